@@ -1,0 +1,40 @@
+"""Cz-v0: Czochralski crystal growth as a Gymnasium environment.
+
+Importing this package registers ``Cz-v0``; ``gym.make("cz_gym:Cz-v0")`` imports it by itself.
+"""
+
+from __future__ import annotations
+
+import gymnasium as gym
+
+from .config import Config
+from .env import CzEnv, EnvState
+from .meniscus import HURLE, MeniscusModel
+from .observation import decode
+from .parameters import Parameters
+from .plant import Puller, State, make_puller
+from .scenario import Scenario
+from .scenarios import SCENARIOS
+from .vector import CzVectorEnv
+
+__version__ = "0.1.0"
+ENV_ID = "Cz-v0"
+
+__all__ = [
+    "ENV_ID",
+    "HURLE",
+    "SCENARIOS",
+    "Config",
+    "CzEnv",
+    "CzVectorEnv",
+    "EnvState",
+    "MeniscusModel",
+    "Parameters",
+    "Puller",
+    "Scenario",
+    "State",
+    "decode",
+    "make_puller",
+]
+
+gym.register(id=ENV_ID, entry_point="cz_gym.env:CzEnv", vector_entry_point="cz_gym.vector:CzVectorEnv")

@@ -1,0 +1,92 @@
+"""What an environment is made with: one frozen, checked value shared by the scalar and the batched form."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from dataclasses import dataclass, field, replace
+
+from .meniscus import HURLE, MeniscusModel
+from .observation import OBSERVATIONS
+from .parameters import Parameters, check_parameters
+from .scenario import Range, Scenario
+from .scenarios import RANDOMIZED, find_scenario, mix_of
+
+VERSION = 0
+"""Version of physics and contract; a change of either makes a Cz-v1."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of ``gym.make("Cz-v0", ...)``, checked on construction by :func:`make_config`."""
+
+    scenario: Scenario = RANDOMIZED
+    model: str | float | None = None
+    observation: str = "measured"
+    control_interval: float = 5.0
+    """Time between actions [s]."""
+    horizon: float = 10800.0
+    """Length of an episode [s]."""
+    parameters: Parameters = field(default_factory=Parameters)
+    meniscus: MeniscusModel = HURLE
+
+    @property
+    def steps(self) -> int:
+        """Steps in an episode."""
+        return round(self.horizon / self.control_interval)
+
+    @property
+    def mix(self) -> Range:
+        """Range of the share of conduction [-]."""
+        return mix_of(self.model, self.scenario)
+
+    @property
+    def plant_hash(self) -> str:
+        """SHA-256 of what the crystal obeys: version, meniscus and parameters (16 hex digits)."""
+        text = json.dumps([VERSION, self.meniscus.name, self.parameters._asdict()], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 of everything a saved state depends on (16 hex digits)."""
+        parts = [self.plant_hash, self.scenario.hash, self.mix, self.observation, self.control_interval, self.horizon]
+        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
+
+    def with_scenario(self, scenario: str | Scenario) -> Config:
+        """The same settings on another scenario."""
+        return replace(self, scenario=find_scenario(scenario))
+
+
+def make_config(
+    scenario: str | Scenario = "randomized",
+    model: str | float | None = None,
+    observation: str = "measured",
+    control_interval: float = 5.0,
+    horizon: float = 10800.0,
+    parameters: Parameters | None = None,
+    meniscus: MeniscusModel | None = None,
+) -> Config:
+    """Check the arguments of the environment; ValueError names what was given and what is allowed."""
+    found = find_scenario(scenario)
+    mix_of(model, found)
+    if not isinstance(observation, str) or observation not in OBSERVATIONS:
+        raise ValueError(f"unknown observation {observation!r}; choose one of {', '.join(OBSERVATIONS)}")
+    interval = _positive("control_interval", control_interval)
+    length = _positive("horizon", horizon)
+    steps = length / interval
+    if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:
+        raise ValueError(f"horizon {horizon} s must be a whole number of control intervals of {control_interval} s")
+    if meniscus is not None and not isinstance(meniscus, MeniscusModel):
+        raise ValueError(f"meniscus must be a cz_gym.MeniscusModel, not {meniscus!r}")
+    checked = check_parameters(parameters if parameters is not None else Parameters())
+    return Config(found, model, observation, interval, length, checked, meniscus or HURLE)
+
+
+def _positive(name: str, value: float) -> float:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not number or not math.isfinite(value) or value <= 0:
+        raise ValueError(f"{name} must be a positive number of seconds, not {value!r}")
+    return float(value)
+
+

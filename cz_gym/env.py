@@ -1,0 +1,188 @@
+"""The environment: ``gym.make("Cz-v0")``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium.error import InvalidAction, ResetNeeded
+from gymnasium.spaces import Box
+
+from .batch import Batch, SlotState, new_key
+from .config import make_config
+from .meniscus import MeniscusModel
+from .observation import CLIP, OBSERVATIONS
+from .parameters import Parameters
+from .scenario import Scenario
+from .scenarios import find_scenario
+from .slots import INFO
+
+Observation = npt.NDArray[np.float32]
+Action = npt.NDArray[np.float32]
+_OPTIONS = ("scenario", "state")
+
+
+@dataclass(frozen=True)
+class EnvState:
+    """A saved environment: its slot and its random stream. Picklable."""
+
+    slot: SlotState
+    random: dict[str, Any]
+
+
+def action_space() -> Box:
+    """Pull speed and heater power, each in [-1, 1]: v_p = v_0 (1 + a_0), Q_H = Q_H0 + 10 kW a_1."""
+    return Box(-1.0, 1.0, (2,), np.float32)
+
+
+def observation_space(observation: str) -> Box:
+    """The observation's channels, scaled and clipped to +-10."""
+    return Box(-CLIP, CLIP, (len(OBSERVATIONS[observation]),), np.float32)
+
+
+def check_options(options: dict[str, Any] | None, allowed: tuple[str, ...] = _OPTIONS) -> dict[str, Any]:
+    """A copy of reset's options; ValueError for a key that is not one."""
+    given = dict(options or {})
+    unknown = sorted(set(given) - set(allowed))
+    if unknown:
+        raise ValueError(f"unknown reset option {unknown[0]!r}; choose from {', '.join(allowed)}")
+    return given
+
+
+class CzEnv(gym.Env[Observation, Action]):
+    """Czochralski growth of a silicon ingot: hold the true radius, seeing only the camera's bright ring.
+
+    ## Action Space
+    ``Box(-1, 1, (2,), float32)``: pull speed v_p = v_0 (1 + a_0), 0 to 2.4 mm/min, and heater power
+    Q_H = Q_H0 + 10 kW a_1. Out-of-range actions are clipped and ``info["action_clipped"]`` says so; NaN or a wrong
+    shape raises :class:`gymnasium.error.InvalidAction`.
+
+    ## Observation Space
+    ``Box(-10, 10, (n,), float32)``; every channel with unit and scale in :mod:`cz_gym.observation`. "measured" (11) is
+    what a puller's control computer has, "history" (72) adds the integral of the error and past samples, "state"
+    (17) is the true state and the disturbances, for bounds and asymmetric critics only.
+
+    ## Rewards
+    1 - c with c = 10 cost / (10 + cost), cost = (e_r / 0.5 mm)^2 + 0.5 (dv_p / 0.36 mm/min)^2 + 0.25 (step of v_p /
+    0.06 mm/min)^2 + 0.05 (step of Q_H / 1 kW)^2 on the true radius error e_r; a failure at step k of N adds -10 (N - k).
+
+    ## Starting State
+    The drawn puller's own operating point, the radius off by N(0, 0.2 mm) on "randomized".
+
+    ## Episode End
+    Terminated when |r_c - r_ref| > 8 mm, or the meniscus freezes (h_c < 1.2 mm) or detaches (h_c > 1.24 a);
+    truncated after ``horizon``.
+
+    ## Arguments
+    ``scenario`` (name or :class:`cz_gym.Scenario`), ``model`` ("I", "II", a mix in [0, 1], or None for the
+    scenario's draw), ``observation``, ``control_interval`` [s], ``horizon`` [s], ``render_mode``, ``parameters``
+    (:class:`cz_gym.Parameters`), ``meniscus`` (:class:`cz_gym.MeniscusModel`). Bad values raise ValueError.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  (Gymnasium's own declaration)
+
+    def __init__(
+        self,
+        scenario: str | Scenario = "randomized",
+        model: str | float | None = None,
+        observation: str = "measured",
+        control_interval: float = 5.0,
+        horizon: float = 10800.0,
+        render_mode: str | None = None,
+        parameters: Parameters | None = None,
+        meniscus: MeniscusModel | None = None,
+    ) -> None:
+        check_render_mode(render_mode, self.metadata)
+        self.render_mode = render_mode
+        self.config = make_config(scenario, model, observation, control_interval, horizon, parameters, meniscus)
+        self.action_space = action_space()
+        self.observation_space = observation_space(observation)
+        self._batch = Batch(self.config, 1)
+        self._slots = self._batch.memory.slots
+        self._out = self._batch.new_out()
+        self._action = np.zeros((1, 2))
+        self._over = True
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Draw an episode; see :class:`gymnasium.Env`.
+
+        ``options={"scenario": ...}`` draws this one episode from another scenario; ``options={"state": ...}`` goes
+        on from a value of :meth:`get_state`. Raises ValueError for other options.
+        """
+        given = check_options(options)
+        super().reset(seed=seed)
+        self._out = self._batch.new_out()
+        if "state" in given:
+            self.set_state(given["state"])
+        else:
+            scenario = find_scenario(given["scenario"]) if "scenario" in given else None
+            self._batch.reset([0], [new_key(self.np_random)], self._out, scenario)
+        self._over = bool(self._slots["over"][0])
+        return self._observation(), self._info()
+
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Hold an action, shape (2,), for one control interval; see :class:`gymnasium.Env`.
+
+        Raises InvalidAction for NaN or another shape, ResetNeeded once the episode is over.
+        """
+        if self._over:
+            raise ResetNeeded("the episode is over (or never began): call reset()")
+        self._action[0] = check_action(action)
+        out = self._out = self._batch.new_out()
+        self._batch.step(self._action, out)
+        terminated, truncated = bool(out.terminated[0]), bool(out.truncated[0])
+        self._over = terminated or truncated
+        return self._observation(), float(out.reward[0]), terminated, truncated, self._info()
+
+    def get_state(self) -> EnvState:
+        """A picklable value from which :meth:`set_state` continues bit-exactly, random stream included."""
+        return EnvState(self._batch.save(0, self._out), dict(self.np_random.bit_generator.state))
+
+    def set_state(self, state: EnvState) -> None:
+        """Continue from a value of :meth:`get_state`; ValueError if it was saved under other settings."""
+        if not isinstance(state, EnvState):
+            raise ValueError(f"expected a state made by get_state, not {type(state).__name__}")
+        self._out = self._batch.new_out()
+        self._batch.restore(0, state.slot, self._out)
+        self.np_random.bit_generator.state = state.random
+        self._over = bool(self._slots["over"][0])
+
+    def close(self) -> None:
+        """Nothing to close."""
+        self._batch.close()
+
+    def _observation(self) -> Observation:
+        array: Observation = self._out.state[0] if self.config.observation == "state" else self._out.observation[0]
+        return array
+
+    def _info(self) -> dict[str, Any]:
+        info: dict[str, Any] = dict(zip(INFO, self._out.info[:, 0].tolist(), strict=True))
+        info["action_clipped"] = info["action_clipped"] > 0.0
+        if self.config.observation == "history":
+            info["state"] = self._out.state[0]
+        return info
+
+
+def check_action(action: Any) -> Any:
+    """The action as float64, shape (2,); InvalidAction names what was given."""
+    try:
+        array = np.asarray(action, np.float64)
+    except (TypeError, ValueError):
+        raise InvalidAction(f"an action must be two numbers in [-1, 1], not {action!r}") from None
+    if array.shape != (2,):
+        raise InvalidAction(f"an action must have shape (2,), not {array.shape}")
+    if array[0] != array[0] or array[1] != array[1]:
+        raise InvalidAction(f"an action must not be NaN: {action!r}")
+    return array
+
+
+def check_render_mode(render_mode: str | None, metadata: dict[str, Any]) -> None:
+    """ValueError for a render mode that is not declared."""
+    modes = metadata["render_modes"]
+    if render_mode is not None and render_mode not in modes:
+        raise ValueError(f"unknown render_mode {render_mode!r}; choose from {', '.join(['None', *modes])}")

@@ -1,0 +1,74 @@
+"""Meniscus and bright ring: two pure functions of radius, height and puller, for any meniscus model.
+
+A meniscus model is a :class:`MeniscusModel`: ``slope`` gives the sine and cosine of the angle theta between
+the meniscus and the vertical at the triple point, ``ring_offset`` the distance from the triple point to the
+bright ring. The default is Hurle's closed form; both functions compile into the step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ._compile import physics
+
+
+class MeniscusModel(NamedTuple):
+    """A meniscus the plant can run on: its name and its functions, all of signature ``(r_c, h_c, p)``."""
+
+    name: str
+    slope: Callable[[Any, Any, Any], Any]
+    ring_offset: Callable[[Any, Any, Any], Any]
+    height: Callable[[Any, Any, Any], Any]
+
+
+@physics
+def hurle_slope(r_c: Any, h_c: Any, p: Any) -> Any:
+    """Sine and cosine of theta, solving Hurle's A cos(theta) + sin(theta) = B in closed form.
+
+    A = h_c / (2 r_c), B = 1 - h_c^2 / a^2; the branch is theta = arcsin(B / sqrt(1 + A^2)) - arctan(A). Radius
+    and height [m], ``p.a`` the capillary constant [m].
+    """
+    A = h_c / (2.0 * r_c)
+    B = 1.0 - (h_c / p.a) * (h_c / p.a)
+    norm = 1.0 + A * A
+    root = np.sqrt(norm - B * B)
+    return (B - A * root) / norm, (A * B + root) / norm
+
+
+@physics
+def hurle_height(r_c: Any, theta: Any, a: Any) -> Any:
+    """Meniscus height [m] at which Hurle's meniscus leaves the crystal at angle theta [rad]."""
+    half = a * np.cos(theta) / (4.0 * r_c)
+    return a * (np.sqrt(half * half + 1.0 - np.sin(theta)) - half)
+
+
+@physics
+def profile_scale(r_c: Any, h_c: Any, cos_theta: Any, a: Any) -> Any:
+    """Scale M [m] of Hurle's meniscus profile: 1 / M^2 = 1 / a^2 + cos(theta) / (2 r_c h_c)."""
+    return 1.0 / np.sqrt(1.0 / (a * a) + cos_theta / (2.0 * r_c * h_c))
+
+
+@physics
+def profile(z: Any, M: Any) -> Any:
+    """Horizontal coordinate X(z) [m] of Hurle's profile at height z [m] above the melt, scale M [m]."""
+    return M / np.sqrt(2.0) * np.arccosh(np.sqrt(2.0) * M / z) - np.sqrt(2.0 * M * M - z * z)
+
+
+@physics
+def ring_point(phi_b: Any) -> Any:
+    """X(z_b) / M at the profile's point of slope phi_b [rad], z_b = M sqrt(1 - cos(phi_b)); M cancels."""
+    return profile(np.sqrt(1.0 - np.cos(phi_b)), 1.0)
+
+
+@physics
+def hurle_ring_offset(r_c: Any, h_c: Any, p: Any) -> Any:
+    """Distance X(z_b) - X(h_c) [m] from the triple point out to the bright ring; NaN for h_c >= sqrt(2) a."""
+    _, cos_theta = hurle_slope(r_c, h_c, p)
+    M = profile_scale(r_c, h_c, cos_theta, p.a)
+    return M * p.X_b - profile(h_c, M)
+
+
+HURLE = MeniscusModel("hurle", hurle_slope, hurle_ring_offset, hurle_height)

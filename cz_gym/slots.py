@@ -1,0 +1,102 @@
+"""What a slot holds, what a step reads and where it writes: the arrays of the compiled loop."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .episode import FREEZES, Episode
+from .plant import Puller, State
+
+
+def _record(fields: tuple[str, ...]) -> np.dtype[Any]:
+    return np.dtype([(name, np.float64) for name in fields])
+
+
+SLOT = np.dtype(
+    [
+        ("puller", _record(Puller._fields)),
+        ("episode", _record(Episode._fields)),
+        ("x", _record(State._fields)),
+        ("freezes", np.float64, (FREEZES, 2)),
+        ("v_p", np.float64),
+        ("Q_H", np.float64),
+        ("Q_H_slewed", np.float64),
+        ("dT_i", np.float64),
+        ("Q_d", np.float64),
+        ("ring", np.float64),
+        ("T_1", np.float64),
+        ("valid", np.float64),
+        ("integral", np.float64),
+        ("k", np.int64),
+        ("frames", np.int64),
+        ("over", np.int64),
+    ],
+    align=True,
+)
+"""One slot: constants of puller and episode, plant state, drives [m/s, W], the disturbance of the last substep,
+the last readings (``ring`` [m] without the operator's bias, ``T_1`` [K], ``valid``), the integral of the scaled ring
+error, the sample number ``k``, the number of camera frames taken, and whether the episode is over."""
+
+
+class Clock(NamedTuple):
+    """Time base of the slots."""
+
+    interval: float
+    """Control interval [s]."""
+    steps: int
+    """Steps in an episode."""
+
+
+class Memory(NamedTuple):
+    """What the slots read and remember, one row a slot."""
+
+    slots: Any
+    """Records of :data:`SLOT`, shape (n,)."""
+    interface: Any
+    """dT_i on the grid [K], shape (n, grid points)."""
+    noise: Any
+    """Camera [m] and pyrometer [K] noise, shape (n, samples, 2)."""
+    history: Any
+    """Running sums of the remembered channels, circular in time, shape (n, depth, channels); depth 0: none."""
+    frames: Any
+    """Time [s] and ring [m] of camera frames, circular, shape (n, depth, 2)."""
+
+
+class Out(NamedTuple):
+    """Where a step writes, one row a slot."""
+
+    observation: Any
+    """The "measured" or "history" channels, float32, shape (n, channels)."""
+    state: Any
+    """The "state" channels, float32, shape (n, channels); width 0: not written."""
+    reward: Any
+    """Float64, shape (n,)."""
+    terminated: Any
+    """Bool, shape (n,)."""
+    truncated: Any
+    """Bool, shape (n,)."""
+    info: Any
+    """Rows of :data:`INFO`, float64, shape (rows, n)."""
+
+
+class Reading(NamedTuple):
+    """Constants of reading a slot."""
+
+    measured: Any
+    """Scales of the measured channels, shape (channels,)."""
+    state: Any
+    """Scales of the state channels, shape (channels,)."""
+    newest: Any
+    """Age of the newest sample of each remembered mean, shape (lags,)."""
+    oldest: Any
+    """Age of the oldest sample of each remembered mean, shape (lags,)."""
+
+
+INFO = (
+    "r_c", "r_br", "r_ref", "h_c", "alpha_c", "v_g", "v_p", "Q_H", "T_1", "T_1_ref", "T_b",
+    "r_br_measured", "ring_offset",
+    "cost_radius", "cost_pull", "cost_pull_step", "cost_heater_step", "action_clipped",
+)  # fmt: skip
+"""Names of the info rows, SI units."""

@@ -1,0 +1,70 @@
+"""The task: limits, reward and its terms. The benchmark's metrics never read the reward."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ._compile import physics
+from .observation import HEATER_SCALE
+from .units import KILO, MM, MM_PER_MIN
+
+RADIUS_LIMIT = 8.0 * MM
+"""Largest |r_c - r_ref| [m]."""
+HEIGHT_MIN = 1.2 * MM
+"""Lowest meniscus before it freezes [m]."""
+HEIGHT_MAX_IN_A = 1.24
+"""Highest meniscus before it detaches [capillary constants]."""
+HEATER_RANGE = HEATER_SCALE
+"""Q_H = Q_H0 +- this [W]."""
+RADIUS_SCALE = 0.5 * MM
+PULL_SCALE = 0.36 * MM_PER_MIN
+PULL_STEP_SCALE = 0.06 * MM_PER_MIN
+HEATER_STEP_SCALE = 1.0 * KILO
+PULL_WEIGHT, PULL_STEP_WEIGHT, HEATER_STEP_WEIGHT = 0.5, 0.25, 0.05
+COST_CAP = 10.0
+"""What the saturated cost approaches [-]."""
+FAILURE_COST = 10.0
+"""Cost of each step lost to a failure [-]."""
+
+
+class Cost(NamedTuple):
+    """Terms of the cost, each weighted and dimensionless."""
+
+    radius: Any
+    pull: Any
+    pull_step: Any
+    heater_step: Any
+
+
+@physics
+def within_limits(r_c: Any, h_c: Any, r_ref: Any, a: Any) -> Any:
+    """Whether the crystal still grows: false for NaN, freezing, detachment and a lost radius."""
+    return (
+        (np.abs(r_c - r_ref) <= RADIUS_LIMIT) & (h_c >= HEIGHT_MIN) & (h_c <= HEIGHT_MAX_IN_A * a)
+    )
+
+
+@physics
+def cost_terms(radius_error: Any, pull: Any, pull_step: Any, heater_step: Any) -> Any:
+    """Terms from the true radius error [m], v_p - v_0 [m/s], and step changes of v_p [m/s] and Q_H [W]."""
+    return Cost(
+        (radius_error / RADIUS_SCALE) ** 2,
+        PULL_WEIGHT * (pull / PULL_SCALE) ** 2,
+        PULL_STEP_WEIGHT * (pull_step / PULL_STEP_SCALE) ** 2,
+        HEATER_STEP_WEIGHT * (heater_step / HEATER_STEP_SCALE) ** 2,
+    )
+
+
+@physics
+def reward(cost: Any) -> Any:
+    """1 - 10 cost / (10 + cost): saturating, never flat, between -9 and 1."""
+    total = cost.radius + cost.pull + cost.pull_step + cost.heater_step
+    return 1.0 - COST_CAP * total / (COST_CAP + total)
+
+
+@physics
+def failure_penalty(step: Any, steps: Any) -> Any:
+    """Added to the reward when step ``step`` of ``steps`` fails: dying never pays."""
+    return -FAILURE_COST * (steps - step)

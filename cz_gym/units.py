@@ -1,0 +1,22 @@
+"""Conversions between SI and the units people read; no other module spells these numbers.
+
+A value in SI times nothing is SI; multiply by a constant to enter SI (``0.5 * MM``), divide to leave it
+(``r_c / MM``).
+"""
+
+from __future__ import annotations
+
+MM = 1e-3
+"""One millimetre [m]."""
+KILO = 1e3
+"""One kilowatt [W]."""
+MINUTE = 60.0
+"""One minute [s]."""
+HOUR = 3600.0
+"""One hour [s]."""
+MM_PER_MIN = MM / MINUTE
+"""One millimetre per minute [m/s]."""
+PERCENT = 1e-2
+"""One per cent [-]."""
+MICRO = 1e-6
+"""One microsecond [s]."""

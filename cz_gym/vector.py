@@ -1,0 +1,238 @@
+"""The native batch of environments: ``gym.make_vec("Cz-v0", vectorization_mode="vector_entry_point")``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium.error import InvalidAction, ResetNeeded
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from .batch import Batch, new_key
+from .config import make_config
+from .env import CzEnv, EnvState, action_space, check_options, check_render_mode, observation_space
+from .meniscus import MeniscusModel
+from .parameters import Parameters
+from .scenario import Scenario
+from .scenarios import find_scenario
+from .slots import INFO, Out
+
+Array = npt.NDArray[Any]
+Mask = npt.NDArray[np.bool_]
+
+
+class CzVectorEnv(VectorEnv[Array, Array, Array]):
+    """Many pullers at once in one compiled loop; slot i with seed s equals :class:`CzEnv` with seed s bit for bit.
+
+    Arguments are those of :class:`CzEnv`, with ``num_envs``, ``autoreset_mode`` (a
+    :class:`gymnasium.vector.AutoresetMode` or its value; each episode is re-drawn from the slot's own stream) and
+    ``threads`` (None: one per core and 256 slots; results do not depend on it). Nothing returned is reused by a
+    later call.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scenario: str | Scenario = "randomized",
+        model: str | float | None = None,
+        observation: str = "measured",
+        control_interval: float = 5.0,
+        horizon: float = 10800.0,
+        render_mode: str | None = None,
+        parameters: Parameters | None = None,
+        meniscus: MeniscusModel | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        threads: int | None = None,
+    ) -> None:
+        if not isinstance(num_envs, int) or isinstance(num_envs, bool) or num_envs < 1:
+            raise ValueError(f"num_envs must be a positive whole number, not {num_envs!r}")
+        if threads is not None and (not isinstance(threads, int) or threads < 1):
+            raise ValueError(f"threads must be a positive whole number or None, not {threads!r}")
+        check_render_mode(render_mode, self.metadata)
+        self.render_mode = render_mode
+        self.num_envs = num_envs
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
+        self.config = make_config(scenario, model, observation, control_interval, horizon, parameters, meniscus)
+        self.single_action_space = action_space()
+        self.single_observation_space = observation_space(observation)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._batch = Batch(self.config, num_envs, threads)
+        self._out = self._batch.new_out()
+        self._over: Mask = np.ones(num_envs, np.bool_)
+        self._begun = False
+        self._randoms: list[np.random.Generator | None] = [None] * num_envs
+        self._seeds: list[int | None] = [None] * num_envs
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Array, dict[str, Any]]:
+        """Draw episodes; slot i is seeded with seed + i, or with seed[i].
+
+        ``options={"scenario": ...}`` draws these episodes from another scenario, ``{"state": states}`` goes on from a
+        value of :meth:`get_state`, ``{"reset_mask": mask}`` resets only some slots. Raises ValueError or TypeError for
+        anything else.
+        """
+        given = check_options(options, ("scenario", "state", "reset_mask"))
+        mask = self._reset_mask(given.get("reset_mask"))
+        self._seed(seed, mask)
+        previous, self._out = self._out, self._batch.new_out()
+        if not mask.all():
+            self._keep(previous, ~mask)
+        which = np.flatnonzero(mask).tolist()
+        if "state" in given:
+            self._restore(given["state"], which)
+        else:
+            scenario = find_scenario(given["scenario"]) if "scenario" in given else None
+            self._batch.reset(which, (new_key(self._random(i)) for i in which), self._out, scenario)
+        self._over[mask] = self._batch.memory.slots["over"][mask] > 0
+        self._begun = True
+        return self._observations(), self._infos(self._out, mask)
+
+    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """Hold actions, shape (num_envs, 2), for one control interval in every slot.
+
+        Raises InvalidAction for NaN or another shape, ResetNeeded before the first reset and, with autoreset
+        disabled, while any episode is over.
+        """
+        actions = self._check_actions(actions)
+        if not self._begun:
+            raise ResetNeeded("call reset() first")
+        out = self._out = self._batch.new_out()
+        infos: dict[str, Any] = {}
+        if self._over.any():
+            if self.autoreset_mode == AutoresetMode.DISABLED:
+                raise ResetNeeded(f"{int(self._over.sum())} episodes are over: reset them with options['reset_mask']")
+            self._batch.step(actions, out, ~self._over)
+            self._redraw(np.flatnonzero(self._over).tolist(), out)
+        else:
+            self._batch.step(actions, out)
+        over = out.terminated | out.truncated
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and over.any():
+            infos = self._finals(out, over)
+            reward, terminated, truncated = out.reward.copy(), out.terminated.copy(), out.truncated.copy()
+            self._redraw(np.flatnonzero(over).tolist(), out)
+            out = self._out = out._replace(reward=reward, terminated=terminated, truncated=truncated)
+            over = np.zeros_like(over)
+        self._over = over
+        infos.update(self._infos(out, np.ones(self.num_envs, np.bool_)))
+        return self._observations(), out.reward, out.terminated.copy(), out.truncated.copy(), infos
+
+    def get_state(self) -> tuple[EnvState, ...]:
+        """Picklable values, one a slot, from which :meth:`set_state` (also of the scalar form) continues bit-exactly."""
+        return tuple(
+            EnvState(self._batch.save(i, self._out), dict(self._random(i).bit_generator.state))
+            for i in range(self.num_envs)
+        )
+
+    def set_state(self, states: Sequence[EnvState]) -> None:
+        """Continue from a value of :meth:`get_state`; ValueError if it was saved under other settings."""
+        self._out = self._batch.new_out()
+        self._restore(states, list(range(self.num_envs)))
+        self._over = self._batch.memory.slots["over"] > 0
+        self._begun = True
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Stop the threads."""
+        self._batch.close()
+
+    @property
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
+        """The slots' random streams."""
+        return tuple(self._random(i) for i in range(self.num_envs))
+
+    @property
+    def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
+        """The seeds the slots' streams began with."""
+        return tuple(self._seeds)
+
+    def _random(self, i: int) -> np.random.Generator:
+        random = self._randoms[i]
+        if random is None:
+            random, self._seeds[i] = seeding.np_random(None)
+            self._randoms[i] = random
+        return random
+
+    def _seed(self, seed: int | Sequence[int | None] | None, mask: Mask) -> None:
+        if seed is None:
+            return
+        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else list(seed)
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"expected {self.num_envs} seeds, one a slot, got {len(seeds)}")
+        for i in np.flatnonzero(mask).tolist():
+            if seeds[i] is not None:
+                self._randoms[i], self._seeds[i] = seeding.np_random(seeds[i])
+
+    def _reset_mask(self, mask: Any) -> Mask:
+        if mask is None:
+            return np.ones(self.num_envs, np.bool_)
+        if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
+            raise TypeError(f"options['reset_mask'] must be a numpy array of bool, not {mask!r}")
+        if mask.shape != (self.num_envs,) or not mask.any():
+            raise ValueError(f"options['reset_mask'] must have shape ({self.num_envs},) and a True, got {mask!r}")
+        if not self._begun and not mask.all():
+            raise ResetNeeded("the first reset must be of every slot")
+        return mask.copy()
+
+    def _check_actions(self, actions: Any) -> npt.NDArray[np.float64]:
+        try:
+            array = np.asarray(actions, np.float64)
+        except (TypeError, ValueError):
+            raise InvalidAction(f"actions must be numbers of shape ({self.num_envs}, 2), not {actions!r}") from None
+        if array.shape != (self.num_envs, 2):
+            raise InvalidAction(f"actions must have shape ({self.num_envs}, 2), not {array.shape}")
+        if np.isnan(array).any():
+            raise InvalidAction(f"actions must not be NaN; slots {np.flatnonzero(np.isnan(array).any(axis=1))[:10].tolist()} are")
+        return array
+
+    def _redraw(self, which: list[int], out: Out) -> None:
+        self._batch.reset(which, (new_key(self._random(i)) for i in which), out)
+
+    def _restore(self, states: Sequence[EnvState], which: list[int]) -> None:
+        if len(states) != self.num_envs or not all(isinstance(state, EnvState) for state in states):
+            raise ValueError(f"expected {self.num_envs} states made by get_state, one a slot")
+        for i in which:
+            self._batch.restore(i, states[i].slot, self._out)
+            self._random(i).bit_generator.state = states[i].random
+
+    def _keep(self, previous: Out, kept: Mask) -> None:
+        for name, old, new in zip(previous._fields, previous, self._out, strict=True):
+            index = (slice(None), kept) if name == "info" else kept
+            new[index] = old[index]
+
+    def _observations(self) -> Array:
+        array: Array = self._out.state if self.config.observation == "state" else self._out.observation
+        return array.copy() if self.autoreset_mode == AutoresetMode.DISABLED else array
+
+    def _finals(self, out: Out, over: Mask) -> dict[str, Any]:
+        final_obs = np.full(self.num_envs, None, dtype=object)
+        observations = self._observations()
+        for i in np.flatnonzero(over).tolist():
+            final_obs[i] = observations[i].copy()
+        info = self._infos(out._replace(info=out.info.copy(), state=out.state.copy()), over)
+        return {"final_obs": final_obs, "_final_obs": over.copy(), "final_info": info, "_final_info": over.copy()}
+
+    def _infos(self, out: Out, mask: Mask) -> dict[str, Any]:
+        everything = bool(mask.all())
+        infos: dict[str, Any] = {}
+        for name, row in zip(INFO, out.info, strict=True):
+            values = row > 0.0 if name == "action_clipped" else row
+            infos[name] = values if everything else np.where(mask, values, values.dtype.type(0))
+            infos[f"_{name}"] = mask
+        if self.config.observation == "history":
+            infos["state"] = out.state if everything else np.where(mask[:, None], out.state, np.float32(0))
+            infos["_state"] = mask
+        return infos
+
+
+CzVectorEnv.metadata = {**CzEnv.metadata, "autoreset_mode": AutoresetMode.NEXT_STEP}
