@@ -132,4 +132,3 @@ class CompensatedPID:
         inside = np.abs(power) <= HEATER_SCALE
         heat = memory.heat + np.where(inside, self.control_interval / self.T_iT * error, 0.0)
         return power, heat
-

@@ -32,7 +32,7 @@ def physics(function: F) -> F:
 
     Division by zero gives inf or NaN in both, never an exception (``error_model="numpy"``).
     """
-    return cast(F, register_jitable(error_model="numpy")(function))
+    return register_jitable(error_model="numpy")(function)
 
 
 def source_hash(folder: Path | None = None) -> str:
@@ -72,14 +72,15 @@ def _user_cache() -> Path:
 def kernel(function: F) -> F:
     """Compile a loop over slots: no GIL, no fast-math, cached on disk when there is a place for it."""
     folder = cache_folder()
-    options = {"nogil": True, "error_model": "numpy"}
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+    settings: Any = numba.config
     if folder is None:
         return cast(F, numba.njit(**options)(function))
-    previous = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(folder)
+    previous = settings.CACHE_DIR
+    settings.CACHE_DIR = str(folder)
     try:
         return cast(F, numba.njit(cache=True, **options)(function))
     except (RuntimeError, OSError):
         return cast(F, numba.njit(**options)(function))
     finally:
-        numba.config.CACHE_DIR = previous
+        settings.CACHE_DIR = previous

@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -75,7 +76,11 @@ class Batch:
         self.reading = Reading(scales(MEASURED, v_0), scales(STATE, v_0), ages.newest, ages.oldest)
         depth = int(ages.oldest[-1]) + 2 if config.observation == "history" else 0
         grid_points = math.ceil(config.horizon / GRID) + 1
-        frames = math.ceil(MAX_LATENCY / config.control_interval) + math.ceil((MAX_LATENCY + config.control_interval) / GRID) + 2
+        frames = (
+            math.ceil(MAX_LATENCY / config.control_interval)
+            + math.ceil((MAX_LATENCY + config.control_interval) / GRID)
+            + 2
+        )
         self.memory = Memory(
             np.zeros(num_envs, SLOT),
             np.zeros((num_envs, grid_points)),
@@ -118,7 +123,7 @@ class Batch:
         """Advance the active slots by one control interval; actions of shape (num_envs, 2), not NaN."""
         self._actions[:] = actions
         active = self._all if active is None else active
-        arguments = (self.memory, self._actions, active, self.clock, self.reading, out)
+        arguments: tuple[Any, ...] = (self.memory, self._actions, active, self.clock, self.reading, out)
         if self._parts == 1:
             self.kernels.step(*arguments, 0, self.num_envs)
             return
@@ -126,8 +131,7 @@ class Batch:
             self._pool = ThreadPoolExecutor(self._parts - 1, thread_name_prefix="cz-gym")
         bounds = np.linspace(0, self.num_envs, self._parts + 1).astype(int).tolist()
         futures = [
-            self._pool.submit(self.kernels.step, *arguments, start, stop)
-            for start, stop in zip(bounds[1:-1], bounds[2:], strict=True)
+            self._pool.submit(self.kernels.step, *arguments, start, stop) for start, stop in pairwise(bounds[1:])
         ]
         self.kernels.step(*arguments, bounds[0], bounds[1])
         for future in futures:
@@ -136,7 +140,8 @@ class Batch:
     def save(self, i: int, out: Out) -> SlotState:
         """A copy of everything slot i is, with its last sample."""
         sample = tuple(np.copy(array[..., i] if name == "info" else array[i]) for name, array in out._asdict().items())
-        return SlotState(self.config.hash, *(np.copy(array[i]) for array in self.memory), sample)
+        slot, interface, noise, history, frames = (np.copy(array[i]) for array in self.memory)
+        return SlotState(self.config.hash, slot, interface, noise, history, frames, sample)
 
     def restore(self, i: int, state: SlotState, out: Out) -> None:
         """Continue slot i from a saved state and write its last sample into ``out``.

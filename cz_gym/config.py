@@ -88,5 +88,3 @@ def _positive(name: str, value: float) -> float:
     if not number or not math.isfinite(value) or value <= 0:
         raise ValueError(f"{name} must be a positive number of seconds, not {value!r}")
     return float(value)
-
-

@@ -33,12 +33,12 @@ class EnvState:
     random: dict[str, Any]
 
 
-def action_space() -> Box:
+def action_space() -> Any:
     """Pull speed and heater power, each in [-1, 1]: v_p = v_0 (1 + a_0), Q_H = Q_H0 + 10 kW a_1."""
     return Box(-1.0, 1.0, (2,), np.float32)
 
 
-def observation_space(observation: str) -> Box:
+def observation_space(observation: str) -> Any:
     """The observation's channels, scaled and clipped to +-10."""
     return Box(-CLIP, CLIP, (len(OBSERVATIONS[observation]),), np.float32)
 
@@ -67,7 +67,8 @@ class CzEnv(gym.Env[Observation, Action]):
 
     ## Rewards
     1 - c with c = 10 cost / (10 + cost), cost = (e_r / 0.5 mm)^2 + 0.5 (dv_p / 0.36 mm/min)^2 + 0.25 (step of v_p /
-    0.06 mm/min)^2 + 0.05 (step of Q_H / 1 kW)^2 on the true radius error e_r; a failure at step k of N adds -10 (N - k).
+    0.06 mm/min)^2 + 0.05 (step of Q_H / 1 kW)^2 on the true radius error e_r; a failure at
+    step k of N adds -10 (N - k).
 
     ## Starting State
     The drawn puller's own operating point, the radius off by N(0, 0.2 mm) on "randomized".

@@ -130,7 +130,9 @@ def draw_factors(scenario: Scenario, mix: Range, key: tuple[int, int]) -> Factor
         return Factors(lam=mix[0])
     u = stream(key, Stream.PARAMETERS).random(7).tolist()
     widths = (spread.capillary, spread.conductivity, *(spread.conductance,) * 4)
-    return Factors(_between(mix, u[0]), *(1.0 + width * (2.0 * v - 1.0) for width, v in zip(widths, u[1:], strict=True)))
+    return Factors(
+        _between(mix, u[0]), *(1.0 + width * (2.0 * v - 1.0) for width, v in zip(widths, u[1:], strict=True))
+    )
 
 
 def draw_episode(scenario: Scenario, key: tuple[int, int], out: Series) -> Episode:
@@ -240,7 +242,13 @@ def _draw_sensor(scenario: Scenario, key: tuple[int, int], noise: Floats) -> tup
         noise[hit, 0] += sensor.outlier_sd * ndtri(chance[hit])
     offset = _between(sensor.bias_offset, u[2]) + _between(sensor.level_offset, u[3])
     phase = 2.0 * math.pi * u[6]
-    return offset, _between(sensor.rotation, u[5]), _between(sensor.ripple, u[4]), phase, _between(sensor.pyrometer_drift, u[7])
+    return (
+        offset,
+        _between(sensor.rotation, u[5]),
+        _between(sensor.ripple, u[4]),
+        phase,
+        _between(sensor.pyrometer_drift, u[7]),
+    )
 
 
 def _draw_faults(faults: Faults, key: tuple[int, int], out: Series) -> tuple[float, float, float]:
@@ -249,7 +257,11 @@ def _draw_faults(faults: Faults, key: tuple[int, int], out: Series) -> tuple[flo
     if faults == Faults():
         return 0.0, 1.0, 0.0
     u = stream(key, Stream.FAULTS).random(5 + 3 * FREEZES).tolist()
-    bias_drift = u[0] * DRAW_SPAN, max(_between(faults.bias_drift_duration, u[1]), 1e-9), _between(faults.bias_drift, u[2])
+    bias_drift = (
+        u[0] * DRAW_SPAN,
+        max(_between(faults.bias_drift_duration, u[1]), 1e-9),
+        _between(faults.bias_drift, u[2]),
+    )
     least, most = faults.flagged
     flagged = min(most, least + int(u[3] * (most - least + 1)))
     wanted = list(range(flagged)) + [MAX_FLAGGED] * faults.unflagged

@@ -251,9 +251,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
             _write_state(slot, measured, t, reading.state, out.state[i])
         _write_info(slot, measured, cost, t, slope, ring_offset, out.info[:, i])
 
-    def step(
-        memory: Any, actions: Any, active: Any, clock: Any, reading: Any, out: Any, start: int, stop: int
-    ) -> None:
+    def step(memory: Any, actions: Any, active: Any, clock: Any, reading: Any, out: Any, start: int, stop: int) -> None:
         for i in range(start, stop):
             if not active[i]:
                 continue

@@ -58,7 +58,12 @@ LAGS = (5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0, 240.0, 360.0, 480
 def _lagged() -> tuple[Channel, ...]:
     by_name = {channel.name: channel for channel in MEASURED}
     return tuple(
-        Channel(f"{name}_{age:g}s", by_name[name].unit, by_name[name].scale, f"{name}, mean of the samples up to {age:g} s old")
+        Channel(
+            f"{name}_{age:g}s",
+            by_name[name].unit,
+            by_name[name].scale,
+            f"{name}, mean of the samples up to {age:g} s old",
+        )
         for age in LAGS
         for name in LAGGED
     )
@@ -119,7 +124,8 @@ def decode(observation: npt.ArrayLike, v_0: float = PULL_SCALE) -> Measured:
     array = np.asarray(observation, dtype=np.float64)
     if array.ndim == 0 or array.shape[-1] not in (len(MEASURED), len(HISTORY)):
         raise ValueError(
-            f"expected an observation of {len(MEASURED)} (measured) or {len(HISTORY)} (history) channels, got shape {array.shape}"
+            f"expected an observation of {len(MEASURED)} (measured) or {len(HISTORY)} (history) channels, "
+            f"got shape {array.shape}"
         )
     head = array[..., : len(MEASURED)] * scales(MEASURED, v_0)
     return Measured(*np.moveaxis(head, -1, 0))

@@ -38,14 +38,21 @@ class Parameters(NamedTuple):
     rho_s: Annotated[float, Quantity("kg/m3", "density of the crystal", _LITERATURE)] = 2330.0
     dH: Annotated[float, Quantity("J/kg", "latent heat of fusion", _LITERATURE)] = 1.8e6
     T_m: Annotated[float, Quantity("K", "melting temperature", _LITERATURE)] = 1685.0
-    dT_0: Annotated[float, Quantity("K", "nominal superheat of the melt bulk", f"fitted: stable pole of {_PART_II}")] = 5.02
+    dT_0: Annotated[
+        float, Quantity("K", "nominal superheat of the melt bulk", f"fitted: stable pole of {_PART_II}")
+    ] = 5.02
     phi_b: Annotated[
-        float, Quantity("rad", "effective reflection slope of the bright ring, not a camera pose", f"fitted: G_m of {_PART_II}")
+        float,
+        Quantity(
+            "rad", "effective reflection slope of the bright ring, not a camera pose", f"fitted: G_m of {_PART_II}"
+        ),
     ] = math.radians(3.5)
     r_0: Annotated[float, Quantity("m", "nominal crystal radius", _PART_II)] = 87.5 * MM
     v_0: Annotated[float, Quantity("m/s", "nominal pull speed", _PART_II)] = 1.2 * MM_PER_MIN
     C_1: Annotated[float, Quantity("J/K", "heat capacity of the heater", f"{_ESTIMATE}: 30 kg graphite")] = 5.7e4
-    C_2: Annotated[float, Quantity("J/K", "heat capacity of susceptor and crucible", f"{_ESTIMATE}: susceptor and quartz")] = 1.0e5
+    C_2: Annotated[
+        float, Quantity("J/K", "heat capacity of susceptor and crucible", f"{_ESTIMATE}: susceptor and quartz")
+    ] = 1.0e5
     C_b: Annotated[float, Quantity("J/K", "heat capacity of the melt bulk", f"{_ESTIMATE}: 80 kg melt")] = 8.0e4
     kappa_12: Annotated[float, Quantity("W/K4", "radiative link heater to susceptor", _ESTIMATE)] = 2.8e-8
     G_1a: Annotated[float, Quantity("W/K", "insulation loss of the heater", _ESTIMATE)] = 30.0
@@ -53,7 +60,9 @@ class Parameters(NamedTuple):
     G_2b: Annotated[float, Quantity("W/K", "conductance of the quartz wall", _ESTIMATE)] = 200.0
     eps: Annotated[float, Quantity("1", "emissivity of the melt surface", f"{_ESTIMATE}: liquid silicon")] = 0.2
     R_cr: Annotated[float, Quantity("m", "inner radius of the crucible", _ESTIMATE)] = 0.28
-    T_e: Annotated[float, Quantity("K", "effective temperature the melt surface sees", f"{_ESTIMATE}: heat shield")] = 1300.0
+    T_e: Annotated[float, Quantity("K", "effective temperature the melt surface sees", f"{_ESTIMATE}: heat shield")] = (
+        1300.0
+    )
 
 
 def describe() -> dict[str, Quantity]:
@@ -74,5 +83,7 @@ def check_parameters(parameters: Parameters) -> Parameters:
         if not number or value < 0 or (value == 0 and name not in _MAY_BE_ZERO):
             raise ValueError(f"parameter {name} = {value!r} must be a positive finite number [{describe()[name].unit}]")
     if parameters.R_cr <= parameters.r_0:
-        raise ValueError(f"the crucible (R_cr = {parameters.R_cr} m) must be wider than the crystal (r_0 = {parameters.r_0} m)")
+        raise ValueError(
+            f"the crucible (R_cr = {parameters.R_cr} m) must be wider than the crystal (r_0 = {parameters.r_0} m)"
+        )
     return parameters

@@ -172,11 +172,13 @@ class Scenario:
 
     def __post_init__(self) -> None:
         for family in dataclasses.fields(self)[1:]:
-            expected, value = type(family.default_factory()), getattr(self, family.name)  # type: ignore[misc]
+            expected, value = _FAMILIES[family.name], getattr(self, family.name)
             if not isinstance(value, expected):
                 raise ValueError(f"scenario {self.name!r}: {family.name} must be a {expected.__name__}, not {value!r}")
             for member in dataclasses.fields(value):
-                _check(f"scenario {self.name!r}: {family.name}.{member.name}", member.default, getattr(value, member.name))
+                _check(
+                    f"scenario {self.name!r}: {family.name}.{member.name}", member.default, getattr(value, member.name)
+                )
         self._check_sense()
 
     def _check_sense(self) -> None:
@@ -185,24 +187,38 @@ class Scenario:
                 raise ValueError(f"scenario {self.name!r}: {what}")
 
         need(bool(self.name) and isinstance(self.name, str), "needs a name")
-        need(0.0 <= self.pullers.mix[0] <= self.pullers.mix[1] <= 1.0, f"pullers.mix = {self.pullers.mix} must lie in [0, 1]")
+        need(
+            0.0 <= self.pullers.mix[0] <= self.pullers.mix[1] <= 1.0,
+            f"pullers.mix = {self.pullers.mix} must lie in [0, 1]",
+        )
         for spread in ("capillary", "conductivity", "conductance"):
             need(0.0 <= getattr(self.pullers, spread) < 0.5, f"pullers.{spread} must lie in [0, 0.5)")
         need(0.0 <= self.pullers.melt_loss < 1.0, "pullers.melt_loss must lie in [0, 1)")
         need(0.0 <= self.reference.probability <= 1.0, "reference.probability must lie in [0, 1]")
         need(0.0 <= self.sensor.outlier_probability <= 1.0, "sensor.outlier_probability must lie in [0, 1]")
         need(0.0 <= self.faults.dropout[0] <= self.faults.dropout[1] <= 1.0, "faults.dropout must lie in [0, 1]")
-        need(0 <= self.faults.flagged[0] <= self.faults.flagged[1] <= MAX_FLAGGED, f"faults.flagged must lie in 0..{MAX_FLAGGED}")
+        need(
+            0 <= self.faults.flagged[0] <= self.faults.flagged[1] <= MAX_FLAGGED,
+            f"faults.flagged must lie in 0..{MAX_FLAGGED}",
+        )
         need(0 <= self.faults.unflagged <= MAX_UNFLAGGED, f"faults.unflagged must lie in 0..{MAX_UNFLAGGED}")
-        longest = self.faults.flagged[1] * self.faults.flagged_duration[1] + self.faults.unflagged * self.faults.unflagged_duration[1]
+        longest = (
+            self.faults.flagged[1] * self.faults.flagged_duration[1]
+            + self.faults.unflagged * self.faults.unflagged_duration[1]
+        )
         need(longest <= DRAW_SPAN, f"freezes of {longest} s do not fit into {DRAW_SPAN} s")
-        need(self.interface.tau_fast > 0 and self.interface.tau_slow > 0, "interface correlation times must be positive")
+        need(
+            self.interface.tau_fast > 0 and self.interface.tau_slow > 0, "interface correlation times must be positive"
+        )
         need(0.0 <= self.sensor.latency <= MAX_LATENCY, f"sensor.latency must lie in [0, {MAX_LATENCY}] s")
         need(min(vars(self.actuators).values()) >= 0, "actuator limits must not be negative")
         for family, names in _NOT_NEGATIVE.items():
             for name in names:
                 value = getattr(getattr(self, family), name)
-                need(min(value if isinstance(value, tuple) else (value,)) >= 0, f"{family}.{name} = {value} must not be negative")
+                need(
+                    min(value if isinstance(value, tuple) else (value,)) >= 0,
+                    f"{family}.{name} = {value} must not be negative",
+                )
 
     @property
     def hash(self) -> str:
@@ -216,6 +232,16 @@ class Scenario:
         return all(not _is_random(getattr(self, family.name)) for family in dataclasses.fields(self)[1:])
 
 
+_FAMILIES: dict[str, type[Any]] = {
+    "pullers": Pullers,
+    "recipe": Recipe,
+    "drift": Drift,
+    "interface": Interface,
+    "reference": Reference,
+    "sensor": Sensor,
+    "faults": Faults,
+    "actuators": Actuators,
+}
 _NOT_NEGATIVE = {
     "pullers": ("start_radius_sd",),
     "recipe": ("duration", "start"),

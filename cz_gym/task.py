@@ -41,9 +41,7 @@ class Cost(NamedTuple):
 @physics
 def within_limits(r_c: Any, h_c: Any, r_ref: Any, a: Any) -> Any:
     """Whether the crystal still grows: false for NaN, freezing, detachment and a lost radius."""
-    return (
-        (np.abs(r_c - r_ref) <= RADIUS_LIMIT) & (h_c >= HEIGHT_MIN) & (h_c <= HEIGHT_MAX_IN_A * a)
-    )
+    return (np.abs(r_c - r_ref) <= RADIUS_LIMIT) & (h_c >= HEIGHT_MIN) & (h_c <= HEIGHT_MAX_IN_A * a)
 
 
 @physics

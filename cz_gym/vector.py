@@ -129,7 +129,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         return self._observations(), out.reward, out.terminated.copy(), out.truncated.copy(), infos
 
     def get_state(self) -> tuple[EnvState, ...]:
-        """Picklable values, one a slot, from which :meth:`set_state` (also of the scalar form) continues bit-exactly."""
+        """Picklable values, one a slot; :meth:`set_state`, also of the scalar form, continues them bit-exactly."""
         return tuple(
             EnvState(self._batch.save(i, self._out), dict(self._random(i).bit_generator.state))
             for i in range(self.num_envs)
@@ -147,7 +147,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         self._batch.close()
 
     @property
-    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[misc,override]
         """The slots' random streams."""
         return tuple(self._random(i) for i in range(self.num_envs))
 
@@ -192,7 +192,9 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         if array.shape != (self.num_envs, 2):
             raise InvalidAction(f"actions must have shape ({self.num_envs}, 2), not {array.shape}")
         if np.isnan(array).any():
-            raise InvalidAction(f"actions must not be NaN; slots {np.flatnonzero(np.isnan(array).any(axis=1))[:10].tolist()} are")
+            raise InvalidAction(
+                f"actions must not be NaN; slots {np.flatnonzero(np.isnan(array).any(axis=1))[:10].tolist()} are"
+            )
         return array
 
     def _redraw(self, which: list[int], out: Out) -> None:

@@ -1,0 +1,112 @@
+"""The benchmark's metrics, on the true radius, one value an episode. They never read the reward's terms."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ..task import RADIUS_LIMIT
+from ..units import KILO, MINUTE, MM, MM_PER_MIN
+from .rollout import Rollout
+
+Floats = npt.NDArray[np.float64]
+TOLERANCE = 0.5 * MM
+"""Half width of the tolerance band [m]."""
+PULL_WINDOW = 30.0 * MINUTE
+"""Length of the mean that v/G hangs on [s]."""
+PULL_TOLERANCE = 0.03
+"""Share of nominal pull the mean may be off [-]."""
+
+
+class Metrics(NamedTuple):
+    """Metrics of each episode, shape (episodes,).
+
+    After a failure the radius error counts as 8 mm to the horizon; what describes the drives and the crystal is
+    taken over the steps lived.
+    """
+
+    rmse_mm: Floats
+    """Root mean square of r_c - r_ref [mm]."""
+    rmse_observable_mm: Floats
+    """The same against r_ref minus the ring offset that no sensor shows [mm]."""
+    max_error_mm: Floats
+    """Largest |r_c - r_ref| [mm]."""
+    within_half_mm: Floats
+    """Share of time with |r_c - r_ref| <= 0.5 mm [-]."""
+    pull_rms_mm_per_min: Floats
+    """RMS of v_p - v_0 [mm/min]."""
+    pull_step_rms_mm_per_min: Floats
+    """RMS of the change of v_p from one step to the next [mm/min]."""
+    mean_pull_within_3pct: Floats
+    """Share of the time after 30 min in which the 30 min mean of v_p is within 3 % of v_0 [-]."""
+    heater_step_rms_kw: Floats
+    """RMS of the change of Q_H from one step to the next [kW]."""
+    growth_rate_rms_mm_per_min: Floats
+    """RMS of v_g - v_0 [mm/min]."""
+    ground_off_pct: Floats
+    """Silicon ground off to a cylinder, 100 (mean r_c^2 / min r_c^2 - 1) [%]."""
+    failure_rate: Floats
+    """1 if the episode failed, else 0 [-]."""
+    # ``return`` is not a Python name; metric_names() restores it.
+    return_: Floats
+    """Sum of rewards [-]."""
+
+
+def metric_names() -> tuple[str, ...]:
+    """Names of the metrics as they stand in files and tables."""
+    return tuple(name.rstrip("_") for name in Metrics._fields)
+
+
+def metrics(run: Rollout) -> Metrics:
+    """Metrics of a rollout."""
+    s, alive = run.signals, run.alive
+    v_0 = run.config.parameters.v_0
+    lost = ~alive | (run.failed & _last(alive))
+    error = np.where(lost, RADIUS_LIMIT, s.r_c - s.r_ref)
+    observable = np.where(lost, RADIUS_LIMIT, s.r_c - s.r_ref + s.ring_offset)
+    pull_step = np.diff(s.v_p, axis=0, prepend=run.start.v_p)
+    heater_step = np.diff(s.Q_H, axis=0, prepend=run.start.Q_H)
+    return Metrics(
+        rmse_mm=_rms(error) / MM,
+        rmse_observable_mm=_rms(observable) / MM,
+        max_error_mm=np.abs(error).max(axis=0) / MM,
+        within_half_mm=np.mean(np.abs(error) <= TOLERANCE, axis=0),
+        pull_rms_mm_per_min=_rms(s.v_p - v_0, alive) / MM_PER_MIN,
+        pull_step_rms_mm_per_min=_rms(pull_step, alive) / MM_PER_MIN,
+        mean_pull_within_3pct=_mean_pull_share(s.v_p, alive, v_0, run.config.control_interval),
+        heater_step_rms_kw=_rms(heater_step, alive) / KILO,
+        growth_rate_rms_mm_per_min=_rms(s.v_g - v_0, alive) / MM_PER_MIN,
+        ground_off_pct=_ground_off(s.r_c, alive),
+        failure_rate=run.failed.astype(np.float64),
+        return_=run.reward.sum(axis=0),
+    )
+
+
+def _rms(values: Floats, where: npt.NDArray[np.bool_] | None = None) -> Floats:
+    squares = np.square(values)
+    mean: Floats = np.mean(squares, axis=0) if where is None else np.mean(squares, axis=0, where=where)
+    return np.sqrt(mean)
+
+
+def _last(alive: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """The last step taken in each episode."""
+    following = np.vstack([alive[1:], np.zeros((1, alive.shape[1]), np.bool_)])
+    return alive & ~following
+
+
+def _mean_pull_share(v_p: Floats, alive: npt.NDArray[np.bool_], v_0: float, dt: float) -> Floats:
+    window = min(max(round(PULL_WINDOW / dt), 1), len(v_p))
+    sums = np.cumsum(np.vstack([np.zeros((1, v_p.shape[1])), v_p]), axis=0)
+    means = (sums[window:] - sums[:-window]) / window
+    within = (np.abs(means - v_0) <= PULL_TOLERANCE * v_0) & alive[window - 1 :]
+    share: Floats = within.mean(axis=0)
+    return share
+
+
+def _ground_off(r_c: Floats, alive: npt.NDArray[np.bool_]) -> Floats:
+    mean_square = np.mean(np.square(r_c), axis=0, where=alive)
+    smallest = np.min(r_c, axis=0, where=alive, initial=np.inf)
+    ground: Floats = 100.0 * (mean_square / np.square(smallest) - 1.0)
+    return ground

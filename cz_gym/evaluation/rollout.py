@@ -1,0 +1,130 @@
+"""Rollouts: a policy on seeded episodes, all in one batch, every signal logged."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ..config import Config
+from ..vector import CzVectorEnv
+
+Floats = npt.NDArray[np.float64]
+CHUNK = 500
+"""Most episodes in one batch."""
+
+
+class Signals(NamedTuple):
+    """Logged signals in SI units, shape (steps, episodes); row k is the end of step k + 1."""
+
+    r_c: Floats
+    r_ref: Floats
+    r_br: Floats
+    r_br_measured: Floats
+    ring_offset: Floats
+    h_c: Floats
+    alpha_c: Floats
+    v_g: Floats
+    v_p: Floats
+    Q_H: Floats
+    T_1: Floats
+    T_1_ref: Floats
+    T_b: Floats
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """What happened to a policy on some seeds."""
+
+    config: Config
+    seeds: tuple[int, ...]
+    signals: Signals
+    reward: Floats
+    """Reward, 0 after the end, shape (steps, episodes)."""
+    alive: npt.NDArray[np.bool_]
+    """Whether the step was taken: true up to and including a failing one, shape (steps, episodes)."""
+    failed: npt.NDArray[np.bool_]
+    """Whether the episode ended in a failure, shape (episodes,)."""
+    start: Signals
+    """Signals at t = 0, each of shape (1, episodes)."""
+    seconds_in_policy: float
+    """Time spent in ``predict``, all episodes together [s]."""
+
+    @property
+    def microseconds_per_step(self) -> float:
+        """Time in ``predict`` per step of one episode, batched [us]."""
+        return 1e6 * self.seconds_in_policy / self.alive.size
+
+
+def rollout(
+    policy: Any,
+    config: Config,
+    seeds: Sequence[int],
+    progress: Callable[[int], None] | None = None,
+) -> Rollout:
+    """Run ``policy.predict`` on one episode a seed, batched.
+
+    ``progress`` is called with the number of steps done since its last call. A failed episode stops counting; its
+    slot goes on with another crystal that nobody reads.
+    """
+    if not seeds:
+        raise ValueError("a rollout needs at least one seed")
+    parts = [
+        _rollout_chunk(policy, config, list(seeds[first : first + CHUNK]), progress)
+        for first in range(0, len(seeds), CHUNK)
+    ]
+    return parts[0] if len(parts) == 1 else _join(parts)
+
+
+def _rollout_chunk(policy: Any, config: Config, seeds: list[int], progress: Callable[[int], None] | None) -> Rollout:
+    steps, n = config.steps, len(seeds)
+    env = CzVectorEnv(n, **_arguments(config))
+    signals = Signals(*(np.zeros((steps, n)) for _ in Signals._fields))
+    reward, alive = np.zeros((steps, n)), np.zeros((steps, n), np.bool_)
+    failed, running = np.zeros(n, np.bool_), np.ones(n, np.bool_)
+    observation, info = env.reset(seed=seeds)
+    start = Signals(*(np.array(info[name])[None] for name in Signals._fields))
+    state: Any = None
+    begins = np.ones(n, np.bool_)
+    seconds = 0.0
+    for k in range(steps):
+        before = time.perf_counter()
+        action, state = policy.predict(observation, state=state, episode_start=begins, deterministic=True)
+        seconds += time.perf_counter() - before
+        observation, gained, terminated, truncated, info = env.step(action)
+        begins = terminated | truncated
+        for log, name in zip(signals, Signals._fields, strict=True):
+            log[k] = info[name]
+        reward[k] = np.where(running, gained, 0.0)
+        alive[k] = running
+        failed |= running & terminated
+        running &= ~begins
+        if progress is not None:
+            progress(n)
+    env.close()
+    return Rollout(config, tuple(seeds), signals, reward, alive, failed, start, seconds)
+
+
+def _arguments(config: Config) -> dict[str, Any]:
+    names = ("scenario", "model", "observation", "control_interval", "horizon", "parameters", "meniscus")
+    return {name: getattr(config, name) for name in names}
+
+
+def _join(parts: list[Rollout]) -> Rollout:
+    def columns(pick: Callable[[Rollout], Any]) -> Any:
+        return np.concatenate([pick(part) for part in parts], axis=-1)
+
+    return Rollout(
+        parts[0].config,
+        tuple(seed for part in parts for seed in part.seeds),
+        Signals(*(columns(lambda part, i=i: part.signals[i]) for i in range(len(Signals._fields)))),  # type: ignore[misc]
+        columns(lambda part: part.reward),
+        columns(lambda part: part.alive),
+        columns(lambda part: part.failed),
+        Signals(*(columns(lambda part, i=i: part.start[i]) for i in range(len(Signals._fields)))),  # type: ignore[misc]
+        sum(part.seconds_in_policy for part in parts),
+    )
