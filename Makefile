@@ -1,0 +1,48 @@
+# One target a task; `make help` lists them. Everything installs into its own virtual environment, pinned.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+TEST_READY := $(VENV)/.ready-test
+BENCHMARK_READY := $(VENV)/.ready-benchmark
+
+.PHONY: help venv lint types test benchmark paper clean
+.DEFAULT_GOAL := help
+
+help: ## list the targets
+	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 12
+
+venv: $(TEST_READY) ## virtual environment with everything: agents, benchmark, tests
+
+lint: $(TEST_READY) ## format and lint
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+
+types: $(TEST_READY) ## strict types
+	$(BIN)/mypy
+
+test: lint types ## lint, types and tests
+	$(BIN)/python -m pytest -q
+
+benchmark: $(BENCHMARK_READY) ## the shipped agent and the classical controllers on the same crystals
+	$(BIN)/python benchmark.py
+
+paper: $(BENCHMARK_READY) ## the paper's numbers beside ours
+	$(BIN)/python -m baselines.paper
+
+clean: ## remove what builds and checks leave behind; the virtual environment stays
+	rm -rf build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +
+
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(BENCHMARK_READY): pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) --editable ".[benchmark]"
+	touch $@
+
+# torch first: alone under its pin, pip decides at once which build to take.
+$(TEST_READY): pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) torch
+	$(PIP) --editable ".[test]"
+	touch $(BENCHMARK_READY) $@
