@@ -252,7 +252,7 @@ _NOT_NEGATIVE = {
     "faults": ("flagged_duration", "unflagged_duration", "bias_drift_duration"),
 }
 _ALWAYS_RANDOM = ("start_radius_sd", "capillary", "conductivity", "conductance", "outlier_probability", "unflagged")
-_RANDOM_SD = ("sd", "camera_noise", "pyrometer_noise", "dropout", "ripple")
+_RANDOM_UNLESS_ZERO = ("sd", "camera_noise", "pyrometer_noise", "dropout", "ripple", "flagged", "bias_drift")
 
 
 def _check(where: str, default: Any, value: Any) -> None:
@@ -266,6 +266,8 @@ def _check(where: str, default: Any, value: Any) -> None:
             raise ValueError(f"{where} must be a pair of finite numbers low <= high, not {value!r}")
     elif not _is_number(value) or (math.isinf(value) and not math.isinf(default)):
         raise ValueError(f"{where} must be a finite number, not {value!r}")
+    elif isinstance(default, int) and not isinstance(value, int):
+        raise ValueError(f"{where} must be a whole number, not {value!r}")
 
 
 def _is_number(value: Any) -> bool:
@@ -276,6 +278,8 @@ def _is_random(family: Any) -> bool:
     for member, value in vars(family).items():
         if member in _ALWAYS_RANDOM and value:
             return True
-        if isinstance(value, tuple) and (value[0] != value[1] or (member in _RANDOM_SD and value[1] > 0)):
+        if member == "probability" and 0.0 < value < 1.0:
+            return True
+        if isinstance(value, tuple) and (value[0] != value[1] or (member in _RANDOM_UNLESS_ZERO and any(value))):
             return True
     return False

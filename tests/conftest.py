@@ -1,0 +1,54 @@
+"""What the tests share: one place for compiled code, and the plant's equations written a second time."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import settings
+
+os.environ.setdefault("CZ_GYM_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "cz-gym"))
+
+settings.register_profile("repeatable", deadline=None, derandomize=True, database=None, max_examples=40)
+settings.load_profile("repeatable")
+
+HOUR = 3600.0
+
+
+class Truth(NamedTuple):
+    """What drives the plant over a stretch of time."""
+
+    v_p: float
+    Q_H: float
+    Q_d: float = 0.0
+    dT_i: float = 0.0
+    melt: float = 1.0
+
+
+def design_rates(x: np.ndarray, u: Truth, p: Any) -> np.ndarray:
+    """The design's equations, written a second time from its text: arcsin and arctan, powers of four."""
+    r_c, h_c, T_1, T_2, T_b = x
+    A, B = h_c / (2 * r_c), 1 - h_c**2 / p.a**2
+    theta = np.arcsin(B / np.sqrt(1 + A**2)) - np.arctan(A)
+    alpha_c = theta - np.arctan2(p.sin_alpha_0, p.cos_alpha_0)
+    Phi_l = p.k_l * (T_b + u.dT_i - p.T_m) * (p.lam / h_c + (1 - p.lam) / p.h_0)
+    v_g = (p.Phi_s - Phi_l) / p.rho_dH
+    link = p.kappa_12 * (T_1**4 - T_2**4)
+    wall = p.G_2b * (T_2 - T_b)
+    return np.array(
+        [
+            v_g * np.tan(alpha_c),
+            u.v_p - v_g,
+            (u.Q_H - link - p.G_1a * (T_1 - p.T_a)) / p.C_1,
+            (link - wall) / p.C_2,
+            (wall - p.kappa_b * (T_b**4 - p.T_e**4) - p.Q_i + u.Q_d) / (p.C_b * u.melt),
+        ]
+    )
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(20)
