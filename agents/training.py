@@ -1,0 +1,114 @@
+"""Making learners: stable-baselines3's PPO and SAC on the native batch, as the settings say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from gymnasium.vector import AutoresetMode
+from stable_baselines3 import PPO as PPOLearner
+from stable_baselines3 import SAC as SACLearner
+from stable_baselines3.common.callbacks import BaseCallback
+
+from cz_gym import CzVectorEnv
+
+from . import settings
+from .callbacks import Statistics
+from .network import DrivePolicy, Normalise
+from .vec_env import CzVecEnv
+from .wrappers import DriveAction, TrainingReward
+
+TRAINING_SEEDS = 1_000_000
+"""Environment seeds below this are for training."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """A learner, ready to learn."""
+
+    learner: Any
+    callbacks: list[BaseCallback]
+    recipe: settings.Recipe
+    steps: int
+
+
+def make_training(choice: settings.PPO | settings.SAC, seed: int, logs: str | None, done: int = 0) -> Training:
+    """The learner of these settings for a training seed; ``done`` steps have been taken before (resuming)."""
+    recipe = choice.recipe
+    torch.set_num_threads(recipe.threads)
+    slots = _make_slots(recipe, seed, done)
+    make = _make_ppo if isinstance(choice, settings.PPO) else _make_sac
+    learner = make(choice, slots, seed, logs)  # type: ignore[operator]
+    return Training(learner, [Statistics(choice.steps // 4, known=done > 0)], recipe, choice.steps)
+
+
+def _make_slots(recipe: settings.Recipe, seed: int, done: int) -> CzVecEnv:
+    env = CzVectorEnv(
+        recipe.num_envs,
+        scenario=recipe.scenario,
+        observation=recipe.observation,
+        control_interval=recipe.control_interval,
+        autoreset_mode=AutoresetMode.SAME_STEP,
+    )
+    slots = CzVecEnv(env, recipe.privileged_critic, stagger=seed + done)
+    slots.seed((seed * 10_007 + done) % (TRAINING_SEEDS - recipe.num_envs))
+    return slots
+
+
+def _linear(start: float, end: float) -> Callable[[float], float]:
+    """A schedule over the share of training left."""
+    return lambda left: end + (start - end) * left
+
+
+def _make_ppo(choice: settings.PPO, slots: CzVecEnv, seed: int, logs: str | None) -> PPOLearner:
+    recipe, head = choice.recipe, choice.recipe.head
+    return PPOLearner(
+        DrivePolicy,
+        TrainingReward(slots, choice.gamma),
+        learning_rate=_linear(choice.learning_rate, choice.learning_rate / 20.0),
+        n_steps=choice.n_steps,
+        batch_size=choice.batch_size,
+        n_epochs=choice.n_epochs,
+        gamma=choice.gamma,
+        gae_lambda=choice.gae_lambda,
+        clip_range=choice.clip_range,
+        ent_coef=choice.ent_coef,
+        vf_coef=choice.vf_coef,
+        max_grad_norm=choice.max_grad_norm,
+        policy_kwargs={
+            "hidden": recipe.hidden,
+            "skip": head.skip,
+            "scale": (head.pull_scale, head.heater_scale),
+            "log_std_init": choice.log_std_init,
+        },
+        seed=seed,
+        device="cpu",
+        tensorboard_log=logs,
+    )
+
+
+def _make_sac(choice: settings.SAC, slots: CzVecEnv, seed: int, logs: str | None) -> SACLearner:
+    recipe, head = choice.recipe, choice.recipe.head
+    env = DriveAction(TrainingReward(slots, choice.gamma), head.skip, (head.pull_scale, head.heater_scale))
+    return SACLearner(
+        "MlpPolicy",
+        env,
+        learning_rate=_linear(choice.learning_rate, choice.learning_rate / 20.0),
+        buffer_size=choice.buffer_size,
+        learning_starts=choice.learning_starts,
+        batch_size=choice.batch_size,
+        tau=choice.tau,
+        gamma=choice.gamma,
+        train_freq=1,
+        gradient_steps=choice.gradient_steps,
+        policy_kwargs={
+            "net_arch": list(recipe.hidden),
+            "features_extractor_class": Normalise,
+            "features_extractor_kwargs": {"drives": False},
+        },
+        seed=seed,
+        device="cpu",
+        tensorboard_log=logs,
+    )

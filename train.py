@@ -1,0 +1,105 @@
+"""Train an agent on Cz-v0: ``python train.py --help``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+ALGORITHMS = ("ppo", "sac")
+
+
+def parse(argv: list[str] | None = None) -> argparse.Namespace:
+    """Read the command line; exits with code 2 and one line for anything that cannot be meant."""
+    parser = argparse.ArgumentParser(
+        prog="train.py",
+        description="Train an agent with stable-baselines3 and pick it on validation episodes.",
+        epilog="The run folder holds agent.onnx with its contract, settings, checkpoints, progress and TensorBoard logs.",
+    )
+    parser.add_argument("--algo", choices=ALGORITHMS, default="ppo", help="learning algorithm (default: %(default)s)")
+    parser.add_argument("--seed", type=_whole(0), default=0, help="training seed (default: %(default)s)")
+    parser.add_argument(
+        "--steps", type=_whole(1), help="environment steps (default: the algorithm's own, or the resumed run's)"
+    )
+    parser.add_argument("--scenario", default="randomized", help="scenario to train on (default: %(default)s)")
+    parser.add_argument("--out", type=Path, help="run folder (default: runs/<algo>-seed<seed>)")
+    parser.add_argument("--resume", action="store_true", help="go on from the run folder's checkpoint")
+    arguments = parser.parse_args(argv)
+    arguments.out = arguments.out or Path("runs") / f"{arguments.algo}-seed{arguments.seed}"
+    return arguments
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Train; 0 when done, 2 for bad input, 130 when interrupted."""
+    arguments = parse(argv)
+    try:
+        return train(arguments)
+    except (ValueError, OSError) as error:
+        print(f"train.py: {_one_line(error)}", file=sys.stderr)
+        return 2
+    except ImportError as error:
+        print(f'train.py: {error.name} is missing: pip install "cz-gym[agents]"', file=sys.stderr)
+        return 2
+
+
+def train(arguments: argparse.Namespace) -> int:
+    """Run the training that the command line asks for."""
+    from tqdm import tqdm
+
+    from agents import settings
+    from agents.run import QUICK, Run, saved_steps, validation_rmse
+    from baselines import CompensatedPID
+    from cz_gym.config import make_config
+    from cz_gym.scenarios import find_scenario
+
+    find_scenario(arguments.scenario)
+    folder: Path = arguments.out
+    if not arguments.resume and (folder / "settings.json").exists():
+        raise ValueError(f"{folder} holds a run already: --resume it, or name another --out")
+    choice: settings.PPO | settings.SAC = settings.PPO() if arguments.algo == "ppo" else settings.SAC()
+    choice = replace(choice, recipe=replace(choice.recipe, scenario=arguments.scenario))
+    steps = arguments.steps or (saved_steps(folder) if arguments.resume else choice.steps)
+    choice = replace(choice, steps=steps)
+    paper_config = make_config(arguments.scenario, control_interval=choice.recipe.control_interval)
+    paper, _, _ = validation_rmse(CompensatedPID(choice.recipe.control_interval), paper_config, QUICK)
+    run = Run(folder, choice, arguments.seed, paper, arguments.resume)
+    print(f"{arguments.algo}, seed {arguments.seed}, {choice.steps:,} steps on {arguments.scenario!r}, into {folder}")
+    with tqdm(total=choice.steps, unit="step", unit_scale=True, dynamic_ncols=True, mininterval=1.0) as bar:
+        try:
+            run.learn(bar)
+        except KeyboardInterrupt:
+            run.save()
+            bar.close()
+            print(f"train.py: interrupted; checkpoint saved, --resume --out {folder} goes on", file=sys.stderr)
+            return 130
+    summary = run.finish()
+    print(
+        f"best agent: {summary['validation_rmse_mm']:.3f} mm mean RMSE on {summary['validation_episodes']} validation "
+        f"episodes, {100 * summary['failure_rate']:.1f} % failures; paper's controller {paper:.3f} mm on {QUICK}"
+    )
+    print(f"wrote {folder / 'agent.onnx'}")
+    return 0
+
+
+def _whole(least: int):  # type: ignore[no-untyped-def]
+    def read(text: str) -> int:
+        try:
+            value = int(text.replace("_", ""))
+        except ValueError:
+            value = least - 1
+        if value < least:
+            raise argparse.ArgumentTypeError(f"must be a whole number of at least {least}, not {text!r}")
+        return value
+
+    return read
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename or 'output'}: {error.strerror}"
+    return " ".join(str(error).split())
+
+
+if __name__ == "__main__":
+    sys.exit(main())
