@@ -15,7 +15,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="train.py",
         description="Train an agent with stable-baselines3 and pick it on validation episodes.",
-        epilog="The run folder holds agent.onnx with its contract, settings, checkpoints, progress and TensorBoard logs.",
+        epilog="The run folder holds the agent with its contract, settings, checkpoints, progress and logs.",
     )
     parser.add_argument("--algo", choices=ALGORITHMS, default="ppo", help="learning algorithm (default: %(default)s)")
     parser.add_argument("--seed", type=_whole(0), default=0, help="training seed (default: %(default)s)")

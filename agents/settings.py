@@ -32,7 +32,7 @@ class Recipe:
     """Whether the critic also sees the true state."""
     hidden: tuple[int, ...] = (128, 128)
     """Widths of actor and of critic."""
-    threads: int = 2
+    threads: int = 1
     """Threads that torch computes on."""
     head: ActionHead = field(default_factory=ActionHead)
 
@@ -64,7 +64,7 @@ class PPO:
 class SAC:
     """Soft actor-critic on the same batch."""
 
-    recipe: Recipe = field(default_factory=lambda: Recipe(num_envs=16, privileged_critic=False, threads=1))
+    recipe: Recipe = field(default_factory=lambda: Recipe(num_envs=16, privileged_critic=False))
     steps: int = 400_000
     """Environment steps."""
     buffer_size: int = 400_000

@@ -59,6 +59,20 @@ class Compensator:
         A_d, B_d, C_d, _, _ = cont2discrete((A, B, C, np.zeros((1, 1))), dt, method="zoh")
         return A_d, B_d[:, 0], C_d[0]
 
+    def respond(self, v_p: npt.ArrayLike, dt: float) -> Floats:
+        """Output y_pc [m] from rest, for pull speeds v_p - v_0 [m/s] each held for dt [s].
+
+        ``v_p`` has shape (steps, ...), and so has the result: row k is y_pc at the end of step k.
+        """
+        speeds = np.asarray(v_p, np.float64)
+        A, B, C = self.discrete(dt)
+        state = np.zeros((*speeds.shape[1:], 2))
+        output = np.empty_like(speeds)
+        for k, speed in enumerate(speeds):
+            state = state @ A.T + speed[..., None] * B
+            output[k] = state @ C
+        return output
+
 
 class Memory(NamedTuple):
     """What the controller remembers, each of shape (n,) or (n, 2)."""

@@ -10,7 +10,7 @@ import os
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import pairwise
 from typing import Any
 
@@ -18,10 +18,11 @@ import numpy as np
 import numpy.typing as npt
 
 from .config import Config
-from .episode import GRID, Series, check_draw, draw_episode, draw_factors, randomised
+from .episode import GRID, Series, draw_episode, draw_factors, randomised
 from .kernels import KERNELS, Kernels, build_kernels
 from .meniscus import HURLE, MeniscusModel
 from .observation import HISTORY, LAGGED, MEASURED, STATE, lags, scales
+from .plant import check_puller
 from .scenario import MAX_LATENCY, Scenario
 from .slots import INFO, SLOT, Clock, Memory, Out, Reading
 
@@ -130,17 +131,17 @@ class Batch:
         if self._pool is None:
             self._pool = ThreadPoolExecutor(self._parts - 1, thread_name_prefix="cz-gym")
         bounds = np.linspace(0, self.num_envs, self._parts + 1).astype(int).tolist()
-        futures = [
-            self._pool.submit(self.kernels.step, *arguments, start, stop) for start, stop in pairwise(bounds[1:])
-        ]
-        self.kernels.step(*arguments, bounds[0], bounds[1])
+        part = partial(self.kernels.step, *arguments)
+        futures = [self._pool.submit(part, start, stop) for start, stop in pairwise(bounds[1:])]
+        part(bounds[0], bounds[1])
         for future in futures:
             future.result()
 
     def save(self, i: int, out: Out) -> SlotState:
         """A copy of everything slot i is, with its last sample."""
         sample = tuple(np.copy(array[..., i] if name == "info" else array[i]) for name, array in out._asdict().items())
-        slot, interface, noise, history, frames = (np.copy(array[i]) for array in self.memory)
+        # array[i] of a structured array is a view that np.copy does not copy; array[i, ...] is an array.
+        slot, interface, noise, history, frames = (array[i, ...].copy() for array in self.memory)
         return SlotState(self.config.hash, slot, interface, noise, history, frames, sample)
 
     def restore(self, i: int, state: SlotState, out: Out) -> None:
@@ -172,7 +173,7 @@ class Batch:
         slot = memory.slots[i]
         factors = draw_factors(config.scenario, config.mix, key)
         puller = self.kernels.derive(randomised(config.parameters, factors), factors.lam)
-        check_draw(puller)
+        check_puller(puller)
         series = Series(memory.interface[i], memory.noise[i], slot["freezes"])
         episode = draw_episode(config.scenario, key, series)
         slot["puller"], slot["episode"] = puller, episode

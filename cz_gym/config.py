@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from .meniscus import HURLE, MeniscusModel
 from .observation import OBSERVATIONS
 from .parameters import Parameters, check_parameters
+from .plant import make_puller
 from .scenario import Range, Scenario
 from .scenarios import RANDOMIZED, find_scenario, mix_of
 
@@ -80,6 +81,7 @@ def make_config(
     if meniscus is not None and not isinstance(meniscus, MeniscusModel):
         raise ValueError(f"meniscus must be a cz_gym.MeniscusModel, not {meniscus!r}")
     checked = check_parameters(parameters if parameters is not None else Parameters())
+    make_puller(checked, meniscus=meniscus or HURLE)
     return Config(found, model, observation, interval, length, checked, meniscus or HURLE)
 
 

@@ -17,7 +17,6 @@ import numpy.typing as npt
 from scipy.special import ndtri
 
 from ._compile import kernel
-from .plant import Puller
 from .scenario import DRAW_SPAN, MAX_FLAGGED, MAX_UNFLAGGED, Faults, Range, Scenario
 
 GRID = 5.0
@@ -286,9 +285,3 @@ def _place_freezes(faults: Faults, wanted: list[int], u: list[float], freezes: F
     for which, start in zip(order, starts, strict=True):
         freezes[which] = passed + start, passed + start + lengths[which]
         passed += lengths[which]
-
-
-def check_draw(puller: Puller) -> None:
-    """Raise ValueError if the drawn puller has no finite operating point."""
-    if not np.all(np.isfinite(puller)):
-        raise ValueError("these parameters have no finite operating point; check temperatures and conductances")

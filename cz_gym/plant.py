@@ -173,13 +173,21 @@ def make_puller(parameters: Parameters | None = None, lam: float = 1.0, meniscus
     """The puller of these parameters at its own steady state.
 
     ``lam`` is the share of conduction [-], 1 for Model I and 0 for Model II. Raises ValueError for parameters
-    that are not numbers or out of range.
+    that are not numbers, out of range or without a finite operating point.
     """
     if not 0.0 <= lam <= 1.0:
         raise ValueError(f"lam (share of conduction) must lie in [0, 1], not {lam!r}")
     q = check_parameters(parameters or Parameters())
-    puller: Puller = derive_puller(q, float(lam), meniscus.height, meniscus.ring_offset)
-    return Puller(*map(float, puller))
+    with np.errstate(all="ignore"):
+        puller = derive_puller(q, float(lam), meniscus.height, meniscus.ring_offset)
+    return check_puller(Puller(*map(float, puller)))
+
+
+def check_puller(puller: Puller) -> Puller:
+    """Return the puller, or raise ValueError if it has no finite operating point."""
+    if not np.all(np.isfinite(puller)):
+        raise ValueError("these parameters have no finite operating point; check temperatures and conductances")
+    return puller
 
 
 @physics

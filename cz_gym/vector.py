@@ -146,8 +146,8 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         """Stop the threads."""
         self._batch.close()
 
-    @property
-    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[misc,override]
+    @property  # type: ignore[misc]
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
         """The slots' random streams."""
         return tuple(self._random(i) for i in range(self.num_envs))
 

@@ -18,7 +18,6 @@ from cz_gym.episode import (
     Factors,
     Series,
     Stream,
-    check_draw,
     draw_episode,
     draw_factors,
     new_series,
@@ -254,8 +253,3 @@ def test_factors_reach_the_puller() -> None:
     assert (p.k_l, p.kappa_12, p.G_1a, p.G_2b) == pytest.approx((62 * 1.1, 2.8e-8 * 0.9, 30 * 1.05, 200 * 0.95))
     assert p.kappa_b / nominal.kappa_b == pytest.approx(1.08)
     assert (p.lam, p.r_0, p.v_0, p.C_1, p.T_b_0) == (0.3, nominal.r_0, nominal.v_0, nominal.C_1, nominal.T_b_0)
-
-
-def test_a_puller_without_an_operating_point_is_refused() -> None:
-    with pytest.raises(ValueError, match="no finite operating point"):
-        check_draw(make_puller()._replace(T_2_0=math.nan))
