@@ -212,6 +212,5 @@ def test_hidden_load_is_the_static_equivalent_of_a_drift(drift: float) -> None:
 
 
 def test_parameters_without_an_operating_point_are_refused() -> None:
-    for wrong in (Parameters(T_e=4000.0), Parameters(kappa_12=1e-300)):
-        with pytest.raises(ValueError, match="no finite operating point"):
-            make_puller(wrong)
+    with pytest.raises(ValueError, match="no finite operating point"):
+        make_puller(Parameters(T_e=4000.0))

@@ -1,0 +1,142 @@
+from __future__ import annotations
+
+import copy
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cz_gym import CzEnv, CzVectorEnv
+
+ACTIONS = np.random.default_rng(0).uniform(-0.3, 0.3, (100, 2)).astype(np.float32)
+
+
+def run(env: CzEnv, steps: int, first: int = 0) -> list[Any]:
+    """Everything an environment says, resetting when it must."""
+    said: list[Any] = []
+    for k in range(first, first + steps):
+        observation, gained, terminated, truncated, info = env.step(ACTIONS[k])
+        said.append((observation.tolist(), gained, terminated, truncated, sorted(info.items(), key=str)))
+        if terminated or truncated:
+            observation, info = env.reset()
+            said.append((observation.tolist(), sorted(info.items(), key=str)))
+    return [repr(row) for row in said]
+
+
+@pytest.mark.parametrize("scenario", ["randomized", "sensor-fault", "puller"])
+@pytest.mark.parametrize("observation", ["measured", "history", "state"])
+def test_a_saved_state_continues_bit_for_bit(scenario: str, observation: str) -> None:
+    env = CzEnv(scenario, observation=observation, horizon=200.0)
+    env.reset(seed=9)
+    run(env, 25)
+    saved = pickle.dumps(env.get_state())
+    expected = run(env, 60, 25)
+    other = CzEnv(scenario, observation=observation, horizon=200.0)
+    other.set_state(pickle.loads(saved))
+    assert run(other, 60, 25) == expected
+    env.set_state(pickle.loads(saved))
+    assert run(env, 60, 25) == expected
+
+
+def test_reset_from_a_state_shows_its_last_sample() -> None:
+    env = CzEnv(observation="history")
+    env.reset(seed=9)
+    for action in ACTIONS[:10]:
+        observation, *_, info = env.step(action)
+    other = CzEnv(observation="history")
+    again, other_info = other.reset(options={"state": env.get_state()})
+    np.testing.assert_array_equal(again, observation)
+    assert repr(other_info) == repr(info)
+    assert run(other, 20, 10) == run(env, 20, 10)
+
+
+def test_a_state_is_a_value() -> None:
+    env = CzEnv()
+    env.reset(seed=9)
+    state = env.get_state()
+    before = pickle.dumps(state)
+    run(env, 30)
+    assert pickle.dumps(state) == before
+    env.set_state(state)
+    run(env, 30)
+    assert pickle.dumps(state) == before
+
+
+def test_state_of_a_finished_episode_stays_finished() -> None:
+    env = CzEnv("nominal", horizon=5.0)
+    env.reset(seed=0)
+    env.step(ACTIONS[0])
+    other = CzEnv("nominal", horizon=5.0)
+    other.set_state(env.get_state())
+    with pytest.raises(Exception, match="episode is over"):
+        other.step(ACTIONS[0])
+
+
+def test_states_travel_between_scalar_and_vector() -> None:
+    scalars = [CzEnv(horizon=100.0) for _ in range(3)]
+    for seed, env in enumerate(scalars):
+        env.reset(seed=seed)
+        for action in ACTIONS[:7]:
+            env.step(action)
+    batch = CzVectorEnv(3, horizon=100.0)
+    batch.set_state([env.get_state() for env in scalars])
+    for action in ACTIONS[7:12]:
+        observation, gained, _, _, info = batch.step(np.tile(action, (3, 1)))
+        for i, env in enumerate(scalars):
+            alone, alone_gained, _, _, alone_info = env.step(action)
+            np.testing.assert_array_equal(observation[i], alone)
+            assert gained[i] == alone_gained
+            assert info["h_c"][i] == alone_info["h_c"]
+    back = CzEnv(horizon=100.0)
+    back.set_state(pickle.loads(pickle.dumps(batch.get_state()))[1])
+    assert run(back, 40, 12) == run(scalars[1], 40, 12)
+
+
+def test_a_batch_continues_bit_for_bit_through_redraws() -> None:
+    one, other = CzVectorEnv(4, horizon=50.0), CzVectorEnv(4, horizon=50.0)
+    one.reset(seed=3)
+    for action in ACTIONS[:13]:
+        one.step(np.tile(action, (4, 1)))
+    states = pickle.loads(pickle.dumps(one.get_state()))
+    shown, _ = other.reset(options={"state": states})
+    assert shown.shape == (4, 11)
+    for action in ACTIONS[13:60]:
+        expected, actual = one.step(np.tile(action, (4, 1))), other.step(np.tile(action, (4, 1)))
+        for a, b in zip(expected[:4], actual[:4], strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [{"scenario": "hard"}, {"model": "I"}, {"observation": "state"}, {"control_interval": 10.0}, {"horizon": 100.0}],
+)
+def test_a_state_of_other_settings_is_refused(arguments: dict[str, Any]) -> None:
+    env = CzEnv()
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="other settings"):
+        CzEnv(**arguments).set_state(env.get_state())
+
+
+def test_what_is_no_state_is_refused() -> None:
+    with pytest.raises(ValueError, match="get_state"):
+        CzEnv().set_state({"x": 1})  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="expected 2 states"):
+        CzVectorEnv(2).set_state([])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("r_c", np.nan), ("h_c", np.nan), ("T_b", np.nan), ("h_c", 0.0), ("h_c", -1e-3)]
+)
+def test_a_broken_state_terminates(name: str, value: float) -> None:
+    """What no crystal can be ends the episode as a failure, without an exception."""
+    env = CzEnv("nominal")
+    env.reset(seed=0)
+    state = copy.deepcopy(env.get_state())
+    state.slot.slot["x"][name] = value
+    env.set_state(state)
+    observation, gained, terminated, truncated, _ = env.step(ACTIONS[0])
+    assert (terminated, truncated) == (True, False)
+    if not np.isnan(value):
+        assert gained <= 1.0 - 10.0 * 2159
+        assert np.isfinite(observation).all()

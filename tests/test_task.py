@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cz_gym import CzEnv, make_puller
+from cz_gym.task import cost_terms, failure_penalty, reward, within_limits
+
+MM, MM_PER_MIN = 1e-3, 1e-3 / 60
+P = make_puller()
+
+
+def test_cost_is_the_designs() -> None:
+    cost = cost_terms(0.5 * MM, 0.36 * MM_PER_MIN, -0.06 * MM_PER_MIN, 1000.0)
+    assert cost == pytest.approx((1.0, 0.5, 0.25, 0.05))
+    assert reward(cost) == pytest.approx(1 - 10 * 1.8 / 11.8)
+    assert reward(cost_terms(0.0, 0.0, 0.0, 0.0)) == 1.0
+
+
+@given(st.floats(0, 8e-3), st.floats(1e-6, 1e-3), st.floats(-4e-5, 4e-5), st.floats(-2e4, 2e4))
+def test_reward_saturates_and_is_never_flat(error: float, more: float, pull: float, heater: float) -> None:
+    near, far = (reward(cost_terms(e, pull, pull, heater)) for e in (error, error + more))
+    assert -9.0 < far < near <= 1.0
+
+
+def test_limits() -> None:
+    assert within_limits(P.r_0, P.h_0, P.r_0, P.a)
+    assert within_limits(P.r_0 + 7.9 * MM, P.h_0, P.r_0, P.a)
+    assert not within_limits(P.r_0 + 8.1 * MM, P.h_0, P.r_0, P.a)
+    assert not within_limits(P.r_0 - 8.1 * MM, P.h_0, P.r_0, P.a)
+    assert within_limits(P.r_0, 1.21 * MM, P.r_0, P.a)
+    assert not within_limits(P.r_0, 1.19 * MM, P.r_0, P.a)
+    assert within_limits(P.r_0, 1.239 * P.a, P.r_0, P.a)
+    assert not within_limits(P.r_0, 1.241 * P.a, P.r_0, P.a)
+    assert not within_limits(math.nan, P.h_0, P.r_0, P.a)
+    assert not within_limits(P.r_0, math.nan, P.r_0, P.a)
+
+
+@given(st.integers(1, 2160))
+def test_dying_never_pays(step: int) -> None:
+    """The best life before a failure, and the failure, are worth less than the worst life to the horizon."""
+    steps = 2160
+    worst_to_live = -9.0 * (steps - step)
+    assert failure_penalty(step, steps) <= worst_to_live
+    assert failure_penalty(steps, steps) == 0.0
+    assert failure_penalty(step, steps) == -10.0 * (steps - step)
+
+
+@pytest.mark.parametrize(
+    ("model", "pull", "what"), [("I", 1.0, "detachment"), ("II", 1.0, "detachment"), ("II", -1.0, "freezing")]
+)
+def test_failure_is_terminated_never_truncated(model: str, pull: float, what: str) -> None:
+    env = CzEnv("nominal", model=model)
+    env.reset(seed=0)
+    returns, k = 0.0, 0
+    while True:
+        _, gained, terminated, truncated, info = env.step(np.array([pull, 0.0], np.float32))
+        returns, k = returns + gained, k + 1
+        if terminated or truncated:
+            break
+    assert terminated
+    assert not truncated
+    assert k < 2160
+    beyond = info["h_c"] > 1.24 * P.a if what == "detachment" else info["h_c"] < 1.2 * MM
+    assert beyond or abs(info["r_c"] - info["r_ref"]) > 8 * MM
+    terms = sum(info[f"cost_{name}"] for name in ("radius", "pull", "pull_step", "heater_step"))
+    assert gained == pytest.approx(1 - 10 * terms / (10 + terms) - 10 * (2160 - k))
+    assert returns < -9.0 * 2160 + 10 * k
+
+
+def test_reward_of_a_step_is_made_of_what_info_says() -> None:
+    env = CzEnv("randomized")
+    _, before = env.reset(seed=3)
+    for action in ([0.1, 0.0], [-0.2, 0.3], [0.0, 0.3]):
+        _, gained, _, _, info = env.step(np.array(action, np.float32))
+        expected = cost_terms(
+            info["r_c"] - info["r_ref"], info["v_p"] - P.v_0, info["v_p"] - before["v_p"], info["Q_H"] - before["Q_H"]
+        )
+        names = ("cost_radius", "cost_pull", "cost_pull_step", "cost_heater_step")
+        assert [info[name] for name in names] == pytest.approx(list(expected), rel=1e-9)
+        assert gained == pytest.approx(reward(expected), rel=1e-9)
+        before = info
+
+
+def test_failure_inside_a_long_interval_is_latched() -> None:
+    """Ten minutes at full pull detach the crystal; the state stays where it failed, finite and measured."""
+    env = CzEnv("nominal", control_interval=600.0, horizon=6000.0)
+    env.reset(seed=0)
+    observation, gained, terminated, _, info = env.step(np.array([1.0, 0.0], np.float32))
+    assert terminated
+    assert 1.24 * P.a < info["h_c"] < 1.26 * P.a
+    assert all(math.isfinite(value) for value in info.values())
+    assert np.isfinite(observation).all()
+    assert gained < -10.0 * 9 + 1
