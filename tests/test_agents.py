@@ -1,0 +1,217 @@
+"""Agent files: what is exported is what was trained, and what is broken is refused in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agents import AgentFileError, OnnxPolicy, settings, shipped
+from agents.checkpoint import load_checkpoint, restore, save_checkpoint
+from agents.contract import MAX_BYTES, write_agent
+from agents.export import actor_of, to_onnx
+from agents.network import Normalise
+from agents.training import make_training
+from baselines import CompensatedPID
+from cz_gym import Parameters
+from cz_gym.config import make_config
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.observation import HISTORY, STATE
+
+CONFIG = make_config(observation="history")
+SMALL = settings.PPO(
+    recipe=settings.Recipe(num_envs=4, hidden=(16, 16)), steps=64, n_steps=16, batch_size=32, n_epochs=1
+)
+SMALL_SAC = settings.SAC(
+    recipe=settings.Recipe(num_envs=4, hidden=(16, 16), privileged_critic=False),
+    steps=64,
+    buffer_size=256,
+    learning_starts=32,
+    batch_size=16,
+    gradient_steps=1,
+)
+
+
+def facts(**changes: Any) -> dict[str, Any]:
+    known = {
+        "observation": "history",
+        "channels": len(HISTORY),
+        "control_interval": 5.0,
+        "plant_hash": CONFIG.plant_hash,
+        "scenario": "randomized",
+        "scenario_hash": CONFIG.scenario.hash,
+        "algorithm": "ppo",
+        "training_seed": 0,
+        "training_steps": 64,
+        "validation_rmse_mm": 1.0,
+    }
+    return {**known, **changes}
+
+
+def observations(n: int, channels: int) -> np.ndarray:
+    return np.random.default_rng(0).uniform(-3.0, 3.0, (n, channels)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def ppo() -> Any:
+    training = make_training(SMALL, 0, None)
+    training.learner.learn(64, callback=training.callbacks)
+    return training.learner
+
+
+@pytest.fixture
+def agent(ppo: Any, tmp_path: Path) -> Path:
+    path = tmp_path / "agent.onnx"
+    write_agent(path, to_onnx(actor_of(ppo)), **facts())
+    return path
+
+
+def test_exported_ppo_acts_like_the_network_it_came_from(ppo: Any, agent: Path) -> None:
+    normalise = ppo.policy.features_extractor
+    assert normalise.std.min() > 0
+    assert not torch.allclose(normalise.std, torch.ones_like(normalise.std))
+    seen = observations(64, len(HISTORY) + len(STATE))
+    expected, _ = ppo.predict(seen, deterministic=True)
+    action, _ = OnnxPolicy.load(agent, CONFIG).predict(seen[:, : len(HISTORY)])
+    np.testing.assert_allclose(action, expected, atol=2e-6)
+    assert action.dtype == np.float32
+
+
+def test_actor_is_blind_to_the_true_state(ppo: Any) -> None:
+    seen = observations(8, len(HISTORY) + len(STATE))
+    blind = seen.copy()
+    blind[:, len(HISTORY) :] = 0.0
+    np.testing.assert_array_equal(ppo.predict(seen, deterministic=True)[0], ppo.predict(blind, deterministic=True)[0])
+    values = [ppo.policy.predict_values(torch.as_tensor(array)) for array in (seen, blind)]
+    assert not torch.allclose(*values)
+
+
+def test_exported_sac_acts_like_its_network_on_top_of_the_drives(tmp_path: Path) -> None:
+    training = make_training(SMALL_SAC, 0, None)
+    training.learner.learn(64, callback=training.callbacks)
+    path = tmp_path / "sac.onnx"
+    write_agent(path, to_onnx(actor_of(training.learner)), **facts(algorithm="sac"))
+    seen = observations(64, len(HISTORY))
+    output, _ = training.learner.predict(seen, deterministic=True)
+    head = SMALL_SAC.recipe.head
+    wanted = head.skip * seen[:, [9, 10]] + np.array([head.pull_scale, head.heater_scale]) * output
+    action, _ = OnnxPolicy.load(path).predict(seen)
+    np.testing.assert_allclose(action, np.clip(wanted, -1.0, 1.0), atol=2e-6)
+
+
+def test_normalisation_is_the_data_s_mean_and_spread() -> None:
+    training = make_training(SMALL, 1, None)
+    training.learner.learn(64, callback=training.callbacks)
+    buffer = training.learner.rollout_buffer
+    assert buffer.observations.shape[-1] == len(HISTORY) + len(STATE)
+    normalise = next(module for module in training.learner.policy.modules() if isinstance(module, Normalise))
+    assert np.isfinite(normalise.mean.numpy()).all()
+
+
+def test_one_observation_and_a_batch_of_one_act_alike(agent: Path) -> None:
+    policy = OnnxPolicy.load(agent)
+    seen = observations(1, len(HISTORY))
+    np.testing.assert_array_equal(policy.predict(seen)[0][0], policy.predict(seen[0])[0])
+    with pytest.raises(ValueError, match="expected 72 channels"):
+        policy.predict(seen[:, :-1])
+
+
+def test_agent_for_another_plant_is_refused(agent: Path) -> None:
+    with pytest.raises(AgentFileError, match="trained on plant"):
+        OnnxPolicy.load(agent, make_config(observation="history", parameters=Parameters(k_l=60.0)))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"observation": "camera"}, "does not have"),
+        ({"channels": 71}, "reads 71 channels"),
+        ({"channels": "72"}, "must be int"),
+        ({"format": "zip"}, "not a cz-gym-agent contract"),
+        ({"format_version": 2}, "format version 2"),
+        ({"sha256": "0" * 64}, "SHA-256 differs"),
+        ({"surprise": 1}, "'surprise' is unknown"),
+    ],
+)
+def test_broken_promises_are_refused(agent: Path, change: dict[str, Any], message: str) -> None:
+    contract = agent.with_suffix(".json")
+    contract.write_text(json.dumps({**json.loads(contract.read_text()), **change}))
+    with pytest.raises(AgentFileError, match=message) as caught:
+        OnnxPolicy.load(agent)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_and_oversized_files_are_refused(agent: Path, tmp_path: Path) -> None:
+    with pytest.raises(AgentFileError, match="no such file"):
+        OnnxPolicy.load(tmp_path / "nobody.onnx")
+    agent.write_bytes(b"0" * (MAX_BYTES + 1))
+    with pytest.raises(AgentFileError, match="larger than"):
+        OnnxPolicy.load(agent)
+    with pytest.raises(AgentFileError, match="no shipped agent"):
+        shipped("nobody")
+
+
+@given(content=st.binary(max_size=200), where=st.integers(0, 10_000), as_contract=st.booleans())
+def test_damaged_files_always_give_one_line(
+    tmp_path_factory: pytest.TempPathFactory, ppo: Any, content: bytes, where: int, as_contract: bool
+) -> None:
+    path = tmp_path_factory.mktemp("damaged") / "agent.onnx"
+    whole = to_onnx(actor_of(ppo))
+    damaged = whole[: where % len(whole)] + content
+    write_agent(path, damaged, **facts())
+    if as_contract:
+        path.with_suffix(".json").write_bytes(content)
+    with pytest.raises(AgentFileError) as caught:
+        OnnxPolicy.load(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_checkpoint_continues_and_refuses_what_does_not_fit(ppo: Any, tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.pt"
+    save_checkpoint(path, ppo, 0.5)
+    other = make_training(SMALL, 1, None).learner
+    restore(other, load_checkpoint(path), path)
+    assert other.num_timesteps == ppo.num_timesteps
+    for one, two in zip(ppo.policy.state_dict().values(), other.policy.state_dict().values(), strict=True):
+        torch.testing.assert_close(one, two, rtol=0, atol=0)
+    wider = dataclasses.replace(SMALL, recipe=dataclasses.replace(SMALL.recipe, hidden=(8, 8)))
+    with pytest.raises(AgentFileError, match="does not fit"):
+        restore(make_training(wider, 0, None).learner, load_checkpoint(path), path)
+
+
+class Trap:
+    """Runs code when unpickled carelessly."""
+
+    def __init__(self, flag: Path) -> None:
+        self.flag = flag
+
+    def __reduce__(self) -> Any:
+        return (Path.touch, (self.flag,))
+
+
+def test_a_hostile_checkpoint_runs_nothing(tmp_path: Path) -> None:
+    flag, path = tmp_path / "ran", tmp_path / "checkpoint.pt"
+    buffer = io.BytesIO()
+    torch.save({"format": "cz-gym-checkpoint-1", "parameters": Trap(flag)}, buffer)
+    path.write_bytes(buffer.getvalue())
+    with pytest.raises(AgentFileError, match="not a checkpoint"):
+        load_checkpoint(path)
+    assert not flag.exists()
+
+
+def test_shipped_agent_beats_the_paper_s_controller_on_validation() -> None:
+    seeds = range(1_000_000, 1_000_030)
+    agent = metrics(rollout(OnnxPolicy.load(shipped(), CONFIG), CONFIG, seeds))
+    paper = metrics(rollout(CompensatedPID(), make_config(), seeds))
+    assert agent.rmse_mm.mean() < 0.3 * paper.rmse_mm.mean()
+    assert agent.failure_rate.sum() == 0
+    assert agent.pull_step_rms_mm_per_min.mean() < paper.pull_step_rms_mm_per_min.mean()

@@ -1,0 +1,125 @@
+"""``train.py``: a run leaves what it promises, goes on where it stopped, and answers mistakes in one line."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import train
+from agents import OnnxPolicy, run
+from agents.vec_env import CzVecEnv
+from agents.wrappers import DriveAction, TrainingReward
+from cz_gym import CzVectorEnv
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "QUICK", 2)
+    monkeypatch.setattr(run, "FULL", 2)
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_run_leaves_everything_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "run"
+    assert train.main(["--steps", "20000", "--seed", "3", "--out", str(folder)]) == 0
+    settings = json.loads((folder / "settings.json").read_text())
+    assert settings["seed"] == 3
+    assert settings["settings"]["recipe"]["scenario"] == "randomized"
+    assert settings["packages"]["stable-baselines3"]
+    assert {"command", "git_commit", "plant_hash", "scenario_hash"} <= set(settings)
+    policy = OnnxPolicy.load(folder / "agent.onnx")
+    assert policy.contract.training_seed == 3
+    assert list((folder / "tensorboard").rglob("events.*"))
+    before = list(csv.DictReader((folder / "progress.csv").open()))
+    assert float(before[-1]["paper_rmse_mm"]) > 0
+    assert train.main(["--out", str(folder)]) == 2
+    assert "--resume" in capsys.readouterr().err
+    assert train.main(["--steps", "40000", "--seed", "3", "--resume", "--out", str(folder)]) == 0
+    after = list(csv.DictReader((folder / "progress.csv").open()))
+    assert after[: len(before)] == before
+    assert int(after[-1]["steps"]) >= 40000 > int(before[-1]["steps"])
+
+
+@pytest.mark.usefixtures("quick")
+def test_an_interrupted_run_keeps_its_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(self: Any, bar: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run.Run, "_validate", interrupt)
+    folder = tmp_path / "run"
+    assert train.main(["--steps", "10000", "--out", str(folder)]) == 130
+    assert (folder / "checkpoint.pt").exists()
+    assert "--resume" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--algo", "dqn"], "invalid choice: 'dqn'"),
+        (["--steps", "0"], "at least 1, not '0'"),
+        (["--seed", "minus"], "at least 0, not 'minus'"),
+        (["--sceanrio", "hard"], "unrecognized arguments"),
+    ],
+)
+def test_impossible_arguments_exit_with_2(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        train.main(arguments)
+    assert caught.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--scenario", "quiet"], "unknown scenario 'quiet'"),
+        (["--resume"], "nothing to resume"),
+    ],
+)
+def test_mistakes_give_one_line(
+    tmp_path: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train.main([*arguments, "--out", str(tmp_path / "run")]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
+def slots(**settings: Any) -> CzVecEnv:
+    return CzVecEnv(CzVectorEnv(2, observation="history", autoreset_mode="SameStep", **settings))
+
+
+def test_training_reward_makes_a_failure_cost_the_worst_for_ever() -> None:
+    env = TrainingReward(slots(), gamma=0.9)
+    env.seed(0)
+    env.reset()
+    worst = 0.0
+    for _ in range(2000):
+        _, reward, done, infos = env.step(np.array([[1.0, 1.0], [0.0, 0.0]], np.float32))
+        if done[0]:
+            assert not infos[0]["TimeLimit.truncated"]
+            worst = float(reward[0])
+            break
+    assert worst == pytest.approx(-10.0)
+
+
+def test_drive_action_moves_the_drives_from_where_they_are() -> None:
+    plain, driven = slots(), DriveAction(slots(), 1.0, (0.1, 0.2))
+    for env in (plain, driven):
+        env.seed(5)
+        env.reset()
+    position = np.zeros(2)
+    for move in ([1.0, -0.5], [0.5, 1.0], [-1.0, 0.0]):
+        position = position + np.array([0.1, 0.2]) * move
+        expected = plain.step(np.tile(position, (2, 1)).astype(np.float32))
+        got = driven.step(np.tile(move, (2, 1)).astype(np.float32))
+        np.testing.assert_allclose(got[0], expected[0], atol=1e-6)
