@@ -49,6 +49,19 @@ def design_rates(x: np.ndarray, u: Truth, p: Any) -> np.ndarray:
     )
 
 
+class View:
+    """A NumPy record's fields as floats."""
+
+    def __init__(self, record: Any) -> None:
+        for name in record.dtype.names:
+            setattr(self, name, float(record[name]))
+
+
+def hold(info: dict[str, Any], p: Any) -> float:
+    """Pull action that holds any crystal, from its true state: poles near 0.01 rad/s."""
+    return float(1000 * (info["r_c"] - info["r_ref"]) - 700 * (info["h_c"] - p.h_0))
+
+
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import HOUR, Truth, design_rates
+from conftest import HOUR, Truth, View, design_rates, hold
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
@@ -167,19 +167,19 @@ def test_an_hour_of_driven_motion_agrees_with_scipy(interval: float, scenario: s
     env = CzEnv(scenario, control_interval=interval, horizon=HOUR)
     env.reset(seed=5)
     saved = env.get_state().slot
-    p, e, x = saved.slot["puller"], saved.slot["episode"], np.array(saved.slot["x"].tolist())
+    p, e, x = View(saved.slot["puller"]), View(saved.slot["episode"]), np.array(saved.slot["x"].tolist())
     steps = round(HOUR / interval)
     worst, heights, feedback = 0.0, [], 0.0
     for k in range(steps):
         t = k * interval
         pull = 0.3 * np.sin(t / 70.0) + feedback
         _, _, terminated, _, info = env.step(np.array([pull, 0.3 * np.sin(t / 300.0)], np.float32))
-        feedback = 1000 * (info["r_c"] - info["r_ref"]) - 700 * (info["h_c"] - p["h_0"])
+        feedback = hold(info, p)
         while t < (k + 1) * interval - 1e-6:
             j = int(t // 5.0)
             upto = min(5.0 * (j + 1), (k + 1) * interval)
-            d = disturbance(5.0 * j, saved.interface[j], View(e), View(p))
-            x = integrated(x, Truth(info["v_p"], info["Q_H"], *d), View(p), upto - t)
+            d = disturbance(5.0 * j, saved.interface[j], e, p)
+            x = integrated(x, Truth(info["v_p"], info["Q_H"], *d), p, upto - t)
             t = upto
         ours = [info["r_c"], info["h_c"], info["T_1"], x[3], info["T_b"]]
         worst = max(worst, np.abs(np.array(ours) / x - 1).max())
@@ -189,14 +189,6 @@ def test_an_hour_of_driven_motion_agrees_with_scipy(interval: float, scenario: s
     assert worst < 1e-8
     end = np.array(env.get_state().slot.slot["x"].tolist())
     np.testing.assert_allclose(end, x, rtol=1e-8)
-
-
-class View:
-    """A record's fields as floats."""
-
-    def __init__(self, record: Any) -> None:
-        for name in record.dtype.names:
-            setattr(self, name, float(record[name]))
 
 
 @pytest.mark.parametrize("drift", [-20.0, -5.0, 0.0, 1e-3, 5.0, 20.0])
