@@ -23,6 +23,10 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run, "FULL", 2)
 
 
+def rows(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(path.read_text().splitlines()))
+
+
 @pytest.mark.usefixtures("quick")
 def test_a_run_leaves_everything_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "run"
@@ -35,12 +39,12 @@ def test_a_run_leaves_everything_and_goes_on(tmp_path: Path, capsys: pytest.Capt
     policy = OnnxPolicy.load(folder / "agent.onnx")
     assert policy.contract.training_seed == 3
     assert list((folder / "tensorboard").rglob("events.*"))
-    before = list(csv.DictReader((folder / "progress.csv").open()))
+    before = rows(folder / "progress.csv")
     assert float(before[-1]["paper_rmse_mm"]) > 0
     assert train.main(["--out", str(folder)]) == 2
     assert "--resume" in capsys.readouterr().err
     assert train.main(["--steps", "40000", "--seed", "3", "--resume", "--out", str(folder)]) == 0
-    after = list(csv.DictReader((folder / "progress.csv").open()))
+    after = rows(folder / "progress.csv")
     assert after[: len(before)] == before
     assert int(after[-1]["steps"]) >= 40000 > int(before[-1]["steps"])
 
