@@ -30,7 +30,7 @@ CACHE_VARIABLE = "CZ_GYM_CACHE_DIR"
 def physics(function: F) -> F:
     """Mark a function as an equation: plain Python outside a kernel, compiled inside it.
 
-    Division by zero gives inf or NaN in both, never an exception (``error_model="numpy"``).
+    Compiled, as on arrays, division by zero gives inf or NaN, never an exception (``error_model="numpy"``).
     """
     return register_jitable(error_model="numpy")(function)
 
@@ -69,9 +69,19 @@ def _user_cache() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "cz-gym"
 
 
-def kernel(function: F) -> F:
-    """Compile a loop over slots: no GIL, no fast-math, cached on disk when there is a place for it."""
-    folder = cache_folder()
+def hashed(*functions: Callable[..., Any]) -> bool:
+    """Whether :func:`source_hash` sees the text of every one of these functions."""
+    folder = Path(__file__).parent
+    codes = [getattr(function, "__code__", None) for function in functions]
+    return all(code is not None and Path(code.co_filename).parent == folder for code in codes)
+
+
+def kernel(function: F, keep: bool = True) -> F:
+    """Compile a loop over slots: no GIL, no fast-math, cached on disk when there is a place for it.
+
+    ``keep=False`` caches nothing: for loops over functions from elsewhere, whose changes no hash would see.
+    """
+    folder = cache_folder() if keep else None
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
     settings: Any = numba.config
     if folder is None:

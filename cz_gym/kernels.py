@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ._compile import kernel, physics
+from ._compile import hashed, kernel, physics
 from .episode import FREEZES, GRID
 from .meniscus import HURLE, MeniscusModel
 from .observation import CLIP, INTEGRAL_SCALE, LAGGED, MEASURED, PREVIEWS, STATE, Measured
@@ -231,7 +231,7 @@ class Kernels(NamedTuple):
 
 
 def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
-    """Compile the loops for a meniscus model; Hurle's are kept on disk."""
+    """Compile the loops for a meniscus model; those of this package's models are kept on disk."""
     slope, ring_offset, height = meniscus.slope, meniscus.ring_offset, meniscus.height
 
     @physics
@@ -293,7 +293,8 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
     def derive(parameters: Any, lam: float) -> Any:
         return derive_puller(parameters, lam, height, ring_offset)
 
-    return Kernels(kernel(step), kernel(observe), kernel(plant), kernel(derive))
+    keep = hashed(*meniscus[1:])
+    return Kernels(*(kernel(loop, keep) for loop in (step, observe, plant, derive)))
 
 
 KERNELS = build_kernels()

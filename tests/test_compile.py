@@ -1,0 +1,141 @@
+"""Each test runs fresh processes on a copy of the package, so that sources can be changed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from cz_gym._compile import cache_folder, hashed, kernel, source_hash
+from cz_gym.meniscus import hurle_slope
+
+ROOT = Path(__file__).parents[1]
+DERIVE = """
+from cz_gym import Parameters
+from cz_gym._compile import cache_folder
+from cz_gym.kernels import KERNELS
+puller = KERNELS.derive(Parameters(), 1.0)
+stats = getattr(KERNELS.derive, "stats", None)
+print(cache_folder(), puller.h_0, sum(stats.cache_hits.values()), sep="|")
+"""
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    """A folder that holds a copy of the package."""
+    shutil.copytree(ROOT / "cz_gym", tmp_path / "copy" / "cz_gym", ignore=shutil.ignore_patterns("__pycache__"))
+    return tmp_path / "copy"
+
+
+def run(code: str, folder: Path, cache: Path) -> list[str]:
+    """What a fresh process prints, split at bars."""
+    environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+    environment["CZ_GYM_CACHE_DIR"] = str(cache)
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], cwd=folder, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip().split("|")
+
+
+def edit(file: Path, old: str, new: str) -> None:
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+
+
+def test_changed_physics_is_never_run_from_an_old_cache(package: Path, tmp_path: Path) -> None:
+    """The edited function is compiled into a loop that stands in another, unchanged module."""
+    cache = tmp_path / "cache"
+    folder, height, hits = run(DERIVE, package, cache)
+    assert (Path(folder).parent, hits) == (cache, "0")
+    assert run(DERIVE, package, cache) == [folder, height, "1"]
+    edit(package / "cz_gym" / "meniscus.py", "return a * (np.sqrt(half", "return 2.0 * a * (np.sqrt(half")
+    other, changed, hits = run(DERIVE, package, cache)
+    assert float(changed) == pytest.approx(2 * float(height))
+    assert (other != folder, hits) == (True, "0")
+
+
+def test_no_place_for_a_cache_is_no_failure(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    folder, height, hits = run(DERIVE, ROOT, tmp_path / "file" / "below")
+    assert (folder, hits) == ("None", "0")
+    assert float(height) == pytest.approx(6.64e-3, rel=1e-3)
+
+
+@pytest.fixture
+def fresh(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
+    """The choice of a cache folder, made anew and forgotten."""
+    cache_folder.cache_clear()
+    yield monkeypatch
+    cache_folder.cache_clear()
+
+
+def test_an_empty_name_means_no_cache(fresh: pytest.MonkeyPatch) -> None:
+    fresh.setenv("CZ_GYM_CACHE_DIR", "")
+    assert cache_folder() is None
+    assert kernel(lambda x: x + 1)(1) == 2
+
+
+def test_a_home_that_is_not_there_means_no_cache(fresh: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    fresh.delenv("CZ_GYM_CACHE_DIR")
+    fresh.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert cache_folder() is None
+    fresh.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    cache_folder.cache_clear()
+    assert cache_folder() == next((tmp_path / "cache" / "cz-gym").iterdir())
+
+
+def test_a_read_only_cache_is_no_failure(fresh: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def refuse(*arguments: object, **more: object) -> None:
+        raise PermissionError("read-only file system")
+
+    fresh.setenv("CZ_GYM_CACHE_DIR", str(tmp_path))
+    fresh.setattr("tempfile.TemporaryFile", refuse)
+    assert cache_folder() is None
+
+
+def test_a_cache_that_vanishes_is_no_failure(tmp_path: Path) -> None:
+    code = "import shutil, cz_gym._compile as c, cz_gym\nshutil.rmtree(c.cache_folder())\n" + DERIVE
+    assert float(run(code, ROOT, tmp_path / "cache")[1]) == pytest.approx(6.64e-3, rel=1e-3)
+
+
+def test_a_users_meniscus_is_never_run_from_a_cache(package: Path, tmp_path: Path) -> None:
+    (package / "mine.py").write_text(
+        "from cz_gym import HURLE\n"
+        "from cz_gym._compile import physics\n"
+        "from cz_gym.meniscus import hurle_height\n"
+        "@physics\n"
+        "def height(r_c, theta, a):\n"
+        "    return 1.0 * hurle_height(r_c, theta, a)\n"
+        "MINE = HURLE._replace(name='mine', height=height)\n"
+    )
+    code = (
+        "from cz_gym import Parameters\nfrom cz_gym.kernels import build_kernels\nfrom mine import MINE\n"
+        "print(build_kernels(MINE).derive(Parameters(), 1.0).h_0)"
+    )
+    height = float(run(code, package, tmp_path / "cache")[0])
+    edit(package / "mine.py", "1.0 *", "1.1 *")
+    assert float(run(code, package, tmp_path / "cache")[0]) == pytest.approx(1.1 * height)
+
+
+def test_hash_sees_names_and_contents(package: Path) -> None:
+    folder = package / "cz_gym"
+    first = source_hash(folder)
+    assert first == source_hash(ROOT / "cz_gym")
+    edit(folder / "task.py", "FAILURE_COST = 10.0", "FAILURE_COST = 11.0")
+    second = source_hash(folder)
+    (folder / "task.py").rename(folder / "tasks.py")
+    assert len({first, second, source_hash(folder)}) == 3
+
+
+def test_only_functions_of_the_package_are_hashed() -> None:
+    assert hashed(hurle_slope)
+    assert not hashed(hurle_slope, lambda r_c, h_c, p: (0.0, 1.0))
+    assert not hashed(abs)

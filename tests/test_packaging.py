@@ -1,0 +1,121 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import cz_gym
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+BLOCKED = """
+import sys
+
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in BANNED:
+            raise ImportError(f"{name} is not installed here")
+
+sys.meta_path.insert(0, Blocker())
+"""
+SMOKE = """
+import gymnasium as gym
+import numpy as np
+env = gym.make("cz_gym:Cz-v0", scenario="puller", observation="history")
+env.reset(seed=1)
+for _ in range(20):
+    observation, reward, *_ = env.step(env.action_space.sample())
+assert np.isfinite(observation).all()
+import cz_gym
+batch = gym.make_vec("Cz-v0", num_envs=2, vectorization_mode="vector_entry_point")
+batch.reset(seed=1)
+from {baselines} import CompensatedPID
+action, state = CompensatedPID().predict(batch.step(np.zeros((2, 2)))[0])
+assert action.shape == (2, 2)
+print(cz_gym.__file__)
+"""
+
+
+def run(code: str, folder: Path, path: Path) -> str:
+    """What a fresh process prints, started in ``folder`` with ``path`` first."""
+    prelude = f"import sys\nsys.path[:] = [{str(path)!r}] + [p for p in sys.path if p not in ('', {str(ROOT)!r})]\n"
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", prelude + code], cwd=folder, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_environment_and_baselines_need_neither_torch_nor_plots(tmp_path: Path) -> None:
+    banned = [
+        "torch", "stable_baselines3", "sb3_contrib", "matplotlib", "onnxruntime", "onnx", "optuna", "tensorboard",
+        "control", "tqdm", "pygame", "casadi", "agents",
+    ]  # fmt: skip
+    code = f"BANNED = {banned!r}\n" + BLOCKED + SMOKE.format(baselines="baselines")
+    assert run(code, tmp_path, ROOT) == str(ROOT / "cz_gym" / "__init__.py")
+
+
+def test_core_dependencies_are_four() -> None:
+    names = [requirement.partition(">")[0] for requirement in PROJECT["dependencies"]]
+    assert names == ["gymnasium", "numpy", "scipy", "numba"]
+    assert set(PROJECT["optional-dependencies"]) == {"benchmark", "agents", "render", "mpc", "peers", "test"}
+
+
+def test_version_stands_once() -> None:
+    assert cz_gym.__version__ == PROJECT["version"]
+
+
+def test_pins_lie_in_the_open_ranges() -> None:
+    packaging = pytest.importorskip("packaging.requirements")
+    pins = dict(
+        line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")
+    )
+    pins = {name.lower().replace("_", "-"): version for name, version in pins.items()}
+    extras = PROJECT["optional-dependencies"]
+    for text in [*PROJECT["dependencies"], *extras["benchmark"], *extras["agents"], *extras["test"]]:
+        requirement = packaging.Requirement(text)
+        if requirement.name != "cz-gym":
+            assert requirement.specifier.contains(pins[requirement.name.lower()]), text
+            assert "<" not in str(requirement.specifier)
+    assert pins["torch"] == "2.13.0"
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    tracked = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True)
+    names = [name for name in tracked.stdout.split("\0") if name] if tracked.returncode == 0 else []
+    source = folder / "source"
+    for name in names:
+        if (ROOT / name).is_file():
+            (source / name).parent.mkdir(parents=True, exist_ok=True)
+            (source / name).write_bytes((ROOT / name).read_bytes())
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(source)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return next(folder.glob("*.whl"))
+
+
+def test_wheel_installs_one_package_and_works_outside_the_checkout(wheel: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+        archive.extractall(tmp_path)
+    top = {name.partition("/")[0] for name in names}
+    assert {name for name in top if not name.endswith(".dist-info")} == {"cz_gym"}
+    for needed in ("py.typed", "baselines/__init__.py", "agents/__init__.py", "evaluation/__init__.py"):
+        assert f"cz_gym/{needed}" in names
+    assert not any("test" in name for name in names)
+    assert any(name.endswith("licenses/LICENSE") for name in names)
+    printed = run(SMOKE.format(baselines="cz_gym.baselines"), tmp_path, tmp_path)
+    assert printed == str(tmp_path / "cz_gym" / "__init__.py")
+
+
+def test_wheel_carries_the_shipped_agents(wheel: Path) -> None:
+    shipped = [*(ROOT / "agents" / "models").glob("*.onnx"), *(ROOT / "agents" / "models").glob("*.json")]
+    with zipfile.ZipFile(wheel) as archive:
+        for file in shipped:
+            assert f"cz_gym/agents/models/{file.name}" in archive.namelist()
