@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..config import Config
+from ..units import MICRO
 from ..vector import CzVectorEnv
 
 Floats = npt.NDArray[np.float64]
@@ -57,7 +58,7 @@ class Rollout:
     @property
     def microseconds_per_step(self) -> float:
         """Time in ``predict`` per step of one episode, batched [us]."""
-        return 1e6 * self.seconds_in_policy / self.alive.size
+        return self.seconds_in_policy / MICRO / self.alive.size
 
 
 def rollout(
@@ -89,20 +90,21 @@ def _rollout_chunk(policy: Any, config: Config, seeds: list[int], progress: Call
     observation, info = env.reset(seed=seeds)
     start = Signals(*(np.array(info[name])[None] for name in Signals._fields))
     state: Any = None
-    begins = np.ones(n, np.bool_)
+    begins, over = np.ones(n, np.bool_), np.zeros(n, np.bool_)
     seconds = 0.0
     for k in range(steps):
         before = time.perf_counter()
         action, state = policy.predict(observation, state=state, episode_start=begins, deterministic=True)
         seconds += time.perf_counter() - before
         observation, gained, terminated, truncated, info = env.step(action)
-        begins = terminated | truncated
+        # A slot that is over is drawn anew by the next step: only then does its policy begin again.
+        begins, over = over, terminated | truncated
         for log, name in zip(signals, Signals._fields, strict=True):
             log[k] = info[name]
         reward[k] = np.where(running, gained, 0.0)
         alive[k] = running
         failed |= running & terminated
-        running &= ~begins
+        running &= ~over
         if progress is not None:
             progress(n)
     env.close()

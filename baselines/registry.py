@@ -1,0 +1,51 @@
+"""The classical controllers by name: what the benchmark can run without a trained agent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from cz_gym.config import Config
+
+from .compensated_pid import CompensatedPID
+from .open_loop import OpenLoop
+from .policy import Policy
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A controller that can be asked for by name."""
+
+    name: str
+    make: Callable[[Config], Policy]
+    """Builds the controller for an environment's settings."""
+    observation: str
+    """Observation mode it reads: "measured" or "history"; "state" marks a bound, which no sensor could feed."""
+    meaning: str
+    """One line for people."""
+    default: bool = True
+    """Whether a benchmark that names no controllers runs it."""
+
+
+def _paper(config: Config) -> Policy:
+    return CompensatedPID(config.control_interval, v_0=config.parameters.v_0)
+
+
+def _pid_uncompensated(config: Config) -> Policy:
+    return CompensatedPID(config.control_interval, compensator=None, v_0=config.parameters.v_0)
+
+
+CONTROLLERS: tuple[Entry, ...] = (
+    Entry("open-loop", lambda config: OpenLoop(), "measured", "nominal pull speed and heater power, no feedback"),
+    Entry("paper", _paper, "measured", "the paper's compensator and PID as printed, Table 1"),
+    Entry("pid-uncompensated", _pid_uncompensated, "measured", "the same PID without the compensator: unstable"),
+)
+"""Every named controller, in the order of tables."""
+
+
+def find_controller(name: str) -> Entry:
+    """The controller of that name; ValueError names what there is."""
+    for entry in CONTROLLERS:
+        if entry.name == name:
+            return entry
+    raise ValueError(f"unknown controller {name!r}; choose from {', '.join(entry.name for entry in CONTROLLERS)}")

@@ -1,0 +1,243 @@
+"""Controllers and agents on the same disturbed crystals, in one table: ``python benchmark.py --help``."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+if TYPE_CHECKING:
+    from baselines.registry import Entry
+    from cz_gym.config import Config
+    from cz_gym.evaluation.results import Benchmark
+    from cz_gym.evaluation.run import Contender, Plan
+
+FOLDER = Path(__file__).resolve().parent / "results" / "benchmark"
+"""Where the committed results are."""
+RESULTS = "benchmark.json"
+SHIPPED = ("ppo",)
+"""Agents that come with the package."""
+EPISODES = 500
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Exit with code 2."""
+        self.exit(2, f"{self.prog}: {message}\n")
+
+
+def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """Read the command line; exits with code 2 and one line for anything that cannot be meant."""
+    parser = OneLineParser(
+        prog="benchmark.py",
+        allow_abbrev=False,
+        description="Run controllers and agents on the same disturbed crystals and compare them.",
+        epilog="docs/benchmark.md has the protocol, the formula of every metric and how to add a controller.",
+    )
+    parser.add_argument(
+        "--episodes", type=int, default=EPISODES, metavar="N", help="first N test episodes (%(default)s)"
+    )
+    parser.add_argument("--controllers", type=_names, metavar="A,B", help='controllers and agents by name, or "all"')
+    parser.add_argument("--scenarios", type=_names, metavar="A,B", help="scenarios by name")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (results/benchmark)")
+    parser.add_argument(
+        "--json", type=Path, metavar="FILE", help="write benchmark.json to FILE, and nothing else unless --out is given"
+    )
+    parser.add_argument(
+        "--agent",
+        type=Path,
+        action="append",
+        metavar="FILE",
+        help="agent file in place of the shipped one; repeat it for the training seeds of one algorithm",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="let a partial run replace a folder's results")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar, no table")
+    return parser.parse_args(argv)
+
+
+def _names(text: str) -> list[str]:
+    names = list(dict.fromkeys(name.strip() for name in text.split(",")))
+    if not all(names):
+        raise argparse.ArgumentTypeError(f"must be names with commas between, not {text!r}")
+    return names
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the benchmark; 0 when done, 2 for bad input, 130 when interrupted."""
+    arguments = parse(argv)
+    if arguments.out is None and arguments.json is None:
+        arguments.out = FOLDER
+    try:
+        return benchmark(arguments, shlex.join(["benchmark.py", *(sys.argv[1:] if argv is None else argv)]))
+    except ImportError as error:
+        print(f'benchmark.py: {error.name} is missing: pip install "cz-gym[benchmark]"', file=sys.stderr)
+        return 2
+    except (ValueError, OSError) as error:
+        print(f"benchmark.py: {_one_line(error)}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("benchmark.py: interrupted; nothing written", file=sys.stderr)
+        return 130
+
+
+def benchmark(arguments: argparse.Namespace, command: str) -> int:
+    """Check, run, write, show."""
+    from cz_gym.evaluation.report import terminal
+    from cz_gym.evaluation.run import Progress, run
+
+    plan = make_plan(arguments, command)
+    check_targets(arguments, is_partial(arguments, plan))
+    if arguments.out is not None:
+        import matplotlib  # noqa: F401  (missing? say so before the work, not after it)
+    with Progress(plan.steps, arguments.quiet) as progress:
+        done = run(plan, progress)
+    write(arguments.out, arguments.json, done)
+    if not arguments.quiet:
+        print(f"{terminal(done)}\nwrote {', '.join(str(path) for path in (arguments.out, arguments.json) if path)}")
+    return 0
+
+
+def make_plan(arguments: argparse.Namespace, command: str) -> Plan:
+    """What the command line asks for; ValueError names what was given and what is allowed."""
+    from cz_gym.evaluation.protocol import ROWS, check_episodes, find_row
+    from cz_gym.evaluation.run import Plan
+
+    episodes = check_episodes(arguments.episodes)
+    if arguments.scenarios is None:
+        rows = tuple(row for row in ROWS if row.default)
+    else:
+        rows = tuple(find_row(name) for name in arguments.scenarios)
+    contenders, contracts = choose(arguments.controllers, arguments.agent or [])
+    return Plan(contenders, rows, episodes, contracts, command)
+
+
+def is_partial(arguments: argparse.Namespace, plan: Plan) -> bool:
+    """Whether the run holds less than the default one, or another agent than the shipped one."""
+    from baselines.registry import CONTROLLERS
+    from cz_gym.evaluation.protocol import ROWS
+
+    names = {contender.controller.name for contender in plan.contenders}
+    everyone = {entry.name for entry in CONTROLLERS if entry.default} | set(SHIPPED)
+    every_row = {row for row in ROWS if row.default}
+    return bool(plan.episodes < EPISODES or every_row - set(plan.rows) or everyone - names or arguments.agent)
+
+
+def check_targets(arguments: argparse.Namespace, partial: bool) -> None:
+    """Raise ValueError or OSError if the results could not be written, or would replace better ones untold."""
+    from cz_gym.evaluation.files import check_writable
+
+    held = [arguments.out / RESULTS] if arguments.out else []
+    if arguments.json and arguments.json.resolve() == FOLDER / RESULTS:
+        held.append(arguments.json)
+    for path in held:
+        if partial and path.exists() and not arguments.overwrite:
+            raise ValueError(f"{path} exists and this run is partial: add --overwrite, or name another --out")
+    if arguments.json and arguments.json.is_dir():
+        raise ValueError(f"--json {arguments.json} is a folder")
+    for folder in (arguments.out, arguments.json and arguments.json.parent):
+        if folder:
+            check_writable(folder)
+
+
+def choose(wanted: list[str] | None, files: list[Path]) -> tuple[tuple[Contender, ...], tuple[dict[str, Any], ...]]:
+    """Who takes part, classical controllers first, and the contracts of the agents among them.
+
+    Agent files named on the command line always take part, in place of the shipped ones. Raises ValueError for a name
+    that nobody has, and for agent files that cannot be used.
+    """
+    from agents import OnnxPolicy, shipped
+    from baselines.registry import CONTROLLERS
+
+    given = [OnnxPolicy.load(file, _nominal()) for file in files]
+    learned = list(dict.fromkeys(policy.contract.algorithm for policy in given)) or list(SHIPPED)
+    classical = [entry.name for entry in CONTROLLERS]
+    for name in learned:
+        if name in classical:
+            raise ValueError(f"the algorithm of an agent may not be called {name!r}: a controller has that name")
+    if wanted is None:
+        wanted = [entry.name for entry in CONTROLLERS if entry.default] + learned
+    elif wanted == ["all"]:
+        wanted = classical + learned
+    for name in wanted:
+        if name not in classical + learned:
+            raise ValueError(f"unknown controller {name!r}; choose from {', '.join(classical + learned)}, or all")
+    contenders = [_classical(entry) for entry in CONTROLLERS if entry.name in wanted]
+    contracts = []
+    for name in learned:
+        if given:
+            policies = [policy for policy in given if policy.contract.algorithm == name]
+        elif name in wanted:
+            policies = [OnnxPolicy.load(shipped(name), _nominal())]
+        else:
+            continue
+        contenders.append(_agent(name, policies))
+        contracts += [asdict(policy.contract) for policy in policies]
+    return tuple(contenders), tuple(contracts)
+
+
+def _classical(entry: Entry) -> Contender:
+    from cz_gym.evaluation.results import Controller
+    from cz_gym.evaluation.run import Contender
+
+    return Contender(Controller(entry.name, entry.observation, entry.meaning), lambda config: [entry.make(config)])
+
+
+def _agent(name: str, policies: Sequence[Any]) -> Contender:
+    """A learned controller: every training seed of one algorithm. Raises ValueError if they are no such set."""
+    from cz_gym.evaluation.results import Controller
+    from cz_gym.evaluation.run import Contender
+
+    contracts = [policy.contract for policy in policies]
+    seeds = tuple(contract.training_seed for contract in contracts)
+    if len(set(seeds)) < len(seeds):
+        raise ValueError(f"agent {name!r}: a training seed appears twice among {', '.join(map(str, seeds))}")
+    if len({contract.observation for contract in contracts}) > 1:
+        raise ValueError(f"agent {name!r}: its training seeds read different observations")
+    interval = _nominal().control_interval
+    for contract in contracts:
+        if contract.control_interval != interval:
+            raise ValueError(
+                f"agent {name!r}: trained at {contract.control_interval:g} s control, the benchmark runs {interval:g} s"
+            )
+    meaning = f"agent trained with {name} on {contracts[0].scenario}"
+    return Contender(Controller(name, policies[0].observation, meaning, seeds), lambda config: policies)
+
+
+def _nominal() -> Config:
+    from cz_gym.evaluation.protocol import ROWS
+
+    return ROWS[0].config()
+
+
+def write(folder: Path | None, json: Path | None, done: Benchmark) -> None:
+    """Write the files, all or none."""
+    from cz_gym.evaluation.files import to_csv, to_json, write_files
+
+    text = to_json(done).encode()
+    files = {json: text} if json else {}
+    if folder:
+        from cz_gym.evaluation.figures import draw_figures
+        from cz_gym.evaluation.report import markdown
+
+        figures = draw_figures(done)
+        files |= {folder / name: image for name, image in figures.items()}
+        files[folder / "episodes.csv"] = to_csv(done).encode()
+        files[folder / "report.md"] = markdown(done, figures).encode()
+        files[folder / RESULTS] = text
+    write_files(files)
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename or 'output'}: {error.strerror}"
+    return " ".join(str(error).split())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,49 @@
+"""What the figures share: colours, a canvas without a display, PNG bytes."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F5FB0", "#8C6D1F", "#444444", "#A0A000")
+"""Okabe and Ito's palette, safe for colour-blind readers, with a few more for a long table."""
+MARKERS = "osD^vP*Xph<>"
+DPI = 160
+INK, GREY = "#222222", "#999999"
+
+
+class Style(NamedTuple):
+    """How a controller is drawn, the same in every figure."""
+
+    colour: str
+    marker: str
+
+
+def styles(names: Sequence[str]) -> dict[str, Style]:
+    """One style a controller, in the order of the table."""
+    return {name: Style(COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]) for i, name in enumerate(names)}
+
+
+def canvas(width: float, height: float) -> Figure:
+    """A figure of that size [in]."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def png(figure: Figure) -> bytes:
+    """The figure as a PNG file, its axes in the house's style."""
+    for axis in figure.axes:
+        axis.grid(True, color="#dddddd", lw=0.5)
+        axis.set_axisbelow(True)
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.tick_params(which="both", labelsize=8)
+        axis.xaxis.label.set_fontsize(8.5)
+        axis.yaxis.label.set_fontsize(8.5)
+    image = io.BytesIO()
+    figure.savefig(image, dpi=DPI, format="png", metadata={"Software": None})
+    return image.getvalue()

@@ -1,0 +1,149 @@
+"""The benchmark's results as files: JSON, CSV, and writing them whole or not at all."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import platform
+import tempfile
+from collections.abc import Mapping
+from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from ..scenarios import SCENARIOS
+from .metrics import metric_names
+from .results import REFERENCE, Benchmark, Outcome
+from .statistics import RESAMPLES, SEED, Estimate
+
+PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime")
+"""Packages whose versions are recorded."""
+
+
+def to_json(benchmark: Benchmark) -> str:
+    """``benchmark.json``: results, paired differences, tails, verdicts and provenance."""
+    results: dict[str, Any] = {}
+    paired: dict[str, Any] = {}
+    tails: dict[str, Any] = {}
+    for scenario in benchmark.scenarios:
+        name = scenario.row.name
+        results[name] = {outcome.controller.name: _estimates(outcome.means) for outcome in scenario.outcomes}
+        tails[name] = {outcome.controller.name: _estimates(outcome.cvar5) for outcome in scenario.outcomes}
+        paired[name] = {outcome.controller.name: _paired(outcome) for outcome in scenario.outcomes if outcome.paired}
+    verdicts = {
+        scenario.row.name: {
+            verdict.agent: {
+                "rival": verdict.rival,
+                "rmse_mm_difference": _estimate(verdict.difference),
+                "wins": verdict.wins,
+            }
+            for verdict in scenario.verdicts
+        }
+        for scenario in benchmark.scenarios
+    }
+    data = {
+        "results": results,
+        "paired": paired,
+        "cvar5": tails,
+        "verdicts": verdicts,
+        "provenance": _provenance(benchmark),
+    }
+    return json.dumps(data, indent=1, allow_nan=False) + "\n"
+
+
+def _paired(outcome: Outcome) -> dict[str, Any]:
+    found: dict[str, Any] = _estimates(outcome.paired)
+    if outcome.improvement is not None:
+        found["rmse_mm"]["probability_of_improvement"] = _estimate(outcome.improvement)
+    return found
+
+
+def _estimates(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
+    return {name: _estimate(estimate) for name, estimate in estimates.items()}
+
+
+def _estimate(estimate: Estimate) -> dict[str, Any]:
+    return {"mean": estimate.mean, "ci95": list(estimate.ci95) if estimate.ci95 else None, "n": estimate.n}
+
+
+def _provenance(benchmark: Benchmark) -> dict[str, Any]:
+    config = benchmark.scenarios[0].row.config()
+    return {
+        "command": benchmark.command,
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in PACKAGES},
+        "plant_hash": config.plant_hash,
+        "control_interval_s": config.control_interval,
+        "horizon_s": config.horizon,
+        "scenarios": {
+            scenario.row.name: {
+                "scenario": scenario.row.scenario,
+                "hash": SCENARIOS[scenario.row.scenario].hash,
+                "model": scenario.row.model,
+                "first_seed": scenario.outcomes[0].sample.seeds[0],
+                "episodes": len(scenario.outcomes[0].sample.seeds),
+            }
+            for scenario in benchmark.scenarios
+        },
+        "controllers": {controller.name: asdict(controller) for controller in benchmark.controllers},
+        "agents": [dict(contract) for contract in benchmark.agents],
+        "bootstrap": {"resamples": RESAMPLES, "seed": SEED, "paired_against": REFERENCE},
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def to_csv(benchmark: Benchmark) -> str:
+    """``episodes.csv``: one line an episode."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("scenario", "controller", "training_seed", "seed", *metric_names()))
+    for scenario in benchmark.scenarios:
+        for outcome in scenario.outcomes:
+            trained = outcome.controller.training_seeds or ("",)
+            for training_seed, episodes in zip(trained, outcome.sample.values, strict=True):
+                for seed, values in zip(outcome.sample.seeds, episodes, strict=True):
+                    numbers = (f"{value:.5g}" for value in values)
+                    writer.writerow((scenario.row.name, outcome.controller.name, training_seed, seed, *numbers))
+    return text.getvalue()
+
+
+def write_files(files: Mapping[Path, bytes]) -> None:
+    """Write all files or none: complete temporary files first, then renamed. Raises OSError."""
+    waiting: dict[str, Path] = {}
+    try:
+        for path, content in files.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+            waiting[temporary] = path
+            with os.fdopen(handle, "wb") as file:
+                file.write(content)
+            os.chmod(temporary, 0o644)
+        for temporary, path in waiting.items():
+            os.replace(temporary, path)
+    except BaseException:
+        for temporary in waiting:
+            Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def check_writable(path: Path) -> None:
+    """Raise OSError unless files could be written into the folder ``path``, made if need be; leaves no trace."""
+    existing = path
+    while not existing.exists():
+        existing = existing.parent
+    if not existing.is_dir():
+        raise NotADirectoryError(f"{path}: {existing} is not a folder")
+    try:
+        with tempfile.TemporaryFile(dir=existing):
+            pass
+    except OSError as error:
+        raise OSError(f"{path}: cannot be written ({error.strerror})") from None

@@ -1,0 +1,83 @@
+"""The benchmark's protocol: which scenarios, which episodes, at which settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ..config import Config, make_config
+from ..scenarios import SCENARIOS
+
+TEST_SEEDS = range(2_000_000, 2_000_500)
+"""Seeds of the test episodes; nothing is tuned, selected or stopped on them."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A scenario as the benchmark runs it."""
+
+    name: str
+    scenario: str
+    meaning: str
+    """One line for people."""
+    model: str | None = None
+    """ "I" or "II", or None for the scenario's own draw."""
+    default: bool = True
+    """Whether a benchmark that names no scenarios runs it."""
+
+    def config(self, observation: str = "measured") -> Config:
+        """The environment's settings: 5 s control, three hours, this row's scenario and model."""
+        return make_config(self.scenario, self.model, observation)
+
+    def seeds(self, episodes: int) -> range:
+        """The first test seeds; one where every draw is the same."""
+        return TEST_SEEDS[: 1 if SCENARIOS[self.scenario].deterministic else episodes]
+
+
+_RAMP = (
+    "the recipe's temperature rises by 5 K; a drive that ignores the recipe, as open-loop does, meets no disturbance"
+)
+_FALL = "the radius reference falls by {} mm within 30 min; nothing else happens"
+_ALONE = (
+    ("recipe", "errors of the recipe"),
+    ("drift", "drift of the hot zone"),
+    ("interface", "interface fluctuations"),
+    ("sensor", "sensor noise"),
+    ("reference", "changes of the reference"),
+    ("parameters", "unlike pullers"),
+)
+
+ROWS: tuple[Row, ...] = (
+    Row(
+        "randomized",
+        "randomized",
+        "unlike pullers, recipe errors, drift, fluctuations, noise: the training distribution",
+    ),
+    Row("hard", "hard", "the same families, half as wide again or more"),
+    Row("sensor-fault", "sensor-fault", "randomized with frozen frames, drop-outs and a drifting ring"),
+    Row("puller", "puller", "randomized with latency, ripple, outliers, a wrong ring bias and slow, narrow drives"),
+    Row("paper-ramp-I", "paper-ramp", _RAMP, "I"),
+    Row("paper-ramp-II", "paper-ramp", _RAMP, "II"),
+    Row("reference-a", "reference-a", _FALL.format(2.5), "I"),
+    Row("reference-b", "reference-b", _FALL.format(0.5), "I"),
+    Row("nominal", "nominal", "nothing happens", "I", default=False),
+    *(
+        Row(f"only-{name}", f"only-{name}", f"{what} alone, as wide as in randomized", default=False)
+        for name, what in _ALONE
+    ),
+)
+"""Every row, in the order of tables; those with one disturbance family alone run when asked for."""
+
+
+def find_row(name: str) -> Row:
+    """The row of that name; ValueError names what there is."""
+    for row in ROWS:
+        if row.name == name:
+            return row
+    raise ValueError(f"unknown scenario {name!r}; choose from {', '.join(row.name for row in ROWS)}")
+
+
+def check_episodes(episodes: int) -> int:
+    """The number of test episodes; ValueError if the protocol has no such many."""
+    if not 1 <= episodes <= len(TEST_SEEDS):
+        raise ValueError(f"episodes must be between 1 and {len(TEST_SEEDS)}, not {episodes}")
+    return episodes

@@ -1,0 +1,206 @@
+"""The benchmark's results for people: a Markdown report whose first line is the verdict, and a terminal table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+from ..units import HOUR, PERCENT
+from .results import REFERENCE, SPEED, Benchmark, Outcome, ScenarioResult, Verdict
+from .statistics import Estimate
+
+NOTHING = "-"
+
+
+class Column(NamedTuple):
+    """A metric as a table shows it."""
+
+    metric: str
+    heading: str
+    decimals: int
+    unit: float = 1.0
+    """What one shown unit is in the metric's own."""
+
+
+ERROR = (
+    Column("rmse_mm", "RMSE [mm]", 3),
+    Column("rmse_observable_mm", "observable RMSE [mm]", 3),
+    Column("max_error_mm", "largest error [mm]", 2),
+    Column("within_half_mm", "within 0.5 mm [%]", 1, PERCENT),
+    Column("failure_rate", "failures [%]", 1, PERCENT),
+    Column("ground_off_pct", "ground off [%]", 2),
+)
+DRIVES = (
+    Column("pull_rms_mm_per_min", "pull RMS [mm/min]", 3),
+    Column("pull_step_rms_mm_per_min", "pull step RMS [mm/min]", 4),
+    Column("mean_pull_within_3pct", "30 min mean pull within 3 % [%]", 1, PERCENT),
+    Column("heater_step_rms_kw", "heater step RMS [kW]", 3),
+    Column("growth_rate_rms_mm_per_min", "growth rate RMS [mm/min]", 3),
+    Column("return", "return", 0),
+    Column(SPEED, "compute [us/step]", 2),
+)
+
+
+def headline(benchmark: Benchmark) -> str:
+    """One plain line: whether the agents win, and where they don't."""
+    agents = [controller.name for controller in benchmark.controllers if controller.learned]
+    if not agents:
+        return "No learned agent took part in this run."
+    if not benchmark.scenarios[0].verdicts:
+        return "No classical controller took part in this run, so there is nobody to win against."
+    return " ".join(_agent_line(benchmark, agent) for agent in agents)
+
+
+def _agent_line(benchmark: Benchmark, agent: str) -> str:
+    verdicts = [
+        (scenario.row.name, verdict)
+        for scenario in benchmark.scenarios
+        for verdict in scenario.verdicts
+        if verdict.agent == agent
+    ]
+    won = [name for name, verdict in verdicts if verdict.wins]
+    rest = [f"{name} ({_not_won(verdict)})" for name, verdict in verdicts if not verdict.wins]
+    if not rest:
+        return f"The agent {agent} wins: lowest mean RMSE on {_all_of(len(won), 'scenario')} of this run."
+    if not won:
+        return f"The agent {agent} does not win: {', '.join(rest)}."
+    return f"The agent {agent} does not win everywhere: not on {', '.join(rest)}; it wins on {', '.join(won)}."
+
+
+def _not_won(verdict: Verdict) -> str:
+    return f"{verdict.rival} is better" if verdict.loses else f"no clear difference from {verdict.rival}"
+
+
+def _all_of(count: int, what: str) -> str:
+    return f"the only {what}" if count == 1 else f"all {count} {what}s"
+
+
+def markdown(benchmark: Benchmark, figures: Iterable[str]) -> str:
+    """``report.md``; its first line is :func:`headline`."""
+    config = benchmark.scenarios[0].row.config()
+    counts = {len(scenario.outcomes[0].sample.seeds) for scenario in benchmark.scenarios}
+    parts = [
+        headline(benchmark),
+        "# Benchmark",
+        "Every controller meets the same crystals (test seeds), "
+        f"{config.horizon / HOUR:.3g} h each at {config.control_interval:g} s control. Mean over crystals with its "
+        "95 % bootstrap interval; a scenario without randomness is one crystal and has no interval. After a failure "
+        "the radius error counts 8 mm to the end; drives, growth rate and ground-off are those of the time lived. "
+        f"No failure in n crystals still allows a rate of up to 3/n, {3 / max(counts) / PERCENT:.2g} % at "
+        f"n = {max(counts)}. docs/benchmark.md has the protocol and every formula.",
+        "## Who took part",
+        _table(
+            ("controller", "reads", "what it is", "training seeds"),
+            [(c.name, c.observation, c.meaning, _seeds(c.training_seeds)) for c in benchmark.controllers],
+            rule="---",
+        ),
+    ]
+    for scenario in benchmark.scenarios:
+        parts += _scenario(scenario)
+    parts += ["## Figures", *(f"![{name.removesuffix('.png')}]({name})" for name in figures)]
+    parts += ["## How it was made", f"`{benchmark.command}`; versions, hashes and seeds stand in benchmark.json."]
+    return "\n\n".join(parts) + "\n"
+
+
+def _seeds(seeds: Sequence[int]) -> str:
+    return ", ".join(str(seed) for seed in seeds) or NOTHING
+
+
+def _scenario(scenario: ScenarioResult) -> list[str]:
+    crystals = len(scenario.outcomes[0].sample.seeds)
+    parts = [
+        f"## {scenario.row.name} ({crystals} crystal{'s' if crystals > 1 else ''})",
+        f"{scenario.row.meaning[0].upper()}{scenario.row.meaning[1:]}.",
+        _metrics(scenario.outcomes, ERROR),
+        _metrics(scenario.outcomes, DRIVES),
+    ]
+    if any(outcome.paired for outcome in scenario.outcomes):
+        parts.append(_comparison(scenario.outcomes))
+    return parts
+
+
+def _metrics(outcomes: Sequence[Outcome], columns: Sequence[Column]) -> str:
+    rows = [
+        (outcome.controller.name, *(_interval(outcome.means[column.metric], column) for column in columns))
+        for outcome in outcomes
+    ]
+    return _table(("controller", *(column.heading for column in columns)), rows)
+
+
+def _comparison(outcomes: Sequence[Outcome]) -> str:
+    rmse, step = ERROR[0], DRIVES[1]
+    rows = [
+        (
+            outcome.controller.name,
+            _interval(outcome.cvar5["rmse_mm"], rmse),
+            _interval(outcome.paired["rmse_mm"], rmse) if outcome.paired else NOTHING,
+            _interval(outcome.improvement, rmse) if outcome.improvement else NOTHING,
+            _interval(outcome.paired[step.metric], step) if outcome.paired else NOTHING,
+        )
+        for outcome in outcomes
+    ]
+    headings = (
+        "controller",
+        "worst 5 % RMSE [mm]",
+        f"RMSE less {REFERENCE}'s [mm]",
+        f"better than {REFERENCE} with probability",
+        f"pull step RMS less {REFERENCE}'s [mm/min]",
+    )
+    return _table(headings, rows)
+
+
+def _interval(estimate: Estimate, column: Column) -> str:
+    def number(value: float) -> str:
+        text = f"{value / column.unit:.{column.decimals}f}"
+        return text[1:] if text.startswith("-") and not text.strip("-0.") else text
+
+    if estimate.ci95 is None:
+        return number(estimate.mean)
+    low, high = (number(value) for value in estimate.ci95)
+    return f"{number(estimate.mean)} [{low}, {high}]"
+
+
+def _table(headings: Sequence[str], rows: Sequence[Sequence[str]], rule: str = "--:") -> str:
+    lines = [" | ".join(headings), " | ".join(["---", *(rule for _ in headings[1:])])]
+    return "\n".join(f"| {line} |" for line in [*lines, *(" | ".join(row) for row in rows)])
+
+
+SHOWN = (
+    Column("rmse_mm", "RMSE/mm", 3),
+    Column("max_error_mm", "max/mm", 2),
+    Column("within_half_mm", "in 0.5 mm/%", 1, PERCENT),
+    Column("pull_step_rms_mm_per_min", "pull step/mm/min", 4),
+    Column("heater_step_rms_kw", "heater step/kW", 3),
+    Column("failure_rate", "failures/%", 1, PERCENT),
+    Column(SPEED, "compute/us/step", 2),
+)
+"""Columns of the terminal's table, heading and unit one above the other."""
+
+
+def terminal(benchmark: Benchmark) -> str:
+    """The short table: RMSE with its interval, then means, and the paired difference of RMSE."""
+    headings = [("", "controller"), *_heads(column.heading for column in SHOWN), (f"RMSE less {REFERENCE}'s", "mm")]
+    blocks = []
+    for scenario in benchmark.scenarios:
+        rows = [[outcome.controller.name, *_cells(outcome)] for outcome in scenario.outcomes]
+        grid = [[top for top, _ in headings], [unit for _, unit in headings], *rows]
+        widths = [max(len(line[i]) for line in grid) for i in range(len(headings))]
+        crystals = len(scenario.outcomes[0].sample.seeds)
+        lines = [f"{scenario.row.name} ({crystals} crystal{'s' if crystals > 1 else ''})"]
+        for name, *cells in grid:
+            padded = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
+            lines.append("  ".join([f"  {name:<{widths[0]}}", *padded]).rstrip())
+        blocks.append("\n".join(lines))
+    return "\n\n".join([*blocks, headline(benchmark)])
+
+
+def _heads(headings: Iterable[str]) -> list[tuple[str, str]]:
+    parts = (heading.split("/", 1) for heading in headings)
+    return [(top, unit) for top, unit in parts]
+
+
+def _cells(outcome: Outcome) -> list[str]:
+    rmse, *others = SHOWN
+    means = [_interval(outcome.means[column.metric]._replace(ci95=None), column) for column in others]
+    paired = _interval(outcome.paired["rmse_mm"], rmse) if outcome.paired else NOTHING
+    return [_interval(outcome.means["rmse_mm"], rmse), *means, paired]

@@ -1,0 +1,173 @@
+"""The benchmark's results: typed, frozen, computed from samples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .metrics import metric_names, metrics
+from .protocol import Row
+from .rollout import Rollout, Signals
+from .statistics import Estimate, Resamples, cvar, differences, means, probability_of_improvement
+
+Floats = npt.NDArray[np.float64]
+REFERENCE = "paper"
+"""Controller that paired differences are taken against."""
+SPEED = "microseconds_per_step"
+"""Name of the one metric that is not per episode: time in ``predict`` per step and episode, batched [us]."""
+TAIL_METRICS = ("rmse_mm", "rmse_observable_mm", "max_error_mm")
+"""Metrics whose worst 5 % are reported."""
+
+
+@dataclass(frozen=True)
+class Controller:
+    """Who was measured."""
+
+    name: str
+    observation: str
+    meaning: str
+    training_seeds: tuple[int, ...] = ()
+    """Training seeds of a learned controller, empty for the others."""
+
+    @property
+    def learned(self) -> bool:
+        """Whether it was trained."""
+        return bool(self.training_seeds)
+
+    @property
+    def bound(self) -> bool:
+        """Whether it reads the true state, which no sensor could feed."""
+        return self.observation == "state"
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One controller on one scenario."""
+
+    controller: Controller
+    seeds: tuple[int, ...]
+    values: Floats
+    """Shape (training seeds or 1, episodes, metrics), metrics in the order of :func:`metric_names`."""
+    microseconds_per_step: float
+    example: Signals
+    """Signals of the first episode up to its end, each of shape (steps,)."""
+    control_interval: float
+
+    @classmethod
+    def of(cls, controller: Controller, runs: Sequence[Rollout]) -> Sample:
+        """The sample of a controller's rollouts, one a training seed, all on the same episodes."""
+        values = np.array([np.stack(metrics(run), axis=-1) for run in runs])
+        lived = runs[0].alive[:, 0]
+        example = Signals(*(signal[lived, 0] for signal in runs[0].signals))
+        microseconds = float(np.mean([run.microseconds_per_step for run in runs]))
+        return cls(controller, runs[0].seeds, values, microseconds, example, runs[0].config.control_interval)
+
+    def metric(self, name: str) -> Floats:
+        """One metric, shape (training seeds or 1, episodes)."""
+        values: Floats = self.values[:, :, metric_names().index(name)]
+        return values
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a sample says."""
+
+    sample: Sample
+    means: Mapping[str, Estimate]
+    """By metric, :data:`SPEED` included."""
+    cvar5: Mapping[str, Estimate]
+    """Mean of the worst 5 % of episodes, by metric of :data:`TAIL_METRICS`."""
+    paired: Mapping[str, Estimate]
+    """Mean difference against :data:`REFERENCE` on the same crystals, by metric; empty without it."""
+    improvement: Estimate | None
+    """Probability of a lower RMSE than :data:`REFERENCE` on the same crystal."""
+
+    @property
+    def controller(self) -> Controller:
+        """Who was measured."""
+        return self.sample.controller
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A learned controller against the best classical one that reads sensors."""
+
+    agent: str
+    rival: str
+    difference: Estimate
+    """Mean paired difference of RMSE, agent less rival [mm]."""
+
+    @property
+    def wins(self) -> bool:
+        """Whether the agent's RMSE is lower beyond doubt: the whole interval, or the one episode."""
+        return (self.difference.ci95[1] if self.difference.ci95 else self.difference.mean) < 0.0
+
+    @property
+    def loses(self) -> bool:
+        """Whether the rival's is."""
+        return (self.difference.ci95[0] if self.difference.ci95 else self.difference.mean) > 0.0
+
+
+@dataclass(frozen=True)
+class ScenarioResult:
+    """Every controller on one scenario."""
+
+    row: Row
+    outcomes: tuple[Outcome, ...]
+    verdicts: tuple[Verdict, ...]
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A whole run."""
+
+    scenarios: tuple[ScenarioResult, ...]
+    command: str
+    agents: tuple[Mapping[str, Any], ...]
+    """Contracts of the agent files."""
+
+    @property
+    def controllers(self) -> tuple[Controller, ...]:
+        """Who took part."""
+        return tuple(outcome.controller for outcome in self.scenarios[0].outcomes)
+
+
+def summarise(row: Row, samples: Sequence[Sample]) -> ScenarioResult:
+    """Means, tails, paired differences and verdicts of one scenario, all on the same resamples."""
+    resamples = Resamples.draw(len(samples[0].seeds))
+    reference = next((sample for sample in samples if sample.controller.name == REFERENCE), None)
+    outcomes = tuple(_outcome(sample, reference, resamples) for sample in samples)
+    return ScenarioResult(row, outcomes, _verdicts(samples, resamples))
+
+
+def _outcome(sample: Sample, reference: Sample | None, resamples: Resamples) -> Outcome:
+    names = metric_names()
+    found = dict(zip(names, means(sample.values, resamples), strict=True))
+    found[SPEED] = Estimate(sample.microseconds_per_step, None, len(sample.seeds))
+    tails = {name: cvar(sample.metric(name), resamples) for name in TAIL_METRICS}
+    if reference is None or sample is reference:
+        return Outcome(sample, found, tails, {}, None)
+    paired = dict(zip(names, differences(sample.values, reference.values, resamples), strict=True))
+    better = probability_of_improvement(sample.metric("rmse_mm"), reference.metric("rmse_mm"), resamples)
+    return Outcome(sample, found, tails, paired, better)
+
+
+def _verdicts(samples: Sequence[Sample], resamples: Resamples) -> tuple[Verdict, ...]:
+    rivals = [sample for sample in samples if not (sample.controller.learned or sample.controller.bound)]
+    if not rivals:
+        return ()
+    best = min(rivals, key=lambda sample: float(sample.metric("rmse_mm").mean()))
+    theirs = best.metric("rmse_mm")[:, :, None]
+    return tuple(
+        Verdict(
+            sample.controller.name,
+            best.controller.name,
+            differences(sample.metric("rmse_mm")[:, :, None], theirs, resamples)[0],
+        )
+        for sample in samples
+        if sample.controller.learned
+    )

@@ -1,0 +1,85 @@
+"""Running a benchmark: every contender on every row, sample by sample."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+from ..config import Config
+from .protocol import Row
+from .results import Benchmark, Controller, Sample, summarise
+from .rollout import rollout
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A controller and how to build it for an environment's settings: one policy a training seed."""
+
+    controller: Controller
+    make: Callable[[Config], Sequence[Any]]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a benchmark runs, and what is written down about it."""
+
+    contenders: tuple[Contender, ...]
+    rows: tuple[Row, ...]
+    episodes: int
+    agents: tuple[Mapping[str, Any], ...] = ()
+    """Contracts of the agent files."""
+    command: str = ""
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of the whole run."""
+        policies = sum(len(contender.controller.training_seeds) or 1 for contender in self.contenders)
+        return sum(policies * len(row.seeds(self.episodes)) * row.config().steps for row in self.rows)
+
+
+def run(plan: Plan, progress: Progress) -> Benchmark:
+    """Roll every contender out on every row and summarise."""
+    scenarios = []
+    for row in plan.rows:
+        samples = []
+        for contender in plan.contenders:
+            controller = contender.controller
+            config = row.config(controller.observation)
+            progress.say(f"{row.name}, {controller.name}")
+            policies = contender.make(config)
+            runs = [rollout(policy, config, row.seeds(plan.episodes), progress.advance) for policy in policies]
+            samples.append(Sample.of(controller, runs))
+        scenarios.append(summarise(row, samples))
+    return Benchmark(tuple(scenarios), plan.command, plan.agents)
+
+
+class Progress:
+    """A progress bar over the steps of a run, on stderr; none when quiet. Needs tqdm unless quiet."""
+
+    def __init__(self, steps: int, quiet: bool = False) -> None:
+        self._bar: Any = None
+        if not quiet:
+            from tqdm import tqdm
+
+            self._bar = tqdm(total=steps, unit="step", unit_scale=True, dynamic_ncols=True, leave=False)
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def say(self, what: str) -> None:
+        """Name what runs now."""
+        if self._bar is not None:
+            self._bar.set_description(what)
+
+    def advance(self, steps: int) -> None:
+        """Count steps."""
+        if self._bar is not None:
+            self._bar.update(steps)

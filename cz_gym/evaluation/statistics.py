@@ -1,0 +1,124 @@
+"""Uncertainty of the benchmark's figures: 95 % percentile bootstrap over episodes and training seeds.
+
+Values have shape (training seeds, episodes, metrics); a controller that is not trained has one "seed". All controllers
+of a scenario meet the same crystals, so one set of resampled episodes serves them all: metrics and controllers stay
+paired in every resample. Training seeds are crossed with episodes (every trained copy meets every crystal), so seeds
+and episodes are resampled on their own and their weights multiply.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+RESAMPLES = 10_000
+"""Bootstrap resamples."""
+SEED = 1895
+"""Seed of the resamples: the same data always gives the same intervals."""
+LEVEL = 0.95
+"""Level of the intervals [-]."""
+TAIL = 0.05
+"""Share of episodes that the worst-case mean (CVaR) is taken over [-]."""
+_BLOCK = 500
+
+
+class Estimate(NamedTuple):
+    """A mean, its 95 % interval (None for a single deterministic episode) and the number of episodes."""
+
+    mean: float
+    ci95: tuple[float, float] | None
+    n: int
+
+
+@dataclass(frozen=True)
+class Resamples:
+    """Weights of the episodes in each resample, shape (resamples, episodes); each row sums to 1."""
+
+    episodes: Floats
+
+    @classmethod
+    def draw(cls, episodes: int, count: int = RESAMPLES, seed: int = SEED) -> Resamples:
+        """Multinomial counts over ``episodes``, ``count`` times. Raises ValueError for no episodes."""
+        return cls(_weights(episodes, count, np.random.default_rng(seed)))
+
+    def training_seeds(self, number: int, of: int = 0) -> Floats:
+        """Weights of ``number`` training seeds, shape (resamples, number); ``of`` tells trained policies apart."""
+        return _weights(number, len(self.episodes), np.random.default_rng([SEED, 1 + of]))
+
+
+def _weights(items: int, count: int, random: np.random.Generator) -> Floats:
+    if items < 1:
+        raise ValueError(f"a bootstrap needs at least one item, not {items}")
+    return random.multinomial(items, np.full(items, 1.0 / items), size=count) / items
+
+
+def means(values: Floats, resamples: Resamples) -> tuple[Estimate, ...]:
+    """Mean of each metric over seeds and episodes."""
+    return _estimates(values.mean(axis=(0, 1)), _resampled_means(values, resamples), values.shape[:2])
+
+
+def differences(values: Floats, reference: Floats, resamples: Resamples) -> tuple[Estimate, ...]:
+    """Mean of each metric less the reference's on the same crystals."""
+    point = values.mean(axis=(0, 1)) - reference.mean(axis=(0, 1))
+    spread = _resampled_means(values, resamples) - _resampled_means(reference, resamples, of=1)
+    shape = max(len(values), len(reference)), values.shape[1]
+    return _estimates(point, spread, shape)
+
+
+def probability_of_improvement(values: Floats, reference: Floats, resamples: Resamples) -> Estimate:
+    """Chance that one metric (lower is better) is lower than the reference's on the same crystal, ties half.
+
+    ``values`` and ``reference`` have shape (training seeds, episodes).
+    """
+    ours, theirs = values[:, None], reference[None]
+    wins = ((ours < theirs) + 0.5 * (ours == theirs)).mean(axis=1)[:, :, None]
+    return means(wins, resamples)[0]
+
+
+def cvar(values: Floats, resamples: Resamples, tail: float = TAIL) -> Estimate:
+    """Mean of the worst (largest) ``tail`` of one metric over seeds and episodes, shape (training seeds, episodes).
+
+    Rockafellar and Uryasev's conditional value at risk: where the tail is no whole number of episodes, the last one
+    counts in part; with fewer than 1/tail episodes it is the maximum.
+    """
+    flat = values.ravel()
+    order = np.argsort(-flat, kind="stable")
+    point = _tail_mean(flat[order], np.full((1, flat.size), 1.0 / flat.size), tail)
+    seeds = resamples.training_seeds(len(values))
+    spread = np.empty(len(resamples.episodes))
+    for first in range(0, len(spread), _BLOCK):
+        part = slice(first, first + _BLOCK)
+        weights = (seeds[part, :, None] * resamples.episodes[part, None, :]).reshape(-1, flat.size)
+        spread[part] = _tail_mean(flat[order], weights[:, order], tail)
+    return _estimates(point, spread[:, None], values.shape)[0]
+
+
+def _tail_mean(descending: Floats, weights: Floats, tail: float) -> Floats:
+    """Mean of the first ``tail`` of the weight, one a row of ``weights``."""
+    taken = np.diff(np.minimum(np.cumsum(weights, axis=1), tail), axis=1, prepend=0.0)
+    mean: Floats = taken @ descending / tail
+    return mean
+
+
+def _resampled_means(values: Floats, resamples: Resamples, of: int = 0) -> Floats:
+    """Means of every resample, shape (resamples, metrics)."""
+    seeds = resamples.training_seeds(len(values), of)
+    total = np.zeros((len(seeds), values.shape[2]))
+    for weight, copy in zip(seeds.T, values, strict=True):
+        total += weight[:, None] * (resamples.episodes @ copy)
+    return total
+
+
+def _estimates(point: Floats, spread: Floats, shape: tuple[int, ...]) -> tuple[Estimate, ...]:
+    seeds, episodes = shape
+    if seeds * episodes == 1:
+        return tuple(Estimate(float(value), None, 1) for value in point)
+    low, high = np.quantile(spread, [(1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0], axis=0)
+    return tuple(
+        Estimate(float(value), (float(below), float(above)), episodes)
+        for value, below, above in zip(point, low, high, strict=True)
+    )
