@@ -1,0 +1,146 @@
+"""Sampled loops, linearised from the code that runs: a controller's ``predict``, the plant and what they make together.
+
+A controller whose memory is a NamedTuple of arrays is linear near rest, so feeding its own ``predict`` one unit of each
+memory entry and of each observation channel yields its state space: the design table judges the shipped code and no
+second description of it. Timing as in the environment: measure at t_k, act at once; the v_p and Q_H observed at
+t_k are those applied over the interval before.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import solve_discrete_lyapunov
+from scipy.signal import cont2discrete
+
+from cz_gym.linear import INPUTS, OUTPUTS, STATES, StateSpace, linearise
+from cz_gym.observation import HEATER_SCALE, MEASURED, PULL_SCALE, Measured, scales
+from cz_gym.plant import Puller
+
+Floats = npt.NDArray[np.float64]
+_SMALL = 1e-6
+"""Observed amplitude that no limit, gate or dead zone notices [-]; float32 actions keep their relative precision."""
+_SEEN = ("ring_error", "T_1", "v_p", "Q_H")
+"""Channels through which the plant reaches the controller."""
+_DISTURBED = ("v_p", "Q_d", "dT_i", "camera", "pyrometer")
+"""Inputs of a joined loop."""
+
+
+class NotLinearError(ValueError):
+    """A controller that has no state space near rest."""
+
+
+class Loop(NamedTuple):
+    """Plant and controller in one: z(k+1) = A z + B w, y = C z + D w, w and y as named, at one control interval."""
+
+    A: Floats
+    B: Floats
+    C: Floats
+    D: Floats
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    dt: float
+    """Control interval [s]."""
+
+    @property
+    def stable(self) -> bool:
+        """Whether every pole lies inside the unit circle."""
+        return bool(np.abs(np.linalg.eigvals(self.A)).max() < 1.0)
+
+    def pick(self, output: str, inputs: tuple[str, ...]) -> StateSpace:
+        """The part from some inputs to one output."""
+        row, columns = self.outputs.index(output), [self.inputs.index(name) for name in inputs]
+        return StateSpace(self.A, self.B[:, columns], self.C[[row]], self.D[np.ix_([row], columns)])
+
+
+def linear_controller(policy: Any, v_0: float = PULL_SCALE) -> StateSpace:
+    """The controller in discrete time: inputs the channels of Measured [SI], outputs v_p - v_0 [m/s] and Q_H - Q_H0 [W].
+
+    Raises NotLinearError if rest is not an equilibrium, or if the answer to twice the input is not twice the answer.
+    """
+    channels = len(MEASURED)
+    _, rest = policy.predict(np.zeros((1, channels)))
+    if not isinstance(rest, tuple):
+        raise NotLinearError(f"{type(policy).__name__} remembers no named tuple of arrays: it has no state space here")
+    shapes = [np.shape(part)[1:] for part in rest]
+    sizes = [int(np.prod(shape)) for shape in shapes]
+    memory = sum(sizes)
+    probes = np.eye(memory + channels) * _SMALL
+    answers = [_answer(policy, factor * probes, rest, shapes, sizes) for factor in (0.0, 1.0, 2.0)]
+    largest = np.abs(answers[1]).max()
+    if np.abs(answers[0]).max() > 1e-9 * largest:
+        raise NotLinearError(f"{type(policy).__name__} does not rest at zero")
+    if not np.allclose(answers[2], 2.0 * answers[1], rtol=1e-5, atol=1e-9 * largest):
+        raise NotLinearError(f"{type(policy).__name__} is not linear near rest")
+    gains = answers[1].T / _SMALL
+    gains[:, memory:] /= scales(MEASURED, v_0)
+    gains[memory:] *= np.array([[v_0], [HEATER_SCALE]])
+    return StateSpace(gains[:memory, :memory], gains[:memory, memory:], gains[memory:, :memory], gains[memory:, memory:])
+
+
+def _answer(policy: Any, probes: Floats, rest: Any, shapes: list[Any], sizes: list[int]) -> Floats:
+    """Next memory and action for rows of (memory, observation)."""
+    n, memory = len(probes), sum(sizes)
+    parts = np.split(probes[:, :memory], np.cumsum(sizes)[:-1], axis=1)
+    state = type(rest)(*(part.reshape(n, *shape) for part, shape in zip(parts, shapes, strict=True)))
+    action, after = policy.predict(probes[:, memory:], state=state)
+    return np.hstack([*(np.reshape(part, (n, -1)) for part in after), action])
+
+
+def sampled_plant(puller: Puller, dt: float) -> StateSpace:
+    """The plant by zero-order hold: inputs v_p, Q_H, Q_d, dT_i; outputs r_c, r_br, T_1; deviations in SI."""
+    A, B, C, D = linearise(puller)
+    pyrometer = np.zeros((1, len(STATES)))
+    pyrometer[0, STATES.index("T_1")] = 1.0
+    C = np.vstack([C[: OUTPUTS.index("r_br") + 1], pyrometer])
+    A_d, B_d, *_ = cont2discrete((A, B, C, np.zeros((len(C), len(INPUTS)))), dt, method="zoh")
+    return StateSpace(A_d, B_d, C, np.zeros((len(C), len(INPUTS))))
+
+
+def close(controller: StateSpace, puller: Puller, dt: float, broken: str = "") -> Loop:
+    """Join controller and plant.
+
+    Inputs: v_p (added to the command), Q_d, dT_i, camera and pyrometer noise; references held. Outputs: v_p and Q_H
+    (the commands), r_c, r_br. ``broken="camera"`` opens the loop there: the controller reads the input ``camera``
+    alone; ``broken="v_p"`` opens it at the pull speed: plant and controller see the input ``v_p`` alone. The state is
+    (plant, v_p and Q_H applied last, controller).
+    """
+    plant, m, n = sampled_plant(puller, dt), len(controller.A), len(STATES)
+    at = [Measured._fields.index(name) for name in _SEEN]
+    seen = np.zeros((len(_SEEN), n + 2 + m))
+    seen[0, :n], seen[1, :n] = plant.C[1] * (broken != "camera"), plant.C[2]
+    seen[2, n], seen[3, n + 1] = 1.0, 1.0
+    noise = np.zeros((len(_SEEN), len(_DISTURBED)))
+    noise[0, _DISTURBED.index("camera")] = noise[1, _DISTURBED.index("pyrometer")] = 1.0
+    command = np.hstack([np.zeros((2, n + 2)), controller.C]) + controller.D[:, at] @ seen
+    direct = controller.D[:, at] @ noise
+    closed = np.array([[broken != "v_p"], [True]], np.float64)
+    applied, given = closed * command, closed * direct
+    given[0, _DISTURBED.index("v_p")] = 1.0
+    load = np.zeros((2, len(_DISTURBED)))
+    load[0, _DISTURBED.index("Q_d")] = load[1, _DISTURBED.index("dT_i")] = 1.0
+    moved = np.hstack([plant.A, np.zeros((n, 2 + m))]) + plant.B[:, :2] @ applied
+    recalled = np.hstack([np.zeros((m, n + 2)), controller.A]) + controller.B[:, at] @ seen
+    A = np.vstack([moved, applied, recalled])
+    B = np.vstack([plant.B[:, :2] @ given + plant.B[:, 2:] @ load, given, controller.B[:, at] @ noise])
+    radii = np.hstack([plant.C[:2], np.zeros((2, 2 + m))])
+    C, D = np.vstack([command, radii]), np.vstack([direct, np.zeros((2, len(_DISTURBED)))])
+    return Loop(A, B, C, D, _DISTURBED, ("v_p", "Q_H", "r_c", "r_br"), dt)
+
+
+def root_mean_square(system: StateSpace, difference: bool = False) -> float:
+    """Standard deviation of the output for white noise of unit standard deviation per sample (discrete Lyapunov).
+
+    ``difference`` takes that of the step-to-step change. NaN for an unstable system.
+    """
+    A, B, C, D = system
+    if np.abs(np.linalg.eigvals(A)).max() >= 1.0:
+        return float("nan")
+    if difference:
+        n = len(A)
+        A, B = np.block([[A, np.zeros((n, 1))], [C, np.zeros((1, 1))]]), np.vstack([B, D])
+        C = np.hstack([C, -np.ones((1, 1))])
+    covariance = solve_discrete_lyapunov(A, B @ B.T)
+    return float(np.sqrt((C @ covariance @ C.T + D @ D.T)[0, 0]))
