@@ -99,13 +99,12 @@ def _frequency(loop: Any, omega: npt.NDArray[np.float64]) -> tuple[npt.NDArray[n
     """Gain [dB] and phase [degrees], the phase unwrapped and near -180 degrees for a loop of the right sign."""
     response = np.asarray(loop(1j * omega))
     phase = np.unwrap(np.angle(response)) / DEGREE
-    # The branch is fixed at the highest frequency, where the compensated loop is a lag of 90 to 180 degrees.
+    # The branch is fixed at the highest frequency, where the loop lags by 90 to 270 degrees.
     return 20.0 * np.log10(np.abs(response)), phase - 360.0 * np.round((phase[-1] + 135.0) / 360.0)
 
 
-def frequency_responses(results: Results) -> Any:
-    """Bode diagram of both compensated plants with the PID: published functions and our plant."""
-    omega = np.logspace(-5, 0.5, 500)
+def _bode(results: Results, omega: npt.NDArray[np.float64], compensated: bool) -> tuple[Any, Any]:
+    """Bode diagram of both models, published functions and our plant, with or without their compensators."""
     figure, axes = sheet(2, 1, (6.4, 5.2), sharex=True)
     sources: tuple[tuple[str, dict[str, RadiusModel], Compensator, dict[str, Any]], ...] = (
         ("our plant", results.models, results.own_compensator, {"linewidth": 3.0, "alpha": 0.45}),
@@ -113,40 +112,41 @@ def frequency_responses(results: Results) -> Any:
     )
     for name, models, compensator, line in sources:
         for (model, functions), color in zip(models.items(), (BLUE, ORANGE), strict=True):
-            gain, phase = _frequency(open_loop(functions, compensator, PID), omega)
-            for axis, values in zip(axes[:, 0], (gain, phase), strict=True):
+            loop = open_loop(functions, compensator if compensated else None, PID)
+            for axis, values in zip(axes[:, 0], _frequency(loop, omega), strict=True):
                 axis.semilogx(omega, values, color=color, label=f"Model {model}, {name}", **line)
-    margin = results.margins["own_I"]
     axes[0, 0].axhline(0.0, color=GREY, linewidth=0.8)
     axes[1, 0].axhline(-180.0, color=GREY, linewidth=0.8)
-    for axis in axes[:, 0]:
+    return figure, axes[:, 0]
+
+
+def frequency_responses(results: Results) -> Any:
+    """Bode diagram of both compensated plants with the PID: published functions and our plant."""
+    figure, axes = _bode(results, np.logspace(-5, 0.5, 500), compensated=True)
+    margin = results.margins["own_I"]
+    for axis in axes:
         axis.axvline(margin.crossover, color=GREY, linewidth=0.8, linestyle=":")
-    axes[1, 0].annotate(
+    axes[1].annotate(
         rf"$\omega_c$ = {margin.crossover:.3f} rad/s, $\varphi_m$ = {margin.phase_margin_deg:.0f}° (our Model I)",
         (margin.crossover, -180.0 + margin.phase_margin_deg), (2e-3, -265.0), fontsize=8,
         arrowprops={"arrowstyle": "-", "color": GREY},
     )  # fmt: skip
-    label(axes[0, 0], "", "|L| [dB]", legend=True)
-    label(axes[1, 0], "frequency [rad/s]", "phase of L [deg]")
+    label(axes[0], "", "|L| [dB]", legend=True)
+    label(axes[1], "frequency [rad/s]", "phase of L [deg]")
     return figure
 
 
 def margin_sketch(results: Results) -> Any:
     """The paper's sketch of a Bode diagram with a right half plane zero, drawn with the uncompensated plant itself."""
-    omega = np.logspace(-4.5, 0.3, 500)
+    omega = np.logspace(-5, 0.5, 500)
+    figure, axes = _bode(results, omega, compensated=False)
     model = results.models["I"]
-    figure, axes = sheet(2, 1, (6.4, 4.8), sharex=True)
-    gain, phase = _frequency(open_loop(model, None, PID), omega)
-    axes[0, 0].semilogx(omega, gain, color=BLUE, label="PID, no compensator, Model I")
-    axes[1, 0].semilogx(omega, phase, color=BLUE)
-    for axis in axes[:, 0]:
-        axis.axvspan(2.0 * model.poles[0], 0.5 * model.zero, color=GREY, alpha=0.2, label="room for the crossover")
-        axis.axvline(model.zero, color=ORANGE, linestyle="--", label="right half plane zero")
-    axes[0, 0].axhline(0.0, color=GREY, linewidth=0.8)
-    axes[1, 0].axhline(-180.0, color=GREY, linewidth=0.8)
-    axes[0, 0].set_xlim(omega[0], omega[-1])
-    label(axes[0, 0], "", "|L| [dB]", legend=True)
-    label(axes[1, 0], "frequency [rad/s]", "phase of L [deg]")
+    for axis in axes:
+        axis.axvspan(2.0 * model.poles[0], 0.5 * model.zero, color=GREY, alpha=0.15, label="room for the crossover")
+        axis.axvline(model.zero, color="black", linestyle=":", linewidth=1.0, label="right half plane zero")
+    axes[0].set_xlim(omega[0], omega[-1])
+    label(axes[0], "", "|L| [dB]", legend=True)
+    label(axes[1], "frequency [rad/s]", "phase of L [deg]")
     return figure
 
 

@@ -1,0 +1,230 @@
+"""The report: sections, figures and tables, in Markdown."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cz_gym.units import MINUTE, MM
+
+from .paper_experiments import INTERVAL, SEEDS
+from .paper_gallery import FIGURES
+from .paper_numbers import Results, ramp_numbers
+from .paper_published import CROSSOVER, PHASE_MARGIN_DEG, PID
+from .paper_rows import as_markdown, number, rows
+
+
+def _shown(*marks: str) -> str:
+    """Markdown of the figures whose file names begin so."""
+    return "\n\n".join(f"![{f.caption}]({f.file})\n\n*{f.caption}*" for f in FIGURES if f.file.startswith(marks))
+
+
+def _table(head: str, lines: list[str]) -> str:
+    columns = head.count("|") - 1
+    return "\n".join([head, "|" + "---|" * columns, *lines])
+
+
+def report(results: Results) -> str:
+    """The whole report."""
+    sections = (_opening, _open_loop, _linear, _compensator, _pid, _closed_loop, _beyond, _meniscus)
+    return "\n\n".join(section(results) for section in sections) + "\n"
+
+
+def _opening(r: Results) -> str:
+    ramp, cases = ramp_numbers(r.ramp["I"]), r.case_difference
+    published = r.margins["published_I"], r.margins["published_II"]
+    worst = max(max(found) for found in cases.values())
+    return f"""# Part II, redone on our plant
+
+Every value that Bukhari, Hovd and Winkler print in Part II beside what our plant, or the paper's own functions, give.
+Written by `python -m baselines.paper`; nothing here is typed in by hand. `docs/paper.md` explains each step.
+
+- The plant's linear model agrees with the paper's Model II; Model I's G_p and G_m differ by a factor that cancels
+  in their product.
+- The design procedure returns the printed compensator: {r.published_compensator.gain:.5f} from the published functions,
+  {r.own_compensator.gain:.5f} from our plant.
+- The printed crossover ({CROSSOVER} rad/s) and phase margin ({PHASE_MARGIN_DEG:.0f} degrees) **do not follow from the
+  paper's own functions and Table 1**: those give {published[0].crossover:.4f} rad/s and
+  {published[0].phase_margin_deg:.1f} degrees (I), {published[1].crossover:.4f} rad/s and
+  {published[1].phase_margin_deg:.1f} degrees (II).
+- Cases A and B scaled by 5 differ by at most {100 * worst:.1f} % of the largest deviation of any signal.
+- In the temperature ramp the true radius is off by up to {ramp["max_error_mm"]:.2f} mm while the compensated
+  measurement shows {ramp["max_compensated_error_mm"]:.2f} mm.
+
+## Published beside computed
+
+A dash means that the paper gives no number.
+
+{as_markdown(rows(r))}"""
+
+
+def _open_loop(r: Results) -> str:
+    return f"""## 1. Open loop
+
+The pull speed falls by 10 % along the quintic 10 s^3 - 15 s^4 + 6 s^5 over 600 s, the heater at nominal power. The
+paper shows its profile without numbers, so the shapes can be compared and not the values. The crystal thickens at
+once; the ring first shows it thinner, by {1e3 * r.inverse["I"].depth / MM:.2f} µm (I) and
+{1e3 * r.inverse["II"].depth / MM:.2f} µm (II), and is back after {r.inverse["I"].recovery:.0f} s and
+{r.inverse["II"].recovery:.0f} s. The dip is small because the change is slow against the zero: a sudden change of the
+same size gives {1e3 * r.inverse_step["I"].depth / MM:.1f} µm and {r.inverse_step["I"].recovery:.0f} s (I).
+In Model II the growth rate is constant, in Model I it falls with the meniscus, which slows the widening.
+
+{_shown("figure_01", "figure_02", "figure_03")}"""
+
+
+def _linear(r: Results) -> str:
+    lines = []
+    for model, steps in r.steps.items():
+        for step in steps:
+            gaps = " | ".join(f"{100 * step.worst(output):.2f} %" for output in (0, 1))
+            lines.append(f"| {model} | {100 * step.share:.0f} % | {gaps} |")
+    functions = []
+    for model, m in r.models.items():
+        poles = ", ".join(f"{pole:.4g}" for pole in m.poles)
+        functions.append(
+            f"| {model} | {m.numerator:.7f} | {poles} | {m.lead:.4f} s + {m.constant:.4f} | {m.zero:.5f} | "
+            f"{m.numerator * m.constant:.7f} |"
+        )
+    head = "| model | numerator of G_p [1/s] | poles [rad/s] | G_m | zero [rad/s] | gain, numerator x constant [1/s] |"
+    return f"""## 2. Linearisation
+
+Derivatives by complex step through the functions that are simulated; melt temperature held, as in the paper.
+
+{_table(head, functions)}
+
+Largest difference between plant and linear model over 10 min after a pull-speed step, relative to the largest
+deviation. The ring is the less linear of the two, its offset bending with the height of the meniscus:
+
+{_table("| model | step | r_c | r_br |", lines)}
+
+{_shown("figure_04", "extra_a")}"""
+
+
+def _compensator(r: Results) -> str:
+    found = r.own_compensator
+    return f"""## 3. Compensator
+
+Ideal compensator G_p (1 - G_m), high-pass filter 5000 s/(5000 s + 1), stable part by ordered Schur form and Sylvester
+equation, constant of the numerator removed. From the published functions of Model I:
+
+    G_pc,real(s) = {r.published_compensator.gain:.5f} s / ((s + {r.published_compensator.fast:.4g}) (s + \
+{r.published_compensator.slow:.4g}))
+
+and from our plant {found.gain:.5f} s / ((s + {found.fast:.4g}) (s + {found.slow:.4g})).
+
+Model II has no compensator of its own: neither pole of its plant is stable, so only the filter's pole is left, and
+without its steady gain nothing is. The paper uses Model I's for both, and so do we.
+
+{_shown("figure_05", "figure_07", "figure_08")}"""
+
+
+def _pid(r: Results) -> str:
+    lines = []
+    for label, group in (("with", r.margins), ("without", r.bare_margins)):
+        for name, m in group.items():
+            source, model = name.split("_")
+            functions = "published" if source == "published" else "our plant"
+            poles = ", ".join(
+                f"{pole.real:.3g}{pole.imag:+.3g}j" if pole.imag else f"{pole.real:.3g}" for pole in m.poles
+            )
+            lines.append(
+                f"| {model} | {functions} | {label} | {m.crossover:.4f} | {m.phase_margin_deg:.1f} | "
+                f"{'yes' if m.stable else 'no'} | {poles} |"
+            )
+    head = "| model | functions | compensator | crossover [rad/s] | phase margin [deg] | stable | poles [rad/s] |"
+    own = r.margins["own_I"]
+    hold = np.degrees(own.crossover * INTERVAL / 2)
+    bare = r.bare_ramp["II"]
+    fate = f"is lost after {bare.t[-1] / MINUTE:.0f} min" if bare.failed else "survives, its pull speed at the limits"
+    return f"""## 4. PID
+
+Table 1: K_p = {PID.K_p} 1/s, T_i = {PID.T_i:.0f} s, T_d = {PID.T_d:.0f} s, N = {PID.N:.0f}.
+The paper prints {CROSSOVER} rad/s and about {PHASE_MARGIN_DEG:.0f} degrees for both models.
+
+{_table(head, lines)}
+
+Neither the published functions nor our plant give the printed crossover and margin. The loop above is continuous;
+holding the pull speed for {INTERVAL:.0f} s costs another {hold:.1f} degrees at our crossover. Without the
+compensator the PID is unstable on both models; in the temperature ramp below, Model II without it {fate}.
+
+{_shown("figure_06", "figure_09")}"""
+
+
+def _closed_loop(r: Results) -> str:
+    lines = [
+        f"| {model} | " + " | ".join(f"{100 * value:.2f} %" for value in found) + " |"
+        for model, found in r.case_difference.items()
+    ]
+    return f"""## 5. Closed loop on the nonlinear plant
+
+max of A - 5 B over max of A, deviations from the operating point:
+
+{_table("| model | r_c | h_c | alpha_c | v_p |", lines)}
+
+The ramp: T_1,ref rises by 0.5 K/min for 10 min and holds. The paper gives no duration, nor the gains of the temperature
+loop, so its curves can be compared in shape only.
+
+{_shown("figure_10", "figure_11", "figure_12", "figure_13", "figure_14")}"""
+
+
+def _beyond(r: Results) -> str:
+    bare = [
+        f"| {c.cut_off:.0e} | "
+        + " | ".join(f"{c.max_error[m] / MM:.2f} | {c.max_compensated_error[m] / MM:.2f}" for m in ("I", "II"))
+        + f" | {c.phase_margin_deg['I']:.0f} | {c.phase_margin_deg['II']:.0f} |"
+        for c in r.cut_offs
+    ]
+    head = (
+        "| cut-off [rad/s] | r_c, I [mm] | r_tilde, I [mm] | r_c, II [mm] | r_tilde, II [mm] | margin, I [deg] | "
+        "margin, II [deg] |"
+    )
+    noise = [
+        f"| {n.noise / MM:.2f} | {n.expected_pull_rms_mm_per_min:.2f} | {n.pull_rms_mm_per_min:.2f} | "
+        f"{100 * n.clipped:.0f} % | {n.rmse_mm:.3f} | {100 * n.failures:.0f} % |"
+        for n in r.noise
+    ]
+    noise_head = (
+        "| camera noise, sd [mm] | RMS of v_p expected [mm/min] | RMS of v_p - v_0 [mm/min] | time at a limit | "
+        "true RMSE [mm] | lost |"
+    )
+    return f"""## 6. What the paper does not show
+
+**The washout.** A warmer melt grows more slowly, so the loop must pull more slowly for good. The compensator answers a
+lasting change of pull speed with a correction that fades only at the high-pass cut-off; meanwhile the loop holds
+r_tilde and the crystal is off by the correction. Raising the cut-off shortens it, at little cost in margin until
+it nears the zero. Largest errors in the ramp, compensator redesigned from our Model I for each cut-off:
+
+{_table(head, bare)}
+
+**Noise.** The PID's gain at high frequency is K_p N = {PID.K_p * PID.N:.0f} mm/s per mm.
+White camera noise, {INTERVAL:.0f} s samples,
+reference held for an hour, mean of {len(SEEDS)} episodes. The pull speed is spoilt long before the crystal is:
+
+{_table(noise_head, noise)}
+
+{_shown("extra_b", "extra_c", "extra_d")}"""
+
+
+def _meniscus(r: Results) -> str:
+    lines = [
+        f"| {p.r_c / MM:.1f} | {p.hurle.h / MM:.4f} | {p.exact.h / MM:.4f} | "
+        f"{100 * (p.hurle.h / p.exact.h - 1):+.2f} % | "
+        f"{p.hurle.slope_rate * MM:.4f} | {p.exact.slope_rate * MM:.4f} | {p.hurle.ring_offset / MM:.3f} | "
+        f"{p.exact.ring_offset / MM:.3f} | {p.hurle.zero:.4f} | {p.exact.zero:.4f} |"
+        for p in r.menisci
+    ]
+    head = (
+        "| r_c [mm] | h, Hurle [mm] | h, exact [mm] | difference | d alpha_c/d h, Hurle [rad/mm] | exact | "
+        "ring offset, Hurle [mm] | exact | zero, Hurle [rad/s] | exact |"
+    )
+    exact, hurle = ramp_numbers(r.exact_ramp), ramp_numbers(r.ramp["I"])
+    return f"""## 7. Hurle against the exact meniscus
+
+At the operating point the axisymmetric Young-Laplace equation gives {number(r.exact_h / MM)} mm, Hurle's closed form
+{number(r.ramp["I"].signals.h_c[0] / MM)} mm.
+The zero differs most, because the ring's slope phi_b was fitted to the paper's G_m on Hurle's
+profile. On a plant with the exact meniscus the printed controller's largest error in the ramp is
+{exact["max_error_mm"]:.3f} mm against {hurle["max_error_mm"]:.3f} mm (Model I).
+
+{_table(head, lines)}
+
+{_shown("extra_e")}"""
