@@ -95,6 +95,7 @@ class Batch:
         threads = threads or os.cpu_count() or 1
         self._parts = max(1, min(threads, num_envs // SLOTS_PER_THREAD))
         self._pool: ThreadPoolExecutor | None = None
+        self._owner = os.getpid()
 
     def new_out(self) -> Out:
         """Fresh arrays to write into."""
@@ -128,8 +129,10 @@ class Batch:
         if self._parts == 1:
             self.kernels.step(*arguments, 0, self.num_envs)
             return
-        if self._pool is None:
+        if self._pool is None or self._owner != os.getpid():
+            # A forked child inherits the pool without its threads and would wait for them for ever.
             self._pool = ThreadPoolExecutor(self._parts - 1, thread_name_prefix="cz-gym")
+            self._owner = os.getpid()
         bounds = np.linspace(0, self.num_envs, self._parts + 1).astype(int).tolist()
         part = partial(self.kernels.step, *arguments)
         futures = [self._pool.submit(part, start, stop) for start, stop in pairwise(bounds[1:])]
@@ -144,11 +147,8 @@ class Batch:
         slot, interface, noise, history, frames = (array[i, ...].copy() for array in self.memory)
         return SlotState(self.config.hash, slot, interface, noise, history, frames, sample)
 
-    def restore(self, i: int, state: SlotState, out: Out) -> None:
-        """Continue slot i from a saved state and write its last sample into ``out``.
-
-        Raises ValueError if the state was saved under other settings.
-        """
+    def check(self, state: SlotState) -> None:
+        """Raise ValueError if this is no saved state, or one saved under other settings."""
         if not isinstance(state, SlotState):
             raise ValueError(f"expected a state made by get_state, not {type(state).__name__}")
         if state.config_hash != self.config.hash:
@@ -156,6 +156,9 @@ class Batch:
                 f"this state was saved under other settings (hash {state.config_hash}) than this environment's "
                 f"(hash {self.config.hash}): scenario, model, observation, interval, horizon and parameters must agree"
             )
+
+    def restore(self, i: int, state: SlotState, out: Out) -> None:
+        """Continue slot i from a state that :meth:`check` let pass and write its last sample into ``out``."""
         saved = (state.slot, state.interface, state.noise, state.history, state.frames)
         for array, values in zip(self.memory, saved, strict=True):
             array[i] = values

@@ -116,12 +116,14 @@ class CzEnv(gym.Env[Observation, Action]):
         on from a value of :meth:`get_state`. Raises ValueError for other options.
         """
         given = check_options(options)
+        scenario = find_scenario(given["scenario"]) if "scenario" in given else None
+        if "state" in given:
+            self._check_state(given["state"])
         super().reset(seed=seed)
-        self._out = self._batch.new_out()
         if "state" in given:
             self.set_state(given["state"])
         else:
-            scenario = find_scenario(given["scenario"]) if "scenario" in given else None
+            self._out = self._batch.new_out()
             self._batch.reset([0], [new_key(self.np_random)], self._out, scenario)
         self._over = bool(self._slots["over"][0])
         return self._observation(), self._info()
@@ -146,12 +148,16 @@ class CzEnv(gym.Env[Observation, Action]):
 
     def set_state(self, state: EnvState) -> None:
         """Continue from a value of :meth:`get_state`; ValueError if it was saved under other settings."""
-        if not isinstance(state, EnvState):
-            raise ValueError(f"expected a state made by get_state, not {type(state).__name__}")
+        self._check_state(state)
         self._out = self._batch.new_out()
         self._batch.restore(0, state.slot, self._out)
         self.np_random.bit_generator.state = state.random
         self._over = bool(self._slots["over"][0])
+
+    def _check_state(self, state: Any) -> None:
+        if not isinstance(state, EnvState):
+            raise ValueError(f"expected a state made by get_state, not {type(state).__name__}")
+        self._batch.check(state.slot)
 
     def close(self) -> None:
         """Nothing to close."""

@@ -85,6 +85,9 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         """
         given = check_options(options, ("scenario", "state", "reset_mask"))
         mask = self._reset_mask(given.get("reset_mask"))
+        scenario = find_scenario(given["scenario"]) if "scenario" in given else None
+        if "state" in given:
+            self._check_states(given["state"])
         self._seed(seed, mask)
         previous, self._out = self._out, self._batch.new_out()
         if not mask.all():
@@ -93,7 +96,6 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         if "state" in given:
             self._restore(given["state"], which)
         else:
-            scenario = find_scenario(given["scenario"]) if "scenario" in given else None
             self._batch.reset(which, (new_key(self._random(i)) for i in which), self._out, scenario)
         self._over[mask] = self._batch.memory.slots["over"][mask] > 0
         self._begun = True
@@ -108,11 +110,11 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         actions = self._check_actions(actions)
         if not self._begun:
             raise ResetNeeded("call reset() first")
+        if self.autoreset_mode == AutoresetMode.DISABLED and self._over.any():
+            raise ResetNeeded(f"{int(self._over.sum())} episodes are over: reset them with options['reset_mask']")
         out = self._out = self._batch.new_out()
         infos: dict[str, Any] = {}
         if self._over.any():
-            if self.autoreset_mode == AutoresetMode.DISABLED:
-                raise ResetNeeded(f"{int(self._over.sum())} episodes are over: reset them with options['reset_mask']")
             self._batch.step(actions, out, ~self._over)
             self._redraw(np.flatnonzero(self._over).tolist(), out)
         else:
@@ -137,6 +139,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
 
     def set_state(self, states: Sequence[EnvState]) -> None:
         """Continue from a value of :meth:`get_state`; ValueError if it was saved under other settings."""
+        self._check_states(states)
         self._out = self._batch.new_out()
         self._restore(states, list(range(self.num_envs)))
         self._over = self._batch.memory.slots["over"] > 0
@@ -200,9 +203,14 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
     def _redraw(self, which: list[int], out: Out) -> None:
         self._batch.reset(which, (new_key(self._random(i)) for i in which), out)
 
-    def _restore(self, states: Sequence[EnvState], which: list[int]) -> None:
-        if len(states) != self.num_envs or not all(isinstance(state, EnvState) for state in states):
+    def _check_states(self, states: Any) -> None:
+        several = isinstance(states, Sequence) and len(states) == self.num_envs
+        if not several or not all(isinstance(state, EnvState) for state in states):
             raise ValueError(f"expected {self.num_envs} states made by get_state, one a slot")
+        for state in states:
+            self._batch.check(state.slot)
+
+    def _restore(self, states: Sequence[EnvState], which: list[int]) -> None:
         for i in which:
             self._batch.restore(i, states[i].slot, self._out)
             self._random(i).bit_generator.state = states[i].random

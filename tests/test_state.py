@@ -118,6 +118,17 @@ def test_a_state_of_other_settings_is_refused(arguments: dict[str, Any]) -> None
         CzEnv(**arguments).set_state(env.get_state())
 
 
+@pytest.mark.parametrize("options", [{"scenario": "nonsense"}, {"state": 3}, {"state": CzEnv("nominal").get_state()}])
+def test_a_refused_reset_changes_nothing(options: dict[str, Any]) -> None:
+    env = CzEnv()
+    env.reset(seed=0)
+    env.step(ACTIONS[0])
+    before = pickle.dumps(env.get_state())
+    with pytest.raises(ValueError, match=r"unknown scenario|get_state|other settings"):
+        env.reset(seed=5, options=options)
+    assert pickle.dumps(env.get_state()) == before
+
+
 def test_what_is_no_state_is_refused() -> None:
     with pytest.raises(ValueError, match="get_state"):
         CzEnv().set_state({"x": 1})  # type: ignore[arg-type]

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import copy
 import math
+import multiprocessing
+import pickle
 from typing import Any
 
 import gymnasium as gym
@@ -164,8 +166,39 @@ def test_the_reset_mask_is_copied_and_the_rest_goes_on() -> None:
     np.testing.assert_array_equal(shown[1:], before[1:])
     _, _, _, truncated, _ = env.step(np.zeros((3, 2)))
     assert truncated.tolist() == [False, True, True]
+    last = env.get_state()
     with pytest.raises(ResetNeeded, match="2 episodes are over"):
         env.step(np.zeros((3, 2)))
+    assert pickle.dumps(env.get_state()) == pickle.dumps(last)
+    kept, _ = env.reset(options={"reset_mask": np.array([False, True, True])})
+    np.testing.assert_array_equal(kept[0], last[0].slot.sample[0])
+
+
+@pytest.mark.parametrize(
+    "options", [{"scenario": "nonsense"}, {"state": 3}, {"state": []}, {"state": [1, 2, 3]}, {"typo": 1}]
+)
+def test_a_refused_reset_changes_nothing(options: dict[str, Any]) -> None:
+    env = CzVectorEnv(3)
+    env.reset(seed=0)
+    env.step(np.zeros((3, 2)))
+    before = pickle.dumps(env.get_state())
+    with pytest.raises(ValueError, match=r"unknown|expected 3 states"):
+        env.reset(seed=5, options=options)
+    assert pickle.dumps(env.get_state()) == before
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_forked_child_steps_on_threads_of_its_own() -> None:
+    env = CzVectorEnv(512, "nominal", threads=2)
+    env.reset(seed=0)
+    env.step(np.zeros((512, 2)))
+    child = multiprocessing.get_context("fork").Process(target=env.step, args=(np.zeros((512, 2)),))
+    child.start()
+    child.join(timeout=60)
+    ended, code = not child.is_alive(), child.exitcode
+    child.kill()
+    env.close()
+    assert (ended, code) == (True, 0)
 
 
 @pytest.mark.parametrize(
