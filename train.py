@@ -48,9 +48,8 @@ def train(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from agents import settings
-    from agents.run import QUICK, Run, saved_steps, validation_rmse
+    from agents.run import Run, saved_steps
     from baselines import CompensatedPID
-    from cz_gym.config import make_config
     from cz_gym.scenarios import find_scenario
 
     find_scenario(arguments.scenario)
@@ -61,8 +60,7 @@ def train(arguments: argparse.Namespace) -> int:
     choice = replace(choice, recipe=replace(choice.recipe, scenario=arguments.scenario))
     steps = arguments.steps or (saved_steps(folder) if arguments.resume else choice.steps)
     choice = replace(choice, steps=steps)
-    paper_config = make_config(arguments.scenario, control_interval=choice.recipe.control_interval)
-    paper, _, _ = validation_rmse(CompensatedPID(choice.recipe.control_interval), paper_config, QUICK)
+    paper = CompensatedPID(choice.recipe.control_interval)
     run = Run(folder, choice, arguments.seed, paper, arguments.resume)
     print(f"{arguments.algo}, seed {arguments.seed}, {choice.steps:,} steps on {arguments.scenario!r}, into {folder}")
     with tqdm(total=choice.steps, unit="step", unit_scale=True, dynamic_ncols=True, mininterval=1.0) as bar:
@@ -76,7 +74,7 @@ def train(arguments: argparse.Namespace) -> int:
     summary = run.finish()
     print(
         f"best agent: {summary['validation_rmse_mm']:.3f} mm mean RMSE on {summary['validation_episodes']} validation "
-        f"episodes, {100 * summary['failure_rate']:.1f} % failures; paper's controller {paper:.3f} mm on {QUICK}"
+        f"episodes, {100 * summary['failure_rate']:.1f} % failures; paper's controller {summary['paper_rmse_mm']:.3f} mm"
     )
     print(f"wrote {folder / 'agent.onnx'}")
     return 0

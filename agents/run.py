@@ -48,8 +48,8 @@ def validation_rmse(policy: Any, config: Config, episodes: int) -> tuple[float, 
 class Run:
     """One training run.
 
-    ``paper_rmse_mm`` (64 validation episodes of the paper's controller) is shown beside the agent's; ``resume`` goes on
-    from the folder's checkpoint. Raises AgentFileError if the folder cannot be used.
+    ``rival``, a policy on "measured" observations, runs the same validation episodes and is shown beside the agent;
+    ``resume`` goes on from the folder's checkpoint. Raises AgentFileError if the folder cannot be used.
     """
 
     def __init__(
@@ -57,14 +57,15 @@ class Run:
         folder: Path,
         choice: settings.PPO | settings.SAC,
         seed: int,
-        paper_rmse_mm: float,
+        rival: Any,
         resume: bool = False,
     ) -> None:
-        self.folder, self.choice, self.seed, self.paper = folder, choice, seed, paper_rmse_mm
+        self.folder, self.choice, self.seed, self.rival = folder, choice, seed, rival
         recipe = choice.recipe
         self.config = make_config(
             recipe.scenario, observation=recipe.observation, control_interval=recipe.control_interval
         )
+        self.rival_rmse_mm = self._validate_rival(QUICK)
         self.best = math.inf
         self.rows: list[dict[str, Any]] = []
         self.began = time.monotonic()
@@ -105,6 +106,7 @@ class Run:
         summary = {
             "validation_episodes": FULL,
             "validation_rmse_mm": rmse,
+            "paper_rmse_mm": self._validate_rival(FULL),
             "pull_step_rms_mm_per_min": activity,
             "failure_rate": failures,
             "training_steps": self.training.learner.num_timesteps,
@@ -112,6 +114,10 @@ class Run:
         }
         _write_json(self.folder / "summary.json", summary)
         return summary
+
+    def _validate_rival(self, episodes: int) -> float:
+        measured = make_config(self.config.scenario, control_interval=self.config.control_interval)
+        return validation_rmse(self.rival, measured, episodes)[0]
 
     def _validate(self, bar: Any) -> None:
         """Export the actor as it stands, run the file itself on validation, keep it if it is the best."""
@@ -130,7 +136,7 @@ class Run:
             "steps": learner.num_timesteps,
             "seconds": round(time.monotonic() - self.began, 1),
             "validation_rmse_mm": rmse,
-            "paper_rmse_mm": self.paper,
+            "paper_rmse_mm": self.rival_rmse_mm,
             "pull_step_rms_mm_per_min": activity,
             "failure_rate": failures,
         }
@@ -139,7 +145,7 @@ class Run:
         learner.logger.record("validation/rmse_mm", rmse)
         learner.logger.record("validation/pull_step_rms_mm_per_min", activity)
         learner.logger.record("validation/failure_rate", failures)
-        bar.set_postfix_str(f"validation RMSE {rmse:.3f} mm, best {self.best:.3f}, paper {self.paper:.3f}")
+        bar.set_postfix_str(f"validation RMSE {rmse:.3f} mm, best {self.best:.3f}, paper {self.rival_rmse_mm:.3f}")
 
     def _facts(self, steps: int, rmse: float) -> dict[str, Any]:
         config = self.config
