@@ -121,6 +121,8 @@ def write_files(files: Mapping[Path, bytes]) -> None:
     waiting: dict[str, Path] = {}
     try:
         for path, content in files.items():
+            if path.is_dir():
+                raise IsADirectoryError(f"{path} is a folder")
             path.parent.mkdir(parents=True, exist_ok=True)
             handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
             waiting[temporary] = path

@@ -1,0 +1,143 @@
+"""Statistics against closed forms: where the bootstrap's answer is known, it must be that."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from cz_gym.evaluation.statistics import Resamples, cvar, differences, means, probability_of_improvement
+
+
+def single(values: np.ndarray) -> np.ndarray:
+    """Episodes of a controller without training seeds, one metric."""
+    return np.asarray(values, float)[None, :, None]
+
+
+def test_interval_of_a_mean_is_the_normal_one(rng: np.random.Generator) -> None:
+    values = rng.normal(2.0, 0.5, 500)
+    (estimate,) = means(single(values), Resamples.draw(500))
+    half = 1.96 * values.std() / np.sqrt(500)
+    assert estimate.mean == pytest.approx(values.mean())
+    assert estimate.n == 500
+    assert estimate.ci95 == pytest.approx((values.mean() - half, values.mean() + half), abs=0.06 * half)
+
+
+def test_interval_of_a_share_is_the_binomial_one() -> None:
+    (estimate,) = means(single(np.repeat([1.0, 0.0], [50, 150])), Resamples.draw(200))
+    assert estimate.ci95 == pytest.approx(np.array(stats.binom(200, 0.25).ppf([0.025, 0.975])) / 200, abs=0.005)
+
+
+def test_intervals_cover_the_truth_as_often_as_they_say(rng: np.random.Generator) -> None:
+    resamples = Resamples.draw(100, count=1000)
+    draws = rng.exponential(1.0, (1, 100, 400))
+    covered = [estimate.ci95[0] <= 1.0 <= estimate.ci95[1] for estimate in means(draws, resamples) if estimate.ci95]
+    assert len(covered) == 400
+    assert np.mean(covered) == pytest.approx(0.94, abs=0.035)
+
+
+def test_every_metric_and_controller_shares_its_resamples(rng: np.random.Generator) -> None:
+    values = rng.normal(0.0, 1.0, 60)
+    resamples = Resamples.draw(60)
+    both = np.stack([values, 3.0 - 2.0 * values], axis=-1)[None]
+    first, second = means(both, resamples)
+    assert first.ci95 is not None
+    assert second.ci95 == pytest.approx((3.0 - 2.0 * first.ci95[1], 3.0 - 2.0 * first.ci95[0]))
+    (shift,) = differences(single(values - 0.1), single(values), resamples)
+    assert shift.mean == pytest.approx(-0.1)
+    assert shift.ci95 == pytest.approx((-0.1, -0.1))
+
+
+def test_paired_difference_is_as_sharp_as_the_differences(rng: np.random.Generator) -> None:
+    crystal, own = rng.normal(0.0, 5.0, 400), rng.normal(-0.2, 0.3, 400)
+    (estimate,) = differences(single(crystal + own), single(crystal), Resamples.draw(400))
+    half = 1.96 * own.std() / np.sqrt(400)
+    assert estimate.ci95 == pytest.approx((own.mean() - half, own.mean() + half), abs=0.08 * half)
+
+
+def test_the_same_data_give_the_same_intervals(rng: np.random.Generator) -> None:
+    values = rng.normal(size=(3, 40, 2))
+    assert means(values, Resamples.draw(40)) == means(values, Resamples.draw(40))
+
+
+def test_one_deterministic_episode_has_no_interval() -> None:
+    resamples = Resamples.draw(1)
+    assert means(single([0.7]), resamples)[0] == (0.7, None, 1)
+    assert differences(single([0.7]), single([0.9]), resamples)[0] == (pytest.approx(-0.2), None, 1)
+    assert probability_of_improvement(np.array([[0.7]]), np.array([[0.9]]), resamples) == (1.0, None, 1)
+    assert cvar(np.array([[0.7]]), resamples) == (pytest.approx(0.7), None, 1)
+
+
+def test_training_seeds_carry_their_own_uncertainty() -> None:
+    """Two seeds at 0 and 1 on identical episodes: a resample's mean is 0, 1/2 or 1 with chances 1/4, 1/2, 1/4."""
+    values = np.stack([np.zeros((30, 1)), np.ones((30, 1))])
+    (estimate,) = means(values, Resamples.draw(30))
+    assert estimate == (0.5, (0.0, 1.0), 30)
+
+
+def test_training_seeds_that_agree_add_nothing(rng: np.random.Generator) -> None:
+    values = rng.normal(size=(1, 50, 3))
+    resamples = Resamples.draw(50)
+    for one, five in zip(means(values, resamples), means(np.repeat(values, 5, axis=0), resamples), strict=True):
+        assert five.mean == pytest.approx(one.mean)
+        assert five.ci95 == pytest.approx(one.ci95)
+
+
+def test_spread_over_seeds_and_episodes_adds_up(rng: np.random.Generator) -> None:
+    """Seed effect plus episode effect: variances of the two resamplings add."""
+    seeds, episodes = rng.normal(0.0, 1.0, 40), rng.normal(0.0, 3.0, 300)
+    values = (seeds[:, None] + episodes[None])[:, :, None]
+    (estimate,) = means(values, Resamples.draw(300))
+    half = 1.96 * np.sqrt(seeds.var() / 40 + episodes.var() / 300)
+    assert estimate.ci95 is not None
+    assert np.diff(estimate.ci95)[0] == pytest.approx(2 * half, rel=0.06)
+
+
+def test_seeds_of_the_reference_are_resampled_on_their_own() -> None:
+    """Both at 0 or 1 by seed: differences of -1 and 1 happen only if the two draws are independent."""
+    values = np.stack([np.zeros((5, 1)), np.ones((5, 1))])
+    (estimate,) = differences(values, values, Resamples.draw(5))
+    assert estimate == (0.0, (-1.0, 1.0), 5)
+
+
+def test_probability_of_improvement_counts_wins_and_half_the_ties() -> None:
+    ours, theirs = np.array([[0.1, 0.2, 0.3, 0.4]]), np.array([[0.2, 0.2, 0.2, 0.5]])
+    estimate = probability_of_improvement(ours, theirs, Resamples.draw(4))
+    assert estimate.mean == (1 + 0.5 + 0 + 1) / 4
+    assert probability_of_improvement(theirs, ours, Resamples.draw(4)).mean == 1 - estimate.mean
+    two_seeds = np.vstack([ours, theirs])
+    assert probability_of_improvement(two_seeds, theirs, Resamples.draw(4)).mean == (estimate.mean + 0.5) / 2
+
+
+def test_cvar_is_the_mean_of_the_worst_twentieth(rng: np.random.Generator) -> None:
+    values = rng.permutation(np.arange(1.0, 101.0))[None]
+    assert cvar(values, Resamples.draw(100)).mean == pytest.approx((96 + 97 + 98 + 99 + 100) / 5)
+
+
+def test_cvar_counts_the_last_episode_in_part() -> None:
+    values = np.arange(1.0, 31.0)[None]
+    assert cvar(values, Resamples.draw(30)).mean == pytest.approx((30 + 0.5 * 29) / 1.5)
+    assert cvar(values[:, :10], Resamples.draw(10)).mean == pytest.approx(10)
+
+
+def test_cvar_of_normal_values_and_its_spread(rng: np.random.Generator) -> None:
+    values = rng.normal(0.0, 1.0, (1, 2000))
+    estimate = cvar(values, Resamples.draw(2000, count=1000))
+    expected = stats.norm.pdf(stats.norm.ppf(0.95)) / 0.05
+    assert estimate.ci95 is not None
+    assert estimate.ci95[0] < expected < estimate.ci95[1]
+    # Asymptotic variance (Brazauskas et al. 2008): ((1 - a) (CVaR - VaR)^2 + var(tail)) / (a n).
+    threshold = stats.norm.ppf(0.95)
+    tail_variance = 1 + threshold * expected - expected**2
+    sd = np.sqrt((0.95 * (expected - threshold) ** 2 + tail_variance) / (0.05 * 2000))
+    assert np.diff(estimate.ci95)[0] == pytest.approx(2 * 1.96 * sd, rel=0.2)
+
+
+def test_cvar_over_seeds_pools_them() -> None:
+    values = np.stack([np.zeros(20), np.arange(20.0)])
+    assert cvar(values, Resamples.draw(20)).mean == pytest.approx((19 + 18) / 2)
+
+
+def test_no_episodes_no_bootstrap() -> None:
+    with pytest.raises(ValueError, match="at least one"):
+        Resamples.draw(0)
