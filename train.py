@@ -73,8 +73,9 @@ def train(arguments: argparse.Namespace) -> int:
             return 130
     summary = run.finish()
     print(
-        f"best agent on {summary['validation_episodes']} validation episodes: {summary['validation_rmse_mm']:.3f} mm "
-        f"mean RMSE, {100 * summary['failure_rate']:.1f} % failures; paper's controller {summary['paper_rmse_mm']:.3f} mm"
+        f"best agent on {summary['validation_episodes']} validation episodes: mean RMSE "
+        f"{summary['validation_rmse_mm']:.3f} mm, {100 * summary['failure_rate']:.1f} % failures; "
+        f"the paper's controller {summary['paper_rmse_mm']:.3f} mm"
     )
     print(f"wrote {folder / 'agent.onnx'}")
     return 0
