@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import tomllib
@@ -108,7 +109,7 @@ def test_wheel_installs_one_package_and_works_outside_the_checkout(wheel: Path, 
     assert {name for name in top if not name.endswith(".dist-info")} == {"cz_gym"}
     for needed in ("py.typed", "baselines/__init__.py", "agents/__init__.py", "evaluation/__init__.py"):
         assert f"cz_gym/{needed}" in names
-    assert not any("test" in name for name in names)
+    assert not any("tests" in Path(name).parts for name in names)
     assert any(name.endswith("licenses/LICENSE") for name in names)
     printed = run(SMOKE.format(baselines="cz_gym.baselines"), tmp_path, tmp_path)
     assert printed == str(tmp_path / "cz_gym" / "__init__.py")
@@ -119,3 +120,12 @@ def test_wheel_carries_the_shipped_agents(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         for file in shipped:
             assert f"cz_gym/agents/models/{file.name}" in archive.namelist()
+
+
+def test_readme_example_runs_as_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    block = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert block is not None
+    exec(compile(block.group(1), "README.md", "exec"), {})
+    number = re.search(r"RMSE.*?([0-9.]+) mm", capsys.readouterr().out)
+    assert number is not None
+    assert 0.0 < float(number.group(1)) < 2.0
