@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -18,13 +18,17 @@ import numpy as np
 import numpy.typing as npt
 
 from .config import Config
-from .episode import GRID, Series, draw_episode, draw_factors, randomised
+from .draws import STREAMS
+from .episode import Series, draw_episode, new_series
 from .kernels import KERNELS, Kernels, build_kernels
+from .law import GRID, law_of
 from .meniscus import HURLE, MeniscusModel
 from .observation import HISTORY, LAGGED, MEASURED, STATE, lags, scales
-from .plant import check_puller
+from .parameters import Parameters
+from .plant import NO_OPERATING_POINT
 from .scenario import MAX_LATENCY, Scenario
-from .slots import INFO, SLOT, Clock, Memory, Out, Reading
+from .slots import INFO, SLOT, Clock, Memory, Out, Reading, info_width
+from .streams import WORDS
 
 SLOTS_PER_THREAD = 256
 """Fewest slots worth a thread of their own."""
@@ -49,12 +53,33 @@ class SlotState:
 
     config_hash: str
     slot: npt.NDArray[Any]
-    interface: npt.NDArray[np.float64]
-    noise: npt.NDArray[np.float64]
+    streams: npt.NDArray[np.uint64]
     history: npt.NDArray[np.float64]
     frames: npt.NDArray[np.float64]
     sample: tuple[npt.NDArray[Any], ...]
     """The slot's rows of the last :class:`cz_gym.slots.Out`."""
+    scenario: Scenario
+    """What the episode was drawn from."""
+    points: tuple[int, int]
+    """Grid points and samples of the whole episode."""
+
+    @property
+    def series(self) -> Series:
+        """What is random at every step, from the start of the episode to its horizon."""
+        key = self.slot["key"].tolist()
+        series = new_series(*self.points)
+        draw_episode(self.scenario, (key[0], key[1]), series)
+        return series
+
+    @property
+    def interface(self) -> npt.NDArray[np.float64]:
+        """dT_i on the 5 s grid [K], shape (grid points,)."""
+        return self.series.interface
+
+    @property
+    def noise(self) -> npt.NDArray[np.float64]:
+        """Camera [m] (NaN: dropped) and pyrometer [K] noise, shape (samples, 2)."""
+        return self.series.noise
 
 
 class Batch:
@@ -74,22 +99,31 @@ class Batch:
             self.channels = len(MEASURED)
         ages = lags(config.control_interval)
         v_0 = config.parameters.v_0
-        self.reading = Reading(scales(MEASURED, v_0), scales(STATE, v_0), ages.newest, ages.oldest)
+        self.reading = Reading(
+            scales(MEASURED, v_0),
+            scales(STATE, v_0),
+            ages.newest,
+            ages.oldest + 1,
+            1.0 / (ages.oldest - ages.newest + 1),
+        )
         depth = int(ages.oldest[-1]) + 2 if config.observation == "history" else 0
-        grid_points = math.ceil(config.horizon / GRID) + 1
+        self.points = math.ceil(config.horizon / GRID) + 1, config.steps + 1
         frames = (
             math.ceil(MAX_LATENCY / config.control_interval)
             + math.ceil((MAX_LATENCY + config.control_interval) / GRID)
             + 2
         )
+        slots = np.zeros(num_envs, SLOT)
         self.memory = Memory(
-            np.zeros(num_envs, SLOT),
-            np.zeros((num_envs, grid_points)),
-            np.zeros((num_envs, config.steps + 1, 2)),
+            slots,
+            slots.view(np.float64).reshape(num_envs, -1),
+            np.zeros((num_envs, STREAMS, WORDS), np.uint64),
             np.zeros((num_envs, depth, len(LAGGED))),
             np.zeros((num_envs, frames, 2)),
         )
         self.memory.slots["over"] = 1
+        self._scenarios = [config.scenario] * num_envs
+        self._parameters = Parameters(*map(float, config.parameters))
         self._actions = np.zeros((num_envs, 2))
         self._all = np.ones(num_envs, np.bool_)
         threads = threads or os.cpu_count() or 1
@@ -106,46 +140,53 @@ class Batch:
             np.empty(n),
             np.empty(n, np.bool_),
             np.empty(n, np.bool_),
-            np.empty((len(INFO), n)),
+            np.empty((len(INFO), info_width(n))),
         )
 
-    def reset(self, which: Iterable[int], keys: Iterable[Key], out: Out, scenario: Scenario | None = None) -> None:
-        """Draw new episodes for the slots ``which`` and write their first sample into ``out``."""
-        config = self.config if scenario is None else self.config.with_scenario(scenario)
-        indices = np.fromiter(which, np.int64)
-        for i, key in zip(indices.tolist(), keys, strict=True):
-            self._draw(i, key, config)
-        self.observe(indices, out)
+    def reset(self, which: Sequence[int], keys: Iterable[Key], out: Out, scenario: Scenario | None = None) -> None:
+        """Draw new episodes for the slots ``which`` and write their first sample into ``out``.
 
-    def observe(self, which: npt.NDArray[np.int64], out: Out) -> None:
-        """Write the first sample of freshly drawn slots."""
-        self.kernels.observe(self.memory, which, self.clock, self.reading, out)
+        Raises ValueError if a drawn puller has no finite operating point.
+        """
+        config = self.config if scenario is None else self.config.with_scenario(scenario)
+        slots = np.array(which, np.int64)
+        self.memory.slots["key"][slots] = np.array(list(keys), np.uint64).reshape(-1, 2)
+        for i in which:
+            self._scenarios[i] = config.scenario
+        arguments = (
+            self.memory, slots, law_of(config.scenario), np.array(config.mix, np.float64), self._parameters,
+            self.clock, self.reading, out,
+        )  # fmt: skip
+        if max(self._run(self.kernels.draw, arguments, len(slots))) >= 0:
+            raise ValueError(NO_OPERATING_POINT)
 
     def step(self, actions: npt.ArrayLike, out: Out, active: npt.NDArray[np.bool_] | None = None) -> None:
         """Advance the active slots by one control interval; actions of shape (num_envs, 2), not NaN."""
         self._actions[:] = actions
         active = self._all if active is None else active
-        arguments: tuple[Any, ...] = (self.memory, self._actions, active, self.clock, self.reading, out)
-        if self._parts == 1:
-            self.kernels.step(*arguments, 0, self.num_envs)
-            return
+        self._run(self.kernels.step, (self.memory, self._actions, active, self.clock, self.reading, out), self.num_envs)
+
+    def _run(self, loop: Any, arguments: tuple[Any, ...], count: int) -> list[Any]:
+        """Run a loop over ``count`` rows, in as many parts as there are threads; what the parts return."""
+        if self._parts == 1 or count < SLOTS_PER_THREAD:
+            return [loop(*arguments, 0, count)]
         if self._pool is None or self._owner != os.getpid():
             # A forked child inherits the pool without its threads and would wait for them for ever.
             self._pool = ThreadPoolExecutor(self._parts - 1, thread_name_prefix="cz-gym")
             self._owner = os.getpid()
-        bounds = np.linspace(0, self.num_envs, self._parts + 1).astype(int).tolist()
-        part = partial(self.kernels.step, *arguments)
+        bounds = np.linspace(0, count, self._parts + 1).astype(int).tolist()
+        part = partial(loop, *arguments)
         futures = [self._pool.submit(part, start, stop) for start, stop in pairwise(bounds[1:])]
-        part(bounds[0], bounds[1])
-        for future in futures:
-            future.result()
+        return [part(bounds[0], bounds[1]), *(future.result() for future in futures)]
 
     def save(self, i: int, out: Out) -> SlotState:
         """A copy of everything slot i is, with its last sample."""
         sample = tuple(np.copy(array[..., i] if name == "info" else array[i]) for name, array in out._asdict().items())
         # array[i] of a structured array is a view that np.copy does not copy; array[i, ...] is an array.
-        slot, interface, noise, history, frames = (array[i, ...].copy() for array in self.memory)
-        return SlotState(self.config.hash, slot, interface, noise, history, frames, sample)
+        slot, _, streams, history, frames = (array[i, ...].copy() for array in self.memory)
+        return SlotState(
+            self.config.hash, slot, streams, history, frames, sample, self._scenarios[i], self.points
+        )  # fmt: skip
 
     def check(self, state: SlotState) -> None:
         """Raise ValueError if this is no saved state, or one saved under other settings."""
@@ -159,9 +200,10 @@ class Batch:
 
     def restore(self, i: int, state: SlotState, out: Out) -> None:
         """Continue slot i from a state that :meth:`check` let pass and write its last sample into ``out``."""
-        saved = (state.slot, state.interface, state.noise, state.history, state.frames)
-        for array, values in zip(self.memory, saved, strict=True):
-            array[i] = values
+        memory = self.memory
+        memory.slots[i], memory.streams[i], memory.history[i] = state.slot, state.streams, state.history
+        memory.frames[i] = state.frames
+        self._scenarios[i] = state.scenario
         for name, array, values in zip(out._fields, out, state.sample, strict=True):
             array[(..., i) if name == "info" else i] = values
 
@@ -170,17 +212,3 @@ class Batch:
         if self._pool is not None:
             self._pool.shutdown()
             self._pool = None
-
-    def _draw(self, i: int, key: Key, config: Config) -> None:
-        memory = self.memory
-        slot = memory.slots[i]
-        factors = draw_factors(config.scenario, config.mix, key)
-        puller = self.kernels.derive(randomised(config.parameters, factors), factors.lam)
-        check_puller(puller)
-        series = Series(memory.interface[i], memory.noise[i], slot["freezes"])
-        episode = draw_episode(config.scenario, key, series)
-        slot["puller"], slot["episode"] = puller, episode
-        slot["x"] = (puller.r_0 + episode.r_c_start, puller.h_0, puller.T_1_0, puller.T_2_0, puller.T_b_0)
-        slot["v_p"], slot["Q_H"], slot["Q_H_slewed"] = puller.v_0, puller.Q_H_0, puller.Q_H_0
-        slot["dT_i"], slot["Q_d"] = memory.interface[i, 0], 0.0
-        slot["integral"], slot["k"], slot["frames"], slot["over"] = 0.0, 0, 0, 0

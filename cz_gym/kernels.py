@@ -1,7 +1,7 @@
-"""The compiled loops: drives, plant, sensors, observation and reward, for one slot or ten thousand.
+"""The compiled loops: draws, drives, plant, sensors, observation and reward, for one slot or ten thousand.
 
 The equations are the functions of :mod:`cz_gym.plant`, :mod:`cz_gym.schedule` and :mod:`cz_gym.task`, compiled
-in; this module says in which order a slot goes through them. Nothing here draws a random number or allocates.
+in; this module says in which order a slot goes through them.
 """
 
 from __future__ import annotations
@@ -11,35 +11,44 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ._compile import hashed, kernel, physics
-from .episode import FREEZES, GRID
+from .draws import draw_episode, draw_factors, randomised, seed_streams
+from .fluctuation import interface_temperature, move_fluctuation, start_fluctuation
+from .law import GRID, Stream
 from .meniscus import HURLE, MeniscusModel
-from .observation import CLIP, INTEGRAL_SCALE, LAGGED, MEASURED, PREVIEWS, STATE, Measured
-from .plant import Disturbance, Inputs, State, derive_puller, growth, rk4
-from .schedule import bias_offset, disturbance, pyrometer_drift, recipe, reference, ripple
-from .slots import INFO
+from .plant import Disturbance, Inputs, State, derive_puller, hidden_load, rk4
+from .readings import clip, measure, recall, remember, write_info, write_measured, write_state
+from .schedule import drift, melt_left, reference
+from .sensing import photograph, sense
+from .slots import EPISODE_AT, INFO, PULLER_AT
 from .task import HEATER_RANGE, HEIGHT_MAX_IN_A, HEIGHT_MIN, Cost, cost_terms, failure_penalty, reward, within_limits
 
-_AHEAD_1, _AHEAD_2 = PREVIEWS[1:]
-_M, _S, _L = len(MEASURED), len(STATE), len(LAGGED)
-_RING_SCALE = MEASURED[0].scale
 _EPS = 1e-9
 _CLIPPED = INFO.index("action_clipped")
 _JUMP = HEIGHT_MIN
+_INTERFACE = int(Stream.INTERFACE)
 
 
 @physics
-def _clip(value: Any, limit: Any) -> Any:
-    return np.minimum(np.maximum(value, -limit), limit)
+def _begin(slot: Any, streams: Any) -> None:
+    """Put a slot with drawn constants at the start of its episode."""
+    p, e = slot.puller, slot.episode
+    slot.x.r_c, slot.x.h_c = p.r_0 + e.r_c_start, p.h_0
+    slot.x.T_1, slot.x.T_2, slot.x.T_b = p.T_1_0, p.T_2_0, p.T_b_0
+    slot.v_p, slot.Q_H, slot.Q_H_slewed = p.v_0, p.Q_H_0, p.Q_H_0
+    slot.fast, slot.slow = start_fluctuation(e, streams[_INTERFACE])
+    slot.dT_i, slot.Q_d, slot.drift = interface_temperature(slot.fast, slot.slow, e), 0.0, np.nan
+    slot.integral = 0.0
+    slot.k = slot.grid = slot.frames = slot.over = 0
 
 
 @physics
 def _drive(slot: Any, pull: Any, heat: Any, interval: Any) -> None:
     """Move the drives towards an action within window and slew, the heater in whole steps."""
     p, e = slot.puller, slot.episode
-    wanted = p.v_0 + _clip(p.v_0 * _clip(pull, 1.0), e.pull_window)
-    slot.v_p = slot.v_p + _clip(wanted - slot.v_p, e.pull_slew * interval)
-    power = p.Q_H_0 + HEATER_RANGE * _clip(heat, 1.0)
-    slot.Q_H_slewed = slot.Q_H_slewed + _clip(power - slot.Q_H_slewed, e.heater_slew * interval)
+    wanted = p.v_0 + clip(p.v_0 * clip(pull, 1.0), e.pull_window)
+    slot.v_p = slot.v_p + clip(wanted - slot.v_p, e.pull_slew * interval)
+    power = p.Q_H_0 + HEATER_RANGE * clip(heat, 1.0)
+    slot.Q_H_slewed = slot.Q_H_slewed + clip(power - slot.Q_H_slewed, e.heater_slew * interval)
     slot.Q_H = slot.Q_H_slewed
     if e.heater_step > 0.0:
         slot.Q_H = p.Q_H_0 + e.heater_step * np.rint((slot.Q_H_slewed - p.Q_H_0) / e.heater_step)
@@ -62,28 +71,22 @@ def _substep(x: Any, u: Any, d: Any, p: Any, dt: Any, r_ref: Any, slope: Any) ->
 
 
 @physics
-def _photograph(slot: Any, frames: Any, t: Any, ring_offset: Any) -> None:
-    """Keep the ring, less the operator's bias, as a frame taken at t."""
-    p, x = slot.puller, slot.x
-    at = slot.frames % frames.shape[0]
-    frames[at, 0] = t
-    frames[at, 1] = x.r_c + ring_offset(x.r_c, _height_inside(x.h_c, p), p) - p.ring_bias
-    slot.frames = slot.frames + 1
+def _disturb(slot: Any, stream: Any, j: Any) -> Any:
+    """The disturbance at grid point j; the hidden load is solved only while the drift moves."""
+    p, e = slot.puller, slot.episode
+    if slot.grid < j:
+        while slot.grid < j:
+            slot.fast, slot.slow = move_fluctuation(slot.fast, slot.slow, e, stream)
+            slot.grid = slot.grid + 1
+        slot.dT_i = interface_temperature(slot.fast, slot.slow, e)
+    shift = drift(j * GRID, e)
+    if shift != slot.drift:
+        slot.drift, slot.Q_d = shift, hidden_load(shift, p)
+    return Disturbance(slot.Q_d, slot.dT_i, melt_left(j * GRID, e))
 
 
 @physics
-def _delivered(slot: Any, frames: Any, t: Any) -> Any:
-    """Index of the newest frame as old as the latency, or of the oldest there is."""
-    depth = frames.shape[0]
-    index = slot.frames - 1
-    oldest = max(slot.frames - depth, 0)
-    while index > oldest and frames[index % depth, 0] > t - slot.episode.latency + _EPS:
-        index -= 1
-    return index % depth
-
-
-@physics
-def _advance(slot: Any, interface: Any, frames: Any, clock: Any, slope: Any, ring_offset: Any) -> Any:
+def _advance(slot: Any, stream: Any, frames: Any, clock: Any, slope: Any, ring_offset: Any) -> Any:
     """Integrate over one control interval, split at the 5 s grid; returns whether the crystal still grows."""
     p, e = slot.puller, slot.episode
     u = Inputs(slot.v_p, slot.Q_H)
@@ -93,128 +96,13 @@ def _advance(slot: Any, interface: Any, frames: Any, clock: Any, slope: Any, rin
     while grows and t < end - _EPS:
         j = int(t / GRID + _EPS)
         upto = min((j + 1) * GRID, end)
-        d = disturbance(j * GRID, interface[j], e, p)
-        x, grows = _substep(x, u, d, p, upto - t, p.r_0 + reference(upto, e), slope)
-        slot.dT_i = d.dT_i
-        slot.Q_d = d.Q_d
-        slot.x.r_c = x.r_c
-        slot.x.h_c = x.h_c
-        slot.x.T_1 = x.T_1
-        slot.x.T_2 = x.T_2
-        slot.x.T_b = x.T_b
+        x, grows = _substep(x, u, _disturb(slot, stream, j), p, upto - t, p.r_0 + reference(upto, e), slope)
         t = upto
         if e.latency > 0.0 and t < end - _EPS:
-            _photograph(slot, frames, t, ring_offset)
+            photograph(slot, frames, t, x.r_c + ring_offset(x.r_c, _height_inside(x.h_c, p), p) - p.ring_bias)
+    slot.x.r_c, slot.x.h_c, slot.x.T_1, slot.x.T_2, slot.x.T_b = x.r_c, x.h_c, x.T_1, x.T_2, x.T_b
+    slot.k = slot.k + 1
     return grows
-
-
-@physics
-def _sense(slot: Any, noise: Any, frames: Any, t: Any) -> None:
-    """Read pyrometer and camera at sample k; a frozen or dropped sample shows the last ring again."""
-    e = slot.episode
-    slot.T_1 = slot.x.T_1 + pyrometer_drift(t, e) + noise[slot.k, 1]
-    camera = noise[slot.k, 0]
-    invalid = np.isnan(camera)
-    stuck = invalid
-    for which in range(FREEZES):
-        if slot.freezes[which, 0] <= t < slot.freezes[which, 1]:
-            stuck = True
-            invalid = invalid or which < FREEZES - 1
-    slot.valid = 0.0 if invalid else 1.0
-    if not stuck or slot.k == 0:
-        at = _delivered(slot, frames, t)
-        slot.ring = frames[at, 1] + bias_offset(t, e)
-        if e.ripple_amplitude > 0.0:
-            slot.ring = slot.ring + ripple(frames[at, 0], e)
-        if not np.isnan(camera):
-            slot.ring = slot.ring + camera
-
-
-@physics
-def _measure(slot: Any, t: Any) -> Any:
-    """The "measured" channels in SI units."""
-    p, e = slot.puller, slot.episode
-    r_ref = reference(t, e)
-    return Measured(
-        slot.ring - p.r_0 - r_ref,
-        slot.valid,
-        r_ref,
-        reference(t + _AHEAD_1, e),
-        reference(t + _AHEAD_2, e),
-        recipe(t, e),
-        recipe(t + _AHEAD_1, e),
-        recipe(t + _AHEAD_2, e),
-        slot.T_1 - p.T_1_0,
-        slot.v_p - p.v_0,
-        slot.Q_H - p.Q_H_0,
-    )
-
-
-@physics
-def _remember(slot: Any, out: Any, history: Any, interval: Any) -> None:
-    """Add the sample's scaled channels to the running sums, and the ring error to its integral."""
-    depth = history.shape[0]
-    values = (out[0], out[9], out[8], out[10])
-    if slot.k == 0:
-        for back in range(depth):
-            history[depth - 1 - back, 0] = -values[0] * back
-            for channel in range(1, _L):
-                history[depth - 1 - back, channel] = 0.0
-    else:
-        step = values[0] * (_RING_SCALE / INTEGRAL_SCALE) * interval
-        slot.integral = _clip(slot.integral + step, CLIP)
-    at = slot.k % depth
-    before = at - 1 if at > 0 else depth - 1
-    for channel in range(_L):
-        history[at, channel] = history[before, channel] + values[channel]
-
-
-@physics
-def _recall(slot: Any, history: Any, newest: Any, oldest: Any, out: Any) -> None:
-    """Write the integral and the means of the remembered samples."""
-    depth = history.shape[0]
-    at = slot.k % depth
-    out[_M] = slot.integral
-    for lag in range(newest.size):
-        upto, before = at - newest[lag], at - oldest[lag] - 1
-        upto = upto + depth if upto < 0 else upto
-        before = before + depth if before < 0 else before
-        count = oldest[lag] - newest[lag] + 1
-        for channel in range(_L):
-            mean = (history[upto, channel] - history[before, channel]) / count
-            out[_M + 1 + lag * _L + channel] = _clip(mean, CLIP)
-
-
-@physics
-def _write_state(slot: Any, measured: Any, t: Any, scales: Any, out: Any) -> None:
-    """Write the "state" channels."""
-    p, x = slot.puller, slot.x
-    truth = (
-        x.r_c - p.r_0 - measured.r_ref, x.h_c - p.h_0, x.T_1 - p.T_1_0, x.T_2 - p.T_2_0, x.T_b - p.T_b_0,
-        measured.r_ref, measured.r_ref_1min, measured.r_ref_5min,
-        measured.T_1_ref, measured.T_1_ref_1min, measured.T_1_ref_5min,
-        measured.v_p, measured.Q_H, slot.dT_i, slot.Q_d, bias_offset(t, slot.episode), p.lam,
-    )  # fmt: skip
-    for channel in range(_S):
-        out[channel] = _clip(truth[channel] / scales[channel], CLIP)
-
-
-@physics
-def _write_info(slot: Any, measured: Any, cost: Any, t: Any, slope: Any, ring_offset: Any, info: Any) -> None:
-    """Write the info rows, all but the last."""
-    p, x = slot.puller, slot.x
-    h_c = _height_inside(x.h_c, p)
-    d = Disturbance(slot.Q_d, slot.dT_i, 1.0)
-    at_interface = growth(State(x.r_c, h_c, x.T_1, x.T_2, x.T_b), d, p, slope)
-    values = (
-        x.r_c, x.r_c + ring_offset(x.r_c, h_c, p), p.r_0 + measured.r_ref, x.h_c,
-        np.arctan2(at_interface.sin_alpha, at_interface.cos_alpha), at_interface.v_g,
-        slot.v_p, slot.Q_H, x.T_1, p.T_1_0 + measured.T_1_ref, x.T_b,
-        slot.ring + p.ring_bias, bias_offset(t, slot.episode),
-        cost.radius, cost.pull, cost.pull_step, cost.heater_step,
-    )  # fmt: skip
-    for row in range(len(values)):
-        info[row] = values[row]
 
 
 class Kernels(NamedTuple):
@@ -222,8 +110,10 @@ class Kernels(NamedTuple):
 
     step: Any
     """``step(memory, actions, active, clock, reading, out, start, stop)``: one control interval of the active slots."""
-    observe: Any
-    """``observe(memory, which, clock, reading, out)``: first sample of the freshly drawn slots ``which``."""
+    draw: Any
+    """``draw(memory, which, law, mix, parameters, clock, reading, out, start, stop)``: new episodes, from the slots'
+    keys, for the slots ``which[start:stop]``, with their first sample; returns a slot whose puller has no operating
+    point, or -1."""
     plant: Any
     """``plant(memory, actions, clock, rings, start, stop)``: drives, plant and ring alone, to measure speed against."""
     derive: Any
@@ -235,21 +125,26 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
     slope, ring_offset, height = meniscus.slope, meniscus.ring_offset, meniscus.height
 
     @physics
-    def sample(memory: Any, i: Any, cost: Any, clock: Any, reading: Any, out: Any) -> None:
-        slot, frames = memory.slots[i], memory.frames[i]
-        t = slot.k * clock.interval
-        _photograph(slot, frames, t, ring_offset)
-        _sense(slot, memory.noise[i], frames, t)
-        measured = _measure(slot, t)
+    def sample(memory: Any, i: Any, v_p: Any, Q_H: Any, clock: Any, reading: Any, out: Any) -> Any:
+        """Read slot i and write what it says; returns the cost of the step from drives v_p, Q_H."""
+        slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
+        t, h_c = slot.k * clock.interval, _height_inside(x.h_c, p)
+        ring = x.r_c + ring_offset(x.r_c, h_c, p)
+        sense(slot, memory.streams[i], memory.frames[i], t, ring - p.ring_bias)
+        measured = measure(slot, t)
         row = out.observation[i]
-        for channel in range(_M):
-            row[channel] = _clip(measured[channel] / reading.measured[channel], CLIP)
+        write_measured(measured, reading.measured, row)
         if memory.history.shape[1] > 0:
-            _remember(slot, row, memory.history[i], clock.interval)
-            _recall(slot, memory.history[i], reading.newest, reading.oldest, row)
+            remember(slot, memory.history[i], clock.interval, row)
+            recall(slot, memory.history[i], reading, row)
         if out.state.shape[1] > 0:
-            _write_state(slot, measured, t, reading.state, out.state[i])
-        _write_info(slot, measured, cost, t, slope, ring_offset, out.info[:, i])
+            write_state(slot, measured, t, reading.state, out.state[i])
+        error = x.r_c - p.r_0 - measured.r_ref
+        cost = cost_terms(error, measured.v_p, slot.v_p - v_p, slot.Q_H - Q_H)
+        if slot.k == 0:
+            cost = Cost(0.0, 0.0, 0.0, 0.0)
+        write_info(slot, measured, cost, t, h_c, ring, slope, out.info[:, i])
+        return cost
 
     def step(memory: Any, actions: Any, active: Any, clock: Any, reading: Any, out: Any, start: int, stop: int) -> None:
         for i in range(start, stop):
@@ -259,42 +154,50 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
             v_p, Q_H = slot.v_p, slot.Q_H
             pull, heat = actions[i, 0], actions[i, 1]
             _drive(slot, pull, heat, clock.interval)
-            grows = _advance(slot, memory.interface[i], memory.frames[i], clock, slope, ring_offset)
-            slot.k = slot.k + 1
-            p = slot.puller
-            radius_error = slot.x.r_c - p.r_0 - reference(slot.k * clock.interval, slot.episode)
-            cost = cost_terms(radius_error, slot.v_p - p.v_0, slot.v_p - v_p, slot.Q_H - Q_H)
+            grows = _advance(slot, memory.streams[i, _INTERFACE], memory.frames[i], clock, slope, ring_offset)
+            cost = sample(memory, i, v_p, Q_H, clock, reading, out)
+            ends = slot.k >= clock.steps
             out.reward[i] = reward(cost) + (0.0 if grows else failure_penalty(slot.k, clock.steps))
             out.terminated[i] = not grows
-            out.truncated[i] = grows and slot.k >= clock.steps
-            slot.over = 1 if (not grows or slot.k >= clock.steps) else 0
-            sample(memory, i, cost, clock, reading, out)
+            out.truncated[i] = grows and ends
+            slot.over = 1 if (not grows or ends) else 0
             out.info[_CLIPPED, i] = 1.0 if (np.abs(pull) > 1.0 or np.abs(heat) > 1.0) else 0.0
 
-    def observe(memory: Any, which: Any, clock: Any, reading: Any, out: Any) -> None:
-        for i in which:
-            slot = memory.slots[i]
-            sample(memory, i, Cost(0.0, 0.0, 0.0, 0.0), clock, reading, out)
-            out.info[_CLIPPED, i] = 0.0
-            out.reward[i] = 0.0
-            out.terminated[i] = False
-            out.truncated[i] = False
-            slot.over = 0
+    def draw(
+        memory: Any, which: Any, law: Any, mix: Any, parameters: Any, clock: Any, reading: Any, out: Any,
+        start: int, stop: int,
+    ) -> int:  # fmt: skip
+        impossible = -1
+        for at in range(start, stop):
+            i = which[at]
+            slot, streams, numbers = memory.slots[i], memory.streams[i], memory.numbers[i]
+            seed_streams(streams, slot.key)
+            factors = draw_factors(law[0], mix, streams)
+            puller = derive_puller(randomised(parameters, factors), factors.lam, height, ring_offset)
+            for number in range(len(puller)):
+                numbers[PULLER_AT + number] = puller[number]
+                impossible = impossible if np.isfinite(puller[number]) else i
+            episode = draw_episode(law[0], streams, slot.freezes)
+            for number in range(len(episode)):
+                numbers[EPISODE_AT + number] = episode[number]
+            _begin(slot, streams)
+            sample(memory, i, slot.v_p, slot.Q_H, clock, reading, out)
+            out.info[_CLIPPED, i], out.reward[i] = 0.0, 0.0
+            out.terminated[i] = out.truncated[i] = False
+        return impossible
 
     def plant(memory: Any, actions: Any, clock: Any, rings: Any, start: int, stop: int) -> None:
         for i in range(start, stop):
-            slot = memory.slots[i]
+            slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
             _drive(slot, actions[i, 0], actions[i, 1], clock.interval)
-            _advance(slot, memory.interface[i], memory.frames[i], clock, slope, ring_offset)
-            slot.k = slot.k + 1
-            x, p = slot.x, slot.puller
+            _advance(slot, memory.streams[i, _INTERFACE], memory.frames[i], clock, slope, ring_offset)
             rings[i] = x.r_c + ring_offset(x.r_c, _height_inside(x.h_c, p), p)
 
     def derive(parameters: Any, lam: float) -> Any:
         return derive_puller(parameters, lam, height, ring_offset)
 
     keep = hashed(*meniscus[1:])
-    return Kernels(*(kernel(loop, keep) for loop in (step, observe, plant, derive)))
+    return Kernels(*(kernel(loop, keep) for loop in (step, draw, plant, derive)))
 
 
 KERNELS = build_kernels()

@@ -134,6 +134,7 @@ class Puller(NamedTuple):
 
 
 NO_DISTURBANCE = Disturbance(0.0, 0.0, 1.0)
+NO_OPERATING_POINT = "these parameters have no finite operating point; check temperatures and conductances"
 
 
 class _RingPuller(NamedTuple):
@@ -186,7 +187,7 @@ def make_puller(parameters: Parameters | None = None, lam: float = 1.0, meniscus
 def check_puller(puller: Puller) -> Puller:
     """Return the puller, or raise ValueError if it has no finite operating point."""
     if not np.all(np.isfinite(puller)):
-        raise ValueError("these parameters have no finite operating point; check temperatures and conductances")
+        raise ValueError(NO_OPERATING_POINT)
     return puller
 
 

@@ -1,6 +1,6 @@
 """What time does to an episode: reference, recipe, hidden drift and melt loss, as pure functions of t [s].
 
-``e`` is an :class:`cz_gym.episode.Episode` or a record with its fields, ``p`` a puller.
+``e`` is an :class:`cz_gym.law.Episode` or a record with its fields, ``p`` a puller.
 """
 
 from __future__ import annotations
@@ -47,10 +47,15 @@ def reference(t: Any, e: Any) -> Any:
 
 
 @physics
+def melt_left(t: Any, e: Any) -> Any:
+    """Share of the melt's heat capacity left [-]."""
+    return 1.0 - e.melt_loss * progress(t, 0.0, SPAN)
+
+
+@physics
 def disturbance(t: Any, dT_i: Any, e: Any, p: Any) -> Any:
     """Disturbance at a point t [s] of the 5 s grid, with the interface fluctuation [K] drawn there."""
-    melt = 1.0 - e.melt_loss * progress(t, 0.0, SPAN)
-    return Disturbance(hidden_load(drift(t, e), p), dT_i, melt)
+    return Disturbance(hidden_load(drift(t, e), p), dT_i, melt_left(t, e))
 
 
 @physics

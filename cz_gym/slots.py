@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .episode import FREEZES, Episode
+from .law import FREEZES, Episode
 from .plant import Puller, State
 
 
@@ -29,6 +29,11 @@ SLOT = np.dtype(
         ("T_1", np.float64),
         ("valid", np.float64),
         ("integral", np.float64),
+        ("fast", np.float64),
+        ("slow", np.float64),
+        ("drift", np.float64),
+        ("key", np.uint64, (2,)),
+        ("grid", np.int64),
         ("k", np.int64),
         ("frames", np.int64),
         ("over", np.int64),
@@ -37,7 +42,10 @@ SLOT = np.dtype(
 )
 """One slot: constants of puller and episode, plant state, drives [m/s, W], the disturbance of the last substep,
 the last readings (``ring`` [m] without the operator's bias, ``T_1`` [K], ``valid``), the integral of the scaled ring
-error, the sample number ``k``, the number of camera frames taken, and whether the episode is over."""
+error, the interface's two processes, the drift [K] that ``Q_d`` belongs to, the episode's key, the grid point that the
+fluctuation stands at, the sample number ``k``, the number of camera frames taken, and whether the episode is over."""
+PULLER_AT, EPISODE_AT = 0, len(Puller._fields)
+"""Where a slot's constants begin, in numbers of eight bytes."""
 
 
 class Clock(NamedTuple):
@@ -54,10 +62,10 @@ class Memory(NamedTuple):
 
     slots: Any
     """Records of :data:`SLOT`, shape (n,)."""
-    interface: Any
-    """dT_i on the grid [K], shape (n, grid points)."""
-    noise: Any
-    """Camera [m] and pyrometer [K] noise, shape (n, samples, 2)."""
+    numbers: Any
+    """The same memory as plain float64, shape (n, numbers a record)."""
+    streams: Any
+    """Random streams of the episode (:mod:`cz_gym.streams`), shape (n, streams, 4)."""
     history: Any
     """Running sums of the remembered channels, circular in time, shape (n, depth, channels); depth 0: none."""
     frames: Any
@@ -78,7 +86,7 @@ class Out(NamedTuple):
     truncated: Any
     """Bool, shape (n,)."""
     info: Any
-    """Rows of :data:`INFO`, float64, shape (rows, n)."""
+    """Rows of :data:`INFO`, float64, shape (rows, n or a little more: see :func:`info_width`)."""
 
 
 class Reading(NamedTuple):
@@ -88,10 +96,12 @@ class Reading(NamedTuple):
     """Scales of the measured channels, shape (channels,)."""
     state: Any
     """Scales of the state channels, shape (channels,)."""
-    newest: Any
+    upto: Any
     """Age of the newest sample of each remembered mean, shape (lags,)."""
-    oldest: Any
-    """Age of the oldest sample of each remembered mean, shape (lags,)."""
+    before: Any
+    """Age of the sample before its oldest, shape (lags,)."""
+    share: Any
+    """One over the samples in it, shape (lags,)."""
 
 
 INFO = (
@@ -100,3 +110,8 @@ INFO = (
     "cost_radius", "cost_pull", "cost_pull_step", "cost_heater_step", "action_clipped",
 )  # fmt: skip
 """Names of the info rows, SI units."""
+
+
+def info_width(n: int) -> int:
+    """Length of an info row for n slots: rows a multiple of 4 KiB apart would share one set of the cache."""
+    return n + 8 if n % 64 == 0 else n

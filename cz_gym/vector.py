@@ -235,7 +235,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
     def _infos(self, out: Out, mask: Mask) -> dict[str, Any]:
         everything = bool(mask.all())
         infos: dict[str, Any] = {}
-        for name, row in zip(INFO, out.info, strict=True):
+        for name, row in zip(INFO, out.info[:, : self.num_envs], strict=True):
             values = row > 0.0 if name == "action_clipped" else row
             infos[name] = values if everything else np.where(mask, values, values.dtype.type(0))
             infos[f"_{name}"] = mask

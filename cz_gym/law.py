@@ -1,0 +1,145 @@
+"""What an episode is drawn from, and what a draw is: a scenario as one flat record, ramps and constants as tuples."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from enum import IntEnum
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from .scenario import MAX_FLAGGED, MAX_UNFLAGGED, Scenario
+
+GRID = 5.0
+"""Interval [s] of the grid on which physical fluctuations live; held in between."""
+FREEZES = MAX_FLAGGED + MAX_UNFLAGGED
+"""Freeze windows an episode can hold; the last is the unflagged one."""
+
+
+class Stream(IntEnum):
+    """The independent random streams of an episode."""
+
+    START = 0
+    PARAMETERS = 1
+    SCHEDULE = 2
+    INTERFACE = 3
+    SENSOR = 4
+    FAULTS = 5
+    DROPOUTS = 6
+    OUTLIERS = 7
+
+
+class Episode(NamedTuple):
+    """What an episode's ramps, sensors and drives are made of; every field a float."""
+
+    r_c_start: float = 0.0
+    """r_c(0) - r_0 [m]."""
+    recipe_start: float = 0.0
+    """Start of the recipe error's ramp [s]."""
+    recipe_duration: float = 1.0
+    """Its length [s]."""
+    recipe_amount: float = 0.0
+    """Its final value [K]."""
+    drift_start: float = 0.0
+    """Start of the hot zone's drift [s]."""
+    drift_duration: float = 1.0
+    """Its length [s]."""
+    drift_amount: float = 0.0
+    """Its final value [K]."""
+    drift_rate: float = 0.0
+    """Steady drift on top [K/s]."""
+    reference_start: float = 0.0
+    """Start of the reference change [s]."""
+    reference_duration: float = 1.0
+    """Its length [s]."""
+    reference_amount: float = 0.0
+    """The change [m]."""
+    melt_loss: float = 0.0
+    """Share of the melt's heat capacity lost over 3 h [-]."""
+    ring_offset: float = 0.0
+    """Constant offset of the ring [m]."""
+    bias_drift_start: float = 0.0
+    """Start of the ring's drift [s]."""
+    bias_drift_duration: float = 1.0
+    """Its length [s]."""
+    bias_drift_amount: float = 0.0
+    """Its final value [m]."""
+    ripple_amplitude: float = 0.0
+    """Amplitude of the ring's ripple [m]."""
+    ripple_omega: float = 0.0
+    """Its angular frequency [rad/s]."""
+    ripple_phase: float = 0.0
+    """Its phase at t = 0 [rad]."""
+    pyrometer_drift: float = 0.0
+    """Drift of the pyrometer over 3 h [K]."""
+    latency: float = 0.0
+    """Age of the newest camera frame [s]."""
+    pull_window: float = math.inf
+    """Largest |v_p - v_0| [m/s]."""
+    pull_slew: float = math.inf
+    """Largest |dv_p/dt| [m/s2]."""
+    heater_slew: float = math.inf
+    """Largest |dQ_H/dt| [W/s]."""
+    heater_step: float = 0.0
+    """Resolution of the heater [W]."""
+    sd_fast: float = 0.0
+    """Standard deviation of the interface's fast fluctuation [K]."""
+    sd_slow: float = 0.0
+    """Standard deviation of its slow fluctuation [K]."""
+    keep_fast: float = 0.0
+    """What the fast fluctuation keeps over the grid's interval [-]."""
+    keep_slow: float = 0.0
+    """What the slow one keeps [-]."""
+    kick_fast: float = 0.0
+    """Standard deviation of what it gains, sqrt(1 - keep_fast^2) [-]."""
+    kick_slow: float = 0.0
+    """What the slow one gains [-]."""
+    camera_sd: float = 0.0
+    """Standard deviation of the ring's white noise [m]."""
+    pyrometer_sd: float = 0.0
+    """Standard deviation of the pyrometer's white noise [K]."""
+    dropout: float = 0.0
+    """Probability that a sample drops out [-]."""
+    outlier_probability: float = 0.0
+    """Probability that a sample carries an outlier [-]."""
+    outlier_sd: float = 0.0
+    """Standard deviation of an outlier [m]."""
+
+
+class Factors(NamedTuple):
+    """A puller's factors on its design parameters, and its mix of models."""
+
+    lam: float = 1.0
+    a: float = 1.0
+    k_l: float = 1.0
+    kappa_12: float = 1.0
+    G_1a: float = 1.0
+    G_2b: float = 1.0
+    kappa_b: float = 1.0
+
+
+def _members(scenario: Scenario) -> list[tuple[str, dict[str, Any]]]:
+    """Each family of a scenario and its members, by name."""
+    return [(family.name, vars(getattr(scenario, family.name))) for family in dataclasses.fields(Scenario)[1:]]
+
+
+def _record(members: dict[str, Any]) -> np.dtype[Any]:
+    return np.dtype([(name, np.float64, (2,) if isinstance(value, tuple) else ()) for name, value in members.items()])
+
+
+LAW = np.dtype([(family, _record(members)) for family, members in _members(Scenario("plain"))])
+"""A scenario as the compiled draws read it: a record of families, each a number or a pair a member."""
+
+
+@lru_cache(maxsize=64)
+def law_of(scenario: Scenario) -> npt.NDArray[Any]:
+    """The scenario's numbers, a read-only array of one :data:`LAW`."""
+    law = np.zeros(1, LAW)
+    for family, members in _members(scenario):
+        for member, value in members.items():
+            law[family][member] = value
+    law.setflags(write=False)
+    return law

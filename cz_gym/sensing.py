@@ -1,0 +1,70 @@
+"""Camera and pyrometer of a slot: frames, latency, noise, drop-outs and freezes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ._compile import physics
+from .fluctuation import drops_out, outlier, white_noise
+from .law import FREEZES, Stream
+from .schedule import bias_offset, pyrometer_drift, ripple
+
+_EPS = 1e-9
+_SENSOR, _DROPOUTS, _OUTLIERS = int(Stream.SENSOR), int(Stream.DROPOUTS), int(Stream.OUTLIERS)
+
+
+@physics
+def photograph(slot: Any, frames: Any, t: Any, ring: Any) -> None:
+    """Keep the ring [m] as a frame taken at t."""
+    at = slot.frames % frames.shape[0]
+    frames[at, 0] = t
+    frames[at, 1] = ring
+    slot.frames = slot.frames + 1
+
+
+@physics
+def _delivered(slot: Any, frames: Any, t: Any) -> Any:
+    """Index of the newest frame as old as the latency, or of the oldest there is."""
+    depth = frames.shape[0]
+    index = slot.frames - 1
+    oldest = max(slot.frames - depth, 0)
+    while index > oldest and frames[index % depth, 0] > t - slot.episode.latency + _EPS:
+        index -= 1
+    return index % depth
+
+
+@physics
+def _freezes(slot: Any, t: Any) -> Any:
+    """Whether the camera is frozen at t, and whether it says so."""
+    frozen, flagged = False, False
+    for which in range(FREEZES):
+        if slot.freezes[which, 0] <= t < slot.freezes[which, 1]:
+            frozen = True
+            flagged = flagged or which < FREEZES - 1
+    return frozen, flagged
+
+
+@physics
+def sense(slot: Any, streams: Any, frames: Any, t: Any, ring: Any) -> None:
+    """Read pyrometer and camera at t; ``ring`` [m] is what a camera without latency sees, less the operator's bias.
+
+    A frozen or dropped sample shows the last reading again.
+    """
+    e = slot.episode
+    camera, pyrometer = white_noise(e, streams[_SENSOR])
+    camera = camera + outlier(e, streams[_OUTLIERS])
+    slot.T_1 = slot.x.T_1 + pyrometer_drift(t, e) + pyrometer
+    lost = drops_out(e, streams[_DROPOUTS])
+    frozen, flagged = _freezes(slot, t)
+    slot.valid = 0.0 if lost or flagged else 1.0
+    taken = t
+    if e.latency > 0.0:
+        photograph(slot, frames, t, ring)
+        at = _delivered(slot, frames, t)
+        taken, ring = frames[at, 0], frames[at, 1]
+    if slot.k == 0 or not (lost or frozen):
+        slot.ring = ring + bias_offset(t, e)
+        if e.ripple_amplitude > 0.0:
+            slot.ring = slot.ring + ripple(taken, e)
+        if not lost:
+            slot.ring = slot.ring + camera
