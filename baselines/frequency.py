@@ -1,0 +1,95 @@
+"""Margins of sampled loops, by python-control from their frequency response (no polynomial of order twenty needed)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.linear import StateSpace
+from cz_gym.plant import Puller
+
+from .optional import require
+from .sampled_loop import Loop, close
+
+Floats = npt.NDArray[np.float64]
+SLOWEST = 1e-4
+"""Lowest frequency of the tables [rad/s]: 17 hours a turn, below the drift of any episode."""
+
+
+class LoopMargins(NamedTuple):
+    """How much one broken place of a stable loop bears; NaN where a bound does not exist."""
+
+    crossover: float
+    """Highest frequency where the loop's gain falls through one [rad/s]."""
+    gain_up: float
+    """Factor by which the gain may grow [-]."""
+    gain_down: float
+    """Factor by which it may fall [-]."""
+    phase_deg: float
+    """Least phase margin over all crossings [degrees]."""
+    delay: float
+    """Least delay that destabilises [s]."""
+    sensitivity: float
+    """Peak of |1/(1 + L)| [-]: 1 over the distance to the critical point."""
+
+
+def frequencies(dt: float, points: int = 2000) -> Floats:
+    """Logarithmic grid [rad/s] from SLOWEST up to the Nyquist frequency."""
+    return np.geomspace(SLOWEST, np.pi / dt, points)
+
+
+def response(system: StateSpace, dt: float, omega: Floats) -> npt.NDArray[np.complex128]:
+    """Frequency response of a discrete single-input single-output system, by python-control."""
+    control = require("control")
+    values: npt.NDArray[np.complex128] = control.ss(*system, dt)(np.exp(1j * omega * dt))
+    return values
+
+
+def opened(controller: StateSpace, puller: Puller, dt: float, at: str) -> StateSpace:
+    """Minus the way around the loop, opened at "camera" (the plant alone is uncertain) or at "v_p" (the paper's view,
+    where what the controller knows of its own pull speed counts as plant)."""
+    A, B, C, D = close(controller, puller, dt, broken=at).pick("r_br" if at == "camera" else "v_p", (at,))
+    return StateSpace(A, B, -C, -D)
+
+
+def crossover(controller: StateSpace, puller: Puller, dt: float, at: str = "camera", points: int = 400) -> float:
+    """Highest frequency [rad/s] where the opened loop's gain falls through one; NaN if it never does."""
+    omega = frequencies(dt, points)
+    gain = np.log(np.abs(response(opened(controller, puller, dt, at), dt, omega)))
+    falls = np.flatnonzero((gain[:-1] > 0.0) & (gain[1:] <= 0.0))
+    if not len(falls):
+        return float("nan")
+    k = falls[-1]
+    share = gain[k] / (gain[k] - gain[k + 1])
+    return float(omega[k] * (omega[k + 1] / omega[k]) ** share)
+
+
+def loop_margins(controller: StateSpace, puller: Puller, dt: float, at: str = "camera") -> LoopMargins:
+    """Margins of the loop opened there; all NaN but the crossover if the closed loop is unstable."""
+    control = require("control")
+    omega = frequencies(dt)
+    found = crossover(controller, puller, dt, at, len(omega))
+    if not close(controller, puller, dt).stable:
+        return LoopMargins(found, *[float("nan")] * 5)
+    values = response(opened(controller, puller, dt, at), dt, omega)
+    gain, phase, _, _, crossing, _ = control.stability_margins(control.frd(values, omega), returnall=True)
+    turns = np.radians(np.mod(phase, 360.0))
+    return LoopMargins(
+        found,
+        _least(gain[gain > 1.0], np.min),
+        _least(gain[gain < 1.0], np.max),
+        _least(np.abs(phase), np.min),
+        _least(turns / crossing, np.min),
+        float(np.max(1.0 / np.abs(1.0 + values))),
+    )
+
+
+def _least(values: Any, pick: Any) -> float:
+    return float(pick(values)) if len(values) else float("nan")
+
+
+def peak(loop: Loop, output: str, cause: str, points: int = 600) -> float:
+    """Largest gain over frequency from a disturbance to an output, SI."""
+    return float(np.abs(response(loop.pick(output, (cause,)), loop.dt, frequencies(loop.dt, points))).max())

@@ -1,0 +1,199 @@
+"""Tune a classical controller within a budget: ``python -m baselines.tune --controller paper-tuned --trials 300``.
+
+Optuna's tree-structured Parzen estimator on the first training seeds, always the same; the best few meet the first
+validation seeds, and the best there is chosen. Test seeds are never touched. Every trial is kept in ``history.csv``;
+the same command goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cz_gym.config import Config, make_config
+from cz_gym.evaluation.files import write_files
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.units import MM_PER_MIN
+
+from .optional import require
+from .tune_spaces import Space, reading, space_of, turned
+
+TRAINING, VALIDATION = range(1_000_000), range(1_000_000, 1_000_500)
+"""Seeds: the first ones of each are used."""
+STEP_PRICE, EXCESS_PRICE, FAILURE_PRICE, RULE_PRICE = 0.2, 20.0, 5.0, 2.0
+"""Prices of pull step RMS and of its excess over what is allowed [mm per mm/min], of failures, of a broken rule [mm]."""
+DIGITS = 4
+"""Significant digits that a knob is turned to."""
+
+
+class Score(NamedTuple):
+    """What a design costs on some episodes."""
+
+    objective: float
+    """Mean RMSE against what a sensor can show, plus the priced pull steps, failures and broken rules [mm]."""
+    rmse_mm: float
+    pull_step_rms_mm_per_min: float
+    failure_rate: float
+    rule_excess: float
+
+
+class Trial(NamedTuple):
+    """One design tried."""
+
+    values: tuple[float, ...]
+    """Where the knobs stood, in the order of the space."""
+    score: Score
+
+
+def build(space: Space, values: Sequence[float]) -> Any:
+    """The controller with its knobs turned."""
+    policy = space.base
+    for knob, value in zip(space.knobs, values, strict=True):
+        policy = turned(policy, knob.path, value)
+    return policy
+
+
+def score(space: Space, values: Sequence[float], config: Config, seeds: Sequence[int]) -> Score:
+    """Cost of a design on those episodes."""
+    policy = build(space, values)
+    found = metrics(rollout(policy, config, seeds))
+    rmse, step = float(found.rmse_observable_mm.mean()), float(found.pull_step_rms_mm_per_min.mean())
+    failures, broken = float(found.failure_rate.mean()), space.rule(policy)
+    excess = max(0.0, step - space.allowed_step / MM_PER_MIN)
+    cost = rmse + STEP_PRICE * step + EXCESS_PRICE * excess + FAILURE_PRICE * failures + RULE_PRICE * broken
+    return Score(cost, rmse, step, failures, broken)
+
+
+def first_values(space: Space) -> tuple[float, ...]:
+    """The base's own knobs, held inside their ranges."""
+    return tuple(float(np.clip(reading(space.base, knob.path), knob.low, knob.high)) for knob in space.knobs)
+
+
+def read_history(path: Path, space: Space) -> list[Trial]:
+    """Trials kept so far; ValueError if the file is of another search."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        rows = list(csv.reader(file))
+    if not rows or rows[0] != _header(space):
+        raise ValueError(f"{path} holds another search than {space.name}'s; move it away or choose another --out")
+    count = len(space.knobs)
+    numbers = [[float(entry) for entry in row] for row in rows[1:]]
+    return [Trial(tuple(row[:count]), Score(*row[count:])) for row in numbers]
+
+
+def write_history(path: Path, space: Space, trials: Sequence[Trial]) -> None:
+    """Keep the trials as CSV."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(_header(space))
+    writer.writerows([*trial.values, *(f"{number:.6g}" for number in trial.score)] for trial in trials)
+    write_files({path: out.getvalue().encode()})
+
+
+def _header(space: Space) -> list[str]:
+    return [*(knob.path for knob in space.knobs), *Score._fields]
+
+
+def search(space: Space, config: Config, episodes: int, trials: int, path: Path, seed: int = 0) -> list[Trial]:
+    """Run the search up to that many trials in all, going on from the history at ``path``."""
+    optuna, tqdm = require("optuna", "agents"), require("tqdm").tqdm
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    done = read_history(path, space)
+    ranges = {k.path: optuna.distributions.FloatDistribution(k.low, k.high, log=k.log) for k in space.knobs}
+    study = optuna.create_study(sampler=_sampler(optuna, seed + len(done)))
+    for trial in done:
+        _tell(optuna, study, ranges, trial)
+    seeds = list(TRAINING[:episodes])
+    bar = tqdm(range(len(done), trials), desc=space.name, initial=len(done), total=trials, disable=None)
+    for number in bar:
+        asked = None if number == 0 else study.ask(ranges)
+        wanted = first_values(space) if asked is None else tuple(asked.params[knob.path] for knob in space.knobs)
+        values = tuple(float(f"{value:.{DIGITS}g}") for value in wanted)
+        trial = Trial(values, score(space, values, config, seeds))
+        if asked is None:
+            _tell(optuna, study, ranges, trial)
+        else:
+            study.tell(asked, trial.score.objective)
+        done.append(trial)
+        write_history(path, space, done)
+        bar.set_postfix(best=f"{min(t.score.objective for t in done):.4f}")
+    return done
+
+
+def _sampler(optuna: Any, seed: int) -> Any:
+    return optuna.samplers.TPESampler(seed=seed, n_startup_trials=30, n_ei_candidates=48, multivariate=False)
+
+
+def _tell(optuna: Any, study: Any, ranges: Any, trial: Trial) -> None:
+    held = {path: float(np.clip(v, d.low, d.high)) for (path, d), v in zip(ranges.items(), trial.values, strict=True)}
+    study.add_trial(optuna.trial.create_trial(params=held, distributions=ranges, value=trial.score.objective))
+
+
+def choose(space: Space, config: Config, trials: Sequence[Trial], finalists: int, episodes: int) -> tuple[Trial, ...]:
+    """The best of the search on the validation seeds, best first there."""
+    best = sorted(dict.fromkeys(trials), key=lambda trial: trial.score.objective)[:finalists]
+    seeds = list(VALIDATION[:episodes])
+    judged = [Trial(trial.values, score(space, trial.values, config, seeds)) for trial in best]
+    return tuple(sorted(judged, key=lambda trial: trial.score.objective))
+
+
+def report(space: Space, config: Config, trials: Sequence[Trial], judged: Sequence[Trial], args: Any) -> str:
+    """What was chosen and how, as JSON."""
+    names = [knob.path for knob in space.knobs]
+    return json.dumps(
+        {
+            "controller": space.name,
+            "scenario": config.scenario.name,
+            "scenario_hash": config.scenario.hash,
+            "trials": len(trials),
+            "training_seeds": [TRAINING[0], TRAINING[args.episodes - 1]],
+            "validation_seeds": [VALIDATION[0], VALIDATION[args.validation - 1]],
+            "chosen": dict(zip(names, judged[0].values, strict=True)),
+            "finalists_on_validation": [t.score._asdict() for t in judged],
+        },
+        indent=2,
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m baselines.tune", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--controller", required=True, help="paper-tuned, paper-filtered, pid-conventional, industrial")
+    parser.add_argument("--scenario", default="randomized", help="scenario to tune on")
+    parser.add_argument("--trials", type=int, default=60, help="trials in all, those of an earlier run included")
+    parser.add_argument("--episodes", type=int, default=60, help="training episodes a trial")
+    parser.add_argument("--finalists", type=int, default=8, help="designs that meet the validation seeds")
+    parser.add_argument("--validation", type=int, default=200, help="validation episodes, at most 500")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the search")
+    parser.add_argument("--out", type=Path, default=Path("results/tuning"), help="folder of histories and choices")
+    args = parser.parse_args(arguments)
+    try:
+        for name, most in (("trials", 100_000), ("episodes", 10_000), ("finalists", 1000), ("validation", 500)):
+            if not 1 <= getattr(args, name) <= most:
+                raise ValueError(f"--{name} must be between 1 and {most}, not {getattr(args, name)}")
+        config = make_config(args.scenario)
+        space = space_of(args.controller, config.scenario.name)
+        folder = args.out / space.name / config.scenario.name
+        trials = search(space, config, args.episodes, args.trials, folder / "history.csv", args.seed)
+        judged = choose(space, config, trials, args.finalists, args.validation)
+        write_files({folder / "chosen.json": (report(space, config, trials, judged, args) + "\n").encode()})
+    except (ValueError, ImportError, OSError) as error:
+        print(f"tune: {error}", file=sys.stderr)
+        return 2
+    print(f"{space.name} on {config.scenario.name}: {judged[0].score}")
+    print(build(space, judged[0].values))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

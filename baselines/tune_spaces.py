@@ -1,0 +1,144 @@
+"""What may be tuned of each classical controller: knobs, their ranges, and rules a design must keep."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cz_gym.linear import radius_model
+from cz_gym.plant import make_puller
+from cz_gym.units import HOUR, MINUTE, MM, MM_PER_MIN
+
+from .compensated_pid import Compensator, SeriesPID
+from .filtered_pid import FilteredPID
+from .frequency import crossover
+from .industrial import Industrial
+from .sampled_loop import linear_controller
+from .temperature_loop import TemperatureLoop
+
+
+class Knob(NamedTuple):
+    """One number of a controller's settings, searched over a range."""
+
+    path: str
+    """Where it stands, fields joined by dots."""
+    low: float
+    high: float
+    log: bool = True
+    """Whether the range is searched logarithmically."""
+
+
+class Space(NamedTuple):
+    """A controller's search."""
+
+    name: str
+    base: Any
+    """Settings that no knob turns, and the first trial."""
+    knobs: tuple[Knob, ...]
+    allowed_step: float
+    """Mean pull step RMS allowed [m/s]."""
+    rule: Callable[[Any], float]
+    """How far a design breaks the controller's own rule; 0 if it keeps it."""
+
+
+HEATER = (
+    Knob("heater.K", 300.0, 10000.0),
+    Knob("heater.T_i", 60.0, 0.5 * HOUR),
+    Knob("heater.share", 0.0, 1.0, log=False),
+    Knob("heater.K_pull", 1.0, 100.0),
+    Knob("heater.T_pull", 3.0 * MINUTE, 3.0 * HOUR),
+    Knob("heater.T_mean", 10.0, 0.5 * HOUR),
+)
+LOOP = (
+    Knob("pid.K_p", 3e-4, 5e-2),
+    Knob("pid.T_i", 300.0, 3.0 * HOUR),
+    Knob("pid.T_d", 30.0, 2000.0),
+    Knob("pid.N", 2.0, 100.0),
+    Knob("T_f", 2.0, 200.0),
+    Knob("T_start", 5.0, 0.5 * HOUR),
+    Knob("ring_lead", -MINUTE, MINUTE, log=False),
+    Knob("K_ff", 0.0, 1.3, log=False),
+    *HEATER,
+)
+COMPENSATOR = (
+    Knob("compensator.gain", -1.0, -0.1, log=False),
+    Knob("compensator.fast", 2e-4, 1e-2),
+    Knob("compensator.slow", 5e-5, 5e-2),
+)
+ROBUST = (Knob("T_track", 10.0, HOUR), Knob("jump", 0.05 * MM, 2.0 * MM))
+"""What matters where drives saturate and readings lie."""
+
+
+def unruled(policy: Any) -> float:
+    """No rule."""
+    return 0.0
+
+
+def over_half_the_zero(policy: FilteredPID) -> float:
+    """The paper's rule for a loop with inverse response: crossover at most half the zero, relative excess [-].
+
+    Sampled loop at the nominal Models I and II.
+    """
+    controller = linear_controller(replace(policy, T_track=np.inf), policy.v_0)
+    excess = 0.0
+    for lam in (1.0, 0.0):
+        puller = make_puller(lam=lam)
+        found = crossover(controller, puller, policy.control_interval)
+        excess = max(excess, found / (0.5 * radius_model(puller).zero) - 1.0)
+    return excess
+
+
+def turned(policy: Any, path: str, value: float) -> Any:
+    """The settings with one knob turned; AttributeError if there is no such knob."""
+    head, _, rest = path.partition(".")
+    inner = getattr(policy, head)
+    return replace(policy, **{head: turned(inner, rest, value) if rest else value})
+
+
+def reading(policy: Any, path: str) -> float:
+    """Where a knob stands."""
+    for name in path.split("."):
+        policy = getattr(policy, name)
+    return float(policy)
+
+
+_STEP = 0.029 * MM_PER_MIN
+_TUNED = FilteredPID(
+    pid=SeriesPID(K_p=0.023, T_i=2600.0, T_d=715.0, N=10.0),
+    compensator=Compensator(gain=-0.57, fast=1.95e-3, slow=7.2e-3),
+    T_f=83.0,
+    T_start=300.0,
+    T_track=300.0,
+    ring_lead=24.0,
+    K_ff=0.87,
+    heater=TemperatureLoop(K=620.0, T_i=250.0, share=0.28, K_pull=4.5, T_pull=310.0, T_mean=41.0),
+)
+_CONVENTIONAL = replace(_TUNED, pid=SeriesPID(K_p=2e-3, T_i=2000.0, T_d=700.0, N=8.0), compensator=None, T_f=20.0)
+SPACES = (
+    Space("paper-tuned", _TUNED, (*LOOP, *COMPENSATOR), _STEP, unruled),
+    Space("paper-filtered", FilteredPID(), (Knob("T_f", 2.0, 200.0),), np.inf, unruled),
+    Space("pid-conventional", _CONVENTIONAL, LOOP, _STEP, over_half_the_zero),
+    Space(
+        "industrial",
+        Industrial(heater=TemperatureLoop(K_pull=3.0)),
+        (Knob("T_f", 1.0, MINUTE), *HEATER),
+        np.inf,
+        unruled,
+    ),
+)
+"""Every search."""
+
+
+def space_of(name: str, scenario: str) -> Space:
+    """The search of that controller; scenarios with limited drives or lying cameras open two more knobs.
+
+    ValueError names the controllers that can be tuned.
+    """
+    for space in SPACES:
+        if space.name == name:
+            more = ROBUST if scenario in ("puller", "sensor-fault") and isinstance(space.base, FilteredPID) else ()
+            return space._replace(knobs=(*space.knobs, *more))
+    raise ValueError(f"nothing to tune for {name!r}; choose from {', '.join(space.name for space in SPACES)}")
