@@ -96,3 +96,21 @@ def test_failure_inside_a_long_interval_is_latched() -> None:
     assert all(math.isfinite(value) for value in info.values())
     assert np.isfinite(observation).all()
     assert gained < -10.0 * 9 + 1
+
+
+def test_failing_at_the_horizon_is_a_failure() -> None:
+    """The same flight with the horizon at its end: terminated, not truncated, and no step left to pay for."""
+
+    def fly(horizon: float) -> tuple[int, float, bool, bool]:
+        env, k = CzEnv("nominal", model="II", horizon=horizon), 0
+        env.reset(seed=0)
+        while True:
+            _, gained, terminated, truncated, _ = env.step(np.array([1.0, 0.0], np.float32))
+            k += 1
+            if terminated or truncated:
+                return k, gained, terminated, truncated
+
+    steps, paid, *_ = fly(10800.0)
+    last, gained, terminated, truncated = fly(5.0 * steps)
+    assert (last, terminated, truncated) == (steps, True, False)
+    assert gained == pytest.approx(paid + 10 * (2160 - steps))
