@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 FOLDER = Path(__file__).resolve().parent / "results" / "benchmark"
 """Where the committed results are."""
+README = FOLDER.parents[1] / "README.md"
+"""Where the committed results are quoted, between two markers."""
 RESULTS = "benchmark.json"
 SHIPPED = ("ppo",)
 """Agents that come with the package."""
@@ -92,12 +94,13 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
     from cz_gym.evaluation.run import Progress, run
 
     plan = make_plan(arguments, command)
-    check_targets(arguments, is_partial(arguments, plan))
+    partial = is_partial(arguments, plan)
+    check_targets(arguments, partial)
     if arguments.out is not None:
         import matplotlib  # noqa: F401  (missing? say so before the work, not after it)
     with Progress(plan.steps, arguments.quiet) as progress:
         done = run(plan, progress)
-    write(arguments.out, arguments.json, done)
+    write(arguments.out, arguments.json, done, quote=not partial)
     if not arguments.quiet:
         print(f"{terminal(done)}\nwrote {', '.join(str(path) for path in (arguments.out, arguments.json) if path)}")
     return 0
@@ -215,21 +218,23 @@ def _nominal() -> Config:
     return ROWS[0].config()
 
 
-def write(folder: Path | None, json: Path | None, done: Benchmark) -> None:
-    """Write the files, all or none."""
+def write(folder: Path | None, json: Path | None, done: Benchmark, quote: bool) -> None:
+    """Write the files, all or none; ``quote`` committed results in the README as well."""
     from cz_gym.evaluation.files import to_csv, to_json, write_files
 
     text = to_json(done).encode()
     files = {json: text} if json else {}
     if folder:
         from cz_gym.evaluation.figures import draw_figures
-        from cz_gym.evaluation.report import markdown
+        from cz_gym.evaluation.report import fill_in, markdown
 
         figures = draw_figures(done)
         files |= {folder / name: image for name, image in figures.items()}
         files[folder / "episodes.csv"] = to_csv(done).encode()
         files[folder / "report.md"] = markdown(done, figures).encode()
         files[folder / RESULTS] = text
+        if quote and folder.resolve() == FOLDER and README.is_file():
+            files[README] = fill_in(README.read_text("utf-8"), done).encode()
     write_files(files)
 
 

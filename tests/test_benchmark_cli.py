@@ -248,6 +248,25 @@ def test_an_overwriting_run_replaces_the_results(tmp_path: Path) -> None:
     assert "No learned agent" in (tmp_path / "report.md").read_text().splitlines()[0]
 
 
+def test_a_full_run_is_quoted_in_the_readme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Full as measured by a smaller protocol; a partial run leaves the page alone."""
+    page = tmp_path / "README.md"
+    page.write_text("before\n<!-- benchmark:begin -->\nold\n<!-- benchmark:end -->\nafter\n")
+    monkeypatch.setattr(benchmark, "FOLDER", tmp_path / "results")
+    monkeypatch.setattr(benchmark, "README", page)
+    arguments = ["--scenarios", "reference-b", "--controllers", "open-loop", "--overwrite", "--quiet"]
+    assert benchmark.main(arguments) == 0
+    assert "old" in page.read_text()
+    monkeypatch.setattr(benchmark, "is_partial", lambda arguments, plan: False)
+    assert benchmark.main(arguments) == 0
+    text = page.read_text()
+    assert text.startswith("before\n<!-- benchmark:begin -->\n")
+    assert text.endswith("\n<!-- benchmark:end -->\nafter\n")
+    assert "old" not in text
+    mean = json.loads((tmp_path / "results" / "benchmark.json").read_text())["results"]["reference-b"]["open-loop"]
+    assert f"| open-loop | {mean['rmse_mm']['mean']:.3f} |" in text
+
+
 def test_an_interrupt_is_one_line_and_writes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -24,7 +24,7 @@ class Style(NamedTuple):
 
 
 def styles(names: Sequence[str]) -> dict[str, Style]:
-    """One style a controller, in the order of the table."""
+    """One style a controller; the first ones are the boldest."""
     return {name: Style(COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]) for i, name in enumerate(names)}
 
 

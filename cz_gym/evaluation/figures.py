@@ -18,7 +18,8 @@ Floats = npt.NDArray[np.float64]
 
 def draw_figures(benchmark: Benchmark) -> dict[str, bytes]:
     """Every figure by file name; a figure with nothing to show is left out."""
-    looks = styles([controller.name for controller in benchmark.controllers])
+    ranked = sorted(benchmark.controllers, key=lambda controller: not controller.learned)
+    looks = styles([controller.name for controller in ranked])
     random = [scenario for scenario in benchmark.scenarios if len(scenario.outcomes[0].sample.seeds) > 1]
     figures = {"crystal.png": crystal(benchmark.scenarios[0], looks)}
     if random:
@@ -97,7 +98,7 @@ def _pareto_point(axis: Any, outcome: Outcome, look: Style, floor: float) -> Non
     x = max(activity.mean, floor)
     if activity.mean < floor:
         axis.annotate(
-            "← 0", (x, error.mean), (0, 6), textcoords="offset points", ha="center", fontsize=8, color=look.colour
+            "← 0", (x, error.mean), (0, -14), textcoords="offset points", ha="center", fontsize=8, color=look.colour
         )
     elif activity.ci95:
         axis.plot(activity.ci95, [error.mean] * 2, color=look.colour, lw=1.2)

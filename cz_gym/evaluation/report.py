@@ -10,6 +10,8 @@ from .results import REFERENCE, SPEED, Benchmark, Outcome, ScenarioResult, Verdi
 from .statistics import Estimate
 
 NOTHING = "-"
+BEGIN, END = "<!-- benchmark:begin -->", "<!-- benchmark:end -->"
+"""Markers around the part of a page that :func:`fill_in` writes."""
 
 
 class Column(NamedTuple):
@@ -75,6 +77,30 @@ def _all_of(count: int, what: str) -> str:
     return f"the only {what}" if count == 1 else f"all {count} {what}s"
 
 
+def summary(benchmark: Benchmark) -> str:
+    """One table: RMSE on every scenario, then drives and failures on the first."""
+    first = benchmark.scenarios[0]
+    extras = (DRIVES[1], DRIVES[3], ERROR[4])
+    headings = [*(scenario.row.name for scenario in benchmark.scenarios), *(column.heading for column in extras)]
+    caption = (
+        f"RMSE of the true radius [mm] on each scenario; the last {len(extras)} columns are of {first.row.name}. "
+        "In brackets: 95 % interval."
+    )
+    rows = []
+    for place, outcome in enumerate(first.outcomes):
+        errors = [_interval(scenario.outcomes[place].means["rmse_mm"], ERROR[0]) for scenario in benchmark.scenarios]
+        others = [_interval(outcome.means[column.metric], column) for column in extras]
+        rows.append((outcome.controller.name, *errors, *others))
+    return f"{caption}\n\n{_table(('controller', *headings), rows)}"
+
+
+def fill_in(page: str, benchmark: Benchmark) -> str:
+    """A page with verdict and summary between its two markers; the page itself if it has none."""
+    before, begin, rest = page.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    return f"{before}{begin}\n{headline(benchmark)}\n\n{summary(benchmark)}\n{end}{after}" if end else page
+
+
 def markdown(benchmark: Benchmark, figures: Iterable[str]) -> str:
     """``report.md``; its first line is :func:`headline`."""
     config = benchmark.scenarios[0].row.config()
@@ -88,6 +114,7 @@ def markdown(benchmark: Benchmark, figures: Iterable[str]) -> str:
         "the radius error counts 8 mm to the end; drives, growth rate and ground-off are those of the time lived. "
         f"No failure in n crystals still allows a rate of up to 3/n, {3 / max(counts) / PERCENT:.2g} % at "
         f"n = {max(counts)}. docs/benchmark.md has the protocol and every formula.",
+        summary(benchmark),
         "## Who took part",
         _table(
             ("controller", "reads", "what it is", "training seeds"),

@@ -70,7 +70,8 @@ def rollout(
     """Run ``policy.predict`` on one episode a seed, batched.
 
     ``progress`` is called with the number of steps done since its last call. A failed episode stops counting; its
-    slot goes on with another crystal that nobody reads.
+    slot goes on with another crystal that nobody reads. A bound with a method ``for_episodes(config, seeds)`` is
+    replaced by what it returns for each batch: so it is told what no controller knows.
     """
     if not seeds:
         raise ValueError("a rollout needs at least one seed")
@@ -83,6 +84,8 @@ def rollout(
 
 def _rollout_chunk(policy: Any, config: Config, seeds: list[int], progress: Callable[[int], None] | None) -> Rollout:
     steps, n = config.steps, len(seeds)
+    if hasattr(policy, "for_episodes"):
+        policy = policy.for_episodes(config, seeds)
     env = CzVectorEnv(n, **_arguments(config))
     signals = Signals(*(np.zeros((steps, n)) for _ in Signals._fields))
     reward, alive = np.zeros((steps, n)), np.zeros((steps, n), np.bool_)
