@@ -78,7 +78,7 @@ def open_loop_response(results: Results, model: str) -> Any:
     axes[0, 0].plot(t, _shown(run, "r_c"), color=BLUE, label="$r_c$")
     axes[0, 0].plot(t, ring, color=ORANGE, label="$r_{br}$ - bias")
     label(axes[0, 0], "", RADII)
-    axes[0, 0].legend(frameon=False, loc="lower right")
+    axes[0, 0].legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(0.03, 0.32))
     inset = axes[0, 0].inset_axes((0.16, 0.55, 0.5, 0.42))
     early = (run.t >= BEFORE) & (run.t <= BEFORE + 300.0)
     inset.plot(t[early], (s.r_c[early] - s.r_c[0]) / (MM * MM), color=BLUE)
@@ -201,7 +201,8 @@ def ramp_response(results: Results, model: str) -> Any:
     radii.plot(t, _shown(run, "r_c"), color=BLUE, label="$r_c$ (true)")
     radii.plot(t, ring, color=ORANGE, linewidth=0.9, label="$r_{br}$ - bias")
     radii.plot(t, run.r_tilde / MM, "--", color=GREEN, label=r"$\tilde r$ (what the controller holds)")
-    label(radii, "", RADII, legend=True)
+    radii.tick_params(labelbottom=True)
+    label(radii, "time [min]", RADII, legend=True)
     for name, text in (("v_p", PULL), ("h_c", HEIGHT), ("v_g", GROWTH), ("alpha_c", CONE)):
         panels[name].plot(t, _shown(run, name), color=BLUE)
         label(panels[name], "time [min]" if name in ("v_g", "alpha_c") else "", text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from cz_gym import HURLE, MeniscusModel, Parameters, make_puller
@@ -11,6 +12,8 @@ from cz_gym.young_laplace import YOUNG_LAPLACE, solve_height
 
 RADII = tuple(radius * MM for radius in (50.0, 62.5, 75.0, 87.5, 100.0, 112.5, 125.0, 137.5, 150.0))
 """Crystal radii compared [m]."""
+RING_SLOPES_DEG = (1.0, 2.0, 3.5, 5.0, 8.0, 12.0)
+"""Slopes of the bright ring compared [degrees]; 3.5 is the plant's."""
 
 
 class Meniscus(NamedTuple):
@@ -45,6 +48,27 @@ def meniscus_at(r_c: float, model: MeniscusModel) -> Meniscus:
 def compare_menisci() -> list[MeniscusPair]:
     """Both menisci at :data:`RADII`."""
     return [MeniscusPair(r_c, meniscus_at(r_c, HURLE), meniscus_at(r_c, YOUNG_LAPLACE)) for r_c in RADII]
+
+
+class RingSlope(NamedTuple):
+    """Coefficient of s in G_m at the operating point, for one slope of the ring."""
+
+    phi_b_deg: float
+    """[degrees]."""
+    hurle: float
+    """[s]."""
+    exact: float
+    """[s]."""
+
+
+def compare_ring_slopes() -> list[RingSlope]:
+    """How G_m depends on the ring's slope on both menisci."""
+    found = []
+    for degrees in RING_SLOPES_DEG:
+        parameters = Parameters(phi_b=math.radians(degrees))
+        leads = [radius_model(make_puller(parameters, meniscus=m), m).lead for m in (HURLE, YOUNG_LAPLACE)]
+        found.append(RingSlope(degrees, *leads))
+    return found
 
 
 def exact_height() -> float:

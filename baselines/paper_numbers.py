@@ -30,7 +30,7 @@ from .paper_experiments import (
     step_comparison,
     trace,
 )
-from .paper_meniscus import MeniscusPair, compare_menisci, exact_height
+from .paper_meniscus import MeniscusPair, RingSlope, compare_menisci, compare_ring_slopes, exact_height
 from .paper_published import MODEL_I, MODEL_II, PID
 
 CUT_OFFS = (1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2)
@@ -78,6 +78,7 @@ class Results:
     cut_offs: list[CutOffResult]
     noise: list[NoiseResult]
     menisci: list[MeniscusPair]
+    ring_slopes: list[RingSlope]
     exact_h: float
     """Exact meniscus height at the operating point [m]."""
 
@@ -136,6 +137,7 @@ def compute(progress: Callable[[str], Any]) -> Results:
         cut_offs=cut_offs,
         noise=noise,
         menisci=compare_menisci(),
+        ring_slopes=compare_ring_slopes(),
         exact_h=exact_height(),
     )
 

@@ -1,6 +1,8 @@
 """The exact meniscus against an independent solver, its limits and its table."""
 
 import math
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -79,6 +81,17 @@ def test_slope_sensitivity_against_the_exact_solution():
         assert rate == pytest.approx((high - low) / (2.0 * step), rel=1e-6)
 
 
+@pytest.mark.parametrize("degrees", [1.0, 3.5, 10.0])
+def test_ring_sensitivity_against_the_exact_solution(degrees):
+    """How fast the ring moves with the height, at the operating point: what G_m hangs on."""
+    step, phi_b = 1e-4 * A, math.radians(degrees)
+    h = float(exact.solve_height(R_0, ALPHA_0, A))
+    low, high = exact.solve(R_0, h + np.array([-step, step]), A, phi_b).ring_offset
+    p = make_puller(Parameters(phi_b=phi_b), meniscus=YOUNG_LAPLACE)
+    model = radius_model(p, YOUNG_LAPLACE)
+    assert model.lead * model.numerator == pytest.approx((high - low) / (2.0 * step), rel=1e-5)
+
+
 def test_shipped_table_is_what_the_command_computes():
     tables = build()
     x = np.linspace(-1.0, 1.0, 9)
@@ -120,3 +133,8 @@ def test_outside_the_table_is_nan():
 def test_no_meniscus_rises_that_high():
     with pytest.raises(ArithmeticError, match="Young-Laplace"):
         exact.solve(0.01, 1.4 * A, A, PHI_B)
+
+
+def test_importing_the_package_does_not_load_the_table():
+    code = "import sys, cz_gym; sys.exit(any('young_laplace' in name for name in sys.modules))"
+    subprocess.run([sys.executable, "-c", code], check=True)
