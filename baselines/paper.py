@@ -26,6 +26,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m baselines.paper", description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("results/paper"), help="folder for the results")
     out: Path = parser.parse_args(arguments).out
+    if out.exists() and not out.is_dir():
+        print(f"baselines.paper: --out must be a folder; {out} is a file", file=sys.stderr)
+        return 2
     try:
         for package in ("control", "matplotlib", "tqdm"):
             require(package)
