@@ -8,7 +8,7 @@ plant without compensator. Radii [m], speeds [m/s], temperatures [K], power [W].
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -62,8 +62,8 @@ class FilteredPID:
 
     control_interval: float = 5.0
     """Time between actions [s]."""
-    pid: SeriesPID = SeriesPID()
-    compensator: Compensator | None = Compensator()
+    pid: SeriesPID = field(default_factory=SeriesPID)
+    compensator: Compensator | None = field(default_factory=Compensator)
     T_f: float = 20.0
     """Measurement filter [s]; 0 is none."""
     jump: float = math.inf
@@ -76,7 +76,7 @@ class FilteredPID:
     """Lead of the ring's target on a moving reference [s]; G_m's own lead coefficient is -46 s."""
     K_ff: float = 0.0
     """Feed-forward of the reference's acceleration, in multiples of the inverse plant [-]."""
-    heater: TemperatureLoop = TemperatureLoop()
+    heater: TemperatureLoop = field(default_factory=TemperatureLoop)
     v_0: float = PULL_SCALE
     """Nominal pull speed of the environment's parameters [m/s]."""
 
@@ -86,7 +86,7 @@ class FilteredPID:
         """Act on "measured" (or "history") observations."""
         array, single = batched(observation)
         seen = decode(array, self.v_0)
-        memory = fresh(state, self._at_rest(seen), episode_start) if _begins(state, episode_start) else state
+        memory = fresh(state, self._at_rest(seen), episode_start)
         dt = self.control_interval
         slope, curvature = _ahead(seen)
         compensated, compensator = self._compensate(seen, memory)
@@ -107,9 +107,7 @@ class FilteredPID:
         zero = np.zeros_like(seen.v_p)
         start = seen.ring_error if self.T_start > 0.0 else zero
         integral = seen.v_p / self.pid.K_p
-        return Memory(
-            np.zeros((len(zero), 2)), zero, start, zero, zero, integral, seen.v_p, *self.heater.at_rest(seen)
-        )
+        return Memory(np.zeros((len(zero), 2)), zero, start, zero, zero, integral, seen.v_p, *self.heater.at_rest(seen))
 
     def _compensate(self, seen: Any, memory: Memory) -> tuple[Floats, Floats]:
         """r_tilde - r_ref [m] and the compensator's state, moved on by the pull speed applied since."""
@@ -126,12 +124,8 @@ class FilteredPID:
 
 
 INVERSE_GAIN = -4.888e-3
-"""Numerator of G_p [1/s]: r'' = INVERSE_GAIN (v_p - v_0) on Model II."""
+"""Numerator of G_p [1/s] (:func:`cz_gym.linear.radius_model`): r'' = INVERSE_GAIN (v_p - v_0) on Model II."""
 _NEAR, _FAR = 1.0 * MINUTE, 5.0 * MINUTE
-
-
-def _begins(state: Any, episode_start: Any) -> bool:
-    return state is None or (episode_start is not None and bool(np.any(episode_start)))
 
 
 def _ahead(seen: Any) -> tuple[Floats, Floats]:

@@ -75,15 +75,21 @@ def loop_margins(controller: StateSpace, puller: Puller, dt: float, at: str = "c
         return LoopMargins(found, *[float("nan")] * 5)
     values = response(opened(controller, puller, dt, at), dt, omega)
     gain, phase, _, _, crossing, _ = control.stability_margins(control.frd(values, omega), returnall=True)
-    turns = np.radians(np.mod(phase, 360.0))
+    late = np.append(np.radians(np.mod(phase, 360.0)) / crossing, _late_at_nyquist(values[-1], dt))
     return LoopMargins(
         found,
         _least(gain[gain > 1.0], np.min),
         _least(gain[gain < 1.0], np.max),
         _least(np.abs(phase), np.min),
-        _least(turns / crossing, np.min),
+        _least(late, np.min),
         float(np.max(1.0 / np.abs(1.0 + values))),
     )
+
+
+def _late_at_nyquist(value: complex, dt: float) -> Floats:
+    """Delay [s] that turns a loop gain above one at the Nyquist frequency, which is real, to the critical side."""
+    turn = np.mod(np.angle(value) + np.pi, 2.0 * np.pi)
+    return np.array([turn * dt / np.pi] if np.abs(value) > 1.0 else [])
 
 
 def _least(values: Any, pick: Any) -> float:

@@ -8,7 +8,7 @@ mm/min, and acts every 5 s; at other control intervals each increment is scaled 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,7 +47,7 @@ class Memory(NamedTuple):
 
 
 def dead_zone(error: npt.ArrayLike) -> Floats:
-    """E of the diameter error e [mm]: 2 e up to 1 mm, flat at +-2 to 2 mm, +-3 beyond."""
+    """E of the diameter error e [mm]: 2 e up to 1 mm, flat (the dead zone) at +-2 from there to 2 mm, +-3 beyond."""
     e = np.asarray(error, np.float64)
     return np.where(np.abs(e) >= 2.0, 3.0 * np.sign(e), np.clip(2.0 * e, -2.0, 2.0))
 
@@ -74,7 +74,7 @@ class Industrial:
     """Share of the newest rate in the averaged one, every 5 s [-]."""
     T_f: float = 10.0
     """Averaging time of the diameter [s]: about two revolutions of the crystal (the logs do not say)."""
-    heater: TemperatureLoop = TemperatureLoop(K_pull=12.0)
+    heater: TemperatureLoop = field(default_factory=TemperatureLoop)
     v_0: float = PULL_SCALE
     """Nominal pull speed of the environment's parameters [m/s]."""
 

@@ -30,7 +30,7 @@ from .tune_spaces import Space, reading, space_of, turned
 TRAINING, VALIDATION = range(1_000_000), range(1_000_000, 1_000_500)
 """Seeds: the first ones of each are used."""
 STEP_PRICE, EXCESS_PRICE, FAILURE_PRICE, RULE_PRICE = 0.2, 20.0, 5.0, 2.0
-"""Prices of pull step RMS and of its excess over what is allowed [mm per mm/min], of failures, of a broken rule [mm]."""
+"""Prices of pull step RMS and its excess over what is allowed [mm per mm/min], of failures and broken rules [mm]."""
 DIGITS = 4
 """Significant digits that a knob is turned to."""
 
