@@ -1,8 +1,8 @@
 """The LQG's eyes: the augmented plant's extended Kalman filter on bright ring and pyrometer.
 
-It predicts through the plant's own equations (or, ``nonlinear=False``, through the linearised ones), with the covariance of
-the linearised plant; the ring's slope is taken where the meniscus is believed to be, because a growing radius nearly
-doubles it and halves the RHP zero. The camera's noise is estimated from the innovations.
+It predicts through the plant's own equations (or, ``nonlinear=False``, through the linearised ones), with the
+covariance of the linearised plant; the ring's slope is taken where the meniscus is believed to be, because a growing
+radius nearly doubles it and halves the RHP zero. The camera's noise is estimated from the innovations.
 """
 
 from __future__ import annotations

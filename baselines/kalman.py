@@ -1,7 +1,7 @@
 """An extended Kalman filter over a batch of slots, one scalar reading at a time.
 
-Every slot carries its own covariance, so that starts, missing frames, a ring whose slope changes with the meniscus and a
-camera of unknown noise need no cases of their own. On a linear plant with constant noise it settles at the Riccati
+Every slot carries its own covariance, so that starts, missing frames, a ring whose slope changes with the meniscus and
+a camera of unknown noise need no cases of their own. On a linear plant with constant noise it settles at the Riccati
 equation's solution.
 """
 
@@ -89,5 +89,5 @@ def steady_state(A: Floats, H: Floats, Q: Floats, R: Floats) -> Floats:
 
     P = A P A' - A P H' (H P H' + R)^-1 H P A' + Q
     """
-    P: Floats = solve_discrete_are(A.T, H.T, Q, R)
+    P: Floats = np.asarray(solve_discrete_are(A.T, H.T, Q, R), np.float64)
     return P

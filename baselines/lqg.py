@@ -1,8 +1,8 @@
 """Linear-quadratic-Gaussian control of pull speed and heater, jointly.
 
-An extended Kalman filter (:mod:`baselines.estimator`) on the augmented plant (:mod:`baselines.lqg_model`), a regulator with
-costs on input moves and five minutes of recipe preview (:mod:`baselines.lqr`). Inputs enter the estimator as the drives
-applied them, so that limits and slew rates never wind anything up.
+An extended Kalman filter (:mod:`baselines.estimator`) on the augmented plant (:mod:`baselines.lqg_model`), a regulator
+with costs on input moves and five minutes of recipe preview (:mod:`baselines.lqr`). Inputs enter the estimator as the
+drives applied them, so that limits and slew rates never wind anything up.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -34,8 +34,8 @@ from .preview import look_ahead, samples_ahead
 class LQGSettings:
     """Everything that is chosen about an LQG; frozen and hashed."""
 
-    noise: NoiseModel = NoiseModel()
-    weights: Weights = Weights()
+    noise: NoiseModel = field(default_factory=NoiseModel)
+    weights: Weights = field(default_factory=Weights)
     lam: float = 0.5
     """Share of conduction at the design point [-]."""
     nonlinear: bool = True
@@ -100,7 +100,7 @@ class LQG:
     settings: LQGSettings = LQGSettings()
     control_interval: float = 5.0
     """Time between actions [s]."""
-    parameters: Parameters = Parameters()
+    parameters: Parameters = field(default_factory=Parameters)
     """Parameters of the nominal puller."""
     meniscus: MeniscusModel = HURLE
 
@@ -122,7 +122,9 @@ class LQG:
         applied = np.stack([seen.v_p, seen.Q_H], axis=-1)
         belief = self._estimate(memory, seen, applied, begins, gains.eye)
         plan = look_ahead(memory.plan, seen, begins, self.control_interval)
-        inputs = self._act(belief.mean, plan, self._previous(memory, applied, begins), gains.regulator)
+        previous = self._previous(memory, applied, begins)
+        share = self.settings.noise.recipe_share
+        inputs = act(belief.mean, plan, previous, gains.regulator, share, self.parameters.v_0)
         action = to_action(inputs[:, 0] / self.parameters.v_0, inputs[:, 1] / HEATER_SCALE, single)
         return action, Memory(*belief, plan, inputs, np.ones(len(array)))
 
@@ -143,16 +145,21 @@ class LQG:
         previous: Floats = applied + np.where(begins[:, None], 0.0, unserved)
         return previous
 
-    def _act(self, estimate: Floats, plan: Floats, previous: Floats, law: Regulator) -> Floats:
-        """Inputs [m/s, W], deviations within the drives' range."""
-        error = estimate.copy()
-        error[:, 0] -= plan[:, 0, 0]
-        ahead = np.diff(plan, axis=-1)
-        moves = -(law.feedback @ np.concatenate([error, previous], axis=-1)[..., None])[..., 0]
-        moves += (ahead[:, :1] @ law.reference)[:, 0]
-        moves += self.settings.noise.recipe_share * (ahead[:, 1:] @ law.drift)[:, 0]
-        limit = np.array([self.parameters.v_0, HEATER_SCALE])
-        return np.clip(previous + moves, -limit, limit)
+
+def act(estimate: Floats, plan: Floats, previous: Floats, law: Regulator, recipe_share: float, v_0: float) -> Floats:
+    """Inputs [m/s, W], deviations within the drives' range, from the previous ones and the plant's state.
+
+    ``estimate`` has shape (n, 10), ``plan`` (n, 2, samples + 1); the drift is expected to follow ``recipe_share`` of
+    the recipe's movement. ``v_0`` is the nominal pull speed [m/s].
+    """
+    error = estimate.copy()
+    error[:, 0] -= plan[:, 0, 0]
+    ahead = np.diff(plan, axis=-1)
+    moves = -(law.feedback @ np.concatenate([error, previous], axis=-1)[..., None])[..., 0]
+    moves += (ahead[:, :1] @ law.reference)[:, 0] + recipe_share * (ahead[:, 1:] @ law.drift)[:, 0]
+    limit = np.array([v_0, HEATER_SCALE])
+    inputs: Floats = np.clip(previous + moves, -limit, limit)
+    return inputs
 
 
 def at_rest(n: int, gains: Gains) -> Memory:

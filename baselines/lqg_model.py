@@ -9,7 +9,7 @@ that lets T_1 agree with the pyrometer without offset. Of the recipe's known mov
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import expm
@@ -78,9 +78,9 @@ class PlantModel(NamedTuple):
     """Covariance of x at the start of an episode, shape (10, 10)."""
 
 
-def load_per_drift(puller: Puller) -> float:
-    """dQ_d/dp at p = 0 [W/K], by complex step through the plant's own static equivalence."""
-    return float(np.imag(hidden_load(complex(0.0, _STEP), puller)) / _STEP)
+def load_per_drift(puller: Puller) -> Any:
+    """dQ_d/dp at p = 0 [W/K], by complex step through the plant's own static equivalence; floats or arrays."""
+    return np.imag(hidden_load(complex(0.0, _STEP), puller)) / _STEP
 
 
 def plant_model(puller: Puller, noise: NoiseModel, dt: float, meniscus: MeniscusModel = HURLE) -> PlantModel:

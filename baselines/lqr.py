@@ -1,8 +1,8 @@
 """Linear-quadratic regulator with costs on input moves, known disturbances and a previewed reference.
 
-States of the regulator are the plant's five and the previous inputs (v, q); its inputs are the moves of both. The cost is
-the reward's, before it saturates. What drives the plant without being moved by it (the disturbance states) enters by a
-Sylvester equation instead of the Riccati equation, which would call an integrating disturbance unstabilisable.
+States of the regulator are the plant's five and the previous inputs (v, q); its inputs are the moves of both. The cost
+is the reward's, before it saturates. What drives the plant without being moved by it (the disturbance states) enters by
+a Sylvester equation instead of the Riccati equation, which would call an integrating disturbance unstabilisable.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def regulator(model: PlantModel, weights: Weights, dt: float, ahead: int) -> Reg
     S = R + B.T @ P @ B
     K = np.linalg.solve(S, B.T @ P @ A + N.T)
     A_c = A - B @ K
-    cross = np.eye(A_c.size // len(A_c) * len(A_d)) - np.kron(A_c.T, A_d.T)
+    cross = np.eye(E.size) - np.kron(A_c.T, A_d.T)
     X = np.linalg.solve(cross, (A_c.T @ P @ E).ravel()).reshape(E.shape)
     K_d = np.linalg.solve(S, B.T @ (P @ E + X @ A_d))
     moves = np.linalg.solve(S, B.T)

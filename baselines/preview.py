@@ -39,5 +39,5 @@ def look_ahead(plan: Floats, seen: Measured, begins: npt.NDArray[np.bool_], dt: 
 def _interpolated(shown: list[Floats], samples: int, dt: float) -> Floats:
     t = np.minimum(np.arange(samples) * dt, PREVIEWS[-1])
     shares = [np.interp(t, PREVIEWS, np.eye(len(PREVIEWS))[i]) for i in range(len(PREVIEWS))]
-    total: Floats = sum(values[:, :, None] * share for values, share in zip(shown, shares, strict=True))  # type: ignore[assignment]
+    total: Floats = sum(values[:, :, None] * share for values, share in zip(shown, shares, strict=True))
     return total

@@ -1,0 +1,145 @@
+"""Bounds made of the LQG's parts: what a perfect model, and what a perfect view of the present, would be worth.
+
+They are told what no controller knows and stand in tables as bounds, never as contenders. What they are told comes
+through ``for_episodes``, which a rollout calls with the episodes it is about to run.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium.utils import seeding
+
+from cz_gym.batch import new_key
+from cz_gym.config import Config
+from cz_gym.episode import draw_factors, randomised
+from cz_gym.observation import HEATER_SCALE, STATE, Measured, scales
+from cz_gym.plant import Puller, hidden_load, make_puller
+
+from . import kalman
+from .lqg import LQG, Gains, LQGSettings, act, solve_each
+from .lqg_model import DRIFT, FAST, PLANT, SLOW, STATES, load_per_drift
+from .policy import Floats, batched, fresh, to_action
+from .preview import look_ahead, samples_ahead
+
+
+def pullers_of(config: Config, seeds: Sequence[int]) -> tuple[Puller, ...]:
+    """The pullers that those seeds draw in their first episode, by the environment's own functions."""
+    pullers = []
+    for seed in seeds:
+        random, _ = seeding.np_random(seed)
+        factors = draw_factors(config.scenario, config.mix, new_key(random))
+        pullers.append(make_puller(randomised(config.parameters, factors), factors.lam, config.meniscus))
+    return tuple(pullers)
+
+
+@dataclass(frozen=True)
+class ToldLQG(LQG):
+    """The LQG with each slot's own puller as its model: what knowing the parameters is worth."""
+
+    told: Gains | None = None
+
+    @property
+    def gains(self) -> Gains:
+        """Gains of the slots' own pullers; RuntimeError before any were told."""
+        if self.told is None:
+            raise RuntimeError("lqg-true is told its pullers by for_episodes(config, seeds), which a rollout calls")
+        return self.told
+
+    def for_episodes(self, config: Config, seeds: Sequence[int]) -> ToldLQG:
+        """The same controller for those episodes, one a slot."""
+        told = solve_each(self.settings, config.control_interval, pullers_of(config, seeds), config.meniscus)
+        return ToldLQG(self.settings, config.control_interval, config.parameters, config.meniscus, told)
+
+
+class Memory(NamedTuple):
+    """What the full-information regulator remembers."""
+
+    fluctuation: Floats
+    """The two parts of the interface fluctuation [K], shape (n, 2)."""
+    drift: Floats
+    """Drift of the hot zone at the last sample [K], shape (n,)."""
+    plan: Floats
+    """Recipe ahead, shape (n, 2, samples + 1)."""
+    begun: Floats
+    """1 once the slot has seen a sample, shape (n,)."""
+
+
+@dataclass(frozen=True)
+class FullInformation:
+    """The LQG's regulator on the true state and the present disturbances ("state" observations); no future.
+
+    It is told each slot's puller too. The interface fluctuation is seen as a sum: a noise-free Kalman filter of two
+    states parts it into fast and slow. The drift is the one whose static load is seen, its rate the last change.
+    """
+
+    settings: LQGSettings = field(default_factory=LQGSettings)
+    told: Gains | None = None
+
+    def for_episodes(self, config: Config, seeds: Sequence[int]) -> FullInformation:
+        """The same regulator for those episodes, one a slot."""
+        pullers = pullers_of(config, seeds)
+        return FullInformation(
+            self.settings, solve_each(self.settings, config.control_interval, pullers, config.meniscus)
+        )
+
+    def predict(
+        self, observation: Any, state: Memory | None = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[npt.NDArray[np.float32], Memory]:
+        """The action and what to remember."""
+        if self.told is None:
+            raise RuntimeError("full-information is told its pullers by for_episodes(config, seeds)")
+        array, single = batched(observation)
+        p, law, dt = self.told.eye.puller, self.told.regulator, self.told.eye.dt
+        v_0 = float(np.ravel(p.v_0)[0])
+        seen = dict(zip((channel.name for channel in STATE), (array * scales(STATE, v_0)).T, strict=True))
+        n = len(array)
+        rest = Memory(np.zeros((n, 2)), np.zeros(n), np.zeros((n, 2, samples_ahead(dt) + 1)), np.zeros(n))
+        memory = fresh(state, rest, episode_start)
+        begins = memory.begun == 0.0
+        fluctuation = self._parted(memory.fluctuation, seen["dT_i"], begins)
+        drift = _drift(seen["Q_d"], p)
+        plan = look_ahead(memory.plan, _recipe(seen), begins, dt)
+        x = np.zeros((n, len(STATES)))
+        x[:, :PLANT] = np.stack([seen[name] for name in ("r_c_error", "h_c", "T_1", "T_2", "T_b")], axis=-1)
+        x[:, 0] += seen["r_ref"]
+        x[:, [FAST, SLOW]] = fluctuation
+        x[:, DRIFT] = drift
+        x[:, DRIFT + 1] = np.where(begins, 0.0, drift - memory.drift) / dt
+        applied = np.stack([seen["v_p"], seen["Q_H"]], axis=-1)
+        inputs = act(x, plan, applied, law, 0.0, v_0)
+        action = to_action(inputs[:, 0] / v_0, inputs[:, 1] / HEATER_SCALE, single)
+        return action, Memory(fluctuation, drift, plan, np.ones(n))
+
+    def _parted(self, old: Floats, total: Floats, begins: npt.NDArray[np.bool_]) -> Floats:
+        noise, dt = self.settings.noise, self.told.eye.dt if self.told else 1.0
+        keep = np.array([math.exp(-dt / noise.fast_tau), math.exp(-dt / noise.slow_tau)])
+        variance = np.array([noise.fast_sd, noise.slow_sd]) ** 2
+        H = np.ones((1, 2))
+        tiny = np.array([[1e-9 * variance.sum()]])
+        P = kalman.steady_state(np.diag(keep), H, np.diag((1.0 - keep**2) * variance), tiny)
+        K = (P @ H.T)[:, 0] / (P.sum() + tiny[0, 0])
+        predicted = old * keep
+        gain = np.where(begins[:, None], variance / variance.sum(), K)
+        parted: Floats = predicted + gain * (total - predicted.sum(axis=-1))[:, None]
+        return parted
+
+
+def _drift(Q_d: Floats, p: Any) -> Floats:
+    """The drift [K] whose static load is Q_d [W], by Newton's method from the linearised one."""
+    slope = load_per_drift(p)
+    drift: Floats = Q_d / slope
+    for _ in range(3):
+        drift = drift - (hidden_load(drift, p) - Q_d) / slope
+    return drift
+
+
+def _recipe(seen: dict[str, Floats]) -> Measured:
+    """The recipe's channels as a "measured" observation has them; what is not the recipe is zero."""
+    zero = np.zeros_like(seen["r_ref"])
+    return Measured(*(seen[name] if "_ref" in name else zero for name in Measured._fields))
