@@ -118,10 +118,10 @@ def test_a_large_batch_holds_the_same_slots_as_a_small_one() -> None:
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("observation", ["measured", "history", "state"])
 def test_nothing_returned_is_written_again(mode: AutoresetMode, observation: str) -> None:
-    env = CzVectorEnv(N, observation=observation, control_interval=20.0, horizon=100.0, autoreset_mode=mode)
+    env = CzVectorEnv(N, observation=observation, control_interval=20.0, horizon=600.0, autoreset_mode=mode)
     kept = [env.reset(seed=0)]
     copies = [copy.deepcopy(kept[0])]
-    for action in actions(14):
+    for action in actions(45):
         result = env.step(action)
         kept.append(result)
         copies.append(copy.deepcopy(result))
@@ -137,10 +137,10 @@ def test_nothing_returned_is_written_again(mode: AutoresetMode, observation: str
 
 @pytest.mark.parametrize("mode", MODES)
 def test_what_is_written_into_a_result_changes_nothing_inside(mode: AutoresetMode) -> None:
-    plain, spoilt = (CzVectorEnv(N, control_interval=20.0, horizon=100.0, autoreset_mode=mode) for _ in range(2))
+    plain, spoilt = (CzVectorEnv(N, control_interval=20.0, horizon=600.0, autoreset_mode=mode) for _ in range(2))
     for env in (plain, spoilt):
         env.reset(seed=0)
-    for action in actions(14):
+    for action in actions(45):
         expected, result = plain.step(action), spoilt.step(action)
         for a, b in zip(expected, result, strict=True):
             equal(a, b)
