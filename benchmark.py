@@ -188,7 +188,8 @@ def _classical(entry: Entry) -> Contender:
     from cz_gym.evaluation.results import Controller
     from cz_gym.evaluation.run import Contender
 
-    return Contender(Controller(entry.name, entry.observation, entry.meaning), lambda config: [entry.make(config)])
+    controller = Controller(entry.name, entry.observation, entry.meaning, told=entry.told)
+    return Contender(controller, lambda config: [entry.make(config)])
 
 
 def _agent(name: str, policies: Sequence[Any]) -> Contender:

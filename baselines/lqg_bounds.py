@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,9 +24,12 @@ from cz_gym.plant import Puller, hidden_load, make_puller
 
 from . import kalman
 from .lqg import LQG, Gains, LQGSettings, act, solve_each
-from .lqg_model import DRIFT, FAST, PLANT, SLOW, STATES, load_per_drift
+from .lqg_model import DRIFT, FAST, PLANT, SLOW, STATES, NoiseModel, load_per_drift
 from .policy import Floats, batched, fresh, to_action
 from .preview import look_ahead, samples_ahead
+
+_TINY = 1e-9
+"""Share of the fluctuations' variance by which their sum is taken to be uncertain, for Riccati's equation."""
 
 
 def pullers_of(config: Config, seeds: Sequence[int]) -> tuple[Puller, ...]:
@@ -102,7 +106,7 @@ class FullInformation:
         rest = Memory(np.zeros((n, 2)), np.zeros(n), np.zeros((n, 2, samples_ahead(dt) + 1)), np.zeros(n))
         memory = fresh(state, rest, episode_start)
         begins = memory.begun == 0.0
-        fluctuation = self._parted(memory.fluctuation, seen["dT_i"], begins)
+        fluctuation = _parted(memory.fluctuation, seen["dT_i"], begins, self.settings.noise, dt)
         drift = _drift(seen["Q_d"], p)
         plan = look_ahead(memory.plan, _recipe(seen), begins, dt)
         x = np.zeros((n, len(STATES)))
@@ -116,18 +120,23 @@ class FullInformation:
         action = to_action(inputs[:, 0] / v_0, inputs[:, 1] / HEATER_SCALE, single)
         return action, Memory(fluctuation, drift, plan, np.ones(n))
 
-    def _parted(self, old: Floats, total: Floats, begins: npt.NDArray[np.bool_]) -> Floats:
-        noise, dt = self.settings.noise, self.told.eye.dt if self.told else 1.0
-        keep = np.array([math.exp(-dt / noise.fast_tau), math.exp(-dt / noise.slow_tau)])
-        variance = np.array([noise.fast_sd, noise.slow_sd]) ** 2
-        H = np.ones((1, 2))
-        tiny = np.array([[1e-9 * variance.sum()]])
-        P = kalman.steady_state(np.diag(keep), H, np.diag((1.0 - keep**2) * variance), tiny)
-        K = (P @ H.T)[:, 0] / (P.sum() + tiny[0, 0])
-        predicted = old * keep
-        gain = np.where(begins[:, None], variance / variance.sum(), K)
-        parted: Floats = predicted + gain * (total - predicted.sum(axis=-1))[:, None]
-        return parted
+
+@lru_cache(maxsize=16)
+def _parting(noise: NoiseModel, dt: float) -> tuple[Floats, Floats, Floats]:
+    """Decay of the two fluctuations over dt [s], Kalman gain on their exactly seen sum, and gain at the start."""
+    keep = np.array([math.exp(-dt / noise.fast_tau), math.exp(-dt / noise.slow_tau)])
+    variance = np.array([noise.fast_sd, noise.slow_sd]) ** 2
+    tiny = _TINY * variance.sum()
+    P = kalman.steady_state(np.diag(keep), np.ones((1, 2)), np.diag((1.0 - keep**2) * variance), np.array([[tiny]]))
+    return keep, P.sum(axis=1) / (P.sum() + tiny), variance / variance.sum()
+
+
+def _parted(old: Floats, total: Floats, begins: npt.NDArray[np.bool_], noise: NoiseModel, dt: float) -> Floats:
+    """The fluctuation [K] parted into fast and slow, shape (n, 2)."""
+    keep, gain, first = _parting(noise, dt)
+    predicted = old * keep
+    parted: Floats = predicted + np.where(begins[:, None], first, gain) * (total - predicted.sum(axis=-1))[:, None]
+    return parted
 
 
 def _drift(Q_d: Floats, p: Any) -> Floats:

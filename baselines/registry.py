@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from cz_gym.config import Config
 
+from . import lqg_settings
 from .compensated_pid import CompensatedPID
 from .open_loop import OpenLoop
 from .policy import Policy
@@ -25,6 +26,8 @@ class Entry:
     """One line for people."""
     default: bool = True
     """Whether a benchmark that names no controllers runs it."""
+    told: bool = False
+    """Whether it is told what no controller knows, which makes it a bound."""
 
 
 def _paper(config: Config) -> Policy:
@@ -39,6 +42,24 @@ CONTROLLERS: tuple[Entry, ...] = (
     Entry("open-loop", lambda config: OpenLoop(), "measured", "nominal pull speed and heater power, no feedback"),
     Entry("paper", _paper, "measured", "the paper's compensator and PID as printed, Table 1"),
     Entry("pid-uncompensated", _pid_uncompensated, "measured", "the same PID without the compensator: unstable"),
+    Entry("lqg", lqg_settings.lqg, "measured", "Kalman filter and LQ regulator of pull and heater, for the reward"),
+    Entry("lqg-quiet", lqg_settings.lqg_quiet, "measured", "the same for low pull activity"),
+    Entry(
+        "lqg-true",
+        lqg_settings.lqg_true,
+        "measured",
+        "bound: lqg told the puller's parameters",
+        default=False,
+        told=True,
+    ),
+    Entry(
+        "full-information",
+        lqg_settings.full_information,
+        "state",
+        "bound: lqg's regulator, true state seen",
+        default=False,
+        told=True,
+    ),
 )
 """Every named controller, in the order of tables."""
 

@@ -32,6 +32,8 @@ class Controller:
     meaning: str
     training_seeds: tuple[int, ...] = ()
     """Training seeds of a learned controller, empty for the others."""
+    told: bool = False
+    """Whether it is told what no controller knows."""
 
     @property
     def learned(self) -> bool:
@@ -40,8 +42,8 @@ class Controller:
 
     @property
     def bound(self) -> bool:
-        """Whether it reads the true state, which no sensor could feed."""
-        return self.observation == "state"
+        """Whether it reads the true state, which no sensor could feed, or is told what no controller knows."""
+        return self.told or self.observation == "state"
 
 
 @dataclass(frozen=True)
