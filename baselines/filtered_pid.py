@@ -112,7 +112,7 @@ class FilteredPID:
     def _compensate(self, seen: Any, memory: Memory) -> tuple[Floats, Floats]:
         """r_tilde - r_ref [m] and the compensator's state, moved on by the pull speed applied since."""
         if self.compensator is None:
-            return seen.ring_error, memory.compensator
+            return seen.ring_error, np.zeros_like(memory.compensator)
         A, B, C = self.compensator.discrete(self.control_interval)
         moved = memory.compensator @ A.T + seen.v_p[:, None] * B
         return seen.ring_error + moved @ C, moved

@@ -66,6 +66,12 @@ def crossover(controller: StateSpace, puller: Puller, dt: float, at: str = "came
     return float(omega[k] * (omega[k + 1] / omega[k]) ** share)
 
 
+def sensitivity(controller: StateSpace, puller: Puller, dt: float, points: int = 400) -> float:
+    """Peak of |1/(1 + L)| with the loop opened at the camera [-]."""
+    values = response(opened(controller, puller, dt, "camera"), dt, frequencies(dt, points))
+    return float(np.max(1.0 / np.abs(1.0 + values)))
+
+
 def loop_margins(controller: StateSpace, puller: Puller, dt: float, at: str = "camera") -> LoopMargins:
     """Margins of the loop opened there; all NaN but the crossover if the closed loop is unstable."""
     control = require("control")

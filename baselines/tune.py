@@ -35,6 +35,19 @@ DIGITS = 4
 """Significant digits that a knob is turned to."""
 
 
+SURVIVE = "hard"
+"""Scenario whose episodes a design tuned on ``randomized`` has to survive as well."""
+
+
+class Episodes(NamedTuple):
+    """What a design is judged on."""
+
+    config: Config
+    seeds: Sequence[int]
+    survive: Sequence[int]
+    """Seeds of the episodes of SURVIVE, for designs tuned on ``randomized``."""
+
+
 class Score(NamedTuple):
     """What a design costs on some episodes."""
 
@@ -62,12 +75,16 @@ def build(space: Space, values: Sequence[float]) -> Any:
     return policy
 
 
-def score(space: Space, values: Sequence[float], config: Config, seeds: Sequence[int]) -> Score:
+def score(space: Space, values: Sequence[float], episodes: Episodes) -> Score:
     """Cost of a design on those episodes."""
     policy = build(space, values)
-    found = metrics(rollout(policy, config, seeds))
+    found = metrics(rollout(policy, episodes.config, episodes.seeds))
     rmse, step = float(found.rmse_observable_mm.mean()), float(found.pull_step_rms_mm_per_min.mean())
-    failures, broken = float(found.failure_rate.mean()), space.rule(policy)
+    failed = found.failure_rate
+    if len(episodes.survive):
+        harder = rollout(policy, episodes.config.with_scenario(SURVIVE), episodes.survive)
+        failed = np.concatenate([failed, harder.failed])
+    failures, broken = float(failed.mean()), space.rule(policy)
     excess = max(0.0, step - space.allowed_step / MM_PER_MIN)
     cost = rmse + STEP_PRICE * step + EXCESS_PRICE * excess + FAILURE_PRICE * failures + RULE_PRICE * broken
     return Score(cost, rmse, step, failures, broken)
@@ -104,7 +121,7 @@ def _header(space: Space) -> list[str]:
     return [*(knob.path for knob in space.knobs), *Score._fields]
 
 
-def search(space: Space, config: Config, episodes: int, trials: int, path: Path, seed: int = 0) -> list[Trial]:
+def search(space: Space, episodes: Episodes, trials: int, path: Path, seed: int = 0) -> list[Trial]:
     """Run the search up to that many trials in all, going on from the history at ``path``."""
     optuna, tqdm = require("optuna", "agents"), require("tqdm").tqdm
     optuna.logging.set_verbosity(optuna.logging.ERROR)
@@ -113,13 +130,12 @@ def search(space: Space, config: Config, episodes: int, trials: int, path: Path,
     study = optuna.create_study(sampler=_sampler(optuna, seed + len(done)))
     for trial in done:
         _tell(optuna, study, ranges, trial)
-    seeds = list(TRAINING[:episodes])
     bar = tqdm(range(len(done), trials), desc=space.name, initial=len(done), total=trials, disable=None)
     for number in bar:
         asked = None if number == 0 else study.ask(ranges)
         wanted = first_values(space) if asked is None else tuple(asked.params[knob.path] for knob in space.knobs)
         values = tuple(float(f"{value:.{DIGITS}g}") for value in wanted)
-        trial = Trial(values, score(space, values, config, seeds))
+        trial = Trial(values, score(space, values, episodes))
         if asked is None:
             _tell(optuna, study, ranges, trial)
         else:
@@ -139,30 +155,38 @@ def _tell(optuna: Any, study: Any, ranges: Any, trial: Trial) -> None:
     study.add_trial(optuna.trial.create_trial(params=held, distributions=ranges, value=trial.score.objective))
 
 
-def choose(space: Space, config: Config, trials: Sequence[Trial], finalists: int, episodes: int) -> tuple[Trial, ...]:
-    """The best of the search on the validation seeds, best first there."""
+def choose(space: Space, trials: Sequence[Trial], finalists: int, episodes: Episodes) -> tuple[Trial, ...]:
+    """The best of the search on other episodes, best first there."""
     best = sorted(dict.fromkeys(trials), key=lambda trial: trial.score.objective)[:finalists]
-    seeds = list(VALIDATION[:episodes])
-    judged = [Trial(trial.values, score(space, trial.values, config, seeds)) for trial in best]
+    judged = [Trial(trial.values, score(space, trial.values, episodes)) for trial in best]
     return tuple(sorted(judged, key=lambda trial: trial.score.objective))
 
 
-def report(space: Space, config: Config, trials: Sequence[Trial], judged: Sequence[Trial], args: Any) -> str:
+def report(
+    space: Space, trials: Sequence[Trial], judged: Sequence[Trial], training: Episodes, validation: Episodes
+) -> str:
     """What was chosen and how, as JSON."""
     names = [knob.path for knob in space.knobs]
-    return json.dumps(
-        {
-            "controller": space.name,
-            "scenario": config.scenario.name,
-            "scenario_hash": config.scenario.hash,
-            "trials": len(trials),
-            "training_seeds": [TRAINING[0], TRAINING[args.episodes - 1]],
-            "validation_seeds": [VALIDATION[0], VALIDATION[args.validation - 1]],
-            "chosen": dict(zip(names, judged[0].values, strict=True)),
-            "finalists_on_validation": [t.score._asdict() for t in judged],
-        },
-        indent=2,
-    )
+    told = {
+        "controller": space.name,
+        "scenario": training.config.scenario.name,
+        "scenario_hash": training.config.scenario.hash,
+        "trials": len(trials),
+        "training_seeds": [training.seeds[0], training.seeds[-1]],
+        "validation_seeds": [validation.seeds[0], validation.seeds[-1]],
+        f"episodes_of_{SURVIVE}_to_survive": [len(training.survive), len(validation.survive)],
+        "chosen": dict(zip(names, judged[0].values, strict=True)),
+        "finalists_on_validation": [trial.score._asdict() for trial in judged],
+    }
+    return json.dumps(told, indent=2) + "\n"
+
+
+def check(args: argparse.Namespace) -> None:
+    """ValueError for a budget out of range."""
+    ranges = {"trials": (1, 100_000), "episodes": (1, 10_000), "survive": (0, 10_000), "finalists": (1, 1000)}
+    for name, (least, most) in {**ranges, "validation": (1, len(VALIDATION))}.items():
+        if not least <= getattr(args, name) <= most:
+            raise ValueError(f"--{name} must be between {least} and {most}, not {getattr(args, name)}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -172,21 +196,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--scenario", default="randomized", help="scenario to tune on")
     parser.add_argument("--trials", type=int, default=60, help="trials in all, those of an earlier run included")
     parser.add_argument("--episodes", type=int, default=60, help="training episodes a trial")
+    parser.add_argument("--survive", type=int, default=30, help="training episodes of hard to survive, on randomized")
     parser.add_argument("--finalists", type=int, default=8, help="designs that meet the validation seeds")
     parser.add_argument("--validation", type=int, default=200, help="validation episodes, at most 500")
     parser.add_argument("--seed", type=int, default=0, help="seed of the search")
     parser.add_argument("--out", type=Path, default=Path("results/tuning"), help="folder of histories and choices")
     args = parser.parse_args(arguments)
     try:
-        for name, most in (("trials", 100_000), ("episodes", 10_000), ("finalists", 1000), ("validation", 500)):
-            if not 1 <= getattr(args, name) <= most:
-                raise ValueError(f"--{name} must be between 1 and {most}, not {getattr(args, name)}")
+        check(args)
         config = make_config(args.scenario)
         space = space_of(args.controller, config.scenario.name)
         folder = args.out / space.name / config.scenario.name
-        trials = search(space, config, args.episodes, args.trials, folder / "history.csv", args.seed)
-        judged = choose(space, config, trials, args.finalists, args.validation)
-        write_files({folder / "chosen.json": (report(space, config, trials, judged, args) + "\n").encode()})
+        survive = args.survive if config.scenario.name == "randomized" else 0
+        training = Episodes(config, TRAINING[: args.episodes], TRAINING[:survive])
+        validation = Episodes(config, VALIDATION[: args.validation], VALIDATION[: args.validation * (survive > 0)])
+        trials = search(space, training, args.trials, folder / "history.csv", args.seed)
+        judged = choose(space, trials, args.finalists, validation)
+        write_files({folder / "chosen.json": report(space, trials, judged, training, validation).encode()})
     except (ValueError, ImportError, OSError) as error:
         print(f"tune: {error}", file=sys.stderr)
         return 2

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.linear import radius_model
-from cz_gym.plant import make_puller
+from cz_gym.linear import StateSpace, radius_model
+from cz_gym.plant import Puller, make_puller
 from cz_gym.units import HOUR, MINUTE, MM, MM_PER_MIN
 
 from .compensated_pid import Compensator, SeriesPID
 from .filtered_pid import FilteredPID
-from .frequency import crossover
+from .frequency import crossover, sensitivity
 from .industrial import Industrial
 from .sampled_loop import linear_controller
 from .temperature_loop import TemperatureLoop
@@ -72,9 +72,26 @@ ROBUST = (Knob("T_track", 10.0, HOUR), Knob("jump", 0.05 * MM, 2.0 * MM))
 """What matters where drives saturate and readings lie."""
 
 
+SENSITIVITY = 2.7
+"""Largest peak of the sensitivity function a tuned loop may have: that of the printed controller [-]."""
+
+
+def nominal_loops(policy: Any) -> tuple[StateSpace, tuple[Puller, Puller]]:
+    """The controller without anti-windup, and the nominal Models I and II."""
+    free = replace(policy, T_track=np.inf) if isinstance(policy, FilteredPID) else policy
+    return linear_controller(free, policy.v_0), (make_puller(lam=1.0), make_puller(lam=0.0))
+
+
 def unruled(policy: Any) -> float:
     """No rule."""
     return 0.0
+
+
+def too_sensitive(policy: FilteredPID) -> float:
+    """How far the peak of the sensitivity function is over SENSITIVITY, relatively, at the worse nominal model [-]."""
+    controller, pullers = nominal_loops(policy)
+    dt = policy.control_interval
+    return max(0.0, *(sensitivity(controller, puller, dt) / SENSITIVITY - 1.0 for puller in pullers))
 
 
 def over_half_the_zero(policy: FilteredPID) -> float:
@@ -82,13 +99,14 @@ def over_half_the_zero(policy: FilteredPID) -> float:
 
     Sampled loop at the nominal Models I and II.
     """
-    controller = linear_controller(replace(policy, T_track=np.inf), policy.v_0)
-    excess = 0.0
-    for lam in (1.0, 0.0):
-        puller = make_puller(lam=lam)
-        found = crossover(controller, puller, policy.control_interval)
-        excess = max(excess, found / (0.5 * radius_model(puller).zero) - 1.0)
-    return excess
+    controller, pullers = nominal_loops(policy)
+    found = (crossover(controller, p, policy.control_interval) / (0.5 * radius_model(p).zero) for p in pullers)
+    return max(0.0, *(ratio - 1.0 for ratio in found))
+
+
+def conventional(policy: FilteredPID) -> float:
+    """Both rules."""
+    return over_half_the_zero(policy) + too_sensitive(policy)
 
 
 def turned(policy: Any, path: str, value: float) -> Any:
@@ -116,11 +134,20 @@ _TUNED = FilteredPID(
     K_ff=0.87,
     heater=TemperatureLoop(K=620.0, T_i=250.0, share=0.28, K_pull=4.5, T_pull=310.0, T_mean=41.0),
 )
-_CONVENTIONAL = replace(_TUNED, pid=SeriesPID(K_p=2e-3, T_i=2000.0, T_d=700.0, N=8.0), compensator=None, T_f=20.0)
+_CONVENTIONAL = FilteredPID(
+    pid=SeriesPID(K_p=3e-3, T_i=1000.0, T_d=400.0, N=6.5),
+    compensator=None,
+    T_f=13.0,
+    T_start=300.0,
+    T_track=300.0,
+    ring_lead=15.0,
+    K_ff=0.1,
+    heater=TemperatureLoop(K=900.0, T_i=65.0, share=0.03, K_pull=2.6, T_pull=200.0, T_mean=340.0),
+)
 SPACES = (
-    Space("paper-tuned", _TUNED, (*LOOP, *COMPENSATOR), _STEP, unruled),
+    Space("paper-tuned", _TUNED, (*LOOP, *COMPENSATOR), _STEP, too_sensitive),
     Space("paper-filtered", FilteredPID(), (Knob("T_f", 2.0, 200.0),), np.inf, unruled),
-    Space("pid-conventional", _CONVENTIONAL, LOOP, _STEP, over_half_the_zero),
+    Space("pid-conventional", _CONVENTIONAL, LOOP, _STEP, conventional),
     Space(
         "industrial",
         Industrial(heater=TemperatureLoop(K_pull=3.0)),
