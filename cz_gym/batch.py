@@ -18,8 +18,6 @@ import numpy as np
 import numpy.typing as npt
 
 from .config import Config
-from .draws import STREAMS
-from .episode import Series, draw_episode, new_series
 from .kernels import KERNELS, Kernels, build_kernels
 from .law import GRID, law_of
 from .meniscus import HURLE, MeniscusModel
@@ -28,10 +26,11 @@ from .parameters import Parameters
 from .plant import NO_OPERATING_POINT
 from .scenario import MAX_LATENCY, Scenario
 from .slots import INFO, SLOT, Clock, Memory, Out, Reading, info_width
-from .streams import WORDS
 
 SLOTS_PER_THREAD = 256
-"""Fewest slots worth a thread of their own."""
+"""Fewest slots worth a thread of their own in a step."""
+DRAWS_PER_THREAD = 4
+"""Fewest draws worth a thread of their own in a reset."""
 Key = tuple[int, int]
 """128 random bits that an episode is drawn from, as two 64-bit words."""
 
@@ -53,33 +52,22 @@ class SlotState:
 
     config_hash: str
     slot: npt.NDArray[Any]
-    streams: npt.NDArray[np.uint64]
+    series: npt.NDArray[np.float64]
     history: npt.NDArray[np.float64]
     frames: npt.NDArray[np.float64]
     sample: tuple[npt.NDArray[Any], ...]
     """The slot's rows of the last :class:`cz_gym.slots.Out`."""
-    scenario: Scenario
-    """What the episode was drawn from."""
-    points: tuple[int, int]
-    """Grid points and samples of the whole episode."""
-
-    @property
-    def series(self) -> Series:
-        """What is random at every step, from the start of the episode to its horizon."""
-        key = self.slot["key"].tolist()
-        series = new_series(*self.points)
-        draw_episode(self.scenario, (key[0], key[1]), series)
-        return series
+    clock: Clock
 
     @property
     def interface(self) -> npt.NDArray[np.float64]:
         """dT_i on the 5 s grid [K], shape (grid points,)."""
-        return self.series.interface
+        return self.series[: self.clock.grid_points, 0]
 
     @property
     def noise(self) -> npt.NDArray[np.float64]:
         """Camera [m] (NaN: dropped) and pyrometer [K] noise, shape (samples, 2)."""
-        return self.series.noise
+        return self.series[: self.clock.steps + 1, 1:]
 
 
 class Batch:
@@ -92,7 +80,7 @@ class Batch:
         self.config = config
         self.num_envs = num_envs
         self.kernels = _kernels(config.meniscus)
-        self.clock = Clock(config.control_interval, config.steps)
+        self.clock = Clock(config.control_interval, config.steps, math.ceil(config.horizon / GRID) + 1)
         self.channels = len(MEASURED) if config.observation == "measured" else len(HISTORY)
         self.state_channels = 0 if config.observation == "measured" else len(STATE)
         if config.observation == "state":
@@ -107,7 +95,7 @@ class Batch:
             1.0 / (ages.oldest - ages.newest + 1),
         )
         depth = int(ages.oldest[-1]) + 2 if config.observation == "history" else 0
-        self.points = math.ceil(config.horizon / GRID) + 1, config.steps + 1
+        rows = max(self.clock.grid_points, config.steps + 1)
         frames = (
             math.ceil(MAX_LATENCY / config.control_interval)
             + math.ceil((MAX_LATENCY + config.control_interval) / GRID)
@@ -117,12 +105,11 @@ class Batch:
         self.memory = Memory(
             slots,
             slots.view(np.float64).reshape(num_envs, -1),
-            np.zeros((num_envs, STREAMS, WORDS), np.uint64),
+            np.zeros((num_envs, rows, 3)),
             np.zeros((num_envs, depth, len(LAGGED))),
             np.zeros((num_envs, frames, 2)),
         )
         self.memory.slots["over"] = 1
-        self._scenarios = [config.scenario] * num_envs
         self._parameters = Parameters(*map(float, config.parameters))
         self._actions = np.zeros((num_envs, 2))
         self._all = np.ones(num_envs, np.bool_)
@@ -150,31 +137,31 @@ class Batch:
         """
         config = self.config if scenario is None else self.config.with_scenario(scenario)
         slots = np.array(which, np.int64)
-        self.memory.slots["key"][slots] = np.array(list(keys), np.uint64).reshape(-1, 2)
-        for i in which:
-            self._scenarios[i] = config.scenario
+        words = np.array(list(keys), np.uint64).reshape(-1, 2)
         arguments = (
-            self.memory, slots, law_of(config.scenario), np.array(config.mix, np.float64), self._parameters,
+            self.memory, slots, words, law_of(config.scenario), np.array(config.mix, np.float64), self._parameters,
             self.clock, self.reading, out,
         )  # fmt: skip
-        if max(self._run(self.kernels.draw, arguments, len(slots))) >= 0:
+        if max(self._run(self.kernels.draw, arguments, len(slots), DRAWS_PER_THREAD)) >= 0:
             raise ValueError(NO_OPERATING_POINT)
 
     def step(self, actions: npt.ArrayLike, out: Out, active: npt.NDArray[np.bool_] | None = None) -> None:
         """Advance the active slots by one control interval; actions of shape (num_envs, 2), not NaN."""
         self._actions[:] = actions
         active = self._all if active is None else active
-        self._run(self.kernels.step, (self.memory, self._actions, active, self.clock, self.reading, out), self.num_envs)
+        arguments = (self.memory, self._actions, active, self.clock, self.reading, out)
+        self._run(self.kernels.step, arguments, self.num_envs, SLOTS_PER_THREAD)
 
-    def _run(self, loop: Any, arguments: tuple[Any, ...], count: int) -> list[Any]:
-        """Run a loop over ``count`` rows, in as many parts as there are threads; what the parts return."""
-        if self._parts == 1 or count < SLOTS_PER_THREAD:
+    def _run(self, loop: Any, arguments: tuple[Any, ...], count: int, least: int) -> list[Any]:
+        """Run a loop over ``count`` rows, in a part of at least ``least`` rows a thread; what the parts return."""
+        parts = min(self._parts, count // least)
+        if parts <= 1:
             return [loop(*arguments, 0, count)]
         if self._pool is None or self._owner != os.getpid():
             # A forked child inherits the pool without its threads and would wait for them for ever.
             self._pool = ThreadPoolExecutor(self._parts - 1, thread_name_prefix="cz-gym")
             self._owner = os.getpid()
-        bounds = np.linspace(0, count, self._parts + 1).astype(int).tolist()
+        bounds = np.linspace(0, count, parts + 1).astype(int).tolist()
         part = partial(loop, *arguments)
         futures = [self._pool.submit(part, start, stop) for start, stop in pairwise(bounds[1:])]
         return [part(bounds[0], bounds[1]), *(future.result() for future in futures)]
@@ -183,10 +170,8 @@ class Batch:
         """A copy of everything slot i is, with its last sample."""
         sample = tuple(np.copy(array[..., i] if name == "info" else array[i]) for name, array in out._asdict().items())
         # array[i] of a structured array is a view that np.copy does not copy; array[i, ...] is an array.
-        slot, _, streams, history, frames = (array[i, ...].copy() for array in self.memory)
-        return SlotState(
-            self.config.hash, slot, streams, history, frames, sample, self._scenarios[i], self.points
-        )  # fmt: skip
+        slot, _, series, history, frames = (array[i, ...].copy() for array in self.memory)
+        return SlotState(self.config.hash, slot, series, history, frames, sample, self.clock)
 
     def check(self, state: SlotState) -> None:
         """Raise ValueError if this is no saved state, or one saved under other settings."""
@@ -201,9 +186,8 @@ class Batch:
     def restore(self, i: int, state: SlotState, out: Out) -> None:
         """Continue slot i from a state that :meth:`check` let pass and write its last sample into ``out``."""
         memory = self.memory
-        memory.slots[i], memory.streams[i], memory.history[i] = state.slot, state.streams, state.history
+        memory.slots[i], memory.series[i], memory.history[i] = state.slot, state.series, state.history
         memory.frames[i] = state.frames
-        self._scenarios[i] = state.scenario
         for name, array, values in zip(out._fields, out, state.sample, strict=True):
             array[(..., i) if name == "info" else i] = values
 

@@ -1,8 +1,7 @@
 """An episode's draw: a value made at reset from one 128-bit key, and the series that follow from it.
 
-Ramps are kept as parameters and evaluated where needed (:mod:`cz_gym.schedule`); what is random at every step is drawn
-as the episode goes (:mod:`cz_gym.fluctuation`). Both come from the episode's own streams, so that a key says
-everything there is to know about an episode: :func:`draw_episode` writes it out ahead.
+Ramps are kept as parameters and evaluated where needed (:mod:`cz_gym.schedule`); only what is random at every step
+is stored as series (:mod:`cz_gym.fluctuation`). Both come from the episode's own streams: a step draws nothing.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import numpy.typing as npt
 from . import draws
 from ._compile import kernel
 from .draws import STREAMS, randomised, seed_streams
-from .fluctuation import drops_out, interface_temperature, move_fluctuation, outlier, start_fluctuation, white_noise
+from .fluctuation import draw_series
 from .law import FREEZES, GRID, Episode, Factors, Stream, law_of
 from .scenario import Range, Scenario
 from .streams import WORDS
@@ -25,8 +24,6 @@ __all__ = [
     "randomised", "stream",
 ]  # fmt: skip
 Floats = npt.NDArray[np.float64]
-_INTERFACE, _SENSOR = int(Stream.INTERFACE), int(Stream.SENSOR)
-_DROPOUTS, _OUTLIERS = int(Stream.DROPOUTS), int(Stream.OUTLIERS)
 
 
 class Series(NamedTuple):
@@ -56,7 +53,7 @@ def draw_factors(scenario: Scenario, mix: Range, key: tuple[int, int]) -> Factor
 
 
 def draw_episode(scenario: Scenario, key: tuple[int, int], out: Series) -> Episode:
-    """Draw an episode: ramps and constants are returned, series written into ``out`` as a slot would meet them."""
+    """Draw an episode: ramps and constants are returned, series written into ``out``."""
     return Episode(*_episode(law_of(scenario), _words(key), _streams(), out.interface, out.noise, out.freezes))
 
 
@@ -78,14 +75,5 @@ def _factors(law: Any, mix: Any, key: Any, streams: Any) -> Any:
 def _episode(law: Any, key: Any, streams: Any, interface: Any, noise: Any, freezes: Any) -> Any:
     seed_streams(streams, key)
     e = draws.draw_episode(law[0], streams, freezes)
-    fast, slow = start_fluctuation(e, streams[_INTERFACE])
-    for j in range(interface.size):
-        if j > 0:
-            fast, slow = move_fluctuation(fast, slow, e, streams[_INTERFACE])
-        interface[j] = interface_temperature(fast, slow, e)
-    for k in range(noise.shape[0]):
-        camera, pyrometer = white_noise(e, streams[_SENSOR])
-        camera = camera + outlier(e, streams[_OUTLIERS])
-        noise[k, 0] = np.nan if drops_out(e, streams[_DROPOUTS]) else camera
-        noise[k, 1] = pyrometer
+    draw_series(e, streams, interface, noise)
     return e

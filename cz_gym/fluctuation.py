@@ -1,58 +1,60 @@
-"""What is random at every step, drawn as the episode goes: interface fluctuation, sensor noise, drop-outs, outliers.
+"""What is random at every step, drawn at reset: interface fluctuation, sensor noise, drop-outs, outliers.
 
-``s`` is one stream of the episode (:mod:`cz_gym.streams`), ``e`` its :class:`cz_gym.law.Episode`.
+``s`` is one stream of the episode (:mod:`cz_gym.streams`), ``e`` its :class:`cz_gym.law.Episode`. Series are drawn
+front to back, each on a stream of its own: a longer horizon extends them and changes nothing.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from ._compile import physics
+from .law import Stream
 from .streams import normal, uniform
 
-
-@physics
-def start_fluctuation(e: Any, s: Any) -> Any:
-    """Stationary start of the interface's two Ornstein-Uhlenbeck processes, each of unit variance."""
-    if e.sd_fast > 0.0 or e.sd_slow > 0.0:
-        fast = normal(s)
-        return fast, normal(s)
-    return 0.0, 0.0
+_INTERFACE, _SENSOR = int(Stream.INTERFACE), int(Stream.SENSOR)
+_DROPOUTS, _OUTLIERS = int(Stream.DROPOUTS), int(Stream.OUTLIERS)
 
 
 @physics
-def move_fluctuation(fast: Any, slow: Any, e: Any, s: Any) -> Any:
-    """The processes one grid interval on, discretised exactly: x <- keep x + sqrt(1 - keep^2) n."""
-    if e.sd_fast > 0.0 or e.sd_slow > 0.0:
+def draw_interface(e: Any, s: Any, out: Any) -> None:
+    """Write dT_i [K] on the grid: two stationary processes, discretised exactly, x <- keep x + sqrt(1 - keep^2) n."""
+    if not (e.sd_fast > 0.0 or e.sd_slow > 0.0):
+        out[:] = 0.0
+        return
+    fast = normal(s)
+    slow = normal(s)
+    out[0] = e.sd_fast * fast + e.sd_slow * slow
+    for j in range(1, out.size):
         fast = e.keep_fast * fast + e.kick_fast * normal(s)
         slow = e.keep_slow * slow + e.kick_slow * normal(s)
-    return fast, slow
+        out[j] = e.sd_fast * fast + e.sd_slow * slow
 
 
 @physics
-def interface_temperature(fast: Any, slow: Any, e: Any) -> Any:
-    """dT_i [K]."""
-    return e.sd_fast * fast + e.sd_slow * slow
+def draw_noise(e: Any, streams: Any, out: Any) -> None:
+    """Write camera [m] and pyrometer [K] noise of each sample, shape (samples, 2); a camera's NaN is a drop-out."""
+    s = streams[_SENSOR]
+    noisy = e.camera_sd > 0.0 or e.pyrometer_sd > 0.0
+    for k in range(out.shape[0]):
+        out[k, 0] = e.camera_sd * normal(s) if noisy else 0.0
+        out[k, 1] = e.pyrometer_sd * normal(s) if noisy else 0.0
+    if e.outlier_probability > 0.0:
+        s = streams[_OUTLIERS]
+        for k in range(out.shape[0]):
+            if uniform(s) < e.outlier_probability:
+                out[k, 0] += e.outlier_sd * normal(s)
+    if e.dropout > 0.0:
+        s = streams[_DROPOUTS]
+        for k in range(out.shape[0]):
+            if uniform(s) < e.dropout:
+                out[k, 0] = np.nan
 
 
 @physics
-def white_noise(e: Any, s: Any) -> Any:
-    """Camera [m] and pyrometer [K] noise of the next sample."""
-    if e.camera_sd > 0.0 or e.pyrometer_sd > 0.0:
-        camera = e.camera_sd * normal(s)
-        return camera, e.pyrometer_sd * normal(s)
-    return 0.0, 0.0
-
-
-@physics
-def outlier(e: Any, s: Any) -> Any:
-    """Outlier [m] of the next sample, mostly 0."""
-    if e.outlier_probability > 0.0 and uniform(s) < e.outlier_probability:
-        return e.outlier_sd * normal(s)
-    return 0.0
-
-
-@physics
-def drops_out(e: Any, s: Any) -> Any:
-    """Whether the camera loses the next sample."""
-    return e.dropout > 0.0 and uniform(s) < e.dropout
+def draw_series(e: Any, streams: Any, interface: Any, noise: Any) -> None:
+    """Draw everything that is random at every step of the episode."""
+    draw_interface(e, streams[_INTERFACE], interface)
+    draw_noise(e, streams, noise)

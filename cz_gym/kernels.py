@@ -11,34 +11,33 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ._compile import hashed, kernel, physics
-from .draws import draw_episode, draw_factors, randomised, seed_streams
-from .fluctuation import interface_temperature, move_fluctuation, start_fluctuation
-from .law import GRID, Stream
+from .draws import STREAMS, draw_episode, draw_factors, randomised, seed_streams
+from .fluctuation import draw_series
+from .law import GRID
 from .meniscus import HURLE, MeniscusModel
 from .plant import Disturbance, Inputs, State, derive_puller, hidden_load, rk4
 from .readings import clip, measure, recall, remember, write_info, write_measured, write_state
 from .schedule import drift, melt_left, reference
 from .sensing import photograph, sense
 from .slots import EPISODE_AT, INFO, PULLER_AT
+from .streams import WORDS
 from .task import HEATER_RANGE, HEIGHT_MAX_IN_A, HEIGHT_MIN, Cost, cost_terms, failure_penalty, reward, within_limits
 
 _EPS = 1e-9
 _CLIPPED = INFO.index("action_clipped")
 _JUMP = HEIGHT_MIN
-_INTERFACE = int(Stream.INTERFACE)
 
 
 @physics
-def _begin(slot: Any, streams: Any) -> None:
+def _begin(slot: Any, dT_i: Any) -> None:
     """Put a slot with drawn constants at the start of its episode."""
     p, e = slot.puller, slot.episode
     slot.x.r_c, slot.x.h_c = p.r_0 + e.r_c_start, p.h_0
     slot.x.T_1, slot.x.T_2, slot.x.T_b = p.T_1_0, p.T_2_0, p.T_b_0
     slot.v_p, slot.Q_H, slot.Q_H_slewed = p.v_0, p.Q_H_0, p.Q_H_0
-    slot.fast, slot.slow = start_fluctuation(e, streams[_INTERFACE])
-    slot.dT_i, slot.Q_d, slot.drift = interface_temperature(slot.fast, slot.slow, e), 0.0, np.nan
+    slot.dT_i, slot.Q_d, slot.drift = dT_i, 0.0, np.nan
     slot.integral = 0.0
-    slot.k = slot.grid = slot.frames = slot.over = 0
+    slot.k = slot.frames = slot.over = 0
 
 
 @physics
@@ -71,14 +70,10 @@ def _substep(x: Any, u: Any, d: Any, p: Any, dt: Any, r_ref: Any, slope: Any) ->
 
 
 @physics
-def _disturb(slot: Any, stream: Any, j: Any) -> Any:
+def _disturb(slot: Any, series: Any, j: Any) -> Any:
     """The disturbance at grid point j; the hidden load is solved only while the drift moves."""
     p, e = slot.puller, slot.episode
-    if slot.grid < j:
-        while slot.grid < j:
-            slot.fast, slot.slow = move_fluctuation(slot.fast, slot.slow, e, stream)
-            slot.grid = slot.grid + 1
-        slot.dT_i = interface_temperature(slot.fast, slot.slow, e)
+    slot.dT_i = series[j, 0]
     shift = drift(j * GRID, e)
     if shift != slot.drift:
         slot.drift, slot.Q_d = shift, hidden_load(shift, p)
@@ -86,7 +81,7 @@ def _disturb(slot: Any, stream: Any, j: Any) -> Any:
 
 
 @physics
-def _advance(slot: Any, stream: Any, frames: Any, clock: Any, slope: Any, ring_offset: Any) -> Any:
+def _advance(slot: Any, series: Any, frames: Any, clock: Any, slope: Any, ring_offset: Any) -> Any:
     """Integrate over one control interval, split at the 5 s grid; returns whether the crystal still grows."""
     p, e = slot.puller, slot.episode
     u = Inputs(slot.v_p, slot.Q_H)
@@ -96,7 +91,7 @@ def _advance(slot: Any, stream: Any, frames: Any, clock: Any, slope: Any, ring_o
     while grows and t < end - _EPS:
         j = int(t / GRID + _EPS)
         upto = min((j + 1) * GRID, end)
-        x, grows = _substep(x, u, _disturb(slot, stream, j), p, upto - t, p.r_0 + reference(upto, e), slope)
+        x, grows = _substep(x, u, _disturb(slot, series, j), p, upto - t, p.r_0 + reference(upto, e), slope)
         t = upto
         if e.latency > 0.0 and t < end - _EPS:
             photograph(slot, frames, t, x.r_c + ring_offset(x.r_c, _height_inside(x.h_c, p), p) - p.ring_bias)
@@ -111,9 +106,9 @@ class Kernels(NamedTuple):
     step: Any
     """``step(memory, actions, active, clock, reading, out, start, stop)``: one control interval of the active slots."""
     draw: Any
-    """``draw(memory, which, law, mix, parameters, clock, reading, out, start, stop)``: new episodes, from the slots'
-    keys, for the slots ``which[start:stop]``, with their first sample; returns a slot whose puller has no operating
-    point, or -1."""
+    """``draw(memory, which, keys, law, mix, parameters, clock, reading, out, start, stop)``: new episodes, each
+    from its key, for the slots ``which[start:stop]``, with their first sample; returns a slot whose puller has no
+    operating point, or -1."""
     plant: Any
     """``plant(memory, actions, clock, rings, start, stop)``: drives, plant and ring alone, to measure speed against."""
     derive: Any
@@ -130,7 +125,8 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
         slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
         t, h_c = slot.k * clock.interval, _height_inside(x.h_c, p)
         ring = x.r_c + ring_offset(x.r_c, h_c, p)
-        sense(slot, memory.streams[i], memory.frames[i], t, ring - p.ring_bias)
+        series = memory.series[i]
+        sense(slot, series[slot.k, 1], series[slot.k, 2], memory.frames[i], t, ring - p.ring_bias)
         measured = measure(slot, t)
         row = out.observation[i]
         write_measured(measured, reading.measured, row)
@@ -154,7 +150,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
             v_p, Q_H = slot.v_p, slot.Q_H
             pull, heat = actions[i, 0], actions[i, 1]
             _drive(slot, pull, heat, clock.interval)
-            grows = _advance(slot, memory.streams[i, _INTERFACE], memory.frames[i], clock, slope, ring_offset)
+            grows = _advance(slot, memory.series[i], memory.frames[i], clock, slope, ring_offset)
             cost = sample(memory, i, v_p, Q_H, clock, reading, out)
             ends = slot.k >= clock.steps
             out.reward[i] = reward(cost) + (0.0 if grows else failure_penalty(slot.k, clock.steps))
@@ -164,14 +160,15 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
             out.info[_CLIPPED, i] = 1.0 if (np.abs(pull) > 1.0 or np.abs(heat) > 1.0) else 0.0
 
     def draw(
-        memory: Any, which: Any, law: Any, mix: Any, parameters: Any, clock: Any, reading: Any, out: Any,
+        memory: Any, which: Any, keys: Any, law: Any, mix: Any, parameters: Any, clock: Any, reading: Any, out: Any,
         start: int, stop: int,
     ) -> int:  # fmt: skip
         impossible = -1
+        streams = np.zeros((STREAMS, WORDS), np.uint64)
         for at in range(start, stop):
             i = which[at]
-            slot, streams, numbers = memory.slots[i], memory.streams[i], memory.numbers[i]
-            seed_streams(streams, slot.key)
+            slot, series, numbers = memory.slots[i], memory.series[i], memory.numbers[i]
+            seed_streams(streams, keys[at])
             factors = draw_factors(law[0], mix, streams)
             puller = derive_puller(randomised(parameters, factors), factors.lam, height, ring_offset)
             for number in range(len(puller)):
@@ -180,7 +177,8 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
             episode = draw_episode(law[0], streams, slot.freezes)
             for number in range(len(episode)):
                 numbers[EPISODE_AT + number] = episode[number]
-            _begin(slot, streams)
+            draw_series(slot.episode, streams, series[: clock.grid_points, 0], series[: clock.steps + 1, 1:])
+            _begin(slot, series[0, 0])
             sample(memory, i, slot.v_p, slot.Q_H, clock, reading, out)
             out.info[_CLIPPED, i], out.reward[i] = 0.0, 0.0
             out.terminated[i] = out.truncated[i] = False
@@ -190,7 +188,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
         for i in range(start, stop):
             slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
             _drive(slot, actions[i, 0], actions[i, 1], clock.interval)
-            _advance(slot, memory.streams[i, _INTERFACE], memory.frames[i], clock, slope, ring_offset)
+            _advance(slot, memory.series[i], memory.frames[i], clock, slope, ring_offset)
             rings[i] = x.r_c + ring_offset(x.r_c, _height_inside(x.h_c, p), p)
 
     def derive(parameters: Any, lam: float) -> Any:

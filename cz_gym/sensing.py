@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from ._compile import physics
-from .fluctuation import drops_out, outlier, white_noise
-from .law import FREEZES, Stream
+from .law import FREEZES
 from .schedule import bias_offset, pyrometer_drift, ripple
 
 _EPS = 1e-9
-_SENSOR, _DROPOUTS, _OUTLIERS = int(Stream.SENSOR), int(Stream.DROPOUTS), int(Stream.OUTLIERS)
 
 
 @physics
@@ -45,16 +45,15 @@ def _freezes(slot: Any, t: Any) -> Any:
 
 
 @physics
-def sense(slot: Any, streams: Any, frames: Any, t: Any, ring: Any) -> None:
+def sense(slot: Any, camera: Any, pyrometer: Any, frames: Any, t: Any, ring: Any) -> None:
     """Read pyrometer and camera at t; ``ring`` [m] is what a camera without latency sees, less the operator's bias.
 
-    A frozen or dropped sample shows the last reading again.
+    ``camera`` [m] (NaN: the sample drops out) and ``pyrometer`` [K] are the sample's noise. A frozen or dropped sample
+    shows the last reading again.
     """
     e = slot.episode
-    camera, pyrometer = white_noise(e, streams[_SENSOR])
-    camera = camera + outlier(e, streams[_OUTLIERS])
     slot.T_1 = slot.x.T_1 + pyrometer_drift(t, e) + pyrometer
-    lost = drops_out(e, streams[_DROPOUTS])
+    lost = np.isnan(camera)
     frozen, flagged = _freezes(slot, t)
     slot.valid = 0.0 if lost or flagged else 1.0
     taken = t

@@ -29,11 +29,7 @@ SLOT = np.dtype(
         ("T_1", np.float64),
         ("valid", np.float64),
         ("integral", np.float64),
-        ("fast", np.float64),
-        ("slow", np.float64),
         ("drift", np.float64),
-        ("key", np.uint64, (2,)),
-        ("grid", np.int64),
         ("k", np.int64),
         ("frames", np.int64),
         ("over", np.int64),
@@ -42,8 +38,8 @@ SLOT = np.dtype(
 )
 """One slot: constants of puller and episode, plant state, drives [m/s, W], the disturbance of the last substep,
 the last readings (``ring`` [m] without the operator's bias, ``T_1`` [K], ``valid``), the integral of the scaled ring
-error, the interface's two processes, the drift [K] that ``Q_d`` belongs to, the episode's key, the grid point that the
-fluctuation stands at, the sample number ``k``, the number of camera frames taken, and whether the episode is over."""
+error, the drift [K] that ``Q_d`` belongs to, the sample number ``k``, the number of camera frames taken, and whether
+the episode is over."""
 PULLER_AT, EPISODE_AT = 0, len(Puller._fields)
 """Where a slot's constants begin, in numbers of eight bytes."""
 
@@ -55,6 +51,8 @@ class Clock(NamedTuple):
     """Control interval [s]."""
     steps: int
     """Steps in an episode."""
+    grid_points: int
+    """Points of the 5 s grid in an episode."""
 
 
 class Memory(NamedTuple):
@@ -64,8 +62,9 @@ class Memory(NamedTuple):
     """Records of :data:`SLOT`, shape (n,)."""
     numbers: Any
     """The same memory as plain float64, shape (n, numbers a record)."""
-    streams: Any
-    """Random streams of the episode (:mod:`cz_gym.streams`), shape (n, streams, 4)."""
+    series: Any
+    """What was drawn for every step, shape (n, steps, 3): dT_i of a grid point [K], camera [m] and pyrometer [K]
+    noise of a sample; side by side, since a step reads all three."""
     history: Any
     """Running sums of the remembered channels, circular in time, shape (n, depth, channels); depth 0: none."""
     frames: Any
