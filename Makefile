@@ -22,7 +22,7 @@ types: $(TEST_READY) ## strict types
 	$(BIN)/mypy
 
 test: lint types ## lint, types and tests
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q --numprocesses auto --dist loadfile
 
 benchmark: $(BENCHMARK_READY) ## the shipped agent and the classical controllers on the same crystals
 	$(BIN)/python benchmark.py
