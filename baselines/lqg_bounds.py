@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -23,7 +23,7 @@ from cz_gym.observation import HEATER_SCALE, STATE, Measured, scales
 from cz_gym.plant import Puller, hidden_load, make_puller
 
 from . import kalman
-from .lqg import LQG, Gains, LQGSettings, act, solve_each
+from .lqg import LQG, Gains, act, solve_each
 from .lqg_model import DRIFT, FAST, PLANT, SLOW, STATES, NoiseModel, load_per_drift
 from .policy import Floats, batched, fresh, to_action
 from .preview import look_ahead, samples_ahead
@@ -44,21 +44,35 @@ def pullers_of(config: Config, seeds: Sequence[int]) -> tuple[Puller, ...]:
 
 @dataclass(frozen=True)
 class ToldLQG(LQG):
-    """The LQG with each slot's own puller as its model: what knowing the parameters is worth."""
+    """The LQG with each slot's own puller as its model: what knowing the parameters is worth.
+
+    Until it is told, it takes the nominal puller for everyone's, as the LQG does.
+    """
 
     told: Gains | None = None
 
     @property
     def gains(self) -> Gains:
-        """Gains of the slots' own pullers; RuntimeError before any were told."""
-        if self.told is None:
-            raise RuntimeError("lqg-true is told its pullers by for_episodes(config, seeds), which a rollout calls")
-        return self.told
+        """Gains of the slots' own pullers."""
+        return super().gains if self.told is None else self.told
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[npt.NDArray[np.float32], Any]:
+        """The action and what to remember; ValueError for another number of slots than it was told."""
+        _check_slots(self.told, observation)
+        return super().predict(observation, state, episode_start, deterministic)
 
     def for_episodes(self, config: Config, seeds: Sequence[int]) -> ToldLQG:
         """The same controller for those episodes, one a slot."""
         told = solve_each(self.settings, config.control_interval, pullers_of(config, seeds), config.meniscus)
-        return ToldLQG(self.settings, config.control_interval, config.parameters, config.meniscus, told)
+        return replace(self, told=told)
+
+
+def _check_slots(told: Gains | None, observation: Any) -> None:
+    slots = len(np.atleast_2d(observation))
+    if told is not None and len(told.eye.model.A) != slots:
+        raise ValueError(f"told {len(told.eye.model.A)} pullers, got {slots} slots: one puller a slot is needed")
 
 
 class Memory(NamedTuple):
@@ -82,31 +96,26 @@ class FullInformation:
     states parts it into fast and slow. The drift is the one whose static load is seen, its rate the last change.
     """
 
-    settings: LQGSettings = field(default_factory=LQGSettings)
-    told: Gains | None = None
+    law: ToldLQG = field(default_factory=ToldLQG)
 
     def for_episodes(self, config: Config, seeds: Sequence[int]) -> FullInformation:
         """The same regulator for those episodes, one a slot."""
-        pullers = pullers_of(config, seeds)
-        return FullInformation(
-            self.settings, solve_each(self.settings, config.control_interval, pullers, config.meniscus)
-        )
+        return FullInformation(self.law.for_episodes(config, seeds))
 
     def predict(
         self, observation: Any, state: Memory | None = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[npt.NDArray[np.float32], Memory]:
         """The action and what to remember."""
-        if self.told is None:
-            raise RuntimeError("full-information is told its pullers by for_episodes(config, seeds)")
         array, single = batched(observation)
-        p, law, dt = self.told.eye.puller, self.told.regulator, self.told.eye.dt
-        v_0 = float(np.ravel(p.v_0)[0])
+        _check_slots(self.law.told, observation)
+        gains, v_0 = self.law.gains, self.law.parameters.v_0
+        p, dt = gains.eye.puller, gains.eye.dt
         seen = dict(zip((channel.name for channel in STATE), (array * scales(STATE, v_0)).T, strict=True))
         n = len(array)
         rest = Memory(np.zeros((n, 2)), np.zeros(n), np.zeros((n, 2, samples_ahead(dt) + 1)), np.zeros(n))
         memory = fresh(state, rest, episode_start)
         begins = memory.begun == 0.0
-        fluctuation = _parted(memory.fluctuation, seen["dT_i"], begins, self.settings.noise, dt)
+        fluctuation = _parted(memory.fluctuation, seen["dT_i"], begins, gains.eye.noise, dt)
         drift = _drift(seen["Q_d"], p)
         plan = look_ahead(memory.plan, _recipe(seen), begins, dt)
         x = np.zeros((n, len(STATES)))
@@ -116,7 +125,7 @@ class FullInformation:
         x[:, DRIFT] = drift
         x[:, DRIFT + 1] = np.where(begins, 0.0, drift - memory.drift) / dt
         applied = np.stack([seen["v_p"], seen["Q_H"]], axis=-1)
-        inputs = act(x, plan, applied, law, 0.0, v_0)
+        inputs = act(x, plan, applied, gains.regulator, 0.0, v_0)
         action = to_action(inputs[:, 0] / v_0, inputs[:, 1] / HEATER_SCALE, single)
         return action, Memory(fluctuation, drift, plan, np.ones(n))
 

@@ -31,4 +31,4 @@ def lqg_true(config: Config) -> ToldLQG:
 
 def full_information(config: Config) -> FullInformation:
     """Bound: the LQG's regulator on the true state and the present disturbances."""
-    return FullInformation(REWARD)
+    return FullInformation(lqg_true(config))

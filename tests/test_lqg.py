@@ -305,9 +305,16 @@ def test_a_told_nominal_puller_is_the_lqg():
     np.testing.assert_allclose(told.signals.v_p, plain.signals.v_p, rtol=1e-5)
 
 
-def test_a_bound_must_be_told():
-    with pytest.raises(RuntimeError, match="for_episodes"):
-        lqg_bounds.ToldLQG().predict(np.zeros((1, len(MEASURED))))
+def test_a_bound_nobody_told_is_the_controller_it_bounds():
+    for observation in observations(steps=3):
+        expected = LQG().predict(observation)[0]
+        np.testing.assert_array_equal(lqg_bounds.ToldLQG().predict(observation)[0], expected)
+
+
+def test_a_bound_told_other_slots_refuses():
+    told = lqg_bounds.ToldLQG().for_episodes(make_config("randomized"), [1, 2])
+    with pytest.raises(ValueError, match="told 2 pullers, got 3 slots"):
+        told.predict(next(observations()))
 
 
 def test_the_drift_is_read_off_its_load():
