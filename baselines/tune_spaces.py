@@ -73,7 +73,9 @@ ROBUST = (Knob("T_track", 10.0, HOUR), Knob("jump", 0.05 * MM, 2.0 * MM))
 
 
 SENSITIVITY = 2.7
-"""Largest peak of the sensitivity function a tuned loop may have: that of the printed controller [-]."""
+"""Largest peak of the sensitivity function a tuned loop should have: that of the printed controller [-]."""
+WISH = 0.02
+"""Weight of a wish against a rule [-]."""
 
 
 def nominal_loops(policy: Any) -> tuple[StateSpace, tuple[Puller, Puller]]:
@@ -88,10 +90,10 @@ def unruled(policy: Any) -> float:
 
 
 def too_sensitive(policy: FilteredPID) -> float:
-    """How far the peak of the sensitivity function is over SENSITIVITY, relatively, at the worse nominal model [-]."""
+    """A wish: part of the relative excess of the sensitivity's peak over SENSITIVITY, worse nominal model [-]."""
     controller, pullers = nominal_loops(policy)
     dt = policy.control_interval
-    return max(0.0, *(sensitivity(controller, puller, dt) / SENSITIVITY - 1.0 for puller in pullers))
+    return WISH * max(0.0, *(sensitivity(controller, puller, dt) / SENSITIVITY - 1.0 for puller in pullers))
 
 
 def over_half_the_zero(policy: FilteredPID) -> float:
@@ -105,7 +107,7 @@ def over_half_the_zero(policy: FilteredPID) -> float:
 
 
 def conventional(policy: FilteredPID) -> float:
-    """Both rules."""
+    """The rule and the wish."""
     return over_half_the_zero(policy) + too_sensitive(policy)
 
 
