@@ -227,7 +227,6 @@ def settings_from(data: dict[str, Any]) -> LQGSettings:
 
 def write_whole(path: Path, data: Any) -> None:
     """Write JSON whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(path.name + ".part")
     temporary.write_text(json.dumps(data, indent=1) + "\n")
     os.replace(temporary, path)
@@ -249,14 +248,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given.survive < 0:
         parser.error(f"--survive must be at least 0, not {given.survive}")
     output = given.output or Path("results") / "tuning" / f"{given.controller}.json"
-    goal = GOALS[given.controller]
-    history = search(goal, given.budget, given.episodes, given.survive)
-    chosen = choose(goal, history, given.validation)
-    budget = {name: getattr(given, name) for name in ("budget", "episodes", "survive", "validation")}
     try:
-        write_whole(
-            output, {"controller": given.controller, "budget": budget, "chosen": chosen, "history": history.entries}
-        )
+        output.parent.mkdir(parents=True, exist_ok=True)
+        goal = GOALS[given.controller]
+        history = search(goal, given.budget, given.episodes, given.survive)
+        chosen = choose(goal, history, given.validation)
+        budget = {name: getattr(given, name) for name in ("budget", "episodes", "survive", "validation")}
+        found = {"controller": given.controller, "budget": budget, "chosen": chosen, "history": history.entries}
+        write_whole(output, found)
     except OSError as error:
         print(f"cannot write {output}: {error}", file=sys.stderr)
         return 2
