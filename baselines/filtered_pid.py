@@ -90,8 +90,8 @@ class FilteredPID:
         dt = self.control_interval
         slope, curvature = _ahead(seen)
         compensated, compensator = self._compensate(seen, memory)
+        filtered = self._filter(compensated - self.ring_lead * slope - memory.start, memory.filtered)
         start = memory.start * (math.exp(-dt / self.T_start) if self.T_start > 0.0 else 0.0)
-        filtered = self._filter(compensated - self.ring_lead * slope - start, memory.filtered)
         b_0, b_1, a_1 = self.pid.lead(dt)
         lead = b_0 * filtered + memory.lead_in
         missed = (seen.v_p - memory.command) / self.pid.K_p

@@ -51,7 +51,8 @@ def autocorrelation(error: Floats, lags: int) -> Floats:
     """Autocorrelation of one course at lags 0 to ``lags``, mean removed."""
     centred = error - error.mean()
     n = len(centred)
-    return np.array([centred[: n - lag] @ centred[lag:] for lag in range(lags + 1)]) / (centred @ centred)
+    products: Floats = np.array([centred[: n - lag] @ centred[lag:] for lag in range(lags + 1)])
+    return products / products[0]
 
 
 def identified_gain(diameter: Floats, pull: Floats, samples: int) -> float:

@@ -1,8 +1,8 @@
 """Tune a classical controller within a budget: ``python -m baselines.tune --controller paper-tuned --trials 300``.
 
-Optuna's tree-structured Parzen estimator on the first training seeds, always the same; the best few meet the first
-validation seeds, and the best there is chosen. Test seeds are never touched. Every trial is kept in ``history.csv``;
-the same command goes on where it stopped.
+Optuna's tree-structured Parzen estimator explores on the first training seeds, always the same; steps around the best
+design then refine it; the best few meet the first validation seeds, and the best there is chosen. Test seeds are never
+touched. Every trial is kept in ``history.csv``; the same command goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import argparse
 import csv
 import io
 import json
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,12 +26,16 @@ from cz_gym.evaluation.rollout import rollout
 from cz_gym.units import MM_PER_MIN
 
 from .optional import require
-from .tune_spaces import Space, reading, space_of, turned
+from .tune_spaces import Knob, Space, reading, space_of, turned
 
 TRAINING, VALIDATION = range(1_000_000), range(1_000_000, 1_000_500)
 """Seeds: the first ones of each are used."""
 STEP_PRICE, EXCESS_PRICE, FAILURE_PRICE, RULE_PRICE = 0.2, 20.0, 5.0, 2.0
 """Prices of pull step RMS and its excess over what is allowed [mm per mm/min], of failures and broken rules [mm]."""
+EXPLORE = 0.6
+"""Share of the trials that explore; the others refine."""
+STEPS = (0.01, 0.15)
+"""Standard deviations of a refining step, in parts of a knob's range."""
 DIGITS = 4
 """Significant digits that a knob is turned to."""
 
@@ -132,18 +137,34 @@ def search(space: Space, episodes: Episodes, trials: int, path: Path, seed: int 
         _tell(optuna, study, ranges, trial)
     bar = tqdm(range(len(done), trials), desc=space.name, initial=len(done), total=trials, disable=None)
     for number in bar:
-        asked = None if number == 0 else study.ask(ranges)
-        wanted = first_values(space) if asked is None else tuple(asked.params[knob.path] for knob in space.knobs)
+        if number == 0:
+            wanted = first_values(space)
+        elif number < EXPLORE * trials:
+            asked = study.ask(ranges)
+            wanted = tuple(asked.params[knob.path] for knob in space.knobs)
+            study.tell(asked, state=optuna.trial.TrialState.FAIL)  # what is told is the rounded design
+        else:
+            best = min(done, key=lambda trial: trial.score.objective)
+            wanted = refined(space, best.values, np.random.default_rng([seed, number]))
         values = tuple(float(f"{value:.{DIGITS}g}") for value in wanted)
         trial = Trial(values, score(space, values, episodes))
-        if asked is None:
-            _tell(optuna, study, ranges, trial)
-        else:
-            study.tell(asked, trial.score.objective)
+        _tell(optuna, study, ranges, trial)
         done.append(trial)
         write_history(path, space, done)
         bar.set_postfix(best=f"{min(t.score.objective for t in done):.4f}")
     return done
+
+
+def refined(space: Space, values: Sequence[float], random: np.random.Generator) -> tuple[float, ...]:
+    """A step from there: about half of the knobs, by a normal step whose size is drawn as well."""
+    size = math.exp(random.uniform(math.log(STEPS[0]), math.log(STEPS[1])))
+    moved = size * random.standard_normal(len(values)) * (random.random(len(values)) < 0.5)
+    return tuple(_moved(knob, value, part) for knob, value, part in zip(space.knobs, values, moved, strict=True))
+
+
+def _moved(knob: Knob, value: float, part: float) -> float:
+    wanted = value * (knob.high / knob.low) ** part if knob.log else value + (knob.high - knob.low) * part
+    return float(np.clip(wanted, knob.low, knob.high))
 
 
 def _sampler(optuna: Any, seed: int) -> Any:
