@@ -19,10 +19,12 @@ from typing import Any, TypeVar, cast
 import llvmlite
 import numba
 import numpy as np
+from numba.core.options import DefaultOptions as default_options
 from numba.extending import register_jitable
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+_NO_COUNTS = "_nrt"
 CACHE_VARIABLE = "CZ_GYM_CACHE_DIR"
 """Environment variable naming the folder for compiled code; empty means: keep none."""
 
@@ -76,13 +78,16 @@ def hashed(*functions: Callable[..., Any]) -> bool:
     return all(code is not None and Path(code.co_filename).parent == folder for code in codes)
 
 
-def kernel(function: F, keep: bool = True) -> F:
+def kernel(function: F, keep: bool = True, allocates: bool = True) -> F:
     """Compile a loop over slots: no GIL, no fast-math, cached on disk when there is a place for it.
 
     ``keep=False`` caches nothing: for loops over functions from elsewhere, whose changes no hash would see.
+    ``allocates=False`` promises that the loop makes no array, so that views of its arguments need no reference counts.
     """
     folder = cache_folder() if keep else None
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+    if not allocates and _NO_COUNTS in default_options.__dict__:
+        options[_NO_COUNTS] = False
     settings: Any = numba.config
     if folder is None:
         return cast(F, numba.njit(**options)(function))
@@ -94,3 +99,13 @@ def kernel(function: F, keep: bool = True) -> F:
         return cast(F, numba.njit(**options)(function))
     finally:
         settings.CACHE_DIR = previous
+
+
+def entry(loop: Any, arguments: tuple[Any, ...]) -> Any:
+    """The compiled form of a kernel for arguments of these types, and only these.
+
+    It skips the search for the right form at every call, which costs several times a slot's step.
+    """
+    compile_for = getattr(loop, "compile", None)
+    typeof: Any = numba.typeof
+    return loop if compile_for is None else compile_for(tuple(map(typeof, arguments)))

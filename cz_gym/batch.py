@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ._compile import entry
 from .config import Config
 from .kernels import KERNELS, Kernels, build_kernels
 from .law import GRID, law_of
@@ -31,6 +33,8 @@ SLOTS_PER_THREAD = 256
 """Fewest slots worth a thread of their own in a step."""
 DRAWS_PER_THREAD = 4
 """Fewest draws worth a thread of their own in a reset."""
+SPARES = 3
+"""Most sets of output arrays kept for further use."""
 Key = tuple[int, int]
 """128 random bits that an episode is drawn from, as two 64-bit words."""
 
@@ -44,6 +48,14 @@ def new_key(random: np.random.Generator) -> Key:
     """The next episode key of an environment's random stream."""
     raw = random.bit_generator.random_raw(2)
     return int(raw[0]), int(raw[1])
+
+
+def _held(out: Out | tuple[npt.NDArray[Any], ...]) -> int:
+    """References to the most wanted of these arrays; a view counts for the array it looks at."""
+    return max(map(sys.getrefcount, out))
+
+
+_ALONE = _held((np.empty(1), np.empty(1)))
 
 
 @dataclass(frozen=True)
@@ -73,7 +85,7 @@ class SlotState:
 class Batch:
     """``num_envs`` slots of one configuration.
 
-    Every array that :meth:`step` and :meth:`reset` fill is fresh: nothing returned is written again.
+    Nothing that :meth:`new_out` gave out is written again while anybody holds it or a view of it.
     """
 
     def __init__(self, config: Config, num_envs: int, threads: int | None = None) -> None:
@@ -88,8 +100,8 @@ class Batch:
         ages = lags(config.control_interval)
         v_0 = config.parameters.v_0
         self.reading = Reading(
-            scales(MEASURED, v_0),
-            scales(STATE, v_0),
+            1.0 / scales(MEASURED, v_0),
+            1.0 / scales(STATE, v_0),
             ages.newest,
             ages.oldest + 1,
             1.0 / (ages.oldest - ages.newest + 1),
@@ -111,17 +123,26 @@ class Batch:
         )
         self.memory.slots["over"] = 1
         self._parameters = Parameters(*map(float, config.parameters))
-        self._actions = np.zeros((num_envs, 2))
+        self.actions = np.zeros((num_envs, 2))
         self._all = np.ones(num_envs, np.bool_)
+        self._spare: list[Out] = []
+        arguments = (self.memory, self.actions, self._all, self.clock, self.reading, self.new_out(), 0, num_envs)
+        self._step = entry(self.kernels.step, arguments)
         threads = threads or os.cpu_count() or 1
         self._parts = max(1, min(threads, num_envs // SLOTS_PER_THREAD))
         self._pool: ThreadPoolExecutor | None = None
         self._owner = os.getpid()
 
     def new_out(self) -> Out:
-        """Fresh arrays to write into."""
+        """Arrays to write into that nobody holds: new ones, or ones that everybody has let go.
+
+        Large new arrays come as untouched pages, whose first writing costs more than the step itself.
+        """
+        for out in self._spare:
+            if _held(out) == _ALONE:
+                return out
         n = self.num_envs
-        return Out(
+        out = Out(
             np.empty((n, self.channels), np.float32),
             np.empty((n, self.state_channels), np.float32),
             np.empty(n),
@@ -129,6 +150,12 @@ class Batch:
             np.empty(n, np.bool_),
             np.empty((len(INFO), info_width(n))),
         )
+        self._spare = [*self._spare, out][-SPARES:]
+        return out
+
+    def bound_step(self, actions: npt.NDArray[np.float64], out: Out) -> Any:
+        """``step`` of all slots from and into always the same arrays, called without arguments."""
+        return partial(self._step, self.memory, actions, self._all, self.clock, self.reading, out, 0, self.num_envs)
 
     def reset(self, which: Sequence[int], keys: Iterable[Key], out: Out, scenario: Scenario | None = None) -> None:
         """Draw new episodes for the slots ``which`` and write their first sample into ``out``.
@@ -147,10 +174,11 @@ class Batch:
 
     def step(self, actions: npt.ArrayLike, out: Out, active: npt.NDArray[np.bool_] | None = None) -> None:
         """Advance the active slots by one control interval; actions of shape (num_envs, 2), not NaN."""
-        self._actions[:] = actions
+        if actions is not self.actions:
+            self.actions[:] = actions
         active = self._all if active is None else active
-        arguments = (self.memory, self._actions, active, self.clock, self.reading, out)
-        self._run(self.kernels.step, arguments, self.num_envs, SLOTS_PER_THREAD)
+        arguments = (self.memory, self.actions, active, self.clock, self.reading, out)
+        self._run(self._step, arguments, self.num_envs, SLOTS_PER_THREAD)
 
     def _run(self, loop: Any, arguments: tuple[Any, ...], count: int, least: int) -> list[Any]:
         """Run a loop over ``count`` rows, in a part of at least ``least`` rows a thread; what the parts return."""

@@ -105,6 +105,9 @@ class CzEnv(gym.Env[Observation, Action]):
         self._slots = self._batch.memory.slots
         self._out = self._batch.new_out()
         self._action = np.zeros((1, 2))
+        self._shown = self._out.state[0] if observation == "state" else self._out.observation[0]
+        self._said = self._out.info[:, 0]
+        self._step = self._batch.bound_step(self._action, self._out)
         self._over = True
 
     def reset(
@@ -123,10 +126,9 @@ class CzEnv(gym.Env[Observation, Action]):
         if "state" in given:
             self.set_state(given["state"])
         else:
-            self._out = self._batch.new_out()
             self._batch.reset([0], [new_key(self.np_random)], self._out, scenario)
         self._over = bool(self._slots["over"][0])
-        return self._observation(), self._info()
+        return self._shown.copy(), self._info()
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Hold an action, shape (2,), for one control interval; see :class:`gymnasium.Env`.
@@ -136,11 +138,11 @@ class CzEnv(gym.Env[Observation, Action]):
         if self._over:
             raise ResetNeeded("the episode is over (or never began): call reset()")
         self._action[0] = check_action(action)
-        out = self._out = self._batch.new_out()
-        self._batch.step(self._action, out)
-        terminated, truncated = bool(out.terminated[0]), bool(out.truncated[0])
+        self._step()
+        out = self._out
+        terminated, truncated = out.terminated.item(), out.truncated.item()
         self._over = terminated or truncated
-        return self._observation(), float(out.reward[0]), terminated, truncated, self._info()
+        return self._shown.copy(), out.reward.item(), terminated, truncated, self._info()
 
     def get_state(self) -> EnvState:
         """A picklable value from which :meth:`set_state` continues bit-exactly, random stream included."""
@@ -149,7 +151,6 @@ class CzEnv(gym.Env[Observation, Action]):
     def set_state(self, state: EnvState) -> None:
         """Continue from a value of :meth:`get_state`; ValueError if it was saved under other settings."""
         self._check_state(state)
-        self._out = self._batch.new_out()
         self._batch.restore(0, state.slot, self._out)
         self.np_random.bit_generator.state = state.random
         self._over = bool(self._slots["over"][0])
@@ -163,15 +164,11 @@ class CzEnv(gym.Env[Observation, Action]):
         """Nothing to close."""
         self._batch.close()
 
-    def _observation(self) -> Observation:
-        array: Observation = self._out.state[0] if self.config.observation == "state" else self._out.observation[0]
-        return array
-
     def _info(self) -> dict[str, Any]:
-        info: dict[str, Any] = dict(zip(INFO, self._out.info[:, 0].tolist(), strict=True))
+        info: dict[str, Any] = dict(zip(INFO, self._said.tolist(), strict=True))
         info["action_clipped"] = info["action_clipped"] > 0.0
         if self.config.observation == "history":
-            info["state"] = self._out.state[0]
+            info["state"] = self._out.state[0].copy()
         return info
 
 
@@ -183,7 +180,8 @@ def check_action(action: Any) -> Any:
         raise InvalidAction(f"an action must be two numbers in [-1, 1], not {action!r}") from None
     if array.shape != (2,):
         raise InvalidAction(f"an action must have shape (2,), not {array.shape}")
-    if array[0] != array[0] or array[1] != array[1]:
+    pull, heat = array.tolist()
+    if pull != pull or heat != heat:
         raise InvalidAction(f"an action must not be NaN: {action!r}")
     return array
 

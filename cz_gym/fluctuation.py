@@ -12,7 +12,7 @@ import numpy as np
 
 from ._compile import physics
 from .law import Stream
-from .streams import normal, uniform
+from .streams import normal, two_normals, uniform
 
 _INTERFACE, _SENSOR = int(Stream.INTERFACE), int(Stream.SENSOR)
 _DROPOUTS, _OUTLIERS = int(Stream.DROPOUTS), int(Stream.OUTLIERS)
@@ -24,12 +24,12 @@ def draw_interface(e: Any, s: Any, out: Any) -> None:
     if not (e.sd_fast > 0.0 or e.sd_slow > 0.0):
         out[:] = 0.0
         return
-    fast = normal(s)
-    slow = normal(s)
+    fast, slow = two_normals(s)
     out[0] = e.sd_fast * fast + e.sd_slow * slow
     for j in range(1, out.size):
-        fast = e.keep_fast * fast + e.kick_fast * normal(s)
-        slow = e.keep_slow * slow + e.kick_slow * normal(s)
+        first, second = two_normals(s)
+        fast = e.keep_fast * fast + e.kick_fast * first
+        slow = e.keep_slow * slow + e.kick_slow * second
         out[j] = e.sd_fast * fast + e.sd_slow * slow
 
 
@@ -39,8 +39,8 @@ def draw_noise(e: Any, streams: Any, out: Any) -> None:
     s = streams[_SENSOR]
     noisy = e.camera_sd > 0.0 or e.pyrometer_sd > 0.0
     for k in range(out.shape[0]):
-        out[k, 0] = e.camera_sd * normal(s) if noisy else 0.0
-        out[k, 1] = e.pyrometer_sd * normal(s) if noisy else 0.0
+        camera, pyrometer = two_normals(s) if noisy else (0.0, 0.0)
+        out[k, 0], out[k, 1] = e.camera_sd * camera, e.pyrometer_sd * pyrometer
     if e.outlier_probability > 0.0:
         s = streams[_OUTLIERS]
         for k in range(out.shape[0]):

@@ -195,7 +195,12 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
         return derive_puller(parameters, lam, height, ring_offset)
 
     keep = hashed(*meniscus[1:])
-    return Kernels(*(kernel(loop, keep) for loop in (step, draw, plant, derive)))
+    return Kernels(
+        kernel(step, keep, allocates=False),
+        kernel(draw, keep),
+        kernel(plant, keep, allocates=False),
+        kernel(derive, keep),
+    )
 
 
 KERNELS = build_kernels()

@@ -18,8 +18,9 @@ _RING_SCALE = MEASURED[0].scale
 
 @physics
 def clip(value: Any, limit: Any) -> Any:
-    """The value held within +-limit."""
-    return np.minimum(np.maximum(value, -limit), limit)
+    """The value held within +-limit; NaN passes."""
+    value = -limit if value < -limit else value
+    return limit if value > limit else value
 
 
 @physics
@@ -43,10 +44,10 @@ def measure(slot: Any, t: Any) -> Any:
 
 
 @physics
-def write_measured(measured: Any, scales: Any, out: Any) -> None:
+def write_measured(measured: Any, per_scale: Any, out: Any) -> None:
     """Write the "measured" channels, scaled and clipped."""
     for channel in range(_M):
-        out[channel] = clip(measured[channel] / scales[channel], CLIP)
+        out[channel] = clip(measured[channel] * per_scale[channel], CLIP)
 
 
 @physics
@@ -70,14 +71,11 @@ def remember(slot: Any, history: Any, interval: Any, out: Any) -> None:
 
 @physics
 def recall(slot: Any, history: Any, reading: Any, out: Any) -> None:
-    """Write the integral and the means of the remembered samples."""
-    depth = history.shape[0]
-    at = slot.k % depth
+    """Write the integral and the means of the remembered samples; a negative index goes round the circle."""
+    at = slot.k % history.shape[0]
     out[_M] = slot.integral
     for lag in range(reading.upto.size):
         upto, before = at - reading.upto[lag], at - reading.before[lag]
-        upto = upto + depth if upto < 0 else upto
-        before = before + depth if before < 0 else before
         first, share = _M + 1 + lag * _L, reading.share[lag]
         for channel in range(_L):
             mean = (history[upto, channel] - history[before, channel]) * share
@@ -85,7 +83,7 @@ def recall(slot: Any, history: Any, reading: Any, out: Any) -> None:
 
 
 @physics
-def write_state(slot: Any, measured: Any, t: Any, scales: Any, out: Any) -> None:
+def write_state(slot: Any, measured: Any, t: Any, per_scale: Any, out: Any) -> None:
     """Write the "state" channels."""
     p, x = slot.puller, slot.x
     truth = (
@@ -95,7 +93,7 @@ def write_state(slot: Any, measured: Any, t: Any, scales: Any, out: Any) -> None
         measured.v_p, measured.Q_H, slot.dT_i, slot.Q_d, bias_offset(t, slot.episode), p.lam,
     )  # fmt: skip
     for channel in range(_S):
-        out[channel] = clip(truth[channel] / scales[channel], CLIP)
+        out[channel] = clip(truth[channel] * per_scale[channel], CLIP)
 
 
 @physics

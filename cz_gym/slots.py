@@ -92,9 +92,9 @@ class Reading(NamedTuple):
     """Constants of reading a slot."""
 
     measured: Any
-    """Scales of the measured channels, shape (channels,)."""
+    """One over the scales of the measured channels, shape (channels,)."""
     state: Any
-    """Scales of the state channels, shape (channels,)."""
+    """One over the scales of the state channels, shape (channels,)."""
     upto: Any
     """Age of the newest sample of each remembered mean, shape (lags,)."""
     before: Any

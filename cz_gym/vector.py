@@ -188,12 +188,16 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         return mask.copy()
 
     def _check_actions(self, actions: Any) -> npt.NDArray[np.float64]:
+        """The actions as the batch's own float64 array; InvalidAction names what was given."""
+        array = self._batch.actions
         try:
-            array = np.asarray(actions, np.float64)
+            shape = np.shape(actions)
+            if shape == array.shape:
+                array[:] = actions
         except (TypeError, ValueError):
-            raise InvalidAction(f"actions must be numbers of shape ({self.num_envs}, 2), not {actions!r}") from None
-        if array.shape != (self.num_envs, 2):
-            raise InvalidAction(f"actions must have shape ({self.num_envs}, 2), not {array.shape}")
+            raise InvalidAction(f"actions must be numbers of shape {array.shape}, not {actions!r}") from None
+        if shape != array.shape:
+            raise InvalidAction(f"actions must have shape {array.shape}, not {shape}")
         if np.isnan(array).any():
             raise InvalidAction(
                 f"actions must not be NaN; slots {np.flatnonzero(np.isnan(array).any(axis=1))[:10].tolist()} are"

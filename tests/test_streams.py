@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from cz_gym._compile import kernel
 from cz_gym.law import Stream
-from cz_gym.streams import WORDS, next_word, normal, seed_stream, uniform
+from cz_gym.streams import WORDS, next_word, normal, seed_stream, two_normals, uniform
 
 WORD = st.one_of(st.integers(0, 2**64 - 1), st.sampled_from([0, 1, 2**32 - 1, 2**32, 2**64 - 1]))
 
@@ -20,8 +20,11 @@ def fill(key, number, words, uniforms, normals):  # type: ignore[no-untyped-def]
         words[i] = next_word(s)
     for i in range(uniforms.size):
         uniforms[i] = uniform(s)
-    for i in range(normals.size):
+    half = normals.size // 2
+    for i in range(half):
         normals[i] = normal(s)
+    for i in range(half, normals.size, 2):
+        normals[i], normals[i + 1] = two_normals(s)
     return s
 
 
@@ -32,12 +35,12 @@ def numpys(key: tuple[int, int], number: int) -> np.random.PCG64:
 @settings(max_examples=200)
 @given(st.tuples(WORD, WORD), st.sampled_from(list(Stream)))
 def test_streams_are_numpys_own_bit_for_bit(key: tuple[int, int], number: Stream) -> None:
-    words, uniforms, normals = np.zeros(3, np.uint64), np.zeros(5), np.zeros(50)
+    words, uniforms, normals = np.zeros(3, np.uint64), np.zeros(5), np.zeros(52)
     end = fill(np.array(key, np.uint64), int(number), words, uniforms, normals)
     random = np.random.Generator(numpys(key, number))
     np.testing.assert_array_equal(words, random.bit_generator.random_raw(3))
     np.testing.assert_array_equal(uniforms, random.random(5))
-    np.testing.assert_array_equal(normals, random.standard_normal(50))
+    np.testing.assert_array_equal(normals, random.standard_normal(52))
     state = random.bit_generator.state["state"]
     assert (int(end[0]) << 64 | int(end[1]), int(end[2]) << 64 | int(end[3])) == (state["state"], state["inc"])
 
