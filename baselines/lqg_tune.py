@@ -236,10 +236,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The command."""
     parser = argparse.ArgumentParser(prog="python -m baselines.lqg_tune", description=__doc__)
     parser.add_argument("--controller", choices=sorted(GOALS), default="lqg")
-    parser.add_argument("--budget", type=int, default=120, help="candidates to try")
+    parser.add_argument("--budget", type=int, default=60, help="candidates to try")
     parser.add_argument("--episodes", type=int, default=100, help="training episodes a candidate")
-    parser.add_argument("--survive", type=int, default=40, help="more of each harder scenario, failures only")
-    parser.add_argument("--validation", type=int, default=500, help="validation episodes a finalist")
+    parser.add_argument("--survive", type=int, default=20, help="more of each harder scenario, failures only")
+    parser.add_argument("--validation", type=int, default=250, help="validation episodes a finalist")
     parser.add_argument("--output", type=Path, default=None, help="default results/tuning/<controller>.json")
     given = parser.parse_args(arguments)
     for name in ("budget", "episodes", "validation"):

@@ -1,0 +1,107 @@
+"""The tuning command on a made-up plant whose optimum is known, and what ships against its history."""
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from baselines import lqg_settings, lqg_tune
+from baselines.lqg import LQGSettings
+from baselines.lqg_tune import KNOBS, VALIDATION_SEED, Figures, Goal, History
+
+GOAL = Goal(0.07, 0.02, True, LQGSettings())
+SHIPPED = {"lqg": lqg_settings.REWARD, "lqg-quiet": lqg_settings.QUIET}
+RESULTS = Path(__file__).parents[1] / "results" / "tuning"
+
+
+def made_up(settings, scenario="randomized", seeds=()):
+    """Best return where every knob is twice its default; the radius error is within its limit below the default."""
+    away = lqg_tune.knobs(settings) - lqg_tune.knobs(LQGSettings()) - np.log(2.0)
+    rmse = 0.07 * np.exp(0.1 * (lqg_tune.knobs(settings)[0] - lqg_tune.knobs(LQGSettings())[0]))
+    return Figures(float(rmse), 0.01, 0.02, 2000.0 - 20.0 * float(away @ away), 0.0, 2160)
+
+
+def test_knobs_and_settings_are_inverse():
+    values = lqg_tune.knobs(LQGSettings()) + np.linspace(-1.0, 1.0, len(KNOBS))
+    found = lqg_tune.knobs(lqg_tune.with_knobs(LQGSettings(), values))
+    np.testing.assert_allclose(found, values, atol=1e-3)
+
+
+def test_the_search_finds_the_optimum_inside_the_limits(monkeypatch):
+    monkeypatch.setattr(lqg_tune, "measure", made_up)
+    history = lqg_tune.search(GOAL, 250, 1, 0)
+    best = lqg_tune.settings_from(history.best(1)[0]["settings"])
+    away = lqg_tune.knobs(best) - lqg_tune.knobs(LQGSettings())
+    assert away[0] == pytest.approx(0.0, abs=0.02)
+    np.testing.assert_allclose(away[1:], np.log(2.0), atol=0.15)
+
+
+def test_a_candidate_that_loses_crystals_is_never_best(monkeypatch):
+    def fragile(settings, scenario="randomized", seeds=()):
+        found = made_up(settings)
+        lost = scenario != "randomized" and lqg_tune.knobs(settings)[1] > lqg_tune.knobs(LQGSettings())[1]
+        return replace(found, failure_rate=float(lost))
+
+    monkeypatch.setattr(lqg_tune, "measure", fragile)
+    history = lqg_tune.search(GOAL, 60, 1, 5)
+    assert any(sum(entry["lost"]) for entry in history.entries)
+    best = history.best(1)[0]
+    assert best["lost"]
+    assert sum(best["lost"]) == 0.0
+
+
+def test_validation_seeds_choose(monkeypatch):
+    candidates = [LQGSettings(lam=lam) for lam in (0.1, 0.2, 0.3)]
+    history = History([{"score": float(i), "settings": asdict(c)} for i, c in enumerate(candidates)])
+    met = []
+
+    def by_lam(settings, scenario, seeds):
+        met.extend(seeds)
+        return Figures(0.06, 0.01, 0.02, 1000.0 * settings.lam, 0.0, 2160)
+
+    monkeypatch.setattr(lqg_tune, "measure", by_lam)
+    chosen = lqg_tune.choose(GOAL, history, 7)
+    assert chosen["settings"]["lam"] == 0.3
+    assert chosen["hash"] == candidates[2].hash
+    assert set(met) == set(range(VALIDATION_SEED, VALIDATION_SEED + 7))
+
+
+def test_missing_a_limit_and_losing_a_crystal_cost_more_than_any_return():
+    inside, outside = Figures(0.069, 0.01, 0.0, 1800.0, 0.0, 2160), Figures(0.08, 0.01, 0.0, 2000.0, 0.0, 2160)
+    lost = replace(inside, mean_return=2000.0, failure_rate=0.01)
+    assert GOAL.score(inside) < GOAL.score(outside)
+    assert GOAL.score(inside) < GOAL.score(lost)
+
+
+def test_the_command_writes_its_history(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(lqg_tune, "measure", made_up)
+    output = tmp_path / "new" / "lqg.json"
+    assert lqg_tune.main(["--budget", "20", "--survive", "0", "--output", str(output)]) == 0
+    written = json.loads(output.read_text())
+    assert len(written["history"]) >= 20
+    assert lqg_tune.settings_from(written["chosen"]["settings"]).hash == written["chosen"]["hash"]
+    assert [file.name for file in output.parent.iterdir()] == ["lqg.json"]
+
+
+@pytest.mark.parametrize("arguments", [["--budget", "0"], ["--survive", "-1"], ["--controller", "pid"]])
+def test_bad_arguments_are_refused_in_a_line(arguments, capsys):
+    with pytest.raises(SystemExit) as error:
+        lqg_tune.main(arguments)
+    assert error.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_a_place_that_cannot_be_written_is_refused_before_the_search(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(lqg_tune, "measure", None)
+    (tmp_path / "file").write_text("")
+    assert lqg_tune.main(["--output", str(tmp_path / "file" / "lqg.json")]) == 2
+    assert "cannot write" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", sorted(SHIPPED))
+def test_what_ships_is_what_the_command_chose(name):
+    chosen = json.loads((RESULTS / f"{name}.json").read_text())["chosen"]
+    assert SHIPPED[name].hash == chosen["hash"]
+    assert SHIPPED[name] == lqg_tune.settings_from(chosen["settings"])
