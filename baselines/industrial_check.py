@@ -52,7 +52,8 @@ def autocorrelation(error: Floats, lags: int) -> Floats:
     centred = error - error.mean()
     n = len(centred)
     products: Floats = np.array([centred[: n - lag] @ centred[lag:] for lag in range(lags + 1)])
-    return products / products[0]
+    course: Floats = products / products[0]
+    return course
 
 
 def identified_gain(diameter: Floats, pull: Floats, samples: int) -> float:

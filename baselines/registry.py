@@ -11,6 +11,7 @@ from . import lqg_settings
 from .compensated_pid import CompensatedPID
 from .open_loop import OpenLoop
 from .policy import Policy
+from .tuned import tuned
 
 
 @dataclass(frozen=True)
@@ -38,10 +39,18 @@ def _pid_uncompensated(config: Config) -> Policy:
     return CompensatedPID(config.control_interval, compensator=None, v_0=config.parameters.v_0)
 
 
+def _tuned(name: str, meaning: str) -> Entry:
+    return Entry(name, lambda config: tuned(name, config), "measured", meaning)
+
+
 CONTROLLERS: tuple[Entry, ...] = (
     Entry("open-loop", lambda config: OpenLoop(), "measured", "nominal pull speed and heater power, no feedback"),
     Entry("paper", _paper, "measured", "the paper's compensator and PID as printed, Table 1"),
     Entry("pid-uncompensated", _pid_uncompensated, "measured", "the same PID without the compensator: unstable"),
+    _tuned("paper-filtered", "the paper's controller with a measurement filter and anti-windup"),
+    _tuned("paper-tuned", "compensator and PID re-tuned, with a slow trim of the heater"),
+    _tuned("pid-conventional", "tuned PID without compensator, crossover below half the right-half-plane zero"),
+    _tuned("industrial", "incremental pull-speed law of a logged puller, with automatic growth control"),
     Entry("lqg", lqg_settings.lqg, "measured", "Kalman filter and LQ regulator of pull and heater, for the reward"),
     Entry("lqg-quiet", lqg_settings.lqg_quiet, "measured", "the same for low pull activity"),
     Entry(

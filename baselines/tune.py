@@ -32,7 +32,7 @@ TRAINING, VALIDATION = range(1_000_000), range(1_000_000, 1_000_500)
 """Seeds: the first ones of each are used."""
 STEP_PRICE, EXCESS_PRICE, FAILURE_PRICE, RULE_PRICE = 0.2, 20.0, 5.0, 2.0
 """Prices of pull step RMS and its excess over what is allowed [mm per mm/min], of failures and broken rules [mm]."""
-EXPLORE = 0.6
+EXPLORE = 0.4
 """Share of the trials that explore; the others refine."""
 STEPS = (0.01, 0.15)
 """Standard deviations of a refining step, in parts of a knob's range."""

@@ -28,6 +28,69 @@ class Tuned(NamedTuple):
 
 TUNED: tuple[Tuned, ...] = (
     Tuned(
+        "paper-filtered",
+        "randomized",
+        FilteredPID(T_f=53.88),
+    ),
+    Tuned(
+        "paper-tuned",
+        "randomized",
+        FilteredPID(
+            pid=SeriesPID(K_p=0.01007, T_i=604.9, T_d=591.0, N=13.01),
+            compensator=Compensator(gain=-0.5118, fast=0.0003176, slow=0.005184),
+            T_f=75.44,
+            T_start=268.9,
+            T_track=300.0,
+            ring_lead=2.687,
+            K_ff=0.8906,
+            heater=TemperatureLoop(K=6111.0, T_i=217.6, share=0.407, K_pull=2.639, T_pull=325.0, T_mean=40.17),
+        ),
+    ),
+    Tuned(
+        "paper-tuned",
+        "puller",
+        FilteredPID(
+            pid=SeriesPID(K_p=0.02777, T_i=1701.0, T_d=441.3, N=11.91),
+            compensator=Compensator(gain=-0.5952, fast=0.001781, slow=0.005267),
+            T_f=78.27,
+            jump=0.002,
+            T_start=187.6,
+            T_track=301.5,
+            ring_lead=18.3,
+            K_ff=1.004,
+            heater=TemperatureLoop(K=507.1, T_i=202.0, share=0.5192, K_pull=5.78, T_pull=444.7, T_mean=42.84),
+        ),
+    ),
+    Tuned(
+        "pid-conventional",
+        "randomized",
+        FilteredPID(
+            pid=SeriesPID(K_p=0.001598, T_i=399.9, T_d=1066.0, N=25.29),
+            compensator=None,
+            T_f=9.763,
+            T_start=771.9,
+            T_track=300.0,
+            ring_lead=5.257,
+            K_ff=0.1345,
+            heater=TemperatureLoop(K=10000.0, T_i=378.9, share=0.3245, K_pull=8.659, T_pull=1010.0, T_mean=382.1),
+        ),
+    ),
+    Tuned(
+        "pid-conventional",
+        "puller",
+        FilteredPID(
+            pid=SeriesPID(K_p=0.004046, T_i=836.2, T_d=407.2, N=7.641),
+            compensator=None,
+            T_f=11.74,
+            jump=0.001944,
+            T_start=337.8,
+            T_track=293.0,
+            ring_lead=18.75,
+            K_ff=0.05013,
+            heater=TemperatureLoop(K=699.2, T_i=65.87, share=0.09396, K_pull=2.866, T_pull=180.0, T_mean=220.5),
+        ),
+    ),
+    Tuned(
         "industrial",
         "randomized",
         Industrial(
@@ -35,7 +98,6 @@ TUNED: tuple[Tuned, ...] = (
             heater=TemperatureLoop(K=407.2, T_i=64.27, share=0.8326, K_pull=36.0, T_pull=6343.0, T_mean=1611.0),
         ),
     ),
-    Tuned("paper-filtered", "randomized", FilteredPID(T_f=53.88)),
 )
 """All settings; for each controller those of ``randomized`` come first."""
 
