@@ -6,11 +6,36 @@ from cz_gym.config import Config
 
 from .lqg import LQG, LQGSettings
 from .lqg_bounds import FullInformation, ToldLQG
+from .lqg_model import NoiseModel
 from .lqr import Weights
 
-REWARD = LQGSettings(weights=Weights(pull=0.12, pull_step=0.06, heater_step=0.08))
+REWARD = LQGSettings(
+    noise=NoiseModel(
+        fast_sd=0.3103,
+        slow_sd=0.367,
+        drift_rate_sd=0.0007431,
+        drift_rate_tau=2132.0,
+        heater_walk=0.3841,
+        thermal_walk=0.002908,
+        recipe_share=0.2405,
+        pyrometer_sd=0.08622,
+    ),
+    weights=Weights(pull=0.1548, pull_step=0.06511, heater_step=0.05704),
+)
 """``lqg``: as much reward as a mean radius error of 0.062 mm allows."""
-QUIET = LQGSettings(weights=Weights(pull=0.1, pull_step=0.2, heater_step=0.1))
+QUIET = LQGSettings(
+    noise=NoiseModel(
+        fast_sd=0.2614,
+        slow_sd=0.311,
+        drift_rate_sd=0.0005758,
+        drift_rate_tau=2265.0,
+        heater_walk=0.3219,
+        thermal_walk=0.002207,
+        recipe_share=0.2513,
+        pyrometer_sd=0.06289,
+    ),
+    weights=Weights(pull=0.05482, pull_step=0.3051, heater_step=0.1168),
+)
 """``lqg-quiet``: the radius as well as pull steps of 0.0095 mm/min allow."""
 
 
