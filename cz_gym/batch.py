@@ -122,12 +122,16 @@ class Batch:
             np.zeros((num_envs, frames, 2)),
         )
         self.memory.slots["over"] = 1
+        self._law = law_of(config.scenario)
+        self._mix = np.array(config.mix, np.float64)
         self._parameters = Parameters(*map(float, config.parameters))
         self.actions = np.zeros((num_envs, 2))
         self._all = np.ones(num_envs, np.bool_)
         self._spare: list[Out] = []
-        arguments = (self.memory, self.actions, self._all, self.clock, self.reading, self.new_out(), 0, num_envs)
-        self._step = entry(self.kernels.step, arguments)
+        out, which, keys = self.new_out(), np.zeros(1, np.int64), np.zeros((1, 2), np.uint64)
+        stepped = (self.memory, self.actions, self._all, self.clock, self.reading, out, 0, 1)
+        drawn = (self.memory, which, keys, self._law, self._mix, self._parameters, self.clock, self.reading, out, 0, 1)
+        self._step, self._draw = entry(self.kernels.step, stepped), entry(self.kernels.draw, drawn)
         threads = threads or os.cpu_count() or 1
         self._parts = max(1, min(threads, num_envs // SLOTS_PER_THREAD))
         self._pool: ThreadPoolExecutor | None = None
@@ -162,14 +166,15 @@ class Batch:
 
         Raises ValueError if a drawn puller has no finite operating point.
         """
-        config = self.config if scenario is None else self.config.with_scenario(scenario)
+        law, mix = self._law, self._mix
+        if scenario is not None:
+            law, mix = law_of(scenario), np.array(self.config.with_scenario(scenario).mix, np.float64)
         slots = np.array(which, np.int64)
         words = np.array(list(keys), np.uint64).reshape(-1, 2)
         arguments = (
-            self.memory, slots, words, law_of(config.scenario), np.array(config.mix, np.float64), self._parameters,
-            self.clock, self.reading, out,
+            self.memory, slots, words, law, mix, self._parameters, self.clock, self.reading, out,
         )  # fmt: skip
-        if max(self._run(self.kernels.draw, arguments, len(slots), DRAWS_PER_THREAD)) >= 0:
+        if max(self._run(self._draw, arguments, len(slots), DRAWS_PER_THREAD)) >= 0:
             raise ValueError(NO_OPERATING_POINT)
 
     def step(self, actions: npt.ArrayLike, out: Out, active: npt.NDArray[np.bool_] | None = None) -> None:
@@ -179,6 +184,10 @@ class Batch:
         active = self._all if active is None else active
         arguments = (self.memory, self.actions, active, self.clock, self.reading, out)
         self._run(self._step, arguments, self.num_envs, SLOTS_PER_THREAD)
+
+    def advance(self, rings: npt.NDArray[np.float64]) -> None:
+        """Drives, plant and ring [m] of every slot, and nothing else: what the speed of a step is measured against."""
+        self._run(self.kernels.plant, (self.memory, self.actions, self.clock, rings), self.num_envs, SLOTS_PER_THREAD)
 
     def _run(self, loop: Any, arguments: tuple[Any, ...], count: int, least: int) -> list[Any]:
         """Run a loop over ``count`` rows, in a part of at least ``least`` rows a thread; what the parts return."""
