@@ -20,6 +20,8 @@ FOLDER = Path(__file__).resolve().parent / "results" / "benchmark"
 """Where the committed results are."""
 README = FOLDER.parents[1] / "README.md"
 """Where the committed results are quoted, between two markers."""
+KEPT = FOLDER.parent / "cache"
+"""Where episodes of slow controllers are kept."""
 RESULTS = "benchmark.json"
 SHIPPED = ("ppo",)
 """Agents that come with the package."""
@@ -58,6 +60,9 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
         metavar="FILE",
         help="agent file in place of the shipped one; repeat it for the training seeds of one algorithm",
     )
+    parser.add_argument(
+        "--slow", action="store_true", help="slow controllers too, on the first 50 episodes; resumed from results/cache"
+    )
     parser.add_argument("--overwrite", action="store_true", help="let a partial run replace a folder's results")
     parser.add_argument("--quiet", action="store_true", help="no progress bar, no table")
     return parser.parse_args(argv)
@@ -78,7 +83,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return benchmark(arguments, shlex.join(["benchmark.py", *(sys.argv[1:] if argv is None else argv)]))
     except ImportError as error:
-        print(f'benchmark.py: {error.name} is missing: pip install "cz-gym[benchmark]"', file=sys.stderr)
+        missing = f'{error.name} is missing: pip install "cz-gym[benchmark]"' if error.name else error
+        print(f"benchmark.py: {missing}", file=sys.stderr)
         return 2
     except (ValueError, OSError) as error:
         print(f"benchmark.py: {_one_line(error)}", file=sys.stderr)
@@ -116,8 +122,8 @@ def make_plan(arguments: argparse.Namespace, command: str) -> Plan:
         rows = tuple(row for row in ROWS if row.default)
     else:
         rows = tuple(find_row(name) for name in arguments.scenarios)
-    contenders, contracts = choose(arguments.controllers, arguments.agent or [])
-    return Plan(contenders, rows, episodes, contracts, command)
+    contenders, contracts = choose(arguments.controllers, arguments.agent or [], arguments.slow)
+    return Plan(contenders, rows, episodes, contracts, command, KEPT)
 
 
 def is_partial(arguments: argparse.Namespace, plan: Plan) -> bool:
@@ -148,14 +154,17 @@ def check_targets(arguments: argparse.Namespace, partial: bool) -> None:
             check_writable(folder)
 
 
-def choose(wanted: list[str] | None, files: list[Path]) -> tuple[tuple[Contender, ...], tuple[dict[str, Any], ...]]:
+def choose(
+    wanted: list[str] | None, files: list[Path], slow: bool = False
+) -> tuple[tuple[Contender, ...], tuple[dict[str, Any], ...]]:
     """Who takes part, classical controllers first, and the contracts of the agents among them.
 
-    Agent files named on the command line always take part, in place of the shipped ones. Raises ValueError for a name
-    that nobody has, and for agent files that cannot be used.
+    Agent files named on the command line always take part, in place of the shipped ones; slow controllers only if
+    ``slow``. Raises ValueError for a name that nobody has, and for agent files that cannot be used.
     """
     from agents import OnnxPolicy, shipped
     from baselines.registry import CONTROLLERS
+    from cz_gym.evaluation.protocol import SLOW_EPISODES
 
     given = [OnnxPolicy.load(file, _nominal()) for file in files]
     learned = list(dict.fromkeys(policy.contract.algorithm for policy in given)) or list(SHIPPED)
@@ -164,13 +173,17 @@ def choose(wanted: list[str] | None, files: list[Path]) -> tuple[tuple[Contender
         if name in classical:
             raise ValueError(f"the algorithm of an agent may not be called {name!r}: a controller has that name")
     if wanted is None:
-        wanted = [entry.name for entry in CONTROLLERS if entry.default] + learned
+        wanted = [entry.name for entry in CONTROLLERS if (slow if entry.slow else entry.default)] + learned
     elif wanted == ["all"]:
-        wanted = classical + learned
+        wanted = [entry.name for entry in CONTROLLERS if slow or not entry.slow] + learned
     for name in wanted:
         if name not in classical + learned:
             raise ValueError(f"unknown controller {name!r}; choose from {', '.join(classical + learned)}, or all")
-    contenders = [_classical(entry) for entry in CONTROLLERS if entry.name in wanted]
+    taking_part = [entry for entry in CONTROLLERS if entry.name in wanted]
+    for entry in taking_part:
+        if entry.slow and not slow:
+            raise ValueError(f"{entry.name!r} is slow: add --slow to run it on the first {SLOW_EPISODES} episodes")
+    contenders = [_classical(entry) for entry in taking_part]
     contracts = []
     for name in learned:
         if given:
@@ -188,7 +201,9 @@ def _classical(entry: Entry) -> Contender:
     from cz_gym.evaluation.results import Controller
     from cz_gym.evaluation.run import Contender
 
-    controller = Controller(entry.name, entry.observation, entry.meaning, told=entry.told)
+    controller = Controller(entry.name, entry.observation, entry.meaning, told=entry.told, slow=entry.slow)
+    if entry.slow:
+        entry.make(_nominal())  # a package it needs is missing? say so before the work, not after it
     return Contender(controller, lambda config: [entry.make(config)])
 
 

@@ -18,6 +18,7 @@ from cz_gym.evaluation.rollout import Rollout
 from cz_gym.observation import HEATER_SCALE, STATE, scales
 from cz_gym.task import cost_terms
 
+from .fingerprint import fingerprint
 from .future import future_of
 from .policy import Floats, batched, fresh, to_action
 from .trajectory import INPUTS, Search, Trajectory, limits_of, optimise, predicted_cost
@@ -55,6 +56,11 @@ class Clairvoyant:
 
     search: Search = field(default_factory=Search)
     plan: Plan | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def hash(self) -> str:
+        """Hash of its settings and its code (16 hex digits)."""
+        return fingerprint(self.search, "future", "stagewise", "trajectory", "clairvoyant")
 
     def for_episodes(self, config: Config, seeds: Sequence[int]) -> Clairvoyant:
         """The same for those episodes, one a slot."""

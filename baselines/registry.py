@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from cz_gym.config import Config
 
 from . import lqg_settings
+from .clairvoyant import Clairvoyant
 from .compensated_pid import CompensatedPID
 from .open_loop import OpenLoop
 from .policy import Policy
@@ -29,6 +30,8 @@ class Entry:
     """Whether a benchmark that names no controllers runs it."""
     told: bool = False
     """Whether it is told what no controller knows, which makes it a bound."""
+    slow: bool = False
+    """Whether it runs only when slow controllers are asked for, on the first few episodes."""
 
 
 def _paper(config: Config) -> Policy:
@@ -68,6 +71,15 @@ CONTROLLERS: tuple[Entry, ...] = (
         "bound: lqg's regulator, true state seen",
         default=False,
         told=True,
+    ),
+    Entry(
+        "clairvoyant",
+        lambda config: Clairvoyant(),
+        "state",
+        "bound: the best trajectory for the whole future known",
+        default=False,
+        told=True,
+        slow=True,
     ),
 )
 """Every named controller, in the order of tables."""

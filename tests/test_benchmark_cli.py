@@ -347,7 +347,11 @@ def test_controllers_say_what_they_are_and_act() -> None:
         assert find_controller(entry.name) is entry
         channels = OBSERVATIONS[entry.observation]
         quiet = np.array([[1.0 if channel.name == "valid" else 0.0 for channel in channels]] * 3, np.float32)
-        action, _ = entry.make(make_config(observation=entry.observation)).predict(quiet)
+        config = make_config(observation=entry.observation, horizon=60.0)
+        policy: Any = entry.make(config)
+        if hasattr(policy, "for_episodes"):
+            policy = policy.for_episodes(config, [0, 1, 2])
+        action, _ = policy.predict(quiet)
         assert action.shape == (3, 2)
         assert action.dtype == np.float32
     with pytest.raises(ValueError, match="unknown controller 'nobody'; choose from open-loop, paper"):

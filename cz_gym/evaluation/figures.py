@@ -20,7 +20,7 @@ def draw_figures(benchmark: Benchmark) -> dict[str, bytes]:
     """Every figure by file name; a figure with nothing to show is left out."""
     ranked = sorted(benchmark.controllers, key=lambda controller: not controller.learned)
     looks = styles([controller.name for controller in ranked])
-    random = [scenario for scenario in benchmark.scenarios if len(scenario.outcomes[0].sample.seeds) > 1]
+    random = [scenario for scenario in benchmark.scenarios if len(scenario.seeds) > 1]
     figures = {"crystal.png": crystal(benchmark.scenarios[0], looks)}
     if random:
         figures["errors.png"] = errors(random, looks)
@@ -40,7 +40,7 @@ def errors(scenarios: Sequence[ScenarioResult], looks: dict[str, Style]) -> byte
     for axis, scenario in zip(axes.flat, scenarios, strict=False):
         for place, outcome in enumerate(scenario.outcomes):
             _spread(axis, outcome.sample.metric("rmse_mm").ravel(), place, looks[outcome.controller.name].colour)
-        axis.set_title(f"{scenario.row.name} ({len(scenario.outcomes[0].sample.seeds)} crystals)", fontsize=9.5)
+        axis.set_title(f"{scenario.row.name} ({len(scenario.seeds)} crystals)", fontsize=9.5)
         axis.set_xscale("log")
         axis.set_yticks(range(len(names)), names)
         axis.set_ylim(len(names) - 0.4, -0.6)

@@ -16,10 +16,10 @@ from typing import Any
 
 from ..scenarios import SCENARIOS
 from .metrics import metric_names
-from .results import REFERENCE, Benchmark, Outcome
+from .results import BOUND, REFERENCE, Benchmark, Outcome
 from .statistics import RESAMPLES, SEED, Estimate
 
-PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime")
+PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime", "casadi")
 """Packages whose versions are recorded."""
 
 
@@ -44,10 +44,16 @@ def to_json(benchmark: Benchmark) -> str:
         }
         for scenario in benchmark.scenarios
     }
+    gaps = {
+        scenario.row.name: {o.controller.name: _estimate(o.gap) for o in scenario.outcomes if o.gap}
+        for scenario in benchmark.scenarios
+        if any(o.gap for o in scenario.outcomes)
+    }
     data = {
         "results": results,
         "paired": paired,
         "cvar5": tails,
+        "optimality_gap": gaps,
         "verdicts": verdicts,
         "provenance": _provenance(benchmark),
     }
@@ -83,14 +89,15 @@ def _provenance(benchmark: Benchmark) -> dict[str, Any]:
                 "scenario": scenario.row.scenario,
                 "hash": SCENARIOS[scenario.row.scenario].hash,
                 "model": scenario.row.model,
-                "first_seed": scenario.outcomes[0].sample.seeds[0],
-                "episodes": len(scenario.outcomes[0].sample.seeds),
+                "first_seed": scenario.seeds[0],
+                "episodes": len(scenario.seeds),
             }
             for scenario in benchmark.scenarios
         },
         "controllers": {controller.name: asdict(controller) for controller in benchmark.controllers},
         "agents": [dict(contract) for contract in benchmark.agents],
         "bootstrap": {"resamples": RESAMPLES, "seed": SEED, "paired_against": REFERENCE},
+        "gap_measured_from": BOUND,
     }
 
 

@@ -10,6 +10,9 @@ from ..scenarios import SCENARIOS
 TEST_SEEDS = range(2_000_000, 2_000_500)
 """Seeds of the test episodes; nothing is tuned, selected or stopped on them."""
 
+SLOW_EPISODES = 50
+"""Most test episodes of a controller that is slow: the first ones."""
+
 
 @dataclass(frozen=True)
 class Row:

@@ -42,6 +42,8 @@ DRIVES = (
     Column(SPEED, "compute [us/step]", 2),
 )
 
+GAP = Column("optimality_gap", f"optimality gap [% of {REFERENCE}'s]", 1, PERCENT)
+
 
 def headline(benchmark: Benchmark) -> str:
     """One plain line: whether the agents win, and where they don't."""
@@ -90,7 +92,7 @@ def summary(benchmark: Benchmark) -> str:
     for place, outcome in enumerate(first.outcomes):
         errors = [_interval(scenario.outcomes[place].means["rmse_mm"], ERROR[0]) for scenario in benchmark.scenarios]
         others = [_interval(outcome.means[column.metric], column) for column in extras]
-        rows.append((outcome.controller.name, *errors, *others))
+        rows.append((_label(outcome, first), *errors, *others))
     return f"{caption}\n\n{_table(('controller', *headings), rows)}"
 
 
@@ -104,7 +106,7 @@ def fill_in(page: str, benchmark: Benchmark) -> str:
 def markdown(benchmark: Benchmark, figures: Iterable[str]) -> str:
     """``report.md``; its first line is :func:`headline`."""
     config = benchmark.scenarios[0].row.config()
-    counts = {len(scenario.outcomes[0].sample.seeds) for scenario in benchmark.scenarios}
+    counts = {len(scenario.seeds) for scenario in benchmark.scenarios}
     parts = [
         headline(benchmark),
         "# Benchmark",
@@ -134,35 +136,43 @@ def _seeds(seeds: Sequence[int]) -> str:
 
 
 def _scenario(scenario: ScenarioResult) -> list[str]:
-    crystals = len(scenario.outcomes[0].sample.seeds)
+    crystals = len(scenario.seeds)
     parts = [
         f"## {scenario.row.name} ({crystals} crystal{'s' if crystals > 1 else ''})",
         f"{scenario.row.meaning[0].upper()}{scenario.row.meaning[1:]}.",
-        _metrics(scenario.outcomes, ERROR),
-        _metrics(scenario.outcomes, DRIVES),
+        _metrics(scenario, ERROR),
+        _metrics(scenario, DRIVES),
     ]
     if any(outcome.paired for outcome in scenario.outcomes):
-        parts.append(_comparison(scenario.outcomes))
+        parts.append(_comparison(scenario))
     return parts
 
 
-def _metrics(outcomes: Sequence[Outcome], columns: Sequence[Column]) -> str:
+def _label(outcome: Outcome, scenario: ScenarioResult) -> str:
+    """The controller's name, and how many crystals it met if fewer than the scenario has."""
+    met = len(outcome.sample.seeds)
+    return outcome.controller.name + (f" (n = {met})" if met < len(scenario.seeds) else "")
+
+
+def _metrics(scenario: ScenarioResult, columns: Sequence[Column]) -> str:
     rows = [
-        (outcome.controller.name, *(_interval(outcome.means[column.metric], column) for column in columns))
-        for outcome in outcomes
+        (_label(outcome, scenario), *(_interval(outcome.means[column.metric], column) for column in columns))
+        for outcome in scenario.outcomes
     ]
     return _table(("controller", *(column.heading for column in columns)), rows)
 
 
-def _comparison(outcomes: Sequence[Outcome]) -> str:
-    rmse, step = ERROR[0], DRIVES[1]
+def _comparison(scenario: ScenarioResult) -> str:
+    outcomes, rmse, step = scenario.outcomes, ERROR[0], DRIVES[1]
+    gaps = any(outcome.gap for outcome in outcomes)
     rows = [
         (
-            outcome.controller.name,
+            _label(outcome, scenario),
             _interval(outcome.cvar5["rmse_mm"], rmse),
             _interval(outcome.paired["rmse_mm"], rmse) if outcome.paired else NOTHING,
             _interval(outcome.improvement, rmse) if outcome.improvement else NOTHING,
             _interval(outcome.paired[step.metric], step) if outcome.paired else NOTHING,
+            *([_interval(outcome.gap, GAP) if outcome.gap else NOTHING] if gaps else []),
         )
         for outcome in outcomes
     ]
@@ -172,6 +182,7 @@ def _comparison(outcomes: Sequence[Outcome]) -> str:
         f"RMSE less {REFERENCE}'s [mm]",
         f"better than {REFERENCE} with probability",
         f"pull step RMS less {REFERENCE}'s [mm/min]",
+        *([GAP.heading] if gaps else []),
     )
     return _table(headings, rows)
 
@@ -209,10 +220,10 @@ def terminal(benchmark: Benchmark) -> str:
     headings = [("", "controller"), *_heads(column.heading for column in SHOWN), (f"RMSE less {REFERENCE}'s", "mm")]
     blocks = []
     for scenario in benchmark.scenarios:
-        rows = [[outcome.controller.name, *_cells(outcome)] for outcome in scenario.outcomes]
+        rows = [[_label(outcome, scenario), *_cells(outcome)] for outcome in scenario.outcomes]
         grid = [[top for top, _ in headings], [unit for _, unit in headings], *rows]
         widths = [max(len(line[i]) for line in grid) for i in range(len(headings))]
-        crystals = len(scenario.outcomes[0].sample.seeds)
+        crystals = len(scenario.seeds)
         lines = [f"{scenario.row.name} ({crystals} crystal{'s' if crystals > 1 else ''})"]
         for name, *cells in grid:
             padded = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,21 @@ import numpy.typing as npt
 from .metrics import metric_names, metrics
 from .protocol import Row
 from .rollout import Rollout, Signals
-from .statistics import Estimate, Resamples, cvar, differences, means, probability_of_improvement
+from .statistics import (
+    Estimate,
+    Resamples,
+    cvar,
+    differences,
+    means,
+    optimality_gap,
+    probability_of_improvement,
+)
 
 Floats = npt.NDArray[np.float64]
 REFERENCE = "paper"
 """Controller that paired differences are taken against."""
+BOUND = "clairvoyant"
+"""Controller that optimality gaps are measured from."""
 SPEED = "microseconds_per_step"
 """Name of the one metric that is not per episode: time in ``predict`` per step and episode, batched [us]."""
 TAIL_METRICS = ("rmse_mm", "rmse_observable_mm", "max_error_mm")
@@ -34,6 +45,8 @@ class Controller:
     """Training seeds of a learned controller, empty for the others."""
     told: bool = False
     """Whether it is told what no controller knows."""
+    slow: bool = False
+    """Whether it meets only the first few episodes, and its results are kept."""
 
     @property
     def learned(self) -> bool:
@@ -73,6 +86,10 @@ class Sample:
         values: Floats = self.values[:, :, metric_names().index(name)]
         return values
 
+    def first(self, episodes: int) -> Sample:
+        """The same sample on its first episodes."""
+        return replace(self, seeds=self.seeds[:episodes], values=self.values[:, :episodes])
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -87,6 +104,8 @@ class Outcome:
     """Mean difference against :data:`REFERENCE` on the same crystals, by metric; empty without it."""
     improvement: Estimate | None
     """Probability of a lower RMSE than :data:`REFERENCE` on the same crystal."""
+    gap: Estimate | None = None
+    """(J - J_bound) / (J_reference - J_bound), J the mean squared radius error; None without :data:`BOUND`."""
 
     @property
     def controller(self) -> Controller:
@@ -122,6 +141,11 @@ class ScenarioResult:
     outcomes: tuple[Outcome, ...]
     verdicts: tuple[Verdict, ...]
 
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Seeds of its episodes; a slow controller may have met only the first of them."""
+        return max((outcome.sample.seeds for outcome in self.outcomes), key=len)
+
 
 @dataclass(frozen=True)
 class Benchmark:
@@ -139,37 +163,59 @@ class Benchmark:
 
 
 def summarise(row: Row, samples: Sequence[Sample]) -> ScenarioResult:
-    """Means, tails, paired differences and verdicts of one scenario, all on the same resamples."""
-    resamples = Resamples.draw(len(samples[0].seeds))
-    reference = next((sample for sample in samples if sample.controller.name == REFERENCE), None)
-    outcomes = tuple(_outcome(sample, reference, resamples) for sample in samples)
+    """Means, tails, paired differences, gaps and verdicts of one scenario.
+
+    Controllers that met the same episodes share their resamples; two that met different numbers are compared on those
+    that both met.
+    """
+    resamples = cache(Resamples.draw)
+    named = {sample.controller.name: sample for sample in samples}
+    outcomes = tuple(_outcome(sample, named.get(REFERENCE), named.get(BOUND), resamples) for sample in samples)
     return ScenarioResult(row, outcomes, _verdicts(samples, resamples))
 
 
-def _outcome(sample: Sample, reference: Sample | None, resamples: Resamples) -> Outcome:
-    names = metric_names()
-    found = dict(zip(names, means(sample.values, resamples), strict=True))
+def _outcome(
+    sample: Sample, reference: Sample | None, bound: Sample | None, resamples: Callable[[int], Resamples]
+) -> Outcome:
+    names, own = metric_names(), resamples(len(sample.seeds))
+    found = dict(zip(names, means(sample.values, own), strict=True))
     found[SPEED] = Estimate(sample.microseconds_per_step, None, len(sample.seeds))
-    tails = {name: cvar(sample.metric(name), resamples) for name in TAIL_METRICS}
-    if reference is None or sample is reference:
-        return Outcome(sample, found, tails, {}, None)
-    paired = dict(zip(names, differences(sample.values, reference.values, resamples), strict=True))
-    better = probability_of_improvement(sample.metric("rmse_mm"), reference.metric("rmse_mm"), resamples)
-    return Outcome(sample, found, tails, paired, better)
+    tails = {name: cvar(sample.metric(name), own) for name in TAIL_METRICS}
+    outcome = Outcome(sample, found, tails, {}, None)
+    if reference is None:
+        return outcome
+    if bound is not None:
+        outcome = replace(outcome, gap=_gap(sample, reference, bound, resamples))
+    if sample is reference:
+        return outcome
+    ours, theirs = common(sample, reference)
+    shared = resamples(len(ours.seeds))
+    paired = dict(zip(names, differences(ours.values, theirs.values, shared), strict=True))
+    better = probability_of_improvement(ours.metric("rmse_mm"), theirs.metric("rmse_mm"), shared)
+    return replace(outcome, paired=paired, improvement=better)
 
 
-def _verdicts(samples: Sequence[Sample], resamples: Resamples) -> tuple[Verdict, ...]:
+def _gap(sample: Sample, reference: Sample, bound: Sample, resamples: Callable[[int], Resamples]) -> Estimate | None:
+    ours, theirs, best = (np.square(one.metric("rmse_mm")) for one in common(sample, reference, bound))
+    return optimality_gap(ours, theirs, best, resamples(ours.shape[1]))
+
+
+def common(*samples: Sample) -> tuple[Sample, ...]:
+    """The samples on the episodes that all of them met, the first ones."""
+    fewest = min(len(sample.seeds) for sample in samples)
+    return tuple(sample.first(fewest) for sample in samples)
+
+
+def _verdicts(samples: Sequence[Sample], resamples: Callable[[int], Resamples]) -> tuple[Verdict, ...]:
     rivals = [sample for sample in samples if not (sample.controller.learned or sample.controller.bound)]
     if not rivals:
         return ()
-    best = min(rivals, key=lambda sample: float(sample.metric("rmse_mm").mean()))
-    theirs = best.metric("rmse_mm")[:, :, None]
-    return tuple(
-        Verdict(
-            sample.controller.name,
-            best.controller.name,
-            differences(sample.metric("rmse_mm")[:, :, None], theirs, resamples)[0],
-        )
-        for sample in samples
-        if sample.controller.learned
-    )
+    best = min(common(*rivals), key=lambda sample: float(sample.metric("rmse_mm").mean())).controller
+    rival = next(sample for sample in rivals if sample.controller is best)
+    verdicts = []
+    for sample in samples:
+        if sample.controller.learned:
+            ours, theirs = (one.metric("rmse_mm")[:, :, None] for one in common(sample, rival))
+            difference = differences(ours, theirs, resamples(ours.shape[1]))[0]
+            verdicts.append(Verdict(sample.controller.name, best.name, difference))
+    return tuple(verdicts)

@@ -53,7 +53,7 @@ class Rollout:
     start: Signals
     """Signals at t = 0, each of shape (1, episodes)."""
     seconds_in_policy: float
-    """Time spent in ``predict``, all episodes together [s]."""
+    """Time spent in ``predict``, and in ``for_episodes`` of a bound, all episodes together [s]."""
 
     @property
     def microseconds_per_step(self) -> float:
@@ -84,8 +84,10 @@ def rollout(
 
 def _rollout_chunk(policy: Any, config: Config, seeds: list[int], progress: Callable[[int], None] | None) -> Rollout:
     steps, n = config.steps, len(seeds)
+    before = time.perf_counter()
     if hasattr(policy, "for_episodes"):
         policy = policy.for_episodes(config, seeds)
+    seconds = time.perf_counter() - before
     env = CzVectorEnv(n, **_arguments(config))
     signals = Signals(*(np.zeros((steps, n)) for _ in Signals._fields))
     reward, alive = np.zeros((steps, n)), np.zeros((steps, n), np.bool_)
@@ -94,7 +96,6 @@ def _rollout_chunk(policy: Any, config: Config, seeds: list[int], progress: Call
     start = Signals(*(np.array(info[name])[None] for name in Signals._fields))
     state: Any = None
     begins, over = np.ones(n, np.bool_), np.zeros(n, np.bool_)
-    seconds = 0.0
     for k in range(steps):
         before = time.perf_counter()
         action, state = policy.predict(observation, state=state, episode_start=begins, deterministic=True)

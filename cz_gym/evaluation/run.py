@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from ..config import Config
-from .protocol import Row
+from .kept import slow_sample
+from .protocol import SLOW_EPISODES, Row
 from .results import Benchmark, Controller, Sample, summarise
 from .rollout import rollout
 
@@ -31,12 +33,23 @@ class Plan:
     agents: tuple[Mapping[str, Any], ...] = ()
     """Contracts of the agent files."""
     command: str = ""
+    kept: Path | None = None
+    """Folder where slow controllers' episodes are kept; needed if there are any."""
 
     @property
     def steps(self) -> int:
         """Environment steps of the whole run."""
-        policies = sum(len(contender.controller.training_seeds) or 1 for contender in self.contenders)
-        return sum(policies * len(row.seeds(self.episodes)) * row.config().steps for row in self.rows)
+        return sum(
+            (len(contender.controller.training_seeds) or 1)
+            * len(self.seeds(contender.controller, row))
+            * row.config().steps
+            for row in self.rows
+            for contender in self.contenders
+        )
+
+    def seeds(self, controller: Controller, row: Row) -> range:
+        """The episodes of a row that a controller meets."""
+        return row.seeds(min(self.episodes, SLOW_EPISODES) if controller.slow else self.episodes)
 
 
 def run(plan: Plan, progress: Progress) -> Benchmark:
@@ -48,11 +61,22 @@ def run(plan: Plan, progress: Progress) -> Benchmark:
             controller = contender.controller
             config = row.config(controller.observation)
             progress.say(f"{row.name}, {controller.name}")
-            policies = contender.make(config)
-            runs = [rollout(policy, config, row.seeds(plan.episodes), progress.advance) for policy in policies]
+            policies, seeds = contender.make(config), plan.seeds(controller, row)
+            if controller.slow:
+                samples.append(_slow(plan, controller, policies, config, seeds, progress))
+                continue
+            runs = [rollout(policy, config, seeds, progress.advance) for policy in policies]
             samples.append(Sample.of(controller, runs))
         scenarios.append(summarise(row, samples))
     return Benchmark(tuple(scenarios), plan.command, plan.agents)
+
+
+def _slow(
+    plan: Plan, controller: Controller, policies: Sequence[Any], config: Config, seeds: range, progress: Progress
+) -> Sample:
+    if plan.kept is None or len(policies) != 1:
+        raise ValueError(f"the slow controller {controller.name!r} needs a folder for its episodes, and one policy")
+    return slow_sample(controller, policies[0], config, seeds, plan.kept, progress.advance)
 
 
 class Progress:

@@ -1,0 +1,118 @@
+"""Slow controllers: their episodes run a few at a time and kept on disk, so that a run can be resumed.
+
+One file an episode, in a folder named by controller and a hash of all that its results depend on: the controller's
+settings, the environment's (plant, scenario, interval, horizon) and the sources of physics and metrics.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from ..config import Config
+from .files import write_files
+from .metrics import metric_names, metrics
+from .results import Controller, Sample
+from .rollout import Rollout, Signals, rollout
+
+Floats = npt.NDArray[np.float64]
+BLOCK = 10
+"""Episodes run at once."""
+SOURCES = ("plant.py", "meniscus.py", "schedule.py", "task.py", "evaluation/metrics.py")
+"""What the kept numbers are made by, beside the controller."""
+
+
+class SlowPolicy(Protocol):
+    """A policy whose results are worth keeping."""
+
+    @property
+    def hash(self) -> str:
+        """Hash of its settings and its code."""
+        ...
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[npt.NDArray[np.float32], Any]:
+        """The seam of all policies."""
+        ...
+
+
+class Kept(NamedTuple):
+    """What is kept of one episode."""
+
+    values: Floats
+    """Shape (metrics,)."""
+    microseconds: float
+    """Time in the policy per step [us]."""
+    signals: Floats
+    """Signals of the first episode, shape (signals, steps); of the others empty."""
+
+
+def slow_sample(
+    controller: Controller,
+    policy: SlowPolicy,
+    config: Config,
+    seeds: Sequence[int],
+    folder: Path,
+    progress: Callable[[int], None],
+) -> Sample:
+    """The sample of a slow controller; episodes already in ``folder`` are read, the others run and written there."""
+    folder = folder / f"{controller.name}-{config.scenario.name}-{key(controller.name, policy, config)}"
+    kept = {seed: found for seed in seeds if (found := read(folder / f"{seed}.npz", seed == seeds[0])) is not None}
+    progress(config.steps * len(kept))
+    missing = [seed for seed in seeds if seed not in kept]
+    for first in range(0, len(missing), BLOCK):
+        block = missing[first : first + BLOCK]
+        new = dict(zip(block, _kept(rollout(policy, config, block, progress), seeds[0]), strict=True))
+        write_files({folder / f"{seed}.npz": _written(episode) for seed, episode in new.items()})
+        kept |= new
+    ordered = [kept[seed] for seed in seeds]
+    values = np.array([[episode.values for episode in ordered]])
+    microseconds = float(np.mean([episode.microseconds for episode in ordered]))
+    example = Signals(*ordered[0].signals)
+    return Sample(controller, tuple(seeds), values, microseconds, example, config.control_interval)
+
+
+def key(name: str, policy: SlowPolicy, config: Config) -> str:
+    """Hash of everything a kept episode depends on (16 hex digits)."""
+    package = Path(__file__).parents[1]
+    parts = [name, policy.hash, config.hash, *metric_names()]
+    digest = hashlib.sha256(json.dumps(parts).encode())
+    for source in SOURCES:
+        digest.update((package / source).read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def read(path: Path, example: bool) -> Kept | None:
+    """A kept episode, with its signals if it is the ``example``; None if there is none that can be used."""
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as data:
+            found = Kept(data["values"], float(data["microseconds"]), data["signals"])
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+        return None
+    whole = found.values.shape == (len(metric_names()),) and (len(found.signals) == len(Signals._fields) or not example)
+    return found if whole else None
+
+
+def _kept(run: Rollout, example: int) -> list[Kept]:
+    values = np.stack(metrics(run), axis=-1)
+    episodes = []
+    for i, seed in enumerate(run.seeds):
+        lived = run.alive[:, i] & (seed == example)
+        signals = np.stack([signal[lived, i] for signal in run.signals])
+        episodes.append(Kept(values[i], run.microseconds_per_step, signals))
+    return episodes
+
+
+def _written(episode: Kept) -> bytes:
+    file = io.BytesIO()
+    np.savez_compressed(file, values=episode.values, microseconds=episode.microseconds, signals=episode.signals)
+    return file.getvalue()

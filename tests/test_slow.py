@@ -1,0 +1,196 @@
+"""Slow controllers: fewer episodes, kept on disk and resumed; compared on the episodes that both met; the gap."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import benchmark
+from baselines import registry
+from baselines.fingerprint import fingerprint
+from baselines.open_loop import OpenLoop
+from cz_gym.config import make_config
+from cz_gym.evaluation import kept, run
+from cz_gym.evaluation.metrics import metric_names
+from cz_gym.evaluation.protocol import find_row
+from cz_gym.evaluation.results import Controller, Sample, summarise
+from cz_gym.evaluation.rollout import Signals, rollout
+from cz_gym.evaluation.statistics import Resamples, optimality_gap
+
+CONFIG = make_config(horizon=300.0)
+SEEDS = range(5)
+WHO = Controller("snail", "measured", "slow", slow=True)
+
+
+@dataclass(frozen=True)
+class Snail(OpenLoop):
+    """Does nothing, and says so in its settings."""
+
+    setting: float = 0.0
+
+    @property
+    def hash(self) -> str:
+        return fingerprint(self, "open_loop")
+
+
+def sample(folder: Path, policy: Any = None, config: Any = CONFIG, seeds: Any = SEEDS) -> Sample:
+    return kept.slow_sample(WHO, policy or Snail(), config, seeds, folder, lambda steps: None)
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Seeds of every episode that was really run."""
+    ran: list[int] = []
+
+    def counting(policy: Any, config: Any, seeds: Any, progress: Any) -> Any:
+        ran.extend(seeds)
+        return rollout(policy, config, seeds, progress)
+
+    monkeypatch.setattr(kept, "rollout", counting)
+    monkeypatch.setattr(kept, "BLOCK", 2)
+    return ran
+
+
+def test_a_slow_sample_is_what_one_rollout_gives(tmp_path: Path, counted: list[int]) -> None:
+    found, direct = sample(tmp_path), Sample.of(WHO, [rollout(OpenLoop(), CONFIG, SEEDS)])
+    np.testing.assert_allclose(found.values, direct.values, rtol=1e-12)
+    for ours, theirs in zip(found.example, direct.example, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert found.seeds == direct.seeds
+    assert found.microseconds_per_step > 0.0
+
+
+def test_episodes_are_run_once_and_read_again(tmp_path: Path, counted: list[int]) -> None:
+    first = sample(tmp_path, seeds=range(3))
+    again = sample(tmp_path)
+    assert counted == [0, 1, 2, 3, 4]
+    np.testing.assert_array_equal(again.values[:, :3], first.values)
+    np.testing.assert_array_equal(again.example.r_c, first.example.r_c)
+
+
+def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ran: list[int] = []
+
+    def interrupted(policy: Any, config: Any, seeds: Any, progress: Any) -> Any:
+        if len(ran) == 4:
+            raise KeyboardInterrupt
+        ran.extend(seeds)
+        return rollout(policy, config, seeds, progress)
+
+    monkeypatch.setattr(kept, "BLOCK", 2)
+    monkeypatch.setattr(kept, "rollout", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        sample(tmp_path)
+    monkeypatch.setattr(kept, "rollout", lambda policy, config, seeds, progress: rollout(policy, config, seeds))
+    assert sample(tmp_path).values.shape == (1, 5, len(metric_names()))
+    assert ran == [0, 1, 2, 3]
+
+
+def test_other_settings_plants_and_scenarios_share_nothing(tmp_path: Path, counted: list[int]) -> None:
+    sample(tmp_path, seeds=range(1))
+    others = (
+        (Snail(setting=1.0), CONFIG),
+        (Snail(), CONFIG.with_scenario("hard")),
+        (Snail(), replace(CONFIG, parameters=CONFIG.parameters._replace(k_l=60.0))),
+        (Snail(), replace(CONFIG, horizon=600.0)),
+    )
+    for policy, config in others:
+        sample(tmp_path, policy, config, range(1))
+    assert counted == [0] * 5
+
+
+def test_a_damaged_file_is_run_again(tmp_path: Path, counted: list[int]) -> None:
+    whole = sample(tmp_path, seeds=range(2))
+    for path in tmp_path.glob("*/1.npz"):
+        path.write_bytes(path.read_bytes()[:100])
+    np.testing.assert_allclose(sample(tmp_path, seeds=range(2)).values, whole.values, rtol=1e-12)
+    assert counted == [0, 1, 1]
+
+
+def made(name: str, errors: list[float], **facts: Any) -> Sample:
+    """A sample with these RMSEs [mm]."""
+    values = np.zeros((1, len(errors), len(metric_names())))
+    values[0, :, 0] = errors
+    signals = Signals(*(np.zeros(3) for _ in Signals._fields))
+    return Sample(Controller(name, "measured", "", **facts), tuple(range(len(errors))), values, 1.0, signals, 5.0)
+
+
+def test_the_gap_is_zero_at_the_bound_one_at_the_reference_and_counts_squares() -> None:
+    bound, reference = np.array([[0.0, 1.0]]), np.array([[4.0, 9.0]])
+    resamples = Resamples.draw(2)
+    assert optimality_gap(bound, reference, bound, resamples) == (0.0, (0.0, 0.0), 2)
+    assert optimality_gap(reference, reference, bound, resamples) == (1.0, (1.0, 1.0), 2)
+    found = optimality_gap(np.array([[2.0, 5.0]]), reference, bound, resamples)
+    assert found is not None
+    assert found.mean == pytest.approx((3.5 - 0.5) / (6.5 - 0.5))
+    assert found.ci95 == pytest.approx((0.5, 0.5))
+    assert optimality_gap(bound, bound, bound, resamples) is None
+
+
+def test_different_numbers_of_episodes_meet_on_those_of_both() -> None:
+    samples = [
+        made("paper", [1.0, 2.0, 30.0]),
+        made("lqg", [0.5, 0.4, 9.0]),
+        made("clairvoyant", [0.0, 0.1], told=True),
+        made("mpc", [0.6, 0.5]),
+        made("ppo", [0.4, 0.3, 9.0], training_seeds=(0,)),
+    ]
+    result = summarise(find_row("randomized"), samples)
+    by_name = {outcome.controller.name: outcome for outcome in result.outcomes}
+    assert len(result.seeds) == 3
+    assert by_name["mpc"].paired["rmse_mm"][::2] == pytest.approx((0.55 - 1.5, 2))
+    assert by_name["lqg"].paired["rmse_mm"][::2] == pytest.approx((9.9 / 3 - 11.0, 3))
+    assert by_name["mpc"].improvement[::2] == (1.0, 2)
+    gap = by_name["lqg"].gap
+    assert gap is not None
+    assert gap.mean == pytest.approx(((0.25 + 0.16) / 2 - 0.005) / (2.5 - 0.005))
+    assert {name: outcome.gap.n for name, outcome in by_name.items()} == dict.fromkeys(by_name, 2)
+    # On the two episodes of all, lqg is the better rival; on its own three it would look worse than mpc.
+    assert result.verdicts[0].rival == "lqg"
+    assert result.verdicts[0].difference[::2] == pytest.approx((-0.2 / 3, 3))
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A registry with a slow entry that is a bound, and two episodes for it."""
+    snail = registry.Entry("clairvoyant", lambda config: Snail(), "measured", "slow", False, told=True, slow=True)
+    quick = tuple(entry for entry in registry.CONTROLLERS if not entry.slow)
+    monkeypatch.setattr(registry, "CONTROLLERS", (*quick, snail))
+    monkeypatch.setattr(run, "SLOW_EPISODES", 2)
+    monkeypatch.setattr(benchmark, "KEPT", tmp_path / "kept")
+    return tmp_path / "out"
+
+
+def test_the_command_shows_how_many_episodes_a_slow_controller_met(small: Path) -> None:
+    arguments = ["--episodes", "3", "--scenarios", "randomized", "--controllers", "open-loop,paper,clairvoyant"]
+    assert benchmark.main([*arguments, "--slow", "--out", str(small), "--quiet"]) == 0
+    data = json.loads((small / "benchmark.json").read_text())
+    assert data["results"]["randomized"]["clairvoyant"]["rmse_mm"]["n"] == 2
+    assert data["results"]["randomized"]["paper"]["rmse_mm"]["n"] == 3
+    assert data["paired"]["randomized"]["clairvoyant"]["rmse_mm"]["n"] == 2
+    assert data["provenance"]["scenarios"]["randomized"]["episodes"] == 3
+    gaps = data["optimality_gap"].get("randomized", {})
+    # The bound here does nothing and is worse than the paper's controller, so there is no gap to speak of.
+    assert gaps == {} or set(gaps) == {"open-loop", "paper", "clairvoyant"}
+    assert "| clairvoyant (n = 2) |" in (small / "report.md").read_text()
+    rows = list(csv.DictReader((small / "episodes.csv").read_text().splitlines()))
+    assert [row["seed"] for row in rows if row["controller"] == "clairvoyant"] == ["2000000", "2000001"]
+    assert len(list((small.parent / "kept").glob("clairvoyant-randomized-*/*.npz"))) == 2
+
+
+def test_slow_controllers_run_only_when_asked_for(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert benchmark.main(["--controllers", "paper,clairvoyant", "--out", str(small)]) == 2
+    assert capsys.readouterr().err == (
+        "benchmark.py: 'clairvoyant' is slow: add --slow to run it on the first 50 episodes\n"
+    )
+    assert not small.exists()
+    for wanted in (None, ["all"]):
+        for slow in (False, True):
+            names = [contender.controller.name for contender in benchmark.choose(wanted, [], slow)[0]]
+            assert ("clairvoyant" in names) == slow
