@@ -7,7 +7,6 @@ validation seeds, which choose. Test seeds are never touched. Every candidate st
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import os
 import sys
@@ -24,92 +23,17 @@ from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 
 from .lqg import LQG, LQGSettings
-from .lqr import Weights
+from .lqg_goal import FAILURE_PENALTY, GOALS, Figures, Goal, knobs, settings_from, with_knobs
 from .policy import Floats
 
 VALIDATION_SEED = 1_000_000
 ROBUSTNESS_SEED = 100_000
 """First training seed of the episodes that only have to be survived."""
 ROBUSTNESS = ("hard", "puller")
-FINALISTS = 4
-_FAILURE_PENALTY = 100.0
-_MISS_PENALTY = 20.0
-_EMPHASIS = 10.0
+FINALISTS = 3
+CALMER = (1.0, 3.0, 10.0)
+"""Factors on the weight of heater steps that every finalist is tried with: the search hardly sees that weight."""
 _FIRST_STEP = 0.5
-_BOUNDS = np.log(1e-4), np.log(1e4)
-
-
-@dataclass(frozen=True)
-class Knob:
-    """One number that is tuned, on a logarithmic scale."""
-
-    group: str
-    """Member of :class:`baselines.lqg.LQGSettings`, "noise" or "weights"."""
-    name: str
-
-
-KNOBS = (
-    *(Knob("weights", name) for name in ("pull", "pull_step", "heater_step")),
-    *(
-        Knob("noise", name)
-        for name in (
-            "fast_sd",
-            "slow_sd",
-            "drift_rate_sd",
-            "drift_rate_tau",
-            "heater_walk",
-            "thermal_walk",
-            "pyrometer_sd",
-            "recipe_share",
-        )
-    ),
-)
-
-
-@dataclass(frozen=True)
-class Goal:
-    """What a version of the controller is tuned to, on mean figures over training episodes."""
-
-    rmse_mm: float
-    """Largest radius error [mm]; missing it costs."""
-    pull_step: float
-    """Largest pull step RMS [mm/min]; missing it costs."""
-    by_return: bool
-    """Whether the rest is the mean return, or the radius error."""
-    start: LQGSettings
-    """Where the search begins."""
-
-    def worth(self, found: Figures) -> float:
-        """What is minimised within the limits, failures last; of order one."""
-        worth = -found.mean_return / found.steps if self.by_return else found.rmse_mm / self.rmse_mm
-        return _EMPHASIS * worth + _FAILURE_PENALTY * found.failure_rate
-
-    def room(self, found: Figures) -> tuple[float, float]:
-        """Relative distance to the limits, negative beyond them."""
-        return 1.0 - found.rmse_mm / self.rmse_mm, 1.0 - found.pull_step / self.pull_step
-
-    def score(self, found: Figures) -> float:
-        """What candidates are ranked by: the worth, and what missing a limit costs."""
-        return self.worth(found) + _MISS_PENALTY * sum(max(0.0, -room) for room in self.room(found))
-
-
-@dataclass(frozen=True)
-class Figures:
-    """Mean figures over episodes."""
-
-    rmse_mm: float
-    pull_step: float
-    heater_step: float
-    mean_return: float
-    failure_rate: float
-    steps: int
-
-
-GOALS = {
-    "lqg": Goal(0.062, 0.02, True, LQGSettings(weights=Weights(pull=0.12, pull_step=0.06, heater_step=0.08))),
-    "lqg-quiet": Goal(0.075, 0.0095, False, LQGSettings(weights=Weights(pull=0.1, pull_step=0.2, heater_step=0.1))),
-}
-"""By name: what the shipped versions are tuned to."""
 
 
 @dataclass
@@ -121,19 +45,6 @@ class History:
     def best(self, count: int) -> list[dict[str, Any]]:
         """The best so many."""
         return sorted(self.entries, key=lambda entry: entry["score"])[:count]
-
-
-def knobs(settings: LQGSettings) -> Floats:
-    """Logarithms of the tuned numbers."""
-    return np.log([getattr(getattr(settings, knob.group), knob.name) for knob in KNOBS])
-
-
-def with_knobs(settings: LQGSettings, values: Floats) -> LQGSettings:
-    """The settings with those numbers, to four digits."""
-    for knob, value in zip(KNOBS, np.exp(np.clip(values, *_BOUNDS)), strict=True):
-        group = replace(getattr(settings, knob.group), **{knob.name: float(f"{value:.4g}")})
-        settings = replace(settings, **{knob.group: group})
-    return settings
 
 
 def measure(settings: LQGSettings, scenario: str, seeds: Sequence[int]) -> Figures:
@@ -182,7 +93,7 @@ def _try(goal: Goal, settings: LQGSettings, history: History, episodes: int, sur
     lost = []
     if survive and all(score < entry["score"] for entry in history.entries):
         lost = [measure(settings, name, _from(ROBUSTNESS_SEED, survive)).failure_rate for name in ROBUSTNESS]
-        score += _FAILURE_PENALTY * sum(lost)
+        score += FAILURE_PENALTY * sum(lost)
     history.entries.append({"score": score, "settings": asdict(settings), "figures": asdict(found), "lost": lost})
     print(
         f"{len(history.entries):4d}  score {score:8.4f}  rmse {found.rmse_mm:.4f} mm  "
@@ -192,37 +103,44 @@ def _try(goal: Goal, settings: LQGSettings, history: History, episodes: int, sur
     return found
 
 
-def choose(goal: Goal, history: History, episodes: int) -> dict[str, Any]:
-    """The finalist that is best on validation seeds."""
+def choose(goal: Goal, history: History, episodes: int, survive: int) -> dict[str, Any]:
+    """The best on validation seeds of the finalists and their calmer versions, losses on training seeds first.
+
+    Losses are counted on ``survive`` training episodes of each harder scenario.
+    """
     finals = []
-    for entry in history.best(FINALISTS):
-        settings = settings_from(entry["settings"])
+    for settings in (calmer(found, factor) for found in finalists(history) for factor in CALMER):
+        lost = {name: measure(settings, name, _from(ROBUSTNESS_SEED, survive)).failure_rate for name in ROBUSTNESS}
         found = measure(settings, "randomized", _from(VALIDATION_SEED, episodes))
-        finals.append(
-            {
-                "score": goal.score(found),
-                "settings": asdict(settings),
-                "hash": settings.hash,
-                "validation": asdict(found),
-            }
-        )
+        score = goal.score(found) + FAILURE_PENALTY * sum(lost.values())
+        final = {"score": score, "settings": asdict(settings), "hash": settings.hash}
+        finals.append(final | {"validation": asdict(found), "lost": lost})
+        print(f"final  score {score:8.4f}  {settings.hash}  {found}  lost {lost}", flush=True)
     return min(finals, key=lambda final: final["score"])
+
+
+def finalists(history: History) -> list[LQGSettings]:
+    """The best settings met."""
+    return [settings_from(entry["settings"]) for entry in history.best(FINALISTS)]
+
+
+def calmer(settings: LQGSettings, factor: float) -> LQGSettings:
+    """The same with a heavier weight on heater steps."""
+    weight = float(f"{factor * settings.weights.heater_step:.4g}")
+    return replace(settings, weights=replace(settings.weights, heater_step=weight))
 
 
 def _from(first: int, count: int) -> range:
     return range(first, first + count)
 
 
-def settings_from(data: dict[str, Any]) -> LQGSettings:
-    """Settings from their form in JSON."""
-    groups: dict[str, Any] = {}
-    for member in dataclasses.fields(LQGSettings):
-        value = data[member.name]
-        if isinstance(value, dict):
-            kind = type(getattr(LQGSettings(), member.name))
-            value = kind(**{name: tuple(part) if isinstance(part, list) else part for name, part in value.items()})
-        groups[member.name] = value
-    return LQGSettings(**groups)
+def read_history(path: Path) -> tuple[dict[str, int], History]:
+    """Budget and candidates of a file this command wrote; ValueError for any other."""
+    try:
+        data = json.loads(path.read_text())
+        return dict(data["budget"]), History(list(data["history"]))
+    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path} is no tuning history: {error!r}") from None
 
 
 def write_whole(path: Path, data: Any) -> None:
@@ -240,9 +158,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--episodes", type=int, default=100, help="training episodes a candidate")
     parser.add_argument("--survive", type=int, default=20, help="more of each harder scenario, failures only")
     parser.add_argument("--validation", type=int, default=250, help="validation episodes a finalist")
+    parser.add_argument("--finals", type=int, default=200, help="harder training episodes a finalist must survive")
+    parser.add_argument("--history", type=Path, help="choose again from this kept history, without a search")
     parser.add_argument("--output", type=Path, default=None, help="default results/tuning/<controller>.json")
     given = parser.parse_args(arguments)
-    for name in ("budget", "episodes", "validation"):
+    for name in ("budget", "episodes", "validation", "finals"):
         if getattr(given, name) < 1:
             parser.error(f"--{name} must be at least 1, not {getattr(given, name)}")
     if given.survive < 0:
@@ -251,13 +171,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         goal = GOALS[given.controller]
-        history = search(goal, given.budget, given.episodes, given.survive)
-        chosen = choose(goal, history, given.validation)
-        budget = {name: getattr(given, name) for name in ("budget", "episodes", "survive", "validation")}
+        if given.history is None:
+            budget = {name: getattr(given, name) for name in ("budget", "episodes", "survive")}
+            history = search(goal, given.budget, given.episodes, given.survive)
+        else:
+            budget, history = read_history(given.history)
+        budget |= {"validation": given.validation, "finals": given.finals}
+        chosen = choose(goal, history, given.validation, given.finals)
         found = {"controller": given.controller, "budget": budget, "chosen": chosen, "history": history.entries}
         write_whole(output, found)
-    except OSError as error:
-        print(f"cannot write {output}: {error}", file=sys.stderr)
+    except (OSError, ValueError) as error:
+        print(f"cannot read or write: {error}", file=sys.stderr)
         return 2
     print(json.dumps(chosen, indent=1))
     return 0

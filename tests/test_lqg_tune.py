@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from baselines import lqg_settings, lqg_tune
+from baselines import lqg_goal, lqg_settings, lqg_tune
 from baselines.lqg import LQGSettings
-from baselines.lqg_tune import KNOBS, VALIDATION_SEED, Figures, Goal, History
+from baselines.lqg_goal import KNOBS, Figures, Goal
+from baselines.lqg_tune import VALIDATION_SEED, History
 
 GOAL = Goal(0.07, 0.02, True, LQGSettings())
 SHIPPED = {"lqg": lqg_settings.REWARD, "lqg-quiet": lqg_settings.QUIET}
@@ -18,22 +19,22 @@ RESULTS = Path(__file__).parents[1] / "results" / "tuning"
 
 def made_up(settings, scenario="randomized", seeds=()):
     """Best return where every knob is twice its default; the radius error is within its limit below the default."""
-    away = lqg_tune.knobs(settings) - lqg_tune.knobs(LQGSettings()) - np.log(2.0)
-    rmse = 0.07 * np.exp(0.1 * (lqg_tune.knobs(settings)[0] - lqg_tune.knobs(LQGSettings())[0]))
+    away = lqg_goal.knobs(settings) - lqg_goal.knobs(LQGSettings()) - np.log(2.0)
+    rmse = 0.07 * np.exp(0.1 * (lqg_goal.knobs(settings)[0] - lqg_goal.knobs(LQGSettings())[0]))
     return Figures(float(rmse), 0.01, 0.02, 2000.0 - 20.0 * float(away @ away), 0.0, 2160)
 
 
 def test_knobs_and_settings_are_inverse():
-    values = lqg_tune.knobs(LQGSettings()) + np.linspace(-1.0, 1.0, len(KNOBS))
-    found = lqg_tune.knobs(lqg_tune.with_knobs(LQGSettings(), values))
+    values = lqg_goal.knobs(LQGSettings()) + np.linspace(-1.0, 1.0, len(KNOBS))
+    found = lqg_goal.knobs(lqg_goal.with_knobs(LQGSettings(), values))
     np.testing.assert_allclose(found, values, atol=1e-3)
 
 
 def test_the_search_finds_the_optimum_inside_the_limits(monkeypatch):
     monkeypatch.setattr(lqg_tune, "measure", made_up)
     history = lqg_tune.search(GOAL, 250, 1, 0)
-    best = lqg_tune.settings_from(history.best(1)[0]["settings"])
-    away = lqg_tune.knobs(best) - lqg_tune.knobs(LQGSettings())
+    best = lqg_goal.settings_from(history.best(1)[0]["settings"])
+    away = lqg_goal.knobs(best) - lqg_goal.knobs(LQGSettings())
     assert away[0] == pytest.approx(0.0, abs=0.02)
     np.testing.assert_allclose(away[1:], np.log(2.0), atol=0.15)
 
@@ -41,7 +42,7 @@ def test_the_search_finds_the_optimum_inside_the_limits(monkeypatch):
 def test_a_candidate_that_loses_crystals_is_never_best(monkeypatch):
     def fragile(settings, scenario="randomized", seeds=()):
         found = made_up(settings)
-        lost = scenario != "randomized" and lqg_tune.knobs(settings)[1] > lqg_tune.knobs(LQGSettings())[1]
+        lost = scenario != "randomized" and lqg_goal.knobs(settings)[1] > lqg_goal.knobs(LQGSettings())[1]
         return replace(found, failure_rate=float(lost))
 
     monkeypatch.setattr(lqg_tune, "measure", fragile)
@@ -58,14 +59,36 @@ def test_validation_seeds_choose(monkeypatch):
     met = []
 
     def by_lam(settings, scenario, seeds):
-        met.extend(seeds)
+        met.extend(seeds if scenario == "randomized" else [])
         return Figures(0.06, 0.01, 0.02, 1000.0 * settings.lam, 0.0, 2160)
 
     monkeypatch.setattr(lqg_tune, "measure", by_lam)
-    chosen = lqg_tune.choose(GOAL, history, 7)
+    chosen = lqg_tune.choose(GOAL, history, 7, 5)
     assert chosen["settings"]["lam"] == 0.3
     assert chosen["hash"] == candidates[2].hash
+    assert sum(chosen["lost"].values()) == 0.0
     assert set(met) == set(range(VALIDATION_SEED, VALIDATION_SEED + 7))
+
+
+def test_the_calmer_version_wins_where_the_other_loses_crystals(monkeypatch):
+    def restless(settings, scenario, seeds):
+        lost = scenario == "puller" and settings.weights.heater_step < 2.0 * LQGSettings().weights.heater_step
+        return Figures(0.06, 0.01, 0.02, 1900.0 - settings.weights.heater_step, float(lost), 2160)
+
+    monkeypatch.setattr(lqg_tune, "measure", restless)
+    chosen = lqg_tune.choose(GOAL, History([{"score": 0.0, "settings": asdict(LQGSettings())}]), 1, 1)
+    assert chosen["settings"]["weights"]["heater_step"] == pytest.approx(3.0 * LQGSettings().weights.heater_step)
+
+
+def test_a_kept_history_can_be_chosen_from_again(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(lqg_tune, "measure", made_up)
+    first, second = tmp_path / "first.json", tmp_path / "second.json"
+    assert lqg_tune.main(["--budget", "20", "--output", str(first)]) == 0
+    assert lqg_tune.main(["--history", str(first), "--output", str(second)]) == 0
+    assert json.loads(first.read_text()) == json.loads(second.read_text())
+    (tmp_path / "other.json").write_text("{}")
+    assert lqg_tune.main(["--history", str(tmp_path / "other.json"), "--output", str(second)]) == 2
+    assert "no tuning history" in capsys.readouterr().err
 
 
 def test_missing_a_limit_and_losing_a_crystal_cost_more_than_any_return():
@@ -81,7 +104,7 @@ def test_the_command_writes_its_history(monkeypatch, tmp_path, capsys):
     assert lqg_tune.main(["--budget", "20", "--survive", "0", "--output", str(output)]) == 0
     written = json.loads(output.read_text())
     assert len(written["history"]) >= 20
-    assert lqg_tune.settings_from(written["chosen"]["settings"]).hash == written["chosen"]["hash"]
+    assert lqg_goal.settings_from(written["chosen"]["settings"]).hash == written["chosen"]["hash"]
     assert [file.name for file in output.parent.iterdir()] == ["lqg.json"]
 
 
@@ -97,11 +120,11 @@ def test_a_place_that_cannot_be_written_is_refused_before_the_search(monkeypatch
     monkeypatch.setattr(lqg_tune, "measure", None)
     (tmp_path / "file").write_text("")
     assert lqg_tune.main(["--output", str(tmp_path / "file" / "lqg.json")]) == 2
-    assert "cannot write" in capsys.readouterr().err
+    assert "cannot read or write" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", sorted(SHIPPED))
 def test_what_ships_is_what_the_command_chose(name):
     chosen = json.loads((RESULTS / f"{name}.json").read_text())["chosen"]
     assert SHIPPED[name].hash == chosen["hash"]
-    assert SHIPPED[name] == lqg_tune.settings_from(chosen["settings"])
+    assert SHIPPED[name] == lqg_goal.settings_from(chosen["settings"])
