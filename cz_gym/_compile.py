@@ -37,6 +37,11 @@ def physics(function: F) -> F:
     return register_jitable(error_model="numpy")(function)
 
 
+def inlined(function: F) -> F:
+    """Like :func:`physics`, its text put into the kernel: passing a step's arrays on costs a tenth of the step."""
+    return register_jitable(error_model="numpy", inline="always")(function)
+
+
 def source_hash(folder: Path | None = None) -> str:
     """SHA-256 of the names and contents of the package's Python sources (32 hex digits)."""
     folder = folder or Path(__file__).parent

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ._compile import hashed, kernel, physics
+from ._compile import hashed, inlined, kernel, physics
 from .draws import STREAMS, draw_episode, draw_factors, randomised, seed_streams
 from .fluctuation import draw_series
 from .law import GRID
@@ -119,7 +119,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
     """Compile the loops for a meniscus model; those of this package's models are kept on disk."""
     slope, ring_offset, height = meniscus.slope, meniscus.ring_offset, meniscus.height
 
-    @physics
+    @inlined
     def sample(memory: Any, i: Any, v_p: Any, Q_H: Any, clock: Any, reading: Any, out: Any) -> Any:
         """Read slot i and write what it says; returns the cost of the step from drives v_p, Q_H."""
         slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
