@@ -11,16 +11,16 @@ from .lqr import Weights
 
 REWARD = LQGSettings(
     noise=NoiseModel(
-        fast_sd=0.3103,
-        slow_sd=0.367,
-        drift_rate_sd=0.0007431,
-        drift_rate_tau=2132.0,
-        heater_walk=0.3841,
-        thermal_walk=0.002908,
-        recipe_share=0.2405,
-        pyrometer_sd=0.08622,
+        fast_sd=0.3106,
+        slow_sd=0.369,
+        drift_rate_sd=0.0007519,
+        drift_rate_tau=2113.0,
+        heater_walk=0.3833,
+        thermal_walk=0.002862,
+        recipe_share=0.2398,
+        pyrometer_sd=0.08655,
     ),
-    weights=Weights(pull=0.1548, pull_step=0.06511, heater_step=0.05704),
+    weights=Weights(pull=0.1556, pull_step=0.06564, heater_step=0.5706),
 )
 """``lqg``: as much reward as a mean radius error of 0.062 mm allows."""
 QUIET = LQGSettings(
@@ -34,7 +34,7 @@ QUIET = LQGSettings(
         recipe_share=0.2513,
         pyrometer_sd=0.06289,
     ),
-    weights=Weights(pull=0.05482, pull_step=0.3051, heater_step=0.1168),
+    weights=Weights(pull=0.05482, pull_step=0.3051, heater_step=1.168),
 )
 """``lqg-quiet``: the radius as well as pull steps of 0.0095 mm/min allow."""
 
