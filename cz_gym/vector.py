@@ -220,8 +220,9 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
             self._random(i).bit_generator.state = states[i].random
 
     def _keep(self, previous: Out, kept: Mask) -> None:
+        which = np.flatnonzero(kept)
         for name, old, new in zip(previous._fields, previous, self._out, strict=True):
-            index = (slice(None), kept) if name == "info" else kept
+            index = (slice(None), which) if name == "info" else which
             new[index] = old[index]
 
     def _observations(self) -> Array:

@@ -121,3 +121,16 @@ def test_the_plain_numpy_batch_runs_the_same_plant(monkeypatch: pytest.MonkeyPat
     for _ in range(10):
         case.step()
     np.testing.assert_allclose(made[0].r_c, 87.5e-3, rtol=1e-9)
+
+
+def test_a_masked_reset_of_a_batch_with_padded_info_keeps_the_other_slots() -> None:
+    env = speed_cases.CzVectorEnv(64, horizon=600.0)
+    env.reset(seed=0)
+    before = env.step(np.full((64, 2), 0.1))
+    mask = np.arange(64) % 3 == 0
+    observation, info = env.reset(options={"reset_mask": mask})
+    np.testing.assert_array_equal(observation[~mask], before[0][~mask])
+    assert not np.array_equal(observation[mask], before[0][mask])
+    assert info["r_c"].shape == (64,)
+    assert info["_r_c"].tolist() == mask.tolist()
+    np.testing.assert_array_equal(env._out.info[0, :64][~mask], before[4]["r_c"][~mask])
