@@ -35,6 +35,9 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parse(argv)
     try:
         return train(arguments)
+    except KeyboardInterrupt:
+        print(f"train.py: interrupted; if {arguments.out} holds a checkpoint, --resume goes on", file=sys.stderr)
+        return 130
     except (ValueError, OSError) as error:
         print(f"train.py: {_one_line(error)}", file=sys.stderr)
         return 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import tempfile
 from dataclasses import asdict, dataclass, fields
@@ -113,4 +114,6 @@ def _parse(path: Path, content: bytes) -> Contract:
     for name, value in given.items():
         if not isinstance(value, kinds[str(wanted[name])]) or isinstance(value, bool):
             raise AgentFileError(f"{path}: field {name!r} must be {wanted[name]}, not {value!r:.80}")
+        if isinstance(value, float) and not math.isfinite(value):
+            raise AgentFileError(f"{path}: field {name!r} must be finite, not {value!r}")
     return Contract(**given)

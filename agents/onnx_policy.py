@@ -44,7 +44,12 @@ class OnnxPolicy:
             raise AgentFileError(
                 f"{path}: trained on plant {contract.plant_hash}, this environment's is {config.plant_hash}"
             )
-        return cls(contract, _session(path, onnx_bytes, expected))
+        policy = cls(contract, _session(path, onnx_bytes, expected))
+        try:
+            policy._run(np.zeros((2, expected), np.float32))
+        except AgentFileError as error:
+            raise AgentFileError(f"{path}: {error}") from None
+        return policy
 
     @property
     def observation(self) -> str:
@@ -60,8 +65,18 @@ class OnnxPolicy:
             raise ValueError(
                 f"expected {self.contract.channels} channels ({self.observation}), got shape {array.shape}"
             )
-        (action,) = self.session.run(None, {"observation": np.atleast_2d(array)})
+        action = self._run(np.atleast_2d(array))
         return (action[0] if array.ndim == 1 else action), state
+
+    def _run(self, observation: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        try:
+            (action,) = self.session.run(None, {"observation": observation})
+        except Exception:  # onnxruntime raises its own exception types, one for each way a graph can fail
+            raise AgentFileError(f"agent {self.contract.sha256[:12]}: its graph cannot be run") from None
+        if action.shape != (len(observation), 2) or not np.isfinite(action).all():
+            raise AgentFileError(f"agent {self.contract.sha256[:12]}: its action is not two finite numbers")
+        found: npt.NDArray[np.float32] = action
+        return found
 
 
 def _session(path: Path, onnx_bytes: bytes, channels: int) -> Any:

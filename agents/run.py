@@ -68,19 +68,22 @@ class Run:
         self.rival_rmse_mm = self._validate_rival(QUICK)
         self.best = math.inf
         self.rows: list[dict[str, Any]] = []
+        self.sessions: list[dict[str, Any]] = []
         self.began = time.monotonic()
         checkpoint = None
         if resume:
-            self._check_settings()
+            self.sessions = self._check_settings()
             checkpoint = load_checkpoint(folder / "checkpoint.pt")
             self.best = checkpoint.best_rmse_mm
             self.rows = _read_rows(folder / "progress.csv")
-        else:
-            self._write_settings()
+            self.began -= float(self.rows[-1]["seconds"]) if self.rows else 0.0
         done = checkpoint.steps if checkpoint else 0
         self.training: Training = make_training(choice, seed, str(folder / "tensorboard"), done)
         if checkpoint:
             restore(self.training.learner, checkpoint, folder / "checkpoint.pt")
+        else:
+            self.save()
+        self._write_settings(done)
 
     def learn(self, bar: Any) -> None:
         """Learn to the end, validating and saving on the way; the bar counts environment steps."""
@@ -171,35 +174,42 @@ class Run:
             "scenario_hash": self.config.scenario.hash,
         }
 
-    def _write_settings(self) -> None:
-        facts = {
-            **self._identity(),
-            "steps": self.choice.steps,
+    def _write_settings(self, done: int) -> None:
+        """Write what this run is; each time it is begun or resumed adds a session."""
+        session = {
+            "from_step": done,
             "command": " ".join([Path(sys.executable).name, *sys.argv]),
             "git_commit": _git_commit(),
             "python": platform.python_version(),
             "packages": {name: _version(name) for name in PACKAGES},
         }
+        first = (self.sessions or [session])[0]
+        facts = {**self._identity(), "steps": self.choice.steps, **first, "sessions": [*self.sessions, session]}
         _write_json(self.folder / "settings.json", facts)
 
-    def _check_settings(self) -> None:
+    def _check_settings(self) -> list[dict[str, Any]]:
+        """The sessions of the run in this folder; AgentFileError if it is not this run."""
         path = self.folder / "settings.json"
-        try:
-            saved = json.loads(path.read_text())
-        except (OSError, ValueError):
-            raise AgentFileError(f"{path}: missing or damaged, so there is nothing to resume") from None
+        saved = _read_settings(path)
         for name, value in self._identity().items():
             if saved.get(name) != value:
                 raise AgentFileError(f"{path}: the run was begun with another {name}; resume it with the same options")
+        return list(saved["sessions"])
 
 
 def saved_steps(folder: Path) -> int:
     """Environment steps that the run in this folder was begun with; AgentFileError if there is none."""
-    path = folder / "settings.json"
+    return int(_read_settings(folder / "settings.json")["steps"])
+
+
+def _read_settings(path: Path) -> dict[str, Any]:
     try:
-        return int(json.loads(path.read_text())["steps"])
-    except (OSError, ValueError, KeyError, TypeError):
-        raise AgentFileError(f"{path}: missing or damaged, so there is nothing to resume") from None
+        saved = json.loads(path.read_text())
+    except (OSError, ValueError):
+        saved = None
+    if not isinstance(saved, dict) or not isinstance(saved.get("steps"), int) or not saved.get("sessions"):
+        raise AgentFileError(f"{path}: missing or damaged, so there is nothing to resume")
+    return saved
 
 
 def _git_commit() -> str | None:

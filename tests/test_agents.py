@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from hypothesis import given
@@ -148,6 +149,28 @@ def test_broken_promises_are_refused(agent: Path, change: dict[str, Any], messag
     with pytest.raises(AgentFileError, match=message) as caught:
         OnnxPolicy.load(agent)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity"])
+def test_a_contract_without_finite_numbers_is_refused(agent: Path, number: str) -> None:
+    contract = agent.with_suffix(".json")
+    contract.write_text(contract.read_text().replace('"validation_rmse_mm": 1.0', f'"validation_rmse_mm": {number}'))
+    with pytest.raises(AgentFileError, match="must be finite"):
+        OnnxPolicy.load(agent)
+
+
+def test_networks_that_give_no_action_are_refused(ppo: Any, tmp_path: Path) -> None:
+    path = tmp_path / "agent.onnx"
+    actor = actor_of(ppo)
+    write_agent(path, to_onnx(dataclasses.replace(actor, scale=np.full(2, np.nan, np.float32))), **facts())
+    with pytest.raises(AgentFileError, match="not two finite numbers"):
+        OnnxPolicy.load(path)
+    model = onnx.load_from_string(to_onnx(actor))
+    drives = next(value for value in model.graph.initializer if value.name == "drives")
+    drives.CopyFrom(onnx.numpy_helper.from_array(np.array([9, 900], np.int64), "drives"))
+    write_agent(path, model.SerializeToString(), **facts())
+    with pytest.raises(AgentFileError, match="cannot be run"):
+        OnnxPolicy.load(path)
 
 
 def test_missing_and_oversized_files_are_refused(agent: Path, tmp_path: Path) -> None:

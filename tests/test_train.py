@@ -63,6 +63,39 @@ def test_an_interrupted_run_keeps_its_checkpoint(
     assert "--resume" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("quick")
+def test_a_run_killed_at_once_can_be_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def die(self: Any, bar: Any) -> None:
+        raise ValueError("killed")
+
+    folder = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(run.Run, "learn", die)
+        assert train.main(["--steps", "10000", "--out", str(folder)]) == 2
+    assert train.main(["--resume", "--out", str(folder)]) == 0
+    settings = json.loads((folder / "settings.json").read_text())
+    assert [session["from_step"] for session in settings["sessions"]] == [0, 0]
+
+
+def test_settings_that_are_none_are_damaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "settings.json").write_text("[]")
+    assert train.main(["--resume", "--steps", "10", "--out", str(folder)]) == 2
+    assert "missing or damaged" in capsys.readouterr().err
+
+
+def test_interrupting_before_learning_gives_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(arguments: Any) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train, "train", interrupt)
+    assert train.main(["--out", str(tmp_path / "run")]) == 130
+    assert capsys.readouterr().err.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
