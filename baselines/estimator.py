@@ -80,7 +80,7 @@ def correct(belief: Belief, seen: Measured, eye: Eye) -> Belief:
     row[:, _PYROMETER] = 1.0
     pyrometer = Reading(seen.T_1 - belief.mean[:, _PYROMETER], row, np.full(n, eye.noise.pyrometer_sd**2))
     gaussian = kalman.correct(Gaussian(belief.mean, belief.covariance), pyrometer, eye.gate)
-    ring, row = _ring(gaussian.mean, eye)
+    ring, row = expected_ring(gaussian.mean, eye)
     valid = seen.valid > 0.5
     variance = np.where(valid, belief.camera_variance, np.inf)
     camera = Reading(seen.ring_error + seen.r_ref - ring, row, variance)
@@ -108,7 +108,7 @@ def _moved_by_plant(mean: Floats, applied: Floats, eye: Eye) -> Floats:
     return np.stack([value - nominal for value, nominal in zip(new, p.state_0, strict=True)], axis=-1)
 
 
-def _ring(mean: Floats, eye: Eye) -> tuple[Floats, Floats]:
+def expected_ring(mean: Floats, eye: Eye) -> tuple[Floats, Floats]:
     """Bright ring [m] less its nominal, shape (n,), and its derivative by the state, shape (n, 10)."""
     if not eye.nonlinear:
         row = np.broadcast_to(eye.model.H[..., 0, :], mean.shape)

@@ -122,7 +122,7 @@ class LQG:
         applied = np.stack([seen.v_p, seen.Q_H], axis=-1)
         belief = self._estimate(memory, seen, applied, begins, gains.eye)
         plan = look_ahead(memory.plan, seen, begins, self.control_interval)
-        previous = self._previous(memory, applied, begins)
+        previous = moved_from(applied, memory.asked, begins, self.settings.heater_slack)
         share = self.settings.noise.recipe_share
         inputs = act(belief.mean, plan, previous, gains.regulator, share, self.parameters.v_0)
         action = to_action(inputs[:, 0] / self.parameters.v_0, inputs[:, 1] / HEATER_SCALE, single)
@@ -138,12 +138,12 @@ class LQG:
             belief = fresh(belief, old, begins)
         return estimator.correct(belief, seen, eye)
 
-    def _previous(self, memory: Memory, applied: Floats, begins: npt.NDArray[np.bool_]) -> Floats:
-        """The inputs to move from: the applied ones, but what was asked of the heater if it is as near as it can be."""
-        slack = np.array([0.0, self.settings.heater_slack])
-        unserved = np.clip(memory.asked - applied, -slack, slack)
-        previous: Floats = applied + np.where(begins[:, None], 0.0, unserved)
-        return previous
+
+def moved_from(applied: Floats, asked: Floats, begins: npt.NDArray[np.bool_], heater_slack: float) -> Floats:
+    """The inputs to move from: the applied ones, but what was asked of the heater if it is as near as it can be."""
+    slack = np.array([0.0, heater_slack])
+    previous: Floats = applied + np.where(begins[:, None], 0.0, np.clip(asked - applied, -slack, slack))
+    return previous
 
 
 def act(estimate: Floats, plan: Floats, previous: Floats, law: Regulator, recipe_share: float, v_0: float) -> Floats:

@@ -46,6 +46,12 @@ def _tuned(name: str, meaning: str) -> Entry:
     return Entry(name, lambda config: tuned(name, config), "measured", meaning)
 
 
+def _ekf_mpc(config: Config) -> Policy:
+    from .ekf_mpc import ekf_mpc
+
+    return ekf_mpc(config)
+
+
 CONTROLLERS: tuple[Entry, ...] = (
     Entry("open-loop", lambda config: OpenLoop(), "measured", "nominal pull speed and heater power, no feedback"),
     Entry("paper", _paper, "measured", "the paper's compensator and PID as printed, Table 1"),
@@ -56,6 +62,7 @@ CONTROLLERS: tuple[Entry, ...] = (
     _tuned("industrial", "incremental pull-speed law of a logged puller, with automatic growth control"),
     Entry("lqg", lqg_settings.lqg, "measured", "Kalman filter and LQ regulator of pull and heater, for the reward"),
     Entry("lqg-quiet", lqg_settings.lqg_quiet, "measured", "the same for low pull activity"),
+    Entry("ekf-mpc", _ekf_mpc, "measured", "nonlinear MPC on a bank of lqg's filters", default=False, slow=True),
     Entry(
         "lqg-true",
         lqg_settings.lqg_true,
