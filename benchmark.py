@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import json
 import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
+
+from cz_gym.commands import OneLineParser, interrupted
 
 if TYPE_CHECKING:
+    from agents.contract import Contract
     from baselines.registry import Entry
     from cz_gym.config import Config
     from cz_gym.evaluation.results import Benchmark
@@ -22,25 +26,15 @@ README = FOLDER.parents[1] / "README.md"
 """Where the committed results are quoted, between two markers."""
 KEPT = FOLDER.parent / "cache"
 """Where episodes of slow controllers are kept."""
-RESULTS = "benchmark.json"
 SHIPPED = ("ppo",)
 """Agents that come with the package."""
 EPISODES = 500
-
-
-class OneLineParser(argparse.ArgumentParser):
-    """Says what is wrong in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        """Exit with code 2."""
-        self.exit(2, f"{self.prog}: {message}\n")
 
 
 def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Read the command line; exits with code 2 and one line for anything that cannot be meant."""
     parser = OneLineParser(
         prog="benchmark.py",
-        allow_abbrev=False,
         description="Run controllers and agents on the same disturbed crystals and compare them.",
         epilog="docs/benchmark.md has the protocol, the formula of every metric and how to add a controller.",
     )
@@ -63,7 +57,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--slow", action="store_true", help="slow controllers too, on the first 50 episodes; resumed from results/cache"
     )
-    parser.add_argument("--overwrite", action="store_true", help="let a partial run replace a folder's results")
+    parser.add_argument("--overwrite", action="store_true", help="replace files that would be kept otherwise")
     parser.add_argument("--quiet", action="store_true", help="no progress bar, no table")
     return parser.parse_args(argv)
 
@@ -90,8 +84,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"benchmark.py: {_one_line(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("benchmark.py: interrupted; nothing written", file=sys.stderr)
-        return 130
+        return interrupted("benchmark.py")
 
 
 def benchmark(arguments: argparse.Namespace, command: str) -> int:
@@ -141,17 +134,43 @@ def check_targets(arguments: argparse.Namespace, partial: bool) -> None:
     """Raise ValueError or OSError if the results could not be written, or would replace better ones untold."""
     from cz_gym.evaluation.files import check_writable
 
-    held = [arguments.out / RESULTS] if arguments.out else []
-    if arguments.json and arguments.json.resolve() == FOLDER / RESULTS:
-        held.append(arguments.json)
-    for path in held:
-        if partial and path.exists() and not arguments.overwrite:
-            raise ValueError(f"{path} exists and this run is partial: add --overwrite, or name another --out")
+    kept = kept_files(arguments.out, arguments.json, partial)
+    if kept and not arguments.overwrite:
+        path, why = kept[0]
+        raise ValueError(f"{path} exists and {why}: add --overwrite, or name another --out or --json")
     if arguments.json and arguments.json.is_dir():
         raise ValueError(f"--json {arguments.json} is a folder")
     for folder in (arguments.out, arguments.json and arguments.json.parent):
         if folder:
             check_writable(folder)
+
+
+def kept_files(folder: Path | None, lone: Path | None, partial: bool) -> list[tuple[Path, str]]:
+    """Existing files that this run may not replace untold, each with the reason.
+
+    In a folder: any of the benchmark's files, unless a full run renews an earlier benchmark. A lone JSON file: one
+    that is no earlier benchmark, and for a partial run one that belongs to a folder of results.
+    """
+    from cz_gym.evaluation.files import FILES, RESULTS
+
+    kept = []
+    if folder:
+        earlier = is_benchmark(folder / RESULTS)
+        why = "its folder holds no earlier benchmark" if not earlier else "this run is partial" if partial else ""
+        kept += [(folder / name, why) for name in FILES if why and (folder / name).exists()]
+    if lone and lone.is_file():
+        if not is_benchmark(lone):
+            kept.append((lone, "is no earlier benchmark"))
+        elif partial and lone.name == RESULTS and (lone.resolve().parent / "report.md").exists():
+            kept.append((lone, "this run is partial"))
+    return kept
+
+
+def is_benchmark(path: Path) -> bool:
+    """Whether a file is the JSON of an earlier benchmark."""
+    from cz_gym.evaluation.files import is_benchmark_json
+
+    return path.is_file() and is_benchmark_json(path.read_bytes())
 
 
 def choose(
@@ -193,8 +212,21 @@ def choose(
         else:
             continue
         contenders.append(_agent(name, policies))
-        contracts += [asdict(policy.contract) for policy in policies]
+        contracts += [_recorded(policy.contract) for policy in policies]
     return tuple(contenders), tuple(contracts)
+
+
+def _recorded(contract: Contract) -> dict[str, Any]:
+    """A contract as it will be written down; ValueError if no JSON or no page can hold it."""
+    facts = asdict(contract)
+    for name, value in facts.items():
+        try:
+            json.dumps(value, ensure_ascii=False, allow_nan=False).encode()
+        except ValueError:
+            raise ValueError(
+                f"agent {contract.algorithm!r}: its contract's {name} cannot be written: {value!r:.80}"
+            ) from None
+    return facts
 
 
 def _classical(entry: Entry) -> Contender:
@@ -234,12 +266,12 @@ def _nominal() -> Config:
     return ROWS[0].config()
 
 
-def write(folder: Path | None, json: Path | None, done: Benchmark, quote: bool) -> None:
+def write(folder: Path | None, lone: Path | None, done: Benchmark, quote: bool) -> None:
     """Write the files, all or none; ``quote`` committed results in the README as well."""
-    from cz_gym.evaluation.files import to_csv, to_json, write_files
+    from cz_gym.evaluation.files import RESULTS, to_csv, to_json, write_files
 
     text = to_json(done).encode()
-    files = {json: text} if json else {}
+    files = {lone: text} if lone else {}
     if folder:
         from cz_gym.evaluation.figures import draw_figures
         from cz_gym.evaluation.report import fill_in, markdown

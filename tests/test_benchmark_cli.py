@@ -6,6 +6,7 @@ import csv
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 import benchmark
-from agents.contract import write_agent
+from agents.contract import read_agent, write_agent
 from baselines.registry import CONTROLLERS, find_controller
 from cz_gym.config import make_config
 from cz_gym.evaluation import run as running
@@ -240,6 +241,55 @@ def test_committed_results_are_guarded_under_every_name(
     assert "--overwrite" in refused([*SMALL, "--json", str(tmp_path / "benchmark.json")], capsys)
 
 
+@pytest.mark.usefixtures("no_work")
+def test_no_file_of_others_is_replaced_untold(
+    tmp_path: Path, finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A folder with somebody's report, a page and a table named by --json: kept, whether the run is partial or full."""
+    foreign, page = tmp_path / "foreign", tmp_path / "page.md"
+    foreign.mkdir()
+    (foreign / "report.md").write_text("precious")
+    page.write_text("precious")
+    table = finished / "episodes.csv"
+    for run in (SMALL, []):
+        for arguments in (["--out", str(foreign)], ["--json", str(page)], ["--json", str(table)]):
+            line = refused([*run, *arguments], capsys)
+            assert arguments[1] in line
+            assert "--overwrite" in line
+    assert "partial" in refused([*SMALL, "--json", str(finished / "benchmark.json")], capsys)
+    (tmp_path / "lone.json").write_bytes((finished / "benchmark.json").read_bytes())
+    for arguments in (["--json", str(tmp_path / "lone.json")], ["--json", str(page), "--overwrite"]):
+        with pytest.raises(AssertionError, match="work was done"):
+            benchmark.main([*SMALL, *arguments, "--quiet"])
+
+
+@pytest.mark.usefixtures("no_work")
+def test_a_full_run_may_renew_an_earlier_benchmark(finished: Path) -> None:
+    benchmark.check_targets(
+        benchmark.parse(["--out", str(finished), "--json", str(finished / "benchmark.json")]), False
+    )
+
+
+@pytest.mark.parametrize(
+    "odd", [{"validation_rmse_mm": float("nan")}, {"validation_rmse_mm": float("inf")}, {"scenario": "\ud800"}]
+)
+@pytest.mark.usefixtures("no_work")
+def test_a_contract_that_cannot_be_recorded_is_refused_at_once(odd: dict[str, Any], tmp_path: Path) -> None:
+    constant_agent(tmp_path / "agent.onnx")
+    contract, _ = read_agent(tmp_path / "agent.onnx")
+    assert benchmark._recorded(contract)["scenario"] == "randomized"
+    with pytest.raises(ValueError, match=f"agent 'ppo': its contract's {next(iter(odd))} cannot be written"):
+        benchmark._recorded(replace(contract, **odd))
+
+
+@pytest.mark.usefixtures("no_work")
+def test_a_contract_with_an_endless_number_gets_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    agent = constant_agent(tmp_path / "agent.onnx")
+    promised = agent.with_suffix(".json")
+    promised.write_text(promised.read_text().replace('"validation_rmse_mm": 6.0', '"validation_rmse_mm": NaN'))
+    assert "validation_rmse_mm" in refused([*SMALL, "--agent", str(agent), "--out", str(tmp_path / "out")], capsys)
+
+
 def test_an_overwriting_run_replaces_the_results(tmp_path: Path) -> None:
     (tmp_path / "benchmark.json").write_text("old")
     arguments = ["--scenarios", "reference-b", "--controllers", "open-loop", "--out", str(tmp_path), "--quiet"]
@@ -283,7 +333,7 @@ def test_files_are_written_all_or_none(tmp_path: Path, capsys: pytest.CaptureFix
     """A file that cannot be replaced (a folder stands in its place) leaves no half-written neighbours."""
     (tmp_path / "report.md").mkdir()
     arguments = ["--scenarios", "reference-b", "--controllers", "open-loop", "--out", str(tmp_path), "--quiet"]
-    assert "report.md" in refused(arguments, capsys)
+    assert "report.md" in refused([*arguments, "--overwrite"], capsys)
     assert [path.name for path in tmp_path.iterdir()] == ["report.md"]
 
 

@@ -21,6 +21,9 @@ from .statistics import RESAMPLES, SEED, Estimate
 
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime", "casadi")
 """Packages whose versions are recorded."""
+RESULTS = "benchmark.json"
+FILES = (RESULTS, "episodes.csv", "report.md", "crystal.png", "errors.png", "pareto.png")
+"""Everything a folder of results may hold."""
 
 
 def to_json(benchmark: Benchmark) -> str:
@@ -58,6 +61,15 @@ def to_json(benchmark: Benchmark) -> str:
         "provenance": _provenance(benchmark),
     }
     return json.dumps(data, indent=1, allow_nan=False) + "\n"
+
+
+def is_benchmark_json(content: bytes) -> bool:
+    """Whether these bytes were written by :func:`to_json`, by this release or an earlier one."""
+    try:
+        data = json.loads(content)
+    except (ValueError, RecursionError):
+        return False
+    return isinstance(data, dict) and {"results", "paired", "cvar5", "verdicts", "provenance"} <= set(data)
 
 
 def _paired(outcome: Outcome) -> dict[str, Any]:

@@ -1,0 +1,27 @@
+"""What the project's commands share: a parser that says what is wrong in one line, and the end of an interrupt."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import NoReturn
+
+INTERRUPTED = 130
+"""Exit code of a command that Ctrl-C ended."""
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """Takes options only as they are written out, and says in one line what is wrong with them."""
+
+    def __init__(self, prog: str, description: str | None = None, epilog: str | None = None) -> None:
+        super().__init__(prog=prog, description=description, epilog=epilog, allow_abbrev=False)
+
+    def error(self, message: str) -> NoReturn:
+        """Exit with code 2."""
+        self.exit(2, f"{self.prog}: {' '.join(message.split())}\n")
+
+
+def interrupted(prog: str, left: str = "nothing written") -> int:
+    """Say in one line that Ctrl-C ended the command, and what it left; returns the exit code."""
+    print(f"{prog}: interrupted; {left}", file=sys.stderr)
+    return INTERRUPTED
