@@ -7,7 +7,6 @@ every column shows the worst.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import io
 import json
@@ -21,6 +20,7 @@ import numpy as np
 from gymnasium.utils.seeding import np_random
 
 from cz_gym.batch import new_key
+from cz_gym.commands import OneLineParser, interrupted
 from cz_gym.config import Config, make_config
 from cz_gym.episode import draw_factors, randomised
 from cz_gym.evaluation.files import write_files
@@ -196,9 +196,7 @@ def as_json(rows: Sequence[Row], skipped: Sequence[str]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m baselines.design_table", description=(__doc__ or "").split("\n")[0]
-    )
+    parser = OneLineParser(prog="python -m baselines.design_table", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--controllers", nargs="+", help="names; by default every one that has a linear form")
     parser.add_argument("--pullers", type=int, default=50, help="random pullers for the worst case, at most 500")
     parser.add_argument("--out", type=Path, default=Path("results/design"), help="folder of design.md, .csv and .json")
@@ -214,6 +212,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, ImportError, OSError) as error:
         print(f"design_table: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        return interrupted("design_table")
     print(text, end="")
     return 0
 

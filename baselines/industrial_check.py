@@ -7,13 +7,13 @@ autocorrelation), and the sign of the pull-speed gain that identification from t
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from cz_gym.commands import OneLineParser, interrupted
 from cz_gym.config import make_config
 from cz_gym.evaluation.rollout import Rollout, rollout
 from cz_gym.units import MINUTE, MM, MM_PER_MIN
@@ -90,7 +90,7 @@ def facts(run: Rollout) -> Facts:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m baselines.industrial_check", description="the logged facts")
+    parser = OneLineParser(prog="python -m baselines.industrial_check", description="the logged facts")
     parser.add_argument("--episodes", type=int, default=100, help="validation episodes, at most 500")
     parser.add_argument("--scenario", default="randomized")
     parser.add_argument("--model", choices=["I", "II"], help="one model instead of the scenario's mix")
@@ -103,6 +103,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ValueError as error:
         print(f"industrial_check: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        return interrupted("industrial_check")
     print(f"{'':<20}{'logged':>10}{'here':>10}")
     for name, logged, here in zip(Facts._fields, LOGGED, found, strict=True):
         print(f"{name:<20}{logged:>10.3g}{here:>10.3g}")

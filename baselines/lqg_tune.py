@@ -6,9 +6,7 @@ validation seeds, which choose. Test seeds are never touched. Every candidate st
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -18,7 +16,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import NonlinearConstraint, minimize
 
+from cz_gym.commands import OneLineParser, interrupted
 from cz_gym.config import make_config
+from cz_gym.evaluation.files import check_writable, write_files
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 
@@ -143,16 +143,9 @@ def read_history(path: Path) -> tuple[dict[str, int], History]:
         raise ValueError(f"{path} is no tuning history: {error!r}") from None
 
 
-def write_whole(path: Path, data: Any) -> None:
-    """Write JSON whole or not at all."""
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(json.dumps(data, indent=1) + "\n")
-    os.replace(temporary, path)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command."""
-    parser = argparse.ArgumentParser(prog="python -m baselines.lqg_tune", description=__doc__)
+    parser = OneLineParser(prog="python -m baselines.lqg_tune", description=__doc__)
     parser.add_argument("--controller", choices=sorted(GOALS), default="lqg")
     parser.add_argument("--budget", type=int, default=60, help="candidates to try")
     parser.add_argument("--episodes", type=int, default=100, help="training episodes a candidate")
@@ -169,7 +162,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"--survive must be at least 0, not {given.survive}")
     output = given.output or Path("results") / "tuning" / f"{given.controller}.json"
     try:
-        output.parent.mkdir(parents=True, exist_ok=True)
+        check_writable(output.parent)
         goal = GOALS[given.controller]
         if given.history is None:
             budget = {name: getattr(given, name) for name in ("budget", "episodes", "survive")}
@@ -179,10 +172,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         budget |= {"validation": given.validation, "finals": given.finals}
         chosen = choose(goal, history, given.validation, given.finals)
         found = {"controller": given.controller, "budget": budget, "chosen": chosen, "history": history.entries}
-        write_whole(output, found)
+        write_files({output: (json.dumps(found, indent=1) + "\n").encode()})
     except (OSError, ValueError) as error:
         print(f"cannot read or write: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        return interrupted("lqg_tune")
     print(json.dumps(chosen, indent=1))
     return 0
 

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cz_gym.commands import OneLineParser, interrupted
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation.files import write_files
 from cz_gym.evaluation.metrics import metrics
@@ -212,7 +213,7 @@ def check(args: argparse.Namespace) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m baselines.tune", description=(__doc__ or "").split("\n")[0])
+    parser = OneLineParser(prog="python -m baselines.tune", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--controller", required=True, help="paper-tuned, paper-filtered, pid-conventional, industrial")
     parser.add_argument("--scenario", default="randomized", help="scenario to tune on")
     parser.add_argument("--trials", type=int, default=60, help="trials in all, those of an earlier run included")
@@ -237,6 +238,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, ImportError, OSError) as error:
         print(f"tune: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        return interrupted("tune", "the same command goes on from the trials in its history")
     print(f"{space.name} on {config.scenario.name}: {judged[0].score}")
     print(build(space, judged[0].values))
     return 0

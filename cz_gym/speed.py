@@ -6,7 +6,6 @@ while is busy for all. Steps per second count every slot's step, resets included
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import statistics
@@ -18,6 +17,7 @@ from typing import Any, NamedTuple
 
 from . import speed_cases as cases
 from . import speed_peers as peers
+from .commands import OneLineParser, interrupted
 from .evaluation.files import check_writable, write_files
 from .speed_cases import THREADS, Case, Skipped
 from .speed_costs import KIB, megabytes, memory_per_slot, reset_seconds, start_seconds
@@ -196,7 +196,7 @@ def run(plan: Plan, quick: bool, progress: Callable[[str], None] = lambda _: Non
 
 def main(argv: list[str] | None = None) -> int:
     """Measure and print; 2 if the file cannot be written."""
-    parser = argparse.ArgumentParser(prog="python -m cz_gym.speed", description="Measure speed beside installed peers.")
+    parser = OneLineParser(prog="python -m cz_gym.speed", description="Measure speed beside installed peers.")
     parser.add_argument("--quick", action="store_true", help="fewer repeats, up to 4,096 slots: under 40 s")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures here")
     arguments = parser.parse_args(argv)
@@ -214,6 +214,9 @@ def main(argv: list[str] | None = None) -> int:
         said = f"{error.filename}: {error.strerror}" if error.filename else str(error)
         print(f"cz_gym.speed: {said}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        _say("")
+        return interrupted("cz_gym.speed")
     return 0
 
 

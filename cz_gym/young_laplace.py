@@ -10,7 +10,7 @@ point phi = pi/2 - theta. :data:`YOUNG_LAPLACE` is the solution as polynomials t
 
     gym.make("Cz-v0", meniscus=YOUNG_LAPLACE)
 
-``python -m cz_gym.young_laplace`` computes the polynomials anew and writes them to ``young_laplace_table.py``.
+``python -m cz_gym.young_laplace`` computes the polynomials anew; ``--write`` puts them into ``young_laplace_table.py``.
 """
 
 from __future__ import annotations
@@ -220,6 +220,8 @@ YOUNG_LAPLACE = MeniscusModel("young-laplace", exact_slope, exact_ring_offset, e
 """The exact meniscus as a model for the plant: ``gym.make("Cz-v0", meniscus=YOUNG_LAPLACE)``."""
 
 if __name__ == "__main__":
+    import sys
+
     from .young_laplace_build import main
 
-    main()
+    sys.exit(main())

@@ -1,13 +1,14 @@
 """Compute the polynomials of the exact meniscus and write them to ``young_laplace_table.py``.
 
-``python -m cz_gym.young_laplace`` runs :func:`main`. The exact solution is sampled at Chebyshev points, where
+``python -m cz_gym.young_laplace`` runs :func:`main`, which writes only if told to.
+The exact solution is sampled at Chebyshev points, where
 interpolation converges as fast as the function is smooth; what is stored are the powers' coefficients.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +17,10 @@ import numpy.typing as npt
 from numpy.polynomial import chebyshev
 
 from . import young_laplace as exact
+from .commands import OneLineParser, interrupted
+from .evaluation.files import check_writable, write_files
 from .meniscus import profile, ring_point
+from .young_laplace_table import RING, SLOPE, TAIL
 
 Floats = npt.NDArray[np.float64]
 SIZES = ((9, 16), (9, 22), (7, 8))
@@ -124,10 +128,26 @@ def render(tables: Tables) -> str:
     return "\n".join(lines).rstrip("\n") + "\n"
 
 
-def main() -> None:
-    """Write the tables next to this module, whole or not at all."""
-    text = render(build())
-    temporary = TABLE.with_suffix(".tmp")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, TABLE)
-    print(f"wrote {TABLE.name}: {len(text)} characters")
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code. Compares, and with ``--write`` replaces the table next to this module."""
+    parser = OneLineParser(
+        "python -m cz_gym.young_laplace", "Compute the exact meniscus and compare it with the table."
+    )
+    parser.add_argument("--write", action="store_true", help=f"replace {TABLE.name} by what was computed")
+    write = parser.parse_args(arguments).write
+    try:
+        if write:
+            check_writable(TABLE.parent)
+        tables = build()
+        if write:
+            write_files({TABLE: render(tables).encode()})
+    except OSError as error:
+        print(f"cz_gym.young_laplace: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return interrupted("cz_gym.young_laplace")
+    shipped = Tables(SLOPE, RING, TAIL)
+    worst = max(float(np.max(np.abs(new - old))) for new, old in zip(tables, shipped, strict=True))
+    print(f"largest difference from the coefficients there were: {worst:.2g}")
+    print(f"wrote {TABLE.name}" if write else f"nothing written; --write replaces {TABLE.name}")
+    return 0
