@@ -38,8 +38,12 @@ def physics(function: F) -> F:
 
 
 def inlined(function: F) -> F:
-    """Like :func:`physics`, its text put into the kernel: passing a step's arrays on costs a tenth of the step."""
-    return register_jitable(error_model="numpy", inline="always")(function)
+    """A part of kernels alone, its text put into each: passing a step's arrays on costs a tenth of the step.
+
+    Put in before types are inferred; as an inlined :func:`physics` it and all it calls would compile twice.
+    For module level only: kept in a closure it would change the key of the kernel on disk in every process.
+    """
+    return cast(F, numba.njit(error_model="numpy", inline="always")(function))
 
 
 def source_hash(folder: Path | None = None) -> str:

@@ -100,6 +100,32 @@ def _advance(slot: Any, series: Any, frames: Any, clock: Any, slope: Any, ring_o
     return grows
 
 
+@inlined
+def _sample(
+    memory: Any, i: Any, v_p: Any, Q_H: Any, clock: Any, reading: Any, out: Any, slope: Any, ring_offset: Any
+) -> Any:
+    """Read slot i and write what it says; returns the cost of the step from drives v_p, Q_H."""
+    slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
+    t, h_c = slot.k * clock.interval, _height_inside(x.h_c, p)
+    ring = x.r_c + ring_offset(x.r_c, h_c, p)
+    series = memory.series[i]
+    sense(slot, series[slot.k, 1], series[slot.k, 2], memory.frames[i], t, ring - p.ring_bias)
+    measured = measure(slot, t)
+    row = out.observation[i]
+    write_measured(measured, reading.measured, row)
+    if memory.history.shape[1] > 0:
+        remember(slot, memory.history[i], clock.interval, row)
+        recall(slot, memory.history[i], reading, row)
+    if out.state.shape[1] > 0:
+        write_state(slot, measured, t, reading.state, out.state[i])
+    error = x.r_c - p.r_0 - measured.r_ref
+    cost = cost_terms(error, measured.v_p, slot.v_p - v_p, slot.Q_H - Q_H)
+    if slot.k == 0:
+        cost = Cost(0.0, 0.0, 0.0, 0.0)
+    write_info(slot, measured, cost, t, h_c, ring, slope, out.info[:, i])
+    return cost
+
+
 class Kernels(NamedTuple):
     """The compiled loops for one meniscus model."""
 
@@ -119,29 +145,6 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
     """Compile the loops for a meniscus model; those of this package's models are kept on disk."""
     slope, ring_offset, height = meniscus.slope, meniscus.ring_offset, meniscus.height
 
-    @inlined
-    def sample(memory: Any, i: Any, v_p: Any, Q_H: Any, clock: Any, reading: Any, out: Any) -> Any:
-        """Read slot i and write what it says; returns the cost of the step from drives v_p, Q_H."""
-        slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
-        t, h_c = slot.k * clock.interval, _height_inside(x.h_c, p)
-        ring = x.r_c + ring_offset(x.r_c, h_c, p)
-        series = memory.series[i]
-        sense(slot, series[slot.k, 1], series[slot.k, 2], memory.frames[i], t, ring - p.ring_bias)
-        measured = measure(slot, t)
-        row = out.observation[i]
-        write_measured(measured, reading.measured, row)
-        if memory.history.shape[1] > 0:
-            remember(slot, memory.history[i], clock.interval, row)
-            recall(slot, memory.history[i], reading, row)
-        if out.state.shape[1] > 0:
-            write_state(slot, measured, t, reading.state, out.state[i])
-        error = x.r_c - p.r_0 - measured.r_ref
-        cost = cost_terms(error, measured.v_p, slot.v_p - v_p, slot.Q_H - Q_H)
-        if slot.k == 0:
-            cost = Cost(0.0, 0.0, 0.0, 0.0)
-        write_info(slot, measured, cost, t, h_c, ring, slope, out.info[:, i])
-        return cost
-
     def step(memory: Any, actions: Any, active: Any, clock: Any, reading: Any, out: Any, start: int, stop: int) -> None:
         for i in range(start, stop):
             if not active[i]:
@@ -151,7 +154,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
             pull, heat = actions[i, 0], actions[i, 1]
             _drive(slot, pull, heat, clock.interval)
             grows = _advance(slot, memory.series[i], memory.frames[i], clock, slope, ring_offset)
-            cost = sample(memory, i, v_p, Q_H, clock, reading, out)
+            cost = _sample(memory, i, v_p, Q_H, clock, reading, out, slope, ring_offset)
             ends = slot.k >= clock.steps
             out.reward[i] = reward(cost) + (0.0 if grows else failure_penalty(slot.k, clock.steps))
             out.terminated[i] = not grows
@@ -179,7 +182,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
                 numbers[EPISODE_AT + number] = episode[number]
             draw_series(slot.episode, streams, series[: clock.grid_points, 0], series[: clock.steps + 1, 1:])
             _begin(slot, series[0, 0])
-            sample(memory, i, slot.v_p, slot.Q_H, clock, reading, out)
+            _sample(memory, i, slot.v_p, slot.Q_H, clock, reading, out, slope, ring_offset)
             out.info[_CLIPPED, i], out.reward[i] = 0.0, 0.0
             out.terminated[i] = out.truncated[i] = False
         return impossible
