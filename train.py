@@ -7,12 +7,14 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+from cz_gym.commands import OneLineParser
+
 ALGORITHMS = ("ppo", "sac")
 
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
     """Read the command line; exits with code 2 and one line for anything that cannot be meant."""
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="train.py",
         description="Train an agent with stable-baselines3 and pick it on validation episodes.",
         epilog="The run folder holds the agent with its contract, settings, checkpoints, progress and logs.",

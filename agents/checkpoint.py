@@ -9,7 +9,9 @@ from typing import Any
 
 import torch
 
-from .contract import AgentFileError, write_whole
+from cz_gym.evaluation.files import write_files
+
+from .contract import AgentFileError
 
 FORMAT = "cz-gym-checkpoint-1"
 
@@ -39,7 +41,7 @@ def save_checkpoint(path: Path, learner: Any, best_rmse_mm: float) -> None:
     }
     buffer = io.BytesIO()
     torch.save(content, buffer)
-    write_whole(path, buffer.getvalue())
+    write_files({path: buffer.getvalue()})
 
 
 def load_checkpoint(path: Path) -> Checkpoint:

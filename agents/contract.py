@@ -5,11 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
-import tempfile
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
+
+from cz_gym.evaluation.files import write_files
 
 FORMAT = "cz-gym-agent"
 FORMAT_VERSION = 1
@@ -53,23 +53,8 @@ def write_agent(path: Path, onnx_bytes: bytes, **facts: Any) -> Contract:
     """Write ``path`` (.onnx) and its contract (.json), each whole or not at all; ``facts`` are Contract's fields."""
     contract = Contract(**facts, sha256=hashlib.sha256(onnx_bytes).hexdigest())
     text = json.dumps({"format": FORMAT, "format_version": FORMAT_VERSION, **asdict(contract)}, indent=2) + "\n"
-    write_whole(path, onnx_bytes)
-    write_whole(path.with_suffix(".json"), text.encode())
+    write_files({path: onnx_bytes, path.with_suffix(".json"): text.encode()})
     return contract
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file by renaming a complete temporary one over it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
 
 
 def read_agent(path: Path) -> tuple[Contract, bytes]:

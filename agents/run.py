@@ -17,13 +17,14 @@ from typing import Any
 
 import cz_gym
 from cz_gym.config import Config, make_config
+from cz_gym.evaluation.files import write_files
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 
 from . import settings
 from .callbacks import Every, Tell
 from .checkpoint import load_checkpoint, restore, save_checkpoint
-from .contract import AgentFileError, write_agent, write_whole
+from .contract import AgentFileError, write_agent
 from .export import actor_of, to_onnx
 from .onnx_policy import OnnxPolicy
 from .training import Training, make_training
@@ -230,7 +231,7 @@ def _version(package: str) -> str | None:
 
 
 def _write_json(path: Path, content: Any) -> None:
-    write_whole(path, (json.dumps(content, indent=2) + "\n").encode())
+    write_files({path: (json.dumps(content, indent=2) + "\n").encode()})
 
 
 def _write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
@@ -238,7 +239,7 @@ def _write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
     writer = csv.DictWriter(text, fieldnames=list(rows[0]))
     writer.writeheader()
     writer.writerows(rows)
-    write_whole(path, text.getvalue().encode())
+    write_files({path: text.getvalue().encode()})
 
 
 def _read_rows(path: Path) -> list[dict[str, Any]]:

@@ -103,6 +103,7 @@ def test_interrupting_before_learning_gives_one_line(
         (["--steps", "0"], "at least 1, not '0'"),
         (["--seed", "minus"], "at least 0, not 'minus'"),
         (["--sceanrio", "hard"], "unrecognized arguments"),
+        (["--scen", "hard"], "unrecognized arguments"),
     ],
 )
 def test_impossible_arguments_exit_with_2(
@@ -111,7 +112,9 @@ def test_impossible_arguments_exit_with_2(
     with pytest.raises(SystemExit) as caught:
         train.main(arguments)
     assert caught.value.code == 2
-    assert message in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
 
 
 @pytest.mark.parametrize(
