@@ -153,10 +153,16 @@ def polynomial(c: Any, x: Any, y: Any) -> Any:
 
 
 @physics
+def _inside(beyond: Any) -> Any:
+    """One inside the table, NaN beyond: NaN to the power of zero is one. No ``np.where``, which makes arrays."""
+    return np.power(np.nan, 1.0 * beyond)
+
+
+@physics
 def _curvature(r_c: Any, a: Any) -> Any:
     """a / r_c mapped to [-1, 1], and the ratio itself; NaN for a crystal narrower than the table's."""
     ratio = a / r_c
-    ratio = ratio * np.where(np.real(ratio) <= NARROWEST, 1.0, np.nan)
+    ratio = ratio * _inside(np.real(ratio) > NARROWEST)
     return 2.0 * ratio / NARROWEST - 1.0, ratio
 
 
@@ -211,8 +217,7 @@ def exact_ring_offset(r_c: Any, h_c: Any, p: Any) -> Any:
     planar = RING_REFERENCE - profile(h_c / p.a, 1.0)
     at_reference = planar + ratio * polynomial(RING, x, _between(q, Q_LOW, Q_HIGH))
     y, ratio = _curvature(r_c + p.a * at_reference, p.a)
-    known = np.where((p.X_b >= X_LOW) & (p.X_b <= X_HIGH), 1.0, np.nan)
-    moved = (p.X_b - RING_REFERENCE) * known
+    moved = (p.X_b - RING_REFERENCE) * _inside((p.X_b < X_LOW) | (p.X_b > X_HIGH))
     return p.a * (at_reference + moved * (1.0 + ratio * polynomial(TAIL, y, _between(p.X_b, X_LOW, X_HIGH))))
 
 
