@@ -126,6 +126,16 @@ def _sample(
     return cost
 
 
+def _read(
+    memory: Any, i: Any, v_p: Any, Q_H: Any, clock: Any, reading: Any, out: Any, slope: Any, ring_offset: Any
+) -> None:
+    _sample(memory, i, v_p, Q_H, clock, reading, out, slope, ring_offset)
+
+
+_first_sample = kernel(_read, keep=False, allocates=False)
+"""A sample as a function of its own: with the step's options, so that what it calls is compiled only once."""
+
+
 class Kernels(NamedTuple):
     """The compiled loops for one meniscus model."""
 
@@ -182,7 +192,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
                 numbers[EPISODE_AT + number] = episode[number]
             draw_series(slot.episode, streams, series[: clock.grid_points, 0], series[: clock.steps + 1, 1:])
             _begin(slot, series[0, 0])
-            _sample(memory, i, slot.v_p, slot.Q_H, clock, reading, out, slope, ring_offset)
+            _first_sample(memory, i, slot.v_p, slot.Q_H, clock, reading, out, slope, ring_offset)
             out.info[_CLIPPED, i], out.reward[i] = 0.0, 0.0
             out.terminated[i] = out.truncated[i] = False
         return impossible
