@@ -6,13 +6,16 @@ import hashlib
 import json
 import math
 from dataclasses import dataclass, field, replace
+from numbers import Real
 
+from ._compile import hashed
 from .meniscus import HURLE, MeniscusModel
 from .observation import OBSERVATIONS
 from .parameters import Parameters, check_parameters
 from .plant import make_puller
 from .scenario import Range, Scenario
 from .scenarios import RANDOMIZED, find_scenario, mix_of
+from .task import check_height
 
 VERSION = 0
 """Version of physics and contract; a change of either makes a Cz-v1."""
@@ -45,13 +48,15 @@ class Config:
     @property
     def plant_hash(self) -> str:
         """SHA-256 of what the crystal obeys: version, meniscus and parameters (16 hex digits)."""
-        text = json.dumps([VERSION, self.meniscus.name, self.parameters._asdict()], sort_keys=True)
+        numbers = {name: float(value) + 0.0 for name, value in self.parameters._asdict().items()}
+        text = json.dumps([VERSION, _name(self.meniscus), numbers], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @property
     def hash(self) -> str:
         """SHA-256 of everything a saved state depends on (16 hex digits)."""
-        parts = [self.plant_hash, self.scenario.hash, self.mix, self.observation, self.control_interval, self.horizon]
+        mix = [float(share) + 0.0 for share in self.mix]
+        parts = [self.plant_hash, self.scenario.hash, mix, self.observation, self.control_interval, self.horizon]
         return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
 
     def with_scenario(self, scenario: str | Scenario) -> Config:
@@ -81,12 +86,20 @@ def make_config(
     if meniscus is not None and not isinstance(meniscus, MeniscusModel):
         raise ValueError(f"meniscus must be a cz_gym.MeniscusModel, not {meniscus!r}")
     checked = check_parameters(parameters if parameters is not None else Parameters())
-    make_puller(checked, meniscus=meniscus or HURLE)
+    check_height(make_puller(checked, meniscus=meniscus or HURLE))
     return Config(found, model, observation, interval, length, checked, meniscus or HURLE)
 
 
+def _name(meniscus: MeniscusModel) -> str:
+    """The name of a meniscus model; with its functions' full names where they are not this package's own."""
+    if hashed(*meniscus[1:]):
+        return meniscus.name
+    names = [f"{getattr(f, '__module__', '')}.{getattr(f, '__qualname__', repr(f))}" for f in meniscus[1:]]
+    return " ".join([meniscus.name, *names])
+
+
 def _positive(name: str, value: float) -> float:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
+    number = isinstance(value, Real) and not isinstance(value, bool)
     if not number or not math.isfinite(value) or value <= 0:
         raise ValueError(f"{name} must be a positive number of seconds, not {value!r}")
     return float(value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,11 +45,17 @@ def observation_space(observation: str) -> Any:
 
 
 def check_options(options: dict[str, Any] | None, allowed: tuple[str, ...] = _OPTIONS) -> dict[str, Any]:
-    """A copy of reset's options; ValueError for a key that is not one."""
+    """A copy of reset's options; ValueError unless a mapping of known ones, of scenario and state one at most."""
+    if options is not None and not isinstance(options, Mapping):
+        raise ValueError(f"reset options must be a dict, not {options!r}")
     given = dict(options or {})
-    unknown = sorted(set(given) - set(allowed))
+    unknown = [key for key in given if key not in allowed]
     if unknown:
         raise ValueError(f"unknown reset option {unknown[0]!r}; choose from {', '.join(allowed)}")
+    if "scenario" in given and "state" in given:
+        raise ValueError(
+            "reset options 'scenario' and 'state' exclude each other: a state has its own episode"
+        )
     return given
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from numbers import Real
 from typing import Annotated, NamedTuple, get_type_hints
 
 from .units import MM, MM_PER_MIN
@@ -79,11 +80,11 @@ def check_parameters(parameters: Parameters) -> Parameters:
     if not isinstance(parameters, Parameters):
         raise ValueError(f"parameters must be a cz_gym.Parameters, not {parameters!r}")
     for name, value in parameters._asdict().items():
-        number = isinstance(value, int | float) and math.isfinite(value)
+        number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
         if not number or value < 0 or (value == 0 and name not in _MAY_BE_ZERO):
             raise ValueError(f"parameter {name} = {value!r} must be a positive finite number [{describe()[name].unit}]")
     if parameters.R_cr <= parameters.r_0:
         raise ValueError(
             f"the crucible (R_cr = {parameters.R_cr} m) must be wider than the crystal (r_0 = {parameters.r_0} m)"
         )
-    return parameters
+    return Parameters(*map(float, parameters))

@@ -186,6 +186,11 @@ def make_puller(parameters: Parameters | None = None, lam: float = 1.0, meniscus
 
 def check_puller(puller: Puller) -> Puller:
     """Return the puller, or raise ValueError if it has no finite operating point."""
+    if np.isfinite(puller.a) and not np.all(np.isfinite([puller.h_0, puller.ring_bias])):
+        raise ValueError(
+            f"r_0 = {puller.r_0:g} m, alpha_0 or phi_b lies outside the range of the meniscus: "
+            f"its height is {puller.h_0:g} m, its bright ring {puller.ring_bias:g} m outside the crystal"
+        )
     if not np.all(np.isfinite(puller)):
         raise ValueError(NO_OPERATING_POINT)
     return puller

@@ -223,7 +223,13 @@ class Scenario:
     @property
     def hash(self) -> str:
         """SHA-256 of the scenario's contents (16 hex digits)."""
-        text = json.dumps(dataclasses.asdict(self), sort_keys=True)
+        contents: dict[str, Any] = {"name": self.name}
+        for family in dataclasses.fields(self)[1:]:
+            value = getattr(self, family.name)
+            contents[family.name] = {
+                member.name: _plain(member.default, getattr(value, member.name)) for member in dataclasses.fields(value)
+            }
+        text = json.dumps(contents, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @property
@@ -268,6 +274,13 @@ def _check(where: str, default: Any, value: Any) -> None:
         raise ValueError(f"{where} must be a finite number, not {value!r}")
     elif isinstance(default, int) and not isinstance(value, int):
         raise ValueError(f"{where} must be a whole number, not {value!r}")
+
+
+def _plain(default: Any, value: Any) -> Any:
+    """The value with its default's kind of number, so that equal values read alike: 1 as 1.0, -0.0 as 0.0."""
+    if isinstance(default, tuple):
+        return [_plain(default[0], part) for part in value]
+    return int(value) if isinstance(default, int) else float(value) + 0.0
 
 
 def _is_number(value: Any) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from numbers import Real
 
 from .scenario import Actuators, Drift, Faults, Interface, Pullers, Recipe, Reference, Scenario, Sensor
 from .units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
@@ -131,6 +132,6 @@ def mix_of(model: str | float | None, scenario: Scenario) -> tuple[float, float]
         return scenario.pullers.mix
     if isinstance(model, str) and model in ("I", "II"):
         return (1.0, 1.0) if model == "I" else (0.0, 0.0)
-    if isinstance(model, int | float) and not isinstance(model, bool) and 0.0 <= model <= 1.0:
+    if isinstance(model, Real) and not isinstance(model, bool) and 0.0 <= model <= 1.0:
         return float(model), float(model)
     raise ValueError(f'model must be "I", "II", a mix in [0, 1] or None, not {model!r}')

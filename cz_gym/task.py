@@ -8,6 +8,7 @@ import numpy as np
 
 from ._compile import physics
 from .observation import HEATER_SCALE
+from .plant import Puller
 from .units import KILO, MM, MM_PER_MIN
 
 RADIUS_LIMIT = 8.0 * MM
@@ -42,6 +43,16 @@ class Cost(NamedTuple):
 def within_limits(r_c: Any, h_c: Any, r_ref: Any, a: Any) -> Any:
     """Whether the crystal still grows: false for NaN, freezing, detachment and a lost radius."""
     return (np.abs(r_c - r_ref) <= RADIUS_LIMIT) & (h_c >= HEIGHT_MIN) & (h_c <= HEIGHT_MAX_IN_A * a)
+
+
+def check_height(puller: Puller) -> None:
+    """ValueError unless the puller's operating point lies inside the meniscus' limits."""
+    highest = HEIGHT_MAX_IN_A * puller.a
+    if not HEIGHT_MIN <= puller.h_0 <= highest:
+        raise ValueError(
+            f"the nominal meniscus height {puller.h_0 / MM:.3g} mm of these parameters lies outside its limits, "
+            f"{HEIGHT_MIN / MM:.3g} to {highest / MM:.3g} mm; check r_0, alpha_0, sigma and rho_l"
+        )
 
 
 @physics

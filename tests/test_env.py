@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 import warnings
 from typing import Any
 
@@ -13,8 +14,11 @@ from stable_baselines3.common.env_checker import check_env as check_with_sb3
 
 import cz_gym
 from cz_gym import CzEnv, Parameters, Scenario, make_puller
+from cz_gym.config import Config, make_config
+from cz_gym.meniscus import HURLE, MeniscusModel
 from cz_gym.plant import Disturbance, State, growth
 from cz_gym.scenario import Actuators, Interface, Recipe
+from cz_gym.young_laplace import YOUNG_LAPLACE
 
 MM_PER_MIN = 1e-3 / 60
 ZERO = np.zeros(2, np.float32)
@@ -84,6 +88,14 @@ def test_dtypes(observation: str) -> None:
         ({"parameters": {"sigma": 1.0}}, r"cz_gym\.Parameters"),
         ({"parameters": Parameters(k_l=math.nan)}, "parameter k_l = nan"),
         ({"meniscus": "hurle"}, r"cz_gym\.MeniscusModel"),
+        ({"control_interval": True}, "not True"),
+        ({"parameters": Parameters(alpha_0=1.7)}, "nominal meniscus height .* check r_0, alpha_0"),
+        ({"parameters": Parameters(r_0=1e-4)}, "nominal meniscus height .* check r_0, alpha_0"),
+        ({"meniscus": YOUNG_LAPLACE, "parameters": Parameters(r_0=0.02)}, "r_0 = 0.02 m.* range of the meniscus"),
+        (
+            {"meniscus": YOUNG_LAPLACE, "parameters": Parameters(phi_b=math.radians(20.0))},
+            "phi_b .* range of the meniscus",
+        ),
     ],
 )
 @pytest.mark.parametrize("make", [CzEnv, cz_gym.CzVectorEnv])
@@ -112,10 +124,45 @@ def test_bad_actions_are_refused(action: Any) -> None:
     assert "\n" not in str(refusal.value)
 
 
-@pytest.mark.parametrize("options", [{"seed": 3}, {"scenario": "nonsense"}, {"state": 3}])
-def test_bad_reset_options_are_refused(options: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=r"unknown reset option|unknown scenario|get_state"):
+@pytest.mark.parametrize("options", [{"seed": 3}, {3: 1, "a": 2}, {"scenario": "nonsense"}, {"state": 3}, 3, "abc", []])
+def test_bad_reset_options_are_refused(options: Any) -> None:
+    with pytest.raises(ValueError, match=r"unknown reset option|unknown scenario|get_state|must be a dict, not"):
         CzEnv().reset(options=options)
+
+
+def test_a_state_is_not_continued_on_another_scenario() -> None:
+    env = CzEnv()
+    env.reset(seed=0)
+    before = pickle.dumps(env.get_state())
+    with pytest.raises(ValueError, match="exclude each other"):
+        env.reset(seed=1, options={"scenario": "hard", "state": env.get_state()})
+    assert pickle.dumps(env.get_state()) == before
+
+
+@pytest.mark.parametrize("number", [np.int64, np.float32, np.float64])
+def test_numpy_numbers_are_numbers(number: Any) -> None:
+    parameters = Parameters()._replace(T_m=number(1685), C_1=number(57000))
+    given = make_config("nominal", number(1), "measured", number(5), number(100), parameters)
+    plain = make_config("nominal", 1.0, "measured", 5.0, 100.0)
+    assert (given.hash, given.steps, given.mix) == (plain.hash, 20, (1.0, 1.0))
+
+
+def test_equal_plants_have_equal_hashes() -> None:
+    zero, minus_zero = (make_config(parameters=Parameters(T_e=T_e)) for T_e in (0.0, -0.0))
+    assert zero.plant_hash == minus_zero.plant_hash == Config(parameters=Parameters(T_e=0)).plant_hash
+    assert Config(parameters=Parameters(T_m=1685)).plant_hash == make_config().plant_hash
+    assert make_config("nominal", -0.0).hash == make_config("nominal", 0).hash
+
+
+def test_a_foreign_meniscus_is_another_plant() -> None:
+    """Its name alone does not make it Hurle's."""
+
+    def slope(r_c: Any, h_c: Any, p: Any) -> Any:
+        return HURLE.slope(r_c, h_c, p)
+
+    foreign = MeniscusModel(HURLE.name, slope, HURLE.ring_offset, HURLE.height)
+    assert make_config(meniscus=foreign).plant_hash != make_config().plant_hash
+    assert make_config(meniscus=MeniscusModel(*HURLE)).plant_hash == make_config().plant_hash
 
 
 def test_out_of_range_actions_are_clipped_and_said_so() -> None:

@@ -203,6 +203,9 @@ def test_equal_contents_have_equal_hashes() -> None:
 
     assert mine() == mine()
     assert mine().hash == mine().hash
+    whole = Scenario("mine", Pullers(mix=(0, 1)), drift=Drift((-0.0, 2)), interface=Interface((1, 1)))
+    same = Scenario("mine", Pullers(mix=(0.0, 1.0)), drift=Drift((0.0, 2.0)), interface=Interface((1.0, 1.0)))
+    assert (whole == same, whole.hash) == (True, same.hash)
     assert len({scenario.hash for scenario in SCENARIOS.values()}) == len(SCENARIOS)
 
 

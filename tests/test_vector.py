@@ -175,14 +175,24 @@ def test_the_reset_mask_is_copied_and_the_rest_goes_on() -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"scenario": "nonsense"}, {"state": 3}, {"state": []}, {"state": [1, 2, 3]}, {"typo": 1}]
+    "options",
+    [
+        {"scenario": "nonsense"},
+        {"state": 3},
+        {"state": []},
+        {"state": [1, 2, 3]},
+        {"typo": 1},
+        {"scenario": "hard", "state": []},
+        3,
+        "abc",
+    ],
 )
-def test_a_refused_reset_changes_nothing(options: dict[str, Any]) -> None:
+def test_a_refused_reset_changes_nothing(options: Any) -> None:
     env = CzVectorEnv(3)
     env.reset(seed=0)
     env.step(np.zeros((3, 2)))
     before = pickle.dumps(env.get_state())
-    with pytest.raises(ValueError, match=r"unknown|expected 3 states"):
+    with pytest.raises(ValueError, match=r"unknown|expected 3 states|exclude each other|must be a dict"):
         env.reset(seed=5, options=options)
     assert pickle.dumps(env.get_state()) == before
 
