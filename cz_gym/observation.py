@@ -11,13 +11,15 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .units import KILO, MINUTE, MM, MM_PER_MIN
+from .parameters import Parameters
+from .units import KILO, MINUTE, MM
 
 CLIP = 10.0
 """Largest observed value after scaling [-]."""
 PREVIEWS = (0.0, 1.0 * MINUTE, 5.0 * MINUTE)
 """Times ahead at which the recipe is shown [s]."""
-PULL_SCALE = 1.2 * MM_PER_MIN
+PULL_SCALE = Parameters().v_0
+"""The default puller's v_0 [m/s]; another puller's channels are scaled with its own."""
 HEATER_SCALE = 10.0 * KILO
 """Half the heater's action range [W]."""
 TEMPERATURE_SCALE = 5.0

@@ -13,7 +13,9 @@ from .schedule import bias_offset, recipe, reference
 
 _AHEAD_1, _AHEAD_2 = PREVIEWS[1:]
 _M, _S, _L = len(MEASURED), len(STATE), len(LAGGED)
-_RING_SCALE = MEASURED[0].scale
+_REMEMBERED = tuple(Measured._fields.index(name) for name in LAGGED)
+_RING = _REMEMBERED[0]
+_RING_SCALE = MEASURED[_RING].scale
 
 
 @physics
@@ -54,19 +56,18 @@ def write_measured(measured: Any, per_scale: Any, out: Any) -> None:
 def remember(slot: Any, history: Any, interval: Any, out: Any) -> None:
     """Add the sample's scaled channels to the running sums, and the ring error to its integral."""
     depth = history.shape[0]
-    values = (out[0], out[9], out[8], out[10])
     if slot.k == 0:
         for back in range(depth):
-            history[depth - 1 - back, 0] = -values[0] * back
+            history[depth - 1 - back, 0] = -out[_RING] * back
             for channel in range(1, _L):
                 history[depth - 1 - back, channel] = 0.0
     else:
-        step = values[0] * (_RING_SCALE / INTEGRAL_SCALE) * interval
+        step = out[_RING] * (_RING_SCALE / INTEGRAL_SCALE) * interval
         slot.integral = clip(slot.integral + step, CLIP)
     at = slot.k % depth
     before = at - 1 if at > 0 else depth - 1
     for channel in range(_L):
-        history[at, channel] = history[before, channel] + values[channel]
+        history[at, channel] = history[before, channel] + out[_REMEMBERED[channel]]
 
 
 @physics
