@@ -206,9 +206,12 @@ def noise_result(noise: float, pid: SeriesPID, to_mm_per_min: float) -> NoiseRes
 
 
 def _share_clipped(run: Rollout) -> float:
-    v_0 = run.config.parameters.v_0
-    at_limit = np.abs(run.signals.v_p - v_0) > (1.0 - 1e-6) * v_0
-    return float(at_limit[run.alive].mean())
+    return float(at_pull_limit(run.signals.v_p, run.config.parameters.v_0)[run.alive].mean())
+
+
+def at_pull_limit(v_p: Floats, v_0: float) -> npt.NDArray[np.bool_]:
+    """Where a pull speed [m/s] stands at one of its limits, 0 and 2 v_0."""
+    return np.abs(v_p - v_0) > (1.0 - 1e-6) * v_0
 
 
 def _noise_gain(pid: SeriesPID) -> float:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from cz_gym import make_puller
 from cz_gym.linear import RadiusModel
-from cz_gym.units import MM, MM_PER_MIN
+from cz_gym.units import MINUTE, MM, MM_PER_MIN
 
 from .compensated_pid import Compensator
 from .design import open_loop
@@ -81,11 +81,13 @@ def open_loop_response(results: Results, model: str) -> Any:
     axes[0, 0].legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(0.03, 0.32))
     inset = axes[0, 0].inset_axes((0.16, 0.55, 0.5, 0.42))
     early = (run.t >= BEFORE) & (run.t <= BEFORE + 300.0)
-    inset.plot(t[early], (s.r_c[early] - s.r_c[0]) / (MM * MM), color=BLUE)
-    inset.plot(t[early], (s.r_br[early] - s.r_br[0]) / (MM * MM), color=ORANGE)
+    since = (run.t[early] - BEFORE) / MINUTE
+    inset.plot(since, (s.r_c[early] - s.r_c[0]) / (MM * MM), color=BLUE)
+    inset.plot(since, (s.r_br[early] - s.r_br[0]) / (MM * MM), color=ORANGE)
     inset.axhline(0.0, color=GREY, linewidth=0.7)
     inset.set_ylim(-1.0, 3.0)
-    inset.set_title(r"first 5 min: deviation [µm]", fontsize=7)
+    inset.set_title("deviation [µm]", fontsize=7)
+    inset.set_xlabel("since the change began [min]", fontsize=7, labelpad=1)
     inset.tick_params(labelsize=7)
     inset.grid(False)
     for axis, name, text in ((axes[0, 1], "alpha_c", CONE), (axes[1, 0], "h_c", HEIGHT), (axes[1, 1], "v_g", GROWTH)):

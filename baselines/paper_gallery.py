@@ -41,7 +41,11 @@ FIGURES = (
     Figure("figure_09_bode.png", "Paper's figure 9: compensated loops.", figures.frequency_responses),
     Figure("figure_10_tested_loop.png", "Paper's figure 10: the loop on the plant.", lambda r: diagrams.tested_loop()),
     Figure("figure_11_cases.png", "Paper's figure 11: cases A and B.", figures.case_comparison),
-    Figure("figure_12_temperatures.png", "Paper's figure 12: temperatures, Model I.", figures.ramp_temperatures),
+    Figure(
+        "figure_12_temperatures.png",
+        "Paper's figure 12: temperatures; Model II's are identical, as the thermal chain does not depend on it.",
+        figures.ramp_temperatures,
+    ),
     Figure("figure_13_ramp_I.png", "Paper's figure 13: the ramp, Model I.", lambda r: figures.ramp_response(r, "I")),
     Figure("figure_14_ramp_II.png", "Paper's figure 14: the ramp, Model II.", lambda r: figures.ramp_response(r, "II")),
     Figure("extra_a_linear_steps.png", "Steps of plant and linear model, per per cent.", extras.linear_steps),

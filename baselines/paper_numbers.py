@@ -8,7 +8,7 @@ from typing import Any
 
 from cz_gym import make_puller
 from cz_gym.linear import RadiusModel, radius_model
-from cz_gym.units import MM, MM_PER_MIN
+from cz_gym.units import HOUR, MINUTE, MM, MM_PER_MIN
 from cz_gym.young_laplace import YOUNG_LAPLACE
 
 from .compensated_pid import CompensatedPID, Compensator
@@ -21,6 +21,7 @@ from .paper_experiments import (
     NoiseResult,
     StepComparison,
     Trace,
+    at_pull_limit,
     case_difference,
     cut_off_result,
     errors,
@@ -150,6 +151,17 @@ def ramp_numbers(run: Trace) -> dict[str, float]:
         "rmse_mm": float((true[1:] ** 2).mean() ** 0.5) / MM,
         "max_compensated_error_mm": float(abs(seen).max()) / MM,
         "v_p_min_mm_per_min": float(run.signals.v_p.min()) / MM_PER_MIN,
+    }
+
+
+def cycle_numbers(run: Trace) -> dict[str, float]:
+    """How far a ramp's crystal swings and how hard its drive works; a lost crystal up to its end."""
+    late = run.signals.r_c[run.t >= run.t[-1] - HOUR]
+    return {
+        **ramp_numbers(run),
+        "lived_min": float(run.t[-1]) / MINUTE,
+        "at_limit": float(at_pull_limit(run.signals.v_p[1:], make_puller().v_0).mean()),
+        "late_swing_mm": float(late.max() - late.min()) / MM,
     }
 
 

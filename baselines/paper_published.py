@@ -16,6 +16,8 @@ ZERO = 0.021
 """Right half plane zero of both models, as rounded in the text [rad/s]."""
 COMPENSATOR = Compensator(gain=-0.22517, fast=1.684e-3, slow=2.0e-4)
 """G_pc,real."""
+ODE = (1.884e-3, 3.368e-7)
+"""The same as a differential equation in time: coefficients of y_pc' [rad/s] and y_pc [(rad/s)^2]."""
 PID = SeriesPID(K_p=0.01, T_i=5000.0, T_d=650.0, N=100.0)
 """Table 1."""
 CROSSOVER = 0.03275

@@ -7,8 +7,9 @@ from typing import NamedTuple
 from cz_gym.linear import RadiusModel
 from cz_gym.units import MM
 
+from .compensated_pid import Compensator
 from .paper_numbers import PUBLISHED, Results, ramp_numbers
-from .paper_published import COMPENSATOR, CROSSOVER, PHASE_MARGIN_DEG, ZERO
+from .paper_published import COMPENSATOR, CROSSOVER, ODE, PHASE_MARGIN_DEG, ZERO
 
 _DAY = 86400.0
 
@@ -84,7 +85,18 @@ def _compensator_rows(results: Results) -> list[Row]:
         Row("compensator numerator, procedure on our plant", "1/s", COMPENSATOR.gain, own.gain, "our G_p and G_m"),
         Row("compensator fast pole, our plant", "rad/s", COMPENSATOR.fast, own.fast, "the plant's stable pole"),
         Row("compensator slow pole", "rad/s", COMPENSATOR.slow, own.slow, "the high-pass cut-off"),
+        Row("differential equation, y_pc', printed poles", "rad/s", ODE[0], _ode(COMPENSATOR)[0], "sum of the poles"),
+        Row("differential equation, y_pc, printed poles", "rad2/s2", ODE[1], _ode(COMPENSATOR)[1], "their product"),
+        Row("differential equation, y_pc', published functions", "rad/s", ODE[0], _ode(published)[0]),
+        Row("differential equation, y_pc, published functions", "rad2/s2", ODE[1], _ode(published)[1]),
+        Row("differential equation, y_pc', our plant", "rad/s", ODE[0], _ode(own)[0], "our stable pole"),
+        Row("differential equation, y_pc, our plant", "rad2/s2", ODE[1], _ode(own)[1], "our stable pole"),
     ]
+
+
+def _ode(compensator: Compensator) -> tuple[float, float]:
+    """Coefficients of y_pc' [rad/s] and y_pc [(rad/s)^2] in the time domain."""
+    return compensator.fast + compensator.slow, compensator.fast * compensator.slow
 
 
 def _margin_rows(results: Results) -> list[Row]:
@@ -101,7 +113,7 @@ def _margin_rows(results: Results) -> list[Row]:
         source, model = name.split("_")
         if source == "own":
             worst = float(margin.poles.real.max())
-            why = "positive: the PID needs the compensator"
+            why = "positive: the linear loop is unstable"
             found.append(Row(f"rightmost closed-loop pole without compensator, Model {model}", "1/s", None, worst, why))
     return found
 

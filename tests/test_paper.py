@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +21,11 @@ from baselines.paper_experiments import (
     step_comparison,
     trace,
 )
+from baselines.paper_figures import open_loop_response
 from baselines.paper_gallery import FIGURES
+from baselines.paper_numbers import BEFORE, cycle_numbers
+from baselines.paper_published import COMPENSATOR, ODE
+from baselines.paper_rows import _ode
 from cz_gym import make_puller
 from cz_gym.linear import radius_model
 from cz_gym.units import MM, MM_PER_MIN
@@ -104,10 +109,51 @@ def test_files(written):
         assert figure.file in report
     expected = {figure.file for figure in FIGURES} | {"report.md", "numbers.json"}
     assert {path.name for path in written.iterdir()} == expected
-    assert sum(path.stat().st_size for path in written.iterdir()) < 2_000_000
+    assert sum(path.stat().st_size for path in written.iterdir()) < 2_500_000
     assert "nan" not in report
-    for printed in ("0.03275", "do not follow from the", "-0.22517"):
+    for printed in ("0.03275", "do not follow from the", "-0.22517", "0.001884", "3.368e-07", "chain does not depend"):
         assert printed in report
+
+
+def test_ode_follows_from_the_printed_poles():
+    """The paper's time-domain form of its compensator has the same two poles."""
+    poles = sorted(np.roots([1.0, *ODE]))
+    assert poles == pytest.approx([-COMPENSATOR.fast, -COMPENSATOR.slow], rel=1e-3)
+    assert _ode(COMPENSATOR) == pytest.approx(ODE, rel=1e-3)
+
+
+def test_without_the_compensator(written):
+    """Model II is lost; Model I cycles between the pull limits, nearer to its radius than the printed controller."""
+    bare = {m: trace(CompensatedPID(compensator=None), m, "paper-ramp") for m in ("I", "II")}
+    assert bare["II"].failed
+    assert not bare["I"].failed
+    cycle, printed = (cycle_numbers(run) for run in (bare["I"], trace(CompensatedPID(), "I", "paper-ramp")))
+    assert cycle["at_limit"] > 0.3 > 0.001 > printed["at_limit"]
+    assert cycle["late_swing_mm"] < 2.0
+    assert cycle["rmse_mm"] < 0.5 < printed["rmse_mm"]
+    report = (written / "report.md").read_text()
+    for number in (
+        f"{cycle['rmse_mm']:.3f}",
+        f"{printed['rmse_mm']:.3f}",
+        f"lost after {bare['II'].t[-1] / 60:.0f} min",
+    ):
+        assert number in report
+
+
+def test_thermal_chain_does_not_depend_on_the_model():
+    first, second = (trace(CompensatedPID(), m, "paper-ramp").signals for m in ("I", "II"))
+    for name in ("T_1", "T_1_ref", "T_b"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+
+
+def test_inset_counts_from_the_change():
+    run = pull_change("I", before=BEFORE, horizon=900.0)
+    figure = open_loop_response(SimpleNamespace(open_loop={"I": run}), "I")
+    (inset,) = figure.axes[0].child_axes
+    for line in inset.lines[:2]:
+        assert line.get_xdata()[0] == 0.0
+        assert line.get_xdata()[-1] == 5.0
+    assert "[min]" in inset.get_xlabel()
 
 
 def test_inverse_response_against_a_double_integrator():
