@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 
 from ..units import KILO, MINUTE, MM, MM_PER_MIN
 from .canvas import GREY, INK, Style, canvas, png
-from .results import Sample, ScenarioResult
+from .results import REFERENCE, Sample, ScenarioResult
 from .rollout import Signals
 
 Floats = npt.NDArray[np.float64]
@@ -19,6 +19,8 @@ COLUMNS = 6
 """Most controllers in the figure of one crystal."""
 WINDOW = 3.0 * MM
 """Widest radius error shown, beyond the reference's own range [m]."""
+NARROWEST = 0.01 * MM
+"""Narrowest: a crystal that nothing disturbs has no error to scale by [m]."""
 
 
 def crystal(scenario: ScenarioResult, looks: dict[str, Style]) -> bytes:
@@ -32,8 +34,7 @@ def crystal(scenario: ScenarioResult, looks: dict[str, Style]) -> bytes:
     for row, panel in enumerate(_PANELS):
         axes[row, 0].set_ylabel(panel.label)
     _crystal_limits(axes, samples, longest)
-    seed = samples[0].seeds[0]
-    figure.suptitle(f"One crystal of {scenario.row.name!r} (test seed {seed:,}) under each controller", fontsize=11)
+    figure.suptitle(_heading(scenario, samples), fontsize=11)
     figure.legend(
         handles=[
             Line2D([], [], color=INK, lw=1.2, ls="--", label="reference"),
@@ -68,9 +69,25 @@ SMOOTH = 5.0 * MINUTE
 
 
 def _chosen(samples: list[Sample]) -> list[Sample]:
-    """At most :data:`COLUMNS`: the learned first, then the table's order."""
-    ranked = sorted(samples, key=lambda sample: not sample.controller.learned)[:COLUMNS]
-    return [sample for sample in samples if sample in ranked]
+    """At most :data:`COLUMNS`: the learned, the reference, then the lowest mean RMSE, bounds last."""
+
+    def rank(sample: Sample) -> tuple[bool, bool, bool, float]:
+        who = sample.controller
+        return (not who.learned, who.name != REFERENCE, who.bound, float(sample.metric("rmse_mm").mean()))
+
+    ranked = sorted(samples, key=rank)[:COLUMNS]
+    return [sample for sample in samples if any(sample is one for one in ranked)]
+
+
+def _heading(scenario: ScenarioResult, shown: list[Sample]) -> str:
+    """What the figure shows and, if there were more controllers, by which rule these were chosen."""
+    text = f"One crystal of {scenario.row.name!r} (test seed {shown[0].seeds[0]:,}) under each controller"
+    names = {sample.controller.name for sample in shown}
+    others = [outcome.controller.name for outcome in scenario.outcomes if outcome.controller.name not in names]
+    if not others:
+        return text
+    rule = f"shown: the learned, {REFERENCE}, then the lowest mean RMSE of those that read sensors"
+    return f"{text}\n{rule}\nnot shown: {', '.join(others)}"
 
 
 def _crystal_column(axes: Any, sample: Sample, colour: str, reference: Floats) -> None:
@@ -81,7 +98,7 @@ def _crystal_column(axes: Any, sample: Sample, colour: str, reference: Floats) -
     for axis, panel in zip(axes, _PANELS, strict=True):
         values = panel.value(signals)
         if panel.noisy:
-            axis.plot(minutes, values, color=colour, lw=0.4, alpha=0.35)
+            axis.plot(minutes, values, color=colour, lw=0.3, alpha=0.15)
             window = min(round(SMOOTH / dt), len(values))
             mean = np.convolve(values, np.full(window, 1.0 / window), "valid")
             axis.plot(minutes[window - 1 :] - 0.5 * (window - 1) * dt / MINUTE, mean, color=colour, lw=1.4)
@@ -114,7 +131,7 @@ def _crystal_limits(axes: Any, samples: list[Sample], longest: Signals) -> None:
     """Scale by the crystals that lived: one that is lost leaves the picture, it does not set the scale."""
     lived = [sample for sample in samples if not sample.metric("failure_rate")[0, 0]] or samples
     worst = max(float(np.abs(sample.example.r_c - sample.example.r_ref).max()) for sample in lived)
-    width = 1.15 * min(worst, WINDOW)
+    width = 1.15 * max(min(worst, WINDOW), NARROWEST)
     low, high = float(longest.r_ref.min()) - width, float(longest.r_ref.max()) + width
     ring = float(np.median(longest.r_br - longest.r_c))
     axes[0, 0].set_ylim(low / MM, high / MM)

@@ -1,0 +1,47 @@
+"""The figure of one crystal: who is shown when there are many, and a crystal that nothing disturbs."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+
+from cz_gym.config import make_config
+from cz_gym.evaluation.canvas import styles
+from cz_gym.evaluation.crystal import COLUMNS, _chosen, _heading, crystal
+from cz_gym.evaluation.metrics import metric_names
+from cz_gym.evaluation.protocol import find_row
+from cz_gym.evaluation.results import Controller, Sample, summarise
+from cz_gym.evaluation.rollout import rollout
+
+
+class Still:
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> Any:
+        return np.zeros((len(observation), 2), np.float32), state
+
+
+def sample(name: str, rmse: float, observation: str = "measured", seeds: tuple[int, ...] = ()) -> Sample:
+    values = np.full((1, 1, len(metric_names())), rmse)
+    return Sample(Controller(name, observation, "", seeds), (7,), values, 0.0, cast(Any, None), 5.0)
+
+
+def test_many_controllers_are_chosen_by_a_rule_and_the_rest_named() -> None:
+    many = [sample("bound", 0.1, "state"), sample("paper", 9.0), *(sample(f"c{i}", 1.0 + i) for i in range(6))]
+    many.append(sample("ppo", 99.0, seeds=(0,)))
+    shown = _chosen(many)
+    assert len(shown) == COLUMNS
+    assert [one.controller.name for one in shown] == ["paper", "c0", "c1", "c2", "c3", "ppo"]
+    assert _chosen(many[::-1]) == shown[::-1]
+    outcomes = [SimpleNamespace(controller=one.controller) for one in many]
+    text = _heading(cast(Any, SimpleNamespace(row=find_row("hard"), outcomes=outcomes)), shown)
+    assert text.endswith("not shown: bound, c4, c5")
+
+
+def test_a_crystal_that_nothing_disturbs_is_drawn_without_a_warning() -> None:
+    row = find_row("nominal")
+    run = rollout(Still(), make_config("nominal", horizon=600.0), row.seeds(1))
+    result = summarise(row, [Sample.of(Controller("still", "measured", ""), [run])])
+    assert crystal(result, styles(["still"])).startswith(b"\x89PNG")
