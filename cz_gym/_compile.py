@@ -16,9 +16,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import numpy as np
+
+# Intel's vector mathematics, where numba finds it, rounds otherwise than libm: results would depend on the machine.
+# numba reads this when it is first imported.
+os.environ.setdefault("NUMBA_DISABLE_INTEL_SVML", "1")
+
 import llvmlite
 import numba
-import numpy as np
 from numba.core.options import DefaultOptions as default_options
 from numba.extending import register_jitable
 

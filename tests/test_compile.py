@@ -76,6 +76,12 @@ def fresh(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
     cache_folder.cache_clear()
 
 
+def test_no_vector_mathematics_that_rounds_otherwise(package: Path, tmp_path: Path, fresh: pytest.MonkeyPatch) -> None:
+    fresh.delenv("NUMBA_DISABLE_INTEL_SVML", raising=False)
+    code = "import cz_gym, numba\nprint(numba.config.DISABLE_INTEL_SVML, numba.config.USING_SVML)"
+    assert run(code, package, tmp_path / "cache") == ["1 False"]
+
+
 def test_an_empty_name_means_no_cache(fresh: pytest.MonkeyPatch) -> None:
     fresh.setenv("CZ_GYM_CACHE_DIR", "")
     assert cache_folder() is None
