@@ -92,9 +92,9 @@ def make_config(
 
 def _name(meniscus: MeniscusModel) -> str:
     """The name of a meniscus model; with its functions' full names where they are not this package's own."""
-    if hashed(*meniscus[1:]):
+    if hashed(*meniscus.functions):
         return meniscus.name
-    names = [f"{getattr(f, '__module__', '')}.{getattr(f, '__qualname__', repr(f))}" for f in meniscus[1:]]
+    names = [f"{getattr(f, '__module__', '')}.{getattr(f, '__qualname__', repr(f))}" for f in meniscus.functions]
     return " ".join([meniscus.name, *names])
 
 

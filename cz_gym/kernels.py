@@ -207,7 +207,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
     def derive(parameters: Any, lam: float) -> Any:
         return derive_puller(parameters, lam, height, ring_offset)
 
-    keep = hashed(*meniscus[1:])
+    keep = hashed(*meniscus.functions)
     return Kernels(
         kernel(step, keep, allocates=False),
         kernel(draw, keep),

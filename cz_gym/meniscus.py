@@ -22,6 +22,13 @@ class MeniscusModel(NamedTuple):
     slope: Callable[[Any, Any, Any], Any]
     ring_offset: Callable[[Any, Any, Any], Any]
     height: Callable[[Any, Any, Any], Any]
+    covers: str = ""
+    """What the functions cover, for people; empty: no bounds of its own."""
+
+    @property
+    def functions(self) -> tuple[Callable[[Any, Any, Any], Any], ...]:
+        """The model's functions."""
+        return self.slope, self.ring_offset, self.height
 
 
 @physics

@@ -181,15 +181,16 @@ def make_puller(parameters: Parameters | None = None, lam: float = 1.0, meniscus
     q = check_parameters(parameters or Parameters())
     with np.errstate(all="ignore"):
         puller = derive_puller(q, float(lam), meniscus.height, meniscus.ring_offset)
-    return check_puller(Puller(*map(float, puller)))
+    return check_puller(Puller(*map(float, puller)), meniscus)
 
 
-def check_puller(puller: Puller) -> Puller:
-    """Return the puller, or raise ValueError if it has no finite operating point."""
+def check_puller(puller: Puller, meniscus: MeniscusModel = HURLE) -> Puller:
+    """Return the puller, or raise ValueError if it has no finite operating point on the meniscus."""
     if np.isfinite(puller.a) and not np.all(np.isfinite([puller.h_0, puller.ring_bias])):
+        covers = f" ({meniscus.covers}; a = {puller.a:.4g} m)" if meniscus.covers else ""
         raise ValueError(
-            f"r_0 = {puller.r_0:g} m, alpha_0 or phi_b lies outside the range of the meniscus: "
-            f"its height is {puller.h_0:g} m, its bright ring {puller.ring_bias:g} m outside the crystal"
+            f"r_0 = {puller.r_0:g} m, alpha_0 or phi_b lies outside the range of the meniscus {meniscus.name!r}{covers}"
+            f": its height is {puller.h_0:.4g} m, its bright ring {puller.ring_bias:.4g} m outside the crystal"
         )
     if not np.all(np.isfinite(puller)):
         raise ValueError(NO_OPERATING_POINT)

@@ -221,7 +221,8 @@ def exact_ring_offset(r_c: Any, h_c: Any, p: Any) -> Any:
     return p.a * (at_reference + moved * (1.0 + ratio * polynomial(TAIL, y, _between(p.X_b, X_LOW, X_HIGH))))
 
 
-YOUNG_LAPLACE = MeniscusModel("young-laplace", exact_slope, exact_ring_offset, exact_height)
+_COVERS = f"r_0 >= a / {NARROWEST}, phi_b from {RING_SLOPES[0]:.4f} to {RING_SLOPES[1]:.4f} rad"
+YOUNG_LAPLACE = MeniscusModel("young-laplace", exact_slope, exact_ring_offset, exact_height, _COVERS)
 """The exact meniscus as a model for the plant: ``gym.make("Cz-v0", meniscus=YOUNG_LAPLACE)``."""
 
 if __name__ == "__main__":

@@ -91,10 +91,13 @@ def test_dtypes(observation: str) -> None:
         ({"control_interval": True}, "not True"),
         ({"parameters": Parameters(alpha_0=1.7)}, "nominal meniscus height .* check r_0, alpha_0"),
         ({"parameters": Parameters(r_0=1e-4)}, "nominal meniscus height .* check r_0, alpha_0"),
-        ({"meniscus": YOUNG_LAPLACE, "parameters": Parameters(r_0=0.02)}, "r_0 = 0.02 m.* range of the meniscus"),
+        (
+            {"meniscus": YOUNG_LAPLACE, "parameters": Parameters(r_0=0.02)},
+            "meniscus .young-laplace. .r_0 >= a",
+        ),
         (
             {"meniscus": YOUNG_LAPLACE, "parameters": Parameters(phi_b=math.radians(20.0))},
-            "phi_b .* range of the meniscus",
+            "phi_b from 0.0087 to 0.2618 rad",
         ),
     ],
 )
