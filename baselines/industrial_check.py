@@ -15,13 +15,14 @@ import numpy as np
 
 from cz_gym.commands import OneLineParser, interrupted
 from cz_gym.config import make_config
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import Rollout, rollout
 from cz_gym.units import MINUTE, MM, MM_PER_MIN
 
 from .policy import Floats
 from .tuned import tuned
 
-VALIDATION = range(1_000_000, 1_000_500)
+VALIDATION = VALIDATION_SEEDS
 SETTLED = 30.0 * MINUTE
 """Start of the analysed part, past the transient of the start [s]."""
 LAG = 60.0

@@ -23,13 +23,14 @@ from cz_gym.commands import OneLineParser, interrupted
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation.files import write_files
 from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.units import MM_PER_MIN
 
 from .optional import require
 from .tune_spaces import Knob, Space, reading, space_of, turned
 
-TRAINING, VALIDATION = range(1_000_000), range(1_000_000, 1_000_500)
+TRAINING, VALIDATION = TRAINING_SEEDS, VALIDATION_SEEDS
 """Seeds: the first ones of each are used."""
 STEP_PRICE, EXCESS_PRICE, FAILURE_PRICE, RULE_PRICE = 0.2, 20.0, 5.0, 2.0
 """Prices of pull step RMS and its excess over what is allowed [mm per mm/min], of failures and broken rules [mm]."""

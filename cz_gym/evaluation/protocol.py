@@ -7,6 +7,10 @@ from dataclasses import dataclass
 from ..config import Config, make_config
 from ..scenarios import SCENARIOS
 
+TRAINING_SEEDS = range(1_000_000)
+"""Seeds of the episodes that controllers are tuned and agents are trained on."""
+VALIDATION_SEEDS = range(1_000_000, 1_000_500)
+"""Seeds of the episodes that selection and early stopping look at."""
 TEST_SEEDS = range(2_000_000, 2_000_500)
 """Seeds of the test episodes; nothing is tuned, selected or stopped on them."""
 
