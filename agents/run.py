@@ -19,6 +19,7 @@ import cz_gym
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation.files import write_files
 from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
 
 from . import settings
@@ -29,8 +30,6 @@ from .export import actor_of, to_onnx
 from .onnx_policy import OnnxPolicy
 from .training import Training, make_training
 
-VALIDATION_SEEDS = range(1_000_000, 1_000_500)
-"""Seeds that agents are picked on."""
 QUICK, FULL = 64, 200
 """Validation episodes while learning, and at the end."""
 CHECKPOINT_SECONDS = 60.0

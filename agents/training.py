@@ -13,15 +13,13 @@ from stable_baselines3 import SAC as SACLearner
 from stable_baselines3.common.callbacks import BaseCallback
 
 from cz_gym import CzVectorEnv
+from cz_gym.evaluation.protocol import TRAINING_SEEDS
 
 from . import settings
 from .callbacks import Statistics
 from .network import DrivePolicy, Normalise
 from .vec_env import CzVecEnv
 from .wrappers import DriveAction, TrainingReward
-
-TRAINING_SEEDS = 1_000_000
-"""Environment seeds below this are for training."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ def _make_slots(recipe: settings.Recipe, seed: int, done: int) -> CzVecEnv:
         autoreset_mode=AutoresetMode.SAME_STEP,
     )
     slots = CzVecEnv(env, recipe.privileged_critic, stagger=seed + done)
-    slots.seed((seed * 10_007 + done) % (TRAINING_SEEDS - recipe.num_envs))
+    slots.seed((seed * 10_007 + done) % (len(TRAINING_SEEDS) - recipe.num_envs))
     return slots
 
 

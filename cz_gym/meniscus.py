@@ -16,7 +16,12 @@ from ._compile import physics
 
 
 class MeniscusModel(NamedTuple):
-    """A meniscus the plant can run on: its name and its functions, all of signature ``(r_c, h_c, p)``."""
+    """A meniscus the plant can run on: its name and its functions.
+
+    ``slope`` and ``ring_offset`` take ``(r_c, h_c, p)``, ``height`` takes ``(r_c, theta, a)``. All three are marked
+    ``cz_gym._compile.physics`` and compile into the step, which makes no array: they hold arithmetic, ``np.sqrt`` and
+    its like, ``min`` and ``max`` on numbers, but not ``np.where``.
+    """
 
     name: str
     slope: Callable[[Any, Any, Any], Any]
