@@ -31,7 +31,7 @@ class Hypotheses:
     fast_sd: tuple[float, ...] = (0.1, 0.3, 0.5)
     """Of the fast interface fluctuation [K]."""
     slow_sd: tuple[float, ...] = (0.15, 0.35)
-    """Of the slow one [K]; one as large as 0.6 loses crystals on slow drives, where the heater then chases the radius."""
+    """Of the slow one [K]; with one as large as 0.6 the heater chases the radius and slow drives lose crystals."""
 
     @property
     def count(self) -> int:

@@ -53,9 +53,7 @@ def check_options(options: dict[str, Any] | None, allowed: tuple[str, ...] = _OP
     if unknown:
         raise ValueError(f"unknown reset option {unknown[0]!r}; choose from {', '.join(allowed)}")
     if "scenario" in given and "state" in given:
-        raise ValueError(
-            "reset options 'scenario' and 'state' exclude each other: a state has its own episode"
-        )
+        raise ValueError("reset options 'scenario' and 'state' exclude each other: a state has its own episode")
     return given
 
 
