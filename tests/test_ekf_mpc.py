@@ -270,6 +270,8 @@ def test_estimates_beyond_the_equations_fall_back_on_the_law():
     law = act(estimate, plan, previous, mpc.lqg.gains.regulator, SHARE, mpc.lqg.parameters.v_0)
     assert np.isfinite(inputs).all()
     assert inputs[0] == pytest.approx(law[0])
+    alone = mpc.moves(estimate[:1], plan[:1], previous[:1], mpc.lqg.gains)
+    assert alone[0] == pytest.approx(law[0])
 
 
 def test_without_casadi_one_line_names_the_extra(monkeypatch):
