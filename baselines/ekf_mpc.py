@@ -141,10 +141,7 @@ class EkfMpc:
         H, g = newton(prediction, held(plan, shape.stages)[:, -1, 0], disturbances[:, -1], cost)
         usable = np.isfinite(np.concatenate([H.reshape(len(H), -1), g], axis=1)).all(axis=1)
         corrections = np.zeros(g.shape)
-        if usable.any():
-            corrections[usable] = best_corrections(
-                H[usable], g[usable], prediction.of(usable), self.blocks, self.limits
-            )
+        corrections[usable] = best_corrections(H[usable], g[usable], prediction.of(usable), self.blocks, self.limits)
         law = act(estimate, plan, previous, gains.regulator, share, self.lqg.parameters.v_0)
         optimal = previous + scale * (prediction.shown[:, 0, 3:] + corrections[:, :U])
         moved = np.where(usable[:, None], optimal, law)

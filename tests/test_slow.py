@@ -113,6 +113,17 @@ def test_a_damaged_file_is_run_again(tmp_path: Path, counted: list[int]) -> None
     assert counted == [0, 1, 1]
 
 
+def test_code_counts_and_text_does_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = tmp_path / "thing.py"
+    monkeypatch.setattr("baselines.fingerprint.__file__", str(tmp_path / "fingerprint.py"))
+    hashes = []
+    for text in ('"""A."""\nx = 1\n', '"""B."""\n# why\nx = (\n    1\n)\n', "x = 2\n"):
+        module.write_text(text)
+        hashes.append(fingerprint(None, "thing"))
+    assert hashes[0] == hashes[1] != hashes[2]
+    assert fingerprint(1, "thing") != hashes[2]
+
+
 def made(name: str, errors: list[float], **facts: Any) -> Sample:
     """A sample with these RMSEs [mm]."""
     values = np.zeros((1, len(errors), len(metric_names())))
