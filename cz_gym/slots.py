@@ -103,12 +103,37 @@ class Reading(NamedTuple):
     """One over the samples in it, shape (lags,)."""
 
 
-INFO = (
-    "r_c", "r_br", "r_ref", "h_c", "alpha_c", "v_g", "v_p", "Q_H", "T_1", "T_1_ref", "T_b",
-    "r_br_measured", "ring_offset",
-    "cost_radius", "cost_pull", "cost_pull_step", "cost_heater_step", "action_clipped",
-)  # fmt: skip
-"""Names of the info rows, SI units."""
+class InfoRow(NamedTuple):
+    """One number of ``info``."""
+
+    name: str
+    unit: str
+    meaning: str
+
+
+INFO_ROWS = (
+    InfoRow("r_c", "m", "true crystal radius"),
+    InfoRow("r_br", "m", "true radius of the bright ring"),
+    InfoRow("r_ref", "m", "radius reference"),
+    InfoRow("h_c", "m", "true meniscus height"),
+    InfoRow("alpha_c", "rad", "cone angle of the crystal's wall"),
+    InfoRow("v_g", "m/s", "growth rate"),
+    InfoRow("v_p", "m/s", "applied pull speed"),
+    InfoRow("Q_H", "W", "applied heater power"),
+    InfoRow("T_1", "K", "true heater temperature"),
+    InfoRow("T_1_ref", "K", "recipe of the heater temperature"),
+    InfoRow("T_b", "K", "true melt temperature"),
+    InfoRow("r_br_measured", "m", "the camera's reading, with noise and offset"),
+    InfoRow("ring_offset", "m", "offset of the ring that no sensor shows"),
+    InfoRow("cost_radius", "1", "the cost's term of the radius error"),
+    InfoRow("cost_pull", "1", "the cost's term of the pull speed"),
+    InfoRow("cost_pull_step", "1", "the cost's term of the step of the pull speed"),
+    InfoRow("cost_heater_step", "1", "the cost's term of the step of the heater power"),
+    InfoRow("action_clipped", "bool", "whether the action lay outside its box"),
+)
+"""What a step says beside the observation, SI units."""
+INFO = tuple(row.name for row in INFO_ROWS)
+"""Names of the info rows."""
 
 
 def info_width(n: int) -> int:
