@@ -1,23 +1,22 @@
-"""The benchmark's results as files: JSON, CSV, and writing them whole or not at all."""
+"""The benchmark's results as files: JSON and CSV, written whole or not at all."""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
-import os
 import platform
-import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import Any
 
 from ..scenarios import SCENARIOS
 from .metrics import metric_names
 from .results import BOUND, REFERENCE, Benchmark, Outcome
 from .statistics import RESAMPLES, SEED, Estimate
+from .whole import check_writable as check_writable
+from .whole import write_files as write_files
 
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime", "casadi")
 """Packages whose versions are recorded."""
@@ -133,38 +132,3 @@ def to_csv(benchmark: Benchmark) -> str:
                     numbers = (f"{value:.5g}" for value in values)
                     writer.writerow((scenario.row.name, outcome.controller.name, training_seed, seed, *numbers))
     return text.getvalue()
-
-
-def write_files(files: Mapping[Path, bytes]) -> None:
-    """Write all files or none: complete temporary files first, then renamed. Raises OSError."""
-    waiting: dict[str, Path] = {}
-    try:
-        for path, content in files.items():
-            if path.is_dir():
-                raise IsADirectoryError(f"{path} is a folder")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-            waiting[temporary] = path
-            with os.fdopen(handle, "wb") as file:
-                file.write(content)
-            os.chmod(temporary, 0o644)
-        for temporary, path in waiting.items():
-            os.replace(temporary, path)
-    except BaseException:
-        for temporary in waiting:
-            Path(temporary).unlink(missing_ok=True)
-        raise
-
-
-def check_writable(path: Path) -> None:
-    """Raise OSError unless files could be written into the folder ``path``, made if need be; leaves no trace."""
-    existing = path
-    while not existing.exists():
-        existing = existing.parent
-    if not existing.is_dir():
-        raise NotADirectoryError(f"{path}: {existing} is not a folder")
-    try:
-        with tempfile.TemporaryFile(dir=existing):
-            pass
-    except OSError as error:
-        raise OSError(f"{path}: cannot be written ({error.strerror})") from None
