@@ -1,0 +1,34 @@
+"""What the code says about its own fields: the text below each, its unit in the brackets at the end."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import textwrap
+from typing import NamedTuple
+
+UNIT = re.compile(r"\s*\[([^\]\[]*)\]\.?$")
+
+
+class Attribute(NamedTuple):
+    """A field of a class."""
+
+    name: str
+    unit: str
+    meaning: str
+
+
+def attributes(cls: type) -> list[Attribute]:
+    """The fields of a NamedTuple or dataclass that carry a text, in order."""
+    (node,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
+    assert isinstance(node, ast.ClassDef)
+    found = []
+    for field, text in zip(node.body, node.body[1:], strict=False):
+        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+            assert isinstance(field.target, ast.Name)
+            whole = " ".join(str(text.value.value).split())
+            unit = UNIT.search(whole)
+            meaning = UNIT.sub("", whole).rstrip(".")
+            found.append(Attribute(field.target.id, unit.group(1) if unit else "", meaning))
+    return found

@@ -1,0 +1,39 @@
+"""Formulas as MathML, written when the site is built: browsers show them without scripts, fonts or a network."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from docutils import nodes
+from latex2mathml.converter import convert
+
+TAG = re.compile(r"\\tag\{([^}]*)\}")
+
+
+def inline(writer: Any, node: nodes.Element) -> None:
+    """Write a formula within a line."""
+    writer.body.append(convert(node.astext()))
+    raise nodes.SkipNode
+
+
+def block(writer: Any, node: nodes.Element) -> None:
+    r"""Write a displayed formula; the number of its ``\tag`` becomes an anchor ``eq-number``."""
+    text = node.astext()
+    tag = TAG.search(text)
+    formula = convert(TAG.sub("", text).strip(), display="block")
+    if tag is None:
+        writer.body.append(f'<div class="equation">{formula}</div>\n')
+    else:
+        number = tag.group(1)
+        writer.body.append(
+            f'<div class="equation" id="eq-{number}">{formula}'
+            f'<a class="equation-number" href="#eq-{number}">({number})</a></div>\n'
+        )
+    raise nodes.SkipNode
+
+
+def setup(app: Any) -> dict[str, bool]:
+    """Register the renderer."""
+    app.add_html_math_renderer("mathml", inline_renderers=(inline, None), block_renderers=(block, None))
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,111 @@
+r"""The nomenclature: symbols follow from the code's names, equations from where the physics page uses them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+from attributes import attributes
+
+from cz_gym import Parameters, Puller, State
+from cz_gym.parameters import describe
+from cz_gym.plant import Disturbance, Inputs
+from cz_gym.slots import INFO_ROWS
+
+PHYSICS = Path(__file__).parents[1] / "physics.md"
+GREEK = frozenset({"alpha", "kappa", "lam", "lambda", "phi", "rho", "sigma", "theta", "Phi"})
+UNLIKE = {
+    "eps": r"\varepsilon",
+    "lam": r"\lambda",
+    "X_b": r"\xi_b",
+    "ring_bias": r"b",
+    "melt": r"m",
+    "ring_offset": r"\delta_{br}",
+    "rho_dH": r"\rho_s \Delta H",
+    "sin_alpha_0": r"\sin\alpha_0",
+    "cos_alpha_0": r"\cos\alpha_0",
+}
+"""Symbols that do not follow from their names."""
+FORMULA = re.compile(r"\$\$(.*?)\\tag\{(\d+)\}", re.DOTALL)
+WITHOUT_SYMBOL = frozenset({"action_clipped", "r_br_measured"})
+
+
+class Row(NamedTuple):
+    """A line of the nomenclature."""
+
+    symbol: str
+    code: str
+    unit: str
+    meaning: str
+    equations: tuple[str, ...]
+    value: str = ""
+    source: str = ""
+
+
+def symbol(name: str) -> str:
+    """The LaTeX of a name: ``rho_l`` is rho with subscript l, ``dT_0`` is Delta T_0, ``T_1_0`` has subscripts 1, 0."""
+    if name in UNLIKE:
+        return UNLIKE[name]
+    letter, *below = name.split("_")
+    delta = r"\Delta " if re.fullmatch(r"d[A-Z]", letter) else ""
+    letter = letter[1:] if delta else letter
+    letter = f"\\{letter}" if letter in GREEK else letter
+    under = ",".join(below)
+    return delta + letter + (f"_{{{under}}}" if len(under) > 1 else f"_{under}" if under else "")
+
+
+def formulas() -> dict[str, str]:
+    """The physics page's numbered formulas."""
+    return {number: text for text, number in FORMULA.findall(PHYSICS.read_text())}
+
+
+def equations(tex: str) -> tuple[str, ...]:
+    """Numbers of the physics page's formulas that hold a symbol."""
+    end = "" if tex.endswith("}") else r"(?![A-Za-z0-9{])"
+    if "_" not in tex:
+        end += r"(?!_)"
+    pattern = re.compile(r"(?<![A-Za-z0-9_\\{,])" + re.escape(tex) + end)
+    return tuple(number for number, text in formulas().items() if pattern.search(text))
+
+
+def _documented(cls: type, without: frozenset[str] = frozenset()) -> list[Row]:
+    return [
+        Row(symbol(name), name, unit, meaning, equations(symbol(name)))
+        for name, unit, meaning in attributes(cls)
+        if name not in without
+    ]
+
+
+def states() -> list[Row]:
+    """The plant's state."""
+    return _documented(State)
+
+
+def inputs() -> list[Row]:
+    """Inputs and disturbances."""
+    return _documented(Inputs) + _documented(Disturbance)
+
+
+def seen() -> list[Row]:
+    """What the step says beside states and inputs, those rows of ``info`` that have a symbol."""
+    known = {*State._fields, *Inputs._fields, *WITHOUT_SYMBOL}
+    return [
+        Row(symbol(name), name, unit, meaning, equations(symbol(name)))
+        for name, unit, meaning in INFO_ROWS
+        if name not in known and not name.startswith("cost_")
+    ]
+
+
+def parameters() -> list[Row]:
+    """What is typed in about a puller and its material."""
+    default = Parameters()
+    return [
+        Row(symbol(name), name, q.unit, q.meaning, equations(symbol(name)), f"{getattr(default, name):.6g}", q.source)
+        for name, q in describe().items()
+    ]
+
+
+def derived() -> list[Row]:
+    """What follows from the parameters at the operating point."""
+    return _documented(Puller, frozenset(Parameters._fields))

@@ -1,0 +1,202 @@
+"""Tables that the site takes from the code: a block ``{generated} name`` stands where one goes."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable
+from typing import Any, ClassVar
+
+import nomenclature
+from attributes import attributes
+from docutils import nodes
+from docutils.parsers.rst import Directive
+from docutils.statemachine import StringList
+
+from cz_gym import SCENARIOS, Scenario
+from cz_gym.evaluation.metrics import Metrics
+from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED, STATE, Channel
+from cz_gym.scenarios import RANDOMIZED
+from cz_gym.slots import INFO_ROWS
+from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
+
+WIDE = ("randomized", "hard", "sensor-fault", "puller")
+READABLE = {
+    "m": (MM, "mm"),
+    "m/s": (MM_PER_MIN, "mm/min"),
+    "m/s2": (MM_PER_MIN / MINUTE, "mm/min²"),
+    "K/s": (1.0 / MINUTE, "K/min"),
+    "W/s": (KILO / MINUTE, "kW/min"),
+    "rev/s": (1.0 / MINUTE, "rev/min"),
+    "s": (1.0, "s"),
+}
+"""Where people read another unit than SI: its size in SI, its name."""
+
+
+def markdown(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
+    """A Markdown table."""
+    lines = [list(head), *map(list, rows)]
+    lines.insert(1, ["---"] * len(lines[0]))
+    return ["| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |" for line in lines] + [""]
+
+
+def code(text: str) -> str:
+    """The text as code."""
+    return f"`{text}`"
+
+
+def channels(listed: Iterable[Channel]) -> list[str]:
+    """A table of observation channels."""
+    rows = (
+        (str(i), code(c.name), c.unit, "$v_0$" if c.name == "v_p" else f"{c.scale:g}", c.meaning)
+        for i, c in enumerate(listed)
+    )
+    return markdown(("index", "name", "unit", "scale", "meaning"), rows)
+
+
+def remembered() -> list[str]:
+    """Where the past samples of "history" stand."""
+    at = {channel.name: i for i, channel in enumerate(HISTORY)}
+    (integral,) = (c for c in HISTORY if c.name == "integral")
+    first = channels([integral])[2].replace("| 0 |", f"| {at['integral']} |", 1)
+    ages = [0.0, *LAGS[:-1]]
+    rows = (
+        (f"{before:g} to {age:g} s", *(str(at[f"{name}_{age:g}s"]) for name in LAGGED))
+        for before, age in zip(ages, LAGS, strict=True)
+    )
+    return [*channels([])[:2], first, "", *markdown(("age of the samples", *map(code, LAGGED)), rows)]
+
+
+def info() -> list[str]:
+    """The keys of ``info``."""
+    return markdown(("key", "unit", "meaning"), ((code(row.name), row.unit, row.meaning) for row in INFO_ROWS))
+
+
+def readable(value: Any, unit: str) -> str:
+    """A scenario's number, or range, in the unit that people read."""
+    size, name = READABLE.get(unit, (1.0, "" if unit == "-" else unit))
+    if unit == "s" and max(value if isinstance(value, tuple) else (value,)) >= 5 * MINUTE:
+        size, name = MINUTE, "min"
+    parts = [f"{part / size:.4g}" if math.isfinite(part) else "∞" for part in _pair(value)]
+    low, high = parts
+    if low == high:
+        return f"{low} {name}".strip()
+    between = f"±{high}" if low == f"-{high}" else f"{low} … {high}"
+    return f"{between} {name}".strip()
+
+
+def _pair(value: Any) -> tuple[float, float]:
+    return value if isinstance(value, tuple) else (value, value)
+
+
+def scenario_table(shown: Iterable[str]) -> list[str]:
+    """Scenarios as columns, one line for each number in which any of them departs from the default."""
+    columns = [SCENARIOS[name] for name in shown]
+    rows = []
+    for family in dataclasses.fields(Scenario)[1:]:
+        values = [getattr(scenario, family.name) for scenario in columns]
+        absent = type(values[0])()
+        present = [value != absent for value in values]
+        for name, unit, meaning in attributes(type(absent)):
+            cells = [getattr(value, name) for value in values]
+            if any(cell != getattr(absent, name) for cell in cells) and any(present):
+                written = [readable(cell, unit) if cell != getattr(absent, name) else "–" for cell in cells]
+                rows.append((f"{code(f'{family.name}.{name}')} {meaning}", *written))
+    return markdown(("", *(code(scenario.name) for scenario in columns)), rows)
+
+
+def plain_scenarios() -> list[str]:
+    """The scenarios in which every draw is the same."""
+    return scenario_table(name for name, scenario in SCENARIOS.items() if scenario.deterministic)
+
+
+def single_scenarios() -> list[str]:
+    """The scenarios with one of randomized's families, and which it is."""
+    rows = []
+    for name, scenario in SCENARIOS.items():
+        alone = [f.name for f in dataclasses.fields(scenario)[1:] if getattr(scenario, f.name) != f.default_factory()]
+        if name not in WIDE and not scenario.deterministic:
+            (family,) = alone
+            assert getattr(scenario, family) == getattr(RANDOMIZED, family)
+            rows.append((code(name), code(family)))
+    return markdown(("scenario", "family"), rows)
+
+
+def families() -> list[str]:
+    """Every member of every family, with unit and default."""
+    rows = []
+    for family in dataclasses.fields(Scenario)[1:]:
+        absent = family.default_factory()  # type: ignore[misc]
+        for name, unit, meaning in attributes(type(absent)):
+            default = getattr(absent, name)
+            shown = f"{default:g}" if not isinstance(default, tuple) else f"({default[0]:g}, {default[1]:g})"
+            rows.append((code(f"{type(absent).__name__}.{name}"), unit, shown, meaning))
+    return markdown(("member", "unit", "default", "meaning"), rows)
+
+
+def symbols(rows: Iterable[nomenclature.Row]) -> list[str]:
+    """A part of the nomenclature."""
+    listed = list(rows)
+    typed = any(row.value for row in listed)
+    head = (
+        "symbol",
+        "code",
+        *(("value",) if typed else ()),
+        "unit",
+        "meaning",
+        "equation",
+        *(("source",) if typed else ()),
+    )
+    lines = []
+    for row in listed:
+        where = ", ".join(f'<a href="physics.html#eq-{n}">({n})</a>' for n in row.equations) or "–"
+        value, source = ((row.value,), (row.source,)) if typed else ((), ())
+        lines.append((f"${row.symbol}$", code(row.code), *value, row.unit, row.meaning, where, *source))
+    return markdown(head, lines)
+
+
+def metrics() -> list[str]:
+    """The benchmark's metrics."""
+    return markdown(
+        ("metric", "unit", "meaning"), ((code(a.name.rstrip("_")), a.unit, a.meaning) for a in attributes(Metrics))
+    )
+
+
+TABLES: dict[str, Callable[[], list[str]]] = {
+    "measured": lambda: channels(MEASURED),
+    "history": remembered,
+    "state": lambda: channels(STATE),
+    "info": info,
+    "scenarios": lambda: scenario_table(WIDE),
+    "plain-scenarios": plain_scenarios,
+    "single-scenarios": single_scenarios,
+    "families": families,
+    "states": lambda: symbols(nomenclature.states()),
+    "inputs": lambda: symbols(nomenclature.inputs()),
+    "seen": lambda: symbols(nomenclature.seen()),
+    "parameters": lambda: symbols(nomenclature.parameters()),
+    "derived": lambda: symbols(nomenclature.derived()),
+}
+"""Every table, by the name a page asks for it with."""
+
+
+class Generated(Directive):
+    """Stands for a table of :data:`TABLES`."""
+
+    required_arguments = 1
+    has_content: ClassVar[bool] = False
+
+    def run(self) -> list[nodes.Node]:
+        """Parse the table where it stands."""
+        name = self.arguments[0]
+        if name not in TABLES:
+            raise self.error(f"no table {name!r}; there are {', '.join(TABLES)}")
+        box = nodes.container()
+        self.state.nested_parse(StringList(TABLES[name](), source=f"table {name}"), self.content_offset, box)
+        return box.children
+
+
+def setup(app: Any) -> dict[str, bool]:
+    """Register the block."""
+    app.add_directive("generated", Generated)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,57 @@
+"""Settings of the documentation site: ``make docs`` builds it with warnings as errors, offline.
+
+The source folder is the repository, so that README, docs and results link to each other by their own paths.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from pathlib import Path
+
+import cz_gym
+
+sys.path.insert(0, str(Path(__file__).parent / "_ext"))
+
+project = "Cz-v0"
+author = "The Cz-v0 developers"
+copyright = author
+version = release = cz_gym.__version__
+language = "en"
+
+root_doc = "docs/index"
+include_patterns = ["README.md", "CHANGELOG.md", "docs/**.md", "results/**.md"]
+exclude_patterns = [".*", "build", "dist", "runs", "results/cache", "docs/_*", "**/.*", "**/node_modules"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "mathml", "tables", "names", "pages"]
+nitpicky = True
+nitpick_ignore = [
+    ("py:class", "cz_gym.batch.SlotState"),
+    ("py:class", "cz_gym.baselines.compensated_pid.Memory"),
+    ("py:func", "make_config"),
+]
+nitpick_ignore_regex = [
+    # Other projects' names; their inventories would have to be fetched.
+    (r"py:.*", r"(numpy|np|npt|gymnasium|gym|collections|typing|pathlib|ndarray|optional|Callable|Any|Floats)\b.*"),
+    (r"py:.*", r"(int|float|str|bool|dict|list|tuple|array|Array|Mask|Mapping|Sequence|Path)\b.*"),
+]
+
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 4
+myst_dmath_double_inline = False
+highlight_language = "text"
+html_math_renderer = "mathml"
+
+autodoc_default_options = {"members": True, "member-order": "bysource", "undoc-members": True}
+autodoc_typehints = "signature"
+autodoc_preserve_defaults = True
+python_use_unqualified_type_names = True
+python_maximum_signature_line_length = 100
+
+html_theme = "furo"
+html_title = f"Cz-v0 {release}"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_extra_path = ["_root"]
+html_copy_source = False
+html_show_sphinx = False
+html_theme_options = {"navigation_with_keys": True}
