@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +28,13 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--scenario", default="randomized", help="scenario to train on (default: %(default)s)")
     parser.add_argument("--out", type=Path, help="run folder (default: runs/<algo>-seed<seed>)")
     parser.add_argument("--resume", action="store_true", help="go on from the run folder's checkpoint")
+    parser.add_argument(
+        "--checkpoint-seconds",
+        type=_seconds,
+        default=60.0,
+        metavar="S",
+        help="time between checkpoints, the most that an interruption loses (default: %(default)g)",
+    )
     arguments = parser.parse_args(argv)
     arguments.out = arguments.out or Path("runs") / f"{arguments.algo}-seed{arguments.seed}"
     return arguments
@@ -55,6 +63,7 @@ def train(arguments: argparse.Namespace) -> int:
     from agents import settings
     from agents.run import Run, saved_steps
     from baselines import CompensatedPID
+    from cz_gym.evaluation.whole import check_writable
     from cz_gym.scenarios import find_scenario
 
     find_scenario(arguments.scenario)
@@ -66,7 +75,8 @@ def train(arguments: argparse.Namespace) -> int:
     steps = arguments.steps or (saved_steps(folder) if arguments.resume else choice.steps)
     choice = replace(choice, steps=steps)
     paper = CompensatedPID(choice.recipe.control_interval)
-    run = Run(folder, choice, arguments.seed, paper, arguments.resume)
+    check_writable(folder)
+    run = Run(folder, choice, arguments.seed, paper, arguments.resume, arguments.checkpoint_seconds)
     print(f"{arguments.algo}, seed {arguments.seed}, {choice.steps:,} steps on {arguments.scenario!r}, into {folder}")
     with tqdm(total=choice.steps, unit="step", unit_scale=True, dynamic_ncols=True, mininterval=1.0) as bar:
         try:
@@ -97,6 +107,16 @@ def _whole(least: int):  # type: ignore[no-untyped-def]
         return value
 
     return read
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"must be a number of at least 0, not {text!r}")
+    return value
 
 
 def _one_line(error: Exception) -> str:

@@ -5,16 +5,25 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
+import stat
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from cz_gym.evaluation.files import write_files
+from cz_gym.evaluation.whole import write_files
+from cz_gym.observation import CLIP, OBSERVATIONS
 
 FORMAT = "cz-gym-agent"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 MAX_BYTES = 4_000_000
 """Largest agent file that is read."""
+MAX_JSON_BYTES = 1_000_000
+"""Largest JSON file that is read."""
+MAX_TEXT = 80
+"""Longest text in a contract."""
+MAX_WHOLE = 2**63 - 1
+"""Largest whole number in a contract."""
 
 
 class AgentFileError(ValueError):
@@ -29,6 +38,8 @@ class Contract:
     """Observation mode it reads."""
     channels: int
     """Length of that observation."""
+    observation_hash: str
+    """Hash of that observation's channels: names, units and scales in their order."""
     control_interval: float
     """Time between actions it was trained at [s]."""
     plant_hash: str
@@ -49,56 +60,97 @@ class Contract:
     """Hash of the ONNX file."""
 
 
-def write_agent(path: Path, onnx_bytes: bytes, **facts: Any) -> Contract:
-    """Write ``path`` (.onnx) and its contract (.json), each whole or not at all; ``facts`` are Contract's fields."""
-    contract = Contract(**facts, sha256=hashlib.sha256(onnx_bytes).hexdigest())
+def observation_hash(name: str) -> str:
+    """Hash of an observation mode's channels (16 hex digits); their explanations do not count."""
+    channels = [(channel.name, channel.unit, channel.scale) for channel in OBSERVATIONS[name]]
+    return hashlib.sha256(json.dumps([channels, CLIP]).encode()).hexdigest()[:16]
+
+
+def make_contract(onnx_bytes: bytes, **facts: Any) -> Contract:
+    """The contract of an ONNX file; ``facts`` are Contract's fields without the hashes of observation and file."""
+    digest = hashlib.sha256(onnx_bytes).hexdigest()
+    return Contract(**facts, observation_hash=observation_hash(facts["observation"]), sha256=digest)
+
+
+def agent_files(path: Path, onnx_bytes: bytes, contract: Contract) -> dict[Path, bytes]:
+    """The contents of ``path`` (.onnx) and of its contract (.json)."""
     text = json.dumps({"format": FORMAT, "format_version": FORMAT_VERSION, **asdict(contract)}, indent=2) + "\n"
-    write_files({path: onnx_bytes, path.with_suffix(".json"): text.encode()})
+    return {path: onnx_bytes, path.with_suffix(".json"): text.encode()}
+
+
+def write_agent(path: Path, onnx_bytes: bytes, **facts: Any) -> Contract:
+    """Write an agent file with its contract, both or none; ``facts`` as for :func:`make_contract`."""
+    contract = make_contract(onnx_bytes, **facts)
+    write_files(agent_files(path, onnx_bytes, contract))
     return contract
 
 
 def read_agent(path: Path) -> tuple[Contract, bytes]:
     """The contract and the ONNX bytes of an agent file; AgentFileError with the reason if anything is wrong."""
-    onnx_bytes = _read(path)
-    contract = _parse(path.with_suffix(".json"), _read(path.with_suffix(".json")))
+    onnx_bytes = read_bounded(path, MAX_BYTES)
+    contract = _parse(path.with_suffix(".json"))
     if hashlib.sha256(onnx_bytes).hexdigest() != contract.sha256:
         raise AgentFileError(f"{path}: not the file its contract was written for (SHA-256 differs)")
     return contract, onnx_bytes
 
 
-def _read(path: Path) -> bytes:
+def read_bounded(path: Path, limit: int) -> bytes:
+    """The contents of a regular file of at most ``limit`` bytes; AgentFileError otherwise, and for pipes and devices."""
     try:
-        with path.open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
+        # Without O_NONBLOCK, opening a pipe would wait for somebody to write into it.
+        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise AgentFileError(f"{path}: not a regular file")
+            content = file.read(limit + 1)
     except FileNotFoundError:
         raise AgentFileError(f"{path}: no such file") from None
     except OSError as error:
         raise AgentFileError(f"{path}: cannot be read ({error.strerror})") from None
-    if len(content) > MAX_BYTES:
-        raise AgentFileError(f"{path}: larger than {MAX_BYTES} bytes")
+    except ValueError as error:
+        # AgentFileError is one; the other is a name that no file can have.
+        raise error if isinstance(error, AgentFileError) else AgentFileError(f"{path!r}: {error}") from None
+    if len(content) > limit:
+        raise AgentFileError(f"{path}: larger than {limit} bytes")
     return content
 
 
-def _parse(path: Path, content: bytes) -> Contract:
+def read_json(path: Path) -> Any:
+    """What a JSON file of bounded size says; AgentFileError if it is none."""
+    content = read_bounded(path, MAX_JSON_BYTES)
     try:
-        data = json.loads(content)
+        return json.loads(content)
     except (ValueError, RecursionError):
         raise AgentFileError(f"{path}: not JSON") from None
+
+
+def _parse(path: Path) -> Contract:
+    data = read_json(path)
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise AgentFileError(f"{path}: not a {FORMAT} contract")
     if data.get("format_version") != FORMAT_VERSION:
-        raise AgentFileError(
-            f"{path}: format version {data.get('format_version')!r}, this release reads {FORMAT_VERSION}"
-        )
-    wanted = {field.name: field.type for field in fields(Contract)}
+        version = data.get("format_version")
+        raise AgentFileError(f"{path}: format version {version!r:.80}, this release reads {FORMAT_VERSION}")
+    wanted = {field.name: str(field.type) for field in fields(Contract)}
     given = {name: value for name, value in data.items() if name not in ("format", "format_version")}
     if set(given) != set(wanted):
         odd = sorted(set(given) ^ set(wanted))[0]
-        raise AgentFileError(f"{path}: field {odd!r} is {'missing' if odd in wanted else 'unknown'}")
-    kinds: dict[str, tuple[type, ...]] = {"str": (str,), "int": (int,), "float": (int, float)}
+        raise AgentFileError(f"{path}: field {odd!r:.80} is {'missing' if odd in wanted else 'unknown'}")
     for name, value in given.items():
-        if not isinstance(value, kinds[str(wanted[name])]) or isinstance(value, bool):
-            raise AgentFileError(f"{path}: field {name!r} must be {wanted[name]}, not {value!r:.80}")
-        if isinstance(value, float) and not math.isfinite(value):
-            raise AgentFileError(f"{path}: field {name!r} must be finite, not {value!r}")
+        if wrong := _wrong(wanted[name], value):
+            raise AgentFileError(f"{path}: field {name!r} must be {wrong}, not {value!r:.80}")
     return Contract(**given)
+
+
+def _wrong(kind: str, value: Any) -> str | None:
+    """What a value of this kind must be, if this one is not."""
+    kinds: dict[str, tuple[type, ...]] = {"str": (str,), "int": (int,), "float": (int, float)}
+    if not isinstance(value, kinds[kind]) or isinstance(value, bool):
+        return kind
+    if isinstance(value, str):
+        plain = 0 < len(value) <= MAX_TEXT and value.isprintable()
+        return None if plain else f"printable text of 1 to {MAX_TEXT} characters"
+    if isinstance(value, int):
+        return None if 0 <= value <= MAX_WHOLE else f"between 0 and {MAX_WHOLE}"
+    if not math.isfinite(value):
+        return "finite"
+    return None if value >= 0.0 else "at least 0"

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from cz_gym.config import Config
 from cz_gym.observation import OBSERVATIONS
 
-from .contract import AgentFileError, Contract, read_agent
+from .contract import AgentFileError, Contract, observation_hash, read_agent
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,13 @@ class OnnxPolicy:
         that says why a file is refused. Nothing in the file is executed but its tensor operations.
         """
         path = Path(path)
-        contract, onnx_bytes = read_agent(path)
+        return cls.of(*read_agent(path), config, path)
+
+    @classmethod
+    def of(
+        cls, contract: Contract, onnx_bytes: bytes, config: Config | None = None, path: str | Path = "agent"
+    ) -> OnnxPolicy:
+        """An agent of what its files say; ``path`` names it in errors."""
         if contract.observation not in OBSERVATIONS:
             raise AgentFileError(
                 f"{path}: reads observation {contract.observation!r}, which this release does not have"
@@ -39,6 +45,10 @@ class OnnxPolicy:
         if contract.channels != expected:
             raise AgentFileError(
                 f"{path}: reads {contract.channels} channels, this release's {contract.observation!r} has {expected}"
+            )
+        if contract.observation_hash != observation_hash(contract.observation):
+            raise AgentFileError(
+                f"{path}: reads observation {contract.observation!r} with other channels or scales than this release's"
             )
         if config is not None and config.plant_hash != contract.plant_hash:
             raise AgentFileError(
@@ -79,7 +89,7 @@ class OnnxPolicy:
         return found
 
 
-def _session(path: Path, onnx_bytes: bytes, channels: int) -> Any:
+def _session(path: str | Path, onnx_bytes: bytes, channels: int) -> Any:
     try:
         import onnxruntime
     except ImportError:

@@ -17,24 +17,35 @@ from typing import Any
 
 import cz_gym
 from cz_gym.config import Config, make_config
-from cz_gym.evaluation.files import write_files
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
+from cz_gym.evaluation.whole import finish_writing, write_files
 
 from . import settings
 from .callbacks import Every, Tell
-from .checkpoint import load_checkpoint, restore, save_checkpoint
-from .contract import AgentFileError, write_agent
+from .checkpoint import load_checkpoint, restore, to_bytes
+from .contract import MAX_JSON_BYTES, AgentFileError, agent_files, make_contract, read_bounded, read_json
 from .export import actor_of, to_onnx
 from .onnx_policy import OnnxPolicy
 from .training import Training, make_training
 
 QUICK, FULL = 64, 200
 """Validation episodes while learning, and at the end."""
+CHECKPOINT = "checkpoint.safetensors"
 CHECKPOINT_SECONDS = 60.0
+"""Longest time between checkpoints, but for a validation or an update in between [s]."""
 VALIDATE_EVERY = 200_000
 """Fewest steps between validations."""
+COLUMNS = (
+    "steps",
+    "seconds",
+    "validation_rmse_mm",
+    "paper_rmse_mm",
+    "pull_step_rms_mm_per_min",
+    "failure_rate",
+)
+"""Columns of ``progress.csv``."""
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "stable-baselines3", "torch", "onnx", "onnxruntime")
 
 
@@ -49,7 +60,9 @@ class Run:
     """One training run.
 
     ``rival``, a policy on "measured" observations, runs the same validation episodes and is shown beside the agent;
-    ``resume`` goes on from the folder's checkpoint. Raises AgentFileError if the folder cannot be used.
+    ``resume`` goes on from the folder's checkpoint, saved anew every ``checkpoint_seconds``. Checkpoint, progress and
+    best agent are replaced together, so that they agree whenever a run is killed. Raises AgentFileError if the folder
+    cannot be used.
     """
 
     def __init__(
@@ -59,8 +72,10 @@ class Run:
         seed: int,
         rival: Any,
         resume: bool = False,
+        checkpoint_seconds: float = CHECKPOINT_SECONDS,
     ) -> None:
         self.folder, self.choice, self.seed, self.rival = folder, choice, seed, rival
+        self.checkpoint_seconds = checkpoint_seconds
         recipe = choice.recipe
         self.config = make_config(
             recipe.scenario, observation=recipe.observation, control_interval=recipe.control_interval
@@ -70,37 +85,42 @@ class Run:
         self.rows: list[dict[str, Any]] = []
         self.sessions: list[dict[str, Any]] = []
         self.began = time.monotonic()
-        checkpoint = None
-        if resume:
-            self.sessions = self._check_settings()
-            checkpoint = load_checkpoint(folder / "checkpoint.pt")
-            self.best = checkpoint.best_rmse_mm
-            self.rows = _read_rows(folder / "progress.csv")
-            self.began -= float(self.rows[-1]["seconds"]) if self.rows else 0.0
-        done = checkpoint.steps if checkpoint else 0
-        self.training: Training = make_training(choice, seed, str(folder / "tensorboard"), done)
-        if checkpoint:
-            restore(self.training.learner, checkpoint, folder / "checkpoint.pt")
-        else:
+        self.unsaved: dict[Path, bytes] = {}
+        if not resume:
+            self.training: Training = make_training(choice, seed, str(folder / "tensorboard"))
             self.save()
-        self._write_settings(done)
+            self._write_settings(0)
+            return
+        if folder.is_dir():
+            finish_writing(folder)
+        self.sessions = self._check_settings()
+        progress, tensors = load_checkpoint(folder / CHECKPOINT)
+        self.began -= progress.seconds
+        self.rows = _read_rows(folder / "progress.csv")
+        if progress.best_rmse_mm is not None and _usable(folder / "agent.onnx", self.config):
+            self.best = progress.best_rmse_mm
+        self.training = make_training(choice, seed, str(folder / "tensorboard"), progress.steps)
+        restore(self.training.learner, progress, tensors, folder / CHECKPOINT)
+        self._write_settings(progress.steps)
 
     def learn(self, bar: Any) -> None:
         """Learn to the end, validating and saving on the way; the bar counts environment steps."""
         learner = self.training.learner
         bar.update(learner.num_timesteps - bar.n)
         validate = Every(max(self.choice.steps // 24, VALIDATE_EVERY), None, lambda: self._validate(bar))
-        checkpoint = Every(None, CHECKPOINT_SECONDS, self.save)
+        checkpoint = Every(None, self.checkpoint_seconds, self.save)
         callbacks = [*self.training.callbacks, Tell(bar), validate, checkpoint]
         left = self.choice.steps - learner.num_timesteps
         if left > 0:
             learner.learn(left, callback=callbacks, reset_num_timesteps=False, tb_log_name="run")
         self._validate(bar)
-        self.save()
 
     def save(self) -> None:
-        """Write a checkpoint."""
-        save_checkpoint(self.folder / "checkpoint.pt", self.training.learner, self.best)
+        """Write a checkpoint, and with it what a validation left to be written."""
+        best = self.best if math.isfinite(self.best) else None
+        content = to_bytes(self.training.learner, time.monotonic() - self.began, best)
+        write_files({**self.unsaved, self.folder / CHECKPOINT: content})
+        self.unsaved = {}
 
     def finish(self) -> dict[str, float]:
         """Validate the best agent on more episodes and write ``summary.json``; its contents."""
@@ -126,25 +146,18 @@ class Run:
         """Export the actor as it stands, run the file itself on validation, keep it if it is the best."""
         learner = self.training.learner
         content = to_onnx(actor_of(learner))
-        candidate = self.folder / "candidate.onnx"
-        facts = self._facts(learner.num_timesteps, math.inf)
-        write_agent(candidate, content, **{**facts, "validation_rmse_mm": 0.0})
-        rmse, activity, failures = validation_rmse(OnnxPolicy.load(candidate, self.config), self.config, QUICK)
+        candidate = make_contract(content, **self._facts(learner.num_timesteps, 0.0))
+        policy = OnnxPolicy.of(candidate, content, self.config)
+        rmse, activity, failures = validation_rmse(policy, self.config, QUICK)
         if rmse < self.best:
             self.best = rmse
-            write_agent(self.folder / "agent.onnx", content, **self._facts(learner.num_timesteps, rmse))
-        for leftover in (candidate, candidate.with_suffix(".json")):
-            leftover.unlink(missing_ok=True)
-        row = {
-            "steps": learner.num_timesteps,
-            "seconds": round(time.monotonic() - self.began, 1),
-            "validation_rmse_mm": rmse,
-            "paper_rmse_mm": self.rival_rmse_mm,
-            "pull_step_rms_mm_per_min": activity,
-            "failure_rate": failures,
-        }
-        self.rows.append(row)
-        _write_rows(self.folder / "progress.csv", self.rows)
+            contract = dataclasses.replace(candidate, validation_rmse_mm=rmse)
+            self.unsaved |= agent_files(self.folder / "agent.onnx", content, contract)
+        seconds = round(time.monotonic() - self.began, 1)
+        row = (learner.num_timesteps, seconds, rmse, self.rival_rmse_mm, activity, failures)
+        self.rows.append(dict(zip(COLUMNS, row, strict=True)))
+        self.unsaved[self.folder / "progress.csv"] = _csv(self.rows)
+        self.save()
         learner.logger.record("validation/rmse_mm", rmse)
         learner.logger.record("validation/pull_step_rms_mm_per_min", activity)
         learner.logger.record("validation/failure_rate", failures)
@@ -204,12 +217,22 @@ def saved_steps(folder: Path) -> int:
 
 def _read_settings(path: Path) -> dict[str, Any]:
     try:
-        saved = json.loads(path.read_text())
-    except (OSError, ValueError):
+        saved = read_json(path)
+    except AgentFileError:
         saved = None
-    if not isinstance(saved, dict) or not isinstance(saved.get("steps"), int) or not saved.get("sessions"):
+    steps, sessions = (saved.get("steps"), saved.get("sessions")) if isinstance(saved, dict) else (None, None)
+    whole = type(steps) is int and 0 < steps < 2**63 and isinstance(sessions, list)
+    if not whole or not sessions or not all(isinstance(session, dict) for session in sessions):
         raise AgentFileError(f"{path}: missing or damaged, so there is nothing to resume")
-    return saved
+    return dict(saved)
+
+
+def _usable(path: Path, config: Config) -> bool:
+    try:
+        OnnxPolicy.load(path, config)
+    except AgentFileError:
+        return False
+    return True
 
 
 def _git_commit() -> str | None:
@@ -233,17 +256,23 @@ def _write_json(path: Path, content: Any) -> None:
     write_files({path: (json.dumps(content, indent=2) + "\n").encode()})
 
 
-def _write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
+def _csv(rows: list[dict[str, Any]]) -> bytes:
     text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(rows[0]))
+    writer = csv.DictWriter(text, fieldnames=COLUMNS)
     writer.writeheader()
     writer.writerows(rows)
-    write_files({path: text.getvalue().encode()})
+    return text.getvalue().encode()
 
 
 def _read_rows(path: Path) -> list[dict[str, Any]]:
-    try:
-        with path.open(newline="") as file:
-            return list(csv.DictReader(file))
-    except OSError:
+    """The validations before this session; AgentFileError if the file is not one that a run wrote."""
+    if not path.exists():
         return []
+    try:
+        rows = list(csv.DictReader(io.StringIO(read_bounded(path, MAX_JSON_BYTES).decode(), newline="")))
+        for row in rows:
+            if list(row) != list(COLUMNS) or not all(math.isfinite(float(value)) for value in row.values()):
+                raise ValueError("a row is not one of numbers")
+    except (ValueError, TypeError, csv.Error):
+        raise AgentFileError(f"{path}: damaged; without it the run can be resumed") from None
+    return rows

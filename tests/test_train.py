@@ -59,7 +59,7 @@ def test_an_interrupted_run_keeps_its_checkpoint(
     monkeypatch.setattr(run.Run, "_validate", interrupt)
     folder = tmp_path / "run"
     assert train.main(["--steps", "10000", "--out", str(folder)]) == 130
-    assert (folder / "checkpoint.pt").exists()
+    assert (folder / "checkpoint.safetensors").exists()
     assert "--resume" in capsys.readouterr().err
 
 
