@@ -5,12 +5,13 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 TEST_READY := $(VENV)/.ready-test
 BENCHMARK_READY := $(VENV)/.ready-benchmark
+BROWSER_READY := $(VENV)/.ready-browser
 
-.PHONY: help venv lint types test benchmark paper clean
+.PHONY: help venv lint types test test-browser benchmark paper clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
-	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 12
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
 
 venv: $(TEST_READY) ## virtual environment with everything: agents, benchmark, tests
 
@@ -23,6 +24,9 @@ types: $(TEST_READY) ## strict types
 
 test: lint types ## lint, types and tests
 	$(BIN)/python -m pytest -q --numprocesses auto --dist loadfile
+
+test-browser: $(BROWSER_READY) ## report.html in Chromium without a window; skipped where chromium or chromedriver is absent
+	$(BIN)/python -m pytest -q tests/browser
 
 benchmark: $(BENCHMARK_READY) ## the shipped agent and the classical controllers on the same crystals
 	$(BIN)/python benchmark.py
@@ -46,3 +50,7 @@ $(TEST_READY): pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) torch
 	$(PIP) --editable ".[test]"
 	touch $(BENCHMARK_READY) $@
+
+$(BROWSER_READY): $(TEST_READY)
+	$(PIP) --editable ".[test,browser]"
+	touch $@

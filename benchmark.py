@@ -97,6 +97,7 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
     check_targets(arguments, partial)
     if arguments.out is not None:
         import matplotlib  # noqa: F401  (missing? say so before the work, not after it)
+        import plotly  # noqa: F401
     with Progress(plan.steps, arguments.quiet) as progress:
         done = run(plan, progress)
     write(arguments.out, arguments.json, done, quote=not partial)
@@ -274,12 +275,14 @@ def write(folder: Path | None, lone: Path | None, done: Benchmark, quote: bool) 
     files = {lone: text} if lone else {}
     if folder:
         from cz_gym.evaluation.figures import draw_figures
+        from cz_gym.evaluation.page import page
         from cz_gym.evaluation.report import fill_in, markdown
 
         figures = draw_figures(done)
         files |= {folder / name: image for name, image in figures.items()}
         files[folder / "episodes.csv"] = to_csv(done).encode()
         files[folder / "report.md"] = markdown(done, figures).encode()
+        files[folder / "report.html"] = page(done).encode()
         files[folder / RESULTS] = text
         if quote and folder.resolve() == FOLDER and README.is_file():
             files[README] = fill_in(README.read_text("utf-8"), done).encode()

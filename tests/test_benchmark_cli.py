@@ -25,7 +25,7 @@ from cz_gym.evaluation.protocol import ROWS, TEST_SEEDS, find_row
 from cz_gym.observation import MEASURED, OBSERVATIONS
 
 ALL_METRICS = {*metric_names(), "microseconds_per_step"}
-FILES = ["benchmark.json", "crystal.png", "episodes.csv", "errors.png", "pareto.png", "report.md"]
+FILES = ["benchmark.json", "crystal.png", "episodes.csv", "errors.png", "pareto.png", "report.html", "report.md"]
 SMALL = ["--episodes", "3", "--scenarios", "randomized,reference-b", "--controllers", "open-loop,paper"]
 
 
@@ -338,7 +338,7 @@ def test_files_are_written_all_or_none(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 @pytest.mark.usefixtures("no_work")
-@pytest.mark.parametrize("package", ["matplotlib", "tqdm"])
+@pytest.mark.parametrize("package", ["matplotlib", "plotly", "tqdm"])
 def test_a_missing_extra_is_named(
     package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -372,7 +372,7 @@ def test_the_benchmark_needs_neither_torch_nor_stable_baselines3(tmp_path: Path)
         "import sys\n"
         "class Absent:\n"
         "    def find_spec(self, name, path=None, target=None):\n"
-        "        if name.split('.')[0] in ('torch', 'stable_baselines3', 'onnx'):\n"
+        "        if name.split('.')[0] in ('torch', 'stable_baselines3'):\n"
         "            raise ModuleNotFoundError(f'No module named {name!r}', name=name)\n"
         "sys.meta_path.insert(0, Absent())\n"
         f"import benchmark; sys.exit(benchmark.main({arguments!r}))"

@@ -63,7 +63,7 @@ def test_environment_and_baselines_need_neither_torch_nor_plots(tmp_path: Path) 
 def test_core_dependencies_are_four() -> None:
     names = [requirement.partition(">")[0] for requirement in PROJECT["dependencies"]]
     assert names == ["gymnasium", "numpy", "scipy", "numba"]
-    assert set(PROJECT["optional-dependencies"]) == {"benchmark", "agents", "render", "mpc", "peers", "test"}
+    assert set(PROJECT["optional-dependencies"]) == {"benchmark", "agents", "render", "mpc", "peers", "browser", "test"}
 
 
 def test_version_stands_once() -> None:

@@ -113,6 +113,20 @@ def test_a_damaged_file_is_run_again(tmp_path: Path, counted: list[int]) -> None
     assert counted == [0, 1, 1]
 
 
+def test_signals_are_kept_of_the_first_episodes_alone(
+    tmp_path: Path, counted: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    direct = rollout(OpenLoop(), CONFIG, SEEDS)
+    for examples in (1, 3, 2):
+        monkeypatch.setattr(kept, "EXAMPLES", examples)
+        found = sample(tmp_path)
+        assert len(found.examples) == examples
+        for i, shown in enumerate(found.examples):
+            np.testing.assert_array_equal(shown.r_c, direct.signals.r_c[:, i])
+    # Asked for more signals, episodes that were kept without them run again; asked for fewer, none does.
+    assert counted == [0, 1, 2, 3, 4, 1, 2]
+
+
 def test_code_counts_and_text_does_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     module = tmp_path / "thing.py"
     monkeypatch.setattr("baselines.fingerprint.__file__", str(tmp_path / "fingerprint.py"))
@@ -129,7 +143,7 @@ def made(name: str, errors: list[float], **facts: Any) -> Sample:
     values = np.zeros((1, len(errors), len(metric_names())))
     values[0, :, 0] = errors
     signals = Signals(*(np.zeros(3) for _ in Signals._fields))
-    return Sample(Controller(name, "measured", "", **facts), tuple(range(len(errors))), values, 1.0, signals, 5.0)
+    return Sample(Controller(name, "measured", "", **facts), tuple(range(len(errors))), values, 1.0, (signals,), 5.0)
 
 
 def test_the_gap_is_zero_at_the_bound_one_at_the_reference_and_counts_squares() -> None:

@@ -21,7 +21,7 @@ from .whole import write_files as write_files
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime", "casadi")
 """Packages whose versions are recorded."""
 RESULTS = "benchmark.json"
-FILES = (RESULTS, "episodes.csv", "report.md", "crystal.png", "errors.png", "pareto.png")
+FILES = (RESULTS, "episodes.csv", "report.md", "report.html", "crystal.png", "errors.png", "pareto.png")
 """Everything a folder of results may hold."""
 
 

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from ..config import Config
 from .files import write_files
 from .metrics import metric_names, metrics
-from .results import Controller, Sample
+from .results import EXAMPLES, Controller, Sample
 from .rollout import Rollout, Signals, rollout
 
 Floats = npt.NDArray[np.float64]
@@ -53,7 +53,7 @@ class Kept(NamedTuple):
     microseconds: float
     """Time in the policy per step [us]."""
     signals: Floats
-    """Signals of the first episode, shape (signals, steps); of the others empty."""
+    """Signals of one of the first episodes, shape (signals, steps); of the others empty."""
 
 
 def slow_sample(
@@ -66,19 +66,20 @@ def slow_sample(
 ) -> Sample:
     """The sample of a slow controller; episodes already in ``folder`` are read, the others run and written there."""
     folder = folder / f"{controller.name}-{config.scenario.name}-{key(controller.name, policy, config)}"
-    kept = {seed: found for seed in seeds if (found := read(folder / f"{seed}.npz", seed == seeds[0])) is not None}
+    shown = seeds[:EXAMPLES]
+    kept = {seed: found for seed in seeds if (found := read(folder / f"{seed}.npz", seed in shown)) is not None}
     progress(config.steps * len(kept))
     missing = [seed for seed in seeds if seed not in kept]
     for first in range(0, len(missing), BLOCK):
         block = missing[first : first + BLOCK]
-        new = dict(zip(block, _kept(rollout(policy, config, block, progress), seeds[0]), strict=True))
+        new = dict(zip(block, _kept(rollout(policy, config, block, progress), shown), strict=True))
         write_files({folder / f"{seed}.npz": _written(episode) for seed, episode in new.items()})
         kept |= new
     ordered = [kept[seed] for seed in seeds]
     values = np.array([[episode.values for episode in ordered]])
     microseconds = float(np.mean([episode.microseconds for episode in ordered]))
-    example = Signals(*ordered[0].signals)
-    return Sample(controller, tuple(seeds), values, microseconds, example, config.control_interval)
+    examples = tuple(Signals(*episode.signals) for episode in ordered[: len(shown)])
+    return Sample(controller, tuple(seeds), values, microseconds, examples, config.control_interval)
 
 
 def key(name: str, policy: SlowPolicy, config: Config) -> str:
@@ -92,22 +93,21 @@ def key(name: str, policy: SlowPolicy, config: Config) -> str:
 
 
 def read(path: Path, example: bool) -> Kept | None:
-    """A kept episode, with its signals if it is the ``example``; None if there is none that can be used."""
+    """A kept episode, with its signals if it is an ``example``; None if there is none that can be used."""
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as data:
             found = Kept(data["values"], float(data["microseconds"]), data["signals"])
     except (OSError, ValueError, KeyError, zipfile.BadZipFile):
         return None
-    whole = found.values.shape == (len(metric_names()),) and (len(found.signals) == len(Signals._fields) or not example)
-    return found if whole else None
+    logged = len(found.signals) == len(Signals._fields) and found.signals.size > 0
+    return found if found.values.shape == (len(metric_names()),) and (logged or not example) else None
 
 
-def _kept(run: Rollout, example: int) -> list[Kept]:
+def _kept(run: Rollout, shown: Sequence[int]) -> list[Kept]:
     values = np.stack(metrics(run), axis=-1)
     episodes = []
     for i, seed in enumerate(run.seeds):
-        lived = run.alive[:, i] & (seed == example)
-        signals = np.stack([signal[lived, i] for signal in run.signals])
+        signals = np.stack(run.episode(i)) if seed in shown else np.zeros((0, 0))
         episodes.append(Kept(values[i], run.microseconds_per_step, signals))
     return episodes
 

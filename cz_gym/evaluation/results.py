@@ -32,6 +32,8 @@ SPEED = "microseconds_per_step"
 """Name of the one metric that is not per episode: time in ``predict`` per step and episode, batched [us]."""
 TAIL_METRICS = ("rmse_mm", "rmse_observable_mm", "max_error_mm")
 """Metrics whose worst 5 % are reported."""
+EXAMPLES = 8
+"""Episodes of a sample whose signals are kept, the first ones: 2 MB a sample of 3 h episodes at 5 s."""
 
 
 @dataclass(frozen=True)
@@ -68,18 +70,24 @@ class Sample:
     values: Floats
     """Shape (training seeds or 1, episodes, metrics), metrics in the order of :func:`metric_names`."""
     microseconds_per_step: float
-    example: Signals
-    """Signals of the first episode up to its end, each of shape (steps,)."""
+    examples: tuple[Signals, ...]
+    """Signals of the first :data:`EXAMPLES` episodes up to their ends, each of shape (steps,); those of the first
+    training seed."""
     control_interval: float
 
     @classmethod
     def of(cls, controller: Controller, runs: Sequence[Rollout]) -> Sample:
         """The sample of a controller's rollouts, one a training seed, all on the same episodes."""
         values = np.array([np.stack(metrics(run), axis=-1) for run in runs])
-        lived = runs[0].alive[:, 0]
-        example = Signals(*(signal[lived, 0] for signal in runs[0].signals))
+        first = runs[0]
+        examples = tuple(first.episode(i) for i in range(min(len(first.seeds), EXAMPLES)))
         microseconds = float(np.mean([run.microseconds_per_step for run in runs]))
-        return cls(controller, runs[0].seeds, values, microseconds, example, runs[0].config.control_interval)
+        return cls(controller, first.seeds, values, microseconds, examples, first.config.control_interval)
+
+    @property
+    def example(self) -> Signals:
+        """Signals of the first episode up to its end, each of shape (steps,)."""
+        return self.examples[0]
 
     def metric(self, name: str) -> Floats:
         """One metric, shape (training seeds or 1, episodes)."""
@@ -88,7 +96,8 @@ class Sample:
 
     def first(self, episodes: int) -> Sample:
         """The same sample on its first episodes."""
-        return replace(self, seeds=self.seeds[:episodes], values=self.values[:, :episodes])
+        shown = self.examples[:episodes]
+        return replace(self, seeds=self.seeds[:episodes], values=self.values[:, :episodes], examples=shown)
 
 
 @dataclass(frozen=True)

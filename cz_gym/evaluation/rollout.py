@@ -60,6 +60,11 @@ class Rollout:
         """Time in ``predict`` per step of one episode, batched [us]."""
         return self.seconds_in_policy / MICRO / self.alive.size
 
+    def episode(self, i: int) -> Signals:
+        """Signals of episode ``i`` up to its end, each of shape (steps lived,); a copy."""
+        lived = self.alive[:, i]
+        return Signals(*(signal[lived, i] for signal in self.signals))
+
 
 def rollout(
     policy: Any,
