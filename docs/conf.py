@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from pathlib import Path
 
 import cz_gym
 
-sys.path.insert(0, str(Path(__file__).parent / "_ext"))
+sys.path.insert(0, str(Path(__file__).parent))
 
 project = "Cz-v0"
 author = "The Cz-v0 developers"
@@ -22,7 +21,7 @@ language = "en"
 root_doc = "docs/index"
 include_patterns = ["README.md", "CHANGELOG.md", "docs/**.md", "results/**.md"]
 exclude_patterns = [".*", "build", "dist", "runs", "results/cache", "docs/_*", "**/.*", "**/node_modules"]
-extensions = ["myst_parser", "sphinx.ext.autodoc", "mathml", "tables", "names", "pages"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "czdocs.mathml", "czdocs.tables", "czdocs.names", "czdocs.pages"]
 nitpicky = True
 nitpick_ignore = [
     ("py:class", "cz_gym.batch.SlotState"),
@@ -41,7 +40,8 @@ myst_dmath_double_inline = False
 highlight_language = "text"
 html_math_renderer = "mathml"
 
-autodoc_default_options = {"members": True, "member-order": "bysource", "undoc-members": True}
+autodoc_default_options = {"members": True, "member-order": "bysource", "undoc-members": True, "no-value": True}
+toc_object_entries = False
 autodoc_typehints = "signature"
 autodoc_preserve_defaults = True
 python_use_unqualified_type_names = True

@@ -1,4 +1,4 @@
-"""What the code says about its own fields: the text below each, its unit in the brackets at the end."""
+"""What the code says about its own fields: the text below each, its unit in the first brackets."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import re
 import textwrap
 from typing import NamedTuple
 
-UNIT = re.compile(r"\s*\[([^\]\[]*)\]\.?$")
+UNIT = re.compile(r"\s*\[([^\]\[]*)\]")
 
 
 class Attribute(NamedTuple):
@@ -29,6 +29,6 @@ def attributes(cls: type) -> list[Attribute]:
             assert isinstance(field.target, ast.Name)
             whole = " ".join(str(text.value.value).split())
             unit = UNIT.search(whole)
-            meaning = UNIT.sub("", whole).rstrip(".")
+            meaning = UNIT.sub("", whole, count=1).rstrip(".")
             found.append(Attribute(field.target.id, unit.group(1) if unit else "", meaning))
     return found

@@ -6,12 +6,12 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
-from attributes import attributes
-
 from cz_gym import Parameters, Puller, State
 from cz_gym.parameters import describe
 from cz_gym.plant import Disturbance, Inputs
 from cz_gym.slots import INFO_ROWS
+
+from .attributes import attributes
 
 PHYSICS = Path(__file__).parents[1] / "physics.md"
 GREEK = frozenset({"alpha", "kappa", "lam", "lambda", "phi", "rho", "sigma", "theta", "Phi"})
@@ -27,7 +27,7 @@ UNLIKE = {
     "cos_alpha_0": r"\cos\alpha_0",
 }
 """Symbols that do not follow from their names."""
-FORMULA = re.compile(r"\$\$(.*?)\\tag\{(\d+)\}", re.DOTALL)
+FORMULA = re.compile(r"\$\$((?:(?!\$\$).)*)\\tag\{(\d+)\}\s*\$\$", re.DOTALL)
 WITHOUT_SYMBOL = frozenset({"action_clipped", "r_br_measured"})
 
 
@@ -62,10 +62,11 @@ def formulas() -> dict[str, str]:
 
 def equations(tex: str) -> tuple[str, ...]:
     """Numbers of the physics page's formulas that hold a symbol."""
-    end = "" if tex.endswith("}") else r"(?![A-Za-z0-9{])"
+    before = "" if tex.startswith("\\") else r"(?<![A-Za-z0-9_\\,])(?<!_\{)"
+    after = "" if tex.endswith("}") else r"(?![A-Za-z0-9{])"
     if "_" not in tex:
-        end += r"(?!_)"
-    pattern = re.compile(r"(?<![A-Za-z0-9_\\{,])" + re.escape(tex) + end)
+        after += r"(?!_)"
+    pattern = re.compile(before + re.escape(tex) + after)
     return tuple(number for number, text in formulas().items() if pattern.search(text))
 
 

@@ -22,7 +22,7 @@ def fill(app: Any, docname: str, source: list[str]) -> None:
         return
     found = app.env.found_docs
     others = unnamed(found, source[0], "docs/")
-    reports = [f"../results/{page}" for page in unnamed(found, "", "results/")]
+    reports = [f"{page.partition('/')[0].capitalize()} <../results/{page}>" for page in unnamed(found, "", "results/")]
     source[0] = source[0].replace("{other pages}", "\n".join(others)).replace("{reports}", "\n".join(reports))
 
 

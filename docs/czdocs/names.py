@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from typing import Any
 
 from cz_gym import Parameters
 
 PLACE = "Alias for field number"
+LONGEST = 24
+"""Longest default in a signature [characters]."""
 HEADING = re.compile(r"^## (.*)$")
 CODE = re.compile(r"(``.*?``)")
 
@@ -27,11 +30,21 @@ def _plain(line: str) -> str:
 
 
 def sign(app: Any, what: str, name: str, thing: Any, options: Any, signature: str | None, returns: str | None) -> Any:
-    """The parameters' signature without their descriptions, which stand below it."""
-    if thing is not Parameters:
+    """The signature of a record of settings: names, and defaults that are short enough to read."""
+    if thing is Parameters:
+        defaults = Parameters()._asdict()
+    elif dataclasses.is_dataclass(thing) and isinstance(thing, type):
+        defaults = {field.name: field.default for field in dataclasses.fields(thing)}
+    else:
         return None
-    defaults = (f"{field}={value:.6g}" for field, value in Parameters()._asdict().items())
-    return f"({', '.join(defaults)})", None
+    return f"({', '.join(f'{field}{_default(value)}' for field, value in defaults.items())})", returns
+
+
+def _default(value: Any) -> str:
+    if value is dataclasses.MISSING:
+        return ""
+    shown = f"{value:.6g}" if isinstance(value, float) else repr(value)
+    return f"={shown}" if len(shown) <= LONGEST else "=..."
 
 
 def skip(app: Any, what: str, name: str, thing: Any, skipped: bool, options: Any) -> bool | None:

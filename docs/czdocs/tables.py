@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable, Iterable
 from typing import Any, ClassVar
 
-import nomenclature
-from attributes import attributes
 from docutils import nodes
 from docutils.parsers.rst import Directive
 from docutils.statemachine import StringList
 
 from cz_gym import SCENARIOS, Scenario
-from cz_gym.evaluation.metrics import Metrics
 from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED, STATE, Channel
 from cz_gym.scenarios import RANDOMIZED
 from cz_gym.slots import INFO_ROWS
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
+from . import nomenclature
+from .attributes import attributes
+
+ABSENT = "\N{EN DASH}"
+POWERS = {"2": "\N{SUPERSCRIPT TWO}", "3": "\N{SUPERSCRIPT THREE}", "4": "\N{SUPERSCRIPT FOUR}"}
 WIDE = ("randomized", "hard", "sensor-fault", "puller")
 READABLE = {
     "m": (MM, "mm"),
@@ -45,10 +48,15 @@ def code(text: str) -> str:
     return f"`{text}`"
 
 
+def units(text: str) -> str:
+    """A unit with its powers raised: m/s2 as m/s²."""
+    return re.sub(r"(?<=[A-Za-z])[234]", lambda power: POWERS[power.group()], text)
+
+
 def channels(listed: Iterable[Channel]) -> list[str]:
     """A table of observation channels."""
     rows = (
-        (str(i), code(c.name), c.unit, "$v_0$" if c.name == "v_p" else f"{c.scale:g}", c.meaning)
+        (str(i), code(c.name), units(c.unit), "$v_0$" if c.name == "v_p" else f"{c.scale:g}", c.meaning)
         for i, c in enumerate(listed)
     )
     return markdown(("index", "name", "unit", "scale", "meaning"), rows)
@@ -69,7 +77,7 @@ def remembered() -> list[str]:
 
 def info() -> list[str]:
     """The keys of ``info``."""
-    return markdown(("key", "unit", "meaning"), ((code(row.name), row.unit, row.meaning) for row in INFO_ROWS))
+    return markdown(("key", "unit", "meaning"), ((code(row.name), units(row.unit), row.meaning) for row in INFO_ROWS))
 
 
 def readable(value: Any, unit: str) -> str:
@@ -81,7 +89,7 @@ def readable(value: Any, unit: str) -> str:
     low, high = parts
     if low == high:
         return f"{low} {name}".strip()
-    between = f"±{high}" if low == f"-{high}" else f"{low} … {high}"
+    between = f"±{high}" if low == f"-{high}" else f"{low} to {high}"
     return f"{between} {name}".strip()
 
 
@@ -100,7 +108,7 @@ def scenario_table(shown: Iterable[str]) -> list[str]:
         for name, unit, meaning in attributes(type(absent)):
             cells = [getattr(value, name) for value in values]
             if any(cell != getattr(absent, name) for cell in cells) and any(present):
-                written = [readable(cell, unit) if cell != getattr(absent, name) else "–" for cell in cells]
+                written = [readable(cell, unit) if cell != getattr(absent, name) else ABSENT for cell in cells]
                 rows.append((f"{code(f'{family.name}.{name}')} {meaning}", *written))
     return markdown(("", *(code(scenario.name) for scenario in columns)), rows)
 
@@ -130,7 +138,7 @@ def families() -> list[str]:
         for name, unit, meaning in attributes(type(absent)):
             default = getattr(absent, name)
             shown = f"{default:g}" if not isinstance(default, tuple) else f"({default[0]:g}, {default[1]:g})"
-            rows.append((code(f"{type(absent).__name__}.{name}"), unit, shown, meaning))
+            rows.append((code(f"{type(absent).__name__}.{name}"), units(unit), shown, meaning))
     return markdown(("member", "unit", "default", "meaning"), rows)
 
 
@@ -149,17 +157,10 @@ def symbols(rows: Iterable[nomenclature.Row]) -> list[str]:
     )
     lines = []
     for row in listed:
-        where = ", ".join(f'<a href="physics.html#eq-{n}">({n})</a>' for n in row.equations) or "–"
+        where = ", ".join(f'<a href="physics.html#eq-{n}">({n})</a>' for n in row.equations) or ABSENT
         value, source = ((row.value,), (row.source,)) if typed else ((), ())
-        lines.append((f"${row.symbol}$", code(row.code), *value, row.unit, row.meaning, where, *source))
+        lines.append((f"${row.symbol}$", code(row.code), *value, units(row.unit), row.meaning, where, *source))
     return markdown(head, lines)
-
-
-def metrics() -> list[str]:
-    """The benchmark's metrics."""
-    return markdown(
-        ("metric", "unit", "meaning"), ((code(a.name.rstrip("_")), a.unit, a.meaning) for a in attributes(Metrics))
-    )
 
 
 TABLES: dict[str, Callable[[], list[str]]] = {
@@ -191,9 +192,9 @@ class Generated(Directive):
         name = self.arguments[0]
         if name not in TABLES:
             raise self.error(f"no table {name!r}; there are {', '.join(TABLES)}")
-        box = nodes.container()
+        box = nodes.container(classes=["generated", name])
         self.state.nested_parse(StringList(TABLES[name](), source=f"table {name}"), self.content_offset, box)
-        return box.children
+        return [box]
 
 
 def setup(app: Any) -> dict[str, bool]:
