@@ -5,9 +5,10 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 TEST_READY := $(VENV)/.ready-test
 BENCHMARK_READY := $(VENV)/.ready-benchmark
+DOCS_READY := $(VENV)/.ready-docs
 BROWSER_READY := $(VENV)/.ready-browser
 
-.PHONY: help venv lint types test test-browser benchmark paper clean
+.PHONY: help venv lint types test test-browser benchmark paper docs clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -34,6 +35,9 @@ benchmark: $(BENCHMARK_READY) ## the shipped agent and the classical controllers
 paper: $(BENCHMARK_READY) ## the paper's numbers beside ours
 	$(BIN)/python -m baselines.paper
 
+docs: $(DOCS_READY) ## the documentation site, into build/docs; warnings are errors
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -c docs . build/docs
+
 clean: ## remove what builds and checks leave behind; the virtual environment stays
 	rm -rf build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +
@@ -45,11 +49,15 @@ $(BENCHMARK_READY): pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) --editable ".[benchmark]"
 	touch $@
 
+$(DOCS_READY): pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) --editable ".[docs]"
+	touch $@
+
 # torch first: alone under its pin, pip decides at once which build to take.
 $(TEST_READY): pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) torch
 	$(PIP) --editable ".[test]"
-	touch $(BENCHMARK_READY) $@
+	touch $(BENCHMARK_READY) $(DOCS_READY) $@
 
 $(BROWSER_READY): $(TEST_READY)
 	$(PIP) --editable ".[test,browser]"

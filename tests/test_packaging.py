@@ -63,7 +63,16 @@ def test_environment_and_baselines_need_neither_torch_nor_plots(tmp_path: Path) 
 def test_core_dependencies_are_four() -> None:
     names = [requirement.partition(">")[0] for requirement in PROJECT["dependencies"]]
     assert names == ["gymnasium", "numpy", "scipy", "numba"]
-    assert set(PROJECT["optional-dependencies"]) == {"benchmark", "agents", "render", "mpc", "peers", "browser", "test"}
+    assert set(PROJECT["optional-dependencies"]) == {
+        "benchmark",
+        "agents",
+        "render",
+        "mpc",
+        "peers",
+        "docs",
+        "browser",
+        "test",
+    }
 
 
 def test_version_stands_once() -> None:
@@ -77,7 +86,7 @@ def test_pins_lie_in_the_open_ranges() -> None:
     )
     pins = {name.lower().replace("_", "-"): version for name, version in pins.items()}
     extras = PROJECT["optional-dependencies"]
-    for text in [*PROJECT["dependencies"], *extras["benchmark"], *extras["agents"], *extras["test"]]:
+    for text in [*PROJECT["dependencies"], *extras["benchmark"], *extras["agents"], *extras["docs"], *extras["test"]]:
         requirement = packaging.Requirement(text)
         if requirement.name != "cz-gym":
             assert requirement.specifier.contains(pins[requirement.name.lower()]), text
