@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ._compile import entry
-from .config import Config
+from .config import Config, Identity
 from .kernels import KERNELS, Kernels, build_kernels
 from .law import GRID, law_of
 from .meniscus import HURLE, MeniscusModel
@@ -35,6 +35,7 @@ DRAWS_PER_THREAD = 4
 """Fewest draws worth a thread of their own in a reset."""
 SPARES = 3
 """Most sets of output arrays kept for further use."""
+_SAVED = ("slot", "series", "history", "frames")
 Key = tuple[int, int]
 """128 random bits that an episode is drawn from, as two 64-bit words."""
 
@@ -62,13 +63,11 @@ _ALONE = _held((np.empty(1), np.empty(1)))
 class SlotState:
     """Everything one slot is at an instant; picklable, continued bit-exactly by :meth:`Batch.restore`."""
 
-    config_hash: str
+    identity: Identity
     slot: npt.NDArray[Any]
     series: npt.NDArray[np.float64]
     history: npt.NDArray[np.float64]
     frames: npt.NDArray[np.float64]
-    sample: tuple[npt.NDArray[Any], ...]
-    """The slot's rows of the last :class:`cz_gym.slots.Out`."""
     clock: Clock
 
     @property
@@ -90,6 +89,7 @@ class Batch:
 
     def __init__(self, config: Config, num_envs: int, threads: int | None = None) -> None:
         self.config = config
+        self.identity = config.identity
         self.num_envs = num_envs
         self.kernels = _kernels(config.meniscus)
         self.clock = Clock(config.control_interval, config.steps, math.ceil(config.horizon / GRID) + 1)
@@ -203,30 +203,41 @@ class Batch:
         futures = [self._pool.submit(part, start, stop) for start, stop in pairwise(bounds[1:])]
         return [part(bounds[0], bounds[1]), *(future.result() for future in futures)]
 
-    def save(self, i: int, out: Out) -> SlotState:
-        """A copy of everything slot i is, with its last sample."""
-        sample = tuple(np.copy(array[..., i] if name == "info" else array[i]) for name, array in out._asdict().items())
+    def save(self, i: int) -> SlotState:
+        """A copy of everything slot i is."""
         # array[i] of a structured array is a view that np.copy does not copy; array[i, ...] is an array.
-        slot, _, series, history, frames = (array[i, ...].copy() for array in self.memory)
-        return SlotState(self.config.hash, slot, series, history, frames, sample, self.clock)
+        slot, series, history, frames = (rows[i, ...].copy() for rows in self._saved())
+        return SlotState(self.identity, slot, series, history, frames, self.clock)
 
     def check(self, state: SlotState) -> None:
         """Raise ValueError if this is no saved state, or one saved under other settings."""
         if not isinstance(state, SlotState):
             raise ValueError(f"expected a state made by get_state, not {type(state).__name__}")
-        if state.config_hash != self.config.hash:
-            raise ValueError(
-                f"this state was saved under other settings (hash {state.config_hash}) than this environment's "
-                f"(hash {self.config.hash}): scenario, model, observation, interval, horizon and parameters must agree"
-            )
+        saved = getattr(state, "identity", None)
+        if not isinstance(saved, Identity):
+            raise ValueError("this state was saved by another version of cz_gym")
+        odd = saved.difference(self.identity)
+        if odd is not None:
+            raise ValueError(f"this state was saved under other settings than this environment's: {odd}")
+        for name, rows in zip(_SAVED, self._saved(), strict=True):
+            array = getattr(state, name)
+            if not isinstance(array, np.ndarray) or (array.dtype, array.shape) != (rows.dtype, rows.shape[1:]):
+                raise ValueError(
+                    f"this state was saved by another version of cz_gym, or damaged: its {name} does not fit"
+                )
+        if not 0 <= int(state.slot["k"]) <= self.clock.steps:
+            raise ValueError(f"this state is damaged: sample {int(state.slot['k'])} of {self.clock.steps}")
 
-    def restore(self, i: int, state: SlotState, out: Out) -> None:
-        """Continue slot i from a state that :meth:`check` let pass and write its last sample into ``out``."""
+    def restore(self, which: Sequence[int], states: Sequence[SlotState], out: Out) -> None:
+        """Continue slots from states that :meth:`check` let pass and write their last samples into ``out``."""
+        for i, state in zip(which, states, strict=True):
+            for name, rows in zip(_SAVED, self._saved(), strict=True):
+                rows[i] = getattr(state, name)
+        self.kernels.show(self.memory, np.array(which, np.int64), self.clock, self.reading, out, 0, len(which))
+
+    def _saved(self) -> tuple[npt.NDArray[Any], ...]:
         memory = self.memory
-        memory.slots[i], memory.series[i], memory.history[i] = state.slot, state.series, state.history
-        memory.frames[i] = state.frames
-        for name, array, values in zip(out._fields, out, state.sample, strict=True):
-            array[(..., i) if name == "info" else i] = values
+        return memory.slots, memory.series, memory.history, memory.frames
 
     def close(self) -> None:
         """Stop the threads."""

@@ -7,6 +7,7 @@ import json
 import math
 from dataclasses import dataclass, field, replace
 from numbers import Real
+from typing import NamedTuple
 
 from ._compile import hashed
 from .meniscus import HURLE, MeniscusModel
@@ -19,6 +20,31 @@ from .task import check_height
 
 VERSION = 0
 """Version of physics and contract; a change of either makes a Cz-v1."""
+
+
+class Identity(NamedTuple):
+    """What a saved state belongs to: two environments with equal ones continue each other's states."""
+
+    version: int
+    """:data:`VERSION`."""
+    plant: str
+    """:attr:`Config.plant_hash`."""
+    scenario: str
+    """Name and hash."""
+    mix: Range
+    """Range of the share of conduction [-]."""
+    observation: str
+    control_interval: float
+    """[s]."""
+    horizon: float
+    """[s]."""
+
+    def difference(self, other: Identity) -> str | None:
+        """What differs first, in words; None if nothing does."""
+        for name, mine, its in zip(self._fields, self, other, strict=True):
+            if mine != its:
+                return f"{name.replace('_', ' ')} {mine}, not {its}"
+        return None
 
 
 @dataclass(frozen=True)
@@ -58,6 +84,14 @@ class Config:
         mix = [float(share) + 0.0 for share in self.mix]
         parts = [self.plant_hash, self.scenario.hash, mix, self.observation, self.control_interval, self.horizon]
         return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
+
+    @property
+    def identity(self) -> Identity:
+        """What a saved state belongs to."""
+        scenario = f"{self.scenario.name!r} ({self.scenario.hash})"
+        low, high = self.mix
+        mix = float(low) + 0.0, float(high) + 0.0
+        return Identity(VERSION, self.plant_hash, scenario, mix, self.observation, self.control_interval, self.horizon)
 
     def with_scenario(self, scenario: str | Scenario) -> Config:
         """The same settings on another scenario."""

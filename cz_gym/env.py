@@ -73,7 +73,7 @@ class CzEnv(gym.Env[Observation, Action]):
     ## Rewards
     1 - c with c = 10 cost / (10 + cost), cost = (e_r / 0.5 mm)^2 + 0.5 (dv_p / 0.36 mm/min)^2 + 0.25 (step of v_p /
     0.06 mm/min)^2 + 0.05 (step of Q_H / 1 kW)^2 on the true radius error e_r; a failure at
-    step k of N adds -10 (N - k).
+    step k of N, the first being 1, adds -10 (N - k + 1), so that no failing step earns what surviving could.
 
     ## Starting State
     The drawn puller's own operating point, the radius off by N(0, 0.2 mm) on "randomized".
@@ -151,19 +151,17 @@ class CzEnv(gym.Env[Observation, Action]):
 
     def get_state(self) -> EnvState:
         """A picklable value from which :meth:`set_state` continues bit-exactly, random stream included."""
-        return EnvState(self._batch.save(0, self._out), dict(self.np_random.bit_generator.state))
+        return EnvState(self._batch.save(0), dict(self.np_random.bit_generator.state))
 
     def set_state(self, state: EnvState) -> None:
         """Continue from a value of :meth:`get_state`; ValueError if it was saved under other settings."""
         self._check_state(state)
-        self._batch.restore(0, state.slot, self._out)
+        self._batch.restore([0], [state.slot], self._out)
         self.np_random.bit_generator.state = state.random
         self._over = bool(self._slots["over"][0])
 
     def _check_state(self, state: Any) -> None:
-        if not isinstance(state, EnvState):
-            raise ValueError(f"expected a state made by get_state, not {type(state).__name__}")
-        self._batch.check(state.slot)
+        check_state(state, self._batch)
 
     def close(self) -> None:
         """Nothing to close."""
@@ -175,6 +173,18 @@ class CzEnv(gym.Env[Observation, Action]):
         if self.config.observation == "history":
             info["state"] = self._out.state[0].copy()
         return info
+
+
+def check_state(state: Any, batch: Batch) -> None:
+    """ValueError, in one line, unless a state that a slot of this batch can go on from."""
+    if not isinstance(state, EnvState):
+        raise ValueError(f"expected a state made by get_state, not {type(state).__name__}")
+    batch.check(state.slot)
+    try:
+        random: Any = np.random.PCG64(0)
+        random.state = state.random
+    except (ValueError, TypeError, KeyError, OverflowError):
+        raise ValueError("this state is damaged: its random stream is none of PCG64") from None
 
 
 def check_action(action: Any) -> Any:

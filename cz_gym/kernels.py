@@ -35,6 +35,7 @@ def _begin(slot: Any, dT_i: Any) -> None:
     slot.x.r_c, slot.x.h_c = p.r_0 + e.r_c_start, p.h_0
     slot.x.T_1, slot.x.T_2, slot.x.T_b = p.T_1_0, p.T_2_0, p.T_b_0
     slot.v_p, slot.Q_H, slot.Q_H_slewed = p.v_0, p.Q_H_0, p.Q_H_0
+    slot.v_p_before, slot.Q_H_before, slot.clipped = p.v_0, p.Q_H_0, 0.0
     slot.dT_i, slot.Q_d, slot.drift = dT_i, 0.0, np.nan
     slot.integral = 0.0
     slot.k = slot.frames = slot.over = 0
@@ -44,13 +45,16 @@ def _begin(slot: Any, dT_i: Any) -> None:
 def _drive(slot: Any, pull: Any, heat: Any, interval: Any) -> None:
     """Move the drives towards an action within window and slew, the heater in whole steps."""
     p, e = slot.puller, slot.episode
+    slot.v_p_before, slot.Q_H_before = slot.v_p, slot.Q_H
+    slot.clipped = 1.0 if (np.abs(pull) > 1.0 or np.abs(heat) > 1.0) else 0.0
     wanted = p.v_0 + clip(p.v_0 * clip(pull, 1.0), e.pull_window)
     slot.v_p = slot.v_p + clip(wanted - slot.v_p, e.pull_slew * interval)
-    power = p.Q_H_0 + HEATER_RANGE * clip(heat, 1.0)
+    power = np.maximum(p.Q_H_0 + HEATER_RANGE * clip(heat, 1.0), 0.0)
     slot.Q_H_slewed = slot.Q_H_slewed + clip(power - slot.Q_H_slewed, e.heater_slew * interval)
     slot.Q_H = slot.Q_H_slewed
     if e.heater_step > 0.0:
-        slot.Q_H = p.Q_H_0 + e.heater_step * np.rint((slot.Q_H_slewed - p.Q_H_0) / e.heater_step)
+        whole = p.Q_H_0 + e.heater_step * np.rint((slot.Q_H_slewed - p.Q_H_0) / e.heater_step)
+        slot.Q_H = np.maximum(whole, 0.0)
 
 
 @physics
@@ -101,38 +105,39 @@ def _advance(slot: Any, series: Any, frames: Any, clock: Any, slope: Any, ring_o
 
 
 @inlined
-def _sample(
-    memory: Any, i: Any, v_p: Any, Q_H: Any, clock: Any, reading: Any, out: Any, slope: Any, ring_offset: Any
-) -> Any:
-    """Read slot i and write what it says; returns the cost of the step from drives v_p, Q_H."""
+def _sample(memory: Any, i: Any, fresh: Any, clock: Any, reading: Any, out: Any, slope: Any, ring_offset: Any) -> Any:
+    """Read slot i, unless its last reading is to be shown again, and write what it says; returns the step's cost."""
     slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
     t, h_c = slot.k * clock.interval, _height_inside(x.h_c, p)
     ring = x.r_c + ring_offset(x.r_c, h_c, p)
     series = memory.series[i]
-    sense(slot, series[slot.k, 1], series[slot.k, 2], memory.frames[i], t, ring - p.ring_bias)
+    if fresh:
+        sense(slot, series[slot.k, 1], series[slot.k, 2], memory.frames[i], t, ring - p.ring_bias)
     measured = measure(slot, t)
     row = out.observation[i]
     write_measured(measured, reading.measured, row)
     if memory.history.shape[1] > 0:
-        remember(slot, memory.history[i], clock.interval, row)
+        if fresh:
+            remember(slot, memory.history[i], clock.interval, row)
         recall(slot, memory.history[i], reading, row)
     if out.state.shape[1] > 0:
         write_state(slot, measured, t, reading.state, out.state[i])
     error = x.r_c - p.r_0 - measured.r_ref
-    cost = cost_terms(error, measured.v_p, slot.v_p - v_p, slot.Q_H - Q_H)
+    cost = cost_terms(error, measured.v_p, slot.v_p - slot.v_p_before, slot.Q_H - slot.Q_H_before)
     if slot.k == 0:
         cost = Cost(0.0, 0.0, 0.0, 0.0)
     write_info(slot, measured, cost, t, h_c, ring, slope, out.info[:, i])
+    out.info[_CLIPPED, i] = slot.clipped
     return cost
 
 
-def _read(
-    memory: Any, i: Any, v_p: Any, Q_H: Any, clock: Any, reading: Any, out: Any, slope: Any, ring_offset: Any
-) -> None:
-    _sample(memory, i, v_p, Q_H, clock, reading, out, slope, ring_offset)
+def _read(memory: Any, i: Any, fresh: Any, clock: Any, reading: Any, out: Any, slope: Any, ring_offset: Any) -> None:
+    _sample(memory, i, fresh, clock, reading, out, slope, ring_offset)
+    out.reward[i] = 0.0
+    out.terminated[i] = out.truncated[i] = False
 
 
-_first_sample = kernel(_read, keep=False, allocates=False)
+_sample_alone = kernel(_read, keep=False, allocates=False)
 """A sample as a function of its own: with the step's options, so that what it calls is compiled only once."""
 
 
@@ -145,6 +150,9 @@ class Kernels(NamedTuple):
     """``draw(memory, which, keys, law, mix, parameters, clock, reading, out, start, stop)``: new episodes, each
     from its key, for the slots ``which[start:stop]``, with their first sample; returns a slot whose puller has no
     operating point, or -1."""
+    show: Any
+    """``show(memory, which, clock, reading, out, start, stop)``: the last sample of the slots ``which[start:stop]``
+    again."""
     plant: Any
     """``plant(memory, actions, clock, rings, start, stop)``: drives, plant and ring alone, to measure speed against."""
     derive: Any
@@ -160,17 +168,14 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
             if not active[i]:
                 continue
             slot = memory.slots[i]
-            v_p, Q_H = slot.v_p, slot.Q_H
-            pull, heat = actions[i, 0], actions[i, 1]
-            _drive(slot, pull, heat, clock.interval)
+            _drive(slot, actions[i, 0], actions[i, 1], clock.interval)
             grows = _advance(slot, memory.series[i], memory.frames[i], clock, slope, ring_offset)
-            cost = _sample(memory, i, v_p, Q_H, clock, reading, out, slope, ring_offset)
+            cost = _sample(memory, i, True, clock, reading, out, slope, ring_offset)
             ends = slot.k >= clock.steps
             out.reward[i] = reward(cost) + (0.0 if grows else failure_penalty(slot.k, clock.steps))
             out.terminated[i] = not grows
             out.truncated[i] = grows and ends
             slot.over = 1 if (not grows or ends) else 0
-            out.info[_CLIPPED, i] = 1.0 if (np.abs(pull) > 1.0 or np.abs(heat) > 1.0) else 0.0
 
     def draw(
         memory: Any, which: Any, keys: Any, law: Any, mix: Any, parameters: Any, clock: Any, reading: Any, out: Any,
@@ -192,10 +197,12 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
                 numbers[EPISODE_AT + number] = episode[number]
             draw_series(slot.episode, streams, series[: clock.grid_points, 0], series[: clock.steps + 1, 1:])
             _begin(slot, series[0, 0])
-            _first_sample(memory, i, slot.v_p, slot.Q_H, clock, reading, out, slope, ring_offset)
-            out.info[_CLIPPED, i], out.reward[i] = 0.0, 0.0
-            out.terminated[i] = out.truncated[i] = False
+            _sample_alone(memory, i, True, clock, reading, out, slope, ring_offset)
         return impossible
+
+    def show(memory: Any, which: Any, clock: Any, reading: Any, out: Any, start: int, stop: int) -> None:
+        for at in range(start, stop):
+            _sample_alone(memory, which[at], False, clock, reading, out, slope, ring_offset)
 
     def plant(memory: Any, actions: Any, clock: Any, rings: Any, start: int, stop: int) -> None:
         for i in range(start, stop):
@@ -211,6 +218,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
     return Kernels(
         kernel(step, keep, allocates=False),
         kernel(draw, keep),
+        kernel(show, keep, allocates=False),
         kernel(plant, keep, allocates=False),
         kernel(derive, keep),
     )

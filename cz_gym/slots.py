@@ -33,13 +33,17 @@ SLOT = np.dtype(
         ("k", np.int64),
         ("frames", np.int64),
         ("over", np.int64),
+        ("v_p_before", np.float64),
+        ("Q_H_before", np.float64),
+        ("clipped", np.float64),
     ],
     align=True,
 )
 """One slot: constants of puller and episode, plant state, drives [m/s, W], the disturbance of the last substep,
 the last readings (``ring`` [m] without the operator's bias, ``T_1`` [K], ``valid``), the integral of the scaled ring
-error, the drift [K] that ``Q_d`` belongs to, the sample number ``k``, the number of camera frames taken, and whether
-the episode is over."""
+error, the drift [K] that ``Q_d`` belongs to, the sample number ``k``, the number of camera frames taken, whether
+the episode is over, the drives [m/s, W] of the step before and whether the action was clipped: a sample can be
+written again from its slot."""
 PULLER_AT, EPISODE_AT = 0, len(Puller._fields)
 """Where a slot's constants begin, in numbers of eight bytes."""
 

@@ -27,7 +27,7 @@ PULL_WEIGHT, PULL_STEP_WEIGHT, HEATER_STEP_WEIGHT = 0.5, 0.25, 0.05
 COST_CAP = 10.0
 """What the saturated cost approaches [-]."""
 FAILURE_COST = 10.0
-"""Cost of each step lost to a failure [-]."""
+"""Cost of the failing step and of each step lost to it [-]."""
 
 
 class Cost(NamedTuple):
@@ -75,5 +75,9 @@ def reward(cost: Any) -> Any:
 
 @physics
 def failure_penalty(step: Any, steps: Any) -> Any:
-    """Added to the reward when step ``step`` of ``steps`` fails: dying never pays."""
-    return -FAILURE_COST * (steps - step)
+    """Added to the reward when step ``step`` of ``steps``, the first being 1, fails: for this step and each one lost.
+
+    So a failing step earns at most 1 - 10 (steps - step + 1), never more than the worst life from it to the horizon,
+    over -9 (steps - step + 1): dying never pays, also in the last steps.
+    """
+    return -FAILURE_COST * (steps - step + 1)

@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 
 from .batch import Batch, new_key
 from .config import make_config
-from .env import CzEnv, EnvState, action_space, check_options, check_render_mode, observation_space
+from .env import CzEnv, EnvState, action_space, check_options, check_render_mode, check_state, observation_space
 from .meniscus import MeniscusModel
 from .parameters import Parameters
 from .scenario import Scenario
@@ -133,8 +133,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
     def get_state(self) -> tuple[EnvState, ...]:
         """Picklable values, one a slot; :meth:`set_state`, also of the scalar form, continues them bit-exactly."""
         return tuple(
-            EnvState(self._batch.save(i, self._out), dict(self._random(i).bit_generator.state))
-            for i in range(self.num_envs)
+            EnvState(self._batch.save(i), dict(self._random(i).bit_generator.state)) for i in range(self.num_envs)
         )
 
     def set_state(self, states: Sequence[EnvState]) -> None:
@@ -212,11 +211,11 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         if not several or not all(isinstance(state, EnvState) for state in states):
             raise ValueError(f"expected {self.num_envs} states made by get_state, one a slot")
         for state in states:
-            self._batch.check(state.slot)
+            check_state(state, self._batch)
 
     def _restore(self, states: Sequence[EnvState], which: list[int]) -> None:
+        self._batch.restore(which, [states[i].slot for i in which], self._out)
         for i in which:
-            self._batch.restore(i, states[i].slot, self._out)
             self._random(i).bit_generator.state = states[i].random
 
     def _keep(self, previous: Out, kept: Mask) -> None:

@@ -42,12 +42,11 @@ def test_limits() -> None:
 
 @given(st.integers(1, 2160))
 def test_dying_never_pays(step: int) -> None:
-    """The best life before a failure, and the failure, are worth less than the worst life to the horizon."""
+    """The cheapest failing step is worth no more than the worst life from that step to the horizon."""
     steps = 2160
-    worst_to_live = -9.0 * (steps - step)
-    assert failure_penalty(step, steps) <= worst_to_live
-    assert failure_penalty(steps, steps) == 0.0
-    assert failure_penalty(step, steps) == -10.0 * (steps - step)
+    assert 1.0 + failure_penalty(step, steps) <= -9.0 * (steps - step + 1)
+    assert failure_penalty(steps, steps) == -10.0
+    assert failure_penalty(step, steps) == -10.0 * (steps - step + 1)
 
 
 @pytest.mark.parametrize(
@@ -68,7 +67,7 @@ def test_failure_is_terminated_never_truncated(model: str, pull: float, what: st
     beyond = info["h_c"] > 1.24 * P.a if what == "detachment" else info["h_c"] < 1.2 * MM
     assert beyond or abs(info["r_c"] - info["r_ref"]) > 8 * MM
     terms = sum(info[f"cost_{name}"] for name in ("radius", "pull", "pull_step", "heater_step"))
-    assert gained == pytest.approx(1 - 10 * terms / (10 + terms) - 10 * (2160 - k))
+    assert gained == pytest.approx(1 - 10 * terms / (10 + terms) - 10 * (2160 - k + 1))
     assert returns < -9.0 * 2160 + 10 * k
 
 
@@ -95,7 +94,7 @@ def test_failure_inside_a_long_interval_is_latched() -> None:
     assert 1.24 * P.a < info["h_c"] < 1.26 * P.a
     assert all(math.isfinite(value) for value in info.values())
     assert np.isfinite(observation).all()
-    assert gained < -10.0 * 9 + 1
+    assert gained < -10.0 * 10 + 1
 
 
 def test_failing_at_the_horizon_is_a_failure() -> None:
