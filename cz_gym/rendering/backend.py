@@ -1,0 +1,32 @@
+"""pygame, loaded when the first picture is drawn, quietly and without touching the user's environment."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import io
+import warnings
+from typing import Any
+
+from gymnasium.error import DependencyNotInstalled
+
+MISSING = 'rendering needs pygame: pip install "cz-gym[render]"'
+
+
+def available() -> bool:
+    """Whether pygame can be found."""
+    return importlib.util.find_spec("pygame") is not None
+
+
+def load() -> Any:
+    """The pygame module; :class:`gymnasium.error.DependencyNotInstalled` says how to get it.
+
+    pygame greets on standard output and warns of what its own imports do; neither is the user's concern.
+    """
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return importlib.import_module("pygame")
+    except ImportError:
+        raise DependencyNotInstalled(MISSING) from None

@@ -1,0 +1,217 @@
+"""A canvas: shapes at twice the picture's resolution, so that their edges are smooth, and text on top."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from .backend import load
+from .palette import BACK, FAINT, INK, PANEL, RIM, Colour, mix
+
+if TYPE_CHECKING:
+    from pygame import Surface
+
+Points = npt.NDArray[np.float64]
+FINE = 2
+"""Drawn pixels along each side of a pixel of the picture."""
+FONTS = Path(__file__).parent / "fonts"
+TIMES = "\N{MULTIPLICATION SIGN}"
+BASE = (640, 480)
+"""Width and height [px] at which text and lines have their nominal size."""
+
+
+class Box(NamedTuple):
+    """A rectangle of the picture [px]; y runs down."""
+
+    x: float
+    y: float
+    w: float
+    h: float
+
+    @property
+    def right(self) -> float:
+        """The right edge."""
+        return self.x + self.w
+
+    @property
+    def bottom(self) -> float:
+        """The lower edge."""
+        return self.y + self.h
+
+    def inner(self, left: float, top: float, right: float, bottom: float) -> Box:
+        """The box without margins of these widths [px]."""
+        return Box(self.x + left, self.y + top, self.w - left - right, self.h - top - bottom)
+
+
+class Label(NamedTuple):
+    """Text waiting to be drawn."""
+
+    x: float
+    y: float
+    text: str
+    size: float
+    colour: Colour
+    anchor: str
+    bold: bool
+
+
+class Canvas:
+    """A picture of a given width and height [px]; all coordinates are pixels of the picture, floats welcome."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self.pygame = load()
+        self.width, self.height = width, height
+        self.unit = min(width / BASE[0], height / BASE[1])
+        """Size of a nominal pixel [px]."""
+        self._fine: Surface = self.pygame.Surface((FINE * width, FINE * height), 0, 32)
+        self._picture: Surface = self.pygame.Surface((width, height), 0, 32)
+        self._labels: list[Label] = []
+
+    def clear(self) -> None:
+        """Begin a new picture."""
+        self._fine.fill(BACK)
+        self._labels.clear()
+
+    def finish(self) -> Surface:
+        """The picture; the next one is drawn into the same surface."""
+        self.pygame.transform.smoothscale(self._fine, (self.width, self.height), self._picture)
+        for label in self._labels:
+            self._write(label)
+        return self._picture
+
+    @contextmanager
+    def clip(self, box: Box) -> Iterator[None]:
+        """Draw shapes inside the box only."""
+        self._fine.set_clip(_rounded(box))
+        try:
+            yield
+        finally:
+            self._fine.set_clip(None)
+
+    def panel(self, box: Box, title: str = "") -> None:
+        """A panel's ground, with its title."""
+        radius = round(6 * self.unit * FINE)
+        self.pygame.draw.rect(self._fine, PANEL, _rounded(box), border_radius=radius)
+        if title:
+            self.text(box.x + 8 * self.unit, box.y + 5 * self.unit, title, 9.5, FAINT)
+
+    def frame(self, box: Box) -> None:
+        """A thin line around a box."""
+        self.pygame.draw.rect(self._fine, RIM, _rounded(box), width=max(1, round(self.unit)))
+
+    def rectangle(self, colour: Colour, box: Box, round_by: float = 0.0) -> None:
+        """A filled rectangle, its corners rounded by that radius [nominal px]."""
+        self.pygame.draw.rect(self._fine, colour, _rounded(box), border_radius=round(round_by * self.unit * FINE))
+
+    def polygon(self, colour: Colour, points: Points) -> None:
+        """A filled polygon, points of shape (n, 2); nothing with fewer than three."""
+        if len(points) > 2:
+            self.pygame.draw.polygon(self._fine, colour, _fine(points))
+
+    def lines(self, colour: Colour, points: Points, width: float = 1.5) -> None:
+        """Straight lines from point to point, shape (n, 2), of that width [nominal px]."""
+        if len(points) > 1:
+            self.pygame.draw.lines(self._fine, colour, False, _fine(points), max(1, round(width * self.unit * FINE)))
+
+    def dashes(self, colour: Colour, points: Points, width: float = 1.2, dash: float = 5.0, gap: float = 4.0) -> None:
+        """Dashed lines from point to point; dash and gap in nominal px along the line."""
+        if len(points) < 2:
+            return
+        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+        starts = np.arange(0.0, along[-1], (dash + gap) * self.unit)
+        ends = np.minimum(starts + dash * self.unit, along[-1])
+        at = np.stack([np.interp(np.concatenate([starts, ends]), along, axis) for axis in points.T], 1)
+        thick, fine = max(1, round(width * self.unit * FINE)), _fine(at)
+        for start, end in zip(fine[: len(starts)], fine[len(starts) :], strict=True):
+            self.pygame.draw.line(self._fine, colour, start, end, thick)
+
+    def dot(self, colour: Colour, at: tuple[float, float], radius: float, width: float = 0.0) -> None:
+        """A filled circle of that radius [nominal px], or a ring of that line width."""
+        size = max(1, round(radius * self.unit * FINE))
+        centre = (round(at[0] * FINE), round(at[1] * FINE))
+        self.pygame.draw.circle(self._fine, colour, centre, size, round(width * self.unit * FINE))
+
+    def glow(self, colour: Colour, x: float, y: float, radius: float) -> None:
+        """Light around a point, fading over that radius [nominal px]."""
+        size = max(2, round(radius * self.unit * FINE))
+        corner = (round(x * FINE) - size, round(y * FINE) - size)
+        self._fine.blit(_glow(colour, size), corner, special_flags=self.pygame.BLEND_RGB_ADD)
+
+    def shade(self, box: Box, top: Colour, bottom: Colour) -> None:
+        """A box whose colour runs from top to bottom."""
+        x, y, w, h = _rounded(box)
+        self._fine.blit(_gradient(w, h, top, bottom), (x, y))
+
+    def text(
+        self,
+        x: float,
+        y: float,
+        text: str,
+        size: float = 11.0,
+        colour: Colour = INK,
+        anchor: str = "left",
+        bold: bool = False,
+    ) -> None:
+        """Text whose top is at y and whose left, centre or right (``anchor``) is at x; size in nominal px."""
+        self._labels.append(Label(x, y, text, size, colour, anchor, bold))
+
+    def _write(self, label: Label) -> None:
+        image = _glyphs(label.text, max(7, round(label.size * self.unit)), label.colour, label.bold)
+        left = {"left": 0.0, "centre": 0.5, "right": 1.0}[label.anchor] * image.get_width()
+        self._picture.blit(image, (round(label.x - left), round(label.y)))
+
+
+def _rounded(box: Box) -> tuple[int, int, int, int]:
+    left, top = round(box.x * FINE), round(box.y * FINE)
+    return left, top, round(box.right * FINE) - left, round(box.bottom * FINE) - top
+
+
+def _fine(points: Points) -> list[list[float]]:
+    """Points as the drawing functions take them; far-off ones are held, since their integers would wrap."""
+    held: list[list[float]] = np.minimum(np.maximum(points * float(FINE), -20_000.0), 20_000.0).tolist()
+    return held
+
+
+@lru_cache(maxsize=8)
+def _font(size: int, bold: bool) -> Any:
+    pygame = load()
+    pygame.font.init()
+    return pygame.font.Font(FONTS / ("DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"), size)
+
+
+@lru_cache(maxsize=2048)
+def _glyphs(text: str, size: int, colour: Colour, bold: bool) -> Any:
+    try:
+        return _font(size, bold).render(text, True, colour)
+    except load().error:
+        # pygame.quit(), called by anybody, ends the life of every font.
+        _font.cache_clear()
+        return _font(size, bold).render(text, True, colour)
+
+
+@lru_cache(maxsize=16)
+def _glow(colour: Colour, size: int) -> Any:
+    at = np.arange(-size, size) + 0.5
+    distance = np.hypot(at[:, None], at[None, :]) / size
+    light = np.clip(1.0 - distance, 0.0, 1.0) ** 2.2
+    return _image((light[..., None] * np.array(colour)).astype(np.uint8))
+
+
+@lru_cache(maxsize=16)
+def _gradient(width: int, height: int, top: Colour, bottom: Colour) -> Any:
+    column = np.array([mix(top, bottom, row / max(height - 1, 1)) for row in range(height)], np.uint8)
+    return _image(np.broadcast_to(column, (width, height, 3)))
+
+
+def _image(pixels: npt.NDArray[np.uint8]) -> Any:
+    """A surface in the canvas' own format of pixels of shape (width, height, 3)."""
+    pygame = load()
+    image = pygame.Surface(pixels.shape[:2], 0, 32)
+    pygame.surfarray.blit_array(image, pixels)
+    return image

@@ -1,0 +1,117 @@
+"""The column of numbers: radius, pull speed, heater, heater temperature against its recipe, melt temperature."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..task import HEATER_RANGE
+from ..units import KILO, MM, MM_PER_MIN
+from . import palette
+from .canvas import Box, Canvas
+from .palette import Colour
+from .record import Record
+
+T_1_RANGE = 20.0
+"""T_1 gauge: nominal +- this [K]."""
+T_B_RANGE = 3.0
+"""T_b gauge: nominal +- this [K]."""
+GAP = 6.0
+
+
+class Gauge(NamedTuple):
+    """One gauge: a bar from its origin to its value on a scale from low to high, any unit."""
+
+    name: str
+    shown: str
+    value: float
+    low: float
+    high: float
+    origin: float
+    colour: Colour
+    mark: float | None = None
+    """A set-point, drawn as a pointer."""
+    note: str = ""
+    """What stands under the bar."""
+
+
+class Asked(NamedTuple):
+    """What somebody asks of the drives."""
+
+    v_p: float
+    """Pull speed [m/s]."""
+    Q_H: float
+    """Heater power [W]."""
+
+
+def gauges(record: Record, asked: Asked | None = None) -> tuple[Gauge, ...]:
+    """The gauges of a record's newest sample; ``asked`` adds the set-points of the drives."""
+    now, p = record.now, record.puller
+    v_0, window = p.v_0 / MM_PER_MIN, HEATER_RANGE / KILO
+    v_p, Q_H, Q_H_0 = now.v_p / MM_PER_MIN, now.Q_H / KILO, p.Q_H_0 / KILO
+    recipe = now.T_1 - now.T_1_ref
+    return (
+        Gauge(
+            "pull", f"{v_p:.2f} mm/min", v_p, 0.0, 2.0 * v_0, 0.0, palette.DRIVE,
+            None if asked is None else asked.v_p / MM_PER_MIN, f"nominal {v_0:.2f}",
+        ),
+        Gauge(
+            "heater", f"{Q_H:.2f} kW", Q_H, Q_H_0 - window, Q_H_0 + window, Q_H_0, palette.DRIVE,
+            None if asked is None else asked.Q_H / KILO, f"nominal {Q_H_0:.2f}",
+        ),
+        Gauge(
+            "T₁ heater", f"{now.T_1:.1f} K", now.T_1, p.T_1_0 - T_1_RANGE, p.T_1_0 + T_1_RANGE, p.T_1_0,
+            palette.TEMPERATURE, now.T_1_ref, f"recipe {now.T_1_ref:.1f}, {recipe:+.1f} K",
+        ),
+        Gauge(
+            "T_b melt", f"{now.T_b:.2f} K", now.T_b, p.T_b_0 - T_B_RANGE, p.T_b_0 + T_B_RANGE, p.T_b_0,
+            palette.TEMPERATURE, None, f"nominal {p.T_b_0:.2f}, {now.T_b - p.T_b_0:+.2f} K",
+        ),
+    )  # fmt: skip
+
+
+def draw(canvas: Canvas, box: Box, record: Record, asked: Asked | None = None) -> None:
+    """The column: the radius on top, then a panel a gauge."""
+    unit = canvas.unit
+    shown = gauges(record, asked)
+    height = (box.h - len(shown) * GAP * unit) / (len(shown) + 1.45)
+    radius(canvas, Box(box.x, box.y, box.w, 1.45 * height), record)
+    for i, gauge in enumerate(shown):
+        y = box.y + 1.45 * height + GAP * unit + i * (height + GAP * unit)
+        _gauge(canvas, Box(box.x, y, box.w, height), gauge)
+
+
+def radius(canvas: Canvas, box: Box, record: Record) -> None:
+    """The true radius error in large figures, with reference and camera under it."""
+    now, unit = record.now, canvas.unit
+    canvas.panel(box, "true radius error")
+    middle = box.x + box.w / 2.0
+    canvas.text(middle, box.y + 16 * unit, f"{(now.r_c - now.r_ref) / MM:+.2f} mm", 19, palette.TRUE, "centre", True)
+    canvas.text(box.x + 8 * unit, box.y + 40 * unit, "reference", 9.5, palette.FAINT)
+    canvas.text(box.right - 8 * unit, box.y + 40 * unit, f"{now.r_ref / MM:.2f}", 9.5, palette.REFERENCE, "right")
+    camera = f"{now.camera / MM:.2f}" if now.valid > 0.0 else "no reading"
+    canvas.text(box.x + 8 * unit, box.y + 52 * unit, "by the camera", 9.5, palette.FAINT)
+    canvas.text(box.right - 8 * unit, box.y + 52 * unit, camera, 9.5, palette.CAMERA, "right")
+
+
+def _gauge(canvas: Canvas, box: Box, gauge: Gauge) -> None:
+    unit = canvas.unit
+    canvas.panel(box, gauge.name)
+    canvas.text(box.right - 8 * unit, box.y + 4 * unit, gauge.shown, 10.5, palette.INK, "right", True)
+    track = Box(box.x + 8 * unit, box.y + 20.5 * unit, box.w - 16 * unit, 6.0 * unit)
+    canvas.rectangle(palette.TRACK, track, 3.0)
+
+    def at(value: float) -> float:
+        share = (value - gauge.low) / (gauge.high - gauge.low)
+        return track.x + float(np.clip(share, 0.0, 1.0)) * track.w
+
+    left, right = sorted((at(gauge.origin), at(gauge.value)))
+    canvas.rectangle(gauge.colour, Box(left, track.y, max(right - left, unit), track.h), 2.0)
+    middle = track.x + track.w / 2.0
+    canvas.lines(palette.FAINT, np.array([[middle, track.y - 2 * unit], [middle, track.bottom + 2 * unit]]), 1.0)
+    if gauge.mark is not None:
+        x, top = at(gauge.mark), track.y - 1.0 * unit
+        pointer = [[x, top + 4 * unit], [x - 4 * unit, top - 3 * unit], [x + 4 * unit, top - 3 * unit]]
+        canvas.polygon(palette.RECIPE, np.array(pointer))
+    canvas.text(box.x + 8 * unit, track.bottom + 3 * unit, gauge.note, 9.0, palette.FAINT)

@@ -1,0 +1,131 @@
+"""What a picture is drawn from: one episode's samples so far, read from the environment and never written back."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ..config import Config
+from ..plant import Puller
+from ..slots import INFO
+from ..task import HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT
+
+Floats = npt.NDArray[np.float64]
+_READ = ("r_c", "r_br", "r_ref", "h_c", "v_g", "v_p", "Q_H", "T_1", "T_1_ref", "T_b", "r_br_measured")
+_ROWS = [INFO.index(name) for name in _READ]
+
+
+class Sample(NamedTuple):
+    """One instant, SI units."""
+
+    r_c: float
+    """True crystal radius [m]."""
+    r_br: float
+    """True radius of the bright ring [m]."""
+    r_ref: float
+    """Reference [m]."""
+    h_c: float
+    """Meniscus height [m]."""
+    v_g: float
+    """Growth rate [m/s]."""
+    v_p: float
+    """Pull speed [m/s]."""
+    Q_H: float
+    """Heater power [W]."""
+    T_1: float
+    """Heater temperature [K]."""
+    T_1_ref: float
+    """Its recipe [K]."""
+    T_b: float
+    """Melt temperature [K]."""
+    camera: float
+    """The camera's radius: the ring it reports minus the operator's bias [m]."""
+    valid: float
+    """1 if the camera says this reading is good, else 0."""
+    t: float
+    """Time since the episode's beginning [s]."""
+    length: float
+    """Length grown since the record began [m]."""
+
+
+_AT = {name: column for column, name in enumerate(Sample._fields)}
+
+
+class Ending(Enum):
+    """How an episode ended, in words for a picture."""
+
+    FROZEN = "FROZEN: meniscus too low"
+    DETACHED = "DETACHED: meniscus too high"
+    LOST = "RADIUS LOST: more than 8 mm off"
+    HORIZON = "END OF THE RUN"
+
+
+class Record:
+    """The samples of one puller's episode, oldest first."""
+
+    def __init__(self, config: Config, slot: Any, scenario: str) -> None:
+        self.config = config
+        self.scenario = scenario
+        self.puller = Puller(*slot["puller"].tolist())
+        self.ending: Ending | None = None
+        self._rows = np.zeros((256, len(Sample._fields)))
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def now(self) -> Sample:
+        """The newest sample."""
+        return Sample(*self._rows[self._count - 1].tolist())
+
+    def column(self, name: str) -> Floats:
+        """All values of a sample's field, shape (samples,); not to be written to."""
+        return self._rows[: self._count, _AT[name]]
+
+    def add(self, info: Floats, slot: Any, terminated: bool = False, truncated: bool = False) -> None:
+        """Add the sample of info rows (:data:`cz_gym.slots.INFO`) and the slot they were read from.
+
+        The length grown is what the pull took up and the meniscus did not: h_c' = v_p - v_g, integrated exactly.
+        """
+        values = dict(zip(_READ, info[_ROWS].tolist(), strict=True))
+        values["camera"] = values.pop("r_br_measured") - self.puller.ring_bias
+        t, length = float(slot["k"]) * self.config.control_interval, 0.0
+        if self._count:
+            before = self.now
+            length = before.length + values["v_p"] * (t - before.t) - (values["h_c"] - before.h_c)
+        sample = Sample(valid=float(slot["valid"]), t=t, length=length, **values)
+        if self._count == len(self._rows):
+            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
+        self._rows[self._count] = sample
+        self._count += 1
+        if terminated or truncated:
+            self.ending = how_it_failed(sample, self.puller.a) if terminated else Ending.HORIZON
+
+    def surface(self, height: float | None = None) -> tuple[Floats, Floats, Floats]:
+        """The grown surface: radius, reference [m] and height above the melt [m], newest (lowest) first.
+
+        What solidified when the crystal was L long now hangs at h_c + (L_now - L). ``height`` [m] above the triple
+        point limits how much is returned.
+        """
+        now, length = self.now, self.column("length")
+        # What was melted back hangs there no more: its length is above one that came later.
+        kept = length <= np.minimum.accumulate(length[::-1])[::-1]
+        if height is not None:
+            inside = np.flatnonzero(kept & (length >= now.length - height))
+            kept[: max(int(inside[0]) - 1, 0)] = False
+        z = now.h_c + (now.length - length[kept])
+        return self.column("r_c")[kept][::-1], self.column("r_ref")[kept][::-1], z[::-1]
+
+
+def how_it_failed(sample: Sample, a: float) -> Ending:
+    """The limit that a failed sample broke, or came nearest to where the last substep was not kept."""
+    room = {
+        Ending.FROZEN: (sample.h_c - HEIGHT_MIN) / HEIGHT_MIN,
+        Ending.DETACHED: (HEIGHT_MAX_IN_A * a - sample.h_c) / a,
+        Ending.LOST: (RADIUS_LIMIT - abs(sample.r_c - sample.r_ref)) / RADIUS_LIMIT,
+    }
+    return min(room, key=lambda ending: room[ending])

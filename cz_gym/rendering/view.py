@@ -1,0 +1,129 @@
+"""What an environment with a ``render_mode`` owns: the episode's record, its picture and, for "human", the window."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium.error import DependencyNotInstalled, Error, ResetNeeded
+
+from ..config import Config
+from .backend import MISSING, available, load
+from .record import Record
+from .scene import Scene, check_size
+
+if TYPE_CHECKING:
+    from pygame import Surface
+
+Frame = npt.NDArray[np.uint8]
+MODES = ("human", "rgb_array")
+FPS = 30
+"""Frames a second of a window or a video; each frame is one control interval."""
+CAPTION = "Cz-v0: Czochralski growth"
+
+
+def declared_modes() -> list[str]:
+    """The render modes that can be drawn here: none without pygame."""
+    return list(MODES) if available() else []
+
+
+def make_view(render_mode: str | None, size: Any, config: Config) -> View | None:
+    """The view of a render mode, None without one.
+
+    Raises ValueError for a mode or size that is not allowed, DependencyNotInstalled where pygame is missing.
+    """
+    width, height = check_size(size)
+    if render_mode is None:
+        return None
+    if render_mode not in MODES:
+        raise ValueError(f"unknown render_mode {render_mode!r}; choose from {', '.join(['None', *MODES])}")
+    if not available():
+        raise DependencyNotInstalled(MISSING)
+    return View(render_mode, width, height, config)
+
+
+def image(surface: Surface) -> Frame:
+    """A surface as an array of its own, shape (height, width, 3)."""
+    width, height = surface.get_size()
+    return np.frombuffer(load().image.tobytes(surface, "RGB"), np.uint8).reshape(height, width, 3).copy()
+
+
+class View:
+    """Records an episode as it is stepped, and draws it when asked."""
+
+    def __init__(self, mode: str, width: int, height: int, config: Config) -> None:
+        self.mode, self.size, self.config = mode, (width, height), config
+        self.record: Record | None = None
+        self._scene: Scene | None = None
+        self._window: Window | None = None
+
+    def begin(self, info: npt.NDArray[np.float64], slot: Any, scenario: str) -> None:
+        """Start the record of an episode from its first sample, or from wherever a state was restored."""
+        self.record = Record(self.config, slot, scenario)
+        self.record.add(info, slot)
+        self._show()
+
+    def add(self, info: npt.NDArray[np.float64], slot: Any, terminated: bool, truncated: bool) -> None:
+        """Record a step."""
+        if self.record is not None:
+            self.record.add(info, slot, terminated, truncated)
+            self._show()
+
+    def _show(self) -> None:
+        if self.mode == "human":
+            self.render()
+
+    def render(self) -> Frame | None:
+        """The picture, shape (height, width, 3), or None once it is in the window.
+
+        Raises ResetNeeded before the first reset.
+        """
+        if self.record is None:
+            raise ResetNeeded("cannot render before the first reset(): there is no crystal yet")
+        if self._scene is None:
+            self._scene = Scene(*self.size)
+        picture = self._scene.draw(self.record)
+        if self.mode == "rgb_array":
+            return image(picture)
+        if self._window is None:
+            self._window = Window(self.size, CAPTION)
+        self._window.show(picture)
+        return None
+
+    def close(self) -> None:
+        """Close the window, if there is one; it opens again with the next picture."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+
+class Window:
+    """A window for pictures of one size. Raises :class:`gymnasium.error.Error` where none can be opened."""
+
+    def __init__(self, size: tuple[int, int], caption: str) -> None:
+        self._pygame = load()
+        try:
+            self._pygame.display.init()
+            self.screen: Surface = self._pygame.display.set_mode(size)
+        except self._pygame.error as error:
+            raise Error(f"cannot open a window: {error}; render_mode='rgb_array' needs none") from None
+        self._pygame.display.set_caption(caption)
+        self._clock = self._pygame.time.Clock()
+
+    @property
+    def visible(self) -> bool:
+        """Whether anybody could see it: SDL opens windows that nobody sees where there is no display."""
+        driver: str = self._pygame.display.get_driver()
+        return driver != "offscreen"
+
+    def show(self, picture: Surface) -> None:
+        """Show a picture, at most FPS a second."""
+        self.screen.blit(picture, (0, 0))
+        self._pygame.event.pump()
+        self._clock.tick(FPS)
+        self._pygame.display.flip()
+
+    def close(self) -> None:
+        """Close it."""
+        self._pygame.display.quit()
