@@ -17,6 +17,7 @@ from .config import make_config
 from .meniscus import MeniscusModel
 from .observation import CLIP, OBSERVATIONS
 from .parameters import Parameters
+from .rendering.view import FPS, Frame, declared_modes, make_view
 from .scenario import Scenario
 from .scenarios import find_scenario
 from .slots import INFO
@@ -86,9 +87,12 @@ class CzEnv(gym.Env[Observation, Action]):
     ``scenario`` (name or :class:`cz_gym.Scenario`), ``model`` ("I", "II", a mix in [0, 1], or None for the
     scenario's draw), ``observation``, ``control_interval`` [s], ``horizon`` [s], ``render_mode``, ``parameters``
     (:class:`cz_gym.Parameters`), ``meniscus`` (:class:`cz_gym.MeniscusModel`). Bad values raise ValueError.
+    ``render_mode`` is None, "rgb_array" or "human", ``render_size`` the picture's width and height [px]; rendering
+    needs the extra ``render``, without which no mode is declared and asking for one raises
+    :class:`gymnasium.error.DependencyNotInstalled`.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  (Gymnasium's own declaration)
+    metadata: dict[str, Any] = {"render_modes": declared_modes(), "render_fps": FPS}  # noqa: RUF012  (Gymnasium's own)
 
     def __init__(
         self,
@@ -100,8 +104,8 @@ class CzEnv(gym.Env[Observation, Action]):
         render_mode: str | None = None,
         parameters: Parameters | None = None,
         meniscus: MeniscusModel | None = None,
+        render_size: tuple[int, int] = (640, 480),
     ) -> None:
-        check_render_mode(render_mode, self.metadata)
         self.render_mode = render_mode
         self.config = make_config(scenario, model, observation, control_interval, horizon, parameters, meniscus)
         self.action_space = action_space()
@@ -114,6 +118,7 @@ class CzEnv(gym.Env[Observation, Action]):
         self._said = self._out.info[:, 0]
         self._step = self._batch.bound_step(self._action, self._out)
         self._over = True
+        self._view = make_view(render_mode, render_size, self.config)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -132,6 +137,7 @@ class CzEnv(gym.Env[Observation, Action]):
             self.set_state(given["state"])
         else:
             self._batch.reset([0], [new_key(self.np_random)], self._out, scenario)
+            self._look(scenario)
         self._over = bool(self._slots["over"][0])
         return self._shown.copy(), self._info()
 
@@ -147,6 +153,8 @@ class CzEnv(gym.Env[Observation, Action]):
         out = self._out
         terminated, truncated = out.terminated.item(), out.truncated.item()
         self._over = terminated or truncated
+        if self._view is not None:
+            self._view.add(self._said, self._slots[0], terminated, truncated)
         return self._shown.copy(), out.reward.item(), terminated, truncated, self._info()
 
     def get_state(self) -> EnvState:
@@ -158,14 +166,32 @@ class CzEnv(gym.Env[Observation, Action]):
         self._check_state(state)
         self._batch.restore([0], [state.slot], self._out)
         self.np_random.bit_generator.state = state.random
+        self._look()
         self._over = bool(self._slots["over"][0])
 
     def _check_state(self, state: Any) -> None:
         check_state(state, self._batch)
 
+    def render(self) -> Frame | None:
+        """The picture, uint8 of shape (height, width, 3), for "rgb_array"; "human" shows it at every reset and step.
+
+        Raises ResetNeeded before the first reset.
+        """
+        if self._view is None:
+            gym.logger.warn('nothing to render: make the environment with render_mode="rgb_array" or "human"')
+            return None
+        return self._view.render()
+
     def close(self) -> None:
-        """Nothing to close."""
+        """Close the window, if there is one."""
+        if self._view is not None:
+            self._view.close()
         self._batch.close()
+
+    def _look(self, scenario: Scenario | None = None) -> None:
+        """Show the crystal from here on."""
+        if self._view is not None:
+            self._view.begin(self._said, self._slots[0], (scenario or self.config.scenario).name)
 
     def _info(self) -> dict[str, Any]:
         info: dict[str, Any] = dict(zip(INFO, self._said.tolist(), strict=True))
@@ -199,10 +225,3 @@ def check_action(action: Any) -> Any:
     if pull != pull or heat != heat:
         raise InvalidAction(f"an action must not be NaN: {action!r}")
     return array
-
-
-def check_render_mode(render_mode: str | None, metadata: dict[str, Any]) -> None:
-    """ValueError for a render mode that is not declared."""
-    modes = metadata["render_modes"]
-    if render_mode is not None and render_mode not in modes:
-        raise ValueError(f"unknown render_mode {render_mode!r}; choose from {', '.join(['None', *modes])}")

@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 
 from .batch import Batch, new_key
 from .config import make_config
-from .env import CzEnv, EnvState, action_space, check_options, check_render_mode, check_state, observation_space
+from .env import CzEnv, EnvState, action_space, check_options, check_state, observation_space
 from .meniscus import MeniscusModel
 from .parameters import Parameters
 from .scenario import Scenario
@@ -54,7 +54,8 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
             raise ValueError(f"num_envs must be a positive whole number, not {num_envs!r}")
         if threads is not None and (not isinstance(threads, int) or threads < 1):
             raise ValueError(f"threads must be a positive whole number or None, not {threads!r}")
-        check_render_mode(render_mode, self.metadata)
+        if render_mode is not None:
+            raise ValueError(f"a batch does not render: render_mode must be None, not {render_mode!r}")
         self.render_mode = render_mode
         self.num_envs = num_envs
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -249,4 +250,4 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         return infos
 
 
-CzVectorEnv.metadata = {**CzEnv.metadata, "autoreset_mode": AutoresetMode.NEXT_STEP}
+CzVectorEnv.metadata = {**CzEnv.metadata, "render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}

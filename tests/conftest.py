@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+os.environ["SDL_VIDEODRIVER"] = os.environ["SDL_AUDIODRIVER"] = "dummy"  # no test opens a window
 os.environ.setdefault("CZ_GYM_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "cz-gym"))
 
 settings.register_profile("repeatable", deadline=None, derandomize=True, database=None, max_examples=40)
