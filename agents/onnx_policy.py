@@ -13,14 +13,19 @@ from cz_gym.config import Config
 from cz_gym.observation import OBSERVATIONS
 
 from .contract import AgentFileError, Contract, observation_hash, read_agent
+from .graph import GraphError, checked
+
+Floats = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class OnnxPolicy:
-    """A feed-forward agent; deterministic, stateless, batched."""
+    """A deterministic, batched agent; what it remembers, if anything, travels in ``state``."""
 
     contract: Contract
     session: Any = field(repr=False, compare=False)
+    remembers: int = 0
+    """Length of its state; 0 if it has none."""
 
     @classmethod
     def load(cls, path: str | Path, config: Config | None = None) -> OnnxPolicy:
@@ -54,9 +59,9 @@ class OnnxPolicy:
             raise AgentFileError(
                 f"{path}: trained on plant {contract.plant_hash}, this environment's is {config.plant_hash}"
             )
-        policy = cls(contract, _session(path, onnx_bytes, expected))
+        policy = cls(contract, *_session(path, onnx_bytes, expected))
         try:
-            policy._run(np.zeros((2, expected), np.float32))
+            policy.predict(np.zeros((2, expected), np.float32))
         except AgentFileError as error:
             raise AgentFileError(f"{path}: {error}") from None
         return policy
@@ -69,41 +74,54 @@ class OnnxPolicy:
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[npt.NDArray[np.float32], Any]:
-        """Actions, shape (n, 2) or (2,), of observations of shape (n, channels) or (channels,)."""
+        """Actions, shape (n, 2) or (2,), of observations of shape (n, channels) or (channels,).
+
+        An agent that remembers takes and returns ``state``, shape (n, k) or (k,); None, and rows where
+        ``episode_start``, begin at zero. One that does not returns it as it was.
+        """
         array = np.asarray(observation, np.float32)
         if array.ndim not in (1, 2) or array.shape[-1] != self.contract.channels:
             raise ValueError(
                 f"expected {self.contract.channels} channels ({self.observation}), got shape {array.shape}"
             )
-        action = self._run(np.atleast_2d(array))
-        return (action[0] if array.ndim == 1 else action), state
+        rows = np.atleast_2d(array)
+        if not self.remembers:
+            (action,) = self._run({"observation": rows})
+            return (action[0] if array.ndim == 1 else action), state
+        before = np.zeros((len(rows), self.remembers), np.float32)
+        if state is not None:
+            before += np.reshape(state, before.shape)
+        if episode_start is not None:
+            before[np.broadcast_to(episode_start, len(rows))] = 0.0
+        action, after = self._run({"observation": rows, "state": before})
+        return (action[0], after[0]) if array.ndim == 1 else (action, after)
 
-    def _run(self, observation: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    def _run(self, inputs: dict[str, Floats]) -> list[Floats]:
         try:
-            (action,) = self.session.run(None, {"observation": observation})
+            outputs: list[Floats] = self.session.run(None, inputs)
         except Exception:  # onnxruntime raises its own exception types, one for each way a graph can fail
             raise AgentFileError(f"agent {self.contract.sha256[:12]}: its graph cannot be run") from None
-        if action.shape != (len(observation), 2) or not np.isfinite(action).all():
+        shapes = [(len(inputs["observation"]), width) for width in (2, self.remembers) if width]
+        if [output.shape for output in outputs] != shapes or not all(np.isfinite(output).all() for output in outputs):
             raise AgentFileError(f"agent {self.contract.sha256[:12]}: its action is not two finite numbers")
-        found: npt.NDArray[np.float32] = action
-        return found
+        return outputs
 
 
-def _session(path: str | Path, onnx_bytes: bytes, channels: int) -> Any:
+def _session(path: str | Path, onnx_bytes: bytes, channels: int) -> tuple[Any, int]:
+    """The graph, ready to run, and the length of its state."""
     try:
         import onnxruntime
+
+        clean, state = checked(onnx_bytes, channels)
     except ImportError:
-        raise AgentFileError('running agents needs onnxruntime: pip install "cz-gym[benchmark]"') from None
+        raise AgentFileError('running agents needs onnx and onnxruntime: pip install "cz-gym[benchmark]"') from None
+    except GraphError as error:
+        raise AgentFileError(f"{path}: {error}") from None
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     options.log_severity_level = 4
     try:
-        session = onnxruntime.InferenceSession(onnx_bytes, options, providers=["CPUExecutionProvider"])
+        return onnxruntime.InferenceSession(clean, options, providers=["CPUExecutionProvider"]), state
     except Exception:  # onnxruntime raises its own exception types, one for each way a file can be broken
         raise AgentFileError(f"{path}: not an ONNX model that onnxruntime can run") from None
-    inputs = [(value.name, value.shape[1:], value.type) for value in session.get_inputs()]
-    outputs = [(value.name, value.shape[1:]) for value in session.get_outputs()]
-    if inputs != [("observation", [channels], "tensor(float)")] or outputs != [("action", [2])]:
-        raise AgentFileError(f"{path}: must map observation (n, {channels}) to action (n, 2)")
-    return session
