@@ -1,0 +1,52 @@
+"""Actions that look for trouble: extremes, bang-bang, long saturation, infinities; feedback that saves a crystal while
+its heater saturates."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+KINDS = (
+    "uniform", "bang-bang", "full pull", "no pull", "kept alive, hot", "kept alive, cold", "infinite", "chatter",
+    "random walk", "kept alive, bang-bang heat",
+)  # fmt: skip
+"""One kind a slot, in turn."""
+RADIUS_GAIN, HEIGHT_GAIN = 1000.0, 700.0
+"""Pull action per metre of true radius error and of meniscus height [1/m]: poles near 0.01 rad/s."""
+EXTREME = (np.inf, -np.inf, 1e308, -1e308, 1e-320, -0.0, 1.0 + 1e-7, -1.0 - 1e-7)
+
+
+class Adversaries:
+    """Actions for ``num_envs`` slots, slot i by kind i modulo the number of kinds."""
+
+    def __init__(self, num_envs: int, seed: int) -> None:
+        self._kind = np.arange(num_envs) % len(KINDS)
+        self._random = np.random.default_rng([20, seed])
+        self._bang = np.ones((num_envs, 2))
+        self._walk = np.zeros((num_envs, 2))
+        self._turn = 0
+
+    def actions(self, infos: dict[str, Any], height: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """The next actions, shape (num_envs, 2), from the last infos and the nominal heights [m], shape (num_envs,)."""
+        random, n = self._random, len(self._kind)
+        self._turn += 1
+        flip = np.where(random.random((n, 2)) < 0.02, -1.0, 1.0)
+        self._bang *= flip
+        self._walk = np.clip(self._walk + 0.1 * random.standard_normal((n, 2)), -1.5, 1.5)
+        alive = RADIUS_GAIN * (infos["r_c"] - infos["r_ref"]) - HEIGHT_GAIN * (infos["h_c"] - height)
+        alive = alive + 0.02 * random.standard_normal(n)
+        extreme = np.array(EXTREME)[random.integers(len(EXTREME), size=(n, 2))]
+        chatter = np.full((n, 2), 1.0 if self._turn % 2 else -1.0)
+        one = np.ones(n)
+        by_kind = (
+            random.uniform(-1.0, 1.0, (n, 2)), self._bang, _pair(one, 0.0 * one), _pair(-one, 0.0 * one),
+            _pair(alive, one), _pair(alive, -one), extreme, chatter, self._walk, _pair(alive, self._bang[:, 1]),
+        )  # fmt: skip
+        chosen: npt.NDArray[np.float64] = np.stack(by_kind)[self._kind, np.arange(n)]
+        return chosen
+
+
+def _pair(pull: Any, heat: Any) -> npt.NDArray[np.float64]:
+    return np.stack([pull, heat], axis=-1)
