@@ -19,6 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ._compile import entry
+from .camera import IMAGE, make_view
+from .camera_image import build_look, new_scratch
 from .config import Config, Identity
 from .kernels import KERNELS, Kernels, build_kernels
 from .law import GRID, law_of
@@ -43,6 +45,11 @@ Key = tuple[int, int]
 @lru_cache(maxsize=8)
 def _kernels(meniscus: MeniscusModel) -> Kernels:
     return KERNELS if meniscus == HURLE else build_kernels(meniscus)
+
+
+@lru_cache(maxsize=8)
+def _look(meniscus: MeniscusModel) -> Any:
+    return build_look(meniscus)
 
 
 def new_key(random: np.random.Generator) -> Key:
@@ -93,10 +100,9 @@ class Batch:
         self.num_envs = num_envs
         self.kernels = _kernels(config.meniscus)
         self.clock = Clock(config.control_interval, config.steps, math.ceil(config.horizon / GRID) + 1)
-        self.channels = len(MEASURED) if config.observation == "measured" else len(HISTORY)
-        self.state_channels = 0 if config.observation == "measured" else len(STATE)
-        if config.observation == "state":
-            self.channels = len(MEASURED)
+        self.channels = len(HISTORY) if config.observation == "history" else len(MEASURED)
+        self.state_channels = len(STATE) if config.observation in ("history", "state") else 0
+        self._camera = config.observation == "camera"
         ages = lags(config.control_interval)
         v_0 = config.parameters.v_0
         self.reading = Reading(
@@ -119,7 +125,7 @@ class Batch:
             slots.view(np.float64).reshape(num_envs, -1),
             np.zeros((num_envs, rows, 3)),
             np.zeros((num_envs, depth, len(LAGGED))),
-            np.zeros((num_envs, frames, 2)),
+            np.zeros((num_envs, frames, 3)),
         )
         self.memory.slots["over"] = 1
         self._law = law_of(config.scenario)
@@ -133,7 +139,11 @@ class Batch:
         drawn = (self.memory, which, keys, self._law, self._mix, self._parameters, self.clock, self.reading, out, 0, 1)
         self._step, self._draw = entry(self.kernels.step, stepped), entry(self.kernels.draw, drawn)
         threads = threads or os.cpu_count() or 1
-        self._parts = max(1, min(threads, num_envs // SLOTS_PER_THREAD))
+        self._parts = max(1, min(threads, num_envs // (1 if self._camera else SLOTS_PER_THREAD)))
+        if self._camera:
+            self._view, self._scratch = make_view(config.camera), new_scratch(num_envs)
+            seen = (self.memory.slots, self._all, self._view, self._scratch, out.image, 0, 1)
+            self._look = entry(_look(config.meniscus), seen)
         self._pool: ThreadPoolExecutor | None = None
         self._owner = os.getpid()
 
@@ -149,6 +159,7 @@ class Batch:
         out = Out(
             np.empty((n, self.channels), np.float32),
             np.empty((n, self.state_channels), np.float32),
+            np.empty((n, *IMAGE) if self._camera else (n, 0, 0, 0), np.uint8),
             np.empty(n),
             np.empty(n, np.bool_),
             np.empty(n, np.bool_),
@@ -157,9 +168,31 @@ class Batch:
         self._spare = [*self._spare, out][-SPARES:]
         return out
 
+    def shown(self, out: Out) -> npt.NDArray[Any]:
+        """The observations among what a step wrote, a row a slot."""
+        shown: npt.NDArray[Any] = {"state": out.state, "camera": out.image}.get(
+            self.config.observation, out.observation
+        )
+        return shown
+
     def bound_step(self, actions: npt.NDArray[np.float64], out: Out) -> Any:
         """``step`` of all slots from and into always the same arrays, called without arguments."""
-        return partial(self._step, self.memory, actions, self._all, self.clock, self.reading, out, 0, self.num_envs)
+        n = self.num_envs
+        step = partial(self._step, self.memory, actions, self._all, self.clock, self.reading, out, 0, n)
+        if not self._camera:
+            return step
+
+        def step_and_look() -> None:
+            step()
+            self._photograph(out, self._all)
+
+        return step_and_look
+
+    def _photograph(self, out: Out, active: npt.NDArray[np.bool_]) -> None:
+        """Write the images of the active slots, where images are observed."""
+        if self._camera:
+            arguments = (self.memory.slots, active, self._view, self._scratch, out.image)
+            self._run(self._look, arguments, self.num_envs, 1)
 
     def reset(self, which: Sequence[int], keys: Iterable[Key], out: Out, scenario: Scenario | None = None) -> None:
         """Draw new episodes for the slots ``which`` and write their first sample into ``out``.
@@ -176,6 +209,10 @@ class Batch:
         )  # fmt: skip
         if max(self._run(self._draw, arguments, len(slots), DRAWS_PER_THREAD)) >= 0:
             raise ValueError(NO_OPERATING_POINT)
+        if self._camera:
+            drawn = np.zeros(self.num_envs, np.bool_)
+            drawn[slots] = True
+            self._photograph(out, drawn)
 
     def step(self, actions: npt.ArrayLike, out: Out, active: npt.NDArray[np.bool_] | None = None) -> None:
         """Advance the active slots by one control interval; actions of shape (num_envs, 2), not NaN."""
@@ -184,6 +221,7 @@ class Batch:
         active = self._all if active is None else active
         arguments = (self.memory, self.actions, active, self.clock, self.reading, out)
         self._run(self._step, arguments, self.num_envs, SLOTS_PER_THREAD)
+        self._photograph(out, active)
 
     def advance(self, rings: npt.NDArray[np.float64]) -> None:
         """Drives, plant and ring [m] of every slot, and nothing else: what the speed of a step is measured against."""
@@ -234,6 +272,10 @@ class Batch:
             for name, rows in zip(_SAVED, self._saved(), strict=True):
                 rows[i] = getattr(state, name)
         self.kernels.show(self.memory, np.array(which, np.int64), self.clock, self.reading, out, 0, len(which))
+        if self._camera:
+            shown = np.zeros(self.num_envs, np.bool_)
+            shown[list(which)] = True
+            self._photograph(out, shown)
 
     def _saved(self) -> tuple[npt.NDArray[Any], ...]:
         memory = self.memory

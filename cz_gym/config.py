@@ -10,8 +10,9 @@ from numbers import Real
 from typing import NamedTuple
 
 from ._compile import hashed
+from .camera import Camera, camera_for, check_camera
 from .meniscus import HURLE, MeniscusModel
-from .observation import OBSERVATIONS
+from .observation import CAMERA, OBSERVATIONS
 from .parameters import Parameters, check_parameters
 from .plant import make_puller
 from .scenario import Range, Scenario
@@ -60,6 +61,8 @@ class Config:
     """Length of an episode [s]."""
     parameters: Parameters = field(default_factory=Parameters)
     meniscus: MeniscusModel = HURLE
+    camera: Camera = field(default_factory=Camera)
+    """What ``observation="camera"`` looks through; nothing else depends on it."""
 
     @property
     def steps(self) -> int:
@@ -83,6 +86,8 @@ class Config:
         """SHA-256 of everything a saved state depends on (16 hex digits)."""
         mix = [float(share) + 0.0 for share in self.mix]
         parts = [self.plant_hash, self.scenario.hash, mix, self.observation, self.control_interval, self.horizon]
+        if self.observation == CAMERA:
+            parts.append(list(self.camera))
         return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
 
     @property
@@ -91,7 +96,8 @@ class Config:
         scenario = f"{self.scenario.name!r} ({self.scenario.hash})"
         low, high = self.mix
         mix = float(low) + 0.0, float(high) + 0.0
-        return Identity(VERSION, self.plant_hash, scenario, mix, self.observation, self.control_interval, self.horizon)
+        seen = f"camera {tuple(self.camera)}" if self.observation == CAMERA else self.observation
+        return Identity(VERSION, self.plant_hash, scenario, mix, seen, self.control_interval, self.horizon)
 
     def with_scenario(self, scenario: str | Scenario) -> Config:
         """The same settings on another scenario."""
@@ -106,12 +112,15 @@ def make_config(
     horizon: float = 10800.0,
     parameters: Parameters | None = None,
     meniscus: MeniscusModel | None = None,
+    camera: Camera | None = None,
 ) -> Config:
     """Check the arguments of the environment; ValueError names what was given and what is allowed."""
     found = find_scenario(scenario)
     mix_of(model, found)
-    if not isinstance(observation, str) or observation not in OBSERVATIONS:
-        raise ValueError(f"unknown observation {observation!r}; choose one of {', '.join(OBSERVATIONS)}")
+    if not isinstance(observation, str) or observation not in (*OBSERVATIONS, CAMERA):
+        raise ValueError(f"unknown observation {observation!r}; choose one of {', '.join([*OBSERVATIONS, CAMERA])}")
+    if camera is not None and observation != CAMERA:
+        raise ValueError(f'a camera is of use with observation="camera" only, not with {observation!r}')
     interval = _positive("control_interval", control_interval)
     length = _positive("horizon", horizon)
     steps = length / interval
@@ -121,7 +130,8 @@ def make_config(
         raise ValueError(f"meniscus must be a cz_gym.MeniscusModel, not {meniscus!r}")
     checked = check_parameters(parameters if parameters is not None else Parameters())
     check_height(make_puller(checked, meniscus=meniscus or HURLE))
-    return Config(found, model, observation, interval, length, checked, meniscus or HURLE)
+    looking = check_camera(camera_for(checked) if camera is None else camera, checked)
+    return Config(found, model, observation, interval, length, checked, meniscus or HURLE, looking)
 
 
 def _name(meniscus: MeniscusModel) -> str:

@@ -13,16 +13,17 @@ from gymnasium.error import InvalidAction, ResetNeeded
 from gymnasium.spaces import Box
 
 from .batch import Batch, SlotState, new_key
+from .camera import IMAGE, Camera
 from .config import make_config
 from .meniscus import MeniscusModel
-from .observation import CLIP, OBSERVATIONS
+from .observation import CAMERA, CLIP, OBSERVATIONS
 from .parameters import Parameters
 from .rendering.view import FPS, Frame, declared_modes, make_view
 from .scenario import Scenario
 from .scenarios import find_scenario
 from .slots import INFO
 
-Observation = npt.NDArray[np.float32]
+Observation = npt.NDArray[Any]
 Action = npt.NDArray[np.float32]
 _OPTIONS = ("scenario", "state")
 
@@ -41,7 +42,9 @@ def action_space() -> Any:
 
 
 def observation_space(observation: str) -> Any:
-    """The observation's channels, scaled and clipped to +-10."""
+    """The observation's channels, scaled and clipped to +-10, or the camera's grey values."""
+    if observation == CAMERA:
+        return Box(0, 255, IMAGE, np.uint8)
     return Box(-CLIP, CLIP, (len(OBSERVATIONS[observation]),), np.float32)
 
 
@@ -69,7 +72,8 @@ class CzEnv(gym.Env[Observation, Action]):
     ## Observation Space
     ``Box(-10, 10, (n,), float32)``; every channel with unit and scale in :mod:`cz_gym.observation`. "measured" (11) is
     what a puller's control computer has, "history" (72) adds the integral of the error and past samples, "state"
-    (17) is the true state and the disturbances, for bounds and asymmetric critics only.
+    (17) is the true state and the disturbances, for bounds and asymmetric critics only. "camera" is the camera's image
+    instead, ``Box(0, 255, (120, 160, 1), uint8)``; see :mod:`cz_gym.camera`.
 
     ## Rewards
     1 - c with c = 10 cost / (10 + cost), cost = (e_r / 0.5 mm)^2 + 0.5 (dv_p / 0.36 mm/min)^2 + 0.25 (step of v_p /
@@ -86,7 +90,8 @@ class CzEnv(gym.Env[Observation, Action]):
     ## Arguments
     ``scenario`` (name or :class:`cz_gym.Scenario`), ``model`` ("I", "II", a mix in [0, 1], or None for the
     scenario's draw), ``observation``, ``control_interval`` [s], ``horizon`` [s], ``render_mode``, ``parameters``
-    (:class:`cz_gym.Parameters`), ``meniscus`` (:class:`cz_gym.MeniscusModel`). Bad values raise ValueError.
+    (:class:`cz_gym.Parameters`), ``meniscus`` (:class:`cz_gym.MeniscusModel`), ``camera``
+    (:class:`cz_gym.camera.Camera`, with observation "camera" only). Bad values raise ValueError.
     ``render_mode`` is None, "rgb_array" or "human", ``render_size`` the picture's width and height [px]; rendering
     needs the extra ``render``, without which no mode is declared and asking for one raises
     :class:`gymnasium.error.DependencyNotInstalled`.
@@ -105,16 +110,17 @@ class CzEnv(gym.Env[Observation, Action]):
         parameters: Parameters | None = None,
         meniscus: MeniscusModel | None = None,
         render_size: tuple[int, int] = (640, 480),
+        camera: Camera | None = None,
     ) -> None:
         self.render_mode = render_mode
-        self.config = make_config(scenario, model, observation, control_interval, horizon, parameters, meniscus)
+        self.config = make_config(scenario, model, observation, control_interval, horizon, parameters, meniscus, camera)
         self.action_space = action_space()
         self.observation_space = observation_space(observation)
         self._batch = Batch(self.config, 1)
         self._slots = self._batch.memory.slots
         self._out = self._batch.new_out()
         self._action = np.zeros((1, 2))
-        self._shown = self._out.state[0] if observation == "state" else self._out.observation[0]
+        self._shown = self._batch.shown(self._out)[0]
         self._said = self._out.info[:, 0]
         self._step = self._batch.bound_step(self._action, self._out)
         self._over = True

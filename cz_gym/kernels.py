@@ -98,7 +98,8 @@ def _advance(slot: Any, series: Any, frames: Any, clock: Any, slope: Any, ring_o
         x, grows = _substep(x, u, _disturb(slot, series, j), p, upto - t, p.r_0 + reference(upto, e), slope)
         t = upto
         if e.latency > 0.0 and t < end - _EPS:
-            photograph(slot, frames, t, x.r_c + ring_offset(x.r_c, _height_inside(x.h_c, p), p) - p.ring_bias)
+            h_c = _height_inside(x.h_c, p)
+            photograph(slot, frames, t, x.r_c + ring_offset(x.r_c, h_c, p) - p.ring_bias, h_c)
     slot.x.r_c, slot.x.h_c, slot.x.T_1, slot.x.T_2, slot.x.T_b = x.r_c, x.h_c, x.T_1, x.T_2, x.T_b
     slot.k = slot.k + 1
     return grows
@@ -112,7 +113,7 @@ def _sample(memory: Any, i: Any, fresh: Any, clock: Any, reading: Any, out: Any,
     ring = x.r_c + ring_offset(x.r_c, h_c, p)
     series = memory.series[i]
     if fresh:
-        sense(slot, series[slot.k, 1], series[slot.k, 2], memory.frames[i], t, ring - p.ring_bias)
+        sense(slot, series[slot.k, 1], series[slot.k, 2], memory.frames[i], t, ring - p.ring_bias, h_c)
     measured = measure(slot, t)
     row = out.observation[i]
     write_measured(measured, reading.measured, row)
@@ -196,6 +197,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
             for number in range(len(episode)):
                 numbers[EPISODE_AT + number] = episode[number]
             draw_series(slot.episode, streams, series[: clock.grid_points, 0], series[: clock.steps + 1, 1:])
+            slot.key[0], slot.key[1] = keys[at, 0], keys[at, 1]
             _begin(slot, series[0, 0])
             _sample_alone(memory, i, True, clock, reading, out, slope, ring_offset)
         return impossible

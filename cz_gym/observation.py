@@ -95,6 +95,8 @@ STATE = (
 """Channels of ``observation="state"``."""
 
 OBSERVATIONS: dict[str, tuple[Channel, ...]] = {"measured": MEASURED, "history": HISTORY, "state": STATE}
+CAMERA = "camera"
+"""The observation that is an image instead of channels (:mod:`cz_gym.camera`)."""
 
 
 class Measured(NamedTuple):

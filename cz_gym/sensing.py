@@ -14,11 +14,12 @@ _EPS = 1e-9
 
 
 @physics
-def photograph(slot: Any, frames: Any, t: Any, ring: Any) -> None:
-    """Keep the ring [m] as a frame taken at t."""
+def photograph(slot: Any, frames: Any, t: Any, ring: Any, h_c: Any) -> None:
+    """Keep the ring [m] and the meniscus height [m] as a frame taken at t."""
     at = slot.frames % frames.shape[0]
     frames[at, 0] = t
     frames[at, 1] = ring
+    frames[at, 2] = h_c
     slot.frames = slot.frames + 1
 
 
@@ -45,8 +46,9 @@ def _freezes(slot: Any, t: Any) -> Any:
 
 
 @physics
-def sense(slot: Any, camera: Any, pyrometer: Any, frames: Any, t: Any, ring: Any) -> None:
-    """Read pyrometer and camera at t; ``ring`` [m] is what a camera without latency sees, less the operator's bias.
+def sense(slot: Any, camera: Any, pyrometer: Any, frames: Any, t: Any, ring: Any, h_c: Any) -> None:
+    """Read pyrometer and camera at t; ``ring`` [m] is what a camera without latency sees, less the operator's bias,
+    on a meniscus of height ``h_c`` [m].
 
     ``camera`` [m] (NaN: the sample drops out) and ``pyrometer`` [K] are the sample's noise. A frozen or dropped sample
     shows the last reading again.
@@ -58,11 +60,12 @@ def sense(slot: Any, camera: Any, pyrometer: Any, frames: Any, t: Any, ring: Any
     slot.valid = 0.0 if lost or flagged else 1.0
     taken = t
     if e.latency > 0.0:
-        photograph(slot, frames, t, ring)
+        photograph(slot, frames, t, ring, h_c)
         at = _delivered(slot, frames, t)
-        taken, ring = frames[at, 0], frames[at, 1]
+        taken, ring, h_c = frames[at, 0], frames[at, 1], frames[at, 2]
     if slot.k == 0 or not (lost or frozen):
         slot.ring = ring + bias_offset(t, e)
+        slot.h_seen, slot.k_seen = h_c, slot.k
         if e.ripple_amplitude > 0.0:
             slot.ring = slot.ring + ripple(taken, e)
         if not lost:

@@ -26,6 +26,7 @@ SLOT = np.dtype(
         ("dT_i", np.float64),
         ("Q_d", np.float64),
         ("ring", np.float64),
+        ("h_seen", np.float64),
         ("T_1", np.float64),
         ("valid", np.float64),
         ("integral", np.float64),
@@ -33,6 +34,8 @@ SLOT = np.dtype(
         ("k", np.int64),
         ("frames", np.int64),
         ("over", np.int64),
+        ("k_seen", np.int64),
+        ("key", np.uint64, (2,)),
         ("v_p_before", np.float64),
         ("Q_H_before", np.float64),
         ("clipped", np.float64),
@@ -40,10 +43,11 @@ SLOT = np.dtype(
     align=True,
 )
 """One slot: constants of puller and episode, plant state, drives [m/s, W], the disturbance of the last substep,
-the last readings (``ring`` [m] without the operator's bias, ``T_1`` [K], ``valid``), the integral of the scaled ring
-error, the drift [K] that ``Q_d`` belongs to, the sample number ``k``, the number of camera frames taken, whether
-the episode is over, the drives [m/s, W] of the step before and whether the action was clipped: a sample can be
-written again from its slot."""
+the last readings (``ring`` [m] without the operator's bias, with the meniscus height ``h_seen`` [m] and the sample
+``k_seen`` it was taken at, ``T_1`` [K], ``valid``), the integral of the scaled ring error, the drift [K] that ``Q_d``
+belongs to, the sample number ``k``, the number of camera frames taken, whether the episode is over, the ``key`` it
+was drawn from, the drives [m/s, W] of the step before and whether the action was clipped: a sample can be written
+again from its slot."""
 PULLER_AT, EPISODE_AT = 0, len(Puller._fields)
 """Where a slot's constants begin, in numbers of eight bytes."""
 
@@ -72,7 +76,7 @@ class Memory(NamedTuple):
     history: Any
     """Running sums of the remembered channels, circular in time, shape (n, depth, channels); depth 0: none."""
     frames: Any
-    """Time [s] and ring [m] of camera frames, circular, shape (n, depth, 2)."""
+    """Time [s], ring [m] and meniscus height [m] of camera frames, circular, shape (n, depth, 3)."""
 
 
 class Out(NamedTuple):
@@ -82,6 +86,9 @@ class Out(NamedTuple):
     """The "measured" or "history" channels, float32, shape (n, channels)."""
     state: Any
     """The "state" channels, float32, shape (n, channels); width 0: not written."""
+    image: Any
+    """The camera's image, uint8, shape (n, rows, columns, 1); empty unless it is the observation. Written after the
+    step, by :mod:`cz_gym.camera_image`."""
     reward: Any
     """Float64, shape (n,)."""
     terminated: Any

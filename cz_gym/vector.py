@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from .batch import Batch, new_key
+from .camera import Camera
 from .config import make_config
 from .env import CzEnv, EnvState, action_space, check_options, check_state, observation_space
 from .meniscus import MeniscusModel
@@ -49,6 +50,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         meniscus: MeniscusModel | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         threads: int | None = None,
+        camera: Camera | None = None,
     ) -> None:
         if not isinstance(num_envs, int) or isinstance(num_envs, bool) or num_envs < 1:
             raise ValueError(f"num_envs must be a positive whole number, not {num_envs!r}")
@@ -60,7 +62,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         self.num_envs = num_envs
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
-        self.config = make_config(scenario, model, observation, control_interval, horizon, parameters, meniscus)
+        self.config = make_config(scenario, model, observation, control_interval, horizon, parameters, meniscus, camera)
         self.single_action_space = action_space()
         self.single_observation_space = observation_space(observation)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -226,7 +228,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
             new[index] = old[index]
 
     def _observations(self) -> Array:
-        array: Array = self._out.state if self.config.observation == "state" else self._out.observation
+        array: Array = self._batch.shown(self._out)
         return array.copy() if self.autoreset_mode == AutoresetMode.DISABLED else array
 
     def _finals(self, out: Out, over: Mask) -> dict[str, Any]:
