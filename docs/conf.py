@@ -23,12 +23,10 @@ include_patterns = ["README.md", "CHANGELOG.md", "docs/**.md", "results/**.md"]
 exclude_patterns = [".*", "build", "dist", "runs", "results/cache", "docs/_*", "**/.*", "**/node_modules"]
 extensions = ["myst_parser", "sphinx.ext.autodoc", "czdocs.mathml", "czdocs.tables", "czdocs.names", "czdocs.pages"]
 nitpicky = True
-nitpick_ignore = [
-    ("py:class", "cz_gym.batch.SlotState"),
-    ("py:class", "cz_gym.baselines.compensated_pid.Memory"),
-    ("py:func", "make_config"),
-]
+nitpick_ignore = [("py:func", "make_config")]
 nitpick_ignore_regex = [
+    # What annotations name and no page describes.
+    (r"py:class", r"cz_gym\.\w+\..*"),
     # Other projects' names; their inventories would have to be fetched.
     (r"py:.*", r"(numpy|np|npt|gymnasium|gym|collections|typing|pathlib|ndarray|optional|Callable|Any|Floats)\b.*"),
     (r"py:.*", r"(int|float|str|bool|dict|list|tuple|array|Array|Mask|Mapping|Sequence|Path)\b.*"),

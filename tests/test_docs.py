@@ -160,7 +160,7 @@ def check_command(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
         assert named <= extras(), line
     elif words[0] == "python":
         found = program(words)
-        if found is not None:
+        if found is not None and found[1]:
             parses(*found, line, monkeypatch)
     else:
         assert words[0] in ELSEWHERE, f"{line}: not a command this test knows"
