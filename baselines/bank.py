@@ -20,6 +20,7 @@ from cz_gym.plant import Puller
 
 from . import estimator
 from .estimator import Belief, Eye
+from .late_ring import RingModel, augmented
 from .lqg_model import NoiseModel, plant_model
 from .policy import Floats
 
@@ -43,11 +44,15 @@ class Believed(NamedTuple):
     """What the filters believe, by slot and hypothesis."""
 
     mean: Floats
-    """Shape (n, m, 10)."""
+    """Shape (n, m, states)."""
     covariance: Floats
-    """Shape (n, m, 10, 10)."""
+    """Shape (n, m, states, states)."""
     camera_variance: Floats
     """Variance of the camera's noise [m2], shape (n, m)."""
+    spectrum: Floats
+    """As in :class:`baselines.late_ring.Search`, with the axis m, as the next two."""
+    omega: Floats
+    samples: Floats
     evidence: Floats
     """Logarithm of each hypothesis's probability, up to a constant, shape (n, m)."""
 
@@ -60,24 +65,24 @@ class Believed(NamedTuple):
 
     @property
     def estimate(self) -> Floats:
-        """The state, the mean over the hypotheses, shape (n, 10)."""
+        """The state, the mean over the hypotheses, shape (n, states)."""
         mean: Floats = np.einsum("nm,nmi->ni", self.probability, self.mean)
         return mean
 
     @property
     def rows(self) -> Belief:
         """All filters as one belief, slot by slot, hypothesis by hypothesis."""
-        return Belief(*(part.reshape(-1, *part.shape[2:]) for part in self[:3]))
+        return Belief(*(part.reshape(-1, *part.shape[2:]) for part in self[:-1]))
 
     def moved_to(self, rows: Belief) -> Believed:
         """The same evidence, another belief."""
-        mean, covariance, variance = (part.reshape(*self.evidence.shape, *part.shape[1:]) for part in rows)
-        return Believed(mean, covariance, variance, self.evidence)
+        shaped = Belief(*(part.reshape(*self.evidence.shape, *part.shape[1:]) for part in rows))
+        return Believed(*shaped, evidence=self.evidence)
 
 
 def bank_eye(eye: Eye, hypotheses: Hypotheses, slots: int) -> Eye:
     """What the filters of that many slots know, row by row."""
-    Q, start = _noises(eye.puller, eye.noise, eye.dt, eye.meniscus, hypotheses)
+    Q, start = _noises(eye.puller, eye.noise, eye.ring, eye.dt, eye.meniscus, hypotheses)
     rows = (slots, 1, 1)
     return eye._replace(model=eye.model._replace(Q=np.tile(Q, rows), start=np.tile(start, rows)))
 
@@ -85,7 +90,7 @@ def bank_eye(eye: Eye, hypotheses: Hypotheses, slots: int) -> Eye:
 def begin(slots: int, hypotheses: Hypotheses, eye: Eye) -> Believed:
     """Belief before the first sample; ``eye`` is that of :func:`bank_eye`."""
     rows, shape = estimator.begin(slots * hypotheses.count, eye), (slots, hypotheses.count)
-    blank = Believed(rows.mean, rows.covariance, rows.camera_variance, np.zeros(shape))
+    blank = Believed(*rows, evidence=np.zeros(shape))
     return blank.moved_to(rows)
 
 
@@ -107,7 +112,7 @@ def correct(believed: Believed, seen: Measured, eye: Eye) -> Believed:
 
 def _likelihood(belief: Belief, seen: Measured, eye: Eye) -> Floats:
     """Logarithm of the ring's likelihood under each filter, up to a constant; innovations count up to the gate."""
-    ring, row = estimator.expected_ring(belief.mean, eye)
+    ring, row = estimator.expected_reading(belief.mean, eye)
     variance = np.einsum("ri,rij,rj->r", row, belief.covariance, row) + belief.camera_variance
     square = np.minimum(np.square(seen.ring_error + seen.r_ref - ring) / variance, eye.gate**2)
     return np.where(seen.valid > 0.5, -0.5 * (square + np.log(variance)), 0.0)
@@ -115,12 +120,19 @@ def _likelihood(belief: Belief, seen: Measured, eye: Eye) -> Floats:
 
 @lru_cache(maxsize=8)
 def _noises(
-    puller: Puller, noise: NoiseModel, dt: float, meniscus: MeniscusModel, hypotheses: Hypotheses
+    puller: Puller,
+    noise: NoiseModel,
+    ring: RingModel | None,
+    dt: float,
+    meniscus: MeniscusModel,
+    hypotheses: Hypotheses,
 ) -> tuple[Floats, Floats]:
-    """Process noise and initial covariance of each hypothesis, shape (m, 10, 10)."""
+    """Process noise and initial covariance of each hypothesis, shape (m, states, states)."""
     models = [
         plant_model(puller, replace(noise, fast_sd=fast, slow_sd=slow), dt, meniscus)
         for fast in hypotheses.fast_sd
         for slow in hypotheses.slow_sd
     ]
+    if ring is not None:
+        models = [augmented(model, ring, dt) for model in models]
     return np.stack([model.Q for model in models]), np.stack([model.start for model in models])

@@ -20,7 +20,7 @@ from .compensated_pid import Compensator, SeriesPID
 from .optional import require
 
 Floats = npt.NDArray[np.float64]
-CUT_OFF = 1.0 / 5000.0
+CUT_OFF = Compensator().slow
 """The paper's high-pass cut-off [rad/s]."""
 _ROUNDING = 1e3 * float(np.finfo(np.float64).eps)
 

@@ -24,6 +24,7 @@ from cz_gym.commands import OneLineParser, interrupted
 from cz_gym.config import Config, make_config
 from cz_gym.episode import draw_factors, randomised
 from cz_gym.evaluation.files import write_files
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.linear import StateSpace, radius_model
 from cz_gym.plant import Puller, make_puller
 from cz_gym.units import KILO, MM, MM_PER_MIN
@@ -33,8 +34,6 @@ from .linear_form import linear_form
 from .registry import CONTROLLERS, find_controller
 from .sampled_loop import Loop, NotLinearError, close, root_mean_square
 
-PULLER_SEED = 1_000_000
-"""First validation seed: its pullers are the random ones of the table."""
 FAST, SLOW = 30.0, 780.0
 """Correlation times of the interface's fluctuations [s]."""
 
@@ -82,7 +81,7 @@ _MOST = ("crossover", "crossover_over_zero", "crossover_compensated", "gain_down
 def random_pullers(config: Config, count: int) -> list[Puller]:
     """The pullers of the first validation episodes of a scenario."""
     pullers = []
-    for seed in range(PULLER_SEED, PULLER_SEED + count):
+    for seed in VALIDATION_SEEDS[:count]:
         factors = draw_factors(config.scenario, config.mix, new_key(np_random(seed)[0]))
         pullers.append(make_puller(randomised(config.parameters, factors), factors.lam, config.meniscus))
     return pullers

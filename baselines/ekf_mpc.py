@@ -36,7 +36,7 @@ from .trajectory import Limits, limits_of
 
 MODULES = (
     "ekf_mpc", "mpc_model", "mpc_prediction", "mpc_limits", "bank",
-    "lqg", "lqg_model", "lqr", "estimator", "kalman", "preview", "trajectory",
+    "lqg", "lqg_model", "late_ring", "lqr", "estimator", "kalman", "preview", "trajectory",
 )  # fmt: skip
 """What the controller is written in."""
 LIVELY = 0.8
@@ -55,11 +55,14 @@ class Objective(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What the controller remembers; the first four as in :class:`baselines.bank.Believed`."""
+    """What the controller remembers; the first seven as in :class:`baselines.bank.Believed`."""
 
     mean: Floats
     covariance: Floats
     camera_variance: Floats
+    spectrum: Floats
+    omega: Floats
+    samples: Floats
     evidence: Floats
     plan: Floats
     """Recipe ahead, shape (n, 2, samples + 1): r_ref [m] and T_1_ref [K]."""
@@ -120,7 +123,7 @@ class EkfMpc:
         begins = memory.begun == 0.0
         applied = np.stack([seen.v_p, seen.Q_H], axis=-1)
         followed = lqg.settings.noise.recipe_share * (memory.plan[:, 1, 1] - memory.plan[:, 1, 0])
-        believed = bank.predict(bank.Believed(*memory[:4]), applied, followed, eye)
+        believed = bank.predict(bank.Believed(*memory[: len(bank.Believed._fields)]), applied, followed, eye)
         if begins.any():
             believed = fresh(believed, blank, begins)
         believed = bank.correct(believed, seen, eye)

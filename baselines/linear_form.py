@@ -12,6 +12,7 @@ from cz_gym.observation import MEASURED, PULL_SCALE, Measured
 from cz_gym.units import MM
 
 from .filtered_pid import FilteredPID
+from .late_ring import Search
 from .lqg import LQG
 from .open_loop import OpenLoop
 from .sampled_loop import NotLinearError, linear_controller
@@ -61,5 +62,7 @@ def _lqg(policy: LQG) -> LinearForm:
         _, state = linear.predict(observation, state)
     assert state is not None
     rest = state._replace(mean=0.0 * state.mean, plan=0.0 * state.plan, asked=0.0 * state.asked)
-    found = linear_controller(linear, policy.parameters.v_0, rest, ("covariance", "camera_variance", "plan", "begun"))
+    found = linear_controller(
+        linear, policy.parameters.v_0, rest, ("covariance", "camera_variance", "plan", "begun", *Search._fields)
+    )
     return LinearForm(found, found, policy.control_interval)

@@ -24,7 +24,8 @@ from cz_gym.plant import Puller, make_puller
 from cz_gym.units import KILO
 
 from . import estimator
-from .lqg_model import NoiseModel, PlantModel, plant_model
+from .late_ring import RingModel, augmented
+from .lqg_model import STATES, NoiseModel, PlantModel, plant_model
 from .lqr import Regulator, Weights, regulator
 from .policy import Floats, batched, fresh, to_action
 from .preview import look_ahead, samples_ahead
@@ -44,11 +45,14 @@ class LQGSettings:
     """Innovations count up to this many standard deviations [-]."""
     heater_slack: float = 0.06 * KILO
     """A heater this close to the power asked for [W] counts as there: the resolution of its drive."""
+    ring: RingModel | None = None
+    """What is known of a camera that is late or shaken; None for one that is neither."""
 
     @property
     def hash(self) -> str:
         """SHA-256 of the settings (16 hex digits)."""
-        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:16]
+        told = {name: value for name, value in asdict(self).items() if value is not None}
+        return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
 
 
 class Gains(NamedTuple):
@@ -63,11 +67,15 @@ class Memory(NamedTuple):
     """What the controller remembers."""
 
     mean: Floats
-    """Estimated state of the augmented plant, deviations in SI units, shape (n, 10)."""
+    """Estimated state of the augmented plant, deviations in SI units, shape (n, states)."""
     covariance: Floats
-    """Its covariance, shape (n, 10, 10)."""
+    """Its covariance, shape (n, states, states)."""
     camera_variance: Floats
     """Variance of the camera's noise [m2], shape (n,)."""
+    spectrum: Floats
+    """As in :class:`baselines.late_ring.Search`, as the next two."""
+    omega: Floats
+    samples: Floats
     plan: Floats
     """Recipe ahead, shape (n, 2, samples + 1): r_ref [m] and T_1_ref [K]."""
     asked: Floats
@@ -80,7 +88,9 @@ class Memory(NamedTuple):
 def solve(settings: LQGSettings, dt: float, puller: Puller, meniscus: MeniscusModel = HURLE) -> Gains:
     """Linearise at that puller's operating point and solve the regulator's Riccati equation."""
     model = plant_model(puller, settings.noise, dt, meniscus)
-    eye = estimator.Eye(puller, model, settings.noise, meniscus, dt, settings.nonlinear, settings.gate)
+    if settings.ring is not None:
+        model = augmented(model, settings.ring, dt)
+    eye = estimator.Eye(puller, model, settings.noise, meniscus, dt, settings.nonlinear, settings.gate, settings.ring)
     return Gains(eye, regulator(model, settings.weights, dt, samples_ahead(dt)))
 
 
@@ -131,7 +141,7 @@ class LQG:
     def _estimate(
         self, memory: Memory, seen: Measured, applied: Floats, begins: npt.NDArray[np.bool_], eye: estimator.Eye
     ) -> estimator.Belief:
-        old = estimator.Belief(memory.mean, memory.covariance, memory.camera_variance)
+        old = estimator.Belief(*memory[: len(estimator.Belief._fields)])
         moved = self.settings.noise.recipe_share * (memory.plan[:, 1, 1] - memory.plan[:, 1, 0])
         belief = estimator.predict(old, applied, moved, eye)
         if begins.any():
@@ -149,10 +159,10 @@ def moved_from(applied: Floats, asked: Floats, begins: npt.NDArray[np.bool_], he
 def act(estimate: Floats, plan: Floats, previous: Floats, law: Regulator, recipe_share: float, v_0: float) -> Floats:
     """Inputs [m/s, W], deviations within the drives' range, from the previous ones and the plant's state.
 
-    ``estimate`` has shape (n, 10), ``plan`` (n, 2, samples + 1); the drift is expected to follow ``recipe_share`` of
-    the recipe's movement. ``v_0`` is the nominal pull speed [m/s].
+    ``estimate`` has shape (n, states), ``plan`` (n, 2, samples + 1); the drift is expected to follow ``recipe_share``
+    of the recipe's movement. ``v_0`` is the nominal pull speed [m/s].
     """
-    error = estimate.copy()
+    error = estimate[:, : len(STATES)].copy()
     error[:, 0] -= plan[:, 0, 0]
     ahead = np.diff(plan, axis=-1)
     moves = -(law.feedback @ np.concatenate([error, previous], axis=-1)[..., None])[..., 0]

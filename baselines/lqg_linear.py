@@ -16,29 +16,32 @@ from cz_gym.units import HOUR, KILO, MM, MM_PER_MIN
 
 from . import kalman
 from .lqg import Gains
-from .lqg_model import PLANT
+from .lqg_model import PLANT, STATES, PlantModel
 from .policy import Floats
 
 FLUCTUATING = PLANT + 2
 """States of the plant and its two interface fluctuations: what is stationary."""
 _PLANT_SCALES = np.array([MM, MM, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0 / HOUR, KILO])
-_SCALES = np.concatenate([_PLANT_SCALES[:FLUCTUATING], _PLANT_SCALES, [MM_PER_MIN, KILO]])
-"""Units in which the loop's states are of one order; the covariance equation is ill-conditioned in SI."""
 
 
 class Loop(NamedTuple):
-    """s_{k+1} = A s_k + B n_k with s = (x, x_hat before the reading, previous inputs); all stationary."""
+    """s_{k+1} = A s_k + B n_k with s = (x, x_hat before the reading, previous inputs); all stationary.
+
+    m = 19 states, and two more for each of a late or shaken ring.
+    """
 
     A: Floats
-    """Shape (19, 19)."""
+    """Shape (m, m)."""
     B: Floats
-    """Shape (19, noises)."""
+    """Shape (m, noises)."""
     signals: Floats
-    """Rows giving r_c, v_p, and the steps of v_p and Q_H from (s, n), shape (4, 19 + noises)."""
+    """Rows giving r_c, v_p, and the steps of v_p and Q_H from (s, n), shape (4, m + noises)."""
+    scales: Floats
+    """Units in which the states are of one order, shape (m,); the covariance equation is ill-conditioned in SI."""
 
 
 def steady_gain(gains: Gains) -> Floats:
-    """Kalman gain of readings (r_br, T_1) the filter settles at, shape (10, 2)."""
+    """Kalman gain of readings (r_br, T_1) the filter settles at, shape (states, 2)."""
     A, _, H, Q, _ = gains.eye.model
     noise = gains.eye.noise
     R = np.diag([noise.camera_sd**2, noise.pyrometer_sd**2])
@@ -53,7 +56,8 @@ def controller(gains: Gains) -> StateSpace:
     States: the prediction x_hat, and the previous inputs; SI units. The reference is held at r_0.
     """
     model, K = gains.eye.model, steady_gain(gains)
-    F, K_u = np.split(gains.regulator.feedback, [len(model.A)], axis=1)
+    F, K_u = np.split(gains.regulator.feedback, [len(STATES)], axis=1)
+    F = np.pad(F, ((0, 0), (0, len(model.A) - len(STATES))))
     corrected = np.eye(len(model.A)) - K @ model.H
     C = np.hstack([-F @ corrected, np.eye(2) - K_u])
     D = -F @ K
@@ -64,9 +68,10 @@ def controller(gains: Gains) -> StateSpace:
 def closed_loop(gains: Gains) -> Loop:
     """The controller around the plant it is designed for, driven by fluctuations and sensor noise of unit variance."""
     model, noise, law = gains.eye.model, gains.eye.noise, controller(gains)
-    n, m = FLUCTUATING, len(law.A)
-    A, B, H = model.A[:n, :n], model.B[:n], model.H[:, :n]
-    w = _root(model.Q[:n, :n])
+    moving = stationary(model)
+    n, m, both = len(moving), len(law.A), np.ix_(moving, moving)
+    A, B, H = model.A[both], model.B[moving], model.H[:, moving]
+    w = _root(model.Q[both])
     v = np.diag([noise.camera_sd, noise.pyrometer_sd])
     inputs = np.hstack([law.D @ H, law.C, np.zeros((2, n)), law.D @ v])
     state = np.hstack([A, np.zeros((n, m)), w, np.zeros((n, 2))]) + B @ inputs
@@ -75,16 +80,24 @@ def closed_loop(gains: Gains) -> Loop:
     previous[:, n + m - 2 : n + m] = np.eye(2)
     radius = np.zeros((1, inputs.shape[1]))
     radius[0, 0] = 1.0
-    both = np.vstack([state, memory])
-    return Loop(both[:, : n + m], both[:, n + m :], np.vstack([radius, inputs[:1], inputs - previous]))
+    together = np.vstack([state, memory])
+    own = np.concatenate([_PLANT_SCALES, np.full(len(model.A) - len(STATES), MM)])
+    scales = np.concatenate([own[moving], own, [MM_PER_MIN, KILO]])
+    signals = np.vstack([radius, inputs[:1], inputs - previous])
+    return Loop(together[:, : n + m], together[:, n + m :], signals, scales)
+
+
+def stationary(model: PlantModel) -> list[int]:
+    """Indices of the states that are stationary in a loop: plant, interface fluctuations, ripple and past rings."""
+    return [*range(FLUCTUATING), *range(len(STATES), len(model.A))]
 
 
 def stationary_cost(gains: Gains) -> Cost:
     """Mean of the reward's terms, before it saturates, by the covariance equation P = A P A' + B B' (Lyapunov)."""
     loop = closed_loop(gains)
-    A = loop.A / _SCALES[:, None] * _SCALES
-    B = loop.B / _SCALES[:, None]
-    P = solve_discrete_lyapunov(A, B @ B.T, method="direct") * np.outer(_SCALES, _SCALES)
+    A = loop.A / loop.scales[:, None] * loop.scales
+    B = loop.B / loop.scales[:, None]
+    P = solve_discrete_lyapunov(A, B @ B.T, method="direct") * np.outer(loop.scales, loop.scales)
     by_state, by_noise = np.split(loop.signals, [len(loop.A)], axis=1)
     mean_squares = np.diag(by_state @ P @ by_state.T + by_noise @ by_noise.T)
     return Cost(*(float(term) for term in cost_terms(*np.sqrt(mean_squares))))

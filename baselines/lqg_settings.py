@@ -1,6 +1,13 @@
-"""The LQGs that ship: chosen by ``python -m baselines.lqg_tune``, frozen, hashed; histories in results/tuning."""
+"""The LQGs that ship: chosen by ``python -m baselines.lqg_tune``, frozen, hashed; histories in results/tuning.
+
+Each was searched on training seeds and chosen on validation seeds of its scenario. Scenarios without settings of their
+own use those of ``randomized``.
+"""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
 
 from cz_gym.config import Config
 
@@ -37,21 +44,74 @@ QUIET = LQGSettings(
     weights=Weights(pull=0.05482, pull_step=0.3051, heater_step=1.168),
 )
 """``lqg-quiet``: the radius as well as pull steps of 0.0095 mm/min allow."""
+SHIPPED: dict[tuple[str, str], LQGSettings] = {
+    ("lqg", "randomized"): REWARD,
+    ("lqg-quiet", "randomized"): QUIET,
+}
+"""By controller and scenario."""
+
+
+class Step(NamedTuple):
+    """A setting of the frontier: a shipped LQG with another weight on pull steps."""
+
+    base: str
+    """Whose noise model and other weights it has."""
+    pull_step: float
+    """Weight on the squared step of v_p."""
+
+
+ACTIVITIES = (0.003, 0.005, 0.008, 0.013, 0.02, 0.03)
+"""Pull step RMS [mm/min] that the settings of the frontier are made for."""
+FRONTIER: dict[str, tuple[Step, ...]] = {}
+"""By scenario, one an activity: chosen by ``python -m baselines.lqg_frontier``."""
+
+
+def family_name(activity: float) -> str:
+    """Name of the LQG made for that pull step RMS [mm/min]."""
+    return f"lqg-at-{activity:g}"
+
+
+def settings_of(controller: str, scenario: str) -> LQGSettings:
+    """The frozen settings of "lqg" or "lqg-quiet" for that scenario."""
+    return SHIPPED.get((controller, scenario), SHIPPED[controller, "randomized"])
+
+
+def frontier_settings(activity: float, scenario: str) -> LQGSettings:
+    """The frozen settings for that pull step RMS [mm/min], one of ACTIVITIES, on that scenario."""
+    where = scenario if scenario in FRONTIER else "randomized"
+    step = FRONTIER[where][ACTIVITIES.index(activity)]
+    return with_pull_step(settings_of(step.base, where), step.pull_step)
+
+
+def with_pull_step(settings: LQGSettings, weight: float) -> LQGSettings:
+    """The same settings with another weight on pull steps."""
+    return replace(settings, weights=replace(settings.weights, pull_step=weight))
+
+
+def made(settings: LQGSettings, config: Config) -> LQG:
+    """The LQG of those settings for an environment."""
+    return LQG(settings, config.control_interval, config.parameters, config.meniscus)
 
 
 def lqg(config: Config) -> LQG:
     """The LQG tuned to the reward."""
-    return LQG(REWARD, config.control_interval, config.parameters, config.meniscus)
+    return made(settings_of("lqg", config.scenario.name), config)
 
 
 def lqg_quiet(config: Config) -> LQG:
     """The LQG tuned to low pull activity."""
-    return LQG(QUIET, config.control_interval, config.parameters, config.meniscus)
+    return made(settings_of("lqg-quiet", config.scenario.name), config)
+
+
+def lqg_at(activity: float, config: Config) -> LQG:
+    """The LQG made for that pull step RMS [mm/min]."""
+    return made(frontier_settings(activity, config.scenario.name), config)
 
 
 def lqg_true(config: Config) -> ToldLQG:
     """Bound: the LQG told each puller's parameters."""
-    return ToldLQG(REWARD, config.control_interval, config.parameters, config.meniscus)
+    settings = settings_of("lqg", config.scenario.name)
+    return ToldLQG(settings, config.control_interval, config.parameters, config.meniscus)
 
 
 def full_information(config: Config) -> FullInformation:

@@ -1,4 +1,4 @@
-"""Tune the LQG: ``python -m baselines.lqg_tune --controller lqg``.
+"""Tune the LQG: ``python -m baselines.lqg_tune --controller lqg --scenario puller``.
 
 COBYLA (SciPy) on the logarithms of design point and noise model, on training seeds; the best candidates then meet the
 validation seeds, which choose. Test seeds are never touched. Every candidate stays in the history that is written.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,16 +20,15 @@ from cz_gym.commands import OneLineParser, interrupted
 from cz_gym.config import make_config
 from cz_gym.evaluation.files import check_writable, write_files
 from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
 
 from .lqg import LQG, LQGSettings
 from .lqg_goal import FAILURE_PENALTY, GOALS, Figures, Goal, knobs, settings_from, with_knobs
 from .policy import Floats
 
-VALIDATION_SEED = 1_000_000
-ROBUSTNESS_SEED = 100_000
-"""First training seed of the episodes that only have to be survived."""
-ROBUSTNESS = ("hard", "puller")
+ROBUSTNESS_SEEDS = TRAINING_SEEDS[100_000:]
+"""Training seeds of the episodes that only have to be survived."""
 FINALISTS = 3
 CALMER = (1.0, 3.0, 10.0)
 """Factors on the weight of heater steps that every finalist is tried with: the search hardly sees that weight."""
@@ -41,6 +40,13 @@ class History:
     """Every candidate met, in order."""
 
     entries: list[dict[str, Any]] = field(default_factory=list)
+    keep: Callable[[list[dict[str, Any]]], None] = lambda entries: None
+    """Called with all of them after each."""
+
+    def add(self, entry: dict[str, Any]) -> None:
+        """One more."""
+        self.entries.append(entry)
+        self.keep(self.entries)
 
     def best(self, count: int) -> list[dict[str, Any]]:
         """The best so many."""
@@ -52,7 +58,7 @@ def measure(settings: LQGSettings, scenario: str, seeds: Sequence[int]) -> Figur
     config = make_config(scenario)
     found = metrics(rollout(LQG(settings, config.control_interval), config, seeds))
     return Figures(
-        float(found.rmse_mm.mean()),
+        float(found.rmse_observable_mm.mean()),
         float(found.pull_step_rms_mm_per_min.mean()),
         float(found.heater_step_rms_kw.mean()),
         float(found.return_.mean()),
@@ -61,9 +67,9 @@ def measure(settings: LQGSettings, scenario: str, seeds: Sequence[int]) -> Figur
     )
 
 
-def search(goal: Goal, budget: int, episodes: int, survive: int) -> History:
+def search(goal: Goal, budget: int, episodes: int, survive: int, history: History | None = None) -> History:
     """COBYLA from the goal's start; the best so far must survive ``survive`` episodes of each harder scenario."""
-    history = History()
+    history = History() if history is None else history
     met: dict[bytes, Figures] = {}
 
     def figures(values: Floats) -> Figures:
@@ -88,13 +94,13 @@ def search(goal: Goal, budget: int, episodes: int, survive: int) -> History:
 
 
 def _try(goal: Goal, settings: LQGSettings, history: History, episodes: int, survive: int) -> Figures:
-    found = measure(settings, "randomized", range(episodes))
+    found = measure(settings, goal.scenario, TRAINING_SEEDS[:episodes])
     score = goal.score(found)
     lost = []
     if survive and all(score < entry["score"] for entry in history.entries):
-        lost = [measure(settings, name, _from(ROBUSTNESS_SEED, survive)).failure_rate for name in ROBUSTNESS]
+        lost = [measure(settings, name, ROBUSTNESS_SEEDS[:survive]).failure_rate for name in goal.survive]
         score += FAILURE_PENALTY * sum(lost)
-    history.entries.append({"score": score, "settings": asdict(settings), "figures": asdict(found), "lost": lost})
+    history.add({"score": score, "settings": asdict(settings), "figures": asdict(found), "lost": lost})
     print(
         f"{len(history.entries):4d}  score {score:8.4f}  rmse {found.rmse_mm:.4f} mm  "
         f"step {found.pull_step:.4f} mm/min  return {found.mean_return:.1f}  lost {found.failure_rate} {lost}",
@@ -110,8 +116,8 @@ def choose(goal: Goal, history: History, episodes: int, survive: int) -> dict[st
     """
     finals = []
     for settings in (calmer(found, factor) for found in finalists(history) for factor in CALMER):
-        lost = {name: measure(settings, name, _from(ROBUSTNESS_SEED, survive)).failure_rate for name in ROBUSTNESS}
-        found = measure(settings, "randomized", _from(VALIDATION_SEED, episodes))
+        lost = {name: measure(settings, name, ROBUSTNESS_SEEDS[:survive]).failure_rate for name in goal.survive}
+        found = measure(settings, goal.scenario, VALIDATION_SEEDS[:episodes])
         score = goal.score(found) + FAILURE_PENALTY * sum(lost.values())
         final = {"score": score, "settings": asdict(settings), "hash": settings.hash}
         finals.append(final | {"validation": asdict(found), "lost": lost})
@@ -130,8 +136,24 @@ def calmer(settings: LQGSettings, factor: float) -> LQGSettings:
     return replace(settings, weights=replace(settings.weights, heater_step=weight))
 
 
-def _from(first: int, count: int) -> range:
-    return range(first, first + count)
+def _text(found: dict[str, Any]) -> bytes:
+    return (json.dumps(found, indent=1) + "\n").encode()
+
+
+def file_name(controller: str, scenario: str) -> str:
+    """Where the history of that search is kept."""
+    return f"{controller}.json" if scenario == "randomized" else f"{controller}-{scenario}.json"
+
+
+def check_budget(survive: int = 0, *, validation: int, **least_one: int) -> None:
+    """ValueError for a number out of range."""
+    for name, value in least_one.items():
+        if value < 1:
+            raise ValueError(f"--{name} must be at least 1, not {value}")
+    if not 1 <= validation <= len(VALIDATION_SEEDS):
+        raise ValueError(f"--validation must be between 1 and {len(VALIDATION_SEEDS)}, not {validation}")
+    if survive < 0:
+        raise ValueError(f"--survive must be at least 0, not {survive}")
 
 
 def read_history(path: Path) -> tuple[dict[str, int], History]:
@@ -146,38 +168,49 @@ def read_history(path: Path) -> tuple[dict[str, int], History]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command."""
     parser = OneLineParser(prog="python -m baselines.lqg_tune", description=__doc__)
-    parser.add_argument("--controller", choices=sorted(GOALS), default="lqg")
+    parser.add_argument("--controller", choices=sorted({name for name, _ in GOALS}), default="lqg")
+    parser.add_argument("--scenario", choices=sorted({scenario for _, scenario in GOALS}), default="randomized")
     parser.add_argument("--budget", type=int, default=60, help="candidates to try")
     parser.add_argument("--episodes", type=int, default=100, help="training episodes a candidate")
-    parser.add_argument("--survive", type=int, default=20, help="more of each harder scenario, failures only")
+    parser.add_argument("--survive", type=int, default=20, help="more that must be survived, failures only")
     parser.add_argument("--validation", type=int, default=250, help="validation episodes a finalist")
-    parser.add_argument("--finals", type=int, default=200, help="harder training episodes a finalist must survive")
+    parser.add_argument("--finals", type=int, default=200, help="training episodes a finalist must survive")
     parser.add_argument("--history", type=Path, help="choose again from this kept history, without a search")
-    parser.add_argument("--output", type=Path, default=None, help="default results/tuning/<controller>.json")
+    parser.add_argument("--output", type=Path, default=None, help="default in results/tuning")
     given = parser.parse_args(arguments)
-    for name in ("budget", "episodes", "validation", "finals"):
-        if getattr(given, name) < 1:
-            parser.error(f"--{name} must be at least 1, not {getattr(given, name)}")
-    if given.survive < 0:
-        parser.error(f"--survive must be at least 0, not {given.survive}")
-    output = given.output or Path("results") / "tuning" / f"{given.controller}.json"
+    try:
+        sizes = {name: getattr(given, name) for name in ("budget", "episodes", "validation", "finals")}
+        check_budget(given.survive, **sizes)
+    except ValueError as error:
+        parser.error(str(error))
+    output = given.output or Path("results") / "tuning" / file_name(given.controller, given.scenario)
+    part = output.with_suffix(".part.json")
     try:
         check_writable(output.parent)
-        goal = GOALS[given.controller]
+        goal = GOALS[given.controller, given.scenario]
         if given.history is None:
             budget = {name: getattr(given, name) for name in ("budget", "episodes", "survive")}
-            history = search(goal, given.budget, given.episodes, given.survive)
+            history = History(keep=lambda entries: write_files({part: _text({"budget": budget, "history": entries})}))
+            search(goal, given.budget, given.episodes, given.survive, history)
         else:
             budget, history = read_history(given.history)
         budget |= {"validation": given.validation, "finals": given.finals}
         chosen = choose(goal, history, given.validation, given.finals)
-        found = {"controller": given.controller, "budget": budget, "chosen": chosen, "history": history.entries}
-        write_files({output: (json.dumps(found, indent=1) + "\n").encode()})
+        found = {
+            "controller": given.controller,
+            "scenario": given.scenario,
+            "budget": budget,
+            "chosen": chosen,
+            "history": history.entries,
+        }
+        write_files({output: _text(found)})
+        part.unlink(missing_ok=True)
     except (OSError, ValueError) as error:
         print(f"cannot read or write: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        return interrupted("lqg_tune")
+        left = f"--history {part} chooses from the candidates met" if part.exists() else "nothing written"
+        return interrupted("lqg_tune", left)
     print(json.dumps(chosen, indent=1))
     return 0
 

@@ -23,7 +23,7 @@ from cz_gym.task import (
     RADIUS_SCALE,
 )
 
-from .lqg_model import DRIFT, PLANT, PlantModel
+from .lqg_model import DRIFT, PLANT, STATES, PlantModel
 from .policy import Floats
 
 STEP_TIME = 5.0
@@ -125,10 +125,11 @@ def cost_to_go(model: PlantModel, weights: Weights, dt: float) -> CostToGo:
 
 
 def _solve(model: PlantModel, weights: Weights, dt: float) -> _Solution:
+    known = len(STATES)
     A = np.block([[model.A[:PLANT, :PLANT], model.B[:PLANT]], [np.zeros((2, PLANT)), np.eye(2)]])
     B = np.vstack([model.B[:PLANT], np.eye(2)])
-    E = np.vstack([model.A[:PLANT, PLANT:], np.zeros((2, len(model.A) - PLANT))])
-    A_d = model.A[PLANT:, PLANT:]
+    E = np.vstack([model.A[:PLANT, PLANT:known], np.zeros((2, known - PLANT))])
+    A_d = model.A[PLANT:known, PLANT:known]
     Q, N, R = quadratic_cost(weights, dt)
     P = solve_discrete_are(A, B, Q, R, s=N)
     S = R + B.T @ P @ B

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from cz_gym.plant import hidden_load
 
 from .lqg import Gains
-from .lqg_model import DRIFT, FAST, HEATER, PLANT, SLOW
+from .lqg_model import DRIFT, FAST, HEATER, PLANT, SLOW, STATES
 from .lqr import Regulator
 from .mpc_model import SCALES, SHOWN, Shape, U, Z, build
 from .policy import Floats
@@ -61,9 +61,9 @@ def predict_under_law(
 
 def expected_disturbances(estimate: Floats, plan: Floats, gains: Gains, share: float, stages: int) -> Floats:
     """Disturbance states from now to the end of the horizon, SI units, shape (n, stages + 1, 5)."""
-    decay = gains.eye.model.A[PLANT:, PLANT:]
+    decay = gains.eye.model.A[PLANT : len(STATES), PLANT : len(STATES)]
     d = np.empty((len(estimate), stages + 1, len(decay)))
-    d[:, 0] = estimate[:, PLANT:]
+    d[:, 0] = estimate[:, PLANT : len(STATES)]
     followed = share * np.diff(held(plan, stages)[:, :, 1], axis=1)
     for k in range(stages):
         d[:, k + 1] = d[:, k] @ decay.T
@@ -92,7 +92,7 @@ def _acting(disturbances: Floats, gains: Gains, shape: Shape) -> Floats:
     """What disturbs each stage, as the prediction takes it."""
     d = disturbances[:, :-1]
     if not shape.nonlinear:
-        pushed: Floats = d @ gains.eye.model.A[:PLANT, PLANT:].T / SCALES[:PLANT]
+        pushed: Floats = d @ gains.eye.model.A[:PLANT, PLANT : len(STATES)].T / SCALES[:PLANT]
         return pushed
     load = hidden_load(d[..., _OWN], gains.eye.puller)
     dT_i = d[..., FAST - PLANT] + d[..., SLOW - PLANT]

@@ -13,20 +13,16 @@ from cz_gym.young_laplace import YOUNG_LAPLACE
 
 from .compensated_pid import CompensatedPID, Compensator
 from .design import Margins, design_compensator, margins
+from .paper_beyond import CutOffResult, NoiseResult, at_pull_limit, cut_off_result, noise_result
 from .paper_experiments import (
     MODELS,
     CaseDifference,
-    CutOffResult,
     InverseResponse,
-    NoiseResult,
     StepComparison,
     Trace,
-    at_pull_limit,
     case_difference,
-    cut_off_result,
     errors,
     inverse_response,
-    noise_result,
     pull_change,
     step_comparison,
     trace,

@@ -1,5 +1,6 @@
 """What Part II prints: Bukhari, Hovd and Winkler, "Inverse response behaviour in the bright ring radius measurement of
-the Czochralski process II: Mitigation by control", Journal of Crystal Growth.
+the Czochralski process II: Mitigation by control", Journal of Crystal Growth. The controller's own numbers are the
+defaults it is built with.
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ MODEL_II = RadiusModel(numerator=-0.0048849, poles=(4.63e-7, 7.602e-6), lead=-46
 """G_p,II and G_m,II."""
 ZERO = 0.021
 """Right half plane zero of both models, as rounded in the text [rad/s]."""
-COMPENSATOR = Compensator(gain=-0.22517, fast=1.684e-3, slow=2.0e-4)
+COMPENSATOR = Compensator()
 """G_pc,real."""
 ODE = (1.884e-3, 3.368e-7)
 """The same as a differential equation in time: coefficients of y_pc' [rad/s] and y_pc [(rad/s)^2]."""
-PID = SeriesPID(K_p=0.01, T_i=5000.0, T_d=650.0, N=100.0)
+PID = SeriesPID()
 """Table 1."""
 CROSSOVER = 0.03275
 """Table 1 [rad/s]."""

@@ -6,26 +6,16 @@ import numpy as np
 
 from cz_gym.units import MM
 
-from .paper_experiments import INTERVAL, SEEDS
-from .paper_gallery import FIGURES
+from .paper_experiments import INTERVAL
 from .paper_numbers import Results, cycle_numbers, ramp_numbers
-from .paper_published import CROSSOVER, MODEL_II, PHASE_MARGIN_DEG, PID
-from .paper_rows import as_markdown, number, rows
-
-
-def _shown(*marks: str) -> str:
-    """Markdown of the figures whose file names begin so."""
-    return "\n\n".join(f"![{f.caption}]({f.file})\n\n*{f.caption}*" for f in FIGURES if f.file.startswith(marks))
-
-
-def _table(head: str, lines: list[str]) -> str:
-    columns = head.count("|") - 1
-    return "\n".join([head, "|" + "---|" * columns, *lines])
+from .paper_published import CROSSOVER, PHASE_MARGIN_DEG, PID
+from .paper_report_beyond import beyond, meniscus, shown, table
+from .paper_rows import as_markdown, rows
 
 
 def report(results: Results) -> str:
     """The whole report."""
-    sections = (_opening, _open_loop, _linear, _compensator, _pid, _closed_loop, _beyond, _meniscus)
+    sections = (_opening, _open_loop, _linear, _compensator, _pid, _closed_loop, beyond, meniscus)
     return "\n\n".join(section(results) for section in sections) + "\n"
 
 
@@ -69,7 +59,7 @@ once; the ring first shows it thinner, by {1e3 * r.inverse["I"].depth / MM:.2f} 
 same size gives {1e3 * r.inverse_step["I"].depth / MM:.1f} µm and {r.inverse_step["I"].recovery:.0f} s (I).
 In Model II the growth rate is constant, in Model I it falls with the meniscus, which slows the widening.
 
-{_shown("figure_01", "figure_02", "figure_03")}"""
+{shown("figure_01", "figure_02", "figure_03")}"""
 
 
 def _linear(r: Results) -> str:
@@ -90,14 +80,14 @@ def _linear(r: Results) -> str:
 
 Derivatives by complex step through the functions that are simulated; melt temperature held, as in the paper.
 
-{_table(head, functions)}
+{table(head, functions)}
 
 Largest difference between plant and linear model over 10 min after a pull-speed step, relative to the largest
 deviation. The ring is the less linear of the two, its offset bending with the height of the meniscus:
 
-{_table("| model | step | r_c | r_br |", lines)}
+{table("| model | step | r_c | r_br |", lines)}
 
-{_shown("figure_04", "extra_a")}"""
+{shown("figure_04", "extra_a")}"""
 
 
 def _compensator(r: Results) -> str:
@@ -115,7 +105,7 @@ and from our plant {found.gain:.5f} s / ((s + {found.fast:.4g}) (s + {found.slow
 Model II has no compensator of its own: neither pole of its plant is stable, so only the filter's pole is left, and
 without its steady gain nothing is. The paper uses Model I's for both, and so do we.
 
-{_shown("figure_05", "figure_07", "figure_08")}"""
+{shown("figure_05", "figure_07", "figure_08")}"""
 
 
 def _pid(r: Results) -> str:
@@ -139,14 +129,14 @@ def _pid(r: Results) -> str:
 Table 1: K_p = {PID.K_p} 1/s, T_i = {PID.T_i:.0f} s, T_d = {PID.T_d:.0f} s, N = {PID.N:.0f}.
 The paper prints {CROSSOVER} rad/s and about {PHASE_MARGIN_DEG:.0f} degrees for both models.
 
-{_table(head, lines)}
+{table(head, lines)}
 
 Neither the published functions nor our plant give the printed crossover and margin. The loop above is continuous;
 holding the pull speed for {INTERVAL:.0f} s costs another {hold:.1f} degrees at our crossover.
 
 {_without(r)}
 
-{_shown("figure_06", "figure_09")}"""
+{shown("figure_06", "figure_09")}"""
 
 
 def _without(r: Results) -> str:
@@ -168,7 +158,7 @@ def _without(r: Results) -> str:
     return f"""Without the compensator the linear loop is unstable on both models. What that means on the nonlinear
 plant, whose pull speed has limits, shows in the temperature ramp of the next section:
 
-{_table(head, lines)}
+{table(head, lines)}
 
 In Model II the instability costs the crystal. In Model I, where a rising meniscus freezes faster, it ends in a bounded
 limit cycle between the limits of the pull speed, which no puller should be asked for; yet the true radius is off by
@@ -186,80 +176,9 @@ def _closed_loop(r: Results) -> str:
 
 max of A - 5 B over max of A, deviations from the operating point:
 
-{_table("| model | r_c | h_c | alpha_c | v_p |", lines)}
+{table("| model | r_c | h_c | alpha_c | v_p |", lines)}
 
 The ramp: T_1,ref rises by 0.5 K/min for 10 min and holds. The paper gives no duration, nor the gains of the temperature
 loop, so its curves can be compared in shape only.
 
-{_shown("figure_10", "figure_11", "figure_12", "figure_13", "figure_14")}"""
-
-
-def _beyond(r: Results) -> str:
-    bare = [
-        f"| {c.cut_off:.0e} | "
-        + " | ".join(f"{c.max_error[m] / MM:.2f} | {c.max_compensated_error[m] / MM:.2f}" for m in ("I", "II"))
-        + f" | {c.phase_margin_deg['I']:.0f} | {c.phase_margin_deg['II']:.0f} |"
-        for c in r.cut_offs
-    ]
-    head = (
-        "| cut-off [rad/s] | r_c, I [mm] | r_tilde, I [mm] | r_c, II [mm] | r_tilde, II [mm] | margin, I [deg] | "
-        "margin, II [deg] |"
-    )
-    noise = [
-        f"| {n.noise / MM:.2f} | {n.expected_pull_rms_mm_per_min:.2f} | {n.pull_rms_mm_per_min:.2f} | "
-        f"{100 * n.clipped:.0f} % | {n.rmse_mm:.3f} | {100 * n.failures:.0f} % |"
-        for n in r.noise
-    ]
-    noise_head = (
-        "| camera noise, sd [mm] | RMS of v_p expected [mm/min] | RMS of v_p - v_0 [mm/min] | time at a limit | "
-        "true RMSE [mm] | lost |"
-    )
-    return f"""## 6. What the paper does not show
-
-**The washout.** A warmer melt grows more slowly, so the loop must pull more slowly for good. The compensator answers a
-lasting change of pull speed with a correction that fades only at the high-pass cut-off; meanwhile the loop holds
-r_tilde and the crystal is off by the correction. Raising the cut-off shortens it, at little cost in margin until
-it nears the zero. Largest errors in the ramp, compensator redesigned from our Model I for each cut-off:
-
-{_table(head, bare)}
-
-**Noise.** The PID's gain at high frequency is K_p N = {PID.K_p * PID.N:.0f} mm/s per mm.
-White camera noise, {INTERVAL:.0f} s samples,
-reference held for an hour, mean of {len(SEEDS)} episodes. The pull speed is spoilt long before the crystal is:
-
-{_table(noise_head, noise)}
-
-{_shown("extra_b", "extra_c", "extra_d")}"""
-
-
-def _meniscus(r: Results) -> str:
-    lines = [
-        f"| {p.r_c / MM:.1f} | {p.hurle.h / MM:.4f} | {p.exact.h / MM:.4f} | "
-        f"{100 * (p.hurle.h / p.exact.h - 1):+.2f} % | "
-        f"{p.hurle.slope_rate * MM:.4f} | {p.exact.slope_rate * MM:.4f} | {p.hurle.ring_offset / MM:.3f} | "
-        f"{p.exact.ring_offset / MM:.3f} | {p.hurle.zero:.4f} | {p.exact.zero:.4f} |"
-        for p in r.menisci
-    ]
-    head = (
-        "| r_c [mm] | h, Hurle [mm] | h, exact [mm] | difference | d alpha_c/d h, Hurle [rad/mm] | exact | "
-        "ring offset, Hurle [mm] | exact | zero, Hurle [rad/s] | exact |"
-    )
-    slopes = [f"| {p.phi_b_deg:g} | {p.hurle:.2f} | {p.exact:.2f} |" for p in r.ring_slopes]
-    exact, hurle = ramp_numbers(r.exact_ramp), ramp_numbers(r.ramp["I"])
-    return f"""## 7. Hurle against the exact meniscus
-
-At the operating point the axisymmetric Young-Laplace equation gives {number(r.exact_h / MM)} mm, Hurle's closed form
-{number(r.ramp["I"].signals.h_c[0] / MM)} mm.
-On a plant with the exact meniscus the printed controller's largest error in the ramp is
-{exact["max_error_mm"]:.3f} mm against {hurle["max_error_mm"]:.3f} mm (Model I).
-
-{_table(head, lines)}
-
-The zero differs most. It hangs on how fast the ring moves with the height, which Hurle's profile overstates: on the
-exact meniscus the coefficient of s in G_m hardly depends on where the ring is seen, and with the capillary constant
-that gives the paper's G_p no slope phi_b gives its {MODEL_II.lead:.1f} s. That number belongs to the approximate
-profile; the exact meniscus makes the inverse response somewhat milder.
-
-{_table("| phi_b [deg] | coefficient of s, Hurle [s] | exact [s] |", slopes)}
-
-{_shown("extra_e")}"""
+{shown("figure_10", "figure_11", "figure_12", "figure_13", "figure_14")}"""

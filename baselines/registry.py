@@ -46,6 +46,16 @@ def _tuned(name: str, meaning: str) -> Entry:
     return Entry(name, lambda config: tuned(name, config), "measured", meaning)
 
 
+def _lqg_at(activity: float) -> Entry:
+    return Entry(
+        lqg_settings.family_name(activity),
+        lambda config: lqg_settings.lqg_at(activity, config),
+        "measured",
+        f"lqg's frontier: made for pull steps of {activity:g} mm/min",
+        default=False,
+    )
+
+
 def _ekf_mpc(config: Config) -> Policy:
     from .ekf_mpc import ekf_mpc
 
@@ -62,6 +72,7 @@ CONTROLLERS: tuple[Entry, ...] = (
     _tuned("industrial", "incremental pull-speed law of a logged puller, with automatic growth control"),
     Entry("lqg", lqg_settings.lqg, "measured", "Kalman filter and LQ regulator of pull and heater, for the reward"),
     Entry("lqg-quiet", lqg_settings.lqg_quiet, "measured", "the same for low pull activity"),
+    *(_lqg_at(activity) for activity in lqg_settings.ACTIVITIES if lqg_settings.FRONTIER),
     Entry("ekf-mpc", _ekf_mpc, "measured", "nonlinear MPC on a bank of lqg's filters", default=False, slow=True),
     Entry(
         "lqg-true",

@@ -9,6 +9,7 @@ from scipy.optimize import minimize
 from baselines import bank, optional
 from baselines.bank import Hypotheses
 from baselines.lqg import LQG, LQGSettings, act
+from baselines.lqg_goal import PULLER_RING
 from baselines.lqg_model import DRIFT, HEATER, PLANT, STATES
 from baselines.lqr import cost_to_go, quadratic_cost
 from baselines.registry import find_controller
@@ -199,9 +200,10 @@ def test_what_it_asks_for_is_within_the_drives_limits():
     assert np.abs(pull).max() == pytest.approx(actuators.pull_window, rel=1e-3)
 
 
-def test_one_filter_is_the_lqgs_own():
+@pytest.mark.parametrize("ring", [None, PULLER_RING])
+def test_one_filter_is_the_lqgs_own(ring):
     config = make_config("sensor-fault", horizon=0.25 * HOUR)
-    lqg = LQG(LINEAR)
+    lqg = LQG(replace(LINEAR, ring=ring))
     noise = LINEAR.noise
     mpc = EkfMpc(lqg, Hypotheses((noise.fast_sd,), (noise.slow_sd,)))
     seeds = range(1_000_000, 1_000_003)
@@ -244,7 +246,7 @@ def test_the_bank_tells_a_calm_crystal_from_a_rough_one():
         config = make_config(scenario, horizon=1.0 * HOUR)
         watched = Watched(EkfMpc(hypotheses=hypotheses))
         rollout(watched, config, range(1_000_000, 1_000_004))
-        believed = bank.Believed(*watched.states[-1][:4])
+        believed = bank.Believed(*watched.states[-1][: len(bank.Believed._fields)])
         assert (believed.probability[:, which] > 0.9).mean() >= 0.75
 
 

@@ -10,10 +10,11 @@ import pytest
 from baselines import lqg_goal, lqg_settings, lqg_tune
 from baselines.lqg import LQGSettings
 from baselines.lqg_goal import KNOBS, Figures, Goal
-from baselines.lqg_tune import VALIDATION_SEED, History
+from baselines.lqg_tune import History
+from cz_gym.config import make_config
+from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 
 GOAL = Goal(0.07, 0.02, True, LQGSettings())
-SHIPPED = {"lqg": lqg_settings.REWARD, "lqg-quiet": lqg_settings.QUIET}
 RESULTS = Path(__file__).parents[1] / "results" / "tuning"
 
 
@@ -67,7 +68,7 @@ def test_validation_seeds_choose(monkeypatch):
     assert chosen["settings"]["lam"] == 0.3
     assert chosen["hash"] == candidates[2].hash
     assert sum(chosen["lost"].values()) == 0.0
-    assert set(met) == set(range(VALIDATION_SEED, VALIDATION_SEED + 7))
+    assert set(met) == set(VALIDATION_SEEDS[:7])
 
 
 def test_the_calmer_version_wins_where_the_other_loses_crystals(monkeypatch):
@@ -108,7 +109,9 @@ def test_the_command_writes_its_history(monkeypatch, tmp_path, capsys):
     assert [file.name for file in output.parent.iterdir()] == ["lqg.json"]
 
 
-@pytest.mark.parametrize("arguments", [["--budget", "0"], ["--survive", "-1"], ["--controller", "pid"]])
+@pytest.mark.parametrize(
+    "arguments", [["--budget", "0"], ["--survive", "-1"], ["--validation", "501"], ["--controller", "pid"]]
+)
 def test_bad_arguments_are_refused_in_a_line(arguments, capsys):
     with pytest.raises(SystemExit) as error:
         lqg_tune.main(arguments)
@@ -123,8 +126,38 @@ def test_a_place_that_cannot_be_written_is_refused_before_the_search(monkeypatch
     assert "cannot read or write" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", sorted(SHIPPED))
-def test_what_ships_is_what_the_command_chose(name):
-    chosen = json.loads((RESULTS / f"{name}.json").read_text())["chosen"]
-    assert SHIPPED[name].hash == chosen["hash"]
-    assert SHIPPED[name] == lqg_goal.settings_from(chosen["settings"])
+@pytest.mark.parametrize(("name", "scenario"), sorted(lqg_settings.SHIPPED))
+def test_what_ships_is_what_the_command_chose(name, scenario):
+    chosen = json.loads((RESULTS / lqg_tune.file_name(name, scenario)).read_text())["chosen"]
+    shipped = lqg_settings.SHIPPED[name, scenario]
+    assert shipped.hash == chosen["hash"]
+    assert shipped == lqg_goal.settings_from(chosen["settings"])
+    assert not chosen["validation"]["failure_rate"]
+
+
+@pytest.mark.parametrize("scenario", ["randomized", "hard", "nominal", "paper-ramp", "reference-a", "only-sensor"])
+def test_everywhere_else_the_settings_of_randomized_serve(scenario):
+    assert lqg_settings.lqg(make_config(scenario)).settings.hash == "769324959cc3ed6e"
+    assert lqg_settings.lqg_quiet(make_config(scenario)).settings.hash == "f4a3e50fb1dcf8af"
+
+
+def test_another_scenario_is_tuned_on_its_own_training_seeds(monkeypatch):
+    met = {}
+
+    def watched(settings, scenario, seeds):
+        met.setdefault(scenario, set()).update(seeds)
+        return made_up(settings)
+
+    monkeypatch.setattr(lqg_tune, "measure", watched)
+    goal = replace(lqg_goal.GOALS["lqg", "puller"], start=LQGSettings())
+    lqg_tune.search(goal, 15, 4, 3)
+    assert met == {"puller": {*range(4), *range(100_000, 100_003)}}
+    lqg_tune.choose(goal, History([{"score": 0.0, "settings": asdict(LQGSettings())}]), 5, 2)
+    assert set(met) == {"puller"}
+    assert met["puller"] <= set(TRAINING_SEEDS) | set(VALIDATION_SEEDS)
+
+
+def test_settings_with_a_ring_are_read_back_as_written():
+    settings = lqg_goal.GOALS["lqg", "puller"].start
+    assert settings.ring == lqg_goal.PULLER_RING
+    assert lqg_goal.settings_from(json.loads(json.dumps(asdict(settings)))) == settings

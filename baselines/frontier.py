@@ -1,0 +1,112 @@
+"""What the LQG's radius error would be at another's pull activity: ``python -m baselines.frontier benchmark.json``.
+
+Radius error and pull activity are traded against each other, so controllers are fairly compared at equal activity. The
+LQG's settings of :data:`baselines.lqg_settings.ACTIVITIES` span the trade; between them the logarithm of the radius
+error is a monotone cubic (Fritsch and Carlson's PCHIP) of the logarithm of the activity.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from cz_gym.commands import OneLineParser
+
+from .lqg_settings import ACTIVITIES, family_name
+from .policy import Floats
+
+ACTIVITY = "pull_step_rms_mm_per_min"
+
+
+class Frontier(NamedTuple):
+    """The trade, from quiet to lively; the error never rises."""
+
+    activity: Floats
+    """Pull step RMS [mm/min], increasing."""
+    rmse: Floats
+    """Radius error [mm], not increasing."""
+
+    def at(self, activity: float) -> float:
+        """The radius error [mm] at that pull step RMS [mm/min].
+
+        Above the liveliest setting it is the least there is: who may move more need not. ValueError below the quietest.
+        """
+        if not activity >= self.activity[0]:
+            raise ValueError(f"a pull step RMS of {activity} mm/min is below the frontier's {self.activity[0]:.4g}")
+        if activity >= self.activity[-1]:
+            return float(self.rmse[-1])
+        curve = PchipInterpolator(np.log(self.activity), np.log(self.rmse))
+        return float(np.exp(curve(np.log(activity))))
+
+
+def frontier(points: Sequence[tuple[float, float]]) -> Frontier:
+    """The frontier of (activity, radius error) pairs, both positive; pairs that another beats in both are left out.
+
+    ValueError if fewer than two are left.
+    """
+    kept: list[tuple[float, float]] = []
+    for activity, rmse in sorted(points):
+        if not (0.0 < activity < np.inf and 0.0 < rmse < np.inf):
+            raise ValueError(f"activity and radius error must be positive numbers, not {activity} and {rmse}")
+        if not kept or rmse < kept[-1][1]:
+            kept += [(activity, rmse)] if not kept or activity > kept[-1][0] else []
+    if len(kept) < 2:
+        raise ValueError(f"a frontier needs two settings of which neither beats the other, found {len(kept)}")
+    activities, errors = np.array(kept).T
+    return Frontier(activities, errors)
+
+
+def frontier_of(scenario: Mapping[str, Any], metric: str = "rmse_mm") -> Frontier:
+    """The LQG's frontier in one scenario of a benchmark.json; ValueError if it has too few of its settings."""
+    names = ["lqg", "lqg-quiet", *(family_name(activity) for activity in ACTIVITIES)]
+    found = [scenario[name] for name in names if name in scenario]
+    return frontier([(entry[ACTIVITY]["mean"], entry[metric]["mean"]) for entry in found])
+
+
+def at_equal_activity(scenario: Mapping[str, Any], controller: str, metric: str = "rmse_mm") -> float:
+    """Radius error of that controller over the LQG's at its activity [-]: below 1 it beats the frontier."""
+    entry = scenario[controller]
+    return float(entry[metric]["mean"]) / frontier_of(scenario, metric).at(entry[ACTIVITY]["mean"])
+
+
+def table(results: Mapping[str, Any], metric: str) -> str:
+    """A line for every controller of every scenario that holds a frontier."""
+    lines = []
+    for name, scenario in results.items():
+        try:
+            curve = frontier_of(scenario, metric)
+        except ValueError as error:
+            lines.append(f"{name}: {error}")
+            continue
+        for controller, entry in scenario.items():
+            activity, rmse = entry[ACTIVITY]["mean"], entry[metric]["mean"]
+            beyond = activity < curve.activity[0]
+            rival = (
+                "quieter than any" if beyond else f"{curve.at(activity):.4f} mm, ratio {rmse / curve.at(activity):.2f}"
+            )
+            lines.append(f"{name}: {controller} {rmse:.4f} mm at {activity:.4f} mm/min; lqg there: {rival}")
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command."""
+    parser = OneLineParser(prog="python -m baselines.frontier", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("benchmark", type=Path, help="a benchmark.json with lqg's settings among its controllers")
+    parser.add_argument("--metric", choices=("rmse_mm", "rmse_observable_mm"), default="rmse_mm")
+    given = parser.parse_args(arguments)
+    try:
+        print(table(json.loads(given.benchmark.read_text())["results"], given.metric))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        print(f"frontier: {given.benchmark} is no benchmark.json: {error!r}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

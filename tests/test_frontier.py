@@ -1,0 +1,121 @@
+"""The LQG's frontier: interpolation between what was measured, and how its settings are chosen."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from baselines import frontier, lqg_frontier, lqg_settings
+from baselines.frontier import at_equal_activity, frontier_of
+from baselines.lqg_goal import Figures
+from baselines.lqg_settings import ACTIVITIES, family_name, frontier_settings
+from baselines.registry import find_controller
+from cz_gym.config import make_config
+
+RESULTS = Path(__file__).parents[1] / "results" / "tuning"
+PAIRS = st.lists(st.tuples(st.floats(1e-4, 1.0), st.floats(1e-3, 10.0)), min_size=2, max_size=12)
+
+
+def entry(activity, rmse):
+    return {"pull_step_rms_mm_per_min": {"mean": activity}, "rmse_mm": {"mean": rmse}}
+
+
+def test_a_power_law_is_met_exactly():
+    curve = frontier.frontier([(a, 0.01 * a**-0.5) for a in (0.003, 0.006, 0.02, 0.03)])
+    for activity in (0.003, 0.004, 0.011, 0.03):
+        assert curve.at(activity) == pytest.approx(0.01 * activity**-0.5, rel=1e-12)
+
+
+@given(PAIRS)
+def test_it_goes_through_its_points_and_never_rises(pairs):
+    try:
+        curve = frontier.frontier(pairs)
+    except ValueError:
+        return
+    for activity, rmse in zip(*curve, strict=True):
+        assert curve.at(activity) == pytest.approx(rmse, rel=1e-9)
+    between = np.geomspace(curve.activity[0], curve.activity[-1], 50)[1:-1]
+    values = [curve.at(activity) for activity in between]
+    assert np.all(np.diff(values) <= 1e-12)
+    assert all(rmse >= curve.at(activity) * (1.0 - 1e-9) for activity, rmse in pairs if activity >= curve.activity[0])
+
+
+def test_a_setting_beaten_in_both_is_left_out_and_the_liveliest_need_not_move():
+    curve = frontier.frontier([(0.01, 0.07), (0.02, 0.05), (0.03, 0.06)])
+    np.testing.assert_array_equal(curve.activity, [0.01, 0.02])
+    assert curve.at(5.0) == 0.05
+
+
+@pytest.mark.parametrize("activity", [0.009, 0.0, -1.0, float("nan")])
+def test_below_the_quietest_nothing_is_made_up(activity):
+    with pytest.raises(ValueError, match=r"below the frontier's 0\.01"):
+        frontier.frontier([(0.01, 0.07), (0.02, 0.05)]).at(activity)
+
+
+@pytest.mark.parametrize("pairs", [[(0.01, 0.07)], [(0.01, 0.05), (0.02, 0.06)], [(0.0, 0.1), (0.1, 0.1)]])
+def test_a_frontier_needs_two_settings_and_positive_numbers(pairs):
+    with pytest.raises(ValueError, match=r"frontier needs two|must be positive"):
+        frontier.frontier(pairs)
+
+
+def test_a_benchmark_is_compared_at_equal_activity(tmp_path, capsys):
+    scenario = {name: entry(a, 0.01 * a**-0.5) for name, a in ((family_name(0.005), 0.005), ("lqg", 0.02))}
+    scenario |= {"ppo": entry(0.01, 0.2), "industrial": entry(0.001, 0.4)}
+    assert at_equal_activity(scenario, "ppo") == pytest.approx(2.0)
+    assert len(frontier_of(scenario).activity) == 2
+    file = tmp_path / "benchmark.json"
+    file.write_text(json.dumps({"results": {"randomized": scenario, "nominal": {"ppo": entry(0.01, 0.2)}}}))
+    assert frontier.main([str(file)]) == 0
+    told = capsys.readouterr().out
+    assert "ppo 0.2000 mm at 0.0100 mm/min; lqg there: 0.1000 mm, ratio 2.00" in told
+    assert "industrial 0.4000 mm at 0.0010 mm/min; lqg there: quieter than any" in told
+    assert "nominal: a frontier needs two settings" in told
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"results": {"randomized": {"lqg": 1}}}'])
+def test_another_file_is_refused_in_a_line(content, tmp_path, capsys):
+    (tmp_path / "x.json").write_text(content)
+    assert frontier.main([str(tmp_path / "x.json")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert frontier.main([str(tmp_path / "none.json")]) == 2
+
+
+# How the settings are chosen
+
+
+def test_the_weight_for_an_activity_is_read_off_between(monkeypatch, tmp_path):
+    def made_up(settings, scenario, seeds):
+        """Pull steps fall with the square root of their weight; the quiet base holds the radius better."""
+        step = 0.01 * settings.weights.pull_step**-0.5
+        return Figures(0.05 + 0.01 * (settings.noise == lqg_settings.REWARD.noise), step, 0.0, 0.0, 0.0, 2160)
+
+    monkeypatch.setattr(lqg_frontier, "measure", made_up)
+    output = tmp_path / "frontier.json"
+    assert lqg_frontier.main(["--output", str(output)]) == 0
+    found = json.loads(output.read_text())
+    assert [chosen["activity"] for chosen in found["chosen"]] == list(ACTIVITIES)
+    assert {chosen["base"] for chosen in found["chosen"]} == {"lqg-quiet"}
+    for chosen in found["chosen"]:
+        assert chosen["validation"]["pull_step"] == pytest.approx(chosen["activity"], rel=1e-2)
+
+
+@pytest.mark.parametrize("option", [["--episodes", "0"], ["--validation", "501"]])
+def test_a_budget_out_of_range_is_refused_in_a_line(option, tmp_path, capsys):
+    assert lqg_frontier.main([*option, "--output", str(tmp_path / "x.json")]) == 2
+    assert "must be" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("scenario", sorted(lqg_settings.FRONTIER))
+def test_what_ships_is_what_the_command_chose(scenario):
+    chosen = json.loads((RESULTS / f"lqg-frontier-{scenario}.json").read_text())["chosen"]
+    for activity, one in zip(ACTIVITIES, chosen, strict=True):
+        assert one["activity"] == activity
+        assert frontier_settings(activity, scenario).hash == one["hash"]
+        policy = find_controller(family_name(activity)).make(make_config(scenario))
+        assert policy.settings.hash == one["hash"]
+        assert not one["validation"]["failure_rate"]
+    steps = [one["validation"]["pull_step"] for one in chosen]
+    assert steps == sorted(steps)

@@ -1,0 +1,155 @@
+"""The late, shaken ring in the LQG's model: against the covariance equation, the environment's camera, known tones."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from baselines import late_ring, lqg_linear, lqg_settings
+from baselines.late_ring import RingModel, frequencies, listen
+from baselines.lqg import LQG, LQGSettings, solve
+from baselines.lqg_goal import PULLER_RING
+from baselines.lqg_model import FAST, STATES, NoiseModel, plant_model
+from cz_gym import make_puller
+from cz_gym.config import make_config
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.observation import MEASURED, scales
+from cz_gym.scenario import Interface, Scenario, Sensor
+from cz_gym.scenarios import PULLER as PULLER_SCENARIO
+from cz_gym.task import cost_terms
+from cz_gym.units import MINUTE, MM
+
+PULLER = make_puller(lam=0.5)
+LINEAR = replace(LQGSettings(), nonlinear=False, gate=np.inf, noise=NoiseModel(camera_memory=np.inf, recipe_share=0.0))
+KNOWN = RingModel(5.0, 0.1 * MM, 10.0 * MINUTE, rotation=(10.0 / MINUTE, 10.0 / MINUTE))
+
+
+def measured(**values):
+    """An observation of these values [SI], the rest zero and the camera valid."""
+    n = len(next(iter(values.values())))
+    columns = {channel.name: np.zeros(n) for channel in MEASURED} | {"valid": np.ones(n)} | values
+    return np.stack([columns[channel.name] for channel in MEASURED], axis=1) / scales(MEASURED, PULLER.v_0)
+
+
+@pytest.mark.parametrize(
+    ("ring", "dt"), [(RingModel(5.0), 5.0), (RingModel(5.0), 10.0), (RingModel(7.0), 5.0), (KNOWN, 5.0)]
+)
+def test_measured_cost_with_a_late_ring_matches_the_covariance_equation(ring, dt):
+    settings = replace(LINEAR, ring=ring)
+    gains = solve(settings, dt, PULLER)
+    model, noise, rng = gains.eye.model, settings.noise, np.random.default_rng(5)
+    moving = lqg_linear.stationary(model)
+    both, n, steps, settle = np.ix_(moving, moving), 400, 2000, 400
+    A, B, H, kick = model.A[both], model.B[moving], model.H[:, moving], lqg_linear._root(model.Q[both])
+    x = np.zeros((n, len(moving)))
+    x[:, FAST : FAST + 2] = rng.normal(size=(n, 2)) * [noise.fast_sd, noise.slow_sd]
+    controller, u, state, totals = LQG(settings, dt), np.zeros((n, 2)), None, []
+    for k in range(steps):
+        y = x @ H.T + rng.normal(size=(n, 2)) * [noise.camera_sd, noise.pyrometer_sd]
+        action, state = controller.predict(measured(ring_error=y[:, 0], T_1=y[:, 1], v_p=u[:, 0], Q_H=u[:, 1]), state)
+        moved = action.astype(float) * [PULLER.v_0, 1e4]
+        if k >= settle:
+            totals.append([np.mean(term) for term in cost_terms(x[:, 0], moved[:, 0], *(moved - u).T)])
+        u = moved
+        x = x @ A.T + u @ B.T + rng.normal(size=x.shape) @ kick.T
+    expected = lqg_linear.stationary_cost(gains)
+    assert np.mean(np.sum(totals, axis=1)) == pytest.approx(sum(expected), rel=0.02)
+
+
+def test_to_know_of_the_latency_costs_less_than_to_ignore_it():
+    cheap = [
+        sum(lqg_linear.stationary_cost(solve(replace(LINEAR, ring=RingModel(t)), 5.0, PULLER))) for t in (0, 5, 10)
+    ]
+    assert cheap[0] == pytest.approx(sum(lqg_linear.stationary_cost(solve(LINEAR, 5.0, PULLER))), rel=1e-9)
+    assert cheap[0] < cheap[1] < cheap[2]
+
+
+@pytest.mark.parametrize("latency", [0.0, 2.0, 5.0, 7.0])
+@pytest.mark.parametrize("dt", [2.0, 5.0, 10.0])
+def test_a_ring_that_grows_evenly_is_delivered_as_old_as_the_latency(latency, dt):
+    ring, slope, steps = RingModel(latency), 3e-7, 20
+    model = late_ring.augmented(plant_model(PULLER, NoiseModel(), dt), ring, dt)
+    row = np.zeros((1, len(model.A)))
+    row[0, 0] = 1.0
+    A = late_ring.transition(np.eye(len(model.A)), row, np.zeros(1), ring, dt)[0]
+    for state in range(ring.late, len(A)):
+        A[state] = row[0] if state == ring.late else np.eye(len(A))[state - 1]
+    x = np.zeros(len(A))
+    for k in range(steps):
+        x = A @ x
+        x[0] = slope * (k + 1) * dt
+    delivered = late_ring.reading_row(row, ring, dt)[0] @ x
+    assert delivered == pytest.approx(slope * (steps * dt - latency), rel=1e-12)
+
+
+@pytest.mark.parametrize("dt", [5.0, 10.0])
+def test_the_camera_of_the_environment_is_late_as_modelled(dt):
+    late = Scenario("late", interface=Interface(sd=(0.3, 0.3)), sensor=Sensor(latency=5.0))
+    run = rollout(LQG(control_interval=dt), make_config(late, control_interval=dt, horizon=1200.0), [1])
+    prompt, delivered = run.signals.r_br[:, 0], run.signals.r_br_measured[:, 0]
+    samples, oldest = RingModel(5.0).delay(dt)
+    assert samples == 1
+    expected = oldest * prompt[:-1] + (1.0 - oldest) * prompt[1:]
+    np.testing.assert_allclose(delivered[1:], expected, atol=1e-7 if dt == 5.0 else 5e-6)
+
+
+# The search for the ripple
+
+
+def heard(tone_hz, amplitude, noise, samples, dt=5.0, slots=40, ring=PULLER_RING):
+    rng = np.random.default_rng(6)
+    phase, search = rng.uniform(0.0, 2.0 * np.pi, slots), late_ring.begin(slots, ring, dt)
+    for k in range(samples):
+        rest = amplitude * np.sin(2.0 * np.pi * tone_hz * k * dt + phase) + noise * rng.normal(size=slots)
+        found = listen(search, rest, np.ones(slots, bool), ring, dt)
+        search = found.search
+    return found, amplitude * np.sin(2.0 * np.pi * tone_hz * k * dt + phase)
+
+
+@pytest.mark.parametrize("dt", [2.0, 5.0, 10.0])
+@pytest.mark.parametrize("rotation", [8.3, 9.7, 11.2, 13.6, 14.9])
+def test_a_tone_is_found_where_its_alias_is(rotation, dt):
+    tone = rotation / MINUTE
+    alias = abs(tone - round(tone * dt) / dt)
+    found, now = heard(tone, 0.1 * MM, 0.05 * MM, round(1200.0 / dt), dt)
+    np.testing.assert_allclose(found.search.omega / (2.0 * np.pi), alias, atol=1e-4)
+    np.testing.assert_allclose(found.ripple[:, 0], now, atol=0.04 * MM)
+
+
+def test_noise_is_hardly_ever_taken_for_a_ripple():
+    found, _ = heard(0.2, 0.0, 0.05 * MM, 1000, slots=200)
+    assert np.mean(found.search.omega > 0.0) < 0.05
+
+
+def test_what_cannot_be_told_from_the_radius_is_not_searched():
+    assert frequencies(PULLER_RING, 5.0).min() >= 2.0 * np.pi * PULLER_RING.lowest
+    assert not len(frequencies(KNOWN, 5.0))
+
+
+def test_once_found_the_ripple_is_left_out_of_the_radius():
+    shaken = Scenario(
+        "shaken", interface=Interface(sd=(0.2, 0.2)),
+        sensor=Sensor(latency=5.0, ripple=(0.2 * MM, 0.2 * MM), rotation=PULLER_SCENARIO.sensor.rotation),
+    )  # fmt: skip
+    config, seeds = make_config(shaken, horizon=5400.0), range(20)
+    knowing = metrics(rollout(LQG(replace(lqg_settings.REWARD, ring=PULLER_RING)), config, seeds))
+    late = metrics(rollout(LQG(replace(lqg_settings.REWARD, ring=RingModel(5.0))), config, seeds))
+    assert knowing.rmse_mm.mean() < 0.75 * late.rmse_mm.mean()
+    assert knowing.pull_step_rms_mm_per_min.mean() < late.pull_step_rms_mm_per_min.mean()
+
+
+def test_a_ring_that_is_neither_late_nor_shaken_adds_nothing():
+    model = plant_model(PULLER, NoiseModel(), 5.0)
+    for plain, with_ring in zip(model, late_ring.augmented(model, RingModel(), 5.0), strict=True):
+        np.testing.assert_allclose(with_ring, plain, rtol=1e-12, atol=1e-30)
+    config = make_config("randomized", horizon=1200.0)
+    plain, with_ring = (rollout(LQG(replace(LQGSettings(), ring=ring)), config, [3]) for ring in (None, RingModel()))
+    np.testing.assert_allclose(with_ring.signals.v_p, plain.signals.v_p, rtol=1e-6)
+
+
+def test_the_ripple_keeps_its_variance():
+    model = late_ring.augmented(plant_model(PULLER, NoiseModel(), 5.0), PULLER_RING, 5.0)
+    both = slice(len(STATES), len(STATES) + 2)
+    A, Q = model.A[both, both], model.Q[both, both]
+    np.testing.assert_allclose(A @ A.T * PULLER_RING.ripple_sd**2 + Q, PULLER_RING.ripple_sd**2 * np.eye(2), atol=1e-18)
