@@ -211,5 +211,5 @@ def test_a_window_that_cannot_open_is_one_clear_error(monkeypatch: pytest.Monkey
     monkeypatch.setenv("SDL_VIDEODRIVER", "nonsense")
     pygame.display.quit()
     env = CzEnv(render_mode="human")
-    with pytest.raises(gym.error.Error, match="cannot open a window: .*rgb_array"):
+    with pytest.raises(gym.error.Error, match=r"cannot open a window: .*rgb_array"):
         env.reset(seed=1)

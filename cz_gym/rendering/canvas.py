@@ -82,7 +82,8 @@ class Canvas:
         """The picture; the next one is drawn into the same surface."""
         self.pygame.transform.smoothscale(self._fine, (self.width, self.height), self._picture)
         for label in self._labels:
-            self._write(label)
+            text, left, top = self._placed(label)
+            self._picture.blit(text, (left, top))
         return self._picture
 
     @contextmanager
@@ -143,6 +144,15 @@ class Canvas:
         corner = (round(x * FINE) - size, round(y * FINE) - size)
         self._fine.blit(_glow(colour, size), corner, special_flags=self.pygame.BLEND_RGB_ADD)
 
+    def cover(self, box: Box) -> None:
+        """Forget the text that reaches into a box, which something else will cover."""
+        self._labels = [label for label in self._labels if not self._reaches(label, box)]
+
+    def _reaches(self, label: Label, box: Box) -> bool:
+        image, left, top = self._placed(label)
+        across = left < box.right and left + image.get_width() > box.x
+        return across and top < box.bottom and top + image.get_height() > box.y
+
     def shade(self, box: Box, top: Colour, bottom: Colour) -> None:
         """A box whose colour runs from top to bottom."""
         x, y, w, h = _rounded(box)
@@ -161,10 +171,11 @@ class Canvas:
         """Text whose top is at y and whose left, centre or right (``anchor``) is at x; size in nominal px."""
         self._labels.append(Label(x, y, text, size, colour, anchor, bold))
 
-    def _write(self, label: Label) -> None:
+    def _placed(self, label: Label) -> tuple[Any, int, int]:
+        """The text's image and its upper left corner [px]."""
         image = _glyphs(label.text, max(7, round(label.size * self.unit)), label.colour, label.bold)
         left = {"left": 0.0, "centre": 0.5, "right": 1.0}[label.anchor] * image.get_width()
-        self._picture.blit(image, (round(label.x - left), round(label.y)))
+        return image, round(label.x - left), round(label.y)
 
 
 def _rounded(box: Box) -> tuple[int, int, int, int]:

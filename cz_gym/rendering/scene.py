@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from numbers import Integral
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -69,8 +70,13 @@ class Scene:
         self.canvas = Canvas(width, height)
         self.layout = layout(width, height)
 
-    def draw(self, record: Record, asked: Asked | None = None) -> Surface:
-        """The picture of a record's newest sample; the next call draws into the same surface."""
+    def draw(
+        self, record: Record, asked: Asked | None = None, overlay: Callable[[Canvas], None] | None = None
+    ) -> Surface:
+        """The picture of a record's newest sample; the next call draws into the same surface.
+
+        ``asked`` shows set-points of the drives, ``overlay`` draws on top.
+        """
         canvas, boxes = self.canvas, self.layout
         canvas.clear()
         self._header(record)
@@ -81,6 +87,8 @@ class Scene:
         strips.draw(canvas, boxes.strips, record)
         if record.ending is not None:
             banner(canvas, boxes.edge, record.ending)
+        if overlay is not None:
+            overlay(canvas)
         return canvas.finish()
 
     def _header(self, record: Record) -> None:
