@@ -4,16 +4,16 @@ const v0 = FACTS.v_0_mm_per_min;
 
 /** Panels in two columns, row by row: what is solid (true), pale (the camera's), dashed (asked for or hidden), dotted. */
 const PANELS = [
-  { title: "Crystal radius r<sub>c</sub> and reference", unit: "mm", solid: (s) => s.r_c, dashed: (e) => e.r_ref },
+  { title: "Crystal radius r<sub>c</sub> and reference", unit: "mm", solid: (s) => s.r_c, dashed: (e) => e.r_ref, asked: "reference" },
   { title: "Pull speed v<sub>p</sub>", unit: "mm/min", solid: (s) => s.v_p, levels: [v0] },
   { title: "Radius error: true, and as the camera says", unit: "mm", solid: (s, e) => less(s.r_c, e.r_ref),
     pale: (s, e) => less(s.camera, e.r_ref), levels: [-FACTS.tolerance_mm, 0, FACTS.tolerance_mm] },
   { title: "Growth rate v<sub>g</sub>", unit: "mm/min", solid: (s) => s.v_g, levels: [v0] },
   { title: "Bright ring less true radius: optical, and as read", unit: "mm", solid: (s) => less(s.ring, s.r_c),
-    pale: (s) => less(s.camera, s.r_c), dashed: (e) => e.offset, levels: [0] },
+    pale: (s) => less(s.camera, s.r_c), dashed: (e) => e.offset, asked: "hidden offset", levels: [0] },
   { title: "Heater power Q<sub>H</sub>", unit: "kW", solid: (s) => s.Q_H },
   { title: "Meniscus height h<sub>c</sub>", unit: "mm", solid: (s) => s.h_c },
-  { title: "Heater temperature T<sub>1</sub> and recipe", unit: "K", solid: (s) => s.T_1, dashed: (e) => e.T_1_ref },
+  { title: "Heater temperature T<sub>1</sub> and recipe", unit: "K", solid: (s) => s.T_1, dashed: (e) => e.T_1_ref, asked: "recipe" },
   { title: "Growth angle α<sub>c</sub>", unit: "deg", solid: (s) => s.alpha_c, levels: [0] },
   { title: "Melt temperature T<sub>b</sub>", unit: "K", solid: (s) => s.T_b },
 ];
@@ -48,7 +48,20 @@ async function drawCrystal() {
     ...panels, margin: { l: 44, r: 8, t: 20, b: 36 }, showlegend: false, hovermode: "x",
     dragmode: "zoom", annotations: PANELS.map(panelTitle), shapes: PANELS.flatMap(levels),
   }), CONFIG);
+  if (!plot.querySelector(".cursor")) followCursor(plot);
   plot.dataset.drawn = asked;
+}
+
+/** A line in every panel at the time that is pointed at in one. */
+function followCursor(plot) {
+  const lines = PANELS.map(() => plot.appendChild(make("i", { class: "cursor", hidden: true })));
+  plot.on("plotly_hover", ({ xvals }) => lines.forEach((line, i) => {
+    const x = plot._fullLayout[`xaxis${i ? i + 1 : ""}`], y = plot._fullLayout[`yaxis${i ? i + 1 : ""}`];
+    const place = { left: x._offset + x.l2p(xvals[0]), top: y._offset, height: y._length };
+    for (const [name, pixels] of Object.entries(place)) line.style[name] = `${pixels}px`;
+    line.hidden = false;
+  }));
+  plot.on("plotly_unhover", () => lines.forEach((line) => (line.hidden = true)));
 }
 
 function axisName(letter, i) {
@@ -76,8 +89,8 @@ function panelTraces(panel, i, shared, runs, camera) {
   }
   if (panel.dashed) {
     traces.push({
-      ...on, ...timed(panel.dashed(shared)), name: "dashed", line: { color: INK, width: 1.3, dash: "dash" },
-      hovertemplate: `dashed${over}`,
+      ...on, ...timed(panel.dashed(shared)), name: panel.asked, line: { color: INK, width: 1.3, dash: "dash" },
+      hovertemplate: `${panel.asked}${over}`,
     });
   }
   return traces;
@@ -124,8 +137,7 @@ function panelAxes(panel, i, range) {
   const x = axis({
     domain: column ? [0.53, 1] : [0, 0.47], anchor: axisName("y", i), showticklabels: last, uirevision: "time",
     range: [0, FACTS.horizon_min], ...(last ? { title: { text: "time [min]", standoff: 4 } } : {}),
-    ...(i ? { matches: "x" } : {}), showspikes: true, spikemode: "across", spikethickness: 1, spikedash: "dot",
-    spikecolor: SOFT, hoverformat: ".2f",
+    ...(i ? { matches: "x" } : {}), hoverformat: ".2f", ticksuffix: " min", showticksuffix: "last",
   });
   const y = axis({
     domain: [Math.max(top - FILLED * height, 0), top], anchor: axisName("x", i), range, nticks: 5,
