@@ -25,8 +25,6 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "czdocs.mathml", "czdocs.tabl
 nitpicky = True
 nitpick_ignore = [("py:func", "make_config")]
 nitpick_ignore_regex = [
-    # What annotations name and no page describes.
-    (r"py:class", r"cz_gym\.\w+\..*"),
     # Other projects' names; their inventories would have to be fetched.
     (r"py:.*", r"(numpy|np|npt|gymnasium|gym|collections|typing|pathlib|ndarray|optional|Callable|Any|Floats)\b.*"),
     (r"py:.*", r"(int|float|str|bool|dict|list|tuple|array|Array|Mask|Mapping|Sequence|Path)\b.*"),

@@ -1,14 +1,18 @@
-"""API pages: docstrings as this project writes them; the parameters' fields stand in the nomenclature."""
+"""API pages: docstrings as this project writes them; fields that a table describes stand there."""
 
 from __future__ import annotations
 
 import dataclasses
+import pkgutil
 import re
 from typing import Any
 
 from cz_gym import Parameters
+from cz_gym.camera import Camera
 
 PLACE = "Alias for field number"
+DESCRIBED: tuple[Any, ...] = (Parameters, Camera)
+"""What has its fields in a table."""
 LONGEST = 24
 """Longest default in a signature [characters]."""
 HEADING = re.compile(r"^## (.*)$")
@@ -31,8 +35,8 @@ def _plain(line: str) -> str:
 
 def sign(app: Any, what: str, name: str, thing: Any, options: Any, signature: str | None, returns: str | None) -> Any:
     """The signature of a record of settings: names, and defaults that are short enough to read."""
-    if thing is Parameters:
-        defaults = Parameters()._asdict()
+    if thing in DESCRIBED:
+        defaults = thing()._asdict()
     elif dataclasses.is_dataclass(thing) and isinstance(thing, type):
         defaults = {field.name: field.default for field in dataclasses.fields(thing)}
     else:
@@ -48,8 +52,20 @@ def _default(value: Any) -> str:
 
 
 def skip(app: Any, what: str, name: str, thing: Any, skipped: bool, options: Any) -> bool | None:
-    """Leave the parameters' fields to the nomenclature."""
-    return True if name in Parameters._fields and thing is vars(Parameters).get(name) else None
+    """Leave the fields of what is described in tables to these."""
+    return True if any(thing is vars(described).get(name) for described in DESCRIBED) else None
+
+
+def exists(app: Any, domain: Any, node: Any) -> bool | None:
+    """Nobody is warned of a name that is there but that no page describes; a name that is not there is a warning."""
+    target, within = node.get("reftarget", ""), node.get("py:module")
+    for name in (target, f"{within}.{target}"):
+        try:
+            pkgutil.resolve_name(name)
+        except (ImportError, AttributeError, ValueError):
+            continue
+        return True
+    return None
 
 
 def setup(app: Any) -> dict[str, bool]:
@@ -57,4 +73,5 @@ def setup(app: Any) -> dict[str, bool]:
     app.connect("autodoc-process-docstring", say)
     app.connect("autodoc-process-signature", sign)
     app.connect("autodoc-skip-member", skip)
+    app.connect("warn-missing-reference", exists)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

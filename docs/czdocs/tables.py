@@ -13,6 +13,7 @@ from docutils.parsers.rst import Directive
 from docutils.statemachine import StringList
 
 from cz_gym import SCENARIOS, Scenario
+from cz_gym.camera import Camera, describe_camera
 from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED, STATE, Channel
 from cz_gym.scenarios import RANDOMIZED
 from cz_gym.slots import INFO_ROWS
@@ -163,6 +164,16 @@ def symbols(rows: Iterable[nomenclature.Row]) -> list[str]:
     return markdown(head, lines)
 
 
+def camera() -> list[str]:
+    """The camera's parameters."""
+    default = Camera()
+    rows = (
+        (code(name), f"{getattr(default, name):.6g}", units(q.unit), q.meaning, q.source)
+        for name, q in describe_camera().items()
+    )
+    return markdown(("code", "value", "unit", "meaning", "source"), rows)
+
+
 TABLES: dict[str, Callable[[], list[str]]] = {
     "measured": lambda: channels(MEASURED),
     "history": remembered,
@@ -172,6 +183,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "plain-scenarios": plain_scenarios,
     "single-scenarios": single_scenarios,
     "families": families,
+    "camera": camera,
     "states": lambda: symbols(nomenclature.states()),
     "inputs": lambda: symbols(nomenclature.inputs()),
     "seen": lambda: symbols(nomenclature.seen()),
