@@ -8,7 +8,7 @@ BENCHMARK_READY := $(VENV)/.ready-benchmark
 DOCS_READY := $(VENV)/.ready-docs
 BROWSER_READY := $(VENV)/.ready-browser
 
-.PHONY: help venv lint types test test-browser benchmark paper docs clean
+.PHONY: help venv lint types test test-lowest test-newest test-wheel audit test-browser benchmark paper docs clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -25,6 +25,33 @@ types: $(TEST_READY) ## strict types
 
 test: lint types ## lint, types and tests
 	$(BIN)/python -m pytest -q --numprocesses auto --dist loadfile
+
+# Old packages warn about the new ones beneath them, which is not this project's to mend: warnings are no errors there.
+test-lowest: ## the tests on the lowest versions that pyproject.toml allows
+	$(PYTHON) -m venv build/lowest
+	build/lowest/bin/python -m pip install --quiet --constraint constraints-lowest.txt torch
+	build/lowest/bin/python -m pip install --quiet --constraint constraints-lowest.txt --editable ".[test]"
+	build/lowest/bin/python -m pytest -q -W default --numprocesses auto --dist loadfile
+
+test-newest: ## the tests on the newest versions there are
+	$(PYTHON) -m venv build/newest
+	build/newest/bin/python -m pip install --quiet --upgrade --editable ".[test]"
+	build/newest/bin/python -m pytest -q --numprocesses auto --dist loadfile
+
+# The tests come from the source distribution, all code from the wheel built of it.
+test-wheel: $(TEST_READY) ## the tests on what the wheel installs, outside this folder
+	folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && mkdir "$$folder/tests" && \
+	$(BIN)/python -m build --no-isolation --outdir "$$folder" . >/dev/null && \
+	tar -xzf "$$folder"/*.tar.gz -C "$$folder/tests" --strip-components=1 && \
+	$(BIN)/python -m pip install --quiet --no-deps --target "$$folder/installed" "$$folder"/*.whl && \
+	rm -r "$$folder/tests/cz_gym" "$$folder/tests/agents" "$$folder/tests/baselines" && \
+	ln -s ../installed/cz_gym ../installed/cz_gym/agents ../installed/cz_gym/baselines "$$folder/tests" && \
+	cd "$$folder/tests" && "$(CURDIR)/$(BIN)/python" -m pytest -q $(TESTS) --numprocesses auto --dist loadfile
+
+audit: $(TEST_READY) ## known weaknesses of the pinned packages; asks PyPI's advisories
+	$(PYTHON) -m venv build/audit
+	build/audit/bin/python -m pip install --quiet pip-audit
+	build/audit/bin/pip-audit --requirement constraints.txt --no-deps --disable-pip --strict
 
 test-browser: $(BROWSER_READY) ## report.html in Chromium without a window; skipped where chromium or chromedriver is absent
 	$(BIN)/python -m pytest -q tests/browser

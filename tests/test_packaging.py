@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -94,20 +95,44 @@ def test_pins_lie_in_the_open_ranges() -> None:
     assert pins["torch"] == "2.13.0"
 
 
+def test_lowest_versions_are_those_of_the_open_ranges() -> None:
+    """``make test-lowest`` tests what pyproject.toml promises; torch alone stands where its note says."""
+    packaging = pytest.importorskip("packaging.requirements")
+    version = pytest.importorskip("packaging.version").Version
+    lines = (ROOT / "constraints-lowest.txt").read_text().splitlines()
+    pins = dict(line.split("==") for line in lines if not line.startswith("#"))
+    extras = PROJECT["optional-dependencies"]
+    tested = packaging.Requirement(extras["test"][0]).extras
+    wanted = [*PROJECT["dependencies"], *extras["test"][1:], *(text for name in tested for text in extras[name])]
+    requirements = [packaging.Requirement(text) for text in wanted]
+    assert {requirement.name for requirement in requirements} == set(pins)
+    for requirement in requirements:
+        (lowest,) = (version(bound.version).release for bound in requirement.specifier)
+        if requirement.name != "torch":
+            assert version(pins[requirement.name]).release[: len(lowest)] == lowest, requirement
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
     tracked = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True)
-    names = [name for name in tracked.stdout.split("\0") if name] if tracked.returncode == 0 else []
+    names = tracked.stdout.split("\0") if tracked.returncode == 0 else _files()
     source = folder / "source"
     for name in names:
-        if (ROOT / name).is_file():
+        if name and (ROOT / name).is_file():
             (source / name).parent.mkdir(parents=True, exist_ok=True)
             (source / name).write_bytes((ROOT / name).read_bytes())
     command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(source)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     return next(folder.glob("*.whl"))
+
+
+def _files() -> list[str]:
+    """What lies here if this is no checkout, but for what was made by running it."""
+    made = {"build", "__pycache__", ".pytest_cache", ".hypothesis"}
+    walked = ((Path(folder).relative_to(ROOT), names) for folder, _, names in os.walk(ROOT, followlinks=True))
+    return [str(folder / name) for folder, names in walked if not made & set(folder.parts) for name in names]
 
 
 def test_wheel_installs_one_package_and_works_outside_the_checkout(wheel: Path, tmp_path: Path) -> None:
