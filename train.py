@@ -63,7 +63,7 @@ def train(arguments: argparse.Namespace) -> int:
     from agents import settings
     from agents.run import Run, saved_steps
     from baselines import CompensatedPID
-    from cz_gym.evaluation.whole import check_writable
+    from cz_gym.evaluation.whole import alone, check_writable
     from cz_gym.scenarios import find_scenario
 
     find_scenario(arguments.scenario)
@@ -76,17 +76,20 @@ def train(arguments: argparse.Namespace) -> int:
     choice = replace(choice, steps=steps)
     paper = CompensatedPID(choice.recipe.control_interval)
     check_writable(folder)
-    run = Run(folder, choice, arguments.seed, paper, arguments.resume, arguments.checkpoint_seconds)
-    print(f"{arguments.algo}, seed {arguments.seed}, {choice.steps:,} steps on {arguments.scenario!r}, into {folder}")
-    with tqdm(total=choice.steps, unit="step", unit_scale=True, dynamic_ncols=True, mininterval=1.0) as bar:
-        try:
-            run.learn(bar)
-        except KeyboardInterrupt:
-            run.save()
-            bar.close()
-            print(f"train.py: interrupted; checkpoint saved, --resume --out {folder} goes on", file=sys.stderr)
-            return 130
-    summary = run.finish()
+    with alone(folder):
+        run = Run(folder, choice, arguments.seed, paper, arguments.resume, arguments.checkpoint_seconds)
+        print(
+            f"{arguments.algo}, seed {arguments.seed}, {choice.steps:,} steps on {arguments.scenario!r}, into {folder}"
+        )
+        with tqdm(total=choice.steps, unit="step", unit_scale=True, dynamic_ncols=True, mininterval=1.0) as bar:
+            try:
+                run.learn(bar)
+            except KeyboardInterrupt:
+                run.save()
+                bar.close()
+                print(f"train.py: interrupted; checkpoint saved, --resume --out {folder} goes on", file=sys.stderr)
+                return 130
+        summary = run.finish()
     print(
         f"best agent on {summary['validation_episodes']} validation episodes: mean RMSE "
         f"{summary['validation_rmse_mm']:.3f} mm, {100 * summary['failure_rate']:.1f} % failures; "

@@ -27,6 +27,8 @@ import numba
 from numba.core.options import DefaultOptions as default_options
 from numba.extending import register_jitable
 
+from ._kept_code import KeptCode
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 _NO_COUNTS = "_nrt"
@@ -108,7 +110,10 @@ def kernel(function: F, keep: bool = True, allocates: bool = True) -> F:
     previous = settings.CACHE_DIR
     settings.CACHE_DIR = str(folder)
     try:
-        return cast(F, numba.njit(cache=True, **options)(function))
+        compiled: Any = numba.njit(**options)(function)
+        if hasattr(compiled, "_cache"):
+            compiled._cache = KeptCode(function)
+        return cast(F, compiled)
     except (RuntimeError, OSError):
         return cast(F, numba.njit(**options)(function))
     finally:

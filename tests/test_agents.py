@@ -162,6 +162,14 @@ def test_networks_that_give_no_action_are_refused(ppo: Any, tmp_path: Path) -> N
     path = tmp_path / "agent.onnx"
     actor = actor_of(ppo)
     write_agent(path, to_onnx(dataclasses.replace(actor, scale=np.full(2, np.nan, np.float32))), **facts())
+    with pytest.raises(AgentFileError, match="not finite"):
+        OnnxPolicy.load(path)
+    weight, bias = actor.layers[-1]
+    endless = dataclasses.replace(actor, layers=(*actor.layers[:-1], (weight * 0, bias * 0 + 1e38)))
+    model = onnx.load_from_string(to_onnx(dataclasses.replace(endless, scale=np.full(2, 1e38, np.float32))))
+    clip = model.graph.node[-1]
+    clip.CopyFrom(onnx.helper.make_node("Sub", [clip.input[0], clip.input[0]], [clip.output[0]]))
+    write_agent(path, model.SerializeToString(), **facts())
     with pytest.raises(AgentFileError, match="not two finite numbers"):
         OnnxPolicy.load(path)
     model = onnx.load_from_string(to_onnx(actor))

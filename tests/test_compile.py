@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from cz_gym._compile import cache_folder, hashed, kernel, source_hash
+from cz_gym._kept_code import Store
 from cz_gym.meniscus import hurle_slope
 
 ROOT = Path(__file__).parents[1]
@@ -59,6 +60,51 @@ def test_changed_physics_is_never_run_from_an_old_cache(package: Path, tmp_path:
     other, changed, hits = run(DERIVE, package, cache)
     assert float(changed) == pytest.approx(2 * float(height))
     assert (other != folder, hits) == (True, "0")
+
+
+def test_damaged_code_is_compiled_again(tmp_path: Path) -> None:
+    """Cut short, changed in one bit, and of another function under the right name."""
+    cache = tmp_path / "cache"
+    folder, height, _ = run(DERIVE, ROOT, cache)
+    (file,) = Path(folder).rglob("*derive*.code")
+    whole = file.read_bytes()
+    for damaged in (whole[: len(whole) // 2], whole[:-1] + bytes([whole[-1] ^ 1]), b""):
+        file.write_bytes(damaged)
+        assert run(DERIVE, ROOT, cache) == [folder, height, "0"]
+        assert run(DERIVE, ROOT, cache) == [folder, height, "1"]
+    assert not list(Path(folder).rglob(".code-*"))
+
+
+def test_code_for_other_types_is_not_used(tmp_path: Path) -> None:
+    store = Store(tmp_path, "kernel")
+    store.save("floats", 1)
+    store.save("integers", 2)
+    os.replace(store.path("floats"), store.path("integers"))
+    assert store.load("integers") is None
+    assert store.load("floats") is None
+    store.save("integers", 3)
+    assert store.load("integers") == 3
+
+
+def test_a_full_disk_keeps_nothing_and_fails_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*arguments: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("cz_gym._kept_code.os.replace", full)
+    store = Store(tmp_path, "kernel")
+    store.save("floats", 1)
+    assert store.load("floats") is None
+    assert not list(tmp_path.iterdir())
+
+
+def test_processes_that_compile_at_once_all_have_it_right(tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "CZ_GYM_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", DERIVE]
+    several = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    printed = {process.communicate()[0].split("|")[1] for process in several}
+    assert all(process.returncode == 0 for process in several)
+    assert printed == {run(DERIVE, ROOT, tmp_path)[1]}
+    assert run(DERIVE, ROOT, tmp_path)[2] == "1"
 
 
 def test_no_place_for_a_cache_is_no_failure(tmp_path: Path) -> None:

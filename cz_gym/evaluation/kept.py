@@ -26,6 +26,8 @@ from .rollout import Rollout, Signals, rollout
 Floats = npt.NDArray[np.float64]
 BLOCK = 10
 """Episodes run at once."""
+MAX_BYTES = 64_000_000
+"""Largest kept episode that is read, packed or not."""
 SOURCES = ("plant.py", "meniscus.py", "schedule.py", "task.py", "evaluation/metrics.py")
 """What the kept numbers are made by, beside the controller."""
 
@@ -95,9 +97,17 @@ def key(name: str, policy: SlowPolicy, config: Config) -> str:
 def read(path: Path, example: bool) -> Kept | None:
     """A kept episode, with its signals if it is an ``example``; None if there is none that can be used."""
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as data:
+        with open(path, "rb") as file:
+            content = file.read(MAX_BYTES + 1)
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            # What is packed may be a thousand times larger than the file.
+            if len(content) > MAX_BYTES or sum(part.file_size for part in archive.infolist()) > MAX_BYTES:
+                return None
+        with np.load(io.BytesIO(content), allow_pickle=False) as data:
             found = Kept(data["values"], float(data["microseconds"]), data["signals"])
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+    except Exception:  # zipfile, zlib and NumPy each raise their own for the ways a file can be broken
+        return None
+    if found.values.dtype != np.float64 or found.signals.dtype != np.float64 or found.signals.ndim != 2:
         return None
     logged = len(found.signals) == len(Signals._fields) and found.signals.size > 0
     return found if found.values.shape == (len(metric_names()),) and (logged or not example) else None

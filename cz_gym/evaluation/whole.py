@@ -64,6 +64,16 @@ def finish_writing(folder: Path) -> None:
                 shutil.rmtree(path, ignore_errors=True)
 
 
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Hold a folder, made if need be, for one process; ValueError if another holds it. Its death lets go of it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with _locked(folder) as mine:
+        if mine is False:
+            raise ValueError(f"{folder}: another process is at work in this folder")
+        yield
+
+
 def check_writable(path: Path) -> None:
     """Raise OSError unless files could be written into the folder ``path``, made if need be; leaves no trace."""
     existing = path
@@ -137,8 +147,8 @@ def _settle(folder: Path) -> None:
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[bool]:
-    """Whether a hidden folder has been locked: nobody who lives is writing it."""
+def _locked(path: Path) -> Iterator[bool | None]:
+    """Whether a folder has been locked: nobody who lives holds it. None where the file system has no locks."""
     try:
         handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     except OSError:
@@ -147,9 +157,11 @@ def _locked(path: Path) -> Iterator[bool]:
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            free = True
-        except OSError:
+            free: bool | None = True
+        except BlockingIOError:
             free = False
+        except OSError:
+            free = None
         yield free
     finally:
         os.close(handle)
