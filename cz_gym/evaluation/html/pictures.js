@@ -61,18 +61,18 @@ function placed(points) {
     return logs.map((log) => ((log - low) / (Math.max(...logs) - low || 1)) * length);
   };
   const xs = scale(points.map((point) => point.x), width), ys = scale(points.map((point) => point.y), height);
-  const taken = points.map((_, i) => [xs[i] - 8, ys[i] - 8, xs[i] + 8, ys[i] + 8]);
+  const taken = points.map((_, i) => [xs[i] - 6, ys[i] - 6, xs[i] + 6, ys[i] + 6]);
   return points.map(({ name }, i) => {
     const long = letter * Math.min(name.length, 32), [x, y] = [xs[i], ys[i]];
     const boxes = {
-      "middle right": [x + 9, y - line / 2, x + 9 + long, y + line / 2],
-      "middle left": [x - 9 - long, y - line / 2, x - 9, y + line / 2],
-      "top center": [x - long / 2, y + 9, x + long / 2, y + 9 + line],
-      "bottom center": [x - long / 2, y - 9 - line, x + long / 2, y - 9],
+      "top right": [x + 4, y + 4, x + 4 + long, y + 4 + line],
+      "bottom right": [x + 4, y - 4 - line, x + 4 + long, y - 4],
+      "top left": [x - 4 - long, y + 4, x - 4, y + 4 + line],
+      "bottom left": [x - 4 - long, y - 4 - line, x - 4, y - 4],
     };
     const free = ([left, low, right, high]) =>
       right < width + 40 && left > -40 && taken.every((one, j) => j === i || right < one[0] || left > one[2] || high < one[1] || low > one[3]);
-    const place = Object.keys(boxes).find((key) => free(boxes[key])) || "top center";
+    const place = Object.keys(boxes).find((key) => free(boxes[key])) || "top left";
     taken.push(boxes[place]);
     return place;
   });
@@ -83,7 +83,7 @@ function paretoTrace(s, c, floor, place) {
   const still = moves[0] < floor;
   return {
     type: "scatter", mode: "markers+text", name: plain(controller.name), legendgroup: `c${c}`, xaxis: "x", yaxis: "y",
-    text: [`\u2002${still ? "0 ← " : ""}${plain(controller.name)}\u2002`], textposition: place,
+    text: [`${still ? "0 ← " : ""}${plain(controller.name)}`], textposition: place,
     textfont: { color: controller.colour, size: 12 }, cliponaxis: false,
     x: [Math.max(moves[0], floor)], y: [error[0]], error_x: still ? { visible: false } : bars(moves), error_y: bars(error),
     marker: { color: controller.colour, symbol: controller.symbol, size: 10, line: { color: "#fff", width: 1 } },
