@@ -69,6 +69,8 @@ function placed(points) {
       "bottom right": [x + 4, y - 4 - line, x + 4 + long, y - 4],
       "top left": [x - 4 - long, y + 4, x - 4, y + 4 + line],
       "bottom left": [x - 4 - long, y - 4 - line, x - 4, y - 4],
+      "bottom center": [x - long / 2, y - 8 - line, x + long / 2, y - 8],
+      "top center": [x - long / 2, y + 8, x + long / 2, y + 8 + line],
     };
     const free = ([left, low, right, high]) =>
       right < width + 40 && left > -40 && taken.every((one, j) => j === i || right < one[0] || left > one[2] || high < one[1] || low > one[3]);
