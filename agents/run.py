@@ -37,6 +37,8 @@ CHECKPOINT_SECONDS = 60.0
 """Longest time between checkpoints, but for a validation or an update in between [s]."""
 VALIDATE_EVERY = 200_000
 """Fewest steps between validations."""
+MAX_SESSIONS = 100
+"""Sessions that are remembered beside the first and the present one."""
 COLUMNS = (
     "steps",
     "seconds",
@@ -197,7 +199,8 @@ class Run:
             "packages": {name: _version(name) for name in PACKAGES},
         }
         first = (self.sessions or [session])[0]
-        facts = {**self._identity(), "steps": self.choice.steps, **first, "sessions": [*self.sessions, session]}
+        sessions = [*self.sessions[:1], *self.sessions[1:][-MAX_SESSIONS:], session]
+        facts = {**self._identity(), "steps": self.choice.steps, **first, "sessions": sessions}
         _write_json(self.folder / "settings.json", facts)
 
     def _check_settings(self) -> list[dict[str, Any]]:
