@@ -6,7 +6,7 @@ mirrored to the crucible's hot wall, the heat shield, the crystal, the opening a
 (:mod:`cz_gym.camera_rays`). Nothing draws a ring: it is the part of the meniscus steep enough to mirror the wall.
 
 x points from the crystal's axis towards the camera, y to its right, z up; z = 0 is the melt far from the crystal.
-``python -m cz_gym.camera`` measures the view and draws ``results/camera``.
+``python -m cz_gym.camera_study`` measures the view and draws ``results/camera``.
 """
 
 from __future__ import annotations
@@ -223,11 +223,3 @@ def project(x: Any, y: Any, z: Any, view: View) -> Point:
     down = view.cos_tilt * from_x - view.sin_tilt * from_z
     scale = 1.0 / (view.pixel * depth)
     return Point(0.5 * ROWS + down * scale, 0.5 * COLUMNS + y * scale)
-
-
-if __name__ == "__main__":
-    import sys
-
-    from .camera_study import main
-
-    sys.exit(main())

@@ -27,6 +27,7 @@ TOLERANCE = 12.0
 FRAME_STREAMS = len(Stream)
 """Frame k draws its shot noise from the episode's stream of number FRAME_STREAMS + k."""
 _RADIUS_TURNS = 4
+_GOLDEN = 0.6180339887498949
 
 
 class Scratch(NamedTuple):
@@ -53,17 +54,18 @@ def grey_value(row: Any, column: Any, scene: Any, view: Any) -> Any:
 def _pixel(row: Any, column: Any, corners: Any, scene: Any, view: Any) -> Any:
     """Brightness of a pixel whose upper and lower corners stand in the two rows of ``corners``.
 
-    No two of the rays through an edge share a row or a column, so that also a level edge has SUB x SUB steps.
+    No two of the rays through an edge share a row or a column, so that also a level edge has SUB x SUB steps; these
+    fall elsewhere in each column, so that a ring of many columns has none.
     """
     above, below = row % 2, (row + 1) % 2
     a, b = corners[above, column], corners[above, column + 1]
     c, d = corners[below, column], corners[below, column + 1]
     if max(max(a, b), max(c, d)) - min(min(a, b), min(c, d)) < TOLERANCE:
         return 0.25 * (a + b + c + d)
-    total = 0.0
+    total, offset = 0.0, (column * _GOLDEN) % 1.0
     for i in range(SUB):
         for j in range(SUB):
-            down, right = (i + (j + 0.5) / SUB) / SUB, (j + (i + 0.5) / SUB) / SUB
+            down, right = (i + (j + offset) / SUB) / SUB, (j + (i + 0.5) / SUB) / SUB
             total += grey_value(row + down, column + right, scene, view)
     return total / (SUB * SUB)
 

@@ -33,6 +33,8 @@ REACH = (2.0, 1.5)
 """How far outside and inside its first guess an edge is looked at [pixels]."""
 LEAST_CONTRAST = 40.0
 """Least rise from the dark melt to the ring [grey values]."""
+LEAST_SHARE = 0.85
+"""Least contrast, as a share of the operating point's: a ring too thin to fill a pixel is none."""
 LEAST_LINES = 60
 """Least scan lines with an edge."""
 ROBUST = 0.1 * MM
@@ -79,7 +81,8 @@ def wall_edge(scene: Scene, view: View) -> Edge:
 class RingDetector:
     """Reads the ring's radius from images of one view of one puller.
 
-    ``bias`` [m] is what it takes off, measured on the puller's own steady state; ``height`` [m] the plane of its scan
+    ``bias`` [m] is what it takes off, measured on the puller's own steady state, and ``shape`` [m] by how much each
+    scan line differs there (seen from the side another slope mirrors the wall); ``height`` [m] the plane of its scan
     lines; ``pixel`` [m] a pixel's height there. Raises ValueError if the view shows no
     ring there.
     """
@@ -93,7 +96,10 @@ class RingDetector:
         rows = project(np.array([at_rest.r, at_rest.r + SPACING]), 0.0, at_rest.z, view).row
         self.pixel = SPACING / float(rows[1] - rows[0])
         self._reach = tuple(round(pixels * self.pixel / SPACING) for pixels in REACH)
-        self.bias = 0.0
+        self.bias, self.shape, self.contrast = 0.0, np.zeros(len(ANGLES)), 0.0
+        edges, self.contrast = self.find_edges(picture(puller.r_0, puller.h_0, puller, view))
+        if np.isfinite(edges).all():
+            self.shape = edges - edges.mean()
         self.bias = self.read(picture(puller.r_0, puller.h_0, puller, view)).radius - puller.r_0
         if not math.isfinite(self.bias):
             raise ValueError(
@@ -103,21 +109,22 @@ class RingDetector:
 
     def read(self, image: npt.NDArray[np.uint8]) -> Ring:
         """Find the ring in an image, shape (ROWS, COLUMNS) or (ROWS, COLUMNS, 1)."""
-        edges = self.find_edges(image)
+        edges, contrast = self.find_edges(image)
         found = np.isfinite(edges)
-        if found.sum() < LEAST_LINES:
+        if found.sum() < LEAST_LINES or contrast < LEAST_SHARE * self.contrast:
             return Ring(math.nan, edges)
-        x, y = edges[found] * np.cos(ANGLES[found]), edges[found] * np.sin(ANGLES[found])
+        shaped = edges[found] - self.shape[found]
+        x, y = shaped * np.cos(ANGLES[found]), shaped * np.sin(ANGLES[found])
 
         def misses(R: Floats) -> Floats:
             missed: Floats = np.hypot(x, y) - R
             return missed
 
-        fit = least_squares(misses, [float(np.median(edges[found]))], loss="soft_l1", f_scale=ROBUST, xtol=1e-12)
+        fit = least_squares(misses, [float(np.median(shaped))], loss="soft_l1", f_scale=ROBUST, xtol=1e-12)
         return Ring(float(fit.x[0]) - self.bias, edges)
 
-    def find_edges(self, image: npt.NDArray[np.uint8]) -> Floats:
-        """Radius of the ring's outer edge on each scan line [m]; NaN where there is none."""
+    def find_edges(self, image: npt.NDArray[np.uint8]) -> tuple[Floats, float]:
+        """Radius of the ring's outer edge on each scan line [m], NaN where there is none, and its contrast [greys]."""
         grey = np.asarray(image, np.float64).reshape(image.shape[:2])
         lines = map_coordinates(grey, [self._where.row - 0.5, self._where.column - 0.5], order=1, mode="nearest")
         peak = np.argmax(lines, axis=1)
@@ -129,8 +136,8 @@ class RingDetector:
         at = np.where(sound, first, outside)
         step = np.take_along_axis(lines, at[:, None] + np.arange(-outside, inside + 1), axis=1)
         if not sound.any():
-            return np.full(len(lines), np.nan)
+            return np.full(len(lines), np.nan), 0.0
         low, rise = step[sound, 0].mean(), (step[sound, -1] - step[sound, 0]).mean()
         filled = np.trapezoid(step - low, dx=SPACING, axis=1) / rise
         radius: Floats = np.where(sound, self.radii[at + inside] + filled, np.nan)
-        return radius
+        return radius, float(rise)
