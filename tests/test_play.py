@@ -22,7 +22,7 @@ from cz_gym.rendering.view import Window
 from cz_gym.units import KILO, MM_PER_MIN
 
 pygame = pytest.importorskip("pygame")
-SIZE = (320, 240)
+SIZE = (480, 360)
 ROOT = Path(__file__).parents[1]
 
 
@@ -167,7 +167,7 @@ def test_a_failed_run_counts_to_the_horizon(config: Config) -> None:
         (["--minutes", "inf"], "--minutes must be 1 to 6000, not inf"),
         (["--seed", "-1"], "--seed must not be negative"),
         (["--size", "large"], "--size must be WxH in pixels"),
-        (["--size", "10x10"], "240 to 3840"),
+        (["--size", "10x10"], "360 to 3840"),
     ],
 )
 def test_bad_options_are_one_line(options: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -203,7 +203,7 @@ def test_the_command_prints_the_score(monkeypatch: pytest.MonkeyPatch, capsys: p
         return self.outcomes
 
     monkeypatch.setattr(hand.Game, "play", play_on)
-    assert play.main(["--minutes", "5", "--size", "320x240"]) == 0
+    assert play.main(["--minutes", "5", "--size", "480x360"]) == 0
     assert capsys.readouterr().out.startswith("randomized, crystal 1, 5 min: RMSE of the true radius ")
 
 

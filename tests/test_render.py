@@ -80,7 +80,7 @@ def test_every_scenario_has_a_picture(scenario: str) -> None:
     assert len(np.unique(frame.reshape(-1, 3), axis=0)) > 200
 
 
-@pytest.mark.parametrize("size", [(320, 240), (641, 483), (1280, 720)])
+@pytest.mark.parametrize("size", [(480, 360), (641, 483), (1280, 720)])
 def test_the_size_is_the_users(size: tuple[int, int]) -> None:
     env = gym.make("Cz-v0", render_mode="rgb_array", render_size=size)
     env.reset(seed=1)
@@ -94,9 +94,9 @@ def test_other_sizes_are_refused_in_one_line(size: Any) -> None:
     assert "\n" not in str(said.value).replace(repr(size), "")
 
 
-@pytest.mark.parametrize("size", [(239, 480), (640, 3841), (True, 480), (640, -480)])
+@pytest.mark.parametrize("size", [(359, 480), (640, 3841), (True, 480), (640, -480)])
 def test_sizes_outside_the_range_are_refused(size: tuple[int, int]) -> None:
-    with pytest.raises(ValueError, match="240 to 3840"):
+    with pytest.raises(ValueError, match="360 to 3840"):
         CzEnv(render_size=size)
 
 

@@ -88,12 +88,13 @@ class Canvas:
 
     @contextmanager
     def clip(self, box: Box) -> Iterator[None]:
-        """Draw shapes inside the box only."""
-        self._fine.set_clip(_rounded(box))
+        """Draw shapes inside the box only, and inside the box of a clip around this one."""
+        before = self._fine.get_clip()
+        self._fine.set_clip(before.clip(_rounded(box)))
         try:
             yield
         finally:
-            self._fine.set_clip(None)
+            self._fine.set_clip(before)
 
     def panel(self, box: Box, title: str = "") -> None:
         """A panel's ground, with its title."""

@@ -13,7 +13,7 @@ from ..units import MM
 from . import edge_panel, palette, puller_panel, strips
 from .canvas import Box, Canvas
 from .palette import Colour
-from .record import Record
+from .record import Floats, Record
 from .scene import banner
 from .view import record_of
 
@@ -45,9 +45,13 @@ class Side:
             action, self._state = self.policy.predict(self._observation, self._state)
             self._observation, *_ = self.env.step(action)
 
+    def error(self) -> Floats:
+        """The true radius error at every sample [m]."""
+        return self.record.column("r_c") - self.record.column("r_ref")
+
     def rmse(self) -> float:
         """RMSE of the true radius so far [m]; from a failure on the error counts 8 mm only in the benchmark."""
-        error = (self.record.column("r_c") - self.record.column("r_ref"))[1:]
+        error = self.error()[1:]
         return float(np.sqrt(np.mean(np.square(error)))) if len(error) else 0.0
 
 
@@ -65,8 +69,9 @@ class Duel:
         width = (canvas.width - (len(sides) + 1) * gap) / len(sides)
         height = canvas.height - chart - 3.0 * gap
         magnified = min(puller_panel.gain(side.record) for side in sides)
+        reach = max(edge_panel.reach_of(side.error()) for side in sides)
         for i, side in enumerate(sides):
-            self._side(Box(gap + i * (width + gap), gap, width, height), side, magnified)
+            self._side(Box(gap + i * (width + gap), gap, width, height), side, magnified, reach)
         bottom = Box(gap, canvas.height - chart - gap, canvas.width - 2.0 * gap, chart)
         strips.error(canvas, bottom, [(side.record, side.colour) for side in sides])
         x = bottom.x + 34.0 * unit
@@ -75,7 +80,7 @@ class Duel:
             canvas.text(x + (125 + 140 * i) * unit, bottom.y + 4 * unit, side.name, 9.5, side.colour, bold=True)
         return canvas.finish()
 
-    def _side(self, box: Box, side: Side, magnified: float) -> None:
+    def _side(self, box: Box, side: Side, magnified: float, reach: float) -> None:
         canvas, unit, record = self.canvas, self.canvas.unit, side.record
         canvas.panel(box)
         canvas.text(box.x + 10 * unit, box.y + 7 * unit, side.name, 13, side.colour, bold=True)
@@ -85,6 +90,6 @@ class Duel:
         crystal = Box(below.x, below.y, 0.44 * below.w, below.h)
         puller_panel.draw(canvas, crystal, record, magnified)
         edge = Box(crystal.right, below.y, below.right - crystal.right, below.h)
-        edge_panel.draw(canvas, edge, record)
+        edge_panel.draw(canvas, edge, record, reach)
         if record.ending is not None and record.ending.name != "HORIZON":
             banner(canvas, edge, record.ending)

@@ -34,8 +34,8 @@ def scale_of(box: Box, record: Record) -> Scale:
     return Scale(x_0, record.puller.r_0, box.bottom - BELOW * per_metre, per_metre, per_metre)
 
 
-def draw(canvas: Canvas, box: Box, record: Record, magnifier: bool = True) -> None:
-    """The cross-section, its marks and the magnified surface."""
+def draw(canvas: Canvas, box: Box, record: Record, reach: float | None = None) -> None:
+    """The cross-section, its marks and the magnified surface; ``reach`` [m] is its half width unless it fits itself."""
     scale = scale_of(box, record)
     now = record.now
     top = (scale.y_0 - box.y) / scale.up
@@ -54,12 +54,16 @@ def draw(canvas: Canvas, box: Box, record: Record, magnifier: bool = True) -> No
         canvas.dot(palette.TRUE, edge, 2.2)
     _axis(canvas, box, scale, record)
     words = canvas.unit * 7.0
-    canvas.text(box.x + words, box.y + 0.8 * words, "crystal", 10, palette.INK)
+    canvas.text(box.x + words, box.y + 30 * canvas.unit, "crystal", 10, palette.INK)
     canvas.text(box.x + words, box.bottom - 31 * canvas.unit, "melt", 10, palette.INK)
-    if magnifier:
-        x, right = scale.x(record.puller.r_0 + 0.62 * INSIDE), box.right - 8.0 * canvas.unit
-        inset = Box(float(x), box.y + 34.0 * canvas.unit, right - float(x), scale.y_0 - box.y - 60.0 * canvas.unit)
-        _magnified(canvas, inset, scale, r_c - r_ref, z)
+    x, right = float(scale.x(record.puller.r_0 + 0.62 * INSIDE)), box.right - 8.0 * canvas.unit
+    inset = Box(x, box.y + 44.0 * canvas.unit, right - x, scale.y_0 - box.y - 70.0 * canvas.unit)
+    _magnified(canvas, inset, scale, r_c - r_ref, z, reach or reach_of(r_c - r_ref))
+
+
+def reach_of(error: Floats) -> float:
+    """Half width of the magnified surface that holds an error [m]."""
+    return ladder(1.1 * float(np.abs(error).max()), RANGES)
 
 
 def _bodies(canvas: Canvas, box: Box, scale: Scale, record: Record, r_c: Floats, z: Floats) -> None:
@@ -108,14 +112,13 @@ def _axis(canvas: Canvas, box: Box, scale: Scale, record: Record) -> None:
     for number in range(math.ceil(reach[0] / step), math.floor(reach[1] / step) + 1):
         x = float(scale.x(number * step))
         canvas.lines(palette.FAINT, np.array([[x, y], [x, y + 3 * unit]]), 1.0)
-        if box.x + 8 * unit < x < box.right - 34 * unit:
+        if box.x + 8 * unit < x < box.right - 46 * unit:
             canvas.text(x, y + 4 * unit, f"{number * step / MM:g}", 9.0, palette.FAINT, "centre")
     canvas.text(box.right - 4 * unit, y + 4 * unit, "r [mm]", 9.0, palette.FAINT, "right")
 
 
-def _magnified(canvas: Canvas, box: Box, scale: Scale, error: Floats, z: Floats) -> None:
+def _magnified(canvas: Canvas, box: Box, scale: Scale, error: Floats, z: Floats, reach: float) -> None:
     unit = canvas.unit
-    reach = ladder(1.1 * float(np.abs(error).max()), RANGES)
     middle, across = box.x + box.w / 2.0, box.w / 2.0 / reach
     canvas.rectangle(palette.PANEL, box, 4.0)
     band = min(TOLERANCE * across, box.w / 2.0)

@@ -15,7 +15,7 @@ from .record import Ending, Record
 if TYPE_CHECKING:
     from pygame import Surface
 
-SMALLEST, LARGEST = 240, 3840
+SMALLEST, LARGEST = 360, 3840
 """Fewest and most pixels along a side."""
 
 

@@ -143,7 +143,7 @@ def _time_axis(canvas: Canvas, plot: Box, horizon: float) -> None:
     for number in range(int(horizon / step + 1e-9) + 1):
         x = plot.x + number * step / horizon * plot.w
         canvas.lines(palette.RIM, np.array([[x, plot.y], [x, plot.bottom]]), 0.6)
-        if x < plot.right - 24 * unit:
+        if x < plot.right - 46 * unit:
             canvas.text(x, plot.bottom + 2 * unit, clock(number * step), 9.0, palette.FAINT, "centre")
     canvas.text(plot.right, plot.bottom + 2 * unit, f"{horizon / HOUR:.3g} h", 9.0, palette.FAINT, "right")
 
