@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import math
 import os
-import sys
+from collections import deque
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -22,8 +21,10 @@ from ._compile import entry
 from .camera import IMAGE, make_view
 from .camera_image import build_look, new_scratch
 from .config import Config, Identity
+from .episode import series_of
 from .kernels import KERNELS, Kernels, build_kernels
-from .law import GRID, law_of
+from .law import GRID, Episode, law_of
+from .lending import Lender
 from .meniscus import HURLE, MeniscusModel
 from .observation import HISTORY, LAGGED, MEASURED, STATE, lags, scales
 from .parameters import Parameters
@@ -31,13 +32,11 @@ from .plant import NO_OPERATING_POINT
 from .scenario import MAX_LATENCY, Scenario
 from .slots import INFO, SLOT, Clock, Memory, Out, Reading, info_width
 
-SLOTS_PER_THREAD = 256
-"""Fewest slots worth a thread of their own in a step."""
-DRAWS_PER_THREAD = 4
-"""Fewest draws worth a thread of their own in a reset."""
-SPARES = 3
-"""Most sets of output arrays kept for further use."""
-_SAVED = ("slot", "series", "history", "frames")
+SLOTS_PER_THREAD, SLOTS_AT_ONCE = 256, 128
+"""Fewest slots worth a thread of their own in a step, and how many a thread takes at once."""
+DRAWS_PER_THREAD, DRAWS_AT_ONCE = 16, 16
+"""Fewest draws worth a thread of their own in a reset, and how many a thread takes at once."""
+_SAVED = ("slot", "history", "frames")
 Key = tuple[int, int]
 """128 random bits that an episode is drawn from, as two 64-bit words."""
 
@@ -58,21 +57,12 @@ def new_key(random: np.random.Generator) -> Key:
     return int(raw[0]), int(raw[1])
 
 
-def _held(out: Out | tuple[npt.NDArray[Any], ...]) -> int:
-    """References to the most wanted of these arrays; a view counts for the array it looks at."""
-    return max(map(sys.getrefcount, out))
-
-
-_ALONE = _held((np.empty(1), np.empty(1)))
-
-
 @dataclass(frozen=True)
 class SlotState:
     """Everything one slot is at an instant; picklable, continued bit-exactly by :meth:`Batch.restore`."""
 
     identity: Identity
     slot: npt.NDArray[Any]
-    series: npt.NDArray[np.float64]
     history: npt.NDArray[np.float64]
     frames: npt.NDArray[np.float64]
     clock: Clock
@@ -80,18 +70,23 @@ class SlotState:
     @property
     def interface(self) -> npt.NDArray[np.float64]:
         """dT_i on the 5 s grid [K], shape (grid points,)."""
-        return self.series[: self.clock.grid_points, 0]
+        return self._series()[0]
 
     @property
     def noise(self) -> npt.NDArray[np.float64]:
         """Camera [m] (NaN: dropped) and pyrometer [K] noise, shape (samples, 2)."""
-        return self.series[: self.clock.steps + 1, 1:]
+        return self._series()[1]
+
+    def _series(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        first, second = self.slot["key"].tolist()
+        episode = Episode(*self.slot["episode"].item())
+        return series_of(episode, (first, second), self.clock.grid_points, self.clock.steps + 1)
 
 
 class Batch:
     """``num_envs`` slots of one configuration.
 
-    Nothing that :meth:`new_out` gave out is written again while anybody holds it or a view of it.
+    Nothing that :meth:`new_out` gave out is written again by a later one while anybody can look at it.
     """
 
     def __init__(self, config: Config, num_envs: int, threads: int | None = None) -> None:
@@ -113,7 +108,6 @@ class Batch:
             1.0 / (ages.oldest - ages.newest + 1),
         )
         depth = int(ages.oldest[-1]) + 2 if config.observation == "history" else 0
-        rows = max(self.clock.grid_points, config.steps + 1)
         frames = (
             math.ceil(MAX_LATENCY / config.control_interval)
             + math.ceil((MAX_LATENCY + config.control_interval) / GRID)
@@ -123,7 +117,6 @@ class Batch:
         self.memory = Memory(
             slots,
             slots.view(np.float64).reshape(num_envs, -1),
-            np.zeros((num_envs, rows, 3)),
             np.zeros((num_envs, depth, len(LAGGED))),
             np.zeros((num_envs, frames, 3)),
         )
@@ -133,7 +126,10 @@ class Batch:
         self._parameters = Parameters(*map(float, config.parameters))
         self.actions = np.zeros((num_envs, 2))
         self._all = np.ones(num_envs, np.bool_)
-        self._spare: list[Out] = []
+        self._observations = Lender((num_envs, self.channels), np.float32)
+        self._states = Lender((num_envs, self.state_channels), np.float32)
+        self._images = Lender((num_envs, *IMAGE) if self._camera else (num_envs, 0, 0, 0), np.uint8)
+        self._infos = Lender((len(INFO), info_width(num_envs)), np.float64)
         out, which, keys = self.new_out(), np.zeros(1, np.int64), np.zeros((1, 2), np.uint64)
         stepped = (self.memory, self.actions, self._all, self.clock, self.reading, out, 0, 1)
         drawn = (self.memory, which, keys, self._law, self._mix, self._parameters, self.clock, self.reading, out, 0, 1)
@@ -148,25 +144,17 @@ class Batch:
         self._owner = os.getpid()
 
     def new_out(self) -> Out:
-        """Arrays to write into that nobody holds: new ones, or ones that everybody has let go.
-
-        Large new arrays come as untouched pages, whose first writing costs more than the step itself.
-        """
-        for out in self._spare:
-            if _held(out) == _ALONE:
-                return out
+        """Arrays to write into, on memory that nobody looks at."""
         n = self.num_envs
-        out = Out(
-            np.empty((n, self.channels), np.float32),
-            np.empty((n, self.state_channels), np.float32),
-            np.empty((n, *IMAGE) if self._camera else (n, 0, 0, 0), np.uint8),
+        return Out(
+            self._observations.new(),
+            self._states.new(),
+            self._images.new(),
             np.empty(n),
             np.empty(n, np.bool_),
             np.empty(n, np.bool_),
-            np.empty((len(INFO), info_width(n))),
+            self._infos.new(),
         )
-        self._spare = [*self._spare, out][-SPARES:]
-        return out
 
     def shown(self, out: Out) -> npt.NDArray[Any]:
         """The observations among what a step wrote, a row a slot."""
@@ -207,7 +195,7 @@ class Batch:
         arguments = (
             self.memory, slots, words, law, mix, self._parameters, self.clock, self.reading, out,
         )  # fmt: skip
-        if max(self._run(self._draw, arguments, len(slots), DRAWS_PER_THREAD)) >= 0:
+        if max(self._run(self._draw, arguments, len(slots), DRAWS_PER_THREAD, DRAWS_AT_ONCE)) >= 0:
             raise ValueError(NO_OPERATING_POINT)
         if self._camera:
             drawn = np.zeros(self.num_envs, np.bool_)
@@ -220,15 +208,20 @@ class Batch:
             self.actions[:] = actions
         active = self._all if active is None else active
         arguments = (self.memory, self.actions, active, self.clock, self.reading, out)
-        self._run(self._step, arguments, self.num_envs, SLOTS_PER_THREAD)
+        self._run(self._step, arguments, self.num_envs, SLOTS_PER_THREAD, SLOTS_AT_ONCE)
         self._photograph(out, active)
 
     def advance(self, rings: npt.NDArray[np.float64]) -> None:
         """Drives, plant and ring [m] of every slot, and nothing else: what the speed of a step is measured against."""
-        self._run(self.kernels.plant, (self.memory, self.actions, self.clock, rings), self.num_envs, SLOTS_PER_THREAD)
+        arguments = (self.memory, self.actions, self.clock, rings)
+        self._run(self.kernels.plant, arguments, self.num_envs, SLOTS_PER_THREAD, SLOTS_AT_ONCE)
 
-    def _run(self, loop: Any, arguments: tuple[Any, ...], count: int, least: int) -> list[Any]:
-        """Run a loop over ``count`` rows, in a part of at least ``least`` rows a thread; what the parts return."""
+    def _run(self, loop: Any, arguments: tuple[Any, ...], count: int, least: int, share: int = 1) -> list[Any]:
+        """Run a loop over ``count`` rows, on a thread for every ``least`` rows; what its calls return.
+
+        Rows are taken ``share`` at a time by whoever is free: a thread that is late, or whose core is busy, costs
+        no more than what it would have done.
+        """
         parts = min(self._parts, count // least)
         if parts <= 1:
             return [loop(*arguments, 0, count)]
@@ -236,16 +229,24 @@ class Batch:
             # A forked child inherits the pool without its threads and would wait for them for ever.
             self._pool = ThreadPoolExecutor(self._parts - 1, thread_name_prefix="cz-gym")
             self._owner = os.getpid()
-        bounds = np.linspace(0, count, parts + 1).astype(int).tolist()
-        part = partial(loop, *arguments)
-        futures = [self._pool.submit(part, start, stop) for start, stop in pairwise(bounds[1:])]
-        return [part(bounds[0], bounds[1]), *(future.result() for future in futures)]
+        starts = deque([*range(0, count, share), *[None] * parts])
+
+        def work() -> list[Any]:
+            return [loop(*arguments, start, min(start + share, count)) for start in iter(starts.popleft, None)]
+
+        futures = [self._pool.submit(work) for _ in range(parts - 1)]
+        try:
+            mine = work()
+        finally:
+            begun = [future for future in futures if not future.cancel()]
+            wait(begun)
+        return [*mine, *(found for future in begun for found in future.result())]
 
     def save(self, i: int) -> SlotState:
         """A copy of everything slot i is."""
         # array[i] of a structured array is a view that np.copy does not copy; array[i, ...] is an array.
-        slot, series, history, frames = (rows[i, ...].copy() for rows in self._saved())
-        return SlotState(self.identity, slot, series, history, frames, self.clock)
+        slot, history, frames = (rows[i, ...].copy() for rows in self._saved())
+        return SlotState(self.identity, slot, history, frames, self.clock)
 
     def check(self, state: SlotState) -> None:
         """Raise ValueError if this is no saved state, or one saved under other settings."""
@@ -279,7 +280,7 @@ class Batch:
 
     def _saved(self) -> tuple[npt.NDArray[Any], ...]:
         memory = self.memory
-        return memory.slots, memory.series, memory.history, memory.frames
+        return memory.slots, memory.history, memory.frames
 
     def close(self) -> None:
         """Stop the threads."""

@@ -24,6 +24,7 @@ SHORTEST = 1e-9
 _START, _PARAMETERS, _SCHEDULE = int(Stream.START), int(Stream.PARAMETERS), int(Stream.SCHEDULE)
 _INTERFACE, _SENSOR, _FAULTS = int(Stream.INTERFACE), int(Stream.SENSOR), int(Stream.FAULTS)
 _FACTORS, _FAULT_NUMBERS = len(Factors._fields), 5 + 3 * FREEZES
+_INTERFACE_NUMBERS, _SENSOR_NUMBERS = 2, 8
 
 
 @physics
@@ -83,8 +84,10 @@ def draw_episode(law: Any, streams: Any, freezes: Any) -> Any:
     """Draw ramps and constants; freezes [s], shape (FREEZES, 2), are written."""
     recipe, drift, reference, sensor, drives = law.recipe, law.drift, law.reference, law.sensor, law.actuators
     plan, at, read = (
-        _uniforms(streams[_SCHEDULE], 10), _uniforms(streams[_INTERFACE], 2), _uniforms(streams[_SENSOR], 8)
-    )  # fmt: skip
+        _uniforms(streams[_SCHEDULE], 10),
+        _uniforms(streams[_INTERFACE], _INTERFACE_NUMBERS),
+        _uniforms(streams[_SENSOR], _SENSOR_NUMBERS),
+    )
     recipe_length = between(recipe.duration, plan[1])
     moved = 1.0 if plan[6] < reference.probability else 0.0
     sd_fast, sd_slow = between(law.interface.sd, at[0]), between(law.interface.sd, at[1])
@@ -106,6 +109,13 @@ def draw_episode(law: Any, streams: Any, freezes: Any) -> Any:
         between(sensor.camera_noise, read[0]), between(sensor.pyrometer_noise, read[1]), fault[3],
         sensor.outlier_probability, sensor.outlier_sd,
     )  # fmt: skip
+
+
+@physics
+def skip_constants(streams: Any) -> None:
+    """Move fresh streams to where :func:`draw_episode` leaves those that series are drawn from."""
+    _uniforms(streams[_INTERFACE], _INTERFACE_NUMBERS)
+    _uniforms(streams[_SENSOR], _SENSOR_NUMBERS)
 
 
 @physics

@@ -1,7 +1,7 @@
 """An episode's draw: a value made at reset from one 128-bit key, and the series that follow from it.
 
-Ramps are kept as parameters and evaluated where needed (:mod:`cz_gym.schedule`); only what is random at every step
-is stored as series (:mod:`cz_gym.fluctuation`). Both come from the episode's own streams: a step draws nothing.
+Ramps are kept as parameters and evaluated where needed (:mod:`cz_gym.schedule`); what is random at every step follows
+on the episode's own streams (:mod:`cz_gym.fluctuation`), drawn by a slot as it goes, or here as whole series.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from . import draws
 from ._compile import kernel
-from .draws import STREAMS, randomised, seed_streams
+from .draws import STREAMS, randomised, seed_streams, skip_constants
 from .fluctuation import draw_series
 from .law import FREEZES, GRID, Episode, Factors, Stream, law_of
 from .scenario import Range, Scenario
@@ -21,7 +21,7 @@ from .streams import WORDS
 
 __all__ = [
     "FREEZES", "GRID", "Episode", "Factors", "Series", "Stream", "draw_episode", "draw_factors", "new_series",
-    "randomised", "stream",
+    "randomised", "series_of", "stream",
 ]  # fmt: skip
 Floats = npt.NDArray[np.float64]
 
@@ -57,6 +57,13 @@ def draw_episode(scenario: Scenario, key: tuple[int, int], out: Series) -> Episo
     return Episode(*_episode(law_of(scenario), _words(key), _streams(), out.interface, out.noise, out.freezes))
 
 
+def series_of(episode: Episode, key: tuple[int, int], grid_points: int, samples: int) -> tuple[Floats, Floats]:
+    """The series of an episode drawn before: dT_i [K], shape (grid points,), and noise, shape (samples, 2)."""
+    interface, noise, _ = new_series(grid_points, samples)
+    _series(episode, _words(key), _streams(), interface, noise)
+    return interface, noise
+
+
 def _words(key: tuple[int, int]) -> npt.NDArray[np.uint64]:
     return np.array(key, np.uint64)
 
@@ -77,3 +84,10 @@ def _episode(law: Any, key: Any, streams: Any, interface: Any, noise: Any, freez
     e = draws.draw_episode(law[0], streams, freezes)
     draw_series(e, streams, interface, noise)
     return e
+
+
+@kernel
+def _series(e: Any, key: Any, streams: Any, interface: Any, noise: Any) -> None:
+    seed_streams(streams, key)
+    skip_constants(streams)
+    draw_series(e, streams, interface, noise)

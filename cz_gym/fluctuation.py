@@ -1,7 +1,8 @@
-"""What is random at every step, drawn at reset: interface fluctuation, sensor noise, drop-outs, outliers.
+"""What is random at every step: interface fluctuation, sensor noise, drop-outs, outliers.
 
-``s`` is one stream of the episode (:mod:`cz_gym.streams`), ``e`` its :class:`cz_gym.law.Episode`. Series are drawn
-front to back, each on a stream of its own: a longer horizon extends them and changes nothing.
+``streams`` are the episode's (:mod:`cz_gym.streams`), ``e`` its :class:`cz_gym.law.Episode`. Each kind is drawn front
+to back on a stream of its own, so that it is settled by the episode's key whenever it is drawn: step by step as a slot
+goes, or as a whole series.
 """
 
 from __future__ import annotations
@@ -19,42 +20,43 @@ _DROPOUTS, _OUTLIERS = int(Stream.DROPOUTS), int(Stream.OUTLIERS)
 
 
 @physics
-def draw_interface(e: Any, s: Any, out: Any) -> None:
-    """Write dT_i [K] on the grid: two stationary processes, discretised exactly, x <- keep x + sqrt(1 - keep^2) n."""
-    if not (e.sd_fast > 0.0 or e.sd_slow > 0.0):
-        out[:] = 0.0
-        return
-    fast, slow = two_normals(s)
-    out[0] = e.sd_fast * fast + e.sd_slow * slow
-    for j in range(1, out.size):
-        first, second = two_normals(s)
-        fast = e.keep_fast * fast + e.kick_fast * first
-        slow = e.keep_slow * slow + e.kick_slow * second
-        out[j] = e.sd_fast * fast + e.sd_slow * slow
+def first_fluctuation(e: Any, streams: Any) -> Any:
+    """The interface's two stationary processes at t = 0 [standard deviations]."""
+    return two_normals(streams[_INTERFACE]) if e.sd_fast > 0.0 or e.sd_slow > 0.0 else (0.0, 0.0)
 
 
 @physics
-def draw_noise(e: Any, streams: Any, out: Any) -> None:
-    """Write camera [m] and pyrometer [K] noise of each sample, shape (samples, 2); a camera's NaN is a drop-out."""
-    s = streams[_SENSOR]
+def next_fluctuation(e: Any, streams: Any, fast: Any, slow: Any) -> Any:
+    """The two processes one point of the grid on, discretised exactly: x <- keep x + sqrt(1 - keep^2) n."""
+    first, second = two_normals(streams[_INTERFACE]) if e.sd_fast > 0.0 or e.sd_slow > 0.0 else (0.0, 0.0)
+    return e.keep_fast * fast + e.kick_fast * first, e.keep_slow * slow + e.kick_slow * second
+
+
+@physics
+def fluctuation(e: Any, fast: Any, slow: Any) -> Any:
+    """dT_i [K] of the two processes."""
+    return e.sd_fast * fast + e.sd_slow * slow
+
+
+@physics
+def sample_noise(e: Any, streams: Any) -> Any:
+    """Camera [m] and pyrometer [K] noise of the next sample; a camera's NaN is a drop-out."""
     noisy = e.camera_sd > 0.0 or e.pyrometer_sd > 0.0
-    for k in range(out.shape[0]):
-        camera, pyrometer = two_normals(s) if noisy else (0.0, 0.0)
-        out[k, 0], out[k, 1] = e.camera_sd * camera, e.pyrometer_sd * pyrometer
-    if e.outlier_probability > 0.0:
-        s = streams[_OUTLIERS]
-        for k in range(out.shape[0]):
-            if uniform(s) < e.outlier_probability:
-                out[k, 0] += e.outlier_sd * normal(s)
-    if e.dropout > 0.0:
-        s = streams[_DROPOUTS]
-        for k in range(out.shape[0]):
-            if uniform(s) < e.dropout:
-                out[k, 0] = np.nan
+    camera, pyrometer = two_normals(streams[_SENSOR]) if noisy else (0.0, 0.0)
+    camera, pyrometer = e.camera_sd * camera, e.pyrometer_sd * pyrometer
+    if e.outlier_probability > 0.0 and uniform(streams[_OUTLIERS]) < e.outlier_probability:
+        camera += e.outlier_sd * normal(streams[_OUTLIERS])
+    if e.dropout > 0.0 and uniform(streams[_DROPOUTS]) < e.dropout:
+        camera = np.nan
+    return camera, pyrometer
 
 
 @physics
 def draw_series(e: Any, streams: Any, interface: Any, noise: Any) -> None:
-    """Draw everything that is random at every step of the episode."""
-    draw_interface(e, streams[_INTERFACE], interface)
-    draw_noise(e, streams, noise)
+    """Write dT_i [K] on the grid, shape (points,), and the noise of each sample, shape (samples, 2)."""
+    fast, slow = first_fluctuation(e, streams)
+    for j in range(interface.size):
+        interface[j] = fluctuation(e, fast, slow)
+        fast, slow = next_fluctuation(e, streams, fast, slow)
+    for k in range(noise.shape[0]):
+        noise[k, 0], noise[k, 1] = sample_noise(e, streams)

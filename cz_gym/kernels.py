@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ._compile import hashed, inlined, kernel, physics
-from .draws import STREAMS, draw_episode, draw_factors, randomised, seed_streams
-from .fluctuation import draw_series
+from .draws import draw_episode, draw_factors, randomised, seed_streams
+from .fluctuation import first_fluctuation, fluctuation, next_fluctuation, sample_noise
 from .law import GRID
 from .meniscus import HURLE, MeniscusModel
 from .plant import Disturbance, Inputs, State, derive_puller, hidden_load, rk4
@@ -20,7 +20,6 @@ from .readings import clip, measure, recall, remember, write_info, write_measure
 from .schedule import drift, melt_left, reference
 from .sensing import photograph, sense
 from .slots import EPISODE_AT, INFO, PULLER_AT
-from .streams import WORDS
 from .task import HEATER_RANGE, HEIGHT_MAX_IN_A, HEIGHT_MIN, Cost, cost_terms, failure_penalty, reward, within_limits
 
 _EPS = 1e-9
@@ -29,16 +28,17 @@ _JUMP = HEIGHT_MIN
 
 
 @physics
-def _begin(slot: Any, dT_i: Any) -> None:
+def _begin(slot: Any) -> None:
     """Put a slot with drawn constants at the start of its episode."""
     p, e = slot.puller, slot.episode
     slot.x.r_c, slot.x.h_c = p.r_0 + e.r_c_start, p.h_0
     slot.x.T_1, slot.x.T_2, slot.x.T_b = p.T_1_0, p.T_2_0, p.T_b_0
     slot.v_p, slot.Q_H, slot.Q_H_slewed = p.v_0, p.Q_H_0, p.Q_H_0
     slot.v_p_before, slot.Q_H_before, slot.clipped = p.v_0, p.Q_H_0, 0.0
-    slot.dT_i, slot.Q_d, slot.drift = dT_i, 0.0, np.nan
+    slot.fast, slot.slow = first_fluctuation(e, slot.streams)
+    slot.dT_i, slot.Q_d, slot.drift = fluctuation(e, slot.fast, slot.slow), 0.0, np.nan
     slot.integral = 0.0
-    slot.k = slot.frames = slot.over = 0
+    slot.k = slot.frames = slot.over = slot.point = 0
 
 
 @physics
@@ -74,10 +74,13 @@ def _substep(x: Any, u: Any, d: Any, p: Any, dt: Any, r_ref: Any, slope: Any) ->
 
 
 @physics
-def _disturb(slot: Any, series: Any, j: Any) -> Any:
-    """The disturbance at grid point j; the hidden load is solved only while the drift moves."""
+def _disturb(slot: Any, j: Any) -> Any:
+    """The disturbance at grid point j, this one or the next; the hidden load is solved only while the drift moves."""
     p, e = slot.puller, slot.episode
-    slot.dT_i = series[j, 0]
+    if j != slot.point:
+        slot.point = j
+        slot.fast, slot.slow = next_fluctuation(e, slot.streams, slot.fast, slot.slow)
+        slot.dT_i = fluctuation(e, slot.fast, slot.slow)
     shift = drift(j * GRID, e)
     if shift != slot.drift:
         slot.drift, slot.Q_d = shift, hidden_load(shift, p)
@@ -85,7 +88,7 @@ def _disturb(slot: Any, series: Any, j: Any) -> Any:
 
 
 @physics
-def _advance(slot: Any, series: Any, frames: Any, clock: Any, slope: Any, ring_offset: Any) -> Any:
+def _advance(slot: Any, frames: Any, clock: Any, slope: Any, ring_offset: Any) -> Any:
     """Integrate over one control interval, split at the 5 s grid; returns whether the crystal still grows."""
     p, e = slot.puller, slot.episode
     u = Inputs(slot.v_p, slot.Q_H)
@@ -95,7 +98,7 @@ def _advance(slot: Any, series: Any, frames: Any, clock: Any, slope: Any, ring_o
     while grows and t < end - _EPS:
         j = int(t / GRID + _EPS)
         upto = min((j + 1) * GRID, end)
-        x, grows = _substep(x, u, _disturb(slot, series, j), p, upto - t, p.r_0 + reference(upto, e), slope)
+        x, grows = _substep(x, u, _disturb(slot, j), p, upto - t, p.r_0 + reference(upto, e), slope)
         t = upto
         if e.latency > 0.0 and t < end - _EPS:
             h_c = _height_inside(x.h_c, p)
@@ -111,9 +114,9 @@ def _sample(memory: Any, i: Any, fresh: Any, clock: Any, reading: Any, out: Any,
     slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
     t, h_c = slot.k * clock.interval, _height_inside(x.h_c, p)
     ring = x.r_c + ring_offset(x.r_c, h_c, p)
-    series = memory.series[i]
     if fresh:
-        sense(slot, series[slot.k, 1], series[slot.k, 2], memory.frames[i], t, ring - p.ring_bias, h_c)
+        camera, pyrometer = sample_noise(slot.episode, slot.streams)
+        sense(slot, camera, pyrometer, memory.frames[i], t, ring - p.ring_bias, h_c)
     measured = measure(slot, t)
     row = out.observation[i]
     write_measured(measured, reading.measured, row)
@@ -170,7 +173,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
                 continue
             slot = memory.slots[i]
             _drive(slot, actions[i, 0], actions[i, 1], clock.interval)
-            grows = _advance(slot, memory.series[i], memory.frames[i], clock, slope, ring_offset)
+            grows = _advance(slot, memory.frames[i], clock, slope, ring_offset)
             cost = _sample(memory, i, True, clock, reading, out, slope, ring_offset)
             ends = slot.k >= clock.steps
             out.reward[i] = reward(cost) + (0.0 if grows else failure_penalty(slot.k, clock.steps))
@@ -183,22 +186,20 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
         start: int, stop: int,
     ) -> int:  # fmt: skip
         impossible = -1
-        streams = np.zeros((STREAMS, WORDS), np.uint64)
         for at in range(start, stop):
             i = which[at]
-            slot, series, numbers = memory.slots[i], memory.series[i], memory.numbers[i]
-            seed_streams(streams, keys[at])
-            factors = draw_factors(law[0], mix, streams)
+            slot, numbers = memory.slots[i], memory.numbers[i]
+            slot.key[0], slot.key[1] = keys[at, 0], keys[at, 1]
+            seed_streams(slot.streams, slot.key)
+            factors = draw_factors(law[0], mix, slot.streams)
             puller = derive_puller(randomised(parameters, factors), factors.lam, height, ring_offset)
             for number in range(len(puller)):
                 numbers[PULLER_AT + number] = puller[number]
                 impossible = impossible if np.isfinite(puller[number]) else i
-            episode = draw_episode(law[0], streams, slot.freezes)
+            episode = draw_episode(law[0], slot.streams, slot.freezes)
             for number in range(len(episode)):
                 numbers[EPISODE_AT + number] = episode[number]
-            draw_series(slot.episode, streams, series[: clock.grid_points, 0], series[: clock.steps + 1, 1:])
-            slot.key[0], slot.key[1] = keys[at, 0], keys[at, 1]
-            _begin(slot, series[0, 0])
+            _begin(slot)
             _sample_alone(memory, i, True, clock, reading, out, slope, ring_offset)
         return impossible
 
@@ -210,7 +211,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
         for i in range(start, stop):
             slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
             _drive(slot, actions[i, 0], actions[i, 1], clock.interval)
-            _advance(slot, memory.series[i], memory.frames[i], clock, slope, ring_offset)
+            _advance(slot, memory.frames[i], clock, slope, ring_offset)
             rings[i] = x.r_c + ring_offset(x.r_c, _height_inside(x.h_c, p), p)
 
     def derive(parameters: Any, lam: float) -> Any:

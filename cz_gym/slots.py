@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .law import FREEZES, Episode
+from .law import FREEZES, Episode, Stream
 from .plant import Puller, State
+from .streams import WORDS
 
 
 def _record(fields: tuple[str, ...]) -> np.dtype[Any]:
@@ -39,6 +40,10 @@ SLOT = np.dtype(
         ("v_p_before", np.float64),
         ("Q_H_before", np.float64),
         ("clipped", np.float64),
+        ("point", np.int64),
+        ("fast", np.float64),
+        ("slow", np.float64),
+        ("streams", np.uint64, (len(Stream), WORDS)),
     ],
     align=True,
 )
@@ -47,7 +52,8 @@ the last readings (``ring`` [m] without the operator's bias, with the meniscus h
 ``k_seen`` it was taken at, ``T_1`` [K], ``valid``), the integral of the scaled ring error, the drift [K] that ``Q_d``
 belongs to, the sample number ``k``, the number of camera frames taken, whether the episode is over, the ``key`` it
 was drawn from, the drives [m/s, W] of the step before and whether the action was clipped: a sample can be written
-again from its slot."""
+again from its slot. Then the 5 s grid point that ``dT_i`` belongs to with its two processes [standard deviations], and
+the episode's random streams, as far as they are drawn from."""
 PULLER_AT, EPISODE_AT = 0, len(Puller._fields)
 """Where a slot's constants begin, in numbers of eight bytes."""
 
@@ -70,9 +76,6 @@ class Memory(NamedTuple):
     """Records of :data:`SLOT`, shape (n,)."""
     numbers: Any
     """The same memory as plain float64, shape (n, numbers a record)."""
-    series: Any
-    """What was drawn for every step, shape (n, steps, 3): dT_i of a grid point [K], camera [m] and pyrometer [K]
-    noise of a sample; side by side, since a step reads all three."""
     history: Any
     """Running sums of the remembered channels, circular in time, shape (n, depth, channels); depth 0: none."""
     frames: Any

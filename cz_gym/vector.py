@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -22,6 +23,7 @@ from .scenario import Scenario
 from .scenarios import find_scenario
 from .slots import INFO, Out
 
+_MASKS = tuple(f"_{name}" for name in INFO)
 Array = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
 
@@ -70,6 +72,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         self._batch = Batch(self.config, num_envs, threads)
         self._out = self._batch.new_out()
         self._over: Mask = np.ones(num_envs, np.bool_)
+        self._waiting = True
         self._begun = False
         self._randoms: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int | None] = [None] * num_envs
@@ -101,6 +104,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         else:
             self._batch.reset(which, (new_key(self._random(i)) for i in which), self._out, scenario)
         self._over[mask] = self._batch.memory.slots["over"][mask] > 0
+        self._waiting = bool(self._over.any())
         self._begun = True
         return self._observations(), self._infos(self._out, mask)
 
@@ -113,23 +117,25 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         actions = self._check_actions(actions)
         if not self._begun:
             raise ResetNeeded("call reset() first")
-        if self.autoreset_mode == AutoresetMode.DISABLED and self._over.any():
+        waiting = self._waiting
+        if self.autoreset_mode == AutoresetMode.DISABLED and waiting:
             raise ResetNeeded(f"{int(self._over.sum())} episodes are over: reset them with options['reset_mask']")
         out = self._out = self._batch.new_out()
         infos: dict[str, Any] = {}
-        if self._over.any():
+        if waiting:
             self._batch.step(actions, out, ~self._over)
             self._redraw(np.flatnonzero(self._over).tolist(), out)
         else:
             self._batch.step(actions, out)
         over = out.terminated | out.truncated
-        if self.autoreset_mode == AutoresetMode.SAME_STEP and over.any():
+        ended = bool(over.any())
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and ended:
             infos = self._finals(out, over)
             reward, terminated, truncated = out.reward.copy(), out.terminated.copy(), out.truncated.copy()
             self._redraw(np.flatnonzero(over).tolist(), out)
             out = self._out = out._replace(reward=reward, terminated=terminated, truncated=truncated)
-            over = np.zeros_like(over)
-        self._over = over
+            over, ended = np.zeros_like(over), False
+        self._over, self._waiting = over, ended
         infos.update(self._infos(out, np.ones(self.num_envs, np.bool_)))
         return self._observations(), out.reward, out.terminated.copy(), out.truncated.copy(), infos
 
@@ -145,6 +151,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         self._out = self._batch.new_out()
         self._restore(states, list(range(self.num_envs)))
         self._over = self._batch.memory.slots["over"] > 0
+        self._waiting = bool(self._over.any())
         self._begun = True
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -200,7 +207,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
             raise InvalidAction(f"actions must be numbers of shape {array.shape}, not {actions!r}") from None
         if shape != array.shape:
             raise InvalidAction(f"actions must have shape {array.shape}, not {shape}")
-        if np.isnan(array).any():
+        if math.isnan(array.min()):
             raise InvalidAction(
                 f"actions must not be NaN; slots {np.flatnonzero(np.isnan(array).any(axis=1))[:10].tolist()} are"
             )
@@ -241,11 +248,10 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
 
     def _infos(self, out: Out, mask: Mask) -> dict[str, Any]:
         everything = bool(mask.all())
-        infos: dict[str, Any] = {}
-        for name, row in zip(INFO, out.info[:, : self.num_envs], strict=True):
-            values = row > 0.0 if name == "action_clipped" else row
-            infos[name] = values if everything else np.where(mask, values, values.dtype.type(0))
-            infos[f"_{name}"] = mask
+        infos: dict[str, Any] = dict.fromkeys(_MASKS, mask)
+        rows: Any = out.info[:, : self.num_envs]
+        infos.update(zip(INFO, rows if everything else np.where(mask, rows, 0.0), strict=True))
+        infos["action_clipped"] = infos["action_clipped"] > 0.0
         if self.config.observation == "history":
             infos["state"] = out.state if everything else np.where(mask[:, None], out.state, np.float32(0))
             infos["_state"] = mask

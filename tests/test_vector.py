@@ -4,6 +4,7 @@ import copy
 import math
 import multiprocessing
 import pickle
+import threading
 from typing import Any
 
 import gymnasium as gym
@@ -103,6 +104,23 @@ def test_threads_do_not_change_results() -> None:
     for batch in batches:
         batch.close()
         batch.close()
+
+
+def test_a_thread_that_is_late_is_not_waited_for() -> None:
+    env, alone = (CzVectorEnv(512, "nominal", threads=threads) for threads in (2, 1))
+    env.reset(seed=0)
+    alone.reset(seed=0)
+    action = np.zeros((512, 2))
+    env.step(action)
+    alone.step(action)
+    busy = threading.Event()
+    pool = env._batch._pool
+    assert pool is not None
+    held = pool.submit(busy.wait, 60.0)
+    equal(env.step(action)[0], alone.step(action)[0])
+    assert not held.done()
+    busy.set()
+    env.close()
 
 
 def test_a_large_batch_holds_the_same_slots_as_a_small_one() -> None:
