@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 from . import speed_cases as cases
 from . import speed_peers as peers
+from . import speed_training as training
 from .commands import OneLineParser, interrupted
 from .evaluation.files import check_writable, write_files
 from .speed_cases import THREADS, Case, Skipped
@@ -175,6 +176,9 @@ def run(plan: Plan, quick: bool, progress: Callable[[str], None] = lambda _: Non
     measured_costs = costs(quick)
     others = peers.peers(quick)
     skipped = [other for other in others if isinstance(other, Skipped)]
+    share = {} if quick else training.environment_share()
+    if isinstance(share, Skipped):
+        skipped, share = [*skipped, share], {}
     groups = [own_cases(plan) + [other for other in others if isinstance(other, Case)]]
     rows = measure(groups, plan, progress)
     large = [n for n in GROWTH if 4096 < n <= plan.most_slots]
@@ -186,7 +190,7 @@ def run(plan: Plan, quick: bool, progress: Callable[[str], None] = lambda _: Non
     result: dict[str, Any] = {
         "ratios": ratios(rows),
         "rows": [row._asdict() for row in rows],
-        "figures": more_figures(rows),
+        "figures": more_figures(rows) | share,
         "costs": measured_costs,
         "skipped": [skip._asdict() for skip in skipped],
         "threads": THREADS,
@@ -205,7 +209,8 @@ def main(argv: list[str] | None = None) -> int:
             if arguments.json.is_dir():
                 raise IsADirectoryError(f"{arguments.json} is a folder")
             check_writable(arguments.json.parent)
-        result, text = run(QUICK if arguments.quick else FULL, arguments.quick, _say)
+        with peers.silenced():
+            result, text = run(QUICK if arguments.quick else FULL, arguments.quick, _say)
         _say("")
         print(text)
         if arguments.json is not None:

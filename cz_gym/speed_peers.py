@@ -5,7 +5,8 @@ from __future__ import annotations
 import importlib
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -35,11 +36,26 @@ def peers(quick: bool) -> list[Case | Skipped]:
     return found
 
 
-def _try(name: str, make: Callable[[str], Case]) -> Case | Skipped:
+@contextmanager
+def silenced() -> Iterator[None]:
+    """Without the warnings of peers, here and in the processes they start."""
+    variable = "PYTHONWARNINGS"
+    before = os.environ.get(variable)
+    os.environ[variable] = "ignore"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return make(name)
+            yield
+    finally:
+        if before is None:
+            del os.environ[variable]
+        else:
+            os.environ[variable] = before
+
+
+def _try(name: str, make: Callable[[str], Case]) -> Case | Skipped:
+    try:
+        return make(name)
     except ImportError as error:
         return Skipped(name, f"{error.name or error} is not installed")
     except Exception as error:  # a peer's own failure must not end the run
@@ -79,17 +95,7 @@ def _pcgym(name: str) -> Case:
         "noise_percentage": 0.001,
         "integration_method": "casadi",
     }
-    return scalar(name, _Quiet(pcgym.make_env(settings)))._replace(calls=5)
-
-
-class _Quiet(gym.Wrapper[Any, Any, Any, Any]):
-    """Without the warnings of a peer at every step."""
-
-    def step(self, action: Any) -> Any:
-        """One step."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return self.env.step(action)
+    return scalar(name, pcgym.make_env(settings))._replace(calls=5)
 
 
 def _stepping(name: str, env: Any, calls: int = 1) -> Case:
@@ -99,14 +105,20 @@ def _stepping(name: str, env: Any, calls: int = 1) -> Case:
     return Case(name, env.num_envs, lambda: env.step(action), env.close, calls)
 
 
-def _adapter(name: str) -> Case:
+def agents_module(name: str) -> Any:
+    """A module of the learners' room, as installed or beside the working folder."""
     try:
-        module = importlib.import_module("cz_gym.agents.vec_env")
+        return importlib.import_module(f"cz_gym.agents.{name}")
     except ModuleNotFoundError as error:
-        if error.name not in ("cz_gym.agents", "cz_gym.agents.vec_env"):
+        if error.name not in ("cz_gym.agents", f"cz_gym.agents.{name}"):
             raise
-        module = importlib.import_module("agents.vec_env")
-    return _stepping(name, module.CzVecEnv(CzVectorEnv(SB3_SLOTS, autoreset_mode=AutoresetMode.SAME_STEP)))
+        return importlib.import_module(f"agents.{name}")
+
+
+def _adapter(name: str) -> Case:
+    return _stepping(
+        name, agents_module("vec_env").CzVecEnv(CzVectorEnv(SB3_SLOTS, autoreset_mode=AutoresetMode.SAME_STEP))
+    )
 
 
 def _make() -> Any:

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import json
+import os
+import subprocess
+import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -134,3 +139,35 @@ def test_a_masked_reset_of_a_batch_with_padded_info_keeps_the_other_slots() -> N
     assert info["r_c"].shape == (64,)
     assert info["_r_c"].tolist() == mask.tolist()
     np.testing.assert_array_equal(env._out.info[0, :64][~mask], before[4]["r_c"][~mask])
+
+
+def test_cases_without_resets_have_none() -> None:
+    """Over and over the same minutes: slots come back to where they were, and none is redrawn."""
+    for make in (speed_cases.in_step, speed_cases.bare):
+        case = make(64, 1)
+        batch = inspect.getclosurevars(case.step).nonlocals["first"]
+        slots = inspect.getclosurevars(case.step).nonlocals["slots"]
+        for _ in range(3 * speed_cases._UNFAILED):
+            case.step()
+            assert not slots["over"].any()
+        assert slots.tobytes() == batch.tobytes()
+        case.close()
+
+
+def test_a_peer_that_warns_is_not_heard(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    def peer(quick: bool) -> list[Case | Skipped]:
+        def step() -> None:
+            warnings.warn("look at me", UserWarning, stacklevel=1)
+            subprocess.run([sys.executable, "-c", "import warnings; warnings.warn('me too')"], check=True)
+
+        return [Case("loud", 1, step, lambda: None)]
+
+    monkeypatch.setattr(speed, "QUICK", Plan(1, 0.0, 8))
+    monkeypatch.setattr(speed, "own_cases", lambda plan: [])
+    monkeypatch.setattr(speed, "more_figures", lambda rows: {})
+    monkeypatch.setattr(speed, "costs", lambda quick: {})
+    monkeypatch.setattr(speed_peers, "peers", peer)
+    monkeypatch.delenv("PYTHONWARNINGS", raising=False)
+    assert main(["--quick"]) == 0
+    assert capfd.readouterr().err == ""
+    assert "PYTHONWARNINGS" not in os.environ
