@@ -174,7 +174,8 @@ def listen(search: Search, rest: Floats, seen: npt.NDArray[np.bool_], ring: Ring
     """Go on with the search: ``rest`` [m] is what the plant does not explain, shape (n,), where ``seen``.
 
     Running sums Z <- (1 - 1/m) e^(i omega dt) Z + rest/m with m samples of memory, fewer at the start; the peak is
-    refined by a parabola through its neighbours' log power.
+    refined by a parabola through its neighbours' log power. The spectrum's ends, where a slow transient shows, are no
+    peaks.
     """
     omega = frequencies(ring, dt)
     samples = search.samples + 1.0
@@ -184,8 +185,8 @@ def listen(search: Search, rest: Floats, seen: npt.NDArray[np.bool_], ring: Ring
     Z += new_share * np.where(seen, rest, 0.0)[:, None]
     power = np.square(Z.real) + np.square(Z.imag)
     slot, peak = np.arange(len(Z)), power.argmax(axis=1)
-    clear = power[slot, peak] > ring.clear * power.mean(axis=1)
     inside = np.clip(peak, 1, len(omega) - 2)
+    clear = (power[slot, peak] > ring.clear * power.mean(axis=1)) & (inside == peak)
     left, top, right = (np.log(power[slot, inside + side] + MM**2 * 1e-12) for side in (-1, 0, 1))
     bend = 2.0 * top - left - right
     shift = np.where(bend > 0.0, 0.5 * (right - left) / np.where(bend > 0.0, bend, 1.0), 0.0)

@@ -117,8 +117,7 @@ class LQG:
     @property
     def gains(self) -> Gains:
         """Gains of the design point."""
-        puller = make_puller(self.parameters, self.settings.lam, self.meniscus)
-        return solve(self.settings, self.control_interval, puller, self.meniscus)
+        return _at_design_point(self.settings, self.control_interval, self.parameters, self.meniscus)
 
     def predict(
         self, observation: Any, state: Memory | None = None, episode_start: Any = None, deterministic: bool = True
@@ -147,6 +146,11 @@ class LQG:
         if begins.any():
             belief = fresh(belief, old, begins)
         return estimator.correct(belief, seen, eye)
+
+
+@lru_cache(maxsize=16)
+def _at_design_point(settings: LQGSettings, dt: float, parameters: Parameters, meniscus: MeniscusModel) -> Gains:
+    return solve(settings, dt, make_puller(parameters, settings.lam, meniscus), meniscus)
 
 
 def moved_from(applied: Floats, asked: Floats, begins: npt.NDArray[np.bool_], heater_slack: float) -> Floats:

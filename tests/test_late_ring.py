@@ -32,9 +32,7 @@ def measured(**values):
     return np.stack([columns[channel.name] for channel in MEASURED], axis=1) / scales(MEASURED, PULLER.v_0)
 
 
-@pytest.mark.parametrize(
-    ("ring", "dt"), [(RingModel(5.0), 5.0), (RingModel(5.0), 10.0), (RingModel(7.0), 5.0), (KNOWN, 5.0)]
-)
+@pytest.mark.parametrize(("ring", "dt"), [(KNOWN, 5.0), (RingModel(5.0), 10.0)])
 def test_measured_cost_with_a_late_ring_matches_the_covariance_equation(ring, dt):
     settings = replace(LINEAR, ring=ring)
     gains = solve(settings, dt, PULLER)
