@@ -23,7 +23,7 @@ SHOULDER_IN_R_0 = 0.55
 """Height of the drawn shoulder, in crystal radii: an episode begins after it [-]."""
 GAINS = (40.0, 20.0, 10.0, 5.0, 2.0)
 """Magnifications of the radius error [-]."""
-LARGEST = 0.16
+LARGEST = 0.2
 """Largest magnified error, in r_0 [-]."""
 MOST_POINTS = 160
 

@@ -122,7 +122,7 @@ def _pieces(points: Floats) -> list[Floats]:
 
 def thinned(t: Floats, values: Floats, columns: int) -> tuple[Floats, Floats]:
     """The values, or, if there are more than a few a pixel column, the lowest and highest of each stretch."""
-    size = len(values) // (2 * columns)
+    size = len(values) // columns
     if size < 2:
         return t, values
     starts = np.arange(0, len(values), size)
