@@ -40,8 +40,9 @@ WIDE = replace(
     actuators=PULLER.actuators,
 )
 """Pullers and disturbances far beyond the named scenarios."""
-EACH = ((20.0, 16), (5.0, 8), (0.0, 2))
-"""Slots for each kind of adversary from a control interval [s] on: the shorter the steps, the more of them in a row."""
+SHORT, CALLS, CALLS_IF_SHORT = 5.0, 460, 920
+"""Steps in a row that a large campaign takes in each case, twice as many at control intervals below ``SHORT`` [s]: the
+rest goes into more slots."""
 
 
 class Totals(NamedTuple):
@@ -67,7 +68,8 @@ def cases(scenarios: Sequence[str | Scenario] = (*SCENARIOS, WIDE)) -> list[Conf
 
 def run_case(config: Config, steps: int, seed: int) -> Totals:
     """About ``steps`` slot steps of one case, at least one; raises :class:`Broken` at the first thing wrong."""
-    n = len(KINDS) * next(each for least, each in EACH if config.control_interval >= least)
+    row = CALLS_IF_SHORT if config.control_interval < SHORT else CALLS
+    n = len(KINDS) * max(1, round(steps / row / len(KINDS)))
     # At short intervals the horizon is cut so that every case meets ends by time as well.
     calls = max(1, round(steps / n))
     horizon = min(config.horizon, max(1, 2 * calls // 3) * config.control_interval)

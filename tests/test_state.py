@@ -1,13 +1,14 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import pickle
 from typing import Any
 
 import numpy as np
 import pytest
 
-from cz_gym import CzEnv, CzVectorEnv
+from cz_gym import CzEnv, CzVectorEnv, Parameters
 
 ACTIONS = np.random.default_rng(0).uniform(-0.3, 0.3, (100, 2)).astype(np.float32)
 
@@ -116,6 +117,93 @@ def test_a_state_of_other_settings_is_refused(arguments: dict[str, Any]) -> None
     env.reset(seed=0)
     with pytest.raises(ValueError, match="other settings"):
         CzEnv(**arguments).set_state(env.get_state())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"scenario": "hard"}, "scenario 'randomized' (.*), not 'hard' "),
+        ({"model": "I"}, r"mix .0.0, 1.0., not .1.0, 1.0."),
+        ({"observation": "state"}, "observation measured, not state"),
+        ({"control_interval": 10.0}, "control interval 5.0, not 10.0"),
+        ({"horizon": 100.0}, "horizon 10800.0, not 100.0"),
+        ({"parameters": Parameters(dH=1.7e6)}, "plant [0-9a-f]{16}, not [0-9a-f]{16}"),
+    ],
+)
+@pytest.mark.parametrize("form", [CzEnv, CzVectorEnv])
+def test_what_does_not_fit_is_named(form: Any, arguments: dict[str, Any], says: str) -> None:
+    env = form()
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=f"other settings than this environment's: {says}") as refusal:
+        form(**arguments).reset(options={"state": env.get_state()})
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_state_of_another_version_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cz_gym.config.VERSION", 7)
+    env = CzEnv()
+    env.reset(seed=0)
+    state = env.get_state()
+    monkeypatch.undo()
+    with pytest.raises(ValueError, match="version 7, not 0"):
+        CzEnv().set_state(state)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "says"),
+    [
+        ("identity", None, "saved by another version of cz_gym"),
+        ("slot", np.zeros((), [("x", float)]), "its slot does not fit"),
+        ("series", np.zeros((3, 3)), "its series does not fit"),
+        ("series", np.zeros((2161, 3), np.float32), "its series does not fit"),
+        ("history", [1, 2], "its history does not fit"),
+        ("frames", np.zeros((1, 2)), "its frames does not fit"),
+    ],
+)
+def test_a_damaged_state_is_refused_and_changes_nothing(name: str, value: Any, says: str) -> None:
+    env = CzEnv()
+    env.reset(seed=0)
+    state = env.get_state()
+    damaged = dataclasses.replace(state, slot=dataclasses.replace(state.slot, **{name: value}))
+    before = pickle.dumps(env.get_state())
+    with pytest.raises(ValueError, match=says):
+        env.set_state(damaged)
+    assert pickle.dumps(env.get_state()) == before
+
+
+@pytest.mark.parametrize("random", [{}, None, {"bit_generator": "MT19937"}, {"bit_generator": "PCG64", "state": 3}])
+def test_a_damaged_random_stream_is_refused(random: Any) -> None:
+    env = CzEnv()
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="its random stream is none of PCG64"):
+        env.set_state(dataclasses.replace(env.get_state(), random=random))
+
+
+@pytest.mark.parametrize("k", [-1, 2161])
+def test_a_sample_outside_the_episode_is_refused(k: int) -> None:
+    env = CzEnv()
+    env.reset(seed=0)
+    state = copy.deepcopy(env.get_state())
+    state.slot.slot["k"] = k
+    with pytest.raises(ValueError, match=f"damaged: sample {k} of 2160"):
+        env.set_state(state)
+
+
+@pytest.mark.parametrize("observation", ["measured", "history", "state"])
+def test_what_is_written_into_results_is_not_saved(observation: str) -> None:
+    """A policy that normalises observations in place does not change what a saved state shows."""
+    env, other = CzVectorEnv(2, "puller", observation=observation), CzVectorEnv(2, "puller", observation=observation)
+    env.reset(seed=0)
+    for action in ACTIONS[:5]:
+        shown, _, _, _, infos = env.step(np.tile(2.0 * action, (2, 1)) + 0.5)
+    expected, said = shown.copy(), {name: np.copy(value) for name, value in infos.items()}
+    shown[:] = 7.0
+    for name in infos:
+        infos[name][...] = 1
+    again, infos = other.reset(options={"state": env.get_state()})
+    np.testing.assert_array_equal(again, expected)
+    for name in said:
+        np.testing.assert_array_equal(infos[name], said[name], err_msg=name)
 
 
 @pytest.mark.parametrize("options", [{"scenario": "nonsense"}, {"state": 3}, {"state": CzEnv("nominal").get_state()}])

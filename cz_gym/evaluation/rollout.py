@@ -88,36 +88,71 @@ def rollout(
 
 
 def _rollout_chunk(policy: Any, config: Config, seeds: list[int], progress: Callable[[int], None] | None) -> Rollout:
-    steps, n = config.steps, len(seeds)
     before = time.perf_counter()
     if hasattr(policy, "for_episodes"):
         policy = policy.for_episodes(config, seeds)
-    seconds = time.perf_counter() - before
-    env = CzVectorEnv(n, **_arguments(config))
-    signals = Signals(*(np.zeros((steps, n)) for _ in Signals._fields))
-    reward, alive = np.zeros((steps, n)), np.zeros((steps, n), np.bool_)
-    failed, running = np.zeros(n, np.bool_), np.ones(n, np.bool_)
-    observation, info = env.reset(seed=seeds)
-    start = Signals(*(np.array(info[name])[None] for name in Signals._fields))
-    state: Any = None
-    begins, over = np.ones(n, np.bool_), np.zeros(n, np.bool_)
-    for k in range(steps):
-        before = time.perf_counter()
-        action, state = policy.predict(observation, state=state, episode_start=begins, deterministic=True)
-        seconds += time.perf_counter() - before
-        observation, gained, terminated, truncated, info = env.step(action)
+    course = Course(config, seeds)
+    course.seconds = time.perf_counter() - before
+    course.run(policy, config.steps, progress)
+    return course.finish()
+
+
+class Course:
+    """Episodes under way, one a seed: run by a policy up to a step, forked, run on by another."""
+
+    def __init__(self, config: Config, seeds: Sequence[int]) -> None:
+        n = len(seeds)
+        self.config, self.seeds, self.k, self.seconds = config, tuple(seeds), 0, 0.0
+        self.env = CzVectorEnv(n, **_arguments(config))
+        self.signals = Signals(*(np.zeros((config.steps, n)) for _ in Signals._fields))
+        self.reward, self.alive = np.zeros((config.steps, n)), np.zeros((config.steps, n), np.bool_)
+        self.failed, self.running = np.zeros(n, np.bool_), np.ones(n, np.bool_)
+        self.begins, self.over = np.ones(n, np.bool_), np.zeros(n, np.bool_)
+        self.memory: Any = None
+        """What the policy remembers."""
+        self.observation, info = self.env.reset(seed=list(seeds))
+        self.start = Signals(*(np.array(info[name])[None] for name in Signals._fields))
+
+    def run(self, policy: Any, upto: int, progress: Callable[[int], None] | None = None) -> None:
+        """Let the policy act until ``upto`` steps are done."""
+        while self.k < upto:
+            before = time.perf_counter()
+            action, self.memory = policy.predict(
+                self.observation, state=self.memory, episode_start=self.begins, deterministic=True
+            )
+            self.seconds += time.perf_counter() - before
+            self._step(action)
+            if progress is not None:
+                progress(len(self.seeds))
+
+    def _step(self, action: Any) -> None:
+        self.observation, gained, terminated, truncated, info = self.env.step(action)
         # A slot that is over is drawn anew by the next step: only then does its policy begin again.
-        begins, over = over, terminated | truncated
-        for log, name in zip(signals, Signals._fields, strict=True):
-            log[k] = info[name]
-        reward[k] = np.where(running, gained, 0.0)
-        alive[k] = running
-        failed |= running & terminated
-        running &= ~over
-        if progress is not None:
-            progress(n)
-    env.close()
-    return Rollout(config, tuple(seeds), signals, reward, alive, failed, start, seconds)
+        self.begins, self.over = self.over, terminated | truncated
+        for log, name in zip(self.signals, Signals._fields, strict=True):
+            log[self.k] = info[name]
+        self.reward[self.k] = np.where(self.running, gained, 0.0)
+        self.alive[self.k] = self.running
+        self.failed |= self.running & terminated
+        self.running &= ~self.over
+        self.k += 1
+
+    def fork(self) -> Course:
+        """The same episodes at the same moment, with what was logged; no policy has begun in them."""
+        other = Course(self.config, self.seeds)
+        other.env.set_state(self.env.get_state())
+        other.k, other.observation = self.k, self.observation.copy()
+        other.signals = Signals(*(log.copy() for log in self.signals))
+        other.reward, other.alive, other.failed = self.reward.copy(), self.alive.copy(), self.failed.copy()
+        other.running, other.over = self.running.copy(), self.over.copy()
+        return other
+
+    def finish(self) -> Rollout:
+        """What happened; the environment is closed."""
+        self.env.close()
+        return Rollout(
+            self.config, self.seeds, self.signals, self.reward, self.alive, self.failed, self.start, self.seconds
+        )
 
 
 def _arguments(config: Config) -> dict[str, Any]:

@@ -1,0 +1,91 @@
+"""What would another controller have done? The same melt twice: :func:`replay`.
+
+Both trajectories share every disturbance, every sensor's noise and every fault, from the start or from a moment on:
+the environment's state is saved there and continued bit for bit, so that all that differs is the controller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..config import Config
+from .rollout import Course, Rollout
+
+
+@dataclass(frozen=True)
+class Counterfactual:
+    """What happened, and what would have happened under another controller."""
+
+    at: float
+    """When the other controller takes over [s]."""
+    actual: Rollout
+    instead: Rollout
+    """Equal to ``actual`` up to ``at``."""
+
+
+class Playback:
+    """A policy that plays logged actions back, whatever it observes; beyond the log it holds the last."""
+
+    def __init__(self, actions: npt.ArrayLike) -> None:
+        """Take actions of shape (steps, 2) for every episode alike, or (steps, episodes, 2); ValueError otherwise."""
+        self.actions = np.array(actions, np.float32)
+        if self.actions.ndim not in (2, 3) or self.actions.shape[-1] != 2 or len(self.actions) == 0:
+            raise ValueError(
+                f"logged actions must be of shape (steps, 2) or (steps, episodes, 2), not {self.actions.shape}"
+            )
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[npt.NDArray[np.float32], Any]:
+        """The next logged action of each episode; ``state`` is the number of actions played."""
+        k = 0 if state is None else state
+        action = self.actions[min(k, len(self.actions) - 1)]
+        return np.broadcast_to(action, (len(observation), 2)).copy(), k + 1
+
+
+def replay(
+    policy: Any, instead: Any, config: Config, seeds: Sequence[int], at: float = 0.0, watches: bool = False
+) -> Counterfactual:
+    """Run ``policy`` on one episode a seed, and again with ``instead`` from ``at`` [s] on.
+
+    ``policy`` may be a :class:`Playback` of logged actions. ``instead`` begins with an empty memory at ``at``, as in a
+    new episode, unless it ``watches``: then it has seen every observation before, and its actions were not taken.
+    ``at`` is rounded to the control interval. Raises ValueError without a seed or for a moment outside the horizon.
+    """
+    if not seeds:
+        raise ValueError("a replay needs at least one seed")
+    if not 0.0 <= at <= config.horizon:
+        raise ValueError(f"at must lie in the episode, 0 to {config.horizon:g} s, not {at!r}")
+    policy, instead = (
+        one.for_episodes(config, list(seeds)) if hasattr(one, "for_episodes") else one for one in (policy, instead)
+    )
+    takeover = round(at / config.control_interval)
+    actual, watcher = Course(config, seeds), _Watched(policy, instead if watches else None)
+    actual.run(watcher, takeover)
+    other = actual.fork()
+    other.memory = watcher.memory
+    other.begins = np.zeros_like(actual.begins) if watches and takeover > 0 else np.ones_like(actual.begins)
+    actual.run(policy, config.steps)
+    other.run(instead, config.steps)
+    return Counterfactual(takeover * config.control_interval, actual.finish(), other.finish())
+
+
+class _Watched:
+    """A policy that acts while another looks on."""
+
+    def __init__(self, policy: Any, watcher: Any) -> None:
+        self.policy, self.watcher, self.memory = policy, watcher, None
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[Any, Any]:
+        if self.watcher is not None:
+            _, self.memory = self.watcher.predict(
+                observation.copy(), state=self.memory, episode_start=episode_start, deterministic=deterministic
+            )
+        return self.policy.predict(observation, state=state, episode_start=episode_start, deterministic=deterministic)
