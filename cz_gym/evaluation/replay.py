@@ -88,4 +88,7 @@ class _Watched:
             _, self.memory = self.watcher.predict(
                 observation.copy(), state=self.memory, episode_start=episode_start, deterministic=deterministic
             )
-        return self.policy.predict(observation, state=state, episode_start=episode_start, deterministic=deterministic)
+        action, state = self.policy.predict(
+            observation, state=state, episode_start=episode_start, deterministic=deterministic
+        )
+        return action, state
