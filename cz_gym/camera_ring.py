@@ -33,7 +33,7 @@ REACH = (2.0, 1.5)
 """How far outside and inside its first guess an edge is looked at [pixels]."""
 LEAST_CONTRAST = 40.0
 """Least rise from the dark melt to the ring [grey values]."""
-LEAST_SHARE = 0.85
+LEAST_SHARE = 0.95
 """Least contrast, as a share of the operating point's: a ring too thin to fill a pixel is none."""
 LEAST_LINES = 60
 """Least scan lines with an edge."""

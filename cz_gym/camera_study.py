@@ -108,8 +108,8 @@ def read_rings(r_c: Floats, h_c: Floats, detector: RingDetector, view: View, pul
 def gains(detector: RingDetector, view: View, puller: Puller) -> dict[str, tuple[float, float]]:
     """Slopes of each ring by radius and by height [-]: straight lines through +-1 mm about the operating point."""
     step = np.linspace(-1.0, 1.0, 41) * MM
-    by_radius = read_rings(puller.r_0 + step, np.float64(puller.h_0), detector, view, puller)
-    by_height = read_rings(np.float64(puller.r_0), puller.h_0 + step, detector, view, puller)
+    by_radius = read_rings(puller.r_0 + step, np.full_like(step, puller.h_0), detector, view, puller)
+    by_height = read_rings(np.full_like(step, puller.r_0), puller.h_0 + step, detector, view, puller)
 
     def slope(ring: Floats) -> float:
         return float(np.polyfit(step, ring, 1)[0])
@@ -134,7 +134,7 @@ def respond(model: str, change: float, detector: RingDetector, view: View, pulle
     traced = [wall_edge(make_scene(r, h, puller), view).r - at_rest for r, h in zip(r_c, h_c, strict=True)]
     detected = [detector.read(image).radius - puller.r_0 for image in images]
     rings = Rings(r_br - puller.ring_bias - puller.r_0, np.array(traced), np.array(detected))
-    return Response(model, change, INTERVAL * np.arange(len(images)), r_c - puller.r_0, h_c, rings)
+    return Response(model, change, np.linspace(0.0, HORIZON, len(images)), r_c - puller.r_0, h_c, rings)
 
 
 def frames_per_second(view: View, puller: Puller) -> float:
