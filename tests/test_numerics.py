@@ -185,7 +185,7 @@ def test_a_longest_substep_at_the_limits_with_extreme_drives(lam: float, factor:
         x = State(p.r_0 + side * 8.0 * MM, h_c, p.T_1_0 + 60.0 * side, p.T_2_0 + 40.0 * side, p.T_b_0 + 5.0 * side)
         # A melt 6.5 K too hot freezes no crystal: beyond what a step from 1.2 mm meets, and bounded all the same.
         too_hot = height == 1.2 and lam == 1.0 and side > 0.0
-        bound = 1e-8 if height in (4.0, 1.0) else 3e-4 if too_hot else 1e-4
+        bound = 1e-8 if height in (4.0, 1.0) else 5e-4 if too_hot else 1e-4
         for pull in (0.0, 2.0):
             u = Inputs(pull * p.v_0, p.Q_H_0 - 10e3 * side)
             assert _error(x, u, Disturbance(800.0 * side, 1.5 * side, 0.9), p, 5.0) < bound
