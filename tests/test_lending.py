@@ -24,7 +24,7 @@ def torch_tensor(array: np.ndarray) -> Any:
 WAYS: dict[str, tuple[Callable[[np.ndarray], Any], Callable[[Any], Any]]] = {
     "itself": (lambda array: array, lambda held: held[0, 0]),
     "row": (lambda array: array[0], lambda held: held[0]),
-    "view of a view": (lambda array: array.T[:1].ravel(order="K")[:5][::-1], lambda held: held[-1]),
+    "view of a view": (lambda array: array.T[:1][0][::-1].view(np.int64)[:5], lambda held: held.view(np.float64)[-1]),
     "asarray": (np.asarray, lambda held: held[0, 0]),
     "frombuffer": (lambda array: np.frombuffer(array, array.dtype), lambda held: held[0]),
     "flat": (lambda array: array.flat, lambda held: held[0]),
