@@ -10,7 +10,7 @@ from pathlib import Path
 
 from cz_gym.commands import OneLineParser
 
-ALGORITHMS = ("ppo", "sac")
+ALGORITHMS = ("ppo", "ppo-lively", "ppo-quiet", "ppo-scratch", "sac")
 
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
@@ -63,6 +63,8 @@ def train(arguments: argparse.Namespace) -> int:
     from agents import settings
     from agents.run import Run, saved_steps
     from baselines import CompensatedPID
+    from baselines.registry import find_controller
+    from cz_gym.config import make_config
     from cz_gym.evaluation.whole import alone, check_writable
     from cz_gym.scenarios import find_scenario
 
@@ -70,14 +72,16 @@ def train(arguments: argparse.Namespace) -> int:
     folder: Path = arguments.out
     if not arguments.resume and (folder / "settings.json").exists():
         raise ValueError(f"{folder} holds a run already: --resume it, or name another --out")
-    choice: settings.PPO | settings.SAC = settings.PPO() if arguments.algo == "ppo" else settings.SAC()
+    choice = settings.RECIPES[arguments.algo]
     choice = replace(choice, recipe=replace(choice.recipe, scenario=arguments.scenario))
     steps = arguments.steps or (saved_steps(folder) if arguments.resume else choice.steps)
     choice = replace(choice, steps=steps)
     paper = CompensatedPID(choice.recipe.control_interval)
+    clone = choice.recipe.clone
+    teacher = find_controller(clone.teacher).make(make_config(arguments.scenario)) if clone else None
     check_writable(folder)
     with alone(folder):
-        run = Run(folder, choice, arguments.seed, paper, arguments.resume, arguments.checkpoint_seconds)
+        run = Run(folder, choice, arguments.seed, paper, arguments.resume, arguments.checkpoint_seconds, teacher)
         print(
             f"{arguments.algo}, seed {arguments.seed}, {choice.steps:,} steps on {arguments.scenario!r}, into {folder}"
         )

@@ -43,10 +43,38 @@ class Statistics(BaseCallback):
         share = max(1.0 / self.rounds, 0.1)
         for module in self.model.policy.modules():
             if isinstance(module, Normalise):
-                mean, var = module.mean.numpy(), module.std.numpy() ** 2
+                mean, var = module.mean.numpy(), module.scaling.diagonal().numpy() ** -2.0
                 mean = mean + share * (seen.mean(axis=0) - mean)
                 var = var + share * (seen.var(axis=0) - var)
-                module.set(mean, np.maximum(np.sqrt(var), STD_FLOOR))
+                module.set(mean, np.diag(1.0 / np.maximum(np.sqrt(var), STD_FLOOR)))
+
+
+class CriticFirst(BaseCallback):
+    """Holds the actor still for the first steps, then lets it learn at its pace."""
+
+    def __init__(self, steps: int, pace: float) -> None:
+        super().__init__()
+        self.steps, self.pace = steps, pace
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self.model.policy.set_actor_pace(self.pace if self.num_timesteps > self.steps else 0.0)
+
+
+class AtStart(BaseCallback):
+    """Calls back before the first step."""
+
+    def __init__(self, action: Callable[[], Any]) -> None:
+        super().__init__()
+        self.action = action
+
+    def _on_training_start(self) -> None:
+        self.action()
+
+    def _on_step(self) -> bool:
+        return True
 
 
 class Every(BaseCallback):

@@ -38,13 +38,13 @@ class Progress:
     """Gradient updates taken."""
     seconds: float
     """Time spent, over all sessions [s]."""
-    best_rmse_mm: float | None
-    """Best validation RMSE so far [mm]; None before the first."""
+    best_cost: float | None
+    """Least validation cost so far [-]; None before the first."""
 
 
-def to_bytes(learner: Any, seconds: float, best_rmse_mm: float | None) -> bytes:
+def to_bytes(learner: Any, seconds: float, best_cost: float | None) -> bytes:
     """The checkpoint of a stable-baselines3 learner (a replay buffer is not kept; it fills again)."""
-    progress = Progress(int(learner.num_timesteps), int(learner._n_updates), seconds, best_rmse_mm)
+    progress = Progress(int(learner.num_timesteps), int(learner._n_updates), seconds, best_cost)
     # Modules that share a tensor each get their copy: the format knows no sharing.
     tensors = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in _tensors(learner).items()}
     content: bytes = save(tensors, {"format": FORMAT, "progress": json.dumps(asdict(progress))})
@@ -68,7 +68,7 @@ def load_checkpoint(path: Path) -> tuple[Progress, Tensors]:
         progress = Progress(**json.loads(told["progress"]))
     except (ValueError, KeyError, TypeError, RecursionError):
         raise AgentFileError(f"{path}: does not say where the run stood") from None
-    numbers = (progress.steps, progress.updates), (progress.seconds, progress.best_rmse_mm or 0.0)
+    numbers = (progress.steps, progress.updates), (progress.seconds, progress.best_cost or 0.0)
     whole = all(type(number) is int and 0 <= number < 2**63 for number in numbers[0])
     if not whole or not all(type(number) is float and 0.0 <= number < math.inf for number in numbers[1]):
         raise AgentFileError(f"{path}: does not say where the run stood")

@@ -21,10 +21,15 @@ OPSET, IR_VERSION = 17, 9
 
 @dataclass(frozen=True)
 class Actor:
-    """An actor as arrays: action = clip(skip * drives + scale * squash(layers(normalised observation)))."""
+    """An actor as arrays: action = clip(skip * drives + scale * squash(layers(x) + direct(x))).
+
+    x is the normalised observation, (observation - mean) @ scaling within +-10.
+    """
 
     mean: Floats
-    std: Floats
+    scaling: Floats
+    direct: tuple[Floats, Floats] | None
+    """Weight (out, in) and bias (out,) of the linear path."""
     layers: tuple[tuple[Floats, Floats], ...]
     """Weight (out, in) and bias (out,) of each layer; the activation follows all but the last."""
     activation: str
@@ -46,17 +51,19 @@ def actor_of(learner: Any) -> Actor:
         normalise: Normalise = policy.features_extractor
         head = policy.action_net
         torso, last, activation, squash = policy.mlp_extractor.actor, head.linear, "Tanh", False
+        direct = _linear(policy.mlp_extractor.direct)
         skip, scale = head.skip, head.scale.numpy().copy()
     else:
         normalise = policy.actor.features_extractor
         torso, last, activation, squash = policy.actor.latent_pi, policy.actor.mu, "Relu", True
+        direct = None
         skip, scale = learner.env.skip, learner.env.scale.astype(np.float32)
     visible = min(len(normalise.mean), len(HISTORY))
     layers = [_linear(module) for module in torso if isinstance(module, torch.nn.Linear)]
     first_weight, first_bias = layers[0]
     layers[0] = first_weight[:, :visible].copy(), first_bias
-    mean, std = normalise.mean.numpy()[:visible].copy(), normalise.std.numpy()[:visible].copy()
-    return Actor(mean, std, (*layers, _linear(last)), activation, squash, skip, scale)
+    mean, scaling = normalise.mean.numpy()[:visible].copy(), normalise.scaling.numpy()[:visible, :visible].copy()
+    return Actor(mean, scaling, direct, (*layers, _linear(last)), activation, squash, skip, scale)
 
 
 def to_onnx(actor: Actor) -> bytes:
@@ -74,14 +81,17 @@ def to_onnx(actor: Actor) -> bytes:
 
     channels = len(actor.mean)
     x = node("Sub", ["observation", constant("mean", actor.mean)], "centred")
-    x = node("Div", [x, constant("std", actor.std)], "scaled")
+    x = node("MatMul", [x, constant("scaling", actor.scaling)], "scaled")
     limits = [constant("least", np.float32(-NORMALISED_LIMIT)), constant("most", np.float32(NORMALISED_LIMIT))]
-    x = node("Clip", [x, *limits], "normalised")
+    x = seen = node("Clip", [x, *limits], "normalised")
     for depth, (weight, bias) in enumerate(actor.layers):
         parameters = [constant(f"weight_{depth}", weight), constant(f"bias_{depth}", bias)]
         x = node("Gemm", [x, *parameters], f"linear_{depth}", transB=1)
         if depth < len(actor.layers) - 1:
             x = node(actor.activation, [x], f"active_{depth}")
+    if actor.direct:
+        parameters = [constant("weight_direct", actor.direct[0]), constant("bias_direct", actor.direct[1])]
+        x = node("Add", [x, node("Gemm", [seen, *parameters], "direct", transB=1)], "bent")
     if actor.squash:
         x = node("Tanh", [x], "squashed")
     x = node("Mul", [x, constant("scale", actor.scale.astype(np.float32))], "move")

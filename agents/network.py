@@ -1,7 +1,9 @@
 """The policy network: an actor that moves the drives from where they are, a critic that may see more.
 
-Actor: observation -> normalise -> tanh layers -> two outputs; action = skip * (applied v_p, Q_H) + scale * output.
-The applied drives stand in the observation, so that the whole actor is one function of it and exports as one file.
+Actor: observation -> normalise -> (tanh layers -> linear) + linear -> two outputs;
+action = skip * (applied v_p, Q_H) + scale * output. The linear path carries what a linear controller would do, the
+layers what bends it. The applied drives stand in the observation, so that the actor is one function of it and exports
+as one file.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from cz_gym.observation import HISTORY, MEASURED
 
 DRIVES = tuple([channel.name for channel in MEASURED].index(name) for name in ("v_p", "Q_H"))
 """Where an observation holds the applied drives, in action units."""
-NORMALISED_LIMIT = 10.0
+NORMALISED_LIMIT = 30.0
 
 
 def tanh_layers(sizes: list[int]) -> nn.Sequential:
@@ -39,16 +41,16 @@ class Normalise(BaseFeaturesExtractor):
         super().__init__(observation_space, channels + (len(DRIVES) if drives else 0))
         self.drives = drives
         self.register_buffer("mean", torch.zeros(channels))
-        self.register_buffer("std", torch.ones(channels))
+        self.register_buffer("scaling", torch.eye(channels))
 
-    def set(self, mean: np.ndarray, std: np.ndarray) -> None:
-        """Set what observations are normalised with, shape (channels,)."""
+    def set(self, mean: np.ndarray, scaling: np.ndarray) -> None:
+        """Set what observations are normalised with: (observation - mean) @ scaling, shapes (channels,) and square."""
         self.mean.copy_(torch.as_tensor(mean))
-        self.std.copy_(torch.as_tensor(std))
+        self.scaling.copy_(torch.as_tensor(scaling))
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """Shape (n, channels) to (n, channels) or (n, channels + 2)."""
-        normalised = torch.clamp((observations - self.mean) / self.std, -NORMALISED_LIMIT, NORMALISED_LIMIT)
+        normalised = torch.clamp((observations - self.mean) @ self.scaling, -NORMALISED_LIMIT, NORMALISED_LIMIT)
         if not self.drives:
             return normalised
         return torch.cat([normalised, observations[:, list(DRIVES)]], dim=1)
@@ -60,26 +62,34 @@ class Torsos(nn.Module):
     def __init__(self, channels: int, visible: int, hidden: tuple[int, ...]) -> None:
         super().__init__()
         self.channels, self.visible = channels, visible
-        self.latent_dim_pi = self.latent_dim_vf = hidden[-1]
+        truths = channels - visible
+        self.register_buffer("pairs", torch.triu_indices(truths, truths), persistent=False)
+        self.latent_dim_pi = hidden[-1]
+        self.latent_dim_vf = hidden[-1] + truths + self.pairs.shape[1]
         self.actor = tanh_layers([visible, *hidden])
+        self.direct = nn.Linear(visible, len(DRIVES))
+        nn.init.zeros_(self.direct.weight)
+        nn.init.zeros_(self.direct.bias)
         self.critic = tanh_layers([channels, *hidden])
 
     def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Latents of actor (with drives) and critic."""
+        """Latents of actor (with its linear path and drives) and critic."""
         return self.forward_actor(features), self.forward_critic(features)
 
     def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
-        """Shape (n, features) to (n, hidden + 2)."""
-        return torch.cat([self.actor(features[:, : self.visible]), features[:, self.channels :]], dim=1)
+        """Shape (n, features) to (n, hidden + 4)."""
+        seen = features[:, : self.visible]
+        return torch.cat([self.actor(seen), self.direct(seen), features[:, self.channels :]], dim=1)
 
     def forward_critic(self, features: torch.Tensor) -> torch.Tensor:
-        """Shape (n, features) to (n, hidden)."""
-        latent: torch.Tensor = self.critic(features[:, : self.channels])
-        return latent
+        """Shape (n, features) to (n, hidden + true channels and their products)."""
+        truths = features[:, self.visible : self.channels]
+        products = truths[:, self.pairs[0]] * truths[:, self.pairs[1]]
+        return torch.cat([self.critic(features[:, : self.channels]), truths, products], dim=1)
 
 
 class DriveHead(nn.Module):
-    """action = skip * drives + scale * linear(latent)."""
+    """action = skip * drives + scale * (linear(latent) + direct)."""
 
     def __init__(self, linear: nn.Linear, skip: float, scale: tuple[float, float]) -> None:
         super().__init__()
@@ -87,10 +97,24 @@ class DriveHead(nn.Module):
         self.register_buffer("scale", torch.tensor(scale))
 
     def forward(self, latent: torch.Tensor) -> torch.Tensor:
-        """Shape (n, hidden + 2) to (n, 2)."""
-        drives = latent[:, -len(DRIVES) :]
-        mean: torch.Tensor = self.skip * drives + self.scale * self.linear(latent[:, : -len(DRIVES)])
+        """Shape (n, hidden + 4) to (n, 2)."""
+        hidden, direct, drives = torch.tensor_split(latent, (-2 * len(DRIVES), -len(DRIVES)), dim=1)
+        mean: torch.Tensor = self.skip * drives + self.scale * (self.linear(hidden) + direct)
         return mean
+
+
+class Paced(torch.optim.Adam):
+    """Adam whose groups of parameters learn at a ``pace`` of their own: a share of the scheduled learning rate."""
+
+    def step(self, closure: Any = None) -> Any:
+        """One update."""
+        scheduled = [group["lr"] for group in self.param_groups]
+        for group in self.param_groups:
+            group["lr"] *= group["pace"]
+        result = super().step(closure)
+        for group, rate in zip(self.param_groups, scheduled, strict=True):
+            group["lr"] = rate
+        return result
 
 
 class DrivePolicy(ActorCriticPolicy):
@@ -102,9 +126,11 @@ class DrivePolicy(ActorCriticPolicy):
         hidden: tuple[int, ...] = (128, 128),
         skip: float = 1.0,
         scale: tuple[float, float] = (0.05, 0.05),
+        noise: tuple[float, float] = (0.05, 0.05),
+        frozen: tuple[str, ...] = (),
         **kwargs: Any,
     ) -> None:
-        self.hidden, self.skip, self.scale = hidden, skip, scale
+        self.hidden, self.skip, self.scale, self.noise, self.frozen = hidden, skip, scale, noise, frozen
         super().__init__(*args, features_extractor_class=Normalise, **kwargs)
 
     def _build_mlp_extractor(self) -> None:
@@ -113,5 +139,24 @@ class DrivePolicy(ActorCriticPolicy):
 
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
-        # The optimiser already holds the linear layer's parameters; the head only wraps them.
         self.action_net = DriveHead(self.action_net, self.skip, self.scale)
+        with torch.no_grad():
+            self.log_std.copy_(torch.log(torch.tensor(self.noise)))
+        critic = [*self.mlp_extractor.critic.parameters(), *self.value_net.parameters()]
+        outputs = [*self.mlp_extractor.direct.parameters(), *self.action_net.parameters()]
+        actor = [*outputs, self.log_std]
+        if "layers" not in self.frozen:
+            actor += self.mlp_extractor.actor.parameters()
+        if "heater" in self.frozen:
+            for parameter in outputs:
+                parameter.register_hook(_without_heater)
+        groups = [{"params": critic, "pace": 1.0}, {"params": actor, "pace": 1.0}]
+        self.optimizer = Paced(groups, lr_schedule(1.0), eps=1e-5)
+
+    def set_actor_pace(self, pace: float) -> None:
+        """Let the actor learn at this share of the learning rate."""
+        self.optimizer.param_groups[1]["pace"] = pace
+
+
+def _without_heater(gradient: torch.Tensor) -> torch.Tensor:
+    return torch.cat([gradient[:1], torch.zeros_like(gradient[1:])])

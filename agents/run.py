@@ -13,7 +13,9 @@ import sys
 import time
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 import cz_gym
 from cz_gym.config import Config, make_config
@@ -21,14 +23,16 @@ from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.evaluation.whole import finish_writing, write_files
+from cz_gym.task import FAILURE_COST, cost_terms
+from cz_gym.units import KILO, MM, MM_PER_MIN
 
 from . import settings
-from .callbacks import Every, Tell
+from .callbacks import AtStart, Every, Tell
 from .checkpoint import load_checkpoint, restore, to_bytes
 from .contract import MAX_JSON_BYTES, AgentFileError, agent_files, make_contract, read_bounded, read_json
 from .export import actor_of, to_onnx
 from .onnx_policy import OnnxPolicy
-from .training import Training, make_training
+from .training import Training, clone, make_training
 
 QUICK, FULL = 64, 200
 """Validation episodes while learning, and at the end."""
@@ -42,6 +46,7 @@ MAX_SESSIONS = 100
 COLUMNS = (
     "steps",
     "seconds",
+    "validation_cost",
     "validation_rmse_mm",
     "paper_rmse_mm",
     "pull_step_rms_mm_per_min",
@@ -51,17 +56,38 @@ COLUMNS = (
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "stable-baselines3", "torch", "onnx", "onnxruntime")
 
 
-def validation_rmse(policy: Any, config: Config, episodes: int) -> tuple[float, float, float]:
-    """Mean RMSE [mm], mean pull step RMS [mm/min] and failure rate on the first validation episodes."""
-    result = metrics(rollout(policy, config, VALIDATION_SEEDS[:episodes]))
-    values = result.rmse_mm, result.pull_step_rms_mm_per_min, result.failure_rate
-    return float(values[0].mean()), float(values[1].mean()), float(values[2].mean())
+class Validation(NamedTuple):
+    """Mean figures over validation episodes."""
+
+    cost: float
+    """Of a step, unsaturated and weighed as in training; a lost episode costs ten a step [-]."""
+    rmse_mm: float
+    pull_step_rms_mm_per_min: float
+    failure_rate: float
+
+
+def validate(policy: Any, config: Config, episodes: int, weights: settings.CostWeights) -> Validation:
+    """Run the first validation episodes."""
+    found = metrics(rollout(policy, config, VALIDATION_SEEDS[:episodes]))
+    error = found.rmse_observable_mm if weights.observable else found.rmse_mm
+    terms = cost_terms(
+        error * MM,
+        found.pull_rms_mm_per_min * MM_PER_MIN,
+        found.pull_step_rms_mm_per_min * MM_PER_MIN,
+        found.heater_step_rms_kw * KILO,
+    )
+    cost = terms.radius + weights.pull * terms.pull
+    cost += weights.pull_step * terms.pull_step + weights.heater_step * terms.heater_step
+    cost = np.where(found.failure_rate > 0, FAILURE_COST, cost)
+    figures = cost, found.rmse_mm, found.pull_step_rms_mm_per_min, found.failure_rate
+    return Validation(*(float(figure.mean()) for figure in figures))
 
 
 class Run:
     """One training run.
 
     ``rival``, a policy on "measured" observations, runs the same validation episodes and is shown beside the agent;
+    ``teacher`` is the controller that the settings clone;
     ``resume`` goes on from the folder's checkpoint, saved anew every ``checkpoint_seconds``. Checkpoint, progress and
     best agent are replaced together, so that they agree whenever a run is killed. Raises AgentFileError if the folder
     cannot be used.
@@ -75,8 +101,10 @@ class Run:
         rival: Any,
         resume: bool = False,
         checkpoint_seconds: float = CHECKPOINT_SECONDS,
+        teacher: Any = None,
     ) -> None:
         self.folder, self.choice, self.seed, self.rival = folder, choice, seed, rival
+        self.teacher = teacher
         self.checkpoint_seconds = checkpoint_seconds
         recipe = choice.recipe
         self.config = make_config(
@@ -89,7 +117,7 @@ class Run:
         self.began = time.monotonic()
         self.unsaved: dict[Path, bytes] = {}
         if not resume:
-            self.training: Training = make_training(choice, seed, str(folder / "tensorboard"))
+            self.training: Training = make_training(choice, seed, str(folder / "tensorboard"), 0, teacher)
             self.save()
             self._write_settings(0)
             return
@@ -99,9 +127,9 @@ class Run:
         progress, tensors = load_checkpoint(folder / CHECKPOINT)
         self.began -= progress.seconds
         self.rows = _read_rows(folder / "progress.csv")
-        if progress.best_rmse_mm is not None and _usable(folder / "agent.onnx", self.config):
-            self.best = progress.best_rmse_mm
-        self.training = make_training(choice, seed, str(folder / "tensorboard"), progress.steps)
+        if progress.best_cost is not None and _usable(folder / "agent.onnx", self.config):
+            self.best = progress.best_cost
+        self.training = make_training(choice, seed, str(folder / "tensorboard"), progress.steps, teacher)
         restore(self.training.learner, progress, tensors, folder / CHECKPOINT)
         self._write_settings(progress.steps)
 
@@ -111,11 +139,18 @@ class Run:
         bar.update(learner.num_timesteps - bar.n)
         validate = Every(max(self.choice.steps // 24, VALIDATE_EVERY), None, lambda: self._validate(bar))
         checkpoint = Every(None, self.checkpoint_seconds, self.save)
-        callbacks = [*self.training.callbacks, Tell(bar), validate, checkpoint]
+        begin = AtStart(lambda: self._begin(bar))
+        callbacks = [begin, *self.training.callbacks, Tell(bar), validate, checkpoint]
         left = self.choice.steps - learner.num_timesteps
         if left > 0:
             learner.learn(left, callback=callbacks, reset_num_timesteps=False, tb_log_name="run")
         self._validate(bar)
+
+    def _begin(self, bar: Any) -> None:
+        """Imitate the teacher, if there is one and nothing has been learned yet."""
+        if self.training.learner.num_timesteps == 0 and self.choice.recipe.clone is not None:
+            clone(self.training, self.teacher, self.config, self.seed, bar.set_postfix_str)
+            self._validate(bar)
 
     def save(self) -> None:
         """Write a checkpoint, and with it what a validation left to be written."""
@@ -127,13 +162,14 @@ class Run:
     def finish(self) -> dict[str, float]:
         """Validate the best agent on more episodes and write ``summary.json``; its contents."""
         policy = OnnxPolicy.load(self.folder / "agent.onnx", self.config)
-        rmse, activity, failures = validation_rmse(policy, self.config, FULL)
+        found = validate(policy, self.config, FULL, self.choice.recipe.weights)
         summary = {
             "validation_episodes": FULL,
-            "validation_rmse_mm": rmse,
+            "validation_cost": found.cost,
+            "validation_rmse_mm": found.rmse_mm,
             "paper_rmse_mm": self._validate_rival(FULL),
-            "pull_step_rms_mm_per_min": activity,
-            "failure_rate": failures,
+            "pull_step_rms_mm_per_min": found.pull_step_rms_mm_per_min,
+            "failure_rate": found.failure_rate,
             "training_steps": self.training.learner.num_timesteps,
             "seconds": time.monotonic() - self.began,
         }
@@ -142,7 +178,7 @@ class Run:
 
     def _validate_rival(self, episodes: int) -> float:
         measured = make_config(self.config.scenario, control_interval=self.config.control_interval)
-        return validation_rmse(self.rival, measured, episodes)[0]
+        return validate(self.rival, measured, episodes, settings.CostWeights()).rmse_mm
 
     def _validate(self, bar: Any) -> None:
         """Export the actor as it stands, run the file itself on validation, keep it if it is the best."""
@@ -150,20 +186,22 @@ class Run:
         content = to_onnx(actor_of(learner))
         candidate = make_contract(content, **self._facts(learner.num_timesteps, 0.0))
         policy = OnnxPolicy.of(candidate, content, self.config)
-        rmse, activity, failures = validation_rmse(policy, self.config, QUICK)
-        if rmse < self.best:
-            self.best = rmse
-            contract = dataclasses.replace(candidate, validation_rmse_mm=rmse)
+        found = validate(policy, self.config, QUICK, self.choice.recipe.weights)
+        if found.cost < self.best:
+            self.best = found.cost
+            contract = dataclasses.replace(candidate, validation_rmse_mm=found.rmse_mm)
             self.unsaved |= agent_files(self.folder / "agent.onnx", content, contract)
         seconds = round(time.monotonic() - self.began, 1)
-        row = (learner.num_timesteps, seconds, rmse, self.rival_rmse_mm, activity, failures)
+        cost, rmse, activity, failures = found
+        row = (learner.num_timesteps, seconds, cost, rmse, self.rival_rmse_mm, activity, failures)
         self.rows.append(dict(zip(COLUMNS, row, strict=True)))
         self.unsaved[self.folder / "progress.csv"] = _csv(self.rows)
         self.save()
+        learner.logger.record("validation/cost", cost)
         learner.logger.record("validation/rmse_mm", rmse)
         learner.logger.record("validation/pull_step_rms_mm_per_min", activity)
         learner.logger.record("validation/failure_rate", failures)
-        bar.set_postfix_str(f"validation RMSE {rmse:.3f} mm, best {self.best:.3f}, paper {self.rival_rmse_mm:.3f}")
+        bar.set_postfix_str(f"validation RMSE {rmse:.3f} mm, paper {self.rival_rmse_mm:.3f}")
 
     def _facts(self, steps: int, rmse: float) -> dict[str, Any]:
         config = self.config
@@ -174,7 +212,7 @@ class Run:
             "plant_hash": config.plant_hash,
             "scenario": config.scenario.name,
             "scenario_hash": config.scenario.hash,
-            "algorithm": type(self.choice).__name__.lower(),
+            "algorithm": self.choice.name,
             "training_seed": self.seed,
             "training_steps": int(steps),
             "validation_rmse_mm": rmse,
@@ -182,7 +220,7 @@ class Run:
 
     def _identity(self) -> dict[str, Any]:
         return {
-            "algorithm": type(self.choice).__name__.lower(),
+            "algorithm": self.choice.name,
             "seed": self.seed,
             "settings": json.loads(json.dumps(dataclasses.asdict(dataclasses.replace(self.choice, steps=0)))),
             "plant_hash": self.config.plant_hash,

@@ -19,6 +19,38 @@ class ActionHead:
 
 
 @dataclass(frozen=True)
+class CostWeights:
+    """The reward that is trained on: the environment's cost with its terms weighted."""
+
+    pull: float = 1.0
+    """Of the pull speed's deviation, relative to the environment's [-]."""
+    pull_step: float = 1.0
+    """Of its step changes [-]."""
+    heater_step: float = 1.0
+    """Of the heater's step changes [-]."""
+    observable: bool = False
+    """Whether the radius error leaves out the offset that no sensor shows."""
+
+
+@dataclass(frozen=True)
+class Clone:
+    """Behaviour cloning before reinforcement learning."""
+
+    teacher: str = "lqg"
+    """Name of the classical controller that is imitated."""
+    rounds: int = 3
+    """Times it is asked: first about its own episodes, then about the imitation's."""
+    episodes: int = 320
+    """Training episodes a round."""
+    noise: tuple[float, float] = (0.006, 0.001)
+    """Spread of the noise added to the driver's actions, pull speed and heater [-]."""
+    epochs: int = 10
+    """Times each round goes through all answers so far."""
+    learning_rate: float = 2e-3
+    """At the middle of each round's cycle."""
+
+
+@dataclass(frozen=True)
 class Recipe:
     """What training shares whatever the algorithm."""
 
@@ -35,35 +67,72 @@ class Recipe:
     threads: int = 1
     """Threads that torch computes on."""
     head: ActionHead = field(default_factory=ActionHead)
+    weights: CostWeights = field(default_factory=CostWeights)
+    clone: Clone | None = None
+    """None: learning starts from nothing."""
 
 
 @dataclass(frozen=True)
 class PPO:
-    """Proximal policy optimisation on the native batch."""
+    """Proximal policy optimisation on the native batch, from an imitation of a classical controller.
 
-    recipe: Recipe = field(default_factory=Recipe)
-    steps: int = 10_000_000
+    The imitation is good, so learning must not lose it: the critic learns first, the actor slowly, and only the last
+    weights that move the pull speed. The heater acts over a quarter of an hour, which the discount does not see.
+    """
+
+    name: str = "ppo"
+    """What agents of these settings are called."""
+    recipe: Recipe = field(default_factory=lambda: Recipe(weights=CostWeights(pull=0.5, pull_step=0.5), clone=Clone()))
+    steps: int = 1_000_000
     """Environment steps."""
-    n_steps: int = 64
+    critic_steps: int = 200_000
+    """The first of them, in which only the critic learns."""
+    n_steps: int = 128
     """Steps a slot between updates."""
-    batch_size: int = 2048
-    n_epochs: int = 5
+    batch_size: int = 8192
+    n_epochs: int = 4
     learning_rate: float = 1e-3
     """At the start; it falls linearly to a twentieth."""
-    gamma: float = 0.99
-    gae_lambda: float = 0.95
+    actor_pace: float = 0.15
+    """The actor's learning rate, in units of it [-]."""
+    frozen: tuple[str, ...] = ("heater", "layers")
+    """What of the actor keeps its first weights: "heater", the heater's output; "layers", the hidden layers."""
+    paired: bool = True
+    """Whether the teacher's reward on the same crystal is taken off."""
+    gamma: float = 0.98
+    gae_lambda: float = 0.9
     clip_range: float = 0.2
     ent_coef: float = 0.0
     vf_coef: float = 0.5
     max_grad_norm: float = 0.5
-    log_std_init: float = -3.0
-    """Logarithm of the action noise's standard deviation at the start."""
+    noise: tuple[float, float] = (0.006, 0.0003)
+    """Spread of the exploration at the start, pull speed and heater [-]."""
+
+
+SCRATCH = PPO(
+    name="ppo-scratch",
+    recipe=Recipe(),
+    steps=10_000_000,
+    critic_steps=0,
+    n_steps=64,
+    batch_size=2048,
+    n_epochs=5,
+    actor_pace=1.0,
+    frozen=(),
+    paired=False,
+    gamma=0.99,
+    gae_lambda=0.95,
+    noise=(0.05, 0.05),
+)
+"""PPO from nothing."""
 
 
 @dataclass(frozen=True)
 class SAC:
     """Soft actor-critic on the same batch."""
 
+    name: str = "sac"
+    """What agents of these settings are called."""
     recipe: Recipe = field(default_factory=lambda: Recipe(num_envs=16, privileged_critic=False))
     steps: int = 400_000
     """Environment steps."""
@@ -75,6 +144,23 @@ class SAC:
     learning_rate: float = 5e-4
     gamma: float = 0.99
     tau: float = 0.01
+
+
+def _cloning(teacher: str, weights: CostWeights) -> Recipe:
+    return Recipe(weights=weights, clone=Clone(teacher))
+
+
+RECIPES: dict[str, PPO | SAC] = {
+    choice.name: choice
+    for choice in (
+        PPO(),
+        PPO(name="ppo-lively", recipe=_cloning("lqg", CostWeights(pull=0.2, pull_step=0.2))),
+        PPO(name="ppo-quiet", recipe=_cloning("lqg-quiet", CostWeights(pull_step=2.0))),
+        SCRATCH,
+        SAC(),
+    )
+}
+"""By name: what ``train.py --algo`` offers."""
 
 
 def describe(settings: Any) -> dict[str, Any]:

@@ -16,8 +16,10 @@ from cz_gym import CzVectorEnv
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 
 from . import settings
-from .callbacks import Statistics
+from .callbacks import CriticFirst, Statistics
+from .clone import imitate
 from .network import DrivePolicy, Normalise
+from .pairing import PairedReward
 from .vec_env import CzVecEnv
 from .wrappers import DriveAction, TrainingReward
 
@@ -32,14 +34,35 @@ class Training:
     steps: int
 
 
-def make_training(choice: settings.PPO | settings.SAC, seed: int, logs: str | None, done: int = 0) -> Training:
-    """The learner of these settings for a training seed; ``done`` steps have been taken before (resuming)."""
+def make_training(
+    choice: settings.PPO | settings.SAC, seed: int, logs: str | None, done: int = 0, teacher: Any = None
+) -> Training:
+    """The learner of these settings for a training seed; ``done`` steps have been taken before (resuming).
+
+    ``teacher`` is the controller that the settings name, for what is cloned or paired.
+    """
     recipe = choice.recipe
     torch.set_num_threads(recipe.threads)
+    torch.manual_seed(seed)
     slots = _make_slots(recipe, seed, done)
-    make = _make_ppo if isinstance(choice, settings.PPO) else _make_sac
-    learner = make(choice, slots, seed, logs)  # type: ignore[operator]
-    return Training(learner, [Statistics(choice.steps // 4, known=done > 0)], recipe, choice.steps)
+    if isinstance(choice, settings.SAC):
+        return Training(
+            _make_sac(choice, slots, seed, logs), [Statistics(choice.steps // 4, done > 0)], recipe, choice.steps
+        )
+    learner = _make_ppo(choice, slots, seed, logs, teacher)
+    callbacks: list[BaseCallback] = [CriticFirst(choice.critic_steps, choice.actor_pace)]
+    if recipe.clone is None:
+        callbacks.append(Statistics(choice.steps // 4, known=done > 0))
+    return Training(learner, callbacks, recipe, choice.steps)
+
+
+def clone(training: Training, teacher: Any, config: Any, seed: int, tell: Callable[[str], None]) -> None:
+    """Let a learner that has not learned yet imitate the teacher that its recipe names."""
+    choice = training.recipe.clone
+    if choice is not None:
+        span = len(TRAINING_SEEDS) - choice.rounds * choice.episodes
+        torch.manual_seed(seed)
+        imitate(training.learner.policy, teacher, config, choice, (seed * 20_011 + 500_000) % span, tell)
 
 
 def _make_slots(recipe: settings.Recipe, seed: int, done: int) -> CzVecEnv:
@@ -60,11 +83,14 @@ def _linear(start: float, end: float) -> Callable[[float], float]:
     return lambda left: end + (start - end) * left
 
 
-def _make_ppo(choice: settings.PPO, slots: CzVecEnv, seed: int, logs: str | None) -> PPOLearner:
+def _make_ppo(choice: settings.PPO, slots: CzVecEnv, seed: int, logs: str | None, teacher: Any) -> PPOLearner:
     recipe, head = choice.recipe, choice.recipe.head
+    env: Any = TrainingReward(slots, choice.gamma, recipe.weights)
+    if choice.paired:
+        env = PairedReward(env, slots, teacher)
     return PPOLearner(
         DrivePolicy,
-        TrainingReward(slots, choice.gamma),
+        env,
         learning_rate=_linear(choice.learning_rate, choice.learning_rate / 20.0),
         n_steps=choice.n_steps,
         batch_size=choice.batch_size,
@@ -79,7 +105,8 @@ def _make_ppo(choice: settings.PPO, slots: CzVecEnv, seed: int, logs: str | None
             "hidden": recipe.hidden,
             "skip": head.skip,
             "scale": (head.pull_scale, head.heater_scale),
-            "log_std_init": choice.log_std_init,
+            "noise": choice.noise,
+            "frozen": choice.frozen,
         },
         seed=seed,
         device="cpu",
@@ -89,7 +116,9 @@ def _make_ppo(choice: settings.PPO, slots: CzVecEnv, seed: int, logs: str | None
 
 def _make_sac(choice: settings.SAC, slots: CzVecEnv, seed: int, logs: str | None) -> SACLearner:
     recipe, head = choice.recipe, choice.recipe.head
-    env = DriveAction(TrainingReward(slots, choice.gamma), head.skip, (head.pull_scale, head.heater_scale))
+    env = DriveAction(
+        TrainingReward(slots, choice.gamma, recipe.weights), head.skip, (head.pull_scale, head.heater_scale)
+    )
     return SACLearner(
         "MlpPolicy",
         env,

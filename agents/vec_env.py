@@ -39,6 +39,8 @@ class CzVecEnv(VecEnv):
         self.render_mode = env.render_mode
         channels = env.single_observation_space.shape[0] + (len(STATE) if privileged else 0)
         super().__init__(env.num_envs, Box(-CLIP, CLIP, (channels,), np.float32), env.single_action_space)
+        self.info: dict[str, Any] = {}
+        """What the batch said of its last step."""
         self._actions = np.zeros((env.num_envs, 2), np.float32)
         self._returns = np.zeros(env.num_envs)
         self._lengths = np.zeros(env.num_envs, np.int64)
@@ -68,6 +70,7 @@ class CzVecEnv(VecEnv):
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Advance every slot."""
         observation, reward, terminated, truncated, info = self.env.step(self._actions)
+        self.info = info
         self._returns += reward
         self._lengths += 1
         self._k += 1

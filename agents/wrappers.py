@@ -8,19 +8,22 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
-from cz_gym.task import FAILURE_COST
+from cz_gym.task import FAILURE_COST, Cost, cost_terms, reward
 
 from .network import DRIVES
+from .settings import CostWeights
 
 
 class TrainingReward(VecEnvWrapper):
     """Reward for a discounting learner: scaled by 1 - gamma; a failure costs the worst step for the discounted rest.
 
-    The environment's own failure penalty, -10 a lost step, is the same thing undiscounted.
+    The environment's own failure penalty, -10 a lost step, is the same thing undiscounted. The terms of the cost are
+    weighted as asked; the last step of an episode keeps the environment's own weights.
     """
 
-    def __init__(self, venv: VecEnv, gamma: float) -> None:
+    def __init__(self, venv: VecEnv, gamma: float, weights: CostWeights = CostWeights()) -> None:  # noqa: B008 (frozen)
         super().__init__(venv)
+        self.weights = weights
         self.share = 1.0 - gamma
         self.floor = -FAILURE_COST / self.share
 
@@ -29,9 +32,24 @@ class TrainingReward(VecEnvWrapper):
         return self.venv.reset()
 
     def step_wait(self) -> Any:
-        """Scale the reward."""
-        observation, reward, done, infos = self.venv.step_wait()
-        return observation, np.maximum(reward, self.floor) * self.share, done, infos
+        """Weigh and scale the reward."""
+        observation, given, done, infos = self.venv.step_wait()
+        if self.weights != CostWeights():
+            given = np.where(done, given, self.reward(self.venv.unwrapped.info))
+        return observation, (np.maximum(given, self.floor) * self.share).astype(np.float32), done, infos
+
+    def reward(self, info: dict[str, Any]) -> Any:
+        """The weighed reward of a step from what the batch said of it."""
+        weights, radius = self.weights, info["cost_radius"]
+        if weights.observable:
+            radius = cost_terms(info["r_c"] - info["r_ref"] + info["ring_offset"], 0.0, 0.0, 0.0).radius
+        cost = Cost(
+            radius,
+            weights.pull * info["cost_pull"],
+            weights.pull_step * info["cost_pull_step"],
+            weights.heater_step * info["cost_heater_step"],
+        )
+        return reward(cost)
 
 
 class DriveAction(VecEnvWrapper):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +29,13 @@ from cz_gym.evaluation.rollout import rollout
 from cz_gym.observation import HISTORY, STATE
 
 CONFIG = make_config(observation="history")
-SMALL = settings.PPO(
-    recipe=settings.Recipe(num_envs=4, hidden=(16, 16)), steps=64, n_steps=16, batch_size=32, n_epochs=1
+SMALL = replace(
+    settings.SCRATCH,
+    recipe=settings.Recipe(num_envs=4, hidden=(16, 16)),
+    steps=64,
+    n_steps=16,
+    batch_size=32,
+    n_epochs=1,
 )
 SMALL_SAC = settings.SAC(
     recipe=settings.Recipe(num_envs=4, hidden=(16, 16), privileged_critic=False),
@@ -77,8 +83,8 @@ def agent(ppo: Any, tmp_path: Path) -> Path:
 
 def test_exported_ppo_acts_like_the_network_it_came_from(ppo: Any, agent: Path) -> None:
     normalise = ppo.policy.features_extractor
-    assert normalise.std.min() > 0
-    assert not torch.allclose(normalise.std, torch.ones_like(normalise.std))
+    assert normalise.scaling.diagonal().min() > 0
+    assert not torch.allclose(normalise.scaling, torch.eye(len(normalise.scaling)))
     seen = observations(64, len(HISTORY) + len(STATE))
     expected, _ = ppo.predict(seen, deterministic=True)
     action, _ = OnnxPolicy.load(agent, CONFIG).predict(seen[:, : len(HISTORY)])
@@ -209,7 +215,7 @@ def test_checkpoint_continues_and_refuses_what_does_not_fit(ppo: Any, tmp_path: 
     path = tmp_path / "checkpoint.safetensors"
     path.write_bytes(to_bytes(ppo, 12.0, 0.5))
     progress, tensors = load_checkpoint(path)
-    assert (progress.seconds, progress.best_rmse_mm) == (12.0, 0.5)
+    assert (progress.seconds, progress.best_cost) == (12.0, 0.5)
     other = make_training(SMALL, 1, None).learner
     restore(other, progress, tensors, path)
     assert other.num_timesteps == ppo.num_timesteps
@@ -223,6 +229,43 @@ def test_checkpoint_continues_and_refuses_what_does_not_fit(ppo: Any, tmp_path: 
     wider = dataclasses.replace(SMALL, recipe=dataclasses.replace(SMALL.recipe, hidden=(8, 8)))
     with pytest.raises(AgentFileError, match="does not fit"):
         restore(make_training(wider, 0, None).learner, progress, tensors, path)
+
+
+def test_a_resumed_sac_keeps_its_temperature(tmp_path: Path) -> None:
+    """stable-baselines3 counts it as a variable, not among the parameters."""
+    path = tmp_path / "checkpoint.safetensors"
+    learner = make_training(SMALL_SAC, 0, None).learner
+    with torch.no_grad():
+        learner.log_ent_coef.fill_(-1.25)
+    path.write_bytes(to_bytes(learner, 1.0, None))
+    other = make_training(SMALL_SAC, 1, None).learner
+    restore(other, *load_checkpoint(path), path)
+    assert other.log_ent_coef.item() == -1.25
+    assert other.log_ent_coef in other.ent_coef_optimizer.param_groups[0]["params"]
+
+
+@pytest.mark.parametrize(
+    ("name", "tensor", "message"),
+    [
+        ("policy/log_std", torch.full((2,), torch.nan), "not finite"),
+        ("policy/log_std", torch.zeros(3), "does not fit"),
+        ("policy/log_std", torch.zeros(2, dtype=torch.float64), "does not fit"),
+        ("policy.optimizer/0/step", torch.tensor(-1.0), "does not fit"),
+        ("policy.optimizer/99/step", torch.tensor(1.0), "does not fit"),
+        ("policy.optimizer/0/surprise", torch.tensor(1.0), "does not fit"),
+        ("elsewhere/weight", torch.zeros(2), "does not fit"),
+    ],
+)
+def test_tensors_that_do_not_belong_are_refused(
+    ppo: Any, tmp_path: Path, name: str, tensor: torch.Tensor, message: str
+) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    path.write_bytes(to_bytes(ppo, 1.0, None))
+    progress, tensors = load_checkpoint(path)
+    with pytest.raises(AgentFileError, match=message):
+        restore(ppo, progress, {**tensors, name: tensor}, path)
+    with pytest.raises(AgentFileError, match="does not fit"):
+        restore(ppo, progress, {key: tensors[key] for key in tensors if key != "policy/log_std"}, path)
 
 
 def test_shipped_agent_beats_the_paper_s_controller_on_validation() -> None:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
+import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +14,7 @@ import numpy as np
 import pytest
 
 import train
-from agents import OnnxPolicy, run
+from agents import OnnxPolicy, run, settings
 from agents.vec_env import CzVecEnv
 from agents.wrappers import DriveAction, TrainingReward
 from cz_gym import CzVectorEnv
@@ -21,6 +24,8 @@ from cz_gym import CzVectorEnv
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run, "QUICK", 2)
     monkeypatch.setattr(run, "FULL", 2)
+    recipe = replace(settings.RECIPES["ppo"].recipe, num_envs=64, clone=settings.Clone(rounds=2, episodes=2, epochs=1))
+    monkeypatch.setitem(settings.RECIPES, "ppo", replace(settings.PPO(), recipe=recipe, n_steps=32, critic_steps=4096))
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -31,11 +36,11 @@ def rows(path: Path) -> list[dict[str, str]]:
 def test_a_run_leaves_everything_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "run"
     assert train.main(["--steps", "20000", "--seed", "3", "--out", str(folder)]) == 0
-    settings = json.loads((folder / "settings.json").read_text())
-    assert settings["seed"] == 3
-    assert settings["settings"]["recipe"]["scenario"] == "randomized"
-    assert settings["packages"]["stable-baselines3"]
-    assert {"command", "git_commit", "plant_hash", "scenario_hash"} <= set(settings)
+    saved = json.loads((folder / "settings.json").read_text())
+    assert saved["seed"] == 3
+    assert saved["settings"]["recipe"]["scenario"] == "randomized"
+    assert saved["packages"]["stable-baselines3"]
+    assert {"command", "git_commit", "plant_hash", "scenario_hash"} <= set(saved)
     policy = OnnxPolicy.load(folder / "agent.onnx")
     assert policy.contract.training_seed == 3
     assert list((folder / "tensorboard").rglob("events.*"))
@@ -73,8 +78,8 @@ def test_a_run_killed_at_once_can_be_resumed(tmp_path: Path, monkeypatch: pytest
         patch.setattr(run.Run, "learn", die)
         assert train.main(["--steps", "10000", "--out", str(folder)]) == 2
     assert train.main(["--resume", "--out", str(folder)]) == 0
-    settings = json.loads((folder / "settings.json").read_text())
-    assert [session["from_step"] for session in settings["sessions"]] == [0, 0]
+    saved = json.loads((folder / "settings.json").read_text())
+    assert [session["from_step"] for session in saved["sessions"]] == [0, 0]
 
 
 def test_settings_that_are_none_are_damaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -102,6 +107,8 @@ def test_interrupting_before_learning_gives_one_line(
         (["--algo", "dqn"], "invalid choice: 'dqn'"),
         (["--steps", "0"], "at least 1, not '0'"),
         (["--seed", "minus"], "at least 0, not 'minus'"),
+        (["--checkpoint-seconds", "-1"], "at least 0, not '-1'"),
+        (["--checkpoint-seconds", "nan"], "at least 0, not 'nan'"),
         (["--sceanrio", "hard"], "unrecognized arguments"),
         (["--scen", "hard"], "unrecognized arguments"),
     ],
@@ -132,6 +139,34 @@ def test_mistakes_give_one_line(
     assert message in error
     assert error.count("\n") == 1
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_full_disk_is_one_line_that_names_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*arguments: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("cz_gym.evaluation.whole.os.fsync", full)
+    folder = tmp_path / "run"
+    assert train.main(["--steps", "10000", "--out", str(folder)]) == 2
+    error = capsys.readouterr().err
+    assert error == f"train.py: {folder / run.CHECKPOINT}: No space left on device\n"
+    assert not list(folder.glob("*.*"))
+
+
+@pytest.mark.parametrize(
+    "settings", ["[" * 100_000, '{"steps": true, "sessions": [{}]}', '{"steps": 9, "sessions": 3}', "x" * 2_000_000]
+)
+def test_settings_from_a_stranger_are_refused_in_one_line(
+    tmp_path: Path, settings: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "settings.json").write_text(settings)
+    assert train.main(["--resume", "--out", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert "missing or damaged" in error
+    assert error.count("\n") == 1
 
 
 def slots(**settings: Any) -> CzVecEnv:

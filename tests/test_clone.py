@@ -1,0 +1,160 @@
+"""Imitating a teacher, comparing with it on the same crystal, and learning gently from there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode
+
+from agents import clone, settings
+from agents.network import Paced
+from agents.pairing import PairedReward
+from agents.training import make_training
+from agents.vec_env import CzVecEnv
+from agents.wrappers import TrainingReward
+from baselines.lqg_settings import lqg
+from cz_gym import CzVectorEnv
+from cz_gym.config import make_config
+from cz_gym.observation import HISTORY
+from cz_gym.task import Cost, reward
+
+CONFIG = make_config("randomized", observation="history", horizon=600.0)
+TINY = replace(
+    settings.PPO(),
+    recipe=settings.Recipe(num_envs=4, hidden=(16, 16), clone=settings.Clone()),
+    steps=256,
+    n_steps=32,
+    batch_size=64,
+    n_epochs=1,
+    critic_steps=0,
+)
+
+
+class Teacher:
+    """Moves the drives by a function of the observation."""
+
+    def __init__(self, moves: Any) -> None:
+        self.moves = moves
+
+    def predict(self, observation: Any, state: Any = None, episode_start: Any = None) -> Any:
+        return (observation[:, [9, 10]] + self.moves(observation)).astype(np.float32), state
+
+
+def policy_of(teacher: Any = None, choice: settings.PPO = TINY) -> Any:
+    return make_training(replace(choice, paired=teacher is not None), 0, None, 0, teacher).learner.policy
+
+
+def linear(observation: np.ndarray) -> np.ndarray:
+    return np.column_stack([-0.01 * observation[:, 0] + 0.002 * observation[:, 11], 0.003 * observation[:, 8]])
+
+
+def test_whitened_observations_are_uncorrelated() -> None:
+    random = np.random.default_rng(0)
+    seen = random.normal(size=(5000, 6)) @ random.normal(size=(6, 6)) + 3.0
+    mean, scaling = clone.whitening(seen.astype(np.float32))
+    np.testing.assert_allclose(np.cov(((seen - mean) @ scaling).T), np.eye(6), atol=1e-3)
+
+
+def test_a_linear_teacher_is_imitated_exactly() -> None:
+    policy = policy_of()
+    shown = clone.demonstrate(Teacher(linear), CONFIG, range(8), (0.01, 0.01))
+    clone.begin_linear(policy, shown)
+    acts = clone.acts(policy)(shown.observation)
+    np.testing.assert_allclose(acts, shown.action, atol=2e-5)
+
+
+def test_the_layers_learn_what_bends_the_teacher() -> None:
+    bent = Teacher(lambda seen: np.column_stack([0.02 * np.abs(seen[:, 0]), np.zeros(len(seen))]))
+    policy = policy_of()
+    shown = clone.demonstrate(bent, CONFIG, range(8), (0.01, 0.001))
+    clone.begin_linear(policy, shown)
+    before = np.abs(clone.acts(policy)(shown.observation) - shown.action)[:, 0].mean()
+    clone.fit(policy, shown, settings.Clone(epochs=60, learning_rate=5e-3))
+    assert np.abs(clone.acts(policy)(shown.observation) - shown.action)[:, 0].mean() < 0.5 * before
+
+
+def test_lost_crystals_teach_nothing() -> None:
+    shown = clone.demonstrate(
+        Teacher(lambda seen: np.full((len(seen), 2), [2.0, 0.0])), replace(CONFIG, horizon=3600.0), range(4), (0.0, 0.0)
+    )
+    assert len(shown.action) < 4 * 720 / clone.EVERY
+    assert np.abs(shown.state[:, 0]).max() < 8.0
+
+
+def test_the_imitation_of_lqg_holds_the_radius() -> None:
+    policy = policy_of(choice=replace(TINY, recipe=settings.Recipe(num_envs=4, clone=settings.Clone())))
+    config = make_config("randomized", observation="history")
+    few = settings.Clone(rounds=1, episodes=48, epochs=4)
+    clone.imitate(policy, lqg(make_config("randomized")), config, few, 900_000)
+    env = CzVectorEnv(16, scenario="randomized", observation="history")
+    observation, info = env.reset(seed=list(range(950_000, 950_016)))
+    squares = []
+    for _ in range(1000):
+        observation, _, terminated, _, info = env.step(np.clip(clone.acts(policy)(observation), -1.0, 1.0))
+        assert not terminated.any()
+        squares.append((info["r_c"] - info["r_ref"]) ** 2)
+    assert np.sqrt(np.mean(squares[360:])) < 0.15e-3
+
+
+def slots(n: int = 3, horizon: float = 100.0) -> CzVecEnv:
+    env = CzVectorEnv(
+        n, scenario="randomized", observation="history", horizon=horizon, autoreset_mode=AutoresetMode.SAME_STEP
+    )
+    made = CzVecEnv(env, privileged=True, stagger=7)
+    made.seed(40)
+    return made
+
+
+def test_an_agent_that_does_what_its_teacher_does_earns_nothing_more() -> None:
+    base = slots()
+    env = PairedReward(TrainingReward(base, 0.9), base, lqg(make_config("randomized")))
+    twin = lqg(make_config("randomized"))
+    observation, memory, begins = env.reset(), None, np.ones(3, np.bool_)
+    for _ in range(70):
+        action, memory = twin.predict(observation[:, : len(HISTORY)], memory, begins)
+        observation, gained, begins, _ = env.step(action)
+        np.testing.assert_allclose(gained[~begins], 0.0, atol=1e-7)
+    assert env.together.all()
+    env.close()
+
+
+def test_the_weighed_reward_is_the_weighed_cost_s() -> None:
+    base = slots()
+    weights = settings.CostWeights(pull=0.5, pull_step=3.0, heater_step=2.0)
+    env = TrainingReward(base, 0.9, weights)
+    env.reset()
+    _, gained, done, _ = env.step(np.full((3, 2), 0.1, np.float32))
+    said = base.info
+    cost = Cost(
+        said["cost_radius"], 0.5 * said["cost_pull"], 3.0 * said["cost_pull_step"], 2.0 * said["cost_heater_step"]
+    )
+    assert not done.any()
+    np.testing.assert_allclose(gained, 0.1 * reward(cost), rtol=1e-6)
+
+
+def test_a_group_of_parameters_keeps_its_pace() -> None:
+    still, slow, fast = (torch.nn.Parameter(torch.zeros(3)) for _ in range(3))
+    groups = [{"params": part, "pace": pace} for part, pace in ((still, 0.0), (slow, 0.1), (fast, 1.0))]
+    optimiser = Paced(groups, 1e-2)
+    for part in (still, slow, fast):
+        part.grad = torch.ones(3)
+    optimiser.step()
+    assert torch.equal(still, torch.zeros(3))
+    torch.testing.assert_close(10.0 * slow.detach(), fast.detach())
+    assert [group["lr"] for group in optimiser.param_groups] == [1e-2] * 3
+
+
+@pytest.mark.parametrize("frozen", [("heater", "layers"), ()])
+def test_what_is_frozen_stays(frozen: tuple[str, ...]) -> None:
+    training = make_training(replace(TINY, frozen=frozen), 0, None, 0, lqg(make_config("randomized")))
+    policy = training.learner.policy
+    direct, layer = policy.mlp_extractor.direct, policy.mlp_extractor.actor[0]
+    before = direct.weight.detach().clone(), layer.weight.detach().clone()
+    training.learner.learn(256, callback=training.callbacks)
+    assert not torch.equal(direct.weight[0], before[0][0])
+    assert torch.equal(direct.weight[1], before[0][1]) == ("heater" in frozen)
+    assert torch.equal(layer.weight, before[1]) == ("layers" in frozen)
