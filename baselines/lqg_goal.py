@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from cz_gym.units import MM
-
 from .late_ring import RingModel
 from .lqg import LQGSettings
 from .lqg_model import NoiseModel
-from .lqg_settings import QUIET, REWARD
+from .lqg_settings import PULLER_RING, QUIET, REWARD
 from .lqr import Weights
 from .policy import Floats
 
@@ -98,8 +96,6 @@ class Figures:
 
 _LIVELY = LQGSettings(weights=Weights(pull=0.12, pull_step=0.06, heater_step=0.08))
 _CALM = LQGSettings(weights=Weights(pull=0.1, pull_step=0.2, heater_step=0.1))
-PULLER_RING = RingModel(latency=5.0, ripple_sd=0.08 * MM)
-"""The camera of ``puller``: its latency and rotation, and what amplitudes between 0 and 0.2 mm come to on average."""
 
 
 def _on_puller(settings: LQGSettings) -> LQGSettings:

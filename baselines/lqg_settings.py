@@ -10,7 +10,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from cz_gym.config import Config
+from cz_gym.units import MM
 
+from .late_ring import RingModel
 from .lqg import LQG, LQGSettings
 from .lqg_bounds import FullInformation, ToldLQG
 from .lqg_model import NoiseModel
@@ -44,6 +46,8 @@ QUIET = LQGSettings(
     weights=Weights(pull=0.05482, pull_step=0.3051, heater_step=1.168),
 )
 """``lqg-quiet``: the radius as well as pull steps of 0.0095 mm/min allow."""
+PULLER_RING = RingModel(latency=5.0, ripple_sd=0.08 * MM)
+"""The camera of ``puller``: its latency and rotation, and what amplitudes between 0 and 0.2 mm come to on average."""
 SHIPPED: dict[tuple[str, str], LQGSettings] = {
     ("lqg", "randomized"): REWARD,
     ("lqg-quiet", "randomized"): QUIET,

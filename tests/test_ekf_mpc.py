@@ -9,8 +9,8 @@ from scipy.optimize import minimize
 from baselines import bank, optional
 from baselines.bank import Hypotheses
 from baselines.lqg import LQG, LQGSettings, act
-from baselines.lqg_goal import PULLER_RING
 from baselines.lqg_model import DRIFT, HEATER, PLANT, STATES
+from baselines.lqg_settings import PULLER_RING
 from baselines.lqr import cost_to_go, quadratic_cost
 from baselines.registry import find_controller
 from cz_gym.config import make_config

@@ -159,5 +159,5 @@ def test_another_scenario_is_tuned_on_its_own_training_seeds(monkeypatch):
 
 def test_settings_with_a_ring_are_read_back_as_written():
     settings = lqg_goal.GOALS["lqg", "puller"].start
-    assert settings.ring == lqg_goal.PULLER_RING
+    assert settings.ring == lqg_settings.PULLER_RING
     assert lqg_goal.settings_from(json.loads(json.dumps(asdict(settings)))) == settings
