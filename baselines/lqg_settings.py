@@ -48,9 +48,17 @@ QUIET = LQGSettings(
 """``lqg-quiet``: the radius as well as pull steps of 0.0095 mm/min allow."""
 PULLER_RING = RingModel(latency=5.0, ripple_sd=0.08 * MM)
 """The camera of ``puller``: its latency and rotation, and what amplitudes between 0 and 0.2 mm come to on average."""
+PULLER_REWARD = replace(
+    REWARD,
+    noise=replace(REWARD.noise, heater_walk=1.0),
+    weights=replace(REWARD.weights, heater_step=1.712),
+    ring=PULLER_RING,
+)
+"""``lqg`` on ``puller``: the observable radius as well as pull steps of 0.016 mm/min allow."""
 SHIPPED: dict[tuple[str, str], LQGSettings] = {
     ("lqg", "randomized"): REWARD,
     ("lqg-quiet", "randomized"): QUIET,
+    ("lqg", "puller"): PULLER_REWARD,
 }
 """By controller and scenario."""
 
@@ -66,7 +74,16 @@ class Step(NamedTuple):
 
 ACTIVITIES = (0.003, 0.005, 0.008, 0.013, 0.02, 0.03)
 """Pull step RMS [mm/min] that the settings of the frontier are made for."""
-FRONTIER: dict[str, tuple[Step, ...]] = {}
+FRONTIER: dict[str, tuple[Step, ...]] = {
+    "randomized": (
+        Step("lqg-quiet", 23.83),
+        Step("lqg-quiet", 3.011),
+        Step("lqg-quiet", 0.4969),
+        Step("lqg-quiet", 0.07386),
+        Step("lqg-quiet", 0.01232),
+        Step("lqg-quiet", 0.004767),
+    ),
+}
 """By scenario, one an activity: chosen by ``python -m baselines.lqg_frontier``."""
 
 

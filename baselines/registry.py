@@ -72,7 +72,7 @@ CONTROLLERS: tuple[Entry, ...] = (
     _tuned("industrial", "incremental pull-speed law of a logged puller, with automatic growth control"),
     Entry("lqg", lqg_settings.lqg, "measured", "Kalman filter and LQ regulator of pull and heater, for the reward"),
     Entry("lqg-quiet", lqg_settings.lqg_quiet, "measured", "the same for low pull activity"),
-    *(_lqg_at(activity) for activity in lqg_settings.ACTIVITIES if lqg_settings.FRONTIER),
+    *(_lqg_at(activity) for activity in lqg_settings.ACTIVITIES),
     Entry("ekf-mpc", _ekf_mpc, "measured", "nonlinear MPC on a bank of lqg's filters", default=False, slow=True),
     Entry(
         "lqg-true",
