@@ -24,8 +24,10 @@ os.environ.setdefault("NUMBA_DISABLE_INTEL_SVML", "1")
 
 import llvmlite
 import numba
+from llvmlite import ir
+from numba.core import cgutils, types
 from numba.core.options import DefaultOptions as default_options
-from numba.extending import register_jitable
+from numba.extending import intrinsic, overload, register_jitable
 
 from ._kept_code import KeptCode
 
@@ -128,3 +130,31 @@ def entry(loop: Any, arguments: tuple[Any, ...]) -> Any:
     compile_for = getattr(loop, "compile", None)
     typeof: Any = numba.typeof
     return loop if compile_for is None else compile_for(tuple(map(typeof, arguments)))
+
+
+@intrinsic
+def _fetch(typing_context: Any, array: Any, at: Any) -> Any:
+    """The processor's hint itself: for writing (1), to be kept (3), data (1)."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        held = context.make_array(signature.args[0])(context, builder, arguments[0])
+        address = builder.bitcast(builder.gep(held.data, [arguments[1]]), cgutils.voidptr_t)
+        number = ir.IntType(32)
+        hint = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, number, number, number])
+        prefetch = builder.module.declare_intrinsic("llvm.prefetch", [cgutils.voidptr_t], hint)
+        builder.call(prefetch, [address, number(1), number(3), number(1)])
+        return context.get_dummy_value()
+
+    return types.none(array, types.int64), generate
+
+
+def fetch(array: Any, at: Any) -> None:
+    """In a kernel, have number ``at`` of a contiguous array brought to the cache; it may lie outside. Else nothing."""
+
+
+@overload(fetch, inline="never")
+def _compiled_fetch(array: Any, at: Any) -> Any:
+    def compiled(array: Any, at: Any) -> None:
+        _fetch(array, at)  # type: ignore[call-arg]
+
+    return compiled

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ._compile import hashed, inlined, kernel, physics
+from ._compile import fetch, hashed, inlined, kernel, physics
 from .draws import draw_episode, draw_factors, randomised, seed_streams
 from .fluctuation import first_fluctuation, fluctuation, next_fluctuation, sample_noise
 from .law import GRID
@@ -19,12 +19,15 @@ from .plant import Disturbance, Inputs, State, derive_puller, hidden_load, rk4
 from .readings import clip, measure, recall, remember, write_info, write_measured, write_state
 from .schedule import drift, melt_left, reference
 from .sensing import photograph, sense
-from .slots import EPISODE_AT, INFO, PULLER_AT
+from .slots import EPISODE_AT, INFO, PULLER_AT, SLOT
 from .task import HEATER_RANGE, HEIGHT_MAX_IN_A, HEIGHT_MIN, Cost, cost_terms, failure_penalty, reward, within_limits
 
 _EPS = 1e-9
 _CLIPPED = INFO.index("action_clipped")
 _JUMP = HEIGHT_MIN
+_LINE = 8
+"""Numbers of eight bytes in a line of the cache."""
+_NUMBERS, _ROWS = SLOT.itemsize // 8, len(INFO)
 
 
 @physics
@@ -145,6 +148,21 @@ _sample_alone = kernel(_read, keep=False, allocates=False)
 """A sample as a function of its own: with the step's options, so that what it calls is compiled only once."""
 
 
+@physics
+def _fetch_slot(numbers: Any, i: Any) -> None:
+    """Have slot i brought to the cache: the slots of a large batch are further away than one step is long."""
+    for at in range(0, _NUMBERS, _LINE):
+        fetch(numbers, i * _NUMBERS + at)
+
+
+@physics
+def _fetch_info(info: Any, i: Any) -> None:
+    """Have the lines brought that the info of slot i and of those after it is written to."""
+    if i % _LINE == 0:
+        for row in range(_ROWS):
+            fetch(info, row * info.shape[1] + i)
+
+
 class Kernels(NamedTuple):
     """The compiled loops for one meniscus model."""
 
@@ -171,6 +189,8 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
         for i in range(start, stop):
             if not active[i]:
                 continue
+            _fetch_slot(memory.numbers, i + 1)
+            _fetch_info(out.info, i + _LINE)
             slot = memory.slots[i]
             _drive(slot, actions[i, 0], actions[i, 1], clock.interval)
             grows = _advance(slot, memory.frames[i], clock, slope, ring_offset)
@@ -209,6 +229,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
 
     def plant(memory: Any, actions: Any, clock: Any, rings: Any, start: int, stop: int) -> None:
         for i in range(start, stop):
+            _fetch_slot(memory.numbers, i + 1)
             slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
             _drive(slot, actions[i, 0], actions[i, 1], clock.interval)
             _advance(slot, memory.frames[i], clock, slope, ring_offset)

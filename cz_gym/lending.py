@@ -8,7 +8,7 @@ from __future__ import annotations
 import ctypes
 import math
 import weakref
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -51,7 +51,7 @@ class Lender:
             block = self._free.pop()
         except IndexError:
             block = _block(ctypes.sizeof(self._type))
-        lent = self._type.from_buffer(block)
+        lent: Any = self._type.from_buffer(cast(Any, block))
         loan = _Loan(lent, self._give_back)
         loan.block = block
         self._loans[id(loan)] = loan
