@@ -26,8 +26,10 @@ README = FOLDER.parents[1] / "README.md"
 """Where the committed results are quoted, between two markers."""
 KEPT = FOLDER.parent / "cache"
 """Where episodes of slow controllers are kept."""
-SHIPPED = ("ppo",)
-"""Agents that come with the package."""
+DEFAULT = "ppo-default"
+"""The training seed of ``ppo`` that did best on validation."""
+SHIPPED = ("ppo", DEFAULT, "ppo-lively", "ppo-quiet", "ppo-scratch", "ppo-puller")
+"""Agents that come with the package; all but the default pool their training seeds."""
 EPISODES = 500
 
 
@@ -182,7 +184,7 @@ def choose(
     Agent files named on the command line always take part, in place of the shipped ones; slow controllers only if
     ``slow``. Raises ValueError for a name that nobody has, and for agent files that cannot be used.
     """
-    from agents import OnnxPolicy, shipped
+    from agents import OnnxPolicy, shipped, shipped_seeds
     from baselines.registry import CONTROLLERS
     from cz_gym.evaluation.protocol import SLOW_EPISODES
 
@@ -209,7 +211,8 @@ def choose(
         if given:
             policies = [policy for policy in given if policy.contract.algorithm == name]
         elif name in wanted:
-            policies = [OnnxPolicy.load(shipped(name), _nominal())]
+            files = [shipped()] if name == DEFAULT else shipped_seeds(name)
+            policies = [OnnxPolicy.load(file, _nominal()) for file in files]
         else:
             continue
         contenders.append(_agent(name, policies))
@@ -257,7 +260,9 @@ def _agent(name: str, policies: Sequence[Any]) -> Contender:
             raise ValueError(
                 f"agent {name!r}: trained at {contract.control_interval:g} s control, the benchmark runs {interval:g} s"
             )
-    meaning = f"agent trained with {name} on {contracts[0].scenario}"
+    meaning = f"agent trained with {contracts[0].algorithm} on {contracts[0].scenario}"
+    if name == DEFAULT:
+        meaning += ", the seed that did best on validation"
     return Contender(Controller(name, policies[0].observation, meaning, seeds), lambda config: policies)
 
 

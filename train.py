@@ -10,7 +10,7 @@ from pathlib import Path
 
 from cz_gym.commands import OneLineParser
 
-ALGORITHMS = ("ppo", "ppo-lively", "ppo-quiet", "ppo-scratch", "sac")
+ALGORITHMS = ("ppo", "ppo-lively", "ppo-quiet", "ppo-puller", "ppo-scratch", "sac")
 
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
@@ -25,7 +25,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--steps", type=_whole(1), help="environment steps (default: the algorithm's own, or the resumed run's)"
     )
-    parser.add_argument("--scenario", default="randomized", help="scenario to train on (default: %(default)s)")
+    parser.add_argument("--scenario", help="scenario to train on (default: the algorithm's own)")
     parser.add_argument("--out", type=Path, help="run folder (default: runs/<algo>-seed<seed>)")
     parser.add_argument("--resume", action="store_true", help="go on from the run folder's checkpoint")
     parser.add_argument(
@@ -68,23 +68,21 @@ def train(arguments: argparse.Namespace) -> int:
     from cz_gym.evaluation.whole import alone, check_writable
     from cz_gym.scenarios import find_scenario
 
-    find_scenario(arguments.scenario)
+    choice = settings.RECIPES[arguments.algo]
+    scenario = find_scenario(arguments.scenario or choice.recipe.scenario).name
     folder: Path = arguments.out
     if not arguments.resume and (folder / "settings.json").exists():
         raise ValueError(f"{folder} holds a run already: --resume it, or name another --out")
-    choice = settings.RECIPES[arguments.algo]
-    choice = replace(choice, recipe=replace(choice.recipe, scenario=arguments.scenario))
+    choice = replace(choice, recipe=replace(choice.recipe, scenario=scenario))
     steps = arguments.steps or (saved_steps(folder) if arguments.resume else choice.steps)
     choice = replace(choice, steps=steps)
     paper = CompensatedPID(choice.recipe.control_interval)
     clone = choice.recipe.clone
-    teacher = find_controller(clone.teacher).make(make_config(arguments.scenario)) if clone else None
+    teacher = find_controller(clone.teacher).make(make_config(scenario)) if clone else None
     check_writable(folder)
     with alone(folder):
         run = Run(folder, choice, arguments.seed, paper, arguments.resume, arguments.checkpoint_seconds, teacher)
-        print(
-            f"{arguments.algo}, seed {arguments.seed}, {choice.steps:,} steps on {arguments.scenario!r}, into {folder}"
-        )
+        print(f"{arguments.algo}, seed {arguments.seed}, {choice.steps:,} steps on {scenario!r}, into {folder}")
         with tqdm(total=choice.steps, unit="step", unit_scale=True, dynamic_ncols=True, mininterval=1.0) as bar:
             try:
                 run.learn(bar)

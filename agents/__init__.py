@@ -7,18 +7,26 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .contract import AgentFileError, Contract
+from .contract import AgentFileError, Contract, read_agent
 from .onnx_policy import OnnxPolicy
 
-__all__ = ["AgentFileError", "Contract", "OnnxPolicy", "shipped"]
+__all__ = ["AgentFileError", "Contract", "OnnxPolicy", "shipped", "shipped_seeds"]
 
 MODELS = Path(__file__).parent / "models"
 
 
+def shipped_seeds(name: str = "ppo") -> list[Path]:
+    """Paths of the trained agents of that name that come with the package, one a training seed, in their order.
+
+    AgentFileError names what there is.
+    """
+    found = {int(path.stem.removeprefix(f"{name}-seed")): path for path in MODELS.glob(f"{name}-seed[0-9]*.onnx")}
+    if not found:
+        there = sorted({path.stem.rpartition("-seed")[0] for path in MODELS.glob("*-seed*.onnx")})
+        raise AgentFileError(f"no shipped agent {name!r}; there are: {', '.join(there) or 'none'}")
+    return [found[seed] for seed in sorted(found)]
+
+
 def shipped(name: str = "ppo") -> Path:
-    """Path of a trained agent that comes with the package; AgentFileError names what there is."""
-    path = MODELS / f"{name}.onnx"
-    if not path.is_file():
-        there = ", ".join(sorted(file.stem for file in MODELS.glob("*.onnx"))) or "none"
-        raise AgentFileError(f"no shipped agent {name!r}; there are: {there}")
-    return path
+    """Path of the one of :func:`shipped_seeds` that did best on validation episodes."""
+    return min(shipped_seeds(name), key=lambda path: read_agent(path)[0].validation_rmse_mm)

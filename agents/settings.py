@@ -83,7 +83,7 @@ class PPO:
     name: str = "ppo"
     """What agents of these settings are called."""
     recipe: Recipe = field(default_factory=lambda: Recipe(weights=CostWeights(pull=0.5, pull_step=0.5), clone=Clone()))
-    steps: int = 1_000_000
+    steps: int = 600_000
     """Environment steps."""
     critic_steps: int = 200_000
     """The first of them, in which only the critic learns."""
@@ -146,16 +146,13 @@ class SAC:
     tau: float = 0.01
 
 
-def _cloning(teacher: str, weights: CostWeights) -> Recipe:
-    return Recipe(weights=weights, clone=Clone(teacher))
-
-
 RECIPES: dict[str, PPO | SAC] = {
     choice.name: choice
     for choice in (
         PPO(),
-        PPO(name="ppo-lively", recipe=_cloning("lqg", CostWeights(pull=0.2, pull_step=0.2))),
-        PPO(name="ppo-quiet", recipe=_cloning("lqg-quiet", CostWeights(pull_step=2.0))),
+        PPO("ppo-lively", Recipe(weights=CostWeights(0.2, 0.2), clone=Clone("lqg-at-0.02"))),
+        PPO("ppo-quiet", Recipe(weights=CostWeights(), clone=Clone("lqg-quiet"))),
+        PPO("ppo-puller", Recipe(scenario="puller", weights=CostWeights(0.5, 0.5, observable=True), clone=Clone())),
         SCRATCH,
         SAC(),
     )

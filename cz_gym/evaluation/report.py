@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from ..units import HOUR, PERCENT
+from .metrics import metric_names
 from .results import REFERENCE, SPEED, Benchmark, Outcome, ScenarioResult, Verdict
 from .statistics import Estimate
 
@@ -145,7 +148,23 @@ def _scenario(scenario: ScenarioResult) -> list[str]:
     ]
     if any(outcome.paired for outcome in scenario.outcomes):
         parts.append(_comparison(scenario))
+    pooled = [outcome for outcome in scenario.outcomes if len(outcome.controller.training_seeds) > 1]
+    if pooled:
+        parts.append(_training_seeds(pooled))
     return parts
+
+
+def _training_seeds(pooled: Sequence[Outcome]) -> str:
+    """How far the training seeds of each agent lie apart: mean RMSE of the best, the middle and the worst one."""
+    rmse, rows = metric_names().index("rmse_mm"), []
+    for outcome in pooled:
+        seeds = outcome.controller.training_seeds
+        found = outcome.sample.values[..., rmse].mean(axis=1)
+        worst = int(found.argmax())
+        figures = (f"{value:.3f}" for value in (found.min(), np.median(found), found.max()))
+        rows.append((outcome.controller.name, str(len(seeds)), *figures, str(seeds[worst])))
+    headings = ("agent", "training seeds", "best [mm]", "median [mm]", "worst [mm]", "worst seed")
+    return _table(headings, rows)
 
 
 def _label(outcome: Outcome, scenario: ScenarioResult) -> str:
