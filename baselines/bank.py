@@ -72,7 +72,7 @@ class Believed(NamedTuple):
     @property
     def rows(self) -> Belief:
         """All filters as one belief, slot by slot, hypothesis by hypothesis."""
-        return Belief(*(part.reshape(-1, *part.shape[2:]) for part in self[:-1]))
+        return Belief(*(part.reshape(self.evidence.size, *part.shape[2:]) for part in self[:-1]))
 
     def moved_to(self, rows: Belief) -> Believed:
         """The same evidence, another belief."""
