@@ -156,7 +156,9 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the threads."""
-        self._batch.close()
+        # Gymnasium up to 1.1 closes what was refused when it was made, and so never had any.
+        if hasattr(self, "_batch"):
+            self._batch.close()
 
     @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]

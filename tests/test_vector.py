@@ -289,3 +289,8 @@ def test_made_by_gymnasium() -> None:
     shown, _ = env.reset(seed=3)
     np.testing.assert_array_equal(shown[1], gym.make("Cz-v0", scenario="hard", horizon=50.0).reset(seed=4)[0])
     env.close()
+
+
+def test_an_environment_that_was_refused_can_be_closed() -> None:
+    """Gymnasium up to 1.1 does so when it is forgotten."""
+    CzVectorEnv.__new__(CzVectorEnv).close_extras()
