@@ -10,7 +10,7 @@ from pathlib import Path
 
 from cz_gym.commands import OneLineParser
 
-ALGORITHMS = ("ppo", "ppo-lively", "ppo-quiet", "ppo-puller", "ppo-scratch", "sac")
+ALGORITHMS = ("ppo", "ppo-medium", "ppo-quiet", "ppo-puller", "ppo-scratch", "sac")
 
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:

@@ -36,7 +36,7 @@ class CostWeights:
 class Clone:
     """Behaviour cloning before reinforcement learning."""
 
-    teacher: str = "lqg"
+    teacher: str
     """Name of the classical controller that is imitated."""
     rounds: int = 3
     """Times it is asked: first about its own episodes, then about the imitation's."""
@@ -150,9 +150,12 @@ RECIPES: dict[str, PPO | SAC] = {
     choice.name: choice
     for choice in (
         PPO(),
-        PPO("ppo-lively", Recipe(weights=CostWeights(0.2, 0.2), clone=Clone("lqg-at-0.02"))),
+        PPO("ppo-medium", Recipe(weights=CostWeights(0.5, 0.5), clone=Clone("lqg"))),
         PPO("ppo-quiet", Recipe(weights=CostWeights(), clone=Clone("lqg-quiet"))),
-        PPO("ppo-puller", Recipe(scenario="puller", weights=CostWeights(0.5, 0.5, observable=True), clone=Clone())),
+        PPO(
+            "ppo-puller",
+            Recipe(scenario="puller", weights=CostWeights(0.5, 0.5, observable=True), clone=Clone("lqg")),
+        ),
         SCRATCH,
         SAC(),
     )

@@ -25,7 +25,7 @@ from cz_gym.task import Cost, reward
 CONFIG = make_config("randomized", observation="history", horizon=600.0)
 TINY = replace(
     settings.PPO(),
-    recipe=settings.Recipe(num_envs=4, hidden=(16, 16), clone=settings.Clone()),
+    recipe=settings.Recipe(num_envs=4, hidden=(16, 16), clone=settings.Clone("lqg")),
     steps=256,
     n_steps=32,
     batch_size=64,
@@ -73,7 +73,7 @@ def test_the_layers_learn_what_bends_the_teacher() -> None:
     shown = clone.demonstrate(bent, CONFIG, range(8), (0.01, 0.001))
     clone.begin_linear(policy, shown)
     before = np.abs(clone.acts(policy)(shown.observation) - shown.action)[:, 0].mean()
-    clone.fit(policy, shown, settings.Clone(epochs=60, learning_rate=5e-3))
+    clone.fit(policy, shown, settings.Clone("lqg", epochs=60, learning_rate=5e-3))
     assert np.abs(clone.acts(policy)(shown.observation) - shown.action)[:, 0].mean() < 0.5 * before
 
 
@@ -86,9 +86,9 @@ def test_lost_crystals_teach_nothing() -> None:
 
 
 def test_the_imitation_of_lqg_holds_the_radius() -> None:
-    policy = policy_of(choice=replace(TINY, recipe=settings.Recipe(num_envs=4, clone=settings.Clone())))
+    policy = policy_of(choice=replace(TINY, recipe=settings.Recipe(num_envs=4, clone=settings.Clone("lqg"))))
     config = make_config("randomized", observation="history")
-    few = settings.Clone(rounds=1, episodes=48, epochs=4)
+    few = settings.Clone("lqg", rounds=1, episodes=48, epochs=4)
     clone.imitate(policy, lqg(make_config("randomized")), config, few, 900_000)
     env = CzVectorEnv(16, scenario="randomized", observation="history")
     observation, info = env.reset(seed=list(range(950_000, 950_016)))

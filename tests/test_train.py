@@ -24,8 +24,12 @@ from cz_gym import CzVectorEnv
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run, "QUICK", 2)
     monkeypatch.setattr(run, "FULL", 2)
-    recipe = replace(settings.RECIPES["ppo"].recipe, num_envs=64, clone=settings.Clone(rounds=2, episodes=2, epochs=1))
-    monkeypatch.setitem(settings.RECIPES, "ppo", replace(settings.PPO(), recipe=recipe, n_steps=32, critic_steps=4096))
+    recipe = replace(
+        settings.RECIPES["ppo"].recipe, num_envs=64, clone=settings.Clone("lqg", rounds=2, episodes=2, epochs=1)
+    )
+    monkeypatch.setitem(
+        settings.RECIPES, "ppo", replace(settings.PPO(), recipe=recipe, n_steps=32, batch_size=1024, critic_steps=4096)
+    )
 
 
 def rows(path: Path) -> list[dict[str, str]]:
