@@ -82,7 +82,7 @@ class PPO:
 
     name: str = "ppo"
     """What agents of these settings are called."""
-    recipe: Recipe = field(default_factory=lambda: Recipe(weights=CostWeights(pull=0.5, pull_step=0.5), clone=Clone()))
+    recipe: Recipe = field(default_factory=lambda: Recipe(weights=CostWeights(0.2, 0.2), clone=Clone("lqg-at-0.02")))
     steps: int = 600_000
     """Environment steps."""
     critic_steps: int = 200_000
