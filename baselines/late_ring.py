@@ -39,8 +39,8 @@ class RingModel:
     """Range of the crystal's rotation [rev/s]; with both equal it is known."""
     memory: float = 10.0 * MINUTE
     """Time over which the spectrum is averaged [s]."""
-    lowest: float = 0.004
-    """Lowest frequency that is searched [Hz]; below, ripple and radius cannot be told apart."""
+    lowest: float = 0.001
+    """Lowest frequency that is searched [Hz]; below, ripple and radius cannot be told apart in time."""
     clear: float = 8.0
     """Power of a peak over the spectrum's mean at which it is a ripple [-]."""
 

@@ -48,17 +48,28 @@ QUIET = LQGSettings(
 """``lqg-quiet``: the radius as well as pull steps of 0.0095 mm/min allow."""
 PULLER_RING = RingModel(latency=5.0, ripple_sd=0.08 * MM)
 """The camera of ``puller``: its latency and rotation, and what amplitudes between 0 and 0.2 mm come to on average."""
-PULLER_REWARD = replace(
-    REWARD,
-    noise=replace(REWARD.noise, heater_walk=1.0),
-    weights=replace(REWARD.weights, heater_step=1.712),
+PULLER_REWARD = replace(REWARD, noise=replace(REWARD.noise, heater_walk=1.0), ring=PULLER_RING)
+"""``lqg`` on ``puller``: the observable radius as well as pull steps of 0.016 mm/min allow."""
+PULLER_QUIET = LQGSettings(
+    noise=NoiseModel(
+        fast_sd=0.205,
+        slow_sd=0.1956,
+        drift_rate_sd=0.001543,
+        drift_rate_tau=4256.0,
+        heater_walk=0.7207,
+        thermal_walk=0.001945,
+        recipe_share=0.4671,
+        pyrometer_sd=0.06032,
+    ),
+    weights=Weights(pull=0.0539, pull_step=0.3026, heater_step=18.05),
     ring=PULLER_RING,
 )
-"""``lqg`` on ``puller``: the observable radius as well as pull steps of 0.016 mm/min allow."""
+"""``lqg-quiet`` on ``puller``: the same with pull steps of 0.01 mm/min."""
 SHIPPED: dict[tuple[str, str], LQGSettings] = {
     ("lqg", "randomized"): REWARD,
     ("lqg-quiet", "randomized"): QUIET,
     ("lqg", "puller"): PULLER_REWARD,
+    ("lqg-quiet", "puller"): PULLER_QUIET,
 }
 """By controller and scenario."""
 

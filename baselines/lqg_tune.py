@@ -30,6 +30,7 @@ from .policy import Floats
 ROBUSTNESS_SEEDS = TRAINING_SEEDS[100_000:]
 """Training seeds of the episodes that only have to be survived."""
 FINALISTS = 3
+"""Candidates of a search that meet the validation seeds."""
 CALMER = (1.0, 3.0, 10.0)
 """Factors on the weight of heater steps that every finalist is tried with: the search hardly sees that weight."""
 _FIRST_STEP = 0.5
@@ -109,13 +110,15 @@ def _try(goal: Goal, settings: LQGSettings, history: History, episodes: int, sur
     return found
 
 
-def choose(goal: Goal, history: History, episodes: int, survive: int) -> dict[str, Any]:
+def choose(goal: Goal, history: History, episodes: int, survive: int, count: int = FINALISTS) -> dict[str, Any]:
     """The best on validation seeds of the finalists and their calmer versions, losses on training seeds first.
 
-    Losses are counted on ``survive`` training episodes of each harder scenario.
+    Losses are counted on ``survive`` training episodes of each harder scenario. What is known of the camera is not
+    searched: it is the goal's, whatever it was when a kept history was searched.
     """
     finals = []
-    for settings in (calmer(found, factor) for found in finalists(history) for factor in CALMER):
+    for candidate in (calmer(found, factor) for found in finalists(history, count) for factor in CALMER):
+        settings = replace(candidate, ring=goal.start.ring)
         lost = {name: measure(settings, name, ROBUSTNESS_SEEDS[:survive]).failure_rate for name in goal.survive}
         found = measure(settings, goal.scenario, VALIDATION_SEEDS[:episodes])
         score = goal.score(found) + FAILURE_PENALTY * sum(lost.values())
@@ -125,9 +128,9 @@ def choose(goal: Goal, history: History, episodes: int, survive: int) -> dict[st
     return min(finals, key=lambda final: final["score"])
 
 
-def finalists(history: History) -> list[LQGSettings]:
+def finalists(history: History, count: int = FINALISTS) -> list[LQGSettings]:
     """The best settings met."""
-    return [settings_from(entry["settings"]) for entry in history.best(FINALISTS)]
+    return [settings_from(entry["settings"]) for entry in history.best(count)]
 
 
 def calmer(settings: LQGSettings, factor: float) -> LQGSettings:
@@ -175,11 +178,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--survive", type=int, default=20, help="more that must be survived, failures only")
     parser.add_argument("--validation", type=int, default=250, help="validation episodes a finalist")
     parser.add_argument("--finals", type=int, default=200, help="training episodes a finalist must survive")
+    parser.add_argument("--finalists", type=int, default=FINALISTS, help="candidates that meet the validation seeds")
     parser.add_argument("--history", type=Path, help="choose again from this kept history, without a search")
     parser.add_argument("--output", type=Path, default=None, help="default in results/tuning")
     given = parser.parse_args(arguments)
     try:
-        sizes = {name: getattr(given, name) for name in ("budget", "episodes", "validation", "finals")}
+        sizes = {name: getattr(given, name) for name in ("budget", "episodes", "validation", "finals", "finalists")}
         check_budget(given.survive, **sizes)
     except ValueError as error:
         parser.error(str(error))
@@ -195,7 +199,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else:
             budget, history = read_history(given.history)
         budget |= {"validation": given.validation, "finals": given.finals}
-        chosen = choose(goal, history, given.validation, given.finals)
+        chosen = choose(goal, history, given.validation, given.finals, given.finalists)
         found = {
             "controller": given.controller,
             "scenario": given.scenario,

@@ -106,7 +106,7 @@ def heard(tone_hz, amplitude, noise, samples, dt=5.0, slots=40, ring=PULLER_RING
 
 
 @pytest.mark.parametrize("dt", [2.0, 5.0, 10.0])
-@pytest.mark.parametrize("rotation", [8.3, 9.7, 11.2, 13.6, 14.9])
+@pytest.mark.parametrize("rotation", [8.3, 11.2, 12.2, 14.9])
 def test_a_tone_is_found_where_its_alias_is(rotation, dt):
     tone = rotation / MINUTE
     alias = abs(tone - round(tone * dt) / dt)

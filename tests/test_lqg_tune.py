@@ -157,6 +157,14 @@ def test_another_scenario_is_tuned_on_its_own_training_seeds(monkeypatch):
     assert met["puller"] <= set(TRAINING_SEEDS) | set(VALIDATION_SEEDS)
 
 
+def test_a_kept_history_is_chosen_from_with_the_camera_that_is_known_now(monkeypatch):
+    monkeypatch.setattr(lqg_tune, "measure", made_up)
+    goal = lqg_goal.GOALS["lqg", "puller"]
+    other = replace(goal.start, ring=replace(lqg_settings.PULLER_RING, lowest=0.004))
+    chosen = lqg_tune.choose(goal, History([{"score": 0.0, "settings": asdict(other)}]), 1, 1, count=1)
+    assert lqg_goal.settings_from(chosen["settings"]).ring == lqg_settings.PULLER_RING
+
+
 def test_settings_with_a_ring_are_read_back_as_written():
     settings = lqg_goal.GOALS["lqg", "puller"].start
     assert settings.ring == lqg_settings.PULLER_RING
