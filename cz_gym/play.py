@@ -42,7 +42,7 @@ def settings(arguments: argparse.Namespace) -> tuple[Config, tuple[int, int]]:
     """The environment's settings and the window's size; ValueError names what was given and what is allowed."""
     from .config import make_config
     from .rendering.hand import FASTEST, SLOWEST
-    from .rendering.scene import check_size
+    from .rendering.scene import parse_size
 
     if not SLOWEST <= arguments.speed <= FASTEST:
         raise ValueError(f"--speed must be {SLOWEST:g} to {FASTEST:g}, not {arguments.speed:g}")
@@ -51,11 +51,7 @@ def settings(arguments: argparse.Namespace) -> tuple[Config, tuple[int, int]]:
     if arguments.seed < 0:
         raise ValueError(f"--seed must not be negative, not {arguments.seed}")
     config = make_config(arguments.scenario, horizon=arguments.minutes * MINUTE)
-    try:
-        width, height = (int(side) for side in arguments.size.split("x"))
-    except ValueError:
-        raise ValueError(f"--size must be WxH in pixels, such as 960x720, not {arguments.size!r}") from None
-    return config, check_size((width, height))
+    return config, parse_size(arguments.size)
 
 
 def main(argv: list[str] | None = None) -> int:

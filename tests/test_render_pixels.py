@@ -84,7 +84,7 @@ def test_strip_chart_ends_at_the_true_error(picture: tuple[CzEnv, Frame, Record]
     _, frame, record = picture
     strip = layout(*SIZE).strips
     box = Box(strip.x, strip.y, strip.w, 0.64 * strip.h)
-    plot = box.inner(34.0, 18.0, 10.0, 14.0)
+    plot = box.inner(38.0, 18.0, 10.0, 14.0)
     now = record.now
     error = record.column("r_c") - record.column("r_ref")
     reach = ladder(1.15 * float(np.abs(error).max()), edge_panel.RANGES)
@@ -182,8 +182,8 @@ def test_the_crucible_rises_by_what_the_crystal_took(picture: tuple[CzEnv, Frame
 def test_long_traces_keep_their_extremes() -> None:
     values = np.sin(np.arange(40_000) * 1.7)
     values[12_345] = 7.0
-    t, thin = strips.thinned(np.arange(40_000.0), values, 500)
-    assert len(t) == len(thin) <= 1100
+    t, thin = strips.thinned(np.arange(40_000.0), values, 80)
+    assert len(t) == len(thin) == 1000
     assert thin.max() == 7.0
     assert thin.min() == values.min()
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -72,11 +72,22 @@ class Canvas:
         self._fine: Surface = self.pygame.Surface((FINE * width, FINE * height), 0, 32)
         self._picture: Surface = self.pygame.Surface((width, height), 0, 32)
         self._labels: list[Label] = []
+        self._ground: Surface = self._fine.copy()
+        self._ground_labels: list[Label] = []
+        self._ground_is: Hashable = None
 
-    def clear(self) -> None:
-        """Begin a new picture."""
+    def begin(self, ground: Hashable, paint: Callable[[], None]) -> None:
+        """Begin a new picture on a ground that ``paint`` draws; it is painted anew only when ``ground`` is another."""
+        if ground == self._ground_is:
+            self._fine.blit(self._ground, (0, 0))
+            self._labels = self._ground_labels.copy()
+            return
+        self._ground_is = None
         self._fine.fill(BACK)
-        self._labels.clear()
+        self._labels = []
+        paint()
+        self._ground.blit(self._fine, (0, 0))
+        self._ground_labels, self._ground_is = self._labels.copy(), ground
 
     def finish(self) -> Surface:
         """The picture; the next one is drawn into the same surface."""
@@ -121,6 +132,11 @@ class Canvas:
         if len(points) > 1:
             self.pygame.draw.lines(self._fine, colour, False, _fine(points), max(1, round(width * self.unit * FINE)))
 
+    def line(self, colour: Colour, start: tuple[float, float], end: tuple[float, float], width: float = 1.5) -> None:
+        """A straight line of that width [nominal px]."""
+        ends = [(x * FINE, y * FINE) for x, y in (start, end)]
+        self.pygame.draw.line(self._fine, colour, *ends, max(1, round(width * self.unit * FINE)))
+
     def dashes(self, colour: Colour, points: Points, width: float = 1.2, dash: float = 5.0, gap: float = 4.0) -> None:
         """Dashed lines from point to point; dash and gap in nominal px along the line."""
         if len(points) < 2:
@@ -128,7 +144,7 @@ class Canvas:
         along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
         starts = np.arange(0.0, along[-1], (dash + gap) * self.unit)
         ends = np.minimum(starts + dash * self.unit, along[-1])
-        at = np.stack([np.interp(np.concatenate([starts, ends]), along, axis) for axis in points.T], 1)
+        at = paired(*(np.interp(np.concatenate([starts, ends]), along, axis) for axis in points.T))
         thick, fine = max(1, round(width * self.unit * FINE)), _fine(at)
         for start, end in zip(fine[: len(starts)], fine[len(starts) :], strict=True):
             self.pygame.draw.line(self._fine, colour, start, end, thick)
@@ -177,6 +193,13 @@ class Canvas:
         image = _glyphs(label.text, max(7, round(label.size * self.unit)), label.colour, label.bold)
         left = {"left": 0.0, "centre": 0.5, "right": 1.0}[label.anchor] * image.get_width()
         return image, round(label.x - left), round(label.y)
+
+
+def paired(x: npt.ArrayLike, y: npt.ArrayLike) -> Points:
+    """Points of coordinates that broadcast to one axis, shape (n, 2)."""
+    points = np.empty((np.broadcast(x, y).size, 2))
+    points[:, 0], points[:, 1] = x, y
+    return points
 
 
 def _rounded(box: Box) -> tuple[int, int, int, int]:

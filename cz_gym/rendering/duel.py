@@ -64,32 +64,51 @@ class Duel:
     def draw(self, sides: Sequence[Side]) -> Surface:
         """Each side's crystal and triple point, and below them both errors on one chart."""
         canvas, unit = self.canvas, self.canvas.unit
-        canvas.clear()
         gap, chart = 6.0 * unit, 0.27 * canvas.height
         width = (canvas.width - (len(sides) + 1) * gap) / len(sides)
         height = canvas.height - chart - 3.0 * gap
         magnified = min(puller_panel.gain(side.record) for side in sides)
         reach = max(edge_panel.reach_of(side.error()) for side in sides)
-        for i, side in enumerate(sides):
-            self._side(Box(gap + i * (width + gap), gap, width, height), side, magnified, reach)
+        boxes = [Box(gap + i * (width + gap), gap, width, height) for i in range(len(sides))]
         bottom = Box(gap, canvas.height - chart - gap, canvas.width - 2.0 * gap, chart)
-        strips.error(canvas, bottom, [(side.record, side.colour) for side in sides])
-        x = bottom.x + 34.0 * unit
+        charted = strips.reach_of([side.record for side in sides])
+        canvas.begin(
+            (charted, *((side.name, side.record.puller, side.record.config.horizon) for side in sides)),
+            lambda: self._ground(sides, boxes, bottom, charted),
+        )
+        for side, box in zip(sides, boxes, strict=True):
+            self._side(box, side, magnified, reach)
+        strips.error(canvas, bottom, [(side.record, side.colour) for side in sides], charted)
+        return canvas.finish()
+
+    def _ground(self, sides: Sequence[Side], boxes: Sequence[Box], bottom: Box, charted: float) -> None:
+        """All that is the same in every picture, until the chart needs a longer axis."""
+        canvas, unit = self.canvas, self.canvas.unit
+        strips.error_ground(canvas, bottom, sides[0].record.config.horizon, charted)
+        x = bottom.x + 38.0 * unit
         canvas.text(x, bottom.y + 4 * unit, "true radius error [mm]", 9.5, palette.FAINT)
         for i, side in enumerate(sides):
             canvas.text(x + (125 + 140 * i) * unit, bottom.y + 4 * unit, side.name, 9.5, side.colour, bold=True)
-        return canvas.finish()
+        for side, box in zip(sides, boxes, strict=True):
+            canvas.panel(box)
+            canvas.text(box.x + 10 * unit, box.y + 7 * unit, side.name, 13, side.colour, bold=True)
+            crystal, edge = _split(canvas, box)
+            puller_panel.ground(canvas, crystal, side.record.puller.r_0)
+            edge_panel.ground(canvas, edge, side.record)
 
     def _side(self, box: Box, side: Side, magnified: float, reach: float) -> None:
         canvas, unit, record = self.canvas, self.canvas.unit, side.record
-        canvas.panel(box)
-        canvas.text(box.x + 10 * unit, box.y + 7 * unit, side.name, 13, side.colour, bold=True)
         rmse = f"RMSE {min(side.rmse(), RADIUS_LIMIT) / MM:.2f} mm"
         canvas.text(box.right - 10 * unit, box.y + 7 * unit, rmse, 13, palette.INK, "right", True)
-        below = box.inner(0.0, 26.0 * unit, 0.0, 0.0)
-        crystal = Box(below.x, below.y, 0.44 * below.w, below.h)
+        crystal, edge = _split(canvas, box)
         puller_panel.draw(canvas, crystal, record, magnified)
-        edge = Box(crystal.right, below.y, below.right - crystal.right, below.h)
         edge_panel.draw(canvas, edge, record, reach)
         if record.ending is not None and record.ending.name != "HORIZON":
             banner(canvas, edge, record.ending)
+
+
+def _split(canvas: Canvas, box: Box) -> tuple[Box, Box]:
+    """Where a side shows its crystal and its triple point."""
+    below = box.inner(0.0, 26.0 * canvas.unit, 0.0, 0.0)
+    crystal = Box(below.x, below.y, 0.44 * below.w, below.h)
+    return crystal, Box(crystal.right, below.y, below.right - crystal.right, below.h)

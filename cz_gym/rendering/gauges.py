@@ -71,36 +71,55 @@ def gauges(record: Record, asked: Asked | None = None) -> tuple[Gauge, ...]:
     )  # fmt: skip
 
 
+def ground(canvas: Canvas, box: Box, record: Record) -> None:
+    """What lies under every picture: panels, tracks and names."""
+    unit, shown = canvas.unit, gauges(record)
+    top, *boxes = _boxes(canvas, box, len(shown))
+    canvas.panel(top, "true radius error")
+    canvas.text(top.x + 8 * unit, top.y + 40 * unit, "reference", 9.5, palette.FAINT)
+    canvas.text(top.x + 8 * unit, top.y + 52 * unit, "by the camera", 9.5, palette.FAINT)
+    for gauge, place in zip(shown, boxes, strict=True):
+        canvas.panel(place, gauge.name)
+        canvas.rectangle(palette.TRACK, _track(canvas, place), 3.0)
+
+
 def draw(canvas: Canvas, box: Box, record: Record, asked: Asked | None = None) -> None:
     """The column: the radius on top, then a panel a gauge."""
-    unit = canvas.unit
     shown = gauges(record, asked)
-    height = (box.h - len(shown) * GAP * unit) / (len(shown) + 1.45)
-    radius(canvas, Box(box.x, box.y, box.w, 1.45 * height), record)
-    for i, gauge in enumerate(shown):
-        y = box.y + 1.45 * height + GAP * unit + i * (height + GAP * unit)
-        _gauge(canvas, Box(box.x, y, box.w, height), gauge)
+    top, *boxes = _boxes(canvas, box, len(shown))
+    radius(canvas, top, record)
+    for gauge, place in zip(shown, boxes, strict=True):
+        _gauge(canvas, place, gauge)
+
+
+def _boxes(canvas: Canvas, box: Box, count: int) -> list[Box]:
+    """The radius' panel and those of so many gauges."""
+    gap = GAP * canvas.unit
+    height = (box.h - count * gap) / (count + 1.45)
+    first = box.y + 1.45 * height + gap
+    below = [Box(box.x, first + i * (height + gap), box.w, height) for i in range(count)]
+    return [Box(box.x, box.y, box.w, 1.45 * height), *below]
+
+
+def _track(canvas: Canvas, box: Box) -> Box:
+    unit = canvas.unit
+    return Box(box.x + 8 * unit, box.y + 20.5 * unit, box.w - 16 * unit, 6.0 * unit)
 
 
 def radius(canvas: Canvas, box: Box, record: Record) -> None:
     """The true radius error in large figures, with reference and camera under it."""
     now, unit = record.now, canvas.unit
-    canvas.panel(box, "true radius error")
     middle = box.x + box.w / 2.0
     canvas.text(middle, box.y + 16 * unit, f"{(now.r_c - now.r_ref) / MM:+.2f} mm", 19, palette.TRUE, "centre", True)
-    canvas.text(box.x + 8 * unit, box.y + 40 * unit, "reference", 9.5, palette.FAINT)
     canvas.text(box.right - 8 * unit, box.y + 40 * unit, f"{now.r_ref / MM:.2f}", 9.5, palette.REFERENCE, "right")
     camera = f"{now.camera / MM:.2f}" if now.valid > 0.0 else "no reading"
-    canvas.text(box.x + 8 * unit, box.y + 52 * unit, "by the camera", 9.5, palette.FAINT)
     canvas.text(box.right - 8 * unit, box.y + 52 * unit, camera, 9.5, palette.CAMERA, "right")
 
 
 def _gauge(canvas: Canvas, box: Box, gauge: Gauge) -> None:
     unit = canvas.unit
-    canvas.panel(box, gauge.name)
     canvas.text(box.right - 8 * unit, box.y + 4 * unit, gauge.shown, 10.5, palette.INK, "right", True)
-    track = Box(box.x + 8 * unit, box.y + 20.5 * unit, box.w - 16 * unit, 6.0 * unit)
-    canvas.rectangle(palette.TRACK, track, 3.0)
+    track = _track(canvas, box)
 
     def at(value: float) -> float:
         share = (value - gauge.low) / (gauge.high - gauge.low)
@@ -109,7 +128,7 @@ def _gauge(canvas: Canvas, box: Box, gauge: Gauge) -> None:
     left, right = sorted((at(gauge.origin), at(gauge.value)))
     canvas.rectangle(gauge.colour, Box(left, track.y, max(right - left, unit), track.h), 2.0)
     middle = track.x + track.w / 2.0
-    canvas.lines(palette.FAINT, np.array([[middle, track.y - 2 * unit], [middle, track.bottom + 2 * unit]]), 1.0)
+    canvas.line(palette.FAINT, (middle, track.y - 2 * unit), (middle, track.bottom + 2 * unit), 1.0)
     if gauge.mark is not None:
         x, top = at(gauge.mark), track.y - 1.0 * unit
         pointer = [[x, top + 4 * unit], [x - 4 * unit, top - 3 * unit], [x + 4 * unit, top - 3 * unit]]

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from ..meniscus import MeniscusModel, profile, profile_scale
 from ..plant import Puller
 from ..task import HEIGHT_MAX_IN_A, HEIGHT_MIN
-from .canvas import Box
+from .canvas import Box, paired
 
 Floats = npt.NDArray[np.float64]
 POINTS = 48
@@ -59,7 +59,7 @@ class Scale(NamedTuple):
 
     def points(self, r: npt.ArrayLike, z: npt.ArrayLike) -> Floats:
         """Pixels of radii and heights [m], shape (n, 2)."""
-        return np.stack(np.broadcast_arrays(self.x(r), self.y(z)), axis=-1)
+        return paired(self.x(r), self.y(z))
 
     def x(self, r: npt.ArrayLike) -> Floats:
         """Pixels across of radii [m]."""

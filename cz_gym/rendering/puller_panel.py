@@ -8,7 +8,7 @@ import numpy.typing as npt
 from ..task import HEATER_RANGE
 from ..units import MM
 from . import palette
-from .canvas import TIMES, Box, Canvas
+from .canvas import TIMES, Box, Canvas, paired
 from .geometry import Scale, ladder
 from .record import Record
 
@@ -40,6 +40,14 @@ def scale_of(box: Box, r_0: float) -> Scale:
     return Scale(box.x + box.w / 2.0, 0.0, box.y + MELT_LEVEL * box.h, scale, scale)
 
 
+def ground(canvas: Canvas, box: Box, r_0: float) -> None:
+    """What lies under every picture of a puller: how long 50 mm are."""
+    unit, bar = canvas.unit, 50.0 * MM * scale_of(box, r_0).up
+    x, y = box.right - 10.0 * unit, box.y + 24.0 * unit
+    canvas.lines(palette.FAINT, np.array([[x - 3 * unit, y], [x, y], [x, y + bar], [x - 3 * unit, y + bar]]), 1.0)
+    canvas.text(x - 5 * unit, y + bar / 2 - 6 * unit, "50 mm", 9.0, palette.FAINT, "right")
+
+
 def draw(canvas: Canvas, box: Box, record: Record, magnified: float | None = None) -> None:
     """Heaters, crucible, melt and crystal; ``magnified`` sets the gain instead of :func:`gain`."""
     scale = scale_of(box, record.puller.r_0)
@@ -47,7 +55,7 @@ def draw(canvas: Canvas, box: Box, record: Record, magnified: float | None = Non
     with canvas.clip(box):
         _crucible(canvas, box, scale, record)
         _crystal(canvas, box, scale, record, magnified)
-    _words(canvas, box, scale, magnified)
+    canvas.text(box.x + 8 * canvas.unit, box.y + 18 * canvas.unit, f"error {TIMES}{magnified:g}", 9.5, palette.TRUE)
 
 
 def crucible_rise(record: Record) -> float:
@@ -81,7 +89,7 @@ def _break(canvas: Canvas, x: float, top: float, bottom: float) -> None:
     """The draughtsman's mark for a part left out: the crucible is wider than the panel."""
     y = np.linspace(top, bottom, 24)
     swing = 1.8 * canvas.unit * np.where(np.arange(24) % 2, 1.0, -1.0)
-    canvas.lines(palette.PANEL, np.stack([x + swing, y], 1), 3.0)
+    canvas.lines(palette.PANEL, paired(x + swing, y), 3.0)
 
 
 def _crystal(canvas: Canvas, box: Box, scale: Scale, record: Record, magnified: float) -> None:
@@ -90,9 +98,9 @@ def _crystal(canvas: Canvas, box: Box, scale: Scale, record: Record, magnified: 
     half = (r_ref + magnified * (r_c - r_ref)) * scale.across
     y = scale.y(z)
     shoulder_x, shoulder_y = _shoulder(half[-1], y[-1], r_0 * scale.across)
-    _, neck_y = shoulder_x[-1], shoulder_y[-1]
+    neck_y = float(shoulder_y[-1])
     neck, seed = 2.2 * unit, 4.0 * unit
-    canvas.lines(palette.FAINT, np.array([[x, box.y], [x, neck_y]]), 1.0)
+    canvas.line(palette.FAINT, (x, box.y), (x, neck_y), 1.0)
     canvas.rectangle(palette.FAINT, Box(x - seed, neck_y - 34.0 * unit, 2.0 * seed, 12.0 * unit), 2.0)
     canvas.rectangle(palette.SEED, Box(x - neck, neck_y - 24.0 * unit, 2.0 * neck, 26.0 * unit))
     canvas.polygon(palette.SEED, _mirrored(x, shoulder_x, shoulder_y))
@@ -110,8 +118,8 @@ def _crystal(canvas: Canvas, box: Box, scale: Scale, record: Record, magnified: 
         )
     reference = r_ref * scale.across
     for side in (-1.0, 1.0):
-        canvas.lines(palette.TRUE, np.stack([x + side * half, y], 1), 1.6)
-        canvas.dashes(palette.REFERENCE, np.stack([x + side * reference, y], 1), 0.8)
+        canvas.lines(palette.TRUE, paired(x + side * half, y), 1.6)
+        canvas.dashes(palette.REFERENCE, paired(x + side * reference, y), 0.8)
 
 
 def _shoulder(half: float, y: float, nominal: float) -> tuple[Floats, Floats]:
@@ -123,7 +131,7 @@ def _shoulder(half: float, y: float, nominal: float) -> tuple[Floats, Floats]:
 
 def _mirrored(x: float | Floats, half: Floats, y: Floats) -> Floats:
     """A body of revolution's outline, from half its width at each height."""
-    right, left = np.stack([x + half, y], 1), np.stack([x - half, y], 1)
+    right, left = paired(x + half, y), paired(x - half, y)
     return np.concatenate([right, left[::-1]])
 
 
@@ -133,12 +141,3 @@ def _thinned(values: Floats) -> Floats:
         return values
     kept: Floats = values[np.unique(np.linspace(0, len(values) - 1, MOST_POINTS).astype(int))]
     return kept
-
-
-def _words(canvas: Canvas, box: Box, scale: Scale, magnified: float) -> None:
-    unit = canvas.unit
-    canvas.text(box.x + 8 * unit, box.y + 18 * unit, f"error {TIMES}{magnified:g}", 9.5, palette.TRUE)
-    bar = 50.0 * MM * scale.up
-    x, y = box.right - 10.0 * unit, box.y + 24.0 * unit
-    canvas.lines(palette.FAINT, np.array([[x - 3 * unit, y], [x, y], [x, y + bar], [x - 3 * unit, y + bar]]), 1.0)
-    canvas.text(x - 5 * unit, y + bar / 2 - 6 * unit, "50 mm", 9.0, palette.FAINT, "right")

@@ -42,6 +42,15 @@ def check_size(size: Any) -> tuple[int, int]:
     return int(width), int(height)
 
 
+def parse_size(text: str) -> tuple[int, int]:
+    """The size that a command's ``--size`` names; ValueError names what was given and what is allowed."""
+    try:
+        width, height = (int(side) for side in text.split("x"))
+    except ValueError:
+        raise ValueError(f"--size must be WxH in pixels, such as 960x720, not {text!r}") from None
+    return check_size((width, height))
+
+
 def _is_side(side: Any) -> bool:
     return isinstance(side, Integral) and not isinstance(side, bool) and SMALLEST <= int(side) <= LARGEST
 
@@ -77,32 +86,42 @@ class Scene:
 
         ``asked`` shows set-points of the drives, ``overlay`` draws on top.
         """
-        canvas, boxes = self.canvas, self.layout
-        canvas.clear()
+        canvas, boxes, reach = self.canvas, self.layout, strips.reach_of([record])
+        same = (record.scenario, record.puller, record.config.horizon, reach)
+        canvas.begin(same, lambda: self._ground(record, reach))
         self._header(record)
-        canvas.panel(boxes.puller, "crystal")
         puller_panel.draw(canvas, boxes.puller, record)
         edge_panel.draw(canvas, boxes.edge, record)
         gauges.draw(canvas, boxes.gauges, record, asked)
-        strips.draw(canvas, boxes.strips, record)
+        strips.draw(canvas, boxes.strips, record, reach)
         if record.ending is not None:
             banner(canvas, boxes.edge, record.ending)
         if overlay is not None:
             overlay(canvas)
         return canvas.finish()
 
+    def _ground(self, record: Record, reach: float) -> None:
+        """All that is the same in every picture of a record, until the error chart needs a longer axis."""
+        canvas, boxes, unit = self.canvas, self.layout, self.canvas.unit
+        canvas.text(boxes.header.x + 4 * unit, 7 * unit, "Cz-v0", 14, palette.INK, bold=True)
+        canvas.text(boxes.header.x + 58 * unit, 10 * unit, record.scenario, 11, palette.FAINT)
+        canvas.text(boxes.edge.x, 10 * unit, "time", 11, palette.FAINT)
+        canvas.text(boxes.edge.x + 112 * unit, 10 * unit, "grown", 11, palette.FAINT)
+        canvas.panel(boxes.puller, "crystal")
+        puller_panel.ground(canvas, boxes.puller, record.puller.r_0)
+        edge_panel.ground(canvas, boxes.edge, record)
+        gauges.ground(canvas, boxes.gauges, record)
+        strips.ground(canvas, boxes.strips, record, reach)
+
     def _header(self, record: Record) -> None:
         canvas, box, now = self.canvas, self.layout.header, record.now
         unit = canvas.unit
-        canvas.text(box.x + 4 * unit, 7 * unit, "Cz-v0", 14, palette.INK, bold=True)
-        canvas.text(box.x + 58 * unit, 10 * unit, record.scenario, 11, palette.FAINT)
         minutes, seconds = divmod(round(now.t), 60)
         time = f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
-        canvas.text(self.layout.edge.x, 10 * unit, "time", 11, palette.FAINT)
         canvas.text(self.layout.edge.x + 30 * unit, 7.5 * unit, time, 13, palette.INK, bold=True)
-        x = self.layout.edge.x + 112 * unit
-        canvas.text(x, 10 * unit, "grown", 11, palette.FAINT)
-        canvas.text(x + 40 * unit, 7.5 * unit, f"{now.length / MM:.1f} mm", 13, palette.INK, bold=True)
+        canvas.text(
+            self.layout.edge.x + 152 * unit, 7.5 * unit, f"{now.length / MM:.1f} mm", 13, palette.INK, bold=True
+        )
         status, colour = ("growing", palette.RECIPE) if record.ending is None else ("ended", palette.ALARM)
         if record.ending is None and now.valid <= 0.0:
             status, colour = "camera: no reading", palette.CAMERA

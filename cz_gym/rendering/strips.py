@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from ..config import Config
 from ..units import HOUR, MINUTE, MM, MM_PER_MIN
 from . import palette
-from .canvas import Box, Canvas
+from .canvas import Box, Canvas, paired
 from .edge_panel import RANGES, TOLERANCE
 from .geometry import ladder
 from .palette import Colour
@@ -24,6 +26,8 @@ TICKS = (1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0)
 SEEN = palette.mix(palette.PANEL, palette.CAMERA, 0.55)
 SMOOTH = 5.0 * MINUTE
 """Length of the running mean drawn over the pull speed [s]."""
+PIXELS = 1.4
+"""Width that is drawn by one lowest and one highest value [nominal px]."""
 
 
 class Trace(NamedTuple):
@@ -35,58 +39,83 @@ class Trace(NamedTuple):
     width: float
 
 
-def draw(canvas: Canvas, box: Box, record: Record) -> None:
-    """Radius error, true and by the camera, above the pull speed, both over the horizon."""
+def boxes(canvas: Canvas, box: Box) -> tuple[Box, Box]:
+    """The panels of the radius error and of the pull speed."""
     unit = canvas.unit
     upper = Box(box.x, box.y, box.w, 0.64 * box.h)
-    lower = Box(box.x, upper.bottom + 6.0 * unit, box.w, box.h - upper.h - 6.0 * unit)
-    error(canvas, upper, [(record, palette.TRUE)], camera=record)
-    canvas.text(upper.x + 34 * unit, upper.y + 4 * unit, "radius error [mm]", 9.5, palette.FAINT)
-    canvas.text(upper.x + 132 * unit, upper.y + 4 * unit, "true", 9.5, palette.TRUE)
-    canvas.text(upper.x + 163 * unit, upper.y + 4 * unit, "by the camera", 9.5, palette.CAMERA)
+    return upper, Box(box.x, upper.bottom + 6.0 * unit, box.w, box.h - upper.h - 6.0 * unit)
+
+
+def reach_of(records: Sequence[Record]) -> float:
+    """Half height of a chart that holds the radius errors of all records [m]."""
+    largest = max(float(np.abs(record.column("r_c") - record.column("r_ref")).max()) for record in records)
+    return ladder(1.15 * largest, RANGES)
+
+
+def ground(canvas: Canvas, box: Box, record: Record, reach: float) -> None:
+    """What lies under every picture whose error chart reaches so far [m]: panels, axes and names."""
+    unit, (upper, lower) = canvas.unit, boxes(canvas, box)
+    error_ground(canvas, upper, record.config.horizon, reach)
+    for x, name, colour in ((38, "radius error [mm]", palette.FAINT), (136, "true", palette.TRUE),
+                            (167, "by the camera", palette.CAMERA)):  # fmt: skip
+        canvas.text(upper.x + x * unit, upper.y + 4 * unit, name, 9.5, colour)
+    canvas.panel(lower)
+    plot, top = _pull_plot(canvas, lower), 2.0 * record.puller.v_0
+    for value in (0.0, record.puller.v_0, top):
+        _level(canvas, plot, value, 0.0, top, f"{value / MM_PER_MIN:.1f}")
+    canvas.text(lower.x + 38 * unit, lower.y + 2 * unit, "pull speed [mm/min], 5 min mean", 9.5, palette.DRIVE)
+
+
+def draw(canvas: Canvas, box: Box, record: Record, reach: float) -> None:
+    """Radius error, true and by the camera, above the pull speed, both over the horizon."""
+    upper, lower = boxes(canvas, box)
+    error(canvas, upper, [(record, palette.TRUE)], reach, camera=record)
     pull(canvas, lower, record)
-    canvas.text(lower.x + 34 * unit, lower.y + 3 * unit, "pull speed [mm/min], 5 min mean", 9.5, palette.DRIVE)
 
 
 def plot_of(canvas: Canvas, box: Box) -> Box:
-    """The part of a chart's panel that lines are drawn in."""
+    """The part of the error chart's panel that lines are drawn in."""
     unit = canvas.unit
-    return box.inner(34.0 * unit, 18.0 * unit, 10.0 * unit, 14.0 * unit)
+    return box.inner(38.0 * unit, 18.0 * unit, 10.0 * unit, 14.0 * unit)
 
 
-def error(canvas: Canvas, box: Box, records: Sequence[tuple[Record, Colour]], camera: Record | None = None) -> None:
-    """True radius errors against time, one line a record, with the tolerance band; ``camera`` adds what it saw."""
+def _pull_plot(canvas: Canvas, box: Box) -> Box:
+    unit = canvas.unit
+    return box.inner(38.0 * unit, 18.0 * unit, 10.0 * unit, 5.0 * unit)
+
+
+def error_ground(canvas: Canvas, box: Box, horizon: float, reach: float) -> None:
+    """Panel, tolerance band and axes of the error chart."""
     canvas.panel(box)
     plot = plot_of(canvas, box)
-    largest = max(float(np.abs(record.column("r_c") - record.column("r_ref")).max()) for record, _ in records)
-    reach = ladder(1.15 * largest, RANGES)
     band = min(TOLERANCE / reach, 1.0) * plot.h / 2.0
     canvas.rectangle(palette.BAND, Box(plot.x, plot.y + plot.h / 2.0 - band, plot.w, 2.0 * band))
-    _time_axis(canvas, plot, records[0][0].config.horizon)
+    _time_axis(canvas, plot, horizon)
     for value in (-reach, 0.0, reach):
         _level(canvas, plot, value, -reach, reach, f"{value / MM:+g}" if value else "0")
+
+
+def error(
+    canvas: Canvas, box: Box, records: Sequence[tuple[Record, Colour]], reach: float, camera: Record | None = None
+) -> None:
+    """True radius errors against time, one line a record; ``camera`` adds what it saw."""
     traces = []
     if camera is not None:
         seen = np.where(camera.column("valid") > 0.0, camera.column("camera"), np.nan)
         traces.append(Trace(camera.column("t"), seen - camera.column("r_ref"), SEEN, 0.8))
     for record, colour in records:
         traces.append(Trace(record.column("t"), record.column("r_c") - record.column("r_ref"), colour, 1.7))
-    _lines(canvas, plot, records[0][0].config.horizon, traces, -reach, reach)
+    _lines(canvas, plot_of(canvas, box), records[0][0].config, traces, -reach, reach)
 
 
 def pull(canvas: Canvas, box: Box, record: Record) -> None:
     """The pull speed against time, between 0 and twice nominal."""
-    canvas.panel(box)
-    plot = box.inner(34.0 * canvas.unit, 16.0 * canvas.unit, 10.0 * canvas.unit, 5.0 * canvas.unit)
-    top = 2.0 * record.puller.v_0
-    for value in (0.0, record.puller.v_0, top):
-        _level(canvas, plot, value, 0.0, top, f"{value / MM_PER_MIN:.1f}")
     t, v_p = record.column("t"), record.column("v_p")
     traces = [
         Trace(t, v_p, palette.mix(palette.PANEL, palette.DRIVE, 0.4), 0.6),
         Trace(t, running_mean(v_p, record.config.control_interval), palette.DRIVE, 1.6),
     ]
-    _lines(canvas, plot, record.config.horizon, traces, 0.0, top)
+    _lines(canvas, _pull_plot(canvas, box), record.config, traces, 0.0, 2.0 * record.puller.v_0)
 
 
 def running_mean(values: Floats, interval: float) -> Floats:
@@ -99,13 +128,14 @@ def running_mean(values: Floats, interval: float) -> Floats:
     return mean
 
 
-def _lines(canvas: Canvas, plot: Box, horizon: float, traces: list[Trace], low: float, high: float) -> None:
+def _lines(canvas: Canvas, plot: Box, config: Config, traces: list[Trace], low: float, high: float) -> None:
+    horizon, size = config.horizon, math.ceil(config.steps * PIXELS * canvas.unit / plot.w)
     with canvas.clip(plot):
         for trace in traces:
-            t, values = thinned(trace.t, trace.values, round(plot.w))
+            t, values = thinned(trace.t, trace.values, size)
             x = plot.x + t / horizon * plot.w
             y = plot.bottom - (values - low) / (high - low) * plot.h
-            for piece in _pieces(np.stack([x, y], 1)):
+            for piece in _pieces(paired(x, y)):
                 canvas.lines(trace.colour, piece, trace.width)
     newest = traces[-1]
     x, value = plot.x + newest.t[-1] / horizon * plot.w, float(np.clip(newest.values[-1], low, high))
@@ -120,20 +150,20 @@ def _pieces(points: Floats) -> list[Floats]:
     return [piece[~np.isnan(piece[:, 1])] for piece in np.split(points, np.flatnonzero(gaps))]
 
 
-def thinned(t: Floats, values: Floats, columns: int) -> tuple[Floats, Floats]:
-    """The values, or, if there are more than a few a pixel column, the lowest and highest of each stretch."""
-    size = len(values) // columns
-    if size < 2:
+def thinned(t: Floats, values: Floats, size: int) -> tuple[Floats, Floats]:
+    """Lowest and highest value of each stretch of ``size``, at its middle; all values if that saves nothing."""
+    if size < 3 or not len(values):
         return t, values
     starts = np.arange(0, len(values), size)
     low, high = np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)
-    return np.repeat(t[starts], 2), np.stack([low, high], 1).ravel()
+    middle = np.minimum(starts + size // 2, len(values) - 1)
+    return np.repeat(t[middle], 2), paired(low, high).ravel()
 
 
 def _level(canvas: Canvas, plot: Box, value: float, low: float, high: float, text: str) -> None:
     unit = canvas.unit
     y = plot.bottom - (value - low) / (high - low) * plot.h
-    canvas.lines(palette.RIM, np.array([[plot.x, y], [plot.right, y]]), 0.6)
+    canvas.line(palette.RIM, (plot.x, y), (plot.right, y), 0.6)
     canvas.text(plot.x - 4 * unit, y - 6 * unit, text, 9.0, palette.FAINT, "right")
 
 
@@ -142,7 +172,7 @@ def _time_axis(canvas: Canvas, plot: Box, horizon: float) -> None:
     step = ladder(horizon / MINUTE / 9.0, TICKS) * MINUTE
     for number in range(int(horizon / step + 1e-9) + 1):
         x = plot.x + number * step / horizon * plot.w
-        canvas.lines(palette.RIM, np.array([[x, plot.y], [x, plot.bottom]]), 0.6)
+        canvas.line(palette.RIM, (x, plot.y), (x, plot.bottom), 0.6)
         if x < plot.right - 46 * unit:
             canvas.text(x, plot.bottom + 2 * unit, clock(number * step), 9.0, palette.FAINT, "centre")
     canvas.text(plot.right, plot.bottom + 2 * unit, f"{horizon / HOUR:.3g} h", 9.0, palette.FAINT, "right")
