@@ -1,6 +1,7 @@
-"""The README's animated picture: ``python -m cz_gym.film [--seed N] [--scenario NAME] [--out FILE]``.
+"""The README's animated picture: ``python -m cz_gym.film [--seed N] [--scenario NAME] [--agent FILE] [--out FILE]``.
 
-The paper's controller and the shipped agent pull the same crystal side by side. GIF, because it plays everywhere.
+The paper's controller and an agent, the shipped one unless told, pull the same crystal side by side. GIF, because it
+plays everywhere.
 """
 
 from __future__ import annotations
@@ -35,10 +36,11 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     """Read the command line; exits with code 2 and one line for anything that cannot be meant."""
     parser = OneLineParser(
         prog="python -m cz_gym.film",
-        description="Film the paper's controller and the shipped agent on the same crystal.",
+        description="Film the paper's controller and an agent on the same crystal.",
     )
     parser.add_argument("--scenario", default="randomized", metavar="NAME", help="scenario (%(default)s)")
     parser.add_argument("--seed", type=int, default=SEED, metavar="N", help="which crystal (%(default)s)")
+    parser.add_argument("--agent", type=Path, metavar="FILE", help="agent file in place of the shipped one")
     parser.add_argument("--frames", type=int, default=120, metavar="N", help="frames of the film (%(default)s)")
     parser.add_argument("--out", type=Path, default=OUT, metavar="FILE", help="file to write (results/media/duel.gif)")
     return parser.parse_args(argv)
@@ -59,7 +61,7 @@ def main(argv: list[str] | None = None) -> int:
         from .evaluation.files import check_writable, write_files
 
         check_writable(arguments.out.resolve().parent)
-        content = film(arguments.scenario, arguments.seed, arguments.frames)
+        content = film(arguments.scenario, arguments.seed, arguments.frames, arguments.agent)
         write_files({arguments.out.resolve(): content})
     except KeyboardInterrupt:
         return interrupted(PROG)
@@ -74,12 +76,12 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def film(scenario: str, seed: int, frames: int) -> bytes:
+def film(scenario: str, seed: int, frames: int, agent: Path | None = None) -> bytes:
     """The GIF: both sides stepped together, ``frames`` pictures equally far apart in time."""
     from .rendering.duel import Duel
     from .rendering.view import image
 
-    sides = contestants(scenario)
+    sides = contestants(scenario, agent)
     for side in sides:
         side.begin(seed)
     duel = Duel(*SIZE)
@@ -93,8 +95,8 @@ def film(scenario: str, seed: int, frames: int) -> bytes:
     return gif(pictures)
 
 
-def contestants(scenario: str) -> tuple[Side, Side]:
-    """The paper's controller and the shipped agent, each with an environment of its own."""
+def contestants(scenario: str, agent: Path | None = None) -> tuple[Side, Side]:
+    """The paper's controller and the agent of a file, or the shipped one, each with an environment of its own."""
     from .env import CzEnv
     from .rendering.duel import Side
     from .rendering.palette import TEMPERATURE, TRUE
@@ -103,9 +105,12 @@ def contestants(scenario: str) -> tuple[Side, Side]:
     env = CzEnv(scenario, observation="measured", render_mode="rgb_array")
     paper = room("baselines.registry").find_controller("paper").make(env.config)
     agents = room("agents")
-    learned = agents.OnnxPolicy.load(agents.shipped("ppo"), env.config)
+    learned = agents.OnnxPolicy.load(agent or agents.shipped(), env.config)
+    if learned.contract.control_interval != env.config.control_interval:
+        raise ValueError(f"{agent}: acts every {learned.contract.control_interval:g} s, not every 5 s")
     other = CzEnv(scenario, observation=learned.observation, render_mode="rgb_array")
-    return Side("the paper's controller", paper, env, TEMPERATURE), Side("learned: ppo", learned, other, TRUE)
+    name = f"learned: {learned.contract.algorithm}"
+    return Side("the paper's controller", paper, env, TEMPERATURE), Side(name, learned, other, TRUE)
 
 
 def gif(pictures: Sequence[Any]) -> bytes:
@@ -113,7 +118,7 @@ def gif(pictures: Sequence[Any]) -> bytes:
     from PIL import Image
 
     images = [Image.fromarray(picture) for picture in pictures]
-    palette = _with_meanings(pictures[-1], Image).quantize(COLOURS, method=Image.Quantize.MEDIANCUT, dither=0)
+    palette = _palette(images[-1], Image)
     indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in images]
     durations = [round(1000 / RATE)] * (len(images) - 1) + [round(1000 * HOLD)]
     content = io.BytesIO()
@@ -123,14 +128,17 @@ def gif(pictures: Sequence[Any]) -> bytes:
     return content.getvalue()
 
 
-def _with_meanings(picture: Any, Image: Any) -> Any:
-    """A picture with stripes of the colours that mean something and are small in it, for the palette to keep."""
-    from .rendering.palette import CAMERA, GLOW, MELT_TOP, mix
+def _palette(picture: Any, Image: Any) -> Any:
+    """COLOURS colours: those that mean something, however few their pixels, and the rest as the picture needs them."""
+    from .rendering import palette as c
 
-    picture = picture.copy()
-    for i, colour in enumerate((CAMERA, GLOW, mix(CAMERA, GLOW, 0.5), mix(MELT_TOP, GLOW, 0.5))):
-        picture[8 * i : 8 * (i + 1)] = colour
-    return Image.fromarray(picture)
+    marker = c.mix(c.CAMERA, c.MELT_TOP, 0.5)
+    kept = (c.BACK, c.PANEL, c.INK, c.TRUE, c.CAMERA, marker, c.REFERENCE, c.TEMPERATURE, c.ALARM, c.GLOW)
+    needed = picture.quantize(COLOURS - len(kept), method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    channels = [*needed.getpalette()[: 3 * (COLOURS - len(kept))], *(channel for colour in kept for channel in colour)]
+    found = Image.new("P", (1, 1))
+    found.putpalette(channels + channels[-3:] * (256 - len(channels) // 3))
+    return found
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from cz_gym.camera_rays import make_scene
 from cz_gym.camera_ring import RingDetector, wall_edge
 from cz_gym.config import make_config
 from cz_gym.meniscus import hurle_ring_offset
+from cz_gym.young_laplace import YOUNG_LAPLACE
 
 PULLER = make_puller()
 VIEW = make_view(Camera())
@@ -215,3 +216,15 @@ def test_another_puller_is_in_the_picture() -> None:
     assert abs(RingDetector(view, puller).read(picture(0.061, puller.h_0, puller, view)).radius - 0.061) < 1e-4
     image, _ = CzEnv("nominal", observation="camera", parameters=parameters).reset(seed=0)
     np.testing.assert_array_equal(image, picture(puller.r_0, puller.h_0, puller, view))
+
+
+def test_the_exact_meniscus_is_in_the_picture() -> None:
+    puller = make_puller(meniscus=YOUNG_LAPLACE)
+    detector = RingDetector(VIEW, puller)
+    env = CzEnv("nominal", observation="camera", meniscus=YOUNG_LAPLACE)
+    image, _ = env.reset(seed=0)
+    np.testing.assert_array_equal(image, picture(puller.r_0, puller.h_0, puller, VIEW))
+    for _ in range(12):
+        image, _, _, _, info = env.step(np.array([-0.5, 0.0], np.float32))
+        assert abs(detector.read(image).radius - (info["r_br"] - puller.ring_bias)) < 0.2 * detector.pixel
+    assert abs(info["h_c"] - puller.h_0) > 3e-4

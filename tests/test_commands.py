@@ -10,8 +10,9 @@ import pytest
 
 import benchmark
 from baselines import design_table, industrial_check, lqg_tune, paper, tune
-from cz_gym import speed, young_laplace_build
+from cz_gym import film, play, speed, young_laplace_build
 from cz_gym.commands import OneLineParser, interrupted
+from cz_gym.rendering import speed as rendering_speed
 
 COMMANDS = [
     (benchmark, "--episode"),
@@ -22,6 +23,9 @@ COMMANDS = [
     (industrial_check, "--episode"),
     (speed, "--qui"),
     (young_laplace_build, "--wri"),
+    (play, "--minute"),
+    (film, "--frame"),
+    (rendering_speed, "--round"),
 ]
 """Each with the beginning of one of its options."""
 WORK = [
@@ -32,6 +36,9 @@ WORK = [
     (industrial_check, "rollout", []),
     (speed, "run", ["--quick"]),
     (young_laplace_build, "build", ["--write"]),
+    (play, "settings", []),
+    (film, "film", ["--out", "new/film.gif"]),
+    (rendering_speed, "measure", []),
 ]
 """Each with the function that does its work, and arguments that would write a file."""
 

@@ -11,14 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+import agents
 from baselines.registry import find_controller
 from cz_gym import CzEnv, film, play
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.evaluation.score import Played
-from cz_gym.rendering import backend, hand
+from cz_gym.rendering import backend, hand, palette
 from cz_gym.rendering.view import Window
+from cz_gym.rooms import room
 from cz_gym.units import KILO, MM_PER_MIN
 
 pygame = pytest.importorskip("pygame")
@@ -249,12 +251,35 @@ def test_a_short_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     Image = pytest.importorskip("PIL.Image")
     pytest.importorskip("onnxruntime")
     out = tmp_path / "new" / "film.gif"
-    assert film.main(["--frames", "3", "--out", str(out)]) == 0
+    agent = min(agents.MODELS.glob("*.onnx"))
+    assert film.main(["--frames", "3", "--agent", str(agent), "--out", str(out)]) == 0
     with Image.open(out) as picture:
         assert picture.n_frames == 3
         assert picture.size == film.SIZE
         assert picture.info["loop"] == 0
+        picture.seek(2)
+        last = np.asarray(picture.convert("RGB"), np.float64)
+    # The ring's marker is some fifty pixels in four hundred thousand, and keeps its colour all the same.
+    assert (np.linalg.norm(last - palette.CAMERA, axis=-1) < 40.0).sum() > 30
     assert "3 frames" in capsys.readouterr().out
+
+
+def test_the_film_shows_the_shipped_agent_unless_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("onnxruntime")
+    agent = min(agents.MODELS.glob("*.onnx"))
+    monkeypatch.setattr(room("agents"), "shipped", lambda: agent)
+    _, learned = film.contestants("randomized")
+    assert learned.policy.contract.sha256 == agents.OnnxPolicy.load(agent).contract.sha256
+    assert learned.name == f"learned: {learned.policy.contract.algorithm}"
+
+
+def test_a_film_of_no_agent_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("PIL.Image")
+    assert film.main(["--agent", str(tmp_path / "none.onnx"), "--out", str(tmp_path / "film.gif")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "none.onnx" in said
+    assert not list(tmp_path.iterdir())
 
 
 def test_playing_loads_no_learning_package() -> None:

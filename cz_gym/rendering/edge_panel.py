@@ -124,7 +124,7 @@ def _axis(canvas: Canvas, box: Box, scale: Scale) -> None:
     for number in range(math.ceil(reach[0] / step), math.floor(reach[1] / step) + 1):
         x = float(scale.x(number * step))
         canvas.line(palette.FAINT, (x, y), (x, y + 3 * unit), 1.0)
-        if box.x + 8 * unit < x < box.right - 46 * unit:
+        if box.x + 8 * unit < x < box.right - 52 * unit:
             canvas.text(x, y + 4 * unit, f"{number * step / MM:g}", 9.0, palette.FAINT, "centre")
     canvas.text(box.right - 4 * unit, y + 4 * unit, "r [mm]", 9.0, palette.FAINT, "right")
 

@@ -83,19 +83,19 @@ def measure(size: tuple[int, int]) -> dict[str, Speed]:
 
     env.render()
     name = f"render() and step() at {size[0]} x {size[1]}"
-    found = {f"{name}, first 15 min": timed(film)}
+    found = {f"{name}, first 15 min": timed(film, FRAMES)}
     for _ in range(env.config.steps - 2 * FRAMES):
         step()
-    found[f"{name}, last 15 min"] = timed(film)
+    found[f"{name}, last 15 min"] = timed(film, FRAMES)
     camera = CzEnv("nominal", observation="camera")
     camera.reset(seed=SEED)
     rest = 0.0 * camera.action_space.sample()
     camera.step(rest)
-    found['step() with observation="camera"'] = timed(lambda: camera.step(rest))
+    found['step() with observation="camera"'] = timed(lambda: camera.step(rest), FRAMES)
     return found
 
 
-def timed(frame: Callable[[], Any], frames: int = FRAMES) -> Speed:
+def timed(frame: Callable[[], Any], frames: int) -> Speed:
     """Frames a second of something done so many times."""
     clock, core = time.perf_counter(), time.process_time()
     for _ in range(frames):
