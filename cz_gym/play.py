@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import sys
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,9 @@ if TYPE_CHECKING:
 PROG = "cz_gym.play"
 SPEED = 60.0
 """Seconds of growth a second of watching, unless told."""
-NO_DISPLAY = "no display: a crystal is pulled by hand in a window"
+NO_DISPLAY = "no display: a crystal is pulled by hand in a window; set DISPLAY or WAYLAND_DISPLAY"
+DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
+"""Environment variables one of which names a display, on systems that have such."""
 
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
@@ -60,6 +63,8 @@ def main(argv: list[str] | None = None) -> int:
     try:
         config, size = settings(arguments)
         paper = room("baselines.registry").find_controller("paper").make(config)
+        if sys.platform.startswith(("linux", "freebsd")) and not any(map(os.environ.get, DISPLAYS)):
+            raise ValueError(NO_DISPLAY)
         from .evaluation.score import Outcome
         from .rendering.hand import Game
         from .rendering.view import Window
@@ -74,7 +79,7 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     try:
         if not window.visible:
-            print(f"{PROG}: {NO_DISPLAY}; set DISPLAY or WAYLAND_DISPLAY", file=sys.stderr)
+            print(f"{PROG}: {NO_DISPLAY}", file=sys.stderr)
             return 2
         outcomes: list[Outcome] = Game(window, size, config, arguments.seed, arguments.speed, paper).play()
     except KeyboardInterrupt:

@@ -194,8 +194,18 @@ def test_without_a_display_it_says_so(capsys: pytest.CaptureFixture[str], monkey
     assert play.main([]) == 2
     said = capsys.readouterr()
     assert said.out == ""
-    assert said.err == f"cz_gym.play: {play.NO_DISPLAY}; set DISPLAY or WAYLAND_DISPLAY\n"
+    assert said.err == f"cz_gym.play: {play.NO_DISPLAY}\n"
     assert not pygame.display.get_init()
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="displays have names on Linux")
+def test_where_no_display_is_named_none_is_tried(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for name in play.DISPLAYS:
+        monkeypatch.delenv(name, raising=False)
+    assert play.main([]) == 2
+    assert capfd.readouterr() == ("", f"cz_gym.play: {play.NO_DISPLAY}\n")
 
 
 def test_the_command_prints_the_score(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
