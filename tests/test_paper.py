@@ -11,9 +11,8 @@ from scipy.signal import lfilter
 
 from baselines import CompensatedPID, paper, paper_numbers
 from baselines.compensated_pid import SeriesPID
-from baselines.paper_beyond import noise_result
+from baselines.paper_beyond import SEEDS, noise_result
 from baselines.paper_experiments import (
-    SEEDS,
     case_difference,
     errors,
     inverse_response,
