@@ -65,11 +65,29 @@ PULLER_QUIET = LQGSettings(
     ring=PULLER_RING,
 )
 """``lqg-quiet`` on ``puller``: the same with pull steps of 0.01 mm/min."""
+FAULTY_REWARD = replace(REWARD, weights=replace(REWARD.weights, heater_step=1.712))
+"""``lqg`` on ``sensor-fault``: the reward there."""
+FAULTY_QUIET = LQGSettings(
+    noise=NoiseModel(
+        fast_sd=0.2612,
+        slow_sd=0.3085,
+        drift_rate_sd=0.0006116,
+        drift_rate_tau=2265.0,
+        heater_walk=0.322,
+        thermal_walk=0.002208,
+        recipe_share=0.2515,
+        pyrometer_sd=0.06288,
+    ),
+    weights=Weights(pull=0.08919, pull_step=0.3056, heater_step=1.162),
+)
+"""``lqg-quiet`` on ``sensor-fault``."""
 SHIPPED: dict[tuple[str, str], LQGSettings] = {
     ("lqg", "randomized"): REWARD,
     ("lqg-quiet", "randomized"): QUIET,
     ("lqg", "puller"): PULLER_REWARD,
     ("lqg-quiet", "puller"): PULLER_QUIET,
+    ("lqg", "sensor-fault"): FAULTY_REWARD,
+    ("lqg-quiet", "sensor-fault"): FAULTY_QUIET,
 }
 """By controller and scenario."""
 
