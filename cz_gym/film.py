@@ -79,7 +79,7 @@ def main(argv: list[str] | None = None) -> int:
 def film(scenario: str, seed: int, frames: int, agent: Path | None = None) -> bytes:
     """The GIF: both sides stepped together, ``frames`` pictures equally far apart in time."""
     from .rendering.duel import Duel
-    from .rendering.view import image
+    from .rendering.pixels import colours
 
     sides = contestants(scenario, agent)
     for side in sides:
@@ -91,7 +91,7 @@ def film(scenario: str, seed: int, frames: int, agent: Path | None = None) -> by
         upto = round((number + 1) * steps / frames)
         for side in sides:
             side.step_to(upto)
-        pictures.append(image(duel.draw(sides)))
+        pictures.append(colours(duel.draw(sides)))
     return gif(pictures)
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from cz_gym import HURLE, CzEnv, Parameters, make_puller
 from cz_gym.meniscus import hurle_slope
-from cz_gym.rendering import edge_panel, geometry, palette, puller_panel, strips
+from cz_gym.rendering import edge_panel, geometry, palette, pixels, puller_panel, strips
 from cz_gym.rendering.canvas import Box
 from cz_gym.rendering.geometry import ladder, meniscus_curve, ring_height
 from cz_gym.rendering.record import Ending, Record, Sample, how_it_failed
@@ -186,6 +186,18 @@ def test_long_traces_keep_their_extremes() -> None:
     assert len(t) == len(thin) == 1000
     assert thin.max() == 7.0
     assert thin.min() == values.min()
+
+
+def test_a_picture_is_the_mean_of_twice_its_resolution(rng: np.random.Generator) -> None:
+    pygame = pytest.importorskip("pygame")
+    fine, half = pygame.Surface((86, 34), 0, 32), pygame.Surface((43, 17), 0, 32)
+    colours = rng.integers(0, 256, (86, 34, 3), np.uint8)
+    colours[:4, :4] = (255, 0, 255)
+    pygame.surfarray.blit_array(fine, colours)
+    pixels.halve(fine, half)
+    mean = np.floor(colours.reshape(43, 2, 17, 2, 3).mean(axis=(1, 3)) + 0.5)
+    np.testing.assert_array_equal(pygame.surfarray.array3d(half), mean)
+    np.testing.assert_array_equal(pixels.colours(half), mean.swapaxes(0, 1))
 
 
 def test_running_mean_is_of_what_there_is() -> None:

@@ -13,13 +13,14 @@ import numpy.typing as npt
 
 from .backend import load
 from .palette import BACK, FAINT, INK, PANEL, RIM, Colour, mix
+from .pixels import halve
 
 if TYPE_CHECKING:
     from pygame import Surface
 
 Points = npt.NDArray[np.float64]
 FINE = 2
-"""Drawn pixels along each side of a pixel of the picture."""
+"""Drawn pixels along each side of a pixel of the picture, which is their mean."""
 FONTS = Path(__file__).parent / "fonts"
 TIMES = "\N{MULTIPLICATION SIGN}"
 BASE = (640, 480)
@@ -91,7 +92,7 @@ class Canvas:
 
     def finish(self) -> Surface:
         """The picture; the next one is drawn into the same surface."""
-        self.pygame.transform.smoothscale(self._fine, (self.width, self.height), self._picture)
+        halve(self._fine, self._picture)
         for label in self._labels:
             text, left, top = self._placed(label)
             self._picture.blit(text, (left, top))

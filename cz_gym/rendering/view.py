@@ -10,6 +10,7 @@ from gymnasium.error import DependencyNotInstalled, Error, ResetNeeded
 
 from ..config import Config
 from .backend import MISSING, available, load
+from .pixels import colours
 from .record import Record
 from .scene import Scene, check_size
 
@@ -52,12 +53,6 @@ def record_of(env: Any) -> Record:
     return record
 
 
-def image(surface: Surface) -> Frame:
-    """A surface as an array of its own, shape (height, width, 3)."""
-    width, height = surface.get_size()
-    return np.frombuffer(load().image.tobytes(surface, "RGB"), np.uint8).reshape(height, width, 3).copy()
-
-
 class View:
     """Records an episode as it is stepped, and draws it when asked."""
 
@@ -94,7 +89,7 @@ class View:
             self._scene = Scene(*self.size)
         picture = self._scene.draw(self.record)
         if self.mode == "rgb_array":
-            return image(picture)
+            return colours(picture)
         if self._window is None:
             self._window = Window(self.size, CAPTION)
         self._window.show(picture)
