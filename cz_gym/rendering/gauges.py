@@ -50,7 +50,7 @@ def gauges(record: Record, asked: Asked | None = None) -> tuple[Gauge, ...]:
     now, p = record.now, record.puller
     v_0, window = p.v_0 / MM_PER_MIN, HEATER_RANGE / KILO
     v_p, Q_H, Q_H_0 = now.v_p / MM_PER_MIN, now.Q_H / KILO, p.Q_H_0 / KILO
-    recipe = now.T_1 - now.T_1_ref
+    recipe = round(now.T_1 - now.T_1_ref, 1) + 0.0
     return (
         Gauge(
             "pull", f"{v_p:.2f} mm/min", v_p, 0.0, 2.0 * v_0, 0.0, palette.DRIVE,
