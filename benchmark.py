@@ -28,7 +28,7 @@ KEPT = FOLDER.parent / "cache"
 """Where episodes of slow controllers are kept."""
 DEFAULT = "ppo-default"
 """The training seed of ``ppo`` that did best on validation."""
-SHIPPED = ("ppo", DEFAULT, "ppo-medium", "ppo-quiet", "ppo-scratch", "ppo-puller")
+SHIPPED = ("ppo", DEFAULT, "ppo-quiet", "ppo-scratch", "ppo-puller")
 """Agents that come with the package; all but the default pool their training seeds."""
 EPISODES = 500
 
