@@ -15,7 +15,7 @@ from .draws import draw_episode, draw_factors, randomised, seed_streams
 from .fluctuation import first_fluctuation, fluctuation, next_fluctuation, sample_noise
 from .law import GRID
 from .meniscus import HURLE, MeniscusModel
-from .plant import Disturbance, Inputs, State, derive_puller, hidden_load, rk4
+from .plant import Disturbance, Inputs, State, derive_puller, growth, hidden_load, rk4
 from .readings import clip, measure, recall, remember, write_info, write_measured, write_state
 from .schedule import drift, melt_left, reference
 from .sensing import photograph, sense
@@ -68,10 +68,15 @@ def _height_inside(h_c: Any, p: Any) -> Any:
 
 @physics
 def _substep(x: Any, u: Any, d: Any, p: Any, dt: Any, r_ref: Any, slope: Any) -> Any:
-    """One RK4 substep and whether the crystal still grows; a jump no crystal makes keeps the state before."""
+    """One RK4 substep and whether the crystal still grows; a jump no crystal makes keeps the state before.
+
+    Over a melt far too cold a low meniscus freezes within seconds, and a step across that singularity can end anywhere,
+    inside the limits too. There the height falls faster and faster, so half the step at the first rate tells.
+    """
     new = rk4(x, u, d, p, dt, slope)
-    grows = within_limits(new.r_c, new.h_c, r_ref, p.a)
-    if not grows and not (np.abs(new.r_c - x.r_c) < _JUMP and np.abs(new.h_c - x.h_c) < _JUMP):
+    inside = within_limits(new.r_c, new.h_c, r_ref, p.a)
+    grows = inside & (x.h_c + 0.5 * dt * (u.v_p - growth(x, d, p, slope).v_g) >= HEIGHT_MIN)
+    if not grows and (inside or not (np.abs(new.r_c - x.r_c) < _JUMP and np.abs(new.h_c - x.h_c) < _JUMP)):
         new = State(x.r_c, x.h_c, x.T_1, x.T_2, x.T_b)
     return new, grows
 

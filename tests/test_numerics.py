@@ -13,6 +13,7 @@ from cz_gym import CzEnv, CzVectorEnv, Parameters, make_puller
 from cz_gym.adversaries import KINDS, Adversaries
 from cz_gym.config import make_config
 from cz_gym.draws import randomised
+from cz_gym.kernels import _substep
 from cz_gym.law import Factors
 from cz_gym.meniscus import HURLE
 from cz_gym.plant import Disturbance, Inputs, State, rk4
@@ -173,22 +174,62 @@ def test_steps_from_states_that_adversaries_reach_are_exact_enough() -> None:
     assert worst[False] < 1e-4
 
 
+@pytest.mark.parametrize(("excess", "bound"), [(-5.0, 1e-4), (-8.0, 1e-4), (-13.0, 5e-4), (-20.0, np.inf)])
+@pytest.mark.parametrize("pull", [0.0, 2.0])
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
+def test_no_freezing_is_missed(excess: float, bound: float, pull: float) -> None:
+    """Over a melt too cold a meniscus freezes within seconds: the exact solution reaches 1.2 mm, and so does the step.
+
+    Adversaries reach 13 K below freezing on "hard". A step that a crystal just survives there, ending at 1.2 mm, is the
+    least exact of all. Across the singularity the trial steps of both methods meet roots of negative numbers.
+    """
+    p, fates, worst = make_puller(), set(), 0.0
+    d, u = Disturbance(0.0, 0.0, 1.0), Inputs(pull * p.v_0, p.Q_H_0)
+    truth = Truth(u.v_p, u.Q_H)
+    for height in np.arange(1.2, 2.6, 0.02):
+        x = State(p.r_0, height * MM, p.T_1_0 - 60.0, p.T_2_0 - 40.0, p.T_m + excess)
+        new, grows = _substep(x, u, d, p, 5.0, p.r_0, HURLE.slope)
+        solved = solve_ivp(
+            lambda _, y: design_rates(y, truth, p), (0.0, 5.0), np.array(x), method="DOP853", rtol=1e-12,
+            events=_frozen,
+        )  # fmt: skip
+        close = abs(solved.y[1, -1] - HEIGHT_MIN) < 5e-3 * MM and solved.t[-1] > 4.9
+        assert grows == (solved.status == 0) or close
+        assert grows or new.h_c < HEIGHT_MIN or new.h_c == x.h_c
+        fates.add(bool(grows))
+        if grows:
+            worst = max(worst, _error(x, u, d, p, 5.0))
+    assert fates == {False, True}
+    assert worst < bound
+
+
+def _frozen(_: float, y: Any) -> float:
+    return float(y[1] - HEIGHT_MIN)
+
+
+_frozen.terminal = True  # type: ignore[attr-defined]
+
+
 @pytest.mark.parametrize("lam", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("factor", [0.85, 1.0, 1.15])
 @pytest.mark.parametrize("height", [1.2, 2.0, 4.0, 1.0, 1.2399])
 def test_a_longest_substep_at_the_limits_with_extreme_drives(lam: float, factor: float, height: float) -> None:
-    """The corners of "hard": pullers at their spread, the radius lost, melt hot or cold, drives at their ends."""
+    """The corners of "hard": pullers at their spread, the radius lost, melt hot or cold, drives at their ends.
+
+    But a low meniscus over a hot melt, which adversaries do not reach: at 1.2 mm in pure conduction 2.5 K of superheat
+    already melt it back, and a melt needs minutes to gain more. In 1.6 million adversarial steps on "nominal", "hard"
+    and "puller" the largest error from below 1.5 mm over a melt hotter than nominal was 2e-8. So it is nominal there.
+    """
     f = Factors(lam, 1.0 + 0.3 * (factor - 1.0), factor, factor, factor, factor, factor)
     p = make_puller(randomised(Parameters(), f), lam)
     h_c = height * MM if height in (1.2, 2.0, 4.0) else height * p.a
     for side in (-1.0, 1.0):
-        x = State(p.r_0 + side * 8.0 * MM, h_c, p.T_1_0 + 60.0 * side, p.T_2_0 + 40.0 * side, p.T_b_0 + 5.0 * side)
-        # A melt 6.5 K too hot freezes no crystal: beyond what a step from 1.2 mm meets, and bounded all the same.
-        too_hot = height == 1.2 and lam == 1.0 and side > 0.0
-        bound = 1e-8 if height in (4.0, 1.0) else 5e-4 if too_hot else 1e-4
+        hot = 0.0 if height == 1.2 and side > 0.0 else side
+        x = State(p.r_0 + side * 8.0 * MM, h_c, p.T_1_0 + 60.0 * side, p.T_2_0 + 40.0 * side, p.T_b_0 + 5.0 * hot)
+        bound = 1e-8 if height in (4.0, 1.0) else 1e-4
         for pull in (0.0, 2.0):
             u = Inputs(pull * p.v_0, p.Q_H_0 - 10e3 * side)
-            assert _error(x, u, Disturbance(800.0 * side, 1.5 * side, 0.9), p, 5.0) < bound
+            assert _error(x, u, Disturbance(800.0 * side, 1.5 * hot, 0.9), p, 5.0) < bound
 
 
 def test_a_case_repeats_bit_for_bit() -> None:
