@@ -45,11 +45,20 @@ def test_the_native_batch_is_a_vector_of_scalars(scenario: str, observation: str
     assert checked.held > 2000
 
 
+def test_a_batch_of_images_is_a_vector_of_scalars() -> None:
+    settings: dict[str, Any] = {"scenario": "hard", "observation": "camera", "control_interval": 60.0, "horizon": 180.0}
+    checked = check_vector_env(
+        lambda n, mode: CzVectorEnv(n, autoreset_mode=mode, **settings), lambda: CzEnv(**settings), num_envs=2, steps=5
+    )
+    assert checked.episodes > 6
+    assert checked.held > 300
+
+
 def test_the_command_prints_the_counts(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cz_gym.scenarios.SCENARIOS", {"nominal": SCENARIOS["nominal"]})
     assert main(["--steps", "50"]) == 0
     last = capsys.readouterr().out.splitlines()[-1]
-    assert last.startswith("3 cases conform: ")
+    assert last.startswith("4 cases conform: ")
 
 
 @pytest.mark.parametrize("keep", ["thread", "torch", "dlpack", "generator", "flat bytes", "closure"])
