@@ -21,9 +21,12 @@ from .schedule import drift, melt_left, reference
 from .sensing import photograph, sense
 from .slots import EPISODE_AT, INFO, PULLER_AT, SLOT
 from .task import HEATER_RANGE, HEIGHT_MAX_IN_A, HEIGHT_MIN, Cost, cost_terms, failure_penalty, reward, within_limits
+from .units import MM
 
 _EPS = 1e-9
 _CLIPPED = INFO.index("action_clipped")
+_LOW = 5.0 * MM
+"""A meniscus from which no melt freezes the crystal within half a substep need not be asked [m]."""
 _JUMP = HEIGHT_MIN
 _LINE = 8
 """Numbers of eight bytes in a line of the cache."""
@@ -75,7 +78,9 @@ def _substep(x: Any, u: Any, d: Any, p: Any, dt: Any, r_ref: Any, slope: Any) ->
     """
     new = rk4(x, u, d, p, dt, slope)
     inside = within_limits(new.r_c, new.h_c, r_ref, p.a)
-    grows = inside & (x.h_c + 0.5 * dt * (u.v_p - growth(x, d, p, slope).v_g) >= HEIGHT_MIN)
+    grows = inside
+    if inside and x.h_c < _LOW:
+        grows = x.h_c + 0.5 * dt * (u.v_p - growth(x, d, p, slope).v_g) >= HEIGHT_MIN
     if not grows and (inside or not (np.abs(new.r_c - x.r_c) < _JUMP and np.abs(new.h_c - x.h_c) < _JUMP)):
         new = State(x.r_c, x.h_c, x.T_1, x.T_2, x.T_b)
     return new, grows

@@ -1,10 +1,13 @@
-"""What share of a PPO training is spent in environment and adapter: the first updates of train.py's own learner."""
+"""What share of a PPO training is spent in environment and adapter: the first updates of train.py's own recipe."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
+from .config import make_config
+from .rooms import room
 from .speed_cases import Skipped
 from .speed_peers import agents_module
 
@@ -13,7 +16,10 @@ _UPDATES = 3
 
 
 def environment_share() -> dict[str, float] | Skipped:
-    """Time in the environment's step, its adapter and the reward's wrapper, over the time that learning takes [-]."""
+    """Time in the adapter's step and in the twin that rewards are compared with, over the time that learning takes [-].
+
+    What the teacher computes on the twin is no environment's, nor is imitating it before.
+    """
     try:
         torch = agents_module("network").torch
         make_training, settings = agents_module("training").make_training, agents_module("settings")
@@ -21,7 +27,9 @@ def environment_share() -> dict[str, float] | Skipped:
         return Skipped(NAME, f"{error.name or error} is not installed")
     threads = torch.get_num_threads()
     try:
-        return {NAME: _measured(make_training(settings.SCRATCH, 0, None), settings.SCRATCH)}
+        choice = settings.PPO()
+        teacher = room("baselines.registry").find_controller(choice.recipe.clone.teacher).make(make_config())
+        return {NAME: _measured(make_training(choice, 0, None, 0, teacher), choice)}
     except Exception as error:  # what training needs must not end the run
         return Skipped(NAME, " ".join(f"{type(error).__name__}: {error}".split())[:100])
     finally:
@@ -31,17 +39,21 @@ def environment_share() -> dict[str, float] | Skipped:
 def _measured(training: Any, choice: Any) -> float:
     learner, update = training.learner, choice.n_steps * choice.recipe.num_envs
     learner.learn(update, callback=training.callbacks)
-    step, spent = learner.env.step, 0.0
+    paired, spent = learner.env, 0.0
 
-    def timed(actions: Any) -> Any:
-        nonlocal spent
-        began = time.perf_counter()
-        try:
-            return step(actions)
-        finally:
-            spent += time.perf_counter() - began
+    def timed(step: Callable[..., Any]) -> Callable[..., Any]:
+        def run(*arguments: Any) -> Any:
+            nonlocal spent
+            began = time.perf_counter()
+            try:
+                return step(*arguments)
+            finally:
+                spent += time.perf_counter() - began
 
-    learner.env.step = timed
+        return run
+
+    paired.slots.step_wait = timed(paired.slots.step_wait)
+    paired.twin.step = timed(paired.twin.step)
     began = time.perf_counter()
     learner.learn(_UPDATES * update, callback=training.callbacks, reset_num_timesteps=False)
     whole = time.perf_counter() - began
