@@ -84,7 +84,7 @@ def test_dtypes(observation: str) -> None:
         ({"control_interval": 7.0}, "whole number of control intervals"),
         ({"horizon": math.inf}, "horizon must be a positive number"),
         ({"horizon": 2.0}, "whole number of control intervals"),
-        ({"render_mode": "hologram"}, "unknown render_mode 'hologram'"),
+        ({"render_mode": "hologram"}, "render_mode .*'hologram'"),
         ({"parameters": {"sigma": 1.0}}, r"cz_gym\.Parameters"),
         ({"parameters": Parameters(k_l=math.nan)}, "parameter k_l = nan"),
         ({"meniscus": "hurle"}, r"cz_gym\.MeniscusModel"),
