@@ -6,6 +6,7 @@ import io
 import json
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +23,8 @@ from cz_gym.evaluation import kept
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.rollout import Signals
 
-SMALL = settings.PPO(
+SMALL = replace(
+    settings.SCRATCH,
     recipe=settings.Recipe(num_envs=2, hidden=(8,)), steps=8, n_steps=4, batch_size=8, n_epochs=1
 )  # fmt: skip
 ODD = (

@@ -78,7 +78,8 @@ def kill_training(folder: Path, kills: int, chance: random.Random) -> str:
     while done < kills:
         going_on = (out / "settings.json").exists()
         interval = chance.choice((0.0, 0.2))
-        options = ["--steps", str(STEPS), "--out", str(out), "--checkpoint-seconds", str(interval)]
+        options = ["--algo", "ppo-scratch", "--steps", str(STEPS), "--out", str(out)]
+        options += ["--checkpoint-seconds", str(interval)]
         began = time.time()
         code = Killed(train, options + ["--resume"] * going_on, log).after(chance.uniform(0.0, longest))
         ended = time.time()
@@ -152,11 +153,12 @@ def warm() -> None:
     """Import and compile here what each of the forked would."""
     import matplotlib.pyplot  # noqa: F401
 
-    learner = make_training(settings.PPO(), 0, None).learner
+    learner = make_training(settings.SCRATCH, 0, None).learner
     learner.env.reset()
     learner.env.step(np.zeros((learner.n_envs, 2), np.float32))
     for policy, observation in ((OnnxPolicy.load(shipped()), "history"), (CompensatedPID(5.0), "measured")):
-        run.validation_rmse(policy, make_config("randomized", observation=observation, horizon=300.0), 1)
+        config = make_config("randomized", observation=observation, horizon=300.0)
+        run.validate(policy, config, 1, settings.CostWeights())
 
 
 def main(argv: list[str] | None = None) -> int:
