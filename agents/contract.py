@@ -95,7 +95,7 @@ def read_agent(path: Path) -> tuple[Contract, bytes]:
 
 
 def read_bounded(path: Path, limit: int) -> bytes:
-    """The contents of a regular file of at most ``limit`` bytes; AgentFileError otherwise, for pipes and devices too."""
+    """The contents of a regular file of at most ``limit`` bytes; AgentFileError for others, pipes and devices too."""
     try:
         # Without O_NONBLOCK, opening a pipe would wait for somebody to write into it.
         with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
