@@ -10,17 +10,19 @@ from pathlib import Path
 
 from cz_gym.commands import OneLineParser
 
-ALGORITHMS = ("ppo", "ppo-medium", "ppo-quiet", "ppo-puller", "ppo-scratch", "sac")
-
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
     """Read the command line; exits with code 2 and one line for anything that cannot be meant."""
+    from agents.settings import RECIPES
+
     parser = OneLineParser(
         prog="train.py",
         description="Train an agent with stable-baselines3 and pick it on validation episodes.",
         epilog="The run folder holds the agent with its contract, settings, checkpoints, progress and logs.",
     )
-    parser.add_argument("--algo", choices=ALGORITHMS, default="ppo", help="learning algorithm (default: %(default)s)")
+    parser.add_argument(
+        "--algo", choices=tuple(RECIPES), default="ppo", help="learning algorithm (default: %(default)s)"
+    )
     parser.add_argument("--seed", type=_whole(0), default=0, help="training seed (default: %(default)s)")
     parser.add_argument(
         "--steps", type=_whole(1), help="environment steps (default: the algorithm's own, or the resumed run's)"
@@ -61,7 +63,8 @@ def train(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from agents import settings
-    from agents.run import Run, saved_steps
+    from agents.run import Run
+    from agents.run_files import saved_steps
     from baselines import CompensatedPID
     from baselines.registry import find_controller
     from cz_gym.config import make_config

@@ -18,7 +18,7 @@ from cz_gym import CzVectorEnv
 from cz_gym.config import Config
 from cz_gym.observation import HISTORY
 
-from .network import DRIVES, NORMALISED_LIMIT, Normalise
+from .network import DRIVES, Normalise
 from .settings import Clone
 
 Floats = npt.NDArray[np.float32]
@@ -100,12 +100,10 @@ def imitate(
 
 def acts(policy: Any) -> Callable[[Floats], Floats]:
     """The policy's mean action as a function of "history" observations."""
-    hidden = policy.observation_space.shape[0] - len(HISTORY)
 
     def act(observation: Floats) -> Floats:
-        whole = np.pad(observation, ((0, 0), (0, hidden)))
         with torch.no_grad():
-            action: Floats = policy._predict(torch.as_tensor(whole), deterministic=True).numpy()
+            action: Floats = policy._predict(_whole(policy, observation), deterministic=True).numpy()
         return action
 
     return act
@@ -122,7 +120,7 @@ def begin_linear(policy: Any, shown: Shown) -> None:
         spread = np.maximum(shown.state.std(axis=0), VARIANCE_FLOOR**0.5)
         whole_mean[seen:], whole[seen:, seen:] = shown.state.mean(axis=0), np.diag(1.0 / spread)
     normalise.set(whole_mean, whole)
-    whitened = np.clip((shown.observation - mean) @ scaling, -NORMALISED_LIMIT, NORMALISED_LIMIT)
+    whitened = _features(policy, shown.observation).numpy().astype(np.float64)
     x = np.column_stack([whitened, np.ones(len(whitened))])
     weights = np.linalg.solve(x.T @ x + RIDGE * len(x) * np.eye(x.shape[1]), x.T @ _outputs(policy, shown))
     head, direct = policy.action_net, policy.mlp_extractor.direct
@@ -155,11 +153,17 @@ def fit(policy: Any, shown: Shown, choice: Clone) -> None:
         cycle.step()
 
 
+def _whole(policy: Any, observation: Floats) -> torch.Tensor:
+    """What the policy reads, with this observation for the actor and nothing for the critic."""
+    hidden = policy.observation_space.shape[0] - len(HISTORY)
+    return torch.as_tensor(np.pad(observation, ((0, 0), (0, hidden))))
+
+
 def _features(policy: Any, observation: Floats) -> torch.Tensor:
-    """The actor's normalised view, computed once."""
-    normalise, seen = policy.features_extractor, observation.shape[1]
-    centred = torch.as_tensor(observation) - normalise.mean[:seen]
-    return torch.clamp(centred @ normalise.scaling[:seen, :seen], -NORMALISED_LIMIT, NORMALISED_LIMIT)
+    """The actor's normalised view, shape (samples, channels)."""
+    with torch.no_grad():
+        features: torch.Tensor = policy.features_extractor(_whole(policy, observation))
+    return features[:, : len(HISTORY)].contiguous()
 
 
 def _outputs(policy: Any, shown: Shown) -> Floats:

@@ -2,37 +2,26 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 import json
 import math
-import platform
-import subprocess
-import sys
 import time
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import Any
 
 import cz_gym
 from cz_gym.config import Config, make_config
-from cz_gym.evaluation.metrics import metrics
-from cz_gym.evaluation.protocol import VALIDATION_SEEDS
-from cz_gym.evaluation.rollout import rollout
 from cz_gym.evaluation.whole import finish_writing, write_files
-from cz_gym.task import FAILURE_COST, cost_terms
-from cz_gym.units import KILO, MM, MM_PER_MIN
 
 from . import settings
 from .callbacks import AtStart, Every, Tell
 from .checkpoint import load_checkpoint, restore, to_bytes
-from .contract import MAX_JSON_BYTES, AgentFileError, agent_files, make_contract, read_bounded, read_json
+from .contract import AgentFileError, agent_files, make_contract
 from .export import actor_of, to_onnx
 from .onnx_policy import OnnxPolicy
+from .run_files import COLUMNS, provenance, read_rows, read_settings, to_csv, write_json
 from .training import Training, clone, make_training
+from .validation import validate
 
 QUICK, FULL = 64, 200
 """Validation episodes while learning, and at the end."""
@@ -43,44 +32,6 @@ VALIDATE_EVERY = 200_000
 """Fewest steps between validations."""
 MAX_SESSIONS = 100
 """Sessions that are remembered beside the first and the present one."""
-COLUMNS = (
-    "steps",
-    "seconds",
-    "validation_cost",
-    "validation_rmse_mm",
-    "paper_rmse_mm",
-    "pull_step_rms_mm_per_min",
-    "failure_rate",
-)
-"""Columns of ``progress.csv``."""
-PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "stable-baselines3", "torch", "onnx", "onnxruntime")
-
-
-class Validation(NamedTuple):
-    """Mean figures over validation episodes."""
-
-    cost: float
-    """Of a step, unsaturated and weighed as in training; a lost episode costs ten a step [-]."""
-    rmse_mm: float
-    pull_step_rms_mm_per_min: float
-    failure_rate: float
-
-
-def validate(policy: Any, config: Config, episodes: int, weights: settings.CostWeights) -> Validation:
-    """Run the first validation episodes."""
-    found = metrics(rollout(policy, config, VALIDATION_SEEDS[:episodes]))
-    error = found.rmse_observable_mm if weights.observable else found.rmse_mm
-    terms = cost_terms(
-        error * MM,
-        found.pull_rms_mm_per_min * MM_PER_MIN,
-        found.pull_step_rms_mm_per_min * MM_PER_MIN,
-        found.heater_step_rms_kw * KILO,
-    )
-    cost = terms.radius + weights.pull * terms.pull
-    cost += weights.pull_step * terms.pull_step + weights.heater_step * terms.heater_step
-    cost = np.where(found.failure_rate > 0, FAILURE_COST, cost)
-    figures = cost, found.rmse_mm, found.pull_step_rms_mm_per_min, found.failure_rate
-    return Validation(*(float(figure.mean()) for figure in figures))
 
 
 class Run:
@@ -126,7 +77,7 @@ class Run:
         self.sessions = self._check_settings()
         progress, tensors = load_checkpoint(folder / CHECKPOINT)
         self.began -= progress.seconds
-        self.rows = _read_rows(folder / "progress.csv")
+        self.rows = read_rows(folder / "progress.csv")
         if progress.best_cost is not None and _usable(folder / "agent.onnx", self.config):
             self.best = progress.best_cost
         self.training = make_training(choice, seed, str(folder / "tensorboard"), progress.steps, teacher)
@@ -173,7 +124,7 @@ class Run:
             "training_steps": self.training.learner.num_timesteps,
             "seconds": time.monotonic() - self.began,
         }
-        _write_json(self.folder / "summary.json", summary)
+        write_json(self.folder / "summary.json", summary)
         return summary
 
     def _validate_rival(self, episodes: int) -> float:
@@ -195,7 +146,7 @@ class Run:
         cost, rmse, activity, failures = found
         row = (learner.num_timesteps, seconds, cost, rmse, self.rival_rmse_mm, activity, failures)
         self.rows.append(dict(zip(COLUMNS, row, strict=True)))
-        self.unsaved[self.folder / "progress.csv"] = _csv(self.rows)
+        self.unsaved[self.folder / "progress.csv"] = to_csv(self.rows)
         self.save()
         learner.logger.record("validation/cost", cost)
         learner.logger.record("validation/rmse_mm", rmse)
@@ -231,41 +182,21 @@ class Run:
         """Write what this run is; each time it is begun or resumed adds a session."""
         session = {
             "from_step": done,
-            "command": " ".join([Path(sys.executable).name, *sys.argv]),
-            "git_commit": _git_commit(),
-            "python": platform.python_version(),
-            "packages": {name: _version(name) for name in PACKAGES},
+            **provenance(),
         }
         first = (self.sessions or [session])[0]
         sessions = [*self.sessions[:1], *self.sessions[1:][-MAX_SESSIONS:], session]
         facts = {**self._identity(), "steps": self.choice.steps, **first, "sessions": sessions}
-        _write_json(self.folder / "settings.json", facts)
+        write_json(self.folder / "settings.json", facts)
 
     def _check_settings(self) -> list[dict[str, Any]]:
         """The sessions of the run in this folder; AgentFileError if it is not this run."""
         path = self.folder / "settings.json"
-        saved = _read_settings(path)
+        saved = read_settings(path)
         for name, value in self._identity().items():
             if saved.get(name) != value:
                 raise AgentFileError(f"{path}: the run was begun with another {name}; resume it with the same options")
         return list(saved["sessions"])
-
-
-def saved_steps(folder: Path) -> int:
-    """Environment steps that the run in this folder was begun with; AgentFileError if there is none."""
-    return int(_read_settings(folder / "settings.json")["steps"])
-
-
-def _read_settings(path: Path) -> dict[str, Any]:
-    try:
-        saved = read_json(path)
-    except AgentFileError:
-        saved = None
-    steps, sessions = (saved.get("steps"), saved.get("sessions")) if isinstance(saved, dict) else (None, None)
-    whole = type(steps) is int and 0 < steps < 2**63 and isinstance(sessions, list)
-    if not whole or not sessions or not all(isinstance(session, dict) for session in sessions):
-        raise AgentFileError(f"{path}: missing or damaged, so there is nothing to resume")
-    return dict(saved)
 
 
 def _usable(path: Path, config: Config) -> bool:
@@ -274,46 +205,3 @@ def _usable(path: Path, config: Config) -> bool:
     except AgentFileError:
         return False
     return True
-
-
-def _git_commit() -> str | None:
-    here = Path(__file__).parent
-    try:
-        asked = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=True)
-        changed = subprocess.run(["git", "status", "--porcelain", "-uno"], cwd=here, capture_output=True, text=True)
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return asked.stdout.strip() + ("-dirty" if changed.stdout.strip() else "")
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
-
-
-def _write_json(path: Path, content: Any) -> None:
-    write_files({path: (json.dumps(content, indent=2) + "\n").encode()})
-
-
-def _csv(rows: list[dict[str, Any]]) -> bytes:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=COLUMNS)
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue().encode()
-
-
-def _read_rows(path: Path) -> list[dict[str, Any]]:
-    """The validations before this session; AgentFileError if the file is not one that a run wrote."""
-    if not path.exists():
-        return []
-    try:
-        rows = list(csv.DictReader(io.StringIO(read_bounded(path, MAX_JSON_BYTES).decode(), newline="")))
-        for row in rows:
-            if list(row) != list(COLUMNS) or not all(math.isfinite(float(value)) for value in row.values()):
-                raise ValueError("a row is not one of numbers")
-    except (ValueError, TypeError, csv.Error):
-        raise AgentFileError(f"{path}: damaged; without it the run can be resumed") from None
-    return rows

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
@@ -161,8 +160,3 @@ RECIPES: dict[str, PPO | SAC] = {
     )
 }
 """By name: what ``train.py --algo`` offers."""
-
-
-def describe(settings: Any) -> dict[str, Any]:
-    """The settings as plain data."""
-    return asdict(settings)

@@ -16,7 +16,7 @@ from agents import AgentFileError, OnnxPolicy, settings, shipped
 from agents.checkpoint import load_checkpoint, restore, to_bytes
 from agents.contract import make_contract, read_agent
 from agents.graph import OPERATORS
-from agents.run import COLUMNS, _read_rows, saved_steps
+from agents.run_files import COLUMNS, saved_steps
 from agents.training import make_training
 from cz_gym._kept_code import Store
 from cz_gym.evaluation import kept
@@ -83,7 +83,7 @@ def targets(folder: Path) -> dict[str, Target]:
 
     def read_rows(content: bytes) -> None:
         (folder / "progress.csv").write_bytes(content)
-        _read_rows(folder / "progress.csv")
+        read_rows(folder / "progress.csv")
 
     def read_episode(content: bytes) -> None:
         (folder / "0.npz").write_bytes(content)

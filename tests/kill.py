@@ -25,6 +25,7 @@ import train
 from agents import OnnxPolicy, run, settings, shipped
 from agents.checkpoint import load_checkpoint
 from agents.training import make_training
+from agents.validation import validate
 from baselines import CompensatedPID
 from cz_gym.config import make_config
 from cz_gym.evaluation.files import is_benchmark_json
@@ -158,7 +159,7 @@ def warm() -> None:
     learner.env.step(np.zeros((learner.n_envs, 2), np.float32))
     for policy, observation in ((OnnxPolicy.load(shipped()), "history"), (CompensatedPID(5.0), "measured")):
         config = make_config("randomized", observation=observation, horizon=300.0)
-        run.validate(policy, config, 1, settings.CostWeights())
+        validate(policy, config, 1, settings.CostWeights())
 
 
 def main(argv: list[str] | None = None) -> int:

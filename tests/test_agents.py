@@ -12,6 +12,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from contracts import facts
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -45,22 +46,6 @@ SMALL_SAC = settings.SAC(
     batch_size=16,
     gradient_steps=1,
 )
-
-
-def facts(**changes: Any) -> dict[str, Any]:
-    known = {
-        "observation": "history",
-        "channels": len(HISTORY),
-        "control_interval": 5.0,
-        "plant_hash": CONFIG.plant_hash,
-        "scenario": "randomized",
-        "scenario_hash": CONFIG.scenario.hash,
-        "algorithm": "ppo",
-        "training_seed": 0,
-        "training_steps": 64,
-        "validation_rmse_mm": 1.0,
-    }
-    return {**known, **changes}
 
 
 def observations(n: int, channels: int) -> np.ndarray:

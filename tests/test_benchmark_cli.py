@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+from contracts import facts
 from onnx import TensorProto, helper, numpy_helper
 
 import benchmark
@@ -44,20 +45,11 @@ def constant_agent(path: Path, pull: float = 0.0, **changes: Any) -> Path:
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
     onnx.checker.check_model(model)
-    config = make_config()
-    facts = {
-        "observation": "measured",
-        "channels": channels,
-        "control_interval": 5.0,
-        "plant_hash": config.plant_hash,
-        "scenario": "randomized",
-        "scenario_hash": config.scenario.hash,
-        "algorithm": "ppo",
-        "training_seed": 0,
-        "training_steps": 1,
-        "validation_rmse_mm": 6.0,
-    }
-    write_agent(path, model.SerializeToString(), **{**facts, **changes})
+    write_agent(
+        path,
+        model.SerializeToString(),
+        **facts("measured", **{"channels": channels, "validation_rmse_mm": 6.0, **changes}),
+    )
     return path
 
 

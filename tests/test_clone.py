@@ -122,6 +122,29 @@ def test_an_agent_that_does_what_its_teacher_does_earns_nothing_more() -> None:
     env.close()
 
 
+def test_a_teacher_that_loses_its_crystal_is_no_longer_compared_with() -> None:
+    base = slots(horizon=3600.0)
+    env = PairedReward(TrainingReward(base, 0.9), base, Teacher(lambda seen: np.full((len(seen), 2), [2.0, 0.0])))
+    keeper, observation, memory, begins = lqg(make_config("randomized")), env.reset(), None, np.ones(3, np.bool_)
+    for _ in range(500):
+        action, memory = keeper.predict(observation[:, : len(HISTORY)], memory, begins)
+        observation, gained, begins, _ = env.step(action)
+        assert np.isfinite(gained).all()
+    assert not env.together.any()
+    assert np.abs(gained).max() < 0.2
+    env.close()
+
+
+def test_the_critic_learns_first() -> None:
+    training = make_training(replace(TINY, critic_steps=512), 0, None, 0, lqg(make_config("randomized")))
+    policy = training.learner.policy
+    actor, critic = policy.mlp_extractor.direct.weight, policy.value_net.weight
+    before = actor.detach().clone(), critic.detach().clone()
+    training.learner.learn(256, callback=training.callbacks)
+    assert torch.equal(actor, before[0])
+    assert not torch.equal(critic, before[1])
+
+
 def test_the_weighed_reward_is_the_weighed_cost_s() -> None:
     base = slots()
     weights = settings.CostWeights(pull=0.5, pull_step=3.0, heater_step=2.0)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+from contracts import facts
 from onnx import TensorProto, helper, numpy_helper
 
 from agents import AgentFileError, OnnxPolicy, shipped
@@ -46,19 +47,7 @@ def model_of(nodes: list[Any] | None = None, weights: dict[str, Any] | None = No
 def policy_of(model: Any) -> OnnxPolicy:
     config = make_config()
     content = model if isinstance(model, bytes) else model.SerializeToString()
-    facts = {
-        "observation": "measured",
-        "channels": CHANNELS,
-        "control_interval": 5.0,
-        "plant_hash": config.plant_hash,
-        "scenario": "randomized",
-        "scenario_hash": config.scenario.hash,
-        "algorithm": "ppo",
-        "training_seed": 0,
-        "training_steps": 1,
-        "validation_rmse_mm": 6.0,
-    }
-    return OnnxPolicy.of(make_contract(content, **facts), content, config)
+    return OnnxPolicy.of(make_contract(content, **facts("measured", channels=CHANNELS)), content, config)
 
 
 def test_the_shipped_agent_is_run_as_it_is_stored() -> None:
@@ -298,7 +287,8 @@ def test_hostile_graphs_stay_within_a_small_memory() -> None:
     code = (
         "import resource, sys\n"
         "import onnxruntime, onnx.checker\n"
-        "from tests import test_graph as t\n"
+        "sys.path.insert(0, 'tests')\n"
+        "import test_graph as t\n"
         "t.policy_of(t.model_of())\n"
         "now = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()\n"
         "resource.setrlimit(resource.RLIMIT_AS, (now + 2**29,) * 2)\n"

@@ -1,0 +1,43 @@
+"""How good an agent is while it trains: the first validation episodes."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cz_gym.config import Config
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.task import FAILURE_COST, cost_terms
+from cz_gym.units import KILO, MM, MM_PER_MIN
+
+from .settings import CostWeights
+
+
+class Validation(NamedTuple):
+    """Mean figures over validation episodes."""
+
+    cost: float
+    """Of a step, unsaturated and weighed as in training; a lost episode costs ten a step [-]."""
+    rmse_mm: float
+    pull_step_rms_mm_per_min: float
+    failure_rate: float
+
+
+def validate(policy: Any, config: Config, episodes: int, weights: CostWeights) -> Validation:
+    """Run the first validation episodes."""
+    found = metrics(rollout(policy, config, VALIDATION_SEEDS[:episodes]))
+    error = found.rmse_observable_mm if weights.observable else found.rmse_mm
+    terms = cost_terms(
+        error * MM,
+        found.pull_rms_mm_per_min * MM_PER_MIN,
+        found.pull_step_rms_mm_per_min * MM_PER_MIN,
+        found.heater_step_rms_kw * KILO,
+    )
+    cost = terms.radius + weights.pull * terms.pull
+    cost += weights.pull_step * terms.pull_step + weights.heater_step * terms.heater_step
+    cost = np.where(found.failure_rate > 0, FAILURE_COST, cost)
+    figures = cost, found.rmse_mm, found.pull_step_rms_mm_per_min, found.failure_rate
+    return Validation(*(float(figure.mean()) for figure in figures))

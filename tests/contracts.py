@@ -1,0 +1,26 @@
+"""The facts of an agent's contract, for tests that write agents of their own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from cz_gym.config import make_config
+from cz_gym.observation import OBSERVATIONS
+
+
+def facts(observation: str = "history", **changes: Any) -> dict[str, Any]:
+    """What :func:`agents.contract.make_contract` asks for, of an agent trained on "randomized"."""
+    config = make_config(observation=observation)
+    known = {
+        "observation": observation,
+        "channels": len(OBSERVATIONS[observation]),
+        "control_interval": config.control_interval,
+        "plant_hash": config.plant_hash,
+        "scenario": config.scenario.name,
+        "scenario_hash": config.scenario.hash,
+        "algorithm": "ppo",
+        "training_seed": 0,
+        "training_steps": 64,
+        "validation_rmse_mm": 1.0,
+    }
+    return {**known, **changes}
