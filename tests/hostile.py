@@ -16,7 +16,7 @@ from agents import AgentFileError, OnnxPolicy, settings, shipped
 from agents.checkpoint import load_checkpoint, restore, to_bytes
 from agents.contract import make_contract, read_agent
 from agents.graph import OPERATORS
-from agents.run_files import COLUMNS, saved_steps
+from agents.run_files import COLUMNS, read_rows, saved_steps
 from agents.training import make_training
 from cz_gym._kept_code import Store
 from cz_gym.evaluation import kept
@@ -81,7 +81,7 @@ def targets(folder: Path) -> dict[str, Target]:
         (folder / "settings.json").write_bytes(content)
         saved_steps(folder)
 
-    def read_rows(content: bytes) -> None:
+    def read_progress(content: bytes) -> None:
         (folder / "progress.csv").write_bytes(content)
         read_rows(folder / "progress.csv")
 
@@ -98,7 +98,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "agent.json": Target(shipped().with_suffix(".json").read_bytes(), read_contract),
         "checkpoint": Target(to_bytes(learner, 1.0, 0.5), read_checkpoint),
         "settings.json": Target(json.dumps(sessions).encode(), read_settings),
-        "progress.csv": Target(rows.encode(), read_rows),
+        "progress.csv": Target(rows.encode(), read_progress),
         "kept episode": Target(episode.getvalue(), read_episode),
         "compiled code": Target(store.path("key").read_bytes(), read_code),
     }
