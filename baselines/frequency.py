@@ -57,7 +57,12 @@ def opened(controller: StateSpace, puller: Puller, dt: float, at: str) -> StateS
 def crossover(controller: StateSpace, puller: Puller, dt: float, at: str = "camera", points: int = 400) -> float:
     """Highest frequency [rad/s] where the opened loop's gain falls through one; NaN if it never does."""
     omega = frequencies(dt, points)
-    gain = np.log(np.abs(response(opened(controller, puller, dt, at), dt, omega)))
+    return crossover_of(response(opened(controller, puller, dt, at), dt, omega), omega)
+
+
+def crossover_of(values: npt.NDArray[np.complex128], omega: Floats) -> float:
+    """The same of an opened loop's frequency response."""
+    gain = np.log(np.abs(values))
     falls = np.flatnonzero((gain[:-1] > 0.0) & (gain[1:] <= 0.0))
     if not len(falls):
         return float("nan")
@@ -74,12 +79,17 @@ def sensitivity(controller: StateSpace, puller: Puller, dt: float, points: int =
 
 def loop_margins(controller: StateSpace, puller: Puller, dt: float, at: str = "camera") -> LoopMargins:
     """Margins of the loop opened there; all NaN but the crossover if the closed loop is unstable."""
-    control = require("control")
     omega = frequencies(dt)
-    found = crossover(controller, puller, dt, at, len(omega))
-    if not close(controller, puller, dt).stable:
-        return LoopMargins(found, *[float("nan")] * 5)
     values = response(opened(controller, puller, dt, at), dt, omega)
+    return margins_of(values, omega, dt, close(controller, puller, dt).stable)
+
+
+def margins_of(values: npt.NDArray[np.complex128], omega: Floats, dt: float, stable: bool) -> LoopMargins:
+    """The same from an opened loop's response up to the Nyquist frequency, and whether it is stable closed."""
+    control = require("control")
+    found = crossover_of(values, omega)
+    if not stable:
+        return LoopMargins(found, *[float("nan")] * 5)
     gain, phase, _, _, crossing, _ = control.stability_margins(control.frd(values, omega), returnall=True)
     late = np.append(np.radians(np.mod(phase, 360.0)) / crossing, _late_at_nyquist(values[-1], dt))
     return LoopMargins(
