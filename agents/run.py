@@ -9,6 +9,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from stable_baselines3.common.logger import Logger
+
 import cz_gym
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation.whole import finish_writing, write_files
@@ -16,9 +18,10 @@ from cz_gym.evaluation.whole import finish_writing, write_files
 from . import settings
 from .callbacks import AtStart, Every, Tell
 from .checkpoint import load_checkpoint, restore, to_bytes
-from .contract import AgentFileError, agent_files, make_contract
+from .contract import AgentFileError, Contract, agent_files, make_contract
 from .export import actor_of, to_onnx
 from .onnx_policy import OnnxPolicy
+from .residual import Residual
 from .run_files import COLUMNS, provenance, read_rows, read_settings, to_csv, write_json
 from .training import Training, clone, make_training
 from .validation import validate
@@ -26,6 +29,8 @@ from .validation import validate
 QUICK, FULL = 64, 200
 """Validation episodes while learning, and at the end."""
 CHECKPOINT = "checkpoint.safetensors"
+IMITATION = "imitation.onnx"
+"""The agent as it was before it learned, if it began as an imitation."""
 CHECKPOINT_SECONDS = 60.0
 """Longest time between checkpoints, but for a validation or an update in between [s]."""
 VALIDATE_EVERY = 200_000
@@ -38,7 +43,7 @@ class Run:
     """One training run.
 
     ``rival``, a policy on "measured" observations, runs the same validation episodes and is shown beside the agent;
-    ``teacher`` is the controller that the settings clone;
+    ``teacher`` is the controller that the settings clone; ``imitations`` a folder where imitations are kept for others;
     ``resume`` goes on from the folder's checkpoint, saved anew every ``checkpoint_seconds``. Checkpoint, progress and
     best agent are replaced together, so that they agree whenever a run is killed. Raises AgentFileError if the folder
     cannot be used.
@@ -53,9 +58,10 @@ class Run:
         resume: bool = False,
         checkpoint_seconds: float = CHECKPOINT_SECONDS,
         teacher: Any = None,
+        imitations: Path | None = None,
     ) -> None:
         self.folder, self.choice, self.seed, self.rival = folder, choice, seed, rival
-        self.teacher = teacher
+        self.teacher, self.imitations = teacher, imitations
         self.checkpoint_seconds = checkpoint_seconds
         recipe = choice.recipe
         self.config = make_config(
@@ -95,12 +101,16 @@ class Run:
         left = self.choice.steps - learner.num_timesteps
         if left > 0:
             learner.learn(left, callback=callbacks, reset_num_timesteps=False, tb_log_name="run")
+        else:
+            learner.set_logger(Logger(None, []))
         self._validate(bar)
 
     def _begin(self, bar: Any) -> None:
         """Imitate the teacher, if there is one and nothing has been learned yet."""
         if self.training.learner.num_timesteps == 0 and self.choice.recipe.clone is not None:
-            clone(self.training, self.teacher, self.config, self.seed, bar.set_postfix_str)
+            clone(self.training, self.teacher, self.config, self.seed, bar.set_postfix_str, self.imitations)
+            contract, content, _ = self._exported()
+            self.unsaved |= agent_files(self.folder / IMITATION, content, contract)
             self._validate(bar)
 
     def save(self) -> None:
@@ -112,8 +122,7 @@ class Run:
 
     def finish(self) -> dict[str, float]:
         """Validate the best agent on more episodes and write ``summary.json``; its contents."""
-        policy = OnnxPolicy.load(self.folder / "agent.onnx", self.config)
-        found = validate(policy, self.config, FULL, self.choice.recipe.weights)
+        found = validate(self.best_policy(), self.config, FULL, self.choice.recipe.weights)
         summary = {
             "validation_episodes": FULL,
             "validation_cost": found.cost,
@@ -127,6 +136,27 @@ class Run:
         write_json(self.folder / "summary.json", summary)
         return summary
 
+    def best_policy(self) -> Any:
+        """The agent that did best on validation, as it acts."""
+        return self._whole(OnnxPolicy.load(self.folder / "agent.onnx", self.config))
+
+    def first_policy(self) -> Any:
+        """The agent before it learned, as it acts; None if it began from nothing."""
+        path = self.folder / IMITATION
+        return self._whole(OnnxPolicy.load(path, self.config)) if self.choice.recipe.clone else None
+
+    def present_policy(self) -> Any:
+        """The agent as it stands, as it acts."""
+        return self._whole(self._exported()[2])
+
+    def _whole(self, agent: OnnxPolicy) -> Any:
+        return Residual(self.teacher, agent) if self.choice.recipe.residual else agent
+
+    def _exported(self) -> tuple[Contract, bytes, OnnxPolicy]:
+        content = to_onnx(actor_of(self.training.learner))
+        contract = make_contract(content, **self._facts(self.training.learner.num_timesteps, 0.0))
+        return contract, content, OnnxPolicy.of(contract, content, self.config)
+
     def _validate_rival(self, episodes: int) -> float:
         measured = make_config(self.config.scenario, control_interval=self.config.control_interval)
         return validate(self.rival, measured, episodes, settings.CostWeights()).rmse_mm
@@ -134,10 +164,8 @@ class Run:
     def _validate(self, bar: Any) -> None:
         """Export the actor as it stands, run the file itself on validation, keep it if it is the best."""
         learner = self.training.learner
-        content = to_onnx(actor_of(learner))
-        candidate = make_contract(content, **self._facts(learner.num_timesteps, 0.0))
-        policy = OnnxPolicy.of(candidate, content, self.config)
-        found = validate(policy, self.config, QUICK, self.choice.recipe.weights)
+        candidate, content, agent = self._exported()
+        found = validate(self._whole(agent), self.config, QUICK, self.choice.recipe.weights)
         if found.cost < self.best:
             self.best = found.cost
             contract = dataclasses.replace(candidate, validation_rmse_mm=found.rmse_mm)

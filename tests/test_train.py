@@ -50,6 +50,8 @@ def test_a_run_leaves_everything_and_goes_on(tmp_path: Path, capsys: pytest.Capt
     assert list((folder / "tensorboard").rglob("events.*"))
     before = rows(folder / "progress.csv")
     assert float(before[-1]["paper_rmse_mm"]) > 0
+    assert train.main(["--seed", "3", "--resume", "--out", str(folder)]) == 0, "nothing was left to learn"
+    assert rows(folder / "progress.csv")[:-1] == before
     assert train.main(["--out", str(folder)]) == 2
     assert "--resume" in capsys.readouterr().err
     assert train.main(["--steps", "40000", "--seed", "3", "--resume", "--out", str(folder)]) == 0
