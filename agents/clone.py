@@ -16,9 +16,9 @@ import torch
 
 from cz_gym import CzVectorEnv
 from cz_gym.config import Config
-from cz_gym.observation import HISTORY
+from cz_gym.observation import HISTORY, LAGS
 
-from .network import DRIVES, Normalise
+from .network import DRIVES, Normalise, seen_channels
 from .settings import Clone
 
 Floats = npt.NDArray[np.float32]
@@ -42,6 +42,15 @@ class Shown(NamedTuple):
     """What the teacher would do there, shape (samples, 2)."""
     state: Floats
     """The true state there, shape (samples, state channels)."""
+
+
+class Views(NamedTuple):
+    """How the networks look at what is shown: mean and scaling of the observation, mean and spread of the state."""
+
+    mean: npt.NDArray[np.float64]
+    scaling: npt.NDArray[np.float64]
+    state_mean: npt.NDArray[np.float64]
+    state_spread: npt.NDArray[np.float64]
 
 
 def demonstrate(
@@ -84,18 +93,30 @@ def imitate(
     choice: Clone,
     first_seed: int,
     tell: Callable[[str], None] = lambda _: None,
-) -> None:
+) -> Views:
     """Make a :class:`agents.network.DrivePolicy` act like the teacher; seeds from ``first_seed`` on are shown."""
     shown: Shown | None = None
+    views: Views | None = None
     for turn in range(choice.rounds):
         seeds = range(first_seed + turn * choice.episodes, first_seed + (turn + 1) * choice.episodes)
         tell(f"asks {choice.teacher}, round {turn + 1} of {choice.rounds}")
         answers = demonstrate(teacher, config, seeds, choice.noise, acts(policy) if turn else None)
-        if shown is None:
-            begin_linear(policy, answers)
+        if views is None:
+            views = begin_linear(policy, answers)
         shown = Shown(*map(np.concatenate, zip(shown, answers, strict=True))) if shown else answers
         tell(f"fits {len(shown.action):,} answers")
         fit(policy, shown, choice)
+    if views is None:
+        raise ValueError(f"an imitation needs at least one round, not {choice.rounds}")
+    return views
+
+
+def stand_beside(policy: Any, teacher: Any, config: Config, choice: Clone, first_seed: int) -> Views:
+    """Make a policy whose action is added to the teacher's add nothing yet; it sees as if it had imitated."""
+    views = views_of(demonstrate(teacher, config, range(first_seed, first_seed + choice.episodes), choice.noise))
+    set_views(policy, views)
+    _clear(policy)
+    return views
 
 
 def acts(policy: Any) -> Callable[[Floats], Floats]:
@@ -109,26 +130,43 @@ def acts(policy: Any) -> Callable[[Floats], Floats]:
     return act
 
 
-def begin_linear(policy: Any, shown: Shown) -> None:
-    """Set normalisation and linear path from the answers; the layers add nothing yet."""
-    mean, scaling = whitening(shown.observation)
+def views_of(shown: Shown, memory: float = LAGS[-1]) -> Views:
+    """Whitening of what networks with that memory [s] see, and the state's mean and spread."""
+    mean, scaling = whitening(shown.observation * seen_channels(len(HISTORY), memory))
+    return Views(mean, scaling, shown.state.mean(axis=0), np.maximum(shown.state.std(axis=0), VARIANCE_FLOOR**0.5))
+
+
+def set_views(policy: Any, views: Views) -> None:
+    """Let the policy's networks look that way."""
     normalise: Normalise = policy.features_extractor
-    whole_mean, whole = np.zeros(len(normalise.mean)), np.eye(len(normalise.mean))
-    seen = len(HISTORY)
-    whole_mean[:seen], whole[:seen, :seen] = mean, scaling
+    mean, whole, seen = np.zeros(len(normalise.mean)), np.eye(len(normalise.mean)), len(HISTORY)
+    mean[:seen], whole[:seen, :seen] = views.mean, views.scaling
     if len(whole) > seen:
-        spread = np.maximum(shown.state.std(axis=0), VARIANCE_FLOOR**0.5)
-        whole_mean[seen:], whole[seen:, seen:] = shown.state.mean(axis=0), np.diag(1.0 / spread)
-    normalise.set(whole_mean, whole)
+        mean[seen:], whole[seen:, seen:] = views.state_mean, np.diag(1.0 / views.state_spread)
+    normalise.set(mean, whole)
+
+
+def begin_linear(policy: Any, shown: Shown) -> Views:
+    """Set normalisation and linear path from the answers; the layers add nothing yet."""
+    views = views_of(shown, policy.memory)
+    set_views(policy, views)
     whitened = _features(policy, shown.observation).numpy().astype(np.float64)
     x = np.column_stack([whitened, np.ones(len(whitened))])
     weights = np.linalg.solve(x.T @ x + RIDGE * len(x) * np.eye(x.shape[1]), x.T @ _outputs(policy, shown))
-    head, direct = policy.action_net, policy.mlp_extractor.direct
+    _clear(policy)
+    direct = policy.mlp_extractor.direct
     with torch.no_grad():
         direct.weight.copy_(torch.as_tensor(weights[:-1].T))
         direct.bias.copy_(torch.as_tensor(weights[-1]))
-        head.linear.weight.zero_()
-        head.linear.bias.zero_()
+    return views
+
+
+def _clear(policy: Any) -> None:
+    """Let the network put out nothing."""
+    with torch.no_grad():
+        for module in (policy.mlp_extractor.direct, policy.action_net.linear):
+            module.weight.zero_()
+            module.bias.zero_()
 
 
 def fit(policy: Any, shown: Shown, choice: Clone) -> None:

@@ -62,7 +62,8 @@ def actor_of(learner: Any) -> Actor:
     layers = [_linear(module) for module in torso if isinstance(module, torch.nn.Linear)]
     first_weight, first_bias = layers[0]
     layers[0] = first_weight[:, :visible].copy(), first_bias
-    mean, scaling = normalise.mean.numpy()[:visible].copy(), normalise.scaling.numpy()[:visible, :visible].copy()
+    seen = normalise.seen[:visible, None] * normalise.scaling[:visible, :visible]
+    mean, scaling = normalise.mean.numpy()[:visible].copy(), seen.numpy()
     return Actor(mean, scaling, direct, (*layers, _linear(last)), activation, squash, skip, scale)
 
 

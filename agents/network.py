@@ -12,17 +12,27 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from gymnasium.spaces import Box
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from cz_gym.observation import HISTORY, MEASURED
+from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED
 
 DRIVES = tuple([channel.name for channel in MEASURED].index(name) for name in ("v_p", "Q_H"))
 """Where an observation holds the applied drives, in action units."""
 NORMALISED_LIMIT = 30.0
+
+
+def seen_channels(channels: int, memory: float) -> npt.NDArray[np.float32]:
+    """1 for what networks see, 0 for past samples older than ``memory`` [s], shape (channels,)."""
+    seen = np.ones(channels, np.float32)
+    lagged = seen[len(HISTORY) - len(LAGS) * len(LAGGED) : len(HISTORY)]
+    if channels >= len(HISTORY):
+        lagged[:] = np.repeat(np.array(LAGS) <= memory, len(LAGGED))
+    return seen
 
 
 def tanh_layers(sizes: list[int]) -> nn.Sequential:
@@ -36,21 +46,26 @@ def tanh_layers(sizes: list[int]) -> nn.Sequential:
 class Normalise(BaseFeaturesExtractor):
     """Normalised observation, on request with the two applied drives appended raw; part of the saved policy."""
 
-    def __init__(self, observation_space: Box, drives: bool = True) -> None:
+    def __init__(self, observation_space: Box, drives: bool = True, memory: float = LAGS[-1]) -> None:
         channels = observation_space.shape[0]
         super().__init__(observation_space, channels + (len(DRIVES) if drives else 0))
         self.drives = drives
+        self.register_buffer("seen", torch.as_tensor(seen_channels(channels, memory)), persistent=False)
         self.register_buffer("mean", torch.zeros(channels))
         self.register_buffer("scaling", torch.eye(channels))
 
     def set(self, mean: np.ndarray, scaling: np.ndarray) -> None:
-        """Set what observations are normalised with: (observation - mean) @ scaling, shapes (channels,) and square."""
+        """Set what observations are normalised with: (observation - mean) @ scaling, shapes (channels,) and square.
+
+        Channels that are not seen count as their mean.
+        """
         self.mean.copy_(torch.as_tensor(mean))
         self.scaling.copy_(torch.as_tensor(scaling))
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """Shape (n, channels) to (n, channels) or (n, channels + 2)."""
-        normalised = torch.clamp((observations - self.mean) @ self.scaling, -NORMALISED_LIMIT, NORMALISED_LIMIT)
+        centred = (observations - self.mean) * self.seen
+        normalised = torch.clamp(centred @ self.scaling, -NORMALISED_LIMIT, NORMALISED_LIMIT)
         if not self.drives:
             return normalised
         return torch.cat([normalised, observations[:, list(DRIVES)]], dim=1)
@@ -128,10 +143,13 @@ class DrivePolicy(ActorCriticPolicy):
         scale: tuple[float, float] = (0.05, 0.05),
         noise: tuple[float, float] = (0.05, 0.05),
         frozen: tuple[str, ...] = (),
+        memory: float = LAGS[-1],
         **kwargs: Any,
     ) -> None:
         self.hidden, self.skip, self.scale, self.noise, self.frozen = hidden, skip, scale, noise, frozen
-        super().__init__(*args, features_extractor_class=Normalise, **kwargs)
+        self.memory = memory
+        seeing = {"memory": memory}
+        super().__init__(*args, features_extractor_class=Normalise, features_extractor_kwargs=seeing, **kwargs)
 
     def _build_mlp_extractor(self) -> None:
         channels = self.features_dim - len(DRIVES)

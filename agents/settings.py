@@ -59,6 +59,10 @@ class Recipe:
     """Time between actions [s]."""
     num_envs: int = 256
     """Slots trained on at once."""
+    memory: float = 1200.0
+    """Age of the oldest samples that the networks see [s]; 0: none, only the integral."""
+    width: float = 1.0
+    """Spread of the pullers trained on, in units of the scenario's [-]; 0: the nominal one in the middle."""
     privileged_critic: bool = True
     """Whether the critic also sees the true state."""
     hidden: tuple[int, ...] = (128, 128)
@@ -69,6 +73,8 @@ class Recipe:
     weights: CostWeights = field(default_factory=CostWeights)
     clone: Clone | None = None
     """None: learning starts from nothing."""
+    residual: bool = False
+    """Whether the network's action is added to the teacher's instead of imitating it."""
 
 
 @dataclass(frozen=True)

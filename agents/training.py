@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,13 +14,18 @@ from stable_baselines3 import SAC as SACLearner
 from stable_baselines3.common.callbacks import BaseCallback
 
 from cz_gym import CzVectorEnv
+from cz_gym.config import Config
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
+from cz_gym.scenario import Scenario
+from cz_gym.scenarios import find_scenario
 
 from . import settings
 from .callbacks import CriticFirst, Statistics
-from .clone import imitate
+from .clone import Views, imitate, stand_beside
+from .kept_imitation import imitate_once, kept_imitation
 from .network import DrivePolicy, Normalise
 from .pairing import PairedReward
+from .residual import ResidualAction
 from .vec_env import CzVecEnv
 from .wrappers import DriveAction, TrainingReward
 
@@ -56,19 +62,59 @@ def make_training(
     return Training(learner, callbacks, recipe, choice.steps)
 
 
-def clone(training: Training, teacher: Any, config: Any, seed: int, tell: Callable[[str], None]) -> None:
-    """Let a learner that has not learned yet imitate the teacher that its recipe names."""
-    choice = training.recipe.clone
-    if choice is not None:
-        span = len(TRAINING_SEEDS) - choice.rounds * choice.episodes
-        torch.manual_seed(seed)
-        imitate(training.learner.policy, teacher, config, choice, (seed * 20_011 + 500_000) % span, tell)
+def clone(
+    training: Training,
+    teacher: Any,
+    config: Config,
+    seed: int,
+    tell: Callable[[str], None],
+    kept: Path | None = None,
+) -> None:
+    """Let a learner that has not learned yet imitate the teacher that its recipe names, or stand beside it.
+
+    With ``kept``, a folder, an imitation of the same settings is made once and kept there.
+    """
+    recipe, policy = training.recipe, training.learner.policy
+    choice = recipe.clone
+    if choice is None:
+        return
+    shown = config.with_scenario(training_scenario(recipe))
+    first = (seed * 20_011 + 500_000) % (len(TRAINING_SEEDS) - choice.rounds * choice.episodes)
+
+    def begin() -> Views:
+        if recipe.residual:
+            return stand_beside(policy, teacher, shown, choice, first)
+        return imitate(policy, teacher, shown, choice, first, tell)
+
+    torch.manual_seed(seed)
+    if kept is None:
+        begin()
+        return
+    imitate_once(kept_imitation(kept, recipe, shown, seed), policy, begin)
+    torch.manual_seed(seed)  # what follows does not depend on whether the imitation was kept
+
+
+def training_scenario(recipe: settings.Recipe) -> Scenario:
+    """The scenario with the pullers' spread that is trained on."""
+    scenario = find_scenario(recipe.scenario)
+    if recipe.width == 1.0:
+        return scenario
+    width, pullers = recipe.width, scenario.pullers
+    middle, half = sum(pullers.mix) / 2.0, (pullers.mix[1] - pullers.mix[0]) / 2.0
+    spread = replace(
+        pullers,
+        mix=(max(middle - width * half, 0.0), min(middle + width * half, 1.0)),
+        capillary=width * pullers.capillary,
+        conductivity=width * pullers.conductivity,
+        conductance=width * pullers.conductance,
+    )
+    return replace(scenario, name=f"{scenario.name}-width-{width:g}", pullers=spread)
 
 
 def _make_slots(recipe: settings.Recipe, seed: int, done: int) -> CzVecEnv:
     env = CzVectorEnv(
         recipe.num_envs,
-        scenario=recipe.scenario,
+        scenario=training_scenario(recipe),
         observation=recipe.observation,
         control_interval=recipe.control_interval,
         autoreset_mode=AutoresetMode.SAME_STEP,
@@ -88,6 +134,8 @@ def _make_ppo(choice: settings.PPO, slots: CzVecEnv, seed: int, logs: str | None
     env: Any = TrainingReward(slots, choice.gamma, recipe.weights)
     if choice.paired:
         env = PairedReward(env, slots, teacher)
+    if recipe.residual:
+        env = ResidualAction(env, teacher)
     return PPOLearner(
         DrivePolicy,
         env,
@@ -107,6 +155,7 @@ def _make_ppo(choice: settings.PPO, slots: CzVecEnv, seed: int, logs: str | None
             "scale": (head.pull_scale, head.heater_scale),
             "noise": choice.noise,
             "frozen": choice.frozen,
+            "memory": recipe.memory,
         },
         seed=seed,
         device="cpu",

@@ -5,15 +5,18 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from cz_gym.config import Config
-from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.metrics import Metrics, metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.task import FAILURE_COST, cost_terms
 from cz_gym.units import KILO, MM, MM_PER_MIN
 
 from .settings import CostWeights
+
+Floats = npt.NDArray[np.float64]
 
 
 class Validation(NamedTuple):
@@ -29,6 +32,12 @@ class Validation(NamedTuple):
 def validate(policy: Any, config: Config, episodes: int, weights: CostWeights) -> Validation:
     """Run the first validation episodes."""
     found = metrics(rollout(policy, config, VALIDATION_SEEDS[:episodes]))
+    figures = costs(found, weights), found.rmse_mm, found.pull_step_rms_mm_per_min, found.failure_rate
+    return Validation(*(float(figure.mean()) for figure in figures))
+
+
+def costs(found: Metrics, weights: CostWeights) -> Floats:
+    """Mean cost of a step of each episode, as :class:`Validation` says, shape (episodes,)."""
     error = found.rmse_observable_mm if weights.observable else found.rmse_mm
     terms = cost_terms(
         error * MM,
@@ -38,6 +47,4 @@ def validate(policy: Any, config: Config, episodes: int, weights: CostWeights) -
     )
     cost = terms.radius + weights.pull * terms.pull
     cost += weights.pull_step * terms.pull_step + weights.heater_step * terms.heater_step
-    cost = np.where(found.failure_rate > 0, FAILURE_COST, cost)
-    figures = cost, found.rmse_mm, found.pull_step_rms_mm_per_min, found.failure_rate
-    return Validation(*(float(figure.mean()) for figure in figures))
+    return np.where(found.failure_rate > 0, FAILURE_COST, cost)
