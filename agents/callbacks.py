@@ -26,6 +26,13 @@ class Statistics(BaseCallback):
         self.until = until
         self.rounds = 10 if known else 0
 
+    def _on_training_start(self) -> None:
+        if not any(module.mean.any() for module in self._normalisations()):
+            self.rounds = 0  # also of a run that was cut short before it knew any
+
+    def _normalisations(self) -> list[Normalise]:
+        return [module for module in self.model.policy.modules() if isinstance(module, Normalise)]
+
     def _on_step(self) -> bool:
         if hasattr(self.model, "replay_buffer") and self.rounds == 0:
             buffer = self.model.replay_buffer
@@ -41,12 +48,11 @@ class Statistics(BaseCallback):
         seen = observations.reshape(-1, observations.shape[-1])
         self.rounds += 1
         share = max(1.0 / self.rounds, 0.1)
-        for module in self.model.policy.modules():
-            if isinstance(module, Normalise):
-                mean, var = module.mean.numpy(), module.scaling.diagonal().numpy() ** -2.0
-                mean = mean + share * (seen.mean(axis=0) - mean)
-                var = var + share * (seen.var(axis=0) - var)
-                module.set(mean, np.diag(1.0 / np.maximum(np.sqrt(var), STD_FLOOR)))
+        for module in self._normalisations():
+            mean, var = module.mean.numpy(), module.scaling.diagonal().numpy() ** -2.0
+            mean = mean + share * (seen.mean(axis=0) - mean)
+            var = var + share * (seen.var(axis=0) - var)
+            module.set(mean, np.diag(1.0 / np.maximum(np.sqrt(var), STD_FLOOR)))
 
 
 class CriticFirst(BaseCallback):

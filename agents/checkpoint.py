@@ -18,6 +18,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 from .contract import AgentFileError, read_bounded
+from .experience import PREFIX, fits, latest, refill
 
 FORMAT = "cz-gym-checkpoint-2"
 MAX_BYTES = 64_000_000
@@ -43,10 +44,11 @@ class Progress:
 
 
 def to_bytes(learner: Any, seconds: float, best_cost: float | None) -> bytes:
-    """The checkpoint of a stable-baselines3 learner (a replay buffer is not kept; it fills again)."""
+    """The checkpoint of a stable-baselines3 learner; of a replay buffer the latest transitions."""
     progress = Progress(int(learner.num_timesteps), int(learner._n_updates), seconds, best_cost)
     # Modules that share a tensor each get their copy: the format knows no sharing.
     tensors = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in _tensors(learner).items()}
+    tensors |= latest(learner)
     content: bytes = save(tensors, {"format": FORMAT, "progress": json.dumps(asdict(progress))})
     return content
 
@@ -78,9 +80,11 @@ def load_checkpoint(path: Path) -> tuple[Progress, Tensors]:
 def restore(learner: Any, progress: Progress, tensors: Tensors, path: Path) -> None:
     """Put a checkpoint into a learner made with the same settings; AgentFileError if it does not fit."""
     modules, optimisers, variables = _parts(learner)
+    experience = {name: tensor for name, tensor in tensors.items() if name.startswith(PREFIX)}
     fixed = {name: tensor for name, tensor in _tensors(learner).items() if name.partition("/")[0] not in optimisers}
-    kept = {name: tensor for name, tensor in tensors.items() if name.partition("/")[0] not in optimisers}
-    if set(fixed) != set(kept) or not all(_alike(fixed[name], kept[name]) for name in fixed):
+    kept = {name: part for name, part in tensors.items() if name.partition("/")[0] not in {*optimisers, PREFIX[:-1]}}
+    alike = set(fixed) == set(kept) and all(_alike(fixed[name], kept[name]) for name in fixed)
+    if not alike or not fits(learner, experience):
         raise AgentFileError(f"{path}: does not fit this run's settings")
     states = {name: _optimiser_state(name, part, tensors, path) for name, part in optimisers.items()}
     for name, tensor in tensors.items():
@@ -92,6 +96,7 @@ def restore(learner: Any, progress: Progress, tensors: Tensors, path: Path) -> N
         optimiser.load_state_dict({**optimiser.state_dict(), "state": states[name]})
     for name, variable in variables.items():
         variable.data.copy_(tensors[f"{name}/"])
+    refill(learner, experience)
     learner.num_timesteps = progress.steps
     learner._n_updates = progress.updates
 

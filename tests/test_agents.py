@@ -229,6 +229,73 @@ def test_a_resumed_sac_keeps_its_temperature(tmp_path: Path) -> None:
     assert other.log_ent_coef in other.ent_coef_optimizer.param_groups[0]["params"]
 
 
+@pytest.fixture(scope="module")
+def sac() -> Any:
+    """A learner whose buffer of 64 steps has gone round."""
+    training = make_training(SMALL_SAC, 0, None)
+    training.learner.learn(280, callback=training.callbacks)
+    return training.learner
+
+
+@pytest.mark.parametrize(("kept", "steps"), [(50_000, 64), (80, 20)])
+def test_a_resumed_sac_keeps_its_latest_transitions(
+    sac: Any, kept: int, steps: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("agents.experience.KEPT", kept)
+    path = tmp_path / "checkpoint.safetensors"
+    path.write_bytes(to_bytes(sac, 1.0, None))
+    other = make_training(SMALL_SAC, 1, None, sac.num_timesteps).learner
+    restore(other, *load_checkpoint(path), path)
+    assert sac.replay_buffer.full
+    assert other.replay_buffer.size() == steps
+    for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
+        was = np.roll(getattr(sac.replay_buffer, name), -sac.replay_buffer.pos, axis=0)[-steps:]
+        np.testing.assert_array_equal(getattr(other.replay_buffer, name)[:steps], was)
+    other.learn(40, callback=[], reset_num_timesteps=False)
+    assert other.replay_buffer.pos == (steps + 10) % 64
+
+
+def test_normalisation_is_found_by_a_run_that_was_cut_short_before_it_knew_any() -> None:
+    training = make_training(SMALL_SAC, 0, None, done=8)
+    training.learner.num_timesteps = 8
+    training.learner.learn(40, callback=training.callbacks, reset_num_timesteps=False)
+    found = [module.mean for module in training.learner.policy.modules() if isinstance(module, Normalise)]
+    assert found
+    assert all(mean.any() for mean in found)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("replay/rewards", lambda tensor: tensor[:-1]),
+        ("replay/rewards", lambda tensor: tensor[0, 0]),
+        ("replay/actions", lambda tensor: tensor.double()),
+        ("replay/actions", lambda tensor: tensor[:, :, :1].contiguous()),
+        ("replay/dones", lambda tensor: tensor + 0.5),
+        ("replay/observations", lambda tensor: None),
+        ("replay/observations", lambda tensor: tensor * torch.nan),
+        ("replay/surprise", lambda tensor: torch.zeros(1)),
+    ],
+)
+def test_transitions_that_do_not_belong_are_refused(sac: Any, name: str, change: Any, tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    path.write_bytes(to_bytes(sac, 1.0, None))
+    progress, tensors = load_checkpoint(path)
+    tensors[name] = change(tensors.get(name))
+    other = make_training(SMALL_SAC, 1, None).learner
+    with pytest.raises(AgentFileError, match=r"does not fit|not finite"):
+        restore(other, progress, {key: tensor for key, tensor in tensors.items() if tensor is not None}, path)
+    assert other.replay_buffer.size() == 0
+
+
+def test_more_transitions_than_are_kept_are_refused(sac: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    path.write_bytes(to_bytes(sac, 1.0, None))
+    monkeypatch.setattr("agents.experience.KEPT", 80)
+    with pytest.raises(AgentFileError, match="does not fit"):
+        restore(make_training(SMALL_SAC, 1, None).learner, *load_checkpoint(path), path)
+
+
 @pytest.mark.parametrize(
     ("name", "tensor", "message"),
     [
