@@ -33,8 +33,11 @@ test-lowest: ## the tests on the lowest versions that pyproject.toml allows
 	build/lowest/bin/python -m pip install --quiet --constraint constraints-lowest.txt --editable ".[test]"
 	build/lowest/bin/python -m pytest -q -W default --numprocesses auto --dist loadfile
 
-test-newest: ## the tests on the newest versions there are
+# torch comes first and stands: the newest one from PyPI brings gigabytes of CUDA; `make test-newest TORCH=torch` takes it.
+TORCH ?= torch==2.13.0
+test-newest: ## the tests on the newest versions there are, but for torch
 	$(PYTHON) -m venv build/newest
+	build/newest/bin/python -m pip install --quiet "$(TORCH)"
 	build/newest/bin/python -m pip install --quiet --upgrade --editable ".[test]"
 	build/newest/bin/python -m pytest -q --numprocesses auto --dist loadfile
 
