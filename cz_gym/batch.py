@@ -202,14 +202,18 @@ class Batch:
             drawn[slots] = True
             self._photograph(out, drawn)
 
-    def step(self, actions: npt.ArrayLike, out: Out, active: npt.NDArray[np.bool_] | None = None) -> None:
-        """Advance the active slots by one control interval; actions of shape (num_envs, 2), not NaN."""
+    def step(self, actions: npt.ArrayLike, out: Out, active: npt.NDArray[np.bool_] | None = None) -> int:
+        """Advance the active slots by one control interval; actions of shape (num_envs, 2), not NaN.
+
+        Returns how many episodes ended.
+        """
         if actions is not self.actions:
             self.actions[:] = actions
         active = self._all if active is None else active
         arguments = (self.memory, self.actions, active, self.clock, self.reading, out)
-        self._run(self._step, arguments, self.num_envs, SLOTS_PER_THREAD, SLOTS_AT_ONCE)
+        ended: int = sum(self._run(self._step, arguments, self.num_envs, SLOTS_PER_THREAD, SLOTS_AT_ONCE))
         self._photograph(out, active)
+        return ended
 
     def advance(self, rings: npt.NDArray[np.float64]) -> None:
         """Drives, plant and ring [m] of every slot, and nothing else: what the speed of a step is measured against."""

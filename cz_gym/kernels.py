@@ -127,6 +127,7 @@ def _sample(memory: Any, i: Any, fresh: Any, clock: Any, reading: Any, out: Any,
     slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
     t, h_c = slot.k * clock.interval, _height_inside(x.h_c, p)
     ring = x.r_c + ring_offset(x.r_c, h_c, p)
+    at_interface = growth(State(x.r_c, h_c, x.T_1, x.T_2, x.T_b), Disturbance(slot.Q_d, slot.dT_i, 1.0), p, slope)
     if fresh:
         camera, pyrometer = sample_noise(slot.episode, slot.streams)
         sense(slot, camera, pyrometer, memory.frames[i], t, ring - p.ring_bias, h_c)
@@ -143,7 +144,7 @@ def _sample(memory: Any, i: Any, fresh: Any, clock: Any, reading: Any, out: Any,
     cost = cost_terms(error, measured.v_p, slot.v_p - slot.v_p_before, slot.Q_H - slot.Q_H_before)
     if slot.k == 0:
         cost = Cost(0.0, 0.0, 0.0, 0.0)
-    write_info(slot, measured, cost, t, h_c, ring, slope, out.info[:, i])
+    write_info(slot, measured, cost, t, ring, at_interface, out.info[:, i])
     out.info[_CLIPPED, i] = slot.clipped
     return cost
 
@@ -177,7 +178,8 @@ class Kernels(NamedTuple):
     """The compiled loops for one meniscus model."""
 
     step: Any
-    """``step(memory, actions, active, clock, reading, out, start, stop)``: one control interval of the active slots."""
+    """``step(memory, actions, active, clock, reading, out, start, stop)``: one control interval of the active slots;
+    returns how many episodes ended."""
     draw: Any
     """``draw(memory, which, keys, law, mix, parameters, clock, reading, out, start, stop)``: new episodes, each
     from its key, for the slots ``which[start:stop]``, with their first sample; returns a slot whose puller has no
@@ -195,7 +197,8 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
     """Compile the loops for a meniscus model; those of this package's models are kept on disk."""
     slope, ring_offset, height = meniscus.slope, meniscus.ring_offset, meniscus.height
 
-    def step(memory: Any, actions: Any, active: Any, clock: Any, reading: Any, out: Any, start: int, stop: int) -> None:
+    def step(memory: Any, actions: Any, active: Any, clock: Any, reading: Any, out: Any, start: int, stop: int) -> int:
+        ended = 0
         for i in range(start, stop):
             if not active[i]:
                 continue
@@ -210,6 +213,8 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
             out.terminated[i] = not grows
             out.truncated[i] = grows and ends
             slot.over = 1 if (not grows or ends) else 0
+            ended += slot.over
+        return ended
 
     def draw(
         memory: Any, which: Any, keys: Any, law: Any, mix: Any, parameters: Any, clock: Any, reading: Any, out: Any,

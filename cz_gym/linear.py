@@ -101,7 +101,7 @@ def linearise(
             state.r_c,
             state.r_c + meniscus.ring_offset(state.r_c, state.h_c, puller),
             at_interface.v_g,
-            np.arctan(at_interface.sin_alpha / at_interface.cos_alpha),
+            np.arctan(at_interface.tan_alpha),
         )
 
     point = (*x, *u, d.Q_d, d.dT_i)

@@ -7,12 +7,15 @@ bright ring. The default is Hurle's closed form; both functions compile into the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ._compile import physics
+
+SQRT_2, SQRT_HALF = math.sqrt(2.0), math.sqrt(0.5)
 
 
 class MeniscusModel(NamedTuple):
@@ -41,13 +44,15 @@ def hurle_slope(r_c: Any, h_c: Any, p: Any) -> Any:
     """Sine and cosine of theta, solving Hurle's A cos(theta) + sin(theta) = B in closed form.
 
     A = h_c / (2 r_c), B = 1 - h_c^2 / a^2; the branch is theta = arcsin(B / sqrt(1 + A^2)) - arctan(A). Radius
-    and height [m], ``p.a`` the capillary constant [m].
+    and height [m], ``p.a`` the capillary constant [m]. Written without angles, and with no difference of nearly equal
+    numbers under the root: 1 - B^2 = raised (2 - raised).
     """
-    A = h_c / (2.0 * r_c)
-    B = 1.0 - (h_c / p.a) * (h_c / p.a)
-    norm = 1.0 + A * A
-    root = np.sqrt(norm - B * B)
-    return (B - A * root) / norm, (A * B + root) / norm
+    width = 2.0 * r_c
+    raised = h_c * h_c / (p.a * p.a)
+    B = 1.0 - raised
+    root = np.sqrt(h_c * h_c + width * width * (raised * (2.0 - raised)))
+    per = 1.0 / (width * width + h_c * h_c)
+    return (width * width * B - h_c * root) * per, width * (h_c * B + root) * per
 
 
 @physics
@@ -60,13 +65,18 @@ def hurle_height(r_c: Any, theta: Any, a: Any) -> Any:
 @physics
 def profile_scale(r_c: Any, h_c: Any, cos_theta: Any, a: Any) -> Any:
     """Scale M [m] of Hurle's meniscus profile: 1 / M^2 = 1 / a^2 + cos(theta) / (2 r_c h_c)."""
-    return 1.0 / np.sqrt(1.0 / (a * a) + cos_theta / (2.0 * r_c * h_c))
+    curved = 2.0 * r_c * h_c
+    return a * np.sqrt(curved / (curved + a * a * cos_theta))
 
 
 @physics
 def profile(z: Any, M: Any) -> Any:
-    """Horizontal coordinate X(z) [m] of Hurle's profile at height z [m] above the melt, scale M [m]."""
-    return M / np.sqrt(2.0) * np.arccosh(np.sqrt(2.0) * M / z) - np.sqrt(2.0 * M * M - z * z)
+    """Horizontal coordinate X(z) [m] of Hurle's profile at height z [m] above the melt, scale M [m].
+
+    X = M / sqrt(2) arccosh(sqrt(2) M / z) - sqrt(2 M^2 - z^2); arccosh(y) = log(y + sqrt(y^2 - 1)) shares the root.
+    """
+    width = np.sqrt(2.0 * M * M - z * z)
+    return M * SQRT_HALF * np.log((SQRT_2 * M + width) / z) - width
 
 
 @physics

@@ -58,10 +58,8 @@ class Growth(NamedTuple):
 
     v_g: Any
     """Growth rate [m/s]."""
-    sin_alpha: Any
-    """Sine of the cone angle alpha_c = theta - alpha_0 [-]."""
-    cos_alpha: Any
-    """Cosine of the cone angle [-]."""
+    tan_alpha: Any
+    """Tangent of the cone angle alpha_c = theta - alpha_0 [-]."""
 
 
 class Puller(NamedTuple):
@@ -205,7 +203,7 @@ def growth(x: Any, d: Any, p: Any, slope: Any) -> Any:
     sin_theta, cos_theta = slope(x.r_c, x.h_c, p)
     sin_alpha = sin_theta * p.cos_alpha_0 - cos_theta * p.sin_alpha_0
     cos_alpha = cos_theta * p.cos_alpha_0 + sin_theta * p.sin_alpha_0
-    return Growth(v_g, sin_alpha, cos_alpha)
+    return Growth(v_g, sin_alpha / cos_alpha)
 
 
 @physics
@@ -223,7 +221,7 @@ def rates(x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
     into_melt = p.G_2b * (x.T_2 - x.T_b)
     surface_loss = p.kappa_b * (fourth_power(x.T_b) - fourth_power(p.T_e))
     return State(
-        at_interface.v_g * at_interface.sin_alpha / at_interface.cos_alpha,
+        at_interface.v_g * at_interface.tan_alpha,
         u.v_p - at_interface.v_g,
         (u.Q_H - radiated - p.G_1a * (x.T_1 - p.T_a)) / p.C_1,
         (radiated - into_melt) / p.C_2,

@@ -8,7 +8,6 @@ import numpy as np
 
 from ._compile import physics
 from .observation import CLIP, INTEGRAL_SCALE, LAGGED, MEASURED, PREVIEWS, STATE, Measured
-from .plant import Disturbance, State, growth
 from .schedule import bias_offset, recipe, reference
 
 _AHEAD_1, _AHEAD_2 = PREVIEWS[1:]
@@ -98,14 +97,12 @@ def write_state(slot: Any, measured: Any, t: Any, per_scale: Any, out: Any) -> N
 
 
 @physics
-def write_info(slot: Any, measured: Any, cost: Any, t: Any, h_c: Any, ring: Any, slope: Any, info: Any) -> None:
+def write_info(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, at_interface: Any, info: Any) -> None:
     """Write the info rows, all but the last; ``h_c`` is the height held inside its limits, ``ring`` the ring there."""
     p, x = slot.puller, slot.x
-    d = Disturbance(slot.Q_d, slot.dT_i, 1.0)
-    at_interface = growth(State(x.r_c, h_c, x.T_1, x.T_2, x.T_b), d, p, slope)
     values = (
         x.r_c, ring, p.r_0 + measured.r_ref, x.h_c,
-        np.arctan2(at_interface.sin_alpha, at_interface.cos_alpha), at_interface.v_g,
+        np.arctan(at_interface.tan_alpha), at_interface.v_g,
         slot.v_p, slot.Q_H, x.T_1, p.T_1_0 + measured.T_1_ref, x.T_b,
         slot.ring + p.ring_bias, bias_offset(t, slot.episode),
         cost.radius, cost.pull, cost.pull_step, cost.heater_step,

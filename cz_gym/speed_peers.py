@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
+from .rooms import room
 from .speed_cases import THREADS, Case, Skipped, scalar
 from .vector import CzVectorEnv
 
@@ -105,20 +106,9 @@ def _stepping(name: str, env: Any, calls: int = 1) -> Case:
     return Case(name, env.num_envs, lambda: env.step(action), env.close, calls)
 
 
-def agents_module(name: str) -> Any:
-    """A module of the learners' room, as installed or beside the working folder."""
-    try:
-        return importlib.import_module(f"cz_gym.agents.{name}")
-    except ModuleNotFoundError as error:
-        if error.name not in ("cz_gym.agents", f"cz_gym.agents.{name}"):
-            raise
-        return importlib.import_module(f"agents.{name}")
-
-
 def _adapter(name: str) -> Case:
-    return _stepping(
-        name, agents_module("vec_env").CzVecEnv(CzVectorEnv(SB3_SLOTS, autoreset_mode=AutoresetMode.SAME_STEP))
-    )
+    env = CzVectorEnv(SB3_SLOTS, autoreset_mode=AutoresetMode.SAME_STEP)
+    return _stepping(name, room("agents.vec_env").CzVecEnv(env))
 
 
 def _make() -> Any:

@@ -9,7 +9,6 @@ from typing import Any
 from .config import make_config
 from .rooms import room
 from .speed_cases import Skipped
-from .speed_peers import agents_module
 
 NAME = "ppo_share_in_environment"
 _UPDATES = 3
@@ -21,8 +20,8 @@ def environment_share() -> dict[str, float] | Skipped:
     What the teacher computes on the twin is no environment's, nor is imitating it before.
     """
     try:
-        torch = agents_module("network").torch
-        make_training, settings = agents_module("training").make_training, agents_module("settings")
+        torch = room("agents.network").torch
+        make_training, settings = room("agents.training").make_training, room("agents.settings")
     except ImportError as error:
         return Skipped(NAME, f"{error.name or error} is not installed")
     threads = torch.get_num_threads()

@@ -71,7 +71,8 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._batch = Batch(self.config, num_envs, threads)
         self._out = self._batch.new_out()
-        self._over: Mask = np.ones(num_envs, np.bool_)
+        self._everybody: Mask = np.ones(num_envs, np.bool_)
+        self._over = self._everybody.copy()
         self._waiting = True
         self._begun = False
         self._randoms: list[np.random.Generator | None] = [None] * num_envs
@@ -123,12 +124,11 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         out = self._out = self._batch.new_out()
         infos: dict[str, Any] = {}
         if waiting:
-            self._batch.step(actions, out, ~self._over)
+            ended = self._batch.step(actions, out, ~self._over) > 0
             self._redraw(np.flatnonzero(self._over).tolist(), out)
         else:
-            self._batch.step(actions, out)
-        over = out.terminated | out.truncated
-        ended = bool(over.any())
+            ended = self._batch.step(actions, out) > 0
+        over = out.terminated | out.truncated if ended else np.zeros(self.num_envs, np.bool_)
         if self.autoreset_mode == AutoresetMode.SAME_STEP and ended:
             infos = self._finals(out, over)
             reward, terminated, truncated = out.reward.copy(), out.terminated.copy(), out.truncated.copy()
@@ -136,7 +136,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
             out = self._out = out._replace(reward=reward, terminated=terminated, truncated=truncated)
             over, ended = np.zeros_like(over), False
         self._over, self._waiting = over, ended
-        infos.update(self._infos(out, np.ones(self.num_envs, np.bool_)))
+        infos.update(self._infos(out))
         return self._observations(), out.reward, out.terminated.copy(), out.truncated.copy(), infos
 
     def get_state(self) -> tuple[EnvState, ...]:
@@ -248,8 +248,9 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         info = self._infos(out._replace(info=out.info.copy(), state=out.state.copy()), over)
         return {"final_obs": final_obs, "_final_obs": over.copy(), "final_info": info, "_final_info": over.copy()}
 
-    def _infos(self, out: Out, mask: Mask) -> dict[str, Any]:
-        everything = bool(mask.all())
+    def _infos(self, out: Out, mask: Mask | None = None) -> dict[str, Any]:
+        everything = mask is None or bool(mask.all())
+        mask = self._everybody.copy() if mask is None else mask
         infos: dict[str, Any] = dict.fromkeys(_MASKS, mask)
         rows: Any = out.info[:, : self.num_envs]
         infos.update(zip(INFO, rows if everything else np.where(mask, rows, 0.0), strict=True))

@@ -231,7 +231,7 @@ def test_info_is_the_plant_in_si() -> None:
     x = State(info["r_c"], info["h_c"], info["T_1"], math.nan, info["T_b"])
     grown = growth(x, Disturbance(0.0, float(slot["dT_i"]), 1.0), p, cz_gym.HURLE.slope)
     assert info["v_g"] == pytest.approx(grown.v_g, rel=1e-12)
-    assert math.tan(info["alpha_c"]) == pytest.approx(grown.sin_alpha / grown.cos_alpha, rel=1e-9)
+    assert math.tan(info["alpha_c"]) == pytest.approx(grown.tan_alpha, rel=1e-9)
     assert info["r_br"] == pytest.approx(info["r_c"] + cz_gym.HURLE.ring_offset(info["r_c"], info["h_c"], p))
     assert (info["r_ref"], info["T_1_ref"]) == (p.r_0, p.T_1_0)
     assert "state" not in info

@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
@@ -20,8 +20,8 @@ from .whole import write_files as write_files
 
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime", "casadi")
 """Packages whose versions are recorded."""
-RESULTS = "benchmark.json"
-FILES = (RESULTS, "episodes.csv", "report.md", "report.html", "crystal.png", "errors.png", "pareto.png")
+RESULTS, EPISODES = "benchmark.json", "episodes.csv"
+FILES = (RESULTS, EPISODES, "report.md", "report.html", "crystal.png", "errors.png", "pareto.png")
 """Everything a folder of results may hold."""
 
 
@@ -46,16 +46,12 @@ def to_json(benchmark: Benchmark) -> str:
         }
         for scenario in benchmark.scenarios
     }
-    gaps = {
-        scenario.row.name: {o.controller.name: _estimate(o.gap) for o in scenario.outcomes if o.gap}
-        for scenario in benchmark.scenarios
-        if any(o.gap for o in scenario.outcomes)
-    }
     data = {
         "results": results,
         "paired": paired,
         "cvar5": tails,
-        "optimality_gap": gaps,
+        "optimality_gap": _by_scenario(benchmark, lambda outcome: outcome.gap),
+        "optimality_gap_radius": _by_scenario(benchmark, lambda outcome: outcome.gap_radius),
         "verdicts": verdicts,
         "provenance": _provenance(benchmark),
     }
@@ -69,6 +65,15 @@ def is_benchmark_json(content: bytes) -> bool:
     except (ValueError, RecursionError):
         return False
     return isinstance(data, dict) and {"results", "paired", "cvar5", "verdicts", "provenance"} <= set(data)
+
+
+def _by_scenario(benchmark: Benchmark, pick: Callable[[Outcome], Estimate | None]) -> dict[str, Any]:
+    """One estimate an outcome; scenarios without any are left out."""
+    found = {
+        scenario.row.name: {o.controller.name: _estimate(one) for o in scenario.outcomes if (one := pick(o))}
+        for scenario in benchmark.scenarios
+    }
+    return {name: estimates for name, estimates in found.items() if estimates}
 
 
 def _paired(outcome: Outcome) -> dict[str, Any]:
@@ -109,6 +114,7 @@ def _provenance(benchmark: Benchmark) -> dict[str, Any]:
         "agents": [dict(contract) for contract in benchmark.agents],
         "bootstrap": {"resamples": RESAMPLES, "seed": SEED, "paired_against": REFERENCE},
         "gap_measured_from": BOUND,
+        "gap_from_kept_episodes": {s.row.name: len(s.kept_bound.seeds) for s in benchmark.scenarios if s.kept_bound},
     }
 
 

@@ -67,7 +67,7 @@ def slow_sample(
     progress: Callable[[int], None],
 ) -> Sample:
     """The sample of a slow controller; episodes already in ``folder`` are read, the others run and written there."""
-    folder = folder / f"{controller.name}-{config.scenario.name}-{key(controller.name, policy, config)}"
+    folder = place(controller, policy, config, folder)
     shown = seeds[:EXAMPLES]
     kept = {seed: found for seed in seeds if (found := read(folder / f"{seed}.npz", seed in shown)) is not None}
     progress(config.steps * len(kept))
@@ -82,6 +82,17 @@ def slow_sample(
     microseconds = float(np.mean([episode.microseconds for episode in ordered]))
     examples = tuple(Signals(*episode.signals) for episode in ordered[: len(shown)])
     return Sample(controller, tuple(seeds), values, microseconds, examples, config.control_interval)
+
+
+def is_kept(controller: Controller, policy: SlowPolicy, config: Config, seeds: Sequence[int], folder: Path) -> bool:
+    """Whether :func:`slow_sample` would have nothing to run."""
+    folder = place(controller, policy, config, folder)
+    return all(read(folder / f"{seed}.npz", seed in seeds[:EXAMPLES]) is not None for seed in seeds)
+
+
+def place(controller: Controller, policy: SlowPolicy, config: Config, folder: Path) -> Path:
+    """Where a slow controller's episodes are kept."""
+    return folder / f"{controller.name}-{config.scenario.name}-{key(controller.name, policy, config)}"
 
 
 def key(name: str, policy: SlowPolicy, config: Config) -> str:

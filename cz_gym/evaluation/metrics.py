@@ -1,4 +1,4 @@
-"""The benchmark's metrics, on the true radius, one value an episode. They never read the reward's terms."""
+"""The benchmark's metrics on the true radius, one value an episode, from logged signals; ``return`` alone is reward."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..task import RADIUS_LIMIT
+from ..task import RADIUS_LIMIT, cost_terms
 from ..units import KILO, MINUTE, MM, MM_PER_MIN
 from .rollout import Rollout
 
@@ -47,6 +47,8 @@ class Metrics(NamedTuple):
     """RMS of v_g - v_0 [mm/min]."""
     ground_off_pct: Floats
     """Silicon ground off to a cylinder, 100 (mean r_c^2 / min r_c^2 - 1) [%]."""
+    cost: Floats
+    """Mean over the steps of the reward's cost before it saturates, which the clairvoyant bound minimises [-]."""
     failure_rate: Floats
     """1 if the episode failed, else 0 [-]."""
     # ``return`` is not a Python name; metric_names() restores it.
@@ -79,6 +81,7 @@ def metrics(run: Rollout) -> Metrics:
         heater_step_rms_kw=_rms(heater_step, alive) / KILO,
         growth_rate_rms_mm_per_min=_rms(s.v_g - v_0, alive) / MM_PER_MIN,
         ground_off_pct=_ground_off(s.r_c, alive),
+        cost=_cost(error, s.v_p - v_0, pull_step, heater_step, alive),
         failure_rate=run.failed.astype(np.float64),
         return_=run.reward.sum(axis=0),
     )
@@ -88,6 +91,12 @@ def _rms(values: Floats, where: npt.NDArray[np.bool_] | None = None) -> Floats:
     squares = np.square(values)
     mean: Floats = np.mean(squares, axis=0) if where is None else np.mean(squares, axis=0, where=where)
     return np.sqrt(mean)
+
+
+def _cost(error: Floats, pull: Floats, pull_step: Floats, heater_step: Floats, alive: npt.NDArray[np.bool_]) -> Floats:
+    terms = cost_terms(error, *(np.where(alive, moved, 0.0) for moved in (pull, pull_step, heater_step)))
+    mean: Floats = np.sum(terms, axis=0).mean(axis=0)
+    return mean
 
 
 def _last(alive: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:

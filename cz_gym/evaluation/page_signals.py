@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import base64
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,33 +28,42 @@ BITS = 7
 
 
 class Curve(NamedTuple):
-    """A signal as the page shows it."""
+    """A logged signal as the page shows it."""
 
     key: str
     unit: str
+    scale: float
+    """The unit in the signal's own [SI]."""
     resolution: float
     """Values are rounded to a multiple of this [unit]."""
-    value: Callable[[Signals, float], Floats]
-    """The signal in its unit, from the logged ones and the operator's bias [m]."""
+    signal: str = ""
+    """Its field of Signals, where that is not the key."""
+    ring: bool = False
+    """Whether the operator's bias is taken off, as the ring's readings are shown."""
+
+    def value(self, signals: Signals, bias: float) -> Floats:
+        """The signal in its unit, the operator's bias in m."""
+        logged: Floats = getattr(signals, self.signal or self.key)
+        return (logged - bias * self.ring) / self.scale
 
 
 CURVES = (
-    Curve("r_c", "mm", 0.001, lambda s, bias: s.r_c / MM),
-    Curve("camera", "mm", 0.001, lambda s, bias: (s.r_br_measured - bias) / MM),
-    Curve("ring", "mm", 0.001, lambda s, bias: (s.r_br - bias) / MM),
-    Curve("h_c", "mm", 0.001, lambda s, bias: s.h_c / MM),
-    Curve("alpha_c", "deg", 0.001, lambda s, bias: np.degrees(s.alpha_c)),
-    Curve("v_p", "mm/min", 0.0005, lambda s, bias: s.v_p / MM_PER_MIN),
-    Curve("v_g", "mm/min", 0.0005, lambda s, bias: s.v_g / MM_PER_MIN),
-    Curve("Q_H", "kW", 0.001, lambda s, bias: s.Q_H / KILO),
-    Curve("T_1", "K", 0.01, lambda s, bias: s.T_1),
-    Curve("T_b", "K", 0.001, lambda s, bias: s.T_b),
+    Curve("r_c", "mm", MM, 0.001),
+    Curve("camera", "mm", MM, 0.001, "r_br_measured", ring=True),
+    Curve("ring", "mm", MM, 0.001, "r_br", ring=True),
+    Curve("h_c", "mm", MM, 0.001),
+    Curve("alpha_c", "deg", np.pi / 180.0, 0.001),
+    Curve("v_p", "mm/min", MM_PER_MIN, 0.0005),
+    Curve("v_g", "mm/min", MM_PER_MIN, 0.0005),
+    Curve("Q_H", "kW", KILO, 0.001),
+    Curve("T_1", "K", 1.0, 0.01),
+    Curve("T_b", "K", 1.0, 0.001),
 )
 """What a controller does to a crystal."""
 SHARED = (
-    Curve("r_ref", "mm", 0.001, lambda s, bias: s.r_ref / MM),
-    Curve("T_1_ref", "K", 0.01, lambda s, bias: s.T_1_ref),
-    Curve("offset", "mm", 0.001, lambda s, bias: s.ring_offset / MM),
+    Curve("r_ref", "mm", MM, 0.001),
+    Curve("T_1_ref", "K", 1.0, 0.01),
+    Curve("offset", "mm", MM, 0.001, "ring_offset"),
 )
 """What is the same for every controller on that crystal."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from ..units import PERCENT
-from .report import DRIVES, ERROR, GAP, Column
+from .report import DRIVES, ERROR, GAPS, Column, gap_of
 from .results import REFERENCE, Benchmark, Outcome, ScenarioResult
 from .statistics import Estimate
 
@@ -50,7 +50,7 @@ def groups(benchmark: Benchmark) -> tuple[Group, ...]:
     if not any(controller.name == REFERENCE for controller in benchmark.controllers):
         return (error, *others)
     if any(outcome.gap for scenario in benchmark.scenarios for outcome in scenario.outcomes):
-        against = against._replace(columns=(*against.columns, GAP))
+        against = against._replace(columns=(*against.columns, *GAPS))
     return (error, against, *others)
 
 
@@ -96,8 +96,9 @@ def estimate_of(outcome: Outcome, metric: str) -> Estimate | None:
             return outcome.paired.get("rmse_mm")
         case "paired_step":
             return outcome.paired.get("pull_step_rms_mm_per_min")
-        case GAP.metric:
-            return outcome.gap
+    for column in GAPS:
+        if metric == column.metric:
+            return gap_of(outcome, column)
     return outcome.means[metric]
 
 

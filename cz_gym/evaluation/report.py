@@ -1,4 +1,4 @@
-"""The benchmark's results for people: a Markdown report whose first line is the verdict, and a terminal table."""
+"""The benchmark's results for people: a Markdown report whose first line is the verdict."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from ..units import HOUR, PERCENT
 from .metrics import metric_names
-from .results import REFERENCE, SPEED, Benchmark, Outcome, ScenarioResult, Verdict
+from .results import BOUND, REFERENCE, SPEED, Benchmark, Outcome, ScenarioResult, Verdict, common
 from .statistics import Estimate
 
 NOTHING = "-"
@@ -41,11 +41,15 @@ DRIVES = (
     Column("mean_pull_within_3pct", "30 min mean pull within 3 % [%]", 1, PERCENT),
     Column("heater_step_rms_kw", "heater step RMS [kW]", 3),
     Column("growth_rate_rms_mm_per_min", "growth rate RMS [mm/min]", 3),
+    Column("cost", "cost", 4),
     Column("return", "return", 0),
     Column(SPEED, "compute [us/step]", 2),
 )
 
-GAP = Column("optimality_gap", f"optimality gap [% of {REFERENCE}'s]", 1, PERCENT)
+GAPS = (
+    Column("optimality_gap", f"optimality gap in cost [% of {REFERENCE}'s]", 3, PERCENT),
+    Column("optimality_gap_radius", f"in squared radius error [% of {REFERENCE}'s]", 1, PERCENT),
+)
 
 
 def headline(benchmark: Benchmark) -> str:
@@ -93,9 +97,9 @@ def summary(benchmark: Benchmark) -> str:
     )
     rows = []
     for place, outcome in enumerate(first.outcomes):
-        errors = [_interval(scenario.outcomes[place].means["rmse_mm"], ERROR[0]) for scenario in benchmark.scenarios]
-        others = [_interval(outcome.means[column.metric], column) for column in extras]
-        rows.append((_label(outcome, first), *errors, *others))
+        errors = [interval(scenario.outcomes[place].means["rmse_mm"], ERROR[0]) for scenario in benchmark.scenarios]
+        others = [interval(outcome.means[column.metric], column) for column in extras]
+        rows.append((label(outcome, first), *errors, *others))
     return f"{caption}\n\n{_table(('controller', *headings), rows)}"
 
 
@@ -147,27 +151,55 @@ def _scenario(scenario: ScenarioResult) -> list[str]:
         _metrics(scenario, DRIVES),
     ]
     if any(outcome.paired for outcome in scenario.outcomes):
-        parts.append(_comparison(scenario))
+        parts += [_comparison(scenario), _measured_from(scenario)]
     pooled = [outcome for outcome in scenario.outcomes if len(outcome.controller.training_seeds) > 1]
     if pooled:
         parts.append(_training_seeds(pooled))
     return parts
 
 
+def _measured_from(scenario: ScenarioResult) -> str:
+    """Where the optimality gap comes from, or how to get it."""
+    row, bound = scenario.row.name, scenario.kept_bound
+    if bound is not None:
+        count = len(common(bound, *(outcome.sample for outcome in scenario.outcomes))[0].seeds)
+        crystals = "the only crystal" if len(scenario.seeds) == 1 else f"the first {count} crystals"
+        return f"Optimality gaps are measured from `{BOUND}`, kept from an earlier run (results/bounds), on {crystals}."
+    if any(outcome.gap for outcome in scenario.outcomes):
+        return f"Optimality gaps are measured from `{BOUND}` on the crystals that it met."
+    return (
+        f"No optimality gap: the bound is not kept for {row}, or is no better than {REFERENCE}. "
+        f"`python benchmark.py --slow --controllers {REFERENCE},{BOUND} --scenarios {row}` runs it."
+    )
+
+
 def _training_seeds(pooled: Sequence[Outcome]) -> str:
-    """How far the training seeds of each agent lie apart: mean RMSE of the best, the middle and the worst one."""
-    rmse, rows = metric_names().index("rmse_mm"), []
+    """How far the training seeds of each agent lie apart: mean RMSE of the best, the middle and the worst one, and how
+    many crystals each lost."""
+    names, rows = metric_names(), []
     for outcome in pooled:
         seeds = outcome.controller.training_seeds
-        found = outcome.sample.values[..., rmse].mean(axis=1)
+        found = outcome.sample.values[..., names.index("rmse_mm")].mean(axis=1)
+        lost = outcome.sample.values[..., names.index("failure_rate")].sum(axis=1)
         worst = int(found.argmax())
         figures = (f"{value:.3f}" for value in (found.min(), np.median(found), found.max()))
-        rows.append((outcome.controller.name, str(len(seeds)), *figures, str(seeds[worst])))
-    headings = ("agent", "training seeds", "best [mm]", "median [mm]", "worst [mm]", "worst seed")
+        losses = [f"{count:.0f} by seed {seed}" for seed, count in zip(seeds, lost, strict=True) if count]
+        name, crystals = outcome.controller.name, len(outcome.sample.seeds)
+        rows.append((name, str(len(seeds)), *figures, str(seeds[worst]), ", ".join(losses) or "none", str(crystals)))
+    headings = (
+        "agent",
+        "training seeds",
+        "best [mm]",
+        "median [mm]",
+        "worst [mm]",
+        "worst seed",
+        "crystals lost",
+        "of",
+    )
     return _table(headings, rows)
 
 
-def _label(outcome: Outcome, scenario: ScenarioResult) -> str:
+def label(outcome: Outcome, scenario: ScenarioResult) -> str:
     """The controller's name, and how many crystals it met if fewer than the scenario has."""
     met = len(outcome.sample.seeds)
     return outcome.controller.name + (f" (n = {met})" if met < len(scenario.seeds) else "")
@@ -175,7 +207,7 @@ def _label(outcome: Outcome, scenario: ScenarioResult) -> str:
 
 def _metrics(scenario: ScenarioResult, columns: Sequence[Column]) -> str:
     rows = [
-        (_label(outcome, scenario), *(_interval(outcome.means[column.metric], column) for column in columns))
+        (label(outcome, scenario), *(interval(outcome.means[column.metric], column) for column in columns))
         for outcome in scenario.outcomes
     ]
     return _table(("controller", *(column.heading for column in columns)), rows)
@@ -183,15 +215,15 @@ def _metrics(scenario: ScenarioResult, columns: Sequence[Column]) -> str:
 
 def _comparison(scenario: ScenarioResult) -> str:
     outcomes, rmse, step = scenario.outcomes, ERROR[0], DRIVES[1]
-    gaps = any(outcome.gap for outcome in outcomes)
+    gaps = [column for column in GAPS if any(gap_of(outcome, column) for outcome in outcomes)]
     rows = [
         (
-            _label(outcome, scenario),
-            _interval(outcome.cvar5["rmse_mm"], rmse),
-            _interval(outcome.paired["rmse_mm"], rmse) if outcome.paired else NOTHING,
-            _interval(outcome.improvement, rmse) if outcome.improvement else NOTHING,
-            _interval(outcome.paired[step.metric], step) if outcome.paired else NOTHING,
-            *([_interval(outcome.gap, GAP) if outcome.gap else NOTHING] if gaps else []),
+            label(outcome, scenario),
+            interval(outcome.cvar5["rmse_mm"], rmse),
+            interval(outcome.paired["rmse_mm"], rmse) if outcome.paired else NOTHING,
+            interval(outcome.improvement, rmse) if outcome.improvement else NOTHING,
+            interval(outcome.paired[step.metric], step) if outcome.paired else NOTHING,
+            *(interval(gap, column) if (gap := gap_of(outcome, column)) else NOTHING for column in gaps),
         )
         for outcome in outcomes
     ]
@@ -201,12 +233,19 @@ def _comparison(scenario: ScenarioResult) -> str:
         f"RMSE less {REFERENCE}'s [mm]",
         f"better than {REFERENCE} with probability",
         f"pull step RMS less {REFERENCE}'s [mm/min]",
-        *([GAP.heading] if gaps else []),
+        *(column.heading for column in gaps),
     )
     return _table(headings, rows)
 
 
-def _interval(estimate: Estimate, column: Column) -> str:
+def gap_of(outcome: Outcome, column: Column) -> Estimate | None:
+    """What an outcome says in a column of :data:`GAPS`."""
+    return outcome.gap if column is GAPS[0] else outcome.gap_radius
+
+
+def interval(estimate: Estimate, column: Column) -> str:
+    """The mean in the column's unit, with its interval if it has one."""
+
     def number(value: float) -> str:
         text = f"{value / column.unit:.{column.decimals}f}"
         return text[1:] if text.startswith("-") and not text.strip("-0.") else text
@@ -220,44 +259,3 @@ def _interval(estimate: Estimate, column: Column) -> str:
 def _table(headings: Sequence[str], rows: Sequence[Sequence[str]], rule: str = "--:") -> str:
     lines = [" | ".join(headings), " | ".join(["---", *(rule for _ in headings[1:])])]
     return "\n".join(f"| {line} |" for line in [*lines, *(" | ".join(row) for row in rows)])
-
-
-SHOWN = (
-    Column("rmse_mm", "RMSE/mm", 3),
-    Column("max_error_mm", "max/mm", 2),
-    Column("within_half_mm", "in 0.5 mm/%", 1, PERCENT),
-    Column("pull_step_rms_mm_per_min", "pull step/mm/min", 4),
-    Column("heater_step_rms_kw", "heater step/kW", 3),
-    Column("failure_rate", "failures/%", 1, PERCENT),
-    Column(SPEED, "compute/us/step", 2),
-)
-"""Columns of the terminal's table, heading and unit one above the other."""
-
-
-def terminal(benchmark: Benchmark) -> str:
-    """The short table: RMSE with its interval, then means, and the paired difference of RMSE."""
-    headings = [("", "controller"), *_heads(column.heading for column in SHOWN), (f"RMSE less {REFERENCE}'s", "mm")]
-    blocks = []
-    for scenario in benchmark.scenarios:
-        rows = [[_label(outcome, scenario), *_cells(outcome)] for outcome in scenario.outcomes]
-        grid = [[top for top, _ in headings], [unit for _, unit in headings], *rows]
-        widths = [max(len(line[i]) for line in grid) for i in range(len(headings))]
-        crystals = len(scenario.seeds)
-        lines = [f"{scenario.row.name} ({crystals} crystal{'s' if crystals > 1 else ''})"]
-        for name, *cells in grid:
-            padded = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
-            lines.append("  ".join([f"  {name:<{widths[0]}}", *padded]).rstrip())
-        blocks.append("\n".join(lines))
-    return "\n\n".join([*blocks, headline(benchmark)])
-
-
-def _heads(headings: Iterable[str]) -> list[tuple[str, str]]:
-    parts = (heading.split("/", 1) for heading in headings)
-    return [(top, unit) for top, unit in parts]
-
-
-def _cells(outcome: Outcome) -> list[str]:
-    rmse, *others = SHOWN
-    means = [_interval(outcome.means[column.metric]._replace(ci95=None), column) for column in others]
-    paired = _interval(outcome.paired["rmse_mm"], rmse) if outcome.paired else NOTHING
-    return [_interval(outcome.means["rmse_mm"], rmse), *means, paired]

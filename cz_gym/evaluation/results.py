@@ -114,7 +114,9 @@ class Outcome:
     improvement: Estimate | None
     """Probability of a lower RMSE than :data:`REFERENCE` on the same crystal."""
     gap: Estimate | None = None
-    """(J - J_bound) / (J_reference - J_bound), J the mean squared radius error; None without :data:`BOUND`."""
+    """(J - J_bound) / (J_reference - J_bound), J the cost that the bound minimises; None without :data:`BOUND`."""
+    gap_radius: Estimate | None = None
+    """The same with J the mean squared radius error, which is only a part of that cost."""
 
     @property
     def controller(self) -> Controller:
@@ -149,6 +151,8 @@ class ScenarioResult:
     row: Row
     outcomes: tuple[Outcome, ...]
     verdicts: tuple[Verdict, ...]
+    kept_bound: Sample | None = None
+    """What gaps are measured from where :data:`BOUND` took no part in the run: its kept episodes."""
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -171,16 +175,19 @@ class Benchmark:
         return tuple(outcome.controller for outcome in self.scenarios[0].outcomes)
 
 
-def summarise(row: Row, samples: Sequence[Sample]) -> ScenarioResult:
+def summarise(row: Row, samples: Sequence[Sample], kept_bound: Sample | None = None) -> ScenarioResult:
     """Means, tails, paired differences, gaps and verdicts of one scenario.
 
     Controllers that met the same episodes share their resamples; two that met different numbers are compared on those
-    that both met.
+    that both met. ``kept_bound`` stands in for :data:`BOUND` if that is not among the samples.
     """
     resamples = cache(Resamples.draw)
     named = {sample.controller.name: sample for sample in samples}
-    outcomes = tuple(_outcome(sample, named.get(REFERENCE), named.get(BOUND), resamples) for sample in samples)
-    return ScenarioResult(row, outcomes, _verdicts(samples, resamples))
+    if BOUND in named:
+        kept_bound = None
+    bound = named.get(BOUND, kept_bound)
+    outcomes = tuple(_outcome(sample, named.get(REFERENCE), bound, resamples) for sample in samples)
+    return ScenarioResult(row, outcomes, _verdicts(samples, resamples), kept_bound)
 
 
 def _outcome(
@@ -194,7 +201,8 @@ def _outcome(
     if reference is None:
         return outcome
     if bound is not None:
-        outcome = replace(outcome, gap=_gap(sample, reference, bound, resamples))
+        gap, gap_radius = _gaps(sample, reference, bound, resamples)
+        outcome = replace(outcome, gap=gap, gap_radius=gap_radius)
     if sample is reference:
         return outcome
     ours, theirs = common(sample, reference)
@@ -204,9 +212,17 @@ def _outcome(
     return replace(outcome, paired=paired, improvement=better)
 
 
-def _gap(sample: Sample, reference: Sample, bound: Sample, resamples: Callable[[int], Resamples]) -> Estimate | None:
-    ours, theirs, best = (np.square(one.metric("rmse_mm")) for one in common(sample, reference, bound))
-    return optimality_gap(ours, theirs, best, resamples(ours.shape[1]))
+def _gaps(
+    sample: Sample, reference: Sample, bound: Sample, resamples: Callable[[int], Resamples]
+) -> tuple[Estimate | None, Estimate | None]:
+    """In cost, and in squared radius error."""
+    ours, theirs, best = common(sample, reference, bound)
+    shared = resamples(len(ours.seeds))
+
+    def gap(lost: Callable[[Sample], Floats]) -> Estimate | None:
+        return optimality_gap(lost(ours), lost(theirs), lost(best), shared)
+
+    return gap(lambda one: one.metric("cost")), gap(lambda one: np.square(one.metric("rmse_mm")))
 
 
 def common(*samples: Sample) -> tuple[Sample, ...]:

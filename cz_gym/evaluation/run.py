@@ -9,7 +9,8 @@ from types import TracebackType
 from typing import Any
 
 from ..config import Config
-from .kept import slow_sample
+from .kept import is_kept, slow_sample
+from .kept_bound import kept_bound
 from .protocol import SLOW_EPISODES, Row
 from .results import Benchmark, Controller, Sample, summarise
 from .rollout import rollout
@@ -35,6 +36,8 @@ class Plan:
     command: str = ""
     kept: Path | None = None
     """Folder where slow controllers' episodes are kept; needed if there are any."""
+    bounds: Path | None = None
+    """Folder of an earlier benchmark whose bound serves a run without one."""
 
     @property
     def steps(self) -> int:
@@ -50,6 +53,17 @@ class Plan:
     def seeds(self, controller: Controller, row: Row) -> range:
         """The episodes of a row that a controller meets."""
         return row.seeds(min(self.episodes, SLOW_EPISODES) if controller.slow else self.episodes)
+
+    def all_kept(self, contender: Contender) -> bool:
+        """Whether every episode of a slow controller is kept, so that none would be run."""
+        controller, folder = contender.controller, self.kept
+        if folder is None:
+            return False
+        configs = {row: row.config(controller.observation) for row in self.rows}
+        return all(
+            is_kept(controller, contender.make(config)[0], config, self.seeds(controller, row), folder)
+            for row, config in configs.items()
+        )
 
 
 def run(plan: Plan, progress: Progress) -> Benchmark:
@@ -67,7 +81,7 @@ def run(plan: Plan, progress: Progress) -> Benchmark:
                 continue
             runs = [rollout(policy, config, seeds, progress.advance) for policy in policies]
             samples.append(Sample.of(controller, runs))
-        scenarios.append(summarise(row, samples))
+        scenarios.append(summarise(row, samples, kept_bound(plan.bounds, row) if plan.bounds else None))
     return Benchmark(tuple(scenarios), plan.command, plan.agents)
 
 

@@ -97,13 +97,13 @@ def cvar(values: Floats, resamples: Resamples, tail: float = TAIL) -> Estimate:
     return _estimates(point, spread[:, None], values.shape)[0]
 
 
-def optimality_gap(squares: Floats, reference: Floats, bound: Floats, resamples: Resamples) -> Estimate | None:
-    """(J - J_bound) / (J_reference - J_bound), J the mean squared error over seeds and the same episodes.
+def optimality_gap(costs: Floats, reference: Floats, bound: Floats, resamples: Resamples) -> Estimate | None:
+    """(J - J_bound) / (J_reference - J_bound), J the mean of what is lost over seeds and the same episodes.
 
     All three have shape (training seeds, episodes). 0 is the bound, 1 the reference; None where the two are equal.
     """
     point, spread = [], []
-    for of, values in enumerate((squares, reference, bound)):
+    for of, values in enumerate((costs, reference, bound)):
         point.append(values.mean())
         spread.append(_resampled_means(values[:, :, None], resamples, of)[:, 0])
     if point[1] <= point[2]:
@@ -111,7 +111,7 @@ def optimality_gap(squares: Floats, reference: Floats, bound: Floats, resamples:
     ratio = np.array([(point[0] - point[2]) / (point[1] - point[2])])
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = (spread[0] - spread[2]) / (spread[1] - spread[2])
-    return _estimates(ratio, ratios[np.isfinite(ratios), None], squares.shape)[0]
+    return _estimates(ratio, ratios[np.isfinite(ratios), None], costs.shape)[0]
 
 
 def _tail_mean(descending: Floats, weights: Floats, tail: float) -> Floats:
