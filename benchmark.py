@@ -6,7 +6,7 @@ import argparse
 import json
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from agents.contract import Contract
     from baselines.registry import Entry
     from cz_gym.config import Config
-    from cz_gym.evaluation.results import Benchmark
+    from cz_gym.evaluation.protocol import Row
     from cz_gym.evaluation.run import Contender, Plan
 
 FOLDER = Path(__file__).resolve().parent / "results" / "benchmark"
@@ -26,6 +26,8 @@ README = FOLDER.parents[1] / "README.md"
 """Where the committed results are quoted, between two markers."""
 KEPT = FOLDER.parent / "cache"
 """Where episodes of slow controllers are kept."""
+BOUNDS = FOLDER.parent / "bounds"
+"""Committed results of the slow controllers; their bound serves runs without one."""
 DEFAULT = "ppo-default"
 """The training seed of ``ppo`` that did best on validation."""
 SHIPPED = ("ppo", DEFAULT, "ppo-quiet", "ppo-scratch", "ppo-puller")
@@ -91,20 +93,27 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def benchmark(arguments: argparse.Namespace, command: str) -> int:
     """Check, run, write, show."""
-    from cz_gym.evaluation.report import terminal
+    from cz_gym.evaluation.output import check_targets, write
     from cz_gym.evaluation.run import Progress, run
+    from cz_gym.evaluation.terminal import terminal
 
     plan = make_plan(arguments, command)
     partial = is_partial(arguments, plan)
-    check_targets(arguments, partial)
+    check_targets(arguments.out, arguments.json, partial, arguments.overwrite)
     if arguments.out is not None:
         import matplotlib  # noqa: F401  (missing? say so before the work, not after it)
         import plotly  # noqa: F401
     with Progress(plan.steps, arguments.quiet) as progress:
         done = run(plan, progress)
-    write(arguments.out, arguments.json, done, quote=not partial)
+    quoted = README if not partial and arguments.out and arguments.out.resolve() == FOLDER else None
+    write(arguments.out, arguments.json, done, quoted)
     if not arguments.quiet:
         print(f"{terminal(done)}\nwrote {', '.join(str(path) for path in (arguments.out, arguments.json) if path)}")
+        if arguments.controllers == ["all"] and (missing := left_out(plan)):
+            print(
+                f"left out of all: {', '.join(missing)}, which are slow and not kept for every episode asked for; "
+                f"add --slow to run them ({BOUNDS.relative_to(README.parent)}/report.md has what was measured of them)"
+            )
     return 0
 
 
@@ -118,8 +127,40 @@ def make_plan(arguments: argparse.Namespace, command: str) -> Plan:
         rows = tuple(row for row in ROWS if row.default)
     else:
         rows = tuple(find_row(name) for name in arguments.scenarios)
-    contenders, contracts = choose(arguments.controllers, arguments.agent or [], arguments.slow)
-    return Plan(contenders, rows, episodes, contracts, command, KEPT)
+    free = kept_names(rows, episodes) if arguments.controllers and not arguments.slow else set()
+    slow = slow_names() if arguments.slow else free
+    contenders, contracts = choose(arguments.controllers, arguments.agent or [], slow)
+    return Plan(contenders, rows, episodes, contracts, command, KEPT, BOUNDS)
+
+
+def slow_names() -> set[str]:
+    """Controllers that run only when asked for: everyone that is slow."""
+    from baselines.registry import CONTROLLERS
+
+    return {entry.name for entry in CONTROLLERS if entry.slow}
+
+
+def kept_names(rows: Sequence[Row], episodes: int) -> set[str]:
+    """The slow controllers of which every episode asked for is kept, so that they cost no time."""
+    from baselines.registry import CONTROLLERS
+    from cz_gym.evaluation.run import Plan
+
+    found = set()
+    for entry in CONTROLLERS:
+        if entry.slow:
+            try:
+                contender = _classical(entry)
+            except ImportError:
+                continue
+            if Plan((contender,), tuple(rows), episodes, kept=KEPT).all_kept(contender):
+                found.add(entry.name)
+    return found
+
+
+def left_out(plan: Plan) -> list[str]:
+    """Slow controllers that take no part."""
+    taking_part = {contender.controller.name for contender in plan.contenders}
+    return sorted(slow_names() - taking_part)
 
 
 def is_partial(arguments: argparse.Namespace, plan: Plan) -> bool:
@@ -133,56 +174,13 @@ def is_partial(arguments: argparse.Namespace, plan: Plan) -> bool:
     return bool(plan.episodes < EPISODES or every_row - set(plan.rows) or everyone - names or arguments.agent)
 
 
-def check_targets(arguments: argparse.Namespace, partial: bool) -> None:
-    """Raise ValueError or OSError if the results could not be written, or would replace better ones untold."""
-    from cz_gym.evaluation.files import check_writable
-
-    kept = kept_files(arguments.out, arguments.json, partial)
-    if kept and not arguments.overwrite:
-        path, why = kept[0]
-        raise ValueError(f"{path} exists and {why}: add --overwrite, or name another --out or --json")
-    if arguments.json and arguments.json.is_dir():
-        raise ValueError(f"--json {arguments.json} is a folder")
-    for folder in (arguments.out, arguments.json and arguments.json.parent):
-        if folder:
-            check_writable(folder)
-
-
-def kept_files(folder: Path | None, lone: Path | None, partial: bool) -> list[tuple[Path, str]]:
-    """Existing files that this run may not replace untold, each with the reason.
-
-    In a folder: any of the benchmark's files, unless a full run renews an earlier benchmark. A lone JSON file: one
-    that is no earlier benchmark, and for a partial run one that belongs to a folder of results.
-    """
-    from cz_gym.evaluation.files import FILES, RESULTS
-
-    kept = []
-    if folder:
-        earlier = is_benchmark(folder / RESULTS)
-        why = "its folder holds no earlier benchmark" if not earlier else "this run is partial" if partial else ""
-        kept += [(folder / name, why) for name in FILES if why and (folder / name).exists()]
-    if lone and lone.is_file():
-        if not is_benchmark(lone):
-            kept.append((lone, "is no earlier benchmark"))
-        elif partial and lone.name == RESULTS and (lone.resolve().parent / "report.md").exists():
-            kept.append((lone, "this run is partial"))
-    return kept
-
-
-def is_benchmark(path: Path) -> bool:
-    """Whether a file is the JSON of an earlier benchmark."""
-    from cz_gym.evaluation.files import is_benchmark_json
-
-    return path.is_file() and is_benchmark_json(path.read_bytes())
-
-
 def choose(
-    wanted: list[str] | None, files: list[Path], slow: bool = False
+    wanted: list[str] | None, files: list[Path], slow: Container[str] = ()
 ) -> tuple[tuple[Contender, ...], tuple[dict[str, Any], ...]]:
     """Who takes part, classical controllers first, and the contracts of the agents among them.
 
     Agent files named on the command line always take part, in place of the shipped ones; slow controllers only if
-    ``slow``. Raises ValueError for a name that nobody has, and for agent files that cannot be used.
+    ``slow`` names them. Raises ValueError for a name that nobody has, and for agent files that cannot be used.
     """
     from agents import OnnxPolicy, shipped, shipped_seeds
     from baselines.registry import CONTROLLERS
@@ -195,15 +193,17 @@ def choose(
         if name in classical:
             raise ValueError(f"the algorithm of an agent may not be called {name!r}: a controller has that name")
     if wanted is None:
-        wanted = [entry.name for entry in CONTROLLERS if (slow if entry.slow else entry.default)] + learned
+        wanted = [
+            entry.name for entry in CONTROLLERS if (entry.name in slow if entry.slow else entry.default)
+        ] + learned
     elif wanted == ["all"]:
-        wanted = [entry.name for entry in CONTROLLERS if slow or not entry.slow] + learned
+        wanted = [entry.name for entry in CONTROLLERS if not entry.slow or entry.name in slow] + learned
     for name in wanted:
         if name not in classical + learned:
             raise ValueError(f"unknown controller {name!r}; choose from {', '.join(classical + learned)}, or all")
     taking_part = [entry for entry in CONTROLLERS if entry.name in wanted]
     for entry in taking_part:
-        if entry.slow and not slow:
+        if entry.slow and entry.name not in slow:
             raise ValueError(f"{entry.name!r} is slow: add --slow to run it on the first {SLOW_EPISODES} episodes")
     contenders = [_classical(entry) for entry in taking_part]
     contracts = []
@@ -270,28 +270,6 @@ def _nominal() -> Config:
     from cz_gym.evaluation.protocol import ROWS
 
     return ROWS[0].config()
-
-
-def write(folder: Path | None, lone: Path | None, done: Benchmark, quote: bool) -> None:
-    """Write the files, all or none; ``quote`` committed results in the README as well."""
-    from cz_gym.evaluation.files import RESULTS, to_csv, to_json, write_files
-
-    text = to_json(done).encode()
-    files = {lone: text} if lone else {}
-    if folder:
-        from cz_gym.evaluation.figures import draw_figures
-        from cz_gym.evaluation.page import page
-        from cz_gym.evaluation.report import fill_in, markdown
-
-        figures = draw_figures(done)
-        files |= {folder / name: image for name, image in figures.items()}
-        files[folder / "episodes.csv"] = to_csv(done).encode()
-        files[folder / "report.md"] = markdown(done, figures).encode()
-        files[folder / "report.html"] = page(done).encode()
-        files[folder / RESULTS] = text
-        if quote and folder.resolve() == FOLDER and README.is_file():
-            files[README] = fill_in(README.read_text("utf-8"), done).encode()
-    write_files(files)
 
 
 def _one_line(error: Exception) -> str:

@@ -2,7 +2,7 @@
 
 Each controller is linearised from the code that runs (:mod:`baselines.sampled_loop`) and joined, at its control
 interval, with the plant: nominal Model I, nominal Model II, and the pullers of the first validation episodes, of which
-every column shows the worst.
+every column shows the worst. Where a scenario has settings of its own, these follow; a late camera is part of the loop.
 """
 
 from __future__ import annotations
@@ -32,10 +32,12 @@ from cz_gym.units import KILO, MM, MM_PER_MIN
 from .frequency import crossover, loop_margins, peak
 from .linear_form import linear_form
 from .registry import CONTROLLERS, find_controller
-from .sampled_loop import Loop, NotLinearError, close, root_mean_square
+from .sampled_loop import Loop, NotLinearError, close, late, root_mean_square
 
 FAST, SLOW = 30.0, 780.0
 """Correlation times of the interface's fluctuations [s]."""
+USUAL, OTHERS = "randomized", ("puller", "sensor-fault")
+"""The scenario whose settings come first, and those with settings of their own."""
 
 
 class Row(NamedTuple):
@@ -126,22 +128,38 @@ def worst(rows: Sequence[Row], plant: str) -> Row:
     return Row(**columns)
 
 
-def table(names: Sequence[str], pullers: int) -> tuple[list[Row], list[str]]:
-    """Rows of the named controllers, and one line for each that has no linear form."""
-    config, rows, skipped = make_config("randomized"), [], []
-    drawn = random_pullers(config, pullers)
+def table(names: Sequence[str], pullers: int, others: Sequence[str] = OTHERS) -> tuple[list[Row], list[str]]:
+    """Rows of the named controllers, and one line for each that has no linear form.
+
+    First on ``randomized``; then on those of the ``others`` for which a controller has settings of its own.
+    """
+    rows: list[Row] = []
+    skipped: list[str] = []
     for name in names:
+        make = find_controller(name).make
         try:
-            form = linear_form(find_controller(name).make(config))
+            rows += _rows(name, make(make_config(USUAL)), make_config(USUAL), pullers)
         except NotLinearError as error:
             skipped.append(f"{name}: {error}")
             continue
-        for label, lam in (("Model I", 1.0), ("Model II", 0.0)):
-            puller = make_puller(config.parameters, lam, config.meniscus)
-            rows.append(judge(name, label, form.controller, form.free, puller, form.dt))
-        many = [judge(name, "", form.controller, form.free, puller, form.dt) for puller in drawn]
-        rows.append(worst(many, f"worst of {pullers}"))
+        for other in others:
+            config = make_config(other)
+            if make(config) != make(make_config(USUAL)):
+                rows += _rows(f"{name} on {other}", make(config), config, pullers)
     return rows, skipped
+
+
+def _rows(name: str, policy: Any, config: Config, pullers: int) -> list[Row]:
+    """Models I and II, and the worst of the scenario's first pullers."""
+    form = linear_form(policy)
+    behind = round(config.scenario.sensor.latency / form.dt)
+    controller, free = late(form.controller, behind), late(form.free, behind)
+    rows = []
+    for label, lam in (("Model I", 1.0), ("Model II", 0.0)):
+        puller = make_puller(config.parameters, lam, config.meniscus)
+        rows.append(judge(name, label, controller, free, puller, form.dt))
+    many = [judge(name, "", controller, free, puller, form.dt) for puller in random_pullers(config, pullers)]
+    return [*rows, worst(many, f"worst of {pullers}")]
 
 
 def as_markdown(rows: Sequence[Row], skipped: Sequence[str]) -> str:
@@ -156,7 +174,7 @@ def as_markdown(rows: Sequence[Row], skipped: Sequence[str]) -> str:
 
 
 _MEANING = {
-    "controller": "name in the benchmark",
+    "controller": "name in the benchmark; with a scenario, its settings there and that camera's latency in the loop",
     "plant": "nominal puller, or the worst of each column over the pullers of the first validation episodes",
     "stable": "share of the plants on which the closed loop is stable",
     "crossover": "where the loop gain falls through one, loop opened at the camera [rad/s]",
@@ -165,7 +183,7 @@ _MEANING = {
     "gain_up": "factor by which the plant's gain may grow",
     "gain_down": "factor by which it may fall",
     "phase_deg": "least phase margin at the camera [degrees]",
-    "delay": "least delay of the camera that destabilises [s]",
+    "delay": "least delay of the camera, beyond its own, that destabilises [s]",
     "sensitivity": "peak of the sensitivity function",
     "noise_gain": "pull speed RMS per white camera noise RMS [mm/min per mm]",
     "noise_step_gain": "pull speed step RMS per white camera noise RMS [mm/min per mm]",
@@ -196,14 +214,14 @@ def as_json(rows: Sequence[Row], skipped: Sequence[str]) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser(prog="python -m baselines.design_table", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--controllers", nargs="+", help="names; by default every one that has a linear form")
+    parser.add_argument("--controllers", nargs="+", help="names; by default those that the benchmark runs by default")
     parser.add_argument("--pullers", type=int, default=50, help="random pullers for the worst case, at most 500")
     parser.add_argument("--out", type=Path, default=Path("results/design"), help="folder of design.md, .csv and .json")
     args = parser.parse_args(arguments)
     try:
         if not 1 <= args.pullers <= 500:
             raise ValueError(f"--pullers must be between 1 and 500, not {args.pullers}")
-        names = args.controllers or [entry.name for entry in CONTROLLERS if entry.observation == "measured"]
+        names = args.controllers or [entry.name for entry in CONTROLLERS if entry.default]
         rows, skipped = table(names, args.pullers)
         text = as_markdown(rows, skipped)
         contents = {"design.md": text, "design.csv": as_csv(rows), "design.json": as_json(rows, skipped)}

@@ -142,6 +142,23 @@ def close(controller: StateSpace, puller: Puller, dt: float, broken: str = "") -
     return Loop(A, B, C, D, _DISTURBED, ("v_p", "Q_H", "r_c", "r_br"), dt)
 
 
+def late(controller: StateSpace, samples: int) -> StateSpace:
+    """The controller reading the camera that many samples late."""
+    camera = np.zeros((1, controller.B.shape[1]))
+    camera[0, Measured._fields.index("ring_error")] = 1.0
+    for _ in range(samples):
+        A, B, C, D = controller
+        n = len(A)
+        read = B @ camera.T, D @ camera.T
+        controller = StateSpace(
+            np.block([[A, read[0]], [np.zeros((1, n + 1))]]),
+            np.vstack([B * (1.0 - camera), camera]),
+            np.hstack([C, read[1]]),
+            D * (1.0 - camera),
+        )
+    return controller
+
+
 def root_mean_square(system: StateSpace, difference: bool = False) -> float:
     """Standard deviation of the output for white noise of unit standard deviation per sample (Lyapunov equation,
     by doubling: badly scaled slow loops lose no positive variance to rounding).

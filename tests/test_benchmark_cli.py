@@ -22,6 +22,7 @@ from baselines.registry import CONTROLLERS, find_controller
 from cz_gym.config import make_config
 from cz_gym.evaluation import run as running
 from cz_gym.evaluation.metrics import metric_names
+from cz_gym.evaluation.output import check_targets
 from cz_gym.evaluation.protocol import ROWS, TEST_SEEDS, find_row
 from cz_gym.observation import MEASURED, OBSERVATIONS
 
@@ -257,9 +258,7 @@ def test_no_file_of_others_is_replaced_untold(
 
 @pytest.mark.usefixtures("no_work")
 def test_a_full_run_may_renew_an_earlier_benchmark(finished: Path) -> None:
-    benchmark.check_targets(
-        benchmark.parse(["--out", str(finished), "--json", str(finished / "benchmark.json")]), False
-    )
+    check_targets(finished, finished / "benchmark.json", partial=False, overwrite=False)
 
 
 @pytest.mark.parametrize(

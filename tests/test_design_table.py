@@ -14,7 +14,8 @@ from baselines.filtered_pid import FilteredPID
 from baselines.frequency import LoopMargins, crossover, loop_margins, opened, response
 from baselines.linear_form import linear_form
 from baselines.open_loop import OpenLoop
-from baselines.sampled_loop import NotLinearError, close, linear_controller, root_mean_square
+from baselines.registry import find_controller
+from baselines.sampled_loop import NotLinearError, close, late, linear_controller, root_mean_square
 from baselines.temperature_loop import TemperatureLoop
 from cz_gym import make_puller
 from cz_gym.config import make_config
@@ -56,20 +57,6 @@ def scaled(controller, factor):
     return StateSpace(controller.A, B, controller.C, D)
 
 
-def delayed(controller, samples):
-    """The controller reading the camera some samples late."""
-    for _ in range(samples):
-        A, B, C, D = controller
-        n = len(A)
-        late = np.zeros((1, B.shape[1]))
-        late[0, 0] = 1.0
-        rest = np.ones(B.shape[1])
-        rest[0] = 0.0
-        A = np.block([[A, B[:, :1]], [np.zeros((1, n + 1))]])
-        controller = StateSpace(A, np.vstack([B * rest, late]), np.hstack([C, D[:, :1]]), D * rest)
-    return controller
-
-
 @pytest.mark.parametrize("policy", [PAPER, FilteredPID(T_f=20.0)])
 @pytest.mark.parametrize("lam", [1.0, 0.0])
 def test_margins_are_where_the_closed_loop_turns_unstable(policy, lam):
@@ -78,8 +65,26 @@ def test_margins_are_where_the_closed_loop_turns_unstable(policy, lam):
     assert close(scaled(controller, 0.98 * margins.gain_up), puller, 5.0).stable
     assert not close(scaled(controller, 1.02 * margins.gain_up), puller, 5.0).stable
     too_late = math.ceil(margins.delay / 5.0 - 1e-6)
-    assert close(delayed(controller, too_late - 1), puller, 5.0).stable
-    assert not close(delayed(controller, too_late), puller, 5.0).stable
+    assert close(late(controller, too_late - 1), puller, 5.0).stable
+    assert not close(late(controller, too_late), puller, 5.0).stable
+
+
+@pytest.mark.parametrize("samples", [1, 3])
+def test_a_late_camera_only_turns_the_phase(samples):
+    """Loop opened at the camera: the response of the prompt one, turned by the delay."""
+    prompt, puller = linear_controller(FilteredPID(T_f=20.0)), make_puller()
+    found, expected = (response(opened(c, puller, 5.0, "camera"), 5.0, OMEGA) for c in (late(prompt, samples), prompt))
+    np.testing.assert_allclose(found, expected * np.exp(-5.0j * samples * OMEGA), rtol=1e-9)
+
+
+def test_settings_of_another_scenario_follow_with_its_latency(monkeypatch):
+    """A controller with settings of its own on puller has rows for them; one without has none."""
+    rows, _ = design_table.table(["paper", "pid-conventional"], 1, ("puller",))
+    assert [row.controller for row in rows[::3]] == ["paper", "pid-conventional", "pid-conventional on puller"]
+    form = linear_form(find_controller("pid-conventional").make(make_config("puller")))
+    expected = loop_margins(late(form.controller, 1), make_puller(lam=0.0), 5.0)
+    assert rows[7].plant == "Model II"
+    assert rows[7].delay == expected.delay
 
 
 def test_the_printed_controller_bears_no_late_frame():

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from baselines.compensated_pid import CompensatedPID
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import Metrics, metric_names, metrics
-from cz_gym.evaluation.rollout import Rollout, Signals
+from cz_gym.evaluation.rollout import Rollout, Signals, rollout
 
 DT = 5.0
 R, V, Q = 0.0875, 2e-5, 60e3
@@ -38,13 +39,13 @@ def test_names_are_the_published_ones() -> None:
     assert metric_names() == (
         "rmse_mm", "rmse_observable_mm", "max_error_mm", "within_half_mm", "pull_rms_mm_per_min",
         "pull_step_rms_mm_per_min", "mean_pull_within_3pct", "heater_step_rms_kw", "growth_rate_rms_mm_per_min",
-        "ground_off_pct", "failure_rate", "return",
+        "ground_off_pct", "cost", "failure_rate", "return",
     )  # fmt: skip
 
 
 def test_a_perfect_crystal() -> None:
     perfect = of(made_up(720))
-    assert perfect == Metrics(0, 0, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0)
+    assert perfect == Metrics(0, 0, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0)
 
 
 def test_a_constant_error() -> None:
@@ -172,6 +173,26 @@ def test_return_is_the_sum_of_rewards_and_nothing_else_reads_them() -> None:
     rewarded = of(run)
     assert rewarded.return_ == 45
     assert rewarded._replace(return_=0.0) == of(made_up(10, lived=4, r_c=R + 1e-4))
+
+
+def test_cost_is_that_of_the_reward_before_it_saturates() -> None:
+    """Each term where it is one weight, by the printed scales: 0.5 mm, 0.36 and 0.06 mm/min, 1 kW."""
+    assert of(made_up(100, r_c=R + 1e-3)).cost == pytest.approx(4.0)
+    assert of(made_up(100, v_p=V + 0.36 * MM_PER_MIN)).cost == pytest.approx(0.5 + 0.25 * 36.0 / 100)
+    assert of(made_up(100, Q_H=Q + 1e3 * (np.arange(100) % 2))).cost == pytest.approx(0.05 * 99 / 100)
+
+
+def test_cost_of_a_failure_counts_the_lost_radius_to_the_end_and_drives_while_they_lived() -> None:
+    found = of(made_up(10, lived=4, v_p=V + 0.36 * MM_PER_MIN))
+    assert found.cost == pytest.approx((7 * 16.0**2 + 4 * 0.5 + 0.25 * 36.0) / 10)
+
+
+def test_cost_gives_the_reward_of_every_step() -> None:
+    """One step an episode: what the environment paid is the saturated cost."""
+    for seed in range(3):
+        run = rollout(CompensatedPID(), make_config("randomized", horizon=DT), [seed])
+        found = metrics(run)
+        np.testing.assert_allclose(found.return_, 1.0 - 10.0 * found.cost / (10.0 + found.cost), rtol=1e-6)
 
 
 def test_episodes_do_not_mix() -> None:

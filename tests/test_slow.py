@@ -16,9 +16,12 @@ from baselines import registry
 from baselines.fingerprint import fingerprint
 from baselines.open_loop import OpenLoop
 from cz_gym.config import make_config
-from cz_gym.evaluation import kept, run
+from cz_gym.evaluation import kept, results, run
+from cz_gym.evaluation.files import to_csv, to_json, write_files
+from cz_gym.evaluation.kept_bound import kept_bound
 from cz_gym.evaluation.metrics import metric_names
-from cz_gym.evaluation.protocol import find_row
+from cz_gym.evaluation.protocol import TEST_SEEDS, find_row
+from cz_gym.evaluation.report import markdown
 from cz_gym.evaluation.results import Controller, Sample, summarise
 from cz_gym.evaluation.rollout import Signals, rollout
 from cz_gym.evaluation.statistics import Resamples, optimality_gap
@@ -138,15 +141,16 @@ def test_code_counts_and_text_does_not(tmp_path: Path, monkeypatch: pytest.Monke
     assert fingerprint(1, "thing") != hashes[2]
 
 
-def made(name: str, errors: list[float], **facts: Any) -> Sample:
-    """A sample with these RMSEs [mm]."""
+def made(name: str, errors: list[float], costs: list[float] | None = None, **facts: Any) -> Sample:
+    """A sample with these RMSEs [mm] and costs."""
     values = np.zeros((1, len(errors), len(metric_names())))
     values[0, :, 0] = errors
+    values[0, :, metric_names().index("cost")] = errors if costs is None else costs
     signals = Signals(*(np.zeros(3) for _ in Signals._fields))
     return Sample(Controller(name, "measured", "", **facts), tuple(range(len(errors))), values, 1.0, (signals,), 5.0)
 
 
-def test_the_gap_is_zero_at_the_bound_one_at_the_reference_and_counts_squares() -> None:
+def test_the_gap_is_zero_at_the_bound_and_one_at_the_reference() -> None:
     bound, reference = np.array([[0.0, 1.0]]), np.array([[4.0, 9.0]])
     resamples = Resamples.draw(2)
     assert optimality_gap(bound, reference, bound, resamples) == (0.0, (0.0, 0.0), 2)
@@ -160,9 +164,9 @@ def test_the_gap_is_zero_at_the_bound_one_at_the_reference_and_counts_squares() 
 
 def test_different_numbers_of_episodes_meet_on_those_of_both() -> None:
     samples = [
-        made("paper", [1.0, 2.0, 30.0]),
-        made("lqg", [0.5, 0.4, 9.0]),
-        made("clairvoyant", [0.0, 0.1], told=True),
+        made("paper", [1.0, 2.0, 30.0], [8.0, 4.0, 99.0]),
+        made("lqg", [0.5, 0.4, 9.0], [3.0, 1.0, 99.0]),
+        made("clairvoyant", [0.0, 0.1], [1.0, 1.0], told=True),
         made("mpc", [0.6, 0.5]),
         made("ppo", [0.4, 0.3, 9.0], training_seeds=(0,)),
     ]
@@ -172,9 +176,11 @@ def test_different_numbers_of_episodes_meet_on_those_of_both() -> None:
     assert by_name["mpc"].paired["rmse_mm"][::2] == pytest.approx((0.55 - 1.5, 2))
     assert by_name["lqg"].paired["rmse_mm"][::2] == pytest.approx((9.9 / 3 - 11.0, 3))
     assert by_name["mpc"].improvement[::2] == (1.0, 2)
-    gap = by_name["lqg"].gap
+    gap, gap_radius = by_name["lqg"].gap, by_name["lqg"].gap_radius
     assert gap is not None
-    assert gap.mean == pytest.approx(((0.25 + 0.16) / 2 - 0.005) / (2.5 - 0.005))
+    assert gap_radius is not None
+    assert gap.mean == pytest.approx((2.0 - 1.0) / (6.0 - 1.0))
+    assert gap_radius.mean == pytest.approx(((0.25 + 0.16) / 2 - 0.005) / (2.5 - 0.005))
     assert {name: outcome.gap.n for name, outcome in by_name.items()} == dict.fromkeys(by_name, 2)
     # On the two episodes of all, lqg is the better rival; on its own three it would look worse than mpc.
     assert result.verdicts[0].rival == "lqg"
@@ -183,9 +189,10 @@ def test_different_numbers_of_episodes_meet_on_those_of_both() -> None:
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A registry with a slow entry that is a bound, and two episodes for it."""
+    """A registry of three quick controllers and a slow one that is a bound, two episodes for it, no agents."""
     snail = registry.Entry("clairvoyant", lambda config: Snail(), "measured", "slow", False, told=True, slow=True)
-    quick = tuple(entry for entry in registry.CONTROLLERS if not entry.slow)
+    quick = tuple(registry.find_controller(name) for name in ("open-loop", "paper", "pid-uncompensated"))
+    monkeypatch.setattr(benchmark, "SHIPPED", ())
     monkeypatch.setattr(registry, "CONTROLLERS", (*quick, snail))
     monkeypatch.setattr(run, "SLOW_EPISODES", 2)
     monkeypatch.setattr(benchmark, "KEPT", tmp_path / "kept")
@@ -209,13 +216,112 @@ def test_the_command_shows_how_many_episodes_a_slow_controller_met(small: Path) 
     assert len(list((small.parent / "kept").glob("clairvoyant-randomized-*/*.npz"))) == 2
 
 
+def taking_part(arguments: list[str]) -> list[str]:
+    plan = benchmark.make_plan(benchmark.parse([*arguments, "--scenarios", "randomized,nominal"]), "")
+    return [contender.controller.name for contender in plan.contenders]
+
+
 def test_slow_controllers_run_only_when_asked_for(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert benchmark.main(["--controllers", "paper,clairvoyant", "--out", str(small)]) == 2
     assert capsys.readouterr().err == (
         "benchmark.py: 'clairvoyant' is slow: add --slow to run it on the first 50 episodes\n"
     )
     assert not small.exists()
-    for wanted in (None, ["all"]):
-        for slow in (False, True):
-            names = [contender.controller.name for contender in benchmark.choose(wanted, [], slow)[0]]
-            assert ("clairvoyant" in names) == slow
+    for wanted in ([], ["--controllers", "all"]):
+        assert "clairvoyant" not in taking_part(wanted)
+        assert "clairvoyant" in taking_part([*wanted, "--slow"])
+
+
+def test_all_takes_those_that_are_kept_and_names_the_others(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    everyone = ["--controllers", "all", "--episodes", "2"]
+    nominal = ["--scenarios", "nominal", "--json", str(small.parent / "all.json")]
+    assert benchmark.main([*everyone, *nominal]) == 0
+    assert "left out of all: clairvoyant, which are slow" in capsys.readouterr().out
+    arguments = ["--controllers", "clairvoyant", "--slow", "--scenarios", "nominal", "--episodes", "2", "--quiet"]
+    assert benchmark.main([*arguments, "--json", str(small.parent / "one.json")]) == 0
+    assert "clairvoyant" not in taking_part(everyone)  # nominal is kept, randomized is not
+    assert benchmark.main([*everyone, *nominal]) == 0
+    assert "left out" not in capsys.readouterr().out
+    data = json.loads((small.parent / "all.json").read_text())
+    assert "clairvoyant" in data["results"]["nominal"]
+    assert "clairvoyant" not in taking_part([])  # who names nobody gets the default, whatever is kept
+
+
+@pytest.fixture
+def earlier(tmp_path: Path) -> Path:
+    """A folder with the results of an earlier run with a bound, on two crystals."""
+    samples = (made("paper", [1.0, 2.0]), made("clairvoyant", [0.1, 0.2], [0.3, 0.5], told=True, slow=True))
+    here = [replace(sample, seeds=TEST_SEEDS[:2]) for sample in samples]
+    done = benchmark_of(*here)
+    folder = tmp_path / "earlier"
+    write_files({folder / "benchmark.json": to_json(done).encode(), folder / "episodes.csv": to_csv(done).encode()})
+    return folder
+
+
+def test_gaps_are_measured_from_the_kept_bound(earlier: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(benchmark, "BOUNDS", earlier)
+    arguments = ["--episodes", "3", "--scenarios", "randomized,hard", "--controllers", "open-loop,paper"]
+    assert benchmark.main([*arguments, "--out", str(tmp_path / "new"), "--quiet"]) == 0
+    data = json.loads((tmp_path / "new" / "benchmark.json").read_text())
+    assert list(data["optimality_gap"]) == list(data["optimality_gap_radius"]) == ["randomized"]
+    lines = list(csv.DictReader((tmp_path / "new" / "episodes.csv").read_text().splitlines()))
+    for metric, power, best in (("cost", 1, (0.3 + 0.5) / 2), ("rmse_mm", 2, (0.01 + 0.04) / 2)):
+        ours, theirs = (
+            np.mean([float(line[metric]) ** power for line in lines if line["controller"] == name][:2])
+            for name in ("open-loop", "paper")
+        )
+        found = data["optimality_gap" if power == 1 else "optimality_gap_radius"]["randomized"]["open-loop"]
+        assert found["mean"] == pytest.approx((ours - best) / (theirs - best), rel=1e-3)
+        assert found["n"] == 2
+    assert data["provenance"]["gap_from_kept_episodes"] == {"randomized": 2}
+    report = (tmp_path / "new" / "report.md").read_text()
+    assert "kept from an earlier run (results/bounds), on the first 2 crystals" in report
+    assert "`python benchmark.py --slow --controllers paper,clairvoyant --scenarios hard` runs it" in report
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('"plant_hash": "', '"plant_hash": "0'),
+        ('"hash": "', '"hash": "0'),
+        ('"control_interval_s": 5.0', '"control_interval_s": 2.0'),
+        ('"provenance"', '"origin"'),
+        ("{", "["),
+    ],
+)
+def test_a_bound_of_another_plant_or_no_benchmark_at_all_is_not_used(earlier: Path, old: str, new: str) -> None:
+    row, path = find_row("randomized"), earlier / "benchmark.json"
+    found = kept_bound(earlier, row)
+    assert found is not None
+    assert found.seeds == (2_000_000, 2_000_001)
+    assert found.controller.bound
+    np.testing.assert_allclose(found.metric("cost"), [[0.3, 0.5]])
+    path.write_text(path.read_text().replace(old, new))
+    assert kept_bound(earlier, row) is None
+
+
+def test_a_kept_bound_needs_its_episodes_from_the_first_on(earlier: Path) -> None:
+    row, table = find_row("randomized"), earlier / "episodes.csv"
+    whole = table.read_text()
+    assert kept_bound(earlier, find_row("hard")) is None
+    for broken in (whole.replace(",2000000,", ",2000001,"), whole.replace("cost", "price"), "", whole[:-9] + "nan\n"):
+        table.write_text(broken)
+        assert kept_bound(earlier, row) is None
+    table.unlink()
+    assert kept_bound(earlier, row) is None
+
+
+def benchmark_of(*samples: Sample) -> results.Benchmark:
+    return results.Benchmark((summarise(find_row("randomized"), samples),), "", ())
+
+
+def test_the_table_of_training_seeds_tells_who_lost_crystals() -> None:
+    sample = made("ppo", [0.1, 0.2, 0.3], training_seeds=(4, 7, 9))
+    values = np.repeat(sample.values, 3, axis=0)
+    values[1, :, metric_names().index("failure_rate")] = [0.0, 1.0, 1.0]
+    values[1, :, 0] = 5.0
+    report = markdown(benchmark_of(replace(sample, values=values)), ())
+    assert "| ppo | 3 | 0.200 | 0.200 | 5.000 | 7 | 2 by seed 7 | 3 |" in report
+    values[1, :, metric_names().index("failure_rate")] = 0.0
+    report = markdown(benchmark_of(replace(sample, values=values)), ())
+    assert "| 7 | none | 3 |" in report
