@@ -23,7 +23,7 @@ from cz_gym.batch import new_key
 from cz_gym.commands import OneLineParser, interrupted
 from cz_gym.config import Config, make_config
 from cz_gym.episode import draw_factors, randomised
-from cz_gym.evaluation.files import write_files
+from cz_gym.evaluation.files import check_writable, write_files
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.linear import StateSpace, radius_model
 from cz_gym.plant import Puller, make_puller
@@ -221,6 +221,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if not 1 <= args.pullers <= 500:
             raise ValueError(f"--pullers must be between 1 and 500, not {args.pullers}")
+        check_writable(args.out)
         names = args.controllers or [entry.name for entry in CONTROLLERS if entry.default]
         rows, skipped = table(names, args.pullers)
         text = as_markdown(rows, skipped)

@@ -21,7 +21,7 @@ import numpy as np
 
 from cz_gym.commands import OneLineParser, interrupted
 from cz_gym.config import Config, make_config
-from cz_gym.evaluation.files import write_files
+from cz_gym.evaluation.files import check_writable, write_files
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
@@ -230,6 +230,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         config = make_config(args.scenario)
         space = space_of(args.controller, config.scenario.name)
         folder = args.out / space.name / config.scenario.name
+        check_writable(folder)
         survive = args.survive if config.scenario.name == "randomized" else 0
         training = Episodes(config, TRAINING[: args.episodes], TRAINING[:survive])
         validation = Episodes(config, VALIDATION[: args.validation], VALIDATION[: args.validation * (survive > 0)])

@@ -77,6 +77,26 @@ def test_an_interrupt_is_one_line_and_leaves_nothing(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("module", "work", "arguments"),
+    [(*row[:2], [str(part).replace("new/", "file/") for part in row[2]]) for row in WORK if "new/" in str(row[2])]
+    + [(speed, "run", ["--quick", "--json", "file/speed.json"])],
+    ids=lambda part: getattr(part, "__name__", None),
+)
+def test_a_place_that_cannot_be_written_is_refused_before_the_work(
+    module: Any, work: str, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(module, work, interrupt)
+    (tmp_path / "file").write_text("not a folder")
+    assert module.main(arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert "file is not a folder" in captured.err
+
+
 def test_help_of_the_meniscus_writes_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(young_laplace_build, "TABLE", tmp_path / "table.py")
     monkeypatch.setattr(young_laplace_build, "build", interrupt)
