@@ -48,7 +48,20 @@ QUIET = LQGSettings(
 """``lqg-quiet``: the radius as well as pull steps of 0.0095 mm/min allow."""
 PULLER_RING = RingModel(latency=5.0, ripple_sd=0.08 * MM)
 """The camera of ``puller``: its latency and rotation, and what amplitudes between 0 and 0.2 mm come to on average."""
-PULLER_REWARD = replace(REWARD, noise=replace(REWARD.noise, heater_walk=1.0), ring=PULLER_RING)
+PULLER_REWARD = LQGSettings(
+    noise=NoiseModel(
+        fast_sd=0.5188,
+        slow_sd=0.2875,
+        drift_rate_sd=0.001395,
+        drift_rate_tau=3324.0,
+        heater_walk=2.462,
+        thermal_walk=0.002528,
+        recipe_share=0.3956,
+        pyrometer_sd=0.08621,
+    ),
+    weights=Weights(pull=0.1095, pull_step=0.06209, heater_step=1.577),
+    ring=PULLER_RING,
+)
 """``lqg`` on ``puller``: the observable radius as well as pull steps of 0.016 mm/min allow."""
 PULLER_QUIET = LQGSettings(
     noise=NoiseModel(
