@@ -245,6 +245,7 @@ def _classical(entry: Entry) -> Contender:
 
 def _agent(name: str, policies: Sequence[Any]) -> Contender:
     """A learned controller: every training seed of one algorithm. Raises ValueError if they are no such set."""
+    from agents.resampled import at_interval
     from cz_gym.evaluation.results import Controller
     from cz_gym.evaluation.run import Contender
 
@@ -263,7 +264,11 @@ def _agent(name: str, policies: Sequence[Any]) -> Contender:
     meaning = f"agent trained with {contracts[0].algorithm} on {contracts[0].scenario}"
     if name == DEFAULT:
         meaning += ", the seed that did best on validation"
-    return Contender(Controller(name, policies[0].observation, meaning, seeds), lambda config: policies)
+
+    def make(config: Config) -> list[Any]:
+        return [at_interval(policy, config.control_interval) for policy in policies]
+
+    return Contender(Controller(name, policies[0].observation, meaning, seeds), make)
 
 
 def _nominal() -> Config:

@@ -24,7 +24,9 @@ from cz_gym.evaluation import run as running
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.output import check_targets
 from cz_gym.evaluation.protocol import ROWS, TEST_SEEDS, find_row
+from cz_gym.meniscus import HURLE
 from cz_gym.observation import MEASURED, OBSERVATIONS
+from cz_gym.young_laplace import YOUNG_LAPLACE
 
 ALL_METRICS = {*metric_names(), "microseconds_per_step"}
 FILES = ["benchmark.json", "crystal.png", "episodes.csv", "errors.png", "pareto.png", "report.html", "report.md"]
@@ -405,9 +407,13 @@ def test_rows_are_the_published_ones() -> None:
     ]  # fmt: skip
     for row in ROWS:
         assert find_row(row.name) is row
-        assert row.config().steps == 2160
+        assert row.config().steps == round(10_800 / row.control_interval)
+        assert row.told().meniscus == HURLE
         deterministic = row.name.startswith(("paper-", "reference-", "nominal"))
         assert len(row.seeds(500)) == (1 if deterministic else 500)
     assert find_row("hard").seeds(500) == range(2_000_000, 2_000_500)
     assert find_row("hard").seeds(7) == range(2_000_000, 2_000_007)
     assert find_row("paper-ramp-II").config().mix == (0.0, 0.0)
+    assert find_row("randomized-2s").config("history").control_interval == 2.0
+    assert find_row("randomized-exact").config().meniscus == YOUNG_LAPLACE
+    assert {row.name for row in ROWS if row.config().plant_hash != row.told().plant_hash} == {"randomized-exact"}

@@ -105,6 +105,8 @@ def _provenance(benchmark: Benchmark) -> dict[str, Any]:
                 "scenario": scenario.row.scenario,
                 "hash": SCENARIOS[scenario.row.scenario].hash,
                 "model": scenario.row.model,
+                "control_interval_s": scenario.row.control_interval,
+                "meniscus": scenario.row.meniscus.name,
                 "first_seed": scenario.seeds[0],
                 "episodes": len(scenario.seeds),
             }

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ..config import Config, make_config
+from ..meniscus import HURLE, MeniscusModel
 from ..scenarios import SCENARIOS
+from ..young_laplace import YOUNG_LAPLACE
 
 TRAINING_SEEDS = range(1_000_000)
 """Seeds of the episodes that controllers are tuned and agents are trained on."""
@@ -30,10 +32,18 @@ class Row:
     """ "I" or "II", or None for the scenario's own draw."""
     default: bool = True
     """Whether a benchmark that names no scenarios runs it."""
+    control_interval: float = 5.0
+    """Time between actions [s]."""
+    meniscus: MeniscusModel = HURLE
+    """What the crystals grow on; controllers and agents know Hurle's, whatever it is."""
 
     def config(self, observation: str = "measured") -> Config:
-        """The environment's settings: 5 s control, three hours, this row's scenario and model."""
-        return make_config(self.scenario, self.model, observation)
+        """The environment's settings: three hours, this row's scenario, model, interval and meniscus."""
+        return make_config(self.scenario, self.model, observation, self.control_interval, meniscus=self.meniscus)
+
+    def told(self, observation: str = "measured") -> Config:
+        """The settings that a controller is made for: the same on Hurle's meniscus."""
+        return make_config(self.scenario, self.model, observation, self.control_interval)
 
     def seeds(self, episodes: int) -> range:
         """The first test seeds; one where every draw is the same."""
@@ -71,8 +81,19 @@ ROWS: tuple[Row, ...] = (
         Row(f"only-{name}", f"only-{name}", f"{what} alone, as wide as in randomized", default=False)
         for name, what in _ALONE
     ),
+    Row("randomized-I", "randomized", "randomized, every puller conducting only: Model I", "I", default=False),
+    Row("randomized-II", "randomized", "randomized, every puller convecting only: Model II", "II", default=False),
+    Row("randomized-2s", "randomized", "randomized, an action every 2 s", default=False, control_interval=2.0),
+    Row("randomized-10s", "randomized", "randomized, an action every 10 s", default=False, control_interval=10.0),
+    Row(
+        "randomized-exact",
+        "randomized",
+        "randomized on the exact Young-Laplace meniscus, which no controller is told of",
+        default=False,
+        meniscus=YOUNG_LAPLACE,
+    ),
 )
-"""Every row, in the order of tables; those with one disturbance family alone run when asked for."""
+"""Every row, in the order of tables; families of disturbances alone and variants of randomized run when asked for."""
 
 
 def find_row(name: str) -> Row:

@@ -61,7 +61,13 @@ class Plan:
             return False
         configs = {row: row.config(controller.observation) for row in self.rows}
         return all(
-            is_kept(controller, contender.make(config)[0], config, self.seeds(controller, row), folder)
+            is_kept(
+                controller,
+                contender.make(row.told(controller.observation))[0],
+                config,
+                self.seeds(controller, row),
+                folder,
+            )
             for row, config in configs.items()
         )
 
@@ -75,7 +81,7 @@ def run(plan: Plan, progress: Progress) -> Benchmark:
             controller = contender.controller
             config = row.config(controller.observation)
             progress.say(f"{row.name}, {controller.name}")
-            policies, seeds = contender.make(config), plan.seeds(controller, row)
+            policies, seeds = contender.make(row.told(controller.observation)), plan.seeds(controller, row)
             if controller.slow:
                 samples.append(_slow(plan, controller, policies, config, seeds, progress))
                 continue

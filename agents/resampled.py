@@ -1,0 +1,52 @@
+"""An agent at another control interval than the one it was trained at.
+
+The channels of "history" are defined in time, so an agent can read them at any interval, means over at least one
+sample. What it asks for is a move of the drives within its own interval; so within another it makes that share of it:
+action = applied + (interval / trained) (asked - applied). A plain repetition would move the drives so many times too
+fast or too slowly. This is an override: the contract's interval stays what the agent was trained and picked at.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.observation import MEASURED
+
+from .onnx_policy import OnnxPolicy
+
+_DRIVES = [[channel.name for channel in MEASURED].index(name) for name in ("v_p", "Q_H")]
+
+
+@dataclass(frozen=True)
+class Resampled:
+    """An agent whose moves are stretched to another control interval."""
+
+    policy: OnnxPolicy
+    share: float
+    """The interval over the one it was trained at [-]."""
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[npt.NDArray[np.float32], Any]:
+        """Actions as :meth:`agents.OnnxPolicy.predict`, each move the share of the one asked for, within the box."""
+        asked, state = self.policy.predict(observation, state, episode_start, deterministic)
+        applied = np.asarray(observation, np.float32)[..., _DRIVES]
+        moved = applied + np.float32(self.share) * (asked - applied)
+        return np.clip(moved, -1.0, 1.0), state
+
+
+def at_interval(policy: OnnxPolicy, control_interval: float) -> OnnxPolicy | Resampled:
+    """The agent itself at its own control interval [s], its moves stretched at any other.
+
+    ValueError for an agent that remembers: what a sample does to its memory belongs to its interval.
+    """
+    share = control_interval / policy.contract.control_interval
+    if share == 1.0:
+        return policy
+    if policy.remembers:
+        raise ValueError(f"an agent with a memory runs at its own {policy.contract.control_interval:g} s alone")
+    return Resampled(policy, share)

@@ -1,0 +1,54 @@
+"""Agents at another control interval: their moves are stretched, not repeated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import agents
+from agents.resampled import Resampled, at_interval
+from cz_gym.config import make_config
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.observation import HISTORY
+
+AGENT = agents.OnnxPolicy.load(agents.shipped())
+NAMES = [channel.name for channel in HISTORY]
+
+
+def test_own_interval_changes_nothing() -> None:
+    assert at_interval(AGENT, AGENT.contract.control_interval) is AGENT
+
+
+@pytest.mark.parametrize("interval", [2.0, 10.0])
+def test_a_move_is_the_intervals_share_of_the_one_asked_for(interval: float) -> None:
+    observation = np.random.default_rng(0).normal(0.0, 0.02, (5, len(HISTORY))).astype(np.float32)
+    asked, _ = AGENT.predict(observation)
+    applied = observation[:, [NAMES.index("v_p"), NAMES.index("Q_H")]]
+    action, state = at_interval(AGENT, interval).predict(observation)
+    assert state is None
+    assert action.dtype == np.float32
+    assert action == pytest.approx(np.clip(applied + interval / 5.0 * (asked - applied), -1.0, 1.0), abs=1e-6)
+    single, _ = at_interval(AGENT, interval).predict(observation[0])
+    assert single == pytest.approx(action[0], abs=1e-6)
+
+
+def test_stretched_moves_hold_the_radius_where_repeated_ones_do_not() -> None:
+    seeds = VALIDATION_SEEDS[:6]
+
+    def error(policy: object, interval: float) -> float:
+        config = make_config("randomized", observation="history", control_interval=interval)
+        return float(metrics(rollout(policy, config, seeds)).rmse_mm.mean())
+
+    own = error(AGENT, 5.0)
+    assert error(at_interval(AGENT, 2.0), 2.0) < 1.1 * own < error(AGENT, 2.0)
+    assert error(at_interval(AGENT, 10.0), 10.0) < 1.3 * own
+
+
+def test_an_agent_that_remembers_stays_at_its_interval() -> None:
+    with pytest.raises(ValueError, match="an agent with a memory runs at its own 5 s alone"):
+        at_interval(replace(AGENT, remembers=3), 2.0)
+    assert isinstance(at_interval(AGENT, 2.0), Resampled)
