@@ -285,6 +285,7 @@ def test_gaps_are_measured_from_the_kept_bound(earlier: Path, tmp_path: Path, mo
         ('"plant_hash": "', '"plant_hash": "0'),
         ('"hash": "', '"hash": "0'),
         ('"control_interval_s": 5.0', '"control_interval_s": 2.0'),
+        ('"meniscus": "', '"meniscus": "not '),
         ('"provenance"', '"origin"'),
         ("{", "["),
     ],

@@ -19,8 +19,8 @@ from .results import BOUND, Controller, Sample
 def kept_bound(folder: Path, row: Row) -> Sample | None:
     """The bound on that row, from a folder of benchmark results; signals and time are not kept there.
 
-    None unless the folder's benchmark met the row's own first test episodes: same plant, scenario and model by their
-    hashes, same interval, horizon and first seeds.
+    None unless the folder's benchmark met the row's own first test episodes: same plant and scenario by their hashes,
+    same model, meniscus, interval, horizon and first seeds.
     """
     try:
         made = json.loads((folder / RESULTS).read_text("utf-8"))["provenance"]
@@ -41,6 +41,12 @@ def kept_bound(folder: Path, row: Row) -> Sample | None:
 
 def _same(made: dict[str, Any], row: Row) -> bool:
     """Whether those results are of the row's plant and scenario."""
-    config, scenario = row.config(), made["scenarios"][row.name]
-    theirs = (made["plant_hash"], made["control_interval_s"], made["horizon_s"], scenario["hash"], scenario["model"])
-    return theirs == (config.plant_hash, config.control_interval, config.horizon, config.scenario.hash, row.model)
+    config, theirs = row.config(), made["scenarios"][row.name]
+    ours = {
+        "hash": config.scenario.hash,
+        "model": row.model,
+        "control_interval_s": config.control_interval,
+        "meniscus": row.meniscus.name,
+    }
+    same_plant = (made["plant_hash"], made["horizon_s"]) == (config.plant_hash, config.horizon)
+    return same_plant and all(theirs[name] == value for name, value in ours.items())
