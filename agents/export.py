@@ -40,7 +40,8 @@ class Actor:
     scale: Floats
 
 
-def _linear(module: torch.nn.Linear) -> tuple[Floats, Floats]:
+def linear_of(module: torch.nn.Linear) -> tuple[Floats, Floats]:
+    """Weight (out, in) and bias (out,) of a layer."""
     return module.weight.detach().numpy().copy(), module.bias.detach().numpy().copy()
 
 
@@ -51,7 +52,7 @@ def actor_of(learner: Any) -> Actor:
         normalise: Normalise = policy.features_extractor
         head = policy.action_net
         torso, last, activation, squash = policy.mlp_extractor.actor, head.linear, "Tanh", False
-        direct = _linear(policy.mlp_extractor.direct)
+        direct = linear_of(policy.mlp_extractor.direct)
         skip, scale = head.skip, head.scale.numpy().copy()
     else:
         normalise = policy.actor.features_extractor
@@ -59,55 +60,95 @@ def actor_of(learner: Any) -> Actor:
         direct = None
         skip, scale = learner.env.skip, learner.env.scale.astype(np.float32)
     visible = min(len(normalise.mean), len(HISTORY))
-    layers = [_linear(module) for module in torso if isinstance(module, torch.nn.Linear)]
+    layers = [linear_of(module) for module in torso if isinstance(module, torch.nn.Linear)]
     first_weight, first_bias = layers[0]
     layers[0] = first_weight[:, :visible].copy(), first_bias
     seen = normalise.seen[:visible, None] * normalise.scaling[:visible, :visible]
     mean, scaling = normalise.mean.numpy()[:visible].copy(), seen.numpy()
-    return Actor(mean, scaling, direct, (*layers, _linear(last)), activation, squash, skip, scale)
+    return Actor(mean, scaling, direct, (*layers, linear_of(last)), activation, squash, skip, scale)
+
+
+def exported(learner: Any) -> bytes:
+    """The deterministic actor of a learner made by :mod:`agents.training`, as a serialised ONNX model."""
+    if hasattr(learner.policy, "lstm_actor"):
+        from .recurrent import recurrent_onnx
+
+        return recurrent_onnx(learner)
+    return to_onnx(actor_of(learner))
+
+
+class OnnxGraph:
+    """An agent's graph in the making; every node is named after its output."""
+
+    def __init__(self) -> None:
+        self._nodes: list[Any] = []
+        self._constants: list[Any] = []
+
+    def constant(self, name: str, value: npt.ArrayLike) -> str:
+        """A weight; its name."""
+        self._constants.append(numpy_helper.from_array(np.asarray(value), name))
+        return name
+
+    def node(self, operator: str, inputs: list[str], output: str, **attributes: Any) -> str:
+        """An operator with one output; its name."""
+        self.nodes_of(operator, inputs, [output], **attributes)
+        return output
+
+    def nodes_of(self, operator: str, inputs: list[str], outputs: list[str], **attributes: Any) -> None:
+        """An operator with several outputs."""
+        self._nodes.append(helper.make_node(operator, inputs, outputs, **attributes))
+
+    def gemm(self, x: str, weight: Floats, bias: Floats, name: str) -> str:
+        """A layer of weight (out, in) and bias (out,)."""
+        parameters = [self.constant(f"{name}_weight", weight), self.constant(f"{name}_bias", bias)]
+        return self.node("Gemm", [x, *parameters], name, transB=1)
+
+    def normalised(self, mean: Floats, scaling: Floats) -> str:
+        """The normalised observation."""
+        x = self.node("Sub", ["observation", self.constant("mean", mean)], "centred")
+        x = self.node("MatMul", [x, self.constant("scaling", scaling)], "scaled")
+        limits = [
+            self.constant(name, np.float32(sign * NORMALISED_LIMIT)) for name, sign in (("least", -1.0), ("most", 1.0))
+        ]
+        return self.node("Clip", [x, *limits], "normalised")
+
+    def drives(self, x: str, skip: float, scale: npt.ArrayLike) -> None:
+        """The action: skip * (applied drives) + scale * x, within the box."""
+        x = self.node("Mul", [x, self.constant("scale", np.asarray(scale, np.float32))], "scaled_move")
+        at = self.constant("drives", np.array(DRIVES, np.int64))
+        applied = self.node("Gather", ["observation", at], "applied", axis=1)
+        kept = self.node("Mul", [applied, self.constant("skip", np.float32(skip))], "kept")
+        x = self.node("Add", [x, kept], "wanted")
+        limits = [self.constant(name, np.float32(value)) for name, value in (("low", -1.0), ("high", 1.0))]
+        self.node("Clip", [x, *limits], "action")
+
+    def finished(self, channels: int, state: int = 0) -> bytes:
+        """The model, checked and serialised; ``state`` is the length of what it remembers, 0 if nothing."""
+
+        def value(name: str, width: int) -> Any:
+            return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", width])
+
+        given, answers = [value("observation", channels)], [value("action", len(DRIVES))]
+        if state:
+            given, answers = [*given, value("state", state)], [*answers, value("next_state", state)]
+        graph = helper.make_graph(self._nodes, "cz_gym_agent", given, answers, self._constants)
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
+        onnx.checker.check_model(model)
+        serialised: bytes = model.SerializeToString()
+        return serialised
 
 
 def to_onnx(actor: Actor) -> bytes:
     """The actor as a serialised ONNX model: observation (n, channels) to action (n, 2), float32."""
-    nodes: list[Any] = []
-    constants: list[Any] = []
-
-    def constant(name: str, value: npt.ArrayLike) -> str:
-        constants.append(numpy_helper.from_array(np.asarray(value), name))
-        return name
-
-    def node(operator: str, inputs: list[str], output: str, **attributes: Any) -> str:
-        nodes.append(helper.make_node(operator, inputs, [output], **attributes))
-        return output
-
-    channels = len(actor.mean)
-    x = node("Sub", ["observation", constant("mean", actor.mean)], "centred")
-    x = node("MatMul", [x, constant("scaling", actor.scaling)], "scaled")
-    limits = [constant("least", np.float32(-NORMALISED_LIMIT)), constant("most", np.float32(NORMALISED_LIMIT))]
-    x = seen = node("Clip", [x, *limits], "normalised")
+    graph = OnnxGraph()
+    x = seen = graph.normalised(actor.mean, actor.scaling)
     for depth, (weight, bias) in enumerate(actor.layers):
-        parameters = [constant(f"weight_{depth}", weight), constant(f"bias_{depth}", bias)]
-        x = node("Gemm", [x, *parameters], f"linear_{depth}", transB=1)
+        x = graph.gemm(x, weight, bias, f"linear_{depth}")
         if depth < len(actor.layers) - 1:
-            x = node(actor.activation, [x], f"active_{depth}")
+            x = graph.node(actor.activation, [x], f"active_{depth}")
     if actor.direct:
-        parameters = [constant("weight_direct", actor.direct[0]), constant("bias_direct", actor.direct[1])]
-        x = node("Add", [x, node("Gemm", [seen, *parameters], "direct", transB=1)], "bent")
+        x = graph.node("Add", [x, graph.gemm(seen, *actor.direct, "direct")], "bent")
     if actor.squash:
-        x = node("Tanh", [x], "squashed")
-    x = node("Mul", [x, constant("scale", actor.scale.astype(np.float32))], "move")
-    drives = node("Gather", ["observation", constant("drives", np.array(DRIVES, np.int64))], "applied", axis=1)
-    drives = node("Mul", [drives, constant("skip", np.float32(actor.skip))], "kept")
-    x = node("Add", [x, drives], "wanted")
-    node("Clip", [x, constant("low", np.float32(-1.0)), constant("high", np.float32(1.0))], "action")
-    graph = helper.make_graph(
-        nodes,
-        "cz_gym_agent",
-        [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["n", channels])],
-        [helper.make_tensor_value_info("action", TensorProto.FLOAT, ["n", 2])],
-        constants,
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
-    onnx.checker.check_model(model)
-    serialised: bytes = model.SerializeToString()
-    return serialised
+        x = graph.node("Tanh", [x], "squashed")
+    graph.drives(x, actor.skip, actor.scale)
+    return graph.finished(len(actor.mean))

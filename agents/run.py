@@ -19,7 +19,7 @@ from . import settings
 from .callbacks import AtStart, Every, Tell
 from .checkpoint import load_checkpoint, restore, to_bytes
 from .contract import AgentFileError, Contract, agent_files, make_contract
-from .export import actor_of, to_onnx
+from .export import exported
 from .onnx_policy import OnnxPolicy
 from .residual import Residual
 from .run_files import COLUMNS, provenance, read_rows, read_settings, to_csv, write_json
@@ -52,7 +52,7 @@ class Run:
     def __init__(
         self,
         folder: Path,
-        choice: settings.PPO | settings.SAC,
+        choice: settings.Choice,
         seed: int,
         rival: Any,
         resume: bool = False,
@@ -153,7 +153,7 @@ class Run:
         return Residual(self.teacher, agent) if self.choice.recipe.residual else agent
 
     def _exported(self) -> tuple[Contract, bytes, OnnxPolicy]:
-        content = to_onnx(actor_of(self.training.learner))
+        content = exported(self.training.learner)
         contract = make_contract(content, **self._facts(self.training.learner.num_timesteps, 0.0))
         return contract, content, OnnxPolicy.of(contract, content, self.config)
 

@@ -151,7 +151,37 @@ class SAC:
     tau: float = 0.01
 
 
-RECIPES: dict[str, PPO | SAC] = {
+@dataclass(frozen=True)
+class RecurrentPPO:
+    """Proximal policy optimisation of a network that remembers (an LSTM), from nothing."""
+
+    name: str = "ppo-recurrent"
+    """What agents of these settings are called."""
+    recipe: Recipe = field(default_factory=lambda: Recipe(num_envs=64, privileged_critic=False, hidden=(64,)))
+    steps: int = 1_000_000
+    """Environment steps."""
+    units: int = 64
+    """Of the actor's LSTM and of the critic's."""
+    n_steps: int = 128
+    """Steps a slot between updates; also how far back its gradient sees."""
+    batch_size: int = 2048
+    n_epochs: int = 4
+    learning_rate: float = 1e-3
+    """At the start; it falls linearly to a twentieth."""
+    gamma: float = 0.99
+    gae_lambda: float = 0.95
+    clip_range: float = 0.2
+    ent_coef: float = 0.0
+    vf_coef: float = 0.5
+    max_grad_norm: float = 0.5
+    noise: float = 1.0
+    """Spread of the exploration at the start, in the network's outputs [-]."""
+
+
+Choice = PPO | SAC | RecurrentPPO
+"""Settings of any algorithm."""
+
+RECIPES: dict[str, Choice] = {
     choice.name: choice
     for choice in (
         PPO(),
@@ -163,6 +193,7 @@ RECIPES: dict[str, PPO | SAC] = {
         ),
         SCRATCH,
         SAC(),
+        RecurrentPPO(),
     )
 }
 """By name: what ``train.py --algo`` offers."""

@@ -1,4 +1,4 @@
-"""Making learners: stable-baselines3's PPO and SAC on the native batch, as the settings say."""
+"""Making learners: PPO, SAC and recurrent PPO on the native batch, as the settings say."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from .clone import Views, imitate, stand_beside
 from .kept_imitation import imitate_once, kept_imitation
 from .network import DrivePolicy, Normalise
 from .pairing import PairedReward
+from .recurrent import make_recurrent
 from .residual import ResidualAction
 from .vec_env import CzVecEnv
 from .wrappers import DriveAction, TrainingReward
@@ -40,9 +41,7 @@ class Training:
     steps: int
 
 
-def make_training(
-    choice: settings.PPO | settings.SAC, seed: int, logs: str | None, done: int = 0, teacher: Any = None
-) -> Training:
+def make_training(choice: settings.Choice, seed: int, logs: str | None, done: int = 0, teacher: Any = None) -> Training:
     """The learner of these settings for a training seed; ``done`` steps have been taken before (resuming).
 
     ``teacher`` is the controller that the settings name, for what is cloned or paired.
@@ -51,10 +50,14 @@ def make_training(
     torch.set_num_threads(recipe.threads)
     torch.manual_seed(seed)
     slots = _make_slots(recipe, seed, done)
-    if isinstance(choice, settings.SAC):
-        return Training(
-            _make_sac(choice, slots, seed, logs), [Statistics(choice.steps // 4, done > 0)], recipe, choice.steps
-        )
+    if not isinstance(choice, settings.PPO):
+        moves = _moves(choice, slots)
+        rate = _linear(choice.learning_rate, choice.learning_rate / 20.0)
+        if isinstance(choice, settings.SAC):
+            other: Any = _make_sac(choice, moves, rate, seed, logs)
+        else:
+            other = make_recurrent(choice, moves, rate, seed, logs)
+        return Training(other, [Statistics(choice.steps // 4, done > 0)], recipe, choice.steps)
     learner = _make_ppo(choice, slots, seed, logs, teacher)
     callbacks: list[BaseCallback] = [CriticFirst(choice.critic_steps, choice.actor_pace)]
     if recipe.clone is None:
@@ -163,15 +166,20 @@ def _make_ppo(choice: settings.PPO, slots: CzVecEnv, seed: int, logs: str | None
     )
 
 
-def _make_sac(choice: settings.SAC, slots: CzVecEnv, seed: int, logs: str | None) -> SACLearner:
+def _moves(choice: settings.SAC | settings.RecurrentPPO, slots: CzVecEnv) -> DriveAction:
+    """The slots for networks that have no action head of their own."""
     recipe, head = choice.recipe, choice.recipe.head
-    env = DriveAction(
-        TrainingReward(slots, choice.gamma, recipe.weights), head.skip, (head.pull_scale, head.heater_scale)
-    )
+    rewarded = TrainingReward(slots, choice.gamma, recipe.weights)
+    return DriveAction(rewarded, head.skip, (head.pull_scale, head.heater_scale))
+
+
+def _make_sac(
+    choice: settings.SAC, env: DriveAction, rate: Callable[[float], float], seed: int, logs: str | None
+) -> SACLearner:
     return SACLearner(
         "MlpPolicy",
         env,
-        learning_rate=_linear(choice.learning_rate, choice.learning_rate / 20.0),
+        learning_rate=rate,
         buffer_size=choice.buffer_size,
         learning_starts=choice.learning_starts,
         batch_size=choice.batch_size,
@@ -180,7 +188,7 @@ def _make_sac(choice: settings.SAC, slots: CzVecEnv, seed: int, logs: str | None
         train_freq=1,
         gradient_steps=choice.gradient_steps,
         policy_kwargs={
-            "net_arch": list(recipe.hidden),
+            "net_arch": list(choice.recipe.hidden),
             "features_extractor_class": Normalise,
             "features_extractor_kwargs": {"drives": False},
         },
