@@ -86,6 +86,8 @@ class Torsos(nn.Module):
         nn.init.zeros_(self.direct.weight)
         nn.init.zeros_(self.direct.bias)
         self.critic = tanh_layers([channels, *hidden])
+        self.still = False
+        """Whether the actor's layers keep their weights: no gradient passes, nor counts where gradients are clipped."""
 
     def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Latents of actor (with its linear path and drives) and critic."""
@@ -94,7 +96,10 @@ class Torsos(nn.Module):
     def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
         """Shape (n, features) to (n, hidden + 4)."""
         seen = features[:, : self.visible]
-        return torch.cat([self.actor(seen), self.direct(seen), features[:, self.channels :]], dim=1)
+        hidden = self.actor(seen)
+        return torch.cat(
+            [hidden.detach() if self.still else hidden, self.direct(seen), features[:, self.channels :]], dim=1
+        )
 
     def forward_critic(self, features: torch.Tensor) -> torch.Tensor:
         """Shape (n, features) to (n, hidden + true channels and their products)."""
@@ -163,7 +168,8 @@ class DrivePolicy(ActorCriticPolicy):
         critic = [*self.mlp_extractor.critic.parameters(), *self.value_net.parameters()]
         outputs = [*self.mlp_extractor.direct.parameters(), *self.action_net.parameters()]
         actor = [*outputs, self.log_std]
-        if "layers" not in self.frozen:
+        self.mlp_extractor.still = "layers" in self.frozen
+        if not self.mlp_extractor.still:
             actor += self.mlp_extractor.actor.parameters()
         if "heater" in self.frozen:
             for parameter in outputs:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,12 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 
-from agents import clone, settings
+from agents import clone, export, settings
 from agents.network import Paced
 from agents.pairing import PairedReward
-from agents.training import make_training
+from agents.residual import Residual
+from agents.training import clone as clone_into
+from agents.training import make_training, training_scenario
 from agents.vec_env import CzVecEnv
 from agents.wrappers import TrainingReward
 from baselines.lqg_settings import lqg
@@ -181,3 +184,75 @@ def test_what_is_frozen_stays(frozen: tuple[str, ...]) -> None:
     assert not torch.equal(direct.weight[0], before[0][0])
     assert torch.equal(direct.weight[1], before[0][1]) == ("heater" in frozen)
     assert torch.equal(layer.weight, before[1]) == ("layers" in frozen)
+    # What no optimiser clears would pile up, and count where gradients are clipped.
+    assert (layer.weight.grad is None) == ("layers" in frozen)
+
+
+def test_what_is_not_seen_changes_nothing() -> None:
+    choice = replace(TINY, recipe=replace(TINY.recipe, memory=30.0))
+    training = make_training(replace(choice, paired=False), 0, None)
+    shown = clone.demonstrate(Teacher(linear), CONFIG, range(4), (0.01, 0.01))
+    clone.begin_linear(training.learner.policy, shown)
+    exported = export.actor_of(training.learner)
+    old = np.array([channel.name.rpartition("_")[2] in ("45s", "60s", "1200s") for channel in HISTORY])
+    assert old.sum() == 12
+    other = np.where(old, shown.observation + 1.0, shown.observation).astype(np.float32)
+    np.testing.assert_array_equal(
+        clone.acts(training.learner.policy)(other), clone.acts(training.learner.policy)(shown.observation)
+    )
+    assert not exported.scaling[old].any()
+
+
+def test_pullers_spread_as_wide_as_asked() -> None:
+    asked = [training_scenario(replace(TINY.recipe, width=width)).pullers for width in (0.0, 0.5, 1.0, 1.5)]
+    assert [each.mix for each in asked] == [(0.5, 0.5), (0.25, 0.75), (0.0, 1.0), (0.0, 1.0)]
+    np.testing.assert_allclose([each.capillary for each in asked], [0.0, 0.015, 0.03, 0.045])
+    np.testing.assert_allclose([each.conductance for each in asked], [0.0, 0.05, 0.1, 0.15])
+    assert {each.start_radius_sd for each in asked} == {0.2e-3}
+
+
+def test_a_network_beside_a_controller_begins_as_the_controller() -> None:
+    recipe = replace(TINY.recipe, clone=settings.Clone("lqg", rounds=1, episodes=2), residual=True)
+    choice = replace(TINY, recipe=replace(recipe, head=settings.ActionHead(skip=0.0)), noise=(1e-9, 1e-9))
+    teacher = lqg(make_config("randomized"))
+    training = make_training(choice, 0, None, 0, teacher)
+    clone_into(training, teacher, CONFIG, 0, lambda _: None)
+    training.learner.learn(128)
+    np.testing.assert_allclose(training.learner.rollout_buffer.rewards, 0.0, atol=1e-6)
+    both = Residual(teacher, Teacher(lambda seen: np.full((len(seen), 2), 0.01) - seen[:, [9, 10]]))
+    seen = np.zeros((3, len(HISTORY)), np.float32)
+    action, memory = both.predict(seen, None, np.ones(3, np.bool_))
+    alone, expected = teacher.predict(seen, None, np.ones(3, np.bool_))
+    np.testing.assert_allclose(action, alone + 0.01, atol=1e-7)
+    np.testing.assert_equal(memory, expected)
+
+
+def test_a_kept_imitation_is_the_imitation(tmp_path: Path) -> None:
+    asked = []
+
+    def made(privileged: bool) -> Any:
+        few = replace(
+            TINY.recipe, clone=settings.Clone("lqg", rounds=1, episodes=2, epochs=1), privileged_critic=privileged
+        )
+        training = make_training(replace(TINY, recipe=few, paired=False), 0, None)
+        clone_into(training, Counted(linear), CONFIG, 3, lambda _: None, tmp_path)
+        return training.learner.policy
+
+    class Counted(Teacher):
+        def predict(self, *args: Any, **kwargs: Any) -> Any:
+            asked.append(1)
+            return super().predict(*args, **kwargs)
+
+    first = made(True)
+    times = len(asked)
+    assert times == CONFIG.steps
+    second, other = made(True), made(False)
+    assert len(asked) == times
+    seen = np.random.default_rng(0).normal(size=(5, len(HISTORY))).astype(np.float32)
+    for policy in (second, other):
+        np.testing.assert_array_equal(clone.acts(policy)(seen), clone.acts(first)(seen))
+    assert torch.equal(first.features_extractor.scaling, second.features_extractor.scaling)
+    (kept,) = tmp_path.iterdir()
+    kept.write_bytes(kept.read_bytes()[:1000])
+    np.testing.assert_array_equal(clone.acts(made(True))(seen), clone.acts(first)(seen))
+    assert len(asked) == 2 * times

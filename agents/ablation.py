@@ -1,0 +1,127 @@
+"""Measure what helps: ``python -m agents.ablation`` changes one thing of the ``ppo`` recipe at a time.
+
+Each row is trained for the same number of steps with the same training seeds, and judged on validation crystals that
+all rows share. Every finished run is kept; the same command goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from cz_gym.commands import OneLineParser, interrupted
+
+PROG = "python -m agents.ablation"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    args = _parser().parse_args(arguments)
+    try:
+        return _main(args)
+    except (ValueError, OSError) as error:
+        print(f"{PROG}: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except ImportError as error:
+        print(f'{PROG}: {error.name} is missing: pip install "cz-gym[agents]"', file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return interrupted(PROG, "finished runs are kept, and the same command goes on from the others' checkpoints")
+
+
+def _parser() -> OneLineParser:
+    parser = OneLineParser(prog=PROG, description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--rows", help="rows to run, joined by commas (default: all)")
+    parser.add_argument("--seeds", type=int, default=3, help="training seeds a row (default: %(default)s)")
+    parser.add_argument("--steps", type=int, default=3_000_000, help="environment steps a run (default: %(default)s)")
+    parser.add_argument("--jobs", type=int, default=2, help="runs at once (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=Path("results/ablation"), help="results (default: %(default)s)")
+    parser.add_argument(
+        "--work", type=Path, default=Path("runs/ablation"), help="unfinished runs and imitations (default: %(default)s)"
+    )
+    parser.add_argument("--list", action="store_true", help="say what the rows are and how many of their runs are done")
+    return parser
+
+
+def _main(args: argparse.Namespace) -> int:
+    for name, most in (("seeds", 100), ("steps", 10**9), ("jobs", 64)):
+        if not 1 <= getattr(args, name) <= most:
+            raise ValueError(f"--{name} must be between 1 and {most}, not {getattr(args, name)}")
+    from cz_gym.evaluation.whole import alone, check_writable
+
+    from .ablation_rows import ROWS, find_rows
+    from .ablation_run import Plan, read_all, read_finished
+    from .settings import PPO
+
+    rows = ROWS if args.rows is None else find_rows(args.rows.split(","))
+    plan = Plan(args.steps, args.out, args.work, PPO().recipe.weights)
+    if args.list:
+        for row in rows:
+            done = len(read_all(plan, [row], range(args.seeds)).get(row.name, ()))
+            print(f"{row.name:20} {done}/{args.seeds}  {row.meaning}")
+        return 0
+    check_writable(plan.out)
+    with alone(plan.work):
+        tasks = [(row, seed) for row in rows for seed in range(args.seeds) if not read_finished(plan, row, seed)]
+        print(f"{len(rows) * args.seeds - len(tasks)} runs are done, {len(tasks)} to do")
+        _run(plan, tasks, args.jobs, range(args.seeds))
+        _write(plan, range(args.seeds))
+    print(f"wrote {plan.out / 'table.md'}")
+    return 0
+
+
+def _run(plan: Any, tasks: Sequence[Any], jobs: int, seeds: Sequence[int]) -> None:
+    """Do the runs, so many at once; the table is renewed after each."""
+    if jobs == 1:
+        for row, seed in tasks:
+            print(_work(plan, row, seed), flush=True)
+            _write(plan, seeds)
+        return
+    # Forking would copy the threads of torch and of the native batch in unknown states.
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        under_way = [pool.submit(_work, plan, row, seed) for row, seed in tasks]
+        try:
+            for each in as_completed(under_way):
+                print(each.result(), flush=True)
+                _write(plan, seeds)
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+
+
+def _work(plan: Any, row: Any, seed: int) -> str:
+    from tqdm import tqdm
+
+    from .ablation_run import run_one
+
+    title = f"{row.name}, seed {seed}"
+    with tqdm(total=plan.steps, desc=title, unit="step", unit_scale=True, mininterval=1.0, disable=None) as bar:
+        run_one(plan, row, seed, bar)
+    return f"{title}: done"
+
+
+def _write(plan: Any, seeds: Sequence[int]) -> None:
+    """Write the table and its picture from everything that is finished."""
+    from cz_gym.evaluation.whole import write_files
+
+    from .ablation_figure import forest
+    from .ablation_rows import ROWS
+    from .ablation_run import read_all
+    from .ablation_table import tabulate, to_csv, to_markdown
+
+    runs = read_all(plan, ROWS, seeds)
+    if not runs:
+        return
+    lines = tabulate(ROWS, runs)
+    files = {"table.csv": to_csv(lines).encode(), "table.md": to_markdown(lines, plan.steps).encode()}
+    files["forest.png"] = forest(lines)
+    write_files({plan.out / name: content for name, content in files.items()})
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,187 @@
+"""One run of the ablation: train a row for a seed, judge it on validation crystals, keep what was found as one file."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.config import make_config
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.evaluation.whole import alone, write_files
+from cz_gym.rooms import room
+
+from .ablation_rows import Row
+from .contract import AgentFileError, read_json
+from .run import QUICK, Run
+from .run_files import provenance
+from .settings import PPO, CostWeights
+from .validation import costs
+
+Floats = npt.NDArray[np.float64]
+JUDGED = VALIDATION_SEEDS[QUICK : QUICK + 200]
+"""Seeds of the crystals that all rows are judged on: validation, but none that picks the best agent of a run."""
+SCENARIO = "randomized"
+"""What they are drawn from, whatever a row was trained on."""
+FIGURES = ("rmse_mm", "cost", "reward_cost", "pull_step_rms_mm_per_min", "failure_rate")
+"""Figures of an episode: true-radius RMSE [mm]; mean cost of a step [-] as ``ppo`` weighs it and as the environment's
+reward does, a lost crystal costing ten; RMS of the pull speed's steps [mm/min]; 1 if the crystal was lost."""
+STAGES = ("best", "last", "start")
+"""The agents of a run: the one that did best on the validation that selects, the last one, and the one it began as."""
+DIGITS = 5
+"""Significant digits that are kept."""
+
+
+class Plan(NamedTuple):
+    """What all runs of an ablation share."""
+
+    steps: int
+    """Environment steps a run."""
+    out: Path
+    """Folder of what is kept: finished runs in ``runs``, the table beside it."""
+    work: Path
+    """Folder of unfinished runs, and of imitations that several runs begin with."""
+    weights: CostWeights
+    """Of the figure ``cost``."""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What a finished run left."""
+
+    row: str
+    seed: int
+    settings: Mapping[str, Any]
+    stages: Mapping[str, Floats]
+    """By stage, shape (episodes, figures)."""
+
+
+def path_of(plan: Plan, row: Row, seed: int) -> Path:
+    """Where a finished run is kept."""
+    return plan.out / "runs" / f"{row.name}-seed{seed}.json"
+
+
+def run_one(plan: Plan, row: Row, seed: int, bar: Any) -> None:
+    """Train and judge, from the checkpoint if there is one; the run's folder goes when its result is kept."""
+    folder = plan.work / f"{row.name}-seed{seed}"
+    with alone(folder):
+        run = _open(folder, row.of(plan.steps), seed, plan.work / "imitations")
+        try:
+            run.learn(bar)
+        except KeyboardInterrupt:
+            run.save()
+            raise
+        policies = {"best": run.best_policy(), "last": run.present_policy(), "start": run.first_policy()}
+        stages = {name: judge(policy, plan.weights) for name, policy in policies.items() if policy is not None}
+        write_files({path_of(plan, row, seed): _to_json(plan, row, seed, run, stages)})
+        run.training.learner.env.close()
+        shutil.rmtree(folder)
+
+
+def judge(policy: Any, weights: CostWeights) -> Floats:
+    """Figures of a policy on the crystals that all rows are judged on, shape (episodes, figures)."""
+    found = metrics(rollout(policy, make_config(SCENARIO, observation="history"), JUDGED))
+    by_name = {
+        **found._asdict(),
+        "cost": costs(found, weights),
+        "reward_cost": costs(found, CostWeights()),
+    }
+    return np.stack([by_name[name] for name in FIGURES], axis=-1)
+
+
+def _open(folder: Path, choice: PPO, seed: int, imitations: Path) -> Run:
+    """The run in this folder; one that cannot go on begins again."""
+    registry, recipe = room("baselines.registry"), choice.recipe
+    config = make_config(recipe.scenario, control_interval=recipe.control_interval)
+    paper = registry.find_controller("paper").make(config)
+    teacher = registry.find_controller(recipe.clone.teacher).make(config) if recipe.clone else None
+    if (folder / "settings.json").exists():
+        try:
+            return Run(folder, choice, seed, paper, True, teacher=teacher, imitations=imitations)
+        except AgentFileError:
+            for path in folder.iterdir():
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+    return Run(folder, choice, seed, paper, False, teacher=teacher, imitations=imitations)
+
+
+def _to_json(plan: Plan, row: Row, seed: int, run: Run, stages: Mapping[str, Floats]) -> bytes:
+    facts = {
+        "row": row.name,
+        "seed": seed,
+        "settings": asdict(run.choice),
+        "plant_hash": run.config.plant_hash,
+        "scenario_hash": make_config(SCENARIO).scenario.hash,
+        "judged_seeds": [JUDGED[0], JUDGED[-1]],
+        "provenance": {**provenance(), "sessions": [each.get("git_commit") for each in run.sessions]},
+        "validations": [{name: float(value) for name, value in line.items()} for line in run.rows],
+        "stages": {
+            stage: {name: [_rounded(value) for value in column] for name, column in zip(FIGURES, values.T, strict=True)}
+            for stage, values in stages.items()
+        },
+    }
+    lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(value, allow_nan=False)}" for name, value in facts.items())
+    return f"{{\n{lines}\n}}\n".encode()
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{DIGITS}g}")
+
+
+def read_finished(plan: Plan, row: Row, seed: int) -> Finished | None:
+    """A finished run, None if there is none; ValueError if it is of other settings, or damaged."""
+    path = path_of(plan, row, seed)
+    if not path.exists():
+        return None
+    told = read_json(path)
+    found = _parsed(told) if isinstance(told, dict) else None
+    if found is None or (found.row, found.seed) != (row.name, seed):
+        raise ValueError(f"{path}: not a finished run of this ablation, or damaged; move it away to run it again")
+    wanted = json.loads(json.dumps(asdict(row.of(plan.steps))))
+    if _completed(found.settings) != wanted or told.get("scenario_hash") != make_config(SCENARIO).scenario.hash:
+        raise ValueError(f"{path}: made with other settings; move it away, or choose another --out or --steps")
+    return found
+
+
+def read_all(plan: Plan, rows: Iterable[Row], seeds: Iterable[int]) -> dict[str, list[Finished]]:
+    """Every finished run by row, in the order of seeds; rows without one are left out."""
+    wanted = list(seeds)
+    found = {row.name: [run for seed in wanted if (run := read_finished(plan, row, seed))] for row in rows}
+    return {name: runs for name, runs in found.items() if runs}
+
+
+def _parsed(told: Mapping[str, Any]) -> Finished | None:
+    try:
+        stages = {
+            str(stage): np.array([columns[name] for name in FIGURES], np.float64).T
+            for stage, columns in told["stages"].items()
+        }
+        found = Finished(str(told["row"]), int(told["seed"]), dict(told["settings"]), stages)
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return None
+    shape = len(JUDGED), len(FIGURES)
+    sound = all(values.shape == shape and math.isfinite(values.sum()) for values in stages.values())
+    return found if sound and {"best", "last"} <= set(stages) else None
+
+
+def _completed(saved: Mapping[str, Any]) -> dict[str, Any]:
+    """Kept settings with today's defaults for those that did not exist when they were kept."""
+
+    def filled(part: Any, default: Any) -> Any:
+        if not isinstance(part, Mapping) or not isinstance(default, Mapping):
+            return part
+        return {name: filled(part[name], default[name]) if name in part else default[name] for name in default} | {
+            name: value for name, value in part.items() if name not in default
+        }
+
+    whole = filled(saved, json.loads(json.dumps(asdict(PPO()))))
+    assert isinstance(whole, dict)
+    return whole
