@@ -71,12 +71,14 @@ class LinearAgent(NamedTuple):
         return StateSpace(A, B, C, D)
 
 
-def linear_agent(onnx_bytes: bytes, observation: npt.ArrayLike, dt: float, v_0: float = PULL_SCALE) -> LinearAgent:
-    """The agent of these (judged) ONNX bytes near a "history" observation; v_0 [m/s] scales the pull speed.
+def linear_agent(onnx_bytes: bytes, observations: npt.ArrayLike, dt: float, v_0: float = PULL_SCALE) -> LinearAgent:
+    """The agent of these (judged) ONNX bytes near "history" observations; v_0 [m/s] scales the pull speed.
 
-    ValueError if the file reads another observation or remembers something between samples.
+    Of several observations, shape (n, channels), it is the mean derivative: for Gaussian ones the best linear
+    approximation there is (Stein's lemma). ValueError if the file reads another observation or remembers something.
     """
-    slopes = jacobian(onnx_bytes, np.asarray(observation, np.float64))
+    rows = np.atleast_2d(np.asarray(observations, np.float64))
+    slopes = np.mean([jacobian(onnx_bytes, row) for row in rows], axis=0)
     slopes = np.array([[v_0], [HEATER_SCALE]]) * slopes / scales(HISTORY, v_0)
     now, rest = len(MEASURED), slopes[:, len(MEASURED) + 1 :]
     return LinearAgent(slopes[:, :now], slopes[:, now], rest.reshape(2, len(LAGS), len(LAGGED)), dt)

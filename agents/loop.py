@@ -42,12 +42,20 @@ class Responses(NamedTuple):
         """Drives by the ring, the pyrometer held: the controller with what it knows of itself, shape (points, 2)."""
         return _solve(np.eye(2) - self._recalled, self.controller[:, :, RING])
 
+    def _without_camera(self) -> Complex:
+        """Drives by what the camera is made to say, the pyrometer's loop closed, shape (points, 2)."""
+        around = self._recalled + self.controller[:, :, PYROMETER, None] * self.plant[:, None, PYROMETER]
+        return _solve(np.eye(2) - around, self.controller[:, :, RING])
+
+    def closed(self) -> Complex:
+        """Drives by the camera's noise, every loop closed, shape (points, 2)."""
+        found: Complex = self._without_camera() / (1.0 + self.opened("camera"))[:, None]
+        return found
+
     def opened(self, at: str) -> Complex:
         """Minus the way round the loop opened at "camera" or at "v_p", shape (points,)."""
         if at == "camera":
-            around = self._recalled + self.controller[:, :, PYROMETER, None] * self.plant[:, None, PYROMETER]
-            drives = _solve(np.eye(2) - around, self.controller[:, :, RING])
-            camera: Complex = -np.einsum("ki,ki->k", self.plant[:, RING], drives)
+            camera: Complex = -np.einsum("ki,ki->k", self.plant[:, RING], self._without_camera())
             return camera
         if at != "v_p":
             raise ValueError(f"a loop is opened at camera or v_p, not {at!r}")
@@ -65,21 +73,13 @@ def response(system: StateSpace, dt: float, omega: Floats) -> Complex:
     return found + D
 
 
-def impulse(system: StateSpace, samples: int, drives: tuple[int, int], cause: int = 0) -> Floats:
-    """Drives asked for after one unit at input ``cause`` at t = 0, shape (samples, 2), fed back as applied.
-
-    ``drives`` are the inputs that read the applied drives.
-    """
-    A, B, C, D = system
-    x, u, found = np.zeros(len(A)), np.zeros(2), np.zeros((samples, 2))
-    for k in range(samples):
-        y = np.zeros(B.shape[1])
-        y[list(drives)] = u
-        y[cause] += float(k == 0)
-        u = C @ x + D @ y
-        x = A @ x + B @ y
-        found[k] = u
-    return found
+def after_one(A: Floats, B: Floats, C: Floats, D: Floats, samples: int) -> Floats:
+    """Outputs of a discrete system after one unit of its only input at t = 0, shape (samples, outputs)."""
+    x, found = B[:, 0], [D[:, 0]]
+    for _ in range(samples - 1):
+        found.append(C @ x)
+        x = A @ x
+    return np.array(found)
 
 
 def _solve(matrices: npt.NDArray[np.complex128], rights: npt.NDArray[np.complex128]) -> Complex:

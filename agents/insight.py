@@ -1,0 +1,247 @@
+"""What an agent does that other controllers do not: ``python -m agents.insight --out results/insight``.
+
+Answers to single events on a nominal puller, the network's exact local gain and the margins of its loop beside the
+LQG's, how large an event each survives, and which property of the real puller costs it crystals.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cz_gym.commands import OneLineParser, interrupted
+from cz_gym.config import make_config
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.evaluation.whole import check_writable, write_files
+from cz_gym.linear import radius_model
+from cz_gym.observation import MEASURED
+from cz_gym.plant import make_puller
+from cz_gym.rooms import room
+from cz_gym.scenarios import PULLER, RANDOMIZED
+from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
+
+from . import shipped
+from .contract import read_agent
+from .linear import SEEN, Floats, linear_agent
+from .loop import Responses, after_one, response
+from .onnx_policy import OnnxPolicy
+from .trials import (
+    JUMPS,
+    LIMITS,
+    MIX,
+    TRIALS,
+    crystal,
+    jump_gains,
+    noisy_observations,
+    parts_of,
+    respond,
+    run_events,
+    survive,
+)
+
+PROG = "agents.insight"
+BESIDE = ("lqg-at-0.02", "lqg", "paper-tuned")
+"""Controllers that an agent is shown beside; its teacher is among them."""
+READINGS = tuple(channel.name for channel in MEASURED)
+MODELS = (("Model I", 1.0), ("Model II", 0.0))
+AT_REST = "at rest"
+READING_SAMPLES = 120
+"""Length of the answer to one reading."""
+NOISE_POINTS = 20_000
+"""Frequencies that a variance is summed over."""
+
+
+class Contender(NamedTuple):
+    """A controller as everything here needs it."""
+
+    name: str
+    observation: str
+    make: Callable[[Any], Any]
+    """Builds it for an environment's settings."""
+    system: Any
+    """Its state space near rest: readings of MEASURED to v_p [m/s] and Q_H [W]."""
+    answer: Callable[[Floats], Any]
+    """Its frequency response, drives by the readings of SEEN."""
+
+
+class Margins(NamedTuple):
+    """A row of the table of margins."""
+
+    controller: str
+    plant: str
+    at: str
+    """Where the loop is opened."""
+    stable: bool
+    crossover: float
+    """[rad/s]"""
+    gain_up: float
+    gain_down: float
+    phase_deg: float
+    delay: float
+    """[s]"""
+    sensitivity: float
+
+
+def contenders(path: Path | None) -> tuple[Contender, ...]:
+    """The agent of a file, or the shipped one, and those it is shown beside.
+
+    All are linearised under the usual noise, LQGs at the covariance that their filters settle on; the agent, second,
+    also without any, where its network bends least.
+    """
+    file = path or shipped()
+    contract, content = read_agent(file)
+    name = "ppo-default" if path is None else contract.algorithm
+    config = crystal(3.0 * HOUR / MINUTE, contract.observation)
+    policy = OnnxPolicy.load(file, config)
+    seen = {
+        name: noisy_observations(policy, contract.observation),
+        f"{name} {AT_REST}": run_events(policy, config, (), [0.0]).observation,
+    }
+    found = []
+    for label, observations in seen.items():
+        near = linear_agent(content, observations, config.control_interval, config.parameters.v_0)
+        found.append(Contender(label, contract.observation, lambda _: policy, near.state_space(), near.response))
+    linear_form, registry = room("baselines.linear_form").linear_form, room("baselines.registry")
+    at = [READINGS.index(channel) for channel in SEEN]
+    for beside in BESIDE:
+        make = registry.find_controller(beside).make
+        form = linear_form(make(crystal(1.0, "measured")))
+
+        def answer(omega: Floats, form: Any = form) -> Any:
+            return response(form.controller, form.dt, omega)[:, :, at]
+
+        found.append(Contender(beside, "measured", make, form.controller, answer))
+    return tuple(found)
+
+
+def joined(contender: Contender, omega: Floats, lam: float, dt: float) -> Responses:
+    """A controller and a nominal puller at some frequencies."""
+    plant = room("baselines.sampled_loop").sampled_plant(make_puller(lam=lam), dt)
+    return Responses(omega, contender.answer(omega), response(plant, dt, omega)[:, 1:, :2], dt)
+
+
+def one_reading(contender: Contender, dt: float) -> Floats:
+    """Drives after one reading of the ring that is a metre too large, loop closed, shape (samples, 2)."""
+    loop = room("baselines.sampled_loop").close(contender.system, make_puller(lam=MIX), dt)
+    at, rows = loop.inputs.index("camera"), [loop.outputs.index(name) for name in ("v_p", "Q_H")]
+    return after_one(loop.A, loop.B[:, [at]], loop.C[rows], loop.D[np.ix_(rows, [at])], READING_SAMPLES)
+
+
+def margins(contender: Contender, omega: Floats, dt: float) -> list[Margins]:
+    """Margins at both places on both models."""
+    frequency, loop = room("baselines.frequency"), room("baselines.sampled_loop")
+    rows = []
+    for plant, lam in MODELS:
+        stable = bool(loop.close(contender.system, make_puller(lam=lam), dt).stable)
+        found = joined(contender, omega, lam, dt)
+        for at in ("camera", "v_p"):
+            rows.append(
+                Margins(contender.name, plant, at, stable, *frequency.margins_of(found.opened(at), omega, dt, stable))
+            )
+    return rows
+
+
+def noise_gains(contender: Contender, dt: float) -> dict[str, float]:
+    """RMS of the drives and of the pull speed's steps per white camera noise RMS, both models' mean puller."""
+    omega = (np.arange(NOISE_POINTS) + 0.5) * np.pi / dt / NOISE_POINTS
+    closed = joined(contender, omega, MIX, dt).closed()
+    step = closed[:, 0] * (1.0 - np.exp(-1j * omega * dt))
+    gains = (("pull", closed[:, 0], MM_PER_MIN), ("pull_step", step, MM_PER_MIN), ("heater", closed[:, 1], KILO))
+    units = {"pull": "mm_per_min", "pull_step": "mm_per_min", "heater": "kw"}
+    return {
+        f"{name}_{units[name]}_per_mm": float(np.sqrt(np.mean(np.abs(values) ** 2)) * MM / scale)
+        for name, values, scale in gains
+    }
+
+
+def puller_parts(contender: Contender, episodes: int) -> dict[str, dict[str, float]]:
+    """Observable RMSE and share of lost crystals when randomized gets one property of puller, on validation."""
+    found = {}
+    for name, scenario in {"nothing": RANDOMIZED, **parts_of(PULLER, RANDOMIZED), "all of it": PULLER}.items():
+        config = make_config(scenario, observation=contender.observation)
+        policy = contender.make(make_config("randomized", observation=contender.observation))
+        values = metrics(rollout(policy, config, VALIDATION_SEEDS[:episodes]))
+        found[name] = {
+            "rmse_observable_mm": float(values.rmse_observable_mm.mean()),
+            "failure_rate": float(values.failure_rate.mean()),
+        }
+    return found
+
+
+def study(agent: Path | None, episodes: int, tell: Callable[[str], None]) -> dict[str, bytes]:
+    """Everything, as files by name."""
+    from .insight_figures import gain_figure, jump_figure, loop_figure, response_figure, share_figure
+    from .insight_report import Found, as_json, as_markdown
+
+    tell("linearising")
+    taking_part = contenders(agent)
+    dt = crystal(1.0, "measured").control_interval
+    omega = room("baselines.frequency").frequencies(dt)
+    responses = {contender.name: joined(contender, omega, MIX, dt) for contender in taking_part}
+    impulses = {contender.name: one_reading(contender, dt) for contender in taking_part}
+    acting = [contender for contender in taking_part if not contender.name.endswith(AT_REST)]
+    answers: dict[str, dict[str, Any]] = {}
+    for trial in TRIALS:
+        tell(trial.title)
+        answers[trial.name] = {}
+        for contender in acting:
+            config = crystal(trial.minutes, contender.observation)
+            answers[trial.name][contender.name] = respond(contender.make(config), config, trial)
+    limits: dict[str, dict[str, Any]] = {}
+    parts, jumps = {}, {}
+    for contender in acting:
+        tell(f"limits of {contender.name}")
+        policy = contender.make(crystal(3.0 * HOUR / MINUTE, contender.observation))
+        jumps[contender.name] = tuple(jump_gains(policy, contender.observation, noisy) for noisy in (False, True))
+        limits[contender.name] = {limit.name: survive(policy, limit, contender.observation) for limit in LIMITS}
+        tell(f"{contender.name}, one property of the real puller at a time")
+        parts[contender.name] = puller_parts(contender, episodes)
+    rows = [row for contender in taking_part for row in margins(contender, omega, dt)]
+    gains = {contender.name: noise_gains(contender, dt) for contender in taking_part}
+    found = Found(read_agent(agent or shipped())[0], answers, rows, gains, limits, parts, episodes, jumps)
+    zero = radius_model(make_puller(lam=MIX)).zero
+    return {
+        "responses.png": response_figure(answers, TRIALS, dt),
+        "gains.png": gain_figure(impulses, responses, dt),
+        "loop.png": loop_figure(responses, zero),
+        "jumps.png": jump_figure(jumps, JUMPS),
+        "shares.png": share_figure(answers["load"], responses, TRIALS[1].title),
+        "insight.json": as_json(found).encode(),
+        "insight.md": as_markdown(found).encode(),
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    parser = OneLineParser(prog=f"python -m {PROG}", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--agent", type=Path, metavar="FILE", help="agent file in place of the shipped one")
+    parser.add_argument("--episodes", type=int, default=50, metavar="N", help="validation episodes (%(default)s)")
+    parser.add_argument("--out", type=Path, default=Path("results/insight"), metavar="DIR", help="%(default)s")
+    given = parser.parse_args(arguments)
+    try:
+        if not 1 <= given.episodes <= len(VALIDATION_SEEDS):
+            raise ValueError(f"--episodes must be 1 to {len(VALIDATION_SEEDS)}, not {given.episodes}")
+        check_writable(given.out)
+        files = study(given.agent, given.episodes, lambda what: print(what, file=sys.stderr, flush=True))
+        write_files({given.out / name: content for name, content in files.items()})
+    except ImportError as error:
+        missing = f'{error.name} is missing: pip install "cz-gym[benchmark]"' if error.name else error
+        print(f"{PROG}: {missing}", file=sys.stderr)
+        return 2
+    except (ValueError, OSError) as error:
+        print(f"{PROG}: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return interrupted(PROG)
+    print(files["insight.md"].decode(), end="")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
