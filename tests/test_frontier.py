@@ -119,3 +119,9 @@ def test_what_ships_is_what_the_command_chose(scenario):
         assert not one["validation"]["failure_rate"]
     steps = [one["validation"]["pull_step"] for one in chosen]
     assert steps == sorted(steps)
+
+
+def test_an_lqg_as_lively_as_ppo_stands_in_the_default_table():
+    """And no other of the frontier: they run when named."""
+    shown = {name: find_controller(name).default for name in map(family_name, ACTIVITIES)}
+    assert [name for name, default in shown.items() if default] == ["lqg-at-0.02"]
