@@ -63,6 +63,7 @@ class Run:
         self.folder, self.choice, self.seed, self.rival = folder, choice, seed, rival
         self.teacher, self.imitations = teacher, imitations
         self.checkpoint_seconds = checkpoint_seconds
+        self.validate_every = max(choice.steps // 24, VALIDATE_EVERY)
         recipe = choice.recipe
         self.config = make_config(
             recipe.scenario, observation=recipe.observation, control_interval=recipe.control_interval
@@ -94,7 +95,7 @@ class Run:
         """Learn to the end, validating and saving on the way; the bar counts environment steps."""
         learner = self.training.learner
         bar.update(learner.num_timesteps - bar.n)
-        validate = Every(max(self.choice.steps // 24, VALIDATE_EVERY), None, lambda: self._validate(bar))
+        validate = Every(self.validate_every, None, lambda: self._validate(bar))
         checkpoint = Every(None, self.checkpoint_seconds, self.save)
         begin = AtStart(lambda: self._begin(bar))
         callbacks = [begin, *self.training.callbacks, Tell(bar), validate, checkpoint]

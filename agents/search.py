@@ -1,0 +1,139 @@
+"""Search the ``ppo`` recipe's hyperparameters: ``python -m agents.search --trials 30``.
+
+Optuna's tree-structured Parzen estimator proposes, beginning with the settings that ship; a trial learns from a kept
+imitation, and one that does worse than most at the same step is given up. What counts is the last agent's cost on
+validation crystals, less that of the imitation it began as. The best few then meet other validation crystals and other
+training seeds beside the settings that ship. Every trial is kept in ``history.csv``; the same command goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from cz_gym.commands import OneLineParser, interrupted
+
+PROG = "python -m agents.search"
+STARTUP, WARMUP = 8, 1
+"""Trials that are drawn at random first, and looks before which none is given up."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    args = _parser().parse_args(arguments)
+    try:
+        return _main(args)
+    except (ValueError, OSError) as error:
+        print(f"{PROG}: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except ImportError as error:
+        print(f'{PROG}: {error.name} is missing: pip install "cz-gym[agents]"', file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return interrupted(PROG, "the same command goes on from the trials in its history")
+
+
+def _parser() -> OneLineParser:
+    parser = OneLineParser(prog=PROG, description=(__doc__ or "").split("\n")[0])
+    parser.add_argument(
+        "--trials", type=int, default=30, help="trials in all, kept ones included (default: %(default)s)"
+    )
+    parser.add_argument("--steps", type=int, default=600_000, help="environment steps a trial (default: %(default)s)")
+    parser.add_argument(
+        "--finalists", type=int, default=2, help="best trials that are confirmed (default: %(default)s)"
+    )
+    parser.add_argument("--seeds", type=int, default=3, help="training seeds that confirm (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the search (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=Path("results/search"), help="results (default: %(default)s)")
+    parser.add_argument("--work", type=Path, default=Path("runs/search"), help="imitations (default: %(default)s)")
+    return parser
+
+
+def _main(args: argparse.Namespace) -> int:
+    for name, least, most in (("trials", 1, 10_000), ("steps", 1, 10**9), ("finalists", 0, 100), ("seeds", 1, 100)):
+        if not least <= getattr(args, name) <= most:
+            raise ValueError(f"--{name} must be between {least} and {most}, not {getattr(args, name)}")
+    from cz_gym.evaluation.whole import alone, check_writable, write_files
+
+    from .search_report import confirm, report
+    from .search_space import read_history
+
+    check_writable(args.out)
+    history = args.out / "history.csv"
+    read_history(history, args.steps)
+    with alone(args.work):
+        trials = search(history, args.trials, args.steps, args.work, args.seed)
+        confirmed = confirm(trials, args.finalists, args.seeds, args.steps, args.out / "confirmed", args.work)
+        write_files({args.out / "report.md": report(trials, confirmed, args.steps).encode()})
+    print(f"wrote {args.out / 'report.md'}")
+    return 0
+
+
+def search(history: Path, count: int, steps: int, work: Path, seed: int = 0) -> list[Any]:
+    """Try settings until there are that many trials in all, going on from the history."""
+    import optuna
+
+    from .search_space import KNOBS, Trial, read_history, rounded, settings_of, values_of, write_history
+    from .search_trial import CHOOSE, Given, attempt
+    from .settings import PPO
+
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    done = read_history(history, steps)
+    ranges = {knob.name: _distribution(optuna, knob) for knob in KNOBS}
+    sampler = optuna.samplers.TPESampler(seed=seed + len(done), n_startup_trials=STARTUP)
+    study = optuna.create_study(sampler=sampler, pruner=optuna.pruners.MedianPruner(3, WARMUP))
+    for trial in done:
+        _tell(optuna, study, ranges, trial)
+    for number in range(len(done), count):
+        asked = study.ask(ranges)
+        values = rounded(values_of(PPO()) if number == 0 else [asked.params[knob.name] for knob in KNOBS])
+        course: list[float] = []
+
+        def look(step: int, cost: float, asked: Any = asked, course: list[float] = course) -> None:
+            course.append(cost)
+            asked.report(cost, step)
+            if asked.should_prune():
+                raise Given
+
+        try:
+            found = attempt(settings_of(values, steps), 0, CHOOSE, work, look)
+            cost, rmse = (found.last - found.start).mean(axis=0)
+            trial = Trial(values, False, float(cost), 1e3 * float(rmse), found.seconds, found.course, steps)
+        except Given:
+            trial = Trial(values, True, course[-1], float("nan"), 0.0, tuple(course), steps)
+        study.tell(asked, state=optuna.trial.TrialState.FAIL)  # what is told is the rounded setting
+        _tell(optuna, study, ranges, trial)
+        done.append(trial)
+        write_history(history, done)
+        print(f"trial {number}: cost {trial.cost:+.5f}{', given up' if trial.pruned else ''}", flush=True)
+    return done
+
+
+def _distribution(optuna: Any, knob: Any) -> Any:
+    if knob.whole:
+        return optuna.distributions.IntDistribution(int(knob.low), int(knob.high))
+    return optuna.distributions.FloatDistribution(knob.low, knob.high, log=knob.log)
+
+
+def _tell(optuna: Any, study: Any, ranges: Any, trial: Any) -> None:
+    kind = optuna.trial.TrialState
+    params = {
+        name: (round if isinstance(at, optuna.distributions.IntDistribution) else float)(min(max(v, at.low), at.high))
+        for (name, at), v in zip(ranges.items(), trial.values, strict=True)
+    }
+    study.add_trial(
+        optuna.trial.create_trial(
+            params=params,
+            distributions=ranges,
+            value=trial.cost,
+            intermediate_values=dict(enumerate(trial.course, 1)),
+            state=kind.PRUNED if trial.pruned else kind.COMPLETE,
+        )
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
