@@ -15,37 +15,14 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent / "golden"))
 
+from digest import digest
 from trajectories import FILE, SIGNALS, trajectories, trajectory
 
+import benchmark
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv, Parameters
 
 ROOT = Path(__file__).parents[1]
 GOLDEN: dict[str, Any] = json.loads(FILE.read_text())
-DIGEST = """
-import hashlib
-import numpy as np
-from cz_gym import CzVectorEnv
-import cz_gym
-digest = hashlib.sha256()
-for scenario in ("randomized", "puller", "sensor-fault"):
-    env = CzVectorEnv(3, scenario, observation="history", control_interval=20.0, horizon=600.0)
-    observation, infos = env.reset(seed=4)
-    rng = np.random.default_rng(0)
-    for _ in range(70):
-        digest.update(observation.tobytes() + b"".join(np.asarray(infos[name]).tobytes() for name in sorted(infos)))
-        observation, reward, terminated, truncated, infos = env.step(rng.uniform(-0.5, 0.5, (3, 2)))
-        digest.update(reward.tobytes() + terminated.tobytes() + truncated.tobytes())
-print(digest.hexdigest(), cz_gym.__file__)
-"""
-
-
-def digest(folder: Path, path: Path) -> list[str]:
-    """Digest and origin, printed by a fresh process in ``folder`` that imports from ``path``."""
-    environment = {**os.environ, "PYTHONPATH": str(path)}
-    done = subprocess.run(
-        [sys.executable, "-c", DIGEST], cwd=folder, env=environment, capture_output=True, text=True, check=True
-    )
-    return done.stdout.split()
 
 
 def test_golden_trajectories() -> None:
@@ -69,25 +46,12 @@ def test_goldens_notice_a_change_of_any_parameter(name: str) -> None:
     assert not np.allclose(rows, GOLDEN["randomized, I"], rtol=1e-9, atol=0.0)
 
 
-def test_the_same_bits_in_another_process_and_from_an_installed_wheel(tmp_path: Path) -> None:
-    """The wheel is unpacked where an installer would put it."""
-    source, wheels, installed = tmp_path / "source", tmp_path / "wheels", tmp_path / "installed"
-    for folder in ("cz_gym", "baselines", "agents"):
-        for file in (ROOT / folder).rglob("*"):
-            if file.is_file() and "__pycache__" not in file.parts:
-                target = source / file.relative_to(ROOT)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                target.write_bytes(file.read_bytes())
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        (source / name).write_bytes((ROOT / name).read_bytes())
-    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
-    alone = ["--no-deps", "--no-build-isolation", "--no-index"]
-    subprocess.run([*pip, "wheel", *alone, "--wheel-dir", str(wheels), str(source)], check=True, capture_output=True)
-    wheel = next(wheels.glob("*.whl"))
-    subprocess.run([*pip, "install", *alone, "--target", str(installed), str(wheel)], check=True, capture_output=True)
-    ours, theirs = digest(tmp_path, ROOT), digest(tmp_path, installed)
-    assert (Path(ours[1]).parents[1], Path(theirs[1]).parents[1]) == (ROOT, installed)
-    assert ours[0] == theirs[0] == digest(tmp_path, ROOT)[0]
+def test_the_same_bits_in_another_process() -> None:
+    """And from an installed wheel: ``tests/test_packaging.py``."""
+    command = [sys.executable, str(ROOT / "tests" / "golden" / "digest.py")]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [digest(), str(ROOT / "cz_gym" / "__init__.py")]
 
 
 def test_thread_counts_do_not_change_bits() -> None:
@@ -127,21 +91,24 @@ def times(results: Any, taken: list[float]) -> Any:
     return {name: times(part, taken) for name, part in results.items() if name != "microseconds_per_step"}
 
 
-def test_the_benchmark_prints_the_same_table_twice(tmp_path: Path) -> None:
-    """All but the time in the policies, which is measured; so are the numbers of the JSON."""
+def test_the_benchmark_prints_the_same_table_twice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Here and in a process of its own, and the same JSON; all but the time in the policies, which is measured."""
     printed, written = [], []
-    for run in ("one", "two"):
+    for run in ("here", "elsewhere"):
         file = tmp_path / f"{run}.json"
-        command = [
-            sys.executable, str(ROOT / "benchmark.py"), "--episodes", "2", "--controllers", "open-loop,paper",
-            "--scenarios", "randomized,nominal", "--json", str(file),
-        ]  # fmt: skip
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+        options = ["--episodes", "2", "--controllers", "open-loop,paper", "--scenarios", "randomized,nominal"]
+        options += ["--json", str(file)]
+        if run == "here":
+            assert benchmark.main(options) == 0
+            table = capsys.readouterr().out
+        else:
+            command = [sys.executable, str(ROOT / "benchmark.py"), *options]
+            table = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
         taken: list[float] = []
         found = times(json.loads(file.read_text()), taken)
         shown = {f"{value:.2f}" for value in taken}
         assert len(shown) >= 2
-        lines = [line.split() for line in done.stdout.splitlines() if ".json" not in line]
+        lines = [line.split() for line in table.splitlines() if ".json" not in line]
         printed.append([[token for token in line if token not in shown] for line in lines])
         written.append({name: found[name] for name in ("results", "paired", "cvar5", "verdicts")})
     assert printed[0] == printed[1] != []

@@ -10,6 +10,10 @@ from pathlib import Path
 
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parent / "golden"))
+
+from digest import digest
+
 import cz_gym
 
 ROOT = Path(__file__).parents[1]
@@ -140,18 +144,35 @@ def _files() -> list[str]:
     return [str(folder / name) for folder, names in walked if not made & set(folder.parts) for name in names]
 
 
-def test_wheel_installs_one_package_and_works_outside_the_checkout(wheel: Path, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that an installer puts the wheel into; with it, its compiled code is made once."""
+    folder = tmp_path_factory.mktemp("installed")
+    command = [sys.executable, "-m", "pip", "install", "--disable-pip-version-check", "--quiet", "--no-deps"]
+    done = subprocess.run([*command, "--no-index", "--target", str(folder), str(wheel)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+def test_wheel_installs_one_package_and_works_outside_the_checkout(
+    wheel: Path, installed: Path, tmp_path: Path
+) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
-        archive.extractall(tmp_path)
     top = {name.partition("/")[0] for name in names}
     assert {name for name in top if not name.endswith(".dist-info")} == {"cz_gym"}
     for needed in ("py.typed", "baselines/__init__.py", "agents/__init__.py", "evaluation/__init__.py"):
         assert f"cz_gym/{needed}" in names
     assert not any("tests" in Path(name).parts for name in names)
     assert any(name.endswith("licenses/LICENSE") for name in names)
-    printed = run(SMOKE.format(baselines="cz_gym.baselines"), tmp_path, tmp_path)
-    assert printed == str(tmp_path / "cz_gym" / "__init__.py")
+    printed = run(SMOKE.format(baselines="cz_gym.baselines"), tmp_path, installed)
+    assert printed == str(installed / "cz_gym" / "__init__.py")
+
+
+def test_an_installed_wheel_gives_the_same_bits(installed: Path, tmp_path: Path) -> None:
+    script = str(ROOT / "tests" / "golden" / "digest.py")
+    printed = run(f"import runpy\nrunpy.run_path({script!r}, run_name='__main__')", tmp_path, installed)
+    assert printed.split() == [digest(), str(installed / "cz_gym" / "__init__.py")]
 
 
 def test_wheel_carries_the_shipped_agents(wheel: Path) -> None:
