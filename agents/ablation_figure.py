@@ -8,14 +8,17 @@ from typing import Any
 from cz_gym.evaluation.canvas import COLOURS, GREY, INK, canvas, png
 
 from .ablation_rows import BASE
-from .ablation_table import MICRON, SHOWN, Line
+from .ablation_table import MICRON, MILLI, SHOWN, Line
 
 PANELS = (
-    ("rmse_mm", MICRON, "RMSE of the radius less base's [um]", 1.0),
-    ("cost", 1.0, "cost, as ppo weighs it, less base's [-]", 1e-3),
-    ("pull_step_rms_mm_per_min", 1.0, "pull step RMS less base's [mm/min]", 1e-3),
+    ("rmse_mm", MICRON, "RMSE of the radius less base's [um]"),
+    ("cost", MILLI, "1000 cost, as ppo weighs it, less base's [-]"),
+    ("pull_step_rms_mm_per_min", MICRON, "RMS of pull steps less base's [um/min]"),
 )
-"""Figure, its unit, the axis's title, and the width around zero that is linear."""
+"""Figure, its unit, and the axis's title."""
+LINEAR = 1.0
+"""Half width of the middle of each axis, in its unit, that is linear; beyond it the axis is logarithmic."""
+TICKS = (-100.0, -10.0, -3.0, -1.0, 0.0, 1.0, 3.0, 10.0, 100.0, 1000.0, 10000.0)
 STYLES = (
     (SHOWN, "kept", COLOURS[1], "o", -0.18),
     ("last", "last", COLOURS[0], "D", 0.06),
@@ -28,11 +31,17 @@ def forest(lines: Sequence[Line]) -> bytes:
     shown = [line for line in lines if line.cells[SHOWN, "rmse_mm"].difference is not None] or list(lines)
     figure = canvas(11.0, 0.34 * len(shown) + 1.7)
     axes = figure.subplots(1, len(PANELS), sharey=True, squeeze=False)[0]
-    for axis, (name, unit, title, linear) in zip(axes, PANELS, strict=True):
+    for axis, (name, unit, title) in zip(axes, PANELS, strict=True):
         axis.axvline(0.0, color=INK, lw=0.8)
         for place, line in enumerate(shown):
             _draw(axis, line, name, unit, place)
-        axis.set_xscale("symlog", linthresh=linear, linscale=0.6)
+        axis.set_xscale("symlog", linthresh=LINEAR, linscale=1.0)
+        low, high = axis.get_xlim()
+        low, high = min(low, -1.5 * LINEAR), max(high, 1.5 * LINEAR)
+        axis.set_xticks([tick for tick in TICKS if low <= tick <= high], minor=False)
+        axis.set_xticks([], minor=True)
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.set_xlim(low, high)
         axis.set_xlabel(title)
         axis.set_ylim(len(shown) - 0.4, -0.6)
     axes[0].set_yticks(range(len(shown)), [f"{line.row.name} ({len(line.seeds)})" for line in shown])

@@ -21,6 +21,7 @@ from .ablation_rows import BASE, Row
 from .ablation_run import FIGURES, JUDGED, STAGES, Finished
 
 Floats = npt.NDArray[np.float64]
+MILLI = 1e-3
 MICRON = 1e-3
 """A micrometre in millimetres."""
 SHOWN = "best"
@@ -48,12 +49,14 @@ class Line:
 def tabulate(
     rows: Sequence[Row], runs: Mapping[str, Sequence[Finished]], resamples: Resamples | None = None
 ) -> list[Line]:
-    """A line for each row with finished runs."""
+    """A line for each row with finished runs; rows about the same thing stand together."""
     if not runs:
         return []
     weights = resamples or Resamples.draw(len(next(iter(runs.values()))[0].stages[SHOWN]))
     base = {run.seed: run.stages[SHOWN] for run in runs.get(BASE, ())}
-    return [_line(row, runs[row.name], base, weights) for row in rows if row.name in runs]
+    subjects = list(dict.fromkeys(row.about for row in rows))
+    ordered = sorted(rows, key=lambda row: subjects.index(row.about))
+    return [_line(row, runs[row.name], base, weights) for row in ordered if row.name in runs]
 
 
 def _line(row: Row, runs: Sequence[Finished], base: Mapping[int, Floats], resamples: Resamples) -> Line:
@@ -127,14 +130,14 @@ def to_markdown(lines: Sequence[Line], steps: int) -> str:
 
 def _table(lines: Sequence[Line]) -> list[str]:
     headings = (
-        "row", "seeds", "RMSE kept [um]", "difference [um]", "RMSE last [um]", "RMSE start [um]", "cost kept",
-        "difference", "cost last", "reward's cost kept", "difference", "pull step kept [mm/min]",
+        "row", "seeds", "RMSE kept [um]", "difference [um]", "RMSE last [um]", "RMSE start [um]", "1000 cost kept",
+        "difference", "last", "start", "1000 reward's cost kept", "difference", "pull step kept [mm/min]",
         "lost kept / last [%]",
     )  # fmt: skip
     found = [f"| {' | '.join(headings)} |", f"|---|{'--:|' * (len(headings) - 1)}"]
     for line in lines:
         kept, lost = {name: line.cells[SHOWN, name] for name in FIGURES}, line.cells["last", "failure_rate"].mean
-        start = line.cells.get(("start", "rmse_mm"))
+        start, began = line.cells.get(("start", "rmse_mm")), line.cells.get(("start", "cost"))
         entries = (
             line.row.name,
             str(len(line.seeds)),
@@ -142,11 +145,12 @@ def _table(lines: Sequence[Line]) -> list[str]:
             _interval(kept["rmse_mm"].difference, MICRON, 1, True),
             f"{line.cells['last', 'rmse_mm'].mean.mean / MICRON:.1f}",
             f"{start.mean.mean / MICRON:.1f}" if start else "-",
-            _interval(kept["cost"].mean, 1.0, 4),
-            _interval(kept["cost"].difference, 1.0, 4, True),
-            f"{line.cells['last', 'cost'].mean.mean:.4f}",
-            f"{kept['reward_cost'].mean.mean:.4f}",
-            _interval(kept["reward_cost"].difference, 1.0, 4, True),
+            _interval(kept["cost"].mean, MILLI, 2),
+            _interval(kept["cost"].difference, MILLI, 2, True),
+            f"{line.cells['last', 'cost'].mean.mean / MILLI:.2f}",
+            f"{began.mean.mean / MILLI:.2f}" if began else "-",
+            f"{kept['reward_cost'].mean.mean / MILLI:.2f}",
+            _interval(kept["reward_cost"].difference, MILLI, 2, True),
             f"{kept['pull_step_rms_mm_per_min'].mean.mean:.4f}",
             f"{100.0 * kept['failure_rate'].mean.mean:.1f} / {100.0 * lost.mean:.1f}",
         )
