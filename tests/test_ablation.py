@@ -13,8 +13,10 @@ import pytest
 from agents import ablation, ablation_figure, ablation_rows, ablation_run, ablation_table, run, settings
 from agents.ablation_rows import BASE, ROWS, Row, find_rows
 from agents.ablation_run import FIGURES, Finished, Plan
-from agents.training import training_scenario
+from agents.export import actor_of
+from agents.training import clone, make_training, training_scenario
 from baselines.registry import find_controller
+from cz_gym.config import make_config
 from cz_gym.evaluation.protocol import TEST_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.statistics import Resamples
 
@@ -65,6 +67,23 @@ def test_a_row_changes_what_it_says_and_nothing_else(row: Row) -> None:
     if row.choice.recipe.clone:
         assert not find_controller(row.choice.recipe.clone.teacher).told
     assert row.choice.recipe.residual == row.name.startswith("residual")
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
+def test_a_row_can_be_learned(row: Row, tmp_path: Path) -> None:
+    choice, recipe = row.of(32), row.choice.recipe
+    few = replace(recipe.clone, rounds=1, episodes=1, epochs=1) if recipe.clone else None
+    choice = replace(choice, recipe=replace(recipe, num_envs=4, clone=few), n_steps=8, batch_size=32, critic_steps=0)
+    config = replace(make_config(recipe.scenario, observation="history"), horizon=100.0)
+    teacher = find_controller(few.teacher).make(make_config(recipe.scenario)) if few else None
+    training = make_training(choice, 0, None, 0, teacher)
+    clone(training, teacher, config, 0, lambda _: None, tmp_path)
+    before = actor_of(training.learner)
+    training.learner.learn(32, callback=training.callbacks)
+    after = actor_of(training.learner)
+    assert not np.array_equal(before.layers[-1][0][0], after.layers[-1][0][0])
+    assert np.isfinite(after.layers[-1][0]).all()
+    training.learner.env.close()
 
 
 def test_rows_have_names_of_their_own() -> None:
