@@ -146,7 +146,10 @@ def read_finished(plan: Plan, row: Row, seed: int) -> Finished | None:
     if found is None or (found.row, found.seed) != (row.name, seed):
         raise ValueError(f"{path}: not a finished run of this ablation, or damaged; move it away to run it again")
     wanted = json.loads(json.dumps(asdict(row.of(plan.steps))))
-    if _completed(found.settings) != wanted or told.get("scenario_hash") != make_config(SCENARIO).scenario.hash:
+    if (
+        _completed(found.settings, type(row.choice)) != wanted
+        or told.get("scenario_hash") != make_config(SCENARIO).scenario.hash
+    ):
         raise ValueError(f"{path}: made with other settings; move it away, or choose another --out or --steps")
     return found
 
@@ -172,8 +175,8 @@ def _parsed(told: Mapping[str, Any]) -> Finished | None:
     return found if sound and {"best", "last"} <= set(stages) else None
 
 
-def _completed(saved: Mapping[str, Any]) -> dict[str, Any]:
-    """Kept settings with today's defaults for those that did not exist when they were kept."""
+def _completed(saved: Mapping[str, Any], kind: type[Any] = PPO) -> dict[str, Any]:
+    """Kept settings of that kind with today's defaults for those that did not exist when they were kept."""
 
     def filled(part: Any, default: Any) -> Any:
         if not isinstance(part, Mapping) or not isinstance(default, Mapping):
@@ -182,6 +185,6 @@ def _completed(saved: Mapping[str, Any]) -> dict[str, Any]:
             name: value for name, value in part.items() if name not in default
         }
 
-    whole = filled(saved, json.loads(json.dumps(asdict(PPO()))))
+    whole = filled(saved, json.loads(json.dumps(asdict(kind()))))
     assert isinstance(whole, dict)
     return whole

@@ -1,0 +1,173 @@
+"""Algorithms side by side: ``python -m agents.algorithms`` trains each for as many steps on the same observations.
+
+PPO, recurrent PPO and SAC from nothing, and ``ppo`` as it ships, which begins with an imitation. They are judged on
+the crystals of :mod:`agents.ablation_run`, validation that selects nothing. Finished runs are kept; the same command
+goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cz_gym.commands import OneLineParser, interrupted
+
+from .ablation_rows import Row
+from .settings import PPO, RECIPES, CostWeights
+
+PROG = "agents.algorithms"
+
+
+def _row(name: str, about: str, meaning: str) -> Row:
+    choice: Any = RECIPES[name]
+    return Row(name, about, meaning, choice)
+
+
+ROWS = (
+    _row("ppo-scratch", "from nothing", "PPO; the critic also sees the true state"),
+    _row("ppo-recurrent", "from nothing", "PPO of an LSTM, actor and critic (sb3-contrib)"),
+    _row("sac", "from nothing", "soft actor-critic"),
+    _row("ppo", "from an imitation", f"the shipped recipe: imitates {PPO().recipe.clone.teacher}, then PPO"),  # type: ignore[union-attr]
+)
+"""Every row, in the order of the table."""
+WEIGHTS = CostWeights()
+"""Of the cost that all are judged by: the environment's reward."""
+
+
+def to_markdown(lines: Sequence[Any], curves: Mapping[str, Sequence[Any]], steps: int) -> str:
+    """``table.md``."""
+    from .ablation_run import JUDGED
+
+    heads = ("algorithm", "begins", "training seeds", "RMSE [mm]", "worst seed [mm]", "lost [%]", "pull steps [mm/min]",
+             "reward's cost", "before learning [mm]", "minutes a run")  # fmt: skip
+    found = [
+        "# Algorithms side by side",
+        "",
+        f"{steps:,} environment steps a run, the same 72 channels of history, judged on {len(JUDGED)} validation"
+        " crystals of `randomized` that select nothing: of each run the agent that did best on those that select."
+        " In brackets: 95 % intervals, bootstrap over training seeds and crystals. A lost crystal counts 8 mm.",
+        "",
+        "| " + " | ".join(heads) + " |",
+        "|---|---" + "|--:" * (len(heads) - 2) + "|",
+    ]
+    for line in lines:
+        runs = curves[line.row.name]
+        rmse, cost = line.cells["best", "rmse_mm"].mean, line.cells["best", "reward_cost"].mean
+        start = line.cells.get(("start", "rmse_mm"))
+        minutes = sum(run["validations"][-1]["seconds"] for run in runs) / len(runs) / 60.0
+        worst = max(sum(run["stages"]["best"]["rmse_mm"]) / len(JUDGED) for run in runs)
+        cells = (
+            line.row.name,
+            line.row.about,
+            f"{len(line.seeds)}",
+            f"{rmse.mean:.3f} [{rmse.ci95[0]:.3f}, {rmse.ci95[1]:.3f}]",
+            f"{worst:.3f}",
+            f"{100.0 * line.cells['best', 'failure_rate'].mean.mean:.1f}",
+            f"{line.cells['best', 'pull_step_rms_mm_per_min'].mean.mean:.4f}",
+            f"{cost.mean:.3f} [{cost.ci95[0]:.3f}, {cost.ci95[1]:.3f}]",
+            f"{start.mean.mean:.3f}" if start else "-",
+            f"{minutes:.0f}",
+        )
+        found.append("| " + " | ".join(cells) + " |")
+    found += ["", *(f"- **{line.row.name}**: {line.row.meaning}" for line in lines)]
+    return "\n".join(found) + "\n"
+
+
+def curve_figure(curves: Mapping[str, Sequence[Any]]) -> bytes:
+    """Validation RMSE while learning, a line a run; ``curves`` holds the kept runs by row."""
+    from cz_gym.evaluation.canvas import canvas, png, styles
+
+    figure = canvas(6.4, 3.8)
+    axis = figure.subplots()
+    for (name, runs), style in zip(curves.items(), styles(tuple(curves)).values(), strict=True):
+        for i, run in enumerate(runs):
+            steps = [each["steps"] / 1e3 for each in run["validations"]]
+            error = [each["validation_rmse_mm"] for each in run["validations"]]
+            axis.plot(
+                steps, error, color=style.colour, marker=style.marker, ms=3.5, lw=1.3, label=name if not i else None
+            )
+    axis.set_yscale("log")
+    axis.yaxis.set_major_formatter(lambda value, position: f"{value:g}")
+    axis.set_xlabel("environment steps [thousand]")
+    axis.set_ylabel("validation RMSE of the radius [mm]")
+    figure.legend(loc="outside lower center", ncols=len(curves), frameon=False, fontsize=9)
+    figure.suptitle("Learning, one line a training seed", fontsize=11)
+    return png(figure)
+
+
+def _write(plan: Any, seeds: Sequence[int]) -> None:
+    from cz_gym.evaluation.whole import write_files
+
+    from .ablation_run import path_of, read_all
+    from .ablation_table import tabulate, to_csv
+
+    runs = read_all(plan, ROWS, seeds)
+    if not runs:
+        return
+    lines = tabulate(ROWS, runs)
+    told = {
+        line.row.name: [json.loads(path_of(plan, line.row, seed).read_bytes()) for seed in line.seeds] for line in lines
+    }
+    files = {
+        "table.csv": to_csv(lines).encode(),
+        "table.md": to_markdown(lines, told, plan.steps).encode(),
+        "curves.png": curve_figure(told),
+    }
+    write_files({plan.out / name: content for name, content in files.items()})
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    parser = OneLineParser(prog=f"python -m {PROG}", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--seeds", type=int, default=3, help="training seeds a row (default: %(default)s)")
+    parser.add_argument("--steps", type=int, default=1_000_000, help="environment steps a run (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=Path("results/algorithms"), help="results (default: %(default)s)")
+    parser.add_argument(
+        "--work", type=Path, default=Path("runs/algorithms"), help="unfinished runs (default: %(default)s)"
+    )
+    args = parser.parse_args(arguments)
+    try:
+        for name, most in (("seeds", 100), ("steps", 10**9)):
+            if not 1 <= getattr(args, name) <= most:
+                raise ValueError(f"--{name} must be between 1 and {most}, not {getattr(args, name)}")
+        _main(args)
+    except ImportError as error:
+        print(f'{PROG}: {error.name} is missing: pip install "cz-gym[agents,benchmark]"', file=sys.stderr)
+        return 2
+    except (ValueError, OSError) as error:
+        print(f"{PROG}: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return interrupted(PROG, "finished runs are kept, and the same command goes on from the others' checkpoints")
+    print(f"wrote {args.out / 'table.md'}")
+    return 0
+
+
+def _main(args: Any) -> None:
+    from tqdm import tqdm
+
+    from cz_gym.evaluation.whole import alone, check_writable
+
+    from .ablation_run import Plan, read_finished, run_one
+
+    plan = Plan(args.steps, args.out, args.work, WEIGHTS)
+    check_writable(plan.out)
+    with alone(plan.work):
+        # Seed by seed, so that a stopped comparison holds every algorithm.
+        for seed in range(args.seeds):
+            for row in ROWS:
+                if read_finished(plan, row, seed):
+                    continue
+                title = f"{row.name}, seed {seed}"
+                with tqdm(total=plan.steps, desc=title, unit="step", unit_scale=True, disable=None) as bar:
+                    run_one(plan, row, seed, bar)
+                print(f"{title}: done", flush=True)
+                _write(plan, range(args.seeds))
+        _write(plan, range(args.seeds))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
