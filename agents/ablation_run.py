@@ -30,11 +30,16 @@ from .validation import costs
 Floats = npt.NDArray[np.float64]
 JUDGED = VALIDATION_SEEDS[QUICK : QUICK + 200]
 """Seeds of the crystals that all rows are judged on: validation, but none that picks the best agent of a run."""
-SCENARIO = "randomized"
-"""What they are drawn from, whatever a row was trained on."""
-FIGURES = ("rmse_mm", "cost", "reward_cost", "pull_step_rms_mm_per_min", "failure_rate")
+SCENARIO, FARTHER = "randomized", "hard"
+"""What they are drawn from, whatever a row was trained on; and a scenario to travel to."""
+_TRAVELLED = ("rmse_mm", "failure_rate")
+FIGURES = (
+    "rmse_mm", "cost", "reward_cost", "pull_step_rms_mm_per_min", "failure_rate",
+    *(f"{FARTHER}_{name}" for name in _TRAVELLED),
+)  # fmt: skip
 """Figures of an episode: true-radius RMSE [mm]; mean cost of a step [-] as ``ppo`` weighs it and as the environment's
-reward does, a lost crystal costing ten; RMS of the pull speed's steps [mm/min]; 1 if the crystal was lost."""
+reward does, a lost crystal costing ten; RMS of the pull speed's steps [mm/min]; 1 if the crystal was lost; radius error
+and loss on the other scenario."""
 STAGES = ("best", "last", "start")
 """The agents of a run: the one that did best on the validation that selects, the last one, and the one it began as."""
 DIGITS = 5
@@ -89,9 +94,12 @@ def run_one(plan: Plan, row: Row, seed: int, bar: Any) -> None:
 
 def judge(policy: Any, weights: CostWeights) -> Floats:
     """Figures of a policy on the crystals that all rows are judged on, shape (episodes, figures)."""
-    found = metrics(rollout(policy, make_config(SCENARIO, observation="history"), JUDGED))
+    found, farther = (
+        metrics(rollout(policy, make_config(name, observation="history"), JUDGED)) for name in (SCENARIO, FARTHER)
+    )
     by_name = {
         **found._asdict(),
+        **{f"{FARTHER}_{name}": getattr(farther, name) for name in _TRAVELLED},
         "cost": costs(found, weights),
         "reward_cost": costs(found, CostWeights()),
     }

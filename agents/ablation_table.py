@@ -18,7 +18,7 @@ import numpy.typing as npt
 from cz_gym.evaluation.statistics import Estimate, Resamples, means
 
 from .ablation_rows import BASE, Row
-from .ablation_run import FIGURES, JUDGED, STAGES, Finished
+from .ablation_run import FARTHER, FIGURES, JUDGED, STAGES, Finished
 
 Floats = npt.NDArray[np.float64]
 MILLI = 1e-3
@@ -132,7 +132,7 @@ def _table(lines: Sequence[Line]) -> list[str]:
     headings = (
         "row", "seeds", "RMSE kept [um]", "difference [um]", "RMSE last [um]", "RMSE start [um]", "1000 cost kept",
         "difference", "last", "start", "1000 reward's cost kept", "difference", "pull step kept [mm/min]",
-        "lost kept / last [%]",
+        "lost kept / last [%]", f"{FARTHER}: RMSE kept [um]", "lost [%]",
     )  # fmt: skip
     found = [f"| {' | '.join(headings)} |", f"|---|{'--:|' * (len(headings) - 1)}"]
     for line in lines:
@@ -153,6 +153,8 @@ def _table(lines: Sequence[Line]) -> list[str]:
             _interval(kept["reward_cost"].difference, MILLI, 2, True),
             f"{kept['pull_step_rms_mm_per_min'].mean.mean:.4f}",
             f"{100.0 * kept['failure_rate'].mean.mean:.1f} / {100.0 * lost.mean:.1f}",
+            _interval(kept[f"{FARTHER}_rmse_mm"].mean, MICRON, 1),
+            f"{100.0 * kept[f'{FARTHER}_failure_rate'].mean.mean:.1f}",
         )
         found.append(f"| {' | '.join(entries)} |")
     return found

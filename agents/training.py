@@ -16,7 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from cz_gym import CzVectorEnv
 from cz_gym.config import Config
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
-from cz_gym.scenario import Scenario
+from cz_gym.scenario import Pullers, Scenario
 from cz_gym.scenarios import find_scenario
 
 from . import settings
@@ -81,7 +81,7 @@ def clone(
     choice = recipe.clone
     if choice is None:
         return
-    shown = config.with_scenario(training_scenario(recipe))
+    shown = config.with_scenario(widened(training_scenario(recipe), choice.width))
     first = (seed * 20_011 + 500_000) % (len(TRAINING_SEEDS) - choice.rounds * choice.episodes)
 
     def begin() -> Views:
@@ -102,16 +102,46 @@ def training_scenario(recipe: settings.Recipe) -> Scenario:
     scenario = find_scenario(recipe.scenario)
     if recipe.width == 1.0:
         return scenario
-    width, pullers = recipe.width, scenario.pullers
+    pullers = _spread(scenario.pullers, recipe.width)
+    return replace(scenario, name=f"{scenario.name}-width-{recipe.width:g}", pullers=pullers)
+
+
+def widened(scenario: Scenario, width: float) -> Scenario:
+    """The scenario with its pullers, ramps, fluctuations and noises spread that many times as wide.
+
+    What an imitation is shown: on crystals no worse than the scenario's own it never sees how the teacher saves one.
+    """
+    if width == 1.0:
+        return scenario
+    s = scenario
+
+    def times(bounds: tuple[float, float]) -> tuple[float, float]:
+        return width * bounds[0], width * bounds[1]
+
+    return replace(
+        s,
+        name=f"{s.name}-times-{width:g}",
+        pullers=replace(_spread(s.pullers, width), start_radius_sd=width * s.pullers.start_radius_sd),
+        recipe=replace(s.recipe, rate=times(s.recipe.rate)),
+        drift=replace(s.drift, amount=times(s.drift.amount)),
+        interface=replace(s.interface, sd=times(s.interface.sd)),
+        reference=replace(s.reference, amount=times(s.reference.amount)),
+        sensor=replace(
+            s.sensor, camera_noise=times(s.sensor.camera_noise), pyrometer_noise=times(s.sensor.pyrometer_noise)
+        ),
+    )
+
+
+def _spread(pullers: Pullers, width: float) -> Pullers:
+    """The pullers with their constants spread that many times as wide about the middle."""
     middle, half = sum(pullers.mix) / 2.0, (pullers.mix[1] - pullers.mix[0]) / 2.0
-    spread = replace(
+    return replace(
         pullers,
         mix=(max(middle - width * half, 0.0), min(middle + width * half, 1.0)),
         capillary=width * pullers.capillary,
         conductivity=width * pullers.conductivity,
         conductance=width * pullers.conductance,
     )
-    return replace(scenario, name=f"{scenario.name}-width-{width:g}", pullers=spread)
 
 
 def _make_slots(recipe: settings.Recipe, seed: int, done: int) -> CzVecEnv:

@@ -41,6 +41,8 @@ CHANGES = {
     "pullers-half": {"recipe.width"},
     "pullers-wider": {"recipe.width"},
     "teacher-lqg": {"recipe.clone"},
+    "shown-narrow": {"recipe.clone"},
+    "shown-wider": {"recipe.clone"},
     "teacher-lqg-quiet": {"recipe.clone"},
     "on-hard": {"recipe.scenario"},
     BASE: set(),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +16,14 @@ from agents.network import Paced
 from agents.pairing import PairedReward
 from agents.residual import Residual
 from agents.training import clone as clone_into
-from agents.training import make_training, training_scenario
+from agents.training import make_training, training_scenario, widened
 from agents.vec_env import CzVecEnv
 from agents.wrappers import TrainingReward
 from baselines.lqg_settings import lqg
 from cz_gym import CzVectorEnv
 from cz_gym.config import make_config
 from cz_gym.observation import HISTORY
+from cz_gym.scenarios import find_scenario
 from cz_gym.task import Cost, reward
 
 CONFIG = make_config("randomized", observation="history", horizon=600.0)
@@ -209,6 +210,16 @@ def test_pullers_spread_as_wide_as_asked() -> None:
     np.testing.assert_allclose([each.capillary for each in asked], [0.0, 0.015, 0.03, 0.045])
     np.testing.assert_allclose([each.conductance for each in asked], [0.0, 0.05, 0.1, 0.15])
     assert {each.start_radius_sd for each in asked} == {0.2e-3}
+
+
+def test_what_an_imitation_is_shown_spreads_as_hard_does() -> None:
+    trained_on, hard = find_scenario("randomized"), find_scenario("hard")
+    assert widened(trained_on, 1.0) is trained_on
+    ours = widened(trained_on, 1.5)
+    assert ours.reference.amount == hard.reference.amount
+    assert (ours.recipe, ours.drift, ours.interface) == (hard.recipe, hard.drift, hard.interface)
+    np.testing.assert_allclose(astuple(ours.pullers)[1:], astuple(hard.pullers)[1:], rtol=1e-12)
+    assert ours.pullers.mix == hard.pullers.mix
 
 
 def test_a_network_beside_a_controller_begins_as_the_controller() -> None:
