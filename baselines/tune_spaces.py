@@ -18,6 +18,7 @@ from .frequency import crossover, sensitivity
 from .industrial import Industrial
 from .sampled_loop import linear_controller
 from .temperature_loop import TemperatureLoop
+from .tuned import USUAL, settings
 
 
 class Knob(NamedTuple):
@@ -165,10 +166,12 @@ SPACES = (
 def space_of(name: str, scenario: str) -> Space:
     """The search of that controller; scenarios with limited drives or lying cameras open two more knobs.
 
-    ValueError names the controllers that can be tuned.
+    On other scenarios than ``randomized`` it begins with the settings frozen for that one. ValueError names the
+    controllers that can be tuned.
     """
     for space in SPACES:
         if space.name == name:
             more = ROBUST if scenario in ("puller", "sensor-fault") and isinstance(space.base, FilteredPID) else ()
-            return space._replace(knobs=(*space.knobs, *more))
+            base = space.base if scenario == USUAL else settings(name, USUAL)
+            return space._replace(base=base, knobs=(*space.knobs, *more))
     raise ValueError(f"nothing to tune for {name!r}; choose from {', '.join(space.name for space in SPACES)}")

@@ -17,6 +17,9 @@ from .industrial import Industrial
 from .policy import Policy
 from .temperature_loop import TemperatureLoop
 
+USUAL = "randomized"
+"""Scenario whose settings serve where there are none."""
+
 
 class Tuned(NamedTuple):
     """A controller's settings for a scenario."""
@@ -31,6 +34,16 @@ TUNED: tuple[Tuned, ...] = (
         "paper-filtered",
         "randomized",
         FilteredPID(T_f=53.88),
+    ),
+    Tuned(
+        "paper-filtered",
+        "puller",
+        FilteredPID(T_f=17.97, jump=0.0004818, T_track=1320.0),
+    ),
+    Tuned(
+        "paper-filtered",
+        "sensor-fault",
+        FilteredPID(T_f=165.2, jump=0.0002365, T_track=168.2),
     ),
     Tuned(
         "paper-tuned",
@@ -59,6 +72,21 @@ TUNED: tuple[Tuned, ...] = (
             ring_lead=18.3,
             K_ff=1.004,
             heater=TemperatureLoop(K=507.1, T_i=202.0, share=0.5192, K_pull=5.78, T_pull=444.7, T_mean=42.84),
+        ),
+    ),
+    Tuned(
+        "paper-tuned",
+        "sensor-fault",
+        FilteredPID(
+            pid=SeriesPID(K_p=0.02233, T_i=839.1, T_d=799.9, N=12.11),
+            compensator=Compensator(gain=-0.5563, fast=0.001643, slow=0.005015),
+            T_f=78.43,
+            jump=0.001873,
+            T_start=183.0,
+            T_track=349.7,
+            ring_lead=19.31,
+            K_ff=0.8874,
+            heater=TemperatureLoop(K=498.0, T_i=207.3, share=0.5671, K_pull=5.088, T_pull=546.9, T_mean=39.99),
         ),
     ),
     Tuned(
@@ -98,17 +126,38 @@ TUNED: tuple[Tuned, ...] = (
             heater=TemperatureLoop(K=407.2, T_i=64.27, share=0.8326, K_pull=36.0, T_pull=6343.0, T_mean=1611.0),
         ),
     ),
+    Tuned(
+        "industrial",
+        "puller",
+        Industrial(
+            T_f=1.069,
+            heater=TemperatureLoop(K=300.0, T_i=71.63, share=0.964, K_pull=12.23, T_pull=7361.0, T_mean=786.8),
+        ),
+    ),
+    Tuned(
+        "industrial",
+        "sensor-fault",
+        Industrial(
+            T_f=1.38,
+            heater=TemperatureLoop(K=300.0, T_i=66.21, share=0.7286, K_pull=19.71, T_pull=6438.0, T_mean=1049.0),
+        ),
+    ),
 )
 """All settings; for each controller those of ``randomized`` come first."""
 
 
-def tuned(controller: str, config: Config) -> Policy:
-    """The controller with the settings for that environment; ValueError if it has none."""
+def settings(controller: str, scenario: str) -> Any:
+    """The controller with its frozen settings for that scenario; ValueError if it has none."""
     found = {entry.scenario: entry.policy for entry in TUNED if entry.controller == controller}
     if not found:
         raise ValueError(
             f"no settings for {controller!r}; choose from {', '.join(sorted({e.controller for e in TUNED}))}"
         )
-    policy = found.get(config.scenario.name, found["randomized"])
+    return found.get(scenario, found[USUAL])
+
+
+def tuned(controller: str, config: Config) -> Policy:
+    """The controller with the settings for that environment; ValueError if it has none."""
+    policy = settings(controller, config.scenario.name)
     settled: Policy = replace(policy, control_interval=config.control_interval, v_0=config.parameters.v_0)
     return settled

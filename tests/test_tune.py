@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from baselines import tune
 from baselines.filtered_pid import FilteredPID
 from baselines.tune import Score, build, first_values, read_history, search
 from baselines.tune_spaces import SPACES, Knob, Space, reading, space_of, turned, unruled
+from baselines.tuned import settings
 from cz_gym.config import make_config
 
 BOWL = Space("bowl", FilteredPID(), (Knob("T_f", 1.0, 100.0), Knob("K_ff", -1.0, 1.0, log=False)), np.inf, unruled)
@@ -123,3 +125,12 @@ def test_command_refuses(wrong, named, tmp_path, capsys):
     assert named in error
     assert error.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", [space.name for space in SPACES])
+def test_a_search_elsewhere_begins_with_the_settings_of_randomized(name):
+    """But for a jump without end, which the knob holds inside its range."""
+    space = space_of(name, "sensor-fault")
+    first, frozen = build(space, first_values(space)), settings(name, "randomized")
+    highest = max((knob.high for knob in space.knobs if knob.path == "jump"), default=None)
+    assert first == (frozen if highest is None else replace(frozen, jump=highest))
