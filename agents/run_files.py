@@ -51,11 +51,21 @@ def read_settings(path: Path) -> dict[str, Any]:
 def provenance() -> dict[str, Any]:
     """The command, and what it runs on: git commit, Python, packages."""
     return {
-        "command": " ".join([Path(sys.executable).name, *sys.argv]),
+        "command": " ".join([Path(sys.executable).name, *_program(), *sys.argv[1:]]),
         "git_commit": _git_commit(),
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in PACKAGES},
     }
+
+
+def _program() -> list[str]:
+    """How Python was told what to run; of a path, what is left of it in this checkout."""
+    path = Path(sys.argv[0])
+    here = Path(__file__).parents[1]
+    if path.is_absolute() and path.is_relative_to(here):
+        path = path.relative_to(here)
+        return ["-m", ".".join(path.with_suffix("").parts)] if len(path.parts) > 1 else [str(path)]
+    return [path.name if path.is_absolute() else str(path)]
 
 
 def _git_commit() -> str | None:

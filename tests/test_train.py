@@ -14,10 +14,12 @@ import numpy as np
 import pytest
 
 import train
-from agents import OnnxPolicy, run, settings
+from agents import OnnxPolicy, run, run_files, settings
 from agents.vec_env import CzVecEnv
 from agents.wrappers import DriveAction, TrainingReward
 from cz_gym import CzVectorEnv
+
+ROOT = Path(run.__file__).parents[1]
 
 
 @pytest.fixture
@@ -58,6 +60,22 @@ def test_a_run_leaves_everything_and_goes_on(tmp_path: Path, capsys: pytest.Capt
     after = rows(folder / "progress.csv")
     assert after[: len(before)] == before
     assert int(after[-1]["steps"]) >= 40000 > int(before[-1]["steps"])
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("train.py", "train.py"),
+        (str(ROOT / "train.py"), "train.py"),
+        (str(ROOT / "agents" / "ablation.py"), "-m agents.ablation"),
+        ("/elsewhere/bin/pytest", "pytest"),
+    ],
+)
+def test_the_command_is_told_without_the_machine_s_paths(
+    given: str, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", [given, "--seed", "3"])
+    assert run_files.provenance()["command"].endswith(f" {said} --seed 3")
 
 
 @pytest.mark.usefixtures("quick")
