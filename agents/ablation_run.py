@@ -184,7 +184,10 @@ def _parsed(told: Mapping[str, Any]) -> Finished | None:
 
 
 def _completed(saved: Mapping[str, Any], kind: type[Any] = PPO) -> dict[str, Any]:
-    """Kept settings of that kind with today's defaults for those that did not exist when they were kept."""
+    """Kept settings of that kind with today's defaults for those that did not exist when they were kept.
+
+    So a new setting's default has to be what was done before it came, or what is kept has to be moved away.
+    """
 
     def filled(part: Any, default: Any) -> Any:
         if not isinstance(part, Mapping) or not isinstance(default, Mapping):
