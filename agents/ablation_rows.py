@@ -88,7 +88,7 @@ ROWS: tuple[Row, ...] = (
     Row("unpaired", "critic", "the teacher's reward is not taken off", replace(_PPO, paired=False)),
     Row("heater-free", "what learns", "the heater's outputs learn too", replace(_PPO, frozen=("layers",))),
     Row("actor-pace-1", "what learns", "the actor learns at the critic's rate", replace(_PPO, actor_pace=1.0)),
-    _shown("narrow", 1.0, "the imitation is shown crystals spread as the scenario's own"),
+    _shown("1", 1.0, "the imitation is shown crystals spread as the scenario's own, not twice as wide"),
     _residual("lqg", _TEACHER.teacher),
     _residual("paper", "paper"),
     _memory("none", 0.0, "no past samples: what is measured now, and the integral"),
@@ -102,7 +102,7 @@ ROWS: tuple[Row, ...] = (
     Row("all-free", "what learns", "heater and hidden layers learn too", replace(_PPO, frozen=())),
     Row("no-critic-first", "critic", "critic and actor learn from the first step", replace(_PPO, critic_steps=0)),
     _teacher("lqg-quiet"),
-    _shown("wider", 2.0, "the imitation is shown crystals spread twice as wide"),
+    _shown("1.5", 1.5, "the imitation is shown crystals spread one and a half times as wide"),
     _width("half", 0.5, "parameters of pullers spread half as wide"),
     Row("on-hard", "pullers", "imitates, learns and is selected on hard", _recipe(replace(_RECIPE, scenario="hard"))),
 )

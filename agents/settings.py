@@ -41,7 +41,7 @@ class Clone:
     """Times it is asked: first about its own episodes, then about the imitation's."""
     episodes: int = 320
     """Training episodes a round."""
-    width: float = 1.5
+    width: float = 2.0
     """How far everything random on those crystals is spread, in units of the scenario's [-]."""
     noise: tuple[float, float] = (0.006, 0.001)
     """Spread of the noise added to the driver's actions, pull speed and heater [-]."""
