@@ -11,7 +11,7 @@ import numpy as np
 from .late_ring import RingModel
 from .lqg import LQGSettings
 from .lqg_model import NoiseModel
-from .lqg_settings import PULLER_REWARD, PULLER_RING, QUIET, REWARD
+from .lqg_settings import PULLER_RING, QUIET, REWARD
 from .lqr import Weights
 from .policy import Floats
 
@@ -103,16 +103,11 @@ def _on_puller(settings: LQGSettings) -> LQGSettings:
     return replace(settings, noise=replace(settings.noise, heater_walk=1.0), ring=PULLER_RING)
 
 
-def _calmed(settings: LQGSettings) -> LQGSettings:
-    """Where the search of ``lqg-quiet`` on ``puller`` begins: what was found for ``lqg``, with a heavier pull step."""
-    return replace(settings, weights=replace(settings.weights, pull_step=0.5))
-
-
 GOALS = {
     ("lqg", "randomized"): Goal(0.062, 0.02, True, _LIVELY),
     ("lqg-quiet", "randomized"): Goal(0.075, 0.0095, False, _CALM),
     ("lqg", "puller"): Goal(0.09, 0.016, False, _on_puller(REWARD), "puller", ("puller",)),
-    ("lqg-quiet", "puller"): Goal(0.1, 0.01, False, _calmed(PULLER_REWARD), "puller", ("puller",)),
+    ("lqg-quiet", "puller"): Goal(0.1, 0.01, False, _on_puller(QUIET), "puller", ("puller",)),
     ("lqg", "sensor-fault"): Goal(0.063, 0.02, True, REWARD, "sensor-fault", ("sensor-fault",)),
     ("lqg-quiet", "sensor-fault"): Goal(0.076, 0.0095, False, QUIET, "sensor-fault", ("sensor-fault",)),
 }
