@@ -187,7 +187,7 @@ RECIPES: dict[str, Choice] = {
     choice.name: choice
     for choice in (
         PPO(),
-        PPO("ppo-medium", Recipe(weights=CostWeights(0.5, 0.5), clone=Clone("lqg"))),
+        PPO("ppo-medium", Recipe(weights=CostWeights(0.5, 0.5), clone=Clone("lqg-at-0.013"))),
         PPO("ppo-quiet", Recipe(weights=CostWeights(), clone=Clone("lqg-quiet"))),
         PPO(
             "ppo-puller",
