@@ -32,6 +32,7 @@ from .linear import SEEN, Floats, linear_agent
 from .loop import Responses, after_one, response
 from .onnx_policy import OnnxPolicy
 from .trials import (
+    AT_REST,
     JUMPS,
     LIMITS,
     MIX,
@@ -50,7 +51,10 @@ BESIDE = ("lqg-at-0.02", "lqg", "paper-tuned")
 """Controllers that an agent is shown beside; its teacher is among them."""
 READINGS = tuple(channel.name for channel in MEASURED)
 MODELS = (("Model I", 1.0), ("Model II", 0.0))
-AT_REST = "at rest"
+Answers = dict[str, dict[str, Any]]
+"""Signals by trial, then by controller."""
+Jumps = dict[str, tuple[Any, ...]]
+"""Answers to jumps by controller, without noise and under it."""
 READING_SAMPLES = 120
 """Length of the answer to one reading."""
 NOISE_POINTS = 20_000
@@ -91,7 +95,7 @@ class Margins(NamedTuple):
 def contenders(path: Path | None) -> tuple[Contender, ...]:
     """The agent of a file, or the shipped one, and those it is shown beside.
 
-    All are linearised under the usual noise, LQGs at the covariance that their filters settle on; the agent, second,
+    All are linearised under the usual noise, LQGs at the covariance that their filters settle on; the agent, last,
     also without any, where its network bends least.
     """
     file = path or shipped()
@@ -103,10 +107,11 @@ def contenders(path: Path | None) -> tuple[Contender, ...]:
         name: noisy_observations(policy, contract.observation),
         f"{name} {AT_REST}": run_events(policy, config, (), [0.0]).observation,
     }
-    found = []
+    own = []
     for label, observations in seen.items():
         near = linear_agent(content, observations, config.control_interval, config.parameters.v_0)
-        found.append(Contender(label, contract.observation, lambda _: policy, near.state_space(), near.response))
+        own.append(Contender(label, contract.observation, lambda _: policy, near.state_space(), near.response))
+    found = own[:1]
     linear_form, registry = room("baselines.linear_form").linear_form, room("baselines.registry")
     at = [READINGS.index(channel) for channel in SEEN]
     for beside in BESIDE:
@@ -117,7 +122,7 @@ def contenders(path: Path | None) -> tuple[Contender, ...]:
             return response(form.controller, form.dt, omega)[:, :, at]
 
         found.append(Contender(beside, "measured", make, form.controller, answer))
-    return tuple(found)
+    return (*found, *own[1:])
 
 
 def joined(contender: Contender, omega: Floats, lam: float, dt: float) -> Responses:
@@ -174,47 +179,56 @@ def puller_parts(contender: Contender, episodes: int) -> dict[str, dict[str, flo
     return found
 
 
-def study(agent: Path | None, episodes: int, tell: Callable[[str], None]) -> dict[str, bytes]:
-    """Everything, as files by name."""
+def pictures(taking_part: Sequence[Contender], answers: Answers, jumps: Jumps, dt: float) -> dict[str, bytes]:
+    """The figures, by file name."""
     from .insight_figures import gain_figure, jump_figure, loop_figure, response_figure, share_figure
+
+    omega = room("baselines.frequency").frequencies(dt)
+    responses = {contender.name: joined(contender, omega, MIX, dt) for contender in taking_part}
+    return {
+        "responses.png": response_figure(answers, TRIALS, dt),
+        "gains.png": gain_figure({each.name: one_reading(each, dt) for each in taking_part}, responses, dt),
+        "loop.png": loop_figure(responses, radius_model(make_puller(lam=MIX)).zero),
+        "jumps.png": jump_figure(jumps, JUMPS),
+        "shares.png": share_figure(answers["load"], responses, TRIALS[1].title),
+    }
+
+
+def study(agent: Path | None, episodes: int, only_pictures: bool, tell: Callable[[str], None]) -> dict[str, bytes]:
+    """Everything, as files by name."""
     from .insight_report import Found, as_json, as_markdown
 
     tell("linearising")
     taking_part = contenders(agent)
     dt = crystal(1.0, "measured").control_interval
     omega = room("baselines.frequency").frequencies(dt)
-    responses = {contender.name: joined(contender, omega, MIX, dt) for contender in taking_part}
-    impulses = {contender.name: one_reading(contender, dt) for contender in taking_part}
     acting = [contender for contender in taking_part if not contender.name.endswith(AT_REST)]
-    answers: dict[str, dict[str, Any]] = {}
+    made = {each.name: each.make(crystal(3.0 * HOUR / MINUTE, each.observation)) for each in acting}
+    answers: Answers = {}
     for trial in TRIALS:
         tell(trial.title)
-        answers[trial.name] = {}
-        for contender in acting:
-            config = crystal(trial.minutes, contender.observation)
-            answers[trial.name][contender.name] = respond(contender.make(config), config, trial)
-    limits: dict[str, dict[str, Any]] = {}
-    parts, jumps = {}, {}
-    for contender in acting:
-        tell(f"limits of {contender.name}")
-        policy = contender.make(crystal(3.0 * HOUR / MINUTE, contender.observation))
-        jumps[contender.name] = tuple(jump_gains(policy, contender.observation, noisy) for noisy in (False, True))
-        limits[contender.name] = {limit.name: survive(policy, limit, contender.observation) for limit in LIMITS}
-        tell(f"{contender.name}, one property of the real puller at a time")
-        parts[contender.name] = puller_parts(contender, episodes)
-    rows = [row for contender in taking_part for row in margins(contender, omega, dt)]
-    gains = {contender.name: noise_gains(contender, dt) for contender in taking_part}
-    found = Found(read_agent(agent or shipped())[0], answers, rows, gains, limits, parts, episodes, jumps)
-    zero = radius_model(make_puller(lam=MIX)).zero
-    return {
-        "responses.png": response_figure(answers, TRIALS, dt),
-        "gains.png": gain_figure(impulses, responses, dt),
-        "loop.png": loop_figure(responses, zero),
-        "jumps.png": jump_figure(jumps, JUMPS),
-        "shares.png": share_figure(answers["load"], responses, TRIALS[1].title),
-        "insight.json": as_json(found).encode(),
-        "insight.md": as_markdown(found).encode(),
+        answers[trial.name] = {
+            each.name: respond(made[each.name], crystal(trial.minutes, each.observation), trial) for each in acting
+        }
+    tell("jumps")
+    jumps = {
+        each.name: tuple(jump_gains(made[each.name], each.observation, noisy) for noisy in (False, True))
+        for each in acting
     }
+    files = pictures(taking_part, answers, jumps, dt)
+    if only_pictures:
+        return files
+    limits: dict[str, dict[str, Any]] = {}
+    parts = {}
+    for each in acting:
+        tell(f"limits of {each.name}")
+        limits[each.name] = {limit.name: survive(made[each.name], limit, each.observation) for limit in LIMITS}
+        tell(f"{each.name}, one property of the real puller at a time")
+        parts[each.name] = puller_parts(each, episodes)
+    rows = [row for each in taking_part for row in margins(each, omega, dt)]
+    gains = {each.name: noise_gains(each, dt) for each in taking_part}
+    found = Found(read_agent(agent or shipped())[0], answers, rows, gains, limits, parts, episodes, jumps)
+    return {**files, "insight.json": as_json(found).encode(), "insight.md": as_markdown(found).encode()}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -222,13 +236,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = OneLineParser(prog=f"python -m {PROG}", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--agent", type=Path, metavar="FILE", help="agent file in place of the shipped one")
     parser.add_argument("--episodes", type=int, default=50, metavar="N", help="validation episodes (%(default)s)")
+    parser.add_argument("--pictures", action="store_true", help="draw the pictures alone; the tables stay as they are")
     parser.add_argument("--out", type=Path, default=Path("results/insight"), metavar="DIR", help="%(default)s")
     given = parser.parse_args(arguments)
     try:
         if not 1 <= given.episodes <= len(VALIDATION_SEEDS):
             raise ValueError(f"--episodes must be 1 to {len(VALIDATION_SEEDS)}, not {given.episodes}")
         check_writable(given.out)
-        files = study(given.agent, given.episodes, lambda what: print(what, file=sys.stderr, flush=True))
+        files = study(
+            given.agent, given.episodes, given.pictures, lambda what: print(what, file=sys.stderr, flush=True)
+        )
         write_files({given.out / name: content for name, content in files.items()})
     except ImportError as error:
         missing = f'{error.name} is missing: pip install "cz-gym[benchmark]"' if error.name else error
@@ -239,7 +256,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         return interrupted(PROG)
-    print(files["insight.md"].decode(), end="")
+    print(files.get("insight.md", b"").decode() or f"wrote {', '.join(files)}\n", end="")
     return 0
 
 

@@ -13,19 +13,20 @@ from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from .linear import Floats
 from .loop import Responses
-from .trials import BEGIN, Trial
+from .trials import AT_REST, BEGIN, Trial
 
-_LINES = ((None, None), (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), "solid")
+_LINES = ("solid", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (2, 1.2)))
 LABELS = ("radius error [mm]", "pull speed less v₀ [mm/min]", "heater less nominal [kW]")
 DRIVES = (("pull speed", "mm/min", MM_PER_MIN), ("heater", "kW", KILO))
 
 
 def looks(names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
     """How each controller's line is drawn, the same in every figure; the first, the agent, boldest."""
-    found = {}
+    found: dict[str, dict[str, Any]] = {}
     for i, (name, style) in enumerate(styles(names).items()):
         dash: Any = "solid" if i == 0 else _LINES[i % len(_LINES)]
-        found[name] = {"color": style.colour, "lw": 2.0 if i == 0 else 1.3, "ls": dash, "zorder": 3 - 0.1 * i}
+        colour = found[names[0]]["color"] if name == f"{names[0]} {AT_REST}" else style.colour
+        found[name] = {"color": colour, "lw": 2.0 if i == 0 else 1.3, "ls": dash, "zorder": 3 - 0.1 * i}
     return found
 
 
@@ -124,11 +125,11 @@ def jump_figure(jumps: Mapping[str, tuple[Floats, Floats]], sizes: Floats) -> by
     for column, title in enumerate(("without noise", "under the usual noise")):
         for name, gains in jumps.items():
             values = gains[column] * MM / MM_PER_MIN
-            axes[column].loglog(sizes / MM, values, marker="o", ms=3.5, label=name, **style[name])
+            axes[column].semilogx(sizes / MM, values, marker="o", ms=3.5, label=name, **style[name])
         axes[column].set_title(title, fontsize=9.5)
         axes[column].set_xlabel("jump of the radius [mm]")
         axes[column].xaxis.set_major_formatter(lambda value, position: f"{value:g}")
-        axes[column].yaxis.set_major_formatter(lambda value, position: f"{value:g}")
+    axes[0].set_ylim(bottom=0.0)
     axes[0].set_ylabel("pull speed moved [mm/min per mm]")
     _legend(figure, axes[0])
     figure.suptitle("How strongly a jump is answered", fontsize=11)

@@ -20,6 +20,8 @@ MIX = 0.5
 """Share of conduction of the nominal puller here: halfway between Model I and Model II [-]."""
 CAMERA_NOISE, PYROMETER_NOISE = 0.025 * MM, 0.05
 """Standard deviations in the middle of the randomised scenario's ranges [m, K]."""
+AT_REST = "at rest"
+"""Behind an agent's name: linearised without noise."""
 BEGIN = 10.0 * MINUTE
 """When an event happens [s]."""
 AT_ONCE = 16
