@@ -15,6 +15,7 @@ import sys
 import tomllib
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
@@ -322,6 +323,18 @@ def nomenclature() -> Iterator[Any]:
     sys.path.insert(0, str(DOCS))
     yield importlib.import_module("czdocs.nomenclature")
     sys.path.remove(str(DOCS))
+
+
+def test_a_scenario_that_is_added_appears_among_the_others(nomenclature: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    tables = importlib.import_module("czdocs.tables").TABLES
+    before = {name: tables[name]() for name in ("scenarios", "plain-scenarios", "single-scenarios")}
+    added = replace(SCENARIOS["only-sensor"], name="mine", drift=SCENARIOS["hard"].drift)
+    monkeypatch.setitem(SCENARIOS, "mine", added)
+    monkeypatch.setitem(SCENARIOS, "alone", replace(SCENARIOS["only-sensor"], name="alone"))
+    assert "`mine`" in tables["scenarios"]()[0]
+    assert any("`alone`" in line for line in tables["single-scenarios"]())
+    assert tables["plain-scenarios"]() == before["plain-scenarios"]
+    assert before["scenarios"][0].count("`") == 2 * len(("randomized", "hard", "sensor-fault", "puller"))
 
 
 def test_the_nomenclature_is_complete(nomenclature: Any, pages: dict[Path, Page], site: Path) -> None:

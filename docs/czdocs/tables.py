@@ -24,7 +24,6 @@ from .attributes import attributes
 
 ABSENT = "\N{EN DASH}"
 POWERS = {"2": "\N{SUPERSCRIPT TWO}", "3": "\N{SUPERSCRIPT THREE}", "4": "\N{SUPERSCRIPT FOUR}"}
-WIDE = ("randomized", "hard", "sensor-fault", "puller")
 READABLE = {
     "m": (MM, "mm"),
     "m/s": (MM_PER_MIN, "mm/min"),
@@ -121,14 +120,22 @@ def plain_scenarios() -> list[str]:
 
 def single_scenarios() -> list[str]:
     """The scenarios with one of randomized's families, and which it is."""
-    rows = []
-    for name, scenario in SCENARIOS.items():
-        alone = [f.name for f in dataclasses.fields(scenario)[1:] if getattr(scenario, f.name) != f.default_factory()]
-        if name not in WIDE and not scenario.deterministic:
-            (family,) = alone
-            assert getattr(scenario, family) == getattr(RANDOMIZED, family)
-            rows.append((code(name), code(family)))
-    return markdown(("scenario", "family"), rows)
+    found = {name: _single(scenario) for name, scenario in SCENARIOS.items()}
+    return markdown(("scenario", "family"), [(code(name), code(family)) for name, family in found.items() if family])
+
+
+def wide_scenarios() -> list[str]:
+    """All others."""
+    return scenario_table(
+        name for name, scenario in SCENARIOS.items() if not scenario.deterministic and not _single(scenario)
+    )
+
+
+def _single(scenario: Scenario) -> str | None:
+    """The one family of a scenario, if it is as in randomized."""
+    names = [f.name for f in dataclasses.fields(scenario)[1:] if getattr(scenario, f.name) != f.default_factory()]
+    alone = len(names) == 1 and getattr(scenario, names[0]) == getattr(RANDOMIZED, names[0])
+    return names[0] if alone else None
 
 
 def families() -> list[str]:
@@ -179,7 +186,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "history": remembered,
     "state": lambda: channels(STATE),
     "info": info,
-    "scenarios": lambda: scenario_table(WIDE),
+    "scenarios": wide_scenarios,
     "plain-scenarios": plain_scenarios,
     "single-scenarios": single_scenarios,
     "families": families,
