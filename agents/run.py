@@ -107,8 +107,9 @@ class Run:
         self._validate(bar)
 
     def _begin(self, bar: Any) -> None:
-        """Imitate the teacher, if there is one and nothing has been learned yet."""
-        if self.training.learner.num_timesteps == 0 and self.choice.recipe.clone is not None:
+        """Imitate the teacher, if there is one and the checkpoint holds neither its imitation nor anything after it."""
+        begun = self.training.learner.num_timesteps > 0 or bool(self.rows)
+        if self.choice.recipe.clone is not None and not begun:
             clone(self.training, self.teacher, self.config, self.seed, bar.set_postfix_str, self.imitations)
             contract, content, _ = self._exported()
             self.unsaved |= agent_files(self.folder / IMITATION, content, contract)

@@ -106,6 +106,24 @@ def test_a_run_killed_at_once_can_be_resumed(tmp_path: Path, monkeypatch: pytest
     assert [session["from_step"] for session in saved["sessions"]] == [0, 0]
 
 
+@pytest.mark.usefixtures("quick")
+def test_a_run_killed_between_imitation_and_first_step_does_not_imitate_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def die(*arguments: Any) -> None:
+        raise ValueError("killed")
+
+    folder = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(run.Tell, "_on_step", die)
+        assert train.main(["--steps", "2048", "--out", str(folder)]) == 2
+    imitated = rows(folder / "progress.csv")
+    assert [row["steps"] for row in imitated] == ["0"]
+    monkeypatch.setattr(run, "clone", die)
+    assert train.main(["--resume", "--out", str(folder)]) == 0
+    assert rows(folder / "progress.csv")[:1] == imitated
+
+
 def test_settings_that_are_none_are_damaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "run"
     folder.mkdir()
