@@ -111,6 +111,8 @@ def to_markdown(cells: Sequence[Cell], against: str) -> str:
     crystals = cells[0].rmse.n
     return "\n".join(
         [
+            "# How agents travel",
+            "",
             f"RMSE of the radius [mm] on the first {crystals} test crystals of each row, 95 % interval in brackets, and"
             f" crystals lost; on {' and '.join(OBSERVABLE)} against the radius that sensors can show.",
             "",
