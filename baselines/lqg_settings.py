@@ -125,6 +125,14 @@ FRONTIER: dict[str, tuple[Step, ...]] = {
         Step("lqg-quiet", 0.01232),
         Step("lqg-quiet", 0.004767),
     ),
+    "puller": (
+        Step("lqg-quiet", 40.07),
+        Step("lqg-quiet", 4.025),
+        Step("lqg-quiet", 0.556),
+        Step("lqg", 0.1428),
+        Step("lqg", 0.00467),
+        Step("lqg", 0.0009702),
+    ),
 }
 """By scenario, one an activity: chosen by ``python -m baselines.lqg_frontier``."""
 

@@ -119,6 +119,21 @@ TUNED: tuple[Tuned, ...] = (
         ),
     ),
     Tuned(
+        "pid-conventional",
+        "sensor-fault",
+        FilteredPID(
+            pid=SeriesPID(K_p=0.001757, T_i=376.4, T_d=1069.0, N=25.27),
+            compensator=None,
+            T_f=10.37,
+            jump=0.002,
+            T_start=624.3,
+            T_track=300.0,
+            ring_lead=-23.76,
+            K_ff=0.2872,
+            heater=TemperatureLoop(K=1975.0, T_i=301.3, share=0.2966, K_pull=9.476, T_pull=1049.0, T_mean=286.7),
+        ),
+    ),
+    Tuned(
         "industrial",
         "randomized",
         Industrial(
