@@ -7,6 +7,7 @@ import json
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,6 +27,10 @@ from cz_gym.evaluation.rollout import Signals
 SMALL = replace(
     settings.SCRATCH,
     recipe=settings.Recipe(num_envs=2, hidden=(8,)), steps=8, n_steps=4, batch_size=8, n_epochs=1
+)  # fmt: skip
+SMALL_SAC = settings.SAC(
+    recipe=settings.Recipe(num_envs=2, hidden=(8,), privileged_critic=False),
+    steps=16, buffer_size=32, learning_starts=8, batch_size=4, gradient_steps=1,
 )  # fmt: skip
 ODD = (
     b"",
@@ -54,8 +59,9 @@ def targets(folder: Path) -> dict[str, Target]:
     """Every kind of file that the project reads back."""
     contract, network = read_agent(shipped())
     facts = {name: value for name, value in vars(contract).items() if name not in ("observation_hash", "sha256")}
-    learner = make_training(SMALL, 0, None).learner
-    learner.learn(8)
+    learner, off_policy = make_training(SMALL, 0, None).learner, make_training(SMALL_SAC, 0, None).learner
+    for some in (learner, off_policy):
+        some.learn(16)
     agent, checkpoint = folder / "agent.onnx", folder / "checkpoint.safetensors"
     sessions = {"steps": 100, "sessions": [{"from_step": 0}]}
     rows = ",".join(COLUMNS) + "\r\n" + ",".join(["1.5"] * len(COLUMNS)) + "\r\n"
@@ -73,9 +79,9 @@ def targets(folder: Path) -> dict[str, Target]:
         agent.with_suffix(".json").write_bytes(content)
         read_agent(agent)
 
-    def read_checkpoint(content: bytes) -> None:
+    def read_checkpoint(content: bytes, into: Any = learner) -> None:
         checkpoint.write_bytes(content)
-        restore(learner, *load_checkpoint(checkpoint), checkpoint)
+        restore(into, *load_checkpoint(checkpoint), checkpoint)
 
     def read_settings(content: bytes) -> None:
         (folder / "settings.json").write_bytes(content)
@@ -97,6 +103,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "agent.onnx": Target(network, read_network),
         "agent.json": Target(shipped().with_suffix(".json").read_bytes(), read_contract),
         "checkpoint": Target(to_bytes(learner, 1.0, 0.5), read_checkpoint),
+        "sac checkpoint": Target(to_bytes(off_policy, 1.0, 0.5), partial(read_checkpoint, into=off_policy)),
         "settings.json": Target(json.dumps(sessions).encode(), read_settings),
         "progress.csv": Target(rows.encode(), read_progress),
         "kept episode": Target(episode.getvalue(), read_episode),
@@ -123,7 +130,7 @@ def mutant(kind: str, seed: bytes, rng: np.random.Generator) -> bytes:
         return _odd_json(json.loads(seed), rng)
     if kind == "agent.onnx" and rng.random() < 0.5:
         return _odd_graph(seed, rng)
-    if kind == "checkpoint" and rng.random() < 0.5:
+    if kind.endswith("checkpoint") and rng.random() < 0.5:
         return _odd_header(seed, rng)
     if kind == "kept episode" and rng.random() < 0.3:
         return _odd_archive(rng)

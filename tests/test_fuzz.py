@@ -15,7 +15,10 @@ from agents import AgentFileError, OnnxPolicy
 from agents.contract import MAX_BYTES, read_agent, read_bounded
 from tests.hostile import Target, mutant, refused, targets
 
-KINDS = ("agent.onnx", "agent.json", "checkpoint", "settings.json", "progress.csv", "kept episode", "compiled code")
+KINDS = (
+    "agent.onnx", "agent.json", "checkpoint", "sac checkpoint", "settings.json", "progress.csv", "kept episode",
+    "compiled code",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
