@@ -30,7 +30,7 @@ BOUNDS = FOLDER.parent / "bounds"
 """Committed results of the slow controllers; their bound serves runs without one."""
 DEFAULT = "ppo-default"
 """The training seed of ``ppo`` that did best on validation."""
-SHIPPED = ("ppo", DEFAULT, "ppo-quiet", "ppo-scratch", "ppo-puller")
+SHIPPED = ("ppo", DEFAULT, "ppo-medium", "ppo-quiet", "ppo-scratch", "ppo-puller")
 """Agents that come with the package; all but the default pool their training seeds."""
 EPISODES = 500
 
