@@ -191,7 +191,11 @@ RECIPES: dict[str, Choice] = {
         PPO("ppo-quiet", Recipe(weights=CostWeights(), clone=Clone("lqg-quiet"))),
         PPO(
             "ppo-puller",
-            Recipe(scenario="puller", weights=CostWeights(0.5, 0.5, observable=True), clone=Clone("lqg")),
+            Recipe(
+                scenario="puller",
+                weights=CostWeights(0.5, 0.5, observable=True),
+                clone=Clone("lqg-quiet", rounds=5, width=1.0),
+            ),
         ),
         SCRATCH,
         SAC(),
