@@ -55,7 +55,10 @@ def frontier(points: Sequence[tuple[float, float]]) -> Frontier:
         if not (0.0 < activity < np.inf and 0.0 < rmse < np.inf):
             raise ValueError(f"activity and radius error must be positive numbers, not {activity} and {rmse}")
         if not kept or rmse < kept[-1][1]:
-            kept += [(activity, rmse)] if not kept or activity > kept[-1][0] else []
+            # A logarithm cannot tell activities apart that are rounding errors apart: the better one stands for both.
+            if kept and not np.log(activity) > np.log(kept[-1][0]):
+                kept.pop()
+            kept.append((activity, rmse))
     if len(kept) < 2:
         raise ValueError(f"a frontier needs two settings of which neither beats the other, found {len(kept)}")
     activities, errors = np.array(kept).T

@@ -371,7 +371,7 @@ def test_the_benchmark_needs_neither_torch_nor_stable_baselines3(tmp_path: Path)
         f"import benchmark; sys.exit(benchmark.main({arguments!r}))"
     )
     done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code],
+        [sys.executable, "-W", "error", "-W", "ignore::DeprecationWarning", "-c", code],
         cwd=Path(benchmark.__file__).parent,
         capture_output=True,
         text=True,

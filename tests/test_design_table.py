@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import trapezoid
 
 from baselines import design_table
 from baselines.compensated_pid import CompensatedPID
@@ -127,7 +128,7 @@ def test_fluctuation_is_the_integral_of_its_spectrum(tau):
     keep = math.exp(-5.0 / tau)
     spectrum = (1.0 - keep**2) / np.abs(1.0 - keep * np.exp(-5.0j * omega)) ** 2
     gain = np.abs(response(loop.pick("r_c", ("dT_i",)), 5.0, omega))
-    variance = np.trapezoid(gain**2 * spectrum, omega) * 5.0 / np.pi
+    variance = trapezoid(gain**2 * spectrum, omega) * 5.0 / np.pi
     assert root_mean_square(design_table.coloured(loop, tau)) == pytest.approx(math.sqrt(variance), rel=1e-3)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.integrate import trapezoid
 
 from cz_gym import HURLE, CzEnv, Parameters, make_puller
 from cz_gym.meniscus import hurle_slope
@@ -119,7 +120,7 @@ def test_another_meniscus_leaves_from_the_same_triple_point() -> None:
 
 def test_length_grown_is_the_integral_of_the_growth_rate(picture: tuple[CzEnv, Frame, Record]) -> None:
     _, _, record = picture
-    integral = np.trapezoid(record.column("v_g"), record.column("t"))
+    integral = trapezoid(record.column("v_g"), record.column("t"))
     assert record.now.length == pytest.approx(integral, rel=2e-3)
 
 
@@ -174,7 +175,7 @@ def test_magnification_falls_as_the_error_grows(picture: tuple[CzEnv, Frame, Rec
 
 def test_the_crucible_rises_by_what_the_crystal_took(picture: tuple[CzEnv, Frame, Record]) -> None:
     _, _, record = picture
-    grown_mass = 2330 * np.pi * np.trapezoid(record.column("r_c") ** 2, record.column("length"))
+    grown_mass = 2330 * np.pi * trapezoid(record.column("r_c") ** 2, record.column("length"))
     melt_mass = 2570 * np.pi * 0.28**2 * puller_panel.crucible_rise(record)
     assert melt_mass == pytest.approx(grown_mass, rel=1e-3)
 
