@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.integrate import trapezoid
 from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
@@ -138,6 +139,6 @@ class RingDetector:
         if not sound.any():
             return np.full(len(lines), np.nan), 0.0
         low, rise = step[sound, 0].mean(), (step[sound, -1] - step[sound, 0]).mean()
-        filled = np.trapezoid(step - low, dx=SPACING, axis=1) / rise
+        filled = trapezoid(step - low, dx=SPACING, axis=1) / rise
         radius: Floats = np.where(sound, self.radii[at + inside] + filled, np.nan)
         return radius, float(rise)
