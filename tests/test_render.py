@@ -57,8 +57,8 @@ def test_rendering_changes_nothing(mode: str, scenario: str) -> None:
 
 def test_the_users_environment_stays_as_it_was() -> None:
     code = (
-        "import os; before = dict(os.environ)\n"
-        "import gymnasium as gym, cz_gym\n"
+        "import os, gymnasium as gym; before = dict(os.environ)\n"
+        "import cz_gym\n"
         "env = gym.make('Cz-v0', render_mode='rgb_array'); env.reset(seed=1); env.render()\n"
         "import pygame; assert not pygame.display.get_init()\n"
         "assert dict(os.environ) == before"
