@@ -40,6 +40,13 @@ def test_many_controllers_are_chosen_by_a_rule_and_the_rest_named() -> None:
     assert text.endswith("not shown: bound, c4, c5")
 
 
+def test_many_agents_leave_room_for_what_they_are_compared_with() -> None:
+    agents = [sample(f"ppo-{i}", 9.0 - i, seeds=(0,)) for i in range(6)]
+    others = [sample("paper", 99.0), sample("lqg", 1.0), sample("pid", 2.0)]
+    shown = [one.controller.name for one in _chosen([*others, *agents])]
+    assert shown == ["paper", "lqg", "pid", "ppo-3", "ppo-4", "ppo-5"]
+
+
 def test_a_crystal_that_nothing_disturbs_is_drawn_without_a_warning() -> None:
     row = find_row("nominal")
     run = rollout(Still(), make_config("nominal", horizon=600.0), row.seeds(1))
