@@ -154,10 +154,7 @@ def read_finished(plan: Plan, row: Row, seed: int) -> Finished | None:
     if found is None or (found.row, found.seed) != (row.name, seed):
         raise ValueError(f"{path}: not a finished run of this ablation, or damaged; move it away to run it again")
     wanted = json.loads(json.dumps(asdict(row.of(plan.steps))))
-    if (
-        _completed(found.settings, type(row.choice)) != wanted
-        or told.get("scenario_hash") != make_config(SCENARIO).scenario.hash
-    ):
+    if found.settings != wanted or told.get("scenario_hash") != make_config(SCENARIO).scenario.hash:
         raise ValueError(f"{path}: made with other settings; move it away, or choose another --out or --steps")
     return found
 
@@ -181,21 +178,3 @@ def _parsed(told: Mapping[str, Any]) -> Finished | None:
     shape = len(JUDGED), len(FIGURES)
     sound = all(values.shape == shape and math.isfinite(values.sum()) for values in stages.values())
     return found if sound and {"best", "last"} <= set(stages) else None
-
-
-def _completed(saved: Mapping[str, Any], kind: type[Any] = PPO) -> dict[str, Any]:
-    """Kept settings of that kind with today's defaults for those that did not exist when they were kept.
-
-    So a new setting's default has to be what was done before it came, or what is kept has to be moved away.
-    """
-
-    def filled(part: Any, default: Any) -> Any:
-        if not isinstance(part, Mapping) or not isinstance(default, Mapping):
-            return part
-        return {name: filled(part[name], default[name]) if name in part else default[name] for name in default} | {
-            name: value for name, value in part.items() if name not in default
-        }
-
-    whole = filled(saved, json.loads(json.dumps(asdict(kind()))))
-    assert isinstance(whole, dict)
-    return whole

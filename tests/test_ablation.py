@@ -12,7 +12,7 @@ import pytest
 
 from agents import ablation, ablation_figure, ablation_rows, ablation_run, ablation_table, run, settings
 from agents.ablation_rows import BASE, ROWS, Row, find_rows
-from agents.ablation_run import FIGURES, Finished, Plan
+from agents.ablation_run import FIGURES, Finished, Plan, read_finished
 from agents.export import actor_of
 from agents.training import clone, make_training, training_scenario
 from baselines.registry import find_controller
@@ -190,13 +190,25 @@ def test_a_damaged_result_is_named(content: str, tmp_path: Path, capsys: pytest.
     assert error.count("\n") == 1
 
 
-def test_settings_that_did_not_exist_count_as_their_default() -> None:
-    wanted = json.loads(json.dumps(asdict(ROWS[2].of(7))))
-    older = json.loads(json.dumps(wanted))
-    del older["recipe"]["memory"]
-    assert ablation_run._completed(older) == wanted
-    del older["recipe"]["head"]
-    assert ablation_run._completed(older) != wanted
+def test_a_run_kept_before_a_setting_existed_is_of_other_settings(tmp_path: Path) -> None:
+    """A new setting's default may change what the recipe does; what was kept before it must not pass for today's."""
+    plan, row = Plan(7, tmp_path, tmp_path, settings.CostWeights()), ROWS[0]
+    path = ablation_run.path_of(plan, row, 0)
+    path.parent.mkdir()
+    stages = {stage: dict.fromkeys(FIGURES, [0.0] * len(ablation_run.JUDGED)) for stage in ("best", "last")}
+    told = {
+        "row": row.name,
+        "seed": 0,
+        "settings": asdict(row.of(7)),
+        "scenario_hash": make_config("randomized").scenario.hash,
+        "stages": stages,
+    }
+    path.write_text(json.dumps(told))
+    assert read_finished(plan, row, 0) is not None
+    del told["settings"]["recipe"]["clone"]["width"]
+    path.write_text(json.dumps(told))
+    with pytest.raises(ValueError, match="made with other settings"):
+        read_finished(plan, row, 0)
 
 
 def finished(random: np.random.Generator, row: str, seeds: range, shift: float) -> list[Finished]:
