@@ -14,7 +14,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from cz_gym.commands import OneLineParser, interrupted
+from cz_gym.commands import OneLineParser, guarded
 
 PROG = "python -m agents.ablation"
 
@@ -22,16 +22,8 @@ PROG = "python -m agents.ablation"
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     args = _parser().parse_args(arguments)
-    try:
-        return _main(args)
-    except (ValueError, OSError) as error:
-        print(f"{PROG}: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    except ImportError as error:
-        print(f'{PROG}: {error.name} is missing: pip install "cz-gym[agents]"', file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return interrupted(PROG, "finished runs are kept, and the same command goes on from the others' checkpoints")
+    left = "finished runs are kept, and the same command goes on from the others' checkpoints"
+    return guarded(PROG, lambda: _main(args), "agents", left)
 
 
 def _parser() -> OneLineParser:

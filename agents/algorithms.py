@@ -7,13 +7,14 @@ goes on where it stopped.
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cz_gym.commands import OneLineParser, interrupted
+from cz_gym.commands import OneLineParser, guarded
 
 from .ablation_rows import Row
 from .settings import PPO, RECIPES, CostWeights
@@ -129,24 +130,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--work", type=Path, default=Path("runs/algorithms"), help="unfinished runs (default: %(default)s)"
     )
     args = parser.parse_args(arguments)
-    try:
-        for name, most in (("seeds", 100), ("steps", 10**9)):
-            if not 1 <= getattr(args, name) <= most:
-                raise ValueError(f"--{name} must be between 1 and {most}, not {getattr(args, name)}")
-        _main(args)
-    except ImportError as error:
-        print(f'{PROG}: {error.name} is missing: pip install "cz-gym[agents,benchmark]"', file=sys.stderr)
-        return 2
-    except (ValueError, OSError) as error:
-        print(f"{PROG}: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return interrupted(PROG, "finished runs are kept, and the same command goes on from the others' checkpoints")
-    print(f"wrote {args.out / 'table.md'}")
-    return 0
+    left = "finished runs are kept, and the same command goes on from the others' checkpoints"
+    return guarded(PROG, lambda: _main(args), "agents,benchmark", left)
 
 
-def _main(args: Any) -> None:
+def _main(args: argparse.Namespace) -> int:
+    for name, most in (("seeds", 100), ("steps", 10**9)):
+        if not 1 <= getattr(args, name) <= most:
+            raise ValueError(f"--{name} must be between 1 and {most}, not {getattr(args, name)}")
     from tqdm import tqdm
 
     from cz_gym.evaluation.whole import alone, check_writable
@@ -167,6 +158,8 @@ def _main(args: Any) -> None:
                 print(f"{title}: done", flush=True)
                 _write(plan, range(args.seeds))
         _write(plan, range(args.seeds))
+    print(f"wrote {args.out / 'table.md'}")
+    return 0
 
 
 if __name__ == "__main__":

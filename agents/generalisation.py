@@ -6,6 +6,7 @@ error, lost crystals and the paired difference to one controller, with 95 % inte
 
 from __future__ import annotations
 
+import argparse
 import csv
 import io
 import sys
@@ -16,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.commands import OneLineParser
+from cz_gym.commands import OneLineParser, guarded
 from cz_gym.evaluation.statistics import Estimate, Resamples, differences, means
 from cz_gym.evaluation.whole import write_files
 
@@ -152,13 +153,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("folder", type=Path, help="a benchmark's folder, with its episodes.csv")
     parser.add_argument("--against", default="lqg-at-0.02", metavar="NAME", help="compared with (%(default)s)")
     given = parser.parse_args(arguments)
-    try:
-        cells = tabulate(read_episodes(given.folder / EPISODES), given.against)
-        text = to_markdown(cells, given.against)
-        write_files({given.folder / "table.csv": to_csv(cells).encode(), given.folder / "table.md": text.encode()})
-    except (ValueError, OSError) as error:
-        print(f"{PROG}: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+    return guarded(PROG, lambda: _main(given), "benchmark")
+
+
+def _main(given: argparse.Namespace) -> int:
+    cells = tabulate(read_episodes(given.folder / EPISODES), given.against)
+    text = to_markdown(cells, given.against)
+    write_files({given.folder / "table.csv": to_csv(cells).encode(), given.folder / "table.md": text.encode()})
     print(text, end="")
     return 0
 

@@ -6,6 +6,7 @@ LQG's, how large an event each survives, and which property of the real puller c
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.commands import OneLineParser, interrupted
+from cz_gym.commands import OneLineParser, guarded
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
@@ -239,23 +240,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--pictures", action="store_true", help="draw the pictures alone; the tables stay as they are")
     parser.add_argument("--out", type=Path, default=Path("results/insight"), metavar="DIR", help="%(default)s")
     given = parser.parse_args(arguments)
-    try:
-        if not 1 <= given.episodes <= len(VALIDATION_SEEDS):
-            raise ValueError(f"--episodes must be 1 to {len(VALIDATION_SEEDS)}, not {given.episodes}")
-        check_writable(given.out)
-        files = study(
-            given.agent, given.episodes, given.pictures, lambda what: print(what, file=sys.stderr, flush=True)
-        )
-        write_files({given.out / name: content for name, content in files.items()})
-    except ImportError as error:
-        missing = f'{error.name} is missing: pip install "cz-gym[benchmark]"' if error.name else error
-        print(f"{PROG}: {missing}", file=sys.stderr)
-        return 2
-    except (ValueError, OSError) as error:
-        print(f"{PROG}: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return interrupted(PROG)
+    return guarded(PROG, lambda: _main(given), "benchmark")
+
+
+def _main(given: argparse.Namespace) -> int:
+    if not 1 <= given.episodes <= len(VALIDATION_SEEDS):
+        raise ValueError(f"--episodes must be 1 to {len(VALIDATION_SEEDS)}, not {given.episodes}")
+    check_writable(given.out)
+    files = study(given.agent, given.episodes, given.pictures, lambda what: print(what, file=sys.stderr, flush=True))
+    write_files({given.out / name: content for name, content in files.items()})
     print(files.get("insight.md", b"").decode() or f"wrote {', '.join(files)}\n", end="")
     return 0
 

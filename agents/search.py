@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cz_gym.commands import OneLineParser, interrupted
+from cz_gym.commands import OneLineParser, guarded
 
 PROG = "python -m agents.search"
 STARTUP, WARMUP = 8, 1
@@ -24,16 +24,8 @@ STARTUP, WARMUP = 8, 1
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     args = _parser().parse_args(arguments)
-    try:
-        return _main(args)
-    except (ValueError, OSError) as error:
-        print(f"{PROG}: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    except ImportError as error:
-        print(f'{PROG}: {error.name} is missing: pip install "cz-gym[agents]"', file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return interrupted(PROG, "the same command goes on from the trials in its history")
+    left = "the same command goes on from the trials in its history"
+    return guarded(PROG, lambda: _main(args), "agents", left)
 
 
 def _parser() -> OneLineParser:

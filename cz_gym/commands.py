@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from typing import NoReturn
 
 INTERRUPTED = 130
@@ -19,6 +20,23 @@ class OneLineParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Exit with code 2."""
         self.exit(2, f"{self.prog}: {' '.join(message.split())}\n")
+
+
+def guarded(prog: str, body: Callable[[], int], extra: str, left: str = "nothing written") -> int:
+    """Run a command's body, its exit code; what ends it early is said in one line.
+
+    ``extra`` names the extras of the package that hold what the command imports, ``left`` what an interrupt leaves.
+    """
+    try:
+        return body()
+    except ImportError as error:
+        said = f'{error.name} is missing: pip install "cz-gym[{extra}]"' if error.name else str(error)
+    except (ValueError, OSError) as error:
+        said = str(error)
+    except KeyboardInterrupt:
+        return interrupted(prog, left)
+    print(f"{prog}: {' '.join(said.split())}", file=sys.stderr)
+    return 2
 
 
 def interrupted(prog: str, left: str = "nothing written") -> int:

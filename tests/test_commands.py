@@ -11,7 +11,7 @@ import pytest
 import benchmark
 from baselines import design_table, industrial_check, lqg_tune, paper, tune
 from cz_gym import film, play, speed, young_laplace_build
-from cz_gym.commands import OneLineParser, interrupted
+from cz_gym.commands import OneLineParser, guarded, interrupted
 from cz_gym.rendering import speed as rendering_speed
 
 COMMANDS = [
@@ -125,3 +125,36 @@ def test_a_message_of_several_lines_becomes_one(capsys: pytest.CaptureFixture[st
         OneLineParser("it").parse_args(["two\nlines"])
     assert capsys.readouterr().err == "it: unrecognized arguments: two lines\n"
     assert interrupted("it") == 130
+
+
+def _missing() -> int:
+    raise ModuleNotFoundError("No module named 'absent'", name="absent")
+
+
+def _wrong() -> int:
+    raise ValueError("first line\nsecond line")
+
+
+def _gone() -> int:
+    raise FileNotFoundError(2, "No such file or directory", "there.csv")
+
+
+def _stopped() -> int:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ("body", "code", "said"),
+    [
+        (lambda: 0, 0, ""),
+        (_missing, 2, 'prog: absent is missing: pip install "cz-gym[agents]"\n'),
+        (_wrong, 2, "prog: first line second line\n"),
+        (_gone, 2, "prog: [Errno 2] No such file or directory: 'there.csv'\n"),
+        (_stopped, 130, "prog: interrupted; runs are kept\n"),
+    ],
+)
+def test_whatever_ends_a_command_is_one_line(
+    body: Any, code: int, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert guarded("prog", body, "agents", "runs are kept") == code
+    assert capsys.readouterr().err == said
