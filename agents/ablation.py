@@ -9,8 +9,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +45,8 @@ def _main(args: argparse.Namespace) -> int:
     from cz_gym.evaluation.whole import alone, check_writable
 
     from .ablation_rows import ROWS, find_rows
-    from .ablation_run import Plan, read_all, read_finished
+    from .ablation_run import Plan, read_all
+    from .jobs import missing, run_all
     from .settings import PPO
 
     rows = ROWS if args.rows is None else find_rows(args.rows.split(","))
@@ -59,42 +58,12 @@ def _main(args: argparse.Namespace) -> int:
         return 0
     check_writable(plan.out)
     with alone(plan.work):
-        tasks = [(row, seed) for row in rows for seed in range(args.seeds) if not read_finished(plan, row, seed)]
+        tasks = missing(plan, [(row, seed) for row in rows for seed in range(args.seeds)])
         print(f"{len(rows) * args.seeds - len(tasks)} runs are done, {len(tasks)} to do")
-        _run(plan, tasks, args.jobs, range(args.seeds))
+        run_all(plan, tasks, args.jobs, lambda: _write(plan, range(args.seeds)))
         _write(plan, range(args.seeds))
     print(f"wrote {plan.out / 'table.md'}")
     return 0
-
-
-def _run(plan: Any, tasks: Sequence[Any], jobs: int, seeds: Sequence[int]) -> None:
-    """Do the runs, so many at once; the table is renewed after each."""
-    if jobs == 1:
-        for row, seed in tasks:
-            print(_work(plan, row, seed), flush=True)
-            _write(plan, seeds)
-        return
-    # Forking would copy the threads of torch and of the native batch in unknown states.
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        under_way = [pool.submit(_work, plan, row, seed) for row, seed in tasks]
-        try:
-            for each in as_completed(under_way):
-                print(each.result(), flush=True)
-                _write(plan, seeds)
-        except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
-
-
-def _work(plan: Any, row: Any, seed: int) -> str:
-    from tqdm import tqdm
-
-    from .ablation_run import run_one
-
-    title = f"{row.name}, seed {seed}"
-    with tqdm(total=plan.steps, desc=title, unit="step", unit_scale=True, mininterval=1.0, disable=None) as bar:
-        run_one(plan, row, seed, bar)
-    return f"{title}: done"
 
 
 def _write(plan: Any, seeds: Sequence[int]) -> None:

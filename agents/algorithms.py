@@ -19,7 +19,7 @@ from cz_gym.commands import OneLineParser, guarded
 from .ablation_rows import Row
 from .settings import PPO, RECIPES, CostWeights
 
-PROG = "agents.algorithms"
+PROG = "python -m agents.algorithms"
 
 
 def _row(name: str, about: str, meaning: str) -> Row:
@@ -122,9 +122,10 @@ def _write(plan: Any, seeds: Sequence[int]) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser(prog=f"python -m {PROG}", description=(__doc__ or "").split("\n")[0])
+    parser = OneLineParser(prog=PROG, description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--seeds", type=int, default=3, help="training seeds a row (default: %(default)s)")
     parser.add_argument("--steps", type=int, default=1_000_000, help="environment steps a run (default: %(default)s)")
+    parser.add_argument("--jobs", type=int, default=2, help="runs at once (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("results/algorithms"), help="results (default: %(default)s)")
     parser.add_argument(
         "--work", type=Path, default=Path("runs/algorithms"), help="unfinished runs (default: %(default)s)"
@@ -135,29 +136,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(args: argparse.Namespace) -> int:
-    for name, most in (("seeds", 100), ("steps", 10**9)):
+    for name, most in (("seeds", 100), ("steps", 10**9), ("jobs", 64)):
         if not 1 <= getattr(args, name) <= most:
             raise ValueError(f"--{name} must be between 1 and {most}, not {getattr(args, name)}")
-    from tqdm import tqdm
-
     from cz_gym.evaluation.whole import alone, check_writable
 
-    from .ablation_run import Plan, read_finished, run_one
+    from .ablation_run import Plan
+    from .jobs import missing, run_all
 
-    plan = Plan(args.steps, args.out, args.work, WEIGHTS)
+    plan, seeds = Plan(args.steps, args.out, args.work, WEIGHTS), range(args.seeds)
     check_writable(plan.out)
     with alone(plan.work):
         # Seed by seed, so that a stopped comparison holds every algorithm.
-        for seed in range(args.seeds):
-            for row in ROWS:
-                if read_finished(plan, row, seed):
-                    continue
-                title = f"{row.name}, seed {seed}"
-                with tqdm(total=plan.steps, desc=title, unit="step", unit_scale=True, disable=None) as bar:
-                    run_one(plan, row, seed, bar)
-                print(f"{title}: done", flush=True)
-                _write(plan, range(args.seeds))
-        _write(plan, range(args.seeds))
+        tasks = missing(plan, [(row, seed) for seed in seeds for row in ROWS])
+        run_all(plan, tasks, args.jobs, lambda: _write(plan, seeds))
+        _write(plan, seeds)
     print(f"wrote {args.out / 'table.md'}")
     return 0
 

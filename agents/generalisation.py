@@ -22,7 +22,7 @@ from cz_gym.evaluation.statistics import Estimate, Resamples, differences, means
 from cz_gym.evaluation.whole import write_files
 
 Floats = npt.NDArray[np.float64]
-PROG = "agents.generalisation"
+PROG = "python -m agents.generalisation"
 EPISODES = "episodes.csv"
 OBSERVABLE = ("sensor-fault", "puller")
 """Rows with an offset that no sensor shows: the error against what can be seen is counted there."""
@@ -149,7 +149,7 @@ def _apart(cell: Cell) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser(prog=f"python -m {PROG}", description=(__doc__ or "").split("\n")[0])
+    parser = OneLineParser(prog=PROG, description=(__doc__ or "").split("\n")[0])
     parser.add_argument("folder", type=Path, help="a benchmark's folder, with its episodes.csv")
     parser.add_argument("--against", default="lqg-at-0.02", metavar="NAME", help="compared with (%(default)s)")
     given = parser.parse_args(arguments)

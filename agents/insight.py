@@ -47,7 +47,7 @@ from .trials import (
     survive,
 )
 
-PROG = "agents.insight"
+PROG = "python -m agents.insight"
 BESIDE = ("lqg-at-0.02", "lqg", "paper-tuned")
 """Controllers that an agent is shown beside; its teacher is among them."""
 READINGS = tuple(channel.name for channel in MEASURED)
@@ -234,7 +234,7 @@ def study(agent: Path | None, episodes: int, only_pictures: bool, tell: Callable
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser(prog=f"python -m {PROG}", description=(__doc__ or "").split("\n")[0])
+    parser = OneLineParser(prog=PROG, description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--agent", type=Path, metavar="FILE", help="agent file in place of the shipped one")
     parser.add_argument("--episodes", type=int, default=50, metavar="N", help="validation episodes (%(default)s)")
     parser.add_argument("--pictures", action="store_true", help="draw the pictures alone; the tables stay as they are")

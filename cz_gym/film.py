@@ -20,7 +20,7 @@ from .commands import OneLineParser, interrupted
 if TYPE_CHECKING:
     from .rendering.duel import Side
 
-PROG = "cz_gym.film"
+PROG = "python -m cz_gym.film"
 OUT = Path(__file__).resolve().parents[1] / "results" / "media" / "duel.gif"
 SEED = 2_000_000
 """The first test crystal, the one in the benchmark's figure."""
@@ -35,7 +35,7 @@ COLOURS = 128
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
     """Read the command line; exits with code 2 and one line for anything that cannot be meant."""
     parser = OneLineParser(
-        prog="python -m cz_gym.film",
+        prog=PROG,
         description="Film the paper's controller and an agent on the same crystal.",
     )
     parser.add_argument("--scenario", default="randomized", metavar="NAME", help="scenario (%(default)s)")

@@ -15,7 +15,7 @@ from .units import MINUTE
 if TYPE_CHECKING:
     from .config import Config
 
-PROG = "cz_gym.play"
+PROG = "python -m cz_gym.play"
 SPEED = 60.0
 """Seconds of growth a second of watching, unless told."""
 NO_DISPLAY = "no display: a crystal is pulled by hand in a window; set DISPLAY or WAYLAND_DISPLAY"
@@ -26,7 +26,7 @@ DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
     """Read the command line; exits with code 2 and one line for anything that cannot be meant."""
     parser = OneLineParser(
-        prog="python -m cz_gym.play",
+        prog=PROG,
         description="Pull a crystal by hand, in a window, and be compared with the paper's controller on the same one.",
         epilog="Keys: up and down the pull speed, right and left the heater (with shift: in large steps), space starts "
         "and pauses, + and - change the speed of time, R begins again, N takes the next crystal, H shows help, Q ends.",

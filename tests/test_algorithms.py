@@ -37,7 +37,8 @@ def test_rows_are_the_recipes_by_name() -> None:
 
 @pytest.mark.usefixtures("small")
 def test_each_is_run_once_and_tabulated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--seeds", "1", "--steps", "128", "--out", str(tmp_path / "out"), "--work", str(tmp_path / "work")]
+    arguments = ["--seeds", "1", "--steps", "128", "--jobs", "1"]
+    arguments += ["--out", str(tmp_path / "out"), "--work", str(tmp_path / "work")]
     assert algorithms.main(arguments) == 0
     assert capsys.readouterr().out.count(": done") == 2
     table = (tmp_path / "out" / "table.md").read_text()
@@ -52,4 +53,4 @@ def test_each_is_run_once_and_tabulated(tmp_path: Path, capsys: pytest.CaptureFi
 
 def test_what_cannot_be_meant_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert algorithms.main(["--seeds", "0"]) == 2
-    assert capsys.readouterr().err == "agents.algorithms: --seeds must be between 1 and 100, not 0\n"
+    assert capsys.readouterr().err == "python -m agents.algorithms: --seeds must be between 1 and 100, not 0\n"

@@ -185,7 +185,7 @@ def test_without_pygame_it_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pygame", None)
     assert play.main([]) == 2
-    assert capsys.readouterr().err == f"cz_gym.play: {backend.MISSING}\n"
+    assert capsys.readouterr().err == f"python -m cz_gym.play: {backend.MISSING}\n"
 
 
 def test_without_a_display_it_says_so(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -194,7 +194,7 @@ def test_without_a_display_it_says_so(capsys: pytest.CaptureFixture[str], monkey
     assert play.main([]) == 2
     said = capsys.readouterr()
     assert said.out == ""
-    assert said.err == f"cz_gym.play: {play.NO_DISPLAY}\n"
+    assert said.err == f"python -m cz_gym.play: {play.NO_DISPLAY}\n"
     assert not pygame.display.get_init()
 
 
@@ -205,7 +205,7 @@ def test_where_no_display_is_named_none_is_tried(
     for name in play.DISPLAYS:
         monkeypatch.delenv(name, raising=False)
     assert play.main([]) == 2
-    assert capfd.readouterr() == ("", f"cz_gym.play: {play.NO_DISPLAY}\n")
+    assert capfd.readouterr() == ("", f"python -m cz_gym.play: {play.NO_DISPLAY}\n")
 
 
 def test_the_command_prints_the_score(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

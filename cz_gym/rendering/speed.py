@@ -19,7 +19,7 @@ from gymnasium.error import DependencyNotInstalled
 
 from ..commands import OneLineParser, interrupted
 
-PROG = "cz_gym.rendering.speed"
+PROG = "python -m cz_gym.rendering.speed"
 FRAMES = 180
 """Frames of a measurement: a quarter of an hour at 5 s control."""
 SEED = 1
@@ -34,7 +34,7 @@ class Speed(NamedTuple):
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
     """Read the command line; exits with code 2 and one line for anything that cannot be meant."""
-    parser = OneLineParser(prog=f"python -m {PROG}", description="Frames a second of render() and of the camera.")
+    parser = OneLineParser(prog=PROG, description="Frames a second of render() and of the camera.")
     parser.add_argument("--size", default="640x480", metavar="WxH", help="size of the picture in pixels (%(default)s)")
     parser.add_argument("--rounds", type=int, default=5, metavar="N", help="rounds, 1 to 100 (%(default)s)")
     return parser.parse_args(argv)
