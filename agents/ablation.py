@@ -74,12 +74,13 @@ def _write(plan: Any, seeds: Sequence[int]) -> None:
     from .ablation_rows import ROWS
     from .ablation_run import read_all
     from .ablation_table import tabulate, to_csv, to_markdown
+    from .rivals import rivals
 
     runs = read_all(plan, ROWS, seeds)
     if not runs:
         return
     lines = tabulate(ROWS, runs)
-    files = {"table.csv": to_csv(lines).encode(), "table.md": to_markdown(lines, plan.steps).encode()}
+    files = {"table.csv": to_csv(lines).encode(), "table.md": to_markdown(lines, plan.steps, rivals(plan)).encode()}
     files["forest.png"] = forest(lines)
     write_files({plan.out / name: content for name, content in files.items()})
 

@@ -19,6 +19,7 @@ from cz_gym.evaluation.statistics import Estimate, Resamples, means
 
 from .ablation_rows import BASE, Row
 from .ablation_run import FARTHER, FIGURES, JUDGED, STAGES, Finished
+from .rivals import Rivals, rivals_table
 
 Floats = npt.NDArray[np.float64]
 MILLI = 1e-3
@@ -103,7 +104,7 @@ def _numbers(estimate: Estimate | None) -> tuple[float | None, ...]:
     return estimate.mean, *(estimate.ci95 or (None, None))
 
 
-def to_markdown(lines: Sequence[Line], steps: int) -> str:
+def to_markdown(lines: Sequence[Line], steps: int, lqgs: Rivals) -> str:
     """``table.md``."""
     most = max((len(line.seeds) for line in lines), default=0)
     return "\n".join(
@@ -116,23 +117,28 @@ def to_markdown(lines: Sequence[Line], steps: int) -> str:
             " training seeds, negative is better. *Kept* is the agent of least cost on the validation that selects,"
             " as the recipe does it; *last* is what learning ended with; *start* is what it began as: the imitation,"
             " or the controller that the network's action is added to. With so few training seeds the intervals are"
-            " somewhat too narrow.",
+            " somewhat too narrow. *At equal activity*: RMSE of the kept agents over what the LQG's frontier has"
+            " at their pull step RMS, by means; 1 is as good.",
             "",
-            *_table(lines),
+            *_table(lines, lqgs),
             "",
             "| row | what is changed |",
             "|---|---|",
             *(f"| {line.row.name} | {line.row.meaning} |" for line in lines),
             "",
+            "The LQG's settings on the same crystals:",
+            "",
+            *rivals_table(lqgs),
+            "",
         ]
     )
 
 
-def _table(lines: Sequence[Line]) -> list[str]:
+def _table(lines: Sequence[Line], lqgs: Rivals) -> list[str]:
     headings = (
-        "row", "seeds", "RMSE kept [um]", "difference [um]", "RMSE last [um]", "RMSE start [um]", "1000 cost kept",
-        "difference", "last", "start", "1000 reward's cost kept", "difference", "pull step kept [mm/min]",
-        "lost kept / last [%]", f"{FARTHER}: RMSE kept [um]", "lost [%]",
+        "row", "seeds", "RMSE kept [um]", "at equal activity", "difference [um]", "RMSE last [um]", "RMSE start [um]",
+        "1000 cost kept", "difference", "last", "start", "1000 reward's cost kept", "difference",
+        "pull step kept [mm/min]", "lost kept / last [%]", f"{FARTHER}: RMSE kept [um]", "lost [%]",
     )  # fmt: skip
     found = [f"| {' | '.join(headings)} |", f"|---|{'--:|' * (len(headings) - 1)}"]
     for line in lines:
@@ -142,6 +148,7 @@ def _table(lines: Sequence[Line]) -> list[str]:
             line.row.name,
             str(len(line.seeds)),
             _interval(kept["rmse_mm"].mean, MICRON, 1),
+            at_equal_activity(line, lqgs),
             _interval(kept["rmse_mm"].difference, MICRON, 1, True),
             f"{line.cells['last', 'rmse_mm'].mean.mean / MICRON:.1f}",
             f"{start.mean.mean / MICRON:.1f}" if start else "-",
@@ -158,6 +165,13 @@ def _table(lines: Sequence[Line]) -> list[str]:
         )
         found.append(f"| {' | '.join(entries)} |")
     return found
+
+
+def at_equal_activity(line: Line, lqgs: Rivals) -> str:
+    """RMSE of a row's kept agents over the LQG's where it is as active, "-" where none is."""
+    rmse, activity = (line.cells[SHOWN, name].mean.mean for name in ("rmse_mm", "pull_step_rms_mm_per_min"))
+    ratio = lqgs.ratio(rmse, activity)
+    return "-" if ratio is None else f"{ratio:.2f}"
 
 
 def _interval(estimate: Estimate | None, unit: float, digits: int, signed: bool = False) -> str:

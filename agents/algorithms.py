@@ -38,18 +38,21 @@ WEIGHTS = CostWeights()
 """Of the cost that all are judged by: the environment's reward."""
 
 
-def to_markdown(lines: Sequence[Any], curves: Mapping[str, Sequence[Any]], steps: int) -> str:
+def to_markdown(lines: Sequence[Any], curves: Mapping[str, Sequence[Any]], steps: int, lqgs: Any) -> str:
     """``table.md``."""
     from .ablation_run import JUDGED
+    from .ablation_table import at_equal_activity
+    from .rivals import rivals_table
 
     heads = ("algorithm", "begins", "training seeds", "RMSE [mm]", "worst seed [mm]", "lost [%]", "pull steps [mm/min]",
-             "reward's cost", "before learning [mm]", "minutes a run")  # fmt: skip
+             "at equal activity", "reward's cost", "before learning [mm]", "minutes a run")  # fmt: skip
     found = [
         "# Algorithms side by side",
         "",
         f"{steps:,} environment steps a run, the same 72 channels of history, judged on {len(JUDGED)} validation"
         " crystals of `randomized` that select nothing: of each run the agent that did best on those that select."
-        " In brackets: 95 % intervals, bootstrap over training seeds and crystals. A lost crystal counts 8 mm.",
+        " In brackets: 95 % intervals, bootstrap over training seeds and crystals. A lost crystal counts 8 mm."
+        " *At equal activity*: RMSE over what the LQG's frontier has at those pull steps; 1 is as good.",
         "",
         "| " + " | ".join(heads) + " |",
         "|---|---" + "|--:" * (len(heads) - 2) + "|",
@@ -68,12 +71,14 @@ def to_markdown(lines: Sequence[Any], curves: Mapping[str, Sequence[Any]], steps
             f"{worst:.3f}",
             f"{100.0 * line.cells['best', 'failure_rate'].mean.mean:.1f}",
             f"{line.cells['best', 'pull_step_rms_mm_per_min'].mean.mean:.4f}",
+            at_equal_activity(line, lqgs),
             f"{cost.mean:.3f} [{cost.ci95[0]:.3f}, {cost.ci95[1]:.3f}]",
             f"{start.mean.mean:.3f}" if start else "-",
             f"{minutes:.0f}",
         )
         found.append("| " + " | ".join(cells) + " |")
     found += ["", *(f"- **{line.row.name}**: {line.row.meaning}" for line in lines)]
+    found += ["", "The LQG's settings on the same crystals:", "", *rivals_table(lqgs)]
     return "\n".join(found) + "\n"
 
 
@@ -104,6 +109,7 @@ def _write(plan: Any, seeds: Sequence[int]) -> None:
 
     from .ablation_run import path_of, read_all
     from .ablation_table import tabulate, to_csv
+    from .rivals import rivals
 
     runs = read_all(plan, ROWS, seeds)
     if not runs:
@@ -114,7 +120,7 @@ def _write(plan: Any, seeds: Sequence[int]) -> None:
     }
     files = {
         "table.csv": to_csv(lines).encode(),
-        "table.md": to_markdown(lines, told, plan.steps).encode(),
+        "table.md": to_markdown(lines, told, plan.steps, rivals(plan)).encode(),
         "curves.png": curve_figure(told),
     }
     write_files({plan.out / name: content for name, content in files.items()})

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents import ablation, ablation_figure, ablation_rows, ablation_run, ablation_table, run, settings
+from agents import ablation, ablation_figure, ablation_rows, ablation_run, ablation_table, rivals, run, settings
 from agents.ablation_rows import BASE, ROWS, Row, find_rows
 from agents.ablation_run import FIGURES, Finished, Plan, read_finished
 from agents.export import actor_of
@@ -47,6 +47,11 @@ CHANGES = {
     "on-hard": {"recipe.scenario"},
     BASE: set(),
 }
+
+
+LQGS = rivals.Rivals(
+    {name: dict.fromkeys(FIGURES, error) | {rivals.ACTIVITY: 0.01 / error} for name, error in (("a", 1.0), ("b", 2.0))}
+)
 
 
 def differing(one: dict[str, Any], other: dict[str, Any], inside: str = "") -> set[str]:
@@ -113,6 +118,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     beside = replace(recipe, residual=True, head=settings.ActionHead(skip=0.0))
     rows = (Row(BASE, BASE, "as it is", quick), Row("beside", "action", "residual", replace(quick, recipe=beside)))
     monkeypatch.setattr(ablation_rows, "ROWS", rows)
+    monkeypatch.setattr(rivals, "rivals", lambda plan: LQGS)
 
 
 def test_a_sweep_keeps_what_is_finished_and_goes_on(
@@ -247,7 +253,7 @@ def test_the_table_is_written_for_people_and_machines() -> None:
     random = np.random.default_rng(0)
     runs = {name: finished(random, name, range(2), shift) for name, shift in ((BASE, 0.0), ("scratch", 0.5))}
     lines = ablation_table.tabulate(ROWS, runs)
-    text = ablation_table.to_markdown(lines, 3_000_000)
+    text = ablation_table.to_markdown(lines, 3_000_000, LQGS)
     assert [line.split(" |")[0] for line in text.splitlines() if line.startswith("| ba")] == ["| base", "| base"]
     assert "3,000,000 environment steps" in text
     table = ablation_table.to_csv(lines).splitlines()
@@ -255,3 +261,28 @@ def test_the_table_is_written_for_people_and_machines() -> None:
     assert len({line.count(",") for line in table}) == 1
     assert ablation_figure.forest(lines).startswith(b"\x89PNG")
     assert ablation_table.tabulate(ROWS, {}) == []
+
+
+def test_the_lqgs_are_judged_once_and_stand_at_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def judge(law: Any, weights: settings.CostWeights) -> np.ndarray:
+        asked.append(law.settings.hash)
+        moves = 1.0 / law.settings.weights.pull_step
+        return np.tile([2.0 + 1.0 / moves, 0.0, 0.0, moves, 0.0, 0.0, 0.0], (3, 1))
+
+    monkeypatch.setattr(ablation_run, "judge", judge)
+    plan = Plan(1, tmp_path, tmp_path, settings.CostWeights())
+    found = rivals.rivals(plan)
+    assert len(found.means) == len(asked) == len(set(asked)) == 8
+    assert rivals.rivals(plan) == found
+    assert len(asked) == 8
+    for each in found.means.values():
+        assert found.ratio(each["rmse_mm"], each[rivals.ACTIVITY]) == pytest.approx(1.0)
+    quietest = min(each[rivals.ACTIVITY] for each in found.means.values())
+    assert found.ratio(1.0, 0.5 * quietest) is None
+    rivals.rivals(plan._replace(weights=settings.CostWeights(0.5)))
+    assert len(asked) == 16
+    (tmp_path / rivals.KEPT).write_text('{"of": 1}')
+    assert rivals.rivals(plan) == found
+    assert len(rivals.rivals_table(found)) == 2 + 8

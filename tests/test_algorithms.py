@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("sb3_contrib")
 pytest.importorskip("matplotlib")
 
-from agents import ablation_run, algorithms, run, settings
+from agents import ablation_run, algorithms, rivals, run, settings
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
 SMALL = settings.Recipe(num_envs=4, privileged_critic=False, hidden=(4,))
@@ -27,6 +27,9 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(algorithms, "ROWS", tuple(rows))
     monkeypatch.setattr(ablation_run, "JUDGED", VALIDATION_SEEDS[:2])
     monkeypatch.setattr(run, "QUICK", 1)
+    means = {name: dict.fromkeys(ablation_run.FIGURES, error) for name, error in (("lively", 1.0), ("quiet", 2.0))}
+    means["lively"] |= {rivals.ACTIVITY: 3.0}
+    monkeypatch.setattr(rivals, "rivals", lambda plan: rivals.Rivals(means))
 
 
 def test_rows_are_the_recipes_by_name() -> None:
