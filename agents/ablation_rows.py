@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from cz_gym.units import MINUTE
 
-from .settings import PPO, SCRATCH, ActionHead, Clone, CostWeights, Recipe
+from .settings import PPO, SCRATCH, ActionHead, Choice, Clone, CostWeights, Recipe
 
 BASE = "base"
 """Name of the row that the others are compared with."""
@@ -22,11 +22,14 @@ class Row:
     """What was changed: rows about the same thing stand together."""
     meaning: str
     """One line for people."""
-    choice: PPO
+    choice: Choice
+    share: float = 1.0
+    """Of the steps that rows are trained for [-]."""
 
-    def of(self, steps: int) -> PPO:
-        """Its settings for that many environment steps."""
-        return replace(self.choice, name=f"ppo-{self.name}", steps=steps)
+    def of(self, steps: int) -> Choice:
+        """Its settings when rows are trained for that many environment steps."""
+        name = self.choice.name if self.choice.name == self.name else f"{self.choice.name}-{self.name}"
+        return replace(self.choice, name=name, steps=round(self.share * steps))
 
 
 _PPO = PPO()
@@ -68,10 +71,11 @@ def _shown(name: str, width: float, meaning: str) -> Row:
     return Row(f"shown-{name}", "beginning", meaning, _recipe(changed))
 
 
-_FROM_NOTHING = replace(SCRATCH, recipe=replace(SCRATCH.recipe, weights=_RECIPE.weights))
+_FROM_NOTHING = replace(SCRATCH, name=_PPO.name, recipe=replace(SCRATCH.recipe, weights=_RECIPE.weights))
 
 ROWS: tuple[Row, ...] = (
-    Row(BASE, BASE, f"the recipe as it ships: imitates {_TEACHER.teacher}, then PPO", _PPO),
+    Row(BASE, BASE, f"the recipe that ships, for all the steps: imitates {_TEACHER.teacher}, then PPO", _PPO),
+    Row("fifth", BASE, "a fifth of the steps, as the recipe ships", _PPO, share=0.2),
     Row("scratch", "beginning", "no imitation: ppo-scratch's settings, the same reward", _FROM_NOTHING),
     Row(
         "absolute",

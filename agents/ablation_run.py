@@ -24,7 +24,7 @@ from .ablation_rows import Row
 from .contract import AgentFileError, read_json
 from .run import QUICK, Run
 from .run_files import provenance
-from .settings import PPO, CostWeights
+from .settings import Choice, CostWeights
 from .validation import costs
 
 Floats = npt.NDArray[np.float64]
@@ -92,6 +92,12 @@ def run_one(plan: Plan, row: Row, seed: int, bar: Any) -> None:
         shutil.rmtree(folder)
 
 
+def judged_on() -> dict[str, Any]:
+    """What figures depend on beside the agent: crystals, and the scenarios and the plant that they are drawn from."""
+    configs = {name: make_config(name, observation="history").hash for name in (SCENARIO, FARTHER)}
+    return {"seeds": [JUDGED[0], JUDGED[-1]], "figures": list(FIGURES), **configs}
+
+
 def judge(policy: Any, weights: CostWeights) -> Floats:
     """Figures of a policy on the crystals that all rows are judged on, shape (episodes, figures)."""
     found, farther = (
@@ -106,7 +112,7 @@ def judge(policy: Any, weights: CostWeights) -> Floats:
     return np.stack([by_name[name] for name in FIGURES], axis=-1)
 
 
-def _open(folder: Path, choice: PPO, seed: int, imitations: Path) -> Run:
+def _open(folder: Path, choice: Choice, seed: int, imitations: Path) -> Run:
     """The run in this folder; one that cannot go on begins again."""
     registry, recipe = room("baselines.registry"), choice.recipe
     config = make_config(recipe.scenario, control_interval=recipe.control_interval)
@@ -126,9 +132,7 @@ def _to_json(plan: Plan, row: Row, seed: int, run: Run, stages: Mapping[str, Flo
         "row": row.name,
         "seed": seed,
         "settings": asdict(run.choice),
-        "plant_hash": run.config.plant_hash,
-        "scenario_hash": make_config(SCENARIO).scenario.hash,
-        "judged_seeds": [JUDGED[0], JUDGED[-1]],
+        "judged": judged_on(),
         "provenance": {**provenance(), "sessions": [each.get("git_commit") for each in run.sessions]},
         "validations": [{name: float(value) for name, value in line.items()} for line in run.rows],
         "stages": {
@@ -154,7 +158,7 @@ def read_finished(plan: Plan, row: Row, seed: int) -> Finished | None:
     if found is None or (found.row, found.seed) != (row.name, seed):
         raise ValueError(f"{path}: not a finished run of this ablation, or damaged; move it away to run it again")
     wanted = json.loads(json.dumps(asdict(row.of(plan.steps))))
-    if found.settings != wanted or told.get("scenario_hash") != make_config(SCENARIO).scenario.hash:
+    if found.settings != wanted or told.get("judged") != judged_on():
         raise ValueError(f"{path}: made with other settings; move it away, or choose another --out or --steps")
     return found
 

@@ -43,9 +43,7 @@ def rivals(plan: Plan) -> Rivals:
     settings = room("baselines.lqg_settings")
     names = ["lqg-quiet", "lqg", *map(settings.family_name, settings.ACTIVITIES)]
     laws = {name: room("baselines.registry").find_controller(name).make(make_config(SCENARIO)) for name in names}
-    scenarios = [make_config(name).hash for name in (SCENARIO, FARTHER)]
-    judged = ablation_run.JUDGED
-    about = [*scenarios, FIGURES, judged[0], judged[-1], asdict(plan.weights)]
+    about = [ablation_run.judged_on(), asdict(plan.weights)]
     told = json.dumps([about, {name: law.settings.hash for name, law in laws.items()}])
     digest, path = hashlib.sha256(told.encode()).hexdigest()[:16], plan.out / KEPT
     kept = _read(path)

@@ -30,6 +30,9 @@ from .residual import ResidualAction
 from .vec_env import CzVecEnv
 from .wrappers import DriveAction, TrainingReward
 
+CRITIC_SHARE = 2.0 / 3.0
+"""Most of all steps that the critic may have for itself [-]: a short run shall not end before its actor learns."""
+
 
 @dataclass(frozen=True)
 class Training:
@@ -57,9 +60,12 @@ def make_training(choice: settings.Choice, seed: int, logs: str | None, done: in
             other: Any = _make_sac(choice, moves, rate, seed, logs)
         else:
             other = make_recurrent(choice, moves, rate, seed, logs)
+        _set_streams(other, seed, done)
         return Training(other, [Statistics(choice.steps // 4, done > 0)], recipe, choice.steps)
     learner = _make_ppo(choice, slots, seed, logs, teacher)
-    callbacks: list[BaseCallback] = [CriticFirst(choice.critic_steps, choice.actor_pace)]
+    _set_streams(learner, seed, done)
+    critic_steps = min(choice.critic_steps, int(CRITIC_SHARE * choice.steps))
+    callbacks: list[BaseCallback] = [CriticFirst(critic_steps, choice.actor_pace)]
     if recipe.clone is None:
         callbacks.append(Statistics(choice.steps // 4, known=done > 0))
     return Training(learner, callbacks, recipe, choice.steps)
@@ -152,9 +158,16 @@ def _make_slots(recipe: settings.Recipe, seed: int, done: int) -> CzVecEnv:
         control_interval=recipe.control_interval,
         autoreset_mode=AutoresetMode.SAME_STEP,
     )
-    slots = CzVecEnv(env, recipe.privileged_critic, stagger=seed + done)
-    slots.seed((seed * 10_007 + done) % (len(TRAINING_SEEDS) - recipe.num_envs))
-    return slots
+    return CzVecEnv(env, recipe.privileged_critic, stagger=seed + done)
+
+
+def _set_streams(learner: Any, seed: int, done: int) -> None:
+    """Give the learner's randomness and its slots seeds of this training seed, and new ones when it is resumed.
+
+    Made learners have set the slots' seeds to ``seed`` and those after it: neighbouring training seeds would meet the
+    same crystals, and a resumed run its first ones again.
+    """
+    learner.set_random_seed((seed * 10_007 + done) % (len(TRAINING_SEEDS) - learner.n_envs))
 
 
 def _linear(start: float, end: float) -> Callable[[float], float]:

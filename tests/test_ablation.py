@@ -46,6 +46,7 @@ CHANGES = {
     "teacher-lqg-quiet": {"recipe.clone"},
     "on-hard": {"recipe.scenario"},
     BASE: set(),
+    "fifth": set(),
 }
 
 
@@ -69,7 +70,7 @@ def changed(choice: settings.PPO) -> set[str]:
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
 def test_a_row_changes_what_it_says_and_nothing_else(row: Row) -> None:
     assert changed(row.of(1000)) == CHANGES[row.name]
-    assert row.of(1000).steps == 1000
+    assert row.of(1000).steps == 1000 * row.share
     training_scenario(row.choice.recipe)
     if row.choice.recipe.clone:
         assert not find_controller(row.choice.recipe.clone.teacher).told
@@ -95,7 +96,7 @@ def test_a_row_can_be_learned(row: Row, tmp_path: Path) -> None:
 
 def test_rows_have_names_of_their_own() -> None:
     assert len({row.name for row in ROWS}) == len(ROWS) == len(CHANGES)
-    assert len({repr(row.choice) for row in ROWS}) == len(ROWS)
+    assert len({repr((row.choice, row.share)) for row in ROWS}) == len(ROWS)
     assert [row.name for row in find_rows(["absolute", BASE])] == [BASE, "absolute"]
 
 
@@ -173,7 +174,7 @@ def test_a_run_that_cannot_go_on_begins_again(small: None, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--rows", "base,abslute"], "unknown row 'abslute'; choose from base, scratch"),
+        (["--rows", "base,abslute"], "unknown row 'abslute'; choose from base, fifth"),
         (["--seeds", "0"], "--seeds must be between 1 and 100, not 0"),
         (["--steps", "-5"], "--steps must be between 1"),
         (["--jobs", "0"], "--jobs must be between 1 and 64, not 0"),
@@ -206,7 +207,7 @@ def test_a_run_kept_before_a_setting_existed_is_of_other_settings(tmp_path: Path
         "row": row.name,
         "seed": 0,
         "settings": asdict(row.of(7)),
-        "scenario_hash": make_config("randomized").scenario.hash,
+        "judged": ablation_run.judged_on(),
         "stages": stages,
     }
     path.write_text(json.dumps(told))
