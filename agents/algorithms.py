@@ -1,8 +1,8 @@
 """Algorithms side by side: ``python -m agents.algorithms`` trains each for as many steps on the same observations.
 
-PPO, recurrent PPO and SAC from nothing, and ``ppo`` as it ships, which begins with an imitation. They are judged on
-the crystals of :mod:`agents.ablation_run`, validation that selects nothing. Finished runs are kept; the same command
-goes on where it stopped.
+PPO, recurrent PPO and SAC from nothing, and ``ppo-quiet``, which begins with an imitation. All learn for the
+environment's reward. They are judged on the crystals of :mod:`agents.ablation_run`, validation that selects nothing.
+Finished runs are kept; the same command goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -15,27 +15,34 @@ from pathlib import Path
 from typing import Any
 
 from cz_gym.commands import OneLineParser, guarded
+from cz_gym.config import make_config
 
 from .ablation_rows import Row
-from .settings import PPO, RECIPES, CostWeights
+from .settings import PPO, RECIPES, Choice, CostWeights
 
 PROG = "python -m agents.algorithms"
 
 
 def _row(name: str, about: str, meaning: str) -> Row:
-    choice: Any = RECIPES[name]
-    return Row(name, about, meaning, choice)
+    return Row(name, about, meaning, RECIPES[name])
 
 
 ROWS = (
     _row("ppo-scratch", "from nothing", "PPO; the critic also sees the true state"),
-    _row("ppo-recurrent", "from nothing", "PPO of an LSTM, actor and critic (sb3-contrib)"),
-    _row("sac", "from nothing", "soft actor-critic"),
-    _row("ppo", "from an imitation", f"the shipped recipe: imitates {PPO().recipe.clone.teacher}, then PPO"),  # type: ignore[union-attr]
+    _row("ppo-recurrent", "from nothing", "PPO of an LSTM, actor and critic (sb3-contrib); both see what is measured"),
+    _row("sac", "from nothing", "soft actor-critic; both see what is measured"),
+    _row("ppo-quiet", "from an imitation", "imitates lqg-quiet, then PPO; the critic also sees the true state"),
 )
 """Every row, in the order of the table."""
 WEIGHTS = CostWeights()
-"""Of the cost that all are judged by: the environment's reward."""
+"""Of the cost that all learn for and are judged by: the environment's reward."""
+
+
+def plant_steps(choice: Choice, steps: int) -> int:
+    """Control intervals that the plant is run for: those learned from, the imitation's, and those of the pair."""
+    clone = choice.recipe.clone
+    shown = clone.rounds * clone.episodes * make_config(choice.recipe.scenario).steps if clone else 0
+    return shown + steps * (2 if isinstance(choice, PPO) and choice.paired else 1)
 
 
 def to_markdown(lines: Sequence[Any], curves: Mapping[str, Sequence[Any]], steps: int, lqgs: Any) -> str:
@@ -45,14 +52,17 @@ def to_markdown(lines: Sequence[Any], curves: Mapping[str, Sequence[Any]], steps
     from .rivals import rivals_table
 
     heads = ("algorithm", "begins", "training seeds", "RMSE [mm]", "worst seed [mm]", "lost [%]", "pull steps [mm/min]",
-             "at equal activity", "reward's cost", "before learning [mm]", "minutes a run")  # fmt: skip
+             "at equal activity", "reward's cost", "before learning [mm]",
+             "plant steps [million]", "minutes a run")  # fmt: skip
     found = [
         "# Algorithms side by side",
         "",
-        f"{steps:,} environment steps a run, the same 72 channels of history, judged on {len(JUDGED)} validation"
-        " crystals of `randomized` that select nothing: of each run the agent that did best on those that select."
+        f"{steps:,} environment steps of learning a run, the same reward and the same 72 channels of history, judged"
+        f" on {len(JUDGED)} validation crystals of `randomized` that select nothing: of each run the agent that did"
+        " best on those that select."
         " In brackets: 95 % intervals, bootstrap over training seeds and crystals. A lost crystal counts 8 mm."
-        " *At equal activity*: RMSE over what the LQG's frontier has at those pull steps; 1 is as good.",
+        " *At equal activity*: RMSE over what the LQG's frontier has at those pull steps; 1 is as good."
+        " Plant steps count the imitation and the teacher's twin of each crystal too.",
         "",
         "| " + " | ".join(heads) + " |",
         "|---|---" + "|--:" * (len(heads) - 2) + "|",
@@ -74,6 +84,7 @@ def to_markdown(lines: Sequence[Any], curves: Mapping[str, Sequence[Any]], steps
             at_equal_activity(line, lqgs),
             f"{cost.mean:.3f} [{cost.ci95[0]:.3f}, {cost.ci95[1]:.3f}]",
             f"{start.mean.mean:.3f}" if start else "-",
+            f"{1e-6 * plant_steps(line.row.choice, steps):.1f}",
             f"{minutes:.0f}",
         )
         found.append("| " + " | ".join(cells) + " |")

@@ -1,9 +1,10 @@
 """Search the ``ppo`` recipe's hyperparameters: ``python -m agents.search --trials 30``.
 
 Optuna's tree-structured Parzen estimator proposes, beginning with the settings that ship; a trial learns from a kept
-imitation, and one that does worse than most at the same step is given up. What counts is the last agent's cost on
-validation crystals, less that of the imitation it began as. The best few then meet other validation crystals and other
-training seeds beside the settings that ship. Every trial is kept in ``history.csv``; the same command goes on.
+imitation, and one whose actor has learned and does worse than most at the same step is given up. What counts is the
+last agent's cost on validation crystals, less that of the imitation it began as. The best few then meet other
+validation crystals and other training seeds beside the settings that ship. Every trial is kept in ``history.csv``; the
+same command goes on.
 """
 
 from __future__ import annotations
@@ -12,13 +13,14 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from cz_gym.commands import OneLineParser, guarded
 
 PROG = "python -m agents.search"
-STARTUP, WARMUP = 8, 1
-"""Trials that are drawn at random first, and looks before which none is given up."""
+STARTUP, RIVALS = 8, 4
+"""Trials that are drawn at random first, and those that must have come as far before one is given up."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -69,29 +71,29 @@ def search(history: Path, count: int, steps: int, work: Path, seed: int = 0) -> 
     import optuna
 
     from .search_space import KNOBS, Trial, read_history, rounded, settings_of, values_of, write_history
-    from .search_trial import CHOOSE, Given, attempt
+    from .search_trial import CHOOSE, LOOKS, Given, attempt
     from .settings import PPO
 
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     done = read_history(history, steps)
     ranges = {knob.name: _distribution(optuna, knob) for knob in KNOBS}
     sampler = optuna.samplers.TPESampler(seed=seed + len(done), n_startup_trials=STARTUP)
-    study = optuna.create_study(sampler=sampler, pruner=optuna.pruners.MedianPruner(3, WARMUP))
+    study = optuna.create_study(sampler=sampler)
     for trial in done:
         _tell(optuna, study, ranges, trial)
     for number in range(len(done), count):
         asked = study.ask(ranges)
         values = rounded(values_of(PPO()) if number == 0 else [asked.params[knob.name] for knob in KNOBS])
+        choice = settings_of(values, steps)
         course: list[float] = []
 
-        def look(step: int, cost: float, asked: Any = asked, course: list[float] = course) -> None:
+        def look(step: int, cost: float, share: float = choice.critic_steps / steps, course: Any = course) -> None:
             course.append(cost)
-            asked.report(cost, step)
-            if asked.should_prune():
+            if step / LOOKS > share and behind(course, done):
                 raise Given
 
         try:
-            found = attempt(settings_of(values, steps), 0, CHOOSE, work, look)
+            found = attempt(choice, 0, CHOOSE, work, look)
             cost, rmse = (found.last - found.start).mean(axis=0)
             trial = Trial(values, False, float(cost), 1e3 * float(rmse), found.seconds, found.course, steps)
         except Given:
@@ -102,6 +104,12 @@ def search(history: Path, count: int, steps: int, work: Path, seed: int = 0) -> 
         write_history(history, done)
         print(f"trial {number}: cost {trial.cost:+.5f}{', given up' if trial.pruned else ''}", flush=True)
     return done
+
+
+def behind(course: Sequence[float], others: Sequence[Any]) -> bool:
+    """Whether a trial's present cost is above the median of those that came as far; ``course`` is never empty."""
+    reached = [other.course[len(course) - 1] for other in others if len(other.course) >= len(course)]
+    return len(reached) >= RIVALS and course[-1] > median(reached)
 
 
 def _distribution(optuna: Any, knob: Any) -> Any:

@@ -2,11 +2,13 @@
 
 Radius error and pull activity are traded against each other, so controllers are fairly compared at equal activity. The
 LQG's settings of :data:`baselines.lqg_settings.ACTIVITIES` span the trade; between them the logarithm of the radius
-error is a monotone cubic (Fritsch and Carlson's PCHIP) of the logarithm of the activity.
+error is a monotone cubic (Fritsch and Carlson's PCHIP) of the logarithm of the activity. Where ``episodes.csv`` stands
+beside the file, each ratio has a 95 % bootstrap interval over crystals and training seeds.
 """
 
 from __future__ import annotations
 
+import csv
 import json
 import sys
 from collections.abc import Mapping, Sequence
@@ -17,11 +19,16 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from cz_gym.commands import OneLineParser
+from cz_gym.evaluation.statistics import Resamples
 
 from .lqg_settings import ACTIVITIES, family_name
 from .policy import Floats
 
 ACTIVITY = "pull_step_rms_mm_per_min"
+FAMILY = ("lqg", "lqg-quiet", *map(family_name, ACTIVITIES))
+"""Controllers that span the frontier."""
+DRAWS = 2_000
+"""Bootstrap resamples of a ratio."""
 
 
 class Frontier(NamedTuple):
@@ -67,8 +74,7 @@ def frontier(points: Sequence[tuple[float, float]]) -> Frontier:
 
 def frontier_of(scenario: Mapping[str, Any], metric: str = "rmse_mm") -> Frontier:
     """The LQG's frontier in one scenario of a benchmark.json; ValueError if it has too few of its settings."""
-    names = ["lqg", "lqg-quiet", *(family_name(activity) for activity in ACTIVITIES)]
-    found = [scenario[name] for name in names if name in scenario]
+    found = [scenario[name] for name in FAMILY if name in scenario]
     return frontier([(entry[ACTIVITY]["mean"], entry[metric]["mean"]) for entry in found])
 
 
@@ -78,21 +84,70 @@ def at_equal_activity(scenario: Mapping[str, Any], controller: str, metric: str 
     return float(entry[metric]["mean"]) / frontier_of(scenario, metric).at(entry[ACTIVITY]["mean"])
 
 
-def table(results: Mapping[str, Any], metric: str) -> str:
-    """A line for every controller of every scenario that holds a frontier."""
+Episodes = Mapping[str, Mapping[str, Floats]]
+"""By scenario and controller: pull step RMS [mm/min] and radius error [mm], shape (training seeds, crystals, 2)."""
+
+
+def read_episodes(path: Path, metric: str) -> Episodes:
+    """A benchmark's ``episodes.csv``; ValueError where a controller did not meet every crystal with every seed."""
+    found: dict[str, dict[str, dict[str, dict[str, tuple[float, float]]]]] = {}
+    with path.open(newline="") as file:
+        for line in csv.DictReader(file):
+            seeds = found.setdefault(line["scenario"], {}).setdefault(line["controller"], {})
+            seeds.setdefault(line["training_seed"], {})[line["seed"]] = float(line[ACTIVITY]), float(line[metric])
+    return {
+        name: {
+            controller: np.array([[crystals[seed] for seed in sorted(crystals)] for crystals in seeds.values()])
+            for controller, seeds in scenario.items()
+        }
+        for name, scenario in found.items()
+    }
+
+
+def intervals(scenario: Mapping[str, Floats], resamples: Resamples) -> dict[str, tuple[float, float]]:
+    """95 % interval of each controller's ratio at equal activity: crystals, and training seeds, drawn again.
+
+    The frontier is made anew of each draw. Controllers that are quieter than it in some draw are left out.
+    """
+    means = {}
+    for of, (name, values) in enumerate(scenario.items()):
+        seeds = resamples.training_seeds(len(values), of)
+        means[name] = np.einsum("rs,rsm->rm", seeds, np.stack([resamples.episodes @ copy for copy in values], axis=1))
+    settings = [means[name] for name in FAMILY if name in means]
+    ratios: dict[str, list[float]] = {name: [] for name in means}
+    for draw in range(len(resamples.episodes)):
+        curve = frontier([(float(each[draw, 0]), float(each[draw, 1])) for each in settings])
+        for name, each in means.items():
+            if each[draw, 0] >= curve.activity[0]:
+                ratios[name].append(float(each[draw, 1]) / curve.at(float(each[draw, 0])))
+    whole = {name: np.quantile(each, [0.025, 0.975]) for name, each in ratios.items() if len(each) == draw + 1}
+    return {name: (float(low), float(high)) for name, (low, high) in whole.items()}
+
+
+def table(results: Mapping[str, Any], metric: str, episodes: Episodes | None = None) -> str:
+    """A line for every controller of every scenario that holds a frontier; with intervals if there are episodes."""
     lines = []
     for name, scenario in results.items():
+        spread = {}
         try:
             curve = frontier_of(scenario, metric)
         except ValueError as error:
             lines.append(f"{name}: {error}")
             continue
+        if episodes is not None:
+            crystals = episodes[name]
+            for controller, entry in scenario.items():
+                if not np.isclose(crystals[controller][..., 1].mean(), entry[metric]["mean"], rtol=1e-4):
+                    raise ValueError(f"episodes.csv is of another run: {controller} on {name}")
+            spread = intervals(crystals, Resamples.draw(next(iter(crystals.values())).shape[1], DRAWS))
         for controller, entry in scenario.items():
             activity, rmse = entry[ACTIVITY]["mean"], entry[metric]["mean"]
             beyond = activity < curve.activity[0]
             rival = (
-                "quieter than any" if beyond else f"{curve.at(activity):.4f} mm, ratio {rmse / curve.at(activity):.2f}"
+                "quieter than any" if beyond else f"{curve.at(activity):.4f} mm, ratio {rmse / curve.at(activity):.3f}"
             )
+            if controller in spread and not beyond:
+                rival += " [{:.3f}, {:.3f}]".format(*spread[controller])
             lines.append(f"{name}: {controller} {rmse:.4f} mm at {activity:.4f} mm/min; lqg there: {rival}")
     return "\n".join(lines)
 
@@ -104,7 +159,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--metric", choices=("rmse_mm", "rmse_observable_mm"), default="rmse_mm")
     given = parser.parse_args(arguments)
     try:
-        print(table(json.loads(given.benchmark.read_text())["results"], given.metric))
+        beside = given.benchmark.with_name("episodes.csv")
+        episodes = read_episodes(beside, given.metric) if beside.exists() else None
+        print(table(json.loads(given.benchmark.read_text())["results"], given.metric, episodes))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         print(f"frontier: {given.benchmark} is no benchmark.json: {error!r}", file=sys.stderr)
         return 2

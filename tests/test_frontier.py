@@ -14,6 +14,7 @@ from baselines.lqg_goal import Figures
 from baselines.lqg_settings import ACTIVITIES, family_name, frontier_settings
 from baselines.registry import find_controller
 from cz_gym.config import make_config
+from cz_gym.evaluation.statistics import Resamples
 
 RESULTS = Path(__file__).parents[1] / "results" / "tuning"
 PAIRS = st.lists(st.tuples(st.floats(1e-4, 1.0), st.floats(1e-3, 10.0)), min_size=2, max_size=12)
@@ -126,3 +127,46 @@ def test_an_lqg_as_lively_as_ppo_stands_in_the_default_table():
     """And no other of the frontier: they run when named."""
     shown = {name: find_controller(name).default for name in map(family_name, ACTIVITIES)}
     assert [name for name, default in shown.items() if default] == ["lqg-at-0.02"]
+
+
+def drawn(activity, rmse, seeds=1, spread=0.1):
+    random = np.random.default_rng(int(1e6 * activity))
+    return np.array([activity, rmse]) * np.exp(spread * random.normal(size=(seeds, 60, 2)))
+
+
+def test_a_ratios_interval_holds_it_and_shrinks_with_the_spread():
+    family = {
+        name: drawn(a, 0.01 * a**-0.5) for name, a in zip(frontier.FAMILY, np.geomspace(0.003, 0.03, 8), strict=True)
+    }
+    widths = []
+    for spread in (0.2, 0.02):
+        scenario = {**family, "agent": drawn(0.01, 0.12, seeds=3, spread=spread)}
+        found = frontier.intervals(scenario, Resamples.draw(60, 200))
+        means = {name: values.mean(axis=(0, 1)) for name, values in scenario.items()}
+        curve = frontier.frontier([tuple(means[name]) for name in frontier.FAMILY])
+        low, high = found["agent"]
+        assert low < means["agent"][1] / curve.at(means["agent"][0]) < high
+        assert found["lqg-at-0.005"] == pytest.approx((1.0, 1.0))
+        widths.append(high - low)
+    assert widths[1] < widths[0]
+
+
+def test_an_agent_quieter_than_the_family_has_no_interval():
+    family = {
+        name: drawn(a, 0.01 * a**-0.5) for name, a in zip(frontier.FAMILY, np.geomspace(0.003, 0.03, 8), strict=True)
+    }
+    assert "agent" not in frontier.intervals({**family, "agent": drawn(0.001, 0.5)}, Resamples.draw(60, 50))
+
+
+def test_episodes_beside_a_benchmark_give_intervals_unless_they_are_of_another_run(tmp_path, capsys):
+    values = {"lqg": (0.02, 0.05), "lqg-quiet": (0.01, 0.07), "agent": (0.015, 0.06)}
+    lines = ["scenario,controller,training_seed,seed,pull_step_rms_mm_per_min,rmse_mm"]
+    lines += [f"randomized,{name},,{seed},{a},{e}" for name, (a, e) in values.items() for seed in (1, 2)]
+    (tmp_path / "episodes.csv").write_text("\n".join(lines))
+    path = tmp_path / "benchmark.json"
+    path.write_text(json.dumps({"results": {"randomized": {name: entry(*pair) for name, pair in values.items()}}}))
+    assert frontier.main([str(path)]) == 0
+    assert "ratio 1.044 [1.044, 1.044]" in capsys.readouterr().out
+    path.write_text(path.read_text().replace("0.06", "0.0601"))
+    assert frontier.main([str(path)]) == 2
+    assert "episodes.csv is of another run: agent on randomized" in capsys.readouterr().err
