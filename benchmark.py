@@ -53,10 +53,11 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument(
         "--agent",
-        type=Path,
+        type=_agent_file,
         action="append",
-        metavar="FILE",
-        help="agent file in place of the shipped one; repeat it for the training seeds of one algorithm",
+        metavar="[NAME=]FILE",
+        help="agent file, by default in place of the shipped ones; those of one NAME (default: the algorithm's) are "
+        "training seeds of one agent",
     )
     parser.add_argument(
         "--slow", action="store_true", help="slow controllers too, on the first 50 episodes; resumed from results/cache"
@@ -71,6 +72,12 @@ def _names(text: str) -> list[str]:
     if not all(names):
         raise argparse.ArgumentTypeError(f"must be names with commas between, not {text!r}")
     return names
+
+
+def _agent_file(text: str) -> tuple[str, Path]:
+    """The name an agent is called by, "" for its algorithm's, and its file."""
+    name, equals, file = text.partition("=")
+    return (name, Path(file)) if equals and name and "/" not in name else ("", Path(text))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -175,29 +182,30 @@ def is_partial(arguments: argparse.Namespace, plan: Plan) -> bool:
 
 
 def choose(
-    wanted: list[str] | None, files: list[Path], slow: Container[str] = ()
+    wanted: list[str] | None, files: Sequence[tuple[str, Path]], slow: Container[str] = ()
 ) -> tuple[tuple[Contender, ...], tuple[dict[str, Any], ...]]:
     """Who takes part, classical controllers first, and the contracts of the agents among them.
 
-    Agent files named on the command line always take part, in place of the shipped ones; slow controllers only if
-    ``slow`` names them. Raises ValueError for a name that nobody has, and for agent files that cannot be used.
+    Agent files, each with a name or "" for its algorithm's, always take part; shipped agents beside them only if they
+    are wanted by name, and slow controllers only if ``slow`` names them. Raises ValueError for a name that nobody has,
+    and for agent files that cannot be used.
     """
-    from agents import OnnxPolicy, shipped, shipped_seeds
+    from agents import OnnxPolicy
     from baselines.registry import CONTROLLERS
     from cz_gym.evaluation.protocol import SLOW_EPISODES
 
-    given = [OnnxPolicy.load(file, _nominal()) for file in files]
-    learned = list(dict.fromkeys(policy.contract.algorithm for policy in given)) or list(SHIPPED)
+    given: dict[str, list[Any]] = {}
+    for called, file in files:
+        policy = OnnxPolicy.load(file, _nominal())
+        given.setdefault(called or policy.contract.algorithm, []).append(policy)
     classical = [entry.name for entry in CONTROLLERS]
-    for name in learned:
+    for name in given:
         if name in classical:
-            raise ValueError(f"the algorithm of an agent may not be called {name!r}: a controller has that name")
-    if wanted is None:
-        wanted = [
-            entry.name for entry in CONTROLLERS if (entry.name in slow if entry.slow else entry.default)
-        ] + learned
-    elif wanted == ["all"]:
-        wanted = [entry.name for entry in CONTROLLERS if not entry.slow or entry.name in slow] + learned
+            raise ValueError(f"an agent may not be called {name!r}: a controller has that name; name it NAME=FILE")
+    learned = [*given, *(name for name in SHIPPED if name not in given)]
+    if wanted is None or wanted == ["all"]:
+        some = [entry for entry in CONTROLLERS if entry.name in slow or not entry.slow]
+        wanted = [entry.name for entry in some if wanted or entry.slow or entry.default] + list(given or SHIPPED)
     for name in wanted:
         if name not in classical + learned:
             raise ValueError(f"unknown controller {name!r}; choose from {', '.join(classical + learned)}, or all")
@@ -208,16 +216,17 @@ def choose(
     contenders = [_classical(entry) for entry in taking_part]
     contracts = []
     for name in learned:
-        if given:
-            policies = [policy for policy in given if policy.contract.algorithm == name]
-        elif name in wanted:
-            files = [shipped()] if name == DEFAULT else shipped_seeds(name)
-            policies = [OnnxPolicy.load(file, _nominal()) for file in files]
-        else:
-            continue
-        contenders.append(_agent(name, policies))
-        contracts += [_recorded(policy.contract) for policy in policies]
+        if name in given or name in wanted:
+            policies = given.get(name) or _shipped(name)
+            contenders.append(_agent(name, policies, name in given))
+            contracts += [_recorded(policy.contract) for policy in policies]
     return tuple(contenders), tuple(contracts)
+
+
+def _shipped(name: str) -> list[Any]:
+    from agents import OnnxPolicy, shipped, shipped_seeds
+
+    return [OnnxPolicy.load(file, _nominal()) for file in ([shipped()] if name == DEFAULT else shipped_seeds(name))]
 
 
 def _recorded(contract: Contract) -> dict[str, Any]:
@@ -243,7 +252,7 @@ def _classical(entry: Entry) -> Contender:
     return Contender(controller, lambda config: [entry.make(config)])
 
 
-def _agent(name: str, policies: Sequence[Any]) -> Contender:
+def _agent(name: str, policies: Sequence[Any], given: bool) -> Contender:
     """A learned controller: every training seed of one algorithm. Raises ValueError if they are no such set."""
     from agents.resampled import at_interval
     from cz_gym.evaluation.results import Controller
@@ -255,6 +264,9 @@ def _agent(name: str, policies: Sequence[Any]) -> Contender:
         raise ValueError(f"agent {name!r}: a training seed appears twice among {', '.join(map(str, seeds))}")
     if len({contract.observation for contract in contracts}) > 1:
         raise ValueError(f"agent {name!r}: its training seeds read different observations")
+    if len({contract.scenario_hash for contract in contracts}) > 1:
+        trained = ", ".join(sorted({contract.scenario for contract in contracts}))
+        raise ValueError(f"agent {name!r}: its training seeds were trained on different scenarios: {trained}")
     interval = _nominal().control_interval
     for contract in contracts:
         if contract.control_interval != interval:
@@ -264,6 +276,8 @@ def _agent(name: str, policies: Sequence[Any]) -> Contender:
     meaning = f"agent trained with {contracts[0].algorithm} on {contracts[0].scenario}"
     if name == DEFAULT:
         meaning += ", the seed that did best on validation"
+    if given:
+        meaning += ", given as a file"
 
     def make(config: Config) -> list[Any]:
         return [at_interval(policy, config.control_interval) for policy in policies]

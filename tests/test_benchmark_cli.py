@@ -213,6 +213,25 @@ def test_broken_agent_files_get_one_line(tmp_path: Path, capsys: pytest.CaptureF
     assert "appears twice" in refused(["--agent", twice, "--agent", twice], capsys)
     called = constant_agent(tmp_path / "called.onnx", algorithm="paper")
     assert "may not be called 'paper'" in refused(["--agent", str(called)], capsys)
+    other = constant_agent(tmp_path / "other.onnx", training_seed=1, scenario="hard", scenario_hash="0" * 16)
+    assert "different scenarios: hard, randomized" in refused(["--agent", twice, "--agent", str(other)], capsys)
+    assert "choose from" in (said := refused(["--agent", f"mine={twice}", "--controllers", "your"], capsys))
+    assert "mine, ppo, ppo-default" in said
+
+
+def test_a_file_may_be_named_and_stand_beside_the_shipped_agents(tmp_path: Path) -> None:
+    file = constant_agent(tmp_path / "some.onnx", algorithm="ppo")
+    names = ["paper", "mine", "ppo-quiet"]
+    contenders, contracts = benchmark.choose(names, [("mine", file)])
+    assert [each.controller.name for each in contenders] == names
+    assert contenders[1].controller.meaning.endswith("given as a file")
+    assert [contract["algorithm"] for contract in contracts] == ["ppo", *["ppo-quiet"] * 3]
+    alone, _ = benchmark.choose(["paper"], [("", file)])
+    assert [each.controller.name for each in alone] == ["paper", "ppo"]
+    assert benchmark.parse(["--agent", "a=b=c.onnx", "--agent", "x/a=b.onnx"]).agent == [
+        ("a", Path("b=c.onnx")),
+        ("", Path("x/a=b.onnx")),
+    ]
 
 
 @pytest.mark.usefixtures("no_work")

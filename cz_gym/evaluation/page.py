@@ -19,8 +19,8 @@ from .canvas import styles
 from .metrics import TOLERANCE
 from .page_signals import CURVES, SHARED, episodes
 from .page_tables import DISTRIBUTIONS, columns, distributions, rows
-from .report import headline
 from .results import REFERENCE, Benchmark, Controller, ScenarioResult
+from .verdict import headline
 
 SCRIPTS = ("data.js", "look.js", "table.js", "pictures.js", "viewer.js", "main.js")
 """The page's own code, in the order of use."""

@@ -9,8 +9,9 @@ import numpy as np
 
 from ..units import HOUR, PERCENT
 from .metrics import metric_names
-from .results import BOUND, REFERENCE, SPEED, Benchmark, Outcome, ScenarioResult, Verdict, common
+from .results import BOUND, REFERENCE, SPEED, Benchmark, Outcome, ScenarioResult, common
 from .statistics import Estimate
+from .verdict import headline
 
 NOTHING = "-"
 BEGIN, END = "<!-- benchmark:begin -->", "<!-- benchmark:end -->"
@@ -50,40 +51,6 @@ GAPS = (
     Column("optimality_gap", f"optimality gap in cost [% of {REFERENCE}'s]", 3, PERCENT),
     Column("optimality_gap_radius", f"in squared radius error [% of {REFERENCE}'s]", 1, PERCENT),
 )
-
-
-def headline(benchmark: Benchmark) -> str:
-    """One plain line: whether the agents win, and where they don't."""
-    agents = [controller.name for controller in benchmark.controllers if controller.learned]
-    if not agents:
-        return "No learned agent took part in this run."
-    if not benchmark.scenarios[0].verdicts:
-        return "No classical controller took part in this run, so there is nobody to win against."
-    return " ".join(_agent_line(benchmark, agent) for agent in agents)
-
-
-def _agent_line(benchmark: Benchmark, agent: str) -> str:
-    verdicts = [
-        (scenario.row.name, verdict)
-        for scenario in benchmark.scenarios
-        for verdict in scenario.verdicts
-        if verdict.agent == agent
-    ]
-    won = [name for name, verdict in verdicts if verdict.wins]
-    rest = [f"{name} ({_not_won(verdict)})" for name, verdict in verdicts if not verdict.wins]
-    if not rest:
-        return f"The agent {agent} wins: lowest mean RMSE on {_all_of(len(won), 'scenario')} of this run."
-    if not won:
-        return f"The agent {agent} does not win: {', '.join(rest)}."
-    return f"The agent {agent} does not win everywhere: not on {', '.join(rest)}; it wins on {', '.join(won)}."
-
-
-def _not_won(verdict: Verdict) -> str:
-    return f"{verdict.rival} is better" if verdict.loses else f"no clear difference from {verdict.rival}"
-
-
-def _all_of(count: int, what: str) -> str:
-    return f"the only {what}" if count == 1 else f"all {count} {what}s"
 
 
 def summary(benchmark: Benchmark) -> str:

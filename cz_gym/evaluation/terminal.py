@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from ..units import PERCENT
-from .report import NOTHING, Column, headline, interval, label
+from .report import NOTHING, Column, interval, label
 from .results import REFERENCE, SPEED, Benchmark, Outcome
+from .verdict import headline
 
 SHOWN = (
     Column("rmse_mm", "RMSE/mm", 3),
