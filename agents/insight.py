@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,6 +30,7 @@ from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 from . import shipped
 from .contract import read_agent
+from .insight_report import BANDS
 from .linear import SEEN, Floats, linear_agent
 from .loop import Responses, after_one, response
 from .onnx_policy import OnnxPolicy
@@ -166,6 +168,20 @@ def noise_gains(contender: Contender, dt: float) -> dict[str, float]:
     }
 
 
+def apart(contender: Contender, other: Contender, dt: float) -> dict[str, list[float]]:
+    """Largest relative deviation of one's local gains from the ring from another's, by drive, in each band.
+
+    The pyrometer is held, and each knows what it asked of its own drives.
+    """
+    found: dict[str, list[float]] = {"pull speed": [], "heater": []}
+    for low, high in pairwise(BANDS):
+        omega = np.geomspace(low, high, 200)
+        mine, its = (joined(each, omega, MIX, dt).drives() for each in (contender, other))
+        for drive, deviation in zip(found, np.abs(mine / its - 1.0).max(axis=0), strict=True):
+            found[drive].append(float(deviation))
+    return found
+
+
 def puller_parts(contender: Contender, episodes: int) -> dict[str, dict[str, float]]:
     """Observable RMSE and share of lost crystals when randomized gets one property of puller, on validation."""
     found = {}
@@ -228,7 +244,11 @@ def study(agent: Path | None, episodes: int, only_pictures: bool, tell: Callable
         parts[each.name] = puller_parts(each, episodes)
     rows = [row for each in taking_part for row in margins(each, omega, dt)]
     gains = {each.name: noise_gains(each, dt) for each in taking_part}
-    found = Found(read_agent(agent or shipped())[0], answers, rows, gains, limits, parts, episodes, jumps)
+    beside = next(each for each in taking_part if each.name == BESIDE[0])
+    differing = {each.name: apart(each, beside, dt) for each in taking_part if each is not beside}
+    found = Found(
+        read_agent(agent or shipped())[0], answers, rows, gains, limits, parts, episodes, beside.name, differing, jumps
+    )
     return {**files, "insight.json": as_json(found).encode(), "insight.md": as_markdown(found).encode()}
 
 

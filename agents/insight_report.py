@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from cz_gym.evaluation.rollout import Signals
 from cz_gym.units import KILO, MM, MM_PER_MIN
 
 from .contract import Contract
-from .trials import JUMPS, LIMITS, TRIALS, Survival
+from .trials import DRAWS, JUMPS, LIMITS, TRIALS, Survival
 
 
 class Found(NamedTuple):
@@ -28,8 +29,16 @@ class Found(NamedTuple):
     parts: Mapping[str, Mapping[str, Mapping[str, float]]]
     episodes: int
     """Validation episodes of ``parts``."""
+    apart_from: str
+    """The controller that local gains are compared with."""
+    apart: Mapping[str, Mapping[str, Sequence[float]]]
+    """By controller and drive: largest |gain / its - 1| from the ring, in each of :data:`BANDS`."""
     jumps: Mapping[str, tuple[Any, Any]]
     """Pull speed moved over the jump of the radius [1/s], without noise and under it."""
+
+
+BANDS = (1e-4, 1e-3, 1e-2, 0.1, 0.3)
+"""Edges of the bands of frequency [rad/s] in which local gains are compared."""
 
 
 def answer_figures(signals: Signals) -> dict[str, float]:
@@ -60,6 +69,7 @@ def as_json(found: Found) -> str:
         },
         "margins": rows,
         "noise_gain": found.noise,
+        "apart": {"from": found.apart_from, "bands_rad_per_s": BANDS, **found.apart},
         "jumps": {
             "mm": [float(size / MM) for size in JUMPS],
             "mm_per_min_per_mm": {
@@ -102,7 +112,11 @@ def as_markdown(found: Found) -> str:
         "",
         *_noise(found),
         "",
-        "## Largest event survived",
+        f"## Local gain: largest deviation from {found.apart_from}'s",
+        "",
+        *_apart(found),
+        "",
+        f"## Largest event survived, median and range over {DRAWS} draws of noise",
         "",
         *_limits(found),
         "",
@@ -153,11 +167,22 @@ def _noise(found: Found) -> list[str]:
     return _table(heads, ([name, *(f"{value:.3g}" for value in gains.values())] for name, gains in found.noise.items()))
 
 
+def _apart(found: Found) -> list[str]:
+    heads = ("controller", "drive", *(f"{low:g} to {high:g} rad/s" for low, high in pairwise(BANDS)))
+    rows = []
+    for name, by_drive in found.apart.items():
+        for drive, values in by_drive.items():
+            rows.append([name, drive, *(f"{100.0 * value:.0f} %" for value in values)])
+    return _table(heads, rows)
+
+
 def _limits(found: Found) -> list[str]:
     rows = []
     for limit in LIMITS:
         survived = (by_name[limit.name] for by_name in found.limits.values())
-        cells = (f"{'over ' if one.capped else ''}{one.largest:.3g}" for one in survived)
+        cells = (
+            f"{one.largest:.3g} ({one.least:.3g} to {'over ' if one.capped else ''}{one.most:.3g})" for one in survived
+        )
         rows.append([f"{limit.name} ({limit.meaning}) [{limit.unit}]", *cells])
     return _table(("event", *found.limits), rows)
 

@@ -28,6 +28,8 @@ AT_ONCE = 16
 """Amplitudes tried in one batch."""
 JUMPS = np.array([1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 300.0]) * MICRO
 """Jumps of the radius whose answers are compared [m]."""
+DRAWS = 5
+"""Draws of noise that each is tried under."""
 NOISES = 32
 """Crystals that an answer under noise is averaged over."""
 PROPERTIES: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -185,25 +187,32 @@ def respond(policy: Any, config: Config, trial: Trial) -> Signals:
 
 
 class Survival(NamedTuple):
-    """How much of an event a controller survives."""
+    """How much of an event a controller survives: amplitudes below which every one tried was survived, limit's unit."""
 
     largest: float
-    """Largest amplitude below which every one tried was survived, in the limit's unit."""
+    """Median over the draws of noise."""
+    least: float
+    most: float
+    """The smallest and the largest of them."""
     capped: bool
-    """Whether all that were tried were survived."""
+    """Whether ``most`` is all that was tried."""
 
 
 def survive(policy: Any, limit: Limit, observation: str) -> Survival:
-    """The largest amplitude survived over three hours, in two rounds of :data:`AT_ONCE` amplitudes."""
+    """The largest amplitude survived over three hours, in two rounds of :data:`AT_ONCE` amplitudes a draw of noise."""
     config = crystal(3.0 * HOUR / MINUTE, observation)
-    low, high = 0.0, limit.most
+    low, high = np.zeros(DRAWS), np.full(DRAWS, limit.most)
+    whole = np.zeros(DRAWS, np.bool_)
+    seeds = np.repeat(VALIDATION_SEEDS[:DRAWS], AT_ONCE).tolist()
     for _ in range(2):
-        tried = np.linspace(low, high, AT_ONCE + 1)[1:]
-        lost = np.flatnonzero(run_events(policy, config, limit.events, tried.tolist()).failed)
-        if not len(lost):
-            return Survival(limit.most / limit.scale, True)
-        low, high = (low, *tried)[lost[0]], tried[lost[0]]
-    return Survival(float(low) / limit.scale, False)
+        tried = np.linspace(low, high, AT_ONCE + 1, axis=1)[:, 1:]
+        lost = run_events(policy, config, limit.events, tried.ravel().tolist(), seeds).failed.reshape(tried.shape)
+        first = np.where(lost.any(axis=1), lost.argmax(axis=1), AT_ONCE)
+        steps, draws = np.column_stack([low, tried]), np.arange(DRAWS)
+        whole |= (first == AT_ONCE) & (high == limit.most)
+        low, high = steps[draws, first], steps[draws, np.minimum(first + 1, AT_ONCE)]
+    found = low / limit.scale
+    return Survival(float(np.median(found)), float(found.min()), float(found.max()), bool(whole.any()))
 
 
 def jump_gains(policy: Any, observation: str, noisy: bool) -> Floats:

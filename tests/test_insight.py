@@ -158,10 +158,10 @@ def test_survival_is_found_where_it_lies() -> None:
 
     lost = Limit("lost", "jump beyond the limit at once", "mm", MM, 16.0 * MM, LIMITS[0].events[1:])
     found = survive(Still(), lost, "measured")
-    assert 7.0 < found.largest <= 8.0
+    assert 7.0 < found.least <= found.largest <= found.most <= 8.0
     assert not found.capped
     never = Limit("never", "nothing", "mm", MM, 4.0 * MM, ())
-    assert survive(CompensatedPID(), never, "measured") == Survival(4.0, True)
+    assert survive(CompensatedPID(), never, "measured") == Survival(4.0, 4.0, 4.0, True)
 
 
 def test_the_real_puller_is_taken_apart_property_by_property() -> None:
@@ -206,7 +206,7 @@ def test_pictures_and_tables_say_what_was_found(near: Any) -> None:
     ):
         assert picture.startswith(b"\x89PNG")
     row = insight.Margins("one", "Model I", "v_p", True, *margins_of(responses["one"].opened("v_p"), omega, DT, True))
-    limits = {"one": {limit.name: Survival(1.5, False) for limit in LIMITS}}
+    limits = {"one": {limit.name: Survival(1.5, 1.25, 2.0, True) for limit in LIMITS}}
     parts = {"one": {"latency": {"rmse_observable_mm": 0.1, "failure_rate": 0.25}}}
     gains = {"one": {"pull": 1.0, "step": 2.0, "heater": 3.0}}
     found = Found(
@@ -217,10 +217,22 @@ def test_pictures_and_tables_say_what_was_found(near: Any) -> None:
         limits,
         parts,
         4,
+        "two",
+        {"one": {"pull speed": (0.0, 0.01, 0.5, 2.0)}},
         {"one": (np.ones(len(JUMPS)), np.ones(len(JUMPS)))},
     )
     assert json.loads(as_json(found))["margins"][0]["controller"] == "one"
     assert "| latency | 0.100 mm, 25 % lost |" in as_markdown(found)
+    assert "| one | pull speed | 0 % | 1 % | 50 % | 200 % |" in as_markdown(found)
+    assert "| 1.5 (1.25 to over 2) |" in as_markdown(found)
+
+
+def test_gains_are_apart_from_others_and_not_from_themselves(near: Any) -> None:
+    mine = insight.Contender("one", "history", lambda _: None, near.state_space(), near.response)
+    twice = mine._replace(answer=lambda omega: near.response(omega) * np.array([2.0, 1.0, 1.0, 1.0]))
+    for other, deviation in ((mine, 0.0), (twice, 1.0)):
+        for values in insight.apart(other, mine, DT).values():
+            assert values == pytest.approx([deviation] * 4, abs=1e-12)
 
 
 @pytest.mark.parametrize("arguments", [["--episodes", "0"], ["--agent", "no-such.onnx"]])
