@@ -23,7 +23,7 @@ OPSET, IR_VERSION = 17, 9
 class Actor:
     """An actor as arrays: action = clip(skip * drives + scale * squash(layers(x) + direct(x))).
 
-    x is the normalised observation, (observation - mean) @ scaling within +-10.
+    x is the normalised observation, (observation - mean) @ scaling within +-30.
     """
 
     mean: Floats
