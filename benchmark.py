@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cz_gym.commands import OneLineParser, interrupted
+from cz_gym.commands import OneLineParser, guarded
 
 if TYPE_CHECKING:
     from agents.contract import Contract
@@ -85,17 +85,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parse(argv)
     if arguments.out is None and arguments.json is None:
         arguments.out = FOLDER
-    try:
-        return benchmark(arguments, shlex.join(["benchmark.py", *(sys.argv[1:] if argv is None else argv)]))
-    except ImportError as error:
-        missing = f'{error.name} is missing: pip install "cz-gym[benchmark]"' if error.name else error
-        print(f"benchmark.py: {missing}", file=sys.stderr)
-        return 2
-    except (ValueError, OSError) as error:
-        print(f"benchmark.py: {_one_line(error)}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return interrupted("benchmark.py")
+    command = shlex.join(["benchmark.py", *(sys.argv[1:] if argv is None else argv)])
+    return guarded("benchmark.py", lambda: benchmark(arguments, command), "benchmark")
 
 
 def benchmark(arguments: argparse.Namespace, command: str) -> int:
@@ -289,12 +280,6 @@ def _nominal() -> Config:
     from cz_gym.evaluation.protocol import ROWS
 
     return ROWS[0].config()
-
-
-def _one_line(error: Exception) -> str:
-    if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename or 'output'}: {error.strerror}"
-    return " ".join(str(error).split())
 
 
 if __name__ == "__main__":

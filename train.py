@@ -8,7 +8,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from cz_gym.commands import OneLineParser
+from cz_gym.commands import OneLineParser, guarded
 
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
@@ -45,17 +45,8 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
 def main(argv: list[str] | None = None) -> int:
     """Train; 0 when done, 2 for bad input, 130 when interrupted."""
     arguments = parse(argv)
-    try:
-        return train(arguments)
-    except KeyboardInterrupt:
-        print(f"train.py: interrupted; if {arguments.out} holds a checkpoint, --resume goes on", file=sys.stderr)
-        return 130
-    except (ValueError, OSError) as error:
-        print(f"train.py: {_one_line(error)}", file=sys.stderr)
-        return 2
-    except ImportError as error:
-        print(f'train.py: {error.name} is missing: pip install "cz-gym[agents]"', file=sys.stderr)
-        return 2
+    left = f"if {arguments.out} holds a checkpoint, --resume goes on"
+    return guarded("train.py", lambda: train(arguments), "agents", left)
 
 
 def train(arguments: argparse.Namespace) -> int:
@@ -65,9 +56,6 @@ def train(arguments: argparse.Namespace) -> int:
     from agents import settings
     from agents.run import Run
     from agents.run_files import saved_steps
-    from baselines import CompensatedPID
-    from baselines.registry import find_controller
-    from cz_gym.config import make_config
     from cz_gym.evaluation.whole import alone, check_writable
     from cz_gym.scenarios import find_scenario
 
@@ -79,12 +67,9 @@ def train(arguments: argparse.Namespace) -> int:
     choice = replace(choice, recipe=replace(choice.recipe, scenario=scenario))
     steps = arguments.steps or (saved_steps(folder) if arguments.resume else choice.steps)
     choice = replace(choice, steps=steps)
-    paper = CompensatedPID(choice.recipe.control_interval)
-    clone = choice.recipe.clone
-    teacher = find_controller(clone.teacher).make(make_config(scenario)) if clone else None
     check_writable(folder)
     with alone(folder):
-        run = Run(folder, choice, arguments.seed, paper, arguments.resume, arguments.checkpoint_seconds, teacher)
+        run = Run(folder, choice, arguments.seed, arguments.resume, arguments.checkpoint_seconds)
         print(f"{arguments.algo}, seed {arguments.seed}, {choice.steps:,} steps on {scenario!r}, into {folder}")
         with tqdm(total=choice.steps, unit="step", unit_scale=True, dynamic_ncols=True, mininterval=1.0) as bar:
             try:
@@ -125,12 +110,6 @@ def _seconds(text: str) -> float:
     if not 0.0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f"must be a number of at least 0, not {text!r}")
     return value
-
-
-def _one_line(error: Exception) -> str:
-    if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename or 'output'}: {error.strerror}"
-    return " ".join(str(error).split())
 
 
 if __name__ == "__main__":

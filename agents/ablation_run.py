@@ -18,7 +18,6 @@ from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.evaluation.whole import alone, write_files
-from cz_gym.rooms import room
 
 from .ablation_rows import Row
 from .contract import AgentFileError, read_json
@@ -114,17 +113,13 @@ def judge(policy: Any, weights: CostWeights) -> Floats:
 
 def _open(folder: Path, choice: Choice, seed: int, imitations: Path) -> Run:
     """The run in this folder; one that cannot go on begins again."""
-    registry, recipe = room("baselines.registry"), choice.recipe
-    config = make_config(recipe.scenario, control_interval=recipe.control_interval)
-    paper = registry.find_controller("paper").make(config)
-    teacher = registry.find_controller(recipe.clone.teacher).make(config) if recipe.clone else None
     if (folder / "settings.json").exists():
         try:
-            return Run(folder, choice, seed, paper, True, teacher=teacher, imitations=imitations)
+            return Run(folder, choice, seed, True, imitations=imitations)
         except AgentFileError:
             for path in folder.iterdir():
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
-    return Run(folder, choice, seed, paper, False, teacher=teacher, imitations=imitations)
+    return Run(folder, choice, seed, imitations=imitations)
 
 
 def _to_json(plan: Plan, row: Row, seed: int, run: Run, stages: Mapping[str, Floats]) -> bytes:

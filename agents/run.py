@@ -14,6 +14,7 @@ from stable_baselines3.common.logger import Logger
 import cz_gym
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation.whole import finish_writing, write_files
+from cz_gym.rooms import room
 
 from . import settings
 from .callbacks import AtStart, Every, Tell
@@ -42,11 +43,10 @@ MAX_SESSIONS = 100
 class Run:
     """One training run.
 
-    ``rival``, a policy on "measured" observations, runs the same validation episodes and is shown beside the agent;
-    ``teacher`` is the controller that the settings clone; ``imitations`` a folder where imitations are kept for others;
-    ``resume`` goes on from the folder's checkpoint, saved anew every ``checkpoint_seconds``. Checkpoint, progress and
-    best agent are replaced together, so that they agree whenever a run is killed. Raises AgentFileError if the folder
-    cannot be used.
+    The paper's controller runs the same validation episodes and is shown beside the agent. ``imitations`` is a folder
+    where imitations are kept for others; ``resume`` goes on from the folder's checkpoint, saved anew every
+    ``checkpoint_seconds``. Checkpoint, progress and best agent are replaced together, so that they agree whenever a run
+    is killed. Raises AgentFileError if the folder cannot be used.
     """
 
     def __init__(
@@ -54,20 +54,21 @@ class Run:
         folder: Path,
         choice: settings.Choice,
         seed: int,
-        rival: Any,
         resume: bool = False,
         checkpoint_seconds: float = CHECKPOINT_SECONDS,
-        teacher: Any = None,
         imitations: Path | None = None,
     ) -> None:
-        self.folder, self.choice, self.seed, self.rival = folder, choice, seed, rival
-        self.teacher, self.imitations = teacher, imitations
+        self.folder, self.choice, self.seed, self.imitations = folder, choice, seed, imitations
         self.checkpoint_seconds = checkpoint_seconds
         self.validate_every = max(choice.steps // 24, VALIDATE_EVERY)
         recipe = choice.recipe
         self.config = make_config(
             recipe.scenario, observation=recipe.observation, control_interval=recipe.control_interval
         )
+        measured = make_config(recipe.scenario, control_interval=recipe.control_interval)
+        find_controller = room("baselines.registry").find_controller
+        self.rival = find_controller("paper").make(measured)
+        self.teacher = find_controller(recipe.clone.teacher).make(measured) if recipe.clone else None
         self.rival_rmse_mm = self._validate_rival(QUICK)
         self.best = math.inf
         self.rows: list[dict[str, Any]] = []
@@ -75,7 +76,7 @@ class Run:
         self.began = time.monotonic()
         self.unsaved: dict[Path, bytes] = {}
         if not resume:
-            self.training: Training = make_training(choice, seed, str(folder / "tensorboard"), 0, teacher)
+            self.training: Training = make_training(choice, seed, str(folder / "tensorboard"), 0, self.teacher)
             self.save()
             self._write_settings(0)
             return
@@ -87,7 +88,7 @@ class Run:
         self.rows = read_rows(folder / "progress.csv")
         if progress.best_cost is not None and _usable(folder / "agent.onnx", self.config):
             self.best = progress.best_cost
-        self.training = make_training(choice, seed, str(folder / "tensorboard"), progress.steps, teacher)
+        self.training = make_training(choice, seed, str(folder / "tensorboard"), progress.steps, self.teacher)
         restore(self.training.learner, progress, tensors, folder / CHECKPOINT)
         self._write_settings(progress.steps)
 

@@ -15,7 +15,6 @@ from cz_gym.config import Config, make_config
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.rooms import room
 
 from .run import QUICK, Run
 from .settings import PPO, CostWeights
@@ -72,11 +71,8 @@ def attempt(
     """Train those settings and judge what came out; ``tell(look, cost)`` may raise :class:`Given`."""
     began, folder = time.monotonic(), work / "trial"
     shutil.rmtree(folder, ignore_errors=True)
-    registry, recipe = room("baselines.registry"), choice.recipe
-    config = make_config(recipe.scenario, control_interval=recipe.control_interval)
-    paper = registry.find_controller("paper").make(config)
-    teacher = registry.find_controller(recipe.clone.teacher).make(config) if recipe.clone else None
-    run = _TrialRun(folder, choice, seed, paper, teacher=teacher, imitations=work / "imitations")
+    recipe = choice.recipe
+    run = _TrialRun(folder, choice, seed, imitations=work / "imitations")
     run.validate_every = max(choice.steps // LOOKS, 1)
     run.tell = tell  # type: ignore[method-assign]
     try:

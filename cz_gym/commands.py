@@ -31,7 +31,9 @@ def guarded(prog: str, body: Callable[[], int], extra: str, left: str = "nothing
         return body()
     except ImportError as error:
         said = f'{error.name} is missing: pip install "cz-gym[{extra}]"' if error.name else str(error)
-    except (ValueError, OSError) as error:
+    except OSError as error:
+        said = f"{error.filename or 'output'}: {error.strerror}" if error.strerror else str(error)
+    except ValueError as error:
         said = str(error)
     except KeyboardInterrupt:
         return interrupted(prog, left)

@@ -149,7 +149,7 @@ def _stopped() -> int:
         (lambda: 0, 0, ""),
         (_missing, 2, 'prog: absent is missing: pip install "cz-gym[agents]"\n'),
         (_wrong, 2, "prog: first line second line\n"),
-        (_gone, 2, "prog: [Errno 2] No such file or directory: 'there.csv'\n"),
+        (_gone, 2, "prog: there.csv: No such file or directory\n"),
         (_stopped, 130, "prog: interrupted; runs are kept\n"),
     ],
 )
