@@ -140,7 +140,7 @@ def test_a_teacher_that_loses_its_crystal_is_no_longer_compared_with() -> None:
 
 
 def test_the_critic_learns_first() -> None:
-    training = make_training(replace(TINY, critic_steps=512), 0, None, 0, lqg(make_config("randomized")))
+    training = make_training(replace(TINY, critic_steps=512, steps=1024), 0, None, 0, lqg(make_config("randomized")))
     policy = training.learner.policy
     actor, critic = policy.mlp_extractor.direct.weight, policy.value_net.weight
     before = actor.detach().clone(), critic.detach().clone()
