@@ -25,6 +25,8 @@ Floats = npt.NDArray[np.float64]
 MILLI = 1e-3
 MICRON = 1e-3
 """A micrometre in millimetres."""
+FEW = 0.01
+"""Share of lost crystals up to which radius errors are compared at equal activity: lost ones would be most of it."""
 SHOWN = "best"
 """The agent that the table's first columns show: a recipe keeps the one that did best on validation."""
 
@@ -168,9 +170,10 @@ def _table(lines: Sequence[Line], lqgs: Rivals) -> list[str]:
 
 
 def at_equal_activity(line: Line, lqgs: Rivals) -> str:
-    """RMSE of a row's kept agents over the LQG's where it is as active, "-" where none is."""
-    rmse, activity = (line.cells[SHOWN, name].mean.mean for name in ("rmse_mm", "pull_step_rms_mm_per_min"))
-    ratio = lqgs.ratio(rmse, activity)
+    """RMSE of a row's kept agents over the LQG's where it is as active, "-" where none is or crystals are lost."""
+    figures = "rmse_mm", "pull_step_rms_mm_per_min", "failure_rate"
+    rmse, activity, lost = (line.cells[SHOWN, name].mean.mean for name in figures)
+    ratio = lqgs.ratio(rmse, activity) if lost <= FEW else None
     return "-" if ratio is None else f"{ratio:.2f}"
 
 

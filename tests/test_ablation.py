@@ -287,3 +287,11 @@ def test_the_lqgs_are_judged_once_and_stand_at_one(tmp_path: Path, monkeypatch: 
     (tmp_path / rivals.KEPT).write_text('{"of": 1}')
     assert rivals.rivals(plan) == found
     assert len(rivals.rivals_table(found)) == 2 + 8
+
+
+@pytest.mark.parametrize(("lost", "said"), [(0.0, "1.00"), (0.02, "-")])
+def test_where_crystals_are_lost_nothing_is_compared_at_equal_activity(lost: float, said: str) -> None:
+    values = np.tile([1.0 if name == "rmse_mm" else 0.01 for name in FIGURES], (50, 1))
+    values[:, FIGURES.index("failure_rate")] = np.arange(50) < lost * 50
+    (line,) = ablation_table.tabulate(find_rows([BASE]), {BASE: [Finished(BASE, 0, {}, {"best": values})]})
+    assert ablation_table.at_equal_activity(line, LQGS) == said
