@@ -28,8 +28,7 @@ class Row:
 
     def of(self, steps: int) -> Choice:
         """Its settings when rows are trained for that many environment steps."""
-        name = self.choice.name if self.choice.name == self.name else f"{self.choice.name}-{self.name}"
-        return replace(self.choice, name=name, steps=round(self.share * steps))
+        return replace(self.choice, steps=round(self.share * steps))
 
 
 _PPO = PPO()
@@ -71,9 +70,9 @@ def _shown(name: str, width: float, meaning: str) -> Row:
     return Row(f"shown-{name}", "beginning", meaning, _recipe(changed))
 
 
-_FROM_NOTHING = replace(SCRATCH, name=_PPO.name, recipe=replace(SCRATCH.recipe, weights=_RECIPE.weights))
+_FROM_NOTHING = replace(SCRATCH, recipe=replace(SCRATCH.recipe, weights=_RECIPE.weights))
 
-ROWS: tuple[Row, ...] = (
+_ROWS = (
     Row(BASE, BASE, f"the recipe that ships, for all the steps: imitates {_TEACHER.teacher}, then PPO", _PPO),
     Row("fifth", BASE, "a fifth of the steps, as the recipe ships", _PPO, share=0.2),
     Row("scratch", "beginning", "no imitation: ppo-scratch's settings, the same reward", _FROM_NOTHING),
@@ -110,7 +109,8 @@ ROWS: tuple[Row, ...] = (
     _width("half", 0.5, "parameters of pullers spread half as wide"),
     Row("on-hard", "pullers", "imitates, learns and is selected on hard", _recipe(replace(_RECIPE, scenario="hard"))),
 )
-"""Every row, those that say most first."""
+ROWS: tuple[Row, ...] = tuple(replace(row, choice=replace(row.choice, name=f"ppo-{row.name}")) for row in _ROWS)
+"""Every row, those that say most first; its agents are called by its name."""
 
 
 def find_rows(names: Sequence[str]) -> tuple[Row, ...]:

@@ -141,7 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser(prog=PROG, description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--seeds", type=int, default=3, help="training seeds a row (default: %(default)s)")
-    parser.add_argument("--steps", type=int, default=1_000_000, help="environment steps a run (default: %(default)s)")
+    parser.add_argument("--steps", type=int, default=400_000, help="environment steps a run (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=2, help="runs at once (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("results/algorithms"), help="results (default: %(default)s)")
     parser.add_argument(

@@ -18,12 +18,13 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.commands import OneLineParser, guarded
+from cz_gym.evaluation.episodes import read_episodes
+from cz_gym.evaluation.files import EPISODES
 from cz_gym.evaluation.statistics import Estimate, Resamples, differences, means
 from cz_gym.evaluation.whole import write_files
 
 Floats = npt.NDArray[np.float64]
 PROG = "python -m agents.generalisation"
-EPISODES = "episodes.csv"
 OBSERVABLE = ("sensor-fault", "puller")
 """Rows with an offset that no sensor shows: the error against what can be seen is counted there."""
 MICRON = 1e-3
@@ -49,32 +50,15 @@ class Cell(NamedTuple):
     """RMSE of the worst training seed [mm]."""
 
 
-def read_episodes(path: Path) -> dict[str, dict[str, Floats]]:
-    """By row and controller: RMSE [mm], failure and pull step RMS [mm/min], shape (training seeds, episodes, 3).
-
-    ValueError if a file is none of a benchmark's.
-    """
-    found: dict[str, dict[str, dict[str, list[list[float]]]]] = {}
-    try:
-        for line in csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))):
-            error = "rmse_observable_mm" if line["scenario"] in OBSERVABLE else "rmse_mm"
-            figures = [float(line[name]) for name in (error, "failure_rate", "pull_step_rms_mm_per_min")]
-            by_seed = found.setdefault(line["scenario"], {}).setdefault(line["controller"], {})
-            by_seed.setdefault(line["training_seed"], []).append(figures)
-        arrays = {
-            row: {name: np.array([*by_seed.values()]) for name, by_seed in by_name.items()}
-            for row, by_name in found.items()
-        }
-    except (KeyError, TypeError, ValueError, csv.Error, UnicodeDecodeError):
-        raise ValueError(f"{path}: no episodes of a benchmark, or damaged") from None
-    shapes = {values.shape[1:] for by_name in arrays.values() for values in by_name.values()}
-    if len(shapes) != 1:
-        raise ValueError(f"{path}: every controller and row needs the same crystals, and at least one")
-    return arrays
+def figures(row: str) -> tuple[str, ...]:
+    """What is read of a row's episodes: RMSE [mm], failure and pull step RMS [mm/min]."""
+    return ("rmse_observable_mm" if row in OBSERVABLE else "rmse_mm"), "failure_rate", "pull_step_rms_mm_per_min"
 
 
 def tabulate(episodes: Mapping[str, Mapping[str, Floats]], against: str) -> list[Cell]:
-    """A cell a row and controller; ValueError unless the compared controller took part in every row."""
+    """A cell a row and controller; ValueError unless the compared one took part in every row, on the same crystals."""
+    if len({values.shape[1] for by_name in episodes.values() for values in by_name.values()}) != 1:
+        raise ValueError("every controller and row needs the same crystals, and at least one")
     for row, by_name in episodes.items():
         if against not in by_name:
             raise ValueError(f"{against!r} took no part in {row!r}; choose from {', '.join(by_name)}")
@@ -157,7 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(given: argparse.Namespace) -> int:
-    cells = tabulate(read_episodes(given.folder / EPISODES), given.against)
+    cells = tabulate(read_episodes(given.folder / EPISODES, figures), given.against)
     text = to_markdown(cells, given.against)
     write_files({given.folder / "table.csv": to_csv(cells).encode(), given.folder / "table.md": text.encode()})
     print(text, end="")

@@ -40,9 +40,8 @@ class Rivals(NamedTuple):
 
 def rivals(plan: Plan) -> Rivals:
     """Those kept in the plan's folder; judged, and kept there, if there are none of these settings and crystals."""
-    settings = room("baselines.lqg_settings")
-    names = ["lqg-quiet", "lqg", *map(settings.family_name, settings.ACTIVITIES)]
-    laws = {name: room("baselines.registry").find_controller(name).make(make_config(SCENARIO)) for name in names}
+    names, find_controller = room("baselines.frontier").FAMILY, room("baselines.registry").find_controller
+    laws = {name: find_controller(name).make(make_config(SCENARIO)) for name in names}
     about = [ablation_run.judged_on(), asdict(plan.weights)]
     told = json.dumps([about, {name: law.settings.hash for name, law in laws.items()}])
     digest, path = hashlib.sha256(told.encode()).hexdigest()[:16], plan.out / KEPT

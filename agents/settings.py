@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+CRITIC_SHARE = 2.0 / 3.0
+"""Most of all steps that a critic may have for itself [-]: a short run shall not end before its actor learns."""
+
 
 @dataclass(frozen=True)
 class ActionHead:
@@ -93,7 +96,7 @@ class PPO:
     steps: int = 600_000
     """Environment steps."""
     critic_steps: int = 200_000
-    """The first of them, in which only the critic learns."""
+    """The first of them, in which only the critic learns; at most :data:`CRITIC_SHARE` of them."""
     n_steps: int = 128
     """Steps a slot between updates."""
     batch_size: int = 8192

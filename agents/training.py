@@ -30,9 +30,6 @@ from .residual import ResidualAction
 from .vec_env import CzVecEnv
 from .wrappers import DriveAction, TrainingReward
 
-CRITIC_SHARE = 2.0 / 3.0
-"""Most of all steps that the critic may have for itself [-]: a short run shall not end before its actor learns."""
-
 
 @dataclass(frozen=True)
 class Training:
@@ -64,7 +61,7 @@ def make_training(choice: settings.Choice, seed: int, logs: str | None, done: in
         return Training(other, [Statistics(choice.steps // 4, done > 0)], recipe, choice.steps)
     learner = _make_ppo(choice, slots, seed, logs, teacher)
     _set_streams(learner, seed, done)
-    critic_steps = min(choice.critic_steps, int(CRITIC_SHARE * choice.steps))
+    critic_steps = min(choice.critic_steps, int(settings.CRITIC_SHARE * choice.steps))
     callbacks: list[BaseCallback] = [CriticFirst(critic_steps, choice.actor_pace)]
     if recipe.clone is None:
         callbacks.append(Statistics(choice.steps // 4, known=done > 0))

@@ -8,7 +8,7 @@ beside the file, each ratio has a 95 % bootstrap interval over crystals and trai
 
 from __future__ import annotations
 
-import csv
+import argparse
 import json
 import sys
 from collections.abc import Mapping, Sequence
@@ -18,12 +18,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from cz_gym.commands import OneLineParser
+from cz_gym.commands import OneLineParser, guarded
+from cz_gym.evaluation.episodes import Episodes, read_episodes
+from cz_gym.evaluation.files import EPISODES
 from cz_gym.evaluation.statistics import Resamples
 
 from .lqg_settings import ACTIVITIES, family_name
 from .policy import Floats
 
+PROG = "python -m baselines.frontier"
 ACTIVITY = "pull_step_rms_mm_per_min"
 FAMILY = ("lqg", "lqg-quiet", *map(family_name, ACTIVITIES))
 """Controllers that span the frontier."""
@@ -84,26 +87,6 @@ def at_equal_activity(scenario: Mapping[str, Any], controller: str, metric: str 
     return float(entry[metric]["mean"]) / frontier_of(scenario, metric).at(entry[ACTIVITY]["mean"])
 
 
-Episodes = Mapping[str, Mapping[str, Floats]]
-"""By scenario and controller: pull step RMS [mm/min] and radius error [mm], shape (training seeds, crystals, 2)."""
-
-
-def read_episodes(path: Path, metric: str) -> Episodes:
-    """A benchmark's ``episodes.csv``; ValueError where a controller did not meet every crystal with every seed."""
-    found: dict[str, dict[str, dict[str, dict[str, tuple[float, float]]]]] = {}
-    with path.open(newline="") as file:
-        for line in csv.DictReader(file):
-            seeds = found.setdefault(line["scenario"], {}).setdefault(line["controller"], {})
-            seeds.setdefault(line["training_seed"], {})[line["seed"]] = float(line[ACTIVITY]), float(line[metric])
-    return {
-        name: {
-            controller: np.array([[crystals[seed] for seed in sorted(crystals)] for crystals in seeds.values()])
-            for controller, seeds in scenario.items()
-        }
-        for name, scenario in found.items()
-    }
-
-
 def intervals(scenario: Mapping[str, Floats], resamples: Resamples) -> dict[str, tuple[float, float]]:
     """95 % interval of each controller's ratio at equal activity: crystals, and training seeds, drawn again.
 
@@ -124,6 +107,18 @@ def intervals(scenario: Mapping[str, Floats], resamples: Resamples) -> dict[str,
     return {name: (float(low), float(high)) for name, (low, high) in whole.items()}
 
 
+def _spread(name: str, scenario: Mapping[str, Any], metric: str, episodes: Episodes) -> dict[str, tuple[float, float]]:
+    """Intervals of those who met all the crystals; ValueError if the episodes are not of that run."""
+    crystals = episodes.get(name, {})
+    for controller, entry in scenario.items():
+        values = crystals.get(controller)
+        if values is None or not np.isclose(values[..., 1].mean(), entry[metric]["mean"], rtol=1e-4):
+            raise ValueError(f"{EPISODES} is of another run: {controller} on {name}")
+    count = max(values.shape[1] for values in crystals.values())
+    whole = {controller: values for controller, values in crystals.items() if values.shape[1] == count}
+    return intervals(whole, Resamples.draw(count, DRAWS))
+
+
 def table(results: Mapping[str, Any], metric: str, episodes: Episodes | None = None) -> str:
     """A line for every controller of every scenario that holds a frontier; with intervals if there are episodes."""
     lines = []
@@ -135,11 +130,7 @@ def table(results: Mapping[str, Any], metric: str, episodes: Episodes | None = N
             lines.append(f"{name}: {error}")
             continue
         if episodes is not None:
-            crystals = episodes[name]
-            for controller, entry in scenario.items():
-                if not np.isclose(crystals[controller][..., 1].mean(), entry[metric]["mean"], rtol=1e-4):
-                    raise ValueError(f"episodes.csv is of another run: {controller} on {name}")
-            spread = intervals(crystals, Resamples.draw(next(iter(crystals.values())).shape[1], DRAWS))
+            spread = _spread(name, scenario, metric, episodes)
         for controller, entry in scenario.items():
             activity, rmse = entry[ACTIVITY]["mean"], entry[metric]["mean"]
             beyond = activity < curve.activity[0]
@@ -154,17 +145,24 @@ def table(results: Mapping[str, Any], metric: str, episodes: Episodes | None = N
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command."""
-    parser = OneLineParser(prog="python -m baselines.frontier", description=(__doc__ or "").split("\n")[0])
+    parser = OneLineParser(prog=PROG, description=(__doc__ or "").split("\n")[0])
     parser.add_argument("benchmark", type=Path, help="a benchmark.json with lqg's settings among its controllers")
     parser.add_argument("--metric", choices=("rmse_mm", "rmse_observable_mm"), default="rmse_mm")
     given = parser.parse_args(arguments)
+    return guarded(PROG, lambda: _main(given), "benchmark")
+
+
+def _main(given: argparse.Namespace) -> int:
     try:
-        beside = given.benchmark.with_name("episodes.csv")
-        episodes = read_episodes(beside, given.metric) if beside.exists() else None
-        print(table(json.loads(given.benchmark.read_text())["results"], given.metric, episodes))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        print(f"frontier: {given.benchmark} is no benchmark.json: {error!r}", file=sys.stderr)
-        return 2
+        results = json.loads(given.benchmark.read_text())["results"]
+        for scenario in results.values():
+            for entry in scenario.values():
+                float(entry[ACTIVITY]["mean"]), float(entry[given.metric]["mean"])
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise ValueError(f"{given.benchmark} is no benchmark.json") from None
+    beside = given.benchmark.with_name(EPISODES)
+    episodes = read_episodes(beside, lambda _: (ACTIVITY, given.metric)) if beside.exists() else None
+    print(table(results, given.metric, episodes))
     return 0
 
 

@@ -115,9 +115,12 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     recipe = replace(
         settings.Recipe(), num_envs=16, hidden=(8, 8), clone=settings.Clone("lqg", rounds=1, episodes=2, epochs=1)
     )
-    quick = settings.PPO(recipe=recipe, n_steps=16, batch_size=256, n_epochs=1, critic_steps=0)
+    quick = settings.PPO("ppo-base", recipe, n_steps=16, batch_size=256, n_epochs=1, critic_steps=0)
     beside = replace(recipe, residual=True, head=settings.ActionHead(skip=0.0))
-    rows = (Row(BASE, BASE, "as it is", quick), Row("beside", "action", "residual", replace(quick, recipe=beside)))
+    rows = (
+        Row(BASE, BASE, "as it is", quick),
+        Row("beside", "action", "residual", replace(quick, name="ppo-beside", recipe=beside)),
+    )
     monkeypatch.setattr(ablation_rows, "ROWS", rows)
     monkeypatch.setattr(rivals, "rivals", lambda plan: LQGS)
 

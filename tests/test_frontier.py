@@ -167,6 +167,10 @@ def test_episodes_beside_a_benchmark_give_intervals_unless_they_are_of_another_r
     path.write_text(json.dumps({"results": {"randomized": {name: entry(*pair) for name, pair in values.items()}}}))
     assert frontier.main([str(path)]) == 0
     assert "ratio 1.044 [1.044, 1.044]" in capsys.readouterr().out
+    (tmp_path / "episodes.csv").write_text("\n".join([*lines[:-1], lines[-1].replace("0.06", "nan")]))
+    assert frontier.main([str(path)]) == 2
+    assert "no episodes of a benchmark, or damaged" in capsys.readouterr().err
+    (tmp_path / "episodes.csv").write_text("\n".join(lines))
     path.write_text(path.read_text().replace("0.06", "0.0601"))
     assert frontier.main([str(path)]) == 2
     assert "episodes.csv is of another run: agent on randomized" in capsys.readouterr().err

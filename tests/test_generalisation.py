@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from agents import generalisation
-from agents.generalisation import read_episodes, tabulate, to_csv
+from agents.generalisation import figures, tabulate, to_csv
+from cz_gym.evaluation.episodes import read_episodes
 
 HEAD = "scenario,controller,training_seed,seed,rmse_mm,rmse_observable_mm,failure_rate,pull_step_rms_mm_per_min"
 
@@ -32,7 +33,7 @@ def sample(folder: Path) -> Path:
 
 
 def test_differences_are_paired_and_seeds_pooled(tmp_path: Path) -> None:
-    cells = {(cell.row, cell.controller): cell for cell in tabulate(read_episodes(sample(tmp_path)), "lqg")}
+    cells = {(cell.row, cell.controller): cell for cell in tabulate(read_episodes(sample(tmp_path), figures), "lqg")}
     ppo = cells["randomized", "ppo"]
     assert ppo.seeds == 2
     assert ppo.apart.mean == pytest.approx(0.015)
@@ -50,7 +51,10 @@ def test_files_say_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert "| randomized | +15 [+10, +20] |" in (tmp_path / "table.md").read_text()
     rows = list(csv.DictReader(io.StringIO((tmp_path / "table.csv").read_text())))
     assert [(row["row"], row["controller"], row["crystals"]) for row in rows][1] == ("randomized", "ppo", "6")
-    assert to_csv(tabulate(read_episodes(tmp_path / "episodes.csv"), "lqg")) == (tmp_path / "table.csv").read_text()
+    assert (
+        to_csv(tabulate(read_episodes(tmp_path / "episodes.csv", figures), "lqg"))
+        == (tmp_path / "table.csv").read_text()
+    )
 
 
 @pytest.mark.parametrize(
@@ -58,6 +62,7 @@ def test_files_say_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     [
         ([], "lqg", "every controller and row needs the same crystals"),
         (["randomized,lqg,,0,x,0.1,0,0.02"], "lqg", "no episodes of a benchmark, or damaged"),
+        (["randomized,lqg,,0,nan,0.1,0,0.02"], "lqg", "no episodes of a benchmark, or damaged"),
         (["hard,lqg,,0,0.1,0.1,0,0.02"], "paper", "'paper' took no part in 'hard'; choose from lqg"),
         (["hard,lqg,,0,0.1,0.1,0,0.02", "hard,a,,0,1,1,0,1", "hard,a,,1,1,1,0,1"], "lqg", "needs the same crystals"),
     ],
