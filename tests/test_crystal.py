@@ -38,6 +38,10 @@ def test_many_controllers_are_chosen_by_a_rule_and_the_rest_named() -> None:
     outcomes = [SimpleNamespace(controller=one.controller) for one in many]
     text = _heading(cast(Any, SimpleNamespace(row=find_row("hard"), outcomes=outcomes)), shown)
     assert text.endswith("not shown: bound, c4, c5")
+    assert "shown: paper, the best of the learned, the best of the others" in text
+    two = [sample("c9", 1.0), sample("a", 1.0, seeds=(0,)), sample("b", 1.0, seeds=(0,))]
+    text = _heading(cast(Any, SimpleNamespace(row=find_row("hard"), outcomes=outcomes)), two)
+    assert "shown: the 2 best of the learned, the best of the others" in text  # who took no part is not named
 
 
 def test_many_agents_leave_room_for_what_they_are_compared_with() -> None:

@@ -94,10 +94,11 @@ def _heading(scenario: ScenarioResult, shown: list[Sample]) -> str:
     others = [outcome.controller.name for outcome in scenario.outcomes if outcome.controller.name not in names]
     if not others:
         return text
-    rule = (
-        f"shown: {REFERENCE}, the {LEARNED} best of the learned, the best of the others that read sensors, by mean RMSE"
-    )
-    return f"{text}\n{rule}\nnot shown: {', '.join(others)}"
+    kinds = [REFERENCE] if REFERENCE in names else []
+    learned = sum(sample.controller.learned for sample in shown)
+    kinds += [f"the {learned} best of the learned" if learned > 1 else "the best of the learned"] if learned else []
+    kinds.append("the best of the others that read sensors")
+    return f"{text}\nshown: {', '.join(kinds)}, by mean RMSE\nnot shown: {', '.join(others)}"
 
 
 def _crystal_column(axes: Any, sample: Sample, colour: str, reference: Floats) -> None:
