@@ -15,20 +15,17 @@ import numpy.typing as npt
 
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metrics
-from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.evaluation.whole import alone, write_files
 
 from .ablation_rows import Row
 from .contract import AgentFileError, read_json
-from .run import QUICK, Run
+from .run import Run
 from .run_files import provenance
 from .settings import Choice, CostWeights
-from .validation import costs
+from .validation import JUDGING, costs
 
 Floats = npt.NDArray[np.float64]
-JUDGED = VALIDATION_SEEDS[QUICK : QUICK + 200]
-"""Seeds of the crystals that all rows are judged on: validation, but none that picks the best agent of a run."""
 SCENARIO, FARTHER = "randomized", "hard"
 """What they are drawn from, whatever a row was trained on; and a scenario to travel to."""
 _TRAVELLED = ("rmse_mm", "failure_rate")
@@ -94,13 +91,13 @@ def run_one(plan: Plan, row: Row, seed: int, bar: Any) -> None:
 def judged_on() -> dict[str, Any]:
     """What figures depend on beside the agent: crystals, and the scenarios and the plant that they are drawn from."""
     configs = {name: make_config(name, observation="history").hash for name in (SCENARIO, FARTHER)}
-    return {"seeds": [JUDGED[0], JUDGED[-1]], "figures": list(FIGURES), **configs}
+    return {"seeds": [JUDGING[0], JUDGING[-1]], "figures": list(FIGURES), **configs}
 
 
 def judge(policy: Any, weights: CostWeights) -> Floats:
     """Figures of a policy on the crystals that all rows are judged on, shape (episodes, figures)."""
     found, farther = (
-        metrics(rollout(policy, make_config(name, observation="history"), JUDGED)) for name in (SCENARIO, FARTHER)
+        metrics(rollout(policy, make_config(name, observation="history"), JUDGING)) for name in (SCENARIO, FARTHER)
     )
     by_name = {
         **found._asdict(),
@@ -174,6 +171,6 @@ def _parsed(told: Mapping[str, Any]) -> Finished | None:
         found = Finished(str(told["row"]), int(told["seed"]), dict(told["settings"]), stages)
     except (KeyError, TypeError, ValueError, AttributeError):
         return None
-    shape = len(JUDGED), len(FIGURES)
+    shape = len(JUDGING), len(FIGURES)
     sound = all(values.shape == shape and math.isfinite(values.sum()) for values in stages.values())
     return found if sound and {"best", "last"} <= set(stages) else None

@@ -18,8 +18,9 @@ import numpy.typing as npt
 from cz_gym.evaluation.statistics import Estimate, Resamples, means
 
 from .ablation_rows import BASE, Row
-from .ablation_run import FARTHER, FIGURES, JUDGED, STAGES, Finished
+from .ablation_run import FARTHER, FIGURES, STAGES, Finished
 from .rivals import Rivals, rivals_table
+from .validation import JUDGING
 
 Floats = npt.NDArray[np.float64]
 MILLI = 1e-3
@@ -113,8 +114,8 @@ def to_markdown(lines: Sequence[Line], steps: int, lqgs: Rivals) -> str:
         [
             "# What helps: one change of `ppo` at a time",
             "",
-            f"{steps:,} environment steps a run, up to {most} training seeds a row, judged on {len(JUDGED)} validation"
-            f" crystals of `randomized` (seeds {JUDGED[0]:,} to {JUDGED[-1]:,}) that select nothing. In brackets: 95 %"
+            f"{steps:,} environment steps a run, up to {most} training seeds a row, judged on {len(JUDGING)}"
+            f" validation crystals of `randomized` (seeds {JUDGING[0]:,} to {JUDGING[-1]:,}) that select nothing. In brackets: 95 %"
             " intervals, bootstrap over training seeds and crystals; differences are to `base` on the same crystals and"
             " training seeds, negative is better. *Kept* is the agent of least cost on the validation that selects,"
             " as the recipe does it; *last* is what learning ended with; *start* is what it began as: the imitation,"

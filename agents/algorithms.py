@@ -47,9 +47,9 @@ def plant_steps(choice: Choice, steps: int) -> int:
 
 def to_markdown(lines: Sequence[Any], curves: Mapping[str, Sequence[Any]], steps: int, lqgs: Any) -> str:
     """``table.md``."""
-    from .ablation_run import JUDGED
     from .ablation_table import at_equal_activity
     from .rivals import rivals_table
+    from .validation import JUDGING
 
     heads = ("algorithm", "begins", "training seeds", "RMSE [mm]", "worst seed [mm]", "lost [%]", "pull steps [mm/min]",
              "at equal activity", "reward's cost", "before learning [mm]",
@@ -58,7 +58,7 @@ def to_markdown(lines: Sequence[Any], curves: Mapping[str, Sequence[Any]], steps
         "# Algorithms side by side",
         "",
         f"{steps:,} environment steps of learning a run, the same reward and the same 72 channels of history, judged"
-        f" on {len(JUDGED)} validation crystals of `randomized` that select nothing: of each run the agent that did"
+        f" on {len(JUDGING)} validation crystals of `randomized` that select nothing: of each run the agent that did"
         " best on those that select."
         " In brackets: 95 % intervals, bootstrap over training seeds and crystals. A lost crystal counts 8 mm."
         " *At equal activity*: RMSE over what the LQG's frontier has at those pull steps; 1 is as good."
@@ -72,7 +72,7 @@ def to_markdown(lines: Sequence[Any], curves: Mapping[str, Sequence[Any]], steps
         rmse, cost = line.cells["best", "rmse_mm"].mean, line.cells["best", "reward_cost"].mean
         start = line.cells.get(("start", "rmse_mm"))
         minutes = sum(run["validations"][-1]["seconds"] for run in runs) / len(runs) / 60.0
-        worst = max(sum(run["stages"]["best"]["rmse_mm"]) / len(JUDGED) for run in runs)
+        worst = max(sum(run["stages"]["best"]["rmse_mm"]) / len(JUDGING) for run in runs)
         cells = (
             line.row.name,
             line.row.about,

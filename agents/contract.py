@@ -15,7 +15,7 @@ from cz_gym.evaluation.whole import write_files
 from cz_gym.observation import CLIP, OBSERVATIONS
 
 FORMAT = "cz-gym-agent"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 MAX_BYTES = 4_000_000
 """Largest agent file that is read."""
 MAX_JSON_BYTES = 1_000_000
@@ -54,8 +54,10 @@ class Contract:
     """Seed of the training run."""
     training_steps: int
     """Environment steps behind these weights."""
+    validation_cost: float
+    """Mean cost of a step, weighed as in training [-], on validation episodes: those that judge a run at its end."""
     validation_rmse_mm: float
-    """Mean RMSE on the validation episodes it was picked by [mm]."""
+    """Mean RMSE on the same [mm]."""
     sha256: str
     """Hash of the ONNX file."""
 

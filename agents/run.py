@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +20,14 @@ from cz_gym.rooms import room
 from . import settings
 from .callbacks import AtStart, Every, Tell
 from .checkpoint import load_checkpoint, restore, to_bytes
-from .contract import AgentFileError, Contract, agent_files, make_contract
+from .contract import AgentFileError, Contract, agent_files, make_contract, read_agent
 from .export import exported
 from .onnx_policy import OnnxPolicy
 from .residual import Residual
-from .run_files import COLUMNS, provenance, read_rows, read_settings, to_csv, write_json
+from .run_files import COLUMNS, provenance, read_rows, read_settings, to_csv, to_json
 from .training import Training, clone, make_training
-from .validation import validate
+from .validation import JUDGING, PICKING, validate
 
-QUICK, FULL = 64, 200
-"""Validation episodes while learning, and at the end."""
 CHECKPOINT = "checkpoint.safetensors"
 IMITATION = "imitation.onnx"
 """The agent as it was before it learned, if it began as an imitation."""
@@ -69,7 +68,7 @@ class Run:
         find_controller = room("baselines.registry").find_controller
         self.rival = find_controller("paper").make(measured)
         self.teacher = find_controller(recipe.clone.teacher).make(measured) if recipe.clone else None
-        self.rival_rmse_mm = self._validate_rival(QUICK)
+        self.rival_rmse_mm = self._validate_rival(PICKING)
         self.best = math.inf
         self.rows: list[dict[str, Any]] = []
         self.sessions: list[dict[str, Any]] = []
@@ -124,19 +123,22 @@ class Run:
         self.unsaved = {}
 
     def finish(self) -> dict[str, float]:
-        """Validate the best agent on more episodes and write ``summary.json``; its contents."""
-        found = validate(self.best_policy(), self.config, FULL, self.choice.recipe.weights)
+        """Judge the best agent on episodes that did not pick it; the contents of ``summary.json``."""
+        found = validate(self.best_policy(), self.config, JUDGING, self.choice.recipe.weights)
         summary = {
-            "validation_episodes": FULL,
+            "validation_episodes": len(JUDGING),
             "validation_cost": found.cost,
             "validation_rmse_mm": found.rmse_mm,
-            "paper_rmse_mm": self._validate_rival(FULL),
+            "paper_rmse_mm": self._validate_rival(JUDGING),
             "pull_step_rms_mm_per_min": found.pull_step_rms_mm_per_min,
             "failure_rate": found.failure_rate,
             "training_steps": self.training.learner.num_timesteps,
             "seconds": time.monotonic() - self.began,
         }
-        write_json(self.folder / "summary.json", summary)
+        path = self.folder / "agent.onnx"
+        contract, content = read_agent(path)
+        judged = dataclasses.replace(contract, validation_cost=found.cost, validation_rmse_mm=found.rmse_mm)
+        write_files({**agent_files(path, content, judged), self.folder / "summary.json": to_json(summary)})
         return summary
 
     def best_policy(self) -> Any:
@@ -157,21 +159,21 @@ class Run:
 
     def _exported(self) -> tuple[Contract, bytes, OnnxPolicy]:
         content = exported(self.training.learner)
-        contract = make_contract(content, **self._facts(self.training.learner.num_timesteps, 0.0))
+        contract = make_contract(content, **self._facts(self.training.learner.num_timesteps))
         return contract, content, OnnxPolicy.of(contract, content, self.config)
 
-    def _validate_rival(self, episodes: int) -> float:
+    def _validate_rival(self, seeds: Sequence[int]) -> float:
         measured = make_config(self.config.scenario, control_interval=self.config.control_interval)
-        return validate(self.rival, measured, episodes, settings.CostWeights()).rmse_mm
+        return validate(self.rival, measured, seeds, settings.CostWeights()).rmse_mm
 
     def _validate(self, bar: Any) -> None:
         """Export the actor as it stands, run the file itself on validation, keep it if it is the best."""
         learner = self.training.learner
         candidate, content, agent = self._exported()
-        found = validate(self._whole(agent), self.config, QUICK, self.choice.recipe.weights)
+        found = validate(self._whole(agent), self.config, PICKING, self.choice.recipe.weights)
         if found.cost < self.best:
             self.best = found.cost
-            contract = dataclasses.replace(candidate, validation_rmse_mm=found.rmse_mm)
+            contract = dataclasses.replace(candidate, validation_cost=found.cost, validation_rmse_mm=found.rmse_mm)
             self.unsaved |= agent_files(self.folder / "agent.onnx", content, contract)
         seconds = round(time.monotonic() - self.began, 1)
         cost, rmse, activity, failures = found
@@ -185,7 +187,7 @@ class Run:
         learner.logger.record("validation/failure_rate", failures)
         bar.set_postfix_str(f"validation RMSE {rmse:.3f} mm, paper {self.rival_rmse_mm:.3f}")
 
-    def _facts(self, steps: int, rmse: float) -> dict[str, Any]:
+    def _facts(self, steps: int) -> dict[str, Any]:
         config = self.config
         return {
             "observation": config.observation,
@@ -197,7 +199,8 @@ class Run:
             "algorithm": self.choice.name,
             "training_seed": self.seed,
             "training_steps": int(steps),
-            "validation_rmse_mm": rmse,
+            "validation_cost": 0.0,
+            "validation_rmse_mm": 0.0,
         }
 
     def _identity(self) -> dict[str, Any]:
@@ -218,7 +221,7 @@ class Run:
         first = (self.sessions or [session])[0]
         sessions = [*self.sessions[:1], *self.sessions[1:][-MAX_SESSIONS:], session]
         facts = {**self._identity(), "steps": self.choice.steps, **first, "sessions": sessions}
-        write_json(self.folder / "settings.json", facts)
+        write_files({self.folder / "settings.json": to_json(facts)})
 
     def _check_settings(self) -> list[dict[str, Any]]:
         """The sessions of the run in this folder; AgentFileError if it is not this run."""

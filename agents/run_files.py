@@ -13,8 +13,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from cz_gym.evaluation.whole import write_files
-
 from .contract import MAX_JSON_BYTES, AgentFileError, read_bounded, read_json
 
 COLUMNS = (
@@ -85,9 +83,9 @@ def _version(package: str) -> str | None:
         return None
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write a JSON file, whole or not at all."""
-    write_files({path: (json.dumps(content, indent=2) + "\n").encode()})
+def to_json(content: Any) -> bytes:
+    """The contents of a JSON file."""
+    return (json.dumps(content, indent=2) + "\n").encode()
 
 
 def to_csv(rows: list[dict[str, Any]]) -> bytes:

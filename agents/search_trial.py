@@ -16,14 +16,14 @@ from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
 
-from .run import QUICK, Run
+from .run import Run
 from .settings import PPO, CostWeights
-from .validation import costs
+from .validation import PICKING, costs
 
 Floats = npt.NDArray[np.float64]
-CHOOSE = VALIDATION_SEEDS[QUICK : QUICK + 150]
+CHOOSE = VALIDATION_SEEDS[len(PICKING) :][:150]
 """Seeds of the crystals that trials are judged on; those that a run looks at on its way are none of them."""
-CONFIRM = VALIDATION_SEEDS[QUICK + 150 : QUICK + 350]
+CONFIRM = VALIDATION_SEEDS[len(PICKING) :][150:350]
 """Seeds of the crystals that the best trials are judged on again, with other training seeds."""
 LOOKS = 6
 """Validations on the way of a trial."""

@@ -1,7 +1,8 @@
-"""How good an agent is while it trains: the first validation episodes."""
+"""How good an agent is while it trains, and when it has."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +18,10 @@ from cz_gym.units import KILO, MM, MM_PER_MIN
 from .settings import CostWeights
 
 Floats = npt.NDArray[np.float64]
+PICKING = VALIDATION_SEEDS[:64]
+"""Seeds of the crystals that pick the best agent of a run."""
+JUDGING = VALIDATION_SEEDS[64:264]
+"""Seeds of those that say what it is worth; they pick nothing within a run."""
 
 
 class Validation(NamedTuple):
@@ -29,9 +34,9 @@ class Validation(NamedTuple):
     failure_rate: float
 
 
-def validate(policy: Any, config: Config, episodes: int, weights: CostWeights) -> Validation:
-    """Run the first validation episodes."""
-    found = metrics(rollout(policy, config, VALIDATION_SEEDS[:episodes]))
+def validate(policy: Any, config: Config, seeds: Sequence[int], weights: CostWeights) -> Validation:
+    """Run the episodes of those seeds."""
+    found = metrics(rollout(policy, config, seeds))
     figures = costs(found, weights), found.rmse_mm, found.pull_step_rms_mm_per_min, found.failure_rate
     return Validation(*(float(figure.mean()) for figure in figures))
 

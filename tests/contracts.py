@@ -21,6 +21,7 @@ def facts(observation: str = "history", **changes: Any) -> dict[str, Any]:
         "algorithm": "ppo",
         "training_seed": 0,
         "training_steps": 64,
+        "validation_cost": 0.1,
         "validation_rmse_mm": 1.0,
     }
     return {**known, **changes}

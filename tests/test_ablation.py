@@ -15,6 +15,7 @@ from agents.ablation_rows import BASE, ROWS, Row, find_rows
 from agents.ablation_run import FIGURES, Finished, Plan, read_finished
 from agents.export import actor_of
 from agents.training import clone, make_training, training_scenario
+from agents.validation import JUDGING, PICKING
 from baselines.registry import find_controller
 from cz_gym.config import make_config
 from cz_gym.evaluation.protocol import TEST_SEEDS, VALIDATION_SEEDS
@@ -101,17 +102,17 @@ def test_rows_have_names_of_their_own() -> None:
 
 
 def test_what_judges_neither_selects_nor_tests() -> None:
-    judged = set(ablation_run.JUDGED)
+    judged = set(JUDGING)
     assert judged <= set(VALIDATION_SEEDS)
-    assert not judged & set(VALIDATION_SEEDS[: run.QUICK])
+    assert not judged & set(PICKING)
     assert not judged & set(TEST_SEEDS)
 
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two rows of a recipe that is done in a moment."""
-    monkeypatch.setattr(run, "QUICK", 2)
-    monkeypatch.setattr(ablation_run, "JUDGED", VALIDATION_SEEDS[2:4])
+    monkeypatch.setattr(run, "PICKING", VALIDATION_SEEDS[:2])
+    monkeypatch.setattr(ablation_run, "JUDGING", VALIDATION_SEEDS[2:4])
     recipe = replace(
         settings.Recipe(), num_envs=16, hidden=(8, 8), clone=settings.Clone("lqg", rounds=1, episodes=2, epochs=1)
     )
@@ -205,7 +206,7 @@ def test_a_run_kept_before_a_setting_existed_is_of_other_settings(tmp_path: Path
     plan, row = Plan(7, tmp_path, tmp_path, settings.CostWeights()), ROWS[0]
     path = ablation_run.path_of(plan, row, 0)
     path.parent.mkdir()
-    stages = {stage: dict.fromkeys(FIGURES, [0.0] * len(ablation_run.JUDGED)) for stage in ("best", "last")}
+    stages = {stage: dict.fromkeys(FIGURES, [0.0] * len(ablation_run.JUDGING)) for stage in ("best", "last")}
     told = {
         "row": row.name,
         "seed": 0,

@@ -25,8 +25,8 @@ CHOICES: tuple[Any, ...] = (
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = [replace(row, choice=choice) for row, choice in zip(algorithms.ROWS[1:3], CHOICES, strict=True)]
     monkeypatch.setattr(algorithms, "ROWS", tuple(rows))
-    monkeypatch.setattr(ablation_run, "JUDGED", VALIDATION_SEEDS[:2])
-    monkeypatch.setattr(run, "QUICK", 1)
+    monkeypatch.setattr(ablation_run, "JUDGING", VALIDATION_SEEDS[:2])
+    monkeypatch.setattr(run, "PICKING", VALIDATION_SEEDS[:1])
     means = {name: dict.fromkeys(ablation_run.FIGURES, error) for name, error in (("lively", 1.0), ("quiet", 2.0))}
     means["lively"] |= {rivals.ACTIVITY: 3.0}
     monkeypatch.setattr(rivals, "rivals", lambda plan: rivals.Rivals(means))

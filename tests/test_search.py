@@ -12,6 +12,7 @@ import pytest
 from agents import run, search, search_report, search_trial, settings
 from agents.search_space import KNOBS, Trial, read_history, settings_of, values_of, write_history
 from agents.search_trial import CHOOSE, CONFIRM, Given, Tried
+from agents.validation import PICKING
 from cz_gym.evaluation.protocol import TEST_SEEDS, VALIDATION_SEEDS
 
 SHIPPED = values_of(settings.PPO())
@@ -32,7 +33,7 @@ def test_the_knobs_turn_what_they_say() -> None:
 
 
 def test_crystals_that_select_choose_and_confirm_are_others() -> None:
-    looked, tested = set(VALIDATION_SEEDS[: run.QUICK]), set(TEST_SEEDS)
+    looked, tested = set(PICKING), set(TEST_SEEDS)
     assert set(CHOOSE) | set(CONFIRM) <= set(VALIDATION_SEEDS)
     assert not set(CHOOSE) & set(CONFIRM)
     assert not (set(CHOOSE) | set(CONFIRM)) & (looked | tested)
@@ -135,7 +136,7 @@ def test_another_history_is_refused(content: str, tmp_path: Path, capsys: pytest
 
 
 def test_a_trial_learns_from_the_kept_imitation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run, "QUICK", 2)
+    monkeypatch.setattr(run, "PICKING", VALIDATION_SEEDS[:2])
     recipe = settings.Recipe(num_envs=16, hidden=(8, 8), clone=settings.Clone("lqg", rounds=1, episodes=2, epochs=1))
     quick = settings.PPO(recipe=recipe, n_steps=16, batch_size=256, n_epochs=1, critic_steps=0, steps=512)
     looks: list[int] = []

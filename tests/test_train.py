@@ -18,14 +18,15 @@ from agents import OnnxPolicy, run, run_files, settings
 from agents.vec_env import CzVecEnv
 from agents.wrappers import DriveAction, TrainingReward
 from cz_gym import CzVectorEnv
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
 ROOT = Path(run.__file__).parents[1]
 
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run, "QUICK", 2)
-    monkeypatch.setattr(run, "FULL", 2)
+    monkeypatch.setattr(run, "PICKING", VALIDATION_SEEDS[:2])
+    monkeypatch.setattr(run, "JUDGING", VALIDATION_SEEDS[2:4])
     recipe = replace(
         settings.RECIPES["ppo"].recipe, num_envs=64, clone=settings.Clone("lqg", rounds=2, episodes=2, epochs=1)
     )
@@ -49,6 +50,12 @@ def test_a_run_leaves_everything_and_goes_on(tmp_path: Path, capsys: pytest.Capt
     assert {"command", "git_commit", "plant_hash", "scenario_hash"} <= set(saved)
     policy = OnnxPolicy.load(folder / "agent.onnx")
     assert policy.contract.training_seed == 3
+    summary, picked = json.loads((folder / "summary.json").read_text()), rows(folder / "progress.csv")
+    assert policy.contract.validation_cost == summary["validation_cost"]
+    assert policy.contract.validation_rmse_mm == summary["validation_rmse_mm"]
+    assert summary["validation_cost"] not in {float(row["validation_cost"]) for row in picked}, (
+        "judged as it was picked"
+    )
     assert list((folder / "tensorboard").rglob("events.*"))
     before = rows(folder / "progress.csv")
     assert float(before[-1]["paper_rmse_mm"]) > 0
