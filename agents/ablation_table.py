@@ -114,14 +114,14 @@ def to_markdown(lines: Sequence[Line], steps: int, lqgs: Rivals) -> str:
         [
             "# What helps: one change of `ppo` at a time",
             "",
-            f"{steps:,} environment steps a run, up to {most} training seeds a row, judged on {len(JUDGING)}"
-            f" validation crystals of `randomized` (seeds {JUDGING[0]:,} to {JUDGING[-1]:,}) that select nothing. In brackets: 95 %"
-            " intervals, bootstrap over training seeds and crystals; differences are to `base` on the same crystals and"
-            " training seeds, negative is better. *Kept* is the agent of least cost on the validation that selects,"
-            " as the recipe does it; *last* is what learning ended with; *start* is what it began as: the imitation,"
-            " or the controller that the network's action is added to. With so few training seeds the intervals are"
-            " somewhat too narrow. *At equal activity*: RMSE of the kept agents over what the LQG's frontier has"
-            " at their pull step RMS, by means; 1 is as good.",
+            f"{steps:,} environment steps a run, up to {most} training seeds a row, judged on {len(JUDGING)} "
+            f"validation crystals of `randomized` (seeds {JUDGING[0]:,} to {JUDGING[-1]:,}) that select nothing. "
+            "In brackets: 95 % intervals, bootstrap over training seeds and crystals; differences are to `base` "
+            "on the same crystals and training seeds, negative is better. *Kept* is the agent of least cost on "
+            "the validation that selects, as the recipe does it; *last* is what learning ended with; *start* is "
+            "what it began as: the imitation, or the controller that the network's action is added to. With so "
+            "few training seeds the intervals are somewhat too narrow. *At equal activity*: RMSE of the kept "
+            "agents over what the LQG's frontier has at their pull step RMS, by means; 1 is as good.",
             "",
             *_table(lines, lqgs),
             "",

@@ -7,6 +7,7 @@ import json
 import math
 import os
 import stat
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -69,9 +70,14 @@ def observation_hash(name: str) -> str:
 
 
 def make_contract(onnx_bytes: bytes, **facts: Any) -> Contract:
-    """The contract of an ONNX file; ``facts`` are Contract's fields without the hashes of observation and file."""
+    """The contract of an ONNX file; ``facts`` are Contract's fields without the hashes of observation and file.
+
+    AgentFileError for a fact that no contract may hold.
+    """
     digest = hashlib.sha256(onnx_bytes).hexdigest()
-    return Contract(**facts, observation_hash=observation_hash(facts["observation"]), sha256=digest)
+    known = {**facts, "observation_hash": observation_hash(facts["observation"]), "sha256": digest}
+    _check(known, "contract")
+    return Contract(**known)
 
 
 def agent_files(path: Path, onnx_bytes: bytes, contract: Contract) -> dict[Path, bytes]:
@@ -132,15 +138,20 @@ def _parse(path: Path) -> Contract:
     if data.get("format_version") != FORMAT_VERSION:
         version = data.get("format_version")
         raise AgentFileError(f"{path}: format version {version!r:.80}, this release reads {FORMAT_VERSION}")
-    wanted = {field.name: str(field.type) for field in fields(Contract)}
+    wanted = {field.name for field in fields(Contract)}
     given = {name: value for name, value in data.items() if name not in ("format", "format_version")}
-    if set(given) != set(wanted):
-        odd = sorted(set(given) ^ set(wanted))[0]
+    if set(given) != wanted:
+        odd = sorted(set(given) ^ wanted)[0]
         raise AgentFileError(f"{path}: field {odd!r:.80} is {'missing' if odd in wanted else 'unknown'}")
-    for name, value in given.items():
-        if wrong := _wrong(wanted[name], value):
-            raise AgentFileError(f"{path}: field {name!r} must be {wrong}, not {value!r:.80}")
+    _check(given, path)
     return Contract(**given)
+
+
+def _check(given: Mapping[str, Any], where: Path | str) -> None:
+    """AgentFileError unless every value is what a contract's field of that name holds."""
+    for field in fields(Contract):
+        if wrong := _wrong(str(field.type), given[field.name]):
+            raise AgentFileError(f"{where}: field {field.name!r} must be {wrong}, not {given[field.name]!r:.80}")
 
 
 def _wrong(kind: str, value: Any) -> str | None:

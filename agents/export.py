@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,14 @@ from .network import DRIVES, NORMALISED_LIMIT, Normalise
 
 Floats = npt.NDArray[np.float32]
 OPSET, IR_VERSION = 17, 9
+ACTIVATIONS: dict[type[torch.nn.Module], tuple[str, dict[str, str]]] = {
+    torch.nn.Tanh: ("Tanh", {}),
+    torch.nn.ReLU: ("Relu", {}),
+    torch.nn.Sigmoid: ("Sigmoid", {}),
+    torch.nn.ELU: ("Elu", {"alpha": "alpha"}),
+    torch.nn.LeakyReLU: ("LeakyRelu", {"alpha": "negative_slope"}),
+}
+"""Modules of one ONNX operator, with its attributes and what torch calls them."""
 
 
 @dataclass(frozen=True)
@@ -103,14 +112,37 @@ class OnnxGraph:
         parameters = [self.constant(f"{name}_weight", weight), self.constant(f"{name}_bias", bias)]
         return self.node("Gemm", [x, *parameters], name, transB=1)
 
+    def through(self, x: str, modules: Iterable[torch.nn.Module]) -> str:
+        """x through torch's modules, one after the other; TypeError for one that is not known here."""
+        for module in modules:
+            name = f"module_{len(self._nodes)}"
+            if isinstance(module, torch.nn.Sequential):
+                x = self.through(x, module)
+            elif isinstance(module, torch.nn.Linear):
+                weight, bias = module.weight.detach().numpy(), module.bias
+                offset = np.zeros(len(weight), np.float32) if bias is None else bias.detach().numpy()
+                x = self.gemm(x, weight, offset, name)
+            elif isinstance(module, torch.nn.Hardtanh):
+                x = self.clip(x, module.min_val, module.max_val, name)
+            elif isinstance(module, torch.nn.SiLU):
+                x = self.node("Mul", [x, self.node("Sigmoid", [x], f"{name}_gate")], name)
+            elif type(module) in ACTIVATIONS:
+                operator, attributes = ACTIVATIONS[type(module)]
+                x = self.node(operator, [x], name, **{key: getattr(module, own) for key, own in attributes.items()})
+            elif not isinstance(module, (torch.nn.Identity, torch.nn.Dropout)):
+                raise TypeError(f"a network with {type(module).__name__} in it cannot be written as an agent file")
+        return x
+
+    def clip(self, x: str, low: float, high: float, name: str) -> str:
+        """x within [low, high]."""
+        limits = [self.constant(f"{name}_{end}", np.float32(value)) for end, value in (("low", low), ("high", high))]
+        return self.node("Clip", [x, *limits], name)
+
     def normalised(self, mean: Floats, scaling: Floats) -> str:
         """The normalised observation."""
         x = self.node("Sub", ["observation", self.constant("mean", mean)], "centred")
         x = self.node("MatMul", [x, self.constant("scaling", scaling)], "scaled")
-        limits = [
-            self.constant(name, np.float32(sign * NORMALISED_LIMIT)) for name, sign in (("least", -1.0), ("most", 1.0))
-        ]
-        return self.node("Clip", [x, *limits], "normalised")
+        return self.clip(x, -NORMALISED_LIMIT, NORMALISED_LIMIT, "normalised")
 
     def drives(self, x: str, skip: float, scale: npt.ArrayLike) -> None:
         """The action: skip * (applied drives) + scale * x, within the box."""
@@ -119,8 +151,7 @@ class OnnxGraph:
         applied = self.node("Gather", ["observation", at], "applied", axis=1)
         kept = self.node("Mul", [applied, self.constant("skip", np.float32(skip))], "kept")
         x = self.node("Add", [x, kept], "wanted")
-        limits = [self.constant(name, np.float32(value)) for name, value in (("low", -1.0), ("high", 1.0))]
-        self.node("Clip", [x, *limits], "action")
+        self.clip(x, -1.0, 1.0, "action")
 
     def finished(self, channels: int, state: int = 0) -> bytes:
         """The model, checked and serialised; ``state`` is the length of what it remembers, 0 if nothing."""

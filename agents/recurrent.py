@@ -15,7 +15,7 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3.common.vec_env import VecEnv
 
 from . import settings
-from .export import OnnxGraph, linear_of
+from .export import OnnxGraph
 from .network import Normalise
 
 
@@ -53,26 +53,21 @@ def recurrent_onnx(learner: RecurrentPPO) -> bytes:
     policy: Any = learner.policy
     env: Any = learner.env
     normalise: Normalise = policy.pi_features_extractor
-    units, graph = policy.lstm_actor.hidden_size, OnnxGraph()
+    graph = OnnxGraph()
     x = graph.normalised(normalise.mean.numpy(), (normalise.seen[:, None] * normalise.scaling).numpy())
-    hidden, cell = _lstm(graph, x, policy.lstm_actor, units)
-    x = hidden
-    layers = [module for module in policy.mlp_extractor.policy_net if isinstance(module, torch.nn.Linear)]
-    for depth, layer in enumerate(layers):
-        x = graph.node("Tanh", [graph.gemm(x, *linear_of(layer), f"layer_{depth}")], f"active_{depth}")
-    x = graph.gemm(x, *linear_of(policy.action_net), "output")
-    x = graph.node(
-        "Clip",
-        [x, graph.constant("least_output", np.float32(-1.0)), graph.constant("most_output", np.float32(1.0))],
-        "move",
-    )
+    x = lstm_step(graph, x, policy.lstm_actor)
+    x = graph.through(x, [*policy.mlp_extractor.policy_net, policy.action_net])
+    x = graph.clip(x, -1.0, 1.0, "move")
     graph.drives(x, env.skip, env.scale)
-    graph.node("Concat", [hidden, cell], "next_state", axis=1)
-    return graph.finished(len(normalise.mean), 2 * units)
+    return graph.finished(len(normalise.mean), 2 * policy.lstm_actor.hidden_size)
 
 
-def _lstm(graph: OnnxGraph, x: str, lstm: torch.nn.LSTM, units: int) -> tuple[str, str]:
-    """One step of torch's LSTM: gates (input, forget, cell, output) = W x + U h + b."""
+def lstm_step(graph: OnnxGraph, x: str, lstm: torch.nn.LSTM) -> str:
+    """One step of torch's LSTM from ``state`` to ``next_state``, (hidden, cell) side by side; the new hidden values.
+
+    Gates (input, forget, cell, output) = W x + U h + b.
+    """
+    units = lstm.hidden_size
     half = graph.constant("halves", np.array([units, units], np.int64))
     graph.nodes_of("Split", ["state", half], ["hidden", "cell"], axis=1)
     gates = [parameter.detach().numpy() for parameter in (lstm.weight_ih_l0, lstm.weight_hh_l0)]
@@ -88,4 +83,5 @@ def _lstm(graph: OnnxGraph, x: str, lstm: torch.nn.LSTM, units: int) -> tuple[st
     gained = graph.node("Mul", [opened[0], new], "gained_cell")
     cell = graph.node("Add", [kept, gained], "next_cell")
     hidden = graph.node("Mul", [opened[2], graph.node("Tanh", [cell], "bent_cell")], "next_hidden")
-    return hidden, cell
+    graph.node("Concat", [hidden, cell], "next_state", axis=1)
+    return hidden

@@ -1,0 +1,206 @@
+"""A stable-baselines3 model as an agent file: ``python -m agents.from_sb3 best_model.zip --algo ppo --out mine.onnx``.
+
+For models trained elsewhere, by plain stable-baselines3 or RL-Zoo; ``train.py`` writes agent files by itself. A saved
+model is a pickle, and reading one can run any code: convert only what you trained. The agent file holds no code.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import stable_baselines3
+import torch
+from sb3_contrib import TQC, TRPO, RecurrentPPO
+from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from cz_gym.commands import OneLineParser, guarded
+from cz_gym.config import make_config
+from cz_gym.env import CzEnv
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from cz_gym.observation import OBSERVATIONS
+from cz_gym.vector import CzVectorEnv
+
+from .contract import AgentFileError, Contract, make_contract, write_agent
+from .export import OnnxGraph
+from .onnx_policy import OnnxPolicy
+from .recurrent import lstm_step
+from .settings import CostWeights
+from .validation import JUDGING, validate
+
+PROG = "python -m agents.from_sb3"
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+    "a2c": stable_baselines3.A2C,
+    "ddpg": stable_baselines3.DDPG,
+    "ppo": stable_baselines3.PPO,
+    "ppo_lstm": RecurrentPPO,
+    "sac": stable_baselines3.SAC,
+    "td3": stable_baselines3.TD3,
+    "tqc": TQC,
+    "trpo": TRPO,
+}
+"""By RL-Zoo's names."""
+SAMPLES, SLOTS = 50, 8
+"""Samples of as many pullers on which file and model must agree."""
+TOLERANCE = 1e-3
+"""Most that they may differ [action units]."""
+
+
+def save_agent(
+    path: Path,
+    model: BaseAlgorithm,
+    name: str,
+    normalisation: VecNormalize | None = None,
+    scenario: str = "randomized",
+    seed: int | None = None,
+) -> Contract:
+    """Write a trained model as an agent file called ``name``; its contract, with its figures on validation crystals.
+
+    ``normalisation`` is what its observations went through, by default that of the model's own environment;
+    ``scenario`` and ``seed`` say what it was trained on, the seed by default the model's. Raises AgentFileError for a
+    model that cannot be written, among them any whose file does not act as it does.
+    """
+    normalisation = normalisation or model.get_vec_normalize_env()
+    observation = _observation_of(model)
+    config = make_config(scenario, observation=observation)
+    content = to_onnx(model, normalisation)
+    facts = {
+        "observation": observation,
+        "channels": len(OBSERVATIONS[observation]),
+        "control_interval": config.control_interval,
+        "plant_hash": config.plant_hash,
+        "scenario": config.scenario.name,
+        "scenario_hash": config.scenario.hash,
+        "algorithm": name,
+        "training_seed": int((model.seed if seed is None else seed) or 0),
+        "training_steps": int(model.num_timesteps),
+        "validation_cost": 0.0,
+        "validation_rmse_mm": 0.0,
+    }
+    agent = OnnxPolicy.of(make_contract(content, **facts), content, config, path)
+    apart = disagreement(agent, model, normalisation)
+    if not apart <= TOLERANCE:
+        raise AgentFileError(f"{path}: the file would act otherwise than the model, by up to {apart:.2g}")
+    found = validate(agent, config, JUDGING, CostWeights())
+    facts |= {"validation_cost": found.cost, "validation_rmse_mm": found.rmse_mm}
+    return write_agent(path, content, **facts)
+
+
+def to_onnx(model: BaseAlgorithm, normalisation: VecNormalize | None) -> bytes:
+    """The model's deterministic action as a serialised ONNX model; AgentFileError if it cannot be written as one."""
+    policy: Any = model.policy
+    graph, x, state = OnnxGraph(), "observation", 0
+    if normalisation is not None and normalisation.norm_obs:
+        rms: Any = normalisation.obs_rms
+        spread = np.sqrt(rms.var + normalisation.epsilon)
+        x = graph.node("Sub", [x, graph.constant("mean", np.float32(rms.mean))], "centred")
+        x = graph.node("Div", [x, graph.constant("spread", np.float32(spread))], "scaled")
+        x = graph.clip(x, -normalisation.clip_obs, normalisation.clip_obs, "normalised")
+    actor = policy if isinstance(policy, ActorCriticPolicy) else getattr(policy, "actor", None)
+    if actor is None:
+        raise AgentFileError(f"{type(policy).__name__} has no actor that gives two continuous actions")
+    seen = actor.pi_features_extractor if isinstance(policy, ActorCriticPolicy) else actor.features_extractor
+    if not isinstance(seen, FlattenExtractor):
+        raise AgentFileError(
+            f"a policy with {type(seen).__name__} before its layers cannot be written as an agent file"
+        )
+    try:
+        if isinstance(policy, RecurrentActorCriticPolicy):
+            if policy.lstm_actor.num_layers > 1:
+                raise AgentFileError("a policy with more than one layer of LSTM cannot be written as an agent file")
+            x, state = lstm_step(graph, x, policy.lstm_actor), 2 * policy.lstm_actor.hidden_size
+        if isinstance(policy, ActorCriticPolicy):
+            x = graph.through(x, [policy.mlp_extractor.policy_net, policy.action_net])
+        elif hasattr(actor, "latent_pi"):
+            x = graph.through(x, [actor.latent_pi, actor.mu, torch.nn.Tanh()])
+        else:
+            x = graph.through(x, [actor.mu])
+    except TypeError as error:
+        raise AgentFileError(str(error)) from None
+    graph.clip(x, -1.0, 1.0, "action")
+    return graph.finished(int(np.prod(model.observation_space.shape or ())), state)
+
+
+def disagreement(agent: OnnxPolicy, model: BaseAlgorithm, normalisation: VecNormalize | None) -> float:
+    """The largest difference between the actions of file and model, on crystals that the file drives [action units]."""
+    envs = CzVectorEnv(SLOTS, observation=agent.observation, scenario=agent.contract.scenario)
+    observation, _ = envs.reset(seed=list(VALIDATION_SEEDS[:SLOTS]))
+    apart, memory, recalled = 0.0, None, None
+    starts = np.ones(SLOTS, bool)
+    for _ in range(SAMPLES):
+        seen = observation if normalisation is None else normalisation.normalize_obs(observation)
+        wanted, memory = model.predict(seen, memory, starts, deterministic=True)
+        action, recalled = agent.predict(observation, recalled, starts)
+        apart = max(apart, float(np.abs(action - wanted).max()))
+        observation, _, terminated, truncated, _ = envs.step(action)
+        starts = terminated | truncated
+    envs.close()
+    return apart
+
+
+def _observation_of(model: BaseAlgorithm) -> str:
+    """The observation mode of the model's channels."""
+    shape = model.observation_space.shape
+    named = [name for name, channels in OBSERVATIONS.items() if shape == (len(channels),)]
+    if not named:
+        lengths = ", ".join(f"{name} {len(channels)}" for name, channels in OBSERVATIONS.items())
+        raise AgentFileError(f"the model reads an observation of shape {shape}; known: {lengths}")
+    if model.action_space.shape != (2,):
+        raise AgentFileError(f"the model's action has the shape {model.action_space.shape}, not (2,)")
+    return named[0]
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Convert a saved model."""
+    description = "Write a model of stable-baselines3 or RL-Zoo as an agent file, which the benchmark runs."
+    epilog = "A saved model is a pickle: reading one can run any code, so convert only what you trained."
+    parser = OneLineParser(PROG, description, epilog)
+    parser.add_argument("model", type=Path, help="saved model (.zip)")
+    parser.add_argument("--algo", choices=sorted(ALGORITHMS), required=True, help="algorithm, by RL-Zoo's name")
+    parser.add_argument(
+        "--vecnormalize", type=Path, metavar="PKL", help="saved VecNormalize, if it was trained with one"
+    )
+    parser.add_argument("--name", help="what the agent is called (default: the algorithm)")
+    parser.add_argument("--scenario", default="randomized", help="scenario it was trained on (default: %(default)s)")
+    parser.add_argument("--seed", type=int, help="training seed (default: the model's)")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="agent file to write (.onnx)")
+    given = parser.parse_args(argv)
+    return guarded(PROG, lambda: _convert(given), "train")
+
+
+def _convert(given: argparse.Namespace) -> int:
+    if given.out.suffix != ".onnx":
+        raise AgentFileError(f"{given.out}: an agent file ends in .onnx")
+    model = _read(given.model, lambda: ALGORITHMS[given.algo].load(given.model, device="cpu"))
+    observation = _observation_of(model)
+    normalisation = None
+    if given.vecnormalize:
+        env = DummyVecEnv([lambda: CzEnv(observation=observation)])
+        normalisation = _read(given.vecnormalize, lambda: VecNormalize.load(str(given.vecnormalize), env))
+    contract = save_agent(
+        given.out, model, given.algo if given.name is None else given.name, normalisation, given.scenario, given.seed
+    )
+    said = f"mean RMSE {contract.validation_rmse_mm:.3f} mm on {len(JUDGING)} validation episodes"
+    print(f"wrote {given.out}: {contract.algorithm} after {contract.training_steps:,} steps, {said}")
+    return 0
+
+
+def _read(path: Path, load: Any) -> Any:
+    """What a file of stable-baselines3 holds; AgentFileError in one line, whatever its many ways to be broken raise."""
+    if not path.is_file():
+        raise AgentFileError(f"{path}: no such file")
+    try:
+        return load()
+    except Exception as error:
+        raise AgentFileError(f"{path}: not what --algo and stable-baselines3 say it is ({error})") from None
+
+
+if __name__ == "__main__":
+    sys.exit(main())
