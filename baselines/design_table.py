@@ -7,6 +7,7 @@ every column shows the worst. Where a scenario has settings of its own, these fo
 
 from __future__ import annotations
 
+import argparse
 import csv
 import io
 import json
@@ -20,7 +21,7 @@ import numpy as np
 from gymnasium.utils.seeding import np_random
 
 from cz_gym.batch import new_key
-from cz_gym.commands import OneLineParser, interrupted
+from cz_gym.commands import OneLineParser, guarded
 from cz_gym.config import Config, make_config
 from cz_gym.episode import draw_factors, randomised
 from cz_gym.evaluation.files import check_writable, write_files
@@ -218,20 +219,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--pullers", type=int, default=50, help="random pullers for the worst case, at most 500")
     parser.add_argument("--out", type=Path, default=Path("results/design"), help="folder of design.md, .csv and .json")
     args = parser.parse_args(arguments)
-    try:
-        if not 1 <= args.pullers <= 500:
-            raise ValueError(f"--pullers must be between 1 and 500, not {args.pullers}")
-        check_writable(args.out)
-        names = args.controllers or [entry.name for entry in CONTROLLERS if entry.default]
-        rows, skipped = table(names, args.pullers)
-        text = as_markdown(rows, skipped)
-        contents = {"design.md": text, "design.csv": as_csv(rows), "design.json": as_json(rows, skipped)}
-        write_files({args.out / name: content.encode() for name, content in contents.items()})
-    except (ValueError, ImportError, OSError) as error:
-        print(f"design_table: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return interrupted("design_table")
+    return guarded(parser.prog, lambda: _tabulate(args), "benchmark")
+
+
+def _tabulate(args: argparse.Namespace) -> int:
+    if not 1 <= args.pullers <= 500:
+        raise ValueError(f"--pullers must be between 1 and 500, not {args.pullers}")
+    check_writable(args.out)
+    names = args.controllers or [entry.name for entry in CONTROLLERS if entry.default]
+    rows, skipped = table(names, args.pullers)
+    text = as_markdown(rows, skipped)
+    contents = {"design.md": text, "design.csv": as_csv(rows), "design.json": as_json(rows, skipped)}
+    write_files({args.out / name: content.encode() for name, content in contents.items()})
     print(text, end="")
     return 0
 

@@ -7,13 +7,14 @@ autocorrelation), and the sign of the pull-speed gain that identification from t
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from cz_gym.commands import OneLineParser, interrupted
+from cz_gym.commands import OneLineParser, guarded
 from cz_gym.config import make_config
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import Rollout, rollout
@@ -96,16 +97,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--scenario", default="randomized")
     parser.add_argument("--model", choices=["I", "II"], help="one model instead of the scenario's mix")
     args = parser.parse_args(arguments)
-    try:
-        if not 1 <= args.episodes <= len(VALIDATION):
-            raise ValueError(f"--episodes must be between 1 and {len(VALIDATION)}, not {args.episodes}")
-        config = make_config(args.scenario, args.model)
-        found = facts(rollout(tuned("industrial", config), config, VALIDATION[: args.episodes]))
-    except ValueError as error:
-        print(f"industrial_check: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return interrupted("industrial_check")
+    return guarded(parser.prog, lambda: _check(args), "benchmark")
+
+
+def _check(args: argparse.Namespace) -> int:
+    if not 1 <= args.episodes <= len(VALIDATION):
+        raise ValueError(f"--episodes must be between 1 and {len(VALIDATION)}, not {args.episodes}")
+    config = make_config(args.scenario, args.model)
+    found = facts(rollout(tuned("industrial", config), config, VALIDATION[: args.episodes]))
     print(f"{'':<20}{'logged':>10}{'here':>10}")
     for name, logged, here in zip(Facts._fields, LOGGED, found, strict=True):
         print(f"{name:<20}{logged:>10.3g}{here:>10.3g}")

@@ -7,6 +7,7 @@ never touched; sweep, finals and choice are kept in results/tuning.
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from cz_gym.commands import OneLineParser, interrupted
+from cz_gym.commands import OneLineParser, guarded
 from cz_gym.evaluation.files import check_writable, write_files
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 
@@ -74,31 +75,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--validation", type=int, default=100, help="validation episodes a final")
     parser.add_argument("--output", type=Path, default=None, help="default in results/tuning")
     given = parser.parse_args(arguments)
+    return guarded(parser.prog, lambda: _sweep(given), "benchmark")
+
+
+def _sweep(given: argparse.Namespace) -> int:
     output = given.output or Path("results") / "tuning" / f"lqg-frontier-{given.scenario}.json"
-    try:
-        check_budget(episodes=given.episodes, validation=given.validation)
-        check_writable(output.parent)
-        swept = {base: sweep(base, given.scenario, given.episodes) for base in BASES}
-        finals = [
-            [
-                final(base, given.scenario, activity, weight_for(activity, swept[base]), given.validation)
-                for base in BASES
-            ]
-            for activity in ACTIVITIES
-        ]
-        found = {
-            "scenario": given.scenario,
-            "budget": {"episodes": given.episodes, "validation": given.validation},
-            "chosen": [better(pair) for pair in finals],
-            "finals": [entry for pair in finals for entry in pair],
-            "sweep": [entry for base in BASES for entry in swept[base]],
-        }
-        write_files({output: (json.dumps(found, indent=1) + "\n").encode()})
-    except (OSError, ValueError) as error:
-        print(f"lqg_frontier: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return interrupted("lqg_frontier")
+    check_budget(episodes=given.episodes, validation=given.validation)
+    check_writable(output.parent)
+    swept = {base: sweep(base, given.scenario, given.episodes) for base in BASES}
+    finals = [
+        [final(base, given.scenario, activity, weight_for(activity, swept[base]), given.validation) for base in BASES]
+        for activity in ACTIVITIES
+    ]
+    found = {
+        "scenario": given.scenario,
+        "budget": {"episodes": given.episodes, "validation": given.validation},
+        "chosen": [better(pair) for pair in finals],
+        "finals": [entry for pair in finals for entry in pair],
+        "sweep": [entry for base in BASES for entry in swept[base]],
+    }
+    write_files({output: (json.dumps(found, indent=1) + "\n").encode()})
     print(json.dumps(found["chosen"], indent=1))
     return 0
 

@@ -6,6 +6,7 @@ validation seeds, which choose. Test seeds are never touched. Every candidate st
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from collections.abc import Callable, Sequence
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import NonlinearConstraint, minimize
 
-from cz_gym.commands import OneLineParser, interrupted
+from cz_gym.commands import OneLineParser, guarded
 from cz_gym.config import make_config
 from cz_gym.evaluation.files import check_writable, write_files
 from cz_gym.evaluation.metrics import metrics
@@ -182,39 +183,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--history", type=Path, help="choose again from this kept history, without a search")
     parser.add_argument("--output", type=Path, default=None, help="default in results/tuning")
     given = parser.parse_args(arguments)
-    try:
-        sizes = {name: getattr(given, name) for name in ("budget", "episodes", "validation", "finals", "finalists")}
-        check_budget(given.survive, **sizes)
-    except ValueError as error:
-        parser.error(str(error))
     output = given.output or Path("results") / "tuning" / file_name(given.controller, given.scenario)
     part = output.with_suffix(".part.json")
-    try:
-        check_writable(output.parent)
-        goal = GOALS[given.controller, given.scenario]
-        if given.history is None:
-            budget = {name: getattr(given, name) for name in ("budget", "episodes", "survive")}
-            history = History(keep=lambda entries: write_files({part: _text({"budget": budget, "history": entries})}))
-            search(goal, given.budget, given.episodes, given.survive, history)
-        else:
-            budget, history = read_history(given.history)
-        budget |= {"validation": given.validation, "finals": given.finals}
-        chosen = choose(goal, history, given.validation, given.finals, given.finalists)
-        found = {
-            "controller": given.controller,
-            "scenario": given.scenario,
-            "budget": budget,
-            "chosen": chosen,
-            "history": history.entries,
-        }
-        write_files({output: _text(found)})
-        part.unlink(missing_ok=True)
-    except (OSError, ValueError) as error:
-        print(f"cannot read or write: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        left = f"--history {part} chooses from the candidates met" if part.exists() else "nothing written"
-        return interrupted("lqg_tune", left)
+    left = f"--history {part} chooses from the candidates met, if any was"
+    return guarded(parser.prog, lambda: _tune(given, output, part), "benchmark", left)
+
+
+def _tune(given: argparse.Namespace, output: Path, part: Path) -> int:
+    sizes = {name: getattr(given, name) for name in ("budget", "episodes", "validation", "finals", "finalists")}
+    check_budget(given.survive, **sizes)
+    check_writable(output.parent)
+    goal = GOALS[given.controller, given.scenario]
+    if given.history is None:
+        budget = {name: getattr(given, name) for name in ("budget", "episodes", "survive")}
+        history = History(keep=lambda entries: write_files({part: _text({"budget": budget, "history": entries})}))
+        search(goal, given.budget, given.episodes, given.survive, history)
+    else:
+        budget, history = read_history(given.history)
+    budget |= {"validation": given.validation, "finals": given.finals}
+    chosen = choose(goal, history, given.validation, given.finals, given.finalists)
+    found = {
+        "controller": given.controller,
+        "scenario": given.scenario,
+        "budget": budget,
+        "chosen": chosen,
+        "history": history.entries,
+    }
+    write_files({output: _text(found)})
+    part.unlink(missing_ok=True)
     print(json.dumps(chosen, indent=1))
     return 0
 

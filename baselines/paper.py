@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from cz_gym.commands import OneLineParser, interrupted
+from cz_gym.commands import OneLineParser, guarded
 from cz_gym.evaluation.files import check_writable, write_files
 
 from . import paper_numbers, paper_rows
@@ -27,17 +27,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = OneLineParser(prog="python -m baselines.paper", description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("results/paper"), help="folder for the results")
     out: Path = parser.parse_args(arguments).out
-    try:
-        for package in ("control", "matplotlib", "tqdm"):
-            require(package)
-        check_writable(out)
-        results = _compute()
-        _write(out, results)
-    except (ImportError, OSError) as error:
-        print(f"baselines.paper: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return interrupted("baselines.paper")
+    return guarded(parser.prog, lambda: _compare(out), "benchmark")
+
+
+def _compare(out: Path) -> int:
+    for package in ("control", "matplotlib", "tqdm"):
+        require(package)
+    check_writable(out)
+    results = _compute()
+    _write(out, results)
     print(paper_rows.as_text(paper_rows.rows(results)))
     print(f"\nreport: {out / 'report.md'}")
     return 0

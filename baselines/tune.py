@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.commands import OneLineParser, interrupted
+from cz_gym.commands import OneLineParser, guarded
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation.files import check_writable, write_files
 from cz_gym.evaluation.metrics import metrics
@@ -225,23 +225,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="seed of the search")
     parser.add_argument("--out", type=Path, default=Path("results/tuning"), help="folder of histories and choices")
     args = parser.parse_args(arguments)
-    try:
-        check(args)
-        config = make_config(args.scenario)
-        space = space_of(args.controller, config.scenario.name)
-        folder = args.out / space.name / config.scenario.name
-        check_writable(folder)
-        survive = args.survive if config.scenario.name == "randomized" else 0
-        training = Episodes(config, TRAINING[: args.episodes], TRAINING[:survive])
-        validation = Episodes(config, VALIDATION[: args.validation], VALIDATION[: args.validation * (survive > 0)])
-        trials = search(space, training, args.trials, folder / "history.csv", args.seed)
-        judged = choose(space, trials, args.finalists, validation)
-        write_files({folder / "chosen.json": report(space, trials, judged, training, validation).encode()})
-    except (ValueError, ImportError, OSError) as error:
-        print(f"tune: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return interrupted("tune", "the same command goes on from the trials in its history")
+    left = "the same command goes on from the trials in its history"
+    return guarded(parser.prog, lambda: _tune(args), "benchmark", left)
+
+
+def _tune(args: argparse.Namespace) -> int:
+    check(args)
+    config = make_config(args.scenario)
+    space = space_of(args.controller, config.scenario.name)
+    folder = args.out / space.name / config.scenario.name
+    check_writable(folder)
+    survive = args.survive if config.scenario.name == "randomized" else 0
+    training = Episodes(config, TRAINING[: args.episodes], TRAINING[:survive])
+    validation = Episodes(config, VALIDATION[: args.validation], VALIDATION[: args.validation * (survive > 0)])
+    trials = search(space, training, args.trials, folder / "history.csv", args.seed)
+    judged = choose(space, trials, args.finalists, validation)
+    write_files({folder / "chosen.json": report(space, trials, judged, training, validation).encode()})
     print(f"{space.name} on {config.scenario.name}: {judged[0].score}")
     print(build(space, judged[0].values))
     return 0

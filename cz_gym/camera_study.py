@@ -22,7 +22,7 @@ from .camera import Camera, View, make_view
 from .camera_image import picture
 from .camera_rays import make_scene
 from .camera_ring import RingDetector, wall_edge
-from .commands import OneLineParser, interrupted
+from .commands import OneLineParser, guarded
 from .env import CzEnv
 from .evaluation.files import check_writable, write_files
 from .meniscus import hurle_ring_offset
@@ -200,28 +200,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = OneLineParser("python -m cz_gym.camera_study", "Measure the camera's view and draw it.")
     parser.add_argument("--out", type=Path, default=Path("results/camera"), metavar="FOLDER", help="%(default)s")
     out = parser.parse_args(arguments).out
-    try:
-        from .camera_figures import response_figure, section_figure, view_figure
-    except ImportError as error:
-        print(f'cz_gym.camera_study: {error.name} is missing: pip install "cz-gym[benchmark]"', file=sys.stderr)
-        return 2
-    try:
-        check_writable(out)
-        study = measure()
-        text = json.dumps(numbers(study), indent=1, allow_nan=False) + "\n"
-        write_files(
-            {
-                out / "camera.json": text.encode(),
-                out / "view.png": view_figure(study),
-                out / "section.png": section_figure(study),
-                out / "response.png": response_figure(study),
-            }
-        )
-    except OSError as error:
-        print(f"cz_gym.camera_study: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return interrupted("cz_gym.camera_study")
+    return guarded(parser.prog, lambda: _study(out), "benchmark")
+
+
+def _study(out: Path) -> int:
+    from .camera_figures import response_figure, section_figure, view_figure
+
+    check_writable(out)
+    study = measure()
+    text = json.dumps(numbers(study), indent=1, allow_nan=False) + "\n"
+    write_files(
+        {
+            out / "camera.json": text.encode(),
+            out / "view.png": view_figure(study),
+            out / "section.png": section_figure(study),
+            out / "response.png": response_figure(study),
+        }
+    )
     print(text, end="")
     return 0
 

@@ -7,6 +7,8 @@ import sys
 from collections.abc import Callable
 from typing import NoReturn
 
+from gymnasium.error import DependencyNotInstalled
+
 INTERRUPTED = 130
 """Exit code of a command that Ctrl-C ended."""
 
@@ -33,7 +35,7 @@ def guarded(prog: str, body: Callable[[], int], extra: str, left: str = "nothing
         said = f'{error.name} is missing: pip install "cz-gym[{extra}]"' if error.name else str(error)
     except OSError as error:
         said = f"{error.filename or 'output'}: {error.strerror}" if error.strerror else str(error)
-    except ValueError as error:
+    except (ValueError, DependencyNotInstalled) as error:
         said = str(error)
     except KeyboardInterrupt:
         return interrupted(prog, left)

@@ -13,9 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gymnasium.error import DependencyNotInstalled
-
-from .commands import OneLineParser, interrupted
+from .commands import OneLineParser, guarded
 
 if TYPE_CHECKING:
     from .rendering.duel import Side
@@ -49,29 +47,23 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
 def main(argv: list[str] | None = None) -> int:
     """Film and write; 0 when done, 2 for bad input or a missing package, 130 when interrupted."""
     arguments = parse(argv)
-    try:
-        if not 2 <= arguments.frames <= 1000:
-            raise ValueError(f"--frames must be 2 to 1000, not {arguments.frames}")
-        if arguments.seed < 0:
-            raise ValueError(f"--seed must not be negative, not {arguments.seed}")
-        if arguments.out.suffix != ".gif":
-            raise ValueError(f"--out must end in .gif, not {str(arguments.out)!r}")
-        import PIL.Image  # noqa: F401  (missing? say so before the work, not after it)
+    return guarded(PROG, lambda: _make(arguments), "render,benchmark")
 
-        from .evaluation.files import check_writable, write_files
 
-        check_writable(arguments.out.resolve().parent)
-        content = film(arguments.scenario, arguments.seed, arguments.frames, arguments.agent)
-        write_files({arguments.out.resolve(): content})
-    except KeyboardInterrupt:
-        return interrupted(PROG)
-    except ImportError as error:
-        missing = f'{error.name} is missing: pip install "cz-gym[render,benchmark]"' if error.name else error
-        print(f"{PROG}: {missing}", file=sys.stderr)
-        return 2
-    except (ValueError, OSError, DependencyNotInstalled) as error:
-        print(f"{PROG}: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+def _make(arguments: argparse.Namespace) -> int:
+    if not 2 <= arguments.frames <= 1000:
+        raise ValueError(f"--frames must be 2 to 1000, not {arguments.frames}")
+    if arguments.seed < 0:
+        raise ValueError(f"--seed must not be negative, not {arguments.seed}")
+    if arguments.out.suffix != ".gif":
+        raise ValueError(f"--out must end in .gif, not {str(arguments.out)!r}")
+    import PIL.Image  # noqa: F401  (missing? say so before the work, not after it)
+
+    from .evaluation.files import check_writable, write_files
+
+    check_writable(arguments.out.resolve().parent)
+    content = film(arguments.scenario, arguments.seed, arguments.frames, arguments.agent)
+    write_files({arguments.out.resolve(): content})
     print(f"wrote {arguments.out}: {arguments.frames} frames, {len(content) / 1e6:.2f} MB")
     return 0
 

@@ -6,6 +6,7 @@ while is busy for all. Steps per second count every slot's step, resets included
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import statistics
@@ -18,7 +19,7 @@ from typing import Any, NamedTuple
 from . import speed_cases as cases
 from . import speed_peers as peers
 from . import speed_training as training
-from .commands import OneLineParser, interrupted
+from .commands import OneLineParser, guarded
 from .evaluation.files import check_writable, write_files
 from .speed_cases import THREADS, Case, Skipped
 from .speed_costs import KIB, megabytes, memory_per_slot, reset_seconds, start_seconds
@@ -204,24 +205,20 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="fewer repeats, up to 4,096 slots: under 40 s")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures here")
     arguments = parser.parse_args(argv)
-    try:
-        if arguments.json is not None:
-            if arguments.json.is_dir():
-                raise IsADirectoryError(f"{arguments.json} is a folder")
-            check_writable(arguments.json.parent)
-        with peers.silenced():
-            result, text = run(QUICK if arguments.quick else FULL, arguments.quick, _say)
-        _say("")
-        print(text)
-        if arguments.json is not None:
-            write_files({arguments.json: (json.dumps(result, indent=1, allow_nan=False) + "\n").encode()})
-    except OSError as error:
-        said = f"{error.filename}: {error.strerror}" if error.filename else str(error)
-        print(f"cz_gym.speed: {said}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        _say("")
-        return interrupted("cz_gym.speed")
+    return guarded(parser.prog, lambda: _measure(arguments), "benchmark")
+
+
+def _measure(arguments: argparse.Namespace) -> int:
+    if arguments.json is not None:
+        if arguments.json.is_dir():
+            raise IsADirectoryError(f"{arguments.json} is a folder")
+        check_writable(arguments.json.parent)
+    with peers.silenced():
+        result, text = run(QUICK if arguments.quick else FULL, arguments.quick, _say)
+    _say("")
+    print(text)
+    if arguments.json is not None:
+        write_files({arguments.json: (json.dumps(result, indent=1, allow_nan=False) + "\n").encode()})
     return 0
 
 

@@ -15,9 +15,7 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from gymnasium.error import DependencyNotInstalled
-
-from ..commands import OneLineParser, interrupted
+from ..commands import OneLineParser, guarded
 
 PROG = "python -m cz_gym.rendering.speed"
 FRAMES = 180
@@ -43,18 +41,16 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
 def main(argv: list[str] | None = None) -> int:
     """Measure and print; 0 when done, 2 for bad input or a missing package, 130 when interrupted."""
     arguments = parse(argv)
-    try:
-        if not 1 <= arguments.rounds <= 100:
-            raise ValueError(f"--rounds must be 1 to 100, not {arguments.rounds}")
-        from .scene import parse_size
+    return guarded(PROG, lambda: _measure_all(arguments), "render")
 
-        size = parse_size(arguments.size)
-        rounds = [measure(size) for _ in range(arguments.rounds)]
-    except KeyboardInterrupt:
-        return interrupted(PROG)
-    except (ValueError, ImportError, DependencyNotInstalled) as error:
-        print(f"{PROG}: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+
+def _measure_all(arguments: argparse.Namespace) -> int:
+    if not 1 <= arguments.rounds <= 100:
+        raise ValueError(f"--rounds must be 1 to 100, not {arguments.rounds}")
+    from .scene import parse_size
+
+    size = parse_size(arguments.size)
+    rounds = [measure(size) for _ in range(arguments.rounds)]
     print(f"{'frames a second, median of ' + str(len(rounds)):52} {'clock':>7} {'core':>7}")
     for name in rounds[0]:
         clock, core = (statistics.median(column) for column in zip(*(each[name] for each in rounds), strict=True))
