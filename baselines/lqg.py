@@ -94,9 +94,12 @@ def solve(settings: LQGSettings, dt: float, puller: Puller, meniscus: MeniscusMo
     return Gains(eye, regulator(model, settings.weights, dt, samples_ahead(dt)))
 
 
-def solve_each(settings: LQGSettings, dt: float, pullers: Sequence[Puller], meniscus: MeniscusModel = HURLE) -> Gains:
-    """The same for one puller a slot."""
-    eyes, laws = zip(*(solve.__wrapped__(settings, dt, puller, meniscus) for puller in pullers), strict=True)
+def solve_each(
+    settings: Sequence[LQGSettings], dt: float, pullers: Sequence[Puller], meniscus: MeniscusModel = HURLE
+) -> Gains:
+    """The same for settings and a puller a slot; settings may differ in the noise that drives the plant."""
+    pairs = zip(settings, pullers, strict=True)
+    eyes, laws = zip(*(solve.__wrapped__(each, dt, puller, meniscus) for each, puller in pairs), strict=True)
     model = PlantModel(*(np.stack(parts) for parts in zip(*(eye.model for eye in eyes), strict=True)))
     puller = Puller(*(np.array(values) for values in zip(*pullers, strict=True)))  # type: ignore[arg-type]
     law = Regulator(*(np.stack(parts) for parts in zip(*laws, strict=True)))

@@ -18,16 +18,18 @@ from gymnasium.utils import seeding
 
 from cz_gym.batch import new_key
 from cz_gym.config import Config
-from cz_gym.episode import draw_factors, randomised
+from cz_gym.episode import draw_episode, draw_factors, new_series, randomised
 from cz_gym.observation import HEATER_SCALE, STATE, Measured, scales
 from cz_gym.plant import Puller, hidden_load, make_puller
 
 from . import kalman
-from .lqg import LQG, Gains, act, solve_each
+from .lqg import LQG, Gains, LQGSettings, act, solve_each
 from .lqg_model import DRIFT, FAST, PLANT, SLOW, STATES, NoiseModel, load_per_drift
 from .policy import Floats, batched, fresh, to_action
 from .preview import look_ahead, samples_ahead
 
+_SMOOTHEST = 0.01
+"""Least standard deviation of a fluctuation [K]: a filter that expects none would not see what its model leaves out."""
 _TINY = 1e-9
 """Share of the fluctuations' variance by which their sum is taken to be uncertain, for Riccati's equation."""
 
@@ -42,14 +44,26 @@ def pullers_of(config: Config, seeds: Sequence[int]) -> tuple[Puller, ...]:
     return tuple(pullers)
 
 
+def roughness_of(config: Config, seeds: Sequence[int]) -> tuple[tuple[float, float], ...]:
+    """Standard deviations of fast and slow interface fluctuation [K] of those seeds' first episodes."""
+    drawn = []
+    for seed in seeds:
+        random, _ = seeding.np_random(seed)
+        episode = draw_episode(config.scenario, new_key(random), new_series(1, 0))
+        drawn.append((float(episode.sd_fast), float(episode.sd_slow)))
+    return tuple(drawn)
+
+
 @dataclass(frozen=True)
 class ToldLQG(LQG):
     """The LQG with each slot's own puller as its model: what knowing the parameters is worth.
 
-    Until it is told, it takes the nominal puller for everyone's, as the LQG does.
+    With ``roughness`` its filter also has each slot's own interface fluctuation, which is as rough on one crystal as on
+    the next on average only. Until it is told, it takes the nominal puller for everyone's, as the LQG does.
     """
 
     told: Gains | None = None
+    roughness: bool = False
 
     @property
     def gains(self) -> Gains:
@@ -65,8 +79,17 @@ class ToldLQG(LQG):
 
     def for_episodes(self, config: Config, seeds: Sequence[int]) -> ToldLQG:
         """The same controller for those episodes, one a slot."""
-        told = solve_each(self.settings, config.control_interval, pullers_of(config, seeds), config.meniscus)
+        settings = [self.settings] * len(seeds)
+        if self.roughness:
+            settings = [_as_rough(self.settings, *each) for each in roughness_of(config, seeds)]
+        told = solve_each(settings, config.control_interval, pullers_of(config, seeds), config.meniscus)
         return replace(self, told=told)
+
+
+def _as_rough(settings: LQGSettings, fast: float, slow: float) -> LQGSettings:
+    """The settings for a melt of that roughness [K]."""
+    noise = replace(settings.noise, fast_sd=max(fast, _SMOOTHEST), slow_sd=max(slow, _SMOOTHEST))
+    return replace(settings, noise=noise)
 
 
 def _check_slots(told: Gains | None, observation: Any) -> None:

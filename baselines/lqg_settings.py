@@ -179,6 +179,11 @@ def lqg_at(activity: float, config: Config) -> LQG:
     return made(frontier_settings(activity, config.scenario.name), config)
 
 
+def lqg_told(law: LQG) -> ToldLQG:
+    """Bound: that LQG told each puller's parameters and how rough its melt is."""
+    return ToldLQG(law.settings, law.control_interval, law.parameters, law.meniscus, roughness=True)
+
+
 def lqg_true(config: Config) -> ToldLQG:
     """Bound: the LQG told each puller's parameters."""
     settings = settings_of("lqg", config.scenario.name)

@@ -10,6 +10,7 @@ from cz_gym.config import Config
 from . import lqg_settings
 from .clairvoyant import Clairvoyant
 from .compensated_pid import CompensatedPID
+from .lqg import LQG
 from .open_loop import OpenLoop
 from .policy import Policy
 from .tuned import tuned
@@ -61,6 +62,17 @@ def _lqg_at(activity: float) -> Entry:
     )
 
 
+def _told(name: str, make: Callable[[Config], LQG]) -> Entry:
+    return Entry(
+        f"{name}-told",
+        lambda config: lqg_settings.lqg_told(make(config)),
+        "measured",
+        f"bound: {name} told the puller's parameters and how rough its melt is",
+        default=False,
+        told=True,
+    )
+
+
 def _ekf_mpc(config: Config) -> Policy:
     from .ekf_mpc import ekf_mpc
 
@@ -87,6 +99,8 @@ CONTROLLERS: tuple[Entry, ...] = (
         default=False,
         told=True,
     ),
+    _told("lqg-quiet", lqg_settings.lqg_quiet),
+    _told(lqg_settings.family_name(IN_TABLE), lambda config: lqg_settings.lqg_at(IN_TABLE, config)),
     Entry(
         "full-information",
         lqg_settings.full_information,

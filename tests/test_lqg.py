@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from baselines import kalman, lqg_bounds, lqg_linear
+from baselines import kalman, lqg_linear
 from baselines.lqg import LQG, LQGSettings, at_rest, solve
 from baselines.lqg_model import DRIFT, FAST, HEATER, PLANT, SLOW, STATES, NoiseModel, load_per_drift, plant_model
 from baselines.lqr import Weights, quadratic_cost, regulator
@@ -286,46 +286,3 @@ def test_without_disturbance_it_stays_where_it_is():
     config = make_config("nominal", model=0.5, horizon=1800.0)
     run = rollout(LQG(), config, [0])
     assert metrics(run).max_error_mm[0] < 1e-3
-
-
-def test_the_bounds_know_the_pullers_the_environment_draws():
-    config = make_config("randomized", horizon=600.0)
-    env = CzVectorEnv(3, horizon=600.0)
-    env.reset(seed=[5, 9, 2_000_000])
-    drawn = env._batch.memory.slots["puller"]
-    for slot, puller in enumerate(lqg_bounds.pullers_of(config, (5, 9, 2_000_000))):
-        np.testing.assert_allclose([drawn[slot][name] for name in puller._fields], puller, rtol=1e-12)
-
-
-def test_a_told_nominal_puller_is_the_lqg():
-    settings = LQGSettings(lam=1.0)
-    config = make_config("only-interface", horizon=900.0)
-    told = rollout(lqg_bounds.ToldLQG(settings), config, [0, 1, 2])
-    plain = rollout(LQG(settings), config, [0, 1, 2])
-    np.testing.assert_allclose(told.signals.v_p, plain.signals.v_p, rtol=1e-5)
-
-
-def test_a_bound_nobody_told_is_the_controller_it_bounds():
-    for observation in observations(steps=3):
-        expected = LQG().predict(observation)[0]
-        np.testing.assert_array_equal(lqg_bounds.ToldLQG().predict(observation)[0], expected)
-
-
-def test_a_bound_told_other_slots_refuses():
-    told = lqg_bounds.ToldLQG().for_episodes(make_config("randomized"), [1, 2])
-    with pytest.raises(ValueError, match="told 2 pullers, got 3 slots"):
-        told.predict(next(observations()))
-
-
-def test_the_drift_is_read_off_its_load():
-    drift = np.linspace(-7.5, 7.5, 7)
-    np.testing.assert_allclose(lqg_bounds._drift(hidden_load(drift, PULLER), PULLER), drift, atol=1e-6)
-
-
-def test_full_information_beats_the_filter_on_the_same_episodes():
-    measured_config = make_config("randomized", horizon=3600.0)
-    state_config = replace(measured_config, observation="state")
-    seeds = range(12)
-    full = metrics(rollout(lqg_bounds.FullInformation(), state_config, seeds))
-    filtered = metrics(rollout(LQG(), measured_config, seeds))
-    assert full.rmse_mm.mean() < filtered.rmse_mm.mean()
