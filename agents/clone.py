@@ -58,9 +58,11 @@ def demonstrate(
 ) -> Shown:
     """Ask the teacher, ``predict`` on "history", at every sample of one episode a seed.
 
-    It drives itself unless there is a ``driver``, a function of the observation; noise of that spread is added.
+    A teacher with ``for_episodes`` is told what no controller knows of those episodes. It drives itself unless there is a ``driver``, a function of the observation; noise of that spread is added.
     """
     n = len(seeds)
+    if hasattr(teacher, "for_episodes"):
+        teacher = teacher.for_episodes(config, seeds)
     env = CzVectorEnv(n, scenario=config.scenario, observation="history", control_interval=config.control_interval)
     random = np.random.default_rng(seeds[0])
     observation, info = env.reset(seed=list(seeds))

@@ -100,6 +100,7 @@ CONTROLLERS: tuple[Entry, ...] = (
         told=True,
     ),
     _told("lqg-quiet", lqg_settings.lqg_quiet),
+    _told(lqg_settings.family_name(0.013), lambda config: lqg_settings.lqg_at(0.013, config)),
     _told(lqg_settings.family_name(IN_TABLE), lambda config: lqg_settings.lqg_at(IN_TABLE, config)),
     Entry(
         "full-information",
