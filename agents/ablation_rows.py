@@ -1,4 +1,4 @@
-"""The rows of the ablation: each is the ``ppo`` recipe with one thing changed."""
+"""The rows of the ablation: each is ``PPO()`` with one thing changed, the recipe that ``ppo`` grew from."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from cz_gym.units import MINUTE
 
-from .settings import PPO, SCRATCH, ActionHead, Choice, Clone, CostWeights, Recipe
+from .settings import PPO, RECIPES, SCRATCH, ActionHead, Choice, Clone, CostWeights, Recipe
 
 BASE = "base"
 """Name of the row that the others are compared with."""
@@ -70,11 +70,28 @@ def _shown(name: str, width: float, meaning: str) -> Row:
     return Row(f"shown-{name}", "beginning", meaning, _recipe(changed))
 
 
+_TOLD = RECIPES["ppo"].recipe.clone or _TEACHER
+_MORE_SHOWN = replace(_TOLD, teacher=_TEACHER.teacher)
 _FROM_NOTHING = replace(SCRATCH, recipe=replace(SCRATCH.recipe, weights=_RECIPE.weights))
 
 _ROWS = (
-    Row(BASE, BASE, f"the recipe that ships, for all the steps: imitates {_TEACHER.teacher}, then PPO", _PPO),
-    Row("fifth", BASE, "a fifth of the steps, as the recipe ships", _PPO, share=0.2),
+    Row(BASE, BASE, f"imitates {_TEACHER.teacher}, then PPO; for all the steps", _PPO),
+    Row("fifth", BASE, "a fifth of the steps", _PPO, share=0.2),
+    Row(
+        "told",
+        "beginning",
+        f"a fifth of the steps; imitates {_TOLD.teacher}, shown {_TOLD.rounds * _TOLD.episodes:,} crystals spread as the"
+        " scenario's own: the imitation that ships",
+        _recipe(replace(_RECIPE, clone=_TOLD)),
+        share=0.2,
+    ),
+    Row(
+        "more-shown",
+        "beginning",
+        f"the same, but imitates {_MORE_SHOWN.teacher}",
+        _recipe(replace(_RECIPE, clone=_MORE_SHOWN)),
+        share=0.2,
+    ),
     Row("scratch", "beginning", "no imitation: ppo-scratch's settings, the same reward", _FROM_NOTHING),
     Row(
         "absolute",

@@ -18,7 +18,7 @@ from cz_gym.commands import OneLineParser, guarded
 from cz_gym.config import make_config
 
 from .ablation_rows import Row
-from .settings import PPO, RECIPES, Choice, CostWeights
+from .settings import PPO, RECIPES, Choice, Clone, CostWeights, Recipe
 
 PROG = "python -m agents.algorithms"
 
@@ -31,7 +31,13 @@ ROWS = (
     _row("ppo-scratch", "from nothing", "PPO; the critic also sees the true state"),
     _row("ppo-recurrent", "from nothing", "PPO of an LSTM, actor and critic (sb3-contrib); both see what is measured"),
     _row("sac", "from nothing", "soft actor-critic; both see what is measured"),
-    _row("ppo-quiet", "from an imitation", "imitates lqg-quiet, then PPO; the critic also sees the true state"),
+    Row(
+        "ppo-quiet",
+        "from an imitation",
+        "imitates lqg-quiet, then PPO; the critic also sees the true state (the shipped recipe of that name imitates"
+        " one that is told)",
+        PPO("ppo-quiet", Recipe(weights=CostWeights(), clone=Clone("lqg-quiet"))),
+    ),
 )
 """Every row, in the order of the table."""
 WEIGHTS = CostWeights()

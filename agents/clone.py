@@ -58,7 +58,8 @@ def demonstrate(
 ) -> Shown:
     """Ask the teacher, ``predict`` on "history", at every sample of one episode a seed.
 
-    A teacher with ``for_episodes`` is told what no controller knows of those episodes. It drives itself unless there is a ``driver``, a function of the observation; noise of that spread is added.
+    A teacher with ``for_episodes`` is told what no controller knows of those episodes. It drives itself unless there is
+    a ``driver``, a function of the observation; noise of that spread is added.
     """
     n = len(seeds)
     if hasattr(teacher, "for_episodes"):

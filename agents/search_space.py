@@ -1,4 +1,4 @@
-"""What the search turns of the ``ppo`` recipe, and the history of what it tried."""
+"""What the search turns of ``PPO()``, and the history of what it tried."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def values_of(choice: PPO) -> Values:
 
 
 def settings_of(values: Values, steps: int) -> PPO:
-    """The ``ppo`` recipe with its knobs turned, for so many steps."""
+    """``PPO()`` with its knobs turned, for so many steps."""
     told = dict(zip((knob.name for knob in KNOBS), values, strict=True))
     return replace(
         PPO(),

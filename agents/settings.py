@@ -88,6 +88,8 @@ class PPO:
 
     The imitation is good, so learning must not lose it: the critic learns first, the actor slowly, and only the last
     weights that move the pull speed. The heater acts over a quarter of an hour, which the discount does not see.
+    As they stand, without a name, these are the settings that :mod:`agents.ablation` takes apart and
+    :mod:`agents.search` turns; :data:`RECIPES` holds those that ship.
     """
 
     name: str = "ppo"
@@ -186,17 +188,23 @@ class RecurrentPPO:
 Choice = PPO | SAC | RecurrentPPO
 """Settings of any algorithm."""
 
+
 def _told(teacher: str) -> Clone:
     """Imitation of an LQG that is told each crystal's puller and roughness: what it shows has to be found out."""
     return Clone(f"{teacher}-told", rounds=6, episodes=480, width=1.0, epochs=6)
 
 
+def _weighed(pull_step: float) -> CostWeights:
+    """The cost that an LQG's regulator was made for (baselines/lqg_settings.py), as multiples of the environment's."""
+    return CostWeights(pull=0.11, pull_step=pull_step, heater_step=23.4)
+
+
 RECIPES: dict[str, Choice] = {
     choice.name: choice
     for choice in (
-        PPO(recipe=Recipe(weights=CostWeights(0.2, 0.2), clone=_told("lqg-at-0.02"))),
-        PPO("ppo-medium", Recipe(weights=CostWeights(0.5, 0.5), clone=_told("lqg-at-0.013"))),
-        PPO("ppo-quiet", Recipe(weights=CostWeights(), clone=_told("lqg-quiet"))),
+        PPO(recipe=Recipe(weights=_weighed(0.049), clone=_told("lqg-at-0.02"))),
+        PPO("ppo-medium", Recipe(weights=_weighed(0.295), clone=_told("lqg-at-0.013"))),
+        PPO("ppo-quiet", Recipe(weights=_weighed(1.22), clone=_told("lqg-quiet"))),
         PPO(
             "ppo-puller",
             Recipe(

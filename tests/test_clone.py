@@ -20,6 +20,7 @@ from agents.training import make_training, training_scenario, widened
 from agents.vec_env import CzVecEnv
 from agents.wrappers import TrainingReward
 from baselines.lqg_settings import lqg
+from baselines.registry import find_controller
 from cz_gym import CzVectorEnv
 from cz_gym.config import make_config
 from cz_gym.observation import HISTORY
@@ -79,6 +80,23 @@ def test_the_layers_learn_what_bends_the_teacher() -> None:
     before = np.abs(clone.acts(policy)(shown.observation) - shown.action)[:, 0].mean()
     clone.fit(policy, shown, settings.Clone("lqg", epochs=60, learning_rate=5e-3))
     assert np.abs(clone.acts(policy)(shown.observation) - shown.action)[:, 0].mean() < 0.5 * before
+
+
+def test_a_teacher_is_told_of_the_crystals_that_are_shown_and_the_imitation_is_not() -> None:
+    """The told teacher answers otherwise than the one it bounds to the same observations; no observation tells."""
+    rough = find_scenario("randomized")
+    rough = replace(rough, interface=replace(rough.interface, sd=(1.0, 1.0)))
+    config, seeds, none = CONFIG.with_scenario(rough), range(40, 48), (0.0, 0.0)
+    told, plain = (find_controller(name).make(make_config("randomized")) for name in ("lqg-quiet-told", "lqg-quiet"))
+    still = lambda seen: seen[:, [9, 10]]  # noqa: E731
+    one, other = (clone.demonstrate(teacher, config, seeds, none, still) for teacher in (told, plain))
+    np.testing.assert_array_equal(one.observation, other.observation)
+    expected, memory = told.for_episodes(config, seeds), None
+    env = CzVectorEnv(len(seeds), scenario=rough, observation="history", horizon=config.horizon)
+    observation, _ = env.reset(seed=list(seeds))
+    answer, memory = expected.predict(observation, memory, np.ones(len(seeds), np.bool_))
+    np.testing.assert_array_equal(one.action[: len(seeds)], answer)
+    assert np.abs(one.action - other.action).max() > 1e-3
 
 
 def test_lost_crystals_teach_nothing() -> None:
