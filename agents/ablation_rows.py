@@ -80,8 +80,8 @@ _ROWS = (
     Row(
         "told",
         "beginning",
-        f"a fifth of the steps; imitates {_TOLD.teacher}, shown {_TOLD.rounds * _TOLD.episodes:,} crystals spread as the"
-        " scenario's own: the imitation that ships",
+        f"a fifth of the steps; imitates {_TOLD.teacher}, shown {_TOLD.rounds * _TOLD.episodes:,} crystals spread as"
+        " the scenario's own: the imitation that ships",
         _recipe(replace(_RECIPE, clone=_TOLD)),
         share=0.2,
     ),

@@ -1,4 +1,4 @@
-"""The end of the search: its best trials once more, on other crystals and training seeds, beside what ships."""
+"""The end of the search: its best trials once more, on other crystals and training seeds, beside the recipe."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ def report(trials: Sequence[Trial], confirmed: Mapping[int, Floats], steps: int)
         "# Search of `ppo`'s hyperparameters",
         "",
         f"{len(trials)} trials of {steps:,} environment steps, {given_up} of them given up on the way; training seed 0."
-        f" Trial {SHIPPED} is what ships. Cost and RMSE are the last agent's on {len(CHOOSE)} validation crystals, less"
-        " those of the imitation that it began as: below zero, learning helped.",
+        f" Trial {SHIPPED} is the recipe as it stands. Cost and RMSE are the last agent's on {len(CHOOSE)} validation"
+        " crystals, less those of the imitation that it began as: below zero, learning helped.",
         "",
         f"| trial | {' | '.join(knob.name for knob in KNOBS)} | cost less start | RMSE less start [um] |",
         f"|--:|{'--:|' * (len(KNOBS) + 2)}",
@@ -83,7 +83,7 @@ def _confirmation(confirmed: Mapping[int, Floats]) -> list[str]:
         f"The best again, on {crystals} other validation crystals with {seeds} other training seeds; 95 % intervals,"
         " bootstrap over both.",
         "",
-        "| trial | cost less start | cost less that of what ships | RMSE less that of what ships [um] |",
+        "| trial | cost less start | cost less that of the recipe | RMSE less that of the recipe [um] |",
         "|--:|--:|--:|--:|",
     ]
     better = []
@@ -94,8 +94,8 @@ def _confirmation(confirmed: Mapping[int, Floats]) -> list[str]:
         lines.append(f"| {number} | {' | '.join(entries)} |")
         if number != SHIPPED and apart[0].ci95 is not None and apart[0].ci95[1] < 0.0:
             better.append(str(number))
-    beaten = f"Beyond this noise, better than what ships: trial {', '.join(better)}." if better else ""
-    return [*lines, "", beaten or "None is better than what ships beyond this noise."]
+    beaten = f"Beyond this noise, better than the recipe: trial {', '.join(better)}." if better else ""
+    return [*lines, "", beaten or "None is better than the recipe beyond this noise."]
 
 
 def _text(estimate: Estimate, digits: int, unit: float) -> str:

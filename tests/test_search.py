@@ -1,4 +1,4 @@
-"""The search: begins with what ships, keeps what it tried, gives up the hopeless, says whether anything was found."""
+"""The search: begins with the recipe, keeps what it tried, gives up the hopeless, says whether anything was found."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def command(folder: Path, trials: int) -> list[str]:
     return ["--trials", str(trials), "--out", str(folder / "out"), "--work", str(folder / "work")]
 
 
-def test_a_search_begins_with_what_ships_and_goes_on(
+def test_a_search_begins_with_the_recipe_and_goes_on(
     simple: list[settings.PPO], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert search.main([*command(tmp_path, 12), "--finalists", "0"]) == 0
@@ -79,7 +79,7 @@ def test_a_search_begins_with_what_ships_and_goes_on(
     assert len(trials) == 30
     assert any(trial.pruned for trial in trials)
     assert min(trial.cost for trial in trials) < 0.5 * trials[0].cost
-    assert "better than what ships: trial" in (tmp_path / "out" / "report.md").read_text()
+    assert "better than the recipe: trial" in (tmp_path / "out" / "report.md").read_text()
     times = len(simple)
     assert search.main(command(tmp_path, 30)) == 0
     assert len(simple) == times
@@ -90,7 +90,7 @@ def test_a_search_begins_with_what_ships_and_goes_on(
 def test_a_search_without_a_find_says_so() -> None:
     noise = np.random.default_rng(0).normal(scale=1e-3, size=(2, 3, 50, 2))
     text = search_report.report([], {0: noise[0], 4: noise[1]}, 1000)
-    assert "None is better than what ships beyond this noise." in text
+    assert "None is better than the recipe beyond this noise." in text
     assert "trial 4" in search_report.report([], {0: noise[0], 4: noise[0] - 1e-4}, 1000)
 
 
