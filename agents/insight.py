@@ -52,6 +52,8 @@ from .trials import (
 PROG = "python -m agents.insight"
 BESIDE = ("lqg-at-0.02", "lqg", "paper-tuned")
 """Controllers that an agent is shown beside; its teacher is among them."""
+A_CRYSTAL = 3.0 * HOUR
+"""How long a crystal is grown [s]."""
 READINGS = tuple(channel.name for channel in MEASURED)
 MODELS = (("Model I", 1.0), ("Model II", 0.0))
 Answers = dict[str, dict[str, Any]]
@@ -84,7 +86,8 @@ class Margins(NamedTuple):
     plant: str
     at: str
     """Where the loop is opened."""
-    stable: bool
+    growth: float
+    """Time in which what grows fastest in the closed loop grows by e [s]; infinite if nothing does."""
     crossover: float
     """[rad/s]"""
     gain_up: float
@@ -104,7 +107,7 @@ def contenders(path: Path | None) -> tuple[Contender, ...]:
     file = path or shipped()
     contract, content = read_agent(file)
     name = "ppo-default" if path is None else contract.algorithm
-    config = crystal(3.0 * HOUR / MINUTE, contract.observation)
+    config = crystal(A_CRYSTAL / MINUTE, contract.observation)
     policy = OnnxPolicy.load(file, config)
     seen = {
         name: noisy_observations(policy, contract.observation),
@@ -142,16 +145,18 @@ def one_reading(contender: Contender, dt: float) -> Floats:
 
 
 def margins(contender: Contender, omega: Floats, dt: float) -> list[Margins]:
-    """Margins at both places on both models."""
+    """Margins at both places on both models; NaN where something grows within a crystal.
+
+    What grows more slowly is a network's use of its integral: no crystal feels it, and margins leave it out.
+    """
     frequency, loop = room("baselines.frequency"), room("baselines.sampled_loop")
     rows = []
     for plant, lam in MODELS:
-        stable = bool(loop.close(contender.system, make_puller(lam=lam), dt).stable)
+        growth = loop.close(contender.system, make_puller(lam=lam), dt).growth
         found = joined(contender, omega, lam, dt)
         for at in ("camera", "v_p"):
-            rows.append(
-                Margins(contender.name, plant, at, stable, *frequency.margins_of(found.opened(at), omega, dt, stable))
-            )
+            found_margins = frequency.margins_of(found.opened(at), omega, dt, growth > A_CRYSTAL)
+            rows.append(Margins(contender.name, plant, at, growth, *found_margins))
     return rows
 
 
@@ -220,7 +225,7 @@ def study(agent: Path | None, episodes: int, only_pictures: bool, tell: Callable
     dt = crystal(1.0, "measured").control_interval
     omega = room("baselines.frequency").frequencies(dt)
     acting = [contender for contender in taking_part if not contender.name.endswith(AT_REST)]
-    made = {each.name: each.make(crystal(3.0 * HOUR / MINUTE, each.observation)) for each in acting}
+    made = {each.name: each.make(crystal(A_CRYSTAL / MINUTE, each.observation)) for each in acting}
     answers: Answers = {}
     for trial in TRIALS:
         tell(trial.title)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cz_gym.evaluation.rollout import Signals
-from cz_gym.units import KILO, MM, MM_PER_MIN
+from cz_gym.units import HOUR, KILO, MM, MM_PER_MIN
 
 from .contract import Contract
 from .trials import DRAWS, JUMPS, LIMITS, TRIALS, Survival
@@ -53,10 +53,10 @@ def answer_figures(signals: Signals) -> dict[str, float]:
 
 
 def as_json(found: Found) -> str:
-    """``insight.json``; unstable or missing margins are null."""
+    """``insight.json``; margins that are missing, and the growth of what does not grow, are null."""
     rows = [
         {
-            name: None if isinstance(value, float) and math.isnan(value) else value
+            name: None if isinstance(value, float) and not math.isfinite(value) else value
             for name, value in row._asdict().items()
         }
         for row in found.margins
@@ -158,7 +158,15 @@ def _margins(found: Found) -> list[str]:
     rows = []
     for row in found.margins:
         numbers = ("-" if math.isnan(value) else f"{value:.3g}" for value in row[4:])
-        rows.append([row.controller, row.plant, row.at, "yes" if row.stable else "no", *numbers])
+        rows.append(
+            [
+                row.controller,
+                row.plant,
+                row.at,
+                "yes" if math.isinf(row.growth) else f"grows by e in {row.growth / HOUR:.3g} h",
+                *numbers,
+            ]
+        )
     return _table(heads, rows)
 
 

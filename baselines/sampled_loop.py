@@ -8,6 +8,7 @@ t_k are those applied over the interval before.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,6 +52,12 @@ class Loop(NamedTuple):
     def stable(self) -> bool:
         """Whether every pole lies inside the unit circle."""
         return bool(np.abs(np.linalg.eigvals(self.A)).max() < 1.0)
+
+    @property
+    def growth(self) -> float:
+        """Time in which the fastest growing mode grows by e [s]; infinite for a stable loop."""
+        largest = float(np.abs(np.linalg.eigvals(self.A)).max())
+        return self.dt / math.log(largest) if largest > 1.0 else math.inf
 
     def pick(self, output: str, inputs: tuple[str, ...]) -> StateSpace:
         """The part from some inputs to one output."""

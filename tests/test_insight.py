@@ -38,7 +38,7 @@ from baselines.frequency import frequencies, margins_of, opened
 from baselines.frequency import response as theirs
 from baselines.linear_form import linear_form
 from baselines.registry import find_controller
-from baselines.sampled_loop import close, root_mean_square, sampled_plant
+from baselines.sampled_loop import Loop, close, root_mean_square, sampled_plant
 from cz_gym.observation import HISTORY, MEASURED
 from cz_gym.plant import make_puller
 from cz_gym.scenarios import HARD, PULLER, RANDOMIZED
@@ -205,7 +205,7 @@ def test_pictures_and_tables_say_what_was_found(near: Any) -> None:
         share_figure(answers["load"], responses, "load"),
     ):
         assert picture.startswith(b"\x89PNG")
-    row = insight.Margins("one", "Model I", "v_p", True, *margins_of(responses["one"].opened("v_p"), omega, DT, True))
+    row = insight.Margins("one", "Model I", "v_p", np.inf, *margins_of(responses["one"].opened("v_p"), omega, DT, True))
     limits = {"one": {limit.name: Survival(1.5, 1.25, 2.0, True) for limit in LIMITS}}
     parts = {"one": {"latency": {"rmse_observable_mm": 0.1, "failure_rate": 0.25}}}
     gains = {"one": {"pull": 1.0, "step": 2.0, "heater": 3.0}}
@@ -239,3 +239,13 @@ def test_gains_are_apart_from_others_and_not_from_themselves(near: Any) -> None:
 def test_what_cannot_be_meant_is_one_line(arguments: list[str], tmp_path: Any, capsys: Any) -> None:
     assert insight.main([*arguments, "--out", str(tmp_path)]) == 2
     assert capsys.readouterr().err.count("\n") <= 2
+
+
+def test_the_growth_of_a_loop_is_that_of_its_fastest_mode() -> None:
+    grows, fades = np.exp(5.0 / 7200.0), np.exp(-5.0 / 60.0)
+    loop = Loop(np.diag([fades, grows]), *[np.zeros((2, 2))] * 3, ("a", "b"), ("c", "d"), 5.0)
+    assert loop.growth == pytest.approx(7200.0)
+    assert not loop.stable
+    calm = loop._replace(A=np.diag([fades, -0.5]))
+    assert calm.growth == np.inf
+    assert calm.stable
