@@ -112,7 +112,7 @@ def to_markdown(lines: Sequence[Line], steps: int, lqgs: Rivals) -> str:
     most = max((len(line.seeds) for line in lines), default=0)
     return "\n".join(
         [
-            "# What helps: one change of `ppo` at a time",
+            "# What helps: one change of `PPO()` at a time",
             "",
             f"{steps:,} environment steps a run, up to {most} training seeds a row, judged on {len(JUDGING)} "
             f"validation crystals of `randomized` (seeds {JUDGING[0]:,} to {JUDGING[-1]:,}) that select nothing. "

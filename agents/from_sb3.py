@@ -167,7 +167,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--vecnormalize", type=Path, metavar="PKL", help="saved VecNormalize, if it was trained with one"
     )
-    parser.add_argument("--name", help="what the agent is called (default: the algorithm)")
+    parser.add_argument("--name", help="what the agent is called (default: the agent file's name)")
     parser.add_argument("--scenario", default="randomized", help="scenario it was trained on (default: %(default)s)")
     parser.add_argument("--seed", type=int, help="training seed (default: the model's)")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="agent file to write (.onnx)")
@@ -178,28 +178,37 @@ def main(argv: list[str] | None = None) -> int:
 def _convert(given: argparse.Namespace) -> int:
     if given.out.suffix != ".onnx":
         raise AgentFileError(f"{given.out}: an agent file ends in .onnx")
-    model = _read(given.model, lambda: ALGORITHMS[given.algo].load(given.model, device="cpu"))
+    model = _read(
+        given.model, f"a model of {given.algo}", lambda: ALGORITHMS[given.algo].load(given.model, device="cpu")
+    )
     observation = _observation_of(model)
     normalisation = None
     if given.vecnormalize:
         env = DummyVecEnv([lambda: CzEnv(observation=observation)])
-        normalisation = _read(given.vecnormalize, lambda: VecNormalize.load(str(given.vecnormalize), env))
+        normalisation = _read(
+            given.vecnormalize, "a VecNormalize", lambda: VecNormalize.load(str(given.vecnormalize), env)
+        )
     contract = save_agent(
-        given.out, model, given.algo if given.name is None else given.name, normalisation, given.scenario, given.seed
+        given.out,
+        model,
+        given.out.stem if given.name is None else given.name,
+        normalisation,
+        given.scenario,
+        given.seed,
     )
     said = f"mean RMSE {contract.validation_rmse_mm:.3f} mm on {len(JUDGING)} validation episodes"
     print(f"wrote {given.out}: {contract.algorithm} after {contract.training_steps:,} steps, {said}")
     return 0
 
 
-def _read(path: Path, load: Any) -> Any:
+def _read(path: Path, what: str, load: Any) -> Any:
     """What a file of stable-baselines3 holds; AgentFileError in one line, whatever its many ways to be broken raise."""
     if not path.is_file():
         raise AgentFileError(f"{path}: no such file")
     try:
         return load()
     except Exception as error:
-        raise AgentFileError(f"{path}: not what --algo and stable-baselines3 say it is ({error})") from None
+        raise AgentFileError(f"{path}: not {what} that stable-baselines3 can read ({error})") from None
 
 
 if __name__ == "__main__":

@@ -38,7 +38,8 @@ def test_rows_are_the_recipes_by_name() -> None:
         if shipped.recipe.clone and row.choice.recipe.clone:
             told = f"{row.choice.recipe.clone.teacher}-told"
             assert shipped.recipe.clone.teacher == told
-            shipped = replace(shipped, recipe=replace(shipped.recipe, clone=row.choice.recipe.clone))
+            mine = row.choice.recipe
+            shipped = replace(shipped, recipe=replace(shipped.recipe, clone=mine.clone, weights=mine.weights))
         assert row.choice == shipped
         assert row.choice.recipe.observation == "history"
 

@@ -226,7 +226,7 @@ def test_output_in_the_way(tmp_path, capsys):
     (tmp_path / "taken").write_text("")
     assert paper.main(["--out", str(tmp_path / "taken")]) == 2
     error = capsys.readouterr().err.strip()
-    assert error.startswith("baselines.paper:")
+    assert error.startswith("python -m baselines.paper:")
     assert "taken" in error
     assert "\n" not in error
 

@@ -239,7 +239,7 @@ def _verdicts(samples: Sequence[Sample], resamples: Callable[[int], Resamples]) 
     rival = next(sample for sample in rivals if sample.controller is best)
     verdicts = []
     for sample in samples:
-        if sample.controller.learned:
+        if sample.controller.learned and not sample.controller.bound:
             ours, theirs = (one.metric("rmse_mm")[:, :, None] for one in common(sample, rival))
             difference = differences(ours, theirs, resamples(ours.shape[1]))[0]
             verdicts.append(Verdict(sample.controller.name, best.name, difference))
