@@ -21,8 +21,10 @@ def made(**scenarios: Any) -> Any:
         )
         seeds = (0,) if name.startswith("single") else tuple(range(9))
         rows.append(SimpleNamespace(row=SimpleNamespace(name=name), verdicts=verdicts, seeds=seeds))
-    agents = [SimpleNamespace(name=verdict.agent, learned=True) for verdict in rows[0].verdicts]
-    return SimpleNamespace(controllers=[SimpleNamespace(name="lqg", learned=False), *agents], scenarios=rows)
+    agents = [SimpleNamespace(name=verdict.agent, learned=True, bound=False) for verdict in rows[0].verdicts]
+    return SimpleNamespace(
+        controllers=[SimpleNamespace(name="lqg", learned=False, bound=False), *agents], scenarios=rows
+    )
 
 
 def test_one_agent() -> None:
@@ -54,3 +56,6 @@ def test_without_a_contest_it_says_so() -> None:
     nobody.controllers = nobody.controllers[:1]
     assert headline(nobody) == "No learned agent took part in this run."
     assert headline(made(one=[])) == "No learned agent took part in this run."
+    seeing = made(one=[])
+    seeing.controllers.append(SimpleNamespace(name="a", learned=True, bound=True))
+    assert headline(seeing) == "No learned agent took part in this run."
