@@ -10,8 +10,8 @@ from .results import Benchmark, ScenarioResult, Verdict
 def headline(benchmark: Benchmark) -> str:
     """One plain line: whether the agents win, and where they don't.
 
-    Scenarios of a single crystal decide nothing, unless there are no others. An agent that reads the true state is a bound
-    and takes part in no contest.
+    Scenarios of a single crystal decide nothing, unless there are no others. An agent that reads the true state is a
+    bound and takes part in no contest.
     """
     agents = [controller.name for controller in benchmark.controllers if controller.learned and not controller.bound]
     if not agents:
