@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from cz_gym.config import Config
 from cz_gym.evaluation.whole import write_files
 from cz_gym.observation import CLIP, OBSERVATIONS
 
@@ -67,6 +68,18 @@ def observation_hash(name: str) -> str:
     """Hash of an observation mode's channels (16 hex digits); their explanations do not count."""
     channels = [(channel.name, channel.unit, channel.scale) for channel in OBSERVATIONS[name]]
     return hashlib.sha256(json.dumps([channels, CLIP]).encode()).hexdigest()[:16]
+
+
+def facts_of(config: Config) -> dict[str, Any]:
+    """What a contract says of the environment's settings."""
+    return {
+        "observation": config.observation,
+        "channels": len(OBSERVATIONS[config.observation]),
+        "control_interval": config.control_interval,
+        "plant_hash": config.plant_hash,
+        "scenario": config.scenario.name,
+        "scenario_hash": config.scenario.hash,
+    }
 
 
 def make_contract(onnx_bytes: bytes, **facts: Any) -> Contract:

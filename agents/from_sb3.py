@@ -28,7 +28,7 @@ from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.observation import OBSERVATIONS
 from cz_gym.vector import CzVectorEnv
 
-from .contract import AgentFileError, Contract, make_contract, write_agent
+from .contract import AgentFileError, Contract, facts_of, make_contract, write_agent
 from .export import OnnxGraph
 from .onnx_policy import OnnxPolicy
 from .recurrent import lstm_step
@@ -68,16 +68,10 @@ def save_agent(
     model that cannot be written, among them any whose file does not act as it does.
     """
     normalisation = normalisation or model.get_vec_normalize_env()
-    observation = _observation_of(model)
-    config = make_config(scenario, observation=observation)
+    config = make_config(scenario, observation=_observation_of(model))
     content = to_onnx(model, normalisation)
     facts = {
-        "observation": observation,
-        "channels": len(OBSERVATIONS[observation]),
-        "control_interval": config.control_interval,
-        "plant_hash": config.plant_hash,
-        "scenario": config.scenario.name,
-        "scenario_hash": config.scenario.hash,
+        **facts_of(config),
         "algorithm": name,
         "training_seed": int((model.seed if seed is None else seed) or 0),
         "training_steps": int(model.num_timesteps),

@@ -12,7 +12,6 @@ from typing import Any
 
 from stable_baselines3.common.logger import Logger
 
-import cz_gym
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation.whole import finish_writing, write_files
 from cz_gym.rooms import room
@@ -20,7 +19,7 @@ from cz_gym.rooms import room
 from . import settings
 from .callbacks import AtStart, Every, Tell
 from .checkpoint import load_checkpoint, restore, to_bytes
-from .contract import AgentFileError, Contract, agent_files, make_contract, read_agent
+from .contract import AgentFileError, Contract, agent_files, facts_of, make_contract, read_agent
 from .export import exported
 from .onnx_policy import OnnxPolicy
 from .residual import Residual
@@ -188,14 +187,8 @@ class Run:
         bar.set_postfix_str(f"validation RMSE {rmse:.3f} mm, paper {self.rival_rmse_mm:.3f}")
 
     def _facts(self, steps: int) -> dict[str, Any]:
-        config = self.config
         return {
-            "observation": config.observation,
-            "channels": len(cz_gym.observation.OBSERVATIONS[config.observation]),
-            "control_interval": config.control_interval,
-            "plant_hash": config.plant_hash,
-            "scenario": config.scenario.name,
-            "scenario_hash": config.scenario.hash,
+            **facts_of(self.config),
             "algorithm": self.choice.name,
             "training_seed": self.seed,
             "training_steps": int(steps),

@@ -18,12 +18,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from gymnasium.utils.seeding import np_random
 
-from cz_gym.batch import new_key
 from cz_gym.commands import OneLineParser, guarded
 from cz_gym.config import Config, make_config
-from cz_gym.episode import draw_factors, randomised
 from cz_gym.evaluation.files import check_writable, write_files
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.linear import StateSpace, radius_model
@@ -32,6 +29,7 @@ from cz_gym.units import KILO, MM, MM_PER_MIN
 
 from .frequency import crossover, loop_margins, peak
 from .linear_form import linear_form
+from .lqg_bounds import pullers_of
 from .registry import CONTROLLERS, find_controller
 from .sampled_loop import Loop, NotLinearError, close, late, root_mean_square
 
@@ -83,11 +81,7 @@ _MOST = ("crossover", "crossover_over_zero", "crossover_compensated", "gain_down
 
 def random_pullers(config: Config, count: int) -> list[Puller]:
     """The pullers of the first validation episodes of a scenario."""
-    pullers = []
-    for seed in VALIDATION_SEEDS[:count]:
-        factors = draw_factors(config.scenario, config.mix, new_key(np_random(seed)[0]))
-        pullers.append(make_puller(randomised(config.parameters, factors), factors.lam, config.meniscus))
-    return pullers
+    return list(pullers_of(config, VALIDATION_SEEDS[:count]))
 
 
 def judge(name: str, plant: str, controller: StateSpace, free: StateSpace, puller: Puller, dt: float) -> Row:

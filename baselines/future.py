@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.utils import seeding
 
-from cz_gym.batch import new_key
+from cz_gym.batch import first_key
 from cz_gym.config import Config
 from cz_gym.episode import GRID, Episode, draw_episode, new_series
 from cz_gym.meniscus import MeniscusModel
@@ -98,6 +97,5 @@ def stacked(kind: Any, values: Sequence[Any]) -> Any:
 
 
 def _drawn(config: Config, seed: int, points: int) -> tuple[Episode, Floats]:
-    random, _ = seeding.np_random(seed)
     series = new_series(points, 0)
-    return draw_episode(config.scenario, new_key(random), series), series.interface
+    return draw_episode(config.scenario, first_key(seed), series), series.interface

@@ -14,9 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.utils import seeding
 
-from cz_gym.batch import new_key
+from cz_gym.batch import first_key
 from cz_gym.config import Config
 from cz_gym.episode import draw_episode, draw_factors, new_series, randomised
 from cz_gym.observation import HEATER_SCALE, STATE, Measured, scales
@@ -38,20 +37,15 @@ def pullers_of(config: Config, seeds: Sequence[int]) -> tuple[Puller, ...]:
     """The pullers that those seeds draw in their first episode, by the environment's own functions."""
     pullers = []
     for seed in seeds:
-        random, _ = seeding.np_random(seed)
-        factors = draw_factors(config.scenario, config.mix, new_key(random))
+        factors = draw_factors(config.scenario, config.mix, first_key(seed))
         pullers.append(make_puller(randomised(config.parameters, factors), factors.lam, config.meniscus))
     return tuple(pullers)
 
 
 def roughness_of(config: Config, seeds: Sequence[int]) -> tuple[tuple[float, float], ...]:
     """Standard deviations of fast and slow interface fluctuation [K] of those seeds' first episodes."""
-    drawn = []
-    for seed in seeds:
-        random, _ = seeding.np_random(seed)
-        episode = draw_episode(config.scenario, new_key(random), new_series(1, 0))
-        drawn.append((float(episode.sd_fast), float(episode.sd_slow)))
-    return tuple(drawn)
+    drawn = (draw_episode(config.scenario, first_key(seed), new_series(1, 0)) for seed in seeds)
+    return tuple((float(episode.sd_fast), float(episode.sd_slow)) for episode in drawn)
 
 
 @dataclass(frozen=True)

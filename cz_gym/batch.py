@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium.utils import seeding
 
 from ._compile import entry
 from .camera import IMAGE, make_view
@@ -55,6 +56,11 @@ def new_key(random: np.random.Generator) -> Key:
     """The next episode key of an environment's random stream."""
     raw = random.bit_generator.random_raw(2)
     return int(raw[0]), int(raw[1])
+
+
+def first_key(seed: int) -> Key:
+    """The key of the episode that an environment draws first after ``reset(seed=seed)``."""
+    return new_key(seeding.np_random(seed)[0])
 
 
 @dataclass(frozen=True)

@@ -213,9 +213,11 @@ def _measure(arguments: argparse.Namespace) -> int:
         if arguments.json.is_dir():
             raise IsADirectoryError(f"{arguments.json} is a folder")
         check_writable(arguments.json.parent)
-    with peers.silenced():
-        result, text = run(QUICK if arguments.quick else FULL, arguments.quick, _say)
-    _say("")
+    try:
+        with peers.silenced():
+            result, text = run(QUICK if arguments.quick else FULL, arguments.quick, _say)
+    finally:
+        _say("")
     print(text)
     if arguments.json is not None:
         write_files({arguments.json: (json.dumps(result, indent=1, allow_nan=False) + "\n").encode()})

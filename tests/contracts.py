@@ -4,20 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
+from agents.contract import facts_of
 from cz_gym.config import make_config
-from cz_gym.observation import OBSERVATIONS
 
 
 def facts(observation: str = "history", **changes: Any) -> dict[str, Any]:
     """What :func:`agents.contract.make_contract` asks for, of an agent trained on "randomized"."""
     config = make_config(observation=observation)
     known = {
-        "observation": observation,
-        "channels": len(OBSERVATIONS[observation]),
-        "control_interval": config.control_interval,
-        "plant_hash": config.plant_hash,
-        "scenario": config.scenario.name,
-        "scenario_hash": config.scenario.hash,
+        **facts_of(config),
         "algorithm": "ppo",
         "training_seed": 0,
         "training_steps": 64,

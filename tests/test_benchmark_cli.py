@@ -25,7 +25,7 @@ from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.output import check_targets
 from cz_gym.evaluation.protocol import ROWS, TEST_SEEDS, find_row
 from cz_gym.meniscus import HURLE
-from cz_gym.observation import MEASURED, OBSERVATIONS
+from cz_gym.observation import OBSERVATIONS
 from cz_gym.young_laplace import YOUNG_LAPLACE
 
 ALL_METRICS = {*metric_names(), "microseconds_per_step"}
@@ -33,9 +33,9 @@ FILES = ["benchmark.json", "crystal.png", "episodes.csv", "errors.png", "pareto.
 SMALL = ["--episodes", "3", "--scenarios", "randomized,reference-b", "--controllers", "open-loop,paper"]
 
 
-def constant_agent(path: Path, pull: float = 0.0, **changes: Any) -> Path:
+def constant_agent(path: Path, pull: float = 0.0, observation: str = "measured", **changes: Any) -> Path:
     """An agent file that always answers with the same action."""
-    channels = len(MEASURED)
+    channels = len(OBSERVATIONS[observation])
     graph = helper.make_graph(
         [helper.make_node("Gemm", ["observation", "weight", "bias"], ["action"])],
         "constant",
@@ -51,7 +51,7 @@ def constant_agent(path: Path, pull: float = 0.0, **changes: Any) -> Path:
     write_agent(
         path,
         model.SerializeToString(),
-        **facts("measured", **{"channels": channels, "validation_rmse_mm": 6.0, **changes}),
+        **facts(observation, **{"validation_rmse_mm": 6.0, **changes}),
     )
     return path
 
@@ -436,3 +436,14 @@ def test_rows_are_the_published_ones() -> None:
     assert find_row("randomized-2s").config("history").control_interval == 2.0
     assert find_row("randomized-exact").config().meniscus == YOUNG_LAPLACE
     assert {row.name for row in ROWS if row.config().plant_hash != row.told().plant_hash} == {"randomized-exact"}
+
+
+def test_an_agent_that_reads_the_true_state_is_a_bound_and_wins_nothing(tmp_path: Path) -> None:
+    agent = tmp_path / "seer.onnx"
+    constant_agent(agent, observation="state", algorithm="seer")
+    command = ["--agent", str(agent), "--controllers", "paper,seer", "--scenarios", "randomized", "--episodes", "2"]
+    assert benchmark.main([*command, "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    found = json.loads((tmp_path / "out" / "benchmark.json").read_text())
+    assert set(found["results"]["randomized"]) == {"paper", "seer"}
+    assert found["verdicts"]["randomized"] == {}
+    assert (tmp_path / "out" / "report.md").read_text().startswith("No learned agent took part in this run.")

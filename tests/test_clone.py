@@ -25,7 +25,7 @@ from cz_gym import CzVectorEnv
 from cz_gym.config import make_config
 from cz_gym.observation import HISTORY
 from cz_gym.scenarios import find_scenario
-from cz_gym.task import Cost, reward
+from cz_gym.task import HEATER_STEP_WEIGHT, PULL_STEP_WEIGHT, PULL_WEIGHT, Cost, reward
 
 CONFIG = make_config("randomized", observation="history", horizon=600.0)
 TINY = replace(
@@ -285,3 +285,14 @@ def test_a_kept_imitation_is_the_imitation(tmp_path: Path) -> None:
     kept.write_bytes(kept.read_bytes()[:1000])
     np.testing.assert_array_equal(clone.acts(made(True))(seen), clone.acts(first)(seen))
     assert len(asked) == 2 * times
+
+
+@pytest.mark.parametrize("name", ["ppo", "ppo-medium", "ppo-quiet"])
+def test_a_recipe_learns_for_the_cost_that_its_teacher_s_regulator_was_made_for(name: str) -> None:
+    recipe = settings.RECIPES[name].recipe
+    assert recipe.clone is not None
+    teacher: Any = find_controller(recipe.clone.teacher).make(make_config("randomized"))
+    theirs, ours = teacher.settings.weights, recipe.weights
+    assert ours.pull * PULL_WEIGHT == pytest.approx(theirs.pull, rel=0.01)
+    assert ours.pull_step * PULL_STEP_WEIGHT == pytest.approx(theirs.pull_step, rel=0.01)
+    assert ours.heater_step * HEATER_STEP_WEIGHT == pytest.approx(theirs.heater_step, rel=0.01)

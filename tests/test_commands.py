@@ -131,6 +131,10 @@ def _missing() -> int:
     raise ModuleNotFoundError("No module named 'absent'", name="absent")
 
 
+def _other_version() -> int:
+    raise ImportError("cannot import name 'one' from 'present'", name="present")
+
+
 def _wrong() -> int:
     raise ValueError("first line\nsecond line")
 
@@ -148,6 +152,7 @@ def _stopped() -> int:
     [
         (lambda: 0, 0, ""),
         (_missing, 2, 'prog: absent is missing: pip install "cz-gym[agents]"\n'),
+        (_other_version, 2, "prog: cannot import name 'one' from 'present'\n"),
         (_wrong, 2, "prog: first line second line\n"),
         (_gone, 2, "prog: there.csv: No such file or directory\n"),
         (_stopped, 130, "prog: interrupted; runs are kept\n"),

@@ -11,7 +11,7 @@ from baselines.lqg import LQG, LQGSettings, at_rest, solve
 from baselines.lqg_model import DRIFT, FAST, HEATER, PLANT, SLOW, STATES, NoiseModel, load_per_drift, plant_model
 from baselines.lqr import Weights, quadratic_cost, regulator
 from baselines.preview import look_ahead, samples_ahead
-from cz_gym import CzVectorEnv, make_puller
+from cz_gym import make_puller
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
@@ -20,6 +20,7 @@ from cz_gym.observation import MEASURED, Measured, scales
 from cz_gym.plant import Disturbance, Inputs, State, hidden_load, rates
 from cz_gym.schedule import quintic
 from cz_gym.task import cost_terms
+from tests.observed import observations
 
 PULLER = make_puller(lam=0.5)
 NOISE = NoiseModel()
@@ -214,15 +215,6 @@ def test_the_plan_is_the_recipe_five_minutes_ahead(dt):
 
 
 # The seam
-
-
-def observations(n=3, steps=20, **keywords):
-    env = CzVectorEnv(n, **keywords)
-    observation, _ = env.reset(seed=0)
-    rng = np.random.default_rng(0)
-    for _ in range(steps):
-        yield observation
-        observation = env.step(rng.uniform(-0.1, 0.1, (n, 2)))[0]
 
 
 def test_one_slot_alone_acts_as_in_a_batch():

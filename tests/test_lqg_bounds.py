@@ -14,17 +14,9 @@ from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.plant import hidden_load
+from tests.observed import observations
 
 PULLER = make_puller(lam=0.5)
-
-
-def observations(n=3, steps=20):
-    env = CzVectorEnv(n)
-    observation, _ = env.reset(seed=0)
-    rng = np.random.default_rng(0)
-    for _ in range(steps):
-        yield observation
-        observation = env.step(rng.uniform(-0.1, 0.1, (n, 2)))[0]
 
 
 def test_the_bounds_know_the_pullers_the_environment_draws():
