@@ -70,7 +70,8 @@ def _shown(name: str, width: float, meaning: str) -> Row:
     return Row(f"shown-{name}", "beginning", meaning, _recipe(changed))
 
 
-_TOLD = RECIPES["ppo"].recipe.clone or _TEACHER
+_SHIPS = RECIPES["ppo"].recipe.clone or _TEACHER
+_TOLD = replace(_SHIPS, rounds=6, width=1.0, wide_share=1.0, epochs=6)
 _MORE_SHOWN = replace(_TOLD, teacher=_TEACHER.teacher)
 _FROM_NOTHING = replace(SCRATCH, recipe=replace(SCRATCH.recipe, weights=_RECIPE.weights))
 
@@ -81,14 +82,22 @@ _ROWS = (
         "told",
         "beginning",
         f"a fifth of the steps; imitates {_TOLD.teacher}, shown {_TOLD.rounds * _TOLD.episodes:,} crystals spread as"
-        " the scenario's own: the imitation that ships",
+        " the scenario's own",
         _recipe(replace(_RECIPE, clone=_TOLD)),
+        share=0.2,
+    ),
+    Row(
+        "some-wide",
+        "beginning",
+        f"the same, but shown {_SHIPS.rounds * _SHIPS.episodes:,} crystals, {_SHIPS.wide_share:.0%} of them spread"
+        f" {_SHIPS.width:g} times as wide: the imitation that ships",
+        _recipe(replace(_RECIPE, clone=_SHIPS)),
         share=0.2,
     ),
     Row(
         "more-shown",
         "beginning",
-        f"the same, but imitates {_MORE_SHOWN.teacher}",
+        f"as told, but imitates {_MORE_SHOWN.teacher}",
         _recipe(replace(_RECIPE, clone=_MORE_SHOWN)),
         share=0.2,
     ),

@@ -38,6 +38,8 @@ reward does, a lost crystal costing ten; RMS of the pull speed's steps [mm/min];
 and loss on the other scenario."""
 STAGES = ("best", "last", "start")
 """The agents of a run: the one that did best on the validation that selects, the last one, and the one it began as."""
+SINCE = {("recipe", "clone", "wide_share"): 1.0}
+"""Settings that kept runs may be older than, and what they were then."""
 DIGITS = 5
 """Significant digits that are kept."""
 
@@ -150,7 +152,7 @@ def read_finished(plan: Plan, row: Row, seed: int) -> Finished | None:
     if found is None or (found.row, found.seed) != (row.name, seed):
         raise ValueError(f"{path}: not a finished run of this ablation, or damaged; move it away to run it again")
     wanted = json.loads(json.dumps(asdict(row.of(plan.steps))))
-    if found.settings != wanted or told.get("judged") != judged_on():
+    if _completed(found.settings) != wanted or told.get("judged") != judged_on():
         raise ValueError(f"{path}: made with other settings; move it away, or choose another --out or --steps")
     return found
 
@@ -160,6 +162,17 @@ def read_all(plan: Plan, rows: Iterable[Row], seeds: Iterable[int]) -> dict[str,
     wanted = list(seeds)
     found = {row.name: [run for seed in wanted if (run := read_finished(plan, row, seed))] for row in rows}
     return {name: runs for name, runs in found.items() if runs}
+
+
+def _completed(settings: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The settings of a kept run, with those that did not exist yet."""
+    for path, value in SINCE.items():
+        place: Any = settings
+        for name in path[:-1]:
+            place = place.get(name) if isinstance(place, dict) else None
+        if isinstance(place, dict):
+            place.setdefault(path[-1], value)
+    return settings
 
 
 def _parsed(told: Mapping[str, Any]) -> Finished | None:

@@ -7,7 +7,7 @@ fitted to those answers: its linear path by regression on the whitened observati
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -83,6 +83,11 @@ def demonstrate(
     return Shown(*(np.concatenate(parts).astype(np.float32) for parts in zip(*kept, strict=True)))
 
 
+def joined(parts: Iterable[Shown]) -> Shown:
+    """All of them as one."""
+    return Shown(*map(np.concatenate, zip(*parts, strict=True)))
+
+
 def whitening(observation: Floats) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Mean and symmetric scaling that make the observation's channels uncorrelated, of variance one."""
     variances, axes = np.linalg.eigh(np.cov(observation.T.astype(np.float64)))
@@ -93,20 +98,26 @@ def imitate(
     policy: Any,
     teacher: Any,
     config: Config,
+    wide: Config,
     choice: Clone,
     first_seed: int,
     tell: Callable[[str], None] = lambda _: None,
 ) -> Views:
-    """Make a :class:`agents.network.DrivePolicy` act like the teacher; seeds from ``first_seed`` on are shown."""
+    """Make a :class:`agents.network.DrivePolicy` act like the teacher; seeds from ``first_seed`` on are shown.
+
+    The first of each round's are crystals of ``wide``, as many as ``choice`` says, the others of ``config``.
+    """
     shown: Shown | None = None
     views: Views | None = None
     for turn in range(choice.rounds):
         seeds = range(first_seed + turn * choice.episodes, first_seed + (turn + 1) * choice.episodes)
         tell(f"asks {choice.teacher}, round {turn + 1} of {choice.rounds}")
-        answers = demonstrate(teacher, config, seeds, choice.noise, acts(policy) if turn else None)
+        driver, many = acts(policy) if turn else None, round(choice.wide_share * choice.episodes)
+        parts = [(wide, seeds[:many]), (config, seeds[many:])]
+        answers = joined(demonstrate(teacher, of, some, choice.noise, driver) for of, some in parts if some)
         if views is None:
             views = begin_linear(policy, answers)
-        shown = Shown(*map(np.concatenate, zip(shown, answers, strict=True))) if shown else answers
+        shown = joined([shown, answers]) if shown else answers
         tell(f"fits {len(shown.action):,} answers")
         fit(policy, shown, choice)
     if views is None:

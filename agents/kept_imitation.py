@@ -32,7 +32,7 @@ CHANGED = ("observation", "control_interval", "hidden", "memory", "head", "clone
 
 
 def kept_imitation(folder: Path, recipe: Recipe, config: Config, seed: int) -> Path:
-    """Where the imitation of these settings is kept; ``config`` is what the teacher was asked on."""
+    """Where the imitation of these settings is kept; ``config`` is of the wide crystals it was asked on."""
     parts = [{name: asdict(recipe)[name] for name in CHANGED}, config.hash, seed]
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
     teacher = recipe.clone.teacher if recipe.clone else "none"

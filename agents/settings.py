@@ -45,7 +45,9 @@ class Clone:
     episodes: int = 320
     """Training episodes a round."""
     width: float = 2.0
-    """How far everything random on those crystals is spread, in units of the scenario's [-]."""
+    """How far everything random on wide crystals is spread, in units of the scenario's [-]."""
+    wide_share: float = 1.0
+    """Share of each round's crystals that are wide; the others are the scenario's own [-]."""
     noise: tuple[float, float] = (0.006, 0.001)
     """Spread of the noise added to the driver's actions, pull speed and heater [-]."""
     epochs: int = 10
@@ -190,8 +192,11 @@ Choice = PPO | SAC | RecurrentPPO
 
 
 def _told(teacher: str) -> Clone:
-    """Imitation of an LQG that is told each crystal's puller and roughness: what it shows has to be found out."""
-    return Clone(f"{teacher}-told", rounds=6, episodes=480, width=1.0, epochs=6)
+    """Imitation of an LQG that is told each crystal's puller and roughness: what it shows has to be found out.
+
+    Wide crystals show how it saves one, the others how it controls those that the agent is for.
+    """
+    return Clone(f"{teacher}-told", rounds=8, episodes=480, wide_share=0.25, epochs=4)
 
 
 def _weighed(pull_step: float) -> CostWeights:

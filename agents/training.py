@@ -84,19 +84,20 @@ def clone(
     choice = recipe.clone
     if choice is None:
         return
-    shown = config.with_scenario(widened(training_scenario(recipe), choice.width))
+    scenario = training_scenario(recipe)
+    own, wide = config.with_scenario(scenario), config.with_scenario(widened(scenario, choice.width))
     first = (seed * 20_011 + 500_000) % (len(TRAINING_SEEDS) - choice.rounds * choice.episodes)
 
     def begin() -> Views:
         if recipe.residual:
-            return stand_beside(policy, teacher, shown, choice, first)
-        return imitate(policy, teacher, shown, choice, first, tell)
+            return stand_beside(policy, teacher, wide, choice, first)
+        return imitate(policy, teacher, own, wide, choice, first, tell)
 
     torch.manual_seed(seed)
     if kept is None:
         begin()
         return
-    imitate_once(kept_imitation(kept, recipe, shown, seed), policy, begin)
+    imitate_once(kept_imitation(kept, recipe, wide, seed), policy, begin)
     torch.manual_seed(seed)  # what follows does not depend on whether the imitation was kept
 
 

@@ -23,6 +23,7 @@ from cz_gym.evaluation.statistics import Resamples
 
 CHANGES = {
     "told": {"recipe.clone"},
+    "some-wide": {"recipe.clone"},
     "more-shown": {"recipe.clone"},
     "scratch": {"recipe", "critic_steps", "n_steps", "batch_size", "n_epochs", "actor_pace", "frozen", "paired"}
     | {"gamma", "gae_lambda", "noise"},
@@ -76,7 +77,7 @@ def test_a_row_changes_what_it_says_and_nothing_else(row: Row) -> None:
     assert row.of(1000).steps == 1000 * row.share
     training_scenario(row.choice.recipe)
     if row.choice.recipe.clone:
-        assert find_controller(row.choice.recipe.clone.teacher).told == (row.name == "told")
+        assert find_controller(row.choice.recipe.clone.teacher).told == (row.name in ("told", "some-wide"))
     assert row.choice.recipe.residual == row.name.startswith("residual")
 
 
@@ -218,6 +219,9 @@ def test_a_run_kept_before_a_setting_existed_is_of_other_settings(tmp_path: Path
     }
     path.write_text(json.dumps(told))
     assert read_finished(plan, row, 0) is not None
+    del told["settings"]["recipe"]["clone"]["wide_share"]
+    path.write_text(json.dumps(told))
+    assert read_finished(plan, row, 0) is not None, "a later setting whose earlier value is written down"
     del told["settings"]["recipe"]["clone"]["width"]
     path.write_text(json.dumps(told))
     with pytest.raises(ValueError, match="made with other settings"):

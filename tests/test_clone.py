@@ -111,7 +111,7 @@ def test_the_imitation_of_lqg_holds_the_radius() -> None:
     policy = policy_of(choice=replace(TINY, recipe=settings.Recipe(num_envs=4, clone=settings.Clone("lqg"))))
     config = make_config("randomized", observation="history")
     few = settings.Clone("lqg", rounds=1, episodes=48, epochs=4)
-    clone.imitate(policy, lqg(make_config("randomized")), config, few, 900_000)
+    clone.imitate(policy, lqg(make_config("randomized")), config, config, few, 900_000)
     env = CzVectorEnv(16, scenario="randomized", observation="history")
     observation, info = env.reset(seed=list(range(950_000, 950_016)))
     squares = []
@@ -254,6 +254,24 @@ def test_a_network_beside_a_controller_begins_as_the_controller() -> None:
     alone, expected = teacher.predict(seen, None, np.ones(3, np.bool_))
     np.testing.assert_allclose(action, alone + 0.01, atol=1e-7)
     np.testing.assert_equal(memory, expected)
+
+
+@pytest.mark.parametrize(("share", "shown"), [(0.25, [("wide", 2), ("own", 6)] * 2), (1.0, [("wide", 8)] * 2)])
+def test_each_round_shows_as_many_wide_crystals_as_asked(
+    share: float, shown: list[tuple[str, int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, met = clone.demonstrate, []
+
+    def counted(teacher: Any, config: Any, seeds: Any, *rest: Any) -> clone.Shown:
+        met.append((config.scenario.name, list(seeds)))
+        return asked(teacher, config, seeds, *rest)
+
+    monkeypatch.setattr(clone, "demonstrate", counted)
+    of = {name: CONFIG.with_scenario(replace(CONFIG.scenario, name=name)) for name in ("own", "wide")}
+    choice = settings.Clone("lqg", rounds=2, episodes=8, wide_share=share, epochs=1)
+    clone.imitate(policy_of(), Teacher(linear), of["own"], of["wide"], choice, 700)
+    assert [(name, len(seeds)) for name, seeds in met] == shown
+    assert [seed for _, seeds in met for seed in seeds] == list(range(700, 716))
 
 
 def test_a_kept_imitation_is_the_imitation(tmp_path: Path) -> None:
