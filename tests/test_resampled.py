@@ -23,7 +23,7 @@ def test_own_interval_changes_nothing() -> None:
     assert at_interval(AGENT, AGENT.contract.control_interval) is AGENT
 
 
-@pytest.mark.parametrize("interval", [1.0, 2.0])
+@pytest.mark.parametrize("interval", [1.0, 2.0, 10.0])
 def test_a_move_is_the_intervals_share_of_the_one_asked_for(interval: float) -> None:
     observation = np.random.default_rng(0).normal(0.0, 0.02, (5, len(HISTORY))).astype(np.float32)
     asked, _ = AGENT.predict(observation)
@@ -36,15 +36,15 @@ def test_a_move_is_the_intervals_share_of_the_one_asked_for(interval: float) -> 
     assert single == pytest.approx(action[0], abs=1e-6)
 
 
-def test_shortened_moves_hold_the_radius_where_whole_ones_do_not() -> None:
+def test_moves_in_proportion_hold_the_radius_better_than_whole_ones() -> None:
     seeds = VALIDATION_SEEDS[:6]
 
     def error(policy: object, interval: float) -> float:
         config = make_config("randomized", observation="history", control_interval=interval)
         return float(metrics(rollout(policy, config, seeds)).rmse_mm.mean())
 
-    assert error(at_interval(AGENT, 2.0), 2.0) < error(AGENT, 2.0)
-    assert at_interval(AGENT, 10.0) is AGENT
+    for interval in (2.0, 10.0):
+        assert error(at_interval(AGENT, interval), interval) < error(AGENT, interval)
 
 
 def test_an_agent_that_remembers_stays_at_its_interval() -> None:
