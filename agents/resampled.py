@@ -1,9 +1,11 @@
 """An agent at another control interval than the one it was trained at.
 
 The channels of "history" are defined in time, so an agent can read them at any interval, means over at least one
-sample. What it asks for is a move of the drives within its own interval; so within another one it makes as much more or
-less of it: action = applied + (interval / trained) (asked - applied). Whole moves at a shorter interval would drive so
-much too fast. This is an override: the contract's interval stays what the agent was trained and picked at.
+sample. What it asks for is a move of the drives within its own interval; so within a shorter one it makes that share
+of it: action = applied + (interval / trained) (asked - applied). Whole moves would drive so much too fast. Within a
+longer one it makes the move half way between the one asked for and one in proportion: a lively loop that waits longer
+between two looks has little margin for larger moves. This is an override: the contract's interval stays what the agent
+was trained and picked at.
 """
 
 from __future__ import annotations
@@ -40,11 +42,11 @@ class Resampled:
 
 
 def at_interval(policy: OnnxPolicy, control_interval: float) -> OnnxPolicy | Resampled:
-    """The agent itself at its own control interval [s], with moves in proportion at another one.
+    """The agent itself at its own control interval [s], its moves shortened or stretched at another one.
 
     ValueError for an agent that remembers: what a sample does to its memory belongs to its interval.
     """
     share = control_interval / policy.contract.control_interval
     if policy.remembers and share != 1.0:
         raise ValueError(f"an agent with a memory runs at its own {policy.contract.control_interval:g} s alone")
-    return policy if share == 1.0 else Resampled(policy, share)
+    return policy if share == 1.0 else Resampled(policy, min(share, (1.0 + share) / 2.0))

@@ -23,20 +23,20 @@ def test_own_interval_changes_nothing() -> None:
     assert at_interval(AGENT, AGENT.contract.control_interval) is AGENT
 
 
-@pytest.mark.parametrize("interval", [1.0, 2.0, 10.0])
-def test_a_move_is_the_intervals_share_of_the_one_asked_for(interval: float) -> None:
+@pytest.mark.parametrize(("interval", "share"), [(1.0, 0.2), (2.0, 0.4), (10.0, 1.5)])
+def test_a_move_is_shortened_or_stretched_for_the_interval(interval: float, share: float) -> None:
     observation = np.random.default_rng(0).normal(0.0, 0.02, (5, len(HISTORY))).astype(np.float32)
     asked, _ = AGENT.predict(observation)
     applied = observation[:, [NAMES.index("v_p"), NAMES.index("Q_H")]]
     action, state = at_interval(AGENT, interval).predict(observation)
     assert state is None
     assert action.dtype == np.float32
-    assert action == pytest.approx(np.clip(applied + interval / 5.0 * (asked - applied), -1.0, 1.0), abs=1e-6)
+    assert action == pytest.approx(np.clip(applied + share * (asked - applied), -1.0, 1.0), abs=1e-6)
     single, _ = at_interval(AGENT, interval).predict(observation[0])
     assert single == pytest.approx(action[0], abs=1e-6)
 
 
-def test_moves_in_proportion_hold_the_radius_better_than_whole_ones() -> None:
+def test_moves_made_for_the_interval_hold_the_radius_better_than_whole_ones() -> None:
     seeds = VALIDATION_SEEDS[:6]
 
     def error(policy: object, interval: float) -> float:
