@@ -1,4 +1,7 @@
-"""The rows of the ablation: each is ``PPO()`` with one thing changed, the recipe that ``ppo`` grew from."""
+"""The rows of the ablation: each is ``PPO()``, the recipe that ``ppo`` grew from, with one thing changed.
+
+But for ``scratch``, and for ``told``, ``some-wide`` and ``more-shown``, which lead step by step to what ships.
+"""
 
 from __future__ import annotations
 
@@ -89,8 +92,8 @@ _ROWS = (
     Row(
         "some-wide",
         "beginning",
-        f"the same, but shown {_SHIPS.rounds * _SHIPS.episodes:,} crystals, {_SHIPS.wide_share:.0%} of them spread"
-        f" {_SHIPS.width:g} times as wide: the imitation that ships",
+        f"the same, but shown {_SHIPS.rounds * _SHIPS.episodes:,} crystals in {_SHIPS.epochs} epochs a round instead of"
+        f" {_TOLD.epochs}, {_SHIPS.wide_share:.0%} of them spread {_SHIPS.width:g} times as wide: what ships",
         _recipe(replace(_RECIPE, clone=_SHIPS)),
         share=0.2,
     ),

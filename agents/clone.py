@@ -126,7 +126,10 @@ def imitate(
 
 
 def stand_beside(policy: Any, teacher: Any, config: Config, choice: Clone, first_seed: int) -> Views:
-    """Make a policy whose action is added to the teacher's add nothing yet; it sees as if it had imitated."""
+    """Make a policy whose action is added to the teacher's add nothing yet; it sees as if it had imitated.
+
+    ``config`` is of the wide crystals, whatever their share: they only set how the network looks at what it sees.
+    """
     views = views_of(demonstrate(teacher, config, range(first_seed, first_seed + choice.episodes), choice.noise))
     set_views(policy, views)
     _clear(policy)

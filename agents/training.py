@@ -113,7 +113,8 @@ def training_scenario(recipe: settings.Recipe) -> Scenario:
 def widened(scenario: Scenario, width: float) -> Scenario:
     """The scenario with its pullers, ramps, fluctuations and noises spread that many times as wide.
 
-    What an imitation is shown: on crystals no worse than the scenario's own it never sees how the teacher saves one.
+    A share of what an imitation is shown (``Clone.wide_share``): on crystals no worse than the scenario's own it never
+    sees how the teacher saves one.
     """
     if width == 1.0:
         return scenario
