@@ -47,7 +47,7 @@ def forest(lines: Sequence[Line]) -> bytes:
     axes[0].set_yticks(range(len(shown)), [f"{line.row.name} ({len(line.seeds)})" for line in shown])
     _legend(figure, axes[0])
     figure.suptitle(
-        "One change of ppo at a time: difference to base on the same crystals (left is better)", fontsize=11
+        "One change of PPO() at a time: difference to base on the same crystals (left is better)", fontsize=11
     )
     return png(figure)
 

@@ -51,13 +51,17 @@ class Loop(NamedTuple):
     @property
     def stable(self) -> bool:
         """Whether every pole lies inside the unit circle."""
-        return bool(np.abs(np.linalg.eigvals(self.A)).max() < 1.0)
+        return self._largest < 1.0
 
     @property
     def growth(self) -> float:
         """Time in which the fastest growing mode grows by e [s]; infinite for a stable loop."""
-        largest = float(np.abs(np.linalg.eigvals(self.A)).max())
-        return self.dt / math.log(largest) if largest > 1.0 else math.inf
+        return self.dt / math.log(self._largest) if self._largest > 1.0 else math.inf
+
+    @property
+    def _largest(self) -> float:
+        """The largest absolute value of a pole [-]."""
+        return float(np.abs(np.linalg.eigvals(self.A)).max())
 
     def pick(self, output: str, inputs: tuple[str, ...]) -> StateSpace:
         """The part from some inputs to one output."""
