@@ -55,12 +55,22 @@ def inlined(function: F) -> F:
     return cast(F, numba.njit(error_model="numpy", inline="always")(function))
 
 
+NEVER_COMPILED = ("evaluation", "baselines", "agents")
+"""Sub-packages of which nothing is compiled in; all others count, whatever they hold."""
+
+
+def compiled_sources(folder: Path | None = None) -> list[Path]:
+    """Every source of the package that compiled code may have taken a function or a constant from, sorted."""
+    folder = folder or Path(__file__).parent
+    return sorted(file for file in folder.rglob("*.py") if file.relative_to(folder).parts[0] not in NEVER_COMPILED)
+
+
 def source_hash(folder: Path | None = None) -> str:
-    """SHA-256 of the names and contents of the package's Python sources (32 hex digits)."""
+    """SHA-256 of the names and contents of :func:`compiled_sources` (32 hex digits)."""
     folder = folder or Path(__file__).parent
     digest = hashlib.sha256()
-    for file in sorted(folder.glob("*.py")):
-        digest.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
+    for file in compiled_sources(folder):
+        digest.update(file.relative_to(folder).as_posix().encode() + b"\0" + file.read_bytes() + b"\0")
     return digest.hexdigest()[:32]
 
 
@@ -91,9 +101,9 @@ def _user_cache() -> Path:
 
 def hashed(*functions: Callable[..., Any]) -> bool:
     """Whether :func:`source_hash` sees the text of every one of these functions."""
-    folder = Path(__file__).parent
+    seen = {str(file) for file in compiled_sources()}
     codes = [getattr(function, "__code__", None) for function in functions]
-    return all(code is not None and Path(code.co_filename).parent == folder for code in codes)
+    return all(code is not None and str(Path(code.co_filename)) in seen for code in codes)
 
 
 def kernel(function: F, keep: bool = True, allocates: bool = True) -> F:

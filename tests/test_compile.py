@@ -184,7 +184,12 @@ def test_hash_sees_names_and_contents(package: Path) -> None:
     edit(folder / "task.py", "FAILURE_COST = 10.0", "FAILURE_COST = 11.0")
     second = source_hash(folder)
     (folder / "task.py").rename(folder / "tasks.py")
-    assert len({first, second, source_hash(folder)}) == 3
+    third = source_hash(folder)
+    edit(folder / "rendering" / "pixels.py", "from __future__", "# changed\nfrom __future__")
+    fourth = source_hash(folder)
+    (folder / "evaluation" / "report.py").write_text("nothing of it is compiled")
+    assert len({first, second, third, fourth}) == 4
+    assert source_hash(folder) == fourth
 
 
 def test_only_functions_of_the_package_are_hashed() -> None:
