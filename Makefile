@@ -66,7 +66,7 @@ benchmark: $(BENCHMARK_READY) ## the shipped agent and the classical controllers
 	$(BIN)/python benchmark.py
 
 paper: $(BENCHMARK_READY) ## the paper's numbers beside ours
-	$(BIN)/python -m baselines.paper
+	$(BIN)/python -m studies.paper
 
 docs: $(DOCS_READY) ## the documentation site, into build/docs; warnings are errors
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -c docs . build/docs

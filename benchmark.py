@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 from cz_gym.commands import OneLineParser, guarded
 
 if TYPE_CHECKING:
-    from agents.contract import Contract
-    from baselines.registry import Entry
+    from cz_gym.agents.agent_file.contract import Contract
+    from cz_gym.baselines.registry import Entry
     from cz_gym.config import Config
     from cz_gym.evaluation.protocol import Row
-    from cz_gym.evaluation.run import Contender, Plan
+    from cz_gym.evaluation.runner import Contender, Plan
 
 FOLDER = Path(__file__).resolve().parent / "results" / "benchmark"
 """Where the committed results are."""
@@ -91,9 +91,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def benchmark(arguments: argparse.Namespace, command: str) -> int:
     """Check, run, write, show."""
-    from cz_gym.evaluation.output import check_targets, write
-    from cz_gym.evaluation.run import Progress, run
-    from cz_gym.evaluation.terminal import terminal
+    from cz_gym.evaluation.report.output import check_targets, write
+    from cz_gym.evaluation.report.terminal import terminal
+    from cz_gym.evaluation.runner import Progress, run
 
     plan = make_plan(arguments, command)
     partial = is_partial(arguments, plan)
@@ -118,7 +118,7 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
 def make_plan(arguments: argparse.Namespace, command: str) -> Plan:
     """What the command line asks for; ValueError names what was given and what is allowed."""
     from cz_gym.evaluation.protocol import ROWS, check_episodes, find_row
-    from cz_gym.evaluation.run import Plan
+    from cz_gym.evaluation.runner import Plan
 
     episodes = check_episodes(arguments.episodes)
     if arguments.scenarios is None:
@@ -133,15 +133,15 @@ def make_plan(arguments: argparse.Namespace, command: str) -> Plan:
 
 def slow_names() -> set[str]:
     """Controllers that run only when asked for: everyone that is slow."""
-    from baselines.registry import CONTROLLERS
+    from cz_gym.baselines.registry import CONTROLLERS
 
     return {entry.name for entry in CONTROLLERS if entry.slow}
 
 
 def kept_names(rows: Sequence[Row], episodes: int) -> set[str]:
     """The slow controllers of which every episode asked for is kept, so that they cost no time."""
-    from baselines.registry import CONTROLLERS
-    from cz_gym.evaluation.run import Plan
+    from cz_gym.baselines.registry import CONTROLLERS
+    from cz_gym.evaluation.runner import Plan
 
     found = set()
     for entry in CONTROLLERS:
@@ -163,7 +163,7 @@ def left_out(plan: Plan) -> list[str]:
 
 def is_partial(arguments: argparse.Namespace, plan: Plan) -> bool:
     """Whether the run holds less than the default one, or another agent than the shipped one."""
-    from baselines.registry import CONTROLLERS
+    from cz_gym.baselines.registry import CONTROLLERS
     from cz_gym.evaluation.protocol import ROWS
 
     names = {contender.controller.name for contender in plan.contenders}
@@ -181,8 +181,8 @@ def choose(
     are wanted by name, and slow controllers only if ``slow`` names them. Raises ValueError for a name that nobody has,
     and for agent files that cannot be used.
     """
-    from agents import OnnxPolicy
-    from baselines.registry import CONTROLLERS
+    from cz_gym.agents import OnnxPolicy
+    from cz_gym.baselines.registry import CONTROLLERS
     from cz_gym.evaluation.protocol import SLOW_EPISODES
 
     given: dict[str, list[Any]] = {}
@@ -215,7 +215,7 @@ def choose(
 
 
 def _shipped(name: str) -> list[Any]:
-    from agents import OnnxPolicy, shipped, shipped_seeds
+    from cz_gym.agents import OnnxPolicy, shipped, shipped_seeds
 
     return [OnnxPolicy.load(file, _nominal()) for file in ([shipped()] if name == DEFAULT else shipped_seeds(name))]
 
@@ -235,7 +235,7 @@ def _recorded(contract: Contract) -> dict[str, Any]:
 
 def _classical(entry: Entry) -> Contender:
     from cz_gym.evaluation.results import Controller
-    from cz_gym.evaluation.run import Contender
+    from cz_gym.evaluation.runner import Contender
 
     controller = Controller(entry.name, entry.observation, entry.meaning, told=entry.told, slow=entry.slow)
     if entry.slow:
@@ -245,9 +245,9 @@ def _classical(entry: Entry) -> Contender:
 
 def _agent(name: str, policies: Sequence[Any], given: bool) -> Contender:
     """A learned controller: every training seed of one algorithm. Raises ValueError if they are no such set."""
-    from agents.resampled import at_interval
+    from cz_gym.agents.policies.resampled import at_interval
     from cz_gym.evaluation.results import Controller
-    from cz_gym.evaluation.run import Contender
+    from cz_gym.evaluation.runner import Contender
 
     contracts = [policy.contract for policy in policies]
     seeds = tuple(contract.training_seed for contract in contracts)

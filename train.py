@@ -13,7 +13,7 @@ from cz_gym.commands import OneLineParser, guarded
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
     """Read the command line; exits with code 2 and one line for anything that cannot be meant."""
-    from agents.settings import RECIPES
+    from cz_gym.agents.training.recipes import RECIPES
 
     parser = OneLineParser(
         prog="train.py",
@@ -53,11 +53,12 @@ def train(arguments: argparse.Namespace) -> int:
     """Run the training that the command line asks for."""
     from tqdm import tqdm
 
-    from agents import settings
-    from agents.run import Run
-    from agents.run_files import saved_steps
-    from cz_gym.evaluation.whole import alone, check_writable
-    from cz_gym.scenarios import find_scenario
+    from cz_gym.agents.training import recipes as settings
+    from cz_gym.agents.training.run import Run
+    from cz_gym.agents.training.run_files import saved_steps
+    from cz_gym.atomic_files import alone, check_writable
+    from cz_gym.baselines.registry import make_controller
+    from cz_gym.episodes.scenarios import find_scenario
 
     choice = settings.RECIPES[arguments.algo]
     scenario = find_scenario(arguments.scenario or choice.recipe.scenario).name
@@ -69,7 +70,7 @@ def train(arguments: argparse.Namespace) -> int:
     choice = replace(choice, steps=steps)
     check_writable(folder)
     with alone(folder):
-        run = Run(folder, choice, arguments.seed, arguments.resume, arguments.checkpoint_seconds)
+        run = Run(folder, choice, arguments.seed, make_controller, arguments.resume, arguments.checkpoint_seconds)
         print(f"{arguments.algo}, seed {arguments.seed}, {choice.steps:,} steps on {scenario!r}, into {folder}")
         with tqdm(total=choice.steps, unit="step", unit_scale=True, dynamic_ncols=True, mininterval=1.0) as bar:
             try:

@@ -1,14 +1,18 @@
 """Learned controllers: training with stable-baselines3, and running what was trained without it.
 
-Importing this package needs neither torch nor stable-baselines3; training (:mod:`agents.training`) needs both.
+Importing this package needs neither torch nor stable-baselines3; training (:mod:`cz_gym.agents.training.learners`)
+needs both.
 """
 
 from __future__ import annotations
 
+if __name__ != "cz_gym.agents":
+    raise ImportError("import cz_gym.agents: the folder agents is that package, under no other name")
+
 from pathlib import Path
 
-from .contract import AgentFileError, Contract, read_agent
-from .onnx_policy import OnnxPolicy
+from cz_gym.agents.agent_file.contract import AgentFileError, Contract, read_agent
+from cz_gym.agents.policies.onnx import OnnxPolicy
 
 __all__ = ["AgentFileError", "Contract", "OnnxPolicy", "shipped", "shipped_seeds"]
 

@@ -1,4 +1,4 @@
-"""A stable-baselines3 model as an agent file: ``python -m agents.from_sb3 best_model.zip --algo ppo --out mine.onnx``.
+"""A stable-baselines3 model as an agent file: ``python -m cz_gym.agents.from_sb3 MODEL.zip --algo ppo --out FILE``.
 
 For models trained elsewhere, by plain stable-baselines3 or RL-Zoo; ``train.py`` writes agent files by itself. A saved
 model is a pickle, and reading one can run any code: convert only what you trained. The agent file holds no code.
@@ -21,6 +21,12 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from cz_gym.agents.agent_file.contract import AgentFileError, Contract, facts_of, make_contract, write_agent
+from cz_gym.agents.policies.onnx import OnnxPolicy
+from cz_gym.agents.training.export import OnnxGraph
+from cz_gym.agents.training.recipes import CostWeights
+from cz_gym.agents.training.recurrent import lstm_step
+from cz_gym.agents.training.validation import JUDGING, validate
 from cz_gym.commands import OneLineParser, guarded
 from cz_gym.config import make_config
 from cz_gym.env import CzEnv
@@ -28,14 +34,7 @@ from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.observation import OBSERVATIONS
 from cz_gym.vector import CzVectorEnv
 
-from .contract import AgentFileError, Contract, facts_of, make_contract, write_agent
-from .export import OnnxGraph
-from .onnx_policy import OnnxPolicy
-from .recurrent import lstm_step
-from .settings import CostWeights
-from .validation import JUDGING, validate
-
-PROG = "python -m agents.from_sb3"
+PROG = "python -m cz_gym.agents.from_sb3"
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "a2c": stable_baselines3.A2C,
     "ddpg": stable_baselines3.DDPG,

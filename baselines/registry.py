@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from cz_gym.baselines.bounds import lqg as lqg_bounds
+from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
+from cz_gym.baselines.lqg import settings as lqg_settings
+from cz_gym.baselines.lqg.controller import LQG
+from cz_gym.baselines.pid.compensated_pid import CompensatedPID
+from cz_gym.baselines.pid.open_loop import OpenLoop
+from cz_gym.baselines.pid.tuned import tuned
 from cz_gym.config import Config
 
-from . import lqg_settings
-from .clairvoyant import Clairvoyant
-from .compensated_pid import CompensatedPID
-from .lqg import LQG
-from .open_loop import OpenLoop
 from .policy import Policy
-from .tuned import tuned
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ def _lqg_at(activity: float) -> Entry:
 def _told(name: str, make: Callable[[Config], LQG]) -> Entry:
     return Entry(
         f"{name}-told",
-        lambda config: lqg_settings.lqg_told(make(config)),
+        lambda config: lqg_bounds.lqg_told(make(config)),
         "measured",
         f"bound: {name} told the puller's parameters and how rough its melt is",
         default=False,
@@ -74,7 +75,7 @@ def _told(name: str, make: Callable[[Config], LQG]) -> Entry:
 
 
 def _ekf_mpc(config: Config) -> Policy:
-    from .ekf_mpc import ekf_mpc
+    from cz_gym.baselines.mpc.controller import ekf_mpc
 
     return ekf_mpc(config)
 
@@ -93,7 +94,7 @@ CONTROLLERS: tuple[Entry, ...] = (
     Entry("ekf-mpc", _ekf_mpc, "measured", "nonlinear MPC on a bank of lqg's filters", default=False, slow=True),
     Entry(
         "lqg-true",
-        lqg_settings.lqg_true,
+        lqg_bounds.lqg_true,
         "measured",
         "bound: lqg told the puller's parameters",
         default=False,
@@ -104,7 +105,7 @@ CONTROLLERS: tuple[Entry, ...] = (
     _told(lqg_settings.family_name(IN_TABLE), lambda config: lqg_settings.lqg_at(IN_TABLE, config)),
     Entry(
         "full-information",
-        lqg_settings.full_information,
+        lqg_bounds.full_information,
         "state",
         "bound: lqg's regulator, true state seen",
         default=False,
@@ -129,3 +130,8 @@ def find_controller(name: str) -> Entry:
         if entry.name == name:
             return entry
     raise ValueError(f"unknown controller {name!r}; choose from {', '.join(entry.name for entry in CONTROLLERS)}")
+
+
+def make_controller(name: str, config: Config) -> Policy:
+    """The controller of that name for an environment's settings; ValueError names what there is."""
+    return find_controller(name).make(config)

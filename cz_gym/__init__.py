@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import gymnasium as gym
 
+from cz_gym.episodes.scenario import Scenario
+from cz_gym.episodes.scenarios import SCENARIOS
+from cz_gym.physics.meniscus import HURLE, MeniscusModel
+from cz_gym.physics.parameters import Parameters
+from cz_gym.physics.plant import Puller, State, make_puller
+
 from .config import Config
 from .env import CzEnv, EnvState
-from .meniscus import HURLE, MeniscusModel
 from .observation import decode
-from .parameters import Parameters
-from .plant import Puller, State, make_puller
-from .scenario import Scenario
-from .scenarios import SCENARIOS
 from .vector import CzVectorEnv
 
 __version__ = "0.1.0"

@@ -9,14 +9,15 @@ from dataclasses import dataclass, field, replace
 from numbers import Real
 from typing import NamedTuple
 
-from ._compile import hashed
-from .camera import Camera, camera_for, check_camera
-from .meniscus import HURLE, MeniscusModel
+from cz_gym.camera.view import Camera, camera_for, check_camera
+from cz_gym.episodes.scenario import Range, Scenario
+from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario, mix_of
+from cz_gym.jit.cache import hashed
+from cz_gym.physics.meniscus import HURLE, MeniscusModel
+from cz_gym.physics.parameters import Parameters, check_parameters
+from cz_gym.physics.plant import make_puller
+
 from .observation import CAMERA, OBSERVATIONS
-from .parameters import Parameters, check_parameters
-from .plant import make_puller
-from .scenario import Range, Scenario
-from .scenarios import RANDOMIZED, find_scenario, mix_of
 from .task import check_height
 
 VERSION = 0

@@ -12,16 +12,17 @@ import numpy.typing as npt
 from gymnasium.error import InvalidAction, ResetNeeded
 from gymnasium.spaces import Box
 
-from .batch import Batch, SlotState, new_key
-from .camera import IMAGE, Camera
+from cz_gym.camera.view import IMAGE, Camera
+from cz_gym.engine.batch import Batch, SlotState, new_key
+from cz_gym.engine.layout import INFO
+from cz_gym.episodes.scenario import Scenario
+from cz_gym.episodes.scenarios import find_scenario
+from cz_gym.physics.meniscus import MeniscusModel
+from cz_gym.physics.parameters import Parameters
+from cz_gym.rendering.view import FPS, Frame, declared_modes, make_view
+
 from .config import make_config
-from .meniscus import MeniscusModel
 from .observation import CAMERA, CLIP, OBSERVATIONS
-from .parameters import Parameters
-from .rendering.view import FPS, Frame, declared_modes, make_view
-from .scenario import Scenario
-from .scenarios import find_scenario
-from .slots import INFO
 
 Observation = npt.NDArray[Any]
 Action = npt.NDArray[np.float32]

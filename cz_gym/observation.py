@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .parameters import Parameters
+from cz_gym.physics.parameters import Parameters
+
 from .units import KILO, MINUTE, MM
 
 CLIP = 10.0

@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ._compile import physics
+from cz_gym.jit.compile import physics
+from cz_gym.physics.plant import Puller
+
 from .observation import HEATER_SCALE
-from .plant import Puller
 from .units import KILO, MM, MM_PER_MIN
 
 RADIUS_LIMIT = 8.0 * MM

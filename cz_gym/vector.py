@@ -13,15 +13,16 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from .batch import Batch, new_key
-from .camera import Camera
+from cz_gym.camera.view import Camera
+from cz_gym.engine.batch import Batch, new_key
+from cz_gym.engine.layout import INFO, Out
+from cz_gym.episodes.scenario import Scenario
+from cz_gym.episodes.scenarios import find_scenario
+from cz_gym.physics.meniscus import MeniscusModel
+from cz_gym.physics.parameters import Parameters
+
 from .config import make_config
 from .env import CzEnv, EnvState, action_space, check_options, check_state, observation_space
-from .meniscus import MeniscusModel
-from .parameters import Parameters
-from .scenario import Scenario
-from .scenarios import find_scenario
-from .slots import INFO, Out
 
 _MASKS = tuple(f"_{name}" for name in INFO)
 Array = npt.NDArray[Any]

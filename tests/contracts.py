@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from agents.contract import facts_of
+from cz_gym.agents.agent_file.contract import facts_of
 from cz_gym.config import make_config
 
 
 def facts(observation: str = "history", **changes: Any) -> dict[str, Any]:
-    """What :func:`agents.contract.make_contract` asks for, of an agent trained on "randomized"."""
+    """What :func:`cz_gym.agents.agent_file.contract.make_contract` asks for, of an agent trained on "randomized"."""
     config = make_config(observation=observation)
     known = {
         **facts_of(config),

@@ -11,12 +11,13 @@ from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from ..scenarios import SCENARIOS
+from cz_gym.atomic_files import check_writable as check_writable
+from cz_gym.atomic_files import write_files as write_files
+from cz_gym.episodes.scenarios import SCENARIOS
+
 from .metrics import metric_names
 from .results import BOUND, REFERENCE, Benchmark, Outcome
 from .statistics import RESAMPLES, SEED, Estimate
-from .whole import check_writable as check_writable
-from .whole import write_files as write_files
 
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime", "casadi")
 """Packages whose versions are recorded."""

@@ -7,8 +7,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..task import RADIUS_LIMIT, cost_terms
-from ..units import KILO, MINUTE, MM, MM_PER_MIN
+from cz_gym.task import RADIUS_LIMIT, cost_terms
+from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
+
 from .rollout import Rollout
 
 Floats = npt.NDArray[np.float64]

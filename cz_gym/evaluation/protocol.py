@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..config import Config, make_config
-from ..meniscus import HURLE, MeniscusModel
-from ..scenarios import SCENARIOS
-from ..young_laplace import YOUNG_LAPLACE
+from cz_gym.config import Config, make_config
+from cz_gym.episodes.scenarios import SCENARIOS
+from cz_gym.physics.meniscus import HURLE, MeniscusModel
+from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 
 TRAINING_SEEDS = range(1_000_000)
 """Seeds of the episodes that controllers are tuned and agents are trained on."""

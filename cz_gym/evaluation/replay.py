@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..config import Config
+from cz_gym.config import Config
+
 from .rollout import Course, Rollout
 
 

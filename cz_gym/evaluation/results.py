@@ -13,15 +13,7 @@ import numpy.typing as npt
 from .metrics import metric_names, metrics
 from .protocol import Row
 from .rollout import Rollout, Signals
-from .statistics import (
-    Estimate,
-    Resamples,
-    cvar,
-    differences,
-    means,
-    optimality_gap,
-    probability_of_improvement,
-)
+from .statistics import Estimate, Resamples, cvar, differences, means, optimality_gap, probability_of_improvement
 
 Floats = npt.NDArray[np.float64]
 REFERENCE = "paper"

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..config import Config
-from ..units import MICRO
-from ..vector import CzVectorEnv
+from cz_gym.config import Config
+from cz_gym.units import MICRO
+from cz_gym.vector import CzVectorEnv
 
 Floats = npt.NDArray[np.float64]
 CHUNK = 500

@@ -10,7 +10,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from ..units import MM
+from cz_gym.units import MM
+
 from . import palette
 from .canvas import TIMES, Box, Canvas, paired
 from .geometry import Scale, beside, height_inside, ladder, meniscus_curve, ring_height

@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..task import HEATER_RANGE
-from ..units import KILO, MM, MM_PER_MIN
+from cz_gym.task import HEATER_RANGE
+from cz_gym.units import KILO, MM, MM_PER_MIN
+
 from . import palette
 from .canvas import Box, Canvas
 from .palette import Colour

@@ -7,9 +7,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..meniscus import MeniscusModel, profile, profile_scale
-from ..plant import Puller
-from ..task import HEIGHT_MAX_IN_A, HEIGHT_MIN
+from cz_gym.physics.meniscus import MeniscusModel, profile, profile_scale
+from cz_gym.physics.plant import Puller
+from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
+
 from .canvas import Box, paired
 
 Floats = npt.NDArray[np.float64]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .._compile import kernel
+from cz_gym.jit.compile import kernel
 
 _RED_BLUE, _GREEN = np.uint32(0xFF00FF), np.uint32(0x00FF00)
 _TWO = np.uint32(2)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from ..task import HEATER_RANGE
-from ..units import MM
+from cz_gym.task import HEATER_RANGE
+from cz_gym.units import MM
+
 from . import palette
 from .canvas import TIMES, Box, Canvas, paired
 from .geometry import Scale, ladder

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..config import Config
-from ..plant import Puller
-from ..slots import INFO
-from ..task import HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT
+from cz_gym.config import Config
+from cz_gym.engine.layout import INFO
+from cz_gym.physics.plant import Puller
+from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT
 
 Floats = npt.NDArray[np.float64]
 _READ = ("r_c", "r_br", "r_ref", "h_c", "v_g", "v_p", "Q_H", "T_1", "T_1_ref", "T_b", "r_br_measured")
@@ -87,7 +87,7 @@ class Record:
         return self._rows[: self._count, _AT[name]]
 
     def add(self, info: Floats, slot: Any, terminated: bool = False, truncated: bool = False) -> None:
-        """Add the sample of info rows (:data:`cz_gym.slots.INFO`) and the slot they were read from.
+        """Add the sample of info rows (:data:`cz_gym.engine.layout.INFO`) and the slot they were read from.
 
         The length grown is what the pull took up and the meniscus did not: h_c' = v_p - v_g, integrated exactly.
         """

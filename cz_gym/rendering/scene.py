@@ -6,7 +6,8 @@ from collections.abc import Callable
 from numbers import Integral
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ..units import MM
+from cz_gym.units import MM
+
 from . import edge_panel, gauges, palette, puller_panel, strips
 from .canvas import BASE, Box, Canvas
 from .gauges import Asked

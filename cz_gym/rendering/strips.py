@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..config import Config
-from ..units import HOUR, MINUTE, MM, MM_PER_MIN
+from cz_gym.config import Config
+from cz_gym.units import HOUR, MINUTE, MM, MM_PER_MIN
+
 from . import palette
 from .canvas import Box, Canvas, paired
 from .edge_panel import RANGES, TOLERANCE

@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.error import DependencyNotInstalled, Error, ResetNeeded
 
-from ..config import Config
+from cz_gym.config import Config
+
 from .backend import MISSING, available, load
 from .pixels import colours
 from .record import Record

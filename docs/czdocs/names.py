@@ -8,7 +8,7 @@ import re
 from typing import Any
 
 from cz_gym import Parameters
-from cz_gym.camera import Camera
+from cz_gym.camera.view import Camera
 
 PLACE = "Alias for field number"
 DESCRIBED: tuple[Any, ...] = (Parameters, Camera)

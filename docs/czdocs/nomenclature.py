@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cz_gym import Parameters, Puller, State
-from cz_gym.parameters import describe
-from cz_gym.plant import Disturbance, Inputs
-from cz_gym.slots import INFO_ROWS
+from cz_gym.engine.layout import INFO_ROWS
+from cz_gym.physics.parameters import describe
+from cz_gym.physics.plant import Disturbance, Inputs
 
 from .attributes import attributes
 

@@ -13,10 +13,10 @@ from docutils.parsers.rst import Directive
 from docutils.statemachine import StringList
 
 from cz_gym import SCENARIOS, Scenario
-from cz_gym.camera import Camera, describe_camera
+from cz_gym.camera.view import Camera, describe_camera
+from cz_gym.engine.layout import INFO_ROWS
+from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED, STATE, Channel
-from cz_gym.scenarios import RANDOMIZED
-from cz_gym.slots import INFO_ROWS
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from . import nomenclature

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cz_gym.evaluation.page import page
-from cz_gym.evaluation.page_signals import CURVES, unpack
 from cz_gym.evaluation.protocol import find_row
+from cz_gym.evaluation.report.page import page
+from cz_gym.evaluation.report.page_signals import CURVES, unpack
 from cz_gym.evaluation.results import Benchmark, Controller, Sample, ScenarioResult, summarise
 from cz_gym.evaluation.rollout import rollout
 
@@ -40,7 +40,7 @@ PATIENCE = 60.0
 
 def scenario(name: str, episodes: int) -> ScenarioResult:
     """Two controllers and an agent with a name that is markup."""
-    from baselines.registry import find_controller
+    from cz_gym.baselines.registry import find_controller
 
     row = find_row(name)
     config, seeds, samples = row.config(), row.seeds(episodes), []

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from cz_gym import SCENARIOS, CzEnv
-from cz_gym.parameters import Parameters
+from cz_gym.physics.parameters import Parameters
 
 FILE = Path(__file__).with_name("trajectories.json")
 SIGNALS = ("r_c", "h_c", "T_1", "T_b", "Q_H", "r_br_measured", "r_ref", "T_1_ref", "v_g")

@@ -1,0 +1,182 @@
+"""What an agent file promises: the JSON beside each ONNX file, and the errors for files that break it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import stat
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from cz_gym.atomic_files import write_files
+from cz_gym.config import Config
+from cz_gym.observation import CLIP, OBSERVATIONS
+
+FORMAT = "cz-gym-agent"
+FORMAT_VERSION = 3
+MAX_BYTES = 4_000_000
+"""Largest agent file that is read."""
+MAX_JSON_BYTES = 1_000_000
+"""Largest JSON file that is read."""
+MAX_TEXT = 80
+"""Longest text in a contract."""
+MAX_WHOLE = 2**63 - 1
+"""Largest whole number in a contract."""
+
+
+class AgentFileError(ValueError):
+    """An agent file is missing, broken, or made for something else; the message is one line."""
+
+
+@dataclass(frozen=True)
+class Contract:
+    """What the agent saw, on which plant it was trained, and how it came about."""
+
+    observation: str
+    """Observation mode it reads."""
+    channels: int
+    """Length of that observation."""
+    observation_hash: str
+    """Hash of that observation's channels: names, units and scales in their order."""
+    control_interval: float
+    """Time between actions it was trained at [s]."""
+    plant_hash: str
+    """Hash of the nominal plant it was trained on."""
+    scenario: str
+    """Scenario it was trained on."""
+    scenario_hash: str
+    """Hash of that scenario."""
+    algorithm: str
+    """Name of the learning algorithm."""
+    training_seed: int
+    """Seed of the training run."""
+    training_steps: int
+    """Environment steps behind these weights."""
+    validation_cost: float
+    """Mean cost of a step, weighed as in training [-], on validation episodes: those that judge a run at its end."""
+    validation_rmse_mm: float
+    """Mean RMSE on the same [mm]."""
+    sha256: str
+    """Hash of the ONNX file."""
+
+
+def observation_hash(name: str) -> str:
+    """Hash of an observation mode's channels (16 hex digits); their explanations do not count."""
+    channels = [(channel.name, channel.unit, channel.scale) for channel in OBSERVATIONS[name]]
+    return hashlib.sha256(json.dumps([channels, CLIP]).encode()).hexdigest()[:16]
+
+
+def facts_of(config: Config) -> dict[str, Any]:
+    """What a contract says of the environment's settings."""
+    return {
+        "observation": config.observation,
+        "channels": len(OBSERVATIONS[config.observation]),
+        "control_interval": config.control_interval,
+        "plant_hash": config.plant_hash,
+        "scenario": config.scenario.name,
+        "scenario_hash": config.scenario.hash,
+    }
+
+
+def make_contract(onnx_bytes: bytes, **facts: Any) -> Contract:
+    """The contract of an ONNX file; ``facts`` are Contract's fields without the hashes of observation and file.
+
+    AgentFileError for a fact that no contract may hold.
+    """
+    digest = hashlib.sha256(onnx_bytes).hexdigest()
+    known = {**facts, "observation_hash": observation_hash(facts["observation"]), "sha256": digest}
+    _check(known, "contract")
+    return Contract(**known)
+
+
+def agent_files(path: Path, onnx_bytes: bytes, contract: Contract) -> dict[Path, bytes]:
+    """The contents of ``path`` (.onnx) and of its contract (.json)."""
+    text = json.dumps({"format": FORMAT, "format_version": FORMAT_VERSION, **asdict(contract)}, indent=2) + "\n"
+    return {path: onnx_bytes, path.with_suffix(".json"): text.encode()}
+
+
+def write_agent(path: Path, onnx_bytes: bytes, **facts: Any) -> Contract:
+    """Write an agent file with its contract, both or none; ``facts`` as for :func:`make_contract`."""
+    contract = make_contract(onnx_bytes, **facts)
+    write_files(agent_files(path, onnx_bytes, contract))
+    return contract
+
+
+def read_agent(path: Path) -> tuple[Contract, bytes]:
+    """The contract and the ONNX bytes of an agent file; AgentFileError with the reason if anything is wrong."""
+    onnx_bytes = read_bounded(path, MAX_BYTES)
+    contract = _parse(path.with_suffix(".json"))
+    if hashlib.sha256(onnx_bytes).hexdigest() != contract.sha256:
+        raise AgentFileError(f"{path}: not the file its contract was written for (SHA-256 differs)")
+    return contract, onnx_bytes
+
+
+def read_bounded(path: Path, limit: int) -> bytes:
+    """The contents of a regular file of at most ``limit`` bytes; AgentFileError for others, pipes and devices too."""
+    try:
+        # Without O_NONBLOCK, opening a pipe would wait for somebody to write into it.
+        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise AgentFileError(f"{path}: not a regular file")
+            content = file.read(limit + 1)
+    except FileNotFoundError:
+        raise AgentFileError(f"{path}: no such file") from None
+    except OSError as error:
+        raise AgentFileError(f"{path}: cannot be read ({error.strerror})") from None
+    except ValueError as error:
+        # AgentFileError is one; the other is a name that no file can have.
+        raise error if isinstance(error, AgentFileError) else AgentFileError(f"{path!r}: {error}") from None
+    if len(content) > limit:
+        raise AgentFileError(f"{path}: larger than {limit} bytes")
+    return content
+
+
+def read_json(path: Path) -> Any:
+    """What a JSON file of bounded size says; AgentFileError if it is none."""
+    content = read_bounded(path, MAX_JSON_BYTES)
+    try:
+        return json.loads(content)
+    except (ValueError, RecursionError):
+        raise AgentFileError(f"{path}: not JSON") from None
+
+
+def _parse(path: Path) -> Contract:
+    data = read_json(path)
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise AgentFileError(f"{path}: not a {FORMAT} contract")
+    if data.get("format_version") != FORMAT_VERSION:
+        version = data.get("format_version")
+        raise AgentFileError(f"{path}: format version {version!r:.80}, this release reads {FORMAT_VERSION}")
+    wanted = {field.name for field in fields(Contract)}
+    given = {name: value for name, value in data.items() if name not in ("format", "format_version")}
+    if set(given) != wanted:
+        odd = sorted(set(given) ^ wanted)[0]
+        raise AgentFileError(f"{path}: field {odd!r:.80} is {'missing' if odd in wanted else 'unknown'}")
+    _check(given, path)
+    return Contract(**given)
+
+
+def _check(given: Mapping[str, Any], where: Path | str) -> None:
+    """AgentFileError unless every value is what a contract's field of that name holds."""
+    for field in fields(Contract):
+        if wrong := _wrong(str(field.type), given[field.name]):
+            raise AgentFileError(f"{where}: field {field.name!r} must be {wrong}, not {given[field.name]!r:.80}")
+
+
+def _wrong(kind: str, value: Any) -> str | None:
+    """What a value of this kind must be, if this one is not."""
+    kinds: dict[str, tuple[type, ...]] = {"str": (str,), "int": (int,), "float": (int, float)}
+    if not isinstance(value, kinds[kind]) or isinstance(value, bool):
+        return kind
+    if isinstance(value, str):
+        plain = 0 < len(value) <= MAX_TEXT and value.isprintable()
+        return None if plain else f"printable text of 1 to {MAX_TEXT} characters"
+    if isinstance(value, int):
+        return None if 0 <= value <= MAX_WHOLE else f"between 0 and {MAX_WHOLE}"
+    if not math.isfinite(value):
+        return "finite"
+    return None if value >= 0.0 else "at least 0"

@@ -1,0 +1,1 @@
+"""Agents that act: ONNX files, residuals on a controller, other control intervals."""

@@ -1,0 +1,126 @@
+"""A trained agent as data: an ONNX file run by onnxruntime, through the ``predict`` seam, without torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.agents.agent_file.contract import AgentFileError, Contract, observation_hash, read_agent
+from cz_gym.agents.agent_file.graph import GraphError, checked
+from cz_gym.config import Config
+from cz_gym.observation import OBSERVATIONS
+
+Floats = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class OnnxPolicy:
+    """A deterministic, batched agent; what it remembers, if anything, travels in ``state``."""
+
+    contract: Contract
+    session: Any = field(repr=False, compare=False)
+    remembers: int = 0
+    """Length of its state; 0 if it has none."""
+
+    @classmethod
+    def load(cls, path: str | Path, config: Config | None = None) -> OnnxPolicy:
+        """Load an agent file (.onnx with its .json beside it).
+
+        With a config, the agent must have been trained on the same nominal plant. Raises AgentFileError with one line
+        that says why a file is refused. Nothing in the file is executed but its tensor operations.
+        """
+        path = Path(path)
+        return cls.of(*read_agent(path), config, path)
+
+    @classmethod
+    def of(
+        cls, contract: Contract, onnx_bytes: bytes, config: Config | None = None, path: str | Path = "agent"
+    ) -> OnnxPolicy:
+        """An agent of what its files say; ``path`` names it in errors."""
+        if contract.observation not in OBSERVATIONS:
+            raise AgentFileError(
+                f"{path}: reads observation {contract.observation!r}, which this release does not have"
+            )
+        expected = len(OBSERVATIONS[contract.observation])
+        if contract.channels != expected:
+            raise AgentFileError(
+                f"{path}: reads {contract.channels} channels, this release's {contract.observation!r} has {expected}"
+            )
+        if contract.observation_hash != observation_hash(contract.observation):
+            raise AgentFileError(
+                f"{path}: reads observation {contract.observation!r} with other channels or scales than this release's"
+            )
+        if config is not None and config.plant_hash != contract.plant_hash:
+            raise AgentFileError(
+                f"{path}: trained on plant {contract.plant_hash}, this environment's is {config.plant_hash}"
+            )
+        policy = cls(contract, *_session(path, onnx_bytes, expected))
+        try:
+            policy.predict(np.zeros((2, expected), np.float32))
+        except AgentFileError as error:
+            raise AgentFileError(f"{path}: {error}") from None
+        return policy
+
+    @property
+    def observation(self) -> str:
+        """The observation mode the agent reads."""
+        return self.contract.observation
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[npt.NDArray[np.float32], Any]:
+        """Actions, shape (n, 2) or (2,), of observations of shape (n, channels) or (channels,).
+
+        An agent that remembers takes and returns ``state``, shape (n, k) or (k,); None, and rows where
+        ``episode_start``, begin at zero. One that does not returns it as it was.
+        """
+        array = np.asarray(observation, np.float32)
+        if array.ndim not in (1, 2) or array.shape[-1] != self.contract.channels:
+            raise ValueError(
+                f"expected {self.contract.channels} channels ({self.observation}), got shape {array.shape}"
+            )
+        rows = np.atleast_2d(array)
+        if not self.remembers:
+            (action,) = self._run({"observation": rows})
+            return (action[0] if array.ndim == 1 else action), state
+        before = np.zeros((len(rows), self.remembers), np.float32)
+        if state is not None:
+            before += np.reshape(state, before.shape)
+        if episode_start is not None:
+            before[np.broadcast_to(episode_start, len(rows))] = 0.0
+        action, after = self._run({"observation": rows, "state": before})
+        return (action[0], after[0]) if array.ndim == 1 else (action, after)
+
+    def _run(self, inputs: dict[str, Floats]) -> list[Floats]:
+        try:
+            outputs: list[Floats] = self.session.run(None, inputs)
+        except Exception:  # onnxruntime raises its own exception types, one for each way a graph can fail
+            raise AgentFileError(f"agent {self.contract.sha256[:12]}: its graph cannot be run") from None
+        shapes = [(len(inputs["observation"]), width) for width in (2, self.remembers) if width]
+        if [output.shape for output in outputs] != shapes or not all(np.isfinite(output).all() for output in outputs):
+            raise AgentFileError(f"agent {self.contract.sha256[:12]}: its action is not two finite numbers")
+        return outputs
+
+
+def _session(path: str | Path, onnx_bytes: bytes, channels: int) -> tuple[Any, int]:
+    """The graph, ready to run, and the length of its state."""
+    try:
+        import onnxruntime
+
+        clean, state = checked(onnx_bytes, channels)
+    except ImportError:
+        raise AgentFileError('running agents needs onnx and onnxruntime: pip install "cz-gym[benchmark]"') from None
+    except GraphError as error:
+        raise AgentFileError(f"{path}: {error}") from None
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    try:
+        return onnxruntime.InferenceSession(clean, options, providers=["CPUExecutionProvider"]), state
+    except Exception:  # onnxruntime raises its own exception types, one for each way a file can be broken
+        raise AgentFileError(f"{path}: not an ONNX model that onnxruntime can run") from None

@@ -1,0 +1,1 @@
+"""Training with stable-baselines3: recipes, networks, learners, runs with checkpoints."""

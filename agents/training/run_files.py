@@ -1,0 +1,112 @@
+"""The files of a run's folder but for its checkpoint: settings with provenance, and the progress of validations."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import platform
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from cz_gym.agents.agent_file.contract import MAX_JSON_BYTES, AgentFileError, read_bounded, read_json
+
+COLUMNS = (
+    "steps",
+    "seconds",
+    "validation_cost",
+    "validation_rmse_mm",
+    "paper_rmse_mm",
+    "pull_step_rms_mm_per_min",
+    "failure_rate",
+)
+"""Columns of ``progress.csv``."""
+PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "stable-baselines3", "torch", "onnx", "onnxruntime")
+
+
+def saved_steps(folder: Path) -> int:
+    """Environment steps that the run in this folder was begun with; AgentFileError if there is none."""
+    return int(read_settings(folder / "settings.json")["steps"])
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """What ``settings.json`` says of a run; AgentFileError unless a run wrote it."""
+    try:
+        saved = read_json(path)
+    except AgentFileError:
+        saved = None
+    steps, sessions = (saved.get("steps"), saved.get("sessions")) if isinstance(saved, dict) else (None, None)
+    whole = type(steps) is int and 0 < steps < 2**63 and isinstance(sessions, list)
+    if not whole or not sessions or not all(isinstance(session, dict) for session in sessions):
+        raise AgentFileError(f"{path}: missing or damaged, so there is nothing to resume")
+    return dict(saved)
+
+
+def provenance() -> dict[str, Any]:
+    """The command, and what it runs on: git commit, Python, packages."""
+    return {
+        "command": " ".join([Path(sys.executable).name, *_program(), *sys.argv[1:]]),
+        "git_commit": _git_commit(),
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in PACKAGES},
+    }
+
+
+def _program() -> list[str]:
+    """How Python was told what to run; of a path, what is left of it in this checkout."""
+    path = Path(sys.argv[0])
+    here = Path(__file__).resolve().parents[2]
+    if path.is_absolute() and path.is_relative_to(here):
+        path = path.relative_to(here)
+        module = ".".join(path.with_suffix("").parts).removesuffix(".__main__")
+        return ["-m", module] if len(path.parts) > 1 else [str(path)]
+    return [path.name if path.is_absolute() else str(path)]
+
+
+def _git_commit() -> str | None:
+    here = Path(__file__).resolve().parent
+    try:
+        asked = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=True)
+        changed = subprocess.run(["git", "status", "--porcelain", "-uno"], cwd=here, capture_output=True, text=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return asked.stdout.strip() + ("-dirty" if changed.stdout.strip() else "")
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def to_json(content: Any) -> bytes:
+    """The contents of a JSON file."""
+    return (json.dumps(content, indent=2) + "\n").encode()
+
+
+def to_csv(rows: list[dict[str, Any]]) -> bytes:
+    """``progress.csv``: a line a validation."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, fieldnames=COLUMNS)
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue().encode()
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """The validations before this session; AgentFileError if the file is not one that a run wrote."""
+    if not path.exists():
+        return []
+    try:
+        rows = list(csv.DictReader(io.StringIO(read_bounded(path, MAX_JSON_BYTES).decode(), newline="")))
+        for row in rows:
+            if list(row) != list(COLUMNS) or not all(math.isfinite(float(value)) for value in row.values()):
+                raise ValueError("a row is not one of numbers")
+    except (ValueError, TypeError, csv.Error):
+        raise AgentFileError(f"{path}: damaged; without it the run can be resumed") from None
+    return rows

@@ -1,0 +1,127 @@
+"""stable-baselines3's ``VecEnv`` over the native batch: no processes, no per-slot Python on the way.
+
+With ``observation="history"`` and ``privileged=True`` the true state is appended to each observation, for a critic
+that sees more than the policy (:mod:`cz_gym.agents.training.networks` lets the actor see only the head).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.vec_env import VecEnv
+
+from cz_gym import CzVectorEnv
+from cz_gym.observation import CLIP, STATE
+
+
+class CzVecEnv(VecEnv):
+    """A :class:`cz_gym.CzVectorEnv` as stable-baselines3 wants it.
+
+    Observations are float32, shape (num_envs, channels); ``infos`` are empty but for slots whose episode ended, which
+    carry ``terminal_observation``, ``TimeLimit.truncated`` and ``episode`` (return, length, time). With ``stagger``, a
+    seed, each slot's first episode is cut (truncated) at a random step, so that slots are not all in the same minute.
+    """
+
+    def __init__(self, env: CzVectorEnv, privileged: bool = False, stagger: int | None = None) -> None:
+        if env.autoreset_mode != AutoresetMode.SAME_STEP:
+            raise ValueError(
+                "CzVecEnv needs autoreset_mode=AutoresetMode.SAME_STEP, as stable-baselines3 resets itself"
+            )
+        if privileged and env.config.observation != "history":
+            raise ValueError('privileged=True needs observation="history"')
+        self.env = env
+        self.privileged = privileged
+        self.render_mode = env.render_mode
+        channels = env.single_observation_space.shape[0] + (len(STATE) if privileged else 0)
+        super().__init__(env.num_envs, Box(-CLIP, CLIP, (channels,), np.float32), env.single_action_space)
+        self.info: dict[str, Any] = {}
+        """What the batch said of its last step."""
+        self._actions = np.zeros((env.num_envs, 2), np.float32)
+        self._returns = np.zeros(env.num_envs)
+        self._lengths = np.zeros(env.num_envs, np.int64)
+        self._began = time.time()
+        self._k = 0
+        self._cuts = np.zeros(env.num_envs, np.int64)
+        if stagger is not None:
+            self._cuts = np.random.default_rng(stagger).integers(1, env.config.steps, env.num_envs, endpoint=True)
+
+    def reset(self) -> Any:
+        """Draw new episodes, with the seeds and options given before."""
+        seeds = list(self._seeds)
+        options = self._options[0] if self._options and self._options[0] else None
+        observation, info = self.env.reset(seed=seeds, options=options)
+        self._reset_seeds()
+        self._reset_options()
+        self._returns[:] = 0.0
+        self._lengths[:] = 0
+        self._k = 0
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        return self._whole(observation, info)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep the actions for :meth:`step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Advance every slot."""
+        observation, reward, terminated, truncated, info = self.env.step(self._actions)
+        self.info = info
+        self._returns += reward
+        self._lengths += 1
+        self._k += 1
+        whole = self._whole(observation, info)
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        done = terminated | truncated
+        for i in np.flatnonzero(done).tolist():
+            final = info["final_obs"][i]
+            if self.privileged:
+                final = np.concatenate([final, info["final_info"]["state"][i]])
+            infos[i] = self._final(i, final, bool(truncated[i]))
+        cut = (self._cuts == self._k) & ~done
+        if cut.any():
+            for i in np.flatnonzero(cut).tolist():
+                infos[i] = self._final(i, whole[i].copy(), True)
+            whole[cut] = self._whole(*self.env.reset(options={"reset_mask": cut}))[cut]
+            done = done | cut
+        self._returns[done] = 0.0
+        self._lengths[done] = 0
+        return whole, reward.astype(np.float32), done, infos
+
+    def _final(self, i: int, observation: np.ndarray, truncated: bool) -> dict[str, Any]:
+        episode = {"r": float(self._returns[i]), "l": int(self._lengths[i]), "t": round(time.time() - self._began, 6)}
+        return {"terminal_observation": observation, "TimeLimit.truncated": truncated, "episode": episode}
+
+    def close(self) -> None:
+        """Stop the environment's threads."""
+        self.env.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """The batch's attribute, once a slot."""
+        return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute of the whole batch."""
+        if indices is not None:
+            raise ValueError("the slots share their attributes: set_attr takes no indices")
+        setattr(self.env, attr_name, value)
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        """Call a method of the batch; its result, once a slot."""
+        result = getattr(self.env, method_name)(*method_args, **method_kwargs)
+        return [result] * len(list(self._get_indices(indices)))
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """No slot is wrapped."""
+        return [False] * len(list(self._get_indices(indices)))
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """The native batch does not render."""
+        return [None] * self.num_envs
+
+    def _whole(self, observation: np.ndarray, info: dict[str, Any]) -> np.ndarray:
+        return np.concatenate([observation, info["state"]], axis=1) if self.privileged else observation

@@ -1,0 +1,78 @@
+"""What stands between the native batch and a learner: its reward and its action."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
+
+from cz_gym.task import FAILURE_COST, Cost, cost_terms, reward
+
+from .networks import DRIVES
+from .recipes import CostWeights
+
+
+class TrainingReward(VecEnvWrapper):
+    """Reward for a discounting learner: scaled by 1 - gamma; a failure costs the worst step for the discounted rest.
+
+    The environment's own failure penalty, -10 a lost step, is the same thing undiscounted. The terms of the cost are
+    weighted as asked; the last step of an episode keeps the environment's own weights.
+    """
+
+    def __init__(self, venv: VecEnv, gamma: float, weights: CostWeights = CostWeights()) -> None:  # noqa: B008 (frozen)
+        super().__init__(venv)
+        self.weights = weights
+        self.share = 1.0 - gamma
+        self.floor = -FAILURE_COST / self.share
+
+    def reset(self) -> Any:
+        """Pass on."""
+        return self.venv.reset()
+
+    def step_wait(self) -> Any:
+        """Weigh and scale the reward."""
+        observation, given, done, infos = self.venv.step_wait()
+        if self.weights != CostWeights():
+            given = np.where(done, given, self.reward(self.venv.unwrapped.info))
+        return observation, (np.maximum(given, self.floor) * self.share).astype(np.float32), done, infos
+
+    def reward(self, info: dict[str, Any]) -> Any:
+        """The weighed reward of a step from what the batch said of it."""
+        weights, radius = self.weights, info["cost_radius"]
+        if weights.observable:
+            radius = cost_terms(info["r_c"] - info["r_ref"] + info["ring_offset"], 0.0, 0.0, 0.0).radius
+        cost = Cost(
+            radius,
+            weights.pull * info["cost_pull"],
+            weights.pull_step * info["cost_pull_step"],
+            weights.heater_step * info["cost_heater_step"],
+        )
+        return reward(cost)
+
+
+class DriveAction(VecEnvWrapper):
+    """The action head for learners whose network has none: action = skip * applied drives + scale * output."""
+
+    def __init__(self, venv: VecEnv, skip: float, scale: tuple[float, float]) -> None:
+        super().__init__(venv)
+        self.skip, self.scale = skip, np.array(scale, np.float32)
+        self._drives = np.zeros((venv.num_envs, len(DRIVES)), np.float32)
+
+    def reset(self) -> Any:
+        """Begin at the applied drives."""
+        return self._seen(self.venv.reset())
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Move the drives."""
+        self.venv.step_async(np.clip(self.skip * self._drives + self.scale * actions, -1.0, 1.0))
+
+    def step_wait(self) -> Any:
+        """Pass on."""
+        observation, reward, done, infos = self.venv.step_wait()
+        return self._seen(observation), reward, done, infos
+
+    def _seen(self, observation: Any) -> Any:
+        self._drives = observation[:, list(DRIVES)].copy()
+        return observation

@@ -1,0 +1,1 @@
+"""Loops as control engineers judge them: design, sampled loops, margins, linear forms."""

@@ -1,0 +1,117 @@
+"""Margins of sampled loops, by python-control from their frequency response (no polynomial of order twenty needed)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.baselines.optional import require
+from cz_gym.physics.linearisation import StateSpace
+from cz_gym.physics.plant import Puller
+
+from .sampled_loop import Loop, close
+
+Floats = npt.NDArray[np.float64]
+SLOWEST = 1e-4
+"""Lowest frequency of the tables [rad/s]: 17 hours a turn, below the drift of any episode."""
+
+
+class LoopMargins(NamedTuple):
+    """How much one broken place of a stable loop bears; NaN where a bound does not exist."""
+
+    crossover: float
+    """Highest frequency where the loop's gain falls through one [rad/s]."""
+    gain_up: float
+    """Factor by which the gain may grow [-]."""
+    gain_down: float
+    """Factor by which it may fall [-]."""
+    phase_deg: float
+    """Least phase margin over all crossings [degrees]."""
+    delay: float
+    """Least delay that destabilises [s]."""
+    sensitivity: float
+    """Peak of |1/(1 + L)| [-]: 1 over the distance to the critical point."""
+
+
+def frequencies(dt: float, points: int = 2000) -> Floats:
+    """Logarithmic grid [rad/s] from SLOWEST up to the Nyquist frequency."""
+    return np.geomspace(SLOWEST, np.pi / dt, points)
+
+
+def response(system: StateSpace, dt: float, omega: Floats) -> npt.NDArray[np.complex128]:
+    """Frequency response of a discrete single-input single-output system, by python-control."""
+    control = require("control")
+    values: npt.NDArray[np.complex128] = control.ss(*system, dt)(np.exp(1j * omega * dt))
+    return values
+
+
+def opened(controller: StateSpace, puller: Puller, dt: float, at: str) -> StateSpace:
+    """Minus the way around the loop, opened at "camera" (the plant alone is uncertain) or at "v_p" (the paper's view,
+    where what the controller knows of its own pull speed counts as plant)."""
+    A, B, C, D = close(controller, puller, dt, broken=at).pick("r_br" if at == "camera" else "v_p", (at,))
+    return StateSpace(A, B, -C, -D)
+
+
+def crossover(controller: StateSpace, puller: Puller, dt: float, at: str = "camera", points: int = 400) -> float:
+    """Highest frequency [rad/s] where the opened loop's gain falls through one; NaN if it never does."""
+    omega = frequencies(dt, points)
+    return crossover_of(response(opened(controller, puller, dt, at), dt, omega), omega)
+
+
+def crossover_of(values: npt.NDArray[np.complex128], omega: Floats) -> float:
+    """The same of an opened loop's frequency response."""
+    gain = np.log(np.abs(values))
+    falls = np.flatnonzero((gain[:-1] > 0.0) & (gain[1:] <= 0.0))
+    if not len(falls):
+        return float("nan")
+    k = falls[-1]
+    share = gain[k] / (gain[k] - gain[k + 1])
+    return float(omega[k] * (omega[k + 1] / omega[k]) ** share)
+
+
+def sensitivity(controller: StateSpace, puller: Puller, dt: float, points: int = 400) -> float:
+    """Peak of |1/(1 + L)| with the loop opened at the camera [-]."""
+    values = response(opened(controller, puller, dt, "camera"), dt, frequencies(dt, points))
+    return float(np.max(1.0 / np.abs(1.0 + values)))
+
+
+def loop_margins(controller: StateSpace, puller: Puller, dt: float, at: str = "camera") -> LoopMargins:
+    """Margins of the loop opened there; all NaN but the crossover if the closed loop is unstable."""
+    omega = frequencies(dt)
+    values = response(opened(controller, puller, dt, at), dt, omega)
+    return margins_of(values, omega, dt, close(controller, puller, dt).stable)
+
+
+def margins_of(values: npt.NDArray[np.complex128], omega: Floats, dt: float, stable: bool) -> LoopMargins:
+    """The same from an opened loop's response up to the Nyquist frequency, and whether it is stable closed."""
+    control = require("control")
+    found = crossover_of(values, omega)
+    if not stable:
+        return LoopMargins(found, *[float("nan")] * 5)
+    gain, phase, _, _, crossing, _ = control.stability_margins(control.frd(values, omega), returnall=True)
+    late = np.append(np.radians(np.mod(phase, 360.0)) / crossing, _late_at_nyquist(values[-1], dt))
+    return LoopMargins(
+        found,
+        _least(gain[gain > 1.0], np.min),
+        _least(gain[gain < 1.0], np.max),
+        _least(np.abs(phase), np.min),
+        _least(late, np.min),
+        float(np.max(1.0 / np.abs(1.0 + values))),
+    )
+
+
+def _late_at_nyquist(value: complex, dt: float) -> Floats:
+    """Delay [s] that turns a loop gain above one at the Nyquist frequency, which is real, to the critical side."""
+    turn = np.mod(np.angle(value) + np.pi, 2.0 * np.pi)
+    return np.array([turn * dt / np.pi] if np.abs(value) > 1.0 else [])
+
+
+def _least(values: Any, pick: Any) -> float:
+    return float(pick(values)) if len(values) else float("nan")
+
+
+def peak(loop: Loop, output: str, cause: str, points: int = 600) -> float:
+    """Largest gain over frequency from a disturbance to an output, SI."""
+    return float(np.abs(response(loop.pick(output, (cause,)), loop.dt, frequencies(loop.dt, points))).max())

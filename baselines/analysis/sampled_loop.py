@@ -1,0 +1,189 @@
+"""Sampled loops, linearised from the code that runs: a controller's ``predict``, the plant and what they make together.
+
+A controller whose memory is a NamedTuple of arrays is linear near rest, so feeding its own ``predict`` one unit of each
+memory entry and of each observation channel yields its state space: the design table judges the shipped code and no
+second description of it. Timing as in the environment: measure at t_k, act at once; the v_p and Q_H observed at
+t_k are those applied over the interval before.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import cont2discrete
+
+from cz_gym.observation import HEATER_SCALE, MEASURED, PULL_SCALE, Measured, scales
+from cz_gym.physics.linearisation import INPUTS, OUTPUTS, STATES, StateSpace, linearise
+from cz_gym.physics.plant import Puller
+
+Floats = npt.NDArray[np.float64]
+_SMALL = 1e-6
+"""Observed amplitude that no limit, gate or dead zone notices [-]; float32 actions keep their relative precision."""
+_SEEN = ("ring_error", "T_1", "v_p", "Q_H")
+"""Channels through which the plant reaches the controller."""
+_DOUBLINGS = 40
+"""2^40 samples, beyond any memory of a stable loop."""
+_QUIET = np.array([float(channel.name == "valid") for channel in MEASURED])
+"""Observation at rest: nothing but a valid camera."""
+_DISTURBED = ("v_p", "Q_d", "dT_i", "camera", "pyrometer")
+"""Inputs of a joined loop."""
+
+
+class NotLinearError(ValueError):
+    """A controller that has no state space near rest."""
+
+
+class Loop(NamedTuple):
+    """Plant and controller in one: z(k+1) = A z + B w, y = C z + D w, w and y as named, at one control interval."""
+
+    A: Floats
+    B: Floats
+    C: Floats
+    D: Floats
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    dt: float
+    """Control interval [s]."""
+
+    @property
+    def stable(self) -> bool:
+        """Whether every pole lies inside the unit circle."""
+        return self._largest < 1.0
+
+    @property
+    def growth(self) -> float:
+        """Time in which the fastest growing mode grows by e [s]; infinite for a stable loop."""
+        return self.dt / math.log(self._largest) if self._largest > 1.0 else math.inf
+
+    @property
+    def _largest(self) -> float:
+        """The largest absolute value of a pole [-]."""
+        return float(np.abs(np.linalg.eigvals(self.A)).max())
+
+    def pick(self, output: str, inputs: tuple[str, ...]) -> StateSpace:
+        """The part from some inputs to one output."""
+        row, columns = self.outputs.index(output), [self.inputs.index(name) for name in inputs]
+        return StateSpace(self.A, self.B[:, columns], self.C[[row]], self.D[np.ix_([row], columns)])
+
+
+def linear_controller(policy: Any, v_0: float = PULL_SCALE, rest: Any = None, held: tuple[str, ...] = ()) -> StateSpace:
+    """The controller in discrete time: inputs the channels of Measured, outputs v_p - v_0 [m/s] and Q_H - Q_H0 [W].
+
+    ``rest`` is its memory at rest, by default that after one sample of zeros; parts of it named in ``held`` (a
+    covariance, say) keep their value. Raises NotLinearError if the controller does not rest there, or if the answer to
+    twice the input is not twice the answer.
+    """
+    channels, name = len(MEASURED), type(policy).__name__
+    rest = policy.predict(_QUIET[None])[1] if rest is None else rest
+    if not hasattr(rest, "_fields"):
+        raise NotLinearError(f"{name} remembers no named tuple of arrays: it has no state space here")
+    free = [field for field in rest._fields if field not in held]
+    memory = sum(getattr(rest, field)[0].size for field in free)
+    probes = np.eye(memory + channels) * _SMALL
+    still, once, twice = (_answer(policy, factor * probes, rest, free) for factor in (0.0, 1.0, 2.0))
+    once, twice = once - still, twice - still
+    largest = np.abs(once).max(axis=0)
+    if np.any(np.abs(still) > 1e-3 * _SMALL):
+        raise NotLinearError(f"{name} does not rest at zero")
+    if np.any(np.abs(twice - 2.0 * once) > 1e-4 * largest):
+        raise NotLinearError(f"{name} is not linear near rest")
+    gains = once.T / _SMALL
+    gains[:, memory:] /= scales(MEASURED, v_0)
+    gains[memory:] *= np.array([[v_0], [HEATER_SCALE]])
+    return StateSpace(
+        gains[:memory, :memory], gains[:memory, memory:], gains[memory:, :memory], gains[memory:, memory:]
+    )
+
+
+def _answer(policy: Any, probes: Floats, rest: Any, free: list[str]) -> Floats:
+    """Next free memory and action for rows of (free memory, observation), both relative to rest."""
+    n, start, parts = len(probes), 0, {}
+    for field in rest._fields:
+        value = np.asarray(getattr(rest, field), np.float64)[:1]
+        parts[field] = np.repeat(value, n, axis=0)
+        if field in free:
+            parts[field] = parts[field] + probes[:, start : start + value.size].reshape(n, *value.shape[1:])
+            start += value.size
+    action, after = policy.predict(_QUIET + probes[:, start:], state=type(rest)(**parts))
+    moved = [np.reshape(getattr(after, field) - getattr(rest, field)[:1], (n, -1)) for field in free]
+    return np.hstack([*moved, action])
+
+
+def sampled_plant(puller: Puller, dt: float) -> StateSpace:
+    """The plant by zero-order hold: inputs v_p, Q_H, Q_d, dT_i; outputs r_c, r_br, T_1; deviations in SI."""
+    A, B, C, _ = linearise(puller)
+    pyrometer = np.zeros((1, len(STATES)))
+    pyrometer[0, STATES.index("T_1")] = 1.0
+    C = np.vstack([C[: OUTPUTS.index("r_br") + 1], pyrometer])
+    A_d, B_d, *_ = cont2discrete((A, B, C, np.zeros((len(C), len(INPUTS)))), dt, method="zoh")
+    return StateSpace(A_d, B_d, C, np.zeros((len(C), len(INPUTS))))
+
+
+def close(controller: StateSpace, puller: Puller, dt: float, broken: str = "") -> Loop:
+    """Join controller and plant.
+
+    Inputs: v_p (added to the command), Q_d, dT_i, camera and pyrometer noise; references held. Outputs: v_p and Q_H
+    (the commands), r_c, r_br. ``broken="camera"`` opens the loop there: the controller reads the input ``camera``
+    alone; ``broken="v_p"`` opens it at the pull speed: plant and controller see the input ``v_p`` alone. The state is
+    (plant, v_p and Q_H applied last, controller).
+    """
+    plant, m, n = sampled_plant(puller, dt), len(controller.A), len(STATES)
+    at = [Measured._fields.index(name) for name in _SEEN]
+    seen = np.zeros((len(_SEEN), n + 2 + m))
+    seen[0, :n], seen[1, :n] = plant.C[1] * (broken != "camera"), plant.C[2]
+    seen[2, n], seen[3, n + 1] = 1.0, 1.0
+    noise = np.zeros((len(_SEEN), len(_DISTURBED)))
+    noise[0, _DISTURBED.index("camera")] = noise[1, _DISTURBED.index("pyrometer")] = 1.0
+    command = np.hstack([np.zeros((2, n + 2)), controller.C]) + controller.D[:, at] @ seen
+    direct = controller.D[:, at] @ noise
+    closed = np.array([[broken != "v_p"], [True]], np.float64)
+    applied, given = closed * command, closed * direct
+    given[0, _DISTURBED.index("v_p")] = 1.0
+    load = np.zeros((2, len(_DISTURBED)))
+    load[0, _DISTURBED.index("Q_d")] = load[1, _DISTURBED.index("dT_i")] = 1.0
+    moved = np.hstack([plant.A, np.zeros((n, 2 + m))]) + plant.B[:, :2] @ applied
+    recalled = np.hstack([np.zeros((m, n + 2)), controller.A]) + controller.B[:, at] @ seen
+    A = np.vstack([moved, applied, recalled])
+    B = np.vstack([plant.B[:, :2] @ given + plant.B[:, 2:] @ load, given, controller.B[:, at] @ noise])
+    radii = np.hstack([plant.C[:2], np.zeros((2, 2 + m))])
+    C, D = np.vstack([command, radii]), np.vstack([direct, np.zeros((2, len(_DISTURBED)))])
+    return Loop(A, B, C, D, _DISTURBED, ("v_p", "Q_H", "r_c", "r_br"), dt)
+
+
+def late(controller: StateSpace, samples: int) -> StateSpace:
+    """The controller reading the camera that many samples late."""
+    camera = np.zeros((1, controller.B.shape[1]))
+    camera[0, Measured._fields.index("ring_error")] = 1.0
+    for _ in range(samples):
+        A, B, C, D = controller
+        n = len(A)
+        read = B @ camera.T, D @ camera.T
+        controller = StateSpace(
+            np.block([[A, read[0]], [np.zeros((1, n + 1))]]),
+            np.vstack([B * (1.0 - camera), camera]),
+            np.hstack([C, read[1]]),
+            D * (1.0 - camera),
+        )
+    return controller
+
+
+def root_mean_square(system: StateSpace, difference: bool = False) -> float:
+    """Standard deviation of the output for white noise of unit standard deviation per sample (Lyapunov equation,
+    by doubling: badly scaled slow loops lose no positive variance to rounding).
+
+    ``difference`` takes that of the step-to-step change. NaN for an unstable system.
+    """
+    A, B, C, D = system
+    if np.abs(np.linalg.eigvals(A)).max() >= 1.0:
+        return float("nan")
+    if difference:
+        n = len(A)
+        A, B = np.block([[A, np.zeros((n, 1))], [C, np.zeros((1, 1))]]), np.vstack([B, D])
+        C = np.hstack([C, -np.ones((1, 1))])
+    covariance, power = B @ B.T, A
+    for _ in range(_DOUBLINGS):
+        covariance, power = covariance + power @ covariance @ power.T, power @ power
+    return float(np.sqrt((C @ covariance @ C.T + D @ D.T)[0, 0]))

@@ -1,0 +1,117 @@
+"""The bound that nothing can beat: true state, parameters and every future disturbance, the reward's own cost.
+
+Before an episode the whole trajectory is optimised (:mod:`cz_gym.baselines.bounds.trajectory`); during it the optimal
+inputs are played, with the optimum's own feedback on the true state for what the plan cannot know: a heater that moves
+in steps.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.baselines.policy import Floats, batched, fresh, to_action
+from cz_gym.config import Config
+from cz_gym.evaluation.rollout import Rollout
+from cz_gym.observation import HEATER_SCALE, STATE, scales
+from cz_gym.task import cost_terms
+
+from .future import future_of
+from .trajectory import INPUTS, Search, Trajectory, limits_of, optimise, predicted_cost
+
+BATCH = 25
+"""Episodes optimised at once."""
+_CHANNELS = tuple(channel.name for channel in STATE)
+_X = ("r_c_error", "h_c", "T_1", "T_2", "T_b")
+
+
+class Plan(NamedTuple):
+    """What the clairvoyant knows of its slots."""
+
+    best: Trajectory
+    state_0: Floats
+    """Each puller's operating point, shape (n, 5)."""
+    inputs_0: Floats
+    """Its inputs, shape (n, 2)."""
+    cost: Floats
+    """The objective at the optimum, summed over the episode, shape (n,)."""
+
+
+class Memory(NamedTuple):
+    """What it remembers."""
+
+    step: Floats
+    """Steps taken, shape (n,)."""
+    asked: Floats
+    """Inputs asked for last, less the planned ones [m/s, W], shape (n, 2)."""
+
+
+@dataclass(frozen=True)
+class Clairvoyant:
+    """Plays the optimum of each slot's episode, on "state" observations; told by :meth:`for_episodes`."""
+
+    search: Search = field(default_factory=Search)
+    plan: Plan | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def hash(self) -> str:
+        """Hash of its settings (16 hex digits)."""
+        return hashlib.sha256(repr(self.search).encode()).hexdigest()[:16]
+
+    def for_episodes(self, config: Config, seeds: Sequence[int]) -> Clairvoyant:
+        """The same for those episodes, one a slot."""
+        parts = [make_plan(config, seeds[i : i + BATCH], self.search) for i in range(0, len(seeds), BATCH)]
+        return Clairvoyant(self.search, parts[0] if len(parts) == 1 else _joined(parts))
+
+    def predict(
+        self, observation: Any, state: Memory | None = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[npt.NDArray[np.float32], Memory]:
+        """The action and what to remember."""
+        if self.plan is None:
+            raise RuntimeError("clairvoyant is told its episodes by for_episodes(config, seeds), which a rollout calls")
+        array, single = batched(observation)
+        n, best, inputs_0 = len(array), self.plan.best, self.plan.inputs_0
+        if n != len(inputs_0):
+            raise ValueError(f"clairvoyant was told {len(inputs_0)} episodes, not {n}")
+        memory = fresh(state, Memory(np.zeros(n), np.zeros((n, INPUTS))), episode_start)
+        k, slot = np.minimum(memory.step.astype(int), len(best.u) - 1), np.arange(n)
+        seen = array * scales(STATE, float(inputs_0[0, 0]))
+        x = seen[:, [_CHANNELS.index(name) for name in _X]] + self.plan.state_0
+        x[:, 0] += seen[:, _CHANNELS.index("r_ref")]
+        off = np.concatenate([x - best.x[k, slot], memory.asked], axis=-1)
+        asked = memory.asked + (best.feedback[k, slot] @ off[:, :, None])[:, :, 0]
+        inputs = best.u[k, slot] + asked - inputs_0
+        action = to_action(inputs[:, 0] / inputs_0[:, 0], inputs[:, 1] / HEATER_SCALE, single)
+        return action, Memory(memory.step + 1.0, asked)
+
+
+def make_plan(config: Config, seeds: Sequence[int], search: Search) -> Plan:
+    """Optimise the first episodes that those seeds draw."""
+    future = future_of(config, seeds)
+    limits = limits_of(config.scenario.actuators, config.parameters.v_0, config.control_interval)
+    best = optimise(future, limits, search)
+    state_0, inputs_0 = (
+        np.stack(np.broadcast_arrays(*values), axis=-1) for values in (future.puller.state_0, future.puller.inputs_0)
+    )
+    return Plan(best, state_0, inputs_0, predicted_cost(future, best))
+
+
+def episode_cost(run: Rollout) -> Floats:
+    """The same objective recomputed from logged signals, shape (episodes,); infinite after a failure."""
+    s, v_0 = run.signals, run.config.parameters.v_0
+    v_p, Q_H = (np.concatenate([start, log]) for start, log in ((run.start.v_p, s.v_p), (run.start.Q_H, s.Q_H)))
+    terms = cost_terms(s.r_c - s.r_ref, s.v_p - v_0, np.diff(v_p, axis=0), np.diff(Q_H, axis=0))
+    return np.where(run.failed, np.inf, sum(terms).sum(axis=0))
+
+
+def _joined(plans: Sequence[Plan]) -> Plan:
+    bests = [plan.best for plan in plans]
+    x, u, feedback = (np.concatenate([best[i] for best in bests], axis=1) for i in range(3))
+    moves = np.concatenate([best.last_move for best in bests])
+    best = Trajectory(x, u, feedback, moves, max(best.steps for best in bests))
+    return Plan(best, *(np.concatenate([plan[i] for plan in plans]) for i in range(1, len(Plan._fields))))

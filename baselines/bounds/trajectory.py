@@ -1,0 +1,204 @@
+"""The best whole-episode trajectory for a known future: Newton steps by stages, limits by an interior point.
+
+Direct multiple shooting (Bock and Plitt 1984): states and inputs of all steps are unknowns, every step's dynamics are
+linearised at once by complex step through the environment's own equations, the banded problem is solved by Riccati's
+recursion (:mod:`cz_gym.baselines.bounds.riccati`), and the drives' limits are kept by a primal-dual barrier (Wright
+1997). The cost is quadratic, so leaving out the dynamics' curvature (Gauss and Newton) costs a little speed and no
+accuracy.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from cz_gym.baselines.policy import Floats
+from cz_gym.episodes.scenario import Actuators
+from cz_gym.physics.plant import Inputs, State
+from cz_gym.task import HEATER_RANGE, HEIGHT_MAX_IN_A, HEIGHT_MIN, Cost, cost_terms
+from cz_gym.units import KILO, MM, MM_PER_MIN
+
+from .future import Future
+from .riccati import Law, Stages, sweep_back, sweep_forward
+
+STATES, INPUTS = len(State._fields), len(Inputs._fields)
+SCALES = np.array([MM, MM, 1.0, 1.0, 1.0, MM_PER_MIN, KILO])
+"""Units in which state and inputs are of one order."""
+_STEP = 1e-30
+
+
+@dataclass(frozen=True)
+class Search:
+    """How the optimum is searched."""
+
+    barrier: float = 1e-2
+    """Weight of the barrier at the start, in the cost of a step [-]."""
+    barrier_end: float = 1e-9
+    """Weight of the barrier at the end [-]."""
+    barrier_cut: float = 0.1
+    """Factor on the barrier from one Newton step to the next [-]."""
+    boundary: float = 0.99
+    """Largest share of the way to a limit that one step goes [-]."""
+    tolerance: float = 1e-7
+    """Largest last move, in mm, K, mm/min and kW, at which the search ends."""
+    most: int = 60
+    """Most Newton steps."""
+
+
+class Limits(NamedTuple):
+    """The drives' limits, in :data:`SCALES`; each of shape (2,)."""
+
+    span: Floats
+    """Largest deviation from nominal."""
+    move: Floats
+    """Largest change from one step to the next; infinite where there is none."""
+
+
+class Trajectory(NamedTuple):
+    """The optimum of each slot; SI units."""
+
+    x: Floats
+    """State at the start of each step and at the end, shape (N + 1, n, 5)."""
+    u: Floats
+    """Inputs v_p [m/s] and Q_H [W] of each step, shape (N, n, 2)."""
+    feedback: Floats
+    """Optimal moves of the inputs per deviation of state and previous inputs, shape (N, n, 2, 7)."""
+    last_move: Floats
+    """Largest last move of any unknown, in :data:`SCALES`, shape (n,)."""
+    steps: int
+    """Newton steps taken."""
+
+
+def limits_of(actuators: Actuators, v_0: float, interval: float) -> Limits:
+    """The limits of the action box and of the drives, for a control interval [s]."""
+    scale = SCALES[STATES:]
+    span = np.array([min(v_0, actuators.pull_window), HEATER_RANGE])
+    return Limits(span / scale, np.array([actuators.pull_slew, actuators.heater_slew]) * interval / scale)
+
+
+def optimise(future: Future, limits: Limits, search: Search | None = None) -> Trajectory:
+    """Minimise the reward's unsaturated cost over the whole episode within the drives' limits."""
+    search = search or Search()
+    N, n = future.r_ref.shape
+    nominal = np.stack([np.broadcast_to(value, n) for value in future.puller.inputs_0], axis=-1)
+    x = np.broadcast_to(np.stack(future.start, axis=-1), (N + 1, n, STATES)).copy()
+    x[1:, :, 0] = future.r_ref
+    u = np.broadcast_to(nominal, (N, n, INPUTS)).copy()
+    slack = _slacks(u, nominal, limits)
+    force = search.barrier / slack
+    barrier, moved = search.barrier, np.full(n, np.inf)
+    step = 0
+    while step < search.most and not (barrier <= search.barrier_end and moved.max() < search.tolerance):
+        barrier = max(search.barrier_end, barrier * search.barrier_cut) if step else barrier
+        stages = _stages(future, x, u, nominal, slack, force, barrier)
+        law = sweep_back(stages)
+        after, moves = sweep_forward(stages, law, np.zeros((n, STATES + INPUTS)))
+        dz = after * SCALES
+        ds = _slopes(after[:, :, STATES:], moves)
+        df = barrier / slack - force - force / slack * ds
+        share = np.minimum(_share(slack, ds, search), _share_of_height(x[1:, :, 1], dz[:, :, 1], future))
+        x[1:] += share[:, None] * dz[:, :, :STATES]
+        u += share[:, None] * dz[:, :, STATES:]
+        slack = _slacks(u, nominal, limits)
+        force = force + _share(force, df, search)[:, None] * df
+        moved = np.abs(after).max(axis=(0, 2))
+        step += 1
+    return Trajectory(x, u, _in_si(law), moved, step)
+
+
+def predicted_cost(future: Future, trajectory: Trajectory) -> Floats:
+    """The objective of a trajectory, summed over its steps, shape (n,)."""
+    v_0, Q_H_0 = future.puller.inputs_0
+    v_p, Q_H = trajectory.u[..., 0], trajectory.u[..., 1]
+    terms = cost_terms(
+        trajectory.x[1:, :, 0] - future.r_ref,
+        v_p - v_0,
+        np.diff(v_p, axis=0, prepend=np.broadcast_to(v_0, (1, v_p.shape[1]))),
+        np.diff(Q_H, axis=0, prepend=np.broadcast_to(Q_H_0, (1, Q_H.shape[1]))),
+    )
+    total: Floats = sum(terms).sum(axis=0)
+    return total
+
+
+def linearised(future: Future, x: Floats, u: Floats) -> tuple[Floats, Floats]:
+    """The state after each step, shape (N, n, 5), and its derivatives by state and inputs, shape (N, n, 5, 7)."""
+    N, n = future.r_ref.shape
+    after, slopes = np.empty((N, n, STATES)), np.empty((N, n, STATES, STATES + INPUTS))
+    point = np.concatenate([x[:-1], u], axis=-1)
+    for first in range(0, N, _BLOCK):
+        part = slice(first, first + _BLOCK)
+        for j in range(STATES + INPUTS):
+            values = [point[part, :, i] + (1j * _STEP if i == j else 0.0) for i in range(STATES + INPUTS)]
+            new = np.stack(future.advance(State(*values[:STATES]), Inputs(*values[STATES:]), part), axis=-1)
+            slopes[part, :, :, j] = new.imag / _STEP
+        after[part] = new.real
+    return after, slopes
+
+
+_BLOCK = 128
+"""Steps linearised at once: what fits a processor's cache."""
+_WEIGHTS = Cost(*cost_terms(MM, MM_PER_MIN, MM_PER_MIN, KILO))
+"""The cost of one unit of :data:`SCALES` in each term."""
+_CURVATURE = 2.0 * np.array([_WEIGHTS.radius, 0.0, 0.0, 0.0, 0.0, _WEIGHTS.pull, 0.0])
+_MOVE_CURVATURE = 2.0 * np.array([_WEIGHTS.pull_step, _WEIGHTS.heater_step])
+
+
+def _stages(
+    future: Future, x: Floats, u: Floats, nominal: Floats, slack: Floats, force: Floats, barrier: float
+) -> Stages:
+    """The Newton step's problem in deviations from (x, u); its states are x and the inputs held."""
+    after, slopes = linearised(future, x, u)
+    N, n = future.r_ref.shape
+    slopes = slopes * (SCALES / SCALES[:STATES, None])
+    A = np.zeros((N, n, STATES + INPUTS, STATES + INPUTS))
+    A[:, :, :STATES] = slopes
+    A[:, :, STATES:, STATES:] = np.eye(INPUTS)
+    c = np.zeros((N, n, STATES + INPUTS))
+    c[:, :, :STATES] = (after - x[1:]) / SCALES[:STATES]
+    moves = np.diff(u, axis=0, prepend=nominal[None]) / SCALES[STATES:]
+    upper, lower, up, down = range(4)
+    curvature, slope = force / slack, barrier / slack
+    Q, q = np.broadcast_to(_CURVATURE, c.shape).copy(), np.zeros(c.shape)
+    Q[:, :, STATES:] += curvature[upper] + curvature[lower]
+    q[:, :, 0] = _CURVATURE[0] * (x[1:, :, 0] - future.r_ref) / MM
+    q[:, :, STATES:] = _CURVATURE[STATES:] * (u - nominal) / SCALES[STATES:] + slope[upper] - slope[lower]
+    R = _MOVE_CURVATURE + curvature[up] + curvature[down]
+    r = _MOVE_CURVATURE * moves + slope[up] - slope[down]
+    return Stages(A, A[:, :, :, STATES:], c, Q, q, R, r)
+
+
+def _slacks(u: Floats, nominal: Floats, limits: Limits) -> Floats:
+    """How far each limit is: above, below, moving up, moving down; shape (4, N, n, 2)."""
+    held = (u - nominal) / SCALES[STATES:]
+    moves = np.diff(u, axis=0, prepend=nominal[None]) / SCALES[STATES:]
+    return np.stack([limits.span - held, limits.span + held, limits.move - moves, limits.move + moves])
+
+
+def _slopes(held: Floats, moves: Floats) -> Floats:
+    """How the slacks change with inputs and moves."""
+    return np.stack([-held, held, -moves, moves])
+
+
+def _share(values: Floats, changes: Floats, search: Search) -> Floats:
+    """Largest share of the changes that keeps positive values positive, at most 1, shape (n,)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(changes < 0.0, -search.boundary * values / changes, math.inf)
+    share: Floats = np.minimum(ratio.min(axis=(0, 1, 3)), 1.0)
+    return share
+
+
+def _share_of_height(h_c: Floats, change: Floats, future: Future) -> Floats:
+    """Largest share that keeps the meniscus halfway from its limits, at most 1, shape (n,)."""
+    with np.errstate(divide="ignore"):
+        upward = (HEIGHT_MAX_IN_A * future.puller.a - h_c) / np.maximum(change, 0.0)
+        downward = (h_c - HEIGHT_MIN) / np.maximum(-change, 0.0)
+    share: Floats = np.minimum(0.5 * np.minimum(upward, downward).min(axis=0), 1.0)
+    return share
+
+
+def _in_si(law: Law) -> Floats:
+    gains: Floats = law.feedback * (SCALES[STATES:, None] / SCALES)
+    return gains

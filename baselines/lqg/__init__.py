@@ -1,0 +1,1 @@
+"""Linear-quadratic-Gaussian control: model, Kalman filter, regulator, shipped settings."""

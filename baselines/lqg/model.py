@@ -1,0 +1,130 @@
+"""The plant as the LQG sees it: linearised, sampled, and augmented by what disturbs it.
+
+x = (r_c, h_c, T_1, T_2, T_b, fast, slow, drift, drift_rate, heater), deviations from the operating point, SI units:
+two Ornstein-Uhlenbeck fluctuations of the interface temperature [K], the hot zone's drift p [K] and its rate [K/s]
+(a slow Ornstein-Uhlenbeck process, so that the drift is ramp-like), and an unknown heater power [W], a random walk
+that lets T_1 agree with the pyrometer without offset. Of the recipe's known movement a share moves the drift.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.linalg import expm
+
+from cz_gym.baselines.policy import Floats
+from cz_gym.physics.linearisation import INPUTS, OUTPUTS, linearise
+from cz_gym.physics.meniscus import HURLE, MeniscusModel
+from cz_gym.physics.plant import Puller, hidden_load
+from cz_gym.units import MINUTE, MM
+
+STATES = ("r_c", "h_c", "T_1", "T_2", "T_b", "fast", "slow", "drift", "drift_rate", "heater")
+"""States of the augmented plant."""
+PLANT = 5
+"""How many of them are the plant's own."""
+FAST, SLOW, DRIFT, DRIFT_RATE, HEATER = range(PLANT, len(STATES))
+_STEP = 1e-30
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """What the Kalman filter believes about disturbances and sensors; tuned, not read from a scenario."""
+
+    fast_sd: float = 0.25
+    """Standard deviation of the fast interface fluctuation [K]."""
+    fast_tau: float = 30.0
+    """Its correlation time [s]."""
+    slow_sd: float = 0.3
+    """Standard deviation of the slow interface fluctuation [K]."""
+    slow_tau: float = 780.0
+    """Its correlation time [s]."""
+    drift_rate_sd: float = 0.02 / MINUTE
+    """Standard deviation of the drift's rate [K/s]; too large a value makes the loop fail."""
+    drift_rate_tau: float = 40.0 * MINUTE
+    """Its correlation time [s]."""
+    heater_walk: float = 1.0
+    """Random walk of the heater's power balance [W/sqrt(s)]."""
+    thermal_walk: float = 0.004
+    """Random walk of the three temperatures, for the puller's unknown conductances [K/sqrt(s)]."""
+    recipe_share: float = 0.5
+    """Share of the recipe's movement that the drift is believed to follow [-]."""
+    camera_sd: float = 0.025 * MM
+    """Standard deviation of the camera's noise at the start [m]."""
+    camera_sd_range: tuple[float, float] = (0.005 * MM, 0.2 * MM)
+    """Range its estimate stays in [m]."""
+    camera_memory: float = 10.0 * MINUTE
+    """Time over which it is estimated from the innovations [s]; infinite: it stays as it starts."""
+    pyrometer_sd: float = 0.1
+    """Standard deviation of the pyrometer's noise [K]."""
+    start_radius_sd: float = 0.2 * MM
+    """Standard deviation of the initial radius [m]."""
+
+
+class PlantModel(NamedTuple):
+    """x_{k+1} = A x_k + B u_k + w_k, y_k = H x_k + v_k with u = (v_p, Q_H) and y = (r_br, T_1); SI units."""
+
+    A: Floats
+    """Shape (10, 10)."""
+    B: Floats
+    """Shape (10, 2)."""
+    H: Floats
+    """Shape (2, 10)."""
+    Q: Floats
+    """Covariance of w over one interval, shape (10, 10)."""
+    start: Floats
+    """Covariance of x at the start of an episode, shape (10, 10)."""
+
+
+def load_per_drift(puller: Puller) -> Any:
+    """dQ_d/dp at p = 0 [W/K], by complex step through the plant's own static equivalence; floats or arrays."""
+    return np.imag(hidden_load(complex(0.0, _STEP), puller)) / _STEP
+
+
+def plant_model(puller: Puller, noise: NoiseModel, dt: float, meniscus: MeniscusModel = HURLE) -> PlantModel:
+    """The augmented plant at that puller's operating point, inputs held over dt [s] and noise sampled exactly."""
+    F, G, H = _continuous(puller, noise, meniscus)
+    W = np.zeros(len(STATES))
+    W[2:PLANT] = noise.thermal_walk**2
+    W[FAST] = 2.0 * noise.fast_sd**2 / noise.fast_tau
+    W[SLOW] = 2.0 * noise.slow_sd**2 / noise.slow_tau
+    W[DRIFT_RATE] = 2.0 * noise.drift_rate_sd**2 / noise.drift_rate_tau
+    W[HEATER] = noise.heater_walk**2
+    start = np.zeros(len(STATES))
+    start[0] = noise.start_radius_sd
+    start[[FAST, SLOW, DRIFT_RATE]] = noise.fast_sd, noise.slow_sd, noise.drift_rate_sd
+    A, B = sampled(F, G, dt)
+    return PlantModel(A, B, H, sampled_noise(F, np.diag(W), dt), np.diag(start**2))
+
+
+def sampled(F: Floats, G: Floats, dt: float) -> tuple[Floats, Floats]:
+    """Zero-order hold of x' = F x + G u over dt [s]."""
+    n, m = G.shape
+    both: Floats = expm(np.block([[F, G], [np.zeros((m, n + m))]]) * dt)
+    return both[:n, :n], both[:n, n:]
+
+
+def sampled_noise(F: Floats, W: Floats, dt: float) -> Floats:
+    """Integral of exp(F s) W exp(F' s) over dt [s], W the intensity of white noise (Van Loan 1978)."""
+    n = len(F)
+    both = expm(np.block([[-F, W], [np.zeros((n, n)), F.T]]) * dt)
+    Q: Floats = both[n:, n:].T @ both[:n, n:]
+    return 0.5 * (Q + Q.T)
+
+
+def _continuous(puller: Puller, noise: NoiseModel, meniscus: MeniscusModel) -> tuple[Floats, Floats, Floats]:
+    plant = linearise(puller, meniscus)
+    column = {name: plant.B[:, INPUTS.index(name)] for name in INPUTS}
+    n = len(STATES)
+    F, G, H = np.zeros((n, n)), np.zeros((n, 2)), np.zeros((2, n))
+    F[:PLANT, :PLANT] = plant.A
+    F[:PLANT, FAST] = F[:PLANT, SLOW] = column["dT_i"]
+    F[:PLANT, DRIFT] = column["Q_d"] * load_per_drift(puller)
+    F[:PLANT, HEATER] = column["Q_H"]
+    F[FAST, FAST], F[SLOW, SLOW] = -1.0 / noise.fast_tau, -1.0 / noise.slow_tau
+    F[DRIFT, DRIFT_RATE], F[DRIFT_RATE, DRIFT_RATE] = 1.0, -1.0 / noise.drift_rate_tau
+    G[:PLANT, 0], G[:PLANT, 1] = column["v_p"], column["Q_H"]
+    H[0, :PLANT] = plant.C[OUTPUTS.index("r_br")]
+    H[1, STATES.index("T_1")] = 1.0
+    return F, G, H

@@ -1,0 +1,141 @@
+"""Linear-quadratic regulator with costs on input moves, known disturbances and a previewed reference.
+
+States of the regulator are the plant's five and the previous inputs (v, q); its inputs are the moves of both. The cost
+is the reward's, before it saturates. What drives the plant without being moved by it (the disturbance states) enters by
+a Sylvester equation instead of the Riccati equation, which would call an integrating disturbance unstabilisable.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import solve_discrete_are
+
+from cz_gym.baselines.policy import Floats
+from cz_gym.task import (
+    HEATER_STEP_SCALE,
+    HEATER_STEP_WEIGHT,
+    PULL_SCALE,
+    PULL_STEP_SCALE,
+    PULL_STEP_WEIGHT,
+    PULL_WEIGHT,
+    RADIUS_SCALE,
+)
+
+from .model import DRIFT, PLANT, STATES, PlantModel
+
+STEP_TIME = 5.0
+"""Control interval [s] that the weights on moves are meant for; at others they keep the same continuous-time law."""
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights on the terms of the cost, each over its scale in :mod:`cz_gym.task`; the defaults are the reward's."""
+
+    radius: float = 1.0
+    """On (r_c - r_ref)^2."""
+    pull: float = PULL_WEIGHT
+    """On (v_p - v_0)^2."""
+    pull_step: float = PULL_STEP_WEIGHT
+    """On the squared step of v_p."""
+    heater_step: float = HEATER_STEP_WEIGHT
+    """On the squared step of Q_H."""
+
+
+class Regulator(NamedTuple):
+    """Moves du = -feedback (x_hat - (r_ref, 0, ...), v, q) + sum_j reference_j dr_ref_j + drift_j dp_j.
+
+    dr_ref_j [m] and dp_j [K] are the known increments from t + j dt to t + (j + 1) dt.
+    """
+
+    feedback: Floats
+    """Shape (2, 12): the augmented plant's ten states, then the previous inputs."""
+    reference: Floats
+    """Shape (samples ahead, 2)."""
+    drift: Floats
+    """Shape (samples ahead, 2)."""
+
+
+class CostToGo(NamedTuple):
+    """z' P z + 2 z' X d: the least cost from z = (plant's five states, previous inputs), disturbance states d."""
+
+    P: Floats
+    """Shape (7, 7)."""
+    X: Floats
+    """Shape (7, 5)."""
+
+
+class Cost(NamedTuple):
+    """sum z' Q z + 2 z' N du + du' R du with z = (plant's five states, previous inputs)."""
+
+    Q: Floats
+    """Shape (7, 7)."""
+    N: Floats
+    """Shape (7, 2)."""
+    R: Floats
+    """Shape (2, 2)."""
+
+
+def quadratic_cost(weights: Weights, dt: float) -> Cost:
+    """The cost's matrices for a control interval of dt [s]."""
+    Q, N = np.zeros((PLANT + 2, PLANT + 2)), np.zeros((PLANT + 2, 2))
+    pull = weights.pull / PULL_SCALE**2
+    per_step = (STEP_TIME / dt) ** 2
+    Q[0, 0] = weights.radius / RADIUS_SCALE**2
+    Q[PLANT, PLANT] = N[PLANT, 0] = pull
+    moves = weights.pull_step / PULL_STEP_SCALE**2, weights.heater_step / HEATER_STEP_SCALE**2
+    return Cost(Q, N, np.diag([pull + per_step * moves[0], per_step * moves[1]]))
+
+
+class _Solution(NamedTuple):
+    """The Riccati and Sylvester equations' solutions, and what the law is made of."""
+
+    least: CostToGo
+    moves: Floats
+    """S^-1 B', shape (2, 7)."""
+    K: Floats
+    """Shape (2, 7)."""
+    K_d: Floats
+    """Shape (2, 5)."""
+    A_c: Floats
+    """Shape (7, 7)."""
+
+
+def regulator(model: PlantModel, weights: Weights, dt: float, ahead: int) -> Regulator:
+    """The optimal moves for that plant and cost, with a preview of ``ahead`` samples.
+
+    With P the Riccati solution, S = R + B' P B and A_c the closed loop, a known later change f_j of the state calls for
+    -S^-1 B' (A_c')^j P f_j now; disturbances x_d' = A_d x_d entering by E add X = A_c' (P E + X A_d).
+    """
+    (P, X), moves, K, K_d, A_c = _solve(model, weights, dt)
+    reference, drift = [], []
+    later_reference, later_drift = P[:, 0], X[:, DRIFT - PLANT]
+    for _ in range(ahead):
+        reference.append(moves @ later_reference)
+        drift.append(-moves @ later_drift)
+        later_reference, later_drift = A_c.T @ later_reference, A_c.T @ later_drift
+    return Regulator(np.hstack([K[:, :PLANT], K_d, K[:, PLANT:]]), np.array(reference), np.array(drift))
+
+
+def cost_to_go(model: PlantModel, weights: Weights, dt: float) -> CostToGo:
+    """What the regulator's law costs from a state on, references and drift held."""
+    return _solve(model, weights, dt).least
+
+
+def _solve(model: PlantModel, weights: Weights, dt: float) -> _Solution:
+    known = len(STATES)
+    A = np.block([[model.A[:PLANT, :PLANT], model.B[:PLANT]], [np.zeros((2, PLANT)), np.eye(2)]])
+    B = np.vstack([model.B[:PLANT], np.eye(2)])
+    E = np.vstack([model.A[:PLANT, PLANT:known], np.zeros((2, known - PLANT))])
+    A_d = model.A[PLANT:known, PLANT:known]
+    Q, N, R = quadratic_cost(weights, dt)
+    P = solve_discrete_are(A, B, Q, R, s=N)
+    S = R + B.T @ P @ B
+    K = np.linalg.solve(S, B.T @ P @ A + N.T)
+    A_c = A - B @ K
+    cross = np.eye(E.size) - np.kron(A_c.T, A_d.T)
+    X = np.linalg.solve(cross, (A_c.T @ P @ E).ravel()).reshape(E.shape)
+    K_d = np.linalg.solve(S, B.T @ (P @ E + X @ A_d))
+    return _Solution(CostToGo(P, X), np.linalg.solve(S, B.T), K, K_d, A_c)

@@ -1,0 +1,1 @@
+"""The commands that tuned what ships, on training and validation seeds."""

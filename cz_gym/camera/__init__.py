@@ -1,0 +1,8 @@
+"""The camera above the melt: its view, ray-traced images, and the bright ring found in them."""
+
+from __future__ import annotations
+
+from .ring_detector import RingDetector
+from .view import Camera
+
+__all__ = ["Camera", "RingDetector"]

@@ -1,0 +1,139 @@
+"""From rays to an image: pixels, shot noise, and what a slot's camera shows.
+
+The loop of a frame first follows a ray through each corner of the pixels. A pixel whose corners agree takes their
+mean; where they differ, at the ring and other edges, it takes the mean of SUB x SUB rays, so that an edge moves by
+fractions of a pixel.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.episodes.record import Stream
+from cz_gym.episodes.rng import WORDS, normal, seed_stream
+from cz_gym.jit.cache import hashed
+from cz_gym.jit.compile import kernel, physics
+from cz_gym.physics.meniscus import HURLE, MeniscusModel
+from cz_gym.physics.plant import Puller
+
+from .rays import make_scene, radiance, sight
+from .view import COLUMNS, IMAGE, ROWS, View
+
+SUB = 4
+"""Rays across a pixel that holds an edge."""
+TOLERANCE = 12.0
+"""Difference between a pixel's corners that counts as an edge [grey values]."""
+FRAME_STREAMS = len(Stream)
+"""Frame k draws its shot noise from the episode's stream of number FRAME_STREAMS + k."""
+_RADIUS_TURNS = 4
+_GOLDEN = 0.6180339887498949
+
+
+class Scratch(NamedTuple):
+    """Working memory of a frame, one row a slot."""
+
+    corners: Any
+    """Brightness of two rows of corners [grey values], shape (n, 2, COLUMNS // 2 + 1)."""
+    stream: Any
+    """A random stream, shape (n, WORDS)."""
+
+
+def new_scratch(n: int) -> Scratch:
+    """Working memory for n slots."""
+    return Scratch(np.zeros((n, 2, COLUMNS // 2 + 1)), np.zeros((n, WORDS), np.uint64))
+
+
+@physics
+def grey_value(row: Any, column: Any, scene: Any, view: Any) -> Any:
+    """Brightness at pixel coordinates [grey values], not rounded."""
+    return view.gain * radiance(sight(row, column, view), scene, view)
+
+
+@physics
+def _pixel(row: Any, column: Any, corners: Any, scene: Any, view: Any) -> Any:
+    """Brightness of a pixel whose upper and lower corners stand in the two rows of ``corners``.
+
+    No two of the rays through an edge share a row or a column, so that also a level edge has SUB x SUB steps; these
+    fall elsewhere in each column, so that a ring of many columns has none.
+    """
+    above, below = row % 2, (row + 1) % 2
+    a, b = corners[above, column], corners[above, column + 1]
+    c, d = corners[below, column], corners[below, column + 1]
+    if max(max(a, b), max(c, d)) - min(min(a, b), min(c, d)) < TOLERANCE:
+        return 0.25 * (a + b + c + d)
+    total, offset = 0.0, (column * _GOLDEN) % 1.0
+    for i in range(SUB):
+        for j in range(SUB):
+            down, right = (i + (j + offset) / SUB) / SUB, (j + (i + 0.5) / SUB) / SUB
+            total += grey_value(row + down, column + right, scene, view)
+    return total / (SUB * SUB)
+
+
+@physics
+def _rounded(value: Any, noisy: Any, stream: Any, view: Any) -> Any:
+    if noisy:
+        value += np.sqrt(max(value, 0.0) / view.electrons) * normal(stream)
+    return np.uint8(min(max(value + 0.5, 0.0), 255.0))
+
+
+@physics
+def expose(scene: Any, view: Any, corners: Any, noisy: Any, stream: Any, image: Any) -> None:
+    """Write the image of a scene, uint8 (ROWS, COLUMNS, 1); with shot noise from ``stream`` if ``noisy``.
+
+    The left half is followed, the right half is its mirror image: nothing stands beside the axis.
+    """
+    for row in range(-1, ROWS):
+        for column in range(COLUMNS // 2 + 1):
+            corners[(row + 1) % 2, column] = grey_value(1.0 * (row + 1), 1.0 * column, scene, view)
+        if row < 0:
+            continue
+        for column in range(COLUMNS // 2):
+            value = _pixel(row, column, corners, scene, view)
+            image[row, column, 0] = _rounded(value, noisy, stream, view)
+            image[row, COLUMNS - 1 - column, 0] = _rounded(value, noisy, stream, view)
+
+
+def _show(scene: Any, view: Any, scratch: Any, image: Any) -> None:
+    expose(scene, view, scratch.corners[0], False, scratch.stream[0], image)
+
+
+_show_scene = kernel(_show)
+
+
+def picture(r_c: float, h_c: float, puller: Puller, view: View) -> npt.NDArray[np.uint8]:
+    """The image, without noise, of a crystal of radius r_c on a meniscus of height h_c [m]; shape of IMAGE."""
+    image = np.zeros(IMAGE, np.uint8)
+    _show_scene(make_scene(r_c, h_c, puller), view, new_scratch(1), image)
+    return image
+
+
+def build_look(meniscus: MeniscusModel = HURLE) -> Any:
+    """Compile ``look(slots, active, view, scratch, images, start, stop)``: the images of the active slots.
+
+    A slot shows the crystal whose bright ring is its last reading, errors included, on the meniscus at that reading;
+    black while the reading is flagged invalid. ``images`` of shape (n, ROWS, COLUMNS, 1), uint8.
+    """
+    ring_offset = meniscus.ring_offset
+
+    def look(slots: Any, active: Any, view: Any, scratch: Any, images: Any, start: int, stop: int) -> None:
+        for i in range(start, stop):
+            if not active[i]:
+                continue
+            slot = slots[i]
+            image, p = images[i], slot.puller
+            if slot.valid == 0.0:
+                image[:] = 0
+                continue
+            ring = slot.ring + p.ring_bias
+            r_c = ring - p.ring_bias
+            for _ in range(_RADIUS_TURNS):
+                r_c = ring - ring_offset(r_c, slot.h_seen, p)
+            stream = scratch.stream[i]
+            seed_stream(stream, slot.key, FRAME_STREAMS + slot.k_seen)
+            noisy = slot.episode.camera_sd > 0.0
+            expose(make_scene(r_c, slot.h_seen, p), view, scratch.corners[i], noisy, stream, image)
+
+    return kernel(look, hashed(*meniscus.functions))

@@ -1,0 +1,291 @@
+"""Rays: what they hit, how melt mirrors them, and how bright they are.
+
+The meniscus is Hurle's profile, z / M = sqrt(2) sech(q) and X / M = q / sqrt(2) - sqrt(2) tanh(q) with q from the
+triple point outwards (the same curve as :func:`cz_gym.physics.meniscus.profile`, whose arccosh(sqrt(2) M / z) is q),
+turned about the crystal's axis. Its slope phi against the horizontal has sin(phi / 2) = sech(q). Along a ray that
+sinks, distance from the axis less radius of the profile is a function of q alone with a single zero below the triple
+point. Directions need not be of unit length. Radii, coordinates [m], radiances as in :class:`cz_gym.camera.View`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cz_gym.jit.compile import physics
+from cz_gym.physics.meniscus import hurle_slope, profile_scale
+
+from .view import COLUMNS, ROWS
+
+SQRT_2 = math.sqrt(2.0)
+FLAT = 9.5
+"""q beyond which the melt is flat: its slope there is less than 0.02 degrees, its height a micrometre."""
+CRYSTAL, MELT, WALL, SHIELD, OPENING = range(5)
+"""What a ray can hit."""
+_APART = 1e-4
+_TURNS = 60
+_CLOSE = 1e-7
+"""Newton step after which the next, its square, is rounding error [-]."""
+
+
+class Scene(NamedTuple):
+    """Crystal and meniscus at an instant."""
+
+    r_c: Any
+    """Radius of the crystal [m]."""
+    h_c: Any
+    """Height of the triple point [m]."""
+    M: Any
+    """Scale of the profile [m]."""
+    q_c: Any
+    """q at the triple point [-]."""
+    X_c: Any
+    """X / M at the triple point [-]."""
+    r_flat: Any
+    """Radius at which the melt is flat [m]."""
+
+
+class Ray(NamedTuple):
+    """A ray: origin [m] and direction."""
+
+    x: Any
+    y: Any
+    z: Any
+    dx: Any
+    dy: Any
+    dz: Any
+
+
+class Hit(NamedTuple):
+    """What a ray meets first, where [m], and q there for melt [-]."""
+
+    what: Any
+    x: Any
+    y: Any
+    z: Any
+    q: Any
+
+
+@physics
+def make_scene(r_c: Any, h_c: Any, p: Any) -> Any:
+    """The scene of a crystal of radius r_c [m] on Hurle's meniscus of height h_c [m]; ``p.a`` [m]."""
+    _, cos_theta = hurle_slope(r_c, h_c, p)
+    M = profile_scale(r_c, h_c, cos_theta, p.a)
+    q_c = np.arccosh(max(SQRT_2 * M / h_c, 1.0))
+    X_c = q_c / SQRT_2 - SQRT_2 * np.tanh(q_c)
+    return Scene(r_c, h_c, M, q_c, X_c, r_c + M * (FLAT / SQRT_2 - SQRT_2 - X_c))
+
+
+@physics
+def _sech_tanh(q: Any) -> Any:
+    e = np.exp(-q)
+    per = 1.0 / (1.0 + e * e)
+    return 2.0 * e * per, (1.0 - e * e) * per
+
+
+@physics
+def profile_at(q: Any, scene: Any) -> Any:
+    """Radius and height [m] of the meniscus at q, and their derivatives by q."""
+    sech, tanh = _sech_tanh(q)
+    M = scene.M
+    r = scene.r_c + M * (q / SQRT_2 - SQRT_2 * tanh - scene.X_c)
+    return r, M * SQRT_2 * sech, M * (1.0 / SQRT_2 - SQRT_2 * sech * sech), -M * SQRT_2 * sech * tanh
+
+
+@physics
+def slope_at(q: Any) -> Any:
+    """Sine and cosine of the meniscus' slope against the horizontal."""
+    sech, tanh = _sech_tanh(q)
+    return 2.0 * sech * tanh, 1.0 - 2.0 * sech * sech
+
+
+@physics
+def _gap(q: Any, ray: Any, scene: Any) -> Any:
+    """Distance of the ray from the axis less the profile's radius, at the profile's height; and its derivative."""
+    r, z, dr, dz = profile_at(q, scene)
+    t = (z - ray.z) / ray.dz
+    x, y = ray.x + t * ray.dx, ray.y + t * ray.dy
+    distance = np.sqrt(x * x + y * y)
+    outward = (x * ray.dx + y * ray.dy) / (distance * ray.dz)
+    return distance - r, outward * dz - dr
+
+
+@physics
+def _zero_of_gap(ray: Any, scene: Any, outside: Any, inside: Any, q: Any) -> Any:
+    """q where the ray meets the profile, by Newton's method held between a q outside the melt and one inside it."""
+    for _ in range(_TURNS):
+        gap, rate = _gap(q, ray, scene)
+        step = gap / rate
+        if abs(step) < _CLOSE:
+            return q - step
+        if gap > 0.0:
+            outside = q
+        else:
+            inside = q
+        q = q - step
+        if not min(outside, inside) < q < max(outside, inside):
+            q = 0.5 * (outside + inside)
+    return q
+
+
+@physics
+def _meet_below(ray: Any, scene: Any, q: Any) -> Any:
+    """q where a sinking ray that is outside the profile at ``q`` meets it, or -1: the melt is flat there."""
+    t = -ray.z / ray.dz
+    x, y = ray.x + t * ray.dx, ray.y + t * ray.dy
+    beyond = np.sqrt(x * x + y * y) - scene.r_flat
+    if not beyond < 0.0:
+        return -1.0
+    guess = FLAT + SQRT_2 * beyond / scene.M
+    guess = guess - 4.0 / (1.0 + np.exp(2.0 * max(guess, q)))
+    return _zero_of_gap(ray, scene, q, FLAT, max(guess, q))
+
+
+@physics
+def _meet_above(ray: Any, scene: Any, q: Any) -> Any:
+    """q where a rising ray that is outside the profile at ``q`` meets it, or -1: it passes the triple point outside."""
+    if ray.x * ray.dx + ray.y * ray.dy >= 0.0:
+        return -1.0
+    gap, _ = _gap(scene.q_c, ray, scene)
+    return _zero_of_gap(ray, scene, q, scene.q_c, 0.5 * (q + scene.q_c)) if gap < 0.0 else -1.0
+
+
+@physics
+def _meet_cylinder(ray: Any, radius: Any, outwards: Any) -> Any:
+    """Time at which the ray enters a cylinder about the axis, or leaves it; -1: never."""
+    a = ray.dx * ray.dx + ray.dy * ray.dy
+    b = ray.x * ray.dx + ray.y * ray.dy
+    c = ray.x * ray.x + ray.y * ray.y - radius * radius
+    square = b * b - a * c
+    if a == 0.0 or square < 0.0:
+        return -1.0
+    root = np.sqrt(square)
+    return (root - b) / a if outwards else (-root - b) / a
+
+
+@physics
+def _meet_crystal(ray: Any, scene: Any) -> Any:
+    """Time at which the ray meets the crystal's wall, or passes its underside into it; -1: never."""
+    inside = ray.x * ray.x + ray.y * ray.y < scene.r_c * scene.r_c
+    t = _meet_cylinder(ray, scene.r_c, inside)
+    return t if t > 0.0 and ray.z + t * ray.dz > scene.h_c else -1.0
+
+
+@physics
+def _at(what: Any, ray: Any, t: Any) -> Any:
+    return Hit(what, ray.x + t * ray.dx, ray.y + t * ray.dy, ray.z + t * ray.dz, -1.0)
+
+
+@physics
+def _beyond(hit: Any, radius: Any) -> Any:
+    """Whether a point lies outside a cylinder about the axis."""
+    return hit.x * hit.x + hit.y * hit.y > radius * radius
+
+
+@physics
+def _at_profile(ray: Any, q: Any, scene: Any) -> Any:
+    _, z, _, _ = profile_at(q, scene)
+    t = (z - ray.z) / ray.dz
+    return Hit(MELT, ray.x + t * ray.dx, ray.y + t * ray.dy, z, q)
+
+
+@physics
+def _rising(ray: Any, q: Any, scene: Any, view: Any) -> Any:
+    """What a ray hits that does not sink."""
+    t = _meet_crystal(ray, scene)
+    shield = _at(SHIELD, ray, (view.wall_height - ray.z) / ray.dz)
+    if t > 0.0 and (ray.z + t * ray.dz < view.wall_height or not _beyond(shield, view.shield_radius)):
+        return _at(CRYSTAL, ray, t)
+    found = _meet_above(ray, scene, q)
+    if found >= 0.0:
+        return _at_profile(ray, found, scene)
+    if _beyond(shield, view.crucible_radius):
+        return _at(WALL, ray, _meet_cylinder(ray, view.crucible_radius, True))
+    return shield if _beyond(shield, view.shield_radius) else _at(OPENING, ray, 1.0)
+
+
+@physics
+def _sinking(ray: Any, q: Any, scene: Any, view: Any) -> Any:
+    """What a ray hits that sinks."""
+    t = _meet_crystal(ray, scene)
+    if ray.z > view.wall_height:
+        shield = _at(SHIELD, ray, (view.wall_height - ray.z) / ray.dz)
+        if _beyond(shield, view.shield_radius) and not (t > 0.0 and ray.z + t * ray.dz > view.wall_height):
+            return shield
+    if t > 0.0:
+        return _at(CRYSTAL, ray, t)
+    found = _meet_below(ray, scene, q)
+    if found >= 0.0:
+        return _at_profile(ray, found, scene)
+    melt = _at(MELT, ray, -ray.z / ray.dz)
+    if _beyond(melt, view.crucible_radius):
+        return _at(WALL, ray, _meet_cylinder(ray, view.crucible_radius, True))
+    return melt
+
+
+@physics
+def first_hit(ray: Any, q: Any, scene: Any, view: Any) -> Any:
+    """What a ray meets first; it is outside the melt at the meniscus' ``q``: the triple point's, or where it starts."""
+    return _sinking(ray, q, scene, view) if ray.dz < 0.0 else _rising(ray, q, scene, view)
+
+
+@physics
+def mirror(ray: Any, hit: Any) -> Any:
+    """The ray that leaves the melt where another met it: the angle of reflection is the angle of incidence."""
+    sine, cosine = (0.0, 1.0)
+    if hit.q >= 0.0:
+        sine, cosine = slope_at(hit.q)
+    r = np.sqrt(hit.x * hit.x + hit.y * hit.y)
+    n_x, n_y = sine * hit.x / r, sine * hit.y / r
+    twice = 2.0 * (ray.dx * n_x + ray.dy * n_y + ray.dz * cosine)
+    return Ray(hit.x, hit.y, hit.z, ray.dx - twice * n_x, ray.dy - twice * n_y, ray.dz - twice * cosine)
+
+
+@physics
+def _just_off(q: Any, ray: Any) -> Any:
+    """q a little along the profile from where a ray leaves the melt: there it is outside."""
+    if q < 0.0:
+        return FLAT
+    return q + _APART if ray.dz < 0.0 else q - _APART
+
+
+@physics
+def emitted(hit: Any, scene: Any, view: Any) -> Any:
+    """Radiance of what was hit, light that it mirrors apart."""
+    if hit.what == MELT:
+        return view.melt
+    if hit.what == WALL:
+        return view.wall
+    if hit.what == SHIELD:
+        return view.shield
+    if hit.what == CRYSTAL:
+        far = view.crystal_far_temperature
+        cooled = np.exp(-(hit.z - scene.h_c) / view.crystal_cooling)
+        T = far + (view.crystal_temperature - far) * cooled
+        return view.crystal_emissivity * np.exp(view.wien * (1.0 / view.white_temperature - 1.0 / T))
+    return view.opening
+
+
+@physics
+def radiance(ray: Any, scene: Any, view: Any) -> Any:
+    """Radiance that comes back along a ray from above the melt."""
+    light, share, q = 0.0, 1.0, scene.q_c
+    for _ in range(int(view.reflections) + 1):
+        hit = first_hit(ray, q, scene, view)
+        light += share * emitted(hit, scene, view)
+        if hit.what != MELT:
+            break
+        share *= view.mirrored
+        ray = mirror(ray, hit)
+        q = _just_off(hit.q, ray)
+    return light
+
+
+@physics
+def sight(row: Any, column: Any, view: Any) -> Any:
+    """The ray from the lens through pixel coordinates of :func:`cz_gym.camera.project`."""
+    u = (column - 0.5 * COLUMNS) * view.pixel
+    v = (row - 0.5 * ROWS) * view.pixel
+    return Ray(view.x, 0.0, view.z, v * view.cos_tilt - view.sin_tilt, u, -view.cos_tilt - v * view.sin_tilt)

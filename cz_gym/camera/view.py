@@ -1,0 +1,225 @@
+"""The camera's view of the meniscus: one set of parameters, and what follows from it.
+
+A pinhole camera above the melt looks down at the near part of the bright ring. Its rays meet the crystal (a straight
+cylinder), the meniscus (Hurle's profile as a surface of revolution) or the flat melt; where they meet melt they are
+mirrored to the crucible's hot wall, the heat shield, the crystal, the opening above, or melt again
+(:mod:`cz_gym.camera.rays`). Nothing draws a ring: it is the part of the meniscus steep enough to mirror the wall.
+
+x points from the crystal's axis towards the camera, y to its right, z up; z = 0 is the melt far from the crystal.
+``python -m studies.camera`` measures the view and draws ``results/camera``.
+"""
+
+from __future__ import annotations
+
+import math
+from numbers import Real
+from typing import Annotated, Any, NamedTuple, get_type_hints
+
+from cz_gym.physics.parameters import Parameters, Quantity
+from cz_gym.units import MM
+
+ROWS, COLUMNS = 120, 160
+IMAGE = (ROWS, COLUMNS, 1)
+"""Shape of ``observation="camera"``, uint8."""
+SECOND_RADIATION = 1.438776877e-2
+"""Second radiation constant h c / k_B [m K] (CODATA)."""
+MOST_REFLECTIONS = 8
+_ESTIMATE = "estimate"
+_SILICON = Parameters()
+_EMISSIVITIES = "order and range: Watanabe et al., High Temp. High Press. 31, 587 (1999)"
+
+
+class Camera(NamedTuple):
+    """Camera, hot zone and surfaces as the image needs them; SI units, kelvin, radians.
+
+    Another view is another instance: ``Camera(tilt=0.4)``. The temperatures do not follow the plant's: an industrial
+    camera sets its exposure by itself. :func:`camera_for` aims the camera at another puller's crystal.
+    """
+
+    tilt: Annotated[float, Quantity("rad", "angle of the optical axis from the vertical", _ESTIMATE)] = math.radians(20)
+    distance: Annotated[float, Quantity("m", "from the lens to the melt, along the optical axis", _ESTIMATE)] = 1.0
+    aim: Annotated[float, Quantity("m", "radius at which the optical axis meets the melt", f"{_ESTIMATE}: r_0")] = (
+        _SILICON.r_0
+    )
+    focal_length: Annotated[float, Quantity("m", "focal length", f"{_ESTIMATE}: a common lens")] = 50.0 * MM
+    pixel_pitch: Annotated[
+        float, Quantity("m", "side of a pixel", f"{_ESTIMATE}: 3.75 um of a 1280 x 960 sensor, binned 8 x 8")
+    ] = 30e-6
+    wavelength: Annotated[
+        float, Quantity("m", "effective wavelength", f"{_ESTIMATE}: CCD behind an infrared filter")
+    ] = 0.9e-6
+    crucible_radius: Annotated[float, Quantity("m", "inner radius of the crucible's wall", "Parameters.R_cr")] = (
+        _SILICON.R_cr
+    )
+    wall_height: Annotated[
+        float, Quantity("m", "wall bare above the melt, up to the heat shield's underside", _ESTIMATE)
+    ] = 0.12
+    wall_temperature: Annotated[float, Quantity("K", "wall of the crucible", "the plant's T_2 at its nominal")] = 1763.0
+    wall_emissivity: Annotated[float, Quantity("1", "quartz with hot graphite behind", _ESTIMATE)] = 0.9
+    shield_radius: Annotated[float, Quantity("m", "radius of the heat shield's opening", _ESTIMATE)] = 0.18
+    shield_temperature: Annotated[float, Quantity("K", "heat shield", "Parameters.T_e")] = _SILICON.T_e
+    shield_emissivity: Annotated[float, Quantity("1", "graphite", _ESTIMATE)] = 0.8
+    opening_temperature: Annotated[float, Quantity("K", "what is seen through the shield's opening", _ESTIMATE)] = 600.0
+    melt_temperature: Annotated[float, Quantity("K", "melt's surface", "Parameters.T_m + dT_0")] = (
+        _SILICON.T_m + _SILICON.dT_0
+    )
+    melt_emissivity: Annotated[float, Quantity("1", "liquid silicon", f"Parameters.eps; {_EMISSIVITIES}")] = (
+        _SILICON.eps
+    )
+    crystal_temperature: Annotated[float, Quantity("K", "crystal at the triple point", "Parameters.T_m")] = _SILICON.T_m
+    crystal_far_temperature: Annotated[float, Quantity("K", "crystal far above the melt", _ESTIMATE)] = 800.0
+    crystal_cooling: Annotated[
+        float, Quantity("m", "height over which the crystal cools by 1/e", f"{_ESTIMATE}: 5.9 K/mm, the plant's Phi_s")
+    ] = 0.15
+    crystal_emissivity: Annotated[float, Quantity("1", "solid silicon, hot", f"{_ESTIMATE}; {_EMISSIVITIES}")] = 0.46
+    white: Annotated[float, Quantity("1", "grey value 255, in black bodies as hot as the wall", _ESTIMATE)] = 1.0
+    full_well: Annotated[float, Quantity("1", "electrons of a binned pixel at grey value 255", _ESTIMATE)] = 1e4
+    reflections: Annotated[
+        float,
+        Quantity("1", "times a ray is mirrored by melt, at most", "1: off the meniscus; 2: and off melt before it"),
+    ] = 2.0
+
+
+def describe_camera() -> dict[str, Quantity]:
+    """Name of each parameter to its :class:`cz_gym.physics.parameters.Quantity`."""
+    hints = get_type_hints(Camera, include_extras=True)
+    return {name: hints[name].__metadata__[0] for name in Camera._fields}
+
+
+def camera_for(parameters: Parameters) -> Camera:
+    """The default camera at a puller of these parameters: aimed at its crystal, the shield's opening in proportion."""
+    default = Camera()
+    opening = (default.shield_radius - _SILICON.r_0) / (_SILICON.R_cr - _SILICON.r_0)
+    return default._replace(
+        aim=parameters.r_0,
+        crucible_radius=parameters.R_cr,
+        shield_radius=parameters.r_0 + opening * (parameters.R_cr - parameters.r_0),
+        melt_temperature=parameters.T_m + parameters.dT_0,
+        crystal_temperature=parameters.T_m,
+    )
+
+
+_MAY_BE_ZERO = frozenset({"tilt"})
+_AT_MOST_ONE = frozenset({"wall_emissivity", "shield_emissivity", "melt_emissivity", "crystal_emissivity"})
+
+
+def check_camera(camera: Camera, parameters: Parameters) -> Camera:
+    """Return the camera, or raise ValueError naming what cannot be at a puller of these parameters."""
+    if not isinstance(camera, Camera):
+        raise ValueError(f"camera must be a cz_gym.camera.Camera, not {camera!r}")
+    for name, value in camera._asdict().items():
+        unit = describe_camera()[name].unit
+        number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+        if not number or value < 0 or (value == 0 and name not in _MAY_BE_ZERO):
+            raise ValueError(f"camera parameter {name} = {value!r} must be a positive finite number [{unit}]")
+        if name in _AT_MOST_ONE and value > 1:
+            raise ValueError(f"camera parameter {name} = {value!r} must not exceed 1")
+    if camera.reflections not in range(1, MOST_REFLECTIONS + 1):
+        raise ValueError(
+            f"camera parameter reflections = {camera.reflections!r} must be one of 1 to {MOST_REFLECTIONS}"
+        )
+    if camera.tilt >= 0.5 * math.pi:
+        raise ValueError(f"camera parameter tilt = {camera.tilt!r} must be less than pi / 2 [rad]")
+    if not parameters.r_0 < camera.shield_radius < camera.crucible_radius:
+        raise ValueError(
+            f"the heat shield's opening (shield_radius = {camera.shield_radius} m) must be wider than the crystal "
+            f"(r_0 = {parameters.r_0} m) and narrower than the crucible ({camera.crucible_radius} m)"
+        )
+    if camera.distance * math.cos(camera.tilt) <= camera.wall_height:
+        raise ValueError(
+            f"the lens, {camera.distance * math.cos(camera.tilt):.3g} m above the melt, must be above the heat shield "
+            f"(wall_height = {camera.wall_height} m)"
+        )
+    return Camera(*map(float, camera))
+
+
+class View(NamedTuple):
+    """What the rays use of a camera: where it stands, how its pixels lie, how bright each thing is.
+
+    A ray through pixel coordinates (row, column) has direction ``forward + right u + down v``, with u and v the
+    distances from the image's centre in focal lengths. Radiances count black bodies as hot as the wall as one.
+    """
+
+    x: float
+    """Lens, distance from the axis [m]; y = 0."""
+    z: float
+    """Lens, height above the melt [m]."""
+    sin_tilt: float
+    cos_tilt: float
+    pixel: float
+    """Side of a pixel in focal lengths [-]."""
+    crucible_radius: float
+    wall_height: float
+    shield_radius: float
+    wall: float
+    """Radiance of the wall [-]."""
+    shield: float
+    """Radiance of the heat shield [-]."""
+    opening: float
+    """Radiance of what the shield's opening shows [-]."""
+    melt: float
+    """What the melt itself emits [-]; it mirrors the rest."""
+    mirrored: float
+    """Share of light that the melt mirrors [-]."""
+    crystal_emissivity: float
+    crystal_temperature: float
+    crystal_far_temperature: float
+    crystal_cooling: float
+    wien: float
+    """Second radiation constant over the wavelength [K]."""
+    white_temperature: float
+    """Temperature whose black body counts as one [K]."""
+    gain: float
+    """Grey values for each unit of radiance."""
+    electrons: float
+    """Electrons for each grey value [-]."""
+    reflections: int
+
+
+def make_view(camera: Camera) -> View:
+    """The view of a camera that :func:`check_camera` let pass."""
+    wien = SECOND_RADIATION / camera.wavelength
+
+    def radiance(temperature: float, emissivity: float) -> float:
+        return emissivity * math.exp(wien * (1.0 / camera.wall_temperature - 1.0 / temperature))
+
+    return View(
+        camera.aim + camera.distance * math.sin(camera.tilt),
+        camera.distance * math.cos(camera.tilt),
+        math.sin(camera.tilt),
+        math.cos(camera.tilt),
+        camera.pixel_pitch / camera.focal_length,
+        camera.crucible_radius,
+        camera.wall_height,
+        camera.shield_radius,
+        radiance(camera.wall_temperature, camera.wall_emissivity),
+        radiance(camera.shield_temperature, camera.shield_emissivity),
+        radiance(camera.opening_temperature, 1.0),
+        radiance(camera.melt_temperature, camera.melt_emissivity),
+        1.0 - camera.melt_emissivity,
+        camera.crystal_emissivity,
+        camera.crystal_temperature,
+        camera.crystal_far_temperature,
+        camera.crystal_cooling,
+        wien,
+        camera.wall_temperature,
+        255.0 / camera.white,
+        camera.full_well / 255.0,
+        int(camera.reflections),
+    )
+
+
+class Point(NamedTuple):
+    """Where something appears in the image: coordinates of :func:`project`, arrays of one shape."""
+
+    row: Any
+    column: Any
+
+
+def project(x: Any, y: Any, z: Any, view: View) -> Point:
+    """Pixel coordinates of a point [m]: row and column, 0 at the image's upper left corner; arrays broadcast."""
+    from_x, from_z = x - view.x, z - view.z
+    depth = -view.sin_tilt * from_x - view.cos_tilt * from_z
+    down = view.cos_tilt * from_x - view.sin_tilt * from_z
+    scale = 1.0 / (view.pixel * depth)
+    return Point(0.5 * ROWS + down * scale, 0.5 * COLUMNS + y * scale)

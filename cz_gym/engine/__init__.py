@@ -1,0 +1,1 @@
+"""The compiled batch: one loop that steps one slot or ten thousand."""

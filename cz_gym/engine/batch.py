@@ -1,0 +1,300 @@
+"""A batch of slots: the arrays, the draws at reset and the compiled step, on as many threads as pay.
+
+The scalar environment is a batch of one; both environments are thin shells over this class.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import deque
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium.utils import seeding
+
+from cz_gym.camera.image import build_look, new_scratch
+from cz_gym.camera.view import IMAGE, make_view
+from cz_gym.config import Config, Identity
+from cz_gym.episodes.record import GRID, Episode, law_of
+from cz_gym.episodes.scenario import MAX_LATENCY, Scenario
+from cz_gym.episodes.series import series_of
+from cz_gym.jit.compile import entry
+from cz_gym.observation import HISTORY, LAGGED, MEASURED, STATE, lags, scales
+from cz_gym.physics.meniscus import HURLE, MeniscusModel
+from cz_gym.physics.parameters import Parameters
+from cz_gym.physics.plant import NO_OPERATING_POINT
+
+from .buffers import Lender
+from .kernels import KERNELS, Kernels, build_kernels
+from .layout import INFO, SLOT, Clock, Memory, Out, Reading, info_width
+
+SLOTS_PER_THREAD, SLOTS_AT_ONCE = 256, 128
+"""Fewest slots worth a thread of their own in a step, and how many a thread takes at once."""
+DRAWS_PER_THREAD, DRAWS_AT_ONCE = 16, 16
+"""Fewest draws worth a thread of their own in a reset, and how many a thread takes at once."""
+_SAVED = ("slot", "history", "frames")
+Key = tuple[int, int]
+"""128 random bits that an episode is drawn from, as two 64-bit words."""
+
+
+@lru_cache(maxsize=8)
+def _kernels(meniscus: MeniscusModel) -> Kernels:
+    return KERNELS if meniscus == HURLE else build_kernels(meniscus)
+
+
+@lru_cache(maxsize=8)
+def _look(meniscus: MeniscusModel) -> Any:
+    return build_look(meniscus)
+
+
+def new_key(random: np.random.Generator) -> Key:
+    """The next episode key of an environment's random stream."""
+    raw = random.bit_generator.random_raw(2)
+    return int(raw[0]), int(raw[1])
+
+
+def first_key(seed: int) -> Key:
+    """The key of the episode that an environment draws first after ``reset(seed=seed)``."""
+    return new_key(seeding.np_random(seed)[0])
+
+
+@dataclass(frozen=True)
+class SlotState:
+    """Everything one slot is at an instant; picklable, continued bit-exactly by :meth:`Batch.restore`."""
+
+    identity: Identity
+    slot: npt.NDArray[Any]
+    history: npt.NDArray[np.float64]
+    frames: npt.NDArray[np.float64]
+    clock: Clock
+
+    @property
+    def interface(self) -> npt.NDArray[np.float64]:
+        """dT_i on the 5 s grid [K], shape (grid points,)."""
+        return self._series()[0]
+
+    @property
+    def noise(self) -> npt.NDArray[np.float64]:
+        """Camera [m] (NaN: dropped) and pyrometer [K] noise, shape (samples, 2)."""
+        return self._series()[1]
+
+    def _series(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        first, second = self.slot["key"].tolist()
+        episode = Episode(*self.slot["episode"].item())
+        return series_of(episode, (first, second), self.clock.grid_points, self.clock.steps + 1)
+
+
+class Batch:
+    """``num_envs`` slots of one configuration.
+
+    Nothing that :meth:`new_out` gave out is written again by a later one while anybody can look at it.
+    """
+
+    def __init__(self, config: Config, num_envs: int, threads: int | None = None) -> None:
+        self.config = config
+        self.identity = config.identity
+        self.num_envs = num_envs
+        self.kernels = _kernels(config.meniscus)
+        self.clock = Clock(config.control_interval, config.steps, math.ceil(config.horizon / GRID) + 1)
+        self.channels = len(HISTORY) if config.observation == "history" else len(MEASURED)
+        self.state_channels = len(STATE) if config.observation in ("history", "state") else 0
+        self._camera = config.observation == "camera"
+        ages = lags(config.control_interval)
+        v_0 = config.parameters.v_0
+        self.reading = Reading(
+            1.0 / scales(MEASURED, v_0),
+            1.0 / scales(STATE, v_0),
+            ages.newest,
+            ages.oldest + 1,
+            1.0 / (ages.oldest - ages.newest + 1),
+        )
+        depth = int(ages.oldest[-1]) + 2 if config.observation == "history" else 0
+        frames = (
+            math.ceil(MAX_LATENCY / config.control_interval)
+            + math.ceil((MAX_LATENCY + config.control_interval) / GRID)
+            + 2
+        )
+        slots = np.zeros(num_envs, SLOT)
+        self.memory = Memory(
+            slots,
+            slots.view(np.float64).reshape(num_envs, -1),
+            np.zeros((num_envs, depth, len(LAGGED))),
+            np.zeros((num_envs, frames, 3)),
+        )
+        self.memory.slots["over"] = 1
+        self._law = law_of(config.scenario)
+        self._mix = np.array(config.mix, np.float64)
+        self._parameters = Parameters(*map(float, config.parameters))
+        self.actions = np.zeros((num_envs, 2))
+        self._all = np.ones(num_envs, np.bool_)
+        self._observations = Lender((num_envs, self.channels), np.float32)
+        self._states = Lender((num_envs, self.state_channels), np.float32)
+        self._images = Lender((num_envs, *IMAGE) if self._camera else (num_envs, 0, 0, 0), np.uint8)
+        self._infos = Lender((len(INFO), info_width(num_envs)), np.float64)
+        out, which, keys = self.new_out(), np.zeros(1, np.int64), np.zeros((1, 2), np.uint64)
+        stepped = (self.memory, self.actions, self._all, self.clock, self.reading, out, 0, 1)
+        drawn = (self.memory, which, keys, self._law, self._mix, self._parameters, self.clock, self.reading, out, 0, 1)
+        self._step, self._draw = entry(self.kernels.step, stepped), entry(self.kernels.draw, drawn)
+        threads = threads or os.cpu_count() or 1
+        self._parts = max(1, min(threads, num_envs // (1 if self._camera else SLOTS_PER_THREAD)))
+        if self._camera:
+            self._view, self._scratch = make_view(config.camera), new_scratch(num_envs)
+            seen = (self.memory.slots, self._all, self._view, self._scratch, out.image, 0, 1)
+            self._look = entry(_look(config.meniscus), seen)
+        self._pool: ThreadPoolExecutor | None = None
+        self._owner = os.getpid()
+
+    def new_out(self) -> Out:
+        """Arrays to write into, on memory that nobody looks at."""
+        n = self.num_envs
+        return Out(
+            self._observations.new(),
+            self._states.new(),
+            self._images.new(),
+            np.empty(n),
+            np.empty(n, np.bool_),
+            np.empty(n, np.bool_),
+            self._infos.new(),
+        )
+
+    def shown(self, out: Out) -> npt.NDArray[Any]:
+        """The observations among what a step wrote, a row a slot."""
+        shown: npt.NDArray[Any] = {"state": out.state, "camera": out.image}.get(
+            self.config.observation, out.observation
+        )
+        return shown
+
+    def bound_step(self, actions: npt.NDArray[np.float64], out: Out) -> Any:
+        """``step`` of all slots from and into always the same arrays, called without arguments."""
+        n = self.num_envs
+        step = partial(self._step, self.memory, actions, self._all, self.clock, self.reading, out, 0, n)
+        if not self._camera:
+            return step
+
+        def step_and_look() -> None:
+            step()
+            self._photograph(out, self._all)
+
+        return step_and_look
+
+    def _photograph(self, out: Out, active: npt.NDArray[np.bool_]) -> None:
+        """Write the images of the active slots, where images are observed."""
+        if self._camera:
+            arguments = (self.memory.slots, active, self._view, self._scratch, out.image)
+            self._run(self._look, arguments, self.num_envs, 1)
+
+    def reset(self, which: Sequence[int], keys: Iterable[Key], out: Out, scenario: Scenario | None = None) -> None:
+        """Draw new episodes for the slots ``which`` and write their first sample into ``out``.
+
+        Raises ValueError if a drawn puller has no finite operating point.
+        """
+        law, mix = self._law, self._mix
+        if scenario is not None:
+            law, mix = law_of(scenario), np.array(self.config.with_scenario(scenario).mix, np.float64)
+        slots = np.array(which, np.int64)
+        words = np.array(list(keys), np.uint64).reshape(-1, 2)
+        arguments = (
+            self.memory, slots, words, law, mix, self._parameters, self.clock, self.reading, out,
+        )  # fmt: skip
+        if max(self._run(self._draw, arguments, len(slots), DRAWS_PER_THREAD, DRAWS_AT_ONCE)) >= 0:
+            raise ValueError(NO_OPERATING_POINT)
+        if self._camera:
+            drawn = np.zeros(self.num_envs, np.bool_)
+            drawn[slots] = True
+            self._photograph(out, drawn)
+
+    def step(self, actions: npt.ArrayLike, out: Out, active: npt.NDArray[np.bool_] | None = None) -> int:
+        """Advance the active slots by one control interval; actions of shape (num_envs, 2), not NaN.
+
+        Returns how many episodes ended.
+        """
+        if actions is not self.actions:
+            self.actions[:] = actions
+        active = self._all if active is None else active
+        arguments = (self.memory, self.actions, active, self.clock, self.reading, out)
+        ended: int = sum(self._run(self._step, arguments, self.num_envs, SLOTS_PER_THREAD, SLOTS_AT_ONCE))
+        self._photograph(out, active)
+        return ended
+
+    def advance(self, rings: npt.NDArray[np.float64]) -> None:
+        """Drives, plant and ring [m] of every slot, and nothing else: what the speed of a step is measured against."""
+        arguments = (self.memory, self.actions, self.clock, rings)
+        self._run(self.kernels.plant, arguments, self.num_envs, SLOTS_PER_THREAD, SLOTS_AT_ONCE)
+
+    def _run(self, loop: Any, arguments: tuple[Any, ...], count: int, least: int, share: int = 1) -> list[Any]:
+        """Run a loop over ``count`` rows, on a thread for every ``least`` rows; what its calls return.
+
+        Rows are taken ``share`` at a time by whoever is free: a thread that is late, or whose core is busy, costs
+        no more than what it would have done.
+        """
+        parts = min(self._parts, count // least)
+        if parts <= 1:
+            return [loop(*arguments, 0, count)]
+        if self._pool is None or self._owner != os.getpid():
+            # A forked child inherits the pool without its threads and would wait for them for ever.
+            self._pool = ThreadPoolExecutor(self._parts - 1, thread_name_prefix="cz-gym")
+            self._owner = os.getpid()
+        starts = deque([*range(0, count, share), *[None] * parts])
+
+        def work() -> list[Any]:
+            return [loop(*arguments, start, min(start + share, count)) for start in iter(starts.popleft, None)]
+
+        futures = [self._pool.submit(work) for _ in range(parts - 1)]
+        try:
+            mine = work()
+        finally:
+            begun = [future for future in futures if not future.cancel()]
+            wait(begun)
+        return [*mine, *(found for future in begun for found in future.result())]
+
+    def save(self, i: int) -> SlotState:
+        """A copy of everything slot i is."""
+        # array[i] of a structured array is a view that np.copy does not copy; array[i, ...] is an array.
+        slot, history, frames = (rows[i, ...].copy() for rows in self._saved())
+        return SlotState(self.identity, slot, history, frames, self.clock)
+
+    def check(self, state: SlotState) -> None:
+        """Raise ValueError if this is no saved state, or one saved under other settings."""
+        if not isinstance(state, SlotState):
+            raise ValueError(f"expected a state made by get_state, not {type(state).__name__}")
+        saved = getattr(state, "identity", None)
+        if not isinstance(saved, Identity):
+            raise ValueError("this state was saved by another version of cz_gym")
+        odd = saved.difference(self.identity)
+        if odd is not None:
+            raise ValueError(f"this state was saved under other settings than this environment's: {odd}")
+        for name, rows in zip(_SAVED, self._saved(), strict=True):
+            array = getattr(state, name)
+            if not isinstance(array, np.ndarray) or (array.dtype, array.shape) != (rows.dtype, rows.shape[1:]):
+                raise ValueError(
+                    f"this state was saved by another version of cz_gym, or damaged: its {name} does not fit"
+                )
+        if not 0 <= int(state.slot["k"]) <= self.clock.steps:
+            raise ValueError(f"this state is damaged: sample {int(state.slot['k'])} of {self.clock.steps}")
+
+    def restore(self, which: Sequence[int], states: Sequence[SlotState], out: Out) -> None:
+        """Continue slots from states that :meth:`check` let pass and write their last samples into ``out``."""
+        for i, state in zip(which, states, strict=True):
+            for name, rows in zip(_SAVED, self._saved(), strict=True):
+                rows[i] = getattr(state, name)
+        self.kernels.show(self.memory, np.array(which, np.int64), self.clock, self.reading, out, 0, len(which))
+        if self._camera:
+            shown = np.zeros(self.num_envs, np.bool_)
+            shown[list(which)] = True
+            self._photograph(out, shown)
+
+    def _saved(self) -> tuple[npt.NDArray[Any], ...]:
+        memory = self.memory
+        return memory.slots, memory.history, memory.frames
+
+    def close(self) -> None:
+        """Stop the threads."""
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None

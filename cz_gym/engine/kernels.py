@@ -1,0 +1,278 @@
+"""The compiled loops: draws, drives, plant, sensors, observation and reward, for one slot or ten thousand.
+
+The equations are the functions of :mod:`cz_gym.physics.plant`, :mod:`cz_gym.episodes.schedule` and :mod:`cz_gym.task`,
+compiled in; this module says in which order a slot goes through them.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cz_gym.episodes.draw import draw_episode, draw_factors, randomised, seed_streams
+from cz_gym.episodes.noise import first_fluctuation, fluctuation, next_fluctuation, sample_noise
+from cz_gym.episodes.record import GRID
+from cz_gym.episodes.schedule import drift, melt_left, reference
+from cz_gym.jit.cache import hashed
+from cz_gym.jit.compile import fetch, inlined, kernel, physics
+from cz_gym.physics.meniscus import HURLE, MeniscusModel
+from cz_gym.physics.plant import Disturbance, Inputs, State, derive_puller, growth, hidden_load, rk4
+from cz_gym.task import (
+    HEATER_RANGE,
+    HEIGHT_MAX_IN_A,
+    HEIGHT_MIN,
+    Cost,
+    cost_terms,
+    failure_penalty,
+    reward,
+    within_limits,
+)
+from cz_gym.units import MM
+
+from .layout import EPISODE_AT, INFO, PULLER_AT, SLOT
+from .outputs import clip, measure, recall, remember, write_info, write_measured, write_state
+from .sensors import photograph, sense
+
+_EPS = 1e-9
+_CLIPPED = INFO.index("action_clipped")
+_LOW = 5.0 * MM
+"""A meniscus from which no melt freezes the crystal within half a substep need not be asked [m]."""
+_JUMP = HEIGHT_MIN
+_LINE = 8
+"""Numbers of eight bytes in a line of the cache."""
+_NUMBERS, _ROWS = SLOT.itemsize // 8, len(INFO)
+
+
+@physics
+def _begin(slot: Any) -> None:
+    """Put a slot with drawn constants at the start of its episode."""
+    p, e = slot.puller, slot.episode
+    slot.x.r_c, slot.x.h_c = p.r_0 + e.r_c_start, p.h_0
+    slot.x.T_1, slot.x.T_2, slot.x.T_b = p.T_1_0, p.T_2_0, p.T_b_0
+    slot.v_p, slot.Q_H, slot.Q_H_slewed = p.v_0, p.Q_H_0, p.Q_H_0
+    slot.v_p_before, slot.Q_H_before, slot.clipped = p.v_0, p.Q_H_0, 0.0
+    slot.fast, slot.slow = first_fluctuation(e, slot.streams)
+    slot.dT_i, slot.Q_d, slot.drift = fluctuation(e, slot.fast, slot.slow), 0.0, np.nan
+    slot.integral = 0.0
+    slot.k = slot.frames = slot.over = slot.point = 0
+
+
+@physics
+def _drive(slot: Any, pull: Any, heat: Any, interval: Any) -> None:
+    """Move the drives towards an action within window and slew, the heater in whole steps."""
+    p, e = slot.puller, slot.episode
+    slot.v_p_before, slot.Q_H_before = slot.v_p, slot.Q_H
+    slot.clipped = 1.0 if (np.abs(pull) > 1.0 or np.abs(heat) > 1.0) else 0.0
+    wanted = p.v_0 + clip(p.v_0 * clip(pull, 1.0), e.pull_window)
+    slot.v_p = slot.v_p + clip(wanted - slot.v_p, e.pull_slew * interval)
+    power = np.maximum(p.Q_H_0 + HEATER_RANGE * clip(heat, 1.0), 0.0)
+    slot.Q_H_slewed = slot.Q_H_slewed + clip(power - slot.Q_H_slewed, e.heater_slew * interval)
+    slot.Q_H = slot.Q_H_slewed
+    if e.heater_step > 0.0:
+        whole = p.Q_H_0 + e.heater_step * np.rint((slot.Q_H_slewed - p.Q_H_0) / e.heater_step)
+        slot.Q_H = np.maximum(whole, 0.0)
+
+
+@physics
+def _height_inside(h_c: Any, p: Any) -> Any:
+    """Meniscus height held inside its limits, so that a failed state is still measured."""
+    return np.minimum(np.maximum(h_c, HEIGHT_MIN), HEIGHT_MAX_IN_A * p.a)
+
+
+@physics
+def _substep(x: Any, u: Any, d: Any, p: Any, dt: Any, r_ref: Any, slope: Any) -> Any:
+    """One RK4 substep and whether the crystal still grows; a jump no crystal makes keeps the state before.
+
+    Over a melt far too cold a low meniscus freezes within seconds, and a step across that singularity can end anywhere,
+    inside the limits too. There the height falls faster and faster, so half the step at the first rate tells.
+    """
+    new = rk4(x, u, d, p, dt, slope)
+    inside = within_limits(new.r_c, new.h_c, r_ref, p.a)
+    grows = inside
+    if inside and x.h_c < _LOW:
+        grows = x.h_c + 0.5 * dt * (u.v_p - growth(x, d, p, slope).v_g) >= HEIGHT_MIN
+    if not grows and (inside or not (np.abs(new.r_c - x.r_c) < _JUMP and np.abs(new.h_c - x.h_c) < _JUMP)):
+        new = State(x.r_c, x.h_c, x.T_1, x.T_2, x.T_b)
+    return new, grows
+
+
+@physics
+def _disturb(slot: Any, j: Any) -> Any:
+    """The disturbance at grid point j, this one or the next; the hidden load is solved only while the drift moves."""
+    p, e = slot.puller, slot.episode
+    if j != slot.point:
+        slot.point = j
+        slot.fast, slot.slow = next_fluctuation(e, slot.streams, slot.fast, slot.slow)
+        slot.dT_i = fluctuation(e, slot.fast, slot.slow)
+    shift = drift(j * GRID, e)
+    if shift != slot.drift:
+        slot.drift, slot.Q_d = shift, hidden_load(shift, p)
+    return Disturbance(slot.Q_d, slot.dT_i, melt_left(j * GRID, e))
+
+
+@physics
+def _advance(slot: Any, frames: Any, clock: Any, slope: Any, ring_offset: Any) -> Any:
+    """Integrate over one control interval, split at the 5 s grid; returns whether the crystal still grows."""
+    p, e = slot.puller, slot.episode
+    u = Inputs(slot.v_p, slot.Q_H)
+    x = State(slot.x.r_c, slot.x.h_c, slot.x.T_1, slot.x.T_2, slot.x.T_b)
+    t, end = slot.k * clock.interval, (slot.k + 1) * clock.interval
+    grows = True
+    while grows and t < end - _EPS:
+        j = int(t / GRID + _EPS)
+        upto = min((j + 1) * GRID, end)
+        x, grows = _substep(x, u, _disturb(slot, j), p, upto - t, p.r_0 + reference(upto, e), slope)
+        t = upto
+        if e.latency > 0.0 and t < end - _EPS:
+            h_c = _height_inside(x.h_c, p)
+            photograph(slot, frames, t, x.r_c + ring_offset(x.r_c, h_c, p) - p.ring_bias, h_c)
+    slot.x.r_c, slot.x.h_c, slot.x.T_1, slot.x.T_2, slot.x.T_b = x.r_c, x.h_c, x.T_1, x.T_2, x.T_b
+    slot.k = slot.k + 1
+    return grows
+
+
+@inlined
+def _sample(memory: Any, i: Any, fresh: Any, clock: Any, reading: Any, out: Any, slope: Any, ring_offset: Any) -> Any:
+    """Read slot i, unless its last reading is to be shown again, and write what it says; returns the step's cost."""
+    slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
+    t, h_c = slot.k * clock.interval, _height_inside(x.h_c, p)
+    ring = x.r_c + ring_offset(x.r_c, h_c, p)
+    at_interface = growth(State(x.r_c, h_c, x.T_1, x.T_2, x.T_b), Disturbance(slot.Q_d, slot.dT_i, 1.0), p, slope)
+    if fresh:
+        camera, pyrometer = sample_noise(slot.episode, slot.streams)
+        sense(slot, camera, pyrometer, memory.frames[i], t, ring - p.ring_bias, h_c)
+    measured = measure(slot, t)
+    row = out.observation[i]
+    write_measured(measured, reading.measured, row)
+    if memory.history.shape[1] > 0:
+        if fresh:
+            remember(slot, memory.history[i], clock.interval, row)
+        recall(slot, memory.history[i], reading, row)
+    if out.state.shape[1] > 0:
+        write_state(slot, measured, t, reading.state, out.state[i])
+    error = x.r_c - p.r_0 - measured.r_ref
+    cost = cost_terms(error, measured.v_p, slot.v_p - slot.v_p_before, slot.Q_H - slot.Q_H_before)
+    if slot.k == 0:
+        cost = Cost(0.0, 0.0, 0.0, 0.0)
+    write_info(slot, measured, cost, t, ring, at_interface, out.info[:, i])
+    out.info[_CLIPPED, i] = slot.clipped
+    return cost
+
+
+def _read(memory: Any, i: Any, fresh: Any, clock: Any, reading: Any, out: Any, slope: Any, ring_offset: Any) -> None:
+    _sample(memory, i, fresh, clock, reading, out, slope, ring_offset)
+    out.reward[i] = 0.0
+    out.terminated[i] = out.truncated[i] = False
+
+
+_sample_alone = kernel(_read, keep=False, allocates=False)
+"""A sample as a function of its own: with the step's options, so that what it calls is compiled only once."""
+
+
+@physics
+def _fetch_slot(numbers: Any, i: Any) -> None:
+    """Have slot i brought to the cache: the slots of a large batch are further away than one step is long."""
+    for at in range(0, _NUMBERS, _LINE):
+        fetch(numbers, i * _NUMBERS + at)
+
+
+@physics
+def _fetch_info(info: Any, i: Any) -> None:
+    """Have the lines brought that the info of slot i and of those after it is written to."""
+    if i % _LINE == 0:
+        for row in range(_ROWS):
+            fetch(info, row * info.shape[1] + i)
+
+
+class Kernels(NamedTuple):
+    """The compiled loops for one meniscus model."""
+
+    step: Any
+    """``step(memory, actions, active, clock, reading, out, start, stop)``: one control interval of the active slots;
+    returns how many episodes ended."""
+    draw: Any
+    """``draw(memory, which, keys, law, mix, parameters, clock, reading, out, start, stop)``: new episodes, each
+    from its key, for the slots ``which[start:stop]``, with their first sample; returns a slot whose puller has no
+    operating point, or -1."""
+    show: Any
+    """``show(memory, which, clock, reading, out, start, stop)``: the last sample of the slots ``which[start:stop]``
+    again."""
+    plant: Any
+    """``plant(memory, actions, clock, rings, start, stop)``: drives, plant and ring alone, to measure speed against."""
+    derive: Any
+    """``derive(parameters, lam)``: the puller at its operating point."""
+
+
+def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
+    """Compile the loops for a meniscus model; those of this package's models are kept on disk."""
+    slope, ring_offset, height = meniscus.slope, meniscus.ring_offset, meniscus.height
+
+    def step(memory: Any, actions: Any, active: Any, clock: Any, reading: Any, out: Any, start: int, stop: int) -> int:
+        ended = 0
+        for i in range(start, stop):
+            if not active[i]:
+                continue
+            _fetch_slot(memory.numbers, i + 1)
+            _fetch_info(out.info, i + _LINE)
+            slot = memory.slots[i]
+            _drive(slot, actions[i, 0], actions[i, 1], clock.interval)
+            grows = _advance(slot, memory.frames[i], clock, slope, ring_offset)
+            cost = _sample(memory, i, True, clock, reading, out, slope, ring_offset)
+            ends = slot.k >= clock.steps
+            out.reward[i] = reward(cost) + (0.0 if grows else failure_penalty(slot.k, clock.steps))
+            out.terminated[i] = not grows
+            out.truncated[i] = grows and ends
+            slot.over = 1 if (not grows or ends) else 0
+            ended += slot.over
+        return ended
+
+    def draw(
+        memory: Any, which: Any, keys: Any, law: Any, mix: Any, parameters: Any, clock: Any, reading: Any, out: Any,
+        start: int, stop: int,
+    ) -> int:  # fmt: skip
+        impossible = -1
+        for at in range(start, stop):
+            i = which[at]
+            slot, numbers = memory.slots[i], memory.numbers[i]
+            slot.key[0], slot.key[1] = keys[at, 0], keys[at, 1]
+            seed_streams(slot.streams, slot.key)
+            factors = draw_factors(law[0], mix, slot.streams)
+            puller = derive_puller(randomised(parameters, factors), factors.lam, height, ring_offset)
+            for number in range(len(puller)):
+                numbers[PULLER_AT + number] = puller[number]
+                impossible = impossible if np.isfinite(puller[number]) else i
+            episode = draw_episode(law[0], slot.streams, slot.freezes)
+            for number in range(len(episode)):
+                numbers[EPISODE_AT + number] = episode[number]
+            _begin(slot)
+            _sample_alone(memory, i, True, clock, reading, out, slope, ring_offset)
+        return impossible
+
+    def show(memory: Any, which: Any, clock: Any, reading: Any, out: Any, start: int, stop: int) -> None:
+        for at in range(start, stop):
+            _sample_alone(memory, which[at], False, clock, reading, out, slope, ring_offset)
+
+    def plant(memory: Any, actions: Any, clock: Any, rings: Any, start: int, stop: int) -> None:
+        for i in range(start, stop):
+            _fetch_slot(memory.numbers, i + 1)
+            slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
+            _drive(slot, actions[i, 0], actions[i, 1], clock.interval)
+            _advance(slot, memory.frames[i], clock, slope, ring_offset)
+            rings[i] = x.r_c + ring_offset(x.r_c, _height_inside(x.h_c, p), p)
+
+    def derive(parameters: Any, lam: float) -> Any:
+        return derive_puller(parameters, lam, height, ring_offset)
+
+    keep = hashed(*meniscus.functions)
+    return Kernels(
+        kernel(step, keep, allocates=False),
+        kernel(draw, keep),
+        kernel(show, keep, allocates=False),
+        kernel(plant, keep, allocates=False),
+        kernel(derive, keep),
+    )
+
+
+KERNELS = build_kernels()
+"""The loops on Hurle's meniscus."""

@@ -1,0 +1,155 @@
+"""What a slot holds, what a step reads and where it writes: the arrays of the compiled loop."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cz_gym.episodes.record import FREEZES, Episode, Stream
+from cz_gym.episodes.rng import WORDS
+from cz_gym.physics.plant import Puller, State
+
+
+def _record(fields: tuple[str, ...]) -> np.dtype[Any]:
+    return np.dtype([(name, np.float64) for name in fields])
+
+
+SLOT = np.dtype(
+    [
+        ("puller", _record(Puller._fields)),
+        ("episode", _record(Episode._fields)),
+        ("x", _record(State._fields)),
+        ("freezes", np.float64, (FREEZES, 2)),
+        ("v_p", np.float64),
+        ("Q_H", np.float64),
+        ("Q_H_slewed", np.float64),
+        ("dT_i", np.float64),
+        ("Q_d", np.float64),
+        ("ring", np.float64),
+        ("h_seen", np.float64),
+        ("T_1", np.float64),
+        ("valid", np.float64),
+        ("integral", np.float64),
+        ("drift", np.float64),
+        ("k", np.int64),
+        ("frames", np.int64),
+        ("over", np.int64),
+        ("k_seen", np.int64),
+        ("key", np.uint64, (2,)),
+        ("v_p_before", np.float64),
+        ("Q_H_before", np.float64),
+        ("clipped", np.float64),
+        ("point", np.int64),
+        ("fast", np.float64),
+        ("slow", np.float64),
+        ("streams", np.uint64, (len(Stream), WORDS)),
+    ],
+    align=True,
+)
+"""One slot: constants of puller and episode, plant state, drives [m/s, W], the disturbance of the last substep,
+the last readings (``ring`` [m] without the operator's bias, with the meniscus height ``h_seen`` [m] and the sample
+``k_seen`` it was taken at, ``T_1`` [K], ``valid``), the integral of the scaled ring error, the drift [K] that ``Q_d``
+belongs to, the sample number ``k``, the number of camera frames taken, whether the episode is over, the ``key`` it
+was drawn from, the drives [m/s, W] of the step before and whether the action was clipped: a sample can be written
+again from its slot. Then the 5 s grid point that ``dT_i`` belongs to with its two processes [standard deviations], and
+the episode's random streams, as far as they are drawn from."""
+PULLER_AT, EPISODE_AT = 0, len(Puller._fields)
+"""Where a slot's constants begin, in numbers of eight bytes."""
+
+
+class Clock(NamedTuple):
+    """Time base of the slots."""
+
+    interval: float
+    """Control interval [s]."""
+    steps: int
+    """Steps in an episode."""
+    grid_points: int
+    """Points of the 5 s grid in an episode."""
+
+
+class Memory(NamedTuple):
+    """What the slots read and remember, one row a slot."""
+
+    slots: Any
+    """Records of :data:`SLOT`, shape (n,)."""
+    numbers: Any
+    """The same memory as plain float64, shape (n, numbers a record)."""
+    history: Any
+    """Running sums of the remembered channels, circular in time, shape (n, depth, channels); depth 0: none."""
+    frames: Any
+    """Time [s], ring [m] and meniscus height [m] of camera frames, circular, shape (n, depth, 3)."""
+
+
+class Out(NamedTuple):
+    """Where a step writes, one row a slot."""
+
+    observation: Any
+    """The "measured" or "history" channels, float32, shape (n, channels)."""
+    state: Any
+    """The "state" channels, float32, shape (n, channels); width 0: not written."""
+    image: Any
+    """The camera's image, uint8, shape (n, rows, columns, 1); empty unless it is the observation. Written after the
+    step, by :mod:`cz_gym.camera.image`."""
+    reward: Any
+    """Float64, shape (n,)."""
+    terminated: Any
+    """Bool, shape (n,)."""
+    truncated: Any
+    """Bool, shape (n,)."""
+    info: Any
+    """Rows of :data:`INFO`, float64, shape (rows, n or a little more: see :func:`info_width`)."""
+
+
+class Reading(NamedTuple):
+    """Constants of reading a slot."""
+
+    measured: Any
+    """One over the scales of the measured channels, shape (channels,)."""
+    state: Any
+    """One over the scales of the state channels, shape (channels,)."""
+    upto: Any
+    """Age of the newest sample of each remembered mean, shape (lags,)."""
+    before: Any
+    """Age of the sample before its oldest, shape (lags,)."""
+    share: Any
+    """One over the samples in it, shape (lags,)."""
+
+
+class InfoRow(NamedTuple):
+    """One number of ``info``."""
+
+    name: str
+    unit: str
+    meaning: str
+
+
+INFO_ROWS = (
+    InfoRow("r_c", "m", "true crystal radius"),
+    InfoRow("r_br", "m", "true radius of the bright ring"),
+    InfoRow("r_ref", "m", "radius reference"),
+    InfoRow("h_c", "m", "true meniscus height"),
+    InfoRow("alpha_c", "rad", "cone angle of the crystal's wall"),
+    InfoRow("v_g", "m/s", "growth rate"),
+    InfoRow("v_p", "m/s", "applied pull speed"),
+    InfoRow("Q_H", "W", "applied heater power"),
+    InfoRow("T_1", "K", "true heater temperature"),
+    InfoRow("T_1_ref", "K", "recipe of the heater temperature"),
+    InfoRow("T_b", "K", "true melt temperature"),
+    InfoRow("r_br_measured", "m", "the camera's reading, with noise and offset"),
+    InfoRow("ring_offset", "m", "offset of the ring that no sensor shows"),
+    InfoRow("cost_radius", "1", "the cost's term of the radius error"),
+    InfoRow("cost_pull", "1", "the cost's term of the pull speed"),
+    InfoRow("cost_pull_step", "1", "the cost's term of the step of the pull speed"),
+    InfoRow("cost_heater_step", "1", "the cost's term of the step of the heater power"),
+    InfoRow("action_clipped", "bool", "whether the action lay outside its box"),
+)
+"""What a step says beside the observation, SI units."""
+INFO = tuple(row.name for row in INFO_ROWS)
+"""Names of the info rows."""
+
+
+def info_width(n: int) -> int:
+    """Length of an info row for n slots: rows a multiple of 4 KiB apart would share one set of the cache."""
+    return n + 8 if n % 64 == 0 else n

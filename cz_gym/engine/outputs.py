@@ -1,0 +1,111 @@
+"""What a slot says after a step: the measured channels, the memory of "history", the true state and the info rows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from cz_gym.episodes.schedule import bias_offset, recipe, reference
+from cz_gym.jit.compile import physics
+from cz_gym.observation import CLIP, INTEGRAL_SCALE, LAGGED, MEASURED, PREVIEWS, STATE, Measured
+
+_AHEAD_1, _AHEAD_2 = PREVIEWS[1:]
+_M, _S, _L = len(MEASURED), len(STATE), len(LAGGED)
+_REMEMBERED = tuple(Measured._fields.index(name) for name in LAGGED)
+_RING = _REMEMBERED[0]
+_RING_SCALE = MEASURED[_RING].scale
+
+
+@physics
+def clip(value: Any, limit: Any) -> Any:
+    """The value held within +-limit; NaN passes."""
+    value = -limit if value < -limit else value
+    return limit if value > limit else value
+
+
+@physics
+def measure(slot: Any, t: Any) -> Any:
+    """The "measured" channels in SI units."""
+    p, e = slot.puller, slot.episode
+    r_ref = reference(t, e)
+    return Measured(
+        slot.ring - p.r_0 - r_ref,
+        slot.valid,
+        r_ref,
+        reference(t + _AHEAD_1, e),
+        reference(t + _AHEAD_2, e),
+        recipe(t, e),
+        recipe(t + _AHEAD_1, e),
+        recipe(t + _AHEAD_2, e),
+        slot.T_1 - p.T_1_0,
+        slot.v_p - p.v_0,
+        slot.Q_H - p.Q_H_0,
+    )
+
+
+@physics
+def write_measured(measured: Any, per_scale: Any, out: Any) -> None:
+    """Write the "measured" channels, scaled and clipped."""
+    for channel in range(_M):
+        out[channel] = clip(measured[channel] * per_scale[channel], CLIP)
+
+
+@physics
+def remember(slot: Any, history: Any, interval: Any, out: Any) -> None:
+    """Add the sample's scaled channels to the running sums, and the ring error to its integral."""
+    depth = history.shape[0]
+    if slot.k == 0:
+        for back in range(depth):
+            history[depth - 1 - back, 0] = -out[_RING] * back
+            for channel in range(1, _L):
+                history[depth - 1 - back, channel] = 0.0
+    else:
+        step = out[_RING] * (_RING_SCALE / INTEGRAL_SCALE) * interval
+        slot.integral = clip(slot.integral + step, CLIP)
+    at = slot.k % depth
+    before = at - 1 if at > 0 else depth - 1
+    for channel in range(_L):
+        history[at, channel] = history[before, channel] + out[_REMEMBERED[channel]]
+
+
+@physics
+def recall(slot: Any, history: Any, reading: Any, out: Any) -> None:
+    """Write the integral and the means of the remembered samples; a negative index goes round the circle."""
+    at = slot.k % history.shape[0]
+    out[_M] = slot.integral
+    for lag in range(reading.upto.size):
+        upto, before = at - reading.upto[lag], at - reading.before[lag]
+        first, share = _M + 1 + lag * _L, reading.share[lag]
+        for channel in range(_L):
+            mean = (history[upto, channel] - history[before, channel]) * share
+            out[first + channel] = clip(mean, CLIP)
+
+
+@physics
+def write_state(slot: Any, measured: Any, t: Any, per_scale: Any, out: Any) -> None:
+    """Write the "state" channels."""
+    p, x = slot.puller, slot.x
+    truth = (
+        x.r_c - p.r_0 - measured.r_ref, x.h_c - p.h_0, x.T_1 - p.T_1_0, x.T_2 - p.T_2_0, x.T_b - p.T_b_0,
+        measured.r_ref, measured.r_ref_1min, measured.r_ref_5min,
+        measured.T_1_ref, measured.T_1_ref_1min, measured.T_1_ref_5min,
+        measured.v_p, measured.Q_H, slot.dT_i, slot.Q_d, bias_offset(t, slot.episode), p.lam,
+    )  # fmt: skip
+    for channel in range(_S):
+        out[channel] = clip(truth[channel] * per_scale[channel], CLIP)
+
+
+@physics
+def write_info(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, at_interface: Any, info: Any) -> None:
+    """Write the info rows, all but the last; ``h_c`` is the height held inside its limits, ``ring`` the ring there."""
+    p, x = slot.puller, slot.x
+    values = (
+        x.r_c, ring, p.r_0 + measured.r_ref, x.h_c,
+        np.arctan(at_interface.tan_alpha), at_interface.v_g,
+        slot.v_p, slot.Q_H, x.T_1, p.T_1_0 + measured.T_1_ref, x.T_b,
+        slot.ring + p.ring_bias, bias_offset(t, slot.episode),
+        cost.radius, cost.pull, cost.pull_step, cost.heater_step,
+    )  # fmt: skip
+    for row in range(len(values)):
+        info[row] = values[row]

@@ -1,0 +1,72 @@
+"""Camera and pyrometer of a slot: frames, latency, noise, drop-outs and freezes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from cz_gym.episodes.record import FREEZES
+from cz_gym.episodes.schedule import bias_offset, pyrometer_drift, ripple
+from cz_gym.jit.compile import physics
+
+_EPS = 1e-9
+
+
+@physics
+def photograph(slot: Any, frames: Any, t: Any, ring: Any, h_c: Any) -> None:
+    """Keep the ring [m] and the meniscus height [m] as a frame taken at t."""
+    at = slot.frames % frames.shape[0]
+    frames[at, 0] = t
+    frames[at, 1] = ring
+    frames[at, 2] = h_c
+    slot.frames = slot.frames + 1
+
+
+@physics
+def _delivered(slot: Any, frames: Any, t: Any) -> Any:
+    """Index of the newest frame as old as the latency, or of the oldest there is."""
+    depth = frames.shape[0]
+    index = slot.frames - 1
+    oldest = max(slot.frames - depth, 0)
+    while index > oldest and frames[index % depth, 0] > t - slot.episode.latency + _EPS:
+        index -= 1
+    return index % depth
+
+
+@physics
+def _freezes(slot: Any, t: Any) -> Any:
+    """Whether the camera is frozen at t, and whether it says so."""
+    frozen, flagged = False, False
+    for which in range(FREEZES):
+        if slot.freezes[which, 0] <= t < slot.freezes[which, 1]:
+            frozen = True
+            flagged = flagged or which < FREEZES - 1
+    return frozen, flagged
+
+
+@physics
+def sense(slot: Any, camera: Any, pyrometer: Any, frames: Any, t: Any, ring: Any, h_c: Any) -> None:
+    """Read pyrometer and camera at t; ``ring`` [m] is what a camera without latency sees, less the operator's bias,
+    on a meniscus of height ``h_c`` [m].
+
+    ``camera`` [m] (NaN: the sample drops out) and ``pyrometer`` [K] are the sample's noise. A frozen or dropped sample
+    shows the last reading again.
+    """
+    e = slot.episode
+    slot.T_1 = slot.x.T_1 + pyrometer_drift(t, e) + pyrometer
+    lost = np.isnan(camera)
+    frozen, flagged = _freezes(slot, t)
+    slot.valid = 0.0 if lost or flagged else 1.0
+    taken = t
+    if e.latency > 0.0:
+        photograph(slot, frames, t, ring, h_c)
+        at = _delivered(slot, frames, t)
+        taken, ring, h_c = frames[at, 0], frames[at, 1], frames[at, 2]
+    if slot.k == 0 or not (lost or frozen):
+        slot.ring = ring + bias_offset(t, e)
+        slot.h_seen, slot.k_seen = h_c, slot.k
+        if e.ripple_amplitude > 0.0:
+            slot.ring = slot.ring + ripple(taken, e)
+        if not lost:
+            slot.ring = slot.ring + camera

@@ -1,0 +1,167 @@
+"""The draw of an episode, compiled: streams from one key, then the puller, ramps, constants and freezes.
+
+Stream n of an episode is ``SeedSequence(key, spawn_key=(n,))``, so that families never share a random number.
+Scalars come first on each stream; what is random at every step follows as the episode goes
+(:mod:`cz_gym.episodes.noise`), so a longer horizon extends a draw and never changes it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from cz_gym.jit.compile import physics
+from cz_gym.physics.parameters import Parameters
+
+from .record import FREEZES, GRID, Episode, Factors, Stream
+from .rng import normal, seed_stream, uniform
+from .scenario import DRAW_SPAN, MAX_FLAGGED
+
+STREAMS = len(Stream)
+SHORTEST = 1e-9
+"""Length [s] of a ramp that is a jump."""
+_START, _PARAMETERS, _SCHEDULE = int(Stream.START), int(Stream.PARAMETERS), int(Stream.SCHEDULE)
+_INTERFACE, _SENSOR, _FAULTS = int(Stream.INTERFACE), int(Stream.SENSOR), int(Stream.FAULTS)
+_FACTORS, _FAULT_NUMBERS = len(Factors._fields), 5 + 3 * FREEZES
+_INTERFACE_NUMBERS, _SENSOR_NUMBERS = 2, 8
+
+
+@physics
+def seed_streams(streams: Any, key: Any) -> None:
+    """Seed an episode's streams, shape (streams, 4), from its key, two 64-bit words."""
+    for number in range(STREAMS):
+        seed_stream(streams[number], key, number)
+
+
+@physics
+def between(limits: Any, u: Any) -> Any:
+    """The number at share u of a range."""
+    return limits[0] + (limits[1] - limits[0]) * u
+
+
+@physics
+def _factor(spread: Any, u: Any) -> Any:
+    return 1.0 + spread * (2.0 * u - 1.0)
+
+
+@physics
+def _uniforms(s: Any, count: Any) -> Any:
+    """The stream's next numbers in [0, 1); one loop compiles in a fraction of the time of as many calls."""
+    u = np.zeros(count)
+    for number in range(count):
+        u[number] = uniform(s)
+    return u
+
+
+@physics
+def draw_factors(law: Any, mix: Any, streams: Any) -> Any:
+    """Draw the puller: its mix of models and the factors on its parameters."""
+    u, spread = _uniforms(streams[_PARAMETERS], _FACTORS), law.pullers
+    return Factors(
+        between(mix, u[0]),
+        _factor(spread.capillary, u[1]),
+        _factor(spread.conductivity, u[2]),
+        _factor(spread.conductance, u[3]),
+        _factor(spread.conductance, u[4]),
+        _factor(spread.conductance, u[5]),
+        _factor(spread.conductance, u[6]),
+    )
+
+
+@physics
+def randomised(q: Any, f: Any) -> Any:
+    """The parameters of the drawn puller: factors on a, k_l and the conductances."""
+    return Parameters(
+        q.sigma * f.a**2, q.rho_l, q.alpha_0, q.g, q.sigma_SB, q.k_l * f.k_l, q.rho_s, q.dH, q.T_m, q.dT_0, q.phi_b,
+        q.r_0, q.v_0, q.C_1, q.C_2, q.C_b, q.kappa_12 * f.kappa_12, q.G_1a * f.G_1a, q.T_a, q.G_2b * f.G_2b,
+        q.eps * f.kappa_b, q.R_cr, q.T_e,
+    )  # fmt: skip
+
+
+@physics
+def draw_episode(law: Any, streams: Any, freezes: Any) -> Any:
+    """Draw ramps and constants; freezes [s], shape (FREEZES, 2), are written."""
+    recipe, drift, reference, sensor, drives = law.recipe, law.drift, law.reference, law.sensor, law.actuators
+    plan, at, read = (
+        _uniforms(streams[_SCHEDULE], 10),
+        _uniforms(streams[_INTERFACE], _INTERFACE_NUMBERS),
+        _uniforms(streams[_SENSOR], _SENSOR_NUMBERS),
+    )
+    recipe_length = between(recipe.duration, plan[1])
+    moved = 1.0 if plan[6] < reference.probability else 0.0
+    sd_fast, sd_slow = between(law.interface.sd, at[0]), between(law.interface.sd, at[1])
+    keep_fast, keep_slow = np.exp(-GRID / law.interface.tau_fast), np.exp(-GRID / law.interface.tau_slow)
+    fault = _draw_faults(law.faults, streams[_FAULTS], freezes)
+    return Episode(
+        law.pullers.start_radius_sd * normal(streams[_START]),
+        between(recipe.start, plan[2]), max(recipe_length, SHORTEST), between(recipe.rate, plan[0]) * recipe_length,
+        between(drift.start, plan[5]), max(between(drift.duration, plan[4]), SHORTEST),
+        between(drift.amount, plan[3]), drift.rate,
+        between(reference.start, plan[9]), max(between(reference.duration, plan[8]), SHORTEST),
+        between(reference.amount, plan[7]) * moved,
+        law.pullers.melt_loss, between(sensor.bias_offset, read[2]) + between(sensor.level_offset, read[3]),
+        fault[0], fault[1], fault[2],
+        between(sensor.ripple, read[4]), 2.0 * math.pi * between(sensor.rotation, read[5]), 2.0 * math.pi * read[6],
+        between(sensor.pyrometer_drift, read[7]), sensor.latency,
+        drives.pull_window, drives.pull_slew, drives.heater_slew, drives.heater_step,
+        sd_fast, sd_slow, keep_fast, keep_slow, np.sqrt(1.0 - keep_fast**2), np.sqrt(1.0 - keep_slow**2),
+        between(sensor.camera_noise, read[0]), between(sensor.pyrometer_noise, read[1]), fault[3],
+        sensor.outlier_probability, sensor.outlier_sd,
+    )  # fmt: skip
+
+
+@physics
+def skip_constants(streams: Any) -> None:
+    """Move fresh streams to where :func:`draw_episode` leaves those that series are drawn from."""
+    _uniforms(streams[_INTERFACE], _INTERFACE_NUMBERS)
+    _uniforms(streams[_SENSOR], _SENSOR_NUMBERS)
+
+
+@physics
+def _draw_faults(faults: Any, s: Any, freezes: Any) -> Any:
+    """Place the freezes; return start [s], length [s] and size [m] of the ring's drift, and the drop-outs' share."""
+    u = _uniforms(s, _FAULT_NUMBERS)
+    least, most = faults.flagged[0], faults.flagged[1]
+    flagged = min(most, least + np.floor(u[3] * (most - least + 1.0)))
+    lengths = np.zeros(FREEZES)
+    for which in range(FREEZES):
+        if which < flagged:
+            lengths[which] = between(faults.flagged_duration, u[5 + which])
+        elif which == MAX_FLAGGED and faults.unflagged > 0.0:
+            lengths[which] = between(faults.unflagged_duration, u[5 + which])
+    _place_freezes(lengths, u[5 + FREEZES : 5 + 2 * FREEZES], u[5 + 2 * FREEZES :], freezes)
+    return (
+        u[0] * DRAW_SPAN,
+        max(between(faults.bias_drift_duration, u[1]), SHORTEST),
+        between(faults.bias_drift, u[2]),
+        between(faults.dropout, u[4]),
+    )
+
+
+@physics
+def _place_freezes(lengths: Any, order: Any, share: Any, freezes: Any) -> None:
+    """Place disjoint windows uniformly: sorted starts in the time left over, lengths put back in between.
+
+    ``order`` and ``share`` hold a random number for each window: which comes first, and where in the room a start
+    lies. A window of length 0 is none.
+    """
+    room = DRAW_SPAN - np.sum(lengths)
+    for which in range(FREEZES):
+        freezes[which, 0] = freezes[which, 1] = 0.0
+        if lengths[which] > 0.0:
+            rank, passed, start = 0, 0.0, 0.0
+            for other in range(FREEZES):
+                if lengths[other] > 0.0 and order[other] < order[which]:
+                    rank += 1
+                    passed += lengths[other]
+            for candidate in range(FREEZES):
+                below = 0
+                for other in range(FREEZES):
+                    if lengths[other] > 0.0 and share[other] < share[candidate]:
+                        below += 1
+                if lengths[candidate] > 0.0 and below == rank:
+                    start = passed + share[candidate] * room
+            freezes[which, 0] = start
+            freezes[which, 1] = start + lengths[which]

@@ -1,0 +1,138 @@
+"""The named scenarios, frozen: the distributions every controller and agent meets."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from numbers import Real
+
+from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
+
+from .scenario import Actuators, Drift, Faults, Interface, Pullers, Recipe, Reference, Scenario, Sensor
+
+K_PER_MIN = 1.0 / MINUTE
+
+
+def _minutes(low: float, high: float) -> tuple[float, float]:
+    return low * MINUTE, high * MINUTE
+
+
+def _either_way(size: float) -> tuple[float, float]:
+    return -size, size
+
+
+_FALL = Reference(probability=1.0, duration=_minutes(30, 30), start=_minutes(10, 10))
+
+NOMINAL = Scenario("nominal")
+
+PAPER_RAMP = Scenario(
+    "paper-ramp",
+    recipe=Recipe(rate=(0.5 * K_PER_MIN, 0.5 * K_PER_MIN), duration=_minutes(10, 10), start=_minutes(10, 10)),
+)
+
+REFERENCE_A = Scenario("reference-a", reference=replace(_FALL, amount=(-2.5 * MM, -2.5 * MM)))
+REFERENCE_B = Scenario("reference-b", reference=replace(_FALL, amount=(-0.5 * MM, -0.5 * MM)))
+
+RANDOMIZED = Scenario(
+    "randomized",
+    pullers=Pullers(mix=(0.0, 1.0), capillary=0.03, conductivity=0.1, conductance=0.1, start_radius_sd=0.2 * MM),
+    recipe=Recipe(rate=_either_way(0.5 * K_PER_MIN), duration=_minutes(5, 10), start=_minutes(10, 110)),
+    drift=Drift(amount=_either_way(5.0), duration=_minutes(20, 100), start=_minutes(0, 100)),
+    interface=Interface(sd=(0.0, 0.5)),
+    reference=Reference(
+        probability=0.5, amount=_either_way(2.5 * MM), duration=_minutes(20, 50), start=_minutes(10, 110)
+    ),
+    sensor=Sensor(camera_noise=(0.0, 0.05 * MM), pyrometer_noise=(0.0, 0.1)),
+)
+
+HARD = Scenario(
+    "hard",
+    pullers=Pullers(mix=(0.0, 1.0), capillary=0.045, conductivity=0.15, conductance=0.15, start_radius_sd=0.3 * MM),
+    recipe=replace(RANDOMIZED.recipe, rate=_either_way(0.75 * K_PER_MIN)),
+    drift=replace(RANDOMIZED.drift, amount=_either_way(7.5)),
+    interface=Interface(sd=(0.0, 0.75)),
+    reference=replace(RANDOMIZED.reference, amount=_either_way(3.75 * MM)),
+    sensor=Sensor(camera_noise=(0.0, 0.1 * MM), pyrometer_noise=(0.0, 0.2)),
+)
+
+SENSOR_FAULT = replace(
+    RANDOMIZED,
+    name="sensor-fault",
+    faults=Faults(
+        flagged=(1, 3),
+        flagged_duration=(30.0, 180.0),
+        unflagged=1,
+        unflagged_duration=(30.0, 60.0),
+        dropout=(0.0, 0.05),
+        bias_drift=_either_way(0.3 * MM),
+        bias_drift_duration=(1.0 * HOUR, 2.0 * HOUR),
+    ),
+)
+
+PULLER = replace(
+    RANDOMIZED,
+    name="puller",
+    pullers=replace(RANDOMIZED.pullers, melt_loss=0.1),
+    drift=replace(RANDOMIZED.drift, rate=0.1 * K_PER_MIN),
+    sensor=replace(
+        RANDOMIZED.sensor,
+        pyrometer_drift=_either_way(2.0),
+        bias_offset=_either_way(0.3 * MM),
+        level_offset=_either_way(0.1 * MM),
+        ripple=(0.0, 0.2 * MM),
+        rotation=(8.0 / MINUTE, 15.0 / MINUTE),
+        latency=5.0,
+        outlier_probability=0.005,
+        outlier_sd=1.0 * MM,
+    ),
+    actuators=Actuators(
+        pull_window=0.5 * MM_PER_MIN,
+        pull_slew=0.3 * MM_PER_MIN / MINUTE,
+        heater_slew=2.0 * KILO / MINUTE,
+        heater_step=0.1 * KILO,
+    ),
+)
+
+_ONE_FAMILY = (
+    Scenario("only-recipe", recipe=RANDOMIZED.recipe),
+    Scenario("only-drift", drift=RANDOMIZED.drift),
+    Scenario("only-interface", interface=RANDOMIZED.interface),
+    Scenario("only-sensor", sensor=RANDOMIZED.sensor),
+    Scenario("only-reference", reference=RANDOMIZED.reference),
+    Scenario("only-parameters", pullers=RANDOMIZED.pullers),
+)
+
+SCENARIOS: dict[str, Scenario] = {
+    scenario.name: scenario
+    for scenario in (
+        NOMINAL,
+        PAPER_RAMP,
+        REFERENCE_A,
+        REFERENCE_B,
+        RANDOMIZED,
+        HARD,
+        SENSOR_FAULT,
+        PULLER,
+        *_ONE_FAMILY,
+    )
+}
+"""Every named scenario."""
+
+
+def find_scenario(scenario: str | Scenario) -> Scenario:
+    """The scenario of that name, or the given one; ValueError names what there is."""
+    if isinstance(scenario, Scenario):
+        return scenario
+    if isinstance(scenario, str) and scenario in SCENARIOS:
+        return SCENARIOS[scenario]
+    raise ValueError(f"unknown scenario {scenario!r}; choose one of {', '.join(SCENARIOS)}, or pass a cz_gym.Scenario")
+
+
+def mix_of(model: str | float | None, scenario: Scenario) -> tuple[float, float]:
+    """Range of lambda [-] for the environment's ``model`` argument; ValueError for anything else."""
+    if model is None:
+        return scenario.pullers.mix
+    if isinstance(model, str) and model in ("I", "II"):
+        return (1.0, 1.0) if model == "I" else (0.0, 0.0)
+    if isinstance(model, Real) and not isinstance(model, bool) and 0.0 <= model <= 1.0:
+        return float(model), float(model)
+    raise ValueError(f'model must be "I", "II", a mix in [0, 1] or None, not {model!r}')

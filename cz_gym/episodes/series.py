@@ -1,0 +1,95 @@
+"""An episode's draw: a value made at reset from one 128-bit key, and the series that follow from it.
+
+Ramps are kept as parameters and evaluated where needed (:mod:`cz_gym.episodes.schedule`); what is random at every step
+follows on the episode's own streams (:mod:`cz_gym.episodes.noise`), drawn by a slot as it goes, or here as whole
+series.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.jit.compile import kernel
+
+from . import draw as draws
+from .draw import STREAMS, randomised, seed_streams, skip_constants
+from .noise import draw_series
+from .record import FREEZES, GRID, Episode, Factors, Stream, law_of
+from .rng import WORDS
+from .scenario import Range, Scenario
+
+__all__ = [
+    "FREEZES", "GRID", "Episode", "Factors", "Series", "Stream", "draw_episode", "draw_factors", "new_series",
+    "randomised", "series_of", "stream",
+]  # fmt: skip
+Floats = npt.NDArray[np.float64]
+
+
+class Series(NamedTuple):
+    """What is random at every step."""
+
+    interface: Floats
+    """dT_i on the 5 s grid [K], shape (grid points,)."""
+    noise: Floats
+    """Camera noise [m] (NaN: the sample drops out) and pyrometer noise [K], shape (samples, 2)."""
+    freezes: Floats
+    """Start and end of each camera freeze [s], shape (FREEZES, 2); the last is unflagged, end 0 is none."""
+
+
+def new_series(grid_points: int, samples: int) -> Series:
+    """Series of zeros."""
+    return Series(np.zeros(grid_points), np.zeros((samples, 2)), np.zeros((FREEZES, 2)))
+
+
+def stream(key: tuple[int, int], number: Stream) -> np.random.Generator:
+    """NumPy's own form of that stream of an episode's key (two 64-bit words)."""
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(key, spawn_key=(int(number),))))
+
+
+def draw_factors(scenario: Scenario, mix: Range, key: tuple[int, int]) -> Factors:
+    """Draw the puller; ``mix`` is the range of the share of conduction [-]."""
+    return Factors(*_factors(law_of(scenario), np.array(mix, np.float64), _words(key), _streams()))
+
+
+def draw_episode(scenario: Scenario, key: tuple[int, int], out: Series) -> Episode:
+    """Draw an episode: ramps and constants are returned, series written into ``out``."""
+    return Episode(*_episode(law_of(scenario), _words(key), _streams(), out.interface, out.noise, out.freezes))
+
+
+def series_of(episode: Episode, key: tuple[int, int], grid_points: int, samples: int) -> tuple[Floats, Floats]:
+    """The series of an episode drawn before: dT_i [K], shape (grid points,), and noise, shape (samples, 2)."""
+    interface, noise, _ = new_series(grid_points, samples)
+    _series(episode, _words(key), _streams(), interface, noise)
+    return interface, noise
+
+
+def _words(key: tuple[int, int]) -> npt.NDArray[np.uint64]:
+    return np.array(key, np.uint64)
+
+
+def _streams() -> npt.NDArray[np.uint64]:
+    return np.zeros((STREAMS, WORDS), np.uint64)
+
+
+@kernel
+def _factors(law: Any, mix: Any, key: Any, streams: Any) -> Any:
+    seed_streams(streams, key)
+    return draws.draw_factors(law[0], mix, streams)
+
+
+@kernel
+def _episode(law: Any, key: Any, streams: Any, interface: Any, noise: Any, freezes: Any) -> Any:
+    seed_streams(streams, key)
+    e = draws.draw_episode(law[0], streams, freezes)
+    draw_series(e, streams, interface, noise)
+    return e
+
+
+@kernel
+def _series(e: Any, key: Any, streams: Any, interface: Any, noise: Any) -> None:
+    seed_streams(streams, key)
+    skip_constants(streams)
+    draw_series(e, streams, interface, noise)

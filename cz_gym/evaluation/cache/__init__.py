@@ -1,0 +1,1 @@
+"""Episodes that were run before: of slow controllers, and of the bound."""

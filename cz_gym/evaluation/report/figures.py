@@ -1,0 +1,119 @@
+"""The benchmark's figures, as PNG bytes; matplotlib's object interface, no display, no global state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.lines import Line2D
+
+from cz_gym.evaluation.results import Benchmark, Outcome, ScenarioResult
+
+from .canvas import INK, Style, canvas, png, styles
+from .crystal import crystal
+
+Floats = npt.NDArray[np.float64]
+
+
+def draw_figures(benchmark: Benchmark) -> dict[str, bytes]:
+    """Every figure by file name; a figure with nothing to show is left out."""
+    ranked = sorted(benchmark.controllers, key=lambda controller: not controller.learned)
+    looks = styles([controller.name for controller in ranked])
+    random = [scenario for scenario in benchmark.scenarios if len(scenario.seeds) > 1]
+    figures = {"crystal.png": crystal(benchmark.scenarios[0], looks)}
+    if random:
+        figures["errors.png"] = errors(random, looks)
+        figures["pareto.png"] = pareto(random, looks)
+    return figures
+
+
+def errors(scenarios: Sequence[ScenarioResult], looks: dict[str, Style]) -> bytes:
+    """Distribution of RMSE over the episodes: median, quartiles, 5 to 95 %, and the episodes beyond."""
+    names = [outcome.controller.name for outcome in scenarios[0].outcomes]
+    columns = min(len(scenarios), 2)
+    rows = -(-len(scenarios) // columns)
+    figure = canvas(4.6 * columns + 1.0, rows * (0.36 * len(names) + 1.0) + 0.6)
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for axis in axes.flat[len(scenarios) :]:
+        axis.set_visible(False)
+    for axis, scenario in zip(axes.flat, scenarios, strict=False):
+        for place, outcome in enumerate(scenario.outcomes):
+            _spread(axis, outcome.sample.metric("rmse_mm").ravel(), place, looks[outcome.controller.name].colour)
+        axis.set_title(f"{scenario.row.name} ({len(scenario.seeds)} crystals)", fontsize=9.5)
+        axis.set_xscale("log")
+        axis.set_yticks(range(len(names)), names)
+        axis.set_ylim(len(names) - 0.4, -0.6)
+        _plain_log(axis.xaxis)
+        axis.tick_params(axis="x", labelbottom=True)
+    for axis in axes[-1]:
+        axis.set_xlabel("RMSE of the radius [mm]")
+    figure.suptitle("Radius error by crystal: median, quartiles, 5 to 95 %, crystals beyond", fontsize=11)
+    return png(figure)
+
+
+def _spread(axis: Any, values: Floats, place: int, colour: str) -> None:
+    low, first, median, third, high = np.quantile(values, [0.05, 0.25, 0.5, 0.75, 0.95])
+    axis.plot([low, high], [place, place], color=colour, lw=1.4, solid_capstyle="butt")
+    axis.plot([first, third], [place, place], color=colour, lw=8, solid_capstyle="butt", alpha=0.55)
+    axis.plot([median, median], [place - 0.26, place + 0.26], color=INK, lw=1.6)
+    beyond = values[(values < low) | (values > high)]
+    axis.plot(beyond, np.full(len(beyond), place), ls="none", marker="|", ms=6, mew=0.6, color=colour, alpha=0.7)
+
+
+def pareto(scenarios: Sequence[ScenarioResult], looks: dict[str, Style]) -> bytes:
+    """Mean RMSE against mean pull step RMS with 95 % intervals, both logarithmic; lower left is better."""
+    columns = min(len(scenarios), 2)
+    rows = -(-len(scenarios) // columns)
+    figure = canvas(4.4 * columns + 0.8, 2.9 * rows + 1.0)
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    moving = [outcome.means["pull_step_rms_mm_per_min"].mean for scenario in scenarios for outcome in scenario.outcomes]
+    floor = min((value for value in moving if value > 0.0), default=1.0) / 3.0
+    for axis in axes.flat[len(scenarios) :]:
+        axis.set_visible(False)
+    for axis, scenario in zip(axes.flat, scenarios, strict=False):
+        axis.set_xscale("log")
+        axis.set_yscale("log")
+        for outcome in scenario.outcomes:
+            _pareto_point(axis, outcome, looks[outcome.controller.name], floor)
+        axis.set_title(scenario.row.name, fontsize=9.5)
+        axis.tick_params(which="both", labelbottom=True, labelleft=True)
+        _plain_log(axis.xaxis)
+        _plain_log(axis.yaxis, between=True)
+    for axis in axes[-1]:
+        axis.set_xlabel("pull step RMS [mm/min]")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("RMSE of the radius [mm]")
+    handles = [
+        Line2D([], [], ls="none", marker=look.marker, color=look.colour, ms=7, label=name)
+        for name, look in looks.items()
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 5), frameon=False)
+    figure.suptitle("Error against pull activity: lower left is better, bars are 95 % intervals", fontsize=11)
+    return png(figure)
+
+
+def _pareto_point(axis: Any, outcome: Outcome, look: Style, floor: float) -> None:
+    error, activity = outcome.means["rmse_mm"], outcome.means["pull_step_rms_mm_per_min"]
+    x = max(activity.mean, floor)
+    if activity.mean < floor:
+        axis.annotate(
+            "← 0", (x, error.mean), (0, -14), textcoords="offset points", ha="center", fontsize=8, color=look.colour
+        )
+    elif activity.ci95:
+        axis.plot(activity.ci95, [error.mean] * 2, color=look.colour, lw=1.2)
+    if error.ci95:
+        axis.plot([x, x], error.ci95, color=look.colour, lw=1.2)
+    axis.plot(x, error.mean, ls="none", marker=look.marker, ms=7, color=look.colour)
+
+
+def _plain_log(axis: Any, between: bool = False) -> None:
+    """Numbers as people write them: powers of ten and, where decades are few, 2 and 5 between them."""
+
+    def two_or_five(value: float, position: int | None) -> str:
+        text = f"{value:g}"
+        return text if text.strip("0.") in ("2", "5") else ""
+
+    axis.set_major_formatter(lambda value, position: f"{value:g}")
+    axis.set_minor_formatter(two_or_five if between else lambda value, position: "")

@@ -1,0 +1,77 @@
+"""Writing a benchmark's results, all files or none; no file that somebody wants is replaced untold."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cz_gym.evaluation.files import (
+    EPISODES,
+    FILES,
+    RESULTS,
+    check_writable,
+    is_benchmark_json,
+    to_csv,
+    to_json,
+    write_files,
+)
+from cz_gym.evaluation.results import Benchmark
+
+
+def check_targets(folder: Path | None, lone: Path | None, partial: bool, overwrite: bool) -> None:
+    """Raise ValueError or OSError if the results could not be written, or would replace better ones untold."""
+    kept = kept_files(folder, lone, partial)
+    if kept and not overwrite:
+        path, why = kept[0]
+        raise ValueError(f"{path} exists and {why}: add --overwrite, or name another --out or --json")
+    if lone and lone.is_dir():
+        raise ValueError(f"--json {lone} is a folder")
+    for place in (folder, lone and lone.parent):
+        if place:
+            check_writable(place)
+
+
+def kept_files(folder: Path | None, lone: Path | None, partial: bool) -> list[tuple[Path, str]]:
+    """Existing files that a run may not replace untold, each with the reason.
+
+    In a folder: any of the benchmark's files, unless a full run renews an earlier benchmark. A lone JSON file: one
+    that is no earlier benchmark, and for a partial run one that belongs to a folder of results.
+    """
+    kept = []
+    if folder:
+        earlier = is_benchmark(folder / RESULTS)
+        why = "its folder holds no earlier benchmark" if not earlier else "this run is partial" if partial else ""
+        kept += [(folder / name, why) for name in FILES if why and (folder / name).exists()]
+    if lone and lone.is_file():
+        if not is_benchmark(lone):
+            kept.append((lone, "is no earlier benchmark"))
+        elif partial and lone.name == RESULTS and (lone.resolve().parent / "report.md").exists():
+            kept.append((lone, "this run is partial"))
+    return kept
+
+
+def is_benchmark(path: Path) -> bool:
+    """Whether a file is the JSON of an earlier benchmark."""
+    return path.is_file() and is_benchmark_json(path.read_bytes())
+
+
+def write(folder: Path | None, lone: Path | None, done: Benchmark, quoted: Path | None = None) -> None:
+    """Write the files; the table between the markers of the page ``quoted``, if there is one, as well.
+
+    Needs matplotlib and plotly if there is a folder.
+    """
+    text = to_json(done).encode()
+    files = {lone: text} if lone else {}
+    if folder:
+        from .figures import draw_figures
+        from .markdown import fill_in, markdown
+        from .page import page
+
+        figures = draw_figures(done)
+        files |= {folder / name: image for name, image in figures.items()}
+        files[folder / EPISODES] = to_csv(done).encode()
+        files[folder / "report.md"] = markdown(done, figures).encode()
+        files[folder / "report.html"] = page(done).encode()
+        files[folder / RESULTS] = text
+        if quoted and quoted.is_file():
+            files[quoted] = fill_in(quoted.read_text("utf-8"), done).encode()
+    write_files(files)

@@ -1,0 +1,132 @@
+"""Compiled code on disk: one file a function and signature, checked before it is used.
+
+numba keeps an index beside numbered files. Two processes that compile at once, or one that is killed between the two
+writes, can leave an index that names the code of another signature, which then runs on arguments it was not made for;
+and a file cut short raises wherever it is read. Here a file is named by what it was compiled for, says so itself,
+carries the hash of its contents and is replaced whole: any other is compiled again. It is code all the same, to be
+trusted as ``__pycache__`` is.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import llvmlite
+import numba
+import numpy as np
+from numba.core.caching import FunctionCache
+from numba.core.serialize import dumps
+
+PACKAGE = Path(__file__).parents[1]
+CACHE_VARIABLE = "CZ_GYM_CACHE_DIR"
+"""Environment variable naming the folder for compiled code; empty means: keep none."""
+NEVER_COMPILED = ("agents", "baselines", "evaluation", "play", "testing")
+"""Sub-packages of which nothing is compiled in; all others count, whatever they hold."""
+DIGEST = hashlib.sha256().digest_size
+
+
+def compiled_sources(folder: Path | None = None) -> list[Path]:
+    """Every source of the package that compiled code may have taken a function or a constant from, sorted."""
+    folder = folder or PACKAGE
+    return sorted(file for file in folder.rglob("*.py") if file.relative_to(folder).parts[0] not in NEVER_COMPILED)
+
+
+def source_hash(folder: Path | None = None) -> str:
+    """SHA-256 of the names and contents of :func:`compiled_sources` (32 hex digits)."""
+    folder = folder or PACKAGE
+    digest = hashlib.sha256()
+    for file in compiled_sources(folder):
+        digest.update(file.relative_to(folder).as_posix().encode() + b"\0" + file.read_bytes() + b"\0")
+    return digest.hexdigest()[:32]
+
+
+@cache
+def cache_folder() -> Path | None:
+    """The writable folder for this version's compiled code, or None if there is none."""
+    named = os.environ.get(CACHE_VARIABLE)
+    if named == "":
+        return None
+    try:
+        home = Path(named) if named else _user_cache()
+        versions = f"numba{numba.__version__}-llvmlite{llvmlite.__version__}-numpy{np.__version__}"
+        folder = home / f"{source_hash()}-{versions}"
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        if not named and hasattr(os, "getuid") and folder.stat().st_uid != os.getuid():
+            return None
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except (OSError, RuntimeError):
+        return None
+    return folder
+
+
+def _user_cache() -> Path:
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "cz-gym"
+
+
+def hashed(*functions: Callable[..., Any]) -> bool:
+    """Whether :func:`source_hash` sees the text of every one of these functions."""
+    seen = {str(file) for file in compiled_sources()}
+    codes = [getattr(function, "__code__", None) for function in functions]
+    return all(code is not None and str(Path(code.co_filename)) in seen for code in codes)
+
+
+class Store:
+    """The files of one function; stands where numba's index and its files would."""
+
+    def __init__(self, folder: Path, name: str) -> None:
+        self.folder, self.name = folder, name
+
+    def path(self, key: Any) -> Path:
+        """Where the code for these types, this processor and this text is kept."""
+        return self.folder / f"{self.name}.{hashlib.sha256(repr(key).encode()).hexdigest()[:32]}.code"
+
+    def load(self, key: Any) -> Any:
+        """What was saved for this key, or None; files that are damaged count as none."""
+        try:
+            content = self.path(key).read_bytes()
+        except OSError:
+            return None
+        if hashlib.sha256(content[DIGEST:]).digest() != content[:DIGEST]:
+            return None
+        made_for, data = pickle.loads(content[DIGEST:])
+        return data if made_for == key else None
+
+    def save(self, key: Any, data: Any) -> None:
+        """Keep it, if there is room: a full disk costs time, not the run."""
+        content: bytes = dumps((key, data))  # type: ignore[no-untyped-call]
+        temporary = None
+        try:
+            handle, temporary = tempfile.mkstemp(dir=self.folder, prefix=".code-")
+            with os.fdopen(handle, "wb") as file:
+                file.write(hashlib.sha256(content).digest() + content)
+            os.replace(temporary, self.path(key))
+        except OSError:
+            if temporary is not None:
+                with suppress(OSError):
+                    os.unlink(temporary)
+
+
+class CachedCode(FunctionCache):
+    """numba's cache of one function, on a :class:`Store`."""
+
+    def __init__(self, function: Any) -> None:
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        files: Any = Store(Path(self._cache_path), self._impl.filename_base)
+        self._cache_file = files
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Compiled code for this signature, or None: whatever cannot be put together again is compiled again."""
+        try:
+            return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+        except Exception:
+            return None

@@ -1,0 +1,105 @@
+"""How the equations are compiled, and where the compiled code is kept.
+
+Physics stands once, in plain functions marked :data:`physics`: called from Python they take floats, arrays or
+complex numbers; called from a :func:`kernel` they compile into its loop. numba's disk cache looks only at
+the file of the outermost function, so a changed equation in another module would run the old physics; here
+the cache folder is named by a hash of every source of the package that can be compiled in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.core.options import DefaultOptions as default_options
+from numba.extending import intrinsic, overload, register_jitable
+
+from .cache import CachedCode, cache_folder
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+_NO_COUNTS = "_nrt"
+
+
+def physics(function: F) -> F:
+    """Mark a function as an equation: plain Python outside a kernel, compiled inside it.
+
+    Compiled, as on arrays, division by zero gives inf or NaN, never an exception (``error_model="numpy"``).
+    """
+    return register_jitable(error_model="numpy")(function)
+
+
+def inlined(function: F) -> F:
+    """A part of kernels alone, its text put into each: passing a step's arrays on costs a tenth of the step.
+
+    Put in before types are inferred; as an inlined :func:`physics` it and all it calls would compile twice.
+    For module level only: kept in a closure it would change the key of the kernel on disk in every process.
+    """
+    return cast(F, numba.njit(error_model="numpy", inline="always")(function))
+
+
+def kernel(function: F, keep: bool = True, allocates: bool = True) -> F:
+    """Compile a loop over slots: no GIL, no fast-math, cached on disk when there is a place for it.
+
+    ``keep=False`` caches nothing: for loops over functions from elsewhere, whose changes no hash would see.
+    ``allocates=False`` promises that the loop makes no array, so that views of its arguments need no reference counts.
+    """
+    folder = cache_folder() if keep else None
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+    if not allocates and _NO_COUNTS in default_options.__dict__:
+        options[_NO_COUNTS] = False
+    settings: Any = numba.config
+    if folder is None:
+        return cast(F, numba.njit(**options)(function))
+    previous = settings.CACHE_DIR
+    settings.CACHE_DIR = str(folder)
+    try:
+        compiled: Any = numba.njit(**options)(function)
+        if hasattr(compiled, "_cache"):
+            compiled._cache = CachedCode(function)
+        return cast(F, compiled)
+    except (RuntimeError, OSError):
+        return cast(F, numba.njit(**options)(function))
+    finally:
+        settings.CACHE_DIR = previous
+
+
+def entry(loop: Any, arguments: tuple[Any, ...]) -> Any:
+    """The compiled form of a kernel for arguments of these types, and only these.
+
+    It skips the search for the right form at every call, which costs several times a slot's step.
+    """
+    compile_for = getattr(loop, "compile", None)
+    typeof: Any = numba.typeof
+    return loop if compile_for is None else compile_for(tuple(map(typeof, arguments)))
+
+
+@intrinsic
+def _fetch(typing_context: Any, array: Any, at: Any) -> Any:
+    """The processor's hint itself: for writing (1), to be kept (3), data (1)."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        held = context.make_array(signature.args[0])(context, builder, arguments[0])
+        address = builder.bitcast(builder.gep(held.data, [arguments[1]]), cgutils.voidptr_t)
+        number = ir.IntType(32)
+        hint = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, number, number, number])
+        prefetch = builder.module.declare_intrinsic("llvm.prefetch", [cgutils.voidptr_t], hint)
+        builder.call(prefetch, [address, number(1), number(3), number(1)])
+        return context.get_dummy_value()
+
+    return types.none(array, types.int64), generate
+
+
+def fetch(array: Any, at: Any) -> None:
+    """In a kernel, have number ``at`` of a contiguous array brought to the cache; it may lie outside. Else nothing."""
+
+
+@overload(fetch, inline="never")
+def _compiled_fetch(array: Any, at: Any) -> Any:
+    def compiled(array: Any, at: Any) -> None:
+        _fetch(array, at)  # type: ignore[call-arg]
+
+    return compiled

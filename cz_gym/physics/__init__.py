@@ -1,0 +1,1 @@
+"""The plant: parameters, meniscus, bright ring, rates of change, operating point, linearisation."""

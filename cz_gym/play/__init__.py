@@ -1,0 +1,1 @@
+"""Pull a crystal by hand: ``python -m cz_gym.play``."""

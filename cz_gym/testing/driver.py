@@ -1,0 +1,108 @@
+"""An environment played for a check: sampled actions, resets as its autoreset mode wants them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+
+from .nested_arrays import leaves, spoil
+
+MakeVector = Callable[[int, AutoresetMode], Any]
+"""Makes the native form from a number of slots and an autoreset mode."""
+MakeScalar = Callable[[], Any]
+
+
+class NotConforming(AssertionError):
+    """A vector environment is not what a vector of its scalar form would be; the message is one line."""
+
+
+class Checked(NamedTuple):
+    """What a check has seen."""
+
+    steps: int
+    """Batched steps of the native form."""
+    episodes: int
+    """Episodes that ended, all slots together."""
+    failures: int
+    """Those that ended by ``terminated``."""
+    held: int
+    """Returned arrays that were kept through later calls."""
+
+    def __str__(self) -> str:
+        """In words."""
+        return (
+            f"{self.steps} steps, {self.episodes} episodes, {self.failures} of them failures, "
+            f"{self.held} arrays kept through later calls"
+        )
+
+    def __add__(self, other: Any) -> Checked:
+        """Both together."""
+        return Checked(*(one + more for one, more in zip(self, other, strict=True)))
+
+
+class Event(NamedTuple):
+    """One call and what it returned."""
+
+    call: str
+    result: tuple[Any, ...]
+    first: Any
+    """Slots whose observation is an episode's first, bool of shape (num_envs,)."""
+    ended: Any
+    """Slots whose episode ended in this call, bool of shape (num_envs,)."""
+    failed: Any
+    """Slots whose episode ended by ``terminated``, bool of shape (num_envs,)."""
+
+
+class Subject(NamedTuple):
+    """What is checked, and how."""
+
+    make_vector: MakeVector
+    make_scalar: MakeScalar
+    num_envs: int
+    steps: int
+    seed: int
+    mode: AutoresetMode
+    random_start: bool
+    rtol: float
+
+    def vector(self) -> Any:
+        """A native form."""
+        return closing(self.make_vector(self.num_envs, self.mode))
+
+    def scalars(self) -> Any:
+        """The oracle: Gymnasium's vector of scalars."""
+        return closing(SyncVectorEnv([self.make_scalar] * self.num_envs, autoreset_mode=self.mode))
+
+
+def play(env: VectorEnv[Any, Any, Any], subject: Subject, spoils: bool = False) -> Iterator[Event]:
+    """Reset and step with sampled actions; ended episodes are reset as the mode wants."""
+    env.action_space.seed(subject.seed)
+    n, mode = subject.num_envs, subject.mode
+    over, none = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+    yield Event("reset", env.reset(seed=subject.seed), ~none, none, none)
+    for k in range(subject.steps):
+        action = env.action_space.sample()
+        given = [(leaf.value, leaf.value.copy()) for leaf in leaves(action)]
+        result = env.step(action)
+        need(all(np.array_equal(a, b) for a, b in given), subject, f"step {k} wrote into the actions it was given")
+        if spoils:
+            spoil(action)
+        ended = np.array(result[2] | result[3], np.bool_)
+        begun = {AutoresetMode.NEXT_STEP: over, AutoresetMode.SAME_STEP: ended}.get(mode, none)
+        over = ended.copy()
+        yield Event(f"step {k}", result, begun.copy(), ended, np.array(result[2], np.bool_))
+        if mode == AutoresetMode.DISABLED and over.any():
+            mask = over.copy()
+            again = env.reset(options={"reset_mask": mask})
+            mask[:] = True
+            yield Event(f"reset of ended slots after step {k}", again, over, none, none)
+
+
+def need(fact: Any, subject: Subject, message: str) -> None:
+    """Raise :class:`NotConforming` unless the fact is one."""
+    if not fact:
+        raise NotConforming(f"[{subject.mode.value}] {message}")

@@ -1,0 +1,28 @@
+"""TorchRL on Cz-v0 as it stands: ``python -m examples.torchrl``, by hand where torchrl is installed."""
+
+from __future__ import annotations
+
+import torch
+import torchrl
+from tensordict.nn import TensorDictModule
+from torchrl.collectors import Collector
+from torchrl.envs import GymEnv, check_env_specs
+
+import cz_gym  # noqa: F401
+
+
+def main() -> None:
+    """Check the specs, then gather frames with a linear policy; prints how many."""
+    env = GymEnv("Cz-v0", control_interval=20.0, horizon=400.0)
+    check_env_specs(env)
+    policy = TensorDictModule(torch.nn.Linear(11, 2), in_keys=["observation"], out_keys=["action"])
+    frames, ended = 0, 0
+    for batch in Collector(env, policy, frames_per_batch=64, total_frames=256):
+        frames, ended = frames + batch.numel(), ended + int(batch["next", "done"].sum())
+        if not batch["next", "reward"].isfinite().all():
+            raise ValueError("a reward is not finite")
+    print(f"torchrl {torchrl.__version__}, torch {torch.__version__}: {frames} frames, {ended} episodes ended")
+
+
+if __name__ == "__main__":
+    main()

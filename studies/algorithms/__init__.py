@@ -1,0 +1,1 @@
+"""Algorithms side by side at one budget: ``python -m studies.algorithms``."""

@@ -1,0 +1,1 @@
+"""What the camera sees, measured: ``python -m studies.camera``."""

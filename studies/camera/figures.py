@@ -1,0 +1,181 @@
+"""Figures of the camera's view: images, a section with its rays, and answers to a change of the pull speed."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.camera.image import picture
+from cz_gym.camera.rays import FLAT, MELT, Ray, Scene, first_hit, make_scene, mirror, profile_at
+from cz_gym.camera.ring_detector import ANGLES, Edge, wall_edge
+from cz_gym.camera.view import COLUMNS, ROWS, View, project
+from cz_gym.evaluation.report.canvas import COLOURS, GREY, INK, canvas, png
+from cz_gym.physics.meniscus import hurle_ring_offset
+from cz_gym.units import MM
+
+from .__main__ import Response, Study
+
+Floats = npt.NDArray[np.float64]
+SHOWN_HEIGHTS = (5.0 * MM, None, 8.0 * MM)
+"""Menisci of the figures [m]; None: the operating point's."""
+DETECTED, CLOSED, TRUE, TRACED = COLOURS[1], COLOURS[0], INK, COLOURS[2]
+
+
+def view_figure(study: Study) -> bytes:
+    """The image at a low, the nominal and a high meniscus, and the grey values down its middle."""
+    figure = canvas(9.6, 5.4)
+    axes = figure.subplots(2, 3, height_ratios=(1.0, 0.75))
+    for i, given in enumerate(SHOWN_HEIGHTS):
+        h_c = given or study.puller.h_0
+        _draw_image(axes[0, i], study, h_c)
+        _draw_middle(axes[1, i], study, h_c)
+    axes[1, 0].set_ylabel("grey value")
+    axes[0, 0].set_ylabel("row")
+    for axis in (*axes[0, 1:], *axes[1, 1:]):
+        axis.tick_params(labelleft=False)
+    axes[0, 0].legend(fontsize=7, loc="upper center", framealpha=0.85)
+    axes[1, 0].legend(fontsize=7, loc="center right", framealpha=1.0)
+    return png(figure)
+
+
+def _draw_image(axis: Any, study: Study, h_c: float) -> None:
+    p, view = study.puller, study.view
+    image = picture(p.r_0, h_c, p, view)
+    axis.imshow(
+        image[:, :, 0], cmap="gray", vmin=0, vmax=255, extent=(0, COLUMNS, ROWS, 0), interpolation="nearest", zorder=1
+    )
+    ring = study.detector.read(image)
+    seen = project(ring.edges * np.cos(ANGLES), ring.edges * np.sin(ANGLES), study.detector.height, view)
+    axis.plot(seen.column, seen.row, color=COLOURS[5], lw=1.0, label="detected edge")
+    r_br = p.r_0 + float(hurle_ring_offset(p.r_0, h_c, p))
+    wide = np.linspace(-0.6, 0.6, 121)
+    closed = project(r_br * np.cos(wide), r_br * np.sin(wide), 0.0, view)
+    inside = (closed.column >= 0) & (closed.column <= COLUMNS)
+    axis.plot(closed.column[inside], closed.row[inside], color=CLOSED, lw=1.0, ls="--", label="closed-form ring")
+    axis.set_title(f"$h_c$ = {h_c / MM:.2f} mm: detected {(ring.radius - p.r_0) / MM:+.2f} mm,\n"
+                   f"closed form {(r_br - p.ring_bias - p.r_0) / MM:+.2f} mm", fontsize=8.5)  # fmt: skip
+    axis.set_xlabel("column")
+
+
+def _draw_middle(axis: Any, study: Study, h_c: float) -> None:
+    p, view = study.puller, study.view
+    axis.step(np.arange(ROWS) + 0.5, picture(p.r_0, h_c, p, view)[:, COLUMNS // 2, 0], where="mid", color=INK, lw=1.0)
+    scene = make_scene(p.r_0, h_c, p)
+    edge = wall_edge(scene, view)
+    marks = (
+        ("triple point", p.r_0, h_c, GREY),
+        ("mirrors the wall's end", edge.r, edge.z, COLOURS[5]),
+        ("closed-form ring", p.r_0 + float(hurle_ring_offset(p.r_0, h_c, p)), 0.0, CLOSED),
+    )
+    for name, r, z, colour in marks:
+        axis.axvline(float(project(r, 0.0, z, view).row), color=colour, lw=1.0, ls="--", label=name)
+    axis.set_xlim(35, ROWS)
+    axis.set_ylim(0, 255)
+    axis.set_xlabel("row of the middle column")
+
+
+def section_figure(study: Study) -> bytes:
+    """Hot zone and meniscus in the camera's plane, with rays."""
+    p, view, camera = study.puller, study.view, study.camera
+    scene = make_scene(p.r_0, p.h_0, p)
+    edge = wall_edge(scene, view)
+    figure = canvas(9.6, 4.2)
+    zone, close = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
+    for axis in (zone, close):
+        _draw_crystal(axis, scene, camera.crucible_radius)
+        for z, colour in _aimed_heights(scene, edge):
+            _draw_ray(axis, z, scene, view, colour)
+    wall, height, opening = camera.crucible_radius / MM, camera.wall_height / MM, camera.shield_radius / MM
+    zone.plot([wall, wall], [0, height], color=COLOURS[0], lw=3, solid_capstyle="butt")
+    zone.plot([opening, wall], [height, height], color=GREY, lw=3, solid_capstyle="butt")
+    zone.text(wall - 4, 0.5 * height, f"hot wall\n{camera.wall_temperature:.0f} K", ha="right", va="center", fontsize=8)
+    zone.text(
+        0.5 * (opening + wall), height + 4, f"heat shield, {camera.shield_temperature:.0f} K", ha="center", fontsize=8
+    )
+    zone.text(40, 70, "crystal", ha="center", fontsize=8)
+    zone.text(200, -13, "melt", ha="center", fontsize=8)
+    zone.text(166, 165, "to the camera", fontsize=8, rotation=70, rotation_mode="anchor", ha="right")
+    zone.set(xlim=(0, wall + 12), ylim=(-22, 175), xlabel="distance from the axis [mm]", ylabel="height [mm]")
+    zone.set_aspect("equal")
+    r_br = p.r_0 + float(hurle_ring_offset(p.r_0, p.h_0, p))
+    close.plot(edge.r / MM, edge.z / MM, "o", color=TRACED, ms=5)
+    said = f"ring's outer edge,\nslope {math.degrees(edge.slope):.1f}°"
+    line = {"arrowstyle": "-", "color": GREY}
+    close.annotate(said, (edge.r / MM, edge.z / MM), (84.3, -1.2), fontsize=8, arrowprops=line)
+    close.plot(r_br / MM, 0.4, "v", color=CLOSED, ms=6)
+    close.text(r_br / MM, 1.1, "closed-form ring,\neffective slope 3.5°", fontsize=8, ha="center")
+    close.set(xlim=(84, 108), ylim=(-2, 12), xlabel="distance from the axis [mm]")
+    close.set_aspect("equal")
+    return png(figure)
+
+
+def _aimed_heights(scene: Scene, edge: Edge) -> tuple[tuple[float, str], ...]:
+    """Heights on the meniscus [m] that rays are drawn to, and their colours."""
+    return (0.5 * (edge.z + scene.h_c), COLOURS[4]), (edge.z + 0.02 * MM, TRACED), (0.25 * edge.z, COLOURS[1])
+
+
+def _draw_crystal(axis: Any, scene: Scene, outer: float) -> None:
+    q = np.linspace(float(scene.q_c), FLAT, 400)
+    points = [profile_at(each, scene) for each in q]
+    r = np.array([0.0, scene.r_c, *[point[0] for point in points], outer]) / MM
+    z = np.array([scene.h_c, scene.h_c, *[point[1] for point in points], 0.0]) / MM
+    axis.fill_between(r, z, -30.0, color="#f3d9b1", lw=0)
+    axis.fill_between([0.0, scene.r_c / MM], scene.h_c / MM, 400.0, color="#d9d9d9", lw=0)
+    axis.plot(r, z, color=INK, lw=1.0)
+
+
+def _draw_ray(axis: Any, z: float, scene: Scene, view: View, colour: str) -> None:
+    """A ray from the lens to the meniscus at height z and, mirrored, on to what it hits."""
+    q = math.acosh(math.sqrt(2.0) * float(scene.M) / z)
+    r = float(profile_at(q, scene)[0])
+    ray = Ray(view.x, 0.0, view.z, r - view.x, 0.0, z - view.z)
+    x, heights = [view.x], [view.z]
+    start = scene.q_c
+    for _ in range(3):
+        hit = first_hit(ray, start, scene, view)
+        far = hit if hit.what != 4 else hit._replace(x=ray.x + 2.0 * ray.dx, z=ray.z + 2.0 * ray.dz)
+        x.append(far.x)
+        heights.append(far.z)
+        if hit.what != MELT:
+            break
+        ray = mirror(ray, hit)
+        start = FLAT if hit.q < 0.0 else hit.q + math.copysign(1e-4, -ray.dz)
+    axis.plot(np.array(x) / MM, np.array(heights) / MM, color=colour, lw=1.1)
+
+
+def response_figure(study: Study) -> bytes:
+    """True radius and rings after sudden changes of the pull speed."""
+    figure = canvas(9.6, 6.0)
+    axes = figure.subplots(2, 2, sharex=True)
+    for axis, response in zip(axes.ravel(), study.responses, strict=True):
+        _draw_response(axis, response)
+    for axis in axes[1]:
+        axis.set_xlabel("time after the change [s]")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("change of radius [µm]")
+    axes[0, 0].legend(fontsize=7.5, loc="lower right")
+    return png(figure)
+
+
+def _draw_response(axis: Any, response: Response) -> None:
+    rings = response.rings
+    lines = (
+        ("true radius", response.r_c, TRUE, "-"),
+        ("closed-form ring", rings.closed, CLOSED, "-"),
+        ("exactly traced edge", rings.traced, TRACED, "--"),
+    )
+    for name, values, colour, style in lines:
+        axis.plot(response.t, 1e3 * values / MM, style, color=colour, lw=1.3, label=name)
+    axis.plot(response.t, 1e3 * rings.detected / MM, ".", color=DETECTED, ms=4, label="image and detector")
+    depths = ", ".join(
+        f"{1e3 * response.depth(ring) / MM:.1f} ({name})"
+        for name, ring in (("closed", rings.closed), ("traced", rings.traced), ("detected", rings.detected))
+    )
+    axis.set_title(
+        f"Model {response.model}, pull speed {100 * response.change:+.0f} %\ndepth [µm]: {depths}", fontsize=8.5
+    )
+    least = 1e3 * min(float(np.nanmin(ring)) for ring in rings) / MM
+    axis.set_ylim(1.25 * least, -2.5 * least)

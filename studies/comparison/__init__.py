@@ -1,0 +1,1 @@
+"""What studies of learners share: runs that are kept, and the LQG's settings on the same crystals."""

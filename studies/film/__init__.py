@@ -1,0 +1,1 @@
+"""The README's animated picture: ``python -m studies.film``."""

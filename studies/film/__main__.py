@@ -1,0 +1,139 @@
+"""The README's animated picture: ``python -m studies.film [--seed N] [--scenario NAME] [--agent FILE] [--out FILE]``.
+
+The paper's controller and an agent, the shipped one unless told, pull the same crystal side by side. GIF, because it
+plays everywhere.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cz_gym.commands import OneLineParser, guarded
+
+if TYPE_CHECKING:
+    from .duel import Side
+
+PROG = "python -m studies.film"
+OUT = Path(__file__).resolve().parents[2] / "results" / "media" / "duel.gif"
+SEED = 2_000_000
+"""The first test crystal, the one in the benchmark's figure."""
+RATE = 14
+"""Frames a second."""
+HOLD = 1.8
+"""How long the last frame stays [s]."""
+SIZE = (860, 470)
+COLOURS = 128
+
+
+def parse(argv: list[str] | None = None) -> argparse.Namespace:
+    """Read the command line; exits with code 2 and one line for anything that cannot be meant."""
+    parser = OneLineParser(
+        prog=PROG,
+        description="Film the paper's controller and an agent on the same crystal.",
+    )
+    parser.add_argument("--scenario", default="randomized", metavar="NAME", help="scenario (%(default)s)")
+    parser.add_argument("--seed", type=int, default=SEED, metavar="N", help="which crystal (%(default)s)")
+    parser.add_argument("--agent", type=Path, metavar="FILE", help="agent file in place of the shipped one")
+    parser.add_argument("--frames", type=int, default=120, metavar="N", help="frames of the film (%(default)s)")
+    parser.add_argument("--out", type=Path, default=OUT, metavar="FILE", help="file to write (results/media/duel.gif)")
+    return parser.parse_args(argv)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Film and write; 0 when done, 2 for bad input or a missing package, 130 when interrupted."""
+    arguments = parse(argv)
+    return guarded(PROG, lambda: _make(arguments), "render,benchmark")
+
+
+def _make(arguments: argparse.Namespace) -> int:
+    if not 2 <= arguments.frames <= 1000:
+        raise ValueError(f"--frames must be 2 to 1000, not {arguments.frames}")
+    if arguments.seed < 0:
+        raise ValueError(f"--seed must not be negative, not {arguments.seed}")
+    if arguments.out.suffix != ".gif":
+        raise ValueError(f"--out must end in .gif, not {str(arguments.out)!r}")
+    import PIL.Image  # noqa: F401  (missing? say so before the work, not after it)
+
+    from cz_gym.evaluation.files import check_writable, write_files
+
+    check_writable(arguments.out.resolve().parent)
+    content = film(arguments.scenario, arguments.seed, arguments.frames, arguments.agent)
+    write_files({arguments.out.resolve(): content})
+    print(f"wrote {arguments.out}: {arguments.frames} frames, {len(content) / 1e6:.2f} MB")
+    return 0
+
+
+def film(scenario: str, seed: int, frames: int, agent: Path | None = None) -> bytes:
+    """The GIF: both sides stepped together, ``frames`` pictures equally far apart in time."""
+    from cz_gym.rendering.pixels import colours
+
+    from .duel import Duel
+
+    sides = contestants(scenario, agent)
+    for side in sides:
+        side.begin(seed)
+    duel = Duel(*SIZE)
+    steps = sides[0].env.config.steps
+    pictures = []
+    for number in range(frames):
+        upto = round((number + 1) * steps / frames)
+        for side in sides:
+            side.step_to(upto)
+        pictures.append(colours(duel.draw(sides)))
+    return gif(pictures)
+
+
+def contestants(scenario: str, agent: Path | None = None) -> tuple[Side, Side]:
+    """The paper's controller and the agent of a file, or the shipped one, each with an environment of its own."""
+    from cz_gym import agents
+    from cz_gym.baselines.registry import find_controller
+    from cz_gym.env import CzEnv
+    from cz_gym.rendering.palette import TEMPERATURE, TRUE
+
+    from .duel import Side
+
+    env = CzEnv(scenario, observation="measured", render_mode="rgb_array")
+    paper = find_controller("paper").make(env.config)
+    learned = agents.OnnxPolicy.load(agent or agents.shipped(), env.config)
+    if learned.contract.control_interval != env.config.control_interval:
+        raise ValueError(f"{agent}: acts every {learned.contract.control_interval:g} s, not every 5 s")
+    other = CzEnv(scenario, observation=learned.observation, render_mode="rgb_array")
+    name = f"learned: {learned.contract.algorithm}"
+    return Side("the paper's controller", paper, env, TEMPERATURE), Side(name, learned, other, TRUE)
+
+
+def gif(pictures: Sequence[Any]) -> bytes:
+    """Pictures as an endless GIF with one palette, so that only what moves is stored again."""
+    from PIL import Image
+
+    images = [Image.fromarray(picture) for picture in pictures]
+    palette = _palette(images[-1], Image)
+    indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in images]
+    durations = [round(1000 / RATE)] * (len(images) - 1) + [round(1000 * HOLD)]
+    content = io.BytesIO()
+    indexed[0].save(
+        content, "GIF", save_all=True, append_images=indexed[1:], duration=durations, loop=0, optimize=False, disposal=1
+    )
+    return content.getvalue()
+
+
+def _palette(picture: Any, Image: Any) -> Any:
+    """COLOURS colours: those that mean something, however few their pixels, and the rest as the picture needs them."""
+    from cz_gym.rendering import palette as c
+
+    marker = c.mix(c.CAMERA, c.MELT_TOP, 0.5)
+    kept = (c.BACK, c.PANEL, c.INK, c.TRUE, c.CAMERA, marker, c.REFERENCE, c.TEMPERATURE, c.ALARM, c.GLOW)
+    needed = picture.quantize(COLOURS - len(kept), method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    channels = [*needed.getpalette()[: 3 * (COLOURS - len(kept))], *(channel for colour in kept for channel in colour)]
+    found = Image.new("P", (1, 1))
+    found.putpalette(channels + channels[-3:] * (256 - len(channels) // 3))
+    return found
+
+
+if __name__ == "__main__":
+    sys.exit(main())

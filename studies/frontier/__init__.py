@@ -1,0 +1,1 @@
+"""Error at equal activity: ``python -m studies.frontier``."""

@@ -1,0 +1,1 @@
+"""Agents where they were not trained: ``python -m studies.generalisation``."""

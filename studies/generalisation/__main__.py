@@ -1,0 +1,152 @@
+"""How agents travel: ``python -m studies.generalisation results/generalisation`` tabulates a benchmark's episodes.
+
+The benchmark of the rows an agent was not trained on, made by ``benchmark.py --scenarios randomized,hard,...``: radius
+error, lost crystals and the paired difference to one controller, with 95 % intervals over training seeds and crystals.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.atomic_files import write_files
+from cz_gym.commands import OneLineParser, guarded
+from cz_gym.evaluation.episodes_file import read_episodes
+from cz_gym.evaluation.files import EPISODES
+from cz_gym.evaluation.statistics import Estimate, Resamples, differences, means
+
+Floats = npt.NDArray[np.float64]
+PROG = "python -m studies.generalisation"
+OBSERVABLE = ("sensor-fault", "puller")
+"""Rows with an offset that no sensor shows: the error against what can be seen is counted there."""
+MICRON = 1e-3
+"""A micrometre in millimetres."""
+
+
+class Cell(NamedTuple):
+    """One controller on one row."""
+
+    row: str
+    controller: str
+    seeds: int
+    """Training seeds; 1 for a controller that is not trained."""
+    rmse: Estimate
+    """[mm]"""
+    lost: Estimate
+    """Share of crystals [-]."""
+    activity: Estimate
+    """RMS of pull steps [mm/min]."""
+    apart: Estimate
+    """RMSE less the compared controller's on the same crystals [mm]."""
+    worst: float
+    """RMSE of the worst training seed [mm]."""
+
+
+def figures(row: str) -> tuple[str, ...]:
+    """What is read of a row's episodes: RMSE [mm], failure and pull step RMS [mm/min]."""
+    return ("rmse_observable_mm" if row in OBSERVABLE else "rmse_mm"), "failure_rate", "pull_step_rms_mm_per_min"
+
+
+def tabulate(episodes: Mapping[str, Mapping[str, Floats]], against: str) -> list[Cell]:
+    """A cell a row and controller; ValueError unless the compared one took part in every row, on the same crystals."""
+    if len({values.shape[1] for by_name in episodes.values() for values in by_name.values()}) != 1:
+        raise ValueError("every controller and row needs the same crystals, and at least one")
+    for row, by_name in episodes.items():
+        if against not in by_name:
+            raise ValueError(f"{against!r} took no part in {row!r}; choose from {', '.join(by_name)}")
+    weights = Resamples.draw(next(iter(next(iter(episodes.values())).values())).shape[1])
+    cells = []
+    for row, by_name in episodes.items():
+        for name, values in by_name.items():
+            rmse, lost, activity = means(values, weights)
+            apart = differences(values, by_name[against], weights)[0]
+            worst = float(values[:, :, 0].mean(axis=1).max())
+            cells.append(Cell(row, name, len(values), rmse, lost, activity, apart, worst))
+    return cells
+
+
+def to_csv(cells: Sequence[Cell]) -> str:
+    """``table.csv``: a line a cell."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    estimates = ("rmse_mm", "lost", "pull_step_rms_mm_per_min", "rmse_mm_difference")
+    ends = [f"{name}{end}" for name in estimates for end in ("", "_low", "_high")]
+    writer.writerow(("row", "controller", "training_seeds", "crystals", *ends, "rmse_mm_worst_seed"))
+    for cell in cells:
+        numbers = [f"{value:.6g}" for one in (cell.rmse, cell.lost, cell.activity, cell.apart) for value in _ends(one)]
+        writer.writerow((cell.row, cell.controller, cell.seeds, cell.rmse.n, *numbers, f"{cell.worst:.6g}"))
+    return text.getvalue()
+
+
+def _ends(estimate: Estimate) -> tuple[float, float, float]:
+    low, high = estimate.ci95 or (estimate.mean, estimate.mean)
+    return estimate.mean, low, high
+
+
+def to_markdown(cells: Sequence[Cell], against: str) -> str:
+    """``table.md``: radius error and lost crystals; then the paired differences."""
+    crystals = cells[0].rmse.n
+    return "\n".join(
+        [
+            "# How agents travel",
+            "",
+            f"RMSE of the radius [mm] on the first {crystals} test crystals of each row, 95 % interval in brackets, and"
+            f" crystals lost; on {' and '.join(OBSERVABLE)} against the radius that sensors can show.",
+            "",
+            *_table(cells, _error),
+            "",
+            f"The same less `{against}`'s, crystal by crystal [µm]; negative is better.",
+            "",
+            *_table([cell for cell in cells if cell.controller != against], _apart),
+            "",
+        ]
+    )
+
+
+def _table(cells: Sequence[Cell], tell: Any) -> list[str]:
+    names = list(dict.fromkeys(cell.controller for cell in cells))
+    rows = list(dict.fromkeys(cell.row for cell in cells))
+    found = {(cell.row, cell.controller): cell for cell in cells}
+    lines = [f"| row | {' | '.join(names)} |", "|---" + "|--:" * len(names) + "|"]
+    return lines + [f"| {row} | {' | '.join(tell(found[row, name]) for name in names)} |" for row in rows]
+
+
+def _error(cell: Cell) -> str:
+    mean, low, high = _ends(cell.rmse)
+    lost = f", {100.0 * cell.lost.mean:.1f} % lost" if cell.lost.mean else ""
+    worst = f", worst seed {cell.worst:.3f}" if cell.seeds > 1 else ""
+    return f"{mean:.3f} [{low:.3f}, {high:.3f}]{lost}{worst}"
+
+
+def _apart(cell: Cell) -> str:
+    mean, low, high = (value / MICRON for value in _ends(cell.apart))
+    return f"{mean:+.0f} [{low:+.0f}, {high:+.0f}]"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    parser = OneLineParser(prog=PROG, description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("folder", type=Path, help="a benchmark's folder, with its episodes.csv")
+    parser.add_argument("--against", default="lqg-at-0.02", metavar="NAME", help="compared with (%(default)s)")
+    given = parser.parse_args(arguments)
+    return guarded(PROG, lambda: _main(given), "benchmark")
+
+
+def _main(given: argparse.Namespace) -> int:
+    cells = tabulate(read_episodes(given.folder / EPISODES, figures), given.against)
+    text = to_markdown(cells, given.against)
+    write_files({given.folder / "table.csv": to_csv(cells).encode(), given.folder / "table.md": text.encode()})
+    print(text, end="")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""The plant beside the logs of a real puller: ``python -m studies.industrial``."""

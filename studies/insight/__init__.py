@@ -1,0 +1,1 @@
+"""What an agent does that other controllers do not: ``python -m studies.insight``."""

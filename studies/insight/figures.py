@@ -1,0 +1,160 @@
+"""Figures of an agent beside other controllers: answers to events, linear gains, loops, shares of the drives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from cz_gym.evaluation.report.canvas import GREY, canvas, png, styles
+from cz_gym.evaluation.rollout import Signals
+from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
+
+from .linear_agent import Floats
+from .loop import Responses
+from .step_tests import AT_REST, BEGIN, Trial
+
+_LINES = ("solid", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (2, 1.2)))
+LABELS = ("radius error [mm]", "pull speed less v₀ [mm/min]", "heater less nominal [kW]")
+DRIVES = (("pull speed", "mm/min", MM_PER_MIN), ("heater", "kW", KILO))
+
+
+def looks(names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+    """How each controller's line is drawn, the same in every figure; the first, the agent, boldest."""
+    found: dict[str, dict[str, Any]] = {}
+    for i, (name, style) in enumerate(styles(names).items()):
+        dash: Any = "solid" if i == 0 else _LINES[i % len(_LINES)]
+        colour = found[names[0]]["color"] if name == f"{names[0]} {AT_REST}" else style.colour
+        found[name] = {"color": colour, "lw": 2.0 if i == 0 else 1.3, "ls": dash, "zorder": 3 - 0.1 * i}
+    return found
+
+
+def _legend(figure: Any, axis: Any) -> None:
+    handles, names = axis.get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=len(names), frameon=False, fontsize=9)
+
+
+def response_figure(answers: Mapping[str, Mapping[str, Signals]], trials: tuple[Trial, ...], dt: float) -> bytes:
+    """Radius error and both drives after each event; ``answers`` by trial, then by controller."""
+    figure = canvas(12.0, 6.6)
+    axes = figure.subplots(3, len(trials), sharex="col", squeeze=False)
+    for column, trial in enumerate(trials):
+        style = looks(tuple(answers[trial.name]))
+        for name, signals in answers[trial.name].items():
+            minutes = dt * np.arange(1, len(signals.r_c) + 1) / MINUTE
+            rows = (
+                (signals.r_c - signals.r_ref) / MM,
+                (signals.v_p - signals.v_p[0]) / MM_PER_MIN,
+                (signals.Q_H - signals.Q_H[0]) / KILO,
+            )
+            for axis, values in zip(axes[:, column], rows, strict=True):
+                axis.plot(minutes, values, label=name, **style[name])
+        for axis in axes[:, column]:
+            axis.axvline(BEGIN / MINUTE, color=GREY, lw=0.7, ls=":")
+            axis.margins(x=0.0)
+        axes[0, column].set_title(trial.title, fontsize=9.5)
+        axes[-1, column].set_xlabel("time [min]")
+    for axis, label in zip(axes[:, 0], LABELS, strict=True):
+        axis.set_ylabel(label)
+    _legend(figure, axes[0, 0])
+    figure.suptitle("One nominal puller without noise, four events", fontsize=11)
+    return png(figure)
+
+
+def gain_figure(impulses: Mapping[str, Floats], responses: Mapping[str, Responses], dt: float) -> bytes:
+    """From the ring to the two drives: after one reading 0.1 mm too large, and over frequency."""
+    figure = canvas(9.6, 6.0)
+    axes = figure.subplots(2, 2)
+    style = looks(tuple(impulses))
+    for row, (drive, unit, scale) in enumerate(DRIVES):
+        for name, answer in impulses.items():
+            seconds = dt * np.arange(len(answer))
+            step = answer[:, row] * 0.1 * MM / scale
+            axes[row, 0].step(seconds / MINUTE, step, where="post", label=name, **style[name])
+            found = responses[name]
+            gain = np.abs(found.drives()[:, row]) * MM / scale
+            axes[row, 1].loglog(found.omega, gain, label=name, **style[name])
+        axes[row, 0].set_ylabel(f"{drive} [{unit}]")
+        axes[row, 1].set_ylabel(f"{drive} by ring [{unit} per mm]")
+        axes[row, 0].axhline(0.0, color=GREY, lw=0.7)
+        axes[row, 0].margins(x=0.0)
+    axes[0, 0].set_title("one reading 0.1 mm too large, loop closed", fontsize=9.5)
+    axes[0, 1].set_title("gain over frequency, the controller alone", fontsize=9.5)
+    axes[1, 0].set_xlabel("time [min]")
+    axes[1, 1].set_xlabel("angular frequency [rad/s]")
+    _legend(figure, axes[0, 0])
+    figure.suptitle("From the ring to the drives, small signals under the usual noise", fontsize=11)
+    return png(figure)
+
+
+def loop_figure(responses: Mapping[str, Responses], zero: float) -> bytes:
+    """Loop gain and phase at the pull speed, and the sensitivity at the camera; ``zero`` is the plant's [rad/s]."""
+    figure = canvas(12.0, 3.8)
+    axes = figure.subplots(1, 3)
+    style = looks(tuple(responses))
+    for name, found in responses.items():
+        at_pull, at_camera = found.opened("v_p"), found.opened("camera")
+        axes[0].loglog(found.omega, np.abs(at_pull), label=name, **style[name])
+        phase = np.degrees(np.unwrap(np.angle(at_pull)))
+        crossing = int(np.argmin(np.abs(np.log(np.abs(at_pull)))))
+        phase += 360.0 * np.round((-120.0 - phase[crossing]) / 360.0)
+        axes[1].semilogx(found.omega, phase, **style[name])
+        axes[2].loglog(found.omega, 1.0 / np.abs(1.0 + at_camera), **style[name])
+    axes[0].axhline(1.0, color=GREY, lw=0.8)
+    axes[1].axhline(-180.0, color=GREY, lw=0.8)
+    axes[2].axhline(1.0, color=GREY, lw=0.8)
+    axes[1].set_ylim(-420.0, 60.0)
+    axes[1].set_yticks(range(-360, 61, 60))
+    titles = ("loop gain, opened at the pull speed", "its phase [°]", "sensitivity |1/(1 + L)|, opened at the camera")
+    for axis, title in zip(axes, titles, strict=True):
+        axis.axvline(zero, color=GREY, lw=0.8, ls=":")
+        axis.set_title(title, fontsize=9.5)
+        axis.set_xlabel("angular frequency [rad/s]")
+    axes[0].annotate("right-half-plane zero", (zero, axes[0].get_ylim()[1]), (-3, -4), textcoords="offset points",
+                     rotation=90, ha="right", va="top", fontsize=7.5, color=GREY)  # fmt: skip
+    _legend(figure, axes[0])
+    return png(figure)
+
+
+def jump_figure(jumps: Mapping[str, tuple[Floats, Floats]], sizes: Floats) -> bytes:
+    """Largest move of the pull speed after a jump of the radius, over the jump; without noise and under it."""
+    figure = canvas(9.6, 4.0)
+    axes = figure.subplots(1, 2, sharey=True)
+    style = looks(tuple(jumps))
+    for column, title in enumerate(("without noise", "under the usual noise")):
+        for name, gains in jumps.items():
+            values = gains[column] * MM / MM_PER_MIN
+            axes[column].semilogx(sizes / MM, values, marker="o", ms=3.5, label=name, **style[name])
+        axes[column].set_title(title, fontsize=9.5)
+        axes[column].set_xlabel("jump of the radius [mm]")
+        axes[column].xaxis.set_major_formatter(lambda value, position: f"{value:g}")
+    axes[0].set_ylim(bottom=0.0)
+    axes[0].set_ylabel("pull speed moved [mm/min per mm]")
+    _legend(figure, axes[0])
+    figure.suptitle("How strongly a jump is answered", fontsize=11)
+    return png(figure)
+
+
+def share_figure(answers: Mapping[str, Signals], responses: Mapping[str, Responses], title: str) -> bytes:
+    """How a correction is shared: pull speed against heater after an event, and their ratio over frequency."""
+    figure = canvas(9.6, 4.2)
+    axes = figure.subplots(1, 2)
+    style = looks(tuple(answers))
+    for name, signals in answers.items():
+        pull = (signals.v_p - signals.v_p[0]) / MM_PER_MIN
+        heat = (signals.Q_H - signals.Q_H[0]) / KILO
+        axes[0].plot(pull, heat, label=name, **style[name])
+        axes[0].plot(pull[-1], heat[-1], "o", color=style[name]["color"], ms=5, zorder=4)
+        drives = responses[name].drives()
+        ratio = np.abs(drives[:, 1]) / np.abs(drives[:, 0]) * MM_PER_MIN / KILO
+        axes[1].loglog(responses[name].omega, ratio, **style[name])
+    axes[0].axhline(0.0, color=GREY, lw=0.7)
+    axes[0].axvline(0.0, color=GREY, lw=0.7)
+    axes[0].set_xlabel("pull speed less v₀ [mm/min]")
+    axes[0].set_ylabel("heater less nominal [kW]")
+    axes[0].set_title(f"{title}; a dot is the end", fontsize=9.5)
+    axes[1].set_xlabel("angular frequency [rad/s]")
+    axes[1].set_title("heater over pull speed, answer to the ring [kW per mm/min]", fontsize=9.5)
+    _legend(figure, axes[0])
+    return png(figure)

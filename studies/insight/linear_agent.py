@@ -1,0 +1,113 @@
+"""An agent near a point: the exact derivative of its network, and what that makes of the past as a linear system.
+
+An agent on "history" is a static function of channels that are themselves linear in the past: readings now, their
+means over past samples, the integral of the ring's error. So near a point its whole behaviour is one matrix of
+derivatives, and a frequency response follows without simulation.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.observation import HEATER_SCALE, HISTORY, LAGGED, LAGS, MEASURED, PULL_SCALE, lags, scales
+from cz_gym.physics.linearisation import StateSpace
+
+Floats = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+SEEN = ("ring_error", "T_1", "v_p", "Q_H")
+"""Readings through which the plant reaches an agent: ring [m], pyrometer [K], applied drives [m/s, W]."""
+_STEP = 1e-6
+_AT = [[channel.name for channel in MEASURED].index(name) for name in SEEN]
+_REMEMBERED = [SEEN.index(name) for name in LAGGED]
+
+
+class LinearAgent(NamedTuple):
+    """Derivatives of the drives asked for, v_p [m/s] and Q_H [W], at one observation; SI units."""
+
+    now: Floats
+    """By the readings of MEASURED, shape (2, channels)."""
+    integral: Floats
+    """By the integral of the ring's error [m s], shape (2,)."""
+    lagged: Floats
+    """By the means over past samples, shape (2, lags, 4), the last axis as LAGGED."""
+    dt: float
+    """Control interval [s]."""
+
+    def response(self, omega: npt.ArrayLike) -> Complex:
+        """Drives by the readings of SEEN at angular frequencies [rad/s], shape (points, 2, 4).
+
+        The applied drives are counted as readings of their own; feeding them back is the loop's affair.
+        """
+        z = np.exp(1j * self.dt * np.atleast_1d(np.asarray(omega, np.float64)))
+        found = np.zeros((len(z), 2, len(SEEN)), np.complex128) + self.now[:, _AT]
+        for lag, (newest, oldest) in enumerate(zip(*lags(self.dt), strict=True)):
+            mean = (z[:, None] ** -np.arange(newest, oldest + 1.0)).mean(axis=1)
+            found[:, :, _REMEMBERED] += mean[:, None, None] * self.lagged[:, lag]
+        found[:, :, 0] += self.integral * (self.dt / (1.0 - 1.0 / z))[:, None]
+        return found
+
+    def state_space(self) -> StateSpace:
+        """The same in discrete time: inputs the channels of MEASURED, outputs the two drives, deviations in SI.
+
+        States: past samples of the remembered channels, newest first, channel by channel; the integral.
+        """
+        newest, oldest = lags(self.dt)
+        depth, kept = int(oldest[-1]), len(LAGGED)
+        n = depth * kept + 1
+        A, B = np.zeros((n, n)), np.zeros((n, len(MEASURED)))
+        C, D = np.zeros((2, n)), self.now.copy()
+        for channel in range(kept):
+            first = channel * depth
+            A[first + 1 : first + depth, first : first + depth - 1] = np.eye(depth - 1)
+            B[first, _AT[_REMEMBERED[channel]]] = 1.0
+            for lag, (new, old) in enumerate(zip(newest, oldest, strict=True)):
+                C[:, first + new - 1 : first + old] += self.lagged[:, lag, channel, None] / (old - new + 1)
+        A[-1, -1], B[-1, _AT[0]] = 1.0, self.dt
+        C[:, -1] = self.integral
+        D[:, _AT[0]] += self.integral * self.dt
+        return StateSpace(A, B, C, D)
+
+
+def linear_agent(onnx_bytes: bytes, observations: npt.ArrayLike, dt: float, v_0: float = PULL_SCALE) -> LinearAgent:
+    """The agent of these (judged) ONNX bytes near "history" observations; v_0 [m/s] scales the pull speed.
+
+    Of several observations, shape (n, channels), it is the mean derivative: for Gaussian ones the best linear
+    approximation there is (Stein's lemma). ValueError if the file reads another observation or remembers something.
+    """
+    rows = np.atleast_2d(np.asarray(observations, np.float64))
+    slopes = np.mean([jacobian(onnx_bytes, row) for row in rows], axis=0)
+    slopes = np.array([[v_0], [HEATER_SCALE]]) * slopes / scales(HISTORY, v_0)
+    now, rest = len(MEASURED), slopes[:, len(MEASURED) + 1 :]
+    return LinearAgent(slopes[:, :now], slopes[:, now], rest.reshape(2, len(LAGS), len(LAGGED)), dt)
+
+
+def jacobian(onnx_bytes: bytes, observation: Floats) -> Floats:
+    """Derivatives of the action by the observation, shape (2, channels), both scaled, in double precision."""
+    evaluate = _in_double(onnx_bytes, len(observation))
+    steps = _STEP * np.eye(len(observation))
+    ahead, behind = evaluate(observation + steps), evaluate(observation - steps)
+    slopes: Floats = (ahead - behind).T / (2.0 * _STEP)
+    return slopes
+
+
+def _in_double(onnx_bytes: bytes, channels: int) -> Any:
+    """The graph as a function of observations in float64: float32 would round such small differences away."""
+    import onnx
+    from onnx import TensorProto, numpy_helper
+    from onnx.reference import ReferenceEvaluator
+
+    model = onnx.load_model_from_string(onnx_bytes)
+    if [value.name for value in model.graph.input] != ["observation"] or channels != len(HISTORY):
+        raise ValueError(
+            f'only agents on "history" ({len(HISTORY)} channels) without a state of their own are linear here'
+        )
+    for weight in model.graph.initializer:
+        if weight.data_type == TensorProto.FLOAT:
+            weight.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(weight).astype(np.float64), weight.name))
+    for value in (*model.graph.input, *model.graph.output):
+        value.type.tensor_type.elem_type = TensorProto.DOUBLE
+    session = ReferenceEvaluator(model)
+    return lambda rows: session.run(None, {"observation": rows})[0]

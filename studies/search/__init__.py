@@ -1,0 +1,1 @@
+"""A search of a recipe's hyperparameters: ``python -m studies.search``."""

@@ -1,0 +1,1 @@
+"""What a step costs, beside other environments: ``python -m studies.speed``."""

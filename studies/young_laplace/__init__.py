@@ -1,0 +1,1 @@
+"""The polynomials of the exact meniscus: ``python -m studies.young_laplace``."""

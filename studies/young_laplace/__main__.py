@@ -1,0 +1,153 @@
+"""Compute the polynomials of the exact meniscus and write them to ``young_laplace_table.py``.
+
+``python -m studies.young_laplace`` runs :func:`main`, which writes only if told to. The exact solution is
+sampled at Chebyshev points, where interpolation converges as fast as the function is smooth; what is stored are the
+powers' coefficients.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numpy.polynomial import chebyshev
+
+from cz_gym.commands import OneLineParser, interrupted
+from cz_gym.evaluation.files import check_writable, write_files
+from cz_gym.physics import young_laplace as exact
+from cz_gym.physics.meniscus import profile, ring_point
+from cz_gym.physics.young_laplace_table import RING, SLOPE, TAIL
+
+Floats = npt.NDArray[np.float64]
+SIZES = ((9, 16), (9, 22), (7, 8))
+"""Coefficients in the two variables of SLOPE, RING and TAIL."""
+TABLE = Path(exact.__file__).with_name("young_laplace_table.py")
+
+
+class Tables(NamedTuple):
+    """Coefficients [-] of the polynomials of :func:`cz_gym.physics.young_laplace.polynomial`, by powers."""
+
+    SLOPE: Floats
+    RING: Floats
+    TAIL: Floats
+
+
+def build() -> Tables:
+    """Solve the meniscus at the nodes of the tables; a few seconds."""
+    return Tables(
+        _fit(_slope_correction, *SIZES[0]), _fit(_ring_correction, *SIZES[1]), _fit(_tail_correction, *SIZES[2])
+    )
+
+
+def _fit(function: Callable[[Floats, Floats], Floats], m: int, n: int) -> Floats:
+    """Interpolate at the m x n Chebyshev points of [-1, 1]^2 and turn the series into powers."""
+    x, y = chebyshev.chebpts1(m), chebyshev.chebpts1(n)
+    X, Y = np.meshgrid(x, y, indexing="ij")
+    values = function(X.ravel(), Y.ravel()).reshape(m, n)
+    series = np.linalg.solve(chebyshev.chebvander(x, m - 1), values)
+    series = np.linalg.solve(chebyshev.chebvander(y, n - 1), series.T).T
+    powers: Floats = _powers(m).T @ series @ _powers(n)
+    return powers
+
+
+def _powers(n: int) -> Floats:
+    """Row k: coefficients of T_k in powers, shape (n, n)."""
+    rows = np.zeros((n, n))
+    for k in range(n):
+        rows[k, : k + 1] = chebyshev.cheb2poly(np.eye(n)[k, : k + 1])
+    return rows
+
+
+def _radius(x: Floats) -> Floats:
+    radius: Floats = 2.0 / (exact.NARROWEST * (x + 1.0))
+    return radius
+
+
+def _middle(y: Floats, low: float, high: float) -> Floats:
+    value: Floats = 0.5 * (low + high + y * (high - low))
+    return value
+
+
+def _slope_correction(x: Floats, y: Floats) -> Floats:
+    r, square = _radius(x), _middle(y, 0.0, exact.HIGHEST**2)
+    theta = exact.solve(r, np.sqrt(square), 1.0, np.radians(3.5)).theta
+    # 1 - sin(theta) without the cancellation near theta = pi/2.
+    lift = 2.0 * np.square(np.sin(0.25 * np.pi - 0.5 * theta))
+    correction: Floats = r * (lift / square - 1.0)
+    return correction
+
+
+def _ring_correction(x: Floats, y: Floats) -> Floats:
+    r, q = _radius(x), _middle(y, exact.Q_LOW, exact.Q_HIGH)
+    h = exact.SQRT_2 / np.cosh(q)
+    offset = exact.solve(r, h, 1.0, np.radians(3.5)).ring_offset
+    correction: Floats = r * (offset - (exact.RING_REFERENCE - profile(h, 1.0)))
+    return correction
+
+
+def _tail_correction(x: Floats, y: Floats) -> Floats:
+    """How far the ring moves between the reference slope, at radius r, and another one, against the planar meniscus."""
+    r, X_b = _radius(x), _middle(y, exact.X_LOW, exact.X_HIGH)
+    slope = np.array([_slope_at(value) for value in X_b])
+    reference = np.full_like(r, np.radians(3.5))
+    start = exact.shoot(lambda outer: exact.turn(outer, reference)[0], r + exact.planar_width(reference), r)
+    moved = exact.turn(start, slope)[0] - r
+    correction: Floats = r * (moved / (X_b - exact.RING_REFERENCE) - 1.0)
+    return correction
+
+
+def _slope_at(X_b: float) -> float:
+    """The ring's slope [rad] that belongs to X_b, by bisection."""
+    low, high = exact.RING_SLOPES
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if ring_point(middle) > X_b else (low, middle)
+    return low
+
+
+def render(tables: Tables) -> str:
+    """The text of the module that holds the tables."""
+    lines = [
+        '"""Polynomials of the exact meniscus, computed by ``python -m studies.young_laplace``; not edited by hand."""',
+        "",
+        "# fmt: off",
+        "import numpy as np",
+        "",
+    ]
+    for name, table in tables._asdict().items():
+        lines.append(f"{name} = np.array([")
+        for row in table:
+            numbers = [f"{value!r}" for value in row.tolist()]
+            groups = [", ".join(numbers[first : first + 4]) for first in range(0, len(numbers), 4)]
+            lines += ["    [", *(f"        {group}," for group in groups), "    ],"]
+        lines += ["])", f'"""Coefficients [-], shape {table.shape}."""', ""]
+    return "\n".join(lines).rstrip("\n") + "\n"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code. Compares, and with ``--write`` replaces the table next to this module."""
+    parser = OneLineParser(
+        "python -m studies.young_laplace", "Compute the exact meniscus and compare it with the table."
+    )
+    parser.add_argument("--write", action="store_true", help=f"replace {TABLE.name} by what was computed")
+    write = parser.parse_args(arguments).write
+    try:
+        if write:
+            check_writable(TABLE.parent)
+        tables = build()
+        if write:
+            write_files({TABLE: render(tables).encode()})
+    except OSError as error:
+        print(f"cz_gym.physics.young_laplace: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return interrupted("cz_gym.physics.young_laplace")
+    shipped = Tables(SLOPE, RING, TAIL)
+    worst = max(float(np.max(np.abs(new - old))) for new, old in zip(tables, shipped, strict=True))
+    print(f"largest difference from the coefficients there were: {worst:.2g}")
+    print(f"wrote {TABLE.name}" if write else f"nothing written; --write replaces {TABLE.name}")
+    return 0

@@ -1,0 +1,153 @@
+"""Models of plain stable-baselines3 as agent files: the file acts as the model does, or there is none."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box
+from sb3_contrib import TQC, RecurrentPPO
+from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import VecNormalize
+
+import cz_gym  # noqa: F401  (registers Cz-v0)
+from cz_gym.agents import OnnxPolicy, from_sb3
+from cz_gym.agents.agent_file.contract import AgentFileError
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+
+ON = {"n_steps": 16, "batch_size": 32, "n_epochs": 1}
+OFF = {"learning_starts": 8, "buffer_size": 64, "batch_size": 8}
+KINDS: dict[str, tuple[Any, str, dict[str, Any]]] = {
+    "a2c": (A2C, "MlpPolicy", {"policy_kwargs": {"activation_fn": torch.nn.ELU}}),
+    "ddpg": (DDPG, "MlpPolicy", OFF),
+    "ppo": (PPO, "MlpPolicy", ON),
+    "ppo_lstm": (RecurrentPPO, "MlpLstmPolicy", ON),
+    "sac": (SAC, "MlpPolicy", OFF),
+    "sac with a clipped mean": (SAC, "MlpPolicy", {**OFF, "use_sde": True}),
+    "td3": (TD3, "MlpPolicy", {**OFF, "policy_kwargs": {"activation_fn": torch.nn.SiLU}}),
+    "tqc": (TQC, "MlpPolicy", OFF),
+}
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(from_sb3, "JUDGING", VALIDATION_SEEDS[:2])
+
+
+def trained(kind: str, normalised: bool = False, observation: str = "history") -> Any:
+    algorithm, policy, options = KINDS[kind]
+    env: Any = make_vec_env("Cz-v0", n_envs=2, env_kwargs={"observation": observation})
+    if normalised:
+        env = VecNormalize(env, clip_obs=3.0)
+    return algorithm(policy, env, device="cpu", seed=5, **options).learn(64)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_policy_becomes_a_file_that_acts_as_it_does(kind: str, tmp_path: Path) -> None:
+    model = trained(kind)
+    contract = from_sb3.save_agent(tmp_path / "mine.onnx", model, "mine")
+    assert (contract.algorithm, contract.observation, contract.training_seed) == ("mine", "history", 5)
+    assert contract.training_steps == model.num_timesteps >= 64
+    agent = OnnxPolicy.load(tmp_path / "mine.onnx")
+    assert from_sb3.disagreement(agent, model, None) < 1e-5
+    for parameter in model.policy.parameters():
+        parameter.data += 0.3
+    assert from_sb3.disagreement(agent, model, None) > 1e-3, "the comparison would not tell another network"
+
+
+@pytest.mark.parametrize("kind", ["ppo", "ppo_lstm"])
+def test_normalisation_goes_into_the_graph(kind: str, tmp_path: Path) -> None:
+    model = trained(kind, normalised=True, observation="measured")
+    normalisation = model.get_vec_normalize_env()
+    from_sb3.save_agent(tmp_path / "mine.onnx", model, "mine")
+    agent = OnnxPolicy.load(tmp_path / "mine.onnx")
+    assert agent.observation == "measured"
+    assert from_sb3.disagreement(agent, model, normalisation) < 1e-4
+    assert from_sb3.disagreement(agent, model, None) > 1e-3
+
+
+def test_the_command_reads_what_stable_baselines3_and_rl_zoo_save(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = trained("ppo", normalised=True)
+    model.save(tmp_path / "best_model.zip")
+    model.get_vec_normalize_env().save(str(tmp_path / "vecnormalize.pkl"))
+    command = [str(tmp_path / "best_model.zip"), "--algo", "ppo", "--out", str(tmp_path / "zoo.onnx")]
+    command += ["--vecnormalize", str(tmp_path / "vecnormalize.pkl")]
+    assert from_sb3.main([*command, "--name", "zoo", "--seed", "7", "--scenario", "hard"]) == 0
+    assert "wrote" in capsys.readouterr().out
+    agent = OnnxPolicy.load(tmp_path / "zoo.onnx")
+    assert (agent.contract.algorithm, agent.contract.training_seed, agent.contract.scenario) == ("zoo", 7, "hard")
+    assert from_sb3.disagreement(agent, model, model.get_vec_normalize_env()) < 1e-4
+
+
+class Own(BaseFeaturesExtractor):
+    """A layer of somebody's own before the policy's."""
+
+    def __init__(self, space: Box) -> None:
+        super().__init__(space, space.shape[0])
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        return 2.0 * observations
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"features_extractor_class": Own}, "Own"),
+        ({"activation_fn": torch.nn.Mish}, "Mish"),
+    ],
+)
+def test_a_network_that_cannot_be_written_is_refused(options: dict[str, Any], said: str, tmp_path: Path) -> None:
+    model = PPO("MlpPolicy", "Cz-v0", device="cpu", n_steps=8, batch_size=8, policy_kwargs=options)
+    with pytest.raises(AgentFileError, match=said):
+        from_sb3.save_agent(tmp_path / "mine.onnx", model, "mine")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_that_would_act_otherwise_is_not_written(tmp_path: Path) -> None:
+    model = trained("ppo")
+    predict = model.predict
+    model.predict = lambda *given, **options: (predict(*given, **options)[0] + np.float32(0.01), None)
+    with pytest.raises(AgentFileError, match=r"otherwise than the model, by up to 0\.01"):
+        from_sb3.save_agent(tmp_path / "mine.onnx", model, "mine")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("missing.zip --algo ppo --out mine.onnx", "missing.zip: no such file"),
+        ("broken.zip --algo ppo --out mine.onnx", "broken.zip: not a model of ppo"),
+        ("broken.zip --algo dqn --out mine.onnx", "invalid choice"),
+        ("good.zip --algo sac --out mine.onnx", "good.zip: not a model of sac"),
+        ("good.zip --algo ppo --out mine.pt", "ends in .onnx"),
+        ("good.zip --algo ppo --out mine.onnx --scenario none", "none"),
+        ("good.zip --algo ppo --out mine.onnx --vecnormalize broken.zip", "broken.zip: not a VecNormalize"),
+        ("good.zip --algo ppo --out mine.onnx --seed -1", "training_seed"),
+        ("good.zip --algo ppo --out mine.onnx --name ''", "algorithm"),
+    ],
+)
+def test_mistakes_are_one_line(
+    arguments: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    PPO("MlpPolicy", "Cz-v0", device="cpu", n_steps=8, batch_size=8).save("good.zip")
+    Path("broken.zip").write_bytes(b"not a model")
+    before = set(os.listdir())
+    try:
+        code = from_sb3.main(shlex.split(arguments))
+    except SystemExit as left:
+        code = int(left.code or 0)
+    error = capsys.readouterr().err
+    assert code == 2
+    assert said in error
+    assert error.count("\n") == 1
+    assert set(os.listdir()) == before

@@ -1,0 +1,70 @@
+"""Cz-v0 under other people's training code: plain stable-baselines3, and RL-Zoo's files."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pytest
+import yaml
+from sb3_contrib import TQC, RecurrentPPO
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.env_util import make_vec_env
+
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+
+FOLDER = Path(__file__).parents[3] / "examples" / "rl_zoo"
+ALGORITHMS: dict[str, Any] = {"ppo": PPO, "ppo_lstm": RecurrentPPO, "sac": SAC, "tqc": TQC}
+TAKEN_BY_RL_ZOO = ("env_kwargs", "normalize", "n_envs", "n_timesteps")
+SMALL = {
+    "ppo": {"n_steps": 8, "batch_size": 16, "n_epochs": 1},
+    "ppo_lstm": {"n_steps": 8, "batch_size": 16, "n_epochs": 1},
+    "sac": {"learning_starts": 8, "buffer_size": 64, "batch_size": 8},
+    "tqc": {"learning_starts": 8, "buffer_size": 64, "batch_size": 8},
+}
+
+
+def read(name: str) -> dict[str, Any]:
+    """Hyperparameters as RL-Zoo reads them: schedules "lin_x", and dictionaries written as Python."""
+    found = yaml.safe_load((FOLDER / f"{name}.yml").read_text())
+    assert list(found) == ["Cz-v0"]
+    chosen: dict[str, Any] = found["Cz-v0"]
+    for key, value in chosen.items():
+        if isinstance(value, str) and value.startswith("lin_"):
+            chosen[key] = float(value.removeprefix("lin_"))
+        elif isinstance(value, str) and value[0] in "{d":
+            chosen[key] = eval(value, {"dict": dict})
+    return chosen
+
+
+@pytest.mark.parametrize("algorithm", [PPO, SAC])
+def test_plain_stable_baselines3_trains_by_name(algorithm: Any) -> None:
+    few = {"n_steps": 16, "batch_size": 16} if algorithm is PPO else {"learning_starts": 8, "buffer_size": 64}
+    learner = algorithm("MlpPolicy", "Cz-v0", device="cpu", **few).learn(32)
+    env = gym.make("Cz-v0")
+    observation, _ = env.reset(seed=VALIDATION_SEEDS[0])
+    action, _ = learner.predict(observation, deterministic=True)
+    assert env.action_space.contains(action)
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_rl_zoos_files_are_what_their_algorithms_take(name: str) -> None:
+    chosen = read(name)
+    rest = {key: value for key, value in chosen.items() if key not in TAKEN_BY_RL_ZOO}
+    assert set(rest) <= set(inspect.signature(ALGORITHMS[name]).parameters)
+    assert set(chosen["normalize"]) == {"norm_obs", "norm_reward"}
+    env = make_vec_env("Cz-v0", n_envs=2, env_kwargs=chosen["env_kwargs"])
+    ALGORITHMS[name](env=env, device="cpu", **{**rest, **SMALL[name]}).learn(24)
+
+
+def test_every_file_says_its_command() -> None:
+    assert {path.stem for path in FOLDER.glob("*.yml")} == set(ALGORITHMS)
+    for path in FOLDER.glob("*.yml"):
+        command = f"python -m rl_zoo3.train --algo {path.stem} --env Cz-v0 --gym-packages cz_gym"
+        text = path.read_text()
+        assert f"{command} --conf-file agents/rl_zoo/{path.name}" in text
+        observation = read(path.stem)["env_kwargs"]["observation"]
+        # RL-Zoo 2.9 evaluates on an environment without the file's env_kwargs, whose default is "measured".
+        assert observation == "measured" or f"--env-kwargs \"observation:'{observation}'\"" in text

@@ -1,0 +1,96 @@
+"""The stable-baselines3 adapter against a vector of scalar environments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from cz_gym import CzEnv, CzVectorEnv
+from cz_gym.agents.training.vec_env import CzVecEnv
+
+N = 3
+SETTINGS: dict[str, Any] = {"scenario": "hard", "observation": "history", "control_interval": 20.0, "horizon": 400.0}
+
+
+def adapter(n: int = N, privileged: bool = False, stagger: int | None = None, **changes: Any) -> CzVecEnv:
+    env = CzVectorEnv(n, autoreset_mode=AutoresetMode.SAME_STEP, **{**SETTINGS, **changes})
+    return CzVecEnv(env, privileged, stagger)
+
+
+def test_equals_sb3s_own_vector_of_scalars() -> None:
+    ours, theirs = adapter(), DummyVecEnv([lambda: CzEnv(**SETTINGS)] * N)
+    rng = np.random.default_rng(0)
+    for env in (ours, theirs):
+        env.seed(5)
+    np.testing.assert_array_equal(ours.reset(), theirs.reset())
+    failed = truncated = 0
+    for _ in range(90):
+        actions = rng.uniform(-0.1, 0.1, (N, 2)).astype(np.float32)
+        actions[0] = 1.0
+        one, other = ours.step(actions), theirs.step(actions)
+        for a, b in zip(one[:3], other[:3], strict=True):
+            np.testing.assert_array_equal(a, b)
+            assert a.dtype == b.dtype
+        for done, mine, its in zip(one[2], one[3], other[3], strict=True):
+            assert ("terminal_observation" in mine) == bool(done)
+            if done:
+                np.testing.assert_array_equal(mine["terminal_observation"], its["terminal_observation"])
+                assert mine["TimeLimit.truncated"] == its["TimeLimit.truncated"]
+                truncated += mine["TimeLimit.truncated"]
+                failed += not mine["TimeLimit.truncated"]
+    assert min(failed, truncated) > 0, "both kinds of end must have happened"
+
+
+def test_episodes_report_return_and_length() -> None:
+    env, total = adapter(1, scenario="nominal"), 0.0
+    env.reset()
+    for k in range(20):
+        _, reward, done, infos = env.step(np.zeros((1, 2), np.float32))
+        total += float(reward[0])
+        assert done[0] == (k == 19)
+    assert infos[0]["episode"]["l"] == 20
+    assert infos[0]["episode"]["r"] == pytest.approx(total, rel=1e-6)
+
+
+def test_a_privileged_critic_sees_the_state_after_the_history() -> None:
+    plain, privileged = adapter(), adapter(privileged=True)
+    for env in (plain, privileged):
+        env.seed(1)
+    first, whole = plain.reset(), privileged.reset()
+    assert whole.shape == (N, first.shape[1] + 17) == (N, *privileged.observation_space.shape)
+    np.testing.assert_array_equal(whole[:, : first.shape[1]], first)
+    for _ in range(20):
+        whole, _, done, infos = privileged.step(np.zeros((N, 2), np.float32))
+    for i in np.flatnonzero(done):
+        assert infos[i]["terminal_observation"].shape == whole[i].shape
+
+
+def test_staggered_first_episodes_end_at_different_times() -> None:
+    env, ends = adapter(64, stagger=3, scenario="nominal"), []
+    env.reset()
+    for _ in range(20):
+        _, _, done, infos = env.step(np.zeros((64, 2), np.float32))
+        ends.append(int(done.sum()))
+        assert all(info["TimeLimit.truncated"] for info in infos if info)
+    assert max(ends) < 32
+    assert sum(ends) >= 64
+
+
+def test_attributes_and_methods() -> None:
+    env = adapter()
+    assert [config.steps for config in env.get_attr("config")] == [20] * N
+    assert len(env.get_attr("config", [0, 2])) == 2
+    assert env.env_is_wrapped(CzEnv) == [False] * N
+    with pytest.raises(ValueError, match="no indices"):
+        env.set_attr("render_mode", None, [0])
+
+
+def test_wrong_settings_are_refused() -> None:
+    with pytest.raises(ValueError, match="SAME_STEP"):
+        CzVecEnv(CzVectorEnv(2))
+    with pytest.raises(ValueError, match="history"):
+        adapter(observation="measured", privileged=True)

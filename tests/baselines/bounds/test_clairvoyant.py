@@ -1,0 +1,241 @@
+"""The clairvoyant bound: its parts against independent solutions, its plan against the environment itself."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_discrete_are
+from scipy.optimize import minimize
+
+from cz_gym.baselines.bounds.clairvoyant import Clairvoyant, episode_cost
+from cz_gym.baselines.bounds.future import future_of, substeps_of
+from cz_gym.baselines.bounds.riccati import Stages, sweep_back, sweep_forward
+from cz_gym.baselines.bounds.trajectory import Limits, Search, limits_of, linearised, optimise, predicted_cost
+from cz_gym.baselines.registry import find_controller
+from cz_gym.config import make_config
+from cz_gym.episodes.scenario import Actuators
+from cz_gym.episodes.scenarios import HARD, RANDOMIZED
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.physics.plant import Inputs, State
+from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
+from cz_gym.vector import CzVectorEnv
+
+SEEDS = (1_000_000, 1_000_001, 1_000_002)
+
+
+def told(scenario=RANDOMIZED, seeds=SEEDS, **settings):
+    config = make_config(scenario, observation="state", **{"horizon": 1.0 * HOUR, **settings})
+    return config, Clairvoyant().for_episodes(config, seeds)
+
+
+def replay(config, policy, seeds=SEEDS):
+    """A rollout of a policy as it is, told or not."""
+    return rollout(SimpleNamespace(predict=policy.predict), config, seeds)
+
+
+class OpenLoopInputs:
+    """Plays given inputs v_p [m/s] and Q_H [W], shape (steps, n, 2)."""
+
+    def __init__(self, u, inputs_0):
+        self.actions = ((u - inputs_0) / np.stack([inputs_0[:, 0], np.full(len(inputs_0), 10 * KILO)], axis=-1)).clip(
+            -1, 1
+        )
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        k = state or 0
+        return self.actions[min(k, len(self.actions) - 1)].astype(np.float32), k + 1
+
+
+@pytest.mark.parametrize("interval", [2.0, 5.0, 7.5, 10.0, 15.0])
+def test_substeps_fill_each_interval_and_never_cross_the_grid(interval):
+    point, length = substeps_of(interval, 12)
+    assert length.sum(axis=1) == pytest.approx(interval)
+    end = np.arange(12)[:, None] * interval + np.cumsum(length, axis=1)
+    begin = end - length
+    used = length > 0
+    assert (begin[used] >= point[used] * 5.0 - 1e-9).all()
+    assert (end[used] <= (point[used] + 1) * 5.0 + 1e-9).all()
+
+
+@pytest.mark.parametrize("interval", [2.0, 5.0, 10.0])
+def test_the_future_told_is_the_one_the_environment_brings(interval):
+    config = make_config(HARD, observation="state", control_interval=interval, horizon=2.0 * HOUR)
+    future = future_of(config, SEEDS)
+    env = CzVectorEnv(3, HARD, observation="state", control_interval=interval, horizon=2.0 * HOUR)
+    env.reset(seed=list(SEEDS))
+    actions = np.random.default_rng(0).uniform(-0.05, 0.05, (200, 3, 2)).astype(np.float32).astype(np.float64)
+    x = future.start
+    for k, action in enumerate(actions[: round(900.0 / interval)]):
+        info = env.step(action)[-1]
+        v_p, Q_H = future.puller.v_0 * (1.0 + action[:, 0]), future.puller.Q_H_0 + 10.0 * KILO * action[:, 1]
+        x = future.advance(State(*x), Inputs(v_p, Q_H), slice(k, k + 1))
+        x = State(*(value[0] for value in x))
+        assert future.r_ref[k] == pytest.approx(info["r_ref"], rel=1e-14)
+    for name in ("r_c", "h_c", "T_1", "T_b"):
+        assert getattr(x, name) == pytest.approx(info[name], rel=1e-12), name
+
+
+def test_the_derivatives_agree_with_finite_differences():
+    config = make_config("randomized", horizon=60.0)
+    future = future_of(config, SEEDS)
+    N, n = future.r_ref.shape
+    x = np.broadcast_to(np.stack(future.start, axis=-1), (N + 1, n, 5)).copy()
+    u = np.broadcast_to(np.stack(np.broadcast_arrays(*future.puller.inputs_0), axis=-1), (N, n, 2)).copy()
+    after, slopes = linearised(future, x, u)
+    for j, size in enumerate((1e-5, 1e-6, 0.1, 0.1, 0.01, 1e-6, 100.0)):
+        shifted = []
+        for sign in (1.0, -1.0):
+            x_s, u_s = x.copy(), u.copy()
+            (x_s if j < 5 else u_s)[..., j if j < 5 else j - 5] += sign * size
+            shifted.append(linearised(future, x_s, u_s)[0])
+        found = (shifted[0] - shifted[1]) / (2.0 * size)
+        assert slopes[..., j] == pytest.approx(found, rel=1e-5, abs=1e-6 * np.abs(found).max())
+    assert after[0, :, 1] == pytest.approx(x[0, :, 1], rel=1e-2)
+
+
+def problem(N, n, states, inputs):
+    random = np.random.default_rng(3)
+    return Stages(
+        random.normal(size=(N, n, states, states)) * 0.5, random.normal(size=(N, n, states, inputs)),
+        random.normal(size=(N, n, states)), random.uniform(0, 2, (N, n, states)), random.normal(size=(N, n, states)),
+        random.uniform(0.5, 2, (N, n, inputs)), random.normal(size=(N, n, inputs)),
+    )  # fmt: skip
+
+
+def test_the_sweeps_solve_the_same_equations_as_a_dense_solver():
+    N, n, s, m = 5, 3, 4, 2
+    stages, start = problem(N, n, s, m), np.random.default_rng(4).normal(size=(n, s))
+    after, inputs = sweep_forward(stages, sweep_back(stages), start)
+    for i in range(n):
+        # Unknowns z_1..z_N, w_0..w_{N-1}; constraints z_{k+1} - A z_k - B w_k = c_k.
+        H = np.diag(np.concatenate([stages.Q[:, i].ravel(), stages.R[:, i].ravel()]))
+        g = np.concatenate([stages.q[:, i].ravel(), stages.r[:, i].ravel()])
+        E, f = np.zeros((N * s, N * (s + m))), stages.c[:, i].copy()
+        f[0] += stages.A[0, i] @ start[i]
+        for k in range(N):
+            rows = slice(k * s, (k + 1) * s)
+            E[rows, rows] = np.eye(s)
+            E[rows, N * s + k * m : N * s + (k + 1) * m] = -stages.B[k, i]
+            if k:
+                E[rows, (k - 1) * s : k * s] = -stages.A[k, i]
+        kkt = np.block([[H, E.T], [E, np.zeros((N * s, N * s))]])
+        dense = np.linalg.solve(kkt, np.concatenate([-g, f.ravel()]))
+        assert after[:, i].ravel() == pytest.approx(dense[: N * s], rel=1e-9, abs=1e-10)
+        assert inputs[:, i].ravel() == pytest.approx(dense[N * s : N * (s + m)], rel=1e-9, abs=1e-10)
+
+
+def test_far_from_the_end_the_feedback_is_that_of_the_riccati_equation():
+    A, B = np.array([[1.0, 0.1], [0.0, 1.02]]), np.array([[0.0], [0.1]])
+    Q, R = np.array([1.0, 0.1]), np.array([0.5])
+    N = 400
+    stages = Stages(
+        *(np.broadcast_to(array, (N, 1, *array.shape)).copy() for array in (A, B, np.zeros(2), Q, np.zeros(2), R)),
+        np.zeros((N, 1, 1)),
+    )
+    P = solve_discrete_are(A, B, np.diag(Q), np.diag(R))
+    K = np.linalg.solve(np.diag(R) + B.T @ P @ B, B.T @ P @ A)
+    assert sweep_back(stages).feedback[0, 0] == pytest.approx(-K, rel=1e-9)
+
+
+def test_the_environment_replays_what_was_planned():
+    config, policy = told()
+    run = replay(config, policy)
+    power = run.signals.Q_H
+    assert not run.failed.any()
+    assert run.signals.r_c == pytest.approx(policy.plan.best.x[1:, :, 0], abs=1e-6 * MM)
+    assert power == pytest.approx(policy.plan.best.u[:, :, 1], abs=0.01)
+    assert episode_cost(run) == pytest.approx(policy.plan.cost, rel=1e-6)
+    assert (policy.plan.best.last_move < Search().tolerance).all()
+
+
+def test_no_nearby_inputs_are_cheaper_and_the_slope_is_zero():
+    config, policy = told()
+    best = policy.plan.best
+    random = np.random.default_rng(5)
+    smooth = np.cumsum(random.normal(size=best.u.shape), axis=0) / np.sqrt(len(best.u))
+    rough = random.normal(size=best.u.shape)
+    for shape in (smooth, rough):
+        change = shape * np.array([0.002 * MM_PER_MIN, 0.002 * KILO])
+        costs = [
+            episode_cost(replay(config, OpenLoopInputs(best.u + sign * change, policy.plan.inputs_0)))
+            for sign in (-1.0, 0.0, 1.0)
+        ]
+        rise = costs[0] + costs[2] - 2.0 * costs[1]
+        assert (rise > 0.0).all()
+        assert (np.abs(costs[2] - costs[0]) < 0.02 * rise).all()
+
+
+def test_it_is_cheaper_than_every_other_controller():
+    config, policy = told()
+    ours = episode_cost(replay(config, policy))
+    for name in ("open-loop", "paper", "lqg", "lqg-quiet", "lqg-true", "full-information"):
+        entry = find_controller(name)
+        other = replace(config, observation=entry.observation)
+        assert (ours < episode_cost(rollout(entry.make(other), other, SEEDS))).all(), name
+
+
+def test_within_tight_limits_it_agrees_with_a_general_optimiser():
+    config = make_config("hard", observation="state", horizon=60.0)
+    future = future_of(config, SEEDS[:1])
+    limits = Limits(np.array([0.003, 0.1]), np.array([0.001, 0.03]))
+    found = optimise(future, limits)
+    nominal = np.array([future.puller.v_0[0], future.puller.Q_H_0[0]])
+    scale, N = np.array([MM_PER_MIN, KILO]), len(future.r_ref)
+
+    def roll(w):
+        u = (nominal + w.reshape(N, 2) * scale)[:, None]
+        x = [np.stack(future.start, axis=-1)]
+        for k in range(N):
+            after = future.advance(State(*x[-1].T), Inputs(*u[k].T), slice(k, k + 1))
+            x.append(np.stack([value[0] for value in after], axis=-1))
+        return found._replace(x=np.array(x), u=u)
+
+    def moves(w):
+        change = np.diff(w.reshape(N, 2), axis=0, prepend=0.0)
+        return np.concatenate([(limits.move - change).ravel(), (limits.move + change).ravel()])
+
+    bounds = [(-span, span) for span in limits.span] * N
+    peer = minimize(
+        lambda w: predicted_cost(future, roll(w))[0], np.zeros(2 * N), method="SLSQP", bounds=bounds,
+        constraints={"type": "ineq", "fun": moves}, options={"ftol": 1e-13, "maxiter": 500},
+    )  # fmt: skip
+    assert np.abs(np.diff(peer.x[::2], prepend=0.0)).max() == pytest.approx(limits.move[0], rel=1e-6)
+    assert np.abs(peer.x[::2]).max() == pytest.approx(limits.span[0], rel=1e-6)
+    assert predicted_cost(future, found)[0] == pytest.approx(peer.fun, rel=1e-6)
+    assert (found.u[:, 0, 0] - nominal[0]) / MM_PER_MIN == pytest.approx(peer.x[::2], abs=1e-5)
+
+
+def test_slow_narrow_and_stepping_drives_are_respected_and_followed():
+    actuators = Actuators(
+        pull_window=0.05 * MM_PER_MIN,
+        pull_slew=0.06 * MM_PER_MIN / MINUTE,
+        heater_slew=0.2 * KILO / MINUTE,
+        heater_step=0.1 * KILO,
+    )
+    config, policy = told(replace(HARD, name="narrow", actuators=actuators))
+    u, u_0 = policy.plan.best.u, policy.plan.inputs_0
+    pull, power = u[:, :, 0] - u_0[:, 0], u[:, :, 1] - u_0[:, 1]
+    limits = limits_of(actuators, u_0[0, 0], config.control_interval)
+    assert np.abs(pull).max() < limits.span[0] * MM_PER_MIN
+    assert np.abs(np.diff(pull, axis=0)).max() < limits.move[0] * MM_PER_MIN
+    assert np.abs(np.diff(power, axis=0)).max() < limits.move[1] * KILO
+    run = replay(config, policy)
+    assert not run.failed.any()
+    assert run.signals.r_c == pytest.approx(policy.plan.best.x[1:, :, 0], abs=0.05 * MM)
+
+
+def test_many_episodes_are_planned_in_parts(monkeypatch):
+    _, whole = told(horizon=300.0)
+    monkeypatch.setattr("cz_gym.baselines.bounds.clairvoyant.BATCH", 2)
+    _, parts = told(horizon=300.0)
+    assert parts.plan.best.u == pytest.approx(whole.plan.best.u, rel=1e-9)
+    assert parts.plan.cost == pytest.approx(whole.plan.cost, rel=1e-9)
+
+
+def test_it_refuses_to_act_untold_or_on_other_slots():
+    with pytest.raises(RuntimeError, match="for_episodes"):
+        Clairvoyant().predict(np.zeros((1, 17)))
+    _, policy = told(horizon=60.0)
+    with pytest.raises(ValueError, match="3 episodes, not 2"):
+        policy.predict(np.zeros((2, 17)))

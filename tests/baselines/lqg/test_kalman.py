@@ -1,0 +1,98 @@
+"""The Kalman filter against Riccati's equation, the textbook's joint update and sensors of known noise."""
+
+import numpy as np
+import pytest
+
+from cz_gym.baselines.lqg import kalman
+from cz_gym.baselines.lqg.kalman import Gaussian, Reading
+
+A = np.array([[1.0, 0.1], [0.0, 0.95]])
+H = np.array([[1.0, 0.3], [0.0, 1.0]])
+Q = np.diag([0.01, 0.04])
+R = np.diag([0.25, 0.5])
+
+
+def readings(belief, y):
+    for i in range(2):
+        row = np.broadcast_to(H[i], belief.mean.shape)
+        yield Reading(y[:, i] - belief.mean @ H[i], row, np.full(len(y), R[i, i]))
+
+
+def joint(mean, P, y):
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    return mean + K @ (y - H @ mean), (np.eye(2) - K @ H) @ P
+
+
+def corrected(belief, y):
+    for i in range(2):
+        belief = kalman.correct(belief, list(readings(belief, y))[i], np.inf)
+    return belief
+
+
+def test_one_reading_at_a_time_is_the_joint_update():
+    rng = np.random.default_rng(0)
+    mean, y = rng.normal(size=(3, 2)), rng.normal(size=(3, 2))
+    P = np.stack([np.diag(rng.uniform(0.5, 2.0, 2)) + 0.1 for _ in range(3)])
+    found = corrected(Gaussian(mean, P), y)
+    for i in range(3):
+        expected_mean, expected_P = joint(mean[i], P[i], y[i])
+        np.testing.assert_allclose(found.mean[i], expected_mean, rtol=1e-12)
+        np.testing.assert_allclose(found.covariance[i], expected_P, rtol=1e-12, atol=1e-15)
+
+
+def test_settles_at_the_riccati_solution():
+    belief = Gaussian(np.zeros((1, 2)), np.eye(2)[None] * 10.0)
+    for _ in range(500):
+        belief = corrected(belief, np.zeros((1, 2)))
+        belief = Gaussian(belief.mean @ A.T, kalman.predicted_covariance(belief.covariance, A, Q))
+    np.testing.assert_allclose(belief.covariance[0], kalman.steady_state(A, H, Q, R), rtol=1e-9)
+
+
+def test_its_covariance_is_that_of_its_errors():
+    rng = np.random.default_rng(1)
+    n = 4000
+    x = rng.normal(size=(n, 2))
+    belief = Gaussian(np.zeros((n, 2)), np.broadcast_to(np.eye(2), (n, 2, 2)))
+    for _ in range(20):
+        belief = corrected(belief, x @ H.T + rng.normal(size=(n, 2)) * np.sqrt(np.diag(R)))
+        belief = Gaussian(belief.mean @ A.T, kalman.predicted_covariance(belief.covariance, A, Q))
+        x = x @ A.T + rng.normal(size=(n, 2)) * np.sqrt(np.diag(Q))
+    np.testing.assert_allclose(np.cov((x - belief.mean).T), belief.covariance[0], rtol=0.1, atol=0.01)
+
+
+def test_no_reading_changes_nothing():
+    belief = Gaussian(np.ones((2, 2)), np.broadcast_to(np.eye(2), (2, 2, 2)))
+    reading = Reading(np.array([5.0, 5.0]), np.ones((2, 2)), np.array([np.inf, 1.0]))
+    found = kalman.correct(belief, reading, 4.0)
+    np.testing.assert_array_equal(found.mean[0], belief.mean[0])
+    np.testing.assert_array_equal(found.covariance[0], belief.covariance[0])
+    assert np.all(found.mean[1] > belief.mean[1])
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_an_outlier_counts_as_the_gate_and_no_more(sign):
+    belief = Gaussian(np.zeros((2, 2)), np.broadcast_to(np.eye(2), (2, 2, 2)))
+    row = np.broadcast_to(H[0], (2, 2))
+    sd = np.sqrt(H[0] @ H[0] + 1.0)
+    found = kalman.correct(belief, Reading(sign * np.array([3.0 * sd, 1e6]), row, np.ones(2)), 3.0)
+    np.testing.assert_allclose(found.mean[1], found.mean[0])
+
+
+def test_the_noise_of_a_sensor_is_found_from_the_innovations():
+    rng = np.random.default_rng(2)
+    sds = np.array([0.2, 1.0, 3.0])
+    predicted = np.full(3, 0.3)
+    variance = np.ones(3)
+    averages = []
+    for _ in range(20000):
+        innovation = rng.normal(size=3) * np.sqrt(predicted + sds**2)
+        variance = kalman.observed_noise(
+            variance, innovation, predicted, np.ones(3, bool), 0.999, (1e-4, 100.0), np.inf
+        )
+        averages.append(variance)
+    np.testing.assert_allclose(np.mean(averages[4000:], axis=0), sds**2, rtol=0.1)
+
+
+def test_an_unseen_sample_and_the_range_bound_the_noise():
+    args = (np.array([1e3, 1e3, 0.0]), np.zeros(3), np.array([False, True, True]), 0.0, (0.5, 2.0), np.inf)
+    np.testing.assert_array_equal(kalman.observed_noise(np.ones(3), *args), [1.0, 2.0, 0.5])

@@ -1,0 +1,159 @@
+"""The late, shaken ring in the LQG's model: against the covariance equation, the environment's camera, known tones."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cz_gym import make_puller
+from cz_gym.baselines.lqg import late_ring
+from cz_gym.baselines.lqg import linear_theory as lqg_linear
+from cz_gym.baselines.lqg import settings as lqg_settings
+from cz_gym.baselines.lqg.controller import LQG, LQGSettings, solve
+from cz_gym.baselines.lqg.late_ring import RingModel, frequencies, listen
+from cz_gym.baselines.lqg.model import STATES, NoiseModel, plant_model
+from cz_gym.baselines.lqg.settings import PULLER_RING
+from cz_gym.config import make_config
+from cz_gym.episodes.scenario import Interface, Scenario, Sensor
+from cz_gym.episodes.scenarios import PULLER as PULLER_SCENARIO
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.observation import MEASURED, scales
+from cz_gym.task import cost_terms
+from cz_gym.units import MINUTE, MM
+
+PULLER = make_puller(lam=0.5)
+LINEAR = replace(LQGSettings(), nonlinear=False, gate=np.inf, noise=NoiseModel(camera_memory=np.inf, recipe_share=0.0))
+KNOWN = RingModel(5.0, 0.1 * MM, 10.0 * MINUTE, rotation=(10.0 / MINUTE, 10.0 / MINUTE))
+
+
+def measured(**values):
+    """An observation of these values [SI], the rest zero and the camera valid."""
+    n = len(next(iter(values.values())))
+    columns = {channel.name: np.zeros(n) for channel in MEASURED} | {"valid": np.ones(n)} | values
+    return np.stack([columns[channel.name] for channel in MEASURED], axis=1) / scales(MEASURED, PULLER.v_0)
+
+
+@pytest.mark.parametrize(("ring", "dt"), [(KNOWN, 5.0), (RingModel(5.0), 10.0)])
+def test_cost_with_a_late_ring_matches_the_covariance_equation(ring, dt):
+    """Mean cost under white noise is the sum of what one kick of each noise costs: one slot a kick, through predict."""
+    gains = solve(replace(LINEAR, ring=ring), dt, PULLER)
+    model, noise = gains.eye.model, gains.eye.noise
+    moving = lqg_linear.stationary(model)
+    both, m = np.ix_(moving, moving), len(moving)
+    A, B, H = model.A[both], model.B[moving], model.H[:, moving]
+    kicks = np.vstack([lqg_linear._root(model.Q[both]).T, np.zeros((2, m))])
+    glitches = np.vstack([np.zeros((m, 2)), np.diag([noise.camera_sd, noise.pyrometer_sd])])
+    x, u, state, cost, settle = np.zeros((m + 2, m)), np.zeros((m + 2, 2)), None, [], 700
+    controller = LQG(replace(LINEAR, ring=ring), dt)
+    for k in range(settle + 1200):
+        y = x @ H.T + glitches * (k == settle)
+        action, state = controller.predict(measured(ring_error=y[:, 0], T_1=y[:, 1], v_p=u[:, 0], Q_H=u[:, 1]), state)
+        moved = action.astype(float) * [PULLER.v_0, 1e4]
+        cost.append([np.sum(term) for term in cost_terms(x[:, 0], moved[:, 0], *(moved - u).T)])
+        x, u = x @ A.T + moved @ B.T + kicks * (k == settle), moved
+    terms = np.sum(cost, axis=0)
+    np.testing.assert_allclose(terms, lqg_linear.stationary_cost(gains), rtol=1e-2)
+    assert np.sum(cost[-100:]) < 1e-3 * np.sum(terms)
+
+
+def test_to_know_of_the_latency_costs_less_than_to_ignore_it():
+    cheap = [
+        sum(lqg_linear.stationary_cost(solve(replace(LINEAR, ring=RingModel(t)), 5.0, PULLER))) for t in (0, 5, 10)
+    ]
+    assert cheap[0] == pytest.approx(sum(lqg_linear.stationary_cost(solve(LINEAR, 5.0, PULLER))), rel=1e-9)
+    assert cheap[0] < cheap[1] < cheap[2]
+
+
+@pytest.mark.parametrize("latency", [0.0, 2.0, 5.0, 7.0])
+@pytest.mark.parametrize("dt", [2.0, 5.0, 10.0])
+def test_a_ring_that_grows_evenly_is_delivered_as_old_as_the_latency(latency, dt):
+    ring, slope, steps = RingModel(latency), 3e-7, 20
+    model = late_ring.augmented(plant_model(PULLER, NoiseModel(), dt), ring, dt)
+    row = np.zeros((1, len(model.A)))
+    row[0, 0] = 1.0
+    A = late_ring.transition(np.eye(len(model.A)), row, np.zeros(1), ring, dt)[0]
+    for state in range(ring.late, len(A)):
+        A[state] = row[0] if state == ring.late else np.eye(len(A))[state - 1]
+    x = np.zeros(len(A))
+    for k in range(steps):
+        x = A @ x
+        x[0] = slope * (k + 1) * dt
+    delivered = late_ring.reading_row(row, ring, dt)[0] @ x
+    assert delivered == pytest.approx(slope * (steps * dt - latency), rel=1e-12)
+
+
+@pytest.mark.parametrize("dt", [5.0, 10.0])
+def test_the_camera_of_the_environment_is_late_as_modelled(dt):
+    late = Scenario("late", interface=Interface(sd=(0.3, 0.3)), sensor=Sensor(latency=5.0))
+    run = rollout(LQG(control_interval=dt), make_config(late, control_interval=dt, horizon=1200.0), [1])
+    prompt, delivered = run.signals.r_br[:, 0], run.signals.r_br_measured[:, 0]
+    samples, oldest = RingModel(5.0).delay(dt)
+    assert samples == 1
+    expected = oldest * prompt[:-1] + (1.0 - oldest) * prompt[1:]
+    np.testing.assert_allclose(delivered[1:], expected, atol=1e-7 if dt == 5.0 else 5e-6)
+
+
+# The search for the ripple
+
+
+def heard(tone_hz, amplitude, noise, samples, dt=5.0, slots=40, ring=PULLER_RING):
+    rng = np.random.default_rng(6)
+    phase, search = rng.uniform(0.0, 2.0 * np.pi, slots), late_ring.begin(slots, ring, dt)
+    for k in range(samples):
+        rest = amplitude * np.sin(2.0 * np.pi * tone_hz * k * dt + phase) + noise * rng.normal(size=slots)
+        found = listen(search, rest, np.ones(slots, bool), ring, dt)
+        search = found.search
+    return found, amplitude * np.sin(2.0 * np.pi * tone_hz * k * dt + phase)
+
+
+@pytest.mark.parametrize("dt", [2.0, 5.0, 10.0])
+@pytest.mark.parametrize("rotation", [8.3, 11.2, 12.2, 14.9])
+def test_a_tone_is_found_where_its_alias_is(rotation, dt):
+    tone = rotation / MINUTE
+    alias = abs(tone - round(tone * dt) / dt)
+    found, now = heard(tone, 0.1 * MM, 0.05 * MM, round(1200.0 / dt), dt)
+    half_a_bin = 0.125 / PULLER_RING.memory
+    np.testing.assert_allclose(found.search.omega / (2.0 * np.pi), alias, atol=half_a_bin)
+    assert np.sqrt(np.mean((found.ripple[:, 0] - now) ** 2)) < PULLER_RING.ripple_sd
+
+
+def test_where_there_is_no_ripple_the_search_for_one_costs_little():
+    calm = Scenario("calm", interface=Interface(sd=(0.2, 0.2)), sensor=Sensor(camera_noise=(5e-5, 5e-5), latency=5.0))
+    config, seeds = make_config(calm, horizon=3600.0), range(12)
+    searching = metrics(rollout(LQG(replace(lqg_settings.REWARD, ring=PULLER_RING)), config, seeds))
+    knowing = metrics(rollout(LQG(replace(lqg_settings.REWARD, ring=RingModel(5.0))), config, seeds))
+    assert searching.rmse_mm.mean() < 1.05 * knowing.rmse_mm.mean()
+
+
+def test_what_cannot_be_told_from_the_radius_is_not_searched():
+    assert frequencies(PULLER_RING, 5.0).min() >= 2.0 * np.pi * PULLER_RING.lowest
+    assert not len(frequencies(KNOWN, 5.0))
+
+
+def test_once_found_the_ripple_is_left_out_of_the_radius():
+    shaken = Scenario(
+        "shaken", interface=Interface(sd=(0.2, 0.2)),
+        sensor=Sensor(latency=5.0, ripple=(0.2 * MM, 0.2 * MM), rotation=PULLER_SCENARIO.sensor.rotation),
+    )  # fmt: skip
+    config, seeds = make_config(shaken, horizon=3600.0), range(12)
+    knowing = metrics(rollout(LQG(replace(lqg_settings.REWARD, ring=PULLER_RING)), config, seeds))
+    late = metrics(rollout(LQG(replace(lqg_settings.REWARD, ring=RingModel(5.0))), config, seeds))
+    assert knowing.rmse_mm.mean() < 0.75 * late.rmse_mm.mean()
+    assert knowing.pull_step_rms_mm_per_min.mean() < late.pull_step_rms_mm_per_min.mean()
+
+
+def test_a_ring_that_is_neither_late_nor_shaken_adds_nothing():
+    model = plant_model(PULLER, NoiseModel(), 5.0)
+    for plain, with_ring in zip(model, late_ring.augmented(model, RingModel(), 5.0), strict=True):
+        np.testing.assert_allclose(with_ring, plain, rtol=1e-12, atol=1e-30)
+    config = make_config("randomized", horizon=1200.0)
+    plain, with_ring = (rollout(LQG(replace(LQGSettings(), ring=ring)), config, [3]) for ring in (None, RingModel()))
+    np.testing.assert_allclose(with_ring.signals.v_p, plain.signals.v_p, rtol=1e-6)
+
+
+def test_the_ripple_keeps_its_variance():
+    model = late_ring.augmented(plant_model(PULLER, NoiseModel(), 5.0), PULLER_RING, 5.0)
+    both = slice(len(STATES), len(STATES) + 2)
+    A, Q = model.A[both, both], model.Q[both, both]
+    np.testing.assert_allclose(A @ A.T * PULLER_RING.ripple_sd**2 + Q, PULLER_RING.ripple_sd**2 * np.eye(2), atol=1e-18)

@@ -1,0 +1,281 @@
+"""The LQG against the exact optimum, the covariance equation, the nonlinear plant and the environment's own draws."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from cz_gym import make_puller
+from cz_gym.baselines.lqg import kalman
+from cz_gym.baselines.lqg import linear_theory as lqg_linear
+from cz_gym.baselines.lqg.controller import LQG, LQGSettings, at_rest, solve
+from cz_gym.baselines.lqg.model import DRIFT, FAST, HEATER, PLANT, SLOW, STATES, NoiseModel, load_per_drift, plant_model
+from cz_gym.baselines.lqg.preview import look_ahead, samples_ahead
+from cz_gym.baselines.lqg.regulator import Weights, quadratic_cost, regulator
+from cz_gym.config import make_config
+from cz_gym.episodes.schedule import quintic
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.observation import MEASURED, Measured, scales
+from cz_gym.physics.meniscus import HURLE
+from cz_gym.physics.plant import Disturbance, Inputs, State, hidden_load, rates
+from cz_gym.task import cost_terms
+from tests.observed import observations
+
+PULLER = make_puller(lam=0.5)
+NOISE = NoiseModel()
+LINEAR = replace(
+    LQGSettings(), nonlinear=False, gate=np.inf, noise=replace(NOISE, camera_memory=np.inf, recipe_share=0.0)
+)
+
+
+def measured(**values):
+    """An observation of these values [SI], the rest zero and the camera valid."""
+    n = len(next(iter(values.values())))
+    columns = {channel.name: np.zeros(n) for channel in MEASURED} | {"valid": np.ones(n)} | values
+    return np.stack([columns[channel.name] for channel in MEASURED], axis=1) / scales(MEASURED, PULLER.v_0)
+
+
+# The augmented plant
+
+
+def test_the_sampled_plant_moves_as_the_equations_do():
+    rng = np.random.default_rng(0)
+    small = np.array([1e-6, 1e-6, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-6, 0.1])
+    z, u, dt = rng.normal(size=len(STATES)) * small, np.array([1e-8, 1.0]), 20.0
+
+    def motion(t, y):
+        x = State(*(y[:PLANT] + np.array(PULLER.state_0)))
+        drives = Inputs(PULLER.v_0 + u[0], PULLER.Q_H_0 + u[1] + y[HEATER])
+        d = Disturbance(float(hidden_load(y[DRIFT], PULLER)), y[FAST] + y[SLOW], 1.0)
+        rate = -y[DRIFT + 1] / NOISE.drift_rate_tau
+        own = [-y[FAST] / NOISE.fast_tau, -y[SLOW] / NOISE.slow_tau, y[DRIFT + 1], rate, 0.0]
+        return np.array([*rates(x, drives, d, PULLER, HURLE.slope), *own])
+
+    exact = solve_ivp(motion, (0.0, dt), z, rtol=1e-10, atol=1e-14).y[:, -1]
+    model = plant_model(PULLER, NOISE, dt)
+    np.testing.assert_allclose(model.A @ z + model.B @ u, exact, rtol=2e-3, atol=1e-3 * small.min())
+
+
+def test_the_fluctuations_keep_their_variance():
+    model = plant_model(PULLER, NOISE, 5.0)
+    for state, sd in ((FAST, NOISE.fast_sd), (SLOW, NOISE.slow_sd), (DRIFT + 1, NOISE.drift_rate_sd)):
+        assert model.A[state, state] ** 2 * sd**2 + model.Q[state, state] == pytest.approx(sd**2, rel=1e-9)
+    two = plant_model(PULLER, NOISE, 10.0)
+    np.testing.assert_allclose(model.A @ model.Q @ model.A.T + model.Q, two.Q, rtol=1e-6, atol=1e-25)
+
+
+def test_load_per_drift_is_the_slope_of_the_hidden_load():
+    difference = (hidden_load(0.01, PULLER) - hidden_load(-0.01, PULLER)) / 0.02
+    assert load_per_drift(PULLER) == pytest.approx(difference, rel=1e-6)
+
+
+# The regulator
+
+
+def brute_force_first_move(model, weights, dt, z, steps, reference_steps, drift_steps):
+    """The first optimal move by least squares over all moves of a long horizon."""
+    n = len(model.A)
+    A = np.block([[model.A, model.B], [np.zeros((2, n)), np.eye(2)]])
+    B = np.vstack([model.B, np.eye(2)])
+    free, forced, radius = z.copy(), np.zeros((n + 2, 2 * steps)), 0.0
+    Q, _, R = quadratic_cost(weights, dt)
+    pull, moves = Q[PLANT, PLANT], np.diag(R) - np.array([Q[PLANT, PLANT], 0.0])
+    rows, targets = [], []
+    for k in range(steps):
+        move = np.zeros((2, 2 * steps))
+        move[:, 2 * k : 2 * k + 2] = np.eye(2)
+        forced, free = A @ forced + B @ move, A @ free
+        if k < len(drift_steps):
+            free[DRIFT] += drift_steps[k]
+            radius += reference_steps[k]
+        terms = (
+            (Q[0, 0], forced[0], free[0] - radius),
+            (pull, forced[n], free[n]),
+            (moves[0], move[0], 0.0),
+            (moves[1], move[1], 0.0),
+        )
+        for weight, row, offset in terms:
+            rows.append(np.sqrt(weight) * row)
+            targets.append(-np.sqrt(weight) * offset)
+    unknown_scale = np.tile([1e-6, 1e3], steps)
+    solution = np.linalg.lstsq(np.array(rows) * unknown_scale, np.array(targets), rcond=None)[0]
+    return (solution * unknown_scale)[:2]
+
+
+@pytest.mark.parametrize("what", ["state", "reference", "drift", "drift-rate"])
+def test_the_first_move_is_that_of_the_whole_horizon(what):
+    dt, ahead = 30.0, 10
+    noise = replace(NOISE, drift_rate_tau=600.0)
+    model, weights = plant_model(PULLER, noise, dt), Weights(heater_step=0.5)
+    law = regulator(model, weights, dt, ahead)
+    z, reference, drift = np.zeros(len(STATES) + 2), np.zeros(ahead), np.zeros(ahead)
+    if what == "state":
+        z[:] = [1e-4, 1e-4, 1.0, 0.5, 0.2, 0.1, 0.2, 0.0, 0.0, 10.0, 1e-6, 100.0]
+    elif what == "reference":
+        reference[:] = np.linspace(0.0, 1e-4, ahead)
+    elif what == "drift":
+        drift[:] = np.linspace(0.1, 0.0, ahead)
+    else:
+        z[[DRIFT, DRIFT + 1]] = 1.0, 1e-3
+    expected = brute_force_first_move(model, weights, dt, z, 500, reference, drift)
+    found = -law.feedback @ z + reference @ law.reference + drift @ law.drift
+    # A shifted reference counts as an equilibrium of its own, though the free radius drifts off it by 9e-6 a second.
+    rtol = 0.02 if what == "reference" else 2e-3
+    np.testing.assert_allclose(found, expected, rtol=rtol, atol=0.0)
+
+
+def test_the_weights_on_moves_keep_the_same_law_at_other_intervals():
+    laws = [regulator(plant_model(PULLER, NOISE, dt), Weights(), dt, 1).feedback / dt for dt in (0.5, 1.0)]
+    np.testing.assert_allclose(laws[0][0, :2], laws[1][0, :2], rtol=0.05)
+
+
+# The filter and the loop on the linear plant
+
+
+def test_measured_cost_on_the_linear_plant_matches_the_covariance_equation():
+    gains = solve(LINEAR, 5.0, PULLER)
+    controller = LQG(LINEAR)
+    model, noise = controller.gains.eye.model, LINEAR.noise
+    np.testing.assert_array_equal(model.A, gains.eye.model.A)
+    rng = np.random.default_rng(3)
+    n, m, steps, settle = 500, lqg_linear.FLUCTUATING, 2400, 400
+    A, B, H = model.A[:m, :m], model.B[:m], model.H[:, :m]
+    kick = lqg_linear._root(model.Q[:m, :m])
+    x = np.zeros((n, m))
+    x[:, FAST:] = rng.normal(size=(n, 2)) * [noise.fast_sd, noise.slow_sd]
+    u, state, totals = np.zeros((n, 2)), None, []
+    for k in range(steps):
+        y = x @ H.T + rng.normal(size=(n, 2)) * [noise.camera_sd, noise.pyrometer_sd]
+        observation = measured(ring_error=y[:, 0], T_1=y[:, 1], v_p=u[:, 0], Q_H=u[:, 1])
+        action, state = controller.predict(observation, state)
+        assert np.all(np.abs(action) < 1.0)
+        moved = action.astype(float) * [PULLER.v_0, 1e4]
+        if k >= settle:
+            totals.append([np.mean(term) for term in cost_terms(x[:, 0], moved[:, 0], *(moved - u).T)])
+        u = moved
+        x = x @ A.T + u @ B.T + rng.normal(size=(n, m)) @ kick.T
+    expected = lqg_linear.stationary_cost(gains)
+    assert np.mean(np.sum(totals, axis=1)) == pytest.approx(sum(expected), rel=0.02)
+    np.testing.assert_allclose(np.mean(totals, axis=0), expected, rtol=0.06)
+
+
+def test_separation_the_loop_has_the_poles_of_regulator_and_filter():
+    gains = solve(LINEAR, 5.0, PULLER)
+    model, n = gains.eye.model, len(STATES)
+    found = np.linalg.eigvals(lqg_linear.closed_loop(gains).A)
+    A = np.block([[model.A[:PLANT, :PLANT], model.B[:PLANT]], [np.zeros((2, PLANT)), np.eye(2)]])
+    B = np.vstack([model.B[:PLANT], np.eye(2)])
+    regulated = A - B @ gains.regulator.feedback[:, [*range(PLANT), n, n + 1]]
+    filtered = model.A @ (np.eye(n) - lqg_linear.steady_gain(gains) @ model.H)
+    fluctuations = np.diag(model.A)[[FAST, SLOW]]
+    expected = np.concatenate([np.linalg.eigvals(regulated), np.linalg.eigvals(filtered), fluctuations])
+    np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(expected), atol=1e-5)
+    assert np.abs(found).max() < 1.0
+
+
+def test_the_linear_system_is_the_controller():
+    gains = solve(LINEAR, 5.0, PULLER)
+    law = lqg_linear.controller(gains)
+    rng = np.random.default_rng(4)
+    ring, T_1 = rng.normal(size=50) * 1e-5, rng.normal(size=50) * 0.01
+    policy, s, u = LQG(LINEAR), np.zeros(len(law.A)), np.zeros(2)
+    A, _, H, Q, _ = gains.eye.model
+    P = kalman.steady_state(A, H, Q, np.diag([LINEAR.noise.camera_sd**2, LINEAR.noise.pyrometer_sd**2]))
+    before = np.linalg.solve(A, np.linalg.solve(A, P - Q).T)
+    state = at_rest(1, gains)._replace(covariance=before[None], begun=np.ones(1))
+    for k in range(50):
+        observation = measured(ring_error=ring[k : k + 1], T_1=T_1[k : k + 1], v_p=u[:1], Q_H=u[1:])
+        action, state = policy.predict(observation, state)
+        y = np.array([ring[k], T_1[k]])
+        expected, s = law.C @ s + law.D @ y, law.A @ s + law.B @ y
+        u = action[0].astype(float) * [PULLER.v_0, 1e4]
+        np.testing.assert_allclose(u, expected, rtol=1e-3, atol=1e-3 * np.abs(law.D @ [1e-5, 0.01]).min())
+
+
+# The preview
+
+
+@pytest.mark.parametrize("dt", [2.0, 5.0, 10.0])
+def test_the_plan_is_the_recipe_five_minutes_ahead(dt):
+    def recipe(t):
+        return 1e-3 * quintic(np.clip((t - 400.0) / 1200.0, 0.0, 1.0))
+
+    zeros = np.zeros(1)
+    samples = samples_ahead(dt)
+    plan = np.zeros((1, 2, samples + 1))
+    for k in range(round(900.0 / dt)):
+        shown = [np.array([recipe(k * dt + ahead)]) for ahead in (0.0, 60.0, 300.0)]
+        seen = Measured(zeros, zeros, *shown, *(2.0 * value for value in shown), zeros, zeros, zeros)
+        plan = look_ahead(plan, seen, np.array([k == 0]), dt)
+        if k * dt >= 300.0:
+            future = recipe((k + np.arange(samples + 1)) * dt)
+            np.testing.assert_allclose(plan[0, 0], future, atol=1e-15)
+            np.testing.assert_allclose(plan[0, 1], 2.0 * future, atol=1e-15)
+
+
+# The seam
+
+
+def test_one_slot_alone_acts_as_in_a_batch():
+    policy, together, alone = LQG(), None, None
+    for observation in observations():
+        actions, together = policy.predict(observation, together)
+        action, alone = policy.predict(observation[1], alone)
+        assert action.shape == (2,)
+        assert action.dtype == np.float32
+        np.testing.assert_allclose(action, actions[1], rtol=1e-5, atol=1e-7)
+
+
+def test_an_episode_that_begins_forgets_the_one_before():
+    policy, state = LQG(), None
+    for observation in observations():
+        _, state = policy.predict(observation, state)
+    starts = np.array([False, True, False])
+    resumed, _ = policy.predict(observation, state, starts)
+    anew, _ = policy.predict(observation)
+    went_on, _ = policy.predict(observation, state)
+    np.testing.assert_array_equal(resumed[1], anew[1])
+    np.testing.assert_array_equal(resumed[[0, 2]], went_on[[0, 2]])
+    assert np.abs(anew[0] - went_on[0]).max() > 0.0
+
+
+def test_history_observations_serve_as_well():
+    seen = zip(observations(), observations(observation="history"), strict=True)
+    for measured_only, history in seen:
+        np.testing.assert_array_equal(LQG().predict(measured_only)[0], LQG().predict(history)[0])
+
+
+def test_while_the_camera_is_out_its_reading_is_not_believed():
+    policy = LQG()
+    states = []
+    for wrong in (0.0, 5e-3):
+        first = measured(ring_error=np.zeros(1))
+        _, state = policy.predict(first)
+        _, state = policy.predict(measured(ring_error=np.full(1, wrong), valid=np.zeros(1)), state)
+        states.append(state)
+    np.testing.assert_array_equal(states[0].mean, states[1].mean)
+    assert states[0].covariance[0, 0, 0] > 0.0
+
+
+def test_settings_are_hashed_by_content():
+    assert LQGSettings().hash == LQGSettings().hash
+    assert LQGSettings().hash != LQGSettings(lam=0.4).hash
+
+
+# In the environment
+
+
+@pytest.mark.parametrize("control_interval", [2.0, 5.0, 10.0])
+def test_it_holds_randomised_pullers_at_every_interval(control_interval):
+    config = make_config("randomized", control_interval=control_interval, horizon=3600.0)
+    found = metrics(rollout(LQG(control_interval=control_interval), config, range(12)))
+    assert not found.failure_rate.any()
+    assert found.rmse_mm.mean() < 0.12
+
+
+def test_without_disturbance_it_stays_where_it_is():
+    config = make_config("nominal", model=0.5, horizon=1800.0)
+    run = rollout(LQG(), config, [0])
+    assert metrics(run).max_error_mm[0] < 1e-3

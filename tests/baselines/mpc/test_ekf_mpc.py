@@ -1,0 +1,293 @@
+"""The predictive controller: against the LQR, the plant itself, finite differences, SciPy, and Bayes' rule."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from cz_gym.baselines import optional
+from cz_gym.baselines.lqg import filter_bank as bank
+from cz_gym.baselines.lqg.controller import LQG, LQGSettings, act
+from cz_gym.baselines.lqg.filter_bank import Hypotheses
+from cz_gym.baselines.lqg.model import DRIFT, HEATER, PLANT, STATES
+from cz_gym.baselines.lqg.regulator import cost_to_go, quadratic_cost
+from cz_gym.baselines.lqg.settings import PULLER_RING
+from cz_gym.baselines.registry import find_controller
+from cz_gym.config import make_config
+from cz_gym.episodes.scenario import Actuators
+from cz_gym.episodes.scenarios import RANDOMIZED
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.observation import Measured
+from cz_gym.physics.plant import Disturbance, Inputs, State, hidden_load, rk4
+from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
+
+pytest.importorskip("casadi", reason="needs the extra mpc")
+
+from cz_gym.baselines.bounds.trajectory import Limits
+from cz_gym.baselines.mpc.controller import EkfMpc, ekf_mpc, newton, objective
+from cz_gym.baselines.mpc.limits import best_corrections
+from cz_gym.baselines.mpc.model import SCALES
+from cz_gym.baselines.mpc.prediction import expected_disturbances, held, predict_under_law
+
+LINEAR = LQGSettings(nonlinear=False)
+SHARE = LINEAR.noise.recipe_share
+
+
+def situation(n=4, reference=0.0, size=1.0):
+    """Estimates, plans and previous inputs, all of plausible size; the recipe of T_1 moves."""
+    random = np.random.default_rng(7)
+    estimate = random.normal(size=(n, len(STATES))) * [1e-4, 1e-4, 0.5, 0.5, 0.2, 0.2, 0.2, 0.5, 1e-4, 50.0]
+    plan = np.zeros((n, 2, 61))
+    plan[:, 0] = reference * np.linspace(0.0, 1.0, 61)
+    plan[:, 1] = np.cumsum(random.normal(size=(n, 61)) * 0.05, axis=1)
+    previous = random.normal(size=(n, 2)) * [1e-6, 100.0]
+    return size * estimate, plan * size, size * previous
+
+
+class Watched:
+    """A policy whose memory is kept, sample by sample."""
+
+    def __init__(self, policy):
+        self.policy, self.states = policy, []
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        action, state = self.policy.predict(observation, state, episode_start)
+        self.states.append(state)
+        return action, state
+
+
+def parts(mpc, estimate, plan, previous):
+    """Prediction, curvature and slope as the controller makes them."""
+    gains, shape = mpc.lqg.gains, mpc.shape
+    disturbances = expected_disturbances(estimate, plan, gains, SHARE, shape.stages)
+    z = np.concatenate([estimate[:, :PLANT], previous], axis=1) / SCALES
+    prediction = predict_under_law(z, plan, disturbances, gains, SHARE, shape)
+    cost = objective(mpc.lqg.settings, gains.eye.puller, shape)
+    H, g = newton(prediction, held(plan, shape.stages)[:, -1, 0], disturbances[:, -1], cost)
+    return prediction, H, g, disturbances
+
+
+@pytest.mark.parametrize(("dt", "blocks"), [(5.0, (1, 1, 2, 4, 8, 16)), (10.0, (1, 3)), (2.0, (1, 40))])
+def test_on_a_linear_plant_without_limits_it_is_the_lqr(dt, blocks):
+    lqg = LQG(LINEAR, dt)
+    mpc = EkfMpc(lqg, blocks=blocks)
+    estimate, plan, previous = situation()
+    plan = np.pad(plan, ((0, 0), (0, 0), (0, 90)), "edge")[:, :, : round(300.0 / dt) + 1]
+    law = act(estimate, plan, previous, lqg.gains.regulator, SHARE, lqg.parameters.v_0)
+    assert mpc.moves(estimate, plan, previous, lqg.gains) == pytest.approx(law, rel=1e-8)
+
+
+def test_no_correction_pays_on_a_linear_plant_whatever_the_recipe_brings():
+    mpc = EkfMpc(LQG(LINEAR))
+    _, H, g, _ = parts(mpc, *situation())
+    worth = np.einsum("nc,nc->n", g, np.linalg.solve(H, g[:, :, None])[:, :, 0])
+    assert (np.linalg.eigvalsh(H) > 0.0).all()
+    assert np.abs(worth).max() < 1e-16
+
+
+def test_the_cost_beyond_the_horizon_is_that_of_the_law():
+    """From any state: one stage's cost plus the cost-to-go after it is the cost-to-go before it, up to what only the
+    disturbances decide, which cancels between two states that see the same ones."""
+    gains, dt = LQG(LINEAR).gains, 5.0
+    model = gains.eye.model
+    P, X = cost_to_go(model, LINEAR.weights, dt)
+    Q, N, R = quadratic_cost(LINEAR.weights, dt)
+    d = np.array([0.3, -0.2, 1.0, 0.0, 40.0])
+    feedback = gains.regulator.feedback
+    K, K_d = np.hstack([feedback[:, :PLANT], feedback[:, -2:]]), feedback[:, PLANT:-2]
+
+    def difference(z):
+        du = -K @ z - K_d @ d
+        u = z[PLANT:] + du
+        after = np.concatenate([model.A[:PLANT] @ np.concatenate([z[:PLANT], d]) + model.B[:PLANT] @ u, u])
+        d_after = model.A[PLANT:, PLANT:] @ d
+        stage = z @ Q @ z + 2.0 * z @ N @ du + du @ R @ du
+        return stage + after @ P @ after + 2.0 * after @ X @ d_after - z @ P @ z - 2.0 * z @ X @ d
+
+    random = np.random.default_rng(1)
+    found = [difference(random.normal(size=7) * SCALES * 0.1) for _ in range(4)]
+    assert found == pytest.approx([found[0]] * 4, rel=1e-6)
+
+
+def test_casadi_predicts_what_the_plant_does():
+    mpc = EkfMpc(LQG(LQGSettings()))
+    estimate, plan, previous = situation(reference=1.0 * MM)
+    prediction, _, _, disturbances = parts(mpc, estimate, plan, previous)
+    p = mpc.lqg.gains.eye.puller
+    for i in range(len(estimate)):
+        x = State(*(np.array(p.state_0) + estimate[i, :PLANT]))
+        for k in range(mpc.shape.stages):
+            d = disturbances[i, k]
+            pull, power = prediction.shown[i, k, 1:3] * SCALES[PLANT:]
+            load = Disturbance(hidden_load(d[DRIFT - PLANT], p), d[0] + d[1], 1.0)
+            x = rk4(x, Inputs(p.v_0 + pull, p.Q_H_0 + power + d[HEATER - PLANT]), load, p, 5.0, mpc.lqg.meniscus.slope)
+            error = prediction.shown[i, k, 0] * MM
+            assert error == pytest.approx(x.r_c - p.r_0 - held(plan, k + 1)[i, -1, 0], abs=1e-13)
+        assert prediction.last[i, :PLANT] * SCALES[:PLANT] == pytest.approx(np.array(x) - p.state_0, abs=1e-9)
+
+
+def test_the_sensitivities_agree_with_finite_differences():
+    """The first block's correction acts on the first move alone, as a change of the previous inputs would but for K."""
+    mpc = EkfMpc(LQG(LQGSettings()), blocks=(1, 2, 4))
+    estimate, plan, previous = situation(n=2)
+    prediction, _, _, _ = parts(mpc, estimate, plan, previous)
+    assert prediction.shown_c.shape == (2, 60, 5, 6)
+    size = np.array([1e-3, 1e-3])
+    K = mpc.lqg.gains.regulator.feedback[:, -2:] * SCALES[PLANT:] / SCALES[PLANT:, None]
+    for j in range(2):
+        change = np.zeros(2)
+        change[j] = size[j]
+        found = []
+        for sign in (1.0, -1.0):
+            shifted, _, _, _ = parts(mpc, estimate, plan, previous + sign * change * SCALES[PLANT:])
+            found.append(shifted.shown)
+        slope = (found[0] - found[1]) / (2.0 * size[j])
+        # d(first input)/d(previous j) = (I - K)_j: the same as corrections (I - K)_j to the first block.
+        same = prediction.shown_c[:, :, :, :2] @ (np.eye(2) - K)[:, j]
+        assert slope[:, 1:] == pytest.approx(same[:, 1:], rel=1e-5, abs=1e-7)
+
+
+def test_limits_are_kept_at_least_cost():
+    random = np.random.default_rng(2)
+    mpc = EkfMpc(LQG(LQGSettings()))
+    prediction, H, g, _ = parts(mpc, *situation())
+    g = g + 0.2 * random.normal(size=g.shape) * np.sqrt(np.diagonal(H, axis1=1, axis2=2))
+    limits = Limits(np.array([0.3, 2.0]), np.array([0.03, 0.6]))
+    corrections = best_corrections(H, g, prediction, mpc.blocks, limits)
+    at = np.cumsum((0, *mpc.blocks[:-1]))
+    most = np.tile(np.concatenate([limits.span, limits.move]), len(at))
+    for i in range(len(g)):
+        rows = prediction.shown_c[i, at, 1:].reshape(-1, g.shape[1])
+        free = prediction.shown[i, at, 1:].ravel()
+        assert (np.abs(free + rows @ corrections[i]) <= most + 1e-7).all()
+        peer = minimize(
+            lambda c, i=i: 0.5 * c @ H[i] @ c + g[i] @ c, np.zeros(len(g[i])), jac=lambda c, i=i: H[i] @ c + g[i],
+            method="SLSQP", options={"ftol": 1e-14, "maxiter": 500},
+            constraints={
+                "type": "ineq",
+                "fun": lambda c, rows=rows, free=free: np.concatenate([most - free - rows @ c, most + free + rows @ c]),
+                "jac": lambda c, rows=rows: np.concatenate([-rows, rows]),
+            },
+        )  # fmt: skip
+        ours = 0.5 * corrections[i] @ H[i] @ corrections[i] + g[i] @ corrections[i]
+        assert ours <= peer.fun + 1e-6 * abs(peer.fun)
+        assert (np.abs(free + rows @ corrections[i]) > most - 1e-6).any(), "no limit was active"
+
+
+def test_where_not_all_limits_can_be_kept_those_of_now_are():
+    mpc = EkfMpc(LQG(LQGSettings()))
+    prediction, H, g, _ = parts(mpc, *situation())
+    limits = Limits(np.array([0.2, 0.5]), np.array([0.02, 0.1]))
+    corrections = best_corrections(H, g, prediction, mpc.blocks, limits)
+    now = prediction.shown[:, 0, 1:] + (prediction.shown_c[:, 0, 1:] @ corrections[:, :, None])[:, :, 0]
+    assert (np.abs(now) <= np.concatenate([limits.span, limits.move]) + 1e-7).all()
+
+
+def test_what_it_asks_for_is_within_the_drives_limits():
+    actuators = Actuators(
+        pull_window=0.02 * MM_PER_MIN, pull_slew=0.05 * MM_PER_MIN / MINUTE, heater_slew=0.5 * KILO / MINUTE
+    )
+    config = make_config(replace(RANDOMIZED, name="narrow", actuators=actuators), horizon=0.25 * HOUR)
+    watched = Watched(ekf_mpc(config))
+    run = rollout(watched, config, range(1_000_000, 1_000_003))
+    wanted = np.array([state.asked for state in watched.states])
+    pull = run.signals.v_p - config.parameters.v_0
+    assert not run.failed.any()
+    # The drives follow to the last digit: nothing was asked for that they could not do.
+    assert pull == pytest.approx(wanted[:, :, 0], abs=1e-6 * actuators.pull_window)
+    power = np.diff(run.signals.Q_H, axis=0)
+    assert power == pytest.approx(np.diff(wanted[:, :, 1], axis=0), abs=0.01)
+    assert np.abs(pull).max() == pytest.approx(actuators.pull_window, rel=1e-3)
+
+
+@pytest.mark.parametrize("ring", [None, PULLER_RING])
+def test_one_filter_is_the_lqgs_own(ring):
+    config = make_config("sensor-fault", horizon=0.25 * HOUR)
+    lqg = LQG(replace(LINEAR, ring=ring))
+    noise = LINEAR.noise
+    mpc = EkfMpc(lqg, Hypotheses((noise.fast_sd,), (noise.slow_sd,)))
+    seeds = range(1_000_000, 1_000_003)
+    ours, theirs = rollout(mpc, config, seeds), rollout(lqg, config, seeds)
+    assert ours.signals.v_p == pytest.approx(theirs.signals.v_p, rel=1e-6)
+    assert ours.signals.r_c == pytest.approx(theirs.signals.r_c, abs=1e-5 * MM)
+
+
+def readings(n, ring):
+    """Frames all valid, a radius reference at r_0, the pyrometer at nominal."""
+    zero = np.zeros(n)
+    return Measured(ring, zero + 1.0, *([zero] * 9))
+
+
+def test_the_bank_weighs_its_filters_by_bayes_rule():
+    eye = LQG(LINEAR).gains.eye
+    hypotheses = Hypotheses((0.05, 0.5), (0.3,))
+    bank_eye = bank.bank_eye(eye, hypotheses, 1)
+    believed = bank.begin(1, hypotheses, bank_eye)
+    evidence = np.zeros(2)
+    random = np.random.default_rng(3)
+    for _ in range(5):
+        believed = bank.predict(believed, np.zeros((1, 2)), np.zeros(1), bank_eye)
+        seen = readings(1, random.normal(size=1) * 0.02 * MM)
+        for j in range(2):
+            row = eye.model.H[0]
+            variance = row @ believed.covariance[0, j] @ row + believed.camera_variance[0, j]
+            innovation = seen.ring_error[0] - row @ believed.mean[0, j]
+            evidence[j] += -0.5 * innovation**2 / variance - 0.5 * np.log(variance)
+        believed = bank.correct(believed, seen, bank_eye)
+    weight = np.exp(evidence - evidence.max())
+    assert believed.probability[0] == pytest.approx(weight / weight.sum(), rel=1e-9)
+    assert believed.estimate[0] == pytest.approx(believed.probability[0] @ believed.mean[0])
+
+
+def test_the_bank_tells_a_calm_crystal_from_a_rough_one():
+    hypotheses = Hypotheses((0.05, 0.5), (0.3,))
+    for which, sd in enumerate(hypotheses.fast_sd):
+        scenario = replace(RANDOMIZED, name="known", interface=replace(RANDOMIZED.interface, sd=(sd, sd)))
+        config = make_config(scenario, horizon=1.0 * HOUR)
+        watched = Watched(EkfMpc(hypotheses=hypotheses))
+        rollout(watched, config, range(1_000_000, 1_000_004))
+        believed = bank.Believed(*watched.states[-1][: len(bank.Believed._fields)])
+        assert (believed.probability[:, which] > 0.9).mean() >= 0.75
+
+
+def test_slots_do_not_disturb_each_other_and_begin_anew():
+    config = make_config("randomized")
+    policy = ekf_mpc(config)
+    random = np.random.default_rng(5)
+    observation = random.normal(size=(3, 11)).astype(np.float32) * 0.1
+    observation[:, 1] = 1.0
+    action, state = policy.predict(observation)
+    alone, _ = policy.predict(observation[1])
+    assert alone == pytest.approx(action[1], abs=1e-6)
+    later, _ = policy.predict(observation, state, np.array([True, False, True]))
+    assert later[[0, 2]] == pytest.approx(action[[0, 2]], abs=1e-6)
+    assert np.abs(later[1] - action[1]).max() > 1e-6
+
+
+def test_estimates_beyond_the_equations_fall_back_on_the_law():
+    mpc = EkfMpc(LQG(LQGSettings()))
+    estimate, plan, previous = situation()
+    estimate[0, 1] = 20.0 * MM
+    inputs = mpc.moves(estimate, plan, previous, mpc.lqg.gains)
+    law = act(estimate, plan, previous, mpc.lqg.gains.regulator, SHARE, mpc.lqg.parameters.v_0)
+    assert np.isfinite(inputs).all()
+    assert inputs[0] == pytest.approx(law[0])
+    alone = mpc.moves(estimate[:1], plan[:1], previous[:1], mpc.lqg.gains)
+    assert alone[0] == pytest.approx(law[0])
+
+
+def test_without_casadi_one_line_names_the_extra(monkeypatch):
+    def missing(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(optional.importlib, "import_module", missing)
+    with pytest.raises(ImportError, match=r"^this needs the package casadi: pip install 'cz-gym\[mpc\]'$"):
+        find_controller("ekf-mpc").make(make_config())
+
+
+def test_settings_tell_results_apart():
+    config = make_config("randomized")
+    assert ekf_mpc(config).hash == ekf_mpc(config).hash
+    others = (replace(ekf_mpc(config), horizon=400.0), EkfMpc(), ekf_mpc(make_config("puller")))
+    assert len({ekf_mpc(config).hash, *(other.hash for other in others)}) == 4

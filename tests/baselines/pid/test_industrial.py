@@ -1,0 +1,143 @@
+"""The logged law against a literal transcription, and against what the logs report of it in operation."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from cz_gym.baselines.pid.industrial import Industrial, dead_zone
+from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
+from cz_gym.baselines.pid.tuned import tuned
+from cz_gym.config import make_config
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.observation import MEASURED, PULL_SCALE, Measured
+from cz_gym.units import MM, MM_PER_MIN
+from studies.industrial.__main__ import LOGGED, autocorrelation, facts, identified_gain
+
+RING, PULL = Measured._fields.index("ring_error"), Measured._fields.index("v_p")
+
+
+def test_dead_zone_as_logged():
+    e = [-5.0, -2.0, -1.5, -1.0, -0.4, 0.0, 0.4, 1.0, 1.5, 1.999, 2.0, 5.0]
+    np.testing.assert_allclose(dead_zone(e), [-3, -3, -2, -2, -0.8, 0, 0.8, 2, 2, 2, 3, 3], atol=1e-12)
+
+
+def literal(diameters):
+    """The law from its description: lists, mm and mm/min, one increment every 5 s; diameters relative to the target."""
+    pull, rate, found = 0.0, 0.0, []
+    for k, now in enumerate(diameters):
+        before = diameters[max(k - 12, 0)]
+        last = diameters[max(k - 1, 0)]
+        rate += ((now - last) * 2.0 - rate) / 24.0
+        E = 2.0 * now if abs(now) < 1.0 else math.copysign(2.0 if abs(now) < 2.0 else 3.0, now)
+        pull += 1.15 * (0.0004 * E + 0.16 * (now - before) / 6.0 - 0.1064 * rate)
+        found.append(pull)
+    return np.array(found)
+
+
+def follow(policy, diameters):
+    """Pull speeds [mm/min above nominal] when every command is applied."""
+    state, pull, found = None, 0.0, []
+    for diameter in diameters:
+        row = np.zeros((1, len(MEASURED)))
+        row[0, RING], row[0, PULL] = diameter / 2.0, pull
+        action, state = policy.predict(row, state)
+        pull = float(action[0, 0])
+        found.append(pull * PULL_SCALE / MM_PER_MIN)
+    return np.array(found)
+
+
+def test_law_as_described(rng):
+    diameters = np.cumsum(rng.normal(0.0, 0.1, 150))
+    assert np.abs(diameters).max() > 1.0
+    found = follow(Industrial(T_f=1e-9), diameters)
+    np.testing.assert_allclose(found, literal(diameters), atol=2e-5)
+
+
+@pytest.mark.parametrize("dt", [2.0, 10.0])
+def test_other_intervals_follow_the_same_law(dt):
+    def course(interval):
+        t = np.arange(0.0, 900.0, interval)
+        return 0.5 * (1.0 - np.cos(2.0 * np.pi * t / 900.0))
+
+    usual = follow(Industrial(T_f=20.0), course(5.0))
+    other = follow(Industrial(control_interval=dt, T_f=20.0), course(dt))
+    assert other[-1] == pytest.approx(usual[-1], rel=0.08)
+    assert np.abs(other).max() == pytest.approx(np.abs(usual).max(), rel=0.05)
+
+
+def test_forgetting_is_one_continuous_time_constant():
+    """Two 5 s shares make one 10 s share: a ramp's rate is averaged alike."""
+    rates = []
+    for dt in (5.0, 10.0):
+        state = None
+        for k in range(round(300.0 / dt) + 1):
+            row = np.zeros((1, len(MEASURED)))
+            row[0, RING] = 1e-3 * k * dt / 2.0
+            _, state = Industrial(control_interval=dt, T_f=1e-9).predict(row, state)
+        rates.append(state.rate[0])
+    assert rates[0] == pytest.approx(1e-2 * (1.0 - (23.0 / 24.0) ** 60), rel=1e-6)
+    assert rates[1] == pytest.approx(rates[0], rel=1e-6)
+
+
+def test_no_wind_up_on_a_stuck_drive():
+    policy, state = Industrial(), None
+    row = np.zeros((1, len(MEASURED)))
+    row[0, RING], row[0, PULL] = 0.4, 0.2
+    for _ in range(500):
+        action, state = policy.predict(row, state)
+    increment = float(action[0, 0]) * PULL_SCALE - 0.2 * PULL_SCALE
+    assert increment == pytest.approx(1.15 * 0.0004 * 1.6 * MM_PER_MIN, rel=1e-3)
+
+
+def test_a_held_diameter_and_a_moving_target():
+    """The rates are those of the diameter itself; a falling target shows in the error alone."""
+    policy, state, r_ref = Industrial(T_f=1e-9), None, Measured._fields.index("r_ref")
+    for k in range(30):
+        row = np.zeros((1, len(MEASURED)))
+        row[0, r_ref], row[0, RING] = -0.01 * k, 0.01 * k
+        _, state = policy.predict(row, state)
+    assert abs(state.rate[0]) < 1e-9
+    np.testing.assert_allclose(state.diameters, 0.0, atol=1e-9)
+
+
+def test_growth_control_warms_a_cold_melt():
+    policy = Industrial(heater=TemperatureLoop(K_pull=5.0))
+    row = np.zeros((1, len(MEASURED)))
+    row[0, PULL] = 0.2
+    state, powers = None, []
+    for _ in range(200):
+        action, state = policy.predict(row, state)
+        powers.append(action[0, 1])
+    assert powers[-1] > powers[0]
+    assert state.trim[0] > 0.0
+    assert state.mean[0] * MM == 0.0
+
+
+def test_logged_facts_from_courses_that_are_known(rng):
+    keep, n = 0.95, 40000
+    noise = rng.normal(0.0, 1.0, n)
+    course = lfilter([1.0], [1.0, -keep], noise)
+    found = autocorrelation(course, 40)
+    assert found[0] == pytest.approx(1.0)
+    np.testing.assert_allclose(found, keep ** np.arange(41), atol=0.06)
+    pull = rng.normal(0.0, 1.0, (n, 1))
+    diameter = lfilter([0.0, -0.3], [1.0, -0.9], pull, axis=0) + lfilter(
+        [1.0], [1.0, -0.9], rng.normal(0, 0.05, (n, 1)), axis=0
+    )
+    assert identified_gain(diameter, pull, 1) == pytest.approx(-0.3, rel=0.02)
+
+
+def test_plant_has_the_error_of_the_logs_and_their_wrong_sign():
+    config = make_config("randomized")
+    found = facts(rollout(tuned("industrial", config), config, range(1_000_000, 1_000_030)))
+    assert found.diameter_error_mm == pytest.approx(LOGGED.diameter_error_mm, rel=0.35)
+    assert found.pull_gain > 0.0
+    with pytest.raises(ValueError, match="every episode failed"):
+        facts(_failed(rollout(tuned("industrial", config), make_config("randomized", horizon=7200.0), range(2))))
+
+
+def _failed(run):
+    return dataclasses.replace(run, failed=np.ones_like(run.failed))

@@ -1,0 +1,240 @@
+from __future__ import annotations
+
+import math
+import pickle
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env as check_with_gymnasium
+from stable_baselines3.common.env_checker import check_env as check_with_sb3
+
+from cz_gym import CzEnv, CzVectorEnv, Parameters, make_puller
+from cz_gym.camera.image import picture
+from cz_gym.camera.rays import make_scene
+from cz_gym.camera.ring_detector import RingDetector, wall_edge
+from cz_gym.camera.view import (
+    COLUMNS,
+    IMAGE,
+    ROWS,
+    Camera,
+    camera_for,
+    check_camera,
+    describe_camera,
+    make_view,
+    project,
+)
+from cz_gym.config import make_config
+from cz_gym.physics.meniscus import hurle_ring_offset
+from cz_gym.physics.young_laplace import YOUNG_LAPLACE
+
+PULLER = make_puller()
+VIEW = make_view(Camera())
+ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (60, 3, 2)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def detector() -> RingDetector:
+    return RingDetector(VIEW, PULLER)
+
+
+def closed_form(r_c: float, h_c: float) -> float:
+    """The plant's ring less the operator's bias [m]."""
+    return r_c + float(hurle_ring_offset(r_c, h_c, PULLER)) - PULLER.ring_bias
+
+
+@pytest.mark.filterwarnings("error")
+def test_both_checkers() -> None:
+    env = gym.make("Cz-v0", observation="camera", horizon=600.0)
+    check_with_gymnasium(env.unwrapped, skip_render_check=True)
+    check_with_sb3(env, warn=True)
+    assert env.observation_space == gym.spaces.Box(0, 255, (120, 160, 1), np.uint8)
+
+
+@pytest.mark.parametrize("scenario", ["randomized", "sensor-fault", "puller"])
+def test_slots_equal_scalars_bit_for_bit(scenario: str) -> None:
+    settings: dict[str, Any] = {"observation": "camera", "horizon": 60.0}
+    batch = CzVectorEnv(3, scenario, autoreset_mode="NextStep", threads=2, **settings)
+    scalars = [CzEnv(scenario, **settings) for _ in range(3)]
+    seen, _ = batch.reset(seed=5)
+    expected = [env.reset(seed=5 + i)[0] for i, env in enumerate(scalars)]
+    np.testing.assert_array_equal(seen, expected)
+    over = [False] * 3
+    for actions in ACTIONS[:20]:
+        seen, *_ = batch.step(actions)
+        for i, env in enumerate(scalars):
+            if over[i]:
+                expected[i], over[i] = env.reset()[0], False
+            else:
+                expected[i], _, terminated, truncated, _ = env.step(actions[i])
+                over[i] = terminated or truncated
+        np.testing.assert_array_equal(seen, expected)
+
+
+@pytest.mark.parametrize("scenario", ["sensor-fault", "puller"])
+def test_a_saved_state_continues_bit_for_bit(scenario: str) -> None:
+    env, other = (CzEnv(scenario, observation="camera", horizon=200.0) for _ in range(2))
+    env.reset(seed=9)
+    for action in ACTIONS[:5, 0]:
+        shown = env.step(0.1 * action)[0]
+    saved = pickle.loads(pickle.dumps(env.get_state()))
+    again, _ = other.reset(options={"state": saved})
+    np.testing.assert_array_equal(again, shown)
+    for action in ACTIONS[5:15, 0]:
+        np.testing.assert_array_equal(env.step(0.1 * action)[0], other.step(0.1 * action)[0])
+
+
+def test_physics_and_info_are_those_of_the_other_observations() -> None:
+    camera, measured = CzEnv("puller", observation="camera"), CzEnv("puller")
+    assert repr(camera.reset(seed=3)[1]) == repr(measured.reset(seed=3)[1])
+    for action in ACTIONS[:10, 0]:
+        assert repr(camera.step(action)[1:]) == repr(measured.step(action)[1:])
+
+
+def test_the_image_shows_the_reading_not_the_truth(detector: RingDetector) -> None:
+    """The ring in the image is the reading, noise included: what "measured" says, and nothing better."""
+    env, measured = (CzEnv("only-sensor", observation=name, horizon=200.0) for name in ("camera", "measured"))
+    image, info = env.reset(seed=4)
+    shown, _ = measured.reset(seed=4)
+    bias = detector.read(picture(PULLER.r_0, PULLER.h_0, PULLER, VIEW)).radius - PULLER.r_0
+    errors, truths = [], []
+    for _ in range(15):
+        reading = info["r_ref"] + 1e-3 * float(shown[0])
+        radius = detector.read(image).radius - bias
+        errors.append(radius - reading)
+        truths.append(reading - (info["r_br"] - PULLER.ring_bias))
+        image, _, _, _, info = env.step(np.zeros(2, np.float32))
+        shown, *_ = measured.step(np.zeros(2, np.float32))
+    assert np.std(truths) > 1e-5
+    assert np.std(errors) < 0.5 * np.std(truths)
+
+
+def test_flagged_readings_are_black_and_unflagged_freezes_repeat() -> None:
+    env, measured = (CzEnv("sensor-fault", observation=name, horizon=900.0) for name in ("camera", "measured"))
+    black = frozen = 0
+    over, rest = True, np.zeros(2, np.float32)
+    for seed in range(3):
+        image, _ = env.reset(seed=seed)
+        shown, _ = measured.reset(seed=seed)
+        over = False
+        while not over:
+            before, was = image, shown
+            image, _, terminated, truncated, _ = env.step(rest)
+            shown, *_ = measured.step(rest)
+            over = terminated or truncated
+            assert (image.max() == 0) == (shown[1] == 0.0)
+            black += int(image.max() == 0)
+            if shown[1] and was[1] and shown[0] == was[0] and shown[2] == was[2]:
+                np.testing.assert_array_equal(image, before)
+                frozen += 1
+    assert black > 0
+    assert frozen > 0
+
+
+def test_nominal_images_are_still_and_noisy_ones_are_not() -> None:
+    still = CzEnv("nominal", observation="camera")
+    first, _ = still.reset(seed=0)
+    np.testing.assert_array_equal(first, picture(PULLER.r_0, PULLER.h_0, PULLER, VIEW))
+    noisy = CzEnv("only-sensor", observation="camera")
+    image = noisy.reset(seed=0)[0].astype(float)
+    dark = image[90:110, 60:100, 0]
+    expected = math.sqrt(float(dark.mean()) / VIEW.electrons)
+    assert np.std(np.diff(dark, axis=1)) / math.sqrt(2) == pytest.approx(
+        math.hypot(expected, 1 / math.sqrt(12)), rel=0.15
+    )
+
+
+def test_the_ring_follows_geometry_and_closed_form_within_a_pixel(detector: RingDetector) -> None:
+    at_rest = wall_edge(make_scene(PULLER.r_0, PULLER.h_0, PULLER), VIEW).r - PULLER.r_0
+    for dr in np.linspace(-8e-3, 8e-3, 5):
+        for dh in (-1.5e-3, 0.0, 1e-3, 2e-3):
+            r_c, h_c = PULLER.r_0 + dr, PULLER.h_0 + dh
+            radius = detector.read(picture(r_c, h_c, PULLER, VIEW)).radius
+            assert abs(radius - closed_form(r_c, h_c)) < 0.5 * detector.pixel
+            assert abs(radius - (wall_edge(make_scene(r_c, h_c, PULLER), VIEW).r - at_rest)) < 0.15 * detector.pixel
+
+
+def test_a_change_of_radius_is_read_as_itself(detector: RingDetector) -> None:
+    step = np.linspace(-2e-3, 2e-3, 21)
+    read = [detector.read(picture(PULLER.r_0 + dr, PULLER.h_0, PULLER, VIEW)).radius for dr in step]
+    assert np.polyfit(step, read, 1)[0] == pytest.approx(1.0, abs=0.02)
+    assert np.max(np.abs(np.array(read) - PULLER.r_0 - step)) < 0.1 * detector.pixel
+
+
+def test_no_ring_is_said_to_be_none(detector: RingDetector) -> None:
+    flat = picture(PULLER.r_0, 3e-3, PULLER, VIEW)
+    for image in (np.zeros(IMAGE, np.uint8), np.full(IMAGE, 200, np.uint8), flat):
+        assert math.isnan(detector.read(image).radius)
+    with pytest.raises(ValueError, match="no bright ring"):
+        RingDetector(make_view(Camera(aim=0.02)), PULLER)
+
+
+def test_a_spoilt_line_hardly_moves_the_ring(detector: RingDetector) -> None:
+    image = picture(PULLER.r_0, PULLER.h_0, PULLER, VIEW)
+    image[64:, 70:75] = 255
+    assert abs(detector.read(image).radius - PULLER.r_0) < 0.1 * detector.pixel
+
+
+def test_images_are_symmetric() -> None:
+    image = picture(PULLER.r_0, PULLER.h_0, PULLER, VIEW)
+    np.testing.assert_array_equal(image, image[:, ::-1])
+
+
+def test_projection_of_the_aim_is_the_middle() -> None:
+    aimed = project(Camera().aim, 0.0, 0.0, VIEW)
+    assert (aimed.row, aimed.column) == pytest.approx((0.5 * ROWS, 0.5 * COLUMNS))
+
+
+def test_every_parameter_of_the_camera_has_unit_meaning_and_source() -> None:
+    described = describe_camera()
+    assert tuple(described) == Camera._fields
+    assert all(quantity.unit and quantity.meaning and quantity.source for quantity in described.values())
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"tilt": 1.6}, "tilt"),
+        ({"distance": 0.1}, "above the heat shield"),
+        ({"focal_length": 0.0}, "focal_length"),
+        ({"pixel_pitch": math.nan}, "pixel_pitch"),
+        ({"melt_emissivity": 1.2}, "must not exceed 1"),
+        ({"shield_radius": 0.05}, "opening"),
+        ({"reflections": 0.5}, "reflections"),
+        ({"wall_temperature": "hot"}, "wall_temperature"),
+    ],
+)
+def test_impossible_cameras_are_refused_in_one_line(change: dict[str, Any], says: str) -> None:
+    with pytest.raises(ValueError, match=says) as raised:
+        check_camera(Camera()._replace(**change), Parameters())
+    assert "\n" not in str(raised.value)
+
+
+def test_a_camera_belongs_to_its_observation() -> None:
+    with pytest.raises(ValueError, match="observation"):
+        make_config(camera=Camera())
+    with pytest.raises(ValueError, match=r"cz_gym\.camera\.Camera"):
+        make_config(observation="camera", camera=3)  # type: ignore[arg-type]
+    looking = [make_config(observation="camera", camera=Camera(tilt=tilt)).hash for tilt in (0.3, 0.35)]
+    assert looking[0] != looking[1]
+
+
+def test_another_puller_is_in_the_picture() -> None:
+    parameters = Parameters(r_0=0.06, R_cr=0.2)
+    puller, view = make_puller(parameters), make_view(camera_for(parameters))
+    assert abs(RingDetector(view, puller).read(picture(0.061, puller.h_0, puller, view)).radius - 0.061) < 1e-4
+    image, _ = CzEnv("nominal", observation="camera", parameters=parameters).reset(seed=0)
+    np.testing.assert_array_equal(image, picture(puller.r_0, puller.h_0, puller, view))
+
+
+def test_the_exact_meniscus_is_in_the_picture() -> None:
+    puller = make_puller(meniscus=YOUNG_LAPLACE)
+    detector = RingDetector(VIEW, puller)
+    env = CzEnv("nominal", observation="camera", meniscus=YOUNG_LAPLACE)
+    image, _ = env.reset(seed=0)
+    np.testing.assert_array_equal(image, picture(puller.r_0, puller.h_0, puller, VIEW))
+    for _ in range(12):
+        image, _, _, _, info = env.step(np.array([-0.5, 0.0], np.float32))
+        assert abs(detector.read(image).radius - (info["r_br"] - puller.ring_bias)) < 0.2 * detector.pixel
+    assert abs(info["h_c"] - puller.h_0) > 3e-4

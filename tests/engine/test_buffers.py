@@ -1,0 +1,120 @@
+"""Nobody who can still look at an array given out may see a later one written: every way of looking is tried."""
+
+from __future__ import annotations
+
+import gc
+import threading
+import weakref
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cz_gym import CzVectorEnv
+from cz_gym.engine.buffers import SPARES, Lender
+
+SHAPE = 64, 64
+
+
+def torch_tensor(array: np.ndarray) -> Any:
+    return pytest.importorskip("torch").from_numpy(array)
+
+
+WAYS: dict[str, tuple[Callable[[np.ndarray], Any], Callable[[Any], Any]]] = {
+    "itself": (lambda array: array, lambda held: held[0, 0]),
+    "row": (lambda array: array[0], lambda held: held[0]),
+    "view of a view": (lambda array: array.T[:1][0][::-1].view(np.int64)[:5], lambda held: held.view(np.float64)[-1]),
+    "asarray": (np.asarray, lambda held: held[0, 0]),
+    "frombuffer": (lambda array: np.frombuffer(array, array.dtype), lambda held: held[0]),
+    "flat": (lambda array: array.flat, lambda held: held[0]),
+    "as_strided": (lambda array: np.lib.stride_tricks.as_strided(array, (1,), (8,)), lambda held: held[0]),
+    "base": (lambda array: array.base, lambda held: np.frombuffer(held)[0]),
+    "memoryview": (memoryview, lambda held: held[0, 0]),
+    "memoryview of a row": (lambda array: memoryview(array)[0:1], lambda held: np.asarray(held)[0, 0]),
+    "ctypes pointer": (lambda array: array.ctypes.data_as(array.ctypes._ctypes.POINTER(
+        array.ctypes._ctypes.c_double)), lambda held: held[0]),
+    "dlpack": (lambda array: np.from_dlpack(array), lambda held: held[0, 0]),
+    "capsule": (lambda array: array.__dlpack__(), lambda held: None),
+    "torch": (torch_tensor, lambda held: float(held[0, 0])),
+    "torch's row": (lambda array: torch_tensor(array)[0], lambda held: float(held[0])),
+    "closure": (lambda array: lambda: array[0, 0], lambda held: held()),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_whoever_looks_keeps_the_memory(way: str) -> None:
+    look, read = WAYS[way]
+    lender = Lender(SHAPE, np.float64)
+    array = lender.new()
+    array[...] = 7.0
+    address = array.ctypes.data
+    held = look(array)
+    del array
+    gc.collect()
+    later = [lender.new() for _ in range(2 * SPARES)]
+    for other in later:
+        other[...] = -1.0
+    assert address not in {other.ctypes.data for other in later}
+    assert read(held) in (7.0, None)
+    del held
+    gc.collect()
+    assert lender.new().ctypes.data == address, "let go, the memory is used again"
+
+
+def test_a_weak_reference_dies_with_its_array() -> None:
+    """A later array on the same memory is another object: a weak reference never shows it."""
+    lender = Lender(SHAPE, np.float64)
+    array = lender.new()
+    address, weak = array.ctypes.data, weakref.ref(array)
+    del array
+    assert (lender.new().ctypes.data, weak()) == (address, None)
+
+
+def test_threads_that_hold_and_let_go_never_see_another_value() -> None:
+    lender, wrong = Lender((2048,), np.float64), []
+
+    def work(number: int) -> None:
+        held: list[np.ndarray] = []
+        for turn in range(300):
+            array = lender.new()
+            array[...] = number * 1000 + turn
+            held = [*held, array[5:]][-3:]
+            if any(np.ptp(one) != 0.0 or one[0] // 1000 != number for one in held):
+                wrong.append(number)
+
+    threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+
+
+def test_few_blocks_are_kept() -> None:
+    lender = Lender(SHAPE, np.float64)
+    many = [lender.new() for _ in range(20)]
+    del many
+    assert len(lender._free) == SPARES
+
+
+def test_a_lent_array_is_like_any_other() -> None:
+    for shape in (SHAPE, (3, 2), (0, 4)):
+        array = Lender(shape, np.float32).new()
+        assert (array.shape, array.dtype, array.flags.c_contiguous, array.flags.writeable, array.flags.aligned) == (
+            shape, np.float32, True, True, True,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("observation", ["measured", "state"])
+def test_a_batch_large_enough_to_be_lent_memory_writes_nothing_again(observation: str) -> None:
+    env = CzVectorEnv(600, "nominal", observation=observation, horizon=40.0, autoreset_mode="SameStep", threads=2)
+    shown, info = env.reset(seed=0)
+    looks = [memoryview(shown), info["r_c"][::2], info["h_c"][:1]]
+    before = [np.array(look) for look in looks]
+    del shown, info
+    for step in range(20):
+        env.step(np.full((600, 2), 0.02 * step))
+    for look, copy in zip(looks, before, strict=True):
+        np.testing.assert_array_equal(np.asarray(look), copy)
+    env.close()

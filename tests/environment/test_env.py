@@ -1,0 +1,294 @@
+from __future__ import annotations
+
+import math
+import pickle
+import warnings
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.error import InvalidAction, ResetNeeded
+from gymnasium.utils.env_checker import check_env as check_with_gymnasium
+from stable_baselines3.common.env_checker import check_env as check_with_sb3
+
+import cz_gym
+from cz_gym import CzEnv, Parameters, Scenario, make_puller
+from cz_gym.config import Config, make_config
+from cz_gym.episodes.scenario import Actuators, Interface, Recipe
+from cz_gym.physics.meniscus import HURLE, MeniscusModel
+from cz_gym.physics.plant import Disturbance, State, growth
+from cz_gym.physics.young_laplace import YOUNG_LAPLACE
+
+MM_PER_MIN = 1e-3 / 60
+ZERO = np.zeros(2, np.float32)
+OBSERVATIONS = ["measured", "history", "state"]
+
+
+@pytest.mark.parametrize("observation", OBSERVATIONS)
+def test_gymnasiums_checker(observation: str) -> None:
+    env = gym.make("Cz-v0", observation=observation, horizon=600.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_with_gymnasium(env.unwrapped)
+
+
+@pytest.mark.parametrize("observation", OBSERVATIONS)
+def test_stable_baselines3s_checker(observation: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_with_sb3(gym.make("Cz-v0", observation=observation, horizon=600.0), warn=True)
+
+
+def test_registration() -> None:
+    assert isinstance(gym.make("cz_gym:Cz-v0").unwrapped, CzEnv)
+    spec = gym.spec("Cz-v0")
+    assert spec.max_episode_steps is None
+    batch = gym.make_vec("Cz-v0", num_envs=3, vectorization_mode="vector_entry_point", observation="history")
+    assert isinstance(batch, cz_gym.CzVectorEnv)
+    assert batch.observation_space.shape == (3, 72)
+
+
+def test_everything_advertised_is_there() -> None:
+    assert cz_gym.__all__ == sorted(cz_gym.__all__, key=lambda name: (not name.isupper(), name))
+    for name in cz_gym.__all__:
+        assert hasattr(cz_gym, name)
+
+
+@pytest.mark.parametrize("observation", OBSERVATIONS)
+def test_dtypes(observation: str) -> None:
+    env = gym.make("Cz-v0", observation=observation)
+    assert (env.action_space.dtype, env.observation_space.dtype) == (np.float32, np.float32)
+    first, _ = env.reset(seed=1)
+    second, gained, terminated, truncated, _ = env.step(env.action_space.sample())
+    for array in (first, second):
+        assert array.dtype == np.float32
+        assert env.observation_space.contains(array)
+    assert (type(gained), type(terminated), type(truncated)) == (float, bool, bool)
+    assert first is not second
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"scenario": "nonsense"}, "unknown scenario 'nonsense'; choose one of nominal"),
+        ({"scenario": 3}, "unknown scenario 3"),
+        ({"model": 1.5}, "not 1.5"),
+        ({"model": "III"}, "not 'III'"),
+        ({"model": math.nan}, "not nan"),
+        ({"observation": "all"}, "unknown observation 'all'; choose one of measured, history, state"),
+        ({"control_interval": 0}, "control_interval must be a positive number"),
+        ({"control_interval": -5.0}, "not -5.0"),
+        ({"control_interval": math.nan}, "not nan"),
+        ({"control_interval": "5"}, "not '5'"),
+        ({"control_interval": 7.0}, "whole number of control intervals"),
+        ({"horizon": math.inf}, "horizon must be a positive number"),
+        ({"horizon": 2.0}, "whole number of control intervals"),
+        ({"render_mode": "hologram"}, "render_mode .*'hologram'"),
+        ({"parameters": {"sigma": 1.0}}, r"cz_gym\.Parameters"),
+        ({"parameters": Parameters(k_l=math.nan)}, "parameter k_l = nan"),
+        ({"meniscus": "hurle"}, r"cz_gym\.MeniscusModel"),
+        ({"control_interval": True}, "not True"),
+        ({"parameters": Parameters(alpha_0=1.7)}, "nominal meniscus height .* check r_0, alpha_0"),
+        ({"parameters": Parameters(r_0=1e-4)}, "nominal meniscus height .* check r_0, alpha_0"),
+        (
+            {"meniscus": YOUNG_LAPLACE, "parameters": Parameters(r_0=0.02)},
+            "meniscus .young-laplace. .r_0 >= a",
+        ),
+        (
+            {"meniscus": YOUNG_LAPLACE, "parameters": Parameters(phi_b=math.radians(20.0))},
+            "phi_b from 0.0087 to 0.2618 rad",
+        ),
+    ],
+)
+@pytest.mark.parametrize("make", [CzEnv, cz_gym.CzVectorEnv])
+def test_bad_arguments_are_refused_in_one_line(make: Any, arguments: dict[str, Any], says: str) -> None:
+    with pytest.raises(ValueError, match=says) as refusal:
+        make(**arguments)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_typo_is_not_swallowed() -> None:
+    with pytest.raises(TypeError, match="control_intervall"):
+        gym.make("Cz-v0", control_intervall=2.0)
+
+
+def test_parameters_without_an_operating_point_are_refused_on_entry() -> None:
+    with pytest.raises(ValueError, match="operating point"):
+        CzEnv(parameters=Parameters(T_e=4000.0))
+
+
+@pytest.mark.parametrize("action", [[math.nan, 0.0], [0.0], [0.0, 0.0, 0.0], [[0.0, 0.0]], 0.0, "up", None, ["a", "b"]])
+def test_bad_actions_are_refused(action: Any) -> None:
+    env = CzEnv()
+    env.reset(seed=0)
+    with pytest.raises(InvalidAction, match="action must") as refusal:
+        env.step(action)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("options", [{"seed": 3}, {3: 1, "a": 2}, {"scenario": "nonsense"}, {"state": 3}, 3, "abc", []])
+def test_bad_reset_options_are_refused(options: Any) -> None:
+    with pytest.raises(ValueError, match=r"unknown reset option|unknown scenario|get_state|must be a dict, not"):
+        CzEnv().reset(options=options)
+
+
+def test_a_state_is_not_continued_on_another_scenario() -> None:
+    env = CzEnv()
+    env.reset(seed=0)
+    before = pickle.dumps(env.get_state())
+    with pytest.raises(ValueError, match="exclude each other"):
+        env.reset(seed=1, options={"scenario": "hard", "state": env.get_state()})
+    assert pickle.dumps(env.get_state()) == before
+
+
+@pytest.mark.parametrize("number", [np.int64, np.float32, np.float64])
+def test_numpy_numbers_are_numbers(number: Any) -> None:
+    parameters = Parameters()._replace(T_m=number(1685), C_1=number(57000))
+    given = make_config("nominal", number(1), "measured", number(5), number(100), parameters)
+    plain = make_config("nominal", 1.0, "measured", 5.0, 100.0)
+    assert (given.hash, given.steps, given.mix) == (plain.hash, 20, (1.0, 1.0))
+
+
+def test_equal_plants_have_equal_hashes() -> None:
+    zero, minus_zero = (make_config(parameters=Parameters(T_e=T_e)) for T_e in (0.0, -0.0))
+    assert zero.plant_hash == minus_zero.plant_hash == Config(parameters=Parameters(T_e=0)).plant_hash
+    assert Config(parameters=Parameters(T_m=1685)).plant_hash == make_config().plant_hash
+    assert make_config("nominal", -0.0).hash == make_config("nominal", 0).hash
+
+
+def test_a_foreign_meniscus_is_another_plant() -> None:
+    """Its name alone does not make it Hurle's."""
+
+    def slope(r_c: Any, h_c: Any, p: Any) -> Any:
+        return HURLE.slope(r_c, h_c, p)
+
+    foreign = MeniscusModel(HURLE.name, slope, HURLE.ring_offset, HURLE.height)
+    assert make_config(meniscus=foreign).plant_hash != make_config().plant_hash
+    assert make_config(meniscus=MeniscusModel(*HURLE)).plant_hash == make_config().plant_hash
+
+
+def test_out_of_range_actions_are_clipped_and_said_so() -> None:
+    runs = []
+    for action, clipped in (([3.0, -math.inf], True), ([1.0, -1.0], False)):
+        env = CzEnv()
+        env.reset(seed=0)
+        observation, *_, info = env.step(np.array(action))
+        assert info["action_clipped"] is clipped
+        runs.append((observation.tolist(), info["v_p"], info["Q_H"]))
+    assert runs[0] == runs[1]
+
+
+def test_actions_are_pull_speed_and_power() -> None:
+    env, p = CzEnv("nominal"), make_puller()
+    _, start = env.reset(seed=0)
+    assert (start["v_p"], start["Q_H"]) == (p.v_0, p.Q_H_0)
+    for pull, heat in ((1.0, 0.0), (-1.0, 1.0), (0.5, -0.25)):
+        *_, info = env.step(np.array([pull, heat], np.float32))
+        assert info["v_p"] / MM_PER_MIN == pytest.approx(1.2 * (1 + pull))
+        assert info["Q_H"] - p.Q_H_0 == pytest.approx(10e3 * heat)
+
+
+def test_stepping_needs_a_reset() -> None:
+    env = CzEnv("nominal", horizon=10.0)
+    with pytest.raises(ResetNeeded):
+        env.step(ZERO)
+    env.reset(seed=0)
+    assert env.step(ZERO)[2:4] == (False, False)
+    assert env.step(ZERO)[2:4] == (False, True)
+    with pytest.raises(ResetNeeded):
+        env.step(ZERO)
+
+
+def test_seeds_reproduce_and_episodes_differ() -> None:
+    def episodes(seed: int) -> list[np.ndarray]:
+        env = CzEnv(horizon=100.0)
+        runs = []
+        for number in range(3):
+            rows = [env.reset(seed=seed if number == 0 else None)[0]]
+            rows += [env.step(ZERO)[0] for _ in range(20)]
+            runs.append(np.array(rows))
+        return runs
+
+    one, again, other = episodes(1), episodes(1), episodes(2)
+    np.testing.assert_array_equal(one, again)
+    assert not np.array_equal(one[0], other[0])
+    assert not np.array_equal(one[0], one[1])
+    assert not np.array_equal(one[1], one[2])
+
+
+def test_without_a_seed_nothing_repeats() -> None:
+    assert not np.array_equal(CzEnv().reset()[0], CzEnv().reset()[0])
+
+
+def test_info_is_the_plant_in_si() -> None:
+    env = CzEnv("only-interface", model=0.3)
+    env.reset(seed=2)
+    p = make_puller(lam=0.3)
+    for _ in range(5):
+        *_, info = env.step(np.array([0.2, 0.0], np.float32))
+    slot = env.get_state().slot.slot
+    x = State(info["r_c"], info["h_c"], info["T_1"], math.nan, info["T_b"])
+    grown = growth(x, Disturbance(0.0, float(slot["dT_i"]), 1.0), p, cz_gym.HURLE.slope)
+    assert info["v_g"] == pytest.approx(grown.v_g, rel=1e-12)
+    assert math.tan(info["alpha_c"]) == pytest.approx(grown.tan_alpha, rel=1e-9)
+    assert info["r_br"] == pytest.approx(info["r_c"] + cz_gym.HURLE.ring_offset(info["r_c"], info["h_c"], p))
+    assert (info["r_ref"], info["T_1_ref"]) == (p.r_0, p.T_1_0)
+    assert "state" not in info
+
+
+def test_a_critic_may_see_the_state_beside_the_history() -> None:
+    history, state = CzEnv(observation="history"), CzEnv(observation="state")
+    np.testing.assert_array_equal(history.reset(seed=4)[1]["state"], state.reset(seed=4)[0])
+    np.testing.assert_array_equal(history.step(ZERO)[4]["state"], state.step(ZERO)[0])
+
+
+@pytest.mark.parametrize("interval", [2.0, 10.0])
+def test_fast_and_slow_controllers_meet_the_same_crystal(interval: float) -> None:
+    """Open loop, the trajectories agree to integration error at the common times."""
+    runs = {}
+    for dt in (5.0, interval):
+        env = CzEnv("randomized", control_interval=dt, horizon=2400.0)
+        env.reset(seed=17)
+        saved = env.get_state().slot
+        steps = [env.step(ZERO)[4] for _ in range(round(2400.0 / dt))]
+        at_common_times = steps[round(10 / dt) - 1 :: round(10 / dt)]
+        runs[dt] = saved, np.array([[i["r_c"], i["h_c"], i["T_1"], i["T_b"], i["r_ref"]] for i in at_common_times])
+    np.testing.assert_array_equal(runs[5.0][0].interface, runs[interval][0].interface)
+    assert runs[5.0][0].slot["episode"] == runs[interval][0].slot["episode"]
+    np.testing.assert_allclose(runs[interval][1], runs[5.0][1], rtol=1e-8)
+
+
+def test_a_scenario_of_ones_own_and_another_puller() -> None:
+    wide = Parameters(r_0=0.1, v_0=1.0 * MM_PER_MIN)
+    scenario = Scenario("mine", interface=Interface(sd=(0.2, 0.2)), recipe=Recipe())
+    env = gym.make("Cz-v0", scenario=scenario, parameters=wide)
+    _, info = env.reset(seed=1)
+    assert info["r_c"] == 0.1
+    *_, info = env.step(np.array([1.0, 0.0], np.float32))
+    assert info["v_p"] / MM_PER_MIN == pytest.approx(2.0)
+
+
+def test_one_episode_of_another_scenario() -> None:
+    env = CzEnv("nominal", observation="state")
+    given, _ = env.reset(seed=5, options={"scenario": "hard"})
+    hard, _ = CzEnv("hard", observation="state").reset(seed=5)
+    np.testing.assert_array_equal(given, hard)
+    assert env.reset()[1]["r_c"] == make_puller().r_0
+
+
+def test_drives_obey_window_slew_and_steps() -> None:
+    limits = Actuators(
+        pull_window=0.5 * MM_PER_MIN, pull_slew=0.3 * MM_PER_MIN / 60, heater_slew=2000.0 / 60, heater_step=100.0
+    )
+    env, p = CzEnv(Scenario("mine", actuators=limits)), make_puller()
+    env.reset(seed=0)
+    infos = [env.step(np.array([1.0, 0.553], np.float32))[4] for _ in range(60)]
+    pull = np.array([(info["v_p"] - p.v_0) / MM_PER_MIN for info in infos])
+    power = np.array([info["Q_H"] - p.Q_H_0 for info in infos])
+    t = 5.0 * np.arange(1, 61)
+    np.testing.assert_allclose(pull, np.minimum(0.3 * t / 60, 0.5), atol=1e-9)
+    slewed = np.minimum(2000.0 * t / 60, 5530.0)
+    np.testing.assert_allclose(power, 100 * np.rint(slewed / 100), atol=1e-6)
+    back = [env.step(np.array([-1.0, 0.0], np.float32))[4] for _ in range(60)]
+    assert min(info["v_p"] for info in back) == pytest.approx(p.v_0 - 0.5 * MM_PER_MIN)

@@ -1,0 +1,199 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import View, hold
+
+from cz_gym import SCENARIOS, CzEnv, Scenario, decode, make_puller
+from cz_gym.episodes.scenario import Faults, Sensor
+from cz_gym.episodes.schedule import bias_offset, pyrometer_drift
+from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED, OBSERVATIONS, lags
+
+P = make_puller()
+ZERO = np.zeros(2, np.float32)
+
+
+def run(env: CzEnv, steps: int, pull: float = 0.0, seed: int = 1) -> tuple[np.ndarray, list[dict[str, Any]], Any]:
+    """Observations, infos and the state saved at the start, under a gentle sine or open loop."""
+    observation, info = env.reset(seed=seed)
+    start = env.get_state().slot
+    rows, infos, p = [observation], [info], View(start.slot["puller"])
+    for k in range(steps):
+        feedback = hold(info, p) if pull else 0.0
+        action = np.array([pull * np.sin(k / 9.0) + feedback, pull * np.cos(k / 20.0)], np.float32)
+        observation, *_, info = env.step(action)
+        rows.append(observation)
+        infos.append(info)
+    return np.array(rows), infos, start
+
+
+def column(infos: list[dict[str, Any]], name: str) -> np.ndarray:
+    return np.array([info[name] for info in infos])
+
+
+def test_every_channel_is_documented() -> None:
+    assert [len(channels) for channels in OBSERVATIONS.values()] == [11, 72, 17]
+    for channels in OBSERVATIONS.values():
+        assert len({channel.name for channel in channels}) == len(channels)
+        assert all(channel.unit and channel.meaning and channel.scale > 0 for channel in channels)
+    assert HISTORY[:11] == MEASURED
+
+
+@pytest.mark.parametrize("scenario", ["randomized", "puller", "sensor-fault"])
+def test_measured_holds_what_the_control_computer_has_and_nothing_else(scenario: str) -> None:
+    """Each channel is rebuilt from readings and recipes alone; what no instrument shows does not enter."""
+    env = CzEnv(scenario)
+    rows, infos, start = run(env, 400, 0.05)
+    p = start.slot["puller"]
+    nominal = {name: float(p[name]) for name in ("r_0", "v_0", "T_1_0", "Q_H_0", "ring_bias")}
+    seen = decode(rows)
+    ring = column(infos, "r_br_measured") - nominal["ring_bias"]
+    np.testing.assert_allclose(seen.ring_error, ring - column(infos, "r_ref"), atol=1e-9)
+    np.testing.assert_allclose(seen.r_ref, column(infos, "r_ref") - nominal["r_0"], atol=1e-9)
+    np.testing.assert_allclose(seen.T_1_ref, column(infos, "T_1_ref") - nominal["T_1_0"], atol=1e-5)
+    np.testing.assert_allclose(seen.v_p, column(infos, "v_p") - nominal["v_0"], atol=1e-11)
+    np.testing.assert_allclose(seen.Q_H, column(infos, "Q_H") - nominal["Q_H_0"], atol=1e-2)
+    t = 5.0 * np.arange(401)
+    e = View(start.slot["episode"])
+    drift = np.array([pyrometer_drift(now, e) for now in t])
+    pyrometer = column(infos, "T_1") + drift + start.noise[:401, 1] - nominal["T_1_0"]
+    np.testing.assert_allclose(seen.T_1, pyrometer, atol=1e-5)
+    assert set(np.unique(seen.valid)) <= {0.0, 1.0}
+
+
+@pytest.mark.parametrize(("interval", "ahead"), [(5.0, (12, 60)), (10.0, (6, 30))])
+def test_the_recipe_is_known_one_and_five_minutes_ahead(interval: float, ahead: tuple[int, int]) -> None:
+    scenario = Scenario(
+        "mine",
+        recipe=replace(SCENARIOS["randomized"].recipe, start=(120.0, 120.0)),
+        reference=replace(SCENARIOS["reference-b"].reference, start=(60.0, 60.0)),
+    )
+    seen = decode(run(CzEnv(scenario, control_interval=interval), 200)[0])
+    assert np.ptp(seen.r_ref) > 0
+    assert np.ptp(seen.T_1_ref) > 0
+    for now, one, five in ((seen.r_ref, seen.r_ref_1min, seen.r_ref_5min), (seen.T_1_ref, *seen[6:8])):
+        np.testing.assert_allclose(one[: -ahead[0]], now[ahead[0] :], rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose(five[: -ahead[1]], now[ahead[1] :], rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("interval", [2.0, 5.0, 10.0, 60.0])
+def test_history_is_means_of_past_samples_and_the_integral(interval: float) -> None:
+    env = CzEnv("randomized", observation="history", control_interval=interval)
+    rows, _, _ = run(env, round(2000 / interval), 0.05)
+    names = [channel.name for channel in HISTORY]
+    ages = lags(interval)
+    for channel in LAGGED:
+        at = names.index(channel)
+        past = np.full(2000, rows[0, at] if channel == "ring_error" else 0.0)
+        series = np.concatenate([past, rows[:, at].astype(float)])
+        for k in (0, 1, 7, len(rows) - 1):
+            now = 2000 + k
+            for lag, newest, oldest in zip(LAGS, *ages, strict=True):
+                expected = series[now - oldest : now - newest + 1].mean()
+                seen = rows[k, names.index(f"{channel}_{lag:g}s")]
+                assert seen == pytest.approx(expected, rel=1e-5, abs=1e-5), (channel, lag, k)
+    steps = np.clip(rows[1:, 0].astype(float), -10, 10) * interval / 1000
+    np.testing.assert_allclose(rows[1:, 11], np.cumsum(steps), rtol=1e-4, atol=1e-5)
+
+
+def test_lags_at_the_default_interval_cover_the_past_without_gaps() -> None:
+    newest, oldest = lags(5.0)
+    assert oldest.tolist() == [round(age / 5) for age in LAGS]
+    assert newest.tolist() == [1, *(oldest[:-1] + 1).tolist()]
+
+
+def test_state_is_the_plant() -> None:
+    env = CzEnv("puller", observation="state")
+    rows, infos, start = run(env, 50, 0.05)
+    p, slot = start.slot["puller"], env.get_state().slot.slot
+    names = [channel.name for channel in OBSERVATIONS["state"]]
+    row = dict(zip(names, rows[-1].astype(float), strict=True))
+    assert row["r_c_error"] == pytest.approx((infos[-1]["r_c"] - infos[-1]["r_ref"]) / 1e-3, rel=1e-5)
+    assert row["h_c"] == pytest.approx((infos[-1]["h_c"] - p["h_0"]) / 1e-3, rel=1e-5)
+    for name in ("T_1", "T_2", "T_b"):
+        assert row[name] == pytest.approx((slot["x"][name] - p[f"{name}_0"]) / 5.0, rel=1e-4)
+    assert row["dT_i"] == pytest.approx(start.interface[49], rel=1e-5)
+    assert row["Q_d"] == pytest.approx(float(slot["Q_d"]) / 1e3, rel=1e-5)
+    assert row["ring_offset"] == pytest.approx(infos[-1]["ring_offset"] / 1e-3, rel=1e-5)
+    assert row["lam"] == pytest.approx(float(p["lam"]))
+
+
+@pytest.mark.parametrize(("interval", "latency"), [(5.0, 5.0), (5.0, 12.0), (2.0, 5.0), (2.0, 60.0), (20.0, 5.0)])
+def test_a_late_frame_is_the_newest_old_enough(interval: float, latency: float) -> None:
+    """Frames are taken at samples and on the 5 s grid; the true ring of every second is the oracle."""
+    scenario = Scenario("mine", interface=SCENARIOS["hard"].interface, sensor=Sensor(latency=latency))
+    every_second = CzEnv(replace(scenario, sensor=Sensor()), control_interval=1.0)
+    ring = column(run(every_second, 200)[1], "r_br")
+    _, infos, _ = run(CzEnv(scenario, control_interval=interval), round(200 / interval))
+    frames = {*range(0, 201, 5), *range(0, 201, round(interval))}
+    for k, measured in enumerate(column(infos, "r_br_measured")):
+        t = k * interval
+        old_enough = [frame for frame in frames if frame <= t - latency]
+        assert measured == pytest.approx(ring[max(old_enough, default=0)], rel=1e-9)
+    assert np.ptp(ring) > 1e-5
+
+
+def test_faulty_camera_shows_the_last_value() -> None:
+    """Flagged freezes and drop-outs are invalid, the unflagged freeze is not; the bias drifts unflagged."""
+    scenario = Scenario("mine", sensor=SCENARIOS["hard"].sensor, faults=SCENARIOS["sensor-fault"].faults)
+    env = CzEnv(scenario)
+    rows, infos, start = run(env, 2160, 0.01, seed=2)
+    e, windows = View(start.slot["episode"]), start.slot["freezes"]
+    shown, invalid, silent = np.nan, 0, 0
+    for k, info in enumerate(infos):
+        t, camera = 5.0 * k, start.noise[k, 0]
+        flagged = any(low <= t < high for low, high in windows[:3])
+        frozen = windows[3, 0] <= t < windows[3, 1]
+        if not (flagged or frozen or np.isnan(camera)):
+            shown = info["r_br"] + bias_offset(t, e) + camera
+        assert info["r_br_measured"] == pytest.approx(shown, rel=1e-12)
+        assert rows[k, 1] == float(not (flagged or np.isnan(camera)))
+        assert info["ring_offset"] == pytest.approx(bias_offset(t, e))
+        invalid += flagged or np.isnan(camera)
+        silent += frozen
+    assert invalid > 6
+    assert 6 <= silent <= 12
+    assert abs(e.bias_drift_amount) > 0
+
+
+def test_ring_ripple_is_sampled_at_the_frame() -> None:
+    scenario = Scenario("mine", sensor=Sensor(ripple=(1e-4, 1e-4), rotation=(11 / 60, 11 / 60)))
+    env = CzEnv(scenario)
+    _, infos, start = run(env, 60)
+    phase = float(start.slot["episode"]["ripple_phase"])
+    expected = 1e-4 * np.sin(2 * np.pi * 11 / 60 * 5.0 * np.arange(61) + phase)
+    np.testing.assert_allclose(column(infos, "r_br_measured") - column(infos, "r_br"), expected, atol=1e-12)
+
+
+def test_outliers_are_not_flagged() -> None:
+    scenario = Scenario("mine", sensor=Sensor(outlier_probability=0.5, outlier_sd=1e-3), faults=Faults())
+    rows, infos, _ = run(CzEnv(scenario), 100)
+    wrong = column(infos, "r_br_measured") - column(infos, "r_br")
+    assert 25 < np.count_nonzero(np.abs(wrong) > 1e-9) < 75
+    assert (rows[:, 1] == 1.0).all()
+
+
+def test_camera_noise_is_per_sample_whatever_the_interval() -> None:
+    scenario = Scenario("mine", sensor=Sensor(camera_noise=(1e-4, 1e-4)))
+    for interval in (2.0, 10.0):
+        _, infos, start = run(CzEnv(scenario, control_interval=interval), 100)
+        noise = column(infos, "r_br_measured") - column(infos, "r_br")
+        np.testing.assert_allclose(noise, start.noise[:101, 0], atol=1e-12)
+
+
+def test_observations_are_clipped_not_lost() -> None:
+    scenario = Scenario("mine", sensor=Sensor(bias_offset=(0.05, 0.05)))
+    observation, _ = CzEnv(scenario).reset(seed=0)
+    assert observation[0] == 10.0
+
+
+def test_decode_takes_any_batch_and_refuses_other_shapes(rng: np.random.Generator) -> None:
+    batch = rng.normal(size=(4, 3, 72))
+    assert decode(batch).T_1.shape == (4, 3)
+    np.testing.assert_allclose(decode(batch).T_1, 5.0 * batch[..., 8])
+    for wrong in (np.zeros(17), np.zeros(()), np.zeros((11, 2))):
+        with pytest.raises(ValueError, match="expected an observation"):
+            decode(wrong)

@@ -1,0 +1,256 @@
+from __future__ import annotations
+
+import dataclasses
+import math
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from cz_gym import SCENARIOS, Parameters, Scenario, make_puller
+from cz_gym.episodes.scenario import Faults, Interface, Pullers, Recipe, Reference, Sensor
+from cz_gym.episodes.series import (
+    FREEZES,
+    Episode,
+    Factors,
+    Series,
+    Stream,
+    draw_episode,
+    draw_factors,
+    new_series,
+    randomised,
+    stream,
+)
+
+MM, MINUTE, SPAN = 1e-3, 60.0, 10800.0
+WORD = st.integers(0, 2**64 - 1)
+KEY = st.tuples(WORD, WORD)
+FAMILIES = [field.name for field in dataclasses.fields(Scenario)[1:]]
+
+
+def draw(scenario: str | Scenario, key: tuple[int, int], grid: int = 50, samples: int = 50) -> tuple[Episode, Series]:
+    found = SCENARIOS[scenario] if isinstance(scenario, str) else scenario
+    series = new_series(grid, samples)
+    for array in series:
+        array[:] = 7.0
+    return draw_episode(found, key, series), series
+
+
+def keys(n: int) -> list[tuple[int, int]]:
+    return [(i, 3 * i + 1) for i in range(n)]
+
+
+def within(value: float, low: float, high: float, unit: float = 1.0) -> bool:
+    return low * unit - 1e-12 <= value <= high * unit + 1e-12
+
+
+@given(KEY)
+def test_randomized_draws_lie_in_the_designs_ranges(key: tuple[int, int]) -> None:
+    e, _ = draw("randomized", key)
+    f = draw_factors(SCENARIOS["randomized"], (0.0, 1.0), key)
+    assert within(f.lam, 0, 1)
+    assert within(f.a, 0.97, 1.03)
+    assert all(within(factor, 0.9, 1.1) for factor in (f.k_l, f.kappa_12, f.G_1a, f.G_2b, f.kappa_b))
+    assert within(e.recipe_duration, 5, 10, MINUTE)
+    assert within(e.recipe_amount / e.recipe_duration, -0.5, 0.5, 1 / MINUTE)
+    assert within(e.recipe_start, 10, 110, MINUTE)
+    assert within(e.drift_amount, -5, 5)
+    assert within(e.drift_duration, 20, 100, MINUTE)
+    assert within(e.drift_start, 0, 100, MINUTE)
+    assert within(e.reference_amount, -2.5, 2.5, MM)
+    assert within(e.reference_duration, 20, 50, MINUTE)
+    assert within(e.reference_start, 10, 110, MINUTE)
+    assert (e.ring_offset, e.bias_drift_amount, e.ripple_amplitude, e.pyrometer_drift, e.melt_loss) == (0,) * 5
+
+
+@given(KEY)
+def test_puller_draws_lie_in_the_designs_ranges(key: tuple[int, int]) -> None:
+    e, _ = draw("puller", key)
+    assert within(e.ring_offset, -0.4, 0.4, MM)
+    assert within(e.ripple_amplitude, 0, 0.2, MM)
+    assert within(e.ripple_omega, 8, 15, 2 * math.pi / MINUTE)
+    assert within(e.ripple_phase, 0, 2 * math.pi)
+    assert within(e.pyrometer_drift, -2, 2)
+
+
+@given(KEY)
+def test_faults_lie_in_the_designs_ranges_and_freezes_are_disjoint(key: tuple[int, int]) -> None:
+    e, series = draw("sensor-fault", key)
+    assert within(e.bias_drift_amount, -0.3, 0.3, MM)
+    assert within(e.bias_drift_duration, 1, 2, 3600)
+    assert within(e.bias_drift_start, 0, SPAN)
+    lengths = series.freezes[:, 1] - series.freezes[:, 0]
+    flagged = lengths[: FREEZES - 1]
+    assert 1 <= np.count_nonzero(flagged) <= 3
+    assert all(within(length, 30, 180) for length in flagged[flagged > 0])
+    assert within(lengths[-1], 30, 60)
+    windows = sorted(window.tolist() for window in series.freezes if window[1] > 0)
+    assert windows[0][0] >= 0
+    assert windows[-1][1] <= SPAN
+    assert all(before[1] <= after[0] for before, after in pairwise(windows))
+
+
+def felt(scenario: str | Scenario, key: tuple[int, int]) -> tuple[Episode, Series]:
+    """A draw without the numbers that act on nothing."""
+    e, series = draw(scenario, key)
+    if not e.ripple_amplitude:
+        e = e._replace(ripple_phase=0.0)
+    if not e.bias_drift_amount:
+        e = e._replace(bias_drift_start=0.0)
+    return e, series
+
+
+def same(one: tuple[Episode, Series], other: tuple[Episode, Series]) -> bool:
+    equal = all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one[1], other[1], strict=True))
+    return one[0] == other[0] and equal
+
+
+@pytest.mark.parametrize("name", list(SCENARIOS))
+def test_a_draw_is_made_from_its_key_alone(name: str) -> None:
+    first, again, other = felt(name, (5, 6)), felt(name, (5, 6)), felt(name, (5, 7))
+    assert same(first, again)
+    factors = [draw_factors(SCENARIOS[name], SCENARIOS[name].pullers.mix, key) for key in ((5, 6), (5, 7))]
+    assert (same(first, other) and factors[0] == factors[1]) == SCENARIOS[name].deterministic
+
+
+FIXED = [
+    ("pullers", Pullers(mix=(0.5, 0.5), melt_loss=0.1)),
+    ("recipe", Recipe((0.01, 0.01), (60.0, 60.0), (60.0, 60.0))),
+    ("reference", Reference(0.5, (1e-3, 1e-3), (60.0, 60.0))),
+    ("reference", Reference(1.0, (1e-3, 1e-3), (60.0, 60.0))),
+    ("interface", Interface((0.1, 0.1))),
+    ("sensor", Sensor(bias_offset=(1e-4, 1e-4), latency=5.0)),
+    ("sensor", Sensor(ripple=(1e-4, 1e-4), rotation=(0.2, 0.2))),
+    ("sensor", Sensor(camera_noise=(1e-5, 1e-5))),
+    ("sensor", Sensor(outlier_probability=0.5, outlier_sd=1e-3)),
+    ("faults", Faults(flagged=(1, 1), flagged_duration=(60.0, 60.0))),
+    ("faults", Faults(unflagged=1, unflagged_duration=(60.0, 60.0))),
+    ("faults", Faults(dropout=(0.5, 0.5))),
+    ("faults", Faults(bias_drift=(-1e-4, -1e-4), bias_drift_duration=(60.0, 60.0))),
+]
+
+
+@pytest.mark.parametrize(("family", "part"), FIXED)
+def test_deterministic_means_that_every_draw_is_the_same(family: str, part: Any) -> None:
+    scenario = dataclasses.replace(Scenario("mine"), **{family: part})
+
+    assert all(same(felt(scenario, keys(1)[0]), felt(scenario, key)) for key in keys(12)) == scenario.deterministic
+
+
+@pytest.mark.parametrize("name", list(SCENARIOS))
+def test_a_longer_horizon_extends_a_draw_and_never_changes_it(name: str) -> None:
+    short, long = draw(name, (8, 9), 100, 90), draw(name, (8, 9), 400, 2000)
+    assert short[0] == long[0]
+    np.testing.assert_array_equal(short[1].interface, long[1].interface[:100])
+    np.testing.assert_array_equal(short[1].noise, long[1].noise[:90])
+    np.testing.assert_array_equal(short[1].freezes, long[1].freezes)
+
+
+def test_families_share_no_random_number() -> None:
+    key = (11, 12)
+    whole, series = draw("randomized", key)
+    shared = {"recipe": "recipe_", "drift": "drift_", "reference": "reference_"}
+    for family, prefix in shared.items():
+        alone, _ = draw(f"only-{family}", key)
+        fields = [name for name in Episode._fields if name.startswith(prefix)]
+        assert fields
+        assert [getattr(alone, name) for name in fields] == [getattr(whole, name) for name in fields]
+    np.testing.assert_array_equal(draw("only-interface", key)[1].interface, series.interface)
+    np.testing.assert_array_equal(draw("only-sensor", key)[1].noise, series.noise)
+    alone, _ = draw("only-parameters", key)
+    assert alone.r_c_start == whole.r_c_start
+    assert alone.drift_amount == 0.0
+    factors = [draw_factors(SCENARIOS[name], (0.0, 1.0), key) for name in ("only-parameters", "randomized")]
+    assert factors[0] == factors[1]
+
+
+def test_sensor_fault_and_puller_disturb_the_same_crystal_as_randomized() -> None:
+    key = (13, 14)
+    whole, series = draw("randomized", key)
+    for name in ("sensor-fault", "puller"):
+        e, other = draw(name, key)
+        assert (e.recipe_amount, e.drift_amount, e.reference_amount) == (
+            whole.recipe_amount, whole.drift_amount, whole.reference_amount,
+        )  # fmt: skip
+        np.testing.assert_array_equal(other.interface, series.interface)
+
+
+def test_streams_are_different() -> None:
+    named = Stream.__members__
+    first = {tuple(stream((1, 2), number).random(4)) for number in named.values()}
+    assert len(first) == len(named) == 8
+
+
+def test_interface_fluctuation_is_two_stationary_processes() -> None:
+    scenario = Scenario("mine", interface=Interface(sd=(1.0, 1.0)))
+    runs = np.array([draw(scenario, key, grid=320)[1].interface for key in keys(3000)])
+    for start in (0, 150):
+        for lag in (0, 1, 6, 40, 156):
+            product = runs[:, start] * runs[:, start + lag]
+            expected = math.exp(-5 * lag / 30) + math.exp(-5 * lag / 780)
+            error = product.std() / math.sqrt(len(runs))
+            assert product.mean() == pytest.approx(expected, abs=4 * error)
+    assert stats.kstest(runs[:, 100] / math.sqrt(2), "norm").pvalue > 1e-3
+
+
+def test_interface_deviations_are_drawn_separately() -> None:
+    runs = np.array([draw("only-interface", key, grid=2)[1].interface[0] for key in keys(3000)])
+    assert np.var(runs) == pytest.approx(2 * 0.5**2 / 3, rel=0.12)
+
+
+def test_draws_are_uniform() -> None:
+    factors = np.array([draw_factors(SCENARIOS["randomized"], (0.0, 1.0), key) for key in keys(2000)])
+    widths = np.array([0.5, 0.03, 0.1, 0.1, 0.1, 0.1, 0.1])
+    middle = np.array([0.5, 1, 1, 1, 1, 1, 1])
+    for column in ((factors - middle) / widths).T:
+        assert stats.kstest(column, stats.uniform(-1, 2).cdf).pvalue > 1e-3
+    assert np.abs(np.corrcoef(factors.T) - np.eye(7)).max() < 0.1
+
+
+def test_half_the_references_move_and_the_start_is_normal() -> None:
+    episodes = [draw("randomized", key)[0] for key in keys(2000)]
+    assert np.mean([e.reference_amount != 0 for e in episodes]) == pytest.approx(0.5, abs=0.045)
+    starts = np.array([e.r_c_start for e in episodes]) / (0.2 * MM)
+    assert stats.kstest(starts, "norm").pvalue > 1e-3
+
+
+def test_camera_and_pyrometer_noise_are_white_and_normal() -> None:
+    scenario = Scenario("mine", sensor=Sensor(camera_noise=(1e-5, 1e-5), pyrometer_noise=(0.2, 0.2)))
+    noise = draw(scenario, (3, 4), samples=20000)[1].noise / [1e-5, 0.2]
+    for column in noise.T:
+        assert stats.kstest(column, "norm").pvalue > 1e-3
+        assert abs(np.mean(column[1:] * column[:-1])) < 4 / math.sqrt(len(column))
+    assert abs(np.mean(noise[:, 0] * noise[:, 1])) < 4 / math.sqrt(len(noise))
+
+
+def test_outliers_are_rare_and_normal() -> None:
+    scenario = Scenario("mine", sensor=Sensor(outlier_probability=0.02, outlier_sd=1e-3))
+    camera = draw(scenario, (3, 4), samples=100_000)[1].noise[:, 0]
+    hit = camera[camera != 0]
+    assert len(hit) == pytest.approx(2000, abs=4 * math.sqrt(2000))
+    assert stats.kstest(hit / 1e-3, "norm").pvalue > 1e-3
+
+
+def test_dropouts_have_their_probability() -> None:
+    scenario = Scenario("mine", faults=Faults(dropout=(0.03, 0.03)))
+    camera = draw(scenario, (3, 4), samples=50_000)[1].noise[:, 0]
+    assert np.isnan(camera).mean() == pytest.approx(0.03, abs=4 * math.sqrt(0.03 / 50_000))
+
+
+def test_one_freeze_starts_uniformly() -> None:
+    scenario = Scenario("mine", faults=Faults(flagged=(1, 1), flagged_duration=(100.0, 100.0)))
+    starts = [draw(scenario, key)[1].freezes[0, 0] for key in keys(1000)]
+    assert stats.kstest(starts, stats.uniform(0, SPAN - 100).cdf).pvalue > 1e-3
+
+
+def test_factors_reach_the_puller() -> None:
+    q, factors = Parameters(), Factors(0.3, 1.02, 1.1, 0.9, 1.05, 0.95, 1.08)
+    p, nominal = make_puller(randomised(q, factors), factors.lam), make_puller(q)
+    assert p.a / nominal.a == pytest.approx(1.02)
+    assert (p.k_l, p.kappa_12, p.G_1a, p.G_2b) == pytest.approx((62 * 1.1, 2.8e-8 * 0.9, 30 * 1.05, 200 * 0.95))
+    assert p.kappa_b / nominal.kappa_b == pytest.approx(1.08)
+    assert (p.lam, p.r_0, p.v_0, p.C_1, p.T_b_0) == (0.3, nominal.r_0, nominal.v_0, nominal.C_1, nominal.T_b_0)

@@ -1,0 +1,235 @@
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cz_gym import SCENARIOS, Scenario
+from cz_gym.episodes.scenario import Drift, Faults, Interface, Pullers, Recipe, Reference, Sensor
+from cz_gym.episodes.scenarios import find_scenario, mix_of
+
+MM, MINUTE = 1e-3, 60.0
+FAMILIES = [field.name for field in dataclasses.fields(Scenario)[1:]]
+FROZEN = {
+    "nominal": "470ebb0cf8fc46d8",
+    "paper-ramp": "00726411751b722d",
+    "reference-a": "c61db8d3195dde7b",
+    "reference-b": "fafc6c06ed88de8b",
+    "randomized": "28ec8d2bf14b3b7b",
+    "hard": "f3b0f280a51eb76d",
+    "sensor-fault": "a2ba81372aa15e66",
+    "puller": "2104861fe7b255c8",
+    "only-recipe": "986d178b78f3b36e",
+    "only-drift": "35df8d2d49bfbfbe",
+    "only-interface": "8b4a530df4f47e75",
+    "only-sensor": "bb58fef8179b8f19",
+    "only-reference": "7e3a5668784daa66",
+    "only-parameters": "6702460317bfa4ff",
+}
+MEMBERS = [
+    (family, member.name) for family in FAMILIES for member in dataclasses.fields(getattr(SCENARIOS["nominal"], family))
+]
+
+
+def changed(scenario: Scenario, family: str, member: str, value: Any) -> Scenario:
+    """The scenario with one number replaced, which may raise."""
+    part = dataclasses.replace(getattr(scenario, family), **{member: value})
+    return dataclasses.replace(scenario, **{family: part})
+
+
+def test_the_names_of_the_design() -> None:
+    assert list(SCENARIOS) == [
+        "nominal", "paper-ramp", "reference-a", "reference-b", "randomized", "hard", "sensor-fault", "puller",
+        "only-recipe", "only-drift", "only-interface", "only-sensor", "only-reference", "only-parameters",
+    ]  # fmt: skip
+    assert all(scenario.name == name for name, scenario in SCENARIOS.items())
+
+
+def test_contents_are_frozen() -> None:
+    """A changed scenario is another benchmark: change a hash here only together with the committed results."""
+    assert {name: scenario.hash for name, scenario in SCENARIOS.items()} == FROZEN
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        SCENARIOS["nominal"].recipe = Recipe()  # type: ignore[misc]
+
+
+def test_deterministic_scenarios() -> None:
+    certain = [name for name, scenario in SCENARIOS.items() if scenario.deterministic]
+    assert certain == ["nominal", "paper-ramp", "reference-a", "reference-b"]
+
+
+def pair(low: float, high: float, unit: float = 1.0) -> Any:
+    return pytest.approx((low * unit, high * unit))
+
+
+def test_randomized_is_the_design() -> None:
+    s = SCENARIOS["randomized"]
+    assert s.pullers.mix == (0, 1)
+    assert (s.pullers.capillary, s.pullers.conductivity, s.pullers.conductance) == (0.03, 0.1, 0.1)
+    assert s.pullers.start_radius_sd == pytest.approx(0.2 * MM)
+    assert (s.recipe.rate, s.recipe.duration, s.recipe.start) == (
+        pair(-0.5, 0.5, 1 / MINUTE), pair(5, 10, MINUTE), pair(10, 110, MINUTE),
+    )  # fmt: skip
+    assert (s.drift.amount, s.drift.duration, s.drift.start, s.drift.rate) == (
+        pair(-5, 5), pair(20, 100, MINUTE), pair(0, 100, MINUTE), 0,
+    )  # fmt: skip
+    assert (s.interface.sd, s.interface.tau_fast, s.interface.tau_slow) == ((0, 0.5), 30, 780)
+    assert (s.sensor.camera_noise, s.sensor.pyrometer_noise) == (pair(0, 0.05, MM), pair(0, 0.1))
+    assert (s.reference.probability, s.reference.amount) == (0.5, pair(-2.5, 2.5, MM))
+    assert (s.reference.duration, s.reference.start) == (pair(20, 50, MINUTE), pair(10, 110, MINUTE))
+
+
+def test_hard_is_randomized_wider() -> None:
+    s, randomized = SCENARIOS["hard"], SCENARIOS["randomized"]
+    assert (s.pullers.capillary, s.pullers.conductivity, s.pullers.conductance) == (0.045, 0.15, 0.15)
+    assert s.pullers.start_radius_sd == pytest.approx(0.3 * MM)
+    assert s.interface.sd == (0, 0.75)
+    assert s.recipe == dataclasses.replace(randomized.recipe, rate=s.recipe.rate)
+    assert s.recipe.rate == pair(-0.75, 0.75, 1 / MINUTE)
+    assert s.drift == dataclasses.replace(randomized.drift, amount=(-7.5, 7.5))
+    assert s.reference == dataclasses.replace(randomized.reference, amount=s.reference.amount)
+    assert s.reference.amount == pair(-3.75, 3.75, MM)
+    assert (s.sensor.camera_noise, s.sensor.pyrometer_noise) == (pair(0, 0.1, MM), pair(0, 0.2))
+
+
+def test_sensor_fault_is_randomized_with_faults() -> None:
+    s, f = SCENARIOS["sensor-fault"], SCENARIOS["sensor-fault"].faults
+    assert dataclasses.replace(s, name="randomized", faults=Faults()) == SCENARIOS["randomized"]
+    assert (f.flagged, f.flagged_duration) == ((1, 3), (30, 180))
+    assert (f.unflagged, f.unflagged_duration) == (1, (30, 60))
+    assert f.dropout == (0, 0.05)
+    assert (f.bias_drift, f.bias_drift_duration) == (pair(-0.3, 0.3, MM), (3600, 7200))
+
+
+def test_puller_is_what_a_growth_engineer_meets() -> None:
+    s = SCENARIOS["puller"]
+    assert (s.recipe, s.interface, s.reference) == (
+        SCENARIOS["randomized"].recipe, SCENARIOS["randomized"].interface, SCENARIOS["randomized"].reference,
+    )  # fmt: skip
+    assert (s.sensor.bias_offset, s.sensor.level_offset) == (pair(-0.3, 0.3, MM), pair(-0.1, 0.1, MM))
+    assert (s.sensor.ripple, s.sensor.rotation) == (pair(0, 0.2, MM), pair(8, 15, 1 / MINUTE))
+    assert (s.sensor.latency, s.sensor.outlier_probability) == (5, 0.005)
+    assert s.sensor.outlier_sd == pytest.approx(1 * MM)
+    assert s.sensor.pyrometer_drift == (-2, 2)
+    assert s.actuators.pull_window == pytest.approx(0.5 * MM / MINUTE)
+    assert s.actuators.pull_slew == pytest.approx(0.3 * MM / MINUTE / MINUTE)
+    assert (s.actuators.heater_slew, s.actuators.heater_step) == (pytest.approx(2000 / MINUTE), 100)
+    assert s.pullers.melt_loss == 0.1
+    assert s.drift.rate == pytest.approx(0.1 / MINUTE)
+
+
+@pytest.mark.parametrize("family", ["recipe", "drift", "interface", "sensor", "reference", "parameters"])
+def test_one_family_alone(family: str) -> None:
+    only, field = SCENARIOS[f"only-{family}"], "pullers" if family == "parameters" else family
+    assert getattr(only, field) == getattr(SCENARIOS["randomized"], field)
+    rest = dataclasses.replace(only, name="nominal", **{field: getattr(SCENARIOS["nominal"], field)})
+    assert rest == SCENARIOS["nominal"]
+
+
+@given(st.sampled_from(MEMBERS))
+def test_every_number_counts_in_the_hash(where: tuple[str, str]) -> None:
+    family, member = where
+    base = SCENARIOS["sensor-fault"]
+    old = getattr(getattr(base, family), member)
+    if isinstance(old, tuple):
+        new: Any = (old[0], old[1] if old[1] == 3 else old[1] + (1 if isinstance(old[1], int) else 1e-7))
+    else:
+        new = 1.0 if math.isinf(old) else old * 0.5 if old else 0.25
+    if new == old or (family, member) in (("pullers", "mix"), ("faults", "flagged")):
+        new = (old[0], old[0])
+    if member == "unflagged":
+        new = 0
+    assert changed(base, family, member, new).hash != base.hash
+
+
+@given(
+    st.sampled_from(MEMBERS),
+    st.sampled_from([math.nan, -math.inf, "much", None, (0.0,), (1.0, 0.0), (0.0, math.nan), (-2.0, -1.0), [0.0, 1.0]]),
+)
+def test_nonsense_is_refused_in_one_line(where: tuple[str, str], value: object) -> None:
+    signed = {"rate", "amount", "pyrometer_drift", "bias_offset", "level_offset", "bias_drift"}
+    family, member = where
+    if value == (-2.0, -1.0) and member in signed:
+        return
+    with pytest.raises(ValueError, match=member) as refusal:
+        changed(SCENARIOS["nominal"], family, member, value)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("family", "member", "value"),
+    [
+        ("faults", "flagged", (0.5, 1.0)),
+        ("faults", "flagged", (2, 9)),
+        ("faults", "unflagged", 0.5),
+        ("faults", "unflagged", 2),
+        ("faults", "dropout", (0.0, 1.5)),
+        ("pullers", "mix", (0.0, 1.5)),
+        ("pullers", "capillary", 0.9),
+        ("pullers", "melt_loss", 1.0),
+        ("reference", "probability", 1.5),
+        ("sensor", "latency", 1e4),
+        ("sensor", "latency", -5.0),
+        ("sensor", "outlier_probability", 2.0),
+        ("sensor", "outlier_sd", -1.0),
+        ("interface", "tau_fast", 0.0),
+        ("interface", "sd", (-0.5, 0.5)),
+        ("actuators", "pull_slew", -1.0),
+    ],
+)
+def test_what_no_draw_can_be_made_from_is_refused(family: str, member: str, value: object) -> None:
+    with pytest.raises(ValueError, match="scenario 'nominal'"):
+        changed(SCENARIOS["nominal"], family, member, value)
+
+
+def test_a_family_is_a_family() -> None:
+    with pytest.raises(ValueError, match="must be a Drift"):
+        Scenario("mine", drift=Recipe())  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="name"):
+        Scenario("")
+
+
+def test_freezes_must_fit() -> None:
+    with pytest.raises(ValueError, match="do not fit"):
+        Scenario("mine", faults=Faults(flagged=(3, 3), flagged_duration=(3601.0, 3601.0)))
+
+
+def test_equal_contents_have_equal_hashes() -> None:
+    def mine() -> Scenario:
+        return Scenario("mine", Pullers(mix=(0.2, 0.3)), drift=Drift((1.0, 2.0)), interface=Interface((0.1, 0.1)))
+
+    assert mine() == mine()
+    assert mine().hash == mine().hash
+    whole = Scenario("mine", Pullers(mix=(0, 1)), drift=Drift((-0.0, 2)), interface=Interface((1, 1)))
+    same = Scenario("mine", Pullers(mix=(0.0, 1.0)), drift=Drift((0.0, 2.0)), interface=Interface((1.0, 1.0)))
+    assert (whole == same, whole.hash) == (True, same.hash)
+    assert len({scenario.hash for scenario in SCENARIOS.values()}) == len(SCENARIOS)
+
+
+def test_a_users_scenario_may_be_random_in_one_number() -> None:
+    assert not Scenario("mine", sensor=Sensor(ripple=(1e-4, 1e-4))).deterministic
+    assert not Scenario("mine", reference=Reference(0.5, (1e-3, 1e-3), (60.0, 60.0))).deterministic
+    assert Scenario("mine", drift=Drift((2.0, 2.0), (60.0, 60.0))).deterministic
+
+
+def test_finding_a_scenario() -> None:
+    mine = Scenario("mine")
+    assert find_scenario(mine) is mine
+    assert find_scenario("hard") is SCENARIOS["hard"]
+    for wrong in ("nonsense", None, 3, ["hard"]):
+        with pytest.raises(ValueError, match=r"unknown scenario .*randomized, hard"):
+            find_scenario(wrong)  # type: ignore[arg-type]
+
+
+def test_model_and_mix() -> None:
+    randomized = SCENARIOS["randomized"]
+    assert mix_of(None, randomized) == (0.0, 1.0)
+    assert mix_of(None, SCENARIOS["nominal"]) == (1.0, 1.0)
+    assert (mix_of("I", randomized), mix_of("II", randomized)) == ((1.0, 1.0), (0.0, 0.0))
+    assert mix_of(0.25, randomized) == (0.25, 0.25)
+    for wrong in (1.5, -0.1, "III", math.nan, True, [1]):
+        with pytest.raises(ValueError, match='"I", "II", a mix in'):
+            mix_of(wrong, randomized)  # type: ignore[arg-type]

@@ -1,0 +1,212 @@
+"""Metrics against values worked out by hand, on made-up crystals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cz_gym.baselines.pid.compensated_pid import CompensatedPID
+from cz_gym.config import make_config
+from cz_gym.evaluation.metrics import Metrics, metric_names, metrics
+from cz_gym.evaluation.rollout import Rollout, Signals, rollout
+
+DT = 5.0
+R, V, Q = 0.0875, 2e-5, 60e3
+MM_PER_MIN = 1e-3 / 60
+
+
+def made_up(steps: int, lived: int | None = None, **signals: Any) -> Rollout:
+    """One episode of a perfect crystal but for the given signals; with ``lived``, it fails at that step."""
+    config = make_config("nominal", control_interval=DT, horizon=DT * steps)
+    calm = dict.fromkeys(Signals._fields, 0.0) | {"r_c": R, "r_ref": R, "v_p": V, "v_g": V, "Q_H": Q}
+    columns = {name: np.full((steps, 1), value) for name, value in calm.items()}
+    for name, value in signals.items():
+        columns[name] = np.broadcast_to(np.asarray(value, float), steps).reshape(steps, 1).copy()
+    alive = np.arange(steps)[:, None] < (steps if lived is None else lived)
+    start = Signals(**{name: np.full((1, 1), value) for name, value in calm.items()})
+    failed = np.array([lived is not None])
+    return Rollout(config, (0,), Signals(**columns), np.zeros((steps, 1)), alive, failed, start, 0.0)
+
+
+def of(run: Rollout) -> Metrics:
+    """The metrics of the one episode."""
+    return Metrics(*(value.item() for value in metrics(run)))
+
+
+def test_names_are_the_published_ones() -> None:
+    assert metric_names() == (
+        "rmse_mm", "rmse_observable_mm", "max_error_mm", "within_half_mm", "pull_rms_mm_per_min",
+        "pull_step_rms_mm_per_min", "mean_pull_within_3pct", "heater_step_rms_kw", "growth_rate_rms_mm_per_min",
+        "ground_off_pct", "cost", "failure_rate", "return",
+    )  # fmt: skip
+
+
+def test_a_perfect_crystal() -> None:
+    perfect = of(made_up(720))
+    assert perfect == Metrics(0, 0, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0)
+
+
+def test_a_constant_error() -> None:
+    found = of(made_up(100, r_c=R - 0.7e-3))
+    assert found.rmse_mm == pytest.approx(0.7)
+    assert found.max_error_mm == pytest.approx(0.7)
+    assert found.within_half_mm == 0
+    assert found.ground_off_pct == pytest.approx(0, abs=1e-10)
+
+
+def test_mean_square_not_mean_absolute() -> None:
+    error = np.where(np.arange(100) < 25, 0.6e-3, 0.2e-3) * np.where(np.arange(100) % 2, 1, -1)
+    found = of(made_up(100, r_c=R + error))
+    assert found.rmse_mm == pytest.approx(np.sqrt(0.25 * 0.36 + 0.75 * 0.04))
+    assert found.max_error_mm == pytest.approx(0.6)
+    assert found.within_half_mm == 0.75
+
+
+def test_error_is_against_the_reference_as_it_moves() -> None:
+    moving = R - np.linspace(0, 2.5e-3, 100)
+    assert of(made_up(100, r_c=moving + 0.1e-3, r_ref=moving)).rmse_mm == pytest.approx(0.1)
+
+
+def test_observable_error_forgives_what_no_sensor_shows() -> None:
+    """The ring reads 0.3 mm too wide: a crystal held 0.3 mm too thin is all that a controller can do."""
+    fooled = of(made_up(100, r_c=R - 0.3e-3, ring_offset=0.3e-3))
+    assert fooled.rmse_mm == pytest.approx(0.3)
+    assert fooled.rmse_observable_mm == pytest.approx(0, abs=1e-10)
+    lucky = of(made_up(100, ring_offset=0.3e-3))
+    assert lucky.rmse_mm == 0
+    assert lucky.rmse_observable_mm == pytest.approx(0.3)
+
+
+def test_a_failure_counts_eight_millimetres_to_the_end() -> None:
+    """Ten steps, the fourth fails: three perfect steps, seven at 8 mm."""
+    found = of(made_up(10, lived=4))
+    assert found.rmse_mm == pytest.approx(8 * np.sqrt(7 / 10))
+    assert found.rmse_observable_mm == pytest.approx(8 * np.sqrt(7 / 10))
+    assert found.max_error_mm == pytest.approx(8)
+    assert found.within_half_mm == pytest.approx(3 / 10)
+    assert found.failure_rate == 1
+
+
+@pytest.mark.parametrize("lived", [1, 10])
+def test_failing_in_the_first_or_last_step(lived: int) -> None:
+    assert of(made_up(10, lived=lived)).rmse_mm == pytest.approx(8 * np.sqrt((11 - lived) / 10))
+
+
+def test_dying_early_never_flatters() -> None:
+    errors = [of(made_up(50, lived=lived, r_c=R + 7e-3)) for lived in range(1, 51)]
+    rmse = [found.rmse_mm for found in errors]
+    assert rmse == sorted(rmse, reverse=True)
+    assert min(rmse) > of(made_up(50, r_c=R + 7e-3)).rmse_mm
+
+
+def test_nothing_after_the_end_counts() -> None:
+    """The slot goes on with another crystal, or with NaN: no metric reads it."""
+    steps, lived = 800, 300
+    rng = np.random.default_rng(1)
+    told = {
+        name: value * rng.uniform(0.99, 1.01, steps) for name, value in (("r_c", R), ("v_p", V), ("v_g", V), ("Q_H", Q))
+    }
+    after = {name: np.where(np.arange(steps) < lived, value, np.nan) for name, value in told.items()}
+    np.testing.assert_array_equal(of(made_up(steps, lived, **told)), of(made_up(steps, lived, **after)))
+
+
+def test_drives_are_those_of_the_time_lived() -> None:
+    found = of(made_up(100, lived=50, v_p=V + 0.1 * MM_PER_MIN, v_g=V - 0.2 * MM_PER_MIN))
+    assert found.pull_rms_mm_per_min == pytest.approx(0.1)
+    assert found.growth_rate_rms_mm_per_min == pytest.approx(0.2)
+    assert found.pull_step_rms_mm_per_min == pytest.approx(0.1 / np.sqrt(50))
+
+
+def test_a_sine_on_the_pull_speed() -> None:
+    phase = 2 * np.pi * np.arange(720) / 72
+    found = of(made_up(720, v_p=V + 0.3 * MM_PER_MIN * np.sin(phase), v_g=V + 0.1 * MM_PER_MIN * np.cos(phase)))
+    assert found.pull_rms_mm_per_min == pytest.approx(0.3 / np.sqrt(2))
+    assert found.growth_rate_rms_mm_per_min == pytest.approx(0.1 / np.sqrt(2))
+    # The change over a step is 2 A sin(w/2) cos(...): RMS sqrt(2) A sin(w/2); the first step is from rest, as sin 0.
+    assert found.pull_step_rms_mm_per_min == pytest.approx(np.sqrt(2) * 0.3 * np.sin(np.pi / 72), rel=2e-3)
+
+
+def test_the_first_step_is_a_step() -> None:
+    found = of(made_up(4, v_p=V + 0.2 * MM_PER_MIN, Q_H=Q + np.array([1e3, 1e3, -1e3, -1e3])))
+    assert found.pull_step_rms_mm_per_min == pytest.approx(0.2 / 2)
+    assert found.heater_step_rms_kw == pytest.approx(np.sqrt((1 + 0 + 4 + 0) / 4))
+
+
+def test_mean_pull_has_a_three_per_cent_band() -> None:
+    assert of(made_up(720, v_p=1.0299 * V)).mean_pull_within_3pct == 1
+    assert of(made_up(720, v_p=0.9701 * V)).mean_pull_within_3pct == 1
+    assert of(made_up(720, v_p=1.0301 * V)).mean_pull_within_3pct == 0
+    assert of(made_up(720, v_p=0.9699 * V)).mean_pull_within_3pct == 0
+
+
+def test_mean_pull_forgives_what_averages_out() -> None:
+    wild = V * np.where(np.arange(1440) % 360 < 180, 1.4, 0.6)
+    assert of(made_up(1440, v_p=wild)).mean_pull_within_3pct == 1
+
+
+def test_mean_pull_counts_full_windows() -> None:
+    """v_0 for an hour, then 6.01 % more: a window of 360 steps leaves the band when 180 of them are faster."""
+    pull = V * np.where(np.arange(1440) < 720, 1.0, 1.0601)
+    windows, inside = 1440 - 359, 720 + 179 - 359
+    assert of(made_up(1440, v_p=pull)).mean_pull_within_3pct == pytest.approx(inside / windows)
+
+
+def test_mean_pull_after_a_failure_is_outside() -> None:
+    assert of(made_up(1440, lived=720)).mean_pull_within_3pct == pytest.approx((720 - 359) / (1440 - 359))
+    assert of(made_up(1440, lived=300)).mean_pull_within_3pct == 0
+
+
+def test_ground_off_a_taper() -> None:
+    """A straight taper from r_1 to r_2: mean r^2 is (r_1^2 + r_1 r_2 + r_2^2) / 3."""
+    first, last = 0.0880, 0.0860
+    steps = 20_001
+    found = of(made_up(steps, r_c=np.linspace(first, last, steps)))
+    expected = 100 * ((first**2 + first * last + last**2) / 3 / last**2 - 1)
+    assert found.ground_off_pct == pytest.approx(expected, rel=1e-4)
+
+
+def test_return_is_the_sum_of_rewards_and_nothing_else_reads_them() -> None:
+    run = made_up(10, lived=4, r_c=R + 1e-4)
+    run.reward[:] = np.arange(10.0)[:, None]
+    rewarded = of(run)
+    assert rewarded.return_ == 45
+    assert rewarded._replace(return_=0.0) == of(made_up(10, lived=4, r_c=R + 1e-4))
+
+
+def test_cost_is_that_of_the_reward_before_it_saturates() -> None:
+    """Each term where it is one weight, by the printed scales: 0.5 mm, 0.36 and 0.06 mm/min, 1 kW."""
+    assert of(made_up(100, r_c=R + 1e-3)).cost == pytest.approx(4.0)
+    assert of(made_up(100, v_p=V + 0.36 * MM_PER_MIN)).cost == pytest.approx(0.5 + 0.25 * 36.0 / 100)
+    assert of(made_up(100, Q_H=Q + 1e3 * (np.arange(100) % 2))).cost == pytest.approx(0.05 * 99 / 100)
+
+
+def test_cost_of_a_failure_counts_the_lost_radius_to_the_end_and_drives_while_they_lived() -> None:
+    found = of(made_up(10, lived=4, v_p=V + 0.36 * MM_PER_MIN))
+    assert found.cost == pytest.approx((7 * 16.0**2 + 4 * 0.5 + 0.25 * 36.0) / 10)
+
+
+def test_cost_gives_the_reward_of_every_step() -> None:
+    """One step an episode: what the environment paid is the saturated cost."""
+    for seed in range(3):
+        run = rollout(CompensatedPID(), make_config("randomized", horizon=DT), [seed])
+        found = metrics(run)
+        np.testing.assert_allclose(found.return_, 1.0 - 10.0 * found.cost / (10.0 + found.cost), rtol=1e-6)
+
+
+def test_episodes_do_not_mix() -> None:
+    """A batch of three, one failing: the same values as one by one."""
+    runs = [made_up(800, r_c=R + 1e-4), made_up(800, lived=500, v_p=1.01 * V), made_up(800, Q_H=Q + np.arange(800.0))]
+    batch = Rollout(
+        runs[0].config,
+        (0, 1, 2),
+        Signals(*(np.hstack(columns) for columns in zip(*(run.signals for run in runs), strict=True))),
+        np.hstack([run.reward for run in runs]),
+        np.hstack([run.alive for run in runs]),
+        np.concatenate([run.failed for run in runs]),
+        Signals(*(np.hstack(columns) for columns in zip(*(run.start for run in runs), strict=True))),
+        0.0,
+    )
+    singles = np.array([of(run) for run in runs])
+    np.testing.assert_allclose(np.stack(metrics(batch), axis=-1), singles, rtol=1e-12, atol=1e-10)

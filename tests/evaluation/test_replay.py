@@ -1,0 +1,116 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cz_gym import CzVectorEnv
+from cz_gym.baselines import CompensatedPID
+from cz_gym.config import make_config
+from cz_gym.evaluation.replay import Playback, replay
+from cz_gym.evaluation.rollout import Rollout, rollout
+
+CONFIG = make_config("puller", horizon=600.0)
+SEEDS = [3, 4, 5]
+
+
+def equal(one: Rollout, other: Rollout, first: int = 0, last: int | None = None) -> None:
+    for a, b in zip(one.signals, other.signals, strict=True):
+        np.testing.assert_array_equal(a[first:last], b[first:last])
+    np.testing.assert_array_equal(one.reward[first:last], other.reward[first:last])
+
+
+def actions(steps: int = 120) -> np.ndarray:
+    return np.random.default_rng(0).uniform(-0.2, 0.2, (steps, len(SEEDS), 2)).astype(np.float32)
+
+
+def test_from_the_start_both_are_rollouts_on_the_same_melt() -> None:
+    found = replay(Playback(actions()), CompensatedPID(), CONFIG, SEEDS)
+    equal(found.actual, rollout(Playback(actions()), CONFIG, SEEDS))
+    equal(found.instead, rollout(CompensatedPID(), CONFIG, SEEDS))
+
+
+@pytest.mark.parametrize("at", [5.0, 300.0, 600.0])
+@pytest.mark.parametrize("watches", [False, True])
+def test_the_same_controller_instead_changes_nothing(at: float, watches: bool) -> None:
+    """A log played back has no memory but its place; a controller that watched itself goes on as it was."""
+    found = replay(CompensatedPID(), CompensatedPID(), CONFIG, SEEDS, at, watches)
+    equal(found.actual, rollout(CompensatedPID(), CONFIG, SEEDS))
+    equal(found.actual, found.instead, 0, round(at / 5.0))
+    if watches:
+        equal(found.actual, found.instead)
+
+
+def test_until_the_takeover_both_are_one_and_then_the_disturbances_are() -> None:
+    found = replay(Playback(actions()), Playback(np.zeros((1, 2))), CONFIG, SEEDS, 300.0)
+    equal(found.actual, found.instead, 0, 60)
+    assert found.at == 300.0
+    assert not np.array_equal(found.actual.signals.r_c[60:], found.instead.signals.r_c[60:])
+    for name in ("r_ref", "T_1_ref", "ring_offset"):
+        np.testing.assert_array_equal(getattr(found.actual.signals, name), getattr(found.instead.signals, name))
+    # By hand: the same actions, then none, on the same seeds.
+    env = CzVectorEnv(len(SEEDS), CONFIG.scenario, horizon=600.0)
+    env.reset(seed=SEEDS)
+    for k in range(120):
+        *_, info = env.step(actions()[k] if k < 60 else np.zeros((len(SEEDS), 2)))
+    np.testing.assert_array_equal(found.instead.signals.r_c[-1], info["r_c"])
+
+
+def test_a_failed_episode_stays_failed() -> None:
+    found = replay(Playback([[1.0, 0.0]]), Playback([[0.0, 0.0]]), make_config("hard", horizon=1800.0), SEEDS, 900.0)
+    assert found.actual.failed.all()
+    np.testing.assert_array_equal(found.instead.failed, found.actual.failed)
+    np.testing.assert_array_equal(found.instead.alive, found.actual.alive)
+
+
+@pytest.mark.parametrize("arguments", [{"seeds": []}, {"at": -1.0}, {"at": 601.0}, {"at": float("nan")}])
+def test_bad_arguments_are_refused(arguments: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"at least one seed|must lie in the episode"):
+        replay(Playback([[0, 0]]), Playback([[0, 0]]), **{"config": CONFIG, "seeds": SEEDS, **arguments})
+
+
+@pytest.mark.parametrize("log", [[], [1.0, 2.0], np.zeros((3, 3)), np.zeros((0, 2))])
+def test_bad_logs_are_refused(log: Any) -> None:
+    with pytest.raises(ValueError, match="logged actions must be of shape"):
+        Playback(log)
+
+
+CONTINUE = """
+import pickle, sys, hashlib
+import numpy as np
+from cz_gym import CzEnv
+env = CzEnv("puller", observation="history", horizon=300.0)
+if sys.argv[1] == "save":
+    env.reset(seed=8)
+else:
+    env.set_state(pickle.load(open(sys.argv[2], "rb")))
+digest, rng = hashlib.sha256(), np.random.default_rng(0)
+actions = rng.uniform(-0.3, 0.3, (160, 2)).astype(np.float32)
+for k in range(40 if sys.argv[1] == "go on" else 0, 160):
+    if k == 40:
+        digest = hashlib.sha256()
+        pickle.dump(env.get_state(), open(sys.argv[2], "wb"))
+    observation, reward, terminated, truncated, info = env.step(actions[k])
+    digest.update(observation.tobytes() + repr((reward, terminated, truncated, sorted(info.items(), key=str))).encode())
+    if terminated or truncated:
+        digest.update(env.reset()[0].tobytes())
+print(digest.hexdigest())
+"""
+
+
+def test_another_process_continues_bit_for_bit(tmp_path: Path) -> None:
+    """Through the ends of episodes: the random stream goes on as well."""
+    digests = [
+        subprocess.run(
+            [sys.executable, "-c", CONTINUE, what, str(tmp_path / "state.pickle")],
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for what in ("save", "go on")
+    ]
+    assert digests[0] == digests[1] != ""

@@ -1,0 +1,139 @@
+"""Rollouts against the scalar environment, step by step."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cz_gym import CzEnv
+from cz_gym.baselines import CompensatedPID, OpenLoop
+from cz_gym.config import Config, make_config
+from cz_gym.evaluation import rollout as module
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.rollout import Rollout, Signals, rollout
+from cz_gym.observation import MEASURED
+
+SHORT = make_config("randomized", horizon=600.0)
+CHANNELS = [channel.name for channel in MEASURED]
+
+
+class FullPull:
+    """Pulls as fast as it can, which detaches every crystal; notes what it is told."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[np.ndarray, Any]:
+        self.told.append((np.array(observation), np.array(episode_start)))
+        assert deterministic
+        assert (state is None) == (len(self.told) == 1)
+        return np.tile(np.float32([1.0, 0.2]), (len(observation), 1)), 0
+
+
+def one_by_one(policy: Any, config: Config, seed: int) -> tuple[dict[str, np.ndarray], float, bool]:
+    """Signals up to the end, return and failure of an episode in the scalar environment."""
+    env = CzEnv(config.scenario, config.model, config.observation, config.control_interval, config.horizon)
+    observation, _ = env.reset(seed=seed)
+    rows: list[dict[str, Any]] = []
+    state, total, over, terminated = None, 0.0, False, False
+    while not over:
+        action, state = policy.predict(observation[None], state, np.array([not rows]), True)
+        observation, reward, terminated, truncated, info = env.step(action[0])
+        total += reward
+        rows.append(info)
+        over = terminated or truncated
+    return {name: np.array([row[name] for row in rows]) for name in Signals._fields}, total, terminated
+
+
+def check_against_scalar(run: Rollout, policy: Any) -> None:
+    for i, seed in enumerate(run.seeds):
+        signals, total, failed = one_by_one(policy, run.config, seed)
+        lived = len(signals["r_c"])
+        assert run.alive[:, i].sum() == lived
+        assert run.alive[:lived, i].all()
+        assert run.failed[i] == failed
+        assert run.reward[:, i].sum() == pytest.approx(total)
+        assert not run.reward[lived:, i].any()
+        for name, logged in zip(Signals._fields, run.signals, strict=True):
+            np.testing.assert_array_equal(logged[:lived, i], signals[name], err_msg=name)
+
+
+def test_every_signal_is_the_scalar_environments() -> None:
+    policy = CompensatedPID()
+    check_against_scalar(rollout(policy, make_config("sensor-fault", horizon=600.0), [3, 2_000_000, 17]), policy)
+
+
+def test_failed_episodes_end_where_the_scalar_ones_do() -> None:
+    run = rollout(FullPull(), SHORT, range(5))
+    assert run.failed.all()
+    assert len(set(run.alive.sum(axis=0).tolist())) > 1
+
+    class Pull(FullPull):
+        def predict(self, observation: Any, *others: Any, **named: Any) -> tuple[np.ndarray, Any]:
+            return np.tile(np.float32([1.0, 0.2]), (len(observation), 1)), None
+
+    check_against_scalar(run, Pull())
+
+
+def test_policy_begins_again_where_the_crystal_does() -> None:
+    """``episode_start`` comes with an episode's first observation: drives at nominal, whatever the policy asks."""
+    policy = FullPull()
+    run = rollout(policy, SHORT, range(4))
+    pull = CHANNELS.index("v_p")
+    assert run.failed.all()
+    for observation, starts in policy.told:
+        np.testing.assert_array_equal(starts, observation[:, pull] == 0.0)
+    assert policy.told[0][1].all()
+    assert sum(starts.sum() for _, starts in policy.told[1:]) >= 4
+
+
+def test_a_crystal_does_not_depend_on_its_neighbours() -> None:
+    many, one = rollout(CompensatedPID(), SHORT, range(6)), rollout(CompensatedPID(), SHORT, [4])
+    for together, alone in zip(many.signals, one.signals, strict=True):
+        np.testing.assert_array_equal(together[:, 4:5], alone)
+
+
+def test_a_long_list_of_seeds_is_cut_and_joined(monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds = range(5)
+    whole = rollout(FullPull(), SHORT, seeds)
+    monkeypatch.setattr(module, "CHUNK", 2)
+    parts = rollout(OpenLoopFullPull(), SHORT, seeds)
+    assert parts.seeds == whole.seeds == tuple(seeds)
+    np.testing.assert_array_equal(np.stack(metrics(parts)), np.stack(metrics(whole)))
+
+
+class OpenLoopFullPull:
+    """The same pull without a notebook."""
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[np.ndarray, Any]:
+        return np.tile(np.float32([1.0, 0.2]), (len(observation), 1)), None
+
+
+def test_start_is_the_state_before_the_first_step() -> None:
+    run = rollout(OpenLoop(), SHORT, [7])
+    _, info = CzEnv(SHORT.scenario, horizon=SHORT.horizon).reset(seed=7)
+    for name, value in zip(Signals._fields, run.start, strict=True):
+        assert value.item() == info[name]
+
+
+def test_progress_counts_every_step_once() -> None:
+    counted: list[int] = []
+    run = rollout(OpenLoop(), SHORT, range(3), counted.append)
+    assert sum(counted) == run.alive.size == 3 * SHORT.steps
+
+
+def test_compute_is_time_in_predict_per_step_and_episode() -> None:
+    run = rollout(OpenLoop(), SHORT, range(3))
+    assert run.seconds_in_policy > 0
+    assert run.microseconds_per_step == pytest.approx(1e6 * run.seconds_in_policy / (3 * SHORT.steps))
+
+
+def test_no_seeds_no_rollout() -> None:
+    with pytest.raises(ValueError, match="at least one seed"):
+        rollout(OpenLoop(), SHORT, [])

@@ -1,0 +1,61 @@
+"""The report's first line: who wins, said of one agent or of several, from scenarios that can decide it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+from cz_gym.evaluation.report.verdict import headline
+from cz_gym.evaluation.results import Verdict
+from cz_gym.evaluation.statistics import Estimate
+
+BETTER, WORSE, EITHER = Estimate(-1.0, (-2.0, -0.5), 9), Estimate(1.0, (0.5, 2.0), 9), Estimate(0.1, (-1.0, 1.0), 9)
+
+
+def made(**scenarios: Any) -> Any:
+    """A benchmark of agents a, b, ...; each scenario gives their differences, "single" stands for one crystal."""
+    rows = []
+    for name, differences in scenarios.items():
+        verdicts = tuple(
+            Verdict(agent, "lqg", difference) for agent, difference in zip("abc", differences, strict=False)
+        )
+        seeds = (0,) if name.startswith("single") else tuple(range(9))
+        rows.append(SimpleNamespace(row=SimpleNamespace(name=name), verdicts=verdicts, seeds=seeds))
+    agents = [SimpleNamespace(name=verdict.agent, learned=True, bound=False) for verdict in rows[0].verdicts]
+    return SimpleNamespace(
+        controllers=[SimpleNamespace(name="lqg", learned=False, bound=False), *agents], scenarios=rows
+    )
+
+
+def test_one_agent() -> None:
+    assert headline(made(one=[BETTER])) == "The agent a wins: lowest mean RMSE on the only scenario of this run."
+    assert headline(made(one=[WORSE], two=[EITHER])) == (
+        "The agent a does not win: one (lqg is better), two (no clear difference from lqg)."
+    )
+    assert headline(made(one=[WORSE], two=[BETTER])).endswith("not on one (lqg is better); it wins on two.")
+
+
+def test_several_agents_are_told_apart_in_one_line() -> None:
+    assert headline(made(one=[WORSE] * 3, two=[WORSE] * 3)) == (
+        "No agent wins. one: lqg better than all 3 agents; two: lqg better than all 3 agents."
+    )
+    assert headline(made(one=[BETTER, WORSE, EITHER], two=[BETTER, WORSE, BETTER])) == (
+        "a wins on every scenario. one: a better than lqg, lqg better than b, no clear difference between lqg and c; "
+        "two: a, c better than lqg, lqg better than b."
+    )
+    assert headline(made(one=[WORSE, WORSE], two=[BETTER, WORSE])).startswith("No agent wins on every scenario.")
+
+
+def test_a_single_crystal_decides_nothing_beside_others() -> None:
+    assert "single" not in headline(made(one=[WORSE, WORSE], single=[BETTER, BETTER]))
+    assert headline(made(single=[Estimate(-1.0, None, 1)])).startswith("The agent a wins")
+
+
+def test_without_a_contest_it_says_so() -> None:
+    nobody = made(one=[WORSE])
+    nobody.controllers = nobody.controllers[:1]
+    assert headline(nobody) == "No learned agent took part in this run."
+    assert headline(made(one=[])) == "No learned agent took part in this run."
+    seeing = made(one=[])
+    seeing.controllers.append(SimpleNamespace(name="a", learned=True, bound=True))
+    assert headline(seeing) == "No learned agent took part in this run."

@@ -1,0 +1,202 @@
+"""Each test runs fresh processes on a copy of the package, so that sources can be changed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from cz_gym.jit.cache import Store, cache_folder, hashed, source_hash
+from cz_gym.jit.compile import kernel
+from cz_gym.physics.meniscus import hurle_slope
+
+ROOT = Path(__file__).parents[2]
+DERIVE = """
+from cz_gym import Parameters
+from cz_gym.jit.cache import cache_folder
+from cz_gym.engine.kernels import KERNELS
+puller = KERNELS.derive(Parameters(), 1.0)
+stats = getattr(KERNELS.derive, "stats", None)
+print(cache_folder(), puller.h_0, sum(stats.cache_hits.values()), sep="|")
+"""
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    """A folder that holds a copy of the package."""
+    shutil.copytree(
+        ROOT / "cz_gym",
+        tmp_path / "copy" / "cz_gym",
+        ignore=shutil.ignore_patterns("__pycache__", "agents", "baselines"),
+    )
+    return tmp_path / "copy"
+
+
+def run(code: str, folder: Path, cache: Path) -> list[str]:
+    """What a fresh process prints, split at bars."""
+    environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+    environment["CZ_GYM_CACHE_DIR"] = str(cache)
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], cwd=folder, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip().split("|")
+
+
+def edit(file: Path, old: str, new: str) -> None:
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+
+
+def test_changed_physics_is_never_run_from_an_old_cache(package: Path, tmp_path: Path) -> None:
+    """The edited function is compiled into a loop that stands in another, unchanged module."""
+    cache = tmp_path / "cache"
+    folder, height, hits = run(DERIVE, package, cache)
+    assert (Path(folder).parent, hits) == (cache, "0")
+    assert run(DERIVE, package, cache) == [folder, height, "1"]
+    edit(package / "cz_gym" / "physics" / "meniscus.py", "return a * (np.sqrt(half", "return 2.0 * a * (np.sqrt(half")
+    other, changed, hits = run(DERIVE, package, cache)
+    assert float(changed) == pytest.approx(2 * float(height))
+    assert (other != folder, hits) == (True, "0")
+
+
+def test_damaged_code_is_compiled_again(tmp_path: Path) -> None:
+    """Cut short, changed in one bit, and of another function under the right name."""
+    cache = tmp_path / "cache"
+    folder, height, _ = run(DERIVE, ROOT, cache)
+    (file,) = Path(folder).rglob("*derive*.code")
+    whole = file.read_bytes()
+    for damaged in (whole[: len(whole) // 2], whole[:-1] + bytes([whole[-1] ^ 1]), b""):
+        file.write_bytes(damaged)
+        assert run(DERIVE, ROOT, cache) == [folder, height, "0"]
+        assert run(DERIVE, ROOT, cache) == [folder, height, "1"]
+    assert not list(Path(folder).rglob(".code-*"))
+
+
+def test_code_for_other_types_is_not_used(tmp_path: Path) -> None:
+    store = Store(tmp_path, "kernel")
+    store.save("floats", 1)
+    store.save("integers", 2)
+    os.replace(store.path("floats"), store.path("integers"))
+    assert store.load("integers") is None
+    assert store.load("floats") is None
+    store.save("integers", 3)
+    assert store.load("integers") == 3
+
+
+def test_a_full_disk_keeps_nothing_and_fails_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*arguments: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("cz_gym.jit.cache.os.replace", full)
+    store = Store(tmp_path, "kernel")
+    store.save("floats", 1)
+    assert store.load("floats") is None
+    assert not list(tmp_path.iterdir())
+
+
+def test_processes_that_compile_at_once_all_have_it_right(tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "CZ_GYM_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", DERIVE]
+    several = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    printed = {process.communicate()[0].split("|")[1] for process in several}
+    assert all(process.returncode == 0 for process in several)
+    assert printed == {run(DERIVE, ROOT, tmp_path)[1]}
+    assert run(DERIVE, ROOT, tmp_path)[2] == "1"
+
+
+def test_no_place_for_a_cache_is_no_failure(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    folder, height, hits = run(DERIVE, ROOT, tmp_path / "file" / "below")
+    assert (folder, hits) == ("None", "0")
+    assert float(height) == pytest.approx(6.64e-3, rel=1e-3)
+
+
+@pytest.fixture
+def fresh(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
+    """The choice of a cache folder, made anew and forgotten."""
+    cache_folder.cache_clear()
+    yield monkeypatch
+    cache_folder.cache_clear()
+
+
+def test_no_vector_mathematics_that_rounds_otherwise(package: Path, tmp_path: Path, fresh: pytest.MonkeyPatch) -> None:
+    fresh.delenv("NUMBA_DISABLE_INTEL_SVML", raising=False)
+    code = "import cz_gym, numba\nprint(numba.config.DISABLE_INTEL_SVML, numba.config.USING_SVML)"
+    assert run(code, package, tmp_path / "cache") == ["1 False"]
+
+
+def test_an_empty_name_means_no_cache(fresh: pytest.MonkeyPatch) -> None:
+    fresh.setenv("CZ_GYM_CACHE_DIR", "")
+    assert cache_folder() is None
+    assert kernel(lambda x: x + 1)(1) == 2
+
+
+def test_a_home_that_is_not_there_means_no_cache(fresh: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    fresh.delenv("CZ_GYM_CACHE_DIR")
+    fresh.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert cache_folder() is None
+    fresh.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    cache_folder.cache_clear()
+    assert cache_folder() == next((tmp_path / "cache" / "cz-gym").iterdir())
+
+
+def test_a_read_only_cache_is_no_failure(fresh: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def refuse(*arguments: object, **more: object) -> None:
+        raise PermissionError("read-only file system")
+
+    fresh.setenv("CZ_GYM_CACHE_DIR", str(tmp_path))
+    fresh.setattr("tempfile.TemporaryFile", refuse)
+    assert cache_folder() is None
+
+
+def test_a_cache_that_vanishes_is_no_failure(tmp_path: Path) -> None:
+    code = "import shutil, cz_gym.jit.compile as c, cz_gym\nshutil.rmtree(c.cache_folder())\n" + DERIVE
+    assert float(run(code, ROOT, tmp_path / "cache")[1]) == pytest.approx(6.64e-3, rel=1e-3)
+
+
+def test_a_users_meniscus_is_never_run_from_a_cache(package: Path, tmp_path: Path) -> None:
+    (package / "mine.py").write_text(
+        "from cz_gym import HURLE\n"
+        "from cz_gym.jit.compile import physics\n"
+        "from cz_gym.physics.meniscus import hurle_height\n"
+        "@physics\n"
+        "def height(r_c, theta, a):\n"
+        "    return 1.0 * hurle_height(r_c, theta, a)\n"
+        "MINE = HURLE._replace(name='mine', height=height)\n"
+    )
+    code = (
+        "from cz_gym import Parameters\nfrom cz_gym.engine.kernels import build_kernels\nfrom mine import MINE\n"
+        "print(build_kernels(MINE).derive(Parameters(), 1.0).h_0)"
+    )
+    height = float(run(code, package, tmp_path / "cache")[0])
+    edit(package / "mine.py", "1.0 *", "1.1 *")
+    assert float(run(code, package, tmp_path / "cache")[0]) == pytest.approx(1.1 * height)
+
+
+def test_hash_sees_names_and_contents(package: Path) -> None:
+    folder = package / "cz_gym"
+    first = source_hash(folder)
+    assert first == source_hash(ROOT / "cz_gym")
+    edit(folder / "task.py", "FAILURE_COST = 10.0", "FAILURE_COST = 11.0")
+    second = source_hash(folder)
+    (folder / "task.py").rename(folder / "tasks.py")
+    third = source_hash(folder)
+    edit(folder / "rendering" / "pixels.py", "from __future__", "# changed\nfrom __future__")
+    fourth = source_hash(folder)
+    (folder / "evaluation" / "report" / "markdown.py").write_text("nothing of it is compiled")
+    assert len({first, second, third, fourth}) == 4
+    assert source_hash(folder) == fourth
+
+
+def test_only_functions_of_the_package_are_hashed() -> None:
+    assert hashed(hurle_slope)
+    assert not hashed(hurle_slope, lambda r_c, h_c, p: (0.0, 1.0))
+    assert not hashed(abs)

@@ -1,0 +1,93 @@
+"""Linearisation against published transfer functions, finite differences and the simulated plant."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+from cz_gym import Parameters, make_puller
+from cz_gym.physics.linearisation import INPUTS, OUTPUTS, STATES, jacobian, linearise, radius_model
+from cz_gym.physics.meniscus import HURLE
+from cz_gym.physics.plant import NO_DISTURBANCE, Inputs, State, rates
+from cz_gym.units import MM
+
+
+@pytest.mark.parametrize(("lam", "second_pole"), [(1.0, -1.684e-3), (0.0, 0.0)])
+def test_published_transfer_functions(lam, second_pole):
+    model = radius_model(make_puller(lam=lam))
+    assert model.numerator == pytest.approx(-0.0048849, rel=1e-3)
+    assert model.poles[0] == pytest.approx(8.78e-6, rel=6e-3)
+    assert model.poles[1] == pytest.approx(second_pole, rel=1e-3, abs=1e-18)
+    assert model.lead == pytest.approx(-46.0050, rel=5e-4)
+    assert model.constant == pytest.approx(1.0041, abs=5e-4)
+    assert model.zero == pytest.approx(0.0218, abs=5e-5)
+
+
+def test_complex_step_against_finite_differences():
+    p = make_puller(lam=0.4)
+    x = State(p.r_0 + 1.0 * MM, p.h_0 - 0.5 * MM, p.T_1_0 + 3.0, p.T_2_0 - 2.0, p.T_b_0 + 1.0)
+    u = Inputs(0.9 * p.v_0, p.Q_H_0 + 500.0)
+    model = linearise(p, x=x, u=u, d=NO_DISTURBANCE._replace(Q_d=300.0, dT_i=0.5))
+    point = np.array([*x, *u, 300.0, 0.5])
+    for j in range(len(point)):
+        step = 1e-5 * abs(point[j])
+        sides = []
+        for sign in (1.0, -1.0):
+            at = point.copy()
+            at[j] += sign * step
+            d = NO_DISTURBANCE._replace(Q_d=at[7], dT_i=at[8])
+            sides.append(np.array(rates(State(*at[:5]), Inputs(*at[5:7]), d, p, HURLE.slope)))
+        column = (sides[0] - sides[1]) / (2.0 * step)
+        np.testing.assert_allclose(np.hstack([model.A, model.B])[:, j], column, rtol=2e-6, atol=1e-12)
+
+
+def test_jacobian_of_known_function():
+    found = jacobian(lambda x, y: (x * y, np.exp(x), y**3), (0.5, 2.0))
+    np.testing.assert_allclose(found, [[2.0, 0.5], [np.exp(0.5), 0.0], [0.0, 12.0]], rtol=1e-15)
+
+
+def test_thermal_chain_reaches_the_crystal_but_not_back():
+    model = linearise(make_puller())
+    thermal, crystal = slice(2, 5), slice(0, 2)
+    assert not model.A[thermal, crystal].any()
+    assert model.A[crystal, thermal].any()
+    assert np.all(np.linalg.eigvals(model.A[thermal, thermal]).real < 0)
+    assert model.A.shape == (len(STATES), len(STATES))
+    assert model.D.shape == (len(OUTPUTS), len(INPUTS))
+
+
+def test_transfer_functions_agree_with_the_state_space():
+    p = make_puller()
+    model, full = radius_model(p), linearise(p)
+    small = model.state_space()
+    for s in (1e-4j, 3e-3j, 0.05j):
+        G_p = model.numerator / ((s - model.poles[0]) * (s - model.poles[1]))
+        G_m = model.lead * s + model.constant
+        exact = full.C @ np.linalg.solve(s * np.eye(5) - full.A, full.B[:, INPUTS.index("v_p")])
+        np.testing.assert_allclose([G_p, G_m * G_p], exact[:2], rtol=1e-9)
+        reduced = small.C @ np.linalg.solve(s * np.eye(2) - small.A, small.B[:, 0])
+        np.testing.assert_allclose(reduced, exact[:2], rtol=1e-9)
+
+
+def test_small_step_follows_the_linear_model_with_second_order_error():
+    """Halving the step quarters what the linear model misses."""
+    p = make_puller()
+    model, t = linearise(p), 300.0
+    misses = []
+    for share in (0.02, 0.01):
+        u = p.inputs_0._replace(v_p=p.v_0 * (1.0 + share))
+
+        def motion(_, x, u=u):
+            return np.array(rates(State(*x), u, NO_DISTURBANCE, p, HURLE.slope))
+
+        end = solve_ivp(motion, (0.0, t), np.array(p.state_0), method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+        block = np.zeros((6, 6))
+        block[:5, :5], block[:5, 5] = model.A * t, model.B[:, 0] * t * p.v_0 * share
+        misses.append(end[0] - p.r_0 - expm(block)[0, 5])
+    assert misses[0] / misses[1] == pytest.approx(4.0, rel=0.03)
+
+
+def test_another_puller_is_linearised_at_its_own_steady_state():
+    p = make_puller(Parameters(r_0=0.1, v_0=1.5e-5))
+    assert radius_model(p).poles[1] < 0 < radius_model(p).zero
+    np.testing.assert_allclose(rates(p.state_0, p.inputs_0, NO_DISTURBANCE, p, HURLE.slope), 0.0, atol=1e-12)

@@ -1,0 +1,67 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cz_gym import Parameters, make_puller
+from cz_gym.physics.parameters import check_parameters, describe
+
+
+def test_every_parameter_says_what_it_is() -> None:
+    described = describe()
+    assert list(described) == list(Parameters._fields)
+    for quantity in described.values():
+        assert quantity.unit
+        assert quantity.meaning
+        assert quantity.source
+
+
+def test_values_are_those_of_the_design() -> None:
+    p = Parameters()
+    assert (p.sigma, p.rho_l, p.g, p.sigma_SB) == (0.72, 2570, 9.81, 5.670374419e-8)
+    assert (p.k_l, p.rho_s, p.dH, p.T_m, p.dT_0) == (62, 2330, 1.8e6, 1685, 5.02)
+    assert math.degrees(p.alpha_0) == pytest.approx(11)
+    assert math.degrees(p.phi_b) == pytest.approx(3.5)
+    assert (p.r_0, p.v_0) == pytest.approx((0.0875, 2e-5))
+    assert (p.C_1, p.C_2, p.C_b) == (5.7e4, 1e5, 8e4)
+    assert (p.kappa_12, p.G_1a, p.T_a, p.G_2b, p.eps, p.R_cr, p.T_e) == (2.8e-8, 30, 350, 200, 0.2, 0.28, 1300)
+
+
+def test_parameters_cannot_be_changed() -> None:
+    with pytest.raises(AttributeError):
+        Parameters().r_0 = 0.1  # type: ignore[misc]
+
+
+@given(
+    st.sampled_from(Parameters._fields),
+    st.sampled_from([math.nan, math.inf, -math.inf, -1.0, "0.1", None]),
+)
+def test_what_is_not_a_number_is_refused_by_name(name: str, value: object) -> None:
+    with pytest.raises(ValueError, match=rf"^parameter {name} = .*\[") as refusal:
+        check_parameters(Parameters()._replace(**{name: value}))
+    assert "\n" not in str(refusal.value)
+
+
+def test_zero_is_refused_where_it_makes_no_sense() -> None:
+    with pytest.raises(ValueError, match="parameter sigma"):
+        check_parameters(Parameters(sigma=0.0))
+    assert check_parameters(Parameters(alpha_0=0.0, T_a=0.0, T_e=0.0))
+
+
+def test_the_crucible_is_wider_than_the_crystal() -> None:
+    with pytest.raises(ValueError, match="crucible"):
+        make_puller(Parameters(r_0=0.3))
+
+
+def test_only_parameters_are_parameters() -> None:
+    with pytest.raises(ValueError, match=r"cz_gym\.Parameters"):
+        check_parameters({"r_0": 0.1})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("lam", [-0.1, 1.5, math.nan])
+def test_the_mix_of_models_lies_between_them(lam: float) -> None:
+    with pytest.raises(ValueError, match=r"\[0, 1\]"):
+        make_puller(lam=lam)

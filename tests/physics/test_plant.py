@@ -1,0 +1,208 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import HOUR, Truth, View, design_rates, hold
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from cz_gym import HURLE, SCENARIOS, CzEnv, Parameters, Puller, Scenario, State, make_puller
+from cz_gym.episodes.scenario import Actuators
+from cz_gym.episodes.schedule import disturbance
+from cz_gym.jit.compile import kernel
+from cz_gym.physics.meniscus import hurle_slope
+from cz_gym.physics.plant import NO_DISTURBANCE, Disturbance, Inputs, growth, hidden_load, rates, rk4
+
+MIXES = [0.0, 0.3, 1.0]
+SPREAD = st.floats(0.85, 1.15)
+MELTING = replace(SCENARIOS["puller"], name="puller without limits", actuators=Actuators())
+
+
+def integrated(x: np.ndarray, u: Truth, p: Any, dt: float) -> np.ndarray:
+    """SciPy's answer on the design's equations."""
+    solution = solve_ivp(
+        lambda t, y: design_rates(y, u, p), (0, dt), x, method="DOP853", rtol=1e-13, atol=1e-16 * np.abs(x)
+    )
+    return solution.y[:, -1]
+
+
+@pytest.fixture
+def states(rng: np.random.Generator) -> State:
+    p = make_puller()
+    n = 200
+    return State(
+        rng.uniform(0.08, 0.095, n), rng.uniform(0.002, 1.24 * p.a, n), p.T_1_0 + rng.normal(0, 20, n),
+        p.T_2_0 + rng.normal(0, 10, n), p.T_b_0 + rng.normal(0, 3, n),
+    )  # fmt: skip
+
+
+def drawn_inputs(rng: np.random.Generator, p: Puller, n: int) -> tuple[Inputs, Disturbance]:
+    u = Inputs(rng.uniform(0, 4e-5, n), p.Q_H_0 + rng.uniform(-1e4, 1e4, n))
+    return u, Disturbance(rng.normal(0, 1000, n), rng.normal(0, 1, n), rng.uniform(0.9, 1, n))
+
+
+@given(st.sampled_from(MIXES), SPREAD, SPREAD, SPREAD, SPREAD, SPREAD)
+def test_operating_point_is_a_steady_state(
+    lam: float, sigma: float, k_l: float, kappa: float, G: float, eps: float
+) -> None:
+    q = Parameters()
+    p = make_puller(
+        q._replace(
+            sigma=q.sigma * sigma, k_l=q.k_l * k_l, kappa_12=q.kappa_12 * kappa, G_2b=q.G_2b * G, eps=q.eps * eps
+        ),
+        lam,
+    )
+    rate = rates(p.state_0, p.inputs_0, NO_DISTURBANCE, p, hurle_slope)
+    assert abs(rate.r_c) < 1e-12 * p.v_0
+    assert abs(rate.h_c) < 1e-12 * p.v_0
+    heats = np.array([rate.T_1 * p.C_1, rate.T_2 * p.C_2, rate.T_b * p.C_b])
+    assert np.abs(heats).max() < 1e-9 * p.Q_H_0
+    assert p.T_b_0 == q.T_m + q.dT_0
+
+
+@pytest.mark.parametrize("lam", MIXES)
+def test_rates_are_the_equations_of_the_design(lam: float, states: State, rng: np.random.Generator) -> None:
+    p = make_puller(lam=lam)
+    u, d = drawn_inputs(rng, p, 200)
+    expected = design_rates(np.array(states), Truth(u.v_p, u.Q_H, d.Q_d, d.dT_i, d.melt), p)
+    actual = np.array(rates(states, u, d, p, hurle_slope))
+    np.testing.assert_allclose(actual, expected, rtol=1e-11, atol=1e-13)
+
+
+def test_compiled_equations_equal_the_plain_ones(states: State, rng: np.random.Generator) -> None:
+    @kernel
+    def loop(rows: Any, u: Any, d: Any, p: Any, out: Any) -> None:
+        for i in range(len(rows)):
+            x = State(rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4])
+            load = Disturbance(d[i, 0], d[i, 1], d[i, 2])
+            inputs = Inputs(u[i, 0], u[i, 1])
+            rate = rates(x, inputs, load, p, hurle_slope)
+            new = rk4(x, inputs, load, p, 5.0, hurle_slope)
+            grown = growth(x, load, p, hurle_slope)
+            for j in range(5):
+                out[i, j] = rate[j]
+                out[i, 5 + j] = new[j]
+            out[i, 10] = grown.v_g
+            out[i, 11] = hidden_load(d[i, 1] * 20.0, p)
+
+    p = make_puller(lam=0.4)
+    u, d = drawn_inputs(rng, p, 200)
+    out = np.zeros((200, 12))
+    loop(np.array(states).T, np.array(u).T, np.array(d).T, p, out)
+    plain = [
+        *rates(states, u, d, p, hurle_slope),
+        *rk4(states, u, d, p, 5.0, hurle_slope),
+        growth(states, d, p, hurle_slope).v_g,
+        hidden_load(d.dT_i * 20.0, p),
+    ]
+    scale = np.abs(out).max(axis=0)
+    np.testing.assert_allclose(out / scale, np.array(plain).T / scale, rtol=1e-12, atol=1e-13)
+
+
+def reduced(lam: float) -> tuple[np.ndarray, np.ndarray]:
+    """Jacobians of radius and height, and of the bright ring, by complex step at constant melt temperature."""
+    p = make_puller(lam=lam)
+    A, C = np.zeros((2, 2)), np.zeros(2)
+    for j in range(2):
+        x = list(map(complex, p.state_0))
+        x[j] += 1e-30j
+        rate = rates(State(*x), p.inputs_0, NO_DISTURBANCE, p, HURLE.slope)
+        A[:, j] = np.imag([rate.r_c, rate.h_c]) / 1e-30
+        C[j] = np.imag(x[0] + HURLE.ring_offset(x[0], x[1], p)) / 1e-30
+    return A, C
+
+
+def test_linearised_plant_has_the_published_numbers() -> None:
+    A, C = reduced(1.0)
+    assert A[0, 1] == pytest.approx(-0.004888, rel=1e-3)
+    stable, unstable = np.sort(np.linalg.eigvals(A))
+    assert stable == pytest.approx(-1.683e-3, rel=1e-3)
+    assert unstable == pytest.approx(8.74e-6, rel=1e-3)
+    slope, gain = C[1] / A[0, 1], C[0] - C[1] * A[0, 0] / A[0, 1]
+    assert slope == pytest.approx(-45.99, rel=1e-3)
+    assert gain == pytest.approx(1.0038, rel=1e-3)
+    assert -gain / slope == pytest.approx(0.0218, rel=2e-3)
+
+
+def test_model_two_has_one_pole_at_zero() -> None:
+    A, _ = reduced(0.0)
+    assert A[0, 1] == pytest.approx(-0.004888, rel=1e-3)
+    assert np.sort(np.linalg.eigvals(A)) == pytest.approx([0.0, 8.74e-6], rel=1e-3, abs=1e-12)
+
+
+def test_runge_kutta_is_of_fourth_order() -> None:
+    p = make_puller(lam=0.7)
+    x = np.array([p.r_0, 0.8 * p.h_0, p.T_1_0 + 5, p.T_2_0, p.T_b_0 + 2])
+    u, d = Inputs(1.2 * p.v_0, p.Q_H_0 + 8000.0), Disturbance(500.0, 0.3, 0.95)
+    exact = integrated(x, Truth(*u, *d), p, 240.0)
+    steps = np.array([10.0, 15.0, 20.0, 30.0, 40.0])
+    errors = []
+    for dt in steps:
+        new = State(*x)
+        for _ in range(round(240.0 / dt)):
+            new = rk4(new, u, d, p, dt, hurle_slope)
+        errors.append(np.abs((np.array(new) - exact) / exact)[:2].max())
+    order = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert order == pytest.approx(4.0, abs=0.15)
+
+
+@pytest.mark.parametrize(("height", "bound"), [(0.004, 1e-8), (0.0012, 1e-4), (1.0, 1e-8), (1.24, 1e-4)])
+def test_one_substep_is_exact_enough(height: float, bound: float) -> None:
+    p = make_puller()
+    h_c = height if height < 0.1 else height * p.a
+    x = np.array([p.r_0, h_c, p.T_1_0, p.T_2_0, p.T_b_0])
+    u = Inputs(p.v_0 * (2.0 if height < 0.1 else 0.0), p.Q_H_0)
+    new = np.array(rk4(State(*x), u, NO_DISTURBANCE, p, 5.0, hurle_slope))
+    exact = integrated(x, Truth(*u), p, 5.0)
+    assert np.abs(new / exact - 1).max() < bound
+
+
+@pytest.mark.parametrize(("interval", "scenario"), [(5.0, "randomized"), (2.0, MELTING), (10.0, "hard")])
+def test_an_hour_of_driven_motion_agrees_with_scipy(interval: float, scenario: str | Scenario) -> None:
+    env = CzEnv(scenario, control_interval=interval, horizon=HOUR)
+    env.reset(seed=5)
+    saved = env.get_state().slot
+    p, e, x = View(saved.slot["puller"]), View(saved.slot["episode"]), np.array(saved.slot["x"].tolist())
+    steps = round(HOUR / interval)
+    worst, heights, feedback = 0.0, [], 0.0
+    for k in range(steps):
+        t = k * interval
+        pull = 0.3 * np.sin(t / 70.0) + feedback
+        _, _, terminated, _, info = env.step(np.array([pull, 0.3 * np.sin(t / 300.0)], np.float32))
+        feedback = hold(info, p)
+        while t < (k + 1) * interval - 1e-6:
+            j = int(t // 5.0)
+            upto = min(5.0 * (j + 1), (k + 1) * interval)
+            d = disturbance(5.0 * j, saved.interface[j], e, p)
+            x = integrated(x, Truth(info["v_p"], info["Q_H"], *d), p, upto - t)
+            t = upto
+        ours = [info["r_c"], info["h_c"], info["T_1"], x[3], info["T_b"]]
+        worst = max(worst, np.abs(np.array(ours) / x - 1).max())
+        heights.append(info["h_c"])
+        assert not terminated
+    assert max(heights) - min(heights) > 5e-4, "the hour must move the meniscus"
+    assert worst < 1e-8
+    end = np.array(env.get_state().slot.slot["x"].tolist())
+    np.testing.assert_allclose(end, x, rtol=1e-8)
+
+
+@pytest.mark.parametrize("drift", [-20.0, -5.0, 0.0, 1e-3, 5.0, 20.0])
+def test_hidden_load_is_the_static_equivalent_of_a_drift(drift: float) -> None:
+    p = make_puller()
+    T_1 = p.T_1_0 + drift
+    T_2 = brentq(lambda T: p.kappa_12 * (T_1**4 - T**4) - p.G_2b * (T - p.T_b_0), 1000, 3000, xtol=1e-12, rtol=1e-15)
+    load = hidden_load(drift, p)
+    assert load == pytest.approx(-p.G_2b * (T_2 - p.T_2_0), rel=1e-8, abs=1e-6)
+    assert drift * load <= 0
+    held = rates(State(p.r_0, p.h_0, T_1, T_2, p.T_b_0), p.inputs_0, Disturbance(load, 0.0, 1.0), p, hurle_slope)
+    assert [held.T_2 * p.C_2, held.T_b * p.C_b] == pytest.approx([0.0, 0.0], abs=1e-5)
+
+
+def test_parameters_without_an_operating_point_are_refused() -> None:
+    with pytest.raises(ValueError, match="no finite operating point"):
+        make_puller(Parameters(T_e=4000.0))

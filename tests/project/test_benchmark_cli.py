@@ -1,0 +1,449 @@
+"""``benchmark.py``: what it writes, what it refuses to overwrite, and one line for every mistake."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from contracts import facts
+from onnx import TensorProto, helper, numpy_helper
+
+import benchmark
+from cz_gym.agents.agent_file.contract import read_agent, write_agent
+from cz_gym.baselines.registry import CONTROLLERS, find_controller
+from cz_gym.config import make_config
+from cz_gym.evaluation import runner as running
+from cz_gym.evaluation.metrics import metric_names
+from cz_gym.evaluation.protocol import ROWS, TEST_SEEDS, find_row
+from cz_gym.evaluation.report.output import check_targets
+from cz_gym.observation import OBSERVATIONS
+from cz_gym.physics.meniscus import HURLE
+from cz_gym.physics.young_laplace import YOUNG_LAPLACE
+
+ALL_METRICS = {*metric_names(), "microseconds_per_step"}
+FILES = ["benchmark.json", "crystal.png", "episodes.csv", "errors.png", "pareto.png", "report.html", "report.md"]
+SMALL = ["--episodes", "3", "--scenarios", "randomized,reference-b", "--controllers", "open-loop,paper"]
+
+
+def constant_agent(path: Path, pull: float = 0.0, observation: str = "measured", **changes: Any) -> Path:
+    """An agent file that always answers with the same action."""
+    channels = len(OBSERVATIONS[observation])
+    graph = helper.make_graph(
+        [helper.make_node("Gemm", ["observation", "weight", "bias"], ["action"])],
+        "constant",
+        [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["n", channels])],
+        [helper.make_tensor_value_info("action", TensorProto.FLOAT, ["n", 2])],
+        [
+            numpy_helper.from_array(np.zeros((channels, 2), np.float32), "weight"),
+            numpy_helper.from_array(np.float32([pull, 0.0]), "bias"),
+        ],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    onnx.checker.check_model(model)
+    write_agent(
+        path,
+        model.SerializeToString(),
+        **facts(observation, **{"validation_rmse_mm": 6.0, **changes}),
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a small run: two controllers and an agent of two training seeds, both as good as nothing."""
+    folder = tmp_path_factory.mktemp("benchmark")
+    agents = [constant_agent(folder / f"{seed}.onnx", training_seed=seed) for seed in (3, 8)]
+    out = folder / "out"
+    arguments = [*SMALL, "--out", str(out), "--json", str(folder / "copy.json"), "--quiet"]
+    assert benchmark.main([*arguments, *(part for agent in agents for part in ("--agent", str(agent)))]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def data(finished: Path) -> dict[str, Any]:
+    loaded: dict[str, Any] = json.loads((finished / "benchmark.json").read_text())
+    return loaded
+
+
+@pytest.fixture
+def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*arguments: Any) -> None:
+        raise AssertionError("work was done")
+
+    monkeypatch.setattr(running, "rollout", refuse)
+
+
+def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line with which a command line is refused."""
+    try:
+        code = benchmark.main(arguments)
+    except SystemExit as exit_:
+        code = exit_.code
+    assert code == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert captured.err.startswith("benchmark.py: ")
+    return captured.err
+
+
+def test_the_folder_holds_every_file_and_nothing_else(finished: Path) -> None:
+    assert sorted(path.name for path in finished.iterdir()) == FILES
+    assert (finished.parent / "copy.json").read_bytes() == (finished / "benchmark.json").read_bytes()
+    for image in finished.glob("*.png"):
+        assert image.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
+    report = (finished / "report.md").read_text()
+    assert all(f"]({image.name})" in report for image in finished.glob("*.png"))
+
+
+def test_json_names_every_metric_of_everyone(data: dict[str, Any]) -> None:
+    assert list(data["results"]) == ["randomized", "reference-b"]
+    for name, scenario in data["results"].items():
+        assert list(scenario) == ["open-loop", "paper", "ppo"]
+        for controller, found in scenario.items():
+            assert set(found) == ALL_METRICS
+            for metric, estimate in found.items():
+                assert set(estimate) == {"mean", "ci95", "n"}
+                assert estimate["n"] == (3 if name == "randomized" else 1)
+                random = name == "randomized" and metric != "microseconds_per_step"
+                interval = estimate["ci95"]
+                assert (interval is not None) == (random or (controller == "ppo" and metric in metric_names()))
+                assert interval is None or interval[0] <= estimate["mean"] <= interval[1]
+
+
+def test_an_agent_that_does_nothing_is_open_loop(data: dict[str, Any]) -> None:
+    for scenario in data["results"].values():
+        for metric in metric_names():
+            assert scenario["ppo"][metric]["mean"] == pytest.approx(scenario["open-loop"][metric]["mean"])
+
+
+def test_pairs_and_tails_follow_from_the_episodes(finished: Path, data: dict[str, Any]) -> None:
+    with (finished / "episodes.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    seeds = [str(seed) for seed in TEST_SEEDS[:3]]
+    assert {line["training_seed"] for line in lines if line["controller"] == "ppo"} == {"3", "8"}
+
+    def rmse(controller: str) -> np.ndarray:
+        chosen = [line for line in lines if (line["scenario"], line["controller"]) == ("randomized", controller)]
+        assert [line["seed"] for line in chosen[:3]] == seeds
+        return np.array([float(line["rmse_mm"]) for line in chosen[:3]])
+
+    ours, theirs = rmse("open-loop"), rmse("paper")
+    paired = data["paired"]["randomized"]
+    assert list(paired) == ["open-loop", "ppo"]
+    assert set(paired["open-loop"]) == set(metric_names())
+    assert paired["open-loop"]["rmse_mm"]["mean"] == pytest.approx((ours - theirs).mean(), rel=1e-4)
+    assert paired["open-loop"]["rmse_mm"]["probability_of_improvement"]["mean"] == (ours < theirs).mean()
+    assert data["cvar5"]["randomized"]["paper"]["rmse_mm"]["mean"] == pytest.approx(theirs.max(), rel=1e-4)
+
+
+def test_provenance_says_what_was_run(data: dict[str, Any]) -> None:
+    told = data["provenance"]
+    assert told["plant_hash"] == make_config().plant_hash
+    assert told["scenarios"]["randomized"]["hash"] == make_config("randomized").scenario.hash
+    assert told["scenarios"]["randomized"]["first_seed"] == 2_000_000
+    assert told["scenarios"]["reference-b"]["model"] == "I"
+    assert told["packages"]["numpy"] == np.__version__
+    assert [agent["training_seed"] for agent in told["agents"]] == [3, 8]
+    assert told["controllers"]["ppo"]["training_seeds"] == [3, 8]
+    assert "--episodes 3" in told["command"]
+
+
+def test_first_line_says_that_the_agent_does_not_win(finished: Path, data: dict[str, Any]) -> None:
+    first = (finished / "report.md").read_text().splitlines()[0]
+    assert first.startswith("The agent ppo does not win")
+    assert data["verdicts"]["reference-b"]["ppo"]["wins"] is False
+    assert data["verdicts"]["reference-b"]["ppo"]["rival"] == "paper"
+
+
+def test_the_paper_peaks_where_it_should(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """1.48 mm on Model I and 1.54 mm on Model II within 3 %; without the compensator Model II is lost."""
+    target = tmp_path / "ramps.json"
+    arguments = ["--scenarios", "paper-ramp-I,paper-ramp-II", "--controllers", "paper,pid-uncompensated"]
+    assert benchmark.main([*arguments, "--json", str(target)]) == 0
+    results = json.loads(target.read_text())["results"]
+    assert results["paper-ramp-I"]["paper"]["max_error_mm"]["mean"] == pytest.approx(1.48, rel=0.03)
+    assert results["paper-ramp-II"]["paper"]["max_error_mm"]["mean"] == pytest.approx(1.54, rel=0.03)
+    assert results["paper-ramp-II"]["pid-uncompensated"]["failure_rate"] == {"mean": 1.0, "ci95": None, "n": 1}
+    captured = capsys.readouterr()
+    assert "paper-ramp-II (1 crystal)" in captured.out
+    assert "paper-ramp-I, paper" in captured.err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ramps.json"]
+
+
+@pytest.mark.usefixtures("no_work")
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--episodes", "0"], "between 1 and 500, not 0"),
+        (["--episodes", "-5"], "between 1 and 500, not -5"),
+        (["--episodes", "501"], "between 1 and 500, not 501"),
+        (["--episodes", "many"], "invalid int value: 'many'"),
+        (["--controllers", "pid"], "unknown controller 'pid'; choose from open-loop, paper"),
+        (["--controllers", "paper,,ppo"], "names with commas between"),
+        (["--scenarios", "easy"], "unknown scenario 'easy'; choose from randomized, hard"),
+        (["--scenario", "hard"], "unrecognized arguments"),
+        (["--agent", "nowhere.onnx"], "nowhere.onnx: no such file"),
+        (["--controllers", "paper", "--out", "/dev/null/results"], "not a folder"),
+        (["--controllers", "paper", "--json", "/"], "is a folder"),
+    ],
+)
+def test_mistakes_get_one_line(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert message in refused(arguments, capsys)
+
+
+@pytest.mark.usefixtures("no_work")
+def test_broken_agent_files_get_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    broken = constant_agent(tmp_path / "broken.onnx")
+    broken.write_bytes(b"not a model")
+    assert "broken.onnx" in refused(["--agent", str(broken)], capsys)
+    strange = constant_agent(tmp_path / "strange.onnx", plant_hash="0" * 16)
+    assert "trained on plant 0000000000000000" in refused(["--agent", str(strange)], capsys)
+    slow = constant_agent(tmp_path / "slow.onnx", control_interval=10.0)
+    assert "trained at 10 s control" in refused(["--agent", str(slow)], capsys)
+    twice = str(constant_agent(tmp_path / "twice.onnx"))
+    assert "appears twice" in refused(["--agent", twice, "--agent", twice], capsys)
+    called = constant_agent(tmp_path / "called.onnx", algorithm="paper")
+    assert "may not be called 'paper'" in refused(["--agent", str(called)], capsys)
+    other = constant_agent(tmp_path / "other.onnx", training_seed=1, scenario="hard", scenario_hash="0" * 16)
+    assert "different scenarios: hard, randomized" in refused(["--agent", twice, "--agent", str(other)], capsys)
+    assert "choose from" in (said := refused(["--agent", f"mine={twice}", "--controllers", "your"], capsys))
+    assert "mine, ppo, ppo-default" in said
+
+
+def test_a_file_may_be_named_and_stand_beside_the_shipped_agents(tmp_path: Path) -> None:
+    file = constant_agent(tmp_path / "some.onnx", algorithm="ppo")
+    names = ["paper", "mine", "ppo-quiet"]
+    contenders, contracts = benchmark.choose(names, [("mine", file)])
+    assert [each.controller.name for each in contenders] == names
+    assert contenders[1].controller.meaning.endswith("given as a file")
+    assert [contract["algorithm"] for contract in contracts] == ["ppo", *["ppo-quiet"] * 3]
+    alone, _ = benchmark.choose(["paper"], [("", file)])
+    assert [each.controller.name for each in alone] == ["paper", "ppo"]
+    assert benchmark.parse(["--agent", "a=b=c.onnx", "--agent", "x/a=b.onnx"]).agent == [
+        ("a", Path("b=c.onnx")),
+        ("", Path("x/a=b.onnx")),
+    ]
+
+
+@pytest.mark.usefixtures("no_work")
+def test_a_partial_run_needs_leave_to_overwrite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    committed = tmp_path / "benchmark.json"
+    committed.write_text("precious")
+    assert "--overwrite" in refused([*SMALL, "--out", str(tmp_path)], capsys)
+    assert "--overwrite" in refused(["--controllers", "paper", "--out", str(tmp_path)], capsys)
+    with pytest.raises(AssertionError, match="work was done"):
+        benchmark.main([*SMALL, "--out", str(tmp_path), "--overwrite", "--quiet"])
+    assert committed.read_text() == "precious"
+
+
+@pytest.mark.usefixtures("no_work")
+def test_committed_results_are_guarded_under_every_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(benchmark, "FOLDER", tmp_path)
+    (tmp_path / "benchmark.json").write_text("precious")
+    assert "--overwrite" in refused(SMALL, capsys)
+    assert "--overwrite" in refused([*SMALL, "--json", str(tmp_path / "benchmark.json")], capsys)
+
+
+@pytest.mark.usefixtures("no_work")
+def test_no_file_of_others_is_replaced_untold(
+    tmp_path: Path, finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A folder with somebody's report, a page and a table named by --json: kept, whether the run is partial or full."""
+    foreign, page = tmp_path / "foreign", tmp_path / "page.md"
+    foreign.mkdir()
+    (foreign / "report.md").write_text("precious")
+    page.write_text("precious")
+    table = finished / "episodes.csv"
+    for run in (SMALL, []):
+        for arguments in (["--out", str(foreign)], ["--json", str(page)], ["--json", str(table)]):
+            line = refused([*run, *arguments], capsys)
+            assert arguments[1] in line
+            assert "--overwrite" in line
+    assert "partial" in refused([*SMALL, "--json", str(finished / "benchmark.json")], capsys)
+    (tmp_path / "lone.json").write_bytes((finished / "benchmark.json").read_bytes())
+    for arguments in (["--json", str(tmp_path / "lone.json")], ["--json", str(page), "--overwrite"]):
+        with pytest.raises(AssertionError, match="work was done"):
+            benchmark.main([*SMALL, *arguments, "--quiet"])
+
+
+@pytest.mark.usefixtures("no_work")
+def test_a_full_run_may_renew_an_earlier_benchmark(finished: Path) -> None:
+    check_targets(finished, finished / "benchmark.json", partial=False, overwrite=False)
+
+
+@pytest.mark.parametrize(
+    "odd", [{"validation_rmse_mm": float("nan")}, {"validation_rmse_mm": float("inf")}, {"scenario": "\ud800"}]
+)
+@pytest.mark.usefixtures("no_work")
+def test_a_contract_that_cannot_be_recorded_is_refused_at_once(odd: dict[str, Any], tmp_path: Path) -> None:
+    constant_agent(tmp_path / "agent.onnx")
+    contract, _ = read_agent(tmp_path / "agent.onnx")
+    assert benchmark._recorded(contract)["scenario"] == "randomized"
+    with pytest.raises(ValueError, match=f"agent 'ppo': its contract's {next(iter(odd))} cannot be written"):
+        benchmark._recorded(replace(contract, **odd))
+
+
+@pytest.mark.usefixtures("no_work")
+def test_a_contract_with_an_endless_number_gets_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    agent = constant_agent(tmp_path / "agent.onnx")
+    promised = agent.with_suffix(".json")
+    promised.write_text(promised.read_text().replace('"validation_rmse_mm": 6.0', '"validation_rmse_mm": NaN'))
+    assert "validation_rmse_mm" in refused([*SMALL, "--agent", str(agent), "--out", str(tmp_path / "out")], capsys)
+
+
+def test_an_overwriting_run_replaces_the_results(tmp_path: Path) -> None:
+    (tmp_path / "benchmark.json").write_text("old")
+    arguments = ["--scenarios", "reference-b", "--controllers", "open-loop", "--out", str(tmp_path), "--quiet"]
+    assert benchmark.main([*arguments, "--overwrite"]) == 0
+    assert set(json.loads((tmp_path / "benchmark.json").read_text())["results"]) == {"reference-b"}
+    assert "No learned agent" in (tmp_path / "report.md").read_text().splitlines()[0]
+
+
+def test_a_full_run_is_quoted_in_the_readme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Full as measured by a smaller protocol; a partial run leaves the page alone."""
+    page = tmp_path / "README.md"
+    page.write_text("before\n<!-- benchmark:begin -->\nold\n<!-- benchmark:end -->\nafter\n")
+    monkeypatch.setattr(benchmark, "FOLDER", tmp_path / "results")
+    monkeypatch.setattr(benchmark, "README", page)
+    arguments = ["--scenarios", "reference-b", "--controllers", "open-loop", "--overwrite", "--quiet"]
+    assert benchmark.main(arguments) == 0
+    assert "old" in page.read_text()
+    monkeypatch.setattr(benchmark, "is_partial", lambda arguments, plan: False)
+    assert benchmark.main(arguments) == 0
+    text = page.read_text()
+    assert text.startswith("before\n<!-- benchmark:begin -->\n")
+    assert text.endswith("\n<!-- benchmark:end -->\nafter\n")
+    assert "old" not in text
+    mean = json.loads((tmp_path / "results" / "benchmark.json").read_text())["results"]["reference-b"]["open-loop"]
+    assert f"| open-loop | {mean['rmse_mm']['mean']:.3f} |" in text
+
+
+def test_an_interrupt_is_one_line_and_writes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(*arguments: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(running, "rollout", interrupt)
+    assert benchmark.main([*SMALL, "--out", str(tmp_path / "out"), "--quiet"]) == 130
+    assert capsys.readouterr().err == "benchmark.py: interrupted; nothing written\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_files_are_written_all_or_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A file that cannot be replaced (a folder stands in its place) leaves no half-written neighbours."""
+    (tmp_path / "report.md").mkdir()
+    arguments = ["--scenarios", "reference-b", "--controllers", "open-loop", "--out", str(tmp_path), "--quiet"]
+    assert "report.md" in refused([*arguments, "--overwrite"], capsys)
+    assert [path.name for path in tmp_path.iterdir()] == ["report.md"]
+
+
+@pytest.mark.usefixtures("no_work")
+@pytest.mark.parametrize("package", ["matplotlib", "plotly", "tqdm"])
+def test_a_missing_extra_is_named(
+    package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    line = refused([*SMALL, "--out", str(tmp_path)], capsys)
+    assert line == f'benchmark.py: {package} is missing: pip install "cz-gym[benchmark]"\n'
+
+
+@pytest.mark.usefixtures("no_work")
+def test_a_missing_onnxruntime_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    agent = constant_agent(tmp_path / "agent.onnx")
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    assert 'pip install "cz-gym[benchmark]"' in refused([*SMALL, "--agent", str(agent)], capsys)
+
+
+def test_the_benchmark_needs_neither_torch_nor_stable_baselines3(tmp_path: Path) -> None:
+    agent = constant_agent(tmp_path / "agent.onnx")
+    arguments = [
+        "--scenarios",
+        "reference-b",
+        "--controllers",
+        "paper",
+        "--agent",
+        str(agent),
+        "--out",
+        str(tmp_path / "o"),
+    ]
+    code = (
+        "import sys\n"
+        "class Absent:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.split('.')[0] in ('torch', 'stable_baselines3'):\n"
+        "            raise ModuleNotFoundError(f'No module named {name!r}', name=name)\n"
+        "sys.meta_path.insert(0, Absent())\n"
+        f"import benchmark; sys.exit(benchmark.main({arguments!r}))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-W", "ignore::DeprecationWarning", "-c", code],
+        cwd=Path(benchmark.__file__).parent,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "The agent ppo does not win" in done.stdout
+
+
+def test_controllers_say_what_they_are_and_act() -> None:
+    names = [entry.name for entry in CONTROLLERS]
+    assert len(set(names)) == len(names)
+    assert {"open-loop", "paper", "pid-uncompensated"} <= set(names)
+    for entry in CONTROLLERS:
+        assert entry.meaning
+        assert find_controller(entry.name) is entry
+        channels = OBSERVATIONS[entry.observation]
+        quiet = np.array([[1.0 if channel.name == "valid" else 0.0 for channel in channels]] * 3, np.float32)
+        config = make_config(observation=entry.observation, horizon=60.0)
+        policy: Any = entry.make(config)
+        if hasattr(policy, "for_episodes"):
+            policy = policy.for_episodes(config, [0, 1, 2])
+        action, _ = policy.predict(quiet)
+        assert action.shape == (3, 2)
+        assert action.dtype == np.float32
+    with pytest.raises(ValueError, match="unknown controller 'nobody'; choose from open-loop, paper"):
+        find_controller("nobody")
+
+
+def test_rows_are_the_published_ones() -> None:
+    assert [row.name for row in ROWS if row.default] == [
+        "randomized", "hard", "sensor-fault", "puller", "paper-ramp-I", "paper-ramp-II", "reference-a", "reference-b",
+    ]  # fmt: skip
+    for row in ROWS:
+        assert find_row(row.name) is row
+        assert row.config().steps == round(10_800 / row.control_interval)
+        assert row.told().meniscus == HURLE
+        deterministic = row.name.startswith(("paper-", "reference-", "nominal"))
+        assert len(row.seeds(500)) == (1 if deterministic else 500)
+    assert find_row("hard").seeds(500) == range(2_000_000, 2_000_500)
+    assert find_row("hard").seeds(7) == range(2_000_000, 2_000_007)
+    assert find_row("paper-ramp-II").config().mix == (0.0, 0.0)
+    assert find_row("randomized-2s").config("history").control_interval == 2.0
+    assert find_row("randomized-exact").config().meniscus == YOUNG_LAPLACE
+    assert {row.name for row in ROWS if row.config().plant_hash != row.told().plant_hash} == {"randomized-exact"}
+
+
+def test_an_agent_that_reads_the_true_state_is_a_bound_and_wins_nothing(tmp_path: Path) -> None:
+    agent = tmp_path / "seer.onnx"
+    constant_agent(agent, observation="state", algorithm="seer")
+    command = ["--agent", str(agent), "--controllers", "paper,seer", "--scenarios", "randomized", "--episodes", "2"]
+    assert benchmark.main([*command, "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    found = json.loads((tmp_path / "out" / "benchmark.json").read_text())
+    assert set(found["results"]["randomized"]) == {"paper", "seer"}
+    assert found["verdicts"]["randomized"] == {}
+    assert (tmp_path / "out" / "report.md").read_text().startswith("No learned agent took part in this run.")

@@ -1,0 +1,233 @@
+"""Render modes through Gymnasium: checkers, wrappers, sizes, failures; and that rendering changes nothing."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.error import DependencyNotInstalled, ResetNeeded
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given
+from hypothesis import strategies as st
+
+import cz_gym
+from cz_gym import CzEnv, Parameters
+from cz_gym.rendering import backend
+from cz_gym.rendering.view import MODES, check_size
+from studies.speed import rendering as speed
+
+pygame = pytest.importorskip("pygame")
+ROOT = Path(__file__).parents[2]
+
+
+def trajectory(render_mode: str | None, scenario: str, steps: int = 60) -> list[Any]:
+    env = CzEnv(scenario=scenario, render_mode=render_mode, observation="history")
+    generator = np.random.default_rng(4)
+    found: list[Any] = [env.reset(seed=9)]
+    for _ in range(steps):
+        found.append(env.step(generator.uniform(-1, 1, 2).astype(np.float32)))
+        if render_mode == "rgb_array":
+            env.render()
+        if found[-1][2]:
+            break
+    found.append(env.get_state())
+    env.close()
+    return found
+
+
+@pytest.mark.parametrize("mode", [None, *MODES])
+def test_gymnasiums_checker_renders_every_mode_without_a_warning(mode: str | None) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(gym.make("Cz-v0", horizon=600.0, render_mode=mode).unwrapped)
+
+
+@pytest.mark.parametrize("scenario", ["randomized", "puller"])
+@pytest.mark.parametrize("mode", MODES)
+def test_rendering_changes_nothing(mode: str, scenario: str) -> None:
+    assert pickle.dumps(trajectory(mode, scenario)) == pickle.dumps(trajectory(None, scenario))
+
+
+def test_the_users_environment_stays_as_it_was() -> None:
+    code = (
+        "import os, gymnasium as gym; before = dict(os.environ)\n"
+        "import cz_gym\n"
+        "env = gym.make('Cz-v0', render_mode='rgb_array'); env.reset(seed=1); env.render()\n"
+        "import pygame; assert not pygame.display.get_init()\n"
+        "assert dict(os.environ) == before"
+    )
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("SDL_")}
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=ROOT, capture_output=True, env=environment)
+    assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
+
+
+@pytest.mark.parametrize("scenario", list(cz_gym.SCENARIOS))
+def test_every_scenario_has_a_picture(scenario: str) -> None:
+    env = CzEnv(scenario=scenario, render_mode="rgb_array")
+    env.reset(seed=3)
+    env.step(np.zeros(2, np.float32))
+    frame = env.render()
+    assert frame is not None
+    assert (frame.shape, frame.dtype) == ((480, 640, 3), np.uint8)
+    assert len(np.unique(frame.reshape(-1, 3), axis=0)) > 200
+
+
+@pytest.mark.parametrize("size", [(480, 360), (641, 483), (1280, 720)])
+def test_the_size_is_the_users(size: tuple[int, int]) -> None:
+    env = gym.make("Cz-v0", render_mode="rgb_array", render_size=size)
+    env.reset(seed=1)
+    assert env.render().shape == (size[1], size[0], 3)  # type: ignore[union-attr]
+
+
+@given(st.one_of(st.none(), st.integers(), st.text(), st.tuples(st.floats(), st.floats()), st.tuples(st.integers())))
+def test_other_sizes_are_refused_in_one_line(size: Any) -> None:
+    with pytest.raises(ValueError, match=r"render_size must be \(width, height\)") as said:
+        check_size(size)
+    assert "\n" not in str(said.value).replace(repr(size), "")
+
+
+@pytest.mark.parametrize("size", [(359, 480), (640, 3841), (True, 480), (640, -480)])
+def test_sizes_outside_the_range_are_refused(size: tuple[int, int]) -> None:
+    with pytest.raises(ValueError, match="360 to 3840"):
+        CzEnv(render_size=size)
+
+
+def test_before_the_first_reset_there_is_no_crystal() -> None:
+    with pytest.raises(ResetNeeded):
+        gym.make("Cz-v0", render_mode="rgb_array").render()
+    with pytest.raises(ResetNeeded):
+        CzEnv(render_mode="rgb_array").render()
+
+
+def test_without_a_mode_render_warns_as_gymnasiums_environments_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(gym.logger, "warn", said.append)
+    env = CzEnv()
+    env.reset(seed=1)
+    assert env.render() is None
+    assert len(said) == 1
+    assert "rgb_array" in said[0]
+
+
+def test_a_frame_is_the_callers_own() -> None:
+    env = CzEnv(render_mode="rgb_array")
+    env.reset(seed=1)
+    first = env.render()
+    assert first is not None
+    kept = first.copy()
+    first[:] = 0
+    second = env.render()
+    assert np.array_equal(second, kept)
+    for _ in range(10):
+        env.step(np.ones(2, np.float32))
+    assert not np.array_equal(env.render(), kept)
+    assert np.array_equal(second, kept)
+
+
+@pytest.mark.parametrize("r_0", [0.02, 0.05, 0.15])
+def test_another_crystal(r_0: float) -> None:
+    env = CzEnv(render_mode="rgb_array", parameters=Parameters(r_0=r_0))
+    env.reset(seed=1)
+    assert env.render() is not None
+
+
+def test_a_restored_state_is_shown_from_where_it_stands() -> None:
+    env = CzEnv(render_mode="rgb_array")
+    env.reset(seed=1)
+    for _ in range(30):
+        env.step(np.zeros(2, np.float32))
+    state = env.get_state()
+    env.reset(options={"state": state})
+    view = env._view
+    assert view is not None
+    assert view.record is not None
+    assert len(view.record) == 1
+    assert view.record.now.t == 150.0
+    assert env.render() is not None
+
+
+def test_video_and_window_wrappers(tmp_path: Path) -> None:
+    env = gym.wrappers.HumanRendering(gym.make("Cz-v0", render_mode="rgb_array"))
+    env.reset(seed=1)
+    env.step(env.action_space.sample())
+    env.close()
+    again = CzEnv(render_mode="rgb_array")  # the wrapper's pygame.quit() took the fonts with it
+    again.reset(seed=1)
+    assert again.render() is not None
+    listed = gym.make("Cz-v0", render_mode="rgb_array_list")
+    listed.reset(seed=1)
+    listed.step(listed.action_space.sample())
+    assert len(listed.render()) == 2  # type: ignore[arg-type]
+
+
+def test_record_video(tmp_path: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        pytest.importorskip("moviepy")
+        env = gym.wrappers.RecordVideo(gym.make("Cz-v0", render_mode="rgb_array", horizon=50.0), str(tmp_path / "new"))
+        env.reset(seed=1)
+        over = False
+        while not over:
+            over = env.step(env.action_space.sample())[3]
+        env.close()
+    (video,) = (tmp_path / "new").glob("*.mp4")
+    assert video.stat().st_size > 5000
+
+
+def test_without_pygame_nothing_is_declared_and_asking_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    code = (
+        "import sys\nsys.modules['pygame'] = None\n"
+        "import importlib.util\n"
+        "find = importlib.util.find_spec\n"
+        "importlib.util.find_spec = lambda name, package=None: None if name == 'pygame' else find(name, package)\n"
+        "import cz_gym\n"
+        "assert cz_gym.CzEnv.metadata['render_modes'] == [], cz_gym.CzEnv.metadata\n"
+        "cz_gym.CzEnv().reset(seed=1)\n"
+        "try:\n    cz_gym.CzEnv(render_mode='rgb_array')\n"
+        "except Exception as error:\n    print(type(error).__name__, error)\n"
+    )
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout == f"DependencyNotInstalled {backend.MISSING}\n", done.stderr
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(DependencyNotInstalled, match="cz-gym"):
+        backend.load()
+
+
+def test_a_batch_does_not_render() -> None:
+    assert cz_gym.CzVectorEnv.metadata["render_modes"] == []
+    with pytest.raises(ValueError, match="a batch does not render"):
+        cz_gym.CzVectorEnv(2, render_mode="rgb_array")
+
+
+def test_a_window_that_cannot_open_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "nonsense")
+    pygame.display.quit()
+    env = CzEnv(render_mode="human")
+    with pytest.raises(gym.error.Error, match=r"cannot open a window: .*rgb_array"):
+        env.reset(seed=1)
+
+
+def test_the_speed_of_pictures_is_measured(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(speed, "FRAMES", 2)
+    assert speed.main(["--size", "400x360", "--rounds", "1"]) == 0
+    _, *lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 3
+    assert all(float(figure) > 0.0 for line in lines for figure in line.split()[-2:])
+
+
+@pytest.mark.parametrize(
+    ("options", "says"), [(["--rounds", "0"], "--rounds must be 1 to 100"), (["--size", "1"], "--size must be WxH")]
+)
+def test_no_speed_of_nothing(options: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert speed.main(options) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert says in said

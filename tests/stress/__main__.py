@@ -1,0 +1,143 @@
+"""Millions of random and adversarial steps over the randomised pullers: ``python -m tests.stress``.
+
+Every scenario, control intervals from 0.5 to 60 s, both models and every mix, every observation, the drives of
+"puller", and pullers drawn far wider than any named scenario. After each step of each slot everything that leaves the
+environment is checked, and the stored heat is balanced against what flowed in and out. The first thing wrong stops
+the command with one line that names the case, the step and the slot.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+from cz_gym.commands import OneLineParser, interrupted
+from cz_gym.config import Config, make_config
+from cz_gym.engine.layout import INFO
+from cz_gym.episodes.scenario import Interface, Scenario
+from cz_gym.episodes.scenarios import HARD, PULLER, SCENARIOS
+from cz_gym.units import HOUR, MM
+from cz_gym.vector import CzVectorEnv
+
+from .adversaries import KINDS, Adversaries
+from .checks import NOWHERE, Broken, Extremes, Watch
+
+INTERVALS = (0.5, 1.0, 2.0, 5.0, 7.5, 10.0, 20.0, 30.0, 60.0)
+"""Control intervals [s]."""
+MODELS: tuple[str | None, ...] = (None, "I", "II")
+OBSERVATIONS = ("measured", "history", "state")
+WIDE = replace(
+    HARD,
+    name="wide",
+    pullers=replace(
+        HARD.pullers, capillary=0.1, conductivity=0.3, conductance=0.3, start_radius_sd=2.0 * MM, melt_loss=0.5
+    ),
+    interface=Interface(sd=(0.0, 5.0)),
+    sensor=PULLER.sensor,
+    faults=SCENARIOS["sensor-fault"].faults,
+    actuators=PULLER.actuators,
+)
+"""Pullers and disturbances far beyond the named scenarios."""
+SHORT, CALLS, CALLS_IF_SHORT = 5.0, 460, 920
+"""Steps in a row that a large campaign takes in each case, twice as many at control intervals below ``SHORT`` [s]: the
+rest goes into more slots."""
+
+
+class Totals(NamedTuple):
+    """What a campaign has done."""
+
+    steps: int
+    episodes: int
+    failures: int
+    extremes: Extremes
+
+
+def cases(scenarios: Sequence[str | Scenario] = (*SCENARIOS, WIDE)) -> list[Config]:
+    """Each scenario at each interval; models and observations take turns, so that all meet."""
+    found = []
+    for at, scenario in enumerate(scenarios):
+        for turn, interval in enumerate(INTERVALS):
+            number = at + turn
+            found.append(
+                make_config(scenario, MODELS[number % 3], OBSERVATIONS[(number + turn) % 3], interval, 3.0 * HOUR)
+            )
+    return found
+
+
+def run_case(config: Config, steps: int, seed: int) -> Totals:
+    """About ``steps`` slot steps of one case, at least one; raises :class:`Broken` at the first thing wrong."""
+    row = CALLS_IF_SHORT if config.control_interval < SHORT else CALLS
+    n = len(KINDS) * max(1, round(steps / row / len(KINDS)))
+    # At short intervals the horizon is cut so that every case meets ends by time as well.
+    calls = max(1, round(steps / n))
+    horizon = min(config.horizon, max(1, 2 * calls // 3) * config.control_interval)
+    config = replace(config, horizon=horizon)
+    env = CzVectorEnv(
+        n, config.scenario, config.model, config.observation, config.control_interval, config.horizon, threads=1
+    )
+    adversaries, watch = Adversaries(n, seed), Watch(env)
+    observation, infos = env.reset(seed=seed)
+    watch.begin(observation, infos)
+    for _ in range(calls):
+        actions = adversaries.actions(infos, env._batch.memory.slots["puller"]["h_0"])
+        watch.before()
+        observation, reward, terminated, truncated, infos = env.step(actions)
+        watch.after(actions, observation, reward, terminated, truncated, infos)
+    env.close()
+    return Totals(n * calls, watch.episodes, watch.failures, watch.extremes)
+
+
+def campaign(configs: Sequence[Config], steps: int, seed: int = 0, say: Any = None) -> Totals:
+    """Share ``steps`` among the cases; raises :class:`Broken` with the case's name in front."""
+    parts = []
+    for number, config in enumerate(configs):
+        name = f"{config.scenario.name}, model {config.model}, {config.observation}, {config.control_interval:g} s"
+        try:
+            part = run_case(config, -(-steps // len(configs)), seed + 1000 * number)
+        except Broken as broken:
+            raise Broken(f"{name}, seed {seed + 1000 * number}: {broken}") from None
+        parts.append(part)
+        if say is not None:
+            say(f"{name}: {part.steps} steps, {part.episodes} episodes, {part.failures} failures")
+    together = NOWHERE
+    for part in parts:
+        together = together.joined(part.extremes)
+    return Totals(
+        sum(part.steps for part in parts),
+        sum(part.episodes for part in parts),
+        sum(part.failures for part in parts),
+        together,
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a campaign and print what it saw; exit code 1 and one line at the first thing wrong."""
+    parser = OneLineParser("python -m tests.stress", "Random and adversarial steps, everything checked at each.")
+    parser.add_argument("--steps", type=int, default=1_000_000, help="slot steps in all (%(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of actions and episodes (%(default)s)")
+    arguments = parser.parse_args(argv)
+    for name, given, least in (("--steps", arguments.steps, 1), ("--seed", arguments.seed, 0)):
+        if given < least:
+            parser.error(f"{name} must be at least {least}, not {given}")
+    configs, began = cases(), time.perf_counter()
+    try:
+        totals = campaign(configs, arguments.steps, arguments.seed, print)
+    except Broken as broken:
+        print(f"{parser.prog}: {broken}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return interrupted(parser.prog)
+    print(
+        f"{len(configs)} cases, {totals.steps:,} steps, {totals.episodes:,} episodes, {totals.failures:,} failures "
+        f"in {time.perf_counter() - began:.0f} s; {len(INFO)} info values, observation and reward checked at each"
+    )
+    for name, value in totals.extremes._asdict().items():
+        print(f"{name}: {value:.6g}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,179 @@
+"""What must hold after every step of every slot, whatever was done: :class:`Watch`."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.engine.layout import INFO
+from cz_gym.episodes.schedule import melt_left
+from cz_gym.observation import CLIP
+from cz_gym.physics.plant import fourth_power
+from cz_gym.task import COST_CAP, FAILURE_COST, HEATER_RANGE, HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT
+from cz_gym.vector import CzVectorEnv
+
+Array = npt.NDArray[Any]
+COLDEST, HOTTEST = 1000.0, 2600.0
+"""Temperatures [K] that no hot zone with 10 kW more or less than nominal leaves."""
+OVERSHOOT = HEIGHT_MIN
+"""How far beyond a limit a crystal can be when it fails [m]: a longer jump in one substep is none."""
+BALANCE = 2e-3
+"""Heat that may be missing from a step's balance, as a share of the nominal heater power: the fluxes are taken as
+straight lines over the step."""
+WORST = 1.0 - COST_CAP
+"""No living step earns as little as this [-]."""
+_EPS = 1e-9
+
+
+class Broken(AssertionError):
+    """Something that must hold after every step does not; the message is one line."""
+
+
+class Extremes(NamedTuple):
+    """The furthest that anything went, SI units."""
+
+    r_c_error_max: float
+    h_c_min: float
+    h_c_max: float
+    alpha_c_max: float
+    v_g_min: float
+    v_g_max: float
+    T_1_min: float
+    T_1_max: float
+    T_b_min: float
+    T_b_max: float
+    reward_min: float
+    reward_max: float
+    imbalance_max: float
+    """Heat missing from a step's balance, as a share of the nominal heater power [-]."""
+
+    def joined(self, other: Extremes) -> Extremes:
+        """The furthest of both."""
+        return Extremes(
+            *(
+                min(a, b) if name.endswith("_min") else max(a, b)
+                for name, a, b in zip(self._fields, self, other, strict=True)
+            )
+        )
+
+
+NOWHERE = Extremes(*(np.inf if name.endswith("_min") else -np.inf for name in Extremes._fields))
+
+
+class Watch:
+    """Checks everything an environment returns, and its heat balance; autoreset NEXT_STEP."""
+
+    def __init__(self, env: CzVectorEnv) -> None:
+        self._env, self._slots = env, env._batch.memory.slots
+        self._dt, self._steps = env.config.control_interval, env.config.steps
+        self._over = np.zeros(env.num_envs, np.bool_)
+        self._call = 0
+        self.episodes = self.failures = 0
+        self.extremes = NOWHERE
+
+    def begin(self, observation: Array, infos: dict[str, Any]) -> None:
+        """Check what the reset returned."""
+        self._check_numbers(observation, np.zeros(self._env.num_envs), infos)
+
+    def before(self) -> None:
+        """Remember the slots; call it before each step."""
+        self._old = self._slots.copy()
+
+    def after(
+        self, actions: Array, observation: Array, reward: Array, terminated: Array, truncated: Array, infos: Any
+    ) -> None:
+        """Check what a step returned; raises :class:`Broken`."""
+        self._call += 1
+        ran, over = ~self._over, terminated | truncated
+        self._check_numbers(observation, reward, infos)
+        self._check_ends(ran, terminated, truncated, infos)
+        self._check_rewards(ran, reward, terminated)
+        self._check_drives(ran, actions, infos)
+        missing = self._check_heat(ran & ~terminated, infos)
+        self.episodes, self.failures = self.episodes + int(over.sum()), self.failures + int(terminated.sum())
+        self._over = over
+        self._note(reward, infos, missing)
+
+    def _need(self, fact: Any, what: str) -> None:
+        if not np.all(fact):
+            raise Broken(f"step {self._call}, slot {int(np.argmin(fact))}: {what}")
+
+    def _check_numbers(self, observation: Array, reward: Array, infos: dict[str, Any]) -> None:
+        finite = np.isfinite(observation).all(axis=1) & (np.abs(observation) <= CLIP).all(axis=1)
+        self._need(finite, f"the observation is not finite and within +-{CLIP}")
+        self._need(np.isfinite(reward), "the reward is not finite")
+        for name in INFO:
+            self._need(np.isfinite(infos[name]), f"info {name!r} is not finite")
+        if "state" in infos:
+            self._need(np.isfinite(infos["state"]).all(axis=1), "info 'state' is not finite")
+
+    def _check_ends(self, ran: Array, terminated: Array, truncated: Array, infos: dict[str, Any]) -> None:
+        """Failures terminate, at the limits and nowhere else; time truncates; radii and heights are a crystal's."""
+        k, a = self._slots["k"], self._slots["puller"]["a"]
+        error, h_c = np.abs(infos["r_c"] - infos["r_ref"]), infos["h_c"]
+        limits = ((error, 0.0, RADIUS_LIMIT), (h_c, HEIGHT_MIN, HEIGHT_MAX_IN_A * a))
+        for value, low, high in limits:
+            self._need(terminated | ((value >= low) & (value <= high)), "beyond a limit and not terminated")
+            self._need((value > low - OVERSHOOT) & (value < high + OVERSHOOT), "far beyond a limit")
+        self._need((infos["r_c"] > 0.0) & (h_c > 0.0), "a radius or height that is not positive")
+        self._need(~ran | (truncated == ((k >= self._steps) & ~terminated)), "truncated before or after the horizon")
+        self._need(~(~ran & (terminated | truncated)), "a new episode ends before its first step")
+        self._need(ran | (k == 0), "an ended episode was not drawn anew")
+        for name in ("T_1", "T_2", "T_b"):
+            T = self._slots["x"][name]
+            self._need((T > COLDEST) & (T < HOTTEST), f"{name} outside {COLDEST:g} to {HOTTEST:g} K")
+
+    def _check_rewards(self, ran: Array, reward: Array, terminated: Array) -> None:
+        """A failing step earns at most what the worst life from it to the horizon could."""
+        left = self._steps - self._slots["k"] + 1.0
+        living = ran & ~terminated
+        self._need(~living | ((reward > WORST) & (reward <= 1.0)), f"a living step earns {WORST:g} or less, or over 1")
+        self._need(ran | (reward == 0.0), "a redrawn slot earns something")
+        self._need(~terminated | (reward <= WORST * left), "a failing step earns more than surviving could")
+        self._need(~terminated | (reward > WORST - FAILURE_COST * left), "a failure costs more than ten a step lost")
+
+    def _check_drives(self, ran: Array, actions: Array, infos: dict[str, Any]) -> None:
+        p, e, old = self._slots["puller"], self._slots["episode"], self._old
+        pull, power = infos["v_p"] - p["v_0"], infos["Q_H"] - p["Q_H_0"]
+        widest = np.minimum(p["v_0"], e["pull_window"]) * (1.0 + _EPS)
+        self._need(np.abs(pull) <= widest, "the pull speed leaves its range")
+        self._need(infos["Q_H"] >= 0.0, "the heater cools")
+        self._need(np.abs(power) <= HEATER_RANGE * (1.0 + _EPS) + 0.5 * e["heater_step"], "the power leaves its range")
+        moved = np.abs(infos["v_p"] - old["v_p"])
+        self._need(~ran | (moved <= e["pull_slew"] * self._dt + _EPS * p["v_0"]), "the pull speed jumps")
+        said = infos["action_clipped"] == (np.abs(actions) > 1.0).any(axis=1)
+        self._need(~ran | said, "info 'action_clipped' is wrong")
+
+    def _check_heat(self, living: Array, infos: dict[str, Any]) -> Array:
+        """Heat stored over the step is what flowed in less what flowed out; returns what is missing, as a share."""
+        p, old, new = self._slots["puller"], self._old["x"], self._slots["x"]
+        middle = (self._slots["k"] - 0.5) * self._dt
+        melt = melt_left(middle, self._slots["episode"].view(np.recarray))
+        stored = (
+            p["C_1"] * (new["T_1"] - old["T_1"])
+            + p["C_2"] * (new["T_2"] - old["T_2"])
+            + p["C_b"] * melt * (new["T_b"] - old["T_b"])
+        )
+        flows = 0.5 * (_losses(p, old) + _losses(p, new))
+        gained = self._dt * (infos["Q_H"] - flows - p["Q_i"] + self._slots["Q_d"])
+        missing: Array = np.where(living, np.abs(stored - gained) / (self._dt * p["Q_H_0"]), 0.0)
+        self._need(missing <= BALANCE, "heat appears or disappears")
+        return missing
+
+    def _note(self, reward: Array, infos: dict[str, Any], missing: Array) -> None:
+        x, error = self._slots["x"], np.abs(infos["r_c"] - infos["r_ref"])
+        seen = (
+            error.max(), infos["h_c"].min(), infos["h_c"].max(), np.abs(infos["alpha_c"]).max(), infos["v_g"].min(),
+            infos["v_g"].max(), x["T_1"].min(), x["T_1"].max(), x["T_b"].min(), x["T_b"].max(), reward.min(),
+            reward.max(), missing.max(),
+        )  # fmt: skip
+        self.extremes = self.extremes.joined(Extremes(*map(float, seen)))
+
+
+def _losses(p: Array, x: Array) -> Array:
+    """Heat that insulation and melt surface lose [W]."""
+    surface = p["kappa_b"] * (fourth_power(x["T_b"]) - fourth_power(p["T_e"]))
+    loss: Array = p["G_1a"] * (x["T_1"] - p["T_a"]) + surface
+    return loss

@@ -1,0 +1,251 @@
+"""What an agent does: exact derivatives, loops against the design table's, events that happen as they are said to."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.signal import dimpulse
+
+pytest.importorskip("control")
+pytest.importorskip("onnx")
+
+from cz_gym import agents
+from cz_gym.agents.agent_file.contract import read_agent
+from cz_gym.agents.training.export import Actor, to_onnx
+from cz_gym.baselines import CompensatedPID
+from cz_gym.baselines.analysis.frequency import frequencies, margins_of, opened
+from cz_gym.baselines.analysis.frequency import response as theirs
+from cz_gym.baselines.analysis.linear_form import linear_form
+from cz_gym.baselines.analysis.sampled_loop import Loop, close, root_mean_square, sampled_plant
+from cz_gym.baselines.registry import find_controller
+from cz_gym.episodes.scenarios import HARD, PULLER, RANDOMIZED
+from cz_gym.observation import HISTORY, MEASURED
+from cz_gym.physics.plant import make_puller
+from cz_gym.units import MM, MM_PER_MIN
+from studies.insight import __main__ as insight
+from studies.insight.figures import gain_figure, jump_figure, loop_figure, response_figure, share_figure
+from studies.insight.linear_agent import SEEN, jacobian, linear_agent
+from studies.insight.loop import Responses, after_one, response
+from studies.insight.report import Found, as_json, as_markdown
+from studies.insight.step_tests import (
+    JUMPS,
+    LIMITS,
+    TRIALS,
+    Limit,
+    Survival,
+    crystal,
+    jump_gains,
+    parts_of,
+    respond,
+    run_events,
+    survive,
+)
+
+DT = 5.0
+OMEGA = np.geomspace(1e-4, np.pi / DT, 9)
+PATH = agents.shipped()
+REST = np.eye(len(HISTORY))[1]
+"""Nothing but a valid camera."""
+AT = [[channel.name for channel in MEASURED].index(name) for name in SEEN]
+
+
+@pytest.fixture(scope="module")
+def near() -> Any:
+    return linear_agent(read_agent(PATH)[1], REST, DT)
+
+
+def test_the_derivative_is_the_chain_rules() -> None:
+    random, n = np.random.default_rng(0), len(HISTORY)
+
+    def some(*shape: int) -> Any:
+        return random.normal(0.0, 0.1, shape).astype(np.float32)
+
+    mean, scaling, first, last, direct = some(n), some(n, n), some(6, n), some(2, 6), some(2, n)
+    layers = ((first, some(6)), (last, some(2)))
+    actor = Actor(mean, scaling, (direct, some(2)), layers, "Tanh", False, 1.0, np.array([0.05, 0.02], np.float32))
+    at = np.float64(some(n))
+    bent = 1.0 - np.tanh(first.astype(float) @ ((at - mean) @ scaling) + layers[0][1]) ** 2
+    expected = actor.scale[:, None] * ((last * bent) @ first.astype(float) + direct) @ scaling.T.astype(float)
+    expected[0, AT[2]] += 1.0
+    expected[1, AT[3]] += 1.0
+    assert jacobian(to_onnx(actor), at) == pytest.approx(expected, rel=1e-6, abs=1e-9)
+
+
+def test_a_linear_agent_answers_alike_as_state_space_and_in_frequency(near: Any) -> None:
+    found = response(near.state_space(), DT, OMEGA[[0, 4, 8]])[:, :, AT]
+    assert np.allclose(found, near.response(OMEGA[[0, 4, 8]]), rtol=1e-9, atol=1e-12)
+
+
+def test_a_linear_agent_moves_as_the_agent_does_after_a_small_jump(near: Any) -> None:
+    """The linear loop of agent and plant against the simulated one: radius 1 um too large, first ten minutes."""
+    config = crystal(20.0, "history")
+    policy = agents.OnnxPolicy.load(PATH, config)
+    limit = LIMITS[0]
+    jump = 0.001 * MM
+    with_it, without = (run_events(policy, config, limit.events[1:], [size]).signals for size in (jump, 0.0))
+    moved = (with_it.v_p - without.v_p)[120:, 0]
+    loop = close(near.state_space(), make_puller(lam=0.5), DT)
+    x, expected = np.zeros(len(loop.A)), [0.0]  # the sample of the jump itself was taken before it
+    x[:5] = jump * sampled_plant(make_puller(lam=0.5), DT).A[:, 0]
+    for _ in moved[1:]:
+        expected.append(loop.C[0] @ x)
+        x = loop.A @ x
+    assert moved == pytest.approx(np.array(expected), abs=0.03 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("at", ["camera", "v_p"])
+@pytest.mark.parametrize("name", ["lqg", "paper-tuned"])
+def test_loops_are_opened_as_the_design_table_opens_them(name: str, at: str) -> None:
+    form, puller = linear_form(find_controller(name).make(crystal(1.0, "measured"))), make_puller(lam=0.5)
+    plant = response(sampled_plant(puller, DT), DT, OMEGA)[:, 1:, :2]
+    loop = Responses(OMEGA, response(form.controller, DT, OMEGA)[:, :, AT], plant, DT)
+    assert np.allclose(loop.opened(at), theirs(opened(form.controller, puller, DT, at), DT, OMEGA), rtol=1e-8)
+
+
+def test_the_mean_derivative_is_the_mean_of_derivatives() -> None:
+    content, rows = read_agent(PATH)[1], np.stack([REST, REST + 0.05])
+    both, each = linear_agent(content, rows, DT), [linear_agent(content, row, DT) for row in rows]
+    assert both.now == pytest.approx(0.5 * (each[0].now + each[1].now), rel=1e-9)
+
+
+def test_one_reading_is_answered_as_the_loops_own_simulation_does() -> None:
+    form = linear_form(find_controller("lqg").make(crystal(1.0, "measured")))
+    loop = close(form.controller, make_puller(lam=0.5), DT)
+    at, row = loop.inputs.index("camera"), loop.outputs.index("v_p")
+    found = after_one(loop.A, loop.B[:, [at]], loop.C[[row]], loop.D[np.ix_([row], [at])], 40)
+    _, (expected,) = dimpulse((*loop.pick("v_p", ("camera",)), DT), n=40)
+    assert found == pytest.approx(expected, rel=1e-9, abs=1e-15)
+
+
+def test_noise_gains_are_those_of_the_lyapunov_equation() -> None:
+    form = linear_form(find_controller("lqg").make(crystal(1.0, "measured")))
+    contender = insight.Contender(
+        "lqg", "measured", lambda config: None, form.controller,
+        lambda omega: response(form.controller, DT, omega)[:, :, AT],
+    )  # fmt: skip
+    pull = close(form.controller, make_puller(lam=0.5), DT).pick("v_p", ("camera",))
+    found = insight.noise_gains(contender, DT)
+    assert found["pull_mm_per_min_per_mm"] == pytest.approx(root_mean_square(pull) / (MM_PER_MIN / MM), rel=2e-3)
+    steps = root_mean_square(pull, difference=True) / (MM_PER_MIN / MM)
+    assert found["pull_step_mm_per_min_per_mm"] == pytest.approx(steps, rel=2e-3)
+
+
+def test_events_happen_when_and_as_large_as_they_are_said() -> None:
+    config = crystal(30.0, "measured")
+    quiet = CompensatedPID()
+    interface, load, reference, noise = (run_events(quiet, config, t.events, [t.amplitude, 0.0]) for t in TRIALS)
+    at = round(600.0 / DT)
+    for course in (interface, load):
+        different = course.signals.v_g[:, 0] != course.signals.v_g[:, 1]
+        assert not different[:at].any()
+        assert different[at + 2 :].any()
+    for course, amplitude in ((interface, 0.3), (load, 1.0)):
+        first = course.env.get_state()[0].slot.slot
+        assert (first["dT_i"] if course is interface else first["drift"]) == pytest.approx(amplitude)
+    assert reference.signals.r_ref[-1, 0] < reference.signals.r_ref[at, 0]
+    measured = noise.signals.r_br_measured - noise.signals.r_br
+    assert np.std(measured[at + 1 : 2 * at - 1, 0]) == pytest.approx(0.05 * MM, rel=0.3)
+    assert np.ptp(measured[2 * at + 2 :, 0]) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_survival_is_found_where_it_lies() -> None:
+    class Still:
+        def predict(self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True):
+            return np.zeros((len(observation), 2), np.float32), None
+
+    lost = Limit("lost", "jump beyond the limit at once", "mm", MM, 16.0 * MM, LIMITS[0].events[1:])
+    found = survive(Still(), lost, "measured")
+    assert 7.0 < found.least <= found.largest <= found.most <= 8.0
+    assert not found.capped
+    never = Limit("never", "nothing", "mm", MM, 4.0 * MM, ())
+    assert survive(CompensatedPID(), never, "measured") == Survival(4.0, 4.0, 4.0, True)
+
+
+def test_the_real_puller_is_taken_apart_property_by_property() -> None:
+    parts = parts_of(PULLER, RANDOMIZED)
+    assert parts["latency"].sensor.latency == PULLER.sensor.latency
+    assert parts["latency"].actuators == RANDOMIZED.actuators
+    with pytest.raises(ValueError, match="'hard' differs from 'randomized' in more than melt loss"):
+        parts_of(HARD, RANDOMIZED)
+
+
+def test_a_linear_controller_answers_every_small_jump_alike_and_the_agent_none_of_the_larger_ones() -> None:
+    paper, agent = (
+        jump_gains(policy, observation, noisy=False)
+        for policy, observation in ((CompensatedPID(), "measured"), (agents.OnnxPolicy.load(PATH), "history"))
+    )
+    assert paper[:5] == pytest.approx(np.full(5, paper[0]), rel=0.01)
+    assert agent[0] == pytest.approx(agent[1], rel=0.02)
+    assert agent[-1] < 0.5 * agent[0]
+
+
+def test_pictures_and_tables_say_what_was_found(near: Any) -> None:
+    config = crystal(21.0, "measured")
+    policy = find_controller("paper-tuned").make(config)
+    answers = {trial.name: {"one": respond(policy, config, trial)} for trial in TRIALS}
+    omega = frequencies(DT, 60)
+    plant = response(sampled_plant(make_puller(), DT), DT, omega)[:, 1:, :2]
+    responses = {"one": Responses(omega, near.response(omega), plant, DT)}
+    for picture in (
+        response_figure(answers, TRIALS, DT),
+        gain_figure(
+            {
+                "one": after_one(
+                    *sampled_plant(make_puller(), DT)[:1], np.ones((5, 1)), np.ones((2, 5)), np.zeros((2, 1)), 5
+                )
+            },
+            responses,
+            DT,
+        ),
+        jump_figure({"one": (np.ones(len(JUMPS)), np.ones(len(JUMPS)))}, JUMPS),
+        loop_figure(responses, 0.02),
+        share_figure(answers["load"], responses, "load"),
+    ):
+        assert picture.startswith(b"\x89PNG")
+    row = insight.Margins("one", "Model I", "v_p", np.inf, *margins_of(responses["one"].opened("v_p"), omega, DT, True))
+    limits = {"one": {limit.name: Survival(1.5, 1.25, 2.0, True) for limit in LIMITS}}
+    parts = {"one": {"latency": {"rmse_observable_mm": 0.1, "failure_rate": 0.25}}}
+    gains = {"one": {"pull": 1.0, "step": 2.0, "heater": 3.0}}
+    found = Found(
+        read_agent(PATH)[0],
+        answers,
+        [row],
+        gains,
+        limits,
+        parts,
+        4,
+        "two",
+        {"one": {"pull speed": (0.0, 0.01, 0.5, 2.0)}},
+        {"one": (np.ones(len(JUMPS)), np.ones(len(JUMPS)))},
+    )
+    assert json.loads(as_json(found))["margins"][0]["controller"] == "one"
+    assert "| latency | 0.100 mm, 25 % lost |" in as_markdown(found)
+    assert "| one | pull speed | 0 % | 1 % | 50 % | 200 % |" in as_markdown(found)
+    assert "| 1.5 (1.25 to over 2) |" in as_markdown(found)
+
+
+def test_gains_are_apart_from_others_and_not_from_themselves(near: Any) -> None:
+    mine = insight.Contender("one", "history", lambda _: None, near.state_space(), near.response)
+    twice = mine._replace(answer=lambda omega: near.response(omega) * np.array([2.0, 1.0, 1.0, 1.0]))
+    for other, deviation in ((mine, 0.0), (twice, 1.0)):
+        for values in insight.apart(other, mine, DT).values():
+            assert values == pytest.approx([deviation] * 4, abs=1e-12)
+
+
+@pytest.mark.parametrize("arguments", [["--episodes", "0"], ["--agent", "no-such.onnx"]])
+def test_what_cannot_be_meant_is_one_line(arguments: list[str], tmp_path: Any, capsys: Any) -> None:
+    assert insight.main([*arguments, "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.count("\n") <= 2
+
+
+def test_the_growth_of_a_loop_is_that_of_its_fastest_mode() -> None:
+    grows, fades = np.exp(5.0 / 7200.0), np.exp(-5.0 / 60.0)
+    loop = Loop(np.diag([fades, grows]), *[np.zeros((2, 2))] * 3, ("a", "b"), ("c", "d"), 5.0)
+    assert loop.growth == pytest.approx(7200.0)
+    assert not loop.stable
+    calm = loop._replace(A=np.diag([fades, -0.5]))
+    assert calm.growth == np.inf
+    assert calm.stable

@@ -1,0 +1,248 @@
+"""The command that redoes Part II: its numbers against published and analytic ones, its files, its errors."""
+
+import json
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from cz_gym import make_puller
+from cz_gym.baselines import CompensatedPID
+from cz_gym.baselines.pid.compensated_pid import SeriesPID
+from cz_gym.physics.linearisation import radius_model
+from cz_gym.units import MM, MM_PER_MIN
+from studies.paper import __main__ as paper
+from studies.paper import numbers as paper_numbers
+from studies.paper.beyond import SEEDS, noise_result
+from studies.paper.experiments import case_difference, errors, inverse_response, pull_change, step_comparison, trace
+from studies.paper.figures import open_loop_response
+from studies.paper.gallery import FIGURES
+from studies.paper.numbers import BEFORE, cycle_numbers
+from studies.paper.published import COMPENSATOR, ODE
+from studies.paper.rows import _ode
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """The command's output folder, with two cut-offs and one noise for speed."""
+    out = tmp_path_factory.mktemp("paper") / "deep" / "folder"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paper_numbers, "CUT_OFFS", (2e-4, 2e-3))
+        patch.setattr(paper_numbers, "NOISES", (0.01 * MM,))
+        assert paper.main(["--out", str(out)]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def numbers(written):
+    return json.loads((written / "numbers.json").read_text())
+
+
+def test_schema(numbers):
+    def keys(name):
+        return list(numbers[name])
+
+    assert list(numbers) == [
+        "model_I", "model_II", "compensator", "margins", "inverse_response", "case_ab", "paper_ramp", "young_laplace",
+    ]  # fmt: skip
+    for model in ("model_I", "model_II"):
+        assert keys(model) == ["G_p", "G_m", "rhp_zero"]
+        assert list(numbers[model]["G_p"]) == ["numerator", "poles"]
+        assert [type(pole) for pole in numbers[model]["G_p"]["poles"]] == [float, float]
+        assert len(numbers[model]["G_m"]) == 2
+    assert keys("compensator") == ["published_functions", "own_plant"]
+    assert keys("margins") == ["published_I", "published_II", "own_I", "own_II"]
+    assert keys("young_laplace") == ["h_mm", "hurle_h_mm"]
+    inner = {
+        "margins": ["crossover", "phase_margin_deg"],
+        "inverse_response": ["depth_mm", "recovery_s"],
+        "case_ab": ["r_c", "h_c", "alpha_c", "v_p"],
+        "paper_ramp": ["max_error_mm", "rmse_mm", "max_compensated_error_mm", "v_p_min_mm_per_min"],
+    }
+    for name, expected in inner.items():
+        assert all(list(part) == expected for part in numbers[name].values())
+    for name in ("inverse_response", "case_ab", "paper_ramp"):
+        assert keys(name) == ["I", "II"]
+
+
+def test_published_values(numbers):
+    for model in ("model_I", "model_II"):
+        assert numbers[model]["G_p"]["numerator"] == pytest.approx(-0.0048849, rel=1e-3)
+        assert numbers[model]["G_m"] == pytest.approx([-46.0050, 1.0043], rel=6e-4)
+        assert numbers[model]["rhp_zero"] == pytest.approx(0.0218, abs=5e-5)
+    assert numbers["model_I"]["G_p"]["poles"] == pytest.approx([8.78e-6, -1.684e-3], rel=6e-3)
+    assert numbers["compensator"]["published_functions"] == pytest.approx(-0.22517, abs=5e-6)
+    assert numbers["compensator"]["own_plant"] == pytest.approx(-0.2252, abs=5e-5)
+    for name, crossover, phase in (("published_I", 0.030, 79), ("published_II", 0.029, 76), ("own_II", 0.029, 76)):
+        assert numbers["margins"][name]["crossover"] == pytest.approx(crossover, abs=5e-4)
+        assert numbers["margins"][name]["phase_margin_deg"] == pytest.approx(phase, abs=0.5)
+    assert numbers["young_laplace"]["h_mm"] == pytest.approx(6.62, abs=5e-3)
+    assert numbers["young_laplace"]["hurle_h_mm"] == pytest.approx(6.64, abs=5e-3)
+
+
+def test_what_the_paper_does_not_show(numbers):
+    """A sustained pull change turns into a true error above 1 mm that r_tilde hides."""
+    for ramp in numbers["paper_ramp"].values():
+        assert ramp["max_error_mm"] > 1.0 > ramp["max_compensated_error_mm"]
+        assert ramp["v_p_min_mm_per_min"] > 0.6
+
+
+def test_case_differences_are_small(numbers):
+    for case in numbers["case_ab"].values():
+        assert all(0.0 < value < 0.1 for value in case.values())
+
+
+def test_files(written):
+    report = (written / "report.md").read_text()
+    for figure in FIGURES:
+        picture = (written / figure.file).read_bytes()
+        assert picture.startswith(b"\x89PNG")
+        assert figure.file in report
+    expected = {figure.file for figure in FIGURES} | {"report.md", "numbers.json"}
+    assert {path.name for path in written.iterdir()} == expected
+    assert sum(path.stat().st_size for path in written.iterdir()) < 2_500_000
+    assert "nan" not in report
+    for printed in ("0.03275", "do not follow from the", "-0.22517", "0.001884", "3.368e-07", "chain does not depend"):
+        assert printed in report
+
+
+def test_ode_follows_from_the_printed_poles():
+    """The paper's time-domain form of its compensator has the same two poles."""
+    poles = sorted(np.roots([1.0, *ODE]))
+    assert poles == pytest.approx([-COMPENSATOR.fast, -COMPENSATOR.slow], rel=1e-3)
+    assert _ode(COMPENSATOR) == pytest.approx(ODE, rel=1e-3)
+
+
+def test_without_the_compensator(written):
+    """Model II is lost; Model I cycles between the pull limits, nearer to its radius than the printed controller."""
+    bare = {m: trace(CompensatedPID(compensator=None), m, "paper-ramp") for m in ("I", "II")}
+    assert bare["II"].failed
+    assert not bare["I"].failed
+    cycle, printed = (cycle_numbers(run) for run in (bare["I"], trace(CompensatedPID(), "I", "paper-ramp")))
+    assert cycle["at_limit"] > 0.3 > 0.001 > printed["at_limit"]
+    assert cycle["late_swing_mm"] < 2.0
+    assert cycle["rmse_mm"] < 0.5 < printed["rmse_mm"]
+    report = (written / "report.md").read_text()
+    for number in (
+        f"{cycle['rmse_mm']:.3f}",
+        f"{printed['rmse_mm']:.3f}",
+        f"lost after {bare['II'].t[-1] / 60:.0f} min",
+    ):
+        assert number in report
+
+
+def test_thermal_chain_does_not_depend_on_the_model():
+    first, second = (trace(CompensatedPID(), m, "paper-ramp").signals for m in ("I", "II"))
+    for name in ("T_1", "T_1_ref", "T_b"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+
+
+def test_inset_counts_from_the_change():
+    run = pull_change("I", before=BEFORE, horizon=900.0)
+    figure = open_loop_response(SimpleNamespace(open_loop={"I": run}), "I")
+    (inset,) = figure.axes[0].child_axes
+    for line in inset.lines[:2]:
+        assert line.get_xdata()[0] == 0.0
+        assert line.get_xdata()[-1] == 5.0
+    assert "[min]" in inset.get_xlabel()
+
+
+def test_inverse_response_against_a_double_integrator():
+    """With both poles near zero a small step gives r_br = n dv (lead t + constant t^2 / 2), a parabola."""
+    puller = make_puller(lam=0.0)
+    model = radius_model(puller)
+    change = -1e-3
+    found = inverse_response(pull_change("II", change, over=1e-6, horizon=300.0), change)
+    rate = abs(model.numerator * puller.v_0 * change)
+    assert found.depth == pytest.approx(rate * model.lead**2 / (2.0 * model.constant), rel=0.01)
+    assert found.recovery == pytest.approx(2.0 / model.zero, rel=0.01)
+
+
+def test_no_inverse_response_is_said():
+    with pytest.raises(ArithmeticError, match="no inverse response"):
+        inverse_response(pull_change("I", 0.0, horizon=60.0))
+
+
+def test_growth_rate_is_constant_in_model_ii_only():
+    v_g = {model: pull_change(model).signals.v_g for model in ("I", "II")}
+    assert np.ptp(v_g["II"]) < 1e-12 * v_g["II"][0]
+    assert np.ptp(v_g["I"]) > 0.01 * v_g["I"][0]
+
+
+def test_linear_model_holds_for_small_steps():
+    for model in ("I", "II"):
+        small, large = (step_comparison(model, share) for share in (-0.001, -0.01))
+        for output in (0, 1):
+            assert small.worst(output) < 0.005
+            assert large.worst(output) / small.worst(output) == pytest.approx(10.0, rel=0.1)
+
+
+def test_compensated_measurement_is_what_the_controller_saw():
+    """r_tilde, through the printed PID, gives back the pull speed that was applied."""
+    pid, dt = SeriesPID(), 5.0
+    run = trace(CompensatedPID(), "I", "paper-ramp", horizon=3600.0)
+    b_0, b_1, a_1 = pid.lead(dt)
+    lead = lfilter([b_0, b_1], [1.0, a_1], errors(run)[1])
+    integral = lfilter([0.5 * dt / pid.T_i, 0.5 * dt / pid.T_i], [1.0, -1.0], lead)
+    expected = run.signals.v_p[0] + pid.K_p * (lead + integral)
+    np.testing.assert_allclose(run.signals.v_p[1:], expected[:-1], atol=1e-3 * run.signals.v_p[0])
+
+
+def test_cases_that_scale_differ_by_nothing():
+    run = pull_change("I", horizon=600.0)
+    fifth = run.signals._replace(**{name: value[0] + (value - value[0]) / 5 for name, value in _named(run)})
+    assert max(case_difference(run, run._replace(signals=fifth))) < 1e-12
+    assert case_difference(run, run).v_p == pytest.approx(4.0)
+
+
+def _named(run):
+    return [(name, getattr(run.signals, name)) for name in ("r_c", "h_c", "alpha_c", "v_p")]
+
+
+def test_expected_noise_in_the_pull_speed():
+    pid = SeriesPID()
+    found = noise_result(0.002 * MM, pid, MM_PER_MIN)
+    b_0, b_1, a_1 = pid.lead(5.0)
+    noise = np.random.default_rng(0).normal(size=200_000)
+    assert found.expected_pull_rms_mm_per_min == pytest.approx(
+        0.002 * pid.K_p * np.std(lfilter([b_0, b_1], [1.0, a_1], noise)) * 60.0, rel=0.01
+    )
+    # Far from the limits the loop amplifies a little more than K alone.
+    assert found.pull_rms_mm_per_min == pytest.approx(found.expected_pull_rms_mm_per_min, rel=0.1)
+    assert found.clipped == 0.0
+    assert min(SEEDS) >= 1_000_000
+    assert max(SEEDS) < 2_000_000
+
+
+def test_output_in_the_way(tmp_path, capsys):
+    (tmp_path / "taken").write_text("")
+    assert paper.main(["--out", str(tmp_path / "taken")]) == 2
+    error = capsys.readouterr().err.strip()
+    assert error.startswith("python -m studies.paper:")
+    assert "taken" in error
+    assert "\n" not in error
+
+
+def test_missing_package(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "control", None)
+    assert paper.main(["--out", str(tmp_path / "new")]) == 2
+    assert "cz-gym[benchmark]" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_unknown_argument_exits_with_two():
+    with pytest.raises(SystemExit) as stop:
+        paper.main(["--frobnicate"])
+    assert stop.value.code == 2
+
+
+def test_baselines_import_without_extras():
+    code = (
+        "import sys\n"
+        "for name in ('control', 'matplotlib', 'tqdm'): sys.modules[name] = None\n"
+        "import cz_gym.baselines, cz_gym.baselines.analysis.design, studies.paper, studies.paper.gallery\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
