@@ -1,0 +1,48 @@
+"""Imports run one way: no circle of modules or rooms, and nothing from a higher room."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from tests.project.imports import (
+    FORBIDDEN,
+    ROOT,
+    arrows,
+    between_rooms,
+    circles,
+    graph_of,
+    imports,
+    main,
+    modules,
+    within,
+)
+
+
+def test_there_is_no_circle() -> None:
+    assert circles({"a": {"b"}, "b": {"a"}}) != []
+    assert circles(graph_of(arrows())) == []
+    assert circles(graph_of(between_rooms())) == []
+
+
+@pytest.mark.parametrize("package", FORBIDDEN)
+def test_nothing_is_imported_from_above(package: str) -> None:
+    inner = [other for other in FORBIDDEN if other != package and within(other, package)]
+    for name, file in modules().items():
+        if within(name, package) and not any(within(name, other) for other in inner):
+            upward = [each for each in imports(name, file) if any(within(each, other) for other in FORBIDDEN[package])]
+            assert not upward, f"{name} imports {upward}"
+
+
+def test_the_command_prints_the_counts(capsys: pytest.CaptureFixture[str]) -> None:
+    main()
+    assert "circles    none" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["baselines", "agents"])
+def test_no_module_has_a_second_name(name: str) -> None:
+    code = f"import cz_gym.{name}\ntry: import {name}.anything\nexcept ImportError as error: print(error)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert f"import cz_gym.{name}" in done.stdout
