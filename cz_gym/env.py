@@ -21,7 +21,7 @@ from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.rendering.view import FPS, Frame, declared_modes, make_view
 
-from .config import make_config
+from .config import Config, make_config
 from .observation import CAMERA, CLIP, OBSERVATIONS
 
 Observation = npt.NDArray[Any]
@@ -113,10 +113,23 @@ class CzEnv(gym.Env[Observation, Action]):
         render_size: tuple[int, int] = (640, 480),
         camera: Camera | None = None,
     ) -> None:
+        config = make_config(scenario, model, observation, control_interval, horizon, parameters, meniscus, camera)
+        self._setup(config, render_mode, render_size)
+
+    @classmethod
+    def from_config(
+        cls, config: Config, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480)
+    ) -> CzEnv:
+        """The environment of settings that were checked when they were made (:func:`cz_gym.config.make_config`)."""
+        env = cls.__new__(cls)
+        env._setup(config, render_mode, render_size)
+        return env
+
+    def _setup(self, config: Config, render_mode: str | None, render_size: tuple[int, int]) -> None:
+        self.config = config
         self.render_mode = render_mode
-        self.config = make_config(scenario, model, observation, control_interval, horizon, parameters, meniscus, camera)
         self.action_space = action_space()
-        self.observation_space = observation_space(observation)
+        self.observation_space = observation_space(config.observation)
         self._batch = Batch(self.config, 1)
         self._slots = self._batch.memory.slots
         self._out = self._batch.new_out()

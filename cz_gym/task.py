@@ -21,7 +21,7 @@ HEIGHT_MAX_IN_A = 1.24
 HEATER_RANGE = HEATER_SCALE
 """Q_H = Q_H0 +- this [W]."""
 RADIUS_SCALE = 0.5 * MM
-PULL_SCALE = 0.36 * MM_PER_MIN
+PULL_DEVIATION = 0.36 * MM_PER_MIN
 PULL_STEP_SCALE = 0.06 * MM_PER_MIN
 HEATER_STEP_SCALE = 1.0 * KILO
 PULL_WEIGHT, PULL_STEP_WEIGHT, HEATER_STEP_WEIGHT = 0.5, 0.25, 0.05
@@ -61,7 +61,7 @@ def cost_terms(radius_error: Any, pull: Any, pull_step: Any, heater_step: Any) -
     """Terms from the true radius error [m], v_p - v_0 [m/s], and step changes of v_p [m/s] and Q_H [W]."""
     return Cost(
         (radius_error / RADIUS_SCALE) ** 2,
-        PULL_WEIGHT * (pull / PULL_SCALE) ** 2,
+        PULL_WEIGHT * (pull / PULL_DEVIATION) ** 2,
         PULL_STEP_WEIGHT * (pull_step / PULL_STEP_SCALE) ** 2,
         HEATER_STEP_WEIGHT * (heater_step / HEATER_STEP_SCALE) ** 2,
     )

@@ -21,7 +21,7 @@ from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
 
-from .config import make_config
+from .config import Config, make_config
 from .env import CzEnv, EnvState, action_space, check_options, check_state, observation_space
 
 _MASKS = tuple(f"_{name}" for name in INFO)
@@ -55,19 +55,36 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         threads: int | None = None,
         camera: Camera | None = None,
     ) -> None:
+        config = make_config(scenario, model, observation, control_interval, horizon, parameters, meniscus, camera)
+        if render_mode is not None:
+            raise ValueError(f"a batch does not render: render_mode must be None, not {render_mode!r}")
+        self._setup(config, num_envs, autoreset_mode, threads)
+
+    @classmethod
+    def from_config(
+        cls,
+        config: Config,
+        num_envs: int = 1,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        threads: int | None = None,
+    ) -> CzVectorEnv:
+        """The batch of settings that were checked when they were made (:func:`cz_gym.config.make_config`)."""
+        env = cls.__new__(cls)
+        env._setup(config, num_envs, autoreset_mode, threads)
+        return env
+
+    def _setup(self, config: Config, num_envs: int, autoreset_mode: AutoresetMode | str, threads: int | None) -> None:
         if not isinstance(num_envs, int) or isinstance(num_envs, bool) or num_envs < 1:
             raise ValueError(f"num_envs must be a positive whole number, not {num_envs!r}")
         if threads is not None and (not isinstance(threads, int) or threads < 1):
             raise ValueError(f"threads must be a positive whole number or None, not {threads!r}")
-        if render_mode is not None:
-            raise ValueError(f"a batch does not render: render_mode must be None, not {render_mode!r}")
-        self.render_mode = render_mode
+        self.config = config
+        self.render_mode = None
         self.num_envs = num_envs
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
-        self.config = make_config(scenario, model, observation, control_interval, horizon, parameters, meniscus, camera)
         self.single_action_space = action_space()
-        self.single_observation_space = observation_space(observation)
+        self.single_observation_space = observation_space(config.observation)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._batch = Batch(self.config, num_envs, threads)

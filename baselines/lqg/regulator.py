@@ -17,7 +17,7 @@ from cz_gym.baselines.policy import Floats
 from cz_gym.task import (
     HEATER_STEP_SCALE,
     HEATER_STEP_WEIGHT,
-    PULL_SCALE,
+    PULL_DEVIATION,
     PULL_STEP_SCALE,
     PULL_STEP_WEIGHT,
     PULL_WEIGHT,
@@ -81,7 +81,7 @@ class Cost(NamedTuple):
 def quadratic_cost(weights: Weights, dt: float) -> Cost:
     """The cost's matrices for a control interval of dt [s]."""
     Q, N = np.zeros((PLANT + 2, PLANT + 2)), np.zeros((PLANT + 2, 2))
-    pull = weights.pull / PULL_SCALE**2
+    pull = weights.pull / PULL_DEVIATION**2
     per_step = (STEP_TIME / dt) ** 2
     Q[0, 0] = weights.radius / RADIUS_SCALE**2
     Q[PLANT, PLANT] = N[PLANT, 0] = pull

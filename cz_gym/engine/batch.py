@@ -192,7 +192,7 @@ class Batch:
     def reset(self, which: Sequence[int], keys: Iterable[Key], out: Out, scenario: Scenario | None = None) -> None:
         """Draw new episodes for the slots ``which`` and write their first sample into ``out``.
 
-        Raises ValueError if a drawn puller has no finite operating point.
+        A puller without a finite operating point is drawn again; ValueError if none is found.
         """
         law, mix = self._law, self._mix
         if scenario is not None:

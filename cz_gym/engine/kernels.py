@@ -34,6 +34,8 @@ from .layout import EPISODE_AT, INFO, PULLER_AT, SLOT
 from .outputs import clip, measure, recall, remember, write_info, write_measured, write_state
 from .sensors import photograph, sense
 
+TRIES = 100
+"""A puller without an operating point is drawn again, from the same stream, at most so often in all."""
 _EPS = 1e-9
 _CLIPPED = INFO.index("action_clipped")
 _LOW = 5.0 * MM
@@ -193,8 +195,8 @@ class Kernels(NamedTuple):
     returns how many episodes ended."""
     draw: Any
     """``draw(memory, which, keys, law, mix, parameters, clock, reading, out, start, stop)``: new episodes, each
-    from its key, for the slots ``which[start:stop]``, with their first sample; returns a slot whose puller has no
-    operating point, or -1."""
+    from its key, for the slots ``which[start:stop]``, with their first sample; returns a slot for which no puller with
+    an operating point was found in :data:`TRIES` draws, or -1."""
     show: Any
     """``show(memory, which, clock, reading, out, start, stop)``: the last sample of the slots ``which[start:stop]``
     again."""
@@ -237,11 +239,15 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
             slot, numbers = memory.slots[i], memory.numbers[i]
             slot.key[0], slot.key[1] = keys[at, 0], keys[at, 1]
             seed_streams(slot.streams, slot.key)
-            factors = draw_factors(law[0], mix, slot.streams)
-            puller = derive_puller(randomised(parameters, factors), factors.lam, height, ring_offset)
-            for number in range(len(puller)):
-                numbers[PULLER_AT + number] = puller[number]
-                impossible = impossible if np.isfinite(puller[number]) else i
+            tries, sound = 0, False
+            while not sound and tries < TRIES:
+                factors = draw_factors(law[0], mix, slot.streams)
+                puller = derive_puller(randomised(parameters, factors), factors.lam, height, ring_offset)
+                tries, sound = tries + 1, True
+                for number in range(len(puller)):
+                    numbers[PULLER_AT + number] = puller[number]
+                    sound = sound and np.isfinite(puller[number])
+            impossible = impossible if sound else i
             episode = draw_episode(law[0], slot.streams, slot.freezes)
             for number in range(len(episode)):
                 numbers[EPISODE_AT + number] = episode[number]

@@ -103,7 +103,7 @@ class Course:
     def __init__(self, config: Config, seeds: Sequence[int]) -> None:
         n = len(seeds)
         self.config, self.seeds, self.k, self.seconds = config, tuple(seeds), 0, 0.0
-        self.env = CzVectorEnv(n, **_arguments(config))
+        self.env = CzVectorEnv.from_config(config, n)
         self.signals = Signals(*(np.zeros((config.steps, n)) for _ in Signals._fields))
         self.reward, self.alive = np.zeros((config.steps, n)), np.zeros((config.steps, n), np.bool_)
         self.failed, self.running = np.zeros(n, np.bool_), np.ones(n, np.bool_)
@@ -153,11 +153,6 @@ class Course:
         return Rollout(
             self.config, self.seeds, self.signals, self.reward, self.alive, self.failed, self.start, self.seconds
         )
-
-
-def _arguments(config: Config) -> dict[str, Any]:
-    names = ("scenario", "model", "observation", "control_interval", "horizon", "parameters", "meniscus")
-    return {name: getattr(config, name) for name in names}
 
 
 def _join(parts: list[Rollout]) -> Rollout:

@@ -22,8 +22,12 @@ from typing import Any
 import llvmlite
 import numba
 import numpy as np
-from numba.core.caching import FunctionCache
-from numba.core.serialize import dumps
+
+try:
+    from numba.core.caching import FunctionCache
+    from numba.core.serialize import dumps
+except ImportError:  # private to numba: one that moved them compiles in every process
+    FunctionCache = dumps = None
 
 PACKAGE = Path(__file__).parents[1]
 CACHE_VARIABLE = "CZ_GYM_CACHE_DIR"
@@ -116,7 +120,7 @@ class Store:
                     os.unlink(temporary)
 
 
-class CachedCode(FunctionCache):
+class CachedCode(FunctionCache or object):  # type: ignore[misc]
     """numba's cache of one function, on a :class:`Store`."""
 
     def __init__(self, function: Any) -> None:

@@ -14,13 +14,16 @@ from typing import Any, TypeVar, cast
 import numba
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.core.options import DefaultOptions as default_options
 from numba.extending import intrinsic, overload, register_jitable
 
 from .cache import CachedCode, cache_folder
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+try:
+    from numba.core.options import DefaultOptions as default_options
+except ImportError:  # private to numba: without it loops run slower
+    default_options = None
 _NO_COUNTS = "_nrt"
 
 
@@ -49,7 +52,7 @@ def kernel(function: F, keep: bool = True, allocates: bool = True) -> F:
     """
     folder = cache_folder() if keep else None
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
-    if not allocates and _NO_COUNTS in default_options.__dict__:
+    if not allocates and _NO_COUNTS in getattr(default_options, "__dict__", ()):
         options[_NO_COUNTS] = False
     settings: Any = numba.config
     if folder is None:
@@ -61,7 +64,8 @@ def kernel(function: F, keep: bool = True, allocates: bool = True) -> F:
         if hasattr(compiled, "_cache"):
             compiled._cache = CachedCode(function)
         return cast(F, compiled)
-    except (RuntimeError, OSError):
+    except (RuntimeError, OSError, AttributeError, TypeError):
+        # No place to write; or a numba whose private parts, which CachedCode stands on, are others: nothing is cached.
         return cast(F, numba.njit(**options)(function))
     finally:
         settings.CACHE_DIR = previous

@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 import pickle
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -13,7 +14,7 @@ from gymnasium.utils.env_checker import check_env as check_with_gymnasium
 from stable_baselines3.common.env_checker import check_env as check_with_sb3
 
 import cz_gym
-from cz_gym import CzEnv, Parameters, Scenario, make_puller
+from cz_gym import SCENARIOS, CzEnv, CzVectorEnv, Parameters, Scenario, make_puller
 from cz_gym.config import Config, make_config
 from cz_gym.episodes.scenario import Actuators, Interface, Recipe
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
@@ -111,6 +112,24 @@ def test_bad_arguments_are_refused_in_one_line(make: Any, arguments: dict[str, A
 def test_a_typo_is_not_swallowed() -> None:
     with pytest.raises(TypeError, match="control_intervall"):
         gym.make("Cz-v0", control_intervall=2.0)
+
+
+def test_a_drawn_puller_without_operating_point_is_drawn_again() -> None:
+    """In a crucible as hot as this, every third draw has none: a training died of it in the middle of a step."""
+    scenario = SCENARIOS["randomized"]
+    spread = replace(scenario.pullers, conductance=0.3, conductivity=0.3)
+    hot = make_config(replace(scenario, name="hot", pullers=spread), horizon=25.0, parameters=Parameters(T_e=2450.0))
+    env = CzVectorEnv.from_config(hot, 200)
+    env.reset(seed=0)
+    for _ in range(12):
+        env.step(np.zeros((200, 2), np.float32))
+    pullers = np.array([[*state.slot.slot["puller"].item()] for state in env.get_state()])
+    assert np.isfinite(pullers).all()
+    assert len(np.unique(pullers[:, 0])) == 200
+    one = CzEnv.from_config(hot)
+    for seed in range(20):
+        one.reset(seed=seed)
+        assert np.isfinite(one.get_state().slot.slot["puller"].item()).all()
 
 
 def test_parameters_without_an_operating_point_are_refused_on_entry() -> None:

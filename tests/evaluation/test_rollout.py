@@ -9,10 +9,11 @@ import pytest
 
 from cz_gym import CzEnv
 from cz_gym.baselines import CompensatedPID, OpenLoop
+from cz_gym.camera import Camera
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation import rollout as module
 from cz_gym.evaluation.metrics import metrics
-from cz_gym.evaluation.rollout import Rollout, Signals, rollout
+from cz_gym.evaluation.rollout import Course, Rollout, Signals, rollout
 from cz_gym.observation import MEASURED
 
 SHORT = make_config("randomized", horizon=600.0)
@@ -47,6 +48,16 @@ def one_by_one(policy: Any, config: Config, seed: int) -> tuple[dict[str, np.nda
         rows.append(info)
         over = terminated or truncated
     return {name: np.array([row[name] for row in rows]) for name in Signals._fields}, total, terminated
+
+
+def test_a_rollout_looks_through_the_camera_of_its_settings() -> None:
+    """It was dropped, while the settings' hash said that it was there."""
+    near = Camera(tilt=0.4)
+    config = make_config("nominal", observation="camera", horizon=10.0, camera=near)
+    course = Course(config, [3])
+    image, _ = CzEnv.from_config(config).reset(seed=3)
+    np.testing.assert_array_equal(course.observation[0], image)
+    assert course.env.config is config
 
 
 def check_against_scalar(run: Rollout, policy: Any) -> None:
