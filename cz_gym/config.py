@@ -18,7 +18,7 @@ from cz_gym.physics.parameters import Parameters, check_parameters
 from cz_gym.physics.plant import make_puller
 
 from .observation import CAMERA, OBSERVATIONS
-from .task import check_height
+from .task import ACTIONS, check_height
 
 VERSION = 0
 """Version of physics and contract; a change of either makes a Cz-v1."""
@@ -36,6 +36,7 @@ class Identity(NamedTuple):
     mix: Range
     """Range of the share of conduction [-]."""
     observation: str
+    action: str
     control_interval: float
     """[s]."""
     horizon: float
@@ -56,6 +57,8 @@ class Config:
     scenario: Scenario = RANDOMIZED
     model: str | float | None = None
     observation: str = "measured"
+    action: str = "direct"
+    """What an action means: "direct" or "smooth" (:func:`cz_gym.task.drives_of`)."""
     control_interval: float = 5.0
     """Time between actions [s]."""
     horizon: float = 10800.0
@@ -89,6 +92,8 @@ class Config:
         parts = [self.plant_hash, self.scenario.hash, mix, self.observation, self.control_interval, self.horizon]
         if self.observation == CAMERA:
             parts.append(list(self.camera))
+        if self.action != "direct":
+            parts.append(self.action)
         return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
 
     @property
@@ -98,7 +103,7 @@ class Config:
         low, high = self.mix
         mix = float(low) + 0.0, float(high) + 0.0
         seen = f"camera {tuple(self.camera)}" if self.observation == CAMERA else self.observation
-        return Identity(VERSION, self.plant_hash, scenario, mix, seen, self.control_interval, self.horizon)
+        return Identity(VERSION, self.plant_hash, scenario, mix, seen, self.action, self.control_interval, self.horizon)
 
     def with_scenario(self, scenario: str | Scenario) -> Config:
         """The same settings on another scenario."""
@@ -114,12 +119,15 @@ def make_config(
     parameters: Parameters | None = None,
     meniscus: MeniscusModel | None = None,
     camera: Camera | None = None,
+    action: str = "direct",
 ) -> Config:
     """Check the arguments of the environment; ValueError names what was given and what is allowed."""
     found = find_scenario(scenario)
     mix_of(model, found)
     if not isinstance(observation, str) or observation not in (*OBSERVATIONS, CAMERA):
         raise ValueError(f"unknown observation {observation!r}; choose one of {', '.join([*OBSERVATIONS, CAMERA])}")
+    if action not in ACTIONS:
+        raise ValueError(f"unknown action {action!r}; choose one of {', '.join(ACTIONS)}")
     if camera is not None and observation != CAMERA:
         raise ValueError(f'a camera is of use with observation="camera" only, not with {observation!r}')
     interval = _positive("control_interval", control_interval)
@@ -132,7 +140,7 @@ def make_config(
     checked = check_parameters(parameters if parameters is not None else Parameters())
     check_height(make_puller(checked, meniscus=meniscus or HURLE))
     looking = check_camera(camera_for(checked) if camera is None else camera, checked)
-    return Config(found, model, observation, interval, length, checked, meniscus or HURLE, looking)
+    return Config(found, model, observation, action, interval, length, checked, meniscus or HURLE, looking)
 
 
 def _name(meniscus: MeniscusModel) -> str:

@@ -14,7 +14,7 @@ from gymnasium.spaces import Box
 
 from cz_gym.camera.view import IMAGE, Camera
 from cz_gym.engine.batch import Batch, SlotState, new_key
-from cz_gym.engine.layout import INFO
+from cz_gym.engine.layout import INFO, LEAN, check_info
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.physics.meniscus import MeniscusModel
@@ -27,6 +27,10 @@ from .observation import CAMERA, CLIP, OBSERVATIONS
 Observation = npt.NDArray[Any]
 Action = npt.NDArray[np.float32]
 _OPTIONS = ("scenario", "state")
+_LEAN_ROWS = tuple((name, INFO.index(name)) for name in LEAN)
+_CLIPPED = INFO.index("action_clipped")
+_FACTS = ("_np_random", "_np_random_seed", "_over", "_begun", "spec")
+"""What a copy of an environment has beside its settings and its slot."""
 
 
 @dataclass(frozen=True)
@@ -112,20 +116,29 @@ class CzEnv(gym.Env[Observation, Action]):
         meniscus: MeniscusModel | None = None,
         render_size: tuple[int, int] = (640, 480),
         camera: Camera | None = None,
+        action: str = "direct",
+        info: str = "lean",
     ) -> None:
-        config = make_config(scenario, model, observation, control_interval, horizon, parameters, meniscus, camera)
-        self._setup(config, render_mode, render_size)
+        config = make_config(
+            scenario, model, observation, control_interval, horizon, parameters, meniscus, camera, action
+        )
+        self._setup(config, render_mode, render_size, info)
 
     @classmethod
     def from_config(
-        cls, config: Config, render_mode: str | None = None, render_size: tuple[int, int] = (640, 480)
+        cls,
+        config: Config,
+        render_mode: str | None = None,
+        render_size: tuple[int, int] = (640, 480),
+        info: str = "lean",
     ) -> CzEnv:
         """The environment of settings that were checked when they were made (:func:`cz_gym.config.make_config`)."""
         env = cls.__new__(cls)
-        env._setup(config, render_mode, render_size)
+        env._setup(config, render_mode, render_size, info)
         return env
 
-    def _setup(self, config: Config, render_mode: str | None, render_size: tuple[int, int]) -> None:
+    def _setup(self, config: Config, render_mode: str | None, render_size: tuple[int, int], info: str) -> None:
+        self._everything, self._settings = check_info(info), (config, render_mode, render_size, info)
         self.config = config
         self.render_mode = render_mode
         self.action_space = action_space()
@@ -137,7 +150,7 @@ class CzEnv(gym.Env[Observation, Action]):
         self._shown = self._batch.shown(self._out)[0]
         self._said = self._out.info[:, 0]
         self._step = self._batch.bound_step(self._action, self._out)
-        self._over = True
+        self._over, self._begun = True, False
         self._view = make_view(render_mode, render_size, self.config)
 
     def reset(
@@ -158,7 +171,7 @@ class CzEnv(gym.Env[Observation, Action]):
         else:
             self._batch.reset([0], [new_key(self.np_random)], self._out, scenario)
             self._look(scenario)
-        self._over = bool(self._slots["over"][0])
+        self._over, self._begun = bool(self._slots["over"][0]), True
         return self._shown.copy(), self._info()
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -187,7 +200,20 @@ class CzEnv(gym.Env[Observation, Action]):
         self._batch.restore([0], [state.slot], self._out)
         self.np_random.bit_generator.state = state.random
         self._look()
-        self._over = bool(self._slots["over"][0])
+        self._over, self._begun = bool(self._slots["over"][0]), True
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Settings, the present state and the random stream: a copy goes on bit for bit."""
+        slot = self._batch.save(0) if self._begun else None
+        return {"settings": self._settings, "slot": slot, "facts": [getattr(self, name) for name in _FACTS]}
+
+    def __setstate__(self, saved: dict[str, Any]) -> None:
+        self._setup(*saved["settings"])
+        if saved["slot"] is not None:
+            self._batch.restore([0], [saved["slot"]], self._out)
+            self._look()
+        for name, fact in zip(_FACTS, saved["facts"], strict=True):
+            setattr(self, name, fact)
 
     def _check_state(self, state: Any) -> None:
         check_state(state, self._batch)
@@ -214,8 +240,13 @@ class CzEnv(gym.Env[Observation, Action]):
             self._view.begin(self._said, self._slots[0], (scenario or self.config.scenario).name)
 
     def _info(self) -> dict[str, Any]:
-        info: dict[str, Any] = dict(zip(INFO, self._said.tolist(), strict=True))
-        info["action_clipped"] = info["action_clipped"] > 0.0
+        if self._everything:
+            info: dict[str, Any] = dict(zip(INFO, self._said.tolist(), strict=True))
+            info["action_clipped"] = info["action_clipped"] > 0.0
+        else:
+            info = {name: self._said.item(row) for name, row in _LEAN_ROWS}
+            if self._said.item(_CLIPPED) > 0.0:
+                info["action_clipped"] = True
         if self.config.observation == "history":
             info["state"] = self._out.state[0].copy()
         return info

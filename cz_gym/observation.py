@@ -55,29 +55,51 @@ MEASURED = (
 LAGGED = ("ring_error", "v_p", "T_1", "Q_H")
 """Channels that "history" remembers."""
 LAGS = (5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0, 240.0, 360.0, 480.0, 720.0, 960.0, 1200.0)
-"""Ages [s] that "history" reaches back to; each value is the mean over the samples since the age before."""
+"""Ages [s] that "history" reaches back to, in spans: each span holds the samples since the age before."""
+_SPAN_SCALES = {"ring_error": 0.1 * MM, "v_p": 0.1 * PULL_SCALE, "T_1": 0.2, "Q_H": 0.2 * KILO}
+_RELATIVE = {
+    "r_ref_1min": ("r_ref", 0.1 * MM, "change of the radius reference within 1 minute"),
+    "r_ref_5min": ("r_ref", 0.5 * MM, "change of the radius reference within 5 minutes"),
+    "T_1_ref_1min": ("T_1_ref", 0.2, "change of the recipe within 1 minute"),
+    "T_1_ref_5min": ("T_1_ref", 1.0, "change of the recipe within 5 minutes"),
+    "T_1": ("T_1_ref", 2.0, "pyrometer reading minus recipe"),
+}
+"""Channels of "history" that are told relative to another one: which, scale, meaning."""
 
 
-def _lagged() -> tuple[Channel, ...]:
-    by_name = {channel.name: channel for channel in MEASURED}
+def _present() -> tuple[Channel, ...]:
+    """The "measured" channels as "history" tells them."""
+    return tuple(
+        channel._replace(scale=_RELATIVE[channel.name][1], meaning=_RELATIVE[channel.name][2])
+        if channel.name in _RELATIVE
+        else channel
+        for channel in MEASURED
+    )
+
+
+def _spans() -> tuple[Channel, ...]:
+    units = {channel.name: channel.unit for channel in MEASURED}
+    before = ("now", *(f"{age:g} s" for age in LAGS))
     return tuple(
         Channel(
             f"{name}_{age:g}s",
-            by_name[name].unit,
-            by_name[name].scale,
-            f"{name}, mean of the samples up to {age:g} s old",
+            units[name],
+            _SPAN_SCALES[name],
+            f"{name}: mean over the span up to {age:g} s ago, minus "
+            + ("the value now" if earlier == "now" else f"that over the span up to {earlier}"),
         )
-        for age in LAGS
+        for age, earlier in zip(LAGS, before, strict=False)
         for name in LAGGED
     )
 
 
 HISTORY = (
-    *MEASURED,
+    *_present(),
     Channel("integral", "m s", INTEGRAL_SCALE, "integral of ring_error since the start, held within +-10"),
-    *_lagged(),
+    *_spans(),
 )
-"""Channels of ``observation="history"``."""
+"""Channels of ``observation="history"``: neighbouring means differ by micrometres under millimetres, so what is told of
+the past are their differences, each on a scale of its own."""
 
 STATE = (
     Channel("r_c_error", "m", MM, "true radius minus r_ref"),
@@ -118,7 +140,12 @@ class Measured(NamedTuple):
 
 def scales(channels: tuple[Channel, ...], v_0: float) -> npt.NDArray[np.float64]:
     """Scales of the channels for a puller of nominal pull speed v_0 [m/s], shape (channels,)."""
-    return np.array([v_0 if channel.name.startswith("v_p") else channel.scale for channel in channels])
+    return np.array(
+        [
+            v_0 * (channel.scale / PULL_SCALE) if channel.name.startswith("v_p") else channel.scale
+            for channel in channels
+        ]
+    )
 
 
 def decode(observation: npt.ArrayLike, v_0: float = PULL_SCALE) -> Measured:
@@ -132,8 +159,37 @@ def decode(observation: npt.ArrayLike, v_0: float = PULL_SCALE) -> Measured:
             f"expected an observation of {len(MEASURED)} (measured) or {len(HISTORY)} (history) channels, "
             f"got shape {array.shape}"
         )
-    head = array[..., : len(MEASURED)] * scales(MEASURED, v_0)
-    return Measured(*np.moveaxis(head, -1, 0))
+    relative = array.shape[-1] == len(HISTORY)
+    head = array[..., : len(MEASURED)] * scales(HISTORY[: len(MEASURED)] if relative else MEASURED, v_0)
+    told = Measured(*np.moveaxis(head, -1, 0))
+    if not relative:
+        return told
+    return told._replace(**{name: getattr(told, name) + getattr(told, to) for name, (to, *_) in _RELATIVE.items()})
+
+
+class Relative(NamedTuple):
+    """The channels that "history" tells relative to another one; arrays of shape (channels,)."""
+
+    channel: npt.NDArray[np.int64]
+    """Its place."""
+    to: npt.NDArray[np.int64]
+    """The place of the other."""
+    scale: npt.NDArray[np.float64]
+    """From the scale of "measured" to its own [-]."""
+
+
+def relative() -> Relative:
+    """What :data:`HISTORY` tells relative to another channel."""
+    place = {channel.name: at for at, channel in enumerate(MEASURED)}
+    rows = [(place[name], place[to], MEASURED[place[name]].scale / scale) for name, (to, scale, _) in _RELATIVE.items()]
+    channel, to, scale = zip(*rows, strict=True)
+    return Relative(np.array(channel), np.array(to), np.array(scale))
+
+
+def span_scales() -> npt.NDArray[np.float64]:
+    """From the scale of a remembered channel to that of the difference of its spans [-], shape (LAGGED,)."""
+    own = {channel.name: channel.scale for channel in MEASURED}
+    return np.array([own[name] / _SPAN_SCALES[name] for name in LAGGED])
 
 
 class Lags(NamedTuple):

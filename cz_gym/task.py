@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +21,10 @@ HEIGHT_MAX_IN_A = 1.24
 """Highest meniscus before it detaches [capillary constants]."""
 HEATER_RANGE = HEATER_SCALE
 """Q_H = Q_H0 +- this [W]."""
+SMOOTH_TIME = 50.0
+"""Time constant with which ``action="smooth"`` moves both drives [s]."""
+SMOOTH_PULL, SMOOTH_HEATER = 0.5, 0.3
+"""Where a held smooth action of 1 brings the drives to: shares of v_0 and of the heater's range [-]."""
 RADIUS_SCALE = 0.5 * MM
 PULL_DEVIATION = 0.36 * MM_PER_MIN
 PULL_STEP_SCALE = 0.06 * MM_PER_MIN
@@ -29,6 +34,36 @@ COST_CAP = 10.0
 """What the saturated cost approaches [-]."""
 FAILURE_COST = 10.0
 """Cost of the failing step and of each step lost to it [-]."""
+
+
+class Drives(NamedTuple):
+    """What an action asks of the drives, in shares of v_0 and of the heater's range: keep * applied + gain * action."""
+
+    keep: float
+    """Share of the applied deviation that stays [-]."""
+    pull: float
+    """Gain of the pull speed [-]."""
+    heater: float
+    """Gain of the heater [-]."""
+
+
+DIRECT = Drives(0.0, 1.0, 1.0)
+"""The action is the drives' deviation from nominal itself."""
+ACTIONS = ("direct", "smooth")
+"""What the two numbers of an action may mean."""
+
+
+def drives_of(action: str, control_interval: float) -> Drives:
+    """How actions of that kind move the drives at that control interval [s].
+
+    "smooth": first-order lags. A held action a brings the pull speed to v_0 (1 + 0.5 a) and the heater to
+    Q_H0 + 3 kW a with a time constant of 50 s; left alone they return to nominal. So noise on the action is bounded,
+    coloured noise of the drives, whatever the control interval.
+    """
+    if action == "direct":
+        return DIRECT
+    keep = math.exp(-control_interval / SMOOTH_TIME)
+    return Drives(keep, SMOOTH_PULL * (1.0 - keep), SMOOTH_HEATER * (1.0 - keep))
 
 
 class Cost(NamedTuple):

@@ -15,7 +15,7 @@ from gymnasium.vector.utils import batch_space
 
 from cz_gym.camera.view import Camera
 from cz_gym.engine.batch import Batch, new_key
-from cz_gym.engine.layout import INFO, Out
+from cz_gym.engine.layout import INFO, LEAN, Out, check_info
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.physics.meniscus import MeniscusModel
@@ -25,6 +25,11 @@ from .config import Config, make_config
 from .env import CzEnv, EnvState, action_space, check_options, check_state, observation_space
 
 _MASKS = tuple(f"_{name}" for name in INFO)
+_LEAN_MASKS = tuple(f"_{name}" for name in LEAN)
+_LEAN_ROWS = tuple((name, INFO.index(name)) for name in LEAN)
+_CLIPPED = INFO.index("action_clipped")
+_FACTS = ("_randoms", "_seeds", "_over", "_waiting", "_begun", "spec")
+"""What a copy of a batch has beside its settings and its slots."""
 Array = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
 
@@ -54,11 +59,15 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         threads: int | None = None,
         camera: Camera | None = None,
+        action: str = "direct",
+        info: str = "lean",
     ) -> None:
-        config = make_config(scenario, model, observation, control_interval, horizon, parameters, meniscus, camera)
+        config = make_config(
+            scenario, model, observation, control_interval, horizon, parameters, meniscus, camera, action
+        )
         if render_mode is not None:
             raise ValueError(f"a batch does not render: render_mode must be None, not {render_mode!r}")
-        self._setup(config, num_envs, autoreset_mode, threads)
+        self._setup(config, num_envs, autoreset_mode, threads, info)
 
     @classmethod
     def from_config(
@@ -67,13 +76,17 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         num_envs: int = 1,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         threads: int | None = None,
+        info: str = "lean",
     ) -> CzVectorEnv:
         """The batch of settings that were checked when they were made (:func:`cz_gym.config.make_config`)."""
         env = cls.__new__(cls)
-        env._setup(config, num_envs, autoreset_mode, threads)
+        env._setup(config, num_envs, autoreset_mode, threads, info)
         return env
 
-    def _setup(self, config: Config, num_envs: int, autoreset_mode: AutoresetMode | str, threads: int | None) -> None:
+    def _setup(
+        self, config: Config, num_envs: int, autoreset_mode: AutoresetMode | str, threads: int | None, info: str
+    ) -> None:
+        self._everything, self._settings = check_info(info), (config, num_envs, autoreset_mode, threads, info)
         if not isinstance(num_envs, int) or isinstance(num_envs, bool) or num_envs < 1:
             raise ValueError(f"num_envs must be a positive whole number, not {num_envs!r}")
         if threads is not None and (not isinstance(threads, int) or threads < 1):
@@ -172,6 +185,18 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         self._waiting = bool(self._over.any())
         self._begun = True
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Settings, every slot's state and random stream: a copy goes on bit for bit."""
+        slots = [self._batch.save(i) for i in range(self.num_envs)] if self._begun else None
+        return {"settings": self._settings, "slots": slots, "facts": [getattr(self, name) for name in _FACTS]}
+
+    def __setstate__(self, saved: dict[str, Any]) -> None:
+        self._setup(*saved["settings"])
+        if saved["slots"] is not None:
+            self._batch.restore(range(self.num_envs), saved["slots"], self._out)
+        for name, fact in zip(_FACTS, saved["facts"], strict=True):
+            setattr(self, name, fact)
+
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the threads."""
         # Gymnasium up to 1.1 closes what was refused when it was made, and so never had any.
@@ -269,10 +294,18 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
     def _infos(self, out: Out, mask: Mask | None = None) -> dict[str, Any]:
         everything = mask is None or bool(mask.all())
         mask = self._everybody.copy() if mask is None else mask
-        infos: dict[str, Any] = dict.fromkeys(_MASKS, mask)
         rows: Any = out.info[:, : self.num_envs]
-        infos.update(zip(INFO, rows if everything else np.where(mask, rows, 0.0), strict=True))
-        infos["action_clipped"] = infos["action_clipped"] > 0.0
+        infos: dict[str, Any]
+        if self._everything:
+            infos = dict.fromkeys(_MASKS, mask)
+            infos.update(zip(INFO, rows if everything else np.where(mask, rows, 0.0), strict=True))
+            infos["action_clipped"] = infos["action_clipped"] > 0.0
+        else:
+            infos = {name: rows[row] if everything else np.where(mask, rows[row], 0.0) for name, row in _LEAN_ROWS}
+            infos.update(dict.fromkeys(_LEAN_MASKS, mask))
+            clipped = (rows[_CLIPPED] > 0.0) & mask
+            if clipped.any():
+                infos["action_clipped"], infos["_action_clipped"] = clipped, clipped.copy()
         if self.config.observation == "history":
             infos["state"] = out.state if everything else np.where(mask[:, None], out.state, np.float32(0))
             infos["_state"] = mask

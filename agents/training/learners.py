@@ -156,6 +156,7 @@ def _make_slots(recipe: settings.Recipe, seed: int, done: int) -> CzVecEnv:
         observation=recipe.observation,
         control_interval=recipe.control_interval,
         autoreset_mode=AutoresetMode.SAME_STEP,
+        info="all",
     )
     return CzVecEnv(env, recipe.privileged_critic, stagger=seed + done)
 

@@ -34,6 +34,7 @@ class PairedReward(VecEnvWrapper):
             scenario=config.scenario,
             control_interval=config.control_interval,
             autoreset_mode=AutoresetMode.SAME_STEP,
+            info="all",
         )
         self.together = np.ones(slots.num_envs, np.bool_)
         self._begins = np.ones(slots.num_envs, np.bool_)

@@ -25,10 +25,11 @@ from cz_gym.episodes.record import GRID, Episode, law_of
 from cz_gym.episodes.scenario import MAX_LATENCY, Scenario
 from cz_gym.episodes.series import series_of
 from cz_gym.jit.compile import entry
-from cz_gym.observation import HISTORY, LAGGED, MEASURED, STATE, lags, scales
+from cz_gym.observation import HISTORY, LAGGED, MEASURED, STATE, lags, relative, scales, span_scales
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.physics.plant import NO_OPERATING_POINT
+from cz_gym.task import drives_of
 
 from .buffers import Lender
 from .kernels import KERNELS, Kernels, build_kernels
@@ -102,6 +103,7 @@ class Batch:
         self.num_envs = num_envs
         self.kernels = _kernels(config.meniscus)
         self.clock = Clock(config.control_interval, config.steps, math.ceil(config.horizon / GRID) + 1)
+        self.drives = drives_of(config.action, config.control_interval)
         self.channels = len(HISTORY) if config.observation == "history" else len(MEASURED)
         self.state_channels = len(STATE) if config.observation in ("history", "state") else 0
         self._camera = config.observation == "camera"
@@ -113,6 +115,8 @@ class Batch:
             ages.newest,
             ages.oldest + 1,
             1.0 / (ages.oldest - ages.newest + 1),
+            span_scales(),
+            relative(),
         )
         depth = int(ages.oldest[-1]) + 2 if config.observation == "history" else 0
         frames = (
@@ -138,7 +142,7 @@ class Batch:
         self._images = Lender((num_envs, *IMAGE) if self._camera else (num_envs, 0, 0, 0), np.uint8)
         self._infos = Lender((len(INFO), info_width(num_envs)), np.float64)
         out, which, keys = self.new_out(), np.zeros(1, np.int64), np.zeros((1, 2), np.uint64)
-        stepped = (self.memory, self.actions, self._all, self.clock, self.reading, out, 0, 1)
+        stepped = (self.memory, self.actions, self._all, self.clock, self.drives, self.reading, out, 0, 1)
         drawn = (self.memory, which, keys, self._law, self._mix, self._parameters, self.clock, self.reading, out, 0, 1)
         self._step, self._draw = entry(self.kernels.step, stepped), entry(self.kernels.draw, drawn)
         threads = threads or os.cpu_count() or 1
@@ -173,7 +177,7 @@ class Batch:
     def bound_step(self, actions: npt.NDArray[np.float64], out: Out) -> Any:
         """``step`` of all slots from and into always the same arrays, called without arguments."""
         n = self.num_envs
-        step = partial(self._step, self.memory, actions, self._all, self.clock, self.reading, out, 0, n)
+        step = partial(self._step, self.memory, actions, self._all, self.clock, self.drives, self.reading, out, 0, n)
         if not self._camera:
             return step
 
@@ -217,14 +221,14 @@ class Batch:
         if actions is not self.actions:
             self.actions[:] = actions
         active = self._all if active is None else active
-        arguments = (self.memory, self.actions, active, self.clock, self.reading, out)
+        arguments = (self.memory, self.actions, active, self.clock, self.drives, self.reading, out)
         ended: int = sum(self._run(self._step, arguments, self.num_envs, SLOTS_PER_THREAD, SLOTS_AT_ONCE))
         self._photograph(out, active)
         return ended
 
     def advance(self, rings: npt.NDArray[np.float64]) -> None:
         """Drives, plant and ring [m] of every slot, and nothing else: what the speed of a step is measured against."""
-        arguments = (self.memory, self.actions, self.clock, rings)
+        arguments = (self.memory, self.actions, self.clock, self.drives, rings)
         self._run(self.kernels.plant, arguments, self.num_envs, SLOTS_PER_THREAD, SLOTS_AT_ONCE)
 
     def _run(self, loop: Any, arguments: tuple[Any, ...], count: int, least: int, share: int = 1) -> list[Any]:

@@ -61,14 +61,16 @@ def _begin(slot: Any) -> None:
 
 
 @physics
-def _drive(slot: Any, pull: Any, heat: Any, interval: Any) -> None:
-    """Move the drives towards an action within window and slew, the heater in whole steps."""
+def _drive(slot: Any, pull: Any, heat: Any, drives: Any, interval: Any) -> None:
+    """Move the drives as an action asks, within window and slew, the heater in whole steps."""
     p, e = slot.puller, slot.episode
     slot.v_p_before, slot.Q_H_before = slot.v_p, slot.Q_H
     slot.clipped = 1.0 if (np.abs(pull) > 1.0 or np.abs(heat) > 1.0) else 0.0
-    wanted = p.v_0 + clip(p.v_0 * clip(pull, 1.0), e.pull_window)
+    speed = drives.keep * ((slot.v_p - p.v_0) / p.v_0) + drives.pull * clip(pull, 1.0)
+    wanted = p.v_0 + clip(p.v_0 * speed, e.pull_window)
     slot.v_p = slot.v_p + clip(wanted - slot.v_p, e.pull_slew * interval)
-    power = np.maximum(p.Q_H_0 + HEATER_RANGE * clip(heat, 1.0), 0.0)
+    share = drives.keep * ((slot.Q_H_slewed - p.Q_H_0) / HEATER_RANGE) + drives.heater * clip(heat, 1.0)
+    power = np.maximum(p.Q_H_0 + HEATER_RANGE * share, 0.0)
     slot.Q_H_slewed = slot.Q_H_slewed + clip(power - slot.Q_H_slewed, e.heater_slew * interval)
     slot.Q_H = slot.Q_H_slewed
     if e.heater_step > 0.0:
@@ -150,7 +152,7 @@ def _sample(memory: Any, i: Any, fresh: Any, clock: Any, reading: Any, out: Any,
     if memory.history.shape[1] > 0:
         if fresh:
             remember(slot, memory.history[i], clock.interval, row)
-        recall(slot, memory.history[i], reading, row)
+        recall(slot, measured, memory.history[i], reading, row)
     if out.state.shape[1] > 0:
         write_state(slot, measured, t, reading.state, out.state[i])
     error = x.r_c - p.r_0 - measured.r_ref
@@ -191,8 +193,8 @@ class Kernels(NamedTuple):
     """The compiled loops for one meniscus model."""
 
     step: Any
-    """``step(memory, actions, active, clock, reading, out, start, stop)``: one control interval of the active slots;
-    returns how many episodes ended."""
+    """``step(memory, actions, active, clock, drives, reading, out, start, stop)``: one control interval of the active
+    slots; returns how many episodes ended."""
     draw: Any
     """``draw(memory, which, keys, law, mix, parameters, clock, reading, out, start, stop)``: new episodes, each
     from its key, for the slots ``which[start:stop]``, with their first sample; returns a slot for which no puller with
@@ -201,7 +203,8 @@ class Kernels(NamedTuple):
     """``show(memory, which, clock, reading, out, start, stop)``: the last sample of the slots ``which[start:stop]``
     again."""
     plant: Any
-    """``plant(memory, actions, clock, rings, start, stop)``: drives, plant and ring alone, to measure speed against."""
+    """``plant(memory, actions, clock, drives, rings, start, stop)``: drives, plant and ring alone, to measure speed
+    against."""
     derive: Any
     """``derive(parameters, lam)``: the puller at its operating point."""
 
@@ -210,7 +213,9 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
     """Compile the loops for a meniscus model; those of this package's models are kept on disk."""
     slope, ring_offset, height = meniscus.slope, meniscus.ring_offset, meniscus.height
 
-    def step(memory: Any, actions: Any, active: Any, clock: Any, reading: Any, out: Any, start: int, stop: int) -> int:
+    def step(
+        memory: Any, actions: Any, active: Any, clock: Any, drives: Any, reading: Any, out: Any, start: int, stop: int
+    ) -> int:
         ended = 0
         for i in range(start, stop):
             if not active[i]:
@@ -218,7 +223,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
             _fetch_slot(memory.numbers, i + 1)
             _fetch_info(out.info, i + _LINE)
             slot = memory.slots[i]
-            _drive(slot, actions[i, 0], actions[i, 1], clock.interval)
+            _drive(slot, actions[i, 0], actions[i, 1], drives, clock.interval)
             grows = _advance(slot, memory.frames[i], clock, slope, ring_offset)
             cost = _sample(memory, i, True, clock, reading, out, slope, ring_offset)
             ends = slot.k >= clock.steps
@@ -259,11 +264,11 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
         for at in range(start, stop):
             _sample_alone(memory, which[at], False, clock, reading, out, slope, ring_offset)
 
-    def plant(memory: Any, actions: Any, clock: Any, rings: Any, start: int, stop: int) -> None:
+    def plant(memory: Any, actions: Any, clock: Any, drives: Any, rings: Any, start: int, stop: int) -> None:
         for i in range(start, stop):
             _fetch_slot(memory.numbers, i + 1)
             slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
-            _drive(slot, actions[i, 0], actions[i, 1], clock.interval)
+            _drive(slot, actions[i, 0], actions[i, 1], drives, clock.interval)
             _advance(slot, memory.frames[i], clock, slope, ring_offset)
             rings[i] = x.r_c + ring_offset(x.r_c, _height_inside(x.h_c, p), p)
 

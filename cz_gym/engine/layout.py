@@ -110,11 +110,16 @@ class Reading(NamedTuple):
     state: Any
     """One over the scales of the state channels, shape (channels,)."""
     upto: Any
-    """Age of the newest sample of each remembered mean, shape (lags,)."""
+    """Age of the newest sample of each remembered span, shape (lags,)."""
     before: Any
     """Age of the sample before its oldest, shape (lags,)."""
     share: Any
     """One over the samples in it, shape (lags,)."""
+    span: Any
+    """From the scale of a remembered channel to that of its differences, shape (remembered channels,)."""
+    relative: Any
+    """Places of the channels that "history" tells relative to another one, of the others, and the change of scale:
+    three arrays of shape (channels,)."""
 
 
 class InfoRow(NamedTuple):
@@ -148,6 +153,16 @@ INFO_ROWS = (
 """What a step says beside the observation, SI units."""
 INFO = tuple(row.name for row in INFO_ROWS)
 """Names of the info rows."""
+LEAN = ("r_c", "r_ref")
+"""What ``info`` holds unless all of it is asked for: libraries copy it key by key, which costs more than the step."""
+INFO_CHOICES = ("lean", "all")
+
+
+def check_info(info: str) -> bool:
+    """Whether all of ``info`` is asked for; ValueError names what may be."""
+    if info not in INFO_CHOICES:
+        raise ValueError(f"info must be one of {', '.join(INFO_CHOICES)}, not {info!r}")
+    return info == "all"
 
 
 def info_width(n: int) -> int:

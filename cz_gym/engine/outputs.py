@@ -70,16 +70,24 @@ def remember(slot: Any, history: Any, interval: Any, out: Any) -> None:
 
 
 @physics
-def recall(slot: Any, history: Any, reading: Any, out: Any) -> None:
-    """Write the integral and the means of the remembered samples; a negative index goes round the circle."""
-    at = slot.k % history.shape[0]
+def recall(slot: Any, measured: Any, history: Any, reading: Any, out: Any) -> None:
+    """Turn "measured" channels into "history": integral, differences of successive spans' means, relative channels.
+
+    A negative index goes round the circle.
+    """
+    at, spans = slot.k % history.shape[0], reading.upto.size
     out[_M] = slot.integral
-    for lag in range(reading.upto.size):
-        upto, before = at - reading.upto[lag], at - reading.before[lag]
-        first, share = _M + 1 + lag * _L, reading.share[lag]
-        for channel in range(_L):
-            mean = (history[upto, channel] - history[before, channel]) * share
-            out[first + channel] = clip(mean, CLIP)
+    for channel in range(_L):
+        later, gain = history[at, channel] - history[at - 1, channel], reading.span[channel]
+        for lag in range(spans):
+            upto, before = at - reading.upto[lag], at - reading.before[lag]
+            mean = (history[upto, channel] - history[before, channel]) * reading.share[lag]
+            out[_M + 1 + lag * _L + channel] = clip((mean - later) * gain, CLIP)
+            later = mean
+    place, to, change = reading.relative
+    for row in range(place.size):
+        told = measured[place[row]] - measured[to[row]]
+        out[place[row]] = clip(told * (reading.measured[place[row]] * change[row]), CLIP)
 
 
 @physics

@@ -103,7 +103,7 @@ class Course:
     def __init__(self, config: Config, seeds: Sequence[int]) -> None:
         n = len(seeds)
         self.config, self.seeds, self.k, self.seconds = config, tuple(seeds), 0, 0.0
-        self.env = CzVectorEnv.from_config(config, n)
+        self.env = CzVectorEnv.from_config(config, n, info="all")
         self.signals = Signals(*(np.zeros((config.steps, n)) for _ in Signals._fields))
         self.reward, self.alive = np.zeros((config.steps, n)), np.zeros((config.steps, n), np.bool_)
         self.failed, self.running = np.zeros(n, np.bool_), np.ones(n, np.bool_)

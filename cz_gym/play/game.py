@@ -51,8 +51,7 @@ class Game:
         self.window, self.config, self.seed, self.speed, self.rival = window, config, seed, speed, rival
         self.env = CzEnv(
             config.scenario, config.model, horizon=config.horizon, parameters=config.parameters,
-            meniscus=config.meniscus, render_mode="rgb_array", render_size=size,
-        )  # fmt: skip
+            meniscus=config.meniscus, render_mode="rgb_array", render_size=size, info="all")  # fmt: skip
         self.scene = Scene(*size)
         self.outcomes: list[Outcome] = []
         self.helping, self.running = True, True

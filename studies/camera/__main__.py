@@ -120,7 +120,7 @@ def gains(detector: RingDetector, view: View, puller: Puller) -> dict[str, tuple
 
 def respond(model: str, change: float, detector: RingDetector, view: View, puller: Puller) -> Response:
     """Change the pull speed of a crystal at rest, and watch it through ``observation="camera"``."""
-    env = CzEnv("nominal", model, "camera", INTERVAL, HORIZON)
+    env = CzEnv("nominal", model, "camera", INTERVAL, HORIZON, info="all")
     image, info = env.reset(seed=0)
     images, infos = [image], [info]
     over = False

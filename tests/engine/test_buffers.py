@@ -108,7 +108,9 @@ def test_a_lent_array_is_like_any_other() -> None:
 
 @pytest.mark.parametrize("observation", ["measured", "state"])
 def test_a_batch_large_enough_to_be_lent_memory_writes_nothing_again(observation: str) -> None:
-    env = CzVectorEnv(600, "nominal", observation=observation, horizon=40.0, autoreset_mode="SameStep", threads=2)
+    env = CzVectorEnv(
+        600, "nominal", observation=observation, horizon=40.0, autoreset_mode="SameStep", threads=2, info="all"
+    )
     shown, info = env.reset(seed=0)
     looks = [memoryview(shown), info["r_c"][::2], info["h_c"][:1]]
     before = [np.array(look) for look in looks]

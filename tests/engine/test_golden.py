@@ -57,7 +57,7 @@ def test_the_same_bits_in_another_process() -> None:
 def test_thread_counts_do_not_change_bits() -> None:
     digests = set()
     for threads in (1, 2, 3):
-        env = CzVectorEnv(780, "puller", horizon=50.0, threads=threads)
+        env = CzVectorEnv(780, "puller", horizon=50.0, threads=threads, info="all")
         assert env._batch._parts == threads
         found, rng = hashlib.sha256(env.reset(seed=3)[0].tobytes()), np.random.default_rng(1)
         for _ in range(14):
@@ -69,7 +69,7 @@ def test_thread_counts_do_not_change_bits() -> None:
 
 
 def test_scalar_and_batch_give_the_same_bits() -> None:
-    batch, alone = CzVectorEnv(5, "hard", horizon=100.0), CzEnv("hard", horizon=100.0)
+    batch, alone = CzVectorEnv(5, "hard", horizon=100.0, info="all"), CzEnv("hard", horizon=100.0, info="all")
     batch.reset(seed=20)
     alone.reset(seed=23)
     for k in range(20):

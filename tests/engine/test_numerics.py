@@ -60,7 +60,7 @@ def test_a_short_campaign() -> None:
     ],
 )
 def test_what_is_wrong_is_found(where: str, value: Any, says: str) -> None:
-    env = CzVectorEnv(2, "nominal", threads=1)
+    env = CzVectorEnv(2, "nominal", threads=1, info="all")
     watch = Watch(env)
     watch.begin(*env.reset(seed=0))
     watch.before()
@@ -74,7 +74,7 @@ def test_what_is_wrong_is_found(where: str, value: Any, says: str) -> None:
 
 
 def test_heat_that_appears_is_found() -> None:
-    env = CzVectorEnv(2, "nominal", threads=1)
+    env = CzVectorEnv(2, "nominal", threads=1, info="all")
     watch = Watch(env)
     watch.begin(*env.reset(seed=0))
     watch.before()
@@ -98,7 +98,7 @@ def test_a_heater_never_cools() -> None:
     nominal = make_puller(small).Q_H_0
     assert nominal < 10e3
     for scenario in ("nominal", "puller"):
-        env = CzEnv(scenario, parameters=small)
+        env = CzEnv(scenario, parameters=small, info="all")
         env.reset(seed=0)
         powers = [env.step(np.array([0.0, -1.0], np.float32))[4]["Q_H"] for _ in range(100)]
         assert min(powers) == 0.0
@@ -106,7 +106,7 @@ def test_a_heater_never_cools() -> None:
 
 def test_crashing_at_the_end_earns_less_than_any_way_on() -> None:
     """In the last step, at the edge of detachment: crash gently, or save the crystal by a violent pull."""
-    env = CzEnv("nominal", model="II", horizon=50.0)
+    env = CzEnv("nominal", model="II", horizon=50.0, info="all")
     env.reset(seed=0)
     for _ in range(9):
         env.step(np.zeros(2, np.float32))
@@ -132,7 +132,7 @@ def _cost(total: float) -> Any:
 
 def _visited(n: int) -> list[tuple[State, Inputs, Disturbance, Any]]:
     """States and drives that adversaries reach on wide pullers, the last before failures among them."""
-    env = CzVectorEnv(2 * len(KINDS), WIDE, horizon=3600.0, threads=1)
+    env = CzVectorEnv(2 * len(KINDS), WIDE, horizon=3600.0, threads=1, info="all")
     slots, adversaries = env._batch.memory.slots, Adversaries(2 * len(KINDS), 5)
     _, infos = env.reset(seed=11)
     found = []

@@ -34,7 +34,7 @@ def test_the_checkers_on_every_scenario(observation: str) -> None:
     ("scenario", "observation"), [("puller", "history"), ("hard", "state"), ("sensor-fault", "measured")]
 )
 def test_the_native_batch_is_a_vector_of_scalars(scenario: str, observation: str, mode: AutoresetMode) -> None:
-    settings = {"scenario": scenario, "observation": observation, **SHORT}
+    settings = {"scenario": scenario, "observation": observation, "info": "all", **SHORT}
     checked = check_vector_env(
         lambda n, mode: CzVectorEnv(n, autoreset_mode=mode, **settings),
         lambda: CzEnv(**settings),
@@ -46,7 +46,13 @@ def test_the_native_batch_is_a_vector_of_scalars(scenario: str, observation: str
 
 
 def test_a_batch_of_images_is_a_vector_of_scalars() -> None:
-    settings: dict[str, Any] = {"scenario": "hard", "observation": "camera", "control_interval": 60.0, "horizon": 180.0}
+    settings: dict[str, Any] = {
+        "scenario": "hard",
+        "observation": "camera",
+        "control_interval": 60.0,
+        "horizon": 180.0,
+        "info": "all",
+    }
     checked = check_vector_env(
         lambda n, mode: CzVectorEnv(n, autoreset_mode=mode, **settings), lambda: CzEnv(**settings), num_envs=2, steps=5
     )

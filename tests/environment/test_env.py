@@ -28,7 +28,7 @@ OBSERVATIONS = ["measured", "history", "state"]
 
 @pytest.mark.parametrize("observation", OBSERVATIONS)
 def test_gymnasiums_checker(observation: str) -> None:
-    env = gym.make("Cz-v0", observation=observation, horizon=600.0)
+    env = gym.make("Cz-v0", observation=observation, horizon=600.0, info="all")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_with_gymnasium(env.unwrapped)
@@ -38,14 +38,16 @@ def test_gymnasiums_checker(observation: str) -> None:
 def test_stable_baselines3s_checker(observation: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_with_sb3(gym.make("Cz-v0", observation=observation, horizon=600.0), warn=True)
+        check_with_sb3(gym.make("Cz-v0", observation=observation, horizon=600.0, info="all"), warn=True)
 
 
 def test_registration() -> None:
-    assert isinstance(gym.make("cz_gym:Cz-v0").unwrapped, CzEnv)
+    assert isinstance(gym.make("cz_gym:Cz-v0", info="all").unwrapped, CzEnv)
     spec = gym.spec("Cz-v0")
     assert spec.max_episode_steps is None
-    batch = gym.make_vec("Cz-v0", num_envs=3, vectorization_mode="vector_entry_point", observation="history")
+    batch = gym.make_vec(
+        "Cz-v0", num_envs=3, vectorization_mode="vector_entry_point", observation="history", info="all"
+    )
     assert isinstance(batch, cz_gym.CzVectorEnv)
     assert batch.observation_space.shape == (3, 72)
 
@@ -58,7 +60,7 @@ def test_everything_advertised_is_there() -> None:
 
 @pytest.mark.parametrize("observation", OBSERVATIONS)
 def test_dtypes(observation: str) -> None:
-    env = gym.make("Cz-v0", observation=observation)
+    env = gym.make("Cz-v0", observation=observation, info="all")
     assert (env.action_space.dtype, env.observation_space.dtype) == (np.float32, np.float32)
     first, _ = env.reset(seed=1)
     second, gained, terminated, truncated, _ = env.step(env.action_space.sample())
@@ -119,14 +121,14 @@ def test_a_drawn_puller_without_operating_point_is_drawn_again() -> None:
     scenario = SCENARIOS["randomized"]
     spread = replace(scenario.pullers, conductance=0.3, conductivity=0.3)
     hot = make_config(replace(scenario, name="hot", pullers=spread), horizon=25.0, parameters=Parameters(T_e=2450.0))
-    env = CzVectorEnv.from_config(hot, 200)
+    env = CzVectorEnv.from_config(hot, 200, info="all")
     env.reset(seed=0)
     for _ in range(12):
         env.step(np.zeros((200, 2), np.float32))
     pullers = np.array([[*state.slot.slot["puller"].item()] for state in env.get_state()])
     assert np.isfinite(pullers).all()
     assert len(np.unique(pullers[:, 0])) == 200
-    one = CzEnv.from_config(hot)
+    one = CzEnv.from_config(hot, info="all")
     for seed in range(20):
         one.reset(seed=seed)
         assert np.isfinite(one.get_state().slot.slot["puller"].item()).all()
@@ -139,7 +141,7 @@ def test_parameters_without_an_operating_point_are_refused_on_entry() -> None:
 
 @pytest.mark.parametrize("action", [[math.nan, 0.0], [0.0], [0.0, 0.0, 0.0], [[0.0, 0.0]], 0.0, "up", None, ["a", "b"]])
 def test_bad_actions_are_refused(action: Any) -> None:
-    env = CzEnv()
+    env = CzEnv(info="all")
     env.reset(seed=0)
     with pytest.raises(InvalidAction, match="action must") as refusal:
         env.step(action)
@@ -149,11 +151,11 @@ def test_bad_actions_are_refused(action: Any) -> None:
 @pytest.mark.parametrize("options", [{"seed": 3}, {3: 1, "a": 2}, {"scenario": "nonsense"}, {"state": 3}, 3, "abc", []])
 def test_bad_reset_options_are_refused(options: Any) -> None:
     with pytest.raises(ValueError, match=r"unknown reset option|unknown scenario|get_state|must be a dict, not"):
-        CzEnv().reset(options=options)
+        CzEnv(info="all").reset(options=options)
 
 
 def test_a_state_is_not_continued_on_another_scenario() -> None:
-    env = CzEnv()
+    env = CzEnv(info="all")
     env.reset(seed=0)
     before = pickle.dumps(env.get_state())
     with pytest.raises(ValueError, match="exclude each other"):
@@ -190,7 +192,7 @@ def test_a_foreign_meniscus_is_another_plant() -> None:
 def test_out_of_range_actions_are_clipped_and_said_so() -> None:
     runs = []
     for action, clipped in (([3.0, -math.inf], True), ([1.0, -1.0], False)):
-        env = CzEnv()
+        env = CzEnv(info="all")
         env.reset(seed=0)
         observation, *_, info = env.step(np.array(action))
         assert info["action_clipped"] is clipped
@@ -199,7 +201,7 @@ def test_out_of_range_actions_are_clipped_and_said_so() -> None:
 
 
 def test_actions_are_pull_speed_and_power() -> None:
-    env, p = CzEnv("nominal"), make_puller()
+    env, p = CzEnv("nominal", info="all"), make_puller()
     _, start = env.reset(seed=0)
     assert (start["v_p"], start["Q_H"]) == (p.v_0, p.Q_H_0)
     for pull, heat in ((1.0, 0.0), (-1.0, 1.0), (0.5, -0.25)):
@@ -209,7 +211,7 @@ def test_actions_are_pull_speed_and_power() -> None:
 
 
 def test_stepping_needs_a_reset() -> None:
-    env = CzEnv("nominal", horizon=10.0)
+    env = CzEnv("nominal", horizon=10.0, info="all")
     with pytest.raises(ResetNeeded):
         env.step(ZERO)
     env.reset(seed=0)
@@ -221,7 +223,7 @@ def test_stepping_needs_a_reset() -> None:
 
 def test_seeds_reproduce_and_episodes_differ() -> None:
     def episodes(seed: int) -> list[np.ndarray]:
-        env = CzEnv(horizon=100.0)
+        env = CzEnv(horizon=100.0, info="all")
         runs = []
         for number in range(3):
             rows = [env.reset(seed=seed if number == 0 else None)[0]]
@@ -237,11 +239,11 @@ def test_seeds_reproduce_and_episodes_differ() -> None:
 
 
 def test_without_a_seed_nothing_repeats() -> None:
-    assert not np.array_equal(CzEnv().reset()[0], CzEnv().reset()[0])
+    assert not np.array_equal(CzEnv(info="all").reset()[0], CzEnv(info="all").reset()[0])
 
 
 def test_info_is_the_plant_in_si() -> None:
-    env = CzEnv("only-interface", model=0.3)
+    env = CzEnv("only-interface", model=0.3, info="all")
     env.reset(seed=2)
     p = make_puller(lam=0.3)
     for _ in range(5):
@@ -257,7 +259,7 @@ def test_info_is_the_plant_in_si() -> None:
 
 
 def test_a_critic_may_see_the_state_beside_the_history() -> None:
-    history, state = CzEnv(observation="history"), CzEnv(observation="state")
+    history, state = CzEnv(observation="history", info="all"), CzEnv(observation="state", info="all")
     np.testing.assert_array_equal(history.reset(seed=4)[1]["state"], state.reset(seed=4)[0])
     np.testing.assert_array_equal(history.step(ZERO)[4]["state"], state.step(ZERO)[0])
 
@@ -267,7 +269,7 @@ def test_fast_and_slow_controllers_meet_the_same_crystal(interval: float) -> Non
     """Open loop, the trajectories agree to integration error at the common times."""
     runs = {}
     for dt in (5.0, interval):
-        env = CzEnv("randomized", control_interval=dt, horizon=2400.0)
+        env = CzEnv("randomized", control_interval=dt, horizon=2400.0, info="all")
         env.reset(seed=17)
         saved = env.get_state().slot
         steps = [env.step(ZERO)[4] for _ in range(round(2400.0 / dt))]
@@ -281,7 +283,7 @@ def test_fast_and_slow_controllers_meet_the_same_crystal(interval: float) -> Non
 def test_a_scenario_of_ones_own_and_another_puller() -> None:
     wide = Parameters(r_0=0.1, v_0=1.0 * MM_PER_MIN)
     scenario = Scenario("mine", interface=Interface(sd=(0.2, 0.2)), recipe=Recipe())
-    env = gym.make("Cz-v0", scenario=scenario, parameters=wide)
+    env = gym.make("Cz-v0", scenario=scenario, parameters=wide, info="all")
     _, info = env.reset(seed=1)
     assert info["r_c"] == 0.1
     *_, info = env.step(np.array([1.0, 0.0], np.float32))
@@ -289,9 +291,9 @@ def test_a_scenario_of_ones_own_and_another_puller() -> None:
 
 
 def test_one_episode_of_another_scenario() -> None:
-    env = CzEnv("nominal", observation="state")
+    env = CzEnv("nominal", observation="state", info="all")
     given, _ = env.reset(seed=5, options={"scenario": "hard"})
-    hard, _ = CzEnv("hard", observation="state").reset(seed=5)
+    hard, _ = CzEnv("hard", observation="state", info="all").reset(seed=5)
     np.testing.assert_array_equal(given, hard)
     assert env.reset()[1]["r_c"] == make_puller().r_0
 
@@ -300,7 +302,7 @@ def test_drives_obey_window_slew_and_steps() -> None:
     limits = Actuators(
         pull_window=0.5 * MM_PER_MIN, pull_slew=0.3 * MM_PER_MIN / 60, heater_slew=2000.0 / 60, heater_step=100.0
     )
-    env, p = CzEnv(Scenario("mine", actuators=limits)), make_puller()
+    env, p = CzEnv(Scenario("mine", actuators=limits), info="all"), make_puller()
     env.reset(seed=0)
     infos = [env.step(np.array([1.0, 0.553], np.float32))[4] for _ in range(60)]
     pull = np.array([(info["v_p"] - p.v_0) / MM_PER_MIN for info in infos])

@@ -39,13 +39,13 @@ def test_every_channel_is_documented() -> None:
     for channels in OBSERVATIONS.values():
         assert len({channel.name for channel in channels}) == len(channels)
         assert all(channel.unit and channel.meaning and channel.scale > 0 for channel in channels)
-    assert HISTORY[:11] == MEASURED
+    assert [channel.name for channel in HISTORY[:11]] == [channel.name for channel in MEASURED]
 
 
 @pytest.mark.parametrize("scenario", ["randomized", "puller", "sensor-fault"])
 def test_measured_holds_what_the_control_computer_has_and_nothing_else(scenario: str) -> None:
     """Each channel is rebuilt from readings and recipes alone; what no instrument shows does not enter."""
-    env = CzEnv(scenario)
+    env = CzEnv(scenario, info="all")
     rows, infos, start = run(env, 400, 0.05)
     p = start.slot["puller"]
     nominal = {name: float(p[name]) for name in ("r_0", "v_0", "T_1_0", "Q_H_0", "ring_bias")}
@@ -71,7 +71,7 @@ def test_the_recipe_is_known_one_and_five_minutes_ahead(interval: float, ahead: 
         recipe=replace(SCENARIOS["randomized"].recipe, start=(120.0, 120.0)),
         reference=replace(SCENARIOS["reference-b"].reference, start=(60.0, 60.0)),
     )
-    seen = decode(run(CzEnv(scenario, control_interval=interval), 200)[0])
+    seen = decode(run(CzEnv(scenario, control_interval=interval, info="all"), 200)[0])
     assert np.ptp(seen.r_ref) > 0
     assert np.ptp(seen.T_1_ref) > 0
     for now, one, five in ((seen.r_ref, seen.r_ref_1min, seen.r_ref_5min), (seen.T_1_ref, *seen[6:8])):
@@ -80,21 +80,29 @@ def test_the_recipe_is_known_one_and_five_minutes_ahead(interval: float, ahead: 
 
 
 @pytest.mark.parametrize("interval", [2.0, 5.0, 10.0, 60.0])
-def test_history_is_means_of_past_samples_and_the_integral(interval: float) -> None:
-    env = CzEnv("randomized", observation="history", control_interval=interval)
-    rows, _, _ = run(env, round(2000 / interval), 0.05)
+def test_history_is_differences_of_past_means_and_the_integral(interval: float) -> None:
+    arguments: dict[str, Any] = {"control_interval": interval, "info": "all"}
+    steps = round(2000 / interval)
+    rows, _, _ = run(CzEnv("randomized", observation="history", **arguments), steps, 0.05)
+    plain, _, _ = run(CzEnv("randomized", **arguments), steps, 0.05)
     names = [channel.name for channel in HISTORY]
+    own = {channel.name: channel.scale for channel in MEASURED}
     ages = lags(interval)
     for channel in LAGGED:
-        at = names.index(channel)
-        past = np.full(2000, rows[0, at] if channel == "ring_error" else 0.0)
-        series = np.concatenate([past, rows[:, at].astype(float)])
+        now_at = [each.name for each in MEASURED].index(channel)
+        past = np.full(2000, plain[0, now_at] if channel == "ring_error" else 0.0)
+        series = np.concatenate([past, plain[:, now_at].astype(float)])
         for k in (0, 1, 7, len(rows) - 1):
-            now = 2000 + k
+            now, later = 2000 + k, series[2000 + k]
             for lag, newest, oldest in zip(LAGS, *ages, strict=True):
-                expected = series[now - oldest : now - newest + 1].mean()
-                seen = rows[k, names.index(f"{channel}_{lag:g}s")]
-                assert seen == pytest.approx(expected, rel=1e-5, abs=1e-5), (channel, lag, k)
+                mean = series[now - oldest : now - newest + 1].mean()
+                told = HISTORY[names.index(f"{channel}_{lag:g}s")]
+                expected = np.clip((mean - later) * own[channel] / told.scale, -10.0, 10.0)
+                assert rows[k, names.index(told.name)] == pytest.approx(expected, rel=1e-4, abs=1e-4), (told.name, k)
+                later = mean
+    told, known = decode(rows), decode(plain)
+    for name, mine, its in zip(told._fields, told, known, strict=True):
+        np.testing.assert_allclose(mine, its, rtol=1e-5, atol=1e-6 * max(own[name], 1e-9), err_msg=name)
     steps = np.clip(rows[1:, 0].astype(float), -10, 10) * interval / 1000
     np.testing.assert_allclose(rows[1:, 11], np.cumsum(steps), rtol=1e-4, atol=1e-5)
 
@@ -106,7 +114,7 @@ def test_lags_at_the_default_interval_cover_the_past_without_gaps() -> None:
 
 
 def test_state_is_the_plant() -> None:
-    env = CzEnv("puller", observation="state")
+    env = CzEnv("puller", observation="state", info="all")
     rows, infos, start = run(env, 50, 0.05)
     p, slot = start.slot["puller"], env.get_state().slot.slot
     names = [channel.name for channel in OBSERVATIONS["state"]]
@@ -125,9 +133,9 @@ def test_state_is_the_plant() -> None:
 def test_a_late_frame_is_the_newest_old_enough(interval: float, latency: float) -> None:
     """Frames are taken at samples and on the 5 s grid; the true ring of every second is the oracle."""
     scenario = Scenario("mine", interface=SCENARIOS["hard"].interface, sensor=Sensor(latency=latency))
-    every_second = CzEnv(replace(scenario, sensor=Sensor()), control_interval=1.0)
+    every_second = CzEnv(replace(scenario, sensor=Sensor()), control_interval=1.0, info="all")
     ring = column(run(every_second, 200)[1], "r_br")
-    _, infos, _ = run(CzEnv(scenario, control_interval=interval), round(200 / interval))
+    _, infos, _ = run(CzEnv(scenario, control_interval=interval, info="all"), round(200 / interval))
     frames = {*range(0, 201, 5), *range(0, 201, round(interval))}
     for k, measured in enumerate(column(infos, "r_br_measured")):
         t = k * interval
@@ -139,7 +147,7 @@ def test_a_late_frame_is_the_newest_old_enough(interval: float, latency: float) 
 def test_faulty_camera_shows_the_last_value() -> None:
     """Flagged freezes and drop-outs are invalid, the unflagged freeze is not; the bias drifts unflagged."""
     scenario = Scenario("mine", sensor=SCENARIOS["hard"].sensor, faults=SCENARIOS["sensor-fault"].faults)
-    env = CzEnv(scenario)
+    env = CzEnv(scenario, info="all")
     rows, infos, start = run(env, 2160, 0.01, seed=2)
     e, windows = View(start.slot["episode"]), start.slot["freezes"]
     shown, invalid, silent = np.nan, 0, 0
@@ -161,7 +169,7 @@ def test_faulty_camera_shows_the_last_value() -> None:
 
 def test_ring_ripple_is_sampled_at_the_frame() -> None:
     scenario = Scenario("mine", sensor=Sensor(ripple=(1e-4, 1e-4), rotation=(11 / 60, 11 / 60)))
-    env = CzEnv(scenario)
+    env = CzEnv(scenario, info="all")
     _, infos, start = run(env, 60)
     phase = float(start.slot["episode"]["ripple_phase"])
     expected = 1e-4 * np.sin(2 * np.pi * 11 / 60 * 5.0 * np.arange(61) + phase)
@@ -170,7 +178,7 @@ def test_ring_ripple_is_sampled_at_the_frame() -> None:
 
 def test_outliers_are_not_flagged() -> None:
     scenario = Scenario("mine", sensor=Sensor(outlier_probability=0.5, outlier_sd=1e-3), faults=Faults())
-    rows, infos, _ = run(CzEnv(scenario), 100)
+    rows, infos, _ = run(CzEnv(scenario, info="all"), 100)
     wrong = column(infos, "r_br_measured") - column(infos, "r_br")
     assert 25 < np.count_nonzero(np.abs(wrong) > 1e-9) < 75
     assert (rows[:, 1] == 1.0).all()
@@ -179,21 +187,22 @@ def test_outliers_are_not_flagged() -> None:
 def test_camera_noise_is_per_sample_whatever_the_interval() -> None:
     scenario = Scenario("mine", sensor=Sensor(camera_noise=(1e-4, 1e-4)))
     for interval in (2.0, 10.0):
-        _, infos, start = run(CzEnv(scenario, control_interval=interval), 100)
+        _, infos, start = run(CzEnv(scenario, control_interval=interval, info="all"), 100)
         noise = column(infos, "r_br_measured") - column(infos, "r_br")
         np.testing.assert_allclose(noise, start.noise[:101, 0], atol=1e-12)
 
 
 def test_observations_are_clipped_not_lost() -> None:
     scenario = Scenario("mine", sensor=Sensor(bias_offset=(0.05, 0.05)))
-    observation, _ = CzEnv(scenario).reset(seed=0)
+    observation, _ = CzEnv(scenario, info="all").reset(seed=0)
     assert observation[0] == 10.0
 
 
 def test_decode_takes_any_batch_and_refuses_other_shapes(rng: np.random.Generator) -> None:
     batch = rng.normal(size=(4, 3, 72))
     assert decode(batch).T_1.shape == (4, 3)
-    np.testing.assert_allclose(decode(batch).T_1, 5.0 * batch[..., 8])
+    np.testing.assert_allclose(decode(batch).T_1, 5.0 * batch[..., 5] + 2.0 * batch[..., 8])
+    np.testing.assert_allclose(decode(batch[..., :11]).T_1, 5.0 * batch[..., 8])
     for wrong in (np.zeros(17), np.zeros(()), np.zeros((11, 2))):
         with pytest.raises(ValueError, match="expected an observation"):
             decode(wrong)

@@ -5,8 +5,10 @@ import dataclasses
 import pickle
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.vector import AutoresetMode
 
 from cz_gym import CzEnv, CzVectorEnv, Parameters
 
@@ -75,12 +77,12 @@ def test_state_of_a_finished_episode_stays_finished() -> None:
 
 
 def test_states_travel_between_scalar_and_vector() -> None:
-    scalars = [CzEnv(horizon=100.0) for _ in range(3)]
+    scalars = [CzEnv(horizon=100.0, info="all") for _ in range(3)]
     for seed, env in enumerate(scalars):
         env.reset(seed=seed)
         for action in ACTIONS[:7]:
             env.step(action)
-    batch = CzVectorEnv(3, horizon=100.0)
+    batch = CzVectorEnv(3, horizon=100.0, info="all")
     batch.set_state([env.get_state() for env in scalars])
     for action in ACTIONS[7:12]:
         observation, gained, _, _, info = batch.step(np.tile(action, (3, 1)))
@@ -89,7 +91,7 @@ def test_states_travel_between_scalar_and_vector() -> None:
             np.testing.assert_array_equal(observation[i], alone)
             assert gained[i] == alone_gained
             assert info["h_c"][i] == alone_info["h_c"]
-    back = CzEnv(horizon=100.0)
+    back = CzEnv(horizon=100.0, info="all")
     back.set_state(pickle.loads(pickle.dumps(batch.get_state()))[1])
     assert run(back, 40, 12) == run(scalars[1], 40, 12)
 
@@ -238,3 +240,35 @@ def test_a_broken_state_terminates(name: str, value: float) -> None:
     if not np.isnan(value):
         assert gained <= 1.0 - 10.0 * 2159
         assert np.isfinite(observation).all()
+
+
+@pytest.mark.parametrize("steps", [0, 12, 55])
+def test_a_pickled_environment_goes_on_bit_for_bit(steps: int) -> None:
+    """Never reset, in an episode, and after the first one; wrappers and all."""
+    env = gym.make("Cz-v0", scenario="puller", observation="history", action="smooth", horizon=200.0, info="all")
+    if steps:
+        env.reset(seed=4)
+        run(env.unwrapped, steps)
+    other = pickle.loads(pickle.dumps(env))
+    assert other.spec == env.spec
+    for each in (env, other):
+        if not steps:
+            each.reset(seed=5)
+    assert run(other.unwrapped, 40, steps) == run(env.unwrapped, 40, steps)
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode)[:2])
+def test_a_pickled_batch_goes_on_bit_for_bit(mode: AutoresetMode) -> None:
+    """With slots that are over and wait for their next episode."""
+    batch = CzVectorEnv(3, "sensor-fault", horizon=100.0, autoreset_mode=mode, info="all")
+    for steps in (0, 20, 20):
+        if steps == 0:
+            batch = pickle.loads(pickle.dumps(batch))
+            batch.reset(seed=7)
+        for k in range(steps):
+            batch.step(np.tile(ACTIONS[k], (3, 1)))
+        other = pickle.loads(pickle.dumps(batch))
+        assert other.np_random_seed == batch.np_random_seed
+        for k in range(25):
+            one, two = batch.step(np.tile(ACTIONS[k], (3, 1))), other.step(np.tile(ACTIONS[k], (3, 1)))
+            assert repr(one) == repr(two)

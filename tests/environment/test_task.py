@@ -53,7 +53,7 @@ def test_dying_never_pays(step: int) -> None:
     ("model", "pull", "what"), [("I", 1.0, "detachment"), ("II", 1.0, "detachment"), ("II", -1.0, "freezing")]
 )
 def test_failure_is_terminated_never_truncated(model: str, pull: float, what: str) -> None:
-    env = CzEnv("nominal", model=model)
+    env = CzEnv("nominal", model=model, info="all")
     env.reset(seed=0)
     returns, k = 0.0, 0
     while True:
@@ -72,7 +72,7 @@ def test_failure_is_terminated_never_truncated(model: str, pull: float, what: st
 
 
 def test_reward_of_a_step_is_made_of_what_info_says() -> None:
-    env = CzEnv("randomized")
+    env = CzEnv("randomized", info="all")
     _, before = env.reset(seed=3)
     for action in ([0.1, 0.0], [-0.2, 0.3], [0.0, 0.3]):
         _, gained, _, _, info = env.step(np.array(action, np.float32))
@@ -87,7 +87,7 @@ def test_reward_of_a_step_is_made_of_what_info_says() -> None:
 
 def test_failure_inside_a_long_interval_is_latched() -> None:
     """Ten minutes at full pull detach the crystal; the state stays where it failed, finite and measured."""
-    env = CzEnv("nominal", control_interval=600.0, horizon=6000.0)
+    env = CzEnv("nominal", control_interval=600.0, horizon=6000.0, info="all")
     env.reset(seed=0)
     observation, gained, terminated, _, info = env.step(np.array([1.0, 0.0], np.float32))
     assert terminated
@@ -101,7 +101,7 @@ def test_failing_at_the_horizon_is_a_failure() -> None:
     """The same flight with the horizon at its end: terminated, not truncated, and no step left to pay for."""
 
     def fly(horizon: float) -> tuple[int, float, bool, bool]:
-        env, k = CzEnv("nominal", model="II", horizon=horizon), 0
+        env, k = CzEnv("nominal", model="II", horizon=horizon, info="all"), 0
         env.reset(seed=0)
         while True:
             _, gained, terminated, truncated, _ = env.step(np.array([1.0, 0.0], np.float32))

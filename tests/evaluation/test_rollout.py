@@ -37,7 +37,7 @@ class FullPull:
 
 def one_by_one(policy: Any, config: Config, seed: int) -> tuple[dict[str, np.ndarray], float, bool]:
     """Signals up to the end, return and failure of an episode in the scalar environment."""
-    env = CzEnv(config.scenario, config.model, config.observation, config.control_interval, config.horizon)
+    env = CzEnv(config.scenario, config.model, config.observation, config.control_interval, config.horizon, info="all")
     observation, _ = env.reset(seed=seed)
     rows: list[dict[str, Any]] = []
     state, total, over, terminated = None, 0.0, False, False
@@ -55,7 +55,7 @@ def test_a_rollout_looks_through_the_camera_of_its_settings() -> None:
     near = Camera(tilt=0.4)
     config = make_config("nominal", observation="camera", horizon=10.0, camera=near)
     course = Course(config, [3])
-    image, _ = CzEnv.from_config(config).reset(seed=3)
+    image, _ = CzEnv.from_config(config, info="all").reset(seed=3)
     np.testing.assert_array_equal(course.observation[0], image)
     assert course.env.config is config
 
@@ -128,7 +128,7 @@ class OpenLoopFullPull:
 
 def test_start_is_the_state_before_the_first_step() -> None:
     run = rollout(OpenLoop(), SHORT, [7])
-    _, info = CzEnv(SHORT.scenario, horizon=SHORT.horizon).reset(seed=7)
+    _, info = CzEnv(SHORT.scenario, horizon=SHORT.horizon, info="all").reset(seed=7)
     for name, value in zip(Signals._fields, run.start, strict=True):
         assert value.item() == info[name]
 

@@ -21,7 +21,7 @@ SEED, STEPS, EVERY = 12, 240, 120
 
 def trajectory(scenario: str, model: str, parameters: Parameters | None = None) -> list[list[float]]:
     """A row every 20 min: the signals in SI units, and the return so far."""
-    env = CzEnv(scenario, model, control_interval=10.0, horizon=2400.0, parameters=parameters)
+    env = CzEnv(scenario, model, control_interval=10.0, horizon=2400.0, parameters=parameters, info="all")
     _, info = env.reset(seed=SEED)
     rows, earned, begun = [], 0.0, info["h_c"]
     for k in range(STEPS):

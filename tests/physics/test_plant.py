@@ -164,7 +164,7 @@ def test_one_substep_is_exact_enough(height: float, bound: float) -> None:
 
 @pytest.mark.parametrize(("interval", "scenario"), [(5.0, "randomized"), (2.0, MELTING), (10.0, "hard")])
 def test_an_hour_of_driven_motion_agrees_with_scipy(interval: float, scenario: str | Scenario) -> None:
-    env = CzEnv(scenario, control_interval=interval, horizon=HOUR)
+    env = CzEnv(scenario, control_interval=interval, horizon=HOUR, info="all")
     env.reset(seed=5)
     saved = env.get_state().slot
     p, e, x = View(saved.slot["puller"]), View(saved.slot["episode"]), np.array(saved.slot["x"].tolist())

@@ -108,7 +108,7 @@ def test_hurle_is_within_its_known_error():
 
 def test_environment_runs_on_the_exact_meniscus():
     """Compiled and plain agree, and the operating point is a steady state."""
-    env = gym.make("Cz-v0", scenario="nominal", model="I", meniscus=YOUNG_LAPLACE)
+    env = gym.make("Cz-v0", scenario="nominal", model="I", meniscus=YOUNG_LAPLACE, info="all")
     p = make_puller(meniscus=YOUNG_LAPLACE)
     env.reset(seed=0)
     for _ in range(20):

@@ -76,7 +76,14 @@ def run_case(config: Config, steps: int, seed: int) -> Totals:
     horizon = min(config.horizon, max(1, 2 * calls // 3) * config.control_interval)
     config = replace(config, horizon=horizon)
     env = CzVectorEnv(
-        n, config.scenario, config.model, config.observation, config.control_interval, config.horizon, threads=1
+        n,
+        config.scenario,
+        config.model,
+        config.observation,
+        config.control_interval,
+        config.horizon,
+        threads=1,
+        info="all",
     )
     adversaries, watch = Adversaries(n, seed), Watch(env)
     observation, infos = env.reset(seed=seed)

@@ -62,7 +62,7 @@ def test_substeps_fill_each_interval_and_never_cross_the_grid(interval):
 def test_the_future_told_is_the_one_the_environment_brings(interval):
     config = make_config(HARD, observation="state", control_interval=interval, horizon=2.0 * HOUR)
     future = future_of(config, SEEDS)
-    env = CzVectorEnv(3, HARD, observation="state", control_interval=interval, horizon=2.0 * HOUR)
+    env = CzVectorEnv(3, HARD, observation="state", control_interval=interval, horizon=2.0 * HOUR, info="all")
     env.reset(seed=list(SEEDS))
     actions = np.random.default_rng(0).uniform(-0.05, 0.05, (200, 3, 2)).astype(np.float32).astype(np.float64)
     x = future.start

@@ -1,0 +1,98 @@
+"""Smooth actions: first-order lags of the drives, the same at every control interval and in the batch."""
+
+from __future__ import annotations
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from cz_gym import CzEnv, CzVectorEnv, make_puller
+from cz_gym.config import make_config
+
+P = make_puller()
+
+
+@pytest.mark.parametrize("interval", [2.0, 5.0, 10.0])
+def test_a_held_action_is_approached_with_one_time_constant(interval: float) -> None:
+    """v_p -> v_0 (1 + 0.5 a) and Q_H -> Q_H0 + 3 kW a, whatever the control interval."""
+    env = CzEnv("nominal", action="smooth", control_interval=interval, horizon=600.0, info="all")
+    env.reset(seed=0)
+    for k in range(round(100.0 / interval)):
+        *_, info = env.step(np.array([0.4, -0.5], np.float32))
+        reached = 1.0 - math.exp(-(k + 1) * interval / 50.0)
+        assert info["v_p"] / P.v_0 - 1.0 == pytest.approx(0.5 * 0.4 * reached, rel=1e-5)
+        assert info["Q_H"] - P.Q_H_0 == pytest.approx(3e3 * -0.5 * reached, rel=1e-5)
+    for _ in range(round(100.0 / interval)):
+        *_, info = env.step(np.zeros(2, np.float32))
+    assert info["v_p"] / P.v_0 - 1.0 == pytest.approx(0.2 * (math.exp(-2.0) - math.exp(-4.0)), rel=1e-5)
+
+
+def test_unit_noise_is_a_sane_exploration() -> None:
+    """Clipped standard normal actions keep the drives near nominal; moved from where they are, they would walk off."""
+    envs = CzVectorEnv(64, "randomized", action="smooth", info="all")
+    envs.reset(seed=0)
+    random = np.random.default_rng(0)
+    pull, lived = [], np.ones(64, np.bool_)
+    for _ in range(240):
+        actions = np.clip(random.normal(size=(64, 2)), -1.0, 1.0).astype(np.float32)
+        _, _, terminated, _, info = envs.step(actions)
+        lived &= ~terminated
+        pull.append(info["v_p"] / P.v_0 - 1.0)
+    assert 0.05 < np.std(pull[40:]) < 0.1
+    assert lived.mean() > 0.9
+
+
+def test_window_slew_and_heater_steps_hold_for_smooth_actions_too() -> None:
+    env = CzEnv("puller", action="smooth", horizon=1800.0, info="all")
+    env.reset(seed=1)
+    p = env.get_state().slot.slot["puller"]
+    before = float(p["v_0"])
+    for k in range(60):
+        *_, info = env.step(np.array([1.0 if k < 10 else 0.0, 1.0], np.float32))
+        assert abs(info["v_p"] - before) <= 0.3e-3 / 60.0 / 60.0 * 5.0 * (1 + 1e-9)
+        hundreds = (info["Q_H"] - float(p["Q_H_0"])) / 100.0
+        assert hundreds == pytest.approx(round(hundreds), abs=1e-6)
+        before = info["v_p"]
+    assert info["Q_H"] - float(p["Q_H_0"]) == pytest.approx(3e3, abs=100.0)
+
+
+@pytest.mark.parametrize("scenario", ["randomized", "puller"])
+def test_the_batch_equals_the_scalar_form(scenario: str) -> None:
+    batch = CzVectorEnv(2, scenario, observation="history", action="smooth", info="all")
+    alone = CzEnv(scenario, observation="history", action="smooth", info="all")
+    together, _ = batch.reset(seed=[3, 4])
+    observation, _ = alone.reset(seed=3)
+    random = np.random.default_rng(1)
+    for _ in range(50):
+        np.testing.assert_array_equal(together[0], observation)
+        actions = random.uniform(-1.2, 1.2, (2, 2)).astype(np.float32)
+        together, gained, *_ = batch.step(actions)
+        observation, reward, *_ = alone.step(actions[0])
+        assert gained[0] == reward
+
+
+def test_settings_and_states_tell_the_kind_of_action() -> None:
+    direct, smooth = make_config(), make_config(action="smooth")
+    assert direct.hash != smooth.hash
+    assert direct.plant_hash == smooth.plant_hash
+    env = CzEnv(action="smooth")
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="action smooth, not direct"):
+        CzEnv().set_state(env.get_state())
+    with pytest.raises(ValueError, match="unknown action 'rough'; choose one of direct, smooth"):
+        gym.make("Cz-v0", action="rough")
+
+
+def test_info_is_lean_unless_all_is_asked_for() -> None:
+    for env, keys in ((CzEnv(), {"r_c", "r_ref"}), (CzEnv(observation="history"), {"r_c", "r_ref", "state"})):
+        _, info = env.reset(seed=0)
+        assert set(info) == keys
+        *_, info = env.step(np.array([0.5, 0.5], np.float32))
+        assert set(info) == keys
+        *_, info = env.step(np.array([1.5, 0.5], np.float32))
+        assert set(info) == {*keys, "action_clipped"}
+        assert info["action_clipped"] is True
+    with pytest.raises(ValueError, match="info must be one of lean, all, not 'everything'"):
+        CzEnv(info="everything")
