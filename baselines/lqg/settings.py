@@ -141,6 +141,10 @@ def family_name(activity: float) -> str:
     return f"lqg-at-{activity:g}"
 
 
+FAMILY = ("lqg", "lqg-quiet", *map(family_name, ACTIVITIES))
+"""Names of all LQGs that run as contenders: the reference family of :mod:`cz_gym.evaluation.equal_activity`."""
+
+
 def settings_of(controller: str, scenario: str) -> LQGSettings:
     """The frozen settings of "lqg" or "lqg-quiet" for that scenario."""
     return SHIPPED.get((controller, scenario), SHIPPED[controller, "randomized"])

@@ -1,7 +1,7 @@
 """The LQG's settings on the crystals that a comparison is judged on: radius error is to be read at equal activity.
 
 A row that learns to move the pull less has a larger radius error, and one that moves it more a smaller; the LQG's
-frontier (:mod:`studies.frontier`) says what the same moves buy without learning.
+frontier (:mod:`cz_gym.evaluation.equal_activity`) says what the same moves buy without learning.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ from typing import Any, NamedTuple
 
 from cz_gym.agents.agent_file.contract import read_json
 from cz_gym.atomic_files import write_files
+from cz_gym.baselines.lqg.settings import FAMILY
 from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config
-from studies.frontier.__main__ import FAMILY, frontier
+from cz_gym.evaluation.equal_activity import frontier
 
 from . import runs as ablation_run
 from .runs import FARTHER, FIGURES, SCENARIO, Plan

@@ -1,0 +1,102 @@
+"""What error would the reference family have at this pull activity?
+
+A controller that moves the pull speed more can hold the radius better, so two radius errors are comparable only at
+equal activity. A *reference family* is one controller tuned for several activities; its members span a frontier of
+radius error against activity. Between the members, the logarithm of the radius error is a monotone cubic (Fritsch and
+Carlson's PCHIP) of the logarithm of the activity::
+
+    curve = frontier([(0.005, 0.14), (0.01, 0.10), (0.02, 0.07)])  # activity [mm/min], radius error [mm]
+    curve.at(0.015)                                                # radius error of the family there [mm]
+
+Activity is the RMS of the pull step (``pull_step_rms_mm_per_min`` among the metrics). Which controllers form the
+family is up to the caller; this module knows no controller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import PchipInterpolator
+
+from .statistics import LEVEL, Resamples
+
+Floats = npt.NDArray[np.float64]
+Point = tuple[float, float]
+"""Pull activity [mm/min] and radius error [mm]."""
+
+
+class Frontier(NamedTuple):
+    """Radius error against pull activity, from the quietest member to the most active one."""
+
+    activity: Floats
+    """Pull step RMS [mm/min], increasing, shape (members,)."""
+    rmse: Floats
+    """Radius error [mm], decreasing, shape (members,)."""
+
+    def at(self, activity: float) -> float:
+        """The family's radius error [mm] at that pull step RMS [mm/min].
+
+        Above the most active member it is that member's error, since nobody has to use all the activity allowed.
+        Raises ValueError below the quietest member, where the family gives no answer.
+        """
+        if not activity >= self.activity[0]:
+            raise ValueError(f"a pull step RMS of {activity} mm/min is below the frontier's {self.activity[0]:.4g}")
+        if activity >= self.activity[-1]:
+            return float(self.rmse[-1])
+        curve = PchipInterpolator(np.log(self.activity), np.log(self.rmse))
+        return float(np.exp(curve(np.log(activity))))
+
+
+def frontier(points: Sequence[Point]) -> Frontier:
+    """The frontier of these points; a point is left out if another has less activity and less error.
+
+    Raises ValueError for numbers that are not positive, and if fewer than two points are left.
+    """
+    kept: list[Point] = []
+    for activity, rmse in sorted(points):
+        if not (0.0 < activity < np.inf and 0.0 < rmse < np.inf):
+            raise ValueError(f"activity and radius error must be positive numbers, not {activity} and {rmse}")
+        if not kept or rmse < kept[-1][1]:
+            # Two activities whose logarithms are equal are one point of the curve: the better one.
+            if kept and not np.log(activity) > np.log(kept[-1][0]):
+                kept.pop()
+            kept.append((activity, rmse))
+    if len(kept) < 2:
+        raise ValueError(f"a frontier needs two settings of which neither beats the other, found {len(kept)}")
+    activities, errors = np.array(kept).T
+    return Frontier(activities, errors)
+
+
+def ratios(points: Mapping[str, Point], family: Sequence[str]) -> dict[str, float]:
+    """Each controller's radius error over the family's at the same activity [-]; below 1 it beats the family.
+
+    ``family`` names the members; names that ``points`` lacks are passed over. Controllers quieter than every member
+    are left out. Raises ValueError if too few members are there.
+    """
+    curve = frontier([points[name] for name in family if name in points])
+    return {
+        name: rmse / curve.at(activity) for name, (activity, rmse) in points.items() if activity >= curve.activity[0]
+    }
+
+
+def intervals(episodes: Mapping[str, Floats], family: Sequence[str], resamples: Resamples) -> dict[str, Point]:
+    """95 % bootstrap interval of each controller's ratio, over crystals and training seeds.
+
+    ``episodes`` has activity [mm/min] and radius error [mm] by controller, shape (training seeds, crystals, 2). Every
+    resample has a frontier of its own. Left out is who is quieter than every member in some resample.
+    """
+    means = {}
+    for of, (name, values) in enumerate(episodes.items()):
+        seeds = resamples.training_seeds(len(values), of)
+        means[name] = np.einsum("rs,rsm->rm", seeds, np.stack([resamples.episodes @ copy for copy in values], axis=1))
+    found = [
+        ratios({name: (float(each[draw, 0]), float(each[draw, 1])) for name, each in means.items()}, family)
+        for draw in range(len(resamples.episodes))
+    ]
+    in_all = [name for name in means if all(name in each for each in found)]
+    tail = (1.0 - LEVEL) / 2.0
+    limits = {name: np.quantile([each[name] for each in found], [tail, 1.0 - tail]) for name in in_all}
+    return {name: (float(low), float(high)) for name, (low, high) in limits.items()}
