@@ -70,13 +70,16 @@ class CzEnv(gym.Env[Observation, Action]):
     """Czochralski growth of a silicon ingot: hold the true radius, seeing only the camera's bright ring.
 
     ## Action Space
-    ``Box(-1, 1, (2,), float32)``: pull speed v_p = v_0 (1 + a_0), 0 to 2.4 mm/min, and heater power
-    Q_H = Q_H0 + 10 kW a_1. Out-of-range actions are clipped and ``info["action_clipped"]`` says so; NaN or a wrong
-    shape raises :class:`gymnasium.error.InvalidAction`.
+    ``Box(-1, 1, (2,), float32)``. With ``action="direct"``, the default, it sets the drives: pull speed
+    v_p = v_0 (1 + a_0), 0 to 2.4 mm/min, and heater power Q_H = Q_H0 + 10 kW a_1. With ``action="smooth"`` the drives
+    follow it as first-order lags of 50 s, towards v_0 (1 + 0.5 a_0) and Q_H0 + 3 kW a_1: noise on the action becomes
+    bounded, slow noise of the drives, which is how a learner should explore. Out-of-range actions are clipped and
+    ``info["action_clipped"]`` says so; NaN or a wrong shape raises :class:`gymnasium.error.InvalidAction`.
 
     ## Observation Space
     ``Box(-10, 10, (n,), float32)``; every channel with unit and scale in :mod:`cz_gym.observation`. "measured" (11) is
-    what a puller's control computer has, "history" (72) adds the integral of the error and past samples, "state"
+    what a puller's control computer has. "history" (72) tells the same relative to reference and recipe, with the
+    integral of the error and differences of past means: what a learner without memory of its own needs. "state"
     (17) is the true state and the disturbances, for bounds and asymmetric critics only. "camera" is the camera's image
     instead, ``Box(0, 255, (120, 160, 1), uint8)``; see :mod:`cz_gym.camera`.
 
@@ -94,7 +97,9 @@ class CzEnv(gym.Env[Observation, Action]):
 
     ## Arguments
     ``scenario`` (name or :class:`cz_gym.Scenario`), ``model`` ("I", "II", a mix in [0, 1], or None for the
-    scenario's draw), ``observation``, ``control_interval`` [s], ``horizon`` [s], ``render_mode``, ``parameters``
+    scenario's draw), ``observation``, ``action`` ("direct" or "smooth"), ``control_interval`` [s], ``horizon`` [s],
+    ``info`` ("lean": true radius and its reference; "all": every signal, see :data:`cz_gym.engine.layout.INFO_ROWS`;
+    with observation "history" also the true ``state``, for critics), ``render_mode``, ``parameters``
     (:class:`cz_gym.Parameters`), ``meniscus`` (:class:`cz_gym.MeniscusModel`), ``camera``
     (:class:`cz_gym.camera.Camera`, with observation "camera" only). Bad values raise ValueError.
     ``render_mode`` is None, "rgb_array" or "human", ``render_size`` the picture's width and height [px]; rendering

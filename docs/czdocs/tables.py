@@ -63,16 +63,23 @@ def channels(listed: Iterable[Channel]) -> list[str]:
 
 
 def remembered() -> list[str]:
-    """Where the past samples of "history" stand."""
+    """The channels of "history": the present ones, then where the spans of the past stand."""
     at = {channel.name: i for i, channel in enumerate(HISTORY)}
-    (integral,) = (c for c in HISTORY if c.name == "integral")
-    first = channels([integral])[2].replace("| 0 |", f"| {at['integral']} |", 1)
+    scale = {name: f"{HISTORY[at[f'{name}_{LAGS[0]:g}s']].scale:g}" for name in LAGGED} | {"v_p": "0.1 $v_0$"}
+    units_of = {channel.name: channel.unit for channel in MEASURED}
+    heads = ("ages of the samples", *(f"{code(name)} [{scale[name]} {units(units_of[name])}]" for name in LAGGED))
+    heads = tuple(head.replace(" m/s]", "]") for head in heads)
     ages = [0.0, *LAGS[:-1]]
     rows = (
         (f"{before:g} to {age:g} s", *(str(at[f"{name}_{age:g}s"]) for name in LAGGED))
         for before, age in zip(ages, LAGS, strict=True)
     )
-    return [*channels([])[:2], first, "", *markdown(("age of the samples", *map(code, LAGGED)), rows)]
+    return [
+        *channels(HISTORY[: at["integral"] + 1]),
+        "Index and scale of each span's difference:",
+        "",
+        *markdown(heads, rows),
+    ]
 
 
 def info() -> list[str]:
