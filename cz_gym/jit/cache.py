@@ -10,6 +10,7 @@ trusted as ``__pycache__`` is.
 from __future__ import annotations
 
 import hashlib
+import importlib
 import os
 import pickle
 import tempfile
@@ -23,17 +24,23 @@ import llvmlite
 import numba
 import numpy as np
 
-try:
-    from numba.core.caching import FunctionCache
-    from numba.core.serialize import dumps
-except ImportError:  # private to numba: one that moved them compiles in every process
-    FunctionCache = dumps = None
-
 PACKAGE = Path(__file__).parents[1]
 CACHE_VARIABLE = "CZ_GYM_CACHE_DIR"
 """Environment variable naming the folder for compiled code; empty means: keep none."""
 NEVER_COMPILED = ("agents", "baselines", "evaluation", "play", "testing")
 """Sub-packages of which nothing is compiled in; all others count, whatever they hold."""
+
+
+def private(module: str, name: str) -> Any:
+    """A private part of numba, or None where this numba has none of that name."""
+    try:
+        return getattr(importlib.import_module(f"numba.{module}"), name)
+    except (ImportError, AttributeError):
+        return None
+
+
+FunctionCache: Any = private("core.caching", "FunctionCache") or object
+dumps: Any = private("core.serialize", "dumps")
 DIGEST = hashlib.sha256().digest_size
 
 
@@ -107,7 +114,7 @@ class Store:
 
     def save(self, key: Any, data: Any) -> None:
         """Keep it, if there is room: a full disk costs time, not the run."""
-        content: bytes = dumps((key, data))  # type: ignore[no-untyped-call]
+        content: bytes = dumps((key, data))
         temporary = None
         try:
             handle, temporary = tempfile.mkstemp(dir=self.folder, prefix=".code-")
@@ -120,17 +127,17 @@ class Store:
                     os.unlink(temporary)
 
 
-class CachedCode(FunctionCache or object):  # type: ignore[misc]
+class CachedCode(FunctionCache):  # type: ignore[misc]
     """numba's cache of one function, on a :class:`Store`."""
 
     def __init__(self, function: Any) -> None:
-        super().__init__(function)  # type: ignore[no-untyped-call]
+        super().__init__(function)
         files: Any = Store(Path(self._cache_path), self._impl.filename_base)
         self._cache_file = files
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Compiled code for this signature, or None: whatever cannot be put together again is compiled again."""
         try:
-            return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+            return super().load_overload(sig, target_context)
         except Exception:
             return None

@@ -16,14 +16,11 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic, overload, register_jitable
 
-from .cache import CachedCode, cache_folder
+from .cache import CachedCode, cache_folder, private
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-try:
-    from numba.core.options import DefaultOptions as default_options
-except ImportError:  # private to numba: without it loops run slower
-    default_options = None
+default_options = private("core.options", "DefaultOptions")
 _NO_COUNTS = "_nrt"
 
 
