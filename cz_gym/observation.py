@@ -18,7 +18,7 @@ from .units import KILO, MINUTE, MM
 CLIP = 10.0
 """Largest observed value after scaling [-]."""
 PREVIEWS = (0.0, 1.0 * MINUTE, 5.0 * MINUTE)
-"""Times ahead at which the recipe is shown [s]."""
+"""Times ahead for which reference and recipe are observed [s]."""
 PULL_SCALE = Parameters().v_0
 """The default puller's v_0 [m/s]; another puller's channels are scaled with its own."""
 HEATER_SCALE = 10.0 * KILO
@@ -64,11 +64,11 @@ _RELATIVE = {
     "T_1_ref_5min": ("T_1_ref", 1.0, "change of the recipe within 5 minutes"),
     "T_1": ("T_1_ref", 2.0, "pyrometer reading minus recipe"),
 }
-"""Channels of "history" that are told relative to another one: which, scale, meaning."""
+"""Channels of "history" that are relative to another one: to which, scale, meaning."""
 
 
 def _present() -> tuple[Channel, ...]:
-    """The "measured" channels as "history" tells them."""
+    """The "measured" channels as "history" holds them."""
     return tuple(
         channel._replace(scale=_RELATIVE[channel.name][1], meaning=_RELATIVE[channel.name][2])
         if channel.name in _RELATIVE
@@ -98,8 +98,8 @@ HISTORY = (
     Channel("integral", "m s", INTEGRAL_SCALE, "integral of ring_error since the start, held within +-10"),
     *_spans(),
 )
-"""Channels of ``observation="history"``: neighbouring means differ by micrometres under millimetres, so what is told of
-the past are their differences, each on a scale of its own."""
+"""Channels of ``observation="history"``. Means over neighbouring spans of the past differ by micrometres, the readings
+themselves by millimetres: so the past is observed as differences of means, on scales of their own."""
 
 STATE = (
     Channel("r_c_error", "m", MM, "true radius minus r_ref"),
@@ -161,14 +161,16 @@ def decode(observation: npt.ArrayLike, v_0: float = PULL_SCALE) -> Measured:
         )
     relative = array.shape[-1] == len(HISTORY)
     head = array[..., : len(MEASURED)] * scales(HISTORY[: len(MEASURED)] if relative else MEASURED, v_0)
-    told = Measured(*np.moveaxis(head, -1, 0))
+    values = Measured(*np.moveaxis(head, -1, 0))
     if not relative:
-        return told
-    return told._replace(**{name: getattr(told, name) + getattr(told, to) for name, (to, *_) in _RELATIVE.items()})
+        return values
+    return values._replace(
+        **{name: getattr(values, name) + getattr(values, to) for name, (to, *_) in _RELATIVE.items()}
+    )
 
 
 class Relative(NamedTuple):
-    """The channels that "history" tells relative to another one; arrays of shape (channels,)."""
+    """The channels that "history" holds relative to another one; arrays of shape (channels,)."""
 
     channel: npt.NDArray[np.int64]
     """Its place."""
@@ -179,7 +181,7 @@ class Relative(NamedTuple):
 
 
 def relative() -> Relative:
-    """What :data:`HISTORY` tells relative to another channel."""
+    """The relative channels of :data:`HISTORY`."""
     place = {channel.name: at for at, channel in enumerate(MEASURED)}
     rows = [(place[name], place[to], MEASURED[place[name]].scale / scale) for name, (to, scale, _) in _RELATIVE.items()]
     channel, to, scale = zip(*rows, strict=True)

@@ -21,7 +21,7 @@ from gymnasium.utils import seeding
 from cz_gym.camera.image import build_look, new_scratch
 from cz_gym.camera.view import IMAGE, make_view
 from cz_gym.config import Config, Identity
-from cz_gym.episodes.record import GRID, Episode, law_of
+from cz_gym.episodes.record import GRID, Episode, record_of
 from cz_gym.episodes.scenario import MAX_LATENCY, Scenario
 from cz_gym.episodes.series import series_of
 from cz_gym.jit.compile import entry
@@ -31,7 +31,7 @@ from cz_gym.physics.parameters import Parameters
 from cz_gym.physics.plant import NO_OPERATING_POINT
 from cz_gym.task import drives_of
 
-from .buffers import Lender
+from .buffers import BufferPool
 from .kernels import KERNELS, Kernels, build_kernels
 from .layout import INFO, SLOT, Clock, Memory, Out, Reading, info_width
 
@@ -94,7 +94,7 @@ class SlotState:
 class Batch:
     """``num_envs`` slots of one configuration.
 
-    Nothing that :meth:`new_out` gave out is written again by a later one while anybody can look at it.
+    The arrays of :meth:`new_out` are never written again while anything refers to them.
     """
 
     def __init__(self, config: Config, num_envs: int, threads: int | None = None) -> None:
@@ -132,18 +132,30 @@ class Batch:
             np.zeros((num_envs, frames, 3)),
         )
         self.memory.slots["over"] = 1
-        self._law = law_of(config.scenario)
+        self._record = record_of(config.scenario)
         self._mix = np.array(config.mix, np.float64)
         self._parameters = Parameters(*map(float, config.parameters))
         self.actions = np.zeros((num_envs, 2))
         self._all = np.ones(num_envs, np.bool_)
-        self._observations = Lender((num_envs, self.channels), np.float32)
-        self._states = Lender((num_envs, self.state_channels), np.float32)
-        self._images = Lender((num_envs, *IMAGE) if self._camera else (num_envs, 0, 0, 0), np.uint8)
-        self._infos = Lender((len(INFO), info_width(num_envs)), np.float64)
+        self._observations = BufferPool((num_envs, self.channels), np.float32)
+        self._states = BufferPool((num_envs, self.state_channels), np.float32)
+        self._images = BufferPool((num_envs, *IMAGE) if self._camera else (num_envs, 0, 0, 0), np.uint8)
+        self._infos = BufferPool((len(INFO), info_width(num_envs)), np.float64)
         out, which, keys = self.new_out(), np.zeros(1, np.int64), np.zeros((1, 2), np.uint64)
         stepped = (self.memory, self.actions, self._all, self.clock, self.drives, self.reading, out, 0, 1)
-        drawn = (self.memory, which, keys, self._law, self._mix, self._parameters, self.clock, self.reading, out, 0, 1)
+        drawn = (
+            self.memory,
+            which,
+            keys,
+            self._record,
+            self._mix,
+            self._parameters,
+            self.clock,
+            self.reading,
+            out,
+            0,
+            1,
+        )
         self._step, self._draw = entry(self.kernels.step, stepped), entry(self.kernels.draw, drawn)
         threads = threads or os.cpu_count() or 1
         self._parts = max(1, min(threads, num_envs // (1 if self._camera else SLOTS_PER_THREAD)))
@@ -155,7 +167,7 @@ class Batch:
         self._owner = os.getpid()
 
     def new_out(self) -> Out:
-        """Arrays to write into, on memory that nobody looks at."""
+        """Arrays to write into, on memory that nothing else refers to."""
         n = self.num_envs
         return Out(
             self._observations.new(),
@@ -198,13 +210,13 @@ class Batch:
 
         A puller without a finite operating point is drawn again; ValueError if none is found.
         """
-        law, mix = self._law, self._mix
+        record, mix = self._record, self._mix
         if scenario is not None:
-            law, mix = law_of(scenario), np.array(self.config.with_scenario(scenario).mix, np.float64)
+            record, mix = record_of(scenario), np.array(self.config.with_scenario(scenario).mix, np.float64)
         slots = np.array(which, np.int64)
         words = np.array(list(keys), np.uint64).reshape(-1, 2)
         arguments = (
-            self.memory, slots, words, law, mix, self._parameters, self.clock, self.reading, out,
+            self.memory, slots, words, record, mix, self._parameters, self.clock, self.reading, out,
         )  # fmt: skip
         if max(self._run(self._draw, arguments, len(slots), DRAWS_PER_THREAD, DRAWS_AT_ONCE)) >= 0:
             raise ValueError(NO_OPERATING_POINT)

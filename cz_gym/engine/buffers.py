@@ -1,4 +1,4 @@
-"""Memory for the arrays that a step gives out, used again once nobody can look at it any more.
+"""A pool of memory for the arrays that a step returns: a block is reused once nothing refers to it.
 
 Large new arrays come as untouched pages, and writing those for the first time costs a good part of a step.
 """
@@ -14,26 +14,26 @@ import numpy as np
 import numpy.typing as npt
 
 SPARES = 3
-"""Most blocks of memory kept for further use."""
+"""Most free blocks that a pool holds."""
 _ALIGNED = 64
 _LARGE = 1 << 14
 """Arrays below this size [B] are made anew: the allocator keeps such memory itself."""
 Block = npt.NDArray[np.uint8]
 
 
-class _Loan(weakref.ref[Any]):
-    """Tells when nobody looks at a block any more; keeps the block until then."""
+class _Use(weakref.ref[Any]):
+    """A weak reference to what a block is seen through: its callback returns the block to the pool."""
 
     __slots__ = ("block",)
     block: Block
 
 
-class Lender:
-    """Gives out arrays of one shape and type, each an object of its own, never written again by a later one while used.
+class BufferPool:
+    """Arrays of one shape and type, on blocks of memory that are reused when no reference to them is left.
 
-    An array stands on a block lent for it alone. Everything that looks at the block (the array, its views, memory
-    views, tensors and pointers made from them, in any thread) keeps that loan alive, as it would keep an array's own
-    memory. Only the end of the loan, when nothing is left that could look, gives the block back.
+    An array's base is a buffer made for it alone. The array, its views, memory views, tensors and pointers made from
+    them, in any thread, all hold a reference to that buffer, as they would to an array's own memory. When the last
+    one is gone, the block returns to the pool.
     """
 
     def __init__(self, shape: tuple[int, ...], dtype: npt.DTypeLike) -> None:
@@ -41,7 +41,7 @@ class Lender:
         size = math.prod(shape) * self._dtype.itemsize
         self._type = ctypes.c_byte * size if size >= _LARGE else None
         self._free: list[Block] = []
-        self._loans: dict[int, _Loan] = {}
+        self._in_use: dict[int, _Use] = {}
 
     def new(self) -> npt.NDArray[Any]:
         """An array of any content."""
@@ -51,16 +51,16 @@ class Lender:
             block = self._free.pop()
         except IndexError:
             block = _block(ctypes.sizeof(self._type))
-        lent: Any = self._type.from_buffer(cast(Any, block))
-        loan = _Loan(lent, self._give_back)
-        loan.block = block
-        self._loans[id(loan)] = loan
-        return np.ndarray(self._shape, self._dtype, lent)
+        view: Any = self._type.from_buffer(cast(Any, block))
+        use = _Use(view, self._return)
+        use.block = block
+        self._in_use[id(use)] = use
+        return np.ndarray(self._shape, self._dtype, view)
 
-    def _give_back(self, loan: _Loan) -> None:
-        del self._loans[id(loan)]
+    def _return(self, use: _Use) -> None:
+        del self._in_use[id(use)]
         if len(self._free) < SPARES:
-            self._free.append(loan.block)
+            self._free.append(use.block)
 
 
 def _block(size: int) -> Block:

@@ -39,7 +39,7 @@ TRIES = 100
 _EPS = 1e-9
 _CLIPPED = INFO.index("action_clipped")
 _LOW = 5.0 * MM
-"""A meniscus from which no melt freezes the crystal within half a substep need not be asked [m]."""
+"""Above this height no melt can freeze the meniscus within half a substep [m]."""
 _JUMP = HEIGHT_MIN
 _LINE = 8
 """Numbers of eight bytes in a line of the cache."""
@@ -138,7 +138,7 @@ def _advance(slot: Any, frames: Any, clock: Any, slope: Any, ring_offset: Any) -
 
 @inlined
 def _sample(memory: Any, i: Any, fresh: Any, clock: Any, reading: Any, out: Any, slope: Any, ring_offset: Any) -> Any:
-    """Read slot i, unless its last reading is to be shown again, and write what it says; returns the step's cost."""
+    """Read slot i, or repeat its last reading, and write observation and info; returns the step's cost."""
     slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
     t, h_c = slot.k * clock.interval, _height_inside(x.h_c, p)
     ring = x.r_c + ring_offset(x.r_c, h_c, p)
@@ -196,7 +196,7 @@ class Kernels(NamedTuple):
     """``step(memory, actions, active, clock, drives, reading, out, start, stop)``: one control interval of the active
     slots; returns how many episodes ended."""
     draw: Any
-    """``draw(memory, which, keys, law, mix, parameters, clock, reading, out, start, stop)``: new episodes, each
+    """``draw(memory, which, keys, record, mix, parameters, clock, reading, out, start, stop)``: new episodes, each
     from its key, for the slots ``which[start:stop]``, with their first sample; returns a slot for which no puller with
     an operating point was found in :data:`TRIES` draws, or -1."""
     show: Any
@@ -210,7 +210,7 @@ class Kernels(NamedTuple):
 
 
 def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
-    """Compile the loops for a meniscus model; those of this package's models are kept on disk."""
+    """Compile the loops for a meniscus model; those of this package's models are cached on disk."""
     slope, ring_offset, height = meniscus.slope, meniscus.ring_offset, meniscus.height
 
     def step(
@@ -235,7 +235,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
         return ended
 
     def draw(
-        memory: Any, which: Any, keys: Any, law: Any, mix: Any, parameters: Any, clock: Any, reading: Any, out: Any,
+        memory: Any, which: Any, keys: Any, record: Any, mix: Any, parameters: Any, clock: Any, reading: Any, out: Any,
         start: int, stop: int,
     ) -> int:  # fmt: skip
         impossible = -1
@@ -246,14 +246,14 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
             seed_streams(slot.streams, slot.key)
             tries, sound = 0, False
             while not sound and tries < TRIES:
-                factors = draw_factors(law[0], mix, slot.streams)
+                factors = draw_factors(record[0], mix, slot.streams)
                 puller = derive_puller(randomised(parameters, factors), factors.lam, height, ring_offset)
                 tries, sound = tries + 1, True
                 for number in range(len(puller)):
                     numbers[PULLER_AT + number] = puller[number]
                     sound = sound and np.isfinite(puller[number])
             impossible = impossible if sound else i
-            episode = draw_episode(law[0], slot.streams, slot.freezes)
+            episode = draw_episode(record[0], slot.streams, slot.freezes)
             for number in range(len(episode)):
                 numbers[EPISODE_AT + number] = episode[number]
             _begin(slot)

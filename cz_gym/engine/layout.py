@@ -1,4 +1,4 @@
-"""What a slot holds, what a step reads and where it writes: the arrays of the compiled loop."""
+"""The arrays of the compiled loop: what a slot holds, what a step reads and where it writes."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ class Reading(NamedTuple):
     span: Any
     """From the scale of a remembered channel to that of its differences, shape (remembered channels,)."""
     relative: Any
-    """Places of the channels that "history" tells relative to another one, of the others, and the change of scale:
+    """Places of the channels that "history" holds relative to another one, of those others, and the change of scale:
     three arrays of shape (channels,)."""
 
 

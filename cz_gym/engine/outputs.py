@@ -86,8 +86,8 @@ def recall(slot: Any, measured: Any, history: Any, reading: Any, out: Any) -> No
             later = mean
     place, to, change = reading.relative
     for row in range(place.size):
-        told = measured[place[row]] - measured[to[row]]
-        out[place[row]] = clip(told * (reading.measured[place[row]] * change[row]), CLIP)
+        difference = measured[place[row]] - measured[to[row]]
+        out[place[row]] = clip(difference * (reading.measured[place[row]] * change[row]), CLIP)
 
 
 @physics

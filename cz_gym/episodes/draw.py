@@ -56,9 +56,9 @@ def _uniforms(s: Any, count: Any) -> Any:
 
 
 @physics
-def draw_factors(law: Any, mix: Any, streams: Any) -> Any:
+def draw_factors(record: Any, mix: Any, streams: Any) -> Any:
     """Draw the puller: its mix of models and the factors on its parameters."""
-    u, spread = _uniforms(streams[_PARAMETERS], _FACTORS), law.pullers
+    u, spread = _uniforms(streams[_PARAMETERS], _FACTORS), record.pullers
     return Factors(
         between(mix, u[0]),
         _factor(spread.capillary, u[1]),
@@ -81,9 +81,15 @@ def randomised(q: Any, f: Any) -> Any:
 
 
 @physics
-def draw_episode(law: Any, streams: Any, freezes: Any) -> Any:
+def draw_episode(record: Any, streams: Any, freezes: Any) -> Any:
     """Draw ramps and constants; freezes [s], shape (FREEZES, 2), are written."""
-    recipe, drift, reference, sensor, drives = law.recipe, law.drift, law.reference, law.sensor, law.actuators
+    recipe, drift, reference, sensor, drives = (
+        record.recipe,
+        record.drift,
+        record.reference,
+        record.sensor,
+        record.actuators,
+    )
     plan, at, read = (
         _uniforms(streams[_SCHEDULE], 10),
         _uniforms(streams[_INTERFACE], _INTERFACE_NUMBERS),
@@ -91,17 +97,17 @@ def draw_episode(law: Any, streams: Any, freezes: Any) -> Any:
     )
     recipe_length = between(recipe.duration, plan[1])
     moved = 1.0 if plan[6] < reference.probability else 0.0
-    sd_fast, sd_slow = between(law.interface.sd, at[0]), between(law.interface.sd, at[1])
-    keep_fast, keep_slow = np.exp(-GRID / law.interface.tau_fast), np.exp(-GRID / law.interface.tau_slow)
-    fault = _draw_faults(law.faults, streams[_FAULTS], freezes)
+    sd_fast, sd_slow = between(record.interface.sd, at[0]), between(record.interface.sd, at[1])
+    keep_fast, keep_slow = np.exp(-GRID / record.interface.tau_fast), np.exp(-GRID / record.interface.tau_slow)
+    fault = _draw_faults(record.faults, streams[_FAULTS], freezes)
     return Episode(
-        law.pullers.start_radius_sd * normal(streams[_START]),
+        record.pullers.start_radius_sd * normal(streams[_START]),
         between(recipe.start, plan[2]), max(recipe_length, SHORTEST), between(recipe.rate, plan[0]) * recipe_length,
         between(drift.start, plan[5]), max(between(drift.duration, plan[4]), SHORTEST),
         between(drift.amount, plan[3]), drift.rate,
         between(reference.start, plan[9]), max(between(reference.duration, plan[8]), SHORTEST),
         between(reference.amount, plan[7]) * moved,
-        law.pullers.melt_loss, between(sensor.bias_offset, read[2]) + between(sensor.level_offset, read[3]),
+        record.pullers.melt_loss, between(sensor.bias_offset, read[2]) + between(sensor.level_offset, read[3]),
         fault[0], fault[1], fault[2],
         between(sensor.ripple, read[4]), 2.0 * math.pi * between(sensor.rotation, read[5]), 2.0 * math.pi * read[6],
         between(sensor.pyrometer_drift, read[7]), sensor.latency,

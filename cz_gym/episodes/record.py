@@ -1,4 +1,4 @@
-"""What an episode is drawn from, and what a draw is: a scenario as one flat record, ramps and constants as tuples."""
+"""A scenario as one flat record that compiled draws read, and an episode's draw: its ramps and constants."""
 
 from __future__ import annotations
 
@@ -130,16 +130,16 @@ def _record(members: dict[str, Any]) -> np.dtype[Any]:
     return np.dtype([(name, np.float64, (2,) if isinstance(value, tuple) else ()) for name, value in members.items()])
 
 
-LAW = np.dtype([(family, _record(members)) for family, members in _members(Scenario("plain"))])
+RECORD = np.dtype([(family, _record(members)) for family, members in _members(Scenario("plain"))])
 """A scenario as the compiled draws read it: a record of families, each a number or a pair a member."""
 
 
 @lru_cache(maxsize=64)
-def law_of(scenario: Scenario) -> npt.NDArray[Any]:
-    """The scenario's numbers, a read-only array of one :data:`LAW`."""
-    law = np.zeros(1, LAW)
+def record_of(scenario: Scenario) -> npt.NDArray[Any]:
+    """The scenario's numbers, a read-only array of one :data:`RECORD`."""
+    record = np.zeros(1, RECORD)
     for family, members in _members(scenario):
         for member, value in members.items():
-            law[family][member] = value
-    law.setflags(write=False)
-    return law
+            record[family][member] = value
+    record.setflags(write=False)
+    return record

@@ -17,7 +17,7 @@ from cz_gym.jit.compile import kernel
 from . import draw as draws
 from .draw import STREAMS, randomised, seed_streams, skip_constants
 from .noise import draw_series
-from .record import FREEZES, GRID, Episode, Factors, Stream, law_of
+from .record import FREEZES, GRID, Episode, Factors, Stream, record_of
 from .rng import WORDS
 from .scenario import Range, Scenario
 
@@ -51,12 +51,12 @@ def stream(key: tuple[int, int], number: Stream) -> np.random.Generator:
 
 def draw_factors(scenario: Scenario, mix: Range, key: tuple[int, int]) -> Factors:
     """Draw the puller; ``mix`` is the range of the share of conduction [-]."""
-    return Factors(*_factors(law_of(scenario), np.array(mix, np.float64), _words(key), _streams()))
+    return Factors(*_factors(record_of(scenario), np.array(mix, np.float64), _words(key), _streams()))
 
 
 def draw_episode(scenario: Scenario, key: tuple[int, int], out: Series) -> Episode:
     """Draw an episode: ramps and constants are returned, series written into ``out``."""
-    return Episode(*_episode(law_of(scenario), _words(key), _streams(), out.interface, out.noise, out.freezes))
+    return Episode(*_episode(record_of(scenario), _words(key), _streams(), out.interface, out.noise, out.freezes))
 
 
 def series_of(episode: Episode, key: tuple[int, int], grid_points: int, samples: int) -> tuple[Floats, Floats]:
@@ -75,15 +75,15 @@ def _streams() -> npt.NDArray[np.uint64]:
 
 
 @kernel
-def _factors(law: Any, mix: Any, key: Any, streams: Any) -> Any:
+def _factors(record: Any, mix: Any, key: Any, streams: Any) -> Any:
     seed_streams(streams, key)
-    return draws.draw_factors(law[0], mix, streams)
+    return draws.draw_factors(record[0], mix, streams)
 
 
 @kernel
-def _episode(law: Any, key: Any, streams: Any, interface: Any, noise: Any, freezes: Any) -> Any:
+def _episode(record: Any, key: Any, streams: Any, interface: Any, noise: Any, freezes: Any) -> Any:
     seed_streams(streams, key)
-    e = draws.draw_episode(law[0], streams, freezes)
+    e = draws.draw_episode(record[0], streams, freezes)
     draw_series(e, streams, interface, noise)
     return e
 

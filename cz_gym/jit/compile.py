@@ -1,4 +1,4 @@
-"""How the equations are compiled, and where the compiled code is kept.
+"""How the equations are compiled.
 
 Physics stands once, in plain functions marked :data:`physics`: called from Python they take floats, arrays or
 complex numbers; called from a :func:`kernel` they compile into its loop. numba's disk cache looks only at

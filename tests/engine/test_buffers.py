@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from cz_gym import CzVectorEnv
-from cz_gym.engine.buffers import SPARES, Lender
+from cz_gym.engine.buffers import SPARES, BufferPool
 
 SHAPE = 64, 64
 
@@ -45,39 +45,39 @@ WAYS: dict[str, tuple[Callable[[np.ndarray], Any], Callable[[Any], Any]]] = {
 @pytest.mark.parametrize("way", WAYS)
 def test_whoever_looks_keeps_the_memory(way: str) -> None:
     look, read = WAYS[way]
-    lender = Lender(SHAPE, np.float64)
-    array = lender.new()
+    pool = BufferPool(SHAPE, np.float64)
+    array = pool.new()
     array[...] = 7.0
     address = array.ctypes.data
     held = look(array)
     del array
     gc.collect()
-    later = [lender.new() for _ in range(2 * SPARES)]
+    later = [pool.new() for _ in range(2 * SPARES)]
     for other in later:
         other[...] = -1.0
     assert address not in {other.ctypes.data for other in later}
     assert read(held) in (7.0, None)
     del held
     gc.collect()
-    assert lender.new().ctypes.data == address, "let go, the memory is used again"
+    assert pool.new().ctypes.data == address, "let go, the memory is used again"
 
 
 def test_a_weak_reference_dies_with_its_array() -> None:
     """A later array on the same memory is another object: a weak reference never shows it."""
-    lender = Lender(SHAPE, np.float64)
-    array = lender.new()
+    pool = BufferPool(SHAPE, np.float64)
+    array = pool.new()
     address, weak = array.ctypes.data, weakref.ref(array)
     del array
-    assert (lender.new().ctypes.data, weak()) == (address, None)
+    assert (pool.new().ctypes.data, weak()) == (address, None)
 
 
 def test_threads_that_hold_and_let_go_never_see_another_value() -> None:
-    lender, wrong = Lender((2048,), np.float64), []
+    pool, wrong = BufferPool((2048,), np.float64), []
 
     def work(number: int) -> None:
         held: list[np.ndarray] = []
         for turn in range(300):
-            array = lender.new()
+            array = pool.new()
             array[...] = number * 1000 + turn
             held = [*held, array[5:]][-3:]
             if any(np.ptp(one) != 0.0 or one[0] // 1000 != number for one in held):
@@ -92,15 +92,15 @@ def test_threads_that_hold_and_let_go_never_see_another_value() -> None:
 
 
 def test_few_blocks_are_kept() -> None:
-    lender = Lender(SHAPE, np.float64)
-    many = [lender.new() for _ in range(20)]
+    pool = BufferPool(SHAPE, np.float64)
+    many = [pool.new() for _ in range(20)]
     del many
-    assert len(lender._free) == SPARES
+    assert len(pool._free) == SPARES
 
 
 def test_a_lent_array_is_like_any_other() -> None:
     for shape in (SHAPE, (3, 2), (0, 4)):
-        array = Lender(shape, np.float32).new()
+        array = BufferPool(shape, np.float32).new()
         assert (array.shape, array.dtype, array.flags.c_contiguous, array.flags.writeable, array.flags.aligned) == (
             shape, np.float32, True, True, True,
         )  # fmt: skip
