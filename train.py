@@ -56,7 +56,7 @@ def train(arguments: argparse.Namespace) -> int:
     from cz_gym.agents.training import recipes as settings
     from cz_gym.agents.training.run import Run
     from cz_gym.agents.training.run_files import saved_steps
-    from cz_gym.atomic_files import alone, check_writable
+    from cz_gym.atomic_files import check_writable, locked
     from cz_gym.baselines.registry import make_controller
     from cz_gym.episodes.scenarios import find_scenario
 
@@ -69,7 +69,7 @@ def train(arguments: argparse.Namespace) -> int:
     steps = arguments.steps or (saved_steps(folder) if arguments.resume else choice.steps)
     choice = replace(choice, steps=steps)
     check_writable(folder)
-    with alone(folder):
+    with locked(folder):
         run = Run(folder, choice, arguments.seed, make_controller, arguments.resume, arguments.checkpoint_seconds)
         print(f"{arguments.algo}, seed {arguments.seed}, {choice.steps:,} steps on {scenario!r}, into {folder}")
         with tqdm(total=choice.steps, unit="step", unit_scale=True, dynamic_ncols=True, mininterval=1.0) as bar:

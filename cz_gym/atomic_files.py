@@ -1,76 +1,70 @@
-"""Writing files whole or not at all, also when the writer is killed.
+"""Files that are replaced together or not at all, also when the writer is killed, and folders that one process uses.
 
-The files of one call are first written into a hidden folder beside their places, ``.writing-...``. Renaming it to
-``.written-...`` is the one moment at which the new contents count; then each file moves to its place. Whoever
-next writes into a folder finishes the moves of a writer that was killed after that moment, and clears up after one that
-was killed before it. A lock on the hidden folder, which dies with its writer, tells the living from the dead.
+:func:`write_files` first writes into a hidden folder beside the files' places, ``.writing``. Renaming that folder to
+``.written`` is the one moment at which the new contents count; then each file moves to its place. If the writer is
+killed before that moment, the next writer removes what is there; if it is killed after it, the next writer finishes
+the moves. A lock file, which the system unlocks when its process ends, lets one process at a time write into a folder.
 """
 
 from __future__ import annotations
 
-import fcntl
+import errno
+import importlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+import time
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-BEGUN, COMPLETE = ".writing-", ".written-"
-"""What the names of hidden folders begin with."""
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+BEGUN, COMPLETE = ".writing", ".written"
+"""Hidden folders of new files, before and after the moment at which they count."""
+WRITER, USER = ".writer.lock", ".user.lock"
+"""Lock files: of the process that writes into a folder, and of the one that works in it."""
+PATIENCE = 60.0
+"""Longest wait for another process to finish writing [s]."""
 
 
 def write_files(files: Mapping[Path, bytes]) -> None:
     """Write all files or none; those of one folder are replaced together. Raises OSError naming the file."""
-    folders: dict[Path, dict[str, bytes]] = {}
+    folders: dict[Path, dict[Path, bytes]] = {}
     for path, content in files.items():
         if path.is_dir():
             raise IsADirectoryError(f"{path} is a folder")
-        folders.setdefault(path.parent, {})[path.name] = content
-    stages: list[_Stage] = []
-    try:
-        for folder, contents in folders.items():
+        folders.setdefault(path.parent.resolve(), {})[path] = content
+    with ExitStack() as locks:
+        for folder in sorted(folders):  # always in the same order, so that two writers cannot wait for each other
             folder.mkdir(parents=True, exist_ok=True)
-            finish_writing(folder)
-            stages.append(_Stage(folder))
-            stages[-1].fill(contents)
-        for stage in stages:
-            stage.complete()
-        for stage in stages:
-            stage.place()
-    except KeyboardInterrupt:
-        for stage in stages:
-            stage.abandon(unless_complete=True)
-        raise
-    except BaseException:
-        for stage in stages:
-            stage.abandon()
-        raise
-    finally:
-        for stage in stages:
-            stage.unlock()
+            locks.enter_context(_writer(folder, folders[folder]))
+            _write(folder / BEGUN, folders[folder])
+        for folder in folders:
+            with _naming(folder):
+                os.rename(folder / BEGUN, folder / COMPLETE)
+        for folder in folders:
+            _place(folder)
 
 
 def finish_writing(folder: Path) -> None:
-    """Finish what killed writers had completed in a folder, and remove what they had not. Raises OSError."""
-    with os.scandir(folder) as entries:
-        names = [entry.name for entry in entries if entry.name.startswith((BEGUN, COMPLETE))]
-    for name in names:
-        path = folder / name
-        with suppress(FileNotFoundError), _locked(path) as mine:
-            if mine and name.startswith(COMPLETE):
-                _place(path)
-            elif mine:
-                shutil.rmtree(path, ignore_errors=True)
+    """Finish what a killed writer had completed in a folder, and remove what it had not. Raises OSError."""
+    with _writer(folder, ()):
+        pass
 
 
 @contextmanager
-def alone(folder: Path) -> Iterator[None]:
-    """Hold a folder, made if need be, for one process; ValueError if another holds it. Its death lets go of it."""
+def locked(folder: Path) -> Iterator[None]:
+    """Reserve a folder, made if need be, for this process until it ends; ValueError if another process has it."""
     folder.mkdir(parents=True, exist_ok=True)
-    with _locked(folder) as mine:
-        if mine is False:
-            raise ValueError(f"{folder}: another process is at work in this folder")
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(_lock(folder / USER, 0.0))
+        except TimeoutError:
+            raise ValueError(f"{folder}: another process is at work in this folder") from None
         yield
 
 
@@ -88,83 +82,89 @@ def check_writable(path: Path) -> None:
         raise OSError(f"{path}: cannot be written ({error.strerror})") from None
 
 
-class _Stage:
-    """The hidden folder of one writer beside the places of its files."""
-
-    def __init__(self, folder: Path) -> None:
-        while True:
-            with _naming(folder):
-                self.path = Path(tempfile.mkdtemp(dir=folder, prefix=BEGUN))
-            # Another process may clear up between the folder's making and its lock.
-            with suppress(FileNotFoundError):
-                self.lock = os.open(self.path, os.O_RDONLY)
-                with suppress(OSError):
-                    fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if self.path.exists():
-                    return
-                os.close(self.lock)
-
-    def fill(self, contents: Mapping[str, bytes]) -> None:
-        for name, content in contents.items():
-            with _naming(self.path.parent / name), open(self.path / name, "wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-
-    def complete(self) -> None:
-        done = self.path.with_name(COMPLETE + self.path.name.removeprefix(BEGUN))
-        with _naming(done.parent):
-            os.rename(self.path, done)
-        self.path = done
-
-    def place(self) -> None:
-        _place(self.path)
-
-    def abandon(self, unless_complete: bool = False) -> None:
-        if not (unless_complete and self.path.name.startswith(COMPLETE)):
-            shutil.rmtree(self.path, ignore_errors=True)
-
-    def unlock(self) -> None:
-        os.close(self.lock)
-
-
-def _place(stage: Path) -> None:
-    for file in sorted(stage.iterdir()):
-        with _naming(stage.parent / file.name):
-            os.replace(file, stage.parent / file.name)
-    stage.rmdir()
-    _settle(stage.parent)
-
-
-def _settle(folder: Path) -> None:
-    """Have the folder's new names survive a power cut, where the file system can."""
-    with suppress(OSError):
-        handle = os.open(folder, os.O_RDONLY)
+@contextmanager
+def _writer(folder: Path, paths: Collection[Path]) -> Iterator[None]:
+    """Hold a folder while those files are written; what an earlier writer left is settled before."""
+    with _lock(folder / WRITER, PATIENCE):
+        _remove(folder / BEGUN)
+        if _is_folder(folder / COMPLETE):
+            _place(folder)
         try:
-            os.fsync(handle)
+            yield
+        except Exception:
+            # Before the first file has moved, all of them can be given up; after that, the next writer goes on.
+            if _is_folder(folder / COMPLETE) and len(list((folder / COMPLETE).iterdir())) == len(paths):
+                _remove(folder / COMPLETE)
+            raise
         finally:
-            os.close(handle)
+            _remove(folder / BEGUN)
+
+
+def _write(stage: Path, contents: Mapping[Path, bytes]) -> None:
+    with _naming(stage.parent):
+        stage.mkdir()
+    for path, content in contents.items():
+        with _naming(path), open(stage / path.name, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def _place(folder: Path) -> None:
+    for file in sorted((folder / COMPLETE).iterdir()):
+        with _naming(folder / file.name):
+            os.replace(file, folder / file.name)
+    (folder / COMPLETE).rmdir()
+
+
+def _remove(folder: Path) -> None:
+    if _is_folder(folder):
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _is_folder(path: Path) -> bool:
+    """Whether it is a folder and no link to one: files behind a link are somebody else's."""
+    return path.is_dir() and not path.is_symlink()
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[bool | None]:
-    """Whether a folder has been locked: nobody who lives holds it. None where the file system has no locks."""
+def _lock(path: Path, patience: float) -> Iterator[None]:
+    """Hold a lock file, made here and removed at the end; TimeoutError if another process has it for so long [s]."""
+    end = time.monotonic() + patience
+    while (handle := _open_locked(path)) is None:
+        if time.monotonic() >= end:
+            raise TimeoutError(errno.ETIMEDOUT, "another process is writing here", str(path.parent))
+        time.sleep(0.02)
     try:
-        handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-    except OSError:
-        yield False
-        return
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            free: bool | None = True
-        except BlockingIOError:
-            free = False
-        except OSError:
-            free = None
-        yield free
+        yield
     finally:
+        if fcntl is None:  # Windows deletes only what nobody has open
+            os.close(handle)
+        with suppress(OSError):
+            path.unlink()
+        if fcntl is not None:  # deleted while locked: whoever waits for it sees that and makes a new one
+            os.close(handle)
+
+
+def _open_locked(path: Path) -> int | None:
+    """A handle of the lock file, locked; None if another process has it."""
+    with _naming(path.parent):
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0))
+    try:
+        if fcntl is not None:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        else:
+            msvcrt = importlib.import_module("msvcrt")
+            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+    except (BlockingIOError, PermissionError):
         os.close(handle)
+        return None
+    except OSError:
+        pass  # a file system without locks: better unlocked than not at all
+    if os.fstat(handle).st_nlink == 0:
+        os.close(handle)
+        return None
+    return handle
 
 
 @contextmanager

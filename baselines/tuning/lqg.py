@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from scipy.optimize import NonlinearConstraint, minimize
 
+from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.baselines.lqg.controller import LQG, LQGSettings
 from cz_gym.baselines.policy import Floats
 from cz_gym.commands import OneLineParser, guarded
 from cz_gym.config import make_config
-from cz_gym.evaluation.files import check_writable, write_files
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.baselines.lqg.settings import ACTIVITIES, SHIPPED, settings_of, with_pull_step
 from cz_gym.commands import OneLineParser, guarded
-from cz_gym.evaluation.files import check_writable, write_files
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 
 from .lqg import check_budget, measure

@@ -19,10 +19,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.baselines.optional import require
 from cz_gym.commands import OneLineParser, guarded
 from cz_gym.config import Config, make_config
-from cz_gym.evaluation.files import check_writable, write_files
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout

@@ -43,7 +43,7 @@ def _main(args: argparse.Namespace) -> int:
         if not 1 <= getattr(args, name) <= most:
             raise ValueError(f"--{name} must be between 1 and {most}, not {getattr(args, name)}")
     from cz_gym.agents.training.recipes import PPO
-    from cz_gym.atomic_files import alone, check_writable
+    from cz_gym.atomic_files import check_writable, locked
     from studies.comparison.jobs import missing, run_all
     from studies.comparison.runs import Plan, read_all
 
@@ -57,7 +57,7 @@ def _main(args: argparse.Namespace) -> int:
             print(f"{row.name:20} {done}/{args.seeds}  {row.meaning}")
         return 0
     check_writable(plan.out)
-    with alone(plan.work):
+    with locked(plan.work):
         tasks = missing(plan, [(row, seed) for row in rows for seed in range(args.seeds)])
         print(f"{len(rows) * args.seeds - len(tasks)} runs are done, {len(tasks)} to do")
         run_all(plan, tasks, args.jobs, lambda: _write(plan, range(args.seeds)))

@@ -160,13 +160,13 @@ def _main(args: argparse.Namespace) -> int:
     for name, most in (("seeds", 100), ("steps", 10**9), ("jobs", 64)):
         if not 1 <= getattr(args, name) <= most:
             raise ValueError(f"--{name} must be between 1 and {most}, not {getattr(args, name)}")
-    from cz_gym.atomic_files import alone, check_writable
+    from cz_gym.atomic_files import check_writable, locked
     from studies.comparison.jobs import missing, run_all
     from studies.comparison.runs import Plan
 
     plan, seeds = Plan(args.steps, args.out, args.work, WEIGHTS), range(args.seeds)
     check_writable(plan.out)
-    with alone(plan.work):
+    with locked(plan.work):
         # Seed by seed, so that a stopped comparison holds every algorithm.
         tasks = missing(plan, [(row, seed) for seed in seeds for row in ROWS])
         run_all(plan, tasks, args.jobs, lambda: _write(plan, seeds))

@@ -18,13 +18,13 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.camera.image import picture
 from cz_gym.camera.rays import make_scene
 from cz_gym.camera.ring_detector import RingDetector, wall_edge
 from cz_gym.camera.view import Camera, View, make_view
 from cz_gym.commands import OneLineParser, guarded
 from cz_gym.env import CzEnv
-from cz_gym.evaluation.files import check_writable, write_files
 from cz_gym.physics.meniscus import hurle_ring_offset
 from cz_gym.physics.plant import Puller, make_puller
 from cz_gym.units import MM

@@ -18,7 +18,7 @@ from cz_gym.agents.training.recipes import Choice, CostWeights
 from cz_gym.agents.training.run import Run
 from cz_gym.agents.training.run_files import provenance
 from cz_gym.agents.training.validation import JUDGING, costs
-from cz_gym.atomic_files import alone, write_files
+from cz_gym.atomic_files import locked, write_files
 from cz_gym.baselines.registry import make_controller
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metrics
@@ -76,7 +76,7 @@ def path_of(plan: Plan, row: Row, seed: int) -> Path:
 def run_one(plan: Plan, row: Row, seed: int, bar: Any) -> None:
     """Train and judge, from the checkpoint if there is one; the run's folder goes when its result is kept."""
     folder = plan.work / f"{row.name}-seed{seed}"
-    with alone(folder):
+    with locked(folder):
         run = _open(folder, row.of(plan.steps), seed, plan.work / "imitations")
         try:
             run.learn(bar)
@@ -87,7 +87,7 @@ def run_one(plan: Plan, row: Row, seed: int, bar: Any) -> None:
         stages = {name: judge(policy, plan.weights) for name, policy in policies.items() if policy is not None}
         write_files({path_of(plan, row, seed): _to_json(plan, row, seed, run, stages)})
         run.training.learner.env.close()
-        shutil.rmtree(folder)
+    shutil.rmtree(folder)
 
 
 def judged_on() -> dict[str, Any]:

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.baselines.analysis.frequency import crossover, loop_margins, peak
 from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.analysis.sampled_loop import Loop, NotLinearError, close, late, root_mean_square
@@ -27,7 +28,6 @@ from cz_gym.baselines.bounds.lqg import pullers_of
 from cz_gym.baselines.registry import CONTROLLERS, find_controller
 from cz_gym.commands import OneLineParser, guarded
 from cz_gym.config import Config, make_config
-from cz_gym.evaluation.files import check_writable, write_files
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.physics.linearisation import StateSpace, radius_model
 from cz_gym.physics.plant import Puller, make_puller

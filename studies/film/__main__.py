@@ -59,7 +59,7 @@ def _make(arguments: argparse.Namespace) -> int:
         raise ValueError(f"--out must end in .gif, not {str(arguments.out)!r}")
     import PIL.Image  # noqa: F401  (missing? say so before the work, not after it)
 
-    from cz_gym.evaluation.files import check_writable, write_files
+    from cz_gym.atomic_files import check_writable, write_files
 
     check_writable(arguments.out.resolve().parent)
     content = film(arguments.scenario, arguments.seed, arguments.frames, arguments.agent)

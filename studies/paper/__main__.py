@@ -12,9 +12,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.baselines.optional import require
 from cz_gym.commands import OneLineParser, guarded
-from cz_gym.evaluation.files import check_writable, write_files
 
 from . import numbers as paper_numbers
 from . import rows as paper_rows

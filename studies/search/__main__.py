@@ -50,7 +50,7 @@ def _main(args: argparse.Namespace) -> int:
     for name, least, most in (("trials", 1, 10_000), ("steps", 1, 10**9), ("finalists", 0, 100), ("seeds", 1, 100)):
         if not least <= getattr(args, name) <= most:
             raise ValueError(f"--{name} must be between {least} and {most}, not {getattr(args, name)}")
-    from cz_gym.atomic_files import alone, check_writable, write_files
+    from cz_gym.atomic_files import check_writable, locked, write_files
 
     from .report import confirm, report
     from .space import read_history
@@ -58,7 +58,7 @@ def _main(args: argparse.Namespace) -> int:
     check_writable(args.out)
     history = args.out / "history.csv"
     read_history(history, args.steps)
-    with alone(args.work):
+    with locked(args.work):
         trials = search(history, args.trials, args.steps, args.work, args.seed)
         confirmed = confirm(trials, args.finalists, args.seeds, args.steps, args.out / "confirmed", args.work)
         write_files({args.out / "report.md": report(trials, confirmed, args.steps).encode()})

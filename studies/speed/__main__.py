@@ -16,8 +16,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser, guarded
-from cz_gym.evaluation.files import check_writable, write_files
 from cz_gym.units import MICRO
 
 from . import cases, peers, training

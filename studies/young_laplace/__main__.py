@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import chebyshev
 
+from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser, interrupted
-from cz_gym.evaluation.files import check_writable, write_files
 from cz_gym.physics import young_laplace as exact
 from cz_gym.physics.meniscus import profile, ring_point
 from cz_gym.physics.young_laplace_table import RING, SLOPE, TAIL
