@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 import argparse
-import json
 import shlex
 import sys
-from collections.abc import Container, Sequence
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cz_gym.commands import OneLineParser, guarded
 
 if TYPE_CHECKING:
-    from cz_gym.agents.agent_file.contract import Contract
     from cz_gym.baselines.registry import Entry
     from cz_gym.config import Config
-    from cz_gym.evaluation.protocol import Row
-    from cz_gym.evaluation.runner import Contender, Plan
+    from cz_gym.evaluation.contenders import Contender
+    from cz_gym.evaluation.runner import Plan
 
 FOLDER = Path(__file__).resolve().parent / "results" / "benchmark"
 """Where the committed results are."""
 README = FOLDER.parents[1] / "README.md"
 """Where the committed results are quoted, between two markers."""
-KEPT = FOLDER.parent / "cache"
-"""Where episodes of slow controllers are kept."""
+CACHE = FOLDER.parent / "cache"
+"""Where episodes of slow controllers are cached."""
 BOUNDS = FOLDER.parent / "bounds"
 """Committed results of the slow controllers; their bound serves runs without one."""
 DEFAULT = "ppo-default"
@@ -42,28 +41,20 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
         description="Run controllers and agents on the same disturbed crystals and compare them.",
         epilog="docs/benchmark.md has the protocol, the formula of every metric and how to add a controller.",
     )
-    parser.add_argument(
-        "--episodes", type=int, default=EPISODES, metavar="N", help="first N test episodes (%(default)s)"
+    add = parser.add_argument
+    add("--episodes", type=int, default=EPISODES, metavar="N", help="first N test episodes (%(default)s)")
+    add("--controllers", type=_names, metavar="A,B", help='controllers and agents by name, or "all"')
+    add("--scenarios", type=_names, metavar="A,B", help="scenarios by name")
+    add("--out", type=Path, metavar="DIR", help="folder for the results (results/benchmark)")
+    add("--json", type=Path, metavar="FILE", help="write benchmark.json to FILE, and only that unless --out is given")
+    agent_help = (
+        "agent file, by default in place of the shipped ones; those of one NAME (default: the algorithm's) are "
+        "training seeds of one agent"
     )
-    parser.add_argument("--controllers", type=_names, metavar="A,B", help='controllers and agents by name, or "all"')
-    parser.add_argument("--scenarios", type=_names, metavar="A,B", help="scenarios by name")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (results/benchmark)")
-    parser.add_argument(
-        "--json", type=Path, metavar="FILE", help="write benchmark.json to FILE, and nothing else unless --out is given"
-    )
-    parser.add_argument(
-        "--agent",
-        type=_agent_file,
-        action="append",
-        metavar="[NAME=]FILE",
-        help="agent file, by default in place of the shipped ones; those of one NAME (default: the algorithm's) are "
-        "training seeds of one agent",
-    )
-    parser.add_argument(
-        "--slow", action="store_true", help="slow controllers too, on the first 50 episodes; resumed from results/cache"
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace files that would be kept otherwise")
-    parser.add_argument("--quiet", action="store_true", help="no progress bar, no table")
+    add("--agent", type=_agent_file, action="append", default=[], metavar="[NAME=]FILE", help=agent_help)
+    add("--slow", action="store_true", help="slow controllers too, on 50 episodes; resumed from results/cache")
+    add("--overwrite", action="store_true", help="replace files of earlier or other runs")
+    add("--quiet", action="store_true", help="no progress bar, no table")
     return parser.parse_args(argv)
 
 
@@ -90,196 +81,120 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def benchmark(arguments: argparse.Namespace, command: str) -> int:
-    """Check, run, write, show."""
+    """Check, run, write, print."""
+    from tqdm import tqdm
+
     from cz_gym.evaluation.report.output import check_targets, write
     from cz_gym.evaluation.report.terminal import terminal
-    from cz_gym.evaluation.runner import Progress, run
+    from cz_gym.evaluation.runner import run
 
     plan = make_plan(arguments, command)
-    partial = is_partial(arguments, plan)
-    check_targets(arguments.out, arguments.json, partial, arguments.overwrite)
+    smaller = is_partial(arguments, plan)
+    check_targets(arguments.out, arguments.json, smaller, arguments.overwrite)
+    # A package that is missing is named before the work, not after it.
     if arguments.out is not None:
-        import matplotlib  # noqa: F401  (missing? say so before the work, not after it)
+        import matplotlib  # noqa: F401
         import plotly  # noqa: F401
-    with Progress(plan.steps, arguments.quiet) as progress:
-        done = run(plan, progress)
-    quoted = README if not partial and arguments.out and arguments.out.resolve() == FOLDER else None
+    for contender in plan.contenders:
+        if contender.controller.slow:
+            contender.make(plan.rows[0].config())
+    with tqdm(
+        total=plan.steps, unit="step", unit_scale=True, dynamic_ncols=True, leave=False, disable=arguments.quiet
+    ) as bar:
+        done = run(plan, bar)
+    quoted = README if not smaller and arguments.out and arguments.out.resolve() == FOLDER else None
     write(arguments.out, arguments.json, done, quoted)
     if not arguments.quiet:
         print(f"{terminal(done)}\nwrote {', '.join(str(path) for path in (arguments.out, arguments.json) if path)}")
         if arguments.controllers == ["all"] and (missing := left_out(plan)):
             print(
-                f"left out of all: {', '.join(missing)}, which are slow and not kept for every episode asked for; "
-                f"add --slow to run them ({BOUNDS.relative_to(README.parent)}/report.md has what was measured of them)"
+                f"left out of all: {', '.join(missing)}, which are slow and not cached for every episode asked for; "
+                f"add --slow to run them ({BOUNDS.relative_to(README.parent)}/report.md has their earlier results)"
             )
     return 0
 
 
 def make_plan(arguments: argparse.Namespace, command: str) -> Plan:
     """What the command line asks for; ValueError names what was given and what is allowed."""
+    from cz_gym.evaluation.contenders import choose
     from cz_gym.evaluation.protocol import ROWS, check_episodes, find_row
     from cz_gym.evaluation.runner import Plan
 
     episodes = check_episodes(arguments.episodes)
-    if arguments.scenarios is None:
-        rows = tuple(row for row in ROWS if row.default)
-    else:
-        rows = tuple(find_row(name) for name in arguments.scenarios)
-    free = kept_names(rows, episodes) if arguments.controllers and not arguments.slow else set()
-    slow = slow_names() if arguments.slow else free
-    contenders, contracts = choose(arguments.controllers, arguments.agent or [], slow)
-    return Plan(contenders, rows, episodes, contracts, command, KEPT, BOUNDS)
+    names = arguments.scenarios or [row.name for row in ROWS if row.default]
+    plan = Plan((), tuple(find_row(name) for name in names), episodes, command, CACHE, BOUNDS)
+    controllers = classical()
+    slow = [each for each in controllers if each.controller.slow]
+    if not arguments.slow:
+        slow = [each for each in slow if arguments.controllers and plan.is_cached(each)]
+    shipped = {name: partial(_shipped, name) for name in SHIPPED}
+    chosen = choose(arguments.controllers, controllers, _given(arguments.agent), shipped, [each.name for each in slow])
+    return replace(plan, contenders=chosen)
 
 
-def slow_names() -> set[str]:
-    """Controllers that run only when asked for: everyone that is slow."""
+def classical() -> list[Contender]:
+    """The classical controllers."""
     from cz_gym.baselines.registry import CONTROLLERS
 
-    return {entry.name for entry in CONTROLLERS if entry.slow}
-
-
-def kept_names(rows: Sequence[Row], episodes: int) -> set[str]:
-    """The slow controllers of which every episode asked for is kept, so that they cost no time."""
-    from cz_gym.baselines.registry import CONTROLLERS
-    from cz_gym.evaluation.runner import Plan
-
-    found = set()
-    for entry in CONTROLLERS:
-        if entry.slow:
-            try:
-                contender = _classical(entry)
-            except ImportError:
-                continue
-            if Plan((contender,), tuple(rows), episodes, kept=KEPT).all_kept(contender):
-                found.add(entry.name)
-    return found
-
-
-def left_out(plan: Plan) -> list[str]:
-    """Slow controllers that take no part."""
-    taking_part = {contender.controller.name for contender in plan.contenders}
-    return sorted(slow_names() - taking_part)
-
-
-def is_partial(arguments: argparse.Namespace, plan: Plan) -> bool:
-    """Whether the run holds less than the default one, or another agent than the shipped one."""
-    from cz_gym.baselines.registry import CONTROLLERS
-    from cz_gym.evaluation.protocol import ROWS
-
-    names = {contender.controller.name for contender in plan.contenders}
-    everyone = {entry.name for entry in CONTROLLERS if entry.default} | set(SHIPPED)
-    every_row = {row for row in ROWS if row.default}
-    return bool(plan.episodes < EPISODES or every_row - set(plan.rows) or everyone - names or arguments.agent)
-
-
-def choose(
-    wanted: list[str] | None, files: Sequence[tuple[str, Path]], slow: Container[str] = ()
-) -> tuple[tuple[Contender, ...], tuple[dict[str, Any], ...]]:
-    """Who takes part, classical controllers first, and the contracts of the agents among them.
-
-    Agent files, each with a name or "" for its algorithm's, always take part; shipped agents beside them only if they
-    are wanted by name, and slow controllers only if ``slow`` names them. Raises ValueError for a name that nobody has,
-    and for agent files that cannot be used.
-    """
-    from cz_gym.agents import OnnxPolicy
-    from cz_gym.baselines.registry import CONTROLLERS
-    from cz_gym.evaluation.protocol import SLOW_EPISODES
-
-    given: dict[str, list[Any]] = {}
-    for called, file in files:
-        policy = OnnxPolicy.load(file, _nominal())
-        given.setdefault(called or policy.contract.algorithm, []).append(policy)
-    classical = [entry.name for entry in CONTROLLERS]
-    for name in given:
-        if name in classical:
-            raise ValueError(f"an agent may not be called {name!r}: a controller has that name; name it NAME=FILE")
-    learned = [*given, *(name for name in SHIPPED if name not in given)]
-    if wanted is None or wanted == ["all"]:
-        some = [entry for entry in CONTROLLERS if entry.name in slow or not entry.slow]
-        wanted = [entry.name for entry in some if wanted or entry.slow or entry.default] + list(given or SHIPPED)
-    for name in wanted:
-        if name not in classical + learned:
-            raise ValueError(f"unknown controller {name!r}; choose from {', '.join(classical + learned)}, or all")
-    taking_part = [entry for entry in CONTROLLERS if entry.name in wanted]
-    for entry in taking_part:
-        if entry.slow and entry.name not in slow:
-            raise ValueError(f"{entry.name!r} is slow: add --slow to run it on the first {SLOW_EPISODES} episodes")
-    contenders = [_classical(entry) for entry in taking_part]
-    contracts = []
-    for name in learned:
-        if name in given or name in wanted:
-            policies = given.get(name) or _shipped(name)
-            contenders.append(_agent(name, policies, name in given))
-            contracts += [_recorded(policy.contract) for policy in policies]
-    return tuple(contenders), tuple(contracts)
-
-
-def _shipped(name: str) -> list[Any]:
-    from cz_gym.agents import OnnxPolicy, shipped, shipped_seeds
-
-    return [OnnxPolicy.load(file, _nominal()) for file in ([shipped()] if name == DEFAULT else shipped_seeds(name))]
-
-
-def _recorded(contract: Contract) -> dict[str, Any]:
-    """A contract as it will be written down; ValueError if no JSON or no page can hold it."""
-    facts = asdict(contract)
-    for name, value in facts.items():
-        try:
-            json.dumps(value, ensure_ascii=False, allow_nan=False).encode()
-        except ValueError:
-            raise ValueError(
-                f"agent {contract.algorithm!r}: its contract's {name} cannot be written: {value!r:.80}"
-            ) from None
-    return facts
+    return [_classical(entry) for entry in CONTROLLERS]
 
 
 def _classical(entry: Entry) -> Contender:
+    from cz_gym.evaluation.contenders import Contender
     from cz_gym.evaluation.results import Controller
-    from cz_gym.evaluation.runner import Contender
 
-    controller = Controller(entry.name, entry.observation, entry.meaning, told=entry.told, slow=entry.slow)
-    if entry.slow:
-        entry.make(_nominal())  # a package it needs is missing? say so before the work, not after it
-    return Contender(controller, lambda config: [entry.make(config)])
+    controller = Controller(entry.name, entry.observation, entry.meaning, privileged=entry.told, slow=entry.slow)
+    return Contender(controller, lambda config: [entry.make(config)], entry.default)
 
 
-def _agent(name: str, policies: Sequence[Any], given: bool) -> Contender:
-    """A learned controller: every training seed of one algorithm. Raises ValueError if they are no such set."""
-    from cz_gym.agents.policies.resampled import at_interval
-    from cz_gym.evaluation.results import Controller
-    from cz_gym.evaluation.runner import Contender
+def _given(files: Sequence[tuple[str, Path]]) -> dict[str, Contender]:
+    """The agents of files, each with a name or "" for its algorithm's."""
+    policies: dict[str, list[Any]] = {}
+    for name, file in files:
+        policy = _load(file)
+        policies.setdefault(name or policy.contract.algorithm, []).append(policy)
+    return {name: _agent(name, some, ", given as a file") for name, some in policies.items()}
 
-    contracts = [policy.contract for policy in policies]
-    seeds = tuple(contract.training_seed for contract in contracts)
-    if len(set(seeds)) < len(seeds):
-        raise ValueError(f"agent {name!r}: a training seed appears twice among {', '.join(map(str, seeds))}")
-    if len({contract.observation for contract in contracts}) > 1:
-        raise ValueError(f"agent {name!r}: its training seeds read different observations")
-    if len({contract.scenario_hash for contract in contracts}) > 1:
-        trained = ", ".join(sorted({contract.scenario for contract in contracts}))
-        raise ValueError(f"agent {name!r}: its training seeds were trained on different scenarios: {trained}")
-    interval = _nominal().control_interval
-    for contract in contracts:
-        if contract.control_interval != interval:
-            raise ValueError(
-                f"agent {name!r}: trained at {contract.control_interval:g} s control, the benchmark runs {interval:g} s"
-            )
-    meaning = f"agent trained with {contracts[0].algorithm} on {contracts[0].scenario}"
+
+def _shipped(name: str) -> Contender:
+    from cz_gym.agents import shipped, shipped_seeds
+
     if name == DEFAULT:
-        meaning += ", the seed that did best on validation"
-    if given:
-        meaning += ", given as a file"
+        return _agent(name, [_load(shipped())], ", the seed that did best on validation")
+    return _agent(name, [_load(file) for file in shipped_seeds(name)])
+
+
+def _load(file: Path) -> Any:
+    from cz_gym.agents import OnnxPolicy
+    from cz_gym.evaluation.protocol import ROWS
+
+    return OnnxPolicy.load(file, ROWS[0].config())
+
+
+def _agent(name: str, policies: Sequence[Any], remark: str = "") -> Contender:
+    from cz_gym.agents.policies.resampled import at_interval
+    from cz_gym.evaluation.contenders import agent
 
     def make(config: Config) -> list[Any]:
         return [at_interval(policy, config.control_interval) for policy in policies]
 
-    return Contender(Controller(name, policies[0].observation, meaning, seeds), make)
+    return agent(name, policies, make, remark)
 
 
-def _nominal() -> Config:
+def left_out(plan: Plan) -> list[str]:
+    """Slow controllers that take no part."""
+    taking_part = {contender.name for contender in plan.contenders}
+    return sorted(each.name for each in classical() if each.controller.slow and each.name not in taking_part)
+
+
+def is_partial(arguments: argparse.Namespace, plan: Plan) -> bool:
+    """Whether the run holds less than the default one, or agents of the user's own."""
     from cz_gym.evaluation.protocol import ROWS
 
-    return ROWS[0].config()
+    everyone = {each.name for each in classical() if each.default} | set(SHIPPED)
+    missing = everyone - {contender.name for contender in plan.contenders}
+    rows = {row for row in ROWS if row.default} - set(plan.rows)
+    return bool(plan.episodes < EPISODES or missing or rows or arguments.agent)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The benchmark's results as files: JSON and CSV, written whole or not at all."""
+"""A benchmark's results as JSON and CSV, written and read back."""
 
 from __future__ import annotations
 
@@ -6,17 +6,19 @@ import csv
 import io
 import json
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
-from cz_gym.atomic_files import check_writable as check_writable
-from cz_gym.atomic_files import write_files as write_files
+import numpy as np
+import numpy.typing as npt
+
 from cz_gym.episodes.scenarios import SCENARIOS
 
 from .metrics import metric_names
-from .results import BOUND, REFERENCE, Benchmark, Outcome
+from .results import BOUND, REFERENCE, Benchmark, Controller, Outcome, ScenarioResult
 from .statistics import RESAMPLES, SEED, Estimate
 
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime", "casadi")
@@ -24,36 +26,39 @@ PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime", "ca
 RESULTS, EPISODES = "benchmark.json", "episodes.csv"
 FILES = (RESULTS, EPISODES, "report.md", "report.html", "crystal.png", "errors.png", "pareto.png")
 """Everything a folder of results may hold."""
+Episodes = dict[str, dict[str, npt.NDArray[np.float64]]]
+"""By scenario and controller: metrics of shape (training seeds, crystals, metrics)."""
 
 
 def to_json(benchmark: Benchmark) -> str:
     """``benchmark.json``: results, paired differences, tails, verdicts and provenance."""
-    results: dict[str, Any] = {}
-    paired: dict[str, Any] = {}
-    tails: dict[str, Any] = {}
-    for scenario in benchmark.scenarios:
-        name = scenario.row.name
-        results[name] = {outcome.controller.name: _estimates(outcome.means) for outcome in scenario.outcomes}
-        tails[name] = {outcome.controller.name: _estimates(outcome.cvar5) for outcome in scenario.outcomes}
-        paired[name] = {outcome.controller.name: _paired(outcome) for outcome in scenario.outcomes if outcome.paired}
-    verdicts = {
-        scenario.row.name: {
-            verdict.agent: {
-                "rival": verdict.rival,
-                "rmse_mm_difference": _estimate(verdict.difference),
-                "wins": verdict.wins,
-            }
-            for verdict in scenario.verdicts
+
+    def by_controller(pick: Callable[[Outcome], Any]) -> dict[str, dict[str, Any]]:
+        """What each outcome of each scenario holds; outcomes that hold nothing are left out."""
+        return {
+            scenario.row.name: {each.controller.name: found for each in scenario.outcomes if (found := pick(each))}
+            for scenario in benchmark.scenarios
         }
-        for scenario in benchmark.scenarios
-    }
+
+    gaps = by_controller(lambda outcome: _plain(outcome.gap))
+    radius_gaps = by_controller(lambda outcome: _plain(outcome.gap_radius))
     data = {
-        "results": results,
-        "paired": paired,
-        "cvar5": tails,
-        "optimality_gap": _by_scenario(benchmark, lambda outcome: outcome.gap),
-        "optimality_gap_radius": _by_scenario(benchmark, lambda outcome: outcome.gap_radius),
-        "verdicts": verdicts,
+        "results": by_controller(lambda outcome: _by_metric(outcome.means)),
+        "paired": by_controller(_paired),
+        "cvar5": by_controller(lambda outcome: _by_metric(outcome.cvar5)),
+        "optimality_gap": {name: found for name, found in gaps.items() if found},
+        "optimality_gap_radius": {name: found for name, found in radius_gaps.items() if found},
+        "verdicts": {
+            scenario.row.name: {
+                verdict.agent: {
+                    "rival": verdict.rival,
+                    "rmse_mm_difference": _plain(verdict.difference),
+                    "wins": verdict.wins,
+                }
+                for verdict in scenario.verdicts
+            }
+            for scenario in benchmark.scenarios
+        },
         "provenance": _provenance(benchmark),
     }
     return json.dumps(data, indent=1, allow_nan=False) + "\n"
@@ -68,28 +73,19 @@ def is_benchmark_json(content: bytes) -> bool:
     return isinstance(data, dict) and {"results", "paired", "cvar5", "verdicts", "provenance"} <= set(data)
 
 
-def _by_scenario(benchmark: Benchmark, pick: Callable[[Outcome], Estimate | None]) -> dict[str, Any]:
-    """One estimate an outcome; scenarios without any are left out."""
-    found = {
-        scenario.row.name: {o.controller.name: _estimate(one) for o in scenario.outcomes if (one := pick(o))}
-        for scenario in benchmark.scenarios
-    }
-    return {name: estimates for name, estimates in found.items() if estimates}
+def _plain(estimate: Estimate | None) -> dict[str, Any] | None:
+    return estimate._asdict() if estimate else None
+
+
+def _by_metric(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
+    return {name: _plain(estimate) for name, estimate in estimates.items()}
 
 
 def _paired(outcome: Outcome) -> dict[str, Any]:
-    found: dict[str, Any] = _estimates(outcome.paired)
+    found = _by_metric(outcome.paired)
     if outcome.improvement is not None:
-        found["rmse_mm"]["probability_of_improvement"] = _estimate(outcome.improvement)
+        found["rmse_mm"]["probability_of_improvement"] = _plain(outcome.improvement)
     return found
-
-
-def _estimates(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
-    return {name: _estimate(estimate) for name, estimate in estimates.items()}
-
-
-def _estimate(estimate: Estimate) -> dict[str, Any]:
-    return {"mean": estimate.mean, "ci95": list(estimate.ci95) if estimate.ci95 else None, "n": estimate.n}
 
 
 def _provenance(benchmark: Benchmark) -> dict[str, Any]:
@@ -101,24 +97,33 @@ def _provenance(benchmark: Benchmark) -> dict[str, Any]:
         "plant_hash": config.plant_hash,
         "control_interval_s": config.control_interval,
         "horizon_s": config.horizon,
-        "scenarios": {
-            scenario.row.name: {
-                "scenario": scenario.row.scenario,
-                "hash": SCENARIOS[scenario.row.scenario].hash,
-                "model": scenario.row.model,
-                "control_interval_s": scenario.row.control_interval,
-                "meniscus": scenario.row.meniscus.name,
-                "first_seed": scenario.seeds[0],
-                "episodes": len(scenario.seeds),
-            }
-            for scenario in benchmark.scenarios
-        },
-        "controllers": {controller.name: asdict(controller) for controller in benchmark.controllers},
+        "scenarios": {scenario.row.name: _crystals(scenario) for scenario in benchmark.scenarios},
+        "controllers": {controller.name: _facts(controller) for controller in benchmark.controllers},
         "agents": [dict(contract) for contract in benchmark.agents],
         "bootstrap": {"resamples": RESAMPLES, "seed": SEED, "paired_against": REFERENCE},
         "gap_measured_from": BOUND,
-        "gap_from_kept_episodes": {s.row.name: len(s.kept_bound.seeds) for s in benchmark.scenarios if s.kept_bound},
+        "gap_from_kept_episodes": {
+            s.row.name: len(s.earlier_bound.seeds) for s in benchmark.scenarios if s.earlier_bound
+        },
     }
+
+
+def _crystals(scenario: ScenarioResult) -> dict[str, Any]:
+    row = scenario.row
+    return {
+        "scenario": row.scenario,
+        "hash": SCENARIOS[row.scenario].hash,
+        "model": row.model,
+        "control_interval_s": row.control_interval,
+        "meniscus": row.meniscus.name,
+        "first_seed": scenario.seeds[0],
+        "episodes": len(scenario.seeds),
+    }
+
+
+def _facts(controller: Controller) -> dict[str, Any]:
+    """A controller's fields; ``told`` is what files have called a privileged one from the first on."""
+    return {{"privileged": "told"}.get(name, name): value for name, value in asdict(controller).items()}
 
 
 def _version(package: str) -> str | None:
@@ -141,3 +146,26 @@ def to_csv(benchmark: Benchmark) -> str:
                     numbers = (f"{value:.5g}" for value in values)
                     writer.writerow((scenario.row.name, outcome.controller.name, training_seed, seed, *numbers))
     return text.getvalue()
+
+
+def read_episodes(path: Path, columns: Callable[[str], Sequence[str]]) -> Episodes:
+    """The columns that are wanted of each scenario in an ``episodes.csv``, crystals in the file's order.
+
+    ValueError if the file is none of a benchmark's, holds what is no finite number, or a controller's training seeds
+    did not meet the same number of crystals.
+    """
+    found: dict[str, dict[str, dict[str, list[list[float]]]]] = {}
+    try:
+        for line in csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))):
+            by_seed = found.setdefault(line["scenario"], {}).setdefault(line["controller"], {})
+            figures = [float(line[name]) for name in columns(line["scenario"])]
+            by_seed.setdefault(line["training_seed"], []).append(figures)
+        arrays = {
+            scenario: {name: np.array([*by_seed.values()]) for name, by_seed in by_name.items()}
+            for scenario, by_name in found.items()
+        }
+        if not all(np.isfinite(values).all() for by_name in arrays.values() for values in by_name.values()):
+            raise ValueError
+    except (KeyError, TypeError, ValueError, csv.Error):
+        raise ValueError(f"{path}: no episodes of a benchmark, or damaged") from None
+    return arrays

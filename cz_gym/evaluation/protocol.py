@@ -12,7 +12,7 @@ from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 TRAINING_SEEDS = range(1_000_000)
 """Seeds of the episodes that controllers are tuned and agents are trained on."""
 VALIDATION_SEEDS = range(1_000_000, 1_000_500)
-"""Seeds of the episodes that selection and early stopping look at."""
+"""Seeds of the episodes that selection and early stopping use."""
 TEST_SEEDS = range(2_000_000, 2_000_500)
 """Seeds of the test episodes; nothing is tuned, selected or stopped on them."""
 
@@ -41,8 +41,8 @@ class Row:
         """The environment's settings: three hours, this row's scenario, model, interval and meniscus."""
         return make_config(self.scenario, self.model, observation, self.control_interval, meniscus=self.meniscus)
 
-    def told(self, observation: str = "measured") -> Config:
-        """The settings that a controller is made for: the same on Hurle's meniscus."""
+    def design_config(self, observation: str = "measured") -> Config:
+        """The settings that a controller is designed for: the same on Hurle's meniscus."""
         return make_config(self.scenario, self.model, observation, self.control_interval)
 
     def seeds(self, episodes: int) -> range:
@@ -88,7 +88,7 @@ ROWS: tuple[Row, ...] = (
     Row(
         "randomized-exact",
         "randomized",
-        "randomized on the exact Young-Laplace meniscus, which no controller is told of",
+        "randomized on the exact Young-Laplace meniscus, which no controller knows of",
         default=False,
         meniscus=YOUNG_LAPLACE,
     ),
@@ -105,7 +105,7 @@ def find_row(name: str) -> Row:
 
 
 def check_episodes(episodes: int) -> int:
-    """The number of test episodes; ValueError if the protocol has no such many."""
+    """The number of test episodes; ValueError if the protocol does not have so many."""
     if not 1 <= episodes <= len(TEST_SEEDS):
         raise ValueError(f"episodes must be between 1 and {len(TEST_SEEDS)}, not {episodes}")
     return episodes

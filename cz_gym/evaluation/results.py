@@ -25,7 +25,7 @@ SPEED = "microseconds_per_step"
 TAIL_METRICS = ("rmse_mm", "rmse_observable_mm", "max_error_mm")
 """Metrics whose worst 5 % are reported."""
 EXAMPLES = 8
-"""Episodes of a sample whose signals are kept, the first ones: 2 MB a sample of 3 h episodes at 5 s."""
+"""Episodes of a sample that keep their signals, the first ones: 2 MB a sample of 3 h episodes at 5 s."""
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,10 @@ class Controller:
     meaning: str
     training_seeds: tuple[int, ...] = ()
     """Training seeds of a learned controller, empty for the others."""
-    told: bool = False
-    """Whether it is told what no controller knows."""
+    privileged: bool = False
+    """Whether it knows what no sensor shows."""
     slow: bool = False
-    """Whether it meets only the first few episodes, and its results are kept."""
+    """Whether it meets only the first few episodes, and these are cached."""
 
     @property
     def learned(self) -> bool:
@@ -49,8 +49,8 @@ class Controller:
 
     @property
     def bound(self) -> bool:
-        """Whether it reads the true state, which no sensor could feed, or is told what no controller knows."""
-        return self.told or self.observation == "state"
+        """Whether it knows or reads what no sensor shows: no contender, a bound."""
+        return self.privileged or self.observation == "state"
 
 
 @dataclass(frozen=True)
@@ -88,13 +88,13 @@ class Sample:
 
     def first(self, episodes: int) -> Sample:
         """The same sample on its first episodes."""
-        shown = self.examples[:episodes]
-        return replace(self, seeds=self.seeds[:episodes], values=self.values[:, :episodes], examples=shown)
+        seeds, values, examples = self.seeds[:episodes], self.values[:, :episodes], self.examples[:episodes]
+        return replace(self, seeds=seeds, values=values, examples=examples)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a sample says."""
+    """The estimates made from a sample."""
 
     sample: Sample
     means: Mapping[str, Estimate]
@@ -127,12 +127,12 @@ class Verdict:
 
     @property
     def wins(self) -> bool:
-        """Whether the agent's RMSE is lower beyond doubt: the whole interval, or the one episode."""
+        """Whether the agent's RMSE is lower: the whole interval of the difference, or the one episode."""
         return (self.difference.ci95[1] if self.difference.ci95 else self.difference.mean) < 0.0
 
     @property
     def loses(self) -> bool:
-        """Whether the rival's is."""
+        """Whether the rival's RMSE is lower, in the same sense."""
         return (self.difference.ci95[0] if self.difference.ci95 else self.difference.mean) > 0.0
 
 
@@ -143,8 +143,8 @@ class ScenarioResult:
     row: Row
     outcomes: tuple[Outcome, ...]
     verdicts: tuple[Verdict, ...]
-    kept_bound: Sample | None = None
-    """What gaps are measured from where :data:`BOUND` took no part in the run: its kept episodes."""
+    earlier_bound: Sample | None = None
+    """What gaps are measured from where :data:`BOUND` took no part in the run: its episodes of an earlier run."""
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -167,19 +167,19 @@ class Benchmark:
         return tuple(outcome.controller for outcome in self.scenarios[0].outcomes)
 
 
-def summarise(row: Row, samples: Sequence[Sample], kept_bound: Sample | None = None) -> ScenarioResult:
+def summarise(row: Row, samples: Sequence[Sample], earlier_bound: Sample | None = None) -> ScenarioResult:
     """Means, tails, paired differences, gaps and verdicts of one scenario.
 
     Controllers that met the same episodes share their resamples; two that met different numbers are compared on those
-    that both met. ``kept_bound`` stands in for :data:`BOUND` if that is not among the samples.
+    that both met. ``earlier_bound`` stands in for :data:`BOUND` if that is not among the samples.
     """
     resamples = cache(Resamples.draw)
     named = {sample.controller.name: sample for sample in samples}
     if BOUND in named:
-        kept_bound = None
-    bound = named.get(BOUND, kept_bound)
+        earlier_bound = None
+    bound = named.get(BOUND, earlier_bound)
     outcomes = tuple(_outcome(sample, named.get(REFERENCE), bound, resamples) for sample in samples)
-    return ScenarioResult(row, outcomes, _verdicts(samples, resamples), kept_bound)
+    return ScenarioResult(row, outcomes, _verdicts(samples, resamples), earlier_bound)
 
 
 def _outcome(

@@ -18,9 +18,8 @@ import numpy as np
 
 from cz_gym.baselines.lqg.settings import FAMILY
 from cz_gym.commands import OneLineParser, guarded
-from cz_gym.evaluation.episodes_file import Episodes, read_episodes
 from cz_gym.evaluation.equal_activity import Point, frontier, intervals
-from cz_gym.evaluation.files import EPISODES
+from cz_gym.evaluation.files import EPISODES, Episodes, read_episodes
 from cz_gym.evaluation.statistics import Resamples
 
 ACTIVITY = "pull_step_rms_mm_per_min"

@@ -19,8 +19,7 @@ import numpy.typing as npt
 
 from cz_gym.atomic_files import write_files
 from cz_gym.commands import OneLineParser, guarded
-from cz_gym.evaluation.episodes_file import read_episodes
-from cz_gym.evaluation.files import EPISODES
+from cz_gym.evaluation.files import EPISODES, read_episodes
 from cz_gym.evaluation.statistics import Estimate, Resamples, differences, means
 
 Floats = npt.NDArray[np.float64]

@@ -17,13 +17,16 @@ from contracts import facts
 from onnx import TensorProto, helper, numpy_helper
 
 import benchmark
-from cz_gym.agents.agent_file.contract import read_agent, write_agent
+from cz_gym.agents import OnnxPolicy
+from cz_gym.agents.agent_file.contract import write_agent
 from cz_gym.baselines.registry import CONTROLLERS, find_controller
 from cz_gym.config import make_config
 from cz_gym.evaluation import runner as running
+from cz_gym.evaluation.contenders import agent
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.protocol import ROWS, TEST_SEEDS, find_row
 from cz_gym.evaluation.report.output import check_targets
+from cz_gym.evaluation.runner import Plan
 from cz_gym.observation import OBSERVATIONS
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
@@ -95,6 +98,10 @@ def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     return captured.err
 
 
+def make_plan(*arguments: str) -> Plan:
+    return benchmark.make_plan(benchmark.parse(arguments), "")
+
+
 def test_the_folder_holds_every_file_and_nothing_else(finished: Path) -> None:
     assert sorted(path.name for path in finished.iterdir()) == FILES
     assert (finished.parent / "copy.json").read_bytes() == (finished / "benchmark.json").read_bytes()
@@ -159,7 +166,7 @@ def test_provenance_says_what_was_run(data: dict[str, Any]) -> None:
 
 def test_first_line_says_that_the_agent_does_not_win(finished: Path, data: dict[str, Any]) -> None:
     first = (finished / "report.md").read_text().splitlines()[0]
-    assert first.startswith("The agent ppo does not win")
+    assert first.startswith("No agent wins.")
     assert data["verdicts"]["reference-b"]["ppo"]["wins"] is False
     assert data["verdicts"]["reference-b"]["ppo"]["rival"] == "paper"
 
@@ -222,12 +229,14 @@ def test_broken_agent_files_get_one_line(tmp_path: Path, capsys: pytest.CaptureF
 def test_a_file_may_be_named_and_stand_beside_the_shipped_agents(tmp_path: Path) -> None:
     file = constant_agent(tmp_path / "some.onnx", algorithm="ppo")
     names = ["paper", "mine", "ppo-quiet"]
-    contenders, contracts = benchmark.choose(names, [("mine", file)])
-    assert [each.controller.name for each in contenders] == names
-    assert contenders[1].controller.meaning.endswith("given as a file")
-    assert [contract["algorithm"] for contract in contracts] == ["ppo", *["ppo-quiet"] * 3]
-    alone, _ = benchmark.choose(["paper"], [("", file)])
-    assert [each.controller.name for each in alone] == ["paper", "ppo"]
+    plan = make_plan("--controllers", ",".join(names), "--agent", f"mine={file}")
+    assert [each.name for each in plan.contenders] == names
+    assert plan.contenders[1].controller.meaning.endswith("given as a file")
+    assert [contract["algorithm"] for contract in plan.agents] == ["ppo", *["ppo-quiet"] * 3]
+    assert [each.name for each in make_plan("--controllers", "paper", "--agent", str(file)).contenders] == [
+        "paper",
+        "ppo",
+    ]
     assert benchmark.parse(["--agent", "a=b=c.onnx", "--agent", "x/a=b.onnx"]).agent == [
         ("a", Path("b=c.onnx")),
         ("", Path("x/a=b.onnx")),
@@ -288,10 +297,11 @@ def test_a_full_run_may_renew_an_earlier_benchmark(finished: Path) -> None:
 @pytest.mark.usefixtures("no_work")
 def test_a_contract_that_cannot_be_recorded_is_refused_at_once(odd: dict[str, Any], tmp_path: Path) -> None:
     constant_agent(tmp_path / "agent.onnx")
-    contract, _ = read_agent(tmp_path / "agent.onnx")
-    assert benchmark._recorded(contract)["scenario"] == "randomized"
+    policy = OnnxPolicy.load(tmp_path / "agent.onnx")
+    assert agent("it", [policy], lambda config: [policy]).contracts[0]["scenario"] == "randomized"
+    policy = replace(policy, contract=replace(policy.contract, **odd))
     with pytest.raises(ValueError, match=f"agent 'ppo': its contract's {next(iter(odd))} cannot be written"):
-        benchmark._recorded(replace(contract, **odd))
+        agent("it", [policy], lambda config: [policy])
 
 
 @pytest.mark.usefixtures("no_work")
@@ -397,7 +407,7 @@ def test_the_benchmark_needs_neither_torch_nor_stable_baselines3(tmp_path: Path)
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert "The agent ppo does not win" in done.stdout
+    assert "No agent wins." in done.stdout
 
 
 def test_controllers_say_what_they_are_and_act() -> None:
@@ -427,7 +437,7 @@ def test_rows_are_the_published_ones() -> None:
     for row in ROWS:
         assert find_row(row.name) is row
         assert row.config().steps == round(10_800 / row.control_interval)
-        assert row.told().meniscus == HURLE
+        assert row.design_config().meniscus == HURLE
         deterministic = row.name.startswith(("paper-", "reference-", "nominal"))
         assert len(row.seeds(500)) == (1 if deterministic else 500)
     assert find_row("hard").seeds(500) == range(2_000_000, 2_000_500)
@@ -435,7 +445,9 @@ def test_rows_are_the_published_ones() -> None:
     assert find_row("paper-ramp-II").config().mix == (0.0, 0.0)
     assert find_row("randomized-2s").config("history").control_interval == 2.0
     assert find_row("randomized-exact").config().meniscus == YOUNG_LAPLACE
-    assert {row.name for row in ROWS if row.config().plant_hash != row.told().plant_hash} == {"randomized-exact"}
+    assert {row.name for row in ROWS if row.config().plant_hash != row.design_config().plant_hash} == {
+        "randomized-exact"
+    }
 
 
 def test_an_agent_that_reads_the_true_state_is_a_bound_and_wins_nothing(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from cz_gym.agents.training import recipes as settings
 from cz_gym.agents.training.checkpoint import load_checkpoint, restore, to_bytes
 from cz_gym.agents.training.learners import make_training
 from cz_gym.agents.training.run_files import COLUMNS, read_rows, saved_steps
-from cz_gym.evaluation.cache import slow_controllers as kept
+from cz_gym.evaluation.cache import read_episode as read_cached
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.rollout import Signals
 from cz_gym.jit.cache import Store
@@ -94,7 +94,7 @@ def targets(folder: Path) -> dict[str, Target]:
 
     def read_episode(content: bytes) -> None:
         (folder / "0.npz").write_bytes(content)
-        kept.read(folder / "0.npz", True)
+        read_cached(folder / "0.npz", True)
 
     def read_code(content: bytes) -> None:
         store.path("key").write_bytes(content)
@@ -107,7 +107,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "sac checkpoint": Target(to_bytes(off_policy, 1.0, 0.5), partial(read_checkpoint, into=off_policy)),
         "settings.json": Target(json.dumps(sessions).encode(), read_settings),
         "progress.csv": Target(rows.encode(), read_progress),
-        "kept episode": Target(episode.getvalue(), read_episode),
+        "cached episode": Target(episode.getvalue(), read_episode),
         "compiled code": Target(store.path("key").read_bytes(), read_code),
     }
 
@@ -133,7 +133,7 @@ def mutant(kind: str, seed: bytes, rng: np.random.Generator) -> bytes:
         return _odd_graph(seed, rng)
     if kind.endswith("checkpoint") and rng.random() < 0.5:
         return _odd_header(seed, rng)
-    if kind == "kept episode" and rng.random() < 0.3:
+    if kind == "cached episode" and rng.random() < 0.3:
         return _odd_archive(rng)
     return _odd_bytes(seed, rng)
 
@@ -186,7 +186,7 @@ def _odd_header(seed: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _odd_archive(rng: np.random.Generator) -> bytes:
-    """A kept episode whose parts unpack to far more than the file, or claim shapes they do not have."""
+    """A cached episode whose parts unpack to far more than the file, or claim shapes they do not have."""
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in ("values", "microseconds", "signals"):

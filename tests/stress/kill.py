@@ -24,8 +24,8 @@ import numpy as np
 from stable_baselines3 import PPO
 
 import benchmark
-import cz_gym.evaluation.files
 import cz_gym.evaluation.report.figures
+import cz_gym.evaluation.report.output
 import cz_gym.evaluation.report.page
 import cz_gym.evaluation.runner
 import train
@@ -77,7 +77,7 @@ BENCHMARK = (
     Watched(cz_gym.evaluation.runner, "run", "episodes"),
     Watched(cz_gym.evaluation.report.figures, "draw_figures", "figures"),
     Watched(cz_gym.evaluation.report.page, "page", "page"),
-    Watched(cz_gym.evaluation.files, "write_files", "writing"),
+    Watched(cz_gym.evaluation.report.output, "write_files", "writing"),
 )
 BENCHMARK_PHASES = tuple(str(watched.phase) for watched in BENCHMARK)
 

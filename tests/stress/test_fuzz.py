@@ -16,7 +16,7 @@ from cz_gym.agents.agent_file.contract import MAX_BYTES, read_agent, read_bounde
 from tests.stress.hostile_files import Target, mutant, refused, targets
 
 KINDS = (
-    "agent.onnx", "agent.json", "checkpoint", "sac checkpoint", "settings.json", "progress.csv", "kept episode",
+    "agent.onnx", "agent.json", "checkpoint", "sac checkpoint", "settings.json", "progress.csv", "cached episode",
     "compiled code",
 )  # fmt: skip
 

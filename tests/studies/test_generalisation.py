@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cz_gym.evaluation.episodes_file import read_episodes
+from cz_gym.evaluation.files import read_episodes
 from studies.generalisation import __main__ as generalisation
 from studies.generalisation.__main__ import figures, tabulate, to_csv
 

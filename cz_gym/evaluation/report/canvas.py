@@ -1,4 +1,4 @@
-"""What the figures share: colours, a canvas without a display, PNG bytes."""
+"""What the figures share: how each controller is drawn, a canvas without a display, PNG bytes."""
 
 from __future__ import annotations
 
@@ -9,9 +9,17 @@ from typing import NamedTuple
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from cz_gym.evaluation.results import Controller
+
 COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F5FB0", "#8C6D1F", "#444444", "#A0A000")
 """Okabe and Ito's palette, safe for colour-blind readers, with a few more for a long table."""
-MARKERS = "osD^vP*Xph<>"
+MARKERS = {
+    "o": "circle", "s": "square", "D": "diamond", "^": "triangle-up", "v": "triangle-down", "P": "cross", "*": "star",
+    "X": "x", "p": "pentagon", "h": "hexagon", "<": "triangle-left", ">": "triangle-right",
+}  # fmt: skip
+"""Matplotlib's markers and plotly's names of them."""
+DASHES = ("solid", "dash", "dot")
+"""Plotly's lines: the next one where the colours begin again."""
 DPI = 160
 INK, GREY = "#222222", "#999999"
 
@@ -21,11 +29,21 @@ class Style(NamedTuple):
 
     colour: str
     marker: str
+    dash: str
 
 
 def styles(names: Sequence[str]) -> dict[str, Style]:
     """One style a controller; the first ones are the boldest."""
-    return {name: Style(COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]) for i, name in enumerate(names)}
+    markers = list(MARKERS)
+    return {
+        name: Style(COLOURS[i % len(COLOURS)], markers[i % len(markers)], DASHES[i // len(COLOURS) % len(DASHES)])
+        for i, name in enumerate(names)
+    }
+
+
+def styles_of(controllers: Sequence[Controller]) -> dict[str, Style]:
+    """One style a controller; the learned ones are the boldest."""
+    return styles([each.name for each in sorted(controllers, key=lambda each: not each.learned)])
 
 
 def canvas(width: float, height: float) -> Figure:

@@ -21,19 +21,19 @@ COLUMNS = 6
 LEARNED = 2
 """Of them, most learned ones while there are others."""
 WINDOW = 3.0 * MM
-"""Widest radius error shown, beyond the reference's own range [m]."""
+"""Largest radius error that the figure has room for, beyond the reference's own range [m]."""
 NARROWEST = 0.01 * MM
-"""Narrowest: a crystal that nothing disturbs has no error to scale by [m]."""
+"""Least room: a crystal that nothing disturbs has no error to scale by [m]."""
 
 
-def crystal(scenario: ScenarioResult, looks: dict[str, Style]) -> bytes:
+def crystal(scenario: ScenarioResult, style: dict[str, Style]) -> bytes:
     """The first crystal of a scenario under each controller: radius, ring, pull, heater, melt against time."""
     samples = _chosen([outcome.sample for outcome in scenario.outcomes])
     figure = canvas(2.35 * len(samples) + 1.0, 8.6)
     axes = figure.subplots(len(_PANELS), len(samples), sharex=True, sharey="row", squeeze=False)
     longest = max((sample.example for sample in samples), key=lambda signals: len(signals.r_c))
     for column, sample in enumerate(samples):
-        _crystal_column(axes[:, column], sample, looks[sample.controller.name].colour, longest.r_ref)
+        _crystal_column(axes[:, column], sample, style[sample.controller.name].colour, longest.r_ref)
     for row, panel in enumerate(_PANELS):
         axes[row, 0].set_ylabel(panel.label)
     _crystal_limits(axes, samples, longest)
@@ -88,15 +88,15 @@ def _chosen(samples: list[Sample]) -> list[Sample]:
     return [sample for sample in samples if any(sample is one for one in chosen)]
 
 
-def _heading(scenario: ScenarioResult, shown: list[Sample]) -> str:
+def _heading(scenario: ScenarioResult, chosen: list[Sample]) -> str:
     """What the figure shows and, if there were more controllers, by which rule these were chosen."""
-    text = f"One crystal of {scenario.row.name!r} (test seed {shown[0].seeds[0]:,}) under each controller"
-    names = {sample.controller.name for sample in shown}
+    text = f"One crystal of {scenario.row.name!r} (test seed {chosen[0].seeds[0]:,}) under each controller"
+    names = {sample.controller.name for sample in chosen}
     others = [outcome.controller.name for outcome in scenario.outcomes if outcome.controller.name not in names]
     if not others:
         return text
     kinds = [REFERENCE] if REFERENCE in names else []
-    learned = sum(sample.controller.learned for sample in shown)
+    learned = sum(sample.controller.learned for sample in chosen)
     kinds += [f"the {learned} best of the learned" if learned > 1 else "the best of the learned"] if learned else []
     kinds.append("the best of the others that read sensors")
     return f"{text}\nshown: {', '.join(kinds)}, by mean RMSE\nnot shown: {', '.join(others)}"
@@ -140,9 +140,9 @@ def _mark_failure(axes: Any, minute: float) -> None:
 
 
 def _crystal_limits(axes: Any, samples: list[Sample], longest: Signals) -> None:
-    """Scale by the crystals that lived: one that is lost leaves the picture, it does not set the scale."""
-    lived = [sample for sample in samples if not sample.metric("failure_rate")[0, 0]] or samples
-    worst = max(float(np.abs(sample.example.r_c - sample.example.r_ref).max()) for sample in lived)
+    """Scale by the crystals that did not fail: one that did leaves the picture, it does not set the scale."""
+    whole = [sample for sample in samples if not sample.metric("failure_rate")[0, 0]] or samples
+    worst = max(float(np.abs(sample.example.r_c - sample.example.r_ref).max()) for sample in whole)
     width = 1.15 * max(min(worst, WINDOW), NARROWEST)
     low, high = float(longest.r_ref.min()) - width, float(longest.r_ref.max()) + width
     ring = float(np.median(longest.r_br - longest.r_c))

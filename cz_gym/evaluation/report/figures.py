@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 
 from cz_gym.evaluation.results import Benchmark, Outcome, ScenarioResult
 
-from .canvas import INK, Style, canvas, png, styles
+from .canvas import INK, Style, canvas, png, styles_of
 from .crystal import crystal
 
 Floats = npt.NDArray[np.float64]
@@ -19,17 +19,16 @@ Floats = npt.NDArray[np.float64]
 
 def draw_figures(benchmark: Benchmark) -> dict[str, bytes]:
     """Every figure by file name; a figure with nothing to show is left out."""
-    ranked = sorted(benchmark.controllers, key=lambda controller: not controller.learned)
-    looks = styles([controller.name for controller in ranked])
+    style = styles_of(benchmark.controllers)
     random = [scenario for scenario in benchmark.scenarios if len(scenario.seeds) > 1]
-    figures = {"crystal.png": crystal(benchmark.scenarios[0], looks)}
+    figures = {"crystal.png": crystal(benchmark.scenarios[0], style)}
     if random:
-        figures["errors.png"] = errors(random, looks)
-        figures["pareto.png"] = pareto(random, looks)
+        figures["errors.png"] = errors(random, style)
+        figures["pareto.png"] = pareto(random, style)
     return figures
 
 
-def errors(scenarios: Sequence[ScenarioResult], looks: dict[str, Style]) -> bytes:
+def errors(scenarios: Sequence[ScenarioResult], style: dict[str, Style]) -> bytes:
     """Distribution of RMSE over the episodes: median, quartiles, 5 to 95 %, and the episodes beyond."""
     names = [outcome.controller.name for outcome in scenarios[0].outcomes]
     columns = min(len(scenarios), 2)
@@ -40,7 +39,7 @@ def errors(scenarios: Sequence[ScenarioResult], looks: dict[str, Style]) -> byte
         axis.set_visible(False)
     for axis, scenario in zip(axes.flat, scenarios, strict=False):
         for place, outcome in enumerate(scenario.outcomes):
-            _spread(axis, outcome.sample.metric("rmse_mm").ravel(), place, looks[outcome.controller.name].colour)
+            _spread(axis, outcome.sample.metric("rmse_mm").ravel(), place, style[outcome.controller.name].colour)
         axis.set_title(f"{scenario.row.name} ({len(scenario.seeds)} crystals)", fontsize=9.5)
         axis.set_xscale("log")
         axis.set_yticks(range(len(names)), names)
@@ -62,7 +61,7 @@ def _spread(axis: Any, values: Floats, place: int, colour: str) -> None:
     axis.plot(beyond, np.full(len(beyond), place), ls="none", marker="|", ms=6, mew=0.6, color=colour, alpha=0.7)
 
 
-def pareto(scenarios: Sequence[ScenarioResult], looks: dict[str, Style]) -> bytes:
+def pareto(scenarios: Sequence[ScenarioResult], style: dict[str, Style]) -> bytes:
     """Mean RMSE against mean pull step RMS with 95 % intervals, both logarithmic; lower left is better."""
     columns = min(len(scenarios), 2)
     rows = -(-len(scenarios) // columns)
@@ -76,7 +75,7 @@ def pareto(scenarios: Sequence[ScenarioResult], looks: dict[str, Style]) -> byte
         axis.set_xscale("log")
         axis.set_yscale("log")
         for outcome in scenario.outcomes:
-            _pareto_point(axis, outcome, looks[outcome.controller.name], floor)
+            _pareto_point(axis, outcome, style[outcome.controller.name], floor)
         axis.set_title(scenario.row.name, fontsize=9.5)
         axis.tick_params(which="both", labelbottom=True, labelleft=True)
         _plain_log(axis.xaxis)
@@ -86,26 +85,25 @@ def pareto(scenarios: Sequence[ScenarioResult], looks: dict[str, Style]) -> byte
     for axis in axes[:, 0]:
         axis.set_ylabel("RMSE of the radius [mm]")
     handles = [
-        Line2D([], [], ls="none", marker=look.marker, color=look.colour, ms=7, label=name)
-        for name, look in looks.items()
+        Line2D([], [], ls="none", marker=one.marker, color=one.colour, ms=7, label=name) for name, one in style.items()
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 5), frameon=False)
     figure.suptitle("Error against pull activity: lower left is better, bars are 95 % intervals", fontsize=11)
     return png(figure)
 
 
-def _pareto_point(axis: Any, outcome: Outcome, look: Style, floor: float) -> None:
+def _pareto_point(axis: Any, outcome: Outcome, style: Style, floor: float) -> None:
     error, activity = outcome.means["rmse_mm"], outcome.means["pull_step_rms_mm_per_min"]
     x = max(activity.mean, floor)
     if activity.mean < floor:
         axis.annotate(
-            "← 0", (x, error.mean), (0, -14), textcoords="offset points", ha="center", fontsize=8, color=look.colour
+            "← 0", (x, error.mean), (0, -14), textcoords="offset points", ha="center", fontsize=8, color=style.colour
         )
     elif activity.ci95:
-        axis.plot(activity.ci95, [error.mean] * 2, color=look.colour, lw=1.2)
+        axis.plot(activity.ci95, [error.mean] * 2, color=style.colour, lw=1.2)
     if error.ci95:
-        axis.plot([x, x], error.ci95, color=look.colour, lw=1.2)
-    axis.plot(x, error.mean, ls="none", marker=look.marker, ms=7, color=look.colour)
+        axis.plot([x, x], error.ci95, color=style.colour, lw=1.2)
+    axis.plot(x, error.mean, ls="none", marker=style.marker, ms=7, color=style.colour)
 
 
 def _plain_log(axis: Any, between: bool = False) -> None:

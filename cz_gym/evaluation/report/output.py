@@ -1,27 +1,19 @@
-"""Writing a benchmark's results, all files or none; no file that somebody wants is replaced untold."""
+"""Writing a benchmark's results, all files or none; files of other origin are replaced only with ``overwrite``."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from cz_gym.evaluation.files import (
-    EPISODES,
-    FILES,
-    RESULTS,
-    check_writable,
-    is_benchmark_json,
-    to_csv,
-    to_json,
-    write_files,
-)
+from cz_gym.atomic_files import check_writable, write_files
+from cz_gym.evaluation.files import EPISODES, FILES, RESULTS, is_benchmark_json, to_csv, to_json
 from cz_gym.evaluation.results import Benchmark
 
 
 def check_targets(folder: Path | None, lone: Path | None, partial: bool, overwrite: bool) -> None:
-    """Raise ValueError or OSError if the results could not be written, or would replace better ones untold."""
-    kept = kept_files(folder, lone, partial)
-    if kept and not overwrite:
-        path, why = kept[0]
+    """Raise ValueError or OSError if the results could not be written, or would replace what only ``overwrite`` may."""
+    protected = protected_files(folder, lone, partial)
+    if protected and not overwrite:
+        path, why = protected[0]
         raise ValueError(f"{path} exists and {why}: add --overwrite, or name another --out or --json")
     if lone and lone.is_dir():
         raise ValueError(f"--json {lone} is a folder")
@@ -30,23 +22,23 @@ def check_targets(folder: Path | None, lone: Path | None, partial: bool, overwri
             check_writable(place)
 
 
-def kept_files(folder: Path | None, lone: Path | None, partial: bool) -> list[tuple[Path, str]]:
-    """Existing files that a run may not replace untold, each with the reason.
+def protected_files(folder: Path | None, lone: Path | None, partial: bool) -> list[tuple[Path, str]]:
+    """Existing files that a run may not replace without ``overwrite``, each with the reason.
 
     In a folder: any of the benchmark's files, unless a full run renews an earlier benchmark. A lone JSON file: one
     that is no earlier benchmark, and for a partial run one that belongs to a folder of results.
     """
-    kept = []
+    found = []
     if folder:
         earlier = is_benchmark(folder / RESULTS)
         why = "its folder holds no earlier benchmark" if not earlier else "this run is partial" if partial else ""
-        kept += [(folder / name, why) for name in FILES if why and (folder / name).exists()]
+        found += [(folder / name, why) for name in FILES if why and (folder / name).exists()]
     if lone and lone.is_file():
         if not is_benchmark(lone):
-            kept.append((lone, "is no earlier benchmark"))
+            found.append((lone, "is no earlier benchmark"))
         elif partial and lone.name == RESULTS and (lone.resolve().parent / "report.md").exists():
-            kept.append((lone, "this run is partial"))
-    return kept
+            found.append((lone, "this run is partial"))
+    return found
 
 
 def is_benchmark(path: Path) -> bool:

@@ -1,50 +1,78 @@
 """``report.html``: the benchmark as one page that opens from disk: table, pictures, and the first episodes' signals.
 
 Everything is inside the file, plotly.js included, and its content policy forbids the browser to fetch anything else.
-Names come from agent files and are untrusted: they travel as JSON that no HTML can end, and ``html/*.js`` writes them
-as text alone.
+Names come from agent files and are untrusted: they are escaped for HTML, for plotly, and as JSON inside a script.
 """
 
 from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable
+from html import escape
 from importlib.resources import files
 from typing import Any
 
+from plotly.graph_objects import Figure
 from plotly.offline import get_plotlyjs
 
-from cz_gym.evaluation.metrics import TOLERANCE
-from cz_gym.evaluation.results import REFERENCE, Benchmark, Controller, ScenarioResult
-from cz_gym.units import HOUR, MINUTE, MM, MM_PER_MIN
+from cz_gym.evaluation.results import Benchmark, Outcome, ScenarioResult
+from cz_gym.units import HOUR, MINUTE
 
-from .canvas import styles
-from .page_signals import CURVES, SHARED, episodes
-from .page_tables import DISTRIBUTIONS, columns, distributions, rows
+from . import tables
+from .canvas import styles_of
+from .markdown import measured_from
+from .page_figures import errors, pareto
+from .page_signals import OWN, PANELS, SHARED, crystals, frame
 from .verdict import headline
 
-SCRIPTS = ("data.js", "look.js", "table.js", "pictures.js", "viewer.js", "main.js")
-"""The page's own code, in the order of use."""
-SYMBOLS = {
-    "o": "circle", "s": "square", "D": "diamond", "^": "triangle-up", "v": "triangle-down", "P": "cross", "*": "star",
-    "X": "x", "p": "pentagon", "h": "hexagon", "<": "triangle-left", ">": "triangle-right",
-}  # fmt: skip
-"""matplotlib's markers by plotly's names."""
-DASHES = ("solid", "dash", "dot")
-"""Line styles: the next one where the colours begin again."""
 _SLOT = re.compile(r"<!-- slot:(\w+) -->")
 
 
 def page(benchmark: Benchmark) -> str:
     """The page; the same results give the same text."""
+    config, scenarios = benchmark.scenarios[0].row.config(), benchmark.scenarios
+    most = max(len(scenario.seeds) for scenario in scenarios)
     parts = {
         "style": _asset("page.css"),
         "plotly": get_plotlyjs(),
-        "scripts": "\n".join(_asset(name) for name in SCRIPTS),
-        "facts": embedded(facts(benchmark)),
-        "episodes": embedded([episodes(scenario) for scenario in benchmark.scenarios]),
+        "script": _asset("page.js"),
+        "data": embedded(_data(benchmark)),
+        "verdict": escape(headline(benchmark)),
+        "lede": f"{len(benchmark.controllers)} controllers, {len(scenarios)} scenarios, up to {tables.crystals(most)} "
+        f"each, the same for everyone: {config.horizon / HOUR:g} h at one action every {config.control_interval:g} s.",
+        "scenarios": _each("option", (scenario.row.name for scenario in scenarios)),
+        "tables": "\n".join(_table(scenario) for scenario in scenarios),
+        "controllers": "\n".join(
+            "<tr>"
+            + _each("td", (each.name, each.observation, each.meaning, ", ".join(map(str, each.training_seeds))))
+            + "</tr>"
+            for each in benchmark.controllers
+        ),
+        "resolutions": ", ".join(f"{panel.title} {panel.resolution:g} {panel.unit}" for panel in PANELS),
+        "command": escape(benchmark.command),
     }
     return _SLOT.sub(lambda slot: parts[slot[1]], _asset("page.html"))
+
+
+def _data(benchmark: Benchmark) -> dict[str, Any]:
+    """What the page's script draws."""
+    config, styles = benchmark.scenarios[0].row.config(), styles_of(benchmark.controllers)
+    rivals = [verdict.rival for scenario in benchmark.scenarios for verdict in scenario.verdicts]
+    return {
+        "minutes": config.control_interval / MINUTE,
+        "resolutions": [[PANELS[panel].resolution for panel, _ in lines] for lines in (OWN, SHARED)],
+        "frame": _figure(frame(benchmark.controllers, rivals, styles, config.horizon)),
+        "scenarios": [
+            {"pictures": [_figure(draw(each, styles)) for draw in (pareto, errors)], "crystals": crystals(each)}
+            for each in benchmark.scenarios
+        ],
+    }
+
+
+def _figure(figure: Figure) -> Any:
+    margin = {"l": 60, "r": 10, "t": 50, "b": 40}
+    return json.loads(figure.update_layout(template="plotly_white", margin=margin, hoverlabel_namelength=-1).to_json())
 
 
 def embedded(value: Any) -> str:
@@ -53,59 +81,37 @@ def embedded(value: Any) -> str:
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def facts(benchmark: Benchmark) -> dict[str, Any]:
-    """Everything the page shows but the episodes' signals."""
-    config = benchmark.scenarios[0].row.config()
-    return {
-        "verdict": headline(benchmark),
-        "command": benchmark.command,
-        "reference": REFERENCE,
-        "interval_s": config.control_interval,
-        "horizon_min": config.horizon / MINUTE,
-        "horizon_h": config.horizon / HOUR,
-        "tolerance_mm": TOLERANCE / MM,
-        "v_0_mm_per_min": config.parameters.v_0 / MM_PER_MIN,
-        "controllers": _controllers(benchmark.controllers),
-        "columns": columns(benchmark),
-        "distributions": [column.heading for column in DISTRIBUTIONS],
-        "curves": [[curve.key, curve.unit, curve.resolution] for curve in CURVES],
-        "shared": [[curve.key, curve.unit, curve.resolution] for curve in SHARED],
-        "scenarios": [_scenario(benchmark, scenario) for scenario in benchmark.scenarios],
-    }
+def _table(scenario: ScenarioResult) -> str:
+    """Every metric of a scenario, the lowest RMSE first."""
+    columns = (*tables.ERROR, *tables.comparison(scenario), *tables.DRIVES)
+    heads = _each("th", ("controller", *(column.heading for column in columns)))
+    ranked = sorted(scenario.outcomes, key=lambda outcome: outcome.means[tables.RMSE.metric].mean)
+    lines = "\n".join(
+        f"<tr>{_name(outcome, scenario)}{''.join(_cell(outcome, column) for column in columns)}</tr>"
+        for outcome in ranked
+    )
+    row, count = scenario.row, tables.crystals(len(scenario.seeds))
+    about = escape(f"{row.name}: {row.meaning}. {count}. {measured_from(scenario).replace('`', '')}")
+    return (
+        f'<div class="scenario"><p class="note">{about}</p><div class="scroll"><table class="metrics">\n'
+        f"<thead><tr>{heads}</tr></thead>\n<tbody>\n{lines}\n</tbody></table></div></div>"
+    )
 
 
-def _controllers(controllers: tuple[Controller, ...]) -> list[dict[str, Any]]:
-    ranked = sorted(controllers, key=lambda controller: not controller.learned)
-    looks = styles([controller.name for controller in ranked])
-    used: list[str] = []
-    dashes = {}
-    for name, look in looks.items():
-        dashes[name] = DASHES[used.count(look.colour) % len(DASHES)]
-        used.append(look.colour)
-    return [
-        {
-            "name": controller.name,
-            "meaning": controller.meaning,
-            "reads": controller.observation,
-            "training_seeds": list(controller.training_seeds),
-            "bound": controller.bound,
-            "colour": looks[controller.name].colour,
-            "symbol": SYMBOLS[looks[controller.name].marker],
-            "dash": dashes[controller.name],
-        }
-        for controller in controllers
-    ]
+def _name(outcome: Outcome, scenario: ScenarioResult) -> str:
+    name, who = escape(tables.label(outcome, scenario)), outcome.controller
+    bound = "<small>bound: knows what no sensor shows</small>" if who.bound else ""
+    return f'<th data-value="{name}" title="{escape(who.meaning)}">{name}{bound}</th>'
 
 
-def _scenario(benchmark: Benchmark, scenario: ScenarioResult) -> dict[str, Any]:
-    return {
-        "name": scenario.row.name,
-        "meaning": scenario.row.meaning,
-        "seeds": list(scenario.seeds),
-        "rivals": sorted({verdict.rival for verdict in scenario.verdicts}),
-        "rows": rows(benchmark, scenario),
-        "distributions": distributions(scenario),
-    }
+def _cell(outcome: Outcome, column: tables.Column) -> str:
+    estimate = column.estimate(outcome)
+    mean, _, interval = column.text(estimate).partition(" ")
+    return f'<td data-value="{estimate.mean if estimate else ""}">{mean}<small>{interval}</small></td>'
+
+
+def _each(tag: str, texts: Iterable[str]) -> str:
+    return "".join(f"<{tag}>{escape(text)}</{tag}>" for text in texts)
 
 
 def _asset(name: str) -> str:

@@ -1,106 +1,137 @@
-"""The signals of the page's episodes: in the units people read, rounded, packed small.
+"""The page's crystals: every signal of the first episodes in panels over one time axis, rounded and packed small.
 
-A packed array is a base64 text of zlib's deflate of variable-length integers: values in steps of the signal's
-resolution, then differences along time, zigzag (0, -1, 1, -2, ... become 0, 1, 2, 3, ...), seven bits a byte, the low
-ones first. Smooth signals take about half a byte a value; ``html/data.js`` reads them in the browser.
+A packed text is base64 of zlib's deflate of 32-bit differences along time, in steps of the panel's resolution: first
+the low bytes of all numbers, then the next ones. Smooth signals take about half a byte a value.
 """
 
 from __future__ import annotations
 
 import base64
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from plotly import graph_objects as go
+from plotly.subplots import make_subplots
 
 from cz_gym.config import Config
-from cz_gym.evaluation.results import ScenarioResult
+from cz_gym.evaluation.metrics import TOLERANCE
+from cz_gym.evaluation.results import REFERENCE, Controller, Sample, ScenarioResult
 from cz_gym.evaluation.rollout import Signals
-from cz_gym.units import KILO, MM, MM_PER_MIN
+from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 from cz_gym.vector import CzVectorEnv
 
+from .canvas import GREY, INK, Style
+from .page_figures import plain
+
 Floats = npt.NDArray[np.float64]
-Bytes = npt.NDArray[np.uint8]
-BITS = 7
-"""Bits of a number in each byte; the eighth says that more follow."""
+OUTLIERS = 0.001
+"""Share of the values at either end that a panel's range need not hold."""
 
 
-class Curve(NamedTuple):
-    """A logged signal as the page shows it."""
+class Panel(NamedTuple):
+    """Lines over time that share an axis."""
 
-    key: str
+    title: str
     unit: str
     scale: float
-    """The unit in the signal's own [SI]."""
+    """The unit in SI."""
     resolution: float
     """Values are rounded to a multiple of this [unit]."""
-    signal: str = ""
-    """Its field of Signals, where that is not the key."""
-    ring: bool = False
-    """Whether the operator's bias is taken off, as the ring's readings are shown."""
-
-    def value(self, signals: Signals, bias: float) -> Floats:
-        """The signal in its unit, the operator's bias in m."""
-        logged: Floats = getattr(signals, self.signal or self.key)
-        return (logged - bias * self.ring) / self.scale
+    lines: Mapping[str, Callable[[Signals, float], Floats]]
+    """From an episode's signals and the operator's bias [m], in SI: ``true``, and by what the ``camera`` reports, of
+    each controller; any other is what all controllers are asked for or meet."""
+    levels: tuple[float, ...] = ()
+    """Values that are marked [unit]."""
 
 
-CURVES = (
-    Curve("r_c", "mm", MM, 0.001),
-    Curve("camera", "mm", MM, 0.001, "r_br_measured", ring=True),
-    Curve("ring", "mm", MM, 0.001, "r_br", ring=True),
-    Curve("h_c", "mm", MM, 0.001),
-    Curve("alpha_c", "deg", np.pi / 180.0, 0.001),
-    Curve("v_p", "mm/min", MM_PER_MIN, 0.0005),
-    Curve("v_g", "mm/min", MM_PER_MIN, 0.0005),
-    Curve("Q_H", "kW", KILO, 0.001),
-    Curve("T_1", "K", 1.0, 0.01),
-    Curve("T_b", "K", 1.0, 0.001),
-)
-"""What a controller does to a crystal."""
-SHARED = (
-    Curve("r_ref", "mm", MM, 0.001),
-    Curve("T_1_ref", "K", 1.0, 0.01),
-    Curve("offset", "mm", MM, 0.001, "ring_offset"),
-)
-"""What is the same for every controller on that crystal."""
+PANELS = (
+    Panel("crystal radius", "mm", MM, 0.001, {"true": lambda s, bias: s.r_c, "reference": lambda s, bias: s.r_ref}),
+    Panel(
+        "radius error", "mm", MM, 0.001,
+        {"camera": lambda s, bias: s.r_br_measured - bias - s.r_ref, "true": lambda s, bias: s.r_c - s.r_ref},
+        (-TOLERANCE / MM, 0.0, TOLERANCE / MM),
+    ),
+    Panel(
+        "bright ring less radius", "mm", MM, 0.001,
+        {
+            "camera": lambda s, bias: s.r_br_measured - bias - s.r_c,
+            "true": lambda s, bias: s.r_br - bias - s.r_c,
+            "hidden offset": lambda s, bias: s.ring_offset,
+        },
+        (0.0,),
+    ),
+    Panel("pull speed", "mm/min", MM_PER_MIN, 0.0005, {"true": lambda s, bias: s.v_p}),
+    Panel("growth rate", "mm/min", MM_PER_MIN, 0.0005, {"true": lambda s, bias: s.v_g}),
+    Panel("heater power", "kW", KILO, 0.001, {"true": lambda s, bias: s.Q_H}),
+    Panel("heater temperature", "K", 1.0, 0.01, {"true": lambda s, bias: s.T_1, "recipe": lambda s, bias: s.T_1_ref}),
+    Panel("melt temperature", "K", 1.0, 0.001, {"true": lambda s, bias: s.T_b}),
+    Panel("meniscus height", "mm", MM, 0.001, {"true": lambda s, bias: s.h_c}),
+    Panel("growth angle", "deg", np.pi / 180.0, 0.001, {"true": lambda s, bias: s.alpha_c}, (0.0,)),
+)  # fmt: skip
+_LINES = [(panel, name) for panel in range(len(PANELS)) for name in PANELS[panel].lines]
+OWN = [(panel, name) for panel, name in _LINES if name in ("true", "camera")]
+"""Panel and name of the lines that each controller has, in the order in which they are packed."""
+SHARED = [line for line in _LINES if line not in OWN]
+"""Of those that are the same for all controllers."""
 
 
-def episodes(scenario: ScenarioResult) -> list[dict[str, Any]]:
-    """The scenario's kept episodes: seed, what all controllers share, and each controller's curves or None."""
+def crystals(scenario: ScenarioResult) -> list[dict[str, Any]]:
+    """The scenario's episodes with signals: seed, the panels' ranges, packed lines by controller, then the shared ones.
+
+    A panel's range is that of the crystals that were not lost: one that was leaves the panel.
+    """
     samples = [outcome.sample for outcome in scenario.outcomes]
     seeds = scenario.seeds[: max(len(sample.examples) for sample in samples)]
     found = []
     for i, (seed, bias) in enumerate(zip(seeds, ring_biases(scenario.row.config(), seeds), strict=True)):
-        here = [_finite(sample.examples[i]) if i < len(sample.examples) else None for sample in samples]
-        longest = max((signals for signals in here if signals is not None), key=lambda signals: len(signals.r_c))
+        runs = [_values(OWN, sample.examples[i], bias) if i < len(sample.examples) else None for sample in samples]
+        longest = max((sample.examples[i] for sample in samples if i < len(sample.examples)), key=lambda s: len(s.r_c))
+        shared = _values(SHARED, longest, bias)
+        there = [(run, sample) for run, sample in zip(runs, samples, strict=True) if run]
+        whole = [run for run, sample in there if not _lost(sample, i)] or [run for run, _ in there]
         found.append(
             {
-                "seed": seed,
-                "steps": len(longest.r_c),
-                "packed": pack([(curve.value(longest, bias), curve.resolution) for curve in SHARED]),
-                "runs": [
-                    None
-                    if signals is None
-                    else {
-                        "steps": len(signals.r_c),
-                        "failed": bool(sample.metric("failure_rate")[0, i]),
-                        "rmse_mm": float(f"{sample.metric('rmse_mm')[0, i]:.5g}"),
-                        "packed": pack([(curve.value(signals, bias), curve.resolution) for curve in CURVES]),
-                    }
-                    for sample, signals in zip(samples, here, strict=True)
-                ],
+                "seed": f"{seed:,}",
+                "names": [_name(sample, i) for sample in samples],
+                "ranges": [_range(panel, [*whole, shared]) for panel in range(len(PANELS))],
+                "packed": [run and pack(run) for run in [*runs, shared]],
             }
         )
     return found
 
 
-def _finite(signals: Signals) -> Signals:
-    """The signals up to the first step at which one of them is no number: a crystal that broke the equations."""
-    broken = ~np.isfinite(np.stack(signals)).all(axis=0)
-    return Signals(*(signal[: int(broken.argmax())] for signal in signals)) if broken.any() else signals
+Line = tuple[int, Floats]
+"""Its panel, and values in the panel's unit."""
+
+
+def _values(lines: Sequence[tuple[int, str]], signals: Signals, bias: float) -> list[Line]:
+    """The lines, up to the first step at which one is no number: a crystal that broke the equations."""
+    values = np.array([PANELS[panel].lines[name](signals, bias) / PANELS[panel].scale for panel, name in lines])
+    steps = int(np.isfinite(values).all(axis=0).cumprod().sum())
+    return [(panel, each[:steps]) for (panel, _), each in zip(lines, values, strict=True)]
+
+
+def _lost(sample: Sample, i: int) -> bool:
+    return bool(sample.metric("failure_rate")[0, i])
+
+
+def _name(sample: Sample, i: int) -> str:
+    """The controller's name with its RMSE on that crystal."""
+    if i >= len(sample.examples):
+        return f"{plain(sample.controller.name)}: not run"
+    lost = ", lost" if _lost(sample, i) else ""
+    return f"{plain(sample.controller.name)}: {sample.metric('rmse_mm')[0, i]:.3f} mm{lost}"
+
+
+def _range(panel: int, runs: Sequence[Sequence[Line]]) -> tuple[float, float]:
+    ends = list(PANELS[panel].levels)
+    for values in (values for run in runs for where, values in run if where == panel and len(values)):
+        ends += np.quantile(values, [OUTLIERS, 1.0 - OUTLIERS]).tolist()
+    margin = max(0.08 * (max(ends) - min(ends)), 5.0 * PANELS[panel].resolution)
+    return min(ends) - margin, max(ends) + margin
 
 
 def ring_biases(config: Config, seeds: Sequence[int]) -> tuple[float, ...]:
@@ -112,34 +143,40 @@ def ring_biases(config: Config, seeds: Sequence[int]) -> tuple[float, ...]:
     return tuple(float(state.slot.slot["puller"]["ring_bias"]) for state in states)
 
 
-def pack(signals: Sequence[tuple[Floats, float]]) -> str:
-    """Arrays of one length, each with its resolution, as a text."""
-    steps = [np.rint(values / resolution).astype(np.int64) for values, resolution in signals]
-    changes = np.concatenate([np.diff(whole, prepend=0) for whole in steps])
-    zigzag = np.where(changes < 0, -2 * changes - 1, 2 * changes)
-    return base64.b64encode(zlib.compress(_varints(zigzag).tobytes(), 9)).decode("ascii")
+def pack(lines: Sequence[Line]) -> str:
+    """Lines of one length as a text, which ``html/page.js`` unpacks."""
+    whole = [np.rint(values / PANELS[panel].resolution) for panel, values in lines]
+    changes = np.diff(whole, axis=1, prepend=0.0).astype("<i4")
+    return base64.b64encode(zlib.compress(changes.reshape(-1, 1).view(np.uint8).T.tobytes(), 9)).decode("ascii")
 
 
-def unpack(text: str, resolutions: Sequence[float]) -> tuple[Floats, ...]:
-    """The arrays that :func:`pack` packed, rounded to their resolutions."""
-    raw = np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8)
-    ends = np.flatnonzero(raw < 1 << BITS)
-    begins = np.concatenate([[0], ends[:-1] + 1])
-    place = np.arange(len(raw)) - np.repeat(begins, ends - begins + 1)
-    parts = (raw & ((1 << BITS) - 1)).astype(np.int64) << (BITS * place)
-    zigzag = np.add.reduceat(parts, begins)
-    changes = np.where(zigzag % 2, -(zigzag + 1) // 2, zigzag // 2)
-    whole = np.cumsum(changes.reshape(len(resolutions), -1), axis=1)
-    return tuple(row * resolution for row, resolution in zip(whole, resolutions, strict=True))
+def frame(
+    controllers: Sequence[Controller], rivals: Sequence[str], styles: Mapping[str, Style], horizon: float
+) -> go.Figure:
+    """The panels over the ``horizon`` [s], without values: traces in the order in which a crystal's lines are packed.
 
-
-def _varints(numbers: npt.NDArray[np.int64]) -> Bytes:
-    """Seven bits a byte, the low ones first; the high bit says that more follow."""
-    width = max(1, -(-int(numbers.max(initial=0)).bit_length() // BITS))
-    shifted = numbers[:, None] >> (BITS * np.arange(width))
-    follows = np.concatenate([shifted[:, 1:] > 0, np.zeros((len(numbers), 1), np.bool_)], axis=1)
-    digits = (shifted & ((1 << BITS) - 1)) | (follows.astype(np.int64) << BITS)
-    used = shifted > 0
-    used[:, 0] = True
-    packed: Bytes = digits[used].astype(np.uint8)
-    return packed
+    The learned, the reference and their ``rivals`` are drawn; a click on a name in the legend draws others.
+    """
+    titles = [f"{panel.title} [{panel.unit}]" for panel in PANELS]
+    figure = make_subplots(len(PANELS), 1, shared_xaxes=True, vertical_spacing=0.02, subplot_titles=titles)
+    some = {each.name for each in controllers if each.learned or each.name in (REFERENCE, *rivals)}
+    for group, controller in enumerate(controllers):
+        style, drawn = styles[controller.name], controller.name in some or not some
+        for number, (panel, name) in enumerate(OWN):
+            figure.add_scatter(
+                row=panel + 1, col=1, x=[], y=[], mode="lines", legendgroup=f"{group}", showlegend=number == 0,
+                line={"color": style.colour, "dash": style.dash, "width": 1.5 if name == "true" else 0.8},
+                opacity=1.0 if name == "true" else 0.35, visible=True if drawn else "legendonly",
+            )  # fmt: skip
+    for panel, name in SHARED:
+        line = {"color": INK, "dash": "dash", "width": 1.3}
+        figure.add_scatter(row=panel + 1, col=1, x=[], y=[], name=name, mode="lines", line=line, showlegend=False)
+    for panel in range(len(PANELS)):
+        for level in PANELS[panel].levels:
+            figure.add_hline(
+                level, row=panel + 1, col=1, line={"color": GREY, "width": 1, "dash": "dot"}, layer="below"
+            )
+    figure.update_xaxes(range=[0.0, horizon / MINUTE], hoverformat=".2f")
+    figure.update_xaxes(title="time [min]", row=len(PANELS), col=1)
+    legend = {"orientation": "h", "y": 1.02, "yanchor": "bottom", "groupclick": "togglegroup"}
+    return figure.update_layout(legend=legend, height=150 * len(PANELS), hovermode="x", uirevision="same")

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 
 import benchmark
+import cz_gym
+from cz_gym.atomic_files import write_files
 from cz_gym.baselines import registry
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
 from cz_gym.baselines.pid.open_loop import OpenLoop
 from cz_gym.config import make_config
-from cz_gym.evaluation import results
+from cz_gym.evaluation import cache, results
 from cz_gym.evaluation import runner as run
-from cz_gym.evaluation.cache import slow_controllers as kept
-from cz_gym.evaluation.cache.bound import kept_bound
-from cz_gym.evaluation.cache.code import PACKAGE, code_behind, code_hash, hash_sources, own_sources
-from cz_gym.evaluation.files import to_csv, to_json, write_files
+from cz_gym.evaluation.cache import code_behind, earlier_bound, hash_sources, sources_behind
+from cz_gym.evaluation.files import to_csv, to_json
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.protocol import TEST_SEEDS, find_row
 from cz_gym.evaluation.report.markdown import markdown
@@ -46,7 +46,7 @@ class Snail(OpenLoop):
 
 
 def sample(folder: Path, policy: Any = None, config: Any = CONFIG, seeds: Any = SEEDS) -> Sample:
-    return kept.slow_sample(WHO, policy or Snail(), config, seeds, folder, lambda steps: None)
+    return cache.slow_sample(WHO, policy or Snail(), config, seeds, folder, lambda steps: None)
 
 
 @pytest.fixture
@@ -58,8 +58,8 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         ran.extend(seeds)
         return rollout(policy, config, seeds, progress)
 
-    monkeypatch.setattr(kept, "rollout", counting)
-    monkeypatch.setattr(kept, "BLOCK", 2)
+    monkeypatch.setattr(cache, "rollout", counting)
+    monkeypatch.setattr(cache, "BLOCK", 2)
     return ran
 
 
@@ -89,11 +89,11 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, monkeypatch
         ran.extend(seeds)
         return rollout(policy, config, seeds, progress)
 
-    monkeypatch.setattr(kept, "BLOCK", 2)
-    monkeypatch.setattr(kept, "rollout", interrupted)
+    monkeypatch.setattr(cache, "BLOCK", 2)
+    monkeypatch.setattr(cache, "rollout", interrupted)
     with pytest.raises(KeyboardInterrupt):
         sample(tmp_path)
-    monkeypatch.setattr(kept, "rollout", lambda policy, config, seeds, progress: rollout(policy, config, seeds))
+    monkeypatch.setattr(cache, "rollout", lambda policy, config, seeds, progress: rollout(policy, config, seeds))
     assert sample(tmp_path).values.shape == (1, 5, len(metric_names()))
     assert ran == [0, 1, 2, 3]
 
@@ -124,7 +124,7 @@ def test_signals_are_kept_of_the_first_episodes_alone(
 ) -> None:
     direct = rollout(OpenLoop(), CONFIG, SEEDS)
     for examples in (1, 3, 2):
-        monkeypatch.setattr(kept, "EXAMPLES", examples)
+        monkeypatch.setattr(cache, "EXAMPLES", examples)
         found = sample(tmp_path)
         assert len(found.examples) == examples
         for i, shown in enumerate(found.examples):
@@ -145,9 +145,11 @@ def test_code_counts_and_text_does_not(tmp_path: Path) -> None:
 @pytest.mark.parametrize("room", ["physics", "episodes", "engine", "task.py", "evaluation/metrics.py"])
 def test_whatever_makes_a_figure_is_in_the_key(room: str) -> None:
     """Kernels, sensors, draws and random streams were once left out."""
-    place = PACKAGE / room
-    assert {*(place.rglob("*.py") if place.is_dir() else [place])} <= {*own_sources()}
-    assert code_behind(Snail()) == code_hash(__file__) != code_behind(Clairvoyant())
+    place = Path(cz_gym.__file__).parent / room
+    sources = sources_behind(Snail.__module__)
+    assert {*(place.rglob("*.py") if place.is_dir() else [place])} <= {*sources}
+    assert sources[-1] == Path(__file__)
+    assert code_behind(Snail.__module__) == hash_sources(sources) != code_behind(Clairvoyant.__module__)
 
 
 def made(name: str, errors: list[float], costs: list[float] | None = None, **facts: Any) -> Sample:
@@ -175,7 +177,7 @@ def test_different_numbers_of_episodes_meet_on_those_of_both() -> None:
     samples = [
         made("paper", [1.0, 2.0, 30.0], [8.0, 4.0, 99.0]),
         made("lqg", [0.5, 0.4, 9.0], [3.0, 1.0, 99.0]),
-        made("clairvoyant", [0.0, 0.1], [1.0, 1.0], told=True),
+        made("clairvoyant", [0.0, 0.1], [1.0, 1.0], privileged=True),
         made("mpc", [0.6, 0.5]),
         made("ppo", [0.4, 0.3, 9.0], training_seeds=(0,)),
     ]
@@ -204,7 +206,7 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setattr(benchmark, "SHIPPED", ())
     monkeypatch.setattr(registry, "CONTROLLERS", (*quick, snail))
     monkeypatch.setattr(run, "SLOW_EPISODES", 2)
-    monkeypatch.setattr(benchmark, "KEPT", tmp_path / "kept")
+    monkeypatch.setattr(benchmark, "CACHE", tmp_path / "cache")
     return tmp_path / "out"
 
 
@@ -222,7 +224,7 @@ def test_the_command_shows_how_many_episodes_a_slow_controller_met(small: Path) 
     assert "| clairvoyant (n = 2) |" in (small / "report.md").read_text()
     rows = list(csv.DictReader((small / "episodes.csv").read_text().splitlines()))
     assert [row["seed"] for row in rows if row["controller"] == "clairvoyant"] == ["2000000", "2000001"]
-    assert len(list((small.parent / "kept").glob("clairvoyant-randomized-*/*.npz"))) == 2
+    assert len(list((small.parent / "cache").glob("clairvoyant-randomized-*/*.npz"))) == 2
 
 
 def taking_part(arguments: list[str]) -> list[str]:
@@ -266,7 +268,7 @@ def paper() -> Sample:
 @pytest.fixture
 def earlier(tmp_path: Path, paper: Sample) -> Path:
     """A folder with the results of an earlier run with a bound, on two crystals."""
-    samples = (paper, made("clairvoyant", [0.1, 0.2], [0.3, 0.5], told=True, slow=True))
+    samples = (paper, made("clairvoyant", [0.1, 0.2], [0.3, 0.5], privileged=True, slow=True))
     here = [replace(sample, seeds=TEST_SEEDS[:2]) for sample in samples]
     done = benchmark_of(*here)
     folder = tmp_path / "earlier"
@@ -274,7 +276,9 @@ def earlier(tmp_path: Path, paper: Sample) -> Path:
     return folder
 
 
-def test_gaps_are_measured_from_the_kept_bound(earlier: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gaps_are_measured_from_the_earlier_bound(
+    earlier: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(benchmark, "BOUNDS", earlier)
     arguments = ["--episodes", "3", "--scenarios", "randomized,hard", "--controllers", "open-loop,paper"]
     assert benchmark.main([*arguments, "--out", str(tmp_path / "new"), "--quiet"]) == 0
@@ -291,7 +295,7 @@ def test_gaps_are_measured_from_the_kept_bound(earlier: Path, tmp_path: Path, mo
         assert found["n"] == 2
     assert data["provenance"]["gap_from_kept_episodes"] == {"randomized": 2}
     report = (tmp_path / "new" / "report.md").read_text()
-    assert "kept from an earlier run (results/bounds), on the first 2 crystals" in report
+    assert "`clairvoyant` of an earlier run (results/bounds), on the first 2 crystals" in report
     assert "`python benchmark.py --slow --controllers paper,clairvoyant --scenarios hard` runs it" in report
 
 
@@ -310,33 +314,33 @@ def test_a_bound_of_another_plant_or_no_benchmark_at_all_is_not_used(
     earlier: Path, paper: Sample, old: str, new: str
 ) -> None:
     row, path = find_row("randomized"), earlier / "benchmark.json"
-    found = kept_bound(earlier, row, [paper])
+    found = earlier_bound(earlier, row, [paper])
     assert found is not None
     assert found.seeds == (2_000_000, 2_000_001)
     assert found.controller.bound
     np.testing.assert_allclose(found.metric("cost"), [[0.3, 0.5]])
     path.write_text(path.read_text().replace(old, new))
-    assert kept_bound(earlier, row, [paper]) is None
+    assert earlier_bound(earlier, row, [paper]) is None
 
 
 def test_a_bound_beside_other_figures_of_the_same_controller_is_not_used(earlier: Path, paper: Sample) -> None:
     """Code that moves the paper's figures moves the bound's too."""
     row = find_row("randomized")
     moved = replace(paper, values=paper.values * 1.001)
-    assert kept_bound(earlier, row, [paper]) is not None
-    assert kept_bound(earlier, row, [moved]) is None
-    assert kept_bound(earlier, row, []) is None
+    assert earlier_bound(earlier, row, [paper]) is not None
+    assert earlier_bound(earlier, row, [moved]) is None
+    assert earlier_bound(earlier, row, []) is None
 
 
 def test_a_kept_bound_needs_its_episodes_from_the_first_on(earlier: Path, paper: Sample) -> None:
     row, table = find_row("randomized"), earlier / "episodes.csv"
     whole = table.read_text()
-    assert kept_bound(earlier, find_row("hard"), [paper]) is None
+    assert earlier_bound(earlier, find_row("hard"), [paper]) is None
     for broken in (whole.replace(",2000000,", ",2000001,"), whole.replace("cost", "price"), "", whole[:-9] + "nan\n"):
         table.write_text(broken)
-        assert kept_bound(earlier, row, [paper]) is None
+        assert earlier_bound(earlier, row, [paper]) is None
     table.unlink()
-    assert kept_bound(earlier, row, [paper]) is None
+    assert earlier_bound(earlier, row, [paper]) is None
 
 
 def benchmark_of(*samples: Sample) -> results.Benchmark:

@@ -1,0 +1,199 @@
+"""Episodes that need not run again: a slow controller's, cached on disk, and the bound's of an earlier benchmark.
+
+The cache has one file an episode, in a folder named by controller, scenario and a hash of all that its results depend
+on: the controller's settings, the environment's (plant, scenario, interval, horizon), and the code of both.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import io
+import json
+import sys
+import zipfile
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.atomic_files import write_files
+from cz_gym.config import Config
+from cz_gym.jit.cache import compiled_sources
+
+from .files import EPISODES, RESULTS, read_episodes
+from .metrics import metric_names, metrics
+from .protocol import Row
+from .results import BOUND, EXAMPLES, Controller, Sample
+from .rollout import Rollout, Signals, rollout
+
+Floats = npt.NDArray[np.float64]
+BLOCK = 10
+"""Episodes run at once."""
+MAX_BYTES = 64_000_000
+"""Largest cached episode that is read, packed or not."""
+PRINTED = 1e-4
+"""Relative precision of the figures in ``episodes.csv``, five digits [-]."""
+
+
+class CachedEpisode(NamedTuple):
+    """What the cache has of one episode."""
+
+    values: Floats
+    """Shape (metrics,)."""
+    microseconds: float
+    """Time in the policy per step [us]."""
+    signals: Floats
+    """Signals of one of the first episodes, shape (signals, steps); of the others empty."""
+
+
+def slow_sample(
+    controller: Controller,
+    policy: Any,
+    config: Config,
+    seeds: Sequence[int],
+    folder: Path,
+    progress: Callable[[int], None],
+) -> Sample:
+    """The sample of a slow controller; cached episodes are read, the others run, a few at a time, and cached.
+
+    ``policy`` has a ``hash`` of its settings.
+    """
+    place = _place(controller, policy, config, folder)
+    examples = seeds[:EXAMPLES]
+    cached = {seed: found for seed in seeds if (found := read_episode(place / f"{seed}.npz", seed in examples))}
+    progress(config.steps * len(cached))
+    missing = [seed for seed in seeds if seed not in cached]
+    for first in range(0, len(missing), BLOCK):
+        run = rollout(policy, config, missing[first : first + BLOCK], progress)
+        new = dict(zip(run.seeds, _episodes(run, examples), strict=True))
+        write_files({place / f"{seed}.npz": _packed(episode) for seed, episode in new.items()})
+        cached |= new
+    ordered = [cached[seed] for seed in seeds]
+    values = np.array([[episode.values for episode in ordered]])
+    microseconds = float(np.mean([episode.microseconds for episode in ordered]))
+    signals = tuple(Signals(*episode.signals) for episode in ordered[: len(examples)])
+    return Sample(controller, tuple(seeds), values, microseconds, signals, config.control_interval)
+
+
+def is_cached(controller: Controller, policy: Any, config: Config, seeds: Sequence[int], folder: Path) -> bool:
+    """Whether :func:`slow_sample` would have nothing to run."""
+    place = _place(controller, policy, config, folder)
+    return all(read_episode(place / f"{seed}.npz", seed in seeds[:EXAMPLES]) for seed in seeds)
+
+
+def _place(controller: Controller, policy: Any, config: Config, folder: Path) -> Path:
+    parts = [controller.name, policy.hash, code_behind(type(policy).__module__), config.hash, *metric_names()]
+    digest = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
+    return folder / f"{controller.name}-{config.scenario.name}-{digest}"
+
+
+def read_episode(path: Path, example: bool) -> CachedEpisode | None:
+    """A cached episode, with its signals if it is an ``example``; None if there is none that can be used."""
+    try:
+        with open(path, "rb") as file:
+            content = file.read(MAX_BYTES + 1)
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            # What is packed may be a thousand times larger than the file.
+            if len(content) > MAX_BYTES or sum(part.file_size for part in archive.infolist()) > MAX_BYTES:
+                return None
+        with np.load(io.BytesIO(content), allow_pickle=False) as data:
+            found = CachedEpisode(data["values"], float(data["microseconds"]), data["signals"])
+    except Exception:  # zipfile, zlib and NumPy each raise their own for the ways a file can be broken
+        return None
+    signals = found.signals
+    logged = signals.ndim == 2 and len(signals) == len(Signals._fields) and signals.size > 0
+    numbers = found.values.dtype == signals.dtype == np.float64
+    return found if numbers and found.values.shape == (len(metric_names()),) and (logged or not example) else None
+
+
+def _episodes(run: Rollout, examples: Sequence[int]) -> list[CachedEpisode]:
+    values = np.stack(metrics(run), axis=-1)
+    signals = [np.stack(run.episode(i)) if seed in examples else np.zeros((0, 0)) for i, seed in enumerate(run.seeds)]
+    return [CachedEpisode(values[i], run.microseconds_per_step, signals[i]) for i in range(len(run.seeds))]
+
+
+def _packed(episode: CachedEpisode) -> bytes:
+    file = io.BytesIO()
+    np.savez_compressed(file, values=episode.values, microseconds=episode.microseconds, signals=episode.signals)
+    return file.getvalue()
+
+
+def earlier_bound(folder: Path, row: Row, samples: Sequence[Sample]) -> Sample | None:
+    """The bound on that row, from a folder of benchmark results, which has neither its signals nor its time.
+
+    None unless that benchmark met the row's own first test episodes: same plant and scenario by their hashes, same
+    model, meniscus, interval, horizon and first seeds. And unless each classical controller that ran then and now, one
+    at least, has the same figures on them: other code makes other figures.
+    """
+    columns = ("seed", *metric_names())
+    try:
+        provenance = json.loads((folder / RESULTS).read_text("utf-8"))["provenance"]
+        found = read_episodes(folder / EPISODES, lambda scenario: columns if scenario == row.name else ())[row.name]
+        facts, (episodes,) = provenance["controllers"][BOUND], found[BOUND]
+        controller = Controller(BOUND, facts["observation"], facts["meaning"], privileged=True, slow=True)
+        seeds = row.seeds(len(episodes))
+        same_crystals = _same_crystals(provenance, row) and episodes[:, 0].tolist() == list(seeds)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    agree = [
+        _agree(sample, found[sample.controller.name][0])
+        for sample in samples
+        if sample.controller.name in found and not sample.controller.learned
+    ]
+    if not (same_crystals and agree and all(agree)):
+        return None
+    return Sample(controller, tuple(seeds), episodes[None, :, 1:], float("nan"), (), row.control_interval)
+
+
+def _agree(sample: Sample, earlier: Floats) -> bool:
+    """Whether a controller has the figures it had earlier, shape (episodes, 1 + metrics), on the crystals met twice."""
+    both = min(len(sample.seeds), len(earlier))
+    same_seeds = earlier[:both, 0].tolist() == list(sample.seeds[:both])
+    return same_seeds and np.allclose(sample.values[0, :both], earlier[:both, 1:], rtol=PRINTED)
+
+
+def _same_crystals(provenance: dict[str, Any], row: Row) -> bool:
+    """Whether those results are of the row's plant and scenario."""
+    config, theirs = row.config(), provenance["scenarios"][row.name]
+    ours = {
+        "hash": config.scenario.hash,
+        "model": row.model,
+        "control_interval_s": config.control_interval,
+        "meniscus": row.meniscus.name,
+    }
+    same_plant = (provenance["plant_hash"], provenance["horizon_s"]) == (config.plant_hash, config.horizon)
+    return same_plant and all(theirs[name] == value for name, value in ours.items())
+
+
+@cache
+def code_behind(module: str) -> str:
+    """Hash of all code that the episodes of a policy of that module come from."""
+    return hash_sources(sources_behind(module))
+
+
+def sources_behind(module: str) -> list[Path]:
+    """Sources of plant, environment and metrics, and the policy's module, or the whole package of it if it is ours."""
+    package = ".".join(module.split(".")[:2]) if module.startswith("cz_gym.") else module
+    file = Path(str(sys.modules[package].__file__))
+    policy = sorted(file.parent.rglob("*.py")) if file.name == "__init__.py" else [file]
+    return [*compiled_sources(), *(Path(__file__).with_name(name) for name in ("rollout.py", "metrics.py")), *policy]
+
+
+def hash_sources(files: Iterable[Path]) -> str:
+    """SHA-256 of what these Python files say but for comments, docstrings and line breaks (16 hex digits)."""
+    digest = hashlib.sha256()
+    for file in files:
+        tree = ast.parse(file.read_bytes())
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+                node.body = [
+                    part
+                    for part in node.body
+                    if not (isinstance(part, ast.Expr) and isinstance(part.value, ast.Constant))
+                ]
+        digest.update(file.name.encode() + b"\0" + ast.dump(tree).encode() + b"\0")
+    return digest.hexdigest()[:16]

@@ -1,1 +1,0 @@
-"""Episodes that were run before: of slow controllers, and of the bound."""

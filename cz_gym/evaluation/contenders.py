@@ -1,0 +1,105 @@
+"""Who takes part in a benchmark: controllers and agents, each with the way to build it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from cz_gym.config import Config
+
+from .protocol import ROWS, SLOW_EPISODES
+from .results import Controller
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A controller and how to build it for an environment's settings: one policy a training seed."""
+
+    controller: Controller
+    make: Callable[[Config], Sequence[Any]]
+    default: bool = True
+    """Whether it takes part where no names are given."""
+    contracts: tuple[Mapping[str, Any], ...] = ()
+    """Contracts of the agent files it is made of."""
+
+    @property
+    def name(self) -> str:
+        """What it is called."""
+        return self.controller.name
+
+
+def agent(name: str, policies: Sequence[Any], make: Callable[[Config], Sequence[Any]], remark: str = "") -> Contender:
+    """A learned contender: policies with a ``contract``, one a training seed of the same agent.
+
+    Raises ValueError if they are no such set, or were not trained at the benchmark's control interval.
+    """
+    contracts = [policy.contract for policy in policies]
+    seeds = tuple(contract.training_seed for contract in contracts)
+    if len(set(seeds)) < len(seeds):
+        raise ValueError(f"agent {name!r}: a training seed appears twice among {', '.join(map(str, seeds))}")
+    if len({contract.observation for contract in contracts}) > 1:
+        raise ValueError(f"agent {name!r}: its training seeds read different observations")
+    if len({contract.scenario_hash for contract in contracts}) > 1:
+        trained = ", ".join(sorted({contract.scenario for contract in contracts}))
+        raise ValueError(f"agent {name!r}: its training seeds were trained on different scenarios: {trained}")
+    interval = ROWS[0].control_interval
+    for contract in contracts:
+        if contract.control_interval != interval:
+            raise ValueError(
+                f"agent {name!r}: trained at {contract.control_interval:g} s control, the benchmark runs {interval:g} s"
+            )
+    meaning = f"agent trained with {contracts[0].algorithm} on {contracts[0].scenario}{remark}"
+    controller = Controller(name, policies[0].observation, meaning, seeds)
+    return Contender(controller, make, contracts=tuple(_writable(contract) for contract in contracts))
+
+
+def _writable(contract: Any) -> dict[str, Any]:
+    """A contract's fields; ValueError if JSON cannot hold them."""
+    facts = asdict(contract)
+    for name, value in facts.items():
+        try:
+            json.dumps(value, ensure_ascii=False, allow_nan=False).encode()
+        except ValueError:
+            raise ValueError(
+                f"agent {contract.algorithm!r}: its contract's {name} cannot be written: {value!r:.80}"
+            ) from None
+    return facts
+
+
+def choose(
+    wanted: Sequence[str] | None,
+    classical: Sequence[Contender],
+    given: Mapping[str, Contender],
+    shipped: Mapping[str, Callable[[], Contender]],
+    slow: Collection[str] = (),
+) -> tuple[Contender, ...]:
+    """Who takes part, classical controllers first.
+
+    ``wanted`` are names, ``["all"]``, or None for the default. Agents that are ``given`` always take part, ``shipped``
+    ones, which are loaded here, beside them only if they are wanted by name, and slow controllers only if ``slow`` has
+    them. Raises ValueError for a name that nobody has, and one that two have.
+    """
+    names = [each.name for each in classical]
+    learned = list(dict.fromkeys((*given, *shipped)))
+    for name in given:
+        if name in names:
+            raise ValueError(f"an agent may not be called {name!r}: a controller has that name; name it NAME=FILE")
+    if wanted is None or wanted == ["all"]:
+        some = [each for each in classical if each.name in slow or not each.controller.slow]
+        wanted = [each.name for each in some if wanted or each.controller.slow or each.default]
+        wanted += list(given or shipped)
+    for name in wanted:
+        if name not in names + learned:
+            raise ValueError(f"unknown controller {name!r}; choose from {', '.join(names + learned)}, or all")
+    chosen = [each for each in classical if each.name in wanted]
+    for each in chosen:
+        if each.controller.slow and each.name not in slow:
+            raise ValueError(f"{each.name!r} is slow: add --slow to run it on the first {SLOW_EPISODES} episodes")
+    for name in learned:
+        if name in given:
+            chosen.append(given[name])
+        elif name in wanted:
+            chosen.append(shipped[name]())
+    return tuple(chosen)
