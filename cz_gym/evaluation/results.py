@@ -175,11 +175,16 @@ def summarise(row: Row, samples: Sequence[Sample], earlier_bound: Sample | None 
     """
     resamples = cache(Resamples.draw)
     named = {sample.controller.name: sample for sample in samples}
-    if BOUND in named:
-        earlier_bound = None
+    earlier_bound = None if BOUND in named else earlier_bound
     bound = named.get(BOUND, earlier_bound)
     outcomes = tuple(_outcome(sample, named.get(REFERENCE), bound, resamples) for sample in samples)
     return ScenarioResult(row, outcomes, _verdicts(samples, resamples), earlier_bound)
+
+
+def common(*samples: Sample) -> tuple[Sample, ...]:
+    """The samples on the episodes that all of them met, the first ones."""
+    fewest = min(len(sample.seeds) for sample in samples)
+    return tuple(sample.first(fewest) for sample in samples)
 
 
 def _outcome(
@@ -188,39 +193,21 @@ def _outcome(
     names, own = metric_names(), resamples(len(sample.seeds))
     found = dict(zip(names, means(sample.values, own), strict=True))
     found[SPEED] = Estimate(sample.microseconds_per_step, None, len(sample.seeds))
-    tails = {name: cvar(sample.metric(name), own) for name in TAIL_METRICS}
-    outcome = Outcome(sample, found, tails, {}, None)
-    if reference is None:
-        return outcome
-    if bound is not None:
-        gap, gap_radius = _gaps(sample, reference, bound, resamples)
+    outcome = Outcome(sample, found, {name: cvar(sample.metric(name), own) for name in TAIL_METRICS}, {}, None)
+    if reference is not None and bound is not None:
+        ours, theirs, best = common(sample, reference, bound)
+        shared = resamples(len(ours.seeds))
+        cost, error = ([one.metric(name) for one in (ours, theirs, best)] for name in ("cost", "rmse_mm"))
+        gap = optimality_gap(cost[0], cost[1], cost[2], shared)
+        gap_radius = optimality_gap(error[0] ** 2, error[1] ** 2, error[2] ** 2, shared)
         outcome = replace(outcome, gap=gap, gap_radius=gap_radius)
-    if sample is reference:
-        return outcome
-    ours, theirs = common(sample, reference)
-    shared = resamples(len(ours.seeds))
-    paired = dict(zip(names, differences(ours.values, theirs.values, shared), strict=True))
-    better = probability_of_improvement(ours.metric("rmse_mm"), theirs.metric("rmse_mm"), shared)
-    return replace(outcome, paired=paired, improvement=better)
-
-
-def _gaps(
-    sample: Sample, reference: Sample, bound: Sample, resamples: Callable[[int], Resamples]
-) -> tuple[Estimate | None, Estimate | None]:
-    """In cost, and in squared radius error."""
-    ours, theirs, best = common(sample, reference, bound)
-    shared = resamples(len(ours.seeds))
-
-    def gap(lost: Callable[[Sample], Floats]) -> Estimate | None:
-        return optimality_gap(lost(ours), lost(theirs), lost(best), shared)
-
-    return gap(lambda one: one.metric("cost")), gap(lambda one: np.square(one.metric("rmse_mm")))
-
-
-def common(*samples: Sample) -> tuple[Sample, ...]:
-    """The samples on the episodes that all of them met, the first ones."""
-    fewest = min(len(sample.seeds) for sample in samples)
-    return tuple(sample.first(fewest) for sample in samples)
+    if reference is not None and sample is not reference:
+        ours, theirs = common(sample, reference)
+        shared = resamples(len(ours.seeds))
+        paired = dict(zip(names, differences(ours.values, theirs.values, shared), strict=True))
+        better = probability_of_improvement(ours.metric("rmse_mm"), theirs.metric("rmse_mm"), shared)
+        outcome = replace(outcome, paired=paired, improvement=better)
+    return outcome
 
 
 def _verdicts(samples: Sequence[Sample], resamples: Callable[[int], Resamples]) -> tuple[Verdict, ...]:

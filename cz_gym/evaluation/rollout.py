@@ -15,8 +15,6 @@ from cz_gym.units import MICRO
 from cz_gym.vector import CzVectorEnv
 
 Floats = npt.NDArray[np.float64]
-CHUNK = 500
-"""Most episodes in one batch."""
 
 
 class Signals(NamedTuple):
@@ -67,30 +65,19 @@ class Rollout:
 
 
 def rollout(
-    policy: Any,
-    config: Config,
-    seeds: Sequence[int],
-    progress: Callable[[int], None] | None = None,
+    policy: Any, config: Config, seeds: Sequence[int], progress: Callable[[int], None] | None = None
 ) -> Rollout:
-    """Run ``policy.predict`` on one episode a seed, batched.
+    """Run ``policy.predict`` on one episode a seed, all in one batch; ValueError without a seed.
 
     ``progress`` is called with the number of steps done since its last call. A failed episode stops counting; its
-    slot goes on with another crystal that nobody reads. A bound with a method ``for_episodes(config, seeds)`` is
-    replaced by what it returns for each batch: so it is told what no controller knows.
+    slot goes on with another crystal, which nothing reads. A bound with a method ``for_episodes(config, seeds)`` is
+    replaced by what it returns, which knows those episodes.
     """
     if not seeds:
         raise ValueError("a rollout needs at least one seed")
-    parts = [
-        _rollout_chunk(policy, config, list(seeds[first : first + CHUNK]), progress)
-        for first in range(0, len(seeds), CHUNK)
-    ]
-    return parts[0] if len(parts) == 1 else _join(parts)
-
-
-def _rollout_chunk(policy: Any, config: Config, seeds: list[int], progress: Callable[[int], None] | None) -> Rollout:
     before = time.perf_counter()
     if hasattr(policy, "for_episodes"):
-        policy = policy.for_episodes(config, seeds)
+        policy = policy.for_episodes(config, list(seeds))
     course = Course(config, seeds)
     course.seconds = time.perf_counter() - before
     course.run(policy, config.steps, progress)
@@ -153,19 +140,3 @@ class Course:
         return Rollout(
             self.config, self.seeds, self.signals, self.reward, self.alive, self.failed, self.start, self.seconds
         )
-
-
-def _join(parts: list[Rollout]) -> Rollout:
-    def columns(pick: Callable[[Rollout], Any]) -> Any:
-        return np.concatenate([pick(part) for part in parts], axis=-1)
-
-    return Rollout(
-        parts[0].config,
-        tuple(seed for part in parts for seed in part.seeds),
-        Signals(*(columns(lambda part, i=i: part.signals[i]) for i in range(len(Signals._fields)))),  # type: ignore[misc]
-        columns(lambda part: part.reward),
-        columns(lambda part: part.alive),
-        columns(lambda part: part.failed),
-        Signals(*(columns(lambda part, i=i: part.start[i]) for i in range(len(Signals._fields)))),  # type: ignore[misc]
-        sum(part.seconds_in_policy for part in parts),
-    )

@@ -11,8 +11,6 @@ from cz_gym import CzEnv
 from cz_gym.baselines import CompensatedPID, OpenLoop
 from cz_gym.camera import Camera
 from cz_gym.config import Config, make_config
-from cz_gym.evaluation import rollout as module
-from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import Course, Rollout, Signals, rollout
 from cz_gym.observation import MEASURED
 
@@ -106,24 +104,6 @@ def test_a_crystal_does_not_depend_on_its_neighbours() -> None:
     many, one = rollout(CompensatedPID(), SHORT, range(6)), rollout(CompensatedPID(), SHORT, [4])
     for together, alone in zip(many.signals, one.signals, strict=True):
         np.testing.assert_array_equal(together[:, 4:5], alone)
-
-
-def test_a_long_list_of_seeds_is_cut_and_joined(monkeypatch: pytest.MonkeyPatch) -> None:
-    seeds = range(5)
-    whole = rollout(FullPull(), SHORT, seeds)
-    monkeypatch.setattr(module, "CHUNK", 2)
-    parts = rollout(OpenLoopFullPull(), SHORT, seeds)
-    assert parts.seeds == whole.seeds == tuple(seeds)
-    np.testing.assert_array_equal(np.stack(metrics(parts)), np.stack(metrics(whole)))
-
-
-class OpenLoopFullPull:
-    """The same pull without a notebook."""
-
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[np.ndarray, Any]:
-        return np.tile(np.float32([1.0, 0.2]), (len(observation), 1)), None
 
 
 def test_start_is_the_state_before_the_first_step() -> None:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from cz_gym.evaluation.results import Benchmark, Outcome, ScenarioResult
 
 from .canvas import INK, Style, canvas, png, styles_of
 from .crystal import crystal
+from .tables import PULL_STEP, RMSE
 
 Floats = npt.NDArray[np.float64]
 
@@ -28,26 +30,36 @@ def draw_figures(benchmark: Benchmark) -> dict[str, bytes]:
     return figures
 
 
-def errors(scenarios: Sequence[ScenarioResult], style: dict[str, Style]) -> bytes:
-    """Distribution of RMSE over the episodes: median, quartiles, 5 to 95 %, and the episodes beyond."""
-    names = [outcome.controller.name for outcome in scenarios[0].outcomes]
+def _axes(
+    figure: Figure, scenarios: Sequence[ScenarioResult], labels: tuple[str, str]
+) -> Iterator[tuple[Any, ScenarioResult]]:
+    """An axis a scenario, in two columns, logarithmic along x, with labels at the outside."""
     columns = min(len(scenarios), 2)
-    rows = -(-len(scenarios) // columns)
-    figure = canvas(4.6 * columns + 1.0, rows * (0.36 * len(names) + 1.0) + 0.6)
-    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    axes = figure.subplots(-(-len(scenarios) // columns), columns, sharex=True, sharey=True, squeeze=False)
+    for axis in axes[-1]:
+        axis.set_xlabel(labels[0])
+    for axis in axes[:, 0]:
+        axis.set_ylabel(labels[1])
     for axis in axes.flat[len(scenarios) :]:
         axis.set_visible(False)
     for axis, scenario in zip(axes.flat, scenarios, strict=False):
-        for place, outcome in enumerate(scenario.outcomes):
-            _spread(axis, outcome.sample.metric("rmse_mm").ravel(), place, style[outcome.controller.name].colour)
-        axis.set_title(f"{scenario.row.name} ({len(scenario.seeds)} crystals)", fontsize=9.5)
         axis.set_xscale("log")
+        axis.tick_params(which="both", labelbottom=True)
+        _plain_log(axis.xaxis)
+        yield axis, scenario
+
+
+def errors(scenarios: Sequence[ScenarioResult], style: Mapping[str, Style]) -> bytes:
+    """Distribution of RMSE over the episodes: median, quartiles, 5 to 95 %, and the episodes beyond."""
+    names = [outcome.controller.name for outcome in scenarios[0].outcomes]
+    rows = -(-len(scenarios) // 2)
+    figure = canvas(4.6 * min(len(scenarios), 2) + 1.0, rows * (0.36 * len(names) + 1.0) + 0.6)
+    for axis, scenario in _axes(figure, scenarios, ("RMSE of the radius [mm]", "")):
+        for place, outcome in enumerate(scenario.outcomes):
+            _spread(axis, outcome.sample.metric(RMSE.metric).ravel(), place, style[outcome.controller.name].colour)
+        axis.set_title(f"{scenario.row.name} ({len(scenario.seeds)} crystals)", fontsize=9.5)
         axis.set_yticks(range(len(names)), names)
         axis.set_ylim(len(names) - 0.4, -0.6)
-        _plain_log(axis.xaxis)
-        axis.tick_params(axis="x", labelbottom=True)
-    for axis in axes[-1]:
-        axis.set_xlabel("RMSE of the radius [mm]")
     figure.suptitle("Radius error by crystal: median, quartiles, 5 to 95 %, crystals beyond", fontsize=11)
     return png(figure)
 
@@ -61,29 +73,18 @@ def _spread(axis: Any, values: Floats, place: int, colour: str) -> None:
     axis.plot(beyond, np.full(len(beyond), place), ls="none", marker="|", ms=6, mew=0.6, color=colour, alpha=0.7)
 
 
-def pareto(scenarios: Sequence[ScenarioResult], style: dict[str, Style]) -> bytes:
+def pareto(scenarios: Sequence[ScenarioResult], style: Mapping[str, Style]) -> bytes:
     """Mean RMSE against mean pull step RMS with 95 % intervals, both logarithmic; lower left is better."""
-    columns = min(len(scenarios), 2)
-    rows = -(-len(scenarios) // columns)
-    figure = canvas(4.4 * columns + 0.8, 2.9 * rows + 1.0)
-    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    moving = [outcome.means["pull_step_rms_mm_per_min"].mean for scenario in scenarios for outcome in scenario.outcomes]
+    figure = canvas(4.4 * min(len(scenarios), 2) + 0.8, 2.9 * -(-len(scenarios) // 2) + 1.0)
+    moving = [outcome.means[PULL_STEP.metric].mean for scenario in scenarios for outcome in scenario.outcomes]
     floor = min((value for value in moving if value > 0.0), default=1.0) / 3.0
-    for axis in axes.flat[len(scenarios) :]:
-        axis.set_visible(False)
-    for axis, scenario in zip(axes.flat, scenarios, strict=False):
-        axis.set_xscale("log")
+    for axis, scenario in _axes(figure, scenarios, (PULL_STEP.heading, "RMSE of the radius [mm]")):
         axis.set_yscale("log")
-        for outcome in scenario.outcomes:
-            _pareto_point(axis, outcome, style[outcome.controller.name], floor)
-        axis.set_title(scenario.row.name, fontsize=9.5)
-        axis.tick_params(which="both", labelbottom=True, labelleft=True)
-        _plain_log(axis.xaxis)
+        axis.tick_params(which="both", labelleft=True)
         _plain_log(axis.yaxis, between=True)
-    for axis in axes[-1]:
-        axis.set_xlabel("pull step RMS [mm/min]")
-    for axis in axes[:, 0]:
-        axis.set_ylabel("RMSE of the radius [mm]")
+        for outcome in scenario.outcomes:
+            _point(axis, outcome, style[outcome.controller.name], floor)
+        axis.set_title(scenario.row.name, fontsize=9.5)
     handles = [
         Line2D([], [], ls="none", marker=one.marker, color=one.colour, ms=7, label=name) for name, one in style.items()
     ]
@@ -92,18 +93,17 @@ def pareto(scenarios: Sequence[ScenarioResult], style: dict[str, Style]) -> byte
     return png(figure)
 
 
-def _pareto_point(axis: Any, outcome: Outcome, style: Style, floor: float) -> None:
-    error, activity = outcome.means["rmse_mm"], outcome.means["pull_step_rms_mm_per_min"]
-    x = max(activity.mean, floor)
+def _point(axis: Any, outcome: Outcome, style: Style, floor: float) -> None:
+    error, activity = outcome.means[RMSE.metric], outcome.means[PULL_STEP.metric]
+    x, colour = max(activity.mean, floor), style.colour
     if activity.mean < floor:
-        axis.annotate(
-            "← 0", (x, error.mean), (0, -14), textcoords="offset points", ha="center", fontsize=8, color=style.colour
-        )
+        below = {"xytext": (0, -14), "textcoords": "offset points", "ha": "center", "fontsize": 8}
+        axis.annotate("← 0", (x, error.mean), color=colour, **below)
     elif activity.ci95:
-        axis.plot(activity.ci95, [error.mean] * 2, color=style.colour, lw=1.2)
+        axis.plot(activity.ci95, [error.mean] * 2, color=colour, lw=1.2)
     if error.ci95:
-        axis.plot([x, x], error.ci95, color=style.colour, lw=1.2)
-    axis.plot(x, error.mean, ls="none", marker=style.marker, ms=7, color=style.colour)
+        axis.plot([x, x], error.ci95, color=colour, lw=1.2)
+    axis.plot(x, error.mean, ls="none", marker=style.marker, ms=7, color=colour)
 
 
 def _plain_log(axis: Any, between: bool = False) -> None:
