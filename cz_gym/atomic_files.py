@@ -123,7 +123,7 @@ def _remove(folder: Path) -> None:
 
 
 def _is_folder(path: Path) -> bool:
-    """Whether it is a folder and no link to one: files behind a link are somebody else's."""
+    """Whether it is a folder and no link to one: files behind a link belong to another folder."""
     return path.is_dir() and not path.is_symlink()
 
 
@@ -138,11 +138,11 @@ def _lock(path: Path, patience: float) -> Iterator[None]:
     try:
         yield
     finally:
-        if fcntl is None:  # Windows deletes only what nobody has open
+        if fcntl is None:  # Windows deletes no open file
             os.close(handle)
         with suppress(OSError):
             path.unlink()
-        if fcntl is not None:  # deleted while locked: whoever waits for it sees that and makes a new one
+        if fcntl is not None:  # deleted while locked: a process that waits for it sees that and makes a new one
             os.close(handle)
 
 

@@ -147,7 +147,7 @@ def earlier_bound(folder: Path, row: Row, samples: Sequence[Sample]) -> Sample |
 
 
 def _agree(sample: Sample, earlier: Floats) -> bool:
-    """Whether a controller has the figures it had earlier, shape (episodes, 1 + metrics), on the crystals met twice."""
+    """Whether a controller has the figures it had earlier, shape (episodes, 1 + metrics), on the same crystals."""
     both = min(len(sample.seeds), len(earlier))
     same_seeds = earlier[:both, 0].tolist() == list(sample.seeds[:both])
     return same_seeds and np.allclose(sample.values[0, :both], earlier[:both, 1:], rtol=PRINTED)

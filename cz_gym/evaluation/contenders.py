@@ -79,7 +79,7 @@ def choose(
 
     ``wanted`` are names, ``["all"]``, or None for the default. Agents that are ``given`` always take part, ``shipped``
     ones, which are loaded here, beside them only if they are wanted by name, and slow controllers only if ``slow`` has
-    them. Raises ValueError for a name that nobody has, and one that two have.
+    them. Raises ValueError for an unknown name, and for one that a controller and an agent share.
     """
     names = [each.name for each in classical]
     learned = list(dict.fromkeys((*given, *shipped)))

@@ -122,7 +122,7 @@ def _crystals(scenario: ScenarioResult) -> dict[str, Any]:
 
 
 def _facts(controller: Controller) -> dict[str, Any]:
-    """A controller's fields; ``told`` is what files have called a privileged one from the first on."""
+    """A controller's fields; files call the privileged ones ``told``."""
     return {{"privileged": "told"}.get(name, name): value for name, value in asdict(controller).items()}
 
 

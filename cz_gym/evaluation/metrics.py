@@ -25,7 +25,7 @@ class Metrics(NamedTuple):
     """Metrics of each episode, shape (episodes,).
 
     After a failure the radius error counts as 8 mm to the horizon; what describes the drives and the crystal is
-    taken over the steps lived.
+    taken over the steps up to the failure.
     """
 
     rmse_mm: Floats

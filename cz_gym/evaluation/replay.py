@@ -1,4 +1,4 @@
-"""What would another controller have done? The same melt twice: :func:`replay`.
+"""What another controller would have done on the same melt: :func:`replay`.
 
 Both trajectories share every disturbance, every sensor's noise and every fault, from the start or from a moment on:
 the environment's state is saved there and continued bit for bit, so that all that differs is the controller.
@@ -77,7 +77,7 @@ def replay(
 
 
 class _Watched:
-    """A policy that acts while another looks on."""
+    """A policy that acts while another one gets the same observations."""
 
     def __init__(self, policy: Any, watcher: Any) -> None:
         self.policy, self.watcher, self.memory = policy, watcher, None

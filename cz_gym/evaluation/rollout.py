@@ -37,7 +37,7 @@ class Signals(NamedTuple):
 
 @dataclass(frozen=True)
 class Rollout:
-    """What happened to a policy on some seeds."""
+    """The episodes of a policy on some seeds, with every signal logged."""
 
     config: Config
     seeds: tuple[int, ...]
@@ -59,9 +59,9 @@ class Rollout:
         return self.seconds_in_policy / MICRO / self.alive.size
 
     def episode(self, i: int) -> Signals:
-        """Signals of episode ``i`` up to its end, each of shape (steps lived,); a copy."""
-        lived = self.alive[:, i]
-        return Signals(*(signal[lived, i] for signal in self.signals))
+        """Signals of episode ``i`` up to its end, each of shape (steps,); a copy."""
+        taken = self.alive[:, i]
+        return Signals(*(signal[taken, i] for signal in self.signals))
 
 
 def rollout(
@@ -85,7 +85,7 @@ def rollout(
 
 
 class Course:
-    """Episodes under way, one a seed: run by a policy up to a step, forked, run on by another."""
+    """Episodes in progress, one a seed: run by a policy up to a step, copied, continued by another."""
 
     def __init__(self, config: Config, seeds: Sequence[int]) -> None:
         n = len(seeds)
@@ -125,7 +125,7 @@ class Course:
         self.k += 1
 
     def fork(self) -> Course:
-        """The same episodes at the same moment, with what was logged; no policy has begun in them."""
+        """The same episodes at the same step, with what was logged; no policy has acted in them."""
         other = Course(self.config, self.seeds)
         other.env.set_state(self.env.get_state())
         other.k, other.observation = self.k, self.observation.copy()
@@ -135,7 +135,7 @@ class Course:
         return other
 
     def finish(self) -> Rollout:
-        """What happened; the environment is closed."""
+        """The finished rollout; closes the environment."""
         self.env.close()
         return Rollout(
             self.config, self.seeds, self.signals, self.reward, self.alive, self.failed, self.start, self.seconds

@@ -46,7 +46,7 @@ class Resamples:
         return cls(_weights(episodes, count, np.random.default_rng(seed)))
 
     def training_seeds(self, number: int, of: int = 0) -> Floats:
-        """Weights of ``number`` training seeds, shape (resamples, number); ``of`` tells trained policies apart."""
+        """Weights of ``number`` training seeds, shape (resamples, number); another ``of`` draws other ones."""
         return _weights(number, len(self.episodes), np.random.default_rng([SEED, 1 + of]))
 
 
@@ -98,7 +98,7 @@ def cvar(values: Floats, resamples: Resamples, tail: float = TAIL) -> Estimate:
 
 
 def optimality_gap(costs: Floats, reference: Floats, bound: Floats, resamples: Resamples) -> Estimate | None:
-    """(J - J_bound) / (J_reference - J_bound), J the mean of what is lost over seeds and the same episodes.
+    """(J - J_bound) / (J_reference - J_bound), J the mean loss over seeds and the same episodes.
 
     All three have shape (training seeds, episodes). 0 is the bound, 1 the reference; None where the two are equal.
     """

@@ -61,7 +61,7 @@ def markdown(benchmark: Benchmark, figures: Iterable[str]) -> str:
         "Every controller meets the same crystals (test seeds), "
         f"{config.horizon / HOUR:.3g} h each at {config.control_interval:g} s control. Mean over crystals with its "
         "95 % bootstrap interval; a scenario without randomness is one crystal and has no interval. After a failure "
-        "the radius error counts 8 mm to the end; drives, growth rate and ground-off are those of the time lived. "
+        "the radius error counts 8 mm to the end; drives, growth rate and ground-off are those of the time before it. "
         f"No failure in n crystals still allows a rate of up to 3/n, {3 / most / PERCENT:.2g} % at n = {most}. "
         "docs/benchmark.md has the protocol and every formula.",
         summary(benchmark),
