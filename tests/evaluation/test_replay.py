@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import hashlib
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -8,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cz_gym import CzVectorEnv
+from cz_gym import CzEnv, CzVectorEnv
 from cz_gym.baselines import CompensatedPID
 from cz_gym.config import make_config
 from cz_gym.evaluation.replay import Playback, replay
@@ -80,37 +82,34 @@ def test_bad_logs_are_refused(log: Any) -> None:
 
 
 CONTINUE = """
-import pickle, sys, hashlib
-import numpy as np
+import pickle, sys
+sys.path.insert(1, sys.argv[2])
+from test_replay import go_on
 from cz_gym import CzEnv
 env = CzEnv("puller", observation="history", horizon=300.0)
-if sys.argv[1] == "save":
-    env.reset(seed=8)
-else:
-    env.set_state(pickle.load(open(sys.argv[2], "rb")))
-digest, rng = hashlib.sha256(), np.random.default_rng(0)
-actions = rng.uniform(-0.3, 0.3, (160, 2)).astype(np.float32)
-for k in range(40 if sys.argv[1] == "go on" else 0, 160):
-    if k == 40:
-        digest = hashlib.sha256()
-        pickle.dump(env.get_state(), open(sys.argv[2], "wb"))
-    observation, reward, terminated, truncated, info = env.step(actions[k])
-    digest.update(observation.tobytes() + repr((reward, terminated, truncated, sorted(info.items(), key=str))).encode())
-    if terminated or truncated:
-        digest.update(env.reset()[0].tobytes())
-print(digest.hexdigest())
+env.set_state(pickle.load(open(sys.argv[1], "rb")))
+print(go_on(env))
 """
+
+
+def go_on(env: CzEnv) -> str:
+    """Digest of 120 steps, through the ends of episodes."""
+    digest, random = hashlib.sha256(), np.random.default_rng(0)
+    for action in random.uniform(-0.3, 0.3, (120, 2)).astype(np.float32):
+        observation, reward, terminated, truncated, info = env.step(action)
+        digest.update(observation.tobytes() + repr((reward, terminated, truncated, sorted(info.items()))).encode())
+        if terminated or truncated:
+            digest.update(env.reset()[0].tobytes())
+    return digest.hexdigest()
 
 
 def test_another_process_continues_bit_for_bit(tmp_path: Path) -> None:
     """Through the ends of episodes: the random stream goes on as well."""
-    digests = [
-        subprocess.run(
-            [sys.executable, "-c", CONTINUE, what, str(tmp_path / "state.pickle")],
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
-        for what in ("save", "go on")
-    ]
-    assert digests[0] == digests[1] != ""
+    env = CzEnv("puller", observation="history", horizon=300.0)
+    env.reset(seed=8)
+    for _ in range(40):
+        env.step(np.float32([0.1, -0.2]))
+    (tmp_path / "state").write_bytes(pickle.dumps(env.get_state()))
+    command = [sys.executable, "-c", CONTINUE, str(tmp_path / "state"), str(Path(__file__).parent)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == go_on(env)

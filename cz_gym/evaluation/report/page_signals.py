@@ -136,7 +136,7 @@ def _range(panel: int, runs: Sequence[Sequence[Line]]) -> tuple[float, float]:
 
 def ring_biases(config: Config, seeds: Sequence[int]) -> tuple[float, ...]:
     """The operator's bias of each seed's puller [m]: bright ring less radius at its own steady state."""
-    env = CzVectorEnv(len(seeds), config.scenario, config.model, parameters=config.parameters, meniscus=config.meniscus)
+    env = CzVectorEnv.from_config(config, len(seeds))
     env.reset(seed=list(seeds))
     states = env.get_state()
     env.close()
