@@ -79,19 +79,14 @@ def test_observable_error_forgives_what_no_sensor_shows() -> None:
     assert lucky.rmse_observable_mm == pytest.approx(0.3)
 
 
-def test_a_failure_counts_eight_millimetres_to_the_end() -> None:
-    """Ten steps, the fourth fails: three perfect steps, seven at 8 mm."""
-    found = of(made_up(10, lived=4))
-    assert found.rmse_mm == pytest.approx(8 * np.sqrt(7 / 10))
-    assert found.rmse_observable_mm == pytest.approx(8 * np.sqrt(7 / 10))
+@pytest.mark.parametrize("steps", [1, 4, 10])
+def test_a_failure_counts_eight_millimetres_to_the_end(steps: int) -> None:
+    """Ten steps: perfect ones, then the failing one and all after it at 8 mm."""
+    found = of(made_up(10, lived=steps))
+    assert found.rmse_mm == found.rmse_observable_mm == pytest.approx(8 * np.sqrt((11 - steps) / 10))
     assert found.max_error_mm == pytest.approx(8)
-    assert found.within_half_mm == pytest.approx(3 / 10)
+    assert found.within_half_mm == pytest.approx((steps - 1) / 10)
     assert found.failure_rate == 1
-
-
-@pytest.mark.parametrize("lived", [1, 10])
-def test_failing_in_the_first_or_last_step(lived: int) -> None:
-    assert of(made_up(10, lived=lived)).rmse_mm == pytest.approx(8 * np.sqrt((11 - lived) / 10))
 
 
 def test_dying_early_never_flatters() -> None:
@@ -134,11 +129,9 @@ def test_the_first_step_is_a_step() -> None:
     assert found.heater_step_rms_kw == pytest.approx(np.sqrt((1 + 0 + 4 + 0) / 4))
 
 
-def test_mean_pull_has_a_three_per_cent_band() -> None:
-    assert of(made_up(720, v_p=1.0299 * V)).mean_pull_within_3pct == 1
-    assert of(made_up(720, v_p=0.9701 * V)).mean_pull_within_3pct == 1
-    assert of(made_up(720, v_p=1.0301 * V)).mean_pull_within_3pct == 0
-    assert of(made_up(720, v_p=0.9699 * V)).mean_pull_within_3pct == 0
+@pytest.mark.parametrize(("factor", "share"), [(1.0299, 1), (0.9701, 1), (1.0301, 0), (0.9699, 0)])
+def test_mean_pull_has_a_three_per_cent_band(factor: float, share: int) -> None:
+    assert of(made_up(720, v_p=factor * V)).mean_pull_within_3pct == share
 
 
 def test_mean_pull_forgives_what_averages_out() -> None:
@@ -146,15 +139,11 @@ def test_mean_pull_forgives_what_averages_out() -> None:
     assert of(made_up(1440, v_p=wild)).mean_pull_within_3pct == 1
 
 
-def test_mean_pull_counts_full_windows() -> None:
+def test_mean_pull_counts_full_windows_up_to_a_failure() -> None:
     """v_0 for an hour, then 6.01 % more: a window of 360 steps leaves the band when 180 of them are faster."""
-    pull = V * np.where(np.arange(1440) < 720, 1.0, 1.0601)
-    windows, inside = 1440 - 359, 720 + 179 - 359
-    assert of(made_up(1440, v_p=pull)).mean_pull_within_3pct == pytest.approx(inside / windows)
-
-
-def test_mean_pull_after_a_failure_is_outside() -> None:
-    assert of(made_up(1440, lived=720)).mean_pull_within_3pct == pytest.approx((720 - 359) / (1440 - 359))
+    pull, windows = V * np.where(np.arange(1440) < 720, 1.0, 1.0601), 1440 - 359
+    assert of(made_up(1440, v_p=pull)).mean_pull_within_3pct == pytest.approx((720 + 179 - 359) / windows)
+    assert of(made_up(1440, lived=720)).mean_pull_within_3pct == pytest.approx((720 - 359) / windows)
     assert of(made_up(1440, lived=300)).mean_pull_within_3pct == 0
 
 

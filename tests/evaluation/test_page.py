@@ -72,11 +72,16 @@ class Parts(HTMLParser):
             self.rows[-1][-1] = value, text + data
 
 
+def whole_numbers(text: str, lines: int) -> np.ndarray:
+    """What was packed, in steps of the resolutions, shape (lines, steps)."""
+    planes = np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8).reshape(4, -1)
+    changes = np.ascontiguousarray(planes.T).view("<i4").reshape(lines, -1)
+    return changes.cumsum(axis=1, dtype=np.int64)
+
+
 def unpack(text: str, lines: Sequence[tuple[int, str]]) -> dict[tuple[str, str], np.ndarray]:
     """Values by panel and line."""
-    planes = np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8).reshape(4, -1)
-    changes = np.ascontiguousarray(planes.T).view("<i4").reshape(len(lines), -1)
-    whole = zip(lines, changes.cumsum(axis=1, dtype=np.int64), strict=True)
+    whole = zip(lines, whole_numbers(text, len(lines)), strict=True)
     return {(PANELS[panel].title, name): values * PANELS[panel].resolution for (panel, name), values in whole}
 
 
@@ -223,9 +228,7 @@ def test_lost_crystals_do_not_set_the_scale(made: Made) -> None:
 @given(st.lists(st.lists(st.integers(-(2**29), 2**29), min_size=3, max_size=3), min_size=1, max_size=4))
 def test_packing_loses_nothing(rows: list[list[int]]) -> None:
     text = pack([(0, np.array(row) * PANELS[0].resolution) for row in rows])
-    planes = np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8).reshape(4, -1)
-    changes = np.ascontiguousarray(planes.T).view("<i4").reshape(len(rows), -1)
-    np.testing.assert_array_equal(changes.cumsum(axis=1, dtype=np.int64), rows)
+    np.testing.assert_array_equal(whole_numbers(text, len(rows)), rows)
 
 
 @given(st.text())

@@ -110,14 +110,14 @@ def test_probability_of_improvement_counts_wins_and_half_the_ties() -> None:
 
 
 def test_cvar_is_the_mean_of_the_worst_twentieth(rng: np.random.Generator) -> None:
+    """Where it is no whole number of episodes, the last one counts in part; training seeds are pooled."""
     values = rng.permutation(np.arange(1.0, 101.0))[None]
     assert cvar(values, Resamples.draw(100)).mean == pytest.approx((96 + 97 + 98 + 99 + 100) / 5)
-
-
-def test_cvar_counts_the_last_episode_in_part() -> None:
-    values = np.arange(1.0, 31.0)[None]
-    assert cvar(values, Resamples.draw(30)).mean == pytest.approx((30 + 0.5 * 29) / 1.5)
-    assert cvar(values[:, :10], Resamples.draw(10)).mean == pytest.approx(10)
+    few = np.arange(1.0, 31.0)[None]
+    assert cvar(few, Resamples.draw(30)).mean == pytest.approx((30 + 0.5 * 29) / 1.5)
+    assert cvar(few[:, :10], Resamples.draw(10)).mean == pytest.approx(10)
+    seeds = np.stack([np.zeros(20), np.arange(20.0)])
+    assert cvar(seeds, Resamples.draw(20)).mean == pytest.approx((19 + 18) / 2)
 
 
 def test_cvar_of_normal_values_and_its_spread(rng: np.random.Generator) -> None:
@@ -131,11 +131,6 @@ def test_cvar_of_normal_values_and_its_spread(rng: np.random.Generator) -> None:
     tail_variance = 1 + threshold * expected - expected**2
     sd = np.sqrt((0.95 * (expected - threshold) ** 2 + tail_variance) / (0.05 * 2000))
     assert np.diff(estimate.ci95)[0] == pytest.approx(2 * 1.96 * sd, rel=0.2)
-
-
-def test_cvar_over_seeds_pools_them() -> None:
-    values = np.stack([np.zeros(20), np.arange(20.0)])
-    assert cvar(values, Resamples.draw(20)).mean == pytest.approx((19 + 18) / 2)
 
 
 def test_no_episodes_no_bootstrap() -> None:
