@@ -98,9 +98,7 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
     for contender in plan.contenders:
         if contender.controller.slow:
             contender.make(plan.rows[0].config())
-    with tqdm(
-        total=plan.steps, unit="step", unit_scale=True, dynamic_ncols=True, leave=False, disable=arguments.quiet
-    ) as bar:
+    with tqdm(total=plan.steps, unit="step", unit_scale=True, leave=False, disable=arguments.quiet) as bar:
         done = run(plan, bar)
     quoted = README if not smaller and arguments.out and arguments.out.resolve() == FOLDER else None
     write(arguments.out, arguments.json, done, quoted)
