@@ -58,7 +58,7 @@ def page(benchmark: Benchmark) -> str:
 def _data(benchmark: Benchmark) -> dict[str, Any]:
     """What the page's script draws."""
     config, styles = benchmark.scenarios[0].row.config(), styles_of(benchmark.controllers)
-    rivals = [verdict.rival for scenario in benchmark.scenarios for verdict in scenario.verdicts]
+    rivals = [verdict.rival for verdict in benchmark.scenarios[0].verdicts]
     return {
         "minutes": config.control_interval / MINUTE,
         "resolutions": [[PANELS[panel].resolution for panel, _ in lines] for lines in (OWN, SHARED)],
