@@ -10,9 +10,9 @@ import numpy as np
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.protocol import find_row
-from cz_gym.evaluation.report.canvas import styles
-from cz_gym.evaluation.report.crystal import COLUMNS, chosen, crystal, heading
-from cz_gym.evaluation.results import Controller, Sample, summarise
+from cz_gym.evaluation.report.crystal import COLUMNS, chosen, heading
+from cz_gym.evaluation.report.figures import draw_figures
+from cz_gym.evaluation.results import Benchmark, Controller, Sample, summarise
 from cz_gym.evaluation.rollout import rollout
 
 
@@ -49,8 +49,12 @@ def test_many_agents_leave_room_for_what_they_are_compared_with() -> None:
     assert shown == ["paper", "lqg", "pid", "ppo-3", "ppo-4", "ppo-5"]
 
 
-def test_a_crystal_that_nothing_disturbs_is_drawn_without_a_warning() -> None:
-    row = find_row("nominal")
-    run = rollout(Still(), make_config("nominal", horizon=600.0), row.seeds(1))
-    result = summarise(row, [Sample.of(Controller("still", "measured", ""), [run])])
-    assert crystal(result, styles(["still"])).startswith(b"\x89PNG")
+def test_figures_of_a_crystal_that_nothing_disturbs_and_of_a_name_that_seems_a_formula() -> None:
+    results = []
+    for name in ("nominal", "randomized"):
+        row = find_row(name)
+        run = rollout(Still(), make_config(name, horizon=600.0), row.seeds(2))
+        results.append(summarise(row, [Sample.of(Controller("a $\\frac$ b", "measured", "", (1,)), [run])]))
+    figures = draw_figures(Benchmark(tuple(results), "", ()))
+    assert set(figures) == {"crystal.png", "errors.png", "pareto.png"}
+    assert all(image.startswith(b"\x89PNG") for image in figures.values())

@@ -332,6 +332,7 @@ def test_a_missing_extra_is_named(
     assert package in line
 
 
+@pytest.mark.slow
 def test_the_benchmark_needs_neither_torch_nor_stable_baselines3(tmp_path: Path) -> None:
     agent = constant_agent(tmp_path / "agent.onnx")
     arguments = [*ONE[:3], "paper", "--agent", str(agent), "--out", str(tmp_path / "out"), "--quiet"]

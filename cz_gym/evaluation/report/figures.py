@@ -1,4 +1,4 @@
-"""The benchmark's figures, as PNG bytes; matplotlib's object interface, no display, no global state."""
+"""The benchmark's figures, as PNG bytes; matplotlib's object interface, no display."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -23,10 +24,11 @@ def draw_figures(benchmark: Benchmark) -> dict[str, bytes]:
     """Every figure by file name; a figure with nothing to show is left out."""
     style = styles_of(benchmark.controllers)
     random = [scenario for scenario in benchmark.scenarios if len(scenario.seeds) > 1]
-    figures = {"crystal.png": crystal(benchmark.scenarios[0], style)}
-    if random:
-        figures["errors.png"] = errors(random, style)
-        figures["pareto.png"] = pareto(random, style)
+    with rc_context({"text.parse_math": False}):  # a name with dollar signs is no formula
+        figures = {"crystal.png": crystal(benchmark.scenarios[0], style)}
+        if random:
+            figures["errors.png"] = errors(random, style)
+            figures["pareto.png"] = pareto(random, style)
     return figures
 
 
