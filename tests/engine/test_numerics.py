@@ -17,7 +17,7 @@ from cz_gym.episodes.record import Factors
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.plant import Disturbance, Inputs, State, rk4
 from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN, failure_penalty, reward
-from tests.stress.__main__ import INTERVALS, MODELS, OBSERVATIONS, WIDE, campaign, cases, main, run_case
+from tests.stress.__main__ import INTERVALS, MODELS, OBSERVATIONS, WIDE, campaign, cases, run_case
 from tests.stress.adversaries import KINDS, Adversaries
 from tests.stress.checks import Broken, Watch
 
@@ -39,8 +39,8 @@ def test_a_short_campaign() -> None:
     assert totals.steps > 50_000
     assert totals.failures > 100
     assert totals.episodes > totals.failures
-    assert totals.extremes.h_c_min < HEIGHT_MIN
-    assert totals.extremes.imbalance_max < 1e-3
+    assert totals.extremes["h_c"][0] < HEIGHT_MIN
+    assert totals.extremes["missing heat"][1] < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -82,14 +82,6 @@ def test_heat_that_appears_is_found() -> None:
     env._batch.memory.slots["x"]["T_1"][0] += 0.1
     with pytest.raises(Broken, match="heat appears or disappears"):
         watch.after(np.zeros((2, 2)), *result)
-
-
-@pytest.mark.parametrize("argv", [["--steps", "0"], ["--seed", "-1"], ["--steps", "many"], ["--stepps", "3"]])
-def test_the_command_refuses_in_one_line(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as left:
-        main(argv)
-    assert left.value.code == 2
-    assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_a_heater_never_cools() -> None:

@@ -90,34 +90,31 @@ def slow_benchmark(arguments: list[str]) -> int:
 
 def settle(folder: Path) -> bool:
     """Finish what a killed writer left in a folder; whether there was anything."""
-    torn = bool(_hidden(folder))
+
+    def left() -> bool:
+        return any(path.is_dir() for path in folder.glob(".writ*"))
+
+    torn = left()
     finish_writing(folder)
-    check(not _hidden(folder), "leftovers")
+    check(not left(), "leftovers")
     return torn
-
-
-def _hidden(folder: Path) -> list[Path]:
-    return [path for path in folder.iterdir() if path.name.startswith(".writ") and path.is_dir()]
 
 
 def check_training(out: Path) -> int:
     """The step at which a killed run of train.py stands; what it left is whole and agrees with itself."""
-    checkpoint = out / run.CHECKPOINT
-    if not checkpoint.exists():
+    if not (out / run.CHECKPOINT).exists():
         check(not (out / "settings.json").exists(), "settings without a checkpoint")
         return 0
-    progress, _ = load_checkpoint(checkpoint)
-    rows = _rows(out / "progress.csv") if (out / "progress.csv").exists() else []
+    progress, _ = load_checkpoint(out / run.CHECKPOINT)
+    rows = _rows(out / "progress.csv")
     best = min((float(row["validation_cost"]) for row in rows), default=None)
     check(best == progress.best_cost, f"best {progress.best_cost} in the checkpoint, {best} in the progress")
     if best is not None:
-        found = [float(row["validation_rmse_mm"]) for row in rows if float(row["validation_cost"]) == best]
+        found = {float(row["validation_rmse_mm"]) for row in rows if float(row["validation_cost"]) == best}
         if (out / "summary.json").exists():
-            found.append(json.loads((out / "summary.json").read_text())["validation_rmse_mm"])
-        kept = OnnxPolicy.load(out / "agent.onnx").contract.validation_rmse_mm
-        check(kept in found, "the agent is not the best one of the progress")
-    if (out / "settings.json").exists():
-        json.loads((out / "settings.json").read_text())
+            found.add(json.loads((out / "summary.json").read_text())["validation_rmse_mm"])
+        contract = OnnxPolicy.load(out / "agent.onnx").contract
+        check(contract.validation_rmse_mm in found, "the agent is not the best one of the progress")
     return progress.steps
 
 
@@ -128,18 +125,18 @@ def check_benchmark(out: Path) -> str | None:
         return None
     content = (out / "benchmark.json").read_bytes()
     check(is_benchmark_json(content), "benchmark.json is damaged")
-    who = set(json.loads(content)["results"]["randomized"])
+    who, report = set(json.loads(content)["results"]["randomized"]), (out / "report.md").read_text()
     check({row["controller"] for row in _rows(out / "episodes.csv")} == who, "files of two runs")
-    check(all(f"| {name}" in (out / "report.md").read_text() for name in who), "files of two runs")
+    check(all(f"| {name}" in report for name in who), "files of two runs")
     (other,) = who - {"slow"}
-    return other
+    return str(other)
+
+
+def _rows(file: Path) -> list[dict[str, Any]]:
+    return list(csv.DictReader(file.read_text().splitlines())) if file.exists() else []
 
 
 def check(condition: bool, what: object) -> None:
     """Raise RuntimeError unless it holds."""
     if not condition:
         raise RuntimeError(str(what))
-
-
-def _rows(file: Path) -> list[dict[str, Any]]:
-    return list(csv.DictReader(file.read_text().splitlines()))

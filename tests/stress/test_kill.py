@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import random
 from pathlib import Path
 
 import pytest
 
-from tests.stress.kill import kill_benchmark
 from tests.stress.kill_at import KILLED, ending
 from tests.stress.small_runs import (
     BENCHMARK,
@@ -50,8 +48,3 @@ def test_a_benchmark_killed_in_every_phase_leaves_the_results_of_one_run(tmp_pat
     assert torn == [phase for phase in BENCHMARK if "count" in phase or "move" in phase]
     assert (len(kept["episodes"]), len(kept["slow episodes"]), len(kept["figures"])) == (0, 2, 6)
     assert kept["slow episodes"].items() <= kept["figures"].items() == kept["other results, as they move"].items()
-
-
-def test_random_kills_are_counted(tmp_path: Path) -> None:
-    """Of the long form, ``python -m tests.stress.kill``, the part that takes seconds."""
-    assert kill_benchmark(tmp_path, 1, random.Random(1)).startswith("benchmark.py: 1 kills survived")
