@@ -63,7 +63,7 @@ def training(arguments: list[str]) -> int:
     tqdm.set_lock(threading.RLock())  # its own is a semaphore, which a killed process leaves behind
     run.PICKING, run.JUDGING, run.VALIDATE_EVERY = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4], STEPS // 2
     default = recipes.RECIPES["ppo"]
-    clone = replace(default.recipe.clone or recipes.Clone("lqg"), rounds=2, episodes=4, epochs=2)
+    clone = replace(default.recipe.clone or recipes.Clone("lqg"), rounds=1, episodes=2, epochs=1)
     small = replace(default.recipe, num_envs=64, clone=clone)
     recipes.RECIPES["ppo"] = replace(
         default, recipe=small, n_steps=32, batch_size=512, n_epochs=2, critic_steps=STEPS // 4
