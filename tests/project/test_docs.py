@@ -37,7 +37,7 @@ from cz_gym.physics.plant import Disturbance, Inputs  # noqa: E402
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
 SLOW = {"docs/paper.md", "docs/extend/meniscus.md"}
 SMALL = {
     "num_envs=10_000": "num_envs=100",

@@ -82,8 +82,9 @@ def test_every_package_is_listed() -> None:
     assert sorted(listed) == sorted(found)
 
 
-def test_version_stands_once_and_core_dependencies_are_four() -> None:
+def test_versions_agree_and_core_dependencies_are_four() -> None:
     assert cz_gym.__version__ == PROJECT["version"]
+    assert f"\nversion: {PROJECT['version']}\n" in (ROOT / "CITATION.cff").read_text()
     names = [requirement.partition(">")[0] for requirement in PROJECT["dependencies"]]
     assert names == ["gymnasium", "numpy", "scipy", "numba"]
 
@@ -156,7 +157,7 @@ def test_the_wheel_holds_one_package_and_what_it_needs(built: tuple[Path, Path],
     assert any(name.endswith("licenses/LICENSE") for name in names)
     with tarfile.open(sdist) as archive:
         kept = {name.partition("/")[2] for name in archive.getnames()}
-    assert {"Makefile", "train.py", "studies/paper/__main__.py", "tests/conftest.py"} <= kept
+    assert {"Makefile", "train.py", "studies/paper/__main__.py", "tests/conftest.py", "CITATION.cff"} <= kept
     home = tmp_path / "installed" / "cz_gym"
     modules = [home / "__init__.py", home / "baselines/registry.py", home / "agents/agent_file/contract.py"]
     assert printed(NAMES, home.parent, tmp_path) == list(map(str, modules))
