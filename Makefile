@@ -7,8 +7,10 @@ TEST_READY := $(VENV)/.ready-test
 BENCHMARK_READY := $(VENV)/.ready-benchmark
 DOCS_READY := $(VENV)/.ready-docs
 BROWSER_READY := $(VENV)/.ready-browser
+# A worker that runs out of tests takes some of the other's: files differ too much in time to be dealt out whole.
+IN_PARALLEL := --numprocesses auto --dist worksteal
 
-.PHONY: help venv lint types test test-lowest test-newest test-wheel audit test-browser benchmark paper docs clean
+.PHONY: help venv lint types test test-all test-lowest test-newest test-wheel audit test-browser benchmark paper docs clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -23,15 +25,18 @@ lint: $(TEST_READY) ## format and lint
 types: $(TEST_READY) ## strict types
 	$(BIN)/mypy
 
-test: lint types ## lint, types and tests
-	$(BIN)/python -m pytest -q --numprocesses auto --dist loadfile
+test: lint types ## lint, types and the fast tests, in minutes
+	$(BIN)/python -m pytest -q -m "not slow" $(IN_PARALLEL)
+
+test-all: lint types ## lint, types and all tests: kills, cold compiles, wheels and long campaigns too
+	$(BIN)/python -m pytest -q $(IN_PARALLEL)
 
 # Old packages warn about the new ones beneath them, which is not this project's to mend: warnings are no errors there.
 test-lowest: ## the tests on the lowest versions that pyproject.toml allows
 	$(PYTHON) -m venv build/lowest
 	build/lowest/bin/python -m pip install --quiet --constraint constraints-lowest.txt torch
 	build/lowest/bin/python -m pip install --quiet --constraint constraints-lowest.txt --editable ".[test]"
-	build/lowest/bin/python -m pytest -q -W default --numprocesses auto --dist loadfile
+	build/lowest/bin/python -m pytest -q -W default $(IN_PARALLEL)
 
 # torch comes first and stands: the newest one from PyPI brings gigabytes of CUDA; `make test-newest TORCH=torch` takes it.
 TORCH ?= torch==2.13.0
@@ -39,7 +44,7 @@ test-newest: ## the tests on the newest versions there are, but for torch
 	$(PYTHON) -m venv build/newest
 	build/newest/bin/python -m pip install --quiet "$(TORCH)"
 	build/newest/bin/python -m pip install --quiet --upgrade --editable ".[test]"
-	build/newest/bin/python -m pytest -q --numprocesses auto --dist loadfile
+	build/newest/bin/python -m pytest -q $(IN_PARALLEL)
 
 # The tests come from the source distribution, all code from the wheel built of it.
 test-wheel: $(TEST_READY) ## the tests on what the wheel installs, outside this folder
@@ -48,8 +53,8 @@ test-wheel: $(TEST_READY) ## the tests on what the wheel installs, outside this 
 	tar -xzf "$$folder"/*.tar.gz -C "$$folder/tests" --strip-components=1 && \
 	$(BIN)/python -m pip install --quiet --no-deps --target "$$folder/installed" "$$folder"/*.whl && \
 	rm -r "$$folder/tests/cz_gym" "$$folder/tests/agents" "$$folder/tests/baselines" && \
-	ln -s ../installed/cz_gym ../installed/cz_gym/agents ../installed/cz_gym/baselines "$$folder/tests" && \
-	cd "$$folder/tests" && "$(CURDIR)/$(BIN)/python" -m pytest -q $(TESTS) --numprocesses auto --dist loadfile
+	ln -s ../installed/cz_gym "$$folder/tests" && \
+	cd "$$folder/tests" && "$(CURDIR)/$(BIN)/python" -m pytest -q $(TESTS) $(IN_PARALLEL)
 
 ADVISORIES := https://pypi.org/pypi/numpy/$(shell sed -n 's/^numpy==//p' constraints.txt)/json
 audit: ## known weaknesses of the pinned packages; asks PyPI's advisories

@@ -13,15 +13,14 @@ import cz_gym
 sys.path.insert(0, str(Path(__file__).parent))
 
 project = "Cz-v0"
-author = "The Cz-v0 developers"
-copyright = author
+author = copyright = "The Cz-v0 developers"
 version = release = cz_gym.__version__
 language = "en"
 
 root_doc = "docs/index"
-include_patterns = ["README.md", "CHANGELOG.md", "docs/**.md", "results/**.md"]
+include_patterns = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/**.md", "results/**.md"]
 exclude_patterns = [".*", "build", "dist", "runs", "results/cache", "docs/_*", "**/.*", "**/node_modules"]
-extensions = ["myst_parser", "sphinx.ext.autodoc", "czdocs.mathml", "czdocs.tables", "czdocs.names", "czdocs.pages"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "czdocs.mathml", "czdocs.tables", "czdocs.names"]
 nitpicky = True
 nitpick_ignore = [("py:func", "make_config")]
 nitpick_ignore_regex = [

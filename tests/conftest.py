@@ -1,8 +1,14 @@
-"""What the tests share: one place for compiled code, and the plant's equations written a second time."""
+"""What the tests share: one place for compiled code, and the plant's equations written a second time.
+
+Where a package for training is not installed, the tests that need it are skipped, whole modules where they import it.
+"""
 
 from __future__ import annotations
 
+import importlib.util
 import os
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +23,38 @@ settings.register_profile("repeatable", deadline=None, derandomize=True, databas
 settings.load_profile("repeatable")
 
 HOUR = 3600.0
+TRAINING = ("torch", "stable_baselines3", "sb3_contrib", "safetensors", "optuna", "tensorboard")
+ABSENT = tuple(name for name in TRAINING if importlib.util.find_spec(name) is None)
+if sys.platform == "win32":
+    collect_ignore = ["stress"]  # signals, pipes and limits of memory as POSIX has them
+
+
+def lacks(error: BaseException | None) -> bool:
+    """Whether an error comes from a package for training that is not installed."""
+    while error is not None:
+        if isinstance(error, ModuleNotFoundError) and str(error.name).partition(".")[0] in ABSENT:
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector: pytest.Collector) -> Iterator[None]:
+    report: Any = yield
+    failed = report.failed and report.call.excinfo
+    if failed and lacks(failed.value):
+        report.outcome, report.longrepr = "skipped", (str(collector.path), 0, "Skipped: no package for training")
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call() -> Iterator[None]:
+    try:
+        return (yield)
+    except ModuleNotFoundError as error:
+        if lacks(error):
+            pytest.skip(f"no {error.name}")
+        raise
 
 
 class Truth(NamedTuple):

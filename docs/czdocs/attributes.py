@@ -22,11 +22,9 @@ class Attribute(NamedTuple):
 def attributes(cls: type) -> list[Attribute]:
     """The fields of a NamedTuple or dataclass that carry a text, in order."""
     (node,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
-    assert isinstance(node, ast.ClassDef)
     found = []
     for field, text in zip(node.body, node.body[1:], strict=False):
         if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
-            assert isinstance(field.target, ast.Name)
             whole = " ".join(str(text.value.value).split())
             unit = UNIT.search(whole)
             meaning = UNIT.sub("", whole, count=1).rstrip(".")

@@ -26,16 +26,12 @@ def inline(writer: Any, node: nodes.Element) -> None:
 def block(writer: Any, node: nodes.Element) -> None:
     r"""Write a displayed formula; the number of its ``\tag`` becomes an anchor ``eq-number``."""
     text = node.astext()
-    tag = TAG.search(text)
     formula = mathml(TAG.sub("", text).strip(), "block")
-    if tag is None:
-        writer.body.append(f'<div class="equation">{formula}</div>\n')
-    else:
-        number = tag.group(1)
-        writer.body.append(
-            f'<div class="equation" id="eq-{number}">{formula}'
-            f'<a class="equation-number" href="#eq-{number}">({number})</a></div>\n'
-        )
+    place, number = "", ""
+    if tag := TAG.search(text):
+        place = f' id="eq-{tag.group(1)}"'
+        number = f'<a class="equation-number" href="#eq-{tag.group(1)}">({tag.group(1)})</a>'
+    writer.body.append(f'<div class="equation"{place}>{formula}{number}</div>\n')
     raise nodes.SkipNode
 
 

@@ -1,4 +1,4 @@
-"""API pages: docstrings as this project writes them; fields that a table describes stand there."""
+"""API pages: docstrings as this project writes them, and links to names that stand on no page."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 from cz_gym import Parameters
 from cz_gym.camera.view import Camera
 
-PLACE = "Alias for field number"
 DESCRIBED: tuple[Any, ...] = (Parameters, Camera)
-"""What has its fields in a table."""
-LONGEST = 24
+"""What has its fields, with values and sources, in a table."""
+LONGEST = 25
 """Longest default in a signature [characters]."""
+PLACE = "Alias for field number"
 HEADING = re.compile(r"^## (.*)$")
 CODE = re.compile(r"(``.*?``)")
 
@@ -27,32 +27,25 @@ def say(app: Any, what: str, name: str, thing: Any, options: Any, lines: list[st
 
 
 def _plain(line: str) -> str:
-    heading = HEADING.match(line)
-    if heading:
-        return f"**{heading.group(1)}**"
+    line = HEADING.sub(r"**\1**", line)
     return "".join(part if part.startswith("``") else part.replace("|", r"\|") for part in CODE.split(line))
 
 
 def sign(app: Any, what: str, name: str, thing: Any, options: Any, signature: str | None, returns: str | None) -> Any:
-    """The signature of a record of settings: names, and defaults that are short enough to read."""
+    """The signature of a record: names, and defaults that are short enough to read."""
     if thing in DESCRIBED:
-        defaults = thing()._asdict()
+        defaults = thing._field_defaults
     elif dataclasses.is_dataclass(thing) and isinstance(thing, type):
         defaults = {field.name: field.default for field in dataclasses.fields(thing)}
     else:
         return None
-    return f"({', '.join(f'{field}{_default(value)}' for field, value in defaults.items())})", returns
-
-
-def _default(value: Any) -> str:
-    if value is dataclasses.MISSING:
-        return ""
-    shown = f"{value:.6g}" if isinstance(value, float) else repr(value)
-    return f"={shown}" if len(shown) <= LONGEST else "=..."
+    shown = {name: f"{value:.6g}" if isinstance(value, float) else repr(value) for name, value in defaults.items()}
+    ends = {name: "" if defaults[name] is dataclasses.MISSING else f"={text}" for name, text in shown.items()}
+    return f"({', '.join(name + (end if len(end) <= LONGEST else '=...') for name, end in ends.items())})", returns
 
 
 def skip(app: Any, what: str, name: str, thing: Any, skipped: bool, options: Any) -> bool | None:
-    """Leave the fields of what is described in tables to these."""
+    """Leave the fields of what a table describes to the table."""
     return True if any(thing is vars(described).get(name) for described in DESCRIBED) else None
 
 

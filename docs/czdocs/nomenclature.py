@@ -3,6 +3,7 @@ r"""The nomenclature: symbols follow from the code's names, equations from where
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -70,43 +71,32 @@ def equations(tex: str) -> tuple[str, ...]:
     return tuple(number for number, text in formulas().items() if pattern.search(text))
 
 
-def _documented(cls: type, without: frozenset[str] = frozenset()) -> list[Row]:
-    return [
-        Row(symbol(name), name, unit, meaning, equations(symbol(name)))
-        for name, unit, meaning in attributes(cls)
-        if name not in without
-    ]
+def _documented(cls: type, without: tuple[str, ...] = ()) -> list[Row]:
+    """The fields of a class with what it says of them."""
+    return [_row(*field) for field in attributes(cls) if field.name not in without]
 
 
-def states() -> list[Row]:
-    """The plant's state."""
-    return _documented(State)
-
-
-def inputs() -> list[Row]:
-    """Inputs and disturbances."""
-    return _documented(Inputs) + _documented(Disturbance)
+def _row(name: str, unit: str, meaning: str, value: str = "", source: str = "") -> Row:
+    return Row(symbol(name), name, unit, meaning, equations(symbol(name)), value, source)
 
 
 def seen() -> list[Row]:
-    """What the step says beside states and inputs, those rows of ``info`` that have a symbol."""
+    """Rows of ``info`` that have a symbol and are neither states nor inputs."""
     known = {*State._fields, *Inputs._fields, *WITHOUT_SYMBOL}
-    return [
-        Row(symbol(name), name, unit, meaning, equations(symbol(name)))
-        for name, unit, meaning in INFO_ROWS
-        if name not in known and not name.startswith("cost_")
-    ]
+    return [_row(*row) for row in INFO_ROWS if row.name not in known and not row.name.startswith("cost_")]
 
 
 def parameters() -> list[Row]:
     """What is typed in about a puller and its material."""
-    default = Parameters()
-    return [
-        Row(symbol(name), name, q.unit, q.meaning, equations(symbol(name)), f"{getattr(default, name):.6g}", q.source)
-        for name, q in describe().items()
-    ]
+    values = Parameters()._asdict()
+    return [_row(name, q.unit, q.meaning, f"{values[name]:.6g}", q.source) for name, q in describe().items()]
 
 
-def derived() -> list[Row]:
-    """What follows from the parameters at the operating point."""
-    return _documented(Puller, frozenset(Parameters._fields))
+ROWS: dict[str, Callable[[], list[Row]]] = {
+    "states": lambda: _documented(State),
+    "inputs": lambda: _documented(Inputs) + _documented(Disturbance),
+    "seen": seen,
+    "parameters": parameters,
+    "derived": lambda: _documented(Puller, Parameters._fields),
+}
+"""The parts of the nomenclature."""

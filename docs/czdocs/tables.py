@@ -6,7 +6,9 @@ import dataclasses
 import math
 import re
 from collections.abc import Callable, Iterable
-from typing import Any, ClassVar
+from functools import partial
+from itertools import pairwise
+from typing import Any
 
 from docutils import nodes
 from docutils.parsers.rst import Directive
@@ -23,7 +25,7 @@ from . import nomenclature
 from .attributes import attributes
 
 ABSENT = "\N{EN DASH}"
-POWERS = {"2": "\N{SUPERSCRIPT TWO}", "3": "\N{SUPERSCRIPT THREE}", "4": "\N{SUPERSCRIPT FOUR}"}
+POWERS = str.maketrans("234", "²³⁴")
 READABLE = {
     "m": (MM, "mm"),
     "m/s": (MM_PER_MIN, "mm/min"),
@@ -37,10 +39,11 @@ READABLE = {
 
 
 def markdown(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
-    """A Markdown table."""
-    lines = [list(head), *map(list, rows)]
-    lines.insert(1, ["---"] * len(lines[0]))
-    return ["| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |" for line in lines] + [""]
+    """A Markdown table; columns that hold nothing are left out."""
+    columns = [column for column in zip(head, *rows, strict=True) if any(column[1:])]
+    lines = [[cell.replace("|", r"\|") for cell in line] for line in zip(*columns, strict=True)]
+    lines.insert(1, ["---"] * len(columns))
+    return ["| " + " | ".join(line) + " |" for line in lines] + [""]
 
 
 def code(text: str) -> str:
@@ -50,7 +53,7 @@ def code(text: str) -> str:
 
 def units(text: str) -> str:
     """A unit with its powers raised: m/s2 as m/s²."""
-    return re.sub(r"(?<=[A-Za-z])[234]", lambda power: POWERS[power.group()], text)
+    return re.sub(r"(?<=[A-Za-z])[234]", lambda power: power.group().translate(POWERS), text)
 
 
 def channels(listed: Iterable[Channel]) -> list[str]:
@@ -65,20 +68,21 @@ def channels(listed: Iterable[Channel]) -> list[str]:
 def remembered() -> list[str]:
     """The channels of "history": the present ones, then where the spans of the past stand."""
     at = {channel.name: i for i, channel in enumerate(HISTORY)}
-    scale = {name: f"{HISTORY[at[f'{name}_{LAGS[0]:g}s']].scale:g}" for name in LAGGED} | {"v_p": "0.1 $v_0$"}
-    units_of = {channel.name: channel.unit for channel in MEASURED}
-    heads = ("ages of the samples", *(f"{code(name)} [{scale[name]} {units(units_of[name])}]" for name in LAGGED))
-    heads = tuple(head.replace(" m/s]", "]") for head in heads)
-    ages = [0.0, *LAGS[:-1]]
+    spans = [HISTORY[at[f"{name}_{LAGS[0]:g}s"]] for name in LAGGED]
+    scales = [
+        "0.1 $v_0$" if name == "v_p" else f"{c.scale:g} {units(c.unit)}" for name, c in zip(LAGGED, spans, strict=True)
+    ]
+    heads = [f"{code(name)} [{scale}]" for name, scale in zip(LAGGED, scales, strict=True)]
     rows = (
         (f"{before:g} to {age:g} s", *(str(at[f"{name}_{age:g}s"]) for name in LAGGED))
-        for before, age in zip(ages, LAGS, strict=True)
+        for before, age in pairwise((0.0, *LAGS))
     )
+    present = channels(HISTORY[: at["integral"] + 1])
     return [
-        *channels(HISTORY[: at["integral"] + 1]),
+        *present,
         "Index and scale of each span's difference:",
         "",
-        *markdown(heads, rows),
+        *markdown(("ages of the samples", *heads), rows),
     ]
 
 
@@ -92,50 +96,30 @@ def readable(value: Any, unit: str) -> str:
     size, name = READABLE.get(unit, (1.0, "" if unit == "-" else unit))
     if unit == "s" and max(value if isinstance(value, tuple) else (value,)) >= 5 * MINUTE:
         size, name = MINUTE, "min"
-    parts = [f"{part / size:.4g}" if math.isfinite(part) else "∞" for part in _pair(value)]
-    low, high = parts
-    if low == high:
-        return f"{low} {name}".strip()
-    between = f"±{high}" if low == f"-{high}" else f"{low} to {high}"
+    ends = value if isinstance(value, tuple) else (value, value)
+    low, high = (f"{end / size:.4g}" if math.isfinite(end) else "∞" for end in ends)
+    between = f"±{high}" if low == f"-{high}" else low if low == high else f"{low} to {high}"
     return f"{between} {name}".strip()
 
 
-def _pair(value: Any) -> tuple[float, float]:
-    return value if isinstance(value, tuple) else (value, value)
-
-
-def scenario_table(shown: Iterable[str]) -> list[str]:
+def scenario_table(columns: list[Scenario]) -> list[str]:
     """Scenarios as columns, one line for each number in which any of them departs from the default."""
-    columns = [SCENARIOS[name] for name in shown]
     rows = []
     for family in dataclasses.fields(Scenario)[1:]:
         values = [getattr(scenario, family.name) for scenario in columns]
         absent = type(values[0])()
-        present = [value != absent for value in values]
         for name, unit, meaning in attributes(type(absent)):
             cells = [getattr(value, name) for value in values]
-            if any(cell != getattr(absent, name) for cell in cells) and any(present):
+            if any(cell != getattr(absent, name) for cell in cells):
                 written = [readable(cell, unit) if cell != getattr(absent, name) else ABSENT for cell in cells]
                 rows.append((f"{code(f'{family.name}.{name}')} {meaning}", *written))
     return markdown(("", *(code(scenario.name) for scenario in columns)), rows)
-
-
-def plain_scenarios() -> list[str]:
-    """The scenarios in which every draw is the same."""
-    return scenario_table(name for name, scenario in SCENARIOS.items() if scenario.deterministic)
 
 
 def single_scenarios() -> list[str]:
     """The scenarios with one of randomized's families, and which it is."""
     found = {name: _single(scenario) for name, scenario in SCENARIOS.items()}
     return markdown(("scenario", "family"), [(code(name), code(family)) for name, family in found.items() if family])
-
-
-def wide_scenarios() -> list[str]:
-    """All others."""
-    return scenario_table(
-        name for name, scenario in SCENARIOS.items() if not scenario.deterministic and not _single(scenario)
-    )
 
 
 def _single(scenario: Scenario) -> str | None:
@@ -157,25 +141,13 @@ def families() -> list[str]:
     return markdown(("member", "unit", "default", "meaning"), rows)
 
 
-def symbols(rows: Iterable[nomenclature.Row]) -> list[str]:
+def symbols(part: str) -> list[str]:
     """A part of the nomenclature."""
-    listed = list(rows)
-    typed = any(row.value for row in listed)
-    head = (
-        "symbol",
-        "code",
-        *(("value",) if typed else ()),
-        "unit",
-        "meaning",
-        "equation",
-        *(("source",) if typed else ()),
-    )
-    lines = []
-    for row in listed:
+    rows = []
+    for row in nomenclature.ROWS[part]():
         where = ", ".join(f'<a href="physics.html#eq-{n}">({n})</a>' for n in row.equations) or ABSENT
-        value, source = ((row.value,), (row.source,)) if typed else ((), ())
-        lines.append((f"${row.symbol}$", code(row.code), *value, units(row.unit), row.meaning, where, *source))
-    return markdown(head, lines)
+        rows.append((f"${row.symbol}$", code(row.code), row.value, units(row.unit), row.meaning, where, row.source))
+    return markdown(("symbol", "code", "value", "unit", "meaning", "equation", "source"), rows)
 
 
 def camera() -> list[str]:
@@ -193,16 +165,12 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "history": remembered,
     "state": lambda: channels(STATE),
     "info": info,
-    "scenarios": wide_scenarios,
-    "plain-scenarios": plain_scenarios,
+    "scenarios": lambda: scenario_table([s for s in SCENARIOS.values() if not s.deterministic and not _single(s)]),
+    "plain-scenarios": lambda: scenario_table([s for s in SCENARIOS.values() if s.deterministic]),
     "single-scenarios": single_scenarios,
     "families": families,
     "camera": camera,
-    "states": lambda: symbols(nomenclature.states()),
-    "inputs": lambda: symbols(nomenclature.inputs()),
-    "seen": lambda: symbols(nomenclature.seen()),
-    "parameters": lambda: symbols(nomenclature.parameters()),
-    "derived": lambda: symbols(nomenclature.derived()),
+    **{part: partial(symbols, part) for part in nomenclature.ROWS},
 }
 """Every table, by the name a page asks for it with."""
 
@@ -211,7 +179,6 @@ class Generated(Directive):
     """Stands for a table of :data:`TABLES`."""
 
     required_arguments = 1
-    has_content: ClassVar[bool] = False
 
     def run(self) -> list[nodes.Node]:
         """Parse the table where it stands."""

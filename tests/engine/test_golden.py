@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -13,13 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "golden"))
-
-from digest import digest
-from trajectories import FILE, SIGNALS, trajectories, trajectory
-
 import benchmark
-from cz_gym import SCENARIOS, CzEnv, CzVectorEnv, Parameters
+from cz_gym import SCENARIOS, CzVectorEnv, Parameters
+from tests.golden.digest import digest
+from tests.golden.trajectories import FILE, SIGNALS, trajectories, trajectory
 
 ROOT = Path(__file__).parents[2]
 GOLDEN: dict[str, Any] = json.loads(FILE.read_text())
@@ -33,10 +29,6 @@ def test_golden_trajectories() -> None:
         np.testing.assert_allclose(rows, GOLDEN[name], rtol=1e-9, atol=0.0, err_msg=name)
 
 
-def test_goldens_are_small() -> None:
-    assert FILE.stat().st_size < 20_000
-
-
 @pytest.mark.parametrize("name", Parameters._fields)
 def test_goldens_notice_a_change_of_any_parameter(name: str) -> None:
     """By a millionth: of what the plant is made of, whatever the scenario."""
@@ -48,9 +40,8 @@ def test_goldens_notice_a_change_of_any_parameter(name: str) -> None:
 
 def test_the_same_bits_in_another_process() -> None:
     """And from an installed wheel: ``tests/project/test_packaging.py``."""
-    command = [sys.executable, str(ROOT / "tests" / "golden" / "digest.py")]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    command = [sys.executable, "-m", "tests.golden.digest"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.split() == [digest(), str(ROOT / "cz_gym" / "__init__.py")]
 
 
@@ -68,18 +59,6 @@ def test_thread_counts_do_not_change_bits() -> None:
     assert len(digests) == 1
 
 
-def test_scalar_and_batch_give_the_same_bits() -> None:
-    batch, alone = CzVectorEnv(5, "hard", horizon=100.0, info="all"), CzEnv("hard", horizon=100.0, info="all")
-    batch.reset(seed=20)
-    alone.reset(seed=23)
-    for k in range(20):
-        action = np.array([0.3 * np.sin(k), -0.2], np.float32)
-        observation, reward, *_, infos = batch.step(np.tile(action, (5, 1)))
-        shown, gained, *_, info = alone.step(action)
-        assert (observation[3].tobytes(), reward[3]) == (shown.tobytes(), gained)
-        assert {name: infos[name][3] for name in info} == info
-
-
 def times(results: Any, taken: list[float]) -> Any:
     """The results without what was timed, which is put into ``taken``."""
     if isinstance(results, list):
@@ -91,6 +70,7 @@ def times(results: Any, taken: list[float]) -> Any:
     return {name: times(part, taken) for name, part in results.items() if name != "microseconds_per_step"}
 
 
+@pytest.mark.slow
 def test_the_benchmark_prints_the_same_table_twice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Here and in a process of its own, and the same JSON; all but the time in the policies, which is measured."""
     printed, written = [], []

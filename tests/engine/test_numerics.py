@@ -16,8 +16,8 @@ from cz_gym.episodes.draw import randomised
 from cz_gym.episodes.record import Factors
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.plant import Disturbance, Inputs, State, rk4
-from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN, failure_penalty, reward
-from tests.stress.__main__ import INTERVALS, MODELS, OBSERVATIONS, WIDE, campaign, cases, main, run_case
+from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
+from tests.stress.__main__ import INTERVALS, MODELS, OBSERVATIONS, WIDE, campaign, cases, run_case
 from tests.stress.adversaries import KINDS, Adversaries
 from tests.stress.checks import Broken, Watch
 
@@ -39,8 +39,8 @@ def test_a_short_campaign() -> None:
     assert totals.steps > 50_000
     assert totals.failures > 100
     assert totals.episodes > totals.failures
-    assert totals.extremes.h_c_min < HEIGHT_MIN
-    assert totals.extremes.imbalance_max < 1e-3
+    assert totals.extremes["h_c"][0] < HEIGHT_MIN
+    assert totals.extremes["missing heat"][1] < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -84,14 +84,6 @@ def test_heat_that_appears_is_found() -> None:
         watch.after(np.zeros((2, 2)), *result)
 
 
-@pytest.mark.parametrize("argv", [["--steps", "0"], ["--seed", "-1"], ["--steps", "many"], ["--stepps", "3"]])
-def test_the_command_refuses_in_one_line(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as left:
-        main(argv)
-    assert left.value.code == 2
-    assert capsys.readouterr().err.count("\n") == 1
-
-
 def test_a_heater_never_cools() -> None:
     """A small furnace, less than 10 kW at its operating point: no action takes heat out of it."""
     small = Parameters(G_1a=0.5, eps=0.01, C_1=2e4)
@@ -119,15 +111,6 @@ def test_crashing_at_the_end_earns_less_than_any_way_on() -> None:
         earned[terminated] = gained
         assert terminated != truncated
     assert earned[True] < earned[False]
-    # By construction: the best failing step against the worst life from it on.
-    for left in (1, 2, 10, 2160):
-        assert reward(_cost(0.0)) + failure_penalty(2160 - left + 1, 2160) <= left * reward(_cost(1e300))
-
-
-def _cost(total: float) -> Any:
-    from cz_gym.task import Cost
-
-    return Cost(total, 0.0, 0.0, 0.0)
 
 
 def _visited(n: int) -> list[tuple[State, Inputs, Disturbance, Any]]:

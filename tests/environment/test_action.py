@@ -58,21 +58,6 @@ def test_window_slew_and_heater_steps_hold_for_smooth_actions_too() -> None:
     assert info["Q_H"] - float(p["Q_H_0"]) == pytest.approx(3e3, abs=100.0)
 
 
-@pytest.mark.parametrize("scenario", ["randomized", "puller"])
-def test_the_batch_equals_the_scalar_form(scenario: str) -> None:
-    batch = CzVectorEnv(2, scenario, observation="history", action="smooth", info="all")
-    alone = CzEnv(scenario, observation="history", action="smooth", info="all")
-    together, _ = batch.reset(seed=[3, 4])
-    observation, _ = alone.reset(seed=3)
-    random = np.random.default_rng(1)
-    for _ in range(50):
-        np.testing.assert_array_equal(together[0], observation)
-        actions = random.uniform(-1.2, 1.2, (2, 2)).astype(np.float32)
-        together, gained, *_ = batch.step(actions)
-        observation, reward, *_ = alone.step(actions[0])
-        assert gained[0] == reward
-
-
 def test_settings_and_states_tell_the_kind_of_action() -> None:
     direct, smooth = make_config(), make_config(action="smooth")
     assert direct.hash != smooth.hash

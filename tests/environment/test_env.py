@@ -1,8 +1,6 @@
 from __future__ import annotations
 
 import math
-import pickle
-import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -10,8 +8,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.error import InvalidAction, ResetNeeded
-from gymnasium.utils.env_checker import check_env as check_with_gymnasium
-from stable_baselines3.common.env_checker import check_env as check_with_sb3
 
 import cz_gym
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv, Parameters, Scenario, make_puller
@@ -24,21 +20,6 @@ from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 MM_PER_MIN = 1e-3 / 60
 ZERO = np.zeros(2, np.float32)
 OBSERVATIONS = ["measured", "history", "state"]
-
-
-@pytest.mark.parametrize("observation", OBSERVATIONS)
-def test_gymnasiums_checker(observation: str) -> None:
-    env = gym.make("Cz-v0", observation=observation, horizon=600.0, info="all")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_with_gymnasium(env.unwrapped)
-
-
-@pytest.mark.parametrize("observation", OBSERVATIONS)
-def test_stable_baselines3s_checker(observation: str) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_with_sb3(gym.make("Cz-v0", observation=observation, horizon=600.0, info="all"), warn=True)
 
 
 def test_registration() -> None:
@@ -56,19 +37,6 @@ def test_everything_advertised_is_there() -> None:
     assert cz_gym.__all__ == sorted(cz_gym.__all__, key=lambda name: (not name.isupper(), name))
     for name in cz_gym.__all__:
         assert hasattr(cz_gym, name)
-
-
-@pytest.mark.parametrize("observation", OBSERVATIONS)
-def test_dtypes(observation: str) -> None:
-    env = gym.make("Cz-v0", observation=observation, info="all")
-    assert (env.action_space.dtype, env.observation_space.dtype) == (np.float32, np.float32)
-    first, _ = env.reset(seed=1)
-    second, gained, terminated, truncated, _ = env.step(env.action_space.sample())
-    for array in (first, second):
-        assert array.dtype == np.float32
-        assert env.observation_space.contains(array)
-    assert (type(gained), type(terminated), type(truncated)) == (float, bool, bool)
-    assert first is not second
 
 
 @pytest.mark.parametrize(
@@ -134,11 +102,6 @@ def test_a_drawn_puller_without_operating_point_is_drawn_again() -> None:
         assert np.isfinite(one.get_state().slot.slot["puller"].item()).all()
 
 
-def test_parameters_without_an_operating_point_are_refused_on_entry() -> None:
-    with pytest.raises(ValueError, match="operating point"):
-        CzEnv(parameters=Parameters(T_e=4000.0))
-
-
 @pytest.mark.parametrize("action", [[math.nan, 0.0], [0.0], [0.0, 0.0, 0.0], [[0.0, 0.0]], 0.0, "up", None, ["a", "b"]])
 def test_bad_actions_are_refused(action: Any) -> None:
     env = CzEnv(info="all")
@@ -146,21 +109,6 @@ def test_bad_actions_are_refused(action: Any) -> None:
     with pytest.raises(InvalidAction, match="action must") as refusal:
         env.step(action)
     assert "\n" not in str(refusal.value)
-
-
-@pytest.mark.parametrize("options", [{"seed": 3}, {3: 1, "a": 2}, {"scenario": "nonsense"}, {"state": 3}, 3, "abc", []])
-def test_bad_reset_options_are_refused(options: Any) -> None:
-    with pytest.raises(ValueError, match=r"unknown reset option|unknown scenario|get_state|must be a dict, not"):
-        CzEnv(info="all").reset(options=options)
-
-
-def test_a_state_is_not_continued_on_another_scenario() -> None:
-    env = CzEnv(info="all")
-    env.reset(seed=0)
-    before = pickle.dumps(env.get_state())
-    with pytest.raises(ValueError, match="exclude each other"):
-        env.reset(seed=1, options={"scenario": "hard", "state": env.get_state()})
-    assert pickle.dumps(env.get_state()) == before
 
 
 @pytest.mark.parametrize("number", [np.int64, np.float32, np.float64])
@@ -236,10 +184,6 @@ def test_seeds_reproduce_and_episodes_differ() -> None:
     assert not np.array_equal(one[0], other[0])
     assert not np.array_equal(one[0], one[1])
     assert not np.array_equal(one[1], one[2])
-
-
-def test_without_a_seed_nothing_repeats() -> None:
-    assert not np.array_equal(CzEnv(info="all").reset()[0], CzEnv(info="all").reset()[0])
 
 
 def test_info_is_the_plant_in_si() -> None:

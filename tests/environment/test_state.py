@@ -96,31 +96,6 @@ def test_states_travel_between_scalar_and_vector() -> None:
     assert run(back, 40, 12) == run(scalars[1], 40, 12)
 
 
-def test_a_batch_continues_bit_for_bit_through_redraws() -> None:
-    one, other = CzVectorEnv(4, horizon=50.0), CzVectorEnv(4, horizon=50.0)
-    one.reset(seed=3)
-    for action in ACTIONS[:13]:
-        one.step(np.tile(action, (4, 1)))
-    states = pickle.loads(pickle.dumps(one.get_state()))
-    shown, _ = other.reset(options={"state": states})
-    assert shown.shape == (4, 11)
-    for action in ACTIONS[13:60]:
-        expected, actual = one.step(np.tile(action, (4, 1))), other.step(np.tile(action, (4, 1)))
-        for a, b in zip(expected[:4], actual[:4], strict=True):
-            np.testing.assert_array_equal(a, b)
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [{"scenario": "hard"}, {"model": "I"}, {"observation": "state"}, {"control_interval": 10.0}, {"horizon": 100.0}],
-)
-def test_a_state_of_other_settings_is_refused(arguments: dict[str, Any]) -> None:
-    env = CzEnv()
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="other settings"):
-        CzEnv(**arguments).set_state(env.get_state())
-
-
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -207,13 +182,29 @@ def test_what_is_written_into_results_is_not_saved(observation: str) -> None:
         np.testing.assert_array_equal(infos[name], said[name], err_msg=name)
 
 
-@pytest.mark.parametrize("options", [{"scenario": "nonsense"}, {"state": 3}, {"state": CzEnv("nominal").get_state()}])
-def test_a_refused_reset_changes_nothing(options: dict[str, Any]) -> None:
-    env = CzEnv()
+OTHER = CzEnv("nominal")
+OTHER.reset(seed=0)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (3, "must be a dict, not"),
+        ("abc", "must be a dict, not"),
+        ({"seed": 3}, "unknown reset option"),
+        ({3: 1, "a": 2}, "unknown reset option"),
+        ({"scenario": "nonsense"}, "unknown scenario"),
+        ({"state": 3}, "get_state|expected 2 states"),
+        ({"state": OTHER.get_state()}, "other settings|expected 2 states"),
+        ({"scenario": "hard", "state": OTHER.get_state()}, "exclude each other"),
+    ],
+)
+@pytest.mark.parametrize("form", [CzEnv, lambda: CzVectorEnv(2)])
+def test_a_refused_reset_changes_nothing(form: Any, options: Any, says: str) -> None:
+    env = form()
     env.reset(seed=0)
-    env.step(ACTIONS[0])
     before = pickle.dumps(env.get_state())
-    with pytest.raises(ValueError, match=r"unknown scenario|get_state|other settings"):
+    with pytest.raises(ValueError, match=says):
         env.reset(seed=5, options=options)
     assert pickle.dumps(env.get_state()) == before
 

@@ -28,16 +28,13 @@ def test_reward_saturates_and_is_never_flat(error: float, more: float, pull: flo
 
 
 def test_limits() -> None:
-    assert within_limits(P.r_0, P.h_0, P.r_0, P.a)
-    assert within_limits(P.r_0 + 7.9 * MM, P.h_0, P.r_0, P.a)
-    assert not within_limits(P.r_0 + 8.1 * MM, P.h_0, P.r_0, P.a)
-    assert not within_limits(P.r_0 - 8.1 * MM, P.h_0, P.r_0, P.a)
-    assert within_limits(P.r_0, 1.21 * MM, P.r_0, P.a)
-    assert not within_limits(P.r_0, 1.19 * MM, P.r_0, P.a)
-    assert within_limits(P.r_0, 1.239 * P.a, P.r_0, P.a)
-    assert not within_limits(P.r_0, 1.241 * P.a, P.r_0, P.a)
-    assert not within_limits(math.nan, P.h_0, P.r_0, P.a)
-    assert not within_limits(P.r_0, math.nan, P.r_0, P.a)
+    for r_c in (P.r_0 - 7.9 * MM, P.r_0 + 7.9 * MM):
+        for h_c in (1.21 * MM, 1.239 * P.a):
+            assert within_limits(r_c, h_c, P.r_0, P.a)
+    for beyond in (P.r_0 - 8.1 * MM, P.r_0 + 8.1 * MM, math.nan):
+        assert not within_limits(beyond, P.h_0, P.r_0, P.a)
+    for beyond in (1.19 * MM, 1.241 * P.a, math.nan):
+        assert not within_limits(P.r_0, beyond, P.r_0, P.a)
 
 
 @given(st.integers(1, 2160))

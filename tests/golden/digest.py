@@ -1,4 +1,4 @@
-"""What an environment gives, as one hash; ``python digest.py`` prints it with the place that cz_gym came from."""
+"""What an environment gives, as one hash; ``python -m tests.golden.digest`` prints it, and where cz_gym came from."""
 
 from __future__ import annotations
 

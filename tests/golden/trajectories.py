@@ -1,4 +1,4 @@
-"""The golden trajectories; ``python tests/golden/trajectories.py`` writes them anew, after a meant change of physics.
+"""The golden trajectories; ``python -m tests.golden.trajectories`` writes them anew, after a meant change of physics.
 
 Every scenario under both models: a fixed feedback on the true state with a fixed dither, 40 min at 10 s, written out
 every 20 min: state, ring as measured, references, and the sum of the rewards so far.

@@ -54,6 +54,7 @@ def edit(file: Path, old: str, new: str) -> None:
     file.write_text(text.replace(old, new))
 
 
+@pytest.mark.slow
 def test_changed_physics_is_never_run_from_an_old_cache(package: Path, tmp_path: Path) -> None:
     """The edited function is compiled into a loop that stands in another, unchanged module."""
     cache = tmp_path / "cache"
@@ -66,6 +67,7 @@ def test_changed_physics_is_never_run_from_an_old_cache(package: Path, tmp_path:
     assert (other != folder, hits) == (True, "0")
 
 
+@pytest.mark.slow
 def test_damaged_code_is_compiled_again(tmp_path: Path) -> None:
     """Cut short, changed in one bit, and of another function under the right name."""
     cache = tmp_path / "cache"
@@ -101,6 +103,7 @@ def test_a_full_disk_keeps_nothing_and_fails_nothing(tmp_path: Path, monkeypatch
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_processes_that_compile_at_once_all_have_it_right(tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "CZ_GYM_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, "-c", DERIVE]
@@ -109,13 +112,6 @@ def test_processes_that_compile_at_once_all_have_it_right(tmp_path: Path) -> Non
     assert all(process.returncode == 0 for process in several)
     assert printed == {run(DERIVE, ROOT, tmp_path)[1]}
     assert run(DERIVE, ROOT, tmp_path)[2] == "1"
-
-
-def test_no_place_for_a_cache_is_no_failure(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("in the way")
-    folder, height, hits = run(DERIVE, ROOT, tmp_path / "file" / "below")
-    assert (folder, hits) == ("None", "0")
-    assert float(height) == pytest.approx(6.64e-3, rel=1e-3)
 
 
 @pytest.fixture
@@ -157,11 +153,13 @@ def test_a_read_only_cache_is_no_failure(fresh: pytest.MonkeyPatch, tmp_path: Pa
     assert cache_folder() is None
 
 
+@pytest.mark.slow
 def test_a_cache_that_vanishes_is_no_failure(tmp_path: Path) -> None:
     code = "import shutil, cz_gym.jit.compile as c, cz_gym\nshutil.rmtree(c.cache_folder())\n" + DERIVE
     assert float(run(code, ROOT, tmp_path / "cache")[1]) == pytest.approx(6.64e-3, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_users_meniscus_is_never_run_from_a_cache(package: Path, tmp_path: Path) -> None:
     (package / "mine.py").write_text(
         "from cz_gym import HURLE\n"

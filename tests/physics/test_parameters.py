@@ -19,17 +19,6 @@ def test_every_parameter_says_what_it_is() -> None:
         assert quantity.source
 
 
-def test_values_are_those_of_the_design() -> None:
-    p = Parameters()
-    assert (p.sigma, p.rho_l, p.g, p.sigma_SB) == (0.72, 2570, 9.81, 5.670374419e-8)
-    assert (p.k_l, p.rho_s, p.dH, p.T_m, p.dT_0) == (62, 2330, 1.8e6, 1685, 5.02)
-    assert math.degrees(p.alpha_0) == pytest.approx(11)
-    assert math.degrees(p.phi_b) == pytest.approx(3.5)
-    assert (p.r_0, p.v_0) == pytest.approx((0.0875, 2e-5))
-    assert (p.C_1, p.C_2, p.C_b) == (5.7e4, 1e5, 8e4)
-    assert (p.kappa_12, p.G_1a, p.T_a, p.G_2b, p.eps, p.R_cr, p.T_e) == (2.8e-8, 30, 350, 200, 0.2, 0.28, 1300)
-
-
 def test_parameters_cannot_be_changed() -> None:
     with pytest.raises(AttributeError):
         Parameters().r_0 = 0.1  # type: ignore[misc]

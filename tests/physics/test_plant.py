@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from cz_gym import HURLE, SCENARIOS, CzEnv, Parameters, Puller, Scenario, State, make_puller
+from cz_gym import SCENARIOS, CzEnv, Parameters, Puller, Scenario, State, make_puller
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.episodes.schedule import disturbance
 from cz_gym.jit.compile import kernel
@@ -104,37 +104,6 @@ def test_compiled_equations_equal_the_plain_ones(states: State, rng: np.random.G
     np.testing.assert_allclose(out / scale, np.array(plain).T / scale, rtol=1e-12, atol=1e-13)
 
 
-def reduced(lam: float) -> tuple[np.ndarray, np.ndarray]:
-    """Jacobians of radius and height, and of the bright ring, by complex step at constant melt temperature."""
-    p = make_puller(lam=lam)
-    A, C = np.zeros((2, 2)), np.zeros(2)
-    for j in range(2):
-        x = list(map(complex, p.state_0))
-        x[j] += 1e-30j
-        rate = rates(State(*x), p.inputs_0, NO_DISTURBANCE, p, HURLE.slope)
-        A[:, j] = np.imag([rate.r_c, rate.h_c]) / 1e-30
-        C[j] = np.imag(x[0] + HURLE.ring_offset(x[0], x[1], p)) / 1e-30
-    return A, C
-
-
-def test_linearised_plant_has_the_published_numbers() -> None:
-    A, C = reduced(1.0)
-    assert A[0, 1] == pytest.approx(-0.004888, rel=1e-3)
-    stable, unstable = np.sort(np.linalg.eigvals(A))
-    assert stable == pytest.approx(-1.683e-3, rel=1e-3)
-    assert unstable == pytest.approx(8.74e-6, rel=1e-3)
-    slope, gain = C[1] / A[0, 1], C[0] - C[1] * A[0, 0] / A[0, 1]
-    assert slope == pytest.approx(-45.99, rel=1e-3)
-    assert gain == pytest.approx(1.0038, rel=1e-3)
-    assert -gain / slope == pytest.approx(0.0218, rel=2e-3)
-
-
-def test_model_two_has_one_pole_at_zero() -> None:
-    A, _ = reduced(0.0)
-    assert A[0, 1] == pytest.approx(-0.004888, rel=1e-3)
-    assert np.sort(np.linalg.eigvals(A)) == pytest.approx([0.0, 8.74e-6], rel=1e-3, abs=1e-12)
-
-
 def test_runge_kutta_is_of_fourth_order() -> None:
     p = make_puller(lam=0.7)
     x = np.array([p.r_0, 0.8 * p.h_0, p.T_1_0 + 5, p.T_2_0, p.T_b_0 + 2])
@@ -149,17 +118,6 @@ def test_runge_kutta_is_of_fourth_order() -> None:
         errors.append(np.abs((np.array(new) - exact) / exact)[:2].max())
     order = np.polyfit(np.log(steps), np.log(errors), 1)[0]
     assert order == pytest.approx(4.0, abs=0.15)
-
-
-@pytest.mark.parametrize(("height", "bound"), [(0.004, 1e-8), (0.0012, 1e-4), (1.0, 1e-8), (1.24, 1e-4)])
-def test_one_substep_is_exact_enough(height: float, bound: float) -> None:
-    p = make_puller()
-    h_c = height if height < 0.1 else height * p.a
-    x = np.array([p.r_0, h_c, p.T_1_0, p.T_2_0, p.T_b_0])
-    u = Inputs(p.v_0 * (2.0 if height < 0.1 else 0.0), p.Q_H_0)
-    new = np.array(rk4(State(*x), u, NO_DISTURBANCE, p, 5.0, hurle_slope))
-    exact = integrated(x, Truth(*u), p, 5.0)
-    assert np.abs(new / exact - 1).max() < bound
 
 
 @pytest.mark.parametrize(("interval", "scenario"), [(5.0, "randomized"), (2.0, MELTING), (10.0, "hard")])

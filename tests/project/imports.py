@@ -6,6 +6,7 @@ A room is a package, or a module that stands beside packages (``cz_gym.env``, ``
 from __future__ import annotations
 
 import ast
+import os
 from collections import Counter
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
@@ -13,8 +14,6 @@ from itertools import pairwise
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-FOLDERS = {"cz_gym": "cz_gym", "baselines": "cz_gym.baselines", "agents": "cz_gym.agents", "studies": "studies"}
-"""Folders of the checkout and the packages in them."""
 PROGRAMS = ("benchmark", "train")
 FORBIDDEN = {
     "cz_gym": ("cz_gym.baselines", "cz_gym.agents", "studies", "examples", "tests", *PROGRAMS),
@@ -22,18 +21,19 @@ FORBIDDEN = {
     "cz_gym.agents": ("cz_gym.baselines", "studies", "examples", "tests", *PROGRAMS),
     "studies": ("examples", "tests", *PROGRAMS),
 }
-"""What nothing in a package may import."""
+"""Packages, and what nothing in each may import."""
+Arrows = Counter[tuple[str, str]]
+"""How often the first imports from the second."""
 
 
 def modules() -> dict[str, Path]:
     """Every module by its one name."""
     found = {name: ROOT / f"{name}.py" for name in PROGRAMS}
-    for folder, package in FOLDERS.items():
-        for file in sorted((ROOT / folder).rglob("*.py")):
-            parts = file.relative_to(ROOT / folder).with_suffix("").parts
-            if folder != "cz_gym" or parts[0] not in FOLDERS:
-                found[".".join((package, *parts)).removesuffix(".__init__")] = file
-    return found
+    for top in ("cz_gym", "studies"):
+        for place, _, names in os.walk(ROOT / top, followlinks=True):
+            for file in (Path(place) / name for name in names if name.endswith(".py")):
+                found[".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")] = file
+    return dict(sorted(found.items()))
 
 
 def imports(name: str, file: Path) -> Iterator[str]:
@@ -48,15 +48,21 @@ def imports(name: str, file: Path) -> Iterator[str]:
             yield from (f"{base}.{alias.name}" for alias in node.names)
 
 
+def owner(name: str) -> str | None:
+    """The innermost of the packages that a dotted name is or lies in."""
+    holders = [package for package in FORBIDDEN if within(name, package)]
+    return max(holders, key=len, default=None)
+
+
 def within(name: str, package: str) -> bool:
     """Whether a dotted name is a package or lies in it."""
     return name == package or name.startswith(f"{package}.")
 
 
-def arrows() -> Counter[tuple[str, str]]:
-    """How often each module imports from each other one."""
+def arrows() -> Arrows:
+    """Between modules."""
     known = modules()
-    found: Counter[tuple[str, str]] = Counter()
+    found: Arrows = Counter()
     for name, file in known.items():
         for imported in imports(name, file):
             target = imported if imported in known else imported.rpartition(".")[0]
@@ -65,16 +71,28 @@ def arrows() -> Counter[tuple[str, str]]:
     return found
 
 
+def between_rooms() -> Arrows:
+    """Between rooms."""
+    found: Arrows = Counter()
+    for (one, other), times in arrows().items():
+        if room(one) != room(other):
+            found[room(one), room(other)] += times
+    return found
+
+
 def room(name: str) -> str:
     """The room of a module: its package, or itself where packages stand beside it."""
-    file, package = modules()[name], name.rpartition(".")[0]
-    beside = file.parent if file.name != "__init__.py" else file.parent.parent
-    several = any(folder.is_dir() and (folder / "__init__.py").exists() for folder in beside.iterdir())
-    return name if file.name == "__init__.py" or several or not package else package
+    package = name.rpartition(".")[0]
+    folder = ROOT / name.replace(".", "/")
+    several = any((beside / "__init__.py").exists() for beside in folder.parent.iterdir())
+    return name if folder.is_dir() or several or not package else package
 
 
-def circles(graph: dict[str, set[str]]) -> list[str]:
+def circle(pairs: Arrows) -> list[str]:
     """The first circle found, as a list of names; empty if there is none."""
+    graph: dict[str, set[str]] = {}
+    for one, other in pairs:
+        graph.setdefault(one, set()).add(other)
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
@@ -82,36 +100,15 @@ def circles(graph: dict[str, set[str]]) -> list[str]:
     return []
 
 
-def graph_of(pairs: Counter[tuple[str, str]]) -> dict[str, set[str]]:
-    """Who imports whom."""
-    graph: dict[str, set[str]] = {}
-    for one, other in pairs:
-        graph.setdefault(one, set()).add(other)
-    return graph
-
-
-def between_rooms() -> Counter[tuple[str, str]]:
-    """How often rooms import from each other."""
-    rooms = {name: room(name) for name in modules()}
-    found: Counter[tuple[str, str]] = Counter()
-    for (one, other), times in arrows().items():
-        if rooms[one] != rooms[other]:
-            found[rooms[one], rooms[other]] += times
-    return found
-
-
 def main() -> None:
     """Print what there is."""
-    pairs = between_rooms()
-    rooms = {room(name) for name in modules()}
-    circle = circles(graph_of(pairs))
-    for folder, package in FOLDERS.items():
-        others = [each for each in FOLDERS.values() if each != package and within(each, package)]
-        mine = [each for each in rooms if within(each, package) and not any(within(each, other) for other in others)]
+    pairs, rooms = between_rooms(), {room(name) for name in modules()}
+    for package in FORBIDDEN:
+        mine = {each for each in rooms if owner(each) == package}
         inside = sum(one in mine and other in mine for one, other in pairs)
-        print(f"{folder:10s} {len(mine):3d} rooms, {inside:3d} arrows between them")
-    print(f"all        {len(rooms):3d} rooms, {len(pairs):3d} arrows, {sum(pairs.values())} imports")
-    print("circles    " + (" ".join(f"{one} -> {other};" for one, other in pairwise(circle)) or "none"))
+        print(f"{package:16s} {len(mine):3d} rooms, {inside:3d} arrows between them")
+    print(f"{'all':16s} {len(rooms):3d} rooms, {len(pairs):3d} arrows, {sum(pairs.values())} imports")
+    print("circles", " ".join(f"{one} -> {other};" for one, other in pairwise(circle(pairs))) or "none")
 
 
 if __name__ == "__main__":

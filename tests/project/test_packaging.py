@@ -1,191 +1,182 @@
+"""What is installed: one package, on four dependencies, by every way of installing it."""
+
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import sys
+import tarfile
 import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "golden"))
-
-from digest import digest
-
 import cz_gym
+from tests.golden.digest import digest
 
 ROOT = Path(__file__).parents[2]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-BLOCKED = """
-import sys
-
-class Blind:
-    def __init__(self, finder):
-        self.finder = finder
-
-    def __getattr__(self, name):
-        return getattr(self.finder, name)
-
-    def find_spec(self, name, path=None, target=None):
-        return None if name.partition(".")[0] in BANNED else self.finder.find_spec(name, path, target)
-
-sys.meta_path[:] = map(Blind, sys.meta_path)
+SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PROJECT = SETTINGS["project"]
+LINKS = {"baselines": "cz_gym.baselines", "agents": "cz_gym.agents"}
+"""Folders that stand beside the package and are packages in it, by links in the checkout."""
+MADE = {"build", "dist", ".git", ".venv", "__pycache__", ".pytest_cache", ".hypothesis", ".mypy_cache", ".ruff_cache"}
+NAMES = """
+import importlib, sys
+for name in ("cz_gym", "cz_gym.baselines.registry", "cz_gym.agents.agent_file.contract"):
+    print(importlib.import_module(name).__file__)
+assert "cz_gym.baselines" in sys.modules
+assert not {"baselines", "agents"} & set(sys.modules)
 """
 SMOKE = """
 import gymnasium as gym
 import numpy as np
 env = gym.make("cz_gym:Cz-v0", scenario="puller", observation="history")
-env.reset(seed=1)
+observation, _ = env.reset(seed=1)
 for _ in range(20):
-    observation, reward, *_ = env.step(env.action_space.sample())
+    observation, *_ = env.step(env.action_space.sample())
 assert np.isfinite(observation).all()
-import cz_gym
+from cz_gym.baselines import CompensatedPID
 batch = gym.make_vec("Cz-v0", num_envs=2, vectorization_mode="vector_entry_point")
 batch.reset(seed=1)
-from {baselines} import CompensatedPID
-action, state = CompensatedPID().predict(batch.step(np.zeros((2, 2)))[0])
-assert action.shape == (2, 2)
-print(cz_gym.__file__)
+assert CompensatedPID().predict(batch.step(np.zeros((2, 2)))[0])[0].shape == (2, 2)
+"""
+ABSENT = """
+import sys
+class Blind:
+    def __init__(self, finder):
+        self.finder = finder
+    def __getattr__(self, name):
+        return getattr(self.finder, name)
+    def find_spec(self, name, path=None, target=None):
+        return None if name.partition(".")[0] in {absent} else self.finder.find_spec(name, path, target)
+sys.meta_path[:] = map(Blind, sys.meta_path)
 """
 
 
-def run(code: str, folder: Path, path: Path) -> str:
-    """What a fresh process prints, started in ``folder`` with ``path`` first."""
-    prelude = f"import sys\nsys.path[:] = [{str(path)!r}] + [p for p in sys.path if p not in ('', {str(ROOT)!r})]\n"
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", prelude + code], cwd=folder, capture_output=True, text=True
+def printed(code: str, place: Path, cwd: Path) -> list[str]:
+    """Lines that a fresh process prints, which finds packages in ``place``, as an installer left it, before others."""
+    prelude = (
+        "import site, sys\n"
+        "sys.meta_path[:] = [f for f in sys.meta_path if 'editable' not in getattr(f, '__module__', '')]\n"
+        "for name in [name for name in sys.modules if 'editable' in name]:\n"
+        "    del sys.modules[name]\n"
+        f"sys.path[:] = [{str(place)!r}] + [p for p in sys.path if p not in ('', {str(ROOT)!r})]\n"
+        f"site.addsitedir({str(place)!r})\n"
     )
+    command = [sys.executable, "-W", "error", "-c", prelude + code]
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
+    return done.stdout.split()
+
+
+def test_every_package_is_listed() -> None:
+    folders = {"cz_gym": ROOT / "cz_gym", **{package: ROOT / "cz_gym" / name for name, package in LINKS.items()}}
+    found = {
+        ".".join((package, *file.parent.relative_to(folder).parts))
+        for package, folder in folders.items()
+        for file in folder.rglob("__init__.py")
+        if package != "cz_gym" or file.relative_to(folder).parts[0] not in LINKS
+    }
+    listed = SETTINGS["tool"]["setuptools"]["packages"]
+    assert sorted(listed) == sorted(found)
+
+
+def test_versions_agree_and_core_dependencies_are_four() -> None:
+    assert cz_gym.__version__ == PROJECT["version"]
+    assert f"\nversion: {PROJECT['version']}\n" in (ROOT / "CITATION.cff").read_text()
+    names = [requirement.partition(">")[0] for requirement in PROJECT["dependencies"]]
+    assert names == ["gymnasium", "numpy", "scipy", "numba"]
+
+
+@pytest.mark.parametrize("file", ["constraints.txt", "constraints-lowest.txt"])
+def test_pins_lie_in_the_open_ranges(file: str) -> None:
+    """And ``make test-lowest`` tests the lowest versions of all it names; torch alone stands where its note says."""
+    packaging = pytest.importorskip("packaging.requirements")
+    version = pytest.importorskip("packaging.version").Version
+    lines = [line for line in (ROOT / file).read_text().splitlines() if not line.startswith("#")]
+    pins = {name.lower().replace("_", "-"): pin for name, pin in (line.split("==") for line in lines)}
+    extras = PROJECT["optional-dependencies"]
+    chosen = [*PROJECT["dependencies"], *extras["test"][1:]]
+    chosen += [text for name in packaging.Requirement(extras["test"][0]).extras for text in extras[name]]
+    requirements = {text: packaging.Requirement(text) for text in chosen}
+    for text, requirement in requirements.items():
+        (bound,) = requirement.specifier
+        pin, least = pins[requirement.name.lower()], version(bound.version).release
+        assert bound.operator == ">=", text
+        assert requirement.specifier.contains(pin), text
+        if "lowest" in file and requirement.name != "torch":
+            assert version(pin).release[: len(least)] == least, text
+    if "lowest" in file:
+        assert {requirement.name for requirement in requirements.values()} == set(pins)
 
 
 def test_environment_and_baselines_need_neither_torch_nor_plots(tmp_path: Path) -> None:
-    banned = [
-        "torch", "stable_baselines3", "sb3_contrib", "matplotlib", "onnxruntime", "onnx", "optuna", "tensorboard",
-        "control", "tqdm", "pygame", "casadi",
-    ]  # fmt: skip
-    code = f"BANNED = {banned!r}\n" + BLOCKED + SMOKE.format(baselines="cz_gym.baselines")
-    assert run(code, tmp_path, ROOT) == str(ROOT / "cz_gym" / "__init__.py")
-
-
-def test_core_dependencies_are_four() -> None:
-    names = [requirement.partition(">")[0] for requirement in PROJECT["dependencies"]]
-    assert names == ["gymnasium", "numpy", "scipy", "numba"]
-    assert set(PROJECT["optional-dependencies"]) == {
-        "benchmark",
-        "agents",
-        "render",
-        "mpc",
-        "peers",
-        "docs",
-        "browser",
-        "test",
-    }
-
-
-def test_version_stands_once() -> None:
-    assert cz_gym.__version__ == PROJECT["version"]
-
-
-def test_pins_lie_in_the_open_ranges() -> None:
-    packaging = pytest.importorskip("packaging.requirements")
-    pins = dict(
-        line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")
-    )
-    pins = {name.lower().replace("_", "-"): version for name, version in pins.items()}
-    extras = PROJECT["optional-dependencies"]
-    for text in [*PROJECT["dependencies"], *extras["benchmark"], *extras["agents"], *extras["docs"], *extras["test"]]:
-        requirement = packaging.Requirement(text)
-        if requirement.name != "cz-gym":
-            assert requirement.specifier.contains(pins[requirement.name.lower()]), text
-            assert "<" not in str(requirement.specifier)
-    assert pins["torch"] == "2.13.0"
-
-
-def test_lowest_versions_are_those_of_the_open_ranges() -> None:
-    """``make test-lowest`` tests what pyproject.toml promises; torch alone stands where its note says."""
-    packaging = pytest.importorskip("packaging.requirements")
-    version = pytest.importorskip("packaging.version").Version
-    lines = (ROOT / "constraints-lowest.txt").read_text().splitlines()
-    pins = dict(line.split("==") for line in lines if not line.startswith("#"))
-    extras = PROJECT["optional-dependencies"]
-    tested = packaging.Requirement(extras["test"][0]).extras
-    wanted = [*PROJECT["dependencies"], *extras["test"][1:], *(text for name in tested for text in extras[name])]
-    requirements = [packaging.Requirement(text) for text in wanted]
-    assert {requirement.name for requirement in requirements} == set(pins)
-    for requirement in requirements:
-        (lowest,) = (version(bound.version).release for bound in requirement.specifier)
-        if requirement.name != "torch":
-            assert version(pins[requirement.name]).release[: len(lowest)] == lowest, requirement
+    absent = {"torch", "stable_baselines3", "sb3_contrib", "matplotlib", "onnxruntime", "onnx", "optuna", "tensorboard"}
+    absent |= {"control", "tqdm", "pygame", "casadi"}
+    printed(ABSENT.replace("{absent}", repr(absent)) + SMOKE, ROOT, tmp_path)
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
-    tracked = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True)
-    names = tracked.stdout.split("\0") if tracked.returncode == 0 else _files()
-    source = folder / "source"
-    for name in names:
-        if name and (ROOT / name).is_file():
-            (source / name).parent.mkdir(parents=True, exist_ok=True)
-            (source / name).write_bytes((ROOT / name).read_bytes())
-    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(source)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return next(folder.glob("*.whl"))
-
-
-def _files() -> list[str]:
-    """What lies here if this is no checkout, but for what was made by running it."""
-    made = {"build", "__pycache__", ".pytest_cache", ".hypothesis"}
-    walked = ((Path(folder).relative_to(ROOT), names) for folder, _, names in os.walk(ROOT, followlinks=True))
-    return [str(folder / name) for folder, names in walked if not made & set(folder.parts) for name in names]
-
-
-@pytest.fixture(scope="module")
-def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that an installer puts the wheel into; with it, its compiled code is made once."""
-    folder = tmp_path_factory.mktemp("installed")
-    command = [sys.executable, "-m", "pip", "install", "--disable-pip-version-check", "--quiet", "--no-deps"]
-    done = subprocess.run([*command, "--no-index", "--target", str(folder), str(wheel)], capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkout as it is where there are no links, as on Windows: the files named as links hold where these lead."""
+    folder = tmp_path_factory.mktemp("source")
+    for place, inner, names in os.walk(ROOT):
+        here = Path(place).relative_to(ROOT)
+        inner[:] = [name for name in inner if name not in MADE and not (Path(place) / name).is_symlink()]
+        (folder / here).mkdir(exist_ok=True)
+        for name in names:
+            (folder / here / name).write_bytes((ROOT / here / name).read_bytes())
+    for name in LINKS:
+        (folder / "cz_gym" / name).write_text(f"../{name}")
     return folder
 
 
-def test_wheel_installs_one_package_and_works_outside_the_checkout(
-    wheel: Path, installed: Path, tmp_path: Path
-) -> None:
+@pytest.fixture(scope="module")
+def built(source: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The source distribution and the wheel that is built from it."""
+    folder = tmp_path_factory.mktemp("built")
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(source)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return next(folder.glob("*.tar.gz")), next(folder.glob("*.whl"))
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_one_package_and_what_it_needs(built: tuple[Path, Path], tmp_path: Path) -> None:
+    sdist, wheel = built
     with zipfile.ZipFile(wheel) as archive:
-        names = archive.namelist()
-    top = {name.partition("/")[0] for name in names}
-    assert {name for name in top if not name.endswith(".dist-info")} == {"cz_gym"}
-    for needed in ("py.typed", "baselines/__init__.py", "agents/__init__.py", "evaluation/__init__.py"):
-        assert f"cz_gym/{needed}" in names
-    assert not any("tests" in Path(name).parts for name in names)
+        names = set(archive.namelist())
+        archive.extractall(tmp_path / "installed")
+    assert {name.partition("/")[0] for name in names if ".dist-info/" not in name} == {"cz_gym"}
+    parts = {part for name in names for part in Path(name).parts}
+    assert not parts & {"tests", "studies", "examples", "docs", "results"}
+    shipped = [f"cz_gym/agents/models/{file.name}" for file in (ROOT / "cz_gym" / "agents" / "models").glob("*-*.*")]
+    assert {"cz_gym/py.typed", *shipped} <= names
+    assert len(shipped) > 10
     assert any(name.endswith("licenses/LICENSE") for name in names)
-    printed = run(SMOKE.format(baselines="cz_gym.baselines"), tmp_path, installed)
-    assert printed == str(installed / "cz_gym" / "__init__.py")
-
-
-def test_an_installed_wheel_gives_the_same_bits(installed: Path, tmp_path: Path) -> None:
+    with tarfile.open(sdist) as archive:
+        kept = {name.partition("/")[2] for name in archive.getnames()}
+    assert {"Makefile", "train.py", "studies/paper/__main__.py", "tests/conftest.py", "CITATION.cff"} <= kept
+    home = tmp_path / "installed" / "cz_gym"
+    modules = [home / "__init__.py", home / "baselines/registry.py", home / "agents/agent_file/contract.py"]
+    assert printed(NAMES, home.parent, tmp_path) == list(map(str, modules))
     script = str(ROOT / "tests" / "golden" / "digest.py")
-    printed = run(f"import runpy\nrunpy.run_path({script!r}, run_name='__main__')", tmp_path, installed)
-    assert printed.split() == [digest(), str(installed / "cz_gym" / "__init__.py")]
+    code = f"{SMOKE}\nimport runpy\nrunpy.run_path({script!r}, run_name='__main__')"
+    assert printed(code, home.parent, tmp_path) == [digest(), str(modules[0])]
 
 
-def test_wheel_carries_the_shipped_agents(wheel: Path) -> None:
-    shipped = [*(ROOT / "agents" / "models").glob("*.onnx"), *(ROOT / "agents" / "models").glob("*.json")]
-    with zipfile.ZipFile(wheel) as archive:
-        for file in shipped:
-            assert f"cz_gym/agents/models/{file.name}" in archive.namelist()
+@pytest.mark.slow
+def test_an_editable_install_needs_no_links(source: Path, tmp_path: Path) -> None:
+    code = f"from setuptools.build_meta import build_editable\nbuild_editable({str(tmp_path)!r})"
+    done = subprocess.run([sys.executable, "-c", code], cwd=source, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as archive:
+        archive.extractall(tmp_path / "installed")
+    modules = ["cz_gym/__init__.py", "baselines/registry.py", "agents/agent_file/contract.py"]
+    assert printed(NAMES, tmp_path / "installed", tmp_path) == [str(source / name) for name in modules]
 
 
-def test_readme_example_runs_as_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    block = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    assert block is not None
-    exec(compile(block.group(1), "README.md", "exec"), {})
-    number = re.search(r"RMSE.*?([0-9.]+) mm", capsys.readouterr().out)
-    assert number is not None
-    assert 0.0 < float(number.group(1)) < 2.0
+def test_a_bare_checkout_needs_no_install(tmp_path: Path) -> None:
+    modules = ["__init__.py", "baselines/registry.py", "agents/agent_file/contract.py"]
+    assert printed(NAMES, ROOT, tmp_path) == [str(ROOT / "cz_gym" / name) for name in modules]

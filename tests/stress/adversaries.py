@@ -15,7 +15,7 @@ KINDS = (
 """One kind a slot, in turn."""
 RADIUS_GAIN, HEIGHT_GAIN = 1000.0, 700.0
 """Pull action per metre of true radius error and of meniscus height [1/m]: poles near 0.01 rad/s."""
-EXTREME = (np.inf, -np.inf, 1e308, -1e308, 1e-320, -0.0, 1.0 + 1e-7, -1.0 - 1e-7)
+EXTREME = np.array([np.inf, -np.inf, 1e308, -1e308, 1e-320, -0.0, 1.0 + 1e-7, -1.0 - 1e-7])
 
 
 class Adversaries:
@@ -32,21 +32,16 @@ class Adversaries:
         """The next actions, shape (num_envs, 2), from the last infos and the nominal heights [m], shape (num_envs,)."""
         random, n = self._random, len(self._kind)
         self._turn += 1
-        flip = np.where(random.random((n, 2)) < 0.02, -1.0, 1.0)
-        self._bang *= flip
+        self._bang *= np.where(random.random((n, 2)) < 0.02, -1.0, 1.0)
         self._walk = np.clip(self._walk + 0.1 * random.standard_normal((n, 2)), -1.5, 1.5)
         alive = RADIUS_GAIN * (infos["r_c"] - infos["r_ref"]) - HEIGHT_GAIN * (infos["h_c"] - height)
         alive = alive + 0.02 * random.standard_normal(n)
-        extreme = np.array(EXTREME)[random.integers(len(EXTREME), size=(n, 2))]
+        extreme = EXTREME[random.integers(len(EXTREME), size=(n, 2))]
         chatter = np.full((n, 2), 1.0 if self._turn % 2 else -1.0)
-        one = np.ones(n)
-        by_kind = (
-            random.uniform(-1.0, 1.0, (n, 2)), self._bang, _pair(one, 0.0 * one), _pair(-one, 0.0 * one),
-            _pair(alive, one), _pair(alive, -one), extreme, chatter, self._walk, _pair(alive, self._bang[:, 1]),
-        )  # fmt: skip
+        one, none = np.ones(n), np.zeros(n)
+        pairs = [(one, none), (-one, none), (alive, one), (alive, -one), (alive, self._bang[:, 1])]
+        full, no, hot, cold, bang_heat = (np.stack(pair, axis=-1) for pair in pairs)
+        uniform = random.uniform(-1.0, 1.0, (n, 2))
+        by_kind = [uniform, self._bang, full, no, hot, cold, extreme, chatter, self._walk, bang_heat]
         chosen: npt.NDArray[np.float64] = np.stack(by_kind)[self._kind, np.arange(n)]
         return chosen
-
-
-def _pair(pull: Any, heat: Any) -> npt.NDArray[np.float64]:
-    return np.stack([pull, heat], axis=-1)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -31,35 +32,18 @@ class Broken(AssertionError):
     """Something that must hold after every step does not; the message is one line."""
 
 
-class Extremes(NamedTuple):
-    """The furthest that anything went, SI units."""
-
-    r_c_error_max: float
-    h_c_min: float
-    h_c_max: float
-    alpha_c_max: float
-    v_g_min: float
-    v_g_max: float
-    T_1_min: float
-    T_1_max: float
-    T_b_min: float
-    T_b_max: float
-    reward_min: float
-    reward_max: float
-    imbalance_max: float
-    """Heat missing from a step's balance, as a share of the nominal heater power [-]."""
-
-    def joined(self, other: Extremes) -> Extremes:
-        """The furthest of both."""
-        return Extremes(
-            *(
-                min(a, b) if name.endswith("_min") else max(a, b)
-                for name, a, b in zip(self._fields, self, other, strict=True)
-            )
-        )
+Extremes = dict[str, tuple[float, float]]
+"""The least and the greatest of each value that was seen, SI units."""
 
 
-NOWHERE = Extremes(*(np.inf if name.endswith("_min") else -np.inf for name in Extremes._fields))
+def joined(parts: Iterable[Extremes]) -> Extremes:
+    """The extremes of all."""
+    whole: Extremes = {}
+    for part in parts:
+        for name, (least, most) in part.items():
+            known = whole.get(name, (least, most))
+            whole[name] = min(known[0], least), max(known[1], most)
+    return whole
 
 
 class Watch:
@@ -71,7 +55,7 @@ class Watch:
         self._over = np.zeros(env.num_envs, np.bool_)
         self._call = 0
         self.episodes = self.failures = 0
-        self.extremes = NOWHERE
+        self.extremes: Extremes = {}
 
     def begin(self, observation: Array, infos: dict[str, Any]) -> None:
         """Check what the reset returned."""
@@ -163,13 +147,11 @@ class Watch:
         return missing
 
     def _note(self, reward: Array, infos: dict[str, Any], missing: Array) -> None:
-        x, error = self._slots["x"], np.abs(infos["r_c"] - infos["r_ref"])
-        seen = (
-            error.max(), infos["h_c"].min(), infos["h_c"].max(), np.abs(infos["alpha_c"]).max(), infos["v_g"].min(),
-            infos["v_g"].max(), x["T_1"].min(), x["T_1"].max(), x["T_b"].min(), x["T_b"].max(), reward.min(),
-            reward.max(), missing.max(),
-        )  # fmt: skip
-        self.extremes = self.extremes.joined(Extremes(*map(float, seen)))
+        x = self._slots["x"]
+        seen = {"radius error": np.abs(infos["r_c"] - infos["r_ref"]), "reward": reward, "missing heat": missing}
+        seen |= {name: infos[name] for name in ("h_c", "alpha_c", "v_g")} | {name: x[name] for name in ("T_1", "T_b")}
+        found = {name: (float(values.min()), float(values.max())) for name, values in seen.items()}
+        self.extremes = joined([self.extremes, found])
 
 
 def _losses(p: Array, x: Array) -> Array:

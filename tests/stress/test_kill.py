@@ -1,19 +1,50 @@
-"""Killed runs lose nothing but what came after the last checkpoint."""
+"""Killed runs lose nothing but what came after the last checkpoint, wherever they are killed."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
+import json
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
-KILLS = os.environ.get("CZ_GYM_KILLS", "5")
+import pytest
+
+from tests.stress.kill_at import KILLED, ending
+from tests.stress.small_runs import (
+    BENCHMARK,
+    STEPS,
+    TRAINING,
+    check_benchmark,
+    check_training,
+    settle,
+    slow_benchmark,
+    training,
+)
+
+pytestmark = pytest.mark.slow
 
 
-def test_runs_killed_at_random_moments_go_on() -> None:
-    """CZ_GYM_KILLS sets how often."""
-    command = [sys.executable, "-m", "tests.stress.kill", "--kills", KILLS]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert f"train.py: {KILLS} kills survived" in done.stdout
+def test_a_training_run_killed_in_every_phase_goes_on(tmp_path: Path) -> None:
+    """One run, killed at each point in turn and resumed until nothing is left to do."""
+    out, log, torn = tmp_path / "run", tmp_path / "log", []
+    for phase, (point, step) in TRAINING.items():
+        resume = ["--resume"] * (out / "settings.json").exists()
+        assert ending(training, ["--out", str(out), *resume], point, log) == KILLED, log.read_text()[-2000:]
+        torn += [phase] * settle(out)
+        assert check_training(out) == step, phase
+    assert torn == [phase for phase in TRAINING if "counts" in phase or "moves" in phase]
+    assert ending(training, ["--out", str(out), "--resume"], None, log) == 0, log.read_text()[-2000:]
+    assert check_training(out) == json.loads((out / "summary.json").read_text())["training_steps"] >= STEPS
+
+
+def test_a_benchmark_killed_in_every_phase_leaves_the_results_of_one_run(tmp_path: Path) -> None:
+    """And episodes of slow controllers, two of which are kept at a time, are not run again."""
+    out, log, kept, torn = tmp_path / "results", tmp_path / "log", {}, []
+    for phase, (point, whose) in BENCHMARK.items():
+        other = "paper" if "other" in phase else "open-loop"
+        code = ending(slow_benchmark, ["--controllers", f"{other},slow", "--out", str(out)], point, log)
+        assert code == KILLED, log.read_text()[-2000:]
+        torn += [phase] * (out.exists() and settle(out))
+        assert check_benchmark(out) == whose, phase
+        kept[phase] = {file: file.stat().st_mtime_ns for file in tmp_path.glob("kept/*/*.npz")}
+    assert torn == [phase for phase in BENCHMARK if "count" in phase or "move" in phase]
+    assert (len(kept["episodes"]), len(kept["slow episodes"]), len(kept["figures"])) == (0, 2, 6)
+    assert kept["slow episodes"].items() <= kept["figures"].items() == kept["other results, as they move"].items()

@@ -1,0 +1,142 @@
+"""Small runs of train.py and benchmark.py, the points at which they are killed, and what a killed one may leave."""
+
+from __future__ import annotations
+
+import csv
+import json
+import threading
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt  # noqa: F401  (here, so that no process of its own has to)
+from tqdm import tqdm
+
+import benchmark
+import train
+from cz_gym.agents import OnnxPolicy
+from cz_gym.agents.training import recipes, run
+from cz_gym.agents.training.checkpoint import load_checkpoint
+from cz_gym.atomic_files import finish_writing
+from cz_gym.baselines import registry
+from cz_gym.baselines.pid.open_loop import OpenLoop
+from cz_gym.evaluation.cache import slow_controllers
+from cz_gym.evaluation.files import is_benchmark_json
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from cz_gym.evaluation.report import figures, page  # noqa: F401
+
+STEPS = 8192
+"""Of a small training run: rollouts of 2,048 steps, a validation after every second one."""
+TRAINING = {
+    "start-up": ("cz_gym.agents.training.run:provenance:1", 0),
+    "imitation": ("cz_gym.agents.training.run:clone:1>cz_gym.vector:CzVectorEnv.step:3000", 0),
+    "first validation": ("cz_gym.agents.training.run:Run._validate:1>cz_gym.vector:CzVectorEnv.step:1000", 0),
+    "before the first step counts": ("cz_gym.agents.training.run:Run._validate:1>os:rename:2", 0),
+    "rollout": ("stable_baselines3.common.buffers:RolloutBuffer.add:20", 1280),
+    "update of the critic": ("stable_baselines3:PPO.train:1>torch.nn.utils:clip_grad_norm_:5", 3328),
+    "checkpoint, before it counts": ("cz_gym.agents.training.run:Run.save:5>os:rename:1", 3584),
+    "update of both networks": ("stable_baselines3:PPO.train:2>torch.nn.utils:clip_grad_norm_:5", 7680),
+    "later validation": ("cz_gym.agents.training.run:Run._validate:1>cz_gym.vector:CzVectorEnv.step:1000", 9728),
+    "checkpoint, as it moves": ("cz_gym.agents.training.run:Run._validate:1>os:replace:2", 9728),
+    "judging": ("cz_gym.agents.training.run:Run.finish:1>cz_gym.vector:CzVectorEnv.step:1000", 9728),
+    "summary, as it moves": ("cz_gym.agents.training.run:Run.finish:1>os:replace:2", 9728),
+}
+"""Where one run can be killed, resumed, killed ...: the point, counted from where it goes on, and the step at which a
+run stands that was killed there."""
+WRITING = "cz_gym.evaluation.report.output:write_files:1"
+BENCHMARK = {
+    "start-up": ("benchmark:make_plan:1", None),
+    "episodes": ("cz_gym.evaluation.runner:rollout:1>cz_gym.vector:CzVectorEnv.step:1000", None),
+    "slow episodes": ("cz_gym.evaluation.cache.slow_controllers:rollout:2>cz_gym.vector:CzVectorEnv.step:1000", None),
+    "figures": ("cz_gym.evaluation.report.figures:draw_figures:1", None),
+    "page": ("cz_gym.evaluation.report.page:page:1", None),
+    "first results, before they count": (f"{WRITING}>os:rename:1", None),
+    "first results, as they move": (f"{WRITING}>os:replace:3", "open-loop"),
+    "other results, before they count": (f"{WRITING}>os:rename:1", "open-loop"),
+    "other results, as they move": (f"{WRITING}>os:replace:3", "paper"),
+}
+"""Where benchmark.py is killed, one run after another into one folder, and whose results are there then."""
+
+
+def training(arguments: list[str]) -> int:
+    """train.py on the recipe that it runs by default, on less of everything; a checkpoint at every step."""
+    tqdm.set_lock(threading.RLock())  # its own is a semaphore, which a killed process leaves behind
+    run.PICKING, run.JUDGING, run.VALIDATE_EVERY = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4], STEPS // 2
+    default = recipes.RECIPES["ppo"]
+    clone = replace(default.recipe.clone or recipes.Clone("lqg"), rounds=1, episodes=2, epochs=1)
+    small = replace(default.recipe, num_envs=64, clone=clone)
+    recipes.RECIPES["ppo"] = replace(
+        default, recipe=small, n_steps=32, batch_size=512, n_epochs=2, critic_steps=STEPS // 4
+    )
+    return train.main(["--steps", str(STEPS), "--checkpoint-seconds", "0", *arguments])
+
+
+@dataclass(frozen=True)
+class Slow(OpenLoop):
+    """Does nothing, and is kept as a slow controller is."""
+
+    hash: str = "nothing"
+
+
+def slow_benchmark(arguments: list[str]) -> int:
+    """benchmark.py with a slow controller whose six episodes are kept, two at a time, beside the results."""
+    slow = registry.Entry("slow", lambda config: Slow(), "measured", "does nothing", default=False, slow=True)
+    registry.CONTROLLERS = (*registry.CONTROLLERS, slow)
+    benchmark.KEPT = Path(arguments[-1]).parent / "kept"
+    slow_controllers.BLOCK = 2
+    options = ["--scenarios", "randomized", "--episodes", "6", "--slow", "--overwrite", "--quiet"]
+    return benchmark.main([*options, *arguments])
+
+
+def settle(folder: Path) -> bool:
+    """Finish what a killed writer left in a folder; whether there was anything."""
+
+    def left() -> bool:
+        return any(path.is_dir() for path in folder.glob(".writ*"))
+
+    torn = left()
+    finish_writing(folder)
+    check(not left(), "leftovers")
+    return torn
+
+
+def check_training(out: Path) -> int:
+    """The step at which a killed run of train.py stands; what it left is whole and agrees with itself."""
+    if not (out / run.CHECKPOINT).exists():
+        check(not (out / "settings.json").exists(), "settings without a checkpoint")
+        return 0
+    progress, _ = load_checkpoint(out / run.CHECKPOINT)
+    rows = _rows(out / "progress.csv")
+    best = min((float(row["validation_cost"]) for row in rows), default=None)
+    check(best == progress.best_cost, f"best {progress.best_cost} in the checkpoint, {best} in the progress")
+    if best is not None:
+        found = {float(row["validation_rmse_mm"]) for row in rows if float(row["validation_cost"]) == best}
+        if (out / "summary.json").exists():
+            found.add(json.loads((out / "summary.json").read_text())["validation_rmse_mm"])
+        contract = OnnxPolicy.load(out / "agent.onnx").contract
+        check(contract.validation_rmse_mm in found, "the agent is not the best one of the progress")
+    return progress.steps
+
+
+def check_benchmark(out: Path) -> str | None:
+    """The controller beside the slow one whose results a killed benchmark.py left; they are all of one run."""
+    if not (out / "benchmark.json").exists():
+        check(not list(out.glob("*.*")), "a part of the results")
+        return None
+    content = (out / "benchmark.json").read_bytes()
+    check(is_benchmark_json(content), "benchmark.json is damaged")
+    who, report = set(json.loads(content)["results"]["randomized"]), (out / "report.md").read_text()
+    check({row["controller"] for row in _rows(out / "episodes.csv")} == who, "files of two runs")
+    check(all(f"| {name}" in report for name in who), "files of two runs")
+    (other,) = who - {"slow"}
+    return str(other)
+
+
+def _rows(file: Path) -> list[dict[str, Any]]:
+    return list(csv.DictReader(file.read_text().splitlines())) if file.exists() else []
+
+
+def check(condition: bool, what: object) -> None:
+    """Raise RuntimeError unless it holds."""
+    if not condition:
+        raise RuntimeError(str(what))
