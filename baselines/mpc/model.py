@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 
 from cz_gym.baselines.lqg.model import PLANT
-from cz_gym.baselines.optional import require
 from cz_gym.baselines.policy import Floats
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.plant import Disturbance, Inputs, Puller, State, rk4
@@ -67,7 +66,11 @@ class Shape:
 
 def casadi() -> Any:
     """CasADi; ImportError in one line names the extra that holds it."""
-    return require("casadi", "mpc")
+    try:
+        import casadi
+    except ImportError:
+        raise ImportError("this needs the package casadi: pip install 'cz-gym[mpc]'") from None
+    return casadi
 
 
 def build(shape: Shape, slots: int) -> Any:

@@ -61,7 +61,7 @@ def predict_under_law(
 
 def expected_disturbances(estimate: Floats, plan: Floats, gains: Gains, share: float, stages: int) -> Floats:
     """Disturbance states from now to the end of the horizon, SI units, shape (n, stages + 1, 5)."""
-    decay = gains.eye.model.A[PLANT : len(STATES), PLANT : len(STATES)]
+    decay = gains.filter.plant.A[PLANT : len(STATES), PLANT : len(STATES)]
     d = np.empty((len(estimate), stages + 1, len(decay)))
     d[:, 0] = estimate[:, PLANT : len(STATES)]
     followed = share * np.diff(held(plan, stages)[:, :, 1], axis=1)
@@ -92,9 +92,9 @@ def _acting(disturbances: Floats, gains: Gains, shape: Shape) -> Floats:
     """What disturbs each stage, as the prediction takes it."""
     d = disturbances[:, :-1]
     if not shape.nonlinear:
-        pushed: Floats = d @ gains.eye.model.A[:PLANT, PLANT : len(STATES)].T / SCALES[:PLANT]
+        pushed: Floats = d @ gains.filter.plant.A[:PLANT, PLANT : len(STATES)].T / SCALES[:PLANT]
         return pushed
-    load = hidden_load(d[..., _OWN], gains.eye.puller)
+    load = hidden_load(d[..., _OWN], gains.filter.puller)
     dT_i = d[..., FAST - PLANT] + d[..., SLOW - PLANT]
     return np.stack([load, dT_i, d[..., HEATER - PLANT]], axis=-1)
 
@@ -102,8 +102,8 @@ def _acting(disturbances: Floats, gains: Gains, shape: Shape) -> Floats:
 def _constants(gains: Gains, shape: Shape) -> Floats:
     """The constants of the prediction."""
     if shape.nonlinear:
-        return np.array(gains.eye.puller)
-    both = np.hstack([gains.eye.model.A[:PLANT, :PLANT], gains.eye.model.B[:PLANT]])
+        return np.array(gains.filter.puller)
+    both = np.hstack([gains.filter.plant.A[:PLANT, :PLANT], gains.filter.plant.B[:PLANT]])
     scaled: Floats = both * SCALES / SCALES[:PLANT, None]
     return scaled.T.ravel()
 

@@ -24,7 +24,7 @@ from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.baselines.analysis.frequency import crossover, loop_margins, peak
 from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.analysis.sampled_loop import Loop, NotLinearError, close, late, root_mean_square
-from cz_gym.baselines.bounds.lqg import pullers_of
+from cz_gym.baselines.bounds.future import pullers_of
 from cz_gym.baselines.registry import CONTROLLERS, find_controller
 from cz_gym.commands import OneLineParser, guarded
 from cz_gym.config import Config, make_config

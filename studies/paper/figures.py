@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym import make_puller
-from cz_gym.baselines.analysis.design import open_loop
+from cz_gym.baselines.analysis.compensator_design import open_loop
 from cz_gym.baselines.optional import require
 from cz_gym.baselines.pid.compensated_pid import Compensator
 from cz_gym.physics.linearisation import RadiusModel

@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import trapezoid
 
 from cz_gym import make_puller
-from cz_gym.baselines.analysis.design import compensator_transfer, controller_transfer
+from cz_gym.baselines.analysis.compensator_design import compensator_transfer, controller_transfer
 from cz_gym.baselines.analysis.frequency import LoopMargins, crossover, loop_margins, opened, response
 from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.analysis.sampled_loop import NotLinearError, close, late, linear_controller, root_mean_square

@@ -11,7 +11,7 @@ import pytest
 from scipy.signal import lfilter
 
 from cz_gym import make_puller
-from cz_gym.baselines.analysis.design import controller_transfer
+from cz_gym.baselines.analysis.compensator_design import controller_transfer
 from cz_gym.baselines.analysis.frequency import crossover, response
 from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.analysis.sampled_loop import linear_controller

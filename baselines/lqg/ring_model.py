@@ -1,9 +1,9 @@
-"""A ring that comes late and shakes with the crystal's rotation: what it adds to the LQG's model of the plant.
+"""A camera with latency, and a ring that ripples with the crystal's rotation: what they add to the LQG's plant model.
 
-Late: the ring of past samples is kept as states, so that a frame some seconds old corrects what was then. Shaken: the
-ripple is an oscillator of two states, a narrow-band process (its phase wanders slowly) at the rotation's frequency as
-the samples show it, aliased. That frequency is not known: it is where the spectrum of what the plant does not explain
-has its peak.
+Latency: the rings of past samples are states, so that a frame some seconds old corrects the state of that time. Ripple:
+an oscillator of two states whose phase wanders slowly (a narrow-band process), at the rotation's frequency as the
+samples show it, aliased. That frequency is not known. It is found as the peak in the spectrum of what the plant does
+not explain.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from .model import STATES, PlantModel
 
 RIPPLE = len(STATES)
 """Index of the first of the ripple's two states."""
+RIPPLE_STATES = slice(RIPPLE, RIPPLE + 2)
+"""Both."""
 
 
 @dataclass(frozen=True)
@@ -45,31 +47,92 @@ class RingModel:
     """Power of a peak over the spectrum's mean at which it is a ripple [-]."""
 
     @property
-    def shakes(self) -> bool:
+    def has_ripple(self) -> bool:
         """Whether there is a ripple."""
         return self.ripple_sd > 0.0
 
     @property
-    def known(self) -> bool:
+    def frequency_known(self) -> bool:
         """Whether the ripple's frequency is known."""
         return self.rotation[0] == self.rotation[1]
 
     @property
-    def late(self) -> int:
+    def first_past(self) -> int:
         """Index of the first of the states that hold past rings."""
-        return RIPPLE + 2 * self.shakes
+        return RIPPLE + 2 * self.has_ripple
 
     def delay(self, dt: float) -> tuple[int, float]:
-        """Past samples to keep, and the share of the oldest in what is delivered, the one after it having the rest."""
+        """Past samples to keep, and the weight of the oldest in what is delivered; the next one has the rest."""
         samples = math.ceil(self.latency / dt - 1e-9)
         return samples, self.latency / dt - samples + 1.0
 
     def states(self, dt: float) -> int:
-        """States of plant, ripple and past rings together."""
-        return self.late + self.delay(dt)[0]
+        """Number of states of plant, ripple and past rings together."""
+        return self.first_past + self.delay(dt)[0]
 
 
-class Search(NamedTuple):
+def augmented(model: PlantModel, ring: RingModel, dt: float) -> PlantModel:
+    """The model with ripple and past rings; the ripple at the middle of the rotation's range."""
+    n, extra = len(STATES), ring.states(dt) - len(STATES)
+    A, Q, start = (np.pad(matrix, (0, extra)) for matrix in (model.A, model.Q, model.start))
+    B, H = np.pad(model.B, ((0, extra), (0, 0))), np.pad(model.H, ((0, 0), (0, extra)))
+    undelayed = H[0].copy()
+    H[0] = delivered_row(undelayed[None], ring, dt)[0]
+    both = RIPPLE_STATES
+    if ring.has_ripple:
+        A[both, both] = oscillator(np.array([math.pi * sum(ring.rotation)]), ring, dt)[0]
+        start[both, both] = ring.ripple_sd**2 * np.eye(2)
+        Q[both, both] = -math.expm1(-2.0 * dt / ring.ripple_tau) * start[both, both]
+    for state in range(ring.first_past, n + extra):
+        A[state] = undelayed if state == ring.first_past else np.eye(n + extra)[state - 1]
+    keep = np.eye(n + extra)
+    keep[ring.first_past :] = undelayed
+    keep[ring.first_past :, ring.first_past :] = 0.0
+    return PlantModel(A, B, H, Q, keep @ start @ keep.T)
+
+
+def undelayed_row(model: PlantModel, ring: RingModel, dt: float) -> Floats:
+    """Derivative by the state of the ring as it is now, shape (..., states), from an augmented model."""
+    if ring.delay(dt)[0]:
+        return model.A[..., ring.first_past, :]
+    row = model.H[..., 0, :].copy()
+    row[..., RIPPLE:] = 0.0
+    return row
+
+
+def oscillator(omega: Floats, ring: RingModel, dt: float) -> Floats:
+    """Transition of the ripple's two states over dt [s] at frequencies omega [rad/s], shape (n, 2, 2)."""
+    c, s = np.cos(omega * dt), np.sin(omega * dt)
+    turned: Floats = math.exp(-dt / ring.ripple_tau) * np.stack([c, -s, s, c], axis=-1).reshape(*omega.shape, 2, 2)
+    return turned
+
+
+def transition(A: Floats, row: Floats, omega: Floats, ring: RingModel, dt: float) -> Floats:
+    """The model's A with each slot's ripple frequency and slope of the ring, shape (n, states, states)."""
+    n, states = row.shape
+    moved = np.broadcast_to(A, (n, states, states)).copy()
+    if ring.has_ripple:
+        moved[:, RIPPLE_STATES, RIPPLE_STATES] = oscillator(omega, ring, dt)
+    if ring.first_past < states:
+        moved[:, ring.first_past] = row
+    return moved
+
+
+def delivered_row(row: Floats, ring: RingModel, dt: float) -> Floats:
+    """Derivative by the state of what the camera delivers, shape (n, states), from that of the ring now."""
+    samples, oldest = ring.delay(dt)
+    delivered = row.copy()
+    if samples:
+        delivered = (1.0 - oldest) * row if samples == 1 else np.zeros(row.shape)
+        delivered[:, ring.first_past + samples - 1] = oldest
+        if samples > 1:
+            delivered[:, ring.first_past + samples - 2] = 1.0 - oldest
+    if ring.has_ripple:
+        delivered[:, RIPPLE] = 1.0
+    return delivered
+
+
+class RippleSearch(NamedTuple):
     """What is remembered of the search for the ripple's frequency, by slot."""
 
     spectrum: Floats
@@ -80,100 +143,41 @@ class Search(NamedTuple):
     """Samples seen, shape (n,)."""
 
 
-def augmented(model: PlantModel, ring: RingModel, dt: float) -> PlantModel:
-    """The model with ripple and past rings; the ripple at the middle of the rotation's range."""
-    n, extra = len(STATES), ring.states(dt) - len(STATES)
-    A, Q, start = (np.pad(matrix, (0, extra)) for matrix in (model.A, model.Q, model.start))
-    B, H = np.pad(model.B, ((0, extra), (0, 0))), np.pad(model.H, ((0, 0), (0, extra)))
-    undelayed = H[0].copy()
-    H[0] = reading_row(undelayed[None], ring, dt)[0]
-    if ring.shakes:
-        both = slice(RIPPLE, RIPPLE + 2)
-        A[both, both] = rotated(np.array([math.pi * sum(ring.rotation)]), ring, dt)[0]
-        start[both, both] = ring.ripple_sd**2 * np.eye(2)
-        Q[both, both] = -math.expm1(-2.0 * dt / ring.ripple_tau) * start[both, both]
-    for state in range(ring.late, n + extra):
-        A[state] = undelayed if state == ring.late else np.eye(n + extra)[state - 1]
-    keep = np.eye(n + extra)
-    keep[ring.late :] = undelayed
-    keep[ring.late :, ring.late :] = 0.0
-    return PlantModel(A, B, H, Q, keep @ start @ keep.T)
+class Found(NamedTuple):
+    """The search after a sample."""
 
-
-def undelayed_row(model: PlantModel, ring: RingModel, dt: float) -> Floats:
-    """Derivative by the state of the ring as it is now, shape (..., states), from an augmented model."""
-    if ring.delay(dt)[0]:
-        return model.A[..., ring.late, :]
-    row = model.H[..., 0, :].copy()
-    row[..., RIPPLE:] = 0.0
-    return row
-
-
-def rotated(omega: Floats, ring: RingModel, dt: float) -> Floats:
-    """Transition of the ripple's two states over dt [s], shape (n, 2, 2)."""
-    c, s = np.cos(omega * dt), np.sin(omega * dt)
-    turned: Floats = math.exp(-dt / ring.ripple_tau) * np.stack([c, -s, s, c], axis=-1).reshape(*omega.shape, 2, 2)
-    return turned
-
-
-def transition(A: Floats, row: Floats, omega: Floats, ring: RingModel, dt: float) -> Floats:
-    """The model's A with each slot's ripple frequency and slope of the ring, shape (n, states, states)."""
-    n, states = row.shape
-    moved = np.broadcast_to(A, (n, states, states)).copy()
-    if ring.shakes:
-        moved[:, RIPPLE : RIPPLE + 2, RIPPLE : RIPPLE + 2] = rotated(omega, ring, dt)
-    if ring.late < states:
-        moved[:, ring.late] = row
-    return moved
-
-
-def reading_row(row: Floats, ring: RingModel, dt: float) -> Floats:
-    """Derivative by the state of what is delivered, shape (n, states), from that of the ring now."""
-    samples, oldest = ring.delay(dt)
-    read = row.copy()
-    if samples:
-        read = (1.0 - oldest) * row if samples == 1 else np.zeros(row.shape)
-        read[:, ring.late + samples - 1] = oldest
-        if samples > 1:
-            read[:, ring.late + samples - 2] = 1.0 - oldest
-    if ring.shakes:
-        read[:, RIPPLE] = 1.0
-    return read
+    search: RippleSearch
+    new: npt.NDArray[np.bool_]
+    """Where a ripple is found, or found at another frequency than before, shape (n,)."""
+    ripple: Floats
+    """The ripple's two states by the spectrum's peak [m], shape (n, 2)."""
 
 
 @lru_cache(maxsize=16)
 def frequencies(ring: RingModel, dt: float) -> Floats:
     """Frequencies that are searched [rad/s], as samples every dt [s] show them."""
     spacing = 0.25 / ring.memory
-    if not ring.shakes or ring.known:
+    if not ring.has_ripple or ring.frequency_known:
         return np.zeros(0)
     real = np.linspace(*ring.rotation, 1 + math.ceil((ring.rotation[1] - ring.rotation[0]) / spacing))
-    seen = np.abs(real - np.round(real * dt) / dt)
-    return 2.0 * math.pi * np.arange(max(seen.min(), ring.lowest), seen.max() + spacing, spacing)
+    aliased = np.abs(real - np.round(real * dt) / dt)
+    return 2.0 * math.pi * np.arange(max(aliased.min(), ring.lowest), aliased.max() + spacing, spacing)
 
 
-def begin(n: int, ring: RingModel | None, dt: float) -> Search:
+def search_at_rest(n: int, ring: RingModel | None, dt: float) -> RippleSearch:
     """Before the first sample of n slots."""
     if ring is None:
-        return Search(np.zeros((n, 0, 2)), np.zeros(n), np.zeros(n))
-    omega = math.pi * sum(ring.rotation) if ring.known else 0.0
-    return Search(np.zeros((n, len(frequencies(ring, dt)), 2)), np.full(n, omega), np.zeros(n))
+        return RippleSearch(np.zeros((n, 0, 2)), np.zeros(n), np.zeros(n))
+    omega = math.pi * sum(ring.rotation) if ring.frequency_known else 0.0
+    return RippleSearch(np.zeros((n, len(frequencies(ring, dt)), 2)), np.full(n, omega), np.zeros(n))
 
 
-class Found(NamedTuple):
-    """What the search says after a sample."""
+def search_step(
+    search: RippleSearch, residual: Floats, valid: npt.NDArray[np.bool_], ring: RingModel, dt: float
+) -> Found:
+    """Go on with the search: ``residual`` [m] is what the plant does not explain, shape (n,), used where ``valid``.
 
-    search: Search
-    new: npt.NDArray[np.bool_]
-    """Where a ripple is found, or found elsewhere than before, shape (n,)."""
-    ripple: Floats
-    """The ripple's two states by the spectrum's peak [m], shape (n, 2)."""
-
-
-def listen(search: Search, rest: Floats, seen: npt.NDArray[np.bool_], ring: RingModel, dt: float) -> Found:
-    """Go on with the search: ``rest`` [m] is what the plant does not explain, shape (n,), where ``seen``.
-
-    Running sums Z <- (1 - 1/m) e^(i omega dt) Z + rest/m with m samples of memory, fewer at the start; the peak is
+    Running sums Z <- (1 - 1/m) e^(i omega dt) Z + residual/m with m samples of memory, fewer at the start; the peak is
     refined by a parabola through its neighbours' log power. The spectrum's ends, where a slow transient shows, are no
     peaks.
     """
@@ -182,7 +186,7 @@ def listen(search: Search, rest: Floats, seen: npt.NDArray[np.bool_], ring: Ring
     new_share = np.maximum(1.0 / samples, dt / ring.memory)[:, None]
     Z = search.spectrum.view(np.complex128)[..., 0] * np.exp(1j * omega * dt)
     Z *= 1.0 - new_share
-    Z += new_share * np.where(seen, rest, 0.0)[:, None]
+    Z += new_share * np.where(valid, residual, 0.0)[:, None]
     power = np.square(Z.real) + np.square(Z.imag)
     slot, peak = np.arange(len(Z)), power.argmax(axis=1)
     inside = np.clip(peak, 1, len(omega) - 2)
@@ -191,8 +195,8 @@ def listen(search: Search, rest: Floats, seen: npt.NDArray[np.bool_], ring: Ring
     bend = 2.0 * top - left - right
     shift = np.where(bend > 0.0, 0.5 * (right - left) / np.where(bend > 0.0, bend, 1.0), 0.0)
     spacing = omega[1] - omega[0]
-    wanted = omega[inside] + spacing * np.clip(shift, -1.0, 1.0)
-    new = clear & (np.abs(wanted - search.omega) > 1.5 * spacing)
+    refined = omega[inside] + spacing * np.clip(shift, -1.0, 1.0)
+    new = clear & (np.abs(refined - search.omega) > 1.5 * spacing)
     ripple = 2.0 * np.stack([Z.real[slot, peak], Z.imag[slot, peak]], axis=-1)
-    found = Search(Z.view(np.float64).reshape(search.spectrum.shape), np.where(clear, wanted, search.omega), samples)
-    return Found(found, new, ripple)
+    spectrum = Z.view(np.float64).reshape(search.spectrum.shape)
+    return Found(RippleSearch(spectrum, np.where(clear, refined, search.omega), samples), new, ripple)

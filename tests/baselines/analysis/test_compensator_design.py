@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lsim, residue
 
 from cz_gym import make_puller
-from cz_gym.baselines.analysis.design import (
+from cz_gym.baselines.analysis.compensator_design import (
     NoSplitError,
     design_compensator,
     high_passed,

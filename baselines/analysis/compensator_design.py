@@ -14,7 +14,6 @@ import numpy.typing as npt
 from scipy.linalg import LinAlgError, schur, solve_sylvester
 from scipy.signal import ss2tf
 
-from cz_gym.baselines.optional import require
 from cz_gym.baselines.pid.compensated_pid import Compensator, SeriesPID
 from cz_gym.physics.linearisation import RadiusModel, StateSpace
 
@@ -138,7 +137,8 @@ def design_compensator(model: RadiusModel, cut_off: float = CUT_OFF) -> Compensa
 
 def plant_transfer(model: RadiusModel) -> tuple[Any, Any]:
     """G_p and G_p G_m as python-control transfer functions."""
-    control = require("control")
+    import control
+
     denominator = np.poly(model.poles)
     return (
         control.tf([model.numerator], denominator),
@@ -148,14 +148,16 @@ def plant_transfer(model: RadiusModel) -> tuple[Any, Any]:
 
 def controller_transfer(pid: SeriesPID) -> Any:
     """K(s) as a python-control transfer function."""
-    control = require("control")
+    import control
+
     numerator = pid.K_p * np.polymul([pid.T_i, 1.0], [pid.T_d, 1.0])
     return control.tf(numerator, np.polymul([pid.T_i, 0.0], [pid.T_d / pid.N, 1.0]))
 
 
 def compensator_transfer(compensator: Compensator) -> Any:
     """G_pc(s) as a python-control transfer function."""
-    control = require("control")
+    import control
+
     return control.tf([compensator.gain, 0.0], np.poly([-compensator.fast, -compensator.slow]))
 
 
@@ -169,7 +171,8 @@ def open_loop(model: RadiusModel, compensator: Compensator | None, pid: SeriesPI
 
 def margins(model: RadiusModel, compensator: Compensator | None, pid: SeriesPID | None = None) -> Margins:
     """Crossover, phase margin and closed-loop poles of the continuous loop; NaN where the gain never crosses one."""
-    control = require("control")
+    import control
+
     loop = open_loop(model, compensator, pid)
     _, phase, _, crossover = control.margin(loop)
     numerator, denominator = loop.num[0][0], loop.den[0][0]
