@@ -1,8 +1,8 @@
-"""The paper's compensator as a procedure, and the loop it is judged by.
+"""The design of the paper's compensator as a procedure, and the loop that the design is judged by.
 
 Part II, section on the compensator design and appendix on the stable-unstable decomposition: from a linear model of
 the plant to the compensator's constants, and from those to margins and closed-loop poles. The decomposition uses
-SciPy's ordered Schur form and Sylvester equation; Bode data and margins come from python-control.
+SciPy's ordered Schur form and Sylvester equation; Bode data, margins and poles come from python-control.
 """
 
 from __future__ import annotations
@@ -34,13 +34,6 @@ class Split(NamedTuple):
     """Eigenvalues with negative real part."""
     unstable: StateSpace
     """The others; of order 0 if there are none."""
-
-
-class Rational(NamedTuple):
-    """A transfer function by the coefficients of its polynomials, highest power first."""
-
-    numerator: Floats
-    denominator: Floats
 
 
 class Margins(NamedTuple):
@@ -109,14 +102,6 @@ def high_passed(system: StateSpace, cut_off: float = CUT_OFF) -> StateSpace:
     )
 
 
-def without_steady_gain(system: StateSpace) -> Rational:
-    """The system's transfer function with the constant of its numerator removed: zero gain at s = 0, the lead kept."""
-    numerator, denominator = ss2tf(*system)
-    adjusted = np.array(numerator[0])
-    adjusted[-1] = 0.0
-    return Rational(adjusted, np.asarray(denominator))
-
-
 def design_compensator(model: RadiusModel, cut_off: float = CUT_OFF) -> Compensator:
     """Part II's design from a linear model of the plant and the high-pass cut-off [rad/s].
 
@@ -132,18 +117,8 @@ def design_compensator(model: RadiusModel, cut_off: float = CUT_OFF) -> Compensa
         shown = ", ".join(f"{pole:.4g}" for pole in poles)
         raise NoSplitError(f"the stable part needs two real poles, it has {shown}: no compensator comes of this plant")
     slow, fast = sorted(-poles.real)
-    return Compensator(float(without_steady_gain(stable).numerator[-2]), float(fast), float(slow))
-
-
-def plant_transfer(model: RadiusModel) -> tuple[Any, Any]:
-    """G_p and G_p G_m as python-control transfer functions."""
-    import control
-
-    denominator = np.poly(model.poles)
-    return (
-        control.tf([model.numerator], denominator),
-        control.tf([model.numerator * model.lead, model.numerator * model.constant], denominator),
-    )
+    numerator = ss2tf(*stable)[0][0]  # its last coefficient, the steady gain, is dropped
+    return Compensator(float(numerator[-2]), float(fast), float(slow))
 
 
 def controller_transfer(pid: SeriesPID) -> Any:
@@ -163,7 +138,9 @@ def compensator_transfer(compensator: Compensator) -> Any:
 
 def open_loop(model: RadiusModel, compensator: Compensator | None, pid: SeriesPID | None = None) -> Any:
     """L = -K (G_m G_p + G_pc) as a python-control transfer function; minus, since pulling faster thins the crystal."""
-    seen = plant_transfer(model)[1]
+    import control
+
+    seen = control.tf([model.numerator * model.lead, model.numerator * model.constant], np.poly(model.poles))
     if compensator is not None:
         seen = seen + compensator_transfer(compensator)
     return -controller_transfer(pid or SeriesPID()) * seen
@@ -175,6 +152,5 @@ def margins(model: RadiusModel, compensator: Compensator | None, pid: SeriesPID 
 
     loop = open_loop(model, compensator, pid)
     _, phase, _, crossover = control.margin(loop)
-    numerator, denominator = loop.num[0][0], loop.den[0][0]
-    poles = np.roots(np.polyadd(numerator, denominator))
-    return Margins(float(crossover), float(phase), poles[np.argsort(np.abs(poles))].astype(np.complex128))
+    poles = control.feedback(loop, 1).poles()
+    return Margins(float(crossover), float(phase), poles[np.argsort(np.abs(poles))])

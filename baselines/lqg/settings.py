@@ -7,7 +7,6 @@ own use those of ``randomized``.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 from cz_gym.config import Config
 from cz_gym.units import MM
@@ -104,36 +103,28 @@ SHIPPED: dict[tuple[str, str], LQGSettings] = {
 """By controller and scenario."""
 
 
-class Member(NamedTuple):
-    """A member of the family: a shipped LQG with another weight on pull steps."""
-
-    base: str
-    """Whose noise model and other weights it has."""
-    pull_step: float
-    """Weight on the squared step of v_p."""
-
-
-ACTIVITIES = (0.003, 0.005, 0.008, 0.013, 0.02, 0.03)
-"""Pull step RMS [mm/min] that the members of the family are made for."""
-MEMBERS: dict[str, tuple[Member, ...]] = {
-    "randomized": (
-        Member("lqg-quiet", 23.83),
-        Member("lqg-quiet", 3.011),
-        Member("lqg-quiet", 0.4969),
-        Member("lqg-quiet", 0.07386),
-        Member("lqg-quiet", 0.01232),
-        Member("lqg-quiet", 0.004767),
-    ),
-    "puller": (
-        Member("lqg-quiet", 40.07),
-        Member("lqg-quiet", 4.025),
-        Member("lqg-quiet", 0.556),
-        Member("lqg", 0.1428),
-        Member("lqg", 0.00467),
-        Member("lqg", 0.0009702),
-    ),
+MEMBERS: dict[str, dict[float, tuple[str, float]]] = {
+    "randomized": {
+        0.003: ("lqg-quiet", 23.83),
+        0.005: ("lqg-quiet", 3.011),
+        0.008: ("lqg-quiet", 0.4969),
+        0.013: ("lqg-quiet", 0.07386),
+        0.02: ("lqg-quiet", 0.01232),
+        0.03: ("lqg-quiet", 0.004767),
+    },
+    "puller": {
+        0.003: ("lqg-quiet", 40.07),
+        0.005: ("lqg-quiet", 4.025),
+        0.008: ("lqg-quiet", 0.556),
+        0.013: ("lqg", 0.1428),
+        0.02: ("lqg", 0.00467),
+        0.03: ("lqg", 0.0009702),
+    },
 }
-"""By scenario, one for each activity: chosen by ``python -m cz_gym.baselines.tuning.lqg_frontier``."""
+"""By scenario and pull step RMS [mm/min]: a shipped LQG, and the weight on pull steps that makes it a member of the
+family; chosen by ``python -m cz_gym.baselines.tuning.lqg_frontier``."""
+ACTIVITIES = tuple(MEMBERS["randomized"])
+"""Pull step RMS [mm/min] that the members are made for."""
 
 
 def family_name(activity: float) -> str:
@@ -153,8 +144,8 @@ def settings_of(controller: str, scenario: str) -> LQGSettings:
 def member_settings(activity: float, scenario: str) -> LQGSettings:
     """The frozen settings of the member for that pull step RMS [mm/min], one of ACTIVITIES, on that scenario."""
     where = scenario if scenario in MEMBERS else "randomized"
-    member = MEMBERS[where][ACTIVITIES.index(activity)]
-    return with_pull_step(settings_of(member.base, where), member.pull_step)
+    base, pull_step = MEMBERS[where][activity]
+    return with_pull_step(settings_of(base, where), pull_step)
 
 
 def with_pull_step(settings: LQGSettings, weight: float) -> LQGSettings:

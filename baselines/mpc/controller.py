@@ -10,26 +10,24 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from cz_gym.baselines.bounds.trajectory import Limits, limits_of
+from cz_gym.baselines.bounds.trajectory import SCALES, Limits, limits_of
 from cz_gym.baselines.lqg import settings as lqg_settings
-from cz_gym.baselines.lqg.controller import LQG, LQGSettings, Memory, memory_at_rest, optimal_inputs
+from cz_gym.baselines.lqg.controller import LQG, Memory, memory_at_rest, optimal_inputs
 from cz_gym.baselines.lqg.filter_bank import FilterBank, Hypotheses, filter_bank
-from cz_gym.baselines.lqg.model import PLANT, plant_model
-from cz_gym.baselines.lqg.regulator import cost_to_go, quadratic_cost
+from cz_gym.baselines.lqg.model import PLANT
+from cz_gym.baselines.lqg.regulator import Regulator, Weights, quadratic_cost
 from cz_gym.baselines.policy import Floats, MeasuredController
 from cz_gym.config import Config
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.observation import Measured
-from cz_gym.physics.plant import Puller
 from cz_gym.units import MINUTE
 
 from .limits import best_corrections
-from .model import SCALES, Shape, U, casadi
+from .model import Shape, U, casadi
 from .prediction import Prediction, expected_disturbances, held, predict_under_law
 
 WEIGHT_FACTOR = 0.8
@@ -37,7 +35,7 @@ WEIGHT_FACTOR = 0.8
 
 
 class Objective(NamedTuple):
-    """The cost in :data:`cz_gym.baselines.mpc.model.SCALES`."""
+    """The cost in :data:`cz_gym.baselines.bounds.trajectory.SCALES`."""
 
     stage: Floats
     """Weights on the squares of what a stage shows, shape (stages, 5)."""
@@ -111,7 +109,7 @@ class EkfMpc(MeasuredController):
         disturbances = expected_disturbances(estimate, plan, gains, share, shape.stages)
         z = np.concatenate([estimate[:, :PLANT], previous], axis=1) / SCALES
         prediction = predict_under_law(z, plan, disturbances, gains, share, shape)
-        cost = objective(settings, gains.filter.puller, shape)
+        cost = objective(gains.regulator, settings.weights, shape)
         H, g = newton(prediction, held(plan, shape.stages)[:, -1, 0], disturbances[:, -1], cost)
         usable = np.isfinite(np.concatenate([H.reshape(len(H), -1), g], axis=1)).all(axis=1)
         corrections = np.zeros(g.shape)
@@ -124,16 +122,14 @@ class EkfMpc(MeasuredController):
         return inputs
 
 
-@lru_cache(maxsize=8)
-def objective(settings: LQGSettings, puller: Puller, shape: Shape) -> Objective:
+def objective(law: Regulator, weights: Weights, shape: Shape) -> Objective:
     """The regulator's cost over the horizon, its cost-to-go beyond."""
-    cost = quadratic_cost(settings.weights, shape.dt)
-    least = cost_to_go(plant_model(puller, settings.noise, shape.dt, shape.meniscus), settings.weights, shape.dt)
+    cost = quadratic_cost(weights, shape.dt)
     pull = cost.Q[PLANT, PLANT]
     squares = np.array([SCALES[0], *SCALES[PLANT:], *SCALES[PLANT:]]) ** 2
     stage = np.tile(squares * np.array([cost.Q[0, 0], pull, 0.0, cost.R[0, 0] - pull, cost.R[1, 1]]), (shape.stages, 1))
     stage[-1, 0] = 0.0
-    return Objective(stage, least.P * np.outer(SCALES, SCALES), least.X * SCALES[:, None])
+    return Objective(stage, law.P * np.outer(SCALES, SCALES), law.X * SCALES[:, None])
 
 
 def newton(prediction: Prediction, r_ref: Floats, d: Floats, cost: Objective) -> tuple[Floats, Floats]:
