@@ -141,7 +141,7 @@ def _classical(entry: Entry) -> Contender:
     from cz_gym.evaluation.contenders import Contender
     from cz_gym.evaluation.results import Controller
 
-    controller = Controller(entry.name, entry.observation, entry.meaning, privileged=entry.told, slow=entry.slow)
+    controller = Controller(entry.name, entry.observation, entry.meaning, privileged=entry.privileged, slow=entry.slow)
     return Contender(controller, lambda config: [entry.make(config)], entry.default)
 
 

@@ -1,11 +1,15 @@
-"""The seam that controllers and agents share: stable-baselines3's ``predict``, batched."""
+"""The interface that controllers and agents share: stable-baselines3's ``predict``, for a batch of crystals at once."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
+
+from cz_gym.observation import HEATER_SCALE, Measured, decode
 
 Floats = npt.NDArray[np.float64]
 
@@ -30,6 +34,36 @@ class Policy(Protocol):
         ...
 
 
+class MeasuredController(ABC):
+    """A controller that reads "measured" (or "history") observations.
+
+    A subclass works in SI units on a batch of n crystals: it says what it remembers at first, and what it does with a
+    sample. Its memory is a tuple of arrays with a leading axis n, or a tuple of such tuples.
+    """
+
+    @property
+    @abstractmethod
+    def v_0(self) -> float:
+        """Nominal pull speed of the environment's parameters [m/s]."""
+
+    @abstractmethod
+    def at_rest(self, seen: Measured) -> Any:
+        """The memory before the first sample, which is ``seen``."""
+
+    @abstractmethod
+    def step(self, seen: Measured, memory: Any) -> tuple[Floats, Floats, Any]:
+        """Pull speed v_p - v_0 [m/s] and heater power Q_H - Q_H0 [W], each of shape (n,), and the new memory."""
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[npt.NDArray[np.float32], Any]:
+        """The action and the next memory; arguments as of :class:`Policy`."""
+        array, single = batched(observation)
+        seen = decode(array, self.v_0)
+        pull, power, memory = self.step(seen, fresh(state, self.at_rest(seen), episode_start))
+        return to_action(pull / self.v_0, power / HEATER_SCALE, single), memory
+
+
 def batched(observation: Any) -> tuple[Floats, bool]:
     """The observation with a batch axis, and whether it had none."""
     array = np.asarray(observation, np.float64)
@@ -43,15 +77,22 @@ def to_action(pull: Floats, heat: Floats, single: bool) -> npt.NDArray[np.float3
 
 
 def fresh(state: Any, zeros: Any, episode_start: Any) -> Any:
-    """The state as a tuple of arrays, zeroed where an episode begins; ``zeros`` is the state at rest."""
+    """The state, a tuple of arrays or of such tuples, with ``zeros``, the state at rest, where an episode begins."""
     if state is None:
         return zeros
     if episode_start is None:
         return state
     begins = np.atleast_1d(np.asarray(episode_start, np.bool_))
-    if not begins.any():
-        return state
-    kept = (
-        np.where(begins.reshape(-1, *(1,) * (old.ndim - 1)), zero, old) for old, zero in zip(state, zeros, strict=True)
-    )
-    return type(zeros)(*kept)
+    return select(begins, zeros, state) if begins.any() else state
+
+
+def select(where: npt.NDArray[np.bool_], one: Any, other: Any) -> Any:
+    """``one`` in the slots where ``where`` is true, ``other`` elsewhere; both as a state in :func:`fresh`."""
+    return map_arrays(lambda a, b: np.where(where.reshape(-1, *(1,) * (b.ndim - 1)), a, b), one, other)
+
+
+def map_arrays(function: Callable[..., Any], *values: Any) -> Any:
+    """A nested NamedTuple with the function's result in place of each array; ``values`` are nested alike."""
+    if isinstance(values[0], tuple):
+        return type(values[0])(*(map_arrays(function, *parts) for parts in zip(*values, strict=True)))
+    return function(*values)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from cz_gym.baselines.bounds import lqg as lqg_bounds
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
@@ -11,7 +12,7 @@ from cz_gym.baselines.lqg import settings as lqg_settings
 from cz_gym.baselines.lqg.controller import LQG
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
 from cz_gym.baselines.pid.open_loop import OpenLoop
-from cz_gym.baselines.pid.tuned import tuned
+from cz_gym.baselines.pid.settings import tuned
 from cz_gym.config import Config
 
 from .policy import Policy
@@ -30,8 +31,8 @@ class Entry:
     """One line for people."""
     default: bool = True
     """Whether a benchmark that names no controllers runs it."""
-    told: bool = False
-    """Whether it is told what no controller knows, which makes it a bound."""
+    privileged: bool = False
+    """Whether it knows what no controller can know, which makes it a bound."""
     slow: bool = False
     """Whether it runs only when slow controllers are asked for, on the first few episodes."""
 
@@ -49,28 +50,17 @@ def _tuned(name: str, meaning: str) -> Entry:
 
 
 IN_TABLE = 0.02
-"""Pull step RMS [mm/min] of the frontier's setting that runs by default: a table of radius errors is fair only if an
-LQG as lively as the liveliest agent stands in it."""
+"""Pull step RMS [mm/min] of the family's member that runs by default: a table of radius errors is fair only if an LQG
+as active as the most active agent stands in it."""
 
 
 def _lqg_at(activity: float) -> Entry:
     return Entry(
         lqg_settings.family_name(activity),
-        lambda config: lqg_settings.lqg_at(activity, config),
+        partial(lqg_settings.lqg_at, activity),
         "measured",
         f"the same LQG, its weight on pull steps made for {activity:g} mm/min of them",
         default=activity == IN_TABLE,
-    )
-
-
-def _told(name: str, make: Callable[[Config], LQG]) -> Entry:
-    return Entry(
-        f"{name}-told",
-        lambda config: lqg_bounds.lqg_told(make(config)),
-        "measured",
-        f"bound: {name} told the puller's parameters and how rough its melt is",
-        default=False,
-        told=True,
     )
 
 
@@ -78,6 +68,14 @@ def _ekf_mpc(config: Config) -> Policy:
     from cz_gym.baselines.mpc.controller import ekf_mpc
 
     return ekf_mpc(config)
+
+
+_bound = partial(Entry, default=False, privileged=True)
+
+
+def _privileged(name: str, make: Callable[[Config], LQG]) -> Entry:
+    meaning = f"bound: {name} told the puller's parameters and how strong each crystal's fluctuations are"
+    return _bound(f"{name}-told", lambda config: lqg_bounds.privileged(make(config)), "measured", meaning)
 
 
 CONTROLLERS: tuple[Entry, ...] = (
@@ -92,32 +90,15 @@ CONTROLLERS: tuple[Entry, ...] = (
     Entry("lqg-quiet", lqg_settings.lqg_quiet, "measured", "the same for low pull activity"),
     *(_lqg_at(activity) for activity in lqg_settings.ACTIVITIES),
     Entry("ekf-mpc", _ekf_mpc, "measured", "nonlinear MPC on a bank of lqg's filters", default=False, slow=True),
-    Entry(
-        "lqg-true",
-        lqg_bounds.lqg_true,
-        "measured",
-        "bound: lqg told the puller's parameters",
-        default=False,
-        told=True,
-    ),
-    _told("lqg-quiet", lqg_settings.lqg_quiet),
-    _told(lqg_settings.family_name(0.013), lambda config: lqg_settings.lqg_at(0.013, config)),
-    _told(lqg_settings.family_name(IN_TABLE), lambda config: lqg_settings.lqg_at(IN_TABLE, config)),
-    Entry(
-        "full-information",
-        lqg_bounds.full_information,
-        "state",
-        "bound: lqg's regulator, true state seen",
-        default=False,
-        told=True,
-    ),
-    Entry(
+    _bound("lqg-true", lqg_bounds.lqg_true, "measured", "bound: lqg told the puller's parameters"),
+    _privileged("lqg-quiet", lqg_settings.lqg_quiet),
+    *(_privileged(lqg_settings.family_name(each), partial(lqg_settings.lqg_at, each)) for each in (0.013, IN_TABLE)),
+    _bound("full-information", lqg_bounds.full_information, "state", "bound: lqg's regulator, true state seen"),
+    _bound(
         "clairvoyant",
         lambda config: Clairvoyant(),
         "state",
         "bound: the best trajectory for the whole future known",
-        default=False,
-        told=True,
         slow=True,
     ),
 )

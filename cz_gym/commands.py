@@ -24,6 +24,21 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {' '.join(message.split())}\n")
 
 
+def between(least: int, most: int) -> Callable[[str], int]:
+    """The type of an option that is a whole number in that range, ends included."""
+
+    def number(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"must be between {least} and {most}, not {text}")
+        return value
+
+    return number
+
+
 def guarded(prog: str, body: Callable[[], int], extra: str, left: str = "nothing written") -> int:
     """Run a command's body, its exit code; what ends it early is said in one line.
 

@@ -1,4 +1,4 @@
-"""Observations of a batch that is driven at random, for tests of controllers."""
+"""Observations for tests of controllers: of given values, and of a batch that is driven at random."""
 
 from __future__ import annotations
 
@@ -8,6 +8,15 @@ from typing import Any
 import numpy as np
 
 from cz_gym import CzVectorEnv
+from cz_gym.observation import MEASURED, PULL_SCALE, scales
+
+
+def measured(**values: Any) -> np.ndarray:
+    """A "measured" observation of these values [SI], of shape (n,) or numbers; the rest zero, the camera valid."""
+    given = {name: np.atleast_1d(value) for name, value in {"valid": 1.0, **values}.items()}
+    zero = np.zeros(max(len(value) for value in given.values()))
+    columns = [given.get(channel.name, 0.0) + zero for channel in MEASURED]
+    return np.stack(columns, axis=1) / scales(MEASURED, PULL_SCALE)
 
 
 def observations(n: int = 3, steps: int = 20, **keywords: Any) -> Iterator[Any]:

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.baselines.optional import require
 from cz_gym.physics.linearisation import StateSpace
 from cz_gym.physics.plant import Puller
 
@@ -42,7 +41,8 @@ def frequencies(dt: float, points: int = 2000) -> Floats:
 
 def response(system: StateSpace, dt: float, omega: Floats) -> npt.NDArray[np.complex128]:
     """Frequency response of a discrete single-input single-output system, by python-control."""
-    control = require("control")
+    import control
+
     values: npt.NDArray[np.complex128] = control.ss(*system, dt)(np.exp(1j * omega * dt))
     return values
 
@@ -86,7 +86,8 @@ def loop_margins(controller: StateSpace, puller: Puller, dt: float, at: str = "c
 
 def margins_of(values: npt.NDArray[np.complex128], omega: Floats, dt: float, stable: bool) -> LoopMargins:
     """The same from an opened loop's response up to the Nyquist frequency, and whether it is stable closed."""
-    control = require("control")
+    import control
+
     found = crossover_of(values, omega)
     if not stable:
         return LoopMargins(found, *[float("nan")] * 5)

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cz_gym.baselines.lqg.controller import LQG
-from cz_gym.baselines.lqg.late_ring import Search
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.open_loop import OpenLoop
 from cz_gym.observation import MEASURED, PULL_SCALE, Measured
@@ -61,8 +60,7 @@ def _lqg(policy: LQG) -> LinearForm:
         observation[Measured._fields.index("T_1")] = PYROMETER_NOISE / scale["T_1"] * noise[1]
         _, state = linear.predict(observation, state)
     assert state is not None
-    rest = state._replace(mean=0.0 * state.mean, plan=0.0 * state.plan, asked=0.0 * state.asked)
-    found = linear_controller(
-        linear, policy.parameters.v_0, rest, ("covariance", "camera_variance", "plan", "begun", *Search._fields)
-    )
+    mean = 0.0 * state.filter.mean
+    rest = state._replace(filter=state.filter._replace(mean=mean), plan=0.0 * state.plan, command=0.0 * state.command)
+    found = linear_controller(linear, policy.v_0, rest, ("filter.mean", "command"))
     return LinearForm(found, found, policy.control_interval)

@@ -9,24 +9,24 @@ t_k are those applied over the interval before.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.signal import cont2discrete
 
+from cz_gym.baselines.policy import Floats, map_arrays
 from cz_gym.observation import HEATER_SCALE, MEASURED, PULL_SCALE, Measured, scales
 from cz_gym.physics.linearisation import INPUTS, OUTPUTS, STATES, StateSpace, linearise
 from cz_gym.physics.plant import Puller
 
-Floats = npt.NDArray[np.float64]
 _SMALL = 1e-6
 """Observed amplitude that no limit, gate or dead zone notices [-]; float32 actions keep their relative precision."""
 _SEEN = ("ring_error", "T_1", "v_p", "Q_H")
 """Channels through which the plant reaches the controller."""
 _DOUBLINGS = 40
 """2^40 samples, beyond any memory of a stable loop."""
-_QUIET = np.array([float(channel.name == "valid") for channel in MEASURED])
+_AT_REST = np.array([float(channel.name == "valid") for channel in MEASURED])
 """Observation at rest: nothing but a valid camera."""
 _DISTURBED = ("v_p", "Q_d", "dT_i", "camera", "pyrometer")
 """Inputs of a joined loop."""
@@ -69,19 +69,22 @@ class Loop(NamedTuple):
         return StateSpace(self.A, self.B[:, columns], self.C[[row]], self.D[np.ix_([row], columns)])
 
 
-def linear_controller(policy: Any, v_0: float = PULL_SCALE, rest: Any = None, held: tuple[str, ...] = ()) -> StateSpace:
+def linear_controller(
+    policy: Any, v_0: float = PULL_SCALE, rest: Any = None, free: Sequence[str] | None = None
+) -> StateSpace:
     """The controller in discrete time: inputs the channels of Measured, outputs v_p - v_0 [m/s] and Q_H - Q_H0 [W].
 
-    ``rest`` is its memory at rest, by default that after one sample of zeros; parts of it named in ``held`` (a
-    covariance, say) keep their value. Raises NotLinearError if the controller does not rest there, or if the answer to
-    twice the input is not twice the answer.
+    ``rest`` is its memory at rest, by default that after one sample of zeros. ``free`` names the parts of it that move,
+    "filter.mean" say, by default all; the others (a covariance, say) keep their value. Raises NotLinearError if the
+    controller does not rest there, or if the answer to twice the input is not twice the answer.
     """
     channels, name = len(MEASURED), type(policy).__name__
-    rest = policy.predict(_QUIET[None])[1] if rest is None else rest
+    rest = policy.predict(_AT_REST[None])[1] if rest is None else rest
     if not hasattr(rest, "_fields"):
         raise NotLinearError(f"{name} remembers no named tuple of arrays: it has no state space here")
-    free = [field for field in rest._fields if field not in held]
-    memory = sum(getattr(rest, field)[0].size for field in free)
+    parts = _parts(rest)
+    free = list(parts) if free is None else free
+    memory = sum(parts[part].size for part in free)
     probes = np.eye(memory + channels) * _SMALL
     still, once, twice = (_answer(policy, factor * probes, rest, free) for factor in (0.0, 1.0, 2.0))
     once, twice = once - still, twice - still
@@ -98,18 +101,28 @@ def linear_controller(policy: Any, v_0: float = PULL_SCALE, rest: Any = None, he
     )
 
 
-def _answer(policy: Any, probes: Floats, rest: Any, free: list[str]) -> Floats:
+def _parts(memory: Any, name: str = "") -> dict[str, Floats]:
+    """The arrays of a memory's first slot, by their place in the nested tuple."""
+    if not isinstance(memory, tuple):
+        return {name: np.asarray(memory, np.float64)[:1]}
+    found: dict[str, Floats] = {}
+    for field, part in zip(memory._fields, memory, strict=True):  # type: ignore[attr-defined]
+        found |= _parts(part, f"{name}.{field}" if name else field)
+    return found
+
+
+def _answer(policy: Any, probes: Floats, rest: Any, free: Sequence[str]) -> Floats:
     """Next free memory and action for rows of (free memory, observation), both relative to rest."""
     n, start, parts = len(probes), 0, {}
-    for field in rest._fields:
-        value = np.asarray(getattr(rest, field), np.float64)[:1]
-        parts[field] = np.repeat(value, n, axis=0)
-        if field in free:
-            parts[field] = parts[field] + probes[:, start : start + value.size].reshape(n, *value.shape[1:])
+    for name, value in _parts(rest).items():
+        parts[name] = np.repeat(value, n, axis=0)
+        if name in free:
+            parts[name] += probes[:, start : start + value.size].reshape(n, *value.shape[1:])
             start += value.size
-    action, after = policy.predict(_QUIET + probes[:, start:], state=type(rest)(**parts))
-    moved = [np.reshape(getattr(after, field) - getattr(rest, field)[:1], (n, -1)) for field in free]
-    return np.hstack([*moved, action])
+    values = iter(parts.values())
+    action, after = policy.predict(_AT_REST + probes[:, start:], state=map_arrays(lambda _: next(values), rest))
+    moved = map_arrays(lambda new, old: np.reshape(new - old[:1], (1, n, -1)), after, rest)
+    return np.hstack([*(part[0] for name, part in _parts(moved).items() if name in free), action])
 
 
 def sampled_plant(puller: Puller, dt: float) -> StateSpace:
@@ -130,27 +143,32 @@ def close(controller: StateSpace, puller: Puller, dt: float, broken: str = "") -
     alone; ``broken="v_p"`` opens it at the pull speed: plant and controller see the input ``v_p`` alone. The state is
     (plant, v_p and Q_H applied last, controller).
     """
-    plant, m, n = sampled_plant(puller, dt), len(controller.A), len(STATES)
+    plant, n, inputs = sampled_plant(puller, dt), len(STATES), len(_DISTURBED)
     at = [Measured._fields.index(name) for name in _SEEN]
-    seen = np.zeros((len(_SEEN), n + 2 + m))
+    column = {name: np.eye(inputs)[i] for i, name in enumerate(_DISTURBED)}
+    seen = np.zeros((len(_SEEN), n + 2))
     seen[0, :n], seen[1, :n] = plant.C[1] * (broken != "camera"), plant.C[2]
     seen[2, n], seen[3, n + 1] = 1.0, 1.0
-    noise = np.zeros((len(_SEEN), len(_DISTURBED)))
-    noise[0, _DISTURBED.index("camera")] = noise[1, _DISTURBED.index("pyrometer")] = 1.0
-    command = np.hstack([np.zeros((2, n + 2)), controller.C]) + controller.D[:, at] @ seen
-    direct = controller.D[:, at] @ noise
-    closed = np.array([[broken != "v_p"], [True]], np.float64)
-    applied, given = closed * command, closed * direct
-    given[0, _DISTURBED.index("v_p")] = 1.0
-    load = np.zeros((2, len(_DISTURBED)))
-    load[0, _DISTURBED.index("Q_d")] = load[1, _DISTURBED.index("dT_i")] = 1.0
-    moved = np.hstack([plant.A, np.zeros((n, 2 + m))]) + plant.B[:, :2] @ applied
-    recalled = np.hstack([np.zeros((m, n + 2)), controller.A]) + controller.B[:, at] @ seen
-    A = np.vstack([moved, applied, recalled])
-    B = np.vstack([plant.B[:, :2] @ given + plant.B[:, 2:] @ load, given, controller.B[:, at] @ noise])
-    radii = np.hstack([plant.C[:2], np.zeros((2, 2 + m))])
-    C, D = np.vstack([command, radii]), np.vstack([direct, np.zeros((2, len(_DISTURBED)))])
-    return Loop(A, B, C, D, _DISTURBED, ("v_p", "Q_H", "r_c", "r_br"), dt)
+    noise = np.stack([column["camera"], column["pyrometer"], np.zeros(inputs), np.zeros(inputs)])
+    B, D = controller.B[:, at], controller.D[:, at]
+    command, direct = np.hstack([D @ seen, controller.C]), D @ noise
+    closed = np.diag([float(broken != "v_p"), 1.0])
+    apply = np.vstack([plant.B[:, :2], np.eye(2)])
+    own = np.zeros((n + 2, n + 2))
+    own[:n, :n] = plant.A
+    disturbed = np.outer(apply[:, 0], column["v_p"])
+    disturbed[:n] += plant.B[:, 2:] @ np.stack([column["Q_d"], column["dT_i"]])
+    moved = np.hstack([own, np.zeros((n + 2, len(controller.A)))]) + apply @ closed @ command
+    radii = np.hstack([plant.C[:2], np.zeros((2, command.shape[1] - n))])
+    return Loop(
+        np.vstack([moved, np.hstack([B @ seen, controller.A])]),
+        np.vstack([disturbed + apply @ closed @ direct, B @ noise]),
+        np.vstack([command, radii]),
+        np.vstack([direct, np.zeros((2, inputs))]),
+        _DISTURBED,
+        ("v_p", "Q_H", "r_c", "r_br"),
+        dt,
+    )
 
 
 def late(controller: StateSpace, samples: int) -> StateSpace:
@@ -171,10 +189,10 @@ def late(controller: StateSpace, samples: int) -> StateSpace:
 
 
 def root_mean_square(system: StateSpace, difference: bool = False) -> float:
-    """Standard deviation of the output for white noise of unit standard deviation per sample (Lyapunov equation,
-    by doubling: badly scaled slow loops lose no positive variance to rounding).
+    """Standard deviation of the output for white noise of unit standard deviation per sample; NaN if unstable.
 
-    ``difference`` takes that of the step-to-step change. NaN for an unstable system.
+    It solves the Lyapunov equation by doubling, so that badly scaled slow loops lose no positive variance to rounding.
+    ``difference`` takes the standard deviation of the step-to-step change.
     """
     A, B, C, D = system
     if np.abs(np.linalg.eigvals(A)).max() >= 1.0:

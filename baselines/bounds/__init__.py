@@ -1,1 +1,1 @@
-"""What no sensor could feed: controllers that are told the puller, the state or the future."""
+"""Bounds: controllers that know the puller, the state or the future, which no sensor shows."""

@@ -1,8 +1,8 @@
-"""The bound that nothing can beat: true state, parameters and every future disturbance, the reward's own cost.
+"""The bound that nothing can beat: true state, parameters and every future disturbance are known.
 
-Before an episode the whole trajectory is optimised (:mod:`cz_gym.baselines.bounds.trajectory`); during it the optimal
-inputs are played, with the optimum's own feedback on the true state for what the plan cannot know: a heater that moves
-in steps.
+Before an episode the whole trajectory is optimised for the reward's own cost
+(:mod:`cz_gym.baselines.bounds.trajectory`). During it the optimal inputs are played. The optimum's own feedback on the
+true state corrects what the plan cannot know: a heater that moves in steps.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ class Memory(NamedTuple):
 
     step: Floats
     """Steps taken, shape (n,)."""
-    asked: Floats
-    """Inputs asked for last, less the planned ones [m/s, W], shape (n, 2)."""
+    correction: Floats
+    """Last inputs less the planned ones [m/s, W], shape (n, 2)."""
 
 
 @dataclass(frozen=True)
 class Clairvoyant:
-    """Plays the optimum of each slot's episode, on "state" observations; told by :meth:`for_episodes`."""
+    """Plays the optimum of each slot's episode, on "state" observations; :meth:`for_episodes` makes the plan."""
 
     search: Search = field(default_factory=Search)
     plan: Plan | None = field(default=None, compare=False, repr=False)
@@ -73,21 +73,21 @@ class Clairvoyant:
     ) -> tuple[npt.NDArray[np.float32], Memory]:
         """The action and what to remember."""
         if self.plan is None:
-            raise RuntimeError("clairvoyant is told its episodes by for_episodes(config, seeds), which a rollout calls")
+            raise RuntimeError("clairvoyant has no plan: call for_episodes(config, seeds) first, as a rollout does")
         array, single = batched(observation)
         n, best, inputs_0 = len(array), self.plan.best, self.plan.inputs_0
         if n != len(inputs_0):
-            raise ValueError(f"clairvoyant was told {len(inputs_0)} episodes, not {n}")
+            raise ValueError(f"clairvoyant has a plan for {len(inputs_0)} episodes, not {n}")
         memory = fresh(state, Memory(np.zeros(n), np.zeros((n, INPUTS))), episode_start)
         k, slot = np.minimum(memory.step.astype(int), len(best.u) - 1), np.arange(n)
         seen = array * scales(STATE, float(inputs_0[0, 0]))
         x = seen[:, [_CHANNELS.index(name) for name in _X]] + self.plan.state_0
         x[:, 0] += seen[:, _CHANNELS.index("r_ref")]
-        off = np.concatenate([x - best.x[k, slot], memory.asked], axis=-1)
-        asked = memory.asked + (best.feedback[k, slot] @ off[:, :, None])[:, :, 0]
-        inputs = best.u[k, slot] + asked - inputs_0
+        deviation = np.concatenate([x - best.x[k, slot], memory.correction], axis=-1)
+        correction = memory.correction + (best.feedback[k, slot] @ deviation[:, :, None])[:, :, 0]
+        inputs = best.u[k, slot] + correction - inputs_0
         action = to_action(inputs[:, 0] / inputs_0[:, 0], inputs[:, 1] / HEATER_SCALE, single)
-        return action, Memory(memory.step + 1.0, asked)
+        return action, Memory(memory.step + 1.0, correction)
 
 
 def make_plan(config: Config, seeds: Sequence[int], search: Search) -> Plan:

@@ -1,6 +1,6 @@
-"""What will happen to an episode: its puller, its start, its reference and every disturbance to come.
+"""What will happen in an episode: its puller, its start, its reference and every disturbance to come.
 
-Told by the environment's own draws and schedules, for bounds alone; no controller may read it.
+All comes from the environment's own draws and schedules. It is for bounds alone; no controller may read it.
 """
 
 from __future__ import annotations
@@ -15,11 +15,9 @@ from cz_gym.baselines.policy import Floats
 from cz_gym.config import Config
 from cz_gym.engine.batch import first_key
 from cz_gym.episodes.schedule import disturbance, reference
-from cz_gym.episodes.series import GRID, Episode, draw_episode, new_series
+from cz_gym.episodes.series import GRID, Episode, draw_episode, draw_factors, new_series, randomised
 from cz_gym.physics.meniscus import MeniscusModel
-from cz_gym.physics.plant import Disturbance, Inputs, Puller, State, rk4
-
-from .lqg import pullers_of
+from cz_gym.physics.plant import Disturbance, Inputs, Puller, State, make_puller, rk4
 
 _EPS = 1e-9
 
@@ -54,6 +52,21 @@ class Future(NamedTuple):
             held = Disturbance(*(value[steps] for value in d))
             x = rk4(x, u, held, self.puller, dt[steps], self.meniscus.slope)
         return x
+
+
+def pullers_of(config: Config, seeds: Sequence[int]) -> tuple[Puller, ...]:
+    """The pullers of the first episodes that those seeds draw."""
+    pullers = []
+    for seed in seeds:
+        factors = draw_factors(config.scenario, config.mix, first_key(seed))
+        pullers.append(make_puller(randomised(config.parameters, factors), factors.lam, config.meniscus))
+    return tuple(pullers)
+
+
+def fluctuations_of(config: Config, seeds: Sequence[int]) -> tuple[tuple[float, float], ...]:
+    """Standard deviations of fast and slow interface fluctuation [K] of those seeds' first episodes."""
+    drawn = (draw_episode(config.scenario, first_key(seed), new_series(1, 0)) for seed in seeds)
+    return tuple((float(episode.sd_fast), float(episode.sd_slow)) for episode in drawn)
 
 
 def future_of(config: Config, seeds: Sequence[int]) -> Future:

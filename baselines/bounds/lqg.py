@@ -1,7 +1,7 @@
-"""Bounds made of the LQG's parts: what a perfect model, and what a perfect view of the present, would be worth.
+"""Privileged LQGs: bounds on what a perfect model, and a perfect view of the present, would be worth.
 
-They are told what no controller knows and stand in tables as bounds, never as contenders. What they are told comes
-through ``for_episodes``, which a rollout calls with the episodes it is about to run.
+They know what no controller can know, and stand in tables as bounds, never as contenders. They get their knowledge
+through ``for_episodes``, which a rollout calls with the episodes that it is about to run.
 """
 
 from __future__ import annotations
@@ -16,92 +16,75 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.baselines.lqg import kalman
-from cz_gym.baselines.lqg.controller import LQG, Gains, LQGSettings, act, solve_each
+from cz_gym.baselines.lqg.controller import LQG, Gains, LQGSettings, Memory, optimal_inputs, solve_each
 from cz_gym.baselines.lqg.model import DRIFT, FAST, PLANT, SLOW, STATES, NoiseModel, load_per_drift
 from cz_gym.baselines.lqg.preview import look_ahead, samples_ahead
 from cz_gym.baselines.lqg.settings import settings_of
 from cz_gym.baselines.policy import Floats, batched, fresh, to_action
 from cz_gym.config import Config
-from cz_gym.engine.batch import first_key
-from cz_gym.episodes.series import draw_episode, draw_factors, new_series, randomised
 from cz_gym.observation import HEATER_SCALE, STATE, Measured, scales
-from cz_gym.physics.plant import Puller, hidden_load, make_puller
+from cz_gym.physics.plant import hidden_load
 
-_SMOOTHEST = 0.01
+from .future import fluctuations_of, pullers_of
+
+_LEAST_SD = 0.01
 """Least standard deviation of a fluctuation [K]: a filter that expects none would not see what its model leaves out."""
 _TINY = 1e-9
 """Share of the fluctuations' variance by which their sum is taken to be uncertain, for Riccati's equation."""
 
 
-def pullers_of(config: Config, seeds: Sequence[int]) -> tuple[Puller, ...]:
-    """The pullers that those seeds draw in their first episode, by the environment's own functions."""
-    pullers = []
-    for seed in seeds:
-        factors = draw_factors(config.scenario, config.mix, first_key(seed))
-        pullers.append(make_puller(randomised(config.parameters, factors), factors.lam, config.meniscus))
-    return tuple(pullers)
-
-
-def roughness_of(config: Config, seeds: Sequence[int]) -> tuple[tuple[float, float], ...]:
-    """Standard deviations of fast and slow interface fluctuation [K] of those seeds' first episodes."""
-    drawn = (draw_episode(config.scenario, first_key(seed), new_series(1, 0)) for seed in seeds)
-    return tuple((float(episode.sd_fast), float(episode.sd_slow)) for episode in drawn)
-
-
 @dataclass(frozen=True)
-class ToldLQG(LQG):
+class PrivilegedLQG(LQG):
     """The LQG with each slot's own puller as its model: what knowing the parameters is worth.
 
-    With ``roughness`` its filter also has each slot's own interface fluctuation, which is as rough on one crystal as on
-    the next on average only. Until it is told, it takes the nominal puller for everyone's, as the LQG does.
+    With ``knows_fluctuations`` its filter also has each crystal's own strength of the interface fluctuations, where
+    other LQGs assume the average. Before ``for_episodes`` it is the LQG with the nominal puller.
     """
 
-    told: Gains | None = None
-    roughness: bool = False
+    gains_by_slot: Gains | None = None
+    knows_fluctuations: bool = False
 
     @property
     def gains(self) -> Gains:
         """Gains of the slots' own pullers."""
-        return super().gains if self.told is None else self.told
+        return super().gains if self.gains_by_slot is None else self.gains_by_slot
 
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[npt.NDArray[np.float32], Any]:
-        """The action and what to remember; ValueError for another number of slots than it was told."""
-        _check_slots(self.told, observation)
-        return super().predict(observation, state, episode_start, deterministic)
+    def at_rest(self, seen: Measured) -> Memory:
+        """The filter at its initial covariance; ValueError for another number of slots than of known pullers."""
+        self.check_slots(len(seen.v_p))
+        return super().at_rest(seen)
 
-    def for_episodes(self, config: Config, seeds: Sequence[int]) -> ToldLQG:
+    def check_slots(self, slots: int) -> None:
+        """ValueError for another number of slots than of known pullers."""
+        known = slots if self.gains_by_slot is None else len(self.gains_by_slot.filter.plant.A)
+        if known != slots:
+            raise ValueError(f"{known} pullers are known, got {slots} slots: one puller a slot is needed")
+
+    def for_episodes(self, config: Config, seeds: Sequence[int]) -> PrivilegedLQG:
         """The same controller for those episodes, one a slot."""
         settings = [self.settings] * len(seeds)
-        if self.roughness:
-            settings = [_as_rough(self.settings, *each) for each in roughness_of(config, seeds)]
-        told = solve_each(settings, config.control_interval, pullers_of(config, seeds), config.meniscus)
-        return replace(self, told=told)
+        if self.knows_fluctuations:
+            settings = [_with_fluctuations(self.settings, *each) for each in fluctuations_of(config, seeds)]
+        solved = solve_each(settings, config.control_interval, pullers_of(config, seeds), config.meniscus)
+        return replace(self, gains_by_slot=solved)
 
 
-def _as_rough(settings: LQGSettings, fast: float, slow: float) -> LQGSettings:
-    """The settings for a melt of that roughness [K]."""
-    noise = replace(settings.noise, fast_sd=max(fast, _SMOOTHEST), slow_sd=max(slow, _SMOOTHEST))
+def _with_fluctuations(settings: LQGSettings, fast: float, slow: float) -> LQGSettings:
+    """The settings for fluctuations of those standard deviations [K]."""
+    noise = replace(settings.noise, fast_sd=max(fast, _LEAST_SD), slow_sd=max(slow, _LEAST_SD))
     return replace(settings, noise=noise)
 
 
-def _check_slots(told: Gains | None, observation: Any) -> None:
-    slots = len(np.atleast_2d(observation))
-    if told is not None and len(told.eye.model.A) != slots:
-        raise ValueError(f"told {len(told.eye.model.A)} pullers, got {slots} slots: one puller a slot is needed")
-
-
-class Memory(NamedTuple):
+class FullMemory(NamedTuple):
     """What the full-information regulator remembers."""
 
     fluctuation: Floats
-    """The two parts of the interface fluctuation [K], shape (n, 2)."""
+    """The fast and the slow part of the interface fluctuation [K], shape (n, 2)."""
     drift: Floats
     """Drift of the hot zone at the last sample [K], shape (n,)."""
     plan: Floats
     """Recipe ahead, shape (n, 2, samples + 1)."""
-    begun: Floats
+    started: Floats
     """1 once the slot has seen a sample, shape (n,)."""
 
 
@@ -109,46 +92,46 @@ class Memory(NamedTuple):
 class FullInformation:
     """The LQG's regulator on the true state and the present disturbances ("state" observations); no future.
 
-    It is told each slot's puller too. The interface fluctuation is seen as a sum: a noise-free Kalman filter of two
-    states parts it into fast and slow. The drift is the one whose static load is seen, its rate the last change.
+    It knows each slot's puller too. The interface fluctuation is seen as a sum: a noise-free Kalman filter of two
+    states separates fast and slow. The drift is the one whose static load is seen, its rate the last change.
     """
 
-    law: ToldLQG = field(default_factory=ToldLQG)
+    lqg: PrivilegedLQG = field(default_factory=PrivilegedLQG)
 
     def for_episodes(self, config: Config, seeds: Sequence[int]) -> FullInformation:
         """The same regulator for those episodes, one a slot."""
-        return FullInformation(self.law.for_episodes(config, seeds))
+        return FullInformation(self.lqg.for_episodes(config, seeds))
 
     def predict(
-        self, observation: Any, state: Memory | None = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[npt.NDArray[np.float32], Memory]:
+        self, observation: Any, state: FullMemory | None = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[npt.NDArray[np.float32], FullMemory]:
         """The action and what to remember."""
         array, single = batched(observation)
-        _check_slots(self.law.told, observation)
-        gains, v_0 = self.law.gains, self.law.parameters.v_0
-        p, dt = gains.eye.puller, gains.eye.dt
-        seen = dict(zip((channel.name for channel in STATE), (array * scales(STATE, v_0)).T, strict=True))
         n = len(array)
-        rest = Memory(np.zeros((n, 2)), np.zeros(n), np.zeros((n, 2, samples_ahead(dt) + 1)), np.zeros(n))
+        self.lqg.check_slots(n)
+        gains, v_0 = self.lqg.gains, self.lqg.v_0
+        p, dt = gains.filter.puller, gains.filter.dt
+        seen = dict(zip((channel.name for channel in STATE), (array * scales(STATE, v_0)).T, strict=True))
+        rest = FullMemory(np.zeros((n, 2)), np.zeros(n), np.zeros((n, 2, samples_ahead(dt) + 1)), np.zeros(n))
         memory = fresh(state, rest, episode_start)
-        begins = memory.begun == 0.0
-        fluctuation = _parted(memory.fluctuation, seen["dT_i"], begins, gains.eye.noise, dt)
+        starts = memory.started == 0.0
+        fluctuation = _separated(memory.fluctuation, seen["dT_i"], starts, gains.filter.noise, dt)
         drift = _drift(seen["Q_d"], p)
-        plan = look_ahead(memory.plan, _recipe(seen), begins, dt)
+        plan = look_ahead(memory.plan, _recipe(seen), starts, dt)
         x = np.zeros((n, len(STATES)))
         x[:, :PLANT] = np.stack([seen[name] for name in ("r_c_error", "h_c", "T_1", "T_2", "T_b")], axis=-1)
         x[:, 0] += seen["r_ref"]
         x[:, [FAST, SLOW]] = fluctuation
         x[:, DRIFT] = drift
-        x[:, DRIFT + 1] = np.where(begins, 0.0, drift - memory.drift) / dt
+        x[:, DRIFT + 1] = np.where(starts, 0.0, drift - memory.drift) / dt
         applied = np.stack([seen["v_p"], seen["Q_H"]], axis=-1)
-        inputs = act(x, plan, applied, gains.regulator, 0.0, v_0)
+        inputs = optimal_inputs(x, plan, applied, gains.regulator, 0.0, v_0)
         action = to_action(inputs[:, 0] / v_0, inputs[:, 1] / HEATER_SCALE, single)
-        return action, Memory(fluctuation, drift, plan, np.ones(n))
+        return action, FullMemory(fluctuation, drift, plan, np.ones(n))
 
 
 @lru_cache(maxsize=16)
-def _parting(noise: NoiseModel, dt: float) -> tuple[Floats, Floats, Floats]:
+def _separation(noise: NoiseModel, dt: float) -> tuple[Floats, Floats, Floats]:
     """Decay of the two fluctuations over dt [s], Kalman gain on their exactly seen sum, and gain at the start."""
     keep = np.array([math.exp(-dt / noise.fast_tau), math.exp(-dt / noise.slow_tau)])
     variance = np.array([noise.fast_sd, noise.slow_sd]) ** 2
@@ -157,12 +140,12 @@ def _parting(noise: NoiseModel, dt: float) -> tuple[Floats, Floats, Floats]:
     return keep, P.sum(axis=1) / (P.sum() + tiny), variance / variance.sum()
 
 
-def _parted(old: Floats, total: Floats, begins: npt.NDArray[np.bool_], noise: NoiseModel, dt: float) -> Floats:
-    """The fluctuation [K] parted into fast and slow, shape (n, 2)."""
-    keep, gain, first = _parting(noise, dt)
+def _separated(old: Floats, total: Floats, starts: npt.NDArray[np.bool_], noise: NoiseModel, dt: float) -> Floats:
+    """The fluctuation [K] as fast and slow part, shape (n, 2)."""
+    keep, gain, first = _separation(noise, dt)
     predicted = old * keep
-    parted: Floats = predicted + np.where(begins[:, None], first, gain) * (total - predicted.sum(axis=-1))[:, None]
-    return parted
+    parts: Floats = predicted + np.where(starts[:, None], first, gain) * (total - predicted.sum(axis=-1))[:, None]
+    return parts
 
 
 def _drift(Q_d: Floats, p: Any) -> Floats:
@@ -180,15 +163,15 @@ def _recipe(seen: dict[str, Floats]) -> Measured:
     return Measured(*(seen[name] if "_ref" in name else zero for name in Measured._fields))
 
 
-def lqg_told(law: LQG) -> ToldLQG:
-    """Bound: that LQG told each puller's parameters and how rough its melt is."""
-    return ToldLQG(law.settings, law.control_interval, law.parameters, law.meniscus, roughness=True)
+def privileged(lqg: LQG) -> PrivilegedLQG:
+    """Bound: that LQG, knowing each puller's parameters and each crystal's fluctuations."""
+    return PrivilegedLQG(lqg.settings, lqg.control_interval, lqg.parameters, lqg.meniscus, knows_fluctuations=True)
 
 
-def lqg_true(config: Config) -> ToldLQG:
-    """Bound: the LQG told each puller's parameters."""
+def lqg_true(config: Config) -> PrivilegedLQG:
+    """Bound: the LQG, knowing each puller's parameters."""
     settings = settings_of("lqg", config.scenario.name)
-    return ToldLQG(settings, config.control_interval, config.parameters, config.meniscus)
+    return PrivilegedLQG(settings, config.control_interval, config.parameters, config.meniscus)
 
 
 def full_information(config: Config) -> FullInformation:

@@ -1,10 +1,9 @@
-"""The best whole-episode trajectory for a known future: Newton steps by stages, limits by an interior point.
+"""The best whole-episode trajectory for a known future: Newton steps by Riccati sweeps, limits by an interior point.
 
-Direct multiple shooting (Bock and Plitt 1984): states and inputs of all steps are unknowns, every step's dynamics are
-linearised at once by complex step through the environment's own equations, the banded problem is solved by Riccati's
-recursion (:mod:`cz_gym.baselines.bounds.riccati`), and the drives' limits are kept by a primal-dual barrier (Wright
-1997). The cost is quadratic, so leaving out the dynamics' curvature (Gauss and Newton) costs a little speed and no
-accuracy.
+Direct multiple shooting (Bock and Plitt 1984): states and inputs of all steps are unknowns. The dynamics of all steps
+are linearised at once, by complex step through the environment's own equations. Riccati sweeps solve the banded problem
+(:mod:`cz_gym.baselines.bounds.riccati`), and a primal-dual barrier keeps the drives' limits (Wright 1997). The cost is
+quadratic, so leaving out the dynamics' curvature (Gauss-Newton) costs a little speed and no accuracy.
 """
 
 from __future__ import annotations
@@ -99,11 +98,11 @@ def optimise(future: Future, limits: Limits, search: Search | None = None) -> Tr
         dz = after * SCALES
         ds = _slopes(after[:, :, STATES:], moves)
         df = barrier / slack - force - force / slack * ds
-        share = np.minimum(_share(slack, ds, search), _share_of_height(x[1:, :, 1], dz[:, :, 1], future))
-        x[1:] += share[:, None] * dz[:, :, :STATES]
-        u += share[:, None] * dz[:, :, STATES:]
+        fraction = np.minimum(_step_fraction(slack, ds, search), _height_fraction(x[1:, :, 1], dz[:, :, 1], future))
+        x[1:] += fraction[:, None] * dz[:, :, :STATES]
+        u += fraction[:, None] * dz[:, :, STATES:]
         slack = _slacks(u, nominal, limits)
-        force = force + _share(force, df, search)[:, None] * df
+        force = force + _step_fraction(force, df, search)[:, None] * df
         moved = np.abs(after).max(axis=(0, 2))
         step += 1
     return Trajectory(x, u, _in_si(law), moved, step)
@@ -182,21 +181,21 @@ def _slopes(held: Floats, moves: Floats) -> Floats:
     return np.stack([-held, held, -moves, moves])
 
 
-def _share(values: Floats, changes: Floats, search: Search) -> Floats:
-    """Largest share of the changes that keeps positive values positive, at most 1, shape (n,)."""
+def _step_fraction(values: Floats, changes: Floats, search: Search) -> Floats:
+    """Largest fraction of the changes that keeps positive values positive, at most 1, shape (n,)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(changes < 0.0, -search.boundary * values / changes, math.inf)
-    share: Floats = np.minimum(ratio.min(axis=(0, 1, 3)), 1.0)
-    return share
+    fraction: Floats = np.minimum(ratio.min(axis=(0, 1, 3)), 1.0)
+    return fraction
 
 
-def _share_of_height(h_c: Floats, change: Floats, future: Future) -> Floats:
-    """Largest share that keeps the meniscus halfway from its limits, at most 1, shape (n,)."""
+def _height_fraction(h_c: Floats, change: Floats, future: Future) -> Floats:
+    """Largest fraction that keeps the meniscus halfway from its limits, at most 1, shape (n,)."""
     with np.errstate(divide="ignore"):
         upward = (HEIGHT_MAX_IN_A * future.puller.a - h_c) / np.maximum(change, 0.0)
         downward = (h_c - HEIGHT_MIN) / np.maximum(-change, 0.0)
-    share: Floats = np.minimum(0.5 * np.minimum(upward, downward).min(axis=0), 1.0)
-    return share
+    fraction: Floats = np.minimum(0.5 * np.minimum(upward, downward).min(axis=0), 1.0)
+    return fraction
 
 
 def _in_si(law: Law) -> Floats:

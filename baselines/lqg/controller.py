@@ -1,8 +1,8 @@
 """Linear-quadratic-Gaussian control of pull speed and heater, jointly.
 
 An extended Kalman filter (:mod:`cz_gym.baselines.lqg.estimator`) on the augmented plant
-(:mod:`cz_gym.baselines.lqg.model`), a regulator with costs on input moves and five minutes of recipe preview
-(:mod:`cz_gym.baselines.lqg.regulator`). Inputs enter the estimator as the drives applied them, so that limits and slew
+(:mod:`cz_gym.baselines.lqg.model`), and a regulator with costs on input moves and five minutes of recipe preview
+(:mod:`cz_gym.baselines.lqg.regulator`). Inputs enter the filter as the drives applied them, so that limits and slew
 rates never wind anything up.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -18,18 +18,19 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.baselines.policy import Floats, batched, fresh, to_action
-from cz_gym.observation import HEATER_SCALE, Measured, decode
+from cz_gym.baselines.policy import Floats, MeasuredController
+from cz_gym.observation import HEATER_SCALE, Measured
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.physics.plant import Puller, make_puller
 from cz_gym.units import KILO
 
-from . import estimator
-from .late_ring import RingModel, augmented
+from .estimator import PlantFilter
+from .filter_bank import FilterBank
 from .model import STATES, NoiseModel, PlantModel, plant_model
 from .preview import look_ahead, samples_ahead
 from .regulator import Regulator, Weights, regulator
+from .ring_model import RingModel, augmented
 
 
 @dataclass(frozen=True)
@@ -47,19 +48,19 @@ class LQGSettings:
     heater_slack: float = 0.06 * KILO
     """A heater this close to the power asked for [W] counts as there: the resolution of its drive."""
     ring: RingModel | None = None
-    """What is known of a camera that is late or shaken; None for one that is neither."""
+    """What is known of a camera with latency or a ring with ripple; None for neither."""
 
     @property
     def hash(self) -> str:
         """SHA-256 of the settings (16 hex digits)."""
-        told = {name: value for name, value in asdict(self).items() if value is not None}
-        return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
+        given = {name: value for name, value in asdict(self).items() if value is not None}
+        return hashlib.sha256(json.dumps(given, sort_keys=True).encode()).hexdigest()[:16]
 
 
 class Gains(NamedTuple):
     """What follows from settings, interval and puller, of one puller or of one a slot."""
 
-    eye: estimator.Eye
+    filter: PlantFilter
     regulator: Regulator
     """Its arrays have a leading axis n for one puller a slot."""
 
@@ -67,21 +68,13 @@ class Gains(NamedTuple):
 class Memory(NamedTuple):
     """What the controller remembers."""
 
-    mean: Floats
-    """Estimated state of the augmented plant, deviations in SI units, shape (n, states)."""
-    covariance: Floats
-    """Its covariance, shape (n, states, states)."""
-    camera_variance: Floats
-    """Variance of the camera's noise [m2], shape (n,)."""
-    spectrum: Floats
-    """As in :class:`cz_gym.baselines.lqg.late_ring.Search`, as the next two."""
-    omega: Floats
-    samples: Floats
+    filter: Any
+    """State of the filter or of the filter bank."""
     plan: Floats
     """Recipe ahead, shape (n, 2, samples + 1): r_ref [m] and T_1_ref [K]."""
-    asked: Floats
+    command: Floats
     """Inputs asked for last [m/s, W], deviations, shape (n, 2)."""
-    begun: Floats
+    started: Floats
     """1 once the slot has seen a sample, shape (n,)."""
 
 
@@ -91,8 +84,9 @@ def solve(settings: LQGSettings, dt: float, puller: Puller, meniscus: MeniscusMo
     model = plant_model(puller, settings.noise, dt, meniscus)
     if settings.ring is not None:
         model = augmented(model, settings.ring, dt)
-    eye = estimator.Eye(puller, model, settings.noise, meniscus, dt, settings.nonlinear, settings.gate, settings.ring)
-    return Gains(eye, regulator(model, settings.weights, dt, samples_ahead(dt)))
+    chosen = settings.nonlinear, settings.gate, settings.ring
+    state_filter = PlantFilter(puller, model, settings.noise, meniscus, dt, *chosen)
+    return Gains(state_filter, regulator(model, settings.weights, dt, samples_ahead(dt)))
 
 
 def solve_each(
@@ -100,15 +94,15 @@ def solve_each(
 ) -> Gains:
     """The same for settings and a puller a slot; settings may differ in the noise that drives the plant."""
     pairs = zip(settings, pullers, strict=True)
-    eyes, laws = zip(*(solve.__wrapped__(each, dt, puller, meniscus) for each, puller in pairs), strict=True)
-    model = PlantModel(*(np.stack(parts) for parts in zip(*(eye.model for eye in eyes), strict=True)))
+    filters, laws = zip(*(solve.__wrapped__(each, dt, puller, meniscus) for each, puller in pairs), strict=True)
+    plant = PlantModel(*(np.stack(parts) for parts in zip(*(each.plant for each in filters), strict=True)))
     puller = Puller(*(np.array(values) for values in zip(*pullers, strict=True)))  # type: ignore[arg-type]
     law = Regulator(*(np.stack(parts) for parts in zip(*laws, strict=True)))
-    return Gains(eyes[0]._replace(puller=puller, model=model), law)
+    return Gains(filters[0]._replace(puller=puller, plant=plant), law)
 
 
 @dataclass(frozen=True)
-class LQG:
+class LQG(MeasuredController):
     """Acts on "measured" (or "history") observations; knows the nominal puller, not this one."""
 
     settings: LQGSettings = LQGSettings()
@@ -119,37 +113,44 @@ class LQG:
     meniscus: MeniscusModel = HURLE
 
     @property
+    def v_0(self) -> float:
+        """Nominal pull speed [m/s]."""
+        return self.parameters.v_0
+
+    @property
     def gains(self) -> Gains:
         """Gains of the design point."""
         return _at_design_point(self.settings, self.control_interval, self.parameters, self.meniscus)
 
-    def predict(
-        self, observation: Any, state: Memory | None = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[npt.NDArray[np.float32], Memory]:
-        """The action and what to remember."""
-        array, single = batched(observation)
-        seen = decode(array, self.parameters.v_0)
-        gains = self.gains
-        memory = fresh(state, at_rest(len(array), gains), episode_start)
-        begins = memory.begun == 0.0
-        applied = np.stack([seen.v_p, seen.Q_H], axis=-1)
-        belief = self._estimate(memory, seen, applied, begins, gains.eye)
-        plan = look_ahead(memory.plan, seen, begins, self.control_interval)
-        previous = moved_from(applied, memory.asked, begins, self.settings.heater_slack)
-        share = self.settings.noise.recipe_share
-        inputs = act(belief.mean, plan, previous, gains.regulator, share, self.parameters.v_0)
-        action = to_action(inputs[:, 0] / self.parameters.v_0, inputs[:, 1] / HEATER_SCALE, single)
-        return action, Memory(*belief, plan, inputs, np.ones(len(array)))
+    def at_rest(self, seen: Measured) -> Memory:
+        """The filter at its initial covariance."""
+        return memory_at_rest(len(seen.v_p), self.gains.filter, self.control_interval)
 
-    def _estimate(
-        self, memory: Memory, seen: Measured, applied: Floats, begins: npt.NDArray[np.bool_], eye: estimator.Eye
-    ) -> estimator.Belief:
-        old = estimator.Belief(*memory[: len(estimator.Belief._fields)])
-        moved = self.settings.noise.recipe_share * (memory.plan[:, 1, 1] - memory.plan[:, 1, 0])
-        belief = estimator.predict(old, applied, moved, eye)
-        if begins.any():
-            belief = fresh(belief, old, begins)
-        return estimator.correct(belief, seen, eye)
+    def step(self, seen: Measured, memory: Memory) -> tuple[Floats, Floats, Memory]:
+        """Pull speed and heater power above nominal, and the new memory."""
+        gains, share = self.gains, self.settings.noise.recipe_share
+
+        def law(estimate: Floats, plan: Floats, previous: Floats) -> Floats:
+            return optimal_inputs(estimate, plan, previous, gains.regulator, share, self.v_0)
+
+        return self.step_with(gains.filter, law, seen, memory)
+
+    def step_with(
+        self,
+        state_filter: PlantFilter | FilterBank,
+        law: Callable[[Floats, Floats, Floats], Floats],
+        seen: Measured,
+        memory: Memory,
+    ) -> tuple[Floats, Floats, Memory]:
+        """The same with another filter, and another law from estimate, plan and previous inputs to the inputs."""
+        starts = memory.started == 0.0
+        applied = np.stack([seen.v_p, seen.Q_H], axis=-1)
+        drift_moved = self.settings.noise.recipe_share * (memory.plan[:, 1, 1] - memory.plan[:, 1, 0])
+        state = state_filter.step(memory.filter, applied, drift_moved, seen, starts)
+        plan = look_ahead(memory.plan, seen, starts, self.control_interval)
+        previous = previous_inputs(applied, memory.command, starts, self.settings.heater_slack)
+        inputs = law(state.mean, plan, previous)
+        return inputs[:, 0], inputs[:, 1], Memory(state, plan, inputs, np.ones(len(inputs)))
 
 
 @lru_cache(maxsize=16)
@@ -157,18 +158,25 @@ def _at_design_point(settings: LQGSettings, dt: float, parameters: Parameters, m
     return solve(settings, dt, make_puller(parameters, settings.lam, meniscus), meniscus)
 
 
-def moved_from(applied: Floats, asked: Floats, begins: npt.NDArray[np.bool_], heater_slack: float) -> Floats:
-    """The inputs to move from: the applied ones, but what was asked of the heater if it is as near as it can be."""
+def memory_at_rest(n: int, state_filter: PlantFilter | FilterBank, dt: float) -> Memory:
+    """Memory before the first sample of n slots, at a control interval of dt [s]."""
+    return Memory(state_filter.at_rest(n), np.zeros((n, 2, samples_ahead(dt) + 1)), np.zeros((n, 2)), np.zeros(n))
+
+
+def previous_inputs(applied: Floats, command: Floats, starts: npt.NDArray[np.bool_], heater_slack: float) -> Floats:
+    """The inputs that moves start from: the applied ones, or the heater's command where it is as near as it can be."""
     slack = np.array([0.0, heater_slack])
-    previous: Floats = applied + np.where(begins[:, None], 0.0, np.clip(asked - applied, -slack, slack))
+    previous: Floats = applied + np.where(starts[:, None], 0.0, np.clip(command - applied, -slack, slack))
     return previous
 
 
-def act(estimate: Floats, plan: Floats, previous: Floats, law: Regulator, recipe_share: float, v_0: float) -> Floats:
-    """Inputs [m/s, W], deviations within the drives' range, from the previous ones and the plant's state.
+def optimal_inputs(
+    estimate: Floats, plan: Floats, previous: Floats, law: Regulator, recipe_share: float, v_0: float
+) -> Floats:
+    """The regulator's inputs [m/s, W], deviations within the drives' range, shape (n, 2).
 
-    ``estimate`` has shape (n, states), ``plan`` (n, 2, samples + 1); the drift is expected to follow ``recipe_share``
-    of the recipe's movement. ``v_0`` is the nominal pull speed [m/s].
+    ``estimate`` has shape (n, states), ``plan`` (n, 2, samples + 1), ``previous`` (n, 2); the drift is expected to
+    follow ``recipe_share`` of the recipe's movement. ``v_0`` is the nominal pull speed [m/s].
     """
     error = estimate[:, : len(STATES)].copy()
     error[:, 0] -= plan[:, 0, 0]
@@ -178,10 +186,3 @@ def act(estimate: Floats, plan: Floats, previous: Floats, law: Regulator, recipe
     limit = np.array([v_0, HEATER_SCALE])
     inputs: Floats = np.clip(previous + moves, -limit, limit)
     return inputs
-
-
-def at_rest(n: int, gains: Gains) -> Memory:
-    """Memory before the first sample of n slots."""
-    belief = estimator.begin(n, gains.eye)
-    ahead = gains.regulator.reference.shape[-2]
-    return Memory(*belief, np.zeros((n, 2, ahead + 1)), np.zeros((n, 2)), np.zeros(n))

@@ -1,33 +1,34 @@
-"""How rough is this crystal's melt? A bank of the LQG's filters, one a hypothesis, weighed by how well it predicts.
+"""Multiple-model estimation: a bank of the LQG's filters, weighed by how well each predicts the ring.
 
-Crystals differ in the strength of their interface fluctuations, and a filter tuned to the middle trusts its camera too
-little on a rough crystal and too much on a calm one. Each filter of the bank believes in one pair of standard
-deviations; Bayes' rule on the ring's innovations gives their probabilities (Magill 1965), and the estimate is the mean
-over them.
+Crystals differ in the strength of their interface fluctuations. A filter made for the average trusts its camera too
+little where they are strong and too much where they are weak. Each filter of the bank assumes one pair of standard
+deviations. Bayes' rule on the ring's innovations gives the probability of each (Magill 1965), and the estimate is the
+mean over the filters.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from cz_gym.baselines.policy import Floats
+from cz_gym.baselines.policy import Floats, map_arrays, select
 from cz_gym.observation import Measured
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.plant import Puller
 
-from . import estimator
-from .estimator import Belief, Eye
-from .late_ring import RingModel, augmented
+from .estimator import FilterState, PlantFilter
 from .model import NoiseModel, plant_model
+from .ring_model import RingModel, augmented
 
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """Standard deviations that the bank holds possible; every pair of them, equally likely at first."""
+    """Standard deviations that are held possible; every pair of them, equally likely at first."""
 
     fast_sd: tuple[float, ...] = (0.1, 0.3, 0.5)
     """Of the fast interface fluctuation [K]."""
@@ -40,19 +41,11 @@ class Hypotheses:
         return len(self.fast_sd) * len(self.slow_sd)
 
 
-class Believed(NamedTuple):
-    """What the filters believe, by slot and hypothesis."""
+class BankState(NamedTuple):
+    """What the filters remember, by slot and hypothesis."""
 
-    mean: Floats
-    """Shape (n, m, states)."""
-    covariance: Floats
-    """Shape (n, m, states, states)."""
-    camera_variance: Floats
-    """Variance of the camera's noise [m2], shape (n, m)."""
-    spectrum: Floats
-    """As in :class:`cz_gym.baselines.lqg.late_ring.Search`, with the axis m, as the next two."""
-    omega: Floats
-    samples: Floats
+    filters: FilterState
+    """Arrays with leading axes (n, m)."""
     evidence: Floats
     """Logarithm of each hypothesis's probability, up to a constant, shape (n, m)."""
 
@@ -64,58 +57,65 @@ class Believed(NamedTuple):
         return share
 
     @property
-    def estimate(self) -> Floats:
-        """The state, the mean over the hypotheses, shape (n, states)."""
-        mean: Floats = np.einsum("nm,nmi->ni", self.probability, self.mean)
+    def mean(self) -> Floats:
+        """The estimated state, the mean over the hypotheses, shape (n, states)."""
+        mean: Floats = np.einsum("nm,nmi->ni", self.probability, self.filters.mean)
         return mean
 
-    @property
-    def rows(self) -> Belief:
-        """All filters as one belief, slot by slot, hypothesis by hypothesis."""
-        return Belief(*(part.reshape(self.evidence.size, *part.shape[2:]) for part in self[:-1]))
 
-    def moved_to(self, rows: Belief) -> Believed:
-        """The same evidence, another belief."""
-        shaped = Belief(*(part.reshape(*self.evidence.shape, *part.shape[1:]) for part in rows))
-        return Believed(*shaped, evidence=self.evidence)
+class FilterBank(NamedTuple):
+    """All filters of n slots as one filter of n m rows: slot by slot, hypothesis by hypothesis."""
 
+    rows: PlantFilter
+    hypotheses: Hypotheses
 
-def bank_eye(eye: Eye, hypotheses: Hypotheses, slots: int) -> Eye:
-    """What the filters of that many slots know, row by row."""
-    Q, start = _noises(eye.puller, eye.noise, eye.ring, eye.dt, eye.meniscus, hypotheses)
-    rows = (slots, 1, 1)
-    return eye._replace(model=eye.model._replace(Q=np.tile(Q, rows), start=np.tile(start, rows)))
+    def at_rest(self, n: int) -> BankState:
+        """The state before the first sample of n slots."""
+        m = self.hypotheses.count
+        return BankState(_by_slot(self.rows.at_rest(n * m), m), np.zeros((n, m)))
 
+    def step(
+        self, state: BankState, applied: Floats, drift_moved: Floats, seen: Measured, starts: npt.NDArray[np.bool_]
+    ) -> BankState:
+        """One sample; arguments as of :meth:`cz_gym.baselines.lqg.estimator.PlantFilter.step`, one a slot."""
+        m = self.hypotheses.count
+        rows = self.rows.predict(_by_row(state.filters), np.repeat(applied, m, axis=0), np.repeat(drift_moved, m))
+        predicted = BankState(_by_slot(rows, m), state.evidence)
+        return self.correct(select(starts, state, predicted) if starts.any() else predicted, seen)
 
-def begin(slots: int, hypotheses: Hypotheses, eye: Eye) -> Believed:
-    """Belief before the first sample; ``eye`` is that of :func:`bank_eye`."""
-    rows, shape = estimator.begin(slots * hypotheses.count, eye), (slots, hypotheses.count)
-    blank = Believed(*rows, evidence=np.zeros(shape))
-    return blank.moved_to(rows)
+    def correct(self, state: BankState, seen: Measured) -> BankState:
+        """Use the measurements: to weigh the filters, then by each of them."""
+        m, rows = self.hypotheses.count, _by_row(state.filters)
+        repeated = Measured(*(np.repeat(channel, m) for channel in seen))
+        evidence = state.evidence + self._log_likelihood(rows, repeated).reshape(state.evidence.shape)
+        corrected = _by_slot(self.rows.correct(rows, repeated), m)
+        return BankState(corrected, evidence - evidence.max(axis=1, keepdims=True))
 
-
-def predict(believed: Believed, applied: Floats, drift_moved: Floats, eye: Eye) -> Believed:
-    """One interval on; arguments as of :func:`cz_gym.baselines.lqg.estimator.predict`, one a slot."""
-    m = believed.evidence.shape[1]
-    rows = estimator.predict(believed.rows, np.repeat(applied, m, axis=0), np.repeat(drift_moved, m), eye)
-    return believed.moved_to(rows)
-
-
-def correct(believed: Believed, seen: Measured, eye: Eye) -> Believed:
-    """Use the readings: to weigh the filters, then by each of them."""
-    n, m = believed.evidence.shape
-    repeated = Measured(*(np.repeat(channel, m) for channel in seen))
-    evidence = believed.evidence + _likelihood(believed.rows, repeated, eye).reshape(n, m)
-    corrected = believed.moved_to(estimator.correct(believed.rows, repeated, eye))
-    return corrected._replace(evidence=evidence - evidence.max(axis=1, keepdims=True))
+    def _log_likelihood(self, state: FilterState, seen: Measured) -> Floats:
+        """Of the ring under each filter, up to a constant; innovations count up to the gate."""
+        ring, row = self.rows.expected_frame(state.mean)
+        variance = np.einsum("ri,rij,rj->r", row, state.covariance, row) + state.camera_variance
+        square = np.minimum(np.square(seen.ring_error + seen.r_ref - ring) / variance, self.rows.gate**2)
+        return np.where(seen.valid > 0.5, -0.5 * (square + np.log(variance)), 0.0)
 
 
-def _likelihood(belief: Belief, seen: Measured, eye: Eye) -> Floats:
-    """Logarithm of the ring's likelihood under each filter, up to a constant; innovations count up to the gate."""
-    ring, row = estimator.expected_reading(belief.mean, eye)
-    variance = np.einsum("ri,rij,rj->r", row, belief.covariance, row) + belief.camera_variance
-    square = np.minimum(np.square(seen.ring_error + seen.r_ref - ring) / variance, eye.gate**2)
-    return np.where(seen.valid > 0.5, -0.5 * (square + np.log(variance)), 0.0)
+def filter_bank(single: PlantFilter, hypotheses: Hypotheses, n: int) -> FilterBank:
+    """The bank of n slots, made of one filter; its process noise and initial covariance are the hypotheses' own."""
+    Q, start = _noises(single.puller, single.noise, single.ring, single.dt, single.meniscus, hypotheses)
+    plant = single.plant._replace(Q=np.tile(Q, (n, 1, 1)), start=np.tile(start, (n, 1, 1)))
+    return FilterBank(single._replace(plant=plant), hypotheses)
+
+
+def _by_row(state: FilterState) -> FilterState:
+    """Arrays of leading axes (n, m) with one axis n m instead."""
+    joined: FilterState = map_arrays(lambda part: part.reshape(part.shape[0] * part.shape[1], *part.shape[2:]), state)
+    return joined
+
+
+def _by_slot(state: FilterState, m: int) -> FilterState:
+    """The reverse."""
+    split: FilterState = map_arrays(lambda part: part.reshape(len(part) // m, m, *part.shape[1:]), state)
+    return split
 
 
 @lru_cache(maxsize=8)
@@ -128,11 +128,8 @@ def _noises(
     hypotheses: Hypotheses,
 ) -> tuple[Floats, Floats]:
     """Process noise and initial covariance of each hypothesis, shape (m, states, states)."""
-    models = [
-        plant_model(puller, replace(noise, fast_sd=fast, slow_sd=slow), dt, meniscus)
-        for fast in hypotheses.fast_sd
-        for slow in hypotheses.slow_sd
-    ]
+    pairs = product(hypotheses.fast_sd, hypotheses.slow_sd)
+    models = [plant_model(puller, replace(noise, fast_sd=fast, slow_sd=slow), dt, meniscus) for fast, slow in pairs]
     if ring is not None:
         models = [augmented(model, ring, dt) for model in models]
     return np.stack([model.Q for model in models]), np.stack([model.start for model in models])

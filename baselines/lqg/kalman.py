@@ -1,8 +1,8 @@
-"""An extended Kalman filter over a batch of slots, one scalar reading at a time.
+"""An extended Kalman filter for a batch of slots, one scalar measurement at a time.
 
-Every slot carries its own covariance, so that starts, missing frames, a ring whose slope changes with the meniscus and
-a camera of unknown noise need no cases of their own. On a linear plant with constant noise it settles at the Riccati
-equation's solution.
+Every slot has a covariance of its own. So the start of an episode, a missing frame, a ring whose slope changes with the
+meniscus and a camera of unknown noise are no special cases. On a linear plant with constant noise the filter settles at
+the solution of the Riccati equation.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from cz_gym.baselines.policy import Floats
 
 
 class Gaussian(NamedTuple):
-    """What a filter believes, by slot."""
+    """An estimate and its uncertainty, by slot."""
 
     mean: Floats
     """Shape (n, states)."""
@@ -25,15 +25,15 @@ class Gaussian(NamedTuple):
     """Shape (n, states, states)."""
 
 
-class Reading(NamedTuple):
+class Measurement(NamedTuple):
     """One scalar measurement by slot."""
 
     innovation: Floats
-    """Reading less what the estimate makes of it, shape (n,)."""
+    """Measured less expected value, shape (n,)."""
     row: Floats
-    """Derivative of the reading by the state, shape (n, states)."""
+    """Derivative of the expected value by the state, shape (n, states)."""
     variance: Floats
-    """Variance of its noise, shape (n,); infinite where there is no reading."""
+    """Variance of the noise, shape (n,); infinite where nothing was measured."""
 
 
 def predicted_covariance(P: Floats, A: Floats, Q: Floats) -> Floats:
@@ -42,50 +42,51 @@ def predicted_covariance(P: Floats, A: Floats, Q: Floats) -> Floats:
     return predicted
 
 
-def correct(belief: Gaussian, reading: Reading, gate: float) -> Gaussian:
-    """Use one reading: K = P h / (h' P h + R).
+def correct(estimate: Gaussian, measurement: Measurement, gate: float) -> Gaussian:
+    """Use one measurement: K = P h / (h' P h + R).
 
-    An innovation beyond ``gate`` standard deviations counts as that much (Huber's limit), so that an outlier does
-    little harm and a real change is followed still.
+    An innovation beyond ``gate`` standard deviations counts as that many (Huber's limit): an outlier does little harm,
+    and a real change is still followed.
     """
-    P = belief.covariance
-    Ph = (P @ reading.row[..., None])[..., 0]
-    S = innovation_variance(belief, reading)
+    P = estimate.covariance
+    Ph = (P @ measurement.row[..., None])[..., 0]
+    S = innovation_variance(estimate, measurement)
     limit = gate * np.sqrt(S)
     with np.errstate(invalid="ignore"):
-        used = np.where(np.isfinite(S), np.clip(reading.innovation, -limit, limit), 0.0) / S
+        used = np.where(np.isfinite(S), np.clip(measurement.innovation, -limit, limit), 0.0) / S
     K = Ph / S[:, None]
-    return Gaussian(belief.mean + Ph * used[:, None], P - K[:, :, None] * Ph[:, None, :])
+    return Gaussian(estimate.mean + Ph * used[:, None], P - K[:, :, None] * Ph[:, None, :])
 
 
-def innovation_variance(belief: Gaussian, reading: Reading) -> Floats:
+def innovation_variance(estimate: Gaussian, measurement: Measurement) -> Floats:
     """h' P h + R, shape (n,)."""
-    Ph = (belief.covariance @ reading.row[..., None])[..., 0]
-    variance: Floats = np.einsum("ni,ni->n", Ph, reading.row) + reading.variance
+    Ph = (estimate.covariance @ measurement.row[..., None])[..., 0]
+    variance: Floats = np.einsum("ni,ni->n", Ph, measurement.row) + measurement.variance
     return variance
 
 
-def observed_noise(
+def matched_variance(
     variance: Floats,
     innovation: Floats,
     predicted: Floats,
-    seen: npt.NDArray[np.bool_],
+    valid: npt.NDArray[np.bool_],
     keep: float,
     limits: tuple[float, float],
     gate: float,
 ) -> Floats:
     """Variance of a sensor's noise by covariance matching: a running mean of innovation^2 - h' P h (Mehra 1972).
 
-    ``predicted`` is h' P h; ``keep`` the share of the old value that stays; samples not ``seen`` change nothing and
-    innovations beyond ``gate`` standard deviations count as that much. The variance stays within ``limits``.
+    ``variance`` is the present one and ``keep`` its share in the new one; ``predicted`` is h' P h. Innovations beyond
+    ``gate`` standard deviations count as that many, samples that are not ``valid`` change nothing, and the variance
+    stays within ``limits``.
     """
     square = np.minimum(np.square(innovation), gate**2 * (predicted + variance))
     matched = keep * variance + (1.0 - keep) * (square - predicted)
-    return np.where(seen, np.clip(matched, *limits), variance)
+    return np.where(valid, np.clip(matched, *limits), variance)
 
 
 def steady_state(A: Floats, H: Floats, Q: Floats, R: Floats) -> Floats:
-    """Covariance of the prediction error a linear filter settles at (SciPy's Riccati solver).
+    """Covariance of the prediction error at which a linear filter settles (SciPy's Riccati solver).
 
     P = A P A' - A P H' (H P H' + R)^-1 H P A' + Q
     """

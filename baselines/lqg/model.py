@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import expm
+from scipy.signal import cont2discrete
 
 from cz_gym.baselines.policy import Floats
 from cz_gym.physics.linearisation import INPUTS, OUTPUTS, linearise
@@ -94,15 +95,8 @@ def plant_model(puller: Puller, noise: NoiseModel, dt: float, meniscus: Meniscus
     start = np.zeros(len(STATES))
     start[0] = noise.start_radius_sd
     start[[FAST, SLOW, DRIFT_RATE]] = noise.fast_sd, noise.slow_sd, noise.drift_rate_sd
-    A, B = sampled(F, G, dt)
+    A, B, *_ = cont2discrete((F, G, H, np.zeros((2, 2))), dt, method="zoh")
     return PlantModel(A, B, H, sampled_noise(F, np.diag(W), dt), np.diag(start**2))
-
-
-def sampled(F: Floats, G: Floats, dt: float) -> tuple[Floats, Floats]:
-    """Zero-order hold of x' = F x + G u over dt [s]."""
-    n, m = G.shape
-    both: Floats = expm(np.block([[F, G], [np.zeros((m, n + m))]]) * dt)
-    return both[:n, :n], both[:n, n:]
 
 
 def sampled_noise(F: Floats, W: Floats, dt: float) -> Floats:

@@ -47,7 +47,8 @@ class Weights:
 class Regulator(NamedTuple):
     """Moves du = -feedback (x_hat - (r_ref, 0, ...), v, q) + sum_j reference_j dr_ref_j + drift_j dp_j.
 
-    dr_ref_j [m] and dp_j [K] are the known increments from t + j dt to t + (j + 1) dt.
+    dr_ref_j [m] and dp_j [K] are the known increments from t + j dt to t + (j + 1) dt. The least cost from
+    z = (plant's five states, previous inputs) and disturbance states d on is z' P z + 2 z' X d, up to terms in d alone.
     """
 
     feedback: Floats
@@ -56,11 +57,6 @@ class Regulator(NamedTuple):
     """Shape (samples ahead, 2)."""
     drift: Floats
     """Shape (samples ahead, 2)."""
-
-
-class CostToGo(NamedTuple):
-    """z' P z + 2 z' X d: the least cost from z = (plant's five states, previous inputs), disturbance states d."""
-
     P: Floats
     """Shape (7, 7)."""
     X: Floats
@@ -89,42 +85,12 @@ def quadratic_cost(weights: Weights, dt: float) -> Cost:
     return Cost(Q, N, np.diag([pull + per_step * moves[0], per_step * moves[1]]))
 
 
-class _Solution(NamedTuple):
-    """The Riccati and Sylvester equations' solutions, and what the law is made of."""
-
-    least: CostToGo
-    moves: Floats
-    """S^-1 B', shape (2, 7)."""
-    K: Floats
-    """Shape (2, 7)."""
-    K_d: Floats
-    """Shape (2, 5)."""
-    A_c: Floats
-    """Shape (7, 7)."""
-
-
 def regulator(model: PlantModel, weights: Weights, dt: float, ahead: int) -> Regulator:
     """The optimal moves for that plant and cost, with a preview of ``ahead`` samples.
 
     With P the Riccati solution, S = R + B' P B and A_c the closed loop, a known later change f_j of the state calls for
     -S^-1 B' (A_c')^j P f_j now; disturbances x_d' = A_d x_d entering by E add X = A_c' (P E + X A_d).
     """
-    (P, X), moves, K, K_d, A_c = _solve(model, weights, dt)
-    reference, drift = [], []
-    later_reference, later_drift = P[:, 0], X[:, DRIFT - PLANT]
-    for _ in range(ahead):
-        reference.append(moves @ later_reference)
-        drift.append(-moves @ later_drift)
-        later_reference, later_drift = A_c.T @ later_reference, A_c.T @ later_drift
-    return Regulator(np.hstack([K[:, :PLANT], K_d, K[:, PLANT:]]), np.array(reference), np.array(drift))
-
-
-def cost_to_go(model: PlantModel, weights: Weights, dt: float) -> CostToGo:
-    """What the regulator's law costs from a state on, references and drift held."""
-    return _solve(model, weights, dt).least
-
-
-def _solve(model: PlantModel, weights: Weights, dt: float) -> _Solution:
     known = len(STATES)
     A = np.block([[model.A[:PLANT, :PLANT], model.B[:PLANT]], [np.zeros((2, PLANT)), np.eye(2)]])
     B = np.vstack([model.B[:PLANT], np.eye(2)])
@@ -138,4 +104,12 @@ def _solve(model: PlantModel, weights: Weights, dt: float) -> _Solution:
     cross = np.eye(E.size) - np.kron(A_c.T, A_d.T)
     X = np.linalg.solve(cross, (A_c.T @ P @ E).ravel()).reshape(E.shape)
     K_d = np.linalg.solve(S, B.T @ (P @ E + X @ A_d))
-    return _Solution(CostToGo(P, X), np.linalg.solve(S, B.T), K, K_d, A_c)
+    moves = np.linalg.solve(S, B.T)
+    reference, drift = [], []
+    later_reference, later_drift = P[:, 0], X[:, DRIFT - PLANT]
+    for _ in range(ahead):
+        reference.append(moves @ later_reference)
+        drift.append(-moves @ later_drift)
+        later_reference, later_drift = A_c.T @ later_reference, A_c.T @ later_drift
+    feedback = np.hstack([K[:, :PLANT], K_d, K[:, PLANT:]])
+    return Regulator(feedback, np.array(reference), np.array(drift), P, X)

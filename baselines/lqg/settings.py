@@ -7,15 +7,14 @@ own use those of ``randomized``.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 from cz_gym.config import Config
 from cz_gym.units import MM
 
 from .controller import LQG, LQGSettings
-from .late_ring import RingModel
 from .model import NoiseModel
 from .regulator import Weights
+from .ring_model import RingModel
 
 REWARD = LQGSettings(
     noise=NoiseModel(
@@ -104,36 +103,28 @@ SHIPPED: dict[tuple[str, str], LQGSettings] = {
 """By controller and scenario."""
 
 
-class Step(NamedTuple):
-    """A setting of the frontier: a shipped LQG with another weight on pull steps."""
-
-    base: str
-    """Whose noise model and other weights it has."""
-    pull_step: float
-    """Weight on the squared step of v_p."""
-
-
-ACTIVITIES = (0.003, 0.005, 0.008, 0.013, 0.02, 0.03)
-"""Pull step RMS [mm/min] that the settings of the frontier are made for."""
-FRONTIER: dict[str, tuple[Step, ...]] = {
-    "randomized": (
-        Step("lqg-quiet", 23.83),
-        Step("lqg-quiet", 3.011),
-        Step("lqg-quiet", 0.4969),
-        Step("lqg-quiet", 0.07386),
-        Step("lqg-quiet", 0.01232),
-        Step("lqg-quiet", 0.004767),
-    ),
-    "puller": (
-        Step("lqg-quiet", 40.07),
-        Step("lqg-quiet", 4.025),
-        Step("lqg-quiet", 0.556),
-        Step("lqg", 0.1428),
-        Step("lqg", 0.00467),
-        Step("lqg", 0.0009702),
-    ),
+MEMBERS: dict[str, dict[float, tuple[str, float]]] = {
+    "randomized": {
+        0.003: ("lqg-quiet", 23.83),
+        0.005: ("lqg-quiet", 3.011),
+        0.008: ("lqg-quiet", 0.4969),
+        0.013: ("lqg-quiet", 0.07386),
+        0.02: ("lqg-quiet", 0.01232),
+        0.03: ("lqg-quiet", 0.004767),
+    },
+    "puller": {
+        0.003: ("lqg-quiet", 40.07),
+        0.005: ("lqg-quiet", 4.025),
+        0.008: ("lqg-quiet", 0.556),
+        0.013: ("lqg", 0.1428),
+        0.02: ("lqg", 0.00467),
+        0.03: ("lqg", 0.0009702),
+    },
 }
-"""By scenario, one an activity: chosen by ``python -m cz_gym.baselines.tuning.lqg_frontier``."""
+"""By scenario and pull step RMS [mm/min]: a shipped LQG, and the weight on pull steps that makes it a member of the
+family; chosen by ``python -m cz_gym.baselines.tuning.lqg_frontier``."""
+ACTIVITIES = tuple(MEMBERS["randomized"])
+"""Pull step RMS [mm/min] that the members are made for."""
 
 
 def family_name(activity: float) -> str:
@@ -150,11 +141,11 @@ def settings_of(controller: str, scenario: str) -> LQGSettings:
     return SHIPPED.get((controller, scenario), SHIPPED[controller, "randomized"])
 
 
-def frontier_settings(activity: float, scenario: str) -> LQGSettings:
-    """The frozen settings for that pull step RMS [mm/min], one of ACTIVITIES, on that scenario."""
-    where = scenario if scenario in FRONTIER else "randomized"
-    step = FRONTIER[where][ACTIVITIES.index(activity)]
-    return with_pull_step(settings_of(step.base, where), step.pull_step)
+def member_settings(activity: float, scenario: str) -> LQGSettings:
+    """The frozen settings of the member for that pull step RMS [mm/min], one of ACTIVITIES, on that scenario."""
+    where = scenario if scenario in MEMBERS else "randomized"
+    base, pull_step = MEMBERS[where][activity]
+    return with_pull_step(settings_of(base, where), pull_step)
 
 
 def with_pull_step(settings: LQGSettings, weight: float) -> LQGSettings:
@@ -162,21 +153,20 @@ def with_pull_step(settings: LQGSettings, weight: float) -> LQGSettings:
     return replace(settings, weights=replace(settings.weights, pull_step=weight))
 
 
-def made(settings: LQGSettings, config: Config) -> LQG:
-    """The LQG of those settings for an environment."""
+def _lqg(settings: LQGSettings, config: Config) -> LQG:
     return LQG(settings, config.control_interval, config.parameters, config.meniscus)
 
 
 def lqg(config: Config) -> LQG:
     """The LQG tuned to the reward."""
-    return made(settings_of("lqg", config.scenario.name), config)
+    return _lqg(settings_of("lqg", config.scenario.name), config)
 
 
 def lqg_quiet(config: Config) -> LQG:
     """The LQG tuned to low pull activity."""
-    return made(settings_of("lqg-quiet", config.scenario.name), config)
+    return _lqg(settings_of("lqg-quiet", config.scenario.name), config)
 
 
 def lqg_at(activity: float, config: Config) -> LQG:
     """The LQG made for that pull step RMS [mm/min]."""
-    return made(frontier_settings(activity, config.scenario.name), config)
+    return _lqg(member_settings(activity, config.scenario.name), config)

@@ -7,7 +7,8 @@ under
     du_k = -K (z_k - (r_ref,k, 0, ...)) + f_k + c_k,    z_k = (plant's five states, previous inputs)
 
 with the regulator's feedback K, its known feedforward f_k and the correction c_k that is optimised; it carries the
-sensitivities dz/dc along. All numbers are in the units of :data:`SCALES`, deviations from the operating point.
+sensitivities dz/dc along. All numbers are deviations from the operating point, in the units of
+:data:`cz_gym.baselines.bounds.trajectory.SCALES`.
 """
 
 from __future__ import annotations
@@ -15,19 +16,17 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
+from cz_gym.baselines.bounds.trajectory import SCALES
 from cz_gym.baselines.lqg.model import PLANT
-from cz_gym.baselines.optional import require
 from cz_gym.baselines.policy import Floats
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.plant import Disturbance, Inputs, Puller, State, rk4
-from cz_gym.units import KILO, MM, MM_PER_MIN
 
-SCALES = np.array([MM, MM, 1.0, 1.0, 1.0, MM_PER_MIN, KILO])
-"""Units of states and inputs inside the prediction."""
 Z, U = PLANT + 2, 2
 LONGEST = 5.0
 """Longest integration step [s]."""
@@ -67,9 +66,14 @@ class Shape:
 
 def casadi() -> Any:
     """CasADi; ImportError in one line names the extra that holds it."""
-    return require("casadi", "mpc")
+    try:
+        import casadi
+    except ImportError:
+        raise ImportError("this needs the package casadi: pip install 'cz-gym[mpc]'") from None
+    return casadi
 
 
+@lru_cache(maxsize=8)
 def build(shape: Shape, slots: int) -> Any:
     """``predict(z, data, K, constants) -> (last, shown, slopes)``, a CasADi function of n slots.
 

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.baselines.bounds.trajectory import SCALES
 from cz_gym.baselines.lqg.controller import Gains
 from cz_gym.baselines.lqg.model import DRIFT, FAST, HEATER, PLANT, SLOW, STATES
 from cz_gym.baselines.lqg.regulator import Regulator
 from cz_gym.baselines.policy import Floats
 from cz_gym.physics.plant import hidden_load
 
-from .model import SCALES, SHOWN, Shape, U, Z, build
+from .model import SHOWN, Shape, U, Z, build
 
 _OWN = DRIFT - PLANT
 
 
 class Prediction(NamedTuple):
-    """What happens under the law, by slot, and how corrections change it; in :data:`.model.SCALES`."""
+    """What happens under the law, by slot, and how corrections change it; all in SCALES."""
 
     last: Floats
     """State at the end, shape (n, 7)."""
@@ -41,14 +41,15 @@ def predict_under_law(
 ) -> Prediction:
     """Roll the law out from z (in the prediction's units), shape (n, 7)."""
     n, N = len(z), shape.stages
-    K, K_d = np.split(gains.regulator.feedback, [PLANT], axis=1)[0], gains.regulator.feedback[:, PLANT:-U]
-    K = np.hstack([K, gains.regulator.feedback[:, -U:]]) * SCALES / SCALES[PLANT:, None]
-    forward = _feedforward(plan, gains.regulator, share, N) - disturbances[:, :-1] @ K_d.T
+    feedback = gains.regulator.feedback
+    K = np.hstack([feedback[:, :PLANT], feedback[:, -U:]]) * SCALES / SCALES[PLANT:, None]
+    forward = _feedforward(plan, gains.regulator, share, N) - disturbances[:, :-1] @ feedback[:, PLANT:-U].T
     reference = held(plan, N)[:, :, 0] / SCALES[0]
     given = [forward / SCALES[PLANT:], reference[:, :-1, None], reference[:, 1:, None]]
     data = np.concatenate([*given, _acting(disturbances, gains, shape)], axis=2)
-    function = _built(shape, n)
-    found = function(z.T, data.reshape(n * N, -1).T, np.tile(K, (1, n)), np.tile(_constants(gains, shape), (n, 1)).T)
+    found = build(shape, n)(
+        z.T, data.reshape(n * N, -1).T, np.tile(K, (1, n)), np.tile(_constants(gains, shape), (n, 1)).T
+    )
     last, shown, shown_c = (part.full() for part in found)
     n_c = shape.corrections
     return Prediction(
@@ -61,7 +62,7 @@ def predict_under_law(
 
 def expected_disturbances(estimate: Floats, plan: Floats, gains: Gains, share: float, stages: int) -> Floats:
     """Disturbance states from now to the end of the horizon, SI units, shape (n, stages + 1, 5)."""
-    decay = gains.eye.model.A[PLANT : len(STATES), PLANT : len(STATES)]
+    decay = gains.filter.plant.A[PLANT : len(STATES), PLANT : len(STATES)]
     d = np.empty((len(estimate), stages + 1, len(decay)))
     d[:, 0] = estimate[:, PLANT : len(STATES)]
     followed = share * np.diff(held(plan, stages)[:, :, 1], axis=1)
@@ -92,9 +93,9 @@ def _acting(disturbances: Floats, gains: Gains, shape: Shape) -> Floats:
     """What disturbs each stage, as the prediction takes it."""
     d = disturbances[:, :-1]
     if not shape.nonlinear:
-        pushed: Floats = d @ gains.eye.model.A[:PLANT, PLANT : len(STATES)].T / SCALES[:PLANT]
+        pushed: Floats = d @ gains.filter.plant.A[:PLANT, PLANT : len(STATES)].T / SCALES[:PLANT]
         return pushed
-    load = hidden_load(d[..., _OWN], gains.eye.puller)
+    load = hidden_load(d[..., _OWN], gains.filter.puller)
     dT_i = d[..., FAST - PLANT] + d[..., SLOW - PLANT]
     return np.stack([load, dT_i, d[..., HEATER - PLANT]], axis=-1)
 
@@ -102,12 +103,7 @@ def _acting(disturbances: Floats, gains: Gains, shape: Shape) -> Floats:
 def _constants(gains: Gains, shape: Shape) -> Floats:
     """The constants of the prediction."""
     if shape.nonlinear:
-        return np.array(gains.eye.puller)
-    both = np.hstack([gains.eye.model.A[:PLANT, :PLANT], gains.eye.model.B[:PLANT]])
+        return np.array(gains.filter.puller)
+    both = np.hstack([gains.filter.plant.A[:PLANT, :PLANT], gains.filter.plant.B[:PLANT]])
     scaled: Floats = both * SCALES / SCALES[:PLANT, None]
     return scaled.T.ravel()
-
-
-@lru_cache(maxsize=8)
-def _built(shape: Shape, slots: int) -> Any:
-    return build(shape, slots)

@@ -9,15 +9,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy.signal import cont2discrete
 
-from cz_gym.baselines.policy import Floats, batched, fresh, to_action
-from cz_gym.observation import HEATER_SCALE, PULL_SCALE, decode
+from cz_gym.baselines.policy import Floats, MeasuredController
+from cz_gym.observation import HEATER_SCALE, PULL_SCALE, Measured
 from cz_gym.units import KILO
+
+
+class PIDState(NamedTuple):
+    """What a series PID remembers, each of shape (n,)."""
+
+    lead_in: Floats
+    """Input term of the lead [m]."""
+    lead_out: Floats
+    """Previous output of the lead [m]."""
+    integral: Floats
+    """Integral of the lead's output, over T_i [m]."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +44,13 @@ class SeriesPID:
     N: float = 100.0
     """Derivative filter [-]."""
 
-    def lead(self, dt: float) -> tuple[float, float, float]:
-        """Tustin's b_0, b_1, a_1 of (T_d s + 1)/(1 + T_d s / N): y = b_0 u + b_1 u_old - a_1 y_old."""
+    def step(self, error: Floats, state: PIDState, dt: float) -> tuple[Floats, PIDState]:
+        """Pull speed [m/s] for an error [m], both of shape (n,), and the new state; one sample takes dt [s]."""
         slow, fast = 2.0 * self.T_d / dt, 2.0 * self.T_d / (self.N * dt)
-        return (1.0 + slow) / (1.0 + fast), (1.0 - slow) / (1.0 + fast), (1.0 - fast) / (1.0 + fast)
+        b_0, b_1, a_1 = (1.0 + slow) / (1.0 + fast), (1.0 - slow) / (1.0 + fast), (1.0 - fast) / (1.0 + fast)
+        lead = b_0 * error + state.lead_in
+        integral = state.integral + 0.5 * dt / self.T_i * (state.lead_out + lead)
+        return self.K_p * (lead + integral), PIDState(b_1 * error - a_1 * lead, lead, integral)
 
 
 @dataclass(frozen=True)
@@ -58,38 +72,47 @@ class Compensator:
         A_d, B_d, C_d, _, _ = cont2discrete((A, B, C, np.zeros((1, 1))), dt, method="zoh")
         return A_d, B_d[:, 0], C_d[0]
 
+    def step(self, v_p: Floats, state: Floats, dt: float) -> tuple[Floats, Floats]:
+        """y_pc [m], shape (n,), and the new state, shape (n, 2), after v_p - v_0 [m/s] was held for dt [s]."""
+        A, B, C = self.discrete(dt)
+        moved = state @ A.T + v_p[..., None] * B
+        return moved @ C, moved
+
     def respond(self, v_p: npt.ArrayLike, dt: float) -> Floats:
         """Output y_pc [m] from rest, for pull speeds v_p - v_0 [m/s] each held for dt [s].
 
         ``v_p`` has shape (steps, ...), and so has the result: row k is y_pc at the end of step k.
         """
         speeds = np.asarray(v_p, np.float64)
-        A, B, C = self.discrete(dt)
         state = np.zeros((*speeds.shape[1:], 2))
         output = np.empty_like(speeds)
         for k, speed in enumerate(speeds):
-            state = state @ A.T + speed[..., None] * B
-            output[k] = state @ C
+            output[k], state = self.step(speed, state, dt)
         return output
 
 
+def compensated_error(
+    compensator: Compensator | None, seen: Measured, state: Floats, dt: float
+) -> tuple[Floats, Floats]:
+    """r_tilde - r_ref [m], and the compensator's state, moved on by the pull speed applied since the last sample."""
+    if compensator is None:
+        return seen.ring_error, np.zeros_like(state)
+    y_pc, state = compensator.step(seen.v_p, state, dt)
+    return seen.ring_error + y_pc, state
+
+
 class Memory(NamedTuple):
-    """What the controller remembers, each of shape (n,) or (n, 2)."""
+    """What the controller remembers."""
 
     compensator: Floats
-    """State of the compensator."""
-    lead_in: Floats
-    """Input term of the lead [m]."""
-    lead_out: Floats
-    """Previous output of the lead [m]."""
-    integral: Floats
-    """Integral of the lead's output, over T_i [m]."""
+    """State of the compensator, shape (n, 2)."""
+    pid: PIDState
     heat: Floats
-    """Integral of the temperature error, over T_i [K]."""
+    """Integral of the temperature error, over T_iT [K], shape (n,)."""
 
 
 @dataclass(frozen=True)
-class CompensatedPID:
+class CompensatedPID(MeasuredController):
     """The paper's controller as printed; ``compensator=None`` leaves the PID alone, which is unstable.
 
     v_p = v_0 - K (r_ref - r_tilde), r_tilde = r_br - bias + y_pc, the compensator driven by the applied pull speed;
@@ -108,40 +131,18 @@ class CompensatedPID:
     v_0: float = PULL_SCALE
     """Nominal pull speed of the environment's parameters [m/s]."""
 
-    def predict(
-        self, observation: Any, state: Memory | None = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[npt.NDArray[np.float32], Memory]:
-        """Act on "measured" (or "history") observations."""
-        array, single = batched(observation)
-        seen = decode(array, self.v_0)
-        n = len(array)
-        at_rest = Memory(np.zeros((n, 2)), *(np.zeros(n) for _ in range(4)))
-        memory = fresh(state, at_rest, episode_start)
-        error, compensator = self._compensate(seen, memory)
-        lead, lead_in = self._lead(error, memory)
+    def at_rest(self, seen: Measured) -> Memory:
+        """Every state at zero."""
+        zero = np.zeros_like(seen.v_p)
+        return Memory(np.zeros((len(zero), 2)), PIDState(zero, zero, zero), zero)
+
+    def step(self, seen: Measured, memory: Memory) -> tuple[Floats, Floats, Memory]:
+        """Pull speed and heater power above nominal, and the new memory."""
         dt = self.control_interval
-        integral = memory.integral + 0.5 * dt / self.pid.T_i * (memory.lead_out + lead)
-        pull = self.pid.K_p * (lead + integral) / self.v_0
-        power, heat = self._temperature(seen, memory)
-        action = to_action(pull, power / HEATER_SCALE, single)
-        return action, Memory(compensator, lead_in, lead, integral, heat)
-
-    def _compensate(self, seen: Any, memory: Memory) -> tuple[Floats, Floats]:
-        """r_tilde - r_ref [m] and the compensator's state, moved on by the pull speed applied since."""
-        if self.compensator is None:
-            return seen.ring_error, memory.compensator
-        A, B, C = self.compensator.discrete(self.control_interval)
-        moved = memory.compensator @ A.T + seen.v_p[:, None] * B
-        return seen.ring_error + moved @ C, moved
-
-    def _lead(self, error: Floats, memory: Memory) -> tuple[Floats, Floats]:
-        b_0, b_1, a_1 = self.pid.lead(self.control_interval)
-        return b_0 * error + memory.lead_in, b_1 * error - a_1 * (b_0 * error + memory.lead_in)
-
-    def _temperature(self, seen: Any, memory: Memory) -> tuple[Floats, Floats]:
-        """Power above nominal [W] and the new integral."""
-        error = seen.T_1_ref - seen.T_1
-        power = self.K_T * (error + memory.heat)
+        error, compensator = compensated_error(self.compensator, seen, memory.compensator, dt)
+        pull, pid = self.pid.step(error, memory.pid, dt)
+        temperature_error = seen.T_1_ref - seen.T_1
+        power = self.K_T * (temperature_error + memory.heat)
         inside = np.abs(power) <= HEATER_SCALE
-        heat = memory.heat + np.where(inside, self.control_interval / self.T_iT * error, 0.0)
-        return power, heat
+        heat = memory.heat + np.where(inside, dt / self.T_iT * temperature_error, 0.0)
+        return pull, power, Memory(compensator, pid, heat)

@@ -9,21 +9,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from cz_gym.baselines.policy import Floats, batched, fresh, to_action
-from cz_gym.observation import HEATER_SCALE, PULL_SCALE, decode
+from cz_gym.baselines.policy import Floats, MeasuredController
+from cz_gym.observation import PULL_SCALE, Measured
 from cz_gym.units import MINUTE
 
-from .compensated_pid import Compensator, SeriesPID
+from .compensated_pid import Compensator, PIDState, SeriesPID, compensated_error
 from .temperature_loop import Heat, TemperatureLoop
 
 
 class Memory(NamedTuple):
-    """What the controller remembers, each of shape (n,) or (n, 2)."""
+    """What the controller remembers, each of shape (n,) but the compensator's state, (n, 2)."""
 
     compensator: Floats
     """State of the compensator."""
@@ -31,27 +30,14 @@ class Memory(NamedTuple):
     """Filtered radius error [m]."""
     start: Floats
     """What is left of the error found at the start [m]."""
-    lead_in: Floats
-    """Input term of the lead [m]."""
-    lead_out: Floats
-    """Previous output of the lead [m]."""
-    integral: Floats
-    """Integral of the lead's output, over T_i [m]."""
+    pid: PIDState
     command: Floats
     """Pull speed above nominal asked for last [m/s]."""
-    heat_integral: Floats
-    heat_command: Floats
-    mean_pull: Floats
-    trim: Floats
-
-    @property
-    def heat(self) -> Heat:
-        """The temperature loop's part."""
-        return Heat(*self[-len(Heat._fields) :])
+    heat: Heat
 
 
 @dataclass(frozen=True)
-class FilteredPID:
+class FilteredPID(MeasuredController):
     """v_p = v_0 + K F e + feed-forward, e = r_tilde - r_target, F = 1/(1 + T_f s).
 
     r_target = r_ref + ring_lead d(r_ref)/dt. A reading further than ``jump`` from the filter counts as that far. At the
@@ -80,42 +66,26 @@ class FilteredPID:
     v_0: float = PULL_SCALE
     """Nominal pull speed of the environment's parameters [m/s]."""
 
-    def predict(
-        self, observation: Any, state: Memory | None = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[npt.NDArray[np.float32], Memory]:
-        """Act on "measured" (or "history") observations."""
-        array, single = batched(observation)
-        seen = decode(array, self.v_0)
-        memory = fresh(state, self._at_rest(seen), episode_start)
-        dt = self.control_interval
-        slope, curvature = _ahead(seen)
-        compensated, compensator = self._compensate(seen, memory)
-        filtered = self._filter(compensated - self.ring_lead * slope - memory.start, memory.filtered)
-        start = memory.start * (math.exp(-dt / self.T_start) if self.T_start > 0.0 else 0.0)
-        b_0, b_1, a_1 = self.pid.lead(dt)
-        lead = b_0 * filtered + memory.lead_in
-        missed = (seen.v_p - memory.command) / self.pid.K_p
-        integral = memory.integral + min(dt / self.T_track, 1.0) * missed
-        integral = integral + 0.5 * dt / self.pid.T_i * (memory.lead_out + lead)
-        pull = self.pid.K_p * (lead + integral) + self.K_ff * curvature / INVERSE_GAIN
-        power, heat = self.heater.step(seen, memory.heat, dt, self.v_0)
-        action = to_action(pull / self.v_0, power / HEATER_SCALE, single)
-        lead_in = b_1 * filtered - a_1 * lead
-        return action, Memory(compensator, filtered, start, lead_in, lead, integral, pull, *heat)
-
-    def _at_rest(self, seen: Any) -> Memory:
+    def at_rest(self, seen: Measured) -> Memory:
+        """The pull speed and the power applied now go on."""
         zero = np.zeros_like(seen.v_p)
         start = seen.ring_error if self.T_start > 0.0 else zero
-        integral = seen.v_p / self.pid.K_p
-        return Memory(np.zeros((len(zero), 2)), zero, start, zero, zero, integral, seen.v_p, *self.heater.at_rest(seen))
+        pid = PIDState(zero, zero, seen.v_p / self.pid.K_p)
+        return Memory(np.zeros((len(zero), 2)), zero, start, pid, seen.v_p, self.heater.at_rest(seen))
 
-    def _compensate(self, seen: Any, memory: Memory) -> tuple[Floats, Floats]:
-        """r_tilde - r_ref [m] and the compensator's state, moved on by the pull speed applied since."""
-        if self.compensator is None:
-            return seen.ring_error, np.zeros_like(memory.compensator)
-        A, B, C = self.compensator.discrete(self.control_interval)
-        moved = memory.compensator @ A.T + seen.v_p[:, None] * B
-        return seen.ring_error + moved @ C, moved
+    def step(self, seen: Measured, memory: Memory) -> tuple[Floats, Floats, Memory]:
+        """Pull speed and heater power above nominal, and the new memory."""
+        dt = self.control_interval
+        slope, curvature = reference_derivatives(seen)
+        error, compensator = compensated_error(self.compensator, seen, memory.compensator, dt)
+        filtered = self._filter(error - self.ring_lead * slope - memory.start, memory.filtered)
+        start = memory.start * (math.exp(-dt / self.T_start) if self.T_start > 0.0 else 0.0)
+        missed = (seen.v_p - memory.command) / self.pid.K_p
+        tracking = memory.pid.integral + min(dt / self.T_track, 1.0) * missed
+        pull, pid = self.pid.step(filtered, memory.pid._replace(integral=tracking), dt)
+        pull = pull + self.K_ff * curvature / INVERSE_GAIN
+        power, heat = self.heater.step(seen, memory.heat, dt, self.v_0)
+        return pull, power, Memory(compensator, filtered, start, pid, pull, heat)
 
     def _filter(self, error: Floats, filtered: Floats) -> Floats:
         """First-order low-pass, exact for a held input, its input held within ``jump`` of its output."""
@@ -128,7 +98,7 @@ INVERSE_GAIN = -4.888e-3
 _NEAR, _FAR = 1.0 * MINUTE, 5.0 * MINUTE
 
 
-def _ahead(seen: Any) -> tuple[Floats, Floats]:
+def reference_derivatives(seen: Measured) -> tuple[Floats, Floats]:
     """First [m/s] and second [m/s2] derivative of the reference, from its preview."""
     near = (seen.r_ref_1min - seen.r_ref) / _NEAR
     far = (seen.r_ref_5min - seen.r_ref_1min) / (_FAR - _NEAR)

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.baselines.policy import Floats, batched, fresh, to_action
-from cz_gym.observation import HEATER_SCALE, PULL_SCALE, decode
+from cz_gym.baselines.policy import Floats, MeasuredController
+from cz_gym.observation import PULL_SCALE, Measured
 from cz_gym.units import MINUTE, MM, MM_PER_MIN
 
 from .temperature_loop import Heat, TemperatureLoop
@@ -35,15 +35,7 @@ class Memory(NamedTuple):
     """Averaged diameters of the last 60 s, oldest first, above 2 r_0 [mm]."""
     rate: Floats
     """Exponentially averaged rate of the diameter [mm per 10 s]."""
-    heat_integral: Floats
-    heat_command: Floats
-    mean_pull: Floats
-    trim: Floats
-
-    @property
-    def heat(self) -> Heat:
-        """The temperature loop's part."""
-        return Heat(*self[-len(Heat._fields) :])
+    heat: Heat
 
 
 def dead_zone(error: npt.ArrayLike) -> Floats:
@@ -53,7 +45,7 @@ def dead_zone(error: npt.ArrayLike) -> Floats:
 
 
 @dataclass(frozen=True)
-class Industrial:
+class Industrial(MeasuredController):
     """v_p gains 1.15 (G_p E + G_v dD60 + G_d dDbar) every 5 s on the pull speed applied, hence no wind-up.
 
     dD60 = (averaged diameter now - 60 s ago)/6, dDbar the exponentially averaged rate, both per 10 s; E as in
@@ -83,13 +75,14 @@ class Industrial:
         """Samples in 60 s."""
         return max(round(MINUTE / self.control_interval), 1)
 
-    def predict(
-        self, observation: Any, state: Memory | None = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[npt.NDArray[np.float32], Memory]:
-        """Act on "measured" (or "history") observations."""
-        array, single = batched(observation)
-        seen = decode(array, self.v_0)
-        memory = fresh(state, self._at_rest(seen), episode_start)
+    def at_rest(self, seen: Measured) -> Memory:
+        """The diameter found has been there for long; the power applied now goes on."""
+        diameter = 2.0 * (seen.r_ref + seen.ring_error) / MM
+        diameters = np.repeat(diameter[:, None], self.samples, axis=1)
+        return Memory(diameter, diameters, np.zeros_like(diameter), self.heater.at_rest(seen))
+
+    def step(self, seen: Measured, memory: Memory) -> tuple[Floats, Floats, Memory]:
+        """Pull speed and heater power above nominal, and the new memory."""
         dt = self.control_interval
         target = 2.0 * seen.r_ref / MM
         diameter = target + 2.0 * seen.ring_error / MM
@@ -102,13 +95,4 @@ class Industrial:
         pull = seen.v_p + self.gain * rise * (dt / LAW_INTERVAL) * MM_PER_MIN
         power, heat = self.heater.step(seen, memory.heat, dt, self.v_0)
         diameters = np.concatenate([memory.diameters[:, 1:], mean[:, None]], axis=1)
-        return to_action(pull / self.v_0, power / HEATER_SCALE, single), Memory(mean, diameters, rate, *heat)
-
-    def _at_rest(self, seen: Any) -> Memory:
-        diameter = 2.0 * (seen.r_ref + seen.ring_error) / MM
-        return Memory(
-            diameter,
-            np.repeat(diameter[:, None], self.samples, axis=1),
-            np.zeros_like(diameter),
-            *self.heater.at_rest(seen),
-        )
+        return pull, power, Memory(mean, diameters, rate, heat)

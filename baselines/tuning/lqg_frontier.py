@@ -1,8 +1,8 @@
 """Choose the LQG's settings for six levels of pull activity: ``python -m cz_gym.baselines.tuning.lqg_frontier``.
 
-Both shipped LQGs are swept over their weight on pull steps on training seeds; the weight for each wanted activity is
-read off in between, and of the two the one with the smaller radius error on validation seeds is taken. Test seeds are
-never touched; sweep, finals and choice are kept in results/tuning.
+Both shipped LQGs are swept over their weight on pull steps on training seeds, and the weight for each wanted activity
+is interpolated. Of the two, the one with the smaller radius error on validation seeds is taken. Test seeds are never
+touched; sweep, finals and choice are kept in results/tuning.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +18,12 @@ import numpy as np
 
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.baselines.lqg.settings import ACTIVITIES, SHIPPED, settings_of, with_pull_step
-from cz_gym.commands import OneLineParser, guarded
+from cz_gym.commands import OneLineParser, between, guarded
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 
-from .lqg import check_budget, measure
-from .lqg_goal import FAILURE_PENALTY, Figures
+from .harness import rounded
+from .lqg import figures
+from .lqg_goals import FAILURE_PENALTY
 
 BASES = ("lqg", "lqg-quiet")
 FACTORS = tuple(4.0**power for power in range(-3, 6))
@@ -33,11 +33,10 @@ FACTORS = tuple(4.0**power for power in range(-3, 6))
 def sweep(base: str, scenario: str, episodes: int) -> list[dict[str, Any]]:
     """Figures on training seeds for every factor."""
     settings, found = settings_of(base, scenario), []
-    for factor in FACTORS:
-        weight = float(f"{factor * settings.weights.pull_step:.4g}")
-        figures = measure(with_pull_step(settings, weight), scenario, TRAINING_SEEDS[:episodes])
-        found.append({"base": base, "pull_step_weight": weight, "figures": asdict(figures)})
-        print(f"{base} {weight:9.4g}  {figures}", flush=True)
+    for weight in rounded(factor * settings.weights.pull_step for factor in FACTORS):
+        each = figures(with_pull_step(settings, weight), scenario, TRAINING_SEEDS[:episodes])
+        found.append({"base": base, "pull_step_weight": weight, "figures": each._asdict()})
+        print(f"{base} {weight:9.4g}  {each}", flush=True)
     return found
 
 
@@ -45,26 +44,22 @@ def weight_for(activity: float, swept: Sequence[dict[str, Any]]) -> float:
     """The weight for pull steps that large [mm/min], by interpolation in logarithms; the nearest end beyond."""
     points = sorted((entry["figures"]["pull_step"], entry["pull_step_weight"]) for entry in swept)
     activities, weights = np.log(np.array(points)).T
-    return float(f"{np.exp(np.interp(np.log(activity), activities, weights)):.4g}")
+    return rounded([np.exp(np.interp(np.log(activity), activities, weights))])[0]
 
 
 def final(base: str, scenario: str, activity: float, weight: float, episodes: int) -> dict[str, Any]:
     """Figures on validation seeds of one setting."""
     settings = with_pull_step(settings_of(base, scenario), weight)
-    figures = measure(settings, scenario, VALIDATION_SEEDS[:episodes])
-    print(f"final {activity:g} {base} {weight:9.4g}  {figures}", flush=True)
-    told = {"activity": activity, "base": base, "pull_step_weight": weight, "hash": settings.hash}
-    return told | {"validation": asdict(figures)}
+    found = figures(settings, scenario, VALIDATION_SEEDS[:episodes])
+    print(f"final {activity:g} {base} {weight:9.4g}  {found}", flush=True)
+    chosen = {"activity": activity, "base": base, "pull_step_weight": weight, "hash": settings.hash}
+    return chosen | {"validation": found._asdict()}
 
 
-def better(finals: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The one with the smallest radius error; losses count first."""
-
-    def cost(entry: dict[str, Any]) -> float:
-        figures = Figures(**entry["validation"])
-        return FAILURE_PENALTY * figures.failure_rate + figures.rmse_mm
-
-    return min(finals, key=cost)
+def cost(entry: dict[str, Any]) -> float:
+    """What decides between the finals of an activity: losses first, then the radius error."""
+    found = entry["validation"]
+    return float(FAILURE_PENALTY * found["failure_rate"] + found["rmse_mm"])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -73,8 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog="python -m cz_gym.baselines.tuning.lqg_frontier", description=(__doc__ or "").split("\n")[0]
     )
     parser.add_argument("--scenario", choices=sorted({scenario for _, scenario in SHIPPED}), default="randomized")
-    parser.add_argument("--episodes", type=int, default=50, help="training episodes a weight")
-    parser.add_argument("--validation", type=int, default=100, help="validation episodes a final")
+    parser.add_argument("--episodes", type=between(1, 10_000), default=50, help="training episodes a weight")
+    parser.add_argument("--validation", type=between(1, 500), default=100, help="validation episodes a final")
     parser.add_argument("--output", type=Path, default=None, help="default in results/tuning")
     given = parser.parse_args(arguments)
     return guarded(parser.prog, lambda: _sweep(given), "benchmark")
@@ -82,7 +77,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _sweep(given: argparse.Namespace) -> int:
     output = given.output or Path("results") / "tuning" / f"lqg-frontier-{given.scenario}.json"
-    check_budget(episodes=given.episodes, validation=given.validation)
     check_writable(output.parent)
     swept = {base: sweep(base, given.scenario, given.episodes) for base in BASES}
     finals = [
@@ -92,7 +86,7 @@ def _sweep(given: argparse.Namespace) -> int:
     found = {
         "scenario": given.scenario,
         "budget": {"episodes": given.episodes, "validation": given.validation},
-        "chosen": [better(pair) for pair in finals],
+        "chosen": [min(pair, key=cost) for pair in finals],
         "finals": [entry for pair in finals for entry in pair],
         "sweep": [entry for base in BASES for entry in swept[base]],
     }

@@ -1,8 +1,8 @@
 """Does the plant look like the logs? ``python -m studies.industrial`` measures the logged facts on this plant.
 
-Runs the ``industrial`` law on validation episodes and reports the diameter error's size and correlation time, the
-share of time in the dead zone, the error's swing back (an oscillation shows as a deep negative lobe of the
-autocorrelation), and the sign of the pull-speed gain that identification from these logs would give.
+It runs the ``industrial`` law on validation episodes and reports size and correlation time of the diameter error, the
+share of time in the dead zone, the depth of the autocorrelation's negative lobe (deep where the error oscillates), and
+the sign of the pull-speed gain that identification from these logs would give.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import correlate
 
-from cz_gym.baselines.pid.tuned import tuned
+from cz_gym.baselines.pid.settings import tuned
 from cz_gym.baselines.policy import Floats
-from cz_gym.commands import OneLineParser, guarded
+from cz_gym.commands import OneLineParser, between, guarded
 from cz_gym.config import make_config
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import Rollout, rollout
 from cz_gym.units import MINUTE, MM, MM_PER_MIN
 
-VALIDATION = VALIDATION_SEEDS
 SETTLED = 30.0 * MINUTE
 """Start of the analysed part, past the transient of the start [s]."""
 LAG = 60.0
@@ -51,8 +51,7 @@ LOGGED = Facts(1.1, 13.0, 0.111, 0.0, 2.65)
 def autocorrelation(error: Floats, lags: int) -> Floats:
     """Autocorrelation of one course at lags 0 to ``lags``, mean removed."""
     centred = error - error.mean()
-    n = len(centred)
-    products: Floats = np.array([centred[: n - lag] @ centred[lag:] for lag in range(lags + 1)])
+    products: Floats = correlate(centred, centred)[len(centred) - 1 :][: lags + 1]
     course: Floats = products / products[0]
     return course
 
@@ -92,7 +91,8 @@ def facts(run: Rollout) -> Facts:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser(prog="python -m studies.industrial", description="the logged facts")
-    parser.add_argument("--episodes", type=int, default=100, help="validation episodes, at most 500")
+    most = len(VALIDATION_SEEDS)
+    parser.add_argument("--episodes", type=between(1, most), default=100, help=f"validation episodes, at most {most}")
     parser.add_argument("--scenario", default="randomized")
     parser.add_argument("--model", choices=["I", "II"], help="one model instead of the scenario's mix")
     args = parser.parse_args(arguments)
@@ -100,10 +100,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _check(args: argparse.Namespace) -> int:
-    if not 1 <= args.episodes <= len(VALIDATION):
-        raise ValueError(f"--episodes must be between 1 and {len(VALIDATION)}, not {args.episodes}")
     config = make_config(args.scenario, args.model)
-    found = facts(rollout(tuned("industrial", config), config, VALIDATION[: args.episodes]))
+    found = facts(rollout(tuned("industrial", config), config, VALIDATION_SEEDS[: args.episodes]))
     print(f"{'':<20}{'logged':>10}{'here':>10}")
     for name, logged, here in zip(Facts._fields, LOGGED, found, strict=True):
         print(f"{name:<20}{logged:>10.3g}{here:>10.3g}")

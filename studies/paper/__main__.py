@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cz_gym.atomic_files import check_writable, write_files
-from cz_gym.baselines.optional import require
 from cz_gym.commands import OneLineParser, guarded
 
 from . import numbers as paper_numbers
@@ -32,8 +31,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _compare(out: Path) -> int:
-    for package in ("control", "matplotlib", "tqdm"):
-        require(package)
+    import control  # noqa: F401  (missing? say so before the work, not after it)
+    import matplotlib  # noqa: F401
+
     check_writable(out)
     results = _compute()
     _write(out, results)
@@ -44,7 +44,9 @@ def _compare(out: Path) -> int:
 
 def _compute() -> paper_numbers.Results:
     """All experiments, with a progress bar that names the stage."""
-    with require("tqdm").tqdm(total=paper_numbers.STAGES, unit="stage") as bar:
+    from tqdm import tqdm
+
+    with tqdm(total=paper_numbers.STAGES, unit="stage") as bar:
 
         def progress(stage: str) -> None:
             bar.update(1 if bar.desc else 0)

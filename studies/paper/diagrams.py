@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from cz_gym.baselines.optional import require
-
 
 class Box(NamedTuple):
     """A block, or with text "+" a summing point, centred at (x, y)."""
@@ -30,8 +28,10 @@ _HALF, _HIGH, _SUM = 0.55, 0.32, 0.16
 
 def draw(boxes: Sequence[Box], arrows: Sequence[Arrow], size: tuple[float, float]) -> Any:
     """A figure of boxes and arrows; one unit of the grid is about an inch."""
-    figure = require("matplotlib.figure").Figure(figsize=size, layout="constrained")
-    patches = require("matplotlib.patches")
+    from matplotlib import patches
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
     axis = figure.subplots()
     for box in boxes:
         if box.text == "+":

@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym import make_puller
-from cz_gym.baselines.analysis.design import open_loop
-from cz_gym.baselines.optional import require
+from cz_gym.baselines.analysis.compensator_design import open_loop
 from cz_gym.baselines.pid.compensated_pid import Compensator
 from cz_gym.physics.linearisation import RadiusModel
 from cz_gym.units import MINUTE, MM, MM_PER_MIN
@@ -36,9 +35,11 @@ RADII, PULL, HEIGHT, GROWTH, CONE = (
 
 def sheet(rows: int, columns: int, size: tuple[float, float], **grid: Any) -> tuple[Any, Any]:
     """A figure and its array of axes."""
-    matplotlib = require("matplotlib")
+    import matplotlib
+    from matplotlib.figure import Figure
+
     with matplotlib.rc_context(STYLE):
-        figure = require("matplotlib.figure").Figure(figsize=size, layout="constrained")
+        figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False, **grid)
     return figure, axes
 
@@ -190,11 +191,12 @@ def ramp_temperatures(results: Results) -> Any:
 
 def ramp_response(results: Results, model: str) -> Any:
     """Closed-loop responses to the ramp in the paper's layout: radii; pull speed, height; growth rate, cone angle."""
+    import matplotlib
+
     run = results.ramp[model]
     t = minutes(run)
     figure = sheet(1, 1, (7.2, 7.0))[0]
     figure.clear()
-    matplotlib = require("matplotlib")
     with matplotlib.rc_context(STYLE):
         panels = figure.subplot_mosaic([["r", "r"], ["v_p", "h_c"], ["v_g", "alpha_c"]], sharex=True)
     ring = (run.signals.r_br - make_puller().ring_bias) / MM

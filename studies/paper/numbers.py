@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from cz_gym import make_puller
-from cz_gym.baselines.analysis.design import Margins, design_compensator, margins
+from cz_gym.baselines.analysis.compensator_design import Margins, design_compensator, margins
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID, Compensator
 from cz_gym.physics.linearisation import RadiusModel, radius_model
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE

@@ -192,7 +192,7 @@ def test_different_numbers_of_episodes_meet_on_those_of_both() -> None:
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """A registry of two quick controllers and a slow one that is a bound, two episodes for it, no agents."""
-    snail = registry.Entry("clairvoyant", lambda config: Snail(), "measured", "slow", False, told=True, slow=True)
+    snail = registry.Entry("clairvoyant", lambda config: Snail(), "measured", "slow", False, privileged=True, slow=True)
     quick = tuple(registry.find_controller(name) for name in ("open-loop", "paper"))
     monkeypatch.setattr(benchmark, "SHIPPED", ())
     monkeypatch.setattr(registry, "CONTROLLERS", (*quick, snail))

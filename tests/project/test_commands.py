@@ -24,8 +24,8 @@ from studies.young_laplace import __main__ as young_laplace
 COMMANDS: list[tuple[Any, str, str, list[str]]] = [
     (benchmark, "--episode", "benchmark", ["--out", "new/folder"]),
     (paper, "--ou", "_compute", ["--out", "new/folder"]),
-    (tune_pid, "--trial", "search", ["--controller", "industrial", "--out", "new/folder"]),
-    (tune_lqg, "--hist", "search", ["--output", "new/folder/lqg.json"]),
+    (tune_pid, "--trial", "measure", ["--controller", "industrial", "--out", "new/folder"]),
+    (tune_lqg, "--hist", "figures", ["--output", "new/folder/lqg.json"]),
     (design_table, "--puller", "table", ["--out", "new/folder"]),
     (industrial, "--episode", "rollout", []),
     (speed, "--qui", "run", ["--quick", "--json", "new/speed.json"]),

@@ -84,7 +84,7 @@ def test_a_row_changes_what_it_says_and_nothing_else(row: Row) -> None:
     assert row.of(1000).steps == 1000 * row.share
     training_scenario(row.choice.recipe)
     if row.choice.recipe.clone:
-        assert find_controller(row.choice.recipe.clone.teacher).told == (row.name in ("told", "some-wide"))
+        assert find_controller(row.choice.recipe.clone.teacher).privileged == (row.name in ("told", "some-wide"))
     assert row.choice.recipe.residual == row.name.startswith("residual")
 
 

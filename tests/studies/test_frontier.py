@@ -1,19 +1,12 @@
-"""The frontier command on made-up benchmarks, and how the frontier's settings are chosen."""
+"""The frontier command on made-up benchmarks."""
 
 import json
-from pathlib import Path
 
 import pytest
 
-from cz_gym.baselines.lqg import settings as lqg_settings
-from cz_gym.baselines.lqg.settings import ACTIVITIES, family_name, frontier_settings
+from cz_gym.baselines.lqg.settings import ACTIVITIES, family_name
 from cz_gym.baselines.registry import find_controller
-from cz_gym.baselines.tuning import lqg_frontier
-from cz_gym.baselines.tuning.lqg_goal import Figures
-from cz_gym.config import make_config
 from studies.frontier import __main__ as frontier
-
-RESULTS = Path(__file__).parents[2] / "results" / "tuning"
 
 
 def entry(activity, rmse):
@@ -40,46 +33,8 @@ def test_another_file_is_refused_in_a_line(content, tmp_path, capsys):
     assert frontier.main([str(tmp_path / "none.json")]) == 2
 
 
-# How the settings are chosen
-
-
-def test_the_weight_for_an_activity_is_read_off_between(monkeypatch, tmp_path):
-    def made_up(settings, scenario, seeds):
-        """Pull steps fall with the square root of their weight; the quiet base holds the radius better."""
-        step = 0.01 * settings.weights.pull_step**-0.5
-        return Figures(0.05 + 0.01 * (settings.noise == lqg_settings.REWARD.noise), step, 0.0, 0.0, 0.0, 2160)
-
-    monkeypatch.setattr(lqg_frontier, "measure", made_up)
-    output = tmp_path / "frontier.json"
-    assert lqg_frontier.main(["--output", str(output)]) == 0
-    found = json.loads(output.read_text())
-    assert [chosen["activity"] for chosen in found["chosen"]] == list(ACTIVITIES)
-    assert {chosen["base"] for chosen in found["chosen"]} == {"lqg-quiet"}
-    for chosen in found["chosen"]:
-        assert chosen["validation"]["pull_step"] == pytest.approx(chosen["activity"], rel=1e-2)
-
-
-@pytest.mark.parametrize("option", [["--episodes", "0"], ["--validation", "501"]])
-def test_a_budget_out_of_range_is_refused_in_a_line(option, tmp_path, capsys):
-    assert lqg_frontier.main([*option, "--output", str(tmp_path / "x.json")]) == 2
-    assert "must be" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("scenario", sorted(lqg_settings.FRONTIER))
-def test_what_ships_is_what_the_command_chose(scenario):
-    chosen = json.loads((RESULTS / f"lqg-frontier-{scenario}.json").read_text())["chosen"]
-    for activity, one in zip(ACTIVITIES, chosen, strict=True):
-        assert one["activity"] == activity
-        assert frontier_settings(activity, scenario).hash == one["hash"]
-        policy = find_controller(family_name(activity)).make(make_config(scenario))
-        assert policy.settings.hash == one["hash"]
-        assert not one["validation"]["failure_rate"]
-    steps = [one["validation"]["pull_step"] for one in chosen]
-    assert steps == sorted(steps)
-
-
-def test_an_lqg_as_lively_as_ppo_stands_in_the_default_table():
-    """And no other of the frontier: they run when named."""
+def test_an_lqg_as_active_as_ppo_stands_in_the_default_table():
+    """And no other of the family: they run when named."""
     shown = {name: find_controller(name).default for name in map(family_name, ACTIVITIES)}
     assert [name for name, default in shown.items() if default] == ["lqg-at-0.02"]
 

@@ -243,6 +243,6 @@ def test_baselines_import_without_extras():
     code = (
         "import sys\n"
         "for name in ('control', 'matplotlib', 'tqdm'): sys.modules[name] = None\n"
-        "import cz_gym.baselines, cz_gym.baselines.analysis.design, studies.paper, studies.paper.gallery\n"
+        "import cz_gym.baselines, cz_gym.baselines.analysis.compensator_design, studies.paper, studies.paper.gallery\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -24,14 +24,19 @@ from cz_gym.vector import CzVectorEnv
 SEEDS = (1_000_000, 1_000_001, 1_000_002)
 
 
-def told(scenario=RANDOMIZED, seeds=SEEDS, **settings):
-    config = make_config(scenario, observation="state", **{"horizon": 1.0 * HOUR, **settings})
-    return config, Clairvoyant().for_episodes(config, seeds)
+def planned(scenario=RANDOMIZED, horizon=0.5 * HOUR):
+    config = make_config(scenario, observation="state", horizon=horizon)
+    return config, Clairvoyant().for_episodes(config, SEEDS)
 
 
-def replay(config, policy, seeds=SEEDS):
-    """A rollout of a policy as it is, told or not."""
-    return rollout(SimpleNamespace(predict=policy.predict), config, seeds)
+@pytest.fixture(scope="module")
+def optimum():
+    return planned(horizon=1.0 * HOUR)
+
+
+def replay(config, policy):
+    """A rollout of a policy as it is, with or without a plan."""
+    return rollout(SimpleNamespace(predict=policy.predict), config, SEEDS)
 
 
 class OpenLoopInputs:
@@ -59,7 +64,7 @@ def test_substeps_fill_each_interval_and_never_cross_the_grid(interval):
 
 
 @pytest.mark.parametrize("interval", [2.0, 5.0, 10.0])
-def test_the_future_told_is_the_one_the_environment_brings(interval):
+def test_the_known_future_is_the_one_the_environment_brings(interval):
     config = make_config(HARD, observation="state", control_interval=interval, horizon=2.0 * HOUR)
     future = future_of(config, SEEDS)
     env = CzVectorEnv(3, HARD, observation="state", control_interval=interval, horizon=2.0 * HOUR, info="all")
@@ -138,8 +143,8 @@ def test_far_from_the_end_the_feedback_is_that_of_the_riccati_equation():
     assert sweep_back(stages).feedback[0, 0] == pytest.approx(-K, rel=1e-9)
 
 
-def test_the_environment_replays_what_was_planned():
-    config, policy = told()
+def test_the_environment_replays_what_was_planned(optimum):
+    config, policy = optimum
     run = replay(config, policy)
     power = run.signals.Q_H
     assert not run.failed.any()
@@ -149,8 +154,8 @@ def test_the_environment_replays_what_was_planned():
     assert (policy.plan.best.last_move < Search().tolerance).all()
 
 
-def test_no_nearby_inputs_are_cheaper_and_the_slope_is_zero():
-    config, policy = told()
+def test_no_nearby_inputs_are_cheaper_and_the_slope_is_zero(optimum):
+    config, policy = optimum
     best = policy.plan.best
     random = np.random.default_rng(5)
     smooth = np.cumsum(random.normal(size=best.u.shape), axis=0) / np.sqrt(len(best.u))
@@ -166,8 +171,8 @@ def test_no_nearby_inputs_are_cheaper_and_the_slope_is_zero():
         assert (np.abs(costs[2] - costs[0]) < 0.02 * rise).all()
 
 
-def test_it_is_cheaper_than_every_other_controller():
-    config, policy = told()
+def test_it_is_cheaper_than_every_other_controller(optimum):
+    config, policy = optimum
     ours = episode_cost(replay(config, policy))
     for name in ("open-loop", "paper", "lqg", "lqg-quiet", "lqg-true", "full-information"):
         entry = find_controller(name)
@@ -183,13 +188,17 @@ def test_within_tight_limits_it_agrees_with_a_general_optimiser():
     nominal = np.array([future.puller.v_0[0], future.puller.Q_H_0[0]])
     scale, N = np.array([MM_PER_MIN, KILO]), len(future.r_ref)
 
-    def roll(w):
-        u = (nominal + w.reshape(N, 2) * scale)[:, None]
-        x = [np.stack(future.start, axis=-1)]
+    def costs(W):
+        """Of candidates of shape (m, 2 N), which may be complex."""
+        u = nominal + W.reshape(-1, N, 2).swapaxes(0, 1) * scale
+        x = [np.broadcast_to(np.stack(future.start, axis=-1), (len(W), 5))]
         for k in range(N):
             after = future.advance(State(*x[-1].T), Inputs(*u[k].T), slice(k, k + 1))
             x.append(np.stack([value[0] for value in after], axis=-1))
-        return found._replace(x=np.array(x), u=u)
+        return predicted_cost(future, found._replace(x=np.array(x), u=u))
+
+    def slope(w):
+        return costs(w + 1e-30j * np.eye(2 * N)).imag / 1e-30
 
     def moves(w):
         change = np.diff(w.reshape(N, 2), axis=0, prepend=0.0)
@@ -197,7 +206,7 @@ def test_within_tight_limits_it_agrees_with_a_general_optimiser():
 
     bounds = [(-span, span) for span in limits.span] * N
     peer = minimize(
-        lambda w: predicted_cost(future, roll(w))[0], np.zeros(2 * N), method="SLSQP", bounds=bounds,
+        lambda w: costs(w[None])[0], np.zeros(2 * N), jac=slope, method="SLSQP", bounds=bounds,
         constraints={"type": "ineq", "fun": moves}, options={"ftol": 1e-13, "maxiter": 500},
     )  # fmt: skip
     assert np.abs(np.diff(peer.x[::2], prepend=0.0)).max() == pytest.approx(limits.move[0], rel=1e-6)
@@ -213,7 +222,7 @@ def test_slow_narrow_and_stepping_drives_are_respected_and_followed():
         heater_slew=0.2 * KILO / MINUTE,
         heater_step=0.1 * KILO,
     )
-    config, policy = told(replace(HARD, name="narrow", actuators=actuators))
+    config, policy = planned(replace(HARD, name="narrow", actuators=actuators))
     u, u_0 = policy.plan.best.u, policy.plan.inputs_0
     pull, power = u[:, :, 0] - u_0[:, 0], u[:, :, 1] - u_0[:, 1]
     limits = limits_of(actuators, u_0[0, 0], config.control_interval)
@@ -226,16 +235,16 @@ def test_slow_narrow_and_stepping_drives_are_respected_and_followed():
 
 
 def test_many_episodes_are_planned_in_parts(monkeypatch):
-    _, whole = told(horizon=300.0)
+    _, whole = planned(horizon=300.0)
     monkeypatch.setattr("cz_gym.baselines.bounds.clairvoyant.BATCH", 2)
-    _, parts = told(horizon=300.0)
+    _, parts = planned(horizon=300.0)
     assert parts.plan.best.u == pytest.approx(whole.plan.best.u, rel=1e-9)
     assert parts.plan.cost == pytest.approx(whole.plan.cost, rel=1e-9)
 
 
-def test_it_refuses_to_act_untold_or_on_other_slots():
+def test_it_refuses_to_act_without_a_plan_or_on_other_slots():
     with pytest.raises(RuntimeError, match="for_episodes"):
         Clairvoyant().predict(np.zeros((1, 17)))
-    _, policy = told(horizon=60.0)
-    with pytest.raises(ValueError, match="3 episodes, not 2"):
+    _, policy = planned(horizon=60.0)
+    with pytest.raises(ValueError, match="a plan for 3 episodes, not 2"):
         policy.predict(np.zeros((2, 17)))

@@ -1,4 +1,4 @@
-"""The LQG's bounds: what they are told is what the environment brings, and is worth something."""
+"""The privileged LQGs: what they know is what the environment brings, and is worth something."""
 
 from dataclasses import replace
 
@@ -7,6 +7,7 @@ import pytest
 
 from cz_gym import CzVectorEnv, make_puller
 from cz_gym.baselines.bounds import lqg as lqg_bounds
+from cz_gym.baselines.bounds.future import fluctuations_of, pullers_of
 from cz_gym.baselines.lqg.controller import LQG, LQGSettings
 from cz_gym.baselines.lqg.model import plant_model
 from cz_gym.baselines.registry import find_controller
@@ -14,66 +15,59 @@ from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.physics.plant import hidden_load
+from cz_gym.units import HOUR
 from tests.observed import observations
 
 PULLER = make_puller(lam=0.5)
 
 
-def test_the_bounds_know_the_pullers_the_environment_draws():
-    config = make_config("randomized", horizon=600.0)
+def test_the_bounds_know_the_pullers_and_fluctuations_that_the_environment_draws():
+    config, seeds = make_config("randomized", horizon=600.0), (5, 9, 2_000_000)
     env = CzVectorEnv(3, horizon=600.0)
-    env.reset(seed=[5, 9, 2_000_000])
-    drawn = env._batch.memory.slots["puller"]
-    for slot, puller in enumerate(lqg_bounds.pullers_of(config, (5, 9, 2_000_000))):
-        np.testing.assert_allclose([drawn[slot][name] for name in puller._fields], puller, rtol=1e-12)
+    env.reset(seed=list(seeds))
+    slots = env._batch.memory.slots
+    for drawn, puller in zip(slots["puller"], pullers_of(config, seeds), strict=True):
+        np.testing.assert_allclose([drawn[name] for name in puller._fields], puller, rtol=1e-12)
+    drawn = np.stack([slots["episode"]["sd_fast"], slots["episode"]["sd_slow"]], axis=1)
+    np.testing.assert_array_equal(fluctuations_of(config, seeds), drawn)
+    assert len(np.unique(drawn)) == 6
 
 
-def test_the_bounds_know_how_rough_the_environment_s_melts_are():
-    config = make_config("randomized", horizon=600.0)
-    env = CzVectorEnv(3, horizon=600.0)
-    env.reset(seed=[5, 9, 2_000_000])
-    drawn = env._batch.memory.slots["episode"]
-    told = lqg_bounds.roughness_of(config, (5, 9, 2_000_000))
-    np.testing.assert_array_equal(told, np.stack([drawn["sd_fast"], drawn["sd_slow"]], axis=1))
-    assert len(np.unique(told)) == 6
-
-
-def test_each_filter_has_the_noise_of_its_own_melt():
+def test_each_filter_has_the_noise_of_its_own_crystal():
     config = make_config("only-interface", horizon=900.0)
-    told = lqg_bounds.ToldLQG(LQGSettings(lam=1.0), roughness=True).for_episodes(config, [0, 1, 2]).gains.eye.model.Q
-    for slot, (fast, slow) in enumerate(lqg_bounds.roughness_of(config, [0, 1, 2])):
+    bound = lqg_bounds.PrivilegedLQG(LQGSettings(lam=1.0), knows_fluctuations=True)
+    known = bound.for_episodes(config, [0, 1, 2]).gains.filter.plant.Q
+    for slot, (fast, slow) in enumerate(fluctuations_of(config, [0, 1, 2])):
         noise = replace(LQGSettings().noise, fast_sd=fast, slow_sd=slow)
-        puller = lqg_bounds.pullers_of(config, [slot])[0]
-        np.testing.assert_allclose(told[slot], plant_model(puller, noise, config.control_interval).Q, rtol=1e-12)
+        puller = pullers_of(config, [slot])[0]
+        np.testing.assert_allclose(known[slot], plant_model(puller, noise, config.control_interval).Q, rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["lqg-quiet", "lqg-at-0.02"])
-def test_knowing_the_roughness_buys_something(name):
-    config = make_config("randomized")
-    plain, told = (
-        metrics(rollout(find_controller(each).make(config), config, range(30))) for each in (name, f"{name}-told")
-    )
+def test_knowing_puller_and_fluctuations_buys_something():
+    config = make_config("randomized", horizon=2.0 * HOUR)
+    names = "lqg-quiet", "lqg-quiet-told"
+    plain, told = (metrics(rollout(find_controller(name).make(config), config, range(20))) for name in names)
     assert told.rmse_mm.mean() < plain.rmse_mm.mean()
     assert told.pull_step_rms_mm_per_min.mean() < plain.pull_step_rms_mm_per_min.mean()
 
 
-def test_a_told_nominal_puller_is_the_lqg():
+def test_knowing_a_nominal_puller_is_the_lqg():
     settings = LQGSettings(lam=1.0)
     config = make_config("only-interface", horizon=900.0)
-    told = rollout(lqg_bounds.ToldLQG(settings), config, [0, 1, 2])
+    told = rollout(lqg_bounds.PrivilegedLQG(settings), config, [0, 1, 2])
     plain = rollout(LQG(settings), config, [0, 1, 2])
     np.testing.assert_allclose(told.signals.v_p, plain.signals.v_p, rtol=1e-5)
 
 
-def test_a_bound_nobody_told_is_the_controller_it_bounds():
+def test_before_it_knows_anything_it_is_the_lqg():
     for observation in observations(steps=3):
         expected = LQG().predict(observation)[0]
-        np.testing.assert_array_equal(lqg_bounds.ToldLQG().predict(observation)[0], expected)
+        np.testing.assert_array_equal(lqg_bounds.PrivilegedLQG().predict(observation)[0], expected)
 
 
-def test_a_bound_told_other_slots_refuses():
-    told = lqg_bounds.ToldLQG().for_episodes(make_config("randomized"), [1, 2])
-    with pytest.raises(ValueError, match="told 2 pullers, got 3 slots"):
+def test_other_slots_than_the_known_ones_are_refused():
+    told = lqg_bounds.PrivilegedLQG().for_episodes(make_config("randomized"), [1, 2])
+    with pytest.raises(ValueError, match="2 pullers are known, got 3 slots"):
         told.predict(next(observations()))
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cz_gym.baselines.lqg import kalman
-from cz_gym.baselines.lqg.kalman import Gaussian, Reading
+from cz_gym.baselines.lqg.kalman import Gaussian, Measurement
 
 A = np.array([[1.0, 0.1], [0.0, 0.95]])
 H = np.array([[1.0, 0.3], [0.0, 1.0]])
@@ -15,7 +15,7 @@ R = np.diag([0.25, 0.5])
 def readings(belief, y):
     for i in range(2):
         row = np.broadcast_to(H[i], belief.mean.shape)
-        yield Reading(y[:, i] - belief.mean @ H[i], row, np.full(len(y), R[i, i]))
+        yield Measurement(y[:, i] - belief.mean @ H[i], row, np.full(len(y), R[i, i]))
 
 
 def joint(mean, P, y):
@@ -62,7 +62,7 @@ def test_its_covariance_is_that_of_its_errors():
 
 def test_no_reading_changes_nothing():
     belief = Gaussian(np.ones((2, 2)), np.broadcast_to(np.eye(2), (2, 2, 2)))
-    reading = Reading(np.array([5.0, 5.0]), np.ones((2, 2)), np.array([np.inf, 1.0]))
+    reading = Measurement(np.array([5.0, 5.0]), np.ones((2, 2)), np.array([np.inf, 1.0]))
     found = kalman.correct(belief, reading, 4.0)
     np.testing.assert_array_equal(found.mean[0], belief.mean[0])
     np.testing.assert_array_equal(found.covariance[0], belief.covariance[0])
@@ -74,7 +74,7 @@ def test_an_outlier_counts_as_the_gate_and_no_more(sign):
     belief = Gaussian(np.zeros((2, 2)), np.broadcast_to(np.eye(2), (2, 2, 2)))
     row = np.broadcast_to(H[0], (2, 2))
     sd = np.sqrt(H[0] @ H[0] + 1.0)
-    found = kalman.correct(belief, Reading(sign * np.array([3.0 * sd, 1e6]), row, np.ones(2)), 3.0)
+    found = kalman.correct(belief, Measurement(sign * np.array([3.0 * sd, 1e6]), row, np.ones(2)), 3.0)
     np.testing.assert_allclose(found.mean[1], found.mean[0])
 
 
@@ -86,7 +86,7 @@ def test_the_noise_of_a_sensor_is_found_from_the_innovations():
     averages = []
     for _ in range(20000):
         innovation = rng.normal(size=3) * np.sqrt(predicted + sds**2)
-        variance = kalman.observed_noise(
+        variance = kalman.matched_variance(
             variance, innovation, predicted, np.ones(3, bool), 0.999, (1e-4, 100.0), np.inf
         )
         averages.append(variance)
@@ -95,4 +95,4 @@ def test_the_noise_of_a_sensor_is_found_from_the_innovations():
 
 def test_an_unseen_sample_and_the_range_bound_the_noise():
     args = (np.array([1e3, 1e3, 0.0]), np.zeros(3), np.array([False, True, True]), 0.0, (0.5, 2.0), np.inf)
-    np.testing.assert_array_equal(kalman.observed_noise(np.ones(3), *args), [1.0, 2.0, 0.5])
+    np.testing.assert_array_equal(kalman.matched_variance(np.ones(3), *args), [1.0, 2.0, 0.5])

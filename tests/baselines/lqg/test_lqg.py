@@ -1,4 +1,4 @@
-"""The LQG against the exact optimum, the covariance equation, the nonlinear plant and the environment's own draws."""
+"""The LQG against the exact optimum, the nonlinear plant and the environment's own draws."""
 
 from dataclasses import replace
 
@@ -7,9 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from cz_gym import make_puller
-from cz_gym.baselines.lqg import kalman
-from cz_gym.baselines.lqg import linear_theory as lqg_linear
-from cz_gym.baselines.lqg.controller import LQG, LQGSettings, at_rest, solve
+from cz_gym.baselines.lqg.controller import LQG, LQGSettings
 from cz_gym.baselines.lqg.model import DRIFT, FAST, HEATER, PLANT, SLOW, STATES, NoiseModel, load_per_drift, plant_model
 from cz_gym.baselines.lqg.preview import look_ahead, samples_ahead
 from cz_gym.baselines.lqg.regulator import Weights, quadratic_cost, regulator
@@ -17,24 +15,13 @@ from cz_gym.config import make_config
 from cz_gym.episodes.schedule import quintic
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.observation import MEASURED, Measured, scales
+from cz_gym.observation import Measured
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.plant import Disturbance, Inputs, State, hidden_load, rates
-from cz_gym.task import cost_terms
-from tests.observed import observations
+from tests.observed import measured
 
 PULLER = make_puller(lam=0.5)
 NOISE = NoiseModel()
-LINEAR = replace(
-    LQGSettings(), nonlinear=False, gate=np.inf, noise=replace(NOISE, camera_memory=np.inf, recipe_share=0.0)
-)
-
-
-def measured(**values):
-    """An observation of these values [SI], the rest zero and the camera valid."""
-    n = len(next(iter(values.values())))
-    columns = {channel.name: np.zeros(n) for channel in MEASURED} | {"valid": np.ones(n)} | values
-    return np.stack([columns[channel.name] for channel in MEASURED], axis=1) / scales(MEASURED, PULLER.v_0)
 
 
 # The augmented plant
@@ -119,7 +106,7 @@ def test_the_first_move_is_that_of_the_whole_horizon(what):
         drift[:] = np.linspace(0.1, 0.0, ahead)
     else:
         z[[DRIFT, DRIFT + 1]] = 1.0, 1e-3
-    expected = brute_force_first_move(model, weights, dt, z, 500, reference, drift)
+    expected = brute_force_first_move(model, weights, dt, z, 200, reference, drift)
     found = -law.feedback @ z + reference @ law.reference + drift @ law.drift
     # A shifted reference counts as an equilibrium of its own, though the free radius drifts off it by 9e-6 a second.
     rtol = 0.02 if what == "reference" else 2e-3
@@ -129,69 +116,6 @@ def test_the_first_move_is_that_of_the_whole_horizon(what):
 def test_the_weights_on_moves_keep_the_same_law_at_other_intervals():
     laws = [regulator(plant_model(PULLER, NOISE, dt), Weights(), dt, 1).feedback / dt for dt in (0.5, 1.0)]
     np.testing.assert_allclose(laws[0][0, :2], laws[1][0, :2], rtol=0.05)
-
-
-# The filter and the loop on the linear plant
-
-
-def test_measured_cost_on_the_linear_plant_matches_the_covariance_equation():
-    gains = solve(LINEAR, 5.0, PULLER)
-    controller = LQG(LINEAR)
-    model, noise = controller.gains.eye.model, LINEAR.noise
-    np.testing.assert_array_equal(model.A, gains.eye.model.A)
-    rng = np.random.default_rng(3)
-    n, m, steps, settle = 500, lqg_linear.FLUCTUATING, 2400, 400
-    A, B, H = model.A[:m, :m], model.B[:m], model.H[:, :m]
-    kick = lqg_linear._root(model.Q[:m, :m])
-    x = np.zeros((n, m))
-    x[:, FAST:] = rng.normal(size=(n, 2)) * [noise.fast_sd, noise.slow_sd]
-    u, state, totals = np.zeros((n, 2)), None, []
-    for k in range(steps):
-        y = x @ H.T + rng.normal(size=(n, 2)) * [noise.camera_sd, noise.pyrometer_sd]
-        observation = measured(ring_error=y[:, 0], T_1=y[:, 1], v_p=u[:, 0], Q_H=u[:, 1])
-        action, state = controller.predict(observation, state)
-        assert np.all(np.abs(action) < 1.0)
-        moved = action.astype(float) * [PULLER.v_0, 1e4]
-        if k >= settle:
-            totals.append([np.mean(term) for term in cost_terms(x[:, 0], moved[:, 0], *(moved - u).T)])
-        u = moved
-        x = x @ A.T + u @ B.T + rng.normal(size=(n, m)) @ kick.T
-    expected = lqg_linear.stationary_cost(gains)
-    assert np.mean(np.sum(totals, axis=1)) == pytest.approx(sum(expected), rel=0.02)
-    np.testing.assert_allclose(np.mean(totals, axis=0), expected, rtol=0.06)
-
-
-def test_separation_the_loop_has_the_poles_of_regulator_and_filter():
-    gains = solve(LINEAR, 5.0, PULLER)
-    model, n = gains.eye.model, len(STATES)
-    found = np.linalg.eigvals(lqg_linear.closed_loop(gains).A)
-    A = np.block([[model.A[:PLANT, :PLANT], model.B[:PLANT]], [np.zeros((2, PLANT)), np.eye(2)]])
-    B = np.vstack([model.B[:PLANT], np.eye(2)])
-    regulated = A - B @ gains.regulator.feedback[:, [*range(PLANT), n, n + 1]]
-    filtered = model.A @ (np.eye(n) - lqg_linear.steady_gain(gains) @ model.H)
-    fluctuations = np.diag(model.A)[[FAST, SLOW]]
-    expected = np.concatenate([np.linalg.eigvals(regulated), np.linalg.eigvals(filtered), fluctuations])
-    np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(expected), atol=1e-5)
-    assert np.abs(found).max() < 1.0
-
-
-def test_the_linear_system_is_the_controller():
-    gains = solve(LINEAR, 5.0, PULLER)
-    law = lqg_linear.controller(gains)
-    rng = np.random.default_rng(4)
-    ring, T_1 = rng.normal(size=50) * 1e-5, rng.normal(size=50) * 0.01
-    policy, s, u = LQG(LINEAR), np.zeros(len(law.A)), np.zeros(2)
-    A, _, H, Q, _ = gains.eye.model
-    P = kalman.steady_state(A, H, Q, np.diag([LINEAR.noise.camera_sd**2, LINEAR.noise.pyrometer_sd**2]))
-    before = np.linalg.solve(A, np.linalg.solve(A, P - Q).T)
-    state = at_rest(1, gains)._replace(covariance=before[None], begun=np.ones(1))
-    for k in range(50):
-        observation = measured(ring_error=ring[k : k + 1], T_1=T_1[k : k + 1], v_p=u[:1], Q_H=u[1:])
-        action, state = policy.predict(observation, state)
-        y = np.array([ring[k], T_1[k]])
-        expected, s = law.C @ s + law.D @ y, law.A @ s + law.B @ y
-        u = action[0].astype(float) * [PULLER.v_0, 1e4]
-        np.testing.assert_allclose(u, expected, rtol=1e-3, atol=1e-3 * np.abs(law.D @ [1e-5, 0.01]).min())
 
 
 # The preview
@@ -215,46 +139,9 @@ def test_the_plan_is_the_recipe_five_minutes_ahead(dt):
             np.testing.assert_allclose(plan[0, 1], 2.0 * future, atol=1e-15)
 
 
-# The seam
-
-
-def test_one_slot_alone_acts_as_in_a_batch():
-    policy, together, alone = LQG(), None, None
-    for observation in observations():
-        actions, together = policy.predict(observation, together)
-        action, alone = policy.predict(observation[1], alone)
-        assert action.shape == (2,)
-        assert action.dtype == np.float32
-        np.testing.assert_allclose(action, actions[1], rtol=1e-5, atol=1e-7)
-
-
-def test_an_episode_that_begins_forgets_the_one_before():
-    policy, state = LQG(), None
-    for observation in observations():
-        _, state = policy.predict(observation, state)
-    starts = np.array([False, True, False])
-    resumed, _ = policy.predict(observation, state, starts)
-    anew, _ = policy.predict(observation)
-    went_on, _ = policy.predict(observation, state)
-    np.testing.assert_array_equal(resumed[1], anew[1])
-    np.testing.assert_array_equal(resumed[[0, 2]], went_on[[0, 2]])
-    assert np.abs(anew[0] - went_on[0]).max() > 0.0
-
-
-def test_history_observations_serve_as_well():
-    seen = zip(observations(), observations(observation="history"), strict=True)
-    for measured_only, history in seen:
-        np.testing.assert_array_equal(LQG().predict(measured_only)[0], LQG().predict(history)[0])
-
-
 def test_while_the_camera_is_out_its_reading_is_not_believed():
-    policy = LQG()
-    states = []
-    for wrong in (0.0, 5e-3):
-        first = measured(ring_error=np.zeros(1))
-        _, state = policy.predict(first)
-        _, state = policy.predict(measured(ring_error=np.full(1, wrong), valid=np.zeros(1)), state)
-        states.append(state)
+    _, first = LQG().predict(measured())
+    states = [LQG().predict(measured(ring_error=wrong, valid=0.0), first)[1].filter for wrong in (0.0, 5e-3)]
     np.testing.assert_array_equal(states[0].mean, states[1].mean)
     assert states[0].covariance[0, 0, 0] > 0.0
 

@@ -1,0 +1,202 @@
+"""A camera with latency, and a ring that ripples with the crystal's rotation: what they add to the LQG's plant model.
+
+Latency: the rings of past samples are states, so that a frame some seconds old corrects the state of that time. Ripple:
+an oscillator of two states whose phase wanders slowly (a narrow-band process), at the rotation's frequency as the
+samples show it, aliased. That frequency is not known. It is found as the peak in the spectrum of what the plant does
+not explain.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.baselines.policy import Floats
+from cz_gym.units import MINUTE, MM
+
+from .model import STATES, PlantModel
+
+RIPPLE = len(STATES)
+"""Index of the first of the ripple's two states."""
+RIPPLE_STATES = slice(RIPPLE, RIPPLE + 2)
+"""Both."""
+
+
+@dataclass(frozen=True)
+class RingModel:
+    """What is known of such a camera; the numbers of a puller, and tuned ones."""
+
+    latency: float = 0.0
+    """Age of a frame when it is delivered [s]."""
+    ripple_sd: float = 0.0
+    """Standard deviation of the ripple [m]; 0: there is none."""
+    ripple_tau: float = 60.0 * MINUTE
+    """Time over which it keeps phase and amplitude [s]."""
+    rotation: tuple[float, float] = (8.0 / MINUTE, 15.0 / MINUTE)
+    """Range of the crystal's rotation [rev/s]; with both equal it is known."""
+    memory: float = 10.0 * MINUTE
+    """Time over which the spectrum is averaged [s]."""
+    lowest: float = 0.001
+    """Lowest frequency that is searched [Hz]; below, ripple and radius cannot be told apart in time."""
+    clear: float = 8.0
+    """Power of a peak over the spectrum's mean at which it is a ripple [-]."""
+
+    @property
+    def has_ripple(self) -> bool:
+        """Whether there is a ripple."""
+        return self.ripple_sd > 0.0
+
+    @property
+    def frequency_known(self) -> bool:
+        """Whether the ripple's frequency is known."""
+        return self.rotation[0] == self.rotation[1]
+
+    @property
+    def first_past(self) -> int:
+        """Index of the first of the states that hold past rings."""
+        return RIPPLE + 2 * self.has_ripple
+
+    def delay(self, dt: float) -> tuple[int, float]:
+        """Past samples to keep, and the weight of the oldest in what is delivered; the next one has the rest."""
+        samples = math.ceil(self.latency / dt - 1e-9)
+        return samples, self.latency / dt - samples + 1.0
+
+    def states(self, dt: float) -> int:
+        """Number of states of plant, ripple and past rings together."""
+        return self.first_past + self.delay(dt)[0]
+
+
+def augmented(model: PlantModel, ring: RingModel, dt: float) -> PlantModel:
+    """The model with ripple and past rings; the ripple at the middle of the rotation's range."""
+    n, extra = len(STATES), ring.states(dt) - len(STATES)
+    A, Q, start = (np.pad(matrix, (0, extra)) for matrix in (model.A, model.Q, model.start))
+    B, H = np.pad(model.B, ((0, extra), (0, 0))), np.pad(model.H, ((0, 0), (0, extra)))
+    undelayed = H[0].copy()
+    H[0] = delivered_row(undelayed[None], ring, dt)[0]
+    both = RIPPLE_STATES
+    if ring.has_ripple:
+        A[both, both] = oscillator(np.array([math.pi * sum(ring.rotation)]), ring, dt)[0]
+        start[both, both] = ring.ripple_sd**2 * np.eye(2)
+        Q[both, both] = -math.expm1(-2.0 * dt / ring.ripple_tau) * start[both, both]
+    for state in range(ring.first_past, n + extra):
+        A[state] = undelayed if state == ring.first_past else np.eye(n + extra)[state - 1]
+    keep = np.eye(n + extra)
+    keep[ring.first_past :] = undelayed
+    keep[ring.first_past :, ring.first_past :] = 0.0
+    return PlantModel(A, B, H, Q, keep @ start @ keep.T)
+
+
+def undelayed_row(model: PlantModel, ring: RingModel, dt: float) -> Floats:
+    """Derivative by the state of the ring as it is now, shape (..., states), from an augmented model."""
+    if ring.delay(dt)[0]:
+        return model.A[..., ring.first_past, :]
+    row = model.H[..., 0, :].copy()
+    row[..., RIPPLE:] = 0.0
+    return row
+
+
+def oscillator(omega: Floats, ring: RingModel, dt: float) -> Floats:
+    """Transition of the ripple's two states over dt [s] at frequencies omega [rad/s], shape (n, 2, 2)."""
+    c, s = np.cos(omega * dt), np.sin(omega * dt)
+    turned: Floats = math.exp(-dt / ring.ripple_tau) * np.stack([c, -s, s, c], axis=-1).reshape(*omega.shape, 2, 2)
+    return turned
+
+
+def transition(A: Floats, row: Floats, omega: Floats, ring: RingModel, dt: float) -> Floats:
+    """The model's A with each slot's ripple frequency and slope of the ring, shape (n, states, states)."""
+    n, states = row.shape
+    moved = np.broadcast_to(A, (n, states, states)).copy()
+    if ring.has_ripple:
+        moved[:, RIPPLE_STATES, RIPPLE_STATES] = oscillator(omega, ring, dt)
+    if ring.first_past < states:
+        moved[:, ring.first_past] = row
+    return moved
+
+
+def delivered_row(row: Floats, ring: RingModel, dt: float) -> Floats:
+    """Derivative by the state of what the camera delivers, shape (n, states), from that of the ring now."""
+    samples, oldest = ring.delay(dt)
+    delivered = row.copy()
+    if samples:
+        delivered = (1.0 - oldest) * row if samples == 1 else np.zeros(row.shape)
+        delivered[:, ring.first_past + samples - 1] = oldest
+        if samples > 1:
+            delivered[:, ring.first_past + samples - 2] = 1.0 - oldest
+    if ring.has_ripple:
+        delivered[:, RIPPLE] = 1.0
+    return delivered
+
+
+class RippleSearch(NamedTuple):
+    """What is remembered of the search for the ripple's frequency, by slot."""
+
+    spectrum: Floats
+    """Real and imaginary parts of the running Fourier sums, shape (n, frequencies, 2)."""
+    omega: Floats
+    """The ripple's frequency [rad/s], 0 where none is found, shape (n,)."""
+    samples: Floats
+    """Samples seen, shape (n,)."""
+
+
+class Found(NamedTuple):
+    """The search after a sample."""
+
+    search: RippleSearch
+    new: npt.NDArray[np.bool_]
+    """Where a ripple is found, or found at another frequency than before, shape (n,)."""
+    ripple: Floats
+    """The ripple's two states by the spectrum's peak [m], shape (n, 2)."""
+
+
+@lru_cache(maxsize=16)
+def frequencies(ring: RingModel, dt: float) -> Floats:
+    """Frequencies that are searched [rad/s], as samples every dt [s] show them."""
+    spacing = 0.25 / ring.memory
+    if not ring.has_ripple or ring.frequency_known:
+        return np.zeros(0)
+    real = np.linspace(*ring.rotation, 1 + math.ceil((ring.rotation[1] - ring.rotation[0]) / spacing))
+    aliased = np.abs(real - np.round(real * dt) / dt)
+    return 2.0 * math.pi * np.arange(max(aliased.min(), ring.lowest), aliased.max() + spacing, spacing)
+
+
+def search_at_rest(n: int, ring: RingModel | None, dt: float) -> RippleSearch:
+    """Before the first sample of n slots."""
+    if ring is None:
+        return RippleSearch(np.zeros((n, 0, 2)), np.zeros(n), np.zeros(n))
+    omega = math.pi * sum(ring.rotation) if ring.frequency_known else 0.0
+    return RippleSearch(np.zeros((n, len(frequencies(ring, dt)), 2)), np.full(n, omega), np.zeros(n))
+
+
+def search_step(
+    search: RippleSearch, residual: Floats, valid: npt.NDArray[np.bool_], ring: RingModel, dt: float
+) -> Found:
+    """Go on with the search: ``residual`` [m] is what the plant does not explain, shape (n,), used where ``valid``.
+
+    Running sums Z <- (1 - 1/m) e^(i omega dt) Z + residual/m with m samples of memory, fewer at the start; the peak is
+    refined by a parabola through its neighbours' log power. The spectrum's ends, where a slow transient shows, are no
+    peaks.
+    """
+    omega = frequencies(ring, dt)
+    samples = search.samples + 1.0
+    new_share = np.maximum(1.0 / samples, dt / ring.memory)[:, None]
+    Z = search.spectrum.view(np.complex128)[..., 0] * np.exp(1j * omega * dt)
+    Z *= 1.0 - new_share
+    Z += new_share * np.where(valid, residual, 0.0)[:, None]
+    power = np.square(Z.real) + np.square(Z.imag)
+    slot, peak = np.arange(len(Z)), power.argmax(axis=1)
+    inside = np.clip(peak, 1, len(omega) - 2)
+    clear = (power[slot, peak] > ring.clear * power.mean(axis=1)) & (inside == peak)
+    left, top, right = (np.log(power[slot, inside + side] + MM**2 * 1e-12) for side in (-1, 0, 1))
+    bend = 2.0 * top - left - right
+    shift = np.where(bend > 0.0, 0.5 * (right - left) / np.where(bend > 0.0, bend, 1.0), 0.0)
+    spacing = omega[1] - omega[0]
+    refined = omega[inside] + spacing * np.clip(shift, -1.0, 1.0)
+    new = clear & (np.abs(refined - search.omega) > 1.5 * spacing)
+    ripple = 2.0 * np.stack([Z.real[slot, peak], Z.imag[slot, peak]], axis=-1)
+    spectrum = Z.view(np.float64).reshape(search.spectrum.shape)
+    return Found(RippleSearch(spectrum, np.where(clear, refined, search.omega), samples), new, ripple)

@@ -1,0 +1,116 @@
+"""Latency and ripple in the LQG's model: against the environment's camera and known tones."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cz_gym import make_puller
+from cz_gym.baselines.lqg import ring_model
+from cz_gym.baselines.lqg import settings as lqg_settings
+from cz_gym.baselines.lqg.controller import LQG, LQGSettings
+from cz_gym.baselines.lqg.model import STATES, NoiseModel, plant_model
+from cz_gym.baselines.lqg.ring_model import RingModel, frequencies, search_step
+from cz_gym.baselines.lqg.settings import PULLER_RING
+from cz_gym.config import make_config
+from cz_gym.episodes.scenario import Interface, Scenario, Sensor
+from cz_gym.episodes.scenarios import PULLER as PULLER_SCENARIO
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.units import MINUTE, MM
+
+PULLER = make_puller(lam=0.5)
+
+
+@pytest.mark.parametrize("latency", [0.0, 2.0, 5.0, 7.0])
+@pytest.mark.parametrize("dt", [2.0, 5.0, 10.0])
+def test_a_ring_that_grows_evenly_is_delivered_as_old_as_the_latency(latency, dt):
+    ring, slope, steps = RingModel(latency), 3e-7, 20
+    model = ring_model.augmented(plant_model(PULLER, NoiseModel(), dt), ring, dt)
+    row = np.zeros((1, len(model.A)))
+    row[0, 0] = 1.0
+    A = ring_model.transition(np.eye(len(model.A)), row, np.zeros(1), ring, dt)[0]
+    for state in range(ring.first_past, len(A)):
+        A[state] = row[0] if state == ring.first_past else np.eye(len(A))[state - 1]
+    x = np.zeros(len(A))
+    for k in range(steps):
+        x = A @ x
+        x[0] = slope * (k + 1) * dt
+    delivered = ring_model.delivered_row(row, ring, dt)[0] @ x
+    assert delivered == pytest.approx(slope * (steps * dt - latency), rel=1e-12)
+
+
+@pytest.mark.parametrize("dt", [5.0, 10.0])
+def test_the_camera_of_the_environment_is_late_as_modelled(dt):
+    late = Scenario("late", interface=Interface(sd=(0.3, 0.3)), sensor=Sensor(latency=5.0))
+    run = rollout(LQG(control_interval=dt), make_config(late, control_interval=dt, horizon=1200.0), [1])
+    prompt, delivered = run.signals.r_br[:, 0], run.signals.r_br_measured[:, 0]
+    samples, oldest = RingModel(5.0).delay(dt)
+    assert samples == 1
+    expected = oldest * prompt[:-1] + (1.0 - oldest) * prompt[1:]
+    np.testing.assert_allclose(delivered[1:], expected, atol=1e-7 if dt == 5.0 else 5e-6)
+
+
+# The search for the ripple
+
+
+def heard(tone_hz, amplitude, noise, samples, dt=5.0, slots=40, ring=PULLER_RING):
+    rng = np.random.default_rng(6)
+    phase, search = rng.uniform(0.0, 2.0 * np.pi, slots), ring_model.search_at_rest(slots, ring, dt)
+    for k in range(samples):
+        rest = amplitude * np.sin(2.0 * np.pi * tone_hz * k * dt + phase) + noise * rng.normal(size=slots)
+        found = search_step(search, rest, np.ones(slots, bool), ring, dt)
+        search = found.search
+    return found, amplitude * np.sin(2.0 * np.pi * tone_hz * k * dt + phase)
+
+
+@pytest.mark.parametrize("dt", [2.0, 5.0, 10.0])
+@pytest.mark.parametrize("rotation", [8.3, 11.2, 12.2, 14.9])
+def test_a_tone_is_found_where_its_alias_is(rotation, dt):
+    tone = rotation / MINUTE
+    alias = abs(tone - round(tone * dt) / dt)
+    found, now = heard(tone, 0.1 * MM, 0.05 * MM, round(1200.0 / dt), dt)
+    half_a_bin = 0.125 / PULLER_RING.memory
+    np.testing.assert_allclose(found.search.omega / (2.0 * np.pi), alias, atol=half_a_bin)
+    assert np.sqrt(np.mean((found.ripple[:, 0] - now) ** 2)) < PULLER_RING.ripple_sd
+
+
+def test_what_cannot_be_told_from_the_radius_is_not_searched():
+    assert frequencies(PULLER_RING, 5.0).min() >= 2.0 * np.pi * PULLER_RING.lowest
+    assert not len(frequencies(RingModel(5.0, 0.1 * MM, rotation=(0.2, 0.2)), 5.0))
+
+
+def with_and_without_search(sensor):
+    """Metrics on crystals with that camera: with the search for a ripple, and with the latency alone."""
+    scenario = Scenario("camera", interface=Interface(sd=(0.2, 0.2)), sensor=sensor)
+    config = make_config(scenario, horizon=3600.0)
+    policies = (LQG(replace(lqg_settings.REWARD, ring=ring)) for ring in (PULLER_RING, RingModel(5.0)))
+    return [metrics(rollout(policy, config, range(12))) for policy in policies]
+
+
+def test_where_there_is_no_ripple_the_search_for_one_costs_little():
+    searching, knowing = with_and_without_search(Sensor(camera_noise=(5e-5, 5e-5), latency=5.0))
+    assert searching.rmse_mm.mean() < 1.05 * knowing.rmse_mm.mean()
+
+
+def test_once_found_the_ripple_is_left_out_of_the_radius():
+    rotation = PULLER_SCENARIO.sensor.rotation
+    found, ignored = with_and_without_search(Sensor(latency=5.0, ripple=(0.2 * MM, 0.2 * MM), rotation=rotation))
+    assert found.rmse_mm.mean() < 0.75 * ignored.rmse_mm.mean()
+    assert found.pull_step_rms_mm_per_min.mean() < ignored.pull_step_rms_mm_per_min.mean()
+
+
+def test_a_ring_that_is_neither_late_nor_shaken_adds_nothing():
+    model = plant_model(PULLER, NoiseModel(), 5.0)
+    for plain, with_ring in zip(model, ring_model.augmented(model, RingModel(), 5.0), strict=True):
+        np.testing.assert_allclose(with_ring, plain, rtol=1e-12, atol=1e-30)
+    config = make_config("randomized", horizon=1200.0)
+    plain, with_ring = (rollout(LQG(replace(LQGSettings(), ring=ring)), config, [3]) for ring in (None, RingModel()))
+    np.testing.assert_allclose(with_ring.signals.v_p, plain.signals.v_p, rtol=1e-6)
+
+
+def test_the_ripple_keeps_its_variance():
+    model = ring_model.augmented(plant_model(PULLER, NoiseModel(), 5.0), PULLER_RING, 5.0)
+    both = slice(len(STATES), len(STATES) + 2)
+    A, Q = model.A[both, both], model.Q[both, both]
+    np.testing.assert_allclose(A @ A.T * PULLER_RING.ripple_sd**2 + Q, PULLER_RING.ripple_sd**2 * np.eye(2), atol=1e-18)
