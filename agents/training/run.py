@@ -58,6 +58,7 @@ class Run:
         self.rows: list[dict[str, Any]] = []
         self.sessions: list[dict[str, Any]] = []
         self.began = self.saved = time.monotonic()
+        self.saved_steps = -1
         self.unsaved: dict[Path, bytes] = {}
         logs = folder / "tensorboard"
         if not resume:
@@ -93,7 +94,7 @@ class Run:
             if self.learner.steps >= due:
                 report(self.learner.steps, self._validate(bar))
                 due = self.learner.steps + self.validate_every
-            elif time.monotonic() >= self.saved + self.checkpoint_seconds:
+            elif self.learner.steps > self.saved_steps and time.monotonic() >= self.saved + self.checkpoint_seconds:
                 self.save()
 
         self.learner.learn(watch)
@@ -104,7 +105,7 @@ class Run:
         best = self.best if math.isfinite(self.best) else None
         content = to_bytes(self.learner, time.monotonic() - self.began, best)
         write_files({**self.unsaved, self.folder / CHECKPOINT: content})
-        self.unsaved, self.saved = {}, time.monotonic()
+        self.unsaved, self.saved, self.saved_steps = {}, time.monotonic(), self.learner.steps
 
     def finish(self) -> dict[str, float]:
         """Judge the best agent on episodes that did not pick it; the contents of ``summary.json``."""
@@ -118,7 +119,7 @@ class Run:
             "paper_rmse_mm": self._validate_paper(JUDGING),
             "pull_step_rms_mm_per_min": found.pull_step_rms_mm_per_min,
             "failure_rate": found.failure_rate,
-            "training_steps": self.learner.steps,
+            "training_steps": contract.training_steps,
             "seconds": time.monotonic() - self.began,
         }
         judged = dataclasses.replace(contract, validation_cost=found.cost, validation_rmse_mm=found.rmse_mm)

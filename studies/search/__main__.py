@@ -35,6 +35,12 @@ STARTUP, RIVALS, LOOKS = 8, 4, 6
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
+    given = parser().parse_args(arguments)
+    return guarded(PROG, lambda: _main(given), "agents", "the same command goes on from the trials in its journal")
+
+
+def parser() -> OneLineParser:
+    """The options."""
     parser = OneLineParser(prog=PROG, description=(__doc__ or "").split("\n")[0])
     parser.add_argument(
         "--trials", type=int, default=30, help="trials in all, earlier ones included (default: %(default)s)"
@@ -46,8 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, default=3, help="training seeds that confirm (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the search (default: %(default)s)")
     add_folders(parser, "search")
-    given = parser.parse_args(arguments)
-    return guarded(PROG, lambda: _main(given), "agents", "the same command goes on from the trials in its journal")
+    return parser
 
 
 def _main(given: argparse.Namespace) -> int:

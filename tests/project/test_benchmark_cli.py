@@ -216,16 +216,16 @@ def test_broken_agent_files_get_one_line(tmp_path: Path, capsys: pytest.CaptureF
     other = constant_agent(tmp_path / "other.onnx", training_seed=1, scenario="hard", scenario_hash="0" * 16)
     assert "different scenarios: hard, randomized" in refused(["--agent", twice, "--agent", str(other)], capsys)
     assert "choose from" in (said := refused(["--agent", f"mine={twice}", "--controllers", "your"], capsys))
-    assert "mine, ppo, ppo-default" in said
+    assert "mine, imitation, imitation-default" in said
 
 
 def test_a_file_may_be_named_and_stand_beside_the_shipped_agents(tmp_path: Path) -> None:
     file = constant_agent(tmp_path / "some.onnx", algorithm="ppo")
-    names = ["paper", "mine", "ppo-quiet"]
+    names = ["paper", "mine", "imitation-quiet"]
     contenders, contracts = benchmark.choose(names, [("mine", file)])
     assert [each.controller.name for each in contenders] == names
     assert contenders[1].controller.meaning.endswith("given as a file")
-    assert [contract["algorithm"] for contract in contracts] == ["ppo", *["ppo-quiet"] * 3]
+    assert [contract["algorithm"] for contract in contracts] == ["ppo", *["imitation-quiet"] * 3]
     alone, _ = benchmark.choose(["paper"], [("", file)])
     assert [each.controller.name for each in alone] == ["paper", "ppo"]
     assert benchmark.parse(["--agent", "a=b=c.onnx", "--agent", "x/a=b.onnx"]).agent == [

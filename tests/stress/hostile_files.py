@@ -6,7 +6,6 @@ import io
 import json
 import zipfile
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,22 +15,19 @@ import numpy as np
 from cz_gym.agents import AgentFileError, OnnxPolicy, shipped
 from cz_gym.agents.agent_file.contract import make_contract, read_agent
 from cz_gym.agents.agent_file.graph import OPERATORS
-from cz_gym.agents.training import recipes as settings
 from cz_gym.agents.training.checkpoint import load_checkpoint, restore, to_bytes
-from cz_gym.agents.training.learners import make_training
+from cz_gym.agents.training.learners import make_learner
+from cz_gym.agents.training.recipes import PPO, SAC
 from cz_gym.agents.training.run_files import COLUMNS, read_rows, saved_steps
+from cz_gym.baselines.registry import make_controller
 from cz_gym.evaluation.cache import slow_controllers as kept
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.rollout import Signals
 from cz_gym.jit.cache import Store
 
-SMALL = replace(
-    settings.SCRATCH,
-    recipe=settings.Recipe(num_envs=2, hidden=(8,)), steps=8, n_steps=4, batch_size=8, n_epochs=1
-)  # fmt: skip
-SMALL_SAC = settings.SAC(
-    recipe=settings.Recipe(num_envs=2, hidden=(8,), privileged_critic=False),
-    steps=16, buffer_size=32, learning_starts=8, batch_size=4, gradient_steps=1,
+SMALL = PPO(num_envs=2, hidden=(8,), steps=16, n_steps=4, batch_size=8, n_epochs=1)
+SMALL_SAC = SAC(
+    num_envs=2, hidden=(8,), steps=16, buffer_size=32, learning_starts=8, batch_size=4, gradient_steps=1
 )  # fmt: skip
 ODD = (
     b"",
@@ -60,9 +56,9 @@ def targets(folder: Path) -> dict[str, Target]:
     """Every kind of file that the project reads back."""
     contract, network = read_agent(shipped())
     facts = {name: value for name, value in vars(contract).items() if name not in ("observation_hash", "sha256")}
-    learner, off_policy = make_training(SMALL, 0, None).learner, make_training(SMALL_SAC, 0, None).learner
+    learner, off_policy = (make_learner(recipe, 0, make_controller) for recipe in (SMALL, SMALL_SAC))
     for some in (learner, off_policy):
-        some.learn(16)
+        some.learn(lambda steps, doing: None)
     agent, checkpoint = folder / "agent.onnx", folder / "checkpoint.safetensors"
     sessions = {"steps": 100, "sessions": [{"from_step": 0}]}
     rows = ",".join(COLUMNS) + "\r\n" + ",".join(["1.5"] * len(COLUMNS)) + "\r\n"
@@ -82,7 +78,7 @@ def targets(folder: Path) -> dict[str, Target]:
 
     def read_checkpoint(content: bytes, into: Any = learner) -> None:
         checkpoint.write_bytes(content)
-        restore(into, *load_checkpoint(checkpoint), checkpoint)
+        restore(into, load_checkpoint(checkpoint)[1], checkpoint)
 
     def read_settings(content: bytes) -> None:
         (folder / "settings.json").write_bytes(content)

@@ -16,9 +16,9 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from stable_baselines3 import PPO
@@ -30,14 +30,15 @@ import cz_gym.evaluation.report.page
 import cz_gym.evaluation.runner
 import train
 from cz_gym.agents import OnnxPolicy, shipped
-from cz_gym.agents.training import recipes as settings
-from cz_gym.agents.training import run
+from cz_gym.agents.training import imitation, run
 from cz_gym.agents.training.checkpoint import load_checkpoint
-from cz_gym.agents.training.learners import make_training
+from cz_gym.agents.training.learners import make_learner
+from cz_gym.agents.training.recipes import PPO as PPORecipe
+from cz_gym.agents.training.recipes import RECIPES, CostWeights, Imitation
 from cz_gym.agents.training.validation import validate
 from cz_gym.atomic_files import BEGUN, COMPLETE, finish_writing
 from cz_gym.baselines import CompensatedPID
-from cz_gym.baselines.registry import find_controller
+from cz_gym.baselines.registry import make_controller
 from cz_gym.config import make_config
 from cz_gym.evaluation.files import is_benchmark_json
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
@@ -45,32 +46,27 @@ from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from .killer import Killer, Watched, check
 
 STEPS = 16_384
-CLONE = replace(settings.RECIPES["ppo"].recipe.clone or settings.Clone("lqg"), rounds=2, episodes=4, epochs=2)
-SMALL = replace(
-    settings.RECIPES["ppo"],
-    recipe=replace(settings.RECIPES["ppo"].recipe, num_envs=64, clone=CLONE),
-    n_steps=32, batch_size=512, critic_steps=STEPS // 3,
-)  # fmt: skip
-"""The recipe that train.py runs by default, on less of everything."""
-
-
-def _learning(work: str) -> Callable[..., str]:
-    return lambda learner, *_: f"{'critic' if learner.num_timesteps <= SMALL.critic_steps else 'PPO'}, {work}"
-
-
+SMALL = {
+    "ppo": PPORecipe(num_envs=64, n_steps=32, batch_size=512),
+    "imitation": Imitation(name="imitation", teacher="lqg", rounds=2, episodes=4, epochs=2, control_interval=30.0),
+}
+"""Recipes of train.py on less of everything."""
+LENGTH = {"ppo": STEPS, "imitation": 2 * 4 * 360}
+"""Environment steps of each."""
 TRAINING = (
     Watched(train, "train", "start-up"),
-    Watched(run, "clone", "cloning"),
-    Watched(PPO, "collect_rollouts", _learning("rollout")),
-    Watched(PPO, "train", _learning("update")),
+    Watched(imitation, "demonstrate", "demonstrations"),
+    Watched(imitation, "fit", "fit"),
+    Watched(PPO, "collect_rollouts", "rollout"),
+    Watched(PPO, "train", "update"),
     Watched(run.Run, "_validate", "validation"),
     Watched(run.Run, "save", "checkpoint"),
     Watched(run.Run, "finish", "summary"),
 )
-TRAINING_PHASES = (
-    "start-up", "cloning", "critic, rollout", "critic, update", "validation", "PPO, rollout", "PPO, update",
-    "checkpoint", "summary",
-)  # fmt: skip
+TRAINING_PHASES = {
+    "ppo": ("start-up", "validation", "rollout", "update", "checkpoint", "summary"),
+    "imitation": ("start-up", "demonstrations", "fit", "validation", "checkpoint", "summary"),
+}
 """In the order in which a run meets them first or, of what it does again and again, in which it is killed."""
 BENCHMARK = (
     Watched(benchmark, "benchmark", "start-up"),
@@ -116,25 +112,27 @@ def kill_training(folder: Path, kills: int, chance: random.Random) -> str:
     """Kill one run after another of train.py, each several times, and let it end; what happened."""
     run.PICKING, run.JUDGING = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4]
     run.VALIDATE_EVERY = STEPS // 6
-    settings.RECIPES["ppo"] = SMALL
+    RECIPES.update(SMALL)
     out = folder / "run"
-    killer = Killer(train, TRAINING, folder / "train.log", chance)
-    resumed, ended, torn, oldest = 0, 0, 0, 0.0
-    targets = list(TRAINING_PHASES)
-    while killer.kills.total() < kills:
+    killers = {algorithm: Killer(train, TRAINING, folder / "train.log", chance) for algorithm in SMALL}
+    resumed, ended, torn, oldest, survived, turns = 0, 0, 0, 0.0, 0, cycle(SMALL)
+    while survived < kills:
         # A run is killed in some phases, in turn, and then left to end.
-        chance.shuffle(targets)
-        size = min(chance.randint(2, 6), kills - killer.kills.total())
-        life: list[str | None] = [*sorted(targets[:size], key=TRAINING_PHASES.index), None]
+        algorithm = next(turns)
+        killer, phases = killers[algorithm], TRAINING_PHASES[algorithm]
+        size = min(chance.randint(2, 6), kills - survived)
+        life: list[str | None] = [*sorted(chance.sample(phases, size), key=phases.index), None]
         steps = 0
         while life:
             going_on = (out / "settings.json").exists()
             interval = chance.choice((0.0, 0.2))
-            options = ["--steps", str(STEPS), "--out", str(out), "--checkpoint-seconds", str(interval)]
+            options = ["--algo", algorithm, "--out", str(out), "--checkpoint-seconds", str(interval)]
+            options += ["--steps", str(STEPS)] if algorithm == "ppo" else []
             began = time.time()
             code = killer.run(options + ["--resume"] * going_on, life.pop(0))
             stopped = time.time()
             resumed += going_on
+            survived += code is None
             if code is None and out.exists():
                 torn += settled(out)
                 before, steps = steps, check_run(out, steps)
@@ -142,15 +140,15 @@ def kill_training(folder: Path, kills: int, chance: random.Random) -> str:
                 if written > began:
                     oldest = max(oldest, stopped - written - interval)
             elif code == 0:
-                check(check_run(out, STEPS) >= STEPS, "ended early")
-                check(
-                    json.loads((out / "summary.json").read_text())["training_steps"] >= STEPS, "summary of another run"
-                )
+                check(check_run(out, LENGTH[algorithm]) >= LENGTH[algorithm], "ended early")
+                learned = json.loads((out / "summary.json").read_text())["training_steps"]
+                check(learned >= STEPS if algorithm == "ppo" else learned == 0, "summary of another run")
                 ended += 1
                 break
         shutil.rmtree(out)
+    where = "; ".join(f"{algorithm}: {killer.where()}" for algorithm, killer in killers.items())
     return (
-        f"train.py: {killer.kills.total()} kills survived ({killer.where()}), {torn} in the middle of writing; "
+        f"train.py: {survived} kills survived ({where}), {torn} in the middle of writing; "
         f"{resumed} runs resumed, {ended} ended whole; oldest checkpoint {oldest:.2f} s beyond its interval"
     )
 
@@ -185,13 +183,12 @@ def warm() -> None:
     """Import and compile here what each of the forked would."""
     import matplotlib.pyplot  # noqa: F401
 
-    teacher = find_controller(CLONE.teacher).make(make_config("randomized"))
-    learner = make_training(SMALL, 0, None, 0, teacher).learner
-    learner.env.reset()
-    learner.env.step(np.zeros((learner.n_envs, 2), np.float32))
+    learner: Any = make_learner(SMALL["ppo"], 0, make_controller)
+    learner.algorithm.env.reset()
+    learner.algorithm.env.step(np.zeros((SMALL["ppo"].num_envs, 2), np.float32))
     for policy, observation in ((OnnxPolicy.load(shipped()), "history"), (CompensatedPID(5.0), "measured")):
         config = make_config("randomized", observation=observation, horizon=300.0)
-        validate(policy, config, VALIDATION_SEEDS[:1], settings.CostWeights())
+        validate(policy, config, VALIDATION_SEEDS[:1], CostWeights())
 
 
 def main(argv: list[str] | None = None) -> int:

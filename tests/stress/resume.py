@@ -1,7 +1,7 @@
 """Is a resumed run as good as one that was never stopped? ``python -m tests.stress.resume --algo ppo --seeds 0 1``.
 
-Each training seed is run twice: once to its end, once killed with SIGKILL at the first checkpoint after each of the
-given steps, and resumed. Prints what both were worth on validation.
+Each training seed is run twice: once to its end, once killed with SIGKILL at the first checkpoint at or after each of
+the given steps, and resumed. Prints what both were worth on validation.
 """
 
 from __future__ import annotations
@@ -9,38 +9,43 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import os
 import signal
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
-from cz_gym.agents.training.checkpoint import load_checkpoint
-from cz_gym.agents.training.run import CHECKPOINT
+import train
+from cz_gym.agents.training import run
 
 ROOT = Path(__file__).parents[2]
+NEVER = -1
 
 
-def train(folder: Path, options: list[str], kills: list[int]) -> None:
+def die_at(step: int, options: list[str]) -> int:
+    """Run train.py here; SIGKILL ends this process when a checkpoint of that step or a later one is written."""
+    save = run.Run.save
+
+    def save_and_die(self: run.Run) -> None:
+        save(self)
+        if 0 <= step <= self.learner.steps:
+            print(f"  killed at a checkpoint of step {self.learner.steps:,}", flush=True)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    run.Run.save = save_and_die  # type: ignore[method-assign]
+    return train.main(options)
+
+
+def killed_and_resumed(folder: Path, options: list[str], kills: list[int]) -> None:
     """One run of train.py, killed and resumed at each of these steps in turn."""
-    command = [sys.executable, str(ROOT / "train.py"), *options, "--out", str(folder), "--checkpoint-seconds", "2"]
-    for kill in [*kills, None]:
+    for kill in [*kills, NEVER]:
         resume = ["--resume"] * (folder / "settings.json").exists()
-        child = subprocess.Popen([*command, *resume], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        while kill is not None and child.poll() is None and _steps(folder) < kill:
-            time.sleep(0.2)
-        if kill is not None:
-            child.send_signal(signal.SIGKILL)
-        code = child.wait()
-        if code != (0 if kill is None else -signal.SIGKILL):
-            raise RuntimeError(f"train.py ended with {code}, to be killed at {kill}")
-        print(f"  {'killed' if code else 'ended'} at a checkpoint of step {_steps(folder):,}", flush=True)
-
-
-def _steps(folder: Path) -> int:
-    path = folder / CHECKPOINT
-    return load_checkpoint(path)[0].steps if path.exists() else 0
+        call = f"import sys; from tests.stress import resume; sys.exit(resume.die_at({kill}, sys.argv[1:]))"
+        given = [*options, "--out", str(folder), "--checkpoint-seconds", "2", *resume]
+        done = subprocess.run([sys.executable, "-c", call, *given], cwd=ROOT, stderr=subprocess.DEVNULL)
+        if done.returncode != (0 if kill == NEVER else -signal.SIGKILL):
+            raise RuntimeError(f"train.py ended with {done.returncode}, to be killed at {kill}")
 
 
 def told(folder: Path) -> str:
@@ -61,14 +66,14 @@ def main() -> int:
     parser.add_argument("--algo", default="ppo")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--kills", type=int, nargs="*", default=[100_000, 400_000], help="steps (%(default)s)")
-    parser.add_argument("--steps", type=int, help="of each run (default: the algorithm's own)")
+    parser.add_argument("--steps", type=int, help="of each run (default: the recipe's own)")
     arguments = parser.parse_args()
     for seed in arguments.seeds:
         options = ["--algo", arguments.algo, "--seed", str(seed)]
         options += ["--steps", str(arguments.steps)] if arguments.steps else []
         for name, kills in (("never stopped", []), ("killed and resumed", arguments.kills)):
             with tempfile.TemporaryDirectory() as folder:
-                train(Path(folder) / "run", options, kills)
+                killed_and_resumed(Path(folder) / "run", options, kills)
                 print(f"{arguments.algo}, seed {seed}, {name}: {told(Path(folder) / 'run')}", flush=True)
     return 0
 
