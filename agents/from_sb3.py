@@ -84,28 +84,11 @@ def save_agent(
 
 def to_onnx(model: BaseAlgorithm, normalisation: VecNormalize | None) -> bytes:
     """The model's deterministic action as a serialised ONNX model; AgentFileError if it cannot be written as one."""
-    import torch
-    from stable_baselines3.common.policies import ActorCriticPolicy
     from stable_baselines3.common.torch_layers import FlattenExtractor
 
-    from cz_gym.agents.training.export import OnnxGraph
+    from cz_gym.agents.training.export import OnnxGraph, actor_of
 
-    policy: Any = model.policy
-    actor: Any = policy if isinstance(policy, ActorCriticPolicy) else getattr(policy, "actor", None)
-    if actor is None:
-        raise AgentFileError(f"{type(policy).__name__} has no actor that gives two continuous actions")
-    extractor = actor.pi_features_extractor if actor is policy else actor.features_extractor
-    if not isinstance(extractor, FlattenExtractor):
-        raise AgentFileError(
-            f"a policy with {type(extractor).__name__} before its layers cannot be written as an agent file"
-        )
-    if actor is policy:
-        layers = [policy.mlp_extractor.policy_net, policy.action_net]
-    else:
-        layers = [actor.latent_pi, actor.mu, torch.nn.Tanh()] if hasattr(actor, "latent_pi") else [actor.mu]
-    graph, x, lstm = OnnxGraph(), "observation", getattr(policy, "lstm_actor", None)
-    if lstm is not None and lstm.num_layers > 1:
-        raise AgentFileError("a policy with more than one layer of LSTM cannot be written as an agent file")
+    graph, x = OnnxGraph(), "observation"
     if normalisation is not None and normalisation.norm_obs:
         rms: Any = normalisation.obs_rms
         spread = np.sqrt(rms.var + normalisation.epsilon)
@@ -113,11 +96,15 @@ def to_onnx(model: BaseAlgorithm, normalisation: VecNormalize | None) -> bytes:
         x = graph.node("Div", [x, graph.constant("spread", np.float32(spread))], "scaled")
         x = graph.clip(x, -normalisation.clip_obs, normalisation.clip_obs, "normalised")
     try:
-        x = graph.through(x if lstm is None else graph.lstm_step(x, lstm), layers)
+        actor = actor_of(model.policy)
+        if not isinstance(actor.extractor, FlattenExtractor):
+            raise TypeError(
+                f"a policy with {type(actor.extractor).__name__} before its layers cannot be written as one"
+            )
+        graph.acted(x, actor, "action")
     except TypeError as error:
         raise AgentFileError(str(error)) from None
-    graph.clip(x, -1.0, 1.0, "action")
-    return graph.finished(len(OBSERVATIONS[_observation_of(model)]), 0 if lstm is None else 2 * lstm.hidden_size)
+    return graph.finished(len(OBSERVATIONS[_observation_of(model)]), actor)
 
 
 def disagreement(agent: OnnxPolicy, model: BaseAlgorithm, normalisation: VecNormalize | None) -> float:

@@ -7,13 +7,14 @@ hold operators that agents' files may not (:mod:`cz_gym.agents.agent_file.graph`
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import onnx
 import torch
 from onnx import TensorProto, helper, numpy_helper
+from stable_baselines3.common.policies import ActorCriticPolicy
 
 from cz_gym.observation import DRIVE_CHANNELS, HISTORY
 
@@ -97,6 +98,11 @@ class OnnxGraph:
         self.node("Concat", [hidden, cell], "next_state", axis=1)
         return hidden
 
+    def acted(self, x: str, actor: Actor, name: str) -> str:
+        """The actor's output, within -1 and 1."""
+        x = x if actor.lstm is None else self.lstm_step(x, actor.lstm)
+        return self.clip(self.through(x, actor.layers), -1.0, 1.0, name)
+
     def clip(self, x: str, low: float, high: float, name: str) -> str:
         """x within [low, high]."""
         limits = [self.constant(f"{name}_{end}", np.float32(value)) for end, value in (("low", low), ("high", high))]
@@ -118,14 +124,15 @@ class OnnxGraph:
         held = self.node("Mul", [applied, self.constant("skip", np.float32(skip))], "held")
         self.clip(self.node("Add", [x, held], "wanted"), -1.0, 1.0, "action")
 
-    def finished(self, channels: int, state: int = 0) -> bytes:
-        """The model, checked and serialised; ``state`` is the length of what it remembers, 0 if nothing."""
+    def finished(self, channels: int, actor: Actor | None = None) -> bytes:
+        """The model, checked and serialised; it remembers what the actor's LSTM does."""
 
         def value(name: str, width: int) -> Any:
             return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", width])
 
         inputs, outputs = [value("observation", channels)], [value("action", len(DRIVE_CHANNELS))]
-        if state:
+        if actor and actor.lstm:
+            state = 2 * actor.lstm.hidden_size
             inputs, outputs = [*inputs, value("state", state)], [*outputs, value("next_state", state)]
         graph = helper.make_graph(self._nodes, "cz_gym_agent", inputs, outputs, self._constants)
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
@@ -144,21 +151,37 @@ def drive_policy_onnx(policy: DrivePolicy) -> bytes:
     return graph.finished(actor.measured)
 
 
-def sac_onnx(algorithm: Any) -> bytes:
-    """The deterministic actor of SAC on moves of the drives (:class:`.wrappers.DriveAction`)."""
-    graph, actor = OnnxGraph(), algorithm.policy.actor
-    x = graph.through(graph.normalised(actor.features_extractor), [actor.latent_pi, actor.mu, torch.nn.Tanh()])
-    graph.drives(x, algorithm.env.skip, algorithm.env.scale)
-    return graph.finished(len(actor.features_extractor.mean))
+class Actor(NamedTuple):
+    """The deterministic actor of a policy of stable-baselines3's own."""
+
+    extractor: Any
+    """What its observations go through first."""
+    lstm: Any
+    """Its LSTM; None without one."""
+    layers: list[torch.nn.Module]
 
 
-def recurrent_onnx(algorithm: Any) -> bytes:
-    """The deterministic actor of recurrent PPO on moves of the drives: the LSTM's step in plain operators.
+def actor_of(policy: Any) -> Actor:
+    """The actor of a policy of any algorithm; TypeError if it has none, or one that an agent file cannot hold."""
+    if isinstance(policy, ActorCriticPolicy):
+        lstm, net = getattr(policy, "lstm_actor", None), policy.mlp_extractor.policy_net
+        if lstm is not None and lstm.num_layers > 1:
+            raise TypeError("a policy with more than one layer of LSTM cannot be written as an agent file")
+        return Actor(policy.pi_features_extractor, lstm, [net, policy.action_net])
+    actor = getattr(policy, "actor", None)
+    if actor is None:
+        raise TypeError(f"{type(policy).__name__} has no actor that gives two continuous actions")
+    squashed = hasattr(actor, "latent_pi")
+    layers = [actor.latent_pi, actor.mu, torch.nn.Tanh()] if squashed else [actor.mu]
+    return Actor(actor.features_extractor, None, layers)
 
-    Its hidden and cell values travel in the file's ``state``, shape (n, 2 units): nothing in the file loops.
+
+def moves_onnx(algorithm: Any) -> bytes:
+    """The deterministic actor of stable-baselines3's own policies on moves of the drives (:mod:`.wrappers`).
+
+    The hidden and cell values of an LSTM travel in the file's ``state``, shape (n, 2 units): nothing in the file loops.
     """
-    graph, policy = OnnxGraph(), algorithm.policy
-    x = graph.lstm_step(graph.normalised(policy.pi_features_extractor), policy.lstm_actor)
-    x = graph.through(x, [*policy.mlp_extractor.policy_net, policy.action_net])
-    graph.drives(graph.clip(x, -1.0, 1.0, "move"), algorithm.env.skip, algorithm.env.scale)
-    return graph.finished(len(policy.pi_features_extractor.mean), 2 * policy.lstm_actor.hidden_size)
+    graph, actor = OnnxGraph(), actor_of(algorithm.policy)
+    x = graph.acted(graph.normalised(actor.extractor), actor, "move")
+    graph.drives(x, algorithm.env.skip, algorithm.env.scale)
+    return graph.finished(len(actor.extractor.mean), actor)
