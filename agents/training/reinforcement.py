@@ -24,7 +24,7 @@ from .callbacks import Statistics, Watching
 from .export import drive_policy_onnx, moves_onnx
 from .learner import Parts, Watch
 from .networks import DrivePolicy, Normalise
-from .recipes import PPO, SAC, RecurrentPPO, Reinforcement
+from .recipes import PPO, SAC, CostWeights, RecurrentPPO, Reinforcement
 from .vec_env import CzVecEnv
 from .wrappers import DriveAction, TrainingReward
 
@@ -84,6 +84,7 @@ def make_slots(recipe: Reinforcement, seed: int, done: int) -> CzVecEnv:
         observation=recipe.observation,
         control_interval=recipe.control_interval,
         autoreset_mode=AutoresetMode.SAME_STEP,
+        info="lean" if recipe.weights == CostWeights() else "all",
     )
     return CzVecEnv(env, recipe.privileged_critic, stagger=seed + done)
 

@@ -16,7 +16,9 @@ from cz_gym.task import Cost, cost_terms, reward
 
 
 def slots(**settings: Any) -> CzVecEnv:
-    made = CzVecEnv(CzVectorEnv(2, observation="history", autoreset_mode=AutoresetMode.SAME_STEP, **settings))
+    made = CzVecEnv(
+        CzVectorEnv(2, observation="history", autoreset_mode=AutoresetMode.SAME_STEP, info="all", **settings)
+    )
     made.seed(5)
     return made
 
