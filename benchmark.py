@@ -27,9 +27,9 @@ CACHE = FOLDER.parent / "cache"
 """Where episodes of slow controllers are cached."""
 BOUNDS = FOLDER.parent / "bounds"
 """Committed results of the slow controllers; their bound serves runs without one."""
-DEFAULT = "ppo-default"
-"""The training seed of ``ppo`` that did best on validation."""
-SHIPPED = ("ppo", DEFAULT, "ppo-medium", "ppo-quiet", "ppo-scratch", "ppo-puller")
+DEFAULT = "imitation-default"
+"""The training seed of ``imitation`` that did best on validation."""
+SHIPPED = ("imitation", DEFAULT, "imitation-medium", "imitation-quiet", "imitation-puller", "ppo")
 """Agents that come with the package; all but the default pool their training seeds."""
 EPISODES = 500
 

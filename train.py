@@ -5,10 +5,15 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cz_gym.commands import OneLineParser, guarded
+
+if TYPE_CHECKING:
+    from cz_gym.agents.training.recipes import Recipe
 
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
@@ -17,17 +22,17 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
 
     parser = OneLineParser(
         prog="train.py",
-        description="Train an agent with stable-baselines3 and pick it on validation episodes.",
+        description="Train an agent by a recipe and pick it on validation episodes.",
         epilog="The run folder holds the agent with its contract, settings, checkpoints, progress and logs.",
     )
-    parser.add_argument(
-        "--algo", choices=tuple(RECIPES), default="ppo", help="learning algorithm (default: %(default)s)"
-    )
+    parser.add_argument("--algo", choices=tuple(RECIPES), default="ppo", help="recipe (default: %(default)s)")
     parser.add_argument("--seed", type=_whole(0), default=0, help="training seed (default: %(default)s)")
     parser.add_argument(
-        "--steps", type=_whole(1), help="environment steps (default: the algorithm's own, or the resumed run's)"
+        "--steps",
+        type=_whole(1),
+        help="environment steps of learning from reward (default: the recipe's, or the resumed run's)",
     )
-    parser.add_argument("--scenario", help="scenario to train on (default: the algorithm's own)")
+    parser.add_argument("--scenario", help="scenario to train on (default: the recipe's)")
     parser.add_argument("--out", type=Path, help="run folder (default: runs/<algo>-seed<seed>)")
     parser.add_argument("--resume", action="store_true", help="go on from the run folder's checkpoint")
     parser.add_argument(
@@ -35,7 +40,8 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         type=_seconds,
         default=60.0,
         metavar="S",
-        help="time between checkpoints, the most that an interruption loses (default: %(default)g)",
+        help="time between checkpoints, the most that an interruption loses; an imitation begins again "
+        "(default: %(default)g)",
     )
     arguments = parser.parse_args(argv)
     arguments.out = arguments.out or Path("runs") / f"{arguments.algo}-seed{arguments.seed}"
@@ -53,26 +59,21 @@ def train(arguments: argparse.Namespace) -> int:
     """Run the training that the command line asks for."""
     from tqdm import tqdm
 
-    from cz_gym.agents.training import recipes as settings
+    from cz_gym.agents.training.recipes import RECIPES
     from cz_gym.agents.training.run import Run
-    from cz_gym.agents.training.run_files import saved_steps
     from cz_gym.atomic_files import check_writable, locked
     from cz_gym.baselines.registry import make_controller
-    from cz_gym.episodes.scenarios import find_scenario
 
-    choice = settings.RECIPES[arguments.algo]
-    scenario = find_scenario(arguments.scenario or choice.recipe.scenario).name
     folder: Path = arguments.out
     if not arguments.resume and (folder / "settings.json").exists():
         raise ValueError(f"{folder} holds a run already: --resume it, or name another --out")
-    choice = replace(choice, recipe=replace(choice.recipe, scenario=scenario))
-    steps = arguments.steps or (saved_steps(folder) if arguments.resume else choice.steps)
-    choice = replace(choice, steps=steps)
+    recipe = _asked_for(RECIPES[arguments.algo], arguments)
     check_writable(folder)
     with locked(folder):
-        run = Run(folder, choice, arguments.seed, make_controller, arguments.resume, arguments.checkpoint_seconds)
-        print(f"{arguments.algo}, seed {arguments.seed}, {choice.steps:,} steps on {scenario!r}, into {folder}")
-        with tqdm(total=choice.steps, unit="step", unit_scale=True, dynamic_ncols=True, mininterval=1.0) as bar:
+        run = Run(folder, recipe, arguments.seed, make_controller, arguments.resume, arguments.checkpoint_seconds)
+        total = run.learner.total
+        print(f"{recipe.name}, seed {arguments.seed}, {total:,} steps on {recipe.scenario!r}, into {folder}")
+        with tqdm(total=total, unit="step", unit_scale=True, dynamic_ncols=True, mininterval=1.0) as bar:
             try:
                 run.learn(bar)
             except KeyboardInterrupt:
@@ -90,7 +91,22 @@ def train(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _whole(least: int):  # type: ignore[no-untyped-def]
+def _asked_for(recipe: Recipe, arguments: argparse.Namespace) -> Recipe:
+    """The recipe with the scenario and the steps that the command line, or the resumed run, asks for."""
+    from cz_gym.agents.training.recipes import Reinforcement
+    from cz_gym.agents.training.run_files import saved_steps
+    from cz_gym.episodes.scenarios import find_scenario
+
+    recipe = replace(recipe, scenario=find_scenario(arguments.scenario or recipe.scenario).name)
+    saved = saved_steps(arguments.out) if arguments.resume else None
+    if isinstance(recipe, Reinforcement):
+        return replace(recipe, steps=arguments.steps or saved or recipe.steps)
+    if arguments.steps:
+        raise ValueError(f"{recipe.name} takes no --steps: its length is that of its demonstrations")
+    return recipe
+
+
+def _whole(least: int) -> Callable[[str], int]:
     def read(text: str) -> int:
         try:
             value = int(text.replace("_", ""))

@@ -1,7 +1,7 @@
 """Learned controllers: training with stable-baselines3, and running what was trained without it.
 
-Importing this package needs neither torch nor stable-baselines3; training (:mod:`cz_gym.agents.training.learners`)
-needs both.
+``load("imitation")`` is a trained agent, ready to act. Importing this package needs neither torch nor
+stable-baselines3; training (:mod:`cz_gym.agents.training.learners`) needs both.
 """
 
 from __future__ import annotations
@@ -13,13 +13,24 @@ from pathlib import Path
 
 from cz_gym.agents.agent_file.contract import AgentFileError, Contract, read_agent
 from cz_gym.agents.policies.onnx import OnnxPolicy
+from cz_gym.config import Config
 
-__all__ = ["AgentFileError", "Contract", "OnnxPolicy", "shipped", "shipped_seeds"]
+__all__ = ["AgentFileError", "Contract", "OnnxPolicy", "load", "shipped", "shipped_seeds"]
 
 MODELS = Path(__file__).parent / "models"
+DEFAULT = "imitation"
 
 
-def shipped_seeds(name: str = "ppo") -> list[Path]:
+def load(name: str | Path = DEFAULT, config: Config | None = None) -> OnnxPolicy:
+    """A trained agent, ready for ``predict``: the shipped one of that name, or that of an agent file (.onnx).
+
+    With a config, it must have been trained on the same nominal plant. AgentFileError says in one line why an agent
+    cannot be had, or names what there is.
+    """
+    return OnnxPolicy.load(name if Path(name).suffix == ".onnx" else shipped(str(name)), config)
+
+
+def shipped_seeds(name: str = DEFAULT) -> list[Path]:
     """Paths of the trained agents of that name that come with the package, one a training seed, in their order.
 
     AgentFileError names what there is.
@@ -27,10 +38,10 @@ def shipped_seeds(name: str = "ppo") -> list[Path]:
     found = {int(path.stem.removeprefix(f"{name}-seed")): path for path in MODELS.glob(f"{name}-seed[0-9]*.onnx")}
     if not found:
         there = sorted({path.stem.rpartition("-seed")[0] for path in MODELS.glob("*-seed*.onnx")})
-        raise AgentFileError(f"no shipped agent {name!r}; there are: {', '.join(there) or 'none'}")
+        raise AgentFileError(f"no shipped agent {name!r:.80}; there are: {', '.join(there) or 'none'}")
     return [found[seed] for seed in sorted(found)]
 
 
-def shipped(name: str = "ppo") -> Path:
+def shipped(name: str = DEFAULT) -> Path:
     """Path of the one of :func:`shipped_seeds` of least cost on validation episodes that picked nothing before."""
     return min(shipped_seeds(name), key=lambda path: read_agent(path)[0].validation_cost)

@@ -7,45 +7,41 @@ model is a pickle, and reading one can run any code: convert only what you train
 from __future__ import annotations
 
 import argparse
+import importlib
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import stable_baselines3
-import torch
-from sb3_contrib import TQC, TRPO, RecurrentPPO
-from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import FlattenExtractor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from cz_gym.agents.agent_file.contract import AgentFileError, Contract, facts_of, make_contract, write_agent
 from cz_gym.agents.policies.onnx import OnnxPolicy
-from cz_gym.agents.training.export import OnnxGraph
 from cz_gym.agents.training.recipes import CostWeights
-from cz_gym.agents.training.recurrent import lstm_step
 from cz_gym.agents.training.validation import JUDGING, validate
 from cz_gym.commands import OneLineParser, guarded
 from cz_gym.config import make_config
 from cz_gym.env import CzEnv
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
-from cz_gym.observation import OBSERVATIONS
+from cz_gym.observation import DRIVE_CHANNELS, OBSERVATIONS
 from cz_gym.vector import CzVectorEnv
 
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.vec_env import VecNormalize
+
 PROG = "python -m cz_gym.agents.from_sb3"
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
-    "a2c": stable_baselines3.A2C,
-    "ddpg": stable_baselines3.DDPG,
-    "ppo": stable_baselines3.PPO,
-    "ppo_lstm": RecurrentPPO,
-    "sac": stable_baselines3.SAC,
-    "td3": stable_baselines3.TD3,
-    "tqc": TQC,
-    "trpo": TRPO,
+ALGORITHMS = {
+    "a2c": "stable_baselines3.A2C",
+    "ddpg": "stable_baselines3.DDPG",
+    "ppo": "stable_baselines3.PPO",
+    "ppo_lstm": "sb3_contrib.RecurrentPPO",
+    "sac": "stable_baselines3.SAC",
+    "td3": "stable_baselines3.TD3",
+    "tqc": "sb3_contrib.TQC",
+    "trpo": "sb3_contrib.TRPO",
 }
-"""By RL-Zoo's names."""
+"""RL-Zoo's names and what they stand for."""
 SAMPLES, SLOTS = 50, 8
 """Samples of as many pullers on which file and model must agree."""
 TOLERANCE = 1e-3
@@ -88,37 +84,27 @@ def save_agent(
 
 def to_onnx(model: BaseAlgorithm, normalisation: VecNormalize | None) -> bytes:
     """The model's deterministic action as a serialised ONNX model; AgentFileError if it cannot be written as one."""
-    policy: Any = model.policy
-    graph, x, state = OnnxGraph(), "observation", 0
+    from stable_baselines3.common.torch_layers import FlattenExtractor
+
+    from cz_gym.agents.training.export import OnnxGraph, actor_of
+
+    graph, x = OnnxGraph(), "observation"
     if normalisation is not None and normalisation.norm_obs:
         rms: Any = normalisation.obs_rms
         spread = np.sqrt(rms.var + normalisation.epsilon)
         x = graph.node("Sub", [x, graph.constant("mean", np.float32(rms.mean))], "centred")
         x = graph.node("Div", [x, graph.constant("spread", np.float32(spread))], "scaled")
         x = graph.clip(x, -normalisation.clip_obs, normalisation.clip_obs, "normalised")
-    actor = policy if isinstance(policy, ActorCriticPolicy) else getattr(policy, "actor", None)
-    if actor is None:
-        raise AgentFileError(f"{type(policy).__name__} has no actor that gives two continuous actions")
-    seen = actor.pi_features_extractor if isinstance(policy, ActorCriticPolicy) else actor.features_extractor
-    if not isinstance(seen, FlattenExtractor):
-        raise AgentFileError(
-            f"a policy with {type(seen).__name__} before its layers cannot be written as an agent file"
-        )
     try:
-        if isinstance(policy, RecurrentActorCriticPolicy):
-            if policy.lstm_actor.num_layers > 1:
-                raise AgentFileError("a policy with more than one layer of LSTM cannot be written as an agent file")
-            x, state = lstm_step(graph, x, policy.lstm_actor), 2 * policy.lstm_actor.hidden_size
-        if isinstance(policy, ActorCriticPolicy):
-            x = graph.through(x, [policy.mlp_extractor.policy_net, policy.action_net])
-        elif hasattr(actor, "latent_pi"):
-            x = graph.through(x, [actor.latent_pi, actor.mu, torch.nn.Tanh()])
-        else:
-            x = graph.through(x, [actor.mu])
+        actor = actor_of(model.policy)
+        if not isinstance(actor.extractor, FlattenExtractor):
+            raise TypeError(
+                f"a policy with {type(actor.extractor).__name__} before its layers cannot be written as one"
+            )
+        graph.acted(x, actor, "action")
     except TypeError as error:
         raise AgentFileError(str(error)) from None
-    graph.clip(x, -1.0, 1.0, "action")
-    return graph.finished(int(np.prod(model.observation_space.shape or ())), state)
+    return graph.finished(len(OBSERVATIONS[_observation_of(model)]), actor)
 
 
 def disagreement(agent: OnnxPolicy, model: BaseAlgorithm, normalisation: VecNormalize | None) -> float:
@@ -145,7 +131,7 @@ def _observation_of(model: BaseAlgorithm) -> str:
     if not named:
         lengths = ", ".join(f"{name} {len(channels)}" for name, channels in OBSERVATIONS.items())
         raise AgentFileError(f"the model reads an observation of shape {shape}; known: {lengths}")
-    if model.action_space.shape != (2,):
+    if model.action_space.shape != (len(DRIVE_CHANNELS),):
         raise AgentFileError(f"the model's action has the shape {model.action_space.shape}, not (2,)")
     return named[0]
 
@@ -165,15 +151,17 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, help="training seed (default: the model's)")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="agent file to write (.onnx)")
     given = parser.parse_args(argv)
-    return guarded(PROG, lambda: _convert(given), "train")
+    return guarded(PROG, lambda: _convert(given), "agents")
 
 
 def _convert(given: argparse.Namespace) -> int:
     if given.out.suffix != ".onnx":
         raise AgentFileError(f"{given.out}: an agent file ends in .onnx")
-    model = _read(
-        given.model, f"a model of {given.algo}", lambda: ALGORITHMS[given.algo].load(given.model, device="cpu")
-    )
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+    module, _, name = ALGORITHMS[given.algo].partition(".")
+    algorithm = getattr(importlib.import_module(module), name)
+    model = _read(given.model, f"a model of {given.algo}", lambda: algorithm.load(given.model, device="cpu"))
     observation = _observation_of(model)
     normalisation = None
     if given.vecnormalize:
@@ -194,7 +182,7 @@ def _convert(given: argparse.Namespace) -> int:
     return 0
 
 
-def _read(path: Path, what: str, load: Any) -> Any:
+def _read(path: Path, what: str, load: Callable[[], Any]) -> Any:
     """What a file of stable-baselines3 holds; AgentFileError in one line, whatever its many ways to be broken raise."""
     if not path.is_file():
         raise AgentFileError(f"{path}: no such file")

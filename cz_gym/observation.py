@@ -51,6 +51,8 @@ MEASURED = (
     Channel("Q_H", "W", HEATER_SCALE, "applied heater power minus nominal"),
 )
 """Channels of ``observation="measured"``."""
+DRIVE_CHANNELS = tuple([channel.name for channel in MEASURED].index(name) for name in ("v_p", "Q_H"))
+"""Where "measured" and "history" hold the applied drives, in units of the action."""
 
 LAGGED = ("ring_error", "v_p", "T_1", "Q_H")
 """Channels that "history" remembers."""

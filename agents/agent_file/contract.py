@@ -51,11 +51,11 @@ class Contract:
     scenario_hash: str
     """Hash of that scenario."""
     algorithm: str
-    """Name of the learning algorithm."""
+    """Name of the recipe that it was trained by."""
     training_seed: int
     """Seed of the training run."""
     training_steps: int
-    """Environment steps behind these weights."""
+    """Environment steps of learning from reward behind these weights; 0 for an imitation."""
     validation_cost: float
     """Mean cost of a step, weighed as in training [-], on validation episodes: those that judge a run at its end."""
     validation_rmse_mm: float
@@ -169,12 +169,11 @@ def _check(given: Mapping[str, Any], where: Path | str) -> None:
 
 def _wrong(kind: str, value: Any) -> str | None:
     """What a value of this kind must be, if this one is not."""
-    kinds: dict[str, tuple[type, ...]] = {"str": (str,), "int": (int,), "float": (int, float)}
-    if not isinstance(value, kinds[kind]) or isinstance(value, bool):
-        return kind
-    if isinstance(value, str):
-        plain = 0 < len(value) <= MAX_TEXT and value.isprintable()
+    if kind == "str":
+        plain = isinstance(value, str) and 0 < len(value) <= MAX_TEXT and value.isprintable()
         return None if plain else f"printable text of 1 to {MAX_TEXT} characters"
+    if isinstance(value, bool) or not isinstance(value, int if kind == "int" else (int, float)):
+        return kind
     if isinstance(value, int):
         return None if 0 <= value <= MAX_WHOLE else f"between 0 and {MAX_WHOLE}"
     if not math.isfinite(value):

@@ -93,16 +93,17 @@ def _clean(graph: Any, channels: int) -> tuple[Any, int]:
     if sum(uses) > MAX_PARAMETERS:
         raise GraphError(f"computes with more than {MAX_PARAMETERS} weights")
     state = _state_length([*graph.input], [*graph.output])
-    lengths = (channels, state), (2, state)
-    values: list[list[Any]] = []
-    for names, given, sizes in zip((INPUTS, OUTPUTS), (graph.input, graph.output), lengths, strict=True):
+
+    def values(given: Any, names: tuple[str, str], sizes: tuple[int, int]) -> list[Any]:
         widths = {name: size for name, size in zip(names, sizes, strict=True) if size}
         if [(value.name, _width(value)) for value in given] != list(widths.items()):
             raise GraphError(f"must map observation (n, {channels}) to action (n, 2), and a state to one like it")
-        values.append([helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", w]) for name, w in widths.items()])
+        return [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", w]) for name, w in widths.items()]
+
+    inputs, outputs = values(graph.input, INPUTS, (channels, state)), values(graph.output, OUTPUTS, (2, state))
     nodes = [_node(node) for node in graph.node]
     tensors = [numpy_helper.from_array(array, name) for name, array in weights.items()]
-    return helper.make_graph(nodes, "cz_gym_agent", *values, tensors), state
+    return helper.make_graph(nodes, "cz_gym_agent", inputs, outputs, tensors), state
 
 
 def _array(tensor: Any) -> Any:

@@ -3,7 +3,7 @@
 The channels of "history" are defined in time, so an agent can read them at any interval, means over at least one
 sample. What it asks for is a move of the drives within its own interval; so within a shorter one it makes that share
 of it: action = applied + (interval / trained) (asked - applied). Whole moves would drive so much too fast. Within a
-longer one it makes the move half way between the one asked for and one in proportion: a lively loop that waits longer
+longer one it makes the move half way between the one asked for and one in proportion: a fast loop that waits longer
 between two looks has little margin for larger moves. This is an override: the contract's interval stays what the agent
 was trained and picked at.
 """
@@ -16,11 +16,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.observation import MEASURED
+from cz_gym.observation import DRIVE_CHANNELS
 
 from .onnx import OnnxPolicy
-
-_DRIVES = [[channel.name for channel in MEASURED].index(name) for name in ("v_p", "Q_H")]
 
 
 @dataclass(frozen=True)
@@ -34,9 +32,9 @@ class Resampled:
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[npt.NDArray[np.float32], Any]:
-        """Actions as :meth:`agents.OnnxPolicy.predict`, each move the share of the one asked for, within the box."""
+        """Actions as :meth:`.onnx.OnnxPolicy.predict`, each move the share of the one asked for, within the box."""
         asked, state = self.policy.predict(observation, state, episode_start, deterministic)
-        applied = np.asarray(observation, np.float32)[..., _DRIVES]
+        applied = np.asarray(observation, np.float32)[..., list(DRIVE_CHANNELS)]
         moved = applied + np.float32(self.share) * (asked - applied)
         return np.clip(moved, -1.0, 1.0), state
 

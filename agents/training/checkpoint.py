@@ -9,9 +9,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import asdict, dataclass
-from operator import attrgetter
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors import SafetensorError
@@ -19,13 +17,16 @@ from safetensors.torch import load, save
 
 from cz_gym.agents.agent_file.contract import AgentFileError, read_bounded
 
+from .learner import Learner, Parts
 from .replay_buffer import PREFIX, fits, latest, refill
 
-FORMAT = "cz-gym-checkpoint-2"
+FORMAT = "cz-gym-checkpoint-3"
 MAX_BYTES = 64_000_000
 """Largest checkpoint that is read."""
 MAX_HEADER = 1_000_000
 """Largest list of its tensors [bytes]."""
+COUNTS = ("step", "exp_avg_sq")
+"""What Adam remembers of a parameter and is never negative."""
 
 Tensors = dict[str, torch.Tensor]
 
@@ -36,21 +37,19 @@ class Progress:
 
     steps: int
     """Environment steps taken."""
-    updates: int
-    """Gradient updates taken."""
     seconds: float
     """Time spent, over all sessions [s]."""
     best_cost: float | None
     """Least validation cost so far [-]; None before the first."""
 
 
-def to_bytes(learner: Any, seconds: float, best_cost: float | None) -> bytes:
-    """The checkpoint of a stable-baselines3 learner; of a replay buffer the latest transitions."""
-    progress = Progress(int(learner.num_timesteps), int(learner._n_updates), seconds, best_cost)
+def to_bytes(learner: Learner, seconds: float, best_cost: float | None) -> bytes:
+    """The checkpoint of a learner; of a replay buffer the latest transitions."""
+    parts, progress = learner.parts(), Progress(int(learner.steps), seconds, best_cost)
     # Modules that share a tensor each get their copy: the format knows no sharing.
-    tensors = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in _tensors(learner).items()}
-    tensors |= latest(learner)
-    content: bytes = save(tensors, {"format": FORMAT, "progress": json.dumps(asdict(progress))})
+    copies = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in _tensors(parts).items()}
+    told = {"format": FORMAT, "progress": json.dumps(asdict(progress))}
+    content: bytes = save(copies | latest(parts.replay_buffer), told)
     return content
 
 
@@ -71,78 +70,44 @@ def load_checkpoint(path: Path) -> tuple[Progress, Tensors]:
         progress = Progress(**json.loads(told["progress"]))
     except (ValueError, KeyError, TypeError, RecursionError):
         raise AgentFileError(f"{path}: does not say where the run stood") from None
-    numbers = (progress.steps, progress.updates), (progress.seconds, progress.best_cost or 0.0)
-    whole = all(type(number) is int and 0 <= number < 2**63 for number in numbers[0])
-    if not whole or not all(type(number) is float and 0.0 <= number < math.inf for number in numbers[1]):
+    best = 0.0 if progress.best_cost is None else progress.best_cost
+    whole = type(progress.steps) is int and 0 <= progress.steps < 2**63
+    if not whole or not all(type(each) is float and 0.0 <= each < math.inf for each in (progress.seconds, best)):
         raise AgentFileError(f"{path}: does not say where the run stood")
     return progress, tensors
 
 
-def restore(learner: Any, progress: Progress, tensors: Tensors, path: Path) -> None:
-    """Put a checkpoint into a learner made with the same settings; AgentFileError if it does not fit."""
-    modules, optimisers, variables = _parts(learner)
-    experience = {name: tensor for name, tensor in tensors.items() if name.startswith(PREFIX)}
-    fixed = {name: tensor for name, tensor in _tensors(learner).items() if name.partition("/")[0] not in optimisers}
-    kept = {name: part for name, part in tensors.items() if name.partition("/")[0] not in {*optimisers, PREFIX[:-1]}}
-    alike = set(fixed) == set(kept) and all(_alike(fixed[name], kept[name]) for name in fixed)
-    if not alike or not fits(learner, experience):
+def restore(learner: Learner, tensors: Tensors, path: Path) -> None:
+    """Put a checkpoint's tensors into a learner made with the same settings; AgentFileError if they do not fit."""
+    parts = learner.parts()
+    live, transitions = _tensors(parts), {name: part for name, part in tensors.items() if name.startswith(PREFIX)}
+    learned = {name: tensor for name, tensor in tensors.items() if name not in transitions}
+    alike = set(learned) == set(live) and all(_alike(live[name], tensor) for name, tensor in learned.items())
+    if not alike or not fits(parts.replay_buffer, transitions):
         raise AgentFileError(f"{path}: does not fit this run's settings")
-    states = {name: _optimiser_state(name, part, tensors, path) for name, part in optimisers.items()}
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():
             raise AgentFileError(f"{path}: {name!r:.80} holds numbers that are not finite")
-    for name, module in modules.items():
-        module.load_state_dict({key: tensors[f"{name}/{key}"] for key in module.state_dict()})
-    for name, optimiser in optimisers.items():
-        optimiser.load_state_dict({**optimiser.state_dict(), "state": states[name]})
-    for name, variable in variables.items():
-        variable.data.copy_(tensors[f"{name}/"])
-    refill(learner, experience)
-    learner.num_timesteps = progress.steps
-    learner._n_updates = progress.updates
+        if name.rpartition("/")[2] in COUNTS and (tensor < 0).any():
+            raise AgentFileError(f"{path}: {name!r:.80} holds numbers below zero")
+    with torch.no_grad():
+        for name, tensor in learned.items():
+            live[name].copy_(tensor)
+    refill(parts.replay_buffer, transitions)
 
 
-def _parts(learner: Any) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-    """What a learner learns, by name: modules, optimisers, lone variables."""
-    states, lone = learner._get_torch_save_params()
-    found = {name: attrgetter(name)(learner) for name in states}
-    optimisers = {name: part for name, part in found.items() if isinstance(part, torch.optim.Optimizer)}
-    modules = {name: part for name, part in found.items() if name not in optimisers}
-    return modules, optimisers, {name: attrgetter(name)(learner) for name in lone}
-
-
-def _tensors(learner: Any) -> Tensors:
+def _tensors(parts: Parts) -> Tensors:
     """Every tensor that training changes, by name."""
-    modules, optimisers, variables = _parts(learner)
-    found = {f"{name}/{key}": value for name, part in modules.items() for key, value in part.state_dict().items()}
-    found |= {
-        f"{name}/{index}/{field}": value
-        for name, part in optimisers.items()
-        for index, state in part.state_dict()["state"].items()
-        for field, value in state.items()
-    }
-    return found | {f"{name}/": variable for name, variable in variables.items()}
-
-
-def _optimiser_state(name: str, optimiser: Any, tensors: Tensors, path: Path) -> dict[int, Tensors]:
-    """The state of an optimiser: of each parameter a step count and moments of its shape, or nothing at all."""
-    parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
-    names = {"step": torch.zeros(()), "exp_avg": None, "exp_avg_sq": None}
-    state: dict[int, Tensors] = {}
-    for full, tensor in tensors.items():
-        owner, _, rest = full.partition("/")
-        if owner != name:
-            continue
-        index, _, field = rest.partition("/")
-        known = index.isdecimal() and len(index) < 9 and int(index) < len(parameters) and field in names
-        wanted = (parameters[int(index)] if names[field] is None else names[field]) if known else None
-        if wanted is None or not _alike(wanted, tensor):
-            raise AgentFileError(f"{path}: does not fit this run's settings")
-        state.setdefault(int(index), {})[field] = tensor
-    sound = all(set(found) == set(names) for found in state.values())
-    if not sound or any((found["step"] < 0).any() or (found["exp_avg_sq"] < 0).any() for found in state.values()):
-        raise AgentFileError(f"{path}: does not fit this run's settings")
-    return state
+    found = {f"{name}/{key}": value for name, part in parts.modules.items() for key, value in part.state_dict().items()}
+    found |= {f"{name}/": variable for name, variable in parts.variables.items()}
+    for name, optimiser in parts.optimisers.items():
+        every = [parameter for group in optimiser.param_groups for parameter in group["params"]]
+        for index, parameter in enumerate(every):
+            # As Adam itself begins a parameter at its first update.
+            begun = {"step": torch.zeros(()), **{key: torch.zeros_like(parameter) for key in ("exp_avg", "exp_avg_sq")}}
+            state = optimiser.state.setdefault(parameter, begun)
+            found |= {f"{name}/{index}/{key}": state[key] for key in begun}
+    return found
 
 
 def _alike(one: torch.Tensor, other: torch.Tensor) -> bool:

@@ -1,21 +1,25 @@
-"""From a trained network to an ONNX file: normalisation, layers, action head and clipping in one graph."""
+"""From a trained network to an ONNX file: normalisation, layers, action head and clipping in one graph.
+
+Written operator by operator, because torch's exporter without further packages is the deprecated one, whose graphs
+hold operators that agents' files may not (:mod:`cz_gym.agents.agent_file.graph`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import onnx
 import torch
 from onnx import TensorProto, helper, numpy_helper
+from stable_baselines3.common.policies import ActorCriticPolicy
 
-from cz_gym.agents.training.networks import DRIVES, NORMALISED_LIMIT, Normalise
-from cz_gym.observation import HISTORY
+from cz_gym.observation import DRIVE_CHANNELS, HISTORY
 
-Floats = npt.NDArray[np.float32]
+from .networks import NORMALISED_LIMIT, DrivePolicy, Normalise
+
 OPSET, IR_VERSION = 17, 9
 ACTIVATIONS: dict[type[torch.nn.Module], tuple[str, dict[str, str]]] = {
     torch.nn.Tanh: ("Tanh", {}),
@@ -27,64 +31,6 @@ ACTIVATIONS: dict[type[torch.nn.Module], tuple[str, dict[str, str]]] = {
 """Modules of one ONNX operator, with its attributes and what torch calls them."""
 
 
-@dataclass(frozen=True)
-class Actor:
-    """An actor as arrays: action = clip(skip * drives + scale * squash(layers(x) + direct(x))).
-
-    x is the normalised observation, (observation - mean) @ scaling within +-30.
-    """
-
-    mean: Floats
-    scaling: Floats
-    direct: tuple[Floats, Floats] | None
-    """Weight (out, in) and bias (out,) of the linear path."""
-    layers: tuple[tuple[Floats, Floats], ...]
-    """Weight (out, in) and bias (out,) of each layer; the activation follows all but the last."""
-    activation: str
-    """ONNX operator: Tanh or Relu."""
-    squash: bool
-    """Whether a tanh follows the last layer."""
-    skip: float
-    scale: Floats
-
-
-def linear_of(module: torch.nn.Linear) -> tuple[Floats, Floats]:
-    """Weight (out, in) and bias (out,) of a layer."""
-    return module.weight.detach().numpy().copy(), module.bias.detach().numpy().copy()
-
-
-def actor_of(learner: Any) -> Actor:
-    """The deterministic actor of a PPO or SAC learner made by :mod:`cz_gym.agents.training.learners`."""
-    policy = learner.policy
-    if hasattr(policy, "mlp_extractor"):
-        normalise: Normalise = policy.features_extractor
-        head = policy.action_net
-        torso, last, activation, squash = policy.mlp_extractor.actor, head.linear, "Tanh", False
-        direct = linear_of(policy.mlp_extractor.direct)
-        skip, scale = head.skip, head.scale.numpy().copy()
-    else:
-        normalise = policy.actor.features_extractor
-        torso, last, activation, squash = policy.actor.latent_pi, policy.actor.mu, "Relu", True
-        direct = None
-        skip, scale = learner.env.skip, learner.env.scale.astype(np.float32)
-    visible = min(len(normalise.mean), len(HISTORY))
-    layers = [linear_of(module) for module in torso if isinstance(module, torch.nn.Linear)]
-    first_weight, first_bias = layers[0]
-    layers[0] = first_weight[:, :visible].copy(), first_bias
-    seen = normalise.seen[:visible, None] * normalise.scaling[:visible, :visible]
-    mean, scaling = normalise.mean.numpy()[:visible].copy(), seen.numpy()
-    return Actor(mean, scaling, direct, (*layers, linear_of(last)), activation, squash, skip, scale)
-
-
-def exported(learner: Any) -> bytes:
-    """The deterministic actor of a learner of :mod:`cz_gym.agents.training.learners`, as a serialised ONNX model."""
-    if hasattr(learner.policy, "lstm_actor"):
-        from cz_gym.agents.training.recurrent import recurrent_onnx
-
-        return recurrent_onnx(learner)
-    return to_onnx(actor_of(learner))
-
-
 class OnnxGraph:
     """An agent's graph in the making; every node is named after its output."""
 
@@ -92,9 +38,10 @@ class OnnxGraph:
         self._nodes: list[Any] = []
         self._constants: list[Any] = []
 
-    def constant(self, name: str, value: npt.ArrayLike) -> str:
-        """A weight; its name."""
-        self._constants.append(numpy_helper.from_array(np.asarray(value), name))
+    def constant(self, name: str, value: Any) -> str:
+        """A weight, of a tensor or of numbers; its name."""
+        array = value.detach().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
+        self._constants.append(numpy_helper.from_array(array, name))
         return name
 
     def node(self, operator: str, inputs: list[str], output: str, **attributes: Any) -> str:
@@ -106,10 +53,10 @@ class OnnxGraph:
         """An operator with several outputs."""
         self._nodes.append(helper.make_node(operator, inputs, outputs, **attributes))
 
-    def gemm(self, x: str, weight: Floats, bias: Floats, name: str) -> str:
+    def linear(self, x: str, weight: torch.Tensor, bias: torch.Tensor | None, name: str) -> str:
         """A layer of weight (out, in) and bias (out,)."""
-        parameters = [self.constant(f"{name}_weight", weight), self.constant(f"{name}_bias", bias)]
-        return self.node("Gemm", [x, *parameters], name, transB=1)
+        parameters = {"weight": weight, "bias": torch.zeros(len(weight)) if bias is None else bias}
+        return self.node("Gemm", [x, *(self.constant(f"{name}_{k}", v) for k, v in parameters.items())], name, transB=1)
 
     def through(self, x: str, modules: Iterable[torch.nn.Module]) -> str:
         """x through torch's modules, one after the other; TypeError for one that is not known here."""
@@ -118,9 +65,7 @@ class OnnxGraph:
             if isinstance(module, torch.nn.Sequential):
                 x = self.through(x, module)
             elif isinstance(module, torch.nn.Linear):
-                weight, bias = module.weight.detach().numpy(), module.bias
-                offset = np.zeros(len(weight), np.float32) if bias is None else bias.detach().numpy()
-                x = self.gemm(x, weight, offset, name)
+                x = self.linear(x, module.weight, module.bias, name)
             elif isinstance(module, torch.nn.Hardtanh):
                 x = self.clip(x, module.min_val, module.max_val, name)
             elif isinstance(module, torch.nn.SiLU):
@@ -132,53 +77,111 @@ class OnnxGraph:
                 raise TypeError(f"a network with {type(module).__name__} in it cannot be written as an agent file")
         return x
 
+    def lstm_step(self, x: str, lstm: torch.nn.LSTM) -> str:
+        """One step of torch's LSTM; the new hidden values. Gates (input, forget, cell, output) = W x + U h + b.
+
+        Hidden and cell values stand side by side in ``state`` and ``next_state``.
+        """
+        half = self.constant("halves", np.full(2, lstm.hidden_size))
+        quarter = self.constant("quarters", np.full(4, lstm.hidden_size))
+        weight_x, weight_h, bias_x, bias_h = lstm.all_weights[0]
+        self.nodes_of("Split", ["state", half], ["hidden", "cell"], axis=1)
+        seen = self.linear(x, weight_x, bias_x + bias_h, "gates_seen")
+        recalled = self.linear("hidden", weight_h, None, "gates_recalled")
+        names = ["gate_in", "gate_forget", "gate_new", "gate_out"]
+        self.nodes_of("Split", [self.node("Add", [seen, recalled], "gates"), quarter], names, axis=1)
+        gain, forget, emit = (self.node("Sigmoid", [names[i]], f"{names[i]}_open") for i in (0, 1, 3))
+        old = self.node("Mul", [forget, "cell"], "old_cell")
+        new = self.node("Mul", [gain, self.node("Tanh", ["gate_new"], "new")], "new_cell")
+        cell = self.node("Add", [old, new], "next_cell")
+        hidden = self.node("Mul", [emit, self.node("Tanh", [cell], "bent_cell")], "next_hidden")
+        self.node("Concat", [hidden, cell], "next_state", axis=1)
+        return hidden
+
+    def acted(self, x: str, actor: Actor, name: str) -> str:
+        """The actor's output, within -1 and 1."""
+        x = x if actor.lstm is None else self.lstm_step(x, actor.lstm)
+        return self.clip(self.through(x, actor.layers), -1.0, 1.0, name)
+
     def clip(self, x: str, low: float, high: float, name: str) -> str:
         """x within [low, high]."""
         limits = [self.constant(f"{name}_{end}", np.float32(value)) for end, value in (("low", low), ("high", high))]
         return self.node("Clip", [x, *limits], name)
 
-    def normalised(self, mean: Floats, scaling: Floats) -> str:
-        """The normalised observation."""
-        x = self.node("Sub", ["observation", self.constant("mean", mean)], "centred")
+    def normalised(self, normalise: Normalise) -> str:
+        """The normalised observation, of the channels that an actor may see."""
+        n = min(len(normalise.mean), len(HISTORY))
+        scaling = (normalise.visible[:n, None] * normalise.scaling[:n, :n]).contiguous()
+        x = self.node("Sub", ["observation", self.constant("mean", normalise.mean[:n])], "centred")
         x = self.node("MatMul", [x, self.constant("scaling", scaling)], "scaled")
         return self.clip(x, -NORMALISED_LIMIT, NORMALISED_LIMIT, "normalised")
 
     def drives(self, x: str, skip: float, scale: npt.ArrayLike) -> None:
         """The action: skip * (applied drives) + scale * x, within the box."""
         x = self.node("Mul", [x, self.constant("scale", np.asarray(scale, np.float32))], "scaled_move")
-        at = self.constant("drives", np.array(DRIVES, np.int64))
+        at = self.constant("drives", np.array(DRIVE_CHANNELS))
         applied = self.node("Gather", ["observation", at], "applied", axis=1)
-        kept = self.node("Mul", [applied, self.constant("skip", np.float32(skip))], "kept")
-        x = self.node("Add", [x, kept], "wanted")
-        self.clip(x, -1.0, 1.0, "action")
+        held = self.node("Mul", [applied, self.constant("skip", np.float32(skip))], "held")
+        self.clip(self.node("Add", [x, held], "wanted"), -1.0, 1.0, "action")
 
-    def finished(self, channels: int, state: int = 0) -> bytes:
-        """The model, checked and serialised; ``state`` is the length of what it remembers, 0 if nothing."""
+    def finished(self, channels: int, actor: Actor | None = None) -> bytes:
+        """The model, checked and serialised; it remembers what the actor's LSTM does."""
 
         def value(name: str, width: int) -> Any:
             return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", width])
 
-        given, answers = [value("observation", channels)], [value("action", len(DRIVES))]
-        if state:
-            given, answers = [*given, value("state", state)], [*answers, value("next_state", state)]
-        graph = helper.make_graph(self._nodes, "cz_gym_agent", given, answers, self._constants)
+        inputs, outputs = [value("observation", channels)], [value("action", len(DRIVE_CHANNELS))]
+        if actor and actor.lstm:
+            state = 2 * actor.lstm.hidden_size
+            inputs, outputs = [*inputs, value("state", state)], [*outputs, value("next_state", state)]
+        graph = helper.make_graph(self._nodes, "cz_gym_agent", inputs, outputs, self._constants)
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
         onnx.checker.check_model(model)
         serialised: bytes = model.SerializeToString()
         return serialised
 
 
-def to_onnx(actor: Actor) -> bytes:
-    """The actor as a serialised ONNX model: observation (n, channels) to action (n, 2), float32."""
-    graph = OnnxGraph()
-    x = seen = graph.normalised(actor.mean, actor.scaling)
-    for depth, (weight, bias) in enumerate(actor.layers):
-        x = graph.gemm(x, weight, bias, f"linear_{depth}")
-        if depth < len(actor.layers) - 1:
-            x = graph.node(actor.activation, [x], f"active_{depth}")
-    if actor.direct:
-        x = graph.node("Add", [x, graph.gemm(seen, *actor.direct, "direct")], "bent")
-    if actor.squash:
-        x = graph.node("Tanh", [x], "squashed")
-    graph.drives(x, actor.skip, actor.scale)
-    return graph.finished(len(actor.mean))
+def drive_policy_onnx(policy: DrivePolicy) -> bytes:
+    """The actor of PPO's or an imitation's network: observation (n, channels) to action (n, 2)."""
+    graph, head, actor = OnnxGraph(), policy.action_net, policy.mlp_extractor
+    seen = graph.normalised(policy.features_extractor)
+    bent = graph.through(seen, [actor.actor, head.linear])
+    direct = graph.linear(seen, actor.direct.weight, actor.direct.bias, "direct")
+    graph.drives(graph.node("Add", [bent, direct], "outputs"), head.skip, head.scale.numpy())
+    return graph.finished(actor.measured)
+
+
+class Actor(NamedTuple):
+    """The deterministic actor of a policy of stable-baselines3's own."""
+
+    extractor: Any
+    """What its observations go through first."""
+    lstm: Any
+    """Its LSTM; None without one."""
+    layers: list[torch.nn.Module]
+
+
+def actor_of(policy: Any) -> Actor:
+    """The actor of a policy of any algorithm; TypeError if it has none, or one that an agent file cannot hold."""
+    if isinstance(policy, ActorCriticPolicy):
+        lstm, net = getattr(policy, "lstm_actor", None), policy.mlp_extractor.policy_net
+        if lstm is not None and lstm.num_layers > 1:
+            raise TypeError("a policy with more than one layer of LSTM cannot be written as an agent file")
+        return Actor(policy.pi_features_extractor, lstm, [net, policy.action_net])
+    actor = getattr(policy, "actor", None)
+    if actor is None:
+        raise TypeError(f"{type(policy).__name__} has no actor that gives two continuous actions")
+    squashed = hasattr(actor, "latent_pi")
+    layers = [actor.latent_pi, actor.mu, torch.nn.Tanh()] if squashed else [actor.mu]
+    return Actor(actor.features_extractor, None, layers)
+
+
+def moves_onnx(algorithm: Any) -> bytes:
+    """The deterministic actor of stable-baselines3's own policies on moves of the drives (:mod:`.wrappers`).
+
+    The hidden and cell values of an LSTM travel in the file's ``state``, shape (n, 2 units): nothing in the file loops.
+    """
+    graph, actor = OnnxGraph(), actor_of(algorithm.policy)
+    x = graph.acted(graph.normalised(actor.extractor), actor, "move")
+    graph.drives(x, algorithm.env.skip, algorithm.env.scale)
+    return graph.finished(len(actor.extractor.mean), actor)

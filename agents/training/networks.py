@@ -8,6 +8,7 @@ as one file.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -19,23 +20,23 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED
+from cz_gym.observation import DRIVE_CHANNELS, HISTORY, LAGGED, LAGS
 
-DRIVES = tuple([channel.name for channel in MEASURED].index(name) for name in ("v_p", "Q_H"))
-"""Where an observation holds the applied drives, in action units."""
 NORMALISED_LIMIT = 30.0
+"""Largest normalised channel [-]."""
+DRIVES = len(DRIVE_CHANNELS)
 
 
-def seen_channels(channels: int, memory: float) -> npt.NDArray[np.float32]:
+def visible_channels(channels: int, memory: float) -> npt.NDArray[np.float32]:
     """1 for what networks see, 0 for past samples older than ``memory`` [s], shape (channels,)."""
-    seen = np.ones(channels, np.float32)
-    lagged = seen[len(HISTORY) - len(LAGS) * len(LAGGED) : len(HISTORY)]
+    visible = np.ones(channels, np.float32)
     if channels >= len(HISTORY):
+        lagged = visible[len(HISTORY) - len(LAGS) * len(LAGGED) : len(HISTORY)]
         lagged[:] = np.repeat(np.array(LAGS) <= memory, len(LAGGED))
-    return seen
+    return visible
 
 
-def tanh_layers(sizes: list[int]) -> nn.Sequential:
+def tanh_layers(sizes: Sequence[int]) -> nn.Sequential:
     """Linear layers with tanh after each."""
     layers: list[nn.Module] = []
     for wide, narrow in pairwise(sizes):
@@ -46,48 +47,50 @@ def tanh_layers(sizes: list[int]) -> nn.Sequential:
 class Normalise(BaseFeaturesExtractor):
     """Normalised observation, on request with the two applied drives appended raw; part of the saved policy."""
 
+    visible: torch.Tensor
+    mean: torch.Tensor
+    scaling: torch.Tensor
+
     def __init__(self, observation_space: Box, drives: bool = True, memory: float = LAGS[-1]) -> None:
-        channels = observation_space.shape[0]
-        super().__init__(observation_space, channels + (len(DRIVES) if drives else 0))
+        (channels,) = observation_space.shape
+        super().__init__(observation_space, channels + (DRIVES if drives else 0))
         self.drives = drives
-        self.register_buffer("seen", torch.as_tensor(seen_channels(channels, memory)), persistent=False)
+        self.register_buffer("visible", torch.as_tensor(visible_channels(channels, memory)), persistent=False)
         self.register_buffer("mean", torch.zeros(channels))
         self.register_buffer("scaling", torch.eye(channels))
 
-    def set(self, mean: np.ndarray, scaling: np.ndarray) -> None:
+    def set(self, mean: npt.NDArray[Any], scaling: npt.NDArray[Any]) -> None:
         """Set what observations are normalised with: (observation - mean) @ scaling, shapes (channels,) and square.
 
-        Channels that are not seen count as their mean.
+        Channels that are not visible count as their mean.
         """
         self.mean.copy_(torch.as_tensor(mean))
         self.scaling.copy_(torch.as_tensor(scaling))
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """Shape (n, channels) to (n, channels) or (n, channels + 2)."""
-        centred = (observations - self.mean) * self.seen
+        centred = (observations - self.mean) * self.visible
         normalised = torch.clamp(centred @ self.scaling, -NORMALISED_LIMIT, NORMALISED_LIMIT)
         if not self.drives:
             return normalised
-        return torch.cat([normalised, observations[:, list(DRIVES)]], dim=1)
+        return torch.cat([normalised, observations[:, list(DRIVE_CHANNELS)]], dim=1)
 
 
-class Torsos(nn.Module):
-    """Actor and critic: the actor sees the first ``visible`` channels, the critic all; drives pass by the actor."""
+class ActorCritic(nn.Module):
+    """Hidden layers: the actor sees the first ``measured`` channels, the critic all; drives pass by the actor."""
 
-    def __init__(self, channels: int, visible: int, hidden: tuple[int, ...]) -> None:
+    pairs: torch.Tensor
+
+    def __init__(self, channels: int, measured: int, hidden: tuple[int, ...]) -> None:
         super().__init__()
-        self.channels, self.visible = channels, visible
-        truths = channels - visible
+        self.channels, self.measured = channels, measured
+        truths = channels - measured
         self.register_buffer("pairs", torch.triu_indices(truths, truths), persistent=False)
-        self.latent_dim_pi = hidden[-1]
-        self.latent_dim_vf = hidden[-1] + truths + self.pairs.shape[1]
-        self.actor = tanh_layers([visible, *hidden])
-        self.direct = nn.Linear(visible, len(DRIVES))
-        nn.init.zeros_(self.direct.weight)
-        nn.init.zeros_(self.direct.bias)
+        self.latent_dim_pi = (measured, *hidden)[-1]
+        self.latent_dim_vf = (channels, *hidden)[-1] + truths + self.pairs.shape[1]
+        self.actor = tanh_layers([measured, *hidden])
+        self.direct = nn.Linear(measured, DRIVES)
         self.critic = tanh_layers([channels, *hidden])
-        self.still = False
-        """Whether the actor's layers keep their weights: no gradient passes, nor counts where gradients are clipped."""
 
     def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Latents of actor (with its linear path and drives) and critic."""
@@ -95,21 +98,23 @@ class Torsos(nn.Module):
 
     def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
         """Shape (n, features) to (n, hidden + 4)."""
-        seen = features[:, : self.visible]
-        hidden = self.actor(seen)
-        return torch.cat(
-            [hidden.detach() if self.still else hidden, self.direct(seen), features[:, self.channels :]], dim=1
-        )
+        seen = features[:, : self.measured]
+        return torch.cat([self.actor(seen), self.direct(seen), features[:, self.channels :]], dim=1)
 
     def forward_critic(self, features: torch.Tensor) -> torch.Tensor:
-        """Shape (n, features) to (n, hidden + true channels and their products)."""
-        truths = features[:, self.visible : self.channels]
+        """Shape (n, features) to (n, hidden + true channels and their products).
+
+        The cost to go of a nearly linear plant is nearly quadratic in its state.
+        """
+        truths = features[:, self.measured : self.channels]
         products = truths[:, self.pairs[0]] * truths[:, self.pairs[1]]
         return torch.cat([self.critic(features[:, : self.channels]), truths, products], dim=1)
 
 
 class DriveHead(nn.Module):
     """action = skip * drives + scale * (linear(latent) + direct)."""
+
+    scale: torch.Tensor
 
     def __init__(self, linear: nn.Linear, skip: float, scale: tuple[float, float]) -> None:
         super().__init__()
@@ -118,69 +123,48 @@ class DriveHead(nn.Module):
 
     def forward(self, latent: torch.Tensor) -> torch.Tensor:
         """Shape (n, hidden + 4) to (n, 2)."""
-        hidden, direct, drives = torch.tensor_split(latent, (-2 * len(DRIVES), -len(DRIVES)), dim=1)
+        hidden, direct, drives = torch.tensor_split(latent, (-2 * DRIVES, -DRIVES), dim=1)
         mean: torch.Tensor = self.skip * drives + self.scale * (self.linear(hidden) + direct)
         return mean
 
 
-class Paced(torch.optim.Adam):
-    """Adam whose groups of parameters learn at a ``pace`` of their own: a share of the scheduled learning rate."""
-
-    def step(self, closure: Any = None) -> Any:
-        """One update."""
-        scheduled = [group["lr"] for group in self.param_groups]
-        for group in self.param_groups:
-            group["lr"] *= group["pace"]
-        result = super().step(closure)
-        for group, rate in zip(self.param_groups, scheduled, strict=True):
-            group["lr"] = rate
-        return result
-
-
 class DrivePolicy(ActorCriticPolicy):
-    """PPO's policy of :class:`Normalise`, :class:`Torsos` and :class:`DriveHead`."""
+    """PPO's policy of :class:`Normalise`, :class:`ActorCritic` and :class:`DriveHead`."""
+
+    features_extractor: Normalise
+    mlp_extractor: ActorCritic  # type: ignore[assignment]  # has all of MlpExtractor that ActorCriticPolicy uses
+    action_net: DriveHead
 
     def __init__(
         self,
-        *args: Any,
+        observation_space: Box,
+        action_space: Box,
+        lr_schedule: Any,
+        *,
         hidden: tuple[int, ...] = (128, 128),
         skip: float = 1.0,
         scale: tuple[float, float] = (0.05, 0.05),
         noise: tuple[float, float] = (0.05, 0.05),
-        frozen: tuple[str, ...] = (),
         memory: float = LAGS[-1],
-        **kwargs: Any,
+        **options: Any,
     ) -> None:
-        self.hidden, self.skip, self.scale, self.noise, self.frozen = hidden, skip, scale, noise, frozen
-        self.memory = memory
-        seeing = {"memory": memory}
-        super().__init__(*args, features_extractor_class=Normalise, features_extractor_kwargs=seeing, **kwargs)
+        self.hidden, self.skip, self.scale, self.noise = hidden, skip, scale, noise
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            features_extractor_class=Normalise,
+            features_extractor_kwargs={"memory": memory},
+            **options,
+        )
 
     def _build_mlp_extractor(self) -> None:
-        channels = self.features_dim - len(DRIVES)
-        self.mlp_extractor = Torsos(channels, min(channels, len(HISTORY)), self.hidden)
+        channels = self.features_dim - DRIVES
+        self.mlp_extractor = ActorCritic(channels, min(channels, len(HISTORY)), self.hidden)
 
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
-        self.action_net = DriveHead(self.action_net, self.skip, self.scale)
+        linear: Any = self.action_net
+        self.action_net = DriveHead(linear, self.skip, self.scale)
         with torch.no_grad():
             self.log_std.copy_(torch.log(torch.tensor(self.noise)))
-        critic = [*self.mlp_extractor.critic.parameters(), *self.value_net.parameters()]
-        outputs = [*self.mlp_extractor.direct.parameters(), *self.action_net.parameters()]
-        actor = [*outputs, self.log_std]
-        self.mlp_extractor.still = "layers" in self.frozen
-        if not self.mlp_extractor.still:
-            actor += self.mlp_extractor.actor.parameters()
-        if "heater" in self.frozen:
-            for parameter in outputs:
-                parameter.register_hook(_without_heater)
-        groups = [{"params": critic, "pace": 1.0}, {"params": actor, "pace": 1.0}]
-        self.optimizer = Paced(groups, lr_schedule(1.0), eps=1e-5)
-
-    def set_actor_pace(self, pace: float) -> None:
-        """Let the actor learn at this share of the learning rate."""
-        self.optimizer.param_groups[1]["pace"] = pace
-
-
-def _without_heater(gradient: torch.Tensor) -> torch.Tensor:
-    return torch.cat([gradient[:1], torch.zeros_like(gradient[1:])])

@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
 from cz_gym import CzVectorEnv
-from cz_gym.observation import CLIP, STATE
+from cz_gym.observation import CLIP, OBSERVATIONS, STATE
 
 
 class CzVecEnv(VecEnv):
@@ -37,7 +37,7 @@ class CzVecEnv(VecEnv):
         self.env = env
         self.privileged = privileged
         self.render_mode = env.render_mode
-        channels = env.single_observation_space.shape[0] + (len(STATE) if privileged else 0)
+        channels = len(OBSERVATIONS[env.config.observation]) + (len(STATE) if privileged else 0)
         super().__init__(env.num_envs, Box(-CLIP, CLIP, (channels,), np.float32), env.single_action_space)
         self.info: dict[str, Any] = {}
         """What the batch said of its last step."""
@@ -61,7 +61,7 @@ class CzVecEnv(VecEnv):
         self._lengths[:] = 0
         self._k = 0
         self.reset_infos = [{} for _ in range(self.num_envs)]
-        return self._whole(observation, info)
+        return self._seen(observation, info)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions for :meth:`step_wait`."""
@@ -74,7 +74,7 @@ class CzVecEnv(VecEnv):
         self._returns += reward
         self._lengths += 1
         self._k += 1
-        whole = self._whole(observation, info)
+        whole = self._seen(observation, info)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         done = terminated | truncated
         for i in np.flatnonzero(done).tolist():
@@ -86,7 +86,7 @@ class CzVecEnv(VecEnv):
         if cut.any():
             for i in np.flatnonzero(cut).tolist():
                 infos[i] = self._final(i, whole[i].copy(), True)
-            whole[cut] = self._whole(*self.env.reset(options={"reset_mask": cut}))[cut]
+            whole[cut] = self._seen(*self.env.reset(options={"reset_mask": cut}))[cut]
             done = done | cut
         self._returns[done] = 0.0
         self._lengths[done] = 0
@@ -123,5 +123,5 @@ class CzVecEnv(VecEnv):
         """The native batch does not render."""
         return [None] * self.num_envs
 
-    def _whole(self, observation: np.ndarray, info: dict[str, Any]) -> np.ndarray:
+    def _seen(self, observation: np.ndarray, info: dict[str, Any]) -> np.ndarray:
         return np.concatenate([observation, info["state"]], axis=1) if self.privileged else observation

@@ -5,13 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
+from cz_gym.observation import DRIVE_CHANNELS
 from cz_gym.task import FAILURE_COST, Cost, cost_terms, reward
 
-from .networks import DRIVES
 from .recipes import CostWeights
+from .vec_env import CzVecEnv
 
 
 class TrainingReward(VecEnvWrapper):
@@ -21,9 +23,9 @@ class TrainingReward(VecEnvWrapper):
     weighted as asked; the last step of an episode keeps the environment's own weights.
     """
 
-    def __init__(self, venv: VecEnv, gamma: float, weights: CostWeights = CostWeights()) -> None:  # noqa: B008 (frozen)
-        super().__init__(venv)
-        self.weights = weights
+    def __init__(self, slots: CzVecEnv, gamma: float, weights: CostWeights) -> None:
+        super().__init__(slots)
+        self.slots, self.weights = slots, weights
         self.share = 1.0 - gamma
         self.floor = -FAILURE_COST / self.share
 
@@ -35,7 +37,7 @@ class TrainingReward(VecEnvWrapper):
         """Weigh and scale the reward."""
         observation, given, done, infos = self.venv.step_wait()
         if self.weights != CostWeights():
-            given = np.where(done, given, self.reward(self.venv.unwrapped.info))
+            given = np.where(done, given, self.reward(self.slots.info))
         return observation, (np.maximum(given, self.floor) * self.share).astype(np.float32), done, infos
 
     def reward(self, info: dict[str, Any]) -> Any:
@@ -58,13 +60,13 @@ class DriveAction(VecEnvWrapper):
     def __init__(self, venv: VecEnv, skip: float, scale: tuple[float, float]) -> None:
         super().__init__(venv)
         self.skip, self.scale = skip, np.array(scale, np.float32)
-        self._drives = np.zeros((venv.num_envs, len(DRIVES)), np.float32)
+        self._drives = np.zeros((venv.num_envs, len(DRIVE_CHANNELS)), np.float32)
 
     def reset(self) -> Any:
         """Begin at the applied drives."""
         return self._seen(self.venv.reset())
 
-    def step_async(self, actions: np.ndarray) -> None:
+    def step_async(self, actions: npt.NDArray[np.float32]) -> None:
         """Move the drives."""
         self.venv.step_async(np.clip(self.skip * self._drives + self.scale * actions, -1.0, 1.0))
 
@@ -74,5 +76,5 @@ class DriveAction(VecEnvWrapper):
         return self._seen(observation), reward, done, infos
 
     def _seen(self, observation: Any) -> Any:
-        self._drives = observation[:, list(DRIVES)].copy()
+        self._drives = observation[:, list(DRIVE_CHANNELS)].copy()
         return observation

@@ -1,1 +1,1 @@
-"""What studies of learners share: runs that are kept, and the LQG's settings on the same crystals."""
+"""Recipes compared: trained over training seeds, judged on the same validation crystals, and put into one table."""

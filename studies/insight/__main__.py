@@ -108,7 +108,7 @@ def contenders(path: Path | None) -> tuple[Contender, ...]:
     """
     file = path or shipped()
     contract, content = read_agent(file)
-    name = "ppo-default" if path is None else contract.algorithm
+    name = "imitation-default" if path is None else contract.algorithm
     config = crystal(A_CRYSTAL / MINUTE, contract.observation)
     policy = OnnxPolicy.load(file, config)
     seen = {

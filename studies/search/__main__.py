@@ -1,39 +1,49 @@
 """Search the ``ppo`` recipe's hyperparameters: ``python -m studies.search --trials 30``.
 
-Optuna's tree-structured Parzen estimator proposes, beginning with the settings that ship; a trial learns from a kept
-imitation, and one whose actor has learned and does worse than most at the same step is given up. What counts is the
-last agent's cost on validation crystals, less that of the imitation it began as. The best few then meet other
-validation crystals and other training seeds beside the settings that ship. Every trial is kept in ``history.csv``; the
-same command goes on.
+Optuna's tree-structured Parzen estimator proposes, beginning with the recipe as it stands; a trial that does worse than
+the median at the same step is given up. What counts is the agent's cost on validation crystals. The best few then meet
+other validation crystals and other training seeds beside the recipe. Optuna's journal holds every trial, and the same
+command goes on from it; ``history.csv`` is the same for people.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import io
+import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING
 
 from cz_gym.commands import OneLineParser, guarded
+from studies.comparison.command import add_folders, check_numbers, compare
+
+if TYPE_CHECKING:
+    from optuna import Study
+    from optuna.trial import FrozenTrial
+
+    from cz_gym.agents.training.validation import Validation
+
+    from .space import Params
 
 PROG = "python -m studies.search"
-STARTUP, RIVALS = 8, 4
-"""Trials that are drawn at random first, and those that must have come as far before one is given up."""
+STARTUP, RIVALS, LOOKS = 8, 4, 6
+"""Trials drawn at random first; those that must be complete before one is given up; validations on a trial's way."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    args = _parser().parse_args(arguments)
-    left = "the same command goes on from the trials in its history"
-    return guarded(PROG, lambda: _main(args), "agents", left)
+    given = parser().parse_args(arguments)
+    return guarded(PROG, lambda: _main(given), "agents", "the same command goes on from the trials in its journal")
 
 
-def _parser() -> OneLineParser:
+def parser() -> OneLineParser:
+    """The options."""
     parser = OneLineParser(prog=PROG, description=(__doc__ or "").split("\n")[0])
     parser.add_argument(
-        "--trials", type=int, default=30, help="trials in all, kept ones included (default: %(default)s)"
+        "--trials", type=int, default=30, help="trials in all, earlier ones included (default: %(default)s)"
     )
     parser.add_argument("--steps", type=int, default=600_000, help="environment steps a trial (default: %(default)s)")
     parser.add_argument(
@@ -41,99 +51,140 @@ def _parser() -> OneLineParser:
     )
     parser.add_argument("--seeds", type=int, default=3, help="training seeds that confirm (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the search (default: %(default)s)")
-    parser.add_argument("--out", type=Path, default=Path("results/search"), help="results (default: %(default)s)")
-    parser.add_argument("--work", type=Path, default=Path("runs/search"), help="imitations (default: %(default)s)")
+    add_folders(parser, "search")
     return parser
 
 
-def _main(args: argparse.Namespace) -> int:
-    for name, least, most in (("trials", 1, 10_000), ("steps", 1, 10**9), ("finalists", 0, 100), ("seeds", 1, 100)):
-        if not least <= getattr(args, name) <= most:
-            raise ValueError(f"--{name} must be between {least} and {most}, not {getattr(args, name)}")
-    from cz_gym.atomic_files import check_writable, locked, write_files
+def _main(given: argparse.Namespace) -> int:
+    check_numbers(given, trials=(1, 10_000), steps=(1, 10**9), finalists=(0, 100), seeds=(1, 100))
+    from cz_gym.atomic_files import check_writable, locked
 
-    from .report import confirm, report
-    from .space import read_history
-
-    check_writable(args.out)
-    history = args.out / "history.csv"
-    read_history(history, args.steps)
-    with locked(args.work):
-        trials = search(history, args.trials, args.steps, args.work, args.seed)
-        confirmed = confirm(trials, args.finalists, args.seeds, args.steps, args.out / "confirmed", args.work)
-        write_files({args.out / "report.md": report(trials, confirmed, args.steps).encode()})
-    print(f"wrote {args.out / 'report.md'}")
+    check_writable(given.out)
+    with locked(given.work):
+        confirm(search(given), given)
     return 0
 
 
-def search(history: Path, count: int, steps: int, work: Path, seed: int = 0) -> list[Any]:
-    """Try settings until there are that many trials in all, going on from the history."""
+def objective(
+    params: Params,
+    seed: int,
+    given: argparse.Namespace,
+    report: Callable[[int, Validation], None] = lambda steps, found: None,
+) -> float:
+    """Mean cost of a step of the agent that these hyperparameters and this training seed make [-]."""
+    from tqdm import tqdm
+
+    from studies.comparison.results import COST, Plan
+    from studies.comparison.training import trained
+
+    from .space import recipe_of
+
+    plan = Plan(given.out, given.work, crystals()[0])
+    with tqdm(disable=True) as bar:
+        recipe = recipe_of(params, given.steps, "ppo-search")
+        return trained(plan, recipe, seed, bar, max(given.steps // LOOKS, 1), report).mean(COST)
+
+
+def crystals() -> tuple[Sequence[int], Sequence[int]]:
+    """Seeds of the crystals that trials are judged on, and of those that confirm; none of them picks a run's agent."""
+    from cz_gym.agents.training.validation import PICKING
+    from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+
+    rest = VALIDATION_SEEDS[len(PICKING) :]
+    return rest[:150], rest[150:350]
+
+
+def search(given: argparse.Namespace) -> Study:
+    """Try settings until there are as many trials as asked for, going on from the journal."""
     import optuna
+    from optuna.storages.journal import JournalFileBackend
 
     from cz_gym.agents.training.recipes import PPO
 
-    from .space import KNOBS, Trial, read_history, rounded, settings_of, values_of, write_history
-    from .trial import CHOOSE, LOOKS, Given, attempt
+    from .space import SPACE, params_of
 
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    done = read_history(history, steps)
-    ranges = {knob.name: _distribution(optuna, knob) for knob in KNOBS}
-    sampler = optuna.samplers.TPESampler(seed=seed + len(done), n_startup_trials=STARTUP)
-    study = optuna.create_study(sampler=sampler)
-    for trial in done:
-        _tell(optuna, study, ranges, trial)
-    for number in range(len(done), count):
-        asked = study.ask(ranges)
-        values = rounded(values_of(PPO()) if number == 0 else [asked.params[knob.name] for knob in KNOBS])
-        choice = settings_of(values, steps)
-        course: list[float] = []
+    given.out.mkdir(parents=True, exist_ok=True)
+    study = optuna.create_study(
+        storage=optuna.storages.JournalStorage(JournalFileBackend(str(given.out / "journal.log"))),
+        study_name=f"ppo-{given.steps}-steps",
+        load_if_exists=True,
+        pruner=optuna.pruners.MedianPruner(n_startup_trials=RIVALS),
+    )
+    recipe, done = params_of(PPO()), finished(study)
+    if all(trial.params != recipe for trial in done):
+        study.enqueue_trial(recipe)
+    for number in range(len(done), given.trials):
+        # What is asked for depends on finished trials only: one that was interrupted comes again, and its run goes on.
+        study.sampler = optuna.samplers.TPESampler(seed=given.seed + number, n_startup_trials=STARTUP)
+        trial = study.ask(SPACE)
 
-        def look(step: int, cost: float, share: float = choice.critic_steps / steps, course: Any = course) -> None:
-            course.append(cost)
-            if step / LOOKS > share and behind(course, done):
-                raise Given
+        def report(steps: int, found: Validation, trial: optuna.Trial = trial) -> None:
+            trial.report(found.cost, steps)
+            if trial.should_prune():
+                raise optuna.TrialPruned
 
         try:
-            found = attempt(choice, 0, CHOOSE, work, look)
-            cost, rmse = (found.last - found.start).mean(axis=0)
-            trial = Trial(values, False, float(cost), 1e3 * float(rmse), found.seconds, found.course, steps)
-        except Given:
-            trial = Trial(values, True, course[-1], float("nan"), 0.0, tuple(course), steps)
-        study.tell(asked, state=optuna.trial.TrialState.FAIL)  # what is told is the rounded setting
-        _tell(optuna, study, ranges, trial)
-        done.append(trial)
-        write_history(history, done)
-        print(f"trial {number}: cost {trial.cost:+.5f}{', given up' if trial.pruned else ''}", flush=True)
-    return done
+            study.tell(trial, objective(trial.params, 0, given, report))
+        except optuna.TrialPruned:
+            study.tell(trial, state=optuna.trial.TrialState.PRUNED)
+            for folder in given.work.iterdir():
+                shutil.rmtree(folder)
+        except BaseException:
+            study.tell(trial, state=optuna.trial.TrialState.FAIL)
+            raise
+        write_history(study, given.out / "history.csv")
+        print(f"trial {trial.number}: {study.trials[-1].state.name.lower()}", flush=True)
+    return study
 
 
-def behind(course: Sequence[float], others: Sequence[Any]) -> bool:
-    """Whether a trial's present cost is above the median of those that came as far; ``course`` is never empty."""
-    reached = [other.course[len(course) - 1] for other in others if len(other.course) >= len(course)]
-    return len(reached) >= RIVALS and course[-1] > median(reached)
+def finished(study: Study) -> list[FrozenTrial]:
+    """Trials that were judged or given up."""
+    return [trial for trial in study.trials if trial.state.name in ("COMPLETE", "PRUNED")]
 
 
-def _distribution(optuna: Any, knob: Any) -> Any:
-    if knob.whole:
-        return optuna.distributions.IntDistribution(int(knob.low), int(knob.high))
-    return optuna.distributions.FloatDistribution(knob.low, knob.high, log=knob.log)
+def write_history(study: Study, path: Path) -> None:
+    """Write the finished trials as CSV."""
+    from cz_gym.atomic_files import write_files
+
+    from .space import SPACE
+
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("trial", "state", "cost", "seconds", *SPACE))
+    for trial in finished(study):
+        seconds = trial.duration.total_seconds() if trial.duration else 0.0
+        cost = f"{trial.value:.6g}" if trial.value is not None else ""
+        values = [f"{trial.params[name]:.6g}" for name in SPACE]
+        writer.writerow((trial.number, trial.state.name.lower(), cost, f"{seconds:.0f}", *values))
+    write_files({path: text.getvalue().encode()})
 
 
-def _tell(optuna: Any, study: Any, ranges: Any, trial: Any) -> None:
-    kind = optuna.trial.TrialState
-    params = {
-        name: (round if isinstance(at, optuna.distributions.IntDistribution) else float)(min(max(v, at.low), at.high))
-        for (name, at), v in zip(ranges.items(), trial.values, strict=True)
-    }
-    study.add_trial(
-        optuna.trial.create_trial(
-            params=params,
-            distributions=ranges,
-            value=trial.cost,
-            intermediate_values=dict(enumerate(trial.course, 1)),
-            state=kind.PRUNED if trial.pruned else kind.COMPLETE,
-        )
+def confirm(study: Study, given: argparse.Namespace) -> None:
+    """Train the best trials once more beside the recipe, on other crystals and training seeds, and write their table.
+
+    Training seeds begin at 1: the search used 0.
+    """
+    from cz_gym.agents.training.recipes import PPO
+    from studies.comparison.results import Plan
+    from studies.comparison.variants import Study as Comparison
+    from studies.comparison.variants import Variant
+
+    from .space import params_of, recipe_of
+
+    complete = sorted(
+        (trial for trial in finished(study) if trial.state.name == "COMPLETE"), key=lambda each: each.values
     )
+    best = [trial for trial in complete if trial.params != params_of(PPO())][: given.finalists]
+    variants = [Variant(PPO(), "the recipe as it stands").of(given.steps)]
+    for trial in best:
+        recipe = recipe_of(trial.params, given.steps, f"ppo-trial-{trial.number}")
+        meaning = ", ".join(f"{name} {value:.4g}" for name, value in trial.params.items())
+        variants.append(Variant(recipe, meaning, variants[0].name))
+    comparison = Comparison("search", f"The best of {len(complete)} trials beside the recipe", variants, given.steps)
+    if best:
+        plan = Plan(given.out, given.work, crystals()[1])
+        compare(comparison, plan, variants, range(1, 1 + given.seeds), 1)
 
 
 if __name__ == "__main__":

@@ -6,8 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from cz_gym.baselines.registry import find_controller
-from cz_gym.config import make_config
+from cz_gym.baselines.registry import make_controller
 
 from .cases import Skipped
 
@@ -16,32 +15,27 @@ _UPDATES = 3
 
 
 def environment_share() -> dict[str, float] | Skipped:
-    """Time in the adapter's step and in the twin that rewards are compared with, over the time that learning takes [-].
-
-    What the teacher computes on the twin is no environment's, nor is imitating it before.
-    """
+    """Time in the adapter's step over the time that learning takes [-]."""
     try:
         import torch
 
-        from cz_gym.agents.training import recipes as settings
-        from cz_gym.agents.training.learners import make_training
+        from cz_gym.agents.training.learners import make_learner
+        from cz_gym.agents.training.recipes import PPO
     except ImportError as error:
         return Skipped(NAME, f"{error.name or error} is not installed")
     threads = torch.get_num_threads()
     try:
-        choice = settings.PPO()
-        teacher = find_controller(choice.recipe.clone.teacher).make(make_config())
-        return {NAME: _measured(make_training(choice, 0, None, 0, teacher), choice)}
+        recipe = PPO()
+        return {NAME: _measured(make_learner(recipe, 0, make_controller), recipe.n_steps * recipe.num_envs)}
     except Exception as error:  # what training needs must not end the run
         return Skipped(NAME, " ".join(f"{type(error).__name__}: {error}".split())[:100])
     finally:
         torch.set_num_threads(threads)
 
 
-def _measured(training: Any, choice: Any) -> float:
-    learner, update = training.learner, choice.n_steps * choice.recipe.num_envs
-    learner.learn(update, callback=training.callbacks)
-    paired, spent = learner.env, 0.0
+def _measured(learner: Any, update: int) -> float:
+    algorithm, spent = learner.algorithm, 0.0
+    algorithm.learn(update)
 
     def timed(step: Callable[..., Any]) -> Callable[..., Any]:
         def run(*arguments: Any) -> Any:
@@ -54,10 +48,10 @@ def _measured(training: Any, choice: Any) -> float:
 
         return run
 
-    paired.slots.step_wait = timed(paired.slots.step_wait)
-    paired.twin.step = timed(paired.twin.step)
+    slots = algorithm.env.slots
+    slots.step_wait = timed(slots.step_wait)
     began = time.perf_counter()
-    learner.learn(_UPDATES * update, callback=training.callbacks, reset_num_timesteps=False)
+    algorithm.learn(_UPDATES * update, reset_num_timesteps=False)
     whole = time.perf_counter() - began
-    learner.env.close()
+    algorithm.env.close()
     return spent / whole

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import shlex
+import subprocess
+import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +21,10 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 
 import cz_gym  # noqa: F401  (registers Cz-v0)
-from cz_gym.agents import OnnxPolicy, from_sb3
-from cz_gym.agents.agent_file.contract import AgentFileError
+from cz_gym.agents import AgentFileError, OnnxPolicy, from_sb3
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
+ROOT = Path(__file__).parents[2]
 ON = {"n_steps": 16, "batch_size": 32, "n_epochs": 1}
 OFF = {"learning_starts": 8, "buffer_size": 64, "batch_size": 8}
 KINDS: dict[str, tuple[Any, str, dict[str, Any]]] = {
@@ -39,6 +42,7 @@ KINDS: dict[str, tuple[Any, str, dict[str, Any]]] = {
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(from_sb3, "JUDGING", VALIDATION_SEEDS[:2])
+    torch.set_num_threads(1)
 
 
 def trained(kind: str, normalised: bool = False, observation: str = "history") -> Any:
@@ -119,6 +123,19 @@ def test_a_file_that_would_act_otherwise_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(AgentFileError, match=r"otherwise than the model, by up to 0\.01"):
         from_sb3.save_agent(tmp_path / "mine.onnx", model, "mine")
     assert not list(tmp_path.iterdir())
+
+
+def test_without_stable_baselines3_it_says_what_to_install() -> None:
+    code = (
+        "import sys; sys.modules['stable_baselines3'] = sys.modules['torch'] = None\n"
+        "from cz_gym.agents import from_sb3\n"
+        "sys.exit(from_sb3.main(['a.zip', '--algo', 'ppo', '--out', 'b.onnx']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert 'pip install "cz-gym[agents]"' in done.stderr
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert any(name.startswith("stable-baselines3") for name in extras["agents"])
 
 
 @pytest.mark.parametrize(

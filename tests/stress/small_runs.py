@@ -47,7 +47,7 @@ WRITING = "cz_gym.evaluation.report.output:write_files:1"
 BENCHMARK = {
     "start-up": ("benchmark:make_plan:1", None),
     "episodes": ("cz_gym.evaluation.runner:rollout:1>cz_gym.vector:CzVectorEnv.step:1000", None),
-    "slow episodes": ("cz_gym.evaluation.cache.slow_controllers:rollout:2>cz_gym.vector:CzVectorEnv.step:1000", None),
+    "slow episodes": ("cz_gym.evaluation.cache:rollout:2>cz_gym.vector:CzVectorEnv.step:1000", None),
     "figures": ("cz_gym.evaluation.report.figures:draw_figures:1", None),
     "page": ("cz_gym.evaluation.report.page:page:1", None),
     "first results, before they count": (f"{WRITING}>os:rename:1", None),

@@ -14,7 +14,9 @@ pytest.importorskip("onnx")
 
 from cz_gym import agents
 from cz_gym.agents.agent_file.contract import read_agent
-from cz_gym.agents.training.export import Actor, to_onnx
+from cz_gym.agents.training.export import drive_policy_onnx
+from cz_gym.agents.training.imitation import make_network
+from cz_gym.agents.training.recipes import ActionHead, Imitation
 from cz_gym.baselines import CompensatedPID
 from cz_gym.baselines.analysis.frequency import frequencies, margins_of, opened
 from cz_gym.baselines.analysis.frequency import response as theirs
@@ -63,15 +65,19 @@ def test_the_derivative_is_the_chain_rules() -> None:
     def some(*shape: int) -> Any:
         return random.normal(0.0, 0.1, shape).astype(np.float32)
 
-    mean, scaling, first, last, direct = some(n), some(n, n), some(6, n), some(2, 6), some(2, n)
-    layers = ((first, some(6)), (last, some(2)))
-    actor = Actor(mean, scaling, (direct, some(2)), layers, "Tanh", False, 1.0, np.array([0.05, 0.02], np.float32))
+    network = make_network(Imitation(name="some", hidden=(6,), head=ActionHead(1.0, 0.05, 0.02)), 0)
+    channels = len(network.features_extractor.mean)
+    network.features_extractor.set(some(channels), some(channels, channels))
+    weights = {name: value.numpy().astype(float) for name, value in network.state_dict().items()}
+    mean, scaling = weights["features_extractor.mean"][:n], weights["features_extractor.scaling"][:n, :n]
+    first, bias = weights["mlp_extractor.actor.0.weight"], weights["mlp_extractor.actor.0.bias"]
+    last, direct = weights["action_net.linear.weight"], weights["mlp_extractor.direct.weight"]
     at = np.float64(some(n))
-    bent = 1.0 - np.tanh(first.astype(float) @ ((at - mean) @ scaling) + layers[0][1]) ** 2
-    expected = actor.scale[:, None] * ((last * bent) @ first.astype(float) + direct) @ scaling.T.astype(float)
+    bent = 1.0 - np.tanh(first @ ((at - mean) @ scaling) + bias) ** 2
+    expected = weights["action_net.scale"][:, None] * ((last * bent) @ first + direct) @ scaling.T
     expected[0, AT[2]] += 1.0
     expected[1, AT[3]] += 1.0
-    assert jacobian(to_onnx(actor), at) == pytest.approx(expected, rel=1e-6, abs=1e-9)
+    assert jacobian(drive_policy_onnx(network), at) == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
 def test_a_linear_agent_answers_alike_as_state_space_and_in_frequency(near: Any) -> None:

@@ -1,114 +1,121 @@
-"""The search: begins with the recipe, keeps what it tried, gives up the hopeless, says whether anything was found."""
+"""The search: begins with the recipe, goes on from its journal, gives up the hopeless, confirms the best."""
 
 from __future__ import annotations
 
+import csv
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from cz_gym.agents.training import recipes as settings
 from cz_gym.agents.training import run
-from cz_gym.agents.training.validation import PICKING
+from cz_gym.agents.training.recipes import PPO
+from cz_gym.agents.training.validation import PICKING, Validation
 from cz_gym.evaluation.protocol import TEST_SEEDS, VALIDATION_SEEDS
+from studies.comparison import training
 from studies.search import __main__ as search
-from studies.search import report as search_report
-from studies.search import trial as search_trial
-from studies.search.space import KNOBS, Trial, read_history, settings_of, values_of, write_history
-from studies.search.trial import CHOOSE, CONFIRM, Given, Tried
+from studies.search.space import SPACE, params_of, recipe_of
 
-SHIPPED = values_of(settings.PPO())
+RECIPE = params_of(PPO())
 
 
-def test_the_knobs_turn_what_they_say() -> None:
-    shipped = settings.PPO()
-    again = settings_of(SHIPPED, shipped.steps)
-    assert again.gamma == pytest.approx(shipped.gamma)
-    assert asdict(again) | {"gamma": shipped.gamma} == asdict(shipped)
-    for number, knob in enumerate(KNOBS):
-        assert knob.low <= SHIPPED[number] <= knob.high
-        turned = tuple(knob.low if place == number else value for place, value in enumerate(SHIPPED))
-        other = settings_of(turned, shipped.steps)
-        assert values_of(other)[number] == pytest.approx(knob.low, rel=1e-3)
-        apart = {name for name, value in asdict(other).items() if value != asdict(again)[name]}
-        assert len(apart) == 1
+def test_the_space_turns_what_it_says() -> None:
+    again = recipe_of(RECIPE, PPO().steps, "ppo")
+    assert again.gamma == pytest.approx(PPO().gamma)
+    assert asdict(again) | {"gamma": PPO().gamma} == asdict(PPO())
+    assert set(RECIPE) == set(SPACE)
+    for name, distribution in SPACE.items():
+        assert distribution._contains(distribution.to_internal_repr(RECIPE[name]))
+        least: Any = distribution.to_external_repr(0) if hasattr(distribution, "choices") else distribution.low
+        other = recipe_of({**RECIPE, name: least}, PPO().steps, "ppo")
+        assert params_of(other)[name] == pytest.approx(least)
+        assert len({key for key, value in asdict(other).items() if value != asdict(again)[key]}) == 1
 
 
-def test_crystals_that_select_choose_and_confirm_are_others() -> None:
-    looked, tested = set(PICKING), set(TEST_SEEDS)
-    assert set(CHOOSE) | set(CONFIRM) <= set(VALIDATION_SEEDS)
-    assert not set(CHOOSE) & set(CONFIRM)
-    assert not (set(CHOOSE) | set(CONFIRM)) & (looked | tested)
-
-
-def bowl(choice: settings.PPO) -> float:
-    """A cost that is least where the actor's pace is 0.05 and the noise is small."""
-    return 0.01 * (np.log(choice.actor_pace / 0.05) ** 2 + choice.noise[0])
+def test_crystals_that_pick_judge_and_confirm_are_others() -> None:
+    groups = [set(PICKING), *map(set, search.crystals())]
+    assert set.union(*groups) <= set(VALIDATION_SEEDS)
+    assert sum(map(len, groups)) == len(set.union(*groups))
+    assert not set.union(*groups) & set(TEST_SEEDS)
 
 
 @pytest.fixture
-def simple(monkeypatch: pytest.MonkeyPatch) -> list[settings.PPO]:
-    """Trials that take no time."""
-    made: list[settings.PPO] = []
+def tried(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """Trials that take no time: their cost is least at a small rate and many epochs."""
+    made: list[dict[str, Any]] = []
 
-    def attempt(choice: settings.PPO, seed: int, judged: Any, work: Path, tell: Any = lambda look, cost: None) -> Tried:
-        made.append(choice)
+    def bowl(params: dict[str, Any], seed: int, given: Any, report: Any) -> float:
+        assert seed == 0
+        made.append(params)
+        cost = params["learning_rate"] / 1e-3 + 1.0 / params["n_epochs"]
         for look in range(1, 4):
-            tell(look, bowl(choice) * look / 3)
-        noise = np.random.default_rng([seed, 1]).normal(scale=1e-5, size=(len(judged), 2))
-        return Tried(bowl(choice) + noise, 0.0 * noise, (bowl(choice),), 1.0)
+            report(look, Validation(cost, 0.1, 0.01, 0.0))
+        return float(cost)
 
-    monkeypatch.setattr(search_trial, "attempt", attempt)
-    monkeypatch.setattr(search_report, "attempt", attempt)
+    monkeypatch.setattr(search, "objective", bowl)
     return made
 
 
-def command(folder: Path, trials: int) -> list[str]:
-    return ["--trials", str(trials), "--out", str(folder / "out"), "--work", str(folder / "work")]
+def command(folder: Path, trials: int, finalists: int = 0) -> list[str]:
+    folders = ["--out", str(folder / "out"), "--work", str(folder / "work")]
+    return ["--trials", str(trials), "--finalists", str(finalists), *folders]
 
 
-def test_a_search_begins_with_the_recipe_and_goes_on(
-    simple: list[settings.PPO], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def history(folder: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader((folder / "out" / "history.csv").read_text().splitlines()))
+
+
+def test_a_search_begins_with_the_recipe_and_goes_on(tried: list[dict[str, Any]], tmp_path: Path) -> None:
+    assert search.main(command(tmp_path, 12)) == 0
+    first = history(tmp_path)
+    assert tried[0] == RECIPE
+    assert float(first[0]["learning_rate"]) == pytest.approx(RECIPE["learning_rate"])
+    assert search.main(command(tmp_path, 24)) == 0
+    every = history(tmp_path)
+    assert every[:12] == first
+    assert len(every) == len(tried) == 24
+    assert {row["state"] for row in every} == {"complete", "pruned"}
+    assert min(float(row["cost"]) for row in every if row["state"] == "complete") < 0.8 * float(first[0]["cost"])
+    assert search.main(command(tmp_path, 24)) == 0
+    assert len(tried) == 24
+    assert search.main([*command(tmp_path, 2), "--steps", "7"]) == 0
+    assert len(tried) == 26, "trials of other steps are another search"
+
+
+def test_an_interrupted_trial_comes_again(
+    tried: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert search.main([*command(tmp_path, 12), "--finalists", "0"]) == 0
-    path = tmp_path / "out" / "history.csv"
-    first = path.read_text().splitlines()
-    assert len(first) == 13
-    np.testing.assert_allclose(read_history(path, 600_000)[0].values, SHIPPED, rtol=1e-3)
-    assert search.main(command(tmp_path, 30)) == 0
-    assert path.read_text().splitlines()[:13] == first
-    trials = read_history(path, 600_000)
-    assert len(trials) == 30
-    assert any(trial.pruned for trial in trials)
-    assert min(trial.cost for trial in trials) < 0.5 * trials[0].cost
-    assert "better than the recipe: trial" in (tmp_path / "out" / "report.md").read_text()
-    times = len(simple)
-    assert search.main(command(tmp_path, 30)) == 0
-    assert len(simple) == times
-    assert search.main([*command(tmp_path, 30), "--steps", "7"]) == 2
-    assert "holds trials of --steps 600000, not 7" in capsys.readouterr().err
+    assert search.main(command(tmp_path, 4)) == 0
+    stopped: list[dict[str, Any]] = []
 
-
-def test_a_search_without_a_find_says_so() -> None:
-    noise = np.random.default_rng(0).normal(scale=1e-3, size=(2, 3, 50, 2))
-    text = search_report.report([], {0: noise[0], 4: noise[1]}, 1000)
-    assert "None is better than the recipe beyond this noise." in text
-    assert "trial 4" in search_report.report([], {0: noise[0], 4: noise[0] - 1e-4}, 1000)
-
-
-def test_an_interrupted_search_keeps_its_trials(
-    simple: list[settings.PPO], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def stop(*args: Any) -> Tried:
+    def stop(params: dict[str, Any], *others: Any) -> float:
+        stopped.append(params)
         raise KeyboardInterrupt
 
-    assert search.main([*command(tmp_path, 2), "--finalists", "0"]) == 0
-    monkeypatch.setattr(search_trial, "attempt", stop)
-    assert search.main(command(tmp_path, 5)) == 130
+    with monkeypatch.context() as patch:
+        patch.setattr(search, "objective", stop)
+        assert search.main(command(tmp_path, 6)) == 130
     assert "goes on from the trials" in capsys.readouterr().err
-    assert len(read_history(tmp_path / "out" / "history.csv", 600_000)) == 2
+    assert len(history(tmp_path)) == 4
+    assert search.main(command(tmp_path, 6)) == 0
+    assert tried[4] == stopped[0]
+    assert len(history(tmp_path)) == 6
+
+
+def test_the_best_are_confirmed_with_other_seeds(
+    tried: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    met: list[Any] = []
+    monkeypatch.setattr(search, "compare", lambda *given: met.append(given))
+    assert search.main([*command(tmp_path, 10, finalists=2), "--seeds", "2"]) == 0
+    ((study, plan, variants, seeds, _),) = met
+    assert [variant.base for variant in variants] == ["", "ppo", "ppo"]
+    assert list(plan.crystals) == list(search.crystals()[1])
+    assert list(seeds) == [1, 2]
+    done = sorted((row for row in history(tmp_path)[1:] if row["state"] == "complete"), key=lambda r: float(r["cost"]))
+    assert [variant.name for variant in study.variants[1:]] == [f"ppo-trial-{row['trial']}" for row in done[:2]]
+    assert variants[1].recipe.learning_rate == pytest.approx(float(done[0]["learning_rate"]), rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -126,32 +133,24 @@ def test_mistakes_give_one_line(arguments: list[str], message: str, capsys: pyte
     assert error.count("\n") == 1
 
 
-@pytest.mark.parametrize("content", ["a,b\n1,2\n", "half"])
-def test_another_history_is_refused(content: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "out").mkdir()
-    path = tmp_path / "out" / "history.csv"
-    write_history(path, [Trial(SHIPPED, False, 0.0, 0.0, 1.0, (0.1, 0.2), 600_000)])
-    assert read_history(path, 600_000)[0].course == (0.1, 0.2)
-    path.write_text(path.read_text()[:-20] + "\n" if content == "half" else content)
-    assert search.main(command(tmp_path, 1)) == 2
-    error = capsys.readouterr().err
-    assert "history.csv" in error
-    assert error.count("\n") == 1
-
-
-def test_a_trial_learns_from_the_kept_imitation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_objective_trains_once_and_can_be_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run, "PICKING", VALIDATION_SEEDS[:2])
-    recipe = settings.Recipe(num_envs=16, hidden=(8, 8), clone=settings.Clone("lqg", rounds=1, episodes=2, epochs=1))
-    quick = settings.PPO(recipe=recipe, n_steps=16, batch_size=256, n_epochs=1, critic_steps=0, steps=512)
+    monkeypatch.setattr(search, "crystals", lambda: (VALIDATION_SEEDS[2:4], VALIDATION_SEEDS[4:6]))
+    given: Any = search.parser().parse_args([*command(tmp_path, 1), "--steps", "24576"])
     looks: list[int] = []
-    found = search_trial.attempt(quick, 0, VALIDATION_SEEDS[2:5], tmp_path, lambda look, cost: looks.append(look))
-    assert found.last.shape == found.start.shape == (3, 2)
-    assert looks == list(range(1, len(found.course) + 1))
-    assert len(looks) >= 2
+    cost = search.objective(RECIPE, 0, given, lambda steps, found: looks.append(steps))
+    assert cost > 0.0
+    assert len(looks) >= search.LOOKS
+    monkeypatch.setattr(training, "Run", None)
+    assert search.objective(RECIPE, 0, given) == cost, "the result is cached"
+    monkeypatch.undo()
 
-    def give_up(look: int, cost: float) -> None:
-        raise Given
+    class GivenUp(Exception):
+        pass
 
-    with pytest.raises(Given):
-        search_trial.attempt(quick, 0, VALIDATION_SEEDS[2:5], tmp_path, give_up)
-    assert [path.name for path in tmp_path.iterdir()] == ["imitations"]
+    def give_up(steps: int, found: Validation) -> None:
+        raise GivenUp
+
+    monkeypatch.setattr(run, "PICKING", VALIDATION_SEEDS[:2])
+    with pytest.raises(GivenUp):
+        search.objective({**RECIPE, "n_epochs": 1}, 0, given, give_up)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,29 +12,31 @@ from contracts import facts
 
 from cz_gym.agents.agent_file.contract import make_contract
 from cz_gym.agents.policies.onnx import OnnxPolicy
-from cz_gym.agents.training import recipes as settings
-from cz_gym.agents.training.export import exported
-from cz_gym.agents.training.learners import make_training
+from cz_gym.agents.training.learners import make_learner
+from cz_gym.agents.training.recipes import RecurrentPPO
+from cz_gym.baselines.registry import make_controller
 from cz_gym.config import make_config
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.observation import HISTORY
+from cz_gym.observation import DRIVE_CHANNELS, HISTORY
 
-RECIPE = replace(settings.RecurrentPPO().recipe, num_envs=8, hidden=(5,))
-SMALL = replace(settings.RecurrentPPO(), recipe=RECIPE, units=7, n_steps=16, batch_size=64, n_epochs=1, steps=256)
-NAMES = [channel.name for channel in HISTORY]
+SMALL = RecurrentPPO(num_envs=8, hidden=(5,), units=7, n_steps=16, batch_size=64, n_epochs=1, steps=256)
+
+
+def trained() -> Any:
+    learner: Any = make_learner(SMALL, 0, make_controller)
+    learner.learn(lambda steps, doing: None)
+    return learner
 
 
 @pytest.fixture(scope="module")
 def learner() -> Any:
-    training = make_training(SMALL, 0, None)
-    training.learner.learn(SMALL.steps, callback=training.callbacks)
-    return training.learner
+    return trained()
 
 
 @pytest.fixture(scope="module")
 def agent(learner: Any) -> OnnxPolicy:
-    content = exported(learner)
+    content = learner.exported()
     return OnnxPolicy.of(make_contract(content, **facts(algorithm="ppo-recurrent")), content)
 
 
@@ -47,11 +48,10 @@ def test_the_file_acts_as_the_policy_does(learner: Any, agent: OnnxPolicy) -> No
     for k in range(6):
         observation = random.normal(0.0, 0.5, (3, len(HISTORY))).astype(np.float32)
         begins = np.array([k == 0, k in (0, 2), k in (0, 3)])
-        moves, theirs = learner.policy.predict(observation, theirs, begins, deterministic=True)
-        applied = observation[:, [NAMES.index("v_p"), NAMES.index("Q_H")]]
-        scale = [SMALL.recipe.head.pull_scale, SMALL.recipe.head.heater_scale]
+        moves, theirs = learner.algorithm.policy.predict(observation, theirs, begins, deterministic=True)
+        applied = observation[:, list(DRIVE_CHANNELS)]
         action, ours = agent.predict(observation, ours, begins)
-        assert action == pytest.approx(np.clip(applied + scale * moves, -1.0, 1.0), abs=2e-6)
+        assert action == pytest.approx(np.clip(applied + np.array(SMALL.head.scale) * moves, -1.0, 1.0), abs=2e-6)
         assert ours == pytest.approx(np.concatenate([theirs[0][-1], theirs[1][-1]], axis=1), abs=2e-6)
 
 
@@ -72,6 +72,4 @@ def test_crystals_of_a_batch_do_not_meet(agent: OnnxPolicy) -> None:
 
 
 def test_same_training_seed_same_agent(learner: Any) -> None:
-    training = make_training(SMALL, 0, None)
-    training.learner.learn(SMALL.steps, callback=training.callbacks)
-    assert exported(training.learner) == exported(learner)
+    assert trained().exported() == learner.exported()

@@ -64,7 +64,7 @@ def test_every_file_says_its_command() -> None:
     for path in FOLDER.glob("*.yml"):
         command = f"python -m rl_zoo3.train --algo {path.stem} --env Cz-v0 --gym-packages cz_gym"
         text = path.read_text()
-        assert f"{command} --conf-file agents/rl_zoo/{path.name}" in text
+        assert f"{command} --conf-file examples/rl_zoo/{path.name}" in text
         observation = read(path.stem)["env_kwargs"]["observation"]
         # RL-Zoo 2.9 evaluates on an environment without the file's env_kwargs, whose default is "measured".
         assert observation == "measured" or f"--env-kwargs \"observation:'{observation}'\"" in text

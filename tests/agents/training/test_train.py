@@ -6,35 +6,35 @@ import csv
 import errno
 import json
 import os
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 import train
-from cz_gym import CzVectorEnv
 from cz_gym.agents import OnnxPolicy
-from cz_gym.agents.training import recipes as settings
-from cz_gym.agents.training import run, run_files
-from cz_gym.agents.training.vec_env import CzVecEnv
-from cz_gym.agents.training.wrappers import DriveAction, TrainingReward
+from cz_gym.agents.training import imitation, run, run_files
+from cz_gym.agents.training.recipes import PPO, RECIPES, Imitation
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
 ROOT = Path(__file__).parents[3]
+POINTS = {
+    "before the first step": ("ppo", run.Run, "learn"),
+    "at the first validation": ("ppo", run.Run, "_validate"),
+    "in the first round's fit": ("imitation", imitation, "fit"),
+    "between imitation and validation": ("imitation", run.Run, "_validate"),
+    "at the summary": ("imitation", run.Run, "finish"),
+}
+"""Where a run is killed: recipe, and the function at whose first call it ends."""
 
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run, "PICKING", VALIDATION_SEEDS[:2])
     monkeypatch.setattr(run, "JUDGING", VALIDATION_SEEDS[2:4])
-    recipe = replace(
-        settings.RECIPES["ppo"].recipe, num_envs=64, clone=settings.Clone("lqg", rounds=2, episodes=2, epochs=1)
-    )
-    monkeypatch.setitem(
-        settings.RECIPES, "ppo", replace(settings.PPO(), recipe=recipe, n_steps=32, batch_size=1024, critic_steps=4096)
-    )
+    monkeypatch.setitem(RECIPES, "ppo", PPO(num_envs=64, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,)))
+    few = {"rounds": 2, "episodes": 4, "wide_share": 0.0, "epochs": 1, "hidden": (16,), "control_interval": 30.0}
+    monkeypatch.setitem(RECIPES, "imitation", Imitation(name="imitation", teacher="lqg", **few))
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -47,7 +47,7 @@ def test_a_run_leaves_everything_and_goes_on(tmp_path: Path, capsys: pytest.Capt
     assert train.main(["--steps", "20000", "--seed", "3", "--out", str(folder)]) == 0
     saved = json.loads((folder / "settings.json").read_text())
     assert saved["seed"] == 3
-    assert saved["settings"]["recipe"]["scenario"] == "randomized"
+    assert saved["settings"]["scenario"] == "randomized"
     assert saved["packages"]["stable-baselines3"]
     assert {"command", "git_commit", "plant_hash", "scenario_hash"} <= set(saved)
     policy = OnnxPolicy.load(folder / "agent.onnx")
@@ -55,9 +55,8 @@ def test_a_run_leaves_everything_and_goes_on(tmp_path: Path, capsys: pytest.Capt
     summary, picked = json.loads((folder / "summary.json").read_text()), rows(folder / "progress.csv")
     assert policy.contract.validation_cost == summary["validation_cost"]
     assert policy.contract.validation_rmse_mm == summary["validation_rmse_mm"]
-    assert summary["validation_cost"] not in {float(row["validation_cost"]) for row in picked}, (
-        "judged as it was picked"
-    )
+    picked_by = {float(row["validation_rmse_mm"]) for row in picked}
+    assert summary["validation_rmse_mm"] not in picked_by, "judged as it was picked"
     assert list((folder / "tensorboard").rglob("events.*"))
     before = rows(folder / "progress.csv")
     assert float(before[-1]["paper_rmse_mm"]) > 0
@@ -102,43 +101,47 @@ def test_an_interrupted_run_keeps_its_checkpoint(
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_run_killed_at_once_can_be_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def die(self: Any, bar: Any) -> None:
-        raise ValueError("killed")
-
-    folder = tmp_path / "run"
-    with monkeypatch.context() as patch:
-        patch.setattr(run.Run, "learn", die)
-        assert train.main(["--steps", "10000", "--out", str(folder)]) == 2
-    assert train.main(["--resume", "--out", str(folder)]) == 0
-    saved = json.loads((folder / "settings.json").read_text())
-    assert [session["from_step"] for session in saved["sessions"]] == [0, 0]
-
-
-@pytest.mark.usefixtures("quick")
-def test_a_run_killed_between_imitation_and_first_step_does_not_imitate_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("point", POINTS)
+def test_a_run_that_is_killed_can_be_resumed(point: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def die(*arguments: Any) -> None:
         raise ValueError("killed")
 
-    folder = tmp_path / "run"
+    algorithm, owner, name = POINTS[point]
+    folder, steps = tmp_path / "run", ["--steps", "10000"] if algorithm == "ppo" else []
     with monkeypatch.context() as patch:
-        patch.setattr(run.Tell, "_on_step", die)
-        assert train.main(["--steps", "2048", "--out", str(folder)]) == 2
-    imitated = rows(folder / "progress.csv")
-    assert [row["steps"] for row in imitated] == ["0"]
-    monkeypatch.setattr(run, "clone", die)
-    assert train.main(["--resume", "--out", str(folder)]) == 0
-    assert rows(folder / "progress.csv")[:1] == imitated
+        patch.setattr(owner, name, die)
+        assert train.main(["--algo", algorithm, *steps, "--out", str(folder)]) == 2
+    assert not (folder / "summary.json").exists()
+    assert train.main(["--algo", algorithm, "--resume", "--out", str(folder)]) == 0
+    saved = json.loads((folder / "settings.json").read_text())
+    assert len(saved["sessions"]) == 2
+    assert (folder / "summary.json").exists()
 
 
-def test_settings_that_are_none_are_damaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = tmp_path / "run"
-    folder.mkdir()
-    (folder / "settings.json").write_text("[]")
-    assert train.main(["--resume", "--steps", "10", "--out", str(folder)]) == 2
-    assert "missing or damaged" in capsys.readouterr().err
+@pytest.mark.usefixtures("quick")
+def test_a_killed_imitation_ends_as_one_that_was_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fit, calls = imitation.fit, []
+
+    def die_in_round_2(*arguments: Any) -> float:
+        calls.append(1)
+        if len(calls) == 2:
+            raise ValueError("killed")
+        return fit(*arguments)
+
+    whole, killed = (["--algo", "imitation", "--out", str(tmp_path / name)] for name in ("whole", "killed"))
+    assert train.main(whole) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(imitation, "fit", die_in_round_2)
+        assert train.main([*killed, "--checkpoint-seconds", "0"]) == 2
+    assert train.main([*killed, "--resume"]) == 0
+    one, other = ((tmp_path / name / "agent.onnx").read_bytes() for name in ("whole", "killed"))
+    assert one == other
+    before = rows(tmp_path / "whole" / "progress.csv")
+    monkeypatch.setattr(imitation, "fit", die_in_round_2)
+    assert train.main([*whole, "--resume"]) == 0, "nothing was left to learn"
+    assert rows(tmp_path / "whole" / "progress.csv")[:1] == before
+    contract = OnnxPolicy.load(tmp_path / "whole" / "agent.onnx").contract
+    assert (contract.algorithm, contract.training_steps) == ("imitation", 0)
 
 
 def test_interrupting_before_learning_gives_one_line(
@@ -179,6 +182,8 @@ def test_impossible_arguments_exit_with_2(
     ("arguments", "message"),
     [
         (["--scenario", "quiet"], "unknown scenario 'quiet'"),
+        (["--algo", "imitation", "--steps", "9"], "imitation takes no --steps"),
+        (["--algo", "imitation", "--resume"], "nothing to resume"),
         (["--resume"], "nothing to resume"),
     ],
 )
@@ -208,7 +213,8 @@ def test_a_full_disk_is_one_line_that_names_the_file(
 
 
 @pytest.mark.parametrize(
-    "settings", ["[" * 100_000, '{"steps": true, "sessions": [{}]}', '{"steps": 9, "sessions": 3}', "x" * 2_000_000]
+    "settings",
+    ["[]", "[" * 100_000, '{"steps": true, "sessions": [{}]}', '{"steps": 9, "sessions": 3}', "x" * 2_000_000],
 )
 def test_settings_from_a_stranger_are_refused_in_one_line(
     tmp_path: Path, settings: str, capsys: pytest.CaptureFixture[str]
@@ -218,34 +224,3 @@ def test_settings_from_a_stranger_are_refused_in_one_line(
     error = capsys.readouterr().err
     assert "missing or damaged" in error
     assert error.count("\n") == 1
-
-
-def slots(**settings: Any) -> CzVecEnv:
-    return CzVecEnv(CzVectorEnv(2, observation="history", autoreset_mode="SameStep", **settings))
-
-
-def test_training_reward_makes_a_failure_cost_the_worst_for_ever() -> None:
-    env = TrainingReward(slots(), gamma=0.9)
-    env.seed(0)
-    env.reset()
-    worst = 0.0
-    for _ in range(2000):
-        _, reward, done, infos = env.step(np.array([[1.0, 1.0], [0.0, 0.0]], np.float32))
-        if done[0]:
-            assert not infos[0]["TimeLimit.truncated"]
-            worst = float(reward[0])
-            break
-    assert worst == pytest.approx(-10.0)
-
-
-def test_drive_action_moves_the_drives_from_where_they_are() -> None:
-    plain, driven = slots(), DriveAction(slots(), 1.0, (0.1, 0.2))
-    for env in (plain, driven):
-        env.seed(5)
-        env.reset()
-    position = np.zeros(2)
-    for move in ([1.0, -0.5], [0.5, 1.0], [-1.0, 0.0]):
-        position = position + np.array([0.1, 0.2]) * move
-        expected = plain.step(np.tile(position, (2, 1)).astype(np.float32))
-        got = driven.step(np.tile(move, (2, 1)).astype(np.float32))
-        np.testing.assert_allclose(got[0], expected[0], atol=1e-6)

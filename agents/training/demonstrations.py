@@ -1,0 +1,100 @@
+"""Demonstrations: what a controller, the teacher, would do on crystals that it or its imitation drives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym import CzVectorEnv
+from cz_gym.config import Config
+from cz_gym.episodes.scenario import Scenario
+
+Floats = npt.NDArray[np.float32]
+SAMPLE_EVERY = 4
+"""Samples from one that is kept to the next."""
+
+
+class Demonstrations(NamedTuple):
+    """Observations, and what the teacher would do there."""
+
+    observation: Floats
+    """Shape (samples, channels)."""
+    action: Floats
+    """Shape (samples, 2)."""
+
+    @classmethod
+    def joined(cls, parts: Iterable[Demonstrations]) -> Demonstrations:
+        """All of them as one."""
+        return cls(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def demonstrate(
+    teacher: Any,
+    config: Config,
+    seeds: Sequence[int],
+    noise: tuple[float, float],
+    driver: Callable[[Floats], Floats] | None = None,
+    progress: Callable[[int], None] = lambda steps: None,
+) -> Demonstrations:
+    """Ask the teacher, ``predict`` on "history", at every sample of one episode a seed.
+
+    A teacher with ``for_episodes`` is told what no sensor shows of those episodes. It drives itself unless there is a
+    ``driver``, a function of the observation; noise of that spread is added. A lost crystal demonstrates nothing more.
+    ``progress`` is told of the environment steps taken.
+    """
+    n = len(seeds)
+    if hasattr(teacher, "for_episodes"):
+        teacher = teacher.for_episodes(config, seeds)
+    env = CzVectorEnv(n, scenario=config.scenario, observation="history", control_interval=config.control_interval)
+    random = np.random.default_rng(seeds[0])
+    observation, _ = env.reset(seed=list(seeds))
+    begins, over, memory = np.ones(n, np.bool_), np.zeros(n, np.bool_), None
+    running = np.ones(n, np.bool_)
+    samples: list[Demonstrations] = []
+    for k in range(config.steps):
+        action, memory = teacher.predict(observation, memory, begins)
+        if k % SAMPLE_EVERY == 0:
+            samples.append(Demonstrations(observation[running], np.asarray(action[running], np.float32)))
+        applied = action if driver is None else driver(observation)
+        disturbed = applied + random.normal(0.0, noise, applied.shape)
+        observation, _, terminated, truncated, _ = env.step(np.clip(disturbed, -1.0, 1.0).astype(np.float32))
+        begins, over = over, terminated | truncated
+        running &= ~over
+        progress(n)
+    env.close()
+    return Demonstrations.joined(samples)
+
+
+def widened(scenario: Scenario, width: float) -> Scenario:
+    """The scenario with its pullers, ramps, fluctuations and noises spread that many times as wide."""
+    if width == 1.0:
+        return scenario
+    s, pullers = scenario, scenario.pullers
+    middle, half = sum(pullers.mix) / 2.0, (pullers.mix[1] - pullers.mix[0]) / 2.0
+
+    def times(bounds: tuple[float, float]) -> tuple[float, float]:
+        return width * bounds[0], width * bounds[1]
+
+    return replace(
+        s,
+        name=f"{s.name}-times-{width:g}",
+        pullers=replace(
+            pullers,
+            mix=(max(middle - width * half, 0.0), min(middle + width * half, 1.0)),
+            capillary=width * pullers.capillary,
+            conductivity=width * pullers.conductivity,
+            conductance=width * pullers.conductance,
+            start_radius_sd=width * pullers.start_radius_sd,
+        ),
+        recipe=replace(s.recipe, rate=times(s.recipe.rate)),
+        drift=replace(s.drift, amount=times(s.drift.amount)),
+        interface=replace(s.interface, sd=times(s.interface.sd)),
+        reference=replace(s.reference, amount=times(s.reference.amount)),
+        sensor=replace(
+            s.sensor, camera_noise=times(s.sensor.camera_noise), pyrometer_noise=times(s.sensor.pyrometer_noise)
+        ),
+    )

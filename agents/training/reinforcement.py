@@ -1,0 +1,126 @@
+"""Learning from reward: stable-baselines3's algorithms on the native batch, as the recipes say."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import asdict
+from operator import attrgetter
+from typing import Any
+
+import numpy as np
+import stable_baselines3
+import torch
+from gymnasium.vector import AutoresetMode
+from sb3_contrib import RecurrentPPO as RecurrentPPOAlgorithm
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import VecEnv
+
+from cz_gym import CzVectorEnv
+from cz_gym.evaluation.protocol import TRAINING_SEEDS
+
+from .callbacks import Statistics, Watching
+from .export import drive_policy_onnx, moves_onnx
+from .learner import Parts, Watch
+from .networks import DrivePolicy, Normalise
+from .recipes import PPO, SAC, CostWeights, RecurrentPPO, Reinforcement
+from .vec_env import CzVecEnv
+from .wrappers import DriveAction, TrainingReward
+
+KINDS: dict[type[Reinforcement], tuple[Any, Any]] = {
+    PPO: (stable_baselines3.PPO, DrivePolicy),
+    RecurrentPPO: (RecurrentPPOAlgorithm, "MlpLstmPolicy"),
+    SAC: (stable_baselines3.SAC, "MlpPolicy"),
+}
+"""The algorithm and the policy of each kind of recipe."""
+
+
+class Reinforced:
+    """A learner around an algorithm of stable-baselines3; ``done`` steps have been taken before (resuming)."""
+
+    def __init__(self, recipe: Reinforcement, seed: int, logger: Logger, done: int) -> None:
+        torch.set_num_threads(recipe.threads)
+        self.recipe, self.total, self.logger = recipe, recipe.steps, logger
+        self.algorithm = make_algorithm(recipe, make_slots(recipe, seed, done), seed)
+        # Made algorithms have set the slots' seeds to ``seed`` and those after it: neighbouring training seeds would
+        # meet the same crystals, and a resumed run its first ones again.
+        self.algorithm.set_random_seed((seed * 10_007 + done) % (len(TRAINING_SEEDS) - recipe.num_envs))
+        self.algorithm.num_timesteps = done
+        self.algorithm.set_logger(logger)
+        self._statistics = Statistics(recipe.steps // 4, known=done > 0)
+
+    @property
+    def steps(self) -> int:
+        """Environment steps taken."""
+        return self.algorithm.num_timesteps
+
+    def learn(self, watch: Watch) -> None:
+        """Take the steps that are left."""
+        left = self.total - self.steps
+        if left > 0:
+            self.algorithm.learn(left, callback=[self._statistics, Watching(watch)], reset_num_timesteps=False)
+
+    def parts(self) -> Parts:
+        """Networks, optimisers, lone variables and the replay buffer of the algorithm."""
+        states, lone = self.algorithm._get_torch_save_params()
+        found: dict[str, Any] = {name: attrgetter(name)(self.algorithm) for name in states}
+        optimisers = {name: part for name, part in found.items() if isinstance(part, torch.optim.Optimizer)}
+        modules = {name: part for name, part in found.items() if name not in optimisers}
+        variables = {name: attrgetter(name)(self.algorithm) for name in lone}
+        return Parts(modules, optimisers, variables, getattr(self.algorithm, "replay_buffer", None))
+
+    def exported(self) -> bytes:
+        """The deterministic actor."""
+        policy: Any = self.algorithm.policy
+        return drive_policy_onnx(policy) if isinstance(policy, DrivePolicy) else moves_onnx(self.algorithm)
+
+
+def make_slots(recipe: Reinforcement, seed: int, done: int) -> CzVecEnv:
+    """The batch that is trained on."""
+    env = CzVectorEnv(
+        recipe.num_envs,
+        scenario=recipe.scenario,
+        observation=recipe.observation,
+        control_interval=recipe.control_interval,
+        autoreset_mode=AutoresetMode.SAME_STEP,
+        info="lean" if recipe.weights == CostWeights() else "all",
+    )
+    return CzVecEnv(env, recipe.privileged_critic, stagger=seed + done)
+
+
+def make_algorithm(recipe: Reinforcement, slots: CzVecEnv, seed: int) -> BaseAlgorithm:
+    """The algorithm of a recipe, whose fields it takes by stable-baselines3's names."""
+    torch.manual_seed(seed)
+    rewarded, head = TrainingReward(slots, recipe.gamma, recipe.weights), recipe.head
+    env: VecEnv
+    algorithm, policy = KINDS[type(recipe)]
+    if isinstance(recipe, PPO):
+        env, network = rewarded, _drive_network(recipe)
+    else:
+        env, network = DriveAction(rewarded, head.skip, head.scale), _own_network(recipe)
+    known = inspect.signature(algorithm).parameters
+    settings = {name: value for name, value in asdict(recipe).items() if name in known}
+    settings["learning_rate"] = linear(recipe.learning_rate, recipe.learning_rate / 20.0)
+    made: BaseAlgorithm = algorithm(policy, env, policy_kwargs=network, seed=seed, device="cpu", **settings)
+    return made
+
+
+def _drive_network(recipe: PPO) -> dict[str, Any]:
+    head = {"skip": recipe.head.skip, "scale": recipe.head.scale}
+    return {"hidden": recipe.hidden, "memory": recipe.memory, "noise": recipe.noise, **head}
+
+
+def _own_network(recipe: Reinforcement) -> dict[str, Any]:
+    """Options of a policy of stable-baselines3's own: normalised observations, layers, an LSTM on request."""
+    seeing, layers = {"drives": False, "memory": recipe.memory}, list(recipe.hidden)
+    network = {"features_extractor_class": Normalise, "features_extractor_kwargs": seeing, "net_arch": layers}
+    if isinstance(recipe, RecurrentPPO):
+        network["net_arch"] = {"pi": layers, "vf": layers}
+        network |= {"lstm_hidden_size": recipe.units, "log_std_init": float(np.log(recipe.noise))}
+    return network
+
+
+def linear(start: float, end: float) -> Callable[[float], float]:
+    """A schedule over the share of training left."""
+    return lambda left: end + (start - end) * left

@@ -1,0 +1,114 @@
+"""The command of a comparison: train what is missing, and write the table and the figures anew after each run."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cz_gym.commands import OneLineParser, guarded
+
+from .variants import Study, Variant
+
+if TYPE_CHECKING:
+    from .results import Plan, Result
+
+ABOUT = """
+Agents are judged on {crystals} validation crystals of `{scenario}` that select nothing, and on those of `{farther}`
+with the same seeds; of each run the agent of least cost on the validation that selects. In brackets: 95 % intervals,
+bootstrap over training seeds and crystals; with few training seeds they are somewhat too narrow. Differences are
+taken on the same crystals and training seeds, negative is better. Cost: of a step, as the environment's reward counts
+it; a lost crystal counts ten there, and 8 mm. *At equal activity*: RMSE over what the LQG's frontier has at that pull
+step RMS, by means; 1 is as good.
+"""
+
+
+def main(study: Study, arguments: Sequence[str] | None) -> int:
+    """Command line; returns the exit code."""
+    prog = f"python -m studies.{study.name}"
+    parser = OneLineParser(prog=prog, description=study.title)
+    parser.add_argument("--rows", help="rows to run, joined by commas (default: all)")
+    parser.add_argument("--seeds", type=int, default=3, help="training seeds a row (default: %(default)s)")
+    parser.add_argument(
+        "--steps",
+        type=int,
+        default=study.steps,
+        help="environment steps of what learns from reward (%(default)s)",
+    )
+    parser.add_argument("--jobs", type=int, default=2, help="runs at once (default: %(default)s)")
+    add_folders(parser, study.name)
+    parser.add_argument("--list", action="store_true", help="say what the rows are and how many of their runs are done")
+    given = parser.parse_args(arguments)
+    left = "finished runs are kept, and the same command goes on from the others' checkpoints"
+    return guarded(prog, lambda: _main(study, given), "agents,benchmark", left)
+
+
+def add_folders(parser: OneLineParser, name: str) -> None:
+    """The options --out and --work."""
+    for option, folder, meaning in (("--out", "results", "results"), ("--work", "runs", "unfinished runs")):
+        default = Path(folder) / name
+        parser.add_argument(option, type=Path, default=default, help=f"{meaning} (default: %(default)s)")
+
+
+def check_numbers(given: argparse.Namespace, **limits: tuple[int, int]) -> None:
+    """ValueError unless those options lie within their limits."""
+    for name, (least, most) in limits.items():
+        if not least <= getattr(given, name) <= most:
+            raise ValueError(f"--{name} must be between {least} and {most}, not {getattr(given, name)}")
+
+
+def _main(study: Study, given: argparse.Namespace) -> int:
+    check_numbers(given, seeds=(1, 100), steps=(1, 10**9), jobs=(1, 64))
+    from cz_gym.agents.training import validation
+    from cz_gym.atomic_files import locked, check_writable
+
+    from .results import Plan
+    from .training import is_finished
+
+    plan, seeds = Plan(given.out, given.work, validation.JUDGING), range(given.seeds)
+    variants = [variant.of(given.steps) for variant in study.variants]
+    chosen = [variant for variant in variants if variant.name in study.names(given.rows)]
+    if given.list:
+        for variant in chosen:
+            done = sum(is_finished(plan, (variant, seed)) for seed in seeds)
+            print(f"{variant.name:24} {done}/{given.seeds}  {variant.meaning}")
+        return 0
+    check_writable(plan.out)
+    with locked(plan.work):
+        compare(study._replace(variants=variants), plan, chosen, seeds, given.jobs)
+    return 0
+
+
+def compare(study: Study, plan: Plan, chosen: Sequence[Variant], seeds: Sequence[int], jobs: int) -> None:
+    """Train the chosen variants for each training seed, and write the table of all that is finished."""
+    from .training import train_all
+
+    # Seed by seed, so that a stopped comparison holds every variant.
+    train_all(plan, [(variant, seed) for seed in seeds for variant in chosen], jobs, lambda: _write(study, plan, seeds))
+    _write(study, plan, seeds)
+    print(f"wrote {plan.out / 'table.md'}")
+
+
+def _write(study: Study, plan: Plan, seeds: Sequence[int]) -> None:
+    """Write table and figures from everything that is finished."""
+    from cz_gym.atomic_files import write_files
+
+    from .figures import curves, forest
+    from .lqg_family import lqg_family
+    from .results import FARTHER, SCENARIO
+    from .table import tabulate, to_csv, to_markdown
+    from .training import is_finished, result_of
+
+    runs: dict[str, dict[int, Result]] = {}
+    for task in ((variant, seed) for variant in study.variants for seed in seeds):
+        if is_finished(plan, task):
+            runs.setdefault(task[0].name, {})[task[1]] = result_of(plan, task)
+    family = lqg_family(plan)
+    lines = tabulate(study.variants, runs, family)
+    about = ABOUT.strip().format(crystals=len(plan.crystals), scenario=SCENARIO, farther=FARTHER)
+    meanings = [f"- **{variant.name}**: {variant.meaning}" for variant in study.variants if variant.name in runs]
+    text = [f"# {study.title}", "", about, "", *to_markdown(lines, family), "", *meanings, ""]
+    files = {"table.md": "\n".join(text).encode(), "table.csv": to_csv(lines).encode()}
+    files |= {"forest.png": forest(lines), "curves.png": curves(lines)}
+    write_files({plan.out / name: content for name, content in files.items()})

@@ -1,0 +1,114 @@
+"""The table of a comparison: means over training seeds and crystals, and paired differences to a base.
+
+Every variant meets the same crystals and the same training seeds. So a difference is taken crystal by crystal and seed
+by seed; its interval resamples both.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from cz_gym.evaluation.statistics import Estimate, Resamples, means
+
+from .lqg_family import Family, at_equal_activity
+from .results import ACTIVITY, COST, FARTHER, FIGURES, LOST, RMSE, Result
+from .variants import Variant
+
+MICRON, PERCENT = 1e-3, 1e-2
+"""A micrometre in millimetres, and a hundredth."""
+COLUMNS = (
+    ("RMSE [um]", RMSE, MICRON, ".1f"),
+    ("cost", COST, 1.0, ".4f"),
+    ("pull step [um/min]", ACTIVITY, MICRON, ".1f"),
+    ("lost [%]", LOST, PERCENT, ".1f"),
+    (f"{FARTHER}: RMSE [um]", f"{FARTHER}_{RMSE}", MICRON, ".1f"),
+    ("lost [%]", f"{FARTHER}_{LOST}", PERCENT, ".1f"),
+)
+"""Figures of the table: heading, figure, unit, format."""
+
+
+class Cell(NamedTuple):
+    """One figure of a line."""
+
+    mean: Estimate
+    difference: Estimate | None
+    """To its base on the same crystals and training seeds; None without one."""
+
+
+class Line(NamedTuple):
+    """One line of the table: a variant, or a controller, which has no training seeds."""
+
+    name: str
+    base: str
+    runs: Mapping[int, Result]
+    """By training seed."""
+    cells: Mapping[str, Cell]
+    """By figure."""
+
+    def trained(self, column: str) -> float | None:
+        """What the runs' progress said at their end, on average over the training seeds; None for a controller."""
+        ends = [run.validations[-1][column] for run in self.runs.values() if run.validations]
+        return float(np.mean(ends)) if ends else None
+
+
+def tabulate(variants: Sequence[Variant], runs: Mapping[str, Mapping[int, Result]], family: Family) -> list[Line]:
+    """A line for each variant with finished runs, then one for each of the family."""
+    bases = {variant.name: variant.base for variant in variants} | dict.fromkeys(family, "")
+    everything = {**runs, **{name: {0: result} for name, result in family.items()}}
+    lines = []
+    for name, base in bases.items():
+        mine, others = everything.get(name, {}), everything.get(base, {})
+        if mine:
+            values = np.array([run.figures for run in mine.values()])
+            weights = Resamples.draw(values.shape[1])
+            paired = [run.figures - others[seed].figures for seed, run in mine.items() if seed in others]
+            differences = means(np.array(paired), weights) if paired else [None] * len(FIGURES)
+            cells = map(Cell, means(values, weights), differences)
+            lines.append(Line(name, base, mine, dict(zip(FIGURES, cells, strict=True))))
+    return lines
+
+
+def to_csv(lines: Sequence[Line]) -> str:
+    """``table.csv``: a line for each variant and figure."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    ends = ("mean", "low", "high")
+    writer.writerow(("name", "base", "seeds", "crystals", "figure", *ends, *(f"difference_{end}" for end in ends)))
+    for line in lines:
+        for figure, cell in line.cells.items():
+            numbers = [f"{each:.6g}" for part in cell if part for each in (part.mean, *(part.ci95 or ()))]
+            row = (line.name, line.base, " ".join(map(str, line.runs)), cell.mean.n, figure, *numbers)
+            writer.writerow((*row, *[""] * (11 - len(row))))
+    return text.getvalue()
+
+
+def to_markdown(lines: Sequence[Line], family: Family) -> list[str]:
+    """The table's lines: means with their intervals, differences beneath them."""
+    heads = ("", "seeds", *(head for head, *_ in COLUMNS), "at equal activity", "million steps", "minutes")
+    rows = [f"| {' | '.join(heads)} |", f"|---|{'--:|' * (len(heads) - 1)}"]
+    for line in lines:
+        steps, seconds = line.trained("steps"), line.trained("seconds")
+        ratio = at_equal_activity(list(line.runs.values()), family)
+        ends = (
+            "-" if ratio is None else f"{ratio:.3f}",
+            "-" if steps is None else f"{1e-6 * steps:.1f}",
+            "-" if seconds is None else f"{seconds / 60.0:.0f}",
+        )
+        figures = [_text(line.cells[figure].mean, unit, form) for _, figure, unit, form in COLUMNS]
+        rows.append(f"| **{line.name}** | {len(line.runs)} | {' | '.join((*figures, *ends))} |")
+        if line.cells[RMSE].difference:
+            apart = [_text(line.cells[figure].difference, unit, f"+{form}") for _, figure, unit, form in COLUMNS]
+            rows.append(f"| less {line.base} | | {' | '.join(apart)} | | | |")
+    return rows
+
+
+def _text(estimate: Estimate | None, unit: float, form: str) -> str:
+    if estimate is None:
+        return "-"
+    ends = ", ".join(f"{end / unit:{form}}" for end in estimate.ci95 or ())
+    return f"{estimate.mean / unit:{form}}" + (f" [{ends}]" if ends else "")

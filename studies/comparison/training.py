@@ -1,0 +1,102 @@
+"""Training the variants of a comparison, one after the other or some at once; a finished run is never run again."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
+from multiprocessing import get_context
+from typing import Any
+
+from tqdm import tqdm
+
+from cz_gym.agents.training.recipes import Recipe
+from cz_gym.agents.training.run import Run
+from cz_gym.agents.training.validation import Validation
+from cz_gym.atomic_files import locked
+from cz_gym.baselines.registry import make_controller
+
+from .results import Plan, Result, cached, judge, path_of
+from .variants import Variant
+
+Report = Callable[[int, Validation], None]
+Task = tuple[Variant, int]
+"""A variant and a training seed."""
+
+
+def trained(
+    plan: Plan,
+    recipe: Recipe,
+    seed: int,
+    bar: Any,
+    validate_every: int | None = None,
+    report: Report = lambda steps, found: None,
+) -> Result:
+    """What the agent of a recipe and a training seed does on the plan's crystals; trained if that is not cached.
+
+    It goes on from its checkpoint if there is one; its folder goes when it is judged. ``report`` is told what each
+    validation on the way found; what it raises ends the run, whose checkpoint stays.
+    """
+
+    def make() -> Result:
+        folder = plan.work / path_of(plan, name, settings).stem
+        with locked(folder):
+            begun = (folder / "settings.json").exists()
+            run = Run(folder, recipe, seed, make_controller, resume=begun)
+            run.validate_every = validate_every or run.validate_every
+            try:
+                run.learn(bar, report)
+            except KeyboardInterrupt:
+                run.save()
+                raise
+            rows = [{key: float(value) for key, value in row.items()} for row in run.rows]
+            result = Result(judge(plan, run.best_policy()), rows)
+        shutil.rmtree(folder)
+        return result
+
+    name, settings = _identity(recipe, seed)
+    return cached(plan, name, settings, make)
+
+
+def _identity(recipe: Recipe, seed: int) -> tuple[str, Any]:
+    return f"{recipe.name}-seed{seed}", {"seed": seed, "recipe": json.loads(json.dumps(asdict(recipe)))}
+
+
+def is_finished(plan: Plan, task: Task) -> bool:
+    """Whether a task's result is cached."""
+    return path_of(plan, *_identity(task[0].recipe, task[1])).exists()
+
+
+def result_of(plan: Plan, task: Task) -> Result:
+    """The cached result of a finished task."""
+    return trained(plan, task[0].recipe, task[1], None)
+
+
+def train_all(plan: Plan, tasks: Sequence[Task], jobs: int, after_each: Callable[[], None]) -> None:
+    """Do the runs that are not finished, so many at once."""
+    missing = [task for task in tasks if not is_finished(plan, task)]
+    print(f"{len(tasks) - len(missing)} runs are done, {len(missing)} to do")
+    if jobs == 1:
+        for task in missing:
+            print(_train(plan, task), flush=True)
+            after_each()
+        return
+    # Forking would copy the threads of torch and of the native batch in unknown states.
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        running = [pool.submit(_train, plan, task) for task in missing]
+        try:
+            for each in as_completed(running):
+                print(each.result(), flush=True)
+                after_each()
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+
+
+def _train(plan: Plan, task: Task) -> str:
+    title = f"{task[0].name}, seed {task[1]}"
+    with tqdm(desc=title, unit="step", unit_scale=True, mininterval=1.0, disable=None) as bar:
+        trained(plan, task[0].recipe, task[1], bar)
+    return f"{title}: done"

@@ -1,0 +1,46 @@
+"""Shipped agents by name."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cz_gym import agents
+from cz_gym.agents.agent_file.contract import read_agent
+from cz_gym.observation import HISTORY
+
+NAMES = ("imitation", "imitation-medium", "imitation-quiet", "imitation-puller", "ppo")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_shipped_agent_is_called_by_how_it_was_made(name: str) -> None:
+    contracts = [read_agent(path)[0] for path in agents.shipped_seeds(name)]
+    assert [contract.training_seed for contract in contracts] == list(range(10 if name == "imitation" else 3))
+    assert {contract.algorithm for contract in contracts} == {name}
+    assert all((contract.training_steps > 0) == (name == "ppo") for contract in contracts)
+    policy = agents.load(name)
+    assert policy.contract.validation_cost == min(contract.validation_cost for contract in contracts)
+    assert policy.predict(np.zeros((3, len(HISTORY)), np.float32))[0].shape == (3, 2)
+
+
+def test_nothing_else_is_shipped() -> None:
+    assert {path.stem.rpartition("-seed")[0] for path in agents.MODELS.iterdir()} == set(NAMES)
+
+
+def test_an_agent_is_loaded_by_its_file() -> None:
+    path = agents.shipped_seeds("ppo")[1]
+    assert agents.load(path) == agents.load(str(path)) == agents.OnnxPolicy.load(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("imitatoin", "no shipped agent 'imitatoin'; there are: imitation, imitation-medium, imitation-puller"),
+        ("", "no shipped agent ''; there are"),
+        ("nobody.onnx", "nobody.onnx: no such file"),
+    ],
+)
+def test_what_there_is_not_is_one_line(name: str, message: str) -> None:
+    with pytest.raises(agents.AgentFileError, match=message) as caught:
+        agents.load(name)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,149 @@
+"""Checkpoints: what goes on is what was saved, and what does not belong is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from small_learners import SMALL, SMALL_SAC, made, trained
+
+from cz_gym.agents import AgentFileError
+from cz_gym.agents.training.checkpoint import load_checkpoint, restore, to_bytes
+from cz_gym.agents.training.networks import Normalise
+
+
+@pytest.fixture(scope="module")
+def ppo() -> Any:
+    return trained(SMALL)
+
+
+def test_a_checkpoint_continues_and_refuses_what_does_not_fit(ppo: Any, tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    path.write_bytes(to_bytes(ppo, 12.0, 0.5))
+    progress, tensors = load_checkpoint(path)
+    assert (progress.steps, progress.seconds, progress.best_cost) == (ppo.steps, 12.0, 0.5)
+    other = made(SMALL, 1, progress.steps)
+    restore(other, tensors, path)
+    path.write_bytes(to_bytes(other, 12.0, 0.5))
+    again = load_checkpoint(path)
+    assert again[0] == progress
+    assert set(again[1]) == set(tensors)
+    assert all(torch.equal(again[1][name], tensor) for name, tensor in tensors.items())
+    with pytest.raises(AgentFileError, match="does not fit"):
+        restore(made(replace(SMALL, hidden=(8, 8))), tensors, path)
+
+
+def test_a_learner_restored_before_its_first_update_learns_as_the_one_it_came_from(tmp_path: Path) -> None:
+    path, first, second = tmp_path / "checkpoint.safetensors", made(SMALL), made(SMALL)
+    path.write_bytes(to_bytes(first, 0.0, None))
+    restore(second, load_checkpoint(path)[1], path)
+    unsaved = made(SMALL)
+    for learner in (first, second, unsaved):
+        learner.algorithm.set_random_seed(3)
+        learner.learn(lambda steps, doing: None)
+    assert first.exported() == second.exported() == unsaved.exported()
+
+
+def test_a_resumed_sac_keeps_its_temperature(tmp_path: Path) -> None:
+    """stable-baselines3 counts it as a variable, not among the parameters."""
+    path = tmp_path / "checkpoint.safetensors"
+    learner, other = made(SMALL_SAC), made(SMALL_SAC, 1)
+    with torch.no_grad():
+        learner.algorithm.log_ent_coef.fill_(-1.25)
+    path.write_bytes(to_bytes(learner, 1.0, None))
+    restore(other, load_checkpoint(path)[1], path)
+    assert other.algorithm.log_ent_coef.item() == -1.25
+    assert other.algorithm.log_ent_coef in other.algorithm.ent_coef_optimizer.param_groups[0]["params"]
+
+
+@pytest.fixture(scope="module")
+def sac() -> Any:
+    """A learner whose buffer of 64 steps has gone round."""
+    return trained(replace(SMALL_SAC, steps=280))
+
+
+@pytest.mark.parametrize(("most", "steps"), [(50_000, 64), (80, 20)])
+def test_a_resumed_sac_keeps_its_latest_transitions(
+    sac: Any, most: int, steps: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cz_gym.agents.training.replay_buffer.MOST", most)
+    path = tmp_path / "checkpoint.safetensors"
+    path.write_bytes(to_bytes(sac, 1.0, None))
+    other = made(replace(SMALL_SAC, steps=320), 1, sac.steps)
+    restore(other, load_checkpoint(path)[1], path)
+    before, after = sac.algorithm.replay_buffer, other.algorithm.replay_buffer
+    assert before.full
+    assert after.size() == steps
+    for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
+        was = np.roll(getattr(before, name), -before.pos, axis=0)[-steps:]
+        np.testing.assert_array_equal(getattr(after, name)[:steps], was)
+    other.learn(lambda steps, doing: None)
+    assert after.pos == (steps + 10) % 64
+
+
+def test_normalisation_is_found_by_a_run_that_was_cut_short_before_it_knew_any() -> None:
+    learner = made(SMALL_SAC, done=8)
+    learner.learn(lambda steps, doing: None)
+    found = [module.mean for module in learner.algorithm.policy.modules() if isinstance(module, Normalise)]
+    assert found
+    assert all(mean.any() for mean in found)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("replay/rewards", lambda tensor: tensor[:-1]),
+        ("replay/rewards", lambda tensor: tensor[0, 0]),
+        ("replay/actions", lambda tensor: tensor.double()),
+        ("replay/actions", lambda tensor: tensor[:, :, :1].contiguous()),
+        ("replay/dones", lambda tensor: tensor + 0.5),
+        ("replay/observations", lambda tensor: None),
+        ("replay/observations", lambda tensor: tensor * torch.nan),
+        ("replay/surprise", lambda tensor: torch.zeros(1)),
+    ],
+)
+def test_transitions_that_do_not_belong_are_refused(sac: Any, name: str, change: Any, tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    path.write_bytes(to_bytes(sac, 1.0, None))
+    _, tensors = load_checkpoint(path)
+    tensors[name] = change(tensors.get(name))
+    other = made(SMALL_SAC, 1)
+    with pytest.raises(AgentFileError, match=r"does not fit|not finite"):
+        restore(other, {key: tensor for key, tensor in tensors.items() if tensor is not None}, path)
+    assert other.algorithm.replay_buffer.size() == 0
+
+
+def test_more_transitions_than_are_kept_are_refused(sac: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    path.write_bytes(to_bytes(sac, 1.0, None))
+    monkeypatch.setattr("cz_gym.agents.training.replay_buffer.MOST", 80)
+    with pytest.raises(AgentFileError, match="does not fit"):
+        restore(made(SMALL_SAC, 1), load_checkpoint(path)[1], path)
+
+
+@pytest.mark.parametrize(
+    ("name", "tensor", "message"),
+    [
+        ("policy/log_std", torch.full((2,), torch.nan), "not finite"),
+        ("policy/log_std", torch.zeros(3), "does not fit"),
+        ("policy/log_std", torch.zeros(2, dtype=torch.float64), "does not fit"),
+        ("policy.optimizer/0/step", torch.tensor(-1.0), "below zero"),
+        ("policy.optimizer/99/step", torch.tensor(1.0), "does not fit"),
+        ("policy.optimizer/0/surprise", torch.tensor(1.0), "does not fit"),
+        ("elsewhere/weight", torch.zeros(2), "does not fit"),
+    ],
+)
+def test_tensors_that_do_not_belong_are_refused(
+    ppo: Any, tmp_path: Path, name: str, tensor: torch.Tensor, message: str
+) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    path.write_bytes(to_bytes(ppo, 1.0, None))
+    _, tensors = load_checkpoint(path)
+    with pytest.raises(AgentFileError, match=message):
+        restore(ppo, {**tensors, name: tensor}, path)
+    with pytest.raises(AgentFileError, match="does not fit"):
+        restore(ppo, {key: tensors[key] for key in tensors if key != "policy/log_std"}, path)

@@ -1,0 +1,68 @@
+"""What is exported acts as the network that was trained."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from contracts import facts
+from small_learners import SMALL, SMALL_SAC, trained
+
+from cz_gym.agents import OnnxPolicy
+from cz_gym.agents.agent_file.contract import make_contract
+from cz_gym.observation import DRIVE_CHANNELS, HISTORY, STATE
+
+
+def observations(n: int, channels: int) -> np.ndarray:
+    return np.random.default_rng(0).uniform(-3.0, 3.0, (n, channels)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def ppo() -> Any:
+    return trained(SMALL)
+
+
+def agent_of(learner: Any) -> OnnxPolicy:
+    content = learner.exported()
+    return OnnxPolicy.of(make_contract(content, **facts()), content)
+
+
+def test_exported_ppo_acts_like_the_network_it_came_from(ppo: Any) -> None:
+    policy = ppo.algorithm.policy
+    normalise = policy.features_extractor
+    assert normalise.scaling.diagonal().min() > 0
+    assert not torch.allclose(normalise.scaling, torch.eye(len(normalise.scaling)))
+    seen = observations(64, len(HISTORY) + len(STATE))
+    expected, _ = policy.predict(seen, deterministic=True)
+    action, _ = agent_of(ppo).predict(seen[:, : len(HISTORY)])
+    np.testing.assert_allclose(action, expected, atol=2e-6)
+    assert action.dtype == np.float32
+
+
+def test_actor_is_blind_to_the_true_state(ppo: Any) -> None:
+    seen = observations(8, len(HISTORY) + len(STATE))
+    blind = seen.copy()
+    blind[:, len(HISTORY) :] = 0.0
+    policy = ppo.algorithm.policy
+    np.testing.assert_array_equal(*(policy.predict(array, deterministic=True)[0] for array in (seen, blind)))
+    values = [policy.predict_values(torch.as_tensor(array)) for array in (seen, blind)]
+    assert not torch.allclose(*values)
+
+
+def test_exported_sac_acts_like_its_network_on_top_of_the_drives() -> None:
+    learner = trained(SMALL_SAC)
+    seen = observations(64, len(HISTORY))
+    output, _ = learner.algorithm.predict(seen, deterministic=True)
+    wanted = SMALL_SAC.head.skip * seen[:, list(DRIVE_CHANNELS)] + np.array(SMALL_SAC.head.scale) * output
+    action, _ = agent_of(learner).predict(seen)
+    np.testing.assert_allclose(action, np.clip(wanted, -1.0, 1.0), atol=2e-6)
+
+
+def test_normalisation_is_the_data_s_mean_and_spread(ppo: Any) -> None:
+    buffer, normalise = ppo.algorithm.rollout_buffer, ppo.algorithm.policy.features_extractor
+    seen = buffer.observations.reshape(-1, len(HISTORY) + len(STATE))
+    np.testing.assert_allclose(normalise.mean, seen.mean(axis=0), atol=1e-5)
+    spread = np.maximum(seen.std(axis=0), 0.02)
+    np.testing.assert_allclose(normalise.scaling, np.diag(1.0 / spread), rtol=1e-4)

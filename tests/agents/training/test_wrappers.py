@@ -1,0 +1,61 @@
+"""What stands between the batch and a learner: the weighted, scaled reward, and moves of the drives."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+from cz_gym import CzVectorEnv
+from cz_gym.agents.training.recipes import CostWeights
+from cz_gym.agents.training.vec_env import CzVecEnv
+from cz_gym.agents.training.wrappers import DriveAction, TrainingReward
+from cz_gym.task import Cost, cost_terms, reward
+
+
+def slots(**settings: Any) -> CzVecEnv:
+    made = CzVecEnv(
+        CzVectorEnv(2, observation="history", autoreset_mode=AutoresetMode.SAME_STEP, info="all", **settings)
+    )
+    made.seed(5)
+    return made
+
+
+def test_a_failure_costs_the_worst_for_ever() -> None:
+    env = TrainingReward(slots(), 0.9, CostWeights())
+    env.reset()
+    for _ in range(2000):
+        _, gained, done, infos = env.step(np.array([[1.0, 1.0], [0.0, 0.0]], np.float32))
+        if done[0]:
+            break
+    assert not infos[0]["TimeLimit.truncated"]
+    assert gained[0] == pytest.approx(-10.0)
+
+
+@pytest.mark.parametrize("observable", [False, True])
+def test_the_weighted_reward_is_the_weighted_cost_s(observable: bool) -> None:
+    base = slots(scenario="puller")
+    env = TrainingReward(base, 0.9, CostWeights(pull=0.5, pull_step=3.0, heater_step=2.0, observable=observable))
+    env.reset()
+    _, gained, done, _ = env.step(np.full((2, 2), 0.1, np.float32))
+    assert not done.any()
+    said = base.info
+    seen = cost_terms(said["r_c"] - said["r_ref"] + said["ring_offset"], 0.0, 0.0, 0.0).radius
+    radius = seen if observable else said["cost_radius"]
+    assert not np.allclose(seen, said["cost_radius"], rtol=1e-3)
+    cost = Cost(radius, 0.5 * said["cost_pull"], 3.0 * said["cost_pull_step"], 2.0 * said["cost_heater_step"])
+    np.testing.assert_allclose(gained, 0.1 * reward(cost), rtol=1e-6)
+
+
+def test_drive_action_moves_the_drives_from_where_they_are() -> None:
+    plain, driven = slots(), DriveAction(slots(), 1.0, (0.1, 0.2))
+    for env in (plain, driven):
+        env.reset()
+    position = np.zeros(2)
+    for move in ([1.0, -0.5], [0.5, 1.0], [-1.0, 0.0]):
+        position = position + np.array([0.1, 0.2]) * move
+        expected = plain.step(np.tile(position, (2, 1)).astype(np.float32))
+        got = driven.step(np.tile(move, (2, 1)).astype(np.float32))
+        np.testing.assert_allclose(got[0], expected[0], atol=1e-6)

@@ -1,0 +1,205 @@
+"""Comparisons: runs are trained once and judged alike, the table's figures are right, a stopped command goes on."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("sb3_contrib")
+pytest.importorskip("matplotlib")
+
+from cz_gym.agents.training import run, validation
+from cz_gym.agents.training.recipes import PPO, SAC, Imitation, RecurrentPPO
+from cz_gym.evaluation.protocol import TEST_SEEDS, VALIDATION_SEEDS
+from cz_gym.evaluation.statistics import Resamples
+from studies.comparison import command, lqg_family, results, table, training
+from studies.comparison.results import ACTIVITY, FIGURES, LOST, RMSE, Plan, Result
+from studies.comparison.variants import Study, Variant
+
+SMALL = {"num_envs": 4, "hidden": (4,), "steps": 128}
+BASE = Variant(PPO(**SMALL, n_steps=16, batch_size=64, n_epochs=1), "as it is")
+VARIANTS = (
+    BASE,
+    Variant(SAC(**SMALL, learning_starts=16, buffer_size=64, batch_size=8), "SAC", "ppo"),
+    Variant(RecurrentPPO(**SMALL, units=4, n_steps=16, batch_size=64), "LSTM", "ppo"),
+    Variant(Imitation(name="few", teacher="lqg", rounds=1, episodes=2, control_interval=60.0), "DAgger", "ppo"),
+)
+STUDY = Study("some", "Some question", VARIANTS, 128)
+CRYSTALS = VALIDATION_SEEDS[2:4]
+
+
+def figures(rmse: float, activity: float, lost: float = 0.0, crystals: int = 50) -> np.ndarray:
+    values = np.zeros((crystals, len(FIGURES)))
+    values[:, FIGURES.index(RMSE)], values[:, FIGURES.index(ACTIVITY)] = rmse, activity
+    values[:, FIGURES.index(LOST)] = np.arange(crystals) < lost * crystals
+    return values
+
+
+FAMILY = {"fast": Result(figures(1.0, 0.02)), "quiet": Result(figures(2.0, 0.01))}
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "PICKING", VALIDATION_SEEDS[:2])
+    monkeypatch.setattr(validation, "JUDGING", CRYSTALS)
+    family = {name: Result(each.figures[:2]) for name, each in FAMILY.items()}
+    monkeypatch.setattr(lqg_family, "lqg_family", lambda plan: family)
+
+
+def test_what_judges_neither_selects_nor_tests() -> None:
+    judged = set(validation.JUDGING)
+    assert judged <= set(VALIDATION_SEEDS)
+    assert not judged & (set(validation.PICKING) | set(TEST_SEEDS))
+
+
+@pytest.mark.usefixtures("small")
+def test_a_comparison_keeps_what_is_finished_and_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, learn = tmp_path / "out", run.Run.learn
+    options = ["--seeds", "1", "--steps", "128", "--jobs", "1", "--out", str(out), "--work", str(tmp_path / "work")]
+    trained: list[str] = []
+
+    def counted(self: run.Run, *arguments: Any) -> None:
+        trained.append(self.recipe.name)
+        learn(self, *arguments)
+        if len(trained) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(run.Run, "learn", counted)
+    assert command.main(STUDY, options) == 130
+    (first,) = (out / "runs").iterdir()
+    before = first.read_bytes()
+    assert command.main(STUDY, options) == 0
+    assert trained == ["ppo", "sac", "sac", "ppo-recurrent", "few"]
+    assert first.read_bytes() == before
+    told = json.loads(before)
+    assert told["key"]["settings"]["recipe"]["num_envs"] == 4
+    assert {"command", "git_commit", "packages"} <= set(told["provenance"])
+    assert [len(told["figures"][name]) for name in FIGURES] == [len(CRYSTALS)] * len(FIGURES)
+    assert {path.name for path in out.iterdir()} == {"table.csv", "table.md", "forest.png", "curves.png", "runs"}
+    assert not list((tmp_path / "work").iterdir())
+    text = (out / "table.md").read_text()
+    for name in ("**few** | 1", "less ppo |", "**quiet** | 1", "- **sac**: SAC"):
+        assert name in text
+    assert (out / "curves.png").read_bytes().startswith(b"\x89PNG")
+    capsys.readouterr()
+    assert command.main(STUDY, [*options, "--list"]) == 0
+    assert capsys.readouterr().out.count("1/1") == 4
+    assert command.main(STUDY, [*options, "--list", "--rows", "few,sac", "--steps", "64"]) == 0
+    listed = capsys.readouterr().out.splitlines()
+    assert [line.split()[:2] for line in listed] == [["sac", "0/1"], ["few", "1/1"]], "--steps are not an imitation's"
+    assert command.main(STUDY, options) == 0
+    assert len(trained) == 5
+
+
+def test_a_result_is_of_everything_it_depends_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = Plan(tmp_path, tmp_path, CRYSTALS)
+    other = replace(BASE, recipe=replace(BASE.recipe, memory=30.0))
+
+    def place(plan: Plan, variant: Variant = BASE, seed: int = 0) -> Path:
+        return results.path_of(plan, *training._identity(variant.recipe, seed))
+
+    paths = [place(plan), place(plan, seed=1), place(plan, other)]
+    paths.append(place(plan._replace(crystals=VALIDATION_SEEDS[:2])))
+    with monkeypatch.context() as patch:
+        patch.setattr(results, "SCENARIO", "puller")
+        paths.append(place(plan))
+    assert len(set(paths)) == 5
+    assert place(plan._replace(work=tmp_path / "elsewhere")) == paths[0]
+
+
+@pytest.mark.parametrize("content", ["{", "[]", '{"figures": {"rmse_mm": [1, 2]}, "validations": []}'])
+def test_a_damaged_result_is_named(content: str, tmp_path: Path) -> None:
+    plan = Plan(tmp_path, tmp_path, CRYSTALS)
+    path = results.path_of(plan, "lqg", "settings")
+    path.parent.mkdir()
+    path.write_text(content)
+    with pytest.raises(ValueError, match=path.name):
+        results.cached(plan, "lqg", "settings", lambda: pytest.fail("it was made again"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--rows", "ppo,sacc"], "unknown row 'sacc'; choose from ppo, sac, ppo-recurrent, few"),
+        (["--seeds", "0"], "--seeds must be between 1 and 100, not 0"),
+        (["--steps", "-5"], "--steps must be between 1"),
+        (["--jobs", "0"], "--jobs must be between 1 and 64, not 0"),
+    ],
+)
+def test_mistakes_give_one_line(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command.main(STUDY, arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("python -m studies.some: ")
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def finished(random: np.random.Generator, seeds: range, shift: float) -> dict[int, Result]:
+    crystals = 1.0 + shift + np.random.default_rng(1).normal(size=(40, 1))
+    noise = [0.01 * random.normal(size=(40, len(FIGURES))) for _ in seeds]
+    progress = [{"steps": 128.0, "seconds": 60.0, "validation_rmse_mm": 1.0}]
+    return {seed: Result(crystals + each, progress) for seed, each in zip(seeds, noise, strict=True)}
+
+
+def test_differences_are_paired_by_crystal_and_training_seed() -> None:
+    random = np.random.default_rng(0)
+    runs = {"ppo": finished(random, range(3), 0.0), "sac": finished(random, range(2), 0.1)}
+    base, other = table.tabulate(VARIANTS, runs, {})
+    assert base.cells[RMSE].difference is None
+    values, reference = (np.array([runs[name][seed].figures[:, 0] for seed in range(2)]) for name in ("sac", "ppo"))
+    cell = other.cells[RMSE]
+    assert cell.mean.mean == pytest.approx(values.mean())
+    assert cell.difference.mean == pytest.approx((values - reference).mean())
+    draws = Resamples.draw(40)
+    by_hand = [
+        sum(seeds[i] * (crystals @ (values - reference)[i]) for i in range(2))
+        for seeds, crystals in zip(draws.training_seeds(2), draws.episodes, strict=True)
+    ]
+    np.testing.assert_allclose(cell.difference.ci95, np.quantile(by_hand, [0.025, 0.975]))
+    # The crystals' own spread, fifty times the difference's, has gone.
+    assert cell.difference.ci95[1] - cell.difference.ci95[0] < 0.02 < cell.mean.ci95[1] - cell.mean.ci95[0]
+    rows = list(csv.reader(table.to_csv([base, other]).splitlines()))
+    assert len(rows) == 1 + 2 * len(FIGURES)
+    assert {len(row) for row in rows} == {11}
+    assert float(rows[-len(FIGURES)][8]) == pytest.approx(cell.difference.mean, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("agent", "ratio"),
+    [
+        ((1.5, 0.02, 0.0), 1.5),
+        ((1.0, 0.01, 0.0), 0.5),
+        ((1.0, 0.04, 0.0), 1.0),
+        ((1.0, 0.005, 0.0), None),
+        ((1.0, 0.02, 0.1), None),
+    ],
+)
+def test_radius_errors_are_read_at_equal_activity(agent: tuple[float, float, float], ratio: float | None) -> None:
+    """None where an agent is quieter than the whole family, and where it loses crystals."""
+    assert lqg_family.at_equal_activity([Result(figures(*agent))], FAMILY) == ratio
+
+
+def test_the_lqgs_are_judged_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    judged: list[str] = []
+
+    def judge(plan: Plan, law: Any) -> np.ndarray:
+        judged.append(law.settings.hash)
+        return figures(2.0 + law.settings.weights.pull_step, 1.0 / law.settings.weights.pull_step, crystals=2)
+
+    monkeypatch.setattr(lqg_family, "judge", judge)
+    plan = Plan(tmp_path, tmp_path, CRYSTALS)
+    found = lqg_family.lqg_family(plan)
+    assert len(found) == len(judged) == len(set(judged)) == 8
+    again = lqg_family.lqg_family(plan)
+    assert len(judged) == 8
+    assert {name: each.mean(RMSE) for name, each in again.items()} == {n: each.mean(RMSE) for n, each in found.items()}
+    for each in found.values():
+        assert lqg_family.at_equal_activity([each], found) == pytest.approx(1.0)
