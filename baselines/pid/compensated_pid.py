@@ -44,10 +44,14 @@ class SeriesPID:
     N: float = 100.0
     """Derivative filter [-]."""
 
+    def lead(self, dt: float) -> tuple[float, float, float]:
+        """The lead by Tustin's rule at a sample time dt [s]: y_k = b_0 e_k + b_1 e_(k-1) - a_1 y_(k-1)."""
+        slow, fast = 2.0 * self.T_d / dt, 2.0 * self.T_d / (self.N * dt)
+        return (1.0 + slow) / (1.0 + fast), (1.0 - slow) / (1.0 + fast), (1.0 - fast) / (1.0 + fast)
+
     def step(self, error: Floats, state: PIDState, dt: float) -> tuple[Floats, PIDState]:
         """Pull speed [m/s] for an error [m], both of shape (n,), and the new state; one sample takes dt [s]."""
-        slow, fast = 2.0 * self.T_d / dt, 2.0 * self.T_d / (self.N * dt)
-        b_0, b_1, a_1 = (1.0 + slow) / (1.0 + fast), (1.0 - slow) / (1.0 + fast), (1.0 - fast) / (1.0 + fast)
+        b_0, b_1, a_1 = self.lead(dt)
         lead = b_0 * error + state.lead_in
         integral = state.integral + 0.5 * dt / self.T_i * (state.lead_out + lead)
         return self.K_p * (lead + integral), PIDState(b_1 * error - a_1 * lead, lead, integral)
