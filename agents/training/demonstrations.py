@@ -15,7 +15,7 @@ from cz_gym.episodes.scenario import Scenario
 
 Floats = npt.NDArray[np.float32]
 SAMPLE_EVERY = 4
-"""Samples from one that is kept to the next."""
+"""Control intervals between the samples that are demonstrated."""
 
 
 class Demonstrations(NamedTuple):
@@ -42,9 +42,9 @@ def demonstrate(
 ) -> Demonstrations:
     """Ask the teacher, ``predict`` on "history", at every sample of one episode a seed.
 
-    A teacher with ``for_episodes`` is told what no sensor shows of those episodes. It drives itself unless there is a
+    A privileged teacher (``for_episodes``) knows what no sensor shows of those episodes. The teacher drives, or a
     ``driver``, a function of the observation; noise of that spread is added. A lost crystal demonstrates nothing more.
-    ``progress`` is told of the environment steps taken.
+    ``progress`` hears of the environment steps taken.
     """
     n = len(seeds)
     if hasattr(teacher, "for_episodes"):
