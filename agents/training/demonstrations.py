@@ -49,7 +49,7 @@ def demonstrate(
     n = len(seeds)
     if hasattr(teacher, "for_episodes"):
         teacher = teacher.for_episodes(config, seeds)
-    env = CzVectorEnv(n, scenario=config.scenario, observation="history", control_interval=config.control_interval)
+    env = CzVectorEnv.from_config(config, n)
     random = np.random.default_rng(seeds[0])
     observation, _ = env.reset(seed=list(seeds))
     begins, over, memory = np.ones(n, np.bool_), np.zeros(n, np.bool_), None
