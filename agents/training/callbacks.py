@@ -1,4 +1,4 @@
-"""Callbacks of stable-baselines3: observation statistics, and telling a run how far learning is."""
+"""Callbacks of stable-baselines3: observation statistics, and the progress of learning."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Statistics(BaseCallback):
 
 
 class Watching(BaseCallback):
-    """Tells after every step of all slots how many environment steps have been taken."""
+    """Reports after every step of all slots how many environment steps have been taken."""
 
     def __init__(self, watch: Watch) -> None:
         super().__init__()

@@ -48,8 +48,8 @@ def to_bytes(learner: Learner, seconds: float, best_cost: float | None) -> bytes
     parts, progress = learner.parts(), Progress(int(learner.steps), seconds, best_cost)
     # Modules that share a tensor each get their copy: the format knows no sharing.
     copies = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in _tensors(parts).items()}
-    told = {"format": FORMAT, "progress": json.dumps(asdict(progress))}
-    content: bytes = save(copies | latest(parts.replay_buffer), told)
+    header = {"format": FORMAT, "progress": json.dumps(asdict(progress))}
+    content: bytes = save(copies | latest(parts.replay_buffer), header)
     return content
 
 
@@ -61,13 +61,13 @@ def load_checkpoint(path: Path) -> tuple[Progress, Tensors]:
         raise AgentFileError(f"{path}: not a checkpoint of this project, or damaged")
     try:
         tensors: Tensors = load(content)
-        told = json.loads(content[8:end])["__metadata__"]
+        header = json.loads(content[8:end])["__metadata__"]
     except (SafetensorError, ValueError, KeyError, TypeError, AttributeError, RuntimeError, RecursionError):
         raise AgentFileError(f"{path}: not a checkpoint of this project, or damaged") from None
-    if told.get("format") != FORMAT:
+    if header.get("format") != FORMAT:
         raise AgentFileError(f"{path}: not a checkpoint of this release ({FORMAT})")
     try:
-        progress = Progress(**json.loads(told["progress"]))
+        progress = Progress(**json.loads(header["progress"]))
     except (ValueError, KeyError, TypeError, RecursionError):
         raise AgentFileError(f"{path}: does not say where the run stood") from None
     best = 0.0 if progress.best_cost is None else progress.best_cost

@@ -15,7 +15,7 @@ from cz_gym.episodes.scenario import Scenario
 
 Floats = npt.NDArray[np.float32]
 SAMPLE_EVERY = 4
-"""Samples from one that is kept to the next."""
+"""Control intervals between the samples that are demonstrated."""
 
 
 class Demonstrations(NamedTuple):
@@ -42,14 +42,14 @@ def demonstrate(
 ) -> Demonstrations:
     """Ask the teacher, ``predict`` on "history", at every sample of one episode a seed.
 
-    A teacher with ``for_episodes`` is told what no sensor shows of those episodes. It drives itself unless there is a
+    A privileged teacher (``for_episodes``) knows what no sensor shows of those episodes. The teacher drives, or a
     ``driver``, a function of the observation; noise of that spread is added. A lost crystal demonstrates nothing more.
-    ``progress`` is told of the environment steps taken.
+    ``progress`` hears of the environment steps taken.
     """
     n = len(seeds)
     if hasattr(teacher, "for_episodes"):
         teacher = teacher.for_episodes(config, seeds)
-    env = CzVectorEnv(n, scenario=config.scenario, observation="history", control_interval=config.control_interval)
+    env = CzVectorEnv.from_config(config, n)
     random = np.random.default_rng(seeds[0])
     observation, _ = env.reset(seed=list(seeds))
     begins, over, memory = np.ones(n, np.bool_), np.zeros(n, np.bool_), None

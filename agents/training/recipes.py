@@ -65,7 +65,7 @@ class Recipe:
 class Imitation(Recipe):
     """DAgger: the network learns to act as a classical controller does, also where its own mistakes lead it.
 
-    The controller may be told more than a sensor shows: the network, which is not, learns what its sensors say of it.
+    The controller may be privileged, knowing more than sensors show: the network learns what its sensors say of that.
     Some crystals are wide: on crystals no worse than the scenario's own it never sees how one is saved.
     """
 

@@ -81,7 +81,7 @@ class Run:
     def learn(self, bar: Any, report: Callable[[int, Validation], None] = lambda steps, found: None) -> None:
         """Learn to the end, validating and saving on the way.
 
-        ``bar`` counts environment steps, as tqdm's does; ``report`` is told what each validation found.
+        ``bar`` counts environment steps, as tqdm's does; ``report`` gets what each validation found.
         """
         bar.update(self.learner.steps - bar.n)
         due = self.learner.steps + self.validate_every

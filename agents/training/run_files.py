@@ -57,7 +57,7 @@ def provenance() -> dict[str, Any]:
 
 
 def _program() -> list[str]:
-    """How Python was told what to run; of a path, what is left of it in this checkout."""
+    """What Python runs, as its command says it: a module of this checkout, or a program's name."""
     path = Path(sys.argv[0])
     here = Path(__file__).resolve().parents[2]
     if path.is_absolute() and path.is_relative_to(here):

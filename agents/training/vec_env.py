@@ -74,7 +74,7 @@ class CzVecEnv(VecEnv):
         self._returns += reward
         self._lengths += 1
         self._k += 1
-        whole = self._seen(observation, info)
+        seen = self._seen(observation, info)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         done = terminated | truncated
         for i in np.flatnonzero(done).tolist():
@@ -85,12 +85,12 @@ class CzVecEnv(VecEnv):
         cut = (self._cuts == self._k) & ~done
         if cut.any():
             for i in np.flatnonzero(cut).tolist():
-                infos[i] = self._final(i, whole[i].copy(), True)
-            whole[cut] = self._seen(*self.env.reset(options={"reset_mask": cut}))[cut]
+                infos[i] = self._final(i, seen[i].copy(), True)
+            seen[cut] = self._seen(*self.env.reset(options={"reset_mask": cut}))[cut]
             done = done | cut
         self._returns[done] = 0.0
         self._lengths[done] = 0
-        return whole, reward.astype(np.float32), done, infos
+        return seen, reward.astype(np.float32), done, infos
 
     def _final(self, i: int, observation: np.ndarray, truncated: bool) -> dict[str, Any]:
         episode = {"r": float(self._returns[i]), "l": int(self._lengths[i]), "t": round(time.time() - self._began, 6)}

@@ -25,8 +25,8 @@ def _ppo(name: str, meaning: str, **changes: Any) -> Variant:
 
 
 ROWS = (
-    Variant(IMITATION, "imitates lqg-at-0.02-told, which is told each crystal's puller and how rough its melt is"),
-    _imitation("untold", "the teacher is lqg-at-0.02, which is told nothing", teacher="lqg-at-0.02"),
+    Variant(IMITATION, "its teacher, lqg-at-0.02-told, is privileged: it knows each crystal's puller and roughness"),
+    _imitation("plain-teacher", "the teacher is lqg-at-0.02, which is not privileged", teacher="lqg-at-0.02"),
     _imitation("quarter", "a quarter of the crystals", episodes=120),
     _imitation("no-wide", "no wide crystals, all spread as the scenario's own", wide_share=0.0),
     _imitation("all-wide", "all crystals are wide", wide_share=1.0),

@@ -13,9 +13,7 @@ ROWS = (
     Variant(RECIPES["ppo"], "PPO from nothing; the critic also sees the true state"),
     Variant(RECIPES["ppo-recurrent"], "PPO of an LSTM from nothing; actor and critic see what is measured", "ppo"),
     Variant(RECIPES["sac"], "soft actor-critic from nothing; both see what is measured", "ppo"),
-    Variant(
-        RECIPES["imitation"], "no reward: DAgger, the teacher is an LQG that is told more than sensors show", "ppo"
-    ),
+    Variant(RECIPES["imitation"], "no reward: DAgger, the teacher is a privileged LQG", "ppo"),
 )
 """Every row, in the order of the table."""
 STUDY = Study("algorithms", "Algorithms side by side: the recipes of train.py on the same crystals", ROWS, 400_000)

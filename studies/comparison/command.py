@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from .results import Plan, Result
 
 ABOUT = """
-Agents are judged on {crystals} validation crystals of `{scenario}` that select nothing, and on those of `{farther}`
+Agents are judged on {crystals} validation crystals of `{scenario}` that select nothing, and on those of `{transfer}`
 with the same seeds; of each run the agent of least cost on the validation that selects. In brackets: 95 % intervals,
 bootstrap over training seeds and crystals; with few training seeds they are somewhat too narrow. Differences are
 taken on the same crystals and training seeds, negative is better. Cost: of a step, as the environment's reward counts
@@ -96,7 +96,7 @@ def _write(study: Study, plan: Plan, seeds: Sequence[int]) -> None:
 
     from .figures import curves, forest
     from .lqg_family import lqg_family
-    from .results import FARTHER, SCENARIO
+    from .results import SCENARIO, TRANSFER
     from .table import tabulate, to_csv, to_markdown
     from .training import is_finished, result_of
 
@@ -106,7 +106,7 @@ def _write(study: Study, plan: Plan, seeds: Sequence[int]) -> None:
             runs.setdefault(task[0].name, {})[task[1]] = result_of(plan, task)
     family = lqg_family(plan)
     lines = tabulate(study.variants, runs, family)
-    about = ABOUT.strip().format(crystals=len(plan.crystals), scenario=SCENARIO, farther=FARTHER)
+    about = ABOUT.strip().format(crystals=len(plan.crystals), scenario=SCENARIO, transfer=TRANSFER)
     meanings = [f"- **{variant.name}**: {variant.meaning}" for variant in study.variants if variant.name in runs]
     text = [f"# {study.title}", "", about, "", *to_markdown(lines, family), "", *meanings, ""]
     files = {"table.md": "\n".join(text).encode(), "table.csv": to_csv(lines).encode()}

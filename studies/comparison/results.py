@@ -25,10 +25,10 @@ from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 
 Floats = npt.NDArray[np.float64]
-SCENARIO, FARTHER = "randomized", "hard"
-"""What crystals are drawn from, whatever an agent was trained on; and a scenario to travel to."""
+SCENARIO, TRANSFER = "randomized", "hard"
+"""What crystals are drawn from, whatever an agent was trained on; and a scenario to transfer to."""
 RMSE, ACTIVITY, COST, LOST = "rmse_mm", "pull_step_rms_mm_per_min", "cost", "failure_rate"
-FIGURES = (RMSE, COST, ACTIVITY, LOST, f"{FARTHER}_{RMSE}", f"{FARTHER}_{LOST}")
+FIGURES = (RMSE, COST, ACTIVITY, LOST, f"{TRANSFER}_{RMSE}", f"{TRANSFER}_{LOST}")
 """Of a crystal: true-radius RMSE [mm]; mean cost of a step as the reward counts it [-], a lost crystal costing ten;
 RMS of the pull speed's steps [mm/min]; 1 if the crystal was lost; radius error and loss on the other scenario."""
 DIGITS = 5
@@ -61,12 +61,12 @@ class Result(NamedTuple):
 
 def judge(plan: Plan, policy: Any) -> Floats:
     """Figures of a policy on the plan's crystals, shape (crystals, figures)."""
-    own, farther = (
+    own, transfer = (
         metrics(rollout(policy, make_config(name, observation="history"), plan.crystals))
-        for name in (SCENARIO, FARTHER)
+        for name in (SCENARIO, TRANSFER)
     )
     cost = costs(own, CostWeights())
-    columns = own.rmse_mm, cost, own.pull_step_rms_mm_per_min, own.failure_rate, farther.rmse_mm, farther.failure_rate
+    columns = own.rmse_mm, cost, own.pull_step_rms_mm_per_min, own.failure_rate, transfer.rmse_mm, transfer.failure_rate
     return np.stack(columns, axis=-1)
 
 
@@ -94,16 +94,16 @@ def cached(plan: Plan, name: str, settings: Any, make: Callable[[], Result]) -> 
 
 
 def _key(plan: Plan, settings: Any) -> Any:
-    hashes = {name: make_config(name, observation="history").hash for name in (SCENARIO, FARTHER)}
+    hashes = {name: make_config(name, observation="history").hash for name in (SCENARIO, TRANSFER)}
     return {"settings": settings, "crystals": [int(seed) for seed in plan.crystals], "scenarios": hashes}
 
 
 def _read(path: Path, crystals: int) -> Result:
     """A cached result; ValueError if the file is damaged."""
-    told = read_json(path)
+    content = read_json(path)
     try:
-        figures = np.array([told["figures"][name] for name in FIGURES], np.float64).T
-        validations = [{str(name): float(value) for name, value in row.items()} for row in told["validations"]]
+        figures = np.array([content["figures"][name] for name in FIGURES], np.float64).T
+        validations = [{str(name): float(value) for name, value in row.items()} for row in content["validations"]]
     except (KeyError, TypeError, ValueError, AttributeError):
         figures, validations = np.zeros(0), []
     if figures.shape != (crystals, len(FIGURES)) or not np.isfinite(figures).all():

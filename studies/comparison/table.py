@@ -16,7 +16,7 @@ import numpy as np
 from cz_gym.evaluation.statistics import Estimate, Resamples, means
 
 from .lqg_family import Family, at_equal_activity
-from .results import ACTIVITY, COST, FARTHER, FIGURES, LOST, RMSE, Result
+from .results import ACTIVITY, COST, FIGURES, LOST, RMSE, TRANSFER, Result
 from .variants import Variant
 
 MICRON, PERCENT = 1e-3, 1e-2
@@ -26,8 +26,8 @@ COLUMNS = (
     ("cost", COST, 1.0, ".4f"),
     ("pull step [um/min]", ACTIVITY, MICRON, ".1f"),
     ("lost [%]", LOST, PERCENT, ".1f"),
-    (f"{FARTHER}: RMSE [um]", f"{FARTHER}_{RMSE}", MICRON, ".1f"),
-    ("lost [%]", f"{FARTHER}_{LOST}", PERCENT, ".1f"),
+    (f"{TRANSFER}: RMSE [um]", f"{TRANSFER}_{RMSE}", MICRON, ".1f"),
+    ("lost [%]", f"{TRANSFER}_{LOST}", PERCENT, ".1f"),
 )
 """Figures of the table: heading, figure, unit, format."""
 

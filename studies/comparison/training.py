@@ -36,7 +36,7 @@ def trained(
 ) -> Result:
     """What the agent of a recipe and a training seed does on the plan's crystals; trained if that is not cached.
 
-    It goes on from its checkpoint if there is one; its folder goes when it is judged. ``report`` is told what each
+    It goes on from its checkpoint if there is one; its folder goes when it is judged. ``report`` gets what each
     validation on the way found; what it raises ends the run, whose checkpoint stays.
     """
 

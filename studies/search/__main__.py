@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from .space import Params
 
 PROG = "python -m studies.search"
-STARTUP, RIVALS, LOOKS = 8, 4, 6
+STARTUP, COMPLETE, VALIDATIONS = 8, 4, 6
 """Trials drawn at random first; those that must be complete before one is given up; validations on a trial's way."""
 
 
@@ -82,7 +82,7 @@ def objective(
     plan = Plan(given.out, given.work, crystals()[0])
     with tqdm(disable=True) as bar:
         recipe = recipe_of(params, given.steps, "ppo-search")
-        return trained(plan, recipe, seed, bar, max(given.steps // LOOKS, 1), report).mean(COST)
+        return trained(plan, recipe, seed, bar, max(given.steps // VALIDATIONS, 1), report).mean(COST)
 
 
 def crystals() -> tuple[Sequence[int], Sequence[int]]:
@@ -109,7 +109,7 @@ def search(given: argparse.Namespace) -> Study:
         storage=optuna.storages.JournalStorage(JournalFileBackend(str(given.out / "journal.log"))),
         study_name=f"ppo-{given.steps}-steps",
         load_if_exists=True,
-        pruner=optuna.pruners.MedianPruner(n_startup_trials=RIVALS),
+        pruner=optuna.pruners.MedianPruner(n_startup_trials=COMPLETE),
     )
     recipe, done = params_of(PPO()), finished(study)
     if all(trial.params != recipe for trial in done):

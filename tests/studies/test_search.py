@@ -140,7 +140,7 @@ def test_the_objective_trains_once_and_can_be_given_up(tmp_path: Path, monkeypat
     looks: list[int] = []
     cost = search.objective(RECIPE, 0, given, lambda steps, found: looks.append(steps))
     assert cost > 0.0
-    assert len(looks) >= search.LOOKS
+    assert len(looks) >= search.VALIDATIONS
     monkeypatch.setattr(training, "Run", None)
     assert search.objective(RECIPE, 0, given) == cost, "the result is cached"
     monkeypatch.undo()
