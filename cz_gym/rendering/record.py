@@ -86,6 +86,11 @@ class Record:
         """All values of a sample's field, shape (samples,); not to be written to."""
         return self._rows[: self._count, _AT[name]]
 
+    @property
+    def error(self) -> Floats:
+        """The true radius error of every sample [m], shape (samples,)."""
+        return self.column("r_c") - self.column("r_ref")
+
     def add(self, info: Floats, slot: Any, terminated: bool = False, truncated: bool = False) -> None:
         """Add the sample of info rows (:data:`cz_gym.engine.layout.INFO`) and the slot they were read from.
 

@@ -18,7 +18,6 @@ from studies.film import __main__ as film
 from studies.industrial import __main__ as industrial_check
 from studies.paper import __main__ as paper
 from studies.speed import __main__ as speed
-from studies.speed import rendering as rendering_speed
 from studies.young_laplace import __main__ as young_laplace_build
 
 COMMANDS = [
@@ -32,7 +31,6 @@ COMMANDS = [
     (young_laplace_build, "--wri"),
     (play, "--minute"),
     (film, "--frame"),
-    (rendering_speed, "--round"),
 ]
 """Each with the beginning of one of its options."""
 WORK = [
@@ -45,7 +43,6 @@ WORK = [
     (young_laplace_build, "build", ["--write"]),
     (play, "settings", []),
     (film, "film", ["--out", "new/film.gif"]),
-    (rendering_speed, "measure", []),
 ]
 """Each with the function that does its work, and arguments that would write a file."""
 
