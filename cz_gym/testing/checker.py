@@ -22,7 +22,7 @@ from cz_gym.commands import OneLineParser
 from cz_gym.episodes import scenarios
 from cz_gym.observation import CAMERA, OBSERVATIONS
 
-from .driver import Checked, Event, MakeScalar, MakeVector, NotConforming, Setup, run
+from .driver import Checked, Driver, MakeScalar, MakeVector, NotConforming
 from .nested_arrays import KEEPERS, Kept, NamedArray, difference, flatten, keep, overwrite
 
 __all__ = ["Checked", "NotConforming", "check_vector_env"]
@@ -55,126 +55,97 @@ def check_vector_env(
         raise ValueError(f"a check needs num_envs >= 2, steps >= 2 and a mode, not {num_envs}, {steps}, {modes!r}")
     total = Checked()
     for mode in modes:
-        setup = Setup(make_vector, make_scalar, num_envs, steps, seed, AutoresetMode(mode), random_start, rtol)
-        _check_spaces(setup)
-        _check_seeds(setup)
-        total += _check_redraws(setup) + _check_equality(setup) + _check_writes(setup)
-        total += _check_kept(setup, every=True) + _check_kept(setup, every=False)
+        driver = Driver(make_vector, make_scalar, num_envs, steps, seed, AutoresetMode(mode))
+        _check_spaces(driver)
+        _check_seeds(driver, random_start, rtol)
+        _check_equality(driver, random_start, rtol)
+        _check_kept(driver, every=True)
+        _check_kept(driver, every=False)
+        _check_writes(driver)
+        total += driver.seen
     return total
 
 
-def _check_spaces(setup: Setup) -> None:
-    with setup.vector() as env, closing(setup.make_scalar()) as scalar:
-        n = setup.num_envs
-        setup.require(env.num_envs == n, f"num_envs is {env.num_envs}, asked for {n}")
+def _check_spaces(driver: Driver) -> None:
+    with driver.vector() as env, closing(driver.make_scalar()) as scalar:
+        n = driver.num_envs
+        driver.require(env.num_envs == n, f"num_envs is {env.num_envs}, asked for {n}")
         declared = env.metadata.get("autoreset_mode")
-        setup.require(declared == setup.mode, f"metadata['autoreset_mode'] is {declared!r}")
+        driver.require(declared == driver.mode, f"metadata['autoreset_mode'] is {declared!r}")
         for name in ("action_space", "observation_space"):
             alone, single, batched = getattr(scalar, name), getattr(env, f"single_{name}"), getattr(env, name)
-            setup.require(single == alone, f"single_{name} is {single}, the scalar's is {alone}")
+            driver.require(single == alone, f"single_{name} is {single}, the scalar's is {alone}")
             expected = batch_space(single, n)
-            setup.require(batched == expected, f"{name} is {batched}, the batch of {n} is {expected}")
+            driver.require(batched == expected, f"{name} is {batched}, the batch of {n} is {expected}")
 
 
-def _check_types(event: Event, env: Any, setup: Setup) -> None:
-    """Shapes and dtypes of what a call returned."""
-    call, n = event.call, setup.num_envs
-    observation, infos = event.result[0], event.result[-1]
-    inside = env.observation_space.contains(observation)
-    setup.require(inside, f"{call}: the observation is not in observation_space (shape, dtype or bounds)")
-    if len(event.result) == 5:
-        for name, array, dtype in zip(_RESULT[1:4], event.result[1:4], (np.float64, np.bool_, np.bool_), strict=True):
-            fits = isinstance(array, np.ndarray) and array.shape == (n,) and array.dtype == dtype
-            found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
-            setup.require(fits, f"{call}: {name} must be {np.dtype(dtype)} of shape ({n},), is {found}")
-    setup.require(isinstance(infos, dict), f"{call}: infos must be a dict, is {type(infos).__name__}")
-    for key in infos:
-        mask = infos[key] if key.startswith("_") else infos.get(f"_{key}")
-        fits = isinstance(mask, np.ndarray) and mask.shape == (n,) and mask.dtype == np.bool_
-        setup.require(fits, f"{call}: info {key!r} needs a mask '_{key.lstrip('_')}', bool of shape ({n},)")
-
-
-def _first(setup: Setup, seed: Any, env: Any = None) -> list[list[NamedArray]]:
+def _first(driver: Driver, seed: Any, env: Any = None) -> list[list[NamedArray]]:
     """Copies of the first observation of every slot."""
     if env is None:
-        with setup.vector() as fresh:
-            return _first(setup, seed, fresh)
+        with driver.vector() as fresh:
+            return _first(driver, seed, fresh)
     arrays = flatten(env.reset(seed=seed)[0])
-    return [[array.at(i) for array in arrays] for i in range(setup.num_envs)]
+    return [[array.at(i) for array in arrays] for i in range(driver.num_envs)]
 
 
-def _check_seeds(setup: Setup) -> None:
-    seed, n = setup.seed, setup.num_envs
+def _check_seeds(driver: Driver, random_start: bool, rtol: float) -> None:
+    seed, n = driver.seed, driver.num_envs
 
     def same(one: list[list[NamedArray]], other: list[list[NamedArray]]) -> bool:
         return all(difference(*pair) is None for pair in zip(one, other, strict=True))
 
-    expected = _first(setup, seed)
-    with setup.vector() as env:
+    expected = _first(driver, seed)
+    with driver.vector() as env:
         for what in ("a second environment", "a second reset"):
-            again = same(_first(setup, seed, env), expected)
-            setup.require(again, f"seed {seed} gives another first observation in {what}")
-        unseeded = _first(setup, None, env)
-    listed = [seed + 7 * (n - i) for i in range(n)]
-    for i, slot in enumerate(_first(setup, listed)):
-        with closing(setup.make_scalar()) as scalar:
-            differs = difference(slot, flatten(scalar.reset(seed=listed[i])[0]), setup.rtol)
-        setup.require(not differs, f"seed list: slot {i} with seed {listed[i]} differs from the scalar with that seed")
-    if not setup.random_start:
+            again = same(_first(driver, seed, env), expected)
+            driver.require(again, f"seed {seed} gives another first observation in {what}")
+        unseeded = _first(driver, None, env)
+    seeds = [seed + 7 * (n - i) for i in range(n)]
+    for i, slot in enumerate(_first(driver, seeds)):
+        with closing(driver.make_scalar()) as scalar:
+            differs = difference(slot, flatten(scalar.reset(seed=seeds[i])[0]), rtol)
+        driver.require(not differs, f"seed list: slot {i} with seed {seeds[i]} differs from the scalar with that seed")
+    if not random_start:
         return
     for other, what in (
-        (_first(setup, seed + 1000), f"seeds {seed} and {seed + 1000} give"),
+        (_first(driver, seed + 1000), f"seeds {seed} and {seed + 1000} give"),
         (unseeded, "a reset without seed repeats the last one: both give"),
-        (_first(setup, None), f"no seed and seed {seed} give"),
+        (_first(driver, None), f"no seed and seed {seed} give"),
     ):
-        setup.require(not same(other, expected), f"{what} the same first observations")
+        driver.require(not same(other, expected), f"{what} the same first observations")
     for i in range(1, n):
         unlike = difference(expected[i], expected[0])
-        setup.require(unlike, f"slots 0 and {i} have the same first observation")
+        driver.require(unlike, f"slots 0 and {i} have the same first observation")
 
 
-def _check_redraws(setup: Setup) -> Checked:
-    """Shapes and dtypes throughout, and a new first observation after every end."""
-    begun: list[list[list[NamedArray]]] = [[] for _ in range(setup.num_envs)]
-    seen = Checked(setup.steps)
-    with setup.vector() as env:
-        for event in run(env, setup):
-            _check_types(event, env, setup)
-            seen += _ends(event)
-            for i in np.flatnonzero(event.first).tolist():
-                new = [array.at(i) for array in flatten(event.result[0])]
-                again = setup.random_start and any(difference(new, old) is None for old in begun[i])
-                setup.require(not again, f"{event.call}: slot {i} begins again with a first observation it had before")
+def _check_equality(driver: Driver, random_start: bool, rtol: float) -> None:
+    """Everything as the scalars have it, and a new first observation after every end."""
+    begun: list[list[list[NamedArray]]] = [[] for _ in range(driver.num_envs)]
+    with driver.vector() as env, driver.scalars() as oracle:
+        for one, other in zip(driver.run(env), driver.run(oracle, oracle=True), strict=True):
+            for i in np.flatnonzero(one.first).tolist() if random_start else ():
+                new = [array.at(i) for array in flatten(one.result[0])]
+                again = any(difference(new, old) is None for old in begun[i])
+                driver.require(not again, f"{one.call}: slot {i} begins again with a first observation it had before")
                 begun[i].append(new)
-    setup.require(seen.episodes, f"no episode ended in {setup.steps} steps: give more steps or a shorter horizon")
-    return seen
-
-
-def _ends(event: Event) -> Checked:
-    return Checked(episodes=int(event.ended.sum()), failures=int(event.failed.sum()))
-
-
-def _check_equality(setup: Setup) -> Checked:
-    seen = Checked(setup.steps)
-    with setup.vector() as env, setup.scalars() as oracle:
-        for one, other in zip(run(env, setup), run(oracle, setup), strict=True):
-            setup.require(one.call == other.call, f"{one.call} where the scalars have {other.call}")
+            driver.require(one.call == other.call, f"{one.call} where the scalars have {other.call}")
             names = _RESULT if len(one.result) == 5 else (_RESULT[0], _RESULT[-1])
             for name, ours, theirs in zip(names, one.result, other.result, strict=True):
-                found = difference(flatten(ours, name), flatten(theirs, name), setup.rtol, masked=name == "info")
-                setup.require(not found, f"{one.call}: {found} (native and scalar)")
-            seen += _ends(one)
-    return seen
+                found = difference(flatten(ours, name), flatten(theirs, name), rtol, masked=name == "info")
+                driver.require(not found, f"{one.call}: {found} (native and scalar)")
+    driver.require(
+        driver.seen.episodes, f"no episode ended in {driver.steps} steps: give more steps or a shorter horizon"
+    )
 
 
-def _check_kept(setup: Setup, every: bool) -> Checked:
+def _check_kept(driver: Driver, every: bool) -> None:
     """Keep every array, each in another way, or one array of each call alone; look again at the end.
 
     One alone, because memory that is used again once nobody needs it would be used again around it.
     """
     kept: list[tuple[str, Kept]] = []
-    with setup.vector() as env:
-        for number, event in enumerate(run(env, setup)):
+    with driver.vector() as env:
+        for number, event in enumerate(driver.run(env)):
             arrays = flatten(event.result)
             if every:
                 kept += [(event.call, keep(array, len(kept) + i)) for i, array in enumerate(arrays)]
@@ -182,18 +153,18 @@ def _check_kept(setup: Setup, every: bool) -> Checked:
                 kept.append((event.call, keep(arrays[number // len(KEEPERS) % len(arrays)], number)))
             del arrays, event
         for call, array in kept:
-            setup.require(array.unchanged, f"{call}: {array.name} (kept as {array.keeper}) was written by a later call")
-    return Checked(setup.steps, held=len(kept))
+            still = f"{call}: {array.name} (kept as {array.keeper}) was written by a later call"
+            driver.require(array.unchanged, still)
+    driver.seen += Checked(held=len(kept))
 
 
-def _check_writes(setup: Setup) -> Checked:
+def _check_writes(driver: Driver) -> None:
     """Overwrite all that one of two equal environments returns, and the actions it was given."""
-    with setup.vector() as plain, setup.vector() as overwritten:
-        for one, other in zip(run(plain, setup), run(overwritten, setup, overwrites=True), strict=True):
+    with driver.vector() as plain, driver.vector() as overwritten:
+        for one, other in zip(driver.run(plain), driver.run(overwritten, oracle=True, overwrites=True), strict=True):
             found = difference(flatten(other.result, "result"), flatten(one.result, "result"), masked=True)
-            setup.require(not found, f"{one.call}: writing into earlier results or actions changed {found}")
+            driver.require(not found, f"{one.call}: writing into earlier results or actions changed {found}")
             overwrite(other.result)
-    return Checked(setup.steps)
 
 
 def _check_cz(scenario: str, observation: str, num_envs: int, steps: int) -> Checked:

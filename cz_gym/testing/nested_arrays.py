@@ -41,13 +41,16 @@ def flatten(value: Any, name: str = "") -> list[NamedArray]:
 
 
 def difference(one: list[NamedArray], other: list[NamedArray], rtol: float = 0.0, masked: bool = False) -> str | None:
-    """What differs first, in words; None if nothing does. ``masked``: only where masks say there is something."""
+    """What differs first, in words; None if nothing does.
+
+    ``masked``: only where masks say there is something; dtypes but bool may differ, as infos' do.
+    """
     names = [[array.name for array in arrays] for arrays in (one, other)]
     if names[0] != names[1]:
         odd = sorted(set(names[0]) ^ set(names[1]))
         return f"{', '.join(odd[:3]) or 'the order of parts'} is in one only"
     for (name, a, _), (_, b, mask) in zip(one, other, strict=True):
-        if a.shape != b.shape or (a.dtype != b.dtype and not masked):
+        if a.shape != b.shape or (a.dtype != b.dtype and (not masked or b.dtype == np.bool_)):
             return f"{name} is {a.dtype} {a.shape} and {b.dtype} {b.shape}"
         unlike = ~_close(a, b, rtol)
         if masked and mask is not None and a.ndim > 0 and mask.shape == a.shape[:1]:

@@ -244,9 +244,9 @@ BROKEN: dict[type[Conforming], str] = {
     Alike: "slots 0 and 1 have the same first observation",
     SeedList: "seed list: slot 1 with seed 14 differs",
     Repeating: "the same first observations",
-    Rewards32: "reward must be float64 of shape .3,., is float32",
-    Observations64: "the observation is not in observation_space",
-    Unmasked: "info 'far' needs a mask '_far'",
+    Rewards32: "reward is float32 .3,. and float64 .3,.",
+    Observations64: r"observation\['t'\] is float64 .* and float32",
+    Unmasked: r"info\['_far'\] is in one only",
     Reward: r"reward of slot 1 is .* and",
     Timeout: "terminated of slot . is True and False",
     Info: r"info\['far'\] of slot 0 is",
@@ -268,7 +268,7 @@ SHOWN_IN = {Mode: AutoresetMode.SAME_STEP, Final: AutoresetMode.SAME_STEP, Reset
 @pytest.mark.parametrize("mode", MODES)
 def test_gymnasiums_own_vector_conforms(mode: AutoresetMode) -> None:
     checked = check_vector_env(Conforming, Walk, steps=40, modes=[mode])
-    assert checked.steps == 5 * 40
+    assert checked.steps == 4 * 40
     assert checked.episodes > checked.failures > 10
     assert checked.held > 40 * 4
 
