@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from cz_gym.config import Config
 from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.replay import Playback
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.units import MINUTE
 
@@ -49,19 +50,6 @@ class Score(NamedTuple):
         )
 
 
-class Actions(NamedTuple):
-    """A policy that repeats what was done, whatever is observed; the last action stays."""
-
-    done: Sequence[npt.NDArray[np.float32]]
-
-    def predict(
-        self, observation: Any, state: int | None = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[npt.NDArray[np.float32], int]:
-        """The next action for one slot, shape (1, 2)."""
-        k = state or 0
-        return self.done[min(k, len(self.done) - 1)][None], k + 1
-
-
 def score(config: Config, seed: int, actions: Sequence[npt.NDArray[np.float32]], failed: bool, rival: Any) -> Score:
     """The score of these actions, each of shape (2,), beside a controller's.
 
@@ -69,7 +57,7 @@ def score(config: Config, seed: int, actions: Sequence[npt.NDArray[np.float32]],
     """
     if not failed:
         config = replace(config, horizon=len(actions) * config.control_interval)
-    player, controller = (_result(policy, config, seed) for policy in (Actions(actions), rival))
+    player, controller = (_result(policy, config, seed) for policy in (Playback(actions), rival))
     return Score(config.scenario.name, seed, config.horizon / MINUTE, player, controller)
 
 

@@ -20,7 +20,8 @@ Complex = npt.NDArray[np.complex128]
 SEEN = ("ring_error", "T_1", "v_p", "Q_H")
 """Readings through which the plant reaches an agent: ring [m], pyrometer [K], applied drives [m/s, W]."""
 _STEP = 1e-6
-_AT = [[channel.name for channel in MEASURED].index(name) for name in SEEN]
+AT = [[channel.name for channel in MEASURED].index(name) for name in SEEN]
+"""Where they stand among the channels of MEASURED."""
 _REMEMBERED = [SEEN.index(name) for name in LAGGED]
 
 
@@ -42,7 +43,7 @@ class LinearAgent(NamedTuple):
         The applied drives are counted as readings of their own; feeding them back is the loop's affair.
         """
         z = np.exp(1j * self.dt * np.atleast_1d(np.asarray(omega, np.float64)))
-        found = np.zeros((len(z), 2, len(SEEN)), np.complex128) + self.now[:, _AT]
+        found = np.zeros((len(z), 2, len(SEEN)), np.complex128) + self.now[:, AT]
         for lag, (newest, oldest) in enumerate(zip(*lags(self.dt), strict=True)):
             mean = (z[:, None] ** -np.arange(newest, oldest + 1.0)).mean(axis=1)
             found[:, :, _REMEMBERED] += mean[:, None, None] * self.lagged[:, lag]
@@ -62,12 +63,12 @@ class LinearAgent(NamedTuple):
         for channel in range(kept):
             first = channel * depth
             A[first + 1 : first + depth, first : first + depth - 1] = np.eye(depth - 1)
-            B[first, _AT[_REMEMBERED[channel]]] = 1.0
+            B[first, AT[_REMEMBERED[channel]]] = 1.0
             for lag, (new, old) in enumerate(zip(newest, oldest, strict=True)):
                 C[:, first + new - 1 : first + old] += self.lagged[:, lag, channel, None] / (old - new + 1)
-        A[-1, -1], B[-1, _AT[0]] = 1.0, self.dt
+        A[-1, -1], B[-1, AT[0]] = 1.0, self.dt
         C[:, -1] = self.integral
-        D[:, _AT[0]] += self.integral * self.dt
+        D[:, AT[0]] += self.integral * self.dt
         return StateSpace(A, B, C, D)
 
 

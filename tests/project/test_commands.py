@@ -34,7 +34,7 @@ COMMANDS = [
 ]
 """Each with the beginning of one of its options."""
 WORK = [
-    (paper, "_compute", ["--out", "new/folder"]),
+    (paper, "contents", ["--out", "new/folder"]),
     (tune, "search", ["--controller", "industrial", "--out", "new/folder"]),
     (lqg_tune, "search", ["--output", "new/folder/lqg.json"]),
     (design_table, "table", ["--out", "new/folder"]),
