@@ -70,18 +70,18 @@ def contenders(path: Path | None) -> tuple[Contender, ...]:
         near = linear_agent(content, observations, config.control_interval, config.parameters.v_0)
         return Contender(label, contract.observation, lambda _: policy, near.state_space(), near.response)
 
-    def other(label: str) -> Contender:
-        make = registry.find_controller(label).make
-        form = linear_form(make(crystal(1.0, "measured")))
-        return Contender(
-            label, "measured", make, form.controller, lambda omega: response(form.controller, form.dt, omega)[:, :, AT]
-        )
-
     return (
         agent(name, noisy_observations(policy, contract.observation)),
-        *map(other, BESIDE),
+        *map(controller, BESIDE),
         agent(f"{name} {AT_REST}", run_events(policy, config, (), [0.0]).observation),
     )
+
+
+def controller(name: str) -> Contender:
+    """A controller of the registry."""
+    make = registry.find_controller(name).make
+    system, _, dt = linear_form(make(crystal(1.0, "measured")))
+    return Contender(name, "measured", make, system, lambda omega: response(system, dt, omega)[:, :, AT])
 
 
 def puller_parts(contender: Contender, episodes: int) -> dict[str, dict[str, float]]:

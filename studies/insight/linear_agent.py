@@ -110,5 +110,5 @@ def _in_double(onnx_bytes: bytes, channels: int) -> Any:
             weight.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(weight).astype(np.float64), weight.name))
     for value in (*model.graph.input, *model.graph.output):
         value.type.tensor_type.elem_type = TensorProto.DOUBLE
-    session = ReferenceEvaluator(model)
+    session: Any = ReferenceEvaluator(model)
     return lambda rows: session.run(None, {"observation": rows})[0]

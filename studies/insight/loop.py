@@ -12,7 +12,6 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from cz_gym.baselines.analysis import frequency, sampled_loop
 from cz_gym.physics.linearisation import StateSpace
@@ -99,13 +98,14 @@ def response(system: StateSpace, dt: float, omega: Floats) -> Complex:
     """Frequency response of a discrete state space of moderate order, shape (points, outputs, inputs)."""
     A, B, C, D = system
     z = np.exp(1j * omega * dt)
-    found: Complex = C @ np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, np.broadcast_to(B, (len(z), *B.shape)))
-    return found + D
-
-
-def _solve(matrices: npt.NDArray[np.complex128], rights: npt.NDArray[np.complex128]) -> Complex:
-    found: Complex = np.linalg.solve(matrices, rights[..., None])[..., 0]
+    inputs: Any = np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, np.broadcast_to(B, (len(z), *B.shape)))
+    found: Complex = C @ inputs + D
     return found
+
+
+def _solve(matrices: Any, rights: Any) -> Complex:
+    found: Any = np.linalg.solve(matrices, rights[..., None])
+    return np.asarray(found[..., 0], np.complex128)
 
 
 def one_reading(contender: Contender, dt: float) -> Floats:
