@@ -173,30 +173,43 @@ def test_a_linear_controller_answers_every_small_jump_alike_and_the_agent_none_o
     assert agent[-1] < 0.5 * agent[0]
 
 
-def test_pictures_and_tables_say_what_was_found(near: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cz_gym.evaluation.report.canvas.DPI", 40)
+@pytest.fixture(scope="module")
+def answers() -> dict[str, dict[str, Any]]:
     config = crystal(21.0, "measured")
     policy = find_controller("paper-tuned").make(config)
-    answers = {test.name: {"one": respond(policy, config, test)} for test in STEP_TESTS}
-    omega = frequencies(DT, 60)
+    return {test.name: {"one": respond(policy, config, test)} for test in STEP_TESTS}
+
+
+@pytest.fixture(scope="module")
+def loop(near: Any) -> Any:
     one = Contender("one", "history", lambda _: None, near.state_space(), near.response)
-    responses, jumps = {"one": one.loop(omega, 1.0, DT)}, {"one": [np.ones(len(JUMPS)), np.ones(len(JUMPS))]}
+    return one.loop(frequencies(DT, 60), 1.0, DT)
+
+
+JUMPED = {"one": [np.ones(len(JUMPS)), np.ones(len(JUMPS))]}
+
+
+@pytest.mark.slow
+def test_pictures(answers: Any, loop: Any) -> None:
     for picture in (
         response_figure(answers, DT),
-        gain_figure({"one": np.ones((5, 2))}, responses, DT),
-        jump_figure(jumps),
-        loop_figure(responses, 0.02),
-        share_figure(answers["load"], responses, "load"),
+        gain_figure({"one": np.ones((5, 2))}, {"one": loop}, DT),
+        jump_figure(JUMPED),
+        loop_figure({"one": loop}, 0.02),
+        share_figure(answers["load"], {"one": loop}, "load"),
     ):
         assert picture.startswith(b"\x89PNG")
+
+
+def test_tables_say_what_was_found(answers: Any, loop: Any) -> None:
     margins = {"controller": "one", "plant": "Model I", "at": "v_p", "growth": np.inf}
     found = {
         "agent": asdict(read_agent(PATH)[0]),
         "answers": {name: {"one": answer_figures(by["one"])} for name, by in answers.items()},
-        "margins": [margins | margins_of(responses["one"].opened("v_p"), omega, DT, False)._asdict()],
+        "margins": [margins | margins_of(loop.opened("v_p"), loop.omega, DT, False)._asdict()],
         "noise_gain": {"one": {"pull": 1.0, "step": 2.0, "heater": 3.0}},
         "apart": {"from": "two", "one": {"pull speed": (0.0, 0.01, 0.5, 2.0)}},
-        "jumps": jump_figures(jumps),
+        "jumps": jump_figures(JUMPED),
         "limits": {"one": {limit.name: Survival(1.5, 1.25, 2.0, True)._asdict() for limit in LIMITS}},
         "puller_parts": {
             "validation_episodes": 4,

@@ -65,19 +65,6 @@ def test_every_row_of_ours_can_be_made_and_steps(monkeypatch: pytest.MonkeyPatch
     assert len(rows) == len(wanted)
 
 
-@pytest.mark.usefixtures("tiny")
-def test_a_file_that_cannot_be_written_is_one_line_before_anything_is_measured(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(speed, "run", lambda *_: pytest.fail("measured"))
-    (tmp_path / "file").write_text("in the way")
-    for file in (tmp_path, tmp_path / "file" / "below.json"):
-        assert main(["--json", str(file)]) == 2
-        said = capsys.readouterr().err
-        assert said.count("\n") == 1
-        assert str(file.parent) in said
-
-
 def test_a_case_counts_the_steps_of_every_slot_and_one_that_breaks_is_skipped_by_name() -> None:
     seen: list[str] = []
     counted = Case("counted", lambda: Stepper(10**9, lambda: seen.append("step"), lambda: seen.append("close")))
