@@ -195,24 +195,26 @@ def _at_profile(ray: Any, q: Any, scene: Any) -> Any:
 def _rising(ray: Any, q: Any, scene: Any, view: Any) -> Any:
     """What a ray hits that does not sink."""
     t = _meet_crystal(ray, scene)
-    shield = _at(SHIELD, ray, (view.wall_height - ray.z) / ray.dz)
-    if t > 0.0 and (ray.z + t * ray.dz < view.wall_height or not _beyond(shield, view.shield_radius)):
+    shield = _at(SHIELD, ray, (view.camera.wall_height - ray.z) / ray.dz)
+    if t > 0.0 and (ray.z + t * ray.dz < view.camera.wall_height or not _beyond(shield, view.camera.shield_radius)):
         return _at(CRYSTAL, ray, t)
     found = _meet_above(ray, scene, q)
     if found >= 0.0:
         return _at_profile(ray, found, scene)
-    if _beyond(shield, view.crucible_radius):
-        return _at(WALL, ray, _meet_cylinder(ray, view.crucible_radius, True))
-    return shield if _beyond(shield, view.shield_radius) else _at(OPENING, ray, 1.0)
+    if _beyond(shield, view.camera.crucible_radius):
+        return _at(WALL, ray, _meet_cylinder(ray, view.camera.crucible_radius, True))
+    return shield if _beyond(shield, view.camera.shield_radius) else _at(OPENING, ray, 1.0)
 
 
 @physics
 def _sinking(ray: Any, q: Any, scene: Any, view: Any) -> Any:
     """What a ray hits that sinks."""
     t = _meet_crystal(ray, scene)
-    if ray.z > view.wall_height:
-        shield = _at(SHIELD, ray, (view.wall_height - ray.z) / ray.dz)
-        if _beyond(shield, view.shield_radius) and not (t > 0.0 and ray.z + t * ray.dz > view.wall_height):
+    if ray.z > view.camera.wall_height:
+        shield = _at(SHIELD, ray, (view.camera.wall_height - ray.z) / ray.dz)
+        if _beyond(shield, view.camera.shield_radius) and not (
+            t > 0.0 and ray.z + t * ray.dz > view.camera.wall_height
+        ):
             return shield
     if t > 0.0:
         return _at(CRYSTAL, ray, t)
@@ -220,8 +222,8 @@ def _sinking(ray: Any, q: Any, scene: Any, view: Any) -> Any:
     if found >= 0.0:
         return _at_profile(ray, found, scene)
     melt = _at(MELT, ray, -ray.z / ray.dz)
-    if _beyond(melt, view.crucible_radius):
-        return _at(WALL, ray, _meet_cylinder(ray, view.crucible_radius, True))
+    if _beyond(melt, view.camera.crucible_radius):
+        return _at(WALL, ray, _meet_cylinder(ray, view.camera.crucible_radius, True))
     return melt
 
 
@@ -261,10 +263,10 @@ def emitted(hit: Any, scene: Any, view: Any) -> Any:
     if hit.what == SHIELD:
         return view.shield
     if hit.what == CRYSTAL:
-        far = view.crystal_far_temperature
-        cooled = np.exp(-(hit.z - scene.h_c) / view.crystal_cooling)
-        T = far + (view.crystal_temperature - far) * cooled
-        return view.crystal_emissivity * np.exp(view.wien * (1.0 / view.white_temperature - 1.0 / T))
+        far = view.camera.crystal_far_temperature
+        cooled = np.exp(-(hit.z - scene.h_c) / view.camera.crystal_cooling)
+        T = far + (view.camera.crystal_temperature - far) * cooled
+        return view.camera.crystal_emissivity * np.exp(view.wien * (1.0 / view.camera.wall_temperature - 1.0 / T))
     return view.opening
 
 

@@ -72,7 +72,7 @@ def wall_edge(scene: Scene, view: View) -> Edge:
     slope, edge = 0.0, Edge(0.0, scene.r_c, scene.h_c)
     for _ in range(60):
         towards_lens = math.atan2(view.x - edge.r, view.z - edge.z)
-        towards_wall = math.atan2(view.crucible_radius - edge.r, view.wall_height - edge.z)
+        towards_wall = math.atan2(view.camera.crucible_radius - edge.r, view.camera.wall_height - edge.z)
         slope = 0.5 * (towards_lens + towards_wall)
         q = math.acosh(1.0 / math.sin(0.5 * slope))
         r, z, _, _ = profile_at(q, scene)
@@ -116,13 +116,14 @@ class RingDetector:
         if found.sum() < LEAST_LINES or contrast < LEAST_SHARE * self.contrast:
             return Ring(math.nan, edges)
         shaped = edges[found] - self.shape[found]
-        x, y = shaped * np.cos(ANGLES[found]), shaped * np.sin(ANGLES[found])
+        distance = np.hypot(shaped * np.cos(ANGLES[found]), shaped * np.sin(ANGLES[found]))
+        middle = float(np.median(shaped))
 
-        def misses(R: Floats) -> Floats:
-            missed: Floats = np.hypot(x, y) - R
+        def misses(radius: Floats) -> Floats:
+            missed: Floats = distance - radius
             return missed
 
-        fit = least_squares(misses, [float(np.median(shaped))], loss="soft_l1", f_scale=ROBUST, xtol=1e-12)
+        fit = least_squares(misses, [middle], loss="soft_l1", f_scale=ROBUST, xtol=1e-12)
         return Ring(float(fit.x[0]) - self.bias, edges)
 
     def find_edges(self, image: npt.NDArray[np.uint8]) -> tuple[Floats, float]:

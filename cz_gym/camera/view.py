@@ -108,16 +108,15 @@ def check_camera(camera: Camera, parameters: Parameters) -> Camera:
     if not isinstance(camera, Camera):
         raise ValueError(f"camera must be a cz_gym.camera.Camera, not {camera!r}")
     for name, value in camera._asdict().items():
-        unit = describe_camera()[name].unit
         number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
         if not number or value < 0 or (value == 0 and name not in _MAY_BE_ZERO):
+            unit = describe_camera()[name].unit
             raise ValueError(f"camera parameter {name} = {value!r} must be a positive finite number [{unit}]")
         if name in _AT_MOST_ONE and value > 1:
             raise ValueError(f"camera parameter {name} = {value!r} must not exceed 1")
     if camera.reflections not in range(1, MOST_REFLECTIONS + 1):
-        raise ValueError(
-            f"camera parameter reflections = {camera.reflections!r} must be one of 1 to {MOST_REFLECTIONS}"
-        )
+        allowed = f"one of 1 to {MOST_REFLECTIONS}"
+        raise ValueError(f"camera parameter reflections = {camera.reflections!r} must be {allowed}")
     if camera.tilt >= 0.5 * math.pi:
         raise ValueError(f"camera parameter tilt = {camera.tilt!r} must be less than pi / 2 [rad]")
     if not parameters.r_0 < camera.shield_radius < camera.crucible_radius:
@@ -125,21 +124,23 @@ def check_camera(camera: Camera, parameters: Parameters) -> Camera:
             f"the heat shield's opening (shield_radius = {camera.shield_radius} m) must be wider than the crystal "
             f"(r_0 = {parameters.r_0} m) and narrower than the crucible ({camera.crucible_radius} m)"
         )
-    if camera.distance * math.cos(camera.tilt) <= camera.wall_height:
+    height = camera.distance * math.cos(camera.tilt)
+    if height <= camera.wall_height:
         raise ValueError(
-            f"the lens, {camera.distance * math.cos(camera.tilt):.3g} m above the melt, must be above the heat shield "
+            f"the lens, {height:.3g} m above the melt, must be above the heat shield "
             f"(wall_height = {camera.wall_height} m)"
         )
     return Camera(*map(float, camera))
 
 
 class View(NamedTuple):
-    """What the rays use of a camera: where it stands, how its pixels lie, how bright each thing is.
+    """A camera, and what the rays use of it: where it stands, how its pixels lie, how bright each thing is.
 
     A ray through pixel coordinates (row, column) has direction ``forward + right u + down v``, with u and v the
     distances from the image's centre in focal lengths. Radiances count black bodies as hot as the wall as one.
     """
 
+    camera: Camera
     x: float
     """Lens, distance from the axis [m]; y = 0."""
     z: float
@@ -148,9 +149,6 @@ class View(NamedTuple):
     cos_tilt: float
     pixel: float
     """Side of a pixel in focal lengths [-]."""
-    crucible_radius: float
-    wall_height: float
-    shield_radius: float
     wall: float
     """Radiance of the wall [-]."""
     shield: float
@@ -161,14 +159,8 @@ class View(NamedTuple):
     """What the melt itself emits [-]; it mirrors the rest."""
     mirrored: float
     """Share of light that the melt mirrors [-]."""
-    crystal_emissivity: float
-    crystal_temperature: float
-    crystal_far_temperature: float
-    crystal_cooling: float
     wien: float
     """Second radiation constant over the wavelength [K]."""
-    white_temperature: float
-    """Temperature whose black body counts as one [K]."""
     gain: float
     """Grey values for each unit of radiance."""
     electrons: float
@@ -178,34 +170,28 @@ class View(NamedTuple):
 
 def make_view(camera: Camera) -> View:
     """The view of a camera that :func:`check_camera` let pass."""
-    wien = SECOND_RADIATION / camera.wavelength
+    c, wien = camera, SECOND_RADIATION / camera.wavelength
+    sin_tilt, cos_tilt = math.sin(c.tilt), math.cos(c.tilt)
 
     def radiance(temperature: float, emissivity: float) -> float:
-        return emissivity * math.exp(wien * (1.0 / camera.wall_temperature - 1.0 / temperature))
+        return emissivity * math.exp(wien * (1.0 / c.wall_temperature - 1.0 / temperature))
 
     return View(
-        camera.aim + camera.distance * math.sin(camera.tilt),
-        camera.distance * math.cos(camera.tilt),
-        math.sin(camera.tilt),
-        math.cos(camera.tilt),
-        camera.pixel_pitch / camera.focal_length,
-        camera.crucible_radius,
-        camera.wall_height,
-        camera.shield_radius,
-        radiance(camera.wall_temperature, camera.wall_emissivity),
-        radiance(camera.shield_temperature, camera.shield_emissivity),
-        radiance(camera.opening_temperature, 1.0),
-        radiance(camera.melt_temperature, camera.melt_emissivity),
-        1.0 - camera.melt_emissivity,
-        camera.crystal_emissivity,
-        camera.crystal_temperature,
-        camera.crystal_far_temperature,
-        camera.crystal_cooling,
-        wien,
-        camera.wall_temperature,
-        255.0 / camera.white,
-        camera.full_well / 255.0,
-        int(camera.reflections),
+        camera=c,
+        x=c.aim + c.distance * sin_tilt,
+        z=c.distance * cos_tilt,
+        sin_tilt=sin_tilt,
+        cos_tilt=cos_tilt,
+        pixel=c.pixel_pitch / c.focal_length,
+        wall=radiance(c.wall_temperature, c.wall_emissivity),
+        shield=radiance(c.shield_temperature, c.shield_emissivity),
+        opening=radiance(c.opening_temperature, 1.0),
+        melt=radiance(c.melt_temperature, c.melt_emissivity),
+        mirrored=1.0 - c.melt_emissivity,
+        wien=wien,
+        gain=255.0 / c.white,
+        electrons=c.full_well / 255.0,
+        reflections=int(c.reflections),
     )
 
 

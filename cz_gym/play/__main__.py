@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import pkgutil
 import sys
 from typing import TYPE_CHECKING
 
-from cz_gym.commands import OneLineParser, interrupted
+from cz_gym.commands import OneLineParser, guarded
 from cz_gym.units import MINUTE
 
 if TYPE_CHECKING:
     from cz_gym.config import Config
 
 PROG = "python -m cz_gym.play"
-CONTROLLER = "cz_gym.baselines.registry:find_controller"
-"""Who makes the rival: looked up by name, since the packages of controllers stand on this one."""
-SPEED = 60.0
-"""Seconds of growth a second of watching, unless told."""
+CONTROLLERS = "cz_gym.baselines.registry:find_controller"
+"""Where the paper's controller comes from: looked up by name, since this package imports no controller."""
 NO_DISPLAY = "no display: a crystal is pulled by hand in a window; set DISPLAY or WAYLAND_DISPLAY"
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
 """Environment variables one of which names a display, on systems that have such."""
@@ -36,7 +33,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--scenario", default="randomized", metavar="NAME", help="scenario (%(default)s)")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="which crystal (%(default)s)")
     parser.add_argument(
-        "--speed", type=float, default=SPEED, metavar="FACTOR", help="times faster than real (%(default)g)"
+        "--speed", type=float, default=60.0, metavar="FACTOR", help="times faster than real (%(default)g)"
     )
     parser.add_argument("--minutes", type=float, default=180.0, metavar="M", help="length of the run (%(default)g)")
     parser.add_argument("--size", default="960x720", metavar="WxH", help="size of the window in pixels (%(default)s)")
@@ -46,60 +43,53 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
 def settings(arguments: argparse.Namespace) -> tuple[Config, tuple[int, int]]:
     """The environment's settings and the window's size; ValueError names what was given and what is allowed."""
     from cz_gym.config import make_config
-    from cz_gym.rendering.scene import parse_size
+    from cz_gym.rendering.scene import check_size
 
     from .game import FASTEST, SLOWEST
 
     if not SLOWEST <= arguments.speed <= FASTEST:
         raise ValueError(f"--speed must be {SLOWEST:g} to {FASTEST:g}, not {arguments.speed:g}")
-    if not (math.isfinite(arguments.minutes) and 1.0 <= arguments.minutes <= 6000.0):
+    if not 1.0 <= arguments.minutes <= 6000.0:
         raise ValueError(f"--minutes must be 1 to 6000, not {arguments.minutes:g}")
     if arguments.seed < 0:
         raise ValueError(f"--seed must not be negative, not {arguments.seed}")
-    config = make_config(arguments.scenario, horizon=arguments.minutes * MINUTE)
-    return config, parse_size(arguments.size)
+    try:
+        width, height = map(int, arguments.size.split("x"))
+    except ValueError:
+        raise ValueError(f"--size must be WxH in pixels, such as 960x720, not {arguments.size!r}") from None
+    return make_config(arguments.scenario, horizon=arguments.minutes * MINUTE), check_size((width, height))
 
 
 def main(argv: list[str] | None = None) -> int:
     """Play until the window is closed; 0 when done, 2 for bad input or without window, 130 when interrupted."""
     arguments = parse(argv)
-    try:
-        config, size = settings(arguments)
-        paper = pkgutil.resolve_name(CONTROLLER)("paper").make(config)
-        if sys.platform.startswith(("linux", "freebsd")) and not any(map(os.environ.get, DISPLAYS)):
-            raise ValueError(NO_DISPLAY)
-        from cz_gym.rendering.view import Window
-
-        from .game import Game
-        from .score import Outcome
-
-        window = Window(size, "Cz-v0: pull a crystal")
-    except KeyboardInterrupt:
-        return interrupted(PROG)
-    except Exception as error:
-        if not _expected(error):
-            raise
-        print(f"{PROG}: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    try:
-        if not window.visible:
-            print(f"{PROG}: {NO_DISPLAY}", file=sys.stderr)
-            return 2
-        outcomes: list[Outcome] = Game(window, size, config, arguments.seed, arguments.speed, paper).play()
-    except KeyboardInterrupt:
-        return interrupted(PROG)
-    finally:
-        window.close()
-    for outcome in outcomes:
-        print(outcome.line())
-    return 0
+    return guarded(PROG, lambda: _play(arguments), "render")
 
 
-def _expected(error: Exception) -> bool:
-    """Whether an error is the user's or the machine's, told in one line."""
+def _play(arguments: argparse.Namespace) -> int:
+    config, size = settings(arguments)
+    if sys.platform.startswith(("linux", "freebsd")) and not any(map(os.environ.get, DISPLAYS)):
+        raise ValueError(NO_DISPLAY)
     from gymnasium.error import Error
 
-    return isinstance(error, (ValueError, ImportError, Error))
+    from cz_gym.rendering.view import Window
+
+    from .game import Game
+
+    paper = pkgutil.resolve_name(CONTROLLERS)("paper").make(config)
+    try:
+        window = Window(size, "Cz-v0: pull a crystal")
+    except Error as error:
+        raise ValueError(str(error)) from None
+    try:
+        if not window.visible:
+            raise ValueError(NO_DISPLAY)
+        scores = Game(window, size, config, arguments.seed, arguments.speed, paper).play()
+    finally:
+        window.close()
+    for score in scores:
+        print(score.line())
+    return 0
 
 
 if __name__ == "__main__":

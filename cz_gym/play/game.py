@@ -2,32 +2,30 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from cz_gym.config import Config
 from cz_gym.env import CzEnv
 from cz_gym.rendering import palette
 from cz_gym.rendering.backend import load
 from cz_gym.rendering.canvas import TIMES, Box, Canvas
-from cz_gym.rendering.gauges import Asked
+from cz_gym.rendering.gauges import SetPoints
+from cz_gym.rendering.record import Record
 from cz_gym.rendering.scene import Scene
 from cz_gym.rendering.view import FPS, Window, record_of
 from cz_gym.task import HEATER_RANGE
 from cz_gym.units import KILO, MM_PER_MIN
 
-from .score import Hand, Outcome, Played
-
-if TYPE_CHECKING:
-    from cz_gym.rendering.record import Record
+from .score import Result, Score, score
 
 SLOWEST, FASTEST = 1.0, 3600.0
-"""Factors on real time."""
-PULL_STEP, PULL_LEAP = 0.01 * MM_PER_MIN, 0.1 * MM_PER_MIN
-"""What a key, and a key with shift, changes the pull speed by [m/s]."""
-HEATER_STEP, HEATER_LEAP = 0.1 * KILO, 1.0 * KILO
-"""The same for the heater [W]."""
+"""Limits of the speed of time: seconds of growth a second of watching."""
+PULL_STEP, HEATER_STEP = 0.01 * MM_PER_MIN, 0.1 * KILO
+"""What a key changes the pull speed [m/s] and the heater [W] by; with shift ten times as much."""
 HELP = (
     ("\N{UPWARDS ARROW} \N{DOWNWARDS ARROW}", "pull speed: more makes the crystal thinner"),
     ("\N{RIGHTWARDS ARROW} \N{LEFTWARDS ARROW}", "heater: more makes it thinner, minutes later"),
@@ -48,12 +46,10 @@ class Game:
     def __init__(
         self, window: Window, size: tuple[int, int], config: Config, seed: int, speed: float, rival: Any
     ) -> None:
-        self.window, self.config, self.seed, self.speed, self.rival = window, config, seed, speed, rival
-        self.env = CzEnv(
-            config.scenario, config.model, horizon=config.horizon, parameters=config.parameters,
-            meniscus=config.meniscus, render_mode="rgb_array", render_size=size, info="all")  # fmt: skip
+        self.window, self.config, self.speed, self.rival = window, config, speed, rival
+        self.env = CzEnv.from_config(config, "rgb_array", size, info="all")
         self.scene = Scene(*size)
-        self.outcomes: list[Outcome] = []
+        self.scores: list[Score] = []
         self.helping, self.running = True, True
         self._keys = _keys()
         self.begin(seed)
@@ -61,21 +57,19 @@ class Game:
     def begin(self, seed: int) -> None:
         """A crystal from its beginning, time standing still."""
         self.seed = seed
-        _, info = self.env.reset(seed=seed)
-        self.played = Played(self.config, seed, info)
-        self.paused, self.due, self.outcome = True, 0.0, None
+        self.env.reset(seed=seed)
+        self.actions: list[npt.NDArray[np.float32]] = []
+        self.paused, self.due = True, 0.0
+        self.score: Score | None = None
         p = self.record.puller
-        self.asked = Asked(p.v_0, p.Q_H_0)
-
-    outcome: Outcome | None
-    """The score once the run is over."""
+        self.asked = SetPoints(p.v_0, p.Q_H_0)
 
     @property
     def record(self) -> Record:
         """What the picture is drawn from."""
         return record_of(self.env)
 
-    def play(self) -> list[Outcome]:
+    def play(self) -> list[Score]:
         """Run until the player ends it; every score, that of a run ended early among them."""
         pygame = load()
         pygame.key.set_repeat(250, 40)
@@ -84,43 +78,49 @@ class Game:
                 self.handle(event)
             self.advance(1.0 / FPS)
             self.window.show(self.scene.draw(self.record, self.asked, self.overlay))
-        if self.outcome is None:
-            self.finish()
+        if self.score is None:
+            self.finish(failed=False)
         self.env.close()
-        return self.outcomes
+        return self.scores
 
     def handle(self, event: Any) -> None:
         """Do what a key asks for, or end when the window is closed."""
         pygame = load()
         if event.type == pygame.QUIT:
-            self.running = False
-        elif event.type == pygame.KEYDOWN:
-            action = self._keys.get(event.key)
-            if action is not None:
-                action(self, bool(event.mod & pygame.KMOD_SHIFT))
+            self.end()
+        elif event.type == pygame.KEYDOWN and event.key in self._keys:
+            self._keys[event.key](self, 10.0 if event.mod & pygame.KMOD_SHIFT else 1.0)
 
-    def ask(self, pull: float, heat: float) -> None:
+    def change(self, pull: float, heat: float) -> None:
         """Change the set-points by so much [m/s, W], inside the range of the drives."""
         p = self.record.puller
         v_p = min(max(self.asked.v_p + pull, 0.0), 2.0 * p.v_0)
         Q_H = min(max(self.asked.Q_H + heat, p.Q_H_0 - HEATER_RANGE), p.Q_H_0 + HEATER_RANGE)
-        self.asked = Asked(v_p, Q_H)
+        self.asked = SetPoints(v_p, Q_H)
 
-    def hasten(self, factor: float) -> None:
+    def change_speed(self, factor: float) -> None:
         """Let time run faster or slower."""
         self.speed = min(max(self.speed * factor, SLOWEST), FASTEST)
 
-    def toggle(self) -> None:
+    def start_or_pause(self) -> None:
         """Start or pause."""
         self.paused = not self.paused
         self.helping = self.helping and self.paused
 
+    def show_or_hide_help(self) -> None:
+        """Show or hide the help."""
+        self.helping = not self.helping
+
+    def end(self) -> None:
+        """End the game."""
+        self.running = False
+
     def advance(self, seconds: float) -> None:
         """Let so much of the player's time pass [s]."""
-        if self.paused or self.outcome is not None:
+        if self.paused or self.score is not None:
             return
         self.due += seconds * self.speed
-        while self.due >= self.config.control_interval and self.outcome is None:
+        while self.due >= self.config.control_interval and self.score is None:
             self.due -= self.config.control_interval
             self.step()
 
@@ -128,84 +128,70 @@ class Game:
         """One control interval with the set-points as they stand."""
         p = self.record.puller
         action = np.array([self.asked.v_p / p.v_0 - 1.0, (self.asked.Q_H - p.Q_H_0) / HEATER_RANGE], np.float32)
-        _, reward, terminated, truncated, info = self.env.step(action.clip(-1.0, 1.0))
-        self.played.add(info, reward, terminated)
+        self.actions.append(action.clip(-1.0, 1.0))
+        _, _, terminated, truncated, _ = self.env.step(self.actions[-1])
         if terminated or truncated:
-            self.finish()
+            self.finish(failed=terminated)
 
-    def finish(self) -> None:
-        """Score what was played, if anything was."""
-        if self.played.steps:
-            self.outcome = self.played.against(self.rival)
-            self.outcomes.append(self.outcome)
+    def finish(self, failed: bool) -> None:
+        """Score what was done, if anything was."""
+        if self.actions:
+            self.score = score(self.config, self.seed, self.actions, failed, self.rival)
+            self.scores.append(self.score)
 
     def overlay(self, canvas: Canvas) -> None:
         """Help, pause and score on top of the picture."""
-        unit, strips = canvas.unit, self.scene.layout.strips
-        canvas.text(
-            strips.right - 10 * unit, strips.y + 4 * unit, f"time {TIMES}{self.speed:.0f}   H: help", 9.5,
-            palette.FAINT, "right",
-        )  # fmt: skip
-        if self.outcome is not None:
-            self._card(canvas, "The run is over", _score(self.outcome), "R: again   N: next crystal   Q: end")
+        unit, chart = canvas.unit, self.scene.layout.charts[0]
+        hint = f"time {TIMES}{self.speed:.0f}   H: help"
+        canvas.text(chart.right - 10 * unit, chart.y + 4 * unit, hint, 9.5, palette.FAINT, "right")
+        if self.score is not None:
+            rows = (("you", _words(self.score.player)), ("paper", _words(self.score.controller)))
+            _card(canvas, "The run is over", rows, "R: again   N: next crystal   Q: end")
         elif self.helping:
-            self._card(canvas, "Pull a crystal by hand", HELP, "hold the radius on its reference; space starts")
+            _card(canvas, "Pull a crystal by hand", HELP, "hold the radius on its reference; space starts")
         elif self.paused:
-            self._card(canvas, "Paused", (), "space goes on")
-
-    def _card(self, canvas: Canvas, title: str, rows: tuple[tuple[str, str], ...], foot: str) -> None:
-        unit = canvas.unit
-        width, height = 330.0 * unit, (62.0 + 18.0 * len(rows)) * unit
-        box = Box((canvas.width - width) / 2.0, (0.66 * canvas.height - height) / 2.0, width, height)
-        rim = Box(box.x - 2 * unit, box.y - 2 * unit, box.w + 4 * unit, box.h + 4 * unit)
-        canvas.cover(rim)
-        canvas.rectangle(palette.RIM, rim, 8.0)
-        canvas.rectangle(palette.BACK, box, 7.0)
-        canvas.text(box.x + 16 * unit, box.y + 11 * unit, title, 14, palette.INK, bold=True)
-        for i, (left, right) in enumerate(rows):
-            y = box.y + (36.0 + 18.0 * i) * unit
-            canvas.text(box.x + 16 * unit, y, left, 11, palette.CAMERA, bold=True)
-            canvas.text(box.x + 76 * unit, y, right, 11, palette.INK)
-        canvas.text(box.x + 16 * unit, box.bottom - 22 * unit, foot, 10, palette.FAINT)
+            _card(canvas, "Paused", (), "space goes on")
 
 
-def _score(outcome: Outcome) -> tuple[tuple[str, str], ...]:
-    def row(name: str, hand: Hand) -> tuple[str, str]:
-        return name, f"RMSE {hand.rmse_mm:.3f} mm    return {hand.reward:,.0f}{'    failed' if hand.failed else ''}"
+def _card(canvas: Canvas, title: str, rows: tuple[tuple[str, str], ...], foot: str) -> None:
+    """A card in the picture's middle."""
+    unit = canvas.unit
+    width, height = 330.0 * unit, (62.0 + 18.0 * len(rows)) * unit
+    box = Box((canvas.width - width) / 2.0, (0.66 * canvas.height - height) / 2.0, width, height)
+    rim = box.inner(-2 * unit, -2 * unit, -2 * unit, -2 * unit)
+    canvas.remove_text(rim)
+    canvas.rectangle(palette.RIM, rim, 8.0)
+    canvas.rectangle(palette.BACK, box, 7.0)
+    canvas.text(box.x + 16 * unit, box.y + 11 * unit, title, 14, palette.INK, bold=True)
+    for i, (left, right) in enumerate(rows):
+        y = box.y + (36.0 + 18.0 * i) * unit
+        canvas.text(box.x + 16 * unit, y, left, 11, palette.CAMERA, bold=True)
+        canvas.text(box.x + 76 * unit, y, right, 11, palette.INK)
+    canvas.text(box.x + 16 * unit, box.bottom - 22 * unit, foot, 10, palette.FAINT)
 
-    return row("you", outcome.mine), row("paper", outcome.rival)
+
+def _words(result: Result) -> str:
+    failed = "    failed" if result.failed else ""
+    return f"RMSE {result.rmse_mm:.3f} mm    return {result.reward:,.0f}{failed}"
 
 
-def _keys() -> dict[int, Any]:
-    """What each key does, given the game and whether shift is held."""
+def _keys() -> dict[int, Callable[[Game, float], None]]:
+    """What each key does, given the game and how many steps at once."""
     k = load()
-
-    def drive(pull: float, heat: float, sign: float) -> Any:
-        def turn(game: Game, shift: bool) -> None:
-            many = sign * (HEATER_LEAP / HEATER_STEP if shift else 1.0)
-            game.ask(many * pull, many * heat)
-
-        return turn
-
-    def end(game: Game, shift: bool) -> None:
-        game.running = False
-
-    def help_(game: Game, shift: bool) -> None:
-        game.helping = not game.helping
-
-    found = {
-        k.K_UP: drive(PULL_STEP, 0.0, 1.0),
-        k.K_DOWN: drive(PULL_STEP, 0.0, -1.0),
-        k.K_RIGHT: drive(0.0, HEATER_STEP, 1.0),
-        k.K_LEFT: drive(0.0, HEATER_STEP, -1.0),
-        k.K_SPACE: lambda game, shift: game.toggle(),
-        k.K_r: lambda game, shift: game.begin(game.seed),
-        k.K_n: lambda game, shift: game.begin(game.seed + 1),
-        k.K_h: help_,
-        k.K_q: end,
-        k.K_ESCAPE: end,
+    keys: dict[int, Callable[[Game, float], None]] = {
+        k.K_UP: lambda game, steps: game.change(steps * PULL_STEP, 0.0),
+        k.K_DOWN: lambda game, steps: game.change(-steps * PULL_STEP, 0.0),
+        k.K_RIGHT: lambda game, steps: game.change(0.0, steps * HEATER_STEP),
+        k.K_LEFT: lambda game, steps: game.change(0.0, -steps * HEATER_STEP),
+        k.K_SPACE: lambda game, _: game.start_or_pause(),
+        k.K_r: lambda game, _: game.begin(game.seed),
+        k.K_n: lambda game, _: game.begin(game.seed + 1),
+        k.K_h: lambda game, _: game.show_or_hide_help(),
+        k.K_q: lambda game, _: game.end(),
+        k.K_ESCAPE: lambda game, _: game.end(),
     }
-    faster, slower = (k.K_PLUS, k.K_KP_PLUS, k.K_EQUALS), (k.K_MINUS, k.K_KP_MINUS)
-    found.update({key: lambda game, shift: game.hasten(1.5) for key in faster})
-    found.update({key: lambda game, shift: game.hasten(1.0 / 1.5) for key in slower})
-    return found
+    for key in (k.K_PLUS, k.K_KP_PLUS, k.K_EQUALS):
+        keys[key] = lambda game, _: game.change_speed(1.5)
+    for key in (k.K_MINUS, k.K_KP_MINUS):
+        keys[key] = lambda game, _: game.change_speed(1.0 / 1.5)
+    return keys

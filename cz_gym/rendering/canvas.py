@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .backend import load
-from .palette import BACK, FAINT, INK, PANEL, RIM, Colour, mix
+from .palette import BACK, FAINT, INK, PANEL, Colour, mix
 from .pixels import halve
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class Box(NamedTuple):
 
 
 class Label(NamedTuple):
-    """Text waiting to be drawn."""
+    """Text that is drawn when the picture is finished."""
 
     x: float
     y: float
@@ -72,30 +72,27 @@ class Canvas:
         """Size of a nominal pixel [px]."""
         self._fine: Surface = self.pygame.Surface((FINE * width, FINE * height), 0, 32)
         self._picture: Surface = self.pygame.Surface((width, height), 0, 32)
+        self._background: Surface = self._fine.copy()
+        self._panels: tuple[Box, ...] | None = None
         self._labels: list[Label] = []
-        self._ground: Surface = self._fine.copy()
-        self._ground_labels: list[Label] = []
-        self._ground_is: Hashable = None
 
-    def begin(self, ground: Hashable, paint: Callable[[], None]) -> None:
-        """Begin a new picture on a ground that ``paint`` draws; it is painted anew only when ``ground`` is another."""
-        if ground == self._ground_is:
-            self._fine.blit(self._ground, (0, 0))
-            self._labels = self._ground_labels.copy()
-            return
-        self._ground_is = None
-        self._fine.fill(BACK)
+    def begin(self, panels: tuple[Box, ...]) -> None:
+        """Begin a new picture with these panels on it."""
+        if panels != self._panels:  # drawn once: pygame takes long for round corners
+            self._background.fill(BACK)
+            for box in panels:
+                radius = round(6 * self.unit * FINE)
+                self.pygame.draw.rect(self._background, PANEL, _rounded(box), border_radius=radius)
+            self._panels = panels
+        self._fine.blit(self._background, (0, 0))
         self._labels = []
-        paint()
-        self._ground.blit(self._fine, (0, 0))
-        self._ground_labels, self._ground_is = self._labels.copy(), ground
 
     def finish(self) -> Surface:
         """The picture; the next one is drawn into the same surface."""
         halve(self._fine, self._picture)
         for label in self._labels:
-            text, left, top = self._placed(label)
-            self._picture.blit(text, (left, top))
+            image, corner = self._placed(label)
+            self._picture.blit(image, corner)
         return self._picture
 
     @contextmanager
@@ -108,20 +105,10 @@ class Canvas:
         finally:
             self._fine.set_clip(before)
 
-    def panel(self, box: Box, title: str = "") -> None:
-        """A panel's ground, with its title."""
-        radius = round(6 * self.unit * FINE)
-        self.pygame.draw.rect(self._fine, PANEL, _rounded(box), border_radius=radius)
-        if title:
-            self.text(box.x + 8 * self.unit, box.y + 5 * self.unit, title, 9.5, FAINT)
-
-    def frame(self, box: Box) -> None:
-        """A thin line around a box."""
-        self.pygame.draw.rect(self._fine, RIM, _rounded(box), width=max(1, round(self.unit)))
-
-    def rectangle(self, colour: Colour, box: Box, round_by: float = 0.0) -> None:
-        """A filled rectangle, its corners rounded by that radius [nominal px]."""
-        self.pygame.draw.rect(self._fine, colour, _rounded(box), border_radius=round(round_by * self.unit * FINE))
+    def rectangle(self, colour: Colour, box: Box, round_by: float = 0.0, line: int = 0) -> None:
+        """A rectangle, its corners rounded by that radius [nominal px]; filled, or a line of that width [fine px]."""
+        radius = round(round_by * self.unit * FINE)
+        self.pygame.draw.rect(self._fine, colour, _rounded(box), line, border_radius=radius)
 
     def polygon(self, colour: Colour, points: Points) -> None:
         """A filled polygon, points of shape (n, 2); nothing with fewer than three."""
@@ -131,12 +118,12 @@ class Canvas:
     def lines(self, colour: Colour, points: Points, width: float = 1.5) -> None:
         """Straight lines from point to point, shape (n, 2), of that width [nominal px]."""
         if len(points) > 1:
-            self.pygame.draw.lines(self._fine, colour, False, _fine(points), max(1, round(width * self.unit * FINE)))
+            self.pygame.draw.lines(self._fine, colour, False, _fine(points), self._thickness(width))
 
     def line(self, colour: Colour, start: tuple[float, float], end: tuple[float, float], width: float = 1.5) -> None:
         """A straight line of that width [nominal px]."""
         ends = [(x * FINE, y * FINE) for x, y in (start, end)]
-        self.pygame.draw.line(self._fine, colour, *ends, max(1, round(width * self.unit * FINE)))
+        self.pygame.draw.line(self._fine, colour, *ends, self._thickness(width))
 
     def dashes(self, colour: Colour, points: Points, width: float = 1.2, dash: float = 5.0, gap: float = 4.0) -> None:
         """Dashed lines from point to point; dash and gap in nominal px along the line."""
@@ -145,31 +132,24 @@ class Canvas:
         along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
         starts = np.arange(0.0, along[-1], (dash + gap) * self.unit)
         ends = np.minimum(starts + dash * self.unit, along[-1])
-        at = paired(*(np.interp(np.concatenate([starts, ends]), along, axis) for axis in points.T))
-        thick, fine = max(1, round(width * self.unit * FINE)), _fine(at)
+        fine = _fine(paired(*(np.interp(np.concatenate([starts, ends]), along, axis) for axis in points.T)))
         for start, end in zip(fine[: len(starts)], fine[len(starts) :], strict=True):
-            self.pygame.draw.line(self._fine, colour, start, end, thick)
+            self.pygame.draw.line(self._fine, colour, start, end, self._thickness(width))
 
-    def dot(self, colour: Colour, at: tuple[float, float], radius: float, width: float = 0.0) -> None:
-        """A filled circle of that radius [nominal px], or a ring of that line width."""
-        size = max(1, round(radius * self.unit * FINE))
+    def dot(self, colour: Colour, at: tuple[float, float], radius: float) -> None:
+        """A filled circle of that radius [nominal px]."""
         centre = (round(at[0] * FINE), round(at[1] * FINE))
-        self.pygame.draw.circle(self._fine, colour, centre, size, round(width * self.unit * FINE))
+        self.pygame.draw.circle(self._fine, colour, centre, self._thickness(radius))
+
+    def _thickness(self, width: float) -> int:
+        """A width of so many nominal pixels [fine px]."""
+        return max(1, round(width * self.unit * FINE))
 
     def glow(self, colour: Colour, x: float, y: float, radius: float) -> None:
         """Light around a point, fading over that radius [nominal px]."""
         size = max(2, round(radius * self.unit * FINE))
         corner = (round(x * FINE) - size, round(y * FINE) - size)
         self._fine.blit(_glow(colour, size), corner, special_flags=self.pygame.BLEND_RGB_ADD)
-
-    def cover(self, box: Box) -> None:
-        """Forget the text that reaches into a box, which something else will cover."""
-        self._labels = [label for label in self._labels if not self._reaches(label, box)]
-
-    def _reaches(self, label: Label, box: Box) -> bool:
-        image, left, top = self._placed(label)
-        across = left < box.right and left + image.get_width() > box.x
-        return across and top < box.bottom and top + image.get_height() > box.y
 
     def shade(self, box: Box, top: Colour, bottom: Colour) -> None:
         """A box whose colour runs from top to bottom."""
@@ -189,11 +169,21 @@ class Canvas:
         """Text whose top is at y and whose left, centre or right (``anchor``) is at x; size in nominal px."""
         self._labels.append(Label(x, y, text, size, colour, anchor, bold))
 
-    def _placed(self, label: Label) -> tuple[Any, int, int]:
+    def title(self, box: Box, title: str) -> None:
+        """A panel's title."""
+        self.text(box.x + 8 * self.unit, box.y + 5 * self.unit, title, 9.5, FAINT)
+
+    def remove_text(self, box: Box) -> None:
+        """Remove the text that reaches into a box, which something else will cover."""
+        area = self.pygame.Rect(*map(round, box))
+        placed = [(label, *self._placed(label)) for label in self._labels]
+        self._labels = [label for label, image, at in placed if not image.get_rect(topleft=at).colliderect(area)]
+
+    def _placed(self, label: Label) -> tuple[Any, tuple[int, int]]:
         """The text's image and its upper left corner [px]."""
         image = _glyphs(label.text, max(7, round(label.size * self.unit)), label.colour, label.bold)
         left = {"left": 0.0, "centre": 0.5, "right": 1.0}[label.anchor] * image.get_width()
-        return image, round(label.x - left), round(label.y)
+        return image, (round(label.x - left), round(label.y))
 
 
 def paired(x: npt.ArrayLike, y: npt.ArrayLike) -> Points:
@@ -209,9 +199,9 @@ def _rounded(box: Box) -> tuple[int, int, int, int]:
 
 
 def _fine(points: Points) -> list[list[float]]:
-    """Points as the drawing functions take them; far-off ones are held, since their integers would wrap."""
-    held: list[list[float]] = np.minimum(np.maximum(points * float(FINE), -20_000.0), 20_000.0).tolist()
-    return held
+    """Points as the drawing functions take them; far-off ones are limited, since pygame's integers would overflow."""
+    limited: list[list[float]] = np.minimum(np.maximum(points * float(FINE), -20_000.0), 20_000.0).tolist()
+    return limited
 
 
 @lru_cache(maxsize=8)
@@ -226,7 +216,7 @@ def _glyphs(text: str, size: int, colour: Colour, bold: bool) -> Any:
     try:
         return _font(size, bold).render(text, True, colour)
     except load().error:
-        # pygame.quit(), called by anybody, ends the life of every font.
+        # pygame.quit(), called by anybody, makes every font invalid.
         _font.cache_clear()
         return _font(size, bold).render(text, True, colour)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,11 +15,8 @@ from .canvas import Box, Canvas
 from .palette import Colour
 from .record import Record
 
-T_1_RANGE = 20.0
-"""T_1 gauge: nominal +- this [K]."""
-T_B_RANGE = 3.0
-"""T_b gauge: nominal +- this [K]."""
-GAP = 6.0
+T_1_RANGE, T_B_RANGE = 20.0, 3.0
+"""Half width of the gauges of T_1 and T_b, nominal in the middle [K]."""
 
 
 class Gauge(NamedTuple):
@@ -31,13 +29,13 @@ class Gauge(NamedTuple):
     high: float
     origin: float
     colour: Colour
-    mark: float | None = None
-    """A set-point, drawn as a pointer."""
+    set_point: float | None = None
+    """Drawn as a pointer."""
     note: str = ""
     """What stands under the bar."""
 
 
-class Asked(NamedTuple):
+class SetPoints(NamedTuple):
     """What somebody asks of the drives."""
 
     v_p: float
@@ -46,7 +44,7 @@ class Asked(NamedTuple):
     """Heater power [W]."""
 
 
-def gauges(record: Record, asked: Asked | None = None) -> tuple[Gauge, ...]:
+def gauges(record: Record, asked: SetPoints | None = None) -> tuple[Gauge, ...]:
     """The gauges of a record's newest sample; ``asked`` adds the set-points of the drives."""
     now, p = record.now, record.puller
     v_0, window = p.v_0 / MM_PER_MIN, HEATER_RANGE / KILO
@@ -72,55 +70,33 @@ def gauges(record: Record, asked: Asked | None = None) -> tuple[Gauge, ...]:
     )  # fmt: skip
 
 
-def ground(canvas: Canvas, box: Box, record: Record) -> None:
-    """What lies under every picture: panels, tracks and names."""
-    unit, shown = canvas.unit, gauges(record)
-    top, *boxes = _boxes(canvas, box, len(shown))
-    canvas.panel(top, "true radius error")
-    canvas.text(top.x + 8 * unit, top.y + 40 * unit, "reference", 9.5, palette.FAINT)
-    canvas.text(top.x + 8 * unit, top.y + 52 * unit, "by the camera", 9.5, palette.FAINT)
-    for gauge, place in zip(shown, boxes, strict=True):
-        canvas.panel(place, gauge.name)
-        canvas.rectangle(palette.TRACK, _track(canvas, place), 3.0)
+def draw(canvas: Canvas, boxes: Sequence[Box], record: Record, asked: SetPoints | None = None) -> None:
+    """The radius in the first box, then a gauge a box."""
+    _radius(canvas, boxes[0], record)
+    for gauge, box in zip(gauges(record, asked), boxes[1:], strict=True):
+        _gauge(canvas, box, gauge)
 
 
-def draw(canvas: Canvas, box: Box, record: Record, asked: Asked | None = None) -> None:
-    """The column: the radius on top, then a panel a gauge."""
-    shown = gauges(record, asked)
-    top, *boxes = _boxes(canvas, box, len(shown))
-    radius(canvas, top, record)
-    for gauge, place in zip(shown, boxes, strict=True):
-        _gauge(canvas, place, gauge)
-
-
-def _boxes(canvas: Canvas, box: Box, count: int) -> list[Box]:
-    """The radius' panel and those of so many gauges."""
-    gap = GAP * canvas.unit
-    height = (box.h - count * gap) / (count + 1.45)
-    first = box.y + 1.45 * height + gap
-    below = [Box(box.x, first + i * (height + gap), box.w, height) for i in range(count)]
-    return [Box(box.x, box.y, box.w, 1.45 * height), *below]
-
-
-def _track(canvas: Canvas, box: Box) -> Box:
-    unit = canvas.unit
-    return Box(box.x + 8 * unit, box.y + 20.5 * unit, box.w - 16 * unit, 6.0 * unit)
-
-
-def radius(canvas: Canvas, box: Box, record: Record) -> None:
+def _radius(canvas: Canvas, box: Box, record: Record) -> None:
     """The true radius error in large figures, with reference and camera under it."""
     now, unit = record.now, canvas.unit
-    middle = box.x + box.w / 2.0
-    canvas.text(middle, box.y + 16 * unit, f"{(now.r_c - now.r_ref) / MM:+.2f} mm", 19, palette.TRUE, "centre", True)
-    canvas.text(box.right - 8 * unit, box.y + 40 * unit, f"{now.r_ref / MM:.2f}", 9.5, palette.REFERENCE, "right")
+    canvas.title(box, "true radius error")
+    error = f"{(now.r_c - now.r_ref) / MM:+.2f} mm"
+    canvas.text(box.x + box.w / 2.0, box.y + 16 * unit, error, 19, palette.TRUE, "centre", True)
     camera = f"{now.camera / MM:.2f}" if now.valid > 0.0 else "no reading"
-    canvas.text(box.right - 8 * unit, box.y + 52 * unit, camera, 9.5, palette.CAMERA, "right")
+    for y, name, value, colour in (
+        (40, "reference", f"{now.r_ref / MM:.2f}", palette.REFERENCE), (52, "by the camera", camera, palette.CAMERA)
+    ):  # fmt: skip
+        canvas.text(box.x + 8 * unit, box.y + y * unit, name, 9.5, palette.FAINT)
+        canvas.text(box.right - 8 * unit, box.y + y * unit, value, 9.5, colour, "right")
 
 
 def _gauge(canvas: Canvas, box: Box, gauge: Gauge) -> None:
     unit = canvas.unit
+    canvas.title(box, gauge.name)
     canvas.text(box.right - 8 * unit, box.y + 4 * unit, gauge.shown, 10.5, palette.INK, "right", True)
-    track = _track(canvas, box)
+    track = Box(box.x + 8 * unit, box.y + 20.5 * unit, box.w - 16 * unit, 6.0 * unit)
+    canvas.rectangle(palette.TRACK, track, 3.0)
 
     def at(value: float) -> float:
         share = (value - gauge.low) / (gauge.high - gauge.low)
@@ -130,8 +106,8 @@ def _gauge(canvas: Canvas, box: Box, gauge: Gauge) -> None:
     canvas.rectangle(gauge.colour, Box(left, track.y, max(right - left, unit), track.h), 2.0)
     middle = track.x + track.w / 2.0
     canvas.line(palette.FAINT, (middle, track.y - 2 * unit), (middle, track.bottom + 2 * unit), 1.0)
-    if gauge.mark is not None:
-        x, top = at(gauge.mark), track.y - 1.0 * unit
+    if gauge.set_point is not None:
+        x, top = at(gauge.set_point), track.y - 1.0 * unit
         pointer = [[x, top + 4 * unit], [x - 4 * unit, top - 3 * unit], [x + 4 * unit, top - 3 * unit]]
         canvas.polygon(palette.RECIPE, np.array(pointer))
     canvas.text(box.x + 8 * unit, track.bottom + 3 * unit, gauge.note, 9.0, palette.FAINT)

@@ -1,4 +1,4 @@
-"""Where things are: the meniscus as a curve, and metres to pixels."""
+"""The meniscus as a curve, metres to pixels, and the choice of a round scale."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cz_gym.physics.meniscus import MeniscusModel, profile, profile_scale
 from cz_gym.physics.plant import Puller
 from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
 
-from .canvas import Box, paired
+from .canvas import paired
 
 Floats = npt.NDArray[np.float64]
 POINTS = 48
@@ -20,8 +20,8 @@ LOWEST = 1e-3
 """Where a drawn meniscus ends, in its height: far out, where it is flat."""
 
 
-def height_inside(h_c: float, a: float) -> float:
-    """Meniscus height held inside its limits, as the ring of a failed state is measured [m]."""
+def clipped_height(h_c: float, a: float) -> float:
+    """Meniscus height clipped to its limits, as the ring of a failed state is measured [m]."""
     return min(max(h_c, HEIGHT_MIN), HEIGHT_MAX_IN_A * a)
 
 
@@ -30,18 +30,21 @@ def meniscus_curve(r_c: float, h_c: float, p: Puller, model: MeniscusModel) -> t
 
     The profile is Hurle's whatever the model; its slope at the triple point is the model's own.
     """
-    h = height_inside(h_c, p.a)
-    _, cos_theta = model.slope(r_c, h, p)
-    M = profile_scale(r_c, h, cos_theta, p.a)
+    h = clipped_height(h_c, p.a)
+    M = _scale(r_c, h, p, model)
     z = h * LOWEST ** np.linspace(0.0, 1.0, POINTS)
     return r_c + profile(z, M) - profile(h, M), z
 
 
 def ring_height(r_c: float, h_c: float, p: Puller, model: MeniscusModel, phi_b: float) -> float:
     """Height of the bright ring above the melt [m], z_b = M sqrt(1 - cos(phi_b))."""
-    h = height_inside(h_c, p.a)
+    return float(_scale(r_c, clipped_height(h_c, p.a), p, model) * np.sqrt(1.0 - np.cos(phi_b)))
+
+
+def _scale(r_c: float, h: float, p: Puller, model: MeniscusModel) -> float:
+    """The profile's scale M [m]."""
     _, cos_theta = model.slope(r_c, h, p)
-    return float(profile_scale(r_c, h, cos_theta, p.a) * np.sqrt(1.0 - np.cos(phi_b)))
+    return float(profile_scale(r_c, h, cos_theta, p.a))
 
 
 class Scale(NamedTuple):
@@ -53,10 +56,8 @@ class Scale(NamedTuple):
     """Radius there [m]."""
     y_0: float
     """Pixel of the melt's surface."""
-    across: float
-    """Pixels a metre of radius."""
-    up: float
-    """Pixels a metre of height."""
+    per_metre: float
+    """Pixels a metre."""
 
     def points(self, r: npt.ArrayLike, z: npt.ArrayLike) -> Floats:
         """Pixels of radii and heights [m], shape (n, 2)."""
@@ -64,21 +65,15 @@ class Scale(NamedTuple):
 
     def x(self, r: npt.ArrayLike) -> Floats:
         """Pixels across of radii [m]."""
-        found: Floats = self.x_0 + (np.asarray(r, np.float64) - self.r_0) * self.across
+        found: Floats = self.x_0 + (np.asarray(r, np.float64) - self.r_0) * self.per_metre
         return found
 
     def y(self, z: npt.ArrayLike) -> Floats:
         """Pixels down of heights [m]."""
-        found: Floats = self.y_0 - np.asarray(z, np.float64) * self.up
+        found: Floats = self.y_0 - np.asarray(z, np.float64) * self.per_metre
         return found
 
 
-def ladder(value: float, steps: tuple[float, ...]) -> float:
-    """The first step that reaches a value, or the last."""
+def first_at_least(value: float, steps: tuple[float, ...]) -> float:
+    """The first of increasing steps that is at least a value, or the last."""
     return next((step for step in steps if step >= value), steps[-1])
-
-
-def beside(points: Floats, box: Box, right: bool) -> Floats:
-    """The area between a line and the left or right side of a box, as a polygon."""
-    side = box.right if right else box.x
-    return np.concatenate([points, [[side, points[-1, 1]], [side, points[0, 1]]]])

@@ -23,7 +23,7 @@ TEMPERATURE: Colour = (230, 159, 0)
 RECIPE: Colour = (0, 190, 140)
 ALARM: Colour = (213, 94, 0)
 
-ATMOSPHERE: Colour = (15, 19, 27)
+GAS: Colour = (15, 19, 27)
 MELT_TOP: Colour = (255, 168, 84)
 MELT_DEEP: Colour = (160, 52, 22)
 CRYSTAL_HOT: Colour = (176, 150, 138)

@@ -19,28 +19,18 @@ _ROWS = [INFO.index(name) for name in _READ]
 
 
 class Sample(NamedTuple):
-    """One instant, SI units."""
+    """One instant, SI units: signals as the environment's ``info`` has them, then what a picture needs besides."""
 
     r_c: float
-    """True crystal radius [m]."""
     r_br: float
-    """True radius of the bright ring [m]."""
     r_ref: float
-    """Reference [m]."""
     h_c: float
-    """Meniscus height [m]."""
     v_g: float
-    """Growth rate [m/s]."""
     v_p: float
-    """Pull speed [m/s]."""
     Q_H: float
-    """Heater power [W]."""
     T_1: float
-    """Heater temperature [K]."""
     T_1_ref: float
-    """Its recipe [K]."""
     T_b: float
-    """Melt temperature [K]."""
     camera: float
     """The camera's radius: the ring it reports minus the operator's bias [m]."""
     valid: float
@@ -71,7 +61,7 @@ class Record:
         self.scenario = scenario
         self.puller = Puller(*slot["puller"].tolist())
         self.ending: Ending | None = None
-        self._rows = np.zeros((256, len(Sample._fields)))
+        self._rows = np.zeros((config.steps + 1, len(Sample._fields)))
         self._count = 0
 
     def __len__(self) -> int:
@@ -86,6 +76,11 @@ class Record:
         """All values of a sample's field, shape (samples,); not to be written to."""
         return self._rows[: self._count, _AT[name]]
 
+    @property
+    def error(self) -> Floats:
+        """The true radius error of every sample [m], shape (samples,)."""
+        return self.column("r_c") - self.column("r_ref")
+
     def add(self, info: Floats, slot: Any, terminated: bool = False, truncated: bool = False) -> None:
         """Add the sample of info rows (:data:`cz_gym.engine.layout.INFO`) and the slot they were read from.
 
@@ -98,8 +93,6 @@ class Record:
             before = self.now
             length = before.length + values["v_p"] * (t - before.t) - (values["h_c"] - before.h_c)
         sample = Sample(valid=float(slot["valid"]), t=t, length=length, **values)
-        if self._count == len(self._rows):
-            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
         self._rows[self._count] = sample
         self._count += 1
         if terminated or truncated:

@@ -6,11 +6,10 @@ from collections.abc import Callable
 from numbers import Integral
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from cz_gym.units import MM
+from cz_gym.units import HOUR, MINUTE, MM
 
-from . import edge_panel, gauges, palette, puller_panel, strips
+from . import gauges, palette, puller_panel, strip_charts, triple_point
 from .canvas import BASE, Box, Canvas
-from .gauges import Asked
 from .record import Ending, Record
 
 if TYPE_CHECKING:
@@ -18,6 +17,8 @@ if TYPE_CHECKING:
 
 SMALLEST, LARGEST = 360, 3840
 """Fewest and most pixels along a side."""
+GAUGES, TALL = 4, 1.45
+"""Number of gauges; height of the radius' panel above them, in panels of a gauge [-]."""
 
 
 class Layout(NamedTuple):
@@ -25,51 +26,44 @@ class Layout(NamedTuple):
 
     header: Box
     puller: Box
-    edge: Box
-    gauges: Box
-    strips: Box
+    triple_point: Box
+    gauges: tuple[Box, ...]
+    """The radius' panel, then one a gauge."""
+    charts: tuple[Box, Box]
+    """Of the radius error and of the pull speed."""
 
 
 def check_size(size: Any) -> tuple[int, int]:
     """Width and height of a picture [px]; ValueError names what was given and what is allowed."""
     try:
         width, height = size
+        numbers = all(isinstance(side, Integral) and not isinstance(side, bool) for side in (width, height))
+        fits = numbers and min(width, height) >= SMALLEST and max(width, height) <= LARGEST
     except (TypeError, ValueError):
-        width = height = None
-    if not (_is_side(width) and _is_side(height)):
+        fits = False
+    if not fits:
         raise ValueError(
             f"render_size must be (width, height), whole numbers of {SMALLEST} to {LARGEST} pixels, not {size!r}"
         )
     return int(width), int(height)
 
 
-def parse_size(text: str) -> tuple[int, int]:
-    """The size that a command's ``--size`` names; ValueError names what was given and what is allowed."""
-    try:
-        width, height = (int(side) for side in text.split("x"))
-    except ValueError:
-        raise ValueError(f"--size must be WxH in pixels, such as 960x720, not {text!r}") from None
-    return check_size((width, height))
-
-
-def _is_side(side: Any) -> bool:
-    return isinstance(side, Integral) and not isinstance(side, bool) and SMALLEST <= int(side) <= LARGEST
-
-
 def layout(width: int, height: int) -> Layout:
     """The panels of a picture of that size; the triple point gets what the others leave."""
     unit = min(width / BASE[0], height / BASE[1])
-    gap, side, head = 6.0 * unit, 188.0 * unit, 28.0 * unit
-    column = 140.0 * unit
-    top = head + gap
-    chart = 0.315 * height
-    main = height - top - chart - 2.0 * gap
+    gap, side, head, column = 6.0 * unit, 188.0 * unit, 28.0 * unit, 140.0 * unit
+    top, below = head + gap, 0.315 * height
+    main = height - top - below - 2.0 * gap
+    x, small = width - column - gap, (main - GAUGES * gap) / (GAUGES + TALL)
+    radius = Box(x, top, column, TALL * small)
+    numbers = [Box(x, radius.bottom + gap + i * (small + gap), column, small) for i in range(GAUGES)]
+    upper = Box(gap, top + main + gap, width - 2.0 * gap, 0.64 * below)
     return Layout(
         Box(gap, 0.0, width - 2.0 * gap, head),
         Box(gap, top, side, main),
         Box(side + 2.0 * gap, top, width - side - column - 4.0 * gap, main),
-        Box(width - column - gap, top, column, main),
-        Box(gap, top + main + gap, width - 2.0 * gap, chart),
+        (radius, *numbers),
+        (upper, Box(gap, upper.bottom + gap, upper.w, below - upper.h - gap)),
     )
 
 
@@ -81,55 +75,48 @@ class Scene:
         self.layout = layout(width, height)
 
     def draw(
-        self, record: Record, asked: Asked | None = None, overlay: Callable[[Canvas], None] | None = None
+        self,
+        record: Record,
+        asked: gauges.SetPoints | None = None,
+        overlay: Callable[[Canvas], None] | None = None,
     ) -> Surface:
         """The picture of a record's newest sample; the next call draws into the same surface.
 
         ``asked`` shows set-points of the drives, ``overlay`` draws on top.
         """
-        canvas, boxes, reach = self.canvas, self.layout, strips.reach_of([record])
-        same = (record.scenario, record.puller, record.config.horizon, reach)
-        canvas.begin(same, lambda: self._ground(record, reach))
+        canvas, boxes = self.canvas, self.layout
+        canvas.begin((boxes.puller, *boxes.gauges, *boxes.charts))
         self._header(record)
+        canvas.title(boxes.puller, "crystal")
         puller_panel.draw(canvas, boxes.puller, record)
-        edge_panel.draw(canvas, boxes.edge, record)
+        triple_point.draw(canvas, boxes.triple_point, record)
         gauges.draw(canvas, boxes.gauges, record, asked)
-        strips.draw(canvas, boxes.strips, record, reach)
+        strip_charts.draw(canvas, *boxes.charts, record)
         if record.ending is not None:
-            banner(canvas, boxes.edge, record.ending)
+            draw_ending(canvas, boxes.triple_point, record.ending)
         if overlay is not None:
             overlay(canvas)
         return canvas.finish()
 
-    def _ground(self, record: Record, reach: float) -> None:
-        """All that is the same in every picture of a record, until the error chart needs a longer axis."""
-        canvas, boxes, unit = self.canvas, self.layout, self.canvas.unit
-        canvas.text(boxes.header.x + 4 * unit, 7 * unit, "Cz-v0", 14, palette.INK, bold=True)
-        canvas.text(boxes.header.x + 58 * unit, 10 * unit, record.scenario, 11, palette.FAINT)
-        canvas.text(boxes.edge.x, 10 * unit, "time", 11, palette.FAINT)
-        canvas.text(boxes.edge.x + 112 * unit, 10 * unit, "grown", 11, palette.FAINT)
-        canvas.panel(boxes.puller, "crystal")
-        puller_panel.ground(canvas, boxes.puller, record.puller.r_0)
-        edge_panel.ground(canvas, boxes.edge, record)
-        gauges.ground(canvas, boxes.gauges, record)
-        strips.ground(canvas, boxes.strips, record, reach)
-
     def _header(self, record: Record) -> None:
-        canvas, box, now = self.canvas, self.layout.header, record.now
-        unit = canvas.unit
-        minutes, seconds = divmod(round(now.t), 60)
-        time = f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
-        canvas.text(self.layout.edge.x + 30 * unit, 7.5 * unit, time, 13, palette.INK, bold=True)
-        canvas.text(
-            self.layout.edge.x + 152 * unit, 7.5 * unit, f"{now.length / MM:.1f} mm", 13, palette.INK, bold=True
-        )
+        """Scenario, time, length grown, and whether all is well."""
+        canvas, unit, now = self.canvas, self.canvas.unit, record.now
+        left, middle, right = self.layout.header.x, self.layout.triple_point.x, self.layout.header.right
+        hours, rest = divmod(round(now.t), round(HOUR))
+        minutes, seconds = divmod(rest, round(MINUTE))
+        canvas.text(left + 4 * unit, 7 * unit, "Cz-v0", 14, palette.INK, bold=True)
+        canvas.text(left + 58 * unit, 10 * unit, record.scenario, 11, palette.FAINT)
+        for x, name in ((0, "time"), (112, "grown")):
+            canvas.text(middle + x * unit, 10 * unit, name, 11, palette.FAINT)
+        for x, value in ((30, f"{hours}:{minutes:02d}:{seconds:02d}"), (152, f"{now.length / MM:.1f} mm")):
+            canvas.text(middle + x * unit, 7.5 * unit, value, 13, palette.INK, bold=True)
         status, colour = ("growing", palette.RECIPE) if record.ending is None else ("ended", palette.ALARM)
         if record.ending is None and now.valid <= 0.0:
             status, colour = "camera: no reading", palette.CAMERA
-        canvas.text(box.right - 4 * unit, 10 * unit, status, 11, colour, "right", True)
+        canvas.text(right - 4 * unit, 10 * unit, status, 11, colour, "right", True)
 
 
-def banner(canvas: Canvas, box: Box, ending: Ending) -> None:
+def draw_ending(canvas: Canvas, box: Box, ending: Ending) -> None:
     """A band across a panel that says how the episode ended."""
     unit = canvas.unit
     colour = palette.TRACK if ending is Ending.HORIZON else palette.ALARM

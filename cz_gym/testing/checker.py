@@ -10,7 +10,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from contextlib import closing
-from typing import Any, NamedTuple
+from itertools import product
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -18,9 +19,11 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from cz_gym.commands import OneLineParser
+from cz_gym.episodes import scenarios
+from cz_gym.observation import CAMERA, OBSERVATIONS
 
-from .driver import Checked, Event, MakeScalar, MakeVector, NotConforming, Subject, need, play
-from .nested_arrays import HOLDERS, Held, Leaf, difference, hold, leaves, spoil
+from .driver import Checked, Driver, MakeScalar, MakeVector, NotConforming
+from .nested_arrays import KEEPERS, Kept, NamedArray, difference, flatten, keep, overwrite
 
 __all__ = ["Checked", "NotConforming", "check_vector_env"]
 
@@ -50,181 +53,137 @@ def check_vector_env(
     """
     if num_envs < 2 or steps < 2 or not modes:
         raise ValueError(f"a check needs num_envs >= 2, steps >= 2 and a mode, not {num_envs}, {steps}, {modes!r}")
-    total = Checked(0, 0, 0, 0)
+    total = Checked()
     for mode in modes:
-        subject = Subject(make_vector, make_scalar, num_envs, steps, seed, AutoresetMode(mode), random_start, rtol)
-        _check_spaces(subject)
-        _check_seeds(subject)
-        for check in (_check_redraws, _check_equality, _check_aliasing, _check_single_holds, _check_writes):
-            total += check(subject)
+        driver = Driver(make_vector, make_scalar, num_envs, steps, seed, AutoresetMode(mode))
+        _check_spaces(driver)
+        _check_seeds(driver, random_start, rtol)
+        _check_equality(driver, random_start, rtol)
+        _check_kept(driver, every=True)
+        _check_kept(driver, every=False)
+        _check_writes(driver)
+        total += driver.seen
     return total
 
 
-def _check_spaces(subject: Subject) -> None:
-    with subject.vector() as env, closing(subject.make_scalar()) as scalar:
-        n = subject.num_envs
-        need(env.num_envs == n, subject, f"num_envs is {env.num_envs}, asked for {n}")
+def _check_spaces(driver: Driver) -> None:
+    with driver.vector() as env, closing(driver.make_scalar()) as scalar:
+        n = driver.num_envs
+        driver.require(env.num_envs == n, f"num_envs is {env.num_envs}, asked for {n}")
         declared = env.metadata.get("autoreset_mode")
-        need(declared == subject.mode, subject, f"metadata['autoreset_mode'] is {declared!r}")
+        driver.require(declared == driver.mode, f"metadata['autoreset_mode'] is {declared!r}")
         for name in ("action_space", "observation_space"):
             alone, single, batched = getattr(scalar, name), getattr(env, f"single_{name}"), getattr(env, name)
-            need(single == alone, subject, f"single_{name} is {single}, the scalar's is {alone}")
+            driver.require(single == alone, f"single_{name} is {single}, the scalar's is {alone}")
             expected = batch_space(single, n)
-            need(batched == expected, subject, f"{name} is {batched}, the batch of {n} is {expected}")
+            driver.require(batched == expected, f"{name} is {batched}, the batch of {n} is {expected}")
 
 
-def _check_types(event: Event, env: Any, subject: Subject) -> None:
-    """Shapes and dtypes of what a call returned."""
-    call, n = event.call, subject.num_envs
-    observation, infos = event.result[0], event.result[-1]
-    inside = env.observation_space.contains(observation)
-    need(inside, subject, f"{call}: the observation is not in observation_space (shape, dtype or bounds)")
-    if len(event.result) == 5:
-        for name, array, dtype in zip(_RESULT[1:4], event.result[1:4], (np.float64, np.bool_, np.bool_), strict=True):
-            fits = isinstance(array, np.ndarray) and array.shape == (n,) and array.dtype == dtype
-            found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
-            need(fits, subject, f"{call}: {name} must be {np.dtype(dtype)} of shape ({n},), is {found}")
-    need(isinstance(infos, dict), subject, f"{call}: infos must be a dict, is {type(infos).__name__}")
-    for key in infos:
-        mask = infos.get(f"_{key}", None) if not key.startswith("_") else infos[key]
-        fits = isinstance(mask, np.ndarray) and mask.shape == (n,) and mask.dtype == np.bool_
-        need(fits, subject, f"{call}: info {key!r} needs a mask '_{key.lstrip('_')}', bool of shape ({n},)")
-
-
-def _first(subject: Subject, seed: Any, env: Any = None) -> list[Leaf]:
+def _first(driver: Driver, seed: Any, env: Any = None) -> list[list[NamedArray]]:
     """Copies of the first observation of every slot."""
     if env is None:
-        with subject.vector() as fresh:
-            return _first(subject, seed, fresh)
-    return [leaf.copy() for leaf in leaves(env.reset(seed=seed)[0])]
+        with driver.vector() as fresh:
+            return _first(driver, seed, fresh)
+    arrays = flatten(env.reset(seed=seed)[0])
+    return [[array.at(i) for array in arrays] for i in range(driver.num_envs)]
 
 
-def _check_seeds(subject: Subject) -> None:
-    seed, n = subject.seed, subject.num_envs
-    expected = _first(subject, seed)
-    with subject.vector() as env:
+def _check_seeds(driver: Driver, random_start: bool, rtol: float) -> None:
+    seed, n = driver.seed, driver.num_envs
+
+    def same(one: list[list[NamedArray]], other: list[list[NamedArray]]) -> bool:
+        return all(difference(*pair) is None for pair in zip(one, other, strict=True))
+
+    expected = _first(driver, seed)
+    with driver.vector() as env:
         for what in ("a second environment", "a second reset"):
-            same = difference(_first(subject, seed, env), expected) is None
-            need(same, subject, f"seed {seed} gives another first observation in {what}")
-        unseeded = _first(subject, None, env)
-    listed = [seed + 7 * (n - i) for i in range(n)]
-    given = _first(subject, listed)
-    for i in range(n):
-        with closing(subject.make_scalar()) as scalar:
-            alone = leaves(scalar.reset(seed=listed[i])[0])
-        same = difference([leaf.at(i) for leaf in given], alone, subject.rtol) is None
-        need(same, subject, f"seed list: slot {i} with seed {listed[i]} differs from the scalar with that seed")
-    if not subject.random_start:
+            again = same(_first(driver, seed, env), expected)
+            driver.require(again, f"seed {seed} gives another first observation in {what}")
+        unseeded = _first(driver, None, env)
+    seeds = [seed + 7 * (n - i) for i in range(n)]
+    for i, slot in enumerate(_first(driver, seeds)):
+        with closing(driver.make_scalar()) as scalar:
+            differs = difference(slot, flatten(scalar.reset(seed=seeds[i])[0]), rtol)
+        driver.require(not differs, f"seed list: slot {i} with seed {seeds[i]} differs from the scalar with that seed")
+    if not random_start:
         return
     for other, what in (
-        (_first(subject, seed + 1000), f"seeds {seed} and {seed + 1000} give"),
+        (_first(driver, seed + 1000), f"seeds {seed} and {seed + 1000} give"),
         (unseeded, "a reset without seed repeats the last one: both give"),
-        (_first(subject, None), f"no seed and seed {seed} give"),
+        (_first(driver, None), f"no seed and seed {seed} give"),
     ):
-        need(difference(other, expected) is not None, subject, f"{what} the same first observations")
+        driver.require(not same(other, expected), f"{what} the same first observations")
     for i in range(1, n):
-        alike = difference([leaf.at(i) for leaf in expected], [leaf.at(0) for leaf in expected]) is None
-        need(not alike, subject, f"slots 0 and {i} have the same first observation")
+        unlike = difference(expected[i], expected[0])
+        driver.require(unlike, f"slots 0 and {i} have the same first observation")
 
 
-def _check_redraws(subject: Subject) -> Checked:
-    """Shapes and dtypes throughout, and a new first observation after every end."""
-    begun: list[list[list[Leaf]]] = [[] for _ in range(subject.num_envs)]
-    episodes = failures = 0
-    with subject.vector() as env:
-        for event in play(env, subject):
-            _check_types(event, env, subject)
-            episodes, failures = episodes + int(event.ended.sum()), failures + int(event.failed.sum())
-            for i in np.flatnonzero(event.first).tolist():
-                new = [leaf.at(i).copy() for leaf in leaves(event.result[0])]
-                again = subject.random_start and any(difference(new, old) is None for old in begun[i])
-                need(not again, subject, f"{event.call}: slot {i} begins again with a first observation it had before")
+def _check_equality(driver: Driver, random_start: bool, rtol: float) -> None:
+    """Everything as the scalars have it, and a new first observation after every end."""
+    begun: list[list[list[NamedArray]]] = [[] for _ in range(driver.num_envs)]
+    with driver.vector() as env, driver.scalars() as oracle:
+        for one, other in zip(driver.run(env), driver.run(oracle, oracle=True), strict=True):
+            for i in np.flatnonzero(one.first).tolist() if random_start else ():
+                new = [array.at(i) for array in flatten(one.result[0])]
+                again = any(difference(new, old) is None for old in begun[i])
+                driver.require(not again, f"{one.call}: slot {i} begins again with a first observation it had before")
                 begun[i].append(new)
-    need(episodes, subject, f"no episode ended in {subject.steps} steps: give more steps or a shorter horizon")
-    return Checked(subject.steps, episodes, failures, 0)
-
-
-def _check_equality(subject: Subject) -> Checked:
-    episodes = failures = 0
-    with subject.vector() as env, subject.scalars() as oracle:
-        for one, other in zip(play(env, subject), play(oracle, subject), strict=True):
-            need(one.call == other.call, subject, f"{one.call} where the scalars have {other.call}")
+            driver.require(one.call == other.call, f"{one.call} where the scalars have {other.call}")
             names = _RESULT if len(one.result) == 5 else (_RESULT[0], _RESULT[-1])
             for name, ours, theirs in zip(names, one.result, other.result, strict=True):
-                found = difference(leaves(ours, name), leaves(theirs, name), subject.rtol, masked=name == "info")
-                need(found is None, subject, f"{one.call}: {found} (native and scalar)")
-            episodes, failures = episodes + int(one.ended.sum()), failures + int(one.failed.sum())
-    return Checked(subject.steps, episodes, failures, 0)
+                found = difference(flatten(ours, name), flatten(theirs, name), rtol, masked=name == "info")
+                driver.require(not found, f"{one.call}: {found} (native and scalar)")
+    driver.require(
+        driver.seen.episodes, f"no episode ended in {driver.steps} steps: give more steps or a shorter horizon"
+    )
 
 
-def _check_aliasing(subject: Subject) -> Checked:
-    """Keep everything, each array by another kind of holder, and look again at the end."""
-    kept: list[tuple[str, Held]] = []
-    with subject.vector() as env:
-        for event in play(env, subject):
-            for leaf in leaves(event.result, ""):
-                kept.append((event.call, hold(leaf, len(kept) % len(HOLDERS))))
-        _need_unchanged(kept, subject)
-    return Checked(subject.steps, 0, 0, len(kept))
+def _check_kept(driver: Driver, every: bool) -> None:
+    """Keep every array, each in another way, or one array of each call alone; look again at the end.
 
-
-def _check_single_holds(subject: Subject) -> Checked:
-    """Keep one array of each call alone, so that whatever is recycled by need is recycled around it."""
-    kept: list[tuple[str, Held]] = []
-    with subject.vector() as env:
-        for number, event in enumerate(play(env, subject)):
-            found = leaves(event.result, "")
-            kept.append((event.call, hold(found[number // len(HOLDERS) % len(found)], number % len(HOLDERS))))
-            del found, event
-        _need_unchanged(kept, subject)
-    return Checked(subject.steps, 0, 0, len(kept))
-
-
-def _need_unchanged(kept: list[tuple[str, Held]], subject: Subject) -> None:
-    for call, held in kept:
-        need(held.unchanged(), subject, f"{call}: {held.name} (kept as {held.holder}) was written by a later call")
-
-
-def _check_writes(subject: Subject) -> Checked:
-    """Overwrite all that one of two equal environments returns, and the actions it was given."""
-    with subject.vector() as plain, subject.vector() as spoilt:
-        for one, other in zip(play(plain, subject), play(spoilt, subject, spoils=True), strict=True):
-            found = difference(leaves(other.result, "result"), leaves(one.result, "result"), masked=True)
-            need(found is None, subject, f"{one.call}: writing into earlier results or actions changed {found}")
-            spoil(other.result)
-    return Checked(subject.steps, 0, 0, 0)
-
-
-class _Case(NamedTuple):
-    """A case of the command."""
-
-    settings: dict[str, Any]
-    share: float
-    """Of the steps asked for [-]."""
-    random_start: bool
-
-
-def _cz_cases() -> list[_Case]:
-    """Every scenario with every observation: short episodes of long steps, so that many end; few images, which cost.
-
-    A first image may be black, as another one: on "sensor-fault" images do not tell episodes apart.
+    One alone, because memory that is used again once nobody needs it would be used again around it.
     """
-    from cz_gym.episodes.scenarios import SCENARIOS
-    from cz_gym.observation import CAMERA, OBSERVATIONS
+    kept: list[tuple[str, Kept]] = []
+    with driver.vector() as env:
+        for number, event in enumerate(driver.run(env)):
+            arrays = flatten(event.result)
+            if every:
+                kept += [(event.call, keep(array, len(kept) + i)) for i, array in enumerate(arrays)]
+            else:
+                kept.append((event.call, keep(arrays[number // len(KEEPERS) % len(arrays)], number)))
+            del arrays, event
+        for call, array in kept:
+            still = f"{call}: {array.name} (kept as {array.keeper}) was written by a later call"
+            driver.require(array.unchanged, still)
+    driver.seen += Checked(held=len(kept))
 
-    random_at_start = {"randomized", "hard", "sensor-fault", "puller", "only-sensor"}
+
+def _check_writes(driver: Driver) -> None:
+    """Overwrite all that one of two equal environments returns, and the actions it was given."""
+    with driver.vector() as plain, driver.vector() as overwritten:
+        for one, other in zip(driver.run(plain), driver.run(overwritten, oracle=True, overwrites=True), strict=True):
+            found = difference(flatten(other.result, "result"), flatten(one.result, "result"), masked=True)
+            driver.require(not found, f"{one.call}: writing into earlier results or actions changed {found}")
+            overwrite(other.result)
+
+
+def _check_cz(scenario: str, observation: str, num_envs: int, steps: int) -> Checked:
+    """Check ``Cz-v0`` in short episodes of long steps, so that many end; few images, which cost."""
+    images = observation == CAMERA
+    settings: dict[str, Any] = {
+        "scenario": scenario, "observation": observation, "control_interval": 60.0,
+        "horizon": 180.0 if images else 1200.0,
+    }  # fmt: skip
+    # A first image may be black, as another one: on "sensor-fault" images do not tell episodes apart.
     alike = {("only-sensor", "state"), ("sensor-fault", CAMERA)}
-    cases = []
-    for scenario in SCENARIOS:
-        for observation in (*OBSERVATIONS, CAMERA):
-            images = observation == CAMERA
-            settings = {
-                "scenario": scenario, "observation": observation, "control_interval": 60.0,
-                "horizon": 180.0 if images else 1200.0,
-            }  # fmt: skip
-            random = scenario in random_at_start and (scenario, observation) not in alike
-            cases.append(_Case(settings, 0.08 if images else 1.0, random))
-    return cases
+    random_at_start = scenario in {"randomized", "hard", "sensor-fault", "puller", "only-sensor"}
+    return check_vector_env(
+        lambda n, mode: gym.make_vec("Cz-v0", n, "vector_entry_point", autoreset_mode=mode, **settings),
+        lambda: gym.make("Cz-v0", **settings).unwrapped,
+        num_envs=num_envs,
+        steps=max(4, round(0.08 * steps)) if images else steps,
+        random_start=random_at_start and (scenario, observation) not in alike,
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -234,23 +193,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--steps", type=int, default=50, help="batched steps a case, images fewer (%(default)s)")
     parser.add_argument("--slots", type=int, default=3, help="slots of the batch (%(default)s)")
-    arguments = parser.parse_args(argv)
-    if arguments.steps < 50 or arguments.slots < 2:
-        parser.error(
-            f"needs --steps of at least 50 and --slots of at least 2, not {arguments.steps}, {arguments.slots}"
-        )
-    total, cases = Checked(0, 0, 0, 0), _cz_cases()
-    for settings, share, random_start in cases:
-        found = check_vector_env(
-            lambda n, mode, settings=settings: gym.make_vec(  # type: ignore[misc]
-                "Cz-v0", num_envs=n, vectorization_mode="vector_entry_point", autoreset_mode=mode, **settings
-            ),
-            lambda settings=settings: gym.make("Cz-v0", **settings).unwrapped,  # type: ignore[misc]
-            num_envs=arguments.slots,
-            steps=max(4, round(share * arguments.steps)),
-            random_start=random_start,
-        )
-        print(f"{settings['scenario']}, {settings['observation']}: {found}", flush=True)
+    given = parser.parse_args(argv)
+    if given.steps < 50 or given.slots < 2:
+        parser.error(f"needs --steps of at least 50 and --slots of at least 2, not {given.steps}, {given.slots}")
+    total, cases = Checked(), list(product(scenarios.SCENARIOS, (*OBSERVATIONS, CAMERA)))
+    for scenario, observation in cases:
+        found = _check_cz(scenario, observation, given.slots, given.steps)
+        print(f"{scenario}, {observation}: {found}", flush=True)
         total += found
     print(f"{len(cases)} cases conform: {total}")
     return 0

@@ -1,4 +1,4 @@
-"""An environment played for a check: sampled actions, resets as its autoreset mode wants them."""
+"""An environment run for a check: sampled actions, resets as its autoreset mode wants them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
-from .nested_arrays import leaves, spoil
+from .nested_arrays import flatten, overwrite
 
 MakeVector = Callable[[int, AutoresetMode], Any]
 """Makes the native form from a number of slots and an autoreset mode."""
@@ -23,13 +23,13 @@ class NotConforming(AssertionError):
 class Checked(NamedTuple):
     """What a check has seen."""
 
-    steps: int
+    steps: int = 0
     """Batched steps of the native form."""
-    episodes: int
+    episodes: int = 0
     """Episodes that ended, all slots together."""
-    failures: int
+    failures: int = 0
     """Those that ended by ``terminated``."""
-    held: int
+    held: int = 0
     """Returned arrays that were kept through later calls."""
 
     def __str__(self) -> str:
@@ -51,23 +51,23 @@ class Event(NamedTuple):
     result: tuple[Any, ...]
     first: Any
     """Slots whose observation is an episode's first, bool of shape (num_envs,)."""
-    ended: Any
-    """Slots whose episode ended in this call, bool of shape (num_envs,)."""
-    failed: Any
-    """Slots whose episode ended by ``terminated``, bool of shape (num_envs,)."""
 
 
-class Subject(NamedTuple):
-    """What is checked, and how."""
+class Driver:
+    """Runs environments in one autoreset mode, and counts what it sees of the native form."""
 
-    make_vector: MakeVector
-    make_scalar: MakeScalar
-    num_envs: int
-    steps: int
-    seed: int
-    mode: AutoresetMode
-    random_start: bool
-    rtol: float
+    def __init__(
+        self,
+        make_vector: MakeVector,
+        make_scalar: MakeScalar,
+        num_envs: int,
+        steps: int,
+        seed: int,
+        mode: AutoresetMode,
+    ) -> None:
+        self.make_vector, self.make_scalar = make_vector, make_scalar
+        self.num_envs, self.steps, self.seed, self.mode = num_envs, steps, seed, mode
+        self.seen = Checked()
 
     def vector(self) -> Any:
         """A native form."""
@@ -77,32 +77,34 @@ class Subject(NamedTuple):
         """The oracle: Gymnasium's vector of scalars."""
         return closing(SyncVectorEnv([self.make_scalar] * self.num_envs, autoreset_mode=self.mode))
 
+    def require(self, fact: Any, message: str) -> None:
+        """Raise :class:`NotConforming` unless the fact is one."""
+        if not fact:
+            raise NotConforming(f"[{self.mode.value}] {message}")
 
-def play(env: VectorEnv[Any, Any, Any], subject: Subject, spoils: bool = False) -> Iterator[Event]:
-    """Reset and step with sampled actions; ended episodes are reset as the mode wants."""
-    env.action_space.seed(subject.seed)
-    n, mode = subject.num_envs, subject.mode
-    over, none = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
-    yield Event("reset", env.reset(seed=subject.seed), ~none, none, none)
-    for k in range(subject.steps):
-        action = env.action_space.sample()
-        given = [(leaf.value, leaf.value.copy()) for leaf in leaves(action)]
-        result = env.step(action)
-        need(all(np.array_equal(a, b) for a, b in given), subject, f"step {k} wrote into the actions it was given")
-        if spoils:
-            spoil(action)
-        ended = np.array(result[2] | result[3], np.bool_)
-        begun = {AutoresetMode.NEXT_STEP: over, AutoresetMode.SAME_STEP: ended}.get(mode, none)
-        over = ended.copy()
-        yield Event(f"step {k}", result, begun.copy(), ended, np.array(result[2], np.bool_))
-        if mode == AutoresetMode.DISABLED and over.any():
-            mask = over.copy()
-            again = env.reset(options={"reset_mask": mask})
-            mask[:] = True
-            yield Event(f"reset of ended slots after step {k}", again, over, none, none)
+    def run(self, env: VectorEnv[Any, Any, Any], oracle: bool = False, overwrites: bool = False) -> Iterator[Event]:
+        """Reset and step with sampled actions; ended episodes are reset as the mode wants.
 
-
-def need(fact: Any, subject: Subject, message: str) -> None:
-    """Raise :class:`NotConforming` unless the fact is one."""
-    if not fact:
-        raise NotConforming(f"[{subject.mode.value}] {message}")
+        An ``oracle`` is not counted; ``overwrites``: the actions are overwritten once they were given.
+        """
+        env.action_space.seed(self.seed)
+        over, none = np.zeros(self.num_envs, np.bool_), np.zeros(self.num_envs, np.bool_)
+        yield Event("reset", env.reset(seed=self.seed), ~none)
+        for k in range(self.steps):
+            action = env.action_space.sample()
+            given = [(array.value, array.value.copy()) for array in flatten(action)]
+            result = env.step(action)
+            self.require(all(np.array_equal(a, b) for a, b in given), f"step {k} wrote into the actions it was given")
+            if overwrites:
+                overwrite(action)
+            ended = np.array(result[2] | result[3], np.bool_)
+            if not oracle:
+                self.seen += Checked(1, int(ended.sum()), int(np.sum(result[2])))
+            begun = {AutoresetMode.NEXT_STEP: over, AutoresetMode.SAME_STEP: ended}.get(self.mode, none)
+            over = ended.copy()
+            yield Event(f"step {k}", result, begun.copy())
+            if self.mode == AutoresetMode.DISABLED and over.any():
+                mask = over.copy()
+                again = env.reset(options={"reset_mask": mask})
+                mask[:] = True
+                yield Event(f"reset of ended slots after step {k}", again, over)

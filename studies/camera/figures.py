@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,46 +12,44 @@ import numpy.typing as npt
 from cz_gym.camera.image import picture
 from cz_gym.camera.rays import FLAT, MELT, Ray, Scene, first_hit, make_scene, mirror, profile_at
 from cz_gym.camera.ring_detector import ANGLES, Edge, wall_edge
-from cz_gym.camera.view import COLUMNS, ROWS, View, project
+from cz_gym.camera.view import COLUMNS, ROWS, Camera, View, project
 from cz_gym.evaluation.report.canvas import COLOURS, GREY, INK, canvas, png
 from cz_gym.physics.meniscus import hurle_ring_offset
+from cz_gym.physics.plant import Puller
 from cz_gym.units import MM
 
-from .__main__ import Response, Study
+from .measurements import Bench, Response
 
 Floats = npt.NDArray[np.float64]
-SHOWN_HEIGHTS = (5.0 * MM, None, 8.0 * MM)
-"""Menisci of the figures [m]; None: the operating point's."""
 DETECTED, CLOSED, TRUE, TRACED = COLOURS[1], COLOURS[0], INK, COLOURS[2]
 
 
-def view_figure(study: Study) -> bytes:
+def view_figure(bench: Bench) -> bytes:
     """The image at a low, the nominal and a high meniscus, and the grey values down its middle."""
     figure = canvas(9.6, 5.4)
     axes = figure.subplots(2, 3, height_ratios=(1.0, 0.75))
-    for i, given in enumerate(SHOWN_HEIGHTS):
-        h_c = given or study.puller.h_0
-        _draw_image(axes[0, i], study, h_c)
-        _draw_middle(axes[1, i], study, h_c)
-    axes[1, 0].set_ylabel("grey value")
+    for (above, below), h_c in zip(axes.T, (5.0 * MM, bench.puller.h_0, 8.0 * MM), strict=True):
+        image = picture(bench.puller.r_0, h_c, bench.puller, bench.view)
+        _draw_image(above, bench, h_c, image)
+        _draw_middle(below, bench, h_c, image)
     axes[0, 0].set_ylabel("row")
-    for axis in (*axes[0, 1:], *axes[1, 1:]):
+    axes[1, 0].set_ylabel("grey value")
+    for axis in axes[:, 1:].flat:
         axis.tick_params(labelleft=False)
     axes[0, 0].legend(fontsize=7, loc="upper center", framealpha=0.85)
     axes[1, 0].legend(fontsize=7, loc="center right", framealpha=1.0)
     return png(figure)
 
 
-def _draw_image(axis: Any, study: Study, h_c: float) -> None:
-    p, view = study.puller, study.view
-    image = picture(p.r_0, h_c, p, view)
+def _draw_image(axis: Any, bench: Bench, h_c: float, image: Any) -> None:
+    view, p, detector = bench
     axis.imshow(
         image[:, :, 0], cmap="gray", vmin=0, vmax=255, extent=(0, COLUMNS, ROWS, 0), interpolation="nearest", zorder=1
     )
-    ring = study.detector.read(image)
-    seen = project(ring.edges * np.cos(ANGLES), ring.edges * np.sin(ANGLES), study.detector.height, view)
+    ring = detector.read(image)
+    seen = project(ring.edges * np.cos(ANGLES), ring.edges * np.sin(ANGLES), detector.height, view)
     axis.plot(seen.column, seen.row, color=COLOURS[5], lw=1.0, label="detected edge")
-    r_br = p.r_0 + float(hurle_ring_offset(p.r_0, h_c, p))
+    r_br = _closed_form(p, h_c)
     wide = np.linspace(-0.6, 0.6, 121)
     closed = project(r_br * np.cos(wide), r_br * np.sin(wide), 0.0, view)
     inside = (closed.column >= 0) & (closed.column <= COLUMNS)
@@ -60,47 +59,38 @@ def _draw_image(axis: Any, study: Study, h_c: float) -> None:
     axis.set_xlabel("column")
 
 
-def _draw_middle(axis: Any, study: Study, h_c: float) -> None:
-    p, view = study.puller, study.view
-    axis.step(np.arange(ROWS) + 0.5, picture(p.r_0, h_c, p, view)[:, COLUMNS // 2, 0], where="mid", color=INK, lw=1.0)
-    scene = make_scene(p.r_0, h_c, p)
-    edge = wall_edge(scene, view)
-    marks = (
+def _closed_form(p: Puller, h_c: float) -> float:
+    """Radius of the plant's bright ring at r_0 [m]."""
+    return p.r_0 + float(hurle_ring_offset(p.r_0, h_c, p))
+
+
+def _draw_middle(axis: Any, bench: Bench, h_c: float, image: Any) -> None:
+    view, p, _ = bench
+    axis.step(np.arange(ROWS) + 0.5, image[:, COLUMNS // 2, 0], where="mid", color=INK, lw=1.0)
+    edge = wall_edge(make_scene(p.r_0, h_c, p), view)
+    for name, r, z, colour in (
         ("triple point", p.r_0, h_c, GREY),
         ("mirrors the wall's end", edge.r, edge.z, COLOURS[5]),
-        ("closed-form ring", p.r_0 + float(hurle_ring_offset(p.r_0, h_c, p)), 0.0, CLOSED),
-    )
-    for name, r, z, colour in marks:
+        ("closed-form ring", _closed_form(p, h_c), 0.0, CLOSED),
+    ):
         axis.axvline(float(project(r, 0.0, z, view).row), color=colour, lw=1.0, ls="--", label=name)
-    axis.set_xlim(35, ROWS)
-    axis.set_ylim(0, 255)
-    axis.set_xlabel("row of the middle column")
+    axis.set(xlim=(35, ROWS), ylim=(0, 255), xlabel="row of the middle column")
 
 
-def section_figure(study: Study) -> bytes:
+def section_figure(bench: Bench) -> bytes:
     """Hot zone and meniscus in the camera's plane, with rays."""
-    p, view, camera = study.puller, study.view, study.camera
+    view, p, _ = bench
     scene = make_scene(p.r_0, p.h_0, p)
     edge = wall_edge(scene, view)
     figure = canvas(9.6, 4.2)
     zone, close = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
     for axis in (zone, close):
-        _draw_crystal(axis, scene, camera.crucible_radius)
+        _draw_crystal(axis, scene, view.camera.crucible_radius)
         for z, colour in _aimed_heights(scene, edge):
             _draw_ray(axis, z, scene, view, colour)
-    wall, height, opening = camera.crucible_radius / MM, camera.wall_height / MM, camera.shield_radius / MM
-    zone.plot([wall, wall], [0, height], color=COLOURS[0], lw=3, solid_capstyle="butt")
-    zone.plot([opening, wall], [height, height], color=GREY, lw=3, solid_capstyle="butt")
-    zone.text(wall - 4, 0.5 * height, f"hot wall\n{camera.wall_temperature:.0f} K", ha="right", va="center", fontsize=8)
-    zone.text(
-        0.5 * (opening + wall), height + 4, f"heat shield, {camera.shield_temperature:.0f} K", ha="center", fontsize=8
-    )
-    zone.text(40, 70, "crystal", ha="center", fontsize=8)
-    zone.text(200, -13, "melt", ha="center", fontsize=8)
-    zone.text(166, 165, "to the camera", fontsize=8, rotation=70, rotation_mode="anchor", ha="right")
-    zone.set(xlim=(0, wall + 12), ylim=(-22, 175), xlabel="distance from the axis [mm]", ylabel="height [mm]")
-    zone.set_aspect("equal")
-    r_br = p.r_0 + float(hurle_ring_offset(p.r_0, p.h_0, p))
+        axis.set_aspect("equal")
+    _draw_hot_zone(zone, view.camera)
+    r_br = _closed_form(p, p.h_0)
     close.plot(edge.r / MM, edge.z / MM, "o", color=TRACED, ms=5)
     said = f"ring's outer edge,\nslope {math.degrees(edge.slope):.1f}°"
     line = {"arrowstyle": "-", "color": GREY}
@@ -108,8 +98,20 @@ def section_figure(study: Study) -> bytes:
     close.plot(r_br / MM, 0.4, "v", color=CLOSED, ms=6)
     close.text(r_br / MM, 1.1, "closed-form ring,\neffective slope 3.5°", fontsize=8, ha="center")
     close.set(xlim=(84, 108), ylim=(-2, 12), xlabel="distance from the axis [mm]")
-    close.set_aspect("equal")
     return png(figure)
+
+
+def _draw_hot_zone(axis: Any, camera: Camera) -> None:
+    wall, height, opening = camera.crucible_radius / MM, camera.wall_height / MM, camera.shield_radius / MM
+    axis.plot([wall, wall], [0, height], color=COLOURS[0], lw=3, solid_capstyle="butt")
+    axis.plot([opening, wall], [height, height], color=GREY, lw=3, solid_capstyle="butt")
+    hot = f"hot wall\n{camera.wall_temperature:.0f} K"
+    axis.text(wall - 4, 0.5 * height, hot, ha="right", va="center", fontsize=8)
+    shield = f"heat shield, {camera.shield_temperature:.0f} K"
+    for x, y, text in ((0.5 * (opening + wall), height + 4, shield), (40, 70, "crystal"), (200, -13, "melt")):
+        axis.text(x, y, text, ha="center", fontsize=8)
+    axis.text(166, 165, "to the camera", fontsize=8, rotation=70, rotation_mode="anchor", ha="right")
+    axis.set(xlim=(0, wall + 12), ylim=(-22, 175), xlabel="distance from the axis [mm]", ylabel="height [mm]")
 
 
 def _aimed_heights(scene: Scene, edge: Edge) -> tuple[tuple[float, str], ...]:
@@ -146,11 +148,11 @@ def _draw_ray(axis: Any, z: float, scene: Scene, view: View, colour: str) -> Non
     axis.plot(np.array(x) / MM, np.array(heights) / MM, color=colour, lw=1.1)
 
 
-def response_figure(study: Study) -> bytes:
+def response_figure(responses: Sequence[Response]) -> bytes:
     """True radius and rings after sudden changes of the pull speed."""
     figure = canvas(9.6, 6.0)
     axes = figure.subplots(2, 2, sharex=True)
-    for axis, response in zip(axes.ravel(), study.responses, strict=True):
+    for axis, response in zip(axes.flat, responses, strict=True):
         _draw_response(axis, response)
     for axis in axes[1]:
         axis.set_xlabel("time after the change [s]")
@@ -162,20 +164,15 @@ def response_figure(study: Study) -> bytes:
 
 def _draw_response(axis: Any, response: Response) -> None:
     rings = response.rings
-    lines = (
-        ("true radius", response.r_c, TRUE, "-"),
-        ("closed-form ring", rings.closed, CLOSED, "-"),
-        ("exactly traced edge", rings.traced, TRACED, "--"),
-    )
-    for name, values, colour, style in lines:
-        axis.plot(response.t, 1e3 * values / MM, style, color=colour, lw=1.3, label=name)
-    axis.plot(response.t, 1e3 * rings.detected / MM, ".", color=DETECTED, ms=4, label="image and detector")
-    depths = ", ".join(
-        f"{1e3 * response.depth(ring) / MM:.1f} ({name})"
-        for name, ring in (("closed", rings.closed), ("traced", rings.traced), ("detected", rings.detected))
-    )
-    axis.set_title(
-        f"Model {response.model}, pull speed {100 * response.change:+.0f} %\ndepth [µm]: {depths}", fontsize=8.5
-    )
+    for name, values, colour, line in (
+        ("true radius", response.r_c, TRUE, {"ls": "-", "lw": 1.3}),
+        ("closed-form ring", rings.closed, CLOSED, {"ls": "-", "lw": 1.3}),
+        ("exactly traced edge", rings.traced, TRACED, {"ls": "--", "lw": 1.3}),
+        ("image and detector", rings.detected, DETECTED, {"ls": "", "marker": ".", "ms": 4}),
+    ):
+        axis.plot(response.t, 1e3 * values / MM, color=colour, label=name, **line)
+    depths = ", ".join(f"{1e3 * response.depth(ring) / MM:.1f} ({name})" for name, ring in rings._asdict().items())
+    title = f"Model {response.model}, pull speed {100 * response.change:+.0f} %\ndepth [µm]: {depths}"
+    axis.set_title(title, fontsize=8.5)
     least = 1e3 * min(float(np.nanmin(ring)) for ring in rings) / MM
     axis.set_ylim(1.25 * least, -2.5 * least)

@@ -61,7 +61,7 @@ def check_numbers(given: argparse.Namespace, **limits: tuple[int, int]) -> None:
 def _main(study: Study, given: argparse.Namespace) -> int:
     check_numbers(given, seeds=(1, 100), steps=(1, 10**9), jobs=(1, 64))
     from cz_gym.agents.training import validation
-    from cz_gym.atomic_files import locked, check_writable
+    from cz_gym.atomic_files import check_writable, locked
 
     from .results import Plan
     from .training import is_finished

@@ -32,10 +32,7 @@ COLOURS = 128
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
     """Read the command line; exits with code 2 and one line for anything that cannot be meant."""
-    parser = OneLineParser(
-        prog=PROG,
-        description="Film the paper's controller and an agent on the same crystal.",
-    )
+    parser = OneLineParser(PROG, "Film the paper's controller and an agent on the same crystal.")
     parser.add_argument("--scenario", default="randomized", metavar="NAME", help="scenario (%(default)s)")
     parser.add_argument("--seed", type=int, default=SEED, metavar="N", help="which crystal (%(default)s)")
     parser.add_argument("--agent", type=Path, metavar="FILE", help="agent file in place of the shipped one")
@@ -70,25 +67,22 @@ def _make(arguments: argparse.Namespace) -> int:
 
 def film(scenario: str, seed: int, frames: int, agent: Path | None = None) -> bytes:
     """The GIF: both sides stepped together, ``frames`` pictures equally far apart in time."""
+    from cz_gym.rendering.canvas import Canvas
     from cz_gym.rendering.pixels import colours
 
-    from .duel import Duel
+    from .duel import draw
 
-    sides = contestants(scenario, agent)
-    for side in sides:
-        side.begin(seed)
-    duel = Duel(*SIZE)
+    sides, canvas = contestants(scenario, seed, agent), Canvas(*SIZE)
     steps = sides[0].env.config.steps
     pictures = []
     for number in range(frames):
-        upto = round((number + 1) * steps / frames)
         for side in sides:
-            side.step_to(upto)
-        pictures.append(colours(duel.draw(sides)))
+            side.step_to(round((number + 1) * steps / frames))
+        pictures.append(colours(draw(canvas, sides)))
     return gif(pictures)
 
 
-def contestants(scenario: str, agent: Path | None = None) -> tuple[Side, Side]:
+def contestants(scenario: str, seed: int, agent: Path | None = None) -> tuple[Side, Side]:
     """The paper's controller and the agent of a file, or the shipped one, each with an environment of its own."""
     from cz_gym import agents
     from cz_gym.baselines.registry import find_controller
@@ -104,7 +98,7 @@ def contestants(scenario: str, agent: Path | None = None) -> tuple[Side, Side]:
         raise ValueError(f"{agent}: acts every {learned.contract.control_interval:g} s, not every 5 s")
     other = CzEnv(scenario, observation=learned.observation, render_mode="rgb_array")
     name = f"learned: {learned.contract.algorithm}"
-    return Side("the paper's controller", paper, env, TEMPERATURE), Side(name, learned, other, TRUE)
+    return Side("the paper's controller", paper, env, TEMPERATURE, seed), Side(name, learned, other, TRUE, seed)
 
 
 def gif(pictures: Sequence[Any]) -> bytes:

@@ -10,9 +10,9 @@ import argparse
 import csv
 import io
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,7 @@ from cz_gym.atomic_files import write_files
 from cz_gym.commands import OneLineParser, guarded
 from cz_gym.evaluation.files import EPISODES, read_episodes
 from cz_gym.evaluation.statistics import Estimate, Resamples, differences, means
+from studies.markdown import table
 
 Floats = npt.NDArray[np.float64]
 PROG = "python -m studies.generalisation"
@@ -80,54 +81,49 @@ def to_csv(cells: Sequence[Cell]) -> str:
     ends = [f"{name}{end}" for name in estimates for end in ("", "_low", "_high")]
     writer.writerow(("row", "controller", "training_seeds", "crystals", *ends, "rmse_mm_worst_seed"))
     for cell in cells:
-        numbers = [f"{value:.6g}" for one in (cell.rmse, cell.lost, cell.activity, cell.apart) for value in _ends(one)]
-        writer.writerow((cell.row, cell.controller, cell.seeds, cell.rmse.n, *numbers, f"{cell.worst:.6g}"))
+        numbers = [value for one in (cell.rmse, cell.lost, cell.activity, cell.apart) for value in _ends(one)]
+        figures = (f"{value:.6g}" for value in (*numbers, cell.worst))
+        writer.writerow((cell.row, cell.controller, cell.seeds, cell.rmse.n, *figures))
     return text.getvalue()
 
 
 def _ends(estimate: Estimate) -> tuple[float, float, float]:
-    low, high = estimate.ci95 or (estimate.mean, estimate.mean)
-    return estimate.mean, low, high
+    return (estimate.mean, *(estimate.ci95 or (estimate.mean, estimate.mean)))
 
 
 def to_markdown(cells: Sequence[Cell], against: str) -> str:
     """``table.md``: radius error and lost crystals; then the paired differences."""
-    crystals = cells[0].rmse.n
-    return "\n".join(
-        [
-            "# How agents travel",
-            "",
-            f"RMSE of the radius [mm] on the first {crystals} test crystals of each row, 95 % interval in brackets, and"
-            f" crystals lost; on {' and '.join(OBSERVABLE)} against the radius that sensors can show.",
-            "",
-            *_table(cells, _error),
-            "",
-            f"The same less `{against}`'s, crystal by crystal [µm]; negative is better.",
-            "",
-            *_table([cell for cell in cells if cell.controller != against], _apart),
-            "",
-        ]
-    )
+
+    def error(cell: Cell) -> str:
+        mean, low, high = _ends(cell.rmse)
+        lost = f", {100.0 * cell.lost.mean:.1f} % lost" if cell.lost.mean else ""
+        worst = f", worst seed {cell.worst:.3f}" if cell.seeds > 1 else ""
+        return f"{mean:.3f} [{low:.3f}, {high:.3f}]{lost}{worst}"
+
+    def apart(cell: Cell) -> str:
+        mean, low, high = (value / MICRON for value in _ends(cell.apart))
+        return f"{mean:+.0f} [{low:+.0f}, {high:+.0f}]"
+
+    others = [cell for cell in cells if cell.controller != against]
+    return f"""# How agents travel
+
+RMSE of the radius [mm] on the first {cells[0].rmse.n} test crystals of each row, 95 % interval in brackets, and \
+crystals lost; on {" and ".join(OBSERVABLE)} against the radius that sensors can show.
+
+{_table(cells, error)}
+
+The same less `{against}`'s, crystal by crystal [µm]; negative is better.
+
+{_table(others, apart)}
+"""
 
 
-def _table(cells: Sequence[Cell], tell: Any) -> list[str]:
+def _table(cells: Sequence[Cell], tell: Callable[[Cell], str]) -> str:
     names = list(dict.fromkeys(cell.controller for cell in cells))
-    rows = list(dict.fromkeys(cell.row for cell in cells))
-    found = {(cell.row, cell.controller): cell for cell in cells}
-    lines = [f"| row | {' | '.join(names)} |", "|---" + "|--:" * len(names) + "|"]
-    return lines + [f"| {row} | {' | '.join(tell(found[row, name]) for name in names)} |" for row in rows]
-
-
-def _error(cell: Cell) -> str:
-    mean, low, high = _ends(cell.rmse)
-    lost = f", {100.0 * cell.lost.mean:.1f} % lost" if cell.lost.mean else ""
-    worst = f", worst seed {cell.worst:.3f}" if cell.seeds > 1 else ""
-    return f"{mean:.3f} [{low:.3f}, {high:.3f}]{lost}{worst}"
-
-
-def _apart(cell: Cell) -> str:
-    mean, low, high = (value / MICRON for value in _ends(cell.apart))
-    return f"{mean:+.0f} [{low:+.0f}, {high:+.0f}]"
+    told: dict[str, dict[str, str]] = {}
+    for cell in cells:
+        told.setdefault(cell.row, {})[cell.controller] = tell(cell)
+    return table(("row", *names), ((row, *(by_name[name] for name in names)) for row, by_name in told.items()))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

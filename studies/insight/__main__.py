@@ -9,18 +9,16 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
-from itertools import pairwise
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import Any
 
 from cz_gym.agents import shipped
 from cz_gym.agents.agent_file.contract import read_agent
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.baselines import registry
-from cz_gym.baselines.analysis import frequency, sampled_loop
+from cz_gym.baselines.analysis import frequency
 from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.commands import OneLineParser, guarded
 from cz_gym.config import make_config
@@ -28,20 +26,16 @@ from cz_gym.episodes.scenarios import PULLER, RANDOMIZED
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.observation import MEASURED
 from cz_gym.physics.linearisation import radius_model
 from cz_gym.physics.plant import make_puller
-from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
+from cz_gym.units import MINUTE
 
-from .linear_agent import SEEN, Floats, linear_agent
-from .loop import Responses, after_one, response
-from .report import BANDS
+from .linear_agent import AT, Floats, linear_agent
+from .loop import A_CRYSTAL, Contender, apart, margins, noise_gains, one_reading, response
 from .step_tests import (
-    AT_REST,
-    JUMPS,
     LIMITS,
     MIX,
-    TRIALS,
+    STEP_TESTS,
     crystal,
     jump_gains,
     noisy_observations,
@@ -54,50 +48,10 @@ from .step_tests import (
 PROG = "python -m studies.insight"
 BESIDE = ("lqg-at-0.02", "lqg", "paper-tuned")
 """Controllers that an agent is shown beside; its teacher is among them."""
-A_CRYSTAL = 3.0 * HOUR
-"""How long a crystal is grown [s]."""
-READINGS = tuple(channel.name for channel in MEASURED)
-MODELS = (("Model I", 1.0), ("Model II", 0.0))
-Answers = dict[str, dict[str, Any]]
-"""Signals by trial, then by controller."""
-Jumps = dict[str, tuple[Any, ...]]
-"""Answers to jumps by controller, without noise and under it."""
-READING_SAMPLES = 120
-"""Length of the answer to one reading."""
-NOISE_POINTS = 20_000
-"""Frequencies that a variance is summed over."""
-
-
-class Contender(NamedTuple):
-    """A controller as everything here needs it."""
-
-    name: str
-    observation: str
-    make: Callable[[Any], Any]
-    """Builds it for an environment's settings."""
-    system: Any
-    """Its state space near rest: readings of MEASURED to v_p [m/s] and Q_H [W]."""
-    answer: Callable[[Floats], Any]
-    """Its frequency response, drives by the readings of SEEN."""
-
-
-class Margins(NamedTuple):
-    """A row of the table of margins."""
-
-    controller: str
-    plant: str
-    at: str
-    """Where the loop is opened."""
-    growth: float
-    """Time in which what grows fastest in the closed loop grows by e [s]; infinite if nothing does."""
-    crossover: float
-    """[rad/s]"""
-    gain_up: float
-    gain_down: float
-    phase_deg: float
-    delay: float
-    """[s]"""
-    sensitivity: float
+SHIPPED = "imitation-default"
+"""What the shipped agent is called in the benchmark."""
+AT_REST = "at rest"
+"""Behind an agent's name: linearised without noise."""
 
 
 def contenders(path: Path | None) -> tuple[Contender, ...]:
@@ -108,92 +62,34 @@ def contenders(path: Path | None) -> tuple[Contender, ...]:
     """
     file = path or shipped()
     contract, content = read_agent(file)
-    name = "imitation-default" if path is None else contract.algorithm
+    name = SHIPPED if path is None else contract.algorithm
     config = crystal(A_CRYSTAL / MINUTE, contract.observation)
     policy = OnnxPolicy.load(file, config)
-    seen = {
-        name: noisy_observations(policy, contract.observation),
-        f"{name} {AT_REST}": run_events(policy, config, (), [0.0]).observation,
-    }
-    own = []
-    for label, observations in seen.items():
+
+    def agent(label: str, observations: Floats) -> Contender:
         near = linear_agent(content, observations, config.control_interval, config.parameters.v_0)
-        own.append(Contender(label, contract.observation, lambda _: policy, near.state_space(), near.response))
-    found = own[:1]
-    at = [READINGS.index(channel) for channel in SEEN]
-    for beside in BESIDE:
-        make = registry.find_controller(beside).make
-        form = linear_form(make(crystal(1.0, "measured")))
+        return Contender(label, contract.observation, lambda _: policy, near.state_space(), near.response)
 
-        def answer(omega: Floats, form: Any = form) -> Any:
-            return response(form.controller, form.dt, omega)[:, :, at]
-
-        found.append(Contender(beside, "measured", make, form.controller, answer))
-    return (*found, *own[1:])
+    return (
+        agent(name, noisy_observations(policy, contract.observation)),
+        *map(controller, BESIDE),
+        agent(f"{name} {AT_REST}", run_events(policy, config, (), [0.0]).observation),
+    )
 
 
-def joined(contender: Contender, omega: Floats, lam: float, dt: float) -> Responses:
-    """A controller and a nominal puller at some frequencies."""
-    plant = sampled_loop.sampled_plant(make_puller(lam=lam), dt)
-    return Responses(omega, contender.answer(omega), response(plant, dt, omega)[:, 1:, :2], dt)
-
-
-def one_reading(contender: Contender, dt: float) -> Floats:
-    """Drives after one reading of the ring that is a metre too large, loop closed, shape (samples, 2)."""
-    loop = sampled_loop.close(contender.system, make_puller(lam=MIX), dt)
-    at, rows = loop.inputs.index("camera"), [loop.outputs.index(name) for name in ("v_p", "Q_H")]
-    return after_one(loop.A, loop.B[:, [at]], loop.C[rows], loop.D[np.ix_(rows, [at])], READING_SAMPLES)
-
-
-def margins(contender: Contender, omega: Floats, dt: float) -> list[Margins]:
-    """Margins at both places on both models; NaN where something grows within a crystal.
-
-    What grows more slowly is a network's use of its integral: no crystal feels it, and margins leave it out.
-    """
-    loop = sampled_loop
-    rows = []
-    for plant, lam in MODELS:
-        growth = loop.close(contender.system, make_puller(lam=lam), dt).growth
-        found = joined(contender, omega, lam, dt)
-        for at in ("camera", "v_p"):
-            found_margins = frequency.margins_of(found.opened(at), omega, dt, growth > A_CRYSTAL)
-            rows.append(Margins(contender.name, plant, at, growth, *found_margins))
-    return rows
-
-
-def noise_gains(contender: Contender, dt: float) -> dict[str, float]:
-    """RMS of the drives and of the pull speed's steps per white camera noise RMS, both models' mean puller."""
-    omega = (np.arange(NOISE_POINTS) + 0.5) * np.pi / dt / NOISE_POINTS
-    closed = joined(contender, omega, MIX, dt).closed()
-    step = closed[:, 0] * (1.0 - np.exp(-1j * omega * dt))
-    gains = (("pull", closed[:, 0], MM_PER_MIN), ("pull_step", step, MM_PER_MIN), ("heater", closed[:, 1], KILO))
-    units = {"pull": "mm_per_min", "pull_step": "mm_per_min", "heater": "kw"}
-    return {
-        f"{name}_{units[name]}_per_mm": float(np.sqrt(np.mean(np.abs(values) ** 2)) * MM / scale)
-        for name, values, scale in gains
-    }
-
-
-def apart(contender: Contender, other: Contender, dt: float) -> dict[str, list[float]]:
-    """Largest relative deviation of one's local gains from the ring from another's, by drive, in each band.
-
-    The pyrometer is held, and each knows what it asked of its own drives.
-    """
-    found: dict[str, list[float]] = {"pull speed": [], "heater": []}
-    for low, high in pairwise(BANDS):
-        omega = np.geomspace(low, high, 200)
-        mine, its = (joined(each, omega, MIX, dt).drives() for each in (contender, other))
-        for drive, deviation in zip(found, np.abs(mine / its - 1.0).max(axis=0), strict=True):
-            found[drive].append(float(deviation))
-    return found
+def controller(name: str) -> Contender:
+    """A controller of the registry."""
+    make = registry.find_controller(name).make
+    system, _, dt = linear_form(make(crystal(1.0, "measured")))
+    return Contender(name, "measured", make, system, lambda omega: response(system, dt, omega)[:, :, AT])
 
 
 def puller_parts(contender: Contender, episodes: int) -> dict[str, dict[str, float]]:
     """Observable RMSE and share of lost crystals when randomized gets one property of puller, on validation."""
     found = {}
+    policy = contender.make(make_config("randomized", observation=contender.observation))
     for name, scenario in {"nothing": RANDOMIZED, **parts_of(PULLER, RANDOMIZED), "all of it": PULLER}.items():
         config = make_config(scenario, observation=contender.observation)
-        policy = contender.make(make_config("randomized", observation=contender.observation))
         values = metrics(rollout(policy, config, VALIDATION_SEEDS[:episodes]))
         found[name] = {
             "rmse_observable_mm": float(values.rmse_observable_mm.mean()),
@@ -202,59 +98,56 @@ def puller_parts(contender: Contender, episodes: int) -> dict[str, dict[str, flo
     return found
 
 
-def pictures(taking_part: Sequence[Contender], answers: Answers, jumps: Jumps, dt: float) -> dict[str, bytes]:
-    """The figures, by file name."""
-    from .figures import gain_figure, jump_figure, loop_figure, response_figure, share_figure
-
-    omega = frequency.frequencies(dt)
-    responses = {contender.name: joined(contender, omega, MIX, dt) for contender in taking_part}
-    return {
-        "responses.png": response_figure(answers, TRIALS, dt),
-        "gains.png": gain_figure({each.name: one_reading(each, dt) for each in taking_part}, responses, dt),
-        "loop.png": loop_figure(responses, radius_model(make_puller(lam=MIX)).zero),
-        "jumps.png": jump_figure(jumps, JUMPS),
-        "shares.png": share_figure(answers["load"], responses, TRIALS[1].title),
-    }
-
-
 def study(agent: Path | None, episodes: int, only_pictures: bool, tell: Callable[[str], None]) -> dict[str, bytes]:
     """Everything, as files by name."""
-    from .report import Found, as_json, as_markdown
+    from . import figures
+    from .report import answer_figures, as_json, as_markdown, jump_figures
 
     tell("linearising")
-    taking_part = contenders(agent)
+    all_of_them = contenders(agent)
+    acting = [contender for contender in all_of_them if not contender.name.endswith(AT_REST)]
+    made = {each.name: each.make(crystal(A_CRYSTAL / MINUTE, each.observation)) for each in acting}
     dt = crystal(1.0, "measured").control_interval
     omega = frequency.frequencies(dt)
-    acting = [contender for contender in taking_part if not contender.name.endswith(AT_REST)]
-    made = {each.name: each.make(crystal(A_CRYSTAL / MINUTE, each.observation)) for each in acting}
-    answers: Answers = {}
-    for trial in TRIALS:
-        tell(trial.title)
-        answers[trial.name] = {
-            each.name: respond(made[each.name], crystal(trial.minutes, each.observation), trial) for each in acting
+    tell("step tests")
+    answers = {
+        test.name: {
+            each.name: respond(made[each.name], crystal(test.minutes, each.observation), test) for each in acting
         }
-    tell("jumps")
-    jumps = {
-        each.name: tuple(jump_gains(made[each.name], each.observation, noisy) for noisy in (False, True))
-        for each in acting
+        for test in STEP_TESTS
     }
-    files = pictures(taking_part, answers, jumps, dt)
+    jumps = {
+        each.name: [jump_gains(made[each.name], each.observation, noisy) for noisy in (False, True)] for each in acting
+    }
+    responses = {each.name: each.loop(omega, MIX, dt) for each in all_of_them}
+    files = {
+        "responses.png": figures.response_figure(answers, dt),
+        "gains.png": figures.gain_figure({each.name: one_reading(each, dt) for each in all_of_them}, responses, dt),
+        "loop.png": figures.loop_figure(responses, radius_model(make_puller(lam=MIX)).zero),
+        "jumps.png": figures.jump_figure(jumps),
+        "shares.png": figures.share_figure(answers["load"], responses, STEP_TESTS[1].title),
+    }
     if only_pictures:
         return files
-    limits: dict[str, dict[str, Any]] = {}
-    parts = {}
+    limits: dict[str, Any] = {}
+    parts: dict[str, Any] = {"validation_episodes": episodes}
     for each in acting:
         tell(f"limits of {each.name}")
-        limits[each.name] = {limit.name: survive(made[each.name], limit, each.observation) for limit in LIMITS}
+        survived = {limit.name: survive(made[each.name], limit, each.observation) for limit in LIMITS}
+        limits[each.name] = {name: one._asdict() for name, one in survived.items()}
         tell(f"{each.name}, one property of the real puller at a time")
         parts[each.name] = puller_parts(each, episodes)
-    rows = [row for each in taking_part for row in margins(each, omega, dt)]
-    gains = {each.name: noise_gains(each, dt) for each in taking_part}
-    beside = next(each for each in taking_part if each.name == BESIDE[0])
-    differing = {each.name: apart(each, beside, dt) for each in taking_part if each is not beside}
-    found = Found(
-        read_agent(agent or shipped())[0], answers, rows, gains, limits, parts, episodes, beside.name, differing, jumps
-    )
+    beside = next(each for each in all_of_them if each.name == BESIDE[0])
+    found = {
+        "agent": asdict(read_agent(agent or shipped())[0]),
+        "answers": {test: {name: answer_figures(one) for name, one in by.items()} for test, by in answers.items()},
+        "margins": [row for each in all_of_them for row in margins(each, omega, dt)],
+        "noise_gain": {each.name: noise_gains(each, dt) for each in all_of_them},
+        "apart": {"from": beside.name} | {o.name: apart(o, beside, dt) for o in all_of_them if o is not beside},
+        "jumps": jump_figures(jumps),
+        "limits": limits,
+        "puller_parts": parts,
+    }
     return {**files, "insight.json": as_json(found).encode(), "insight.md": as_markdown(found).encode()}
 
 

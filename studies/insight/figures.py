@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,10 +13,10 @@ from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from .linear_agent import Floats
 from .loop import Responses
-from .step_tests import AT_REST, BEGIN, Trial
+from .step_tests import BEGIN, JUMPS, STEP_TESTS
 
 _LINES = ("solid", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (2, 1.2)))
-LABELS = ("radius error [mm]", "pull speed less v₀ [mm/min]", "heater less nominal [kW]")
+MOVES = ("pull speed less v₀ [mm/min]", "heater less nominal [kW]")
 DRIVES = (("pull speed", "mm/min", MM_PER_MIN), ("heater", "kW", KILO))
 
 
@@ -25,7 +25,8 @@ def looks(names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
     for i, (name, style) in enumerate(styles(names).items()):
         dash: Any = "solid" if i == 0 else _LINES[i % len(_LINES)]
-        colour = found[names[0]]["color"] if name == f"{names[0]} {AT_REST}" else style.colour
+        # The agent without noise has the agent's colour.
+        colour = found[names[0]]["color"] if i and name.startswith(f"{names[0]} ") else style.colour
         found[name] = {"color": colour, "lw": 2.0 if i == 0 else 1.3, "ls": dash, "zorder": 3 - 0.1 * i}
     return found
 
@@ -35,31 +36,31 @@ def _legend(figure: Any, axis: Any) -> None:
     figure.legend(handles, names, loc="outside lower center", ncols=len(names), frameon=False, fontsize=9)
 
 
-def response_figure(answers: Mapping[str, Mapping[str, Signals]], trials: tuple[Trial, ...], dt: float) -> bytes:
-    """Radius error and both drives after each event; ``answers`` by trial, then by controller."""
+def response_figure(answers: Mapping[str, Mapping[str, Signals]], dt: float) -> bytes:
+    """Radius error and both drives after each event; ``answers`` by step test, then by controller."""
     figure = canvas(12.0, 6.6)
-    axes = figure.subplots(3, len(trials), sharex="col", squeeze=False)
-    for column, trial in enumerate(trials):
-        style = looks(tuple(answers[trial.name]))
-        for name, signals in answers[trial.name].items():
+    axes = figure.subplots(3, len(STEP_TESTS), sharex="col", squeeze=False)
+    for column, test in zip(axes.T, STEP_TESTS, strict=True):
+        style = looks(tuple(answers[test.name]))
+        for name, signals in answers[test.name].items():
             minutes = dt * np.arange(1, len(signals.r_c) + 1) / MINUTE
-            rows = (
-                (signals.r_c - signals.r_ref) / MM,
-                (signals.v_p - signals.v_p[0]) / MM_PER_MIN,
-                (signals.Q_H - signals.Q_H[0]) / KILO,
-            )
-            for axis, values in zip(axes[:, column], rows, strict=True):
+            for axis, values in zip(column, ((signals.r_c - signals.r_ref) / MM, *_moves(signals)), strict=True):
                 axis.plot(minutes, values, label=name, **style[name])
-        for axis in axes[:, column]:
+        for axis in column:
             axis.axvline(BEGIN / MINUTE, color=GREY, lw=0.7, ls=":")
             axis.margins(x=0.0)
-        axes[0, column].set_title(trial.title, fontsize=9.5)
-        axes[-1, column].set_xlabel("time [min]")
-    for axis, label in zip(axes[:, 0], LABELS, strict=True):
+        column[0].set_title(test.title, fontsize=9.5)
+        column[-1].set_xlabel("time [min]")
+    for axis, label in zip(axes[:, 0], ("radius error [mm]", *MOVES), strict=True):
         axis.set_ylabel(label)
     _legend(figure, axes[0, 0])
     figure.suptitle("One nominal puller without noise, four events", fontsize=11)
     return png(figure)
+
+
+def _moves(signals: Signals) -> tuple[Floats, Floats]:
+    """How far the drives went from where they were, as MOVES says."""
+    return (signals.v_p - signals.v_p[0]) / MM_PER_MIN, (signals.Q_H - signals.Q_H[0]) / KILO
 
 
 def gain_figure(impulses: Mapping[str, Floats], responses: Mapping[str, Responses], dt: float) -> bytes:
@@ -117,18 +118,18 @@ def loop_figure(responses: Mapping[str, Responses], zero: float) -> bytes:
     return png(figure)
 
 
-def jump_figure(jumps: Mapping[str, tuple[Floats, Floats]], sizes: Floats) -> bytes:
+def jump_figure(jumps: Mapping[str, Sequence[Floats]]) -> bytes:
     """Largest move of the pull speed after a jump of the radius, over the jump; without noise and under it."""
     figure = canvas(9.6, 4.0)
     axes = figure.subplots(1, 2, sharey=True)
     style = looks(tuple(jumps))
-    for column, title in enumerate(("without noise", "under the usual noise")):
+    for column, (axis, title) in enumerate(zip(axes, ("without noise", "under the usual noise"), strict=True)):
         for name, gains in jumps.items():
             values = gains[column] * MM / MM_PER_MIN
-            axes[column].semilogx(sizes / MM, values, marker="o", ms=3.5, label=name, **style[name])
-        axes[column].set_title(title, fontsize=9.5)
-        axes[column].set_xlabel("jump of the radius [mm]")
-        axes[column].xaxis.set_major_formatter(lambda value, position: f"{value:g}")
+            axis.semilogx(JUMPS / MM, values, marker="o", ms=3.5, label=name, **style[name])
+        axis.set_title(title, fontsize=9.5)
+        axis.set_xlabel("jump of the radius [mm]")
+        axis.xaxis.set_major_formatter(lambda value, position: f"{value:g}")
     axes[0].set_ylim(bottom=0.0)
     axes[0].set_ylabel("pull speed moved [mm/min per mm]")
     _legend(figure, axes[0])
@@ -139,22 +140,19 @@ def jump_figure(jumps: Mapping[str, tuple[Floats, Floats]], sizes: Floats) -> by
 def share_figure(answers: Mapping[str, Signals], responses: Mapping[str, Responses], title: str) -> bytes:
     """How a correction is shared: pull speed against heater after an event, and their ratio over frequency."""
     figure = canvas(9.6, 4.2)
-    axes = figure.subplots(1, 2)
+    event, ratio = figure.subplots(1, 2)
     style = looks(tuple(answers))
     for name, signals in answers.items():
-        pull = (signals.v_p - signals.v_p[0]) / MM_PER_MIN
-        heat = (signals.Q_H - signals.Q_H[0]) / KILO
-        axes[0].plot(pull, heat, label=name, **style[name])
-        axes[0].plot(pull[-1], heat[-1], "o", color=style[name]["color"], ms=5, zorder=4)
-        drives = responses[name].drives()
-        ratio = np.abs(drives[:, 1]) / np.abs(drives[:, 0]) * MM_PER_MIN / KILO
-        axes[1].loglog(responses[name].omega, ratio, **style[name])
-    axes[0].axhline(0.0, color=GREY, lw=0.7)
-    axes[0].axvline(0.0, color=GREY, lw=0.7)
-    axes[0].set_xlabel("pull speed less v₀ [mm/min]")
-    axes[0].set_ylabel("heater less nominal [kW]")
-    axes[0].set_title(f"{title}; a dot is the end", fontsize=9.5)
-    axes[1].set_xlabel("angular frequency [rad/s]")
-    axes[1].set_title("heater over pull speed, answer to the ring [kW per mm/min]", fontsize=9.5)
-    _legend(figure, axes[0])
+        pull, heat = _moves(signals)
+        event.plot(pull, heat, label=name, **style[name])
+        event.plot(pull[-1], heat[-1], "o", color=style[name]["color"], ms=5, zorder=4)
+        drives = np.abs(responses[name].drives())
+        ratio.loglog(responses[name].omega, drives[:, 1] / drives[:, 0] * MM_PER_MIN / KILO, **style[name])
+    event.axhline(0.0, color=GREY, lw=0.7)
+    event.axvline(0.0, color=GREY, lw=0.7)
+    event.set(xlabel=MOVES[0], ylabel=MOVES[1])
+    event.set_title(f"{title}; a dot is the end", fontsize=9.5)
+    ratio.set_xlabel("angular frequency [rad/s]")
+    ratio.set_title("heater over pull speed, answer to the ring [kW per mm/min]", fontsize=9.5)
+    _legend(figure, event)
     return png(figure)

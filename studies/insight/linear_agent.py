@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.observation import HEATER_SCALE, HISTORY, LAGGED, LAGS, MEASURED, PULL_SCALE, lags, scales
+from cz_gym.observation import HEATER_SCALE, HISTORY, LAGGED, LAGS, MEASURED, PULL_SCALE, lags, relative, scales
 from cz_gym.physics.linearisation import StateSpace
 
 Floats = npt.NDArray[np.float64]
@@ -20,7 +20,8 @@ Complex = npt.NDArray[np.complex128]
 SEEN = ("ring_error", "T_1", "v_p", "Q_H")
 """Readings through which the plant reaches an agent: ring [m], pyrometer [K], applied drives [m/s, W]."""
 _STEP = 1e-6
-_AT = [[channel.name for channel in MEASURED].index(name) for name in SEEN]
+AT = [[channel.name for channel in MEASURED].index(name) for name in SEEN]
+"""Where they stand among the channels of MEASURED."""
 _REMEMBERED = [SEEN.index(name) for name in LAGGED]
 
 
@@ -42,7 +43,7 @@ class LinearAgent(NamedTuple):
         The applied drives are counted as readings of their own; feeding them back is the loop's affair.
         """
         z = np.exp(1j * self.dt * np.atleast_1d(np.asarray(omega, np.float64)))
-        found = np.zeros((len(z), 2, len(SEEN)), np.complex128) + self.now[:, _AT]
+        found = np.zeros((len(z), 2, len(SEEN)), np.complex128) + self.now[:, AT]
         for lag, (newest, oldest) in enumerate(zip(*lags(self.dt), strict=True)):
             mean = (z[:, None] ** -np.arange(newest, oldest + 1.0)).mean(axis=1)
             found[:, :, _REMEMBERED] += mean[:, None, None] * self.lagged[:, lag]
@@ -62,12 +63,12 @@ class LinearAgent(NamedTuple):
         for channel in range(kept):
             first = channel * depth
             A[first + 1 : first + depth, first : first + depth - 1] = np.eye(depth - 1)
-            B[first, _AT[_REMEMBERED[channel]]] = 1.0
+            B[first, AT[_REMEMBERED[channel]]] = 1.0
             for lag, (new, old) in enumerate(zip(newest, oldest, strict=True)):
                 C[:, first + new - 1 : first + old] += self.lagged[:, lag, channel, None] / (old - new + 1)
-        A[-1, -1], B[-1, _AT[0]] = 1.0, self.dt
+        A[-1, -1], B[-1, AT[0]] = 1.0, self.dt
         C[:, -1] = self.integral
-        D[:, _AT[0]] += self.integral * self.dt
+        D[:, AT[0]] += self.integral * self.dt
         return StateSpace(A, B, C, D)
 
 
@@ -80,8 +81,14 @@ def linear_agent(onnx_bytes: bytes, observations: npt.ArrayLike, dt: float, v_0:
     rows = np.atleast_2d(np.asarray(observations, np.float64))
     slopes = np.mean([jacobian(onnx_bytes, row) for row in rows], axis=0)
     slopes = np.array([[v_0], [HEATER_SCALE]]) * slopes / scales(HISTORY, v_0)
-    now, rest = len(MEASURED), slopes[:, len(MEASURED) + 1 :]
-    return LinearAgent(slopes[:, :now], slopes[:, now], rest.reshape(2, len(LAGS), len(LAGGED)), dt)
+    now, integral = slopes[:, : len(MEASURED)].copy(), slopes[:, len(MEASURED)]
+    spans = slopes[:, len(MEASURED) + 1 :].reshape(2, len(LAGS), len(LAGGED))
+    # "history" holds differences: of some channels to others, of each span's mean to that of the span after it.
+    for channel, to, _ in zip(*relative(), strict=True):
+        now[:, to] -= slopes[:, channel]
+    now[:, [_AT[at] for at in _REMEMBERED]] -= spans[:, 0]
+    means = spans - np.concatenate([spans[:, 1:], np.zeros((2, 1, len(LAGGED)))], axis=1)
+    return LinearAgent(now, integral, means, dt)
 
 
 def jacobian(onnx_bytes: bytes, observation: Floats) -> Floats:
@@ -109,5 +116,5 @@ def _in_double(onnx_bytes: bytes, channels: int) -> Any:
             weight.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(weight).astype(np.float64), weight.name))
     for value in (*model.graph.input, *model.graph.output):
         value.type.tensor_type.elem_type = TensorProto.DOUBLE
-    session = ReferenceEvaluator(model)
+    session: Any = ReferenceEvaluator(model)
     return lambda rows: session.run(None, {"observation": rows})[0]

@@ -1,4 +1,4 @@
-"""The loop of plant and controller from their frequency responses, opened where it is to be judged.
+"""Controllers near rest, and their loops with the plant, opened where they are to be judged.
 
 Timing as in the environment: measure at t_k, act at once; the v_p and Q_H read at t_k are those applied before. The
 same places as in the controllers' design table: at the camera, where the plant alone is uncertain, and at the pull
@@ -7,16 +7,45 @@ speed, where what a controller knows of its own pull speed counts as plant.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from cz_gym.baselines.analysis import frequency, sampled_loop
 from cz_gym.physics.linearisation import StateSpace
+from cz_gym.physics.plant import make_puller
+from cz_gym.units import HOUR, KILO, MM, MM_PER_MIN
 
 from .linear_agent import Complex, Floats
+from .step_tests import MIX
 
 RING, PYROMETER = 0, 1
+A_CRYSTAL = 3.0 * HOUR
+"""How long a crystal is grown [s]."""
+BANDS = (1e-4, 1e-3, 1e-2, 0.1, 0.3)
+"""Edges of the bands of frequency [rad/s] in which local gains are compared."""
+READING_SAMPLES, NOISE_POINTS = 120, 20_000
+"""Length of the answer to one reading; frequencies that a variance is summed over."""
+
+
+class Contender(NamedTuple):
+    """A controller, and what it is near rest."""
+
+    name: str
+    observation: str
+    make: Callable[[Any], Any]
+    """Builds it for an environment's settings."""
+    system: StateSpace
+    """Readings of MEASURED to v_p [m/s] and Q_H [W]."""
+    response: Callable[[Floats], Any]
+    """Its frequency response, drives by the readings of SEEN, shape (points, 2, 4)."""
+
+    def loop(self, omega: Floats, lam: float, dt: float) -> Responses:
+        """With a nominal puller, at some frequencies."""
+        plant = sampled_loop.sampled_plant(make_puller(lam=lam), dt)
+        return Responses(omega, self.response(omega), response(plant, dt, omega)[:, 1:, :2], dt)
 
 
 class Responses(NamedTuple):
@@ -69,19 +98,68 @@ def response(system: StateSpace, dt: float, omega: Floats) -> Complex:
     """Frequency response of a discrete state space of moderate order, shape (points, outputs, inputs)."""
     A, B, C, D = system
     z = np.exp(1j * omega * dt)
-    found: Complex = C @ np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, np.broadcast_to(B, (len(z), *B.shape)))
-    return found + D
+    inputs: Any = np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, np.broadcast_to(B, (len(z), *B.shape)))
+    found: Complex = C @ inputs + D
+    return found
 
 
-def after_one(A: Floats, B: Floats, C: Floats, D: Floats, samples: int) -> Floats:
-    """Outputs of a discrete system after one unit of its only input at t = 0, shape (samples, outputs)."""
-    x, found = B[:, 0], [D[:, 0]]
-    for _ in range(samples - 1):
-        found.append(C @ x)
-        x = A @ x
+def _solve(matrices: Any, rights: Any) -> Complex:
+    found: Any = np.linalg.solve(matrices, rights[..., None])
+    return np.asarray(found[..., 0], np.complex128)
+
+
+def one_reading(contender: Contender, dt: float) -> Floats:
+    """Drives after one reading of the ring that is a metre too large, loop closed, shape (samples, 2)."""
+    loop = sampled_loop.close(contender.system, make_puller(lam=MIX), dt)
+    at, rows = loop.inputs.index("camera"), [loop.outputs.index(name) for name in ("v_p", "Q_H")]
+    x, found = loop.B[:, at], [loop.D[rows, at]]
+    for _ in range(READING_SAMPLES - 1):
+        found.append(loop.C[rows] @ x)
+        x = loop.A @ x
     return np.array(found)
 
 
-def _solve(matrices: npt.NDArray[np.complex128], rights: npt.NDArray[np.complex128]) -> Complex:
-    found: Complex = np.linalg.solve(matrices, rights[..., None])[..., 0]
+def margins(contender: Contender, omega: Floats, dt: float) -> list[dict[str, Any]]:
+    """Margins at both places on both models; NaN where something grows within a crystal.
+
+    ``growth`` is the time in which what grows fastest in the closed loop grows by e [s], infinite if nothing does. What
+    grows more slowly than a crystal is a network's use of its integral: no crystal feels it, and margins leave it out.
+    """
+    rows = []
+    for plant, lam in (("Model I", 1.0), ("Model II", 0.0)):
+        growth = sampled_loop.close(contender.system, make_puller(lam=lam), dt).growth
+        loop = contender.loop(omega, lam, dt)
+        for at in ("camera", "v_p"):
+            found = frequency.margins_of(loop.opened(at), omega, dt, growth > A_CRYSTAL)
+            row = {"controller": contender.name, "plant": plant, "at": at, "growth": growth}
+            rows.append(row | found._asdict())
+    return rows
+
+
+def noise_gains(contender: Contender, dt: float) -> dict[str, float]:
+    """RMS of the drives and of the pull speed's steps per white camera noise RMS, both models' mean puller."""
+    omega = (np.arange(NOISE_POINTS) + 0.5) * np.pi / dt / NOISE_POINTS
+    pull, heater = contender.loop(omega, MIX, dt).closed().T
+    step = pull * (1.0 - np.exp(-1j * omega * dt))
+    return {
+        name: float(np.sqrt(np.mean(np.abs(values) ** 2)) * MM / unit)
+        for name, values, unit in (
+            ("pull_mm_per_min_per_mm", pull, MM_PER_MIN),
+            ("pull_step_mm_per_min_per_mm", step, MM_PER_MIN),
+            ("heater_kw_per_mm", heater, KILO),
+        )
+    }
+
+
+def apart(contender: Contender, other: Contender, dt: float) -> dict[str, list[float]]:
+    """Largest relative deviation of one's local gains from the ring from another's, by drive, in each of BANDS.
+
+    The pyrometer is held, and each knows what it asked of its own drives.
+    """
+    found: dict[str, list[float]] = {"pull speed": [], "heater": []}
+    for low, high in pairwise(BANDS):
+        omega = np.geomspace(low, high, 200)
+        mine, its = (each.loop(omega, MIX, dt).drives() for each in (contender, other))
+        for drive, deviation in zip(found, np.abs(mine / its - 1.0).max(axis=0), strict=True):
+            found[drive].append(float(deviation))
     return found

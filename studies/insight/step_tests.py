@@ -1,4 +1,4 @@
-"""Trials: one crystal, one event, several controllers; and how large an event each of them survives."""
+"""Step tests: one crystal, one event, several controllers; and how large an event each of them survives."""
 
 from __future__ import annotations
 
@@ -18,20 +18,14 @@ from cz_gym.units import HOUR, MICRO, MINUTE, MM
 Floats = npt.NDArray[np.float64]
 MIX = 0.5
 """Share of conduction of the nominal puller here: halfway between Model I and Model II [-]."""
-CAMERA_NOISE, PYROMETER_NOISE = 0.025 * MM, 0.05
-"""Standard deviations in the middle of the randomised scenario's ranges [m, K]."""
-AT_REST = "at rest"
-"""Behind an agent's name: linearised without noise."""
 BEGIN = 10.0 * MINUTE
 """When an event happens [s]."""
 AT_ONCE = 16
 """Amplitudes tried in one batch."""
 JUMPS = np.array([1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 300.0]) * MICRO
 """Jumps of the radius whose answers are compared [m]."""
-DRAWS = 5
-"""Draws of noise that each is tried under."""
-NOISES = 32
-"""Crystals that an answer under noise is averaged over."""
+DRAWS, CRYSTALS = 5, 32
+"""Draws of noise that an event is survived under; crystals that an answer under noise is averaged over."""
 PROPERTIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "melt loss": ("pullers", ("melt_loss",)),
     "steady drift": ("drift", ("rate",)),
@@ -49,13 +43,45 @@ PROPERTIES: dict[str, tuple[str, tuple[str, ...]]] = {
 
 
 class Event(NamedTuple):
-    """Something that happens to slots: ``change(slot record, amplitude)`` at a time [s]."""
+    """Something that happens to a slot at a time [s]: ``change(slot record, amplitude)`` alters the record."""
 
     at: float
     change: Callable[[Any, float], None]
 
 
-class Trial(NamedTuple):
+def _set(*fields: tuple[str, float | None]) -> Callable[[Any, float], None]:
+    """A change that sets fields of the episode; None: to the amplitude."""
+
+    def change(slot: Any, amplitude: float) -> None:
+        for name, value in fields:
+            slot["episode"][name] = amplitude if value is None else value
+
+    return change
+
+
+def _interface(slot: Any, kelvin: float) -> None:
+    """A lasting shift of the temperature that drives the interface's flux."""
+    _set(("sd_slow", None), ("keep_slow", 1.0), ("kick_slow", 0.0))(slot, kelvin)
+    slot["slow"] = 1.0
+
+
+def _load(slot: Any, kelvin: float) -> None:
+    """A hot zone that drifts at once, by what this change of the recipe would make up for; the recipe does not know."""
+    for kind, amount in (("drift", kelvin), ("recipe", -kelvin)):
+        _set((f"{kind}_start", BEGIN), (f"{kind}_duration", 5.0), (f"{kind}_amount", None))(slot, amount)
+
+
+def _radius(slot: Any, metres: float) -> None:
+    slot["x"]["r_c"] += metres
+
+
+_reference = _set(("reference_start", BEGIN), ("reference_duration", 30.0 * MINUTE), ("reference_amount", None))
+_noise, _silence, _latency = _set(("camera_sd", None)), _set(("camera_sd", 0.0)), _set(("latency", None))
+USUAL_NOISE = Event(0.0, _set(("camera_sd", 0.025 * MM), ("pyrometer_sd", 0.05)))
+"""Standard deviations in the middle of the randomised scenario's ranges [m, K]."""
+
+
+class StepTest(NamedTuple):
     """A crystal with events."""
 
     name: str
@@ -68,54 +94,12 @@ class Trial(NamedTuple):
     """Length [min]."""
 
 
-def _interface(slot: Any, kelvin: float) -> None:
-    """A lasting shift of the temperature that drives the interface's flux."""
-    slot["episode"]["sd_slow"], slot["episode"]["keep_slow"], slot["episode"]["kick_slow"] = kelvin, 1.0, 0.0
-    slot["slow"] = 1.0
-
-
-def _load(slot: Any, kelvin: float) -> None:
-    """A hot zone that drifts at once, by what this change of the recipe would make up for; the recipe does not know."""
-    episode = slot["episode"]
-    for kind, amount in (("drift", kelvin), ("recipe", -kelvin)):
-        episode[f"{kind}_start"], episode[f"{kind}_duration"], episode[f"{kind}_amount"] = BEGIN, 5.0, amount
-
-
-def _reference(slot: Any, metres: float) -> None:
-    slot["episode"]["reference_start"], slot["episode"]["reference_duration"] = BEGIN, 30.0 * MINUTE
-    slot["episode"]["reference_amount"] = metres
-
-
-def _noise(slot: Any, metres: float) -> None:
-    slot["episode"]["camera_sd"] = metres
-
-
-def _radius(slot: Any, metres: float) -> None:
-    slot["x"]["r_c"] += metres
-
-
-def _latency(slot: Any, seconds: float) -> None:
-    slot["episode"]["latency"] = seconds
-
-
-def _usual_noise(slot: Any, _: float) -> None:
-    slot["episode"]["camera_sd"], slot["episode"]["pyrometer_sd"] = CAMERA_NOISE, PYROMETER_NOISE
-
-
-def _silence(slot: Any, _: float) -> None:
-    slot["episode"]["camera_sd"] = 0.0
-
-
-TRIALS = (
-    Trial("interface", "interface 0.3 K hotter", (Event(BEGIN, _interface),), 0.3, 60.0),
-    Trial("load", "hot zone 1 K hotter, unannounced", (Event(0.0, _load),), 1.0, 120.0),
-    Trial("reference", "reference falls 1 mm in 30 min", (Event(0.0, _reference),), -1.0 * MM, 60.0),
-    Trial(
-        "noise",
-        "camera noise 0.05 mm, 10 min",
-        (Event(BEGIN, _noise), Event(20.0 * MINUTE, _silence)),
-        0.05 * MM,
-        40.0,
+STEP_TESTS = (
+    StepTest("interface", "interface 0.3 K hotter", (Event(BEGIN, _interface),), 0.3, 60.0),
+    StepTest("load", "hot zone 1 K hotter, unannounced", (Event(0.0, _load),), 1.0, 120.0),
+    StepTest("reference", "reference falls 1 mm in 30 min", (Event(0.0, _reference),), -1.0 * MM, 60.0),
+    StepTest(
+        "noise", "camera noise 0.05 mm, 10 min", (Event(BEGIN, _noise), Event(2.0 * BEGIN, _silence)), 0.05 * MM, 40.0
     ),
 )
 """What the pictures show, on a nominal puller without noise."""
@@ -130,20 +114,20 @@ class Limit(NamedTuple):
     scale: float
     """What the unit is in SI."""
     most: float
-    """Largest amplitude tried [SI]."""
-    events: tuple[Event, ...]
+    """Largest amplitude tried, in that unit."""
+    event: Event
+    """What happens under the usual noise."""
 
 
-_USUAL = Event(0.0, _usual_noise)
 LIMITS = (
-    Limit("radius too large", "jump of the true radius", "mm", MM, 7.9 * MM, (_USUAL, Event(BEGIN, _radius))),
-    Limit("radius too small", "the same, thinner", "mm", -MM, -7.9 * MM, (_USUAL, Event(BEGIN, _radius))),
-    Limit("interface hotter", "lasting step of dT_i", "K", 1.0, 12.0, (_USUAL, Event(BEGIN, _interface))),
-    Limit("interface colder", "the same, colder", "K", -1.0, -12.0, (_USUAL, Event(BEGIN, _interface))),
-    Limit("heat load", "step of the hot zone's drift", "K", 1.0, 80.0, (_USUAL, Event(0.0, _load))),
-    Limit("heat loss", "the same, colder", "K", -1.0, -80.0, (_USUAL, Event(0.0, _load))),
-    Limit("camera noise", "standard deviation from the start", "mm", MM, 2.0 * MM, (_USUAL, Event(0.0, _noise))),
-    Limit("late camera", "age of the newest frame", "s", 1.0, 60.0, (_USUAL, Event(0.0, _latency))),
+    Limit("radius too large", "jump of the true radius", "mm", MM, 7.9, Event(BEGIN, _radius)),
+    Limit("radius too small", "the same, thinner", "mm", -MM, 7.9, Event(BEGIN, _radius)),
+    Limit("interface hotter", "lasting step of dT_i", "K", 1.0, 12.0, Event(BEGIN, _interface)),
+    Limit("interface colder", "the same, colder", "K", -1.0, 12.0, Event(BEGIN, _interface)),
+    Limit("heat load", "step of the hot zone's drift", "K", 1.0, 80.0, Event(0.0, _load)),
+    Limit("heat loss", "the same, colder", "K", -1.0, 80.0, Event(0.0, _load)),
+    Limit("camera noise", "standard deviation from the start", "mm", MM, 2.0, Event(0.0, _noise)),
+    Limit("late camera", "age of the newest frame", "s", 1.0, 60.0, Event(0.0, _latency)),
 )
 """What the table of limits tries, on the nominal puller with the usual noise."""
 
@@ -151,16 +135,6 @@ LIMITS = (
 def crystal(minutes: float, observation: str) -> Config:
     """The nominal puller for that long."""
     return make_config("nominal", MIX, observation, horizon=minutes * MINUTE)
-
-
-def happen(course: Course, event: Event, amplitudes: Sequence[float]) -> None:
-    """Let an event happen to the slots of a course, each in its size."""
-    states = []
-    for state, amplitude in zip(course.env.get_state(), amplitudes, strict=True):
-        record = state.slot.slot.copy()
-        event.change(record, amplitude)
-        states.append(replace(state, slot=replace(state.slot, slot=record)))
-    course.env.set_state(states)
 
 
 def run_events(
@@ -174,16 +148,20 @@ def run_events(
     course = Course(config, seeds or [VALIDATION_SEEDS[0]] * len(amplitudes))
     for event in sorted(events, key=lambda event: event.at):
         course.run(policy, round(event.at / config.control_interval))
-        happen(course, event, amplitudes)
+        states = []
+        for state, amplitude in zip(course.env.get_state(), amplitudes, strict=True):
+            record = state.slot.slot.copy()
+            event.change(record, amplitude)
+            states.append(replace(state, slot=replace(state.slot, slot=record)))
+        course.env.set_state(states)
     course.run(policy, config.steps)
     course.finish()
     return course
 
 
-def respond(policy: Any, config: Config, trial: Trial) -> Signals:
-    """Signals of a trial, each of shape (steps,)."""
-    signals = run_events(policy, config, trial.events, [trial.amplitude]).signals
-    return Signals(*(signal[:, 0] for signal in signals))
+def respond(policy: Any, config: Config, test: StepTest) -> Signals:
+    """Signals of a step test, each of shape (steps,)."""
+    return Signals(*(signal[:, 0] for signal in run_events(policy, config, test.events, [test.amplitude]).signals))
 
 
 class Survival(NamedTuple):
@@ -202,28 +180,28 @@ def survive(policy: Any, limit: Limit, observation: str) -> Survival:
     """The largest amplitude survived over three hours, in two rounds of :data:`AT_ONCE` amplitudes a draw of noise."""
     config = crystal(3.0 * HOUR / MINUTE, observation)
     low, high = np.zeros(DRAWS), np.full(DRAWS, limit.most)
-    whole = np.zeros(DRAWS, np.bool_)
+    capped = np.zeros(DRAWS, np.bool_)
     seeds = np.repeat(VALIDATION_SEEDS[:DRAWS], AT_ONCE).tolist()
     for _ in range(2):
         tried = np.linspace(low, high, AT_ONCE + 1, axis=1)[:, 1:]
-        lost = run_events(policy, config, limit.events, tried.ravel().tolist(), seeds).failed.reshape(tried.shape)
+        amplitudes = (limit.scale * tried).ravel().tolist()
+        lost = run_events(policy, config, (USUAL_NOISE, limit.event), amplitudes, seeds).failed.reshape(tried.shape)
         first = np.where(lost.any(axis=1), lost.argmax(axis=1), AT_ONCE)
         steps, draws = np.column_stack([low, tried]), np.arange(DRAWS)
-        whole |= (first == AT_ONCE) & (high == limit.most)
+        capped |= (first == AT_ONCE) & (high == limit.most)
         low, high = steps[draws, first], steps[draws, np.minimum(first + 1, AT_ONCE)]
-    found = low / limit.scale
-    return Survival(float(np.median(found)), float(found.min()), float(found.max()), bool(whole.any()))
+    return Survival(float(np.median(low)), float(low.min()), float(low.max()), bool(capped.any()))
 
 
 def jump_gains(policy: Any, observation: str, noisy: bool) -> Floats:
     """Largest move of the pull speed within 3 min of a jump of the radius, over that jump, shape (sizes,) [1/s].
 
-    The difference to the same crystal without the jump; under noise its mean over :data:`NOISES` crystals.
+    The difference to the same crystal without the jump; under noise its mean over :data:`CRYSTALS` crystals.
     """
     config = crystal(BEGIN / MINUTE + 3.0, observation)
-    seeds = VALIDATION_SEEDS[: NOISES if noisy else 1]
+    seeds = VALIDATION_SEEDS[: CRYSTALS if noisy else 1]
     sizes = [size for size in (0.0, *JUMPS) for _ in seeds]
-    events = (*((_USUAL,) if noisy else ()), Event(BEGIN, _radius))
+    events = (*((USUAL_NOISE,) if noisy else ()), Event(BEGIN, _radius))
     v_p = run_events(policy, config, events, sizes, [*seeds] * (len(JUMPS) + 1)).signals.v_p
     mean = v_p.reshape(len(v_p), len(JUMPS) + 1, len(seeds)).mean(axis=2)
     gains: Floats = np.abs(mean[:, 1:] - mean[:, :1]).max(axis=0) / JUMPS
@@ -231,9 +209,9 @@ def jump_gains(policy: Any, observation: str, noisy: bool) -> Floats:
 
 
 def noisy_observations(policy: Any, observation: str) -> Floats:
-    """What a policy observes after an hour of the usual noise, one row a seed of :data:`NOISES`."""
-    config, seeds = crystal(60.0, observation), VALIDATION_SEEDS[:NOISES]
-    found: Floats = run_events(policy, config, (_USUAL,), [0.0] * len(seeds), seeds).observation
+    """What a policy observes after an hour of the usual noise, one row a seed of :data:`CRYSTALS`."""
+    seeds = VALIDATION_SEEDS[:CRYSTALS]
+    found: Floats = run_events(policy, crystal(60.0, observation), (USUAL_NOISE,), [0.0] * CRYSTALS, seeds).observation
     return found
 
 
@@ -242,11 +220,15 @@ def parts_of(whole: Scenario, base: Scenario) -> dict[str, Scenario]:
 
     ValueError if the properties named here are not all that differs.
     """
+
+    def with_part(scenario: Scenario, family: str, members: tuple[str, ...], name: str) -> Scenario:
+        theirs = {member: getattr(getattr(whole, family), member) for member in members}
+        return replace(scenario, **{family: replace(getattr(scenario, family), **theirs)}, name=name)
+
     found, all_of_it = {}, base
     for name, (family, members) in PROPERTIES.items():
-        theirs = {member: getattr(getattr(whole, family), member) for member in members}
-        found[name] = replace(base, **{family: replace(getattr(base, family), **theirs)}, name=f"{base.name}: {name}")
-        all_of_it = replace(all_of_it, **{family: replace(getattr(all_of_it, family), **theirs)})
-    if replace(all_of_it, name=whole.name) != whole:
+        found[name] = with_part(base, family, members, f"{base.name}: {name}")
+        all_of_it = with_part(all_of_it, family, members, whole.name)
+    if all_of_it != whole:
         raise ValueError(f"{whole.name!r} differs from {base.name!r} in more than {', '.join(PROPERTIES)}")
     return found

@@ -6,7 +6,6 @@ all.
 
 from __future__ import annotations
 
-import io
 import json
 import sys
 from collections.abc import Sequence
@@ -15,11 +14,7 @@ from pathlib import Path
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser, guarded
 
-from . import numbers as paper_numbers
-from . import rows as paper_rows
-
-DPI = 160
-"""Resolution of the figures [dots per inch]."""
+from .comparison import as_text, numbers, rows
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -35,42 +30,20 @@ def _compare(out: Path) -> int:
     import matplotlib  # noqa: F401
 
     check_writable(out)
-    results = _compute()
-    _write(out, results)
-    print(paper_rows.as_text(paper_rows.rows(results)))
+    write_files({out / name: content for name, content in contents().items()})
+    print(as_text(rows()))
     print(f"\nreport: {out / 'report.md'}")
     return 0
 
 
-def _compute() -> paper_numbers.Results:
-    """All experiments, with a progress bar that names the stage."""
-    from tqdm import tqdm
-
-    with tqdm(total=paper_numbers.STAGES, unit="stage") as bar:
-
-        def progress(stage: str) -> None:
-            bar.update(1 if bar.desc else 0)
-            bar.set_description(stage)
-
-        results = paper_numbers.compute(progress)
-        bar.update(1)
-    return results
-
-
-def _write(out: Path, results: paper_numbers.Results) -> None:
-    """Draw everything, then write all files or none."""
+def contents() -> dict[str, bytes]:
+    """The report, its figures and the numbers by file name; runs every experiment."""
     from .gallery import FIGURES
     from .report import report
 
-    files: dict[Path, bytes] = {}
-    for figure in FIGURES:
-        image = io.BytesIO()
-        figure.draw(results).savefig(image, dpi=DPI, format="png")
-        files[out / figure.file] = image.getvalue()
-    files[out / "report.md"] = report(results).encode()
-    numbers = json.dumps(paper_numbers.numbers(results), indent=2, allow_nan=False)
-    files[out / "numbers.json"] = f"{numbers}\n".encode()
-    write_files(files)
+    text = json.dumps(numbers(), indent=2, allow_nan=False) + "\n"
+    figures = {figure.file: figure.png() for figure in FIGURES}
+    return {**figures, "report.md": report().encode(), "numbers.json": text.encode()}
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""The paper's experiments on the nonlinear plant, each a run of the environment turned into signals against time."""
+"""The paper's design and its experiments on the nonlinear plant, each computed when it is first asked for."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,36 +10,52 @@ import numpy.typing as npt
 from scipy.linalg import expm
 
 from cz_gym import HURLE, MeniscusModel, Scenario, make_puller
-from cz_gym.baselines.policy import batched, to_action
+from cz_gym.baselines.analysis.compensator_design import Margins, design_compensator, margins
+from cz_gym.baselines.pid.compensated_pid import CompensatedPID, Compensator
 from cz_gym.config import make_config
 from cz_gym.episodes.schedule import quintic
+from cz_gym.evaluation.replay import Playback
 from cz_gym.evaluation.rollout import Signals, rollout
-from cz_gym.physics.linearisation import OUTPUTS, linearise
-from cz_gym.units import HOUR, MINUTE
+from cz_gym.physics.linearisation import OUTPUTS, RadiusModel, linearise, radius_model
+from cz_gym.units import HOUR, MINUTE, MM, MM_PER_MIN
+
+from .published import PID, PUBLISHED
 
 Floats = npt.NDArray[np.float64]
 MODELS = {"I": 1.0, "II": 0.0}
 """Share of conduction of the paper's models [-]."""
+SOURCES = ("published", "own")
+"""Where linear models come from: the paper's functions, our plant."""
+PRINTED, BARE = CompensatedPID(pid=PID), CompensatedPID(pid=PID, compensator=None)
+"""The printed controller, and its PID alone."""
 INTERVAL = 5.0
 """Time between actions in closed loop [s]."""
 FINE = 1.0
 """Time between actions in open loop [s]."""
+SUDDEN = 1e-3
+"""Duration of a sudden change [s]."""
+STEPS = (-0.01, -0.1)
+"""Pull-speed steps compared with the linear model, as shares of v_0 [-]."""
+BEFORE = 120.0
+"""Rest before the pull change in the figures [s]."""
 
 
-@dataclass(frozen=True)
-class PullSchedule:
-    """Pull speed by the clock, heater at its nominal power; ``share[k]`` is v_p / v_0 - 1 during step k."""
+@cache
+def linear_model(source: str, model: str) -> RadiusModel:
+    """G_p and G_m of one of SOURCES."""
+    return PUBLISHED[model] if source == "published" else radius_model(make_puller(lam=MODELS[model]))
 
-    share: tuple[float, ...]
 
-    def predict(
-        self, observation: Any, state: int | None = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[npt.NDArray[np.float32], int]:
-        """The schedule's next entry, whatever is observed."""
-        array, single = batched(observation)
-        k = state or 0
-        pull = np.full(len(array), self.share[k])
-        return to_action(pull, np.zeros(len(array)), single), k + 1
+@cache
+def compensator(source: str) -> Compensator:
+    """The design procedure applied to Model I of one of SOURCES."""
+    return design_compensator(linear_model(source, "I"))
+
+
+@cache
+def loop_margins(source: str, model: str, compensated: bool = True) -> Margins:
+    """Of the loop with the printed PID."""
+    return margins(linear_model(source, model), compensator(source) if compensated else None, PID)
 
 
 class Trace(NamedTuple):
@@ -55,6 +71,7 @@ class Trace(NamedTuple):
     """Whether the episode ended in a failure."""
 
 
+@cache
 def trace(
     policy: Any,
     model: str,
@@ -72,9 +89,9 @@ def trace(
     )
     puller = make_puller(lam=MODELS[model], meniscus=meniscus)
     r_tilde = whole.r_br_measured - puller.ring_bias
-    compensator = getattr(policy, "compensator", None)
-    if compensator is not None:
-        r_tilde = r_tilde + compensator.respond(whole.v_p - puller.v_0, interval)
+    parallel = getattr(policy, "compensator", None)
+    if parallel is not None:
+        r_tilde = r_tilde + parallel.respond(whole.v_p - puller.v_0, interval)
     return Trace(interval * np.arange(lived + 1, dtype=np.float64), whole, r_tilde, bool(run.failed[0]))
 
 
@@ -87,13 +104,20 @@ class InverseResponse(NamedTuple):
     """Time from the start of the change until the ring is back where it was [s]."""
 
 
+@cache
 def pull_change(
     model: str, change: float = -0.1, over: float = 600.0, before: float = 0.0, horizon: float = 1200.0
 ) -> Trace:
     """Change the pull speed by a share of v_0 along the quintic, at constant heater power; times in s."""
     middle = FINE * (np.arange(round(horizon / FINE)) + 0.5) - before
     share = change * quintic(np.clip(middle / over, 0.0, 1.0))
-    return trace(PullSchedule(tuple(share.tolist())), model, horizon=horizon, interval=FINE)
+    return _open_loop(share, model)
+
+
+def _open_loop(share: Floats, model: str) -> Trace:
+    """Pull speed by the clock, heater at its nominal power; ``share[k]`` is v_p / v_0 - 1 during step k."""
+    actions = np.column_stack([share, np.zeros(len(share))])
+    return trace(Playback(actions), model, horizon=len(share) * FINE, interval=FINE)
 
 
 def inverse_response(run: Trace, change: float = -0.1) -> InverseResponse:
@@ -127,10 +151,10 @@ class StepComparison(NamedTuple):
         return float(gap / np.max(np.abs(self.plant[output])))
 
 
+@cache
 def step_comparison(model: str, share: float, horizon: float = 600.0) -> StepComparison:
     """Step the pull speed of plant and linear model by a share of v_0."""
-    steps = round(horizon / FINE)
-    run = trace(PullSchedule((share,) * steps), model, horizon=horizon, interval=FINE)
+    run = _open_loop(np.full(round(horizon / FINE), share), model)
     puller = make_puller(lam=MODELS[model])
     A, B, C, _ = linearise(puller)
     block = np.zeros((len(A) + 1, len(A) + 1))
@@ -140,10 +164,9 @@ def step_comparison(model: str, share: float, horizon: float = 600.0) -> StepCom
     for _ in run.t:
         path.append(C @ x[:-1])
         x = move @ x
-    linear = np.array(path)
+    r_c, r_br = np.array(path)[:, [OUTPUTS.index("r_c"), OUTPUTS.index("r_br")]].T
     s = run.signals
-    seen = tuple(linear[:, OUTPUTS.index(name)] for name in ("r_c", "r_br"))
-    return StepComparison(run.t, share, (s.r_c - s.r_c[0], s.r_br - s.r_br[0]), (seen[0], seen[1]))
+    return StepComparison(run.t, share, (s.r_c - s.r_c[0], s.r_br - s.r_br[0]), (r_c, r_br))
 
 
 class CaseDifference(NamedTuple):
@@ -163,6 +186,43 @@ def case_difference(a: Trace, b: Trace, scale: float = 5.0) -> CaseDifference:
         deviation = large - large[0]
         gaps.append(np.max(np.abs(deviation - scale * (small - small[0]))) / np.max(np.abs(deviation)))
     return CaseDifference(*map(float, gaps))
+
+
+def cases(model: str) -> tuple[Trace, Trace]:
+    """Cases A and B."""
+    return trace(PRINTED, model, "reference-a"), trace(PRINTED, model, "reference-b")
+
+
+def ramp(model: str, policy: Any = PRINTED) -> Trace:
+    """The paper's temperature ramp."""
+    return trace(policy, model, "paper-ramp")
+
+
+def ramp_numbers(run: Trace) -> dict[str, float]:
+    """Errors and lowest pull speed of a ramp."""
+    true, seen = errors(run)
+    return {
+        "max_error_mm": float(abs(true).max()) / MM,
+        "rmse_mm": float((true[1:] ** 2).mean() ** 0.5) / MM,
+        "max_compensated_error_mm": float(abs(seen).max()) / MM,
+        "v_p_min_mm_per_min": float(run.signals.v_p.min()) / MM_PER_MIN,
+    }
+
+
+def cycle_numbers(run: Trace) -> dict[str, float]:
+    """How far a ramp's crystal swings and how hard its drive works; a lost crystal up to its end."""
+    late = run.signals.r_c[run.t >= run.t[-1] - HOUR]
+    return {
+        **ramp_numbers(run),
+        "lived_min": float(run.t[-1]) / MINUTE,
+        "at_limit": float(at_pull_limit(run.signals.v_p[1:], make_puller().v_0).mean()),
+        "late_swing_mm": float(late.max() - late.min()) / MM,
+    }
+
+
+def at_pull_limit(v_p: Floats, v_0: float) -> npt.NDArray[np.bool_]:
+    """Where a pull speed [m/s] stands at one of its limits, 0 and 2 v_0."""
+    return np.abs(v_p - v_0) > (1.0 - 1e-6) * v_0
 
 
 def errors(run: Trace) -> tuple[Floats, Floats]:

@@ -2,43 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
+from matplotlib import rc_context
+from matplotlib.figure import Figure
 
 from cz_gym import make_puller
 from cz_gym.baselines.analysis.compensator_design import open_loop
-from cz_gym.baselines.pid.compensated_pid import Compensator
-from cz_gym.physics.linearisation import RadiusModel
 from cz_gym.units import MINUTE, MM, MM_PER_MIN
 
-from .experiments import Trace, minutes
-from .numbers import BEFORE, PUBLISHED, Results
+from . import experiments as ex
+from .experiments import Floats, Trace
 from .published import PID
 
 DEGREE = np.pi / 180.0
 BLUE, ORANGE, GREEN, GREY = "#1f5fa8", "#d1661f", "#2b8a4b", "#777777"
-STYLE = {
+STYLE: Any = {
     "font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False, "axes.spines.right": False,
     "lines.linewidth": 1.4, "legend.frameon": False, "legend.fontsize": 8, "axes.formatter.useoffset": False,
 }  # fmt: skip
-RADII, PULL, HEIGHT, GROWTH, CONE = (
-    "radius [mm]",
-    "$v_p$ [mm/min]",
-    "$h_c$ [mm]",
-    "$v_g$ [mm/min]",
-    r"$\alpha_c$ [deg]",
-)
+SHOWN = {
+    "r_c": (MM, "radius [mm]"),
+    "r_ref": (MM, "radius [mm]"),
+    "r_tilde": (MM, r"$\tilde r$ [mm]"),
+    "h_c": (MM, "$h_c$ [mm]"),
+    "alpha_c": (DEGREE, r"$\alpha_c$ [deg]"),
+    "v_p": (MM_PER_MIN, "$v_p$ [mm/min]"),
+    "v_g": (MM_PER_MIN, "$v_g$ [mm/min]"),
+}
+"""The unit in which people read a signal, and what stands at its axis."""
 
 
-def sheet(rows: int, columns: int, size: tuple[float, float], **grid: Any) -> tuple[Any, Any]:
-    """A figure and its array of axes."""
-    import matplotlib
-    from matplotlib.figure import Figure
-
-    with matplotlib.rc_context(STYLE):
+def sheet(rows: int, columns: int, size: tuple[float, float], **grid: Any) -> tuple[Figure, Any]:
+    """A figure of that size [in] and its array of axes."""
+    with rc_context(STYLE):
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False, **grid)
     return figure, axes
@@ -53,52 +51,64 @@ def label(axis: Any, x: str, y: str, legend: bool = False) -> None:
         axis.legend(frameon=False, fontsize=8)
 
 
-def _shown(run: Trace, name: str) -> npt.NDArray[np.float64]:
+def values(run: Trace, name: str) -> Floats:
     """A signal in the unit people read."""
-    unit = {"v_p": MM_PER_MIN, "v_g": MM_PER_MIN, "alpha_c": DEGREE}.get(name, MM)
-    values: npt.NDArray[np.float64] = getattr(run.signals, name) / unit
-    return values
+    signal: Floats = run.r_tilde if name == "r_tilde" else getattr(run.signals, name)
+    return signal / SHOWN[name][0]
 
 
-def pull_profile(results: Results) -> Any:
+def draw_signal(axis: Any, run: Trace, name: str, x: str, *style: str, **line: Any) -> None:
+    """A signal against time, blue unless told, with its axes named; ``x`` names the time axis, "" for one below."""
+    axis.plot(ex.minutes(run), values(run, name), *style, **({"color": BLUE} | line))
+    label(axis, x, SHOWN[name][1])
+
+
+def ring(run: Trace) -> Floats:
+    """The bright ring less the operator's bias [mm]."""
+    return (run.signals.r_br - make_puller().ring_bias) / MM
+
+
+def _pull_change(model: str) -> Trace:
+    """The smooth pull change, beginning at ``BEFORE``."""
+    return ex.pull_change(model, before=ex.BEFORE, horizon=1200.0 + ex.BEFORE)
+
+
+def pull_profile() -> Figure:
     """Pull speed of the open-loop experiment."""
-    figure, axes = sheet(1, 1, (5.0, 2.4))
-    run = results.open_loop["I"]
-    axes[0, 0].step(minutes(run)[1:], _shown(run, "v_p")[1:], color=BLUE)
-    axes[0, 0].set_ylim(1.05, 1.23)
-    label(axes[0, 0], "time [min]", PULL)
+    figure, ((axis,),) = sheet(1, 1, (5.0, 2.4))
+    run = _pull_change("I")
+    axis.step(ex.minutes(run)[1:], values(run, "v_p")[1:], color=BLUE)
+    axis.set_ylim(1.05, 1.23)
+    label(axis, "time [min]", SHOWN["v_p"][1])
     return figure
 
 
-def open_loop_response(results: Results, model: str) -> Any:
+def open_loop_response(model: str) -> Figure:
     """Radius and ring, cone angle, height, growth rate after the pull change; an inset shows the inverse response."""
-    run = results.open_loop[model]
-    t, s = minutes(run), run.signals
-    ring = (s.r_br - make_puller().ring_bias) / MM
-    figure, axes = sheet(2, 2, (7.2, 4.8), sharex=True)
-    axes[0, 0].plot(t, _shown(run, "r_c"), color=BLUE, label="$r_c$")
-    axes[0, 0].plot(t, ring, color=ORANGE, label="$r_{br}$ - bias")
-    label(axes[0, 0], "", RADII)
-    axes[0, 0].legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(0.03, 0.32))
-    inset = axes[0, 0].inset_axes((0.16, 0.55, 0.5, 0.42))
-    early = (run.t >= BEFORE) & (run.t <= BEFORE + 300.0)
-    since = (run.t[early] - BEFORE) / MINUTE
-    inset.plot(since, (s.r_c[early] - s.r_c[0]) / (MM * MM), color=BLUE)
-    inset.plot(since, (s.r_br[early] - s.r_br[0]) / (MM * MM), color=ORANGE)
+    run = _pull_change(model)
+    figure, ((radii, cone), (height, growth)) = sheet(2, 2, (7.2, 4.8), sharex=True)
+    draw_signal(radii, run, "r_c", "", label="$r_c$")
+    radii.plot(ex.minutes(run), ring(run), color=ORANGE, label="$r_{br}$ - bias")
+    radii.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(0.03, 0.32))
+    inset = radii.inset_axes((0.16, 0.55, 0.5, 0.42))
+    early = (run.t >= ex.BEFORE) & (run.t <= ex.BEFORE + 300.0)
+    since = (run.t[early] - ex.BEFORE) / MINUTE
+    for signal, color in ((run.signals.r_c, BLUE), (run.signals.r_br, ORANGE)):
+        inset.plot(since, (signal[early] - signal[0]) / (MM * MM), color=color)
     inset.axhline(0.0, color=GREY, linewidth=0.7)
     inset.set_ylim(-1.0, 3.0)
     inset.set_title("deviation [µm]", fontsize=7)
     inset.set_xlabel("since the change began [min]", fontsize=7, labelpad=1)
     inset.tick_params(labelsize=7)
     inset.grid(False)
-    for axis, name, text in ((axes[0, 1], "alpha_c", CONE), (axes[1, 0], "h_c", HEIGHT), (axes[1, 1], "v_g", GROWTH)):
-        axis.plot(t, _shown(run, name), color=BLUE)
-        label(axis, "time [min]" if axis is not axes[0, 1] else "", text)
-    axes[1, 1].set_ylim(1.04, 1.24)
+    draw_signal(cone, run, "alpha_c", "")
+    draw_signal(height, run, "h_c", "time [min]")
+    draw_signal(growth, run, "v_g", "time [min]")
+    growth.set_ylim(1.04, 1.24)
     return figure
 
 
-def _frequency(loop: Any, omega: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def _frequency(loop: Any, omega: Floats) -> tuple[Floats, Floats]:
     """Gain [dB] and phase [degrees], the phase unwrapped and near -180 degrees for a loop of the right sign."""
     response = np.asarray(loop(1j * omega))
     phase = np.unwrap(np.angle(response)) / DEGREE
@@ -106,108 +116,95 @@ def _frequency(loop: Any, omega: npt.NDArray[np.float64]) -> tuple[npt.NDArray[n
     return 20.0 * np.log10(np.abs(response)), phase - 360.0 * np.round((phase[-1] + 135.0) / 360.0)
 
 
-def _bode(results: Results, omega: npt.NDArray[np.float64], compensated: bool) -> tuple[Any, Any]:
+def _bode(compensated: bool) -> tuple[Figure, Any, Any]:
     """Bode diagram of both models, published functions and our plant, with or without their compensators."""
-    figure, axes = sheet(2, 1, (6.4, 5.2), sharex=True)
-    sources: tuple[tuple[str, dict[str, RadiusModel], Compensator, dict[str, Any]], ...] = (
-        ("our plant", results.models, results.own_compensator, {"linewidth": 3.0, "alpha": 0.45}),
-        ("published", PUBLISHED, results.published_compensator, {"linewidth": 1.0, "linestyle": "--"}),
-    )
-    for name, models, compensator, line in sources:
-        for (model, functions), color in zip(models.items(), (BLUE, ORANGE), strict=True):
-            loop = open_loop(functions, compensator if compensated else None, PID)
-            for axis, values in zip(axes[:, 0], _frequency(loop, omega), strict=True):
-                axis.semilogx(omega, values, color=color, label=f"Model {model}, {name}", **line)
-    axes[0, 0].axhline(0.0, color=GREY, linewidth=0.8)
-    axes[1, 0].axhline(-180.0, color=GREY, linewidth=0.8)
-    return figure, axes[:, 0]
+    figure, ((gain,), (phase,)) = sheet(2, 1, (6.4, 5.2), sharex=True)
+    omega = np.logspace(-5, 0.5, 500)
+    for source, name, line in (
+        ("own", "our plant", {"linewidth": 3.0, "alpha": 0.45}),
+        ("published", "published", {"linewidth": 1.0, "linestyle": "--"}),
+    ):
+        for model, color in zip(ex.MODELS, (BLUE, ORANGE), strict=True):
+            loop = open_loop(ex.linear_model(source, model), ex.compensator(source) if compensated else None, PID)
+            for axis, curve in zip((gain, phase), _frequency(loop, omega), strict=True):
+                axis.semilogx(omega, curve, color=color, label=f"Model {model}, {name}", **line)
+    gain.axhline(0.0, color=GREY, linewidth=0.8)
+    phase.axhline(-180.0, color=GREY, linewidth=0.8)
+    label(phase, "frequency [rad/s]", "phase of L [deg]")
+    return figure, gain, phase
 
 
-def frequency_responses(results: Results) -> Any:
+def frequency_responses() -> Figure:
     """Bode diagram of both compensated plants with the PID: published functions and our plant."""
-    figure, axes = _bode(results, np.logspace(-5, 0.5, 500), compensated=True)
-    margin = results.margins["own_I"]
-    for axis in axes:
+    figure, gain, phase = _bode(compensated=True)
+    margin = ex.loop_margins("own", "I")
+    for axis in (gain, phase):
         axis.axvline(margin.crossover, color=GREY, linewidth=0.8, linestyle=":")
-    axes[1].annotate(
+    phase.annotate(
         rf"$\omega_c$ = {margin.crossover:.3f} rad/s, $\varphi_m$ = {margin.phase_margin_deg:.0f}° (our Model I)",
         (margin.crossover, -180.0 + margin.phase_margin_deg), (2e-3, -265.0), fontsize=8,
         arrowprops={"arrowstyle": "-", "color": GREY},
     )  # fmt: skip
-    label(axes[0], "", "|L| [dB]", legend=True)
-    label(axes[1], "frequency [rad/s]", "phase of L [deg]")
+    label(gain, "", "|L| [dB]", legend=True)
     return figure
 
 
-def margin_sketch(results: Results) -> Any:
+def margin_sketch() -> Figure:
     """The paper's sketch of a Bode diagram with a right half plane zero, drawn with the uncompensated plant itself."""
-    omega = np.logspace(-5, 0.5, 500)
-    figure, axes = _bode(results, omega, compensated=False)
-    model = results.models["I"]
-    for axis in axes:
+    figure, gain, phase = _bode(compensated=False)
+    model = ex.linear_model("own", "I")
+    for axis in (gain, phase):
         axis.axvspan(2.0 * model.poles[0], 0.5 * model.zero, color=GREY, alpha=0.15, label="room for the crossover")
         axis.axvline(model.zero, color="black", linestyle=":", linewidth=1.0, label="right half plane zero")
-    axes[0].set_xlim(omega[0], omega[-1])
-    label(axes[0], "", "|L| [dB]", legend=True)
-    label(axes[1], "frequency [rad/s]", "phase of L [deg]")
+    gain.set_xlim(1e-5, 10.0**0.5)
+    label(gain, "", "|L| [dB]", legend=True)
     return figure
 
 
-def case_comparison(results: Results) -> Any:
+def case_comparison() -> Figure:
     """Cases A and B scaled by 5: compensated measurement, height, cone angle and pull speed, for both models."""
-    rows: Iterable[tuple[str, str]] = (
-        ("r_tilde", r"$\tilde r$ [mm]"),
-        ("h_c", HEIGHT),
-        ("alpha_c", CONE),
-        ("v_p", PULL),
-    )
+    names = ("r_tilde", "h_c", "alpha_c", "v_p")
     figure, axes = sheet(4, 2, (7.2, 7.4), sharex=True, sharey="row")
-    for column, (model, (a, b)) in enumerate(results.cases.items()):
-        axes[0, column].set_title(f"Model {model}", fontsize=9)
-        for axis, (name, text) in zip(axes[:, column], rows, strict=True):
-            large, small = ((run.r_tilde / MM if name == "r_tilde" else _shown(run, name)) for run in (a, b))
-            axis.plot(minutes(a), large, color=BLUE, label="case A")
-            axis.plot(minutes(b), large[0] + 5.0 * (small - small[0]), "--", color=ORANGE, label="case B, scaled by 5")
-            label(axis, "time [min]" if name == "v_p" else "", text if column == 0 else "")
+    for column, model in zip(axes.T, ex.MODELS, strict=True):
+        a, b = ex.cases(model)
+        column[0].set_title(f"Model {model}", fontsize=9)
+        for axis, name in zip(column, names, strict=True):
+            draw_signal(axis, a, name, "time [min]" if name == "v_p" else "", label="case A")
+            large, small = values(a, name)[0], values(b, name)
+            axis.plot(ex.minutes(b), large + 5.0 * (small - small[0]), "--", color=ORANGE, label="case B, scaled by 5")
+            axis.set_ylabel(SHOWN[name][1] if model == "I" else "")
             axis.set_xlim(0.0, 90.0)
-    axes[0, 0].plot(minutes(results.cases["I"][0]), _shown(results.cases["I"][0], "r_ref"), ":", color=GREY)
-    axes[0, 0].plot([], [], ":", color=GREY, label="reference of case A")
-    axes[0, 1].plot(minutes(results.cases["II"][0]), _shown(results.cases["II"][0], "r_ref"), ":", color=GREY)
+        column[0].plot(ex.minutes(a), values(a, "r_ref"), ":", color=GREY, label="reference of case A")
     axes[0, 0].legend(frameon=False, fontsize=8)
     return figure
 
 
-def ramp_temperatures(results: Results) -> Any:
+def ramp_temperatures() -> Figure:
     """Heater temperature with its reference, and the melt's, during the ramp (Model I)."""
-    run = results.ramp["I"]
-    figure, axes = sheet(2, 1, (6.4, 4.2), sharex=True)
-    axes[0, 0].plot(minutes(run), run.signals.T_1_ref, "--", color=GREY, label="$T_{1,ref}$")
-    axes[0, 0].plot(minutes(run), run.signals.T_1, color=BLUE, label="$T_1$")
-    axes[1, 0].plot(minutes(run), run.signals.T_b, color=ORANGE, label="$T_{bulk}$")
-    label(axes[0, 0], "", "temperature [K]", legend=True)
-    label(axes[1, 0], "time [min]", "temperature [K]", legend=True)
+    run = ex.ramp("I")
+    figure, ((heater,), (melt,)) = sheet(2, 1, (6.4, 4.2), sharex=True)
+    heater.plot(ex.minutes(run), run.signals.T_1_ref, "--", color=GREY, label="$T_{1,ref}$")
+    heater.plot(ex.minutes(run), run.signals.T_1, color=BLUE, label="$T_1$")
+    melt.plot(ex.minutes(run), run.signals.T_b, color=ORANGE, label="$T_{bulk}$")
+    label(heater, "", "temperature [K]", legend=True)
+    label(melt, "time [min]", "temperature [K]", legend=True)
     return figure
 
 
-def ramp_response(results: Results, model: str) -> Any:
+def ramp_response(model: str) -> Figure:
     """Closed-loop responses to the ramp in the paper's layout: radii; pull speed, height; growth rate, cone angle."""
-    import matplotlib
-
-    run = results.ramp[model]
-    t = minutes(run)
-    figure = sheet(1, 1, (7.2, 7.0))[0]
-    figure.clear()
-    with matplotlib.rc_context(STYLE):
+    run = ex.ramp(model)
+    figure = Figure(figsize=(7.2, 7.0), layout="constrained")
+    with rc_context(STYLE):
         panels = figure.subplot_mosaic([["r", "r"], ["v_p", "h_c"], ["v_g", "alpha_c"]], sharex=True)
-    ring = (run.signals.r_br - make_puller().ring_bias) / MM
-    radii = panels["r"]
-    radii.plot(t, _shown(run, "r_ref"), ":", color=GREY, label="$r_{c,ref}$")
-    radii.plot(t, _shown(run, "r_c"), color=BLUE, label="$r_c$ (true)")
-    radii.plot(t, ring, color=ORANGE, linewidth=0.9, label="$r_{br}$ - bias")
-    radii.plot(t, run.r_tilde / MM, "--", color=GREEN, label=r"$\tilde r$ (what the controller holds)")
+    radii = panels.pop("r")
+    draw_signal(radii, run, "r_ref", "time [min]", ":", color=GREY, label="$r_{c,ref}$")
+    draw_signal(radii, run, "r_c", "time [min]", label="$r_c$ (true)")
+    radii.plot(ex.minutes(run), ring(run), color=ORANGE, linewidth=0.9, label="$r_{br}$ - bias")
+    tilde = r"$\tilde r$ (what the controller holds)"
+    radii.plot(ex.minutes(run), values(run, "r_tilde"), "--", color=GREEN, label=tilde)
     radii.tick_params(labelbottom=True)
-    label(radii, "time [min]", RADII, legend=True)
-    for name, text in (("v_p", PULL), ("h_c", HEIGHT), ("v_g", GROWTH), ("alpha_c", CONE)):
-        panels[name].plot(t, _shown(run, name), color=BLUE)
-        label(panels[name], "time [min]" if name in ("v_g", "alpha_c") else "", text)
+    radii.legend(frameon=False, fontsize=8)
+    for name, axis in panels.items():
+        draw_signal(axis, run, name, "time [min]" if name in ("v_g", "alpha_c") else "")
     return figure

@@ -1,55 +1,66 @@
-"""The report's figures: their files, their captions and who draws them."""
+"""The report's figures: their files, their captions and who draws them; block diagrams are kept as pictures."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
 
-from . import diagrams, figures
-from . import extra_figures as extras
-from .numbers import Results
+from matplotlib.figure import Figure
+
+from . import beyond_figures, figures
+
+DIAGRAMS = Path(__file__).parent / "diagrams"
+DPI = 160
+"""Resolution of the figures [dots per inch]."""
 
 
-class Figure(NamedTuple):
+class Shown(NamedTuple):
     """A figure of the report."""
 
     file: str
     caption: str
-    draw: Callable[[Results], Any]
+    draw: Callable[[], Figure] | None
+    """None for a block diagram, which is a file."""
+
+    def png(self) -> bytes:
+        """The figure as a PNG file."""
+        if self.draw is None:
+            return (DIAGRAMS / self.file).read_bytes()
+        image = io.BytesIO()
+        self.draw().savefig(image, dpi=DPI, format="png")
+        return image.getvalue()
 
 
-FIGURES = (
-    Figure("figure_01_pull_profile.png", "Paper's figure 1: pull speed.", figures.pull_profile),
-    Figure(
-        "figure_02_open_loop_I.png", "Paper's figure 2: plant at constant power, Model I.",
-        lambda r: figures.open_loop_response(r, "I"),
-    ),
-    Figure(
-        "figure_03_open_loop_II.png", "Paper's figure 3: plant at constant power, Model II.",
-        lambda r: figures.open_loop_response(r, "II"),
-    ),
-    Figure("figure_04_series.png", "Paper's figure 4: plant and measurement.", lambda r: diagrams.series_connection()),
-    Figure("figure_05_feedback.png", "Paper's figure 5: feedback.", lambda r: diagrams.feedback()),
-    Figure(
-        "figure_06_bode_sketch.png",
-        "Paper's figure 6, there a sketch, here the uncompensated plant: the PID's crossover lies beyond the zero.",
-        figures.margin_sketch,
-    ),
-    Figure("figure_07_parallel.png", "Paper's figure 7: parallel compensation.", lambda r: diagrams.parallel()),
-    Figure("figure_08_loop.png", "Paper's figure 8: the linear loop.", lambda r: diagrams.compensated_loop()),
-    Figure("figure_09_bode.png", "Paper's figure 9: compensated loops.", figures.frequency_responses),
-    Figure("figure_10_tested_loop.png", "Paper's figure 10: the loop on the plant.", lambda r: diagrams.tested_loop()),
-    Figure("figure_11_cases.png", "Paper's figure 11: cases A and B.", figures.case_comparison),
-    Figure(
-        "figure_12_temperatures.png",
-        "Paper's figure 12: temperatures; Model II's are identical, as the thermal chain does not depend on it.",
-        figures.ramp_temperatures,
-    ),
-    Figure("figure_13_ramp_I.png", "Paper's figure 13: the ramp, Model I.", lambda r: figures.ramp_response(r, "I")),
-    Figure("figure_14_ramp_II.png", "Paper's figure 14: the ramp, Model II.", lambda r: figures.ramp_response(r, "II")),
-    Figure("extra_a_linear_steps.png", "Steps of plant and linear model, per per cent.", extras.linear_steps),
-    Figure("extra_b_washout.png", "True radius against compensated measurement.", extras.true_against_compensated),
-    Figure("extra_c_cut_off.png", "The ramp against the high-pass cut-off.", extras.cut_off_sweep),
-    Figure("extra_d_noise.png", "Camera noise in the pull speed, one hour, Model I.", extras.noise_sweep),
-    Figure("extra_e_meniscus.png", "Hurle against the exact meniscus.", extras.menisci),
+FIGURES = tuple(
+    Shown(f"{file}.png", caption, draw)
+    for file, caption, draw in (
+        ("figure_01_pull_profile", "Paper's figure 1: pull speed.", figures.pull_profile),
+        ("figure_02_open_loop_I", "Paper's figure 2: plant at constant power, Model I.",
+         partial(figures.open_loop_response, model="I")),
+        ("figure_03_open_loop_II", "Paper's figure 3: plant at constant power, Model II.",
+         partial(figures.open_loop_response, model="II")),
+        ("figure_04_series", "Paper's figure 4: plant and measurement.", None),
+        ("figure_05_feedback", "Paper's figure 5: feedback.", None),
+        ("figure_06_bode_sketch",
+         "Paper's figure 6, there a sketch, here the uncompensated plant: the PID's crossover lies beyond the zero.",
+         figures.margin_sketch),
+        ("figure_07_parallel", "Paper's figure 7: parallel compensation.", None),
+        ("figure_08_loop", "Paper's figure 8: the linear loop.", None),
+        ("figure_09_bode", "Paper's figure 9: compensated loops.", figures.frequency_responses),
+        ("figure_10_tested_loop", "Paper's figure 10: the loop on the plant.", None),
+        ("figure_11_cases", "Paper's figure 11: cases A and B.", figures.case_comparison),
+        ("figure_12_temperatures",
+         "Paper's figure 12: temperatures; Model II's are identical, as the thermal chain does not depend on it.",
+         figures.ramp_temperatures),
+        ("figure_13_ramp_I", "Paper's figure 13: the ramp, Model I.", partial(figures.ramp_response, model="I")),
+        ("figure_14_ramp_II", "Paper's figure 14: the ramp, Model II.", partial(figures.ramp_response, model="II")),
+        ("extra_a_linear_steps", "Steps of plant and linear model, per per cent.", beyond_figures.linear_steps),
+        ("extra_b_washout", "True radius against compensated measurement.", beyond_figures.washout),
+        ("extra_c_cut_off", "The ramp against the high-pass cut-off.", beyond_figures.cut_off_sweep),
+        ("extra_d_noise", "Camera noise in the pull speed, one hour, Model I.", beyond_figures.noise_sweep),
+        ("extra_e_meniscus", "Hurle against the exact meniscus.", beyond_figures.menisci),
+    )
 )  # fmt: skip

@@ -12,6 +12,8 @@ MODEL_I = RadiusModel(numerator=-0.0047626, poles=(8.78e-6, -1.684e-3), lead=-47
 """G_p,I and G_m,I, section on the linearised model."""
 MODEL_II = RadiusModel(numerator=-0.0048849, poles=(4.63e-7, 7.602e-6), lead=-46.0050, constant=1.0043)
 """G_p,II and G_m,II."""
+PUBLISHED = {"I": MODEL_I, "II": MODEL_II}
+"""The same by model."""
 ZERO = 0.021
 """Right half plane zero of both models, as rounded in the text [rad/s]."""
 COMPENSATOR = Compensator()

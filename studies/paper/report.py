@@ -2,27 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from itertools import product
+
 import numpy as np
 
+from cz_gym import make_puller
 from cz_gym.units import MM
+from studies.markdown import table
 
-from .experiments import INTERVAL
-from .numbers import Results, cycle_numbers, ramp_numbers
-from .published import CROSSOVER, PHASE_MARGIN_DEG, PID
-from .report_beyond import beyond, meniscus, shown, table
-from .rows import as_markdown, rows
+from . import beyond_paper as beyond
+from . import experiments as ex
+from .comparison import as_markdown, number, rows
+from .gallery import FIGURES
+from .published import CROSSOVER, MODEL_II, PHASE_MARGIN_DEG, PID
 
 
-def report(results: Results) -> str:
+def report() -> str:
     """The whole report."""
-    sections = (_opening, _open_loop, _linear, _compensator, _pid, _closed_loop, beyond, meniscus)
-    return "\n\n".join(section(results) for section in sections) + "\n"
+    sections = (_opening, _open_loop, _linear, _compensator, _pid, _closed_loop, _beyond, _meniscus)
+    return "\n\n".join(section() for section in sections) + "\n"
 
 
-def _opening(r: Results) -> str:
-    ramp, cases = ramp_numbers(r.ramp["I"]), r.case_difference
-    published = r.margins["published_I"], r.margins["published_II"]
-    worst = max(max(found) for found in cases.values())
+def _shown(*marks: str) -> str:
+    """Markdown of the figures whose file names begin so."""
+    return "\n\n".join(f"![{f.caption}]({f.file})\n\n*{f.caption}*" for f in FIGURES if f.file.startswith(marks))
+
+
+def _table(head: str, lines: Iterable[Iterable[str]]) -> str:
+    """A table; the names of its columns are separated by |."""
+    return table(head.split(" | "), lines, "---")
+
+
+def _opening() -> str:
+    numbers = ex.ramp_numbers(ex.ramp("I"))
+    gains = [ex.compensator(source).gain for source in ex.SOURCES]
+    published = ex.loop_margins("published", "I"), ex.loop_margins("published", "II")
+    worst = max(max(ex.case_difference(*ex.cases(model))) for model in ex.MODELS)
     return f"""# Part II, redone on our plant
 
 Every value that Bukhari, Hovd and Winkler print in Part II beside what our plant, or the paper's own functions, give.
@@ -31,134 +47,132 @@ computed; the explanations and reasons were written for these. `docs/paper.md` s
 
 - The plant's linear model agrees with the paper's Model II; Model I's G_p and G_m differ by a factor that cancels
   in their product.
-- The design procedure returns the printed compensator: {r.published_compensator.gain:.5f} from the published functions,
-  {r.own_compensator.gain:.5f} from our plant.
+- The design procedure returns the printed compensator: {gains[0]:.5f} from the published functions,
+  {gains[1]:.5f} from our plant.
 - The printed crossover ({CROSSOVER} rad/s) and phase margin ({PHASE_MARGIN_DEG:.0f} degrees) **do not follow from the
   paper's own functions and Table 1**: those give {published[0].crossover:.4f} rad/s and
   {published[0].phase_margin_deg:.1f} degrees (I), {published[1].crossover:.4f} rad/s and
   {published[1].phase_margin_deg:.1f} degrees (II).
 - Cases A and B scaled by 5 differ by at most {100 * worst:.1f} % of the largest deviation of any signal.
-- In the temperature ramp the true radius is off by up to {ramp["max_error_mm"]:.2f} mm while the compensated
-  measurement shows {ramp["max_compensated_error_mm"]:.2f} mm.
+- In the temperature ramp the true radius is off by up to {numbers["max_error_mm"]:.2f} mm while the compensated
+  measurement shows {numbers["max_compensated_error_mm"]:.2f} mm.
 
 ## Published beside computed
 
 A dash means that the paper gives no number.
 
-{as_markdown(rows(r))}"""
+{as_markdown(rows())}"""
 
 
-def _open_loop(r: Results) -> str:
+def _open_loop() -> str:
+    smooth = {model: ex.inverse_response(ex.pull_change(model)) for model in ex.MODELS}
+    sudden = ex.inverse_response(ex.pull_change("I", over=ex.SUDDEN))
     return f"""## 1. Open loop
 
 The pull speed falls by 10 % along the quintic 10 s^3 - 15 s^4 + 6 s^5 over 600 s, the heater at nominal power. The
 paper shows its profile without numbers, so the shapes can be compared and not the values. The crystal thickens at
-once; the ring first shows it thinner, by {1e3 * r.inverse["I"].depth / MM:.2f} µm (I) and
-{1e3 * r.inverse["II"].depth / MM:.2f} µm (II), and is back after {r.inverse["I"].recovery:.0f} s and
-{r.inverse["II"].recovery:.0f} s. The dip is small because the change is slow against the zero: a sudden change of the
-same size gives {1e3 * r.inverse_step["I"].depth / MM:.1f} µm and {r.inverse_step["I"].recovery:.0f} s (I).
+once; the ring first shows it thinner, by {1e3 * smooth["I"].depth / MM:.2f} µm (I) and
+{1e3 * smooth["II"].depth / MM:.2f} µm (II), and is back after {smooth["I"].recovery:.0f} s and
+{smooth["II"].recovery:.0f} s. The dip is small because the change is slow against the zero: a sudden change of the
+same size gives {1e3 * sudden.depth / MM:.1f} µm and {sudden.recovery:.0f} s (I).
 In Model II the growth rate is constant, in Model I it falls with the meniscus, which slows the widening.
 
-{shown("figure_01", "figure_02", "figure_03")}"""
+{_shown("figure_01", "figure_02", "figure_03")}"""
 
 
-def _linear(r: Results) -> str:
-    lines = []
-    for model, steps in r.steps.items():
-        for step in steps:
-            gaps = " | ".join(f"{100 * step.worst(output):.2f} %" for output in (0, 1))
-            lines.append(f"| {model} | {100 * step.share:.0f} % | {gaps} |")
-    functions = []
-    for model, m in r.models.items():
-        poles = ", ".join(f"{pole:.4g}" for pole in m.poles)
-        functions.append(
-            f"| {model} | {m.numerator:.7f} | {poles} | {m.lead:.4f} s + {m.constant:.4f} | {m.zero:.5f} | "
-            f"{m.numerator * m.constant:.7f} |"
-        )
-    head = "| model | numerator of G_p [1/s] | poles [rad/s] | G_m | zero [rad/s] | gain, numerator x constant [1/s] |"
+def _linear() -> str:
+    functions = [
+        (name, f"{m.numerator:.7f}", ", ".join(f"{pole:.4g}" for pole in m.poles),
+         f"{m.lead:.4f} s + {m.constant:.4f}", f"{m.zero:.5f}", f"{m.numerator * m.constant:.7f}")
+        for name, m in ((name, ex.linear_model("own", name)) for name in ex.MODELS)
+    ]  # fmt: skip
+    gaps = [
+        (name, f"{100 * share:.0f} %", *(f"{100 * ex.step_comparison(name, share).worst(i):.2f} %" for i in (0, 1)))
+        for name in ex.MODELS
+        for share in ex.STEPS
+    ]
+    head = "model | numerator of G_p [1/s] | poles [rad/s] | G_m | zero [rad/s] | gain, numerator x constant [1/s]"
     return f"""## 2. Linearisation
 
 Derivatives by complex step through the functions that are simulated; melt temperature held, as in the paper.
 
-{table(head, functions)}
+{_table(head, functions)}
 
 Largest difference between plant and linear model over 10 min after a pull-speed step, relative to the largest
 deviation. The ring is the less linear of the two, its offset bending with the height of the meniscus:
 
-{table("| model | step | r_c | r_br |", lines)}
+{_table("model | step | r_c | r_br", gaps)}
 
-{shown("figure_04", "extra_a")}"""
+{_shown("figure_04", "extra_a")}"""
 
 
-def _compensator(r: Results) -> str:
-    found = r.own_compensator
+def _compensator() -> str:
+    printed, own = (
+        f"{c.gain:.5f} s / ((s + {c.fast:.4g}) (s + {c.slow:.4g}))" for c in map(ex.compensator, ex.SOURCES)
+    )
     return f"""## 3. Compensator
 
 Ideal compensator G_p (1 - G_m), high-pass filter 5000 s/(5000 s + 1), stable part by ordered Schur form and Sylvester
 equation, constant of the numerator removed. From the published functions of Model I:
 
-    G_pc,real(s) = {r.published_compensator.gain:.5f} s / ((s + {r.published_compensator.fast:.4g}) (s + \
-{r.published_compensator.slow:.4g}))
+    G_pc,real(s) = {printed}
 
-and from our plant {found.gain:.5f} s / ((s + {found.fast:.4g}) (s + {found.slow:.4g})).
+and from our plant {own}.
 
 Model II has no compensator of its own: neither pole of its plant is stable, so only the filter's pole is left, and
 without its steady gain nothing is. The paper uses Model I's for both, and so do we.
 
-{shown("figure_05", "figure_07", "figure_08")}"""
+{_shown("figure_05", "figure_07", "figure_08")}"""
 
 
-def _pid(r: Results) -> str:
+def _pid() -> str:
+    def complex_number(pole: complex) -> str:
+        return f"{pole.real:.3g}{pole.imag:+.3g}j" if pole.imag else f"{pole.real:.3g}"
+
     lines = []
-    for label, group in (("with", r.margins), ("without", r.bare_margins)):
-        for name, m in group.items():
-            source, model = name.split("_")
-            functions = "published" if source == "published" else "our plant"
-            poles = ", ".join(
-                f"{pole.real:.3g}{pole.imag:+.3g}j" if pole.imag else f"{pole.real:.3g}" for pole in m.poles
-            )
-            lines.append(
-                f"| {model} | {functions} | {label} | {m.crossover:.4f} | {m.phase_margin_deg:.1f} | "
-                f"{'yes' if m.stable else 'no'} | {poles} |"
-            )
-    head = "| model | functions | compensator | crossover [rad/s] | phase margin [deg] | stable | poles [rad/s] |"
-    own = r.margins["own_I"]
-    hold = np.degrees(own.crossover * INTERVAL / 2)
+    for compensated, (source, functions), model in product(
+        (True, False), zip(ex.SOURCES, ("published", "our plant"), strict=True), ex.MODELS
+    ):
+        m = ex.loop_margins(source, model, compensated)
+        numbers = f"{m.crossover:.4f}", f"{m.phase_margin_deg:.1f}", "yes" if m.stable else "no"
+        poles = ", ".join(map(complex_number, m.poles))
+        lines.append((model, functions, "with" if compensated else "without", *numbers, poles))
+    head = "model | functions | compensator | crossover [rad/s] | phase margin [deg] | stable | poles [rad/s]"
+    hold = np.degrees(ex.loop_margins("own", "I").crossover * ex.INTERVAL / 2)
     return f"""## 4. PID
 
 Table 1: K_p = {PID.K_p} 1/s, T_i = {PID.T_i:.0f} s, T_d = {PID.T_d:.0f} s, N = {PID.N:.0f}.
 The paper prints {CROSSOVER} rad/s and about {PHASE_MARGIN_DEG:.0f} degrees for both models.
 
-{table(head, lines)}
+{_table(head, lines)}
 
 Neither the published functions nor our plant give the printed crossover and margin. The loop above is continuous;
-holding the pull speed for {INTERVAL:.0f} s costs another {hold:.1f} degrees at our crossover.
+holding the pull speed for {ex.INTERVAL:.0f} s costs another {hold:.1f} degrees at our crossover.
 
-{_without(r)}
+{_without()}
 
-{shown("figure_06", "figure_09")}"""
+{_shown("figure_06", "figure_09")}"""
 
 
-def _without(r: Results) -> str:
+def _without() -> str:
     """The ramp without the compensator, beside the ramp with it."""
     lines = []
-    for label, runs in (("with", r.ramp), ("without", r.bare_ramp)):
-        for model, run in runs.items():
-            n = cycle_numbers(run)
+    for label, policy in (("with", ex.PRINTED), ("without", ex.BARE)):
+        for model in ex.MODELS:
+            run = ex.ramp(model, policy)
+            n = ex.cycle_numbers(run)
             fate = f"lost after {n['lived_min']:.0f} min" if run.failed else "kept"
-            lines.append(
-                f"| {model} | {label} | {fate} | {n['rmse_mm']:.3f} | {n['max_error_mm']:.2f} | "
-                f"{100 * n['at_limit']:.0f} % | {n['late_swing_mm']:.2f} |"
-            )
-    kept, held = (ramp_numbers(runs["I"])["rmse_mm"] for runs in (r.bare_ramp, r.ramp))
+            errors = f"{n['rmse_mm']:.3f}", f"{n['max_error_mm']:.2f}"
+            lines.append((model, label, fate, *errors, f"{100 * n['at_limit']:.0f} %", f"{n['late_swing_mm']:.2f}"))
+    kept, held = (ex.ramp_numbers(ex.ramp("I", policy))["rmse_mm"] for policy in (ex.BARE, ex.PRINTED))
     head = (
-        "| model | compensator | crystal | true RMSE [mm] | largest true error [mm] | time at a pull limit | "
-        "swing of r_c in its last hour [mm] |"
+        "model | compensator | crystal | true RMSE [mm] | largest true error [mm] | time at a pull limit | "
+        "swing of r_c in its last hour [mm]"
     )
     return f"""Without the compensator the linear loop is unstable on both models. What that means on the nonlinear
 plant, whose pull speed has limits, shows in the temperature ramp of the next section:
 
-{table(head, lines)}
+{_table(head, lines)}
 
 In Model II the instability costs the crystal. In Model I, where a rising meniscus freezes faster, it ends in a bounded
 limit cycle between the limits of the pull speed, which no puller should be asked for; yet the true radius is off by
@@ -167,18 +181,85 @@ what costs the compensated loop its radius is the compensator's washout (section
 over the time it lived."""
 
 
-def _closed_loop(r: Results) -> str:
-    lines = [
-        f"| {model} | " + " | ".join(f"{100 * value:.2f} %" for value in found) + " |"
-        for model, found in r.case_difference.items()
-    ]
+def _closed_loop() -> str:
+    lines = [(m, *(f"{100 * value:.2f} %" for value in ex.case_difference(*ex.cases(m)))) for m in ex.MODELS]
     return f"""## 5. Closed loop on the nonlinear plant
 
 max of A - 5 B over max of A, deviations from the operating point:
 
-{table("| model | r_c | h_c | alpha_c | v_p |", lines)}
+{_table("model | r_c | h_c | alpha_c | v_p", lines)}
 
 The ramp: T_1,ref rises by 0.5 K/min for 10 min and holds. The paper gives no duration, nor the gains of the temperature
 loop, so its curves can be compared in shape only.
 
-{shown("figure_10", "figure_11", "figure_12", "figure_13", "figure_14")}"""
+{_shown("figure_10", "figure_11", "figure_12", "figure_13", "figure_14")}"""
+
+
+def _beyond() -> str:
+    cut_offs = []
+    for c in map(beyond.cut_off_result, beyond.CUT_OFFS):
+        peaks = [f"{errors[m] / MM:.2f}" for m in ("I", "II") for errors in (c.max_error, c.max_compensated_error)]
+        cut_offs.append((f"{c.cut_off:.0e}", *peaks, *(f"{c.phase_margin_deg[m]:.0f}" for m in ("I", "II"))))
+    head = (
+        "cut-off [rad/s] | r_c, I [mm] | r_tilde, I [mm] | r_c, II [mm] | r_tilde, II [mm] | margin, I [deg] | "
+        "margin, II [deg]"
+    )
+    noise = [
+        (f"{n.noise / MM:.2f}", f"{n.expected_pull_rms_mm_per_min:.2f}", f"{n.pull_rms_mm_per_min:.2f}",
+         f"{100 * n.clipped:.0f} %", f"{n.rmse_mm:.3f}", f"{100 * n.failures:.0f} %")
+        for n in map(beyond.noise_result, beyond.NOISES)
+    ]  # fmt: skip
+    noise_head = (
+        "camera noise, sd [mm] | RMS of v_p expected [mm/min] | RMS of v_p - v_0 [mm/min] | time at a limit | "
+        "true RMSE [mm] | lost"
+    )
+    return f"""## 6. What the paper does not show
+
+**The washout.** A warmer melt grows more slowly, so the loop must pull more slowly for good. The compensator answers a
+lasting change of pull speed with a correction that fades only at the high-pass cut-off; meanwhile the loop holds
+r_tilde and the crystal is off by the correction. Raising the cut-off shortens it, at little cost in margin until
+it nears the zero. Largest errors in the ramp, compensator redesigned from our Model I for each cut-off:
+
+{_table(head, cut_offs)}
+
+**Noise.** The PID's gain at high frequency is K_p N = {PID.K_p * PID.N:.0f} mm/s per mm.
+White camera noise, {ex.INTERVAL:.0f} s samples,
+reference held for an hour, mean of {len(beyond.SEEDS)} episodes. The pull speed is spoilt long before the crystal is:
+
+{_table(noise_head, noise)}
+
+{_shown("extra_b", "extra_c", "extra_d")}"""
+
+
+def _meniscus() -> str:
+    lines = [
+        (f"{p.r_c / MM:.1f}", f"{p.hurle.h / MM:.4f}", f"{p.exact.h / MM:.4f}",
+         f"{100 * (p.hurle.h / p.exact.h - 1):+.2f} %", f"{p.hurle.slope_rate * MM:.4f}",
+         f"{p.exact.slope_rate * MM:.4f}", f"{p.hurle.ring_offset / MM:.3f}", f"{p.exact.ring_offset / MM:.3f}",
+         f"{p.hurle.zero:.4f}", f"{p.exact.zero:.4f}")
+        for p in beyond.compare_menisci()
+    ]  # fmt: skip
+    head = (
+        "r_c [mm] | h, Hurle [mm] | h, exact [mm] | difference | d alpha_c/d h, Hurle [rad/mm] | exact | "
+        "ring offset, Hurle [mm] | exact | zero, Hurle [rad/s] | exact"
+    )
+    slopes = [(f"{phi_b:g}", *(f"{lead:.2f}" for lead in leads)) for phi_b, *leads in beyond.compare_ring_slopes()]
+    exact_h, hurle_h = beyond.exact_height() / MM, make_puller().h_0 / MM
+    largest, hurles = (ex.ramp_numbers(run)["max_error_mm"] for run in (beyond.exact_ramp(), ex.ramp("I")))
+    return f"""## 7. Hurle against the exact meniscus
+
+At the operating point the axisymmetric Young-Laplace equation gives {number(exact_h)} mm, Hurle's closed form
+{number(hurle_h)} mm.
+On a plant with the exact meniscus the printed controller's largest error in the ramp is
+{largest:.3f} mm against {hurles:.3f} mm (Model I).
+
+{_table(head, lines)}
+
+The zero differs most. It hangs on how fast the ring moves with the height, which Hurle's profile overstates: on the
+exact meniscus the coefficient of s in G_m hardly depends on where the ring is seen, and with the capillary constant
+that gives the paper's G_p no slope phi_b gives its {MODEL_II.lead:.1f} s. That number belongs to the approximate
+profile; the exact meniscus makes the inverse response somewhat milder.
+
+{_table("phi_b [deg] | coefficient of s, Hurle [s] | exact [s]", slopes)}
+
+{_shown("extra_e")}"""

@@ -9,35 +9,21 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import statistics
 import sys
-import time
-from collections.abc import Callable
+import timeit
+import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser, guarded
-from cz_gym.units import MICRO
 
-from . import cases, peers, training
-from .cases import THREADS, Case, Skipped
-from .costs import KIB, megabytes, memory_per_slot, reset_seconds, start_seconds
-
-GROWTH = (1, 16, 256, 1024, 4096, 16384, 65536)
-"""Slots whose cost per step is compared."""
-RATIOS = (
-    "scalar_vs_pendulum", "vector1024_vs_envpool_pendulum", "vector1024_vs_pcgym", "vector1024_vs_kernel",
-    "sb3_adapter_vs_subproc", "sb3_adapter_vs_dummy",
-)  # fmt: skip
-FLOORS = {
-    "scalar_vs_pendulum": 1.7,
-    "vector1024_vs_envpool_pendulum": 3.0,
-    "vector1024_vs_pcgym": 1500.0,
-    "vector1024_vs_kernel": 0.6,
-    "sb3_adapter_vs_subproc": 100.0,
-    "sb3_adapter_vs_dummy": 12.0,
-}
+from .cases import SLOTS, THREADS, Case, Stepper, cases, stepper
+from .costs import costs, environment_share
 
 
 class Plan(NamedTuple):
@@ -45,12 +31,10 @@ class Plan(NamedTuple):
 
     repeats: int
     seconds: float
-    """Least time a case gets in each round."""
-    most_slots: int
+    """What a case gets in each round, about."""
 
 
-QUICK = Plan(3, 0.1, 4096)
-FULL = Plan(9, 0.5, 65536)
+QUICK, FULL = Plan(3, 0.1), Plan(9, 0.5)
 
 
 class Row(NamedTuple):
@@ -61,141 +45,134 @@ class Row(NamedTuple):
     steps_per_s: float
 
 
-def steps_per_second(case: Case, seconds: float) -> float:
-    """Step for about that long; slots times steps over time."""
-    began = time.perf_counter()
-    done = 0
-    while True:
-        for _ in range(case.calls):
-            case.step()
-        done += case.calls
-        passed = time.perf_counter() - began
-        if passed >= seconds:
-            return done * case.num_envs / passed
+class Skipped(NamedTuple):
+    """What cannot be measured here."""
+
+    name: str
+    why: str
 
 
-def measure(groups: list[list[Case]], plan: Plan, progress: Callable[[str], None] = lambda _: None) -> list[Row]:
-    """Medians of interleaved repeats; a group's cases live together and are closed before the next group's begin."""
-    rows = []
-    for group in groups:
-        for case in group:
-            case.step()
-        found: list[list[float]] = [[] for _ in group]
-        for repeat in range(plan.repeats):
-            for case, speeds in zip(group, found, strict=True):
-                progress(f"{case.name}, {case.num_envs} slots, round {repeat + 1} of {plan.repeats}")
-                speeds.append(steps_per_second(case, plan.seconds))
-        for case, speeds in zip(group, found, strict=True):
-            rows.append(Row(case.name, case.num_envs, statistics.median(speeds)))
-            case.close()
-    return rows
+class Ratio(NamedTuple):
+    """Speed of the fastest row whose name begins so over that of another, of rows of 1,024 slots if there are any."""
+
+    row: str
+    over: str
+    promised: float | None = None
+    """What it should be at least; None: only reported."""
 
 
-def own_cases(plan: Plan) -> list[Case]:
-    """This package's cases but for the largest."""
-    threads = sorted({1, THREADS})
-    found = cases.scalars()
-    found += [cases.ours(n, 1) for n in GROWTH if n <= min(plan.most_slots, 4096)]
-    found += [cases.ours(1024, n) for n in threads[1:]]
-    found += [cases.ours(1024, n, "history") for n in threads]
-    for n in threads:
-        found += [cases.in_step(1024, n), cases.bare(1024, n)]
-    found += [cases.plain_numpy(1024), cases.failing(1024, False), cases.failing(1024, True)]
-    return found
+OURS = "Cz-v0 batch, measured"
+RATIOS = {
+    "scalar_vs_pendulum": Ratio("Cz-v0 scalar", "Pendulum-v1 scalar", 1.7),
+    "vector1024_vs_envpool_pendulum": Ratio(OURS, "EnvPool Pendulum-v1", 3.0),
+    "vector1024_vs_pcgym": Ratio(OURS, "pc-gym CSTR", 1500.0),
+    "vector1024_vs_kernel": Ratio(
+        "Cz-v0 batch without resets, 1 thread", "bare compiled plant and ring, 1 thread", 0.6
+    ),
+    "sb3_adapter_vs_subproc": Ratio("SB3 adapter over the batch", "SB3 SubprocVecEnv", 100.0),
+    "sb3_adapter_vs_dummy": Ratio("SB3 adapter over the batch", "SB3 DummyVecEnv", 12.0),
+    "vector1024_vs_envpool_pendulum_one_thread": Ratio(f"{OURS}, 1 thread", "EnvPool Pendulum-v1, 1 thread"),
+    "vector1024_vs_numpy": Ratio(f"{OURS}, 1 thread", "plain NumPy plant and ring"),
+    "failing_vs_not_failing": Ratio("open loop on hard, failing episodes", "open loop on hard, no failures"),
+}
 
 
-def ratios(rows: list[Row]) -> dict[str, float | None]:
-    """The figures that are promised; None where a peer is missing."""
-
-    def best(name: str, num_envs: int | None = None) -> float:
-        found = [row.steps_per_s for row in rows if row.name.startswith(name) and num_envs in (None, row.num_envs)]
-        return max(found, default=math.nan)
-
-    ours = best("Cz-v0 batch, measured", 1024)
-    adapter = best(peers.ADAPTER)
-    values = (
-        best("Cz-v0 scalar") / best("Pendulum-v1 scalar"),
-        ours / best(peers.ENVPOOL),
-        ours / best(peers.PCGYM),
-        best("Cz-v0 batch without resets, 1 thread") / best("bare compiled plant and ring, 1 thread"),
-        adapter / best(peers.SUBPROC),
-        adapter / best(peers.DUMMY),
-    )
-    return {name: None if math.isnan(value) else value for name, value in zip(RATIOS, values, strict=True)}
-
-
-def more_figures(rows: list[Row]) -> dict[str, float]:
-    """Further ratios of the table."""
-    speed = {(row.name, row.num_envs): row.steps_per_s for row in rows}
-
-    def of(top: tuple[str, int], bottom: tuple[str, int]) -> float:
-        return speed.get(top, math.nan) / speed.get(bottom, math.nan)
-
-    mine = "Cz-v0 batch, measured, 1 thread"
-    most = max(row.num_envs for row in rows if row.name == mine)
-    found = {
-        f"cost_per_step_{most}_vs_1024": of((mine, 1024), (mine, most)),
-        "vector1024_vs_envpool_pendulum_one_thread": of((mine, 1024), (f"{peers.ENVPOOL}, 1 thread", 1024)),
-        "vector1024_vs_numpy": of((mine, 1024), ("plain NumPy plant and ring", 1024)),
-        "failing_vs_not_failing": of(
-            ("open loop on hard, failing episodes", 1024), ("open loop on hard, no failures", 1024)
-        ),
-    }
-    return {name: value for name, value in found.items() if not math.isnan(value)}
+def measure(
+    wanted: Sequence[Case], plan: Plan, progress: Callable[[str], None] = lambda _: None
+) -> tuple[list[Row], list[Skipped]]:
+    """Median speeds of interleaved rounds; cases that cannot be made are skipped by name."""
+    running: dict[Case, tuple[Stepper, timeit.Timer, int]] = {}
+    skipped = []
+    for case in wanted:
+        progress(case.name)
+        try:
+            made = stepper(case.make())
+            made.step()
+        except Exception as error:  # what a peer lacks must not end the run
+            skipped.append(Skipped(case.name, why(error)))
+            continue
+        timer = timeit.Timer(made.step, "import gc; gc.enable()")
+        running[case] = made, timer, calls_in(timer, plan.seconds)
+    speeds: dict[Case, list[float]] = {case: [] for case in running}
+    for repeat in range(plan.repeats):
+        for case, (made, timer, calls) in running.items():
+            progress(f"{case.name}, {made.num_envs} slots, round {repeat + 1} of {plan.repeats}")
+            speeds[case].append(calls * made.num_envs / timer.timeit(calls))
+    for made, *_ in running.values():
+        made.close()
+    return [Row(case.name, running[case][0].num_envs, statistics.median(speeds[case])) for case in running], skipped
 
 
-def costs(quick: bool) -> dict[str, float]:
-    """Memory, resets and start-up."""
-    found = {"memory_per_slot_randomized_kib": memory_per_slot("randomized", "measured") / KIB}
-    if not quick:
-        found["memory_per_slot_puller_history_kib"] = memory_per_slot("puller", "history") / KIB
-    found["reset_scalar_us"] = reset_seconds(1) / MICRO
-    found["reset_1024_us_per_slot"] = reset_seconds(1024) / MICRO
-    cold, cached = start_seconds(cold=not quick)
-    found["start_cached_s"] = cached
-    if cold is not None:
-        found["start_cold_s"] = cold
-    return found
+def calls_in(timer: timeit.Timer, seconds: float) -> int:
+    """How many calls take about that long."""
+    calls = 1
+    while (took := timer.timeit(calls)) < 0.1 * seconds:
+        calls *= 4
+    return max(1, round(calls * seconds / took))
 
 
-def table(rows: list[Row], skipped: list[Skipped], result: dict[str, Any]) -> str:
+def why(error: Exception) -> str:
+    """Why something is skipped, in one line."""
+    if isinstance(error, ImportError):
+        return f"{error.name or error} is not installed"
+    return " ".join(f"{type(error).__name__}: {error}".split())[:100]
+
+
+def ratio(rows: Sequence[Row], asked: Ratio) -> float | None:
+    """A ratio of the table's rows; None where one is missing."""
+    speeds = []
+    for begins in (asked.row, asked.over):
+        found = [row for row in rows if row.name.startswith(begins)]
+        alike = [row for row in found if row.num_envs == SLOTS] or found
+        speeds.append(max((row.steps_per_s for row in alike), default=math.nan))
+    value = speeds[0] / speeds[1]
+    return None if math.isnan(value) else value
+
+
+def growth(rows: Sequence[Row]) -> dict[str, float]:
+    """Cost per step of the largest batch over that of 1,024 slots."""
+    speed = {row.num_envs: row.steps_per_s for row in rows if row.name == f"{OURS}, 1 thread"}
+    return {f"cost_per_step_{max(speed)}_vs_{SLOTS}": speed[SLOTS] / speed[max(speed)]} if SLOTS in speed else {}
+
+
+def table(result: dict[str, Any]) -> str:
     """The whole result as text."""
     lines = [f"{'':44}{'slots':>7}{'steps/s':>14}{'us/step':>10}"]
-    lines += [f"{row.name:44}{row.num_envs:7d}{row.steps_per_s:14,.0f}{1e6 / row.steps_per_s:10.3f}" for row in rows]
-    lines += [f"{skip.name:44}skipped: {skip.why}" for skip in skipped]
-    lines.append("")
+    for name, num_envs, speed in (row.values() for row in result["rows"]):
+        lines.append(f"{name:44}{num_envs:7d}{speed:14,.0f}{1e6 / speed:10.3f}")
+    lines += [f"{skipped['name']:44}skipped: {skipped['why']}" for skipped in result["skipped"]] + [""]
     for name, value in result["ratios"].items():
         shown = "-" if value is None else f"{value:.2f}"
-        lines.append(f"{name:44}{shown:>10} x   (at least {FLOORS[name]:g} x)")
+        lines.append(f"{name:44}{shown:>10} x   (at least {RATIOS[name].promised:g} x)")
     lines += [f"{name:44}{value:10.2f}" for name, value in {**result["figures"], **result["costs"]}.items()]
     return "\n".join(lines)
 
 
-def run(plan: Plan, quick: bool, progress: Callable[[str], None] = lambda _: None) -> tuple[dict[str, Any], str]:
-    """Measure everything; the JSON's contents and the table."""
-    measured_costs = costs(quick)
-    others = peers.peers(quick)
-    skipped = [other for other in others if isinstance(other, Skipped)]
-    share = {} if quick else training.environment_share()
-    if isinstance(share, Skipped):
-        skipped, share = [*skipped, share], {}
-    groups = [own_cases(plan) + [other for other in others if isinstance(other, Case)]]
-    rows = measure(groups, plan, progress)
-    large = [n for n in GROWTH if 4096 < n <= plan.most_slots]
-    for n in large:
-        if megabytes() > n * 0.1:
-            rows += measure([[cases.ours(n, 1)]], plan._replace(repeats=3, seconds=2.0), progress)
-        else:
-            skipped.append(Skipped(f"Cz-v0 batch of {n}", "not enough memory"))
-    result: dict[str, Any] = {
-        "ratios": ratios(rows),
+def run(quick: bool, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """Measure everything: the JSON's contents."""
+    plan, wanted = QUICK if quick else FULL, cases(quick)
+    progress("memory, resets, start-up")
+    measured_costs, share, skipped = costs(quick), {}, []
+    if not quick:
+        progress("share of a training")
+        try:
+            share["ppo_share_in_environment"] = environment_share()
+        except Exception as error:  # what training needs must not end the run
+            skipped.append(Skipped("ppo_share_in_environment", why(error)))
+    rows: list[Row] = []
+    for together in ([case for case in wanted if not case.alone], *([case] for case in wanted if case.alone)):
+        more, missing = measure(together, plan, progress)
+        rows, skipped = rows + more, skipped + missing
+    found = {name: ratio(rows, asked) for name, asked in RATIOS.items()}
+    reported = {name: value for name, value in found.items() if RATIOS[name].promised is None and value is not None}
+    return {
+        "ratios": {name: value for name, value in found.items() if RATIOS[name].promised is not None},
         "rows": [row._asdict() for row in rows],
-        "figures": more_figures(rows) | share,
+        "figures": growth(rows) | reported | share,
         "costs": measured_costs,
-        "skipped": [skip._asdict() for skip in skipped],
+        "skipped": [one._asdict() for one in skipped],
         "threads": THREADS,
     }
-    return result, table(rows, skipped, result)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -213,11 +190,12 @@ def _measure(arguments: argparse.Namespace) -> int:
             raise IsADirectoryError(f"{arguments.json} is a folder")
         check_writable(arguments.json.parent)
     try:
-        with peers.silenced():
-            result, text = run(QUICK if arguments.quick else FULL, arguments.quick, _say)
+        # Peers warn, and so do the processes they start.
+        with patch.dict(os.environ, PYTHONWARNINGS="ignore"), warnings.catch_warnings(action="ignore"):
+            result = run(arguments.quick, _say)
     finally:
         _say("")
-    print(text)
+    print(table(result))
     if arguments.json is not None:
         write_files({arguments.json: (json.dumps(result, indent=1, allow_nan=False) + "\n").encode()})
     return 0

@@ -1,15 +1,18 @@
-"""What ``python -m studies.speed`` measures of this package: environments, batches, bare loops, as runnable cases."""
+"""What ``python -m studies.speed`` steps: this package's environments beside others, one entry a row of the table."""
 
 from __future__ import annotations
 
+import importlib
 import os
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
+from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config
 from cz_gym.engine.batch import Batch
 from cz_gym.env import CzEnv
@@ -17,58 +20,102 @@ from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.plant import NO_DISTURBANCE, Inputs, State, make_puller, rk4
 from cz_gym.vector import CzVectorEnv
 
+from .costs import KIB, available_memory
+
 THREADS = os.cpu_count() or 1
 """Threads that the larger cases may use."""
-
-
-_UNFAILED = 50
+SLOTS, SB3_SLOTS = 1024, 256
+"""Slots of the batches that are compared, and of those behind stable-baselines3."""
+SMALL, LARGE = (1, 16, 256, SLOTS, 4096), (16384, 65536)
+"""Slots whose cost a step is compared; the large ones are measured alone."""
+UNFAILED = 50
 """Steps that every crystal survives in open loop."""
 
 
-class Case(NamedTuple):
+class Stepper(NamedTuple):
     """Something that steps."""
 
-    name: str
     num_envs: int
     step: Callable[[], Any]
     """One step of every slot."""
-    close: Callable[[], Any]
-    calls: int = 1
-    """Calls between two looks at the clock."""
+    close: Callable[[], Any] = lambda: None
 
 
-class Skipped(NamedTuple):
-    """A case that cannot be measured here."""
+class Case(NamedTuple):
+    """A row of the table."""
 
     name: str
-    why: str
+    make: Callable[[], Any]
+    """Makes a :class:`Stepper`, or any environment, scalar or batched, which is stepped with actions of zero."""
+    alone: bool = False
+    """Whether nothing else may be in memory."""
 
 
-def scalar(name: str, env: Any) -> Case:
-    """Any scalar environment, with its resets."""
-    action = np.zeros(env.action_space.shape, env.action_space.dtype)
-    env.reset(seed=0)
+def cases(quick: bool) -> list[Case]:
+    """Every row, in the table's order; what is not installed or fails is skipped by name when it is made."""
+    threads = sorted({1, THREADS})
+    one, *more = threads
+    return [
+        *(Case(f"{name} scalar", partial(gym.make, name)) for name in ("Cz-v0", "Pendulum-v1", "CartPole-v1")),
+        *(Case(f"Cz-v0 batch, measured, {_threads(one)}", partial(ours, n)) for n in SMALL),
+        *(Case(f"Cz-v0 batch, measured, {_threads(n)}", partial(ours, SLOTS, n)) for n in more),
+        *(Case(f"Cz-v0 batch, history, {_threads(n)}", partial(ours, SLOTS, n, "history")) for n in threads),
+        *(
+            Case(f"{name}, {_threads(n)}", partial(make, SLOTS, n))
+            for n in threads
+            for name, make in (("Cz-v0 batch without resets", without_resets), ("bare compiled plant and ring", bare))
+        ),
+        Case("plain NumPy plant and ring", partial(plain_numpy, SLOTS)),
+        Case("open loop on hard, no failures", partial(open_loop, SLOTS, fails=False)),
+        Case("open loop on hard, failing episodes", partial(open_loop, SLOTS, fails=True)),
+        Case("CartPole-v1 native batch", lambda: gym.make_vec("CartPole-v1", SLOTS, "vector_entry_point")),
+        *(Case(f"EnvPool Pendulum-v1, {_threads(n)}", partial(_envpool, SLOTS, n)) for n in threads),
+        Case("pc-gym CSTR", _pcgym),
+        Case("SB3 adapter over the batch", _sb3_adapter),
+        Case("SB3 DummyVecEnv", lambda: _sb3("DummyVecEnv", SB3_SLOTS)),
+        *(
+            Case(f"SB3 SubprocVecEnv, {n} processes", partial(_sb3, "SubprocVecEnv", n, start_method=_START))
+            for n in ((2,) if quick else (2, 16))
+        ),
+        Case("render() of a record of 15 min", partial(rendered, 15)),
+        Case("render() of a record of 3 h", partial(rendered, 179)),
+        Case("Cz-v0 scalar, camera", partial(CzEnv, "nominal", observation="camera")),
+        *(Case(f"Cz-v0 batch, measured, {_threads(one)}", partial(ours, n), alone=True) for n in LARGE if not quick),
+    ]
+
+
+def stepper(made: Any) -> Stepper:
+    """A case's environment, stepped with actions of zero and reset where it does not reset itself."""
+    if isinstance(made, Stepper):
+        return made
+    if getattr(made, "num_envs", None) is not None:
+        made.reset()
+        return batched(made, made.num_envs)
+    made.reset(seed=0)
+    action = np.zeros(made.action_space.shape, made.action_space.dtype)[()]
 
     def step() -> None:
-        _, _, terminated, truncated, _ = env.step(action)
+        _, _, terminated, truncated, _ = made.step(action)
         if terminated or truncated:
-            env.reset()
+            made.reset()
 
-    return Case(name, 1, step, env.close, 200)
-
-
-def vector(name: str, env: Any, calls: int = 1) -> Case:
-    """Any batch that resets itself."""
-    action = np.zeros(env.action_space.shape, env.action_space.dtype)
-    return Case(name, env.num_envs, lambda: env.step(action), env.close, calls)
+    return Stepper(1, step, made.close)
 
 
-def ours(num_envs: int, threads: int = THREADS, observation: str = "measured", scenario: str = "randomized") -> Case:
+def batched(env: Any, num_envs: int) -> Stepper:
+    """A batch, begun already, of whatever library."""
+    space = getattr(env, "single_action_space", env.action_space)
+    action = np.zeros((num_envs, *space.shape), space.dtype)
+    return Stepper(num_envs, lambda: env.step(action), env.close)
+
+
+def ours(num_envs: int, threads: int = 1, observation: str = "measured") -> Stepper:
     """The native batch, its slots at random places of their episodes, so that resets are spread out."""
-    env = CzVectorEnv(num_envs, scenario=scenario, observation=observation, threads=threads)
+    if available_memory() < 100.0 * KIB * num_envs:
+        raise MemoryError(f"{num_envs} slots need more memory than there is")
+    env = CzVectorEnv(num_envs, observation=observation, threads=threads)
     spread_out(env)
-    label = f"Cz-v0 batch, {observation}, {_threads(min(threads, max(1, num_envs // 256)))}"
-    return vector(label, env, max(1, 256 // num_envs))
+    return batched(env, num_envs)
 
 
 def spread_out(env: CzVectorEnv) -> None:
@@ -77,37 +124,34 @@ def spread_out(env: CzVectorEnv) -> None:
     env._batch.memory.slots["k"] = np.random.default_rng(0).integers(0, env.config.steps, env.num_envs)
 
 
-def in_step(num_envs: int, threads: int) -> Case:
+def without_resets(num_envs: int, threads: int) -> Stepper:
     """The native batch over and over the same first minutes: no resets, to compare with the bare loop."""
     env = CzVectorEnv(num_envs, threads=threads)
-    action = np.zeros((num_envs, 2), np.float32)
     env.reset(seed=0)
-    step = _again_and_again(env._batch, lambda: env.step(action))
-    return Case(f"Cz-v0 batch without resets, {_threads(threads)}", num_envs, step, env.close)
+    return repeated(env._batch, batched(env, num_envs))
 
 
-def bare(num_envs: int, threads: int) -> Case:
+def bare(num_envs: int, threads: int) -> Stepper:
     """The compiled plant and bright ring alone: no sensors, observation, reward, info or Python shell."""
     batch = Batch(make_config(), num_envs, threads)
     rings = np.zeros(num_envs)
     batch.reset(range(num_envs), [(i, i) for i in range(num_envs)], batch.new_out())
-    step = _again_and_again(batch, lambda: batch.advance(rings))
-    return Case(f"bare compiled plant and ring, {_threads(threads)}", num_envs, step, batch.close)
+    return repeated(batch, Stepper(num_envs, lambda: batch.advance(rings), batch.close))
 
 
-def _again_and_again(batch: Batch, step: Callable[[], Any]) -> Callable[[], None]:
-    """A step that takes every slot back to where it is now before any crystal fails."""
+def repeated(batch: Batch, stepper: Stepper) -> Stepper:
+    """The same, but every slot goes back to where it is now before any crystal fails."""
     slots, first = batch.memory.slots, batch.memory.slots.copy()
 
-    def again() -> None:
-        step()
-        if slots["k"][0] >= _UNFAILED:
+    def step() -> None:
+        stepper.step()
+        if slots["k"][0] >= UNFAILED:
             slots[:] = first
 
-    return again
+    return stepper._replace(step=step)
 
 
-def plain_numpy(num_envs: int) -> Case:
+def plain_numpy(num_envs: int) -> Stepper:
     """The same equations uncompiled on arrays: plant and ring alone, nominal pullers."""
     p = make_puller()
     x = State(*(np.full(num_envs, value) for value in p.state_0))
@@ -115,53 +159,76 @@ def plain_numpy(num_envs: int) -> Case:
 
     def step() -> None:
         new = rk4(x, u, NO_DISTURBANCE, p, 5.0, HURLE.slope)
-        for held, value in zip(x, new, strict=True):
-            held[:] = value
+        for old, value in zip(x, new, strict=True):
+            old[:] = value
         HURLE.ring_offset(x.r_c, x.h_c, p)
 
-    return Case("plain NumPy plant and ring", num_envs, step, lambda: None)
+    return Stepper(num_envs, step)
 
 
-def failing(num_envs: int, fails: bool) -> Case:
-    """Open loop on "hard": as episodes keep failing, or over and over the first 50 steps, before any does."""
+def open_loop(num_envs: int, fails: bool) -> Stepper:
+    """Open loop on "hard": as episodes keep failing, or over and over the first steps, before any does."""
     env = CzVectorEnv(num_envs, scenario="hard", autoreset_mode=AutoresetMode.SAME_STEP)
-    action = np.zeros((num_envs, 2), np.float32)
-    if fails:
-        spread_out(env)
-        for _ in range(env.config.steps):
-            env.step(action)
-    else:
+    found = batched(env, num_envs)
+    if not fails:
         env.reset(seed=0)
-
-    def step() -> None:
-        env.step(action)
-
-    label = "open loop on hard, " + ("failing episodes" if fails else "no failures")
-    return Case(label, num_envs, step if fails else _again_and_again(env._batch, step), env.close)
-
-
-def scalars() -> list[Case]:
-    """Our scalar environment and Gymnasium's, all through ``gym.make``."""
-    return [
-        scalar("Cz-v0 scalar", gym.make("Cz-v0")),
-        scalar("Pendulum-v1 scalar", gym.make("Pendulum-v1")),
-        scalar("CartPole-v1 scalar", _Flat(gym.make("CartPole-v1"))),
-    ]
+        return repeated(env._batch, found)
+    spread_out(env)
+    for _ in range(env.config.steps):
+        found.step()
+    return found
 
 
-class _Flat(gym.ActionWrapper[Any, Any, Any]):
-    """A discrete environment driven by the array of zeros that the others take."""
+def rendered(minutes: int) -> Stepper:
+    """Pictures, 640 x 480, of a crystal that the paper's controller has pulled for so long, again and again."""
+    env = CzEnv("randomized", observation="measured", render_mode="rgb_array")
+    paper, state = find_controller("paper").make(env.config), None
+    observation, _ = env.reset(seed=1)
+    for _ in range(round(60 * minutes / env.config.control_interval)):
+        action, state = paper.predict(observation, state)
+        observation, *_ = env.step(action)
+    return Stepper(1, env.render, env.close)
 
-    def action(self, action: Any) -> Any:
-        """The first action."""
-        return int(action)
+
+def _envpool(num_envs: int, threads: int) -> Stepper:
+    envpool = importlib.import_module("envpool")
+    env = envpool.make("Pendulum-v1", env_type="gymnasium", num_envs=num_envs, num_threads=threads)
+    env.reset()
+    return batched(env, num_envs)
 
 
-def redraw_seconds(num_envs: int) -> Callable[[], Any]:
-    """A call that draws every slot anew."""
-    env: Any = CzEnv() if num_envs == 1 else CzVectorEnv(num_envs)
-    env.reset(seed=0)
-    return lambda: env.reset()
+def _pcgym() -> Any:
+    """Its documentation's CSTR: three states, one input, 100 steps of 0.26 min."""
+    return importlib.import_module("pcgym").make_env(
+        {
+            "N": 100,
+            "tsim": 26,
+            "SP": {"Ca": [0.85] * 50 + [0.9] * 50},
+            "o_space": {"low": np.array([0.7, 300.0, 0.8]), "high": np.array([1.0, 350.0, 0.9])},
+            "a_space": {"low": np.array([295.0]), "high": np.array([302.0])},
+            "x0": np.array([0.8, 330.0, 0.8]),
+            "model": "cstr",
+            "r_scale": {"Ca": 1e3},
+            "normalise_a": True,
+            "normalise_o": True,
+            "noise": True,
+            "noise_percentage": 0.001,
+            "integration_method": "casadi",
+        }
+    )
+
+
+def _sb3_adapter() -> Any:
+    adapter = importlib.import_module("cz_gym.agents.training.vec_env").CzVecEnv
+    return adapter(CzVectorEnv(SB3_SLOTS, autoreset_mode=AutoresetMode.SAME_STEP))
+
+
+_START = "forkserver" if os.name == "posix" else "spawn"
+
+
+def _sb3(kind: str, num_envs: int, **arguments: Any) -> Any:
+    make = getattr(importlib.import_module("stable_baselines3.common.vec_env"), kind)
+    return make([partial(gym.make, "cz_gym:Cz-v0")] * num_envs, **arguments)
 
 
 def _threads(count: int) -> str:

@@ -1,4 +1,4 @@
-"""What ``python -m studies.speed`` measures besides steps: memory a slot, resets, start-up."""
+"""What ``python -m studies.speed`` measures besides steps: memory, resets, start-up, and the share of a training."""
 
 from __future__ import annotations
 
@@ -8,15 +8,18 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-
+from cz_gym.baselines.registry import make_controller
+from cz_gym.env import CzEnv
 from cz_gym.jit.cache import CACHE_VARIABLE
-
-from .cases import redraw_seconds
+from cz_gym.units import MICRO
+from cz_gym.vector import CzVectorEnv
 
 KIB = 1024.0
+_UPDATES = 3
 _FIRST_STEP = """
 import gymnasium, cz_gym
 env = gymnasium.make("Cz-v0")
@@ -30,10 +33,25 @@ from studies.speed.costs import resident
 small, n = CzVectorEnv(8, {scenario!r}, observation={observation!r}), 2048
 small.reset(seed=0); small.step(np.zeros((8, 2))); before = resident()
 env = CzVectorEnv(n, {scenario!r}, observation={observation!r}, threads=1)
-kept = [env.reset(seed=0)]
-for _ in range(4): kept = [*kept, env.step(np.zeros((n, 2)))][-2:]
+results = [env.reset(seed=0)]
+for _ in range(4): results = [*results, env.step(np.zeros((n, 2)))][-2:]
 print((resident() - before) / n)
 """
+
+
+def costs(quick: bool) -> dict[str, float]:
+    """Memory a slot, time of a reset and of the first step in a new process."""
+    found = {"memory_per_slot_randomized_kib": memory_per_slot("randomized", "measured") / KIB}
+    if not quick:
+        found["memory_per_slot_puller_history_kib"] = memory_per_slot("puller", "history") / KIB
+    found["reset_scalar_us"] = reset_seconds(CzEnv(), 21) / MICRO
+    found["reset_1024_us_per_slot"] = reset_seconds(CzVectorEnv(1024), 5) / 1024 / MICRO
+    _python(_FIRST_STEP)
+    found["start_cached_s"] = statistics.median(_start_seconds(None) for _ in range(3))
+    if not quick:
+        with tempfile.TemporaryDirectory() as folder:
+            found["start_cold_s"] = _start_seconds(folder)
+    return found
 
 
 def resident() -> int:
@@ -44,43 +62,35 @@ def resident() -> int:
         return 0
 
 
-def megabytes() -> float:
-    """Memory that is free [MB]; infinite where the system does not say."""
+def available_memory() -> float:
+    """Memory that is free [B]; infinite where the system does not say."""
     try:
         lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-        return int(lines["MemAvailable"].split()[0]) / KIB
+        return int(lines["MemAvailable"].split()[0]) * KIB
     except (OSError, ValueError, KeyError):
         return float("inf")
 
 
 def memory_per_slot(scenario: str, observation: str) -> float:
-    """What a slot costs a process that steps a batch at the default horizon, results held included [B]."""
+    """What a slot costs a process that steps a batch at the default horizon, two results included [B]."""
     return float(_python(_MEMORY.format(scenario=scenario, observation=observation)))
 
 
-def reset_seconds(num_envs: int) -> float:
-    """Time of a reset per slot [s], median."""
-    reset = redraw_seconds(num_envs)
+def reset_seconds(env: Any, repeats: int) -> float:
+    """Time of a reset that draws every slot anew [s], median."""
+    env.reset(seed=0)
     times = []
-    for _ in range(21 if num_envs == 1 else 5):
+    for _ in range(repeats):
         began = time.perf_counter()
-        reset()
-        times.append((time.perf_counter() - began) / num_envs)
+        env.reset()
+        times.append(time.perf_counter() - began)
     return statistics.median(times)
 
 
-def start_seconds(cold: bool) -> tuple[float | None, float]:
-    """Time of import, make, reset and first step in a new process [s]: without and with compiled code at hand."""
-    if not cold:
-        _python(_FIRST_STEP)
-        return None, _time(None)
-    with tempfile.TemporaryDirectory() as folder:
-        return _time(folder), float(np.median([_time(folder) for _ in range(3)]))
-
-
-def _time(folder: str | None) -> float:
+def _start_seconds(cache: str | None) -> float:
+    """Time of import, make, reset and first step in a new process [s]."""
     began = time.perf_counter()
-    _python(_FIRST_STEP, folder)
+    _python(_FIRST_STEP, cache)
     return time.perf_counter() - began
 
 
@@ -90,3 +100,33 @@ def _python(code: str, cache: str | None = None) -> str:
     if done.returncode:
         raise RuntimeError(f"a process that was to be measured failed: {done.stderr.strip()[-300:]}")
     return done.stdout
+
+
+def environment_share() -> float:
+    """Share of the first updates of train.py's own PPO spent in the adapter's step, environment included [-]."""
+    from cz_gym.agents.training.learners import make_learner
+    from cz_gym.agents.training.recipes import PPO
+
+    recipe = PPO()
+    learner: Any = make_learner(recipe, 0, make_controller)
+    algorithm, update = learner.algorithm, recipe.n_steps * recipe.num_envs
+    algorithm.learn(update)
+    spent: list[float] = []
+    slots = algorithm.env.slots
+    slots.step_wait = _timed(slots.step_wait, spent)
+    began = time.perf_counter()
+    algorithm.learn(_UPDATES * update, reset_num_timesteps=False)
+    whole = time.perf_counter() - began
+    algorithm.env.close()
+    return sum(spent) / whole
+
+
+def _timed(step: Callable[..., Any], spent: list[float]) -> Callable[..., Any]:
+    def run(*arguments: Any) -> Any:
+        began = time.perf_counter()
+        try:
+            return step(*arguments)
+        finally:
+            spent.append(time.perf_counter() - began)
+
+    return run

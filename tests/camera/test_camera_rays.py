@@ -42,7 +42,7 @@ def height_of_melt(r: float, scene: Scene) -> float:
     low, high = 1e-9, scene.h_c
     if r <= scene.r_c:
         return math.inf
-    for _ in range(100):
+    for _ in range(60):
         z = 0.5 * (low + high)
         out = scene.r_c + float(profile(z, scene.M) - profile(scene.h_c, scene.M))
         low, high = (z, high) if out > r else (low, z)
@@ -63,11 +63,11 @@ def test_the_profile_is_the_plants(h_c: float) -> None:
 
 
 def test_rays_meet_the_melt_where_marching_says() -> None:
-    """Oracle: bisection between the last point above the surface and the first below, marched in steps of 0.05 mm."""
+    """Oracle: bisection between the last point above the surface and the first below, marched in steps of 0.1 mm."""
     rng = np.random.default_rng(1)
     scene = scene_at()
     met = 0
-    for _ in range(40):
+    for _ in range(25):
         ray = sight(rng.uniform(40, 120), rng.uniform(0, 160), VIEW)
         hit = first_hit(ray, scene.q_c, scene, VIEW)
         if hit.what != MELT:
@@ -80,14 +80,14 @@ def test_rays_meet_the_melt_where_marching_says() -> None:
 
         t = (0.02 - ray.z) / ray.dz
         while above(t):
-            t += 5e-5
-        low, high = t - 5e-5, t
+            t += 1e-4
+        low, high = t - 1e-4, t
         for _ in range(40):
             middle = 0.5 * (low + high)
             low, high = (middle, high) if above(middle) else (low, middle)
         at = np.array([ray.x, ray.y, ray.z]) + low * np.array([ray.dx, ray.dy, ray.dz])
         np.testing.assert_allclose([hit.x, hit.y, hit.z], at, atol=2e-9)
-    assert met > 20
+    assert met > 12
 
 
 def test_reflection_law() -> None:
@@ -176,6 +176,7 @@ def _compiled(row: float, column: float, scene: Scene, view: object) -> float:
     return radiance(sight(row, column, view), scene, view)
 
 
+@pytest.mark.slow
 def test_compiled_equals_uncompiled() -> None:
     rng = np.random.default_rng(3)
     for h_c in (1.2e-3, 4e-3, 6.64e-3, 9.3e-3):

@@ -53,6 +53,19 @@ def test_a_large_batch_holds_the_same_slots_as_a_small_one() -> None:
         np.testing.assert_array_equal(large.step(wide)[0][500:503], small.step(action)[0])
 
 
+def test_a_masked_reset_of_a_batch_with_padded_info_keeps_the_other_slots() -> None:
+    env = CzVectorEnv(64, horizon=600.0)
+    env.reset(seed=0)
+    before = env.step(np.full((64, 2), 0.1))
+    mask = np.arange(64) % 3 == 0
+    observation, info = env.reset(options={"reset_mask": mask})
+    np.testing.assert_array_equal(observation[~mask], before[0][~mask])
+    assert not np.array_equal(observation[mask], before[0][mask])
+    assert info["r_c"].shape == (64,)
+    assert info["_r_c"].tolist() == mask.tolist()
+    np.testing.assert_array_equal(env._out.info[0, :64][~mask], before[4]["r_c"][~mask])
+
+
 def test_the_reset_mask_is_copied_and_the_rest_goes_on() -> None:
     env = CzVectorEnv(3, autoreset_mode="Disabled", horizon=10.0)
     env.reset(seed=0)

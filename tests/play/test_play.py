@@ -11,18 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cz_gym import CzEnv, agents
+from cz_gym import CzEnv
 from cz_gym.baselines.registry import find_controller
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.play import __main__ as play
 from cz_gym.play import game as hand
-from cz_gym.play.score import Played
-from cz_gym.rendering import backend, palette
+from cz_gym.play.score import score
+from cz_gym.rendering import backend
 from cz_gym.rendering.view import Window
 from cz_gym.units import KILO, MM_PER_MIN
-from studies.film import __main__ as film
 
 pygame = pytest.importorskip("pygame")
 SIZE = (480, 360)
@@ -96,7 +95,7 @@ def test_a_whole_run_in_the_window_ends_with_the_score(game: hand.Game) -> None:
     def watch(picture: Any) -> None:
         show(picture)
         shown.append(int(pygame.surfarray.array3d(game.window.screen).max()))
-        if game.outcome is not None:
+        if game.score is not None:
             press(pygame.K_q)
 
     game.window.show = watch  # type: ignore[method-assign]
@@ -104,7 +103,7 @@ def test_a_whole_run_in_the_window_ends_with_the_score(game: hand.Game) -> None:
     assert max(shown) > 200
     assert outcome.minutes == 10.0
     paper = metrics(rollout(game.rival, game.config, [1]))
-    assert outcome.rival == (paper.rmse_mm[0], paper.return_[0], False)
+    assert outcome.controller == (paper.rmse_mm[0], paper.return_[0], False)
     assert "by hand" in outcome.line()
 
 
@@ -136,29 +135,30 @@ def test_nothing_played_has_no_score(game: hand.Game) -> None:
 @pytest.mark.parametrize("seed", [1, 12])
 def test_the_score_of_the_same_controller_is_a_draw(config: Config, seed: int) -> None:
     paper = find_controller("paper").make(config)
-    env, state, over = CzEnv(config.scenario, horizon=config.horizon), None, False
-    observation, info = env.reset(seed=seed)
-    played = Played(config, seed, info)
+    env, state, actions, rewards, over = CzEnv.from_config(config), None, [], [], False
+    observation, _ = env.reset(seed=seed)
     while not over:
         action, state = paper.predict(observation, state)
-        observation, reward, terminated, over, info = env.step(action)
-        played.add(info, reward, terminated)
-    outcome = played.against(paper)
-    assert outcome.mine == pytest.approx(outcome.rival, rel=1e-12)
+        actions.append(action)
+        observation, reward, _, over, _ = env.step(action)
+        rewards.append(reward)
+    found = score(config, seed, actions, False, paper)
+    assert found.player == pytest.approx(found.controller, rel=1e-12)
+    assert found.player.reward == pytest.approx(sum(rewards), rel=1e-12)
 
 
-def test_a_failed_run_counts_to_the_horizon(config: Config) -> None:
-    long = make_config("nominal", horizon=5400.0)
-    env, over = CzEnv("nominal", horizon=5400.0), False
-    _, info = env.reset(seed=1)
-    played = Played(long, 1, info)
+def test_a_failed_run_counts_to_the_horizon() -> None:
+    config = make_config("nominal", horizon=5400.0)
+    env, actions, over = CzEnv.from_config(config), [], False
+    env.reset(seed=1)
     while not over:
-        _, reward, over, _, info = env.step(np.array([1.0, 0.0], np.float32))
-        played.add(info, reward, over)
-    run = played.rollout()
-    assert run.failed.all()
-    assert run.config.horizon == 5400.0
-    assert played.against(find_controller("paper").make(long)).mine.rmse_mm > 4.0
+        actions.append(np.array([1.0, 0.0], np.float32))
+        over = env.step(actions[-1])[2]
+    found = score(config, 1, actions, True, find_controller("paper").make(config))
+    assert found.player.failed
+    assert found.minutes == 90.0
+    assert found.player.rmse_mm > 4.0
+    assert "(failed)" in found.line()
 
 
 @pytest.mark.parametrize(
@@ -213,88 +213,13 @@ def test_the_command_prints_the_score(monkeypatch: pytest.MonkeyPatch, capsys: p
     def play_on(self: hand.Game) -> list[Any]:
         handle(self, pygame.K_SPACE)
         self.advance(1e4)
-        return self.outcomes
+        return self.scores
 
     monkeypatch.setattr(hand.Game, "play", play_on)
     assert play.main(["--minutes", "5", "--size", "480x360"]) == 0
     assert capsys.readouterr().out.startswith("randomized, crystal 1, 5 min: RMSE of the true radius ")
 
 
-def test_an_interrupt_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def stop(*arguments: Any) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(hand.Game, "play", stop)
-    assert play.main([]) == 130
-    assert capsys.readouterr().err.count("\n") == 1
-
-
-@pytest.mark.parametrize("module", [play, film])
-def test_help_and_wrong_options(module: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    for options, code in ((["--help"], 0), (["--frobnicate"], 2), (["--see", "1"], 2)):
-        with pytest.raises(SystemExit) as stop:
-            module.main(options)
-        assert stop.value.code == code
-    assert capsys.readouterr().err.count("\n") == 2
-
-
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        (["--frames", "1"], "--frames must be 2 to 1000"),
-        (["--seed", "-3"], "--seed must not be negative"),
-        (["--out", "film.mp4"], "--out must end in .gif"),
-        (["--scenario", "nonsense"], "unknown scenario"),
-    ],
-)
-def test_a_film_of_nothing_is_one_line(
-    options: list[str], says: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert film.main(options if "--out" in options else [*options, "--out", "new/film.gif"]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert says in said
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_short_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    Image = pytest.importorskip("PIL.Image")
-    pytest.importorskip("onnxruntime")
-    out = tmp_path / "new" / "film.gif"
-    agent = min(agents.MODELS.glob("*.onnx"))
-    assert film.main(["--frames", "3", "--agent", str(agent), "--out", str(out)]) == 0
-    with Image.open(out) as picture:
-        assert picture.n_frames == 3
-        assert picture.size == film.SIZE
-        assert picture.info["loop"] == 0
-        picture.seek(2)
-        last = np.asarray(picture.convert("RGB"), np.float64)
-    # The ring's marker is some fifty pixels in four hundred thousand, and keeps its colour all the same.
-    assert (np.linalg.norm(last - palette.CAMERA, axis=-1) < 40.0).sum() > 30
-    assert "3 frames" in capsys.readouterr().out
-
-
-def test_the_film_shows_the_shipped_agent_unless_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("onnxruntime")
-    agent = min(agents.MODELS.glob("*.onnx"))
-    monkeypatch.setattr("cz_gym.agents.shipped", lambda: agent)
-    _, learned = film.contestants("randomized")
-    assert learned.policy.contract.sha256 == agents.OnnxPolicy.load(agent).contract.sha256
-    assert learned.name == f"learned: {learned.policy.contract.algorithm}"
-
-
-def test_a_film_of_no_agent_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("PIL.Image")
-    assert film.main(["--agent", str(tmp_path / "none.onnx"), "--out", str(tmp_path / "film.gif")]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert "none.onnx" in said
-    assert not list(tmp_path.iterdir())
-
-
 def test_playing_loads_no_learning_package() -> None:
-    code = (
-        "import sys, cz_gym.play, studies.film; assert not {'torch', 'pygame', 'PIL', 'onnxruntime'} & set(sys.modules)"
-    )
+    code = "import sys, cz_gym.play; assert not {'torch', 'pygame', 'PIL', 'onnxruntime'} & set(sys.modules)"
     subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=ROOT, check=True)

@@ -18,21 +18,19 @@ from studies.film import __main__ as film
 from studies.industrial import __main__ as industrial
 from studies.paper import __main__ as paper
 from studies.speed import __main__ as speed
-from studies.speed import rendering
 from studies.young_laplace import __main__ as young_laplace
 
 COMMANDS: list[tuple[Any, str, str, list[str]]] = [
     (benchmark, "--episode", "benchmark", ["--out", "new/folder"]),
-    (paper, "--ou", "_compute", ["--out", "new/folder"]),
+    (paper, "--ou", "contents", ["--out", "new/folder"]),
     (tune_pid, "--trial", "measure", ["--controller", "industrial", "--out", "new/folder"]),
     (tune_lqg, "--hist", "figures", ["--output", "new/folder/lqg.json"]),
     (design_table, "--puller", "table", ["--out", "new/folder"]),
     (industrial, "--episode", "rollout", []),
-    (speed, "--qui", "run", ["--quick", "--json", "new/speed.json"]),
+    (speed, "--qui", "run", ["--quick"]),
     (young_laplace, "--wri", "build", ["--write"]),
     (play, "--minute", "settings", []),
     (film, "--frame", "film", ["--out", "new/film.gif"]),
-    (rendering, "--round", "measure", []),
 ]
 """Each with the beginning of an option, the function that does its work, and arguments that would write a file."""
 

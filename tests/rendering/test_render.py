@@ -21,8 +21,8 @@ from hypothesis import strategies as st
 import cz_gym
 from cz_gym import CzEnv, Parameters
 from cz_gym.rendering import backend
-from cz_gym.rendering.view import MODES, check_size
-from studies.speed import rendering as speed
+from cz_gym.rendering.scene import check_size
+from cz_gym.rendering.view import MODES
 
 pygame = pytest.importorskip("pygame")
 ROOT = Path(__file__).parents[2]
@@ -213,21 +213,3 @@ def test_a_window_that_cannot_open_is_one_clear_error(monkeypatch: pytest.Monkey
     env = CzEnv(render_mode="human")
     with pytest.raises(gym.error.Error, match=r"cannot open a window: .*rgb_array"):
         env.reset(seed=1)
-
-
-def test_the_speed_of_pictures_is_measured(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(speed, "FRAMES", 2)
-    assert speed.main(["--size", "400x360", "--rounds", "1"]) == 0
-    _, *lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 3
-    assert all(float(figure) > 0.0 for line in lines for figure in line.split()[-2:])
-
-
-@pytest.mark.parametrize(
-    ("options", "says"), [(["--rounds", "0"], "--rounds must be 1 to 100"), (["--size", "1"], "--size must be WxH")]
-)
-def test_no_speed_of_nothing(options: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert speed.main(options) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert says in said

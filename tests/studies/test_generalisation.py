@@ -77,11 +77,6 @@ def test_what_cannot_be_tabulated_is_one_line(
     assert error.count("\n") == 1
 
 
-def test_no_folder_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert generalisation.main([str(tmp_path / "none")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-
-
 def test_the_page_shows_the_committed_table() -> None:
     root = Path(__file__).parents[2]
     table = (root / "results" / "generalisation" / "table.md").read_text().partition("\n")[2].strip()

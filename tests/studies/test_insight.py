@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -20,22 +21,22 @@ from cz_gym.agents.training.recipes import ActionHead, Imitation
 from cz_gym.baselines import CompensatedPID
 from cz_gym.baselines.analysis.frequency import frequencies, margins_of, opened
 from cz_gym.baselines.analysis.frequency import response as theirs
-from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.analysis.sampled_loop import Loop, close, root_mean_square, sampled_plant
 from cz_gym.baselines.registry import find_controller
 from cz_gym.episodes.scenarios import HARD, PULLER, RANDOMIZED
-from cz_gym.observation import HISTORY, MEASURED
+from cz_gym.observation import HISTORY
 from cz_gym.physics.plant import make_puller
 from cz_gym.units import MM, MM_PER_MIN
 from studies.insight import __main__ as insight
 from studies.insight.figures import gain_figure, jump_figure, loop_figure, response_figure, share_figure
-from studies.insight.linear_agent import SEEN, jacobian, linear_agent
-from studies.insight.loop import Responses, after_one, response
-from studies.insight.report import Found, as_json, as_markdown
+from studies.insight.linear_agent import AT, jacobian, linear_agent
+from studies.insight.loop import Contender, apart, noise_gains, one_reading, response
+from studies.insight.report import answer_figures, as_json, as_markdown, jump_figures
 from studies.insight.step_tests import (
     JUMPS,
     LIMITS,
-    TRIALS,
+    STEP_TESTS,
+    Event,
     Limit,
     Survival,
     crystal,
@@ -51,7 +52,6 @@ OMEGA = np.geomspace(1e-4, np.pi / DT, 9)
 PATH = agents.shipped()
 REST = np.eye(len(HISTORY))[1]
 """Nothing but a valid camera."""
-AT = [[channel.name for channel in MEASURED].index(name) for name in SEEN]
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,7 @@ def test_a_linear_agent_moves_as_the_agent_does_after_a_small_jump(near: Any) ->
     policy = agents.OnnxPolicy.load(PATH, config)
     limit = LIMITS[0]
     jump = 0.001 * MM
-    with_it, without = (run_events(policy, config, limit.events[1:], [size]).signals for size in (jump, 0.0))
+    with_it, without = (run_events(policy, config, (limit.event,), [size]).signals for size in (jump, 0.0))
     moved = (with_it.v_p - without.v_p)[120:, 0]
     loop = close(near.state_space(), make_puller(lam=0.5), DT)
     x, expected = np.zeros(len(loop.A)), [0.0]  # the sample of the jump itself was taken before it
@@ -105,10 +105,9 @@ def test_a_linear_agent_moves_as_the_agent_does_after_a_small_jump(near: Any) ->
 @pytest.mark.parametrize("at", ["camera", "v_p"])
 @pytest.mark.parametrize("name", ["lqg", "paper-tuned"])
 def test_loops_are_opened_as_the_design_table_opens_them(name: str, at: str) -> None:
-    form, puller = linear_form(find_controller(name).make(crystal(1.0, "measured"))), make_puller(lam=0.5)
-    plant = response(sampled_plant(puller, DT), DT, OMEGA)[:, 1:, :2]
-    loop = Responses(OMEGA, response(form.controller, DT, OMEGA)[:, :, AT], plant, DT)
-    assert np.allclose(loop.opened(at), theirs(opened(form.controller, puller, DT, at), DT, OMEGA), rtol=1e-8)
+    controller, puller = insight.controller(name).system, make_puller(lam=0.5)
+    loop = insight.controller(name).loop(OMEGA, 0.5, DT)
+    assert np.allclose(loop.opened(at), theirs(opened(controller, puller, DT, at), DT, OMEGA), rtol=1e-8)
 
 
 def test_the_mean_derivative_is_the_mean_of_derivatives() -> None:
@@ -118,22 +117,14 @@ def test_the_mean_derivative_is_the_mean_of_derivatives() -> None:
 
 
 def test_one_reading_is_answered_as_the_loops_own_simulation_does() -> None:
-    form = linear_form(find_controller("lqg").make(crystal(1.0, "measured")))
-    loop = close(form.controller, make_puller(lam=0.5), DT)
-    at, row = loop.inputs.index("camera"), loop.outputs.index("v_p")
-    found = after_one(loop.A, loop.B[:, [at]], loop.C[[row]], loop.D[np.ix_([row], [at])], 40)
+    loop = close(insight.controller("lqg").system, make_puller(lam=0.5), DT)
     _, (expected,) = dimpulse((*loop.pick("v_p", ("camera",)), DT), n=40)
-    assert found == pytest.approx(expected, rel=1e-9, abs=1e-15)
+    assert one_reading(insight.controller("lqg"), DT)[:40, :1] == pytest.approx(expected, rel=1e-9, abs=1e-15)
 
 
 def test_noise_gains_are_those_of_the_lyapunov_equation() -> None:
-    form = linear_form(find_controller("lqg").make(crystal(1.0, "measured")))
-    contender = insight.Contender(
-        "lqg", "measured", lambda config: None, form.controller,
-        lambda omega: response(form.controller, DT, omega)[:, :, AT],
-    )  # fmt: skip
-    pull = close(form.controller, make_puller(lam=0.5), DT).pick("v_p", ("camera",))
-    found = insight.noise_gains(contender, DT)
+    pull = close(insight.controller("lqg").system, make_puller(lam=0.5), DT).pick("v_p", ("camera",))
+    found = noise_gains(insight.controller("lqg"), DT)
     assert found["pull_mm_per_min_per_mm"] == pytest.approx(root_mean_square(pull) / (MM_PER_MIN / MM), rel=2e-3)
     steps = root_mean_square(pull, difference=True) / (MM_PER_MIN / MM)
     assert found["pull_step_mm_per_min_per_mm"] == pytest.approx(steps, rel=2e-3)
@@ -142,7 +133,7 @@ def test_noise_gains_are_those_of_the_lyapunov_equation() -> None:
 def test_events_happen_when_and_as_large_as_they_are_said() -> None:
     config = crystal(30.0, "measured")
     quiet = CompensatedPID()
-    interface, load, reference, noise = (run_events(quiet, config, t.events, [t.amplitude, 0.0]) for t in TRIALS)
+    interface, load, reference, noise = (run_events(quiet, config, t.events, [t.amplitude, 0.0]) for t in STEP_TESTS)
     at = round(600.0 / DT)
     for course in (interface, load):
         different = course.signals.v_g[:, 0] != course.signals.v_g[:, 1]
@@ -162,11 +153,11 @@ def test_survival_is_found_where_it_lies() -> None:
         def predict(self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True):
             return np.zeros((len(observation), 2), np.float32), None
 
-    lost = Limit("lost", "jump beyond the limit at once", "mm", MM, 16.0 * MM, LIMITS[0].events[1:])
+    lost = Limit("lost", "jump beyond the limit at once", "mm", MM, 16.0, LIMITS[0].event)
     found = survive(Still(), lost, "measured")
     assert 7.0 < found.least <= found.largest <= found.most <= 8.0
     assert not found.capped
-    never = Limit("never", "nothing", "mm", MM, 4.0 * MM, ())
+    never = Limit("never", "nothing", "mm", MM, 4.0, Event(0.0, lambda slot, amplitude: None))
     assert survive(CompensatedPID(), never, "measured") == Survival(4.0, 4.0, 4.0, True)
 
 
@@ -188,56 +179,66 @@ def test_a_linear_controller_answers_every_small_jump_alike_and_the_agent_none_o
     assert agent[-1] < 0.5 * agent[0]
 
 
-def test_pictures_and_tables_say_what_was_found(near: Any) -> None:
+@pytest.fixture(scope="module")
+def answers() -> dict[str, dict[str, Any]]:
     config = crystal(21.0, "measured")
     policy = find_controller("paper-tuned").make(config)
-    answers = {trial.name: {"one": respond(policy, config, trial)} for trial in TRIALS}
-    omega = frequencies(DT, 60)
-    plant = response(sampled_plant(make_puller(), DT), DT, omega)[:, 1:, :2]
-    responses = {"one": Responses(omega, near.response(omega), plant, DT)}
+    return {test.name: {"one": respond(policy, config, test)} for test in STEP_TESTS}
+
+
+@pytest.fixture(scope="module")
+def loop(near: Any) -> Any:
+    one = Contender("one", "history", lambda _: None, near.state_space(), near.response)
+    return one.loop(frequencies(DT, 60), 1.0, DT)
+
+
+JUMPED = {"one": [np.ones(len(JUMPS)), np.ones(len(JUMPS))]}
+
+
+@pytest.mark.slow
+def test_pictures(answers: Any, loop: Any) -> None:
     for picture in (
-        response_figure(answers, TRIALS, DT),
-        gain_figure(
-            {
-                "one": after_one(
-                    *sampled_plant(make_puller(), DT)[:1], np.ones((5, 1)), np.ones((2, 5)), np.zeros((2, 1)), 5
-                )
-            },
-            responses,
-            DT,
-        ),
-        jump_figure({"one": (np.ones(len(JUMPS)), np.ones(len(JUMPS)))}, JUMPS),
-        loop_figure(responses, 0.02),
-        share_figure(answers["load"], responses, "load"),
+        response_figure(answers, DT),
+        gain_figure({"one": np.ones((5, 2))}, {"one": loop}, DT),
+        jump_figure(JUMPED),
+        loop_figure({"one": loop}, 0.02),
+        share_figure(answers["load"], {"one": loop}, "load"),
     ):
         assert picture.startswith(b"\x89PNG")
-    row = insight.Margins("one", "Model I", "v_p", np.inf, *margins_of(responses["one"].opened("v_p"), omega, DT, True))
-    limits = {"one": {limit.name: Survival(1.5, 1.25, 2.0, True) for limit in LIMITS}}
-    parts = {"one": {"latency": {"rmse_observable_mm": 0.1, "failure_rate": 0.25}}}
-    gains = {"one": {"pull": 1.0, "step": 2.0, "heater": 3.0}}
-    found = Found(
-        read_agent(PATH)[0],
-        answers,
-        [row],
-        gains,
-        limits,
-        parts,
-        4,
-        "two",
-        {"one": {"pull speed": (0.0, 0.01, 0.5, 2.0)}},
-        {"one": (np.ones(len(JUMPS)), np.ones(len(JUMPS)))},
-    )
-    assert json.loads(as_json(found))["margins"][0]["controller"] == "one"
-    assert "| latency | 0.100 mm, 25 % lost |" in as_markdown(found)
-    assert "| one | pull speed | 0 % | 1 % | 50 % | 200 % |" in as_markdown(found)
-    assert "| 1.5 (1.25 to over 2) |" in as_markdown(found)
+
+
+def test_tables_say_what_was_found(answers: Any, loop: Any) -> None:
+    margins = {"controller": "one", "plant": "Model I", "at": "v_p", "growth": np.inf}
+    found = {
+        "agent": asdict(read_agent(PATH)[0]),
+        "answers": {name: {"one": answer_figures(by["one"])} for name, by in answers.items()},
+        "margins": [margins | margins_of(loop.opened("v_p"), loop.omega, DT, False)._asdict()],
+        "noise_gain": {"one": {"pull": 1.0, "step": 2.0, "heater": 3.0}},
+        "apart": {"from": "two", "one": {"pull speed": (0.0, 0.01, 0.5, 2.0)}},
+        "jumps": jump_figures(JUMPED),
+        "limits": {"one": {limit.name: Survival(1.5, 1.25, 2.0, True)._asdict() for limit in LIMITS}},
+        "puller_parts": {
+            "validation_episodes": 4,
+            "one": {"latency": {"rmse_observable_mm": 0.1, "failure_rate": 0.25}},
+        },
+    }
+    (row,) = json.loads(as_json(found))["margins"]
+    assert (row["controller"], row["growth"], row["gain_up"]) == ("one", None, None)
+    text = as_markdown(found)
+    for line in (
+        "| latency | 0.100 mm, 25 % lost |",
+        "| one | pull speed | 0 % | 1 % | 50 % | 200 % |",
+        "| 1.5 (1.25 to over 2) |",
+        "| - | - | - | - | - |",
+    ):
+        assert line in text
 
 
 def test_gains_are_apart_from_others_and_not_from_themselves(near: Any) -> None:
-    mine = insight.Contender("one", "history", lambda _: None, near.state_space(), near.response)
-    twice = mine._replace(answer=lambda omega: near.response(omega) * np.array([2.0, 1.0, 1.0, 1.0]))
+    mine = Contender("one", "history", lambda _: None, near.state_space(), near.response)
+    twice = mine._replace(response=lambda omega: near.response(omega) * np.array([2.0, 1.0, 1.0, 1.0]))
     for other, deviation in ((mine, 0.0), (twice, 1.0)):
-        for values in insight.apart(other, mine, DT).values():
+        for values in apart(other, mine, DT).values():
             assert values == pytest.approx([deviation] * 4, abs=1e-12)
 
 

@@ -12,7 +12,7 @@ from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from cz_gym.testing.checker import Checked, NotConforming, check_vector_env, main
-from cz_gym.testing.nested_arrays import HOLDERS, Leaf, difference, hold, leaves
+from cz_gym.testing.nested_arrays import KEEPERS, NamedArray, difference, flatten, keep
 
 MODES = list(AutoresetMode)
 
@@ -244,9 +244,9 @@ BROKEN: dict[type[Conforming], str] = {
     Alike: "slots 0 and 1 have the same first observation",
     SeedList: "seed list: slot 1 with seed 14 differs",
     Repeating: "the same first observations",
-    Rewards32: "reward must be float64 of shape .3,., is float32",
-    Observations64: "the observation is not in observation_space",
-    Unmasked: "info 'far' needs a mask '_far'",
+    Rewards32: "reward is float32 .3,. and float64 .3,.",
+    Observations64: r"observation\['t'\] is float64 .* and float32",
+    Unmasked: r"info\['_far'\] is in one only",
     Reward: r"reward of slot 1 is .* and",
     Timeout: "terminated of slot . is True and False",
     Info: r"info\['far'\] of slot 0 is",
@@ -268,7 +268,7 @@ SHOWN_IN = {Mode: AutoresetMode.SAME_STEP, Final: AutoresetMode.SAME_STEP, Reset
 @pytest.mark.parametrize("mode", MODES)
 def test_gymnasiums_own_vector_conforms(mode: AutoresetMode) -> None:
     checked = check_vector_env(Conforming, Walk, steps=40, modes=[mode])
-    assert checked.steps == 5 * 40
+    assert checked.steps == 4 * 40
     assert checked.episodes > checked.failures > 10
     assert checked.held > 40 * 4
 
@@ -319,24 +319,24 @@ def test_bad_arguments_are_refused(arguments: dict[str, Any]) -> None:
         check_vector_env(Conforming, Walk, **arguments)
 
 
-@pytest.mark.parametrize("number", range(len(HOLDERS)))
+@pytest.mark.parametrize("number", range(len(KEEPERS)))
 @pytest.mark.parametrize("dtype", [np.float32, np.bool_])
-def test_every_holder_sees_a_later_write(number: int, dtype: type) -> None:
+def test_every_way_to_keep_an_array_sees_a_later_write(number: int, dtype: type) -> None:
     array = np.zeros((3, 2), dtype)
-    held = hold(Leaf("x", array), number)
-    assert held.holder == HOLDERS[number][0]
-    assert held.unchanged()
+    kept = keep(NamedArray("x", array), number)
+    assert kept.keeper == list(KEEPERS)[number]
+    assert kept.unchanged
     array[2, 1] = 1
-    assert not held.unchanged()
+    assert not kept.unchanged
 
 
 def test_differences_in_words() -> None:
     one = {"a": np.array([1.0, np.nan]), "_a": np.array([True, False])}
-    assert difference(leaves(one), leaves(one)) is None
+    assert difference(flatten(one), flatten(one)) is None
     other = {"a": np.array([1.0, 7.0]), "_a": np.array([True, False])}
-    assert difference(leaves(one), leaves(other)) == "a of slot 1 is nan and 7.0"
-    assert difference(leaves(one), leaves(other), masked=True) is None
-    assert difference(leaves(np.zeros(2)), leaves(np.zeros(3))) == " is float64 (2,) and float64 (3,)"
+    assert difference(flatten(one), flatten(other)) == "a of slot 1 is nan and 7.0"
+    assert difference(flatten(one), flatten(other), masked=True) is None
+    assert difference(flatten(np.zeros(2)), flatten(np.zeros(3))) == " is float64 (2,) and float64 (3,)"
 
 
 @pytest.mark.parametrize("argv", [["--steps", "3"], ["--slots", "1"], ["--stepps", "60"]])

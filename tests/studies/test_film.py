@@ -1,0 +1,76 @@
+"""The film: a short one, whose agent it shows, and what it says when it cannot."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cz_gym import agents
+from cz_gym.rendering import palette
+from studies.film import __main__ as film
+
+pytest.importorskip("pygame")
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--frames", "1"], "--frames must be 2 to 1000"),
+        (["--seed", "-3"], "--seed must not be negative"),
+        (["--out", "film.mp4"], "--out must end in .gif"),
+        (["--scenario", "nonsense"], "unknown scenario"),
+    ],
+)
+def test_a_film_of_nothing_is_one_line(
+    options: list[str], says: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert film.main(options if "--out" in options else [*options, "--out", "new/film.gif"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert says in said
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_short_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Image = pytest.importorskip("PIL.Image")
+    pytest.importorskip("onnxruntime")
+    out = tmp_path / "new" / "film.gif"
+    agent = min(agents.MODELS.glob("*.onnx"))
+    assert film.main(["--frames", "3", "--agent", str(agent), "--out", str(out)]) == 0
+    with Image.open(out) as picture:
+        assert picture.n_frames == 3
+        assert picture.size == film.SIZE
+        assert picture.info["loop"] == 0
+        picture.seek(2)
+        last = np.asarray(picture.convert("RGB"), np.float64)
+    # The ring's marker is some fifty pixels in four hundred thousand, and keeps its colour all the same.
+    assert (np.linalg.norm(last - palette.CAMERA, axis=-1) < 40.0).sum() > 30
+    assert "3 frames" in capsys.readouterr().out
+
+
+def test_the_film_shows_the_shipped_agent_unless_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("onnxruntime")
+    agent = min(agents.MODELS.glob("*.onnx"))
+    monkeypatch.setattr("cz_gym.agents.shipped", lambda: agent)
+    _, learned = film.contestants("randomized", 1)
+    assert learned.policy.contract.sha256 == agents.OnnxPolicy.load(agent).contract.sha256
+    assert learned.name == f"learned: {learned.policy.contract.algorithm}"
+
+
+def test_a_film_of_no_agent_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("PIL.Image")
+    assert film.main(["--agent", str(tmp_path / "none.onnx"), "--out", str(tmp_path / "film.gif")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "none.onnx" in said
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_loads_no_learning_package() -> None:
+    code = "import sys, studies.film.__main__; assert not {'torch', 'pygame', 'PIL'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=Path(__file__).parents[2], check=True)
