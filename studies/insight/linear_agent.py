@@ -86,7 +86,7 @@ def linear_agent(onnx_bytes: bytes, observations: npt.ArrayLike, dt: float, v_0:
     # "history" holds differences: of some channels to others, of each span's mean to that of the span after it.
     for channel, to, _ in zip(*relative(), strict=True):
         now[:, to] -= slopes[:, channel]
-    now[:, [_AT[at] for at in _REMEMBERED]] -= spans[:, 0]
+    now[:, [AT[at] for at in _REMEMBERED]] -= spans[:, 0]
     means = spans - np.concatenate([spans[:, 1:], np.zeros((2, 1, len(LAGGED)))], axis=1)
     return LinearAgent(now, integral, means, dt)
 
