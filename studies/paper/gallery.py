@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 from matplotlib.figure import Figure
 
+from cz_gym.evaluation.report.canvas import small
+
 from . import beyond_figures, figures
 
 DIAGRAMS = Path(__file__).parent / "diagrams"
@@ -31,7 +33,7 @@ class Shown(NamedTuple):
             return (DIAGRAMS / self.file).read_bytes()
         image = io.BytesIO()
         self.draw().savefig(image, dpi=DPI, format="png")
-        return image.getvalue()
+        return small(image)
 
 
 FIGURES = tuple(
