@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Truth, design_rates
-from scipy.integrate import solve_ivp
+from conftest import Truth, integrated
 
 from cz_gym import CzEnv, CzVectorEnv, Parameters, make_puller
 from cz_gym.config import make_config
@@ -138,12 +137,8 @@ def _visited(n: int) -> list[tuple[State, Inputs, Disturbance, Any]]:
 
 def _error(x: State, u: Inputs, d: Disturbance, p: Any, dt: float) -> float:
     """Relative error of one RK4 step against DOP853 at its tightest."""
-    new = np.array(rk4(x, u, d, p, dt, HURLE.slope))
-    truth = Truth(u.v_p, u.Q_H, d.Q_d, d.dT_i, d.melt)
-    solved = solve_ivp(
-        lambda _, y: design_rates(y, truth, p), (0.0, dt), np.array(x), method="DOP853", rtol=1e-13, atol=1e-16
-    )
-    return float(np.abs(new / solved.y[:, -1] - 1).max())
+    exact = integrated(x, Truth(*u, *d), p, dt, atol=1e-16).y[:, -1]
+    return float(np.abs(np.array(rk4(x, u, d, p, dt, HURLE.slope)) / exact - 1).max())
 
 
 def test_steps_from_states_that_adversaries_reach_are_exact_enough() -> None:
@@ -168,14 +163,10 @@ def test_no_freezing_is_missed(excess: float, bound: float, pull: float) -> None
     """
     p, fates, worst = make_puller(), set(), 0.0
     d, u = Disturbance(0.0, 0.0, 1.0), Inputs(pull * p.v_0, p.Q_H_0)
-    truth = Truth(u.v_p, u.Q_H)
     for height in np.arange(1.2, 2.6, 0.02):
         x = State(p.r_0, height * MM, p.T_1_0 - 60.0, p.T_2_0 - 40.0, p.T_m + excess)
         new, grows = _substep(x, u, d, p, 5.0, p.r_0, HURLE.slope)
-        solved = solve_ivp(
-            lambda _, y: design_rates(y, truth, p), (0.0, 5.0), np.array(x), method="DOP853", rtol=1e-12,
-            events=_frozen,
-        )  # fmt: skip
+        solved = integrated(x, Truth(*u), p, 5.0, rtol=1e-12, atol=1e-6, events=_frozen)
         close = abs(solved.y[1, -1] - HEIGHT_MIN) < 5e-3 * MM and solved.t[-1] > 4.9
         assert grows == (solved.status == 0) or close
         assert grows or new.h_c < HEIGHT_MIN or new.h_c == x.h_c

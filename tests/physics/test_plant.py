@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import HOUR, Truth, View, design_rates, hold
+from conftest import HOUR, Truth, View, design_rates, hold, integrated
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from cz_gym import SCENARIOS, CzEnv, Parameters, Puller, Scenario, State, make_puller
@@ -21,14 +20,6 @@ from cz_gym.physics.plant import NO_DISTURBANCE, Disturbance, Inputs, growth, hi
 MIXES = [0.0, 0.3, 1.0]
 SPREAD = st.floats(0.85, 1.15)
 MELTING = replace(SCENARIOS["puller"], name="puller without limits", actuators=Actuators())
-
-
-def integrated(x: np.ndarray, u: Truth, p: Any, dt: float) -> np.ndarray:
-    """SciPy's answer on the design's equations."""
-    solution = solve_ivp(
-        lambda t, y: design_rates(y, u, p), (0, dt), x, method="DOP853", rtol=1e-13, atol=1e-16 * np.abs(x)
-    )
-    return solution.y[:, -1]
 
 
 @pytest.fixture
@@ -108,7 +99,7 @@ def test_runge_kutta_is_of_fourth_order() -> None:
     p = make_puller(lam=0.7)
     x = np.array([p.r_0, 0.8 * p.h_0, p.T_1_0 + 5, p.T_2_0, p.T_b_0 + 2])
     u, d = Inputs(1.2 * p.v_0, p.Q_H_0 + 8000.0), Disturbance(500.0, 0.3, 0.95)
-    exact = integrated(x, Truth(*u, *d), p, 240.0)
+    exact = integrated(x, Truth(*u, *d), p, 240.0).y[:, -1]
     steps = np.array([10.0, 15.0, 20.0, 30.0, 40.0])
     errors = []
     for dt in steps:
@@ -137,7 +128,7 @@ def test_an_hour_of_driven_motion_agrees_with_scipy(interval: float, scenario: s
             j = int(t // 5.0)
             upto = min(5.0 * (j + 1), (k + 1) * interval)
             d = disturbance(5.0 * j, saved.interface[j], e, p)
-            x = integrated(x, Truth(info["v_p"], info["Q_H"], *d), p, upto - t)
+            x = integrated(x, Truth(info["v_p"], info["Q_H"], *d), p, upto - t).y[:, -1]
             t = upto
         ours = [info["r_c"], info["h_c"], info["T_1"], x[3], info["T_b"]]
         worst = max(worst, np.abs(np.array(ours) / x - 1).max())

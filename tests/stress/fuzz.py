@@ -27,7 +27,7 @@ from cz_gym.agents.training import recipes
 from cz_gym.agents.training.checkpoint import load_checkpoint, restore, to_bytes
 from cz_gym.agents.training.learners import make_training
 from cz_gym.agents.training.run_files import COLUMNS, read_rows, saved_steps
-from cz_gym.evaluation.cache import slow_controllers as kept
+from cz_gym.evaluation.cache import read_episode
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.rollout import Signals
 from cz_gym.jit.cache import Store
@@ -88,7 +88,7 @@ def targets(folder: Path) -> dict[str, Target]:
             reader(folder / "settings.json", lambda path: saved_steps(path.parent)),
         ),
         "progress.csv": Target(_csv().encode(), reader(folder / "progress.csv", read_rows)),
-        "kept episode": Target(_episode(), reader(folder / "0.npz", lambda path: kept.read(path, True))),
+        "cached episode": Target(_episode(), reader(folder / "0.npz", lambda path: read_episode(path, True))),
         "compiled code": Target(store.path("key").read_bytes(), reader(store.path("key"), read_code)),
     }
 
@@ -125,7 +125,7 @@ def mutant(kind: str, seed: bytes, rng: np.random.Generator) -> bytes:
         "settings.json": _odd_json,
         "checkpoint": _odd_header,
         "sac checkpoint": _odd_header,
-        "kept episode": _odd_archive,
+        "cached episode": _odd_archive,
     }.get(kind, _odd_bytes)
     return (change if rng.random() < 0.5 else _odd_bytes)(seed, rng)
 
@@ -170,7 +170,7 @@ def _odd_header(seed: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _odd_archive(seed: bytes, rng: np.random.Generator) -> bytes:
-    """A kept episode whose parts unpack to far more than the file, or claim shapes they do not have."""
+    """A cached episode whose parts unpack to far more than the file, or claim shapes they do not have."""
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in ("values", "microseconds", "signals"):

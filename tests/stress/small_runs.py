@@ -20,7 +20,7 @@ from cz_gym.agents.training.checkpoint import load_checkpoint
 from cz_gym.atomic_files import finish_writing
 from cz_gym.baselines import registry
 from cz_gym.baselines.pid.open_loop import OpenLoop
-from cz_gym.evaluation.cache import slow_controllers
+from cz_gym.evaluation import cache
 from cz_gym.evaluation.files import is_benchmark_json
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.report import figures, page  # noqa: F401
@@ -73,17 +73,17 @@ def training(arguments: list[str]) -> int:
 
 @dataclass(frozen=True)
 class Slow(OpenLoop):
-    """Does nothing, and is kept as a slow controller is."""
+    """Does nothing, and is cached as a slow controller is."""
 
     hash: str = "nothing"
 
 
 def slow_benchmark(arguments: list[str]) -> int:
-    """benchmark.py with a slow controller whose six episodes are kept, two at a time, beside the results."""
+    """benchmark.py with a slow controller whose six episodes are cached, two at a time, beside the results."""
     slow = registry.Entry("slow", lambda config: Slow(), "measured", "does nothing", default=False, slow=True)
     registry.CONTROLLERS = (*registry.CONTROLLERS, slow)
-    benchmark.KEPT = Path(arguments[-1]).parent / "kept"
-    slow_controllers.BLOCK = 2
+    benchmark.CACHE = Path(arguments[-1]).parent / "cache"
+    cache.BLOCK = 2
     options = ["--scenarios", "randomized", "--episodes", "6", "--slow", "--overwrite", "--quiet"]
     return benchmark.main([*options, *arguments])
 

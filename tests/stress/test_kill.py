@@ -36,15 +36,15 @@ def test_a_training_run_killed_in_every_phase_goes_on(tmp_path: Path) -> None:
 
 
 def test_a_benchmark_killed_in_every_phase_leaves_the_results_of_one_run(tmp_path: Path) -> None:
-    """And episodes of slow controllers, two of which are kept at a time, are not run again."""
-    out, log, kept, torn = tmp_path / "results", tmp_path / "log", {}, []
+    """And episodes of slow controllers, two of which are cached at a time, are not run again."""
+    out, log, cached, torn = tmp_path / "results", tmp_path / "log", {}, []
     for phase, (point, whose) in BENCHMARK.items():
         other = "paper" if "other" in phase else "open-loop"
         code = ending(slow_benchmark, ["--controllers", f"{other},slow", "--out", str(out)], point, log)
         assert code == KILLED, log.read_text()[-2000:]
         torn += [phase] * (out.exists() and settle(out))
         assert check_benchmark(out) == whose, phase
-        kept[phase] = {file: file.stat().st_mtime_ns for file in tmp_path.glob("kept/*/*.npz")}
+        cached[phase] = {file: file.stat().st_mtime_ns for file in tmp_path.glob("cache/*/*.npz")}
     assert torn == [phase for phase in BENCHMARK if "count" in phase or "move" in phase]
-    assert (len(kept["episodes"]), len(kept["slow episodes"]), len(kept["figures"])) == (0, 2, 6)
-    assert kept["slow episodes"].items() <= kept["figures"].items() == kept["other results, as they move"].items()
+    assert (len(cached["episodes"]), len(cached["slow episodes"]), len(cached["figures"])) == (0, 2, 6)
+    assert cached["slow episodes"].items() <= cached["figures"].items() == cached["other results, as they move"].items()
