@@ -44,10 +44,14 @@ class SeriesPID:
     N: float = 100.0
     """Derivative filter [-]."""
 
+    def lead(self, dt: float) -> tuple[float, float, float]:
+        """Tustin's b_0, b_1, a_1 of (T_d s + 1)/(1 + T_d s / N): y = b_0 u + b_1 u_old - a_1 y_old."""
+        slow, fast = 2.0 * self.T_d / dt, 2.0 * self.T_d / (self.N * dt)
+        return (1.0 + slow) / (1.0 + fast), (1.0 - slow) / (1.0 + fast), (1.0 - fast) / (1.0 + fast)
+
     def step(self, error: Floats, state: PIDState, dt: float) -> tuple[Floats, PIDState]:
         """Pull speed [m/s] for an error [m], both of shape (n,), and the new state; one sample takes dt [s]."""
-        slow, fast = 2.0 * self.T_d / dt, 2.0 * self.T_d / (self.N * dt)
-        b_0, b_1, a_1 = (1.0 + slow) / (1.0 + fast), (1.0 - slow) / (1.0 + fast), (1.0 - fast) / (1.0 + fast)
+        b_0, b_1, a_1 = self.lead(dt)
         lead = b_0 * error + state.lead_in
         integral = state.integral + 0.5 * dt / self.T_i * (state.lead_out + lead)
         return self.K_p * (lead + integral), PIDState(b_1 * error - a_1 * lead, lead, integral)
