@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,15 @@ def measured(**values: Any) -> np.ndarray:
     zero = np.zeros(max(len(value) for value in given.values()))
     columns = [given.get(channel.name, 0.0) + zero for channel in MEASURED]
     return np.stack(columns, axis=1) / scales(MEASURED, PULL_SCALE)
+
+
+def pulls(policy: Any, rows: Iterable[Any]) -> np.ndarray:
+    """Pull speeds above nominal [m/s] of one slot, for its observations sample by sample."""
+    state, found = None, []
+    for row in rows:
+        action, state = policy.predict(row, state)
+        found.append(float(action[0, 0]) * PULL_SCALE)
+    return np.array(found)
 
 
 def observations(n: int = 3, steps: int = 20, **keywords: Any) -> Iterator[Any]:

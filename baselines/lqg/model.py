@@ -1,4 +1,4 @@
-"""The plant as the LQG sees it: linearised, sampled, and augmented by what disturbs it.
+"""The LQG's model of the plant: linearised, sampled, and augmented by what disturbs it.
 
 x = (r_c, h_c, T_1, T_2, T_b, fast, slow, drift, drift_rate, heater), deviations from the operating point, SI units:
 two Ornstein-Uhlenbeck fluctuations of the interface temperature [K], the hot zone's drift p [K] and its rate [K/s]
@@ -31,7 +31,7 @@ _STEP = 1e-30
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """What the Kalman filter believes about disturbances and sensors; tuned, not read from a scenario."""
+    """The Kalman filter's model of disturbances and sensors; tuned, not read from a scenario."""
 
     fast_sd: float = 0.25
     """Standard deviation of the fast interface fluctuation [K]."""
@@ -50,7 +50,7 @@ class NoiseModel:
     thermal_walk: float = 0.004
     """Random walk of the three temperatures, for the puller's unknown conductances [K/sqrt(s)]."""
     recipe_share: float = 0.5
-    """Share of the recipe's movement that the drift is believed to follow [-]."""
+    """Share of the recipe's movement that the drift is expected to follow [-]."""
     camera_sd: float = 0.025 * MM
     """Standard deviation of the camera's noise at the start [m]."""
     camera_sd_range: tuple[float, float] = (0.005 * MM, 0.2 * MM)

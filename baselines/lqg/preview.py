@@ -1,4 +1,4 @@
-"""The recipe ahead: what was shown five minutes ahead, remembered until it comes due."""
+"""The recipe ahead: what an observation previews five minutes ahead is remembered until it comes due."""
 
 from __future__ import annotations
 
@@ -14,29 +14,19 @@ def samples_ahead(dt: float) -> int:
     return max(1, round(PREVIEWS[-1] / dt))
 
 
-def look_ahead(plan: Floats, seen: Measured, begins: npt.NDArray[np.bool_], dt: float) -> Floats:
+def look_ahead(plan: Floats, seen: Measured, starts: npt.NDArray[np.bool_], dt: float) -> Floats:
     """Move the plan on by one sample.
 
     ``plan`` holds r_ref [m] and T_1_ref [K] (deviations) from now to the end of the preview, shape
-    (n, 2, samples ahead + 1); slots that begin interpolate the three samples they are shown.
+    (n, 2, samples ahead + 1); slots that start interpolate the three previewed samples.
     """
-    shown = [
-        np.stack(pair, axis=-1)
-        for pair in (
-            (seen.r_ref, seen.T_1_ref),
-            (seen.r_ref_1min, seen.T_1_ref_1min),
-            (seen.r_ref_5min, seen.T_1_ref_5min),
-        )
-    ]
-    moved = np.concatenate([plan[:, :, 1:], shown[-1][:, :, None]], axis=2)
-    moved[:, :, 0] = shown[0]
-    if begins.any():
-        moved[begins] = _interpolated(shown, plan.shape[2], dt)[begins]
+    radius = seen.r_ref, seen.r_ref_1min, seen.r_ref_5min
+    temperature = seen.T_1_ref, seen.T_1_ref_1min, seen.T_1_ref_5min
+    previewed = np.array([radius, temperature]).transpose(2, 0, 1)
+    moved = np.concatenate([plan[:, :, 1:], previewed[:, :, -1:]], axis=2)
+    moved[:, :, 0] = previewed[:, :, 0]
+    if starts.any():
+        t = np.minimum(np.arange(plan.shape[2]) * dt, PREVIEWS[-1])
+        shares = np.array([np.interp(t, PREVIEWS, one) for one in np.eye(len(PREVIEWS))])
+        moved[starts] = (previewed[..., None] * shares).sum(axis=2)[starts]
     return moved
-
-
-def _interpolated(shown: list[Floats], samples: int, dt: float) -> Floats:
-    t = np.minimum(np.arange(samples) * dt, PREVIEWS[-1])
-    shares = [np.interp(t, PREVIEWS, np.eye(len(PREVIEWS))[i]) for i in range(len(PREVIEWS))]
-    total: Floats = sum(values[:, :, None] * share for values, share in zip(shown, shares, strict=True))
-    return total

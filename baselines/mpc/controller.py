@@ -38,7 +38,7 @@ class Objective(NamedTuple):
     """The cost in :data:`cz_gym.baselines.bounds.trajectory.SCALES`."""
 
     stage: Floats
-    """Weights on the squares of what a stage shows, shape (stages, 5)."""
+    """Weights on the squares of a stage's outputs, shape (stages, 5)."""
     P: Floats
     """Cost-to-go from the end, z' P z + 2 z' X d, shape (7, 7)."""
     X: Floats
@@ -115,7 +115,7 @@ class EkfMpc(MeasuredController):
         corrections = np.zeros(g.shape)
         corrections[usable] = best_corrections(H[usable], g[usable], prediction.of(usable), self.blocks, self.limits)
         law = optimal_inputs(estimate, plan, previous, gains.regulator, share, self.v_0)
-        optimal = previous + scale * (prediction.shown[:, 0, 3:] + corrections[:, :U])
+        optimal = previous + scale * (prediction.outputs[:, 0, 3:] + corrections[:, :U])
         moved = np.where(usable[:, None], optimal, law)
         moved = np.clip(moved, previous - scale * self.limits.move, previous + scale * self.limits.move)
         inputs: Floats = np.clip(moved, -scale * self.limits.span, scale * self.limits.span)
@@ -134,10 +134,10 @@ def objective(law: Regulator, weights: Weights, shape: Shape) -> Objective:
 
 def newton(prediction: Prediction, r_ref: Floats, d: Floats, cost: Objective) -> tuple[Floats, Floats]:
     """Curvature (n, c, c) and slope (n, c) of the cost by the corrections; r_ref [m] and d at the horizon's end."""
-    n, _, _, n_c = prediction.shown_c.shape
-    weighted = (cost.stage[..., None] * prediction.shown_c).reshape(n, -1, n_c)
-    H = weighted.swapaxes(1, 2) @ prediction.shown_c.reshape(n, -1, n_c)
-    g = (weighted.swapaxes(1, 2) @ prediction.shown.reshape(n, -1, 1))[:, :, 0]
+    n, _, _, n_c = prediction.outputs_c.shape
+    weighted = (cost.stage[..., None] * prediction.outputs_c).reshape(n, -1, n_c)
+    H = weighted.swapaxes(1, 2) @ prediction.outputs_c.reshape(n, -1, n_c)
+    g = (weighted.swapaxes(1, 2) @ prediction.outputs.reshape(n, -1, 1))[:, :, 0]
     error = prediction.last.copy()
     error[:, 0] -= r_ref / SCALES[0]
     end = prediction.last_c.swapaxes(1, 2)

@@ -29,8 +29,8 @@ def best_corrections(H: Floats, g: Floats, prediction: Prediction, blocks: tuple
     corrections = np.array(-np.linalg.solve(H, g[:, :, None])[:, :, 0], np.float64)
     at = np.cumsum((0, *blocks[:-1]))
     n, n_c = g.shape
-    rows = prediction.shown_c[:, at, 1:].reshape(n, NOW * len(at), n_c)
-    free = prediction.shown[:, at, 1:].reshape(n, NOW * len(at))
+    rows = prediction.outputs_c[:, at, 1:].reshape(n, NOW * len(at), n_c)
+    free = prediction.outputs[:, at, 1:].reshape(n, NOW * len(at))
     most = np.tile(np.concatenate([limits.span, limits.move]), len(at))
     reached = free + (rows @ corrections[:, :, None])[:, :, 0]
     for i in np.flatnonzero((np.abs(reached) > most).any(axis=1)):

@@ -30,10 +30,10 @@ from cz_gym.physics.plant import Disturbance, Inputs, Puller, State, rk4
 Z, U = PLANT + 2, 2
 LONGEST = 5.0
 """Longest integration step [s]."""
-SHOWN = 5
-"""What a stage shows: radius error after it, deviations of v_p and Q_H, moves of both."""
+OUTPUTS = 5
+"""Outputs of a stage: radius error after it, deviations of v_p and Q_H, moves of both."""
 GIVEN = 4
-"""What every stage is given first: feedforward of both moves, r_ref before and after it."""
+"""First inputs of a stage: feedforward of both moves, r_ref before and after it."""
 
 
 @dataclass(frozen=True)
@@ -75,13 +75,13 @@ def casadi() -> Any:
 
 @lru_cache(maxsize=8)
 def build(shape: Shape, slots: int) -> Any:
-    """``predict(z, data, K, constants) -> (last, shown, slopes)``, a CasADi function of n slots.
+    """The prediction of n slots, a CasADi function ``(z, data, K, constants) -> (last, outputs, slopes)``.
 
-    Columns run over slots, within a slot over stages. z: (7, n). data: (7, n stages), what every stage is given, then
-    Q_d [W], dT_i [K] and an unknown heater power; K: (2, 7 n); constants: the fields of a puller, (27, n). last: state
-    and the columns of its sensitivity at the end, (7 + 7 corrections, n); shown: (5, n stages); slopes: the columns of
-    its sensitivity, (5 corrections, n stages). Of the linear prediction the data end in what disturbs the five states
-    and the constants are the columns of A and B, (35, n).
+    Columns run over slots, within a slot over stages. Arguments: z, shape (7, n); data, (7, n stages), what every stage
+    is given, then Q_d [W], dT_i [K] and an unknown heater power; K, (2, 7 n); constants, the fields of a puller,
+    (27, n). Results: last, the state and the columns of its sensitivity at the end, (7 + 7 corrections, n); outputs,
+    (5, n stages); slopes, the columns of their sensitivity, (5 corrections, n stages). For the linear prediction the
+    data end in what disturbs the five states, and the constants are the columns of A and B, (35, n).
     """
     ca = casadi()
     with warnings.catch_warnings():
@@ -92,19 +92,19 @@ def build(shape: Shape, slots: int) -> Any:
     data = ca.MX.sym("data", stage.size1_in(1), shape.stages)
     constants = ca.MX.sym("constants", stage.size1_in(4))
     selectors = ca.DM(np.concatenate(list(shape.selectors), axis=1))
-    after, shown, slopes = stage.mapaccum("trajectory", shape.stages)(
+    after, outputs, slopes = stage.mapaccum("trajectory", shape.stages)(
         ca.vertcat(z, ca.MX.zeros(Z * shape.corrections)),
         data,
         selectors,
         ca.repmat(K, 1, shape.stages),
         ca.repmat(constants, 1, shape.stages),
     )
-    slot = ca.Function("slot", [z, data, K, constants], [after[:, -1], shown, slopes])
+    slot = ca.Function("slot", [z, data, K, constants], [after[:, -1], outputs, slopes])
     return slot.map(slots)
 
 
 def _stage(ca: Any, shape: Shape) -> Any:
-    """One stage: state and sensitivity, data, selector, feedback and constants to what follows and what is shown."""
+    """One stage: from state and sensitivity, data, selector, feedback and constants to what follows and its outputs."""
     n_c, plant = shape.corrections, _plant(ca, shape)
     start, chosen = ca.SX.sym("start", Z * (1 + n_c)), ca.SX.sym("chosen", U, n_c)
     data = ca.SX.sym("data", GIVEN + plant.numel_in(1))
@@ -116,9 +116,9 @@ def _stage(ca: Any, shape: Shape) -> Any:
     x, slope = plant(ca.vertcat(z[:PLANT], u), data[GIVEN:], constants)
     x_c = slope @ ca.vertcat(S[:PLANT, :], u_c)
     after = ca.vertcat(x, u, ca.vec(ca.vertcat(x_c, u_c)))
-    shown = ca.vertcat(x[0] - data[3], u, moves)
-    shown_c = ca.vertcat(x_c[0, :], u_c, moves_c)
-    return ca.Function("stage", [start, data, chosen, K, constants], [after, shown, ca.vec(shown_c)])
+    outputs = ca.vertcat(x[0] - data[3], u, moves)
+    outputs_c = ca.vertcat(x_c[0, :], u_c, moves_c)
+    return ca.Function("stage", [start, data, chosen, K, constants], [after, outputs, ca.vec(outputs_c)])
 
 
 def _plant(ca: Any, shape: Shape) -> Any:

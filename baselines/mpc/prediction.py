@@ -14,7 +14,7 @@ from cz_gym.baselines.lqg.regulator import Regulator
 from cz_gym.baselines.policy import Floats
 from cz_gym.physics.plant import hidden_load
 
-from .model import SHOWN, Shape, U, Z, build
+from .model import OUTPUTS, Shape, U, Z, build
 
 _OWN = DRIFT - PLANT
 
@@ -26,9 +26,9 @@ class Prediction(NamedTuple):
     """State at the end, shape (n, 7)."""
     last_c: Floats
     """Its sensitivity, shape (n, 7, corrections)."""
-    shown: Floats
+    outputs: Floats
     """Radius error, inputs and moves of each stage, shape (n, stages, 5)."""
-    shown_c: Floats
+    outputs_c: Floats
     """Their sensitivity, shape (n, stages, 5, corrections)."""
 
     def of(self, slots: npt.NDArray[np.bool_]) -> Prediction:
@@ -50,13 +50,13 @@ def predict_under_law(
     found = build(shape, n)(
         z.T, data.reshape(n * N, -1).T, np.tile(K, (1, n)), np.tile(_constants(gains, shape), (n, 1)).T
     )
-    last, shown, shown_c = (part.full() for part in found)
+    last, outputs, outputs_c = (part.full() for part in found)
     n_c = shape.corrections
     return Prediction(
         last[:Z].T,
         last[Z:].T.reshape(n, n_c, Z).swapaxes(1, 2),
-        shown.T.reshape(n, N, SHOWN),
-        shown_c.T.reshape(n, N, n_c, SHOWN).swapaxes(2, 3),
+        outputs.T.reshape(n, N, OUTPUTS),
+        outputs_c.T.reshape(n, N, n_c, OUTPUTS).swapaxes(2, 3),
     )
 
 

@@ -40,8 +40,8 @@ class Memory(NamedTuple):
 class FilteredPID(MeasuredController):
     """v_p = v_0 + K F e + feed-forward, e = r_tilde - r_target, F = 1/(1 + T_f s).
 
-    r_target = r_ref + ring_lead d(r_ref)/dt. A reading further than ``jump`` from the filter counts as that far. At the
-    start the error found is taken for zero and given back over T_start, and the integrator takes up the pull speed
+    r_target = r_ref + ring_lead d(r_ref)/dt. A reading further than ``jump`` from the filter counts as that far. The
+    error found at the start is subtracted and comes back over T_start, and the integrator starts at the pull speed
     applied, so that switching on moves nothing. The integrator follows the pull speed really applied (window, slew
     rate, drive limits) within T_track. While the camera is invalid the observation repeats the last reading: hold.
     """
@@ -53,7 +53,7 @@ class FilteredPID(MeasuredController):
     T_f: float = 20.0
     """Measurement filter [s]; 0 is none."""
     jump: float = math.inf
-    """Largest difference between reading and filter that is believed [m]."""
+    """Largest difference between reading and filter that counts [m]."""
     T_start: float = 0.0
     """Time constant in which the error found at the start is taken up [s]; 0 takes it up at once."""
     T_track: float = 600.0

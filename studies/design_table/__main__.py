@@ -9,8 +9,6 @@ is part of the loop.
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import json
 import math
 import sys
@@ -164,22 +162,19 @@ def as_markdown(rows: Sequence[Row], skipped: Sequence[str]) -> str:
 
 def as_csv(rows: Sequence[Row]) -> str:
     """The rows as CSV, unstable loops empty."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(("controller", "plant", *COLUMNS))
+    lines = [",".join(("controller", "plant", *COLUMNS))]
     for controller, plant, figures in rows:
         numbers = ("" if math.isnan(value) else f"{value:.6g}" for value in figures.values())
-        writer.writerow([controller, plant, *numbers])
-    return out.getvalue()
+        lines.append(",".join([controller, plant, *numbers]))
+    return "\n".join(lines) + "\n"
 
 
 def as_json(rows: Sequence[Row], skipped: Sequence[str]) -> str:
     """Rows and skipped controllers as JSON, unstable loops null."""
-    plain = [
-        {"controller": row.controller, "plant": row.plant}
-        | {name: None if math.isnan(value) else value for name, value in row.figures.items()}
-        for row in rows
-    ]
+    plain = []
+    for controller, plant, figures in rows:
+        numbers = {name: None if math.isnan(value) else value for name, value in figures.items()}
+        plain.append({"controller": controller, "plant": plant, **numbers})
     return json.dumps({"rows": plain, "no_linear_form": list(skipped)}, indent=2) + "\n"
 
 

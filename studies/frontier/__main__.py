@@ -18,7 +18,7 @@ import numpy as np
 
 from cz_gym.baselines.lqg.settings import FAMILY
 from cz_gym.commands import OneLineParser, guarded
-from cz_gym.evaluation.equal_activity import Point, frontier, intervals
+from cz_gym.evaluation.equal_activity import Point, intervals, ratios
 from cz_gym.evaluation.files import EPISODES, Episodes, read_episodes
 from cz_gym.evaluation.statistics import Resamples
 
@@ -46,18 +46,17 @@ def table(results: Mapping[str, Points], episodes: Episodes | None = None) -> st
     lines = []
     for scenario, points in results.items():
         try:
-            curve = frontier([points[name] for name in FAMILY if name in points])
+            found = ratios(points, FAMILY)
         except ValueError as error:
             lines.append(f"{scenario}: {error}")
             continue
         spread = {} if episodes is None else _intervals(scenario, points, episodes.get(scenario, {}))
         for name, (activity, rmse) in points.items():
-            if activity < curve.activity[0]:
-                found = "quieter than any"
-            else:
-                found = f"{curve.at(activity):.4f} mm, ratio {rmse / curve.at(activity):.3f}"
-                found += " [{:.3f}, {:.3f}]".format(*spread[name]) if name in spread else ""
-            lines.append(f"{scenario}: {name} {rmse:.4f} mm at {activity:.4f} mm/min; lqg there: {found}")
+            rival = "quieter than any"
+            if name in found:
+                rival = f"{rmse / found[name]:.4f} mm, ratio {found[name]:.3f}"
+                rival += " [{:.3f}, {:.3f}]".format(*spread[name]) if name in spread else ""
+            lines.append(f"{scenario}: {name} {rmse:.4f} mm at {activity:.4f} mm/min; lqg there: {rival}")
     return "\n".join(lines)
 
 

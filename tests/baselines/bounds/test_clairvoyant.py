@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.linalg import solve_discrete_are
 from scipy.optimize import minimize
 
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant, episode_cost
@@ -128,19 +127,6 @@ def test_the_sweeps_solve_the_same_equations_as_a_dense_solver():
         dense = np.linalg.solve(kkt, np.concatenate([-g, f.ravel()]))
         assert after[:, i].ravel() == pytest.approx(dense[: N * s], rel=1e-9, abs=1e-10)
         assert inputs[:, i].ravel() == pytest.approx(dense[N * s : N * (s + m)], rel=1e-9, abs=1e-10)
-
-
-def test_far_from_the_end_the_feedback_is_that_of_the_riccati_equation():
-    A, B = np.array([[1.0, 0.1], [0.0, 1.02]]), np.array([[0.0], [0.1]])
-    Q, R = np.array([1.0, 0.1]), np.array([0.5])
-    N = 400
-    stages = Stages(
-        *(np.broadcast_to(array, (N, 1, *array.shape)).copy() for array in (A, B, np.zeros(2), Q, np.zeros(2), R)),
-        np.zeros((N, 1, 1)),
-    )
-    P = solve_discrete_are(A, B, np.diag(Q), np.diag(R))
-    K = np.linalg.solve(np.diag(R) + B.T @ P @ B, B.T @ P @ A)
-    assert sweep_back(stages).feedback[0, 0] == pytest.approx(-K, rel=1e-9)
 
 
 def test_the_environment_replays_what_was_planned(optimum):

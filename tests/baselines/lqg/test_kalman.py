@@ -48,18 +48,6 @@ def test_settles_at_the_riccati_solution():
     np.testing.assert_allclose(belief.covariance[0], kalman.steady_state(A, H, Q, R), rtol=1e-9)
 
 
-def test_its_covariance_is_that_of_its_errors():
-    rng = np.random.default_rng(1)
-    n = 4000
-    x = rng.normal(size=(n, 2))
-    belief = Gaussian(np.zeros((n, 2)), np.broadcast_to(np.eye(2), (n, 2, 2)))
-    for _ in range(20):
-        belief = corrected(belief, x @ H.T + rng.normal(size=(n, 2)) * np.sqrt(np.diag(R)))
-        belief = Gaussian(belief.mean @ A.T, kalman.predicted_covariance(belief.covariance, A, Q))
-        x = x @ A.T + rng.normal(size=(n, 2)) * np.sqrt(np.diag(Q))
-    np.testing.assert_allclose(np.cov((x - belief.mean).T), belief.covariance[0], rtol=0.1, atol=0.01)
-
-
 def test_no_reading_changes_nothing():
     belief = Gaussian(np.ones((2, 2)), np.broadcast_to(np.eye(2), (2, 2, 2)))
     reading = Measurement(np.array([5.0, 5.0]), np.ones((2, 2)), np.array([np.inf, 1.0]))

@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 from cz_gym import make_puller
 from cz_gym.baselines.lqg.controller import LQG, LQGSettings
-from cz_gym.baselines.lqg.model import DRIFT, FAST, HEATER, PLANT, SLOW, STATES, NoiseModel, load_per_drift, plant_model
+from cz_gym.baselines.lqg.model import DRIFT, FAST, HEATER, PLANT, SLOW, STATES, NoiseModel, plant_model
 from cz_gym.baselines.lqg.preview import look_ahead, samples_ahead
 from cz_gym.baselines.lqg.regulator import Weights, quadratic_cost, regulator
 from cz_gym.config import make_config
@@ -51,11 +51,6 @@ def test_the_fluctuations_keep_their_variance():
         assert model.A[state, state] ** 2 * sd**2 + model.Q[state, state] == pytest.approx(sd**2, rel=1e-9)
     two = plant_model(PULLER, NOISE, 10.0)
     np.testing.assert_allclose(model.A @ model.Q @ model.A.T + model.Q, two.Q, rtol=1e-6, atol=1e-25)
-
-
-def test_load_per_drift_is_the_slope_of_the_hidden_load():
-    difference = (hidden_load(0.01, PULLER) - hidden_load(-0.01, PULLER)) / 0.02
-    assert load_per_drift(PULLER) == pytest.approx(difference, rel=1e-6)
 
 
 # The regulator

@@ -10,7 +10,6 @@ from scipy.optimize import minimize
 from cz_gym.baselines.lqg.controller import LQG, LQGSettings, optimal_inputs
 from cz_gym.baselines.lqg.filter_bank import Hypotheses, filter_bank
 from cz_gym.baselines.lqg.model import DRIFT, HEATER, PLANT, STATES
-from cz_gym.baselines.lqg.regulator import quadratic_cost
 from cz_gym.baselines.lqg.settings import PULLER_RING
 from cz_gym.baselines.policy import map_arrays
 from cz_gym.baselines.registry import find_controller
@@ -78,38 +77,6 @@ def test_on_a_linear_plant_without_limits_it_is_the_lqr(dt, blocks):
     assert mpc.optimal_inputs(estimate, plan, previous) == pytest.approx(law, rel=1e-8)
 
 
-def test_no_correction_pays_on_a_linear_plant_whatever_the_recipe_brings():
-    mpc = EkfMpc(LQG(LINEAR))
-    _, H, g, _ = parts(mpc, *situation())
-    worth = np.einsum("nc,nc->n", g, np.linalg.solve(H, g[:, :, None])[:, :, 0])
-    assert (np.linalg.eigvalsh(H) > 0.0).all()
-    assert np.abs(worth).max() < 1e-16
-
-
-def test_the_cost_beyond_the_horizon_is_that_of_the_law():
-    """From any state: one stage's cost plus the cost-to-go after it is the cost-to-go before it, up to what only the
-    disturbances decide, which cancels between two states that see the same ones."""
-    gains, dt = LQG(LINEAR).gains, 5.0
-    model = gains.filter.plant
-    P, X = gains.regulator.P, gains.regulator.X
-    Q, N, R = quadratic_cost(LINEAR.weights, dt)
-    d = np.array([0.3, -0.2, 1.0, 0.0, 40.0])
-    feedback = gains.regulator.feedback
-    K, K_d = np.hstack([feedback[:, :PLANT], feedback[:, -2:]]), feedback[:, PLANT:-2]
-
-    def difference(z):
-        du = -K @ z - K_d @ d
-        u = z[PLANT:] + du
-        after = np.concatenate([model.A[:PLANT] @ np.concatenate([z[:PLANT], d]) + model.B[:PLANT] @ u, u])
-        d_after = model.A[PLANT:, PLANT:] @ d
-        stage = z @ Q @ z + 2.0 * z @ N @ du + du @ R @ du
-        return stage + after @ P @ after + 2.0 * after @ X @ d_after - z @ P @ z - 2.0 * z @ X @ d
-
-    random = np.random.default_rng(1)
-    found = [difference(random.normal(size=7) * SCALES * 0.1) for _ in range(4)]
-    assert found == pytest.approx([found[0]] * 4, rel=1e-6)
-
-
 def test_casadi_predicts_what_the_plant_does():
     mpc = EkfMpc(LQG(LQGSettings()))
     estimate, plan, previous = situation(reference=1.0 * MM)
@@ -119,10 +86,10 @@ def test_casadi_predicts_what_the_plant_does():
         x = State(*(np.array(p.state_0) + estimate[i, :PLANT]))
         for k in range(mpc.shape.stages):
             d = disturbances[i, k]
-            pull, power = prediction.shown[i, k, 1:3] * SCALES[PLANT:]
+            pull, power = prediction.outputs[i, k, 1:3] * SCALES[PLANT:]
             load = Disturbance(hidden_load(d[DRIFT - PLANT], p), d[0] + d[1], 1.0)
             x = rk4(x, Inputs(p.v_0 + pull, p.Q_H_0 + power + d[HEATER - PLANT]), load, p, 5.0, mpc.lqg.meniscus.slope)
-            error = prediction.shown[i, k, 0] * MM
+            error = prediction.outputs[i, k, 0] * MM
             assert error == pytest.approx(x.r_c - p.r_0 - held(plan, k + 1)[i, -1, 0], abs=1e-13)
         assert prediction.last[i, :PLANT] * SCALES[:PLANT] == pytest.approx(np.array(x) - p.state_0, abs=1e-9)
 
@@ -132,7 +99,7 @@ def test_the_sensitivities_agree_with_finite_differences():
     mpc = EkfMpc(LQG(LQGSettings()), blocks=(1, 2, 4))
     estimate, plan, previous = situation(n=2)
     prediction, _, _, _ = parts(mpc, estimate, plan, previous)
-    assert prediction.shown_c.shape == (2, 60, 5, 6)
+    assert prediction.outputs_c.shape == (2, 60, 5, 6)
     size = np.array([1e-3, 1e-3])
     K = mpc.lqg.gains.regulator.feedback[:, -2:] * SCALES[PLANT:] / SCALES[PLANT:, None]
     for j in range(2):
@@ -141,10 +108,10 @@ def test_the_sensitivities_agree_with_finite_differences():
         found = []
         for sign in (1.0, -1.0):
             shifted, _, _, _ = parts(mpc, estimate, plan, previous + sign * change * SCALES[PLANT:])
-            found.append(shifted.shown)
+            found.append(shifted.outputs)
         slope = (found[0] - found[1]) / (2.0 * size[j])
         # d(first input)/d(previous j) = (I - K)_j: the same as corrections (I - K)_j to the first block.
-        same = prediction.shown_c[:, :, :, :2] @ (np.eye(2) - K)[:, j]
+        same = prediction.outputs_c[:, :, :, :2] @ (np.eye(2) - K)[:, j]
         assert slope[:, 1:] == pytest.approx(same[:, 1:], rel=1e-5, abs=1e-7)
 
 
@@ -158,8 +125,8 @@ def test_limits_are_kept_at_least_cost():
     at = np.cumsum((0, *mpc.blocks[:-1]))
     most = np.tile(np.concatenate([limits.span, limits.move]), len(at))
     for i in range(len(g)):
-        rows = prediction.shown_c[i, at, 1:].reshape(-1, g.shape[1])
-        free = prediction.shown[i, at, 1:].ravel()
+        rows = prediction.outputs_c[i, at, 1:].reshape(-1, g.shape[1])
+        free = prediction.outputs[i, at, 1:].ravel()
         assert (np.abs(free + rows @ corrections[i]) <= most + 1e-7).all()
         peer = minimize(
             lambda c, i=i: 0.5 * c @ H[i] @ c + g[i] @ c, np.zeros(len(g[i])), jac=lambda c, i=i: H[i] @ c + g[i],
@@ -180,7 +147,7 @@ def test_where_not_all_limits_can_be_kept_those_of_now_are():
     prediction, H, g, _ = parts(mpc, *situation())
     limits = Limits(np.array([0.2, 0.5]), np.array([0.02, 0.1]))
     corrections = best_corrections(H, g, prediction, mpc.blocks, limits)
-    now = prediction.shown[:, 0, 1:] + (prediction.shown_c[:, 0, 1:] @ corrections[:, :, None])[:, :, 0]
+    now = prediction.outputs[:, 0, 1:] + (prediction.outputs_c[:, 0, 1:] @ corrections[:, :, None])[:, :, 0]
     assert (np.abs(now) <= np.concatenate([limits.span, limits.move]) + 1e-7).all()
 
 

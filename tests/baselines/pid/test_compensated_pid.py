@@ -1,31 +1,20 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy import signal
 
-from cz_gym import CzEnv
-from cz_gym.baselines import CompensatedPID, Compensator, OpenLoop, Policy, SeriesPID
+from cz_gym import make_puller
+from cz_gym.baselines import CompensatedPID, Compensator, OpenLoop, SeriesPID
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import TEST_SEEDS
 from cz_gym.evaluation.rollout import rollout
-from tests.observed import measured
+from tests.observed import measured, pulls
 
 MM, V_0 = 1e-3, 1.2e-3 / 60
-
-
-def pulls(controller: CompensatedPID, errors: np.ndarray, speeds: np.ndarray | None = None) -> np.ndarray:
-    """v_p - v_0 over a sequence of ring errors and applied pull speeds."""
-    state, out = None, []
-    for k, error in enumerate(errors):
-        seen = measured(ring_error=error, v_p=0.0 if speeds is None else speeds[k])
-        action, state = controller.predict(seen, state)
-        out.append(float(action[0, 0]) * V_0)
-    return np.array(out)
 
 
 def test_settings_are_table_one() -> None:
@@ -46,7 +35,7 @@ def test_pid_is_the_papers_discretised_by_tustin(dt: float, rng: np.random.Gener
     errors = np.cumsum(rng.normal(0, 1e-7, 300))
     filtered = signal.lfilter(*signal.bilinear(numerator, denominator, 1 / dt), errors)
     assert np.abs(filtered).max() < V_0, "the oracle knows no saturation"
-    actual = pulls(CompensatedPID(dt, compensator=None), errors)
+    actual = pulls(CompensatedPID(dt, compensator=None), [measured(ring_error=error) for error in errors])
     np.testing.assert_allclose(actual, filtered, rtol=1e-5, atol=1e-12)
 
 
@@ -63,14 +52,6 @@ def test_compensator_is_the_papers_driven_by_the_applied_pull(dt: float, rng: np
         _, state = controller.predict(measured(v_p=seen), state)
         y.append(state.compensator[0] @ [0.0, -0.22517])
     np.testing.assert_allclose(y, exact, rtol=1e-9, atol=1e-12)
-
-
-def test_pull_answers_the_compensated_ring() -> None:
-    """A radius too large is pulled faster, and a pull raised before counts as a smaller radius to come."""
-    controller = CompensatedPID()
-    assert pulls(controller, np.array([1e-6]))[0] > 0
-    errors = np.zeros(2)
-    assert pulls(controller, errors, np.array([0.0, 1e-6]))[1] < 0
 
 
 def test_heater_is_a_pi_loop_by_forward_euler(rng: np.random.Generator) -> None:
@@ -92,42 +73,22 @@ def test_open_loop_does_nothing() -> None:
     assert OpenLoop().predict(np.ones((3, 11)))[0].tolist() == [[0.0, 0.0]] * 3
 
 
-def episode(controller: Policy, scenario: str, model: str, **more: Any) -> tuple[np.ndarray, np.ndarray, bool]:
-    """True error [m] and observed ring error [m] of each step, and whether the crystal was lost."""
-    env = CzEnv(scenario, model=model, **more)
-    observation, _ = env.reset(seed=0)
-    state, true, seen = None, [], []
-    while True:
-        action, state = controller.predict(observation, state)
-        observation, _, terminated, truncated, info = env.step(action)
-        true.append(info["r_c"] - info["r_ref"])
-        compensator = state.compensator[0, 1] * -0.22517 if state is not None else 0.0
-        seen.append(float(observation[0]) * MM + compensator)
-        if terminated or truncated:
-            return np.array(true), np.array(seen), terminated
-
-
-@pytest.mark.parametrize(("model", "peak_mm"), [("I", 1.48), ("II", 1.54)])
-def test_papers_ramp_peaks_where_the_printed_controller_puts_it(model: str, peak_mm: float) -> None:
-    true, compensated, lost = episode(CompensatedPID(), "paper-ramp", model)
-    assert not lost
+@pytest.mark.parametrize(("model", "dt", "peak_mm"), [("I", 5, 1.48), ("II", 5, 1.54), ("I", 2, 1.48), ("I", 10, 1.48)])
+def test_papers_ramp_peaks_where_the_printed_controller_puts_it(model: str, dt: float, peak_mm: float) -> None:
+    run = rollout(CompensatedPID(dt), make_config("paper-ramp", model, control_interval=dt), [0])
+    true, ring = ((signal - run.signals.r_ref)[:, 0] for signal in (run.signals.r_c, run.signals.r_br))
+    assert not run.failed.any()
     assert np.abs(true).max() / MM == pytest.approx(peak_mm, rel=0.03)
+    compensated = ring - make_puller().ring_bias + Compensator().respond(run.signals.v_p[:, 0] - V_0, dt)
     assert np.abs(compensated).max() < 0.5 * np.abs(true).max(), "the compensated ring shows less than half of it"
 
 
 def test_the_same_pid_without_the_compensator_diverges() -> None:
     """It loses the crystal of Model II; that of Model I it swings from stop to stop for good."""
-    *_, lost = episode(CompensatedPID(compensator=None), "paper-ramp", "II")
-    assert lost
-    pull = rollout(CompensatedPID(compensator=None), make_config("paper-ramp", "I"), [0]).signals.v_p[-120:, 0]
+    runs = {m: rollout(CompensatedPID(compensator=None), make_config("paper-ramp", m), [0]) for m in ("I", "II")}
+    assert [run.failed[0] for run in runs.values()] == [False, True]
+    pull = runs["I"].signals.v_p[-120:, 0]
     assert (pull.min(), pull.max()) == pytest.approx((0.0, 2.0 * V_0))
-
-
-@pytest.mark.parametrize("interval", [2.0, 10.0])
-def test_ramp_depends_little_on_the_control_interval(interval: float) -> None:
-    true, _, lost = episode(CompensatedPID(interval), "paper-ramp", "I", control_interval=interval)
-    assert not lost
-    assert np.abs(true).max() / MM == pytest.approx(1.48, rel=0.05)
 
 
 def test_error_on_randomized_is_the_published_controllers() -> None:

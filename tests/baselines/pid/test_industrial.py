@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from cz_gym.baselines.pid.industrial import Industrial, dead_zone
-from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
 from cz_gym.observation import MEASURED, PULL_SCALE, Measured
-from cz_gym.units import MM, MM_PER_MIN
+from cz_gym.units import MM_PER_MIN
 
 RING, PULL = Measured._fields.index("ring_error"), Measured._fields.index("v_p")
 
@@ -62,20 +61,6 @@ def test_other_intervals_follow_the_same_law(dt):
     assert np.abs(other).max() == pytest.approx(np.abs(usual).max(), rel=0.05)
 
 
-def test_forgetting_is_one_continuous_time_constant():
-    """Two 5 s shares make one 10 s share: a ramp's rate is averaged alike."""
-    rates = []
-    for dt in (5.0, 10.0):
-        state = None
-        for k in range(round(300.0 / dt) + 1):
-            row = np.zeros((1, len(MEASURED)))
-            row[0, RING] = 1e-3 * k * dt / 2.0
-            _, state = Industrial(control_interval=dt, T_f=1e-9).predict(row, state)
-        rates.append(state.rate[0])
-    assert rates[0] == pytest.approx(1e-2 * (1.0 - (23.0 / 24.0) ** 60), rel=1e-6)
-    assert rates[1] == pytest.approx(rates[0], rel=1e-6)
-
-
 def test_no_wind_up_on_a_stuck_drive():
     policy, state = Industrial(), None
     row = np.zeros((1, len(MEASURED)))
@@ -95,16 +80,3 @@ def test_a_held_diameter_and_a_moving_target():
         _, state = policy.predict(row, state)
     assert abs(state.rate[0]) < 1e-9
     np.testing.assert_allclose(state.diameters, 0.0, atol=1e-9)
-
-
-def test_growth_control_warms_a_cold_melt():
-    policy = Industrial(heater=TemperatureLoop(K_pull=5.0))
-    row = np.zeros((1, len(MEASURED)))
-    row[0, PULL] = 0.2
-    state, powers = None, []
-    for _ in range(200):
-        action, state = policy.predict(row, state)
-        powers.append(action[0, 1])
-    assert powers[-1] > powers[0]
-    assert state.heat.trim[0] > 0.0
-    assert state.mean[0] * MM == 0.0
