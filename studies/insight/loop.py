@@ -68,7 +68,7 @@ class Responses(NamedTuple):
         return found
 
     def drives(self) -> Complex:
-        """Drives by the ring, the pyrometer constant: the controller with what it knows of itself, shape (points, 2)."""
+        """Drives by the ring, pyrometer constant: the controller with what it knows of itself, shape (points, 2)."""
         return _solve(np.eye(2) - self._recalled, self.controller[:, :, RING])
 
     def _without_camera(self) -> Complex:
