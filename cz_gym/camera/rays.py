@@ -194,27 +194,27 @@ def _at_profile(ray: Any, q: Any, scene: Any) -> Any:
 @physics
 def _rising(ray: Any, q: Any, scene: Any, view: Any) -> Any:
     """What a ray hits that does not sink."""
+    camera = view.camera
     t = _meet_crystal(ray, scene)
-    shield = _at(SHIELD, ray, (view.camera.wall_height - ray.z) / ray.dz)
-    if t > 0.0 and (ray.z + t * ray.dz < view.camera.wall_height or not _beyond(shield, view.camera.shield_radius)):
+    shield = _at(SHIELD, ray, (camera.wall_height - ray.z) / ray.dz)
+    if t > 0.0 and (ray.z + t * ray.dz < camera.wall_height or not _beyond(shield, camera.shield_radius)):
         return _at(CRYSTAL, ray, t)
     found = _meet_above(ray, scene, q)
     if found >= 0.0:
         return _at_profile(ray, found, scene)
-    if _beyond(shield, view.camera.crucible_radius):
-        return _at(WALL, ray, _meet_cylinder(ray, view.camera.crucible_radius, True))
-    return shield if _beyond(shield, view.camera.shield_radius) else _at(OPENING, ray, 1.0)
+    if _beyond(shield, camera.crucible_radius):
+        return _at(WALL, ray, _meet_cylinder(ray, camera.crucible_radius, True))
+    return shield if _beyond(shield, camera.shield_radius) else _at(OPENING, ray, 1.0)
 
 
 @physics
 def _sinking(ray: Any, q: Any, scene: Any, view: Any) -> Any:
     """What a ray hits that sinks."""
+    camera = view.camera
     t = _meet_crystal(ray, scene)
-    if ray.z > view.camera.wall_height:
-        shield = _at(SHIELD, ray, (view.camera.wall_height - ray.z) / ray.dz)
-        if _beyond(shield, view.camera.shield_radius) and not (
-            t > 0.0 and ray.z + t * ray.dz > view.camera.wall_height
-        ):
+    if ray.z > camera.wall_height:
+        shield = _at(SHIELD, ray, (camera.wall_height - ray.z) / ray.dz)
+        if _beyond(shield, camera.shield_radius) and not (t > 0.0 and ray.z + t * ray.dz > camera.wall_height):
             return shield
     if t > 0.0:
         return _at(CRYSTAL, ray, t)
@@ -222,8 +222,8 @@ def _sinking(ray: Any, q: Any, scene: Any, view: Any) -> Any:
     if found >= 0.0:
         return _at_profile(ray, found, scene)
     melt = _at(MELT, ray, -ray.z / ray.dz)
-    if _beyond(melt, view.camera.crucible_radius):
-        return _at(WALL, ray, _meet_cylinder(ray, view.camera.crucible_radius, True))
+    if _beyond(melt, camera.crucible_radius):
+        return _at(WALL, ray, _meet_cylinder(ray, camera.crucible_radius, True))
     return melt
 
 

@@ -62,7 +62,7 @@ class Game:
         self.paused, self.due = True, 0.0
         self.score: Score | None = None
         p = self.record.puller
-        self.asked = SetPoints(p.v_0, p.Q_H_0)
+        self.set_points = SetPoints(p.v_0, p.Q_H_0)
 
     @property
     def record(self) -> Record:
@@ -77,7 +77,7 @@ class Game:
             for event in pygame.event.get():
                 self.handle(event)
             self.advance(1.0 / FPS)
-            self.window.show(self.scene.draw(self.record, self.asked, self.overlay))
+            self.window.show(self.scene.draw(self.record, self.set_points, self.overlay))
         if self.score is None:
             self.finish(failed=False)
         self.env.close()
@@ -94,9 +94,9 @@ class Game:
     def change(self, pull: float, heat: float) -> None:
         """Change the set-points by so much [m/s, W], inside the range of the drives."""
         p = self.record.puller
-        v_p = min(max(self.asked.v_p + pull, 0.0), 2.0 * p.v_0)
-        Q_H = min(max(self.asked.Q_H + heat, p.Q_H_0 - HEATER_RANGE), p.Q_H_0 + HEATER_RANGE)
-        self.asked = SetPoints(v_p, Q_H)
+        v_p = min(max(self.set_points.v_p + pull, 0.0), 2.0 * p.v_0)
+        Q_H = min(max(self.set_points.Q_H + heat, p.Q_H_0 - HEATER_RANGE), p.Q_H_0 + HEATER_RANGE)
+        self.set_points = SetPoints(v_p, Q_H)
 
     def change_speed(self, factor: float) -> None:
         """Let time run faster or slower."""
@@ -127,7 +127,9 @@ class Game:
     def step(self) -> None:
         """One control interval with the set-points as they stand."""
         p = self.record.puller
-        action = np.array([self.asked.v_p / p.v_0 - 1.0, (self.asked.Q_H - p.Q_H_0) / HEATER_RANGE], np.float32)
+        action = np.array(
+            [self.set_points.v_p / p.v_0 - 1.0, (self.set_points.Q_H - p.Q_H_0) / HEATER_RANGE], np.float32
+        )
         self.actions.append(action.clip(-1.0, 1.0))
         _, _, terminated, truncated, _ = self.env.step(self.actions[-1])
         if terminated or truncated:

@@ -44,8 +44,8 @@ class SetPoints(NamedTuple):
     """Heater power [W]."""
 
 
-def gauges(record: Record, asked: SetPoints | None = None) -> tuple[Gauge, ...]:
-    """The gauges of a record's newest sample; ``asked`` adds the set-points of the drives."""
+def gauges(record: Record, set_points: SetPoints | None = None) -> tuple[Gauge, ...]:
+    """The gauges of a record's newest sample; ``set_points`` of the drives are marked."""
     now, p = record.now, record.puller
     v_0, window = p.v_0 / MM_PER_MIN, HEATER_RANGE / KILO
     v_p, Q_H, Q_H_0 = now.v_p / MM_PER_MIN, now.Q_H / KILO, p.Q_H_0 / KILO
@@ -53,11 +53,11 @@ def gauges(record: Record, asked: SetPoints | None = None) -> tuple[Gauge, ...]:
     return (
         Gauge(
             "pull", f"{v_p:.2f} mm/min", v_p, 0.0, 2.0 * v_0, 0.0, palette.DRIVE,
-            None if asked is None else asked.v_p / MM_PER_MIN, f"nominal {v_0:.2f}",
+            None if set_points is None else set_points.v_p / MM_PER_MIN, f"nominal {v_0:.2f}",
         ),
         Gauge(
             "heater", f"{Q_H:.2f} kW", Q_H, Q_H_0 - window, Q_H_0 + window, Q_H_0, palette.DRIVE,
-            None if asked is None else asked.Q_H / KILO, f"nominal {Q_H_0:.2f}",
+            None if set_points is None else set_points.Q_H / KILO, f"nominal {Q_H_0:.2f}",
         ),
         Gauge(
             "T₁ heater", f"{now.T_1:.1f} K", now.T_1, p.T_1_0 - T_1_RANGE, p.T_1_0 + T_1_RANGE, p.T_1_0,
@@ -70,10 +70,10 @@ def gauges(record: Record, asked: SetPoints | None = None) -> tuple[Gauge, ...]:
     )  # fmt: skip
 
 
-def draw(canvas: Canvas, boxes: Sequence[Box], record: Record, asked: SetPoints | None = None) -> None:
+def draw(canvas: Canvas, boxes: Sequence[Box], record: Record, set_points: SetPoints | None = None) -> None:
     """The radius in the first box, then a gauge a box."""
     _radius(canvas, boxes[0], record)
-    for gauge, box in zip(gauges(record, asked), boxes[1:], strict=True):
+    for gauge, box in zip(gauges(record, set_points), boxes[1:], strict=True):
         _gauge(canvas, box, gauge)
 
 

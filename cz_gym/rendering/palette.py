@@ -35,7 +35,7 @@ GLOW: Colour = (255, 236, 180)
 
 
 def mix(low: Colour, high: Colour, share: float) -> Colour:
-    """The colour at that share of the way from low to high, held between them."""
+    """The colour at that share of the way from low to high, clipped to them."""
     share = min(max(share, 0.0), 1.0)
     red, green, blue = (round(a + share * (b - a)) for a, b in zip(low, high, strict=True))
     return red, green, blue

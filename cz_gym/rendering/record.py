@@ -101,21 +101,21 @@ class Record:
     def surface(self, height: float | None = None) -> tuple[Floats, Floats, Floats]:
         """The grown surface: radius, reference [m] and height above the melt [m], newest (lowest) first.
 
-        What solidified when the crystal was L long now hangs at h_c + (L_now - L). ``height`` [m] above the triple
+        What solidified when the crystal was L long is now at h_c + (L_now - L). ``height`` [m] above the triple
         point limits how much is returned.
         """
         now, length = self.now, self.column("length")
-        # What was melted back hangs there no more: its length is above one that came later.
-        kept = length <= np.minimum.accumulate(length[::-1])[::-1]
+        # What was melted back is gone: its length is above one that came later.
+        remains = length <= np.minimum.accumulate(length[::-1])[::-1]
         if height is not None:
-            inside = np.flatnonzero(kept & (length >= now.length - height))
-            kept[: max(int(inside[0]) - 1, 0)] = False
-        z = now.h_c + (now.length - length[kept])
-        return self.column("r_c")[kept][::-1], self.column("r_ref")[kept][::-1], z[::-1]
+            inside = np.flatnonzero(remains & (length >= now.length - height))
+            remains[: max(int(inside[0]) - 1, 0)] = False
+        z = now.h_c + (now.length - length[remains])
+        return self.column("r_c")[remains][::-1], self.column("r_ref")[remains][::-1], z[::-1]
 
 
 def how_it_failed(sample: Sample, a: float) -> Ending:
-    """The limit that a failed sample broke, or came nearest to where the last substep was not kept."""
+    """The limit that a failed sample broke, or came nearest to where the last substep was discarded."""
     room = {
         Ending.FROZEN: (sample.h_c - HEIGHT_MIN) / HEIGHT_MIN,
         Ending.DETACHED: (HEIGHT_MAX_IN_A * a - sample.h_c) / a,

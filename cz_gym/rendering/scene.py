@@ -77,12 +77,12 @@ class Scene:
     def draw(
         self,
         record: Record,
-        asked: gauges.SetPoints | None = None,
+        set_points: gauges.SetPoints | None = None,
         overlay: Callable[[Canvas], None] | None = None,
     ) -> Surface:
         """The picture of a record's newest sample; the next call draws into the same surface.
 
-        ``asked`` shows set-points of the drives, ``overlay`` draws on top.
+        ``set_points`` of the drives are marked, ``overlay`` draws on top.
         """
         canvas, boxes = self.canvas, self.layout
         canvas.begin((boxes.puller, *boxes.gauges, *boxes.charts))
@@ -90,7 +90,7 @@ class Scene:
         canvas.title(boxes.puller, "crystal")
         puller_panel.draw(canvas, boxes.puller, record)
         triple_point.draw(canvas, boxes.triple_point, record)
-        gauges.draw(canvas, boxes.gauges, record, asked)
+        gauges.draw(canvas, boxes.gauges, record, set_points)
         strip_charts.draw(canvas, *boxes.charts, record)
         if record.ending is not None:
             draw_ending(canvas, boxes.triple_point, record.ending)

@@ -1,6 +1,6 @@
 """The README's animated picture: ``python -m studies.film [--seed N] [--scenario NAME] [--agent FILE] [--out FILE]``.
 
-The paper's controller and an agent, the shipped one unless told, pull the same crystal side by side. GIF, because it
+The paper's controller and an agent, the shipped one by default, pull the same crystal side by side. GIF, because it
 plays everywhere.
 """
 
@@ -121,9 +121,12 @@ def _palette(picture: Any, Image: Any) -> Any:
     from cz_gym.rendering import palette as c
 
     marker = c.mix(c.CAMERA, c.MELT_TOP, 0.5)
-    kept = (c.BACK, c.PANEL, c.INK, c.TRUE, c.CAMERA, marker, c.REFERENCE, c.TEMPERATURE, c.ALARM, c.GLOW)
-    needed = picture.quantize(COLOURS - len(kept), method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-    channels = [*needed.getpalette()[: 3 * (COLOURS - len(kept))], *(channel for colour in kept for channel in colour)]
+    meaning = (c.BACK, c.PANEL, c.INK, c.TRUE, c.CAMERA, marker, c.REFERENCE, c.TEMPERATURE, c.ALARM, c.GLOW)
+    needed = picture.quantize(COLOURS - len(meaning), method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    channels = [
+        *needed.getpalette()[: 3 * (COLOURS - len(meaning))],
+        *(channel for colour in meaning for channel in colour),
+    ]
     found = Image.new("P", (1, 1))
     found.putpalette(channels + channels[-3:] * (256 - len(channels) // 3))
     return found

@@ -120,10 +120,10 @@ The same less `{against}`'s, crystal by crystal [µm]; negative is better.
 
 def _table(cells: Sequence[Cell], tell: Callable[[Cell], str]) -> str:
     names = list(dict.fromkeys(cell.controller for cell in cells))
-    told: dict[str, dict[str, str]] = {}
+    cells_of: dict[str, dict[str, str]] = {}
     for cell in cells:
-        told.setdefault(cell.row, {})[cell.controller] = tell(cell)
-    return table(("row", *names), ((row, *(by_name[name] for name in names)) for row, by_name in told.items()))
+        cells_of.setdefault(cell.row, {})[cell.controller] = tell(cell)
+    return table(("row", *names), ((row, *(by_name[name] for name in names)) for row, by_name in cells_of.items()))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

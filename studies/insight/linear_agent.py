@@ -56,11 +56,11 @@ class LinearAgent(NamedTuple):
         States: past samples of the remembered channels, newest first, channel by channel; the integral.
         """
         newest, oldest = lags(self.dt)
-        depth, kept = int(oldest[-1]), len(LAGGED)
-        n = depth * kept + 1
+        depth, remembered = int(oldest[-1]), len(LAGGED)
+        n = depth * remembered + 1
         A, B = np.zeros((n, n)), np.zeros((n, len(MEASURED)))
         C, D = np.zeros((2, n)), self.now.copy()
-        for channel in range(kept):
+        for channel in range(remembered):
             first = channel * depth
             A[first + 1 : first + depth, first : first + depth - 1] = np.eye(depth - 1)
             B[first, AT[_REMEMBERED[channel]]] = 1.0
@@ -73,7 +73,7 @@ class LinearAgent(NamedTuple):
 
 
 def linear_agent(onnx_bytes: bytes, observations: npt.ArrayLike, dt: float, v_0: float = PULL_SCALE) -> LinearAgent:
-    """The agent of these (judged) ONNX bytes near "history" observations; v_0 [m/s] scales the pull speed.
+    """The agent of these (checked) ONNX bytes near "history" observations; v_0 [m/s] scales the pull speed.
 
     Of several observations, shape (n, channels), it is the mean derivative: for Gaussian ones the best linear
     approximation there is (Stein's lemma). ValueError if the file reads another observation or remembers something.

@@ -1,4 +1,4 @@
-"""Controllers near rest, and their loops with the plant, opened where they are to be judged.
+"""Controllers near rest, and their loops with the plant, opened where margins are taken.
 
 Timing as in the environment: measure at t_k, act at once; the v_p and Q_H read at t_k are those applied before. The
 same places as in the controllers' design table: at the camera, where the plant alone is uncertain, and at the pull
@@ -68,11 +68,11 @@ class Responses(NamedTuple):
         return found
 
     def drives(self) -> Complex:
-        """Drives by the ring, the pyrometer held: the controller with what it knows of itself, shape (points, 2)."""
+        """Drives by the ring, pyrometer constant: the controller with what it knows of itself, shape (points, 2)."""
         return _solve(np.eye(2) - self._recalled, self.controller[:, :, RING])
 
     def _without_camera(self) -> Complex:
-        """Drives by what the camera is made to say, the pyrometer's loop closed, shape (points, 2)."""
+        """Drives by an error of the camera, the pyrometer's loop closed, shape (points, 2)."""
         around = self._recalled + self.controller[:, :, PYROMETER, None] * self.plant[:, None, PYROMETER]
         return _solve(np.eye(2) - around, self.controller[:, :, RING])
 
@@ -154,7 +154,7 @@ def noise_gains(contender: Contender, dt: float) -> dict[str, float]:
 def apart(contender: Contender, other: Contender, dt: float) -> dict[str, list[float]]:
     """Largest relative deviation of one's local gains from the ring from another's, by drive, in each of BANDS.
 
-    The pyrometer is held, and each knows what it asked of its own drives.
+    The pyrometer is constant, and each knows what it asked of its own drives.
     """
     found: dict[str, list[float]] = {"pull speed": [], "heater": []}
     for low, high in pairwise(BANDS):

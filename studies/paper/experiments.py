@@ -84,15 +84,15 @@ def trace(
     config = make_config(scenario, model, control_interval=interval, horizon=horizon, meniscus=meniscus)
     run = rollout(policy, config, [0])
     lived = int(run.alive.sum())
-    whole = Signals(
+    logged = Signals(
         *(np.concatenate([start[0], log[:lived, 0]]) for start, log in zip(run.start, run.signals, strict=True))
     )
     puller = make_puller(lam=MODELS[model], meniscus=meniscus)
-    r_tilde = whole.r_br_measured - puller.ring_bias
+    r_tilde = logged.r_br_measured - puller.ring_bias
     parallel = getattr(policy, "compensator", None)
     if parallel is not None:
-        r_tilde = r_tilde + parallel.respond(whole.v_p - puller.v_0, interval)
-    return Trace(interval * np.arange(lived + 1, dtype=np.float64), whole, r_tilde, bool(run.failed[0]))
+        r_tilde = r_tilde + parallel.respond(logged.v_p - puller.v_0, interval)
+    return Trace(interval * np.arange(lived + 1, dtype=np.float64), logged, r_tilde, bool(run.failed[0]))
 
 
 class InverseResponse(NamedTuple):

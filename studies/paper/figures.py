@@ -43,7 +43,7 @@ def sheet(rows: int, columns: int, size: tuple[float, float], **grid: Any) -> tu
 
 
 def label(axis: Any, x: str, y: str, legend: bool = False) -> None:
-    """Axis labels, and a legend if asked for."""
+    """Axis labels, and a legend if wanted."""
     axis.set_xlabel(x)
     axis.set_ylabel(y)
     axis.margins(x=0.01)
@@ -58,7 +58,7 @@ def values(run: Trace, name: str) -> Floats:
 
 
 def draw_signal(axis: Any, run: Trace, name: str, x: str, *style: str, **line: Any) -> None:
-    """A signal against time, blue unless told, with its axes named; ``x`` names the time axis, "" for one below."""
+    """A signal against time, blue by default, with its axes named; ``x`` names the time axis, "" for one below."""
     axis.plot(ex.minutes(run), values(run, name), *style, **({"color": BLUE} | line))
     label(axis, x, SHOWN[name][1])
 

@@ -1,8 +1,8 @@
 """Compute the polynomials of the exact meniscus and write them to ``young_laplace_table.py``.
 
-``python -m studies.young_laplace`` runs :func:`main`, which writes only if told to. The exact solution is
-sampled at Chebyshev points, where interpolation converges as fast as the function is smooth; what is stored are the
-powers' coefficients.
+``python -m studies.young_laplace`` compares them with the table there is, and writes only with ``--write``. The exact
+solution is sampled at Chebyshev points, where interpolation converges as fast as the function is smooth; what is stored
+are the powers' coefficients.
 """
 
 from __future__ import annotations

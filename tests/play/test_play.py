@@ -51,13 +51,13 @@ def handle(game: hand.Game, *keys: int, mod: int = 0) -> None:
 
 def test_arrows_move_the_set_points(game: hand.Game) -> None:
     p = game.record.puller
-    assert game.asked == (p.v_0, p.Q_H_0)
+    assert game.set_points == (p.v_0, p.Q_H_0)
     handle(game, pygame.K_UP, pygame.K_UP, pygame.K_RIGHT)
-    assert game.asked == pytest.approx((p.v_0 + 0.02 * MM_PER_MIN, p.Q_H_0 + 0.1 * KILO))
+    assert game.set_points == pytest.approx((p.v_0 + 0.02 * MM_PER_MIN, p.Q_H_0 + 0.1 * KILO))
     handle(game, pygame.K_DOWN, pygame.K_LEFT, mod=pygame.KMOD_LSHIFT)
-    assert game.asked == pytest.approx((p.v_0 - 0.08 * MM_PER_MIN, p.Q_H_0 - 0.9 * KILO))
+    assert game.set_points == pytest.approx((p.v_0 - 0.08 * MM_PER_MIN, p.Q_H_0 - 0.9 * KILO))
     handle(game, *[pygame.K_DOWN, pygame.K_LEFT] * 40, mod=pygame.KMOD_LSHIFT)
-    assert game.asked == (0.0, p.Q_H_0 - 10 * KILO)
+    assert game.set_points == (0.0, p.Q_H_0 - 10 * KILO)
 
 
 def test_the_drives_get_what_was_asked(game: hand.Game) -> None:
