@@ -45,11 +45,7 @@ class SeriesPID:
     """Derivative filter [-]."""
 
     def lead(self, dt: float) -> tuple[float, float, float]:
-<<<<<<< HEAD
         """The lead by Tustin's rule at a sample time dt [s]: y_k = b_0 e_k + b_1 e_(k-1) - a_1 y_(k-1)."""
-=======
-        """Tustin's b_0, b_1, a_1 of (T_d s + 1)/(1 + T_d s / N): y = b_0 u + b_1 u_old - a_1 y_old."""
->>>>>>> f559a63a4969dbec36112c05a25e95254f003173
         slow, fast = 2.0 * self.T_d / dt, 2.0 * self.T_d / (self.N * dt)
         return (1.0 + slow) / (1.0 + fast), (1.0 - slow) / (1.0 + fast), (1.0 - fast) / (1.0 + fast)
 
