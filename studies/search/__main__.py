@@ -128,7 +128,7 @@ def search(given: argparse.Namespace) -> Study:
             study.tell(trial, objective(trial.params, 0, given, report))
         except optuna.TrialPruned:
             study.tell(trial, state=optuna.trial.TrialState.PRUNED)
-            for folder in given.work.iterdir():
+            for folder in filter(Path.is_dir, given.work.iterdir()):
                 shutil.rmtree(folder)
         except BaseException:
             study.tell(trial, state=optuna.trial.TrialState.FAIL)

@@ -94,7 +94,9 @@ def test_physics_and_info_are_those_of_the_other_observations() -> None:
 
 def test_the_image_shows_the_reading_not_the_truth(detector: RingDetector) -> None:
     """The ring in the image is the reading, noise included: what "measured" says, and nothing better."""
-    env, measured = (CzEnv("only-sensor", observation=name, horizon=200.0) for name in ("camera", "measured"))
+    env, measured = (
+        CzEnv("only-sensor", observation=name, horizon=200.0, info="all") for name in ("camera", "measured")
+    )
     image, info = env.reset(seed=4)
     shown, _ = measured.reset(seed=4)
     bias = detector.read(picture(PULLER.r_0, PULLER.h_0, PULLER, VIEW)).radius - PULLER.r_0
@@ -226,7 +228,7 @@ def test_another_puller_is_in_the_picture() -> None:
 def test_the_exact_meniscus_is_in_the_picture() -> None:
     puller = make_puller(meniscus=YOUNG_LAPLACE)
     detector = RingDetector(VIEW, puller)
-    env = CzEnv("nominal", observation="camera", meniscus=YOUNG_LAPLACE)
+    env = CzEnv("nominal", observation="camera", meniscus=YOUNG_LAPLACE, info="all")
     image, _ = env.reset(seed=0)
     np.testing.assert_array_equal(image, picture(puller.r_0, puller.h_0, puller, VIEW))
     for _ in range(12):

@@ -29,17 +29,13 @@ STEPS = 8192
 """Of a small training run: rollouts of 2,048 steps, a validation after every second one."""
 TRAINING = {
     "start-up": ("cz_gym.agents.training.run:provenance:1", 0),
-    "imitation": ("cz_gym.agents.training.run:clone:1>cz_gym.vector:CzVectorEnv.step:3000", 0),
-    "first validation": ("cz_gym.agents.training.run:Run._validate:1>cz_gym.vector:CzVectorEnv.step:1000", 0),
-    "before the first step counts": ("cz_gym.agents.training.run:Run._validate:1>os:rename:2", 0),
     "rollout": ("stable_baselines3.common.buffers:RolloutBuffer.add:20", 1280),
-    "update of the critic": ("stable_baselines3:PPO.train:1>torch.nn.utils:clip_grad_norm_:5", 3328),
+    "update": ("stable_baselines3:PPO.train:1>torch.nn.utils:clip_grad_norm_:5", 3328),
     "checkpoint, before it counts": ("cz_gym.agents.training.run:Run.save:5>os:rename:1", 3584),
-    "update of both networks": ("stable_baselines3:PPO.train:2>torch.nn.utils:clip_grad_norm_:5", 7680),
-    "later validation": ("cz_gym.agents.training.run:Run._validate:1>cz_gym.vector:CzVectorEnv.step:1000", 9728),
-    "checkpoint, as it moves": ("cz_gym.agents.training.run:Run._validate:1>os:replace:2", 9728),
-    "judging": ("cz_gym.agents.training.run:Run.finish:1>cz_gym.vector:CzVectorEnv.step:1000", 9728),
-    "summary, as it moves": ("cz_gym.agents.training.run:Run.finish:1>os:replace:2", 9728),
+    "first validation": ("cz_gym.agents.training.run:Run._validate:1>cz_gym.vector:CzVectorEnv.step:1000", 7616),
+    "checkpoint, as it moves": ("cz_gym.agents.training.run:Run._validate:1>os:replace:2", 9664),
+    "judging": ("cz_gym.agents.training.run:Run.finish:1>cz_gym.vector:CzVectorEnv.step:1000", 9664),
+    "summary, as it moves": ("cz_gym.agents.training.run:Run.finish:1>os:replace:2", 9664),
 }
 """Where one run can be killed, resumed, killed ...: the point, counted from where it goes on, and the step at which a
 run stands that was killed there."""
@@ -62,12 +58,8 @@ def training(arguments: list[str]) -> int:
     """train.py on the recipe that it runs by default, on less of everything; a checkpoint at every step."""
     tqdm.set_lock(threading.RLock())  # its own is a semaphore, which a killed process leaves behind
     run.PICKING, run.JUDGING, run.VALIDATE_EVERY = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4], STEPS // 2
-    default = recipes.RECIPES["ppo"]
-    clone = replace(default.recipe.clone or recipes.Clone("lqg"), rounds=1, episodes=2, epochs=1)
-    small = replace(default.recipe, num_envs=64, clone=clone)
-    recipes.RECIPES["ppo"] = replace(
-        default, recipe=small, n_steps=32, batch_size=512, n_epochs=2, critic_steps=STEPS // 4
-    )
+    small = {"num_envs": 64, "n_steps": 32, "batch_size": 512, "n_epochs": 2}
+    recipes.RECIPES["ppo"] = replace(recipes.RECIPES["ppo"], **small)  # type: ignore[arg-type]
     return train.main(["--steps", str(STEPS), "--checkpoint-seconds", "0", *arguments])
 
 

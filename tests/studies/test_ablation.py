@@ -26,7 +26,7 @@ def test_a_row_changes_one_thing(row: Variant) -> None:
     assert row.name == "-".join(filter(None, (row.base, row.name.removeprefix(row.base).strip("-"))))
     assert changed == {"rounds", "episodes"} or len(changed) == (row.base != "")
     if isinstance(row.recipe, Imitation):
-        assert find_controller(row.recipe.teacher).told == ("teacher" not in changed)
+        assert find_controller(row.recipe.teacher).privileged == ("teacher" not in changed)
         assert row.recipe.rounds * row.recipe.episodes == (960 if changed == {"episodes"} else 3840)
 
 
