@@ -7,7 +7,6 @@ true state corrects what the plan cannot know: a heater that moves in steps.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -22,7 +21,7 @@ from cz_gym.observation import HEATER_SCALE, STATE, scales
 from cz_gym.task import cost_terms
 
 from .future import future_of
-from .trajectory import INPUTS, Search, Trajectory, limits_of, optimise, predicted_cost
+from .trajectory import INPUTS, Trajectory, limits_of, optimise, predicted_cost
 
 BATCH = 25
 """Episodes optimised at once."""
@@ -55,18 +54,17 @@ class Memory(NamedTuple):
 class Clairvoyant:
     """Plays the optimum of each slot's episode, on "state" observations; :meth:`for_episodes` makes the plan."""
 
-    search: Search = field(default_factory=Search)
     plan: Plan | None = field(default=None, compare=False, repr=False)
 
     @property
     def hash(self) -> str:
-        """Hash of its settings (16 hex digits)."""
-        return hashlib.sha256(repr(self.search).encode()).hexdigest()[:16]
+        """Hash of its settings: it has none, and its constants are part of the code."""
+        return ""
 
     def for_episodes(self, config: Config, seeds: Sequence[int]) -> Clairvoyant:
         """The same for those episodes, one a slot."""
-        parts = [make_plan(config, seeds[i : i + BATCH], self.search) for i in range(0, len(seeds), BATCH)]
-        return Clairvoyant(self.search, parts[0] if len(parts) == 1 else _joined(parts))
+        parts = [make_plan(config, seeds[i : i + BATCH]) for i in range(0, len(seeds), BATCH)]
+        return Clairvoyant(parts[0] if len(parts) == 1 else _joined(parts))
 
     def predict(
         self, observation: Any, state: Memory | None = None, episode_start: Any = None, deterministic: bool = True
@@ -90,11 +88,11 @@ class Clairvoyant:
         return action, Memory(memory.step + 1.0, correction)
 
 
-def make_plan(config: Config, seeds: Sequence[int], search: Search) -> Plan:
+def make_plan(config: Config, seeds: Sequence[int]) -> Plan:
     """Optimise the first episodes that those seeds draw."""
     future = future_of(config, seeds)
     limits = limits_of(config.scenario.actuators, config.parameters.v_0, config.control_interval)
-    best = optimise(future, limits, search)
+    best = optimise(future, limits)
     state_0, inputs_0 = (
         np.stack(np.broadcast_arrays(*values), axis=-1) for values in (future.puller.state_0, future.puller.inputs_0)
     )
@@ -113,5 +111,5 @@ def _joined(plans: Sequence[Plan]) -> Plan:
     bests = [plan.best for plan in plans]
     x, u, feedback = (np.concatenate([best[i] for best in bests], axis=1) for i in range(3))
     moves = np.concatenate([best.last_move for best in bests])
-    best = Trajectory(x, u, feedback, moves, max(best.steps for best in bests))
+    best = Trajectory(x, u, feedback, moves)
     return Plan(best, *(np.concatenate([plan[i] for plan in plans]) for i in range(1, len(Plan._fields))))

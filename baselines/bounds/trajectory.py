@@ -9,7 +9,6 @@ quadratic, so leaving out the dynamics' curvature (Gauss-Newton) costs a little 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -26,25 +25,15 @@ from .riccati import Law, Stages, sweep_back, sweep_forward
 STATES, INPUTS = len(State._fields), len(Inputs._fields)
 SCALES = np.array([MM, MM, 1.0, 1.0, 1.0, MM_PER_MIN, KILO])
 """Units in which state and inputs are of one order."""
+TOLERANCE = 1e-7
+"""Largest last move, in SCALES, at which the search ends."""
+MOST_STEPS = 60
+"""Most Newton steps."""
+BARRIER, BARRIER_END, BARRIER_CUT = 1e-2, 1e-9, 0.1
+"""Weight of the barrier at the start and at the end, in the cost of a step, and its factor from step to step."""
+BOUNDARY = 0.99
+"""Largest share of the way to a limit that one step goes [-]."""
 _STEP = 1e-30
-
-
-@dataclass(frozen=True)
-class Search:
-    """How the optimum is searched."""
-
-    barrier: float = 1e-2
-    """Weight of the barrier at the start, in the cost of a step [-]."""
-    barrier_end: float = 1e-9
-    """Weight of the barrier at the end [-]."""
-    barrier_cut: float = 0.1
-    """Factor on the barrier from one Newton step to the next [-]."""
-    boundary: float = 0.99
-    """Largest share of the way to a limit that one step goes [-]."""
-    tolerance: float = 1e-7
-    """Largest last move, in mm, K, mm/min and kW, at which the search ends."""
-    most: int = 60
-    """Most Newton steps."""
 
 
 class Limits(NamedTuple):
@@ -67,8 +56,6 @@ class Trajectory(NamedTuple):
     """Optimal moves of the inputs per deviation of state and previous inputs, shape (N, n, 2, 7)."""
     last_move: Floats
     """Largest last move of any unknown, in :data:`SCALES`, shape (n,)."""
-    steps: int
-    """Newton steps taken."""
 
 
 def limits_of(actuators: Actuators, v_0: float, interval: float) -> Limits:
@@ -78,34 +65,33 @@ def limits_of(actuators: Actuators, v_0: float, interval: float) -> Limits:
     return Limits(span / scale, np.array([actuators.pull_slew, actuators.heater_slew]) * interval / scale)
 
 
-def optimise(future: Future, limits: Limits, search: Search | None = None) -> Trajectory:
+def optimise(future: Future, limits: Limits) -> Trajectory:
     """Minimise the reward's unsaturated cost over the whole episode within the drives' limits."""
-    search = search or Search()
     N, n = future.r_ref.shape
     nominal = np.stack([np.broadcast_to(value, n) for value in future.puller.inputs_0], axis=-1)
     x = np.broadcast_to(np.stack(future.start, axis=-1), (N + 1, n, STATES)).copy()
     x[1:, :, 0] = future.r_ref
     u = np.broadcast_to(nominal, (N, n, INPUTS)).copy()
     slack = _slacks(u, nominal, limits)
-    force = search.barrier / slack
-    barrier, moved = search.barrier, np.full(n, np.inf)
-    step = 0
-    while step < search.most and not (barrier <= search.barrier_end and moved.max() < search.tolerance):
-        barrier = max(search.barrier_end, barrier * search.barrier_cut) if step else barrier
+    force = BARRIER / slack
+    barrier, moved = BARRIER, np.full(n, np.inf)
+    for step in range(MOST_STEPS):
+        if barrier <= BARRIER_END and moved.max() < TOLERANCE:
+            break
+        barrier = max(BARRIER_END, barrier * BARRIER_CUT) if step else barrier
         stages = _stages(future, x, u, nominal, slack, force, barrier)
         law = sweep_back(stages)
         after, moves = sweep_forward(stages, law, np.zeros((n, STATES + INPUTS)))
         dz = after * SCALES
         ds = _slopes(after[:, :, STATES:], moves)
         df = barrier / slack - force - force / slack * ds
-        fraction = np.minimum(_step_fraction(slack, ds, search), _height_fraction(x[1:, :, 1], dz[:, :, 1], future))
+        fraction = np.minimum(_step_fraction(slack, ds), _height_fraction(x[1:, :, 1], dz[:, :, 1], future))
         x[1:] += fraction[:, None] * dz[:, :, :STATES]
         u += fraction[:, None] * dz[:, :, STATES:]
         slack = _slacks(u, nominal, limits)
-        force = force + _step_fraction(force, df, search)[:, None] * df
+        force = force + _step_fraction(force, df)[:, None] * df
         moved = np.abs(after).max(axis=(0, 2))
-        step += 1
-    return Trajectory(x, u, _in_si(law), moved, step)
+    return Trajectory(x, u, _in_si(law), moved)
 
 
 def predicted_cost(future: Future, trajectory: Trajectory) -> Floats:
@@ -181,10 +167,10 @@ def _slopes(held: Floats, moves: Floats) -> Floats:
     return np.stack([-held, held, -moves, moves])
 
 
-def _step_fraction(values: Floats, changes: Floats, search: Search) -> Floats:
+def _step_fraction(values: Floats, changes: Floats) -> Floats:
     """Largest fraction of the changes that keeps positive values positive, at most 1, shape (n,)."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(changes < 0.0, -search.boundary * values / changes, math.inf)
+        ratio = np.where(changes < 0.0, -BOUNDARY * values / changes, math.inf)
     fraction: Floats = np.minimum(ratio.min(axis=(0, 1, 3)), 1.0)
     return fraction
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -32,17 +31,6 @@ from .prediction import Prediction, expected_disturbances, held, predict_under_l
 
 WEIGHT_FACTOR = 0.8
 """On ``lqg``'s weights on pull and moves: the better estimate allows it at the same pull activity."""
-
-
-class Objective(NamedTuple):
-    """The cost in :data:`cz_gym.baselines.bounds.trajectory.SCALES`."""
-
-    stage: Floats
-    """Weights on the squares of a stage's outputs, shape (stages, 5)."""
-    P: Floats
-    """Cost-to-go from the end, z' P z + 2 z' X d, shape (7, 7)."""
-    X: Floats
-    """Shape (7, 5), by disturbance states in SI units."""
 
 
 @dataclass(frozen=True)
@@ -109,8 +97,8 @@ class EkfMpc(MeasuredController):
         disturbances = expected_disturbances(estimate, plan, gains, share, shape.stages)
         z = np.concatenate([estimate[:, :PLANT], previous], axis=1) / SCALES
         prediction = predict_under_law(z, plan, disturbances, gains, share, shape)
-        cost = objective(gains.regulator, settings.weights, shape)
-        H, g = newton(prediction, held(plan, shape.stages)[:, -1, 0], disturbances[:, -1], cost)
+        last = held(plan, shape.stages)[:, -1, 0], disturbances[:, -1]
+        H, g = newton(prediction, *last, gains.regulator, settings.weights, shape)
         usable = np.isfinite(np.concatenate([H.reshape(len(H), -1), g], axis=1)).all(axis=1)
         corrections = np.zeros(g.shape)
         corrections[usable] = best_corrections(H[usable], g[usable], prediction.of(usable), self.blocks, self.limits)
@@ -122,27 +110,29 @@ class EkfMpc(MeasuredController):
         return inputs
 
 
-def objective(law: Regulator, weights: Weights, shape: Shape) -> Objective:
-    """The regulator's cost over the horizon, its cost-to-go beyond."""
+def newton(
+    prediction: Prediction, r_ref: Floats, d: Floats, law: Regulator, weights: Weights, shape: Shape
+) -> tuple[Floats, Floats]:
+    """Curvature (n, c, c) and slope (n, c) of the cost by the corrections.
+
+    The cost is the regulator's over the horizon and its cost-to-go, z' P z + 2 z' X d, beyond. ``r_ref`` [m], shape
+    (n,), and the disturbance states ``d``, shape (n, 5), are those at the horizon's end.
+    """
+    n, N, _, n_c = prediction.outputs_c.shape
     cost = quadratic_cost(weights, shape.dt)
     pull = cost.Q[PLANT, PLANT]
     squares = np.array([SCALES[0], *SCALES[PLANT:], *SCALES[PLANT:]]) ** 2
-    stage = np.tile(squares * np.array([cost.Q[0, 0], pull, 0.0, cost.R[0, 0] - pull, cost.R[1, 1]]), (shape.stages, 1))
+    stage = np.tile(squares * np.array([cost.Q[0, 0], pull, 0.0, cost.R[0, 0] - pull, cost.R[1, 1]]), (N, 1))
     stage[-1, 0] = 0.0
-    return Objective(stage, law.P * np.outer(SCALES, SCALES), law.X * SCALES[:, None])
-
-
-def newton(prediction: Prediction, r_ref: Floats, d: Floats, cost: Objective) -> tuple[Floats, Floats]:
-    """Curvature (n, c, c) and slope (n, c) of the cost by the corrections; r_ref [m] and d at the horizon's end."""
-    n, _, _, n_c = prediction.outputs_c.shape
-    weighted = (cost.stage[..., None] * prediction.outputs_c).reshape(n, -1, n_c)
+    weighted = (stage[..., None] * prediction.outputs_c).reshape(n, -1, n_c)
     H = weighted.swapaxes(1, 2) @ prediction.outputs_c.reshape(n, -1, n_c)
     g = (weighted.swapaxes(1, 2) @ prediction.outputs.reshape(n, -1, 1))[:, :, 0]
     error = prediction.last.copy()
     error[:, 0] -= r_ref / SCALES[0]
     end = prediction.last_c.swapaxes(1, 2)
-    H = H + end @ cost.P @ prediction.last_c
-    g = g + (end @ (error @ cost.P.T + d @ cost.X.T)[:, :, None])[:, :, 0]
+    P, X = law.P * np.outer(SCALES, SCALES), law.X * SCALES[:, None]
+    H = H + end @ P @ prediction.last_c
+    g = g + (end @ (error @ P.T + d @ X.T)[:, :, None])[:, :, 0]
     return H, g
 
 

@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant, episode_cost
 from cz_gym.baselines.bounds.future import future_of, substeps_of
 from cz_gym.baselines.bounds.riccati import Stages, sweep_back, sweep_forward
-from cz_gym.baselines.bounds.trajectory import Limits, Search, limits_of, linearised, optimise, predicted_cost
+from cz_gym.baselines.bounds.trajectory import TOLERANCE, Limits, limits_of, linearised, optimise, predicted_cost
 from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Actuators
@@ -137,7 +137,7 @@ def test_the_environment_replays_what_was_planned(optimum):
     assert run.signals.r_c == pytest.approx(policy.plan.best.x[1:, :, 0], abs=1e-6 * MM)
     assert power == pytest.approx(policy.plan.best.u[:, :, 1], abs=0.01)
     assert episode_cost(run) == pytest.approx(policy.plan.cost, rel=1e-6)
-    assert (policy.plan.best.last_move < Search().tolerance).all()
+    assert (policy.plan.best.last_move < TOLERANCE).all()
 
 
 def test_no_nearby_inputs_are_cheaper_and_the_slope_is_zero(optimum):

@@ -25,7 +25,7 @@ from tests.observed import measured
 pytest.importorskip("casadi", reason="needs the extra mpc")
 
 from cz_gym.baselines.bounds.trajectory import SCALES, Limits
-from cz_gym.baselines.mpc.controller import EkfMpc, ekf_mpc, newton, objective
+from cz_gym.baselines.mpc.controller import EkfMpc, ekf_mpc, newton
 from cz_gym.baselines.mpc.limits import best_corrections
 from cz_gym.baselines.mpc.prediction import expected_disturbances, held, predict_under_law
 
@@ -62,8 +62,8 @@ def parts(mpc, estimate, plan, previous):
     disturbances = expected_disturbances(estimate, plan, gains, SHARE, shape.stages)
     z = np.concatenate([estimate[:, :PLANT], previous], axis=1) / SCALES
     prediction = predict_under_law(z, plan, disturbances, gains, SHARE, shape)
-    cost = objective(gains.regulator, mpc.lqg.settings.weights, shape)
-    H, g = newton(prediction, held(plan, shape.stages)[:, -1, 0], disturbances[:, -1], cost)
+    last = held(plan, shape.stages)[:, -1, 0], disturbances[:, -1]
+    H, g = newton(prediction, *last, gains.regulator, mpc.lqg.settings.weights, shape)
     return prediction, H, g, disturbances
 
 
