@@ -22,9 +22,9 @@ import numpy as np
 from cz_gym.agents import AgentFileError, OnnxPolicy, shipped
 from cz_gym.agents.agent_file.contract import make_contract, read_agent
 from cz_gym.agents.agent_file.graph import OPERATORS
-from cz_gym.agents.training import recipes
 from cz_gym.agents.training.checkpoint import load_checkpoint, restore, to_bytes
 from cz_gym.agents.training.learners import make_learner
+from cz_gym.agents.training.recipes import PPO, SAC
 from cz_gym.agents.training.run_files import COLUMNS, read_rows, saved_steps
 from cz_gym.baselines.registry import make_controller
 from cz_gym.evaluation.cache import read_episode
@@ -34,10 +34,10 @@ from cz_gym.jit.cache import Store
 
 SPARE = 1_000_000_000
 """Memory beyond what importing takes [bytes]."""
-SMALL = recipes.PPO(steps=8, num_envs=2, hidden=(8,), n_steps=4, batch_size=8, n_epochs=1)
-SMALL_SAC = recipes.SAC(
-    steps=16, num_envs=2, hidden=(8,), buffer_size=32, learning_starts=8, batch_size=4, gradient_steps=1
-)
+SMALL = PPO(num_envs=2, hidden=(8,), steps=16, n_steps=4, batch_size=8, n_epochs=1)
+SMALL_SAC = SAC(
+    num_envs=2, hidden=(8,), steps=16, buffer_size=32, learning_starts=8, batch_size=4, gradient_steps=1
+)  # fmt: skip
 ODD = (
     b"", b"\0", b"\xff" * 8, b"\x80\x04.", b"../../../etc/passwd", b"NaN", b"1e999", b"-1", b"[" * 200, b'{"a":' * 50,
 )  # fmt: skip
@@ -61,7 +61,7 @@ def targets(folder: Path) -> dict[str, Target]:
     agent, checkpoint = folder / "agent.onnx", folder / "checkpoint.safetensors"
     agent.write_bytes(network)
     facts_file = shipped().with_suffix(".json")
-    ppo, sac = (make_learner(small, 0, make_controller) for small in (SMALL, SMALL_SAC))
+    ppo, sac = (make_learner(recipe, 0, make_controller) for recipe in (SMALL, SMALL_SAC))
     for learner in (ppo, sac):
         learner.learn(lambda steps, doing: None)
     store = Store(folder, "kernel")

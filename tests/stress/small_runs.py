@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,9 @@ from tqdm import tqdm
 import benchmark
 import train
 from cz_gym.agents import OnnxPolicy
-from cz_gym.agents.training import recipes, run
+from cz_gym.agents.training import run
 from cz_gym.agents.training.checkpoint import load_checkpoint
+from cz_gym.agents.training.recipes import PPO, RECIPES, Imitation
 from cz_gym.atomic_files import finish_writing
 from cz_gym.baselines import registry
 from cz_gym.baselines.pid.open_loop import OpenLoop
@@ -25,25 +26,37 @@ from cz_gym.evaluation.files import is_benchmark_json
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.report import figures, page  # noqa: F401
 
-STEPS = 8192
-"""Of a small training run: rollouts of 2,048 steps, a validation after every second one."""
-TRAINING = {
+RUN = "cz_gym.agents.training.run:Run"
+STEP = "cz_gym.vector:CzVectorEnv.step"
+IMITATION = {
+    "start-up": ("cz_gym.agents.training.run:provenance:1", 0),
+    "demonstrations": (f"cz_gym.agents.training.imitation:demonstrate:2>{STEP}:100", 0),
+    "fit": ("cz_gym.agents.training.imitation:fit:2>torch.autograd:backward:1", 0),
+    "checkpoint, before it counts": (f"{RUN}.save:2>os:rename:1", 0),
+    "validation": (f"{RUN}._validate:1>{STEP}:100", 2880),
+    "checkpoint, as it moves": (f"{RUN}._validate:1>os:replace:2", 2880),
+    "judging": (f"{RUN}.finish:1>{STEP}:100", 2880),
+    "summary, as it moves": (f"{RUN}.finish:1>os:replace:2", 2880),
+}
+"""Where one imitation can be killed, resumed, killed ...: the point, counted from where it goes on, and the step at
+which a run stands that was killed there."""
+REINFORCEMENT = {
     "start-up": ("cz_gym.agents.training.run:provenance:1", 0),
     "rollout": ("stable_baselines3.common.buffers:RolloutBuffer.add:20", 1280),
     "update": ("stable_baselines3:PPO.train:1>torch.nn.utils:clip_grad_norm_:5", 3328),
-    "checkpoint, before it counts": ("cz_gym.agents.training.run:Run.save:5>os:rename:1", 3584),
-    "first validation": ("cz_gym.agents.training.run:Run._validate:1>cz_gym.vector:CzVectorEnv.step:1000", 7616),
-    "checkpoint, as it moves": ("cz_gym.agents.training.run:Run._validate:1>os:replace:2", 9664),
-    "judging": ("cz_gym.agents.training.run:Run.finish:1>cz_gym.vector:CzVectorEnv.step:1000", 9664),
-    "summary, as it moves": ("cz_gym.agents.training.run:Run.finish:1>os:replace:2", 9664),
+    "checkpoint, before it counts": (f"{RUN}.save:5>os:rename:1", 3584),
+    "first validation": (f"{RUN}._validate:1>{STEP}:100", 7616),
+    "checkpoint, as it moves": (f"{RUN}._validate:1>os:replace:2", 9664),
+    "one after a validation, before it counts": (f"{RUN}._validate:1>os:rename:2", 9664),
+    "judging": (f"{RUN}.finish:1>{STEP}:100", 9664),
+    "summary, as it moves": (f"{RUN}.finish:1>os:replace:2", 9664),
 }
-"""Where one run can be killed, resumed, killed ...: the point, counted from where it goes on, and the step at which a
-run stands that was killed there."""
+"""The same of PPO, of which rollouts have 2,048 steps, and a validation follows every second one."""
 WRITING = "cz_gym.evaluation.report.output:write_files:1"
 BENCHMARK = {
     "start-up": ("benchmark:make_plan:1", None),
-    "episodes": ("cz_gym.evaluation.runner:rollout:1>cz_gym.vector:CzVectorEnv.step:1000", None),
-    "slow episodes": ("cz_gym.evaluation.cache:rollout:2>cz_gym.vector:CzVectorEnv.step:1000", None),
+    "episodes": (f"cz_gym.evaluation.runner:rollout:1>{STEP}:1000", None),
+    "slow episodes": (f"cz_gym.evaluation.cache:rollout:2>{STEP}:1000", None),
     "figures": ("cz_gym.evaluation.report.figures:draw_figures:1", None),
     "page": ("cz_gym.evaluation.report.page:page:1", None),
     "first results, before they count": (f"{WRITING}>os:rename:1", None),
@@ -55,12 +68,13 @@ BENCHMARK = {
 
 
 def training(arguments: list[str]) -> int:
-    """train.py on the recipe that it runs by default, on less of everything; a checkpoint at every step."""
+    """train.py on less of everything; a checkpoint at every step."""
     tqdm.set_lock(threading.RLock())  # its own is a semaphore, which a killed process leaves behind
-    run.PICKING, run.JUDGING, run.VALIDATE_EVERY = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4], STEPS // 2
-    small = {"num_envs": 64, "n_steps": 32, "batch_size": 512, "n_epochs": 2}
-    recipes.RECIPES["ppo"] = replace(recipes.RECIPES["ppo"], **small)  # type: ignore[arg-type]
-    return train.main(["--steps", str(STEPS), "--checkpoint-seconds", "0", *arguments])
+    run.PICKING, run.JUDGING, run.VALIDATE_EVERY = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4], 4096
+    small: dict[str, Any] = {"hidden": (16,), "control_interval": 30.0}
+    RECIPES["ppo"] = PPO(steps=8192, num_envs=64, n_steps=32, batch_size=512, n_epochs=2, **small)
+    RECIPES["imitation"] = Imitation(name="imitation", rounds=2, episodes=4, epochs=1, **small)
+    return train.main(["--checkpoint-seconds", "0", *arguments])
 
 
 @dataclass(frozen=True)
