@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -96,3 +96,8 @@ def map_arrays(function: Callable[..., Any], *values: Any) -> Any:
     if isinstance(values[0], tuple):
         return type(values[0])(*(map_arrays(function, *parts) for parts in zip(*values, strict=True)))
     return function(*values)
+
+
+def stack(values: Sequence[Any]) -> Any:
+    """NamedTuples of one kind as one of arrays, with a new leading axis."""
+    return map_arrays(lambda *parts: np.stack(parts), *values)

@@ -6,12 +6,12 @@ All comes from the environment's own draws and schedules. It is for bounds alone
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.baselines.policy import Floats
+from cz_gym.baselines.policy import Floats, stack
 from cz_gym.config import Config
 from cz_gym.engine.batch import first_key
 from cz_gym.episodes.schedule import disturbance, reference
@@ -71,11 +71,11 @@ def fluctuations_of(config: Config, seeds: Sequence[int]) -> tuple[tuple[float, 
 
 def future_of(config: Config, seeds: Sequence[int]) -> Future:
     """The future of the first episode that each seed draws."""
-    puller = stacked(Puller, pullers_of(config, seeds))
+    puller = stack(pullers_of(config, seeds))
     substeps = substeps_of(config.control_interval, config.steps)
     points = int(substeps.point.max()) + 1
     drawn = [_drawn(config, seed, points) for seed in seeds]
-    e = stacked(Episode, [episode for episode, _ in drawn])
+    e = stack([episode for episode, _ in drawn])
     dT_i = np.stack([interface for _, interface in drawn], axis=1)
     on_grid = disturbance(np.arange(points)[:, None] * GRID, dT_i, e, puller)
     end = np.arange(1, config.steps + 1)[:, None] * config.control_interval
@@ -102,11 +102,6 @@ def substeps_of(interval: float, steps: int) -> Substeps:
             t, at = upto, at + 1
     used = length.any(axis=0)
     return Substeps(point[:, used], length[:, used])
-
-
-def stacked(kind: Any, values: Sequence[Any]) -> Any:
-    """Several tuples of one kind as one tuple of arrays."""
-    return kind(*(np.array(column) for column in zip(*values, strict=True)))
 
 
 def _drawn(config: Config, seed: int, points: int) -> tuple[Episode, Floats]:

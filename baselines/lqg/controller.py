@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.baselines.policy import Floats, MeasuredController
+from cz_gym.baselines.policy import Floats, MeasuredController, stack
 from cz_gym.observation import HEATER_SCALE, Measured
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
@@ -27,7 +27,7 @@ from cz_gym.units import KILO
 
 from .estimator import PlantFilter
 from .filter_bank import FilterBank
-from .model import STATES, NoiseModel, PlantModel, plant_model
+from .model import STATES, NoiseModel, plant_model
 from .preview import look_ahead, samples_ahead
 from .regulator import Regulator, Weights, regulator
 from .ring_model import RingModel, augmented
@@ -95,10 +95,8 @@ def solve_each(
     """The same for settings and a puller a slot; settings may differ in the noise that drives the plant."""
     pairs = zip(settings, pullers, strict=True)
     filters, laws = zip(*(solve.__wrapped__(each, dt, puller, meniscus) for each, puller in pairs), strict=True)
-    plant = PlantModel(*(np.stack(parts) for parts in zip(*(each.plant for each in filters), strict=True)))
-    puller = Puller(*(np.array(values) for values in zip(*pullers, strict=True)))  # type: ignore[arg-type]
-    law = Regulator(*(np.stack(parts) for parts in zip(*laws, strict=True)))
-    return Gains(filters[0]._replace(puller=puller, plant=plant), law)
+    plant = stack([each.plant for each in filters])
+    return Gains(filters[0]._replace(puller=stack(pullers), plant=plant), stack(laws))
 
 
 @dataclass(frozen=True)
