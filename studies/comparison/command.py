@@ -34,7 +34,7 @@ def main(study: Study, arguments: Sequence[str] | None) -> int:
     parser.add_argument("--seeds", type=between(1, 100), default=3, help="training seeds a row (default: %(default)s)")
     parser.add_argument(
         "--steps",
-        type=int,
+        type=STEPS,
         default=study.steps,
         help="environment steps of what learns from reward (%(default)s)",
     )

@@ -134,7 +134,14 @@ def test_a_damaged_result_is_named(content: str, tmp_path: Path) -> None:
         (["--jobs", "0"], "--jobs: must be between 1 and 64, not 0"),
     ],
 )
-def test_mistakes_give_one_line(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes_give_one_line(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
     try:
         code = command.main(STUDY, arguments)
     except SystemExit as left:
