@@ -7,13 +7,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cz_gym.commands import OneLineParser, guarded
+from cz_gym.commands import OneLineParser, between, guarded
 
 from .variants import Study, Variant
 
 if TYPE_CHECKING:
     from .results import Plan, Result
 
+STEPS = between(1, 10**9)
+"""The type of an option that counts environment steps."""
 ABOUT = """
 Agents are judged on {crystals} validation crystals of `{scenario}` that select nothing, and on those of `{transfer}`
 with the same seeds; of each run the agent of least cost on the validation that selects. In brackets: 95 % intervals,
@@ -29,14 +31,14 @@ def main(study: Study, arguments: Sequence[str] | None) -> int:
     prog = f"python -m studies.{study.name}"
     parser = OneLineParser(prog=prog, description=study.title)
     parser.add_argument("--rows", help="rows to run, joined by commas (default: all)")
-    parser.add_argument("--seeds", type=int, default=3, help="training seeds a row (default: %(default)s)")
+    parser.add_argument("--seeds", type=between(1, 100), default=3, help="training seeds a row (default: %(default)s)")
     parser.add_argument(
         "--steps",
-        type=int,
+        type=STEPS,
         default=study.steps,
         help="environment steps of what learns from reward (%(default)s)",
     )
-    parser.add_argument("--jobs", type=int, default=2, help="runs at once (default: %(default)s)")
+    parser.add_argument("--jobs", type=between(1, 64), default=2, help="runs at once (default: %(default)s)")
     add_folders(parser, study.name)
     parser.add_argument("--list", action="store_true", help="say what the rows are and how many of their runs are done")
     given = parser.parse_args(arguments)
@@ -51,15 +53,7 @@ def add_folders(parser: OneLineParser, name: str) -> None:
         parser.add_argument(option, type=Path, default=default, help=f"{meaning} (default: %(default)s)")
 
 
-def check_numbers(given: argparse.Namespace, **limits: tuple[int, int]) -> None:
-    """ValueError unless those options lie within their limits."""
-    for name, (least, most) in limits.items():
-        if not least <= getattr(given, name) <= most:
-            raise ValueError(f"--{name} must be between {least} and {most}, not {getattr(given, name)}")
-
-
 def _main(study: Study, given: argparse.Namespace) -> int:
-    check_numbers(given, seeds=(1, 100), steps=(1, 10**9), jobs=(1, 64))
     from cz_gym.agents.training import validation
     from cz_gym.atomic_files import check_writable, locked
 

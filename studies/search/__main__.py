@@ -17,8 +17,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cz_gym.commands import OneLineParser, guarded
-from studies.comparison.command import add_folders, check_numbers, compare
+from cz_gym.commands import OneLineParser, between, guarded
+from studies.comparison.command import STEPS, add_folders, compare
 
 if TYPE_CHECKING:
     from optuna import Study
@@ -42,21 +42,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def parser() -> OneLineParser:
     """The options."""
     parser = OneLineParser(prog=PROG, description=(__doc__ or "").split("\n")[0])
-    parser.add_argument(
-        "--trials", type=int, default=30, help="trials in all, earlier ones included (default: %(default)s)"
-    )
-    parser.add_argument("--steps", type=int, default=600_000, help="environment steps a trial (default: %(default)s)")
-    parser.add_argument(
-        "--finalists", type=int, default=2, help="best trials that are confirmed (default: %(default)s)"
-    )
-    parser.add_argument("--seeds", type=int, default=3, help="training seeds that confirm (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the search (default: %(default)s)")
+    for option, kind, default, meaning in (
+        ("--trials", between(1, 10_000), 30, "trials in all, earlier ones included"),
+        ("--steps", STEPS, 600_000, "environment steps a trial"),
+        ("--finalists", between(0, 100), 2, "best trials that are confirmed"),
+        ("--seeds", between(1, 100), 3, "training seeds that confirm"),
+        ("--seed", between(0, 10**9), 0, "seed of the search"),
+    ):
+        parser.add_argument(option, type=kind, default=default, help=f"{meaning} (default: %(default)s)")
     add_folders(parser, "search")
     return parser
 
 
 def _main(given: argparse.Namespace) -> int:
-    check_numbers(given, trials=(1, 10_000), steps=(1, 10**9), finalists=(0, 100), seeds=(1, 100))
     from cz_gym.atomic_files import check_writable, locked
 
     check_writable(given.out)

@@ -129,13 +129,24 @@ def test_a_damaged_result_is_named(content: str, tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         (["--rows", "ppo,sacc"], "unknown row 'sacc'; choose from ppo, sac, ppo-recurrent, few"),
-        (["--seeds", "0"], "--seeds must be between 1 and 100, not 0"),
-        (["--steps", "-5"], "--steps must be between 1"),
-        (["--jobs", "0"], "--jobs must be between 1 and 64, not 0"),
+        (["--seeds", "0"], "--seeds: must be between 1 and 100, not 0"),
+        (["--steps", "-5"], "--steps: must be between 1"),
+        (["--jobs", "0"], "--jobs: must be between 1 and 64, not 0"),
     ],
 )
-def test_mistakes_give_one_line(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert command.main(STUDY, arguments) == 2
+def test_mistakes_give_one_line(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    try:
+        code = command.main(STUDY, arguments)
+    except SystemExit as left:
+        code = left.code
+    assert code == 2
     error = capsys.readouterr().err
     assert error.startswith("python -m studies.some: ")
     assert message in error

@@ -121,13 +121,17 @@ def test_the_best_are_confirmed_with_other_seeds(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--trials", "0"], "--trials must be between 1 and 10000, not 0"),
-        (["--finalists", "-1"], "--finalists must be between 0"),
-        (["--seeds", "0"], "--seeds must be between 1"),
+        (["--trials", "0"], "--trials: must be between 1 and 10000, not 0"),
+        (["--finalists", "-1"], "--finalists: must be between 0"),
+        (["--seeds", "0"], "--seeds: must be between 1"),
     ],
 )
 def test_mistakes_give_one_line(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert search.main(arguments) == 2
+    try:
+        code = search.main(arguments)
+    except SystemExit as left:
+        code = left.code
+    assert code == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
