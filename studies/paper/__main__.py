@@ -14,7 +14,7 @@ from pathlib import Path
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser, guarded
 
-from .comparison import as_text, numbers, rows
+from .comparison import as_markdown, numbers, rows
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -31,7 +31,7 @@ def _compare(out: Path) -> int:
 
     check_writable(out)
     write_files({out / name: content for name, content in contents().items()})
-    print(as_text(rows()))
+    print(as_markdown(rows()))
     print(f"\nreport: {out / 'report.md'}")
     return 0
 

@@ -151,17 +151,6 @@ def number(value: float | None) -> str:
     return "-" if value is None else f"{value:.5g}"
 
 
-def as_text(found: list[Row]) -> str:
-    """The comparison as columns for a terminal."""
-    width = max(len(row.quantity) for row in found)
-    lines = [f"{'quantity':<{width}}  {'unit':<6}  {'published':>11}  {'ours':>11}  difference"]
-    lines += [
-        f"{row.quantity:<{width}}  {row.unit:<6}  {number(row.published):>11}  {number(row.ours):>11}  {row.difference}"
-        for row in found
-    ]
-    return "\n".join(lines)
-
-
 def as_markdown(found: list[Row]) -> str:
     """The comparison as a Markdown table."""
     lines = [
