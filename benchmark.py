@@ -15,7 +15,6 @@ from cz_gym.commands import OneLineParser, guarded
 
 if TYPE_CHECKING:
     from cz_gym.baselines.registry import Entry
-    from cz_gym.config import Config
     from cz_gym.evaluation.contenders import Contender
     from cz_gym.evaluation.runner import Plan
 
@@ -27,10 +26,8 @@ CACHE = FOLDER.parent / "cache"
 """Where episodes of slow controllers are cached."""
 BOUNDS = FOLDER.parent / "bounds"
 """Committed results of the slow controllers; their bound serves runs without one."""
-DEFAULT = "imitation-default"
-"""The training seed of ``imitation`` that did best on validation."""
-SHIPPED = ("imitation", DEFAULT, "imitation-medium", "imitation-quiet", "imitation-puller", "ppo")
-"""Agents that come with the package; all but the default pool their training seeds."""
+SHIPPED = ("ppo", "ppo-recurrent", "sac", "random-search", "imitation")
+"""Agents that come with the package; each pools its training seeds."""
 EPISODES = 500
 
 
@@ -147,19 +144,20 @@ def _classical(entry: Entry) -> Contender:
 
 def _given(files: Sequence[tuple[str, Path]]) -> dict[str, Contender]:
     """The agents of files, each with a name or "" for its algorithm's."""
+    from cz_gym.evaluation.contenders import agent
+
     policies: dict[str, list[Any]] = {}
     for name, file in files:
         policy = _load(file)
         policies.setdefault(name or policy.contract.algorithm, []).append(policy)
-    return {name: _agent(name, some, ", given as a file") for name, some in policies.items()}
+    return {name: agent(name, some, ", given as a file") for name, some in policies.items()}
 
 
 def _shipped(name: str) -> Contender:
-    from cz_gym.agents import shipped, shipped_seeds
+    from cz_gym.agents import shipped_seeds
+    from cz_gym.evaluation.contenders import agent
 
-    if name == DEFAULT:
-        return _agent(name, [_load(shipped())], ", the seed that did best on validation")
-    return _agent(name, [_load(file) for file in shipped_seeds(name)])
+    return agent(name, [_load(file) for file in shipped_seeds(name)])
 
 
 def _load(file: Path) -> Any:
@@ -167,16 +165,6 @@ def _load(file: Path) -> Any:
     from cz_gym.evaluation.protocol import ROWS
 
     return OnnxPolicy.load(file, ROWS[0].config())
-
-
-def _agent(name: str, policies: Sequence[Any], remark: str = "") -> Contender:
-    from cz_gym.agents.policies.resampled import at_interval
-    from cz_gym.evaluation.contenders import agent
-
-    def make(config: Config) -> list[Any]:
-        return [at_interval(policy, config.control_interval) for policy in policies]
-
-    return agent(name, policies, make, remark)
 
 
 def left_out(plan: Plan) -> list[str]:

@@ -20,7 +20,7 @@ from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.agents.training.recipes import CostWeights
 from cz_gym.agents.training.validation import JUDGING, validate
 from cz_gym.commands import OneLineParser, guarded
-from cz_gym.config import make_config
+from cz_gym.config import Config, make_config
 from cz_gym.env import CzEnv
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.observation import DRIVE_CHANNELS, OBSERVATIONS
@@ -53,18 +53,18 @@ def save_agent(
     model: BaseAlgorithm,
     name: str,
     normalisation: VecNormalize | None = None,
-    scenario: str = "randomized",
+    config: Config | None = None,
     seed: int | None = None,
 ) -> Contract:
     """Write a trained model as an agent file called ``name``; its contract, with its figures on validation crystals.
 
-    ``normalisation`` is what its observations went through, by default that of the model's own environment;
-    ``scenario`` and ``seed`` say what it was trained on, the seed by default the model's. Raises AgentFileError for a
-    model that cannot be written, among them any whose file does not act as it does.
+    ``normalisation`` is what its observations went through, ``config`` the settings of the environment it was trained
+    in, ``seed`` its training seed: by default the model's own. Raises AgentFileError for a model that cannot be
+    written, among them any whose file does not act as it does.
     """
-    normalisation = normalisation or model.get_vec_normalize_env()
-    config = make_config(scenario, observation=_observation_of(model))
-    content = to_onnx(model, normalisation)
+    normalisation, config = normalisation or model.get_vec_normalize_env(), config or _config_of(model)
+    _check_spaces(model, config)
+    content = to_onnx(model, normalisation, config.observation)
     facts = {
         **facts_of(config),
         "algorithm": name,
@@ -82,7 +82,7 @@ def save_agent(
     return write_agent(path, content, **facts)
 
 
-def to_onnx(model: BaseAlgorithm, normalisation: VecNormalize | None) -> bytes:
+def to_onnx(model: BaseAlgorithm, normalisation: VecNormalize | None, observation: str) -> bytes:
     """The model's deterministic action as a serialised ONNX model; AgentFileError if it cannot be written as one."""
     from stable_baselines3.common.torch_layers import FlattenExtractor
 
@@ -104,12 +104,12 @@ def to_onnx(model: BaseAlgorithm, normalisation: VecNormalize | None) -> bytes:
         graph.acted(x, actor, "action")
     except TypeError as error:
         raise AgentFileError(str(error)) from None
-    return graph.finished(len(OBSERVATIONS[_observation_of(model)]), actor)
+    return graph.finished(len(OBSERVATIONS[observation]), actor)
 
 
 def disagreement(agent: OnnxPolicy, model: BaseAlgorithm, normalisation: VecNormalize | None) -> float:
     """The largest difference between the actions of file and model, on crystals that the file drives [action units]."""
-    envs = CzVectorEnv(SLOTS, observation=agent.observation, scenario=agent.contract.scenario)
+    envs = CzVectorEnv(SLOTS, agent.contract.scenario, observation=agent.observation, action=agent.action)
     observation, _ = envs.reset(seed=list(VALIDATION_SEEDS[:SLOTS]))
     apart, memory, recalled = 0.0, None, None
     starts = np.ones(SLOTS, bool)
@@ -124,16 +124,26 @@ def disagreement(agent: OnnxPolicy, model: BaseAlgorithm, normalisation: VecNorm
     return apart
 
 
-def _observation_of(model: BaseAlgorithm) -> str:
-    """The observation mode of the model's channels."""
-    shape = model.observation_space.shape
-    named = [name for name, channels in OBSERVATIONS.items() if shape == (len(channels),)]
-    if not named:
-        lengths = ", ".join(f"{name} {len(channels)}" for name, channels in OBSERVATIONS.items())
-        raise AgentFileError(f"the model reads an observation of shape {shape}; known: {lengths}")
-    if model.action_space.shape != (len(DRIVE_CHANNELS),):
-        raise AgentFileError(f"the model's action has the shape {model.action_space.shape}, not (2,)")
-    return named[0]
+def _config_of(model: BaseAlgorithm) -> Config:
+    """The settings of the environment that a model is in."""
+    try:
+        (config, *_) = model.get_env().get_attr("config")  # type: ignore[union-attr]  # there may be none: said below
+    except AttributeError:
+        raise AgentFileError("the model is in no environment of Cz-v0: say in which it was trained (config)") from None
+    if not isinstance(config, Config):
+        raise AgentFileError(f"the model's environment is not Cz-v0's: its config is {config!r:.80}")
+    return config
+
+
+def _check_spaces(model: BaseAlgorithm, config: Config) -> None:
+    """AgentFileError unless the model reads and acts as the environment of these settings wants."""
+    wanted = (len(OBSERVATIONS.get(config.observation, ())),), (len(DRIVE_CHANNELS),)
+    shapes = model.observation_space.shape, model.action_space.shape
+    if shapes != wanted:
+        raise AgentFileError(
+            f"the model reads an observation of shape {shapes[0]} and gives an action of shape {shapes[1]}; "
+            f"with observation {config.observation!r} they are {wanted[0]} and {wanted[1]}"
+        )
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -148,6 +158,9 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--name", help="what the agent is called (default: the agent file's name)")
     parser.add_argument("--scenario", default="randomized", help="scenario it was trained on (default: %(default)s)")
+    parser.add_argument("--observation", default="history", help="observation it reads (default: %(default)s)")
+    parser.add_argument("--action", default="direct", help="direct or smooth (default: %(default)s)")
+    parser.add_argument("--control-interval", type=float, default=5.0, help="in seconds (default: %(default)s)")
     parser.add_argument("--seed", type=int, help="training seed (default: the model's)")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="agent file to write (.onnx)")
     given = parser.parse_args(argv)
@@ -162,10 +175,16 @@ def _convert(given: argparse.Namespace) -> int:
     module, _, name = ALGORITHMS[given.algo].partition(".")
     algorithm = getattr(importlib.import_module(module), name)
     model = _read(given.model, f"a model of {given.algo}", lambda: algorithm.load(given.model, device="cpu"))
-    observation = _observation_of(model)
+    config = make_config(
+        given.scenario,
+        observation=given.observation,
+        action=given.action,
+        control_interval=given.control_interval,
+    )
+    _check_spaces(model, config)
     normalisation = None
     if given.vecnormalize:
-        env = DummyVecEnv([lambda: CzEnv(observation=observation)])
+        env = DummyVecEnv([lambda: CzEnv(observation=given.observation)])
         normalisation = _read(
             given.vecnormalize, "a VecNormalize", lambda: VecNormalize.load(str(given.vecnormalize), env)
         )
@@ -174,7 +193,7 @@ def _convert(given: argparse.Namespace) -> int:
         model,
         given.out.stem if given.name is None else given.name,
         normalisation,
-        given.scenario,
+        config,
         given.seed,
     )
     said = f"mean RMSE {contract.validation_rmse_mm:.3f} mm on {len(JUDGING)} validation episodes"

@@ -23,7 +23,7 @@ HEATER_RANGE = HEATER_SCALE
 """Q_H = Q_H0 +- this [W]."""
 SMOOTH_TIME = 50.0
 """Time constant with which ``action="smooth"`` moves both drives [s]."""
-SMOOTH_PULL, SMOOTH_HEATER = 0.5, 0.3
+SMOOTH_PULL, SMOOTH_HEATER = 1.0, 0.5
 """Where a held smooth action of 1 brings the drives to: shares of v_0 and of the heater's range [-]."""
 RADIUS_SCALE = 0.5 * MM
 PULL_DEVIATION = 0.36 * MM_PER_MIN
@@ -46,6 +46,13 @@ class Drives(NamedTuple):
     heater: float
     """Gain of the heater [-]."""
 
+    def asked(self, wanted: Any, applied: Any) -> Any:
+        """The action that brings the applied drives to those wanted, all of shape (..., 2), in shares of their ranges.
+
+        It may lie outside the box of actions.
+        """
+        return (wanted - self.keep * applied) / np.array([self.pull, self.heater])
+
 
 DIRECT = Drives(0.0, 1.0, 1.0)
 """The action is the drives' deviation from nominal itself."""
@@ -56,8 +63,8 @@ ACTIONS = ("direct", "smooth")
 def drives_of(action: str, control_interval: float) -> Drives:
     """How actions of that kind move the drives at that control interval [s].
 
-    "smooth": first-order lags. A held action a brings the pull speed to v_0 (1 + 0.5 a) and the heater to
-    Q_H0 + 3 kW a with a time constant of 50 s; left alone they return to nominal. So noise on the action is bounded,
+    "smooth": first-order lags. A held action a brings the pull speed to v_0 (1 + a) and the heater to
+    Q_H0 + 5 kW a with a time constant of 50 s; left alone they return to nominal. So noise on the action is bounded,
     coloured noise of the drives, whatever the control interval.
     """
     if action == "direct":

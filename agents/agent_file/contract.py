@@ -17,7 +17,7 @@ from cz_gym.config import Config
 from cz_gym.observation import CLIP, OBSERVATIONS
 
 FORMAT = "cz-gym-agent"
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 MAX_BYTES = 4_000_000
 """Largest agent file that is read."""
 MAX_JSON_BYTES = 1_000_000
@@ -42,6 +42,8 @@ class Contract:
     """Length of that observation."""
     observation_hash: str
     """Hash of that observation's channels: names, units and scales in their order."""
+    action: str
+    """What its actions mean: "direct" or "smooth" (:func:`cz_gym.task.drives_of`)."""
     control_interval: float
     """Time between actions it was trained at [s]."""
     plant_hash: str
@@ -75,6 +77,7 @@ def facts_of(config: Config) -> dict[str, Any]:
     return {
         "observation": config.observation,
         "channels": len(OBSERVATIONS[config.observation]),
+        "action": config.action,
         "control_interval": config.control_interval,
         "plant_hash": config.plant_hash,
         "scenario": config.scenario.name,

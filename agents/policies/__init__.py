@@ -1,1 +1,1 @@
-"""Agents that act: ONNX files, and agents at other control intervals."""
+"""Agents that act: ONNX files."""

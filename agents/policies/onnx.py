@@ -13,6 +13,7 @@ from cz_gym.agents.agent_file.contract import AgentFileError, Contract, observat
 from cz_gym.agents.agent_file.graph import GraphError, checked
 from cz_gym.config import Config
 from cz_gym.observation import OBSERVATIONS
+from cz_gym.task import ACTIONS
 
 Floats = npt.NDArray[np.float32]
 
@@ -54,6 +55,8 @@ class OnnxPolicy:
             raise AgentFileError(
                 f"{path}: reads observation {contract.observation!r} with other channels or scales than this release's"
             )
+        if contract.action not in ACTIONS:
+            raise AgentFileError(f"{path}: gives actions {contract.action!r}, which this release does not have")
         if config is not None and config.plant_hash != contract.plant_hash:
             raise AgentFileError(
                 f"{path}: trained on plant {contract.plant_hash}, this environment's is {config.plant_hash}"
@@ -69,6 +72,11 @@ class OnnxPolicy:
     def observation(self) -> str:
         """The observation mode the agent reads."""
         return self.contract.observation
+
+    @property
+    def action(self) -> str:
+        """What its actions mean, as the environment's argument of that name says it."""
+        return self.contract.action
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True

@@ -12,6 +12,8 @@ import numpy.typing as npt
 from cz_gym import CzVectorEnv
 from cz_gym.config import Config
 from cz_gym.episodes.scenario import Scenario
+from cz_gym.observation import DRIVE_CHANNELS
+from cz_gym.task import drives_of
 
 Floats = npt.NDArray[np.float32]
 SAMPLE_EVERY = 4
@@ -24,7 +26,7 @@ class Demonstrations(NamedTuple):
     observation: Floats
     """Shape (samples, channels)."""
     action: Floats
-    """Shape (samples, 2)."""
+    """What the teacher's answer is in the environment's actions; may lie outside their box. Shape (samples, 2)."""
 
     @classmethod
     def joined(cls, parts: Iterable[Demonstrations]) -> Demonstrations:
@@ -40,7 +42,7 @@ def demonstrate(
     driver: Callable[[Floats], Floats] | None = None,
     progress: Callable[[int], None] = lambda steps: None,
 ) -> Demonstrations:
-    """Ask the teacher, ``predict`` on "history", at every sample of one episode a seed.
+    """Ask the teacher, ``predict`` on "history" to drives, at every sample of one episode a seed.
 
     A privileged teacher (``for_episodes``) knows what no sensor shows of those episodes. The teacher drives, or a
     ``driver``, a function of the observation; noise of that spread is added. A lost crystal demonstrates nothing more.
@@ -55,8 +57,10 @@ def demonstrate(
     begins, over, memory = np.ones(n, np.bool_), np.zeros(n, np.bool_), None
     running = np.ones(n, np.bool_)
     samples: list[Demonstrations] = []
+    drives = drives_of(config.action, config.control_interval)
     for k in range(config.steps):
-        action, memory = teacher.predict(observation, memory, begins)
+        wanted, memory = teacher.predict(observation, memory, begins)
+        action = drives.asked(wanted, observation[:, list(DRIVE_CHANNELS)])
         if k % SAMPLE_EVERY == 0:
             samples.append(Demonstrations(observation[running], np.asarray(action[running], np.float32)))
         applied = action if driver is None else driver(observation)

@@ -1,4 +1,4 @@
-"""From a trained network to an ONNX file: normalisation, layers, action head and clipping in one graph.
+"""From a trained network to an ONNX file: normalisation, layers and clipping in one graph.
 
 Written operator by operator, because torch's exporter without further packages is the deprecated one, whose graphs
 hold operators that agents' files may not (:mod:`cz_gym.agents.agent_file.graph`).
@@ -10,7 +10,6 @@ from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import onnx
 import torch
 from onnx import TensorProto, helper, numpy_helper
@@ -18,7 +17,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from cz_gym.observation import DRIVE_CHANNELS, HISTORY
 
-from .networks import NORMALISED_LIMIT, DrivePolicy, Normalise
+from .networks import NORMALISED_LIMIT, Beside, Normalise
 
 OPSET, IR_VERSION = 17, 9
 ACTIVATIONS: dict[type[torch.nn.Module], tuple[str, dict[str, str]]] = {
@@ -68,6 +67,8 @@ class OnnxGraph:
                 x = self.linear(x, module.weight, module.bias, name)
             elif isinstance(module, torch.nn.Hardtanh):
                 x = self.clip(x, module.min_val, module.max_val, name)
+            elif isinstance(module, Beside):
+                x = self.node("Concat", [self.through(x, [module.layers]), x], f"{name}_beside", axis=1)
             elif isinstance(module, torch.nn.SiLU):
                 x = self.node("Mul", [x, self.node("Sigmoid", [x], f"{name}_gate")], name)
             elif type(module) in ACTIVATIONS:
@@ -116,14 +117,6 @@ class OnnxGraph:
         x = self.node("MatMul", [x, self.constant("scaling", scaling)], "scaled")
         return self.clip(x, -NORMALISED_LIMIT, NORMALISED_LIMIT, "normalised")
 
-    def drives(self, x: str, skip: float, scale: npt.ArrayLike) -> None:
-        """The action: skip * (applied drives) + scale * x, within the box."""
-        x = self.node("Mul", [x, self.constant("scale", np.asarray(scale, np.float32))], "scaled_move")
-        at = self.constant("drives", np.array(DRIVE_CHANNELS))
-        applied = self.node("Gather", ["observation", at], "applied", axis=1)
-        held = self.node("Mul", [applied, self.constant("skip", np.float32(skip))], "held")
-        self.clip(self.node("Add", [x, held], "wanted"), -1.0, 1.0, "action")
-
     def finished(self, channels: int, actor: Actor | None = None) -> bytes:
         """The model, checked and serialised; it remembers what the actor's LSTM does."""
 
@@ -139,16 +132,6 @@ class OnnxGraph:
         onnx.checker.check_model(model)
         serialised: bytes = model.SerializeToString()
         return serialised
-
-
-def drive_policy_onnx(policy: DrivePolicy) -> bytes:
-    """The actor of PPO's or an imitation's network: observation (n, channels) to action (n, 2)."""
-    graph, head, actor = OnnxGraph(), policy.action_net, policy.mlp_extractor
-    seen = graph.normalised(policy.features_extractor)
-    bent = graph.through(seen, [actor.actor, head.linear])
-    direct = graph.linear(seen, actor.direct.weight, actor.direct.bias, "direct")
-    graph.drives(graph.node("Add", [bent, direct], "outputs"), head.skip, head.scale.numpy())
-    return graph.finished(actor.measured)
 
 
 class Actor(NamedTuple):
@@ -176,12 +159,11 @@ def actor_of(policy: Any) -> Actor:
     return Actor(actor.features_extractor, None, layers)
 
 
-def moves_onnx(algorithm: Any) -> bytes:
-    """The deterministic actor of stable-baselines3's own policies on moves of the drives (:mod:`.wrappers`).
+def policy_onnx(policy: Any) -> bytes:
+    """The deterministic actor of a policy that begins with :class:`.networks.Normalise`.
 
     The hidden and cell values of an LSTM travel in the file's ``state``, shape (n, 2 units): nothing in the file loops.
     """
-    graph, actor = OnnxGraph(), actor_of(algorithm.policy)
-    x = graph.acted(graph.normalised(actor.extractor), actor, "move")
-    graph.drives(x, algorithm.env.skip, algorithm.env.scale)
-    return graph.finished(len(actor.extractor.mean), actor)
+    graph, actor = OnnxGraph(), actor_of(policy)
+    graph.acted(graph.normalised(actor.extractor), actor, "action")
+    return graph.finished(min(len(actor.extractor.mean), len(HISTORY)), actor)

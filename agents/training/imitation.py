@@ -20,9 +20,9 @@ from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from cz_gym.observation import CLIP, DRIVE_CHANNELS, HISTORY, STATE
 
 from .demonstrations import Demonstrations, Floats, demonstrate, widened
-from .export import drive_policy_onnx
+from .export import policy_onnx
 from .learner import Parts, Watch
-from .networks import DrivePolicy, visible_channels
+from .networks import AsymmetricPolicy, visible_channels
 from .recipes import Imitation
 
 RIDGE = 1e-6
@@ -97,27 +97,25 @@ class Imitator:
 
     def exported(self) -> bytes:
         """The network's actor."""
-        return drive_policy_onnx(self.policy)
+        return policy_onnx(self.policy)
 
 
-def make_network(recipe: Imitation, seed: int) -> DrivePolicy:
+def make_network(recipe: Imitation, seed: int) -> AsymmetricPolicy:
     """PPO's network with that training seed's first weights; its critic, which would see the state, learns nothing."""
     torch.manual_seed(seed)
     seen = Box(-CLIP, CLIP, (len(HISTORY) + len(STATE),), np.float32)
-    network = DrivePolicy(
+    network = AsymmetricPolicy(
         seen,
         Box(-1.0, 1.0, (len(DRIVE_CHANNELS),), np.float32),
         lambda left: recipe.learning_rate,
         hidden=recipe.hidden,
-        skip=recipe.head.skip,
-        scale=recipe.head.scale,
         memory=recipe.memory,
     )
     network.set_training_mode(False)
     return network
 
 
-def mean_action(policy: DrivePolicy) -> Any:
+def mean_action(policy: AsymmetricPolicy) -> Any:
     """The policy's mean action as a function of "history" observations."""
 
     def act(observation: Floats) -> Floats:
@@ -134,7 +132,7 @@ def whitening(observation: Floats) -> tuple[npt.NDArray[np.float64], npt.NDArray
     return observation.mean(axis=0, dtype=np.float64), axes / np.sqrt(np.maximum(variances, VARIANCE_FLOOR)) @ axes.T
 
 
-def fit_linear_path(policy: DrivePolicy, demonstrations: Demonstrations, memory: float) -> None:
+def fit_linear_path(policy: AsymmetricPolicy, demonstrations: Demonstrations, memory: float) -> None:
     """Set normalisation and linear path by regression; the hidden layers add nothing yet."""
     normalise, seen = policy.features_extractor, len(HISTORY)
     mean, scaling = np.zeros(len(normalise.mean)), np.eye(len(normalise.mean))
@@ -144,32 +142,29 @@ def fit_linear_path(policy: DrivePolicy, demonstrations: Demonstrations, memory:
     whitened = _features(policy, demonstrations.observation).numpy().astype(np.float64)
     x = np.column_stack([whitened, np.ones(len(whitened))])
     squares = x.T @ x + RIDGE * len(x) * np.eye(x.shape[1])
-    weights = np.linalg.solve(squares, x.T @ _outputs(policy, demonstrations))
-    direct, last = policy.mlp_extractor.direct, policy.action_net.linear
+    weights = np.linalg.solve(squares, x.T @ demonstrations.action)
+    last = policy.action_net
     with torch.no_grad():
-        direct.weight.copy_(torch.as_tensor(weights[:-1].T))
-        direct.bias.copy_(torch.as_tensor(weights[-1]))
         last.weight.zero_()
-        last.bias.zero_()
+        last.weight[:, -seen:] = torch.as_tensor(weights[:-1].T)
+        last.bias.copy_(torch.as_tensor(weights[-1]))
 
 
-def fit(policy: DrivePolicy, demonstrations: Demonstrations, recipe: Imitation) -> float:
+def fit(policy: AsymmetricPolicy, demonstrations: Demonstrations, recipe: Imitation) -> float:
     """Fit the actor by gradient and return the last loss: Huber's, of outputs of unit spread, in one cycle of rates."""
-    wanted = _outputs(policy, demonstrations)
+    wanted = demonstrations.action
     spread = torch.as_tensor(np.maximum(np.quantile(np.abs(wanted), 0.68, axis=0), SPREAD_FLOOR).astype(np.float32))
     features = _features(policy, demonstrations.observation)
     targets = torch.as_tensor(wanted / spread.numpy())
     shares = torch.tensor(recipe.loss_weights)
-    layers, direct, last = policy.mlp_extractor.actor, policy.mlp_extractor.direct, policy.action_net.linear
-    optimiser = torch.optim.Adam([*layers.parameters(), *direct.parameters(), *last.parameters()], recipe.learning_rate)
+    actor = torch.nn.Sequential(policy.mlp_extractor.policy_net, policy.action_net)
+    optimiser = torch.optim.Adam(actor.parameters(), recipe.learning_rate)
     steps = recipe.epochs * max(len(wanted) // BATCH, 1)
     cycle = torch.optim.lr_scheduler.OneCycleLR(optimiser, recipe.learning_rate, total_steps=steps)
     loss = torch.zeros(())
     for _ in range(steps):
         rows = torch.randint(len(wanted), (min(BATCH, len(wanted)),))
-        x = features[rows]
-        outputs = (last(layers(x)) + direct(x)) / spread
-        errors = torch.nn.functional.huber_loss(outputs, targets[rows], reduction="none")
+        errors = torch.nn.functional.huber_loss(actor(features[rows]) / spread, targets[rows], reduction="none")
         loss = (shares * errors).mean()
         optimiser.zero_grad()
         torch.autograd.backward(loss)
@@ -183,15 +178,8 @@ def _padded(observation: Floats) -> torch.Tensor:
     return torch.as_tensor(np.pad(observation, ((0, 0), (0, len(STATE)))))
 
 
-def _features(policy: DrivePolicy, observation: Floats) -> torch.Tensor:
+def _features(policy: AsymmetricPolicy, observation: Floats) -> torch.Tensor:
     """The actor's normalised view, shape (samples, channels)."""
     with torch.no_grad():
         features: torch.Tensor = policy.features_extractor(_padded(observation))
     return features[:, : len(HISTORY)].contiguous()
-
-
-def _outputs(policy: DrivePolicy, demonstrations: Demonstrations) -> Floats:
-    """What the network must put out for the demonstrated actions."""
-    head, applied = policy.action_net, demonstrations.observation[:, list(DRIVE_CHANNELS)]
-    outputs: Floats = (demonstrations.action - head.skip * applied) / head.scale.numpy()
-    return outputs

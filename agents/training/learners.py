@@ -39,4 +39,9 @@ def make_learner(
 
 def config_of(recipe: Recipe) -> Config:
     """The environment that a recipe's agents act in."""
-    return make_config(recipe.scenario, observation=recipe.observation, control_interval=recipe.control_interval)
+    return make_config(
+        recipe.scenario,
+        observation=recipe.observation,
+        control_interval=recipe.control_interval,
+        action=recipe.action,
+    )

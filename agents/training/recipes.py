@@ -10,23 +10,6 @@ from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
-class ActionHead:
-    """How the network's two outputs become an action: skip * (v_p, Q_H applied) + scale * output."""
-
-    skip: float = 1.0
-    """1: the network moves the drives from where they are; 0: it sets them."""
-    pull_scale: float = 0.05
-    """Action per output, pull speed [-]."""
-    heater_scale: float = 0.05
-    """Action per output, heater [-]."""
-
-    @property
-    def scale(self) -> tuple[float, float]:
-        """Action per output, pull speed and heater [-]."""
-        return self.pull_scale, self.heater_scale
-
-
-@dataclass(frozen=True)
 class CostWeights:
     """Weights of the cost's terms, relative to the environment's reward; what reward and validation count."""
 
@@ -47,17 +30,18 @@ class Recipe:
     name: str
     """What its agents are called."""
     observation: str = "history"
+    action: str = "smooth"
+    """What the network's two outputs mean (:func:`cz_gym.task.drives_of`)."""
     scenario: str = "randomized"
     """What training and validation crystals are drawn from."""
     control_interval: float = 5.0
     """Time between actions [s]."""
     memory: float = 1200.0
     """Age of the oldest samples that the networks see [s]; 0: none, only the integral."""
-    hidden: tuple[int, ...] = (128, 128)
+    hidden: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers, of the actor's and of the critic's."""
     threads: int = 1
     """Threads that torch computes on."""
-    head: ActionHead = field(default_factory=ActionHead)
     weights: CostWeights = field(default_factory=CostWeights)
 
 
@@ -69,6 +53,7 @@ class Imitation(Recipe):
     Some crystals are wide: on crystals no worse than the scenario's own it never sees how one is saved.
     """
 
+    hidden: tuple[int, ...] = (128, 128)
     teacher: str = "lqg-at-0.02-told"
     """Name of the controller that is imitated."""
     rounds: int = 8
@@ -117,6 +102,8 @@ class OnPolicy(Reinforcement):
     ent_coef: float = 0.0
     vf_coef: float = 0.5
     max_grad_norm: float = 0.5
+    noise: float = 0.5
+    """Spread of the exploration at the start [-]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,8 +118,6 @@ class PPO(OnPolicy):
     batch_size: int = 2048
     n_epochs: int = 5
     learning_rate: float = 1e-3
-    noise: tuple[float, float] = (0.05, 0.05)
-    """Spread of the exploration at the start, pull speed and heater [-]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,8 +134,6 @@ class RecurrentPPO(OnPolicy):
     batch_size: int = 2048
     n_epochs: int = 4
     learning_rate: float = 1e-3
-    noise: float = 1.0
-    """Spread of the exploration at the start, in the network's outputs [-]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,30 +153,9 @@ class SAC(Reinforcement):
     tau: float = 0.01
 
 
-def _teachers_cost(pull_step: float) -> CostWeights:
-    """The cost that an LQG's regulator was made for (baselines/lqg/settings.py), as multiples of the environment's."""
-    return CostWeights(pull=0.11, pull_step=pull_step, heater_step=23.4)
-
-
+TEACHERS_COST = CostWeights(pull=0.11, pull_step=0.049, heater_step=23.4)
+"""The cost that the regulator of lqg-at-0.02 was made for, as multiples of the environment's."""
 RECIPES: dict[str, Recipe] = {
-    recipe.name: recipe
-    for recipe in (
-        PPO(),
-        Imitation(name="imitation", weights=_teachers_cost(0.049)),
-        Imitation(name="imitation-medium", teacher="lqg-at-0.013-told", weights=_teachers_cost(0.295)),
-        Imitation(name="imitation-quiet", teacher="lqg-quiet-told", weights=_teachers_cost(1.22)),
-        Imitation(
-            name="imitation-puller",
-            scenario="puller",
-            weights=CostWeights(0.5, 0.5, observable=True),
-            teacher="lqg-quiet",
-            rounds=5,
-            episodes=320,
-            wide_share=0.0,
-            epochs=10,
-        ),
-        SAC(),
-        RecurrentPPO(),
-    )
+    recipe.name: recipe for recipe in (PPO(), RecurrentPPO(), SAC(), Imitation(name="imitation", weights=TEACHERS_COST))
 }
 """By name: what ``train.py --algo`` offers."""

@@ -15,21 +15,20 @@ from gymnasium.vector import AutoresetMode
 from sb3_contrib import RecurrentPPO as RecurrentPPOAlgorithm
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.vec_env import VecEnv
 
 from cz_gym import CzVectorEnv
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 
 from .callbacks import Statistics, Watching
-from .export import drive_policy_onnx, moves_onnx
+from .export import policy_onnx
 from .learner import Parts, Watch
-from .networks import DrivePolicy, Normalise
+from .networks import AsymmetricPolicy, Normalise
 from .recipes import PPO, SAC, CostWeights, RecurrentPPO, Reinforcement
 from .vec_env import CzVecEnv
-from .wrappers import DriveAction, TrainingReward
+from .wrappers import TrainingReward
 
 KINDS: dict[type[Reinforcement], tuple[Any, Any]] = {
-    PPO: (stable_baselines3.PPO, DrivePolicy),
+    PPO: (stable_baselines3.PPO, AsymmetricPolicy),
     RecurrentPPO: (RecurrentPPOAlgorithm, "MlpLstmPolicy"),
     SAC: (stable_baselines3.SAC, "MlpPolicy"),
 }
@@ -72,8 +71,7 @@ class Reinforced:
 
     def exported(self) -> bytes:
         """The deterministic actor."""
-        policy: Any = self.algorithm.policy
-        return drive_policy_onnx(policy) if isinstance(policy, DrivePolicy) else moves_onnx(self.algorithm)
+        return policy_onnx(self.algorithm.policy)
 
 
 def make_slots(recipe: Reinforcement, seed: int, done: int) -> CzVecEnv:
@@ -82,6 +80,7 @@ def make_slots(recipe: Reinforcement, seed: int, done: int) -> CzVecEnv:
         recipe.num_envs,
         scenario=recipe.scenario,
         observation=recipe.observation,
+        action=recipe.action,
         control_interval=recipe.control_interval,
         autoreset_mode=AutoresetMode.SAME_STEP,
         info="lean" if recipe.weights == CostWeights() else "all",
@@ -92,33 +91,26 @@ def make_slots(recipe: Reinforcement, seed: int, done: int) -> CzVecEnv:
 def make_algorithm(recipe: Reinforcement, slots: CzVecEnv, seed: int) -> BaseAlgorithm:
     """The algorithm of a recipe, whose fields it takes by stable-baselines3's names."""
     torch.manual_seed(seed)
-    rewarded, head = TrainingReward(slots, recipe.gamma, recipe.weights), recipe.head
-    env: VecEnv
+    env = TrainingReward(slots, recipe.gamma, recipe.weights)
     algorithm, policy = KINDS[type(recipe)]
-    if isinstance(recipe, PPO):
-        env, network = rewarded, _drive_network(recipe)
-    else:
-        env, network = DriveAction(rewarded, head.skip, head.scale), _own_network(recipe)
     known = inspect.signature(algorithm).parameters
     settings = {name: value for name, value in asdict(recipe).items() if name in known}
     settings["learning_rate"] = linear(recipe.learning_rate, recipe.learning_rate / 20.0)
-    made: BaseAlgorithm = algorithm(policy, env, policy_kwargs=network, seed=seed, device="cpu", **settings)
+    made: BaseAlgorithm = algorithm(policy, env, policy_kwargs=_network(recipe), seed=seed, device="cpu", **settings)
     return made
 
 
-def _drive_network(recipe: PPO) -> dict[str, Any]:
-    head = {"skip": recipe.head.skip, "scale": recipe.head.scale}
-    return {"hidden": recipe.hidden, "memory": recipe.memory, "noise": recipe.noise, **head}
-
-
-def _own_network(recipe: Reinforcement) -> dict[str, Any]:
-    """Options of a policy of stable-baselines3's own: normalised observations, layers, an LSTM on request."""
-    seeing, layers = {"drives": False, "memory": recipe.memory}, list(recipe.hidden)
-    network = {"features_extractor_class": Normalise, "features_extractor_kwargs": seeing, "net_arch": layers}
-    if isinstance(recipe, RecurrentPPO):
-        network["net_arch"] = {"pi": layers, "vf": layers}
-        network |= {"lstm_hidden_size": recipe.units, "log_std_init": float(np.log(recipe.noise))}
-    return network
+def _network(recipe: Reinforcement) -> dict[str, Any]:
+    """Options of the policy: normalised observations, layers, an LSTM on request."""
+    layers = list(recipe.hidden)
+    if isinstance(recipe, PPO):
+        return {"hidden": recipe.hidden, "memory": recipe.memory, "log_std_init": float(np.log(recipe.noise))}
+    seeing = {"features_extractor_class": Normalise, "features_extractor_kwargs": {"memory": recipe.memory}}
+    if isinstance(recipe, SAC):
+        return {**seeing, "net_arch": layers}
+    arch = {"pi": layers, "vf": layers}
+    assert isinstance(recipe, RecurrentPPO)
+    return {**seeing, "net_arch": arch, "lstm_hidden_size": recipe.units, "log_std_init": float(np.log(recipe.noise))}
 
 
 def linear(start: float, end: float) -> Callable[[float], float]:

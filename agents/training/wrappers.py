@@ -1,15 +1,12 @@
-"""What stands between the native batch and a learner: its reward and its action."""
+"""What stands between the native batch and a learner: its reward."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
-from cz_gym.observation import DRIVE_CHANNELS
 from cz_gym.task import FAILURE_COST, Cost, cost_terms, reward
 
 from .recipes import CostWeights
@@ -52,29 +49,3 @@ class TrainingReward(VecEnvWrapper):
             weights.heater_step * info["cost_heater_step"],
         )
         return reward(cost)
-
-
-class DriveAction(VecEnvWrapper):
-    """The action head for learners whose network has none: action = skip * applied drives + scale * output."""
-
-    def __init__(self, venv: VecEnv, skip: float, scale: tuple[float, float]) -> None:
-        super().__init__(venv)
-        self.skip, self.scale = skip, np.array(scale, np.float32)
-        self._drives = np.zeros((venv.num_envs, len(DRIVE_CHANNELS)), np.float32)
-
-    def reset(self) -> Any:
-        """Begin at the applied drives."""
-        return self._seen(self.venv.reset())
-
-    def step_async(self, actions: npt.NDArray[np.float32]) -> None:
-        """Move the drives."""
-        self.venv.step_async(np.clip(self.skip * self._drives + self.scale * actions, -1.0, 1.0))
-
-    def step_wait(self) -> Any:
-        """Pass on."""
-        observation, reward, done, infos = self.venv.step_wait()
-        return self._seen(observation), reward, done, infos
-
-    def _seen(self, observation: Any) -> Any:
-        self._drives = observation[:, list(DRIVE_CHANNELS)].copy()
-        return observation

@@ -30,7 +30,7 @@ class Contender:
         return self.controller.name
 
 
-def agent(name: str, policies: Sequence[Any], make: Callable[[Config], Sequence[Any]], remark: str = "") -> Contender:
+def agent(name: str, policies: Sequence[Any], remark: str = "") -> Contender:
     """A learned contender: policies with a ``contract``, one a training seed of the same agent.
 
     Raises ValueError if they are no such set, or were not trained at the benchmark's control interval.
@@ -39,8 +39,8 @@ def agent(name: str, policies: Sequence[Any], make: Callable[[Config], Sequence[
     seeds = tuple(contract.training_seed for contract in contracts)
     if len(set(seeds)) < len(seeds):
         raise ValueError(f"agent {name!r}: a training seed appears twice among {', '.join(map(str, seeds))}")
-    if len({contract.observation for contract in contracts}) > 1:
-        raise ValueError(f"agent {name!r}: its training seeds read different observations")
+    if len({(contract.observation, contract.action) for contract in contracts}) > 1:
+        raise ValueError(f"agent {name!r}: its training seeds read different observations, or act differently")
     if len({contract.scenario_hash for contract in contracts}) > 1:
         trained = ", ".join(sorted({contract.scenario for contract in contracts}))
         raise ValueError(f"agent {name!r}: its training seeds were trained on different scenarios: {trained}")
@@ -51,8 +51,10 @@ def agent(name: str, policies: Sequence[Any], make: Callable[[Config], Sequence[
                 f"agent {name!r}: trained at {contract.control_interval:g} s control, the benchmark runs {interval:g} s"
             )
     meaning = f"agent trained with {contracts[0].algorithm} on {contracts[0].scenario}{remark}"
-    controller = Controller(name, policies[0].observation, meaning, seeds)
-    return Contender(controller, make, contracts=tuple(_writable(contract) for contract in contracts))
+    controller = Controller(name, contracts[0].observation, meaning, seeds, action=contracts[0].action)
+    return Contender(
+        controller, lambda config: policies, contracts=tuple(_writable(contract) for contract in contracts)
+    )
 
 
 def _writable(contract: Any) -> dict[str, Any]:

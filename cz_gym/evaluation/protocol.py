@@ -37,9 +37,11 @@ class Row:
     meniscus: MeniscusModel = HURLE
     """What the crystals grow on; controllers and agents know Hurle's, whatever it is."""
 
-    def config(self, observation: str = "measured") -> Config:
+    def config(self, observation: str = "measured", action: str = "direct") -> Config:
         """The environment's settings: three hours, this row's scenario, model, interval and meniscus."""
-        return make_config(self.scenario, self.model, observation, self.control_interval, meniscus=self.meniscus)
+        return make_config(
+            self.scenario, self.model, observation, self.control_interval, meniscus=self.meniscus, action=action
+        )
 
     def design_config(self, observation: str = "measured") -> Config:
         """The settings that a controller is designed for: the same on Hurle's meniscus."""

@@ -41,6 +41,8 @@ class Controller:
     """Whether it knows what no sensor shows."""
     slow: bool = False
     """Whether it meets only the first few episodes, and these are cached."""
+    action: str = "direct"
+    """What its actions mean (:func:`cz_gym.task.drives_of`)."""
 
     @property
     def learned(self) -> bool:

@@ -57,7 +57,7 @@ class Plan:
             (policy,) = contender.make(row.design_config(controller.observation))
         except ImportError:  # what it needs is not installed
             return False
-        config, seeds = row.config(controller.observation), self.seeds(controller, row)
+        config, seeds = row.config(controller.observation, controller.action), self.seeds(controller, row)
         return self.cache is not None and is_cached(controller, policy, config, seeds, self.cache)
 
 
@@ -72,7 +72,8 @@ def run(plan: Plan, bar: Any) -> Benchmark:
 
 
 def _sample(plan: Plan, row: Row, contender: Contender, bar: Any) -> Sample:
-    controller, config = contender.controller, row.config(contender.controller.observation)
+    controller = contender.controller
+    config = row.config(controller.observation, controller.action)
     bar.set_description(f"{row.name}, {controller.name}")
     policies = contender.make(row.design_config(controller.observation))
     seeds = plan.seeds(controller, row)

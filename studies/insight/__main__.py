@@ -36,6 +36,7 @@ from .step_tests import (
     LIMITS,
     MIX,
     STEP_TESTS,
+    Interface,
     crystal,
     jump_gains,
     noisy_observations,
@@ -48,8 +49,6 @@ from .step_tests import (
 PROG = "python -m studies.insight"
 BESIDE = ("lqg-at-0.02", "lqg", "paper-tuned")
 """Controllers that an agent is shown beside; its teacher is among them."""
-SHIPPED = "imitation-default"
-"""What the shipped agent is called in the benchmark."""
 AT_REST = "at rest"
 """Behind an agent's name: linearised without noise."""
 
@@ -62,34 +61,34 @@ def contenders(path: Path | None) -> tuple[Contender, ...]:
     """
     file = path or shipped()
     contract, content = read_agent(file)
-    name = SHIPPED if path is None else contract.algorithm
-    config = crystal(A_CRYSTAL / MINUTE, contract.observation)
+    interface = Interface(contract.observation, contract.action)
+    config = crystal(A_CRYSTAL / MINUTE, interface)
     policy = OnnxPolicy.load(file, config)
 
     def agent(label: str, observations: Floats) -> Contender:
-        near = linear_agent(content, observations, config.control_interval, config.parameters.v_0)
-        return Contender(label, contract.observation, lambda _: policy, near.state_space(), near.response)
+        near = linear_agent(content, observations, config.control_interval, config.parameters.v_0, contract.action)
+        return Contender(label, interface, lambda _: policy, near.state_space(), near.response)
 
     return (
-        agent(name, noisy_observations(policy, contract.observation)),
+        agent(contract.algorithm, noisy_observations(policy, interface)),
         *map(controller, BESIDE),
-        agent(f"{name} {AT_REST}", run_events(policy, config, (), [0.0]).observation),
+        agent(f"{contract.algorithm} {AT_REST}", run_events(policy, config, (), [0.0]).observation),
     )
 
 
 def controller(name: str) -> Contender:
     """A controller of the registry."""
     make = registry.find_controller(name).make
-    system, _, dt = linear_form(make(crystal(1.0, "measured")))
-    return Contender(name, "measured", make, system, lambda omega: response(system, dt, omega)[:, :, AT])
+    system, _, dt = linear_form(make(crystal(1.0, Interface())))
+    return Contender(name, Interface(), make, system, lambda omega: response(system, dt, omega)[:, :, AT])
 
 
 def puller_parts(contender: Contender, episodes: int) -> dict[str, dict[str, float]]:
     """Observable RMSE and share of lost crystals when randomized gets one property of puller, on validation."""
     found = {}
-    policy = contender.make(make_config("randomized", observation=contender.observation))
+    policy = contender.make(make_config("randomized", **contender.interface._asdict()))
     for name, scenario in {"nothing": RANDOMIZED, **parts_of(PULLER, RANDOMIZED), "all of it": PULLER}.items():
-        config = make_config(scenario, observation=contender.observation)
+        config = make_config(scenario, **contender.interface._asdict())
         values = metrics(rollout(policy, config, VALIDATION_SEEDS[:episodes]))
         found[name] = {
             "rmse_observable_mm": float(values.rmse_observable_mm.mean()),
@@ -106,18 +105,16 @@ def study(agent: Path | None, episodes: int, only_pictures: bool, tell: Callable
     tell("linearising")
     all_of_them = contenders(agent)
     acting = [contender for contender in all_of_them if not contender.name.endswith(AT_REST)]
-    made = {each.name: each.make(crystal(A_CRYSTAL / MINUTE, each.observation)) for each in acting}
-    dt = crystal(1.0, "measured").control_interval
+    made = {each.name: each.make(crystal(A_CRYSTAL / MINUTE, each.interface)) for each in acting}
+    dt = crystal(1.0, Interface()).control_interval
     omega = frequency.frequencies(dt)
     tell("step tests")
     answers = {
-        test.name: {
-            each.name: respond(made[each.name], crystal(test.minutes, each.observation), test) for each in acting
-        }
+        test.name: {each.name: respond(made[each.name], crystal(test.minutes, each.interface), test) for each in acting}
         for test in STEP_TESTS
     }
     jumps = {
-        each.name: [jump_gains(made[each.name], each.observation, noisy) for noisy in (False, True)] for each in acting
+        each.name: [jump_gains(made[each.name], each.interface, noisy) for noisy in (False, True)] for each in acting
     }
     responses = {each.name: each.loop(omega, MIX, dt) for each in all_of_them}
     files = {
@@ -133,7 +130,7 @@ def study(agent: Path | None, episodes: int, only_pictures: bool, tell: Callable
     parts: dict[str, Any] = {"validation_episodes": episodes}
     for each in acting:
         tell(f"limits of {each.name}")
-        survived = {limit.name: survive(made[each.name], limit, each.observation) for limit in LIMITS}
+        survived = {limit.name: survive(made[each.name], limit, each.interface) for limit in LIMITS}
         limits[each.name] = {name: one._asdict() for name, one in survived.items()}
         tell(f"{each.name}, one property of the real puller at a time")
         parts[each.name] = puller_parts(each, episodes)

@@ -12,8 +12,20 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.observation import HEATER_SCALE, HISTORY, LAGGED, LAGS, MEASURED, PULL_SCALE, lags, relative, scales
+from cz_gym.observation import (
+    DRIVE_CHANNELS,
+    HEATER_SCALE,
+    HISTORY,
+    LAGGED,
+    LAGS,
+    MEASURED,
+    PULL_SCALE,
+    lags,
+    relative,
+    scales,
+)
 from cz_gym.physics.linearisation import StateSpace
+from cz_gym.task import drives_of
 
 Floats = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
@@ -72,14 +84,21 @@ class LinearAgent(NamedTuple):
         return StateSpace(A, B, C, D)
 
 
-def linear_agent(onnx_bytes: bytes, observations: npt.ArrayLike, dt: float, v_0: float = PULL_SCALE) -> LinearAgent:
+def linear_agent(
+    onnx_bytes: bytes, observations: npt.ArrayLike, dt: float, v_0: float = PULL_SCALE, action: str = "smooth"
+) -> LinearAgent:
     """The agent of these (checked) ONNX bytes near "history" observations; v_0 [m/s] scales the pull speed.
+
+    ``action`` says what its outputs mean; the drives asked for follow from them and from those applied.
 
     Of several observations, shape (n, channels), it is the mean derivative: for Gaussian ones the best linear
     approximation there is (Stein's lemma). ValueError if the file reads another observation or remembers something.
     """
     rows = np.atleast_2d(np.asarray(observations, np.float64))
     slopes = np.mean([jacobian(onnx_bytes, row) for row in rows], axis=0)
+    drives = drives_of(action, dt)
+    slopes *= np.array([[drives.pull], [drives.heater]])
+    slopes[[0, 1], DRIVE_CHANNELS] += drives.keep
     slopes = np.array([[v_0], [HEATER_SCALE]]) * slopes / scales(HISTORY, v_0)
     now, integral = slopes[:, : len(MEASURED)].copy(), slopes[:, len(MEASURED)]
     spans = slopes[:, len(MEASURED) + 1 :].reshape(2, len(LAGS), len(LAGGED))

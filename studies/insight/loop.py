@@ -19,7 +19,7 @@ from cz_gym.physics.plant import make_puller
 from cz_gym.units import HOUR, KILO, MM, MM_PER_MIN
 
 from .linear_agent import Complex, Floats
-from .step_tests import MIX
+from .step_tests import MIX, Interface
 
 RING, PYROMETER = 0, 1
 A_CRYSTAL = 3.0 * HOUR
@@ -34,7 +34,7 @@ class Contender(NamedTuple):
     """A controller, and what it is near rest."""
 
     name: str
-    observation: str
+    interface: Interface
     make: Callable[[Any], Any]
     """Builds it for an environment's settings."""
     system: StateSpace

@@ -132,9 +132,16 @@ LIMITS = (
 """What the table of limits tries, on the nominal puller with the usual noise."""
 
 
-def crystal(minutes: float, observation: str) -> Config:
+class Interface(NamedTuple):
+    """How a policy meets the environment: arguments of ``gym.make``."""
+
+    observation: str = "measured"
+    action: str = "direct"
+
+
+def crystal(minutes: float, interface: Interface) -> Config:
     """The nominal puller for that long."""
-    return make_config("nominal", MIX, observation, horizon=minutes * MINUTE)
+    return make_config("nominal", MIX, interface.observation, horizon=minutes * MINUTE, action=interface.action)
 
 
 def run_events(
@@ -176,9 +183,9 @@ class Survival(NamedTuple):
     """Whether ``most`` is all that was tried."""
 
 
-def survive(policy: Any, limit: Limit, observation: str) -> Survival:
+def survive(policy: Any, limit: Limit, interface: Interface) -> Survival:
     """The largest amplitude survived over three hours, in two rounds of :data:`AT_ONCE` amplitudes a draw of noise."""
-    config = crystal(3.0 * HOUR / MINUTE, observation)
+    config = crystal(3.0 * HOUR / MINUTE, interface)
     low, high = np.zeros(DRAWS), np.full(DRAWS, limit.most)
     capped = np.zeros(DRAWS, np.bool_)
     seeds = np.repeat(VALIDATION_SEEDS[:DRAWS], AT_ONCE).tolist()
@@ -193,12 +200,12 @@ def survive(policy: Any, limit: Limit, observation: str) -> Survival:
     return Survival(float(np.median(low)), float(low.min()), float(low.max()), bool(capped.any()))
 
 
-def jump_gains(policy: Any, observation: str, noisy: bool) -> Floats:
+def jump_gains(policy: Any, interface: Interface, noisy: bool) -> Floats:
     """Largest move of the pull speed within 3 min of a jump of the radius, over that jump, shape (sizes,) [1/s].
 
     The difference to the same crystal without the jump; under noise its mean over :data:`CRYSTALS` crystals.
     """
-    config = crystal(BEGIN / MINUTE + 3.0, observation)
+    config = crystal(BEGIN / MINUTE + 3.0, interface)
     seeds = VALIDATION_SEEDS[: CRYSTALS if noisy else 1]
     sizes = [size for size in (0.0, *JUMPS) for _ in seeds]
     events = (*((USUAL_NOISE,) if noisy else ()), Event(BEGIN, _radius))
@@ -208,10 +215,10 @@ def jump_gains(policy: Any, observation: str, noisy: bool) -> Floats:
     return gains
 
 
-def noisy_observations(policy: Any, observation: str) -> Floats:
+def noisy_observations(policy: Any, interface: Interface) -> Floats:
     """What a policy observes after an hour of the usual noise, one row a seed of :data:`CRYSTALS`."""
     seeds = VALIDATION_SEEDS[:CRYSTALS]
-    found: Floats = run_events(policy, crystal(60.0, observation), (USUAL_NOISE,), [0.0] * CRYSTALS, seeds).observation
+    found: Floats = run_events(policy, crystal(60.0, interface), (USUAL_NOISE,), [0.0] * CRYSTALS, seeds).observation
     return found
 
 

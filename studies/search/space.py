@@ -20,21 +20,18 @@ SPACE: dict[str, BaseDistribution] = {
     "batch_size": CategoricalDistribution((512, 1024, 2048, 4096, 8192)),
     "n_epochs": IntDistribution(1, 10),
     "horizon": FloatDistribution(10.0, 500.0, log=True),
-    "pull_noise": FloatDistribution(3e-3, 0.3, log=True),
-    "heater_noise": FloatDistribution(3e-3, 0.3, log=True),
+    "noise": FloatDistribution(0.05, 1.0, log=True),
 }
-"""Fields of the recipe; but ``horizon`` is 1 / (1 - gamma) in steps, and the noises are the parts of its ``noise``."""
+"""Fields of the recipe; but ``horizon`` is 1 / (1 - gamma) in steps."""
 
 
 def params_of(recipe: PPO) -> dict[str, Any]:
     """Where a recipe stands in the space."""
     own = {name: getattr(recipe, name) for name in SPACE if hasattr(recipe, name)}
-    pull, heater = recipe.noise
-    return {**own, "horizon": 1.0 / (1.0 - recipe.gamma), "pull_noise": pull, "heater_noise": heater}
+    return {**own, "horizon": 1.0 / (1.0 - recipe.gamma)}
 
 
 def recipe_of(params: Params, steps: int, name: str) -> PPO:
     """The recipe at a place in the space, learning for so many environment steps."""
     own = {key: value for key, value in params.items() if hasattr(PPO(), key)}
-    gamma, noise = 1.0 - 1.0 / params["horizon"], (params["pull_noise"], params["heater_noise"])
-    return replace(PPO(), name=name, steps=steps, gamma=gamma, noise=noise, **own)
+    return replace(PPO(), name=name, steps=steps, gamma=1.0 - 1.0 / params["horizon"], **own)

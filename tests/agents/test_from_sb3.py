@@ -10,6 +10,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -47,7 +48,8 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def trained(kind: str, normalised: bool = False, observation: str = "history") -> Any:
     algorithm, policy, options = KINDS[kind]
-    env: Any = make_vec_env("Cz-v0", n_envs=2, env_kwargs={"observation": observation})
+    settings = {"observation": observation, "action": "smooth", "control_interval": 10.0}
+    env: Any = make_vec_env("Cz-v0", n_envs=2, env_kwargs=settings)
     if normalised:
         env = VecNormalize(env, clip_obs=3.0)
     return algorithm(policy, env, device="cpu", seed=5, **options).learn(64)
@@ -58,6 +60,7 @@ def test_every_policy_becomes_a_file_that_acts_as_it_does(kind: str, tmp_path: P
     model = trained(kind)
     contract = from_sb3.save_agent(tmp_path / "mine.onnx", model, "mine")
     assert (contract.algorithm, contract.observation, contract.training_seed) == ("mine", "history", 5)
+    assert (contract.action, contract.control_interval) == ("smooth", 10.0), "not what it was trained in"
     assert contract.training_steps == model.num_timesteps >= 64
     agent = OnnxPolicy.load(tmp_path / "mine.onnx")
     assert from_sb3.disagreement(agent, model, None) < 1e-5
@@ -85,10 +88,12 @@ def test_the_command_reads_what_stable_baselines3_and_rl_zoo_save(
     model.get_vec_normalize_env().save(str(tmp_path / "vecnormalize.pkl"))
     command = [str(tmp_path / "best_model.zip"), "--algo", "ppo", "--out", str(tmp_path / "zoo.onnx")]
     command += ["--vecnormalize", str(tmp_path / "vecnormalize.pkl")]
-    assert from_sb3.main([*command, "--name", "zoo", "--seed", "7", "--scenario", "hard"]) == 0
+    made = ["--action", "smooth", "--control-interval", "10"]
+    assert from_sb3.main([*command, "--name", "zoo", "--seed", "7", "--scenario", "hard", *made]) == 0
     assert "wrote" in capsys.readouterr().out
     agent = OnnxPolicy.load(tmp_path / "zoo.onnx")
     assert (agent.contract.algorithm, agent.contract.training_seed, agent.contract.scenario) == ("zoo", 7, "hard")
+    assert (agent.contract.action, agent.contract.control_interval) == ("smooth", 10.0)
     assert from_sb3.disagreement(agent, model, model.get_vec_normalize_env()) < 1e-4
 
 
@@ -147,6 +152,8 @@ def test_without_stable_baselines3_it_says_what_to_install() -> None:
         ("good.zip --algo sac --out mine.onnx", "good.zip: not a model of sac"),
         ("good.zip --algo ppo --out mine.pt", "ends in .onnx"),
         ("good.zip --algo ppo --out mine.onnx --scenario none", "none"),
+        ("good.zip --algo ppo --out mine.onnx --action none", "none"),
+        ("good.zip --algo ppo --out mine.onnx --observation measured", "shape (72,)"),
         ("good.zip --algo ppo --out mine.onnx --vecnormalize broken.zip", "broken.zip: not a VecNormalize"),
         ("good.zip --algo ppo --out mine.onnx --seed -1", "training_seed"),
         ("good.zip --algo ppo --out mine.onnx --name ''", "algorithm"),
@@ -156,7 +163,8 @@ def test_mistakes_are_one_line(
     arguments: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    PPO("MlpPolicy", "Cz-v0", device="cpu", n_steps=8, batch_size=8).save("good.zip")
+    env = gym.make("Cz-v0", observation="history")
+    PPO("MlpPolicy", env, device="cpu", n_steps=8, batch_size=8).save("good.zip")
     Path("broken.zip").write_bytes(b"not a model")
     before = set(os.listdir())
     try:

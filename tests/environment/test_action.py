@@ -16,7 +16,7 @@ P = make_puller()
 
 @pytest.mark.parametrize("interval", [2.0, 5.0, 10.0])
 def test_a_held_action_is_approached_with_one_time_constant(interval: float) -> None:
-    """v_p -> v_0 (1 + 0.5 a) and Q_H -> Q_H0 + 3 kW a, whatever the control interval."""
+    """v_p -> v_0 (1 + a) and Q_H -> Q_H0 + 5 kW a, whatever the control interval."""
     env = CzEnv("nominal", action="smooth", control_interval=interval, horizon=600.0, info="all")
     env.reset(seed=0)
     for k in range(round(100.0 / interval)):

@@ -15,9 +15,9 @@ pytest.importorskip("onnx")
 
 from cz_gym import agents
 from cz_gym.agents.agent_file.contract import read_agent
-from cz_gym.agents.training.export import drive_policy_onnx
+from cz_gym.agents.training.export import policy_onnx
 from cz_gym.agents.training.imitation import make_network
-from cz_gym.agents.training.recipes import ActionHead, Imitation
+from cz_gym.agents.training.recipes import Imitation
 from cz_gym.baselines import CompensatedPID
 from cz_gym.baselines.analysis.frequency import frequencies, margins_of, opened
 from cz_gym.baselines.analysis.frequency import response as theirs
@@ -37,6 +37,7 @@ from studies.insight.step_tests import (
     LIMITS,
     STEP_TESTS,
     Event,
+    Interface,
     Limit,
     Survival,
     crystal,
@@ -48,6 +49,7 @@ from studies.insight.step_tests import (
 )
 
 DT = 5.0
+LEARNED = Interface("history", "smooth")
 OMEGA = np.geomspace(1e-4, np.pi / DT, 9)
 PATH = agents.shipped()
 REST = np.eye(len(HISTORY))[1]
@@ -65,19 +67,17 @@ def test_the_derivative_is_the_chain_rules() -> None:
     def some(*shape: int) -> Any:
         return random.normal(0.0, 0.1, shape).astype(np.float32)
 
-    network = make_network(Imitation(name="some", hidden=(6,), head=ActionHead(1.0, 0.05, 0.02)), 0)
+    network = make_network(Imitation(name="some", hidden=(6,)), 0)
     channels = len(network.features_extractor.mean)
     network.features_extractor.set(some(channels), some(channels, channels))
     weights = {name: value.numpy().astype(float) for name, value in network.state_dict().items()}
     mean, scaling = weights["features_extractor.mean"][:n], weights["features_extractor.scaling"][:n, :n]
-    first, bias = weights["mlp_extractor.actor.0.weight"], weights["mlp_extractor.actor.0.bias"]
-    last, direct = weights["action_net.linear.weight"], weights["mlp_extractor.direct.weight"]
+    layer = "mlp_extractor.policy_net.layers.0"
+    first, bias, last = weights[f"{layer}.weight"], weights[f"{layer}.bias"], weights["action_net.weight"]
     at = np.float64(some(n))
     bent = 1.0 - np.tanh(first @ ((at - mean) @ scaling) + bias) ** 2
-    expected = weights["action_net.scale"][:, None] * ((last * bent) @ first + direct) @ scaling.T
-    expected[0, AT[2]] += 1.0
-    expected[1, AT[3]] += 1.0
-    assert jacobian(drive_policy_onnx(network), at) == pytest.approx(expected, rel=1e-6, abs=1e-9)
+    expected = ((last[:, :6] * bent) @ first + last[:, 6:]) @ scaling.T
+    assert jacobian(policy_onnx(network), at) == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
 def test_a_linear_agent_answers_alike_as_state_space_and_in_frequency(near: Any) -> None:
@@ -87,7 +87,7 @@ def test_a_linear_agent_answers_alike_as_state_space_and_in_frequency(near: Any)
 
 def test_a_linear_agent_moves_as_the_agent_does_after_a_small_jump(near: Any) -> None:
     """The linear loop of agent and plant against the simulated one: radius 1 um too large, first ten minutes."""
-    config = crystal(20.0, "history")
+    config = crystal(20.0, LEARNED)
     policy = agents.OnnxPolicy.load(PATH, config)
     limit = LIMITS[0]
     jump = 0.001 * MM
@@ -131,7 +131,7 @@ def test_noise_gains_are_those_of_the_lyapunov_equation() -> None:
 
 
 def test_events_happen_when_and_as_large_as_they_are_said() -> None:
-    config = crystal(30.0, "measured")
+    config = crystal(30.0, Interface())
     quiet = CompensatedPID()
     interface, load, reference, noise = (run_events(quiet, config, t.events, [t.amplitude, 0.0]) for t in STEP_TESTS)
     at = round(600.0 / DT)
@@ -154,11 +154,11 @@ def test_survival_is_found_where_it_lies() -> None:
             return np.zeros((len(observation), 2), np.float32), None
 
     lost = Limit("lost", "jump beyond the limit at once", "mm", MM, 16.0, LIMITS[0].event)
-    found = survive(Still(), lost, "measured")
+    found = survive(Still(), lost, Interface())
     assert 7.0 < found.least <= found.largest <= found.most <= 8.0
     assert not found.capped
     never = Limit("never", "nothing", "mm", MM, 4.0, Event(0.0, lambda slot, amplitude: None))
-    assert survive(CompensatedPID(), never, "measured") == Survival(4.0, 4.0, 4.0, True)
+    assert survive(CompensatedPID(), never, Interface()) == Survival(4.0, 4.0, 4.0, True)
 
 
 def test_the_real_puller_is_taken_apart_property_by_property() -> None:
@@ -171,8 +171,8 @@ def test_the_real_puller_is_taken_apart_property_by_property() -> None:
 
 def test_a_linear_controller_answers_every_small_jump_alike_and_the_agent_none_of_the_larger_ones() -> None:
     paper, agent = (
-        jump_gains(policy, observation, noisy=False)
-        for policy, observation in ((CompensatedPID(), "measured"), (agents.OnnxPolicy.load(PATH), "history"))
+        jump_gains(policy, interface, noisy=False)
+        for policy, interface in ((CompensatedPID(), Interface()), (agents.OnnxPolicy.load(PATH), LEARNED))
     )
     assert paper[:5] == pytest.approx(np.full(5, paper[0]), rel=0.01)
     assert agent[0] == pytest.approx(agent[1], rel=0.02)
@@ -181,14 +181,14 @@ def test_a_linear_controller_answers_every_small_jump_alike_and_the_agent_none_o
 
 @pytest.fixture(scope="module")
 def answers() -> dict[str, dict[str, Any]]:
-    config = crystal(21.0, "measured")
+    config = crystal(21.0, Interface())
     policy = find_controller("paper-tuned").make(config)
     return {test.name: {"one": respond(policy, config, test)} for test in STEP_TESTS}
 
 
 @pytest.fixture(scope="module")
 def loop(near: Any) -> Any:
-    one = Contender("one", "history", lambda _: None, near.state_space(), near.response)
+    one = Contender("one", LEARNED, lambda _: None, near.state_space(), near.response)
     return one.loop(frequencies(DT, 60), 1.0, DT)
 
 
@@ -235,7 +235,7 @@ def test_tables_say_what_was_found(answers: Any, loop: Any) -> None:
 
 
 def test_gains_are_apart_from_others_and_not_from_themselves(near: Any) -> None:
-    mine = Contender("one", "history", lambda _: None, near.state_space(), near.response)
+    mine = Contender("one", LEARNED, lambda _: None, near.state_space(), near.response)
     twice = mine._replace(response=lambda omega: near.response(omega) * np.array([2.0, 1.0, 1.0, 1.0]))
     for other, deviation in ((mine, 0.0), (twice, 1.0)):
         for values in apart(other, mine, DT).values():

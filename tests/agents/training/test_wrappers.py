@@ -1,4 +1,4 @@
-"""What stands between the batch and a learner: the weighted, scaled reward, and moves of the drives."""
+"""What stands between the batch and a learner: the weighted, scaled reward."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 from cz_gym import CzVectorEnv
 from cz_gym.agents.training.recipes import CostWeights
 from cz_gym.agents.training.vec_env import CzVecEnv
-from cz_gym.agents.training.wrappers import DriveAction, TrainingReward
+from cz_gym.agents.training.wrappers import TrainingReward
 from cz_gym.task import Cost, cost_terms, reward
 
 
@@ -47,15 +47,3 @@ def test_the_weighted_reward_is_the_weighted_cost_s(observable: bool) -> None:
     assert not np.allclose(seen, said["cost_radius"], rtol=1e-3)
     cost = Cost(radius, 0.5 * said["cost_pull"], 3.0 * said["cost_pull_step"], 2.0 * said["cost_heater_step"])
     np.testing.assert_allclose(gained, 0.1 * reward(cost), rtol=1e-6)
-
-
-def test_drive_action_moves_the_drives_from_where_they_are() -> None:
-    plain, driven = slots(), DriveAction(slots(), 1.0, (0.1, 0.2))
-    for env in (plain, driven):
-        env.reset()
-    position = np.zeros(2)
-    for move in ([1.0, -0.5], [0.5, 1.0], [-1.0, 0.0]):
-        position = position + np.array([0.1, 0.2]) * move
-        expected = plain.step(np.tile(position, (2, 1)).astype(np.float32))
-        got = driven.step(np.tile(move, (2, 1)).astype(np.float32))
-        np.testing.assert_allclose(got[0], expected[0], atol=1e-6)
