@@ -58,7 +58,7 @@ class Config:
     model: str | float | None = None
     observation: str = "measured"
     action: str = "direct"
-    """What an action means: "direct" or "smooth" (:func:`cz_gym.task.drives_of`)."""
+    """What an action means: "direct", "smooth" or "rate" (:func:`cz_gym.task.drives_of`)."""
     control_interval: float = 5.0
     """Time between actions [s]."""
     horizon: float = 10800.0

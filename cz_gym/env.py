@@ -72,8 +72,9 @@ class CzEnv(gym.Env[Observation, Action]):
     ## Action Space
     ``Box(-1, 1, (2,), float32)``. With ``action="direct"``, the default, it sets the drives: pull speed
     v_p = v_0 (1 + a_0), 0 to 2.4 mm/min, and heater power Q_H = Q_H0 + 10 kW a_1. With ``action="smooth"`` the drives
-    follow it as first-order lags of 50 s, towards v_0 (1 + 0.5 a_0) and Q_H0 + 3 kW a_1: noise on the action becomes
-    bounded, slow noise of the drives, which is how a learner should explore. Out-of-range actions are clipped and
+    follow it as first-order lags of 50 s, towards v_0 (1 + a_0) and Q_H0 + 5 kW a_1: noise on the action becomes
+    bounded, slow noise of the drives, which is how a learner should explore; "rate" moves them at the same gains
+    without the return to nominal. Out-of-range actions are clipped and
     ``info["action_clipped"]`` says so; NaN or a wrong shape raises :class:`gymnasium.error.InvalidAction`.
 
     ## Observation Space

@@ -58,7 +58,7 @@ LAGGED = ("ring_error", "v_p", "T_1", "Q_H")
 """Channels that "history" remembers."""
 LAGS = (5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0, 240.0, 360.0, 480.0, 720.0, 960.0, 1200.0)
 """Ages [s] that "history" reaches back to, in spans: each span holds the samples since the age before."""
-_SPAN_SCALES = {"ring_error": 0.1 * MM, "v_p": 0.1 * PULL_SCALE, "T_1": 0.2, "Q_H": 0.2 * KILO}
+_SPAN_SCALES = {"ring_error": 0.2 * MM, "v_p": 0.2 * PULL_SCALE, "T_1": 0.5, "Q_H": 0.5 * KILO}
 _RELATIVE = {
     "r_ref_1min": ("r_ref", 0.1 * MM, "change of the radius reference within 1 minute"),
     "r_ref_5min": ("r_ref", 0.5 * MM, "change of the radius reference within 5 minutes"),
@@ -188,6 +188,20 @@ def relative() -> Relative:
     rows = [(place[name], place[to], MEASURED[place[name]].scale / scale) for name, (to, scale, _) in _RELATIVE.items()]
     channel, to, scale = zip(*rows, strict=True)
     return Relative(np.array(channel), np.array(to), np.array(scale))
+
+
+def undo_differences() -> npt.NDArray[np.float64]:
+    """From HISTORY to readings and means of spans, both in SI units: a row vector times this 0/1 matrix."""
+    place = {channel.name: at for at, channel in enumerate(HISTORY)}
+    found = np.eye(len(HISTORY))
+    for name, (to, *_) in _RELATIVE.items():
+        found[place[to], place[name]] = 1.0
+    for name in LAGGED:
+        so_far = found[:, place[name]].copy()
+        for age in LAGS:
+            so_far[place[f"{name}_{age:g}s"]] = 1.0
+            found[:, place[f"{name}_{age:g}s"]] = so_far
+    return found
 
 
 def span_scales() -> npt.NDArray[np.float64]:

@@ -56,7 +56,7 @@ class Drives(NamedTuple):
 
 DIRECT = Drives(0.0, 1.0, 1.0)
 """The action is the drives' deviation from nominal itself."""
-ACTIONS = ("direct", "smooth")
+ACTIONS = ("direct", "smooth", "rate")
 """What the two numbers of an action may mean."""
 
 
@@ -65,12 +65,14 @@ def drives_of(action: str, control_interval: float) -> Drives:
 
     "smooth": first-order lags. A held action a brings the pull speed to v_0 (1 + a) and the heater to
     Q_H0 + 5 kW a with a time constant of 50 s; left alone they return to nominal. So noise on the action is bounded,
-    coloured noise of the drives, whatever the control interval.
+    coloured noise of the drives, whatever the control interval. "rate": the same without the return to nominal; a held
+    action of 1 moves the drives by v_0 and 5 kW every 50 s.
     """
     if action == "direct":
         return DIRECT
-    keep = math.exp(-control_interval / SMOOTH_TIME)
-    return Drives(keep, SMOOTH_PULL * (1.0 - keep), SMOOTH_HEATER * (1.0 - keep))
+    share = control_interval / SMOOTH_TIME
+    keep, share = (1.0, share) if action == "rate" else (math.exp(-share), 1.0 - math.exp(-share))
+    return Drives(keep, SMOOTH_PULL * share, SMOOTH_HEATER * share)
 
 
 class Cost(NamedTuple):

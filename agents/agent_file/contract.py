@@ -43,7 +43,7 @@ class Contract:
     observation_hash: str
     """Hash of that observation's channels: names, units and scales in their order."""
     action: str
-    """What its actions mean: "direct" or "smooth" (:func:`cz_gym.task.drives_of`)."""
+    """What its actions mean: "direct", "smooth" or "rate" (:func:`cz_gym.task.drives_of`)."""
     control_interval: float
     """Time between actions it was trained at [s]."""
     plant_hash: str

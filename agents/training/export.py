@@ -7,17 +7,18 @@ hold operators that agents' files may not (:mod:`cz_gym.agents.agent_file.graph`
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import onnx
 import torch
 from onnx import TensorProto, helper, numpy_helper
+from sb3_contrib.ars.policies import ARSPolicy
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from cz_gym.observation import DRIVE_CHANNELS, HISTORY
 
-from .networks import NORMALISED_LIMIT, Beside, Normalise
+from .networks import NORMALISED_LIMIT, Actor, Beside, Normalise
 
 OPSET, IR_VERSION = 17, 9
 ACTIVATIONS: dict[type[torch.nn.Module], tuple[str, dict[str, str]]] = {
@@ -134,16 +135,6 @@ class OnnxGraph:
         return serialised
 
 
-class Actor(NamedTuple):
-    """The deterministic actor of a policy of stable-baselines3's own."""
-
-    extractor: Any
-    """What its observations go through first."""
-    lstm: Any
-    """Its LSTM; None without one."""
-    layers: list[torch.nn.Module]
-
-
 def actor_of(policy: Any) -> Actor:
     """The actor of a policy of any algorithm; TypeError if it has none, or one that an agent file cannot hold."""
     if isinstance(policy, ActorCriticPolicy):
@@ -151,6 +142,8 @@ def actor_of(policy: Any) -> Actor:
         if lstm is not None and lstm.num_layers > 1:
             raise TypeError("a policy with more than one layer of LSTM cannot be written as an agent file")
         return Actor(policy.pi_features_extractor, lstm, [net, policy.action_net])
+    if isinstance(policy, ARSPolicy):
+        return Actor(policy.features_extractor, None, [policy.action_net])
     actor = getattr(policy, "actor", None)
     if actor is None:
         raise TypeError(f"{type(policy).__name__} has no actor that gives two continuous actions")
@@ -159,11 +152,12 @@ def actor_of(policy: Any) -> Actor:
     return Actor(actor.features_extractor, None, layers)
 
 
-def policy_onnx(policy: Any) -> bytes:
-    """The deterministic actor of a policy that begins with :class:`.networks.Normalise`.
+def actor_onnx(actor: Actor) -> bytes:
+    """An actor that begins with :class:`.networks.Normalise`.
 
     The hidden and cell values of an LSTM travel in the file's ``state``, shape (n, 2 units): nothing in the file loops.
     """
-    graph, actor = OnnxGraph(), actor_of(policy)
+    assert isinstance(actor.extractor, Normalise)
+    graph = OnnxGraph()
     graph.acted(graph.normalised(actor.extractor), actor, "action")
     return graph.finished(min(len(actor.extractor.mean), len(HISTORY)), actor)

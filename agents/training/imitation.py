@@ -7,28 +7,26 @@ on the whitened observations of the first round; then the whole actor is fitted 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from gymnasium.spaces import Box
 from stable_baselines3.common.logger import Logger
 
 from cz_gym.config import Config
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
-from cz_gym.observation import CLIP, DRIVE_CHANNELS, HISTORY, STATE
+from cz_gym.observation import CLIP, DRIVE_CHANNELS, HISTORY
 
 from .demonstrations import Demonstrations, Floats, demonstrate, widened
-from .export import policy_onnx
+from .export import actor_onnx
 from .learner import Parts, Watch
-from .networks import AsymmetricPolicy, visible_channels
+from .networks import Actor, Beside, Normalise, tanh_layers, whitening
 from .recipes import Imitation
 
 RIDGE = 1e-6
 """Regularisation of the regression, in units of the whitened observation's variance."""
-VARIANCE_FLOOR = 1e-6
-"""Least variance that whitening divides by [-]."""
 SPREAD_FLOOR = 1e-6
 """Least spread of the demonstrated outputs that a loss is divided by [-]."""
 BATCH = 4096
@@ -48,25 +46,25 @@ class Imitator:
         self.recipe, self.seed, self.teacher, self.config, self.logger = recipe, seed, teacher, config, logger
         self.total = recipe.rounds * recipe.episodes * config.steps
         self.steps = self.total if done else 0
-        self.policy = make_network(recipe, seed)
+        self.network = make_network(recipe, seed)
 
     def learn(self, watch: Watch) -> None:
         """Imitate, unless that is done."""
         if self.steps:
             return
-        recipe, self.policy = self.recipe, make_network(self.recipe, self.seed)
+        recipe, self.network = self.recipe, make_network(self.recipe, self.seed)
         torch.manual_seed(self.seed)
         demonstrations: Demonstrations | None = None
         for turn in range(recipe.rounds):
             found = self._round(turn, watch)
             if demonstrations is None:
                 demonstrations = found
-                fit_linear_path(self.policy, found, recipe.memory)
+                fit_linear_path(self.network, found)
             else:
                 demonstrations = Demonstrations.joined([demonstrations, found])
             taken = (turn + 1) * recipe.episodes * self.config.steps
             watch(taken, f"round {turn + 1} of {recipe.rounds}: fits {len(demonstrations.action):,} samples")
-            self.logger.record("imitation/loss", fit(self.policy, demonstrations, recipe))
+            self.logger.record("imitation/loss", fit(self.network, demonstrations, recipe))
             self.logger.dump(taken)
         self.steps = self.total
         watch(self.total, "")
@@ -84,7 +82,7 @@ class Imitator:
             taken += steps
             watch(taken, f"round {turn + 1} of {recipe.rounds}: {recipe.teacher} demonstrates")
 
-        driver = mean_action(self.policy) if turn else None
+        driver = mean_action(self.network) if turn else None
         return Demonstrations.joined(
             demonstrate(self.teacher, config, some, recipe.noise, driver, progress)
             for config, some in ((wide, seeds[:many]), (self.config, seeds[many:]))
@@ -93,71 +91,78 @@ class Imitator:
 
     def parts(self) -> Parts:
         """The network."""
-        return Parts({"policy": self.policy})
+        return Parts({"network": self.network})
 
     def exported(self) -> bytes:
         """The network's actor."""
-        return policy_onnx(self.policy)
+        return actor_onnx(self.network.actor)
 
 
-def make_network(recipe: Imitation, seed: int) -> AsymmetricPolicy:
-    """PPO's network with that training seed's first weights; its critic, which would see the state, learns nothing."""
+class ImitationNetwork(torch.nn.Module):
+    """Normalised observation -> tanh layers, and beside them the observation itself -> linear -> action.
+
+    The linear path carries what a linear controller would do, the layers what bends it.
+    """
+
+    def __init__(self, hidden: tuple[int, ...], memory: float) -> None:
+        super().__init__()
+        channels = len(HISTORY)
+        self.normalise = Normalise(Box(-CLIP, CLIP, (channels,), np.float32), memory)
+        self.layers = Beside(tanh_layers([channels, *hidden]))
+        self.last = torch.nn.Linear((channels, *hidden)[-1] + channels, len(DRIVE_CHANNELS))
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Shape (n, channels) to (n, 2)."""
+        action: torch.Tensor = self.last(self.layers(self.normalise(observation)))
+        return action
+
+    @property
+    def actor(self) -> Actor:
+        """What is exported."""
+        return Actor(self.normalise, None, [self.layers, self.last])
+
+
+def make_network(recipe: Imitation, seed: int) -> ImitationNetwork:
+    """The network with that training seed's first weights."""
     torch.manual_seed(seed)
-    seen = Box(-CLIP, CLIP, (len(HISTORY) + len(STATE),), np.float32)
-    network = AsymmetricPolicy(
-        seen,
-        Box(-1.0, 1.0, (len(DRIVE_CHANNELS),), np.float32),
-        lambda left: recipe.learning_rate,
-        hidden=recipe.hidden,
-        memory=recipe.memory,
-    )
-    network.set_training_mode(False)
-    return network
+    return ImitationNetwork(recipe.hidden, recipe.memory)
 
 
-def mean_action(policy: AsymmetricPolicy) -> Any:
-    """The policy's mean action as a function of "history" observations."""
+def mean_action(network: ImitationNetwork) -> Callable[[Floats], Floats]:
+    """The network's action, within its box, as a function of "history" observations."""
 
     def act(observation: Floats) -> Floats:
         with torch.no_grad():
-            action: Floats = policy._predict(_padded(observation), deterministic=True).numpy()
+            action: Floats = network(torch.as_tensor(observation)).clamp(-1.0, 1.0).numpy()
         return action
 
     return act
 
 
-def whitening(observation: Floats) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Mean and symmetric scaling that make the observation's channels uncorrelated, of variance one."""
-    variances, axes = np.linalg.eigh(np.cov(observation.T.astype(np.float64)))
-    return observation.mean(axis=0, dtype=np.float64), axes / np.sqrt(np.maximum(variances, VARIANCE_FLOOR)) @ axes.T
-
-
-def fit_linear_path(policy: AsymmetricPolicy, demonstrations: Demonstrations, memory: float) -> None:
+def fit_linear_path(network: ImitationNetwork, demonstrations: Demonstrations) -> None:
     """Set normalisation and linear path by regression; the hidden layers add nothing yet."""
-    normalise, seen = policy.features_extractor, len(HISTORY)
-    mean, scaling = np.zeros(len(normalise.mean)), np.eye(len(normalise.mean))
-    visible = demonstrations.observation * visible_channels(seen, memory)
-    mean[:seen], scaling[:seen, :seen] = whitening(visible)
-    normalise.set(mean, scaling)
-    whitened = _features(policy, demonstrations.observation).numpy().astype(np.float64)
+    normalise, last = network.normalise, network.last
+    seen = demonstrations.observation.astype(np.float64) * normalise.visible.numpy()
+    mean = seen.mean(axis=0)
+    normalise.set(mean, whitening(np.cov(seen.T)))
+    whitened = _features(network, demonstrations.observation).numpy().astype(np.float64)
     x = np.column_stack([whitened, np.ones(len(whitened))])
     squares = x.T @ x + RIDGE * len(x) * np.eye(x.shape[1])
     weights = np.linalg.solve(squares, x.T @ demonstrations.action)
-    last = policy.action_net
     with torch.no_grad():
         last.weight.zero_()
-        last.weight[:, -seen:] = torch.as_tensor(weights[:-1].T)
+        last.weight[:, -len(mean) :] = torch.as_tensor(weights[:-1].T)
         last.bias.copy_(torch.as_tensor(weights[-1]))
 
 
-def fit(policy: AsymmetricPolicy, demonstrations: Demonstrations, recipe: Imitation) -> float:
+def fit(network: ImitationNetwork, demonstrations: Demonstrations, recipe: Imitation) -> float:
     """Fit the actor by gradient and return the last loss: Huber's, of outputs of unit spread, in one cycle of rates."""
     wanted = demonstrations.action
     spread = torch.as_tensor(np.maximum(np.quantile(np.abs(wanted), 0.68, axis=0), SPREAD_FLOOR).astype(np.float32))
-    features = _features(policy, demonstrations.observation)
+    features = _features(network, demonstrations.observation)
     targets = torch.as_tensor(wanted / spread.numpy())
     shares = torch.tensor(recipe.loss_weights)
-    actor = torch.nn.Sequential(policy.mlp_extractor.policy_net, policy.action_net)
+    actor = torch.nn.Sequential(network.layers, network.last)
     optimiser = torch.optim.Adam(actor.parameters(), recipe.learning_rate)
     steps = recipe.epochs * max(len(wanted) // BATCH, 1)
     cycle = torch.optim.lr_scheduler.OneCycleLR(optimiser, recipe.learning_rate, total_steps=steps)
@@ -173,13 +178,8 @@ def fit(policy: AsymmetricPolicy, demonstrations: Demonstrations, recipe: Imitat
     return float(loss.detach())
 
 
-def _padded(observation: Floats) -> torch.Tensor:
-    """What the network reads: this observation for the actor, nothing for the critic."""
-    return torch.as_tensor(np.pad(observation, ((0, 0), (0, len(STATE)))))
-
-
-def _features(policy: AsymmetricPolicy, observation: Floats) -> torch.Tensor:
-    """The actor's normalised view, shape (samples, channels)."""
+def _features(network: ImitationNetwork, observation: Floats) -> torch.Tensor:
+    """The normalised observation, shape (samples, channels)."""
     with torch.no_grad():
-        features: torch.Tensor = policy.features_extractor(_padded(observation))
-    return features[:, : len(HISTORY)].contiguous()
+        features: torch.Tensor = network.normalise(torch.as_tensor(observation))
+    return features

@@ -1,14 +1,10 @@
-"""The policy network: an actor with a linear path beside its layers, and a critic that may see more than it.
-
-Actor: observation -> normalise -> tanh layers beside the normalised observation itself -> linear -> action. The linear
-path carries what a linear controller would do, the layers what bends it.
-"""
+"""Networks: normalised observations, a critic that may see more than its actor, a linear path beside layers."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +18,8 @@ from cz_gym.observation import HISTORY, LAGGED, LAGS
 
 NORMALISED_LIMIT = 30.0
 """Largest normalised channel [-]."""
+VARIANCE_FLOOR = 1e-6
+"""Least variance that whitening divides by [-]."""
 
 
 def visible_channels(channels: int, memory: float) -> npt.NDArray[np.float32]:
@@ -31,6 +29,13 @@ def visible_channels(channels: int, memory: float) -> npt.NDArray[np.float32]:
         lagged = visible[len(HISTORY) - len(LAGS) * len(LAGGED) : len(HISTORY)]
         lagged[:] = np.repeat(np.array(LAGS) <= memory, len(LAGGED))
     return visible
+
+
+def whitening(covariance: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    """The symmetric scaling that makes channels of this covariance uncorrelated, of variance one."""
+    variances, axes = np.linalg.eigh(covariance)
+    scaling: npt.NDArray[np.float64] = axes / np.sqrt(np.maximum(variances, VARIANCE_FLOOR)) @ axes.T
+    return scaling
 
 
 def tanh_layers(sizes: Sequence[int]) -> nn.Sequential:
@@ -84,65 +89,45 @@ class Beside(nn.Module):
 class ActorCritic(nn.Module):
     """The layers of both: the actor sees the first ``measured`` channels, the critic all."""
 
-    pairs: torch.Tensor
-
     def __init__(self, channels: int, measured: int, hidden: tuple[int, ...]) -> None:
         super().__init__()
-        self.measured, truths = measured, channels - measured
-        self.register_buffer("pairs", torch.triu_indices(truths, truths), persistent=False)
-        import os
-
-        skip = os.environ.get("SKIP", "1") == "1"
-        self.latent_dim_pi = (measured, *hidden)[-1] + (measured if skip else 0)
-        self.latent_dim_vf = (channels, *hidden)[-1] + truths + self.pairs.shape[1]
-        self.policy_net = (Beside if skip else (lambda x: x))(tanh_layers([measured, *hidden]))
-        self.value_net = tanh_layers([channels, *hidden])
+        self.measured = measured
+        self.policy_net, self.value_net = tanh_layers([measured, *hidden]), tanh_layers([channels, *hidden])
+        self.latent_dim_pi, self.latent_dim_vf = (measured, *hidden)[-1], (channels, *hidden)[-1]
 
     def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Latents of actor and critic."""
         return self.forward_actor(features), self.forward_critic(features)
 
     def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
-        """Shape (n, channels) to (n, hidden + measured)."""
+        """Shape (n, channels) to (n, hidden)."""
         latent: torch.Tensor = self.policy_net(features[:, : self.measured])
         return latent
 
     def forward_critic(self, features: torch.Tensor) -> torch.Tensor:
-        """Shape (n, channels) to (n, hidden + true channels and their products).
-
-        The cost to go of a nearly linear plant is nearly quadratic in its state.
-        """
-        truths = features[:, self.measured :]
-        products = truths[:, self.pairs[0]] * truths[:, self.pairs[1]]
-        return torch.cat([self.value_net(features), truths, products], dim=1)
+        """Shape (n, channels) to (n, hidden)."""
+        latent: torch.Tensor = self.value_net(features)
+        return latent
 
 
 class AsymmetricPolicy(ActorCriticPolicy):
-    """PPO's policy of :class:`Normalise` and :class:`ActorCritic`."""
+    """PPO's policy, whose actor sees the measured channels alone; what the true state adds is the critic's."""
 
-    features_extractor: Normalise
-    action_net: nn.Linear
     mlp_extractor: ActorCritic  # type: ignore[assignment]  # has all of MlpExtractor that ActorCriticPolicy uses
 
-    def __init__(
-        self,
-        observation_space: Box,
-        action_space: Box,
-        lr_schedule: Any,
-        *,
-        hidden: tuple[int, ...] = (64, 64),
-        memory: float = LAGS[-1],
-        **options: Any,
-    ) -> None:
+    def __init__(self, *arguments: Any, hidden: tuple[int, ...] = (64, 64), **options: Any) -> None:
         self.hidden = hidden
-        super().__init__(
-            observation_space,
-            action_space,
-            lr_schedule,
-            features_extractor_class=Normalise,
-            features_extractor_kwargs={"memory": memory},
-            **options,
-        )
+        super().__init__(*arguments, **options)
 
     def _build_mlp_extractor(self) -> None:
         self.mlp_extractor = ActorCritic(self.features_dim, min(self.features_dim, len(HISTORY)), self.hidden)
+
+
+class Actor(NamedTuple):
+    """A deterministic actor, as it is exported."""
+
+    extractor: nn.Module
+    """What its observations go through first."""
+    lstm: nn.LSTM | None
+    """Its LSTM; None without one."""
+    layers: Sequence[nn.Module]

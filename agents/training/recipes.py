@@ -34,6 +34,8 @@ class Recipe:
     """What the network's two outputs mean (:func:`cz_gym.task.drives_of`)."""
     scenario: str = "randomized"
     """What training and validation crystals are drawn from."""
+    basis: str = "differences"
+    """What of the past the networks see standardised: its "differences", or "means" of spans as they are."""
     control_interval: float = 5.0
     """Time between actions [s]."""
     memory: float = 1200.0
@@ -64,7 +66,7 @@ class Imitation(Recipe):
     """Share of each round's crystals that are wide; the others are the scenario's own [-]."""
     width: float = 2.0
     """How far everything random is spread on wide crystals, in units of the scenario's [-]."""
-    noise: tuple[float, float] = (0.006, 0.001)
+    noise: tuple[float, float] = (0.06, 0.02)
     """Spread of the noise added to the actions while demonstrating, pull speed and heater [-]."""
     epochs: int = 4
     """Times each round goes through all demonstrations so far."""
@@ -82,18 +84,22 @@ class Reinforcement(Recipe):
     """Environment steps."""
     num_envs: int
     """Slots trained on at once."""
-    batch_size: int
     gamma: float = 0.99
     learning_rate: float
     """At the start; it falls linearly to a twentieth."""
     privileged_critic: bool = False
     """Whether the critic also sees the true state."""
+    length: float = 10800.0
+    """Length of its crystals while it learns [s]; they are judged whole."""
+    failure_costs: bool = True
+    """Whether a lost crystal costs what is left of it; without, rewards are positive and end there."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class OnPolicy(Reinforcement):
     """Proximal policy optimisation, whatever the network."""
 
+    batch_size: int
     n_steps: int
     """Steps a slot between updates; of a network with a memory also how far back its gradient sees."""
     n_epochs: int
@@ -153,9 +159,30 @@ class SAC(Reinforcement):
     tau: float = 0.01
 
 
+@dataclass(frozen=True, kw_only=True)
+class RandomSearch(Reinforcement):
+    """Augmented random search of a linear policy, from nothing: no gradient, no critic, no discount."""
+
+    name: str = "random-search"
+    steps: int = 100_000_000
+    num_envs: int = 512
+    """Shared out among the candidates, each of which meets the same crystals."""
+    gamma: float = 0.0
+    n_delta: int = 32
+    """Directions of a round; either way along each is a candidate."""
+    n_top: int = 16
+    """Best directions of a round that are followed."""
+    delta_std: float = 0.03
+    """Spread of the candidates' weights."""
+    part: int = 360
+    """Steps of an episode that candidates are compared on."""
+    learning_rate: float = 0.02
+
+
 TEACHERS_COST = CostWeights(pull=0.11, pull_step=0.049, heater_step=23.4)
 """The cost that the regulator of lqg-at-0.02 was made for, as multiples of the environment's."""
 RECIPES: dict[str, Recipe] = {
-    recipe.name: recipe for recipe in (PPO(), RecurrentPPO(), SAC(), Imitation(name="imitation", weights=TEACHERS_COST))
+    recipe.name: recipe
+    for recipe in (PPO(), RecurrentPPO(), SAC(), RandomSearch(), Imitation(name="imitation", weights=TEACHERS_COST))
 }
 """By name: what ``train.py --algo`` offers."""

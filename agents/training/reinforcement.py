@@ -19,11 +19,12 @@ from stable_baselines3.common.logger import Logger
 from cz_gym import CzVectorEnv
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 
+from . import random_search
 from .callbacks import Statistics, Watching
-from .export import policy_onnx
+from .export import actor_of, actor_onnx
 from .learner import Parts, Watch
 from .networks import AsymmetricPolicy, Normalise
-from .recipes import PPO, SAC, CostWeights, RecurrentPPO, Reinforcement
+from .recipes import PPO, SAC, CostWeights, RandomSearch, RecurrentPPO, Reinforcement
 from .vec_env import CzVecEnv
 from .wrappers import TrainingReward
 
@@ -31,6 +32,7 @@ KINDS: dict[type[Reinforcement], tuple[Any, Any]] = {
     PPO: (stable_baselines3.PPO, AsymmetricPolicy),
     RecurrentPPO: (RecurrentPPOAlgorithm, "MlpLstmPolicy"),
     SAC: (stable_baselines3.SAC, "MlpPolicy"),
+    RandomSearch: (random_search.RandomSearch, random_search.WhitenedLinearPolicy),
 }
 """The algorithm and the policy of each kind of recipe."""
 
@@ -47,7 +49,7 @@ class Reinforced:
         self.algorithm.set_random_seed((seed * 10_007 + done) % (len(TRAINING_SEEDS) - recipe.num_envs))
         self.algorithm.num_timesteps = done
         self.algorithm.set_logger(logger)
-        self._statistics = Statistics(recipe.steps // 4, known=done > 0)
+        self._statistics = Statistics(recipe.steps // 4, recipe.basis, known=done > 0)
 
     @property
     def steps(self) -> int:
@@ -71,7 +73,7 @@ class Reinforced:
 
     def exported(self) -> bytes:
         """The deterministic actor."""
-        return policy_onnx(self.algorithm.policy)
+        return actor_onnx(actor_of(self.algorithm.policy))
 
 
 def make_slots(recipe: Reinforcement, seed: int, done: int) -> CzVecEnv:
@@ -82,16 +84,17 @@ def make_slots(recipe: Reinforcement, seed: int, done: int) -> CzVecEnv:
         observation=recipe.observation,
         action=recipe.action,
         control_interval=recipe.control_interval,
+        horizon=recipe.length,
         autoreset_mode=AutoresetMode.SAME_STEP,
         info="lean" if recipe.weights == CostWeights() else "all",
     )
-    return CzVecEnv(env, recipe.privileged_critic, stagger=seed + done)
+    return CzVecEnv(env, recipe.privileged_critic, stagger=None if isinstance(recipe, RandomSearch) else seed + done)
 
 
 def make_algorithm(recipe: Reinforcement, slots: CzVecEnv, seed: int) -> BaseAlgorithm:
     """The algorithm of a recipe, whose fields it takes by stable-baselines3's names."""
     torch.manual_seed(seed)
-    env = TrainingReward(slots, recipe.gamma, recipe.weights)
+    env = TrainingReward(slots, recipe.gamma, recipe.weights, recipe.failure_costs)
     algorithm, policy = KINDS[type(recipe)]
     known = inspect.signature(algorithm).parameters
     settings = {name: value for name, value in asdict(recipe).items() if name in known}
@@ -102,12 +105,14 @@ def make_algorithm(recipe: Reinforcement, slots: CzVecEnv, seed: int) -> BaseAlg
 
 def _network(recipe: Reinforcement) -> dict[str, Any]:
     """Options of the policy: normalised observations, layers, an LSTM on request."""
+    if isinstance(recipe, RandomSearch):
+        return {}
     layers = list(recipe.hidden)
-    if isinstance(recipe, PPO):
-        return {"hidden": recipe.hidden, "memory": recipe.memory, "log_std_init": float(np.log(recipe.noise))}
     seeing = {"features_extractor_class": Normalise, "features_extractor_kwargs": {"memory": recipe.memory}}
     if isinstance(recipe, SAC):
         return {**seeing, "net_arch": layers}
+    if isinstance(recipe, PPO):
+        return {**seeing, "hidden": recipe.hidden, "log_std_init": float(np.log(recipe.noise))}
     arch = {"pi": layers, "vf": layers}
     assert isinstance(recipe, RecurrentPPO)
     return {**seeing, "net_arch": arch, "lstm_hidden_size": recipe.units, "log_std_init": float(np.log(recipe.noise))}

@@ -17,14 +17,16 @@ class TrainingReward(VecEnvWrapper):
     """Reward for a discounting learner: scaled by 1 - gamma; a failure costs the worst step for the discounted rest.
 
     The environment's own failure penalty, -10 a lost step, is the same thing undiscounted. The terms of the cost are
-    weighted as asked; the last step of an episode keeps the environment's own weights.
+    weighted as asked; the last step of an episode keeps the environment's own weights. Without ``failure_costs``,
+    rewards are raised by what a step can cost, and failing ends them: what a learner gets who is paid to stay alive.
     """
 
-    def __init__(self, slots: CzVecEnv, gamma: float, weights: CostWeights) -> None:
+    def __init__(self, slots: CzVecEnv, gamma: float, weights: CostWeights, failure_costs: bool = True) -> None:
         super().__init__(slots)
         self.slots, self.weights = slots, weights
         self.share = 1.0 - gamma
-        self.floor = -FAILURE_COST / self.share
+        self.floor = -FAILURE_COST / self.share if failure_costs else -FAILURE_COST
+        self.raised = 0.0 if failure_costs else FAILURE_COST
 
     def reset(self) -> Any:
         """Pass on."""
@@ -35,7 +37,8 @@ class TrainingReward(VecEnvWrapper):
         observation, given, done, infos = self.venv.step_wait()
         if self.weights != CostWeights():
             given = np.where(done, given, self.reward(self.slots.info))
-        return observation, (np.maximum(given, self.floor) * self.share).astype(np.float32), done, infos
+        earned = (np.maximum(given, self.floor) + self.raised) * self.share
+        return observation, earned.astype(np.float32), done, infos
 
     def reward(self, info: dict[str, Any]) -> Any:
         """The weighed reward of a step from what the batch said of it."""

@@ -67,10 +67,10 @@ def _drive(slot: Any, pull: Any, heat: Any, drives: Any, interval: Any) -> None:
     slot.v_p_before, slot.Q_H_before = slot.v_p, slot.Q_H
     slot.clipped = 1.0 if (np.abs(pull) > 1.0 or np.abs(heat) > 1.0) else 0.0
     speed = drives.keep * ((slot.v_p - p.v_0) / p.v_0) + drives.pull * clip(pull, 1.0)
-    wanted = p.v_0 + clip(p.v_0 * speed, e.pull_window)
+    wanted = p.v_0 + clip(p.v_0 * clip(speed, 1.0), e.pull_window)
     slot.v_p = slot.v_p + clip(wanted - slot.v_p, e.pull_slew * interval)
     share = drives.keep * ((slot.Q_H_slewed - p.Q_H_0) / HEATER_RANGE) + drives.heater * clip(heat, 1.0)
-    power = np.maximum(p.Q_H_0 + HEATER_RANGE * share, 0.0)
+    power = np.maximum(p.Q_H_0 + HEATER_RANGE * clip(share, 1.0), 0.0)
     slot.Q_H_slewed = slot.Q_H_slewed + clip(power - slot.Q_H_slewed, e.heater_slew * interval)
     slot.Q_H = slot.Q_H_slewed
     if e.heater_step > 0.0:

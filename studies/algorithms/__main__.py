@@ -1,4 +1,7 @@
-"""Algorithms side by side: ``python -m studies.algorithms`` trains each on the same observations and crystals."""
+"""Algorithms side by side: ``python -m studies.algorithms`` trains each recipe of train.py and judges its agents.
+
+The agents stay in the folders of their runs (``--work``); those that are shipped were made so.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +13,14 @@ from studies.comparison.command import main as compare
 from studies.comparison.variants import Study, Variant
 
 ROWS = (
-    Variant(RECIPES["ppo"], "PPO from nothing; the critic also sees the true state"),
-    Variant(RECIPES["ppo-recurrent"], "PPO of an LSTM from nothing; actor and critic see what is measured", "ppo"),
+    Variant(RECIPES["ppo"], "proximal policy optimisation from nothing; the critic also sees the true state"),
+    Variant(RECIPES["ppo-recurrent"], "the same of an LSTM; actor and critic see what is measured", "ppo"),
     Variant(RECIPES["sac"], "soft actor-critic from nothing; both see what is measured", "ppo"),
+    Variant(RECIPES["random-search"], "augmented random search of a linear policy, from nothing", "ppo"),
     Variant(RECIPES["imitation"], "no reward: DAgger, the teacher is a privileged LQG", "ppo"),
 )
 """Every row, in the order of the table."""
-STUDY = Study("algorithms", "Algorithms side by side: the recipes of train.py on the same crystals", ROWS, 400_000)
+STUDY = Study("algorithms", "Algorithms side by side: the recipes of train.py on the same crystals", ROWS, None)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -36,7 +36,7 @@ def main(study: Study, arguments: Sequence[str] | None) -> int:
         "--steps",
         type=STEPS,
         default=study.steps,
-        help="environment steps of what learns from reward (%(default)s)",
+        help=f"environment steps of what learns from reward (default: {study.steps or 'those of its recipe'})",
     )
     parser.add_argument("--jobs", type=between(1, 64), default=2, help="runs at once (default: %(default)s)")
     add_folders(parser, study.name)

@@ -12,7 +12,7 @@ from typing import Any
 
 from cz_gym.baselines.lqg.settings import FAMILY
 from cz_gym.baselines.registry import make_controller
-from cz_gym.config import make_config
+from cz_gym.config import Config, make_config
 from cz_gym.evaluation.equal_activity import frontier
 
 from .results import ACTIVITY, LOST, RMSE, SCENARIO, Plan, Result, cached, judge
@@ -27,13 +27,14 @@ def lqg_family(plan: Plan) -> Family:
     """The family on the plan's crystals; judged if that is not cached."""
     found = {}
     for name in FAMILY:
-        controller: Any = make_controller(name, make_config(SCENARIO))
-        found[name] = cached(plan, name, controller.settings.hash, partial(_judged, plan, controller))
+        config = make_config(SCENARIO)
+        controller: Any = make_controller(name, config)
+        found[name] = cached(plan, name, controller.settings.hash, partial(_judged, plan, controller, config))
     return found
 
 
-def _judged(plan: Plan, controller: Any) -> Result:
-    return Result(judge(plan, controller))
+def _judged(plan: Plan, controller: Any, config: Config) -> Result:
+    return Result(judge(plan, controller, config))
 
 
 def at_equal_activity(results: list[Result], family: Family) -> float | None:

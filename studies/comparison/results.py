@@ -20,7 +20,7 @@ from cz_gym.agents.training.recipes import CostWeights
 from cz_gym.agents.training.run_files import provenance
 from cz_gym.agents.training.validation import costs
 from cz_gym.atomic_files import write_files
-from cz_gym.config import make_config
+from cz_gym.config import Config, make_config
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 
@@ -59,11 +59,13 @@ class Result(NamedTuple):
         return float(self.figures[:, FIGURES.index(figure)].mean())
 
 
-def judge(plan: Plan, policy: Any) -> Floats:
-    """Figures of a policy on the plan's crystals, shape (crystals, figures)."""
+def judge(plan: Plan, policy: Any, config: Config) -> Floats:
+    """Figures of a policy on the plan's crystals, at its own observation, action and time between actions.
+
+    Shape (crystals, figures).
+    """
     own, transfer = (
-        metrics(rollout(policy, make_config(name, observation="history"), plan.crystals))
-        for name in (SCENARIO, TRANSFER)
+        metrics(rollout(policy, config.with_scenario(name), plan.crystals)) for name in (SCENARIO, TRANSFER)
     )
     cost = costs(own, CostWeights())
     columns = own.rmse_mm, cost, own.pull_step_rms_mm_per_min, own.failure_rate, transfer.rmse_mm, transfer.failure_rate

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
@@ -12,8 +11,9 @@ from typing import Any
 
 from tqdm import tqdm
 
+from cz_gym.agents.training.learners import config_of
 from cz_gym.agents.training.recipes import Recipe
-from cz_gym.agents.training.run import Run
+from cz_gym.agents.training.run import CHECKPOINT, Run
 from cz_gym.agents.training.validation import Validation
 from cz_gym.atomic_files import locked
 from cz_gym.baselines.registry import make_controller
@@ -36,12 +36,11 @@ def trained(
 ) -> Result:
     """What the agent of a recipe and a training seed does on the plan's crystals; trained if that is not cached.
 
-    It goes on from its checkpoint if there is one; its folder goes when it is judged. ``report`` gets what each
-    validation on the way found; what it raises ends the run, whose checkpoint stays.
+    It goes on from its checkpoint if there is one, which goes when the agent is judged; the rest of its folder stays.
+    ``report`` gets what each validation on the way found; what it raises ends the run, whose checkpoint stays.
     """
 
     def make() -> Result:
-        folder = plan.work / path_of(plan, name, settings).stem
         with locked(folder):
             begun = (folder / "settings.json").exists()
             run = Run(folder, recipe, seed, make_controller, resume=begun)
@@ -51,13 +50,15 @@ def trained(
             except KeyboardInterrupt:
                 run.save()
                 raise
+            run.finish()
             rows = [{key: float(value) for key, value in row.items()} for row in run.rows]
-            result = Result(judge(plan, run.best_policy()), rows)
-        shutil.rmtree(folder)
-        return result
+            return Result(judge(plan, run.best_policy(), config_of(recipe)), rows)
 
     name, settings = _identity(recipe, seed)
-    return cached(plan, name, settings, make)
+    folder = plan.work / path_of(plan, name, settings).stem
+    result = cached(plan, name, settings, make)
+    (folder / CHECKPOINT).unlink(missing_ok=True)
+    return result
 
 
 def _identity(recipe: Recipe, seed: int) -> tuple[str, Any]:

@@ -24,9 +24,9 @@ class Variant:
         """What its agents are called."""
         return self.recipe.name
 
-    def of(self, steps: int) -> Variant:
-        """The same, learning for that many environment steps if it learns from reward."""
-        if not isinstance(self.recipe, Reinforcement):
+    def of(self, steps: int | None) -> Variant:
+        """The same, learning for that many environment steps if it learns from reward; None: its recipe's own."""
+        if steps is None or not isinstance(self.recipe, Reinforcement):
             return self
         return replace(self, recipe=replace(self.recipe, steps=steps))
 
@@ -39,8 +39,8 @@ class Study(NamedTuple):
     title: str
     """One line for people."""
     variants: Sequence[Variant]
-    steps: int
-    """Environment steps of variants that learn from reward, unless told otherwise."""
+    steps: int | None
+    """Environment steps of variants that learn from reward, unless told otherwise; None: their recipes' own."""
 
     def names(self, wanted: str | None) -> list[str]:
         """The names of all variants, or of those wanted, joined by commas; ValueError names what there is."""

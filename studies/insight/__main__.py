@@ -66,7 +66,7 @@ def contenders(path: Path | None) -> tuple[Contender, ...]:
     policy = OnnxPolicy.load(file, config)
 
     def agent(label: str, observations: Floats) -> Contender:
-        near = linear_agent(content, observations, config.control_interval, config.parameters.v_0, contract.action)
+        near = linear_agent(content, observations, config.control_interval, contract.action, config.parameters.v_0)
         return Contender(label, interface, lambda _: policy, near.state_space(), near.response)
 
     return (

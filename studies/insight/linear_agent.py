@@ -21,8 +21,8 @@ from cz_gym.observation import (
     MEASURED,
     PULL_SCALE,
     lags,
-    relative,
     scales,
+    undo_differences,
 )
 from cz_gym.physics.linearisation import StateSpace
 from cz_gym.task import drives_of
@@ -85,7 +85,7 @@ class LinearAgent(NamedTuple):
 
 
 def linear_agent(
-    onnx_bytes: bytes, observations: npt.ArrayLike, dt: float, v_0: float = PULL_SCALE, action: str = "smooth"
+    onnx_bytes: bytes, observations: npt.ArrayLike, dt: float, action: str, v_0: float = PULL_SCALE
 ) -> LinearAgent:
     """The agent of these (checked) ONNX bytes near "history" observations; v_0 [m/s] scales the pull speed.
 
@@ -100,14 +100,9 @@ def linear_agent(
     slopes *= np.array([[drives.pull], [drives.heater]])
     slopes[[0, 1], DRIVE_CHANNELS] += drives.keep
     slopes = np.array([[v_0], [HEATER_SCALE]]) * slopes / scales(HISTORY, v_0)
-    now, integral = slopes[:, : len(MEASURED)].copy(), slopes[:, len(MEASURED)]
-    spans = slopes[:, len(MEASURED) + 1 :].reshape(2, len(LAGS), len(LAGGED))
-    # "history" holds differences: of some channels to others, of each span's mean to that of the span after it.
-    for channel, to, _ in zip(*relative(), strict=True):
-        now[:, to] -= slopes[:, channel]
-    now[:, [AT[at] for at in _REMEMBERED]] -= spans[:, 0]
-    means = spans - np.concatenate([spans[:, 1:], np.zeros((2, 1, len(LAGGED)))], axis=1)
-    return LinearAgent(now, integral, means, dt)
+    slopes = slopes @ np.linalg.inv(undo_differences()).T
+    now, integral, means = np.split(slopes, (len(MEASURED), len(MEASURED) + 1), axis=1)
+    return LinearAgent(now, integral[:, 0], means.reshape(2, len(LAGS), len(LAGGED)), dt)
 
 
 def jacobian(onnx_bytes: bytes, observation: Floats) -> Floats:

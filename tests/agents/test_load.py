@@ -9,22 +9,23 @@ from cz_gym import agents
 from cz_gym.agents.agent_file.contract import read_agent
 from cz_gym.observation import HISTORY
 
-NAMES = ("imitation", "imitation-medium", "imitation-quiet", "imitation-puller", "ppo")
+SHIPPED = {"imitation": 3, "ppo": 3}
+"""Training seeds of each name."""
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SHIPPED)
 def test_every_shipped_agent_is_called_by_how_it_was_made(name: str) -> None:
     contracts = [read_agent(path)[0] for path in agents.shipped_seeds(name)]
-    assert [contract.training_seed for contract in contracts] == list(range(10 if name == "imitation" else 3))
+    assert [contract.training_seed for contract in contracts] == list(range(SHIPPED[name]))
     assert {contract.algorithm for contract in contracts} == {name}
-    assert all((contract.training_steps > 0) == (name == "ppo") for contract in contracts)
+    assert all((contract.training_steps > 0) == (name != "imitation") for contract in contracts)
     policy = agents.load(name)
     assert policy.contract.validation_cost == min(contract.validation_cost for contract in contracts)
     assert policy.predict(np.zeros((3, len(HISTORY)), np.float32))[0].shape == (3, 2)
 
 
 def test_nothing_else_is_shipped() -> None:
-    assert {path.stem.rpartition("-seed")[0] for path in agents.MODELS.iterdir()} == set(NAMES)
+    assert {path.stem.rpartition("-seed")[0] for path in agents.MODELS.iterdir()} == set(SHIPPED)
 
 
 def test_an_agent_is_loaded_by_its_file() -> None:
@@ -35,7 +36,7 @@ def test_an_agent_is_loaded_by_its_file() -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("imitatoin", "no shipped agent 'imitatoin'; there are: imitation, imitation-medium, imitation-puller"),
+        ("imitatoin", "no shipped agent 'imitatoin'; there are: imitation, ppo"),
         ("", "no shipped agent ''; there are"),
         ("nobody.onnx", "nobody.onnx: no such file"),
     ],

@@ -210,7 +210,7 @@ def test_agent_files_that_cannot_be_used_get_one_line(tmp_path: Path, capsys: py
     other = constant_agent(tmp_path / "other.onnx", training_seed=1, scenario="hard", scenario_hash="0" * 16)
     assert "different scenarios: hard, randomized" in refused(["--agent", twice, "--agent", str(other)], capsys)
     assert "choose from" in (line := refused(["--agent", f"mine={twice}", "--controllers", "your"], capsys))
-    assert "mine, imitation, imitation-default" in line
+    assert "mine, ppo, ppo-recurrent, sac, random-search, imitation, or all" in line
     endless = tmp_path / "twice.json"
     endless.write_text(endless.read_text().replace('"validation_rmse_mm": 1.0', '"validation_rmse_mm": NaN'))
     assert "validation_rmse_mm" in refused([*SMALL, "--agent", twice], capsys)
@@ -228,7 +228,7 @@ def test_a_contract_that_cannot_be_recorded_is_refused_at_once(odd: dict[str, An
 
 
 def test_a_file_may_be_named_and_stand_beside_the_shipped_agents(tmp_path: Path) -> None:
-    file, shipped = constant_agent(tmp_path / "some.onnx", algorithm="ppo"), "imitation-quiet"
+    file, shipped = constant_agent(tmp_path / "some.onnx", algorithm="ppo"), "imitation"
     plan = make_plan("--controllers", f"paper,mine,{shipped}", "--agent", f"mine={file}")
     assert [each.name for each in plan.contenders] == ["paper", "mine", shipped]
     assert plan.contenders[1].controller.meaning.endswith("given as a file")

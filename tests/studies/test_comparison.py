@@ -84,7 +84,9 @@ def test_a_comparison_keeps_what_is_finished_and_goes_on(
     assert {"command", "git_commit", "packages"} <= set(told["provenance"])
     assert [len(told["figures"][name]) for name in FIGURES] == [len(CRYSTALS)] * len(FIGURES)
     assert {path.name for path in out.iterdir()} == {"table.csv", "table.md", "forest.png", "curves.png", "runs"}
-    assert not list((tmp_path / "work").iterdir())
+    left = {path.name for folder in (tmp_path / "work").iterdir() for path in folder.glob("*.*")}
+    assert {"agent.onnx", "agent.json", "summary.json", "progress.csv"} <= left, "agents stay"
+    assert "checkpoint.safetensors" not in left
     text = (out / "table.md").read_text()
     for name in ("**few** | 1", "less ppo |", "**quiet** | 1", "- **sac**: SAC"):
         assert name in text
@@ -201,7 +203,7 @@ def test_radius_errors_are_read_at_equal_activity(agent: tuple[float, float, flo
 def test_the_lqgs_are_judged_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     judged: list[str] = []
 
-    def judge(plan: Plan, law: Any) -> np.ndarray:
+    def judge(plan: Plan, law: Any, config: Any) -> np.ndarray:
         judged.append(law.settings.hash)
         return figures(2.0 + law.settings.weights.pull_step, 1.0 / law.settings.weights.pull_step, crystals=2)
 

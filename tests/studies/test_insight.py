@@ -15,7 +15,7 @@ pytest.importorskip("onnx")
 
 from cz_gym import agents
 from cz_gym.agents.agent_file.contract import read_agent
-from cz_gym.agents.training.export import policy_onnx
+from cz_gym.agents.training.export import actor_onnx
 from cz_gym.agents.training.imitation import make_network
 from cz_gym.agents.training.recipes import Imitation
 from cz_gym.baselines import CompensatedPID
@@ -49,16 +49,17 @@ from studies.insight.step_tests import (
 )
 
 DT = 5.0
-LEARNED = Interface("history", "smooth")
 OMEGA = np.geomspace(1e-4, np.pi / DT, 9)
 PATH = agents.shipped()
+CONTRACT, CONTENT = read_agent(PATH)
+LEARNED = Interface(CONTRACT.observation, CONTRACT.action)
 REST = np.eye(len(HISTORY))[1]
 """Nothing but a valid camera."""
 
 
 @pytest.fixture(scope="module")
 def near() -> Any:
-    return linear_agent(read_agent(PATH)[1], REST, DT)
+    return linear_agent(CONTENT, REST, DT, CONTRACT.action)
 
 
 def test_the_derivative_is_the_chain_rules() -> None:
@@ -68,16 +69,14 @@ def test_the_derivative_is_the_chain_rules() -> None:
         return random.normal(0.0, 0.1, shape).astype(np.float32)
 
     network = make_network(Imitation(name="some", hidden=(6,)), 0)
-    channels = len(network.features_extractor.mean)
-    network.features_extractor.set(some(channels), some(channels, channels))
+    network.normalise.set(some(n), some(n, n))
     weights = {name: value.numpy().astype(float) for name, value in network.state_dict().items()}
-    mean, scaling = weights["features_extractor.mean"][:n], weights["features_extractor.scaling"][:n, :n]
-    layer = "mlp_extractor.policy_net.layers.0"
-    first, bias, last = weights[f"{layer}.weight"], weights[f"{layer}.bias"], weights["action_net.weight"]
+    mean, scaling, last = weights["normalise.mean"], weights["normalise.scaling"], weights["last.weight"]
+    first, bias = weights["layers.layers.0.weight"], weights["layers.layers.0.bias"]
     at = np.float64(some(n))
     bent = 1.0 - np.tanh(first @ ((at - mean) @ scaling) + bias) ** 2
     expected = ((last[:, :6] * bent) @ first + last[:, 6:]) @ scaling.T
-    assert jacobian(policy_onnx(network), at) == pytest.approx(expected, rel=1e-6, abs=1e-9)
+    assert jacobian(actor_onnx(network.actor), at) == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
 def test_a_linear_agent_answers_alike_as_state_space_and_in_frequency(near: Any) -> None:
@@ -111,8 +110,8 @@ def test_loops_are_opened_as_the_design_table_opens_them(name: str, at: str) -> 
 
 
 def test_the_mean_derivative_is_the_mean_of_derivatives() -> None:
-    content, rows = read_agent(PATH)[1], np.stack([REST, REST + 0.05])
-    both, each = linear_agent(content, rows, DT), [linear_agent(content, row, DT) for row in rows]
+    rows = np.stack([REST, REST + 0.05])
+    both, *each = (linear_agent(CONTENT, some, DT, CONTRACT.action) for some in (rows, *rows))
     assert both.now == pytest.approx(0.5 * (each[0].now + each[1].now), rel=1e-9)
 
 

@@ -58,7 +58,7 @@ def test_agent_for_another_plant_is_refused(agent: Path) -> None:
         ({"channels": 71}, "reads 71 channels"),
         ({"channels": "72"}, "must be int"),
         ({"format": "zip"}, "not a cz-gym-agent contract"),
-        ({"format_version": 1}, "format version 1, this release reads 3"),
+        ({"format_version": 1}, "format version 1, this release reads 4"),
         ({"sha256": "0" * 64}, "SHA-256 differs"),
         ({"surprise": 1}, "'surprise' is unknown"),
     ],
@@ -79,30 +79,30 @@ def test_a_contract_without_finite_numbers_is_refused(agent: Path, number: str) 
         OnnxPolicy.load(agent)
 
 
-def set_weight(model: Any, name: str, value: Any) -> None:
-    weight = next(weight for weight in model.graph.initializer if weight.name == name)
-    weight.CopyFrom(onnx.numpy_helper.from_array(np.asarray(value), name))
+def last_bias(model: Any, value: Any) -> None:
+    (weight,) = (each for each in model.graph.initializer if each.name == model.graph.node[-2].input[2])
+    weight.CopyFrom(onnx.numpy_helper.from_array(value, weight.name))
 
 
-def nan_scale(model: Any) -> None:
-    set_weight(model, "scale", np.full(2, np.nan, np.float32))
+def nan_bias(model: Any) -> None:
+    last_bias(model, np.full(2, np.nan, np.float32))
 
 
 def infinity_less_infinity(model: Any) -> None:
-    set_weight(model, "scale", np.full(2, 1e38, np.float32))
-    set_weight(model, "direct_bias", np.full(2, 1e38, np.float32))
+    last_bias(model, np.full(2, 3e38, np.float32))
+    model.graph.node[-2].attribute.append(onnx.helper.make_attribute("beta", 2.0))
     clip = model.graph.node[-1]
     clip.CopyFrom(onnx.helper.make_node("Sub", [clip.input[0], clip.input[0]], [clip.output[0]]))
 
 
 def drives_that_are_not_there(model: Any) -> None:
-    set_weight(model, "drives", np.array([9, 900], np.int64))
+    last_bias(model, np.zeros(900, np.float32))
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (nan_scale, "not finite"),
+        (nan_bias, "not finite"),
         (infinity_less_infinity, "not two finite numbers"),
         (drives_that_are_not_there, "cannot be run"),
     ],

@@ -13,6 +13,7 @@ from stable_baselines3.common.logger import Logger
 from cz_gym import CzVectorEnv
 from cz_gym.agents.training import demonstrations, imitation
 from cz_gym.agents.training.demonstrations import Demonstrations, demonstrate, widened
+from cz_gym.agents.training.networks import whitening
 from cz_gym.agents.training.recipes import RECIPES, Imitation
 from cz_gym.baselines.registry import find_controller, make_controller
 from cz_gym.config import make_config
@@ -20,7 +21,7 @@ from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.observation import DRIVE_CHANNELS, HISTORY
 from cz_gym.task import HEATER_STEP_WEIGHT, PULL_STEP_WEIGHT, PULL_WEIGHT
 
-CONFIG = make_config("randomized", observation="history", horizon=600.0)
+CONFIG = make_config("randomized", observation="history", horizon=600.0, action="smooth")
 FEW = Imitation(name="few", teacher="lqg", hidden=(16, 16), rounds=2, episodes=8, wide_share=0.25, epochs=1)
 APPLIED = list(DRIVE_CHANNELS)
 
@@ -51,8 +52,8 @@ def shown(moves: Any, recipe: Imitation = FEW) -> tuple[Any, Demonstrations]:
     """A network whose linear path is fitted to a teacher, and the demonstrations."""
     torch.set_num_threads(1)
     network = imitation.make_network(recipe, 0)
-    found = demonstrate(Teacher(moves), CONFIG, range(8), (0.01, 0.01))
-    imitation.fit_linear_path(network, found, recipe.memory)
+    found = demonstrate(Teacher(moves), CONFIG, range(8), (0.05, 0.05))
+    imitation.fit_linear_path(network, found)
     return network, found
 
 
@@ -64,32 +65,32 @@ def error(network: Any, found: Demonstrations) -> np.ndarray:
 def test_whitened_observations_are_uncorrelated() -> None:
     random = np.random.default_rng(0)
     seen = random.normal(size=(5000, 6)) @ random.normal(size=(6, 6)) + 3.0
-    mean, scaling = imitation.whitening(seen.astype(np.float32))
-    np.testing.assert_allclose(np.cov(((seen - mean) @ scaling).T), np.eye(6), atol=1e-3)
+    np.testing.assert_allclose(np.cov((seen @ whitening(np.cov(seen.T))).T), np.eye(6), atol=1e-6)
 
 
 @pytest.mark.parametrize("hidden", [(16, 16), ()])
 def test_a_linear_teacher_is_imitated_exactly(hidden: tuple[int, ...]) -> None:
     network, found = shown(linear, replace(FEW, hidden=hidden))
-    np.testing.assert_allclose(imitation.mean_action(network)(found.observation), found.action, atol=2e-5)
+    assert np.abs(found.action).max() < 1.0
+    np.testing.assert_allclose(imitation.mean_action(network)(found.observation), found.action, atol=1e-4)
 
 
 @pytest.mark.parametrize(("weights", "heater_learns"), [((1.0, 0.0), False), ((1.0, 1.0), True)])
 def test_the_layers_learn_what_bends_the_teacher(weights: tuple[float, float], heater_learns: bool) -> None:
-    recipe = replace(FEW, epochs=60, learning_rate=5e-3, loss_weights=weights)
+    recipe = replace(FEW, epochs=1500, learning_rate=5e-3, loss_weights=weights)
     network, found = shown(bent, recipe)
     before = error(network, found)
     imitation.fit(network, found, recipe)
     after = error(network, found)
     assert after[0] < 0.5 * before[0]
-    assert (after[1] < 0.5 * before[1]) if heater_learns else (after[1] == pytest.approx(before[1], abs=1e-9))
+    assert (after[1] < 0.8 * before[1]) if heater_learns else (after[1] == pytest.approx(before[1], abs=1e-9))
 
 
 def test_a_teacher_is_told_of_the_crystals_and_the_imitation_is_not() -> None:
     """The privileged teacher answers otherwise than the plain one to the same observations; no observation tells."""
     rough = find_scenario("randomized")
     rough = replace(rough, interface=replace(rough.interface, sd=(1.0, 1.0)))
-    config, seeds, none = CONFIG.with_scenario(rough), range(40, 43), (0.0, 0.0)
+    config, seeds, none = replace(CONFIG, scenario=rough, action="direct"), range(40, 43), (0.0, 0.0)
     told, plain = (make_controller(name, make_config("randomized")) for name in ("lqg-quiet-told", "lqg-quiet"))
     one, other = (demonstrate(each, config, seeds, none, lambda seen: seen[:, APPLIED]) for each in (told, plain))
     np.testing.assert_array_equal(one.observation, other.observation)
@@ -109,18 +110,18 @@ def test_lost_crystals_teach_nothing() -> None:
 
 
 def test_the_imitation_of_lqg_holds_the_radius() -> None:
-    config = make_config("randomized", observation="history")
+    config = make_config("randomized", observation="history", action="smooth")
     recipe = Imitation(name="lqg", teacher="lqg", rounds=1, episodes=48, wide_share=0.0)
     learner = imitator(recipe, make_controller("lqg", make_config("randomized")), config)
     told: list[tuple[int, str]] = []
     learner.learn(lambda steps, doing: told.append((steps, doing)))
     assert learner.steps == learner.total == told[-1][0] == 48 * config.steps
-    env = CzVectorEnv(16, scenario="randomized", observation="history")
+    env = CzVectorEnv.from_config(config, 16)
     observation, info = env.reset(seed=list(range(950_000, 950_016)))
     squares = []
+    act = imitation.mean_action(learner.network)
     for _ in range(1000):
-        action = imitation.mean_action(learner.policy)(observation)
-        observation, _, terminated, _, info = env.step(np.clip(action, -1.0, 1.0))
+        observation, _, terminated, _, info = env.step(act(observation))
         assert not terminated.any()
         squares.append((info["r_c"] - info["r_ref"]) ** 2)
     assert np.sqrt(np.mean(squares[360:])) < 0.15e-3
@@ -181,9 +182,8 @@ def test_an_interrupted_imitation_begins_again_and_ends_as_one_that_was_not() ->
     assert stopped.exported() == whole.exported()
 
 
-@pytest.mark.parametrize("name", ["imitation", "imitation-medium", "imitation-quiet"])
-def test_a_recipe_is_judged_by_the_cost_that_its_teacher_s_regulator_was_made_for(name: str) -> None:
-    recipe = RECIPES[name]
+def test_it_is_judged_by_the_cost_that_its_teacher_s_regulator_was_made_for() -> None:
+    recipe = RECIPES["imitation"]
     assert isinstance(recipe, Imitation)
     teacher: Any = find_controller(recipe.teacher).make(make_config("randomized"))
     theirs, ours = teacher.settings.weights, recipe.weights

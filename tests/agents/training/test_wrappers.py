@@ -34,6 +34,19 @@ def test_a_failure_costs_the_worst_for_ever() -> None:
     assert gained[0] == pytest.approx(-10.0)
 
 
+def test_without_costs_of_failure_every_step_earns_and_the_last_nothing() -> None:
+    env = TrainingReward(slots(), 0.9, CostWeights(), failure_costs=False)
+    env.reset()
+    least = np.inf
+    for _ in range(2000):
+        _, gained, done, _ = env.step(np.array([[1.0, 1.0], [0.0, 0.0]], np.float32))
+        if done[0]:
+            break
+        least = min(least, gained.min())
+    assert gained[0] == pytest.approx(0.0)
+    assert 0.0 < least < 0.1 * 11.0
+
+
 @pytest.mark.parametrize("observable", [False, True])
 def test_the_weighted_reward_is_the_weighted_cost_s(observable: bool) -> None:
     base = slots(scenario="puller")
