@@ -17,7 +17,7 @@ import numpy as np
 
 from cz_gym.agents.agent_file.contract import AgentFileError, Contract, facts_of, make_contract, write_agent
 from cz_gym.agents.policies.onnx import OnnxPolicy
-from cz_gym.agents.training.recipes import CostWeights
+from cz_gym.agents.training.recipes import OWN_WEIGHTS
 from cz_gym.agents.training.validation import JUDGING, validate
 from cz_gym.commands import OneLineParser, guarded
 from cz_gym.config import Config, make_config
@@ -77,7 +77,7 @@ def save_agent(
     apart = disagreement(agent, model, normalisation)
     if not apart <= TOLERANCE:
         raise AgentFileError(f"{path}: the file would act otherwise than the model, by up to {apart:.2g}")
-    found = validate(agent, config, JUDGING, CostWeights())
+    found = validate(agent, config, JUDGING, OWN_WEIGHTS)
     facts |= {"validation_cost": found.cost, "validation_rmse_mm": found.rmse_mm}
     return write_agent(path, content, **facts)
 

@@ -1,4 +1,4 @@
-"""PPO in one file, in the manner of CleanRL, on the native batch: ``python -m examples.cleanrl_ppo``, about 4 minutes.
+"""PPO in one file, in the manner of CleanRL, on the native batch: ``python -m examples.cleanrl_ppo``, 4 minutes.
 
 Nothing but torch and the batch: copy it and change what you like. It prints the mean radius error on validation
 crystals while it learns from nothing, by reward.
@@ -15,10 +15,9 @@ import torch
 from torch import nn
 
 from cz_gym import CzVectorEnv
+from cz_gym.agents.training.validation import Validation, validate
 from cz_gym.config import make_config
-from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
-from cz_gym.evaluation.rollout import rollout
 
 CONFIG = make_config("randomized", observation="history", action="smooth")
 
@@ -28,11 +27,11 @@ class Args:
     """Settings, as options of the command line."""
 
     seed: int = 0
-    steps: int = 4_000_000
-    num_envs: int = 256
+    steps: int = 6_000_000
+    num_envs: int = 512
     num_steps: int = 64
     epochs: int = 5
-    minibatch: int = 2048
+    minibatch: int = 4096
     learning_rate: float = 1e-3
     gamma: float = 0.99
     gae_lambda: float = 0.95
@@ -92,14 +91,8 @@ def orthogonal(layer: nn.Linear, gain: float) -> nn.Linear:
     return layer
 
 
-def judge(agent: Agent, episodes: int = 100) -> tuple[float, float]:
-    """Mean radius error [mm] and share of lost crystals on validation."""
-    found = metrics(rollout(agent, CONFIG, VALIDATION_SEEDS[:episodes]))
-    return float(found.rmse_mm.mean()), float(found.failure_rate.mean())
-
-
-def main(args: Args) -> float:
-    """Learn; the mean radius error at the end [mm]."""
+def main(args: Args) -> Validation:
+    """Learn, and judge the agent on 100 validation crystals."""
     torch.manual_seed(args.seed)
     torch.set_num_threads(1)
     envs = CzVectorEnv.from_config(CONFIG, args.num_envs, autoreset_mode="SameStep")
@@ -154,11 +147,12 @@ def main(args: Args) -> float:
                 nn.utils.clip_grad_norm_(agent.parameters(), 0.5)
                 optimiser.step()
         if (update + 1) % max(updates // 8, 1) == 0:
-            error, lost = judge(agent)
+            found = validate(agent, CONFIG, VALIDATION_SEEDS[:100])
             steps = (update + 1) * args.num_steps * args.num_envs
-            print(f"{steps:>9,} steps: radius error {error:.3f} mm, {100.0 * lost:.0f} % lost", flush=True)
+            lost = 100.0 * found.failure_rate
+            print(f"{steps:>9,} steps: radius error {found.rmse_mm:.3f} mm, {lost:.0f} % of crystals lost", flush=True)
     envs.close()
-    return judge(agent)[0]
+    return validate(agent, CONFIG, VALIDATION_SEEDS[:100])
 
 
 if __name__ == "__main__":

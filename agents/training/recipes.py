@@ -6,7 +6,7 @@ A new kind needs a dataclass here, a learner (:class:`.learner.Learner`) and its
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,10 @@ class CostWeights:
     """Of the heater's step changes [-]."""
     observable: bool = False
     """Whether the radius error leaves out the offset that no sensor shows."""
+
+
+OWN_WEIGHTS = CostWeights()
+"""The environment's own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +48,7 @@ class Recipe:
     """Widths of the hidden layers, of the actor's and of the critic's."""
     threads: int = 1
     """Threads that torch computes on."""
-    weights: CostWeights = field(default_factory=CostWeights)
+    weights: CostWeights = OWN_WEIGHTS
 
 
 @dataclass(frozen=True, kw_only=True)

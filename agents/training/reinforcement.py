@@ -24,7 +24,7 @@ from .callbacks import Statistics, Watching
 from .export import actor_of, actor_onnx
 from .learner import Parts, Watch
 from .networks import AsymmetricPolicy, Normalise
-from .recipes import PPO, SAC, CostWeights, RandomSearch, RecurrentPPO, Reinforcement
+from .recipes import OWN_WEIGHTS, PPO, SAC, RandomSearch, RecurrentPPO, Reinforcement
 from .vec_env import CzVecEnv
 from .wrappers import TrainingReward
 
@@ -86,7 +86,7 @@ def make_slots(recipe: Reinforcement, seed: int, done: int) -> CzVecEnv:
         control_interval=recipe.control_interval,
         horizon=recipe.length,
         autoreset_mode=AutoresetMode.SAME_STEP,
-        info="lean" if recipe.weights == CostWeights() else "all",
+        info="lean" if recipe.weights == OWN_WEIGHTS else "all",
     )
     return CzVecEnv(env, recipe.privileged_critic, stagger=None if isinstance(recipe, RandomSearch) else seed + done)
 

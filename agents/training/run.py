@@ -18,7 +18,7 @@ from cz_gym.config import Config, make_config
 from .checkpoint import load_checkpoint, restore, to_bytes
 from .learner import Learner
 from .learners import Controllers, config_of, make_learner
-from .recipes import CostWeights, Recipe, Reinforcement
+from .recipes import OWN_WEIGHTS, Recipe, Reinforcement
 from .run_files import COLUMNS, provenance, read_rows, read_settings, to_csv, to_json
 from .validation import JUDGING, PICKING, Validation, validate
 
@@ -151,7 +151,7 @@ class Run:
         return found
 
     def _validate_paper(self, seeds: Sequence[int]) -> float:
-        return validate(self._paper, self._measured, seeds, CostWeights()).rmse_mm
+        return validate(self._paper, self._measured, seeds, OWN_WEIGHTS).rmse_mm
 
     def _contract(self, content: bytes) -> Contract:
         rewarded = isinstance(self.recipe, Reinforcement)

@@ -15,7 +15,7 @@ from cz_gym.evaluation.rollout import rollout
 from cz_gym.task import FAILURE_COST, cost_terms
 from cz_gym.units import KILO, MM, MM_PER_MIN
 
-from .recipes import CostWeights
+from .recipes import OWN_WEIGHTS, CostWeights
 
 Floats = npt.NDArray[np.float64]
 PICKING = VALIDATION_SEEDS[:64]
@@ -34,7 +34,7 @@ class Validation(NamedTuple):
     failure_rate: float
 
 
-def validate(policy: Any, config: Config, seeds: Sequence[int], weights: CostWeights) -> Validation:
+def validate(policy: Any, config: Config, seeds: Sequence[int], weights: CostWeights = OWN_WEIGHTS) -> Validation:
     """Run the episodes of those seeds."""
     found = metrics(rollout(policy, config, seeds))
     figures = costs(found, weights), found.rmse_mm, found.pull_step_rms_mm_per_min, found.failure_rate

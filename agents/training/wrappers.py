@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
 from cz_gym.task import FAILURE_COST, Cost, cost_terms, reward
 
-from .recipes import CostWeights
+from .recipes import OWN_WEIGHTS, CostWeights
 from .vec_env import CzVecEnv
 
 
@@ -21,7 +21,9 @@ class TrainingReward(VecEnvWrapper):
     rewards are raised by what a step can cost, and failing ends them: what a learner gets who is paid to stay alive.
     """
 
-    def __init__(self, slots: CzVecEnv, gamma: float, weights: CostWeights, failure_costs: bool = True) -> None:
+    def __init__(
+        self, slots: CzVecEnv, gamma: float, weights: CostWeights = OWN_WEIGHTS, failure_costs: bool = True
+    ) -> None:
         super().__init__(slots)
         self.slots, self.weights = slots, weights
         self.share = 1.0 - gamma
@@ -35,7 +37,7 @@ class TrainingReward(VecEnvWrapper):
     def step_wait(self) -> Any:
         """Weigh and scale the reward."""
         observation, given, done, infos = self.venv.step_wait()
-        if self.weights != CostWeights():
+        if self.weights != OWN_WEIGHTS:
             given = np.where(done, given, self.reward(self.slots.info))
         earned = (np.maximum(given, self.floor) + self.raised) * self.share
         return observation, earned.astype(np.float32), done, infos

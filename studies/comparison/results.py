@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.agents.agent_file.contract import read_json
-from cz_gym.agents.training.recipes import CostWeights
+from cz_gym.agents.training.recipes import OWN_WEIGHTS
 from cz_gym.agents.training.run_files import provenance
 from cz_gym.agents.training.validation import costs
 from cz_gym.atomic_files import write_files
@@ -67,7 +67,7 @@ def judge(plan: Plan, policy: Any, config: Config) -> Floats:
     own, transfer = (
         metrics(rollout(policy, config.with_scenario(name), plan.crystals)) for name in (SCENARIO, TRANSFER)
     )
-    cost = costs(own, CostWeights())
+    cost = costs(own, OWN_WEIGHTS)
     columns = own.rmse_mm, cost, own.pull_step_rms_mm_per_min, own.failure_rate, transfer.rmse_mm, transfer.failure_rate
     return np.stack(columns, axis=-1)
 

@@ -1,0 +1,41 @@
+"""What users copy: each example learns, is judged, and leaves what it says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("stable_baselines3")
+
+from cz_gym import agents
+from examples import cleanrl_ppo, sb3_ppo
+from studies.plain_tools import __main__ as plain_tools
+
+
+def test_the_stable_baselines_example_writes_an_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sb3_ppo, "VALIDATION_SEEDS", sb3_ppo.VALIDATION_SEEDS[:2])
+    found = sb3_ppo.main(steps=40_000, out=tmp_path / "some.onnx")
+    assert found.cost > 0.0
+    contract = agents.load(tmp_path / "some.onnx").contract
+    assert (contract.action, contract.algorithm, contract.training_steps) == ("smooth", "sb3-ppo", 65_536)
+    assert len(Path(sb3_ppo.__file__).read_text().splitlines()) <= 40
+
+
+def test_the_cleanrl_example_learns(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """From losing crystals within minutes to losing fewer or later: its cost falls."""
+    monkeypatch.setattr(cleanrl_ppo, "VALIDATION_SEEDS", cleanrl_ppo.VALIDATION_SEEDS[:8])
+    found = cleanrl_ppo.main(cleanrl_ppo.Args(steps=262_144, num_envs=64, minibatch=1024))
+    assert found.rmse_mm < 7.0
+    assert len(capsys.readouterr().out.splitlines()) == 8
+
+
+def test_the_study_goes_on_from_what_is_finished(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [plain_tools.Row("sb3_ppo", seed, 1.5, 0.125, 0.02, 0.0) for seed in range(2)]
+    (tmp_path / "runs.csv").write_bytes(plain_tools.to_csv(rows))
+    assert plain_tools.read(tmp_path / "runs.csv") == rows
+    assert plain_tools.main(["--examples", "sb3_ppo", "--seeds", "2", "--out", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.count("| sb3_ppo | ") == 2
+    (tmp_path / "runs.csv").write_text("example,seed\nsb3_ppo,first\n")
+    assert plain_tools.main(["--out", str(tmp_path)]) == 2
+    assert "damaged" in capsys.readouterr().err
