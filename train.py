@@ -34,6 +34,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--scenario", help="scenario to train on (default: the recipe's)")
     parser.add_argument("--out", type=Path, help="run folder (default: runs/<algo>-seed<seed>)")
+    parser.add_argument("--plot", action="store_true", help="draw the progress into the run folder: progress.png")
     parser.add_argument("--resume", action="store_true", help="go on from the run folder's checkpoint")
     parser.add_argument(
         "--checkpoint-seconds",
@@ -52,15 +53,19 @@ def main(argv: list[str] | None = None) -> int:
     """Train; 0 when done, 2 for bad input, 130 when interrupted."""
     arguments = parse(argv)
     left = f"if {arguments.out} holds a checkpoint, --resume goes on"
-    return guarded("train.py", lambda: train(arguments), "agents", left)
+    extras = "agents,benchmark" if arguments.plot else "agents"
+    return guarded("train.py", lambda: train(arguments), extras, left)
 
 
 def train(arguments: argparse.Namespace) -> int:
     """Run the training that the command line asks for."""
     from tqdm import tqdm
 
+    if arguments.plot:
+        import matplotlib  # noqa: F401  # say at once if it is missing
     from cz_gym.agents.training.recipes import RECIPES
     from cz_gym.agents.training.run import Run
+    from cz_gym.agents.training.run_files import REFERENCES
     from cz_gym.atomic_files import check_writable, locked
     from cz_gym.baselines.registry import make_controller
 
@@ -70,7 +75,15 @@ def train(arguments: argparse.Namespace) -> int:
     recipe = _asked_for(RECIPES[arguments.algo], arguments)
     check_writable(folder)
     with locked(folder):
-        run = Run(folder, recipe, arguments.seed, make_controller, arguments.resume, arguments.checkpoint_seconds)
+        run = Run(
+            folder,
+            recipe,
+            arguments.seed,
+            make_controller,
+            arguments.resume,
+            arguments.checkpoint_seconds,
+            arguments.plot,
+        )
         total = run.learner.total
         print(f"{recipe.name}, seed {arguments.seed}, {total:,} steps on {recipe.scenario!r}, into {folder}")
         with tqdm(total=total, unit="step", unit_scale=True, dynamic_ncols=True, mininterval=1.0) as bar:
@@ -84,8 +97,8 @@ def train(arguments: argparse.Namespace) -> int:
         summary = run.finish()
     print(
         f"best agent on {summary['validation_episodes']} validation episodes: mean RMSE "
-        f"{summary['validation_rmse_mm']:.3f} mm, {100 * summary['failure_rate']:.1f} % failures; "
-        f"the paper's controller {summary['paper_rmse_mm']:.3f} mm"
+        f"{summary['validation_rmse_mm']:.3f} mm, {100 * summary['failure_rate']:.1f} % lost; beside it "
+        + ", ".join(f"{name} {summary[f'{name}_rmse_mm']:.3f}" for name in REFERENCES)
     )
     print(f"wrote {folder / 'agent.onnx'}")
     return 0

@@ -18,8 +18,8 @@ from cz_gym.config import Config, make_config
 from .checkpoint import load_checkpoint, restore, to_bytes
 from .learner import Learner
 from .learners import Controllers, config_of, make_learner
-from .recipes import OWN_WEIGHTS, Recipe, Reinforcement
-from .run_files import COLUMNS, provenance, read_rows, read_settings, to_csv, to_json
+from .recipes import Recipe, Reinforcement
+from .run_files import COLUMNS, REFERENCES, provenance, read_rows, read_settings, to_csv, to_json
 from .validation import JUDGING, PICKING, Validation, validate
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -35,9 +35,10 @@ class Run:
     """One training run.
 
     ``controllers`` makes a classical controller from its name and an environment's settings: the teacher of an
-    imitation, and the paper's, which runs the same validation episodes and is shown beside the agent. ``resume`` goes
-    on from the folder's checkpoint, saved anew every ``checkpoint_seconds``. Checkpoint, progress and best agent are
-    replaced together, so that they agree whenever a run is killed. Raises AgentFileError if the folder cannot be used.
+    imitation, and the references, which run the same validation episodes and are shown beside the agent. ``resume``
+    goes on from the folder's checkpoint, saved anew every ``checkpoint_seconds``. Checkpoint, progress and best agent
+    are replaced together, so that they agree whenever a run is killed; with ``plot`` a picture of the progress too.
+    Raises AgentFileError if the folder cannot be used.
     """
 
     def __init__(
@@ -48,12 +49,14 @@ class Run:
         controllers: Controllers,
         resume: bool = False,
         checkpoint_seconds: float = CHECKPOINT_SECONDS,
+        plot: bool = False,
     ) -> None:
         self.folder, self.recipe, self.seed, self.checkpoint_seconds = folder, recipe, seed, checkpoint_seconds
+        self.plot = plot
         self.config = config_of(recipe)
         self._measured = make_config(recipe.scenario, control_interval=recipe.control_interval)
-        self._paper = controllers("paper", self._measured)
-        self.paper_rmse_mm = self._validate_paper(PICKING)
+        self._references = {name: controllers(name, self._measured) for name in REFERENCES}
+        self.references = self._validate_references(PICKING)
         self.best = math.inf
         self.rows: list[dict[str, Any]] = []
         self.sessions: list[dict[str, Any]] = []
@@ -116,7 +119,7 @@ class Run:
             "validation_episodes": len(JUDGING),
             "validation_cost": found.cost,
             "validation_rmse_mm": found.rmse_mm,
-            "paper_rmse_mm": self._validate_paper(JUDGING),
+            **{f"{name}_rmse_mm": rmse for name, rmse in self._validate_references(JUDGING).items()},
             "pull_step_rms_mm_per_min": found.pull_step_rms_mm_per_min,
             "failure_rate": found.failure_rate,
             "training_steps": contract.training_steps,
@@ -141,17 +144,22 @@ class Run:
             contract = dataclasses.replace(contract, validation_cost=found.cost, validation_rmse_mm=found.rmse_mm)
             self.unsaved |= agent_files(self.folder / "agent.onnx", content, contract)
         seconds = round(time.monotonic() - self.began, 1)
-        row = (learner.steps, seconds, found.cost, found.rmse_mm, self.paper_rmse_mm, *found[2:])
+        row = (learner.steps, seconds, *found, *self.references.values())
         self.rows.append(dict(zip(COLUMNS, row, strict=True)))
         self.unsaved[self.folder / "progress.csv"] = to_csv(self.rows)
+        if self.plot:
+            from .plot import progress
+
+            self.unsaved[self.folder / "progress.png"] = progress(self.rows, f"{self.recipe.name}, seed {self.seed}")
         self.save()
         for name, figure in found._asdict().items():
             learner.logger.record(f"validation/{name}", figure)
-        bar.set_postfix_str(f"validation RMSE {found.rmse_mm:.3f} mm, paper {self.paper_rmse_mm:.3f}")
+        beside = ", ".join(f"{name} {rmse:.3f}" for name, rmse in self.references.items())
+        bar.set_postfix_str(f"RMSE {found.rmse_mm:.3f} mm, {found.failure_rate:.0%} lost ({beside})")
         return found
 
-    def _validate_paper(self, seeds: Sequence[int]) -> float:
-        return validate(self._paper, self._measured, seeds, OWN_WEIGHTS).rmse_mm
+    def _validate_references(self, seeds: Sequence[int]) -> dict[str, float]:
+        return {name: validate(each, self._measured, seeds).rmse_mm for name, each in self._references.items()}
 
     def _contract(self, content: bytes) -> Contract:
         rewarded = isinstance(self.recipe, Reinforcement)

@@ -15,16 +15,18 @@ from typing import Any
 
 from cz_gym.agents.agent_file.contract import MAX_JSON_BYTES, AgentFileError, read_bounded, read_json
 
+REFERENCES = ("paper", "paper-tuned", "lqg")
+"""Classical controllers that an agent is shown beside while it learns."""
 COLUMNS = (
     "steps",
     "seconds",
     "validation_cost",
     "validation_rmse_mm",
-    "paper_rmse_mm",
     "pull_step_rms_mm_per_min",
     "failure_rate",
+    *(f"{name}_rmse_mm" for name in REFERENCES),
 )
-"""Columns of ``progress.csv``."""
+"""Columns of ``progress.csv``; the references' figures are the same in every row."""
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "stable-baselines3", "torch", "onnx", "onnxruntime")
 
 

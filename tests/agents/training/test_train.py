@@ -44,7 +44,8 @@ def rows(path: Path) -> list[dict[str, str]]:
 @pytest.mark.usefixtures("quick")
 def test_a_run_leaves_everything_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "run"
-    assert train.main(["--steps", "20000", "--seed", "3", "--out", str(folder)]) == 0
+    assert train.main(["--steps", "20000", "--seed", "3", "--out", str(folder), "--plot"]) == 0
+    assert (folder / "progress.png").read_bytes().startswith(b"\x89PNG")
     saved = json.loads((folder / "settings.json").read_text())
     assert saved["seed"] == 3
     assert saved["settings"]["scenario"] == "randomized"
@@ -59,7 +60,7 @@ def test_a_run_leaves_everything_and_goes_on(tmp_path: Path, capsys: pytest.Capt
     assert summary["validation_rmse_mm"] not in picked_by, "judged as it was picked"
     assert list((folder / "tensorboard").rglob("events.*"))
     before = rows(folder / "progress.csv")
-    assert float(before[-1]["paper_rmse_mm"]) > 0
+    assert float(before[-1]["paper_rmse_mm"]) > float(before[-1]["lqg_rmse_mm"]) > 0
     assert train.main(["--seed", "3", "--resume", "--out", str(folder)]) == 0, "nothing was left to learn"
     assert rows(folder / "progress.csv")[:-1] == before
     assert train.main(["--out", str(folder)]) == 2
