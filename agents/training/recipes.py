@@ -121,8 +121,8 @@ class PPO(OnPolicy):
     """Proximal policy optimisation from nothing; the critic sees the true state."""
 
     name: str = "ppo"
-    steps: int = 10_000_000
-    num_envs: int = 256
+    steps: int = 20_000_000
+    num_envs: int = 512
     privileged_critic: bool = True
     n_steps: int = 64
     batch_size: int = 2048

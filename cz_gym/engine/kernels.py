@@ -61,17 +61,30 @@ def _begin(slot: Any) -> None:
 
 
 @physics
+def next_speed(v_p: Any, pull: Any, drives: Any, p: Any, e: Any, interval: Any) -> Any:
+    """The pull speed [m/s] that an action asks for, within window and slew."""
+    speed = drives.keep * ((v_p - p.v_0) / p.v_0) + drives.pull * clip(pull, 1.0)
+    wanted = p.v_0 + clip(p.v_0 * clip(speed, 1.0), e.pull_window)
+    return v_p + clip(wanted - v_p, e.pull_slew * interval)
+
+
+@physics
+def next_power(Q_H: Any, heat: Any, drives: Any, p: Any, e: Any, interval: Any) -> Any:
+    """The heater power [W] that an action asks for, within its slew, before it is rounded to whole steps."""
+    share = drives.keep * ((Q_H - p.Q_H_0) / HEATER_RANGE) + drives.heater * clip(heat, 1.0)
+    power = p.Q_H_0 + HEATER_RANGE * clip(share, 1.0)
+    power = power if power.real > 0.0 else 0.0
+    return Q_H + clip(power - Q_H, e.heater_slew * interval)
+
+
+@physics
 def _drive(slot: Any, pull: Any, heat: Any, drives: Any, interval: Any) -> None:
-    """Move the drives as an action asks, within window and slew, the heater in whole steps."""
+    """Move the drives as an action asks, the heater in whole steps."""
     p, e = slot.puller, slot.episode
     slot.v_p_before, slot.Q_H_before = slot.v_p, slot.Q_H
     slot.clipped = 1.0 if (np.abs(pull) > 1.0 or np.abs(heat) > 1.0) else 0.0
-    speed = drives.keep * ((slot.v_p - p.v_0) / p.v_0) + drives.pull * clip(pull, 1.0)
-    wanted = p.v_0 + clip(p.v_0 * clip(speed, 1.0), e.pull_window)
-    slot.v_p = slot.v_p + clip(wanted - slot.v_p, e.pull_slew * interval)
-    share = drives.keep * ((slot.Q_H_slewed - p.Q_H_0) / HEATER_RANGE) + drives.heater * clip(heat, 1.0)
-    power = np.maximum(p.Q_H_0 + HEATER_RANGE * clip(share, 1.0), 0.0)
-    slot.Q_H_slewed = slot.Q_H_slewed + clip(power - slot.Q_H_slewed, e.heater_slew * interval)
+    slot.v_p = next_speed(slot.v_p, pull, drives, p, e, interval)
+    slot.Q_H_slewed = next_power(slot.Q_H_slewed, heat, drives, p, e, interval)
     slot.Q_H = slot.Q_H_slewed
     if e.heater_step > 0.0:
         whole = p.Q_H_0 + e.heater_step * np.rint((slot.Q_H_slewed - p.Q_H_0) / e.heater_step)
@@ -79,9 +92,12 @@ def _drive(slot: Any, pull: Any, heat: Any, drives: Any, interval: Any) -> None:
 
 
 @physics
-def _height_inside(h_c: Any, p: Any) -> Any:
+def height_inside(h_c: Any, p: Any) -> Any:
     """Meniscus height held inside its limits, so that a failed state is still measured."""
-    return np.minimum(np.maximum(h_c, HEIGHT_MIN), HEIGHT_MAX_IN_A * p.a)
+    top = HEIGHT_MAX_IN_A * p.a
+    if h_c.real < HEIGHT_MIN:
+        return HEIGHT_MIN
+    return top if h_c.real > top else h_c
 
 
 @physics
@@ -129,7 +145,7 @@ def _advance(slot: Any, frames: Any, clock: Any, slope: Any, ring_offset: Any) -
         x, grows = _substep(x, u, _disturb(slot, j), p, upto - t, p.r_0 + reference(upto, e), slope)
         t = upto
         if e.latency > 0.0 and t < end - _EPS:
-            h_c = _height_inside(x.h_c, p)
+            h_c = height_inside(x.h_c, p)
             photograph(slot, frames, t, x.r_c + ring_offset(x.r_c, h_c, p) - p.ring_bias, h_c)
     slot.x.r_c, slot.x.h_c, slot.x.T_1, slot.x.T_2, slot.x.T_b = x.r_c, x.h_c, x.T_1, x.T_2, x.T_b
     slot.k = slot.k + 1
@@ -140,7 +156,7 @@ def _advance(slot: Any, frames: Any, clock: Any, slope: Any, ring_offset: Any) -
 def _sample(memory: Any, i: Any, fresh: Any, clock: Any, reading: Any, out: Any, slope: Any, ring_offset: Any) -> Any:
     """Read slot i, or repeat its last reading, and write observation and info; returns the step's cost."""
     slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
-    t, h_c = slot.k * clock.interval, _height_inside(x.h_c, p)
+    t, h_c = slot.k * clock.interval, height_inside(x.h_c, p)
     ring = x.r_c + ring_offset(x.r_c, h_c, p)
     at_interface = growth(State(x.r_c, h_c, x.T_1, x.T_2, x.T_b), Disturbance(slot.Q_d, slot.dT_i, 1.0), p, slope)
     if fresh:
@@ -270,7 +286,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
             slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
             _drive(slot, actions[i, 0], actions[i, 1], drives, clock.interval)
             _advance(slot, memory.frames[i], clock, slope, ring_offset)
-            rings[i] = x.r_c + ring_offset(x.r_c, _height_inside(x.h_c, p), p)
+            rings[i] = x.r_c + ring_offset(x.r_c, height_inside(x.h_c, p), p)
 
     def derive(parameters: Any, lam: float) -> Any:
         return derive_puller(parameters, lam, height, ring_offset)

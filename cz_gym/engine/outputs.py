@@ -19,9 +19,10 @@ _RING_SCALE = MEASURED[_RING].scale
 
 @physics
 def clip(value: Any, limit: Any) -> Any:
-    """The value held within +-limit; NaN passes."""
-    value = -limit if value < -limit else value
-    return limit if value > limit else value
+    """The value held within +-limit, a complex one by its real part; NaN passes."""
+    if value.real < -limit:
+        return -limit
+    return limit if value.real > limit else value
 
 
 @physics

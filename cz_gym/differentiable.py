@@ -1,0 +1,118 @@
+"""A batch whose step has derivatives: gradients of a cost through a crystal, for learning, identification, shooting.
+
+The plant is the environment's own; nothing is approximated (:mod:`cz_gym.engine.tangents`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.config import Config
+from cz_gym.engine.batch import Batch, first_key
+from cz_gym.engine.layout import INFO
+from cz_gym.engine.tangents import ACTIONS, ROWS, SCRATCH, SMOOTH, build_tangents
+from cz_gym.episodes.record import GRID
+from cz_gym.observation import MEASURED, scales
+from cz_gym.task import Cost
+
+Floats = npt.NDArray[np.float64]
+_COSTS = [INFO.index(f"cost_{name}") for name in Cost._fields]
+
+
+class Step(NamedTuple):
+    """What a step led to, a row a slot, and its derivatives."""
+
+    state: Floats
+    """The numbers of :data:`STATES`, SI units, shape (n, 9)."""
+    measured: npt.NDArray[np.float32]
+    """The "measured" observation, shape (n, 11)."""
+    cost: Floats
+    """The four terms of the cost (:class:`cz_gym.task.Cost`), shape (n, 4); 0 for a lost crystal."""
+    grows: npt.NDArray[np.bool_]
+    """Whether the crystal still grows, shape (n,). A lost one stays as it is, and all its derivatives are 0."""
+    jacobian: Floats
+    """Derivatives of the next state and of the cost's terms, shape (n, 13, 11): rows are state and cost, columns the
+    state before and the two actions."""
+
+
+STATES = SMOOTH
+"""The differentiable state: radius, meniscus height [m], T_1, T_2, T_b [K], v_p [m/s], Q_H [W], the bright ring [m] and
+the camera's reading of it [m]. All else that a step depends on (disturbances, noise, time) depends on no action."""
+
+
+class DifferentiableBatch:
+    """Many crystals stepped side by side, each step with its derivatives.
+
+    ``config`` is the environment's (:func:`cz_gym.config.make_config`). ValueError unless its control interval fits
+    whole into the 5 s that disturbances are held for, and its camera's latency into the control interval.
+
+    Noise, freezes and drop-outs are there as in the environment; a reading that is held depends on the state that it
+    was taken of. Whole steps of the heater and the rounding of observations are passed as if they were not.
+    """
+
+    def __init__(self, config: Config, num_envs: int, threads: int | None = 1) -> None:
+        parts = GRID / config.control_interval
+        if abs(parts - round(parts)) > 1e-9 or round(parts) < 1:
+            raise ValueError(f"control_interval must divide {GRID:g} s, not be {config.control_interval:g} s")
+        latency = config.scenario.sensor.latency
+        if latency > config.control_interval:
+            raise ValueError(f"the camera's latency of {latency:g} s is longer than the control interval")
+        self.config, self.num_envs = config, num_envs
+        self._batch = Batch(config, num_envs, threads)
+        self._gather, self._tangents = build_tangents(config.meniscus)
+        self._out = self._batch.new_out()
+        self._state = np.zeros((num_envs, len(STATES)))
+        self._grows = np.ones(num_envs, np.bool_)
+        self._work = np.zeros(SCRATCH)
+        self.measured_by_state = _measured_by_state(config)
+        """Derivatives of the "measured" observation with respect to the state it is of, shape (11, 9)."""
+
+    def reset(self, seeds: Sequence[int]) -> tuple[Floats, npt.NDArray[np.float32]]:
+        """Draw the episodes of these seeds, one a slot; state and "measured" observation."""
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"expected a seed for each of {self.num_envs} slots, not {len(seeds)}")
+        self._out = self._batch.new_out()
+        self._batch.reset(range(self.num_envs), [first_key(int(seed)) for seed in seeds], self._out)
+        self._grows = np.ones(self.num_envs, np.bool_)
+        self._state = self._now()
+        return self._state, self._out.observation
+
+    def step(self, actions: npt.ArrayLike) -> Step:
+        """Hold actions, shape (n, 2), for one control interval; lost crystals, and those at their end, stay."""
+        before, active, n = self._state, self._grows, self.num_envs
+        batch, out = self._batch, self._batch.new_out()
+        for new, old in zip(out, self._out, strict=True):
+            new[...] = old
+        batch.step(actions, out, active)
+        self._grows = active & ~out.terminated
+        self._out, self._state = out, self._now()
+        jacobian = np.empty((n, len(ROWS), len(STATES) + ACTIONS))
+        self._tangents(
+            batch.memory, before, batch.actions, self._grows, batch.clock, batch.drives, self._work, jacobian, 0, n
+        )
+        cost = np.where(self._grows, out.info[_COSTS, :n], 0.0).T
+        return Step(self._state, out.observation, cost, self._grows, jacobian)
+
+    def _now(self) -> Floats:
+        state = np.empty((self.num_envs, len(STATES)))
+        self._gather(self._batch.memory, state, 0, self.num_envs)
+        return state
+
+    def close(self) -> None:
+        """Stop the threads."""
+        self._batch.close()
+
+
+def _measured_by_state(config: Config) -> Floats:
+    """Derivatives of "measured" with respect to the differentiable state, shape (11, 9)."""
+    by_state = np.zeros((len(MEASURED), len(STATES)))
+    scale = dict(zip((channel.name for channel in MEASURED), scales(MEASURED, config.parameters.v_0), strict=True))
+    for row, channel in enumerate(MEASURED):
+        of = {"ring_error": "reading", "T_1": "T_1", "v_p": "v_p", "Q_H": "Q_H"}.get(channel.name)
+        if of is not None:
+            by_state[row, STATES.index(of)] = 1.0 / scale[channel.name]
+    return by_state

@@ -1,0 +1,170 @@
+"""Derivatives of a step: complex steps through the very functions it is made of, and the chain rule over them.
+
+A slot's differentiable state are the numbers of :data:`SMOOTH`; :func:`build_tangents` compiles the loop that writes
+how the next ones, and the cost, depend on them and on the action. f'(x) = Im f(x + i h) / h with an h so small that
+nothing is subtracted (Squire and Trapp, SIAM Review 1998).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from cz_gym.episodes.record import GRID
+from cz_gym.episodes.schedule import melt_left, reference
+from cz_gym.jit.cache import hashed
+from cz_gym.jit.compile import kernel, physics
+from cz_gym.physics.meniscus import MeniscusModel
+from cz_gym.physics.plant import Disturbance, Inputs, State, along, rates
+from cz_gym.task import Cost, cost_terms
+
+from .kernels import height_inside, next_power, next_speed
+
+SMOOTH = ("r_c", "h_c", "T_1", "T_2", "T_b", "v_p", "Q_H", "ring", "reading")
+"""The plant's state [m, K]; pull speed [m/s] and heater power [W], the latter before it is rounded to whole steps; the
+bright ring [m] and the camera's reading of it, without the operator's bias [m]."""
+ACTIONS = 2
+ROWS = (*SMOOTH, *Cost._fields)
+"""What is differentiated: the next state and the terms of the step's cost."""
+SCRATCH = (4, len(State._fields), len(State._fields) + len(Inputs._fields))
+"""Shape of what the loop works on."""
+_H = 1e-30
+_X, _INPUTS = len(State._fields), len(Inputs._fields)
+_V, _Q, _RING, _READING = (SMOOTH.index(name) for name in ("v_p", "Q_H", "ring", "reading"))
+_COST = _ACT = len(SMOOTH)
+
+
+@physics
+def _step(value: Any) -> Any:
+    """The value with an imaginary step."""
+    return complex(value, _H)
+
+
+@physics
+def _column(A: Any, j: Any, k: Any) -> None:
+    """Derivatives of the rates along one of their arguments."""
+    A[0, j], A[1, j], A[2, j], A[3, j], A[4, j] = (
+        k.r_c.imag / _H, k.h_c.imag / _H, k.T_1.imag / _H, k.T_2.imag / _H, k.T_b.imag / _H,
+    )  # fmt: skip
+
+
+@physics
+def _rates_by(A: Any, x: Any, u: Any, d: Any, p: Any, slope: Any) -> None:
+    """Derivatives of the rates by state and inputs: a complex number only where a step is taken, which is quicker."""
+    _column(A, 0, rates(State(_step(x.r_c), x.h_c, x.T_1, x.T_2, x.T_b), u, d, p, slope))
+    _column(A, 1, rates(State(x.r_c, _step(x.h_c), x.T_1, x.T_2, x.T_b), u, d, p, slope))
+    _column(A, 2, rates(State(x.r_c, x.h_c, _step(x.T_1), x.T_2, x.T_b), u, d, p, slope))
+    _column(A, 3, rates(State(x.r_c, x.h_c, x.T_1, _step(x.T_2), x.T_b), u, d, p, slope))
+    _column(A, 4, rates(State(x.r_c, x.h_c, x.T_1, x.T_2, _step(x.T_b)), u, d, p, slope))
+    _column(A, 5, rates(x, Inputs(_step(u.v_p), u.Q_H), d, p, slope))
+    _column(A, 6, rates(x, Inputs(u.v_p, _step(u.Q_H)), d, p, slope))
+
+
+@physics
+def _stage(work: Any, weight: Any, ahead: Any, x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
+    """A stage of Runge and Kutta's: its rates, and what they depend on.
+
+    ``work`` holds the derivatives of the rates, of this stage's and the last one's as functions of where the step began
+    (K), and of the step so far. This stage is at ``ahead`` [s] times the last one's rates; it counts ``weight`` [s].
+    """
+    A, last, K, total = work[0], work[1], work[2], work[3]
+    _rates_by(A, x, u, d, p, slope)
+    for i in range(_X):
+        for j in range(_X + _INPUTS):
+            value = A[i, j]
+            for via in range(_X):
+                value += A[i, via] * ahead * last[via, j]
+            K[i, j] = value
+            total[i, j] += weight * value
+    for i in range(_X):
+        for j in range(_X + _INPUTS):
+            last[i, j] = K[i, j]
+    return rates(x, u, d, p, slope)
+
+
+@physics
+def rk4_by(work: Any, x: Any, u: Any, d: Any, p: Any, dt: Any, slope: Any) -> None:
+    """Derivatives of :func:`cz_gym.physics.plant.rk4` by state and inputs, into ``work[3]``, shape (5, 7)."""
+    for i in range(_X):
+        for j in range(_X + _INPUTS):
+            work[1, i, j], work[3, i, j] = 0.0, 1.0 if i == j else 0.0
+    k_1 = _stage(work, dt / 6.0, 0.0, x, u, d, p, slope)
+    k_2 = _stage(work, dt / 3.0, 0.5 * dt, along(x, 0.5 * dt, k_1), u, d, p, slope)
+    k_3 = _stage(work, dt / 3.0, 0.5 * dt, along(x, 0.5 * dt, k_2), u, d, p, slope)
+    _stage(work, dt / 6.0, dt, along(x, dt, k_3), u, d, p, slope)
+
+
+def build_tangents(meniscus: MeniscusModel) -> tuple[Any, Any]:
+    """Compile the loops for a meniscus model.
+
+    ``gather(memory, state, start, stop)`` writes the differentiable states. ``tangents(memory, state, actions, grows,
+    clock, drives, work, jacobian, start, stop)`` writes the derivatives of the step that led from ``state`` to where
+    the slots are now, shape (n, rows, states + actions); zero for a slot that does not grow.
+    """
+    slope, ring_offset = meniscus.slope, meniscus.ring_offset
+
+    def gather(memory: Any, state: Any, start: int, stop: int) -> None:
+        for i in range(start, stop):
+            slot, p, x, row = memory.slots[i], memory.slots[i].puller, memory.slots[i].x, state[i]
+            row[0], row[1], row[2], row[3], row[4] = x.r_c, x.h_c, x.T_1, x.T_2, x.T_b
+            row[_V], row[_Q] = slot.v_p, slot.Q_H_slewed
+            row[_RING] = x.r_c + ring_offset(x.r_c, height_inside(x.h_c, p), p)
+            row[_READING] = slot.ring
+
+    def tangents(
+        memory: Any, state: Any, actions: Any, grows: Any, clock: Any, drives: Any, work: Any, jacobian: Any,
+        start: int, stop: int,
+    ) -> None:  # fmt: skip
+        for i in range(start, stop):
+            J = jacobian[i]
+            J[:, :] = 0.0
+            if not grows[i]:
+                continue
+            slot, now = memory.slots[i], state[i]
+            p, e, x = slot.puller, slot.episode, slot.x
+            d = Disturbance(slot.Q_d, slot.dT_i, melt_left(slot.point * GRID, e))
+            v, Q, pull, heat, dt = now[_V], now[_Q], actions[i, 0], actions[i, 1], clock.interval
+            J[_V, _V] = next_speed(_step(v), pull, drives, p, e, dt).imag / _H
+            J[_V, _ACT] = next_speed(v, _step(pull), drives, p, e, dt).imag / _H
+            # Whole steps of the heater are taken for a power that moves freely.
+            J[_Q, _Q] = next_power(_step(Q), heat, drives, p, e, dt).imag / _H
+            J[_Q, _ACT + 1] = next_power(Q, _step(heat), drives, p, e, dt).imag / _H
+            begun = State(now[0], now[1], now[2], now[3], now[4])
+            rk4_by(work, begun, Inputs(slot.v_p, slot.Q_H), d, p, dt, slope)
+            h_c = height_inside(x.h_c, p)
+            ring_by_r = 1.0 + ring_offset(_step(x.r_c), h_c, p).imag / _H
+            ring_by_h = ring_offset(x.r_c, _step(h_c), p).imag / _H
+            error, pulled, heated = (
+                x.r_c - p.r_0 - reference(slot.k * dt, e),
+                slot.v_p - slot.v_p_before,
+                slot.Q_H - slot.Q_H_before,
+            )
+            radius = cost_terms(_step(error), 0.0, 0.0, 0.0).radius.imag / _H
+            deviation = cost_terms(0.0, _step(slot.v_p - p.v_0), 0.0, 0.0).pull.imag / _H
+            pull_step = cost_terms(0.0, 0.0, _step(pulled), 0.0).pull_step.imag / _H
+            heater_step = cost_terms(0.0, 0.0, 0.0, _step(heated)).heater_step.imag / _H
+            for j in range(_ACT + ACTIONS):
+                drive = _V if j in (_V, _ACT) else _Q
+                if j < _X:
+                    share, column = 1.0, j
+                elif j in (_RING, _READING):
+                    continue
+                else:
+                    share, column = J[drive, j], drive
+                for row in range(_X):
+                    J[row, j] = share * work[3, row, column]
+                J[_RING, j] = ring_by_r * J[0, j] + ring_by_h * J[1, j]
+                J[_COST, j] = radius * J[0, j]
+                J[_COST + 1, j] = deviation * J[_V, j]
+                J[_COST + 2, j] = pull_step * (J[_V, j] - (1.0 if j == _V else 0.0))
+                J[_COST + 3, j] = heater_step * (J[_Q, j] - (1.0 if j == _Q else 0.0))
+            fresh, late = slot.k_seen == slot.k, e.latency > 0.0
+            for j in range(_ACT + ACTIONS):
+                if fresh and not late:
+                    J[_READING, j] = J[_RING, j]
+            if fresh and late:
+                J[_READING, _RING] = 1.0
+            if not fresh:
+                J[_READING, _READING] = 1.0
+
+    keep = hashed(*meniscus.functions)
+    return kernel(gather, keep, allocates=False), kernel(tangents, keep, allocates=False)

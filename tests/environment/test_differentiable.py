@@ -1,0 +1,146 @@
+"""Derivatives of a step: against differences of the environment's own steps, through failures, on the plant alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cz_gym.config import make_config
+from cz_gym.differentiable import STATES, DifferentiableBatch
+from cz_gym.engine.tangents import ROWS, SCRATCH, rk4_by
+from cz_gym.observation import MEASURED
+from cz_gym.physics.linearisation import jacobian
+from cz_gym.physics.meniscus import hurle_slope
+from cz_gym.physics.plant import Disturbance, Inputs, State, make_puller, rk4
+
+STEPS = {"r_c": 1e-7, "h_c": 1e-7, "T_1": 1.0, "T_2": 1.0, "T_b": 1e-2, "v_p": 1e-9, "Q_H": 100.0, "a": 1e-3}
+"""How far each number is moved for differences."""
+
+
+def moved(batch: DifferentiableBatch, slots: Any, frames: Any, actions: Any, column: int, by: float) -> Any:
+    """State and cost after a step from a state, or action, of which one number was moved."""
+    memory, actions = batch._batch.memory, actions.copy()
+    memory.slots[:], memory.frames[:] = slots, frames
+    name = STATES[column] if column < len(STATES) else ""
+    if column >= len(STATES):
+        actions[:, column - len(STATES)] += by
+    elif name in State._fields:
+        memory.slots["x"][name] += by
+    elif name == "v_p":
+        memory.slots["v_p"] += by
+    else:
+        memory.slots["Q_H"] += by
+        memory.slots["Q_H_slewed"] += by
+    batch._state, batch._grows = batch._now(), np.ones(batch.num_envs, np.bool_)
+    step = batch.step(actions)
+    return np.concatenate([step.state, step.cost], axis=1), step
+
+
+@pytest.mark.parametrize("scenario", ["randomized", "sensor-fault"])
+@pytest.mark.parametrize("action", ["smooth", "direct", "rate"])
+def test_derivatives_are_those_of_the_steps(scenario: str, action: str) -> None:
+    n, random = 24, np.random.default_rng(0)
+    batch = DifferentiableBatch(make_config(scenario, action=action), n)
+    batch.reset(range(n))
+    gain = 0.02 if action == "rate" else 0.1
+    for _ in range(40):
+        batch.step(gain * random.normal(size=(n, 2)))
+    memory, actions = batch._batch.memory, gain * random.normal(size=(n, 2))
+    slots, frames = memory.slots.copy(), memory.frames.copy()
+    _, step = moved(batch, slots, frames, actions, 0, 0.0)
+    assert step.grows.all()
+    for column in range(len(STATES) + 2):
+        name = STATES[column] if column < len(STATES) else "a"
+        if name in ("ring", "reading"):
+            continue
+        by = STEPS[name]
+        ahead, behind = (moved(batch, slots, frames, actions, column, sign * by)[0] for sign in (1.0, -1.0))
+        found, expected = step.jacobian[:, :, column], (ahead - behind) / (2.0 * by)
+        rounding = 2e-15 * np.abs(ahead) / by
+        assert (np.abs(found - expected) <= 2e-5 * np.abs(expected).max(axis=0) + rounding).all(), (ROWS, name)
+
+
+def test_a_reading_that_is_held_or_late_depends_on_the_one_before() -> None:
+    ring, reading = STATES.index("ring"), STATES.index("reading")
+    late = DifferentiableBatch(make_config("puller"), 8)
+    late.reset(range(8))
+    step = late.step(np.zeros((8, 2)))
+    np.testing.assert_array_equal(step.jacobian[:, reading, ring], 1.0)
+    fault = DifferentiableBatch(make_config("sensor-fault"), 64)
+    fault.reset(range(64))
+    held = np.zeros(64, bool)
+    for _ in range(100):
+        before = fault._batch.memory.slots["ring"].copy()
+        step = fault.step(np.zeros((64, 2)))
+        same = fault._batch.memory.slots["ring"] == before
+        np.testing.assert_array_equal(step.jacobian[:, reading, reading], same)
+        np.testing.assert_array_equal(step.jacobian[~same, reading], step.jacobian[~same, ring])
+        held |= same
+    assert held.any()
+
+
+def test_window_and_slew_stop_derivatives() -> None:
+    batch = DifferentiableBatch(make_config("puller"), 4)
+    batch.reset(range(4))
+    step = batch.step(np.full((4, 2), 0.9))
+    v, Q, n = STATES.index("v_p"), STATES.index("Q_H"), len(STATES)
+    assert not step.jacobian[:, [v, Q], :][:, :, [n, n + 1]].any(), "the slew decides, not the action"
+    np.testing.assert_array_equal(step.jacobian[:, v, v], 1.0)
+
+
+def test_a_lost_crystal_stops_counting() -> None:
+    batch = DifferentiableBatch(make_config("randomized"), 8)
+    batch.reset(range(8))
+    actions = np.zeros((8, 2))
+    actions[:4] = 1.0
+    for _ in range(1500):
+        step = batch.step(actions)
+        assert np.isfinite(step.jacobian).all()
+        assert np.isfinite(step.cost).all()
+        assert np.isfinite(step.state).all()
+        assert not step.jacobian[~step.grows].any()
+        assert not step.cost[~step.grows].any()
+        if not step.grows[:4].any():
+            break
+    assert not step.grows[:4].any()
+    last = step.state[:4]
+    np.testing.assert_array_equal(batch.step(actions).state[:4], last)
+
+
+def test_the_environment_s_own_crystals_and_observations() -> None:
+    from cz_gym import CzVectorEnv
+
+    batch, env = DifferentiableBatch(make_config("hard", action="smooth"), 4), CzVectorEnv(4, "hard", action="smooth")
+    _, measured = batch.reset([5, 6, 7, 8])
+    np.testing.assert_array_equal(measured, env.reset(seed=5)[0])
+    actions = np.random.default_rng(0).uniform(-0.2, 0.2, (50, 4, 2))
+    for action in actions:
+        step = batch.step(action)
+        np.testing.assert_array_equal(step.measured, env.step(action)[0])
+    assert batch.measured_by_state.shape == (len(MEASURED), len(STATES))
+
+
+def test_the_chain_rule_over_rk4_is_exact() -> None:
+    """Against the complex step through the whole of it, ten times in a row."""
+    puller, d = make_puller(lam=0.5), Disturbance(50.0, 0.3, 0.95)
+    x, u, work = State(*puller.state_0)._replace(r_c=0.051, h_c=0.0062), puller.inputs_0, np.zeros(SCRATCH)
+    for _ in range(10):
+        rk4_by(work, x, u, d, puller, 5.0, hurle_slope)
+        whole = jacobian(lambda *at: rk4(State(*at[:5]), Inputs(*at[5:]), d, puller, 5.0, hurle_slope), (*x, *u))
+        np.testing.assert_allclose(work[3], whole, rtol=1e-10, atol=1e-16)
+        x = rk4(x, u, d, puller, 5.0, hurle_slope)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"control_interval": 10.0}, "must divide 5 s"),
+        ({"control_interval": 2.0}, "must divide 5 s"),
+        ({"scenario": "puller", "control_interval": 2.5}, "latency of 5 s is longer"),
+    ],
+)
+def test_what_has_no_derivatives_is_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        DifferentiableBatch(make_config(**settings), 2)
