@@ -59,6 +59,7 @@ def test_derivatives_are_those_of_the_steps(scenario: str, action: str) -> None:
         ahead, behind = (moved(batch, slots, frames, actions, column, sign * by)[0] for sign in (1.0, -1.0))
         found, expected = step.jacobian[:, :, column], (ahead - behind) / (2.0 * by)
         rounding = 2e-15 * np.abs(ahead) / by
+        rounding[:, len(STATES) :] = 2e-14 / by  # costs are of small errors, differences of radii
         assert (np.abs(found - expected) <= 2e-5 * np.abs(expected).max(axis=0) + rounding).all(), (ROWS, name)
 
 
