@@ -106,13 +106,13 @@ def train(arguments: argparse.Namespace) -> int:
 
 def _asked_for(recipe: Recipe, arguments: argparse.Namespace) -> Recipe:
     """The recipe with the scenario and the steps that the command line, or the resumed run, asks for."""
-    from cz_gym.agents.training.recipes import Reinforcement
+    from cz_gym.agents.training.recipes import Rewarded
     from cz_gym.agents.training.run_files import saved_steps
     from cz_gym.episodes.scenarios import find_scenario
 
     recipe = replace(recipe, scenario=find_scenario(arguments.scenario or recipe.scenario).name)
     saved = saved_steps(arguments.out) if arguments.resume else None
-    if isinstance(recipe, Reinforcement):
+    if isinstance(recipe, Rewarded):
         return replace(recipe, steps=arguments.steps or saved or recipe.steps)
     if arguments.steps:
         raise ValueError(f"{recipe.name} takes no --steps: its length is that of its demonstrations")

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from cz_gym.config import Config
 from cz_gym.engine.batch import Batch, first_key
-from cz_gym.engine.layout import INFO
+from cz_gym.engine.layout import INFO, Out
 from cz_gym.engine.tangents import ACTIONS, ROWS, SCRATCH, SMOOTH, build_tangents
 from cz_gym.episodes.record import GRID
 from cz_gym.observation import MEASURED, scales
@@ -71,22 +71,24 @@ class DifferentiableBatch:
         self.measured_by_state = _measured_by_state(config)
         """Derivatives of the "measured" observation with respect to the state it is of, shape (11, 9)."""
 
-    def reset(self, seeds: Sequence[int]) -> tuple[Floats, npt.NDArray[np.float32]]:
-        """Draw the episodes of these seeds, one a slot; state and "measured" observation."""
-        if len(seeds) != self.num_envs:
-            raise ValueError(f"expected a seed for each of {self.num_envs} slots, not {len(seeds)}")
-        self._out = self._batch.new_out()
-        self._batch.reset(range(self.num_envs), [first_key(int(seed)) for seed in seeds], self._out)
-        self._grows = np.ones(self.num_envs, np.bool_)
+    def reset(self, seeds: Sequence[int], which: Sequence[int] | None = None) -> tuple[Floats, npt.NDArray[np.float32]]:
+        """Draw the episodes of these seeds, one for each of the slots ``which``, by default all; the others stay.
+
+        Returns state, shape (n, 9), and "measured" observation, shape (n, 11), of all slots.
+        """
+        which = range(self.num_envs) if which is None else which
+        if len(seeds) != len(which):
+            raise ValueError(f"expected a seed for each of {len(which)} slots, not {len(seeds)}")
+        self._out = self._copied()
+        self._batch.reset(which, [first_key(int(seed)) for seed in seeds], self._out)
+        self._grows[list(which)] = True
         self._state = self._now()
         return self._state, self._out.observation
 
     def step(self, actions: npt.ArrayLike) -> Step:
-        """Hold actions, shape (n, 2), for one control interval; lost crystals, and those at their end, stay."""
+        """Hold actions, shape (n, 2), for one control interval; lost crystals stay."""
         before, active, n = self._state, self._grows, self.num_envs
-        batch, out = self._batch, self._batch.new_out()
-        for new, old in zip(out, self._out, strict=True):
-            new[...] = old
+        batch, out = self._batch, self._copied()
         batch.step(actions, out, active)
         self._grows = active & ~out.terminated
         self._out, self._state = out, self._now()
@@ -97,10 +99,22 @@ class DifferentiableBatch:
         cost = np.where(self._grows, out.info[_COSTS, :n], 0.0).T
         return Step(self._state, out.observation, cost, self._grows, jacobian)
 
+    def _copied(self) -> Out:
+        """New arrays that hold what the last step wrote."""
+        out = self._batch.new_out()
+        for new, old in zip(out, self._out, strict=True):
+            new[...] = old
+        return out
+
     def _now(self) -> Floats:
         state = np.empty((self.num_envs, len(STATES)))
         self._gather(self._batch.memory, state, 0, self.num_envs)
         return state
+
+    @property
+    def grows(self) -> npt.NDArray[np.bool_]:
+        """Which crystals still grow, shape (n,)."""
+        return self._grows
 
     def close(self) -> None:
         """Stop the threads."""

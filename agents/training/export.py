@@ -118,15 +118,15 @@ class OnnxGraph:
         x = self.node("MatMul", [x, self.constant("scaling", scaling)], "scaled")
         return self.clip(x, -NORMALISED_LIMIT, NORMALISED_LIMIT, "normalised")
 
-    def finished(self, channels: int, actor: Actor | None = None) -> bytes:
-        """The model, checked and serialised; it remembers what the actor's LSTM does."""
+    def finished(self, channels: int, actor: Actor | None = None, state: int = 0) -> bytes:
+        """The model, checked and serialised; it remembers what the actor's LSTM does, or so many numbers."""
 
         def value(name: str, width: int) -> Any:
             return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", width])
 
         inputs, outputs = [value("observation", channels)], [value("action", len(DRIVE_CHANNELS))]
-        if actor and actor.lstm:
-            state = 2 * actor.lstm.hidden_size
+        state = 2 * actor.lstm.hidden_size if actor and actor.lstm else state
+        if state:
             inputs, outputs = [*inputs, value("state", state)], [*outputs, value("next_state", state)]
         graph = helper.make_graph(self._nodes, "cz_gym_agent", inputs, outputs, self._constants)
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)

@@ -11,9 +11,10 @@ from stable_baselines3.common.utils import configure_logger
 
 from cz_gym.config import Config, make_config
 
+from .gradient import GradientLearner
 from .imitation import Imitator
 from .learner import Learner
-from .recipes import Imitation, Recipe, Reinforcement
+from .recipes import Gradient, Imitation, Recipe, Reinforcement
 from .reinforcement import Reinforced
 
 Controllers = Callable[[str, Config], Any]
@@ -32,6 +33,8 @@ def make_learner(
         config = config_of(recipe)
         measured = make_config(recipe.scenario, control_interval=recipe.control_interval)
         return Imitator(recipe, seed, controllers(recipe.teacher, measured), config, logger, done)
+    if isinstance(recipe, Gradient):
+        return GradientLearner(recipe, seed, config_of(recipe), logger, done)
     if isinstance(recipe, Reinforcement):
         return Reinforced(recipe, seed, logger, done)
     raise TypeError(f"no learner learns by a {type(recipe).__name__}")

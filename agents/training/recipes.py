@@ -81,11 +81,33 @@ class Imitation(Recipe):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reinforcement(Recipe):
-    """What recipes that learn from reward have in common."""
+class Rewarded(Recipe):
+    """What recipes that learn from the reward have in common, whether they try or differentiate."""
 
     steps: int
     """Environment steps."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gradient(Rewarded):
+    """The exact gradient of the reward's cost, through policy, memory and plant; from nothing."""
+
+    name: str = "gradient"
+    observation: str = "measured"
+    action: str = "rate"
+    steps: int = 62_208_000
+    num_envs: int = 192
+    window: int = 180
+    """Steps of a crystal that a gradient goes back through."""
+    hidden: tuple[int, ...] = (64,)
+    learning_rate: float = 3e-3
+    """At the start; it falls linearly to zero."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reinforcement(Rewarded):
+    """What recipes that learn from reward by trying have in common."""
+
     num_envs: int
     """Slots trained on at once."""
     gamma: float = 0.99
@@ -183,10 +205,17 @@ class RandomSearch(Reinforcement):
     learning_rate: float = 0.02
 
 
-TEACHERS_COST = CostWeights(pull=0.11, pull_step=0.049, heater_step=23.4)
+LQG_COST = CostWeights(pull=0.11, pull_step=0.049, heater_step=23.4)
 """The cost that the regulator of lqg-at-0.02 was made for, as multiples of the environment's."""
 RECIPES: dict[str, Recipe] = {
     recipe.name: recipe
-    for recipe in (PPO(), RecurrentPPO(), SAC(), RandomSearch(), Imitation(name="imitation", weights=TEACHERS_COST))
+    for recipe in (
+        PPO(),
+        RecurrentPPO(),
+        SAC(),
+        RandomSearch(),
+        Gradient(weights=LQG_COST),
+        Imitation(name="imitation", weights=LQG_COST),
+    )
 }
 """By name: what ``train.py --algo`` offers."""

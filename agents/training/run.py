@@ -18,7 +18,7 @@ from cz_gym.config import Config, make_config
 from .checkpoint import load_checkpoint, restore, to_bytes
 from .learner import Learner
 from .learners import Controllers, config_of, make_learner
-from .recipes import Recipe, Reinforcement
+from .recipes import Recipe, Rewarded
 from .run_files import COLUMNS, REFERENCES, provenance, read_rows, read_settings, to_csv, to_json
 from .validation import JUDGING, PICKING, Validation, validate
 
@@ -162,7 +162,7 @@ class Run:
         return {name: validate(each, self._measured, seeds).rmse_mm for name, each in self._references.items()}
 
     def _contract(self, content: bytes) -> Contract:
-        rewarded = isinstance(self.recipe, Reinforcement)
+        rewarded = isinstance(self.recipe, Rewarded)
         return make_contract(
             content,
             **facts_of(self.config),

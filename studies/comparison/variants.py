@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from cz_gym.agents.training.recipes import Recipe, Reinforcement
+from cz_gym.agents.training.recipes import Recipe, Rewarded
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Variant:
 
     def of(self, steps: int | None) -> Variant:
         """The same, learning for that many environment steps if it learns from reward; None: its recipe's own."""
-        if steps is None or not isinstance(self.recipe, Reinforcement):
+        if steps is None or not isinstance(self.recipe, Rewarded):
             return self
         return replace(self, recipe=replace(self.recipe, steps=steps))
 
