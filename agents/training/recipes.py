@@ -6,7 +6,7 @@ A new kind needs a dataclass here, a learner (:class:`.learner.Learner`) and its
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -210,11 +210,11 @@ LQG_COST = CostWeights(pull=0.11, pull_step=0.049, heater_step=23.4)
 RECIPES: dict[str, Recipe] = {
     recipe.name: recipe
     for recipe in (
+        Gradient(weights=replace(LQG_COST, pull_step=0.07)),
         PPO(),
         RecurrentPPO(),
         SAC(),
         RandomSearch(),
-        Gradient(weights=LQG_COST),
         Imitation(name="imitation", weights=LQG_COST),
     )
 }

@@ -13,6 +13,9 @@ from studies.comparison.command import main as compare
 from studies.comparison.variants import Study, Variant
 
 ROWS = (
+    Variant(
+        RECIPES["gradient"], "the cost's exact gradient through policy and plant, from nothing; the plant is known"
+    ),
     Variant(RECIPES["ppo"], "proximal policy optimisation from nothing; the critic also sees the true state"),
     Variant(RECIPES["ppo-recurrent"], "the same of an LSTM; actor and critic see what is measured", "ppo"),
     Variant(RECIPES["sac"], "soft actor-critic from nothing; both see what is measured", "ppo"),

@@ -14,7 +14,7 @@ from cz_gym.agents.training.recipes import RECIPES
 from cz_gym.baselines.registry import make_controller
 
 
-@pytest.mark.parametrize("name", ["ppo", "sac", "ppo-recurrent", "random-search"])
+@pytest.mark.parametrize("name", ["ppo", "sac", "ppo-recurrent"])
 def test_no_two_training_seeds_meet_the_same_crystals(name: str) -> None:
     recipe: Any = replace(RECIPES[name], num_envs=8, hidden=(4,), batch_size=64)  # type: ignore[call-arg]
     met: list[set[int]] = []
