@@ -25,7 +25,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         description="Train an agent by a recipe and pick it on validation episodes.",
         epilog="The run folder holds the agent with its contract, settings, checkpoints, progress and logs.",
     )
-    parser.add_argument("--algo", choices=tuple(RECIPES), default="ppo", help="recipe (default: %(default)s)")
+    parser.add_argument("--algo", choices=tuple(RECIPES), default="gradient", help="recipe (default: %(default)s)")
     parser.add_argument("--seed", type=_whole(0), default=0, help="training seed (default: %(default)s)")
     parser.add_argument(
         "--steps",

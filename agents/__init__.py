@@ -1,6 +1,6 @@
 """Learned controllers: training with stable-baselines3, and running what was trained without it.
 
-``load("imitation")`` is a trained agent, ready to act. Importing this package needs neither torch nor
+``load("gradient")`` is a trained agent, ready to act. Importing this package needs neither torch nor
 stable-baselines3; training (:mod:`cz_gym.agents.training.learners`) needs both.
 """
 
@@ -18,7 +18,7 @@ from cz_gym.config import Config
 __all__ = ["AgentFileError", "Contract", "OnnxPolicy", "load", "shipped", "shipped_seeds"]
 
 MODELS = Path(__file__).parent / "models"
-DEFAULT = "imitation"
+DEFAULT = "gradient"
 
 
 def load(name: str | Path = DEFAULT, config: Config | None = None) -> OnnxPolicy:

@@ -96,7 +96,7 @@ def contestants(scenario: str, seed: int, agent: Path | None = None) -> tuple[Si
     learned = agents.OnnxPolicy.load(agent or agents.shipped(), env.config)
     if learned.contract.control_interval != env.config.control_interval:
         raise ValueError(f"{agent}: acts every {learned.contract.control_interval:g} s, not every 5 s")
-    other = CzEnv(scenario, observation=learned.observation, render_mode="rgb_array")
+    other = CzEnv(scenario, observation=learned.observation, action=learned.action, render_mode="rgb_array")
     name = f"learned: {learned.contract.algorithm}"
     return Side("the paper's controller", paper, env, TEMPERATURE, seed), Side(name, learned, other, TRUE, seed)
 

@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode
 
 from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config
+from cz_gym.differentiable import DifferentiableBatch
 from cz_gym.engine.batch import Batch
 from cz_gym.env import CzEnv
 from cz_gym.physics.meniscus import HURLE
@@ -65,6 +66,8 @@ def cases(quick: bool) -> list[Case]:
             for n in threads
             for name, make in (("Cz-v0 batch without resets", without_resets), ("bare compiled plant and ring", bare))
         ),
+        Case("step without derivatives", partial(differentiable, False)),
+        Case("step with derivatives", partial(differentiable, True)),
         Case("plain NumPy plant and ring", partial(plain_numpy, SLOTS)),
         Case("open loop on hard, no failures", partial(open_loop, SLOTS, fails=False)),
         Case("open loop on hard, failing episodes", partial(open_loop, SLOTS, fails=True)),
@@ -72,6 +75,11 @@ def cases(quick: bool) -> list[Case]:
         *(Case(f"EnvPool Pendulum-v1, {_threads(n)}", partial(_envpool, SLOTS, n)) for n in threads),
         Case("pc-gym CSTR", _pcgym),
         Case("SB3 adapter over the batch", _sb3_adapter),
+        *(
+            Case(f"{loop}, {name}", partial(make, name))
+            for loop, make in (("SB3 make_vec_env", _make_vec_env), ("SyncVectorEnv", _sync))
+            for name in ("cz_gym:Cz-v0", "Pendulum-v1")
+        ),
         Case("SB3 DummyVecEnv", lambda: _sb3("DummyVecEnv", SB3_SLOTS)),
         *(
             Case(f"SB3 SubprocVecEnv, {n} processes", partial(_sb3, "SubprocVecEnv", n, start_method=_START))
@@ -151,6 +159,15 @@ def repeated(batch: Batch, stepper: Stepper) -> Stepper:
     return stepper._replace(step=step)
 
 
+def differentiable(derivatives: bool) -> Stepper:
+    """A batch of 256 over and over the same first minutes, each step with its derivatives or without."""
+    batch = DifferentiableBatch(make_config(), 256)
+    batch.reset(range(256))
+    inner, out, action = batch._batch, batch._batch.new_out(), np.zeros((256, 2))
+    step = (lambda: batch.step(action)) if derivatives else (lambda: inner.step(action, out))
+    return repeated(inner, Stepper(256, step, batch.close))
+
+
 def plain_numpy(num_envs: int) -> Stepper:
     """The same equations uncompiled on arrays: plant and ring alone, nominal pullers."""
     p = make_puller()
@@ -221,6 +238,15 @@ def _pcgym() -> Any:
 def _sb3_adapter() -> Any:
     adapter = importlib.import_module("cz_gym.agents.training.vec_env").CzVecEnv
     return adapter(CzVectorEnv(SB3_SLOTS, autoreset_mode=AutoresetMode.SAME_STEP))
+
+
+def _make_vec_env(name: str) -> Any:
+    """As most who come from stable-baselines3 begin."""
+    return importlib.import_module("stable_baselines3.common.env_util").make_vec_env(name, 16)
+
+
+def _sync(name: str) -> Any:
+    return gym.make_vec(name, 4, vectorization_mode="sync")
 
 
 _START = "forkserver" if os.name == "posix" else "spawn"

@@ -24,6 +24,8 @@ from .tables import (
 )
 from .verdict import headline
 
+QUOTED = ("paper", "paper-tuned", "lqg-at-0.02", "gradient", "ppo")
+"""Controllers that :func:`brief` shows."""
 BEGIN, END = "<!-- benchmark:begin -->", "<!-- benchmark:end -->"
 """Markers around the part of a page that :func:`fill_in` writes."""
 
@@ -44,11 +46,23 @@ def summary(benchmark: Benchmark) -> str:
     return f"{caption}\n\n{_table(('controller', *headings), lines)}"
 
 
+def brief(benchmark: Benchmark) -> str:
+    """A table for readers in a hurry: the controllers of :data:`QUOTED`, or all, on the scenarios with randomness."""
+    scenarios = [each for each in benchmark.scenarios if len(each.seeds) > 1] or list(benchmark.scenarios)
+    first = rows(scenarios[0], (PULL_STEP, FAILURES))
+    errors = [{name: row[0] for name, *row in rows(scenario, (RMSE,))} for scenario in scenarios]
+    chosen = [line for line in first if line[0] in QUOTED] or first
+    headings = [*(scenario.row.name for scenario in scenarios), PULL_STEP.heading, FAILURES.heading]
+    return _table(
+        ("controller", *headings), [(name, *(each[name] for each in errors), *more) for name, *more in chosen]
+    )
+
+
 def fill_in(page: str, benchmark: Benchmark) -> str:
-    """A page with verdict and summary between its two markers; the page itself if it has none."""
+    """A page with :func:`brief` between its two markers; the page itself if it has none."""
     before, begin, rest = page.partition(BEGIN)
     _, end, after = rest.partition(END)
-    return f"{before}{begin}\n{headline(benchmark)}\n\n{summary(benchmark)}\n{end}{after}" if end else page
+    return f"{before}{begin}\n{brief(benchmark)}\n{end}{after}" if end else page
 
 
 def markdown(benchmark: Benchmark, figures: Iterable[str]) -> str:
