@@ -47,6 +47,8 @@ from .step_tests import (
 )
 
 PROG = "python -m studies.insight"
+AGENT = "imitation"
+"""The shipped agent that is taken apart, unless a file is named: one that keeps nothing between samples."""
 BESIDE = ("lqg-at-0.02", "lqg", "paper-tuned")
 """Controllers that an agent is shown beside; its teacher is among them."""
 AT_REST = "at rest"
@@ -59,7 +61,7 @@ def contenders(path: Path | None) -> tuple[Contender, ...]:
     All are linearised under the usual noise, LQGs at the covariance that their filters settle on; the agent, last,
     also without any, where its network bends least.
     """
-    file = path or shipped()
+    file = path or shipped(AGENT)
     contract, content = read_agent(file)
     interface = Interface(contract.observation, contract.action)
     config = crystal(A_CRYSTAL / MINUTE, interface)
@@ -136,7 +138,7 @@ def study(agent: Path | None, episodes: int, only_pictures: bool, tell: Callable
         parts[each.name] = puller_parts(each, episodes)
     beside = next(each for each in all_of_them if each.name == BESIDE[0])
     found = {
-        "agent": asdict(read_agent(agent or shipped())[0]),
+        "agent": asdict(read_agent(agent or shipped(AGENT))[0]),
         "answers": {test: {name: answer_figures(one) for name, one in by.items()} for test, by in answers.items()},
         "margins": [row for each in all_of_them for row in margins(each, omega, dt)],
         "noise_gain": {each.name: noise_gains(each, dt) for each in all_of_them},

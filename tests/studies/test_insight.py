@@ -50,7 +50,7 @@ from studies.insight.step_tests import (
 
 DT = 5.0
 OMEGA = np.geomspace(1e-4, np.pi / DT, 9)
-PATH = agents.shipped()
+PATH = agents.shipped(insight.AGENT)
 CONTRACT, CONTENT = read_agent(PATH)
 LEARNED = Interface(CONTRACT.observation, CONTRACT.action)
 REST = np.eye(len(HISTORY))[1]
