@@ -111,7 +111,7 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
 
 def make_plan(arguments: argparse.Namespace, command: str) -> Plan:
     """What the command line asks for; ValueError names what was given and what is allowed."""
-    from cz_gym.evaluation.contenders import choose
+    from cz_gym.evaluation.contenders import check_intervals, choose
     from cz_gym.evaluation.protocol import ROWS, check_episodes, find_row
     from cz_gym.evaluation.runner import Plan
 
@@ -124,6 +124,7 @@ def make_plan(arguments: argparse.Namespace, command: str) -> Plan:
         slow = [each for each in slow if arguments.controllers and plan.is_cached(each)]
     shipped = {name: partial(_shipped, name) for name in SHIPPED}
     chosen = choose(arguments.controllers, controllers, _given(arguments.agent), shipped, [each.name for each in slow])
+    check_intervals(chosen, plan.rows)
     return replace(plan, contenders=chosen)
 
 

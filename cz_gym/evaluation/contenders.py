@@ -9,7 +9,7 @@ from typing import Any
 
 from cz_gym.config import Config
 
-from .protocol import ROWS, SLOW_EPISODES
+from .protocol import SLOW_EPISODES, Row
 from .results import Controller
 
 
@@ -33,7 +33,7 @@ class Contender:
 def agent(name: str, policies: Sequence[Any], remark: str = "") -> Contender:
     """A learned contender: policies with a ``contract``, one a training seed of the same agent.
 
-    Raises ValueError if they are no such set, or were not trained at the benchmark's control interval.
+    Raises ValueError if they are no such set.
     """
     contracts = [policy.contract for policy in policies]
     seeds = tuple(contract.training_seed for contract in contracts)
@@ -44,17 +44,22 @@ def agent(name: str, policies: Sequence[Any], remark: str = "") -> Contender:
     if len({contract.scenario_hash for contract in contracts}) > 1:
         trained = ", ".join(sorted({contract.scenario for contract in contracts}))
         raise ValueError(f"agent {name!r}: its training seeds were trained on different scenarios: {trained}")
-    interval = ROWS[0].control_interval
-    for contract in contracts:
-        if contract.control_interval != interval:
-            raise ValueError(
-                f"agent {name!r}: trained at {contract.control_interval:g} s control, the benchmark runs {interval:g} s"
-            )
     meaning = f"agent trained with {contracts[0].algorithm} on {contracts[0].scenario}{remark}"
     controller = Controller(name, contracts[0].observation, meaning, seeds, action=contracts[0].action)
     return Contender(
         controller, lambda config: policies, contracts=tuple(_writable(contract) for contract in contracts)
     )
+
+
+def check_intervals(contenders: Sequence[Contender], rows: Sequence[Row]) -> None:
+    """ValueError for an agent that was trained at another control interval than a row has."""
+    for contender in contenders:
+        for row in rows:
+            for trained in {contract["control_interval"] for contract in contender.contracts} - {row.control_interval}:
+                raise ValueError(
+                    f"agent {contender.name!r}: trained at {trained:g} s control, {row.name} runs at "
+                    f"{row.control_interval:g} s"
+                )
 
 
 def _writable(contract: Any) -> dict[str, Any]:

@@ -12,6 +12,12 @@ from .table import COLUMNS, Line
 LINEAR = {RMSE: 1.0}
 """Half width of the middle of an axis that is linear, in its unit; a hundredth where nothing else is said."""
 
+AGAINST = (
+    ("steps", 1e6, "environment steps [million]"),
+    ("seconds", 60.0, "minutes on a core, validation included"),
+)
+"""What learning curves are drawn against: column of a run's progress, unit, axis."""
+
 
 def forest(lines: Sequence[Line]) -> bytes:
     """Each variant's paired differences to its base with their intervals, as PNG; left is better."""
@@ -35,19 +41,22 @@ def forest(lines: Sequence[Line]) -> bytes:
 
 
 def curves(lines: Sequence[Line]) -> bytes:
-    """Validation RMSE while learning, a line a training seed, as PNG."""
-    figure = canvas(6.4, 3.8)
-    axis = figure.subplots()
+    """Validation RMSE while learning against steps and minutes, a line a training seed, as PNG."""
+    figure = canvas(10.0, 4.2)
+    panels = figure.subplots(1, 2, sharey=True)
     drawn = [line for line in lines if line.trained("steps") is not None]
-    for line, style in zip(drawn, styles([line.name for line in drawn]).values(), strict=True):
-        for place, run in enumerate(line.runs.values()):
-            steps = [1e-6 * row["steps"] for row in run.validations]
-            error = [row["validation_rmse_mm"] for row in run.validations]
-            label = line.name if place == 0 else None
-            axis.plot(steps, error, color=style.colour, marker=style.marker, ms=3.5, lw=1.3, label=label)
-    axis.set_yscale("log")
-    axis.yaxis.set_major_formatter(lambda value, position: f"{value:g}")
-    axis.set_xlabel("environment steps [million]")
-    axis.set_ylabel("validation RMSE of the radius [mm]")
+    for axis, (column, unit, title) in zip(panels, AGAINST, strict=True):
+        for line, style in zip(drawn, styles([line.name for line in drawn]).values(), strict=True):
+            for place, run in enumerate(line.runs.values()):
+                spent = [row[column] / unit for row in run.validations]
+                error = [row["validation_rmse_mm"] for row in run.validations]
+                label = line.name if place == 0 and axis is panels[0] else None
+                axis.plot(spent, error, color=style.colour, marker=style.marker, ms=2.5, lw=1.0, label=label)
+        axis.set_xscale("log")
+        axis.set_yscale("log")
+        axis.set_xlabel(title)
+        for each in (axis.xaxis, axis.yaxis):
+            each.set_major_formatter(lambda value, position: f"{value:g}")
+    panels[0].set_ylabel("validation RMSE of the radius [mm]")
     figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=8)
     return png(figure)
