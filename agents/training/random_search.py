@@ -17,6 +17,7 @@ from sb3_contrib.ars.policies import ARSLinearPolicy
 from torch import nn
 
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
+from cz_gym.observation import HISTORY
 from cz_gym.task import FAILURE_COST
 
 from .networks import Normalise, whitening
@@ -45,6 +46,7 @@ class RandomSearch(ARS):
     def __init__(self, *arguments: Any, part: int = 360, **options: Any) -> None:
         self.part = part
         """Steps of an episode that candidates are compared on."""
+        self.rounds, self.mean, self.spread = 0, np.zeros(len(HISTORY)), np.zeros((len(HISTORY), len(HISTORY)))
         super().__init__(*arguments, **options)
 
     def _do_one_update(self, callback: Any, async_eval: Any) -> None:
@@ -79,9 +81,16 @@ class RandomSearch(ARS):
         return torch.as_tensor(returns.reshape(self.pop_size, crystals).mean(axis=1), dtype=torch.float32)
 
     def _whiten(self, seen: npt.NDArray[Any]) -> None:
-        """Whiten with what is seen, until a quarter of the training; the policy goes on acting as it did."""
+        """Whiten with what has been seen, until a quarter of the training; weights go on meaning what they did."""
         normalise = self.policy.features_extractor
         if self._current_progress_remaining < 0.75 and normalise.mean.any():
             return
+        self.rounds += 1
         mean, spread = seen.mean(axis=0, dtype=np.float64), np.cov(seen.T.astype(np.float64))
-        normalise.set(mean, whitening(spread))
+        self.mean += (mean - self.mean) / self.rounds
+        self.spread += (spread - self.spread) / self.rounds
+        before, after = normalise.scaling.numpy().astype(np.float64), whitening(self.spread)
+        normalise.set(self.mean, after)
+        if self.rounds > 1:
+            weights = self.weights.reshape(2, -1).numpy() @ before.T @ np.linalg.inv(after).T
+            self.weights = torch.as_tensor(weights.reshape(-1), dtype=torch.float32)
