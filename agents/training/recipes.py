@@ -173,9 +173,9 @@ class SAC(Reinforcement):
     """Soft actor-critic on the same batch, from nothing."""
 
     name: str = "sac"
-    steps: int = 400_000
-    num_envs: int = 16
-    buffer_size: int = 400_000
+    steps: int = 1_000_000
+    num_envs: int = 64
+    buffer_size: int = 1_000_000
     learning_starts: int = 10_000
     """Steps of random actions before the first update."""
     batch_size: int = 512
@@ -183,6 +183,8 @@ class SAC(Reinforcement):
     """Updates after each step of all slots."""
     learning_rate: float = 5e-4
     tau: float = 0.01
+    ent_coef: str = "auto_0.005"
+    """Weight of the entropy at the start, in units of the reward times 1 - gamma; it adapts."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,7 +192,7 @@ class RandomSearch(Reinforcement):
     """Augmented random search of a linear policy, from nothing: no gradient, no critic, no discount."""
 
     name: str = "random-search"
-    steps: int = 100_000_000
+    steps: int = 200_000_000
     num_envs: int = 512
     """Shared out among the candidates, each of which meets the same crystals."""
     gamma: float = 0.0
@@ -198,9 +200,9 @@ class RandomSearch(Reinforcement):
     """Directions of a round; either way along each is a candidate."""
     n_top: int = 16
     """Best directions of a round that are followed."""
-    delta_std: float = 0.03
+    delta_std: float = 0.01
     """Spread of the candidates' weights."""
-    part: int = 360
+    part: int = 1440
     """Steps of an episode that candidates are compared on."""
     learning_rate: float = 0.02
 
