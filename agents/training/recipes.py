@@ -204,7 +204,7 @@ class RandomSearch(Reinforcement):
     """Spread of the candidates' weights."""
     part: int = 1440
     """Steps of an episode that candidates are compared on."""
-    learning_rate: float = 0.02
+    learning_rate: float = 0.04
 
 
 LQG_COST = CostWeights(pull=0.11, pull_step=0.049, heater_step=23.4)

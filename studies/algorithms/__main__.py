@@ -17,8 +17,8 @@ ROWS = (
         RECIPES["gradient"], "the cost's exact gradient through policy and plant, from nothing; the plant is known"
     ),
     Variant(RECIPES["ppo"], "proximal policy optimisation from nothing; the critic also sees the true state"),
-    Variant(RECIPES["ppo-recurrent"], "the same of an LSTM; actor and critic see what is measured", "ppo"),
-    Variant(RECIPES["sac"], "soft actor-critic from nothing; both see what is measured", "ppo"),
+    Variant(RECIPES["ppo-recurrent"], "the same of an LSTM; actor and critic see the past", "ppo"),
+    Variant(RECIPES["sac"], "soft actor-critic from nothing; both see the past", "ppo"),
     Variant(RECIPES["random-search"], "augmented random search of a linear policy, from nothing", "ppo"),
     Variant(RECIPES["imitation"], "no reward: DAgger, the teacher is a privileged LQG", "ppo"),
 )
