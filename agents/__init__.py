@@ -14,6 +14,7 @@ from pathlib import Path
 from cz_gym.agents.agent_file.contract import AgentFileError, Contract, read_agent
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.config import Config
+from cz_gym.names import unknown
 
 __all__ = ["AgentFileError", "Contract", "OnnxPolicy", "load", "shipped", "shipped_seeds"]
 
@@ -38,7 +39,7 @@ def shipped_seeds(name: str = DEFAULT) -> list[Path]:
     found = {int(path.stem.removeprefix(f"{name}-seed")): path for path in MODELS.glob(f"{name}-seed[0-9]*.onnx")}
     if not found:
         there = sorted({path.stem.rpartition("-seed")[0] for path in MODELS.glob("*-seed*.onnx")})
-        raise AgentFileError(f"no shipped agent {name!r:.80}; there are: {', '.join(there) or 'none'}")
+        raise AgentFileError(unknown("shipped agent", name, there))
     return [found[seed] for seed in sorted(found)]
 
 

@@ -14,6 +14,7 @@ from cz_gym.baselines.pid.compensated_pid import CompensatedPID
 from cz_gym.baselines.pid.open_loop import OpenLoop
 from cz_gym.baselines.pid.settings import tuned
 from cz_gym.config import Config
+from cz_gym.names import unknown
 
 from .policy import Policy
 
@@ -110,7 +111,7 @@ def find_controller(name: str) -> Entry:
     for entry in CONTROLLERS:
         if entry.name == name:
             return entry
-    raise ValueError(f"unknown controller {name!r}; choose from {', '.join(entry.name for entry in CONTROLLERS)}")
+    raise ValueError(unknown("controller", name, [entry.name for entry in CONTROLLERS]))
 
 
 def make_controller(name: str, config: Config) -> Policy:

@@ -13,6 +13,7 @@ from cz_gym.camera.view import Camera, camera_for, check_camera
 from cz_gym.episodes.scenario import Range, Scenario
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario, mix_of
 from cz_gym.jit.cache import hashed
+from cz_gym.names import unknown
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters, check_parameters
 from cz_gym.physics.plant import make_puller
@@ -125,9 +126,9 @@ def make_config(
     found = find_scenario(scenario)
     mix_of(model, found)
     if not isinstance(observation, str) or observation not in (*OBSERVATIONS, CAMERA):
-        raise ValueError(f"unknown observation {observation!r}; choose one of {', '.join([*OBSERVATIONS, CAMERA])}")
+        raise ValueError(unknown("observation", observation, [*OBSERVATIONS, CAMERA]))
     if action not in ACTIONS:
-        raise ValueError(f"unknown action {action!r}; choose one of {', '.join(ACTIONS)}")
+        raise ValueError(unknown("action", action, ACTIONS))
     if camera is not None and observation != CAMERA:
         raise ValueError(f'a camera is of use with observation="camera" only, not with {observation!r}')
     interval = _positive("control_interval", control_interval)

@@ -17,6 +17,7 @@ from cz_gym.engine.batch import Batch, SlotState, new_key
 from cz_gym.engine.layout import INFO, LEAN, check_info
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import find_scenario
+from cz_gym.names import unknown
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.rendering.view import FPS, Frame, declared_modes, make_view
@@ -58,9 +59,9 @@ def check_options(options: dict[str, Any] | None, allowed: tuple[str, ...] = _OP
     if options is not None and not isinstance(options, Mapping):
         raise ValueError(f"reset options must be a dict, not {options!r}")
     given = dict(options or {})
-    unknown = [key for key in given if key not in allowed]
-    if unknown:
-        raise ValueError(f"unknown reset option {unknown[0]!r}; choose from {', '.join(allowed)}")
+    for key in given:
+        if key not in allowed:
+            raise ValueError(unknown("reset option", key, allowed))
     if "scenario" in given and "state" in given:
         raise ValueError("reset options 'scenario' and 'state' exclude each other: a state has its own episode")
     return given

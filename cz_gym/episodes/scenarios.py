@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from numbers import Real
 
+from cz_gym.names import unknown
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 from .scenario import Actuators, Drift, Faults, Interface, Pullers, Recipe, Reference, Scenario, Sensor
@@ -124,7 +125,10 @@ def find_scenario(scenario: str | Scenario) -> Scenario:
         return scenario
     if isinstance(scenario, str) and scenario in SCENARIOS:
         return SCENARIOS[scenario]
-    raise ValueError(f"unknown scenario {scenario!r}; choose one of {', '.join(SCENARIOS)}, or pass a cz_gym.Scenario")
+    name, _, model = scenario.rpartition("-") if isinstance(scenario, str) else ("", "", "")
+    if name in SCENARIOS and model in ("I", "II"):
+        raise ValueError(f"{scenario!r} is a row of the benchmark: the scenario is {name!r}, with model={model!r}")
+    raise ValueError(unknown("scenario", scenario, SCENARIOS, ", or pass a cz_gym.Scenario"))
 
 
 def mix_of(model: str | float | None, scenario: Scenario) -> tuple[float, float]:

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from cz_gym.config import Config
+from cz_gym.names import unknown
 
 from .protocol import SLOW_EPISODES, Row
 from .results import Controller
@@ -99,7 +100,7 @@ def choose(
         wanted += list(given or shipped)
     for name in wanted:
         if name not in names + learned:
-            raise ValueError(f"unknown controller {name!r}; choose from {', '.join(names + learned)}, or all")
+            raise ValueError(unknown("controller", name, names + learned, ", or all"))
     chosen = [each for each in classical if each.name in wanted]
     for each in chosen:
         if each.controller.slow and each.name not in slow:

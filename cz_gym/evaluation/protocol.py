@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from cz_gym.config import Config, make_config
 from cz_gym.episodes.scenarios import SCENARIOS
+from cz_gym.names import unknown
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 
@@ -103,7 +104,7 @@ def find_row(name: str) -> Row:
     for row in ROWS:
         if row.name == name:
             return row
-    raise ValueError(f"unknown scenario {name!r}; choose from {', '.join(row.name for row in ROWS)}")
+    raise ValueError(unknown("scenario", name, [row.name for row in ROWS]))
 
 
 def check_episodes(episodes: int) -> int:

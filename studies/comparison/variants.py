@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from cz_gym.agents.training.recipes import Recipe, Rewarded
+from cz_gym.names import unknown
 
 
 @dataclass(frozen=True)
@@ -48,5 +49,5 @@ class Study(NamedTuple):
         names = known if wanted is None else wanted.split(",")
         for name in names:
             if name not in known:
-                raise ValueError(f"unknown row {name!r}; choose from {', '.join(known)}")
+                raise ValueError(unknown("row", name, known))
         return names

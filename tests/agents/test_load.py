@@ -36,8 +36,8 @@ def test_an_agent_is_loaded_by_its_file() -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("imitatoin", "no shipped agent 'imitatoin'; there are: imitation, ppo"),
-        ("", "no shipped agent ''; there are"),
+        ("imitatoin", "unknown shipped agent 'imitatoin': did you mean 'imitation'\\? Choose from "),
+        ("", "unknown shipped agent ''; choose from"),
         ("nobody.onnx", "nobody.onnx: no such file"),
     ],
 )

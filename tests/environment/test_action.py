@@ -86,7 +86,7 @@ def test_settings_and_states_tell_the_kind_of_action() -> None:
     env.reset(seed=0)
     with pytest.raises(ValueError, match="action smooth, not direct"):
         CzEnv().set_state(env.get_state())
-    with pytest.raises(ValueError, match="unknown action 'rough'; choose one of direct, smooth, rate"):
+    with pytest.raises(ValueError, match="unknown action 'rough'; choose from direct, smooth, rate"):
         gym.make("Cz-v0", action="rough")
 
 

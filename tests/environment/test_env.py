@@ -42,12 +42,14 @@ def test_everything_advertised_is_there() -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        ({"scenario": "nonsense"}, "unknown scenario 'nonsense'; choose one of nominal"),
+        ({"scenario": "paper-ramp-II"}, "the scenario is 'paper-ramp', with model='II'"),
+        ({"scenario": "randomised"}, "unknown scenario 'randomised': did you mean 'randomized'"),
+        ({"scenario": "nonsense"}, "unknown scenario 'nonsense'; choose from nominal"),
         ({"scenario": 3}, "unknown scenario 3"),
         ({"model": 1.5}, "not 1.5"),
         ({"model": "III"}, "not 'III'"),
         ({"model": math.nan}, "not nan"),
-        ({"observation": "all"}, "unknown observation 'all'; choose one of measured, history, state"),
+        ({"observation": "all"}, "unknown observation 'all'; choose from measured, history, state"),
         ({"control_interval": 0}, "control_interval must be a positive number"),
         ({"control_interval": -5.0}, "not -5.0"),
         ({"control_interval": math.nan}, "not nan"),

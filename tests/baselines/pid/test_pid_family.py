@@ -165,5 +165,5 @@ def test_without_disturbance_it_stays_where_it_is(name):
 
 
 def test_unknown_settings_are_named():
-    with pytest.raises(ValueError, match="no settings for 'nobody'"):
+    with pytest.raises(ValueError, match="unknown controller with settings 'nobody'"):
         tuned("nobody", make_config())
