@@ -67,14 +67,24 @@ class Rollout:
 def rollout(
     policy: Any, config: Config, seeds: Sequence[int], progress: Callable[[int], None] | None = None
 ) -> Rollout:
-    """Run ``policy.predict`` on one episode a seed, all in one batch; ValueError without a seed.
+    """Run ``policy.predict`` on one episode a seed, all in one batch.
+
+    ValueError without a seed, and for a policy that was made for another control interval than the config's.
 
     ``progress`` is called with the number of steps done since its last call. A failed episode stops counting; its
     slot goes on with another crystal, which nothing reads. A bound with a method ``for_episodes(config, seeds)`` is
     replaced by what it returns, which knows those episodes.
     """
+    if not isinstance(config, Config):
+        raise ValueError(f"a rollout needs a config, as make_config({config!r:.80}) makes one")
     if not seeds:
         raise ValueError("a rollout needs at least one seed")
+    made_for = getattr(getattr(policy, "contract", policy), "control_interval", None)
+    if made_for is not None and made_for != config.control_interval:
+        raise ValueError(
+            f"this {type(policy).__name__} was made for an action every {made_for:g} s, "
+            f"the environment takes one every {config.control_interval:g} s"
+        )
     before = time.perf_counter()
     if hasattr(policy, "for_episodes"):
         policy = policy.for_episodes(config, list(seeds))
@@ -104,9 +114,10 @@ class Course:
         """Let the policy act until ``upto`` steps are done."""
         while self.k < upto:
             before = time.perf_counter()
-            action, self.memory = policy.predict(
-                self.observation, state=self.memory, episode_start=self.begins, deterministic=True
-            )
+            found = policy.predict(self.observation, state=self.memory, episode_start=self.begins, deterministic=True)
+            if not (isinstance(found, tuple) and len(found) == 2):
+                raise ValueError(f"predict must return a tuple (action, state), not {type(found).__name__}")
+            action, self.memory = found
             self.seconds += time.perf_counter() - before
             self._step(action)
             if progress is not None:

@@ -128,3 +128,23 @@ def test_compute_is_time_in_predict_per_step_and_episode() -> None:
 def test_no_seeds_no_rollout() -> None:
     with pytest.raises(ValueError, match="at least one seed"):
         rollout(OpenLoop(), SHORT, [])
+
+
+class OnlyAnAction:
+    """Forgets that ``predict`` returns its state too."""
+
+    def predict(self, observation: Any, **rest: Any) -> np.ndarray:
+        return np.zeros((len(observation), 2), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("policy", "config", "message"),
+    [
+        (CompensatedPID(control_interval=2.0), SHORT, "was made for an action every 2 s, the environment takes one"),
+        (OnlyAnAction(), SHORT, r"predict must return a tuple \(action, state\), not ndarray"),
+        (OpenLoop(), "randomized", r"needs a config, as make_config\('randomized'\) makes one"),
+    ],
+)
+def test_silent_traps_speak(policy: Any, config: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        rollout(policy, config, [1])
