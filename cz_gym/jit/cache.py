@@ -13,6 +13,7 @@ import hashlib
 import importlib
 import os
 import pickle
+import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
@@ -138,6 +139,16 @@ class CachedCode(FunctionCache):  # type: ignore[misc]
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Compiled code for this signature, or None: whatever cannot be put together again is compiled again."""
         try:
-            return super().load_overload(sig, target_context)
+            found = super().load_overload(sig, target_context)
         except Exception:
-            return None
+            found = None
+        if found is None:
+            announce()
+        return found
+
+
+@cache
+def announce() -> None:
+    """Say once, to whoever sits before a terminal, what the first use waits for."""
+    if sys.stderr.isatty():
+        print("cz_gym: compiling the plant for this machine, once; about 20 s", file=sys.stderr, flush=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from cz_gym.jit.cache import Store, cache_folder, hashed, source_hash
+from cz_gym.jit.cache import Store, announce, cache_folder, hashed, source_hash
 from cz_gym.jit.compile import kernel
 from cz_gym.physics.meniscus import hurle_slope
 
@@ -198,3 +198,15 @@ def test_only_functions_of_the_package_are_hashed() -> None:
     assert hashed(hurle_slope)
     assert not hashed(hurle_slope, lambda r_c, h_c, p: (0.0, 1.0))
     assert not hashed(abs)
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_compiling_is_announced_once_to_a_terminal(
+    terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    announce.cache_clear()
+    for _ in range(2):
+        announce()
+    assert capsys.readouterr().err.count("compiling the plant") == terminal
+    announce.cache_clear()
