@@ -22,6 +22,8 @@ FOLDER = Path(__file__).resolve().parent / "results" / "benchmark"
 """Where the committed results are."""
 README = FOLDER.parents[1] / "README.md"
 """Where the committed results are quoted, between two markers."""
+OWN = Path("runs/benchmark")
+"""Results with the user's own controllers or scenarios, unless told otherwise."""
 CACHE = FOLDER.parent / "cache"
 """Where episodes of slow controllers are cached."""
 BOUNDS = FOLDER.parent / "bounds"
@@ -49,6 +51,20 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
         "training seeds of one agent"
     )
     add("--agent", type=_agent_file, action="append", default=[], metavar="[NAME=]FILE", help=agent_help)
+    add(
+        "--controller",
+        action="append",
+        default=[],
+        metavar="FILE.py:NAME",
+        help="controller of your own, beside the others",
+    )
+    add(
+        "--scenario",
+        action="append",
+        default=[],
+        metavar="FILE.py:NAME",
+        help="scenario of your own, in place of others",
+    )
     add("--slow", action="store_true", help="slow controllers too, on 50 episodes; resumed from results/cache")
     add("--overwrite", action="store_true", help="replace files of earlier or other runs")
     add("--quiet", action="store_true", help="no progress bar, no table")
@@ -72,7 +88,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the benchmark; 0 when done, 2 for bad input, 130 when interrupted."""
     arguments = parse(argv)
     if arguments.out is None and arguments.json is None:
-        arguments.out = FOLDER
+        mine = bool(arguments.controller or arguments.scenario)
+        arguments.out = OWN if mine else FOLDER
+        arguments.overwrite |= mine
     command = shlex.join(["benchmark.py", *(sys.argv[1:] if argv is None else argv)])
     return guarded("benchmark.py", lambda: benchmark(arguments, command), "benchmark")
 
@@ -111,21 +129,26 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
 
 def make_plan(arguments: argparse.Namespace, command: str) -> Plan:
     """What the command line asks for; ValueError names what was given and what is allowed."""
+    from cz_gym.evaluation import user_code
     from cz_gym.evaluation.contenders import check_intervals, choose
     from cz_gym.evaluation.protocol import ROWS, check_episodes, find_row
     from cz_gym.evaluation.runner import Plan
 
     episodes = check_episodes(arguments.episodes)
-    names = arguments.scenarios or [row.name for row in ROWS if row.default]
-    plan = Plan((), tuple(find_row(name) for name in names), episodes, command, CACHE, BOUNDS)
+    names = arguments.scenarios or [row.name for row in ROWS if row.default and not arguments.scenario]
+    rows = [*map(find_row, names), *map(user_code.row, arguments.scenario)]
+    user_code.check_apart([row.name for row in rows], "scenario")
+    plan = Plan((), tuple(rows), episodes, command, CACHE, BOUNDS)
+    own = [user_code.controller(place) for place in arguments.controller]
     controllers = classical()
+    user_code.check_apart([each.name for each in (*controllers, *own)], "controller")
     slow = [each for each in controllers if each.controller.slow]
     if not arguments.slow:
         slow = [each for each in slow if arguments.controllers and plan.is_cached(each)]
     shipped = {name: partial(_shipped, name) for name in SHIPPED}
     chosen = choose(arguments.controllers, controllers, _given(arguments.agent), shipped, [each.name for each in slow])
     check_intervals(chosen, plan.rows)
-    return replace(plan, contenders=chosen)
+    return replace(plan, contenders=(*chosen, *own))
 
 
 def classical() -> list[Contender]:
@@ -181,7 +204,8 @@ def is_partial(arguments: argparse.Namespace, plan: Plan) -> bool:
     everyone = {each.name for each in classical() if each.default} | set(SHIPPED)
     missing = everyone - {contender.name for contender in plan.contenders}
     rows = {row for row in ROWS if row.default} - set(plan.rows)
-    return bool(plan.episodes < EPISODES or missing or rows or arguments.agent)
+    more = arguments.agent or arguments.controller or arguments.scenario
+    return bool(plan.episodes < EPISODES or missing or rows or more)
 
 
 if __name__ == "__main__":

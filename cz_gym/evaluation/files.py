@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.episodes.scenarios import SCENARIOS
+from cz_gym.episodes.scenarios import find_scenario
 
 from .metrics import metric_names
 from .results import BOUND, REFERENCE, Benchmark, Controller, Outcome, ScenarioResult
@@ -111,8 +111,8 @@ def _provenance(benchmark: Benchmark) -> dict[str, Any]:
 def _crystals(scenario: ScenarioResult) -> dict[str, Any]:
     row = scenario.row
     return {
-        "scenario": row.scenario,
-        "hash": SCENARIOS[row.scenario].hash,
+        "scenario": find_scenario(row.scenario).name,
+        "hash": find_scenario(row.scenario).hash,
         "model": row.model,
         "control_interval_s": row.control_interval,
         "meniscus": row.meniscus.name,

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from cz_gym.config import Config, make_config
-from cz_gym.episodes.scenarios import SCENARIOS
+from cz_gym.episodes.scenario import Scenario
+from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.names import unknown
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
@@ -26,7 +27,7 @@ class Row:
     """A scenario as the benchmark runs it."""
 
     name: str
-    scenario: str
+    scenario: str | Scenario
     meaning: str
     """One line for people."""
     model: str | None = None
@@ -50,7 +51,7 @@ class Row:
 
     def seeds(self, episodes: int) -> range:
         """The first test seeds; one where every draw is the same."""
-        return TEST_SEEDS[: 1 if SCENARIOS[self.scenario].deterministic else episodes]
+        return TEST_SEEDS[: 1 if find_scenario(self.scenario).deterministic else episodes]
 
 
 _RAMP = (

@@ -390,3 +390,62 @@ def test_an_agent_that_reads_the_true_state_is_a_bound_and_wins_nothing(tmp_path
     found = json.loads((tmp_path / "out.json").read_text())
     assert set(found["results"]["reference-b"]) == {"paper", "seer"}
     assert found["verdicts"]["reference-b"] == {}
+
+
+MINE = """
+from dataclasses import dataclass, replace
+import numpy as np
+from cz_gym.episodes.scenarios import REFERENCE_B
+
+@dataclass(frozen=True)
+class Still:
+    control_interval: float = 1.0
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        assert self.control_interval == 5.0
+        return np.zeros((len(observation), 2), np.float32), state
+
+still = Still(5.0)
+def made(config): return Still(config.control_interval)
+number = 3
+later = replace(REFERENCE_B, name="later")
+"""
+
+
+def test_controllers_and_scenarios_of_one_s_own_file_take_part(tmp_path: Path) -> None:
+    mine = tmp_path / "mine.py"
+    mine.write_text(MINE)
+    given = [part for name in ("Still", "still", "made") for part in ("--controller", f"{mine}:{name}")]
+    out = tmp_path / "out"
+    assert benchmark.main([*ONE[2:], *given, "--scenario", f"{mine}:later", "--out", str(out)]) == 0
+    results = json.loads((out / "benchmark.json").read_text())["results"]["later"]
+    assert list(results) == ["open-loop", "Still", "still", "made"]
+    assert len({each["rmse_mm"]["mean"] for each in results.values()}) == 1
+    assert benchmark.parse(["--controller", "a.py:B"]).out is None
+
+
+@pytest.mark.parametrize(
+    ("option", "place", "message"),
+    [
+        ("--controller", "mine.py", "must be FILE.py:NAME"),
+        ("--controller", "nobody.py:Still", "no such file"),
+        ("--controller", "mine.py:Stil", "unknown name 'Stil': did you mean 'Still'"),
+        ("--controller", "mine.py:number", "no controller"),
+        ("--controller", "mine.py:later", "no controller"),
+        ("--scenario", "mine.py:Still", "no scenario"),
+        ("--controller", "broken.py:Still", "ZeroDivisionError"),
+        ("--controller", "lqg.py:lqg", "two controllers are called 'lqg'"),
+    ],
+)
+def test_files_of_one_s_own_that_do_not_fit_get_one_line(
+    option: str,
+    place: str,
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text(MINE)
+    Path("broken.py").write_text("1 / 0")
+    Path("lqg.py").write_text(f"{MINE}\nlqg = still")
+    assert message in refused([option, place], capsys)

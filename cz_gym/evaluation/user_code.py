@@ -1,0 +1,84 @@
+"""Controllers and scenarios of the user's own files, by ``FILE.py:NAME``: the file is run as Python."""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from cz_gym.config import Config
+from cz_gym.episodes.scenario import Scenario
+from cz_gym.names import unknown
+
+from .contenders import Contender
+from .protocol import Row
+from .results import Controller
+
+
+def load(place: str) -> tuple[str, Any]:
+    """The name and the object at ``FILE.py:NAME``; ValueError says in one line why there is none."""
+    file, colon, name = place.rpartition(":")
+    path = Path(file)
+    if not colon or path.suffix != ".py" or not name.isidentifier():
+        raise ValueError(f"must be FILE.py:NAME, not {place!r:.80}")
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file")
+    module_name = f"cz_gym_user_{path.stem}"
+    spec: Any = importlib.util.spec_from_file_location(module_name, path)
+    # Dataclasses look their module up.
+    module = sys.modules[module_name] = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # whatever the user's file raises
+        raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
+    if not hasattr(module, name):
+        public = [each for each in vars(module) if not each.startswith("_")]
+        raise ValueError(f"{path}: {unknown('name', name, public)}")
+    return name, getattr(module, name)
+
+
+def controller(place: str) -> Contender:
+    """A controller to take part: an object with ``predict``, or a class or function that makes one.
+
+    It is made without arguments, with ``config`` (the environment's settings) or ``control_interval`` [s], whichever it
+    names. Its attributes ``observation`` and ``action`` say what it reads and what its actions mean; "measured" and
+    "direct" without.
+    """
+    name, found = load(place)
+    made = _maker(place, found)
+    reads, acts = (
+        getattr(found, each, default) for each, default in (("observation", "measured"), ("action", "direct"))
+    )
+    return Contender(Controller(name, str(reads), f"of {place}", action=str(acts)), lambda config: [made(config)])
+
+
+def _maker(place: str, found: Any) -> Callable[[Config], Any]:
+    if not inspect.isclass(found) and hasattr(found, "predict"):
+        return lambda config: found
+    if not callable(found) or (inspect.isclass(found) and not hasattr(found, "predict")):
+        raise ValueError(f"{place}: no controller: it has no method predict(observation, state, ...)")
+    known = inspect.signature(found).parameters
+
+    def make(config: Config) -> Any:
+        given = {"config": config, "control_interval": config.control_interval}
+        return found(**{name: value for name, value in given.items() if name in known})
+
+    return make
+
+
+def row(place: str) -> Row:
+    """A row of a scenario, a :class:`cz_gym.Scenario`."""
+    _, found = load(place)
+    if not isinstance(found, Scenario):
+        raise ValueError(f"{place}: no scenario: a {type(found).__name__}, not a cz_gym.Scenario")
+    return Row(found.name, found, f"of {place}", default=False)
+
+
+def check_apart(names: Sequence[str], kind: str) -> None:
+    """ValueError for a name that appears twice."""
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"two {kind}s are called {name!r}: rename yours")
