@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from cz_gym import CzEnv
 from cz_gym.baselines import CompensatedPID, OpenLoop
 from cz_gym.camera import Camera
 from cz_gym.config import Config, make_config
+from cz_gym.evaluation import plot
 from cz_gym.evaluation.rollout import Course, Rollout, Signals, rollout
 from cz_gym.observation import MEASURED
 
@@ -148,3 +150,13 @@ class OnlyAnAction:
 def test_silent_traps_speak(policy: Any, config: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         rollout(policy, config, [1])
+
+
+def test_a_rollout_can_be_looked_at(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    run = rollout(OpenLoop(), SHORT, [1, 2])
+    figure = plot(run, 1, tmp_path / "crystal.png")
+    assert (tmp_path / "crystal.png").read_bytes().startswith(b"\x89PNG")
+    assert [panel.get_ylabel() for panel in figure.axes][0] == "radius error [mm]"
+    with pytest.raises(IndexError, match="below 2"):
+        plot(run, 2)
