@@ -157,6 +157,6 @@ def test_a_rollout_can_be_looked_at(tmp_path: Path) -> None:
     run = rollout(OpenLoop(), SHORT, [1, 2])
     figure = plot(run, 1, tmp_path / "crystal.png")
     assert (tmp_path / "crystal.png").read_bytes().startswith(b"\x89PNG")
-    assert [panel.get_ylabel() for panel in figure.axes][0] == "radius error [mm]"
+    assert figure.axes[0].get_ylabel() == "radius error [mm]"
     with pytest.raises(IndexError, match="below 2"):
         plot(run, 2)
