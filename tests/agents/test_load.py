@@ -7,9 +7,8 @@ import pytest
 
 from cz_gym import agents
 from cz_gym.agents.agent_file.contract import read_agent
-from cz_gym.observation import HISTORY
 
-SHIPPED = {"imitation": 3, "ppo": 3}
+SHIPPED = {"gradient": 10, "imitation": 3, "ppo": 3, "random-search": 3}
 """Training seeds of each name."""
 
 
@@ -21,7 +20,7 @@ def test_every_shipped_agent_is_called_by_how_it_was_made(name: str) -> None:
     assert all((contract.training_steps > 0) == (name != "imitation") for contract in contracts)
     policy = agents.load(name)
     assert policy.contract.validation_cost == min(contract.validation_cost for contract in contracts)
-    assert policy.predict(np.zeros((3, len(HISTORY)), np.float32))[0].shape == (3, 2)
+    assert policy.predict(np.zeros((3, policy.contract.channels), np.float32))[0].shape == (3, 2)
 
 
 def test_nothing_else_is_shipped() -> None:

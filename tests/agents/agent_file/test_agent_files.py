@@ -140,7 +140,8 @@ def test_damaged_files_always_give_one_line(
 
 def test_shipped_agent_beats_the_paper_s_controller_on_validation() -> None:
     seeds = range(1_000_000, 1_000_030)
-    agent = metrics(rollout(OnnxPolicy.load(shipped(), CONFIG), CONFIG, seeds))
+    policy = OnnxPolicy.load(shipped(), CONFIG)
+    agent = metrics(rollout(policy, make_config(observation=policy.observation, action=policy.action), seeds))
     paper = metrics(rollout(CompensatedPID(), make_config(), seeds))
     assert agent.rmse_mm.mean() < 0.3 * paper.rmse_mm.mean()
     assert agent.failure_rate.sum() == 0
