@@ -6,48 +6,15 @@ import argparse
 import csv
 import io
 import sys
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
 
 from cz_gym.commands import OneLineParser, between, guarded
 from studies.markdown import table
 
-if TYPE_CHECKING:
-    from cz_gym.agents.training.validation import Validation
-
-
-class Row(NamedTuple):
-    """What one training seed of an example reached on 100 validation crystals."""
-
-    example: str
-    seed: int
-    minutes: float
-    """From start to judged agent."""
-    rmse_mm: float
-    pull_step_rms_mm_per_min: float
-    lost: float
-    """Share of lost crystals [-]."""
-
-
-def sb3_ppo(seed: int) -> Validation:
-    """The example of stable-baselines3."""
-    from examples import sb3_ppo
-
-    return sb3_ppo.main(seed, out=Path(f"runs/plain_tools/sb3-ppo-seed{seed}.onnx"))
-
-
-def cleanrl_ppo(seed: int) -> Validation:
-    """The example in the manner of CleanRL."""
-    from examples import cleanrl_ppo
-
-    return cleanrl_ppo.main(cleanrl_ppo.Args(seed=seed))
-
-
-EXAMPLES: dict[str, Callable[[int], Validation]] = {"sb3_ppo": sb3_ppo, "cleanrl_ppo": cleanrl_ppo}
+from .runs import EXAMPLES, Row, timed
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -55,6 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = OneLineParser(prog="python -m studies.plain_tools", description=__doc__)
     parser.add_argument("--examples", nargs="+", choices=EXAMPLES, default=list(EXAMPLES), help="which (default: all)")
     parser.add_argument("--seeds", type=between(1, 100), default=5, help="training seeds of each (default: 5)")
+    parser.add_argument("--steps", type=between(1, 10**9), help="steps of each run (default: the example's)")
     parser.add_argument("--jobs", type=between(1, 64), default=1, help="runs at once (default: 1)")
     parser.add_argument("--out", type=Path, default=Path("results/plain_tools"), help="results (default: %(default)s)")
     given = parser.parse_args(arguments)
@@ -70,20 +38,12 @@ def _main(given: argparse.Namespace) -> int:
     asked = [(name, seed) for seed in range(given.seeds) for name in given.examples]
     missing = [each for each in asked if each not in {row[:2] for row in rows}]
     with ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
-        for each in as_completed([pool.submit(timed, *task) for task in missing]):
+        for each in as_completed([pool.submit(timed, *task, given.steps) for task in missing]):
             rows = sorted([*rows, each.result()])
             print(to_table([each.result()]), flush=True)
             write_files({path: to_csv(rows), given.out / "table.md": (to_table(rows) + "\n").encode()})
     print(to_table([row for row in rows if row[:2] in asked]))
     return 0
-
-
-def timed(name: str, seed: int) -> Row:
-    """Run one training seed of an example."""
-    began = time.monotonic()
-    found = EXAMPLES[name](seed)
-    minutes = (time.monotonic() - began) / 60.0
-    return Row(name, seed, minutes, found.rmse_mm, found.pull_step_rms_mm_per_min, found.failure_rate)
 
 
 def read(path: Path) -> list[Row]:

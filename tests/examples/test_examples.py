@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -39,3 +41,21 @@ def test_the_study_goes_on_from_what_is_finished(tmp_path: Path, capsys: pytest.
     (tmp_path / "runs.csv").write_text("example,seed\nsb3_ppo,first\n")
     assert plain_tools.main(["--out", str(tmp_path)]) == 2
     assert "damaged" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_study_runs_examples_in_processes_of_their_own(tmp_path: Path) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "studies.plain_tools",
+        "--seeds",
+        "1",
+        "--steps",
+        "100",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert [row.example for row in plain_tools.read(tmp_path / "out" / "runs.csv")] == ["cleanrl_ppo", "sb3_ppo"]
