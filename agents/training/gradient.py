@@ -5,6 +5,7 @@ The plant's derivatives are those of :class:`cz_gym.differentiable.Differentiabl
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -59,7 +60,7 @@ class GradientLearner:
         torch.manual_seed(seed)
         self.recipe, self.config, self.logger = recipe, config, logger
         self.per_update = recipe.num_envs * recipe.window
-        self.total = recipe.steps // self.per_update * self.per_update
+        self.total = math.ceil(recipe.steps / self.per_update) * self.per_update
         self.steps = done
         self.network = FilterBank(config.control_interval, recipe.hidden)
         self.optimiser = torch.optim.Adam(self.network.parameters(), recipe.learning_rate)

@@ -184,7 +184,7 @@ def test_the_paper_peaks_where_it_should(tmp_path: Path, capsys: pytest.CaptureF
         (["--controllers", "pid"], "unknown controller 'pid'; choose from open-loop, paper"),
         (["--controllers", "paper,,ppo"], "names with commas between"),
         (["--scenarios", "easy"], "unknown scenario 'easy'; choose from randomized, hard"),
-        (["--scenario", "hard"], "unrecognized arguments"),
+        (["--scenario", "hard"], "must be FILE.py:NAME, not 'hard'"),
         (["--agent", "nowhere.onnx"], "nowhere.onnx: no such file"),
         (["--controllers", "paper", "--out", "/dev/null/results"], "not a folder"),
         (["--controllers", "paper", "--json", "/"], "is a folder"),

@@ -130,7 +130,7 @@ def test_a_damaged_result_is_named(content: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--rows", "ppo,sacc"], "unknown row 'sacc'; choose from ppo, sac, ppo-recurrent, few"),
+        (["--rows", "ppo,sacc"], "unknown row 'sacc': did you mean 'sac'? Choose from ppo, sac, ppo-recurrent, few"),
         (["--seeds", "0"], "--seeds: must be between 1 and 100, not 0"),
         (["--steps", "-5"], "--steps: must be between 1"),
         (["--jobs", "0"], "--jobs: must be between 1 and 64, not 0"),

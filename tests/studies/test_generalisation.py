@@ -75,11 +75,3 @@ def test_what_cannot_be_tabulated_is_one_line(
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
-
-
-def test_the_page_shows_the_committed_table() -> None:
-    root = Path(__file__).parents[2]
-    table = (root / "results" / "generalisation" / "table.md").read_text().partition("\n")[2].strip()
-    page = (root / "docs" / "generalisation.md").read_text()
-    shown = page.partition("<!-- table:begin -->")[2].partition("<!-- table:end -->")[0].strip()
-    assert shown == table

@@ -14,7 +14,7 @@ import pytest
 import train
 from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.training import imitation, run, run_files
-from cz_gym.agents.training.recipes import PPO, RECIPES, Imitation
+from cz_gym.agents.training.recipes import PPO, RECIPES, Gradient, Imitation
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
 ROOT = Path(__file__).parents[3]
@@ -33,6 +33,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run, "PICKING", VALIDATION_SEEDS[:2])
     monkeypatch.setattr(run, "JUDGING", VALIDATION_SEEDS[2:4])
     monkeypatch.setitem(RECIPES, "ppo", PPO(num_envs=64, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,)))
+    monkeypatch.setitem(RECIPES, "gradient", Gradient(num_envs=16, window=12, steps=10_000, hidden=()))
     few = {"rounds": 2, "episodes": 4, "wide_share": 0.0, "epochs": 1, "hidden": (16,), "control_interval": 30.0}
     monkeypatch.setitem(RECIPES, "imitation", Imitation(name="imitation", teacher="lqg", **few))
 
@@ -42,9 +43,12 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_run_leaves_everything_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("algorithm", ["gradient", "ppo"])
+def test_a_run_leaves_everything_and_goes_on(
+    algorithm: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = tmp_path / "run"
-    assert train.main(["--steps", "20000", "--seed", "3", "--out", str(folder), "--plot"]) == 0
+    assert train.main(["--algo", algorithm, "--steps", "20000", "--seed", "3", "--out", str(folder), "--plot"]) == 0
     assert (folder / "progress.png").read_bytes().startswith(b"\x89PNG")
     saved = json.loads((folder / "settings.json").read_text())
     assert saved["seed"] == 3
@@ -61,11 +65,13 @@ def test_a_run_leaves_everything_and_goes_on(tmp_path: Path, capsys: pytest.Capt
     assert list((folder / "tensorboard").rglob("events.*"))
     before = rows(folder / "progress.csv")
     assert float(before[-1]["paper_rmse_mm"]) > float(before[-1]["lqg_rmse_mm"]) > 0
-    assert train.main(["--seed", "3", "--resume", "--out", str(folder)]) == 0, "nothing was left to learn"
+    assert train.main(["--algo", algorithm, "--seed", "3", "--resume", "--out", str(folder)]) == 0, (
+        "nothing was left to learn"
+    )
     assert rows(folder / "progress.csv")[:-1] == before
-    assert train.main(["--out", str(folder)]) == 2
+    assert train.main(["--algo", algorithm, "--out", str(folder)]) == 2
     assert "--resume" in capsys.readouterr().err
-    assert train.main(["--steps", "40000", "--seed", "3", "--resume", "--out", str(folder)]) == 0
+    assert train.main(["--algo", algorithm, "--steps", "40000", "--seed", "3", "--resume", "--out", str(folder)]) == 0
     after = rows(folder / "progress.csv")
     assert after[: len(before)] == before
     assert int(after[-1]["steps"]) >= 40000 > int(before[-1]["steps"])
