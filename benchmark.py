@@ -141,7 +141,8 @@ def make_plan(arguments: argparse.Namespace, command: str) -> Plan:
     plan = Plan((), tuple(rows), episodes, command, CACHE, BOUNDS)
     own = [user_code.controller(place) for place in arguments.controller]
     controllers = classical()
-    user_code.check_apart([each.name for each in (*controllers, *own)], "controller")
+    reserved = [*(each.name for each in controllers), *SHIPPED, *{name for name, _ in arguments.agent if name}]
+    user_code.check_apart([*reserved, *(each.name for each in own)], "controller")
     slow = [each for each in controllers if each.controller.slow]
     if not arguments.slow:
         slow = [each for each in slow if arguments.controllers and plan.is_cached(each)]

@@ -17,7 +17,6 @@ import numpy as np
 
 from cz_gym.agents.agent_file.contract import AgentFileError, Contract, facts_of, make_contract, write_agent
 from cz_gym.agents.policies.onnx import OnnxPolicy
-from cz_gym.agents.training.recipes import OWN_WEIGHTS
 from cz_gym.agents.training.validation import JUDGING, validate
 from cz_gym.commands import OneLineParser, guarded
 from cz_gym.config import Config, make_config
@@ -77,7 +76,7 @@ def save_agent(
     apart = disagreement(agent, model, normalisation)
     if not apart <= TOLERANCE:
         raise AgentFileError(f"{path}: the file would act otherwise than the model, by up to {apart:.2g}")
-    found = validate(agent, config, JUDGING, OWN_WEIGHTS)
+    found = validate(agent, config, JUDGING)
     facts |= {"validation_cost": found.cost, "validation_rmse_mm": found.rmse_mm}
     return write_agent(path, content, **facts)
 
@@ -104,7 +103,7 @@ def to_onnx(model: BaseAlgorithm, normalisation: VecNormalize | None, observatio
         graph.acted(x, actor, "action")
     except TypeError as error:
         raise AgentFileError(str(error)) from None
-    return graph.finished(len(OBSERVATIONS[observation]), actor)
+    return graph.finished(len(OBSERVATIONS[observation]), actor.remembers)
 
 
 def disagreement(agent: OnnxPolicy, model: BaseAlgorithm, normalisation: VecNormalize | None) -> float:

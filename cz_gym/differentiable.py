@@ -6,10 +6,12 @@ The plant is the environment's own; nothing is approximated (:mod:`cz_gym.engine
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium.error import InvalidAction
 
 from cz_gym.config import Config
 from cz_gym.engine.batch import Batch, first_key
@@ -17,10 +19,16 @@ from cz_gym.engine.layout import INFO, Out
 from cz_gym.engine.tangents import ACTIONS, ROWS, SCRATCH, SMOOTH, build_tangents
 from cz_gym.episodes.record import GRID
 from cz_gym.observation import MEASURED, scales
+from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.task import Cost
 
 Floats = npt.NDArray[np.float64]
 _COSTS = [INFO.index(f"cost_{name}") for name in Cost._fields]
+
+
+@lru_cache(maxsize=8)
+def _compiled(meniscus: MeniscusModel) -> tuple[Any, Any]:
+    return build_tangents(meniscus)
 
 
 class Step(NamedTuple):
@@ -31,9 +39,10 @@ class Step(NamedTuple):
     measured: npt.NDArray[np.float32]
     """The "measured" observation, shape (n, 11)."""
     cost: Floats
-    """The four terms of the cost (:class:`cz_gym.task.Cost`), shape (n, 4); 0 for a lost crystal."""
+    """The four terms of the cost (:class:`cz_gym.task.Cost`), shape (n, 4)."""
     grows: npt.NDArray[np.bool_]
-    """Whether the crystal still grows, shape (n,). A lost one stays as it is, and all its derivatives are 0."""
+    """Whether the crystal grew, shape (n,). One that is lost, or was at its end, stays as it is; its cost and
+    derivatives are 0."""
     jacobian: Floats
     """Derivatives of the next state and of the cost's terms, shape (n, 13, 11): rows are state and cost, columns the
     state before and the two actions."""
@@ -48,13 +57,18 @@ class DifferentiableBatch:
     """Many crystals stepped side by side, each step with its derivatives.
 
     ``config`` is the environment's (:func:`cz_gym.config.make_config`). ValueError unless its control interval fits
-    whole into the 5 s that disturbances are held for, and its camera's latency into the control interval.
+    whole into the 5 s that disturbances are held for, its camera's latency into the control interval, and there is a
+    slot at least.
 
     Noise, freezes and drop-outs are there as in the environment; a reading that is held depends on the state that it
     was taken of. Whole steps of the heater and the rounding of observations are passed as if they were not.
     """
 
     def __init__(self, config: Config, num_envs: int, threads: int | None = 1) -> None:
+        if not isinstance(config, Config):
+            raise ValueError(f"a config is needed, as make_config({config!r:.80}) makes one")
+        if not isinstance(num_envs, int) or num_envs < 1:
+            raise ValueError(f"num_envs must be a positive whole number, not {num_envs!r}")
         parts = GRID / config.control_interval
         if abs(parts - round(parts)) > 1e-9 or round(parts) < 1:
             raise ValueError(f"control_interval must divide {GRID:g} s, not be {config.control_interval:g} s")
@@ -63,7 +77,7 @@ class DifferentiableBatch:
             raise ValueError(f"the camera's latency of {latency:g} s is longer than the control interval")
         self.config, self.num_envs = config, num_envs
         self._batch = Batch(config, num_envs, threads)
-        self._gather, self._tangents = build_tangents(config.meniscus)
+        self._gather, self._tangents = _compiled(config.meniscus)
         self._out = self._batch.new_out()
         self._state = np.zeros((num_envs, len(STATES)))
         self._grows = np.ones(num_envs, np.bool_)
@@ -81,15 +95,23 @@ class DifferentiableBatch:
             raise ValueError(f"expected a seed for each of {len(which)} slots, not {len(seeds)}")
         self._out = self._copied()
         self._batch.reset(which, [first_key(int(seed)) for seed in seeds], self._out)
+        self._grows = self._grows.copy()
         self._grows[list(which)] = True
         self._state = self._now()
         return self._state, self._out.observation
 
     def step(self, actions: npt.ArrayLike) -> Step:
-        """Hold actions, shape (n, 2), for one control interval; lost crystals stay."""
-        before, active, n = self._state, self._grows, self.num_envs
+        """Hold actions, shape (n, 2), for one control interval; crystals that are lost or at their end stay.
+
+        InvalidAction for NaN or another shape.
+        """
+        before, n = self._state, self.num_envs
+        given = np.asarray(actions, np.float64)
+        if given.shape != (n, ACTIONS) or np.isnan(given).any():
+            raise InvalidAction(f"actions must be numbers of shape {(n, ACTIONS)}, not {actions!r:.80}")
         batch, out = self._batch, self._copied()
-        batch.step(actions, out, active)
+        active = self._grows & (batch.memory.slots["k"] < batch.clock.steps)
+        batch.step(given, out, active)
         self._grows = active & ~out.terminated
         self._out, self._state = out, self._now()
         jacobian = np.empty((n, len(ROWS), len(STATES) + ACTIONS))
@@ -113,7 +135,7 @@ class DifferentiableBatch:
 
     @property
     def grows(self) -> npt.NDArray[np.bool_]:
-        """Which crystals still grow, shape (n,)."""
+        """Which crystals grew in the last step, shape (n,)."""
         return self._grows
 
     def close(self) -> None:

@@ -118,14 +118,13 @@ class OnnxGraph:
         x = self.node("MatMul", [x, self.constant("scaling", scaling)], "scaled")
         return self.clip(x, -NORMALISED_LIMIT, NORMALISED_LIMIT, "normalised")
 
-    def finished(self, channels: int, actor: Actor | None = None, state: int = 0) -> bytes:
-        """The model, checked and serialised; it remembers what the actor's LSTM does, or so many numbers."""
+    def finished(self, channels: int, state: int = 0) -> bytes:
+        """The model, checked and serialised; it remembers so many numbers."""
 
         def value(name: str, width: int) -> Any:
             return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", width])
 
         inputs, outputs = [value("observation", channels)], [value("action", len(DRIVE_CHANNELS))]
-        state = 2 * actor.lstm.hidden_size if actor and actor.lstm else state
         if state:
             inputs, outputs = [*inputs, value("state", state)], [*outputs, value("next_state", state)]
         graph = helper.make_graph(self._nodes, "cz_gym_agent", inputs, outputs, self._constants)
@@ -160,4 +159,4 @@ def actor_onnx(actor: Actor) -> bytes:
     assert isinstance(actor.extractor, Normalise)
     graph = OnnxGraph()
     graph.acted(graph.normalised(actor.extractor), actor, "action")
-    return graph.finished(min(len(actor.extractor.mean), len(HISTORY)), actor)
+    return graph.finished(min(len(actor.extractor.mean), len(HISTORY)), actor.remembers)

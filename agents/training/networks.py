@@ -131,3 +131,8 @@ class Actor(NamedTuple):
     lstm: nn.LSTM | None
     """Its LSTM; None without one."""
     layers: Sequence[nn.Module]
+
+    @property
+    def remembers(self) -> int:
+        """Numbers that it carries from step to step: hidden and cell values of its LSTM."""
+        return 2 * self.lstm.hidden_size if self.lstm is not None else 0

@@ -43,7 +43,7 @@ class RandomSearch(ARS):
     policy: WhitenedLinearPolicy
     weights: torch.Tensor  # type: ignore[assignment]  # None before its first round, said the library
 
-    def __init__(self, *arguments: Any, part: int = 360, **options: Any) -> None:
+    def __init__(self, *arguments: Any, part: int, **options: Any) -> None:
         self.part = part
         """Steps of an episode that candidates are compared on."""
         self.rounds, self.mean, self.spread = 0, np.zeros(len(HISTORY)), np.zeros((len(HISTORY), len(HISTORY)))

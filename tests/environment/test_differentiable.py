@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.error import InvalidAction
 
 from cz_gym.config import make_config
 from cz_gym.differentiable import STATES, DifferentiableBatch
@@ -14,6 +15,7 @@ from cz_gym.observation import MEASURED
 from cz_gym.physics.linearisation import jacobian
 from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.plant import Disturbance, Inputs, State, make_puller, rk4
+from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 
 STEPS = {"r_c": 1e-7, "h_c": 1e-7, "T_1": 1.0, "T_2": 1.0, "T_b": 1e-2, "v_p": 1e-9, "Q_H": 100.0, "a": 1e-3}
 """How far each number is moved for differences."""
@@ -145,3 +147,37 @@ def test_the_chain_rule_over_rk4_is_exact() -> None:
 def test_what_has_no_derivatives_is_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         DifferentiableBatch(make_config(**settings), 2)
+
+
+@pytest.mark.parametrize(("config", "slots"), [("randomized", 2), (make_config(), 0), (make_config(), 2.0)])
+def test_neither_config_nor_slots_is_refused(config: Any, slots: Any) -> None:
+    with pytest.raises(ValueError, match=r"a config is needed|num_envs must be"):
+        DifferentiableBatch(config, slots)
+
+
+@pytest.mark.parametrize("actions", [np.full((2, 2), np.nan), np.zeros(2), np.zeros((3, 2))])
+def test_actions_that_are_none_are_refused(actions: np.ndarray) -> None:
+    batch = DifferentiableBatch(make_config(), 2)
+    batch.reset([1, 2])
+    with pytest.raises(InvalidAction, match=r"shape \(2, 2\)"):
+        batch.step(actions)
+
+
+def test_crystals_at_their_end_stay() -> None:
+    batch = DifferentiableBatch(make_config(horizon=50.0), 2)
+    batch.reset([1, 2])
+    ends = [batch.step(np.zeros((2, 2))) for _ in range(12)]
+    assert [step.grows.all() for step in ends] == [True] * 10 + [False] * 2
+    np.testing.assert_array_equal(ends[-1].state, ends[9].state)
+    assert not ends[-1].cost.any()
+
+
+def test_the_exact_meniscus_has_derivatives_too() -> None:
+    batch = DifferentiableBatch(make_config(meniscus=YOUNG_LAPLACE), 4)
+    batch.reset(range(4))
+    slots, frames = batch._batch.memory.slots.copy(), batch._batch.memory.frames.copy()
+    column, by = STATES.index("h_c"), 1e-7
+    _, step = moved(batch, slots, frames, np.zeros((4, 2)), column, 0.0)
+    ahead, behind = (moved(batch, slots, frames, np.zeros((4, 2)), column, sign * by)[0] for sign in (1.0, -1.0))
+    rows = [STATES.index(name) for name in ("r_c", "h_c", "ring")]
+    np.testing.assert_allclose(step.jacobian[:, rows, column], ((ahead - behind) / (2.0 * by))[:, rows], rtol=1e-4)

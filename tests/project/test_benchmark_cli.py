@@ -434,6 +434,7 @@ def test_controllers_and_scenarios_of_one_s_own_file_take_part(tmp_path: Path) -
         ("--scenario", "mine.py:Still", "no scenario"),
         ("--controller", "broken.py:Still", "ZeroDivisionError"),
         ("--controller", "lqg.py:lqg", "two controllers are called 'lqg'"),
+        ("--controller", "lqg.py:gradient", "two controllers are called 'gradient'"),
     ],
 )
 def test_files_of_one_s_own_that_do_not_fit_get_one_line(
@@ -447,5 +448,5 @@ def test_files_of_one_s_own_that_do_not_fit_get_one_line(
     monkeypatch.chdir(tmp_path)
     Path("mine.py").write_text(MINE)
     Path("broken.py").write_text("1 / 0")
-    Path("lqg.py").write_text(f"{MINE}\nlqg = still")
+    Path("lqg.py").write_text(f"{MINE}\nlqg = gradient = still")
     assert message in refused([option, place], capsys)
