@@ -10,7 +10,7 @@ BROWSER_READY := $(VENV)/.ready-browser
 # A worker that runs out of tests takes some of the other's: files differ too much in time to be dealt out whole.
 IN_PARALLEL := --numprocesses auto --dist worksteal
 
-.PHONY: help venv lint types test test-all test-lowest test-newest test-wheel audit test-browser benchmark paper docs clean
+.PHONY: help venv lint types test test-all test-lowest test-newest test-wheel audit test-browser benchmark benchmark-full paper docs clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -67,8 +67,11 @@ audit: ## known weaknesses of the pinned packages; asks PyPI's advisories
 test-browser: $(BROWSER_READY) ## report.html in Chromium without a window; skipped where chromium or chromedriver is absent
 	$(BIN)/python -m pytest -q tests/browser
 
-benchmark: $(BENCHMARK_READY) ## the shipped agent and the classical controllers on the same crystals
-	$(BIN)/python benchmark.py
+benchmark: $(BENCHMARK_READY) ## shipped agents and classical controllers on the first 100 test crystals, into runs/benchmark
+	$(BIN)/python benchmark.py --episodes 100 --out runs/benchmark --overwrite
+
+benchmark-full: $(BENCHMARK_READY) ## the same on all 500: the committed results, in results/benchmark
+	$(BIN)/python benchmark.py --overwrite
 
 paper: $(BENCHMARK_READY) ## the paper's numbers beside ours
 	$(BIN)/python -m studies.paper

@@ -11,7 +11,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cz_gym.commands import OneLineParser, guarded
+try:
+    from cz_gym.commands import OneLineParser, guarded
+except ModuleNotFoundError as error:
+    sys.exit(f"benchmark.py: {error}")
 
 if TYPE_CHECKING:
     from cz_gym.baselines.registry import Entry

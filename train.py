@@ -10,7 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cz_gym.commands import OneLineParser, guarded
+try:
+    from cz_gym.commands import OneLineParser, guarded
+except ModuleNotFoundError as error:
+    sys.exit(f"train.py: {error}")
 
 if TYPE_CHECKING:
     from cz_gym.agents.training.recipes import Recipe

@@ -5,7 +5,11 @@ Importing this package registers ``Cz-v0``; ``gym.make("cz_gym:Cz-v0")`` imports
 
 from __future__ import annotations
 
-import gymnasium as gym
+try:
+    import gymnasium as gym
+except ModuleNotFoundError as error:
+    said = f"{error.name} is missing: run .venv/bin/python, which `make venv` makes, or `pip install .`"
+    raise ModuleNotFoundError(said, name=error.name) from None
 
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import SCENARIOS

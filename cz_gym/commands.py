@@ -48,7 +48,7 @@ def guarded(prog: str, body: Callable[[], int], extra: str, left: str = "nothing
         return body()
     except ImportError as error:
         absent = isinstance(error, ModuleNotFoundError) and error.name
-        said = f'{absent} is missing: pip install "cz-gym[{extra}]"' if absent else str(error)
+        said = f'{absent} is missing: pip install ".[{extra}]"' if absent else str(error)
     except OSError as error:
         said = f"{error.filename or 'output'}: {error.strerror}" if error.strerror else str(error)
     except (ValueError, DependencyNotInstalled) as error:

@@ -27,7 +27,7 @@ class Args:
     """Settings, as options of the command line."""
 
     seed: int = 0
-    steps: int = 6_000_000
+    steps: int = 10_000_000
     num_envs: int = 512
     num_steps: int = 64
     epochs: int = 5

@@ -22,7 +22,7 @@ from cz_gym.agents.training.wrappers import TrainingReward
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
 
-def main(seed: int = 0, steps: int = 6_000_000, out: Path = Path("runs/sb3-ppo.onnx")) -> Validation:
+def main(seed: int = 0, steps: int = 10_000_000, out: Path = Path("runs/sb3-ppo.onnx")) -> Validation:
     """Train, write the agent file, and judge it on 100 validation crystals."""
     torch.set_num_threads(1)  # small networks are quicker so
     crystals = CzVectorEnv(512, observation="history", action="smooth", autoreset_mode="SameStep")

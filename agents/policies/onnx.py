@@ -121,7 +121,7 @@ def _session(path: str | Path, onnx_bytes: bytes, channels: int) -> tuple[Any, i
 
         clean, state = checked(onnx_bytes, channels)
     except ImportError:
-        raise AgentFileError('running agents needs onnx and onnxruntime: pip install "cz-gym[benchmark]"') from None
+        raise AgentFileError('running agents needs onnx and onnxruntime: pip install ".[benchmark]"') from None
     except GraphError as error:
         raise AgentFileError(f"{path}: {error}") from None
     options = onnxruntime.SessionOptions()

@@ -69,7 +69,7 @@ def casadi() -> Any:
     try:
         import casadi
     except ImportError:
-        raise ImportError("this needs the package casadi: pip install 'cz-gym[mpc]'") from None
+        raise ImportError("this needs the package casadi: pip install '.[mpc]'") from None
     return casadi
 
 

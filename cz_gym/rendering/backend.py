@@ -11,7 +11,7 @@ from typing import Any
 
 from gymnasium.error import DependencyNotInstalled
 
-MISSING = 'rendering needs pygame: pip install "cz-gym[render]"'
+MISSING = 'rendering needs pygame: pip install ".[render]"'
 
 
 def available() -> bool:

@@ -20,7 +20,13 @@ from .runs import EXAMPLES, Row, timed
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser(prog="python -m studies.plain_tools", description=__doc__)
-    parser.add_argument("--examples", nargs="+", choices=EXAMPLES, default=list(EXAMPLES), help="which (default: all)")
+    parser.add_argument(
+        "--examples",
+        nargs="+",
+        choices=EXAMPLES,
+        default=list(EXAMPLES)[:2],
+        help="which (default: those without RLlib)",
+    )
     parser.add_argument("--seeds", type=between(1, 100), default=5, help="training seeds of each (default: 5)")
     parser.add_argument("--steps", type=between(1, 10**9), help="steps of each run (default: the example's)")
     parser.add_argument("--jobs", type=between(1, 64), default=1, help="runs at once (default: 1)")

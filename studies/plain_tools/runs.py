@@ -38,7 +38,18 @@ def cleanrl_ppo(seed: int, **settings: int) -> Validation:
     return cleanrl_ppo.main(cleanrl_ppo.Args(seed=seed, **settings))
 
 
-EXAMPLES: dict[str, Callable[..., Validation]] = {"sb3_ppo": sb3_ppo, "cleanrl_ppo": cleanrl_ppo}
+def rllib_ppo(seed: int, **settings: int) -> Validation:
+    """RLlib's, where it is installed."""
+    from examples import rllib_ppo
+
+    return rllib_ppo.main(seed, **settings)
+
+
+EXAMPLES: dict[str, Callable[..., Validation]] = {
+    "sb3_ppo": sb3_ppo,
+    "cleanrl_ppo": cleanrl_ppo,
+    "rllib_ppo": rllib_ppo,
+}
 
 
 def timed(name: str, seed: int, steps: int | None) -> Row:

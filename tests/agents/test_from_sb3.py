@@ -138,7 +138,7 @@ def test_without_stable_baselines3_it_says_what_to_install() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
-    assert 'pip install "cz-gym[agents]"' in done.stderr
+    assert 'pip install ".[agents]"' in done.stderr
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert any(name.startswith("stable-baselines3") for name in extras["agents"])
 

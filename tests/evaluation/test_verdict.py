@@ -5,6 +5,9 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
+
+from cz_gym.evaluation.report import verdict
 from cz_gym.evaluation.report.verdict import headline
 from cz_gym.evaluation.results import Verdict
 from cz_gym.evaluation.statistics import Estimate
@@ -19,9 +22,9 @@ def made(**scenarios: Any) -> Any:
         verdicts = tuple(
             Verdict(agent, "lqg", difference) for agent, difference in zip("abc", differences, strict=False)
         )
-        seeds = (0,) if name.startswith("single") else tuple(range(9))
+        seeds = (0,) if name.startswith("single") else tuple(range(verdict.FEWEST))
         rows.append(SimpleNamespace(row=SimpleNamespace(name=name), verdicts=verdicts, seeds=seeds))
-    agents = [SimpleNamespace(name=verdict.agent, learned=True, bound=False) for verdict in rows[0].verdicts]
+    agents = [SimpleNamespace(name=each.agent, learned=True, bound=False) for each in rows[0].verdicts]
     return SimpleNamespace(
         controllers=[SimpleNamespace(name="lqg", learned=False, bound=False), *agents], scenarios=rows
     )
@@ -45,6 +48,12 @@ def test_agents_and_scenarios_are_compared_in_one_line() -> None:
 def test_a_single_crystal_does_not_count_beside_others() -> None:
     assert "single" not in headline(made(one=[WORSE, WORSE], single=[BETTER, BETTER]))
     assert headline(made(single=[Estimate(-1.0, None, 1)])).startswith("a wins")
+
+
+def test_a_few_crystals_give_no_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
+    few = made(one=[BETTER])
+    monkeypatch.setattr(verdict, "FEWEST", verdict.FEWEST + 1)
+    assert headline(few) == "No verdict from 20 crystals: it needs 21."
 
 
 def test_without_agents_or_rivals_it_says_so() -> None:

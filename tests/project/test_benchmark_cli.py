@@ -98,7 +98,7 @@ def test_the_folder_holds_every_file_and_nothing_else(finished: Path) -> None:
     assert sorted(path.name for path in finished.iterdir()) == FILES
     assert (finished.parent / "copy.json").read_bytes() == (finished / "benchmark.json").read_bytes()
     report = (finished / "report.md").read_text()
-    assert report.startswith("No agent wins.")
+    assert report.startswith("No verdict from ")
     for image in finished.glob("*.png"):
         assert image.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
         assert f"]({image.name})" in report
@@ -330,7 +330,7 @@ def test_a_missing_extra_is_named(
     agent = constant_agent(tmp_path / "agent.onnx")
     monkeypatch.setitem(sys.modules, package, None)
     line = refused([*SMALL, "--agent", str(agent), "--out", str(tmp_path / "out")], capsys)
-    assert 'pip install "cz-gym[benchmark]"' in line
+    assert 'pip install ".[benchmark]"' in line
     assert package in line
 
 
@@ -343,7 +343,7 @@ def test_the_benchmark_needs_neither_torch_nor_stable_baselines3(tmp_path: Path)
     folder = Path(benchmark.__file__).parent
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "out" / "report.md").read_text().startswith("No agent wins.")
+    assert (tmp_path / "out" / "report.md").read_text().startswith("No verdict from ")
 
 
 def test_controllers_say_what_they_are_and_act() -> None:

@@ -111,7 +111,7 @@ def test_a_message_of_several_lines_becomes_one(capsys: pytest.CaptureFixture[st
     ("error", "code", "said"),
     [
         (None, 0, ""),
-        (ModuleNotFoundError("none", name="absent"), 2, 'prog: absent is missing: pip install "cz-gym[agents]"\n'),
+        (ModuleNotFoundError("none", name="absent"), 2, 'prog: absent is missing: pip install ".[agents]"\n'),
         (ImportError("cannot import name 'one'", name="present"), 2, "prog: cannot import name 'one'\n"),
         (ValueError("first line\nsecond line"), 2, "prog: first line second line\n"),
         (FileNotFoundError(2, "No such file", "there.csv"), 2, "prog: there.csv: No such file\n"),

@@ -117,6 +117,16 @@ def test_environment_and_baselines_need_neither_torch_nor_plots(tmp_path: Path) 
     printed(ABSENT.replace("{absent}", repr(absent)) + SMOKE, ROOT, tmp_path)
 
 
+@pytest.mark.parametrize("command", ["train.py", "benchmark.py"])
+def test_outside_the_virtual_environment_one_line_says_so(command: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-S", ROOT / command], capture_output=True, text=True, env={"PATH": os.environ["PATH"]}
+    )
+    assert done.returncode != 0
+    assert done.stderr.startswith(f"{command}: gymnasium is missing: run .venv/bin/python")
+    assert done.stderr.count("\n") == 1
+
+
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A checkout as it is where there are no links, as on Windows: the files named as links hold where these lead."""

@@ -189,7 +189,7 @@ def test_expected_noise_in_the_pull_speed():
 def test_missing_package(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "control", None)
     assert paper.main(["--out", str(tmp_path / "new")]) == 2
-    assert "cz-gym[benchmark]" in capsys.readouterr().err
+    assert ".[benchmark]" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 

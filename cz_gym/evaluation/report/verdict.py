@@ -6,11 +6,15 @@ from collections.abc import Sequence
 
 from cz_gym.evaluation.results import Benchmark, ScenarioResult, Verdict
 
+FEWEST = 20
+"""Crystals that a verdict on a scenario with randomness needs."""
+
 
 def headline(benchmark: Benchmark) -> str:
     """One line: whether the agents win, and where they do not.
 
-    Scenarios of a single crystal do not count, unless there are no others; nor does an agent that is a bound.
+    Scenarios of a single crystal do not count, unless there are no others; nor does an agent that is a bound. A few
+    crystals of a random scenario give no verdict.
     """
     agents = [controller.name for controller in benchmark.controllers if controller.learned and not controller.bound]
     if not agents:
@@ -18,6 +22,8 @@ def headline(benchmark: Benchmark) -> str:
     if not benchmark.scenarios[0].verdicts:
         return "No classical controller took part in this run to compare the agents with."
     deciding = [scenario for scenario in benchmark.scenarios if len(scenario.seeds) > 1] or list(benchmark.scenarios)
+    if 1 < len(deciding[0].seeds) < FEWEST:
+        return f"No verdict from {len(deciding[0].seeds)} crystals: it needs {FEWEST}."
     always = list(agents)
     ever: list[str] = []
     for scenario in deciding:
