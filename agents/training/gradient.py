@@ -14,10 +14,12 @@ from stable_baselines3.common.logger import Logger
 from torch.autograd import backward, grad
 
 from cz_gym.config import Config
-from cz_gym.differentiable import STATES, DifferentiableBatch
+from cz_gym.differentiable import STATES
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from cz_gym.task import COST_CAP
 
+from .crystals import Crystals
+from .demonstrations import widened
 from .filter_bank import MEANS, STATE, FilterBank
 from .learner import Parts, Watch
 from .recipes import Gradient
@@ -65,8 +67,8 @@ class GradientLearner:
     def learn(self, watch: Watch) -> None:
         """Take the updates that are left."""
         recipe, n = self.recipe, self.recipe.num_envs
-        batch = DifferentiableBatch(self.config, n)
-        measured = batch.reset(self._seeds(n))[1]
+        batch = self._crystals()
+        measured = batch.reset(self._seeds(n))
         memory = torch.zeros(n, STATE)
         windows = self.config.steps // recipe.window
         left = self.random.integers(1, windows, n, endpoint=True)
@@ -81,14 +83,23 @@ class GradientLearner:
             left -= 1
             over = np.flatnonzero(~batch.grows | (left == 0)).tolist()
             if over:
-                measured = batch.reset(self._seeds(len(over)), over)[1]
+                measured = batch.reset(self._seeds(len(over)), over)
                 memory[over] = 0.0
                 left[over] = windows
             self.steps += self.per_update
             watch(self.steps, "")
         batch.close()
 
-    def _drive(self, batch: DifferentiableBatch, measured: Any, memory: torch.Tensor) -> Window:
+    def _crystals(self) -> Crystals:
+        """The crystals that are learned on: the recipe's scenario, and its share of each other."""
+        slots = self.recipe.num_envs
+        others = []
+        for name, width, share in self.recipe.also:
+            scenario = widened(self.config.with_scenario(name).scenario, width)
+            others.append((self.config.with_scenario(scenario), round(share * slots)))
+        return Crystals([(self.config, slots - sum(many for _, many in others)), *others])
+
+    def _drive(self, batch: Crystals, measured: Any, memory: torch.Tensor) -> Window:
         """Drive each crystal through a window."""
         features, costs, jacobians = [], [], []
         with torch.no_grad():

@@ -99,6 +99,9 @@ class Gradient(Rewarded):
     num_envs: int = 192
     window: int = 180
     """Steps of a crystal that a gradient goes back through."""
+    also: tuple[tuple[str, float, float], ...] = ()
+    """Other crystals that it learns on: scenario, how far everything random is spread in units of the scenario's own,
+    and their share of all."""
     hidden: tuple[int, ...] = (64,)
     learning_rate: float = 3e-3
     """At the start; it falls linearly to zero."""

@@ -25,32 +25,33 @@ from cz_gym.config import make_config
 from cz_gym.episodes.scenarios import PULLER, RANDOMIZED
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
-from cz_gym.evaluation.rollout import rollout
-from cz_gym.physics.linearisation import radius_model
+from cz_gym.evaluation.rollout import Course, rollout
+from cz_gym.physics.linearisation import StateSpace, radius_model
 from cz_gym.physics.plant import make_puller
 from cz_gym.units import MINUTE
 
-from .linear_agent import AT, Floats, linear_agent
+from .linear_agent import AT, linear_agent, remembering_agent
 from .loop import A_CRYSTAL, Contender, apart, margins, noise_gains, one_reading, response
 from .step_tests import (
     LIMITS,
     MIX,
     STEP_TESTS,
+    Floats,
     Interface,
     crystal,
     jump_gains,
-    noisy_observations,
     parts_of,
     respond,
     run_events,
     survive,
+    usual_noise,
 )
 
 PROG = "python -m studies.insight"
-AGENT = "imitation"
-"""The shipped agent that is taken apart, unless a file is named: one that keeps nothing between samples."""
+AGENT = "gradient"
+"""The shipped agent that is taken apart, unless a file is named."""
 BESIDE = ("lqg-at-0.02", "lqg", "paper-tuned")
-"""Controllers that an agent is shown beside; its teacher is among them."""
+"""Controllers that an agent is shown beside."""
 AT_REST = "at rest"
 """Behind an agent's name: linearised without noise."""
 
@@ -67,14 +68,18 @@ def contenders(path: Path | None) -> tuple[Contender, ...]:
     config = crystal(A_CRYSTAL / MINUTE, interface)
     policy = OnnxPolicy.load(file, config)
 
-    def agent(label: str, observations: Floats) -> Contender:
-        near = linear_agent(content, observations, config.control_interval, contract.action, config.parameters.v_0)
+    def agent(label: str, course: Course) -> Contender:
+        where = config.control_interval, contract.action, config.parameters.v_0
+        if policy.remembers:
+            system = remembering_agent(content, course.observation, course.memory, *where)
+            return Contender(label, interface, lambda _: policy, system, _response(system, config.control_interval))
+        near = linear_agent(content, course.observation, *where)
         return Contender(label, interface, lambda _: policy, near.state_space(), near.response)
 
     return (
-        agent(contract.algorithm, noisy_observations(policy, interface)),
+        agent(contract.algorithm, usual_noise(policy, interface)),
         *map(controller, BESIDE),
-        agent(f"{contract.algorithm} {AT_REST}", run_events(policy, config, (), [0.0]).observation),
+        agent(f"{contract.algorithm} {AT_REST}", run_events(policy, config, (), [0.0])),
     )
 
 
@@ -82,7 +87,11 @@ def controller(name: str) -> Contender:
     """A controller of the registry."""
     make = registry.find_controller(name).make
     system, _, dt = linear_form(make(crystal(1.0, Interface())))
-    return Contender(name, Interface(), make, system, lambda omega: response(system, dt, omega)[:, :, AT])
+    return Contender(name, Interface(), make, system, _response(system, dt))
+
+
+def _response(system: StateSpace, dt: float) -> Callable[[Floats], Any]:
+    return lambda omega: response(system, dt, omega)[:, :, AT]
 
 
 def puller_parts(contender: Contender, episodes: int) -> dict[str, dict[str, float]]:

@@ -95,40 +95,74 @@ def linear_agent(
     approximation there is (Stein's lemma). ValueError if the file reads another observation or remembers something.
     """
     rows = np.atleast_2d(np.asarray(observations, np.float64))
-    slopes = np.mean([jacobian(onnx_bytes, row) for row in rows], axis=0)
-    drives = drives_of(action, dt)
-    slopes *= np.array([[drives.pull], [drives.heater]])
-    slopes[[0, 1], DRIVE_CHANNELS] += drives.keep
-    slopes = np.array([[v_0], [HEATER_SCALE]]) * slopes / scales(HISTORY, v_0)
+    slopes = _asked(np.mean([jacobian(onnx_bytes, row) for row in rows], axis=0), dt, action, v_0)
+    slopes /= scales(HISTORY, v_0)
     slopes = slopes @ np.linalg.inv(undo_differences()).T
     now, integral, means = np.split(slopes, (len(MEASURED), len(MEASURED) + 1), axis=1)
     return LinearAgent(now, integral[:, 0], means.reshape(2, len(LAGS), len(LAGGED)), dt)
 
 
+def remembering_agent(
+    onnx_bytes: bytes,
+    observations: npt.ArrayLike,
+    states: npt.ArrayLike,
+    dt: float,
+    action: str,
+    v_0: float = PULL_SCALE,
+) -> StateSpace:
+    """An agent that remembers, near "measured" observations, shape (n, channels), and its own states there.
+
+    Inputs are the channels of MEASURED, outputs the two drives, deviations in SI; the state is the agent's own, scaled.
+    ValueError if the file reads another observation.
+    """
+    evaluate = _in_double(onnx_bytes, ("observation", "state"))
+    seen, kept = np.asarray(observations, np.float64), np.asarray(states, np.float64)
+    n, width = len(MEASURED), len(MEASURED) + kept.shape[1]
+    if seen.shape[1] != n:
+        raise ValueError(f'an agent that remembers is linear here only on "measured" ({n} channels)')
+    found = np.zeros((2 + kept.shape[1], width))
+    for row in np.concatenate([seen, kept], axis=1):
+        ahead, behind = (evaluate(*np.split(row + sign * _STEP * np.eye(width), [n], axis=1)) for sign in (1, -1))
+        found += (np.concatenate(ahead, axis=1) - np.concatenate(behind, axis=1)).T / (2.0 * _STEP * len(seen))
+    asked = _asked(found[:2], dt, action, v_0)
+    found[2:, :n] /= scales(MEASURED, v_0)
+    asked[:, :n] /= scales(MEASURED, v_0)
+    return StateSpace(found[2:, n:], found[2:, :n], asked[:, n:], asked[:, :n])
+
+
+def _asked(slopes: Floats, dt: float, action: str, v_0: float) -> Floats:
+    """Derivatives of the drives asked for [m/s, W] from those of the action; both by scaled channels."""
+    drives = drives_of(action, dt)
+    slopes = slopes * np.array([[drives.pull], [drives.heater]])
+    slopes[[0, 1], DRIVE_CHANNELS] += drives.keep
+    found: Floats = np.array([[v_0], [HEATER_SCALE]]) * slopes
+    return found
+
+
 def jacobian(onnx_bytes: bytes, observation: Floats) -> Floats:
     """Derivatives of the action by the observation, shape (2, channels), both scaled, in double precision."""
-    evaluate = _in_double(onnx_bytes, len(observation))
+    if len(observation) != len(HISTORY):
+        raise ValueError(f'an agent without a state is linear here only on "history" ({len(HISTORY)} channels)')
+    evaluate = _in_double(onnx_bytes, ("observation",))
     steps = _STEP * np.eye(len(observation))
-    ahead, behind = evaluate(observation + steps), evaluate(observation - steps)
+    ahead, behind = evaluate(observation + steps)[0], evaluate(observation - steps)[0]
     slopes: Floats = (ahead - behind).T / (2.0 * _STEP)
     return slopes
 
 
-def _in_double(onnx_bytes: bytes, channels: int) -> Any:
-    """The graph as a function of observations in float64: float32 would round such small differences away."""
+def _in_double(onnx_bytes: bytes, inputs: tuple[str, ...]) -> Any:
+    """The graph as a function of its inputs in float64: float32 would round such small differences away."""
     import onnx
     from onnx import TensorProto, numpy_helper
     from onnx.reference import ReferenceEvaluator
 
     model = onnx.load_model_from_string(onnx_bytes)
-    if [value.name for value in model.graph.input] != ["observation"] or channels != len(HISTORY):
-        raise ValueError(
-            f'only agents on "history" ({len(HISTORY)} channels) without a state of their own are linear here'
-        )
+    if tuple(value.name for value in model.graph.input) != inputs:
+        raise ValueError(f"the agent must read {' and '.join(inputs)}, and nothing else")
     for weight in model.graph.initializer:
         if weight.data_type == TensorProto.FLOAT:
             weight.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(weight).astype(np.float64), weight.name))
     for value in (*model.graph.input, *model.graph.output):
         value.type.tensor_type.elem_type = TensorProto.DOUBLE
     session: Any = ReferenceEvaluator(model)
-    return lambda rows: session.run(None, {"observation": rows})[0]
+    return lambda *rows: session.run(None, dict(zip(inputs, rows, strict=True)))

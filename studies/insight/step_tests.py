@@ -215,11 +215,10 @@ def jump_gains(policy: Any, interface: Interface, noisy: bool) -> Floats:
     return gains
 
 
-def noisy_observations(policy: Any, interface: Interface) -> Floats:
-    """What a policy observes after an hour of the usual noise, one row a seed of :data:`CRYSTALS`."""
+def usual_noise(policy: Any, interface: Interface) -> Course:
+    """An hour of the usual noise, a slot a seed of :data:`CRYSTALS`."""
     seeds = VALIDATION_SEEDS[:CRYSTALS]
-    found: Floats = run_events(policy, crystal(60.0, interface), (USUAL_NOISE,), [0.0] * CRYSTALS, seeds).observation
-    return found
+    return run_events(policy, crystal(60.0, interface), (USUAL_NOISE,), [0.0] * CRYSTALS, seeds)
 
 
 def parts_of(whole: Scenario, base: Scenario) -> dict[str, Scenario]:

@@ -26,7 +26,7 @@ from cz_gym.baselines.registry import find_controller
 from cz_gym.episodes.scenarios import HARD, PULLER, RANDOMIZED
 from cz_gym.observation import HISTORY
 from cz_gym.physics.plant import make_puller
-from cz_gym.units import MM, MM_PER_MIN
+from cz_gym.units import MINUTE, MM, MM_PER_MIN
 from studies.insight import __main__ as insight
 from studies.insight.figures import gain_figure, jump_figure, loop_figure, response_figure, share_figure
 from studies.insight.linear_agent import AT, jacobian, linear_agent
@@ -50,7 +50,7 @@ from studies.insight.step_tests import (
 
 DT = 5.0
 OMEGA = np.geomspace(1e-4, np.pi / DT, 9)
-PATH = agents.shipped(insight.AGENT)
+PATH = agents.shipped("imitation")
 CONTRACT, CONTENT = read_agent(PATH)
 LEARNED = Interface(CONTRACT.observation, CONTRACT.action)
 REST = np.eye(len(HISTORY))[1]
@@ -84,15 +84,19 @@ def test_a_linear_agent_answers_alike_as_state_space_and_in_frequency(near: Any)
     assert np.allclose(found, near.response(OMEGA[[0, 4, 8]]), rtol=1e-9, atol=1e-12)
 
 
-def test_a_linear_agent_moves_as_the_agent_does_after_a_small_jump(near: Any) -> None:
+@pytest.mark.parametrize("name", ["imitation", "gradient"])
+def test_a_linear_agent_moves_as_the_agent_does_after_a_small_jump(name: str) -> None:
     """The linear loop of agent and plant against the simulated one: radius 1 um too large, first ten minutes."""
-    config = crystal(20.0, LEARNED)
-    policy = agents.OnnxPolicy.load(PATH, config)
-    limit = LIMITS[0]
-    jump = 0.001 * MM
-    with_it, without = (run_events(policy, config, (limit.event,), [size]).signals for size in (jump, 0.0))
-    moved = (with_it.v_p - without.v_p)[120:, 0]
-    loop = close(near.state_space(), make_puller(lam=0.5), DT)
+    (system,) = [
+        each.system for each in insight.contenders(agents.shipped(name)) if each.name.endswith(insight.AT_REST)
+    ]
+    contract, _ = read_agent(agents.shipped(name))
+    config = crystal(190.0, Interface(contract.observation, contract.action))
+    policy = agents.OnnxPolicy.load(agents.shipped(name), config)
+    jump, late = 0.001 * MM, LIMITS[0].event._replace(at=180.0 * MINUTE)
+    with_it, without = (run_events(policy, config, (late,), [size]).signals for size in (jump, 0.0))
+    moved = (with_it.v_p - without.v_p)[round(late.at / DT) :, 0]
+    loop = close(system, make_puller(lam=0.5), DT)
     x, expected = np.zeros(len(loop.A)), [0.0]  # the sample of the jump itself was taken before it
     x[:5] = jump * sampled_plant(make_puller(lam=0.5), DT).A[:, 0]
     for _ in moved[1:]:

@@ -17,6 +17,7 @@ from stable_baselines3.common.logger import Logger
 from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.agent_file.contract import facts_of, make_contract
 from cz_gym.agents.training import filter_bank, gradient
+from cz_gym.agents.training.crystals import Crystals
 from cz_gym.agents.training.filter_bank import STATE, FilterBank
 from cz_gym.agents.training.gradient import GradientLearner
 from cz_gym.agents.training.learners import config_of
@@ -58,9 +59,11 @@ def driven(network: FilterBank, batch: DifferentiableBatch, steps: int) -> Any:
 def test_the_gradient_is_that_of_differences(scenario: str, apart: float) -> None:
     """Along a random direction of all weights, through 40 steps of plant, sensors, memory and policy.
 
-    The heater of ``puller`` moves in whole steps, which differences see and the gradient does not.
+    The heater of ``puller`` moves in whole steps, which differences see and the gradient does not. The estimates of
+    noise and swings, which are taken as they are, count as nothing here.
     """
     network, batch = some_network(), DifferentiableBatch(CONFIG.with_scenario(scenario), 12)
+    network.per_std[-4:] = 0.0
     driven(network, batch, 40).backward()
     directions = [torch.randn_like(parameter) for parameter in network.parameters()]
     along = sum(
@@ -85,11 +88,11 @@ def test_what_is_followed_is_the_gradient_that_torch_finds(scenario: str, monkey
     monkeypatch.setattr(gradient, "MOST_GRADIENT", 1e9)
     learner = GradientLearner(replace(FEW, window=60, weights=LQG_COST), 0, CONFIG, Logger(None, []), 0)
     learner.network = some_network()
-    batch = DifferentiableBatch(CONFIG.with_scenario(scenario), 16)
-    measured = batch.reset(range(16))[1]
+    crystals = Crystals([(CONFIG.with_scenario(scenario), 16)])
+    measured, batch = crystals.reset(range(16)), crystals.batches[0]
     slots = batch._batch.memory.slots
     slots["x"]["r_c"][:4] += 7.9e-3
-    learner._follow(learner._drive(batch, measured, torch.zeros(16, STATE)), batch.measured_by_state)
+    learner._follow(learner._drive(crystals, measured, torch.zeros(16, STATE)), batch.measured_by_state)
     found = [parameter.grad.clone() for parameter in learner.network.parameters() if parameter.grad is not None]
     state, measured = (torch.from_numpy(each) for each in batch.reset(range(16)))
     slots["x"]["r_c"][:4] += 7.9e-3
@@ -134,8 +137,24 @@ def test_what_is_remembered() -> None:
             features, memory = network.remember(seen, memory)
     times = np.array(filter_bank.TIMES)
     np.testing.assert_allclose(memory[0, : len(times)], 1.0 - np.exp(-500.0 / times), rtol=1e-4)
-    assert float(memory[0, 4 * len(times)]) == pytest.approx(0.5, rel=1e-4)
+    assert float(memory[0, filter_bank.MEANS - 1]) == pytest.approx(0.5, rel=1e-4)
     np.testing.assert_allclose(features[0, : len(times) + 1].sum(), 1.0, rtol=1e-5)
+
+
+def test_crystals_of_several_scenarios_are_those_of_each_alone() -> None:
+    other = CONFIG.with_scenario("puller")
+    both, alone = Crystals([(CONFIG, 3), (other, 2)]), [DifferentiableBatch(each, 2) for each in (CONFIG, other)]
+    both.reset(range(5))
+    seen = both.reset([7, 8, 7, 8], [1, 2, 3, 4])
+    actions = np.random.default_rng(0).normal(0.0, 0.3, (5, 2))
+    actions[3:] = actions[1:3]
+    for place, batch in zip((slice(1, 3), slice(3, 5)), alone, strict=True):
+        np.testing.assert_array_equal(seen[place], batch.reset([7, 8])[1])
+    step = both.step(actions)
+    for place, batch in zip((slice(1, 3), slice(3, 5)), alone, strict=True):
+        for ours, theirs in zip(step, batch.step(actions[place]), strict=True):
+            np.testing.assert_array_equal(ours[place], theirs)
+    assert both.grows.shape == (5,)
 
 
 @pytest.mark.parametrize("deviation", [0.0, 0.003, 0.03, 0.1])
@@ -150,11 +169,11 @@ def test_the_noise_of_camera_and_pyrometer_is_estimated(deviation: float) -> Non
             seen[:, 0] = torch.from_numpy(0.001 * k + (k > 100) + deviation * random.normal(size=64))
             seen[:, pyrometer] = torch.from_numpy(0.02 * random.normal(size=64))
             features, memory = network.remember(seen, memory)
-            variances.append(memory[:, -2:].mean(dim=0) + filter_bank.USUAL**2)
+            variances.append(memory[:, -4:-2].mean(dim=0) + filter_bank.USUAL**2)
     camera, pyrometer_too = (float(each) for each in torch.stack(variances[-600:]).mean(dim=0))
     assert camera == pytest.approx(deviation**2, rel=0.1, abs=1e-7)
     assert pyrometer_too == pytest.approx(0.02**2, rel=0.1)
-    assert 0.0 < float(features[:, -2:].min()) < float(features[:, -2:].max()) < 1.0
+    assert 0.0 < float(features[:, -4:-2].min()) < float(features[:, -4:-2].max()) < 1.0
 
 
 def test_it_learns_from_nothing() -> None:
