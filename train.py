@@ -18,6 +18,9 @@ except ModuleNotFoundError as error:
 if TYPE_CHECKING:
     from cz_gym.agents.training.recipes import Recipe
 
+ALGORITHM = "gradient"
+"""What is learned by unless told otherwise."""
+
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
     """Read the command line; exits with code 2 and one line for anything that cannot be meant."""
@@ -28,14 +31,14 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         description="Train an agent by a recipe and pick it on validation episodes.",
         epilog="The run folder holds the agent with its contract, settings, checkpoints, progress and logs.",
     )
-    parser.add_argument("--algo", choices=tuple(RECIPES), default="gradient", help="recipe (default: %(default)s)")
-    parser.add_argument("--seed", type=_whole(0), default=0, help="training seed (default: %(default)s)")
+    parser.add_argument("--algo", choices=tuple(RECIPES), help="recipe (default: gradient, or the resumed run's)")
+    parser.add_argument("--seed", type=_whole(0), help="training seed (default: 0, or the resumed run's)")
     parser.add_argument(
         "--steps",
         type=_whole(1),
         help="environment steps of learning from reward (default: the recipe's, or the resumed run's)",
     )
-    parser.add_argument("--scenario", help="scenario to train on (default: the recipe's)")
+    parser.add_argument("--scenario", help="scenario to train on (default: the recipe's, or the resumed run's)")
     parser.add_argument("--out", type=Path, help="run folder (default: runs/<algo>-seed<seed>)")
     parser.add_argument("--plot", action="store_true", help="draw the progress into the run folder: progress.png")
     parser.add_argument("--resume", action="store_true", help="go on from the run folder's checkpoint")
@@ -48,7 +51,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         "(default: %(default)g)",
     )
     arguments = parser.parse_args(argv)
-    arguments.out = arguments.out or Path("runs") / f"{arguments.algo}-seed{arguments.seed}"
+    arguments.out = arguments.out or Path("runs") / f"{arguments.algo or ALGORITHM}-seed{arguments.seed or 0}"
     return arguments
 
 
@@ -73,6 +76,7 @@ def train(arguments: argparse.Namespace) -> int:
     from cz_gym.baselines.registry import make_controller
 
     folder: Path = arguments.out
+    _take_up(arguments)
     if not arguments.resume and (folder / "settings.json").exists():
         raise ValueError(f"{folder} holds a run already: --resume it, or name another --out")
     recipe = _asked_for(RECIPES[arguments.algo], arguments)
@@ -105,6 +109,22 @@ def train(arguments: argparse.Namespace) -> int:
     )
     print(f"wrote {folder / 'agent.onnx'}")
     return 0
+
+
+def _take_up(arguments: argparse.Namespace) -> None:
+    """Fill in what the command line leaves out: from the run in the folder if it is resumed, or by default."""
+    from cz_gym.agents.training.recipes import RECIPES
+    from cz_gym.agents.training.run_files import read_settings
+
+    saved = read_settings(arguments.out / "settings.json") if arguments.resume else {}
+    settings = saved.get("settings")
+    scenario = settings.get("scenario") if isinstance(settings, dict) else None
+    said = {"algo": (saved.get("algorithm"), ALGORITHM), "seed": (saved.get("seed"), 0), "scenario": (scenario, "")}
+    for name, (value, default) in said.items():
+        if getattr(arguments, name) is None:
+            setattr(arguments, name, value if isinstance(value, type(default)) else default)
+    if arguments.algo not in RECIPES:
+        raise ValueError(f"{arguments.out}: begun with {arguments.algo!r}, which is no recipe here: name one by --algo")
 
 
 def _asked_for(recipe: Recipe, arguments: argparse.Namespace) -> Recipe:

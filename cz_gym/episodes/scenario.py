@@ -13,7 +13,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from cz_gym.units import HOUR
+from cz_gym.units import HOUR, MM
 
 Range = tuple[float, float]
 NONE: Range = (0.0, 0.0)
@@ -152,6 +152,8 @@ class Actuators:
 
 
 MAX_FLAGGED, MAX_UNFLAGGED = 3, 1
+MAX_LENGTH = 20.0 * MM
+"""Largest error of the camera [m]; a crystal is lost long before."""
 MAX_LATENCY = 60.0
 """Oldest camera frame a scenario may deliver [s]."""
 
@@ -212,6 +214,10 @@ class Scenario:
         )
         need(0.0 <= self.sensor.latency <= MAX_LATENCY, f"sensor.latency must lie in [0, {MAX_LATENCY}] s")
         need(min(vars(self.actuators).values()) >= 0, "actuator limits must not be negative")
+        for name in ("camera_noise", "bias_offset", "level_offset", "ripple", "outlier_sd"):
+            value = getattr(self.sensor, name)
+            length = max(map(abs, value if isinstance(value, tuple) else (value,)))
+            need(length <= MAX_LENGTH, f"sensor.{name} of {length:g} m is more than {MAX_LENGTH:g} m: is it in metres?")
         for family, names in _NOT_NEGATIVE.items():
             for name in names:
                 value = getattr(getattr(self, family), name)

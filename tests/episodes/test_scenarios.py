@@ -108,6 +108,8 @@ def test_nonsense_is_refused_in_one_line(where: tuple[str, str], value: object) 
         ("sensor", "latency", -5.0),
         ("sensor", "outlier_probability", 2.0),
         ("sensor", "outlier_sd", -1.0),
+        ("sensor", "camera_noise", (0.0, 0.05)),
+        ("sensor", "bias_offset", (-1.0, 1.0)),
         ("interface", "tau_fast", 0.0),
         ("interface", "sd", (-0.5, 0.5)),
         ("actuators", "pull_slew", -1.0),
