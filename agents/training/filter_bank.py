@@ -17,6 +17,7 @@ from cz_gym.observation import MEASURED
 
 from .export import OnnxGraph
 from .networks import NORMALISED_LIMIT, tanh_layers
+from .symbolic import Value, columns, held, joined, parted, rectified, through
 
 TIMES = tuple(float(time) for time in np.geomspace(3.0, 3600.0, 8))
 """Time constants of the leaky means [s]."""
@@ -72,7 +73,7 @@ class FilterBank(nn.Module):
     mean: torch.Tensor
     per_std: torch.Tensor
 
-    def __init__(self, control_interval: float, hidden: tuple[int, ...]) -> None:
+    def __init__(self, control_interval: float, hidden: tuple[int, ...], scheduled: bool = True) -> None:
         super().__init__()
         keep, gain, features = _filters(control_interval)
         self._constant("keep", keep)
@@ -90,7 +91,8 @@ class FilterBank(nn.Module):
         self.register_buffer("mean", torch.zeros(width))
         self.register_buffer("per_std", torch.ones(width))
         self.layers = tanh_layers([width, *hidden])
-        self.linear = nn.Linear((3 + len(BEGUN) + len(SWINGS)) * width, len(GAINS))
+        self.scheduled = scheduled
+        self.linear = nn.Linear((1 + scheduled * (2 + len(BEGUN) + len(SWINGS))) * width, len(GAINS))
         self.bent = nn.Linear(hidden[-1], len(GAINS), bias=False) if hidden else None
         with torch.no_grad():
             for parameter in (*self.linear.parameters(), *(self.bent.parameters() if self.bent else ())):
@@ -99,22 +101,23 @@ class FilterBank(nn.Module):
     def _constant(self, name: str, value: Any) -> None:
         self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32), persistent=False)
 
-    def remember(self, measured: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def remember(self, measured: Any, state: Any) -> tuple[Any, Any]:
         """Features, shape (n, width), and the next state, from readings (n, 11) and the state (n, STATE)."""
-        means = state[:, :MEANS] * self.keep + measured @ self.gain
+        means, last, change, excess, squares = parted(state, _PARTS)
+        means = means * self.keep + measured @ self.gain
         with torch.no_grad():
-            now = measured[:, _NOISY]
-            _, last, change, excess, swings = torch.split(state, _PARTS, dim=1)
-            variance, difference = USUAL**2 + excess, now - last
-            square = (difference - change) ** 2 / 6.0
-            used = square - torch.relu(square - OUTLIER * variance)
-            excess = excess + self.noise_share * (used - variance)
-            noise = 1.0 - USUAL**2 / (2.0 * USUAL**2 + excess)
-            swings = swings + self.swing_share * ((means @ self.swings) ** 2 - swings)
-            strong = swings / (swings + self.usual)
-        seen = torch.cat([measured, means], dim=1)
-        features = torch.cat([seen @ self.features, noise, strong], dim=1)
-        return features, torch.cat([means, now, difference, excess, swings], dim=1)
+            now = columns(measured, _NOISY)
+            difference, variance = now - last, excess + USUAL**2
+            bend = difference - change
+            square = bend * bend * (1.0 / 6.0)
+            used = square - rectified(square - variance * OUTLIER)
+            excess = excess + (used - variance) * self.noise_share
+            noise = (excess + USUAL**2) / (excess + 2.0 * USUAL**2)
+            swings = means @ self.swings
+            squares = squares + (swings * swings - squares) * self.swing_share
+            strong = squares / (squares + self.usual)
+        features = joined([joined([measured, means]) @ self.features, noise, strong])
+        return features, joined([means, now, difference, excess, squares])
 
     def back(self, by_features: Any, by_means: Any) -> tuple[Any, Any]:
         """Gradients with respect to readings (n, 11) and means before, from those of features and means after.
@@ -125,18 +128,30 @@ class FilterBank(nn.Module):
         by_means = by_means + by_seen[:, len(MEASURED) :]
         return by_seen[:, : len(MEASURED)] + by_means @ self.gain.numpy().T, by_means * self.keep.numpy()
 
-    def act(self, features: torch.Tensor) -> torch.Tensor:
+    def act(self, features: Any) -> Any:
         """The action, shape (..., 2), not yet held within its box, from features of shape (..., width)."""
-        x = torch.clamp((features - self.mean) * self.per_std, -NORMALISED_LIMIT, NORMALISED_LIMIT)
-        noise, _, *swings = torch.clamp(x[..., -_STRENGTHS:, None], -SCHEDULE_LIMIT, SCHEDULE_LIMIT).unbind(-2)
-        begun = features[..., -_STRENGTHS - len(BEGUN) : -_STRENGTHS, None].unbind(-2)
-        schedule = [noise, noise * noise - 1.0, *swings, *(1.0 - each for each in begun)]
-        action = self.linear(torch.cat([x, *(x * each for each in schedule)], dim=-1))
+        x = held((features - self.mean) * self.per_std, -NORMALISED_LIMIT, NORMALISED_LIMIT)
+        action = through(joined([x, *(x * each for each in self._schedule(x, features))]), self.linear)
         if self.bent is not None:
-            action = action + self.bent(self.layers(x))
-        return torch.mul(action, self.gains)
+            action = action + through(through(x, self.layers), self.bent)
+        return action * self.gains
 
-    def forward(self, measured: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _schedule(self, x: Any, features: Any) -> list[Any]:
+        """What the linear map is scheduled on, each of shape (..., 1)."""
+        if not self.scheduled:
+            return []
+        width = len(self.mean)
+        strengths = held(columns(x, range(width - _STRENGTHS, width)), -SCHEDULE_LIMIT, SCHEDULE_LIMIT)
+        noise, _, *swings = parted(strengths, [1] * _STRENGTHS)
+        ages = range(width - _STRENGTHS - len(BEGUN), width - _STRENGTHS)
+        return [
+            noise,
+            noise * noise - 1.0,
+            *swings,
+            *(each * -1.0 + 1.0 for each in parted(columns(features, ages), [1] * len(BEGUN))),
+        ]
+
+    def forward(self, measured: Any, state: Any) -> tuple[Any, Any]:
         """Action and next state."""
         features, after = self.remember(measured, state)
         return self.act(features), after
@@ -144,58 +159,9 @@ class FilterBank(nn.Module):
     def onnx(self) -> bytes:
         """The same as an agent's graph."""
         graph = OnnxGraph()
-
-        def constant(name: str, value: list[float]) -> str:
-            return graph.constant(name, np.array(value, np.float32))
-
-        node = graph.node
-        kept = ["means_before", "last", "change", "excess", "squares"]
-        graph.nodes_of("Split", ["state", graph.constant("parts", np.array(_PARTS))], kept, axis=1)
-        means = node("Mul", ["means_before", graph.constant("keep", self.keep)], "kept")
-        read = node("MatMul", ["observation", graph.constant("gain", self.gain)], "read")
-        means = node("Add", [means, read], "means")
-        now = node("Gather", ["observation", graph.constant("noisy", np.array(_NOISY))], "now", axis=1)
-        variance = node("Add", ["excess", constant("usual", [USUAL**2])], "variance")
-        difference = node("Sub", [now, "last"], "difference")
-        bend = node("Sub", [difference, "change"], "bend")
-        square = node("Mul", [node("Mul", [bend, bend], "bend_2"), constant("sixth", [1.0 / 6.0])], "square")
-        most = node("Mul", [variance, constant("outlier", [OUTLIER])], "most")
-        above = node("Relu", [node("Sub", [square, most], "over")], "above")
-        off = node("Sub", [node("Sub", [square, above], "used"), variance], "off")
-        moved = node("Mul", [off, constant("share", [self.noise_share])], "moved")
-        excess = node("Add", ["excess", moved], "next_excess")
-        half = node("Add", [excess, constant("twice", [2.0 * USUAL**2])], "half")
-        noise = node("Sub", [constant("one", [1.0]), node("Div", ["usual", half], "quiet")], "noise")
-        band = node("MatMul", [means, graph.constant("swings_of", self.swings)], "band")
-        grown = node("Sub", [node("Mul", [band, band], "band_2"), "squares"], "grown")
-        grown = node("Mul", [grown, constant("swing_share", [self.swing_share])], "swing_moved")
-        swings = node("Add", ["squares", grown], "next_squares")
-        above = node("Add", [swings, graph.constant("usual_swings", self.usual)], "swings_above")
-        strong = node("Div", [swings, above], "strong")
-        seen = node("Concat", ["observation", means], "seen", axis=1)
-        plain = node("MatMul", [seen, graph.constant("features_of", self.features)], "plain")
-        x = node("Concat", [plain, noise, strong], "features", axis=1)
-        width = self.mean.numel()
-
-        def feature(of: str, back: int, name: str) -> str:
-            return node("Gather", [of, graph.constant(f"{name}_at", np.array([width - back]))], name, axis=1)
-
-        begun = [feature(x, _STRENGTHS + back, f"begun_{back}") for back in range(len(BEGUN), 0, -1)]
-        x = node("Sub", [x, graph.constant("mean", self.mean)], "centred")
-        x = node("Mul", [x, graph.constant("per_std", self.per_std)], "scaled")
-        x = graph.clip(x, -NORMALISED_LIMIT, NORMALISED_LIMIT, "normalised")
-        strengths = [feature(x, _STRENGTHS - at, f"strength_{at}") for at in (0, *range(len(NOISY), _STRENGTHS))]
-        noise, *swinging = (graph.clip(each, -SCHEDULE_LIMIT, SCHEDULE_LIMIT, f"{each}_held") for each in strengths)
-        bow = node("Sub", [node("Mul", [noise, noise], "noise_2"), "one"], "bow")
-        schedule = [noise, bow, *swinging, *(node("Sub", ["one", each], f"{each}_left") for each in begun)]
-        parts = [x, *(node("Mul", [x, each], f"x_{each}") for each in schedule)]
-        x_scheduled = node("Concat", parts, "scheduled", axis=1)
-        output = graph.linear(x_scheduled, self.linear.weight, self.linear.bias, "linear")
-        if self.bent is not None:
-            output = node("Add", [output, graph.through(x, [self.layers, self.bent])], "output")
-        output = node("Mul", [output, graph.constant("gains", self.gains)], "asked")
-        graph.clip(output, -1.0, 1.0, "action")
-        node("Concat", [means, now, difference, excess, swings], "next_state", axis=1)
+        action, after = self.forward(Value(graph, "observation"), Value(graph, "state"))
+        graph.clip(action.name, -1.0, 1.0, "action")
+        graph.node("Identity", [after.name], "next_state")
         return graph.finished(len(MEASURED), state=STATE)
 
 

@@ -59,8 +59,9 @@ class GradientLearner:
         self.per_update = recipe.num_envs * recipe.window
         self.total = math.ceil(recipe.steps / self.per_update) * self.per_update
         self.steps = done
-        self.network = FilterBank(config.control_interval, recipe.hidden)
-        self.optimiser = torch.optim.Adam(self.network.parameters(), recipe.learning_rate)
+        self.network = FilterBank(config.control_interval, recipe.hidden, recipe.scheduled)
+        weights = self.network.parameters()
+        self.optimiser = torch.optim.Adam(weights, recipe.learning_rate, betas=(0.9, recipe.beta2))
         self.random = np.random.default_rng([seed, done])
         self.weights = np.array([1.0, recipe.weights.pull, recipe.weights.pull_step, recipe.weights.heater_step])
 

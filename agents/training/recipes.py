@@ -103,8 +103,13 @@ class Gradient(Rewarded):
     """Other crystals that it learns on: scenario, how far everything random is spread in units of the scenario's own,
     and their share of all."""
     hidden: tuple[int, ...] = (64,)
-    learning_rate: float = 3e-3
-    """At the start; it falls linearly to zero."""
+    scheduled: bool = True
+    """Whether the linear map depends on noise, swings and the crystal's age."""
+    learning_rate: float = 5e-3
+    """Of Adam at the start; it falls linearly to zero."""
+    beta2: float = 0.95
+    """How much of the squared gradients Adam remembers: the first ones, of lost crystals, are a thousand times those
+    that follow."""
 
 
 @dataclass(frozen=True, kw_only=True)
