@@ -95,7 +95,7 @@ class Gradient(Rewarded):
     name: str = "gradient"
     observation: str = "measured"
     action: str = "rate"
-    steps: int = 62_208_000
+    steps: int = 48_384_000
     num_envs: int = 192
     window: int = 180
     """Steps of a crystal that a gradient goes back through."""
