@@ -1,0 +1,106 @@
+"""Bode plot, margins and sensitivity of a controller's loop with the nominal plant, near rest.
+
+``python -m studies.bode lqg`` takes a shipped controller, ``python -m studies.bode my.py:SlowPI`` one of your own: its
+``state`` is a NamedTuple of arrays, so that its linear form can be read off.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cz_gym.atomic_files import check_writable, write_files
+from cz_gym.baselines.analysis.frequency import LoopMargins, frequencies, margins_of, opened, response
+from cz_gym.baselines.analysis.linear_form import LinearForm, linear_form
+from cz_gym.baselines.analysis.sampled_loop import close
+from cz_gym.baselines.registry import make_controller
+from cz_gym.commands import OneLineParser, guarded
+from cz_gym.config import make_config
+from cz_gym.evaluation import user_code
+from cz_gym.physics.plant import Puller, make_puller
+from studies.markdown import table
+
+PROG = "python -m studies.bode"
+PLACES = {"camera": "ring", "v_p": "pull speed"}
+"""Where the loop is opened, and what it is called."""
+
+
+def form_of(name: str) -> LinearForm:
+    """The linear form of a shipped controller, or of ``FILE.py:NAME``; ValueError says in one line why it has none."""
+    config = make_config("nominal")
+    if ":" in name:
+        (policy,) = user_code.controller(name).make(config)
+        if getattr(policy, "control_interval", None) is None:
+            raise ValueError(f"{name}: needs an attribute control_interval [s]")
+    else:
+        policy = make_controller(name, config)
+    return linear_form(policy)
+
+
+def margins(form: LinearForm, puller: Puller, at: str) -> tuple[Any, LoopMargins]:
+    """The loop opened there: its response at :func:`frequencies`, and its margins."""
+    controller = form.free if at == "v_p" else form.controller
+    omega = frequencies(form.dt)
+    values = response(opened(controller, puller, form.dt, at), form.dt, omega)
+    return values, margins_of(values, omega, form.dt, close(form.controller, puller, form.dt).stable)
+
+
+def picture(name: str, form: LinearForm, responses: dict[str, Any]) -> bytes:
+    """Gain and phase of the loop, and its sensitivity, as PNG."""
+    from cz_gym.evaluation.report.canvas import COLOURS, GREY, canvas, png
+
+    omega = frequencies(form.dt)
+    figure = canvas(7.0, 6.5)
+    gain, phase, sensitivity = figure.subplots(3, 1, sharex=True)
+    for (at, values), colour in zip(responses.items(), COLOURS, strict=False):
+        label = f"opened at the {PLACES[at]}"
+        gain.loglog(omega, np.abs(values), color=colour, lw=1.2, label=label)
+        phase.semilogx(omega, np.degrees(np.unwrap(np.angle(values))), color=colour, lw=1.2)
+        sensitivity.loglog(omega, 1.0 / np.abs(1.0 + values), color=colour, lw=1.2)
+    for panel, label in ((gain, "|L| [-]"), (phase, "phase of L [deg]"), (sensitivity, "|1 / (1 + L)| [-]")):
+        panel.set_ylabel(label)
+        panel.grid(alpha=0.3)
+    for panel in (gain, sensitivity):
+        panel.axhline(1.0, color=GREY, lw=0.8)
+    sensitivity.set_xlabel("angular frequency [rad/s]")
+    gain.legend(fontsize=8, frameon=False)
+    figure.suptitle(f"{name} with the nominal plant", fontsize=10)
+    return png(figure)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    parser = OneLineParser(prog=PROG, description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("controller", help="name of a shipped controller, or FILE.py:NAME")
+    parser.add_argument("--mix", type=float, default=0.5, help="1: Model I, 0: Model II (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=Path("runs/bode.png"), help="picture (default: %(default)s)")
+    given = parser.parse_args(arguments)
+    return guarded(PROG, lambda: _main(given), "benchmark")
+
+
+def _main(given: argparse.Namespace) -> int:
+    if not 0.0 <= given.mix <= 1.0:
+        raise ValueError(f"--mix must lie in [0, 1], not {given.mix:g}")
+    check_writable(given.out.parent)
+    form, puller = form_of(given.controller), make_puller(lam=given.mix)
+    found = {at: margins(form, puller, at) for at in PLACES}
+    rows = []
+    for at, (_, each) in found.items():
+        figures = (each.gain_up, each.gain_down, each.phase_deg, each.delay, each.sensitivity)
+        rows.append([PLACES[at], f"{each.crossover:.2e}", *(f"{figure:.3g}" for figure in figures)])
+    heads = ("opened at", "crossover [rad/s]", "gain up", "gain down", "phase [deg]", "delay [s]", "sensitivity")
+    print(table(heads, rows))
+    if not close(form.controller, puller, form.dt).stable:
+        print("the closed loop is unstable: it has no margins")
+    write_files({given.out: picture(given.controller, form, {at: values for at, (values, _) in found.items()})})
+    print(f"wrote {given.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,60 @@
+"""The Bode plot of any controller: the design table's margins, and one line where there is none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("control")
+
+from cz_gym.baselines.analysis.frequency import loop_margins
+from cz_gym.physics.plant import make_puller
+from studies.bode import __main__ as bode
+
+OWN = """
+from typing import NamedTuple
+import numpy as np
+from cz_gym.baselines import CompensatedPID
+mine = CompensatedPID()
+class Forgetful:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.zeros((len(np.atleast_2d(observation)), 2)), state
+"""
+
+
+def test_a_controllers_margins_are_the_design_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert bode.main(["lqg", "--out", str(tmp_path / "lqg.png")]) == 0
+    assert (tmp_path / "lqg.png").read_bytes().startswith(b"\x89PNG")
+    form = bode.form_of("lqg")
+    expected = loop_margins(form.controller, make_puller(lam=0.5), form.dt)
+    assert f"| ring | {expected.crossover:.2e} | {expected.gain_up:.3g} |" in capsys.readouterr().out
+
+
+def test_one_of_the_users_own_is_taken_from_its_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "my.py").write_text(OWN)
+    assert bode.main([f"{tmp_path / 'my.py'}:mine", "--out", str(tmp_path / "mine.png")]) == 0
+    mine = capsys.readouterr().out.splitlines()[:4]
+    assert bode.main(["paper", "--out", str(tmp_path / "paper.png")]) == 0
+    assert capsys.readouterr().out.splitlines()[:4] == mine
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["lqgg"], "did you mean 'lqg'"),
+        (["open-loop"], "there is no loop"),
+        (["my.py:Forgetful"], "needs an attribute control_interval"),
+        (["nowhere.py:Mine"], "no such file"),
+        (["lqg", "--mix", "2"], "must lie in"),
+    ],
+)
+def test_what_has_no_bode_plot_is_one_line(
+    given: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "my.py").write_text(OWN)
+    monkeypatch.chdir(tmp_path)
+    assert bode.main(given) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
