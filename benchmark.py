@@ -69,6 +69,13 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
         help="scenario of your own, in place of others",
     )
     add("--slow", action="store_true", help="slow controllers too, on 50 episodes; resumed from results/cache")
+    add(
+        "--ray",
+        nargs="?",
+        const="",
+        metavar="HOST:PORT",
+        help="run on a Ray cluster; without an address on this machine's",
+    )
     add("--overwrite", action="store_true", help="replace files of earlier or other runs")
     add("--quiet", action="store_true", help="no progress bar, no table")
     return parser.parse_args(argv)
@@ -104,7 +111,7 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
 
     from cz_gym.evaluation.report.output import check_targets, write
     from cz_gym.evaluation.report.terminal import terminal
-    from cz_gym.evaluation.runner import run
+    from cz_gym.evaluation.runner import in_turn, on_cluster, run
 
     plan = make_plan(arguments, command)
     smaller = is_partial(arguments, plan)
@@ -113,11 +120,15 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
     if arguments.out is not None:
         import matplotlib  # noqa: F401
         import plotly  # noqa: F401
+    if arguments.ray is not None:
+        from cz_gym.evaluation.cluster import connect
+
+        connect(arguments.ray)
     for contender in plan.contenders:
         if contender.controller.slow:
             contender.make(plan.rows[0].config())
     with tqdm(total=plan.steps, unit="step", unit_scale=True, leave=False, disable=arguments.quiet) as bar:
-        done = run(plan, bar)
+        done = run(plan, bar, in_turn if arguments.ray is None else on_cluster)
     quoted = README if not smaller and arguments.out and arguments.out.resolve() == FOLDER else None
     write(arguments.out, arguments.json, done, quoted)
     if not arguments.quiet:

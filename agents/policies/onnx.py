@@ -26,6 +26,11 @@ class OnnxPolicy:
     session: Any = field(repr=False, compare=False)
     remembers: int = 0
     """Length of its state; 0 if it has none."""
+    content: bytes = field(default=b"", repr=False, compare=False)
+    """The ONNX graph as it was read, so that a policy pickles."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self).of, (self.contract, self.content)
 
     @classmethod
     def load(cls, path: str | Path, config: Config | None = None) -> OnnxPolicy:
@@ -61,7 +66,7 @@ class OnnxPolicy:
             raise AgentFileError(
                 f"{path}: trained on plant {contract.plant_hash}, this environment's is {config.plant_hash}"
             )
-        policy = cls(contract, *_session(path, onnx_bytes, expected))
+        policy = cls(contract, *_session(path, onnx_bytes, expected), onnx_bytes)
         try:
             policy.predict(np.zeros((2, expected), np.float32))
         except AgentFileError as error:

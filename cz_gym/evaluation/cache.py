@@ -12,7 +12,7 @@ import io
 import json
 import sys
 import zipfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,10 +25,10 @@ from cz_gym.config import Config
 from cz_gym.jit.cache import compiled_sources
 
 from .files import EPISODES, read_episodes
-from .metrics import metric_names, metrics
+from .metrics import metric_names
 from .protocol import Row
-from .results import BOUND, EXAMPLES, Controller, Sample
-from .rollout import Rollout, Signals, rollout
+from .results import BOUND, EXAMPLES, Controller, Part, Sample
+from .rollout import Signals
 
 Floats = npt.NDArray[np.float64]
 BLOCK = 10
@@ -50,37 +50,33 @@ class CachedEpisode(NamedTuple):
     """Signals of one of the first episodes, shape (signals, steps); of the others empty."""
 
 
-def slow_sample(
-    controller: Controller,
-    policy: Any,
-    config: Config,
-    seeds: Sequence[int],
-    folder: Path,
-    progress: Callable[[int], None],
-) -> Sample:
-    """The sample of a slow controller; cached episodes are read, the others run, a few at a time, and cached.
+class SlowEpisodes:
+    """The cached episodes of a slow controller, whose ``policy`` has a ``hash`` of its settings."""
 
-    ``policy`` has a ``hash`` of its settings.
-    """
-    place = _place(controller, policy, config, folder)
-    examples = seeds[:EXAMPLES]
-    cached = {seed: found for seed in seeds if (found := read_episode(place / f"{seed}.npz", seed in examples))}
-    progress(config.steps * len(cached))
-    missing = [seed for seed in seeds if seed not in cached]
-    for first in range(0, len(missing), BLOCK):
-        run = rollout(policy, config, missing[first : first + BLOCK], progress)
-        new = dict(zip(run.seeds, _episodes(run, examples), strict=True))
-        write_files({place / f"{seed}.npz": _packed(episode) for seed, episode in new.items()})
-        cached |= new
-    ordered = [cached[seed] for seed in seeds]
-    values = np.array([[episode.values for episode in ordered]])
-    microseconds = float(np.mean([episode.microseconds for episode in ordered]))
-    signals = tuple(Signals(*episode.signals) for episode in ordered[: len(examples)])
-    return Sample(controller, tuple(seeds), values, microseconds, signals, config.control_interval)
+    def __init__(self, controller: Controller, policy: Any, config: Config, folder: Path) -> None:
+        self.place = _place(controller, policy, config, folder)
+
+    def read(self, seeds: Sequence[int], examples: Collection[int]) -> list[Part]:
+        """Those of some seeds that are there, each a part; of the ``examples`` those that have their signals."""
+        found = {seed: read_episode(self.place / f"{seed}.npz", seed in examples) for seed in seeds}
+        return [
+            Part((seed,), each.values[None], each.microseconds, {seed: each.signals} if seed in examples else {})
+            for seed, each in found.items()
+            if each is not None
+        ]
+
+    def write(self, part: Part) -> None:
+        """Keep a part."""
+        none = np.zeros((0, 0))
+        packed = {
+            self.place / f"{seed}.npz": _packed(CachedEpisode(row, part.microseconds, part.signals.get(seed, none)))
+            for seed, row in zip(part.seeds, part.values, strict=True)
+        }
+        write_files(packed)
 
 
 def is_cached(controller: Controller, policy: Any, config: Config, seeds: Sequence[int], folder: Path) -> bool:
-    """Whether :func:`slow_sample` would have nothing to run."""
+    """Whether every one of these episodes is there."""
     place = _place(controller, policy, config, folder)
     return all(read_episode(place / f"{seed}.npz", seed in seeds[:EXAMPLES]) for seed in seeds)
 
@@ -108,12 +104,6 @@ def read_episode(path: Path, example: bool) -> CachedEpisode | None:
     logged = signals.ndim == 2 and len(signals) == len(Signals._fields) and signals.size > 0
     numbers = found.values.dtype == signals.dtype == np.float64
     return found if numbers and found.values.shape == (len(metric_names()),) and (logged or not example) else None
-
-
-def _episodes(run: Rollout, examples: Sequence[int]) -> list[CachedEpisode]:
-    values = np.stack(metrics(run), axis=-1)
-    signals = [np.stack(run.episode(i)) if seed in examples else np.zeros((0, 0)) for i, seed in enumerate(run.seeds)]
-    return [CachedEpisode(values[i], run.microseconds_per_step, signals[i]) for i in range(len(run.seeds))]
 
 
 def _packed(episode: CachedEpisode) -> bytes:

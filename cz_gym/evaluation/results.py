@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -55,6 +55,24 @@ class Controller:
         return self.privileged or self.observation == "state"
 
 
+class Part(NamedTuple):
+    """What some episodes of one policy come to."""
+
+    seeds: tuple[int, ...]
+    values: Floats
+    """Shape (episodes, metrics), metrics in the order of :func:`metric_names`."""
+    microseconds: float
+    """Time in the policy per step and episode [us]."""
+    signals: dict[int, Floats]
+    """By seed, of those episodes that keep them: up to the episode's end, shape (signals, steps)."""
+
+    @classmethod
+    def of(cls, run: Rollout, examples: Collection[int]) -> Part:
+        """Of a rollout; the episodes among ``examples`` keep their signals."""
+        signals = {seed: np.stack(run.episode(i)) for i, seed in enumerate(run.seeds) if seed in examples}
+        return cls(run.seeds, np.stack(metrics(run), axis=-1), run.microseconds_per_step, signals)
+
+
 @dataclass(frozen=True)
 class Sample:
     """One controller on one scenario."""
@@ -72,11 +90,25 @@ class Sample:
     @classmethod
     def of(cls, controller: Controller, runs: Sequence[Rollout]) -> Sample:
         """The sample of a controller's rollouts, one a training seed, all on the same episodes."""
-        values = np.array([np.stack(metrics(run), axis=-1) for run in runs])
-        first = runs[0]
-        examples = tuple(first.episode(i) for i in range(min(len(first.seeds), EXAMPLES)))
-        microseconds = float(np.mean([run.microseconds_per_step for run in runs]))
-        return cls(controller, first.seeds, values, microseconds, examples, first.config.control_interval)
+        seeds = runs[0].seeds
+        parts = [[Part.of(run, frozenset(seeds[:EXAMPLES]))] for run in runs]
+        return cls.joined(controller, seeds, parts, runs[0].config.control_interval)
+
+    @classmethod
+    def joined(
+        cls, controller: Controller, seeds: Sequence[int], parts: Sequence[Sequence[Part]], control_interval: float
+    ) -> Sample:
+        """The sample of the parts of each training seed, in any order, which together hold the episodes."""
+        values: list[Floats] = []
+        signals: dict[int, Signals] = {}
+        for policy in reversed(parts):
+            rows = {seed: row for part in policy for seed, row in zip(part.seeds, part.values, strict=True)}
+            values.insert(0, np.stack([rows[seed] for seed in seeds]))
+            signals = {seed: Signals(*found) for part in policy for seed, found in part.signals.items()}
+        every = [(part.microseconds, len(part.seeds)) for policy in parts for part in policy]
+        microseconds = float(np.average([each for each, _ in every], weights=[episodes for _, episodes in every]))
+        examples = tuple(signals[seed] for seed in seeds[:EXAMPLES])
+        return cls(controller, tuple(seeds), np.array(values), microseconds, examples, control_interval)
 
     @property
     def example(self) -> Signals:

@@ -17,6 +17,9 @@ from .contenders import Contender
 from .protocol import Row
 from .results import Controller
 
+PREFIX = "cz_gym_user_"
+"""Of the names that modules from the user's files have."""
+
 
 def load(place: str) -> tuple[str, Any]:
     """The name and the object at ``FILE.py:NAME``; ValueError says in one line why there is none."""
@@ -26,7 +29,7 @@ def load(place: str) -> tuple[str, Any]:
         raise ValueError(f"must be FILE.py:NAME, not {place!r:.80}")
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
-    module_name = f"cz_gym_user_{path.stem}"
+    module_name = f"{PREFIX}{path.stem}"
     spec: Any = importlib.util.spec_from_file_location(module_name, path)
     # Dataclasses look their module up.
     module = sys.modules[module_name] = importlib.util.module_from_spec(spec)

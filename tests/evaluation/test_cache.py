@@ -6,6 +6,7 @@ import csv
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,14 +19,16 @@ from cz_gym.baselines import registry
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
 from cz_gym.baselines.pid.open_loop import OpenLoop
 from cz_gym.config import make_config
-from cz_gym.evaluation import cache, runner
+from cz_gym.evaluation import results, runner
 from cz_gym.evaluation.cache import code_behind, earlier_bound, hash_sources, sources_behind
+from cz_gym.evaluation.contenders import Contender
 from cz_gym.evaluation.files import to_csv, to_json
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.protocol import TEST_SEEDS, find_row
 from cz_gym.evaluation.report.markdown import markdown
 from cz_gym.evaluation.results import Benchmark, Controller, Sample, summarise
 from cz_gym.evaluation.rollout import Signals, rollout
+from cz_gym.evaluation.runner import Job
 from cz_gym.evaluation.statistics import Resamples, optimality_gap
 
 CONFIG = make_config(horizon=300.0)
@@ -45,7 +48,20 @@ class Snail(OpenLoop):
 
 
 def sample(folder: Path, policy: Any = None, config: Any = CONFIG, seeds: Any = SEEDS) -> Sample:
-    return cache.slow_sample(WHO, policy or Snail(), config, seeds, folder, lambda steps: None)
+    row: Any = SimpleNamespace(name="some", config=lambda *_: config, design_config=lambda *_: config)
+    plan: Any = SimpleNamespace(cache=folder, seeds=lambda *_: seeds)
+    job = Job(plan, row, Contender(WHO, lambda _: [policy or Snail()]), Bar())
+    for number, part in runner.in_turn(job.pieces, Bar()):
+        job.keep(job.pieces[number], part)
+    return job.sample()
+
+
+class Bar:
+    """Takes what tqdm's bar takes."""
+
+    def update(self, steps: int) -> None: ...
+
+    def set_description(self, text: str) -> None: ...
 
 
 @pytest.fixture
@@ -59,8 +75,8 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         ran.extend(seeds)
         return rollout(policy, config, seeds, progress)
 
-    monkeypatch.setattr(cache, "rollout", counting)
-    monkeypatch.setattr(cache, "BLOCK", 2)
+    monkeypatch.setattr(runner, "rollout", counting)
+    monkeypatch.setattr(runner, "BLOCK", 2)
     return ran
 
 
@@ -112,7 +128,8 @@ def test_only_the_first_episodes_have_signals(
 ) -> None:
     direct = rollout(OpenLoop(), CONFIG, SEEDS)
     for examples in (1, 3, 2):
-        monkeypatch.setattr(cache, "EXAMPLES", examples)
+        for module in (runner, results):
+            monkeypatch.setattr(module, "EXAMPLES", examples)
         found = sample(tmp_path)
         assert len(found.examples) == examples
         for i, signals in enumerate(found.examples):

@@ -1,0 +1,116 @@
+"""A benchmark on a Ray cluster of several nodes: the same figures, also when a node is lost on the way."""
+
+from __future__ import annotations
+
+import pickle
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import benchmark
+from cz_gym.agents import load
+from cz_gym.evaluation import cluster, runner
+from cz_gym.evaluation.protocol import Row, find_row
+from cz_gym.evaluation.results import Benchmark
+
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
+
+
+class Bar:
+    """Counts steps as tqdm's bar does."""
+
+    def __init__(self) -> None:
+        self.steps = 0
+
+    def update(self, steps: int) -> None:
+        self.steps += steps
+
+    def set_description(self, text: str) -> None: ...
+
+
+class Short(Row):
+    """A row of ten minutes."""
+
+    def config(self, *arguments: Any) -> Any:
+        return replace(super().config(*arguments), horizon=600.0)
+
+
+@pytest.fixture
+def nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Any, Any]]:
+    """A cluster of two nodes, a processor each, and the second of them."""
+    ray = pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    second = made.add_node(num_cpus=1)
+    cluster.connect(made.address)
+    yield made, second
+    ray.shutdown()
+    made.shutdown()
+
+
+def plan() -> runner.Plan:
+    given = benchmark.parse(["--controllers", "paper,lqg,gradient", "--scenarios", "randomized", "--episodes", "4"])
+    row = find_row("randomized")
+    return replace(benchmark.make_plan(given, ""), rows=(Short(row.name, row.scenario, row.meaning),))
+
+
+def values(found: Benchmark) -> dict[str, Any]:
+    return {outcome.controller.name: outcome.sample.values for outcome in found.scenarios[0].outcomes}
+
+
+def test_a_lost_node_changes_nothing(nodes: tuple[Any, Any]) -> None:
+    made, second = nodes
+    lost = []
+
+    def losing(pieces: Any, bar: Any) -> Any:
+        for number, part in runner.on_cluster(pieces, bar):
+            if not lost:
+                lost.append(number)
+                made.remove_node(second, allow_graceful=False)
+            yield number, part
+
+    here, there = Bar(), Bar()
+    wanted, found = runner.run(plan(), here), runner.run(plan(), there, losing)
+    assert lost
+    assert there.steps == here.steps
+    for name, ours in values(wanted).items():
+        np.testing.assert_array_equal(values(found)[name], ours, err_msg=name)
+    assert len(values(wanted)["gradient"]) == 10
+
+
+def test_a_node_with_other_sources_is_named(nodes: tuple[Any, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "_ours", lambda: ("0.0.0", "elsewhere"))
+    with pytest.raises(ValueError, match=r"has cz_gym 0\.1\.0 .*, this machine 0\.0\.0 elsewhere: install the same"):
+        cluster.connect("")
+
+
+def test_what_a_task_raises_is_raised_here(nodes: tuple[Any, Any]) -> None:
+    with pytest.raises(ZeroDivisionError):
+        list(cluster.completed(lambda task: 1 // task, [1, 0]))
+
+
+def test_without_a_cluster_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("ray")
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+    with pytest.raises(ValueError, match=r"no Ray cluster at 127\.0\.0\.1:1") as refusal:
+        cluster.connect("127.0.0.1:1")
+    assert "\n" not in str(refusal.value)
+
+
+def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ValueError, match=r'pip install "\.\[ray\]"'):
+        cluster.connect("")
+
+
+def test_policies_pickle() -> None:
+    policy = load("gradient")
+    again = pickle.loads(pickle.dumps(policy))
+    seen = np.random.default_rng(0).normal(size=(3, policy.contract.channels)).astype(np.float32)
+    np.testing.assert_array_equal(again.predict(seen)[0], policy.predict(seen)[0])
