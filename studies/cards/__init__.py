@@ -1,0 +1,1 @@
+"""Model cards of the shipped agents: ``python -m studies.cards``."""

@@ -1,0 +1,116 @@
+"""Write a card of each shipped agent from the benchmark's results: what it saw, what it reaches, where it fails."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cz_gym.agents import shipped_seeds
+from cz_gym.agents.agent_file.contract import Contract, read_agent
+from cz_gym.atomic_files import check_writable, write_files
+from cz_gym.commands import OneLineParser, guarded
+from studies.markdown import table
+
+PROG = "python -m studies.cards"
+AGENTS = {
+    "gradient": "the exact gradient of the reward's cost, through policy, memory and plant; from nothing",
+    "ppo": "reward, by proximal policy optimisation; from nothing, with a critic that saw the true state",
+    "random-search": "reward, by augmented random search of a linear policy; from nothing",
+    "imitation": "demonstrations of an LQG that knew each crystal's puller and roughness (DAgger); no reward",
+}
+"""Shipped agents, and what each learned from."""
+FIGURES = {
+    "rmse_mm": "RMSE [mm]",
+    "rmse_observable_mm": "observable RMSE [mm]",
+    "pull_step_rms_mm_per_min": "pull step RMS [mm/min]",
+    "failure_rate": "lost [%]",
+}
+"""Metrics of a card, and their heads."""
+Results = Mapping[str, Mapping[str, Mapping[str, Any]]]
+"""The benchmark's estimates, by scenario, controller and metric."""
+
+
+def read_results(path: Path) -> Results:
+    """The results of a benchmark.json; ValueError for any other file."""
+    try:
+        found: Results = json.loads(path.read_text())["results"]
+        for name in AGENTS:
+            for scenario in found:
+                for metric in FIGURES:
+                    float(found[scenario][name][metric]["mean"])
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise ValueError(f"{path} is no benchmark.json with {', '.join(AGENTS)}") from None
+    return found
+
+
+def card(name: str, learned_from: str, contracts: Sequence[Contract], results: Results) -> str:
+    """An agent's section."""
+    first = contracts[0]
+    steps = [f"{each([contract.training_steps for contract in contracts]) / 1e6:.0f}" for each in (min, max)]
+    rows = [
+        [scenario, *(_estimate(of[name][metric], 100.0 if metric == "failure_rate" else 1.0) for metric in FIGURES)]
+        for scenario, of in results.items()
+    ]
+    fails = [f"`{scenario}`" for scenario, of in results.items() if of[name]["failure_rate"]["mean"] > 0.0]
+    return "\n".join(
+        [
+            f"## `{name}`",
+            "",
+            f"- Learned from: {learned_from}.",
+            f"- Saw: crystals of `{first.scenario}`; {' to '.join(dict.fromkeys(steps))} million steps of reward a run.",
+            f"- Reads: `{first.observation}`; acts every {first.control_interval:g} s; its action is `{first.action}`.",
+            f"- Training seeds: {len(contracts)}. `agents.load({name!r})` is the one of least validation cost.",
+            "- Fails: " + (f"loses crystals of {', '.join(fails)}." if fails else "on none of these."),
+            "",
+            table(["scenario", *FIGURES.values()], rows),
+            "",
+        ]
+    )
+
+
+def _estimate(found: Mapping[str, Any], scale: float) -> str:
+    mean, interval = scale * float(found["mean"]), found.get("ci95")
+    digits = 1 if scale > 1.0 else 4
+    if interval is None:
+        return f"{mean:.{digits}f}"
+    low, high = (scale * float(each) for each in interval)
+    return f"{mean:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+ABOUT = """# Model cards
+
+What each shipped agent saw, what it reaches and where it fails, on test crystals that took no part in its training. All
+training seeds of a name are pooled; in brackets the 95 % interval over crystals and training seeds. The figures are those of
+[the benchmark](../benchmark/report.md); `python -m studies.cards` wrote this page.
+
+No agent was trained or tested on a real puller: none may control one.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    parser = OneLineParser(prog=PROG, description=__doc__)
+    benchmark, out = Path("results/benchmark/benchmark.json"), Path("results/cards/cards.md")
+    parser.add_argument("--benchmark", type=Path, default=benchmark, help="results (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=out, help="file to write (default: %(default)s)")
+    given = parser.parse_args(arguments)
+    return guarded(PROG, lambda: _main(given), "benchmark")
+
+
+def _main(given: argparse.Namespace) -> int:
+    check_writable(given.out.parent)
+    results = read_results(given.benchmark)
+    cards = [
+        card(name, of, [read_agent(each)[0] for each in shipped_seeds(name)], results) for name, of in AGENTS.items()
+    ]
+    write_files({given.out: "\n".join([ABOUT, *cards]).encode()})
+    print(f"wrote {given.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
