@@ -50,7 +50,8 @@ def read_results(path: Path) -> Results:
 def card(name: str, learned_from: str, contracts: Sequence[Contract], results: Results) -> str:
     """An agent's section."""
     first = contracts[0]
-    steps = [f"{each([contract.training_steps for contract in contracts]) / 1e6:.0f}" for each in (min, max)]
+    taken = [contract.training_steps / 1e6 for contract in contracts]
+    steps = [f"{least_or_most(taken):.0f}" for least_or_most in (min, max)]
     rows = [
         [scenario, *(_estimate(of[name][metric], 100.0 if metric == "failure_rate" else 1.0) for metric in FIGURES)]
         for scenario, of in results.items()
@@ -84,7 +85,7 @@ def _estimate(found: Mapping[str, Any], scale: float) -> str:
 ABOUT = """# Model cards
 
 What each shipped agent saw, what it reaches and where it fails, on test crystals that took no part in its training. All
-training seeds of a name are pooled; in brackets the 95 % interval over crystals and training seeds. The figures are those of
+training seeds of a name are pooled; in brackets the 95 % interval over crystals and training seeds. The figures are of
 [the benchmark](../benchmark/report.md); `python -m studies.cards` wrote this page.
 
 No agent was trained or tested on a real puller: none may control one.
