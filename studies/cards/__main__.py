@@ -62,7 +62,7 @@ def card(name: str, learned_from: str, contracts: Sequence[Contract], results: R
             f"## `{name}`",
             "",
             f"- Learned from: {learned_from}.",
-            f"- Saw: crystals of `{first.scenario}`; {' to '.join(dict.fromkeys(steps))} million steps of reward a run.",
+            f"- Saw: crystals of `{first.scenario}`; {' to '.join(dict.fromkeys(steps))} million steps a run.",
             f"- Reads: `{first.observation}`; acts every {first.control_interval:g} s; its action is `{first.action}`.",
             f"- Training seeds: {len(contracts)}. `agents.load({name!r})` is the one of least validation cost.",
             "- Fails: " + (f"loses crystals of {', '.join(fails)}." if fails else "on none of these."),
