@@ -95,21 +95,13 @@ class Gradient(Rewarded):
     name: str = "gradient"
     observation: str = "measured"
     action: str = "rate"
-    steps: int = 48_384_000
+    steps: int = 62_208_000
     num_envs: int = 192
     window: int = 180
     """Steps of a crystal that a gradient goes back through."""
-    also: tuple[tuple[str, float, float], ...] = ()
-    """Other crystals that it learns on: scenario, how far everything random is spread in units of the scenario's own,
-    and their share of all."""
     hidden: tuple[int, ...] = (64,)
-    scheduled: bool = True
-    """Whether the linear map depends on noise, swings and the crystal's age."""
-    learning_rate: float = 5e-3
-    """Of Adam at the start; it falls linearly to zero."""
-    beta2: float = 0.95
-    """How much of the squared gradients Adam remembers: the first ones, of lost crystals, are a thousand times those
-    that follow."""
+    learning_rate: float = 3e-3
+    """At the start; it falls linearly to zero."""
 
 
 @dataclass(frozen=True, kw_only=True)
