@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import os
+import socket
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,8 @@ from .user_code import PREFIX
 
 RETRIES = 20
 """Times that a task begins again whose node is lost."""
+TIMEOUT = 5.0
+"""Longest wait for a cluster's address to answer [s]."""
 WAIT = 1.0
 """Longest time between two looks at what is done [s]."""
 
@@ -31,11 +35,22 @@ def connect(address: str) -> None:
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if not ray.is_initialized():
+        _check_answers(address)
         try:
             ray.init(address=address or None, **quiet)
         except (ConnectionError, ValueError, RuntimeError, OSError) as error:
             raise ValueError(f"no Ray cluster at {address or 'this machine'}: {' '.join(str(error).split())}") from None
     _check_nodes()
+
+
+def _check_answers(address: str) -> None:
+    """ValueError unless something answers at ``HOST:PORT``: Ray itself would ask for minutes."""
+    host, colon, port = address.rpartition(":")
+    if colon and port.isdigit():
+        try:
+            socket.create_connection((host, int(port)), TIMEOUT).close()
+        except (OSError, OverflowError) as error:
+            raise ValueError(f"no Ray cluster at {address}: {error}") from None
 
 
 def _check_nodes() -> None:
@@ -62,11 +77,11 @@ def _check_nodes() -> None:
 
 def facts_of_sources() -> tuple[str, str]:
     """Version of ``cz_gym`` and hash of all its sources."""
-    from cz_gym import agents, baselines
-
     digest = hashlib.sha256()
-    for package in (cz_gym, agents, baselines):
-        root = Path(str(package.__file__)).parent
+    for package in ("cz_gym", "cz_gym.agents", "cz_gym.baselines"):
+        spec = find_spec(package)
+        assert spec is not None
+        root = Path(str(spec.origin)).parent
         for file in sorted(root.rglob("*.py")):
             digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes() + b"\0")
     return cz_gym.__version__, digest.hexdigest()[:12]

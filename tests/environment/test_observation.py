@@ -193,7 +193,7 @@ def test_camera_noise_is_per_sample_whatever_the_interval() -> None:
 
 
 def test_observations_are_clipped_not_lost() -> None:
-    scenario = Scenario("mine", sensor=Sensor(bias_offset=(0.05, 0.05)))
+    scenario = Scenario("mine", sensor=Sensor(bias_offset=(0.02, 0.02)))
     observation, _ = CzEnv(scenario, info="all").reset(seed=0)
     assert observation[0] == 10.0
 

@@ -343,7 +343,7 @@ def test_the_benchmark_needs_neither_torch_nor_stable_baselines3(tmp_path: Path)
     folder = Path(benchmark.__file__).parent
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "out" / "report.md").read_text().startswith("No verdict from ")
+    assert (tmp_path / "out" / "report.md").read_text().startswith("No agent wins.")
 
 
 def test_controllers_say_what_they_are_and_act() -> None:

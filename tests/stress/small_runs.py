@@ -21,7 +21,7 @@ from cz_gym.agents.training.recipes import PPO, RECIPES, Imitation
 from cz_gym.atomic_files import finish_writing
 from cz_gym.baselines import registry
 from cz_gym.baselines.pid.open_loop import OpenLoop
-from cz_gym.evaluation import cache
+from cz_gym.evaluation import runner
 from cz_gym.evaluation.files import is_benchmark_json
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.report import figures, page  # noqa: F401
@@ -56,7 +56,7 @@ WRITING = "cz_gym.evaluation.report.output:write_files:1"
 BENCHMARK = {
     "start-up": ("benchmark:make_plan:1", None),
     "episodes": (f"cz_gym.evaluation.runner:rollout:1>{STEP}:1000", None),
-    "slow episodes": (f"cz_gym.evaluation.cache:rollout:2>{STEP}:1000", None),
+    "slow episodes": (f"cz_gym.evaluation.runner:rollout:3>{STEP}:1000", None),
     "figures": ("cz_gym.evaluation.report.figures:draw_figures:1", None),
     "page": ("cz_gym.evaluation.report.page:page:1", None),
     "first results, before they count": (f"{WRITING}>os:rename:1", None),
@@ -89,7 +89,7 @@ def slow_benchmark(arguments: list[str]) -> int:
     slow = registry.Entry("slow", lambda config: Slow(), "measured", "does nothing", default=False, slow=True)
     registry.CONTROLLERS = (*registry.CONTROLLERS, slow)
     benchmark.CACHE = Path(arguments[-1]).parent / "cache"
-    cache.BLOCK = 2
+    runner.BLOCK = 2
     options = ["--scenarios", "randomized", "--episodes", "6", "--slow", "--overwrite", "--quiet"]
     return benchmark.main([*options, *arguments])
 

@@ -227,7 +227,7 @@ def test_estimates_beyond_the_equations_fall_back_on_the_law():
 
 def test_without_casadi_one_line_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "casadi", None)
-    with pytest.raises(ImportError, match=r"^this needs the package casadi: pip install 'cz-gym\[mpc\]'$"):
+    with pytest.raises(ImportError, match=r"^this needs the package casadi: pip install '\.\[mpc\]'$"):
         find_controller("ekf-mpc").make(make_config())
 
 
