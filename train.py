@@ -18,12 +18,10 @@ except ModuleNotFoundError as error:
 if TYPE_CHECKING:
     from cz_gym.agents.training.recipes import Recipe
 
-ALGORITHM = "gradient"
-"""What is learned by unless told otherwise."""
-
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
     """Read the command line; exits with code 2 and one line for anything that cannot be meant."""
+    from cz_gym.agents import DEFAULT
     from cz_gym.agents.training.recipes import RECIPES
 
     parser = OneLineParser(
@@ -31,7 +29,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         description="Train an agent by a recipe and pick it on validation episodes.",
         epilog="The run folder holds the agent with its contract, settings, checkpoints, progress and logs.",
     )
-    parser.add_argument("--algo", choices=tuple(RECIPES), help="recipe (default: gradient, or the resumed run's)")
+    parser.add_argument("--algo", choices=tuple(RECIPES), help=f"recipe (default: {DEFAULT}, or the resumed run's)")
     parser.add_argument("--seed", type=_whole(0), help="training seed (default: 0, or the resumed run's)")
     parser.add_argument(
         "--steps",
@@ -51,7 +49,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         "(default: %(default)g)",
     )
     arguments = parser.parse_args(argv)
-    arguments.out = arguments.out or Path("runs") / f"{arguments.algo or ALGORITHM}-seed{arguments.seed or 0}"
+    arguments.out = arguments.out or Path("runs") / f"{arguments.algo or DEFAULT}-seed{arguments.seed or 0}"
     return arguments
 
 
@@ -76,10 +74,10 @@ def train(arguments: argparse.Namespace) -> int:
     from cz_gym.baselines.registry import make_controller
 
     folder: Path = arguments.out
-    _take_up(arguments)
+    saved_steps = _take_up(arguments)
     if not arguments.resume and (folder / "settings.json").exists():
         raise ValueError(f"{folder} holds a run already: --resume it, or name another --out")
-    recipe = _asked_for(RECIPES[arguments.algo], arguments)
+    recipe = _asked_for(RECIPES[arguments.algo], arguments, saved_steps)
     check_writable(folder)
     with locked(folder):
         run = Run(
@@ -111,32 +109,35 @@ def train(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _take_up(arguments: argparse.Namespace) -> None:
-    """Fill in what the command line leaves out: from the run in the folder if it is resumed, or by default."""
+def _take_up(arguments: argparse.Namespace) -> int | None:
+    """Fill in what the command line leaves out: from the run in the folder if it is resumed, or by default.
+
+    Returns the steps that the resumed run was begun with.
+    """
+    from cz_gym.agents import DEFAULT
     from cz_gym.agents.training.recipes import RECIPES
     from cz_gym.agents.training.run_files import read_settings
 
     saved = read_settings(arguments.out / "settings.json") if arguments.resume else {}
     settings = saved.get("settings")
     scenario = settings.get("scenario") if isinstance(settings, dict) else None
-    said = {"algo": (saved.get("algorithm"), ALGORITHM), "seed": (saved.get("seed"), 0), "scenario": (scenario, "")}
+    said = {"algo": (saved.get("algorithm"), DEFAULT), "seed": (saved.get("seed"), 0), "scenario": (scenario, "")}
     for name, (value, default) in said.items():
         if getattr(arguments, name) is None:
             setattr(arguments, name, value if isinstance(value, type(default)) else default)
     if arguments.algo not in RECIPES:
         raise ValueError(f"{arguments.out}: begun with {arguments.algo!r}, which is no recipe here: name one by --algo")
+    return saved.get("steps")
 
 
-def _asked_for(recipe: Recipe, arguments: argparse.Namespace) -> Recipe:
+def _asked_for(recipe: Recipe, arguments: argparse.Namespace, saved_steps: int | None) -> Recipe:
     """The recipe with the scenario and the steps that the command line, or the resumed run, asks for."""
     from cz_gym.agents.training.recipes import Rewarded
-    from cz_gym.agents.training.run_files import saved_steps
     from cz_gym.episodes.scenarios import find_scenario
 
     recipe = replace(recipe, scenario=find_scenario(arguments.scenario or recipe.scenario).name)
-    saved = saved_steps(arguments.out) if arguments.resume else None
     if isinstance(recipe, Rewarded):
-        return replace(recipe, steps=arguments.steps or saved or recipe.steps)
+        return replace(recipe, steps=arguments.steps or saved_steps or recipe.steps)
     if arguments.steps:
         raise ValueError(f"{recipe.name} takes no --steps: its length is that of its demonstrations")
     return recipe

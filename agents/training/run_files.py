@@ -30,11 +30,6 @@ COLUMNS = (
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "stable-baselines3", "torch", "onnx", "onnxruntime")
 
 
-def saved_steps(folder: Path) -> int:
-    """Environment steps that the run in this folder was begun with; AgentFileError if there is none."""
-    return int(read_settings(folder / "settings.json")["steps"])
-
-
 def read_settings(path: Path) -> dict[str, Any]:
     """What ``settings.json`` says of a run; AgentFileError unless a run wrote it."""
     try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import socket
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -32,7 +31,6 @@ def connect(address: str) -> None:
         import ray
     except ModuleNotFoundError:
         raise ValueError('ray is missing: pip install ".[ray]"') from None
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if not ray.is_initialized():
         _check_answers(address)
@@ -40,7 +38,7 @@ def connect(address: str) -> None:
             ray.init(address=address or None, **quiet)
         except (ConnectionError, ValueError, RuntimeError, OSError) as error:
             raise ValueError(f"no Ray cluster at {address or 'this machine'}: {' '.join(str(error).split())}") from None
-    _check_nodes()
+    _check_nodes(facts_of_sources())
 
 
 def _check_answers(address: str) -> None:
@@ -53,11 +51,12 @@ def _check_answers(address: str) -> None:
             raise ValueError(f"no Ray cluster at {address}: {error}") from None
 
 
-def _check_nodes() -> None:
+def _check_nodes(ours: tuple[str, str]) -> None:
+    """ValueError names a node whose :func:`facts_of_sources` are others."""
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-    facts, ours = ray.remote(facts_of_sources), _ours()
+    facts = ray.remote(facts_of_sources)
     nodes = {node["NodeID"]: node["NodeManagerAddress"] for node in ray.nodes() if node["Alive"]}
     asked = {
         node: facts.options(num_cpus=0, scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False)).remote()
@@ -85,9 +84,6 @@ def facts_of_sources() -> tuple[str, str]:
         for file in sorted(root.rglob("*.py")):
             digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes() + b"\0")
     return cz_gym.__version__, digest.hexdigest()[:12]
-
-
-_ours = facts_of_sources
 
 
 def completed(function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:

@@ -99,12 +99,11 @@ class Sample:
         cls, controller: Controller, seeds: Sequence[int], parts: Sequence[Sequence[Part]], control_interval: float
     ) -> Sample:
         """The sample of the parts of each training seed, in any order, which together hold the episodes."""
-        values: list[Floats] = []
-        signals: dict[int, Signals] = {}
-        for policy in reversed(parts):
+        values = []
+        for policy in parts:
             rows = {seed: row for part in policy for seed, row in zip(part.seeds, part.values, strict=True)}
-            values.insert(0, np.stack([rows[seed] for seed in seeds]))
-            signals = {seed: Signals(*found) for part in policy for seed, found in part.signals.items()}
+            values.append([rows[seed] for seed in seeds])
+        signals = {seed: Signals(*found) for part in parts[0] for seed, found in part.signals.items()}
         every = [(part.microseconds, len(part.seeds)) for policy in parts for part in policy]
         microseconds = float(np.average([each for each, _ in every], weights=[episodes for _, episodes in every]))
         examples = tuple(signals[seed] for seed in seeds[:EXAMPLES])

@@ -9,20 +9,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cz_gym.agents import shipped_seeds
+from cz_gym.agents import MODELS, shipped_seeds
 from cz_gym.agents.agent_file.contract import Contract, read_agent
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser, guarded
+from studies.algorithms.__main__ import ROWS
 from studies.markdown import table
 
 PROG = "python -m studies.cards"
-AGENTS = {
-    "gradient": "the exact gradient of the reward's cost, through policy, memory and plant; from nothing",
-    "ppo": "reward, by proximal policy optimisation; from nothing, with a critic that saw the true state",
-    "random-search": "reward, by augmented random search of a linear policy; from nothing",
-    "imitation": "demonstrations of an LQG that knew each crystal's puller and roughness (DAgger); no reward",
-}
-"""Shipped agents, and what each learned from."""
+AGENTS = {row.name: row.meaning for row in ROWS if any(MODELS.glob(f"{row.name}-seed*.onnx"))}
+"""Shipped agents, and how each learned."""
 FIGURES = {
     "rmse_mm": "RMSE [mm]",
     "rmse_observable_mm": "observable RMSE [mm]",
@@ -47,7 +43,7 @@ def read_results(path: Path) -> Results:
     return found
 
 
-def card(name: str, learned_from: str, contracts: Sequence[Contract], results: Results) -> str:
+def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -> str:
     """An agent's section."""
     first = contracts[0]
     taken = [contract.training_steps / 1e6 for contract in contracts]
@@ -61,7 +57,7 @@ def card(name: str, learned_from: str, contracts: Sequence[Contract], results: R
         [
             f"## `{name}`",
             "",
-            f"- Learned from: {learned_from}.",
+            f"- How it learned: {how}.",
             f"- Saw: crystals of `{first.scenario}`; {' to '.join(dict.fromkeys(steps))} million steps a run.",
             f"- Reads: `{first.observation}`; acts every {first.control_interval:g} s; its action is `{first.action}`.",
             f"- Training seeds: {len(contracts)}. `agents.load({name!r})` is the one of least validation cost.",

@@ -24,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--examples",
         nargs="+",
         choices=EXAMPLES,
-        default=list(EXAMPLES)[:2],
+        default=["sb3_ppo", "cleanrl_ppo"],
         help="which (default: those without RLlib)",
     )
     parser.add_argument("--seeds", type=between(1, 100), default=5, help="training seeds of each (default: 5)")

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tqdm import tqdm
 
 import benchmark
 import cz_gym
@@ -49,19 +50,12 @@ class Snail(OpenLoop):
 
 def sample(folder: Path, policy: Any = None, config: Any = CONFIG, seeds: Any = SEEDS) -> Sample:
     row: Any = SimpleNamespace(name="some", config=lambda *_: config, design_config=lambda *_: config)
+    bar = tqdm(disable=True)
     plan: Any = SimpleNamespace(cache=folder, seeds=lambda *_: seeds)
-    job = Job(plan, row, Contender(WHO, lambda _: [policy or Snail()]), Bar())
-    for number, part in runner.in_turn(job.pieces, Bar()):
+    job = Job(plan, row, Contender(WHO, lambda _: [policy or Snail()]), bar)
+    for number, part in runner.in_turn(job.pieces, bar):
         job.keep(job.pieces[number], part)
     return job.sample()
-
-
-class Bar:
-    """Takes what tqdm's bar takes."""
-
-    def update(self, steps: int) -> None: ...
-
-    def set_description(self, text: str) -> None: ...
 
 
 @pytest.fixture

@@ -25,7 +25,7 @@ from cz_gym.agents.agent_file.graph import OPERATORS
 from cz_gym.agents.training.checkpoint import load_checkpoint, restore, to_bytes
 from cz_gym.agents.training.learners import make_learner
 from cz_gym.agents.training.recipes import PPO, SAC
-from cz_gym.agents.training.run_files import COLUMNS, read_rows, saved_steps
+from cz_gym.agents.training.run_files import COLUMNS, read_rows, read_settings
 from cz_gym.baselines.registry import make_controller
 from cz_gym.evaluation.cache import read_episode
 from cz_gym.evaluation.metrics import metric_names
@@ -83,7 +83,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "sac checkpoint": Target(to_bytes(sac, 1.0, 0.5), reader(checkpoint, restored(sac))),
         "settings.json": Target(
             json.dumps({"steps": 100, "sessions": [{"from_step": 0}]}).encode(),
-            reader(folder / "settings.json", lambda path: saved_steps(path.parent)),
+            reader(folder / "settings.json", read_settings),
         ),
         "progress.csv": Target(_csv().encode(), reader(folder / "progress.csv", read_rows)),
         "cached episode": Target(_episode(), reader(folder / "0.npz", lambda path: read_episode(path, True))),
