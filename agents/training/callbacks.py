@@ -15,12 +15,14 @@ from .networks import Normalise
 
 STD_FLOOR = 0.02
 """Least standard deviation an observation is divided by."""
+RECENT = 400
+"""An off-policy learner's statistics are those of its last so many steps; they are taken anew twice as often."""
 
 
 class Statistics(BaseCallback):
     """Sets the network's normalisation from what it sees: freely at first, then slowly, then never again.
 
-    Works for on-policy learners at the end of each rollout, for off-policy ones once, when learning starts.
+    Works for on-policy learners at the end of each rollout, for off-policy ones from when learning starts.
     """
 
     def __init__(self, until: int, basis: str = "differences", known: bool = False) -> None:
@@ -38,10 +40,12 @@ class Statistics(BaseCallback):
 
     def _on_step(self) -> bool:
         model: Any = self.model
-        if hasattr(model, "replay_buffer") and self.rounds == 0:
+        if hasattr(model, "replay_buffer"):
+            steps = (self.num_timesteps - model.learning_starts) // model.n_envs + 1
+            due = steps % (RECENT // 2) == 0 and self.num_timesteps <= self.until
             buffer = model.replay_buffer
-            if self.num_timesteps >= model.learning_starts - model.n_envs:
-                self._update(buffer.observations[: buffer.pos])
+            if steps >= 0 and (due or self.rounds == 0) and buffer.pos:
+                self._update(buffer.observations[max(buffer.pos - RECENT, 0) : buffer.pos])
         return True
 
     def _on_rollout_end(self) -> None:

@@ -38,6 +38,10 @@ class OnnxGraph:
         self._nodes: list[Any] = []
         self._constants: list[Any] = []
 
+    def unused(self, kind: str) -> str:
+        """A name that nothing in the graph has yet."""
+        return f"{kind.lower()}_{len(self._nodes)}_{len(self._constants)}"
+
     def constant(self, name: str, value: Any) -> str:
         """A weight, of a tensor or of numbers; its name."""
         array = value.detach().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)

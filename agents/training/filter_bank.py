@@ -17,52 +17,87 @@ from cz_gym.observation import MEASURED
 
 from .export import OnnxGraph
 from .networks import NORMALISED_LIMIT, tanh_layers
+from .symbolic import Value, columns, held, joined, parted, rectified, through
 
-TIMES = tuple(float(time) for time in np.geomspace(10.0, 3600.0, 7))
+TIMES = tuple(float(time) for time in np.geomspace(3.0, 3600.0, 8))
 """Time constants of the leaky means [s]."""
 SIGNALS = ("ring_error", "v_p", "T_1", "Q_H")
 """Channels that are averaged."""
-SPREADS = ("ring_error", "T_1")
-"""Channels whose spread about their fastest mean is remembered: how noisy sensors and melt are."""
-SPREAD_TIME = 300.0
-"""Time constant of the spreads [s]."""
-SPREAD_SCALE = 1e-3
-"""A spread, squared and in scaled units, that counts half of the largest [-]."""
+BEGUN = (60.0, 300.0)
+"""Time constants of the leaky means of "valid" [s]: how long ago the crystal began, and whether readings failed."""
+NOISY = ("ring_error", "T_1")
+"""Channels whose white noise is estimated from their second differences: camera and pyrometer."""
+NOISE_TIME = 600.0
+"""Time constant of the estimates [s]."""
+USUAL = 0.01
+"""Standard deviation that the estimates begin with; a variance so large counts half of the largest [scaled units]."""
+LARGE = 0.1
+"""The same of a second scale of the camera's noise: ripples and outliers [scaled units]."""
+OUTLIER = 9.0
+"""A squared second difference counts at most so many times what is usual of it [-]."""
+SWINGS = ((2, 3), (5, 6))
+"""Pairs of the pull speed's means, by their places in :data:`TIMES`, whose differences say how the melt fluctuates."""
+SWING_TIME = 1200.0
+"""Time constant of the squares of these differences [s]."""
+USUAL_SWINGS = (1e-3, 2e-4)
+"""Squares that count half of the largest [scaled units]."""
+SCHEDULE_LIMIT = 2.0
+"""What schedules the linear map does so up to so many standard deviations from its mean [-]."""
 INTEGRAL_TIME = 1000.0
 """A scaled ring error of one held so long gives an integral of one [s]."""
 GAINS = (0.2, 0.08)
 """Action for an output of one: pull speed and heater [-]."""
 _AT = {channel.name: place for place, channel in enumerate(MEASURED)}
-_MEANS, _SPREADS = len(SIGNALS) * len(TIMES), len(SPREADS)
-STATE = _MEANS + 1 + _SPREADS
-"""Numbers that it remembers: means of each signal, fastest first; the integral of the ring error; spreads."""
+_NOISY = [_AT[name] for name in NOISY]
+MEANS = len(SIGNALS) * len(TIMES) + len(BEGUN) + 1
+"""How many means it remembers, the integral with them."""
+_PARTS = [MEANS, *[len(NOISY)] * 3, len(SWINGS)]
+STATE = sum(_PARTS)
+"""Numbers that it remembers: means of each signal, fastest first, with the integral of the ring error; of noisy
+channels the last readings, their last differences, and the variances less the usual ones; the squared swings."""
+_STRENGTHS = len(NOISY) + 1 + len(SWINGS)
+_GROWTH = len(SIGNALS) * (len(TIMES) + 1) + 4
+"""Place of r_ref_5min - r_ref among the features."""
 
 
 class FilterBank(nn.Module):
-    """Readings -> leaky means, their differences, spreads -> normalised -> linear map beside tanh layers -> action."""
+    """Readings -> leaky means, their differences, noise -> normalised -> scheduled linear map, tanh layers -> action.
+
+    The linear map is scheduled, as a Kalman filter's gains would be: it is one of the normalised features x, x n,
+    x (n^2 - 1), x s, x g, x m and x b, where n is the camera's noise, s are swings and g is how the reference will
+    change within 5 minutes, normalised too; m, from 0 to 1, is the camera's noise on the scale of ripples, and b falls
+    from 1 to 0 within each of :data:`BEGUN`.
+    """
 
     keep: torch.Tensor
     gain: torch.Tensor
     features: torch.Tensor
-    fast: torch.Tensor
     gains: torch.Tensor
+    swings: torch.Tensor
+    usual: torch.Tensor
     mean: torch.Tensor
     per_std: torch.Tensor
 
-    def __init__(self, control_interval: float, hidden: tuple[int, ...]) -> None:
+    def __init__(self, control_interval: float, hidden: tuple[int, ...], scheduled: bool = True) -> None:
         super().__init__()
-        keep, gain, features, fast = _filters(control_interval)
+        keep, gain, features = _filters(control_interval)
         self._constant("keep", keep)
         self._constant("gain", gain)
         self._constant("features", features)
-        self._constant("fast", fast)
         self._constant("gains", np.array(GAINS))
-        self.spread_share = 1.0 - float(np.exp(-control_interval / SPREAD_TIME))
-        width = features.shape[1] + _SPREADS
+        swings = np.zeros((MEANS, len(SWINGS)))
+        for band, pair in enumerate(SWINGS):
+            swings[len(TIMES) * SIGNALS.index("v_p") + np.array(pair), band] = 1.0, -1.0
+        self._constant("swings", swings)
+        self._constant("usual", np.array(USUAL_SWINGS))
+        self.swing_share = 1.0 - float(np.exp(-control_interval / SWING_TIME))
+        self.noise_share = 1.0 - float(np.exp(-control_interval / NOISE_TIME))
+        width = features.shape[1] + _STRENGTHS
         self.register_buffer("mean", torch.zeros(width))
         self.register_buffer("per_std", torch.ones(width))
         self.layers = tanh_layers([width, *hidden])
-        self.linear = nn.Linear(width, len(GAINS))
+        self.scheduled = scheduled
+        self.linear = nn.Linear((1 + scheduled * (4 + len(BEGUN) + len(SWINGS))) * width, len(GAINS))
         self.bent = nn.Linear(hidden[-1], len(GAINS), bias=False) if hidden else None
         with torch.no_grad():
             for parameter in (*self.linear.parameters(), *(self.bent.parameters() if self.bent else ())):
@@ -71,24 +106,63 @@ class FilterBank(nn.Module):
     def _constant(self, name: str, value: Any) -> None:
         self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32), persistent=False)
 
-    def remember(self, measured: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def remember(self, measured: Any, state: Any) -> tuple[Any, Any]:
         """Features, shape (n, width), and the next state, from readings (n, 11) and the state (n, STATE)."""
-        means = state[:, : _MEANS + 1] * self.keep + measured @ self.gain
-        seen = torch.cat([measured, means], dim=1)
-        fast = seen @ self.fast
-        spreads = state[:, _MEANS + 1 :] + self.spread_share * (fast * fast - state[:, _MEANS + 1 :])
-        noisy = spreads / (spreads + SPREAD_SCALE)
-        return torch.cat([seen @ self.features, noisy], dim=1), torch.cat([means, spreads], dim=1)
+        means, last, change, excess, squares = parted(state, _PARTS)
+        means = means * self.keep + measured @ self.gain
+        with torch.no_grad():
+            now = columns(measured, _NOISY)
+            difference, variance = now - last, excess + USUAL**2
+            bend = difference - change
+            square = bend * bend * (1.0 / 6.0)
+            used = square - rectified(square - variance * OUTLIER)
+            excess = excess + (used - variance) * self.noise_share
+            noise = (excess + USUAL**2) / (excess + 2.0 * USUAL**2)
+            camera = columns(excess, range(1)) + USUAL**2
+            large = camera / (camera + LARGE**2)
+            swings = means @ self.swings
+            squares = squares + (swings * swings - squares) * self.swing_share
+            strong = squares / (squares + self.usual)
+        features = joined([joined([measured, means]) @ self.features, noise, large, strong])
+        return features, joined([means, now, difference, excess, squares])
 
-    def act(self, features: torch.Tensor) -> torch.Tensor:
-        """The action, shape (n, 2), not yet held within its box."""
-        x = torch.clamp((features - self.mean) * self.per_std, -NORMALISED_LIMIT, NORMALISED_LIMIT)
-        action = self.linear(x)
+    def back(self, by_features: Any, by_means: Any) -> tuple[Any, Any]:
+        """Gradients with respect to readings (n, 11) and means before, from those of features and means after.
+
+        Arrays. Noise and swings are taken as they are: no action is chosen for what it does to their estimates.
+        """
+        by_seen = by_features[:, :-_STRENGTHS] @ self.features.numpy().T
+        by_means = by_means + by_seen[:, len(MEASURED) :]
+        return by_seen[:, : len(MEASURED)] + by_means @ self.gain.numpy().T, by_means * self.keep.numpy()
+
+    def act(self, features: Any) -> Any:
+        """The action, shape (..., 2), not yet held within its box, from features of shape (..., width)."""
+        x = held((features - self.mean) * self.per_std, -NORMALISED_LIMIT, NORMALISED_LIMIT)
+        action = through(joined([x, *(x * each for each in self._schedule(x, features))]), self.linear)
         if self.bent is not None:
-            action = action + self.bent(self.layers(x))
-        return torch.mul(action, self.gains)
+            action = action + through(through(x, self.layers), self.bent)
+        return action * self.gains
 
-    def forward(self, measured: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _schedule(self, x: Any, features: Any) -> list[Any]:
+        """What the linear map is scheduled on, each of shape (..., 1)."""
+        if not self.scheduled:
+            return []
+        width = len(self.mean)
+        strengths = held(columns(x, range(width - _STRENGTHS, width)), -SCHEDULE_LIMIT, SCHEDULE_LIMIT)
+        noise, _, _, *swings = parted(strengths, [1] * _STRENGTHS)
+        ages = range(width - _STRENGTHS - len(BEGUN), width - _STRENGTHS)
+        large = width - len(SWINGS) - 1
+        growth = columns(x, range(_GROWTH, _GROWTH + 1))
+        return [
+            noise,
+            noise * noise - 1.0,
+            *swings,
+            held(growth, -SCHEDULE_LIMIT, SCHEDULE_LIMIT),
+            columns(features, range(large, large + 1)),
+            *(each * -1.0 + 1.0 for each in parted(columns(features, ages), [1] * len(BEGUN))),
+        ]
+
+    def forward(self, measured: Any, state: Any) -> tuple[Any, Any]:
         """Action and next state."""
         features, after = self.remember(measured, state)
         return self.act(features), after
@@ -96,52 +170,33 @@ class FilterBank(nn.Module):
     def onnx(self) -> bytes:
         """The same as an agent's graph."""
         graph = OnnxGraph()
-        sizes = graph.constant("sizes", np.array([_MEANS + 1, _SPREADS]))
-        graph.nodes_of("Split", ["state", sizes], ["means_before", "spreads_before"], axis=1)
-        kept = graph.node("Mul", ["means_before", graph.constant("keep", self.keep)], "kept")
-        read = graph.node("MatMul", ["observation", graph.constant("gain", self.gain)], "read")
-        means = graph.node("Add", [kept, read], "means")
-        seen = graph.node("Concat", ["observation", means], "seen", axis=1)
-        fast = graph.node("MatMul", [seen, graph.constant("fast_of", self.fast)], "fast")
-        square = graph.node("Mul", [fast, fast], "square")
-        change = graph.node("Sub", [square, "spreads_before"], "change")
-        moved = graph.node("Mul", [change, graph.constant("share", np.full(1, self.spread_share, np.float32))], "moved")
-        spreads = graph.node("Add", ["spreads_before", moved], "spreads")
-        above = graph.node("Add", [spreads, graph.constant("scale", np.full(1, SPREAD_SCALE, np.float32))], "above")
-        noisy = graph.node("Div", [spreads, above], "noisy")
-        plain = graph.node("MatMul", [seen, graph.constant("features_of", self.features)], "plain")
-        x = graph.node("Concat", [plain, noisy], "features", axis=1)
-        x = graph.node("Sub", [x, graph.constant("mean", self.mean)], "centred")
-        x = graph.node("Mul", [x, graph.constant("per_std", self.per_std)], "scaled")
-        x = graph.clip(x, -NORMALISED_LIMIT, NORMALISED_LIMIT, "normalised")
-        output = graph.linear(x, self.linear.weight, self.linear.bias, "linear")
-        if self.bent is not None:
-            output = graph.node("Add", [output, graph.through(x, [self.layers, self.bent])], "output")
-        output = graph.node("Mul", [output, graph.constant("gains", self.gains)], "asked")
-        graph.clip(output, -1.0, 1.0, "action")
-        graph.node("Concat", [means, spreads], "next_state", axis=1)
+        action, after = self.forward(Value(graph, "observation"), Value(graph, "state"))
+        graph.clip(action.name, -1.0, 1.0, "action")
+        graph.node("Identity", [after.name], "next_state")
         return graph.finished(len(MEASURED), state=STATE)
 
 
-def _filters(interval: float) -> tuple[Any, Any, Any, Any]:
-    """What is kept of the means a step, what a reading adds, what features are made of both, and what is fast.
+def _filters(interval: float) -> tuple[Any, Any, Any]:
+    """What is kept of the means a step, what a reading adds, and what features are made of both.
 
-    Shapes (means + 1,), (11, means + 1), (11 + means + 1, width), (11 + means + 1, spreads).
+    Shapes (means,), (11, means), (11 + means, width).
     """
     shares = 1.0 - np.exp(-interval / np.array(TIMES))
     n, times = len(MEASURED), len(TIMES)
-    keep, gain, seen = np.ones(_MEANS + 1), np.zeros((n, _MEANS + 1)), np.eye(n + _MEANS + 1)
+    keep, gain, seen = np.ones(MEANS), np.zeros((n, MEANS)), np.eye(n + MEANS)
     now = {channel.name: seen[place] for place, channel in enumerate(MEASURED)}
-    features, fast = [], []
+    features = []
     for signal, name in enumerate(SIGNALS):
         mine = slice(signal * times, (signal + 1) * times)
         keep[mine], gain[_AT[name], mine] = 1.0 - shares, shares
         slower = [now[name], *seen[n:][mine]]
         features += [one - other for one, other in pairwise(slower)] + slower[-1:]
-        if name in SPREADS:
-            fast.append(slower[0] - slower[1])
-    gain[_AT["ring_error"], _MEANS] = interval / INTEGRAL_TIME
-    features += [seen[n + _MEANS], now["valid"], now["r_ref"]]
+    begun = slice(len(SIGNALS) * times, MEANS - 1)
+    shares = 1.0 - np.exp(-interval / np.array(BEGUN))
+    keep[begun], gain[_AT["valid"], begun] = 1.0 - shares, shares
+    gain[_AT["ring_error"], -1] = interval / INTEGRAL_TIME
+    features += [seen[-1], now["valid"], now["r_ref"]]
     features += [now[f"r_ref_{ahead}"] - now["r_ref"] for ahead in ("1min", "5min")]
     features += [now["T_1_ref"] - now["T_1"], *(now[f"T_1_ref_{ahead}"] - now["T_1_ref"] for ahead in ("1min", "5min"))]
-    return keep, gain, np.stack(features, axis=1), np.stack(fast, axis=1)
+    features += list(seen[n:][begun])
+    return keep, gain, np.stack(features, axis=1)

@@ -6,18 +6,21 @@ The plant's derivatives are those of :class:`cz_gym.differentiable.Differentiabl
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from stable_baselines3.common.logger import Logger
+from torch.autograd import backward, grad
 
 from cz_gym.config import Config
-from cz_gym.differentiable import STATES, DifferentiableBatch
+from cz_gym.differentiable import STATES
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from cz_gym.task import COST_CAP
 
-from .filter_bank import STATE, FilterBank
+from .crystals import Crystals
+from .demonstrations import widened
+from .filter_bank import MEANS, STATE, FilterBank
 from .learner import Parts, Watch
 from .recipes import Gradient
 
@@ -27,29 +30,23 @@ MOST_STD, LEAST_STD = 10.0, 1e-4
 """Bounds of a feature's standard deviation [-]."""
 MOST_GRADIENT = 1.0
 """Norm that a gradient is cut to."""
+AT_ONCE = 12
+"""Steps whose actions are differentiated at once: few enough for a processor's cache."""
 
 
-class PlantStep(torch.autograd.Function):
-    """A step of the batch as a function that torch differentiates: state, measured and cost from state and action.
+class Window(NamedTuple):
+    """What some steps of all crystals were, with all that a gradient needs."""
 
-    The batch goes on by a step; the state passed in says only what gradients belong to.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, state: torch.Tensor, action: torch.Tensor, batch: DifferentiableBatch) -> Any:
-        """State (n, 9), measured (n, 11) and the cost's terms (n, 4) after the action, shape (n, 2)."""
-        step = batch.step(action.numpy())
-        ctx.jacobian, ctx.measured_by_state = step.jacobian, batch.measured_by_state
-        return torch.from_numpy(step.state), torch.from_numpy(step.measured), torch.from_numpy(step.cost).float()
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: torch.Tensor) -> Any:
-        """Gradients with respect to state and action."""
-        by_state, by_measured, by_cost = gradients
-        whole = by_state.numpy() + by_measured.double().numpy() @ ctx.measured_by_state
-        rows = np.concatenate([whole, by_cost.double().numpy()], axis=1)
-        back = torch.from_numpy(np.matmul(rows[:, None, :], ctx.jacobian)[:, 0])
-        return back[:, : len(STATES)], back[:, len(STATES) :].float(), None
+    features: torch.Tensor
+    """What the network made of readings and memory, shape (steps, n, width)."""
+    costs: Any
+    """Terms of the cost, shape (steps, n, 4)."""
+    jacobians: list[Any]
+    """Of each step (:class:`cz_gym.differentiable.Step`)."""
+    measured: Any
+    """The last readings, shape (n, 11)."""
+    memory: torch.Tensor
+    """What the network remembers after them, shape (n, :data:`.filter_bank.STATE`)."""
 
 
 class GradientLearner:
@@ -62,55 +59,88 @@ class GradientLearner:
         self.per_update = recipe.num_envs * recipe.window
         self.total = math.ceil(recipe.steps / self.per_update) * self.per_update
         self.steps = done
-        self.network = FilterBank(config.control_interval, recipe.hidden)
-        self.optimiser = torch.optim.Adam(self.network.parameters(), recipe.learning_rate)
+        self.network = FilterBank(config.control_interval, recipe.hidden, recipe.scheduled)
+        weights = self.network.parameters()
+        self.optimiser = torch.optim.Adam(weights, recipe.learning_rate, betas=(0.9, recipe.beta2))
         self.random = np.random.default_rng([seed, done])
-        self.weights = torch.tensor([1.0, recipe.weights.pull, recipe.weights.pull_step, recipe.weights.heater_step])
+        self.weights = np.array([1.0, recipe.weights.pull, recipe.weights.pull_step, recipe.weights.heater_step])
 
     def learn(self, watch: Watch) -> None:
         """Take the updates that are left."""
         recipe, n = self.recipe, self.recipe.num_envs
-        batch = DifferentiableBatch(self.config, n)
-        state, measured = (torch.from_numpy(each) for each in batch.reset(self._seeds(n)))
+        batch = self._crystals()
+        measured = batch.reset(self._seeds(n))
         memory = torch.zeros(n, STATE)
         windows = self.config.steps // recipe.window
         left = self.random.integers(1, windows, n, endpoint=True)
         while self.steps < self.total:
             progress = self.steps / self.total
             self.optimiser.param_groups[0]["lr"] = recipe.learning_rate * (1.0 - progress)
-            state, measured, memory, lost = self._update(batch, state.detach(), measured, memory.detach(), progress)
+            window = self._drive(batch, measured, memory)
+            self._follow(window, batch.measured_by_state)
+            if progress < WARM_UP:
+                self._standardise(window.features.flatten(0, 1))
+            measured, memory = window.measured, window.memory
             left -= 1
-            over = np.flatnonzero(lost | (left == 0)).tolist()
+            over = np.flatnonzero(~batch.grows | (left == 0)).tolist()
             if over:
-                state, measured = (torch.from_numpy(each) for each in batch.reset(self._seeds(len(over)), over))
+                measured = batch.reset(self._seeds(len(over)), over)
                 memory[over] = 0.0
                 left[over] = windows
             self.steps += self.per_update
             watch(self.steps, "")
         batch.close()
 
-    def _update(
-        self, batch: DifferentiableBatch, state: Any, measured: Any, memory: Any, progress: float
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, Any]:
-        """Drive each crystal through a window and follow the cost's gradient; where that left them, and who is lost."""
-        step: Any = PlantStep.apply
-        costs, seen = [], []
-        for _ in range(self.recipe.window):
-            features, memory = self.network.remember(measured, memory)
-            seen.append(features.detach())
-            state, measured, terms = step(state, self.network.act(features), batch)
-            costs.append(terms @ self.weights)
-        whole = torch.stack(costs)
-        loss: Any = (COST_CAP * whole / (COST_CAP + whole)).mean()
+    def _crystals(self) -> Crystals:
+        """The crystals that are learned on: the recipe's scenario, and its share of each other."""
+        slots = self.recipe.num_envs
+        others = []
+        for name, width, share in self.recipe.also:
+            scenario = widened(self.config.with_scenario(name or self.recipe.scenario).scenario, width)
+            others.append((self.config.with_scenario(scenario), round(share * slots)))
+        return Crystals([(self.config, slots - sum(many for _, many in others)), *others])
+
+    def _drive(self, batch: Crystals, measured: Any, memory: torch.Tensor) -> Window:
+        """Drive each crystal through a window."""
+        features, costs, jacobians = [], [], []
+        with torch.no_grad():
+            for _ in range(self.recipe.window):
+                seen, memory = self.network.remember(torch.from_numpy(measured), memory)
+                step = batch.step(self.network.act(seen).numpy())
+                features.append(seen)
+                costs.append(step.cost)
+                jacobians.append(step.jacobian)
+                measured = step.measured
+        return Window(torch.stack(features), np.stack(costs), jacobians, measured, memory)
+
+    def _follow(self, window: Window, measured_by_state: Any) -> None:
+        """Follow the gradient of the window's cost: back through plant and memory step by step, then into the weights.
+
+        What the network's action makes of its features has its derivatives taken for some steps at once.
+        """
+        cost = window.costs @ self.weights
+        by_cost = (COST_CAP / (COST_CAP + cost)) ** 2 / cost.size
+        steps, n = cost.shape
+        rows, by_memory = np.zeros((n, len(STATES) + len(self.weights))), np.zeros((n, MEANS), np.float32)
+        weights = list(self.network.parameters())
         self.optimiser.zero_grad()
-        loss.backward()
+        for first in reversed(range(0, steps, AT_ONCE)):
+            features = window.features[first : first + AT_ONCE].requires_grad_()
+            actions = self.network.act(features)
+            pull, heater = (grad(actions[..., drive].sum(), features, retain_graph=True)[0].numpy() for drive in (0, 1))
+            by_action = np.empty(actions.shape, np.float32)
+            for k in reversed(range(len(actions))):
+                rows[:, len(STATES) :] = by_cost[first + k, :, None] * self.weights
+                back = np.einsum("ni,nij->nj", rows, window.jacobians[first + k])
+                by_action[k] = back[:, len(STATES) :]
+                by_features = by_action[k, :, :1] * pull[k] + by_action[k, :, 1:] * heater[k]
+                by_measured, by_memory = self.network.back(by_features, by_memory)
+                rows[:, : len(STATES)] = back[:, : len(STATES)] + by_measured @ measured_by_state
+            backward(actions, torch.from_numpy(by_action), inputs=weights)
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), MOST_GRADIENT)
         self.optimiser.step()
-        if progress < WARM_UP:
-            self._standardise(torch.cat(seen))
-        self.logger.record("gradient/cost", float(loss.detach()))
+        self.logger.record("gradient/cost", float((COST_CAP * cost / (COST_CAP + cost)).mean()))
         self.logger.record("gradient/norm", float(norm))
-        return state, measured.detach(), memory.detach(), ~batch.grows
 
     def _standardise(self, seen: torch.Tensor) -> None:
         """Move the features' mean and standard deviation towards what is seen; the first time wholly."""

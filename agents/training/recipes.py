@@ -95,13 +95,26 @@ class Gradient(Rewarded):
     name: str = "gradient"
     observation: str = "measured"
     action: str = "rate"
-    steps: int = 62_208_000
+    steps: int = 48_384_000
     num_envs: int = 192
     window: int = 180
     """Steps of a crystal that a gradient goes back through."""
+    also: tuple[tuple[str, float, float], ...] = (
+        ("", 2.0, 0.1),
+        ("hard", 1.0, 0.1),
+        ("sensor-fault", 1.0, 0.03),
+        ("puller", 1.0, 0.03),
+    )
+    """Other crystals that it learns on: scenario ("": its own), how far everything random is spread in units of the
+    scenario's own, and their share of all."""
     hidden: tuple[int, ...] = (64,)
-    learning_rate: float = 3e-3
-    """At the start; it falls linearly to zero."""
+    scheduled: bool = True
+    """Whether the linear map depends on noise, swings, the reference and the crystal's age."""
+    learning_rate: float = 1.2e-2
+    """Of Adam at the start; it falls linearly to zero."""
+    beta2: float = 0.9
+    """How much of the squared gradients Adam remembers: the first ones, of lost crystals, are a thousand times those
+    that follow."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,14 +183,22 @@ class RecurrentPPO(OnPolicy):
 
 @dataclass(frozen=True, kw_only=True)
 class SAC(Reinforcement):
-    """Soft actor-critic on the same batch, from nothing."""
+    """Soft actor-critic on the same batch, from nothing.
+
+    It acts every 20 s: what one action of 5 s changes is lost in its critic's errors.
+    """
 
     name: str = "sac"
-    steps: int = 1_000_000
+    steps: int = 600_000
     num_envs: int = 64
+    control_interval: float = 20.0
+    gamma: float = 0.97
+    failure_costs: bool = False
+    noise: float = 0.2
+    """Spread of the exploration at the start [-]."""
     buffer_size: int = 1_000_000
     learning_starts: int = 10_000
-    """Steps of random actions before the first update."""
+    """Steps before the first update."""
     batch_size: int = 512
     gradient_steps: int = 4
     """Updates after each step of all slots."""

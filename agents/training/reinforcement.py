@@ -28,10 +28,26 @@ from .recipes import OWN_WEIGHTS, PPO, SAC, RandomSearch, RecurrentPPO, Reinforc
 from .vec_env import CzVecEnv
 from .wrappers import TrainingReward
 
+
+class SoftActorCritic(stable_baselines3.SAC):
+    """Soft actor-critic whose first actions are those of its fresh policy, not uniform over the whole box."""
+
+    def _sample_action(self, learning_starts: int, *arguments: Any, **options: Any) -> Any:
+        return super()._sample_action(0, *arguments, **options)
+
+    def begin_with(self, noise: float) -> None:
+        """Make the fresh policy's spread so large and its mean near zero, whatever it sees."""
+        actor: Any = self.actor
+        with torch.no_grad():
+            actor.log_std.bias.fill_(np.log(noise))
+            for layer in (actor.log_std, actor.mu):
+                layer.weight *= 0.1
+
+
 KINDS: dict[type[Reinforcement], tuple[Any, Any]] = {
     PPO: (stable_baselines3.PPO, AsymmetricPolicy),
     RecurrentPPO: (RecurrentPPOAlgorithm, "MlpLstmPolicy"),
-    SAC: (stable_baselines3.SAC, "MlpPolicy"),
+    SAC: (SoftActorCritic, "MlpPolicy"),
     RandomSearch: (random_search.RandomSearch, random_search.WhitenedLinearPolicy),
 }
 """The algorithm and the policy of each kind of recipe."""
@@ -100,6 +116,8 @@ def make_algorithm(recipe: Reinforcement, slots: CzVecEnv, seed: int) -> BaseAlg
     settings = {name: value for name, value in asdict(recipe).items() if name in known}
     settings["learning_rate"] = linear(recipe.learning_rate, recipe.learning_rate / 20.0)
     made: BaseAlgorithm = algorithm(policy, env, policy_kwargs=_network(recipe), seed=seed, device="cpu", **settings)
+    if isinstance(made, SoftActorCritic) and isinstance(recipe, SAC):
+        made.begin_with(recipe.noise)
     return made
 
 

@@ -1,30 +1,38 @@
-"""The rows of the ablation: the recipes ``ppo`` and ``imitation`` as they stand, and each with one thing changed."""
+"""The rows of the ablation: the recipes ``gradient`` and ``ppo``, cut short, and each with one thing changed."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
-from cz_gym.agents.training.recipes import RECIPES, Recipe
+from cz_gym.agents.training.recipes import OWN_WEIGHTS, RECIPES, Gradient, Recipe
 from cz_gym.units import MINUTE
 from studies.comparison.variants import Variant
 
-PPO, IMITATION = RECIPES["ppo"], RECIPES["imitation"]
+GRADIENT: Any = replace(RECIPES["gradient"], steps=350 * Gradient.num_envs * Gradient.window)  # type: ignore[call-arg]
+"""A quarter of the recipe: it holds every crystal, and what helps shows."""
+PPO: Any = replace(RECIPES["ppo"], steps=1_500_000)  # type: ignore[call-arg]
 
 
 def _changed(base: Recipe, name: str, meaning: str, **changes: Any) -> Variant:
     return Variant(replace(base, name=f"{base.name}-{name}", **changes), meaning, base.name)
 
 
-def _ppo(name: str, meaning: str, **changes: Any) -> Variant:
-    return _changed(PPO, name, meaning, **changes)
-
-
-def _imitation(name: str, meaning: str, **changes: Any) -> Variant:
-    return _changed(IMITATION, name, meaning, **changes)
-
-
+_gradient, _ppo = partial(_changed, GRADIENT), partial(_changed, PPO)
 ROWS = (
+    Variant(
+        GRADIENT, "from nothing, by the cost's exact gradient; a law scheduled on noise, swings, reference and age"
+    ),
+    _gradient("unscheduled", "one linear map for all crystals, beside the tanh layer", scheduled=False),
+    _gradient("linear", "no tanh layer beside the scheduled map", hidden=()),
+    _gradient("own-crystals", "crystals of its own scenario alone, none wide or of others", also=()),
+    _gradient("window-5min", "gradients through 5 minutes, not 15; three times as many updates", window=60),
+    _gradient("window-45min", "gradients through 45 minutes; a third of the updates", window=540),
+    _gradient("few-crystals", "48 crystals at once, not 192; four times as many updates", num_envs=48),
+    _gradient("long-adam", "Adam remembers a thousand squared gradients, its default, not ten", beta2=0.999),
+    _gradient("own-cost", "the environment's own weights of the cost", weights=OWN_WEIGHTS),
+    _gradient("smooth", "an action that returns to nominal by itself", action="smooth"),
     Variant(PPO, "from nothing, by reward; smooth actions, differences of the past, a critic that sees the true state"),
     _ppo("rate", "an action moves the drives from where they are: no return to nominal", action="rate"),
     _ppo("direct", "an action sets the drives, within their whole range", action="direct"),
@@ -42,10 +50,5 @@ ROWS = (
     _ppo("interval-10s", "a control interval of 10 s, not of 5", control_interval=10.0),
     _ppo("half-crystals", "crystals of 1.5 h while it learns, not of 3 h", length=5400.0),
     _ppo("linear", "no hidden layers", hidden=()),
-    Variant(IMITATION, "no reward: its teacher, lqg-at-0.02-told, knows each crystal's puller and roughness"),
-    _imitation("plain-teacher", "the teacher is lqg-at-0.02, which is not privileged", teacher="lqg-at-0.02"),
-    _imitation("no-wide", "no wide crystals, all spread as the scenario's own", wide_share=0.0),
-    _imitation("rounds-1", "all crystals in one round: the teacher drives them all", rounds=1, episodes=3840),
-    _imitation("linear", "no hidden layers", hidden=()),
 )
 """Every row, in the table's order; its agents are called by its name."""
