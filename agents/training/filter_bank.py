@@ -117,9 +117,9 @@ class FilterBank(nn.Module):
             square = bend * bend * (1.0 / 6.0)
             used = square - rectified(square - variance * OUTLIER)
             excess = excess + (used - variance) * self.noise_share
-            noise = (excess + USUAL**2) / (excess + 2.0 * USUAL**2)
-            camera = columns(excess, range(1)) + USUAL**2
-            large = camera / (camera + LARGE**2)
+            variance = excess + USUAL**2
+            noise = variance / (variance + USUAL**2)
+            large = columns(variance, range(1)) / (columns(variance, range(1)) + LARGE**2)
             swings = means @ self.swings
             squares = squares + (swings * swings - squares) * self.swing_share
             strong = squares / (squares + self.usual)
