@@ -5,6 +5,9 @@ Importing this package registers ``Cz-v0``; ``gym.make("cz_gym:Cz-v0")`` imports
 
 from __future__ import annotations
 
+from importlib import import_module
+from typing import Any
+
 try:
     import gymnasium as gym
 except ModuleNotFoundError as error:
@@ -43,3 +46,10 @@ __all__ = [
 ]
 
 gym.register(id=ENV_ID, entry_point="cz_gym.env:CzEnv", vector_entry_point="cz_gym.vector:CzVectorEnv")
+
+
+def __getattr__(name: str) -> Any:
+    # After "import cz_gym", cz_gym.agents.load("ppo") works: what stands above this package is imported when asked for.
+    if name in ("agents", "baselines"):
+        return import_module(f"cz_gym.{name}")
+    raise AttributeError(f"module 'cz_gym' has no attribute {name!r}")

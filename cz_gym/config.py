@@ -111,6 +111,13 @@ class Config:
         return replace(self, scenario=find_scenario(scenario))
 
 
+def check_config(config: Config) -> Config:
+    """The config itself; ValueError for anything else, such as the name of a scenario."""
+    if not isinstance(config, Config):
+        raise ValueError(f"this needs a config, as make_config({config!r:.80}) makes one")
+    return config
+
+
 def make_config(
     scenario: str | Scenario = "randomized",
     model: str | float | None = None,

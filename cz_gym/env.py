@@ -22,7 +22,7 @@ from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.rendering.view import FPS, Frame, declared_modes, make_view
 
-from .config import Config, make_config
+from .config import Config, check_config, make_config
 from .observation import CAMERA, CLIP, OBSERVATIONS
 
 Observation = npt.NDArray[Any]
@@ -141,7 +141,7 @@ class CzEnv(gym.Env[Observation, Action]):
     ) -> CzEnv:
         """The environment of settings that were checked when they were made (:func:`cz_gym.config.make_config`)."""
         env = cls.__new__(cls)
-        env._setup(config, render_mode, render_size, info)
+        env._setup(check_config(config), render_mode, render_size, info)
         return env
 
     def _setup(self, config: Config, render_mode: str | None, render_size: tuple[int, int], info: str) -> None:

@@ -21,7 +21,7 @@ from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
 
-from .config import Config, make_config
+from .config import Config, check_config, make_config
 from .env import CzEnv, EnvState, action_space, check_options, check_state, observation_space
 
 _MASKS = tuple(f"_{name}" for name in INFO)
@@ -80,7 +80,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
     ) -> CzVectorEnv:
         """The batch of settings that were checked when they were made (:func:`cz_gym.config.make_config`)."""
         env = cls.__new__(cls)
-        env._setup(config, num_envs, autoreset_mode, threads, info)
+        env._setup(check_config(config), num_envs, autoreset_mode, threads, info)
         return env
 
     def _setup(

@@ -87,8 +87,10 @@ class RandomSearch(ARS):
             return
         self.rounds += 1
         mean, spread = seen.mean(axis=0, dtype=np.float64), np.cov(seen.T.astype(np.float64))
-        self.mean += (mean - self.mean) / self.rounds
-        self.spread += (spread - self.spread) / self.rounds
+        # The first rounds, of lost crystals, are forgotten: beside them all that follow would look alike.
+        share = max(1.0 / self.rounds, 0.1)
+        self.mean += share * (mean - self.mean)
+        self.spread += share * (spread - self.spread)
         before, after = normalise.scaling.numpy().astype(np.float64), whitening(self.spread)
         normalise.set(self.mean, after)
         if self.rounds > 1:

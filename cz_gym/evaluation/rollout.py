@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.config import Config
+from cz_gym.config import Config, check_config
 from cz_gym.units import MICRO
 from cz_gym.vector import CzVectorEnv
 
@@ -75,10 +75,9 @@ def rollout(
     slot goes on with another crystal, which nothing reads. A bound with a method ``for_episodes(config, seeds)`` is
     replaced by what it returns, which knows those episodes.
     """
-    if not isinstance(config, Config):
-        raise ValueError(f"a rollout needs a config, as make_config({config!r:.80}) makes one")
-    if not seeds:
-        raise ValueError("a rollout needs at least one seed")
+    check_config(config)
+    if not isinstance(seeds, Sequence | np.ndarray) or len(seeds) == 0:
+        raise ValueError("a rollout needs a sequence of at least one seed, as [1]")
     made_for = getattr(getattr(policy, "contract", policy), "control_interval", None)
     if made_for is not None and made_for != config.control_interval:
         raise ValueError(

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from cz_gym import CzEnv
+import cz_gym
+from cz_gym import CzEnv, CzVectorEnv
 from cz_gym.baselines import CompensatedPID, OpenLoop
 from cz_gym.camera import Camera
 from cz_gym.config import Config, make_config
@@ -150,6 +152,23 @@ class OnlyAnAction:
 def test_silent_traps_speak(policy: Any, config: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         rollout(policy, config, [1])
+
+
+@pytest.mark.parametrize("make", [CzEnv.from_config, CzVectorEnv.from_config])
+def test_a_name_is_no_config(make: Any) -> None:
+    with pytest.raises(ValueError, match=r"needs a config, as make_config\('hard'\) makes one"):
+        make("hard")
+
+
+def test_a_number_is_no_seeds() -> None:
+    with pytest.raises(ValueError, match=r"needs a sequence of at least one seed, as \[1\]"):
+        rollout(OpenLoop(), SHORT, 5)  # type: ignore[arg-type]
+
+
+def test_after_import_cz_gym_everything_is_there() -> None:
+    assert cz_gym.__getattr__("agents") is import_module("cz_gym.agents")
+    with pytest.raises(AttributeError, match="no attribute 'agent'"):
+        _ = cz_gym.agent
 
 
 def test_a_rollout_can_be_looked_at(tmp_path: Path) -> None:

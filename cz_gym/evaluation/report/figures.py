@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from .canvas import INK, Style, canvas, png, styles_of
 from .crystal import crystal
 from .tables import PULL_STEP, RMSE
 
+FAR = 12
+"""How many times the least error is not drawn [-]."""
 Floats = npt.NDArray[np.float64]
 
 
@@ -76,7 +79,10 @@ def _spread(axis: Any, values: Floats, place: int, colour: str) -> None:
 
 
 def pareto(scenarios: Sequence[ScenarioResult], style: Mapping[str, Style]) -> bytes:
-    """Mean RMSE against mean pull step RMS with 95 % intervals, both logarithmic; lower left is better."""
+    """Mean RMSE against mean pull step RMS with 95 % intervals, both logarithmic; lower left is better.
+
+    Who has more than :data:`FAR` times the least error is named, not drawn: the others would crowd in a corner.
+    """
     figure = canvas(4.4 * min(len(scenarios), 2) + 0.8, 2.9 * -(-len(scenarios) // 2) + 1.0)
     moving = [outcome.means[PULL_STEP.metric].mean for scenario in scenarios for outcome in scenario.outcomes]
     floor = min((value for value in moving if value > 0.0), default=1.0) / 3.0
@@ -84,9 +90,15 @@ def pareto(scenarios: Sequence[ScenarioResult], style: Mapping[str, Style]) -> b
         axis.set_yscale("log")
         axis.tick_params(which="both", labelleft=True)
         _plain_log(axis.yaxis, between=True)
+        most = FAR * min(outcome.means[RMSE.metric].mean for outcome in scenario.outcomes)
+        far = [outcome for outcome in scenario.outcomes if outcome.means[RMSE.metric].mean > most]
         for outcome in scenario.outcomes:
-            _point(axis, outcome, style[outcome.controller.name], floor)
+            if outcome not in far:
+                _point(axis, outcome, style[outcome.controller.name], floor)
         axis.set_title(scenario.row.name, fontsize=9.5)
+        if far:
+            above = f"more than {FAR} times the least error: " + ", ".join(each.controller.name for each in far)
+            axis.text(0.5, 0.995, fill(above, 64), transform=axis.transAxes, va="top", ha="center", fontsize=7)
     handles = [
         Line2D([], [], ls="none", marker=one.marker, color=one.colour, ms=7, label=name) for name, one in style.items()
     ]

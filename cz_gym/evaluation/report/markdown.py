@@ -47,15 +47,20 @@ def summary(benchmark: Benchmark) -> str:
 
 
 def brief(benchmark: Benchmark) -> str:
-    """A table for readers in a hurry: the controllers of :data:`QUOTED`, or all, on the scenarios with randomness."""
+    """A table for readers in a hurry: the controllers of :data:`QUOTED`, or all, on the scenarios with randomness.
+
+    RMSE and failures on each scenario, pull steps on the first.
+    """
     scenarios = [each for each in benchmark.scenarios if len(each.seeds) > 1] or list(benchmark.scenarios)
-    first = rows(scenarios[0], (PULL_STEP, FAILURES))
-    errors = [{name: row[0] for name, *row in rows(scenario, (RMSE,))} for scenario in scenarios]
-    chosen = [line for line in first if line[0] in QUOTED] or first
+    found = [{name: row for name, *row in rows(each, (RMSE, PULL_STEP, FAILURES))} for each in scenarios]
+    names = [name for name in found[0] if name in QUOTED] or list(found[0])
+    lines = []
+    for name in names:
+        errors, steps, failures = zip(*(each[name] for each in found), strict=True)
+        plain = [" / ".join(text.partition(" [")[0] for text in texts) for texts in (steps[:1], failures)]
+        lines.append((name, *errors, *plain))
     headings = [*(scenario.row.name for scenario in scenarios), PULL_STEP.heading, FAILURES.heading]
-    return _table(
-        ("controller", *headings), [(name, *(each[name] for each in errors), *more) for name, *more in chosen]
-    )
+    return _table(("controller", *headings), lines)
 
 
 def fill_in(page: str, benchmark: Benchmark) -> str:
