@@ -185,13 +185,14 @@ class RecurrentPPO(OnPolicy):
 class SAC(Reinforcement):
     """Soft actor-critic on the same batch, from nothing.
 
-    It acts every 20 s: what one action of 5 s changes is lost in its critic's errors.
+    While it learns, each action is held for 20 s: what one of 5 s changes is lost in its critic's errors.
     """
 
     name: str = "sac"
     steps: int = 600_000
     num_envs: int = 64
-    control_interval: float = 20.0
+    held: int = 4
+    """Steps of the environment that an action is held for while it learns; its steps are counted in actions."""
     gamma: float = 0.97
     failure_costs: bool = False
     noise: float = 0.2

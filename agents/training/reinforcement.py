@@ -26,7 +26,7 @@ from .learner import Parts, Watch
 from .networks import AsymmetricPolicy, Normalise
 from .recipes import OWN_WEIGHTS, PPO, SAC, RandomSearch, RecurrentPPO, Reinforcement
 from .vec_env import CzVecEnv
-from .wrappers import TrainingReward
+from .wrappers import Held, TrainingReward
 
 
 class SoftActorCritic(stable_baselines3.SAC):
@@ -110,7 +110,8 @@ def make_slots(recipe: Reinforcement, seed: int, done: int) -> CzVecEnv:
 def make_algorithm(recipe: Reinforcement, slots: CzVecEnv, seed: int) -> BaseAlgorithm:
     """The algorithm of a recipe, whose fields it takes by stable-baselines3's names."""
     torch.manual_seed(seed)
-    env = TrainingReward(slots, recipe.gamma, recipe.weights, recipe.failure_costs)
+    env: Any = TrainingReward(slots, recipe.gamma, recipe.weights, recipe.failure_costs)
+    env = Held(env, recipe.held) if isinstance(recipe, SAC) else env
     algorithm, policy = KINDS[type(recipe)]
     known = inspect.signature(algorithm).parameters
     settings = {name: value for name, value in asdict(recipe).items() if name in known}

@@ -1,11 +1,11 @@
-"""What stands between the native batch and a learner: its reward."""
+"""What stands between the native batch and a learner: its reward, and how long it holds an action."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvWrapper
 
 from cz_gym.task import FAILURE_COST, Cost, cost_terms, reward
 
@@ -54,3 +54,34 @@ class TrainingReward(VecEnvWrapper):
             weights.heater_step * info["cost_heater_step"],
         )
         return reward(cost)
+
+
+class Held(VecEnvWrapper):
+    """Each action is held for ``times`` steps, and earns their mean reward.
+
+    An episode that ends among them ends the transition; what the next one does until the action's end earns nothing.
+    """
+
+    def __init__(self, venv: VecEnv, times: int) -> None:
+        super().__init__(venv)
+        self.times = times
+
+    def reset(self) -> Any:
+        """Pass on."""
+        return self.venv.reset()
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep the actions for :meth:`step_wait`."""
+        self.actions = actions
+        self.venv.step_async(actions)
+
+    def step_wait(self) -> Any:
+        """Advance every slot by as many steps."""
+        observation, earned, done, infos = self.venv.step_wait()
+        for _ in range(self.times - 1):
+            self.venv.step_async(self.actions)
+            observation, more, over, others = self.venv.step_wait()
+            earned = earned + np.where(done, np.float32(0.0), more)
+            infos = [one if one else other for one, other in zip(infos, others, strict=True)]
+            done = done | over
+        return observation, earned / np.float32(self.times), done, infos

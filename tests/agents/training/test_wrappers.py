@@ -1,4 +1,4 @@
-"""What stands between the batch and a learner: the weighted, scaled reward."""
+"""What stands between the batch and a learner: the weighted, scaled reward, and held actions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 from cz_gym import CzVectorEnv
 from cz_gym.agents.training.recipes import CostWeights
 from cz_gym.agents.training.vec_env import CzVecEnv
-from cz_gym.agents.training.wrappers import TrainingReward
+from cz_gym.agents.training.wrappers import Held, TrainingReward
 from cz_gym.task import Cost, cost_terms, reward
 
 
@@ -60,3 +60,23 @@ def test_the_weighted_reward_is_the_weighted_cost_s(observable: bool) -> None:
     assert not np.allclose(seen, said["cost_radius"], rtol=1e-3)
     cost = Cost(radius, 0.5 * said["cost_pull"], 3.0 * said["cost_pull_step"], 2.0 * said["cost_heater_step"])
     np.testing.assert_allclose(gained, 0.1 * reward(cost), rtol=1e-6)
+
+
+@pytest.mark.parametrize("steps", [50, 6])
+def test_a_held_action_is_as_many_steps_and_ends_with_an_episode(steps: int) -> None:
+    """Beside the same steps one by one; episodes of 6 steps end in the middle of the second action."""
+    held, plain = Held(slots(horizon=5.0 * steps), 4), slots(horizon=5.0 * steps)
+    held.reset()
+    plain.reset()
+    random = np.random.default_rng(0)
+    for _ in range(3):
+        action = random.normal(0.0, 0.1, (2, 2)).astype(np.float32)
+        seen, earned, done, infos = held.step(action)
+        singly = [plain.step(action) for _ in range(4)]
+        over = [bool(each[2].all()) for each in singly]
+        ends, counted = any(over), singly[: over.index(True) + 1 if any(over) else 4]
+        np.testing.assert_array_equal(seen, singly[-1][0])
+        np.testing.assert_allclose(earned, np.sum([each[1] for each in counted], axis=0) / 4, rtol=1e-6)
+        assert done.all() == ends
+        if ends:
+            np.testing.assert_array_equal(infos[0]["terminal_observation"], counted[-1][3][0]["terminal_observation"])
