@@ -171,6 +171,12 @@ def decode(observation: npt.ArrayLike, v_0: float = PULL_SCALE) -> Measured:
     )
 
 
+def to_measured(history: npt.ArrayLike, v_0: float = PULL_SCALE) -> npt.NDArray[np.float32]:
+    """The "measured" observation beside a "history" one, shape (..., channels), to the rounding of float32."""
+    found = np.stack(decode(history, v_0), axis=-1) / scales(MEASURED, v_0)
+    return np.clip(found, -CLIP, CLIP).astype(np.float32)
+
+
 class Relative(NamedTuple):
     """The channels that "history" holds relative to another one; arrays of shape (channels,)."""
 

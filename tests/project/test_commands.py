@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 import benchmark
+from cz_gym import datasets
 from cz_gym.baselines.tuning import lqg as tune_lqg
 from cz_gym.baselines.tuning import pid as tune_pid
 from cz_gym.commands import OneLineParser, guarded, interrupted
@@ -30,6 +31,7 @@ COMMANDS: list[tuple[Any, str, str, list[str]]] = [
     (speed, "--qui", "run", ["--quick"]),
     (young_laplace, "--wri", "build", ["--write"]),
     (play, "--minute", "settings", []),
+    (datasets, "--episode", "record", ["--policies", "paper", "--out", "new/folder"]),
     (film, "--frame", "film", ["--out", "new/film.gif"]),
 ]
 """Each with the beginning of an option, the function that does its work, and arguments that would write a file."""

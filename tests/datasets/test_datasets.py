@@ -1,0 +1,185 @@
+"""Datasets: stock Minari reads them, each episode can be made again, and what is wrong is said in one line."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cz_gym import CzVectorEnv, agents, datasets
+from cz_gym.baselines import CompensatedPID
+from cz_gym.config import make_config
+from cz_gym.datasets import Source, excitation, find_source, main, record, write
+from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.observation import to_measured
+
+minari = pytest.importorskip("minari")
+pytest.importorskip("h5py")
+CONFIG = make_config("randomized", observation="history", horizon=1200.0)
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "data"))
+    return tmp_path / "data"
+
+
+def again(dataset: Any, episode: int) -> None:
+    """Make an episode again, from its seed and its actions: everything is the same."""
+    (facts,) = dataset.storage.get_episode_metadata([episode])
+    kept, env = dataset[episode], dataset.recover_environment()
+    observation, info = env.reset(seed=facts["seed"])
+    for k in range(len(kept) + 1):
+        np.testing.assert_array_equal(observation, kept.observations[k])
+        assert all(np.array_equal(info[name], kept.infos[name][k]) for name in ("r_c", "r_ref", "state"))
+        if k < len(kept):
+            observation, *ends, info = env.step(kept.actions[k])
+            assert ends == [kept.rewards[k], kept.terminations[k], kept.truncations[k]]
+    env.close()
+
+
+def test_an_episode_can_be_made_again_from_its_seed_and_actions(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(datasets, "AT_ONCE", 2)
+    write("lqg-at-0.02", find_source("lqg-at-0.02", CONFIG), "sensor-fault", TRAINING_SEEDS[7:10], horizon=600.0)
+    dataset = minari.load_dataset("cz/sensor-fault/lqg-at-0_02-v0")
+    assert (dataset.total_episodes, dataset.total_steps) == (3, 360)
+    facts = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
+    assert [each["seed"] for each in facts] == [7, 8, 9]
+    assert [each["excitation"] for each in facts] == [excitation(seed, CONFIG, 0.2)[0] for seed in (7, 8, 9)]
+    for episode in range(3):
+        again(dataset, episode)
+    assert minari.list_local_datasets()["cz/sensor-fault/lqg-at-0_02-v0"]["algorithm_name"] == "lqg-at-0.02"
+
+
+def test_a_lost_crystal_ends_its_episode(place: Path) -> None:
+    """A policy that pulls at full speed loses each crystal."""
+
+    class Fast:
+        def predict(self, observation: Any, **_: Any) -> Any:
+            return np.tile(np.float32([1.0, 0.0]), (len(observation), 1)), None
+
+    dataset = write("fast", Source(Fast()), seeds=TRAINING_SEEDS[:2], horizon=3600.0)
+    for episode, kept in enumerate(dataset.iterate_episodes()):
+        assert kept.terminations.tolist() == [False] * (len(kept) - 1) + [True]
+        assert not kept.truncations.any()
+        assert len(kept) < 720
+        assert kept.rewards[-1] < -1000.0
+        again(dataset, episode)
+
+
+@pytest.mark.parametrize("name", ["paper-tuned", "gradient", "ppo"])
+def test_without_excitation_a_policy_acts_as_in_the_benchmark(name: str) -> None:
+    """Whatever it reads and its actions mean: "measured" and "direct", "measured" and "rate", "history", "smooth"."""
+    if name != "paper-tuned":
+        pytest.importorskip("onnxruntime")
+    source, seeds = find_source(name, CONFIG), TRAINING_SEEDS[:3]
+    own = make_config("randomized", observation=source.observation, action=source.action, horizon=CONFIG.horizon)
+    expected = rollout(source.policy, own, seeds).signals.r_c
+    found = np.stack([each["infos"]["r_c"][1:] for each in record(source, CONFIG, seeds, 0.0)], axis=1)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-7)  # 0.2 um
+
+
+@pytest.mark.parametrize("name", ["paper-tuned", "gradient"])
+def test_excitation_neither_piles_up_nor_depends_on_the_batch(name: str) -> None:
+    if name != "paper-tuned":
+        pytest.importorskip("onnxruntime")
+    source = find_source(name, CONFIG)
+    quiet, several = (record(source, CONFIG, TRAINING_SEEDS[:4], noise) for noise in (0.0, 0.2))
+    (alone,) = record(source, CONFIG, TRAINING_SEEDS[3:4], 0.2)
+    np.testing.assert_allclose(alone["actions"], several[3]["actions"], atol=1e-6)
+    assert all(each["truncations"][-1] for each in several)
+    without, with_noise = (np.std([each["actions"][:, 0] for each in some]) for some in (quiet, several))
+    assert without < with_noise < 1.3 * without + 0.05
+
+
+def test_excitation_is_a_smooth_action_of_white_noise() -> None:
+    """Its lag-one correlation is the drives' lag, its spread that of a first-order process."""
+    config = make_config("randomized", horizon=500_000.0)
+    level, noise = excitation(3, config, 0.5)
+    keep = np.exp(-5.0 / 50.0)
+    assert 0.0 < level < 0.5
+    assert level == excitation(3, config, 0.5)[0] != excitation(4, config, 0.5)[0]
+    np.testing.assert_allclose(
+        np.std(noise, axis=0), level * (1 - keep) / np.sqrt(1 - keep**2) * np.array([1, 0.5]), rtol=0.05
+    )
+    assert np.corrcoef(noise[1:, 0], noise[:-1, 0])[0, 1] == pytest.approx(keep, abs=0.01)
+    assert not excitation(3, config, 0.0)[1].any()
+
+
+def test_history_tells_what_is_measured() -> None:
+    pair = [CzVectorEnv(4, "sensor-fault", observation=each, horizon=600.0) for each in ("measured", "history")]
+    (measured, _), (history, _) = (env.reset(seed=5) for env in pair)
+    for _ in range(50):
+        np.testing.assert_allclose(to_measured(history), measured, atol=2e-5)
+        action = pair[0].action_space.sample()
+        (measured, *_), (history, *_) = (env.step(action) for env in pair)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--policies", "papper"], "unknown policy 'papper': did you mean 'paper'?"),
+        (["--policies", "lqg-true"], "unknown policy 'lqg-true'"),
+        (["--scenarios", "randomised"], "unknown scenario 'randomised'"),
+        (["--scenarios", ""], "unknown scenario ''"),
+        (["--noise", "-1"], "noise must be between 0 and 1, not -1"),
+        (["--noise", "nan"], "noise must be between 0 and 1, not nan"),
+    ],
+)
+def test_bad_input_gets_one_line_and_leaves_nothing(
+    options: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], place: Path
+) -> None:
+    assert main(["--policies", "paper", *options, "--out", str(place)]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+    assert not place.exists()
+
+
+@given(seeds=st.lists(st.integers(-5, 2_000_010), max_size=3).filter(lambda s: not s or max(s) > 999_999 or min(s) < 0))
+def test_only_training_seeds_are_recorded(seeds: list[int]) -> None:
+    with pytest.raises(ValueError, match="training seeds, 0 to 999999"):
+        write("paper", Source(CompensatedPID()), seeds=seeds)
+    assert not set(VALIDATION_SEEDS) & set(TRAINING_SEEDS)
+
+
+def test_a_dataset_is_replaced_only_when_asked_for_and_never_left_half(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["--policies", "paper", "--scenarios", "nominal", "--episodes", "1", "--out", str(place)]
+    assert main(command) == 0
+    assert "cz/nominal/paper-v0: 1 episodes, 2,160 steps" in capsys.readouterr().out
+    assert main(command) == 2
+    assert capsys.readouterr().err.count("cz/nominal/paper-v0 is there already") == 1
+    assert main([*command, "--overwrite"]) == 0
+
+    def interrupted(*_: Any) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(datasets, "excitation", interrupted)
+    assert main([*command, "--overwrite"]) == 130  # before the first write: what was there stays
+    assert len(minari.load_dataset("cz/nominal/paper-v0")) == 1
+    monkeypatch.setattr(datasets, "record", lambda *_: [])
+    assert main([*command, "--overwrite"]) == 130  # after it
+    assert minari.list_local_datasets() == {}
+
+
+def test_without_minari_one_line_says_how_to_install_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], place: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "minari", None)
+    assert main(["--policies", "paper", "--scenarios", "nominal"]) == 2
+    assert capsys.readouterr().err.endswith('minari is missing: pip install ".[data]"\n')
+
+
+def test_shipped_agents_are_found() -> None:
+    pytest.importorskip("onnxruntime")
+    source = find_source("gradient", CONFIG)
+    assert (source.observation, source.action) == ("measured", "rate")
+    assert isinstance(source.policy, agents.OnnxPolicy)
