@@ -44,6 +44,7 @@ SMALL = {
     "TEST_SEEDS[:50]": "TEST_SEEDS[:2]",
     "TRAINING_SEEDS[:20]": "TRAINING_SEEDS[:2]",
     "VALIDATION_SEEDS[:10]": "VALIDATION_SEEDS[:2]",
+    "learn(2_000_000)": "learn(8192)",
     "seeds=range(20)": "seeds=range(2)",
     "seeds=range(10)": "seeds=range(2)",
     "--scenarios randomized --out mine": "--scenarios reference-b --episodes 1 --quiet --out mine",
@@ -150,6 +151,7 @@ def understood(monkeypatch: pytest.MonkeyPatch) -> Any:
 )
 def test_blocks_of_a_page_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     for example in blocks(page):
         example.evaluate()
     for words, runs in commands(page):
