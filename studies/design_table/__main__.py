@@ -9,7 +9,6 @@ is part of the loop.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from collections.abc import Callable, Sequence
@@ -30,6 +29,7 @@ from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.physics.linearisation import StateSpace, radius_model
 from cz_gym.physics.plant import Puller, make_puller
 from cz_gym.units import KILO, MM, MM_PER_MIN
+from studies import markdown
 
 FAST, SLOW = 30.0, 780.0
 """Correlation times of the interface's fluctuations [s]."""
@@ -152,30 +152,13 @@ def as_markdown(rows: Sequence[Row], skipped: Sequence[str]) -> str:
         "plant": "nominal puller, or the worst of each column over the pullers of the first validation episodes",
         **{name.replace("_", " "): column.meaning for name, column in COLUMNS.items()},
     }
-    lines = ["# Design of the linear controllers", "", f"| {' | '.join(meanings)} |", "|---" * len(meanings) + "|"]
-    for controller, plant, figures in rows:
-        numbers = ("-" if math.isnan(value) else f"{value:.3g}" for value in figures.values())
-        lines.append(f"| {' | '.join([controller, plant, *numbers])} |")
-    lines += ["", *(f"- **{head}**: {meaning}" for head, meaning in meanings.items())]
-    return "\n".join([*lines, "", *(f"No linear form: {line}." for line in skipped)]).rstrip() + "\n"
-
-
-def as_csv(rows: Sequence[Row]) -> str:
-    """The rows as CSV, unstable loops empty."""
-    lines = [",".join(("controller", "plant", *COLUMNS))]
-    for controller, plant, figures in rows:
-        numbers = ("" if math.isnan(value) else f"{value:.6g}" for value in figures.values())
-        lines.append(",".join([controller, plant, *numbers]))
-    return "\n".join(lines) + "\n"
-
-
-def as_json(rows: Sequence[Row], skipped: Sequence[str]) -> str:
-    """Rows and skipped controllers as JSON, unstable loops null."""
-    plain = []
-    for controller, plant, figures in rows:
-        numbers = {name: None if math.isnan(value) else value for name, value in figures.items()}
-        plain.append({"controller": controller, "plant": plant, **numbers})
-    return json.dumps({"rows": plain, "no_linear_form": list(skipped)}, indent=2) + "\n"
+    lines = [
+        (controller, plant, *("-" if math.isnan(value) else f"{value:.3g}" for value in figures.values()))
+        for controller, plant, figures in rows
+    ]
+    parts = ["# Design of the linear controllers", "", markdown.table(meanings, lines, "---"), ""]
+    parts += [f"- **{head}**: {meaning}" for head, meaning in meanings.items()]
+    return "\n".join([*parts, "", *(f"No linear form: {line}." for line in skipped)]).rstrip() + "\n"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -186,7 +169,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--pullers", type=between(1, most), default=50, help=f"random pullers for the worst case, at most {most}"
     )
-    parser.add_argument("--out", type=Path, default=Path("results/design"), help="folder of design.md, .csv and .json")
+    parser.add_argument("--out", type=Path, default=Path("results/design"), help="folder of design.md")
     args = parser.parse_args(arguments)
     return guarded(parser.prog, lambda: _tabulate(args), "benchmark")
 
@@ -196,8 +179,7 @@ def _tabulate(args: argparse.Namespace) -> int:
     names = args.controllers or [entry.name for entry in CONTROLLERS if entry.default]
     rows, skipped = table(names, args.pullers)
     text = as_markdown(rows, skipped)
-    contents = {"design.md": text, "design.csv": as_csv(rows), "design.json": as_json(rows, skipped)}
-    write_files({args.out / name: content.encode() for name, content in contents.items()})
+    write_files({args.out / "design.md": text.encode()})
     print(text, end="")
     return 0
 
