@@ -7,8 +7,6 @@ error, lost crystals and the paired difference to one controller, with 95 % inte
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -42,8 +40,6 @@ class Cell(NamedTuple):
     """[mm]"""
     lost: Estimate
     """Share of crystals [-]."""
-    activity: Estimate
-    """RMS of pull steps [mm/min]."""
     apart: Estimate
     """RMSE less the compared controller's on the same crystals [mm]."""
     worst: float
@@ -51,8 +47,8 @@ class Cell(NamedTuple):
 
 
 def figures(row: str) -> tuple[str, ...]:
-    """What is read of a row's episodes: RMSE [mm], failure and pull step RMS [mm/min]."""
-    return ("rmse_observable_mm" if row in OBSERVABLE else "rmse_mm"), "failure_rate", "pull_step_rms_mm_per_min"
+    """What is read of a row's episodes: RMSE [mm] and failure."""
+    return ("rmse_observable_mm" if row in OBSERVABLE else "rmse_mm"), "failure_rate"
 
 
 def tabulate(episodes: Mapping[str, Mapping[str, Floats]], against: str) -> list[Cell]:
@@ -66,25 +62,11 @@ def tabulate(episodes: Mapping[str, Mapping[str, Floats]], against: str) -> list
     cells = []
     for row, by_name in episodes.items():
         for name, values in by_name.items():
-            rmse, lost, activity = means(values, weights)
+            rmse, lost = means(values, weights)
             apart = differences(values, by_name[against], weights)[0]
             worst = float(values[:, :, 0].mean(axis=1).max())
-            cells.append(Cell(row, name, len(values), rmse, lost, activity, apart, worst))
+            cells.append(Cell(row, name, len(values), rmse, lost, apart, worst))
     return cells
-
-
-def to_csv(cells: Sequence[Cell]) -> str:
-    """``table.csv``: a line a cell."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    estimates = ("rmse_mm", "lost", "pull_step_rms_mm_per_min", "rmse_mm_difference")
-    ends = [f"{name}{end}" for name in estimates for end in ("", "_low", "_high")]
-    writer.writerow(("row", "controller", "training_seeds", "crystals", *ends, "rmse_mm_worst_seed"))
-    for cell in cells:
-        numbers = [value for one in (cell.rmse, cell.lost, cell.activity, cell.apart) for value in _ends(one)]
-        figures = (f"{value:.6g}" for value in (*numbers, cell.worst))
-        writer.writerow((cell.row, cell.controller, cell.seeds, cell.rmse.n, *figures))
-    return text.getvalue()
 
 
 def _ends(estimate: Estimate) -> tuple[float, float, float]:
@@ -138,7 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(given: argparse.Namespace) -> int:
     cells = tabulate(read_episodes(given.folder / EPISODES, figures), given.against)
     text = to_markdown(cells, given.against)
-    write_files({given.folder / "table.csv": to_csv(cells).encode(), given.folder / "table.md": text.encode()})
+    write_files({given.folder / "table.md": text.encode()})
     print(text, end="")
     return 0
 

@@ -51,7 +51,9 @@ def test_command_writes_the_table(tmp_path, capsys):
     assert design_table.main(["--controllers", "paper", "open-loop", "--pullers", "2", "--out", str(tmp_path)]) == 0
     text = (tmp_path / "design.md").read_text()
     assert text == capsys.readouterr().out
-    heads, _, *rows = ([cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line[:1] == "|")
+    heads, _, *rows = (
+        [cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line[:1] == "|"
+    )
     assert [row[1] for row in rows] == ["Model I", "Model II", "worst of 2"]
     assert float(rows[0][heads.index("crossover compensated")]) == pytest.approx(0.031, abs=0.001)
     assert text.endswith("No linear form: open-loop: there is no loop.\n")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +9,7 @@ import pytest
 
 from cz_gym.evaluation.files import read_episodes
 from studies.generalisation import __main__ as generalisation
-from studies.generalisation.__main__ import figures, tabulate, to_csv
+from studies.generalisation.__main__ import figures, tabulate
 
 HEAD = "scenario,controller,training_seed,seed,rmse_mm,rmse_observable_mm,failure_rate,pull_step_rms_mm_per_min"
 
@@ -44,17 +42,11 @@ def test_differences_are_paired_and_seeds_pooled(tmp_path: Path) -> None:
     assert cells["puller", "lqg"].apart.mean == 0.0
 
 
-def test_files_say_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_table_is_printed_and_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sample(tmp_path)
     assert generalisation.main([str(tmp_path), "--against", "lqg"]) == 0
     assert capsys.readouterr().out == (tmp_path / "table.md").read_text()
     assert "| randomized | +15 [+10, +20] |" in (tmp_path / "table.md").read_text()
-    rows = list(csv.DictReader(io.StringIO((tmp_path / "table.csv").read_text())))
-    assert [(row["row"], row["controller"], row["crystals"]) for row in rows][1] == ("randomized", "ppo", "6")
-    assert (
-        to_csv(tabulate(read_episodes(tmp_path / "episodes.csv", figures), "lqg"))
-        == (tmp_path / "table.csv").read_text()
-    )
 
 
 @pytest.mark.parametrize(
