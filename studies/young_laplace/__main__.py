@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import chebyshev
+from scipy.optimize import brentq
 
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser, guarded
@@ -51,16 +52,8 @@ def _fit(function: Callable[[Floats, Floats], Floats], m: int, n: int) -> Floats
     values = function(X.ravel(), Y.ravel()).reshape(m, n)
     series = np.linalg.solve(chebyshev.chebvander(x, m - 1), values)
     series = np.linalg.solve(chebyshev.chebvander(y, n - 1), series.T).T
-    powers: Floats = _powers(m).T @ series @ _powers(n)
+    powers: Floats = np.apply_along_axis(chebyshev.cheb2poly, 1, np.apply_along_axis(chebyshev.cheb2poly, 0, series))
     return powers
-
-
-def _powers(n: int) -> Floats:
-    """Row k: coefficients of T_k in powers, shape (n, n)."""
-    rows = np.zeros((n, n))
-    for k in range(n):
-        rows[k, : k + 1] = chebyshev.cheb2poly(np.eye(n)[k, : k + 1])
-    return rows
 
 
 def _radius(x: Floats) -> Floats:
@@ -93,21 +86,14 @@ def _ring_correction(x: Floats, y: Floats) -> Floats:
 def _tail_correction(x: Floats, y: Floats) -> Floats:
     """How far the ring moves between the reference slope, at radius r, and another one, against the planar meniscus."""
     r, X_b = _radius(x), _middle(y, exact.X_LOW, exact.X_HIGH)
-    slope = np.array([_slope_at(value) for value in X_b])
+    slope = np.array(
+        [brentq(lambda slope, at=at: ring_point(slope) - at, *exact.RING_SLOPES, xtol=1e-16) for at in X_b]
+    )
     reference = np.full_like(r, np.radians(3.5))
     start = exact.shoot(lambda outer: exact.turn(outer, reference)[0], r + exact.planar_width(reference), r)
     moved = exact.turn(start, slope)[0] - r
     correction: Floats = r * (moved / (X_b - exact.RING_REFERENCE) - 1.0)
     return correction
-
-
-def _slope_at(X_b: float) -> float:
-    """The ring's slope [rad] that belongs to X_b, by bisection."""
-    low, high = exact.RING_SLOPES
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if ring_point(middle) > X_b else (low, middle)
-    return low
 
 
 def render(tables: Tables) -> str:
