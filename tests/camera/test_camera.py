@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-import pickle
 from typing import Any
 
 import gymnasium as gym
@@ -10,7 +9,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env as check_with_gymnasium
 from stable_baselines3.common.env_checker import check_env as check_with_sb3
 
-from cz_gym import CzEnv, CzVectorEnv, Parameters, make_puller
+from cz_gym import CzEnv, Parameters, make_puller
 from cz_gym.camera.image import picture
 from cz_gym.camera.rays import make_scene
 from cz_gym.camera.ring_detector import RingDetector, wall_edge
@@ -50,39 +49,6 @@ def test_both_checkers() -> None:
     check_with_gymnasium(env.unwrapped, skip_render_check=True)
     check_with_sb3(env, warn=True)
     assert env.observation_space == gym.spaces.Box(0, 255, (120, 160, 1), np.uint8)
-
-
-@pytest.mark.parametrize("scenario", ["randomized", "sensor-fault", "puller"])
-def test_slots_equal_scalars_bit_for_bit(scenario: str) -> None:
-    settings: dict[str, Any] = {"observation": "camera", "horizon": 60.0}
-    batch = CzVectorEnv(3, scenario, autoreset_mode="NextStep", threads=2, **settings)
-    scalars = [CzEnv(scenario, **settings) for _ in range(3)]
-    seen, _ = batch.reset(seed=5)
-    expected = [env.reset(seed=5 + i)[0] for i, env in enumerate(scalars)]
-    np.testing.assert_array_equal(seen, expected)
-    over = [False] * 3
-    for actions in ACTIONS[:20]:
-        seen, *_ = batch.step(actions)
-        for i, env in enumerate(scalars):
-            if over[i]:
-                expected[i], over[i] = env.reset()[0], False
-            else:
-                expected[i], _, terminated, truncated, _ = env.step(actions[i])
-                over[i] = terminated or truncated
-        np.testing.assert_array_equal(seen, expected)
-
-
-@pytest.mark.parametrize("scenario", ["sensor-fault", "puller"])
-def test_a_saved_state_continues_bit_for_bit(scenario: str) -> None:
-    env, other = (CzEnv(scenario, observation="camera", horizon=200.0) for _ in range(2))
-    env.reset(seed=9)
-    for action in ACTIONS[:5, 0]:
-        shown = env.step(0.1 * action)[0]
-    saved = pickle.loads(pickle.dumps(env.get_state()))
-    again, _ = other.reset(options={"state": saved})
-    np.testing.assert_array_equal(again, shown)
-    for action in ACTIONS[5:15, 0]:
-        np.testing.assert_array_equal(env.step(0.1 * action)[0], other.step(0.1 * action)[0])
 
 
 def test_physics_and_info_are_those_of_the_other_observations() -> None:

@@ -47,10 +47,15 @@ def test_the_native_batch_is_a_vector_of_scalars(settings: dict[str, Any], mode:
     assert checked.held > 2000
 
 
-def test_a_batch_of_images_is_a_vector_of_scalars() -> None:
-    settings: dict[str, Any] = {"scenario": "hard", "observation": "camera", **SHORT, "horizon": 180.0, "info": "all"}
+@pytest.mark.parametrize("scenario", ["hard", "sensor-fault", "puller"])
+def test_a_batch_of_images_is_a_vector_of_scalars(scenario: str) -> None:
+    settings: dict[str, Any] = {"scenario": scenario, "observation": "camera", **SHORT, "horizon": 180.0, "info": "all"}
     checked = check_vector_env(
-        lambda n, mode: CzVectorEnv(n, autoreset_mode=mode, **settings), lambda: CzEnv(**settings), num_envs=2, steps=5
+        lambda n, mode: CzVectorEnv(n, autoreset_mode=mode, **settings),
+        lambda: CzEnv(**settings),
+        num_envs=2,
+        steps=5,
+        random_start=scenario != "sensor-fault",
     )
     assert checked.episodes > 6
     assert checked.held > 300

@@ -171,23 +171,6 @@ def test_stepping_needs_a_reset() -> None:
         env.step(ZERO)
 
 
-def test_seeds_reproduce_and_episodes_differ() -> None:
-    def episodes(seed: int) -> list[np.ndarray]:
-        env = CzEnv(horizon=100.0, info="all")
-        runs = []
-        for number in range(3):
-            rows = [env.reset(seed=seed if number == 0 else None)[0]]
-            rows += [env.step(ZERO)[0] for _ in range(20)]
-            runs.append(np.array(rows))
-        return runs
-
-    one, again, other = episodes(1), episodes(1), episodes(2)
-    np.testing.assert_array_equal(one, again)
-    assert not np.array_equal(one[0], other[0])
-    assert not np.array_equal(one[0], one[1])
-    assert not np.array_equal(one[1], one[2])
-
-
 def test_info_is_the_plant_in_si() -> None:
     env = CzEnv("only-interface", model=0.3, info="all")
     env.reset(seed=2)

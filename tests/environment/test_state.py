@@ -28,7 +28,7 @@ def run(env: CzEnv, steps: int, first: int = 0) -> list[Any]:
 
 
 @pytest.mark.parametrize("scenario", ["randomized", "sensor-fault", "puller"])
-@pytest.mark.parametrize("observation", ["measured", "history", "state"])
+@pytest.mark.parametrize("observation", ["measured", "history", "state", "camera"])
 def test_a_saved_state_continues_bit_for_bit(scenario: str, observation: str) -> None:
     env = CzEnv(scenario, observation=observation, horizon=200.0)
     env.reset(seed=9)
@@ -42,14 +42,14 @@ def test_a_saved_state_continues_bit_for_bit(scenario: str, observation: str) ->
     assert run(env, 60, 25) == expected
 
 
-def test_reset_from_a_state_shows_its_last_sample() -> None:
-    env = CzEnv(observation="history")
+@pytest.mark.parametrize("observation", ["history", "camera"])
+def test_reset_from_a_state_shows_its_last_sample(observation: str) -> None:
+    env, other = CzEnv(observation=observation), CzEnv(observation=observation)
     env.reset(seed=9)
     for action in ACTIONS[:10]:
-        observation, *_, info = env.step(action)
-    other = CzEnv(observation="history")
+        shown, *_, info = env.step(action)
     again, other_info = other.reset(options={"state": env.get_state()})
-    np.testing.assert_array_equal(again, observation)
+    np.testing.assert_array_equal(again, shown)
     assert repr(other_info) == repr(info)
     assert run(other, 20, 10) == run(env, 20, 10)
 
