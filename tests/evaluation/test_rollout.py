@@ -104,12 +104,6 @@ def test_policy_begins_again_where_the_crystal_does() -> None:
     assert sum(starts.sum() for _, starts in policy.told[1:]) >= 4
 
 
-def test_a_crystal_does_not_depend_on_its_neighbours() -> None:
-    many, one = rollout(CompensatedPID(), SHORT, range(6)), rollout(CompensatedPID(), SHORT, [4])
-    for together, alone in zip(many.signals, one.signals, strict=True):
-        np.testing.assert_array_equal(together[:, 4:5], alone)
-
-
 def test_start_is_the_state_before_the_first_step() -> None:
     run = rollout(OpenLoop(), SHORT, [7])
     _, info = CzEnv(SHORT.scenario, horizon=SHORT.horizon, info="all").reset(seed=7)

@@ -55,11 +55,6 @@ def test_paired_difference_is_as_sharp_as_the_differences(rng: np.random.Generat
     assert estimate.ci95 == pytest.approx((own.mean() - half, own.mean() + half), abs=0.08 * half)
 
 
-def test_the_same_data_give_the_same_intervals(rng: np.random.Generator) -> None:
-    values = rng.normal(size=(3, 40, 2))
-    assert means(values, Resamples.draw(40)) == means(values, Resamples.draw(40))
-
-
 def test_one_deterministic_episode_has_no_interval() -> None:
     resamples = Resamples.draw(1)
     assert means(single([0.7]), resamples)[0] == (0.7, None, 1)
