@@ -37,6 +37,7 @@ for _ in range(20):
     observation, *_ = env.step(env.action_space.sample())
 assert np.isfinite(observation).all()
 from cz_gym.baselines import CompensatedPID
+import cz_gym.baselines.analysis.compensator_design
 batch = gym.make_vec("Cz-v0", num_envs=2, vectorization_mode="vector_entry_point")
 batch.reset(seed=1)
 assert CompensatedPID().predict(batch.step(np.zeros((2, 2)))[0])[0].shape == (2, 2)

@@ -57,9 +57,3 @@ def test_command_writes_the_table(tmp_path, capsys):
     assert [row[1] for row in rows] == ["Model I", "Model II", "worst of 2"]
     assert float(rows[0][heads.index("crossover compensated")]) == pytest.approx(0.031, abs=0.001)
     assert text.endswith("No linear form: open-loop: there is no loop.\n")
-
-
-def test_command_refuses(tmp_path, capsys):
-    assert design_table.main(["--controllers", "nobody", "--out", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-    assert not list(tmp_path.iterdir())

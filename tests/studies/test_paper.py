@@ -1,8 +1,6 @@
 """The command that redoes Part II: its numbers against published and analytic ones, its files, its errors."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -184,19 +182,3 @@ def test_expected_noise_in_the_pull_speed():
     assert found.clipped == 0.0
     assert min(SEEDS) >= 1_000_000
     assert max(SEEDS) < 2_000_000
-
-
-def test_missing_package(tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "control", None)
-    assert paper.main(["--out", str(tmp_path / "new")]) == 2
-    assert ".[benchmark]" in capsys.readouterr().err
-    assert not (tmp_path / "new").exists()
-
-
-def test_baselines_import_without_extras():
-    code = (
-        "import sys\n"
-        "for name in ('control', 'matplotlib', 'tqdm'): sys.modules[name] = None\n"
-        "import cz_gym.baselines, cz_gym.baselines.analysis.compensator_design, studies.paper.__main__\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)

@@ -116,16 +116,6 @@ def test_the_command_writes_what_the_search_chose(search, tmp_path, capsys):
     assert f"pull_step={written['chosen']['values']['weights.pull_step']}" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("command", [lqg_tuning, lqg_frontier])
-@pytest.mark.parametrize("arguments", [["--episodes", "0"], ["--validation", "501"], ["--scenario", "moon"]])
-def test_bad_arguments_are_refused_in_a_line(command, arguments, capsys):
-    with pytest.raises(SystemExit, match="2"):
-        command.main(arguments)
-    error = capsys.readouterr().err
-    assert arguments[0] in error
-    assert error.count("\n") == 1
-
-
 def test_the_weight_for_an_activity_is_read_off_between(monkeypatch, tmp_path):
     def by_weight(settings, scenario, seeds):
         """Pull steps fall with the square root of their weight; the quiet base holds the radius better."""
