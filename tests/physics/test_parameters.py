@@ -19,11 +19,6 @@ def test_every_parameter_says_what_it_is() -> None:
         assert quantity.source
 
 
-def test_parameters_cannot_be_changed() -> None:
-    with pytest.raises(AttributeError):
-        Parameters().r_0 = 0.1  # type: ignore[misc]
-
-
 @given(
     st.sampled_from(Parameters._fields),
     st.sampled_from([math.nan, math.inf, -math.inf, -1.0, "0.1", None]),
