@@ -16,9 +16,7 @@ import numpy.typing as npt
 
 from cz_gym.baselines.policy import Floats, batched, fresh, to_action
 from cz_gym.config import Config
-from cz_gym.evaluation.rollout import Rollout
 from cz_gym.observation import HEATER_SCALE, STATE, scales
-from cz_gym.task import cost_terms
 
 from .future import future_of
 from .trajectory import INPUTS, Trajectory, limits_of, optimise, predicted_cost
@@ -97,14 +95,6 @@ def make_plan(config: Config, seeds: Sequence[int]) -> Plan:
         np.stack(np.broadcast_arrays(*values), axis=-1) for values in (future.puller.state_0, future.puller.inputs_0)
     )
     return Plan(best, state_0, inputs_0, predicted_cost(future, best))
-
-
-def episode_cost(run: Rollout) -> Floats:
-    """The same objective recomputed from logged signals, shape (episodes,); infinite after a failure."""
-    s, v_0 = run.signals, run.config.parameters.v_0
-    v_p, Q_H = (np.concatenate([start, log]) for start, log in ((run.start.v_p, s.v_p), (run.start.Q_H, s.Q_H)))
-    terms = cost_terms(s.r_c - s.r_ref, s.v_p - v_0, np.diff(v_p, axis=0), np.diff(Q_H, axis=0))
-    return np.where(run.failed, np.inf, sum(terms).sum(axis=0))
 
 
 def _joined(plans: Sequence[Plan]) -> Plan:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from cz_gym.baselines.bounds.clairvoyant import Clairvoyant, episode_cost
+from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
 from cz_gym.baselines.bounds.future import future_of, substeps_of
 from cz_gym.baselines.bounds.riccati import Stages, sweep_back, sweep_forward
 from cz_gym.baselines.bounds.trajectory import TOLERANCE, Limits, limits_of, linearised, optimise, predicted_cost
@@ -15,6 +15,7 @@ from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.episodes.scenarios import HARD, RANDOMIZED
+from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.physics.plant import Inputs, State
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
@@ -36,6 +37,11 @@ def optimum():
 def replay(config, policy):
     """A rollout of a policy as it is, with or without a plan."""
     return rollout(SimpleNamespace(predict=policy.predict), config, SEEDS)
+
+
+def episode_cost(run):
+    """The objective, from logged signals; a lost crystal costs what its lost radius does."""
+    return metrics(run).cost * run.config.steps
 
 
 class OpenLoopInputs:
