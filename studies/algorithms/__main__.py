@@ -18,7 +18,7 @@ ROWS = (
     ),
     Variant(RECIPES["ppo"], "proximal policy optimisation from nothing; the critic also sees the true state"),
     Variant(RECIPES["ppo-recurrent"], "the same of an LSTM; actor and critic see the past", "ppo"),
-    Variant(RECIPES["sac"], "soft actor-critic from nothing; both see the past; actions held for 20 s while it learns", "ppo"),
+    Variant(RECIPES["sac"], "soft actor-critic from nothing; both see the past; it learns with actions of 20 s", "ppo"),
     Variant(RECIPES["random-search"], "augmented random search of a linear policy, from nothing", "ppo"),
     Variant(RECIPES["imitation"], "no reward: DAgger, the teacher is a privileged LQG", "ppo"),
 )
