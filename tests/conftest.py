@@ -3,8 +3,6 @@
 Where a package for training is not installed, the tests that need it are skipped, whole modules where they import it.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import sys

@@ -1,7 +1,5 @@
 """The facts of an agent's contract, for tests that write agents of their own."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from cz_gym.agents.agent_file.contract import facts_of

@@ -1,7 +1,5 @@
 """Observations for tests of controllers: of given values, and of a batch that is driven at random."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Learners that are done in a moment, for tests that need one that has learned something."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from cz_gym.agents.training.learners import make_learner

@@ -1,8 +1,6 @@
 """``report.html`` in Chromium without a window: ``make test-browser``. Skipped where chromium, chromedriver or selenium
 is absent."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Nobody who can still look at an array given out may see a later one written: every way of looking is tried."""
 
-from __future__ import annotations
-
 import gc
 import threading
 import weakref

@@ -1,7 +1,5 @@
 """The same bits everywhere, and golden trajectories that notice any change of physics."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import subprocess

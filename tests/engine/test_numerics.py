@@ -1,7 +1,5 @@
 """Nothing breaks the numbers: a short campaign, and the integrator at the edge of what can be reached."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

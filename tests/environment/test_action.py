@@ -1,7 +1,5 @@
 """Smooth actions: first-order lags of the drives, the same at every control interval and in the batch."""
 
-from __future__ import annotations
-
 import math
 
 import gymnasium as gym

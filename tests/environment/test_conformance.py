@@ -1,7 +1,5 @@
 """Cz-v0 under Gymnasium's checker, and its batch under ours; under stable-baselines3's in ``test_learners.py``."""
 
-from __future__ import annotations
-
 import warnings
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Derivatives of a step: against differences of the environment's own steps, through failures, on the plant alone."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

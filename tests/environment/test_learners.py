@@ -1,7 +1,5 @@
 """Cz-v0 as learners meet it: under stable-baselines3's checker, and in a single-file loop as CleanRL writes them."""
 
-from __future__ import annotations
-
 import warnings
 from typing import Any
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import dataclasses
 import math
 from itertools import pairwise
@@ -29,7 +27,6 @@ from cz_gym.episodes.series import (
 MM, MINUTE, SPAN = 1e-3, 60.0, 10800.0
 WORD = st.integers(0, 2**64 - 1)
 KEY = st.tuples(WORD, WORD)
-FAMILIES = [field.name for field in dataclasses.fields(Scenario)[1:]]
 
 
 def draw(scenario: str | Scenario, key: tuple[int, int], grid: int = 50, samples: int = 50) -> tuple[Episode, Series]:

@@ -1,7 +1,5 @@
 """Slow controllers: fewer episodes, cached and resumed; compared on the episodes that both met; the optimality gap."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import dataclass, replace

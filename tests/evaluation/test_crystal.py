@@ -1,7 +1,5 @@
 """The figure of one crystal: who is shown when there are many, and a crystal that nothing disturbs."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any, cast
 

@@ -1,7 +1,5 @@
 """Metrics against values worked out by hand, on made-up crystals."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``report.html``: what it holds is what was measured, whatever the names are, and it needs nothing from elsewhere."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

@@ -1,7 +1,5 @@
 """Rollouts against the scalar environment, step by step."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from pathlib import Path
 from typing import Any

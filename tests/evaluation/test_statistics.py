@@ -1,7 +1,5 @@
 """Statistics against closed forms: where the bootstrap's answer is known, it must be that."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats

@@ -1,7 +1,5 @@
 """The report's first line: whether the agents win, and where they do not."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

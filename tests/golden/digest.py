@@ -1,7 +1,5 @@
 """What an environment gives, as one hash; ``python -m tests.golden.digest`` prints it, and where cz_gym came from."""
 
-from __future__ import annotations
-
 import hashlib
 
 import numpy as np

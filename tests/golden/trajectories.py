@@ -4,8 +4,6 @@ Every scenario under both models: a fixed feedback on the true state with a fixe
 every 20 min: state, ring as measured, references, and the sum of the rewards so far.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

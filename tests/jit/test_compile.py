@@ -1,7 +1,5 @@
 """Each test runs fresh processes on a copy of the package, so that sources can be changed."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """What this package takes from numba's private parts: a numba that changes them is found here, by name."""
 
-from __future__ import annotations
-
 import hashlib
 from importlib import import_module
 

@@ -1,7 +1,5 @@
 """Pulling by hand: keys posted to a window nobody sees, the score, and what the commands say when they cannot."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Iterator

@@ -3,8 +3,6 @@
 A room is a package, or a module that stands beside packages (``cz_gym.env``, ``cz_gym.baselines.policy``, ``train``).
 """
 
-from __future__ import annotations
-
 import ast
 import os
 from collections import Counter

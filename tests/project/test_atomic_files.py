@@ -1,7 +1,5 @@
 """Files are replaced together or not at all, wherever the writer is killed, on every system."""
 
-from __future__ import annotations
-
 import errno
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """``benchmark.py``: what it writes, what it refuses to overwrite, and one line for every mistake."""
 
-from __future__ import annotations
-
 import csv
 import json
 import subprocess

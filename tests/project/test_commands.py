@@ -1,7 +1,5 @@
 """Every command: one line for options that cannot be meant, one line for Ctrl-C, and nothing left behind."""
 
-from __future__ import annotations
-
 import importlib
 from pathlib import Path
 from typing import Any

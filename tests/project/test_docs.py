@@ -4,8 +4,6 @@ Python blocks of a page run in order, in one namespace and a folder of its own. 
 blocks and within lines, are parsed by the program they name; shell blocks marked ``run`` are also run.
 """
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import re

@@ -1,7 +1,5 @@
 """Imports run one way: no circle of modules or rooms, and nothing from a higher room."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections import Counter

@@ -1,7 +1,5 @@
 """What is installed: one package, on four dependencies, by every way of installing it."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

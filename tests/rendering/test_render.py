@@ -1,7 +1,5 @@
 """Render modes through Gymnasium: checkers, wrappers, sizes, failures; and that rendering changes nothing."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import subprocess

@@ -1,7 +1,5 @@
 """What a picture says is true: pixels against the logged signals."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 import pytest

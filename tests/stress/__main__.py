@@ -6,8 +6,6 @@ environment is checked, and the stored heat is balanced against what flowed in a
 the command with one line that names the case, the step and the slot.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

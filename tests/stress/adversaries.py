@@ -1,8 +1,6 @@
 """Actions that look for trouble: extremes, bang-bang, long saturation, infinities; feedback that saves a crystal while
 its heater saturates."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What must hold after every step of every slot, whatever was done: :class:`Watch`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

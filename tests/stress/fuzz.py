@@ -4,8 +4,6 @@ Whatever a stranger or a failing disk leaves is read, or refused in one line. Th
 leaves a file that breaks its reader in ``hostile.bin``.
 """
 
-from __future__ import annotations
-
 import argparse
 import io
 import json

@@ -4,8 +4,6 @@
 at another point: ``train:train:1>os:replace:2`` is the second such call after ``train.train`` was called.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib
 import itertools

@@ -1,7 +1,5 @@
 """Small runs of train.py and benchmark.py, the points at which they are killed, and what a killed one may leave."""
 
-from __future__ import annotations
-
 import csv
 import json
 import threading

@@ -1,7 +1,5 @@
 """Damaged and hostile files are read or refused in one line; ``python -m tests.stress.fuzz`` is the long form."""
 
-from __future__ import annotations
-
 import os
 import time
 from pathlib import Path

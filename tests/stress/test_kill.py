@@ -1,7 +1,5 @@
 """Killed runs lose nothing but what came after the last checkpoint, wherever they are killed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The Bode plot of any controller: the design table's margins, and one line where there is none."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

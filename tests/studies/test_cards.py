@@ -1,7 +1,5 @@
 """Model cards: every shipped agent has one, with the benchmark's own figures."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Comparisons: runs are trained once and judged alike, the table's figures are right, a stopped command goes on."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import replace

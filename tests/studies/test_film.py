@@ -1,7 +1,5 @@
 """The film: a short one, whose agent it shows, and what it says when it cannot."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

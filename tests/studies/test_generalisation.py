@@ -1,7 +1,5 @@
 """How agents travel: the table's means, pairing and refusals."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What an agent does: exact derivatives, loops against the design table's, events that happen as they are said to."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from typing import Any

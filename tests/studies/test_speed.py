@@ -1,7 +1,5 @@
 """The speed command's structure on a tiny run; what it measures is never tested."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import os

@@ -1,7 +1,5 @@
 """The checker fires on each way to break a vector environment, and says which in one line."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 
