@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from cz_gym import make_puller
-from cz_gym.baselines.lqg.controller import LQG, LQGSettings
+from cz_gym.baselines.lqg.controller import LQG
 from cz_gym.baselines.lqg.model import DRIFT, FAST, HEATER, PLANT, SLOW, STATES, NoiseModel, plant_model
 from cz_gym.baselines.lqg.preview import look_ahead, samples_ahead
 from cz_gym.baselines.lqg.regulator import Weights, quadratic_cost, regulator
@@ -139,11 +139,6 @@ def test_while_the_camera_is_out_its_reading_is_not_believed():
     states = [LQG().predict(measured(ring_error=wrong, valid=0.0), first)[1].filter for wrong in (0.0, 5e-3)]
     np.testing.assert_array_equal(states[0].mean, states[1].mean)
     assert states[0].covariance[0, 0, 0] > 0.0
-
-
-def test_settings_are_hashed_by_content():
-    assert LQGSettings().hash == LQGSettings().hash
-    assert LQGSettings().hash != LQGSettings(lam=0.4).hash
 
 
 # In the environment

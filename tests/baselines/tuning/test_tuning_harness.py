@@ -9,7 +9,7 @@ import pytest
 from cz_gym.baselines.lqg import settings as lqg_settings
 from cz_gym.baselines.pid import settings as pid_settings
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
-from cz_gym.baselines.tuning.harness import Parameter, Search, file_name, value_at, with_value
+from cz_gym.baselines.tuning.harness import Parameter, Search, file_name
 from cz_gym.baselines.tuning.lqg import LQGSearch
 from cz_gym.baselines.tuning.pid import PIDSearch
 from cz_gym.baselines.tuning.pid_spaces import space_of
@@ -94,13 +94,6 @@ def test_another_file_is_refused(tmp_path):
         Walk().tune(path, history=tmp_path / "none.json")
     with pytest.raises(NotADirectoryError, match="is not a folder"):
         Walk().tune(path / "walk.json")
-
-
-def test_a_parameter_is_set_where_it_is_read():
-    policy = with_value(FilteredPID(), "heater.K_pull", 7.0)
-    assert (value_at(policy, "heater.K_pull"), policy.heater.K) == (7.0, FilteredPID().heater.K)
-    with pytest.raises(AttributeError):
-        with_value(FilteredPID(), "no.such", 1.0)
 
 
 def kept(controller, scenario):
