@@ -7,16 +7,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import expm
+from scipy.signal import dlsim
 
 from cz_gym import HURLE, MeniscusModel, Scenario, make_puller
 from cz_gym.baselines.analysis.compensator_design import Margins, design_compensator, margins
+from cz_gym.baselines.analysis.sampled_loop import sampled_plant
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID, Compensator
 from cz_gym.config import make_config
 from cz_gym.episodes.schedule import quintic
 from cz_gym.evaluation.replay import Playback
 from cz_gym.evaluation.rollout import Signals, rollout
-from cz_gym.physics.linearisation import OUTPUTS, RadiusModel, linearise, radius_model
+from cz_gym.physics.linearisation import RadiusModel, radius_model
 from cz_gym.units import HOUR, MINUTE, MM, MM_PER_MIN
 
 from .published import PID, PUBLISHED
@@ -156,15 +157,9 @@ def step_comparison(model: str, share: float, horizon: float = 600.0) -> StepCom
     """Step the pull speed of plant and linear model by a share of v_0."""
     run = _open_loop(np.full(round(horizon / FINE), share), model)
     puller = make_puller(lam=MODELS[model])
-    A, B, C, _ = linearise(puller)
-    block = np.zeros((len(A) + 1, len(A) + 1))
-    block[:-1, :-1], block[:-1, -1] = A * FINE, B[:, 0] * FINE * puller.v_0 * share
-    move = expm(block)
-    x, path = np.append(np.zeros(len(A)), 1.0), []
-    for _ in run.t:
-        path.append(C @ x[:-1])
-        x = move @ x
-    r_c, r_br = np.array(path)[:, [OUTPUTS.index("r_c"), OUTPUTS.index("r_br")]].T
+    A, B, C, D = sampled_plant(puller, FINE)
+    path: Any = dlsim((A, B[:, :1], C[:2], D[:2, :1], FINE), np.full(len(run.t), puller.v_0 * share))[1]
+    r_c, r_br = path.T
     s = run.signals
     return StepComparison(run.t, share, (s.r_c - s.r_c[0], s.r_br - s.r_br[0]), (r_c, r_br))
 
