@@ -1,12 +1,18 @@
-"""The same work on the machines of a Ray cluster: functions and tasks as here, results in the order they are done."""
+"""The same work in many processes, here or on a Ray cluster's machines; results in the order they are done."""
 
 from __future__ import annotations
 
 import hashlib
+import os
+import signal
 import socket
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from importlib.util import find_spec
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any
 
@@ -53,25 +59,36 @@ def _check_answers(address: str) -> None:
 
 def _check_nodes(ours: tuple[str, str]) -> None:
     """ValueError names a node whose :func:`facts_of_sources` are others."""
-    import ray
-    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-
-    facts = ray.remote(facts_of_sources)
-    nodes = {node["NodeID"]: node["NodeManagerAddress"] for node in ray.nodes() if node["Alive"]}
-    asked = {
-        node: facts.options(num_cpus=0, scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False)).remote()
-        for node in nodes
-    }
-    for node, answer in asked.items():
-        try:
-            theirs = ray.get(answer)
-        except ray.exceptions.RayError as error:
-            cause = getattr(error, "cause", None) or error
-            raise ValueError(f"node {nodes[node]} cannot run cz_gym: {' '.join(str(cause).split())[:200]}") from None
+    for node, theirs in _answers(facts_of_sources):
         if theirs != ours:
             raise ValueError(
-                f"node {nodes[node]} has cz_gym {' '.join(theirs)}, this machine {' '.join(ours)}: install the same"
+                f"node {node} has cz_gym {' '.join(theirs)}, this machine {' '.join(ours)}: install the same"
             )
+
+
+def check_shared(folder: Path) -> None:
+    """ValueError names a node that does not see what is written into a folder here."""
+    with tempfile.NamedTemporaryFile(dir=folder) as file:
+        for node, sees in _answers(os.path.exists, file.name):
+            if not sees:
+                raise ValueError(f"node {node} does not see {folder}: it must be on a file system that all nodes share")
+
+
+def _answers(question: Callable[..., Any], *arguments: Any) -> Iterator[tuple[str, Any]]:
+    """Address and answer of every node; ValueError names one that cannot answer."""
+    import ray
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy as On
+
+    ask = ray.remote(question)
+    nodes = {node["NodeID"]: node["NodeManagerAddress"] for node in ray.nodes() if node["Alive"]}
+    there = {node: ask.options(num_cpus=0, scheduling_strategy=On(node, soft=False)) for node in nodes}
+    asked = [(nodes[node], task.remote(*arguments)) for node, task in there.items()]
+    for node, answer in asked:
+        try:
+            yield node, ray.get(answer)
+        except ray.exceptions.RayError as error:
+            cause = getattr(error, "cause", None) or error
+            raise ValueError(f"node {node} cannot run cz_gym: {' '.join(str(cause).split())[:200]}") from None
 
 
 def facts_of_sources() -> tuple[str, str]:
@@ -86,7 +103,13 @@ def facts_of_sources() -> tuple[str, str]:
     return cz_gym.__version__, digest.hexdigest()[:12]
 
 
-def completed(function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+Look = Callable[[], None]
+"""What is called about every second while tasks run."""
+
+
+def completed(
+    function: Callable[[Any], Any], tasks: Sequence[Any], look: Look | None = None
+) -> Iterator[tuple[int, Any]]:
     """Run ``function`` on every task, a processor each: the number of a task and its result, as they come.
 
     A task whose node is lost runs again elsewhere. What a task raises is raised here.
@@ -108,3 +131,29 @@ def completed(function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[
             except ray.exceptions.RayError as error:
                 raise ValueError(f"the cluster lost a task {RETRIES} times: {' '.join(str(error).split())}") from None
             yield numbers.pop(reference), result
+        if look:
+            look()
+
+
+def in_processes(
+    function: Callable[[Any], Any], tasks: Sequence[Any], look: Look | None = None, processes: int | None = None
+) -> Iterator[tuple[int, Any]]:
+    """As :func:`completed`, in so many processes of this machine (None: one a processor), which end with the caller."""
+    processes = max(min(processes or os.cpu_count() or 1, len(tasks)), 1)
+    # Forking would copy the threads of torch and of the native batch in unknown states; Ctrl-C is the caller's.
+    with ProcessPoolExecutor(
+        processes, get_context("spawn"), initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_IGN)
+    ) as pool:
+        numbers = {pool.submit(function, task): number for number, task in enumerate(tasks)}
+        try:
+            while numbers:
+                for each in wait(numbers, WAIT, FIRST_COMPLETED).done:
+                    yield numbers.pop(each), each.result()
+                if look:
+                    look()
+        except BrokenProcessPool:
+            raise ValueError("a process was killed: is there enough memory?") from None
+        finally:
+            if numbers:
+                for process in active_children():
+                    process.terminate()

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
-from multiprocessing import get_context
+from functools import partial
 from typing import Any
 
 from tqdm import tqdm
@@ -17,6 +16,7 @@ from cz_gym.agents.training.run import CHECKPOINT, Run
 from cz_gym.agents.training.validation import Validation
 from cz_gym.atomic_files import locked
 from cz_gym.baselines.registry import make_controller
+from cz_gym.evaluation.cluster import in_processes
 
 from .results import Plan, Result, cached, judge, path_of
 from .variants import Variant
@@ -79,21 +79,11 @@ def train_all(plan: Plan, tasks: Sequence[Task], jobs: int, after_each: Callable
     """Do the runs that are not finished, so many at once."""
     missing = [task for task in tasks if not is_finished(plan, task)]
     print(f"{len(tasks) - len(missing)} runs are done, {len(missing)} to do")
-    if jobs == 1:
-        for task in missing:
-            print(_train(plan, task), flush=True)
-            after_each()
-        return
-    # Forking would copy the threads of torch and of the native batch in unknown states.
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        running = [pool.submit(_train, plan, task) for task in missing]
-        try:
-            for each in as_completed(running):
-                print(each.result(), flush=True)
-                after_each()
-        except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
+    train = partial(_train, plan)
+    several = (said for _, said in in_processes(train, missing, processes=jobs))
+    for said in map(train, missing) if jobs == 1 else several:
+        print(said, flush=True)
+        after_each()
 
 
 def _train(plan: Plan, task: Task) -> str:
