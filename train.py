@@ -30,14 +30,33 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         epilog="The run folder holds the agent with its contract, settings, checkpoints, progress and logs.",
     )
     parser.add_argument("--algo", choices=tuple(RECIPES), help=f"recipe (default: {DEFAULT}, or the resumed run's)")
-    parser.add_argument("--seed", type=_whole(0), help="training seed (default: 0, or the resumed run's)")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--seed", type=_whole(0), help="training seed (default: 0, or the resumed run's)")
+    which.add_argument(
+        "--seeds",
+        type=_seeds,
+        metavar="FIRST-LAST",
+        help="training seeds side by side, a processor each; with --resume those that are not finished",
+    )
+    parser.add_argument(
+        "--ray",
+        nargs="?",
+        const="",
+        metavar="HOST:PORT",
+        help="train --seeds on a Ray cluster, without an address on this machine's; all its machines must share --out",
+    )
     parser.add_argument(
         "--steps",
         type=_whole(1),
         help="environment steps of learning from reward (default: the recipe's, or the resumed run's)",
     )
     parser.add_argument("--scenario", help="scenario to train on (default: the recipe's, or the resumed run's)")
-    parser.add_argument("--out", type=Path, help="run folder (default: runs/<algo>-seed<seed>)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        help="run folder (default: runs/<algo>-seed<seed>); of --seeds the folder of theirs, seed0, seed1 ... "
+        "(default: runs/<algo>)",
+    )
     parser.add_argument("--plot", action="store_true", help="draw the progress into the run folder: progress.png")
     parser.add_argument("--resume", action="store_true", help="go on from the run folder's checkpoint")
     parser.add_argument(
@@ -49,7 +68,10 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         "(default: %(default)g)",
     )
     arguments = parser.parse_args(argv)
-    arguments.out = arguments.out or Path("runs") / f"{arguments.algo or DEFAULT}-seed{arguments.seed or 0}"
+    if arguments.ray is not None and not arguments.seeds:
+        parser.error("--ray needs --seeds")
+    one = "" if arguments.seeds else f"-seed{arguments.seed or 0}"
+    arguments.out = arguments.out or Path("runs") / f"{arguments.algo or DEFAULT}{one}"
     return arguments
 
 
@@ -69,16 +91,16 @@ def train(arguments: argparse.Namespace) -> int:
         import matplotlib  # noqa: F401  # say at once if it is missing
     from cz_gym.agents.training.recipes import RECIPES
     from cz_gym.agents.training.run import Run
-    from cz_gym.agents.training.run_files import REFERENCES
     from cz_gym.atomic_files import check_writable, locked
     from cz_gym.baselines.registry import make_controller
 
     folder: Path = arguments.out
-    saved_steps = _take_up(arguments)
-    if not arguments.resume and (folder / "settings.json").exists():
-        raise ValueError(f"{folder} holds a run already: --resume it, or name another --out")
+    folders = {seed: folder.resolve() / f"seed{seed}" for seed in arguments.seeds or ()}
+    saved_steps = _take_up(arguments, list(folders.values()) or [folder])
     recipe = _asked_for(RECIPES[arguments.algo], arguments, saved_steps)
     check_writable(folder)
+    if folders:
+        return _train_seeds(arguments, recipe, folders)
     with locked(folder):
         run = Run(
             folder,
@@ -100,25 +122,59 @@ def train(arguments: argparse.Namespace) -> int:
                 print(f"train.py: interrupted; checkpoint saved, --resume --out {folder} goes on", file=sys.stderr)
                 return 130
         summary = run.finish()
-    print(
-        f"best agent on {summary['validation_episodes']} validation episodes: mean RMSE "
-        f"{summary['validation_rmse_mm']:.3f} mm, {100 * summary['failure_rate']:.1f} % lost; beside it "
-        + ", ".join(f"{name} {summary[f'{name}_rmse_mm']:.3f}" for name in REFERENCES)
-    )
+    print(_said(summary))
     print(f"wrote {folder / 'agent.onnx'}")
     return 0
 
 
-def _take_up(arguments: argparse.Namespace) -> int | None:
-    """Fill in what the command line leaves out: from the run in the folder if it is resumed, or by default.
+def _train_seeds(arguments: argparse.Namespace, recipe: Recipe, folders: dict[int, Path]) -> int:
+    """Train several seeds, each into its folder: on this machine, or on a cluster."""
+    from tqdm import tqdm
 
-    Returns the steps that the resumed run was begun with.
+    from cz_gym.agents.training.fleet import Job, train_seeds
+    from cz_gym.atomic_files import locked
+    from cz_gym.baselines.registry import make_controller
+    from cz_gym.evaluation.cluster import check_shared, completed, connect, in_processes
+
+    options = make_controller, arguments.checkpoint_seconds, arguments.plot, sys.argv
+    jobs = [Job(folder, recipe, seed, *options) for seed, folder in folders.items()]
+    for job in jobs:
+        with locked(job.folder):
+            pass  # say at once if another process has it
+    if arguments.ray is not None:
+        connect(arguments.ray)
+        check_shared(jobs[0].folder)
+    print(f"{recipe.name}, {len(jobs)} seeds on {recipe.scenario!r}, into {arguments.out}")
+    with tqdm(total=len(jobs), bar_format="{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}") as bar:
+        for job, summary in train_seeds(jobs, in_processes if arguments.ray is None else completed, bar):
+            bar.write(f"seed {job.seed}: {_said(summary)}")
+    print(f"wrote agent.onnx into {len(jobs)} folders of {arguments.out}")
+    return 0
+
+
+def _said(summary: dict[str, float]) -> str:
+    from cz_gym.agents.training.run_files import REFERENCES
+
+    return (
+        f"best agent on {summary['validation_episodes']} validation episodes: mean RMSE "
+        f"{summary['validation_rmse_mm']:.3f} mm, {100 * summary['failure_rate']:.1f} % lost; beside it "
+        + ", ".join(f"{name} {summary[f'{name}_rmse_mm']:.3f}" for name in REFERENCES)
+    )
+
+
+def _take_up(arguments: argparse.Namespace, folders: list[Path]) -> int | None:
+    """Fill in what the command line leaves out: from the first run in the folders if it is resumed, or by default.
+
+    Returns the steps that the resumed run was begun with. ValueError if there is a run that is not to be resumed.
     """
     from cz_gym.agents import DEFAULT
     from cz_gym.agents.training.recipes import RECIPES
     from cz_gym.agents.training.run_files import read_settings
 
-    saved = read_settings(arguments.out / "settings.json") if arguments.resume else {}
+    begun = [folder for folder in folders if (folder / "settings.json").exists()]
+    if begun and not arguments.resume:
+        raise ValueError(f"{begun[0]} holds a run already: --resume it, or name another --out")
+    saved = read_settings((begun or folders)[0] / "settings.json") if arguments.resume else {}
     settings = saved.get("settings")
     scenario = settings.get("scenario") if isinstance(settings, dict) else None
     said = {"algo": (saved.get("algorithm"), DEFAULT), "seed": (saved.get("seed"), 0), "scenario": (scenario, "")}
@@ -154,6 +210,13 @@ def _whole(least: int) -> Callable[[str], int]:
         return value
 
     return read
+
+
+def _seeds(text: str) -> range:
+    first, _, last = text.partition("-")
+    if not (first.isdecimal() and last.isdecimal() and 0 <= int(last) - int(first) < 1000):
+        raise argparse.ArgumentTypeError(f"must be FIRST-LAST, at most 1000 seeds, not {text!r}")
+    return range(int(first), int(last) + 1)
 
 
 def _seconds(text: str) -> float:

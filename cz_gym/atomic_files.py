@@ -57,12 +57,15 @@ def finish_writing(folder: Path) -> None:
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Reserve a folder, made if need be, for this process until it ends; ValueError if another process has it."""
+def locked(folder: Path, patience: float = 0.0) -> Iterator[None]:
+    """Reserve a folder, made if need be, for this process until it ends.
+
+    ValueError if another process has it for longer than ``patience`` [s].
+    """
     folder.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         try:
-            stack.enter_context(_lock(folder / USER, 0.0))
+            stack.enter_context(_lock(folder / USER, patience))
         except TimeoutError:
             raise ValueError(f"{folder}: another process is at work in this folder") from None
         yield

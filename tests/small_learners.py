@@ -1,15 +1,41 @@
 """Learners that are done in a moment, for tests that need one that has learned something."""
 
+import time
 from typing import Any
 
+from cz_gym.agents.training import fleet, run
 from cz_gym.agents.training.learners import make_learner
-from cz_gym.agents.training.recipes import PPO, SAC, Recipe
+from cz_gym.agents.training.recipes import PPO, SAC, Imitation, Recipe
 from cz_gym.baselines.registry import make_controller
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
 SMALL = PPO(num_envs=4, hidden=(16, 16), steps=64, n_steps=16, batch_size=32, n_epochs=1)
 SMALL_SAC = SAC(
     num_envs=4, hidden=(16, 16), steps=64, buffer_size=256, learning_starts=32, batch_size=16, gradient_steps=1
 )
+SMALL_IMITATION = Imitation(
+    name="imitation", teacher="lqg", rounds=2, episodes=4, epochs=1, hidden=(16,), control_interval=30.0
+)
+TRAIN_SEED = fleet.train_seed
+
+
+def train_small_seed(job: fleet.Job) -> dict[str, float]:
+    """As :func:`fleet.train_seed`, with few validation episodes, in whatever process."""
+    run.PICKING, run.JUDGING = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4]
+    return TRAIN_SEED(job)
+
+
+def train_held_seed(job: fleet.Job) -> dict[str, float]:
+    """The same, in a process of its own; it waits at each validation for a file ``go`` beside the run folders."""
+    validate = run.Run._validate
+
+    def held(self: run.Run, bar: Any) -> Any:
+        while not (self.folder.parent / "go").exists():
+            time.sleep(0.1)
+        return validate(self, bar)
+
+    run.Run._validate = held  # type: ignore[method-assign]
+    return train_small_seed(job)
 
 
 def made(recipe: Recipe, seed: int = 0, done: int = 0) -> Any:

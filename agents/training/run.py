@@ -70,7 +70,7 @@ class Run:
         else:
             if folder.is_dir():
                 finish_writing(folder)
-            self.sessions = self._check_settings()
+            self.sessions = check_settings(folder, recipe, seed)
             progress, tensors = load_checkpoint(folder / CHECKPOINT)
             self.began -= progress.seconds
             self.rows = read_rows(folder / "progress.csv")
@@ -123,6 +123,7 @@ class Run:
             "pull_step_rms_mm_per_min": found.pull_step_rms_mm_per_min,
             "failure_rate": found.failure_rate,
             "training_steps": contract.training_steps,
+            "steps": self.learner.steps,
             "seconds": time.monotonic() - self.began,
         }
         judged = dataclasses.replace(contract, validation_cost=found.cost, validation_rmse_mm=found.rmse_mm)
@@ -173,33 +174,36 @@ class Run:
             validation_rmse_mm=0.0,
         )
 
-    def _identity(self) -> dict[str, Any]:
-        """What a run must be resumed with; it may be longer."""
-        settings = {name: value for name, value in dataclasses.asdict(self.recipe).items() if name != "steps"}
-        return {
-            "algorithm": self.recipe.name,
-            "seed": self.seed,
-            "settings": json.loads(json.dumps(settings)),
-            "plant_hash": self.config.plant_hash,
-            "scenario_hash": self.config.scenario.hash,
-        }
-
     def _write_settings(self) -> None:
         """Write what this run is; each time it is begun or resumed adds a session."""
         session = {"from_step": self.learner.steps, **provenance()}
         first = (self.sessions or [session])[0]
         self.sessions = [*self.sessions[:1], *self.sessions[1:][-MAX_SESSIONS:], session]
-        facts = {**self._identity(), "steps": self.learner.total, **first, "sessions": self.sessions}
+        facts = {**_identity(self.recipe, self.seed), "steps": self.learner.total, **first, "sessions": self.sessions}
         write_files({self.folder / "settings.json": to_json(facts)})
 
-    def _check_settings(self) -> list[dict[str, Any]]:
-        """The sessions of the run in this folder; AgentFileError if it is not this run."""
-        path = self.folder / "settings.json"
-        saved = read_settings(path)
-        for name, value in self._identity().items():
-            if saved.get(name) != value:
-                raise AgentFileError(f"{path}: the run was begun with another {name}; resume it with the same options")
-        return list(saved["sessions"])
+
+def _identity(recipe: Recipe, seed: int) -> dict[str, Any]:
+    """What a run must be resumed with; it may be longer."""
+    settings = {name: value for name, value in dataclasses.asdict(recipe).items() if name != "steps"}
+    config = config_of(recipe)
+    return {
+        "algorithm": recipe.name,
+        "seed": seed,
+        "settings": json.loads(json.dumps(settings)),
+        "plant_hash": config.plant_hash,
+        "scenario_hash": config.scenario.hash,
+    }
+
+
+def check_settings(folder: Path, recipe: Recipe, seed: int) -> list[dict[str, Any]]:
+    """The sessions of the run in this folder; AgentFileError if it is not this run."""
+    path = folder / "settings.json"
+    saved = read_settings(path)
+    for name, value in _identity(recipe, seed).items():
+        if saved.get(name) != value:
+            raise AgentFileError(f"{path}: the run was begun with another {name}; resume it with the same options")
+    return list(saved["sessions"])
 
 
 def _usable(path: Path, config: Config) -> bool:

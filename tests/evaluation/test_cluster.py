@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import pickle
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -27,21 +26,6 @@ class Short(Row):
 
     def config(self, *arguments: Any) -> Any:
         return replace(super().config(*arguments), horizon=600.0)
-
-
-@pytest.fixture
-def nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Any, Any]]:
-    """A cluster of two nodes, a processor each, and the second of them."""
-    ray = pytest.importorskip("ray")
-    from ray.cluster_utils import Cluster
-
-    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
-    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
-    second = made.add_node(num_cpus=1)
-    cluster.connect(made.address)
-    yield made, second
-    ray.shutdown()
-    made.shutdown()
 
 
 def plan() -> runner.Plan:

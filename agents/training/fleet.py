@@ -1,0 +1,92 @@
+"""Training seeds side by side, each a run in its own folder, in processes of this machine or of a cluster."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tqdm import tqdm
+
+from cz_gym.agents.agent_file.contract import read_json
+from cz_gym.atomic_files import locked
+
+from .learners import Controllers
+from .recipes import Recipe
+from .run import Run, check_settings
+from .run_files import read_rows
+
+LOST = 120.0
+"""Longest time that a lost machine's lock on a folder outlives it [s]."""
+
+
+class Job(NamedTuple):
+    """A training seed's run."""
+
+    folder: Path
+    recipe: Recipe
+    seed: int
+    controllers: Controllers
+    checkpoint_seconds: float
+    plot: bool
+    command: Sequence[str]
+    """The command line, for the run's settings."""
+
+    @property
+    def begun(self) -> bool:
+        """Whether its folder holds a run; AgentFileError if that is another one."""
+        exists = (self.folder / "settings.json").exists()
+        return exists and bool(check_settings(self.folder, self.recipe, self.seed))
+
+    @property
+    def summary(self) -> dict[str, float] | None:
+        """The summary of the run; None before its end."""
+        path = self.folder / "summary.json"
+        found = read_json(path) if self.begun and path.exists() else None
+        steps = found.get("steps") if isinstance(found, dict) else None
+        return found if isinstance(steps, int) and steps >= getattr(self.recipe, "steps", 0) else None
+
+
+Perform = Callable[[Callable[[Job], Any], Sequence[Job], Callable[[], None]], Iterator[tuple[int, Any]]]
+"""Does jobs: :func:`cz_gym.evaluation.cluster.in_processes` or :func:`cz_gym.evaluation.cluster.completed`."""
+
+
+def train_seed(job: Job) -> dict[str, float]:
+    """Train a seed to its end, from its checkpoint if there is one; the contents of ``summary.json``."""
+    with locked(job.folder, LOST), tqdm(disable=True) as bar:
+        if summary := job.summary:
+            return summary
+        sys.argv = list(job.command)
+        run = Run(job.folder, job.recipe, job.seed, job.controllers, job.begun, job.checkpoint_seconds, job.plot)
+        run.learn(bar)
+        return run.finish()
+
+
+def train_seeds(jobs: Sequence[Job], perform: Perform, bar: Any) -> Iterator[tuple[Job, dict[str, float]]]:
+    """Train what is not finished; each seed with its summary, as they come. ``bar`` is tqdm's and counts seeds."""
+
+    def look() -> None:
+        shares, told = zip(*map(_standing, jobs), strict=True)
+        bar.set_postfix_str("  ".join(told), refresh=False)
+        bar.update(sum(shares) - bar.n)
+
+    missing = []
+    for job in jobs:
+        if summary := job.summary:
+            yield job, summary
+        else:
+            missing.append(job)
+    for number, summary in perform(train_seed, missing, look):
+        yield missing[number], summary
+    look()
+
+
+def _standing(job: Job) -> tuple[float, str]:
+    """The share of a run that is done at its last validation [-], and what that found."""
+    rows = read_rows(job.folder / "progress.csv")
+    if not rows:
+        return 0.0, f"{job.seed}: 0%"
+    steps = float(rows[-1]["steps"])
+    share = min(steps / getattr(job.recipe, "steps", steps), 1.0)
+    return share, f"{job.seed}: {share:.0%} {float(rows[-1]['validation_rmse_mm']):.3f} mm"

@@ -1,0 +1,222 @@
+"""``train.py --seeds``: seeds side by side come out as one by one, and nothing is lost or done twice."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tqdm import tqdm
+
+import train
+from cz_gym.agents.training import fleet, run
+from cz_gym.agents.training.recipes import PPO, RECIPES, Recipe
+from cz_gym.atomic_files import locked
+from cz_gym.baselines.registry import make_controller
+from cz_gym.evaluation import cluster
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from tests.small_learners import SMALL_IMITATION, train_held_seed, train_small_seed
+
+SMALL_PPO = PPO(steps=4096, num_envs=64, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,), control_interval=30.0)
+
+
+def in_turn(
+    function: Callable[[Any], Any], tasks: Sequence[Any], look: Callable[[], None]
+) -> Iterator[tuple[int, Any]]:
+    for number, task in enumerate(tasks):
+        yield number, function(task)
+        look()
+
+
+@pytest.fixture(autouse=True)
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few validation episodes, in this process."""
+    monkeypatch.setattr(run, "PICKING", VALIDATION_SEEDS[:2])
+    monkeypatch.setattr(run, "JUDGING", VALIDATION_SEEDS[2:4])
+
+
+@pytest.fixture
+def trained(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Small runs in this process; the seeds that were trained, in turn."""
+    seeds: list[int] = []
+
+    def counted(job: fleet.Job) -> Any:
+        seeds.append(job.seed)
+        return train_small_seed(job)
+
+    monkeypatch.setattr(fleet, "train_seed", counted)
+    monkeypatch.setattr(cluster, "in_processes", in_turn)
+    monkeypatch.setitem(RECIPES, "imitation", SMALL_IMITATION)
+    monkeypatch.setitem(RECIPES, "ppo", SMALL_PPO)
+    return seeds
+
+
+def agents(folder: Path) -> dict[str, bytes]:
+    return {path.parent.name: path.read_bytes() for path in sorted(folder.glob("*/agent.onnx"))}
+
+
+def sessions(folder: Path) -> list[int]:
+    """How often each seed's run was begun or resumed."""
+    every = (json.loads(path.read_text()) for path in sorted(folder.glob("*/settings.json")))
+    return [len(each["sessions"]) for each in every]
+
+
+def jobs(folder: Path, seeds: range, recipe: Recipe = SMALL_IMITATION) -> list[fleet.Job]:
+    options = make_controller, 0.0, False, ["train.py", "--seeds"]
+    return [fleet.Job(folder / f"seed{seed}", recipe, seed, *options) for seed in seeds]
+
+
+def is_free(folder: Path) -> bool:
+    try:
+        with locked(folder):
+            return True
+    except ValueError:
+        return False
+
+
+def done(some: list[fleet.Job], perform: fleet.Perform) -> list[int]:
+    """Seeds in the order they were finished; the bar has counted them all."""
+    with tqdm(total=len(some), file=io.StringIO()) as bar:
+        seeds = [job.seed for job, _ in fleet.train_seeds(some, perform, bar)]
+        assert bar.n == pytest.approx(len(some))
+    return seeds
+
+
+def test_seeds_come_out_as_one_by_one_and_only_once(
+    trained: list[int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    several, one = tmp_path / "several", tmp_path / "one"
+    assert train.main(["--algo", "imitation", "--seeds", "3-4", "--out", str(several)]) == 0
+    assert "seed 4: best agent on 2 validation episodes" in capsys.readouterr().out
+    assert train.main(["--algo", "imitation", "--seed", "4", "--out", str(one)]) == 0
+    found = agents(several)
+    assert list(found) == ["seed3", "seed4"]
+    assert found["seed4"] == (one / "agent.onnx").read_bytes() != found["seed3"]
+    assert train.main(["--resume", "--seeds", "2-4", "--out", str(several)]) == 0, "the folder knows the recipe"
+    assert trained == [3, 4, 2]
+    assert sessions(several) == [1, 1, 1]
+    assert train.main(["--seeds", "4-5", "--out", str(several)]) == 2
+    assert "seed4 holds a run already" in capsys.readouterr().err
+    assert train.main(["--resume", "--seeds", "4-5", "--scenario", "hard", "--out", str(several)]) == 2
+    assert "begun with another settings" in capsys.readouterr().err
+
+
+def test_an_unfinished_seed_goes_on_and_longer_runs_do_too(
+    trained: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finish = run.Run.finish
+
+    def killed(self: run.Run) -> Any:
+        if self.seed == 1:
+            raise ValueError("killed")
+        return finish(self)
+
+    command = ["--algo", "ppo", "--seeds", "0-1", "--out", str(tmp_path)]
+    with monkeypatch.context() as patch:
+        patch.setattr(run.Run, "finish", killed)
+        assert train.main(command) == 2
+    assert not (tmp_path / "seed1" / "summary.json").exists()
+    assert train.main([*command, "--resume"]) == 0
+    assert trained == [0, 1, 1]
+    assert sessions(tmp_path) == [1, 2]
+    assert json.loads((tmp_path / "seed1" / "settings.json").read_text())["sessions"][1]["from_step"] == 4096
+    assert train.main([*command, "--resume", "--steps", "6144"]) == 0
+    assert trained == [0, 1, 1, 0, 1]
+
+
+def test_a_task_that_runs_again_after_its_end_does_nothing(tmp_path: Path, trained: list[int]) -> None:
+    (job,) = jobs(tmp_path, range(1))
+    first = fleet.train_seed(job)
+    assert fleet.train_seed(job) == first
+    assert sessions(tmp_path) == [1]
+
+
+def test_a_folder_in_use_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], trained: list[int]) -> None:
+    with locked(tmp_path / "seed1"):
+        assert train.main(["--algo", "imitation", "--seeds", "0-1", "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err == f"train.py: {tmp_path}/seed1: another process is at work in this folder\n"
+    assert not trained
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--seeds", "3"], "must be FIRST-LAST"),
+        (["--seeds", "9-0"], "must be FIRST-LAST"),
+        (["--seeds", "0-99999999999"], "at most 1000 seeds"),
+        (["--seeds", "0-1", "--seed", "0"], "not allowed with"),
+        (["--ray"], "--ray needs --seeds"),
+    ],
+)
+def test_impossible_arguments_exit_with_2(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        train.main(arguments)
+    assert caught.value.code == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_without_ray_the_extra_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], trained: list[int]
+) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    assert train.main(["--algo", "imitation", "--seeds", "0-1", "--ray", "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err == 'train.py: ray is missing: pip install ".[ray]"\n'
+    assert not trained
+
+
+def test_a_node_that_does_not_see_the_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "_answers", lambda *question: [("10.0.0.1", True), ("10.0.0.2", False)])
+    with pytest.raises(ValueError, match=r"^node 10\.0\.0\.2 does not see .*: it must be on a file system that all"):
+        cluster.check_shared(tmp_path)
+
+
+@pytest.mark.slow
+def test_processes_train_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fleet, "train_seed", train_small_seed)
+    assert sorted(done(jobs(tmp_path / "there", range(3)), cluster.in_processes)) == [0, 1, 2]
+    assert done(jobs(tmp_path / "here", range(3)), in_turn) == [0, 1, 2]
+    assert agents(tmp_path / "there") == agents(tmp_path / "here")
+
+
+@pytest.mark.slow
+def test_a_killed_process_is_one_line() -> None:
+    with pytest.raises(ValueError, match="a process was killed"):
+        list(cluster.in_processes(os._exit, [1]))
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_a_lost_node_loses_nothing(nodes: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, second = nodes
+    there, lost = jobs(tmp_path / "there", range(3)), []
+    cluster.check_shared(tmp_path)
+
+    def losing(function: Any, tasks: Any, look: Callable[[], None]) -> Any:
+        def watch() -> None:
+            look()
+            begun = [job.folder for job in there if job.begun]
+            if len(begun) == 2 and not lost:
+                lost.append(second)
+                made.remove_node(second, allow_graceful=False)
+            elif lost and any(map(is_free, begun)):
+                (tmp_path / "there" / "go").touch()
+
+        return cluster.completed(function, tasks, watch)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fleet, "train_seed", train_held_seed)
+        assert sorted(done(there, losing)) == [0, 1, 2]
+    assert lost
+    monkeypatch.setattr(fleet, "train_seed", train_small_seed)
+    assert sorted(sessions(tmp_path / "there")) == [1, 1, 2], "one seed was resumed, none trained twice"
+    assert done(jobs(tmp_path / "here", range(3)), in_turn) == [0, 1, 2]
+    assert agents(tmp_path / "there") == agents(tmp_path / "here")
