@@ -12,8 +12,9 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from importlib.util import find_spec
-from multiprocessing import active_children, get_context
+from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import cz_gym
@@ -140,10 +141,8 @@ def in_processes(
 ) -> Iterator[tuple[int, Any]]:
     """As :func:`completed`, in so many processes of this machine (None: one a processor), which end with the caller."""
     processes = max(min(processes or os.cpu_count() or 1, len(tasks)), 1)
-    # Forking would copy the threads of torch and of the native batch in unknown states; Ctrl-C is the caller's.
-    with ProcessPoolExecutor(
-        processes, get_context("spawn"), initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_IGN)
-    ) as pool:
+    # Forking would copy the threads of torch and of the native batch in unknown states.
+    with ProcessPoolExecutor(processes, get_context("spawn"), initializer=_end_with_caller) as pool:
         numbers = {pool.submit(function, task): number for number, task in enumerate(tasks)}
         try:
             while numbers:
@@ -157,3 +156,15 @@ def in_processes(
             if numbers:
                 for process in active_children():
                     process.terminate()
+
+
+def _end_with_caller() -> None:
+    """In a process of :func:`in_processes`: leave Ctrl-C to the caller, and end when it does, even if it is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    caller: Any = parent_process()
+
+    def follow() -> None:
+        caller.join()
+        os._exit(1)
+
+    Thread(target=follow, daemon=True).start()

@@ -86,6 +86,7 @@ def pareto(scenarios: Sequence[ScenarioResult], style: Mapping[str, Style]) -> b
     figure = canvas(4.4 * min(len(scenarios), 2) + 0.8, 2.9 * -(-len(scenarios) // 2) + 1.0)
     moving = [outcome.means[PULL_STEP.metric].mean for scenario in scenarios for outcome in scenario.outcomes]
     floor = min((value for value in moving if value > 0.0), default=1.0) / 3.0
+    drawn: set[str] = set()
     for axis, scenario in _axes(figure, scenarios, (PULL_STEP.heading, "RMSE of the radius [mm]")):
         axis.set_yscale("log")
         axis.tick_params(which="both", labelleft=True)
@@ -94,13 +95,24 @@ def pareto(scenarios: Sequence[ScenarioResult], style: Mapping[str, Style]) -> b
         far = [outcome for outcome in scenario.outcomes if outcome.means[RMSE.metric].mean > most]
         for outcome in scenario.outcomes:
             if outcome not in far:
+                drawn.add(outcome.controller.name)
                 _point(axis, outcome, style[outcome.controller.name], floor)
         axis.set_title(scenario.row.name, fontsize=9.5)
         if far:
             above = f"more than {FAR} times the least error: " + ", ".join(each.controller.name for each in far)
-            axis.text(0.5, 0.995, fill(above, 64), transform=axis.transAxes, va="top", ha="center", fontsize=7)
+            axis.text(
+                0.5,
+                0.995,
+                fill(above, 64, break_on_hyphens=False),
+                transform=axis.transAxes,
+                va="top",
+                ha="center",
+                fontsize=7,
+            )
     handles = [
-        Line2D([], [], ls="none", marker=one.marker, color=one.colour, ms=7, label=name) for name, one in style.items()
+        Line2D([], [], ls="none", marker=one.marker, color=one.colour, ms=7, label=name)
+        for name, one in style.items()
+        if name in drawn
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 5), frameon=False)
     figure.suptitle("Error against pull activity: lower left is better, bars are 95 % intervals", fontsize=11)

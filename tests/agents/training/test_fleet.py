@@ -5,7 +5,10 @@ from __future__ import annotations
 import io
 import json
 import os
+import signal
+import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,7 @@ from cz_gym.evaluation import cluster
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from tests.small_learners import SMALL_IMITATION, train_held_seed, train_small_seed
 
+ROOT = Path(__file__).parents[3]
 SMALL_PPO = PPO(steps=4096, num_envs=64, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,), control_interval=30.0)
 
 
@@ -191,6 +195,25 @@ def test_processes_train_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_a_killed_process_is_one_line() -> None:
     with pytest.raises(ValueError, match="a process was killed"):
         list(cluster.in_processes(os._exit, [1]))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="signals as POSIX has them")
+def test_processes_end_with_a_killed_caller() -> None:
+    code = "from cz_gym.evaluation.cluster import in_processes; from tests.small_learners import tell_and_wait"
+    main = 'if __name__ == "__main__": list(in_processes(tell_and_wait, [0]))'
+    with subprocess.Popen([sys.executable, "-c", f"{code}\n{main}"], cwd=ROOT, stdout=subprocess.PIPE) as caller:
+        assert caller.stdout is not None
+        worker = int(caller.stdout.readline())
+        caller.kill()
+    for _ in range(600):
+        try:
+            os.kill(worker, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.1)
+    os.kill(worker, signal.SIGKILL)
+    pytest.fail("a process outlived its caller")
 
 
 @pytest.mark.slow
