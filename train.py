@@ -50,6 +50,9 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         type=_whole(1),
         help="environment steps of learning from reward (default: the recipe's, or the resumed run's)",
     )
+    parser.add_argument(
+        "--from", dest="start", metavar="FILE", help="agent file of the recipe gradient that --algo ppo goes on from"
+    )
     parser.add_argument("--scenario", help="scenario to train on (default: the recipe's, or the resumed run's)")
     parser.add_argument(
         "--out",
@@ -70,6 +73,10 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     arguments = parser.parse_args(argv)
     if arguments.ray is not None and not arguments.seeds:
         parser.error("--ray needs --seeds")
+    if arguments.start and arguments.algo == "ppo":
+        arguments.algo = "ppo-after-gradient"
+    if bool(arguments.start) != (arguments.algo == "ppo-after-gradient") and not arguments.resume:
+        parser.error("--from FILE goes with --algo ppo: PPO goes on from an agent of the recipe gradient")
     one = "" if arguments.seeds else f"-seed{arguments.seed or 0}"
     arguments.out = arguments.out or Path("runs") / f"{arguments.algo or DEFAULT}{one}"
     return arguments
@@ -177,7 +184,13 @@ def _take_up(arguments: argparse.Namespace, folders: list[Path]) -> int | None:
     saved = read_settings((begun or folders)[0] / "settings.json") if arguments.resume else {}
     settings = saved.get("settings")
     scenario = settings.get("scenario") if isinstance(settings, dict) else None
-    said = {"algo": (saved.get("algorithm"), DEFAULT), "seed": (saved.get("seed"), 0), "scenario": (scenario, "")}
+    start = settings.get("start") if isinstance(settings, dict) else None
+    said = {
+        "algo": (saved.get("algorithm"), DEFAULT),
+        "seed": (saved.get("seed"), 0),
+        "scenario": (scenario, ""),
+        "start": (start, ""),
+    }
     for name, (value, default) in said.items():
         if getattr(arguments, name) is None:
             setattr(arguments, name, value if isinstance(value, type(default)) else default)
@@ -188,10 +201,12 @@ def _take_up(arguments: argparse.Namespace, folders: list[Path]) -> int | None:
 
 def _asked_for(recipe: Recipe, arguments: argparse.Namespace, saved_steps: int | None) -> Recipe:
     """The recipe with the scenario and the steps that the command line, or the resumed run, asks for."""
-    from cz_gym.agents.training.recipes import Rewarded
+    from cz_gym.agents.training.recipes import Refinement, Rewarded
     from cz_gym.episodes.scenarios import find_scenario
 
     recipe = replace(recipe, scenario=find_scenario(arguments.scenario or recipe.scenario).name)
+    if isinstance(recipe, Refinement):
+        recipe = replace(recipe, start=str(Path(arguments.start).resolve()))
     if isinstance(recipe, Rewarded):
         return replace(recipe, steps=arguments.steps or saved_steps or recipe.steps)
     if arguments.steps:

@@ -37,6 +37,8 @@ class OnnxGraph:
     def __init__(self) -> None:
         self._nodes: list[Any] = []
         self._constants: list[Any] = []
+        self.tensors: dict[str, torch.Tensor] = {}
+        """The tensors that its constants were made of, by the constants' names."""
 
     def unused(self, kind: str) -> str:
         """A name that nothing in the graph has yet."""
@@ -44,7 +46,9 @@ class OnnxGraph:
 
     def constant(self, name: str, value: Any) -> str:
         """A weight, of a tensor or of numbers; its name."""
-        array = value.detach().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
+        if isinstance(value, torch.Tensor):
+            self.tensors[name] = value = value.detach()
+        array = np.asarray(value)
         self._constants.append(numpy_helper.from_array(array, name))
         return name
 

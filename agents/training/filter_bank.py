@@ -10,7 +10,9 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import onnx
 import torch
+from onnx import numpy_helper
 from torch import nn
 
 from cz_gym.observation import MEASURED
@@ -169,11 +171,23 @@ class FilterBank(nn.Module):
 
     def onnx(self) -> bytes:
         """The same as an agent's graph."""
+        return self._graph()[1]
+
+    def load(self, content: bytes) -> None:
+        """Take the weights of an agent's graph that :meth:`onnx` wrote; ValueError if it is of another network."""
+        own = self._graph()[0].tensors
+        found = {each.name: each for each in onnx.load_from_string(content).graph.initializer}
+        if any(name not in found or list(each.shape) != list(found[name].dims) for name, each in own.items()):
+            raise ValueError("not an agent of the recipe gradient")
+        for name, tensor in own.items():
+            tensor.copy_(torch.from_numpy(numpy_helper.to_array(found[name]).copy()))
+
+    def _graph(self) -> tuple[OnnxGraph, bytes]:
         graph = OnnxGraph()
         action, after = self.forward(Value(graph, "observation"), Value(graph, "state"))
         graph.clip(action.name, -1.0, 1.0, "action")
         graph.node("Identity", [after.name], "next_state")
-        return graph.finished(len(MEASURED), state=STATE)
+        return graph, graph.finished(len(MEASURED), state=STATE)
 
 
 def _filters(interval: float) -> tuple[Any, Any, Any]:

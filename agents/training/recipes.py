@@ -166,6 +166,21 @@ class PPO(OnPolicy):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Refinement(PPO):
+    """Proximal policy optimisation that goes on from an agent of the recipe ``gradient``."""
+
+    name: str = "ppo-after-gradient"
+    start: str = ""
+    """Path of that agent's file."""
+    observation: str = "measured"
+    action: str = "rate"
+    steps: int = 3_000_000
+    learning_rate: float = 1e-4
+    noise: float = 0.1
+    """Spread of the exploration at the start, in outputs of the network before its gains [-]."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class RecurrentPPO(OnPolicy):
     """Proximal policy optimisation of a network that remembers (an LSTM), from nothing."""
 
@@ -231,11 +246,14 @@ class RandomSearch(Reinforcement):
 
 LQG_COST = CostWeights(pull=0.11, pull_step=0.049, heater_step=23.4)
 """The cost that the regulator of lqg-at-0.02 was made for, as multiples of the environment's."""
+GRADIENT_COST = replace(LQG_COST, pull_step=0.07)
+"""The cost that the recipe gradient follows: calmer."""
 RECIPES: dict[str, Recipe] = {
     recipe.name: recipe
     for recipe in (
-        Gradient(weights=replace(LQG_COST, pull_step=0.07)),
+        Gradient(weights=GRADIENT_COST),
         PPO(),
+        Refinement(weights=GRADIENT_COST),
         RecurrentPPO(),
         SAC(),
         RandomSearch(),

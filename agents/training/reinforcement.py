@@ -24,7 +24,8 @@ from .callbacks import Statistics, Watching
 from .export import actor_of, actor_onnx
 from .learner import Parts, Watch
 from .networks import AsymmetricPolicy, Normalise
-from .recipes import OWN_WEIGHTS, PPO, SAC, RandomSearch, RecurrentPPO, Reinforcement
+from .recipes import OWN_WEIGHTS, PPO, SAC, RandomSearch, RecurrentPPO, Refinement, Reinforcement
+from .refinement import BankPolicy, Remembering, read_bank
 from .vec_env import CzVecEnv
 from .wrappers import Held, TrainingReward
 
@@ -46,6 +47,7 @@ class SoftActorCritic(stable_baselines3.SAC):
 
 KINDS: dict[type[Reinforcement], tuple[Any, Any]] = {
     PPO: (stable_baselines3.PPO, AsymmetricPolicy),
+    Refinement: (stable_baselines3.PPO, BankPolicy),
     RecurrentPPO: (RecurrentPPOAlgorithm, "MlpLstmPolicy"),
     SAC: (SoftActorCritic, "MlpPolicy"),
     RandomSearch: (random_search.RandomSearch, random_search.WhitenedLinearPolicy),
@@ -89,7 +91,8 @@ class Reinforced:
 
     def exported(self) -> bytes:
         """The deterministic actor."""
-        return actor_onnx(actor_of(self.algorithm.policy))
+        policy = self.algorithm.policy
+        return policy.bank.onnx() if isinstance(policy, BankPolicy) else actor_onnx(actor_of(policy))
 
 
 def make_slots(recipe: Reinforcement, seed: int, done: int) -> CzVecEnv:
@@ -97,7 +100,7 @@ def make_slots(recipe: Reinforcement, seed: int, done: int) -> CzVecEnv:
     env = CzVectorEnv(
         recipe.num_envs,
         scenario=recipe.scenario,
-        observation=recipe.observation,
+        observation="history" if isinstance(recipe, Refinement) else recipe.observation,
         action=recipe.action,
         control_interval=recipe.control_interval,
         horizon=recipe.length,
@@ -112,11 +115,16 @@ def make_algorithm(recipe: Reinforcement, slots: CzVecEnv, seed: int) -> BaseAlg
     torch.manual_seed(seed)
     env: Any = TrainingReward(slots, recipe.gamma, recipe.weights, recipe.failure_costs)
     env = Held(env, recipe.held) if isinstance(recipe, SAC) else env
+    if isinstance(recipe, Refinement):
+        bank = read_bank(recipe)
+        env, options = Remembering(env, bank), {"bank": bank, "hidden": recipe.hidden, "noise": recipe.noise}
+    else:
+        options = _network(recipe)
     algorithm, policy = KINDS[type(recipe)]
     known = inspect.signature(algorithm).parameters
     settings = {name: value for name, value in asdict(recipe).items() if name in known}
     settings["learning_rate"] = linear(recipe.learning_rate, recipe.learning_rate / 20.0)
-    made: BaseAlgorithm = algorithm(policy, env, policy_kwargs=_network(recipe), seed=seed, device="cpu", **settings)
+    made: BaseAlgorithm = algorithm(policy, env, policy_kwargs=options, seed=seed, device="cpu", **settings)
     if isinstance(made, SoftActorCritic) and isinstance(recipe, SAC):
         made.begin_with(recipe.noise)
     return made

@@ -30,9 +30,10 @@ class Value:
     def _name_of(self, other: Any) -> str:
         if isinstance(other, Value):
             return other.name
-        array = other.detach().numpy() if isinstance(other, torch.Tensor) else np.array(other)
-        array = array if array.dtype.kind == "i" else array.astype(np.float32)
-        return self.graph.constant(self.graph.unused("weight"), array)
+        if not isinstance(other, torch.Tensor):
+            other = np.array(other)
+            other = other if other.dtype.kind == "i" else other.astype(np.float32)
+        return self.graph.constant(self.graph.unused("weight"), other)
 
     def __add__(self, other: Any) -> Value:
         return self.node("Add", other)
