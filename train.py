@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import shlex
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -85,9 +86,15 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
 def main(argv: list[str] | None = None) -> int:
     """Train; 0 when done, 2 for bad input, 130 when interrupted."""
     arguments = parse(argv)
-    left = f"if {arguments.out} holds a checkpoint, --resume goes on"
+    left = f"if {arguments.out} holds a checkpoint, {_resume(arguments)} goes on"
     extras = "agents,benchmark" if arguments.plot else "agents"
     return guarded("train.py", lambda: train(arguments), extras, left)
+
+
+def _resume(arguments: argparse.Namespace) -> str:
+    """The command that goes on with a run: the folder knows its algorithm, seed and steps."""
+    seeds = arguments.seeds and f" --seeds {arguments.seeds[0]}-{arguments.seeds[-1]}"
+    return f"python train.py --resume --out {shlex.quote(str(arguments.out))}{seeds or ''}"
 
 
 def train(arguments: argparse.Namespace) -> int:
@@ -126,7 +133,7 @@ def train(arguments: argparse.Namespace) -> int:
             except KeyboardInterrupt:
                 run.save()
                 bar.close()
-                print(f"train.py: interrupted; checkpoint saved, --resume --out {folder} goes on", file=sys.stderr)
+                print(f"train.py: interrupted; checkpoint saved, {_resume(arguments)} goes on", file=sys.stderr)
                 return 130
         summary = run.finish()
     print(_said(summary))

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from cz_gym.agents.agent_file.contract import AgentFileError, Contract, read_agent
 from cz_gym.agents.policies.onnx import OnnxPolicy
-from cz_gym.config import Config
+from cz_gym.config import Config, check_config
 from cz_gym.names import unknown
 
 __all__ = ["AgentFileError", "Contract", "OnnxPolicy", "load", "shipped", "shipped_seeds"]
@@ -28,6 +28,8 @@ def load(name: str | Path = DEFAULT, config: Config | None = None) -> OnnxPolicy
     With a config, it must have been trained on the same nominal plant. AgentFileError says in one line why an agent
     cannot be had, or names what there is.
     """
+    if config is not None:
+        check_config(config)
     return OnnxPolicy.load(name if Path(name).suffix == ".onnx" else shipped(str(name)), config)
 
 

@@ -41,6 +41,8 @@ ALGORITHMS = {
     "trpo": "sb3_contrib.TRPO",
 }
 """RL-Zoo's names and what they stand for."""
+VALID = "valid"
+"""The camera's flag among the channels."""
 SAMPLES, SLOTS = 50, 8
 """Samples of as many pullers on which file and model must agree."""
 TOLERANCE = 1e-3
@@ -59,10 +61,12 @@ def save_agent(
 
     ``normalisation`` is what its observations went through, ``config`` the settings of the environment it was trained
     in, ``seed`` its training seed: by default the model's own. Raises AgentFileError for a model that cannot be
-    written, among them any whose file does not act as it does.
+    written, among them any whose file does not act as it does, and one whose last observations in training were
+    normalised while no ``normalisation`` is given.
     """
     normalisation, config = normalisation or model.get_vec_normalize_env(), config or _config_of(model)
     _check_spaces(model, config)
+    _check_normalisation(model, normalisation, config.observation)
     content = to_onnx(model, normalisation, config.observation)
     facts = {
         **facts_of(config),
@@ -142,6 +146,22 @@ def _check_spaces(model: BaseAlgorithm, config: Config) -> None:
         raise AgentFileError(
             f"the model reads an observation of shape {shapes[0]} and gives an action of shape {shapes[1]}; "
             f"with observation {config.observation!r} they are {wanted[0]} and {wanted[1]}"
+        )
+
+
+def _check_normalisation(model: BaseAlgorithm, normalisation: VecNormalize | None, observation: str) -> None:
+    """AgentFileError if what the model saw last, which its file keeps, was normalised and nothing is here to do so.
+
+    The camera's flag tells: it is 0 or 1, and nothing else once it is normalised.
+    """
+    names = [channel.name for channel in OBSERVATIONS[observation]]
+    seen = getattr(model, "_last_obs", None)
+    if normalisation is not None or seen is None or VALID not in names:
+        return
+    if not np.isin(seen[:, names.index(VALID)], (0.0, 1.0)).all():
+        raise AgentFileError(
+            "the model was trained on normalised observations: give the VecNormalize it was trained in "
+            "(save_agent's normalisation, --vecnormalize of the command)"
         )
 
 

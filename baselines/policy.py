@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.config import positive
 from cz_gym.observation import HEATER_SCALE, Measured, decode
 
 Floats = npt.NDArray[np.float64]
@@ -38,8 +39,20 @@ class MeasuredController(ABC):
     """A controller that reads "measured" (or "history") observations.
 
     A subclass works in SI units on a batch of n crystals: it says what it remembers at first, and what it does with a
-    sample. Its memory is a tuple of arrays with a leading axis n, or a tuple of such tuples.
+    sample. Its memory is a tuple of arrays with a leading axis n, or a tuple of such tuples. ValueError for a
+    ``control_interval`` [s] that is not positive.
     """
+
+    action: ClassVar[str] = "direct"
+    """What its actions mean."""
+
+    def __post_init__(self) -> None:
+        positive("control_interval", self.control_interval)
+
+    @property
+    @abstractmethod
+    def control_interval(self) -> float:
+        """Time between actions that it is made for [s]."""
 
     @property
     @abstractmethod

@@ -13,7 +13,7 @@ from cz_gym.baselines.lqg.controller import LQG
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
 from cz_gym.baselines.pid.open_loop import OpenLoop
 from cz_gym.baselines.pid.settings import tuned
-from cz_gym.config import Config
+from cz_gym.config import Config, check_config
 from cz_gym.names import unknown
 
 from .policy import Policy
@@ -116,4 +116,4 @@ def find_controller(name: str) -> Entry:
 
 def make_controller(name: str, config: Config) -> Policy:
     """The controller of that name for an environment's settings; ValueError names what there is."""
-    return find_controller(name).make(config)
+    return find_controller(name).make(check_config(config))

@@ -138,8 +138,8 @@ def make_config(
         raise ValueError(unknown("action", action, ACTIONS))
     if camera is not None and observation != CAMERA:
         raise ValueError(f'a camera is of use with observation="camera" only, not with {observation!r}')
-    interval = _positive("control_interval", control_interval)
-    length = _positive("horizon", horizon)
+    interval = positive("control_interval", control_interval)
+    length = positive("horizon", horizon)
     steps = length / interval
     if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:
         raise ValueError(f"horizon {horizon} s must be a whole number of control intervals of {control_interval} s")
@@ -159,7 +159,8 @@ def _name(meniscus: MeniscusModel) -> str:
     return " ".join([meniscus.name, *names])
 
 
-def _positive(name: str, value: float) -> float:
+def positive(name: str, value: float) -> float:
+    """The value as a float; ValueError unless it is a positive, finite number [s]."""
     number = isinstance(value, Real) and not isinstance(value, bool)
     if not number or not math.isfinite(value) or value <= 0:
         raise ValueError(f"{name} must be a positive number of seconds, not {value!r}")

@@ -52,6 +52,11 @@ class EkfMpc(MeasuredController):
         casadi()
 
     @property
+    def control_interval(self) -> float:
+        """Time between actions [s]."""
+        return self.lqg.control_interval
+
+    @property
     def v_0(self) -> float:
         """Nominal pull speed [m/s]."""
         return self.lqg.v_0

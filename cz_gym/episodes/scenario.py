@@ -214,10 +214,12 @@ class Scenario:
         )
         need(0.0 <= self.sensor.latency <= MAX_LATENCY, f"sensor.latency must lie in [0, {MAX_LATENCY}] s")
         need(min(vars(self.actuators).values()) >= 0, "actuator limits must not be negative")
-        for name in ("camera_noise", "bias_offset", "level_offset", "ripple", "outlier_sd"):
-            value = getattr(self.sensor, name)
-            length = max(map(abs, value if isinstance(value, tuple) else (value,)))
-            need(length <= MAX_LENGTH, f"sensor.{name} of {length:g} m is more than {MAX_LENGTH:g} m: is it in metres?")
+        for family, names in _LENGTHS.items():
+            for name in names:
+                value = getattr(getattr(self, family), name)
+                length = max(map(abs, value if isinstance(value, tuple) else (value,)))
+                said = f"{family}.{name} of {length:g} m is more than {MAX_LENGTH:g} m: is it in metres?"
+                need(length <= MAX_LENGTH, said)
         for family, names in _NOT_NEGATIVE.items():
             for name in names:
                 value = getattr(getattr(self, family), name)
@@ -253,6 +255,12 @@ _FAMILIES: dict[str, type[Any]] = {
     "sensor": Sensor,
     "faults": Faults,
     "actuators": Actuators,
+}
+_LENGTHS = {
+    "pullers": ("start_radius_sd",),
+    "reference": ("amount",),
+    "sensor": ("camera_noise", "bias_offset", "level_offset", "ripple", "outlier_sd"),
+    "faults": ("bias_drift",),
 }
 _NOT_NEGATIVE = {
     "pullers": ("start_radius_sd",),

@@ -69,7 +69,8 @@ def rollout(
 ) -> Rollout:
     """Run ``policy.predict`` on one episode a seed, all in one batch.
 
-    ValueError without a seed, and for a policy that was made for another control interval than the config's.
+    ValueError without a seed, and for a policy that was made for another control interval than the config's, or whose
+    attribute ``action`` names another kind of actions.
 
     ``progress`` is called with the number of steps done since its last call. A failed episode stops counting; its
     slot goes on with another crystal, which nothing reads. A bound with a method ``for_episodes(config, seeds)`` is
@@ -83,6 +84,12 @@ def rollout(
         raise ValueError(
             f"this {type(policy).__name__} was made for an action every {made_for:g} s, "
             f"the environment takes one every {config.control_interval:g} s"
+        )
+    acts = getattr(policy, "action", None)
+    if isinstance(acts, str) and acts != config.action:
+        raise ValueError(
+            f"this {type(policy).__name__} gives actions {acts!r}, the environment takes {config.action!r}: "
+            f"make_config(action={acts!r})"
         )
     before = time.perf_counter()
     if hasattr(policy, "for_episodes"):

@@ -23,6 +23,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 import cz_gym  # noqa: F401  (registers Cz-v0)
 from cz_gym.agents import AgentFileError, OnnxPolicy, from_sb3
+from cz_gym.config import make_config
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
 ROOT = Path(__file__).parents[2]
@@ -95,6 +96,23 @@ def test_the_command_reads_what_stable_baselines3_and_rl_zoo_save(
     assert (agent.contract.algorithm, agent.contract.training_seed, agent.contract.scenario) == ("zoo", 7, "hard")
     assert (agent.contract.action, agent.contract.control_interval) == ("smooth", 10.0)
     assert from_sb3.disagreement(agent, model, model.get_vec_normalize_env()) < 1e-4
+
+
+@pytest.mark.parametrize("kind", ["ppo", "sac"])
+def test_a_model_without_its_normalisation_is_refused(kind: str, tmp_path: Path) -> None:
+    """A model that was saved and loaded has no environment that could tell."""
+    algorithm = KINDS[kind][0]
+    for normalised in (True, False):
+        model = trained(kind, normalised)
+        model.save(tmp_path / "model.zip")
+        loaded = algorithm.load(tmp_path / "model.zip", device="cpu")
+        config = make_config(observation="history", action="smooth", control_interval=10.0)
+        if normalised:
+            with pytest.raises(AgentFileError, match=r"trained on normalised observations: .*--vecnormalize"):
+                from_sb3.save_agent(tmp_path / "mine.onnx", loaded, "mine", config=config)
+            from_sb3.save_agent(tmp_path / "mine.onnx", loaded, "mine", model.get_vec_normalize_env(), config)
+        else:
+            from_sb3.save_agent(tmp_path / "mine.onnx", loaded, "mine", config=config)
 
 
 class Own(BaseFeaturesExtractor):

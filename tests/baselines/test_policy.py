@@ -1,5 +1,7 @@
 """What every controller on "measured" observations has in common: batches, episodes that begin, memories, shapes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -56,3 +58,9 @@ def test_interval_and_pull_speed_are_the_environments(name):
     config = make_config("nominal", control_interval=2.0)
     policy = find_controller(name).make(config)
     assert (policy.control_interval, policy.v_0) == (2.0, config.parameters.v_0)
+    with pytest.raises(ValueError, match="control_interval must be a positive number of seconds, not 0"):
+        replace(policy, control_interval=0)
+
+
+def test_the_slow_one_has_an_interval_too():
+    assert make("ekf-mpc", "randomized").control_interval == 5.0

@@ -1,5 +1,6 @@
 """Rollouts against the scalar environment, step by step."""
 
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,9 @@ import pytest
 
 import cz_gym
 from cz_gym import CzEnv, CzVectorEnv
+from cz_gym.agents import load
 from cz_gym.baselines import CompensatedPID, OpenLoop
+from cz_gym.baselines.registry import make_controller
 from cz_gym.camera import Camera
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation import plot
@@ -138,6 +141,12 @@ class OnlyAnAction:
     [
         (CompensatedPID(control_interval=2.0), SHORT, "was made for an action every 2 s, the environment takes one"),
         (OnlyAnAction(), SHORT, r"predict must return a tuple \(action, state\), not ndarray"),
+        (CompensatedPID(), make_config(action="smooth"), r"gives actions 'direct', the environment takes 'smooth'"),
+        (
+            load("gradient"),
+            SHORT,
+            r"gives actions 'rate', the environment takes 'direct': make_config\(action='rate'\)",
+        ),
         (OpenLoop(), "randomized", r"needs a config, as make_config\('randomized'\) makes one"),
     ],
 )
@@ -146,7 +155,10 @@ def test_silent_traps_speak(policy: Any, config: Any, message: str) -> None:
         rollout(policy, config, [1])
 
 
-@pytest.mark.parametrize("make", [CzEnv.from_config, CzVectorEnv.from_config])
+@pytest.mark.parametrize(
+    "make",
+    [CzEnv.from_config, CzVectorEnv.from_config, partial(make_controller, "paper"), partial(load, "ppo")],
+)
 def test_a_name_is_no_config(make: Any) -> None:
     with pytest.raises(ValueError, match=r"needs a config, as make_config\('hard'\) makes one"):
         make("hard")

@@ -102,7 +102,7 @@ def test_an_interrupted_run_keeps_its_checkpoint(
     folder = tmp_path / "run"
     assert train.main(["--steps", "10000", "--out", str(folder)]) == 130
     assert (folder / "checkpoint.safetensors").exists()
-    assert "--resume" in capsys.readouterr().err
+    assert f"saved, python train.py --resume --out {folder} goes on" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("quick")
@@ -156,8 +156,16 @@ def test_interrupting_before_learning_gives_one_line(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(train, "train", interrupt)
-    assert train.main(["--out", str(tmp_path / "run")]) == 130
-    assert capsys.readouterr().err.count("\n") == 1
+    monkeypatch.chdir(tmp_path)
+    for given, resumes in (
+        (["--algo", "ppo", "--seed", "3"], "--out runs/ppo-seed3"),
+        (["--algo", "ppo", "--seeds", "1-3"], "--out runs/ppo --seeds 1-3"),
+        (["--out", "two words"], "--out 'two words'"),
+    ):
+        assert train.main(given) == 130
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        assert f"python train.py --resume {resumes} goes on" in said
 
 
 @pytest.mark.parametrize(
