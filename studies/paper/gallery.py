@@ -6,6 +6,7 @@ import io
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from textwrap import fill
 from typing import NamedTuple
 
 from matplotlib.figure import Figure
@@ -32,7 +33,9 @@ class Shown(NamedTuple):
         if self.draw is None:
             return (DIAGRAMS / self.file).read_bytes()
         image = io.BytesIO()
-        self.draw().savefig(image, dpi=DPI, format="png")
+        figure = self.draw()
+        figure.suptitle(fill(self.caption.removesuffix("."), round(13.0 * figure.get_figwidth())), fontsize=10)
+        figure.savefig(image, dpi=DPI, format="png")
         return small(image)
 
 

@@ -1,13 +1,16 @@
 """The figure of one crystal: who is shown when there are many, and a crystal that nothing disturbs."""
 
+import io
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
+from PIL import Image
 
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.protocol import find_row
+from cz_gym.evaluation.report.canvas import COLOURS, DPI, GREY, INK
 from cz_gym.evaluation.report.crystal import COLUMNS, chosen, heading
 from cz_gym.evaluation.report.figures import draw_figures
 from cz_gym.evaluation.results import Benchmark, Controller, Sample, summarise
@@ -31,11 +34,11 @@ def test_many_controllers_are_chosen_by_a_rule_and_the_rest_named() -> None:
     many.append(sample("ppo", 99.0, seeds=(0,)))
     shown = chosen(many)
     assert len(shown) == COLUMNS
-    assert [one.controller.name for one in shown] == ["paper", "c0", "c1", "c2", "c3", "ppo"]
+    assert [one.controller.name for one in shown] == ["paper", "c0", "c1", "ppo"]
     assert chosen(many[::-1]) == shown[::-1]
     outcomes = [SimpleNamespace(controller=one.controller) for one in many]
     text = heading(cast(Any, SimpleNamespace(row=find_row("hard"), outcomes=outcomes)), shown)
-    assert text.endswith("not shown: bound, c4, c5")
+    assert text.endswith("not shown: bound, c2, c3, c4, c5")
     two = [one for one in many if one.controller.name in ("bound", "ppo")]
     assert "\n" not in heading(cast(Any, SimpleNamespace(row=find_row("hard"), outcomes=outcomes[::8])), two)
 
@@ -44,7 +47,7 @@ def test_many_agents_leave_room_for_what_they_are_compared_with() -> None:
     agents = [sample(f"ppo-{i}", 9.0 - i, seeds=(0,)) for i in range(6)]
     others = [sample("paper", 99.0), sample("lqg", 1.0), sample("pid", 2.0)]
     shown = [one.controller.name for one in chosen([*others, *agents])]
-    assert shown == ["paper", "lqg", "pid", "ppo-3", "ppo-4", "ppo-5"]
+    assert shown == ["paper", "lqg", "ppo-4", "ppo-5"]
 
 
 def test_figures_of_a_crystal_that_nothing_disturbs_and_of_a_name_that_seems_a_formula() -> None:
@@ -52,7 +55,22 @@ def test_figures_of_a_crystal_that_nothing_disturbs_and_of_a_name_that_seems_a_f
     for name in ("nominal", "randomized"):
         row = find_row(name)
         run = rollout(Still(), make_config(name, horizon=600.0), row.seeds(2))
-        results.append(summarise(row, [Sample.of(Controller("a $\\frac$ b", "measured", "", (1,)), [run])]))
+        names = ["a $\\frac$ b", *(f"c{i}" for i in range(COLUMNS))]
+        results.append(summarise(row, [Sample.of(Controller(name, "measured", "", (1,)), [run]) for name in names]))
     figures = draw_figures(Benchmark(tuple(results), "", ()))
     assert set(figures) == {"crystal.png", "errors.png", "pareto.png"}
     assert all(image.startswith(b"\x89PNG") for image in figures.values())
+    inches = Image.open(io.BytesIO(figures["crystal.png"])).width / DPI
+    assert 830.0 / inches * 8.0 / 72.0 > 10.0, "8 point text is too small where a page shows the figure 830 pixels wide"
+
+
+def test_no_colour_of_a_controller_is_another_line_s_and_words_are_dark_enough() -> None:
+    assert len({*COLOURS, GREY, INK}) == len(COLOURS) + 2
+    assert contrast(INK) > 4.5
+
+
+def contrast(colour: str, with_white: float = 1.05) -> float:
+    """Contrast of a colour with white, as WCAG defines it."""
+    parts = [int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5)]
+    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+    return with_white / (0.05 + float(np.dot(linear, (0.2126, 0.7152, 0.0722))))

@@ -176,6 +176,9 @@ def test_lines_are_the_rollouts_to_half_a_resolution(made: Made) -> None:
         ring = "bright ring less radius"
         read = (signals.r_br_measured - signals.r_br) * 1e3
         np.testing.assert_allclose(found[ring, "camera"] - found[ring, "true"], read, atol=1e-3)
+        for title, power in (("pull speed", signals.v_p * 6e4), ("heater power", signals.Q_H / 1e3)):
+            mean = [power[max(k - 59, 0) : k + 1].mean() for k in range(len(power))]
+            np.testing.assert_allclose(found[title, "mean"], mean, rtol=0, atol=half[title])
         shared = unpack(told["packed"][-1], SHARED)
         for line, values in (
             (("crystal radius", "reference"), signals.r_ref * 1e3), (("heater temperature", "recipe"), signals.T_1_ref),

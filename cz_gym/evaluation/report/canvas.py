@@ -14,7 +14,7 @@ from cz_gym.evaluation.results import Controller
 
 COLOURS = (
     "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F5FB0", "#8C6D1F",
-    "#444444", "#A0A000", "#8B0000", "#005F5F", "#2A2AE0", "#999999", "#4B0055", "#5FBF3F",
+    "#444444", "#A0A000", "#8B0000", "#005F5F", "#2A2AE0", "#E0218A", "#4B0055", "#5FBF3F",
 )  # fmt: skip
 """Okabe and Ito's palette, safe for colour-blind readers, with more for a long table."""
 MARKERS = {

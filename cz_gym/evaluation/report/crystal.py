@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from textwrap import fill
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,8 +17,8 @@ from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 from .canvas import GREY, INK, Style, canvas, png
 
 Floats = npt.NDArray[np.float64]
-COLUMNS = 6
-"""Most controllers in the figure."""
+COLUMNS = 4
+"""Most controllers in the figure: with more, its words are too small where a page shows it 830 pixels wide."""
 LEARNED = 2
 """Most learned ones of them while there are others."""
 ROOM = (0.01 * MM, 3.0 * MM)
@@ -45,7 +46,7 @@ _PANELS = (
 def crystal(scenario: ScenarioResult, style: Mapping[str, Style]) -> bytes:
     """The first crystal of a scenario under each controller: radius, ring, pull, heater, melt against time."""
     samples = chosen([outcome.sample for outcome in scenario.outcomes])
-    figure = canvas(2.35 * len(samples) + 1.0, 8.6)
+    figure = canvas(1.9 * len(samples) + 1.0, 8.2)
     axes = figure.subplots(len(_PANELS), len(samples), sharex=True, sharey="row", squeeze=False)
     longest = max((sample.example for sample in samples), key=lambda signals: len(signals.r_c))
     for column, sample in enumerate(samples):
@@ -53,15 +54,16 @@ def crystal(scenario: ScenarioResult, style: Mapping[str, Style]) -> bytes:
     for row, panel in enumerate(_PANELS):
         axes[row, 0].set_ylabel(panel.label)
     _set_limits(axes, samples, longest)
-    figure.suptitle(heading(scenario, samples), fontsize=11)
+    width = round(13.0 * figure.get_figwidth())
+    figure.suptitle("\n".join(fill(line, width) for line in heading(scenario, samples).split("\n")), fontsize=9.5)
     lines: tuple[dict[str, Any], ...] = (
         {"color": INK, "lw": 1.2, "ls": "--", "label": "reference"},
         {"color": GREY, "lw": 1.2, "label": "what the camera reports"},
-        {"color": INK, "lw": 1.2, "label": "true value, in the controller's colour"},
+        {"color": INK, "lw": 1.2, "label": "true value"},
         {"color": INK, "lw": 1.6, "label": "5 min mean of a drive"},
     )
     handles = [Line2D([], [], **line) for line in lines]
-    columns = 2 if len(samples) < 3 else 4
+    columns = 2 if len(samples) < 4 else 4
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=8.5, frameon=False)
     return png(figure)
 
@@ -108,7 +110,7 @@ def _draw(axes: Any, sample: Sample, colour: str, reference: Floats) -> None:
         else:
             axis.plot(minutes, values, color=colour, lw=1.1)
     rmse = float(sample.metric("rmse_mm")[0, 0])
-    axes[0].set_title(f"{sample.controller.name}\nRMSE {rmse:.3g} mm", fontsize=9, color=colour, fontweight="bold")
+    axes[0].set_title(f"{sample.controller.name}\nRMSE {rmse:.3g} mm", fontsize=9, color=INK, fontweight="bold")
     axes[-1].set_xlabel("time [min]")
     if _failed(sample):
         for axis in axes:

@@ -81,7 +81,8 @@ def _spread(axis: Any, values: Floats, place: int, colour: str) -> None:
 def pareto(scenarios: Sequence[ScenarioResult], style: Mapping[str, Style]) -> bytes:
     """Mean RMSE against mean pull step RMS with 95 % intervals, both logarithmic; lower left is better.
 
-    Who has more than :data:`FAR` times the least error is named, not drawn: the others would crowd in a corner.
+    Who has more than :data:`FAR` times the least error is named, not drawn: the others would crowd in a corner. Markers
+    are hollow, so that one behind another is seen.
     """
     figure = canvas(4.4 * min(len(scenarios), 2) + 0.8, 2.9 * -(-len(scenarios) // 2) + 1.0)
     moving = [outcome.means[PULL_STEP.metric].mean for scenario in scenarios for outcome in scenario.outcomes]
@@ -110,7 +111,7 @@ def pareto(scenarios: Sequence[ScenarioResult], style: Mapping[str, Style]) -> b
                 fontsize=7,
             )
     handles = [
-        Line2D([], [], ls="none", marker=one.marker, color=one.colour, ms=7, label=name)
+        Line2D([], [], ls="none", marker=one.marker, color=one.colour, ms=8, mfc="none", mew=1.6, label=name)
         for name, one in style.items()
         if name in drawn
     ]
@@ -124,12 +125,12 @@ def _point(axis: Any, outcome: Outcome, style: Style, floor: float) -> None:
     x, colour = max(activity.mean, floor), style.colour
     if activity.mean < floor:
         below = {"xytext": (0, -14), "textcoords": "offset points", "ha": "center", "fontsize": 8}
-        axis.annotate("← 0", (x, error.mean), color=colour, **below)
+        axis.annotate("← 0", (x, error.mean), color=INK, **below)
     elif activity.ci95:
         axis.plot(activity.ci95, [error.mean] * 2, color=colour, lw=1.2)
     if error.ci95:
         axis.plot([x, x], error.ci95, color=colour, lw=1.2)
-    axis.plot(x, error.mean, ls="none", marker=style.marker, ms=7, color=colour)
+    axis.plot(x, error.mean, ls="none", marker=style.marker, ms=8, mfc="none", mew=1.6, color=colour)
 
 
 def _plain_log(axis: Any, between: bool = False) -> None:

@@ -48,7 +48,7 @@ def pareto(scenario: ScenarioResult, styles: Mapping[str, Style]) -> go.Figure:
             mode="markers+text",
             text="← 0" if still else "",
             textposition="bottom center",
-            marker={"color": style.colour, "symbol": MARKERS[style.marker], "size": 10},
+            marker={"color": style.colour, "symbol": f"{MARKERS[style.marker]}-open", "size": 10, "line": {"width": 2}},
             hovertemplate=f"RMSE {RMSE.text(error)} mm<br>pull step RMS {PULL_STEP.text(activity)} mm/min",
         )
     figure.update_xaxes(LOG, title=f"mean {PULL_STEP.heading}")

@@ -20,6 +20,7 @@ from cz_gym.config import Config
 from cz_gym.evaluation.metrics import TOLERANCE
 from cz_gym.evaluation.results import REFERENCE, Controller, Sample, ScenarioResult
 from cz_gym.evaluation.rollout import Signals
+from cz_gym.rendering.strip_charts import running_mean
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 from cz_gym.vector import CzVectorEnv
 
@@ -45,6 +46,8 @@ class Panel(NamedTuple):
     each controller; any other is what all controllers are asked for or meet."""
     levels: tuple[float, ...] = ()
     """Values that are marked [unit]."""
+    smooth: bool = False
+    """Whether a controller's chatter may fill the panel: its ``mean`` over the last five minutes is drawn on top."""
 
 
 PANELS = (
@@ -63,16 +66,18 @@ PANELS = (
         },
         (0.0,),
     ),
-    Panel("pull speed", "mm/min", MM_PER_MIN, 0.0005, {"true": lambda s, bias: s.v_p}),
+    Panel("pull speed", "mm/min", MM_PER_MIN, 0.0005, {"true": lambda s, bias: s.v_p}, smooth=True),
     Panel("growth rate", "mm/min", MM_PER_MIN, 0.0005, {"true": lambda s, bias: s.v_g}),
-    Panel("heater power", "kW", KILO, 0.001, {"true": lambda s, bias: s.Q_H}),
+    Panel("heater power", "kW", KILO, 0.001, {"true": lambda s, bias: s.Q_H}, smooth=True),
     Panel("heater temperature", "K", 1.0, 0.01, {"true": lambda s, bias: s.T_1, "recipe": lambda s, bias: s.T_1_ref}),
     Panel("melt temperature", "K", 1.0, 0.001, {"true": lambda s, bias: s.T_b}),
     Panel("meniscus height", "mm", MM, 0.001, {"true": lambda s, bias: s.h_c}),
     Panel("growth angle", "deg", np.pi / 180.0, 0.001, {"true": lambda s, bias: s.alpha_c}, (0.0,)),
 )  # fmt: skip
-_LINES = [(panel, name) for panel in range(len(PANELS)) for name in PANELS[panel].lines]
-OWN = [(panel, name) for panel, name in _LINES if name in ("true", "camera")]
+_LINES = [
+    (panel, name) for panel in range(len(PANELS)) for name in (*PANELS[panel].lines, *["mean"] * PANELS[panel].smooth)
+]
+OWN = [(panel, name) for panel, name in _LINES if name in ("true", "camera", "mean")]
 """Panel and name of the lines that each controller has, in the order in which they are packed."""
 SHARED = [line for line in _LINES if line not in OWN]
 """Of those that are the same for all controllers."""
@@ -85,11 +90,12 @@ def crystals(scenario: ScenarioResult) -> list[dict[str, Any]]:
     """
     samples = [outcome.sample for outcome in scenario.outcomes]
     seeds = scenario.seeds[: max(len(sample.examples) for sample in samples)]
-    found = []
-    for i, (seed, bias) in enumerate(zip(seeds, ring_biases(scenario.row.config(), seeds), strict=True)):
-        runs = [_values(OWN, sample.examples[i], bias) if i < len(sample.examples) else None for sample in samples]
-        longest = max((sample.examples[i] for sample in samples if i < len(sample.examples)), key=lambda s: len(s.r_c))
-        shared = _values(SHARED, longest, bias)
+    config, found = scenario.row.config(), []
+    for i, (seed, bias) in enumerate(zip(seeds, ring_biases(config, seeds), strict=True)):
+        met = [sample.examples[i] if i < len(sample.examples) else None for sample in samples]
+        runs = [_values(OWN, signals, bias, config.control_interval) if signals else None for signals in met]
+        longest = max((signals for signals in met if signals), key=lambda s: len(s.r_c))
+        shared = _values(SHARED, longest, bias, config.control_interval)
         there = [(run, sample) for run, sample in zip(runs, samples, strict=True) if run]
         whole = [run for run, sample in there if not _lost(sample, i)] or [run for run, _ in there]
         found.append(
@@ -107,9 +113,14 @@ Line = tuple[int, Floats]
 """Its panel, and values in the panel's unit."""
 
 
-def _values(lines: Sequence[tuple[int, str]], signals: Signals, bias: float) -> list[Line]:
+def _values(lines: Sequence[tuple[int, str]], signals: Signals, bias: float, interval: float) -> list[Line]:
     """The lines, up to the first step at which one is no number: a crystal that broke the equations."""
-    values = np.array([PANELS[panel].lines[name](signals, bias) / PANELS[panel].scale for panel, name in lines])
+
+    def line(panel: Panel, name: str) -> Floats:
+        found = panel.lines["true" if name == "mean" else name](signals, bias) / panel.scale
+        return running_mean(found, interval) if name == "mean" else found
+
+    values = np.array([line(PANELS[panel], name) for panel, name in lines])
     steps = int(np.isfinite(values).all(axis=0).cumprod().sum())
     return [(panel, each[:steps]) for (panel, _), each in zip(lines, values, strict=True)]
 
@@ -163,10 +174,11 @@ def frame(
     for group, controller in enumerate(controllers):
         style, drawn = styles[controller.name], controller.name in some or not some
         for number, (panel, name) in enumerate(OWN):
+            bold = name == ("mean" if PANELS[panel].smooth else "true")
             figure.add_scatter(
                 row=panel + 1, col=1, x=[], y=[], mode="lines", legendgroup=f"{group}", showlegend=number == 0,
-                line={"color": style.colour, "dash": style.dash, "width": 1.5 if name == "true" else 0.8},
-                opacity=1.0 if name == "true" else 0.35, visible=True if drawn else "legendonly",
+                line={"color": style.colour, "dash": style.dash, "width": 1.5 if bold else 0.8},
+                opacity=1.0 if bold else 0.35, visible=True if drawn else "legendonly",
             )  # fmt: skip
     for panel, name in SHARED:
         line = {"color": INK, "dash": "dash", "width": 1.3}
