@@ -1,4 +1,4 @@
-"""Pull a crystal by hand: ``python -m cz_gym.play [--scenario NAME] [--seed N] [--speed FACTOR] [--minutes M]``."""
+"""Pull a crystal by hand: ``python -m cz_gym.play [--scenario NAME] [--seed N] [--blind] ...``."""
 
 from __future__ import annotations
 
@@ -36,6 +36,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         "--speed", type=float, default=60.0, metavar="FACTOR", help="times faster than real (%(default)g)"
     )
     parser.add_argument("--minutes", type=float, default=180.0, metavar="M", help="length of the run (%(default)g)")
+    parser.add_argument("--blind", action="store_true", help="show what an operator sees: the ring, not the crystal")
     parser.add_argument("--size", default="960x720", metavar="WxH", help="size of the window in pixels (%(default)s)")
     return parser.parse_args(argv)
 
@@ -84,7 +85,7 @@ def _play(arguments: argparse.Namespace) -> int:
     try:
         if not window.visible:
             raise ValueError(NO_DISPLAY)
-        scores = Game(window, size, config, arguments.seed, arguments.speed, paper).play()
+        scores = Game(window, size, config, arguments.seed, arguments.speed, paper, arguments.blind).play()
     finally:
         window.close()
     for score in scores:

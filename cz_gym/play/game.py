@@ -40,13 +40,21 @@ HELP = (
 class Game:
     """One player at one window.
 
-    ``rival`` is the controller to be compared with. Time stands still until the player starts it.
+    ``rival`` is the controller to be compared with. Time stands still until the player starts it. ``blind`` shows what
+    a puller's sensors do, and the truth only with the score.
     """
 
     def __init__(
-        self, window: Window, size: tuple[int, int], config: Config, seed: int, speed: float, rival: Any
+        self,
+        window: Window,
+        size: tuple[int, int],
+        config: Config,
+        seed: int,
+        speed: float,
+        rival: Any,
+        blind: bool = False,
     ) -> None:
-        self.window, self.config, self.speed, self.rival = window, config, speed, rival
+        self.window, self.config, self.speed, self.rival, self.blind = window, config, speed, rival, blind
         self.env = CzEnv.from_config(config, "rgb_array", size, info="all")
         self.scene = Scene(*size)
         self.scores: list[Score] = []
@@ -77,7 +85,8 @@ class Game:
             for event in pygame.event.get():
                 self.handle(event)
             self.advance(1.0 / FPS)
-            self.window.show(self.scene.draw(self.record, self.set_points, self.overlay))
+            hidden = self.blind and self.score is None
+            self.window.show(self.scene.draw(self.record, self.set_points, self.overlay, hidden))
         if self.score is None:
             self.finish(failed=False)
         self.env.close()
@@ -147,8 +156,9 @@ class Game:
         hint = f"time {TIMES}{self.speed:.0f}   H: help"
         canvas.text(chart.right - 10 * unit, chart.y + 4 * unit, hint, 9.5, palette.FAINT, "right")
         if self.score is not None:
-            rows = (("you", _words(self.score.player)), ("paper", _words(self.score.controller)))
-            _card(canvas, "The run is over", rows, "R: again   N: next crystal   Q: end")
+            both = (("you", self.score.player), ("paper", self.score.controller))
+            rows = tuple((name, _words(result)) for name, result in sorted(both, key=lambda one: one[1].rmse_mm))
+            _card(canvas, "The run is over: least error first", rows, "R: again   N: next crystal   Q: end")
         elif self.helping:
             _card(canvas, "Pull a crystal by hand", HELP, "hold the radius on its reference; space starts")
         elif self.paused:

@@ -19,6 +19,10 @@ T_1_RANGE, T_B_RANGE = 20.0, 3.0
 """Half width of the gauges of T_1 and T_b, nominal in the middle [K]."""
 
 
+MEASURED = 3
+"""How many of the gauges a puller has sensors for: all but the melt's temperature."""
+
+
 class Gauge(NamedTuple):
     """One gauge: a bar from its origin to its value on a scale from low to high, any unit."""
 
@@ -70,19 +74,22 @@ def gauges(record: Record, set_points: SetPoints | None = None) -> tuple[Gauge, 
     )  # fmt: skip
 
 
-def draw(canvas: Canvas, boxes: Sequence[Box], record: Record, set_points: SetPoints | None = None) -> None:
-    """The radius in the first box, then a gauge a box."""
-    _radius(canvas, boxes[0], record)
-    for gauge, box in zip(gauges(record, set_points), boxes[1:], strict=True):
+def draw(
+    canvas: Canvas, boxes: Sequence[Box], record: Record, set_points: SetPoints | None = None, blind: bool = False
+) -> None:
+    """The radius in the first box, then a gauge a box; ``blind`` leaves out what no sensor of the puller shows."""
+    _radius(canvas, boxes[0], record, blind)
+    for gauge, box in zip(gauges(record, set_points)[: MEASURED if blind else None], boxes[1:], strict=False):
         _gauge(canvas, box, gauge)
 
 
-def _radius(canvas: Canvas, box: Box, record: Record) -> None:
-    """The true radius error in large figures, with reference and camera under it."""
+def _radius(canvas: Canvas, box: Box, record: Record, blind: bool) -> None:
+    """The radius error in large figures, true or by the camera, with reference and camera under it."""
     now, unit = record.now, canvas.unit
-    canvas.title(box, "true radius error")
-    error = f"{(now.r_c - now.r_ref) / MM:+.2f} mm"
-    canvas.text(box.x + box.w / 2.0, box.y + 16 * unit, error, 19, palette.TRUE, "centre", True)
+    canvas.title(box, "error by the camera" if blind else "true radius error")
+    seen, colour = (float(record.seen_error[-1]), palette.CAMERA) if blind else (now.r_c - now.r_ref, palette.TRUE)
+    error = f"{seen / MM:+.2f} mm" if np.isfinite(seen) else "no reading"
+    canvas.text(box.x + box.w / 2.0, box.y + 16 * unit, error, 19, colour, "centre", True)
     camera = f"{now.camera / MM:.2f}" if now.valid > 0.0 else "no reading"
     for y, name, value, colour in (
         (40, "reference", f"{now.r_ref / MM:.2f}", palette.REFERENCE), (52, "by the camera", camera, palette.CAMERA)

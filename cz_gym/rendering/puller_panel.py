@@ -11,6 +11,7 @@ from cz_gym.units import MM
 from . import palette
 from .canvas import TIMES, Box, Canvas, paired
 from .geometry import Scale, first_at_least
+from .palette import Colour
 from .record import Ending, Record
 
 Floats = npt.NDArray[np.float64]
@@ -36,8 +37,13 @@ def magnification(record: Record) -> float:
     return 1.0 / first_at_least(largest / (LARGEST * record.puller.r_0), tuple(1.0 / one for one in MAGNIFICATIONS))
 
 
-def draw(canvas: Canvas, box: Box, record: Record, magnified: float | None = None) -> None:
-    """Heaters, crucible, melt and crystal; ``magnified`` is used instead of :func:`magnification`."""
+def draw(
+    canvas: Canvas, box: Box, record: Record, magnified: float | None = None, colour: Colour = palette.TRUE
+) -> None:
+    """Heaters, crucible, melt and crystal, its surface in that colour.
+
+    ``magnified`` is used instead of :func:`magnification`.
+    """
     per_metre = HALF_WIDTH * box.w / record.puller.r_0
     scale = Scale(box.x + box.w / 2.0, 0.0, box.y + MELT_LEVEL * box.h, per_metre)
     magnified, unit, bar = magnified or magnification(record), canvas.unit, 50.0 * MM * per_metre
@@ -46,8 +52,8 @@ def draw(canvas: Canvas, box: Box, record: Record, magnified: float | None = Non
     canvas.text(x - 5 * unit, y + bar / 2 - 6 * unit, "50 mm", 9.0, palette.FAINT, "right")
     with canvas.clip(box):
         _crucible(canvas, box, scale, record)
-        _crystal(canvas, box, scale, record, magnified)
-    canvas.text(box.x + 8 * unit, box.y + 18 * unit, f"error {TIMES}{magnified:g}", 9.5, palette.TRUE)
+        _crystal(canvas, box, scale, record, magnified, colour)
+    canvas.text(box.x + 8 * unit, box.y + 18 * unit, f"error {TIMES}{magnified:g}", 9.5, colour)
 
 
 def crucible_rise(record: Record) -> float:
@@ -80,7 +86,7 @@ def _crucible(canvas: Canvas, box: Box, scale: Scale, record: Record) -> None:
         canvas.lines(palette.PANEL, paired(x + zigzag, y), 3.0)
 
 
-def _crystal(canvas: Canvas, box: Box, scale: Scale, record: Record, magnified: float) -> None:
+def _crystal(canvas: Canvas, box: Box, scale: Scale, record: Record, magnified: float, surface: Colour) -> None:
     unit, x = canvas.unit, scale.x_0
     r_c, r_ref, z = (_thinned(values) for values in record.surface())
     half, y = (r_ref + magnified * (r_c - r_ref)) * scale.per_metre, scale.y(z)
@@ -95,7 +101,7 @@ def _crystal(canvas: Canvas, box: Box, scale: Scale, record: Record, magnified: 
         foot = np.array([half[0] + 2.5 * unit, half[0]])
         canvas.polygon(palette.MELT_TOP, _mirrored(x, foot, np.array([scale.y_0 + 1, y[0]])))
     for side in (-1.0, 1.0):
-        canvas.lines(palette.TRUE, paired(x + side * half, y), 1.6)
+        canvas.lines(surface, paired(x + side * half, y), 1.6)
         canvas.dashes(palette.REFERENCE, paired(x + side * r_ref * scale.per_metre, y), 0.8)
 
 

@@ -81,6 +81,11 @@ class Record:
         """The true radius error of every sample [m], shape (samples,)."""
         return self.column("r_c") - self.column("r_ref")
 
+    @property
+    def seen_error(self) -> Floats:
+        """The radius error of every sample by the camera [m], shape (samples,); NaN without a reading."""
+        return np.where(self.column("valid") > 0.0, self.column("camera"), np.nan) - self.column("r_ref")
+
     def add(self, info: Floats, slot: Any, terminated: bool = False, truncated: bool = False) -> None:
         """Add the sample of info rows (:data:`cz_gym.engine.layout.INFO`) and the slot they were read from.
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cz_gym.units import HOUR, MINUTE, MM
 
-from . import gauges, palette, puller_panel, strip_charts, triple_point
+from . import gauges, palette, puller_panel, ring_panel, strip_charts, triple_point
 from .canvas import BASE, Box, Canvas
 from .record import Ending, Record
 
@@ -79,37 +79,46 @@ class Scene:
         record: Record,
         set_points: gauges.SetPoints | None = None,
         overlay: Callable[[Canvas], None] | None = None,
+        blind: bool = False,
     ) -> Surface:
         """The picture of a record's newest sample; the next call draws into the same surface.
 
-        ``set_points`` of the drives are marked, ``overlay`` draws on top.
+        ``set_points`` of the drives are marked, ``overlay`` draws on top, ``blind`` shows what the puller's sensors do.
         """
         canvas, boxes = self.canvas, self.layout
         canvas.begin((boxes.puller, *boxes.gauges, *boxes.charts))
-        self._header(record)
-        canvas.title(boxes.puller, "crystal")
-        puller_panel.draw(canvas, boxes.puller, record)
-        triple_point.draw(canvas, boxes.triple_point, record)
-        gauges.draw(canvas, boxes.gauges, record, set_points)
-        strip_charts.draw(canvas, *boxes.charts, record)
+        self._header(record, blind)
+        if blind:
+            ring_panel.draw(
+                canvas, Box(*boxes.puller[:2], boxes.triple_point.right - boxes.puller.x, boxes.puller.h), record
+            )
+        else:
+            canvas.title(boxes.puller, "crystal")
+            puller_panel.draw(canvas, boxes.puller, record)
+            triple_point.draw(canvas, boxes.triple_point, record)
+        gauges.draw(canvas, boxes.gauges, record, set_points, blind)
+        strip_charts.draw(canvas, *boxes.charts, record, blind)
         if record.ending is not None:
             draw_ending(canvas, boxes.triple_point, record.ending)
         if overlay is not None:
             overlay(canvas)
         return canvas.finish()
 
-    def _header(self, record: Record) -> None:
-        """Scenario, time, length grown, and whether all is well."""
+    def _header(self, record: Record, blind: bool) -> None:
+        """Scenario, time, length grown unless ``blind``, and whether all is well."""
         canvas, unit, now = self.canvas, self.canvas.unit, record.now
         left, middle, right = self.layout.header.x, self.layout.triple_point.x, self.layout.header.right
         hours, rest = divmod(round(now.t), round(HOUR))
         minutes, seconds = divmod(rest, round(MINUTE))
         canvas.text(left + 4 * unit, 7 * unit, "Cz-v0", 14, palette.INK, bold=True)
         canvas.text(left + 58 * unit, 10 * unit, record.scenario, 11, palette.FAINT)
-        for x, name in ((0, "time"), (112, "grown")):
+        shown = (
+            (0, 30, "time", f"{hours}:{minutes:02d}:{seconds:02d}"),
+            (112, 152, "grown", f"{now.length / MM:.1f} mm"),
+        )
+        for x, after, name, value in shown[: 1 if blind else 2]:
             canvas.text(middle + x * unit, 10 * unit, name, 11, palette.FAINT)
-        for x, value in ((30, f"{hours}:{minutes:02d}:{seconds:02d}"), (152, f"{now.length / MM:.1f} mm")):
-            canvas.text(middle + x * unit, 7.5 * unit, value, 13, palette.INK, bold=True)
+            canvas.text(middle + after * unit, 7.5 * unit, value, 13, palette.INK, bold=True)
         status, colour = ("growing", palette.RECIPE) if record.ending is None else ("ended", palette.ALARM)
         if record.ending is None and now.valid <= 0.0:
             status, colour = "camera: no reading", palette.CAMERA

@@ -39,15 +39,21 @@ class Trace(NamedTuple):
 
 def error_range(records: Sequence[Record]) -> float:
     """Half height of a chart that shows the radius errors of all records [m]."""
-    return first_at_least(1.15 * max(float(np.abs(record.error).max()) for record in records), RANGES)
+    return first_at_least(1.15 * max((_largest(record.error) for record in records), default=0.0), RANGES)
 
 
-def draw(canvas: Canvas, upper: Box, lower: Box, record: Record) -> None:
-    """Radius error, true and by the camera, above the pull speed, both over the horizon."""
-    draw_errors(canvas, upper, [(record, palette.TRUE)], camera=record)
-    for x, name, colour in (
-        (38, "radius error [mm]", palette.FAINT), (136, "true", palette.TRUE), (167, "by the camera", palette.CAMERA),
-    ):  # fmt: skip
+def _largest(error: Floats) -> float:
+    """The largest error, 0 without any; those that are no number do not count."""
+    return float(np.nanmax(np.abs(error), initial=0.0))
+
+
+def draw(canvas: Canvas, upper: Box, lower: Box, record: Record, blind: bool = False) -> None:
+    """Radius error, true unless ``blind`` and by the camera, above the pull speed, both over the horizon."""
+    draw_errors(canvas, upper, [] if blind else [(record, palette.TRUE)], camera=record)
+    names = (
+        (38, "radius error [mm]", palette.FAINT), (136, "by the camera", palette.CAMERA), (220, "true", palette.TRUE),
+    )  # fmt: skip
+    for x, name, colour in names[: 2 if blind else 3]:
         canvas.text(upper.x + x * canvas.unit, upper.y + 4 * canvas.unit, name, 9.5, colour)
     _draw_pull(canvas, lower, record)
 
@@ -61,18 +67,18 @@ def error_plot(canvas: Canvas, box: Box) -> Box:
 def draw_errors(
     canvas: Canvas, box: Box, records: Sequence[tuple[Record, Colour]], camera: Record | None = None
 ) -> None:
-    """True radius errors against time, one line a record; ``camera`` adds what it saw."""
-    plot, limit = error_plot(canvas, box), error_range([record for record, _ in records])
-    config = records[0][0].config
+    """True radius errors against time, one line a record; ``camera`` adds what it saw, and can stand alone."""
+    plot, limit, traces = error_plot(canvas, box), error_range([record for record, _ in records]), []
+    config = (camera or records[0][0]).config
+    if camera is not None:
+        seen = camera.seen_error
+        limit = limit if records else first_at_least(1.15 * _largest(seen), RANGES)
+        traces.append(Trace(camera.column("t"), seen, palette.mix(palette.PANEL, palette.CAMERA, 0.55), 0.8))
     band = min(TOLERANCE / limit, 1.0) * plot.h / 2.0
     canvas.rectangle(palette.BAND, Box(plot.x, plot.y + plot.h / 2.0 - band, plot.w, 2.0 * band))
     _time_axis(canvas, plot, config.horizon)
     for value in (-limit, 0.0, limit):
         _level(canvas, plot, value, -limit, limit, f"{value / MM:+g}" if value else "0")
-    traces = []
-    if camera is not None:
-        seen = np.where(camera.column("valid") > 0.0, camera.column("camera"), np.nan) - camera.column("r_ref")
-        traces.append(Trace(camera.column("t"), seen, palette.mix(palette.PANEL, palette.CAMERA, 0.55), 0.8))
     traces += [Trace(record.column("t"), record.error, colour, 1.7) for record, colour in records]
     _traces(canvas, plot, config, traces, -limit, limit)
 
@@ -116,7 +122,8 @@ def _traces(canvas: Canvas, plot: Box, config: Config, traces: list[Trace], low:
                 canvas.lines(trace.colour, piece, trace.width)
     newest = traces[-1]
     ((x, y),) = placed(newest.t[-1:], np.clip(newest.values[-1:], low, high))
-    canvas.dot(newest.colour, (x, y), 2.6)
+    if np.isfinite(y):
+        canvas.dot(newest.colour, (x, y), 2.6)
 
 
 def _pieces(points: Floats) -> list[Floats]:

@@ -15,6 +15,7 @@ from cz_gym.units import MM
 from . import palette
 from .canvas import TIMES, Box, Canvas, paired
 from .geometry import Scale, clipped_height, first_at_least, meniscus_curve, ring_height
+from .palette import Colour
 from .record import Ending, Record
 
 Floats = npt.NDArray[np.float64]
@@ -44,8 +45,11 @@ def error_range(error: Floats) -> float:
     return first_at_least(1.1 * float(np.abs(error).max()), RANGES)
 
 
-def draw(canvas: Canvas, box: Box, record: Record, limit: float | None = None) -> None:
-    """The cross-section, its marks and the magnified surface; ``limit`` [m] is its half width unless it fits itself."""
+def draw(canvas: Canvas, box: Box, record: Record, limit: float | None = None, colour: Colour = palette.TRUE) -> None:
+    """The cross-section, its marks and the magnified surface, the crystal's in that colour.
+
+    ``limit`` [m] is the magnified one's half width unless it fits itself.
+    """
     scale, now, unit = scale_of(box, record), record.now, canvas.unit
     r_c, r_ref, z = record.surface(max((scale.y_0 - box.y) / scale.per_metre - now.h_c, 0.0))
     with canvas.clip(box):
@@ -56,18 +60,18 @@ def draw(canvas: Canvas, box: Box, record: Record, limit: float | None = None) -
         reference = scale.points(np.append(r_ref[0], r_ref), np.append(0.0, z))
         canvas.dashes(palette.REFERENCE, reference, 1.2)
         surface = scale.points(r_c, z)
-        canvas.lines(palette.TRUE, surface, 2.2)
+        canvas.lines(colour, surface, 2.2)
         if record.ending is not Ending.DETACHED:
-            _ring(canvas, box, scale, record)
+            _ring(canvas, box, scale, record, colour)
         edge = (float(surface[0, 0]), float(surface[0, 1]))
         canvas.dot(palette.INK, edge, 3.2)
-        canvas.dot(palette.TRUE, edge, 2.2)
+        canvas.dot(colour, edge, 2.2)
     _axis(canvas, box, scale)
     canvas.text(box.x + 7.0 * unit, box.y + 30 * unit, "crystal", 10, palette.INK)
     canvas.text(box.x + 7.0 * unit, box.bottom - 31 * unit, "melt", 10, palette.INK)
     x, right = float(scale.x(record.puller.r_0 + 0.62 * INSIDE)), box.right - 8.0 * unit
     inset = Box(x, box.y + 44.0 * unit, right - x, scale.y_0 - box.y - 70.0 * unit)
-    _magnified(canvas, inset, scale, r_c - r_ref, z, limit or error_range(r_c - r_ref))
+    _magnified(canvas, inset, scale, r_c - r_ref, z, limit or error_range(r_c - r_ref), colour)
 
 
 def _gas_and_meniscus(canvas: Canvas, box: Box, scale: Scale, record: Record, r_c: Floats, z: Floats) -> None:
@@ -92,7 +96,7 @@ def _gas_and_meniscus(canvas: Canvas, box: Box, scale: Scale, record: Record, r_
     canvas.lines(palette.mix(palette.MELT_TOP, palette.GLOW, 0.6), meniscus, 1.0)
 
 
-def _ring(canvas: Canvas, box: Box, scale: Scale, record: Record) -> None:
+def _ring(canvas: Canvas, box: Box, scale: Scale, record: Record, colour: Colour) -> None:
     """The bright ring, and its radius beside the crystal's, marked down to the axis."""
     now, p, unit = record.now, record.puller, canvas.unit
     z_b = ring_height(now.r_c, now.h_c, p, record.config.meniscus, record.config.parameters.phi_b)
@@ -101,7 +105,7 @@ def _ring(canvas: Canvas, box: Box, scale: Scale, record: Record) -> None:
     canvas.dot(palette.CAMERA, (x, y), 2.6)
     canvas.line(palette.CAMERA, (x, y), (x, bottom), 1.0)
     edge = float(scale.x(now.r_c))
-    canvas.line(palette.TRUE, (edge, float(scale.y(clipped_height(now.h_c, p.a)))), (edge, bottom), 1.0)
+    canvas.line(colour, (edge, float(scale.y(clipped_height(now.h_c, p.a)))), (edge, bottom), 1.0)
     canvas.text(x + 5 * unit, scale.y_0 + 8 * unit, "bright ring", 9.5, (60, 20, 0), bold=True)
     canvas.text(edge - 5 * unit, scale.y_0 + 8 * unit, "r_c", 9.5, (0, 30, 60), "right", bold=True)
 
@@ -121,7 +125,7 @@ def _axis(canvas: Canvas, box: Box, scale: Scale) -> None:
     canvas.text(box.right - 4 * unit, y + 4 * unit, "r [mm]", 9.0, palette.FAINT, "right")
 
 
-def _magnified(canvas: Canvas, box: Box, scale: Scale, error: Floats, z: Floats, limit: float) -> None:
+def _magnified(canvas: Canvas, box: Box, scale: Scale, error: Floats, z: Floats, limit: float, colour: Colour) -> None:
     """The surface's error [m] between -limit and limit."""
     unit = canvas.unit
     middle, per_metre = box.x + box.w / 2.0, box.w / 2.0 / limit
@@ -131,10 +135,10 @@ def _magnified(canvas: Canvas, box: Box, scale: Scale, error: Floats, z: Floats,
     canvas.dashes(palette.REFERENCE, np.array([[middle, box.y], [middle, box.bottom]]), 1.0)
     with canvas.clip(box):
         points = paired(middle + error * per_metre, scale.y(z))
-        canvas.lines(palette.TRUE, points[points[:, 1] < box.bottom + 40], 2.0)
+        canvas.lines(colour, points[points[:, 1] < box.bottom + 40], 2.0)
     canvas.rectangle(palette.RIM, box, line=max(1, round(unit)))
     title = f"surface error {TIMES}{per_metre / scale.per_metre:.0f}"
-    canvas.text(middle, box.y - 13 * unit, title, 9.5, palette.TRUE, "centre")
+    canvas.text(middle, box.y - 13 * unit, title, 9.5, colour, "centre")
     for x, anchor, text in (
         (box.x, "left", f"{-limit / MM:+g}"), (middle, "centre", "0 mm"), (box.right, "right", f"{limit / MM:+g}")
     ):  # fmt: skip

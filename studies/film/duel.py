@@ -9,7 +9,7 @@ import numpy as np
 
 from cz_gym.env import CzEnv
 from cz_gym.rendering import palette, puller_panel, strip_charts, triple_point
-from cz_gym.rendering.canvas import Box, Canvas
+from cz_gym.rendering.canvas import TIMES, Box, Canvas
 from cz_gym.rendering.palette import Colour
 from cz_gym.rendering.record import Ending, Record
 from cz_gym.rendering.scene import draw_ending
@@ -59,6 +59,8 @@ def draw(canvas: Canvas, sides: Sequence[Side]) -> Surface:
     strip_charts.draw_errors(canvas, bottom, [(side.record, side.colour) for side in sides])
     x, y = bottom.x + 38.0 * unit, bottom.y + 4 * unit
     canvas.text(x, y, "true radius error [mm]", 9.5, palette.FAINT)
+    told = f"{TIMES}40: the drawing above shows the error 40 times as large"
+    canvas.text(bottom.right - 10.0 * unit, y, told, 9.5, palette.FAINT, "right")
     for i, (side, box) in enumerate(zip(sides, boxes, strict=True)):
         canvas.text(x + (125 + 140 * i) * unit, y, side.name, 9.5, side.colour, bold=True)
         _draw_side(canvas, box, side, magnified, limit)
@@ -73,7 +75,7 @@ def _draw_side(canvas: Canvas, box: Box, side: Side, magnified: float, limit: fl
     below = box.inner(0.0, 26.0 * unit, 0.0, 0.0)
     crystal = Box(below.x, below.y, 0.44 * below.w, below.h)
     edge = Box(crystal.right, below.y, below.right - crystal.right, below.h)
-    puller_panel.draw(canvas, crystal, record, magnified)
-    triple_point.draw(canvas, edge, record, limit)
+    puller_panel.draw(canvas, crystal, record, magnified, side.colour)
+    triple_point.draw(canvas, edge, record, limit, side.colour)
     if record.ending not in (None, Ending.HORIZON):
         draw_ending(canvas, edge, record.ending)

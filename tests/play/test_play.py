@@ -105,6 +105,42 @@ def test_a_whole_run_in_the_window_ends_with_the_score(game: hand.Game) -> None:
     assert "by hand" in outcome.line()
 
 
+def test_blind_shows_nothing_that_only_the_truth_can_tell_until_the_score(config: Config) -> None:
+    """Two samples whose true states differ and whose readings do not give the same picture."""
+    window = Window(SIZE, "test")
+    game = hand.Game(window, SIZE, config, 1, 60.0, find_controller("paper").make(config), blind=True)
+    handle(game, pygame.K_SPACE)
+    game.advance(2.0)
+
+    def picture(blind: bool) -> np.ndarray:
+        return np.array(pygame.surfarray.array3d(game.scene.draw(game.record, blind=blind)))
+
+    before = {blind: picture(blind) for blind in (True, False)}
+    for name in ("r_c", "r_br", "h_c", "v_g", "T_b", "length"):
+        game.record.column(name)[:] *= 1.001
+    assert np.array_equal(picture(True), before[True])
+    assert not np.array_equal(picture(False), before[False])
+    game.record.column("camera")[-1] += 3e-4
+    assert not np.array_equal(picture(True), before[True])
+    game.record.column("valid")[:] = 0.0
+    picture(True)
+    shown: list[bool] = []
+    draw = game.scene.draw
+
+    def watch(record: Any, set_points: Any, overlay: Any, blind: bool) -> Any:
+        shown.append(blind)
+        if len(shown) == 2:
+            game.end()
+        else:
+            game.finish(failed=False)
+        return draw(record, set_points, overlay, blind)
+
+    game.scene.draw = watch  # type: ignore[method-assign, assignment]
+    game.play()
+    assert shown == [True, False]
+    window.close()
+
+
 def test_again_and_the_next_crystal(game: hand.Game) -> None:
     first = game.record.now
     handle(game, pygame.K_SPACE)

@@ -9,7 +9,10 @@ import pytest
 
 from cz_gym import agents
 from cz_gym.rendering import palette
+from cz_gym.rendering.canvas import Canvas
+from cz_gym.rendering.pixels import colours
 from studies.film import __main__ as film
+from studies.film.duel import draw
 
 pytest.importorskip("pygame")
 
@@ -49,6 +52,18 @@ def test_a_short_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     # The ring's marker is some fifty pixels in four hundred thousand, and keeps its colour all the same.
     assert (np.linalg.norm(last - palette.CAMERA, axis=-1) < 40.0).sum() > 30
     assert "3 frames" in capsys.readouterr().out
+
+
+def test_each_side_is_drawn_in_its_own_colour() -> None:
+    pytest.importorskip("onnxruntime")
+    sides, canvas = film.contestants("randomized", 1), Canvas(*film.SIZE)
+    for side in sides:
+        side.step_to(200)
+    picture = colours(draw(canvas, sides)).astype(np.float64)[: film.SIZE[1] * 7 // 10]
+    for side, half in zip(sides, np.array_split(picture, 2, axis=1), strict=True):
+        near = {one.colour: (np.linalg.norm(half - one.colour, axis=-1) < 30.0).sum() for one in sides}
+        assert max(near, key=lambda colour: near[colour]) == side.colour
+        assert min(near.values()) == 0
 
 
 def test_the_film_shows_the_shipped_agent_unless_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -54,7 +54,7 @@ def pareto(scenario: ScenarioResult, styles: Mapping[str, Style]) -> go.Figure:
     figure.update_xaxes(LOG, title=f"mean {PULL_STEP.heading}")
     figure.update_yaxes(LOG, title=f"mean {RMSE.heading}")
     figure.update_layout(
-        title="Error against pull activity: lower left is better", legend={"orientation": "h", "y": -0.2}
+        title="Error against pull activity:<br>lower left is better", legend={"orientation": "h", "y": -0.2}
     )
     return figure
 
