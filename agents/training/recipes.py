@@ -204,7 +204,7 @@ class SAC(Reinforcement):
     """
 
     name: str = "sac"
-    steps: int = 600_000
+    steps: int = 1_500_000
     num_envs: int = 64
     held: int = 4
     """Steps of the environment that an action is held for while it learns; its steps are counted in actions."""
@@ -229,7 +229,7 @@ class RandomSearch(Reinforcement):
     """Augmented random search of a linear policy, from nothing: no gradient, no critic, no discount."""
 
     name: str = "random-search"
-    steps: int = 200_000_000
+    steps: int = 160_000_000
     num_envs: int = 512
     """Shared out among the candidates, each of which meets the same crystals."""
     gamma: float = 0.0
@@ -237,11 +237,11 @@ class RandomSearch(Reinforcement):
     """Directions of a round; either way along each is a candidate."""
     n_top: int = 16
     """Best directions of a round that are followed."""
-    delta_std: float = 0.01
+    delta_std: float = 0.04
     """Spread of the candidates' weights."""
     part: int = 1440
     """Steps of an episode that candidates are compared on."""
-    learning_rate: float = 0.04
+    learning_rate: float = 0.01
 
 
 LQG_COST = CostWeights(pull=0.11, pull_step=0.049, heater_step=23.4)

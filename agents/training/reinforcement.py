@@ -121,7 +121,7 @@ def make_algorithm(recipe: Reinforcement, slots: CzVecEnv, seed: int) -> BaseAlg
     else:
         options = _network(recipe)
     algorithm, policy = KINDS[type(recipe)]
-    known = inspect.signature(algorithm).parameters
+    known = {name for kind in algorithm.__mro__ for name in inspect.signature(kind.__init__).parameters}
     settings = {name: value for name, value in asdict(recipe).items() if name in known}
     settings["learning_rate"] = linear(recipe.learning_rate, recipe.learning_rate / 20.0)
     made: BaseAlgorithm = algorithm(policy, env, policy_kwargs=options, seed=seed, device="cpu", **settings)

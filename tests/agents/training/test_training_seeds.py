@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import pytest
@@ -24,3 +24,16 @@ def test_no_two_training_seeds_meet_the_same_crystals(name: str) -> None:
         learner.algorithm.env.close()
     assert [len(each) for each in met] == [8] * 4
     assert len(set.union(*met)) == 4 * 8
+
+
+@pytest.mark.parametrize("name", ["ppo", "sac", "ppo-recurrent", "random-search"])
+def test_the_numbers_of_a_recipe_reach_its_algorithm(name: str) -> None:
+    recipe: Any = replace(RECIPES[name], num_envs=64)  # type: ignore[call-arg]
+    algorithm = make_learner(recipe, 0, make_controller).algorithm  # type: ignore[attr-defined]
+    given = {}
+    for field, wanted in asdict(recipe).items():
+        found = getattr(algorithm, f"{field}_schedule", getattr(algorithm, field, None))
+        if isinstance(wanted, (int, float)) and found is not None and field != "learning_rate":
+            given[field] = wanted
+            assert (found(1.0) if callable(found) else found) == wanted, field
+    assert len(given) >= 4
