@@ -31,7 +31,7 @@ CACHE = FOLDER.parent / "cache"
 """Where episodes of slow controllers are cached."""
 BOUNDS = FOLDER.parent / "bounds"
 """Committed results of the slow controllers; their bound serves runs without one."""
-SHIPPED = ("gradient", "ppo", "random-search", "imitation")
+SHIPPED = ("gradient", "ppo", "ppo-recurrent", "sac", "random-search", "imitation")
 """Agents that come with the package; each pools its training seeds."""
 EPISODES = 500
 

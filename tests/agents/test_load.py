@@ -8,7 +8,7 @@ import pytest
 from cz_gym import agents
 from cz_gym.agents.agent_file.contract import read_agent
 
-SHIPPED = {"gradient": 10, "imitation": 3, "ppo": 3, "random-search": 3}
+SHIPPED = {"gradient": 10, "imitation": 3, "ppo": 3, "ppo-recurrent": 3, "random-search": 3, "sac": 3}
 """Training seeds of each name."""
 
 

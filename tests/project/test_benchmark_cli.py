@@ -210,7 +210,7 @@ def test_agent_files_that_cannot_be_used_get_one_line(tmp_path: Path, capsys: py
     other = constant_agent(tmp_path / "other.onnx", training_seed=1, scenario="hard", scenario_hash="0" * 16)
     assert "different scenarios: hard, randomized" in refused(["--agent", twice, "--agent", str(other)], capsys)
     assert "choose from" in (line := refused(["--agent", f"mine={twice}", "--controllers", "your"], capsys))
-    assert "mine, gradient, ppo, random-search, imitation, or all" in line
+    assert "mine, gradient, ppo, ppo-recurrent, sac, random-search, imitation, or all" in line
     endless = tmp_path / "twice.json"
     endless.write_text(endless.read_text().replace('"validation_rmse_mm": 1.0', '"validation_rmse_mm": NaN'))
     assert "validation_rmse_mm" in refused([*SMALL, "--agent", twice], capsys)

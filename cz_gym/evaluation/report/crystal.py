@@ -55,7 +55,10 @@ def crystal(scenario: ScenarioResult, style: Mapping[str, Style]) -> bytes:
         axes[row, 0].set_ylabel(panel.label)
     _set_limits(axes, samples, longest)
     width = round(13.0 * figure.get_figwidth())
-    figure.suptitle("\n".join(fill(line, width, break_on_hyphens=False) for line in heading(scenario, samples).split("\n")), fontsize=9.5)
+    figure.suptitle(
+        "\n".join(fill(line, width, break_on_hyphens=False) for line in heading(scenario, samples).split("\n")),
+        fontsize=9.5,
+    )
     lines: tuple[dict[str, Any], ...] = (
         {"color": INK, "lw": 1.2, "ls": "--", "label": "reference"},
         {"color": GREY, "lw": 1.2, "label": "what the camera reports"},
