@@ -209,6 +209,26 @@ def test_no_window_needs_sideways_scrolling(browser: Any, width: int) -> None:
     until(browser, lambda: browser.execute_script("return document.documentElement.scrollWidth <= window.innerWidth"))
 
 
+def test_a_narrow_window_has_one_column_and_nothing_covers_anything(browser: Any) -> None:
+    """Pictures below each other, inside the window, titles clear of the menu."""
+    resize(browser, 400)
+
+    def box(selector: str) -> dict[str, float]:
+        script = "return document.querySelector(arguments[0]).getBoundingClientRect().toJSON()"
+        return dict(browser.execute_script(script, selector))
+
+    until(browser, lambda: box("#signals svg")["right"] <= 400)
+    upper, lower = box("#picture-0"), box("#picture-1")
+    assert lower["top"] >= upper["bottom"]
+    for part in ("#picture-0", "#picture-1", "#signals"):
+        assert box(f"{part} svg")["right"] <= 400
+        assert box(f"{part} .nsewdrag")["width"] > 100
+    for title in ("#picture-0 .gtitle", "#picture-1 .gtitle"):
+        assert box(title)["right"] <= 400
+    assert box("#picture-1 .gtitle")["right"] <= box("#picture-1 .updatemenu-header")["left"]
+    assert box("#picture-0 .nsewdrag")["height"] > 150
+
+
 def test_no_complaint_at_the_end_either(browser: Any) -> None:
     assert [line for line in browser.get_log("browser") if line["level"] != "INFO"] == []
     assert browser.find_element("id", "trouble").is_displayed() is False

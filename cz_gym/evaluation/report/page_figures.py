@@ -81,5 +81,5 @@ def errors(scenario: ScenarioResult, styles: Mapping[str, Style]) -> go.Figure:
     ]
     figure.update_xaxes(LOG, title=DISTRIBUTIONS[0].heading)
     menu = {"buttons": buttons, "x": 1, "xanchor": "right", "y": 1.02, "yanchor": "bottom"}
-    figure.update_layout(title="Error crystal by crystal", showlegend=False, updatemenus=[menu])
+    figure.update_layout(title="Error by crystal", showlegend=False, updatemenus=[menu])
     return figure
