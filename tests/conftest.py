@@ -6,7 +6,7 @@ Where a package for training is not installed, the tests that need it are skippe
 import importlib.util
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -121,6 +121,22 @@ def nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Any, Any]]:
     yield made, second
     ray.shutdown()
     made.shutdown()
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Callable[[Callable[[list[str]], int], Sequence[str]], str]:
+    """A function that runs a command which must refuse its arguments; the one line that it says."""
+
+    def run(main: Callable[[list[str]], int], arguments: Sequence[str]) -> str:
+        try:
+            code: Any = main([*arguments])
+        except SystemExit as left:
+            code = left.code
+        said = capsys.readouterr()
+        assert (code, said.out, said.err.count("\n")) == (2, "", 1), said
+        return said.err
+
+    return run
 
 
 @pytest.fixture

@@ -132,13 +132,8 @@ def test_history_tells_what_is_measured() -> None:
         (["--noise", "nan"], "noise must be between 0 and 1, not nan"),
     ],
 )
-def test_bad_input_gets_one_line_and_leaves_nothing(
-    options: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], place: Path
-) -> None:
-    assert main(["--policies", "paper", *options, "--out", str(place)]) == 2
-    error = capsys.readouterr().err
-    assert said in error
-    assert error.count("\n") == 1
+def test_bad_input_gets_one_line_and_leaves_nothing(options: list[str], said: str, refused: Any, place: Path) -> None:
+    assert said in refused(main, ["--policies", "paper", *options, "--out", str(place)])
     assert not place.exists()
 
 

@@ -207,29 +207,19 @@ def test_a_failed_run_counts_to_the_horizon() -> None:
         (["--size", "10x10"], "360 to 3840"),
     ],
 )
-def test_bad_options_are_one_line(options: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert play.main(options) == 2
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert said.err.count("\n") == 1
-    assert says in said.err
+def test_bad_options_are_one_line(options: list[str], says: str, refused: Any) -> None:
+    assert says in refused(play.main, options)
 
 
-def test_without_pygame_it_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_pygame_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch, refused: Any) -> None:
     monkeypatch.setitem(sys.modules, "pygame", None)
-    assert play.main([]) == 2
-    assert capsys.readouterr().err == f"python -m cz_gym.play: {backend.MISSING}\n"
+    assert refused(play.main, []) == f"python -m cz_gym.play: {backend.MISSING}\n"
 
 
-def test_without_a_display_it_says_so(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_display_it_says_so(monkeypatch: pytest.MonkeyPatch, refused: Any) -> None:
     pygame.display.quit()
     monkeypatch.setenv("SDL_VIDEODRIVER", "offscreen")
-    assert play.main([]) == 2
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert said.err == f"python -m cz_gym.play: {play.NO_DISPLAY}\n"
+    assert refused(play.main, []) == f"python -m cz_gym.play: {play.NO_DISPLAY}\n"
     assert not pygame.display.get_init()
 
 

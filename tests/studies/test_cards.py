@@ -2,8 +2,7 @@
 
 import json
 from pathlib import Path
-
-import pytest
+from typing import Any
 
 from cz_gym import agents
 from studies.cards import __main__ as cards
@@ -23,7 +22,7 @@ def test_every_shipped_agent_has_a_card_and_the_committed_ones_are_of_the_commit
         assert ("`puller`" in section.split("Fails: ")[1].split("\n")[0]) == (found["failure_rate"]["mean"] > 0.0)
 
 
-def test_another_file_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_file_is_refused_in_one_line(tmp_path: Path, refused: Any) -> None:
     (tmp_path / "some.json").write_text("[]")
-    assert cards.main(["--benchmark", str(tmp_path / "some.json"), "--out", str(tmp_path / "cards.md")]) == 2
-    assert "is no benchmark.json" in capsys.readouterr().err
+    command = ["--benchmark", str(tmp_path / "some.json"), "--out", str(tmp_path / "cards.md")]
+    assert "is no benchmark.json" in refused(cards.main, command)

@@ -26,11 +26,10 @@ def test_a_benchmark_is_compared_at_equal_activity(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"results": {"randomized": {"lqg": 1}}}'])
-def test_another_file_is_refused_in_a_line(content, tmp_path, capsys):
+def test_another_file_is_refused_in_a_line(content, tmp_path, refused):
     (tmp_path / "x.json").write_text(content)
-    assert frontier.main([str(tmp_path / "x.json")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-    assert frontier.main([str(tmp_path / "none.json")]) == 2
+    refused(frontier.main, [str(tmp_path / "x.json")])
+    refused(frontier.main, [str(tmp_path / "none.json")])
 
 
 def test_an_lqg_as_active_as_ppo_stands_in_the_default_table():
@@ -39,7 +38,7 @@ def test_an_lqg_as_active_as_ppo_stands_in_the_default_table():
     assert [name for name, default in shown.items() if default] == ["lqg-at-0.02"]
 
 
-def test_episodes_beside_a_benchmark_give_intervals_unless_they_are_of_another_run(tmp_path, capsys):
+def test_episodes_beside_a_benchmark_give_intervals_unless_they_are_of_another_run(tmp_path, capsys, refused):
     values = {"lqg": (0.02, 0.05), "lqg-quiet": (0.01, 0.07), "agent": (0.015, 0.06)}
     lines = ["scenario,controller,training_seed,seed,pull_step_rms_mm_per_min,rmse_mm"]
     lines += [f"randomized,{name},,{seed},{a},{e}" for name, (a, e) in values.items() for seed in (1, 2)]
@@ -49,9 +48,7 @@ def test_episodes_beside_a_benchmark_give_intervals_unless_they_are_of_another_r
     assert frontier.main([str(path)]) == 0
     assert "ratio 1.044 [1.044, 1.044]" in capsys.readouterr().out
     (tmp_path / "episodes.csv").write_text("\n".join([*lines[:-1], lines[-1].replace("0.06", "nan")]))
-    assert frontier.main([str(path)]) == 2
-    assert "no episodes of a benchmark, or damaged" in capsys.readouterr().err
+    assert "no episodes of a benchmark, or damaged" in refused(frontier.main, [str(path)])
     (tmp_path / "episodes.csv").write_text("\n".join(lines))
     path.write_text(path.read_text().replace("0.06", "0.0601"))
-    assert frontier.main([str(path)]) == 2
-    assert "episodes.csv is of another run: agent on randomized" in capsys.readouterr().err
+    assert "episodes.csv is of another run: agent on randomized" in refused(frontier.main, [str(path)])
