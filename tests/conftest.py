@@ -139,6 +139,14 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[[Callable[[list[str]
     return run
 
 
+@pytest.fixture(scope="session")
+def ppo() -> Any:
+    """A learner that has learned a little, for tests that leave it as it is."""
+    from small_learners import SMALL, trained
+
+    return trained(SMALL)
+
+
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20)

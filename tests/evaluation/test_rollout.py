@@ -124,11 +124,6 @@ def test_compute_is_time_in_predict_per_step_and_episode() -> None:
     assert run.microseconds_per_step == pytest.approx(1e6 * run.seconds_in_policy / (3 * SHORT.steps))
 
 
-def test_no_seeds_no_rollout() -> None:
-    with pytest.raises(ValueError, match="at least one seed"):
-        rollout(OpenLoop(), SHORT, [])
-
-
 class OnlyAnAction:
     """Forgets that ``predict`` returns its state too."""
 
@@ -164,9 +159,10 @@ def test_a_name_is_no_config(make: Any) -> None:
         make("hard")
 
 
-def test_a_number_is_no_seeds() -> None:
+@pytest.mark.parametrize("seeds", [[], 5])
+def test_seeds_that_are_none_are_refused(seeds: Any) -> None:
     with pytest.raises(ValueError, match=r"needs a sequence of at least one seed, as \[1\]"):
-        rollout(OpenLoop(), SHORT, 5)  # type: ignore[arg-type]
+        rollout(OpenLoop(), SHORT, seeds)
 
 
 def test_after_import_cz_gym_everything_is_there() -> None:

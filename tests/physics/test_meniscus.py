@@ -20,13 +20,6 @@ def angles(r_c: np.ndarray, h_c: np.ndarray) -> np.ndarray:
     return np.arcsin(B / np.sqrt(1 + A**2)) - np.arctan(A)
 
 
-def test_slope_is_the_closed_form_of_the_design(points: tuple[np.ndarray, np.ndarray]) -> None:
-    sine, cosine = hurle_slope(*points, PULLER)
-    theta = angles(*points)
-    np.testing.assert_allclose(sine, np.sin(theta), atol=1e-14)
-    np.testing.assert_allclose(cosine, np.cos(theta), atol=1e-14)
-
-
 def test_slope_solves_hurles_equation(points: tuple[np.ndarray, np.ndarray]) -> None:
     r_c, h_c = points
     sine, cosine = hurle_slope(r_c, h_c, PULLER)

@@ -1,8 +1,6 @@
 """The exact meniscus against an independent solver, its limits and its table."""
 
 import math
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -133,8 +131,3 @@ def test_outside_the_table_is_nan():
 def test_no_meniscus_rises_that_high():
     with pytest.raises(ArithmeticError, match="Young-Laplace"):
         exact.solve(0.01, 1.4 * A, A, PHI_B)
-
-
-def test_importing_the_package_does_not_load_the_table():
-    code = "import sys, cz_gym; sys.exit(any('young_laplace' in name for name in sys.modules))"
-    subprocess.run([sys.executable, "-c", code], check=True)

@@ -29,6 +29,19 @@ def test_the_command_prints_the_counts(capsys: pytest.CaptureFixture[str]) -> No
     assert "circles none" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("module", "absent"),
+    [
+        ("cz_gym", {"cz_gym.physics.young_laplace", "cz_gym.physics.young_laplace_table"}),
+        ("cz_gym.play", {"torch", "pygame", "PIL", "onnxruntime"}),
+        ("studies.film.__main__", {"torch", "pygame", "PIL"}),
+    ],
+)
+def test_importing_loads_nothing_that_is_not_needed(module: str, absent: set[str]) -> None:
+    code = f"import sys, {module}; assert not {absent} & set(sys.modules)"
+    subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=ROOT, check=True)
+
+
 @pytest.mark.parametrize("name", ["baselines", "agents"])
 def test_no_module_has_a_second_name(name: str) -> None:
     code = f"import cz_gym.{name}\ntry: import {name}.anything\nexcept ImportError as error: print(error)"

@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from cz_gym import CzEnv, CzVectorEnv
+from cz_gym import CzEnv
 from studies.speed import __main__ as speed
 from studies.speed import cases, costs
 from studies.speed.__main__ import RATIOS, Plan, Row, main, measure, ratio
@@ -102,14 +102,6 @@ def test_ratios_are_of_like_with_like() -> None:
         "failing_vs_not_failing": None,
     }
     assert speed.growth(rows) == {"cost_per_step_4096_vs_1024": 100.0 / 900.0}
-
-
-def test_spread_out_slots_truncate_at_different_times() -> None:
-    env = CzVectorEnv(32, "nominal", horizon=100.0)
-    cases.spread_out(env)
-    ends = [int(env.step(np.zeros((32, 2)))[3].sum()) for _ in range(21)]
-    assert sum(ends) >= 32
-    assert max(ends) < 16
 
 
 @pytest.mark.slow

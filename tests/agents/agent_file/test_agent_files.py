@@ -12,7 +12,6 @@ import pytest
 from contracts import facts
 from hypothesis import given
 from hypothesis import strategies as st
-from small_learners import SMALL, trained
 
 from cz_gym import Parameters
 from cz_gym.agents import AgentFileError, OnnxPolicy, shipped
@@ -24,11 +23,6 @@ from cz_gym.evaluation.rollout import rollout
 from cz_gym.observation import HISTORY
 
 CONFIG = make_config(observation="history")
-
-
-@pytest.fixture(scope="module")
-def ppo() -> Any:
-    return trained(SMALL)
 
 
 @pytest.fixture

@@ -16,11 +16,6 @@ from cz_gym.agents.training.checkpoint import load_checkpoint, restore, to_bytes
 from cz_gym.agents.training.networks import Normalise
 
 
-@pytest.fixture(scope="module")
-def ppo() -> Any:
-    return trained(SMALL)
-
-
 def test_a_checkpoint_continues_and_refuses_what_does_not_fit(ppo: Any, tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.safetensors"
     path.write_bytes(to_bytes(ppo, 12.0, 0.5))

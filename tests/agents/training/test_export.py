@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pytest
 import torch
 from contracts import facts
-from small_learners import SMALL, SMALL_SAC, trained
+from small_learners import SMALL_SAC, trained
 
 from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.agent_file.contract import make_contract
@@ -17,11 +16,6 @@ from cz_gym.observation import HISTORY, STATE
 
 def observations(n: int, channels: int) -> np.ndarray:
     return np.random.default_rng(0).uniform(-3.0, 3.0, (n, channels)).astype(np.float32)
-
-
-@pytest.fixture(scope="module")
-def ppo() -> Any:
-    return trained(SMALL)
 
 
 def agent_of(learner: Any) -> OnnxPolicy:
