@@ -6,14 +6,13 @@ import csv
 import io
 import json
 import math
-import platform
 import subprocess
 import sys
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from cz_gym.agents.agent_file.contract import MAX_JSON_BYTES, AgentFileError, read_bounded, read_json
+from cz_gym.evaluation.files import software
 
 REFERENCES = ("paper", "paper-tuned", "lqg")
 """Classical controllers that an agent is shown beside while it learns."""
@@ -48,8 +47,7 @@ def provenance() -> dict[str, Any]:
     return {
         "command": " ".join([Path(sys.executable).name, *_program(), *sys.argv[1:]]),
         "git_commit": _git_commit(),
-        "python": platform.python_version(),
-        "packages": {name: _version(name) for name in PACKAGES},
+        **software(PACKAGES),
     }
 
 
@@ -71,13 +69,6 @@ def _git_commit() -> str | None:
             command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
         ).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
-        return None
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
         return None
 
 

@@ -7,6 +7,7 @@ import io
 import json
 import platform
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -92,8 +93,7 @@ def _provenance(benchmark: Benchmark) -> dict[str, Any]:
     config = benchmark.scenarios[0].row.config()
     return {
         "command": benchmark.command,
-        "python": platform.python_version(),
-        "packages": {name: _version(name) for name in PACKAGES},
+        **software(PACKAGES),
         "plant_hash": config.plant_hash,
         "control_interval_s": config.control_interval,
         "horizon_s": config.horizon,
@@ -126,11 +126,13 @@ def _facts(controller: Controller) -> dict[str, Any]:
     return {{"privileged": "told"}.get(name, name): value for name, value in asdict(controller).items()}
 
 
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
+def software(packages: Sequence[str]) -> dict[str, Any]:
+    """Versions of Python and of the packages, None for one that is not installed."""
+    found: dict[str, str | None] = dict.fromkeys(packages)
+    for name in packages:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return {"python": platform.python_version(), "packages": found}
 
 
 def to_csv(benchmark: Benchmark) -> str:
