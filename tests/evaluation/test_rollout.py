@@ -40,7 +40,7 @@ class FullPull:
 
 def one_by_one(policy: Any, config: Config, seed: int) -> tuple[dict[str, np.ndarray], float, bool]:
     """Signals up to the end, return and failure of an episode in the scalar environment."""
-    env = CzEnv(config.scenario, config.model, config.observation, config.control_interval, config.horizon, info="all")
+    env = CzEnv.from_config(config, info="all")
     observation, _ = env.reset(seed=seed)
     rows: list[dict[str, Any]] = []
     state, total, over, terminated = None, 0.0, False, False

@@ -99,17 +99,8 @@ def test_the_study_goes_on_from_what_is_finished(tmp_path: Path, capsys: pytest.
 
 @pytest.mark.slow
 def test_the_study_runs_examples_in_processes_of_their_own(tmp_path: Path) -> None:
-    command = [
-        sys.executable,
-        "-m",
-        "studies.plain_tools",
-        "--seeds",
-        "1",
-        "--steps",
-        "100",
-        "--out",
-        str(tmp_path / "out"),
-    ]
+    options = ["--seeds", "1", "--steps", "100", "--out", str(tmp_path / "out")]
+    command = [sys.executable, "-m", "studies.plain_tools", *options]
     done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert [row.example for row in plain_tools.read(tmp_path / "out" / "runs.csv")] == ["cleanrl_ppo", "sb3_ppo"]

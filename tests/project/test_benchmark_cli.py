@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from contracts import facts
-from onnx import TensorProto, helper, numpy_helper
+from contracts import LINEAR, facts, model_of
 
 import benchmark
 from cz_gym.agents import OnnxPolicy
@@ -36,18 +35,8 @@ ONE = ["--scenarios", "reference-b", "--controllers", "open-loop", "--quiet"]
 def constant_agent(path: Path, observation: str = "measured", **changes: Any) -> Path:
     """An agent file that always answers with the nominal drives."""
     channels = len(OBSERVATIONS[observation])
-    graph = helper.make_graph(
-        [helper.make_node("Gemm", ["observation", "weight", "bias"], ["action"])],
-        "constant",
-        [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["n", channels])],
-        [helper.make_tensor_value_info("action", TensorProto.FLOAT, ["n", 2])],
-        [
-            numpy_helper.from_array(np.zeros((channels, 2), np.float32), "weight"),
-            numpy_helper.from_array(np.zeros(2, np.float32), "bias"),
-        ],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    write_agent(path, model.SerializeToString(), **facts(observation, **changes))
+    weights = {"weight": np.zeros((channels, 2), np.float32), "bias": np.zeros(2, np.float32)}
+    write_agent(path, model_of([LINEAR], weights, channels).SerializeToString(), **facts(observation, **changes))
     return path
 
 
@@ -195,9 +184,6 @@ def test_agent_files_that_cannot_be_used_get_one_line(tmp_path: Path, refusal: A
     assert "different scenarios: hard, randomized" in refusal(["--agent", twice, "--agent", str(other)])
     assert "choose from" in (line := refusal(["--agent", f"mine={twice}", "--controllers", "your"]))
     assert "mine, gradient, ppo, ppo-recurrent, sac, random-search, imitation, or all" in line
-    endless = tmp_path / "twice.json"
-    endless.write_text(endless.read_text().replace('"validation_rmse_mm": 1.0', '"validation_rmse_mm": NaN'))
-    assert "validation_rmse_mm" in refusal([*SMALL, "--agent", twice])
 
 
 @pytest.mark.parametrize(

@@ -69,16 +69,7 @@ def run_case(config: Config, steps: int, seed: int) -> Totals:
     # At short intervals the horizon is cut so that every case meets ends by time as well.
     calls = max(1, round(steps / n))
     config = replace(config, horizon=min(config.horizon, max(1, 2 * calls // 3) * config.control_interval))
-    env = CzVectorEnv(
-        n,
-        config.scenario,
-        config.model,
-        config.observation,
-        config.control_interval,
-        config.horizon,
-        threads=1,
-        info="all",
-    )
+    env = CzVectorEnv.from_config(config, n, threads=1, info="all")
     adversaries, watch = Adversaries(n, seed), Watch(env)
     observation, infos = env.reset(seed=seed)
     watch.begin(observation, infos)

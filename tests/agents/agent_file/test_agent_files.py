@@ -55,6 +55,8 @@ def test_agent_for_another_plant_is_refused(agent: Path) -> None:
         ({"format_version": 1}, "format version 1, this release reads 4"),
         ({"sha256": "0" * 64}, "SHA-256 differs"),
         ({"surprise": 1}, "'surprise' is unknown"),
+        ({"validation_rmse_mm": float("nan")}, "must be finite"),
+        ({"validation_rmse_mm": float("inf")}, "must be finite"),
     ],
 )
 def test_broken_promises_are_refused(agent: Path, change: dict[str, Any], message: str) -> None:
@@ -63,14 +65,6 @@ def test_broken_promises_are_refused(agent: Path, change: dict[str, Any], messag
     with pytest.raises(AgentFileError, match=message) as caught:
         OnnxPolicy.load(agent)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("number", ["NaN", "Infinity"])
-def test_a_contract_without_finite_numbers_is_refused(agent: Path, number: str) -> None:
-    contract = agent.with_suffix(".json")
-    contract.write_text(contract.read_text().replace('"validation_rmse_mm": 1.0', f'"validation_rmse_mm": {number}'))
-    with pytest.raises(AgentFileError, match="must be finite"):
-        OnnxPolicy.load(agent)
 
 
 def last_bias(model: Any, value: Any) -> None:

@@ -9,10 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import contracts
 import numpy as np
 import onnx
 import pytest
-from contracts import facts
+from contracts import LINEAR, facts, graph_of, value
 from onnx import TensorProto, helper, numpy_helper
 
 from cz_gym.agents import AgentFileError, OnnxPolicy, shipped
@@ -23,25 +24,13 @@ from cz_gym.observation import MEASURED
 
 ROOT = Path(__file__).parents[3]
 CHANNELS = len(MEASURED)
-LINEAR = helper.make_node("Gemm", ["observation", "weight", "bias"], ["action"])
 WEIGHTS = {"weight": np.full((CHANNELS, 2), 0.01, np.float32), "bias": np.zeros(2, np.float32)}
 
 
-def value(name: str, *shape: Any) -> Any:
-    return helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
-
-
-def graph_of(nodes: list[Any], weights: dict[str, Any], **changes: Any) -> Any:
-    inputs = changes.get("inputs", [value("observation", "n", CHANNELS)])
-    outputs = changes.get("outputs", [value("action", "n", 2)])
-    tensors = [numpy_helper.from_array(np.asarray(array), name) for name, array in weights.items()]
-    return helper.make_graph(nodes, "graph", inputs, outputs, tensors)
-
-
 def model_of(nodes: list[Any] | None = None, weights: dict[str, Any] | None = None, **changes: Any) -> Any:
-    graph = graph_of([LINEAR] if nodes is None else nodes, WEIGHTS if weights is None else weights, **changes)
-    opsets = [helper.make_opsetid("", changes.get("opset", 17))]
-    return helper.make_model(graph, opset_imports=opsets, ir_version=9)
+    return contracts.model_of(
+        [LINEAR] if nodes is None else nodes, WEIGHTS if weights is None else weights, CHANNELS, **changes
+    )
 
 
 def policy_of(model: Any) -> OnnxPolicy:
@@ -100,7 +89,7 @@ def loop() -> Any:
 
 def branch() -> Any:
     node = helper.make_node("Identity", ["observation"], ["action"])
-    node.attribute.append(helper.make_attribute("then_branch", graph_of([LINEAR], WEIGHTS)))
+    node.attribute.append(helper.make_attribute("then_branch", graph_of([LINEAR], WEIGHTS, CHANNELS)))
     return model_of([node])
 
 
