@@ -37,7 +37,7 @@ def learner() -> Any:
 @pytest.fixture(scope="module")
 def agent(learner: Any) -> OnnxPolicy:
     content = learner.exported()
-    return OnnxPolicy.of(make_contract(content, **facts(algorithm="ppo-recurrent")), content)
+    return OnnxPolicy.of(make_contract(content, **facts(algorithm="ppo-recurrent", action="smooth")), content)
 
 
 def test_the_file_acts_as_the_policy_does(learner: Any, agent: OnnxPolicy) -> None:
