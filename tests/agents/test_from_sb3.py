@@ -1,7 +1,5 @@
 """Models of plain stable-baselines3 as agent files: the file acts as the model does, or there is none."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import subprocess

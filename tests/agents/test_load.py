@@ -1,7 +1,5 @@
 """Shipped agents by name."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

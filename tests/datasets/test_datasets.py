@@ -1,7 +1,5 @@
 """Datasets: stock Minari reads them, each episode can be made again, and what is wrong is said in one line."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What users copy: each example learns, is judged, and leaves what it says."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from contextlib import closing

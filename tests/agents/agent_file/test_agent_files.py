@@ -1,7 +1,5 @@
 """Agent files: what is broken, or made for something else, is refused in one line."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Agents' graphs: what may run, and that hostile ones are refused before anything large or foreign happens."""
 
-from __future__ import annotations
-
 import resource
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Checkpoints: what goes on is what was saved, and what does not belong is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

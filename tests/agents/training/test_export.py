@@ -1,7 +1,5 @@
 """What is exported acts as the network that was trained."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

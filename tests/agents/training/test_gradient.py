@@ -1,7 +1,5 @@
 """Learning from the gradient: it is the cost's own, the exported memory is the trained one, and it learns."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

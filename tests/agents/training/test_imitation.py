@@ -1,7 +1,5 @@
 """Imitating a teacher: what it demonstrates, what the network makes of it, and which crystals are shown."""
 
-from __future__ import annotations
-
 from dataclasses import astuple, replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Recurrent PPO: its file does what sb3-contrib's policy does, sample by sample, and a run of it ends in an agent."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

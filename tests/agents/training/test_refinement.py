@@ -1,7 +1,5 @@
 """PPO that goes on from an agent of the recipe gradient: it begins as that agent, and other files are refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Cz-v0 under other people's training code: plain stable-baselines3, and RL-Zoo's files."""
 
-from __future__ import annotations
-
 import inspect
 from pathlib import Path
 from typing import Any

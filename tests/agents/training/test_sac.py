@@ -1,7 +1,5 @@
 """Soft actor-critic: it begins gently, and its observations are normalised with what it does since."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

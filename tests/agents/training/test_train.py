@@ -1,7 +1,5 @@
 """``train.py``: a run leaves what it promises, goes on where it stopped, and answers mistakes in one line."""
 
-from __future__ import annotations
-
 import csv
 import errno
 import json

@@ -1,7 +1,5 @@
 """Training seeds learn on crystals of their own, and a resumed run on new ones."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 from typing import Any
 

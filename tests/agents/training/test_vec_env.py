@@ -1,7 +1,5 @@
 """The stable-baselines3 adapter against a vector of scalar environments."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

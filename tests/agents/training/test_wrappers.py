@@ -1,7 +1,5 @@
 """What stands between the batch and a learner: the weighted, scaled reward, and held actions."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
