@@ -2,11 +2,14 @@
 
 import os
 import time
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from cz_gym.agents.training import fleet, run
 from cz_gym.agents.training.learners import make_learner
 from cz_gym.agents.training.recipes import PPO, SAC, Imitation, Recipe
+from cz_gym.atomic_files import locked
 from cz_gym.baselines.registry import make_controller
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
@@ -27,16 +30,53 @@ def train_small_seed(job: fleet.Job) -> dict[str, float]:
 
 
 def train_held_seed(job: fleet.Job) -> dict[str, float]:
-    """The same, in a process of its own; it waits at each validation for a file ``go`` beside the run folders."""
+    """The same, held."""
+    hold()
+    return train_small_seed(job)
+
+
+def held(function: Callable[[Any], Any], task: Any) -> Any:
+    """Do a comparison's task, held."""
+    hold()
+    return function(task)
+
+
+def hold() -> None:
+    """Few validation episodes in this process, each after there is a file ``go`` beside the run folders."""
+    run.PICKING, run.JUDGING = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4]
     validate = run.Run._validate
 
-    def held(self: run.Run, bar: Any) -> Any:
+    def wait(self: run.Run, bar: Any) -> Any:
         while not (self.folder.parent / "go").exists():
             time.sleep(0.1)
         return validate(self, bar)
 
-    run.Run._validate = held  # type: ignore[method-assign]
-    return train_small_seed(job)
+    run.Run._validate = wait  # type: ignore[method-assign]
+
+
+def losing(nodes: tuple[Any, Any], folder: Path) -> Callable[[], None]:
+    """What :func:`cluster.completed` calls: takes the second node away when two runs have begun, then lets them go."""
+    made, second = nodes
+    lost = []
+
+    def watch() -> None:
+        begun = [path.parent for path in folder.glob("*/settings.json")]
+        if len(begun) == 2 and not lost:
+            lost.append(second)
+            made.remove_node(second, allow_graceful=False)
+        elif lost and any(map(is_free, begun)):
+            (folder / "go").touch()
+
+    return watch
+
+
+def is_free(folder: Path) -> bool:
+    """Whether no process is at work in a folder."""
+    try:
+        with locked(folder):
+            return True
+    except ValueError:
+        return False
 
 
 def tell_and_wait(task: Any) -> None:

@@ -29,10 +29,11 @@ WAIT = 1.0
 """Longest time between two looks at what is done [s]."""
 
 
-def connect(address: str) -> None:
+def connect(address: str, *more: str) -> None:
     """Join the cluster at ``HOST:PORT``; "" is one on this machine, begun if there is none.
 
-    ValueError says in a line what is wrong: no Ray, no cluster there, or a node with another ``cz_gym``.
+    ValueError says in a line what is wrong: no Ray, no cluster there, or a node with another ``cz_gym``, or with other
+    sources of the packages ``more``.
     """
     try:
         import ray
@@ -45,7 +46,7 @@ def connect(address: str) -> None:
             ray.init(address=address or None, **quiet)
         except (ConnectionError, ValueError, RuntimeError, OSError) as error:
             raise ValueError(f"no Ray cluster at {address or 'this machine'}: {' '.join(str(error).split())}") from None
-    _check_nodes(facts_of_sources())
+    _check_nodes(facts_of_sources(*more), *more)
 
 
 def _check_answers(address: str) -> None:
@@ -58,9 +59,9 @@ def _check_answers(address: str) -> None:
             raise ValueError(f"no Ray cluster at {address}: {error}") from None
 
 
-def _check_nodes(ours: tuple[str, str]) -> None:
+def _check_nodes(ours: tuple[str, str], *more: str) -> None:
     """ValueError names a node whose :func:`facts_of_sources` are others."""
-    for node, theirs in _answers(facts_of_sources):
+    for node, theirs in _answers(facts_of_sources, *more):
         if theirs != ours:
             raise ValueError(
                 f"node {node} has cz_gym {' '.join(theirs)}, this machine {' '.join(ours)}: install the same"
@@ -92,12 +93,13 @@ def _answers(question: Callable[..., Any], *arguments: Any) -> Iterator[tuple[st
             raise ValueError(f"node {node} cannot run cz_gym: {' '.join(str(cause).split())[:200]}") from None
 
 
-def facts_of_sources() -> tuple[str, str]:
-    """Version of ``cz_gym`` and hash of all its sources."""
+def facts_of_sources(*more: str) -> tuple[str, str]:
+    """Version of ``cz_gym`` and hash of all its sources, and of the packages ``more``."""
     digest = hashlib.sha256()
-    for package in ("cz_gym", "cz_gym.agents", "cz_gym.baselines"):
+    for package in ("cz_gym", "cz_gym.agents", "cz_gym.baselines", *more):
         spec = find_spec(package)
-        assert spec is not None
+        if spec is None:
+            raise ModuleNotFoundError(f"no package {package}: its checkout must be at the same place")
         root = Path(str(spec.origin)).parent
         for file in sorted(root.rglob("*.py")):
             digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes() + b"\0")
@@ -120,7 +122,7 @@ def completed(
     for name, module in list(sys.modules.items()):
         if name.startswith(PREFIX):  # other machines do not have the user's files
             ray.cloudpickle.register_pickle_by_value(module)
-    remote = ray.remote(function).options(num_cpus=1, max_retries=RETRIES)
+    remote: Any = ray.remote(lambda task: function(task)).options(num_cpus=1, max_retries=RETRIES)  # takes no partial
     numbers = {remote.remote(task): number for number, task in enumerate(tasks)}
     while numbers:
         done, _ = ray.wait(list(numbers), timeout=WAIT)

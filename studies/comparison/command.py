@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from .variants import Study, Variant
 
 if TYPE_CHECKING:
     from .results import Plan, Result
+    from .training import Perform
 
 STEPS = between(1, 10**9)
 """The type of an option that counts environment steps."""
@@ -38,7 +40,8 @@ def main(study: Study, arguments: Sequence[str] | None) -> int:
         default=study.steps,
         help=f"environment steps of what learns from reward (default: {study.steps or 'those of its recipe'})",
     )
-    parser.add_argument("--jobs", type=between(1, 64), default=2, help="runs at once (default: %(default)s)")
+    parser.add_argument("--jobs", type=between(1, 64), default=2, help="runs at once here (default: %(default)s)")
+    add_ray(parser, "without an address on this machine's")
     add_folders(parser, study.name)
     parser.add_argument("--list", action="store_true", help="say what the rows are and how many of their runs are done")
     given = parser.parse_args(arguments)
@@ -53,12 +56,30 @@ def add_folders(parser: OneLineParser, name: str) -> None:
         parser.add_argument(option, type=Path, default=default, help=f"{meaning} (default: %(default)s)")
 
 
+def add_ray(parser: OneLineParser, otherwise: str) -> None:
+    """The option --ray."""
+    about = f"run on a Ray cluster, {otherwise}; all its machines must share --out and --work"
+    parser.add_argument("--ray", nargs="?", const="", metavar="HOST:PORT", help=about)
+
+
+def join(address: str, plan: Plan) -> Plan:
+    """Join a Ray cluster whose machines share the plan's folders: the plan with their full paths."""
+    from cz_gym.evaluation.cluster import check_shared, connect
+
+    connect(address, "studies")
+    for folder in (plan.out, plan.work):
+        folder.mkdir(parents=True, exist_ok=True)
+        check_shared(folder)
+    return plan._replace(out=plan.out.resolve(), work=plan.work.resolve())
+
+
 def _main(study: Study, given: argparse.Namespace) -> int:
     from cz_gym.agents.training import validation
     from cz_gym.atomic_files import check_writable, locked
+    from cz_gym.evaluation.cluster import completed, in_processes
 
     from .results import Plan
-    from .training import is_finished
+    from .training import in_turn, is_finished
 
     plan, seeds = Plan(given.out, given.work, validation.JUDGING), range(given.seeds)
     variants = [variant.of(given.steps) for variant in study.variants]
@@ -70,16 +91,20 @@ def _main(study: Study, given: argparse.Namespace) -> int:
         return 0
     check_writable(plan.out)
     with locked(plan.work):
-        compare(study._replace(variants=variants), plan, chosen, seeds, given.jobs)
+        perform: Perform = in_turn if given.jobs == 1 else partial(in_processes, processes=given.jobs)
+        if given.ray is not None:
+            plan, perform = join(given.ray, plan), completed
+        compare(study._replace(variants=variants), plan, chosen, seeds, perform)
     return 0
 
 
-def compare(study: Study, plan: Plan, chosen: Sequence[Variant], seeds: Sequence[int], jobs: int) -> None:
+def compare(study: Study, plan: Plan, chosen: Sequence[Variant], seeds: Sequence[int], perform: Perform) -> None:
     """Train the chosen variants for each training seed, and write the table of all that is finished."""
     from .training import train_all
 
     # Seed by seed, so that a stopped comparison holds every variant.
-    train_all(plan, [(variant, seed) for seed in seeds for variant in chosen], jobs, lambda: _write(study, plan, seeds))
+    tasks = [(variant, seed) for seed in seeds for variant in chosen]
+    train_all(plan, tasks, perform, lambda: _write(study, plan, seeds))
     _write(study, plan, seeds)
     print(f"wrote {plan.out / 'table.md'}")
 

@@ -2,7 +2,9 @@
 
 import csv
 import json
+import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +16,13 @@ pytest.importorskip("matplotlib")
 
 from cz_gym.agents.training import run, validation
 from cz_gym.agents.training.recipes import PPO, SAC, Imitation, RecurrentPPO
+from cz_gym.evaluation import cluster
 from cz_gym.evaluation.protocol import TEST_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.statistics import Resamples
 from studies.comparison import command, lqg_family, results, table, training
 from studies.comparison.results import ACTIVITY, FIGURES, LOST, RMSE, Plan, Result
 from studies.comparison.variants import Study, Variant
+from tests.small_learners import held, losing
 
 SMALL = {"num_envs": 4, "hidden": (4,), "steps": 128}
 BASE = Variant(PPO(**SMALL, n_steps=16, batch_size=64, n_epochs=1), "as it is")
@@ -97,6 +101,32 @@ def test_a_comparison_keeps_what_is_finished_and_goes_on(
     assert [line.split()[:2] for line in listed] == [["sac", "0/1"], ["few", "1/1"]], "--steps are not an imitation's"
     assert command.main(STUDY, options) == 0
     assert len(trained) == 5
+
+
+@pytest.mark.usefixtures("small")
+def test_without_ray_the_extra_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "ray", None)
+    assert command.main(STUDY, ["--ray"]) == 2
+    assert capsys.readouterr().err == 'python -m studies.some: ray is missing: pip install ".[ray]"\n'
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.usefixtures("small")
+def test_a_lost_node_loses_nothing(nodes: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    there, here = tmp_path / "there", tmp_path / "here"
+    completed, watch = cluster.completed, losing(nodes, there / "work")
+    monkeypatch.setattr(cluster, "completed", lambda function, tasks: completed(partial(held, function), tasks, watch))
+    for folder, how in ((there, ["--ray"]), (here, ["--jobs", "1"])):
+        folders = ["--out", str(folder / "out"), "--work", str(folder / "work")]
+        assert command.main(STUDY, ["--rows", "few", "--seeds", "3", *folders, *how]) == 0
+    every = [json.loads(path.read_text())["sessions"] for path in (there / "work").glob("*/settings.json")]
+    assert sorted(map(len, every)) == [1, 1, 2], "one run was resumed, none done twice"
+    assert (there / "out/table.csv").read_text() == (here / "out/table.csv").read_text()
+    assert "few,ppo,0 1 2,2,rmse_mm" in (here / "out/table.csv").read_text()
 
 
 def test_a_result_is_of_everything_it_depends_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

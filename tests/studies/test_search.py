@@ -3,21 +3,31 @@
 from __future__ import annotations
 
 import csv
+import time
 from dataclasses import asdict
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
+import optuna
 import pytest
+
+pytest.importorskip("ray.tune", exc_type=ImportError)
 
 from cz_gym.agents.training import run
 from cz_gym.agents.training.recipes import PPO
-from cz_gym.agents.training.validation import PICKING, Validation
+from cz_gym.agents.training.validation import PICKING
 from cz_gym.evaluation.protocol import TEST_SEEDS, VALIDATION_SEEDS
 from studies.comparison import training
+from studies.comparison.results import Plan
 from studies.search import __main__ as search
+from studies.search import trials
 from studies.search.space import SPACE, params_of, recipe_of
+from tests.studies.bowl import attempt_bowl
 
+pytestmark = pytest.mark.filterwarnings("ignore")
 RECIPE = params_of(PPO())
+slow = pytest.mark.slow
 
 
 def test_the_space_turns_what_it_says() -> None:
@@ -40,23 +50,6 @@ def test_crystals_that_pick_judge_and_confirm_are_others() -> None:
     assert not set.union(*groups) & set(TEST_SEEDS)
 
 
-@pytest.fixture
-def tried(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """Trials that take no time: their cost is least at a small rate and many epochs."""
-    made: list[dict[str, Any]] = []
-
-    def bowl(params: dict[str, Any], seed: int, given: Any, report: Any) -> float:
-        assert seed == 0
-        made.append(params)
-        cost = params["learning_rate"] / 1e-3 + 1.0 / params["n_epochs"]
-        for look in range(1, 4):
-            report(look, Validation(cost, 0.1, 0.01, 0.0))
-        return float(cost)
-
-    monkeypatch.setattr(search, "objective", bowl)
-    return made
-
-
 def command(folder: Path, trials: int, finalists: int = 0) -> list[str]:
     folders = ["--out", str(folder / "out"), "--work", str(folder / "work")]
     return ["--trials", str(trials), "--finalists", str(finalists), *folders]
@@ -66,56 +59,75 @@ def history(folder: Path) -> list[dict[str, str]]:
     return list(csv.DictReader((folder / "out" / "history.csv").read_text().splitlines()))
 
 
-def test_a_search_begins_with_the_recipe_and_goes_on(tried: list[dict[str, Any]], tmp_path: Path) -> None:
-    assert search.main(command(tmp_path, 12)) == 0
-    first = history(tmp_path)
-    assert tried[0] == RECIPE
-    assert float(first[0]["learning_rate"]) == pytest.approx(RECIPE["learning_rate"])
-    assert search.main(command(tmp_path, 24)) == 0
-    every = history(tmp_path)
-    assert every[:12] == first
-    assert len(every) == len(tried) == 24
-    assert {row["state"] for row in every} == {"complete", "pruned"}
-    assert min(float(row["cost"]) for row in every if row["state"] == "complete") < 0.8 * float(first[0]["cost"])
-    assert search.main(command(tmp_path, 24)) == 0
-    assert len(tried) == 24
-    assert search.main([*command(tmp_path, 2), "--steps", "7"]) == 0
-    assert len(tried) == 26, "trials of other steps are another search"
+def begun(folder: Path) -> int:
+    return len(list((folder / "work" / "begun").glob("*")))
 
 
-def test_an_interrupted_trial_comes_again(
-    tried: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert search.main(command(tmp_path, 4)) == 0
-    stopped: list[dict[str, Any]] = []
-
-    def stop(params: dict[str, Any], *others: Any) -> float:
-        stopped.append(params)
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(search, "objective", stop)
-        assert search.main(command(tmp_path, 6)) == 130
-    assert "goes on from the trials" in capsys.readouterr().err
-    assert len(history(tmp_path)) == 4
-    assert search.main(command(tmp_path, 6)) == 0
-    assert tried[4] == stopped[0]
-    assert len(history(tmp_path)) == 6
-
-
-def test_the_best_are_confirmed_with_other_seeds(
-    tried: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@slow
+def test_a_search_begins_with_the_recipe_goes_on_and_confirms_the_best(
+    nodes: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     met: list[Any] = []
     monkeypatch.setattr(search, "compare", lambda *given: met.append(given))
-    assert search.main([*command(tmp_path, 10, finalists=2), "--seeds", "2"]) == 0
+    monkeypatch.setattr(trials, "attempt", attempt_bowl)
+    monkeypatch.setattr(trials, "OTHERS", 2)
+    (tmp_path / "work").mkdir()
+    (tmp_path / "work" / "go").touch()
+    assert search.main(command(tmp_path, 3)) == 0
+    first = history(tmp_path)
+    assert float(first[0]["learning_rate"]) == pytest.approx(RECIPE["learning_rate"])
+    assert search.main([*command(tmp_path, 8, finalists=2), "--seeds", "2"]) == 0
+    every = history(tmp_path)
+    assert every[:3] == first
+    assert len(every) == begun(tmp_path) == 8
+    assert {row["state"] for row in every} == {"complete", "pruned"}
     ((study, plan, variants, seeds, _),) = met
     assert [variant.base for variant in variants] == ["", "ppo", "ppo"]
     assert list(plan.crystals) == list(search.crystals()[1])
     assert list(seeds) == [1, 2]
-    done = sorted((row for row in history(tmp_path)[1:] if row["state"] == "complete"), key=lambda r: float(r["cost"]))
+    done = sorted((row for row in every[1:] if row["state"] == "complete"), key=lambda row: float(row["cost"]))
     assert [variant.name for variant in study.variants[1:]] == [f"ppo-trial-{row['trial']}" for row in done[:2]]
     assert variants[1].recipe.learning_rate == pytest.approx(float(done[0]["learning_rate"]), rel=1e-4)
+    assert search.main(command(tmp_path, 8)) == 0
+    assert begun(tmp_path) == 8
+    assert search.main([*command(tmp_path, 1), "--steps", "7"]) == 0
+    assert begun(tmp_path) == 9, "trials of other steps are another search"
+
+
+@slow
+def test_a_lost_node_loses_nothing(nodes: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, second = nodes
+    monkeypatch.setattr(trials, "attempt", attempt_bowl)
+
+    def lose() -> None:
+        while begun(tmp_path) < 2:
+            time.sleep(0.1)
+        made.remove_node(second, allow_graceful=False)
+        (tmp_path / "work" / "go").touch()
+
+    losing = Thread(target=lose)
+    losing.start()
+    assert search.main(command(tmp_path, 4)) == 0
+    losing.join()
+    assert len({row["trial"] for row in history(tmp_path)}) == len(history(tmp_path)) == 4
+    assert begun(tmp_path) == 5, "one trial was begun again"
+
+
+def test_interrupted_trials_come_again_and_once(tmp_path: Path) -> None:
+    study = optuna.create_study()
+    trials.enqueue(study)
+    study.tell(study.ask(SPACE), 1.0)
+    lost, failed = study.ask(SPACE), study.ask(SPACE)
+    study.tell(failed, state=optuna.trial.TrialState.FAIL)
+    for _ in range(2):
+        trials.enqueue(study)
+    again = [study.ask(SPACE) for _ in range(2)]
+    assert [trial.params for trial in again] == [lost.params, failed.params]
+    study.tell(again[0], 2.0)
+    trials.enqueue(study)
+    assert study.ask(SPACE).params == failed.params
+    assert [trial.params for trial in trials.finished(study)] == [RECIPE, lost.params]
+    assert study.ask(SPACE).params not in (RECIPE, lost.params, failed.params)
 
 
 @pytest.mark.parametrize(
@@ -137,24 +149,25 @@ def test_mistakes_give_one_line(arguments: list[str], message: str, capsys: pyte
     assert error.count("\n") == 1
 
 
-def test_the_objective_trains_once_and_can_be_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_attempt_goes_on_and_tells_all_its_validations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[float] = []
+
+    def report(row: dict[str, float]) -> None:
+        told.append(row["cost"])
+        if len(told) == 2:
+            raise KeyboardInterrupt
+
     monkeypatch.setattr(run, "PICKING", VALIDATION_SEEDS[:2])
-    monkeypatch.setattr(search, "crystals", lambda: (VALIDATION_SEEDS[2:4], VALIDATION_SEEDS[4:6]))
-    given: Any = search.parser().parse_args([*command(tmp_path, 1), "--steps", "24576"])
-    looks: list[int] = []
-    cost = search.objective(RECIPE, 0, given, lambda steps, found: looks.append(steps))
-    assert cost > 0.0
-    assert len(looks) >= search.VALIDATIONS
+    monkeypatch.setattr(run, "JUDGING", VALIDATION_SEEDS[2:4])
+    monkeypatch.setattr(trials.tune, "report", report)
+    plan = Plan(tmp_path / "out", tmp_path / "work", VALIDATION_SEEDS[4:6])
+    asked = trials.Search(plan, 24576, 1, 0)
+    with pytest.raises(KeyboardInterrupt):
+        trials.attempt(RECIPE, asked)
+    trials.attempt(RECIPE, asked)
+    assert told[:2] == told[2:4]
+    assert len(told) > 2 + trials.VALIDATIONS
     monkeypatch.setattr(training, "Run", None)
-    assert search.objective(RECIPE, 0, given) == cost, "the result is cached"
-    monkeypatch.undo()
-
-    class GivenUp(Exception):
-        pass
-
-    def give_up(steps: int, found: Validation) -> None:
-        raise GivenUp
-
-    monkeypatch.setattr(run, "PICKING", VALIDATION_SEEDS[:2])
-    with pytest.raises(GivenUp):
-        search.objective({**RECIPE, "n_epochs": 1}, 0, given, give_up)
+    told_once = told[2:]
+    trials.attempt(RECIPE, asked)
+    assert told[2 + len(told_once) :] == pytest.approx(told_once, rel=1e-4), "the result is cached"

@@ -23,7 +23,7 @@ from cz_gym.atomic_files import locked
 from cz_gym.baselines.registry import make_controller
 from cz_gym.evaluation import cluster
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
-from tests.small_learners import SMALL_IMITATION, train_held_seed, train_small_seed
+from tests.small_learners import SMALL_IMITATION, losing, train_held_seed, train_small_seed
 
 ROOT = Path(__file__).parents[3]
 SMALL_PPO = PPO(steps=4096, num_envs=64, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,), control_interval=30.0)
@@ -73,14 +73,6 @@ def sessions(folder: Path) -> list[int]:
 def jobs(folder: Path, seeds: range, recipe: Recipe = SMALL_IMITATION) -> list[fleet.Job]:
     options = make_controller, 0.0, False, ["train.py", "--seeds"]
     return [fleet.Job(folder / f"seed{seed}", recipe, seed, *options) for seed in seeds]
-
-
-def is_free(folder: Path) -> bool:
-    try:
-        with locked(folder):
-            return True
-    except ValueError:
-        return False
 
 
 def done(some: list[fleet.Job], perform: fleet.Perform) -> list[int]:
@@ -219,26 +211,15 @@ def test_processes_end_with_a_killed_caller() -> None:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_lost_node_loses_nothing(nodes: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made, second = nodes
-    there, lost = jobs(tmp_path / "there", range(3)), []
+    watch = losing(nodes, tmp_path / "there")
     cluster.check_shared(tmp_path)
 
-    def losing(function: Any, tasks: Any, look: Callable[[], None]) -> Any:
-        def watch() -> None:
-            look()
-            begun = [job.folder for job in there if job.begun]
-            if len(begun) == 2 and not lost:
-                lost.append(second)
-                made.remove_node(second, allow_graceful=False)
-            elif lost and any(map(is_free, begun)):
-                (tmp_path / "there" / "go").touch()
-
-        return cluster.completed(function, tasks, watch)
+    def perform(function: Any, tasks: Any, look: Callable[[], None]) -> Any:
+        return cluster.completed(function, tasks, lambda: (look(), watch()))
 
     with monkeypatch.context() as patch:
         patch.setattr(fleet, "train_seed", train_held_seed)
-        assert sorted(done(there, losing)) == [0, 1, 2]
-    assert lost
+        assert sorted(done(jobs(tmp_path / "there", range(3)), perform)) == [0, 1, 2]
     monkeypatch.setattr(fleet, "train_seed", train_small_seed)
     assert sorted(sessions(tmp_path / "there")) == [1, 1, 2], "one seed was resumed, none trained twice"
     assert done(jobs(tmp_path / "here", range(3)), in_turn) == [0, 1, 2]

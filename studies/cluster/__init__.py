@@ -1,0 +1,1 @@
+"""Time of a benchmark's tasks against nodes of a Ray cluster: ``python -m studies.cluster``."""
