@@ -27,15 +27,19 @@ def test_the_stable_baselines_example_writes_an_agent(tmp_path: Path, monkeypatc
     assert len(Path(sb3_ppo.__file__).read_text().splitlines()) <= 40
 
 
-def test_the_cleanrl_example_learns(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """It judges itself eight times, and at its end says what it returns."""
+@pytest.mark.parametrize("steps", [8192, pytest.param(262_144, marks=pytest.mark.slow)])
+def test_the_cleanrl_example_learns(
+    steps: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It judges itself eight times, or after each update of a few, and at its end says what it returns."""
     monkeypatch.setattr(cleanrl_ppo, "VALIDATION_SEEDS", cleanrl_ppo.VALIDATION_SEEDS[:8])
-    found = cleanrl_ppo.main(cleanrl_ppo.Args(steps=262_144, num_envs=64, minibatch=1024))
+    found = cleanrl_ppo.main(cleanrl_ppo.Args(steps=steps, num_envs=64, minibatch=1024))
     said = capsys.readouterr().out.splitlines()
-    assert len(said) == 8
+    assert len(said) == min(8, steps // 4096)
     assert said[-1].startswith(
-        f"  262,144 steps: radius error {found.rmse_mm:.3f} mm, {100 * found.failure_rate:.0f} %"
+        f"{steps:>9,} steps: radius error {found.rmse_mm:.3f} mm, {100 * found.failure_rate:.0f} %"
     )
+    assert steps < 100_000 or found.failure_rate < 1.0, "it has learned to hold some crystals"
 
 
 @pytest.fixture
