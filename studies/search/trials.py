@@ -90,7 +90,7 @@ def run(search: Search) -> Study:
     median: Any = MedianStoppingRule("training_iteration", "cost", "min", **rule)
     for earlier in done:
         for number, cost in earlier.intermediate_values.items():
-            median.on_trial_result(None, earlier.number, {"training_iteration": number, "cost": cost})
+            median.on_trial_complete(None, earlier.number, {"training_iteration": number, "cost": cost})
     sampler = optuna.samplers.TPESampler(seed=search.seed + len(done), n_startup_trials=STARTUP)
     searcher = OptunaSearch(SPACE, "cost", "min", sampler=sampler, study_name=study.study_name, storage=storage)
     shutil.rmtree(search.plan.work / "tune", ignore_errors=True)
