@@ -150,7 +150,7 @@ class CzEnv(gym.Env[Observation, Action]):
         self.render_mode = render_mode
         self.action_space = action_space()
         self.observation_space = observation_space(config.observation)
-        self._batch = Batch(self.config, 1)
+        self._batch = Batch(self.config, 1, everything=self._everything or render_mode is not None)
         self._slots = self._batch.memory.slots
         self._out = self._batch.new_out()
         self._action = np.zeros((1, 2))

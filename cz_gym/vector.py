@@ -100,7 +100,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         self.single_observation_space = observation_space(config.observation)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._batch = Batch(self.config, num_envs, threads)
+        self._batch = Batch(self.config, num_envs, threads, self._everything)
         self._out = self._batch.new_out()
         self._everybody: Mask = np.ones(num_envs, np.bool_)
         self._over = self._everybody.copy()

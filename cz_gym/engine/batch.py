@@ -97,7 +97,7 @@ class Batch:
     The arrays of :meth:`new_out` are never written again while anything refers to them.
     """
 
-    def __init__(self, config: Config, num_envs: int, threads: int | None = None) -> None:
+    def __init__(self, config: Config, num_envs: int, threads: int | None = None, everything: bool = True) -> None:
         self.config = config
         self.identity = config.identity
         self.num_envs = num_envs
@@ -117,6 +117,7 @@ class Batch:
             1.0 / (ages.oldest - ages.newest + 1),
             span_scales(),
             relative(),
+            everything,
         )
         depth = int(ages.oldest[-1]) + 2 if config.observation == "history" else 0
         frames = (
@@ -240,7 +241,7 @@ class Batch:
 
     def advance(self, rings: npt.NDArray[np.float64]) -> None:
         """Drives, plant and ring [m] of every slot, and nothing else: what the speed of a step is measured against."""
-        arguments = (self.memory, self.actions, self.clock, self.drives, rings)
+        arguments = (self.memory, self.actions, self._all, self.clock, self.drives, rings)
         self._run(self.kernels.plant, arguments, self.num_envs, SLOTS_PER_THREAD, SLOTS_AT_ONCE)
 
     def _run(self, loop: Any, arguments: tuple[Any, ...], count: int, least: int, share: int = 1) -> list[Any]:

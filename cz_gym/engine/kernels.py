@@ -11,39 +11,24 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cz_gym.episodes.draw import draw_episode, draw_factors, randomised, seed_streams
-from cz_gym.episodes.noise import first_fluctuation, fluctuation, next_fluctuation, sample_noise
-from cz_gym.episodes.record import GRID
-from cz_gym.episodes.schedule import drift, melt_left, reference
+from cz_gym.episodes.noise import first_fluctuation, fluctuation, sample_noise
 from cz_gym.jit.cache import hashed
 from cz_gym.jit.compile import fetch, inlined, kernel, physics
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
-from cz_gym.physics.plant import Disturbance, Inputs, State, derive_puller, growth, hidden_load, rk4
-from cz_gym.task import (
-    HEATER_RANGE,
-    HEIGHT_MAX_IN_A,
-    HEIGHT_MIN,
-    Cost,
-    cost_terms,
-    failure_penalty,
-    reward,
-    within_limits,
-)
-from cz_gym.units import MM
+from cz_gym.physics.plant import Disturbance, State, derive_puller, growth
+from cz_gym.task import HEATER_RANGE, Cost, cost_terms, failure_penalty, reward
 
-from .layout import EPISODE_AT, INFO, PULLER_AT, SLOT
+from .layout import EPISODE_AT, INFO, LEAN, PULLER_AT, SLOT
+from .lockstep import LANES, advance, height_inside
 from .outputs import clip, measure, recall, remember, write_info, write_measured, write_state
-from .sensors import photograph, sense
+from .sensors import sense
 
 TRIES = 100
 """A puller without an operating point is drawn again, from the same stream, at most so often in all."""
-_EPS = 1e-9
-_CLIPPED = INFO.index("action_clipped")
-_LOW = 5.0 * MM
-"""Above this height no melt can freeze the meniscus within half a substep [m]."""
-_JUMP = HEIGHT_MIN
+_R_C, _R_REF, _CLIPPED = (INFO.index(name) for name in (*LEAN, "action_clipped"))
 _LINE = 8
 """Numbers of eight bytes in a line of the cache."""
-_NUMBERS, _ROWS = SLOT.itemsize // 8, len(INFO)
+_NUMBERS, _INFOS = SLOT.itemsize // 8, len(INFO)
 
 
 @physics
@@ -91,74 +76,12 @@ def _drive(slot: Any, pull: Any, heat: Any, drives: Any, interval: Any) -> None:
         slot.Q_H = np.maximum(whole, 0.0)
 
 
-@physics
-def height_inside(h_c: Any, p: Any) -> Any:
-    """Meniscus height held inside its limits, so that a failed state is still measured."""
-    top = HEIGHT_MAX_IN_A * p.a
-    if h_c.real < HEIGHT_MIN:
-        return HEIGHT_MIN
-    return top if h_c.real > top else h_c
-
-
-@physics
-def _substep(x: Any, u: Any, d: Any, p: Any, dt: Any, r_ref: Any, slope: Any) -> Any:
-    """One RK4 substep and whether the crystal still grows; a jump no crystal makes keeps the state before.
-
-    Over a melt far too cold a low meniscus freezes within seconds, and a step across that singularity can end anywhere,
-    inside the limits too. There the height falls faster and faster, so half the step at the first rate tells.
-    """
-    new = rk4(x, u, d, p, dt, slope)
-    inside = within_limits(new.r_c, new.h_c, r_ref, p.a)
-    grows = inside
-    if inside and x.h_c < _LOW:
-        grows = x.h_c + 0.5 * dt * (u.v_p - growth(x, d, p, slope).v_g) >= HEIGHT_MIN
-    if not grows and (inside or not (np.abs(new.r_c - x.r_c) < _JUMP and np.abs(new.h_c - x.h_c) < _JUMP)):
-        new = State(x.r_c, x.h_c, x.T_1, x.T_2, x.T_b)
-    return new, grows
-
-
-@physics
-def _disturb(slot: Any, j: Any) -> Any:
-    """The disturbance at grid point j, this one or the next; the hidden load is solved only while the drift moves."""
-    p, e = slot.puller, slot.episode
-    if j != slot.point:
-        slot.point = j
-        slot.fast, slot.slow = next_fluctuation(e, slot.streams, slot.fast, slot.slow)
-        slot.dT_i = fluctuation(e, slot.fast, slot.slow)
-    shift = drift(j * GRID, e)
-    if shift != slot.drift:
-        slot.drift, slot.Q_d = shift, hidden_load(shift, p)
-    return Disturbance(slot.Q_d, slot.dT_i, melt_left(j * GRID, e))
-
-
-@physics
-def _advance(slot: Any, frames: Any, clock: Any, slope: Any, ring_offset: Any) -> Any:
-    """Integrate over one control interval, split at the 5 s grid; returns whether the crystal still grows."""
-    p, e = slot.puller, slot.episode
-    u = Inputs(slot.v_p, slot.Q_H)
-    x = State(slot.x.r_c, slot.x.h_c, slot.x.T_1, slot.x.T_2, slot.x.T_b)
-    t, end = slot.k * clock.interval, (slot.k + 1) * clock.interval
-    grows = True
-    while grows and t < end - _EPS:
-        j = int(t / GRID + _EPS)
-        upto = min((j + 1) * GRID, end)
-        x, grows = _substep(x, u, _disturb(slot, j), p, upto - t, p.r_0 + reference(upto, e), slope)
-        t = upto
-        if e.latency > 0.0 and t < end - _EPS:
-            h_c = height_inside(x.h_c, p)
-            photograph(slot, frames, t, x.r_c + ring_offset(x.r_c, h_c, p) - p.ring_bias, h_c)
-    slot.x.r_c, slot.x.h_c, slot.x.T_1, slot.x.T_2, slot.x.T_b = x.r_c, x.h_c, x.T_1, x.T_2, x.T_b
-    slot.k = slot.k + 1
-    return grows
-
-
 @inlined
 def _sample(memory: Any, i: Any, fresh: Any, clock: Any, reading: Any, out: Any, slope: Any, ring_offset: Any) -> Any:
     """Read slot i, or repeat its last reading, and write observation and info; returns the step's cost."""
     slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
     t, h_c = slot.k * clock.interval, height_inside(x.h_c, p)
     ring = x.r_c + ring_offset(x.r_c, h_c, p)
-    at_interface = growth(State(x.r_c, h_c, x.T_1, x.T_2, x.T_b), Disturbance(slot.Q_d, slot.dT_i, 1.0), p, slope)
     if fresh:
         camera, pyrometer = sample_noise(slot.episode, slot.streams)
         sense(slot, camera, pyrometer, memory.frames[i], t, ring - p.ring_bias, h_c)
@@ -175,7 +98,11 @@ def _sample(memory: Any, i: Any, fresh: Any, clock: Any, reading: Any, out: Any,
     cost = cost_terms(error, measured.v_p, slot.v_p - slot.v_p_before, slot.Q_H - slot.Q_H_before)
     if slot.k == 0:
         cost = Cost(0.0, 0.0, 0.0, 0.0)
-    write_info(slot, measured, cost, t, ring, at_interface, out.info[:, i])
+    if reading.everything:
+        at_interface = growth(State(x.r_c, h_c, x.T_1, x.T_2, x.T_b), Disturbance(slot.Q_d, slot.dT_i, 1.0), p, slope)
+        write_info(slot, measured, cost, t, ring, at_interface, out.info[:, i])
+    else:
+        out.info[_R_C, i], out.info[_R_REF, i] = x.r_c, p.r_0 + measured.r_ref
     out.info[_CLIPPED, i] = slot.clipped
     return cost
 
@@ -200,9 +127,8 @@ def _fetch_slot(numbers: Any, i: Any) -> None:
 @physics
 def _fetch_info(info: Any, i: Any) -> None:
     """Have the lines brought that the info of slot i and of those after it is written to."""
-    if i % _LINE == 0:
-        for row in range(_ROWS):
-            fetch(info, row * info.shape[1] + i)
+    for row in range(_INFOS):
+        fetch(info, row * info.shape[1] + i)
 
 
 class Kernels(NamedTuple):
@@ -219,8 +145,8 @@ class Kernels(NamedTuple):
     """``show(memory, which, clock, reading, out, start, stop)``: the last sample of the slots ``which[start:stop]``
     again."""
     plant: Any
-    """``plant(memory, actions, clock, drives, rings, start, stop)``: drives, plant and ring alone, to measure speed
-    against."""
+    """``plant(memory, actions, active, clock, drives, rings, start, stop)``: drives, plant and ring of all slots alone,
+    to measure speed against."""
     derive: Any
     """``derive(parameters, lam)``: the puller at its operating point."""
 
@@ -233,21 +159,26 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
         memory: Any, actions: Any, active: Any, clock: Any, drives: Any, reading: Any, out: Any, start: int, stop: int
     ) -> int:
         ended = 0
-        for i in range(start, stop):
-            if not active[i]:
-                continue
-            _fetch_slot(memory.numbers, i + 1)
-            _fetch_info(out.info, i + _LINE)
-            slot = memory.slots[i]
-            _drive(slot, actions[i, 0], actions[i, 1], drives, clock.interval)
-            grows = _advance(slot, memory.frames[i], clock, slope, ring_offset)
-            cost = _sample(memory, i, True, clock, reading, out, slope, ring_offset)
-            ends = slot.k >= clock.steps
-            out.reward[i] = reward(cost) + (0.0 if grows else failure_penalty(slot.k, clock.steps))
-            out.terminated[i] = not grows
-            out.truncated[i] = grows and ends
-            slot.over = 1 if (not grows or ends) else 0
-            ended += slot.over
+        for first in range(start, stop, LANES):
+            count = min(LANES, stop - first)
+            for i in range(first, first + count):
+                if active[i]:
+                    _drive(memory.slots[i], actions[i, 0], actions[i, 1], drives, clock.interval)
+            advance(memory, active, first, count, clock, slope, ring_offset)
+            if reading.everything:
+                _fetch_info(out.info, first + LANES)
+            for i in range(first, first + count):
+                _fetch_slot(memory.numbers, i + LANES)
+                if not active[i]:
+                    continue
+                slot, grows = memory.slots[i], memory.slots[i].over == 0
+                cost = _sample(memory, i, True, clock, reading, out, slope, ring_offset)
+                ends = slot.k >= clock.steps
+                out.reward[i] = reward(cost) + (0.0 if grows else failure_penalty(slot.k, clock.steps))
+                out.terminated[i] = not grows
+                out.truncated[i] = grows and ends
+                slot.over = 1 if (not grows or ends) else 0
+                ended += slot.over
         return ended
 
     def draw(
@@ -280,13 +211,18 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
         for at in range(start, stop):
             _sample_alone(memory, which[at], False, clock, reading, out, slope, ring_offset)
 
-    def plant(memory: Any, actions: Any, clock: Any, drives: Any, rings: Any, start: int, stop: int) -> None:
-        for i in range(start, stop):
-            _fetch_slot(memory.numbers, i + 1)
-            slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
-            _drive(slot, actions[i, 0], actions[i, 1], drives, clock.interval)
-            _advance(slot, memory.frames[i], clock, slope, ring_offset)
-            rings[i] = x.r_c + ring_offset(x.r_c, height_inside(x.h_c, p), p)
+    def plant(
+        memory: Any, actions: Any, active: Any, clock: Any, drives: Any, rings: Any, start: int, stop: int
+    ) -> None:
+        for first in range(start, stop, LANES):
+            count = min(LANES, stop - first)
+            for i in range(first, first + count):
+                _drive(memory.slots[i], actions[i, 0], actions[i, 1], drives, clock.interval)
+            advance(memory, active, first, count, clock, slope, ring_offset)
+            for i in range(first, first + count):
+                _fetch_slot(memory.numbers, i + LANES)
+                p, x = memory.slots[i].puller, memory.slots[i].x
+                rings[i] = x.r_c + ring_offset(x.r_c, height_inside(x.h_c, p), p)
 
     def derive(parameters: Any, lam: float) -> Any:
         return derive_puller(parameters, lam, height, ring_offset)

@@ -120,6 +120,8 @@ class Reading(NamedTuple):
     relative: Any
     """Places of the channels that "history" holds relative to another one, of those others, and the change of scale:
     three arrays of shape (channels,)."""
+    everything: bool
+    """Whether all rows of ``info`` are written; otherwise the rows :data:`LEAN` and ``action_clipped``."""
 
 
 class InfoRow(NamedTuple):

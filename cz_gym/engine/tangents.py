@@ -17,7 +17,8 @@ from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.plant import Disturbance, Inputs, State, along, rates
 from cz_gym.task import Cost, cost_terms
 
-from .kernels import height_inside, next_power, next_speed
+from .kernels import next_power, next_speed
+from .lockstep import height_inside
 
 SMOOTH = ("r_c", "h_c", "T_1", "T_2", "T_b", "v_p", "Q_H", "ring", "reading")
 """The plant's state [m, K]; pull speed [m/s] and heater power [W], the latter before it is rounded to whole steps; the

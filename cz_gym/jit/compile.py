@@ -32,6 +32,11 @@ def physics(function: F) -> F:
     return register_jitable(error_model="numpy")(function)
 
 
+def within(function: F) -> F:
+    """A :data:`physics` whose machine code is put into its callers', so that a loop around it can be vectorised."""
+    return register_jitable(error_model="numpy", forceinline=True)(function)
+
+
 def inlined(function: F) -> F:
     """A part of kernels alone, its text put into each: passing a step's arrays on costs a tenth of the step.
 
@@ -104,3 +109,34 @@ def _compiled_fetch(array: Any, at: Any) -> Any:
         _fetch(array, at)  # type: ignore[call-arg]
 
     return compiled
+
+
+@intrinsic(prefer_literal=True)
+def _on_stack(typing_context: Any, rows: Any, columns: Any) -> Any:
+    if not isinstance(rows, types.IntegerLiteral) or not isinstance(columns, types.IntegerLiteral):
+        return None
+    array, shape = types.Array(types.float64, 2, "C"), (rows.literal_value, columns.literal_value)
+    size = shape[0] * shape[1]
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        number, made = context.get_constant, context.make_array(array)(context, builder)
+        block: Any = cgutils.alloca_once(builder, ir.ArrayType(ir.DoubleType(), size))  # type: ignore[no-untyped-call]
+        block.align = 64
+        context.populate_array(
+            made,
+            data=builder.bitcast(block, made.data.type),
+            shape=[number(types.intp, length) for length in shape],
+            strides=[number(types.intp, 8 * shape[1]), number(types.intp, 8)],
+            itemsize=number(types.intp, 8),
+            meminfo=None,
+        )
+        return made._getvalue()
+
+    return array(rows, columns), generate
+
+
+scratch: Callable[[int, int], Any] = _on_stack  # type: ignore[assignment]
+"""``scratch(rows, columns)``, in a kernel alone: an array of numbers, not set, on the stack until the function returns.
+
+Nothing is allocated, and the compiler knows that nothing else lies there. Rows and columns are constants.
+"""

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.jit.compile import physics
+from cz_gym.jit.compile import physics, within
 
 from .meniscus import HURLE, MeniscusModel, ring_point
 from .parameters import Parameters, check_parameters
@@ -236,7 +236,7 @@ def along(x: Any, s: Any, k: Any) -> Any:
     return State(x.r_c + s * k.r_c, x.h_c + s * k.h_c, x.T_1 + s * k.T_1, x.T_2 + s * k.T_2, x.T_b + s * k.T_b)
 
 
-@physics
+@within
 def rk4(x: Any, u: Any, d: Any, p: Any, dt: Any, slope: Any) -> Any:
     """One classical Runge-Kutta step of dt [s], inputs and disturbance held."""
     k_1 = rates(x, u, d, p, slope)
