@@ -131,6 +131,16 @@ def _fetch_info(info: Any, i: Any) -> None:
         fetch(info, row * info.shape[1] + i)
 
 
+@physics
+def _fetch_history(slot: Any, history: Any, before: Any) -> None:
+    """Have the samples brought at which the remembered spans of a slot's past end."""
+    depth, channels = history.shape
+    at = slot.k % depth
+    for lag in range(before.size):
+        place = at - before[lag]
+        fetch(history, (place if place >= 0 else place + depth) * channels)
+
+
 class Kernels(NamedTuple):
     """The compiled loops for one meniscus model."""
 
@@ -158,7 +168,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
     def step(
         memory: Any, actions: Any, active: Any, clock: Any, drives: Any, reading: Any, out: Any, start: int, stop: int
     ) -> int:
-        ended = 0
+        ended, remembers = 0, memory.history.shape[1] > 0
         for first in range(start, stop, LANES):
             count = min(LANES, stop - first)
             for i in range(first, first + count):
@@ -169,6 +179,8 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
                 _fetch_info(out.info, first + LANES)
             for i in range(first, first + count):
                 _fetch_slot(memory.numbers, i + LANES)
+                if remembers and i + 1 < first + count:
+                    _fetch_history(memory.slots[i + 1], memory.history[i + 1], reading.before)
                 if not active[i]:
                     continue
                 slot, grows = memory.slots[i], memory.slots[i].over == 0

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cz_gym.episodes.schedule import bias_offset, recipe, reference
-from cz_gym.jit.compile import physics
+from cz_gym.jit.compile import physics, scratch
 from cz_gym.observation import CLIP, INTEGRAL_SCALE, LAGGED, MEASURED, PREVIEWS, STATE, Measured
 
 _AHEAD_1, _AHEAD_2 = PREVIEWS[1:]
@@ -72,19 +72,19 @@ def remember(slot: Any, history: Any, interval: Any, out: Any) -> None:
 
 @physics
 def recall(slot: Any, measured: Any, history: Any, reading: Any, out: Any) -> None:
-    """Turn "measured" channels into "history": integral, differences of successive spans' means, relative channels.
-
-    A negative index goes round the circle.
-    """
-    at, spans = slot.k % history.shape[0], reading.upto.size
+    """Turn "measured" channels into "history": integral, differences of successive spans' means, relative channels."""
+    depth, later = history.shape[0], scratch(1, _L)
+    at = slot.k % depth
     out[_M] = slot.integral
     for channel in range(_L):
-        later, gain = history[at, channel] - history[at - 1, channel], reading.span[channel]
-        for lag in range(spans):
-            upto, before = at - reading.upto[lag], at - reading.before[lag]
+        later[0, channel] = history[at, channel] - history[at - 1 if at > 0 else depth - 1, channel]
+    for lag in range(reading.upto.size):
+        upto, before = at - reading.upto[lag], at - reading.before[lag]
+        upto, before = upto if upto >= 0 else upto + depth, before if before >= 0 else before + depth
+        for channel in range(_L):
             mean = (history[upto, channel] - history[before, channel]) * reading.share[lag]
-            out[_M + 1 + lag * _L + channel] = clip((mean - later) * gain, CLIP)
-            later = mean
+            out[_M + 1 + lag * _L + channel] = clip((mean - later[0, channel]) * reading.span[channel], CLIP)
+            later[0, channel] = mean
     place, to, change = reading.relative
     for row in range(place.size):
         difference = measured[place[row]] - measured[to[row]]
