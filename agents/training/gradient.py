@@ -14,9 +14,10 @@ from stable_baselines3.common.logger import Logger
 from torch.autograd import backward, grad
 
 from cz_gym.config import Config
-from cz_gym.differentiable import STATES
+from cz_gym.differentiable import STATES, Step
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
-from cz_gym.task import COST_CAP
+from cz_gym.observation import MEASURED, scales
+from cz_gym.task import COST_CAP, Cost, cost_terms, drives_of
 
 from .crystals import Crystals
 from .demonstrations import widened
@@ -32,6 +33,8 @@ MOST_GRADIENT = 1.0
 """Norm that a gradient is cut to."""
 AT_ONCE = 12
 """Steps whose actions are differentiated at once: few enough for a processor's cache."""
+_V_P = [channel.name for channel in MEASURED].index("v_p")
+_PULL_STEP = Cost._fields.index("pull_step")
 
 
 class Window(NamedTuple):
@@ -41,6 +44,8 @@ class Window(NamedTuple):
     """What the network made of readings and memory, shape (steps, n, width)."""
     costs: Any
     """Terms of the cost, shape (steps, n, 4)."""
+    beyond: Any
+    """What :meth:`GradientLearner._beyond` adds to the gradient, shape (steps, n)."""
     jacobians: list[Any]
     """Of each step (:class:`cz_gym.differentiable.Step`)."""
     measured: Any
@@ -63,6 +68,8 @@ class GradientLearner:
         weights = self.network.parameters()
         self.optimiser = torch.optim.Adam(weights, recipe.learning_rate, betas=(0.9, recipe.beta2))
         self.random = np.random.default_rng([seed, done])
+        self.drives = drives_of(config.action, config.control_interval)
+        self.v_p_scale = float(scales(MEASURED, config.parameters.v_0)[_V_P])
         self.weights = np.array([1.0, recipe.weights.pull, recipe.weights.pull_step, recipe.weights.heater_step])
 
     def learn(self, watch: Watch) -> None:
@@ -102,16 +109,30 @@ class GradientLearner:
 
     def _drive(self, batch: Crystals, measured: Any, memory: torch.Tensor) -> Window:
         """Drive each crystal through a window."""
-        features, costs, jacobians = [], [], []
+        features, costs, beyond, jacobians = [], [], [], []
         with torch.no_grad():
             for _ in range(self.recipe.window):
                 seen, memory = self.network.remember(torch.from_numpy(measured), memory)
-                step = batch.step(self.network.act(seen).numpy())
+                action = self.network.act(seen).numpy()
+                step = batch.step(action)
+                beyond.append(self._beyond(measured, action, step))
                 features.append(seen)
                 costs.append(step.cost)
                 jacobians.append(step.jacobian)
                 measured = step.measured
-        return Window(torch.stack(features), np.stack(costs), jacobians, measured, memory)
+        return Window(torch.stack(features), np.stack(costs), np.stack(beyond), jacobians, measured, memory)
+
+    def _beyond(self, measured: Any, action: Any, step: Step) -> Any:
+        """What each action adds to the gradient where a limit of the pull speed cuts its move off, shape (n,).
+
+        The cost does not depend on the action there, so a policy that asks for more than the drive does would never
+        learn to ask for less. The move that was asked for is charged instead.
+        """
+        deviation = measured[:, _V_P] * self.v_p_scale
+        asked = (self.drives.keep - 1.0) * deviation + self.drives.pull * self.config.parameters.v_0 * action[:, 0]
+        charged = cost_terms(0.0, 0.0, asked, 0.0).pull_step
+        gain = 2.0 * charged / np.where(asked == 0.0, 1.0, asked) * self.drives.pull * self.config.parameters.v_0
+        return np.where(step.grows & (charged > 1.001 * step.cost[:, _PULL_STEP] + 1e-9), gain, 0.0)
 
     def _follow(self, window: Window, measured_by_state: Any) -> None:
         """Follow the gradient of the window's cost: back through plant and memory step by step, then into the weights.
@@ -133,6 +154,7 @@ class GradientLearner:
                 rows[:, len(STATES) :] = by_cost[first + k, :, None] * self.weights
                 back = np.einsum("ni,nij->nj", rows, window.jacobians[first + k])
                 by_action[k] = back[:, len(STATES) :]
+                by_action[k, :, 0] += by_cost[first + k] * self.weights[_PULL_STEP] * window.beyond[first + k]
                 by_features = by_action[k, :, :1] * pull[k] + by_action[k, :, 1:] * heater[k]
                 by_measured, by_memory = self.network.back(by_features, by_memory)
                 rows[:, : len(STATES)] = back[:, : len(STATES)] + by_measured @ measured_by_state

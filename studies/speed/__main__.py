@@ -64,10 +64,10 @@ class Ratio(NamedTuple):
 OURS = "Cz-v0 batch, measured"
 RATIOS = {
     "scalar_vs_pendulum": Ratio("Cz-v0 scalar", "Pendulum-v1 scalar", 1.7),
-    "vector1024_vs_envpool_pendulum": Ratio(OURS, "EnvPool Pendulum-v1", 3.0),
-    "vector1024_vs_pcgym": Ratio(OURS, "pc-gym CSTR", 1500.0),
+    "vector1024_vs_envpool_pendulum": Ratio(OURS, "EnvPool Pendulum-v1", 5.0),
+    "vector1024_vs_pcgym": Ratio(OURS, "pc-gym CSTR", 2000.0),
     "vector1024_vs_kernel": Ratio(
-        "Cz-v0 batch without resets, 1 thread", "bare compiled plant and ring, 1 thread", 0.6
+        "Cz-v0 batch without resets, 1 thread", "bare compiled plant and ring, 1 thread", 0.65
     ),
     "sb3_adapter_vs_subproc": Ratio("SB3 adapter over the batch", "SB3 SubprocVecEnv", 100.0),
     "sb3_adapter_vs_dummy": Ratio("SB3 adapter over the batch", "SB3 DummyVecEnv", 12.0),

@@ -22,10 +22,10 @@ from cz_gym.agents.training.learners import config_of
 from cz_gym.agents.training.plant_step import PlantStep
 from cz_gym.agents.training.recipes import LQG_COST, RECIPES, Gradient
 from cz_gym.agents.training.validation import Validation, validate
-from cz_gym.differentiable import DifferentiableBatch
+from cz_gym.differentiable import STATES, DifferentiableBatch
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.observation import MEASURED
-from cz_gym.task import COST_CAP
+from cz_gym.task import COST_CAP, Cost
 
 FEW = Gradient(num_envs=16, window=20, steps=16 * 20 * 2, hidden=(8,))
 CONFIG = config_of(FEW)
@@ -105,6 +105,27 @@ def test_what_is_followed_is_the_gradient_that_torch_finds(scenario: str, monkey
     wanted = torch.autograd.grad(loss, list(learner.network.parameters()))
     for ours, theirs in zip(found, wanted, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5 * float(theirs.abs().max()))
+
+
+def test_a_move_that_a_limit_cuts_off_is_charged_as_asked_for() -> None:
+    """On ``puller`` the pull speed moves by 0.025 mm/min in 5 s: where an action asks for more, the gradient is that of
+    the cost without the limit; elsewhere it is the cost's own. A lost crystal has none."""
+    config = CONFIG.with_scenario("puller")
+    learner = GradientLearner(FEW, 0, CONFIG, Logger(None, []), 0)
+    crystals = Crystals([(config, 4)])
+    measured = crystals.reset(range(4))
+    crystals.batches[0]._batch.memory.slots["x"]["r_c"][3] += 9e-3
+    actions = np.array([[0.05, 0.0], [0.5, 0.0], [-0.5, 0.0], [0.5, 0.0]])
+    step = crystals.step(actions)
+    assert step.grows.tolist() == [True, True, True, False]
+    found = learner._beyond(measured, actions, step)
+    free = DifferentiableBatch(CONFIG, 4)
+    free.reset(range(4))
+    row, column = len(STATES) + Cost._fields.index("pull_step"), len(STATES)
+    wanted = free.step(actions).jacobian[:, row, column]
+    np.testing.assert_allclose(found, [0.0, wanted[1], wanted[2], 0.0], rtol=1e-4)
+    assert step.jacobian[0, row, column] == pytest.approx(wanted[0], rel=1e-4)
+    assert step.jacobian[1, row, column] == 0.0
 
 
 def test_the_exported_memory_is_the_trained_one() -> None:
