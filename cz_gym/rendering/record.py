@@ -60,8 +60,9 @@ class Record:
         self.config = config
         self.scenario = scenario
         self.puller = Puller(*slot["puller"].tolist())
-        self.ending: Ending | None = None
+        self._terminated = self._truncated = False
         self._rows = np.zeros((config.steps + 1, len(Sample._fields)))
+        self._read, self._said = 0, np.zeros((config.steps + 1, len(INFO) + 2))
         self._count = 0
 
     def __len__(self) -> int:
@@ -70,11 +71,18 @@ class Record:
     @property
     def now(self) -> Sample:
         """The newest sample."""
-        return Sample(*self._rows[self._count - 1].tolist())
+        return Sample(*self._samples()[-1].tolist())
+
+    @property
+    def ending(self) -> Ending | None:
+        """How the episode ended, None while it goes on."""
+        if self._terminated:
+            return how_it_failed(self.now, self.puller.a)
+        return Ending.HORIZON if self._truncated else None
 
     def column(self, name: str) -> Floats:
         """All values of a sample's field, shape (samples,); not to be written to."""
-        return self._rows[: self._count, _AT[name]]
+        return self._samples()[:, _AT[name]]
 
     @property
     def error(self) -> Floats:
@@ -89,19 +97,32 @@ class Record:
     def add(self, info: Floats, slot: Any, terminated: bool = False, truncated: bool = False) -> None:
         """Add the sample of info rows (:data:`cz_gym.engine.layout.INFO`) and the slot they were read from.
 
+        It is only kept: what it means is worked out when somebody looks, since most steps are never drawn.
+        """
+        row = self._said[self._count]
+        row[:-2], row[-2], row[-1] = info, slot["k"], slot["valid"]
+        self._count += 1
+        self._terminated, self._truncated = terminated, truncated
+
+    def _samples(self) -> Floats:
+        """All samples, shape (samples, fields)."""
+        while self._read < self._count:
+            self._rows[self._read] = self._sample(self._said[self._read])
+            self._read += 1
+        return self._rows[: self._count]
+
+    def _sample(self, said: Floats) -> Sample:
+        """The next sample that nobody has looked at.
+
         The length grown is what the pull took up and the meniscus did not: h_c' = v_p - v_g, integrated exactly.
         """
-        values = dict(zip(_READ, info[_ROWS].tolist(), strict=True))
+        values = dict(zip(_READ, said[_ROWS].tolist(), strict=True))
         values["camera"] = values.pop("r_br_measured") - self.puller.ring_bias
-        t, length = float(slot["k"]) * self.config.control_interval, 0.0
-        if self._count:
-            before = self.now
+        t, length = float(said[-2]) * self.config.control_interval, 0.0
+        if self._read:
+            before = Sample(*self._rows[self._read - 1].tolist())
             length = before.length + values["v_p"] * (t - before.t) - (values["h_c"] - before.h_c)
-        sample = Sample(valid=float(slot["valid"]), t=t, length=length, **values)
-        self._rows[self._count] = sample
-        self._count += 1
-        if terminated or truncated:
-            self.ending = how_it_failed(sample, self.puller.a) if terminated else Ending.HORIZON
+        return Sample(valid=float(said[-1]), t=t, length=length, **values)
 
     def surface(self, height: float | None = None) -> tuple[Floats, Floats, Floats]:
         """The grown surface: radius, reference [m] and height above the melt [m], newest (lowest) first.
