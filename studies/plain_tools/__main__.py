@@ -16,6 +16,12 @@ from studies.markdown import table
 
 from .runs import EXAMPLES, Row, timed
 
+HEAD = """# The examples, training seed by training seed
+
+Each example as it stands, judged on 100 validation crystals of `randomized`.
+
+"""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
@@ -47,7 +53,7 @@ def _main(given: argparse.Namespace) -> int:
         for each in as_completed([pool.submit(timed, *task, given.steps) for task in missing]):
             rows = sorted([*rows, each.result()])
             print(to_table([each.result()]), flush=True)
-            write_files({path: to_csv(rows), given.out / "table.md": (to_table(rows) + "\n").encode()})
+            write_files({path: to_csv(rows), given.out / "table.md": (HEAD + to_table(rows) + "\n").encode()})
     print(to_table([row for row in rows if row[:2] in asked]))
     return 0
 

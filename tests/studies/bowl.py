@@ -3,6 +3,7 @@
 import os
 import time
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 from ray import tune
@@ -13,12 +14,13 @@ from studies.search.trials import Search
 
 
 def attempt_bowl(params: Any, search: Search) -> None:
-    """The cost is least at a small rate and many epochs; it waits for a file ``go``."""
+    """The cost is least at a small rate and many epochs; it waits for a file ``go``, for ever where its node is lost."""
     cost = params["learning_rate"] / 1e-3 + 1.0 / params["n_epochs"]
-    begun = search.plan.work / "begun" / str(os.getpid())
+    begun = search.plan.work / "begun" / uuid4().hex
     begun.parent.mkdir(parents=True, exist_ok=True)
+    node = os.getppid()
     begun.touch()
-    while not (search.plan.work / "go").exists():
+    while not (search.plan.work / "go").exists() or os.getppid() != node:
         time.sleep(0.1)
     for _ in range(3):
         tune.report({"cost": cost})
