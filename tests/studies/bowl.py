@@ -14,7 +14,7 @@ from studies.search.trials import Search
 
 
 def attempt_bowl(params: Any, search: Search) -> None:
-    """The cost is least at a small rate and many epochs; it waits for a file ``go``, for ever where its node is lost."""
+    """The cost is least at a small rate and many epochs; it waits for a file ``go``, for ever if its node is lost."""
     cost = params["learning_rate"] / 1e-3 + 1.0 / params["n_epochs"]
     begun = search.plan.work / "begun" / uuid4().hex
     begun.parent.mkdir(parents=True, exist_ok=True)
