@@ -6,18 +6,22 @@ import argparse
 import math
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 try:
     from cz_gym.commands import OneLineParser, guarded
+    from cz_gym.names import unknown
 except ModuleNotFoundError as error:
     sys.exit(f"train.py: {error}")
 
 if TYPE_CHECKING:
     from cz_gym.agents.training.recipes import Recipe
+
+CHECKPOINT_SECONDS = 60.0
+"""Time between checkpoints, unless another is asked for [s]."""
 
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
@@ -30,7 +34,8 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         description="Train an agent by a recipe and pick it on validation episodes.",
         epilog="The run folder holds the agent with its contract, settings, checkpoints, progress and logs.",
     )
-    parser.add_argument("--algo", choices=tuple(RECIPES), help=f"recipe (default: {DEFAULT}, or the resumed run's)")
+    about = f"one of {', '.join(RECIPES)} (default: {DEFAULT}, or the resumed run's)"
+    parser.add_argument("--algo", type=_named("recipe", RECIPES), metavar="RECIPE", help=about)
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--seed", type=_whole(0), help="training seed (default: 0, or the resumed run's)")
     which.add_argument(
@@ -66,7 +71,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--checkpoint-seconds",
         type=_seconds,
-        default=60.0,
+        default=CHECKPOINT_SECONDS,
         metavar="S",
         help="time between checkpoints, the most that an interruption loses; an imitation begins again "
         "(default: %(default)g)",
@@ -93,8 +98,16 @@ def main(argv: list[str] | None = None) -> int:
 
 def _resume(arguments: argparse.Namespace) -> str:
     """The command that goes on with a run: the folder knows its algorithm, seed and steps."""
-    seeds = arguments.seeds and f" --seeds {arguments.seeds[0]}-{arguments.seeds[-1]}"
-    return f"python train.py --resume --out {shlex.quote(str(arguments.out))}{seeds or ''}"
+    words = ["python", "train.py", "--resume", "--out", str(arguments.out)]
+    if arguments.seeds:
+        words += ["--seeds", f"{arguments.seeds[0]}-{arguments.seeds[-1]}"]
+    if arguments.ray is not None:
+        words += filter(None, ["--ray", arguments.ray])
+    if arguments.plot:
+        words.append("--plot")
+    if arguments.checkpoint_seconds != CHECKPOINT_SECONDS:
+        words += ["--checkpoint-seconds", f"{arguments.checkpoint_seconds:g}"]
+    return shlex.join(words)
 
 
 def train(arguments: argparse.Namespace) -> int:
@@ -219,6 +232,15 @@ def _asked_for(recipe: Recipe, arguments: argparse.Namespace, saved_steps: int |
     if arguments.steps:
         raise ValueError(f"{recipe.name} takes no --steps: its length is that of its demonstrations")
     return recipe
+
+
+def _named(kind: str, known: Iterable[str]) -> Callable[[str], str]:
+    def name(text: str) -> str:
+        if text not in known:
+            raise argparse.ArgumentTypeError(unknown(kind, text, known))
+        return text
+
+    return name
 
 
 def _whole(least: int) -> Callable[[str], int]:

@@ -77,7 +77,7 @@ def save_agent(
         "validation_rmse_mm": 0.0,
     }
     agent = OnnxPolicy.of(make_contract(content, **facts), content, config, path)
-    apart = disagreement(agent, model, normalisation)
+    apart = disagreement(agent, model, normalisation, config)
     if not apart <= TOLERANCE:
         raise AgentFileError(f"{path}: the file would act otherwise than the model, by up to {apart:.2g}")
     found = validate(agent, config, JUDGING)
@@ -110,9 +110,11 @@ def to_onnx(model: BaseAlgorithm, normalisation: VecNormalize | None, observatio
     return graph.finished(len(OBSERVATIONS[observation]), actor.remembers)
 
 
-def disagreement(agent: OnnxPolicy, model: BaseAlgorithm, normalisation: VecNormalize | None) -> float:
+def disagreement(
+    agent: OnnxPolicy, model: BaseAlgorithm, normalisation: VecNormalize | None, config: Config | None = None
+) -> float:
     """The largest difference between the actions of file and model, on crystals that the file drives [action units]."""
-    envs = CzVectorEnv(SLOTS, agent.contract.scenario, observation=agent.observation, action=agent.action)
+    envs = CzVectorEnv.from_config(config or _config_of(model), SLOTS)
     observation, _ = envs.reset(seed=list(VALIDATION_SEEDS[:SLOTS]))
     apart, memory, recalled = 0.0, None, None
     starts = np.ones(SLOTS, bool)
@@ -178,7 +180,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--name", help="what the agent is called (default: the agent file's name)")
     parser.add_argument("--scenario", default="randomized", help="scenario it was trained on (default: %(default)s)")
     parser.add_argument("--observation", default="history", help="observation it reads (default: %(default)s)")
-    parser.add_argument("--action", default="direct", help="direct or smooth (default: %(default)s)")
+    parser.add_argument("--action", default="direct", help="direct, smooth or rate (default: %(default)s)")
     parser.add_argument("--control-interval", type=float, default=5.0, help="in seconds (default: %(default)s)")
     parser.add_argument("--seed", type=int, help="training seed (default: the model's)")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="agent file to write (.onnx)")

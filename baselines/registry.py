@@ -75,8 +75,8 @@ _bound = partial(Entry, default=False, privileged=True)
 
 
 def _privileged(name: str, make: Callable[[Config], LQG]) -> Entry:
-    meaning = f"bound: {name} told the puller's parameters and how strong each crystal's fluctuations are"
-    return _bound(f"{name}-told", lambda config: lqg_bounds.privileged(make(config)), "measured", meaning)
+    meaning = f"bound: {name} given the puller's parameters and how strong each crystal's fluctuations are"
+    return _bound(f"{name}-privileged", lambda config: lqg_bounds.privileged(make(config)), "measured", meaning)
 
 
 CONTROLLERS: tuple[Entry, ...] = (
@@ -91,7 +91,7 @@ CONTROLLERS: tuple[Entry, ...] = (
     Entry("lqg-quiet", lqg_settings.lqg_quiet, "measured", "the same for low pull activity"),
     *(_lqg_at(activity) for activity in lqg_settings.ACTIVITIES),
     Entry("ekf-mpc", _ekf_mpc, "measured", "nonlinear MPC on a bank of lqg's filters", default=False, slow=True),
-    _bound("lqg-true", lqg_bounds.lqg_true, "measured", "bound: lqg told the puller's parameters"),
+    _bound("lqg-true", lqg_bounds.lqg_true, "measured", "bound: lqg given the puller's parameters"),
     _privileged("lqg-quiet", lqg_settings.lqg_quiet),
     *(_privileged(lqg_settings.family_name(each), partial(lqg_settings.lqg_at, each)) for each in (0.013, IN_TABLE)),
     _bound("full-information", lqg_bounds.full_information, "state", "bound: lqg's regulator, true state seen"),

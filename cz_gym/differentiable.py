@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from operator import index
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.error import InvalidAction
+from gymnasium.error import InvalidAction, ResetNeeded
 
 from cz_gym.config import Config
 from cz_gym.engine.batch import Batch, first_key
@@ -24,6 +25,7 @@ from cz_gym.task import Cost
 
 Floats = npt.NDArray[np.float64]
 _COSTS = [INFO.index(f"cost_{name}") for name in Cost._fields]
+_RADIUS, _REFERENCE, _OFFSET = (INFO.index(name) for name in ("r_c", "r_ref", "ring_offset"))
 
 
 @lru_cache(maxsize=8)
@@ -40,6 +42,10 @@ class Step(NamedTuple):
     """The "measured" observation, shape (n, 11)."""
     cost: Floats
     """The four terms of the cost (:class:`cz_gym.task.Cost`), shape (n, 4)."""
+    error: Floats
+    """The true radius error r_c - r_ref [m], shape (n,)."""
+    offset: Floats
+    """What of the bright ring's offset no sensor shows [m], shape (n,)."""
     grows: npt.NDArray[np.bool_]
     """Whether the crystal grew, shape (n,). One that is lost, or was at its end, stays as it is; its cost and
     derivatives are 0."""
@@ -67,7 +73,7 @@ class DifferentiableBatch:
     def __init__(self, config: Config, num_envs: int, threads: int | None = 1) -> None:
         if not isinstance(config, Config):
             raise ValueError(f"a config is needed, as make_config({config!r:.80}) makes one")
-        if not isinstance(num_envs, int) or num_envs < 1:
+        if not isinstance(num_envs, int | np.integer) or isinstance(num_envs, bool) or num_envs < 1:
             raise ValueError(f"num_envs must be a positive whole number, not {num_envs!r}")
         parts = GRID / config.control_interval
         if abs(parts - round(parts)) > 1e-9 or round(parts) < 1:
@@ -75,12 +81,12 @@ class DifferentiableBatch:
         latency = config.scenario.sensor.latency
         if latency > config.control_interval:
             raise ValueError(f"the camera's latency of {latency:g} s is longer than the control interval")
-        self.config, self.num_envs = config, num_envs
-        self._batch = Batch(config, num_envs, threads)
+        self.config, self.num_envs = config, int(num_envs)
+        self._batch = Batch(config, self.num_envs, threads)
         self._gather, self._tangents = _compiled(config.meniscus)
         self._out = self._batch.new_out()
         self._state = np.zeros((num_envs, len(STATES)))
-        self._grows = np.ones(num_envs, np.bool_)
+        self._grows, self._begun = np.ones(num_envs, np.bool_), np.zeros(num_envs, np.bool_)
         self._work = np.zeros(SCRATCH)
         self.measured_by_state = _measured_by_state(config)
         """Derivatives of the "measured" observation with respect to the state it is of, shape (11, 9)."""
@@ -88,23 +94,32 @@ class DifferentiableBatch:
     def reset(self, seeds: Sequence[int], which: Sequence[int] | None = None) -> tuple[Floats, npt.NDArray[np.float32]]:
         """Draw the episodes of these seeds, one for each of the slots ``which``, by default all; the others stay.
 
-        Returns state, shape (n, 9), and "measured" observation, shape (n, 11), of all slots.
+        Returns state, shape (n, 9), and "measured" observation, shape (n, 11), of all slots. ValueError unless each
+        seed is a whole number and each slot there is named once at most.
         """
-        which = range(self.num_envs) if which is None else which
-        if len(seeds) != len(which):
-            raise ValueError(f"expected a seed for each of {len(which)} slots, not {len(seeds)}")
+        slots = list(range(self.num_envs) if which is None else which)
+        if len(seeds) != len(slots):
+            raise ValueError(f"expected a seed for each of {len(slots)} slots, not {len(seeds)}")
+        if len(set(slots)) != len(slots) or not set(slots) <= set(range(self.num_envs)):
+            raise ValueError(f"slots must be different ones of 0 to {self.num_envs - 1}, not {slots!r:.80}")
+        try:
+            keys = [first_key(index(seed)) for seed in seeds]
+        except TypeError:
+            raise ValueError(f"seeds must be whole numbers, not {seeds!r:.80}") from None
         self._out = self._copied()
-        self._batch.reset(which, [first_key(int(seed)) for seed in seeds], self._out)
+        self._batch.reset(slots, keys, self._out)
         self._grows = self._grows.copy()
-        self._grows[list(which)] = True
+        self._grows[slots] = self._begun[slots] = True
         self._state = self._now()
         return self._state, self._out.observation
 
     def step(self, actions: npt.ArrayLike) -> Step:
         """Hold actions, shape (n, 2), for one control interval; crystals that are lost or at their end stay.
 
-        InvalidAction for NaN or another shape.
+        InvalidAction for NaN or another shape, ResetNeeded before every slot had its first reset.
         """
+        if not self._begun.all():
+            raise ResetNeeded("every slot needs a crystal: call reset()")
         before, n = self._state, self.num_envs
         given = np.asarray(actions, np.float64)
         if given.shape != (n, ACTIONS) or np.isnan(given).any():
@@ -118,8 +133,10 @@ class DifferentiableBatch:
         self._tangents(
             batch.memory, before, batch.actions, self._grows, batch.clock, batch.drives, self._work, jacobian, 0, n
         )
-        cost = np.where(self._grows, out.info[_COSTS, :n], 0.0).T
-        return Step(self._state, out.observation, cost, self._grows, jacobian)
+        info = out.info[:, :n]
+        cost = np.where(self._grows, info[_COSTS], 0.0).T
+        error = info[_RADIUS] - info[_REFERENCE]
+        return Step(self._state, out.observation, cost, error, info[_OFFSET], self._grows, jacobian)
 
     def _copied(self) -> Out:
         """New arrays that hold what the last step wrote."""

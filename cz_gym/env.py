@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,7 +31,7 @@ Action = npt.NDArray[np.float32]
 _OPTIONS = ("scenario", "state")
 _LEAN_ROWS = tuple((name, INFO.index(name)) for name in LEAN)
 _CLIPPED = INFO.index("action_clipped")
-_FACTS = ("_np_random", "_np_random_seed", "_over", "_begun", "spec")
+_FACTS = ("_np_random", "_np_random_seed", "_over", "_begun", "spec", "action_space", "observation_space")
 """What a copy of an environment has beside its settings and its slot."""
 
 
@@ -99,11 +100,11 @@ class CzEnv(gym.Env[Observation, Action]):
 
     ## Arguments
     ``scenario`` (name or :class:`cz_gym.Scenario`), ``model`` ("I", "II", a mix in [0, 1], or None for the
-    scenario's draw), ``observation``, ``action`` ("direct" or "smooth"), ``control_interval`` [s], ``horizon`` [s],
-    ``info`` ("lean": true radius and its reference; "all": every signal, see :data:`cz_gym.engine.layout.INFO_ROWS`;
-    with observation "history" also the true ``state``, for critics), ``render_mode``, ``parameters``
-    (:class:`cz_gym.Parameters`), ``meniscus`` (:class:`cz_gym.MeniscusModel`), ``camera``
-    (:class:`cz_gym.camera.Camera`, with observation "camera" only). Bad values raise ValueError.
+    scenario's draw), ``observation``, ``action`` ("direct", "smooth" or "rate"), ``control_interval`` [s],
+    ``horizon`` [s], ``info`` ("lean": true radius and its reference; "all": every signal, see
+    :data:`cz_gym.engine.layout.INFO_ROWS`; with observation "history" also the true ``state``, for critics),
+    ``render_mode``, ``parameters`` (:class:`cz_gym.Parameters`), ``meniscus`` (:class:`cz_gym.MeniscusModel`),
+    ``camera`` (:class:`cz_gym.camera.Camera`, with observation "camera" only). Bad values raise ValueError.
     ``render_mode`` is None, "rgb_array" or "human", ``render_size`` the picture's width and height [px]; rendering
     needs the extra ``render``, without which no mode is declared and asking for one raises
     :class:`gymnasium.error.DependencyNotInstalled`.
@@ -155,7 +156,7 @@ class CzEnv(gym.Env[Observation, Action]):
         self._out = self._batch.new_out()
         self._action = np.zeros((1, 2))
         self._shown = self._batch.shown(self._out)[0]
-        self._said = self._out.info[:, 0]
+        self._said, self._valid = self._out.info[:, 0], self._slots["valid"]
         self._step = self._batch.bound_step(self._action, self._out)
         self._over, self._begun = True, False
         self._view = make_view(render_mode, render_size, self.config)
@@ -194,11 +195,16 @@ class CzEnv(gym.Env[Observation, Action]):
         terminated, truncated = out.terminated.item(), out.truncated.item()
         self._over = terminated or truncated
         if self._view is not None:
-            self._view.add(self._said, self._slots[0], terminated, truncated)
+            self._view.add(self._said, self._valid.item(), terminated, truncated)
         return self._shown.copy(), out.reward.item(), terminated, truncated, self._info()
 
     def get_state(self) -> EnvState:
-        """A picklable value from which :meth:`set_state` continues bit-exactly, random stream included."""
+        """A picklable value from which :meth:`set_state` continues bit-exactly, random stream included.
+
+        Raises ResetNeeded before the first reset.
+        """
+        if not self._begun:
+            raise ResetNeeded("there is no crystal yet: call reset()")
         return EnvState(self._batch.save(0), dict(self.np_random.bit_generator.state))
 
     def set_state(self, state: EnvState) -> None:
@@ -248,15 +254,27 @@ class CzEnv(gym.Env[Observation, Action]):
 
     def _info(self) -> dict[str, Any]:
         if self._everything:
-            info: dict[str, Any] = dict(zip(INFO, self._said.tolist(), strict=True))
+            info = Info(zip(INFO, self._said.tolist(), strict=True))
             info["action_clipped"] = info["action_clipped"] > 0.0
         else:
-            info = {name: self._said.item(row) for name, row in _LEAN_ROWS}
+            info = Info()
+            for name, row in _LEAN_ROWS:
+                info[name] = self._said.item(row)
             if self._said.item(_CLIPPED) > 0.0:
                 info["action_clipped"] = True
         if self.config.observation == "history":
             info["state"] = self._out.state[0].copy()
         return info
+
+
+class Info(dict[str, Any]):
+    """A step's ``info``. Stable-baselines3 copies it deeply at every step: numbers alone are copied at once."""
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Info:
+        for value in self.values():
+            if type(value) is not float and type(value) is not bool:
+                return Info(deepcopy(dict(self), memo))
+        return Info(self)
 
 
 def check_state(state: Any, batch: Batch) -> None:

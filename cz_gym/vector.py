@@ -28,7 +28,7 @@ _MASKS = tuple(f"_{name}" for name in INFO)
 _LEAN_MASKS = tuple(f"_{name}" for name in LEAN)
 _LEAN_ROWS = tuple((name, INFO.index(name)) for name in LEAN)
 _CLIPPED = INFO.index("action_clipped")
-_FACTS = ("_randoms", "_seeds", "_over", "_waiting", "_begun", "spec")
+_FACTS = ("_randoms", "_seeds", "_over", "_waiting", "_begun", "spec", "action_space", "observation_space")
 """What a copy of a batch has beside its settings and its slots."""
 Array = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
@@ -87,8 +87,9 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         self, config: Config, num_envs: int, autoreset_mode: AutoresetMode | str, threads: int | None, info: str
     ) -> None:
         self._everything, self._settings = check_info(info), (config, num_envs, autoreset_mode, threads, info)
-        if not isinstance(num_envs, int) or isinstance(num_envs, bool) or num_envs < 1:
+        if not isinstance(num_envs, int | np.integer) or isinstance(num_envs, bool) or num_envs < 1:
             raise ValueError(f"num_envs must be a positive whole number, not {num_envs!r}")
+        num_envs = int(num_envs)
         if threads is not None and (not isinstance(threads, int) or threads < 1):
             raise ValueError(f"threads must be a positive whole number or None, not {threads!r}")
         self.config = config
@@ -171,7 +172,12 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         return self._observations(), out.reward, out.terminated.copy(), out.truncated.copy(), infos
 
     def get_state(self) -> tuple[EnvState, ...]:
-        """Picklable values, one a slot; :meth:`set_state`, also of the scalar form, continues them bit-exactly."""
+        """Picklable values, one a slot; :meth:`set_state`, also of the scalar form, continues them bit-exactly.
+
+        Raises ResetNeeded before the first reset.
+        """
+        if not self._begun:
+            raise ResetNeeded("there are no crystals yet: call reset()")
         return tuple(
             EnvState(self._batch.save(i), dict(self._random(i).bit_generator.state)) for i in range(self.num_envs)
         )
@@ -223,12 +229,14 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
     def _seed(self, seed: int | Sequence[int | None] | None, mask: Mask) -> None:
         if seed is None:
             return
-        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else list(seed)
+        if isinstance(seed, int | np.integer):
+            seed = [int(seed) + i for i in range(self.num_envs)]
+        seeds = list(seed)
         if len(seeds) != self.num_envs:
             raise ValueError(f"expected {self.num_envs} seeds, one a slot, got {len(seeds)}")
         for i in np.flatnonzero(mask).tolist():
-            if seeds[i] is not None:
-                self._randoms[i], self._seeds[i] = seeding.np_random(seeds[i])
+            if (own := seeds[i]) is not None:
+                self._randoms[i], self._seeds[i] = seeding.np_random(int(own) if isinstance(own, np.integer) else own)
 
     def _reset_mask(self, mask: Any) -> Mask:
         if mask is None:

@@ -142,7 +142,7 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[[Callable[[list[str]
 @pytest.fixture(scope="session")
 def ppo() -> Any:
     """A learner that has learned a little, for tests that leave it as it is."""
-    from small_learners import SMALL, trained
+    from tests.small_learners import SMALL, trained
 
     return trained(SMALL)
 

@@ -13,7 +13,7 @@ import numpy as np
 
 OPERATORS = (
     "Add", "Clip", "Concat", "Div", "Elu", "Gather", "Gemm", "Identity", "LeakyRelu", "MatMul", "Mul", "Neg", "Relu",
-    "Sigmoid", "Slice", "Softplus", "Split", "Sub", "Tanh",
+    "Sigmoid", "Slice", "Softplus", "Split", "Sqrt", "Sub", "Tanh",
 )  # fmt: skip
 """Operators an agent may use, of the standard ONNX domain."""
 OPSETS = range(13, 22)
@@ -155,11 +155,17 @@ def _state_length(inputs: list[Any], outputs: list[Any]) -> int:
 
 def _check_shapes(graph: Any) -> None:
     """Refuse a graph whose results have unknown or large shapes, or that mixes the rows of different pullers."""
-    shapes = {value.name: value.type.tensor_type.shape.dim for value in (*graph.value_info, *graph.output)}
+    shapes = {
+        value.name: value.type.tensor_type.shape.dim for value in (*graph.input, *graph.value_info, *graph.output)
+    }
     rows = {value.name for value in graph.input}
     total = 0
     for node in graph.node:
-        per_row = any(name in rows for name in node.input)
+        given = [name for name in node.input if name in rows]
+        ranks, per_row = {len(shapes[name]) for name in given}, bool(given)
+        # Of other ranks, or on the right of a matrix product, n would meet another axis than its own.
+        if len(ranks) > 1 or (node.op_type in ("MatMul", "Gemm") and node.input[1] in rows and ranks == {2}):
+            raise GraphError(f"its {node.op_type} may mix the rows of different pullers")
         for name in filter(None, node.output):
             dims = [dim.dim_param or dim.dim_value for dim in shapes.get(name, ())]
             widths = dims[1:] if per_row else dims

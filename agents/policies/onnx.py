@@ -104,7 +104,7 @@ class OnnxPolicy:
         if state is not None:
             before += np.reshape(state, before.shape)
         if episode_start is not None:
-            before[np.broadcast_to(episode_start, len(rows))] = 0.0
+            before[np.broadcast_to(np.asarray(episode_start, np.bool_), len(rows))] = 0.0
         action, after = self._run({"observation": rows, "state": before})
         return (action[0], after[0]) if array.ndim == 1 else (action, after)
 

@@ -44,10 +44,16 @@ class Progress:
 
 
 def to_bytes(learner: Learner, seconds: float, best_cost: float | None) -> bytes:
-    """The checkpoint of a learner; of a replay buffer the latest transitions."""
+    """The checkpoint of a learner; of a replay buffer the latest transitions.
+
+    AgentFileError if it learned numbers that are not finite: no run could go on from them.
+    """
     parts, progress = learner.parts(), Progress(int(learner.steps), seconds, best_cost)
     # Modules that share a tensor each get their copy: the format knows no sharing.
     copies = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in _tensors(parts).items()}
+    for name, tensor in copies.items():
+        if tensor.is_floating_point() and not tensor.isfinite().all():
+            raise AgentFileError(f"the training went wrong: {name!r:.80} is not finite; the last checkpoint stays")
     header = {"format": FORMAT, "progress": json.dumps(asdict(progress))}
     content: bytes = save(copies | latest(parts.replay_buffer), header)
     return content

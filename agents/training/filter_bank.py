@@ -19,6 +19,8 @@ from cz_gym.observation import MEASURED
 
 from .export import OnnxGraph
 from .networks import NORMALISED_LIMIT, tanh_layers
+from .notch import STATE as NOTCH
+from .notch import cleaned
 from .symbolic import Value, columns, held, joined, parted, rectified, through
 
 TIMES = tuple(float(time) for time in np.geomspace(3.0, 3600.0, 8))
@@ -53,11 +55,20 @@ _AT = {channel.name: place for place, channel in enumerate(MEASURED)}
 _NOISY = [_AT[name] for name in NOISY]
 MEANS = len(SIGNALS) * len(TIMES) + len(BEGUN) + 1
 """How many means it remembers, the integral with them."""
-_PARTS = [MEANS, *[len(NOISY)] * 3, len(SWINGS)]
+CLEANED = 4
+"""The fastest :data:`TIMES` over which what :mod:`.notch` takes from the readings is averaged too."""
+_PARTS = [MEANS, *[len(NOISY)] * 3, len(SWINGS), NOTCH, CLEANED]
 STATE = sum(_PARTS)
 """Numbers that it remembers: means of each signal, fastest first, with the integral of the ring error; of noisy
-channels the last readings, their last differences, and the variances less the usual ones; the squared swings."""
-_STRENGTHS = len(NOISY) + 1 + len(SWINGS)
+channels the last readings, their last differences, and the variances less the usual ones; the squared swings; the notch
+and means of what it takes away."""
+_STRENGTHS = 1 + len(NOISY) + 1 + len(SWINGS)
+_UNLED = _STRENGTHS + 1 + CLEANED
+"""Features that no action is chosen for: outliers and ripples, and what schedules the linear map."""
+HELD = 2
+"""Place in :data:`TIMES` of the mean that stands in for a reading that failed."""
+_BEGUN = len(SIGNALS) * len(TIMES)
+"""Place of the first mean of "valid"."""
 _GROWTH = len(SIGNALS) * (len(TIMES) + 1) + 4
 """Place of r_ref_5min - r_ref among the features."""
 
@@ -65,18 +76,24 @@ _GROWTH = len(SIGNALS) * (len(TIMES) + 1) + 4
 class FilterBank(nn.Module):
     """Readings -> leaky means, their differences, noise -> normalised -> scheduled linear map, tanh layers -> action.
 
-    The linear map is scheduled, as a Kalman filter's gains would be: it is one of the normalised features x, x n,
-    x (n^2 - 1), x s, x g, x m and x b, where n is the camera's noise, s are swings and g is how the reference will
-    change within 5 minutes, normalised too; m, from 0 to 1, is the camera's noise on the scale of ripples, and b falls
-    from 1 to 0 within each of :data:`BEGUN`.
+    The linear map is scheduled, as a Kalman filter's gains would be: it is one of the normalised features x and of
+    their products with the ring's ripple, the camera's noise n, n^2 - 1, swings and how the reference will change
+    within 5 minutes, all normalised; with the camera's noise on the scale of outliers, from 0 to 1; and with how new
+    the crystal is or how many readings failed, from 1 to 0 within each of :data:`BEGUN`.
     """
 
     keep: torch.Tensor
     gain: torch.Tensor
     features: torch.Tensor
     gains: torch.Tensor
+    ring: torch.Tensor
+    ones: torch.Tensor
+    spread: torch.Tensor
+    gather: torch.Tensor
     swings: torch.Tensor
     usual: torch.Tensor
+    cleaned_keep: torch.Tensor
+    cleaned_gain: torch.Tensor
     mean: torch.Tensor
     per_std: torch.Tensor
 
@@ -87,6 +104,7 @@ class FilterBank(nn.Module):
         self._constant("gain", gain)
         self._constant("features", features)
         self._constant("gains", np.array(GAINS))
+        self._constant("ring", np.eye(1, len(MEASURED), _AT["ring_error"]))
         swings = np.zeros((MEANS, len(SWINGS)))
         for band, pair in enumerate(SWINGS):
             swings[len(TIMES) * SIGNALS.index("v_p") + np.array(pair), band] = 1.0, -1.0
@@ -94,12 +112,20 @@ class FilterBank(nn.Module):
         self._constant("usual", np.array(USUAL_SWINGS))
         self.swing_share = 1.0 - float(np.exp(-control_interval / SWING_TIME))
         self.noise_share = 1.0 - float(np.exp(-control_interval / NOISE_TIME))
-        width = features.shape[1] + _STRENGTHS
+        self.interval = control_interval
+        shares = 1.0 - np.exp(-control_interval / np.array(TIMES[:CLEANED]))
+        self._constant("cleaned_keep", 1.0 - shares)
+        self._constant("cleaned_gain", shares[None])
+        width = features.shape[1] + _UNLED
         self.register_buffer("mean", torch.zeros(width))
         self.register_buffer("per_std", torch.ones(width))
         self.layers = tanh_layers([width, *hidden])
         self.scheduled = scheduled
-        self.linear = nn.Linear((1 + scheduled * (4 + len(BEGUN) + len(SWINGS))) * width, len(GAINS))
+        schedules = scheduled * (5 + len(BEGUN) + len(SWINGS))
+        self.linear = nn.Linear(width, len(GAINS) * (1 + schedules))
+        self._constant("ones", np.tile(np.eye(1, 1 + schedules), len(GAINS)))
+        self._constant("spread", np.tile(np.eye(1 + schedules)[1:], len(GAINS)))
+        self._constant("gather", np.repeat(np.diag(GAINS), 1 + schedules, axis=0))
         self.bent = nn.Linear(hidden[-1], len(GAINS), bias=False) if hidden else None
         with torch.no_grad():
             for parameter in (*self.linear.parameters(), *(self.bent.parameters() if self.bent else ())):
@@ -110,7 +136,12 @@ class FilterBank(nn.Module):
 
     def remember(self, measured: Any, state: Any) -> tuple[Any, Any]:
         """Features, shape (n, width), and the next state, from readings (n, 11) and the state (n, STATE)."""
-        means, last, change, excess, squares = parted(state, _PARTS)
+        means, last, change, excess, squares, notch, taken = parted(state, _PARTS)
+        first = held(columns(means, range(_BEGUN, _BEGUN + 1)) * -1e6 + 1.0, 0.0, 1.0)
+        with torch.no_grad():
+            ring, valid = (columns(measured, range(_AT[name], _AT[name] + 1)) for name in ("ring_error", "valid"))
+            failed = (columns(means, range(HELD, HELD + 1)) - ring) * (valid * -1.0 + 1.0)
+        measured = measured + failed @ self.ring
         means = means * self.keep + measured @ self.gain
         with torch.no_grad():
             now = columns(measured, _NOISY)
@@ -118,51 +149,58 @@ class FilterBank(nn.Module):
             bend = difference - change
             square = bend * bend * (1.0 / 6.0)
             used = square - rectified(square - variance * OUTLIER)
-            excess = excess + (used - variance) * self.noise_share
+            excess = excess + (used - variance) * valid * self.noise_share
             variance = excess + USUAL**2
             noise = variance / (variance + USUAL**2)
             large = columns(variance, range(1)) / (columns(variance, range(1)) + LARGE**2)
             swings = means @ self.swings
             squares = squares + (swings * swings - squares) * self.swing_share
             strong = squares / (squares + self.usual)
-        features = joined([joined([measured, means]) @ self.features, noise, large, strong])
-        return features, joined([means, now, difference, excess, squares])
+            take, ripple, notch = cleaned(columns(now, range(1)), notch, first, self.interval)
+            taken = taken * self.cleaned_keep + take @ self.cleaned_gain
+        features = joined([joined([measured, means]) @ self.features, take, taken, ripple, noise, large, strong])
+        return features, joined([means, now, difference, excess, squares, notch, taken])
 
     def back(self, by_features: Any, by_means: Any) -> tuple[Any, Any]:
         """Gradients with respect to readings (n, 11) and means before, from those of features and means after.
 
-        Arrays. Noise and swings are taken as they are: no action is chosen for what it does to their estimates.
+        Arrays. Noise, swings, outliers, ripples and readings that failed are taken as they are: no action is chosen for
+        what it does to their estimates.
         """
-        by_seen = by_features[:, :-_STRENGTHS] @ self.features.numpy().T
+        by_seen = by_features[:, :-_UNLED] @ self.features.numpy().T
         by_means = by_means + by_seen[:, len(MEASURED) :]
         return by_seen[:, : len(MEASURED)] + by_means @ self.gain.numpy().T, by_means * self.keep.numpy()
 
     def act(self, features: Any) -> Any:
         """The action, shape (..., 2), not yet held within its box, from features of shape (..., width)."""
         x = held((features - self.mean) * self.per_std, -NORMALISED_LIMIT, NORMALISED_LIMIT)
-        action = through(joined([x, *(x * each for each in self._schedule(x, features))]), self.linear)
+        lines = through(x, self.linear)
+        if self.scheduled:
+            lines = lines * (self._schedule(x, features) @ self.spread + self.ones)
+        action = lines @ self.gather
         if self.bent is not None:
-            action = action + through(through(x, self.layers), self.bent)
-        return action * self.gains
+            action = action + through(through(x, self.layers), self.bent) * self.gains
+        return action
 
-    def _schedule(self, x: Any, features: Any) -> list[Any]:
-        """What the linear map is scheduled on, each of shape (..., 1)."""
-        if not self.scheduled:
-            return []
+    def _schedule(self, x: Any, features: Any) -> Any:
+        """What the linear map is scheduled on, each in a column."""
         width = len(self.mean)
         strengths = held(columns(x, range(width - _STRENGTHS, width)), -SCHEDULE_LIMIT, SCHEDULE_LIMIT)
-        noise, _, _, *swings = parted(strengths, [1] * _STRENGTHS)
-        ages = range(width - _STRENGTHS - len(BEGUN), width - _STRENGTHS)
+        ripple, noise, _, _, *swings = parted(strengths, [1] * _STRENGTHS)
+        ages = range(width - _UNLED - len(BEGUN), width - _UNLED)
         large = width - len(SWINGS) - 1
         growth = columns(x, range(_GROWTH, _GROWTH + 1))
-        return [
-            noise,
-            noise * noise - 1.0,
-            *swings,
-            held(growth, -SCHEDULE_LIMIT, SCHEDULE_LIMIT),
-            columns(features, range(large, large + 1)),
-            *(each * -1.0 + 1.0 for each in parted(columns(features, ages), [1] * len(BEGUN))),
-        ]
+        return joined(
+            [
+                ripple,
+                noise,
+                noise * noise - 1.0,
+                *swings,
+                held(growth, -SCHEDULE_LIMIT, SCHEDULE_LIMIT),
+                columns(features, range(large, large + 1)),
+                columns(features, ages) * -1.0 + 1.0,
+            ]
+        )
 
     def forward(self, measured: Any, state: Any) -> tuple[Any, Any]:
         """Action and next state."""

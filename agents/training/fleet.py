@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -63,8 +64,19 @@ def train_seed(job: Job) -> dict[str, float]:
         return run.finish()
 
 
+def _tried(train: Callable[[Job], dict[str, float]], job: Job) -> dict[str, float] | Exception:
+    """What training a seed comes to, or why not: one seed's mistake is no reason to stop the others."""
+    try:
+        return train(job)
+    except (ValueError, OSError, ArithmeticError) as error:
+        return error
+
+
 def train_seeds(jobs: Sequence[Job], perform: Perform, bar: Any) -> Iterator[tuple[Job, dict[str, float]]]:
-    """Train what is not finished; each seed with its summary, as they come. ``bar`` is tqdm's and counts seeds."""
+    """Train what is not finished; each seed with its summary, as they come. ``bar`` is tqdm's and counts seeds.
+
+    ValueError names the seeds that failed, once the others are done.
+    """
 
     def look() -> None:
         shares, told = zip(*map(_standing, jobs), strict=True)
@@ -77,9 +89,15 @@ def train_seeds(jobs: Sequence[Job], perform: Perform, bar: Any) -> Iterator[tup
             yield job, summary
         else:
             missing.append(job)
-    for number, summary in perform(train_seed, missing, look):
-        yield missing[number], summary
+    failed = []
+    for number, found in perform(partial(_tried, train_seed), missing, look):
+        if isinstance(found, Exception):
+            failed.append(f"seed {missing[number].seed}: {found}")
+        else:
+            yield missing[number], found
     look()
+    if failed:
+        raise ValueError("; ".join(failed))
 
 
 def _standing(job: Job) -> tuple[float, str]:

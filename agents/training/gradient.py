@@ -1,6 +1,8 @@
-"""Learning from the exact gradient of the cost: through policy, memory and plant, window by window of the crystal.
+"""Learning from the gradient of the cost: through policy, memory and plant, window by window of the crystal.
 
-The plant's derivatives are those of :class:`cz_gym.differentiable.DifferentiableBatch`. No critic, no teacher.
+The plant's derivatives are the exact ones of :class:`cz_gym.differentiable.DifferentiableBatch`. What the network
+estimates beside its means (noise, swings, ripple) and the schedule that follows from it are taken as given. No critic,
+no teacher.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from cz_gym.config import Config
 from cz_gym.differentiable import STATES, Step
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from cz_gym.observation import MEASURED, scales
-from cz_gym.task import COST_CAP, Cost, cost_terms, drives_of
+from cz_gym.task import COST_CAP, RADIUS_SCALE, Cost, cost_terms, drives_of
 
 from .crystals import Crystals
 from .demonstrations import widened
@@ -29,12 +31,14 @@ WARM_UP = 0.05
 """Share of the updates in which features are still standardised anew."""
 MOST_STD, LEAST_STD = 10.0, 1e-4
 """Bounds of a feature's standard deviation [-]."""
-MOST_GRADIENT = 1.0
-"""Norm that a gradient is cut to."""
+MOST_GRADIENT = 2.0
+"""A gradient is cut to so many times the median norm of the last ones [-]: of a crystal that is nearly lost it is
+thousands of times as large, and says little."""
+LAST_GRADIENTS = 100
 AT_ONCE = 12
 """Steps whose actions are differentiated at once: few enough for a processor's cache."""
 _V_P = [channel.name for channel in MEASURED].index("v_p")
-_PULL_STEP = Cost._fields.index("pull_step")
+_RADIUS, _PULL_STEP = (Cost._fields.index(name) for name in ("radius", "pull_step"))
 
 
 class Window(NamedTuple):
@@ -67,6 +71,7 @@ class GradientLearner:
         self.network = FilterBank(config.control_interval, recipe.hidden, recipe.scheduled)
         weights = self.network.parameters()
         self.optimiser = torch.optim.Adam(weights, recipe.learning_rate, betas=(0.9, recipe.beta2))
+        self.norms = torch.zeros(LAST_GRADIENTS)
         self.random = np.random.default_rng([seed, done])
         self.drives = drives_of(config.action, config.control_interval)
         self.v_p_scale = float(scales(MEASURED, config.parameters.v_0)[_V_P])
@@ -114,13 +119,23 @@ class GradientLearner:
             for _ in range(self.recipe.window):
                 seen, memory = self.network.remember(torch.from_numpy(measured), memory)
                 action = self.network.act(seen).numpy()
-                step = batch.step(action)
+                step = self._weighed(batch.step(action))
                 beyond.append(self._beyond(measured, action, step))
                 features.append(seen)
                 costs.append(step.cost)
                 jacobians.append(step.jacobian)
                 measured = step.measured
         return Window(torch.stack(features), np.stack(costs), np.stack(beyond), jacobians, measured, memory)
+
+    def _weighed(self, step: Step) -> Step:
+        """The same with the radius error's cost as the recipe counts it."""
+        if not self.recipe.weights.observable:
+            return step
+        error = np.where(step.grows, step.error + step.offset, 0.0)
+        step.cost[:, _RADIUS] = cost_terms(error, 0.0, 0.0, 0.0).radius
+        slope = 2.0 * error / RADIUS_SCALE**2
+        step.jacobian[:, len(STATES) + _RADIUS] = slope[:, None] * step.jacobian[:, STATES.index("r_c")]
+        return step
 
     def _beyond(self, measured: Any, action: Any, step: Step) -> Any:
         """What each action adds to the gradient where a limit of the pull speed cuts its move off, shape (n,).
@@ -159,7 +174,12 @@ class GradientLearner:
                 by_measured, by_memory = self.network.back(by_features, by_memory)
                 rows[:, : len(STATES)] = back[:, : len(STATES)] + by_measured @ measured_by_state
             backward(actions, torch.from_numpy(by_action), inputs=weights)
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), MOST_GRADIENT)
+        known = self.norms[self.norms > 0.0].numpy()
+        limit = MOST_GRADIENT * float(np.median(known)) if known.size else math.inf
+        norm = torch.nn.utils.clip_grad_norm_(weights, limit)
+        if not norm.isfinite():
+            return
+        self.norms[1:], self.norms[0] = self.norms[:-1].clone(), norm
         self.optimiser.step()
         self.logger.record("gradient/cost", float((COST_CAP * cost / (COST_CAP + cost)).mean()))
         self.logger.record("gradient/norm", float(norm))
@@ -177,8 +197,8 @@ class GradientLearner:
         return [int(seed) for seed in self.random.choice(len(TRAINING_SEEDS), count)]
 
     def parts(self) -> Parts:
-        """Network and optimiser."""
-        return Parts({"network": self.network}, {"optimiser": self.optimiser})
+        """Network, optimiser and the last gradients' norms."""
+        return Parts({"network": self.network}, {"optimiser": self.optimiser}, {"norms": self.norms})
 
     def exported(self) -> bytes:
         """The network with its memory."""

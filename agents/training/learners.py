@@ -30,21 +30,11 @@ def make_learner(
     """
     logger = configure_logger(0, str(logs), "run", reset_num_timesteps=False) if logs else Logger(None, [])
     if isinstance(recipe, Imitation):
-        config = config_of(recipe)
+        config = recipe.config
         measured = make_config(recipe.scenario, control_interval=recipe.control_interval)
         return Imitator(recipe, seed, controllers(recipe.teacher, measured), config, logger, done)
     if isinstance(recipe, Gradient):
-        return GradientLearner(recipe, seed, config_of(recipe), logger, done)
+        return GradientLearner(recipe, seed, recipe.config, logger, done)
     if isinstance(recipe, Reinforcement):
         return Reinforced(recipe, seed, logger, done)
     raise TypeError(f"no learner learns by a {type(recipe).__name__}")
-
-
-def config_of(recipe: Recipe) -> Config:
-    """The environment that a recipe's agents act in."""
-    return make_config(
-        recipe.scenario,
-        observation=recipe.observation,
-        control_interval=recipe.control_interval,
-        action=recipe.action,
-    )

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from cz_gym.config import Config, make_config
+
 
 @dataclass(frozen=True)
 class CostWeights:
@@ -50,6 +52,16 @@ class Recipe:
     """Threads that torch computes on."""
     weights: CostWeights = OWN_WEIGHTS
 
+    @property
+    def config(self) -> Config:
+        """The environment that the recipe's agents act in."""
+        return make_config(
+            self.scenario,
+            observation=self.observation,
+            control_interval=self.control_interval,
+            action=self.action,
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class Imitation(Recipe):
@@ -60,7 +72,7 @@ class Imitation(Recipe):
     """
 
     hidden: tuple[int, ...] = (128, 128)
-    teacher: str = "lqg-at-0.02-told"
+    teacher: str = "lqg-at-0.02-privileged"
     """Name of the controller that is imitated."""
     rounds: int = 8
     """Times it demonstrates: first while it controls itself, then while the imitation does."""
@@ -95,15 +107,15 @@ class Gradient(Rewarded):
     name: str = "gradient"
     observation: str = "measured"
     action: str = "rate"
-    steps: int = 48_384_000
+    steps: int = 96_768_000
     num_envs: int = 192
     window: int = 180
     """Steps of a crystal that a gradient goes back through."""
     also: tuple[tuple[str, float, float], ...] = (
-        ("", 2.0, 0.1),
-        ("hard", 1.0, 0.1),
-        ("sensor-fault", 1.0, 0.03),
-        ("puller", 1.0, 0.03),
+        ("", 2.0, 0.05),
+        ("hard", 1.0, 0.2),
+        ("sensor-fault", 1.0, 0.2),
+        ("puller", 1.0, 0.25),
     )
     """Other crystals that it learns on: scenario ("": its own), how far everything random is spread in units of the
     scenario's own, and their share of all."""
@@ -246,12 +258,24 @@ class RandomSearch(Reinforcement):
 
 LQG_COST = CostWeights(pull=0.11, pull_step=0.049, heater_step=23.4)
 """The cost that the regulator of lqg-at-0.02 was made for, as multiples of the environment's."""
-GRADIENT_COST = replace(LQG_COST, pull_step=0.07)
-"""The cost that the recipe gradient follows: calmer."""
+GRADIENT_COST = replace(LQG_COST, pull_step=0.07, observable=True)
+"""The cost that the recipe gradient follows: calmer, and without what no sensor shows."""
+_OTHERS = ("sensor-fault", 1.0, 0.3), ("", 2.0, 0.03)
+_HALF = Gradient(steps=Gradient.steps // 2, weights=GRADIENT_COST)
+SPECIALISTS = (
+    replace(_HALF, name="gradient-randomized", also=_OTHERS),
+    replace(_HALF, name="gradient-randomized-calm", also=_OTHERS, weights=replace(GRADIENT_COST, pull_step=0.2)),
+    replace(_HALF, name="gradient-randomized-agile", also=_OTHERS, weights=replace(GRADIENT_COST, pull_step=0.04)),
+    Gradient(name="gradient-hard", scenario="hard", also=_OTHERS[:1], weights=GRADIENT_COST),
+    replace(_HALF, name="gradient-sensor-fault", scenario="sensor-fault", also=_OTHERS[1:]),
+    replace(_HALF, name="gradient-puller", scenario="puller", also=()),
+)
+"""The recipe gradient for one scenario each; for ``randomized`` at three activities."""
 RECIPES: dict[str, Recipe] = {
     recipe.name: recipe
     for recipe in (
         Gradient(weights=GRADIENT_COST),
+        *SPECIALISTS,
         PPO(),
         Refinement(weights=GRADIENT_COST),
         RecurrentPPO(),

@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 from torch import nn
 
 from cz_gym.agents.agent_file.contract import AgentFileError, read_agent
+from cz_gym.agents.agent_file.graph import checked
 from cz_gym.observation import HISTORY, MEASURED, PULL_SCALE, scales
 
 from .filter_bank import GAINS, STATE, FilterBank
@@ -29,7 +30,7 @@ def read_bank(recipe: Refinement) -> FilterBank:
     if (contract.control_interval, contract.action) != (recipe.control_interval, recipe.action):
         raise AgentFileError(f"{path}: not an agent of the recipe gradient")
     try:
-        bank.load(content)
+        bank.load(checked(content, len(MEASURED))[0])
     except ValueError as error:
         raise AgentFileError(f"{path}: {error}") from None
     return bank

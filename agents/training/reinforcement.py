@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from operator import attrgetter
 from typing import Any
 
@@ -97,16 +97,10 @@ class Reinforced:
 
 def make_slots(recipe: Reinforcement, seed: int, done: int) -> CzVecEnv:
     """The batch that is trained on."""
-    env = CzVectorEnv(
-        recipe.num_envs,
-        scenario=recipe.scenario,
-        observation="history" if isinstance(recipe, Refinement) else recipe.observation,
-        action=recipe.action,
-        control_interval=recipe.control_interval,
-        horizon=recipe.length,
-        autoreset_mode=AutoresetMode.SAME_STEP,
-        info="lean" if recipe.weights == OWN_WEIGHTS else "all",
-    )
+    observation = "history" if isinstance(recipe, Refinement) else recipe.observation
+    config = replace(recipe.config, observation=observation, horizon=recipe.length)
+    info = "lean" if recipe.weights == OWN_WEIGHTS else "all"
+    env = CzVectorEnv.from_config(config, recipe.num_envs, AutoresetMode.SAME_STEP, info=info)
     return CzVecEnv(env, recipe.privileged_critic, stagger=None if isinstance(recipe, RandomSearch) else seed + done)
 
 

@@ -17,7 +17,7 @@ from cz_gym.config import Config, make_config
 
 from .checkpoint import load_checkpoint, restore, to_bytes
 from .learner import Learner
-from .learners import Controllers, config_of, make_learner
+from .learners import Controllers, make_learner
 from .recipes import Recipe, Rewarded
 from .run_files import COLUMNS, REFERENCES, provenance, read_rows, read_settings, to_csv, to_json
 from .validation import JUDGING, PICKING, Validation, validate
@@ -53,7 +53,7 @@ class Run:
     ) -> None:
         self.folder, self.recipe, self.seed, self.checkpoint_seconds = folder, recipe, seed, checkpoint_seconds
         self.plot = plot
-        self.config = config_of(recipe)
+        self.config = recipe.config
         self._measured = make_config(recipe.scenario, control_interval=recipe.control_interval)
         self._references = {name: controllers(name, self._measured) for name in REFERENCES}
         self.references = self._validate_references(PICKING)
@@ -186,7 +186,7 @@ class Run:
 def _identity(recipe: Recipe, seed: int) -> dict[str, Any]:
     """What a run must be resumed with; it may be longer."""
     settings = {name: value for name, value in dataclasses.asdict(recipe).items() if name != "steps"}
-    config = config_of(recipe)
+    config = recipe.config
     return {
         "algorithm": recipe.name,
         "seed": seed,

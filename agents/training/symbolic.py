@@ -75,6 +75,11 @@ def rectified(x: Any) -> Any:
     return x.node("Relu") if isinstance(x, Value) else torch.relu(x)
 
 
+def root(x: Any) -> Any:
+    """The square root."""
+    return x.node("Sqrt") if isinstance(x, Value) else torch.sqrt(x)
+
+
 def held(x: Any, low: float, high: float) -> Any:
     """Within [low, high]."""
     if isinstance(x, Value):

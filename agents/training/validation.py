@@ -28,7 +28,7 @@ class Validation(NamedTuple):
     """Mean figures over validation episodes."""
 
     cost: float
-    """Of a step, unsaturated and weighed as in training; a lost episode costs ten a step [-]."""
+    """Of a step, weighed as in training; ten at most, which is what a lost episode costs [-]."""
     rmse_mm: float
     pull_step_rms_mm_per_min: float
     failure_rate: float
@@ -52,4 +52,4 @@ def costs(found: Metrics, weights: CostWeights) -> Floats:
     )
     cost = terms.radius + weights.pull * terms.pull
     cost += weights.pull_step * terms.pull_step + weights.heater_step * terms.heater_step
-    return np.where(found.failure_rate > 0, FAILURE_COST, cost)
+    return np.where(found.failure_rate > 0, FAILURE_COST, np.minimum(cost, FAILURE_COST))

@@ -92,6 +92,35 @@ FAULTY_QUIET = LQGSettings(
     weights=Weights(pull=0.08919, pull_step=0.3056, heater_step=1.162),
 )
 """``lqg-quiet`` on ``sensor-fault``."""
+ACTIVE_HARD = LQGSettings(
+    noise=NoiseModel(
+        fast_sd=0.42,
+        slow_sd=0.534,
+        drift_rate_sd=0.0007372,
+        drift_rate_tau=2585.0,
+        heater_walk=0.5908,
+        thermal_walk=0.003217,
+        recipe_share=0.2228,
+        pyrometer_sd=0.09231,
+    ),
+    weights=Weights(pull=0.03605, pull_step=0.03241, heater_step=8.442),
+)
+"""``lqg-active`` on ``hard``: the radius as well as pull steps of 0.03 mm/min allow. No controller of its own: a
+member of the family below."""
+ACTIVE_FAULTY = LQGSettings(
+    noise=NoiseModel(
+        fast_sd=0.2746,
+        slow_sd=0.3879,
+        drift_rate_sd=0.0006,
+        drift_rate_tau=1919.0,
+        heater_walk=0.5296,
+        thermal_walk=0.002281,
+        recipe_share=0.2213,
+        pyrometer_sd=0.08107,
+    ),
+    weights=Weights(pull=0.04006, pull_step=0.03163, heater_step=2.848),
+)
+"""``lqg-active`` on ``sensor-fault``: the observable radius as well as pull steps of 0.02 mm/min allow."""
 SHIPPED: dict[tuple[str, str], LQGSettings] = {
     ("lqg", "randomized"): REWARD,
     ("lqg-quiet", "randomized"): QUIET,
@@ -99,6 +128,8 @@ SHIPPED: dict[tuple[str, str], LQGSettings] = {
     ("lqg-quiet", "puller"): PULLER_QUIET,
     ("lqg", "sensor-fault"): FAULTY_REWARD,
     ("lqg-quiet", "sensor-fault"): FAULTY_QUIET,
+    ("lqg-active", "hard"): ACTIVE_HARD,
+    ("lqg-active", "sensor-fault"): ACTIVE_FAULTY,
 }
 """By controller and scenario."""
 
@@ -111,6 +142,22 @@ MEMBERS: dict[str, dict[float, tuple[str, float]]] = {
         0.013: ("lqg-quiet", 0.07386),
         0.02: ("lqg-quiet", 0.01232),
         0.03: ("lqg-quiet", 0.004767),
+    },
+    "hard": {
+        0.003: ("lqg", 16.8),
+        0.005: ("lqg-active", 21.99),
+        0.008: ("lqg-active", 3.874),
+        0.013: ("lqg-active", 0.672),
+        0.02: ("lqg-active", 0.1405),
+        0.03: ("lqg-active", 0.03068),
+    },
+    "sensor-fault": {
+        0.003: ("lqg", 29.58),
+        0.005: ("lqg-quiet", 3.599),
+        0.008: ("lqg-quiet", 0.591),
+        0.013: ("lqg-active", 0.1511),
+        0.02: ("lqg-active", 0.0291),
+        0.03: ("lqg-active", 0.005465),
     },
     "puller": {
         0.003: ("lqg-quiet", 40.07),
@@ -132,13 +179,14 @@ def family_name(activity: float) -> str:
     return f"lqg-at-{activity:g}"
 
 
-FAMILY = ("lqg", "lqg-quiet", *map(family_name, ACTIVITIES))
-"""Names of all LQGs that run as contenders: the reference family of :mod:`cz_gym.evaluation.equal_activity`."""
+FAMILY = ("lqg-quiet", *map(family_name, ACTIVITIES))
+"""Names of the LQGs that are tuned for the radius: the reference family of :mod:`cz_gym.evaluation.equal_activity`."""
 
 
 def settings_of(controller: str, scenario: str) -> LQGSettings:
-    """The frozen settings of "lqg" or "lqg-quiet" for that scenario."""
-    return SHIPPED.get((controller, scenario), SHIPPED[controller, "randomized"])
+    """The frozen settings of "lqg", "lqg-quiet" or "lqg-active" for that scenario."""
+    where = scenario if (controller, scenario) in SHIPPED else "randomized"
+    return SHIPPED[controller, where]
 
 
 def member_settings(activity: float, scenario: str) -> LQGSettings:

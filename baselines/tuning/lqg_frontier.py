@@ -1,7 +1,7 @@
 """Choose the LQG's settings for six levels of pull activity: ``python -m cz_gym.baselines.tuning.lqg_frontier``.
 
-Both shipped LQGs are swept over their weight on pull steps on training seeds, and the weight for each wanted activity
-is interpolated. Of the two, the one with the smaller radius error on validation seeds is taken. Test seeds are never
+The tuned LQGs are swept over their weight on pull steps on training seeds, and the weight for each wanted activity is
+interpolated. Of them, the one with the smallest radius error on validation seeds is taken. Test seeds are never
 touched; sweep, finals and choice are kept in results/tuning.
 """
 
@@ -25,9 +25,14 @@ from .harness import rounded
 from .lqg import figures
 from .lqg_goals import FAILURE_PENALTY
 
-BASES = ("lqg", "lqg-quiet")
+BASES = ("lqg", "lqg-quiet", "lqg-active")
 FACTORS = tuple(4.0**power for power in range(-3, 6))
 """Multiples of the shipped weight on pull steps that are swept."""
+
+
+def bases_for(scenario: str) -> list[str]:
+    """What is swept: ``randomized``'s settings where a scenario has none, but for "lqg-active"."""
+    return [base for base in BASES if base != "lqg-active" or (base, scenario) in SHIPPED]
 
 
 def sweep(base: str, scenario: str, episodes: int) -> list[dict[str, Any]]:
@@ -78,9 +83,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _sweep(given: argparse.Namespace) -> int:
     output = given.output or Path("results") / "tuning" / f"lqg-frontier-{given.scenario}.json"
     check_writable(output.parent)
-    swept = {base: sweep(base, given.scenario, given.episodes) for base in BASES}
+    bases = bases_for(given.scenario)
+    swept = {base: sweep(base, given.scenario, given.episodes) for base in bases}
     finals = [
-        [final(base, given.scenario, activity, weight_for(activity, swept[base]), given.validation) for base in BASES]
+        [final(base, given.scenario, activity, weight_for(activity, swept[base]), given.validation) for base in bases]
         for activity in ACTIVITIES
     ]
     found = {
@@ -88,7 +94,7 @@ def _sweep(given: argparse.Namespace) -> int:
         "budget": {"episodes": given.episodes, "validation": given.validation},
         "chosen": [min(pair, key=cost) for pair in finals],
         "finals": [entry for pair in finals for entry in pair],
-        "sweep": [entry for base in BASES for entry in swept[base]],
+        "sweep": [entry for base in bases for entry in swept[base]],
     }
     write_files({output: (json.dumps(found, indent=1) + "\n").encode()})
     print(json.dumps(found["chosen"], indent=1))

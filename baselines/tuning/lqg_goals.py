@@ -68,6 +68,8 @@ def _on_puller(settings: LQGSettings) -> LQGSettings:
 GOALS = {
     ("lqg", "randomized"): Goal(0.062, 0.02, True, _AGGRESSIVE_START),
     ("lqg-quiet", "randomized"): Goal(0.075, 0.0095, False, _QUIET_START),
+    ("lqg-active", "hard"): Goal(0.12, 0.03, False, REWARD, "hard", ("hard",)),
+    ("lqg-active", "sensor-fault"): Goal(0.06, 0.02, False, REWARD, "sensor-fault", ("sensor-fault",)),
     ("lqg", "puller"): Goal(0.09, 0.016, False, _on_puller(REWARD), "puller", ("puller",)),
     ("lqg-quiet", "puller"): Goal(0.1, 0.01, False, _on_puller(QUIET), "puller", ("puller",)),
     ("lqg", "sensor-fault"): Goal(0.063, 0.02, True, REWARD, "sensor-fault", ("sensor-fault",)),

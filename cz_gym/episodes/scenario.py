@@ -152,7 +152,7 @@ class Actuators:
 
 
 MAX_FLAGGED, MAX_UNFLAGGED = 3, 1
-MAX_LENGTH = 20.0 * MM
+MAX_LENGTH = 5.0 * MM
 """Largest error of the camera [m]; a crystal is lost long before."""
 MAX_LATENCY = 60.0
 """Oldest camera frame a scenario may deliver [s]."""
@@ -218,7 +218,7 @@ class Scenario:
             for name in names:
                 value = getattr(getattr(self, family), name)
                 length = max(map(abs, value if isinstance(value, tuple) else (value,)))
-                said = f"{family}.{name} of {length:g} m is more than {MAX_LENGTH:g} m: is it in metres?"
+                said = f"{family}.{name} of {length:g} m is {1e3 * length:g} mm: did you mean {length:g} * MM?"
                 need(length <= MAX_LENGTH, said)
         for family, names in _NOT_NEGATIVE.items():
             for name in names:

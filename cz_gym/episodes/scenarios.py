@@ -119,15 +119,25 @@ SCENARIOS: dict[str, Scenario] = {
 """Every named scenario."""
 
 
+_ROWS = {
+    "I": "model='I'",
+    "II": "model='II'",
+    "2s": "control_interval=2.0",
+    "10s": "control_interval=10.0",
+    "exact": "meniscus=cz_gym.physics.young_laplace.YOUNG_LAPLACE",
+}
+"""What the benchmark's rows add to the name of their scenario, as arguments of the environment."""
+
+
 def find_scenario(scenario: str | Scenario) -> Scenario:
     """The scenario of that name, or the given one; ValueError names what there is."""
     if isinstance(scenario, Scenario):
         return scenario
     if isinstance(scenario, str) and scenario in SCENARIOS:
         return SCENARIOS[scenario]
-    name, _, model = scenario.rpartition("-") if isinstance(scenario, str) else ("", "", "")
-    if name in SCENARIOS and model in ("I", "II"):
-        raise ValueError(f"{scenario!r} is a row of the benchmark: the scenario is {name!r}, with model={model!r}")
+    name, _, row = scenario.rpartition("-") if isinstance(scenario, str) else ("", "", "")
+    if name in SCENARIOS and row in _ROWS:
+        raise ValueError(f"{scenario!r} is a row of the benchmark: the scenario is {name!r}, with {_ROWS[row]}")
     raise ValueError(unknown("scenario", scenario, SCENARIOS, ", or pass a cz_gym.Scenario"))
 
 

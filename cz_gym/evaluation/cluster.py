@@ -11,6 +11,8 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from functools import cache
+from importlib.metadata import version
 from importlib.util import find_spec
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
@@ -21,6 +23,12 @@ import cz_gym
 
 from .user_code import PREFIX
 
+SETTINGS = b"\4"
+"""Type of the first frame that a server of HTTP/2 sends, and so one of gRPC (RFC 9113, 3.4)."""
+HTTP2_HELLO = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + b"\0\0\0" + SETTINGS + b"\0\0\0\0\0"
+"""What a client of it begins with: the preface, and settings that change nothing."""
+NUMBERS = "numpy", "scipy", "numba"
+"""Packages whose version the figures may depend on."""
 RETRIES = 20
 """Times that a task begins again whose node is lost."""
 TIMEOUT = 5.0
@@ -50,13 +58,17 @@ def connect(address: str, *more: str) -> None:
 
 
 def _check_answers(address: str) -> None:
-    """ValueError unless something answers at ``HOST:PORT``: Ray itself would ask for minutes."""
+    """ValueError unless a gRPC server answers at ``HOST:PORT``, as Ray's does: Ray itself would ask for minutes."""
     host, colon, port = address.rpartition(":")
-    if colon and port.isdigit():
+    if colon and port.isdigit() and not os.environ.get("RAY_USE_TLS"):
         try:
-            socket.create_connection((host, int(port)), TIMEOUT).close()
+            with socket.create_connection((host, int(port)), TIMEOUT) as connection:
+                connection.sendall(HTTP2_HELLO)
+                answer = connection.recv(len(HTTP2_HELLO))
         except (OSError, OverflowError) as error:
             raise ValueError(f"no Ray cluster at {address}: {error}") from None
+        if answer[3:4] != SETTINGS:
+            raise ValueError(f"no Ray cluster at {address}: what answers there is something else")
 
 
 def _check_nodes(ours: tuple[str, str], *more: str) -> None:
@@ -94,8 +106,13 @@ def _answers(question: Callable[..., Any], *arguments: Any) -> Iterator[tuple[st
 
 
 def facts_of_sources(*more: str) -> tuple[str, str]:
-    """Version of ``cz_gym`` and hash of all its sources, and of the packages ``more``."""
-    digest = hashlib.sha256()
+    """Version of ``cz_gym``; hash of all its sources, those of the packages ``more``, and the versions of NUMBERS."""
+    return _facts_of_sources(more)  # Ray takes plain functions only
+
+
+@cache
+def _facts_of_sources(more: tuple[str, ...]) -> tuple[str, str]:
+    digest = hashlib.sha256(" ".join(map(version, NUMBERS)).encode())
     for package in ("cz_gym", "cz_gym.agents", "cz_gym.baselines", *more):
         spec = find_spec(package)
         if spec is None:
@@ -104,6 +121,13 @@ def facts_of_sources(*more: str) -> tuple[str, str]:
         for file in sorted(root.rglob("*.py")):
             digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes() + b"\0")
     return cz_gym.__version__, digest.hexdigest()[:12]
+
+
+def _same_sources(ours: tuple[str, str], function: Callable[[Any], Any], task: Any) -> Any:
+    """What a function makes of a task; ValueError where the sources are others, as on a node that came later."""
+    if facts_of_sources() != ours:
+        raise ValueError(f"node {socket.gethostname()} has another cz_gym or numpy than this machine: install the same")
+    return function(task)
 
 
 Look = Callable[[], None]
@@ -122,8 +146,9 @@ def completed(
     for name, module in list(sys.modules.items()):
         if name.startswith(PREFIX):  # other machines do not have the user's files
             ray.cloudpickle.register_pickle_by_value(module)
-    remote: Any = ray.remote(lambda task: function(task)).options(num_cpus=1, max_retries=RETRIES)  # takes no partial
-    numbers = {remote.remote(task): number for number, task in enumerate(tasks)}
+    remote: Any = ray.remote(_same_sources).options(num_cpus=1, max_retries=RETRIES)
+    ours = facts_of_sources()
+    numbers = {remote.remote(ours, function, task): number for number, task in enumerate(tasks)}
     while numbers:
         done, _ = ray.wait(list(numbers), timeout=WAIT)
         for reference in done:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from cz_gym.episodes.scenarios import find_scenario
 
 from .metrics import metric_names
-from .results import BOUND, REFERENCE, Benchmark, Controller, Outcome, ScenarioResult
+from .results import BOUND, REFERENCE, Benchmark, Outcome, ScenarioResult
 from .statistics import RESAMPLES, SEED, Estimate
 
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime", "casadi")
@@ -98,11 +98,11 @@ def _provenance(benchmark: Benchmark) -> dict[str, Any]:
         "control_interval_s": config.control_interval,
         "horizon_s": config.horizon,
         "scenarios": {scenario.row.name: _crystals(scenario) for scenario in benchmark.scenarios},
-        "controllers": {controller.name: _facts(controller) for controller in benchmark.controllers},
+        "controllers": {controller.name: asdict(controller) for controller in benchmark.controllers},
         "agents": [dict(contract) for contract in benchmark.agents],
         "bootstrap": {"resamples": RESAMPLES, "seed": SEED, "paired_against": REFERENCE},
         "gap_measured_from": BOUND,
-        "gap_from_kept_episodes": {
+        "gap_from_cached_episodes": {
             s.row.name: len(s.earlier_bound.seeds) for s in benchmark.scenarios if s.earlier_bound
         },
     }
@@ -119,11 +119,6 @@ def _crystals(scenario: ScenarioResult) -> dict[str, Any]:
         "first_seed": scenario.seeds[0],
         "episodes": len(scenario.seeds),
     }
-
-
-def _facts(controller: Controller) -> dict[str, Any]:
-    """A controller's fields; files call the privileged ones ``told``."""
-    return {{"privileged": "told"}.get(name, name): value for name, value in asdict(controller).items()}
 
 
 def software(packages: Sequence[str]) -> dict[str, Any]:

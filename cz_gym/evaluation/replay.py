@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from cz_gym.config import Config
 
-from .rollout import Course, Rollout
+from .rollout import Course, Rollout, answer, check_policy
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,11 @@ def replay(
 
     ``policy`` may be a :class:`Playback` of logged actions. ``instead`` begins with an empty memory at ``at``, as in a
     new episode, unless it ``watches``: then it has seen every observation before, and its actions were not taken.
-    ``at`` is rounded to the control interval. Raises ValueError without a seed or for a moment outside the horizon.
+    ``at`` is rounded to the control interval. Raises ValueError without a seed, for a moment
+    outside the horizon, and for policies that cannot run there.
     """
+    for one in (policy, instead):
+        check_policy(one, config)
     if not seeds:
         raise ValueError("a replay needs at least one seed")
     if not 0.0 <= at <= config.horizon:
@@ -86,10 +89,5 @@ class _Watched:
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[Any, Any]:
         if self.watcher is not None:
-            _, self.memory = self.watcher.predict(
-                observation.copy(), state=self.memory, episode_start=episode_start, deterministic=deterministic
-            )
-        action, state = self.policy.predict(
-            observation, state=state, episode_start=episode_start, deterministic=deterministic
-        )
-        return action, state
+            _, self.memory = answer(self.watcher, observation.copy(), self.memory, episode_start)
+        return answer(self.policy, observation, state, episode_start)

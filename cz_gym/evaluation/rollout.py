@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from inspect import signature
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from cz_gym.units import MICRO
 from cz_gym.vector import CzVectorEnv
 
 Floats = npt.NDArray[np.float64]
+PREDICT = "predict(observation, state=None, episode_start=None, deterministic=True) -> (action, state)"
 
 
 class Signals(NamedTuple):
@@ -76,9 +78,28 @@ def rollout(
     slot goes on with another crystal, which nothing reads. A bound with a method ``for_episodes(config, seeds)`` is
     replaced by what it returns, which knows those episodes.
     """
-    check_config(config)
+    check_policy(policy, config)
     if not isinstance(seeds, Sequence | np.ndarray) or len(seeds) == 0:
         raise ValueError("a rollout needs a sequence of at least one seed, as [1]")
+    before = time.perf_counter()
+    if hasattr(policy, "for_episodes"):
+        policy = policy.for_episodes(config, list(seeds))
+    course = Course(config, seeds)
+    course.seconds = time.perf_counter() - before
+    course.run(policy, config.steps, progress)
+    return course.finish()
+
+
+def check_policy(policy: Any, config: Config) -> None:
+    """ValueError unless a policy that can run in the environment of these settings."""
+    check_config(config)
+    if isinstance(policy, type) or not (hasattr(policy, "predict") or hasattr(policy, "for_episodes")):
+        raise ValueError(f"{policy!r:.80} is no policy: an object with {PREDICT} is needed")
+    if hasattr(policy, "predict"):
+        try:
+            signature(policy.predict).bind(None, state=None, episode_start=None, deterministic=True)
+        except TypeError as error:
+            raise ValueError(f"{type(policy).__name__}.predict: {error}; it must be {PREDICT}") from None
     made_for = getattr(getattr(policy, "contract", policy), "control_interval", None)
     if made_for is not None and made_for != config.control_interval:
         raise ValueError(
@@ -91,13 +112,19 @@ def rollout(
             f"this {type(policy).__name__} gives actions {acts!r}, the environment takes {config.action!r}: "
             f"make_config(action={acts!r})"
         )
-    before = time.perf_counter()
-    if hasattr(policy, "for_episodes"):
-        policy = policy.for_episodes(config, list(seeds))
-    course = Course(config, seeds)
-    course.seconds = time.perf_counter() - before
-    course.run(policy, config.steps, progress)
-    return course.finish()
+
+
+def answer(policy: Any, observation: Any, state: Any, begins: Any) -> tuple[Any, Any]:
+    """Actions of shape (n, 2) and what the policy remembers; ValueError for anything else."""
+    found = policy.predict(observation, state=state, episode_start=begins, deterministic=True)
+    if not (isinstance(found, tuple) and len(found) == 2):
+        raise ValueError(f"predict must return a tuple (action, state), not {type(found).__name__}")
+    if np.shape(found[0]) != (len(observation), 2):
+        raise ValueError(
+            f"predict must return actions of shape {(len(observation), 2)} for {len(observation)} observations, "
+            f"not {np.shape(found[0])}"
+        )
+    return found
 
 
 class Course:
@@ -120,10 +147,7 @@ class Course:
         """Let the policy act until ``upto`` steps are done."""
         while self.k < upto:
             before = time.perf_counter()
-            found = policy.predict(self.observation, state=self.memory, episode_start=self.begins, deterministic=True)
-            if not (isinstance(found, tuple) and len(found) == 2):
-                raise ValueError(f"predict must return a tuple (action, state), not {type(found).__name__}")
-            action, self.memory = found
+            action, self.memory = answer(policy, self.observation, self.memory, self.begins)
             self.seconds += time.perf_counter() - before
             self._step(action)
             if progress is not None:

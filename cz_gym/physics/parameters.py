@@ -75,6 +75,10 @@ def describe() -> dict[str, Quantity]:
 _MAY_BE_ZERO = frozenset({"alpha_0", "T_a", "T_e"})
 
 
+MOST_V_0 = 1e-3
+"""Largest nominal pull speed [m/s]; silicon is pulled at hundredths of it."""
+
+
 def check_parameters(parameters: Parameters) -> Parameters:
     """Return the parameters, or raise ValueError naming the one that is not a usable number."""
     if not isinstance(parameters, Parameters):
@@ -83,6 +87,12 @@ def check_parameters(parameters: Parameters) -> Parameters:
         number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
         if not number or value < 0 or (value == 0 and name not in _MAY_BE_ZERO):
             raise ValueError(f"parameter {name} = {value!r} must be a positive finite number [{describe()[name].unit}]")
+    if parameters.alpha_0 >= math.pi / 2:
+        raise ValueError(
+            f"parameter alpha_0 = {parameters.alpha_0!r} rad must be below a right angle: is it in degrees?"
+        )
+    if parameters.v_0 > MOST_V_0:
+        raise ValueError(f"parameter v_0 = {parameters.v_0!r} m/s is above {MOST_V_0:g} m/s: is it in mm/min?")
     if parameters.R_cr <= parameters.r_0:
         raise ValueError(
             f"the crucible (R_cr = {parameters.R_cr} m) must be wider than the crystal (r_0 = {parameters.r_0} m)"

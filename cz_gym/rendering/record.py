@@ -62,11 +62,12 @@ class Record:
         self.puller = Puller(*slot["puller"].tolist())
         self._terminated = self._truncated = False
         self._rows = np.zeros((config.steps + 1, len(Sample._fields)))
-        self._read, self._said = 0, np.zeros((config.steps + 1, len(INFO) + 2))
-        self._count = 0
+        self._read, self._first = 0, int(slot["k"])
+        self._said: list[bytes] = []
+        self._valid: list[float] = []
 
     def __len__(self) -> int:
-        return self._count
+        return len(self._said)
 
     @property
     def now(self) -> Sample:
@@ -94,35 +95,34 @@ class Record:
         """The radius error of every sample by the camera [m], shape (samples,); NaN without a reading."""
         return np.where(self.column("valid") > 0.0, self.column("camera"), np.nan) - self.column("r_ref")
 
-    def add(self, info: Floats, slot: Any, terminated: bool = False, truncated: bool = False) -> None:
-        """Add the sample of info rows (:data:`cz_gym.engine.layout.INFO`) and the slot they were read from.
+    def add(self, info: Floats, valid: float, terminated: bool = False, truncated: bool = False) -> None:
+        """Add the sample of info rows (:data:`cz_gym.engine.layout.INFO`) and of the camera's word for its reading.
 
         It is only kept: what it means is worked out when somebody looks, since most steps are never drawn.
         """
-        row = self._said[self._count]
-        row[:-2], row[-2], row[-1] = info, slot["k"], slot["valid"]
-        self._count += 1
+        self._said.append(info.tobytes())
+        self._valid.append(valid)
         self._terminated, self._truncated = terminated, truncated
 
     def _samples(self) -> Floats:
         """All samples, shape (samples, fields)."""
-        while self._read < self._count:
-            self._rows[self._read] = self._sample(self._said[self._read])
+        while self._read < len(self._said):
+            self._rows[self._read] = self._sample(np.frombuffer(self._said[self._read]), self._valid[self._read])
             self._read += 1
-        return self._rows[: self._count]
+        return self._rows[: self._read]
 
-    def _sample(self, said: Floats) -> Sample:
+    def _sample(self, said: Floats, valid: float) -> Sample:
         """The next sample that nobody has looked at.
 
         The length grown is what the pull took up and the meniscus did not: h_c' = v_p - v_g, integrated exactly.
         """
         values = dict(zip(_READ, said[_ROWS].tolist(), strict=True))
         values["camera"] = values.pop("r_br_measured") - self.puller.ring_bias
-        t, length = float(said[-2]) * self.config.control_interval, 0.0
+        t, length = (self._first + self._read) * self.config.control_interval, 0.0
         if self._read:
             before = Sample(*self._rows[self._read - 1].tolist())
             length = before.length + values["v_p"] * (t - before.t) - (values["h_c"] - before.h_c)
-        return Sample(valid=float(said[-1]), t=t, length=length, **values)
+        return Sample(valid=valid, t=t, length=length, **values)
 
     def surface(self, height: float | None = None) -> tuple[Floats, Floats, Floats]:
         """The grown surface: radius, reference [m] and height above the melt [m], newest (lowest) first.

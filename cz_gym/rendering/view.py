@@ -67,13 +67,13 @@ class View:
     def begin(self, info: npt.NDArray[np.float64], slot: Any, scenario: str) -> None:
         """Start the record of an episode from its first sample, or from wherever a state was restored."""
         self.record = Record(self.config, slot, scenario)
-        self.record.add(info, slot)
+        self.record.add(info, float(slot["valid"]))
         self._show()
 
-    def add(self, info: npt.NDArray[np.float64], slot: Any, terminated: bool, truncated: bool) -> None:
+    def add(self, info: npt.NDArray[np.float64], valid: float, terminated: bool, truncated: bool) -> None:
         """Record a step."""
         if self.record is not None:
-            self.record.add(info, slot, terminated, truncated)
+            self.record.add(info, valid, terminated, truncated)
             self._show()
 
     def _show(self) -> None:

@@ -11,7 +11,7 @@ from cz_gym.units import MINUTE
 from studies.comparison.variants import Variant
 
 GRADIENT: Any = replace(RECIPES["gradient"], steps=350 * Gradient.num_envs * Gradient.window)  # type: ignore[call-arg]
-"""A quarter of the recipe: it holds every crystal, and what helps shows."""
+"""An eighth of the recipe: it holds every crystal, and what helps shows."""
 PPO: Any = replace(RECIPES["ppo"], steps=1_500_000)  # type: ignore[call-arg]
 
 
@@ -22,7 +22,8 @@ def _changed(base: Recipe, name: str, meaning: str, **changes: Any) -> Variant:
 _gradient, _ppo = partial(_changed, GRADIENT), partial(_changed, PPO)
 ROWS = (
     Variant(
-        GRADIENT, "from nothing, by the cost's exact gradient; a law scheduled on noise, swings, reference and age"
+        GRADIENT,
+        "from nothing, by the cost's exact gradient; a law scheduled on noise, ripple, swings, reference and age",
     ),
     _gradient("unscheduled", "one linear map for all crystals, beside the tanh layer", scheduled=False),
     _gradient("linear", "no tanh layer beside the scheduled map", hidden=()),

@@ -15,8 +15,8 @@ from studies.comparison.variants import Study, Variant
 ROWS = (
     Variant(
         RECIPES["gradient"],
-        "the cost's exact gradient through policy and plant, from nothing; the plant is known; a quarter of its "
-        "crystals are wide, or of hard, sensor-fault and puller",
+        "the cost's gradient through policy and plant, from nothing; the plant is known; of its "
+        "crystals, 70 % are wide, or of hard, sensor-fault and puller",
     ),
     Variant(RECIPES["ppo"], "proximal policy optimisation from nothing; the critic also sees the true state"),
     Variant(RECIPES["ppo-recurrent"], "the same of an LSTM; actor and critic see the past", "ppo"),

@@ -11,13 +11,17 @@ from typing import Any
 
 from cz_gym.agents import MODELS, shipped_seeds
 from cz_gym.agents.agent_file.contract import Contract, read_agent
+from cz_gym.agents.training.recipes import RECIPES, SPECIALISTS, Gradient
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser, guarded
 from studies.algorithms.__main__ import ROWS
 from studies.markdown import table
 
 PROG = "python -m studies.cards"
-AGENTS = {row.name: row.meaning for row in ROWS if any(MODELS.glob(f"{row.name}-seed*.onnx"))}
+_LEARNED = {row.name: row.meaning for row in ROWS} | {
+    recipe.name: f"as `gradient`, for `{recipe.scenario}`" for recipe in SPECIALISTS
+}
+AGENTS = {name: how for name, how in _LEARNED.items() if any(MODELS.glob(f"{name}-seed*.onnx"))}
 """Shipped agents, and how each learned."""
 FIGURES = {
     "rmse_mm": "RMSE [mm]",
@@ -30,35 +34,46 @@ Results = Mapping[str, Mapping[str, Mapping[str, Any]]]
 """The benchmark's estimates, by scenario, controller and metric."""
 
 
-def read_results(path: Path) -> Results:
-    """The results of a benchmark.json; ValueError for any other file."""
+def read_results(paths: Sequence[Path]) -> Results:
+    """Results of benchmark.json files, an agent's of the first that has it; ValueError if none has, or another file."""
     try:
-        found: Results = json.loads(path.read_text())["results"]
+        found: dict[str, dict[str, Any]] = {}
+        for path in reversed(paths):
+            for scenario, of in json.loads(path.read_text())["results"].items():
+                found.setdefault(scenario, {}).update(of)
         for name in AGENTS:
-            for scenario in found:
+            for of in _seen(name, found).values():
                 for metric in FIGURES:
-                    float(found[scenario][name][metric]["mean"])
+                    float(of[name][metric]["mean"])
     except (ValueError, KeyError, TypeError, AttributeError):
-        raise ValueError(f"{path} is no benchmark.json with {', '.join(AGENTS)}") from None
+        raise ValueError(f"no benchmark.json with {', '.join(AGENTS)}: {', '.join(map(str, paths))}") from None
+    return found
+
+
+def _seen(name: str, results: Results) -> Results:
+    """The scenarios that have an agent; KeyError if none has it."""
+    found = {scenario: of for scenario, of in results.items() if name in of}
+    if not found:
+        raise KeyError(name)
     return found
 
 
 def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -> str:
     """An agent's section."""
-    first = contracts[0]
+    first, seen = contracts[0], _seen(name, results)
     taken = [contract.training_steps / 1e6 for contract in contracts]
     steps = [f"{least_or_most(taken):.0f}" for least_or_most in (min, max)]
     rows = [
         [scenario, *(_estimate(of[name][metric], 100.0 if metric == "failure_rate" else 1.0) for metric in FIGURES)]
-        for scenario, of in results.items()
+        for scenario, of in seen.items()
     ]
-    fails = [f"`{scenario}`" for scenario, of in results.items() if of[name]["failure_rate"]["mean"] > 0.0]
+    fails = [f"`{scenario}`" for scenario, of in seen.items() if of[name]["failure_rate"]["mean"] > 0.0]
     return "\n".join(
         [
             f"## `{name}`",
             "",
             f"- How it learned: {how}.",
-            f"- Saw: crystals of `{first.scenario}`; {' to '.join(dict.fromkeys(steps))} million steps a run.",
+            f"- Saw: {_seen_in_training(name, first)}; {' to '.join(dict.fromkeys(steps))} million steps a run.",
             f"- Reads: `{first.observation}`; acts every {first.control_interval:g} s; its action is `{first.action}`.",
             f"- Training seeds: {len(contracts)}. `agents.load({name!r})` is the one of least validation cost.",
             "- Fails: " + (f"loses crystals of {', '.join(fails)}." if fails else "on none of these."),
@@ -67,6 +82,17 @@ def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -
             "",
         ]
     )
+
+
+def _seen_in_training(name: str, contract: Contract) -> str:
+    """What its crystals were, with the shares of those that are not the scenario's own."""
+    recipe = RECIPES.get(name)
+    also = recipe.also if isinstance(recipe, Gradient) else ()
+    others = [
+        f"{100.0 * share:.0f} % " + (f"of `{other}`" if other else f"{width:g} times as wide")
+        for other, width, share in also
+    ]
+    return f"crystals of `{contract.scenario}`" + (f", with {', '.join(others)} among them" if others else "")
 
 
 def _estimate(found: Mapping[str, Any], scale: float) -> str:
@@ -82,7 +108,8 @@ ABOUT = """# Model cards
 
 What each shipped agent saw, what it reaches and where it fails, on test crystals that took no part in its training. All
 training seeds of a name are pooled; in brackets the 95 % interval over crystals and training seeds. The figures are of
-[the benchmark](../benchmark/report.md); `python -m studies.cards` wrote this page.
+[the benchmark](../benchmark/report.md) and, of specialists, [the frontier](../frontier/report.md); `python -m
+studies.cards` wrote this page.
 
 No agent was trained or tested on a real puller: none may control one.
 """
@@ -91,8 +118,14 @@ No agent was trained or tested on a real puller: none may control one.
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser(prog=PROG, description=__doc__)
-    benchmark, out = Path("results/benchmark/benchmark.json"), Path("results/cards/cards.md")
-    parser.add_argument("--benchmark", type=Path, default=benchmark, help="results (default: %(default)s)")
+    results, out = Path("results"), Path("results/cards/cards.md")
+    parser.add_argument(
+        "--benchmark",
+        type=Path,
+        nargs="+",
+        default=[results / name / "benchmark.json" for name in ("benchmark", "frontier")],
+        help="results; an agent's are taken from the first that has it (default: of benchmark and frontier)",
+    )
     parser.add_argument("--out", type=Path, default=out, help="file to write (default: %(default)s)")
     given = parser.parse_args(arguments)
     return guarded(PROG, lambda: _main(given), "benchmark")

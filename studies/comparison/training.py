@@ -13,7 +13,6 @@ from typing import Any
 from tqdm import tqdm
 
 from cz_gym.agents.training.fleet import LOST
-from cz_gym.agents.training.learners import config_of
 from cz_gym.agents.training.recipes import Recipe
 from cz_gym.agents.training.run import CHECKPOINT, Run
 from cz_gym.atomic_files import locked
@@ -54,7 +53,7 @@ def trained(
             raise
         run.finish()
         rows = [{key: float(value) for key, value in row.items()} for row in run.rows]
-        return Result(judge(plan, run.best_policy(), config_of(recipe)), rows)
+        return Result(judge(plan, run.best_policy(), recipe.config), rows)
 
     name, settings = _identity(recipe, seed)
     path = path_of(plan, name, settings)

@@ -18,7 +18,7 @@ import numpy as np
 
 from cz_gym.baselines.lqg.settings import FAMILY
 from cz_gym.commands import OneLineParser, guarded
-from cz_gym.evaluation.equal_activity import Point, intervals, ratios
+from cz_gym.evaluation.equal_activity import Point, frontier, intervals, ratios
 from cz_gym.evaluation.files import EPISODES, Episodes, read_episodes
 from cz_gym.evaluation.statistics import Resamples
 
@@ -47,6 +47,7 @@ def table(results: Mapping[str, Points], episodes: Episodes | None = None) -> st
     for scenario, points in results.items():
         try:
             found = ratios(points, FAMILY)
+            most = frontier([points[name] for name in FAMILY if name in points]).activity[-1]
         except ValueError as error:
             lines.append(f"{scenario}: {error}")
             continue
@@ -56,6 +57,7 @@ def table(results: Mapping[str, Points], episodes: Episodes | None = None) -> st
             if name in found:
                 rival = f"{rmse / found[name]:.4f} mm, ratio {found[name]:.3f}"
                 rival += " [{:.3f}, {:.3f}]".format(*spread[name]) if name in spread else ""
+                rival += f", which lqg has at {most:.4f} and no better above" if activity > most else ""
             lines.append(f"{scenario}: {name} {rmse:.4f} mm at {activity:.4f} mm/min; lqg there: {rival}")
     return "\n".join(lines)
 

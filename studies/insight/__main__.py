@@ -42,6 +42,7 @@ from .step_tests import (
     jump_gains,
     parts_of,
     respond,
+    ripple_answers,
     run_events,
     survive,
     usual_noise,
@@ -111,7 +112,7 @@ def puller_parts(contender: Contender, episodes: int) -> dict[str, dict[str, flo
 def study(agent: Path | None, episodes: int, only_pictures: bool, tell: Callable[[str], None]) -> dict[str, bytes]:
     """Everything, as files by name."""
     from . import figures
-    from .report import answer_figures, as_json, as_markdown, jump_figures
+    from .report import answer_figures, as_json, as_markdown, jump_figures, ripple_figures
 
     tell("linearising")
     all_of_them = contenders(agent)
@@ -127,12 +128,14 @@ def study(agent: Path | None, episodes: int, only_pictures: bool, tell: Callable
     jumps = {
         each.name: [jump_gains(made[each.name], each.interface, noisy) for noisy in (False, True)] for each in acting
     }
+    ripples = {each.name: ripple_answers(made[each.name], each.interface) for each in acting}
     responses = {each.name: each.loop(omega, MIX, dt) for each in all_of_them}
     files = {
         "responses.png": figures.response_figure(answers, dt),
         "gains.png": figures.gain_figure({each.name: one_reading(each, dt) for each in all_of_them}, responses, dt),
         "loop.png": figures.loop_figure(responses, radius_model(make_puller(lam=MIX)).zero),
         "jumps.png": figures.jump_figure(jumps),
+        "ripple.png": figures.ripple_figure(ripples),
         "shares.png": figures.share_figure(answers["load"], responses, STEP_TESTS[1].title),
     }
     if only_pictures:
@@ -153,6 +156,7 @@ def study(agent: Path | None, episodes: int, only_pictures: bool, tell: Callable
         "noise_gain": {each.name: noise_gains(each, dt) for each in all_of_them},
         "apart": {"from": beside.name} | {o.name: apart(o, beside, dt) for o in all_of_them if o is not beside},
         "jumps": jump_figures(jumps),
+        "ripples": ripple_figures(ripples),
         "limits": limits,
         "puller_parts": parts,
     }

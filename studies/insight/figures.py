@@ -13,7 +13,7 @@ from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from .linear_agent import Floats
 from .loop import Responses
-from .step_tests import BEGIN, JUMPS, STEP_TESTS
+from .step_tests import BEGIN, JUMPS, RIPPLE, SPANS, STEP_TESTS
 
 _LINES = ("solid", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (2, 1.2)))
 MOVES = ("pull speed less v₀ [mm/min]", "heater less nominal [kW]")
@@ -155,4 +155,19 @@ def share_figure(answers: Mapping[str, Signals], responses: Mapping[str, Respons
     ratio.set_xlabel("angular frequency [rad/s]")
     ratio.set_title("heater over pull speed, answer to the ring [kW per mm/min]", fontsize=9.5)
     _legend(figure, event)
+    return png(figure)
+
+
+def ripple_figure(ripples: Mapping[str, Floats]) -> bytes:
+    """The pull speed's answer to a ripple of the ring, over the ripple, as time passes."""
+    figure = canvas(6.4, 3.8)
+    axis = figure.subplots()
+    style = looks(tuple(ripples))
+    minutes = BEGIN / MINUTE * (np.arange(SPANS) + 0.5)
+    for name, gains in ripples.items():
+        axis.plot(minutes, gains * MM / MM_PER_MIN, marker="o", ms=3.5, label=name, **style[name])
+    axis.set_ylim(bottom=0.0)
+    axis.set(xlabel="time since the crystal began [min]", ylabel="pull speed moved [mm/min per mm]")
+    axis.set_title(f"How strongly a ripple of {RIPPLE / MM:g} mm is answered", fontsize=11)
+    _legend(figure, axis)
     return png(figure)

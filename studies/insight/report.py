@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from cz_gym.evaluation.rollout import Signals
-from cz_gym.units import HOUR, KILO, MM, MM_PER_MIN
+from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 from studies.markdown import table
 
 from .linear_agent import Floats
 from .loop import BANDS
-from .step_tests import DRAWS, JUMPS, LIMITS, STEP_TESTS
+from .step_tests import BEGIN, DRAWS, JUMPS, LIMITS, RIPPLE, SPANS, STEP_TESTS
 
 
 def answer_figures(signals: Signals) -> dict[str, float]:
@@ -39,6 +39,11 @@ def jump_figures(jumps: Mapping[str, Sequence[Floats]]) -> dict[str, Any]:
     return {"mm": (JUMPS / MM).tolist(), "mm_per_min_per_mm": gains}
 
 
+def ripple_figures(ripples: Mapping[str, Floats]) -> dict[str, list[float]]:
+    """Answers to a ripple by controller, in each span of ten minutes, in mm/min per mm."""
+    return {name: (gains * MM / MM_PER_MIN).tolist() for name, gains in ripples.items()}
+
+
 def as_json(found: Mapping[str, Any]) -> str:
     """``insight.json``; margins that are missing, and the growth of what does not grow, are null."""
 
@@ -57,6 +62,7 @@ def as_markdown(found: Mapping[str, Any]) -> str:
     sections = (
         ("Answers to single events", _answers(found["answers"])),
         ("How strongly a jump of the radius is answered [mm/min per mm]", _jumps(found["jumps"])),
+        (f"How strongly a ripple of {RIPPLE / MM:g} mm is answered [mm/min per mm]", _ripples(found["ripples"])),
         ("Margins of the loop", _margins(found["margins"])),
         ("Noise of the camera in the drives, by the linear loop", _noise(found["noise_gain"])),
         (f"Local gain: largest deviation from {compared}'s", _apart(found["apart"])),
@@ -87,6 +93,14 @@ def _jumps(jumps: Mapping[str, Any]) -> str:
         for noise, gains in by_noise.items()
     ]
     return table(("controller", "noise", *(f"{size:g} mm" for size in jumps["mm"])), rows)
+
+
+def _ripples(ripples: Mapping[str, Sequence[float]]) -> str:
+    minutes = BEGIN / MINUTE
+    shown = {f"{minutes * k:.0f} to {minutes * (k + 1):.0f} min": k for k in (0, 2, 5, SPANS - 1)}
+    return table(
+        ("controller", *shown), [(name, *(f"{by[k]:.2f}" for k in shown.values())) for name, by in ripples.items()]
+    )
 
 
 def _margins(margins: Sequence[Mapping[str, Any]]) -> str:

@@ -26,6 +26,12 @@ JUMPS = np.array([1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 300.0]) * MICRO
 """Jumps of the radius whose answers are compared [m]."""
 DRAWS, CRYSTALS = 5, 32
 """Draws of noise that an event is survived under; crystals that an answer under noise is averaged over."""
+RIPPLE = 0.1 * MM
+"""Amplitude of the ripple whose answer is shown [m]."""
+ROTATIONS = np.linspace(8.0, 15.0, CRYSTALS) / MINUTE
+"""Crystal rotations that it is averaged over [rev/s]."""
+SPANS = 12
+"""Spans of ten minutes that it is followed for."""
 PROPERTIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "melt loss": ("pullers", ("melt_loss",)),
     "steady drift": ("drift", ("rate",)),
@@ -213,6 +219,25 @@ def jump_gains(policy: Any, interface: Interface, noisy: bool) -> Floats:
     mean = v_p.reshape(len(v_p), len(JUMPS) + 1, len(seeds)).mean(axis=2)
     gains: Floats = np.abs(mean[:, 1:] - mean[:, :1]).max(axis=0) / JUMPS
     return gains
+
+
+def ripple_answers(policy: Any, interface: Interface) -> Floats:
+    """How much of the pull speed is the answer to a ripple, RMS over that of the ripple, shape (SPANS,) [1/s].
+
+    The difference to the same crystal without the ripple, ten minutes at a time, over all :data:`ROTATIONS`.
+    """
+    config = crystal(SPANS * BEGIN / MINUTE, interface)
+
+    def turned(slot: Any, rotation: float) -> None:
+        slot["episode"]["ripple_amplitude"] = RIPPLE if rotation else 0.0
+        slot["episode"]["ripple_omega"] = 2.0 * np.pi * rotation
+
+    rotations = [*ROTATIONS, *np.zeros(CRYSTALS)]
+    seeds = [*VALIDATION_SEEDS[:CRYSTALS]] * 2
+    v_p = run_events(policy, config, (USUAL_NOISE, Event(0.0, turned)), rotations, seeds).signals.v_p
+    answer = (v_p[:, :CRYSTALS] - v_p[:, CRYSTALS:]).reshape(SPANS, -1)
+    found: Floats = np.sqrt(2.0 * (answer**2).mean(axis=1)) / RIPPLE
+    return found
 
 
 def usual_noise(policy: Any, interface: Interface) -> Course:

@@ -1,6 +1,7 @@
 """Smooth actions: first-order lags of the drives, the same at every control interval and in the batch."""
 
 import math
+from copy import deepcopy
 
 import gymnasium as gym
 import numpy as np
@@ -99,3 +100,15 @@ def test_info_is_lean_unless_all_is_asked_for() -> None:
         assert info["action_clipped"] is True
     with pytest.raises(ValueError, match="info must be one of lean, all, not 'everything'"):
         CzEnv(info="everything")
+
+
+def test_a_deep_copy_of_info_shares_nothing() -> None:
+    for env in CzEnv(), CzEnv(observation="history"), CzEnv(info="all"):
+        _, info = env.reset(seed=0)
+        info["of a wrapper"] = {"inside": [1.0]}
+        before, copy = deepcopy(dict(info)), deepcopy(info)
+        info["r_c"] = 0.0
+        info["of a wrapper"]["inside"].append(2.0)
+        if "state" in info:
+            info["state"][:] = 0.0
+        assert repr(copy) == repr(before)

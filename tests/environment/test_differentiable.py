@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gymnasium.error import InvalidAction
+from gymnasium.error import InvalidAction, ResetNeeded
 
 from cz_gym.config import make_config
 from cz_gym.differentiable import STATES, DifferentiableBatch
@@ -159,6 +159,20 @@ def test_actions_that_are_none_are_refused(actions: np.ndarray) -> None:
     batch.reset([1, 2])
     with pytest.raises(InvalidAction, match=r"shape \(2, 2\)"):
         batch.step(actions)
+
+
+def test_resets_that_are_none_are_refused() -> None:
+    batch = DifferentiableBatch(make_config(), np.int64(2))
+    with pytest.raises(ResetNeeded, match="every slot needs a crystal"):
+        batch.step(np.zeros((2, 2)))
+    batch.reset([1], [0])
+    with pytest.raises(ResetNeeded, match="every slot needs a crystal"):
+        batch.step(np.zeros((2, 2)))
+    for seeds, which in (([1.7], [0]), ([1, 2], [0, 0]), ([1], [-1]), ([1], [2])):
+        with pytest.raises(ValueError, match=r"seeds must be whole|slots must be different"):
+            batch.reset(seeds, which)  # type: ignore[arg-type]
+    batch.reset([np.int64(1), 2])  # type: ignore[list-item]
+    assert batch.step(np.zeros((2, 2))).grows.all()
 
 
 def test_crystals_at_their_end_stay() -> None:

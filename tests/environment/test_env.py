@@ -41,6 +41,7 @@ def test_everything_advertised_is_there() -> None:
     ("arguments", "says"),
     [
         ({"scenario": "paper-ramp-II"}, "the scenario is 'paper-ramp', with model='II'"),
+        ({"scenario": "randomized-2s"}, "the scenario is 'randomized', with control_interval=2.0"),
         ({"scenario": "randomised"}, "unknown scenario 'randomised': did you mean 'randomized'"),
         ({"scenario": "nonsense"}, "unknown scenario 'nonsense'; choose from nominal"),
         ({"scenario": 3}, "unknown scenario 3"),
@@ -60,7 +61,7 @@ def test_everything_advertised_is_there() -> None:
         ({"parameters": Parameters(k_l=math.nan)}, "parameter k_l = nan"),
         ({"meniscus": "hurle"}, r"cz_gym\.MeniscusModel"),
         ({"control_interval": True}, "not True"),
-        ({"parameters": Parameters(alpha_0=1.7)}, "nominal meniscus height .* check r_0, alpha_0"),
+        ({"parameters": Parameters(alpha_0=1.5)}, "nominal meniscus height .* check r_0, alpha_0"),
         ({"parameters": Parameters(r_0=1e-4)}, "nominal meniscus height .* check r_0, alpha_0"),
         (
             {"meniscus": YOUNG_LAPLACE, "parameters": Parameters(r_0=0.02)},

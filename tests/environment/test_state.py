@@ -238,8 +238,10 @@ def test_a_pickled_environment_goes_on_bit_for_bit(steps: int) -> None:
     if steps:
         env.reset(seed=4)
         run(env.unwrapped, steps)
+    env.action_space.seed(6)
     other = pickle.loads(pickle.dumps(env))
     assert other.spec == env.spec
+    assert repr(other.action_space.sample()) == repr(env.action_space.sample())
     for each in (env, other):
         if not steps:
             each.reset(seed=5)
@@ -258,6 +260,7 @@ def test_a_pickled_batch_goes_on_bit_for_bit(mode: AutoresetMode) -> None:
             batch.step(np.tile(ACTIONS[k], (3, 1)))
         other = pickle.loads(pickle.dumps(batch))
         assert other.np_random_seed == batch.np_random_seed
+        assert repr(other.action_space.sample()) == repr(batch.action_space.sample())
         for k in range(25):
             one, two = batch.step(np.tile(ACTIONS[k], (3, 1))), other.step(np.tile(ACTIONS[k], (3, 1)))
             assert repr(one) == repr(two)

@@ -1,6 +1,7 @@
 import math
 import multiprocessing
 import pickle
+import sys
 import threading
 from typing import Any
 
@@ -76,6 +77,7 @@ def test_no_step_while_an_episode_is_over() -> None:
     assert pickle.dumps(env.get_state()) == last
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows cannot fork")
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_a_forked_child_steps_on_threads_of_its_own() -> None:
     env = CzVectorEnv(512, "nominal", threads=2)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import io
 import pickle
+import socket
 import sys
 from dataclasses import replace
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -74,6 +76,20 @@ def test_without_a_cluster_there_is_one_line(monkeypatch: pytest.MonkeyPatch) ->
     with pytest.raises(ValueError, match=r"no Ray cluster at 127\.0\.0\.1:1") as refusal:
         cluster.connect("127.0.0.1:1")
     assert "\n" not in str(refusal.value)
+
+
+def test_what_is_no_cluster_is_one_line() -> None:
+    """Ray would try for minutes."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        Thread(target=lambda: server.accept()[0].sendall(b"220 mail.example.org ready\r\n"), daemon=True).start()
+        with pytest.raises(ValueError, match="what answers there is something else"):
+            cluster._check_answers(f"127.0.0.1:{server.getsockname()[1]}")
+
+
+def test_a_node_that_came_later_with_other_sources_does_nothing() -> None:
+    assert cluster._same_sources(cluster.facts_of_sources(), abs, -1) == 1
+    with pytest.raises(ValueError, match="has another cz_gym or numpy than this machine: install the same"):
+        cluster._same_sources(("0.0.0", "elsewhere"), abs, -1)
 
 
 def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from cz_gym import CzEnv, CzVectorEnv
+from cz_gym.agents import load
 from cz_gym.baselines import CompensatedPID
 from cz_gym.config import make_config
 from cz_gym.evaluation.replay import Playback, replay
@@ -71,6 +72,13 @@ def test_a_failed_episode_stays_failed() -> None:
 def test_bad_arguments_are_refused(arguments: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"at least one seed|must lie in the episode"):
         replay(Playback([[0, 0]]), Playback([[0, 0]]), **{"config": CONFIG, "seeds": SEEDS, **arguments})
+
+
+def test_policies_of_another_environment_are_refused() -> None:
+    agent, pid = load("gradient"), CompensatedPID()
+    for one, other in ((agent, pid), (pid, agent)):
+        with pytest.raises(ValueError, match="gives actions 'rate', the environment takes 'direct'"):
+            replay(one, other, make_config("randomized", horizon=600.0), [1])
 
 
 @pytest.mark.parametrize("log", [[], [1.0, 2.0], np.zeros((3, 3)), np.zeros((0, 2))])

@@ -107,7 +107,7 @@ def test_gaps_are_measured_from_an_earlier_bound(
         found = data["optimality_gap" if power == 1 else "optimality_gap_radius"]["randomized"]["open-loop"]
         assert found["mean"] == pytest.approx((ours - best) / (theirs - best), rel=1e-3)
         assert found["n"] == 2
-    assert data["provenance"]["gap_from_kept_episodes"] == {"randomized": 2}
+    assert data["provenance"]["gap_from_cached_episodes"] == {"randomized": 2}
     report = (tmp_path / "new" / "report.md").read_text()
     assert "`clairvoyant` of an earlier run (results/bounds), on the first 2 crystals" in report
     assert "`python benchmark.py --slow --controllers paper,clairvoyant --scenarios hard` runs it" in report

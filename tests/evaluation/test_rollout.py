@@ -124,6 +124,22 @@ def test_compute_is_time_in_predict_per_step_and_episode() -> None:
     assert run.microseconds_per_step == pytest.approx(1e6 * run.seconds_in_policy / (3 * SHORT.steps))
 
 
+class OneAction:
+    """Forgets that observations come as rows."""
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> Any:
+        return np.zeros(2, np.float32), state
+
+
+class NoMemory:
+    """Knows nothing of a state."""
+
+    def predict(self, observation: Any) -> Any:
+        return np.zeros((len(observation), 2), np.float32), None
+
+
 class OnlyAnAction:
     """Forgets that ``predict`` returns its state too."""
 
@@ -135,6 +151,10 @@ class OnlyAnAction:
     ("policy", "config", "message"),
     [
         (CompensatedPID(control_interval=2.0), SHORT, "was made for an action every 2 s, the environment takes one"),
+        (OneAction(), SHORT, r"actions of shape \(1, 2\) for 1 observations, not \(2,\)"),
+        (NoMemory(), SHORT, r"unexpected keyword argument 'state'; it must be predict\(observation, state=None"),
+        (CompensatedPID, SHORT, "is no policy: an object with predict"),
+        (lambda observation: observation, SHORT, "is no policy: an object with predict"),
         (OnlyAnAction(), SHORT, r"predict must return a tuple \(action, state\), not ndarray"),
         (CompensatedPID(), make_config(action="smooth"), r"gives actions 'direct', the environment takes 'smooth'"),
         (

@@ -43,6 +43,14 @@ def test_only_parameters_are_parameters() -> None:
         check_parameters({"r_0": 0.1})  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    ("given", "message"), [({"alpha_0": 11.0}, "is it in degrees"), ({"v_0": 1.2}, "is it in mm/min")]
+)
+def test_numbers_in_other_units_are_noticed(given: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_puller(Parameters(**given))
+
+
 @pytest.mark.parametrize("lam", [-0.1, 1.5, math.nan])
 def test_the_mix_of_models_lies_between_them(lam: float) -> None:
     with pytest.raises(ValueError, match=r"\[0, 1\]"):

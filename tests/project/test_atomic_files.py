@@ -113,12 +113,14 @@ def python(code: str, folder: Path) -> str:
     return done.stdout
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="forks, or feigns Windows")
 def test_a_writer_killed_at_any_line_leaves_all_old_or_all_new(tmp_path: Path) -> None:
     kills, finished = map(int, python(ALONE + KILL_AT_EVERY_LINE, tmp_path).split())
     assert kills > 50
     assert 10 < finished < kills
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="forks, or feigns Windows")
 def test_it_works_as_on_windows(tmp_path: Path) -> None:
     """Without ``fcntl`` and user numbers, and where a file that is open cannot be deleted."""
     assert python(AS_ON_WINDOWS, tmp_path / "new") == "True\n['a', 'b']\n"

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from contracts import LINEAR, facts, model_of
 
 import benchmark
 from cz_gym.agents import OnnxPolicy
@@ -26,6 +25,7 @@ from cz_gym.evaluation.report.output import check_targets
 from cz_gym.observation import OBSERVATIONS
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
+from tests.contracts import LINEAR, facts, model_of
 
 FILES = ["benchmark.json", "crystal.png", "episodes.csv", "errors.png", "pareto.png", "report.html", "report.md"]
 SMALL = ["--episodes", "3", "--scenarios", "randomized,reference-b", "--controllers", "open-loop,paper"]
@@ -141,7 +141,7 @@ def test_provenance_says_what_was_run(data: dict[str, Any]) -> None:
     assert told["packages"]["numpy"] == np.__version__
     assert [agent["training_seed"] for agent in told["agents"]] == [3, 8]
     assert told["controllers"]["ppo"]["training_seeds"] == [3, 8]
-    assert told["controllers"]["paper"]["told"] is False
+    assert told["controllers"]["paper"]["privileged"] is False
     assert "--episodes 3" in told["command"]
 
 
@@ -157,7 +157,7 @@ def test_provenance_says_what_was_run(data: dict[str, Any]) -> None:
         (["--scenarios", "easy"], "unknown scenario 'easy'; choose from randomized, hard"),
         (["--scenario", "hard"], "must be FILE.py:NAME, not 'hard'"),
         (["--agent", "nowhere.onnx"], "nowhere.onnx: no such file"),
-        (["--controllers", "paper", "--out", "/dev/null/results"], "not a folder"),
+        (["--controllers", "paper", "--out", str(Path(__file__) / "results")], "not a folder"),
         (["--controllers", "paper", "--json", "/"], "is a folder"),
     ],
 )

@@ -123,13 +123,11 @@ def test_what_was_melted_back_hangs_there_no_more() -> None:
     env = CzEnv("nominal", render_mode="rgb_array")
     env.reset(seed=1)
     record = record_of(env)
-    slot, info = env._slots[0].copy(), env._said.copy()
-    names = ("r_c", "v_p")
-    for k, (radius, v_p) in enumerate([(0.0871, 1e-3), (0.0872, 1e-3), (0.0873, -1.5e-3), (0.0874, 1e-4)], 1):
-        slot["k"] = k
+    info, names = env._said.copy(), ("r_c", "v_p")
+    for radius, v_p in (0.0871, 1e-3), (0.0872, 1e-3), (0.0873, -1.5e-3), (0.0874, 1e-4):
         for name, value in zip(names, (radius, v_p), strict=True):
             info[("r_c", "r_br", "r_ref", "h_c", "alpha_c", "v_g", "v_p").index(name)] = value
-        record.add(info, slot)
+        record.add(info, 1.0)
     r_c, _, z = record.surface()
     assert np.all(np.diff(z) >= 0)
     assert r_c == pytest.approx([0.0874, 0.0873, record.puller.r_0])

@@ -1,7 +1,6 @@
 """Damaged and hostile files are read or refused in one line; ``python -m tests.stress.fuzz`` is the long form."""
 
 import os
-import time
 from pathlib import Path
 
 import numpy as np
@@ -46,8 +45,6 @@ def test_files_cut_short_anywhere_are_read_or_refused(known: dict[str, Target], 
 
 def test_pipes_devices_and_folders_are_refused_at_once(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.onnx")
-    began = time.monotonic()
     for path in (tmp_path / "pipe.onnx", Path("/dev/zero"), tmp_path, Path("a\0b.onnx"), Path("")):
         with pytest.raises(AgentFileError, match=r"regular file|cannot be read|null"):
             OnnxPolicy.load(path)
-    assert time.monotonic() - began < 1.0

@@ -14,14 +14,16 @@ def entry(activity, rmse):
 
 
 def test_a_benchmark_is_compared_at_equal_activity(tmp_path, capsys):
-    scenario = {name: entry(a, 0.01 * a**-0.5) for name, a in ((family_name(0.005), 0.005), ("lqg", 0.02))}
-    scenario |= {"ppo": entry(0.01, 0.2), "industrial": entry(0.001, 0.4)}
+    scenario = {name: entry(a, 0.01 * a**-0.5) for name, a in ((family_name(0.005), 0.005), ("lqg-quiet", 0.02))}
+    scenario |= {"ppo": entry(0.01, 0.2), "industrial": entry(0.001, 0.4), "lively": entry(0.03, 0.1)}
     file = tmp_path / "benchmark.json"
     file.write_text(json.dumps({"results": {"randomized": scenario, "nominal": {"ppo": entry(0.01, 0.2)}}}))
     assert frontier.main([str(file)]) == 0
     told = capsys.readouterr().out
     assert "ppo 0.2000 mm at 0.0100 mm/min; lqg there: 0.1000 mm, ratio 2.00" in told
     assert "industrial 0.4000 mm at 0.0010 mm/min; lqg there: quieter than any" in told
+    assert "lively 0.1000 mm at 0.0300 mm/min; lqg there: 0.0707 mm, ratio 1.41" in told
+    assert ", which lqg has at 0.0200 and no better above" in told
     assert "nominal: a frontier needs two settings" in told
 
 
@@ -39,7 +41,7 @@ def test_an_lqg_as_active_as_ppo_stands_in_the_default_table():
 
 
 def test_episodes_beside_a_benchmark_give_intervals_unless_they_are_of_another_run(tmp_path, capsys, refused):
-    values = {"lqg": (0.02, 0.05), "lqg-quiet": (0.01, 0.07), "agent": (0.015, 0.06)}
+    values = {"lqg-at-0.02": (0.02, 0.05), "lqg-quiet": (0.01, 0.07), "agent": (0.015, 0.06)}
     lines = ["scenario,controller,training_seed,seed,pull_step_rms_mm_per_min,rmse_mm"]
     lines += [f"randomized,{name},,{seed},{a},{e}" for name, (a, e) in values.items() for seed in (1, 2)]
     (tmp_path / "episodes.csv").write_text("\n".join(lines))

@@ -1,5 +1,6 @@
 """Checkpoints: what goes on is what was saved, and what does not belong is refused."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -7,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from small_learners import SMALL, SMALL_SAC, made, trained
 
 from cz_gym.agents import AgentFileError
 from cz_gym.agents.training.checkpoint import load_checkpoint, restore, to_bytes
 from cz_gym.agents.training.networks import Normalise
+from tests.small_learners import SMALL, SMALL_SAC, made, trained
 
 
 def test_a_checkpoint_continues_and_refuses_what_does_not_fit(ppo: Any, tmp_path: Path) -> None:
@@ -28,6 +29,14 @@ def test_a_checkpoint_continues_and_refuses_what_does_not_fit(ppo: Any, tmp_path
     assert all(torch.equal(again[1][name], tensor) for name, tensor in tensors.items())
     with pytest.raises(AgentFileError, match="does not fit"):
         restore(made(replace(SMALL, hidden=(8, 8))), tensors, path)
+
+
+def test_what_is_not_finite_is_not_saved() -> None:
+    learner = made(SMALL)
+    with torch.no_grad():
+        next(learner.algorithm.policy.parameters()).fill_(math.nan)
+    with pytest.raises(AgentFileError, match=r"the training went wrong: .* is not finite; the last checkpoint stays"):
+        to_bytes(learner, 1.0, None)
 
 
 def test_a_learner_restored_before_its_first_update_learns_as_the_one_it_came_from(tmp_path: Path) -> None:

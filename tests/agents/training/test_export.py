@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from contracts import facts
-from small_learners import SMALL_SAC, trained
 
 from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.agent_file.contract import make_contract
 from cz_gym.observation import HISTORY, STATE
+from tests.contracts import facts
+from tests.small_learners import SMALL_SAC, trained
 
 
 def observations(n: int, channels: int) -> np.ndarray:

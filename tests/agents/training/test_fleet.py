@@ -17,6 +17,7 @@ import pytest
 from tqdm import tqdm
 
 import train
+from cz_gym.agents import AgentFileError
 from cz_gym.agents.training import fleet, run
 from cz_gym.agents.training.recipes import PPO, RECIPES, Recipe
 from cz_gym.atomic_files import locked
@@ -123,6 +124,20 @@ def test_an_unfinished_seed_goes_on_and_longer_runs_do_too(
     assert json.loads((tmp_path / "seed1" / "settings.json").read_text())["sessions"][1]["from_step"] == 4096
     assert train.main([*command, "--resume", "--steps", "6144"]) == 0
     assert trained == [0, 1, 1, 0, 1]
+
+
+def test_one_seed_that_fails_stops_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trained: list[int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def failing(job: fleet.Job) -> Any:
+        if job.seed == 1:
+            raise AgentFileError("the training went wrong")
+        return train_small_seed(job)
+
+    monkeypatch.setattr(fleet, "train_seed", failing)
+    assert train.main(["--algo", "imitation", "--seeds", "0-2", "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == "train.py: seed 1: the training went wrong"
+    assert sorted(agents(tmp_path)) == ["seed0", "seed2"]
 
 
 def test_a_task_that_runs_again_after_its_end_does_nothing(tmp_path: Path, trained: list[int]) -> None:

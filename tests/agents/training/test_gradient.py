@@ -9,7 +9,6 @@ import torch
 
 pytest.importorskip("sb3_contrib")
 
-from contracts import facts
 from stable_baselines3.common.logger import Logger
 
 from cz_gym.agents import OnnxPolicy
@@ -18,17 +17,18 @@ from cz_gym.agents.training import filter_bank, gradient
 from cz_gym.agents.training.crystals import Crystals
 from cz_gym.agents.training.filter_bank import STATE, FilterBank
 from cz_gym.agents.training.gradient import GradientLearner
-from cz_gym.agents.training.learners import config_of
 from cz_gym.agents.training.plant_step import PlantStep
 from cz_gym.agents.training.recipes import LQG_COST, RECIPES, Gradient
 from cz_gym.agents.training.validation import Validation, validate
 from cz_gym.differentiable import STATES, DifferentiableBatch
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.observation import MEASURED
-from cz_gym.task import COST_CAP, Cost
+from cz_gym.task import COST_CAP, RADIUS_SCALE, Cost
+from tests.contracts import facts
 
 FEW = Gradient(num_envs=16, window=20, steps=16 * 20 * 2, hidden=(8,))
-CONFIG = config_of(FEW)
+CONFIG = FEW.config
+VALID = [channel.name for channel in MEASURED].index("valid")
 
 
 def some_network(seed: int = 0) -> FilterBank:
@@ -61,7 +61,7 @@ def test_the_gradient_is_that_of_differences(scenario: str, apart: float) -> Non
     noise and swings, which are taken as they are, count as nothing here.
     """
     network, batch = some_network(), DifferentiableBatch(CONFIG.with_scenario(scenario), 12)
-    network.per_std[-5:] = 0.0
+    network.per_std[-6:] = 0.0
     driven(network, batch, 40).backward()
     directions = [torch.randn_like(parameter) for parameter in network.parameters()]
     along = sum(
@@ -104,7 +104,7 @@ def test_what_is_followed_is_the_gradient_that_torch_finds(scenario: str, monkey
     loss: Any = (COST_CAP * whole / (COST_CAP + whole)).mean()
     wanted = torch.autograd.grad(loss, list(learner.network.parameters()))
     for ours, theirs in zip(found, wanted, strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5 * float(theirs.abs().max()))
+        assert float((ours - theirs).norm()) <= 5e-5 * float(theirs.norm())
 
 
 def test_a_move_that_a_limit_cuts_off_is_charged_as_asked_for() -> None:
@@ -126,6 +126,34 @@ def test_a_move_that_a_limit_cuts_off_is_charged_as_asked_for() -> None:
     np.testing.assert_allclose(found, [0.0, wanted[1], wanted[2], 0.0], rtol=1e-4)
     assert step.jacobian[0, row, column] == pytest.approx(wanted[0], rel=1e-4)
     assert step.jacobian[1, row, column] == 0.0
+
+
+@pytest.mark.parametrize(("scenario", "drives"), [("sensor-fault", (0, 1)), ("puller", (0,))])
+def test_an_observable_cost_counts_what_sensors_can_show(scenario: str, drives: tuple[int, ...]) -> None:
+    """With ``observable`` weights, the radius error less what no sensor shows is charged, and its derivatives are those
+    of differences. The heater of ``puller`` moves in whole steps, which only differences see."""
+    config, row = CONFIG.with_scenario(scenario), len(STATES) + Cost._fields.index("radius")
+    learner = GradientLearner(replace(FEW, weights=replace(LQG_COST, observable=True)), 0, CONFIG, Logger(None, []), 0)
+
+    def stepped(action: list[float]) -> Any:
+        batch = DifferentiableBatch(config, 8)
+        batch.reset(range(8))
+        for _ in range(30):
+            batch.step(np.full((8, 2), 0.05))
+        true = batch.step(np.tile(action, (8, 1)))
+        cost = true.cost.copy()
+        return learner._weighed(true), cost
+
+    step, true = stepped([0.06, 0.1])
+    wanted = ((step.error + step.offset) / RADIUS_SCALE) ** 2
+    np.testing.assert_allclose(step.cost[:, 0], wanted, rtol=1e-12)
+    np.testing.assert_array_equal(step.cost[:, 1:], true[:, 1:])
+    assert float(np.abs(step.cost[:, 0] - true[:, 0]).max()) > 1e-3
+    for place in drives:
+        by = 0.01 * np.eye(2)[place]
+        ends = [stepped((np.array([0.06, 0.1]) + sign * by).tolist())[0].cost[:, 0] for sign in (1, -1)]
+        found = step.jacobian[:, row, len(STATES) + place]
+        np.testing.assert_allclose(found, (ends[0] - ends[1]) / 0.02, rtol=1e-4, atol=1e-9)
 
 
 def test_the_exported_memory_is_the_trained_one() -> None:
@@ -150,7 +178,7 @@ def test_what_is_remembered() -> None:
     """After a step of the ring error its means rise as first-order lags and its integral grows."""
     network, memory = FilterBank(5.0, ()), torch.zeros(1, STATE)
     seen = torch.zeros(1, len(MEASURED))
-    seen[0, 0] = 1.0
+    seen[0, [0, VALID]] = 1.0
     with torch.no_grad():
         for _ in range(100):
             features, memory = network.remember(seen, memory)
@@ -158,6 +186,20 @@ def test_what_is_remembered() -> None:
     np.testing.assert_allclose(memory[0, : len(times)], 1.0 - np.exp(-500.0 / times), rtol=1e-4)
     assert float(memory[0, filter_bank.MEANS - 1]) == pytest.approx(0.5, rel=1e-4)
     np.testing.assert_allclose(features[0, : len(times) + 1].sum(), 1.0, rtol=1e-5)
+
+
+def test_a_reading_that_failed_is_not_believed() -> None:
+    """Its crystal's ring error counts as what it was, and not as a jump, noise, a ripple or an outlier; the estimate of
+    the camera's noise waits."""
+    network, memory = FilterBank(5.0, ()), torch.zeros(2, STATE)
+    seen = torch.zeros(2, len(MEASURED))
+    seen[:, 0], seen[:, VALID] = 0.5, 1.0
+    ring = [*range(1 + len(filter_bank.TIMES)), *range(-11, 0)]
+    with torch.no_grad():
+        for k in range(300):
+            seen[1, 0], seen[1, VALID] = (9.0, 0.0) if 200 <= k < 230 else (0.5, 1.0)
+            features, memory = network.remember(seen, memory)
+            torch.testing.assert_close(features[1, ring], features[0, ring], rtol=0.0, atol=0.05)
 
 
 def test_crystals_of_several_scenarios_are_those_of_each_alone() -> None:
@@ -181,14 +223,17 @@ def test_the_noise_of_camera_and_pyrometer_is_estimated(deviation: float) -> Non
     """White noise on a ramp, with a jump in it: the variance is found but for a few per cent, by each channel alone."""
     network, memory = FilterBank(5.0, ()), torch.zeros(64, STATE)
     random, seen = np.random.default_rng(0), torch.zeros(64, len(MEASURED))
+    seen[:, VALID] = 1.0
     pyrometer = [channel.name for channel in MEASURED].index("T_1")
+    channels = len(filter_bank.NOISY)
+    excess = slice(filter_bank.MEANS + 2 * channels, filter_bank.MEANS + 3 * channels)
     variances = []
     with torch.no_grad():
         for k in range(1500):
             seen[:, 0] = torch.from_numpy(0.001 * k + (k > 100) + deviation * random.normal(size=64))
             seen[:, pyrometer] = torch.from_numpy(0.02 * random.normal(size=64))
             features, memory = network.remember(seen, memory)
-            variances.append(memory[:, -4:-2].mean(dim=0) + filter_bank.USUAL**2)
+            variances.append(memory[:, excess].mean(dim=0) + filter_bank.USUAL**2)
     camera, pyrometer_too = (float(each) for each in torch.stack(variances[-600:]).mean(dim=0))
     assert camera == pytest.approx(deviation**2, rel=0.1, abs=1e-7)
     assert pyrometer_too == pytest.approx(0.02**2, rel=0.1)
@@ -198,7 +243,7 @@ def test_the_noise_of_camera_and_pyrometer_is_estimated(deviation: float) -> Non
 def test_it_learns_from_nothing() -> None:
     """Forty updates on a third of the recipe's crystals: from losing all crystals to holding most of them."""
     recipe: Any = replace(RECIPES["gradient"], num_envs=64, steps=64 * 180 * 40, hidden=(), also=())
-    learner, config = GradientLearner(recipe, 0, config_of(recipe), Logger(None, []), 0), config_of(recipe)
+    learner, config = GradientLearner(recipe, 0, recipe.config, Logger(None, []), 0), recipe.config
 
     def judged() -> Validation:
         content = learner.exported()

@@ -89,7 +89,7 @@ def test_a_teacher_is_told_of_the_crystals_and_the_imitation_is_not() -> None:
     rough = find_scenario("randomized")
     rough = replace(rough, interface=replace(rough.interface, sd=(1.0, 1.0)))
     config, seeds, none = replace(CONFIG, scenario=rough, action="direct"), range(40, 43), (0.0, 0.0)
-    told, plain = (make_controller(name, make_config("randomized")) for name in ("lqg-quiet-told", "lqg-quiet"))
+    told, plain = (make_controller(name, make_config("randomized")) for name in ("lqg-quiet-privileged", "lqg-quiet"))
     one, other = (demonstrate(each, config, seeds, none, lambda seen: seen[:, APPLIED]) for each in (told, plain))
     np.testing.assert_array_equal(one.observation, other.observation)
     expected: Any = told

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 pytest.importorskip("sb3_contrib")
-from contracts import facts
-
 from cz_gym.agents.agent_file.contract import make_contract
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.agents.training.learners import make_learner
@@ -17,6 +15,7 @@ from cz_gym.config import make_config
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.observation import HISTORY
+from tests.contracts import facts
 
 SMALL = RecurrentPPO(num_envs=8, hidden=(5,), units=7, n_steps=16, batch_size=64, n_epochs=1, steps=256)
 

@@ -1,5 +1,6 @@
 """PPO that goes on from an agent of the recipe gradient: it begins as that agent, and other files are refused."""
 
+import hashlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,16 +9,18 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode
-from small_learners import made
 
 import train
 from cz_gym import CzVectorEnv, agents
+from cz_gym.agents.agent_file.contract import agent_files, read_agent
 from cz_gym.agents.training import run
 from cz_gym.agents.training.filter_bank import STATE
 from cz_gym.agents.training.recipes import RECIPES
 from cz_gym.agents.training.refinement import Remembering
 from cz_gym.agents.training.vec_env import CzVecEnv
+from cz_gym.atomic_files import write_files
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from tests.small_learners import made
 
 START = agents.shipped_seeds("gradient")[0]
 FEW: dict[str, Any] = {"num_envs": 8, "n_steps": 16, "batch_size": 64, "n_epochs": 1, "hidden": (4,), "steps": 256}
@@ -62,7 +65,10 @@ def test_a_run_goes_on_from_a_file_and_resumes(
     assert train.main(["--resume", "--steps", "512", "--out", folder]) == 0
     made_so = agents.load(Path(folder) / "agent.onnx").contract
     assert (made_so.algorithm, made_so.observation, made_so.action) == ("ppo-after-gradient", "measured", "rate")
-    for wrong in (agents.shipped_seeds("ppo")[0], tmp_path / "none.onnx"):
+    contract, _ = read_agent(START)
+    damaged = tmp_path / "damaged.onnx"
+    write_files(agent_files(damaged, b"no graph", replace(contract, sha256=hashlib.sha256(b"no graph").hexdigest())))
+    for wrong in (agents.shipped_seeds("ppo")[0], tmp_path / "none.onnx", damaged):
         assert train.main(["--algo", "ppo", "--from", str(wrong), "--out", str(tmp_path / "other")]) == 2
         assert wrong.name in capsys.readouterr().err
     for options in (["--from", str(START)], ["--algo", "ppo-after-gradient"]):

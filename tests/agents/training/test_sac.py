@@ -8,10 +8,9 @@ import pytest
 
 pytest.importorskip("sb3_contrib")
 
-from small_learners import SMALL_SAC, made
-
 from cz_gym.agents.training import callbacks
 from cz_gym.agents.training.callbacks import Statistics
+from tests.small_learners import SMALL_SAC, made
 
 
 def test_its_first_actions_are_those_of_a_gentle_policy():

@@ -169,7 +169,7 @@ def test_interrupting_before_learning_gives_one_line(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--algo", "dqn"], "invalid choice: 'dqn'"),
+        (["--algo", "dqn"], "unknown recipe 'dqn'; choose from gradient"),
         (["--steps", "0"], "at least 1, not '0'"),
         (["--seed", "minus"], "at least 0, not 'minus'"),
         (["--checkpoint-seconds", "-1"], "at least 0, not '-1'"),

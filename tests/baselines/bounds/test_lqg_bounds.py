@@ -45,7 +45,7 @@ def test_each_filter_has_the_noise_of_its_own_crystal():
 
 def test_knowing_puller_and_fluctuations_buys_something():
     config = make_config("randomized", horizon=2.0 * HOUR)
-    names = "lqg-quiet", "lqg-quiet-told"
+    names = "lqg-quiet", "lqg-quiet-privileged"
     plain, told = (metrics(rollout(find_controller(name).make(config), config, range(20))) for name in names)
     assert told.rmse_mm.mean() < plain.rmse_mm.mean()
     assert told.pull_step_rms_mm_per_min.mean() < plain.pull_step_rms_mm_per_min.mean()

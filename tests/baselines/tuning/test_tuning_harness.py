@@ -139,4 +139,6 @@ def test_the_family_is_the_one_the_command_chose(scenario):
         assert one["activity"] == activity
         assert lqg_settings.lqg_at(activity, make_config(scenario)).settings.hash == one["hash"]
         assert not one["validation"]["failure_rate"]
-    assert np.all(np.diff([one["validation"]["pull_step"] for one in chosen]) > 0.0)
+    # On hard no LQG holds every crystal at 0.003 mm/min: the quietest that does stands there.
+    steps = [one["validation"]["pull_step"] for one in chosen]
+    assert np.all(np.diff(steps[scenario == "hard" :]) > 0.0)

@@ -13,7 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
-FOLDER = Path(__file__).parents[3] / "examples" / "rl_zoo"
+FOLDER = Path(__file__).parents[2] / "examples" / "rl_zoo"
 ALGORITHMS: dict[str, Any] = {"ppo": PPO, "ppo_lstm": RecurrentPPO, "sac": SAC, "tqc": TQC}
 TAKEN_BY_RL_ZOO = ("env_kwargs", "normalize", "n_envs", "n_timesteps")
 SMALL = {

@@ -1,0 +1,71 @@
+"""What of the ring's readings is outlier or ripple: an adaptive notch filter, after Dragosevic and Stankovic (1995).
+
+Rotation makes the ring ripple at a frequency that differs from crystal to crystal; sampled, it may look slow. A
+resonator at the frequency found so far is driven by the readings less their slow part; what it does says how the
+frequency should move. A notch at that frequency then takes the ripple from the readings.
+
+Tensors or values of a graph (:mod:`.symbolic`), shape (n, 1). Lengths in units of the observation's ring error.
+"""
+
+from __future__ import annotations
+
+from math import exp
+from typing import Any
+
+from .symbolic import held, joined, parted, rectified, root
+
+SLOW = 25.0
+"""Time constant, twice, of the readings' slow part [s]."""
+NOISE_TIME = 600.0
+"""Time constant of the variance about it [s]."""
+PATIENCE = 1600.0
+"""Time constant of what the frequency is found from [s]."""
+OUTLIER = 3.0
+"""So many standard deviations from the slow part are the most that is believed [-]."""
+RADIUS = 0.9
+"""Of the poles of resonator and notch [-]."""
+LEAST, MOST = -0.999, 0.98
+"""Cosine of the turn from reading to reading: slower ripples, longer than 25 readings, are left alone."""
+SEEN = 0.02
+"""Ripples so large count half."""
+BEGIN = 0.05, 0.01
+"""Standard deviation of the readings, and of the resonator's output, that it begins with."""
+STATE = 11
+"""Numbers that it remembers."""
+
+
+def cleaned(reading: Any, state: Any, first: Any, interval: float) -> tuple[Any, Any, Any]:
+    """What to take from a reading, how strong its ripple is, from 0 to 1, and the next state, shape (n, STATE).
+
+    ``first`` is 1 for a crystal's first reading, and 0 for all others.
+    """
+    mean, slow, excess, before, last, along, across, seen, delayed, earlier, power = parted(state, [1] * STATE)
+    share, noise_share, patience = (1.0 - exp(-interval / time) for time in (SLOW, NOISE_TIME, PATIENCE))
+    variance, energy = BEGIN[0] ** 2, BEGIN[1] ** 2
+
+    mean, slow = mean + (reading - mean) * first, slow + (reading - slow) * first
+    off = reading - mean
+    most = root(rectified(excess + variance)) * OUTLIER
+    off = off - rectified(off - most) + rectified(off * -1.0 - most)
+    excess = excess + (off * off - excess - variance) * noise_share
+    believed = mean + off
+    mean = mean + off * share
+    slow = slow + (mean - slow) * share
+
+    turn = held(along / (across + (energy + 1e-8)), LEAST, MOST)
+    now = believed - mean * 2.0 + slow + last * turn * (2.0 * RADIUS) - before * RADIUS**2
+    along = along + (last * (now + before) - along) * patience
+    across = across + (last * last * 2.0 - across - energy) * patience
+    turn = held(along / (across + (energy + 1e-8)), LEAST, MOST)
+
+    scale = (turn * (-2.0 * RADIUS) + (1.0 + RADIUS**2)) / (turn * -2.0 + 2.0)
+    change = believed - seen - (reading - seen) * first
+    ripple = change - scale * change + delayed
+    delayed = scale * change - change * RADIUS**2 + turn * ripple * (2.0 * RADIUS) + earlier
+    power = power + (ripple * ripple - power) * patience
+    strength = power / (power + SEEN**2)
+    return (
+        reading - believed + ripple * strength,
+        strength,
+        joined([mean, slow, excess, last, now, along, across, believed, delayed, ripple * -(RADIUS**2), power]),
+    )

@@ -1,0 +1,28 @@
+"""The camera's study, made small: what it says of the ring, and that its pictures can be drawn."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cz_gym.units import MM
+from studies.camera import __main__ as study
+from studies.camera import measurements
+
+
+@pytest.mark.slow
+def test_the_study_measures_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measurements, "RADII", np.linspace(-8.0, 8.0, 3) * MM)
+    monkeypatch.setattr(measurements, "HEIGHTS", np.zeros(1))
+    monkeypatch.setattr(measurements, "FRAMES", 3)
+    monkeypatch.setattr(measurements, "HORIZON", 20.0)
+    assert study.main(["--out", str(tmp_path)]) == 0
+    found = json.loads((tmp_path / "camera.json").read_text())
+    assert found["images"] == 3
+    assert found["images_without_ring"] == 0
+    assert found["largest_difference_px"]["traced"] < 1.0
+    assert found["gain_by_radius"]["traced"] == pytest.approx(1.0, abs=0.02)
+    for response in found["responses"]:
+        assert response["depth_um"]["traced"] > 0.0, "less pull, and the ring first shrinks"
+    assert {path.suffix for path in tmp_path.iterdir()} == {".json", ".png"}
