@@ -266,7 +266,7 @@ SPECIALISTS = (
     replace(_HALF, name="gradient-randomized", also=_OTHERS),
     replace(_HALF, name="gradient-randomized-calm", also=_OTHERS, weights=replace(GRADIENT_COST, pull_step=0.2)),
     replace(_HALF, name="gradient-randomized-agile", also=_OTHERS, weights=replace(GRADIENT_COST, pull_step=0.04)),
-    Gradient(name="gradient-hard", scenario="hard", also=_OTHERS[:1], weights=GRADIENT_COST),
+    replace(_HALF, name="gradient-hard", scenario="hard", also=_OTHERS[:1]),
     replace(_HALF, name="gradient-sensor-fault", scenario="sensor-fault", also=_OTHERS[1:]),
     replace(_HALF, name="gradient-puller", scenario="puller", also=()),
 )
