@@ -191,9 +191,10 @@ def test_camera_noise_is_per_sample_whatever_the_interval() -> None:
 
 
 def test_observations_are_clipped_not_lost() -> None:
-    scenario = Scenario("mine", sensor=Sensor(bias_offset=(0.02, 0.02)))
-    observation, _ = CzEnv(scenario, info="all").reset(seed=0)
-    assert observation[0] == 10.0
+    sensor = Sensor(bias_offset=(5e-3, 5e-3), outlier_probability=1.0, outlier_sd=5e-3)
+    observations, infos, _ = run(CzEnv(Scenario("mine", sensor=sensor), info="all"), 50)
+    assert column(infos, "r_br_measured").max() > 12e-3 + infos[0]["r_br"]
+    assert observations[:, 0].max() == 10.0
 
 
 def test_decode_takes_any_batch_and_refuses_other_shapes(rng: np.random.Generator) -> None:
