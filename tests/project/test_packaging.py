@@ -99,7 +99,11 @@ def test_pins_lie_in_the_open_ranges(file: str) -> None:
     chosen = [*PROJECT["dependencies"], *extras["test"][1:]]
     chosen += [text for name in packaging.Requirement(extras["test"][0]).extras for text in extras[name]]
     requirements = {text: packaging.Requirement(text) for text in chosen}
-    requirements = {text: each for text, each in requirements.items() if not each.marker or each.marker.evaluate({"python_version": "3.11"})}
+    requirements = {
+        text: each
+        for text, each in requirements.items()
+        if not each.marker or each.marker.evaluate({"python_version": "3.11"})
+    }
     for text, requirement in requirements.items():
         (bound,) = (each for each in requirement.specifier if each.operator != "<")
         pin, least = pins[requirement.name.lower()], version(bound.version).release
