@@ -57,7 +57,11 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         help="environment steps of learning from reward (default: the recipe's, or the resumed run's)",
     )
     parser.add_argument(
-        "--from", dest="start", metavar="FILE", help="agent file of the recipe gradient that --algo ppo goes on from"
+        "--from",
+        dest="start",
+        type=lambda file: str(Path(file).resolve()),
+        metavar="FILE",
+        help="agent file of a recipe gradient that such a recipe, or --algo ppo, goes on from",
     )
     parser.add_argument("--scenario", help="scenario to train on (default: the recipe's, or the resumed run's)")
     parser.add_argument(
@@ -81,8 +85,10 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         parser.error("--ray needs --seeds")
     if arguments.start and arguments.algo == "ppo":
         arguments.algo = "ppo-after-gradient"
-    if bool(arguments.start) != (arguments.algo == "ppo-after-gradient") and not arguments.resume:
-        parser.error("--from FILE goes with --algo ppo: PPO goes on from an agent of the recipe gradient")
+    recipe = RECIPES[arguments.algo or DEFAULT]
+    wanting = arguments.algo == "ppo-after-gradient" and not arguments.start
+    if not arguments.resume and (wanting or (arguments.start and not hasattr(recipe, "start"))):
+        parser.error("--from FILE goes with --algo ppo or gradient: both go on from an agent of a recipe gradient")
     one = "" if arguments.seeds else f"-seed{arguments.seed or 0}"
     arguments.out = arguments.out or Path("runs") / f"{arguments.algo or DEFAULT}{one}"
     return arguments
@@ -221,12 +227,12 @@ def _take_up(arguments: argparse.Namespace, folders: list[Path]) -> int | None:
 
 def _asked_for(recipe: Recipe, arguments: argparse.Namespace, saved_steps: int | None) -> Recipe:
     """The recipe with the scenario and the steps that the command line, or the resumed run, asks for."""
-    from cz_gym.agents.training.recipes import Refinement, Rewarded
+    from cz_gym.agents.training.recipes import Gradient, Refinement, Rewarded
     from cz_gym.episodes.scenarios import find_scenario
 
     recipe = replace(recipe, scenario=find_scenario(arguments.scenario or recipe.scenario).name)
-    if isinstance(recipe, Refinement):
-        recipe = replace(recipe, start=str(Path(arguments.start).resolve()))
+    if isinstance(recipe, Refinement | Gradient):
+        recipe = replace(recipe, start=arguments.start or recipe.start)
     if isinstance(recipe, Rewarded):
         return replace(recipe, steps=arguments.steps or saved_steps or recipe.steps)
     if arguments.steps:

@@ -7,6 +7,7 @@ and in the benchmark.
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,10 @@ import torch
 from onnx import numpy_helper
 from torch import nn
 
+from cz_gym.agents import MODELS
+from cz_gym.agents.agent_file.contract import AgentFileError, read_agent
+from cz_gym.agents.agent_file.graph import checked
+from cz_gym.config import Config
 from cz_gym.observation import MEASURED
 
 from .export import OnnxGraph
@@ -226,6 +231,23 @@ class FilterBank(nn.Module):
         graph.clip(action.name, -1.0, 1.0, "action")
         graph.node("Identity", [after.name], "next_state")
         return graph, graph.finished(len(MEASURED), state=STATE)
+
+
+def read_bank(start: str, seed: int, config: Config, hidden: tuple[int, ...], scheduled: bool = True) -> FilterBank:
+    """The network of an agent that another goes on from: a file, or shipped agents by name, the one of that seed.
+
+    AgentFileError for an agent of another recipe, action or control interval.
+    """
+    path = Path(start) if Path(start).suffix else MODELS / f"{start}-seed{seed}.onnx"
+    contract, content = read_agent(path)
+    bank = FilterBank(config.control_interval, hidden, scheduled)
+    if (contract.control_interval, contract.action) != (config.control_interval, config.action):
+        raise AgentFileError(f"{path}: not an agent of the recipe gradient")
+    try:
+        bank.load(checked(content, len(MEASURED))[0])
+    except ValueError as error:
+        raise AgentFileError(f"{path}: {error}") from None
+    return bank
 
 
 def _filters(interval: float) -> tuple[Any, Any, Any]:

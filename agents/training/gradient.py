@@ -23,7 +23,7 @@ from cz_gym.task import COST_CAP, RADIUS_SCALE, Cost, cost_terms, drives_of
 
 from .crystals import Crystals
 from .demonstrations import widened
-from .filter_bank import MEANS, STATE, FilterBank
+from .filter_bank import MEANS, STATE, FilterBank, read_bank
 from .learner import Parts, Watch
 from .recipes import Gradient
 
@@ -68,7 +68,10 @@ class GradientLearner:
         self.per_update = recipe.num_envs * recipe.window
         self.total = math.ceil(recipe.steps / self.per_update) * self.per_update
         self.steps = done
-        self.network = FilterBank(config.control_interval, recipe.hidden, recipe.scheduled)
+        if recipe.start and not done:
+            self.network = read_bank(recipe.start, seed, config, recipe.hidden, recipe.scheduled)
+        else:
+            self.network = FilterBank(config.control_interval, recipe.hidden, recipe.scheduled)
         weights = self.network.parameters()
         self.optimiser = torch.optim.Adam(weights, recipe.learning_rate, betas=(0.9, recipe.beta2))
         self.norms = torch.zeros(LAST_GRADIENTS)
@@ -90,7 +93,7 @@ class GradientLearner:
             self.optimiser.param_groups[0]["lr"] = recipe.learning_rate * (1.0 - progress)
             window = self._drive(batch, measured, memory)
             self._follow(window, batch.measured_by_state)
-            if progress < WARM_UP:
+            if progress < WARM_UP and not recipe.start:
                 self._standardise(window.features.flatten(0, 1))
             measured, memory = window.measured, window.memory
             left -= 1

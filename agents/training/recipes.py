@@ -119,6 +119,9 @@ class Gradient(Rewarded):
     )
     """Other crystals that it learns on: scenario ("": its own), how far everything random is spread in units of the
     scenario's own, and their share of all."""
+    start: str = ""
+    """Agent of such a recipe that it goes on from: a file, or a name of shipped ones, of which each training seed takes
+    its own; "": from nothing."""
     hidden: tuple[int, ...] = (64,)
     scheduled: bool = True
     """Whether the linear map depends on noise, swings, the reference and the crystal's age."""
@@ -183,7 +186,7 @@ class Refinement(PPO):
 
     name: str = "ppo-after-gradient"
     start: str = ""
-    """Path of that agent's file."""
+    """That agent, as in :class:`Gradient`."""
     observation: str = "measured"
     action: str = "rate"
     steps: int = 3_000_000
@@ -261,14 +264,22 @@ LQG_COST = CostWeights(pull=0.11, pull_step=0.049, heater_step=23.4)
 GRADIENT_COST = replace(LQG_COST, pull_step=0.07, observable=True)
 """The cost that the recipe gradient follows: calmer, and without what no sensor shows."""
 _OTHERS = ("sensor-fault", 1.0, 0.3), ("", 2.0, 0.03)
-_HALF = Gradient(steps=Gradient.steps // 2, weights=GRADIENT_COST)
+_HALF = Gradient(steps=Gradient.steps // 2, also=_OTHERS, weights=GRADIENT_COST)
 SPECIALISTS = (
-    replace(_HALF, name="gradient-randomized", also=_OTHERS),
-    replace(_HALF, name="gradient-randomized-calm", also=_OTHERS, weights=replace(GRADIENT_COST, pull_step=0.2)),
-    replace(_HALF, name="gradient-randomized-agile", also=_OTHERS, weights=replace(GRADIENT_COST, pull_step=0.04)),
+    replace(_HALF, name="gradient-randomized"),
+    replace(_HALF, name="gradient-randomized-calm", weights=replace(GRADIENT_COST, pull_step=0.2)),
+    replace(_HALF, name="gradient-randomized-agile", weights=replace(GRADIENT_COST, pull_step=0.04)),
     replace(_HALF, name="gradient-hard", scenario="hard", also=_OTHERS[:1]),
     replace(_HALF, name="gradient-sensor-fault", scenario="sensor-fault", also=_OTHERS[1:]),
-    replace(_HALF, name="gradient-puller", scenario="puller", also=()),
+    Gradient(
+        name="gradient-puller",
+        scenario="puller",
+        start="gradient",
+        steps=Gradient.steps // 4,
+        learning_rate=4e-3,
+        also=(),
+        weights=GRADIENT_COST,
+    ),
 )
 """The recipe gradient for one scenario each; for ``randomized`` at three activities."""
 RECIPES: dict[str, Recipe] = {

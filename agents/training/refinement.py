@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,28 +11,11 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnvWrapper
 from torch import nn
 
-from cz_gym.agents.agent_file.contract import AgentFileError, read_agent
-from cz_gym.agents.agent_file.graph import checked
 from cz_gym.observation import HISTORY, MEASURED, PULL_SCALE, scales
 
 from .filter_bank import GAINS, STATE, FilterBank
 from .networks import ActorCritic, Normalise
-from .recipes import Gradient, Refinement
 from .vec_env import CzVecEnv
-
-
-def read_bank(recipe: Refinement) -> FilterBank:
-    """The network of the agent file that the recipe starts from; AgentFileError if the file holds another."""
-    path = Path(recipe.start)
-    contract, content = read_agent(path)
-    bank = FilterBank(recipe.control_interval, Gradient.hidden)
-    if (contract.control_interval, contract.action) != (recipe.control_interval, recipe.action):
-        raise AgentFileError(f"{path}: not an agent of the recipe gradient")
-    try:
-        bank.load(checked(content, len(MEASURED))[0])
-    except ValueError as error:
-        raise AgentFileError(f"{path}: {error}") from None
-    return bank
 
 
 class Remembering(VecEnvWrapper):

@@ -22,10 +22,11 @@ from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from . import random_search
 from .callbacks import Statistics, Watching
 from .export import actor_of, actor_onnx
+from .filter_bank import read_bank
 from .learner import Parts, Watch
 from .networks import AsymmetricPolicy, Normalise
-from .recipes import OWN_WEIGHTS, PPO, SAC, RandomSearch, RecurrentPPO, Refinement, Reinforcement
-from .refinement import BankPolicy, Remembering, read_bank
+from .recipes import OWN_WEIGHTS, PPO, SAC, Gradient, RandomSearch, RecurrentPPO, Refinement, Reinforcement
+from .refinement import BankPolicy, Remembering
 from .vec_env import CzVecEnv
 from .wrappers import Held, TrainingReward
 
@@ -110,7 +111,7 @@ def make_algorithm(recipe: Reinforcement, slots: CzVecEnv, seed: int) -> BaseAlg
     env: Any = TrainingReward(slots, recipe.gamma, recipe.weights, recipe.failure_costs)
     env = Held(env, recipe.held) if isinstance(recipe, SAC) else env
     if isinstance(recipe, Refinement):
-        bank = read_bank(recipe)
+        bank = read_bank(recipe.start, seed, recipe.config, Gradient.hidden)
         env, options = Remembering(env, bank), {"bank": bank, "hidden": recipe.hidden, "noise": recipe.noise}
     else:
         options = _network(recipe)

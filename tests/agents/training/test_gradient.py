@@ -11,7 +11,8 @@ pytest.importorskip("sb3_contrib")
 
 from stable_baselines3.common.logger import Logger
 
-from cz_gym.agents import OnnxPolicy
+from cz_gym import agents
+from cz_gym.agents import AgentFileError, OnnxPolicy
 from cz_gym.agents.agent_file.contract import facts_of, make_contract
 from cz_gym.agents.training import filter_bank, gradient
 from cz_gym.agents.training.crystals import Crystals
@@ -238,6 +239,24 @@ def test_the_noise_of_camera_and_pyrometer_is_estimated(deviation: float) -> Non
     assert camera == pytest.approx(deviation**2, rel=0.1, abs=1e-7)
     assert pyrometer_too == pytest.approx(0.02**2, rel=0.1)
     assert 0.0 < float(features[:, -5:-2].min()) < float(features[:, -5:-2].max()) < 1.0
+
+
+def test_a_specialist_goes_on_from_the_shipped_agent_of_its_seed() -> None:
+    """And keeps its standardisation; a run that is resumed has its own weights; what is no such agent is refused."""
+    specialist: Any = RECIPES["gradient-puller"]
+    few = replace(specialist, num_envs=4, window=20, steps=4 * 20)
+    shipped = agents.shipped_seeds("gradient")
+    for seed in (0, 3):
+        learner = GradientLearner(few, seed, few.config, Logger(None, []), 0)
+        assert learner.exported() == shipped[seed].read_bytes()
+    mean = learner.network.mean.clone()
+    learner.learn(lambda steps, doing: None)
+    assert learner.exported() != shipped[3].read_bytes()
+    assert torch.equal(learner.network.mean, mean)
+    assert not GradientLearner(few, 0, few.config, Logger(None, []), 80).network.mean.any()
+    for start, why in (("gradient", "gradient-seed77.onnx"), (str(agents.shipped_seeds("ppo")[0]), "not an agent")):
+        with pytest.raises(AgentFileError, match=why):
+            GradientLearner(replace(few, start=start), 77, few.config, Logger(None, []), 0)
 
 
 def test_it_learns_from_nothing() -> None:

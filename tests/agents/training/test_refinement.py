@@ -71,7 +71,7 @@ def test_a_run_goes_on_from_a_file_and_resumes(
     for wrong in (agents.shipped_seeds("ppo")[0], tmp_path / "none.onnx", damaged):
         assert train.main(["--algo", "ppo", "--from", str(wrong), "--out", str(tmp_path / "other")]) == 2
         assert wrong.name in capsys.readouterr().err
-    for options in (["--from", str(START)], ["--algo", "ppo-after-gradient"]):
+    for options in (["--algo", "sac", "--from", str(START)], ["--algo", "ppo-after-gradient"]):
         with pytest.raises(SystemExit):
             train.main([*options, "--out", str(tmp_path / "third")])
         assert "--from FILE goes with --algo ppo" in capsys.readouterr().err
