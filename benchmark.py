@@ -32,7 +32,7 @@ CACHE = FOLDER.parent / "cache"
 BOUNDS = FOLDER.parent / "bounds"
 """Committed results of the slow controllers; their bound serves runs without one."""
 SHIPPED = ("gradient", "ppo", "ppo-recurrent", "sac", "random-search", "imitation")
-"""Agents that come with the package; each pools its training seeds."""
+"""Shipped agents that take part by default, each with all its training seeds; specialists only if named."""
 EPISODES = 500
 
 
@@ -143,6 +143,7 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
 
 def make_plan(arguments: argparse.Namespace, command: str) -> Plan:
     """What the command line asks for; ValueError names what was given and what is allowed."""
+    from cz_gym.agents import shipped_names
     from cz_gym.evaluation import user_code
     from cz_gym.evaluation.contenders import check_intervals, choose
     from cz_gym.evaluation.protocol import ROWS, check_episodes, find_row
@@ -155,13 +156,15 @@ def make_plan(arguments: argparse.Namespace, command: str) -> Plan:
     plan = Plan((), tuple(rows), episodes, command, CACHE, BOUNDS)
     own = [user_code.controller(place) for place in arguments.controller]
     controllers = classical()
-    reserved = [*(each.name for each in controllers), *SHIPPED, *{name for name, _ in arguments.agent if name}]
+    names = list(dict.fromkeys((*SHIPPED, *shipped_names())))
+    reserved = [*(each.name for each in controllers), *names, *{name for name, _ in arguments.agent if name}]
     user_code.check_apart([*reserved, *(each.name for each in own)], "controller")
     slow = [each for each in controllers if each.controller.slow]
     if not arguments.slow:
         slow = [each for each in slow if arguments.controllers and plan.is_cached(each)]
-    shipped = {name: partial(_shipped, name) for name in SHIPPED}
-    chosen = choose(arguments.controllers, controllers, _given(arguments.agent), shipped, [each.name for each in slow])
+    shipped = {name: partial(_shipped, name) for name in names}
+    slowly = [each.name for each in slow]
+    chosen = choose(arguments.controllers, controllers, _given(arguments.agent), shipped, SHIPPED, slowly)
     check_intervals(chosen, plan.rows)
     return replace(plan, contenders=(*chosen, *own))
 

@@ -16,7 +16,7 @@ from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.config import Config, check_config
 from cz_gym.names import unknown
 
-__all__ = ["AgentFileError", "Contract", "OnnxPolicy", "load", "shipped", "shipped_seeds"]
+__all__ = ["AgentFileError", "Contract", "OnnxPolicy", "load", "shipped", "shipped_names", "shipped_seeds"]
 
 MODELS = Path(__file__).parent / "models"
 DEFAULT = "gradient"
@@ -33,6 +33,11 @@ def load(name: str | Path = DEFAULT, config: Config | None = None) -> OnnxPolicy
     return OnnxPolicy.load(name if Path(name).suffix == ".onnx" else shipped(str(name)), config)
 
 
+def shipped_names() -> list[str]:
+    """Names of the trained agents that come with the package."""
+    return sorted({path.stem.rpartition("-seed")[0] for path in MODELS.glob("*-seed*.onnx")})
+
+
 def shipped_seeds(name: str = DEFAULT) -> list[Path]:
     """Paths of the trained agents of that name that come with the package, one a training seed, in their order.
 
@@ -40,8 +45,7 @@ def shipped_seeds(name: str = DEFAULT) -> list[Path]:
     """
     found = {int(path.stem.removeprefix(f"{name}-seed")): path for path in MODELS.glob(f"{name}-seed[0-9]*.onnx")}
     if not found:
-        there = sorted({path.stem.rpartition("-seed")[0] for path in MODELS.glob("*-seed*.onnx")})
-        raise AgentFileError(unknown("shipped agent", name, there))
+        raise AgentFileError(unknown("shipped agent", name, shipped_names()))
     return [found[seed] for seed in sorted(found)]
 
 

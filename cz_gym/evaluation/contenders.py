@@ -81,13 +81,14 @@ def choose(
     classical: Sequence[Contender],
     given: Mapping[str, Contender],
     shipped: Mapping[str, Callable[[], Contender]],
+    usual: Collection[str],
     slow: Collection[str] = (),
 ) -> tuple[Contender, ...]:
     """Who takes part, classical controllers first.
 
-    ``wanted`` are names, ``["all"]``, or None for the default. Agents that are ``given`` always take part, ``shipped``
-    ones, which are loaded here, beside them only if they are wanted by name, and slow controllers only if ``slow`` has
-    them. Raises ValueError for an unknown name, and for one that a controller and an agent share.
+    ``wanted`` are names, ``["all"]``, or None for the default: of ``shipped`` agents, which are loaded here, the
+    ``usual`` ones. Agents that are ``given`` always take part, beside them shipped ones only if they are wanted by
+    name, and slow controllers only if ``slow`` has them. Raises ValueError for an unknown name, and for one that a controller and an agent share.
     """
     names = [each.name for each in classical]
     learned = list(dict.fromkeys((*given, *shipped)))
@@ -97,7 +98,7 @@ def choose(
     if wanted is None or wanted == ["all"]:
         some = [each for each in classical if each.name in slow or not each.controller.slow]
         wanted = [each.name for each in some if wanted or each.controller.slow or each.default]
-        wanted += list(given or shipped)
+        wanted += list(given or usual)
     for name in wanted:
         if name not in names + learned:
             raise ValueError(unknown("controller", name, names + learned, ", or all"))

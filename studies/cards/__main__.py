@@ -19,7 +19,8 @@ from studies.markdown import table
 
 PROG = "python -m studies.cards"
 _LEARNED = {row.name: row.meaning for row in ROWS} | {
-    recipe.name: f"as `gradient`, for `{recipe.scenario}`" for recipe in SPECIALISTS
+    recipe.name: f"{'going on from' if recipe.start else 'as'} `gradient`, for `{recipe.scenario}`"
+    for recipe in SPECIALISTS
 }
 AGENTS = {name: how for name, how in _LEARNED.items() if any(MODELS.glob(f"{name}-seed*.onnx"))}
 """Shipped agents, and how each learned."""

@@ -80,6 +80,14 @@ def make_plan(*arguments: str) -> runner.Plan:
     return benchmark.make_plan(benchmark.parse(arguments), "")
 
 
+def test_a_specialist_takes_part_if_it_is_named() -> None:
+    usual = [each.name for each in make_plan().contenders]
+    assert set(benchmark.SHIPPED) <= set(usual)
+    assert "gradient-puller" not in usual
+    (specialist,) = make_plan("--controllers", "gradient-puller").contenders
+    assert len(specialist.make(ROWS[0].config())) == 5
+
+
 def test_the_folder_holds_every_file_and_nothing_else(finished: Path) -> None:
     assert sorted(path.name for path in finished.iterdir()) == FILES
     assert (finished.parent / "copy.json").read_bytes() == (finished / "benchmark.json").read_bytes()
