@@ -88,7 +88,8 @@ def choose(
 
     ``wanted`` are names, ``["all"]``, or None for the default: of ``shipped`` agents, which are loaded here, the
     ``usual`` ones. Agents that are ``given`` always take part, beside them shipped ones only if they are wanted by
-    name, and slow controllers only if ``slow`` has them. Raises ValueError for an unknown name, and for one that a controller and an agent share.
+    name, and slow controllers only if ``slow`` has them. Raises ValueError for an unknown name, and for one that a
+    controller and an agent share.
     """
     names = [each.name for each in classical]
     learned = list(dict.fromkeys((*given, *shipped)))
