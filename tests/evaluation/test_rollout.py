@@ -199,3 +199,16 @@ def test_a_rollout_can_be_looked_at(tmp_path: Path) -> None:
     assert figure.axes[0].get_ylabel() == "radius error [mm]"
     with pytest.raises(IndexError, match="below 2"):
         plot(run, 2)
+
+
+def test_making_and_compiling_the_environment_is_no_time_of_the_policy(monkeypatch: pytest.MonkeyPatch) -> None:
+    module, now = import_module("cz_gym.evaluation.rollout"), [0.0]
+    make = CzVectorEnv.from_config
+
+    def slowly(*arguments: Any, **options: Any) -> CzVectorEnv:
+        now[0] += 10.0
+        return make(*arguments, **options)
+
+    monkeypatch.setattr(module.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(module.CzVectorEnv, "from_config", slowly)
+    assert rollout(OpenLoop(), SHORT, [1]).seconds_in_policy == 0.0
