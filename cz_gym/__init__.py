@@ -50,6 +50,6 @@ gym.register(id=ENV_ID, entry_point="cz_gym.env:CzEnv", vector_entry_point="cz_g
 
 def __getattr__(name: str) -> Any:
     # After "import cz_gym", cz_gym.agents.load("ppo") works: what stands above this package is imported when asked for.
-    if name in ("agents", "baselines"):
+    if name in ("agents", "baselines", "evaluation"):
         return import_module(f"cz_gym.{name}")
     raise AttributeError(f"module 'cz_gym' has no attribute {name!r}")

@@ -10,6 +10,7 @@ import numpy as np
 from cz_gym.baselines.lqg.controller import LQG
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.open_loop import OpenLoop
+from cz_gym.config import Config
 from cz_gym.observation import MEASURED, PULL_SCALE, Measured
 from cz_gym.physics.linearisation import StateSpace
 from cz_gym.units import MM
@@ -33,7 +34,8 @@ class LinearForm(NamedTuple):
 
 
 def linear_form(policy: Any) -> LinearForm:
-    """The linear form of a shipped controller; NotLinearError if it has none.
+    """The linear form of a controller that acts every ``control_interval``, 5 s if it does not say; NotLinearError if
+    it has none.
 
     An LQG that predicts through the plant's equations is taken with its linear prediction, at the covariance it
     settles on under mean noise, references held.
@@ -44,8 +46,10 @@ def linear_form(policy: Any) -> LinearForm:
         return _lqg(policy)
     v_0 = getattr(policy, "v_0", PULL_SCALE)
     controller = linear_controller(policy, v_0)
+    if not (controller.C.any() or controller.D.any()):
+        raise NotLinearError("there is no loop: nothing that is measured moves a drive")
     free = linear_controller(replace(policy, T_track=np.inf), v_0) if isinstance(policy, FilteredPID) else controller
-    return LinearForm(controller, free, policy.control_interval)
+    return LinearForm(controller, free, getattr(policy, "control_interval", Config().control_interval))
 
 
 def _lqg(policy: LQG) -> LinearForm:

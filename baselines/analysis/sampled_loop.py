@@ -69,6 +69,10 @@ class Loop(NamedTuple):
         return StateSpace(self.A, self.B[:, columns], self.C[[row]], self.D[np.ix_([row], columns)])
 
 
+class _Nothing(NamedTuple):
+    """What a controller without memory remembers."""
+
+
 def linear_controller(
     policy: Any, v_0: float = PULL_SCALE, rest: Any = None, free: Sequence[str] | None = None
 ) -> StateSpace:
@@ -80,6 +84,7 @@ def linear_controller(
     """
     channels, name = len(MEASURED), type(policy).__name__
     rest = policy.predict(_AT_REST[None])[1] if rest is None else rest
+    rest = _Nothing() if rest is None else rest
     if not hasattr(rest, "_fields"):
         raise NotLinearError(f"{name} remembers no named tuple of arrays: it has no state space here")
     parts = _parts(rest)
@@ -121,7 +126,7 @@ def _answer(policy: Any, probes: Floats, rest: Any, free: Sequence[str]) -> Floa
             start += value.size
     values = iter(parts.values())
     action, after = policy.predict(_AT_REST + probes[:, start:], state=map_arrays(lambda _: next(values), rest))
-    moved = map_arrays(lambda new, old: np.reshape(new - old[:1], (1, n, -1)), after, rest)
+    moved = map_arrays(lambda new, old: np.reshape(new - old[:1], (1, n, -1)), rest if after is None else after, rest)
     return np.hstack([*(part[0] for name, part in _parts(moved).items() if name in free), action])
 
 

@@ -35,8 +35,6 @@ def form_of(name: str) -> LinearForm:
     config = make_config("nominal")
     if ":" in name:
         (policy,) = user_code.controller(name).make(config)
-        if getattr(policy, "control_interval", None) is None:
-            raise ValueError(f"{name}: needs an attribute control_interval [s]")
     else:
         policy = make_controller(name, config)
     return linear_form(policy)
@@ -92,7 +90,13 @@ def _main(given: argparse.Namespace) -> int:
     rows = []
     for at, (_, each) in found.items():
         figures = (each.gain_up, each.gain_down, each.phase_deg, each.delay, each.sensitivity)
-        rows.append([PLACES[at], f"{each.crossover:.2e}", *(f"{figure:.3g}" for figure in figures)])
+        rows.append(
+            [
+                PLACES[at],
+                f"{each.crossover:.2e}",
+                *(f"{figure:.3g}" if figure == figure else "none" for figure in figures),
+            ]
+        )
     heads = ("opened at", "crossover [rad/s]", "gain up", "gain down", "phase [deg]", "delay [s]", "sensitivity")
     print(table(heads, rows))
     if not close(form.controller, puller, form.dt).stable:

@@ -6,7 +6,18 @@ import pytest
 from cz_gym import agents
 from cz_gym.agents.agent_file.contract import read_agent
 
-SHIPPED = {"gradient": 10, "imitation": 3, "ppo": 3, "ppo-recurrent": 3, "random-search": 3, "sac": 3}
+SHIPPED = {
+    "gradient": 10,
+    "gradient-hard": 5,
+    "gradient-puller": 5,
+    "gradient-randomized": 5,
+    "gradient-sensor-fault": 5,
+    "imitation": 3,
+    "ppo": 3,
+    "ppo-recurrent": 3,
+    "random-search": 3,
+    "sac": 3,
+}
 """Training seeds of each name."""
 
 

@@ -8,7 +8,9 @@ import pytest
 pytest.importorskip("control")
 
 from cz_gym.baselines.analysis.frequency import loop_margins
+from cz_gym.observation import PULL_SCALE
 from cz_gym.physics.plant import make_puller
+from cz_gym.units import MM
 from studies.bode import __main__ as bode
 
 OWN = """
@@ -19,6 +21,13 @@ mine = CompensatedPID()
 class Forgetful:
     def predict(self, observation, state=None, episode_start=None, deterministic=True):
         return np.zeros((len(np.atleast_2d(observation)), 2)), state
+"""
+
+GAIN = """
+import numpy as np
+class Gain:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.outer(np.atleast_2d(observation)[:, 0], [0.02, 0.0]), state
 """
 
 
@@ -38,12 +47,22 @@ def test_one_of_the_users_own_is_taken_from_its_file(tmp_path: Path, capsys: pyt
     assert capsys.readouterr().out.splitlines()[:4] == mine
 
 
+def test_a_gain_alone_needs_neither_memory_nor_interval(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The ring error to the pull speed by a gain: at the lowest frequency the loop's gain is the plant's times it."""
+    (tmp_path / "my.py").write_text(GAIN)
+    form = bode.form_of(f"{tmp_path / 'my.py'}:Gain")
+    assert (form.dt, form.controller.A.shape) == (5.0, (0, 0))
+    assert form.controller.D[0, 0] == pytest.approx(0.02 * PULL_SCALE / MM)
+    assert bode.main([f"{tmp_path / 'my.py'}:Gain", "--out", str(tmp_path / "gain.png")]) == 0
+    assert "nan" not in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [
         (["lqgg"], "did you mean 'lqg'"),
         (["open-loop"], "there is no loop"),
-        (["my.py:Forgetful"], "needs an attribute control_interval"),
+        (["my.py:Forgetful"], "there is no loop: nothing"),
         (["nowhere.py:Mine"], "no such file"),
         (["lqg", "--mix", "2"], "must lie in"),
     ],
