@@ -192,7 +192,7 @@ def _given(files: Sequence[tuple[str, Path]]) -> dict[str, Contender]:
     for name, file in files:
         policy = _load(file)
         policies.setdefault(name or policy.contract.algorithm, []).append(policy)
-    return {name: agent(name, some, ", given as a file") for name, some in policies.items()}
+    return {name: agent(name, some, own=True) for name, some in policies.items()}
 
 
 def _shipped(name: str) -> Contender:

@@ -38,6 +38,8 @@ class Row:
     """Time between actions [s]."""
     meniscus: MeniscusModel = HURLE
     """What the crystals grow on; controllers and agents know Hurle's, whatever it is."""
+    file: str = ""
+    """Where a scenario of the user's own comes from: FILE.py:NAME."""
 
     def config(self, observation: str = "measured", action: str = "direct") -> Config:
         """The environment's settings: three hours, this row's scenario, model, interval and meniscus."""

@@ -43,6 +43,8 @@ class Controller:
     """Whether it meets only the first few episodes, and these are cached."""
     action: str = "direct"
     """What its actions mean (:func:`cz_gym.task.drives_of`)."""
+    own: bool = False
+    """Whether it comes from the user's own file: figures show it first."""
 
     @property
     def learned(self) -> bool:

@@ -55,7 +55,9 @@ def controller(place: str) -> Contender:
     reads, acts = (
         getattr(found, each, default) for each, default in (("observation", "measured"), ("action", "direct"))
     )
-    return Contender(Controller(name, str(reads), f"of {place}", action=str(acts)), lambda config: [made(config)])
+    return Contender(
+        Controller(name, str(reads), f"of {place}", action=str(acts), own=True), lambda config: [made(config)]
+    )
 
 
 def _maker(place: str, found: Any) -> Callable[[Config], Any]:
@@ -77,7 +79,7 @@ def row(place: str) -> Row:
     _, found = load(place)
     if not isinstance(found, Scenario):
         raise ValueError(f"{place}: no scenario: a {type(found).__name__}, not a cz_gym.Scenario")
-    return Row(found.name, found, f"of {place}", default=False)
+    return Row(found.name, found, f"of {place}", default=False, file=place)
 
 
 def check_apart(names: Sequence[str], kind: str) -> None:

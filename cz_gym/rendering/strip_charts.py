@@ -158,5 +158,6 @@ def _time_axis(canvas: Canvas, plot: Box, horizon: float) -> None:
         canvas.line(palette.RIM, (x, plot.y), (x, plot.bottom), 0.6)
         if x < plot.right - 46 * unit:
             hours, minutes = divmod(round(number * step / MINUTE), 60)
-            canvas.text(x, below, f"{hours}:{minutes:02d}", 9.0, palette.FAINT, "centre")
+            # The first one would reach into the lowest number of the other axis.
+            canvas.text(x, below, f"{hours}:{minutes:02d}", 9.0, palette.FAINT, "centre" if number else "left")
     canvas.text(plot.right, below, f"{horizon / HOUR:.3g} h", 9.0, palette.FAINT, "right")

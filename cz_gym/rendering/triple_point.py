@@ -23,6 +23,10 @@ INSIDE = 11.0 * MM
 """How far the panel reaches from r_0 towards the axis, at the default puller [m]; failures lie at 8 mm."""
 BELOW, ABOVE = 9.0 * MM, 24.0 * MM
 """How far it reaches below the melt's surface, and above it at least [m]."""
+MARK: Colour = (0, 30, 60)
+"""Of the crystal's radius where it is marked on the melt, dark as the melt is bright."""
+ON_MELT: Colour = (60, 20, 0)
+"""Of words on the melt."""
 RANGES = tuple(value * MM for value in (0.25, 0.5, 1.0, 2.0, 4.0, 8.0))
 """Half widths of the magnified error [m]."""
 TOLERANCE = 0.5 * MM
@@ -62,13 +66,13 @@ def draw(canvas: Canvas, box: Box, record: Record, limit: float | None = None, c
         surface = scale.points(r_c, z)
         canvas.lines(colour, surface, 2.2)
         if record.ending is not Ending.DETACHED:
-            _ring(canvas, box, scale, record, colour)
+            _ring(canvas, box, scale, record)
         edge = (float(surface[0, 0]), float(surface[0, 1]))
         canvas.dot(palette.INK, edge, 3.2)
         canvas.dot(colour, edge, 2.2)
     _axis(canvas, box, scale)
     canvas.text(box.x + 7.0 * unit, box.y + 30 * unit, "crystal", 10, palette.INK)
-    canvas.text(box.x + 7.0 * unit, box.bottom - 31 * unit, "melt", 10, palette.INK)
+    canvas.text(box.x + 7.0 * unit, scale.y_0 + 8 * unit, "melt", 9.5, ON_MELT, bold=True)
     x, right = float(scale.x(record.puller.r_0 + 0.62 * INSIDE)), box.right - 8.0 * unit
     inset = Box(x, box.y + 44.0 * unit, right - x, scale.y_0 - box.y - 70.0 * unit)
     _magnified(canvas, inset, scale, r_c - r_ref, z, limit or error_range(r_c - r_ref), colour)
@@ -96,7 +100,7 @@ def _gas_and_meniscus(canvas: Canvas, box: Box, scale: Scale, record: Record, r_
     canvas.lines(palette.mix(palette.MELT_TOP, palette.GLOW, 0.6), meniscus, 1.0)
 
 
-def _ring(canvas: Canvas, box: Box, scale: Scale, record: Record, colour: Colour) -> None:
+def _ring(canvas: Canvas, box: Box, scale: Scale, record: Record) -> None:
     """The bright ring, and its radius beside the crystal's, marked down to the axis."""
     now, p, unit = record.now, record.puller, canvas.unit
     z_b = ring_height(now.r_c, now.h_c, p, record.config.meniscus, record.config.parameters.phi_b)
@@ -105,9 +109,10 @@ def _ring(canvas: Canvas, box: Box, scale: Scale, record: Record, colour: Colour
     canvas.dot(palette.CAMERA, (x, y), 2.6)
     canvas.line(palette.CAMERA, (x, y), (x, bottom), 1.0)
     edge = float(scale.x(now.r_c))
-    canvas.line(colour, (edge, float(scale.y(clipped_height(now.h_c, p.a)))), (edge, bottom), 1.0)
-    canvas.text(x + 5 * unit, scale.y_0 + 8 * unit, "bright ring", 9.5, (60, 20, 0), bold=True)
-    canvas.text(edge - 5 * unit, scale.y_0 + 8 * unit, "r_c", 9.5, (0, 30, 60), "right", bold=True)
+    canvas.line(MARK, (edge, float(scale.y(clipped_height(now.h_c, p.a)))), (edge, bottom), 1.0)
+    room, anchor = (5.0, "left") if x + 64.0 * unit < box.right else (-5.0, "right")
+    canvas.text(x + room * unit, scale.y_0 + 8 * unit, "bright ring", 9.5, ON_MELT, anchor, True)
+    canvas.text(edge - 5 * unit, scale.y_0 + 8 * unit, "r_c", 9.5, MARK, "right", bold=True)
 
 
 def _axis(canvas: Canvas, box: Box, scale: Scale) -> None:

@@ -21,7 +21,7 @@ from cz_gym.units import MM
 from .measurements import Bench, Response
 
 Floats = npt.NDArray[np.float64]
-DETECTED, CLOSED, TRUE, TRACED = COLOURS[1], COLOURS[0], INK, COLOURS[2]
+DETECTED, CLOSED, TRUE, TRACED, EDGE = COLOURS[1], COLOURS[0], INK, COLOURS[2], "#56B4E9"
 
 
 def view_figure(bench: Bench) -> bytes:
@@ -48,7 +48,7 @@ def _draw_image(axis: Any, bench: Bench, h_c: float, image: Any) -> None:
     )
     ring = detector.read(image)
     seen = project(ring.edges * np.cos(ANGLES), ring.edges * np.sin(ANGLES), detector.height, view)
-    axis.plot(seen.column, seen.row, color=COLOURS[5], lw=1.0, label="detected edge")
+    axis.plot(seen.column, seen.row, color=EDGE, lw=1.0, label="detected edge")
     r_br = _closed_form(p, h_c)
     wide = np.linspace(-0.6, 0.6, 121)
     closed = project(r_br * np.cos(wide), r_br * np.sin(wide), 0.0, view)
@@ -70,7 +70,7 @@ def _draw_middle(axis: Any, bench: Bench, h_c: float, image: Any) -> None:
     edge = wall_edge(make_scene(p.r_0, h_c, p), view)
     for name, r, z, colour in (
         ("triple point", p.r_0, h_c, GREY),
-        ("mirrors the wall's end", edge.r, edge.z, COLOURS[5]),
+        ("mirrors the wall's end", edge.r, edge.z, EDGE),
         ("closed-form ring", _closed_form(p, h_c), 0.0, CLOSED),
     ):
         axis.axvline(float(project(r, 0.0, z, view).row), color=colour, lw=1.0, ls="--", label=name)

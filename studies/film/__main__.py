@@ -28,6 +28,8 @@ HOLD = 1.8
 """How long the last frame stays [s]."""
 SIZE = (860, 470)
 COLOURS = 128
+PAPER = (255, 130, 205)
+"""Colour of the paper's controller: seen on crystal, melt and gas, and unlike the agent's also to the colour-blind."""
 
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
@@ -87,7 +89,7 @@ def contestants(scenario: str, seed: int, agent: Path | None = None) -> tuple[Si
     from cz_gym import agents
     from cz_gym.baselines.registry import find_controller
     from cz_gym.env import CzEnv
-    from cz_gym.rendering.palette import TEMPERATURE, TRUE
+    from cz_gym.rendering.palette import TRUE
 
     from .duel import Side
 
@@ -98,7 +100,7 @@ def contestants(scenario: str, seed: int, agent: Path | None = None) -> tuple[Si
         raise ValueError(f"{agent}: acts every {learned.contract.control_interval:g} s, not every 5 s")
     other = CzEnv(scenario, observation=learned.observation, action=learned.action, render_mode="rgb_array")
     name = f"learned: {learned.contract.algorithm}"
-    return Side("the paper's controller", paper, env, TEMPERATURE, seed), Side(name, learned, other, TRUE, seed)
+    return Side("the paper's controller", paper, env, PAPER, seed), Side(name, learned, other, TRUE, seed)
 
 
 def gif(pictures: Sequence[Any]) -> bytes:
@@ -121,7 +123,7 @@ def _palette(picture: Any, Image: Any) -> Any:
     from cz_gym.rendering import palette as c
 
     marker = c.mix(c.CAMERA, c.MELT_TOP, 0.5)
-    meaning = (c.BACK, c.PANEL, c.INK, c.TRUE, c.CAMERA, marker, c.REFERENCE, c.TEMPERATURE, c.ALARM, c.GLOW)
+    meaning = (c.BACK, c.PANEL, c.INK, c.TRUE, c.CAMERA, marker, c.REFERENCE, PAPER, c.ALARM, c.GLOW)
     needed = picture.quantize(COLOURS - len(meaning), method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     channels = [
         *needed.getpalette()[: 3 * (COLOURS - len(meaning))],

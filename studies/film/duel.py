@@ -59,7 +59,9 @@ def draw(canvas: Canvas, sides: Sequence[Side]) -> Surface:
     strip_charts.draw_errors(canvas, bottom, [(side.record, side.colour) for side in sides])
     x, y = bottom.x + 38.0 * unit, bottom.y + 4 * unit
     canvas.text(x, y, "true radius error [mm]", 9.5, palette.FAINT)
-    told = f"{TIMES}40: the drawing above shows the error 40 times as large"
+    told = (
+        f"{TIMES}{magnified:g}: drawn {magnified:g} times as large; shaded: within {triple_point.TOLERANCE / MM:g} mm"
+    )
     canvas.text(bottom.right - 10.0 * unit, y, told, 9.5, palette.FAINT, "right")
     for i, (side, box) in enumerate(zip(sides, boxes, strict=True)):
         canvas.text(x + (125 + 140 * i) * unit, y, side.name, 9.5, side.colour, bold=True)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cz_gym.evaluation.report.canvas import GREY, canvas, png, styles
+from cz_gym.evaluation.report.canvas import GREY, INK, canvas, png, styles
 from cz_gym.evaluation.rollout import Signals
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
@@ -91,30 +91,31 @@ def gain_figure(impulses: Mapping[str, Floats], responses: Mapping[str, Response
 
 def loop_figure(responses: Mapping[str, Responses], zero: float) -> bytes:
     """Loop gain and phase at the pull speed, and the sensitivity at the camera; ``zero`` is the plant's [rad/s]."""
-    figure = canvas(12.0, 3.8)
+    figure = canvas(12.0, 4.2)
     axes = figure.subplots(1, 3)
-    style = looks(tuple(responses))
+    style, ends = looks(tuple(responses)), [-180.0]
     for name, found in responses.items():
         at_pull, at_camera = found.opened("v_p"), found.opened("camera")
         axes[0].loglog(found.omega, np.abs(at_pull), label=name, **style[name])
         phase = np.degrees(np.unwrap(np.angle(at_pull)))
         crossing = int(np.argmin(np.abs(np.log(np.abs(at_pull)))))
         phase += 360.0 * np.round((-120.0 - phase[crossing]) / 360.0)
+        ends += [float(phase.min()), float(phase.max())]
         axes[1].semilogx(found.omega, phase, **style[name])
         axes[2].loglog(found.omega, 1.0 / np.abs(1.0 + at_camera), **style[name])
     axes[0].axhline(1.0, color=GREY, lw=0.8)
     axes[1].axhline(-180.0, color=GREY, lw=0.8)
     axes[2].axhline(1.0, color=GREY, lw=0.8)
-    axes[1].set_ylim(-420.0, 60.0)
-    axes[1].set_yticks(range(-360, 61, 60))
+    axes[1].set_yticks(np.arange(90.0 * np.floor(min(ends) / 90.0), max(ends) + 90.0, 90.0))
     titles = ("loop gain, opened at the pull speed", "its phase [°]", "sensitivity |1/(1 + L)|, opened at the camera")
     for axis, title in zip(axes, titles, strict=True):
         axis.axvline(zero, color=GREY, lw=0.8, ls=":")
         axis.set_title(title, fontsize=9.5)
         axis.set_xlabel("angular frequency [rad/s]")
     axes[0].annotate("right-half-plane zero", (zero, axes[0].get_ylim()[1]), (-3, -4), textcoords="offset points",
-                     rotation=90, ha="right", va="top", fontsize=7.5, color=GREY)  # fmt: skip
+                     rotation=90, ha="right", va="top", fontsize=8, color=INK)  # fmt: skip
     _legend(figure, axes[0])
+    figure.suptitle("The loop from pull speed to ring and back, small signals under the usual noise", fontsize=11)
     return png(figure)
 
 

@@ -89,7 +89,7 @@ def open_loop_response(model: str) -> Figure:
     figure, ((radii, cone), (height, growth)) = sheet(2, 2, (7.2, 4.8), sharex=True)
     draw_signal(radii, run, "r_c", "", label="$r_c$")
     radii.plot(ex.minutes(run), ring(run), color=ORANGE, label="$r_{br}$ - bias")
-    radii.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(0.03, 0.32))
+    radii.legend(frameon=False, fontsize=8, loc="lower right")
     inset = radii.inset_axes((0.16, 0.55, 0.5, 0.42))
     early = (run.t >= ex.BEFORE) & (run.t <= ex.BEFORE + 300.0)
     since = (run.t[early] - ex.BEFORE) / MINUTE

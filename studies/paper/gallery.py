@@ -9,7 +9,9 @@ from pathlib import Path
 from textwrap import fill
 from typing import NamedTuple
 
+import numpy as np
 from matplotlib.figure import Figure
+from PIL import Image
 
 from cz_gym.evaluation.report.canvas import small
 
@@ -18,6 +20,8 @@ from . import beyond_figures, figures
 DIAGRAMS = Path(__file__).parent / "diagrams"
 DPI = 160
 """Resolution of the figures [dots per inch]."""
+ABOVE = 0.3
+"""Room for a block diagram's title [in]."""
 
 
 class Shown(NamedTuple):
@@ -30,13 +34,19 @@ class Shown(NamedTuple):
 
     def png(self) -> bytes:
         """The figure as a PNG file."""
-        if self.draw is None:
-            return (DIAGRAMS / self.file).read_bytes()
         image = io.BytesIO()
-        figure = self.draw()
+        figure = self.draw() if self.draw else _diagram(DIAGRAMS / self.file)
         figure.suptitle(fill(self.caption.removesuffix("."), round(13.0 * figure.get_figwidth())), fontsize=10)
         figure.savefig(image, dpi=DPI, format="png")
         return small(image)
+
+
+def _diagram(path: Path) -> Figure:
+    """A picture with room for a title above it."""
+    with Image.open(path) as picture:
+        figure = Figure(figsize=(picture.width / DPI, picture.height / DPI + ABOVE), dpi=DPI)
+        figure.figimage(np.asarray(picture))
+    return figure
 
 
 FIGURES = tuple(
@@ -62,10 +72,10 @@ FIGURES = tuple(
          figures.ramp_temperatures),
         ("figure_13_ramp_I", "Paper's figure 13: the ramp, Model I.", partial(figures.ramp_response, model="I")),
         ("figure_14_ramp_II", "Paper's figure 14: the ramp, Model II.", partial(figures.ramp_response, model="II")),
-        ("extra_a_linear_steps", "Steps of plant and linear model, per per cent.", beyond_figures.linear_steps),
-        ("extra_b_washout", "True radius against compensated measurement.", beyond_figures.washout),
-        ("extra_c_cut_off", "The ramp against the high-pass cut-off.", beyond_figures.cut_off_sweep),
-        ("extra_d_noise", "Camera noise in the pull speed, one hour, Model I.", beyond_figures.noise_sweep),
+        ("extra_a_linear_steps", "Steps of the pull speed: plant against linear model.", beyond_figures.linear_steps),
+        ("extra_b_washout", "The ramp: true radius against compensated measurement.", beyond_figures.washout),
+        ("extra_c_cut_off", "The ramp: error and margin against the high-pass cut-off.", beyond_figures.cut_off_sweep),
+        ("extra_d_noise", "Camera noise in the pull speed: one hour, Model I.", beyond_figures.noise_sweep),
         ("extra_e_meniscus", "Hurle against the exact meniscus.", beyond_figures.menisci),
     )
 )  # fmt: skip

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -227,6 +228,10 @@ def test_a_narrow_window_has_one_column_and_nothing_covers_anything(browser: Any
         assert box(title)["right"] <= 400
     assert box("#picture-1 .gtitle")["right"] <= box("#picture-1 .updatemenu-header")["left"]
     assert box("#picture-0 .nsewdrag")["height"] > 150
+    for part in ("#picture-0", "#picture-1"):
+        labels = browser.find_elements("css selector", f"{part} .xtick text")
+        ends = sorted((label.rect["x"], label.rect["x"] + label.rect["width"]) for label in labels)
+        assert all(right <= left for (_, right), (left, _) in pairwise(ends)), "numbers at an axis collide"
 
 
 def test_no_complaint_at_the_end_either(browser: Any) -> None:

@@ -1,18 +1,19 @@
-"""The figure of one crystal: who is shown when there are many, and a crystal that nothing disturbs."""
+"""Figures: who is shown when there are many, colours, and a crystal that nothing disturbs."""
 
 import io
-from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 from PIL import Image
 
+import benchmark
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.protocol import find_row
-from cz_gym.evaluation.report.canvas import COLOURS, DPI, GREY, INK
-from cz_gym.evaluation.report.crystal import COLUMNS, chosen, heading
-from cz_gym.evaluation.report.figures import draw_figures
+from cz_gym.evaluation.report.canvas import COLOURS, DPI, GREY, INK, KNOWN, chosen, styles, styles_of
+from cz_gym.evaluation.report.crystal import COLUMNS
+from cz_gym.evaluation.report.figures import NAMED, draw_figures
+from cz_gym.evaluation.report.markdown import QUOTED
 from cz_gym.evaluation.results import Benchmark, Controller, Sample, summarise
 from cz_gym.evaluation.rollout import rollout
 
@@ -24,30 +25,51 @@ class Still:
         return np.zeros((len(observation), 2), np.float32), state
 
 
-def sample(name: str, rmse: float, observation: str = "measured", seeds: tuple[int, ...] = ()) -> Sample:
+def sample(
+    name: str, rmse: float, observation: str = "measured", seeds: tuple[int, ...] = (), own: bool = False
+) -> Sample:
     values = np.full((1, 1, len(metric_names())), rmse)
-    return Sample(Controller(name, observation, "", seeds), (7,), values, 0.0, cast(Any, None), 5.0)
+    return Sample(Controller(name, observation, "", seeds, own=own), (7,), values, 0.0, cast(Any, None), 5.0)
 
 
-def test_many_controllers_are_chosen_by_a_rule_and_the_rest_named() -> None:
+def names(samples: list[Sample]) -> list[str]:
+    return [one.controller.name for one in samples]
+
+
+def test_many_controllers_are_chosen_by_a_rule() -> None:
     many = [sample("bound", 0.1, "state"), sample("paper", 9.0), *(sample(f"c{i}", 1.0 + i) for i in range(6))]
     many.append(sample("ppo", 99.0, seeds=(0,)))
-    shown = chosen(many)
-    assert len(shown) == COLUMNS
-    assert [one.controller.name for one in shown] == ["paper", "c0", "c1", "ppo"]
-    assert chosen(many[::-1]) == shown[::-1]
-    outcomes = [SimpleNamespace(controller=one.controller) for one in many]
-    text = heading(cast(Any, SimpleNamespace(row=find_row("hard"), outcomes=outcomes)), shown)
-    assert text.endswith("not shown: bound, c2, c3, c4, c5")
-    two = [one for one in many if one.controller.name in ("bound", "ppo")]
-    assert "\n" not in heading(cast(Any, SimpleNamespace(row=find_row("hard"), outcomes=outcomes[::8])), two)
+    shown = chosen(many, 4)
+    assert names(shown) == ["paper", "c0", "c1", "ppo"]
+    assert chosen(many[::-1], 4) == shown[::-1]
+    assert chosen(many, 99) == many
+
+
+def test_one_s_own_is_shown_beside_the_reference() -> None:
+    many = [sample(name, 1.0, seeds=(0,) * (name in ("gradient", "ppo"))) for name in QUOTED]
+    many.append(sample("mine", 50.0, own=True))
+    assert {"paper", "mine"} < set(names(chosen(many, COLUMNS)))
+
+
+def test_the_figure_shows_the_controllers_of_readme_s_table() -> None:
+    assert set(KNOWN) == set(QUOTED)
+    many = [sample(each.name, 0.01) for each in benchmark.classical() if each.default]
+    many += [sample(name, 0.001 * len(name), seeds=(0,)) for name in benchmark.SHIPPED]
+    assert names(chosen(many, COLUMNS)) == list(QUOTED)
 
 
 def test_many_agents_leave_room_for_what_they_are_compared_with() -> None:
     agents = [sample(f"ppo-{i}", 9.0 - i, seeds=(0,)) for i in range(6)]
     others = [sample("paper", 99.0), sample("lqg", 1.0), sample("pid", 2.0)]
-    shown = [one.controller.name for one in chosen([*others, *agents])]
-    assert shown == ["paper", "lqg", "ppo-4", "ppo-5"]
+    assert names(chosen([*others, *agents], 4)) == ["paper", "lqg", "pid", "ppo-5"]
+
+
+def test_a_known_controller_looks_the_same_everywhere_and_no_colour_comes_twice() -> None:
+    alone = styles(["lqg-at-0.02"])
+    everyone = styles_of([sample(name, 1.0).controller for name in ("mine", *KNOWN, *(f"c{i}" for i in range(18)))])
+    assert everyone["lqg-at-0.02"] == alone["lqg-at-0.02"]
+    assert len({one.colour for one in everyone.values()}) == len(everyone) == len(COLOURS)
+    assert len(COLOURS) >= NAMED
 
 
 def test_figures_of_a_crystal_that_nothing_disturbs_and_of_a_name_that_seems_a_formula() -> None:

@@ -110,7 +110,10 @@ def test_gaps_are_measured_from_an_earlier_bound(
     assert data["provenance"]["gap_from_cached_episodes"] == {"randomized": 2}
     report = (tmp_path / "new" / "report.md").read_text()
     assert "`clairvoyant` of an earlier run (results/bounds), on the first 2 crystals" in report
-    assert "`python benchmark.py --slow --controllers paper,clairvoyant --scenarios hard` runs it" in report
+    assert (
+        "`python benchmark.py --slow --controllers paper,clairvoyant --scenarios hard --out runs/bound` runs it"
+        in report
+    )
 
 
 def test_a_bound_is_used_only_beside_the_same_figures_of_the_same_controller(earlier: Path, paper: Sample) -> None:

@@ -2,6 +2,8 @@
 
 import csv
 import json
+import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable
@@ -361,6 +363,31 @@ def test_controllers_and_scenarios_of_one_s_own_file_take_part(tmp_path: Path) -
     assert list(results) == ["open-loop", "Still", "still", "made"]
     assert len({each["rmse_mm"]["mean"] for each in results.values()}) == 1
     assert benchmark.parse(["--controller", "a.py:B"]).out is None
+
+
+def test_a_report_on_one_s_own_shows_it_and_prints_a_command_that_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("my files").mkdir()
+    mine = Path("my files/mine.py")
+    mine.write_text(MINE)
+    own = ["--controller", f"{mine}:still", "--scenario", f"{mine}:later"]
+    assert benchmark.main(["--controllers", "open-loop,paper,lqg-quiet,lqg", *own, "--out", "out", "--quiet"]) == 0
+    told = re.search("`python (.*)` runs it", Path("out/report.md").read_text())
+    assert told
+    command = shlex.split(told[1])[1:]
+    arguments = benchmark.parse(command)
+    assert [row.name for row in make_plan(*command).rows] == ["later"]
+    check_targets(arguments.out, arguments.json, True, arguments.overwrite)
+    page = Path("out/report.html").read_text()
+    assert "5 controllers, 1 scenario, up to 1 crystal each" in page
+    found = re.search('<script type="application/json" id="data">(.*?)</script>', page)
+    assert found
+    drawn = {
+        trace.get("legendgroup") for trace in json.loads(found[1])["frame"]["data"] if trace.get("visible") is True
+    }
+    assert drawn == {"1", "4"}, "the reference and one's own, without agents"
 
 
 @pytest.mark.parametrize(

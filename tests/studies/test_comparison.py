@@ -20,6 +20,7 @@ from cz_gym.evaluation import cluster
 from cz_gym.evaluation.protocol import TEST_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.statistics import Resamples
 from studies.comparison import command, lqg_family, results, table, training
+from studies.comparison import figures as figures_of_it
 from studies.comparison.results import ACTIVITY, FIGURES, LOST, RMSE, Plan, Result
 from studies.comparison.variants import Study, Variant
 from tests.small_learners import held, losing
@@ -188,6 +189,13 @@ def finished(random: np.random.Generator, seeds: range, shift: float) -> dict[in
     noise = [0.01 * random.normal(size=(40, len(FIGURES))) for _ in seeds]
     progress = [{"steps": 128.0, "seconds": 60.0, "validation_rmse_mm": 1.0}]
     return {seed: Result(crystals + each, progress) for seed, each in zip(seeds, noise, strict=True)}
+
+
+def test_curves_stand_beside_the_classical_controllers() -> None:
+    runs = {"ppo": finished(np.random.default_rng(0), range(1), 0.0)}
+    assert figures_of_it._references(table.tabulate(VARIANTS, runs, {})) == {}
+    runs["ppo"][0] = runs["ppo"][0]._replace(validations=[{"lqg_rmse_mm": 0.06, "validation_rmse_mm": 0.05}])
+    assert figures_of_it._references(table.tabulate(VARIANTS, runs, {})) == {"lqg": 0.06}
 
 
 def test_differences_are_paired_by_crystal_and_training_seed() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from cz_gym import agents
 from cz_gym.rendering import palette
-from cz_gym.rendering.canvas import Canvas
+from cz_gym.rendering.canvas import TIMES, Canvas
 from cz_gym.rendering.pixels import colours
 from studies.film import __main__ as film
 from studies.film.duel import draw
@@ -71,3 +71,18 @@ def test_the_film_shows_the_shipped_agent_unless_told(monkeypatch: pytest.Monkey
     _, learned = film.contestants("randomized", 1)
     assert learned.policy.contract.sha256 == agents.OnnxPolicy.load(agent).contract.sha256
     assert learned.name == f"learned: {learned.policy.contract.algorithm}"
+
+
+@pytest.mark.parametrize("samples", [200, 2160])
+def test_the_scale_that_is_told_is_the_one_that_is_drawn(samples: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("onnxruntime")
+    sides, canvas = film.contestants("randomized", film.SEED), Canvas(*film.SIZE)
+    for side in sides:
+        side.step_to(samples)
+    told: list[str] = []
+    monkeypatch.setattr(canvas, "text", lambda x, y, text, *others, **more: told.append(text))
+    draw(canvas, sides)
+    scales = [text.removeprefix("error ") for text in told if text.startswith(f"error {TIMES}")]
+    assert len(set(scales)) == 1
+    assert len(scales) == len(sides)
+    assert any(text.startswith(f"{scales[0]}: drawn {scales[0][1:]} times as large") for text in told)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.signal import lfilter
 
 from cz_gym import make_puller
@@ -71,6 +72,9 @@ def test_files(tmp_path, numbers, monkeypatch):
         picture = (out / figure.file).read_bytes()
         assert picture.startswith(b"\x89PNG")
         assert figure.file in report
+        if figure.draw is None:
+            with Image.open(gallery.DIAGRAMS / figure.file) as diagram, Image.open(out / figure.file) as shown:
+                assert shown.height > diagram.height, "a title stands above it"
     assert {path.name for path in out.iterdir()} == {figure.file for figure in FIGURES} | {"report.md", "numbers.json"}
     assert sum(path.stat().st_size for path in out.iterdir()) < 2_500_000
     assert "nan" not in report

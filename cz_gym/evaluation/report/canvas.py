@@ -10,11 +10,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from cz_gym.evaluation.results import Controller
+from cz_gym.evaluation.results import REFERENCE, Controller, Sample
 
 COLOURS = (
-    "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F5FB0", "#8C6D1F",
-    "#444444", "#A0A000", "#8B0000", "#005F5F", "#2A2AE0", "#E0218A", "#4B0055", "#5FBF3F",
+    "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#4B0055", "#7F5FB0", "#8C6D1F",
+    "#444444", "#A0A000", "#8B0000", "#005F5F", "#2A2AE0", "#E0218A", "#56B4E9", "#5FBF3F",
+    "#FF00FF", "#FF004B", "#1E4B00", "#E178FF", "#E17869", "#690F2D", "#0078FF", "#8700A5",
 )  # fmt: skip
 """Okabe and Ito's palette, safe for colour-blind readers, with more for a long table."""
 MARKERS = {
@@ -26,6 +27,8 @@ DASHES = ("solid", "dash", "dot")
 """Plotly's lines: the next one where the colours begin again."""
 DPI = 160
 INK, GREY = "#222222", "#999999"
+KNOWN = ("ppo", "gradient", "lqg-at-0.02", "paper", "paper-tuned")
+"""Controllers of README's table: each looks the same in every figure, by its place here."""
 
 
 class Style(NamedTuple):
@@ -37,17 +40,35 @@ class Style(NamedTuple):
 
 
 def styles(names: Sequence[str]) -> dict[str, Style]:
-    """One style a controller; the first ones are the boldest."""
-    markers = list(MARKERS)
-    return {
+    """One style a controller: that of its place among :data:`KNOWN`, or one of those after them, in turn."""
+    markers, places = list(MARKERS), [*KNOWN, *(name for name in names if name not in KNOWN)]
+    found = {
         name: Style(COLOURS[i % len(COLOURS)], markers[i % len(markers)], DASHES[i // len(COLOURS) % len(DASHES)])
-        for i, name in enumerate(names)
+        for i, name in enumerate(places)
     }
+    return {name: found[name] for name in names}
 
 
 def styles_of(controllers: Sequence[Controller]) -> dict[str, Style]:
-    """One style a controller; the learned ones are the boldest."""
-    return styles([each.name for each in sorted(controllers, key=lambda each: not each.learned)])
+    """One style a controller; after the known ones come the user's own, then the learned."""
+    return styles([each.name for each in sorted(controllers, key=lambda each: (not each.own, not each.learned))])
+
+
+def chosen(samples: Sequence[Sample], most: int) -> list[Sample]:
+    """At most so many of them, in their order, for a figure that has no room for all.
+
+    The reference, the user's own, the known ones, the best learned one, then the others; bounds last. Among equals the
+    lowest mean RMSE comes first.
+    """
+    ranked = sorted(samples, key=lambda sample: float(sample.metric("rmse_mm").mean()))
+    learned = [sample.controller.name for sample in ranked if sample.controller.learned]
+
+    def place(sample: Sample) -> tuple[bool, ...]:
+        who = sample.controller
+        return who.name != REFERENCE, not who.own, who.name not in KNOWN, who.name not in learned[:1], who.bound
+
+    names = [sample.controller.name for sample in sorted(ranked, key=place)[:most]]
+    return [sample for sample in samples if sample.controller.name in names]
 
 
 def canvas(width: float, height: float) -> Figure:
@@ -64,6 +85,7 @@ def png(figure: Figure) -> bytes:
         axis.set_axisbelow(True)
         axis.spines[["top", "right"]].set_visible(False)
         axis.tick_params(which="both", labelsize=8)
+        axis.tick_params(which="minor", pad=5.0)  # level with the longer ticks' numbers
         axis.xaxis.label.set_fontsize(8.5)
         axis.yaxis.label.set_fontsize(8.5)
     image = io.BytesIO()

@@ -10,17 +10,15 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.lines import Line2D
 
-from cz_gym.evaluation.results import REFERENCE, Sample, ScenarioResult
+from cz_gym.evaluation.results import Sample, ScenarioResult
 from cz_gym.evaluation.rollout import Signals
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
-from .canvas import GREY, INK, Style, canvas, png
+from .canvas import GREY, INK, Style, canvas, chosen, png
 
 Floats = npt.NDArray[np.float64]
-COLUMNS = 4
+COLUMNS = 5
 """Most controllers in the figure: with more, its words are too small where a page shows it 830 pixels wide."""
-LEARNED = 2
-"""Most learned ones of them while there are others."""
 ROOM = (0.01 * MM, 3.0 * MM)
 """Least and largest radius error that the figure has room for, beyond the reference's own range [m]."""
 SMOOTH = 5.0 * MINUTE
@@ -45,8 +43,8 @@ _PANELS = (
 
 def crystal(scenario: ScenarioResult, style: Mapping[str, Style]) -> bytes:
     """The first crystal of a scenario under each controller: radius, ring, pull, heater, melt against time."""
-    samples = chosen([outcome.sample for outcome in scenario.outcomes])
-    figure = canvas(1.9 * len(samples) + 1.0, 8.2)
+    samples = chosen([outcome.sample for outcome in scenario.outcomes], COLUMNS)
+    figure = canvas(max(1.62 * len(samples) + 1.0, 5.0), 7.6)
     axes = figure.subplots(len(_PANELS), len(samples), sharex=True, sharey="row", squeeze=False)
     longest = max((sample.example for sample in samples), key=lambda signals: len(signals.r_c))
     for column, sample in enumerate(samples):
@@ -54,48 +52,16 @@ def crystal(scenario: ScenarioResult, style: Mapping[str, Style]) -> bytes:
     for row, panel in enumerate(_PANELS):
         axes[row, 0].set_ylabel(panel.label)
     _set_limits(axes, samples, longest)
-    width = round(13.0 * figure.get_figwidth())
-    figure.suptitle(
-        "\n".join(fill(line, width, break_on_hyphens=False) for line in heading(scenario, samples).split("\n")),
-        fontsize=9.5,
-    )
+    figure.suptitle(f"One crystal of {scenario.row.name} (test seed {samples[0].seeds[0]:,})", fontsize=10.5)
     lines: tuple[dict[str, Any], ...] = (
         {"color": INK, "lw": 1.2, "ls": "--", "label": "reference"},
         {"color": GREY, "lw": 1.2, "label": "what the camera reports"},
-        {"color": INK, "lw": 1.2, "label": "true value"},
-        {"color": INK, "lw": 1.6, "label": "5 min mean of a drive"},
+        {"ls": "none", "label": "in colour: true value; of a drive its 5 min mean"},
     )
     handles = [Line2D([], [], **line) for line in lines]
-    columns = 2 if len(samples) < 4 else 4
+    columns = 1 if len(samples) < 4 else len(lines)
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=8.5, frameon=False)
     return png(figure)
-
-
-def chosen(samples: Sequence[Sample]) -> list[Sample]:
-    """At most :data:`COLUMNS`: the reference, the best learned, then the best of the others; bounds last.
-
-    Best is the lowest mean RMSE.
-    """
-    ranked = sorted(samples, key=lambda sample: float(sample.metric("rmse_mm").mean()))
-    learned = [sample.controller.name for sample in ranked if sample.controller.learned]
-    best, more = learned[:LEARNED], learned[LEARNED:]
-
-    def place(sample: Sample) -> tuple[bool, bool, bool, bool]:
-        who = sample.controller
-        return who.name != REFERENCE, who.name not in best, who.name in more, who.bound
-
-    names = [sample.controller.name for sample in sorted(ranked, key=place)[:COLUMNS]]
-    return [sample for sample in samples if sample.controller.name in names]
-
-
-def heading(scenario: ScenarioResult, samples: Sequence[Sample]) -> str:
-    """What the figure shows, and which controllers it does not."""
-    text = f"One crystal of {scenario.row.name!r} (test seed {samples[0].seeds[0]:,}) under each controller"
-    names = [sample.controller.name for sample in samples]
-    others = [outcome.controller.name for outcome in scenario.outcomes if outcome.controller.name not in names]
-    if not others:
-        return text
-    return f"{text}:\n{REFERENCE}, the best learned and the best others by mean RMSE\nnot shown: {', '.join(others)}"
 
 
 def _draw(axes: Any, sample: Sample, colour: str, reference: Floats) -> None:
@@ -113,7 +79,8 @@ def _draw(axes: Any, sample: Sample, colour: str, reference: Floats) -> None:
         else:
             axis.plot(minutes, values, color=colour, lw=1.1)
     rmse = float(sample.metric("rmse_mm")[0, 0])
-    axes[0].set_title(f"{sample.controller.name}\nRMSE {rmse:.3g} mm", fontsize=9, color=INK, fontweight="bold")
+    name = fill(sample.controller.name, 18)
+    axes[0].set_title(f"{name}\nRMSE {rmse:.3g} mm", fontsize=9, color=INK, fontweight="bold")
     axes[-1].set_xlabel("time [min]")
     if _failed(sample):
         for axis in axes:

@@ -14,12 +14,18 @@ from matplotlib.lines import Line2D
 
 from cz_gym.evaluation.results import Benchmark, Outcome, ScenarioResult
 
-from .canvas import INK, Style, canvas, png, styles_of
+from .canvas import GREY, INK, Style, canvas, chosen, png, styles_of
 from .crystal import crystal
 from .tables import PULL_STEP, RMSE
 
-FAR = 12
+FAR = 20
 """How many times the least error is not drawn [-]."""
+FEW_DECADES = 1000.0
+"""Up to which ratio of its ends a logarithmic axis has room for more numbers than powers of ten [-]."""
+LETTER = 0.085
+"""Width of a letter in a legend [in]."""
+NAMED = 8
+"""Most controllers that :func:`pareto` names: with more, points hide each other and colours are hard to tell apart."""
 Floats = npt.NDArray[np.float64]
 
 
@@ -81,64 +87,66 @@ def _spread(axis: Any, values: Floats, place: int, colour: str) -> None:
 def pareto(scenarios: Sequence[ScenarioResult], style: Mapping[str, Style]) -> bytes:
     """Mean RMSE against mean pull step RMS with 95 % intervals, both logarithmic; lower left is better.
 
-    Who has more than :data:`FAR` times the least error is named, not drawn: the others would crowd in a corner. Markers
-    are hollow, so that one behind another is seen.
+    Some controllers are named (:func:`.canvas.chosen` on the first scenario), by hollow markers, so that one behind
+    another is seen; the others are grey dots. Who has more than :data:`FAR` times the least error of those that move
+    the pull speed is not drawn.
     """
-    figure = canvas(4.4 * min(len(scenarios), 2) + 0.8, 2.9 * -(-len(scenarios) // 2) + 1.0)
+    named = [sample.controller.name for sample in chosen([each.sample for each in scenarios[0].outcomes], NAMED)]
+    figure = canvas(9.0 if len(scenarios) > 1 else 6.8, max(2.9 * -(-len(scenarios) // 2) + 1.0, 4.6))
     moving = [outcome.means[PULL_STEP.metric].mean for scenario in scenarios for outcome in scenario.outcomes]
     floor = min((value for value in moving if value > 0.0), default=1.0) / 3.0
-    drawn: set[str] = set()
     for axis, scenario in _axes(figure, scenarios, (PULL_STEP.heading, "RMSE of the radius [mm]")):
         axis.set_yscale("log")
         axis.tick_params(which="both", labelleft=True)
-        _plain_log(axis.yaxis, between=True)
-        most = FAR * min(outcome.means[RMSE.metric].mean for outcome in scenario.outcomes)
-        far = [outcome for outcome in scenario.outcomes if outcome.means[RMSE.metric].mean > most]
+        _plain_log(axis.yaxis)
+        least = [each.means[RMSE.metric].mean for each in scenario.outcomes if each.means[PULL_STEP.metric].mean > 0.0]
+        most, far = FAR * min(least, default=np.inf), []
         for outcome in scenario.outcomes:
-            if outcome not in far:
-                drawn.add(outcome.controller.name)
-                _point(axis, outcome, style[outcome.controller.name], floor)
+            name = outcome.controller.name
+            if outcome.means[RMSE.metric].mean <= most:
+                _point(axis, outcome, style[name] if name in named else None, floor)
+            elif name in named:
+                far.append(name)
         axis.set_title(scenario.row.name, fontsize=9.5)
         if far:
-            above = f"more than {FAR} times the least error: " + ", ".join(each.controller.name for each in far)
-            axis.text(
-                0.5,
-                0.995,
-                fill(above, 64, break_on_hyphens=False),
-                transform=axis.transAxes,
-                va="top",
-                ha="center",
-                fontsize=7,
-            )
+            place = {"transform": axis.transAxes, "va": "top", "ha": "right", "fontsize": 8}
+            axis.text(0.995, 0.995, fill(f"above: {', '.join(far)}", 50, break_on_hyphens=False), **place)
     handles = [
-        Line2D([], [], ls="none", marker=one.marker, color=one.colour, ms=8, mfc="none", mew=1.6, label=name)
+        Line2D([], [], ls="none", marker=one.marker, color=one.colour, ms=7, mfc="none", mew=1.6, label=name)
         for name, one in style.items()
-        if name in drawn
+        if name in named
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 5), frameon=False)
+    if len(named) < len(scenarios[0].outcomes):
+        handles.append(Line2D([], [], ls="none", marker="o", color=GREY, ms=3, label="others"))
+    columns = int(figure.get_figwidth() / (0.6 + LETTER * max(len(name) for name in named)))
+    figure.legend(handles=handles, loc="outside lower center", ncols=max(columns, 1), frameon=False, fontsize=9)
     figure.suptitle("Error against pull activity: lower left is better, bars are 95 % intervals", fontsize=11)
     return png(figure)
 
 
-def _point(axis: Any, outcome: Outcome, style: Style, floor: float) -> None:
+def _point(axis: Any, outcome: Outcome, style: Style | None, floor: float) -> None:
+    """A marker with its intervals in that style, or a grey dot."""
     error, activity = outcome.means[RMSE.metric], outcome.means[PULL_STEP.metric]
-    x, colour = max(activity.mean, floor), style.colour
+    x = max(activity.mean, floor)
+    if style is None:
+        axis.plot(x, error.mean, ls="none", marker="o", ms=3, color=GREY, zorder=1)
+        return
     if activity.mean < floor:
         below = {"xytext": (0, -14), "textcoords": "offset points", "ha": "center", "fontsize": 8}
         axis.annotate("← 0", (x, error.mean), color=INK, **below)
     elif activity.ci95:
-        axis.plot(activity.ci95, [error.mean] * 2, color=colour, lw=1.2)
+        axis.plot(activity.ci95, [error.mean] * 2, color=style.colour, lw=1.2)
     if error.ci95:
-        axis.plot([x, x], error.ci95, color=colour, lw=1.2)
-    axis.plot(x, error.mean, ls="none", marker=style.marker, ms=8, mfc="none", mew=1.6, color=colour)
+        axis.plot([x, x], error.ci95, color=style.colour, lw=1.2)
+    axis.plot(x, error.mean, ls="none", marker=style.marker, ms=7, mfc="none", mew=1.6, color=style.colour)
 
 
-def _plain_log(axis: Any, between: bool = False) -> None:
+def _plain_log(axis: Any) -> None:
     """Numbers as people write them: powers of ten and, where decades are few, 2 and 5 between them."""
 
     def two_or_five(value: float, position: int | None) -> str:
-        text = f"{value:g}"
-        return text if text.strip("0.") in ("2", "5") else ""
+        text, (low, high) = f"{value:g}", axis.get_view_interval()
+        return text if text.strip("0.") in ("2", "5") and high < FEW_DECADES * low else ""
 
     axis.set_major_formatter(lambda value, position: f"{value:g}")
-    axis.set_minor_formatter(two_or_five if between else lambda value, position: "")
+    axis.set_minor_formatter(two_or_five)

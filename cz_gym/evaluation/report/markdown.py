@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -84,6 +85,7 @@ def markdown(benchmark: Benchmark, figures: Iterable[str]) -> str:
         f"No failure in n crystals still allows a rate of up to 3/n, {3 / most / PERCENT:.2g} % at n = {most}. "
         "docs/benchmark.md has the protocol and every formula.",
         summary(benchmark),
+        *(f"![{name.removesuffix('.png')}]({name})" for name in figures),
         "## Who took part",
         _table(
             ("controller", "reads", "what it is", "training seeds"),
@@ -96,7 +98,6 @@ def markdown(benchmark: Benchmark, figures: Iterable[str]) -> str:
     ]
     for scenario in benchmark.scenarios:
         parts += _scenario(scenario)
-    parts += ["## Figures", *(f"![{name.removesuffix('.png')}]({name})" for name in figures)]
     parts += ["## How it was made", f"`{benchmark.command}`; versions, hashes and seeds stand in benchmark.json."]
     return "\n\n".join(parts) + "\n"
 
@@ -129,9 +130,10 @@ def measured_from(scenario: ScenarioResult) -> str:
         return f"Optimality gaps are measured from `{BOUND}` of an earlier run (results/bounds), on {met}."
     if any(outcome.gap for outcome in scenario.outcomes):
         return f"Optimality gaps are measured from `{BOUND}` on the crystals that it met."
+    place = f"--scenario {shlex.quote(scenario.row.file)}" if scenario.row.file else f"--scenarios {row}"
     return (
         f"No optimality gap: results/bounds does not have the bound for {row}, or it is no better than {REFERENCE}. "
-        f"`python benchmark.py --slow --controllers {REFERENCE},{BOUND} --scenarios {row}` runs it."
+        f"`python benchmark.py --slow --controllers {REFERENCE},{BOUND} {place} --out runs/bound` runs it."
     )
 
 

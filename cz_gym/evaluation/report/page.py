@@ -39,8 +39,9 @@ def page(benchmark: Benchmark) -> str:
         "script": _asset("page.js"),
         "data": embedded(_data(benchmark)),
         "verdict": escape(headline(benchmark)),
-        "lede": f"{len(benchmark.controllers)} controllers, {len(scenarios)} scenarios, up to {tables.crystals(most)} "
-        f"each, the same for everyone: {config.horizon / HOUR:g} h at one action every {config.control_interval:g} s.",
+        "lede": f"{tables.count(len(benchmark.controllers), 'controller')}, "
+        f"{tables.count(len(scenarios), 'scenario')}, up to {tables.crystals(most)} each, the same for everyone: "
+        f"{config.horizon / HOUR:g} h at one action every {config.control_interval:g} s.",
         "scenarios": _each("option", (scenario.row.name for scenario in scenarios)),
         "tables": "\n".join(_table(scenario) for scenario in scenarios),
         "controllers": "\n".join(

@@ -15,7 +15,8 @@ from cz_gym.evaluation.statistics import Estimate
 from .canvas import MARKERS, Style
 from .tables import ERROR, PULL_STEP, RMSE
 
-LOG = {"type": "log", "dtick": "D2", "tickformat": "~g"}
+LOG = {"type": "log", "exponentformat": "none"}
+"""Plotly then writes powers of ten in full and small digits between them, which do not collide on a narrow screen."""
 DISTRIBUTIONS = ERROR[:3]
 """Errors whose distribution over the crystals can be chosen."""
 LONGEST = 32

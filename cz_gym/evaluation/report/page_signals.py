@@ -166,11 +166,11 @@ def frame(
 ) -> go.Figure:
     """The panels over the ``horizon`` [s], without values: traces in the order in which a crystal's lines are packed.
 
-    The learned, the reference and their ``rivals`` are drawn; a click on a name in the legend draws others.
+    The user's own, the learned, the reference and their ``rivals`` are drawn; a click in the legend draws others.
     """
     titles = [f"{panel.title} [{panel.unit}]" for panel in PANELS]
     figure = make_subplots(len(PANELS), 1, shared_xaxes=True, vertical_spacing=0.02, subplot_titles=titles)
-    some = {each.name for each in controllers if each.learned or each.name in (REFERENCE, *rivals)}
+    some = {each.name for each in controllers if each.own or each.learned or each.name in (REFERENCE, *rivals)}
     for group, controller in enumerate(controllers):
         style, drawn = styles[controller.name], controller.name in some or not some
         for number, (panel, name) in enumerate(OWN):

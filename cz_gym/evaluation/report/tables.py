@@ -100,6 +100,11 @@ def rows(scenario: ScenarioResult, columns: Sequence[Column]) -> list[tuple[str,
     ]
 
 
-def crystals(count: int) -> str:
+def count(number: int, what: str) -> str:
+    """ "2 scenarios", "1 scenario"."""
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def crystals(number: int) -> str:
     """ "500 crystals", "1 crystal"."""
-    return f"{count} crystal{'s' if count > 1 else ''}"
+    return count(number, "crystal")
