@@ -1,4 +1,4 @@
-"""How agents travel: ``python -m studies.generalisation results/generalisation`` tabulates a benchmark's episodes.
+"""Agents on other plants: ``python -m studies.generalisation results/generalisation`` tabulates a benchmark's episodes.
 
 The benchmark of the rows an agent was not trained on, made by ``benchmark.py --scenarios randomized,hard,...``: radius
 error, lost crystals and the paired difference to one controller, with 95 % intervals over training seeds and crystals.
@@ -87,7 +87,7 @@ def to_markdown(cells: Sequence[Cell], against: str) -> str:
         return f"{mean:+.0f} [{low:+.0f}, {high:+.0f}]"
 
     others = [cell for cell in cells if cell.controller != against]
-    return f"""# How agents travel
+    return f"""# Agents on other plants
 
 RMSE of the radius [mm] on the first {cells[0].rmse.n} test crystals of each row, 95 % interval in brackets, and \
 crystals lost; on {" and ".join(OBSERVABLE)} against the radius that sensors can show.

@@ -1,4 +1,4 @@
-"""How agents travel: the table's means, pairing and refusals."""
+"""Agents on other plants: the table's means, pairing and refusals."""
 
 from pathlib import Path
 from typing import Any
