@@ -11,7 +11,7 @@ from typing import Any
 
 from cz_gym.agents import MODELS, shipped_seeds
 from cz_gym.agents.agent_file.contract import Contract, read_agent
-from cz_gym.agents.training.recipes import RECIPES, SPECIALISTS, Gradient
+from cz_gym.agents.training.recipes import RECIPES, SPECIALISTS, Gradient, Imitation
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser, guarded
 from studies.algorithms.__main__ import ROWS
@@ -62,8 +62,6 @@ def _seen(name: str, results: Results) -> Results:
 def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -> str:
     """An agent's section."""
     first, seen = contracts[0], _seen(name, results)
-    taken = [contract.training_steps / 1e6 for contract in contracts]
-    steps = [f"{least_or_most(taken):.0f}" for least_or_most in (min, max)]
     rows = [
         [scenario, *(_estimate(of[name][metric], 100.0 if metric == "failure_rate" else 1.0) for metric in FIGURES)]
         for scenario, of in seen.items()
@@ -74,7 +72,7 @@ def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -
             f"## `{name}`",
             "",
             f"- How it learned: {how}.",
-            f"- Saw: {_seen_in_training(name, first)}; {' to '.join(dict.fromkeys(steps))} million steps a run.",
+            f"- Saw: {_seen_in_training(name, first)}; {_steps(name, contracts)} a run.",
             f"- Reads: `{first.observation}`; acts every {first.control_interval:g} s; its action is `{first.action}`.",
             f"- Training seeds: {len(contracts)}. `agents.load({name!r})` is the one of least validation cost.",
             "- Fails: " + (f"loses crystals of {', '.join(fails)}." if fails else "on none of these."),
@@ -89,11 +87,23 @@ def _seen_in_training(name: str, contract: Contract) -> str:
     """What its crystals were, with the shares of those that are not the scenario's own."""
     recipe = RECIPES.get(name)
     also = recipe.also if isinstance(recipe, Gradient) else ()
+    if isinstance(recipe, Imitation):
+        also = (("", recipe.width, recipe.wide_share),)
     others = [
         f"{100.0 * share:.0f} % " + (f"of `{other}`" if other else f"{width:g} times as wide")
         for other, width, share in also
     ]
     return f"crystals of `{contract.scenario}`" + (f", with {', '.join(others)} among them" if others else "")
+
+
+def _steps(name: str, contracts: Sequence[Contract]) -> str:
+    """How many steps a run learned from; a contract counts only those that it learned from by reward."""
+    recipe = RECIPES.get(name)
+    if isinstance(recipe, Imitation):
+        return f"{recipe.rounds * recipe.episodes * recipe.config.steps / 1e6:.1f} million steps of demonstrations"
+    taken = [contract.training_steps / 1e6 for contract in contracts]
+    steps = [f"{least_or_most(taken):.0f}" for least_or_most in (min, max)]
+    return f"{' to '.join(dict.fromkeys(steps))} million steps"
 
 
 def _estimate(found: Mapping[str, Any], scale: float) -> str:
