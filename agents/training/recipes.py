@@ -264,22 +264,14 @@ LQG_COST = CostWeights(pull=0.11, pull_step=0.049, heater_step=23.4)
 GRADIENT_COST = replace(LQG_COST, pull_step=0.07, observable=True)
 """The cost that the recipe gradient follows: calmer, and without what no sensor shows."""
 _OTHERS = ("sensor-fault", 1.0, 0.3), ("", 2.0, 0.03)
-_HALF = Gradient(steps=Gradient.steps // 2, also=_OTHERS, weights=GRADIENT_COST)
+_ON = Gradient(start="gradient", steps=Gradient.steps // 4, learning_rate=4e-3, weights=GRADIENT_COST)
 SPECIALISTS = (
-    replace(_HALF, name="gradient-randomized"),
-    replace(_HALF, name="gradient-randomized-calm", weights=replace(GRADIENT_COST, pull_step=0.2)),
-    replace(_HALF, name="gradient-randomized-agile", weights=replace(GRADIENT_COST, pull_step=0.04)),
-    replace(_HALF, name="gradient-hard", scenario="hard", also=_OTHERS[:1]),
-    replace(_HALF, name="gradient-sensor-fault", scenario="sensor-fault", also=_OTHERS[1:]),
-    Gradient(
-        name="gradient-puller",
-        scenario="puller",
-        start="gradient",
-        steps=Gradient.steps // 4,
-        learning_rate=4e-3,
-        also=(),
-        weights=GRADIENT_COST,
-    ),
+    replace(_ON, name="gradient-randomized", also=_OTHERS),
+    replace(_ON, name="gradient-randomized-calm", also=_OTHERS, weights=replace(GRADIENT_COST, pull_step=0.2)),
+    replace(_ON, name="gradient-randomized-agile", also=_OTHERS, weights=replace(GRADIENT_COST, pull_step=0.04)),
+    replace(_ON, name="gradient-hard", scenario="hard", also=_OTHERS[:1]),
+    replace(_ON, name="gradient-sensor-fault", scenario="sensor-fault", also=_OTHERS[1:]),
+    replace(_ON, name="gradient-puller", scenario="puller", also=()),
 )
 """The recipe gradient for one scenario each; for ``randomized`` at three activities."""
 RECIPES: dict[str, Recipe] = {
