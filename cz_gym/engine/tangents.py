@@ -12,7 +12,7 @@ from typing import Any
 from cz_gym.episodes.record import GRID
 from cz_gym.episodes.schedule import melt_left, reference
 from cz_gym.jit.cache import hashed
-from cz_gym.jit.compile import kernel, physics
+from cz_gym.jit.compile import kernel, physics, within
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.plant import Disturbance, Inputs, State, along, rates
 from cz_gym.task import Cost, cost_terms
@@ -28,19 +28,20 @@ ROWS = (*SMOOTH, *Cost._fields)
 """What is differentiated: the next state and the terms of the step's cost."""
 SCRATCH = (4, len(State._fields), len(State._fields) + len(Inputs._fields))
 """Shape of what the loop works on."""
-_H = 1e-30
+_H = 2.0**-100
+"""The imaginary step: a power of two, by which a compiler divides as quickly as it multiplies."""
 _X, _INPUTS = len(State._fields), len(Inputs._fields)
 _V, _Q, _RING, _READING = (SMOOTH.index(name) for name in ("v_p", "Q_H", "ring", "reading"))
 _COST = _ACT = len(SMOOTH)
 
 
-@physics
+@within
 def _step(value: Any) -> Any:
     """The value with an imaginary step."""
     return complex(value, _H)
 
 
-@physics
+@within
 def _column(A: Any, j: Any, k: Any) -> None:
     """Derivatives of the rates along one of their arguments."""
     A[0, j], A[1, j], A[2, j], A[3, j], A[4, j] = (
@@ -48,19 +49,21 @@ def _column(A: Any, j: Any, k: Any) -> None:
     )  # fmt: skip
 
 
-@physics
-def _rates_by(A: Any, x: Any, u: Any, d: Any, p: Any, slope: Any) -> None:
-    """Derivatives of the rates by state and inputs: a complex number only where a step is taken, which is quicker."""
+@within
+def _rates_by(A: Any, x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
+    """The rates; their derivatives into ``A``. A number is complex only where a step is taken, which is quicker."""
     _column(A, 0, rates(State(_step(x.r_c), x.h_c, x.T_1, x.T_2, x.T_b), u, d, p, slope))
     _column(A, 1, rates(State(x.r_c, _step(x.h_c), x.T_1, x.T_2, x.T_b), u, d, p, slope))
     _column(A, 2, rates(State(x.r_c, x.h_c, _step(x.T_1), x.T_2, x.T_b), u, d, p, slope))
     _column(A, 3, rates(State(x.r_c, x.h_c, x.T_1, _step(x.T_2), x.T_b), u, d, p, slope))
     _column(A, 4, rates(State(x.r_c, x.h_c, x.T_1, x.T_2, _step(x.T_b)), u, d, p, slope))
     _column(A, 5, rates(x, Inputs(_step(u.v_p), u.Q_H), d, p, slope))
-    _column(A, 6, rates(x, Inputs(u.v_p, _step(u.Q_H)), d, p, slope))
+    k = rates(x, Inputs(u.v_p, _step(u.Q_H)), d, p, slope)
+    _column(A, 6, k)
+    return State(k.r_c.real, k.h_c.real, k.T_1.real, k.T_2.real, k.T_b.real)
 
 
-@physics
+@within
 def _stage(work: Any, weight: Any, ahead: Any, x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
     """A stage of Runge and Kutta's: its rates, and what they depend on.
 
@@ -68,18 +71,16 @@ def _stage(work: Any, weight: Any, ahead: Any, x: Any, u: Any, d: Any, p: Any, s
     (K), and of the step so far. This stage is at ``ahead`` [s] times the last one's rates; it counts ``weight`` [s].
     """
     A, last, K, total = work[0], work[1], work[2], work[3]
-    _rates_by(A, x, u, d, p, slope)
+    k = _rates_by(A, x, u, d, p, slope)
     for i in range(_X):
+        a, b, c, e, f = ahead * A[i, 0], ahead * A[i, 1], ahead * A[i, 2], ahead * A[i, 3], ahead * A[i, 4]
         for j in range(_X + _INPUTS):
-            value = A[i, j]
-            for via in range(_X):
-                value += A[i, via] * ahead * last[via, j]
-            K[i, j] = value
-            total[i, j] += weight * value
+            K[i, j] = A[i, j] + a * last[0, j] + b * last[1, j] + c * last[2, j] + e * last[3, j] + f * last[4, j]
     for i in range(_X):
         for j in range(_X + _INPUTS):
             last[i, j] = K[i, j]
-    return rates(x, u, d, p, slope)
+            total[i, j] += weight * K[i, j]
+    return k
 
 
 @physics
