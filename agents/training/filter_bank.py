@@ -68,7 +68,7 @@ STATE = sum(_PARTS)
 channels the last readings, their last differences, and the variances less the usual ones; the squared swings; the notch
 and means of what it takes away."""
 _STRENGTHS = 1 + len(NOISY) + 1 + len(SWINGS)
-_UNLED = _STRENGTHS + 1 + CLEANED
+UNLED = _STRENGTHS + 1 + CLEANED
 """Features that no action is chosen for: outliers and ripples, and what schedules the linear map."""
 HELD = 2
 """Place in :data:`TIMES` of the mean that stands in for a reading that failed."""
@@ -121,7 +121,7 @@ class FilterBank(nn.Module):
         shares = 1.0 - np.exp(-control_interval / np.array(TIMES[:CLEANED]))
         self._constant("cleaned_keep", 1.0 - shares)
         self._constant("cleaned_gain", shares[None])
-        width = features.shape[1] + _UNLED
+        width = features.shape[1] + UNLED
         self.register_buffer("mean", torch.zeros(width))
         self.register_buffer("per_std", torch.ones(width))
         self.layers = tanh_layers([width, *hidden])
@@ -172,13 +172,13 @@ class FilterBank(nn.Module):
         Arrays. Noise, swings, outliers, ripples and readings that failed are taken as they are: no action is chosen for
         what it does to their estimates.
         """
-        by_seen = by_features[:, :-_UNLED] @ self.features.numpy().T
+        by_seen = by_features[:, :-UNLED] @ self.features.numpy().T
         by_means = by_means + by_seen[:, len(MEASURED) :]
         return by_seen[:, : len(MEASURED)] + by_means @ self.gain.numpy().T, by_means * self.keep.numpy()
 
     def act(self, features: Any) -> Any:
         """The action, shape (..., 2), not yet held within its box, from features of shape (..., width)."""
-        x = held((features - self.mean) * self.per_std, -NORMALISED_LIMIT, NORMALISED_LIMIT)
+        x = self.normalised(features)
         lines = through(x, self.linear)
         if self.scheduled:
             lines = lines * (self._schedule(x, features) @ self.spread + self.ones)
@@ -187,12 +187,16 @@ class FilterBank(nn.Module):
             action = action + through(through(x, self.layers), self.bent) * self.gains
         return action
 
+    def normalised(self, features: Any) -> Any:
+        """The features less their mean, in standard deviations, held within bounds."""
+        return held((features - self.mean) * self.per_std, -NORMALISED_LIMIT, NORMALISED_LIMIT)
+
     def _schedule(self, x: Any, features: Any) -> Any:
         """What the linear map is scheduled on, each in a column."""
         width = len(self.mean)
         strengths = held(columns(x, range(width - _STRENGTHS, width)), -SCHEDULE_LIMIT, SCHEDULE_LIMIT)
         ripple, noise, _, _, *swings = parted(strengths, [1] * _STRENGTHS)
-        ages = range(width - _UNLED - len(BEGUN), width - _UNLED)
+        ages = range(width - UNLED - len(BEGUN), width - UNLED)
         large = width - len(SWINGS) - 1
         growth = columns(x, range(_GROWTH, _GROWTH + 1))
         return joined(

@@ -13,7 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from stable_baselines3.common.logger import Logger
+from torch import nn
 from torch.autograd import backward, grad
+from torch.nn.utils.parametrize import register_parametrization
 
 from cz_gym.config import Config
 from cz_gym.differentiable import STATES, Step
@@ -23,14 +25,17 @@ from cz_gym.task import COST_CAP, RADIUS_SCALE, Cost, cost_terms, drives_of
 
 from .crystals import Crystals
 from .demonstrations import widened
-from .filter_bank import MEANS, STATE, FilterBank, read_bank
+from .filter_bank import MEANS, STATE, UNLED, FilterBank, read_bank
 from .learner import Parts, Watch
+from .networks import whitening
 from .recipes import Gradient
 
 WARM_UP = 0.05
 """Share of the updates in which features are still standardised anew."""
 MOST_STD, LEAST_STD = 10.0, 1e-4
 """Bounds of a feature's standard deviation [-]."""
+LEAST_VARIANCE = 1e-4
+"""Added to the variances that whitening divides by [-]."""
 MOST_GRADIENT = 2.0
 """A gradient is cut to so many times the median norm of the last ones [-]: of a crystal that is nearly lost it is
 thousands of times as large, and says little."""
@@ -58,6 +63,22 @@ class Window(NamedTuple):
     """What the network remembers after them, shape (n, :data:`.filter_bank.STATE`)."""
 
 
+class _OfWhitened(nn.Module):
+    """A layer's weights, learned as weights of its inputs whitened; the layer itself stays as it is."""
+
+    scaling: torch.Tensor
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.register_buffer("scaling", torch.eye(width))
+
+    def forward(self, learned: torch.Tensor) -> torch.Tensor:
+        return learned.matmul(self.scaling)
+
+    def right_inverse(self, weight: torch.Tensor) -> Any:
+        return torch.linalg.solve(self.scaling, weight, left=False)
+
+
 class GradientLearner:
     """A :class:`.filter_bank.FilterBank` that follows the gradient of the reward's own cost."""
 
@@ -72,6 +93,13 @@ class GradientLearner:
             self.network = read_bank(recipe.start, seed, config, recipe.hidden, recipe.scheduled)
         else:
             self.network = FilterBank(config.control_interval, recipe.hidden, recipe.scheduled)
+        width = len(self.network.mean)
+        self.whitened: list[tuple[nn.Linear, _OfWhitened]] = []
+        for layer in (self.network.linear, *self.network.layers):
+            if recipe.whitened and isinstance(layer, nn.Linear) and layer.in_features == width:
+                self.whitened.append((layer, _OfWhitened(width)))
+                register_parametrization(layer, "weight", self.whitened[-1][1])
+        self.products, self.seen = torch.zeros(width, width, dtype=torch.float64), 0
         weights = self.network.parameters()
         self.optimiser = torch.optim.Adam(weights, recipe.learning_rate, betas=(0.9, recipe.beta2))
         self.norms = torch.zeros(LAST_GRADIENTS)
@@ -93,8 +121,11 @@ class GradientLearner:
             self.optimiser.param_groups[0]["lr"] = recipe.learning_rate * (1.0 - progress)
             window = self._drive(batch, measured, memory)
             self._follow(window, batch.measured_by_state)
+            features = window.features.detach().flatten(0, 1)
             if progress < WARM_UP and not recipe.start:
-                self._standardise(window.features.flatten(0, 1))
+                self._standardise(features)
+            if recipe.whitened:
+                self._whiten(features, progress)
             measured, memory = window.measured, window.memory
             left -= 1
             over = np.flatnonzero(~batch.grows | (left == 0)).tolist()
@@ -195,6 +226,30 @@ class GradientLearner:
         variance = network.per_std**-2.0
         variance += share * (seen.var(dim=0) - variance)
         network.per_std.copy_(1.0 / torch.clamp(variance.sqrt(), LEAST_STD, MOST_STD))
+
+    def _whiten(self, features: torch.Tensor, progress: float) -> None:
+        """Gather how the features vary together; after the warm-up have the weights learned of whitened ones.
+
+        The means' differences are alike, so that a step that changes one weight alone changes the action little. What
+        no action is chosen for stays as it is. The policy stays the same, and the optimiser begins anew.
+        """
+        if progress < WARM_UP:
+            x = self.network.normalised(features).double()
+            self.products += x.T @ x
+            self.seen += len(x)
+        elif self.seen:
+            covariance = (self.products / self.seen).numpy()[:-UNLED, :-UNLED]
+            scaling = torch.eye(len(self.products))
+            scaling[:-UNLED, :-UNLED] = torch.from_numpy(
+                whitening(covariance + LEAST_VARIANCE * np.eye(len(covariance)))
+            )
+            for layer, inputs in self.whitened:
+                weight = layer.weight.detach().clone()
+                inputs.scaling.copy_(scaling)
+                layer.weight = weight
+            self.optimiser.state.clear()
+            self.norms.zero_()
+            self.seen = 0
 
     def _seeds(self, count: int) -> list[int]:
         return [int(seed) for seed in self.random.choice(len(TRAINING_SEEDS), count)]

@@ -125,6 +125,8 @@ class Gradient(Rewarded):
     hidden: tuple[int, ...] = (64,)
     scheduled: bool = True
     """Whether the linear map depends on noise, swings, the reference and the crystal's age."""
+    whitened: bool = False
+    """Whether, after a warm-up, weights are learned as those of whitened features."""
     learning_rate: float = 1.2e-2
     """Of Adam at the start; it falls linearly to zero."""
     beta2: float = 0.9
@@ -264,7 +266,7 @@ LQG_COST = CostWeights(pull=0.11, pull_step=0.049, heater_step=23.4)
 GRADIENT_COST = replace(LQG_COST, pull_step=0.07, observable=True)
 """The cost that the recipe gradient follows: calmer, and without what no sensor shows."""
 _OTHERS = ("sensor-fault", 1.0, 0.3), ("", 2.0, 0.03)
-_ON = Gradient(start="gradient", steps=Gradient.steps // 4, learning_rate=4e-3, weights=GRADIENT_COST)
+_ON = Gradient(start="gradient", steps=Gradient.steps // 4, whitened=True, learning_rate=2e-3, weights=GRADIENT_COST)
 SPECIALISTS = (
     replace(_ON, name="gradient-randomized", also=_OTHERS),
     replace(_ON, name="gradient-randomized-calm", also=_OTHERS, weights=replace(GRADIENT_COST, pull_step=0.2)),

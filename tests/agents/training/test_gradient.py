@@ -259,6 +259,28 @@ def test_a_specialist_goes_on_from_the_shipped_agent_of_its_seed() -> None:
             GradientLearner(replace(few, start=start), 77, few.config, Logger(None, []), 0)
 
 
+def test_whitening_changes_what_is_learned_and_not_the_policy() -> None:
+    """Before and after it the network acts alike; its state, and its agent file, are read by another learner."""
+    recipe: Any = replace(RECIPES["gradient-randomized"], num_envs=4, window=20, steps=80)
+    first, second = (GradientLearner(recipe, 0, recipe.config, Logger(None, []), 0) for _ in range(2))
+    network = first.network
+    width, random = len(network.mean), np.random.default_rng(0)
+    features = torch.from_numpy(random.normal(size=(400, 3)) @ random.normal(size=(3, width))).float()
+    features = network.mean + features / network.per_std
+    before, learned = network.act(features).detach(), [weight.clone() for weight in network.parameters()]
+    first._whiten(features, 0.0)
+    first._whiten(features, 1.0)
+    assert torch.allclose(network.act(features), before, atol=1e-4)
+    assert not all(map(torch.equal, network.parameters(), learned))
+    inputs = network.normalised(features)[:, : -filter_bank.UNLED].double()
+    scaling = first.whitened[0][1].scaling[: -filter_bank.UNLED, : -filter_bank.UNLED].double()
+    strengths = torch.linalg.svdvals(inputs @ scaling) / 20.0
+    assert strengths[:3].numpy() == pytest.approx(1.0, abs=0.05)
+    assert float(strengths[3]) < 1e-2
+    second.network.load_state_dict(network.state_dict())
+    assert second.exported() == first.exported()
+
+
 def test_it_learns_from_nothing() -> None:
     """Forty updates on a third of the recipe's crystals: from losing all crystals to holding most of them."""
     recipe: Any = replace(RECIPES["gradient"], num_envs=64, steps=64 * 180 * 40, hidden=(), also=())
