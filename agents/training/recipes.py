@@ -273,7 +273,7 @@ SPECIALISTS = (
     replace(_ON, name="gradient-randomized-agile", also=_OTHERS, weights=replace(GRADIENT_COST, pull_step=0.04)),
     replace(_ON, name="gradient-hard", scenario="hard", also=_OTHERS[:1]),
     replace(_ON, name="gradient-sensor-fault", scenario="sensor-fault", also=_OTHERS[1:]),
-    replace(_ON, name="gradient-puller", scenario="puller", also=()),
+    replace(_ON, name="gradient-puller", scenario="puller", also=(), whitened=False, learning_rate=4e-3),
 )
 """The recipe gradient for one scenario each; for ``randomized`` at three activities."""
 RECIPES: dict[str, Recipe] = {
