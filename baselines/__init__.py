@@ -1,4 +1,4 @@
-"""Classical controllers, all through the ``predict`` seam on "measured" observations."""
+"""Classical controllers, all through the method ``predict`` on "measured" observations."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ class Agent(nn.Module):
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> Any:
-        """The mean action, through the seam that rollouts and the benchmark use."""
+        """The mean action, as rollouts and the benchmark call it."""
         with torch.no_grad():
             return self.actor(self.normalise(observation)).clamp(-1.0, 1.0).numpy(), state
 

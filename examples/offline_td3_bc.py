@@ -36,7 +36,7 @@ def network(inputs: int, outputs: int, activation: type[nn.Module]) -> nn.Module
 
 
 class Policy:
-    """The actor, through the seam that rollouts and the benchmark use."""
+    """The actor, as rollouts and the benchmark call it."""
 
     def __init__(self, actor: nn.Module, *scales: torch.Tensor) -> None:
         self.actor, (self.mean, self.spread, self.unit) = actor, scales

@@ -36,7 +36,7 @@ def crystals(settings: Any) -> VectorWrapper:
 
 
 class Policy:
-    """RLlib's module without exploration, through the seam that rollouts and the benchmark use."""
+    """RLlib's module without exploration, as rollouts and the benchmark call it."""
 
     def __init__(self, runner: Any) -> None:
         self.module, env = runner.module, runner.env

@@ -1,4 +1,4 @@
-"""A trained agent as data: an ONNX file run by onnxruntime, through the ``predict`` seam, without torch."""
+"""A trained agent as data: an ONNX file run by onnxruntime, through the method ``predict``, without torch."""
 
 from __future__ import annotations
 

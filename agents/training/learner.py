@@ -1,4 +1,4 @@
-"""What every learner can do, whatever it learns from: the seam between recipes and runs."""
+"""What every learner can do, whatever it learns from: the interface between recipes and runs."""
 
 from __future__ import annotations
 

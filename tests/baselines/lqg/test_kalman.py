@@ -12,10 +12,10 @@ Q = np.diag([0.01, 0.04])
 R = np.diag([0.25, 0.5])
 
 
-def readings(belief, y):
+def readings(estimate, y):
     for i in range(2):
-        row = np.broadcast_to(H[i], belief.mean.shape)
-        yield Measurement(y[:, i] - belief.mean @ H[i], row, np.full(len(y), R[i, i]))
+        row = np.broadcast_to(H[i], estimate.mean.shape)
+        yield Measurement(y[:, i] - estimate.mean @ H[i], row, np.full(len(y), R[i, i]))
 
 
 def joint(mean, P, y):
@@ -23,10 +23,10 @@ def joint(mean, P, y):
     return mean + K @ (y - H @ mean), (np.eye(2) - K @ H) @ P
 
 
-def corrected(belief, y):
+def corrected(estimate, y):
     for i in range(2):
-        belief = kalman.correct(belief, list(readings(belief, y))[i], np.inf)
-    return belief
+        estimate = kalman.correct(estimate, list(readings(estimate, y))[i], np.inf)
+    return estimate
 
 
 def test_one_reading_at_a_time_is_the_joint_update():
@@ -41,28 +41,28 @@ def test_one_reading_at_a_time_is_the_joint_update():
 
 
 def test_settles_at_the_riccati_solution():
-    belief = Gaussian(np.zeros((1, 2)), np.eye(2)[None] * 10.0)
+    estimate = Gaussian(np.zeros((1, 2)), np.eye(2)[None] * 10.0)
     for _ in range(500):
-        belief = corrected(belief, np.zeros((1, 2)))
-        belief = Gaussian(belief.mean @ A.T, kalman.predicted_covariance(belief.covariance, A, Q))
-    np.testing.assert_allclose(belief.covariance[0], kalman.steady_state(A, H, Q, R), rtol=1e-9)
+        estimate = corrected(estimate, np.zeros((1, 2)))
+        estimate = Gaussian(estimate.mean @ A.T, kalman.predicted_covariance(estimate.covariance, A, Q))
+    np.testing.assert_allclose(estimate.covariance[0], kalman.steady_state(A, H, Q, R), rtol=1e-9)
 
 
 def test_no_reading_changes_nothing():
-    belief = Gaussian(np.ones((2, 2)), np.broadcast_to(np.eye(2), (2, 2, 2)))
+    estimate = Gaussian(np.ones((2, 2)), np.broadcast_to(np.eye(2), (2, 2, 2)))
     reading = Measurement(np.array([5.0, 5.0]), np.ones((2, 2)), np.array([np.inf, 1.0]))
-    found = kalman.correct(belief, reading, 4.0)
-    np.testing.assert_array_equal(found.mean[0], belief.mean[0])
-    np.testing.assert_array_equal(found.covariance[0], belief.covariance[0])
-    assert np.all(found.mean[1] > belief.mean[1])
+    found = kalman.correct(estimate, reading, 4.0)
+    np.testing.assert_array_equal(found.mean[0], estimate.mean[0])
+    np.testing.assert_array_equal(found.covariance[0], estimate.covariance[0])
+    assert np.all(found.mean[1] > estimate.mean[1])
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_an_outlier_counts_as_the_gate_and_no_more(sign):
-    belief = Gaussian(np.zeros((2, 2)), np.broadcast_to(np.eye(2), (2, 2, 2)))
+    estimate = Gaussian(np.zeros((2, 2)), np.broadcast_to(np.eye(2), (2, 2, 2)))
     row = np.broadcast_to(H[0], (2, 2))
     sd = np.sqrt(H[0] @ H[0] + 1.0)
-    found = kalman.correct(belief, Measurement(sign * np.array([3.0 * sd, 1e6]), row, np.ones(2)), 3.0)
+    found = kalman.correct(estimate, Measurement(sign * np.array([3.0 * sd, 1e6]), row, np.ones(2)), 3.0)
     np.testing.assert_allclose(found.mean[1], found.mean[0])
 
 
