@@ -22,7 +22,7 @@ PROG = "python -m studies.film"
 OUT = Path(__file__).resolve().parents[2] / "results" / "media" / "duel.gif"
 SEED = 2_000_000
 """The first test crystal, the one in the benchmark's figure."""
-RATE = 14
+RATE = 11
 """Frames a second."""
 HOLD = 1.8
 """How long the last frame stays [s]."""
@@ -38,7 +38,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--scenario", default="randomized", metavar="NAME", help="scenario (%(default)s)")
     parser.add_argument("--seed", type=int, default=SEED, metavar="N", help="which crystal (%(default)s)")
     parser.add_argument("--agent", type=Path, metavar="FILE", help="agent file in place of the shipped one")
-    parser.add_argument("--frames", type=int, default=120, metavar="N", help="frames of the film (%(default)s)")
+    parser.add_argument("--frames", type=int, default=92, metavar="N", help="frames of the film (%(default)s)")
     parser.add_argument("--out", type=Path, default=OUT, metavar="FILE", help="file to write (results/media/duel.gif)")
     return parser.parse_args(argv)
 
