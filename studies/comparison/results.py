@@ -1,7 +1,7 @@
 """Judging agents and controllers on validation crystals; each result is cached as one small JSON file.
 
-A file's name ends in a hash of everything that the result depends on: settings, training seed, crystals, scenarios and
-plant. So results of other settings lie beside each other, and none passes for another.
+A file's name ends in a hash of everything that the result depends on: settings, training seed, crystals, scenarios,
+plant, and the code of all. So results of other settings lie beside each other, and none passes for another.
 """
 
 from __future__ import annotations
@@ -9,20 +9,25 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.agents import training
 from cz_gym.agents.agent_file.contract import read_json
 from cz_gym.agents.training.recipes import OWN_WEIGHTS
 from cz_gym.agents.training.run_files import provenance
 from cz_gym.agents.training.validation import costs
 from cz_gym.atomic_files import write_files
+from cz_gym.baselines import lqg
 from cz_gym.config import Config, make_config
+from cz_gym.evaluation.cache import hash_sources
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
+from cz_gym.jit.cache import compiled_sources
 
 Floats = npt.NDArray[np.float64]
 SCENARIO, TRANSFER = "randomized", "hard"
@@ -97,7 +102,15 @@ def cached(plan: Plan, name: str, settings: Any, make: Callable[[], Result]) -> 
 
 def _key(plan: Plan, settings: Any) -> Any:
     hashes = {name: make_config(name, observation="history").hash for name in (SCENARIO, TRANSFER)}
-    return {"settings": settings, "crystals": [int(seed) for seed in plan.crystals], "scenarios": hashes}
+    crystals = [int(seed) for seed in plan.crystals]
+    return {"settings": settings, "crystals": crystals, "scenarios": hashes, "code": _code()}
+
+
+@cache
+def _code() -> str:
+    """Hash of plant, learners and the LQG."""
+    own = [path for package in (training, lqg) for path in sorted(Path(str(package.__file__)).parent.glob("*.py"))]
+    return hash_sources([*compiled_sources(), *own])
 
 
 def _read(path: Path, crystals: int) -> Result:

@@ -142,7 +142,10 @@ def test_a_result_is_of_everything_it_depends_on(tmp_path: Path, monkeypatch: py
     with monkeypatch.context() as patch:
         patch.setattr(results, "SCENARIO", "puller")
         paths.append(place(plan))
-    assert len(set(paths)) == 5
+    with monkeypatch.context() as patch:
+        patch.setattr(results, "_code", lambda: "another learner")
+        paths.append(place(plan))
+    assert len(set(paths)) == 6
     assert place(plan._replace(work=tmp_path / "elsewhere")) == paths[0]
 
 
