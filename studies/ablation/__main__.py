@@ -10,7 +10,7 @@ from studies.comparison.variants import Study
 
 from .rows import ROWS
 
-STUDY = Study("ablation", "What helps: one change of the recipes gradient and ppo at a time, cut short", ROWS, None)
+STUDY = Study("ablation", "What helps: one change of a recipe at a time, cut short", ROWS, None)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

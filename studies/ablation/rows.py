@@ -1,4 +1,6 @@
-"""The rows of the ablation: the recipes ``gradient`` and ``ppo``, cut short, and each with one thing changed."""
+"""The rows of the ablation: recipes ``gradient``, ``gradient-randomized`` and ``ppo``, cut short, and each with one
+thing changed.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +14,7 @@ from studies.comparison.variants import Variant
 
 GRADIENT: Any = replace(RECIPES["gradient"], steps=350 * Gradient.num_envs * Gradient.window)  # type: ignore[call-arg]
 """An eighth of the recipe: it holds every crystal, and what helps shows."""
+SPECIALIST: Any = replace(RECIPES["gradient-randomized"], steps=GRADIENT.steps)  # type: ignore[call-arg]
 PPO: Any = replace(RECIPES["ppo"], steps=1_500_000)  # type: ignore[call-arg]
 
 
@@ -19,7 +22,7 @@ def _changed(base: Recipe, name: str, meaning: str, **changes: Any) -> Variant:
     return Variant(replace(base, name=f"{base.name}-{name}", **changes), meaning, base.name)
 
 
-_gradient, _ppo = partial(_changed, GRADIENT), partial(_changed, PPO)
+_gradient, _specialist, _ppo = (partial(_changed, base) for base in (GRADIENT, SPECIALIST, PPO))
 ROWS = (
     Variant(
         GRADIENT,
@@ -34,6 +37,8 @@ ROWS = (
     _gradient("long-adam", "Adam remembers a thousand squared gradients, its default, not ten", beta2=0.999),
     _gradient("own-cost", "the environment's own weights of the cost", weights=OWN_WEIGHTS),
     _gradient("smooth", "an action that returns to nominal by itself", action="smooth"),
+    Variant(SPECIALIST, "going on from gradient on its own scenario; weights of whitened features"),
+    _specialist("plain", "weights of the features as they are", whitened=False),
     Variant(PPO, "from nothing, by reward; smooth actions, differences of the past, a critic that sees the true state"),
     _ppo("rate", "an action moves the drives from where they are: no return to nominal", action="rate"),
     _ppo("direct", "an action sets the drives, within their whole range", action="direct"),
