@@ -31,9 +31,9 @@ def made_for(action: npt.NDArray[np.float32], kind: str, control_interval: float
     return marked
 
 
-def check_made_for(action: Any, config: Config) -> None:
+def check_made_for(action: AgentAction, config: Config) -> None:
     """InvalidAction for an agent's action that is meant for another environment than one of these settings."""
-    made = action.made_for if type(action) is AgentAction else None
+    made = action.made_for
     if made is not None and made != (config.action, config.control_interval):
         raise InvalidAction(
             f"this agent is made for action={made[0]!r}, control_interval={made[1]:g}; the environment has "

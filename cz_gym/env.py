@@ -23,7 +23,7 @@ from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.rendering.view import FPS, Frame, declared_modes, make_view
 
-from .action import check_made_for
+from .action import AgentAction, check_made_for
 from .config import Config, check_config, make_config
 from .observation import CAMERA, CLIP, OBSERVATIONS
 
@@ -191,7 +191,8 @@ class CzEnv(gym.Env[Observation, Action]):
         """
         if self._over:
             raise ResetNeeded("the episode is over (or never began): call reset()")
-        check_made_for(action, self.config)
+        if type(action) is AgentAction:
+            check_made_for(action, self.config)
         self._action[0] = check_action(action)
         self._step()
         out = self._out

@@ -22,7 +22,7 @@ from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.processors import processors
 
-from .action import check_made_for
+from .action import AgentAction, check_made_for
 from .config import Config, check_config, make_config
 from .env import CzEnv, EnvState, action_space, check_options, check_state, observation_space
 
@@ -149,7 +149,8 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         Raises InvalidAction for NaN, another shape, and an agent made for other actions or another control interval;
         ResetNeeded before the first reset and, with autoreset disabled, while any episode is over.
         """
-        check_made_for(actions, self.config)
+        if type(actions) is AgentAction:
+            check_made_for(actions, self.config)
         actions = self._check_actions(actions)
         if not self._begun:
             raise ResetNeeded("call reset() first")
