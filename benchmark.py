@@ -186,10 +186,13 @@ def _classical(entry: Entry) -> Contender:
 
 def _given(files: Sequence[tuple[str, Path]]) -> dict[str, Contender]:
     """The agents of files, each with a name or "" for its algorithm's."""
+    from cz_gym.agents import shipped_names
     from cz_gym.evaluation.contenders import agent
 
     policies: dict[str, list[Any]] = {}
     for name, file in files:
+        if str(file) in shipped_names() and not file.exists():
+            raise ValueError(f"--agent takes a file; {file} is shipped and runs by its name: --controllers {file}")
         policy = _load(file)
         policies.setdefault(name or policy.contract.algorithm, []).append(policy)
     return {name: agent(name, some, own=True) for name, some in policies.items()}

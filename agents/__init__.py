@@ -13,7 +13,7 @@ from pathlib import Path
 
 from cz_gym.agents.agent_file.contract import AgentFileError, Contract, read_agent
 from cz_gym.agents.policies.onnx import OnnxPolicy
-from cz_gym.config import Config, check_config
+from cz_gym.config import Config
 from cz_gym.names import unknown
 
 __all__ = ["AgentFileError", "Contract", "OnnxPolicy", "load", "shipped", "shipped_names", "shipped_seeds"]
@@ -25,12 +25,18 @@ DEFAULT = "gradient"
 def load(name: str | Path = DEFAULT, config: Config | None = None) -> OnnxPolicy:
     """A trained agent, ready for ``predict``: the shipped one of that name, or that of an agent file (.onnx).
 
-    With a config, it must have been trained on the same nominal plant. AgentFileError says in one line why an agent
-    cannot be had, or names what there is.
+    With a config, it must have been trained on the same nominal plant, and for its observation, actions and control
+    interval; without, ``gym.make("Cz-v0", **agent.settings)`` makes an environment for it. AgentFileError says in one
+    line why an agent cannot be had, or names what there is.
     """
-    if config is not None:
-        check_config(config)
-    return OnnxPolicy.load(name if Path(name).suffix == ".onnx" else shipped(str(name)), config)
+    policy = OnnxPolicy.load(name if Path(name).suffix == ".onnx" else shipped(str(name)), config)
+    for setting, value in policy.settings.items():
+        if config is not None and getattr(config, setting) != value:
+            raise AgentFileError(
+                f"{name} is made for {setting}={value!r}, this config has {getattr(config, setting)!r}: "
+                f"make_config(..., {setting}={value!r}) fits"
+            )
+    return policy
 
 
 def shipped_names() -> list[str]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,9 +20,10 @@ from cz_gym.agents.agent_file.contract import AgentFileError, Contract, facts_of
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.agents.training.validation import JUDGING, validate
 from cz_gym.commands import OneLineParser, guarded
-from cz_gym.config import Config, make_config
-from cz_gym.env import CzEnv
+from cz_gym.config import Config, check_config, make_config
+from cz_gym.env import CzEnv, observation_space
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from cz_gym.names import needs
 from cz_gym.observation import DRIVE_CHANNELS, OBSERVATIONS
 from cz_gym.vector import CzVectorEnv
 
@@ -43,6 +45,7 @@ ALGORITHMS = {
 """RL-Zoo's names and what they stand for."""
 VALID = "valid"
 """The camera's flag among the channels."""
+GIVE_IT = "give the VecNormalize it was trained in (save_agent's normalisation, --vecnormalize of the command)"
 SAMPLES, SLOTS = 50, 8
 """Samples of as many pullers on which file and model must agree."""
 TOLERANCE = 1e-3
@@ -50,7 +53,7 @@ TOLERANCE = 1e-3
 
 
 def save_agent(
-    path: Path,
+    path: str | Path,
     model: BaseAlgorithm,
     name: str,
     normalisation: VecNormalize | None = None,
@@ -61,9 +64,20 @@ def save_agent(
 
     ``normalisation`` is what its observations went through, ``config`` the settings of the environment it was trained
     in, ``seed`` its training seed: by default the model's own. Raises AgentFileError for a model that cannot be
-    written, among them any whose file does not act as it does, and one whose last observations in training were
-    normalised while no ``normalisation`` is given.
+    written, among them any whose file does not act as it does, and one that was trained on normalised observations
+    while no ``normalisation`` is given; warns of a model that does not know how it was trained.
     """
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    path = Path(path)
+    if path.suffix != ".onnx":
+        raise AgentFileError(f"{path}: an agent file ends in .onnx")
+    needs(BaseAlgorithm, model, "stable_baselines3.PPO.load(file) reads one")
+    if normalisation is not None:
+        needs(VecNormalize, normalisation, "VecNormalize.load(file, env) reads one")
+    if config is not None:
+        check_config(config)
     normalisation, config = normalisation or model.get_vec_normalize_env(), config or _config_of(model)
     _check_spaces(model, config)
     _check_normalisation(model, normalisation, config.observation)
@@ -80,6 +94,9 @@ def save_agent(
     apart = disagreement(agent, model, normalisation, config)
     if not apart <= TOLERANCE:
         raise AgentFileError(f"{path}: the file would act otherwise than the model, by up to {apart:.2g}")
+    if normalisation is None and not model.num_timesteps:
+        said = f"this model does not know how it was trained: if on normalised observations, {GIVE_IT}"
+        warnings.warn(said, stacklevel=2)
     found = validate(agent, config, JUDGING)
     facts |= {"validation_cost": found.cost, "validation_rmse_mm": found.rmse_mm}
     return write_agent(path, content, **facts)
@@ -152,19 +169,20 @@ def _check_spaces(model: BaseAlgorithm, config: Config) -> None:
 
 
 def _check_normalisation(model: BaseAlgorithm, normalisation: VecNormalize | None, observation: str) -> None:
-    """AgentFileError if what the model saw last, which its file keeps, was normalised and nothing is here to do so.
+    """AgentFileError if the model was trained on normalised observations and nothing is here to normalise them.
 
-    The camera's flag tells: it is 0 or 1, and nothing else once it is normalised.
+    Its file keeps what it saw last, where the camera's flag is 0 or 1, and nothing else once it is normalised. Loaded
+    into an environment it has lost that, but not what came before a VecNormalize.
     """
-    names = [channel.name for channel in OBSERVATIONS[observation]]
-    seen = getattr(model, "_last_obs", None)
-    if normalisation is not None or seen is None or VALID not in names:
+    if normalisation is not None:
         return
-    if not np.isin(seen[:, names.index(VALID)], (0.0, 1.0)).all():
-        raise AgentFileError(
-            "the model was trained on normalised observations: give the VecNormalize it was trained in "
-            "(save_agent's normalisation, --vecnormalize of the command)"
-        )
+    names = [channel.name for channel in OBSERVATIONS[observation]]
+    seen, before = model._last_obs, model._last_original_obs
+    plain = before is None and model.observation_space == observation_space(observation)
+    if isinstance(seen, np.ndarray) and VALID in names:
+        plain = bool(np.isin(seen[:, names.index(VALID)], (0.0, 1.0)).all())
+    if not plain:
+        raise AgentFileError(f"the model was trained on normalised observations: {GIVE_IT}")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -189,8 +207,6 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _convert(given: argparse.Namespace) -> int:
-    if given.out.suffix != ".onnx":
-        raise AgentFileError(f"{given.out}: an agent file ends in .onnx")
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
     module, _, name = ALGORITHMS[given.algo].partition(".")

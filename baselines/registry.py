@@ -37,6 +37,10 @@ class Entry:
     slow: bool = False
     """Whether it runs only when slow controllers are asked for, on the first few episodes."""
 
+    def __post_init__(self) -> None:
+        make = self.make
+        object.__setattr__(self, "make", lambda config: make(check_config(config)))
+
 
 def _paper(config: Config) -> Policy:
     return CompensatedPID(config.control_interval, v_0=config.parameters.v_0)
@@ -116,4 +120,4 @@ def find_controller(name: str) -> Entry:
 
 def make_controller(name: str, config: Config) -> Policy:
     """The controller of that name for an environment's settings; ValueError names what there is."""
-    return find_controller(name).make(check_config(config))
+    return find_controller(name).make(config)

@@ -5,6 +5,7 @@ Importing this package registers ``Cz-v0``; ``gym.make("cz_gym:Cz-v0")`` imports
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 from typing import Any
 
@@ -12,6 +13,8 @@ try:
     import gymnasium as gym
 except ModuleNotFoundError as error:
     said = f"{error.name} is missing: run .venv/bin/python, which `make venv` makes, or `pip install .`"
+    if sys.argv[0] == "-m":  # a command, as python -m cz_gym.play
+        sys.exit(said)
     raise ModuleNotFoundError(said, name=error.name) from None
 
 from cz_gym.episodes.scenario import Scenario

@@ -13,7 +13,7 @@ from cz_gym.camera.view import Camera, camera_for, check_camera
 from cz_gym.episodes.scenario import Range, Scenario
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario, mix_of
 from cz_gym.jit.cache import hashed
-from cz_gym.names import unknown
+from cz_gym.names import needs, unknown
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters, check_parameters
 from cz_gym.physics.plant import make_puller
@@ -113,9 +113,11 @@ class Config:
 
 def check_config(config: Config) -> Config:
     """The config itself; ValueError for anything else, such as the name of a scenario."""
-    if not isinstance(config, Config):
-        raise ValueError(f"this needs a config, as make_config({config!r:.80}) makes one")
-    return config
+    given = repr(config) if isinstance(config, str) else ""
+    checked: Config = needs(
+        Config, config, f"cz_gym.config.make_config({given}) makes one, env.unwrapped.config is one"
+    )
+    return checked
 
 
 def make_config(

@@ -15,6 +15,7 @@ import time
 import warnings
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,7 +28,7 @@ from scipy.signal import lfilter
 import cz_gym
 from cz_gym.atomic_files import check_writable
 from cz_gym.commands import OneLineParser, between, guarded
-from cz_gym.config import Config, make_config
+from cz_gym.config import Config, check_config, make_config
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from cz_gym.names import unknown
 from cz_gym.observation import DRIVE_CHANNELS, to_measured
@@ -59,13 +60,16 @@ class Source(NamedTuple):
 def find_source(name: str, config: Config) -> Source:
     """The controller or shipped agent of that name; ValueError names what there is."""
     controllers = {entry.name: entry for entry in pkgutil.resolve_name(CONTROLLERS) if not entry.privileged}
+    check_config(config)
     if name in controllers:
         return Source(controllers[name].make(config), controllers[name].observation)
+    load = pkgutil.resolve_name(AGENTS)
     try:
-        agent = pkgutil.resolve_name(AGENTS)(name, config)
+        contract = load(name).contract
     except ValueError as error:
         raise ValueError(unknown("policy", name, controllers, f"; or an agent: {error}")) from None
-    return Source(agent, agent.contract.observation, agent.contract.action)
+    reads, acts = contract.observation, contract.action
+    return Source(load(name, replace(config, observation=reads, action=acts)), reads, acts)
 
 
 def excitation(seed: int, config: Config, noise: float) -> tuple[float, npt.NDArray[np.float64]]:

@@ -23,6 +23,7 @@ from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.rendering.view import FPS, Frame, declared_modes, make_view
 
+from .action import AgentAction, check_made_for
 from .config import Config, check_config, make_config
 from .observation import CAMERA, CLIP, OBSERVATIONS
 
@@ -185,10 +186,13 @@ class CzEnv(gym.Env[Observation, Action]):
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Hold an action, shape (2,), for one control interval; see :class:`gymnasium.Env`.
 
-        Raises InvalidAction for NaN or another shape, ResetNeeded once the episode is over.
+        Raises InvalidAction for NaN, another shape, and an agent made for other actions or another control interval;
+        ResetNeeded once the episode is over.
         """
         if self._over:
             raise ResetNeeded("the episode is over (or never began): call reset()")
+        if type(action) is AgentAction:
+            check_made_for(action, self.config)
         self._action[0] = check_action(action)
         self._step()
         out = self._out

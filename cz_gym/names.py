@@ -1,9 +1,17 @@
-"""What is said of a name that does not exist."""
+"""What is said of a name that does not exist, and of one where an object belongs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from typing import Any
+
+
+def needs(kind: type, value: Any, how: str) -> Any:
+    """The value itself; ValueError, which says how one is made, unless it is of that kind."""
+    if not isinstance(value, kind):
+        raise ValueError(f"this needs a {kind.__name__}, not {value!r:.80}: {how}")
+    return value
 
 
 def unknown(kind: str, name: object, known: Iterable[str], also: str = "") -> str:

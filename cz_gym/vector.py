@@ -20,7 +20,9 @@ from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
+from cz_gym.processors import processors
 
+from .action import AgentAction, check_made_for
 from .config import Config, check_config, make_config
 from .env import CzEnv, EnvState, action_space, check_options, check_state, observation_space
 
@@ -39,8 +41,8 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
 
     Arguments are those of :class:`CzEnv`, with ``num_envs``, ``autoreset_mode`` (a
     :class:`gymnasium.vector.AutoresetMode` or its value; each episode is re-drawn from the slot's own stream) and
-    ``threads`` (None: one per core and 256 slots; results do not depend on it). Nothing returned is reused by a
-    later call.
+    ``threads`` (None: one per processor it may use and 256 slots; results do not depend on it). Nothing returned is
+    reused by a later call.
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
@@ -101,7 +103,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         self.single_observation_space = observation_space(config.observation)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._batch = Batch(self.config, num_envs, threads, self._everything)
+        self._batch = Batch(self.config, num_envs, threads or processors(), self._everything)
         self._out = self._batch.new_out()
         self._everybody: Mask = np.ones(num_envs, np.bool_)
         self._over = self._everybody.copy()
@@ -144,9 +146,11 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Hold actions, shape (num_envs, 2), for one control interval in every slot.
 
-        Raises InvalidAction for NaN or another shape, ResetNeeded before the first reset and, with autoreset
-        disabled, while any episode is over.
+        Raises InvalidAction for NaN, another shape, and an agent made for other actions or another control interval;
+        ResetNeeded before the first reset and, with autoreset disabled, while any episode is over.
         """
+        if type(actions) is AgentAction:
+            check_made_for(actions, self.config)
         actions = self._check_actions(actions)
         if not self._begun:
             raise ResetNeeded("call reset() first")

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.action import made_for
 from cz_gym.agents.agent_file.contract import AgentFileError, Contract, observation_hash, read_agent
 from cz_gym.agents.agent_file.graph import GraphError, checked
-from cz_gym.config import Config
+from cz_gym.config import Config, check_config
 from cz_gym.observation import OBSERVATIONS
 from cz_gym.task import ACTIONS
 
@@ -40,6 +41,10 @@ class OnnxPolicy:
         that says why a file is refused. Nothing in the file is executed but its tensor operations.
         """
         path = Path(path)
+        if not path.suffix and not path.exists():
+            raise AgentFileError(
+                f"{path}: no agent file; a shipped agent is had by name: cz_gym.agents.load({str(path)!r})"
+            )
         return cls.of(*read_agent(path), config, path)
 
     @classmethod
@@ -62,7 +67,7 @@ class OnnxPolicy:
             )
         if contract.action not in ACTIONS:
             raise AgentFileError(f"{path}: gives actions {contract.action!r}, which this release does not have")
-        if config is not None and config.plant_hash != contract.plant_hash:
+        if config is not None and check_config(config).plant_hash != contract.plant_hash:
             raise AgentFileError(
                 f"{path}: trained on plant {contract.plant_hash}, this environment's is {config.plant_hash}"
             )
@@ -83,10 +88,17 @@ class OnnxPolicy:
         """What its actions mean, as the environment's argument of that name says it."""
         return self.contract.action
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What ``gym.make("Cz-v0", ...)`` must be given for it: observation, action and control interval [s]."""
+        return {name: getattr(self.contract, name) for name in ("observation", "action", "control_interval")}
+
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[npt.NDArray[np.float32], Any]:
         """Actions, shape (n, 2) or (2,), of observations of shape (n, channels) or (channels,).
+
+        Environments of other actions or of another control interval refuse them.
 
         An agent that remembers takes and returns ``state``, shape (n, k) or (k,); None, and rows where
         ``episode_start``, begin at zero. One that does not returns it as it was.
@@ -94,7 +106,8 @@ class OnnxPolicy:
         array = np.asarray(observation, np.float32)
         if array.ndim not in (1, 2) or array.shape[-1] != self.contract.channels:
             raise ValueError(
-                f"expected {self.contract.channels} channels ({self.observation}), got shape {array.shape}"
+                f"expected {self.contract.channels} channels ({self.observation}), got shape {array.shape}: "
+                'gym.make("Cz-v0", **agent.settings) gives them'
             )
         rows = np.atleast_2d(array)
         if not self.remembers:
@@ -116,6 +129,7 @@ class OnnxPolicy:
         shapes = [(len(inputs["observation"]), width) for width in (2, self.remembers) if width]
         if [output.shape for output in outputs] != shapes or not all(np.isfinite(output).all() for output in outputs):
             raise AgentFileError(f"agent {self.contract.sha256[:12]}: its action is not two finite numbers")
+        outputs[0] = made_for(outputs[0], self.action, self.contract.control_interval)
         return outputs
 
 

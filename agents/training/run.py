@@ -82,7 +82,7 @@ class Run:
         self._write_settings()
 
     def learn(self, bar: Any, report: Callable[[int, Validation], None] = lambda steps, found: None) -> None:
-        """Learn to the end, validating and saving on the way.
+        """Learn to the end, validating and saving on the way; nothing if that is done.
 
         ``bar`` counts environment steps, as tqdm's does; ``report`` gets what each validation found.
         """
@@ -101,7 +101,8 @@ class Run:
                 self.save()
 
         self.learner.learn(watch)
-        report(self.learner.steps, self._validate(bar))
+        if math.isinf(self.best) or not self.rows or int(self.rows[-1]["steps"]) < self.learner.steps:
+            report(self.learner.steps, self._validate(bar))
 
     def save(self) -> None:
         """Write a checkpoint, and with it what a validation left to be written."""

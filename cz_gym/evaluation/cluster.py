@@ -20,6 +20,7 @@ from threading import Thread
 from typing import Any
 
 import cz_gym
+from cz_gym.processors import processors
 
 from .user_code import PREFIX
 
@@ -167,7 +168,7 @@ def in_processes(
     function: Callable[[Any], Any], tasks: Sequence[Any], look: Look | None = None, processes: int | None = None
 ) -> Iterator[tuple[int, Any]]:
     """As :func:`completed`, in so many processes of this machine (None: one a processor), which end with the caller."""
-    processes = max(min(processes or os.cpu_count() or 1, len(tasks)), 1)
+    processes = max(min(processes or processors(), len(tasks)), 1)
     # Forking would copy the threads of torch and of the native batch in unknown states.
     with ProcessPoolExecutor(processes, get_context("spawn"), initializer=_end_with_caller) as pool:
         numbers = {pool.submit(function, task): number for number, task in enumerate(tasks)}

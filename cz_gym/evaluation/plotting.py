@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cz_gym.names import needs
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from .rollout import Rollout
@@ -19,10 +20,11 @@ def plot(run: Rollout, episode: int = 0, path: str | Path | None = None) -> Figu
     """Radius error, drives and temperature of one episode of a rollout; also written to ``path``, as PNG, if given.
 
     The error of the true radius, which no controller sees, stands before that of the bright ring. Needs matplotlib.
-    IndexError for an episode that is not there.
+    IndexError for an episode that is not there, ValueError for what is no rollout.
     """
     from .report.canvas import COLOURS, GREY, canvas, png
 
+    needs(Rollout, run, "cz_gym.evaluation.rollout.rollout(policy, config, seeds) makes one")
     if not -len(run.seeds) <= episode < len(run.seeds):
         raise IndexError(f"episode must be below {len(run.seeds)}, not {episode}")
     signals, config = run.episode(episode), run.config

@@ -95,7 +95,8 @@ def check_policy(policy: Any, config: Config) -> None:
     """ValueError unless a policy that can run in the environment of these settings."""
     check_config(config)
     if isinstance(policy, type) or not (hasattr(policy, "predict") or hasattr(policy, "for_episodes")):
-        raise ValueError(f"{policy!r:.80} is no policy: an object with {PREDICT} is needed")
+        named = f", as make_controller({policy!r}, config) makes one" if isinstance(policy, str) else ""
+        raise ValueError(f"{policy!r:.80} is no policy: an object with {PREDICT} is needed{named}")
     if hasattr(policy, "predict"):
         try:
             signature(policy.predict).bind(None, state=None, episode_start=None, deterministic=True)

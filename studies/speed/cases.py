@@ -19,11 +19,12 @@ from cz_gym.engine.batch import Batch
 from cz_gym.env import CzEnv
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.plant import NO_DISTURBANCE, Inputs, State, make_puller, rk4
+from cz_gym.processors import processors
 from cz_gym.vector import CzVectorEnv
 
 from .costs import KIB, available_memory
 
-THREADS = os.cpu_count() or 1
+THREADS = processors()
 """Threads that the larger cases may use."""
 SLOTS, SB3_SLOTS = 1024, 256
 """Slots of the batches that are compared, and of those behind stable-baselines3."""

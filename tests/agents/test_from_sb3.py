@@ -113,6 +113,37 @@ def test_a_model_without_its_normalisation_is_refused(kind: str, tmp_path: Path)
             from_sb3.save_agent(tmp_path / "mine.onnx", loaded, "mine", config=config)
 
 
+def test_a_model_loaded_into_an_environment_still_lacks_its_normalisation(tmp_path: Path) -> None:
+    model, plain = trained("ppo", normalised=True, observation="state"), trained("ppo", observation="state")
+    for each in (model, plain):
+        each.save(tmp_path / "model.zip")
+        loaded = PPO.load(tmp_path / "model.zip", env=plain.get_env(), device="cpu")
+        if each is plain:
+            from_sb3.save_agent(str(tmp_path / "mine.onnx"), loaded, "mine")
+        else:
+            with pytest.raises(AgentFileError, match="trained on normalised observations"):
+                from_sb3.save_agent(tmp_path / "mine.onnx", loaded, "mine")
+    unknown = PPO("MlpPolicy", plain.get_env(), device="cpu", **ON)
+    unknown.set_parameters(tmp_path / "model.zip")
+    with pytest.warns(UserWarning, match="does not know how it was trained: if on normalised"):
+        from_sb3.save_agent(tmp_path / "mine.onnx", unknown, "mine")
+
+
+@pytest.mark.parametrize(
+    ("path", "given", "said"),
+    [
+        ("mine", {}, "ends in .onnx"),
+        ("mine.onnx", {"model": "model.zip"}, "needs a BaseAlgorithm, not 'model.zip': stable_baselines3.PPO.load"),
+        ("mine.onnx", {"normalisation": "vec.pkl"}, "needs a VecNormalize, not 'vec.pkl'"),
+        ("mine.onnx", {"config": "hard"}, "needs a Config, not 'hard'"),
+    ],
+)
+def test_a_name_is_no_model(path: str, given: dict[str, Any], said: str) -> None:
+    model = PPO("MlpPolicy", "Cz-v0", device="cpu", n_steps=8, batch_size=8)
+    with pytest.raises(ValueError, match=said):
+        from_sb3.save_agent(path, **{"model": model, "name": "mine", **given})
+
+
 class Own(BaseFeaturesExtractor):
     """A layer of somebody's own before the policy's."""
 

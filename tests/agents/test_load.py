@@ -1,10 +1,15 @@
 """Shipped agents by name."""
 
+from typing import Any
+
+import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.error import InvalidAction
 
-from cz_gym import agents
+from cz_gym import CzVectorEnv, agents
 from cz_gym.agents.agent_file.contract import read_agent
+from cz_gym.config import make_config
 
 SHIPPED = {
     "gradient": 10,
@@ -53,3 +58,44 @@ def test_what_there_is_not_is_one_line(name: str, message: str) -> None:
     with pytest.raises(agents.AgentFileError, match=message) as caught:
         agents.load(name)
     assert "\n" not in str(caught.value)
+
+
+def test_a_name_is_no_file() -> None:
+    with pytest.raises(agents.AgentFileError, match=r"had by name: cz_gym\.agents\.load\('ppo'\)"):
+        agents.OnnxPolicy.load("ppo")
+    with pytest.raises(ValueError, match="needs a Config, not 'hard'"):
+        agents.OnnxPolicy.load(agents.shipped("ppo"), "hard")  # type: ignore[arg-type]
+
+
+OTHERS: list[dict[str, Any]] = [{"action": "rate"}, {"control_interval": 2.0}]
+
+
+@pytest.mark.parametrize("other", [*OTHERS, {"observation": "measured"}])
+def test_an_agent_refuses_a_config_that_it_is_not_made_for(other: dict[str, Any]) -> None:
+    settings = agents.load("ppo").settings
+    assert agents.load("ppo", make_config("hard", **settings)).settings == settings
+    ((name, value),) = other.items()
+    with pytest.raises(agents.AgentFileError, match=f"ppo is made for {name}=.*, this config has {value!r}"):
+        agents.load("ppo", make_config(**{**settings, **other}))
+
+
+@pytest.mark.parametrize("name", ["ppo", "ppo-recurrent"])
+def test_an_environment_refuses_an_agent_that_is_not_made_for_it(name: str) -> None:
+    agent = agents.load(name)
+    own = gym.make("Cz-v0", **agent.settings)
+    observation, _ = own.reset(seed=1)
+    action, _ = agent.predict(observation)
+    own.step(action)
+    for other in OTHERS:
+        env = gym.make("Cz-v0", **{**agent.settings, **other})
+        envs = CzVectorEnv(2, **{**agent.settings, **other})
+        observation, _ = env.reset(seed=1)
+        many, _ = envs.reset(seed=1)
+        with pytest.raises(InvalidAction, match=r"made for action='smooth', control_interval=5; the environment has"):
+            env.step(agent.predict(observation)[0])
+        with pytest.raises(InvalidAction, match="made for action='smooth'"):
+            envs.step(agent.predict(many)[0])
+        env.step(np.asarray(agent.predict(observation)[0]))
+        env.step(np.clip(2.0 * agent.predict(observation)[0], -1.0, 1.0).astype(np.float32))
+    with pytest.raises(ValueError, match=r"expected 72 channels \(history\), got shape \(11,\): gym.make"):
+        agent.predict(gym.make("Cz-v0").reset()[0])

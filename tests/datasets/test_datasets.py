@@ -1,6 +1,7 @@
 """Datasets: stock Minari reads them, each episode can be made again, and what is wrong is said in one line."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -176,3 +177,7 @@ def test_shipped_agents_are_found() -> None:
     source = find_source("gradient", CONFIG)
     assert (source.observation, source.action) == ("measured", "rate")
     assert isinstance(source.policy, agents.OnnxPolicy)
+    with pytest.raises(ValueError, match=r"ppo is made for control_interval=5.0, this config has 2.0"):
+        find_source("ppo", replace(CONFIG, control_interval=2.0))
+    with pytest.raises(ValueError, match="needs a Config, not 'hard'"):
+        find_source("paper", "hard")  # type: ignore[arg-type]

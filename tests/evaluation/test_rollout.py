@@ -12,7 +12,7 @@ import cz_gym
 from cz_gym import CzEnv, CzVectorEnv
 from cz_gym.agents import load
 from cz_gym.baselines import CompensatedPID, OpenLoop
-from cz_gym.baselines.registry import make_controller
+from cz_gym.baselines.registry import find_controller, make_controller
 from cz_gym.camera import Camera
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation import plot
@@ -162,7 +162,12 @@ class OnlyAnAction:
             SHORT,
             r"gives actions 'rate', the environment takes 'direct': make_config\(action='rate'\)",
         ),
-        (OpenLoop(), "randomized", r"needs a config, as make_config\('randomized'\) makes one"),
+        (
+            OpenLoop(),
+            "randomized",
+            r"needs a Config, not 'randomized': cz_gym.config.make_config\('randomized'\) makes one",
+        ),
+        ("paper", SHORT, r"as make_controller\('paper', config\) makes one"),
     ],
 )
 def test_silent_traps_speak(policy: Any, config: Any, message: str) -> None:
@@ -172,10 +177,16 @@ def test_silent_traps_speak(policy: Any, config: Any, message: str) -> None:
 
 @pytest.mark.parametrize(
     "make",
-    [CzEnv.from_config, CzVectorEnv.from_config, partial(make_controller, "paper"), partial(load, "ppo")],
+    [
+        CzEnv.from_config,
+        CzVectorEnv.from_config,
+        partial(make_controller, "paper"),
+        find_controller("lqg").make,
+        partial(load, "ppo"),
+    ],
 )
 def test_a_name_is_no_config(make: Any) -> None:
-    with pytest.raises(ValueError, match=r"needs a config, as make_config\('hard'\) makes one"):
+    with pytest.raises(ValueError, match=r"needs a Config, not 'hard': cz_gym.config.make_config\('hard'\) makes one"):
         make("hard")
 
 
@@ -197,6 +208,8 @@ def test_a_rollout_can_be_looked_at(tmp_path: Path) -> None:
     figure = plot(run, 1, tmp_path / "crystal.png")
     assert (tmp_path / "crystal.png").read_bytes().startswith(b"\x89PNG")
     assert figure.axes[0].get_ylabel() == "radius error [mm]"
+    with pytest.raises(ValueError, match=r"needs a Rollout, not 'paper': .*rollout\(policy, config, seeds\) makes one"):
+        plot("paper")  # type: ignore[arg-type]
     with pytest.raises(IndexError, match="below 2"):
         plot(run, 2)
 

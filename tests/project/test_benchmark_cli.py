@@ -182,6 +182,8 @@ def test_agent_files_that_cannot_be_used_get_one_line(tmp_path: Path, refusal: A
     assert "broken.onnx" in refusal(["--agent", str(broken)])
     strange = constant_agent(tmp_path / "strange.onnx", plant_hash="0" * 16)
     assert "trained on plant 0000000000000000" in refusal(["--agent", str(strange)])
+    for given in ("ppo", "mine=ppo"):
+        assert "ppo is shipped and runs by its name: --controllers ppo" in refusal(["--agent", given])
     fast = str(constant_agent(tmp_path / "fast.onnx"))
     slow = constant_agent(tmp_path / "slow.onnx", control_interval=10.0)
     assert "trained at 10 s control, randomized runs at 5 s" in refusal(["--agent", str(slow)])

@@ -1,0 +1,14 @@
+"""How many processors there are to work with."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+
+def processors() -> int:
+    """Processors that this process may use, which taskset or a cluster may have made fewer than the machine has."""
+    counts: Any = os  # Python 3.13 has the one, Linux the other
+    if hasattr(counts, "process_cpu_count"):
+        return counts.process_cpu_count() or 1
+    return len(counts.sched_getaffinity(0)) if hasattr(counts, "sched_getaffinity") else os.cpu_count() or 1
