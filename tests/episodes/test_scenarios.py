@@ -47,19 +47,6 @@ def test_contents_are_frozen() -> None:
         SCENARIOS["nominal"].recipe = Recipe()  # type: ignore[misc]
 
 
-def test_deterministic_scenarios() -> None:
-    certain = [name for name, scenario in SCENARIOS.items() if scenario.deterministic]
-    assert certain == ["nominal", "paper-ramp", "reference-a", "reference-b"]
-
-
-@pytest.mark.parametrize("family", ["recipe", "drift", "interface", "sensor", "reference", "parameters"])
-def test_one_family_alone(family: str) -> None:
-    only, field = SCENARIOS[f"only-{family}"], "pullers" if family == "parameters" else family
-    assert getattr(only, field) == getattr(SCENARIOS["randomized"], field)
-    rest = dataclasses.replace(only, name="nominal", **{field: getattr(SCENARIOS["nominal"], field)})
-    assert rest == SCENARIOS["nominal"]
-
-
 @given(st.sampled_from(MEMBERS))
 def test_every_number_counts_in_the_hash(where: tuple[str, str]) -> None:
     family, member = where

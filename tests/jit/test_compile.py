@@ -67,15 +67,14 @@ def test_changed_physics_is_never_run_from_an_old_cache(package: Path, tmp_path:
 
 @pytest.mark.slow
 def test_damaged_code_is_compiled_again(tmp_path: Path) -> None:
-    """Cut short, changed in one bit, and of another function under the right name."""
+    """Changed in one bit; cut short and overwritten: ``tests/stress/test_fuzz.py``."""
     cache = tmp_path / "cache"
     folder, height, _ = run(DERIVE, ROOT, cache)
     (file,) = Path(folder).rglob("*derive*.code")
     whole = file.read_bytes()
-    for damaged in (whole[: len(whole) // 2], whole[:-1] + bytes([whole[-1] ^ 1]), b""):
-        file.write_bytes(damaged)
-        assert run(DERIVE, ROOT, cache) == [folder, height, "0"]
-        assert run(DERIVE, ROOT, cache) == [folder, height, "1"]
+    file.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    assert run(DERIVE, ROOT, cache) == [folder, height, "0"]
+    assert run(DERIVE, ROOT, cache) == [folder, height, "1"]
     assert not list(Path(folder).rglob(".code-*"))
 
 
