@@ -140,6 +140,16 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[[Callable[[list[str]
     return run
 
 
+@pytest.fixture
+def few_crystals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Training runs of this process pick and judge on two crystals each."""
+    from cz_gym.agents.training import run
+    from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+
+    monkeypatch.setattr(run, "PICKING", VALIDATION_SEEDS[:2])
+    monkeypatch.setattr(run, "JUDGING", VALIDATION_SEEDS[2:4])
+
+
 @pytest.fixture(scope="session")
 def ppo() -> Any:
     """A learner that has learned a little, for tests that leave it as it is."""

@@ -68,10 +68,6 @@ def last_bias(model: Any, value: Any) -> None:
     weight.CopyFrom(onnx.numpy_helper.from_array(value, weight.name))
 
 
-def nan_bias(model: Any) -> None:
-    last_bias(model, np.full(2, np.nan, np.float32))
-
-
 def infinity_less_infinity(model: Any) -> None:
     last_bias(model, np.full(2, 3e38, np.float32))
     model.graph.node[-2].attribute.append(onnx.helper.make_attribute("beta", 2.0))
@@ -79,16 +75,12 @@ def infinity_less_infinity(model: Any) -> None:
     clip.CopyFrom(onnx.helper.make_node("Sub", [clip.input[0], clip.input[0]], [clip.output[0]]))
 
 
-def drives_that_are_not_there(model: Any) -> None:
-    last_bias(model, np.zeros(900, np.float32))
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (nan_bias, "not finite"),
+        (lambda model: last_bias(model, np.full(2, np.nan, np.float32)), "not finite"),
         (infinity_less_infinity, "not two finite numbers"),
-        (drives_that_are_not_there, "cannot be run"),
+        (lambda model: last_bias(model, np.zeros(900, np.float32)), "cannot be run"),
     ],
 )
 def test_networks_that_give_no_action_are_refused(change: Any, message: str, agent: Path) -> None:
@@ -99,9 +91,7 @@ def test_networks_that_give_no_action_are_refused(change: Any, message: str, age
         OnnxPolicy.load(agent)
 
 
-def test_missing_and_oversized_files_are_refused(agent: Path, tmp_path: Path) -> None:
-    with pytest.raises(AgentFileError, match="no such file"):
-        OnnxPolicy.load(tmp_path / "nobody.onnx")
+def test_an_oversized_file_is_refused(agent: Path) -> None:
     agent.write_bytes(b"0" * (MAX_BYTES + 1))
     with pytest.raises(AgentFileError, match="larger than"):
         OnnxPolicy.load(agent)
