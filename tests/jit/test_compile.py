@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from cz_gym.jit.cache import Store, announce, cache_folder, hashed, source_hash
+from cz_gym.jit.cache import Store, announce, cache_folder, source_hash
 from cz_gym.jit.compile import kernel
-from cz_gym.physics.meniscus import hurle_slope
 
 ROOT = Path(__file__).parents[2]
 DERIVE = """
@@ -189,12 +188,6 @@ def test_hash_sees_names_and_contents(package: Path) -> None:
     (folder / "evaluation" / "report" / "markdown.py").write_text("nothing of it is compiled")
     assert len({first, second, third, fourth}) == 4
     assert source_hash(folder) == fourth
-
-
-def test_only_functions_of_the_package_are_hashed() -> None:
-    assert hashed(hurle_slope)
-    assert not hashed(hurle_slope, lambda r_c, h_c, p: (0.0, 1.0))
-    assert not hashed(abs)
 
 
 @pytest.mark.parametrize("terminal", [True, False])

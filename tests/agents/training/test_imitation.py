@@ -166,6 +166,20 @@ def test_each_round_shows_as_many_wide_crystals_as_asked(
     assert not {seed for _, seeds, _ in met for seed in seeds} & set(every)
 
 
+def test_an_interrupted_imitation_begins_again_and_ends_as_one_that_was_not() -> None:
+    def interrupt(steps: int, doing: str) -> None:
+        if doing.startswith("round 2"):
+            raise KeyboardInterrupt
+
+    whole, stopped = imitator(), imitator()
+    whole.learn(lambda steps, doing: None)
+    with pytest.raises(KeyboardInterrupt):
+        stopped.learn(interrupt)
+    assert stopped.steps == 0
+    stopped.learn(lambda steps, doing: None)
+    assert stopped.exported() == whole.exported()
+
+
 def test_it_is_judged_by_the_cost_that_its_teacher_s_regulator_was_made_for() -> None:
     recipe = RECIPES["imitation"]
     assert isinstance(recipe, Imitation)
