@@ -19,7 +19,7 @@ os.environ["SDL_VIDEODRIVER"] = os.environ["SDL_AUDIODRIVER"] = "dummy"  # no te
 os.environ.setdefault("CZ_GYM_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "cz-gym"))
 
 settings.register_profile("repeatable", deadline=None, derandomize=True, database=None, max_examples=40)
-settings.register_profile("long", deadline=None, max_examples=20_000)
+settings.register_profile("long", deadline=None, database=None, max_examples=20_000)
 settings.load_profile("repeatable")
 
 HOUR = 3600.0

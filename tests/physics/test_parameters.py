@@ -27,11 +27,6 @@ def test_what_is_not_a_number_is_refused_by_name(name: str, value: object) -> No
     assert "\n" not in str(refusal.value)
 
 
-def test_only_parameters_are_parameters() -> None:
-    with pytest.raises(ValueError, match=r"cz_gym\.Parameters"):
-        check_parameters({"r_0": 0.1})  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize(
     ("given", "message"),
     [
