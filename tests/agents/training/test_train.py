@@ -9,8 +9,8 @@ import pytest
 
 import train
 from cz_gym.agents import OnnxPolicy
-from cz_gym.agents.training import imitation, run, run_files
-from cz_gym.agents.training.recipes import PPO, RECIPES, Gradient, Imitation
+from cz_gym.agents.training import run, run_files
+from cz_gym.agents.training.recipes import PPO, RECIPES, Gradient
 
 ROOT = Path(__file__).parents[3]
 
@@ -19,8 +19,6 @@ ROOT = Path(__file__).parents[3]
 def quick(monkeypatch: pytest.MonkeyPatch, few_crystals: None) -> None:
     monkeypatch.setitem(RECIPES, "ppo", PPO(num_envs=64, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,)))
     monkeypatch.setitem(RECIPES, "gradient", Gradient(num_envs=16, window=12, steps=10_000, hidden=()))
-    few = {"rounds": 2, "episodes": 4, "wide_share": 0.0, "epochs": 1, "hidden": (16,), "control_interval": 30.0}
-    monkeypatch.setitem(RECIPES, "imitation", Imitation(name="imitation", teacher="lqg", **few))
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -88,34 +86,6 @@ def test_an_interrupted_run_keeps_its_checkpoint(
     assert train.main(["--steps", "10000", "--out", str(folder)]) == 130
     assert (folder / "checkpoint.safetensors").exists()
     assert f"saved, python train.py --resume --out {folder} goes on" in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("quick")
-def test_a_killed_imitation_ends_as_one_that_was_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fit, calls = imitation.fit, []
-
-    def die_in_round_2(*arguments: Any) -> float:
-        calls.append(1)
-        if len(calls) == 2:
-            raise ValueError("killed")
-        return fit(*arguments)
-
-    whole, killed = (["--algo", "imitation", "--out", str(tmp_path / name)] for name in ("whole", "killed"))
-    assert train.main(whole) == 0
-    with monkeypatch.context() as patch:
-        patch.setattr(imitation, "fit", die_in_round_2)
-        assert train.main([*killed, "--checkpoint-seconds", "0"]) == 2
-    assert train.main([*killed, "--resume"]) == 0
-    one, other = ((tmp_path / name / "agent.onnx").read_bytes() for name in ("whole", "killed"))
-    assert one == other
-    before = rows(tmp_path / "whole" / "progress.csv")
-    monkeypatch.setattr(imitation, "fit", die_in_round_2)
-    assert train.main([*whole, "--resume"]) == 0, "nothing was left to learn"
-    assert rows(tmp_path / "whole" / "progress.csv")[:1] == before
-    sessions = json.loads((tmp_path / "killed" / "settings.json").read_text())["sessions"]
-    assert len(sessions) == 2
-    contract = OnnxPolicy.load(tmp_path / "whole" / "agent.onnx").contract
-    assert (contract.algorithm, contract.training_steps) == ("imitation", 0)
 
 
 def test_interrupting_before_learning_gives_one_line(
