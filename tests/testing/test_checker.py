@@ -43,12 +43,14 @@ class Conforming(SyncVectorEnv):
         super().__init__([Walk] * num_envs, autoreset_mode=mode, copy=True)
 
 
-def made(change: Callable[[Any], Any]) -> type[Conforming]:
-    """A vector that is changed once it is made."""
+def made(
+    change: Callable[[Any], Any] = lambda env: None, fewer: int = 0, always: AutoresetMode | None = None
+) -> type[Conforming]:
+    """A vector of fewer slots, of one mode whatever is asked for, or changed once it is made."""
 
     class Made(Conforming):
         def __init__(self, num_envs: int, mode: AutoresetMode) -> None:
-            super().__init__(num_envs, mode)
+            super().__init__(num_envs - fewer, always or mode)
             change(self)
 
     return Made
@@ -157,10 +159,6 @@ class WritesActions(Conforming):
 REWARD = stepping(lambda observation, reward, *rest: (observation, reward * [1.0, 1.0 + 1e-12, 1.0], *rest))
 TIMEOUT = stepping(lambda o, r, terminated, truncated, i: (o, r, terminated | truncated, np.zeros_like(truncated), i))
 """The time limit is returned as a failure, as in pc-gym."""
-ALWAYS_NEXT_STEP = type(
-    "Mode", (Conforming,), {"__init__": lambda self, n, mode: Conforming.__init__(self, n, MODES[0])}
-)
-FEWER = type("Fewer", (Conforming,), {"__init__": lambda self, n, mode: Conforming.__init__(self, n - 1, mode)})
 NEXT, SAME, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
 BROKEN: dict[str, tuple[type[Conforming], str, AutoresetMode]] = {
     "space": (made(lambda env: setattr(env, "single_action_space", Box(-2, 2, (1,)))), "single_action_space is", NEXT),
@@ -169,8 +167,8 @@ BROKEN: dict[str, tuple[type[Conforming], str, AutoresetMode]] = {
         "action_space is .* the batch of 3 is",
         NEXT,
     ),
-    "mode": (ALWAYS_NEXT_STEP, r"metadata\['autoreset_mode'\] is", SAME),
-    "fewer": (FEWER, "num_envs is 2, asked for 3", NEXT),
+    "mode": (made(always=NEXT), r"metadata\['autoreset_mode'\] is", SAME),
+    "fewer": (made(fewer=1), "num_envs is 2, asked for 3", NEXT),
     "seedless": (
         resetting(lambda seed, options: {"seed": None}),
         "seed 0 gives another first observation in a second environment",
