@@ -116,12 +116,6 @@ def test_progress_counts_every_step_once() -> None:
     assert sum(counted) == run.alive.size == 3 * SHORT.steps
 
 
-def test_compute_is_time_in_predict_per_step_and_episode() -> None:
-    run = rollout(OpenLoop(), SHORT, range(3))
-    assert run.seconds_in_policy > 0
-    assert run.microseconds_per_step == pytest.approx(1e6 * run.seconds_in_policy / (3 * SHORT.steps))
-
-
 OF_ONE = SimpleNamespace(predict=lambda observation, **rest: (np.zeros(2, np.float32), None))
 WITHOUT_STATE = SimpleNamespace(predict=lambda observation: (np.zeros((len(observation), 2), np.float32), None))
 WITHOUT_TUPLE = SimpleNamespace(predict=lambda observation, **rest: np.zeros((len(observation), 2), np.float32))

@@ -32,14 +32,28 @@ from tests.small_learners import SMALL_SAC, trained
 SPARE = 1_000_000_000
 """Memory beyond what is used already [bytes]."""
 ODD = st.sampled_from(
-    (b"", b"\0", b"\xff" * 8, b"\x80\x04.", b"../../../etc/passwd", b"NaN", b"1e999", b"-1", b"[" * 200, b'{"a":' * 50)
+    (
+        b"",
+        b"\0",
+        b"\xff" * 8,
+        b"\x80\x04.",
+        b"../../../etc/passwd",
+        b"NaN",
+        b"1e999",
+        b"-1",
+        b"x",
+        b"[" * 200,
+        b'{"a":' * 50,
+    )
 )
 VALUES = st.one_of(
     st.none(), st.booleans(), st.integers(), st.floats(), st.text(), st.lists(st.integers(), max_size=2),
     st.sampled_from((2**63 - 1, 10**400, "a\nb", "\x1b[31m", "x" * 200, "../x", "history", {}, [[]], "F64")),
 )  # fmt: skip
 EDITS = st.lists(
-    st.tuples(st.floats(0.0, 1.0), st.integers(0, 63), st.binary(max_size=64) | ODD, st.integers(0, 8)), max_size=5
+    st.tuples(st.floats(0.0, 1.0), st.none() | st.integers(0, 63), ODD | st.binary(max_size=64), st.integers(0, 8)),
+    min_size=1,
+    max_size=5,
 )
 
 
@@ -111,7 +125,10 @@ def odd_bytes(draw: Any, seed: bytes) -> bytes:
     content = bytearray(seed)
     for where, size, new, times in draw(EDITS):
         at = int(len(content) * where**2)
-        content[at : at + size] = new + content[at : at + size] * times
+        if size is None:
+            content[at : at + len(new)] = new
+        else:
+            content[at : at + size] = new + content[at : at + size] * times
     return bytes(content[: draw(st.none() | st.integers(0, len(content)))])
 
 
@@ -130,9 +147,10 @@ def odd_json(draw: Any, seed: bytes) -> bytes:
 
 @st.composite
 def odd_header(draw: Any, seed: bytes) -> bytes:
-    """A checkpoint whose list of tensors says something else than it holds."""
+    """A checkpoint whose list of tensors says something else than it holds, or names another."""
     size = int.from_bytes(seed[:8], "little")
-    text = draw(odd_json(seed[8 : 8 + size]))
+    text = seed[8 : 8 + size]
+    text = draw(st.just(text.replace(b"weight", b"height", 1)) | odd_json(text))
     said: int = draw(st.sampled_from((len(text), size, 2**62)))
     return said.to_bytes(8, "little") + text + seed[8 + size :]
 
