@@ -19,6 +19,7 @@ os.environ["SDL_VIDEODRIVER"] = os.environ["SDL_AUDIODRIVER"] = "dummy"  # no te
 os.environ.setdefault("CZ_GYM_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "cz-gym"))
 
 settings.register_profile("repeatable", deadline=None, derandomize=True, database=None, max_examples=40)
+settings.register_profile("long", deadline=None, database=None, max_examples=20_000)
 settings.load_profile("repeatable")
 
 HOUR = 3600.0
@@ -137,6 +138,16 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[[Callable[[list[str]
         return said.err
 
     return run
+
+
+@pytest.fixture
+def few_crystals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Training runs of this process pick and judge on two crystals each."""
+    from cz_gym.agents.training import run
+    from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+
+    monkeypatch.setattr(run, "PICKING", VALIDATION_SEEDS[:2])
+    monkeypatch.setattr(run, "JUDGING", VALIDATION_SEEDS[2:4])
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""What every controller on "measured" observations has in common: batches, episodes that begin, memories, shapes."""
+"""What every controller on "measured" observations has in common: batches, memories, shapes, control intervals."""
 
 from dataclasses import replace
 
@@ -8,9 +8,12 @@ import pytest
 from cz_gym.baselines.policy import Policy, map_arrays
 from cz_gym.baselines.registry import CONTROLLERS, find_controller, make_controller
 from cz_gym.config import make_config
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.rollout import rollout
 from tests.observed import observations
 
 CASES = [(entry.name, "randomized") for entry in CONTROLLERS if entry.observation == "measured" and not entry.slow]
+TUNED = ("pid-conventional", "paper-filtered", "paper-tuned", "industrial", "lqg")
 CASES += [("paper-tuned", "puller"), ("lqg", "puller"), ("ekf-mpc", "puller")]
 
 
@@ -62,5 +65,16 @@ def test_interval_and_pull_speed_are_the_environments(name):
         replace(policy, control_interval=0)
 
 
-def test_the_slow_one_has_an_interval_too():
-    assert make("ekf-mpc", "randomized").control_interval == 5.0
+@pytest.mark.parametrize("name", TUNED)
+@pytest.mark.parametrize("dt", [2.0, 10.0])
+def test_every_control_interval_holds_the_radius_alike(name, dt):
+    usual, other = (make_config("randomized", control_interval=each, horizon=5400.0) for each in (5.0, dt))
+    found = [metrics(rollout(make_controller(name, config), config, range(8))) for config in (usual, other)]
+    assert not np.any([m.failure_rate for m in found])
+    assert found[1].rmse_mm.mean() == pytest.approx(found[0].rmse_mm.mean(), rel=0.25)
+
+
+@pytest.mark.parametrize("name", TUNED)
+def test_without_disturbance_it_stays_where_it_is(name):
+    config = make_config("nominal", control_interval=2.0, horizon=3600.0)
+    assert metrics(rollout(make_controller(name, config), config, [0])).max_error_mm[0] < 1e-3

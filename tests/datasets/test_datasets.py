@@ -15,6 +15,7 @@ from cz_gym.baselines import CompensatedPID
 from cz_gym.config import make_config
 from cz_gym.datasets import Source, excitation, find_source, main, record, write
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
+from cz_gym.evaluation.replay import Playback
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.observation import to_measured
 
@@ -58,12 +59,7 @@ def test_an_episode_can_be_made_again_from_its_seed_and_actions(place: Path, mon
 
 def test_a_lost_crystal_ends_its_episode(place: Path) -> None:
     """A policy that pulls at full speed loses each crystal."""
-
-    class Fast:
-        def predict(self, observation: Any, **_: Any) -> Any:
-            return np.tile(np.float32([1.0, 0.0]), (len(observation), 1)), None
-
-    dataset = write("fast", Source(Fast()), seeds=TRAINING_SEEDS[:2], horizon=3600.0)
+    dataset = write("fast", Source(Playback([[1.0, 0.0]])), seeds=TRAINING_SEEDS[:2], horizon=3600.0)
     for episode, kept in enumerate(dataset.iterate_episodes()):
         assert kept.terminations.tolist() == [False] * (len(kept) - 1) + [True]
         assert not kept.truncations.any()

@@ -13,21 +13,12 @@ from cz_gym.episodes.draw import randomised
 from cz_gym.episodes.record import Factors
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.plant import Disturbance, Inputs, State, rk4
-from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
-from tests.stress.__main__ import INTERVALS, MODELS, OBSERVATIONS, WIDE, campaign, cases, run_case
+from cz_gym.task import HEIGHT_MIN
+from tests.stress.__main__ import WIDE, campaign, cases, run_case
 from tests.stress.adversaries import KINDS, Adversaries
 from tests.stress.checks import Broken, Watch
 
 MM = 1e-3
-
-
-def test_the_campaign_meets_everything() -> None:
-    configs = cases()
-    assert {config.control_interval for config in configs} == set(INTERVALS)
-    assert (min(INTERVALS), max(INTERVALS)) == (0.5, 60.0)
-    assert {config.model for config in configs} == set(MODELS)
-    assert {config.observation for config in configs} == set(OBSERVATIONS)
-    assert len(configs) == 15 * len(INTERVALS)
 
 
 def test_a_short_campaign() -> None:
@@ -54,6 +45,7 @@ def test_a_short_campaign() -> None:
         ("v_p", 1.0, "the pull speed leaves its range"),
         ("Q_H", -1.0, "the heater cools"),
         ("action_clipped", True, "info 'action_clipped' is wrong"),
+        ("T_1", 2000.0, "heat appears or disappears"),
     ],
 )
 def test_what_is_wrong_is_found(where: str, value: Any, says: str) -> None:
@@ -64,21 +56,10 @@ def test_what_is_wrong_is_found(where: str, value: Any, says: str) -> None:
     actions = np.zeros((2, 2))
     *result, infos = env.step(actions)
     names = ("observation", "reward", "terminated", "truncated")
-    target = result[names.index(where)] if where in names else infos[where]
-    target[1] = value
+    known = dict(zip(names, result, strict=True)) | {**infos, "T_1": env._batch.memory.slots["x"]["T_1"]}
+    known[where][1] = value
     with pytest.raises(Broken, match=f"step 1, slot 1: {says}"):
         watch.after(actions, *result, infos)
-
-
-def test_heat_that_appears_is_found() -> None:
-    env = CzVectorEnv(2, "nominal", threads=1, info="all")
-    watch = Watch(env)
-    watch.begin(*env.reset(seed=0))
-    watch.before()
-    result = env.step(np.zeros((2, 2)))
-    env._batch.memory.slots["x"]["T_1"][0] += 0.1
-    with pytest.raises(Broken, match="heat appears or disappears"):
-        watch.after(np.zeros((2, 2)), *result)
 
 
 def test_a_heater_never_cools() -> None:
@@ -93,44 +74,22 @@ def test_a_heater_never_cools() -> None:
         assert min(powers) == 0.0
 
 
-def test_crashing_at_the_end_earns_less_than_any_way_on() -> None:
-    """In the last step, at the edge of detachment: crash gently, or save the crystal by a violent pull."""
-    env = CzEnv("nominal", model="II", horizon=50.0, info="all")
-    env.reset(seed=0)
-    for _ in range(9):
-        env.step(np.zeros(2, np.float32))
-    state = env.get_state()
-    state.slot.slot["x"]["h_c"] = HEIGHT_MAX_IN_A * make_puller().a - 1e-6
-    earned = {}
-    for pull in (0.05, -1.0):
-        env.set_state(state)
-        _, gained, terminated, truncated, _ = env.step(np.array([pull, 0.0], np.float32))
-        earned[terminated] = gained
-        assert terminated != truncated
-    assert earned[True] < earned[False]
-
-
 def _visited(n: int) -> list[tuple[State, Inputs, Disturbance, Any]]:
     """States and drives that adversaries reach on wide pullers, the last before failures among them."""
     env = CzVectorEnv(2 * len(KINDS), WIDE, horizon=3600.0, threads=1, info="all")
     slots, adversaries = env._batch.memory.slots, Adversaries(2 * len(KINDS), 5)
     _, infos = env.reset(seed=11)
-    found = []
-    for _ in range(400):
+    found: list[Any] = []
+    for step in range(400):
         old = slots.copy()
         *_, terminated, _, infos = env.step(adversaries.actions(infos, slots["puller"]["h_0"]))
         for i in range(env.num_envs):
-            if terminated[i] or len(found) % 7 == 0:
-                p, x = (
-                    make_puller()._replace(**{f: float(old["puller"][f][i]) for f in make_puller()._fields}),
-                    old["x"][i],
-                )
+            if terminated[i] or (step + i) % 7 == 0:
+                p = make_puller()._replace(**{f: float(old["puller"][f][i]) for f in make_puller()._fields})
                 d = Disturbance(float(slots["Q_d"][i]), float(slots["dT_i"][i]), 1.0)
-                found.append((State(*map(float, x)), Inputs(float(slots["v_p"][i]), float(slots["Q_H"][i])), d, p))
-            else:
-                found.append(found[-1])
-    distinct = list({id(part): part for part in found}.values())
-    return distinct[:: max(1, len(distinct) // n)]
+                u = Inputs(float(slots["v_p"][i]), float(slots["Q_H"][i]))
+                found.append((State(*map(float, old["x"][i])), u, d, p))
+    return found[:: max(1, len(found) // n)]
 
 
 def _error(x: State, u: Inputs, d: Disturbance, p: Any, dt: float) -> float:

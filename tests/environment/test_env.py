@@ -48,6 +48,9 @@ def test_everything_advertised_is_there() -> None:
         ({"model": 1.5}, "not 1.5"),
         ({"model": "III"}, "not 'III'"),
         ({"model": math.nan}, "not nan"),
+        ({"model": -0.1}, "not -0.1"),
+        ({"model": True}, '"I", "II", a mix in .* not True'),
+        ({"model": [1]}, "not \\[1\\]"),
         ({"observation": "all"}, "unknown observation 'all'; choose from measured, history, state"),
         ({"control_interval": 0}, "control_interval must be a positive number"),
         ({"control_interval": -5.0}, "not -5.0"),
@@ -61,6 +64,8 @@ def test_everything_advertised_is_there() -> None:
         ({"parameters": Parameters(k_l=math.nan)}, "parameter k_l = nan"),
         ({"meniscus": "hurle"}, r"cz_gym\.MeniscusModel"),
         ({"control_interval": True}, "not True"),
+        ({"action": "rough"}, "unknown action 'rough'; choose from direct, smooth, rate"),
+        ({"info": "everything"}, "info must be one of lean, all, not 'everything'"),
         ({"parameters": Parameters(alpha_0=1.5)}, "nominal meniscus height .* check r_0, alpha_0"),
         ({"parameters": Parameters(r_0=1e-4)}, "nominal meniscus height .* check r_0, alpha_0"),
         (
@@ -103,11 +108,18 @@ def test_a_drawn_puller_without_operating_point_is_drawn_again() -> None:
         assert np.isfinite(one.get_state().slot.slot["puller"].item()).all()
 
 
-@pytest.mark.parametrize("action", [[math.nan, 0.0], [0.0], [0.0, 0.0, 0.0], [[0.0, 0.0]], 0.0, "up", None, ["a", "b"]])
-def test_bad_actions_are_refused(action: Any) -> None:
-    env = CzEnv(info="all")
+@pytest.mark.parametrize(
+    "action",
+    [[math.nan, 0.0], [0.0], [0.0, 0.0, 0.0], [[0.0, 0.0]], 0.0, "up", None, ["a", "b"], np.zeros((2, 3)),
+     np.full((2, 2), math.nan), [[0.0, 0.0], [0.0]]],
+)  # fmt: skip
+@pytest.mark.parametrize("make", [CzEnv, lambda: CzVectorEnv(2)])
+def test_bad_actions_are_refused(make: Any, action: Any) -> None:
+    env = make()
+    with pytest.raises(ResetNeeded):
+        env.step(np.zeros((2, 2)))
     env.reset(seed=0)
-    with pytest.raises(InvalidAction, match="action must") as refusal:
+    with pytest.raises(InvalidAction, match=r"actions? must") as refusal:
         env.step(action)
     assert "\n" not in str(refusal.value)
 
@@ -124,6 +136,8 @@ def test_equal_plants_have_equal_hashes() -> None:
     zero, minus_zero = (make_config(parameters=Parameters(T_e=T_e)) for T_e in (0.0, -0.0))
     assert zero.plant_hash == minus_zero.plant_hash == Config(parameters=Parameters(T_e=0)).plant_hash
     assert Config(parameters=Parameters(T_m=1685)).plant_hash == make_config().plant_hash
+    assert make_config(action="smooth").plant_hash == make_config().plant_hash
+    assert make_config(action="smooth").hash != make_config().hash
     assert make_config("nominal", -0.0).hash == make_config("nominal", 0).hash
 
 
@@ -159,10 +173,8 @@ def test_actions_are_pull_speed_and_power() -> None:
         assert info["Q_H"] - p.Q_H_0 == pytest.approx(10e3 * heat)
 
 
-def test_stepping_needs_a_reset() -> None:
+def test_an_episode_that_is_over_needs_a_reset() -> None:
     env = CzEnv("nominal", horizon=10.0, info="all")
-    with pytest.raises(ResetNeeded):
-        env.step(ZERO)
     env.reset(seed=0)
     assert env.step(ZERO)[2:4] == (False, False)
     assert env.step(ZERO)[2:4] == (False, True)

@@ -1,4 +1,5 @@
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,20 +45,24 @@ def test_dying_never_pays(step: int) -> None:
     assert failure_penalty(step, steps) == -10.0 * (steps - step + 1)
 
 
+def fly(model: str, pull: float, horizon: float = 10800.0) -> tuple[list[float], bool, bool, dict[str, Any]]:
+    """Rewards under one pull action until the episode ends, and what its last step says."""
+    env, rewards = CzEnv("nominal", model=model, horizon=horizon, info="all"), []
+    env.reset(seed=0)
+    while True:
+        _, gained, terminated, truncated, info = env.step(np.array([pull, 0.0], np.float32))
+        rewards.append(gained)
+        if terminated or truncated:
+            return rewards, terminated, truncated, info
+
+
 @pytest.mark.parametrize(
     ("model", "pull", "what"), [("I", 1.0, "detachment"), ("II", 1.0, "detachment"), ("II", -1.0, "freezing")]
 )
 def test_failure_is_terminated_never_truncated(model: str, pull: float, what: str) -> None:
-    env = CzEnv("nominal", model=model, info="all")
-    env.reset(seed=0)
-    returns, k = 0.0, 0
-    while True:
-        _, gained, terminated, truncated, info = env.step(np.array([pull, 0.0], np.float32))
-        returns, k = returns + gained, k + 1
-        if terminated or truncated:
-            break
-    assert terminated
-    assert not truncated
+    rewards, terminated, truncated, info = fly(model, pull)
+    k, gained, returns = len(rewards), rewards[-1], sum(rewards)
+    assert (terminated, truncated) == (True, False)
     assert k < 2160
     beyond = info["h_c"] > 1.24 * P.a if what == "detachment" else info["h_c"] < 1.2 * MM
     assert beyond or abs(info["r_c"] - info["r_ref"]) > 8 * MM
@@ -94,17 +99,7 @@ def test_failure_inside_a_long_interval_is_latched() -> None:
 
 def test_failing_at_the_horizon_is_a_failure() -> None:
     """The same flight with the horizon at its end: terminated, not truncated, and no step left to pay for."""
-
-    def fly(horizon: float) -> tuple[int, float, bool, bool]:
-        env, k = CzEnv("nominal", model="II", horizon=horizon, info="all"), 0
-        env.reset(seed=0)
-        while True:
-            _, gained, terminated, truncated, _ = env.step(np.array([1.0, 0.0], np.float32))
-            k += 1
-            if terminated or truncated:
-                return k, gained, terminated, truncated
-
-    steps, paid, *_ = fly(10800.0)
-    last, gained, terminated, truncated = fly(5.0 * steps)
-    assert (last, terminated, truncated) == (steps, True, False)
-    assert gained == pytest.approx(paid + 10 * (2160 - steps))
+    paid, *_ = fly("II", 1.0)
+    rewards, terminated, truncated, _ = fly("II", 1.0, 5.0 * len(paid))
+    assert (len(rewards), terminated, truncated) == (len(paid), True, False)
+    assert rewards[-1] == pytest.approx(paid[-1] + 10 * (2160 - len(paid)))

@@ -7,6 +7,7 @@ import numpy as np
 from PIL import Image
 
 import benchmark
+from cz_gym.baselines import OpenLoop
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.protocol import find_row
@@ -16,13 +17,6 @@ from cz_gym.evaluation.report.figures import NAMED, draw_figures
 from cz_gym.evaluation.report.markdown import QUOTED
 from cz_gym.evaluation.results import Benchmark, Controller, Sample, summarise
 from cz_gym.evaluation.rollout import rollout
-
-
-class Still:
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> Any:
-        return np.zeros((len(observation), 2), np.float32), state
 
 
 def sample(
@@ -76,7 +70,7 @@ def test_figures_of_a_crystal_that_nothing_disturbs_and_of_a_name_that_seems_a_f
     results = []
     for name in ("nominal", "randomized"):
         row = find_row(name)
-        run = rollout(Still(), make_config(name, horizon=600.0), row.seeds(2))
+        run = rollout(OpenLoop(), make_config(name, horizon=600.0), row.seeds(2))
         names = ["a $\\frac$ b", *(f"c{i}" for i in range(COLUMNS))]
         results.append(summarise(row, [Sample.of(Controller(name, "measured", "", (1,)), [run]) for name in names]))
     figures = draw_figures(Benchmark(tuple(results), "", ()))

@@ -1,14 +1,9 @@
-import hashlib
-import pickle
-import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from cz_gym import CzEnv, CzVectorEnv
+from cz_gym import CzVectorEnv
 from cz_gym.agents import load
 from cz_gym.baselines import CompensatedPID
 from cz_gym.config import make_config
@@ -85,37 +80,3 @@ def test_policies_of_another_environment_are_refused() -> None:
 def test_bad_logs_are_refused(log: Any) -> None:
     with pytest.raises(ValueError, match="logged actions must be of shape"):
         Playback(log)
-
-
-CONTINUE = """
-import pickle, sys
-sys.path.insert(1, sys.argv[2])
-from test_replay import go_on
-from cz_gym import CzEnv
-env = CzEnv("puller", observation="history", horizon=300.0)
-env.set_state(pickle.load(open(sys.argv[1], "rb")))
-print(go_on(env))
-"""
-
-
-def go_on(env: CzEnv) -> str:
-    """Digest of 120 steps, through the ends of episodes."""
-    digest, random = hashlib.sha256(), np.random.default_rng(0)
-    for action in random.uniform(-0.3, 0.3, (120, 2)).astype(np.float32):
-        observation, reward, terminated, truncated, info = env.step(action)
-        digest.update(observation.tobytes() + repr((reward, terminated, truncated, sorted(info.items()))).encode())
-        if terminated or truncated:
-            digest.update(env.reset()[0].tobytes())
-    return digest.hexdigest()
-
-
-def test_another_process_continues_bit_for_bit(tmp_path: Path) -> None:
-    """Through the ends of episodes: the random stream goes on as well."""
-    env = CzEnv("puller", observation="history", horizon=300.0)
-    env.reset(seed=8)
-    for _ in range(40):
-        env.step(np.float32([0.1, -0.2]))
-    (tmp_path / "state").write_bytes(pickle.dumps(env.get_state()))
-    command = [sys.executable, "-c", CONTINUE, str(tmp_path / "state"), str(Path(__file__).parent)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == go_on(env)

@@ -3,6 +3,7 @@
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from cz_gym.baselines.registry import find_controller, make_controller
 from cz_gym.camera import Camera
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation import plot
+from cz_gym.evaluation.replay import Playback
 from cz_gym.evaluation.rollout import Course, Rollout, Signals, rollout
 from cz_gym.observation import MEASURED
 
@@ -82,15 +84,11 @@ def test_every_signal_is_the_scalar_environments() -> None:
 
 
 def test_failed_episodes_end_where_the_scalar_ones_do() -> None:
-    run = rollout(FullPull(), SHORT, range(5))
+    policy = Playback([[1.0, 0.2]])
+    run = rollout(policy, SHORT, range(5))
     assert run.failed.all()
     assert len(set(run.alive.sum(axis=0).tolist())) > 1
-
-    class Pull(FullPull):
-        def predict(self, observation: Any, *others: Any, **named: Any) -> tuple[np.ndarray, Any]:
-            return np.tile(np.float32([1.0, 0.2]), (len(observation), 1)), None
-
-    check_against_scalar(run, Pull())
+    check_against_scalar(run, policy)
 
 
 def test_policy_begins_again_where_the_crystal_does() -> None:
@@ -118,44 +116,20 @@ def test_progress_counts_every_step_once() -> None:
     assert sum(counted) == run.alive.size == 3 * SHORT.steps
 
 
-def test_compute_is_time_in_predict_per_step_and_episode() -> None:
-    run = rollout(OpenLoop(), SHORT, range(3))
-    assert run.seconds_in_policy > 0
-    assert run.microseconds_per_step == pytest.approx(1e6 * run.seconds_in_policy / (3 * SHORT.steps))
-
-
-class OneAction:
-    """Forgets that observations come as rows."""
-
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> Any:
-        return np.zeros(2, np.float32), state
-
-
-class NoMemory:
-    """Knows nothing of a state."""
-
-    def predict(self, observation: Any) -> Any:
-        return np.zeros((len(observation), 2), np.float32), None
-
-
-class OnlyAnAction:
-    """Forgets that ``predict`` returns its state too."""
-
-    def predict(self, observation: Any, **rest: Any) -> np.ndarray:
-        return np.zeros((len(observation), 2), np.float32)
+OF_ONE = SimpleNamespace(predict=lambda observation, **rest: (np.zeros(2, np.float32), None))
+WITHOUT_STATE = SimpleNamespace(predict=lambda observation: (np.zeros((len(observation), 2), np.float32), None))
+WITHOUT_TUPLE = SimpleNamespace(predict=lambda observation, **rest: np.zeros((len(observation), 2), np.float32))
 
 
 @pytest.mark.parametrize(
     ("policy", "config", "message"),
     [
         (CompensatedPID(control_interval=2.0), SHORT, "was made for an action every 2 s, the environment takes one"),
-        (OneAction(), SHORT, r"actions of shape \(1, 2\) for 1 observations, not \(2,\)"),
-        (NoMemory(), SHORT, r"unexpected keyword argument 'state'; it must be predict\(observation, state=None"),
+        (OF_ONE, SHORT, r"actions of shape \(1, 2\) for 1 observations, not \(2,\)"),
+        (WITHOUT_STATE, SHORT, r"unexpected keyword argument 'state'; it must be predict\(observation, state=None"),
         (CompensatedPID, SHORT, "is no policy: an object with predict"),
         (lambda observation: observation, SHORT, "is no policy: an object with predict"),
-        (OnlyAnAction(), SHORT, r"predict must return a tuple \(action, state\), not ndarray"),
+        (WITHOUT_TUPLE, SHORT, r"predict must return a tuple \(action, state\), not ndarray"),
         (CompensatedPID(), make_config(action="smooth"), r"gives actions 'direct', the environment takes 'smooth'"),
         (
             load("gradient"),

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from cz_gym.jit.cache import Store, announce, cache_folder, hashed, source_hash
+from cz_gym.jit.cache import Store, announce, cache_folder, source_hash
 from cz_gym.jit.compile import kernel
-from cz_gym.physics.meniscus import hurle_slope
 
 ROOT = Path(__file__).parents[2]
 DERIVE = """
@@ -67,15 +66,14 @@ def test_changed_physics_is_never_run_from_an_old_cache(package: Path, tmp_path:
 
 @pytest.mark.slow
 def test_damaged_code_is_compiled_again(tmp_path: Path) -> None:
-    """Cut short, changed in one bit, and of another function under the right name."""
+    """Changed in one bit; cut short and overwritten: ``tests/stress/test_fuzz.py``."""
     cache = tmp_path / "cache"
     folder, height, _ = run(DERIVE, ROOT, cache)
     (file,) = Path(folder).rglob("*derive*.code")
     whole = file.read_bytes()
-    for damaged in (whole[: len(whole) // 2], whole[:-1] + bytes([whole[-1] ^ 1]), b""):
-        file.write_bytes(damaged)
-        assert run(DERIVE, ROOT, cache) == [folder, height, "0"]
-        assert run(DERIVE, ROOT, cache) == [folder, height, "1"]
+    file.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    assert run(DERIVE, ROOT, cache) == [folder, height, "0"]
+    assert run(DERIVE, ROOT, cache) == [folder, height, "1"]
     assert not list(Path(folder).rglob(".code-*"))
 
 
@@ -190,12 +188,6 @@ def test_hash_sees_names_and_contents(package: Path) -> None:
     (folder / "evaluation" / "report" / "markdown.py").write_text("nothing of it is compiled")
     assert len({first, second, third, fourth}) == 4
     assert source_hash(folder) == fourth
-
-
-def test_only_functions_of_the_package_are_hashed() -> None:
-    assert hashed(hurle_slope)
-    assert not hashed(hurle_slope, lambda r_c, h_c, p: (0.0, 1.0))
-    assert not hashed(abs)
 
 
 @pytest.mark.parametrize("terminal", [True, False])

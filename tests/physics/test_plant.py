@@ -148,8 +148,3 @@ def test_hidden_load_is_the_static_equivalent_of_a_drift(drift: float) -> None:
     assert drift * load <= 0
     held = rates(State(p.r_0, p.h_0, T_1, T_2, p.T_b_0), p.inputs_0, Disturbance(load, 0.0, 1.0), p, hurle_slope)
     assert [held.T_2 * p.C_2, held.T_b * p.C_b] == pytest.approx([0.0, 0.0], abs=1e-5)
-
-
-def test_parameters_without_an_operating_point_are_refused() -> None:
-    with pytest.raises(ValueError, match="no finite operating point"):
-        make_puller(Parameters(T_e=4000.0))

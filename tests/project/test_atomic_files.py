@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -136,10 +137,12 @@ def test_several_files_in_several_folders(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_a_writer_waits_for_another_but_not_for_ever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     writer = threading.Thread(target=write_files, args=({tmp_path / "other": b"x"},))
+    waits, sleep = threading.Event(), time.sleep
+    monkeypatch.setattr(atomic_files.time, "sleep", lambda seconds: (waits.set(), sleep(seconds)))
     with atomic_files._writer(tmp_path, ()):
         (tmp_path / BEGUN).mkdir()
         writer.start()
-        writer.join(0.2)
+        assert waits.wait(60.0), "it has tried the lock once"
         assert names(tmp_path) == [WRITER, BEGUN]
         monkeypatch.setattr(atomic_files, "PATIENCE", 0.0)
         with pytest.raises(OSError, match="another process is writing here"):

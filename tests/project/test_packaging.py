@@ -1,6 +1,7 @@
 """What is installed: one package, on four dependencies, by every way of installing it."""
 
 import os
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -18,7 +19,8 @@ SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PROJECT = SETTINGS["project"]
 LINKS = {"baselines": "cz_gym.baselines", "agents": "cz_gym.agents"}
 """Folders that stand beside the package and are packages in it, by links in the checkout."""
-MADE = {"build", "dist", ".git", ".venv", "__pycache__", ".pytest_cache", ".hypothesis", ".mypy_cache", ".ruff_cache"}
+UNPACKED = {"build", "dist", "runs", "results", "venv", "__pycache__"}
+"""Folders that no build needs, beside the hidden ones."""
 NAMES = """
 import importlib, sys
 for name in ("cz_gym", "cz_gym.baselines.registry", "cz_gym.agents.agent_file.contract"):
@@ -134,12 +136,11 @@ def test_outside_the_virtual_environment_one_line_says_so(command: str) -> None:
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A checkout as it is where there are no links, as on Windows: the files named as links hold where these lead."""
     folder = tmp_path_factory.mktemp("source")
-    for place, inner, names in os.walk(ROOT):
-        here = Path(place).relative_to(ROOT)
-        inner[:] = [name for name in inner if name not in MADE and not (Path(place) / name).is_symlink()]
-        (folder / here).mkdir(exist_ok=True)
-        for name in names:
-            (folder / here / name).write_bytes((ROOT / here / name).read_bytes())
+
+    def left_out(place: str, names: list[str]) -> set[str]:
+        return {name for name in names if name in UNPACKED or name[0] == "." or (Path(place) / name).is_symlink()}
+
+    shutil.copytree(ROOT, folder, ignore=left_out, dirs_exist_ok=True)
     for name in LINKS:
         (folder / "cz_gym" / name).write_text(f"../{name}")
     return folder

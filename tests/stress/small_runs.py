@@ -27,17 +27,12 @@ from cz_gym.evaluation.report import figures, page  # noqa: F401
 RUN = "cz_gym.agents.training.run:Run"
 STEP = "cz_gym.vector:CzVectorEnv.step"
 IMITATION = {
-    "start-up": ("cz_gym.agents.training.run:provenance:1", 0),
     "demonstrations": (f"cz_gym.agents.training.imitation:demonstrate:2>{STEP}:100", 0),
     "fit": ("cz_gym.agents.training.imitation:fit:2>torch.autograd:backward:1", 0),
-    "checkpoint, before it counts": (f"{RUN}.save:2>os:rename:1", 0),
-    "validation": (f"{RUN}._validate:1>{STEP}:100", 2880),
-    "checkpoint, as it moves": (f"{RUN}._validate:1>os:replace:2", 2880),
     "judging": (f"{RUN}.finish:1>{STEP}:100", 2880),
-    "summary, as it moves": (f"{RUN}.finish:1>os:replace:2", 2880),
 }
-"""Where one imitation can be killed, resumed, killed ...: the point, counted from where it goes on, and the step at
-which a run stands that was killed there."""
+"""Where one imitation is killed, resumed, killed ...: the point, counted from where it goes on, and the step at which a
+run stands that was killed there. Its checkpoints and its summary are written as PPO's are."""
 REINFORCEMENT = {
     "start-up": ("cz_gym.agents.training.run:provenance:1", 0),
     "rollout": ("stable_baselines3.common.buffers:RolloutBuffer.add:20", 1280),
@@ -52,12 +47,9 @@ REINFORCEMENT = {
 """The same of PPO, of which rollouts have 2,048 steps, and a validation follows every second one."""
 WRITING = "cz_gym.evaluation.report.output:write_files:1"
 BENCHMARK = {
-    "start-up": ("benchmark:make_plan:1", None),
     "episodes": (f"cz_gym.evaluation.runner:rollout:1>{STEP}:1000", None),
     "slow episodes": (f"cz_gym.evaluation.runner:rollout:3>{STEP}:1000", None),
     "figures": ("cz_gym.evaluation.report.figures:draw_figures:1", None),
-    "page": ("cz_gym.evaluation.report.page:page:1", None),
-    "first results, before they count": (f"{WRITING}>os:rename:1", None),
     "first results, as they move": (f"{WRITING}>os:replace:3", "open-loop"),
     "other results, before they count": (f"{WRITING}>os:rename:1", "open-loop"),
     "other results, as they move": (f"{WRITING}>os:replace:3", "paper"),

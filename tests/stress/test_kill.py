@@ -36,6 +36,10 @@ def test_a_training_run_killed_in_every_phase_goes_on(
     assert code == 0, log.read_text()[-2000:]
     assert check_training(out) == step
     assert (out / "summary.json").exists()
+    if algo == "imitation":  # it has no checkpoint before its end
+        whole = tmp_path / "whole"
+        assert ending(training, ["--algo", algo, "--out", str(whole)], None, log) == 0
+        assert (whole / "agent.onnx").read_bytes() == (out / "agent.onnx").read_bytes()
 
 
 def test_a_benchmark_killed_in_every_phase_leaves_the_results_of_one_run(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from cz_gym.agents.agent_file.contract import read_agent
 from cz_gym.agents.training.export import actor_onnx
 from cz_gym.agents.training.imitation import make_network
 from cz_gym.agents.training.recipes import Imitation
-from cz_gym.baselines import CompensatedPID
+from cz_gym.baselines import CompensatedPID, OpenLoop
 from cz_gym.baselines.analysis.frequency import frequencies, margins_of, opened
 from cz_gym.baselines.analysis.frequency import response as theirs
 from cz_gym.baselines.analysis.sampled_loop import Loop, close, root_mean_square, sampled_plant
@@ -155,12 +155,8 @@ def test_events_happen_when_and_as_large_as_they_are_said() -> None:
 
 
 def test_survival_is_found_where_it_lies() -> None:
-    class Still:
-        def predict(self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True):
-            return np.zeros((len(observation), 2), np.float32), None
-
     lost = Limit("lost", "jump beyond the limit at once", "mm", MM, 16.0, LIMITS[0].event)
-    found = survive(Still(), lost, Interface())
+    found = survive(OpenLoop(), lost, Interface())
     assert 7.0 < found.least <= found.largest <= found.most <= 8.0
     assert not found.capped
     never = Limit("never", "nothing", "mm", MM, 4.0, Event(0.0, lambda slot, amplitude: None))

@@ -1,6 +1,7 @@
 """The checker fires on each way to break a vector environment, and says which in one line."""
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -42,53 +43,37 @@ class Conforming(SyncVectorEnv):
         super().__init__([Walk] * num_envs, autoreset_mode=mode, copy=True)
 
 
-class Space(Conforming):
-    def __init__(self, num_envs: int, mode: AutoresetMode) -> None:
-        super().__init__(num_envs, mode)
-        self.single_action_space = Box(-2, 2, (1,), np.float32)
+def made(
+    change: Callable[[Any], Any] = lambda env: None, fewer: int = 0, always: AutoresetMode | None = None
+) -> type[Conforming]:
+    """A vector of fewer slots, of one mode whatever is asked for, or changed once it is made."""
+
+    class Made(Conforming):
+        def __init__(self, num_envs: int, mode: AutoresetMode) -> None:
+            super().__init__(num_envs - fewer, always or mode)
+            change(self)
+
+    return Made
 
 
-class Batched(Conforming):
-    def __init__(self, num_envs: int, mode: AutoresetMode) -> None:
-        super().__init__(num_envs, mode)
-        self.action_space = self.single_action_space
+def resetting(change: Callable[[Any, Any], dict[str, Any]]) -> type[Conforming]:
+    """A vector whose resets get other arguments, as ``change(seed, options)`` gives them."""
+
+    class Resetting(Conforming):
+        def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+            return super().reset(**{"seed": seed, "options": options, **change(seed, options)})
+
+    return Resetting
 
 
-class Mode(Conforming):
-    def __init__(self, num_envs: int, mode: AutoresetMode) -> None:
-        super().__init__(num_envs, AutoresetMode.NEXT_STEP)
+def stepping(change: Callable[..., Any]) -> type[Conforming]:
+    """A vector whose steps return something else, as ``change(observation, reward, ...)`` gives it."""
 
+    class Stepping(Conforming):
+        def step(self, actions: Any) -> Any:
+            return change(*super().step(actions))
 
-class Fewer(Conforming):
-    def __init__(self, num_envs: int, mode: AutoresetMode) -> None:
-        super().__init__(num_envs - 1, mode)
-
-
-class Seedless(Conforming):
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        return super().reset(seed=None, options=options)
-
-
-class Stuck(Conforming):
-    """The same first state whatever the seed: each slot another."""
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        masked = options is not None and "reset_mask" in options
-        return super().reset(seed=None if masked else 5, options=options)
-
-
-class Alike(Conforming):
-    """Every slot gets the first seed."""
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        return super().reset(seed=[seed] * self.num_envs if isinstance(seed, int) else seed, options=options)
-
-
-class SeedList(Conforming):
-    """The list is read as its first seed, plus the slot."""
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        return super().reset(seed=seed[0] if isinstance(seed, list) else seed, options=options)
+    return Stepping
 
 
 class Repeating(Conforming):
@@ -109,61 +94,12 @@ class Repeating(Conforming):
         return env._shown(), {"far": float(np.abs(env.x).max())}
 
 
-class Rewards32(Conforming):
-    def step(self, actions: Any) -> Any:
-        observation, reward, *rest = super().step(actions)
-        return observation, reward.astype(np.float32), *rest
-
-
-class Observations64(Conforming):
-    def step(self, actions: Any) -> Any:
-        observation, *rest = super().step(actions)
-        return {name: part.astype(np.float64) for name, part in observation.items()}, *rest
-
-
-class Unmasked(Conforming):
-    def step(self, actions: Any) -> Any:
-        *rest, infos = super().step(actions)
-        return *rest, {key: value for key, value in infos.items() if key != "_far"}
-
-
-class Reward(Conforming):
-    def step(self, actions: Any) -> Any:
-        observation, reward, *rest = super().step(actions)
-        reward[1] *= 1.0 + 1e-12
-        return observation, reward, *rest
-
-
-class Timeout(Conforming):
-    """The time limit is returned as a failure, as in pc-gym."""
-
-    def step(self, actions: Any) -> Any:
-        observation, reward, terminated, truncated, infos = super().step(actions)
-        return observation, reward, terminated | truncated, np.zeros_like(truncated), infos
-
-
-class Info(Conforming):
-    def step(self, actions: Any) -> Any:
-        *rest, infos = super().step(actions)
-        infos["far"] = infos["far"] + 1e-9
-        return *rest, infos
-
-
-class Extra(Conforming):
-    def step(self, actions: Any) -> Any:
-        *rest, infos = super().step(actions)
-        extra = {"secret": np.zeros(self.num_envs), "_secret": np.ones(self.num_envs, np.bool_)}
-        return *rest, infos | extra
-
-
-class Final(Conforming):
+def next_first(observation: Any, *rest: Any) -> Any:
     """The final observation is the next episode's first."""
-
-    def step(self, actions: Any) -> Any:
-        observation, *rest, infos = super().step(actions)
-        for i in np.flatnonzero(infos.get("_final_obs", [])):
-            infos["final_obs"][i] = {name: part[i].copy() for name, part in observation.items()}
-        return observation, *rest, infos
+    infos = rest[-1]
+    for i in np.flatnonzero(infos.get("_final_obs", [])):
+        infos["final_obs"][i] = {name: part[i].copy() for name, part in observation.items()}
+    return observation, *rest
 
 
 class Coupled(Conforming):
@@ -193,7 +129,7 @@ class Recycled(Conforming):
 
 
 class ReadBack(Conforming):
-    """Rewards carry over what is in the array that was handed out."""
+    """Rewards carry over what is in the array that was handed out, or handed in."""
 
     last: Any = None
 
@@ -201,21 +137,16 @@ class ReadBack(Conforming):
         observation, reward, *rest = super().step(actions)
         if self.last is not None:
             reward = reward + (self.last[0] - self.last[1])
-        self.last = reward, reward.copy()
+        self.last = self.remembered(reward, actions)
         return observation, reward, *rest
 
+    def remembered(self, reward: Any, actions: Any) -> Any:
+        return reward, reward.copy()
 
-class KeepsActions(Conforming):
-    """An action is still read one step later."""
 
-    last: Any = None
-
-    def step(self, actions: Any) -> Any:
-        observation, reward, *rest = super().step(actions)
-        if self.last is not None:
-            reward = reward + (self.last[0] - self.last[1])[:, 0]
-        self.last = actions, actions.copy()
-        return observation, reward, *rest
+class KeepsActions(ReadBack):
+    def remembered(self, reward: Any, actions: Any) -> Any:
+        return actions[:, 0], actions[:, 0].copy()
 
 
 class WritesActions(Conforming):
@@ -225,42 +156,77 @@ class WritesActions(Conforming):
         return result
 
 
-class ResetsAll(Conforming):
-    """The reset mask is ignored."""
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        return super().reset(seed=seed)
-
-
-BROKEN: dict[type[Conforming], str] = {
-    Space: "single_action_space is",
-    Batched: "action_space is .* the batch of 3 is",
-    Mode: r"metadata\['autoreset_mode'\] is",
-    Fewer: "num_envs is 2, asked for 3",
-    Seedless: "seed 0 gives another first observation in a second environment",
-    Stuck: "differs from the scalar with that seed",
-    Alike: "slots 0 and 1 have the same first observation",
-    SeedList: "seed list: slot 1 with seed 14 differs",
-    Repeating: "the same first observations",
-    Rewards32: "reward is float32 .3,. and float64 .3,.",
-    Observations64: r"observation\['t'\] is float64 .* and float32",
-    Unmasked: r"info\['_far'\] is in one only",
-    Reward: r"reward of slot 1 is .* and",
-    Timeout: "terminated of slot . is True and False",
-    Info: r"info\['far'\] of slot 0 is",
-    Extra: r"info\['_secret'\], info\['secret'\] is in one only",
-    Final: r"info\['final_obs'\]\[.\]\['t'\]",
-    Coupled: r"observation\['x'\] of slot 1",
-    Reused: "was written by a later call",
-    Recycled: r"\[1\] .kept as .* was written by a later call",
-    ReadBack: "writing into earlier results or actions changed",
-    KeepsActions: "writing into earlier results or actions changed",
-    WritesActions: "wrote into the actions",
-    ResetsAll: "reset of ended slots",
+REWARD = stepping(lambda observation, reward, *rest: (observation, reward * [1.0, 1.0 + 1e-12, 1.0], *rest))
+TIMEOUT = stepping(lambda o, r, terminated, truncated, i: (o, r, terminated | truncated, np.zeros_like(truncated), i))
+"""The time limit is returned as a failure, as in pc-gym."""
+NEXT, SAME, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
+BROKEN: dict[str, tuple[type[Conforming], str, AutoresetMode]] = {
+    "space": (made(lambda env: setattr(env, "single_action_space", Box(-2, 2, (1,)))), "single_action_space is", NEXT),
+    "batched": (
+        made(lambda env: setattr(env, "action_space", env.single_action_space)),
+        "action_space is .* the batch of 3 is",
+        NEXT,
+    ),
+    "mode": (made(always=NEXT), r"metadata\['autoreset_mode'\] is", SAME),
+    "fewer": (made(fewer=1), "num_envs is 2, asked for 3", NEXT),
+    "seedless": (
+        resetting(lambda seed, options: {"seed": None}),
+        "seed 0 gives another first observation in a second environment",
+        NEXT,
+    ),
+    "stuck": (
+        resetting(lambda seed, options: {"seed": None if "reset_mask" in (options or {}) else 5}),
+        "differs from the scalar with that seed",
+        NEXT,
+    ),
+    "alike": (
+        resetting(lambda seed, options: {"seed": [seed] * 3 if isinstance(seed, int) else seed}),
+        "slots 0 and 1 have the same first observation",
+        NEXT,
+    ),
+    "seed list read as its first": (
+        resetting(lambda seed, options: {"seed": seed[0] if isinstance(seed, list) else seed}),
+        "seed list: slot 1 with seed 14 differs",
+        NEXT,
+    ),
+    "repeating": (Repeating, "the same first observations", NEXT),
+    "rewards of 32 bits": (
+        stepping(lambda observation, reward, *rest: (observation, reward.astype(np.float32), *rest)),
+        "reward is float32 .3,. and float64 .3,.",
+        NEXT,
+    ),
+    "observations of 64 bits": (
+        stepping(lambda shown, *rest: ({name: part.astype(np.float64) for name, part in shown.items()}, *rest)),
+        r"observation\['t'\] is float64 .* and float32",
+        NEXT,
+    ),
+    "unmasked": (
+        stepping(lambda *result: (*result[:4], {key: each for key, each in result[4].items() if key != "_far"})),
+        r"info\['_far'\] is in one only",
+        NEXT,
+    ),
+    "reward": (REWARD, "reward of slot 1 is .* and", NEXT),
+    "time limit": (TIMEOUT, "terminated of slot . is True and False", NEXT),
+    "info": (
+        stepping(lambda *result: (*result[:4], {**result[4], "far": result[4]["far"] + 1e-9})),
+        r"info\['far'\] of slot 0 is",
+        NEXT,
+    ),
+    "extra": (
+        stepping(lambda *result: (*result[:4], {**result[4], "secret": np.zeros(3), "_secret": np.ones(3, np.bool_)})),
+        r"info\['_secret'\], info\['secret'\] is in one only",
+        NEXT,
+    ),
+    "final": (stepping(next_first), r"info\['final_obs'\]\[.\]\['t'\]", SAME),
+    "coupled": (Coupled, r"observation\['x'\] of slot 1", NEXT),
+    "reused": (Reused, "was written by a later call", NEXT),
+    "recycled": (Recycled, r"\[1\] .kept as .* was written by a later call", NEXT),
+    "reads results back": (ReadBack, "writing into earlier results or actions changed", NEXT),
+    "keeps actions": (KeepsActions, "writing into earlier results or actions changed", NEXT),
+    "writes actions": (WritesActions, "wrote into the actions", NEXT),
+    "resets all": (resetting(lambda seed, options: {"options": None}), "reset of ended slots", DISABLED),
 }
-"""Each with what is said of it."""
-SHOWN_IN = {Mode: AutoresetMode.SAME_STEP, Final: AutoresetMode.SAME_STEP, ResetsAll: AutoresetMode.DISABLED}
-"""The mode that shows it; of the others, NEXT_STEP."""
+"""Each with what is said of it, and the mode that shows it."""
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -271,10 +237,10 @@ def test_gymnasiums_own_vector_conforms(mode: AutoresetMode) -> None:
     assert checked.held > 40 * 4
 
 
-@pytest.mark.parametrize("broken", BROKEN, ids=lambda broken: broken.__name__)
-def test_each_break_is_named_in_one_line(broken: Any) -> None:
-    mode = SHOWN_IN.get(broken, AutoresetMode.NEXT_STEP)
-    with pytest.raises(NotConforming, match=BROKEN[broken]) as found:
+@pytest.mark.parametrize("name", BROKEN)
+def test_each_break_is_named_in_one_line(name: str) -> None:
+    broken, says, mode = BROKEN[name]
+    with pytest.raises(NotConforming, match=says) as found:
         check_vector_env(broken, Walk, steps=40, modes=[mode])
     assert "\n" not in str(found.value)
     assert str(found.value).startswith(f"[{mode.value}] ")
@@ -305,10 +271,10 @@ def test_a_check_that_sees_no_end_is_no_check() -> None:
 
 
 def test_a_tolerance_forgives_rounding_alone() -> None:
-    checked = check_vector_env(Reward, Walk, steps=40, modes=[AutoresetMode.NEXT_STEP], rtol=1e-9)
+    checked = check_vector_env(REWARD, Walk, steps=40, modes=[AutoresetMode.NEXT_STEP], rtol=1e-9)
     assert isinstance(checked, Checked)
     with pytest.raises(NotConforming):
-        check_vector_env(Timeout, Walk, steps=40, modes=[AutoresetMode.NEXT_STEP], rtol=1e-9)
+        check_vector_env(TIMEOUT, Walk, steps=40, modes=[AutoresetMode.NEXT_STEP], rtol=1e-9)
 
 
 @pytest.mark.parametrize("arguments", [{"num_envs": 1}, {"steps": 1}, {"modes": []}])

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from cz_gym import Parameters
 from cz_gym.agents import AgentFileError, OnnxPolicy, shipped
@@ -70,10 +68,6 @@ def last_bias(model: Any, value: Any) -> None:
     weight.CopyFrom(onnx.numpy_helper.from_array(value, weight.name))
 
 
-def nan_bias(model: Any) -> None:
-    last_bias(model, np.full(2, np.nan, np.float32))
-
-
 def infinity_less_infinity(model: Any) -> None:
     last_bias(model, np.full(2, 3e38, np.float32))
     model.graph.node[-2].attribute.append(onnx.helper.make_attribute("beta", 2.0))
@@ -81,16 +75,12 @@ def infinity_less_infinity(model: Any) -> None:
     clip.CopyFrom(onnx.helper.make_node("Sub", [clip.input[0], clip.input[0]], [clip.output[0]]))
 
 
-def drives_that_are_not_there(model: Any) -> None:
-    last_bias(model, np.zeros(900, np.float32))
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (nan_bias, "not finite"),
+        (lambda model: last_bias(model, np.full(2, np.nan, np.float32)), "not finite"),
         (infinity_less_infinity, "not two finite numbers"),
-        (drives_that_are_not_there, "cannot be run"),
+        (lambda model: last_bias(model, np.zeros(900, np.float32)), "cannot be run"),
     ],
 )
 def test_networks_that_give_no_action_are_refused(change: Any, message: str, agent: Path) -> None:
@@ -101,27 +91,10 @@ def test_networks_that_give_no_action_are_refused(change: Any, message: str, age
         OnnxPolicy.load(agent)
 
 
-def test_missing_and_oversized_files_are_refused(agent: Path, tmp_path: Path) -> None:
-    with pytest.raises(AgentFileError, match="no such file"):
-        OnnxPolicy.load(tmp_path / "nobody.onnx")
+def test_an_oversized_file_is_refused(agent: Path) -> None:
     agent.write_bytes(b"0" * (MAX_BYTES + 1))
     with pytest.raises(AgentFileError, match="larger than"):
         OnnxPolicy.load(agent)
-
-
-@given(content=st.binary(max_size=200), where=st.integers(0, 10_000), as_contract=st.booleans())
-def test_damaged_files_always_give_one_line(
-    tmp_path_factory: pytest.TempPathFactory, ppo: Any, content: bytes, where: int, as_contract: bool
-) -> None:
-    path = tmp_path_factory.mktemp("damaged") / "agent.onnx"
-    whole = ppo.exported()
-    damaged = whole[: where % len(whole)] + content
-    write_agent(path, damaged, **facts())
-    if as_contract:
-        path.with_suffix(".json").write_bytes(content)
-    with pytest.raises(AgentFileError) as caught:
-        OnnxPolicy.load(path)
-    assert "\n" not in str(caught.value)
 
 
 def test_shipped_agent_beats_the_paper_s_controller_on_validation() -> None:

@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 
 from cz_gym.agents import OnnxPolicy
@@ -21,14 +22,12 @@ def agent_of(learner: Any) -> OnnxPolicy:
     return OnnxPolicy.of(make_contract(content, **facts()), content)
 
 
-def test_exported_ppo_acts_like_the_network_it_came_from(ppo: Any) -> None:
-    policy = ppo.algorithm.policy
-    normalise = policy.features_extractor
-    assert normalise.scaling.diagonal().min() > 0
-    assert not torch.allclose(normalise.scaling, torch.eye(len(normalise.scaling)))
-    seen = observations(64, len(HISTORY) + len(STATE))
-    expected, _ = policy.predict(seen, deterministic=True)
-    action, _ = agent_of(ppo).predict(seen[:, : len(HISTORY)])
+@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
+def test_what_is_exported_acts_like_the_network_it_came_from(algorithm: str, ppo: Any) -> None:
+    learner = ppo if algorithm == "ppo" else trained(SMALL_SAC)
+    seen = observations(64, learner.algorithm.observation_space.shape[0])
+    expected, _ = learner.algorithm.predict(seen, deterministic=True)
+    action, _ = agent_of(learner).predict(seen[:, : len(HISTORY)])
     np.testing.assert_allclose(action, expected, atol=2e-6)
     assert action.dtype == np.float32
 
@@ -43,17 +42,10 @@ def test_actor_is_blind_to_the_true_state(ppo: Any) -> None:
     assert not torch.allclose(*values)
 
 
-def test_exported_sac_acts_like_its_network() -> None:
-    learner = trained(SMALL_SAC)
-    seen = observations(64, len(HISTORY))
-    expected, _ = learner.algorithm.predict(seen, deterministic=True)
-    action, _ = agent_of(learner).predict(seen)
-    np.testing.assert_allclose(action, expected, atol=2e-6)
-
-
 def test_normalisation_is_the_data_s_mean_and_spread(ppo: Any) -> None:
     buffer, normalise = ppo.algorithm.rollout_buffer, ppo.algorithm.policy.features_extractor
     seen = buffer.observations.reshape(-1, len(HISTORY) + len(STATE))
     np.testing.assert_allclose(normalise.mean, seen.mean(axis=0), atol=1e-5)
     spread = np.maximum(seen.std(axis=0), 0.02)
     np.testing.assert_allclose(normalise.scaling, np.diag(1.0 / spread), rtol=1e-4)
+    assert not torch.allclose(normalise.scaling, torch.eye(len(spread)))

@@ -13,13 +13,11 @@ from gymnasium.vector import AutoresetMode
 import train
 from cz_gym import CzVectorEnv, agents
 from cz_gym.agents.agent_file.contract import agent_files, read_agent
-from cz_gym.agents.training import run
 from cz_gym.agents.training.filter_bank import STATE
 from cz_gym.agents.training.recipes import RECIPES
 from cz_gym.agents.training.refinement import Remembering
 from cz_gym.agents.training.vec_env import CzVecEnv
 from cz_gym.atomic_files import write_files
-from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from tests.small_learners import made
 
 START = agents.shipped_seeds("gradient")[0]
@@ -54,11 +52,10 @@ def test_it_begins_as_the_agent_that_it_goes_on_from() -> None:
     assert memory.shape == (3, STATE)
 
 
+@pytest.mark.usefixtures("few_crystals")
 def test_a_run_goes_on_from_a_file_and_resumes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(run, "PICKING", VALIDATION_SEEDS[:2])
-    monkeypatch.setattr(run, "JUDGING", VALIDATION_SEEDS[2:4])
     monkeypatch.setitem(RECIPES, "ppo-after-gradient", replace(RECIPES["ppo-after-gradient"], **FEW))
     folder = str(tmp_path / "run")
     assert train.main(["--algo", "ppo", "--from", str(START), "--out", folder]) == 0

@@ -1,9 +1,7 @@
 """``train.py``: a run leaves what it promises, goes on where it stopped, and answers mistakes in one line."""
 
 import csv
-import errno
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -11,29 +9,16 @@ import pytest
 
 import train
 from cz_gym.agents import OnnxPolicy
-from cz_gym.agents.training import imitation, run, run_files
-from cz_gym.agents.training.recipes import PPO, RECIPES, Gradient, Imitation
-from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from cz_gym.agents.training import run, run_files
+from cz_gym.agents.training.recipes import PPO, RECIPES, Gradient
 
 ROOT = Path(__file__).parents[3]
-POINTS = {
-    "before the first step": ("ppo", run.Run, "learn"),
-    "at the first validation": ("ppo", run.Run, "_validate"),
-    "in the first round's fit": ("imitation", imitation, "fit"),
-    "between imitation and validation": ("imitation", run.Run, "_validate"),
-    "at the summary": ("imitation", run.Run, "finish"),
-}
-"""Where a run is killed: recipe, and the function at whose first call it ends."""
 
 
 @pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run, "PICKING", VALIDATION_SEEDS[:2])
-    monkeypatch.setattr(run, "JUDGING", VALIDATION_SEEDS[2:4])
+def quick(monkeypatch: pytest.MonkeyPatch, few_crystals: None) -> None:
     monkeypatch.setitem(RECIPES, "ppo", PPO(num_envs=64, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,)))
     monkeypatch.setitem(RECIPES, "gradient", Gradient(num_envs=16, window=12, steps=10_000, hidden=()))
-    few = {"rounds": 2, "episodes": 4, "wide_share": 0.0, "epochs": 1, "hidden": (16,), "control_interval": 30.0}
-    monkeypatch.setitem(RECIPES, "imitation", Imitation(name="imitation", teacher="lqg", **few))
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -103,50 +88,6 @@ def test_an_interrupted_run_keeps_its_checkpoint(
     assert f"saved, python train.py --resume --out {folder} goes on" in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("quick")
-@pytest.mark.parametrize("point", POINTS)
-def test_a_run_that_is_killed_can_be_resumed(point: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def die(*arguments: Any) -> None:
-        raise ValueError("killed")
-
-    algorithm, owner, name = POINTS[point]
-    folder, steps = tmp_path / "run", ["--steps", "10000"] if algorithm == "ppo" else []
-    with monkeypatch.context() as patch:
-        patch.setattr(owner, name, die)
-        assert train.main(["--algo", algorithm, *steps, "--out", str(folder)]) == 2
-    assert not (folder / "summary.json").exists()
-    assert train.main(["--algo", algorithm, "--resume", "--out", str(folder)]) == 0
-    saved = json.loads((folder / "settings.json").read_text())
-    assert len(saved["sessions"]) == 2
-    assert (folder / "summary.json").exists()
-
-
-@pytest.mark.usefixtures("quick")
-def test_a_killed_imitation_ends_as_one_that_was_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fit, calls = imitation.fit, []
-
-    def die_in_round_2(*arguments: Any) -> float:
-        calls.append(1)
-        if len(calls) == 2:
-            raise ValueError("killed")
-        return fit(*arguments)
-
-    whole, killed = (["--algo", "imitation", "--out", str(tmp_path / name)] for name in ("whole", "killed"))
-    assert train.main(whole) == 0
-    with monkeypatch.context() as patch:
-        patch.setattr(imitation, "fit", die_in_round_2)
-        assert train.main([*killed, "--checkpoint-seconds", "0"]) == 2
-    assert train.main([*killed, "--resume"]) == 0
-    one, other = ((tmp_path / name / "agent.onnx").read_bytes() for name in ("whole", "killed"))
-    assert one == other
-    before = rows(tmp_path / "whole" / "progress.csv")
-    monkeypatch.setattr(imitation, "fit", die_in_round_2)
-    assert train.main([*whole, "--resume"]) == 0, "nothing was left to learn"
-    assert rows(tmp_path / "whole" / "progress.csv")[:1] == before
-    contract = OnnxPolicy.load(tmp_path / "whole" / "agent.onnx").contract
-    assert (contract.algorithm, contract.training_steps) == ("imitation", 0)
-
-
 def test_interrupting_before_learning_gives_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -185,21 +126,6 @@ def test_interrupting_before_learning_gives_one_line(
 def test_mistakes_give_one_line(tmp_path: Path, arguments: list[str], message: str, refused: Any) -> None:
     assert message in refused(train.main, [*arguments, "--out", str(tmp_path / "run")])
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.usefixtures("quick")
-def test_a_full_disk_is_one_line_that_names_the_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def full(*arguments: Any) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr("cz_gym.atomic_files.os.fsync", full)
-    folder = tmp_path / "run"
-    assert train.main(["--steps", "10000", "--out", str(folder)]) == 2
-    error = capsys.readouterr().err
-    assert error == f"train.py: {folder / run.CHECKPOINT}: No space left on device\n"
-    assert not list(folder.glob("*.*"))
 
 
 @pytest.mark.parametrize(

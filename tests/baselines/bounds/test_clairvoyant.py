@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import minimize
 
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
-from cz_gym.baselines.bounds.future import future_of, substeps_of
+from cz_gym.baselines.bounds.future import future_of
 from cz_gym.baselines.bounds.riccati import Stages, sweep_back, sweep_forward
 from cz_gym.baselines.bounds.trajectory import TOLERANCE, Limits, limits_of, linearised, optimise, predicted_cost
 from cz_gym.baselines.registry import find_controller
@@ -16,6 +16,7 @@ from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.episodes.scenarios import HARD, RANDOMIZED
 from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.replay import Playback
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.physics.plant import Inputs, State
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
@@ -44,31 +45,13 @@ def episode_cost(run):
     return metrics(run).cost * run.config.steps
 
 
-class OpenLoopInputs:
-    """Plays given inputs v_p [m/s] and Q_H [W], shape (steps, n, 2)."""
-
-    def __init__(self, u, inputs_0):
-        self.actions = ((u - inputs_0) / np.stack([inputs_0[:, 0], np.full(len(inputs_0), 10 * KILO)], axis=-1)).clip(
-            -1, 1
-        )
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=True):
-        k = state or 0
-        return self.actions[min(k, len(self.actions) - 1)].astype(np.float32), k + 1
+def played(u, inputs_0):
+    """A policy that plays inputs v_p [m/s] and Q_H [W], shape (steps, n, 2)."""
+    full = np.stack([inputs_0[:, 0], np.full(len(inputs_0), 10 * KILO)], axis=-1)
+    return Playback(((u - inputs_0) / full).clip(-1, 1))
 
 
-@pytest.mark.parametrize("interval", [2.0, 5.0, 7.5, 10.0, 15.0])
-def test_substeps_fill_each_interval_and_never_cross_the_grid(interval):
-    point, length = substeps_of(interval, 12)
-    assert length.sum(axis=1) == pytest.approx(interval)
-    end = np.arange(12)[:, None] * interval + np.cumsum(length, axis=1)
-    begin = end - length
-    used = length > 0
-    assert (begin[used] >= point[used] * 5.0 - 1e-9).all()
-    assert (end[used] <= (point[used] + 1) * 5.0 + 1e-9).all()
-
-
-@pytest.mark.parametrize("interval", [2.0, 5.0, 10.0])
+@pytest.mark.parametrize("interval", [2.0, 5.0, 7.5, 10.0])
 def test_the_known_future_is_the_one_the_environment_brings(interval):
     config = make_config(HARD, observation="state", control_interval=interval, horizon=2.0 * HOUR)
     future = future_of(config, SEEDS)
@@ -155,7 +138,7 @@ def test_no_nearby_inputs_are_cheaper_and_the_slope_is_zero(optimum):
     for shape in (smooth, rough):
         change = shape * np.array([0.002 * MM_PER_MIN, 0.002 * KILO])
         costs = [
-            episode_cost(replay(config, OpenLoopInputs(best.u + sign * change, policy.plan.inputs_0)))
+            episode_cost(replay(config, played(best.u + sign * change, policy.plan.inputs_0)))
             for sign in (-1.0, 0.0, 1.0)
         ]
         rise = costs[0] + costs[2] - 2.0 * costs[1]

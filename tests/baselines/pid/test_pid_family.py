@@ -16,18 +16,14 @@ from cz_gym.baselines.pid.compensated_pid import CompensatedPID, SeriesPID
 from cz_gym.baselines.pid.filtered_pid import INVERSE_GAIN, FilteredPID, reference_derivatives
 from cz_gym.baselines.pid.settings import SHIPPED, tuned
 from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
-from cz_gym.baselines.registry import find_controller
 from cz_gym.baselines.tuning.pid_spaces import over_half_the_zero
 from cz_gym.config import make_config
-from cz_gym.evaluation.metrics import metrics
-from cz_gym.evaluation.rollout import rollout
 from cz_gym.observation import MEASURED, PULL_SCALE, Measured
 from cz_gym.physics.linearisation import StateSpace, radius_model
 from cz_gym.units import MM, MM_PER_MIN
 from tests.observed import measured, pulls
 
 SCALES = {channel.name: channel.scale for channel in MEASURED}
-NAMES = ("pid-conventional", "paper-filtered", "paper-tuned", "industrial")
 
 
 def test_without_filter_it_is_the_printed_controller(rng):
@@ -147,21 +143,6 @@ def test_conventional_loop_keeps_the_papers_rule():
 def test_rule_measures_its_breach():
     fast = FilteredPID(pid=SeriesPID(K_p=0.02, T_i=2000.0, T_d=300.0, N=6.0), compensator=None, T_f=10.0)
     assert over_half_the_zero(fast) > 0.2
-
-
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("dt", [2.0, 10.0])
-def test_every_control_interval(name, dt):
-    usual, other = (make_config("randomized", control_interval=each, horizon=5400.0) for each in (5.0, dt))
-    found = [metrics(rollout(find_controller(name).make(config), config, range(8))) for config in (usual, other)]
-    assert not np.any([m.failure_rate for m in found])
-    assert found[1].rmse_mm.mean() == pytest.approx(found[0].rmse_mm.mean(), rel=0.25)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_without_disturbance_it_stays_where_it_is(name):
-    config = make_config("nominal", "I", control_interval=2.0, horizon=3600.0)
-    assert metrics(rollout(find_controller(name).make(config), config, [0])).rmse_mm[0] < 1e-3
 
 
 def test_unknown_settings_are_named():
