@@ -16,6 +16,8 @@ SHIPPED = {
     "gradient-hard": 5,
     "gradient-puller": 5,
     "gradient-randomized": 5,
+    "gradient-randomized-agile": 5,
+    "gradient-randomized-calm": 5,
     "gradient-sensor-fault": 5,
     "imitation": 3,
     "ppo": 3,
