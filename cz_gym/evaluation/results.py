@@ -118,8 +118,7 @@ class Sample:
 
     def metric(self, name: str) -> Floats:
         """One metric, shape (training seeds or 1, episodes)."""
-        values: Floats = self.values[:, :, metric_names().index(name)]
-        return values
+        return self.values[:, :, metric_names().index(name)]
 
     def first(self, episodes: int) -> Sample:
         """The same sample on its first episodes."""

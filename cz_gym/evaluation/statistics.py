@@ -117,8 +117,7 @@ def optimality_gap(costs: Floats, reference: Floats, bound: Floats, resamples: R
 def _tail_mean(descending: Floats, weights: Floats, tail: float) -> Floats:
     """Mean of the first ``tail`` of the weight, one a row of ``weights``."""
     taken = np.diff(np.minimum(np.cumsum(weights, axis=1), tail), axis=1, prepend=0.0)
-    mean: Floats = taken @ descending / tail
-    return mean
+    return taken @ descending / tail
 
 
 def _resampled_means(values: Floats, resamples: Resamples, of: int = 0) -> Floats:

@@ -135,8 +135,7 @@ def _asked(slopes: Floats, dt: float, action: str, v_0: float) -> Floats:
     drives = drives_of(action, dt)
     slopes = slopes * np.array([[drives.pull], [drives.heater]])
     slopes[[0, 1], DRIVE_CHANNELS] += drives.keep
-    found: Floats = np.array([[v_0], [HEATER_SCALE]]) * slopes
-    return found
+    return np.array([[v_0], [HEATER_SCALE]]) * slopes
 
 
 def jacobian(onnx_bytes: bytes, observation: Floats) -> Floats:

@@ -52,18 +52,15 @@ def _fit(function: Callable[[Floats, Floats], Floats], m: int, n: int) -> Floats
     values = function(X.ravel(), Y.ravel()).reshape(m, n)
     series = np.linalg.solve(chebyshev.chebvander(x, m - 1), values)
     series = np.linalg.solve(chebyshev.chebvander(y, n - 1), series.T).T
-    powers: Floats = np.apply_along_axis(chebyshev.cheb2poly, 1, np.apply_along_axis(chebyshev.cheb2poly, 0, series))
-    return powers
+    return np.apply_along_axis(chebyshev.cheb2poly, 1, np.apply_along_axis(chebyshev.cheb2poly, 0, series))
 
 
 def _radius(x: Floats) -> Floats:
-    radius: Floats = 2.0 / (exact.NARROWEST * (x + 1.0))
-    return radius
+    return 2.0 / (exact.NARROWEST * (x + 1.0))
 
 
 def _middle(y: Floats, low: float, high: float) -> Floats:
-    value: Floats = 0.5 * (low + high + y * (high - low))
-    return value
+    return 0.5 * (low + high + y * (high - low))
 
 
 def _slope_correction(x: Floats, y: Floats) -> Floats:
@@ -71,8 +68,7 @@ def _slope_correction(x: Floats, y: Floats) -> Floats:
     theta = exact.solve(r, np.sqrt(square), 1.0, np.radians(3.5)).theta
     # 1 - sin(theta) without the cancellation near theta = pi/2.
     lift = 2.0 * np.square(np.sin(0.25 * np.pi - 0.5 * theta))
-    correction: Floats = r * (lift / square - 1.0)
-    return correction
+    return r * (lift / square - 1.0)
 
 
 def _ring_correction(x: Floats, y: Floats) -> Floats:
@@ -92,8 +88,7 @@ def _tail_correction(x: Floats, y: Floats) -> Floats:
     reference = np.full_like(r, np.radians(3.5))
     start = exact.shoot(lambda outer: exact.turn(outer, reference)[0], r + exact.planar_width(reference), r)
     moved = exact.turn(start, slope)[0] - r
-    correction: Floats = r * (moved / (X_b - exact.RING_REFERENCE) - 1.0)
-    return correction
+    return r * (moved / (X_b - exact.RING_REFERENCE) - 1.0)
 
 
 def render(tables: Tables) -> str:
