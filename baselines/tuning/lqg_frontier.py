@@ -18,7 +18,7 @@ import numpy as np
 
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.baselines.lqg.settings import ACTIVITIES, SHIPPED, settings_of, with_pull_step
-from cz_gym.commands import OneLineParser, between, guarded
+from cz_gym.commands import OneLineParser, between
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 
 from .harness import rounded
@@ -76,11 +76,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--episodes", type=between(1, 10_000), default=50, help="training episodes a weight")
     parser.add_argument("--validation", type=between(1, 500), default=100, help="validation episodes a final")
     parser.add_argument("--output", type=Path, default=None, help="default in results/tuning")
-    given = parser.parse_args(arguments)
-    return guarded(parser.prog, lambda: _sweep(given), "benchmark")
+    return parser.run(_sweep, arguments, "benchmark")
 
 
-def _sweep(given: argparse.Namespace) -> int:
+def _sweep(given: argparse.Namespace) -> None:
     output = given.output or Path("results") / "tuning" / f"lqg-frontier-{given.scenario}.json"
     check_writable(output.parent)
     bases = bases_for(given.scenario)
@@ -98,7 +97,6 @@ def _sweep(given: argparse.Namespace) -> int:
     }
     write_files({output: (json.dumps(found, indent=1) + "\n").encode()})
     print(json.dumps(found["chosen"], indent=1))
-    return 0
 
 
 if __name__ == "__main__":

@@ -16,13 +16,12 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.atomic_files import write_files
-from cz_gym.commands import OneLineParser, guarded
+from cz_gym.commands import OneLineParser
 from cz_gym.evaluation.files import EPISODES, read_episodes
 from cz_gym.evaluation.statistics import Estimate, Resamples, differences, means
 from studies.markdown import table
 
 Floats = npt.NDArray[np.float64]
-PROG = "python -m studies.generalisation"
 OBSERVABLE = ("sensor-fault", "puller")
 """Rows with an offset that no sensor shows: the error against what can be seen is counted there."""
 MICRON = 1e-3
@@ -110,19 +109,17 @@ def _table(cells: Sequence[Cell], tell: Callable[[Cell], str]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser(prog=PROG, description=(__doc__ or "").split("\n")[0])
+    parser = OneLineParser("python -m studies.generalisation", (__doc__ or "").split("\n")[0])
     parser.add_argument("folder", type=Path, help="a benchmark's folder, with its episodes.csv")
     parser.add_argument("--against", default="lqg-at-0.02", metavar="NAME", help="compared with (%(default)s)")
-    given = parser.parse_args(arguments)
-    return guarded(PROG, lambda: _main(given), "benchmark")
+    return parser.run(_main, arguments, "benchmark")
 
 
-def _main(given: argparse.Namespace) -> int:
+def _main(given: argparse.Namespace) -> None:
     cells = tabulate(read_episodes(given.folder / EPISODES, figures), given.against)
     text = to_markdown(cells, given.against)
     write_files({given.folder / "table.md": text.encode()})
     print(text, end="")
-    return 0
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ are the powers' coefficients.
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,12 +19,11 @@ from numpy.polynomial import chebyshev
 from scipy.optimize import brentq
 
 from cz_gym.atomic_files import check_writable, write_files
-from cz_gym.commands import OneLineParser, guarded
+from cz_gym.commands import OneLineParser
 from cz_gym.physics import young_laplace as exact
 from cz_gym.physics.meniscus import profile, ring_point
 from cz_gym.physics.young_laplace_table import RING, SLOPE, TAIL
 
-PROG = "python -m studies.young_laplace"
 Floats = npt.NDArray[np.float64]
 SIZES = ((9, 16), (9, 22), (7, 8))
 """Coefficients in the two variables of SLOPE, RING and TAIL."""
@@ -112,22 +112,22 @@ def render(tables: Tables) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code. Compares, and with ``--write`` replaces the table next to this module."""
-    parser = OneLineParser(PROG, "Compute the exact meniscus and compare it with the table.")
+    parser = OneLineParser(
+        "python -m studies.young_laplace", "Compute the exact meniscus and compare it with the table."
+    )
     parser.add_argument("--write", action="store_true", help=f"replace {TABLE.name} by what was computed")
-    write = parser.parse_args(arguments).write
-    return guarded(PROG, lambda: _compare(write), "benchmark")
+    return parser.run(_compare, arguments, "benchmark")
 
 
-def _compare(write: bool) -> int:
-    if write:
+def _compare(given: argparse.Namespace) -> None:
+    if given.write:
         check_writable(TABLE.parent)
     tables = build()
-    if write:
+    if given.write:
         write_files({TABLE: render(tables).encode()})
     worst = max(float(np.max(np.abs(new - old))) for new, old in zip(tables, (SLOPE, RING, TAIL), strict=True))
     print(f"largest difference from the coefficients there were: {worst:.2g}")
-    print(f"wrote {TABLE.name}" if write else f"nothing written; --write replaces {TABLE.name}")
-    return 0
+    print(f"wrote {TABLE.name}" if given.write else f"nothing written; --write replaces {TABLE.name}")
 
 
 if __name__ == "__main__":
