@@ -6,13 +6,12 @@ by seed; its interval resamples both.
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from cz_gym.evaluation.files import csv_text
 from cz_gym.evaluation.statistics import Estimate, Resamples, means
 
 from .lqg_family import Family, at_equal_activity
@@ -75,16 +74,14 @@ def tabulate(variants: Sequence[Variant], runs: Mapping[str, Mapping[int, Result
 
 def to_csv(lines: Sequence[Line]) -> str:
     """``table.csv``: a line for each variant and figure."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     ends = ("mean", "low", "high")
-    writer.writerow(("name", "base", "seeds", "crystals", "figure", *ends, *(f"difference_{end}" for end in ends)))
+    heads, rows = ("name", "base", "seeds", "crystals", "figure", *ends, *(f"difference_{end}" for end in ends)), []
     for line in lines:
         for figure, cell in line.cells.items():
             numbers = [f"{each:.6g}" for part in cell if part for each in (part.mean, *(part.ci95 or ()))]
             row = (line.name, line.base, " ".join(map(str, line.runs)), cell.mean.n, figure, *numbers)
-            writer.writerow((*row, *[""] * (11 - len(row))))
-    return text.getvalue()
+            rows.append((*row, *[""] * (len(heads) - len(row))))
+    return csv_text(heads, rows)
 
 
 def to_markdown(lines: Sequence[Line], family: Family) -> list[str]:

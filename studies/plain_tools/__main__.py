@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import io
 import sys
 import time
 from collections.abc import Sequence
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cz_gym.commands import OneLineParser, between
+from cz_gym.evaluation.files import csv_text
 from cz_gym.units import MINUTE
 from studies.markdown import table
 
@@ -92,11 +92,7 @@ def read(path: Path) -> list[Row]:
 
 def to_csv(rows: Sequence[Row]) -> bytes:
     """A line a training seed."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(Row._fields)
-    writer.writerows([*row[:2], *(f"{value:.4g}" for value in row[2:])] for row in rows)
-    return text.getvalue().encode()
+    return csv_text(Row._fields, ([*row[:2], *(f"{value:.4g}" for value in row[2:])] for row in rows)).encode()
 
 
 def to_table(rows: Sequence[Row]) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import os
 import shutil
@@ -21,6 +19,7 @@ from tqdm import tqdm
 
 from cz_gym.agents.training.recipes import PPO
 from cz_gym.atomic_files import write_files
+from cz_gym.evaluation.files import csv_text
 from studies.comparison.results import COST, Plan
 from studies.comparison.training import is_finished, trained
 from studies.comparison.variants import Variant
@@ -147,12 +146,11 @@ class History(tune.Callback):
 
 def write_history(search: Search, study: Study) -> None:
     """Write the finished trials as CSV."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("trial", "state", "cost", "seconds", *SPACE))
+    rows = []
     for trial in finished(study):
         seconds = trial.duration.total_seconds() if trial.duration else 0.0
         state = "complete" if search.is_complete(trial) else "pruned"
         values = [f"{trial.params[name]:.6g}" for name in SPACE]
-        writer.writerow((trial.number, state, f"{trial.value:.6g}", f"{seconds:.0f}", *values))
-    write_files({search.plan.out / "history.csv": text.getvalue().encode()})
+        rows.append((trial.number, state, f"{trial.value:.6g}", f"{seconds:.0f}", *values))
+    text = csv_text(("trial", "state", "cost", "seconds", *SPACE), rows)
+    write_files({search.plan.out / "history.csv": text.encode()})
