@@ -90,13 +90,6 @@ class Sample:
     control_interval: float
 
     @classmethod
-    def of(cls, controller: Controller, runs: Sequence[Rollout]) -> Sample:
-        """The sample of a controller's rollouts, one a training seed, all on the same episodes."""
-        seeds = runs[0].seeds
-        parts = [[Part.of(run, frozenset(seeds[:EXAMPLES]))] for run in runs]
-        return cls.joined(controller, seeds, parts, runs[0].config.control_interval)
-
-    @classmethod
     def joined(
         cls, controller: Controller, seeds: Sequence[int], parts: Sequence[Sequence[Part]], control_interval: float
     ) -> Sample:
@@ -162,12 +155,12 @@ class Verdict:
     @property
     def wins(self) -> bool:
         """Whether the agent's RMSE is lower: the whole interval of the difference, or the one episode."""
-        return (self.difference.ci95[1] if self.difference.ci95 else self.difference.mean) < 0.0
+        return self.difference.ends[1] < 0.0
 
     @property
     def loses(self) -> bool:
         """Whether the rival's RMSE is lower, in the same sense."""
-        return (self.difference.ci95[0] if self.difference.ci95 else self.difference.mean) > 0.0
+        return self.difference.ends[0] > 0.0
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,16 @@ class Estimate(NamedTuple):
     ci95: tuple[float, float] | None
     n: int
 
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The interval's ends; twice the mean without one."""
+        return self.ci95 or (self.mean, self.mean)
+
+    def text(self, form: str, unit: float = 1.0) -> str:
+        """The mean in some unit, with its interval if it has one."""
+        mean, *ends = (f"{value / unit:{form}}" for value in (self.mean, *(self.ci95 or ())))
+        return f"{mean} [{', '.join(ends)}]" if ends else mean
+
 
 @dataclass(frozen=True)
 class Resamples:

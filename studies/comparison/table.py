@@ -96,16 +96,9 @@ def to_markdown(lines: Sequence[Line], family: Family) -> list[str]:
             "-" if steps is None else f"{1e-6 * steps:.1f}",
             "-" if seconds is None else f"{seconds / 60.0:.0f}",
         )
-        figures = [_text(line.cells[figure].mean, unit, form) for _, figure, unit, form in COLUMNS]
+        figures = [line.cells[figure].mean.text(form, unit) for _, figure, unit, form in COLUMNS]
         rows.append(f"| **{line.name}** | {len(line.runs)} | {' | '.join((*figures, *ends))} |")
-        if line.cells[RMSE].difference:
-            apart = [_text(line.cells[figure].difference, unit, f"+{form}") for _, figure, unit, form in COLUMNS]
+        differences = [(line.cells[figure].difference, unit, form) for _, figure, unit, form in COLUMNS]
+        if apart := [difference.text(f"+{form}", unit) for difference, unit, form in differences if difference]:
             rows.append(f"| less {line.base} | | {' | '.join(apart)} | | | |")
     return rows
-
-
-def _text(estimate: Estimate | None, unit: float, form: str) -> str:
-    if estimate is None:
-        return "-"
-    ends = ", ".join(f"{end / unit:{form}}" for end in estimate.ci95 or ())
-    return f"{estimate.mean / unit:{form}}" + (f" [{ends}]" if ends else "")

@@ -68,22 +68,13 @@ def tabulate(episodes: Mapping[str, Mapping[str, Floats]], against: str) -> list
     return cells
 
 
-def _ends(estimate: Estimate) -> tuple[float, float, float]:
-    return (estimate.mean, *(estimate.ci95 or (estimate.mean, estimate.mean)))
-
-
 def to_markdown(cells: Sequence[Cell], against: str) -> str:
     """``table.md``: radius error and lost crystals; then the paired differences."""
 
     def error(cell: Cell) -> str:
-        mean, low, high = _ends(cell.rmse)
         lost = f", {100.0 * cell.lost.mean:.1f} % lost" if cell.lost.mean else ""
         worst = f", worst seed {cell.worst:.3f}" if cell.seeds > 1 else ""
-        return f"{mean:.3f} [{low:.3f}, {high:.3f}]{lost}{worst}"
-
-    def apart(cell: Cell) -> str:
-        mean, low, high = (value / MICRON for value in _ends(cell.apart))
-        return f"{mean:+.0f} [{low:+.0f}, {high:+.0f}]"
+        return f"{cell.rmse.text('.3f')}{lost}{worst}"
 
     others = [cell for cell in cells if cell.controller != against]
     return f"""# Agents on other plants
@@ -95,16 +86,15 @@ crystals lost; on {" and ".join(OBSERVABLE)} against the radius that sensors can
 
 The same less `{against}`'s, crystal by crystal [µm]; negative is better.
 
-{_table(others, apart)}
+{_table(others, lambda cell: cell.apart.text("+.0f", MICRON))}
 """
 
 
 def _table(cells: Sequence[Cell], tell: Callable[[Cell], str]) -> str:
     names = list(dict.fromkeys(cell.controller for cell in cells))
-    cells_of: dict[str, dict[str, str]] = {}
-    for cell in cells:
-        cells_of.setdefault(cell.row, {})[cell.controller] = tell(cell)
-    return table(("row", *names), ((row, *(by_name[name] for name in names)) for row, by_name in cells_of.items()))
+    told = {(cell.row, cell.controller): tell(cell) for cell in cells}
+    rows = dict.fromkeys(cell.row for cell in cells)
+    return table(("row", *names), ((row, *(told[row, name] for name in names)) for row in rows))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
