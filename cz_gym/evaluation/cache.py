@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from cz_gym.atomic_files import write_files
 from cz_gym.config import Config
@@ -28,9 +27,8 @@ from .files import EPISODES, read_episodes
 from .metrics import metric_names
 from .protocol import Row
 from .results import BOUND, EXAMPLES, Controller, Part, Sample
-from .rollout import Signals
+from .rollout import Floats, Signals
 
-Floats = npt.NDArray[np.float64]
 BLOCK = 10
 """Episodes run at once."""
 MAX_BYTES = 64_000_000

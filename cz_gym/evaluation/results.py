@@ -8,14 +8,12 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from .metrics import metric_names, metrics
 from .protocol import Row
-from .rollout import Rollout, Signals
+from .rollout import Floats, Rollout, Signals
 from .statistics import Estimate, Resamples, cvar, differences, means, optimality_gap, probability_of_improvement
 
-Floats = npt.NDArray[np.float64]
 REFERENCE = "paper"
 """Controller that paired differences are taken against."""
 BOUND = "clairvoyant"

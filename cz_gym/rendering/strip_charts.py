@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from cz_gym.config import Config
 from cz_gym.units import HOUR, MINUTE, MM, MM_PER_MIN
@@ -16,10 +15,9 @@ from . import palette
 from .canvas import Box, Canvas, paired
 from .geometry import first_at_least
 from .palette import Colour
-from .record import Record
+from .record import Floats, Record
 from .triple_point import RANGES, TOLERANCE
 
-Floats = npt.NDArray[np.float64]
 TICKS = (1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0)
 """Steps of the time axis [min]."""
 SMOOTH = 5.0 * MINUTE

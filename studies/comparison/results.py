@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from cz_gym.agents.agent_file.contract import read_json
 from cz_gym.agents.training.recipes import OWN_WEIGHTS
@@ -22,9 +21,8 @@ from cz_gym.agents.training.validation import costs
 from cz_gym.atomic_files import write_files
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation.metrics import metrics
-from cz_gym.evaluation.rollout import rollout
+from cz_gym.evaluation.rollout import Floats, rollout
 
-Floats = npt.NDArray[np.float64]
 SCENARIO, TRANSFER = "randomized", "hard"
 """What crystals are drawn from, whatever an agent was trained on; and a scenario to transfer to."""
 RMSE, ACTIVITY, COST, LOST = "rmse_mm", "pull_step_rms_mm_per_min", "cost", "failure_rate"

@@ -12,16 +12,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
 from cz_gym.atomic_files import write_files
 from cz_gym.commands import OneLineParser
 from cz_gym.evaluation.files import EPISODES, read_episodes
-from cz_gym.evaluation.statistics import Estimate, Resamples, differences, means
+from cz_gym.evaluation.statistics import Estimate, Floats, Resamples, differences, means
 from studies.markdown import table
 
-Floats = npt.NDArray[np.float64]
 OBSERVABLE = ("sensor-fault", "puller")
 """Rows with an offset that no sensor shows: the error against what can be seen is counted there."""
 MICRON = 1e-3

@@ -26,7 +26,7 @@ from cz_gym.episodes.scenarios import PULLER, RANDOMIZED
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import Course, rollout
-from cz_gym.physics.linearisation import StateSpace, radius_model
+from cz_gym.physics.linearisation import Floats, StateSpace, radius_model
 from cz_gym.physics.plant import make_puller
 from cz_gym.units import MINUTE
 
@@ -36,7 +36,6 @@ from .step_tests import (
     LIMITS,
     MIX,
     STEP_TESTS,
-    Floats,
     Interface,
     crystal,
     jump_gains,

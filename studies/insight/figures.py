@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from cz_gym.evaluation.report.canvas import GREY, INK, canvas, png, styles
-from cz_gym.evaluation.rollout import Signals
+from cz_gym.evaluation.rollout import Floats, Signals
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
-from .linear_agent import Floats
 from .loop import Responses
 from .step_tests import BEGIN, JUMPS, RIPPLE, SPANS, STEP_TESTS
 

@@ -24,10 +24,9 @@ from cz_gym.observation import (
     scales,
     undo_differences,
 )
-from cz_gym.physics.linearisation import StateSpace
+from cz_gym.physics.linearisation import Floats, StateSpace
 from cz_gym.task import drives_of
 
-Floats = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 SEEN = ("ring_error", "T_1", "v_p", "Q_H")
 """Readings through which the plant reaches an agent: ring [m], pyrometer [K], applied drives [m/s, W]."""

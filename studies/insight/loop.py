@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cz_gym.baselines.analysis import frequency, sampled_loop
-from cz_gym.physics.linearisation import StateSpace
+from cz_gym.physics.linearisation import Floats, StateSpace
 from cz_gym.physics.plant import make_puller
 from cz_gym.units import HOUR, KILO, MM, MM_PER_MIN
 
-from .linear_agent import Complex, Floats
+from .linear_agent import Complex
 from .step_tests import MIX, Interface
 
 RING, PYROMETER = 0, 1

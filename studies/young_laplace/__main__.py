@@ -14,17 +14,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numpy.polynomial import chebyshev
 from scipy.optimize import brentq
 
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser
 from cz_gym.physics import young_laplace as exact
+from cz_gym.physics.linearisation import Floats
 from cz_gym.physics.meniscus import profile, ring_point
 from cz_gym.physics.young_laplace_table import RING, SLOPE, TAIL
 
-Floats = npt.NDArray[np.float64]
 SIZES = ((9, 16), (9, 22), (7, 8))
 """Coefficients in the two variables of SLOPE, RING and TAIL."""
 TABLE = Path(exact.__file__).with_name("young_laplace_table.py")
