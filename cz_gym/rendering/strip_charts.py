@@ -56,17 +56,12 @@ def draw(canvas: Canvas, upper: Box, lower: Box, record: Record, blind: bool = F
     _draw_pull(canvas, lower, record)
 
 
-def error_plot(canvas: Canvas, box: Box) -> Box:
-    """The part of the error chart's panel that lines are drawn in."""
-    unit = canvas.unit
-    return box.inner(38.0 * unit, 18.0 * unit, 10.0 * unit, 14.0 * unit)
-
-
 def draw_errors(
     canvas: Canvas, box: Box, records: Sequence[tuple[Record, Colour]], camera: Record | None = None
 ) -> None:
     """True radius errors against time, one line a record; ``camera`` adds what it saw, and can stand alone."""
-    plot, limit, traces = error_plot(canvas, box), error_range([record for record, _ in records]), []
+    unit, limit, traces = canvas.unit, error_range([record for record, _ in records]), []
+    plot = box.inner(38.0 * unit, 18.0 * unit, 10.0 * unit, 14.0 * unit)
     config = (camera or records[0][0]).config
     if camera is not None:
         seen = camera.seen_error

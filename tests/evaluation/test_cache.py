@@ -46,7 +46,7 @@ def sample(folder: Path, policy: Any = None, config: Any = CONFIG, seeds: Any = 
     row: Any = SimpleNamespace(name="some", config=lambda *_: config, design_config=lambda *_: config)
     bar = tqdm(disable=True)
     plan: Any = SimpleNamespace(cache=folder, seeds=lambda *_: seeds)
-    job = Job(plan, row, Contender(WHO, lambda _: [policy or Snail()]), bar)
+    job = Job(plan, row, Contender(WHO, lambda _: [policy or Snail()]))
     for number, part in runner.in_turn(job.pieces, bar):
         job.keep(job.pieces[number], part)
     return job.sample()

@@ -129,7 +129,7 @@ def test_blind_shows_nothing_that_only_the_truth_can_tell_until_the_score(config
     def watch(record: Any, set_points: Any, overlay: Any, blind: bool) -> Any:
         shown.append(blind)
         if len(shown) == 2:
-            game.end()
+            game.running = False
         else:
             game.finish(failed=False)
         return draw(record, set_points, overlay, blind)
