@@ -26,13 +26,9 @@ from .lqg import figures
 from .lqg_goals import FAILURE_PENALTY
 
 BASES = ("lqg", "lqg-quiet", "lqg-active")
+"""What is swept: ``randomized``'s settings where a scenario has none, but for the last."""
 FACTORS = tuple(4.0**power for power in range(-3, 6))
 """Multiples of the shipped weight on pull steps that are swept."""
-
-
-def bases_for(scenario: str) -> list[str]:
-    """What is swept: ``randomized``'s settings where a scenario has none, but for "lqg-active"."""
-    return [base for base in BASES if base != "lqg-active" or (base, scenario) in SHIPPED]
 
 
 def sweep(base: str, scenario: str, episodes: int) -> list[dict[str, Any]]:
@@ -82,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _sweep(given: argparse.Namespace) -> None:
     output = given.output or Path("results") / "tuning" / f"lqg-frontier-{given.scenario}.json"
     check_writable(output.parent)
-    bases = bases_for(given.scenario)
+    bases = [base for base in BASES if base != BASES[-1] or (base, given.scenario) in SHIPPED]
     swept = {base: sweep(base, given.scenario, given.episodes) for base in bases}
     finals = [
         [final(base, given.scenario, activity, weight_for(activity, swept[base]), given.validation) for base in bases]

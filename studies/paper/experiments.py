@@ -187,9 +187,9 @@ def cases(model: str) -> tuple[Trace, Trace]:
     return trace(PRINTED, model, "reference-a"), trace(PRINTED, model, "reference-b")
 
 
-def ramp(model: str, policy: Any = PRINTED) -> Trace:
+def ramp(model: str, policy: Any = PRINTED, meniscus: MeniscusModel = HURLE) -> Trace:
     """The paper's temperature ramp."""
-    return trace(policy, model, "paper-ramp")
+    return trace(policy, model, "paper-ramp", meniscus=meniscus)
 
 
 def ramp_numbers(run: Trace) -> dict[str, float]:

@@ -77,8 +77,7 @@ def confirm(study: Study, search: Search, given: argparse.Namespace) -> None:
     from studies.comparison.variants import Study as Comparison
     from studies.comparison.variants import Variant
 
-    from .space import params_of, recipe_of
-    from .trials import finished
+    from .trials import finished, params_of, recipe_of
 
     complete = sorted(filter(search.is_complete, finished(study)), key=lambda each: each.values)
     best = [trial for trial in complete if trial.params != params_of(PPO())][: given.finalists]
