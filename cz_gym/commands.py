@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 from gymnasium.error import DependencyNotInstalled
@@ -22,6 +22,17 @@ class OneLineParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Exit with code 2."""
         self.exit(2, f"{self.prog}: {' '.join(message.split())}\n")
+
+    def run(
+        self,
+        body: Callable[[argparse.Namespace], int | None],
+        arguments: Sequence[str] | None,
+        extra: str,
+        left: str = "nothing written",
+    ) -> int:
+        """Run a command's body on what was given, as :func:`guarded` does; returns the exit code."""
+        given = self.parse_args(arguments)
+        return guarded(self.prog, lambda: body(given) or 0, extra, left)
 
 
 def between(least: int, most: int) -> Callable[[str], int]:

@@ -17,7 +17,6 @@ from scipy.signal import ss2tf
 from cz_gym.baselines.pid.compensated_pid import Compensator, SeriesPID
 from cz_gym.physics.linearisation import RadiusModel, StateSpace
 
-Floats = npt.NDArray[np.float64]
 CUT_OFF = Compensator().slow
 """The paper's high-pass cut-off [rad/s]."""
 _ROUNDING = 1e3 * float(np.finfo(np.float64).eps)

@@ -7,12 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.physics.linearisation import StateSpace
+from cz_gym.physics.linearisation import Floats, StateSpace
 from cz_gym.physics.plant import Puller
 
 from .sampled_loop import Loop, close
 
-Floats = npt.NDArray[np.float64]
 SLOWEST = 1e-4
 """Lowest frequency of the tables [rad/s]: 17 hours a turn, below the drift of any episode."""
 

@@ -111,8 +111,7 @@ class EkfMpc(MeasuredController):
         optimal = previous + scale * (prediction.outputs[:, 0, 3:] + corrections[:, :U])
         moved = np.where(usable[:, None], optimal, law)
         moved = np.clip(moved, previous - scale * self.limits.move, previous + scale * self.limits.move)
-        inputs: Floats = np.clip(moved, -scale * self.limits.span, scale * self.limits.span)
-        return inputs
+        return np.clip(moved, -scale * self.limits.span, scale * self.limits.span)
 
 
 def newton(

@@ -57,10 +57,8 @@ class Shape:
     def selectors(self) -> Floats:
         """Which corrections a stage adds to its moves, shape (stages, 2, corrections)."""
         chosen = np.zeros((self.stages, U, self.corrections))
-        first = 0
-        for block, length in enumerate(self.blocks):
-            chosen[first : first + length, :, U * block : U * block + U] = np.eye(U)
-            first += length
+        for stage, block in enumerate(np.repeat(np.arange(len(self.blocks)), self.blocks)):
+            chosen[stage, :, U * block : U * block + U] = np.eye(U)
         return chosen
 
 

@@ -18,7 +18,7 @@ from scipy.optimize import NonlinearConstraint, minimize
 
 from cz_gym.baselines.lqg.controller import LQG, LQGSettings
 from cz_gym.baselines.policy import Floats
-from cz_gym.commands import OneLineParser, between, guarded
+from cz_gym.commands import OneLineParser, between
 from cz_gym.config import make_config
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 
@@ -107,17 +107,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--finalists", type=between(1, 1000), default=3, help="candidates that meet the validation seeds")
     parser.add_argument("--history", type=Path, help="choose again from this kept history, without a search")
     parser.add_argument("--output", type=Path, default=None, help="default in results/tuning")
-    given = parser.parse_args(arguments)
-    left = "the same command goes on from the candidates in its history"
-    return guarded(parser.prog, lambda: _tune(given), "benchmark", left)
+    return parser.run(_tune, arguments, "benchmark", "the same command goes on from the candidates in its history")
 
 
-def _tune(given: argparse.Namespace) -> int:
+def _tune(given: argparse.Namespace) -> None:
     search = LQGSearch(given.controller, given.scenario, {name: getattr(given, name) for name in BUDGET})
     path = given.output or Path("results/tuning") / file_name(given.controller, given.scenario)
     chosen = search.tune(path, given.history)
     print(search.settings(chosen.values))
-    return 0
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ import numpy as np
 
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.baselines.lqg.settings import ACTIVITIES, SHIPPED, settings_of, with_pull_step
-from cz_gym.commands import OneLineParser, between, guarded
+from cz_gym.commands import OneLineParser, between
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 
 from .harness import rounded
@@ -26,13 +26,9 @@ from .lqg import figures
 from .lqg_goals import FAILURE_PENALTY
 
 BASES = ("lqg", "lqg-quiet", "lqg-active")
+"""What is swept: ``randomized``'s settings where a scenario has none, but for the last."""
 FACTORS = tuple(4.0**power for power in range(-3, 6))
 """Multiples of the shipped weight on pull steps that are swept."""
-
-
-def bases_for(scenario: str) -> list[str]:
-    """What is swept: ``randomized``'s settings where a scenario has none, but for "lqg-active"."""
-    return [base for base in BASES if base != "lqg-active" or (base, scenario) in SHIPPED]
 
 
 def sweep(base: str, scenario: str, episodes: int) -> list[dict[str, Any]]:
@@ -76,14 +72,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--episodes", type=between(1, 10_000), default=50, help="training episodes a weight")
     parser.add_argument("--validation", type=between(1, 500), default=100, help="validation episodes a final")
     parser.add_argument("--output", type=Path, default=None, help="default in results/tuning")
-    given = parser.parse_args(arguments)
-    return guarded(parser.prog, lambda: _sweep(given), "benchmark")
+    return parser.run(_sweep, arguments, "benchmark")
 
 
-def _sweep(given: argparse.Namespace) -> int:
+def _sweep(given: argparse.Namespace) -> None:
     output = given.output or Path("results") / "tuning" / f"lqg-frontier-{given.scenario}.json"
     check_writable(output.parent)
-    bases = bases_for(given.scenario)
+    bases = [base for base in BASES if base != BASES[-1] or (base, given.scenario) in SHIPPED]
     swept = {base: sweep(base, given.scenario, given.episodes) for base in bases}
     finals = [
         [final(base, given.scenario, activity, weight_for(activity, swept[base]), given.validation) for base in bases]
@@ -98,7 +93,6 @@ def _sweep(given: argparse.Namespace) -> int:
     }
     write_files({output: (json.dumps(found, indent=1) + "\n").encode()})
     print(json.dumps(found["chosen"], indent=1))
-    return 0
 
 
 if __name__ == "__main__":

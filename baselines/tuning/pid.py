@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from cz_gym.commands import OneLineParser, between, guarded
+from cz_gym.commands import OneLineParser, between
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 from cz_gym.units import MM_PER_MIN
 
@@ -126,19 +126,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--validation", type=between(1, len(VALIDATION_SEEDS)), default=200, help="validation episodes, at most 500")
     parser.add_argument("--seed", type=int, default=0, help="seed of the search")
     parser.add_argument("--out", type=Path, default=Path("results/tuning"), help="folder of histories and choices")
-    given = parser.parse_args(arguments)
-    left = "the same command goes on from the trials in its history"
-    return guarded(parser.prog, lambda: _tune(given), "agents", left)
+    return parser.run(_tune, arguments, "agents", "the same command goes on from the trials in its history")
 
 
-def _tune(given: argparse.Namespace) -> int:
+def _tune(given: argparse.Namespace) -> None:
     budget = {name: getattr(given, name) for name in BUDGET}
     space = space_of(given.controller, given.scenario)
     search = PIDSearch(space, given.scenario, budget, given.seed)
     chosen = search.tune(given.out / file_name(space.name, given.scenario))
     print(f"{space.name} on {given.scenario}: {chosen.score:.4f} {chosen.facts}")
     print(search.settings(chosen.values))
-    return 0
 
 
 if __name__ == "__main__":

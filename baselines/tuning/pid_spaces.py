@@ -31,7 +31,7 @@ class Space(NamedTuple):
     parameters: tuple[Parameter, ...]
     allowed_step: float
     """Mean pull step RMS allowed [m/s]."""
-    rule: Callable[[Any], float]
+    rule: Callable[[Any], float] = lambda policy: 0.0
     """How far a design breaks the controller's own rule; 0 if it keeps it."""
 
 
@@ -70,11 +70,6 @@ _NOMINAL = make_puller(lam=1.0), make_puller(lam=0.0)
 """Models I and II."""
 
 
-def no_rule(policy: Any) -> float:
-    """Every design will do."""
-    return 0.0
-
-
 def too_sensitive(policy: FilteredPID) -> float:
     """A mild rule, sensitivity peak at most SENSITIVITY: relative excess on the worse nominal model, priced [-]."""
     free, dt = linear_form(policy).free, policy.control_interval
@@ -88,11 +83,6 @@ def over_half_the_zero(policy: FilteredPID) -> float:
     """
     free, dt = linear_form(policy).free, policy.control_interval
     return max(0.0, *(crossover(free, each, dt) / (0.5 * radius_model(each).zero) - 1.0 for each in _NOMINAL))
-
-
-def conventional(policy: FilteredPID) -> float:
-    """Both rules."""
-    return over_half_the_zero(policy) + too_sensitive(policy)
 
 
 _STEP = 0.029 * MM_PER_MIN
@@ -119,15 +109,9 @@ _CONVENTIONAL = FilteredPID(
 _INDUSTRIAL = Industrial(heater=TemperatureLoop(K_pull=3.0))
 SPACES = (
     Space("paper-tuned", _TUNED, (*LOOP, *COMPENSATOR), _STEP, too_sensitive),
-    Space("paper-filtered", FilteredPID(), (Parameter("T_f", 2.0, 200.0),), np.inf, no_rule),
-    Space(
-        "pid-conventional",
-        _CONVENTIONAL,
-        LOOP,
-        _STEP,
-        conventional,
-    ),
-    Space("industrial", _INDUSTRIAL, (Parameter("T_f", 1.0, MINUTE), *HEATER), np.inf, no_rule),
+    Space("paper-filtered", FilteredPID(), (Parameter("T_f", 2.0, 200.0),), np.inf),
+    Space("pid-conventional", _CONVENTIONAL, LOOP, _STEP, lambda one: over_half_the_zero(one) + too_sensitive(one)),
+    Space("industrial", _INDUSTRIAL, (Parameter("T_f", 1.0, MINUTE), *HEATER), np.inf),
 )
 """Every search."""
 

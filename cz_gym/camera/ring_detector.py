@@ -120,8 +120,7 @@ class RingDetector:
         middle = float(np.median(shaped))
 
         def misses(radius: Floats) -> Floats:
-            missed: Floats = distance - radius
-            return missed
+            return distance - radius
 
         fit = least_squares(misses, [middle], loss="soft_l1", f_scale=ROBUST, xtol=1e-12)
         return Ring(float(fit.x[0]) - self.bias, edges)

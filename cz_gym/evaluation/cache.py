@@ -15,10 +15,9 @@ import zipfile
 from collections.abc import Collection, Iterable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from cz_gym.atomic_files import write_files
 from cz_gym.config import Config
@@ -27,10 +26,9 @@ from cz_gym.jit.cache import compiled_sources
 from .files import EPISODES, read_episodes
 from .metrics import metric_names
 from .protocol import Row
-from .results import BOUND, EXAMPLES, Controller, Part, Sample
-from .rollout import Signals
+from .results import BOUND, Controller, Part, Sample
+from .rollout import Floats, Signals
 
-Floats = npt.NDArray[np.float64]
 BLOCK = 10
 """Episodes run at once."""
 MAX_BYTES = 64_000_000
@@ -39,55 +37,30 @@ PRINTED = 1e-4
 """Relative precision of the figures in ``episodes.csv``, five digits [-]."""
 
 
-class CachedEpisode(NamedTuple):
-    """What the cache has of one episode."""
-
-    values: Floats
-    """Shape (metrics,)."""
-    microseconds: float
-    """Time in the policy per step [us]."""
-    signals: Floats
-    """Signals of one of the first episodes, shape (signals, steps); of the others empty."""
-
-
 class SlowEpisodes:
     """The cached episodes of a slow controller, whose ``policy`` has a ``hash`` of its settings."""
 
     def __init__(self, controller: Controller, policy: Any, config: Config, folder: Path) -> None:
-        self.place = _place(controller, policy, config, folder)
+        parts = [controller.name, policy.hash, code_behind(type(policy).__module__), config.hash, *metric_names()]
+        digest = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
+        self.place = folder / f"{controller.name}-{config.scenario.name}-{digest}"
 
     def read(self, seeds: Sequence[int], examples: Collection[int]) -> list[Part]:
         """Those of some seeds that are there, each a part; of the ``examples`` those that have their signals."""
-        found = {seed: read_episode(self.place / f"{seed}.npz", seed in examples) for seed in seeds}
-        return [
-            Part((seed,), each.values[None], each.microseconds, {seed: each.signals} if seed in examples else {})
-            for seed, each in found.items()
-            if each is not None
-        ]
+        found = (read_episode(self.place / f"{seed}.npz", seed in examples) for seed in seeds)
+        return [part for part in found if part]
 
     def write(self, part: Part) -> None:
         """Keep a part."""
-        none = np.zeros((0, 0))
-        packed = {
-            self.place / f"{seed}.npz": _packed(CachedEpisode(row, part.microseconds, part.signals.get(seed, none)))
-            for seed, row in zip(part.seeds, part.values, strict=True)
-        }
+        none, packed = np.zeros((0, 0)), {}
+        for seed, row in zip(part.seeds, part.values, strict=True):
+            file, signals = io.BytesIO(), part.signals.get(seed, none)
+            np.savez_compressed(file, values=row, microseconds=part.microseconds, signals=signals)
+            packed[self.place / f"{seed}.npz"] = file.getvalue()
         write_files(packed)
 
 
-def is_cached(controller: Controller, policy: Any, config: Config, seeds: Sequence[int], folder: Path) -> bool:
-    """Whether every one of these episodes is there."""
-    place = _place(controller, policy, config, folder)
-    return all(read_episode(place / f"{seed}.npz", seed in seeds[:EXAMPLES]) for seed in seeds)
-
-
-def _place(controller: Controller, policy: Any, config: Config, folder: Path) -> Path:
-    parts = [controller.name, policy.hash, code_behind(type(policy).__module__), config.hash, *metric_names()]
-    digest = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
-    return folder / f"{controller.name}-{config.scenario.name}-{digest}"
-
-
-def read_episode(path: Path, example: bool) -> CachedEpisode | None:
+def read_episode(path: Path, example: bool) -> Part | None:
     """A cached episode, with its signals if it is an ``example``; None if there is none that can be used."""
     try:
         with open(path, "rb") as file:
@@ -97,19 +70,15 @@ def read_episode(path: Path, example: bool) -> CachedEpisode | None:
             if len(content) > MAX_BYTES or sum(part.file_size for part in archive.infolist()) > MAX_BYTES:
                 return None
         with np.load(io.BytesIO(content), allow_pickle=False) as data:
-            found = CachedEpisode(data["values"], float(data["microseconds"]), data["signals"])
+            seed, microseconds = int(path.stem), float(data["microseconds"])
+            values, signals = data["values"], data["signals"]
     except Exception:  # zipfile, zlib and NumPy each raise their own for the ways a file can be broken
         return None
-    signals = found.signals
     logged = signals.ndim == 2 and len(signals) == len(Signals._fields) and signals.size > 0
-    numbers = found.values.dtype == signals.dtype == np.float64
-    return found if numbers and found.values.shape == (len(metric_names()),) and (logged or not example) else None
-
-
-def _packed(episode: CachedEpisode) -> bytes:
-    file = io.BytesIO()
-    np.savez_compressed(file, values=episode.values, microseconds=episode.microseconds, signals=episode.signals)
-    return file.getvalue()
+    sound = values.dtype == signals.dtype == np.float64 and values.shape == (len(metric_names()),)
+    if not sound or (example and not logged):
+        return None
+    return Part((seed,), values[None], microseconds, {seed: signals} if example else {})
 
 
 def earlier_bound(folder: Path, row: Row, samples: Sequence[Sample]) -> Sample | None:

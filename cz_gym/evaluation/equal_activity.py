@@ -18,12 +18,10 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.interpolate import PchipInterpolator
 
-from .statistics import LEVEL, Resamples
+from .statistics import LEVEL, Floats, Resamples
 
-Floats = npt.NDArray[np.float64]
 Point = tuple[float, float]
 """Pull activity [mm/min] and radius error [mm]."""
 

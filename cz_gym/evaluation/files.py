@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
@@ -132,16 +132,22 @@ def software(packages: Sequence[str]) -> dict[str, Any]:
 
 def to_csv(benchmark: Benchmark) -> str:
     """``episodes.csv``: one line an episode."""
+    rows = (
+        (scenario.row.name, outcome.controller.name, training_seed, seed, *(f"{value:.5g}" for value in values))
+        for scenario in benchmark.scenarios
+        for outcome in scenario.outcomes
+        for training_seed, episodes in zip(
+            outcome.controller.training_seeds or ("",), outcome.sample.values, strict=True
+        )
+        for seed, values in zip(outcome.sample.seeds, episodes, strict=True)
+    )
+    return csv_text(("scenario", "controller", "training_seed", "seed", *metric_names()), rows)
+
+
+def csv_text(heads: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
+    """A table as CSV."""
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("scenario", "controller", "training_seed", "seed", *metric_names()))
-    for scenario in benchmark.scenarios:
-        for outcome in scenario.outcomes:
-            trained = outcome.controller.training_seeds or ("",)
-            for training_seed, episodes in zip(trained, outcome.sample.values, strict=True):
-                for seed, values in zip(outcome.sample.seeds, episodes, strict=True):
-                    numbers = (f"{value:.5g}" for value in values)
-                    writer.writerow((scenario.row.name, outcome.controller.name, training_seed, seed, *numbers))
+    csv.writer(text, lineterminator="\n").writerows([heads, *rows])
     return text.getvalue()
 
 

@@ -8,14 +8,12 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from .metrics import metric_names, metrics
 from .protocol import Row
-from .rollout import Rollout, Signals
+from .rollout import Floats, Rollout, Signals
 from .statistics import Estimate, Resamples, cvar, differences, means, optimality_gap, probability_of_improvement
 
-Floats = npt.NDArray[np.float64]
 REFERENCE = "paper"
 """Controller that paired differences are taken against."""
 BOUND = "clairvoyant"
@@ -90,13 +88,6 @@ class Sample:
     control_interval: float
 
     @classmethod
-    def of(cls, controller: Controller, runs: Sequence[Rollout]) -> Sample:
-        """The sample of a controller's rollouts, one a training seed, all on the same episodes."""
-        seeds = runs[0].seeds
-        parts = [[Part.of(run, frozenset(seeds[:EXAMPLES]))] for run in runs]
-        return cls.joined(controller, seeds, parts, runs[0].config.control_interval)
-
-    @classmethod
     def joined(
         cls, controller: Controller, seeds: Sequence[int], parts: Sequence[Sequence[Part]], control_interval: float
     ) -> Sample:
@@ -118,8 +109,7 @@ class Sample:
 
     def metric(self, name: str) -> Floats:
         """One metric, shape (training seeds or 1, episodes)."""
-        values: Floats = self.values[:, :, metric_names().index(name)]
-        return values
+        return self.values[:, :, metric_names().index(name)]
 
     def first(self, episodes: int) -> Sample:
         """The same sample on its first episodes."""
@@ -163,12 +153,12 @@ class Verdict:
     @property
     def wins(self) -> bool:
         """Whether the agent's RMSE is lower: the whole interval of the difference, or the one episode."""
-        return (self.difference.ci95[1] if self.difference.ci95 else self.difference.mean) < 0.0
+        return self.difference.ends[1] < 0.0
 
     @property
     def loses(self) -> bool:
         """Whether the rival's RMSE is lower, in the same sense."""
-        return (self.difference.ci95[0] if self.difference.ci95 else self.difference.mean) > 0.0
+        return self.difference.ends[0] > 0.0
 
 
 @dataclass(frozen=True)

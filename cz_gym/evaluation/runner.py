@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from cz_gym.config import Config
 
-from .cache import BLOCK, SlowEpisodes, earlier_bound, is_cached
+from .cache import BLOCK, SlowEpisodes, earlier_bound
 from .contenders import Contender
 from .protocol import SLOW_EPISODES, Row
 from .results import EXAMPLES, Benchmark, Controller, Part, Sample, summarise
@@ -55,16 +55,10 @@ class Plan:
 
     def is_cached(self, contender: Contender) -> bool:
         """Whether every episode of a slow controller is cached, so that none would be run."""
-        return all(self._row_is_cached(contender, row) for row in self.rows)
-
-    def _row_is_cached(self, contender: Contender, row: Row) -> bool:
-        controller = contender.controller
         try:
-            (policy,) = contender.make(row.design_config(controller.observation))
+            return not any(Job(self, row, contender).pieces for row in self.rows)
         except ImportError:  # what it needs is not installed
             return False
-        config, seeds = row.config(controller.observation, controller.action), self.seeds(controller, row)
-        return self.cache is not None and is_cached(controller, policy, config, seeds, self.cache)
 
 
 class Piece(NamedTuple):
@@ -117,8 +111,9 @@ def on_cluster(pieces: Sequence[Piece], bar: Any) -> Iterator[tuple[int, Part]]:
 
 def run(plan: Plan, bar: Any, perform: Perform = in_turn) -> Benchmark:
     """Roll every contender out on every row and summarise; ``bar`` is tqdm's, over the steps of the run."""
-    jobs = [Job(plan, row, contender, bar) for row in plan.rows for contender in plan.contenders]
+    jobs = [Job(plan, row, contender) for row in plan.rows for contender in plan.contenders]
     pieces = [(job, piece) for job in jobs for piece in job.pieces]
+    bar.update(plan.steps - sum(piece.steps for _, piece in pieces))
     for number, part in perform([piece for _, piece in pieces], bar):
         pieces[number][0].keep(pieces[number][1], part)
     scenarios = []
@@ -141,7 +136,7 @@ def _same(policy: Any, config: Config) -> Any:
 class Job:
     """A contender on a row: its pieces, and the sample that they make."""
 
-    def __init__(self, plan: Plan, row: Row, contender: Contender, bar: Any) -> None:
+    def __init__(self, plan: Plan, row: Row, contender: Contender) -> None:
         controller = contender.controller
         self.row, self.controller, self.slow = row, controller, None
         self.config = row.config(controller.observation, controller.action)
@@ -156,10 +151,8 @@ class Job:
                     f"the slow controller {controller.name!r} needs a folder for its episodes, and one policy"
                 )
             self.slow = SlowEpisodes(controller, policies[0], self.config, plan.cache)
-            known = self.slow.read(self.seeds, self.seeds[:EXAMPLES])
-            bar.update(sum(len(part.seeds) for part in known) * self.config.steps)
-            self.parts[0] += known
-            found = {seed for part in known for seed in part.seeds}
+            self.parts[0] += self.slow.read(self.seeds, self.seeds[:EXAMPLES])
+            found = {seed for part in self.parts[0] for seed in part.seeds}
             missing, at_once = tuple(seed for seed in missing if seed not in found), BLOCK
         # A learned policy is there already; another is made where it runs, as not all can be sent.
         made = contender.make(design) if controller.learned else None

@@ -33,6 +33,16 @@ class Estimate(NamedTuple):
     ci95: tuple[float, float] | None
     n: int
 
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The interval's ends; twice the mean without one."""
+        return self.ci95 or (self.mean, self.mean)
+
+    def text(self, form: str, unit: float = 1.0) -> str:
+        """The mean in some unit, with its interval if it has one."""
+        mean, *ends = (f"{value / unit:{form}}" for value in (self.mean, *(self.ci95 or ())))
+        return f"{mean} [{', '.join(ends)}]" if ends else mean
+
 
 @dataclass(frozen=True)
 class Resamples:
@@ -117,8 +127,7 @@ def optimality_gap(costs: Floats, reference: Floats, bound: Floats, resamples: R
 def _tail_mean(descending: Floats, weights: Floats, tail: float) -> Floats:
     """Mean of the first ``tail`` of the weight, one a row of ``weights``."""
     taken = np.diff(np.minimum(np.cumsum(weights, axis=1), tail), axis=1, prepend=0.0)
-    mean: Floats = taken @ descending / tail
-    return mean
+    return taken @ descending / tail
 
 
 def _resampled_means(values: Floats, resamples: Resamples, of: int = 0) -> Floats:

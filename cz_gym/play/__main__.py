@@ -6,15 +6,15 @@ import argparse
 import os
 import pkgutil
 import sys
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from cz_gym.commands import OneLineParser, guarded
+from cz_gym.commands import OneLineParser, between
 from cz_gym.units import MINUTE
 
 if TYPE_CHECKING:
     from cz_gym.config import Config
 
-PROG = "python -m cz_gym.play"
 CONTROLLERS = "cz_gym.baselines.registry:find_controller"
 """Where the paper's controller comes from: looked up by name, since this package imports no controller."""
 NO_DISPLAY = "no display: a crystal is pulled by hand in a window; set DISPLAY or WAYLAND_DISPLAY"
@@ -22,23 +22,25 @@ DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
 """Environment variables one of which names a display, on systems that have such."""
 
 
-def parse(argv: list[str] | None = None) -> argparse.Namespace:
-    """Read the command line; exits with code 2 and one line for anything that cannot be meant."""
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Play until the window is closed; 0 when done, 2 for bad input or without window, 130 when interrupted."""
     parser = OneLineParser(
-        prog=PROG,
-        description="Pull a crystal by hand, in a window, and be compared with the paper's controller on the same one.",
-        epilog="Keys: up and down the pull speed, right and left the heater (with shift: in large steps), space starts "
+        "python -m cz_gym.play",
+        "Pull a crystal by hand, in a window, and be compared with the paper's controller on the same one.",
+        "Keys: up and down the pull speed, right and left the heater (with shift: in large steps), space starts "
         "and pauses, + and - change the speed of time, R begins again, N takes the next crystal, H shows help, Q ends.",
     )
     parser.add_argument("--scenario", default="randomized", metavar="NAME", help="scenario (%(default)s)")
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="which crystal (%(default)s)")
+    parser.add_argument(
+        "--seed", type=between(0, 2**63 - 1), default=1, metavar="N", help="which crystal (%(default)s)"
+    )
     parser.add_argument(
         "--speed", type=float, default=60.0, metavar="FACTOR", help="times faster than real (%(default)g)"
     )
     parser.add_argument("--minutes", type=float, default=180.0, metavar="M", help="length of the run (%(default)g)")
     parser.add_argument("--blind", action="store_true", help="show what an operator sees: the ring, not the crystal")
     parser.add_argument("--size", default="960x720", metavar="WxH", help="size of the window in pixels (%(default)s)")
-    return parser.parse_args(argv)
+    return parser.run(_play, arguments, "render")
 
 
 def settings(arguments: argparse.Namespace) -> tuple[Config, tuple[int, int]]:
@@ -52,8 +54,6 @@ def settings(arguments: argparse.Namespace) -> tuple[Config, tuple[int, int]]:
         raise ValueError(f"--speed must be {SLOWEST:g} to {FASTEST:g}, not {arguments.speed:g}")
     if not 1.0 <= arguments.minutes <= 6000.0:
         raise ValueError(f"--minutes must be 1 to 6000, not {arguments.minutes:g}")
-    if arguments.seed < 0:
-        raise ValueError(f"--seed must not be negative, not {arguments.seed}")
     try:
         width, height = map(int, arguments.size.split("x"))
     except ValueError:
@@ -61,13 +61,7 @@ def settings(arguments: argparse.Namespace) -> tuple[Config, tuple[int, int]]:
     return make_config(arguments.scenario, horizon=arguments.minutes * MINUTE), check_size((width, height))
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Play until the window is closed; 0 when done, 2 for bad input or without window, 130 when interrupted."""
-    arguments = parse(argv)
-    return guarded(PROG, lambda: _play(arguments), "render")
-
-
-def _play(arguments: argparse.Namespace) -> int:
+def _play(arguments: argparse.Namespace) -> None:
     config, size = settings(arguments)
     if sys.platform.startswith(("linux", "freebsd")) and not any(map(os.environ.get, DISPLAYS)):
         raise ValueError(NO_DISPLAY)
@@ -90,7 +84,6 @@ def _play(arguments: argparse.Namespace) -> int:
         window.close()
     for score in scores:
         print(score.line())
-    return 0
 
 
 if __name__ == "__main__":

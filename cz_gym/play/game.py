@@ -96,7 +96,7 @@ class Game:
         """Do what a key asks for, or end when the window is closed."""
         pygame = load()
         if event.type == pygame.QUIT:
-            self.end()
+            self.running = False
         elif event.type == pygame.KEYDOWN and event.key in self._keys:
             self._keys[event.key](self, 10.0 if event.mod & pygame.KMOD_SHIFT else 1.0)
 
@@ -115,14 +115,6 @@ class Game:
         """Start or pause."""
         self.paused = not self.paused
         self.helping = self.helping and self.paused
-
-    def show_or_hide_help(self) -> None:
-        """Show or hide the help."""
-        self.helping = not self.helping
-
-    def end(self) -> None:
-        """End the game."""
-        self.running = False
 
     def advance(self, seconds: float) -> None:
         """Let so much of the player's time pass [s]."""
@@ -198,12 +190,9 @@ def _keys() -> dict[int, Callable[[Game, float], None]]:
         k.K_SPACE: lambda game, _: game.start_or_pause(),
         k.K_r: lambda game, _: game.begin(game.seed),
         k.K_n: lambda game, _: game.begin(game.seed + 1),
-        k.K_h: lambda game, _: game.show_or_hide_help(),
-        k.K_q: lambda game, _: game.end(),
-        k.K_ESCAPE: lambda game, _: game.end(),
+        k.K_h: lambda game, _: setattr(game, "helping", not game.helping),
     }
-    for key in (k.K_PLUS, k.K_KP_PLUS, k.K_EQUALS):
-        keys[key] = lambda game, _: game.change_speed(1.5)
-    for key in (k.K_MINUS, k.K_KP_MINUS):
-        keys[key] = lambda game, _: game.change_speed(1.0 / 1.5)
+    keys |= dict.fromkeys((k.K_q, k.K_ESCAPE), lambda game, _: setattr(game, "running", False))
+    keys |= dict.fromkeys((k.K_PLUS, k.K_KP_PLUS, k.K_EQUALS), lambda game, _: game.change_speed(1.5))
+    keys |= dict.fromkeys((k.K_MINUS, k.K_KP_MINUS), lambda game, _: game.change_speed(1.0 / 1.5))
     return keys

@@ -25,11 +25,6 @@ class Result(NamedTuple):
     """Return: the sum of rewards [-]."""
     failed: bool
 
-    @property
-    def note(self) -> str:
-        """What is said of a failure."""
-        return " (failed)" if self.failed else ""
-
 
 class Score(NamedTuple):
     """Both on the same crystal over the same time."""
@@ -42,11 +37,12 @@ class Score(NamedTuple):
 
     def line(self) -> str:
         """The score for a terminal."""
-        player, other = self.player, self.controller
+        both = zip((self.player, self.controller), ("by hand", "by the paper's controller"), strict=True)
+        errors = (f"{one.rmse_mm:.3f} mm {who}{' (failed)' if one.failed else ''}" for one, who in both)
         return (
-            f"{self.scenario}, crystal {self.seed}, {self.minutes:.0f} min: RMSE of the true radius "
-            f"{player.rmse_mm:.3f} mm by hand{player.note}, {other.rmse_mm:.3f} mm by the paper's controller"
-            f"{other.note}; return {player.reward:,.1f} and {other.reward:,.1f}"
+            f"{self.scenario}, crystal {self.seed}, {self.minutes:.0f} min: "
+            f"RMSE of the true radius {', '.join(errors)}; "
+            f"return {self.player.reward:,.1f} and {self.controller.reward:,.1f}"
         )
 
 
@@ -62,6 +58,5 @@ def score(config: Config, seed: int, actions: Sequence[npt.NDArray[np.float32]],
 
 
 def _result(policy: Any, config: Config, seed: int) -> Result:
-    run = rollout(policy, config, [seed])
-    found = metrics(run)
-    return Result(float(found.rmse_mm[0]), float(found.return_[0]), bool(run.failed[0]))
+    found = metrics(rollout(policy, config, [seed]))
+    return Result(float(found.rmse_mm[0]), float(found.return_[0]), bool(found.failure_rate[0]))

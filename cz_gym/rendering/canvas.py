@@ -50,18 +50,6 @@ class Box(NamedTuple):
         return Box(self.x + left, self.y + top, self.w - left - right, self.h - top - bottom)
 
 
-class Label(NamedTuple):
-    """Text that is drawn when the picture is finished."""
-
-    x: float
-    y: float
-    text: str
-    size: float
-    colour: Colour
-    anchor: str
-    bold: bool
-
-
 class Canvas:
     """A picture of a given width and height [px]; all coordinates are pixels of the picture, floats welcome."""
 
@@ -74,7 +62,8 @@ class Canvas:
         self._picture: Surface = self.pygame.Surface((width, height), 0, 32)
         self._background: Surface = self._fine.copy()
         self._panels: tuple[Box, ...] | None = None
-        self._labels: list[Label] = []
+        self._labels: list[tuple[Surface, tuple[int, int]]] = []
+        """Images of text with their upper left corners [px], drawn when the picture is finished."""
 
     def begin(self, panels: tuple[Box, ...]) -> None:
         """Begin a new picture with these panels on it."""
@@ -90,8 +79,7 @@ class Canvas:
     def finish(self) -> Surface:
         """The picture; the next one is drawn into the same surface."""
         halve(self._fine, self._picture)
-        for label in self._labels:
-            image, corner = self._placed(label)
+        for image, corner in self._labels:
             self._picture.blit(image, corner)
         return self._picture
 
@@ -167,7 +155,9 @@ class Canvas:
         bold: bool = False,
     ) -> None:
         """Text whose top is at y and whose left, centre or right (``anchor``) is at x; size in nominal px."""
-        self._labels.append(Label(x, y, text, size, colour, anchor, bold))
+        image = _glyphs(text, max(7, round(size * self.unit)), colour, bold)
+        left = {"left": 0.0, "centre": 0.5, "right": 1.0}[anchor] * image.get_width()
+        self._labels.append((image, (round(x - left), round(y))))
 
     def title(self, box: Box, title: str) -> None:
         """A panel's title."""
@@ -176,14 +166,7 @@ class Canvas:
     def remove_text(self, box: Box) -> None:
         """Remove the text that reaches into a box, which something else will cover."""
         area = self.pygame.Rect(*map(round, box))
-        placed = [(label, *self._placed(label)) for label in self._labels]
-        self._labels = [label for label, image, at in placed if not image.get_rect(topleft=at).colliderect(area)]
-
-    def _placed(self, label: Label) -> tuple[Any, tuple[int, int]]:
-        """The text's image and its upper left corner [px]."""
-        image = _glyphs(label.text, max(7, round(label.size * self.unit)), label.colour, label.bold)
-        left = {"left": 0.0, "centre": 0.5, "right": 1.0}[label.anchor] * image.get_width()
-        return image, (round(label.x - left), round(label.y))
+        self._labels = [(image, at) for image, at in self._labels if not image.get_rect(topleft=at).colliderect(area)]
 
 
 def paired(x: npt.ArrayLike, y: npt.ArrayLike) -> Points:

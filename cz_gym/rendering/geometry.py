@@ -65,13 +65,11 @@ class Scale(NamedTuple):
 
     def x(self, r: npt.ArrayLike) -> Floats:
         """Pixels across of radii [m]."""
-        found: Floats = self.x_0 + (np.asarray(r, np.float64) - self.r_0) * self.per_metre
-        return found
+        return self.x_0 + (np.asarray(r, np.float64) - self.r_0) * self.per_metre
 
     def y(self, z: npt.ArrayLike) -> Floats:
         """Pixels down of heights [m]."""
-        found: Floats = self.y_0 - np.asarray(z, np.float64) * self.per_metre
-        return found
+        return self.y_0 - np.asarray(z, np.float64) * self.per_metre
 
 
 def first_at_least(value: float, steps: tuple[float, ...]) -> float:

@@ -55,5 +55,4 @@ def colours(surface: Any) -> npt.NDArray[np.uint8]:
 
 def _pixels(surface: Any) -> npt.NDArray[np.uint32]:
     """The memory of a surface of 32 bits a pixel, 0xRRGGBB, shape (height, width)."""
-    pixels: npt.NDArray[np.uint32] = np.asarray(surface.get_view("2")).T.view(np.uint32)
-    return pixels
+    return np.asarray(surface.get_view("2")).T.view(np.uint32)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from cz_gym.task import HEATER_RANGE
 from cz_gym.units import MM
@@ -12,9 +11,8 @@ from . import palette
 from .canvas import TIMES, Box, Canvas, paired
 from .geometry import Scale, first_at_least
 from .palette import Colour
-from .record import Ending, Record
+from .record import Ending, Floats, Record
 
-Floats = npt.NDArray[np.float64]
 HALF_WIDTH = 0.29
 """Share of the panel's width that r_0 takes [-]."""
 MELT_LEVEL = 0.73

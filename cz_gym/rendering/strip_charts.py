@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from cz_gym.config import Config
 from cz_gym.units import HOUR, MINUTE, MM, MM_PER_MIN
@@ -16,10 +15,9 @@ from . import palette
 from .canvas import Box, Canvas, paired
 from .geometry import first_at_least
 from .palette import Colour
-from .record import Record
+from .record import Floats, Record
 from .triple_point import RANGES, TOLERANCE
 
-Floats = npt.NDArray[np.float64]
 TICKS = (1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0)
 """Steps of the time axis [min]."""
 SMOOTH = 5.0 * MINUTE
@@ -58,17 +56,12 @@ def draw(canvas: Canvas, upper: Box, lower: Box, record: Record, blind: bool = F
     _draw_pull(canvas, lower, record)
 
 
-def error_plot(canvas: Canvas, box: Box) -> Box:
-    """The part of the error chart's panel that lines are drawn in."""
-    unit = canvas.unit
-    return box.inner(38.0 * unit, 18.0 * unit, 10.0 * unit, 14.0 * unit)
-
-
 def draw_errors(
     canvas: Canvas, box: Box, records: Sequence[tuple[Record, Colour]], camera: Record | None = None
 ) -> None:
     """True radius errors against time, one line a record; ``camera`` adds what it saw, and can stand alone."""
-    plot, limit, traces = error_plot(canvas, box), error_range([record for record, _ in records]), []
+    unit, limit, traces = canvas.unit, error_range([record for record, _ in records]), []
+    plot = box.inner(38.0 * unit, 18.0 * unit, 10.0 * unit, 14.0 * unit)
     config = (camera or records[0][0]).config
     if camera is not None:
         seen = camera.seen_error

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
 from cz_gym.units import MM
 
@@ -16,9 +15,8 @@ from . import palette
 from .canvas import TIMES, Box, Canvas, paired
 from .geometry import Scale, clipped_height, first_at_least, meniscus_curve, ring_height
 from .palette import Colour
-from .record import Ending, Record
+from .record import Ending, Floats, Record
 
-Floats = npt.NDArray[np.float64]
 INSIDE = 11.0 * MM
 """How far the panel reaches from r_0 towards the axis, at the default puller [m]; failures lie at 8 mm."""
 BELOW, ABOVE = 9.0 * MM, 24.0 * MM

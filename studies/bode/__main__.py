@@ -19,13 +19,12 @@ from cz_gym.baselines.analysis.frequency import LoopMargins, frequencies, margin
 from cz_gym.baselines.analysis.linear_form import LinearForm, linear_form
 from cz_gym.baselines.analysis.sampled_loop import close
 from cz_gym.baselines.registry import make_controller
-from cz_gym.commands import OneLineParser, guarded
+from cz_gym.commands import OneLineParser
 from cz_gym.config import make_config
 from cz_gym.evaluation import user_code
 from cz_gym.physics.plant import Puller, make_puller
 from studies.markdown import table
 
-PROG = "python -m studies.bode"
 PLACES = {"camera": "ring", "v_p": "pull speed"}
 """Where the loop is opened, and what it is called."""
 
@@ -73,15 +72,14 @@ def picture(name: str, form: LinearForm, responses: dict[str, Any]) -> bytes:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser(prog=PROG, description=(__doc__ or "").split("\n")[0])
+    parser = OneLineParser("python -m studies.bode", (__doc__ or "").split("\n")[0])
     parser.add_argument("controller", help="name of a shipped controller, or FILE.py:NAME")
     parser.add_argument("--mix", type=float, default=0.5, help="1: Model I, 0: Model II (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("runs/bode.png"), help="picture (default: %(default)s)")
-    given = parser.parse_args(arguments)
-    return guarded(PROG, lambda: _main(given), "benchmark")
+    return parser.run(_main, arguments, "benchmark")
 
 
-def _main(given: argparse.Namespace) -> int:
+def _main(given: argparse.Namespace) -> None:
     if not 0.0 <= given.mix <= 1.0:
         raise ValueError(f"--mix must lie in [0, 1], not {given.mix:g}")
     check_writable(given.out.parent)
@@ -89,21 +87,15 @@ def _main(given: argparse.Namespace) -> int:
     found = {at: margins(form, puller, at) for at in PLACES}
     rows = []
     for at, (_, each) in found.items():
-        figures = (each.gain_up, each.gain_down, each.phase_deg, each.delay, each.sensitivity)
-        rows.append(
-            [
-                PLACES[at],
-                f"{each.crossover:.2e}",
-                *(f"{figure:.3g}" if figure == figure else "none" for figure in figures),
-            ]
-        )
+        crossing, *figures = each
+        shown = (f"{figure:.3g}" if figure == figure else "none" for figure in figures)
+        rows.append((PLACES[at], f"{crossing:.2e}", *shown))
     heads = ("opened at", "crossover [rad/s]", "gain up", "gain down", "phase [deg]", "delay [s]", "sensitivity")
     print(table(heads, rows))
     if not close(form.controller, puller, form.dt).stable:
         print("the closed loop is unstable: it has no margins")
     write_files({given.out: picture(given.controller, form, {at: values for at, (values, _) in found.items()})})
     print(f"wrote {given.out}")
-    return 0
 
 
 if __name__ == "__main__":

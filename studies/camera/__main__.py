@@ -6,13 +6,14 @@ moves with radius and height; and their answers to a sudden change of the pull s
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from cz_gym.atomic_files import check_writable, write_files
-from cz_gym.commands import OneLineParser, guarded
+from cz_gym.commands import OneLineParser
 
 from .measurements import MODELS, PULLS, make_bench, numbers, respond
 
@@ -21,14 +22,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser("python -m studies.camera", "Measure the camera's view and draw it.")
     parser.add_argument("--out", type=Path, default=Path("results/camera"), metavar="FOLDER", help="%(default)s")
-    out = parser.parse_args(arguments).out
-    return guarded(parser.prog, lambda: _study(out), "benchmark")
+    return parser.run(_study, arguments, "benchmark")
 
 
-def _study(out: Path) -> int:
+def _study(given: argparse.Namespace) -> None:
     from .figures import response_figure, section_figure, view_figure
 
-    check_writable(out)
+    check_writable(given.out)
     bench = make_bench()
     responses = [respond(bench, model, change) for change in PULLS for model in MODELS]
     text = json.dumps(numbers(bench, responses), indent=1, allow_nan=False) + "\n"
@@ -38,9 +38,8 @@ def _study(out: Path) -> int:
         "section.png": section_figure(bench),
         "response.png": response_figure(responses),
     }
-    write_files({out / name: content for name, content in files.items()})
+    write_files({given.out / name: content for name, content in files.items()})
     print(text, end="")
-    return 0
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from cz_gym.camera.image import picture
 from cz_gym.camera.rays import FLAT, MELT, Ray, Scene, first_hit, make_scene, mirror, profile_at
@@ -20,7 +19,6 @@ from cz_gym.units import MM
 
 from .measurements import Bench, Response
 
-Floats = npt.NDArray[np.float64]
 DETECTED, CLOSED, TRUE, TRACED, EDGE = COLOURS[1], COLOURS[0], INK, COLOURS[2], "#56B4E9"
 
 

@@ -15,11 +15,11 @@ from cz_gym.camera.rays import make_scene
 from cz_gym.camera.ring_detector import RingDetector, wall_edge
 from cz_gym.camera.view import Camera, View, make_view
 from cz_gym.env import CzEnv
+from cz_gym.physics.linearisation import Floats
 from cz_gym.physics.meniscus import hurle_ring_offset
 from cz_gym.physics.plant import Puller, make_puller
 from cz_gym.units import MM
 
-Floats = npt.NDArray[np.float64]
 RADII = np.linspace(-8.0, 8.0, 17) * MM
 """Radius less r_0 at which the readings are compared [m]."""
 HEIGHTS = np.linspace(-2.0, 2.0, 9) * MM

@@ -22,7 +22,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from cz_gym.commands import OneLineParser, between, guarded
+from cz_gym.commands import OneLineParser, between
 from studies.markdown import table
 
 if TYPE_CHECKING:
@@ -60,11 +60,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ):
         kind = between(1, most)
         parser.add_argument(option, type=kind, default=default, help=f"{meaning} (default: %(default)s)")
-    given = parser.parse_args(arguments)
-    return guarded(parser.prog, lambda: _main(given), "ray")
+    return parser.run(_main, arguments, "ray")
 
 
-def _main(given: argparse.Namespace) -> int:
+def _main(given: argparse.Namespace) -> None:
     piece = a_piece(given.crystals)
     walls = {}
     for nodes in (2, 1):
@@ -81,7 +80,6 @@ def _main(given: argparse.Namespace) -> int:
     rows = [(f"{n}", f"{start + walls[n]:.1f}", f"{model.seconds(given.tasks, n):.1f}") for n in sorted(walls)]
     print(table(("nodes", f"{given.tasks} tasks, measured [s]", "by the model [s]"), rows) + "\n")
     print(forecast(model))
-    return 0
 
 
 def forecast(model: Model) -> str:

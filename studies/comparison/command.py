@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cz_gym.commands import OneLineParser, between, guarded
+from cz_gym.commands import OneLineParser, between
 
 from .variants import Study, Variant
 
@@ -30,23 +30,17 @@ step RMS, by means; 1 is as good.
 
 def main(study: Study, arguments: Sequence[str] | None) -> int:
     """Command line; returns the exit code."""
-    prog = f"python -m studies.{study.name}"
-    parser = OneLineParser(prog=prog, description=study.title)
+    parser = OneLineParser(f"python -m studies.{study.name}", study.title)
     parser.add_argument("--rows", help="rows to run, joined by commas (default: all)")
     parser.add_argument("--seeds", type=between(1, 100), default=3, help="training seeds a row (default: %(default)s)")
-    parser.add_argument(
-        "--steps",
-        type=STEPS,
-        default=study.steps,
-        help=f"environment steps of what learns from reward (default: {study.steps or 'those of its recipe'})",
-    )
+    about = f"environment steps of what learns from reward (default: {study.steps or 'those of its recipe'})"
+    parser.add_argument("--steps", type=STEPS, default=study.steps, help=about)
     parser.add_argument("--jobs", type=between(1, 64), default=2, help="runs at once here (default: %(default)s)")
     add_ray(parser, "without an address on this machine's")
     add_folders(parser, study.name)
     parser.add_argument("--list", action="store_true", help="say what the rows are and how many of their runs are done")
-    given = parser.parse_args(arguments)
     left = "finished runs are kept, and the same command goes on from the others' checkpoints"
-    return guarded(prog, lambda: _main(study, given), "agents,benchmark", left)
+    return parser.run(partial(_main, study), arguments, "agents,benchmark", left)
 
 
 def add_folders(parser: OneLineParser, name: str) -> None:
@@ -73,7 +67,7 @@ def join(address: str, plan: Plan) -> Plan:
     return plan._replace(out=plan.out.resolve(), work=plan.work.resolve())
 
 
-def _main(study: Study, given: argparse.Namespace) -> int:
+def _main(study: Study, given: argparse.Namespace) -> None:
     from cz_gym.agents.training import validation
     from cz_gym.atomic_files import check_writable, locked
     from cz_gym.evaluation.cluster import completed, in_processes
@@ -88,14 +82,13 @@ def _main(study: Study, given: argparse.Namespace) -> int:
         for variant in chosen:
             done = sum(is_finished(plan, (variant, seed)) for seed in seeds)
             print(f"{variant.name:24} {done}/{given.seeds}  {variant.meaning}")
-        return 0
+        return
     check_writable(plan.out)
     with locked(plan.work):
         perform: Perform = in_turn if given.jobs == 1 else partial(in_processes, processes=given.jobs)
         if given.ray is not None:
             plan, perform = join(given.ray, plan), completed
         compare(study._replace(variants=variants), plan, chosen, seeds, perform)
-    return 0
 
 
 def compare(study: Study, plan: Plan, chosen: Sequence[Variant], seeds: Sequence[int], perform: Perform) -> None:

@@ -42,8 +42,7 @@ def forest(lines: Sequence[Line]) -> bytes:
         axis.xaxis.set_major_locator(FixedLocator([0.0, *(s * middle * 10.0**k for s in (-1, 1) for k in range(6))]))
         axis.xaxis.set_minor_locator(NullLocator())
         axis.xaxis.set_major_formatter(lambda value, position: f"{value:g}")
-        axis.set_xlabel(title)
-        axis.set_ylim(len(drawn) - 0.4, -0.6)
+        axis.set(xlabel=title, ylim=(len(drawn) - 0.4, -0.6))
     axes[0].set_yticks(range(len(drawn)), [f"{line.name} less {line.base} ({len(line.runs)})" for line in drawn])
     figure.suptitle(
         "Less than zero is better: differences on the same crystals (training seeds), 95 % intervals", fontsize=11
@@ -71,9 +70,7 @@ def curves(lines: Sequence[Line]) -> bytes:
             if axis is panels[0]:
                 axis.annotate(name, (0.99, rmse), (0, 2), axis.get_yaxis_transform(), textcoords="offset points",
                               ha="right", fontsize=8, color=INK)  # fmt: skip
-        axis.set_xscale("log")
-        axis.set_yscale("log")
-        axis.set_xlabel(title)
+        axis.set(xscale="log", yscale="log", xlabel=title)
         for each in (axis.xaxis, axis.yaxis):
             each.set_major_formatter(lambda value, position: f"{value:g}")
     panels[0].set_ylabel("validation RMSE of the radius [mm]")

@@ -7,12 +7,11 @@ frontier says what the same moves buy without learning.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 from cz_gym.baselines.lqg.settings import FAMILY
 from cz_gym.baselines.registry import make_controller
-from cz_gym.config import Config, make_config
+from cz_gym.config import make_config
 from cz_gym.evaluation.equal_activity import frontier
 
 from .results import ACTIVITY, LOST, RMSE, SCENARIO, Plan, Result, cached, judge
@@ -25,16 +24,13 @@ Family = Mapping[str, Result]
 
 def lqg_family(plan: Plan) -> Family:
     """The family on the plan's crystals; judged if that is not cached."""
-    found = {}
-    for name in FAMILY:
-        config = make_config(SCENARIO)
+    config = make_config(SCENARIO)
+
+    def judged(name: str) -> Result:
         controller: Any = make_controller(name, config)
-        found[name] = cached(plan, name, controller.settings.hash, partial(_judged, plan, controller, config))
-    return found
+        return cached(plan, name, controller.settings.hash, lambda: Result(judge(plan, controller, config)))
 
-
-def _judged(plan: Plan, controller: Any, config: Config) -> Result:
-    return Result(judge(plan, controller, config))
+    return {name: judged(name) for name in FAMILY}
 
 
 def at_equal_activity(results: list[Result], family: Family) -> float | None:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from cz_gym.agents import training
 from cz_gym.agents.agent_file.contract import read_json
@@ -26,10 +25,9 @@ from cz_gym.baselines import lqg
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation.cache import hash_sources
 from cz_gym.evaluation.metrics import metrics
-from cz_gym.evaluation.rollout import rollout
+from cz_gym.evaluation.rollout import Floats, rollout
 from cz_gym.jit.cache import compiled_sources
 
-Floats = npt.NDArray[np.float64]
 SCENARIO, TRANSFER = "randomized", "hard"
 """What crystals are drawn from, whatever an agent was trained on; and a scenario to transfer to."""
 RMSE, ACTIVITY, COST, LOST = "rmse_mm", "pull_step_rms_mm_per_min", "cost", "failure_rate"

@@ -6,13 +6,12 @@ by seed; its interval resamples both.
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from cz_gym.evaluation.files import csv_text
 from cz_gym.evaluation.statistics import Estimate, Resamples, means
 
 from .lqg_family import Family, at_equal_activity
@@ -75,16 +74,14 @@ def tabulate(variants: Sequence[Variant], runs: Mapping[str, Mapping[int, Result
 
 def to_csv(lines: Sequence[Line]) -> str:
     """``table.csv``: a line for each variant and figure."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     ends = ("mean", "low", "high")
-    writer.writerow(("name", "base", "seeds", "crystals", "figure", *ends, *(f"difference_{end}" for end in ends)))
+    heads, rows = ("name", "base", "seeds", "crystals", "figure", *ends, *(f"difference_{end}" for end in ends)), []
     for line in lines:
         for figure, cell in line.cells.items():
             numbers = [f"{each:.6g}" for part in cell if part for each in (part.mean, *(part.ci95 or ()))]
             row = (line.name, line.base, " ".join(map(str, line.runs)), cell.mean.n, figure, *numbers)
-            writer.writerow((*row, *[""] * (11 - len(row))))
-    return text.getvalue()
+            rows.append((*row, *[""] * (len(heads) - len(row))))
+    return csv_text(heads, rows)
 
 
 def to_markdown(lines: Sequence[Line], family: Family) -> list[str]:
@@ -99,16 +96,9 @@ def to_markdown(lines: Sequence[Line], family: Family) -> list[str]:
             "-" if steps is None else f"{1e-6 * steps:.1f}",
             "-" if seconds is None else f"{seconds / 60.0:.0f}",
         )
-        figures = [_text(line.cells[figure].mean, unit, form) for _, figure, unit, form in COLUMNS]
+        figures = [line.cells[figure].mean.text(form, unit) for _, figure, unit, form in COLUMNS]
         rows.append(f"| **{line.name}** | {len(line.runs)} | {' | '.join((*figures, *ends))} |")
-        if line.cells[RMSE].difference:
-            apart = [_text(line.cells[figure].difference, unit, f"+{form}") for _, figure, unit, form in COLUMNS]
+        differences = [(line.cells[figure].difference, unit, form) for _, figure, unit, form in COLUMNS]
+        if apart := [difference.text(f"+{form}", unit) for difference, unit, form in differences if difference]:
             rows.append(f"| less {line.base} | | {' | '.join(apart)} | | | |")
     return rows
-
-
-def _text(estimate: Estimate | None, unit: float, form: str) -> str:
-    if estimate is None:
-        return "-"
-    ends = ", ".join(f"{end / unit:{form}}" for end in estimate.ci95 or ())
-    return f"{estimate.mean / unit:{form}}" + (f" [{ends}]" if ends else "")

@@ -23,7 +23,7 @@ from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.analysis.sampled_loop import Loop, NotLinearError, close, late, root_mean_square
 from cz_gym.baselines.bounds.future import pullers_of
 from cz_gym.baselines.registry import CONTROLLERS, find_controller
-from cz_gym.commands import OneLineParser, between, guarded
+from cz_gym.commands import OneLineParser, between
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.physics.linearisation import StateSpace, radius_model
@@ -170,18 +170,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--pullers", type=between(1, most), default=50, help=f"random pullers for the worst case, at most {most}"
     )
     parser.add_argument("--out", type=Path, default=Path("results/design"), help="folder of design.md")
-    args = parser.parse_args(arguments)
-    return guarded(parser.prog, lambda: _tabulate(args), "benchmark")
+    return parser.run(_tabulate, arguments, "benchmark")
 
 
-def _tabulate(args: argparse.Namespace) -> int:
+def _tabulate(args: argparse.Namespace) -> None:
     check_writable(args.out)
     names = args.controllers or [entry.name for entry in CONTROLLERS if entry.default]
     rows, skipped = table(names, args.pullers)
     text = as_markdown(rows, skipped)
     write_files({args.out / "design.md": text.encode()})
     print(text, end="")
-    return 0
 
 
 if __name__ == "__main__":

@@ -13,12 +13,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cz_gym.commands import OneLineParser, guarded
+from cz_gym.commands import OneLineParser, between
 
 if TYPE_CHECKING:
     from .duel import Side
 
-PROG = "python -m studies.film"
 OUT = Path(__file__).resolve().parents[2] / "results" / "media" / "duel.gif"
 SEED = 2_000_000
 """The first test crystal, the one in the benchmark's figure."""
@@ -32,28 +31,21 @@ PAPER = (255, 130, 205)
 """Colour of the paper's controller: seen on crystal, melt and gas, and unlike the agent's also to the colour-blind."""
 
 
-def parse(argv: list[str] | None = None) -> argparse.Namespace:
-    """Read the command line; exits with code 2 and one line for anything that cannot be meant."""
-    parser = OneLineParser(PROG, "Film the paper's controller and an agent on the same crystal.")
-    parser.add_argument("--scenario", default="randomized", metavar="NAME", help="scenario (%(default)s)")
-    parser.add_argument("--seed", type=int, default=SEED, metavar="N", help="which crystal (%(default)s)")
-    parser.add_argument("--agent", type=Path, metavar="FILE", help="agent file in place of the shipped one")
-    parser.add_argument("--frames", type=int, default=92, metavar="N", help="frames of the film (%(default)s)")
-    parser.add_argument("--out", type=Path, default=OUT, metavar="FILE", help="file to write (results/media/duel.gif)")
-    return parser.parse_args(argv)
-
-
-def main(argv: list[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Film and write; 0 when done, 2 for bad input or a missing package, 130 when interrupted."""
-    arguments = parse(argv)
-    return guarded(PROG, lambda: _make(arguments), "render,benchmark")
+    parser = OneLineParser("python -m studies.film", "Film the paper's controller and an agent on the same crystal.")
+    parser.add_argument("--scenario", default="randomized", metavar="NAME", help="scenario (%(default)s)")
+    parser.add_argument(
+        "--seed", type=between(0, 2**63 - 1), default=SEED, metavar="N", help="which crystal (%(default)s)"
+    )
+    parser.add_argument("--agent", type=Path, metavar="FILE", help="agent file in place of the shipped one")
+    about = "frames of the film (%(default)s)"
+    parser.add_argument("--frames", type=between(2, 1000), default=92, metavar="N", help=about)
+    parser.add_argument("--out", type=Path, default=OUT, metavar="FILE", help="file to write (results/media/duel.gif)")
+    return parser.run(_make, arguments, "render,benchmark")
 
 
-def _make(arguments: argparse.Namespace) -> int:
-    if not 2 <= arguments.frames <= 1000:
-        raise ValueError(f"--frames must be 2 to 1000, not {arguments.frames}")
-    if arguments.seed < 0:
-        raise ValueError(f"--seed must not be negative, not {arguments.seed}")
+def _make(arguments: argparse.Namespace) -> None:
     if arguments.out.suffix != ".gif":
         raise ValueError(f"--out must end in .gif, not {str(arguments.out)!r}")
     import PIL.Image  # noqa: F401  (missing? say so before the work, not after it)
@@ -64,7 +56,6 @@ def _make(arguments: argparse.Namespace) -> int:
     content = film(arguments.scenario, arguments.seed, arguments.frames, arguments.agent)
     write_files({arguments.out.resolve(): content})
     print(f"wrote {arguments.out}: {arguments.frames} frames, {len(content) / 1e6:.2f} MB")
-    return 0
 
 
 def film(scenario: str, seed: int, frames: int, agent: Path | None = None) -> bytes:

@@ -12,17 +12,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
 from cz_gym.atomic_files import write_files
-from cz_gym.commands import OneLineParser, guarded
+from cz_gym.commands import OneLineParser
 from cz_gym.evaluation.files import EPISODES, read_episodes
-from cz_gym.evaluation.statistics import Estimate, Resamples, differences, means
+from cz_gym.evaluation.statistics import Estimate, Floats, Resamples, differences, means
 from studies.markdown import table
 
-Floats = npt.NDArray[np.float64]
-PROG = "python -m studies.generalisation"
 OBSERVABLE = ("sensor-fault", "puller")
 """Rows with an offset that no sensor shows: the error against what can be seen is counted there."""
 MICRON = 1e-3
@@ -69,22 +64,13 @@ def tabulate(episodes: Mapping[str, Mapping[str, Floats]], against: str) -> list
     return cells
 
 
-def _ends(estimate: Estimate) -> tuple[float, float, float]:
-    return (estimate.mean, *(estimate.ci95 or (estimate.mean, estimate.mean)))
-
-
 def to_markdown(cells: Sequence[Cell], against: str) -> str:
     """``table.md``: radius error and lost crystals; then the paired differences."""
 
     def error(cell: Cell) -> str:
-        mean, low, high = _ends(cell.rmse)
         lost = f", {100.0 * cell.lost.mean:.1f} % lost" if cell.lost.mean else ""
         worst = f", worst seed {cell.worst:.3f}" if cell.seeds > 1 else ""
-        return f"{mean:.3f} [{low:.3f}, {high:.3f}]{lost}{worst}"
-
-    def apart(cell: Cell) -> str:
-        mean, low, high = (value / MICRON for value in _ends(cell.apart))
-        return f"{mean:+.0f} [{low:+.0f}, {high:+.0f}]"
+        return f"{cell.rmse.text('.3f')}{lost}{worst}"
 
     others = [cell for cell in cells if cell.controller != against]
     return f"""# Agents on other plants
@@ -96,33 +82,30 @@ crystals lost; on {" and ".join(OBSERVABLE)} against the radius that sensors can
 
 The same less `{against}`'s, crystal by crystal [µm]; negative is better.
 
-{_table(others, apart)}
+{_table(others, lambda cell: cell.apart.text("+.0f", MICRON))}
 """
 
 
 def _table(cells: Sequence[Cell], tell: Callable[[Cell], str]) -> str:
     names = list(dict.fromkeys(cell.controller for cell in cells))
-    cells_of: dict[str, dict[str, str]] = {}
-    for cell in cells:
-        cells_of.setdefault(cell.row, {})[cell.controller] = tell(cell)
-    return table(("row", *names), ((row, *(by_name[name] for name in names)) for row, by_name in cells_of.items()))
+    told = {(cell.row, cell.controller): tell(cell) for cell in cells}
+    rows = dict.fromkeys(cell.row for cell in cells)
+    return table(("row", *names), ((row, *(told[row, name] for name in names)) for row in rows))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser(prog=PROG, description=(__doc__ or "").split("\n")[0])
+    parser = OneLineParser("python -m studies.generalisation", (__doc__ or "").split("\n")[0])
     parser.add_argument("folder", type=Path, help="a benchmark's folder, with its episodes.csv")
     parser.add_argument("--against", default="lqg-at-0.02", metavar="NAME", help="compared with (%(default)s)")
-    given = parser.parse_args(arguments)
-    return guarded(PROG, lambda: _main(given), "benchmark")
+    return parser.run(_main, arguments, "benchmark")
 
 
-def _main(given: argparse.Namespace) -> int:
+def _main(given: argparse.Namespace) -> None:
     cells = tabulate(read_episodes(given.folder / EPISODES, figures), given.against)
     text = to_markdown(cells, given.against)
     write_files({given.folder / "table.md": text.encode()})
     print(text, end="")
-    return 0
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from scipy.signal import correlate
 
 from cz_gym.baselines.pid.settings import tuned
 from cz_gym.baselines.policy import Floats
-from cz_gym.commands import OneLineParser, between, guarded
+from cz_gym.commands import OneLineParser, between
 from cz_gym.config import make_config
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import Rollout, rollout
@@ -95,17 +95,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--episodes", type=between(1, most), default=100, help=f"validation episodes, at most {most}")
     parser.add_argument("--scenario", default="randomized")
     parser.add_argument("--model", choices=["I", "II"], help="one model instead of the scenario's mix")
-    args = parser.parse_args(arguments)
-    return guarded(parser.prog, lambda: _check(args), "benchmark")
+    return parser.run(_check, arguments, "benchmark")
 
 
-def _check(args: argparse.Namespace) -> int:
+def _check(args: argparse.Namespace) -> None:
     config = make_config(args.scenario, args.model)
     found = facts(rollout(tuned("industrial", config), config, VALIDATION_SEEDS[: args.episodes]))
     print(f"{'':<20}{'logged':>10}{'here':>10}")
     for name, logged, here in zip(Facts._fields, LOGGED, found, strict=True):
         print(f"{name:<20}{logged:>10.3g}{here:>10.3g}")
-    return 0
 
 
 if __name__ == "__main__":

@@ -20,13 +20,13 @@ from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.baselines import registry
 from cz_gym.baselines.analysis import frequency
 from cz_gym.baselines.analysis.linear_form import linear_form
-from cz_gym.commands import OneLineParser, guarded
+from cz_gym.commands import OneLineParser, between
 from cz_gym.config import make_config
 from cz_gym.episodes.scenarios import PULLER, RANDOMIZED
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import Course, rollout
-from cz_gym.physics.linearisation import StateSpace, radius_model
+from cz_gym.physics.linearisation import Floats, StateSpace, radius_model
 from cz_gym.physics.plant import make_puller
 from cz_gym.units import MINUTE
 
@@ -36,7 +36,6 @@ from .step_tests import (
     LIMITS,
     MIX,
     STEP_TESTS,
-    Floats,
     Interface,
     crystal,
     jump_gains,
@@ -48,7 +47,6 @@ from .step_tests import (
     usual_noise,
 )
 
-PROG = "python -m studies.insight"
 AGENT = "gradient"
 """The shipped agent that is taken apart, unless a file is named."""
 BESIDE = ("lqg-at-0.02", "lqg", "paper-tuned")
@@ -165,23 +163,20 @@ def study(agent: Path | None, episodes: int, only_pictures: bool, tell: Callable
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser(prog=PROG, description=(__doc__ or "").split("\n")[0])
+    parser = OneLineParser("python -m studies.insight", (__doc__ or "").split("\n")[0])
     parser.add_argument("--agent", type=Path, metavar="FILE", help="agent file in place of the shipped one")
-    parser.add_argument("--episodes", type=int, default=50, metavar="N", help="validation episodes (%(default)s)")
+    most, about = len(VALIDATION_SEEDS), "validation episodes (%(default)s)"
+    parser.add_argument("--episodes", type=between(1, most), default=50, metavar="N", help=about)
     parser.add_argument("--pictures", action="store_true", help="draw the pictures alone; the tables stay as they are")
     parser.add_argument("--out", type=Path, default=Path("results/insight"), metavar="DIR", help="%(default)s")
-    given = parser.parse_args(arguments)
-    return guarded(PROG, lambda: _main(given), "benchmark")
+    return parser.run(_main, arguments, "benchmark")
 
 
-def _main(given: argparse.Namespace) -> int:
-    if not 1 <= given.episodes <= len(VALIDATION_SEEDS):
-        raise ValueError(f"--episodes must be 1 to {len(VALIDATION_SEEDS)}, not {given.episodes}")
+def _main(given: argparse.Namespace) -> None:
     check_writable(given.out)
     files = study(given.agent, given.episodes, given.pictures, lambda what: print(what, file=sys.stderr, flush=True))
     write_files({given.out / name: content for name, content in files.items()})
     print(files.get("insight.md", b"").decode() or f"wrote {', '.join(files)}\n", end="")
-    return 0
 
 
 if __name__ == "__main__":

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from cz_gym.evaluation.report.canvas import GREY, INK, canvas, png, styles
-from cz_gym.evaluation.rollout import Signals
+from cz_gym.evaluation.rollout import Floats, Signals
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
-from .linear_agent import Floats
 from .loop import Responses
 from .step_tests import BEGIN, JUMPS, RIPPLE, SPANS, STEP_TESTS
 
@@ -24,10 +23,14 @@ def looks(names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
     """How each controller's line is drawn, the same in every figure; the first, the agent, boldest."""
     found: dict[str, dict[str, Any]] = {}
     for i, (name, style) in enumerate(styles(names).items()):
-        dash: Any = "solid" if i == 0 else _LINES[i % len(_LINES)]
         # The agent without noise has the agent's colour.
         colour = found[names[0]]["color"] if i and name.startswith(f"{names[0]} ") else style.colour
-        found[name] = {"color": colour, "lw": 2.0 if i == 0 else 1.3, "ls": dash, "zorder": 3 - 0.1 * i}
+        found[name] = {
+            "color": colour,
+            "lw": 2.0 if i == 0 else 1.3,
+            "ls": _LINES[i % len(_LINES) if i else 0],
+            "zorder": 3 - 0.1 * i,
+        }
     return found
 
 
@@ -80,10 +83,10 @@ def gain_figure(impulses: Mapping[str, Floats], responses: Mapping[str, Response
         axes[row, 1].set_ylabel(f"{drive} by ring [{unit} per mm]")
         axes[row, 0].axhline(0.0, color=GREY, lw=0.7)
         axes[row, 0].margins(x=0.0)
-    axes[0, 0].set_title("one reading 0.1 mm too large, loop closed", fontsize=9.5)
-    axes[0, 1].set_title("gain over frequency, the controller alone", fontsize=9.5)
-    axes[1, 0].set_xlabel("time [min]")
-    axes[1, 1].set_xlabel("angular frequency [rad/s]")
+    titles = ("one reading 0.1 mm too large, loop closed", "gain over frequency, the controller alone")
+    for column, title, label in zip(axes.T, titles, ("time [min]", "angular frequency [rad/s]"), strict=True):
+        column[0].set_title(title, fontsize=9.5)
+        column[1].set_xlabel(label)
     _legend(figure, axes[0, 0])
     figure.suptitle("From the ring to the drives, small signals under the usual noise", fontsize=11)
     return png(figure)
@@ -103,12 +106,10 @@ def loop_figure(responses: Mapping[str, Responses], zero: float) -> bytes:
         ends += [float(phase.min()), float(phase.max())]
         axes[1].semilogx(found.omega, phase, **style[name])
         axes[2].loglog(found.omega, 1.0 / np.abs(1.0 + at_camera), **style[name])
-    axes[0].axhline(1.0, color=GREY, lw=0.8)
-    axes[1].axhline(-180.0, color=GREY, lw=0.8)
-    axes[2].axhline(1.0, color=GREY, lw=0.8)
     axes[1].set_yticks(np.arange(90.0 * np.floor(min(ends) / 90.0), max(ends) + 90.0, 90.0))
     titles = ("loop gain, opened at the pull speed", "its phase [°]", "sensitivity |1/(1 + L)|, opened at the camera")
-    for axis, title in zip(axes, titles, strict=True):
+    for axis, title, level in zip(axes, titles, (1.0, -180.0, 1.0), strict=True):
+        axis.axhline(level, color=GREY, lw=0.8)
         axis.axvline(zero, color=GREY, lw=0.8, ls=":")
         axis.set_title(title, fontsize=9.5)
         axis.set_xlabel("angular frequency [rad/s]")
@@ -131,8 +132,7 @@ def jump_figure(jumps: Mapping[str, Sequence[Floats]]) -> bytes:
         axis.set_title(title, fontsize=9.5)
         axis.set_xlabel("jump of the radius [mm]")
         axis.xaxis.set_major_formatter(lambda value, position: f"{value:g}")
-    axes[0].set_ylim(bottom=0.0)
-    axes[0].set_ylabel("pull speed moved [mm/min per mm]")
+    axes[0].set(ylim=(0.0, None), ylabel="pull speed moved [mm/min per mm]")
     _legend(figure, axes[0])
     figure.suptitle("How strongly a jump is answered", fontsize=11)
     return png(figure)
@@ -167,8 +167,7 @@ def ripple_figure(ripples: Mapping[str, Floats]) -> bytes:
     minutes = BEGIN / MINUTE * (np.arange(SPANS) + 0.5)
     for name, gains in ripples.items():
         axis.plot(minutes, gains * MM / MM_PER_MIN, marker="o", ms=3.5, label=name, **style[name])
-    axis.set_ylim(bottom=0.0)
-    axis.set(xlabel="time since the crystal began [min]", ylabel="pull speed moved [mm/min per mm]")
+    axis.set(xlabel="time since the crystal began [min]", ylabel="pull speed moved [mm/min per mm]", ylim=(0.0, None))
     axis.set_title(f"How strongly a ripple of {RIPPLE / MM:g} mm is answered", fontsize=11)
     _legend(figure, axis)
     return png(figure)

@@ -24,10 +24,9 @@ from cz_gym.observation import (
     scales,
     undo_differences,
 )
-from cz_gym.physics.linearisation import StateSpace
+from cz_gym.physics.linearisation import Floats, StateSpace
 from cz_gym.task import drives_of
 
-Floats = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 SEEN = ("ring_error", "T_1", "v_p", "Q_H")
 """Readings through which the plant reaches an agent: ring [m], pyrometer [K], applied drives [m/s, W]."""
@@ -95,8 +94,9 @@ def linear_agent(
     approximation there is (Stein's lemma). ValueError if the file reads another observation or remembers something.
     """
     rows = np.atleast_2d(np.asarray(observations, np.float64))
-    slopes = _asked(np.mean([jacobian(onnx_bytes, row) for row in rows], axis=0), dt, action, v_0)
-    slopes /= scales(HISTORY, v_0)
+    if rows.shape[1] != len(HISTORY):
+        raise ValueError(f'an agent without a state is linear here only on "history" ({len(HISTORY)} channels)')
+    slopes = _asked(jacobian(onnx_bytes, rows), dt, action, v_0) / scales(HISTORY, v_0)
     slopes = slopes @ np.linalg.inv(undo_differences()).T
     now, integral, means = np.split(slopes, (len(MEASURED), len(MEASURED) + 1), axis=1)
     return LinearAgent(now, integral[:, 0], means.reshape(2, len(LAGS), len(LAGGED)), dt)
@@ -115,15 +115,10 @@ def remembering_agent(
     Inputs are the channels of MEASURED, outputs the two drives, deviations in SI; the state is the agent's own, scaled.
     ValueError if the file reads another observation.
     """
-    evaluate = _in_double(onnx_bytes, ("observation", "state"))
-    seen, kept = np.asarray(observations, np.float64), np.asarray(states, np.float64)
-    n, width = len(MEASURED), len(MEASURED) + kept.shape[1]
+    seen, n = np.asarray(observations, np.float64), len(MEASURED)
     if seen.shape[1] != n:
         raise ValueError(f'an agent that remembers is linear here only on "measured" ({n} channels)')
-    found = np.zeros((2 + kept.shape[1], width))
-    for row in np.concatenate([seen, kept], axis=1):
-        ahead, behind = (evaluate(*np.split(row + sign * _STEP * np.eye(width), [n], axis=1)) for sign in (1, -1))
-        found += (np.concatenate(ahead, axis=1) - np.concatenate(behind, axis=1)).T / (2.0 * _STEP * len(seen))
+    found = jacobian(onnx_bytes, seen, np.asarray(states, np.float64))
     asked = _asked(found[:2], dt, action, v_0)
     found[2:, :n] /= scales(MEASURED, v_0)
     asked[:, :n] /= scales(MEASURED, v_0)
@@ -135,19 +130,24 @@ def _asked(slopes: Floats, dt: float, action: str, v_0: float) -> Floats:
     drives = drives_of(action, dt)
     slopes = slopes * np.array([[drives.pull], [drives.heater]])
     slopes[[0, 1], DRIVE_CHANNELS] += drives.keep
-    found: Floats = np.array([[v_0], [HEATER_SCALE]]) * slopes
+    return np.array([[v_0], [HEATER_SCALE]]) * slopes
+
+
+def jacobian(onnx_bytes: bytes, observations: Floats, states: Floats | None = None) -> Floats:
+    """Mean derivatives of the action, and of the next state, by the observation and by the state if there is one.
+
+    Of observations, shape (n, channels), and states, (n, width): shape (2 + width, channels + width), all scaled.
+    """
+    evaluate = _in_double(onnx_bytes, ("observation",) if states is None else ("observation", "state"))
+    rows = observations if states is None else np.concatenate([observations, states], axis=1)
+    ends = [] if states is None else [observations.shape[1]]
+    steps = _STEP * np.eye(rows.shape[1])
+
+    def answers(points: Floats) -> Any:
+        return np.concatenate(evaluate(*np.split(points, ends, axis=1)), axis=1)
+
+    found: Floats = np.mean([(answers(row + steps) - answers(row - steps)).T for row in rows], axis=0) / (2.0 * _STEP)
     return found
-
-
-def jacobian(onnx_bytes: bytes, observation: Floats) -> Floats:
-    """Derivatives of the action by the observation, shape (2, channels), both scaled, in double precision."""
-    if len(observation) != len(HISTORY):
-        raise ValueError(f'an agent without a state is linear here only on "history" ({len(HISTORY)} channels)')
-    evaluate = _in_double(onnx_bytes, ("observation",))
-    steps = _STEP * np.eye(len(observation))
-    ahead, behind = evaluate(observation + steps)[0], evaluate(observation - steps)[0]
-    slopes: Floats = (ahead - behind).T / (2.0 * _STEP)
-    return slopes
 
 
 def _in_double(onnx_bytes: bytes, inputs: tuple[str, ...]) -> Any:

@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cz_gym.baselines.analysis import frequency, sampled_loop
-from cz_gym.physics.linearisation import StateSpace
+from cz_gym.physics.linearisation import Floats, StateSpace
 from cz_gym.physics.plant import make_puller
 from cz_gym.units import HOUR, KILO, MM, MM_PER_MIN
 
-from .linear_agent import Complex, Floats
+from .linear_agent import Complex
 from .step_tests import MIX, Interface
 
 RING, PYROMETER = 0, 1
@@ -78,8 +78,7 @@ class Responses(NamedTuple):
 
     def closed(self) -> Complex:
         """Drives by the camera's noise, every loop closed, shape (points, 2)."""
-        found: Complex = self._without_camera() / (1.0 + self.opened("camera"))[:, None]
-        return found
+        return self._without_camera() / (1.0 + self.opened("camera"))[:, None]
 
     def opened(self, at: str) -> Complex:
         """Minus the way round the loop opened at "camera" or at "v_p", shape (points,)."""
@@ -90,8 +89,7 @@ class Responses(NamedTuple):
             raise ValueError(f"a loop is opened at camera or v_p, not {at!r}")
         around = self._recalled + self.controller[:, :, :2] @ self.plant
         heater = around[:, 1, 0] / (1.0 - around[:, 1, 1])
-        pull: Complex = -(around[:, 0, 0] + around[:, 0, 1] * heater)
-        return pull
+        return -(around[:, 0, 0] + around[:, 0, 1] * heater)
 
 
 def response(system: StateSpace, dt: float, omega: Floats) -> Complex:

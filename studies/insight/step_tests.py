@@ -7,15 +7,13 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from cz_gym.config import Config, make_config
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
-from cz_gym.evaluation.rollout import Course, Signals
+from cz_gym.evaluation.rollout import Course, Floats, Signals
 from cz_gym.units import HOUR, MICRO, MINUTE, MM
 
-Floats = npt.NDArray[np.float64]
 MIX = 0.5
 """Share of conduction of the nominal puller here: halfway between Model I and Model II [-]."""
 BEGIN = 10.0 * MINUTE

@@ -6,13 +6,14 @@ all.
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from cz_gym.atomic_files import check_writable, write_files
-from cz_gym.commands import OneLineParser, guarded
+from cz_gym.commands import OneLineParser
 
 from .comparison import as_markdown, numbers, rows
 
@@ -21,19 +22,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code, 2 for bad input or a missing package."""
     parser = OneLineParser(prog="python -m studies.paper", description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("results/paper"), help="folder for the results")
-    out: Path = parser.parse_args(arguments).out
-    return guarded(parser.prog, lambda: _compare(out), "benchmark")
+    return parser.run(_compare, arguments, "benchmark")
 
 
-def _compare(out: Path) -> int:
+def _compare(given: argparse.Namespace) -> None:
     import control  # noqa: F401  (missing? say so before the work, not after it)
     import matplotlib  # noqa: F401
 
-    check_writable(out)
-    write_files({out / name: content for name, content in contents().items()})
+    check_writable(given.out)
+    write_files({given.out / name: content for name, content in contents().items()})
     print(as_markdown(rows()))
-    print(f"\nreport: {out / 'report.md'}")
-    return 0
+    print(f"\nreport: {given.out / 'report.md'}")
 
 
 def contents() -> dict[str, bytes]:

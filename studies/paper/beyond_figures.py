@@ -49,15 +49,12 @@ def washout() -> Figure:
 def cut_off_sweep() -> Figure:
     """Largest errors in the ramp and phase margin against the high-pass cut-off."""
     figure, ((errors_axis, margin_axis),) = sheet(1, 2, (7.2, 3.0))
-    sweep = [beyond_paper.cut_off_result(cut_off) for cut_off in beyond_paper.CUT_OFFS]
-    at = [found.cut_off for found in sweep]
+    at = beyond_paper.CUT_OFFS
     for model, color in (("I", BLUE), ("II", ORANGE)):
-        for line, name, text in (("o-", "max_error", "$r_c$"), ("s--", "max_compensated_error", r"$\tilde r$")):
-            peaks = [getattr(found, name)[model] / MM for found in sweep]
-            errors_axis.semilogx(
-                beyond_paper.CUT_OFFS, peaks, line, color=color, markersize=3.5, label=f"{text}, Model {model}"
-            )
-        margin = [found.phase_margin_deg[model] for found in sweep]
+        margin, *peaks = zip(*(beyond_paper.cut_off_result(cut_off, model) for cut_off in at), strict=True)
+        for line, peak, text in zip(("o-", "s--"), peaks, ("$r_c$", r"$\tilde r$"), strict=True):
+            shown = [value / MM for value in peak]
+            errors_axis.semilogx(at, shown, line, color=color, markersize=3.5, label=f"{text}, Model {model}")
         margin_axis.semilogx(at, margin, "o-", color=color, markersize=3.5, label=f"Model {model}")
     for axis, top in ((errors_axis, 2.7), (margin_axis, 90.0)):
         axis.axvline(compensator("own").slow, color=GREY, linestyle=":", label="paper's cut-off")
@@ -89,16 +86,15 @@ def noise_sweep() -> Figure:
 def menisci() -> Figure:
     """Hurle against the exact meniscus over the crystal's radius."""
     figure, axes = sheet(2, 2, (7.2, 4.8), sharex=True)
-    pairs = beyond_paper.compare_menisci()
-    radii = [pair.r_c / MM for pair in pairs]
+    at, *menisci = zip(*beyond_paper.compare_menisci(), strict=True)
+    radii = [r_c / MM for r_c in at]
     for axis, (name, unit, text) in zip(axes.flat, (
         ("h", MM, "height $h_c$ [mm]"),
         ("slope_rate", -1.0 / MM, r"$-d\alpha_c/dh_c$ [rad/mm]"),
         ("ring_offset", MM, "$r_{br} - r_c$ [mm]"),
         ("zero", 1.0, "zero of $G_m$ [rad/s]"),
     ), strict=True):  # fmt: skip
-        for meniscus, style, color in (("hurle", "o-", BLUE), ("exact", "s--", ORANGE)):
-            values = [getattr(getattr(pair, meniscus), name) / unit for pair in pairs]
-            axis.plot(radii, values, style, color=color, label="Hurle" if meniscus == "hurle" else "exact")
+        for found, who, style, color in zip(menisci, ("Hurle", "exact"), ("o-", "s--"), (BLUE, ORANGE), strict=True):
+            axis.plot(radii, [getattr(each, name) / unit for each in found], style, color=color, label=who)
         label(axis, "crystal radius [mm]" if name in ("ring_offset", "zero") else "", text, legend=name == "h")
     return figure

@@ -22,7 +22,7 @@ from cz_gym.physics.linearisation import radius_model
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE, solve_height
 from cz_gym.units import HOUR, MM, MM_PER_MIN
 
-from .experiments import INTERVAL, MODELS, PRINTED, Trace, at_pull_limit, errors, linear_model, ramp, trace
+from .experiments import INTERVAL, at_pull_limit, errors, linear_model, ramp
 from .published import PID
 
 SEEDS = VALIDATION_SEEDS[:16]
@@ -79,30 +79,24 @@ def _noise_gain(pid: SeriesPID) -> float:
 
 
 class CutOffResult(NamedTuple):
-    """The paper's ramp with the compensator redesigned for another high-pass cut-off; dictionaries are by model."""
+    """The paper's ramp on one model with the compensator redesigned for another high-pass cut-off."""
 
-    cut_off: float
-    """[rad/s]."""
-    phase_margin_deg: dict[str, float]
+    phase_margin_deg: float
     """[degrees]."""
-    max_error: dict[str, float]
+    max_error: float
     """Largest true radius error [m]; infinite for a lost crystal."""
-    max_compensated_error: dict[str, float]
+    max_compensated_error: float
     """Largest error of r_tilde [m]."""
 
 
 @cache
-def cut_off_result(cut_off: float) -> CutOffResult:
-    """Design for Model I, and run the ramp on both models."""
+def cut_off_result(cut_off: float, model: str) -> CutOffResult:
+    """Design for Model I and that cut-off [rad/s], and run the ramp on a model."""
     compensator = design_compensator(linear_model("own", "I"), cut_off)
-    found = CutOffResult(cut_off, {}, {}, {})
-    for model in MODELS:
-        run = ramp(model, CompensatedPID(compensator=compensator))
-        lost = math.inf if run.failed else 0.0
-        true, seen = (float(np.max(np.abs(radius))) + lost for radius in errors(run))
-        found.phase_margin_deg[model] = margins(linear_model("own", model), compensator, PID).phase_margin_deg
-        found.max_error[model], found.max_compensated_error[model] = true, seen
-    return found
+    run = ramp(model, CompensatedPID(compensator=compensator))
+    lost = math.inf if run.failed else 0.0
+    margin = margins(linear_model("own", model), compensator, PID).phase_margin_deg
+    return CutOffResult(margin, *(float(np.max(np.abs(radius))) + lost for radius in errors(run)))
 
 
 class Meniscus(NamedTuple):
@@ -118,25 +112,16 @@ class Meniscus(NamedTuple):
     """Right half plane zero of G_m at the nominal growth rate [rad/s]."""
 
 
-class MeniscusPair(NamedTuple):
-    """Both menisci at one radius."""
-
-    r_c: float
-    """[m]."""
-    hurle: Meniscus
-    exact: Meniscus
-
-
 @cache
-def compare_menisci() -> list[MeniscusPair]:
-    """Both menisci at :data:`RADII`, everything else nominal."""
+def compare_menisci() -> list[tuple[float, Meniscus, Meniscus]]:
+    """Each of :data:`RADII` [m], Hurle's meniscus there and the exact one, everything else nominal."""
 
     def at(r_c: float, model: MeniscusModel) -> Meniscus:
         puller = make_puller(Parameters(r_0=r_c), meniscus=model)
         linear = radius_model(puller, model)
         return Meniscus(puller.h_0, linear.numerator / puller.v_0, puller.ring_bias, linear.zero)
 
-    return [MeniscusPair(r_c, at(r_c, HURLE), at(r_c, YOUNG_LAPLACE)) for r_c in RADII]
+    return [(r_c, at(r_c, HURLE), at(r_c, YOUNG_LAPLACE)) for r_c in RADII]
 
 
 def compare_ring_slopes() -> list[tuple[float, float, float]]:
@@ -153,8 +138,3 @@ def exact_height() -> float:
     """Exact height at the operating point, from the shooting itself rather than its table [m]."""
     puller = make_puller()
     return float(solve_height(puller.r_0, Parameters().alpha_0, puller.a))
-
-
-def exact_ramp() -> Trace:
-    """The ramp on the exact meniscus, Model I."""
-    return trace(PRINTED, "I", "paper-ramp", meniscus=YOUNG_LAPLACE)

@@ -162,29 +162,5 @@ def as_markdown(found: list[Row]) -> str:
 
 
 def numbers() -> dict[str, Any]:
-    """The content of numbers.json: rad/s and s where no unit is named."""
-    models = {f"model_{name}": ex.linear_model("own", name) for name in ex.MODELS}
-    gains = [ex.compensator(source).gain for source in ex.SOURCES]
-    responses = {m: ex.inverse_response(ex.pull_change(m)) for m in ex.MODELS}
-    margins = {f"{source}_{m}": ex.loop_margins(source, m) for source in ex.SOURCES for m in ex.MODELS}
-    return {
-        **{
-            name: {
-                "G_p": {"numerator": m.numerator, "poles": list(m.poles)},
-                "G_m": [m.lead, m.constant],
-                "rhp_zero": m.zero,
-            }
-            for name, m in models.items()
-        },
-        "compensator": {"published_functions": gains[0], "own_plant": gains[1]},
-        "margins": {
-            name: {"crossover": margin.crossover, "phase_margin_deg": margin.phase_margin_deg}
-            for name, margin in margins.items()
-        },
-        "inverse_response": {
-            m: {"depth_mm": one.depth / MM, "recovery_s": one.recovery} for m, one in responses.items()
-        },
-        "case_ab": {m: ex.case_difference(*ex.cases(m))._asdict() for m in ex.MODELS},
-        "paper_ramp": {m: ex.ramp_numbers(ex.ramp(m)) for m in ex.MODELS},
-        "young_laplace": {"h_mm": beyond.exact_height() / MM, "hurle_h_mm": make_puller().h_0 / MM},
-    }
+    """The content of numbers.json: the comparison's values by quantity, a published one null where there is none."""
+    return {row.quantity: {"unit": row.unit, "published": row.published, "ours": row.ours} for row in rows()}

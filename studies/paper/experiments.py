@@ -17,12 +17,11 @@ from cz_gym.config import make_config
 from cz_gym.episodes.schedule import quintic
 from cz_gym.evaluation.replay import Playback
 from cz_gym.evaluation.rollout import Signals, rollout
-from cz_gym.physics.linearisation import RadiusModel, radius_model
+from cz_gym.physics.linearisation import Floats, RadiusModel, radius_model
 from cz_gym.units import HOUR, MINUTE, MM, MM_PER_MIN
 
 from .published import PID, PUBLISHED
 
-Floats = npt.NDArray[np.float64]
 MODELS = {"I": 1.0, "II": 0.0}
 """Share of conduction of the paper's models [-]."""
 SOURCES = ("published", "own")
@@ -188,9 +187,9 @@ def cases(model: str) -> tuple[Trace, Trace]:
     return trace(PRINTED, model, "reference-a"), trace(PRINTED, model, "reference-b")
 
 
-def ramp(model: str, policy: Any = PRINTED) -> Trace:
+def ramp(model: str, policy: Any = PRINTED, meniscus: MeniscusModel = HURLE) -> Trace:
     """The paper's temperature ramp."""
-    return trace(policy, model, "paper-ramp")
+    return trace(policy, model, "paper-ramp", meniscus=meniscus)
 
 
 def ramp_numbers(run: Trace) -> dict[str, float]:

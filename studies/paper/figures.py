@@ -10,10 +10,11 @@ from matplotlib.figure import Figure
 
 from cz_gym import make_puller
 from cz_gym.baselines.analysis.compensator_design import open_loop
+from cz_gym.physics.linearisation import Floats
 from cz_gym.units import MINUTE, MM, MM_PER_MIN
 
 from . import experiments as ex
-from .experiments import Floats, Trace
+from .experiments import Trace
 from .published import PID
 
 DEGREE = np.pi / 180.0

@@ -7,7 +7,8 @@ from itertools import product
 
 import numpy as np
 
-from cz_gym import make_puller
+from cz_gym import HURLE, make_puller
+from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.units import MM
 from studies.markdown import table
 
@@ -197,9 +198,10 @@ loop, so its curves can be compared in shape only.
 
 def _beyond() -> str:
     cut_offs = []
-    for c in map(beyond.cut_off_result, beyond.CUT_OFFS):
-        peaks = [f"{errors[m] / MM:.2f}" for m in ("I", "II") for errors in (c.max_error, c.max_compensated_error)]
-        cut_offs.append((f"{c.cut_off:.0e}", *peaks, *(f"{c.phase_margin_deg[m]:.0f}" for m in ("I", "II"))))
+    for cut_off in beyond.CUT_OFFS:
+        both = [beyond.cut_off_result(cut_off, model) for model in ex.MODELS]
+        peaks = (f"{error / MM:.2f}" for _, *errors in both for error in errors)
+        cut_offs.append((f"{cut_off:.0e}", *peaks, *(f"{found.phase_margin_deg:.0f}" for found in both)))
     head = (
         "cut-off [rad/s] | r_c, I [mm] | r_tilde, I [mm] | r_c, II [mm] | r_tilde, II [mm] | margin, I [deg] | "
         "margin, II [deg]"
@@ -233,11 +235,10 @@ reference held for an hour, mean of {len(beyond.SEEDS)} episodes. The pull speed
 
 def _meniscus() -> str:
     lines = [
-        (f"{p.r_c / MM:.1f}", f"{p.hurle.h / MM:.4f}", f"{p.exact.h / MM:.4f}",
-         f"{100 * (p.hurle.h / p.exact.h - 1):+.2f} %", f"{p.hurle.slope_rate * MM:.4f}",
-         f"{p.exact.slope_rate * MM:.4f}", f"{p.hurle.ring_offset / MM:.3f}", f"{p.exact.ring_offset / MM:.3f}",
-         f"{p.hurle.zero:.4f}", f"{p.exact.zero:.4f}")
-        for p in beyond.compare_menisci()
+        (f"{r_c / MM:.1f}", f"{one.h / MM:.4f}", f"{exact.h / MM:.4f}", f"{100 * (one.h / exact.h - 1):+.2f} %",
+         f"{one.slope_rate * MM:.4f}", f"{exact.slope_rate * MM:.4f}", f"{one.ring_offset / MM:.3f}",
+         f"{exact.ring_offset / MM:.3f}", f"{one.zero:.4f}", f"{exact.zero:.4f}")
+        for r_c, one, exact in beyond.compare_menisci()
     ]  # fmt: skip
     head = (
         "r_c [mm] | h, Hurle [mm] | h, exact [mm] | difference | d alpha_c/d h, Hurle [rad/mm] | exact | "
@@ -245,7 +246,9 @@ def _meniscus() -> str:
     )
     slopes = [(f"{phi_b:g}", *(f"{lead:.2f}" for lead in leads)) for phi_b, *leads in beyond.compare_ring_slopes()]
     exact_h, hurle_h = beyond.exact_height() / MM, make_puller().h_0 / MM
-    largest, hurles = (ex.ramp_numbers(run)["max_error_mm"] for run in (beyond.exact_ramp(), ex.ramp("I")))
+    largest, hurles = (
+        ex.ramp_numbers(ex.ramp("I", meniscus=meniscus))["max_error_mm"] for meniscus in (YOUNG_LAPLACE, HURLE)
+    )
     return f"""## 7. Hurle against the exact meniscus
 
 At the operating point the axisymmetric Young-Laplace equation gives {number(exact_h)} mm, Hurle's closed form

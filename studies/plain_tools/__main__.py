@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import argparse
 import csv
-import io
 import sys
+import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from importlib import import_module
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any, NamedTuple
 
-from cz_gym.commands import OneLineParser, between, guarded
+from cz_gym.commands import OneLineParser, between
+from cz_gym.evaluation.files import csv_text
+from cz_gym.units import MINUTE
 from studies.markdown import table
 
-from .runs import EXAMPLES, Row, timed
-
+EXAMPLES = ("sb3_ppo", "cleanrl_ppo", "rllib_ppo")
 HEAD = """# The examples, training seed by training seed
 
 Each example as it stands, judged on 100 validation crystals of `randomized`.
@@ -23,25 +26,44 @@ Each example as it stands, judged on 100 validation crystals of `randomized`.
 """
 
 
+class Row(NamedTuple):
+    """What one training seed of an example reached on 100 validation crystals."""
+
+    example: str
+    seed: int
+    minutes: float
+    """From start to judged agent."""
+    rmse_mm: float
+    pull_step_rms_mm_per_min: float
+    lost: float
+    """Share of lost crystals [-]."""
+
+
+def timed(name: str, seed: int, steps: int | None) -> Row:
+    """Run one training seed of an example, for so many steps; None: its own number."""
+    began, example, given = time.monotonic(), import_module(f"examples.{name}"), dict[str, Any](seed=seed)
+    if steps is not None:
+        given["steps"] = steps
+    if name == "sb3_ppo":
+        given["out"] = Path(f"runs/plain_tools/sb3-ppo-seed{seed}.onnx")
+    found = example.main(example.Args(**given)) if name == "cleanrl_ppo" else example.main(**given)
+    minutes = (time.monotonic() - began) / MINUTE
+    return Row(name, seed, minutes, found.rmse_mm, found.pull_step_rms_mm_per_min, found.failure_rate)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser(prog="python -m studies.plain_tools", description=__doc__)
-    parser.add_argument(
-        "--examples",
-        nargs="+",
-        choices=EXAMPLES,
-        default=["sb3_ppo", "cleanrl_ppo"],
-        help="which (default: those without RLlib)",
-    )
+    parser = OneLineParser("python -m studies.plain_tools", __doc__)
+    about = "which (default: those without RLlib)"
+    parser.add_argument("--examples", nargs="+", choices=EXAMPLES, default=EXAMPLES[:2], help=about)
     parser.add_argument("--seeds", type=between(1, 100), default=5, help="training seeds of each (default: 5)")
     parser.add_argument("--steps", type=between(1, 10**9), help="steps of each run (default: the example's)")
     parser.add_argument("--jobs", type=between(1, 64), default=1, help="runs at once (default: 1)")
     parser.add_argument("--out", type=Path, default=Path("results/plain_tools"), help="results (default: %(default)s)")
-    given = parser.parse_args(arguments)
-    return guarded(parser.prog, lambda: _main(given), "agents", "finished runs are kept; the same command goes on")
+    return parser.run(_main, arguments, "agents", "finished runs are kept; the same command goes on")
 
 
-def _main(given: argparse.Namespace) -> int:
+def _main(given: argparse.Namespace) -> None:
     from cz_gym.atomic_files import check_writable, write_files
 
     check_writable(given.out)
@@ -55,7 +77,6 @@ def _main(given: argparse.Namespace) -> int:
             print(to_table([each.result()]), flush=True)
             write_files({path: to_csv(rows), given.out / "table.md": (HEAD + to_table(rows) + "\n").encode()})
     print(to_table([row for row in rows if row[:2] in asked]))
-    return 0
 
 
 def read(path: Path) -> list[Row]:
@@ -71,11 +92,7 @@ def read(path: Path) -> list[Row]:
 
 def to_csv(rows: Sequence[Row]) -> bytes:
     """A line a training seed."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(Row._fields)
-    writer.writerows([*row[:2], *(f"{value:.4g}" for value in row[2:])] for row in rows)
-    return text.getvalue().encode()
+    return csv_text(Row._fields, ([*row[:2], *(f"{value:.4g}" for value in row[2:])] for row in rows)).encode()
 
 
 def to_table(rows: Sequence[Row]) -> str:

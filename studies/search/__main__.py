@@ -14,7 +14,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from cz_gym.commands import OneLineParser, between, guarded
+from cz_gym.commands import OneLineParser, between
 from studies.comparison.command import STEPS, add_folders, add_ray, compare, join
 
 if TYPE_CHECKING:
@@ -22,18 +22,15 @@ if TYPE_CHECKING:
 
     from .trials import Search
 
-PROG = "python -m studies.search"
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    given = parser().parse_args(arguments)
-    return guarded(PROG, lambda: _main(given), "agents,ray", "the same command goes on from the trials in its journal")
+    return parser().run(_main, arguments, "agents,ray", "the same command goes on from the trials in its journal")
 
 
 def parser() -> OneLineParser:
     """The options."""
-    parser = OneLineParser(prog=PROG, description=(__doc__ or "").split("\n")[0])
+    parser = OneLineParser("python -m studies.search", (__doc__ or "").split("\n")[0])
     for option, kind, default, meaning in (
         ("--trials", between(1, 10_000), 30, "trials in all, earlier ones included"),
         ("--steps", STEPS, 600_000, "environment steps a trial"),
@@ -48,7 +45,7 @@ def parser() -> OneLineParser:
     return parser
 
 
-def _main(given: argparse.Namespace) -> int:
+def _main(given: argparse.Namespace) -> None:
     from cz_gym.atomic_files import check_writable, locked
     from studies.comparison.results import Plan
 
@@ -59,7 +56,6 @@ def _main(given: argparse.Namespace) -> int:
 
         search = Search(plan, given.steps, given.trials, given.seed)
         confirm(run(search), search, given)
-    return 0
 
 
 def crystals() -> tuple[Sequence[int], Sequence[int]]:
@@ -81,8 +77,7 @@ def confirm(study: Study, search: Search, given: argparse.Namespace) -> None:
     from studies.comparison.variants import Study as Comparison
     from studies.comparison.variants import Variant
 
-    from .space import params_of, recipe_of
-    from .trials import finished
+    from .trials import finished, params_of, recipe_of
 
     complete = sorted(filter(search.is_complete, finished(study)), key=lambda each: each.values)
     best = [trial for trial in complete if trial.params != params_of(PPO())][: given.finalists]

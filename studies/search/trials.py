@@ -1,17 +1,17 @@
-"""The trials of a search: Ray Tune runs them, a processor each, and Optuna proposes them."""
+"""What the search turns of the ``ppo`` recipe, and its trials: Ray Tune runs them, and Optuna proposes them."""
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import os
 import shutil
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import optuna
 from optuna import Study
+from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 from optuna.storages.journal import JournalFileBackend, JournalStorage
 from optuna.trial import FrozenTrial, TrialState
 from ray import tune
@@ -21,12 +21,24 @@ from tqdm import tqdm
 
 from cz_gym.agents.training.recipes import PPO
 from cz_gym.atomic_files import write_files
+from cz_gym.evaluation.files import csv_text
 from studies.comparison.results import COST, Plan
 from studies.comparison.training import is_finished, trained
 from studies.comparison.variants import Variant
 
-from .space import SPACE, Params, params_of, recipe_of
-
+Params = Mapping[str, Any]
+"""A place in the space, by the names of :data:`SPACE`."""
+SPACE: dict[str, BaseDistribution] = {
+    "learning_rate": FloatDistribution(1e-4, 4e-3, log=True),
+    "gae_lambda": FloatDistribution(0.5, 0.99),
+    "clip_range": FloatDistribution(0.03, 0.4, log=True),
+    "n_steps": CategoricalDistribution((16, 32, 64, 128, 256)),
+    "batch_size": CategoricalDistribution((512, 1024, 2048, 4096, 8192)),
+    "n_epochs": IntDistribution(1, 10),
+    "horizon": FloatDistribution(10.0, 500.0, log=True),
+    "noise": FloatDistribution(0.05, 1.0, log=True),
+}
+"""Fields of the recipe; but ``horizon`` is 1 / (1 - gamma) in steps."""
 STARTUP, OTHERS, VALIDATIONS, RETRIES = 8, 4, 6, 3
 """Trials drawn at random first; others that must have come as far before one is given up; validations on a trial's
 way; times that a trial begins again whose node is lost."""
@@ -36,6 +48,18 @@ SETTINGS = {
     "RAY_AIR_NEW_OUTPUT": "0",
 }
 """Of Tune: Ctrl-C ends the command, as elsewhere; what a trial reports is in the journal alone; no tables."""
+
+
+def params_of(recipe: PPO) -> dict[str, Any]:
+    """Where a recipe stands in the space."""
+    own = {name: getattr(recipe, name) for name in SPACE if hasattr(recipe, name)}
+    return {**own, "horizon": 1.0 / (1.0 - recipe.gamma)}
+
+
+def recipe_of(params: Params, steps: int, name: str) -> PPO:
+    """The recipe at a place in the space, learning for so many environment steps."""
+    own = {key: value for key, value in params.items() if hasattr(PPO(), key)}
+    return replace(PPO(), name=name, steps=steps, gamma=1.0 - 1.0 / params["horizon"], **own)
 
 
 class Search(NamedTuple):
@@ -147,12 +171,11 @@ class History(tune.Callback):
 
 def write_history(search: Search, study: Study) -> None:
     """Write the finished trials as CSV."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("trial", "state", "cost", "seconds", *SPACE))
+    rows = []
     for trial in finished(study):
         seconds = trial.duration.total_seconds() if trial.duration else 0.0
         state = "complete" if search.is_complete(trial) else "pruned"
         values = [f"{trial.params[name]:.6g}" for name in SPACE]
-        writer.writerow((trial.number, state, f"{trial.value:.6g}", f"{seconds:.0f}", *values))
-    write_files({search.plan.out / "history.csv": text.getvalue().encode()})
+        rows.append((trial.number, state, f"{trial.value:.6g}", f"{seconds:.0f}", *values))
+    text = csv_text(("trial", "state", "cost", "seconds", *SPACE), rows)
+    write_files({search.plan.out / "history.csv": text.encode()})

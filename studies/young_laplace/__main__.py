@@ -7,24 +7,23 @@ are the powers' coefficients.
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numpy.polynomial import chebyshev
 from scipy.optimize import brentq
 
 from cz_gym.atomic_files import check_writable, write_files
-from cz_gym.commands import OneLineParser, guarded
+from cz_gym.commands import OneLineParser
 from cz_gym.physics import young_laplace as exact
+from cz_gym.physics.linearisation import Floats
 from cz_gym.physics.meniscus import profile, ring_point
 from cz_gym.physics.young_laplace_table import RING, SLOPE, TAIL
 
-PROG = "python -m studies.young_laplace"
-Floats = npt.NDArray[np.float64]
 SIZES = ((9, 16), (9, 22), (7, 8))
 """Coefficients in the two variables of SLOPE, RING and TAIL."""
 TABLE = Path(exact.__file__).with_name("young_laplace_table.py")
@@ -52,18 +51,15 @@ def _fit(function: Callable[[Floats, Floats], Floats], m: int, n: int) -> Floats
     values = function(X.ravel(), Y.ravel()).reshape(m, n)
     series = np.linalg.solve(chebyshev.chebvander(x, m - 1), values)
     series = np.linalg.solve(chebyshev.chebvander(y, n - 1), series.T).T
-    powers: Floats = np.apply_along_axis(chebyshev.cheb2poly, 1, np.apply_along_axis(chebyshev.cheb2poly, 0, series))
-    return powers
+    return np.apply_along_axis(chebyshev.cheb2poly, 1, np.apply_along_axis(chebyshev.cheb2poly, 0, series))
 
 
 def _radius(x: Floats) -> Floats:
-    radius: Floats = 2.0 / (exact.NARROWEST * (x + 1.0))
-    return radius
+    return 2.0 / (exact.NARROWEST * (x + 1.0))
 
 
 def _middle(y: Floats, low: float, high: float) -> Floats:
-    value: Floats = 0.5 * (low + high + y * (high - low))
-    return value
+    return 0.5 * (low + high + y * (high - low))
 
 
 def _slope_correction(x: Floats, y: Floats) -> Floats:
@@ -71,8 +67,7 @@ def _slope_correction(x: Floats, y: Floats) -> Floats:
     theta = exact.solve(r, np.sqrt(square), 1.0, np.radians(3.5)).theta
     # 1 - sin(theta) without the cancellation near theta = pi/2.
     lift = 2.0 * np.square(np.sin(0.25 * np.pi - 0.5 * theta))
-    correction: Floats = r * (lift / square - 1.0)
-    return correction
+    return r * (lift / square - 1.0)
 
 
 def _ring_correction(x: Floats, y: Floats) -> Floats:
@@ -92,8 +87,7 @@ def _tail_correction(x: Floats, y: Floats) -> Floats:
     reference = np.full_like(r, np.radians(3.5))
     start = exact.shoot(lambda outer: exact.turn(outer, reference)[0], r + exact.planar_width(reference), r)
     moved = exact.turn(start, slope)[0] - r
-    correction: Floats = r * (moved / (X_b - exact.RING_REFERENCE) - 1.0)
-    return correction
+    return r * (moved / (X_b - exact.RING_REFERENCE) - 1.0)
 
 
 def render(tables: Tables) -> str:
@@ -117,22 +111,22 @@ def render(tables: Tables) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code. Compares, and with ``--write`` replaces the table next to this module."""
-    parser = OneLineParser(PROG, "Compute the exact meniscus and compare it with the table.")
+    parser = OneLineParser(
+        "python -m studies.young_laplace", "Compute the exact meniscus and compare it with the table."
+    )
     parser.add_argument("--write", action="store_true", help=f"replace {TABLE.name} by what was computed")
-    write = parser.parse_args(arguments).write
-    return guarded(PROG, lambda: _compare(write), "benchmark")
+    return parser.run(_compare, arguments, "benchmark")
 
 
-def _compare(write: bool) -> int:
-    if write:
+def _compare(given: argparse.Namespace) -> None:
+    if given.write:
         check_writable(TABLE.parent)
     tables = build()
-    if write:
+    if given.write:
         write_files({TABLE: render(tables).encode()})
     worst = max(float(np.max(np.abs(new - old))) for new, old in zip(tables, (SLOPE, RING, TAIL), strict=True))
     print(f"largest difference from the coefficients there were: {worst:.2g}")
-    print(f"wrote {TABLE.name}" if write else f"nothing written; --write replaces {TABLE.name}")
-    return 0
+    print(f"wrote {TABLE.name}" if given.write else f"nothing written; --write replaces {TABLE.name}")
 
 
 if __name__ == "__main__":

@@ -16,8 +16,9 @@ from cz_gym.baselines.registry import find_controller
 from cz_gym.evaluation.protocol import find_row
 from cz_gym.evaluation.report.page import page
 from cz_gym.evaluation.report.page_signals import OWN, PANELS, SHARED
-from cz_gym.evaluation.results import Benchmark, Controller, Sample, ScenarioResult, summarise
+from cz_gym.evaluation.results import Benchmark, Controller, ScenarioResult, summarise
 from cz_gym.evaluation.rollout import rollout
+from tests.samples import sample_of
 
 selenium = pytest.importorskip("selenium", reason="selenium is absent: pip install '.[browser]'")
 from selenium import webdriver  # noqa: E402
@@ -50,7 +51,7 @@ def scenario(name: str, episodes: int) -> ScenarioResult:
     for who in ("open-loop", "paper", "industrial"):
         run = rollout(find_controller(who).make(config), config, seeds)
         agent = Controller(EVIL, "measured", f"trained with {EVIL}", (4,)) if who == "industrial" else None
-        samples.append(Sample.of(agent or Controller(who, "measured", f"what {who} is"), [run]))
+        samples.append(sample_of(agent or Controller(who, "measured", f"what {who} is"), [run]))
     return summarise(row, samples)
 
 

@@ -24,6 +24,7 @@ from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.results import Controller, Sample
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.evaluation.runner import Job
+from tests.samples import sample_of
 
 CONFIG = make_config(horizon=300.0)
 SEEDS = range(5)
@@ -45,7 +46,7 @@ def sample(folder: Path, policy: Any = None, config: Any = CONFIG, seeds: Any = 
     row: Any = SimpleNamespace(name="some", config=lambda *_: config, design_config=lambda *_: config)
     bar = tqdm(disable=True)
     plan: Any = SimpleNamespace(cache=folder, seeds=lambda *_: seeds)
-    job = Job(plan, row, Contender(WHO, lambda _: [policy or Snail()]), bar)
+    job = Job(plan, row, Contender(WHO, lambda _: [policy or Snail()]))
     for number, part in runner.in_turn(job.pieces, bar):
         job.keep(job.pieces[number], part)
     return job.sample()
@@ -69,7 +70,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 def test_episodes_are_run_once_and_are_those_of_one_rollout(tmp_path: Path, counted: list[int]) -> None:
     first, again = sample(tmp_path, seeds=range(2)), sample(tmp_path)
-    direct = Sample.of(WHO, [rollout(OpenLoop(), CONFIG, SEEDS)])
+    direct = sample_of(WHO, [rollout(OpenLoop(), CONFIG, SEEDS)])
     assert counted == [0, 1, 2, 3, 4]
     assert again.seeds == direct.seeds
     assert again.microseconds_per_step > 0.0

@@ -17,6 +17,7 @@ from cz_gym.evaluation.report.figures import NAMED, draw_figures
 from cz_gym.evaluation.report.markdown import QUOTED
 from cz_gym.evaluation.results import Benchmark, Controller, Sample, summarise
 from cz_gym.evaluation.rollout import rollout
+from tests.samples import sample_of
 
 
 def sample(
@@ -72,7 +73,7 @@ def test_figures_of_a_crystal_that_nothing_disturbs_and_of_a_name_that_seems_a_f
         row = find_row(name)
         run = rollout(OpenLoop(), make_config(name, horizon=600.0), row.seeds(2))
         names = ["a $\\frac$ b", *(f"c{i}" for i in range(COLUMNS))]
-        results.append(summarise(row, [Sample.of(Controller(name, "measured", "", (1,)), [run]) for name in names]))
+        results.append(summarise(row, [sample_of(Controller(name, "measured", "", (1,)), [run]) for name in names]))
     figures = draw_figures(Benchmark(tuple(results), "", ()))
     assert set(figures) == {"crystal.png", "errors.png", "pareto.png"}
     assert all(image.startswith(b"\x89PNG") for image in figures.values())

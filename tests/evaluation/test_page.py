@@ -26,9 +26,10 @@ from cz_gym.evaluation.report.page import _asset, embedded, page
 from cz_gym.evaluation.report.page_figures import DISTRIBUTIONS, errors, pareto, plain
 from cz_gym.evaluation.report.page_signals import OWN, PANELS, SHARED, crystals, pack
 from cz_gym.evaluation.report.tables import DRIVES, ERROR, comparison
-from cz_gym.evaluation.results import Benchmark, Controller, Sample, ScenarioResult, summarise
+from cz_gym.evaluation.results import Benchmark, Controller, ScenarioResult, summarise
 from cz_gym.evaluation.rollout import Rollout, rollout
 from cz_gym.observation import MEASURED, scales
+from tests.samples import sample_of
 
 EVIL = "</script><img src=x onerror=alert(1)>\"'&amp;<b>\u2028%{x}"
 ROWS = ("puller", "reference-b")
@@ -104,7 +105,7 @@ class Made:
             run = rollout(find_controller(who).make(config), config, seeds[: len(seeds) - evil] or seeds)
             self.runs[name, who] = run
             agent = Controller(EVIL, "measured", f"agent trained with {EVIL}", (4, 7)) if evil else None
-            samples.append(Sample.of(agent or Controller(who, "measured", f"what {who} is"), [run, run][: 1 + evil]))
+            samples.append(sample_of(agent or Controller(who, "measured", f"what {who} is"), [run, run][: 1 + evil]))
         return summarise(row, samples)
 
 

@@ -21,6 +21,7 @@ from cz_gym.evaluation.report.markdown import markdown
 from cz_gym.evaluation.results import Benchmark, Controller, Sample, summarise
 from cz_gym.evaluation.rollout import Signals, rollout
 from cz_gym.evaluation.statistics import Resamples, optimality_gap
+from tests.samples import sample_of
 
 
 def made(name: str, errors: list[float], costs: list[float] | None = None, **facts: Any) -> Sample:
@@ -77,7 +78,7 @@ def test_different_numbers_of_episodes_meet_on_those_of_both() -> None:
 def paper() -> Sample:
     """The paper's controller on two crystals."""
     run = rollout(CompensatedPID(), find_row("randomized").config(), TEST_SEEDS[:2])
-    return Sample.of(Controller("paper", "measured", ""), [run])
+    return sample_of(Controller("paper", "measured", ""), [run])
 
 
 @pytest.fixture
@@ -128,7 +129,7 @@ def test_a_bound_is_used_only_beside_the_same_figures_of_the_same_controller(ear
     assert earlier_bound(earlier, row, [replace(paper, controller=replace(paper.controller, name="other"))]) is None
     assert earlier_bound(earlier, find_row("hard"), [paper]) is None
     other = make_config("randomized", parameters=make_config().parameters._replace(k_l=62.1))
-    moved = Sample.of(paper.controller, [rollout(CompensatedPID(), other, paper.seeds)])
+    moved = sample_of(paper.controller, [rollout(CompensatedPID(), other, paper.seeds)])
     assert earlier_bound(earlier, row, [moved]) is None
 
 

@@ -129,7 +129,7 @@ def test_blind_shows_nothing_that_only_the_truth_can_tell_until_the_score(config
     def watch(record: Any, set_points: Any, overlay: Any, blind: bool) -> Any:
         shown.append(blind)
         if len(shown) == 2:
-            game.end()
+            game.running = False
         else:
             game.finish(failed=False)
         return draw(record, set_points, overlay, blind)
@@ -201,7 +201,7 @@ def test_a_failed_run_counts_to_the_horizon() -> None:
         (["--speed", "0"], "--speed must be 1 to 3600, not 0"),
         (["--speed", "nan"], "--speed must be 1 to 3600, not nan"),
         (["--minutes", "inf"], "--minutes must be 1 to 6000, not inf"),
-        (["--seed", "-1"], "--seed must not be negative"),
+        (["--seed", "-1"], "--seed: must be between 0 and"),
         (["--size", "large"], "--size must be WxH in pixels"),
         (["--size", "10x10"], "360 to 3840"),
     ],

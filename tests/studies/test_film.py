@@ -19,8 +19,8 @@ pytest.importorskip("pygame")
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--frames", "1"], "--frames must be 2 to 1000"),
-        (["--seed", "-3"], "--seed must not be negative"),
+        (["--frames", "1"], "--frames: must be between 2 and 1000"),
+        (["--seed", "-3"], "--seed: must be between 0 and"),
         (["--out", "film.mp4"], "--out must end in .gif"),
         (["--scenario", "nonsense"], "unknown scenario"),
         (["--agent", "none.onnx"], "none.onnx"),

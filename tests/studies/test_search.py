@@ -21,7 +21,7 @@ from studies.comparison import training
 from studies.comparison.results import Plan
 from studies.search import __main__ as search
 from studies.search import trials
-from studies.search.space import SPACE, params_of, recipe_of
+from studies.search.trials import SPACE, params_of, recipe_of
 from tests.studies.bowl import attempt_bowl
 
 pytestmark = pytest.mark.filterwarnings("ignore")

@@ -7,16 +7,14 @@ from textwrap import fill
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.lines import Line2D
 
 from cz_gym.evaluation.results import Sample, ScenarioResult
-from cz_gym.evaluation.rollout import Signals
+from cz_gym.evaluation.rollout import Floats, Signals
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from .canvas import GREY, INK, Style, canvas, chosen, png
 
-Floats = npt.NDArray[np.float64]
 COLUMNS = 5
 """Most controllers in the figure: with more, its words are too small where a page shows it 830 pixels wide."""
 ROOM = (0.01 * MM, 3.0 * MM)

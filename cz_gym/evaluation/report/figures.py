@@ -7,12 +7,12 @@ from textwrap import fill
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from cz_gym.evaluation.results import Benchmark, Outcome, ScenarioResult
+from cz_gym.evaluation.rollout import Floats
 
 from .canvas import GREY, INK, Style, canvas, chosen, png, styles_of
 from .crystal import crystal
@@ -26,7 +26,6 @@ LETTER = 0.085
 """Width of a letter in a legend [in]."""
 NAMED = 8
 """Most controllers that :func:`pareto` names: with more, points hide each other and colours are hard to tell apart."""
-Floats = npt.NDArray[np.float64]
 
 
 def draw_figures(benchmark: Benchmark) -> dict[str, bytes]:

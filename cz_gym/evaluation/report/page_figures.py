@@ -61,7 +61,7 @@ def pareto(scenario: ScenarioResult, styles: Mapping[str, Style]) -> go.Figure:
 
 
 def _bars(estimate: Estimate) -> dict[str, Any]:
-    low, high = estimate.ci95 or (estimate.mean, estimate.mean)
+    low, high = estimate.ends
     return {"symmetric": False, "array": [high - estimate.mean], "arrayminus": [estimate.mean - low]}
 
 

@@ -12,14 +12,13 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 
 from cz_gym.config import Config
 from cz_gym.evaluation.metrics import TOLERANCE
 from cz_gym.evaluation.results import REFERENCE, Controller, Sample, ScenarioResult
-from cz_gym.evaluation.rollout import Signals
+from cz_gym.evaluation.rollout import Floats, Signals
 from cz_gym.rendering.strip_charts import running_mean
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 from cz_gym.vector import CzVectorEnv
@@ -27,7 +26,6 @@ from cz_gym.vector import CzVectorEnv
 from .canvas import GREY, INK, Style
 from .page_figures import plain
 
-Floats = npt.NDArray[np.float64]
 OUTLIERS = 0.001
 """Share of the values at either end that a panel's range need not hold."""
 

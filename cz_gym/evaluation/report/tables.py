@@ -29,14 +29,7 @@ class Column(NamedTuple):
 
     def text(self, estimate: Estimate | None) -> str:
         """The mean in the column's unit, with its interval if it has one."""
-        if estimate is None:
-            return NOTHING
-        mean, *ends = (self._number(value) for value in (estimate.mean, *(estimate.ci95 or ())))
-        return f"{mean} [{', '.join(ends)}]" if ends else mean
-
-    def _number(self, value: float) -> str:
-        text = f"{value / self.unit:.{self.decimals}f}"
-        return text[1:] if text.startswith("-") and not text.strip("-0.") else text
+        return estimate.text(f"z.{self.decimals}f", self.unit) if estimate else NOTHING
 
 
 RMSE = Column("rmse_mm", "RMSE [mm]", 3)
@@ -65,11 +58,8 @@ _COMPARISON = (
     Column("rmse_mm", "worst 5 % RMSE [mm]", 3, find=lambda outcome: outcome.cvar5["rmse_mm"]),
     Column("rmse_mm", f"RMSE less {REFERENCE}'s [mm]", 3, find=lambda outcome: outcome.paired.get("rmse_mm")),
     Column("rmse_mm", f"better than {REFERENCE} with probability", 3, find=lambda outcome: outcome.improvement),
-    Column(
-        PULL_STEP.metric,
-        f"pull step RMS less {REFERENCE}'s [mm/min]",
-        4,
-        find=lambda outcome: outcome.paired.get(PULL_STEP.metric),
+    PULL_STEP._replace(
+        heading=f"pull step RMS less {REFERENCE}'s [mm/min]", find=lambda outcome: outcome.paired.get(PULL_STEP.metric)
     ),
 )
 _GAPS = (
