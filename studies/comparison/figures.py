@@ -39,7 +39,7 @@ def forest(lines: Sequence[Line]) -> bytes:
                 axis.plot(ends, [place] * len(ends), color=COLOURS[1], lw=1.3, solid_capstyle="butt")
                 axis.plot([difference.mean / unit], [place], marker="o", color=COLOURS[1], ms=5)
         axis.set_xscale("symlog", linthresh=middle)
-        axis.xaxis.set_major_locator(FixedLocator([0.0, *(s * middle * 10.0**k for s in (-1, 1) for k in range(6))]))
+        axis.xaxis.set_major_locator(FixedLocator([0.0, *(s * middle * 10.0**k for s in (-1, 1) for k in (0, 2, 4))]))
         axis.xaxis.set_minor_locator(NullLocator())
         axis.xaxis.set_major_formatter(lambda value, position: f"{value:g}")
         axis.set(xlabel=title, ylim=(len(drawn) - 0.4, -0.6))
