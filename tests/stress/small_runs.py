@@ -39,8 +39,8 @@ REINFORCEMENT = {
     "update": ("stable_baselines3:PPO.train:1>torch.nn.utils:clip_grad_norm_:5", 3328),
     "checkpoint, before it counts": (f"{RUN}.save:5>os:rename:1", 3584),
     "first validation": (f"{RUN}._validate:1>{STEP}:100", 7616),
+    "one after a validation, before it counts": (f"{RUN}._validate:1>os:rename:1", 9664),
     "checkpoint, as it moves": (f"{RUN}._validate:1>os:replace:2", 9664),
-    "one after a validation, before it counts": (f"{RUN}._validate:1>os:rename:2", 9664),
     "judging": (f"{RUN}.finish:1>{STEP}:100", 9664),
     "summary, as it moves": (f"{RUN}.finish:1>os:replace:2", 9664),
 }

@@ -11,11 +11,9 @@ from cz_gym.baselines.pid.settings import settings_of
 from cz_gym.baselines.tuning import pid as pid_tuning
 from cz_gym.baselines.tuning.harness import Parameter, value_at
 from cz_gym.baselines.tuning.pid import PIDSearch
-from cz_gym.baselines.tuning.pid_spaces import SPACES, Space, no_rule, space_of
+from cz_gym.baselines.tuning.pid_spaces import SPACES, Space, space_of
 
-BOWL = Space(
-    "bowl", FilteredPID(), (Parameter("T_f", 1.0, 100.0), Parameter("K_ff", -1.0, 1.0, log=False)), np.inf, no_rule
-)
+BOWL = Space("bowl", FilteredPID(), (Parameter("T_f", 1.0, 100.0), Parameter("K_ff", -1.0, 1.0, log=False)), np.inf)
 BUDGET = {"trials": 80, "episodes": 3, "survive": 2, "finalists": 2, "validation": 3}
 NAMES = [space.name for space in SPACES]
 
@@ -81,7 +79,7 @@ def test_the_objective_prices_what_it_counts():
         search.config = replace(search.config, horizon=300.0)
         return search.objective(space.base, range(3), range(2))
 
-    space = space_of("paper-tuned", "randomized")._replace(rule=no_rule)
+    space = space_of("paper-tuned", "randomized")._replace(rule=BOWL.rule)
     free, facts = objective(space)
     step = facts["pull_step_rms_mm_per_min"]
     assert free == pytest.approx(facts["rmse_mm"] + pid_tuning.STEP_PRICE * step, rel=1e-9)
