@@ -16,6 +16,7 @@ from gymnasium.error import InvalidAction, ResetNeeded
 
 from cz_gym.config import Config
 from cz_gym.engine.batch import Batch, first_key
+from cz_gym.engine.buffers import BufferPool
 from cz_gym.engine.layout import INFO, Out
 from cz_gym.engine.tangents import ACTIONS, ROWS, SCRATCH, SMOOTH, build_tangents
 from cz_gym.episodes.record import GRID
@@ -88,6 +89,7 @@ class DifferentiableBatch:
         self._state = np.zeros((num_envs, len(STATES)))
         self._grows, self._begun = np.ones(num_envs, np.bool_), np.zeros(num_envs, np.bool_)
         self._work = np.zeros(SCRATCH)
+        self._jacobians = BufferPool((self.num_envs, len(ROWS), len(STATES) + ACTIONS), np.float64)
         self.measured_by_state = _measured_by_state(config)
         """Derivatives of the "measured" observation with respect to the state it is of, shape (11, 9)."""
 
@@ -129,7 +131,7 @@ class DifferentiableBatch:
         batch.step(given, out, active)
         self._grows = active & ~out.terminated
         self._out, self._state = out, self._now()
-        jacobian = np.empty((n, len(ROWS), len(STATES) + ACTIONS))
+        jacobian = self._jacobians.new()
         self._tangents(
             batch.memory, before, batch.actions, self._grows, batch.clock, batch.drives, self._work, jacobian, 0, n
         )
