@@ -51,14 +51,24 @@ def _column(A: Any, j: Any, k: Any) -> None:
 
 @within
 def _rates_by(A: Any, x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
-    """The rates; their derivatives into ``A``. A number is complex only where a step is taken, which is quicker."""
-    _column(A, 0, rates(State(_step(x.r_c), x.h_c, x.T_1, x.T_2, x.T_b), u, d, p, slope))
-    _column(A, 1, rates(State(x.r_c, _step(x.h_c), x.T_1, x.T_2, x.T_b), u, d, p, slope))
-    _column(A, 2, rates(State(x.r_c, x.h_c, _step(x.T_1), x.T_2, x.T_b), u, d, p, slope))
-    _column(A, 3, rates(State(x.r_c, x.h_c, x.T_1, _step(x.T_2), x.T_b), u, d, p, slope))
-    _column(A, 4, rates(State(x.r_c, x.h_c, x.T_1, x.T_2, _step(x.T_b)), u, d, p, slope))
-    _column(A, 5, rates(x, Inputs(_step(u.v_p), u.Q_H), d, p, slope))
+    """The rates; their derivatives into ``A``.
+
+    A number is complex only where a step is taken, and all are computed before any is written: so the compiler computes
+    once what they share.
+    """
+    by_r = rates(State(_step(x.r_c), x.h_c, x.T_1, x.T_2, x.T_b), u, d, p, slope)
+    by_h = rates(State(x.r_c, _step(x.h_c), x.T_1, x.T_2, x.T_b), u, d, p, slope)
+    by_1 = rates(State(x.r_c, x.h_c, _step(x.T_1), x.T_2, x.T_b), u, d, p, slope)
+    by_2 = rates(State(x.r_c, x.h_c, x.T_1, _step(x.T_2), x.T_b), u, d, p, slope)
+    by_b = rates(State(x.r_c, x.h_c, x.T_1, x.T_2, _step(x.T_b)), u, d, p, slope)
+    by_v = rates(x, Inputs(_step(u.v_p), u.Q_H), d, p, slope)
     k = rates(x, Inputs(u.v_p, _step(u.Q_H)), d, p, slope)
+    _column(A, 0, by_r)
+    _column(A, 1, by_h)
+    _column(A, 2, by_1)
+    _column(A, 3, by_2)
+    _column(A, 4, by_b)
+    _column(A, 5, by_v)
     _column(A, 6, k)
     return State(k.r_c.real, k.h_c.real, k.T_1.real, k.T_2.real, k.T_b.real)
 

@@ -196,7 +196,7 @@ def check_puller(puller: Puller, meniscus: MeniscusModel = HURLE) -> Puller:
     return puller
 
 
-@physics
+@within
 def growth(x: Any, d: Any, p: Any, slope: Any) -> Any:
     """Growth rate from the interface's heat balance, and the cone angle from the meniscus slope."""
     Phi_l = p.k_l * (x.T_b + d.dT_i - p.T_m) * (p.lam / x.h_c + (1.0 - p.lam) / p.h_0)
@@ -214,7 +214,7 @@ def fourth_power(T: Any) -> Any:
     return square * square
 
 
-@physics
+@within
 def rates(x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
     """Time derivatives of the state [m/s, m/s, K/s, K/s, K/s]; design equations of section 2."""
     at_interface = growth(x, d, p, slope)
