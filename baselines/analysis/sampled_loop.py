@@ -182,12 +182,10 @@ def late(controller: StateSpace, samples: int) -> StateSpace:
     camera[0, Measured._fields.index("ring_error")] = 1.0
     for _ in range(samples):
         A, B, C, D = controller
-        n = len(A)
-        read = B @ camera.T, D @ camera.T
         controller = StateSpace(
-            np.block([[A, read[0]], [np.zeros((1, n + 1))]]),
+            np.block([[A, B @ camera.T], [np.zeros((1, len(A) + 1))]]),
             np.vstack([B * (1.0 - camera), camera]),
-            np.hstack([C, read[1]]),
+            np.hstack([C, D @ camera.T]),
             D * (1.0 - camera),
         )
     return controller

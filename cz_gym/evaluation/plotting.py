@@ -35,16 +35,15 @@ def plot(run: Rollout, episode: int = 0, path: str | Path | None = None) -> Figu
     seen = (signals.r_br_measured - apart - signals.r_ref) / MM
     panels[0].plot(minutes, seen, color=GREY, lw=0.5, label="bright ring as the camera reads it")
     panels[0].plot(minutes, (signals.r_c - signals.r_ref) / MM, color=COLOURS[0], lw=1.2, label="true")
-    panels[0].legend(loc="upper right", fontsize=7, frameon=False, ncols=2)
     panels[1].plot(minutes, signals.v_p / MM_PER_MIN, color=COLOURS[1], lw=0.8)
     panels[2].plot(minutes, signals.Q_H / KILO, color=COLOURS[2], lw=0.8)
     panels[3].plot(minutes, signals.T_1, color=COLOURS[3], lw=1.0, label="heater")
     panels[3].plot(minutes, signals.T_1_ref, color=GREY, lw=0.8, label="recipe")
-    panels[3].legend(loc="upper right", fontsize=7, frameon=False, ncols=2)
-    for panel, label in zip(
-        panels, ("radius error [mm]", "pull speed [mm/min]", "heater [kW]", "T_1 [K]"), strict=True
-    ):
+    labels = ("radius error [mm]", "pull speed [mm/min]", "heater [kW]", "T_1 [K]")
+    for panel, label in zip(panels, labels, strict=True):
         panel.set_ylabel(label)
+    for panel in panels[[0, 3]]:
+        panel.legend(loc="upper right", fontsize=7, frameon=False, ncols=2)
     panels[3].set_xlabel("time [min]")
     ended = "lost" if run.failed[episode] else "held"
     figure.suptitle(f"{config.scenario.name}, seed {run.seeds[episode]}: {ended}", fontsize=10)

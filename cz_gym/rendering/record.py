@@ -63,8 +63,7 @@ class Record:
         self._terminated = self._truncated = False
         self._rows = np.zeros((config.steps + 1, len(Sample._fields)))
         self._read, self._first = 0, int(slot["k"])
-        self._said: list[bytes] = []
-        self._valid: list[float] = []
+        self._said: list[tuple[bytes, float]] = []
 
     def __len__(self) -> int:
         return len(self._said)
@@ -100,23 +99,22 @@ class Record:
 
         It is only kept: what it means is worked out when somebody looks, since most steps are never drawn.
         """
-        self._said.append(info.tobytes())
-        self._valid.append(valid)
+        self._said.append((info.tobytes(), valid))
         self._terminated, self._truncated = terminated, truncated
 
     def _samples(self) -> Floats:
         """All samples, shape (samples, fields)."""
         while self._read < len(self._said):
-            self._rows[self._read] = self._sample(np.frombuffer(self._said[self._read]), self._valid[self._read])
+            self._rows[self._read] = self._sample(*self._said[self._read])
             self._read += 1
         return self._rows[: self._read]
 
-    def _sample(self, said: Floats, valid: float) -> Sample:
+    def _sample(self, said: bytes, valid: float) -> Sample:
         """The next sample that nobody has looked at.
 
         The length grown is what the pull took up and the meniscus did not: h_c' = v_p - v_g, integrated exactly.
         """
-        values = dict(zip(_READ, said[_ROWS].tolist(), strict=True))
+        values = dict(zip(_READ, np.frombuffer(said)[_ROWS].tolist(), strict=True))
         values["camera"] = values.pop("r_br_measured") - self.puller.ring_bias
         t, length = (self._first + self._read) * self.config.control_interval, 0.0
         if self._read:

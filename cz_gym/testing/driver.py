@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,21 +54,17 @@ class Event(NamedTuple):
     """Slots whose observation is an episode's first, bool of shape (num_envs,)."""
 
 
+@dataclass
 class Driver:
     """Runs environments in one autoreset mode, and counts what it sees of the native form."""
 
-    def __init__(
-        self,
-        make_vector: MakeVector,
-        make_scalar: MakeScalar,
-        num_envs: int,
-        steps: int,
-        seed: int,
-        mode: AutoresetMode,
-    ) -> None:
-        self.make_vector, self.make_scalar = make_vector, make_scalar
-        self.num_envs, self.steps, self.seed, self.mode = num_envs, steps, seed, mode
-        self.seen = Checked()
+    make_vector: MakeVector
+    make_scalar: MakeScalar
+    num_envs: int
+    steps: int
+    seed: int
+    mode: AutoresetMode
+    seen: Checked = field(default_factory=Checked)
 
     def vector(self) -> Any:
         """A native form."""

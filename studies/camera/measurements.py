@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import statistics
 import time
+import timeit
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -121,12 +123,9 @@ def respond(bench: Bench, model: str, change: float) -> Response:
 
 def frames_per_second(bench: Bench) -> float:
     """Images of the operating point a second of one core's time, the median of FRAMES."""
-    p, took = bench.puller, []
-    for _ in range(FRAMES):
-        began = time.process_time()
-        picture(p.r_0, p.h_0, p, bench.view)
-        took.append(time.process_time() - began)
-    return 1.0 / statistics.median(took)
+    p = bench.puller
+    draw = partial(picture, p.r_0, p.h_0, p, bench.view)
+    return 1.0 / statistics.median(timeit.repeat(draw, timer=time.process_time, number=1, repeat=FRAMES))
 
 
 def numbers(bench: Bench, responses: list[Response]) -> dict[str, object]:

@@ -11,7 +11,6 @@ import argparse
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -24,24 +23,16 @@ from cz_gym.physics.linearisation import Floats
 from cz_gym.physics.meniscus import profile, ring_point
 from cz_gym.physics.young_laplace_table import RING, SLOPE, TAIL
 
-SIZES = ((9, 16), (9, 22), (7, 8))
-"""Coefficients in the two variables of SLOPE, RING and TAIL."""
 TABLE = Path(exact.__file__).with_name("young_laplace_table.py")
 
 
-class Tables(NamedTuple):
-    """Coefficients [-] of the polynomials of :func:`cz_gym.physics.young_laplace.polynomial`, by powers."""
+def build() -> dict[str, Floats]:
+    """Solve the meniscus at the nodes of the tables; a few seconds.
 
-    SLOPE: Floats
-    RING: Floats
-    TAIL: Floats
-
-
-def build() -> Tables:
-    """Solve the meniscus at the nodes of the tables; a few seconds."""
-    return Tables(
-        _fit(_slope_correction, *SIZES[0]), _fit(_ring_correction, *SIZES[1]), _fit(_tail_correction, *SIZES[2])
-    )
+    Coefficients [-] of the polynomials of :func:`cz_gym.physics.young_laplace.polynomial`, by powers.
+    """
+    wanted = {"SLOPE": (_slope_correction, 9, 16), "RING": (_ring_correction, 9, 22), "TAIL": (_tail_correction, 7, 8)}
+    return {name: _fit(*how) for name, how in wanted.items()}
 
 
 def _fit(function: Callable[[Floats, Floats], Floats], m: int, n: int) -> Floats:
@@ -90,7 +81,7 @@ def _tail_correction(x: Floats, y: Floats) -> Floats:
     return r * (moved / (X_b - exact.RING_REFERENCE) - 1.0)
 
 
-def render(tables: Tables) -> str:
+def render(tables: dict[str, Floats]) -> str:
     """The text of the module that holds the tables."""
     lines = [
         '"""Polynomials of the exact meniscus, computed by ``python -m studies.young_laplace``; not edited by hand."""',
@@ -99,7 +90,7 @@ def render(tables: Tables) -> str:
         "import numpy as np",
         "",
     ]
-    for name, table in tables._asdict().items():
+    for name, table in tables.items():
         lines.append(f"{name} = np.array([")
         for row in table:
             numbers = [f"{value!r}" for value in row.tolist()]
@@ -124,7 +115,7 @@ def _compare(given: argparse.Namespace) -> None:
     tables = build()
     if given.write:
         write_files({TABLE: render(tables).encode()})
-    worst = max(float(np.max(np.abs(new - old))) for new, old in zip(tables, (SLOPE, RING, TAIL), strict=True))
+    worst = max(float(np.max(np.abs(new - old))) for new, old in zip(tables.values(), (SLOPE, RING, TAIL), strict=True))
     print(f"largest difference from the coefficients there were: {worst:.2g}")
     print(f"wrote {TABLE.name}" if given.write else f"nothing written; --write replaces {TABLE.name}")
 

@@ -80,7 +80,7 @@ def test_the_meniscus_is_written_only_when_asked_for(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table = importlib.import_module("cz_gym.physics.young_laplace_table")
-    shipped = young_laplace.Tables(table.SLOPE, table.RING, table.TAIL)
+    shipped = {"SLOPE": table.SLOPE, "RING": table.RING, "TAIL": table.TAIL}
     monkeypatch.setattr(young_laplace, "TABLE", tmp_path / "table.py")
     monkeypatch.setattr(young_laplace, "build", lambda: shipped)
     with pytest.raises(SystemExit, match="0"):
