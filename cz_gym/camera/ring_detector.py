@@ -11,7 +11,7 @@ detector says of this puller's own steady state, less r_0.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -115,8 +115,12 @@ class RingDetector:
         found = np.isfinite(edges)
         if found.sum() < LEAST_LINES or contrast < LEAST_SHARE * self.contrast:
             return Ring(math.nan, edges)
-        radii: Any = edges[found] - self.shape[found]
-        fit = least_squares(lambda r: radii - r, [np.median(radii)], loss="soft_l1", f_scale=ROBUST, xtol=1e-12)
+        radii = edges[found] - self.shape[found]
+
+        def misses(radius: Floats) -> Floats:
+            return radii - radius
+
+        fit = least_squares(misses, [float(np.median(radii))], loss="soft_l1", f_scale=ROBUST, xtol=1e-12)
         return Ring(float(fit.x[0]) - self.bias, edges)
 
     def find_edges(self, image: npt.NDArray[np.uint8]) -> tuple[Floats, float]:
