@@ -7,13 +7,16 @@ import os
 import pkgutil
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+
+from gymnasium.error import Error
 
 from cz_gym.commands import OneLineParser, between
+from cz_gym.config import Config, make_config
+from cz_gym.rendering.scene import check_size
+from cz_gym.rendering.view import Window
 from cz_gym.units import MINUTE
 
-if TYPE_CHECKING:
-    from cz_gym.config import Config
+from .game import FASTEST, SLOWEST, Game
 
 CONTROLLERS = "cz_gym.baselines.registry:find_controller"
 """Where the paper's controller comes from: looked up by name, since this package imports no controller."""
@@ -45,11 +48,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def settings(arguments: argparse.Namespace) -> tuple[Config, tuple[int, int]]:
     """The environment's settings and the window's size; ValueError names what was given and what is allowed."""
-    from cz_gym.config import make_config
-    from cz_gym.rendering.scene import check_size
-
-    from .game import FASTEST, SLOWEST
-
     if not SLOWEST <= arguments.speed <= FASTEST:
         raise ValueError(f"--speed must be {SLOWEST:g} to {FASTEST:g}, not {arguments.speed:g}")
     if not 1.0 <= arguments.minutes <= 6000.0:
@@ -65,12 +63,6 @@ def _play(arguments: argparse.Namespace) -> None:
     config, size = settings(arguments)
     if sys.platform.startswith(("linux", "freebsd")) and not any(map(os.environ.get, DISPLAYS)):
         raise ValueError(NO_DISPLAY)
-    from gymnasium.error import Error
-
-    from cz_gym.rendering.view import Window
-
-    from .game import Game
-
     paper = pkgutil.resolve_name(CONTROLLERS)("paper").make(config)
     try:
         window = Window(size, "Cz-v0: pull a crystal")

@@ -11,12 +11,18 @@ import io
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from cz_gym import agents
+from cz_gym.atomic_files import check_writable, write_files
+from cz_gym.baselines.registry import find_controller
 from cz_gym.commands import OneLineParser, between
+from cz_gym.env import CzEnv
+from cz_gym.rendering import palette as c
+from cz_gym.rendering.canvas import Canvas
+from cz_gym.rendering.pixels import colours
 
-if TYPE_CHECKING:
-    from .duel import Side
+from .duel import Side, draw
 
 OUT = Path(__file__).resolve().parents[2] / "results" / "media" / "duel.gif"
 SEED = 2_000_000
@@ -50,8 +56,6 @@ def _make(arguments: argparse.Namespace) -> None:
         raise ValueError(f"--out must end in .gif, not {str(arguments.out)!r}")
     import PIL.Image  # noqa: F401  (missing? say so before the work, not after it)
 
-    from cz_gym.atomic_files import check_writable, write_files
-
     check_writable(arguments.out.resolve().parent)
     content = film(arguments.scenario, arguments.seed, arguments.frames, arguments.agent)
     write_files({arguments.out.resolve(): content})
@@ -60,11 +64,6 @@ def _make(arguments: argparse.Namespace) -> None:
 
 def film(scenario: str, seed: int, frames: int, agent: Path | None = None) -> bytes:
     """The GIF: both sides stepped together, ``frames`` pictures equally far apart in time."""
-    from cz_gym.rendering.canvas import Canvas
-    from cz_gym.rendering.pixels import colours
-
-    from .duel import draw
-
     sides, canvas = contestants(scenario, seed, agent), Canvas(*SIZE)
     steps = sides[0].env.config.steps
     pictures = []
@@ -77,13 +76,6 @@ def film(scenario: str, seed: int, frames: int, agent: Path | None = None) -> by
 
 def contestants(scenario: str, seed: int, agent: Path | None = None) -> tuple[Side, Side]:
     """The paper's controller and the agent of a file, or the shipped one, each with an environment of its own."""
-    from cz_gym import agents
-    from cz_gym.baselines.registry import find_controller
-    from cz_gym.env import CzEnv
-    from cz_gym.rendering.palette import TRUE
-
-    from .duel import Side
-
     env = CzEnv(scenario, observation="measured", render_mode="rgb_array")
     paper = find_controller("paper").make(env.config)
     learned = agents.OnnxPolicy.load(agent or agents.shipped(), env.config)
@@ -91,7 +83,7 @@ def contestants(scenario: str, seed: int, agent: Path | None = None) -> tuple[Si
         raise ValueError(f"{agent}: acts every {learned.contract.control_interval:g} s, not every 5 s")
     other = CzEnv(scenario, observation=learned.observation, action=learned.action, render_mode="rgb_array")
     name = f"learned: {learned.contract.algorithm}"
-    return Side("the paper's controller", paper, env, PAPER, seed), Side(name, learned, other, TRUE, seed)
+    return Side("the paper's controller", paper, env, PAPER, seed), Side(name, learned, other, c.TRUE, seed)
 
 
 def gif(pictures: Sequence[Any]) -> bytes:
@@ -111,15 +103,10 @@ def gif(pictures: Sequence[Any]) -> bytes:
 
 def _palette(picture: Any, Image: Any) -> Any:
     """COLOURS colours: those that mean something, however few their pixels, and the rest as the picture needs them."""
-    from cz_gym.rendering import palette as c
-
     marker = c.mix(c.CAMERA, c.MELT_TOP, 0.5)
     meaning = (c.BACK, c.PANEL, c.INK, c.TRUE, c.CAMERA, marker, c.REFERENCE, PAPER, c.ALARM, c.GLOW)
     needed = picture.quantize(COLOURS - len(meaning), method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-    channels = [
-        *needed.getpalette()[: 3 * (COLOURS - len(meaning))],
-        *(channel for colour in meaning for channel in colour),
-    ]
+    channels = [*needed.getpalette()[: 3 * (COLOURS - len(meaning))], *sum(meaning, ())]
     found = Image.new("P", (1, 1))
     found.putpalette(channels + channels[-3:] * (256 - len(channels) // 3))
     return found

@@ -12,6 +12,7 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.signal import dimpulse
 
 from cz_gym.baselines.analysis import frequency, sampled_loop
 from cz_gym.physics.linearisation import Floats, StateSpace
@@ -109,12 +110,8 @@ def _solve(matrices: Any, rights: Any) -> Complex:
 def one_reading(contender: Contender, dt: float) -> Floats:
     """Drives after one reading of the ring that is a metre too large, loop closed, shape (samples, 2)."""
     loop = sampled_loop.close(contender.system, make_puller(lam=MIX), dt)
-    at, rows = loop.inputs.index("camera"), [loop.outputs.index(name) for name in ("v_p", "Q_H")]
-    x, found = loop.B[:, at], [loop.D[rows, at]]
-    for _ in range(READING_SAMPLES - 1):
-        found.append(loop.C[rows] @ x)
-        x = loop.A @ x
-    return np.array(found)
+    parts = (loop.pick(drive, ("camera",)) for drive in ("v_p", "Q_H"))
+    return np.hstack([dimpulse((*part, dt), n=READING_SAMPLES)[1][0] for part in parts])
 
 
 def margins(contender: Contender, omega: Floats, dt: float) -> list[dict[str, Any]]:

@@ -25,11 +25,6 @@ if TYPE_CHECKING:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    return parser().run(_main, arguments, "agents,ray", "the same command goes on from the trials in its journal")
-
-
-def parser() -> OneLineParser:
-    """The options."""
     parser = OneLineParser("python -m studies.search", (__doc__ or "").split("\n")[0])
     for option, kind, default, meaning in (
         ("--trials", between(1, 10_000), 30, "trials in all, earlier ones included"),
@@ -42,7 +37,7 @@ def parser() -> OneLineParser:
     add_ray(parser, "by default this machine's")
     parser.set_defaults(ray="")
     add_folders(parser, "search")
-    return parser
+    return parser.run(_main, arguments, "agents,ray", "the same command goes on from the trials in its journal")
 
 
 def _main(given: argparse.Namespace) -> None:
