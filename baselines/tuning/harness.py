@@ -12,6 +12,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -72,9 +73,7 @@ def measure(policy: Any, config: Config, seeds: Sequence[int]) -> Figures:
 
 def value_at(settings: Any, path: str) -> float:
     """The value of a parameter."""
-    for name in path.split("."):
-        settings = getattr(settings, name)
-    return float(settings)
+    return float(attrgetter(path)(settings))
 
 
 def with_value(settings: Any, path: str, value: float) -> Any:

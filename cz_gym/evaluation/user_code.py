@@ -52,12 +52,8 @@ def controller(place: str) -> Contender:
     """
     name, found = load(place)
     made = _maker(place, found)
-    reads, acts = (
-        getattr(found, each, default) for each, default in (("observation", "measured"), ("action", "direct"))
-    )
-    return Contender(
-        Controller(name, str(reads), f"of {place}", action=str(acts), own=True), lambda config: [made(config)]
-    )
+    reads, acts = str(getattr(found, "observation", "measured")), str(getattr(found, "action", "direct"))
+    return Contender(Controller(name, reads, f"of {place}", action=acts, own=True), lambda config: [made(config)])
 
 
 def _maker(place: str, found: Any) -> Callable[[Config], Any]:

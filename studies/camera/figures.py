@@ -10,7 +10,7 @@ import numpy as np
 
 from cz_gym.camera.image import picture
 from cz_gym.camera.rays import FLAT, MELT, Ray, Scene, first_hit, make_scene, mirror, profile_at
-from cz_gym.camera.ring_detector import ANGLES, Edge, wall_edge
+from cz_gym.camera.ring_detector import ANGLES, wall_edge
 from cz_gym.camera.view import COLUMNS, ROWS, Camera, View, project
 from cz_gym.evaluation.report.canvas import COLOURS, GREY, INK, canvas, png
 from cz_gym.physics.meniscus import hurle_ring_offset
@@ -84,7 +84,9 @@ def section_figure(bench: Bench) -> bytes:
     zone, close = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
     for axis in (zone, close):
         _draw_crystal(axis, scene, view.camera.crucible_radius)
-        for z, colour in _aimed_heights(scene, edge):
+        for z, colour in (
+            (0.5 * (edge.z + scene.h_c), COLOURS[4]), (edge.z + 0.02 * MM, TRACED), (0.25 * edge.z, COLOURS[1])
+        ):  # fmt: skip
             _draw_ray(axis, z, scene, view, colour)
         axis.set_aspect("equal")
     _draw_hot_zone(zone, view.camera)
@@ -110,11 +112,6 @@ def _draw_hot_zone(axis: Any, camera: Camera) -> None:
         axis.text(x, y, text, ha="center", fontsize=8)
     axis.text(166, 165, "to the camera", fontsize=8, rotation=70, rotation_mode="anchor", ha="right")
     axis.set(xlim=(0, wall + 12), ylim=(-22, 175), xlabel="distance from the axis [mm]", ylabel="height [mm]")
-
-
-def _aimed_heights(scene: Scene, edge: Edge) -> tuple[tuple[float, str], ...]:
-    """Heights on the meniscus [m] that rays are drawn to, and their colours."""
-    return (0.5 * (edge.z + scene.h_c), COLOURS[4]), (edge.z + 0.02 * MM, TRACED), (0.25 * edge.z, COLOURS[1])
 
 
 def _draw_crystal(axis: Any, scene: Scene, outer: float) -> None:

@@ -24,15 +24,11 @@ def headline(benchmark: Benchmark) -> str:
     deciding = [scenario for scenario in benchmark.scenarios if len(scenario.seeds) > 1] or list(benchmark.scenarios)
     if 1 < len(deciding[0].seeds) < FEWEST:
         return f"No verdict from {len(deciding[0].seeds)} crystals: it needs {FEWEST}."
-    always = list(agents)
-    ever: list[str] = []
-    for scenario in deciding:
-        winners = [verdict.agent for verdict in scenario.verdicts if verdict.wins]
-        always, ever = [agent for agent in always if agent in winners], ever + winners
-    if always:
+    winners = [[verdict.agent for verdict in scenario.verdicts if verdict.wins] for scenario in deciding]
+    if always := [agent for agent in agents if all(agent in some for some in winners)]:
         first = f"{', '.join(always)} win{'s' if len(always) == 1 else ''} on every scenario."
     else:
-        first = "No agent wins on every scenario." if ever else "No agent wins."
+        first = "No agent wins on every scenario." if any(winners) else "No agent wins."
     return f"{first} {'; '.join(_among(scenario, len(agents)) for scenario in deciding)}."
 
 
