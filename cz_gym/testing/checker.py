@@ -18,7 +18,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from cz_gym.commands import OneLineParser
+from cz_gym.commands import OneLineParser, between
 from cz_gym.episodes import scenarios
 from cz_gym.observation import CAMERA, OBSERVATIONS
 
@@ -191,11 +191,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = OneLineParser(
         "python -m cz_gym.testing.checker", "Check Cz-v0's native vector form against its scalar form."
     )
-    parser.add_argument("--steps", type=int, default=50, help="batched steps a case, images fewer (%(default)s)")
-    parser.add_argument("--slots", type=int, default=3, help="slots of the batch (%(default)s)")
+    parser.add_argument(
+        "--steps", type=between(50, 10**9), default=50, help="batched steps a case, images fewer (%(default)s)"
+    )
+    parser.add_argument("--slots", type=between(2, 10**6), default=3, help="slots of the batch (%(default)s)")
     given = parser.parse_args(argv)
-    if given.steps < 50 or given.slots < 2:
-        parser.error(f"needs --steps of at least 50 and --slots of at least 2, not {given.steps}, {given.slots}")
     total, cases = Checked(), list(product(scenarios.SCENARIOS, (*OBSERVATIONS, CAMERA)))
     for scenario, observation in cases:
         found = _check_cz(scenario, observation, given.slots, given.steps)

@@ -20,13 +20,14 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+from cz_gym.baselines.registry import make_controller
 from cz_gym.commands import OneLineParser, between
+from cz_gym.evaluation.cluster import completed, connect
+from cz_gym.evaluation.protocol import find_row
+from cz_gym.evaluation.runner import Piece, run_piece
 from studies.markdown import table
-
-if TYPE_CHECKING:
-    from cz_gym.evaluation.runner import Piece
 
 MACHINES = (1, 2, 10, 100, 1000, 10_000)
 EMPTY = 300
@@ -67,12 +68,12 @@ def _main(given: argparse.Namespace) -> None:
     piece = a_piece(given.crystals)
     walls = {}
     for nodes in (2, 1):
-        with cluster(nodes) as connect:
+        with cluster(nodes) as joining:
             first = timed(piece, nodes)[1]
             found, walls[nodes] = timed(piece, given.tasks)
             t = sum(seconds for seconds, _ in found) / given.tasks
             _, empty = timed(found[0][1], EMPTY)
-    model = Model(connect, max(first - t, 0.0), t, empty / EMPTY)
+    model = Model(joining, max(first - t, 0.0), t, empty / EMPTY)
     print(
         f"connect {model.connect:.2f} s, load {model.load:.2f} s, task {model.t:.3f} s, driver {1e3 * model.d:.2f} ms\n"
     )
@@ -105,8 +106,6 @@ def cluster(nodes: int) -> Iterator[float]:
     import ray
     from ray.cluster_utils import Cluster
 
-    from cz_gym.evaluation.cluster import connect
-
     made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
     try:
         for _ in range(nodes):
@@ -121,10 +120,6 @@ def cluster(nodes: int) -> Iterator[float]:
 
 def a_piece(crystals: int) -> Piece:
     """The LQG on test crystals of ``randomized``: a task of the benchmark."""
-    from cz_gym.baselines.registry import make_controller
-    from cz_gym.evaluation.protocol import find_row
-    from cz_gym.evaluation.runner import Piece
-
     row = find_row("randomized")
     config, seeds = row.config(), tuple(row.seeds(crystals))
     return Piece("", partial(make_controller, "lqg"), row.design_config("measured"), config, 0, seeds, frozenset())
@@ -132,8 +127,6 @@ def a_piece(crystals: int) -> Piece:
 
 def timed(task: Any, count: int) -> tuple[list[Any], float]:
     """Do a task so often: what came back, and the time that all took [s]."""
-    from cz_gym.evaluation.cluster import completed
-
     began = time.perf_counter()
     found = [result for _, result in completed(work, [task] * count)]
     return found, time.perf_counter() - began
@@ -141,8 +134,6 @@ def timed(task: Any, count: int) -> tuple[list[Any], float]:
 
 def work(task: Any) -> Any:
     """Of a piece: the time that it took where it ran [s], and its result. What is no piece comes back as it is."""
-    from cz_gym.evaluation.runner import Piece, run_piece
-
     if not isinstance(task, Piece):
         return task
     began = time.perf_counter()
