@@ -12,15 +12,10 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
+from cz_gym.atomic_files import check_writable, locked
 from cz_gym.commands import OneLineParser, between
-from studies.comparison.command import STEPS, add_folders, add_ray, compare, join
-
-if TYPE_CHECKING:
-    from optuna import Study
-
-    from .trials import Search
+from studies.comparison.command import STEPS, add_folders, add_ray, join
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -41,50 +36,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(given: argparse.Namespace) -> None:
-    from cz_gym.atomic_files import check_writable, locked
     from studies.comparison.results import Plan
 
     check_writable(given.out)
     with locked(given.work):
-        plan = join(given.ray, Plan(given.out, given.work, crystals()[0]))
-        from .trials import Search, run
+        plan = join(given.ray, Plan(given.out, given.work, ()))
+        from .trials import JUDGED, Search, confirm, run
 
-        search = Search(plan, given.steps, given.trials, given.seed)
-        confirm(run(search), search, given)
-
-
-def crystals() -> tuple[Sequence[int], Sequence[int]]:
-    """Seeds of the crystals that trials are judged on, and of those that confirm; none of them picks a run's agent."""
-    from cz_gym.agents.training.validation import PICKING
-    from cz_gym.evaluation.protocol import VALIDATION_SEEDS
-
-    rest = VALIDATION_SEEDS[len(PICKING) :]
-    return rest[:150], rest[150:350]
-
-
-def confirm(study: Study, search: Search, given: argparse.Namespace) -> None:
-    """Train the best trials once more beside the recipe, on other crystals and training seeds, and write their table.
-
-    Training seeds begin at 1: the search used 0.
-    """
-    from cz_gym.agents.training.recipes import PPO
-    from cz_gym.evaluation.cluster import completed
-    from studies.comparison.variants import Study as Comparison
-    from studies.comparison.variants import Variant
-
-    from .trials import finished, params_of, recipe_of
-
-    complete = sorted(filter(search.is_complete, finished(study)), key=lambda each: each.values)
-    best = [trial for trial in complete if trial.params != params_of(PPO())][: given.finalists]
-    variants = [Variant(PPO(), "the recipe as it stands").of(given.steps)]
-    for trial in best:
-        recipe = recipe_of(trial.params, given.steps, f"ppo-trial-{trial.number}")
-        meaning = ", ".join(f"{name} {value:.4g}" for name, value in trial.params.items())
-        variants.append(Variant(recipe, meaning, variants[0].name))
-    comparison = Comparison("search", f"The best of {len(complete)} trials beside the recipe", variants, given.steps)
-    if best:
-        plan = search.plan._replace(crystals=crystals()[1])
-        compare(comparison, plan, variants, range(1, 1 + given.seeds), completed)
+        search = Search(plan._replace(crystals=JUDGED), given.steps, given.trials, given.seed)
+        confirm(run(search), search, given.finalists, given.seeds)
 
 
 if __name__ == "__main__":

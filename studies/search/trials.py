@@ -20,11 +20,20 @@ from ray.tune.search.optuna import OptunaSearch
 from tqdm import tqdm
 
 from cz_gym.agents.training.recipes import PPO
+from cz_gym.agents.training.validation import PICKING
 from cz_gym.atomic_files import write_files
+from cz_gym.evaluation.cluster import completed
 from cz_gym.evaluation.files import csv_text
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from studies.comparison.command import compare
 from studies.comparison.results import COST, Plan
 from studies.comparison.training import is_finished, trained
+from studies.comparison.variants import Study as Comparison
 from studies.comparison.variants import Variant
+
+REST = VALIDATION_SEEDS[len(PICKING) :]
+JUDGED, CONFIRMING = REST[:150], REST[150:350]
+"""Seeds of the crystals that trials are judged on, and of those that confirm; none of them picks a run's agent."""
 
 Params = Mapping[str, Any]
 """A place in the space, by the names of :data:`SPACE`."""
@@ -179,3 +188,20 @@ def write_history(search: Search, study: Study) -> None:
         rows.append((trial.number, state, f"{trial.value:.6g}", f"{seconds:.0f}", *values))
     text = csv_text(("trial", "state", "cost", "seconds", *SPACE), rows)
     write_files({search.plan.out / "history.csv": text.encode()})
+
+
+def confirm(study: Study, search: Search, finalists: int, seeds: int) -> None:
+    """Train the best trials once more beside the recipe, on other crystals and training seeds, and write their table.
+
+    Training seeds begin at 1: the search used 0.
+    """
+    complete = sorted(filter(search.is_complete, finished(study)), key=lambda each: each.values)
+    variants = [Variant(PPO(), "the recipe as it stands").of(search.steps)]
+    for trial in [each for each in complete if each.params != params_of(PPO())][:finalists]:
+        recipe = recipe_of(trial.params, search.steps, f"ppo-trial-{trial.number}")
+        meaning = ", ".join(f"{name} {value:.4g}" for name, value in trial.params.items())
+        variants.append(Variant(recipe, meaning, variants[0].name))
+    comparison = Comparison("search", f"The best of {len(complete)} trials beside the recipe", variants, search.steps)
+    if len(variants) > 1:
+        plan = search.plan._replace(crystals=CONFIRMING)
+        compare(comparison, plan, variants, range(1, 1 + seeds), completed)

@@ -43,7 +43,7 @@ def test_the_space_turns_what_it_says() -> None:
 
 
 def test_crystals_that_pick_judge_and_confirm_are_others() -> None:
-    groups = [set(PICKING), *map(set, search.crystals())]
+    groups = [set(PICKING), set(trials.JUDGED), set(trials.CONFIRMING)]
     assert set.union(*groups) <= set(VALIDATION_SEEDS)
     assert sum(map(len, groups)) == len(set.union(*groups))
     assert not set.union(*groups) & set(TEST_SEEDS)
@@ -67,7 +67,7 @@ def test_a_search_begins_with_the_recipe_goes_on_and_confirms_the_best(
     nodes: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     met: list[Any] = []
-    monkeypatch.setattr(search, "compare", lambda *given: met.append(given))
+    monkeypatch.setattr(trials, "compare", lambda *given: met.append(given))
     monkeypatch.setattr(trials, "attempt", attempt_bowl)
     monkeypatch.setattr(trials, "OTHERS", 2)
     (tmp_path / "work").mkdir()
@@ -82,7 +82,7 @@ def test_a_search_begins_with_the_recipe_goes_on_and_confirms_the_best(
     assert {row["state"] for row in every} == {"complete", "pruned"}
     ((study, plan, variants, seeds, _),) = met
     assert [variant.base for variant in variants] == ["", "ppo", "ppo"]
-    assert list(plan.crystals) == list(search.crystals()[1])
+    assert list(plan.crystals) == list(trials.CONFIRMING)
     assert list(seeds) == [1, 2]
     done = sorted((row for row in every[1:] if row["state"] == "complete"), key=lambda row: float(row["cost"]))
     assert [variant.name for variant in study.variants[1:]] == [f"ppo-trial-{row['trial']}" for row in done[:2]]
