@@ -8,7 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cz_gym.atomic_files import check_writable, locked, write_files
 from cz_gym.commands import OneLineParser, between
+from cz_gym.evaluation import cluster
 
 from .variants import Study, Variant
 
@@ -58,19 +60,15 @@ def add_ray(parser: OneLineParser, otherwise: str) -> None:
 
 def join(address: str, plan: Plan) -> Plan:
     """Join a Ray cluster whose machines share the plan's folders: the plan with their full paths."""
-    from cz_gym.evaluation.cluster import check_shared, connect
-
-    connect(address, "studies")
+    cluster.connect(address, "studies")
     for folder in (plan.out, plan.work):
         folder.mkdir(parents=True, exist_ok=True)
-        check_shared(folder)
+        cluster.check_shared(folder)
     return plan._replace(out=plan.out.resolve(), work=plan.work.resolve())
 
 
 def _main(study: Study, given: argparse.Namespace) -> None:
     from cz_gym.agents.training import validation
-    from cz_gym.atomic_files import check_writable, locked
-    from cz_gym.evaluation.cluster import completed, in_processes
 
     from .results import Plan
     from .training import in_turn, is_finished
@@ -85,9 +83,9 @@ def _main(study: Study, given: argparse.Namespace) -> None:
         return
     check_writable(plan.out)
     with locked(plan.work):
-        perform: Perform = in_turn if given.jobs == 1 else partial(in_processes, processes=given.jobs)
+        perform: Perform = in_turn if given.jobs == 1 else partial(cluster.in_processes, processes=given.jobs)
         if given.ray is not None:
-            plan, perform = join(given.ray, plan), completed
+            plan, perform = join(given.ray, plan), cluster.completed
         compare(study._replace(variants=variants), plan, chosen, seeds, perform)
 
 
@@ -104,8 +102,6 @@ def compare(study: Study, plan: Plan, chosen: Sequence[Variant], seeds: Sequence
 
 def _write(study: Study, plan: Plan, seeds: Sequence[int]) -> None:
     """Write table and figures from everything that is finished."""
-    from cz_gym.atomic_files import write_files
-
     from .figures import curves, forest
     from .lqg_family import lqg_family
     from .results import SCENARIO, TRANSFER
