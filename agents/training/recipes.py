@@ -271,7 +271,12 @@ SPECIALISTS = (
     replace(_ON, name="gradient-randomized", also=_OTHERS),
     replace(_ON, name="gradient-randomized-calm", also=_OTHERS, weights=replace(GRADIENT_COST, pull_step=0.2)),
     replace(_ON, name="gradient-randomized-agile", also=_OTHERS, weights=replace(GRADIENT_COST, pull_step=0.04)),
-    replace(_ON, name="gradient-hard", scenario="hard", also=_OTHERS[:1]),
+    replace(
+        _ON,
+        name="gradient-hard",
+        scenario="hard",
+        also=(("sensor-fault", 1.0, 0.2), ("", 1.3, 0.1), ("puller", 1.0, 0.1)),
+    ),
     replace(_ON, name="gradient-sensor-fault", scenario="sensor-fault", also=_OTHERS[1:]),
     replace(_ON, name="gradient-puller", scenario="puller", also=(), whitened=False, learning_rate=4e-3),
 )
