@@ -281,10 +281,13 @@ SPECIALISTS = (
     replace(_ON, name="gradient-puller", scenario="puller", also=(), whitened=False, learning_rate=4e-3),
 )
 """The recipe gradient for one scenario each; for ``randomized`` at three activities."""
+ALL = replace(_ON, name="gradient-all", steps=Gradient.steps // 2, learning_rate=3e-3)
+"""The recipe gradient further, on its own crystals of all four scenarios."""
 RECIPES: dict[str, Recipe] = {
     recipe.name: recipe
     for recipe in (
         Gradient(weights=GRADIENT_COST),
+        ALL,
         *SPECIALISTS,
         PPO(),
         Refinement(weights=GRADIENT_COST),
