@@ -52,7 +52,7 @@ def pareto(scenario: ScenarioResult, styles: Mapping[str, Style]) -> go.Figure:
             marker={"color": style.colour, "symbol": f"{MARKERS[style.marker]}-open", "size": 10, "line": {"width": 2}},
             hovertemplate=f"RMSE {RMSE.text(error)} mm<br>pull step RMS {PULL_STEP.text(activity)} mm/min",
         )
-    figure.update_xaxes(LOG, title=f"mean {PULL_STEP.heading}")
+    figure.update_xaxes(LOG, title=f"mean {PULL_STEP.heading}", nticks=4)
     figure.update_yaxes(LOG, title=f"mean {RMSE.heading}")
     figure.update_layout(
         title="Error against pull activity:<br>lower left is better", legend={"orientation": "h", "y": -0.2}
