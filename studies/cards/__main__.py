@@ -11,7 +11,7 @@ from typing import Any
 
 from cz_gym.agents import MODELS, shipped_seeds
 from cz_gym.agents.agent_file.contract import Contract, read_agent
-from cz_gym.agents.training.recipes import RECIPES, SPECIALISTS, Gradient, Imitation
+from cz_gym.agents.training.recipes import ALL, RECIPES, SPECIALISTS, Gradient, Imitation
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser, guarded
 from studies.algorithms.__main__ import ROWS
@@ -19,8 +19,9 @@ from studies.markdown import table
 
 PROG = "python -m studies.cards"
 _LEARNED = {row.name: row.meaning for row in ROWS} | {
-    recipe.name: f"{'going on from' if recipe.start else 'as'} `gradient`, for `{recipe.scenario}`"
-    for recipe in SPECIALISTS
+    recipe.name: f"going on from `{recipe.start}`, for "
+    + ("all four scenarios" if recipe is ALL else f"`{recipe.scenario}`")
+    for recipe in (ALL, *SPECIALISTS)
 }
 AGENTS = {name: how for name, how in _LEARNED.items() if any(MODELS.glob(f"{name}-seed*.onnx"))}
 """Shipped agents, and how each learned."""
@@ -119,8 +120,8 @@ ABOUT = """# Model cards
 
 What each shipped agent saw, what it reaches and where it fails, on test crystals that took no part in its training. All
 training seeds of a name are pooled; in brackets the 95 % interval over crystals and training seeds. The figures are of
-[the benchmark](../benchmark/report.md) and, of specialists, [the frontier](../frontier/report.md); `python -m
-studies.cards` wrote this page.
+[the benchmark](../benchmark/report.md) and, of agents for one scenario, [the frontier](../frontier/report.md);
+`python -m studies.cards` wrote this page.
 
 No agent was trained or tested on a real puller: none may control one.
 """

@@ -13,6 +13,7 @@ from cz_gym.config import make_config
 
 SHIPPED = {
     "gradient": 10,
+    "gradient-all": 5,
     "gradient-hard": 5,
     "gradient-puller": 5,
     "gradient-randomized": 5,

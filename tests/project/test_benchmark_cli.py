@@ -194,7 +194,7 @@ def test_agent_files_that_cannot_be_used_get_one_line(tmp_path: Path, refusal: A
     other = constant_agent(tmp_path / "other.onnx", training_seed=1, scenario="hard", scenario_hash="0" * 16)
     assert "different scenarios: hard, randomized" in refusal(["--agent", twice, "--agent", str(other)])
     assert "choose from" in (line := refusal(["--agent", f"mine={twice}", "--controllers", "your"]))
-    assert "mine, gradient, ppo, ppo-recurrent, sac, random-search, imitation, gradient-hard," in line
+    assert "mine, gradient, gradient-all, ppo, ppo-recurrent, sac, random-search, imitation, gradient-hard," in line
 
 
 @pytest.mark.parametrize(
