@@ -266,7 +266,7 @@ LQG_COST = CostWeights(pull=0.11, pull_step=0.049, heater_step=23.4)
 GRADIENT_COST = replace(LQG_COST, pull_step=0.07, observable=True)
 """The cost that the recipe gradient follows: calmer, and without what no sensor shows."""
 _OTHERS = ("sensor-fault", 1.0, 0.3), ("", 2.0, 0.03)
-_ON = Gradient(start="gradient", steps=Gradient.steps // 2, whitened=True, learning_rate=2e-3, weights=GRADIENT_COST)
+_ON = Gradient(start="gradient", steps=Gradient.steps // 4, whitened=True, learning_rate=2e-3, weights=GRADIENT_COST)
 SPECIALISTS = (
     replace(_ON, name="gradient-randomized", also=_OTHERS),
     replace(_ON, name="gradient-randomized-calm", also=_OTHERS, weights=replace(GRADIENT_COST, pull_step=0.2)),
@@ -278,18 +278,10 @@ SPECIALISTS = (
         also=(("sensor-fault", 1.0, 0.2), ("", 1.3, 0.1), ("puller", 1.0, 0.1)),
     ),
     replace(_ON, name="gradient-sensor-fault", scenario="sensor-fault", also=_OTHERS[1:]),
-    replace(
-        _ON,
-        name="gradient-puller",
-        scenario="puller",
-        also=(),
-        steps=Gradient.steps // 4,
-        whitened=False,
-        learning_rate=4e-3,
-    ),
+    replace(_ON, name="gradient-puller", scenario="puller", also=(), whitened=False, learning_rate=4e-3),
 )
 """The recipe gradient for one scenario each; for ``randomized`` at three activities."""
-ALL = replace(_ON, name="gradient-all", learning_rate=3e-3)
+ALL = replace(_ON, name="gradient-all", steps=Gradient.steps // 2, learning_rate=3e-3)
 """The recipe gradient further, on its own crystals of all four scenarios."""
 RECIPES: dict[str, Recipe] = {
     recipe.name: recipe
