@@ -11,7 +11,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnvWrapper
 from torch import nn
 
-from cz_gym.observation import HISTORY, MEASURED, PULL_SCALE, scales
+from cz_gym.observation import HISTORY, to_measured
 
 from .filter_bank import GAINS, STATE, FilterBank
 from .networks import ActorCritic, Normalise
@@ -27,8 +27,6 @@ class Remembering(VecEnvWrapper):
         width = channels - len(HISTORY) + len(bank.mean)
         super().__init__(venv, Box(-np.inf, np.inf, (width,), np.float32))
         self.bank = bank
-        # A history begins with what is measured, some of it in other scales.
-        self._scale = (scales(HISTORY, PULL_SCALE)[: len(MEASURED)] / scales(MEASURED, PULL_SCALE)).astype(np.float32)
 
     def reset(self) -> Any:
         """Forget everything."""
@@ -49,7 +47,7 @@ class Remembering(VecEnvWrapper):
         return features
 
     def _features(self, observation: Any, memory: torch.Tensor) -> tuple[Any, torch.Tensor]:
-        measured = observation[:, : len(MEASURED)] * self._scale
+        measured = to_measured(observation[:, : len(HISTORY)])
         with torch.no_grad():
             features, after = self.bank.remember(torch.from_numpy(measured), memory)
         return np.concatenate([features.numpy(), observation[:, len(HISTORY) :]], axis=1), after

@@ -18,6 +18,7 @@ from cz_gym.agents.training.recipes import RECIPES
 from cz_gym.agents.training.refinement import Remembering
 from cz_gym.agents.training.vec_env import CzVecEnv
 from cz_gym.atomic_files import write_files
+from cz_gym.observation import decode
 from tests.small_learners import made
 
 START = agents.shipped_seeds("gradient")[0]
@@ -28,15 +29,17 @@ SMALL: Any = replace(RECIPES["ppo-after-gradient"], start=str(START), **FEW)
 def test_it_begins_as_the_agent_that_it_goes_on_from() -> None:
     learner, agent = made(SMALL), agents.load(START)
     assert learner.exported() == START.read_bytes()
-    settings: Any = {"action": "rate", "horizon": 300.0, "autoreset_mode": AutoresetMode.SAME_STEP}
+    settings: Any = {"action": "rate", "horizon": 3600.0, "autoreset_mode": AutoresetMode.SAME_STEP}
     ours = Remembering(
         CzVecEnv(CzVectorEnv(3, observation="history", **settings), privileged=True), learner.algorithm.policy.bank
     )
     theirs = CzVectorEnv(3, **settings)
     ours.seed(5)
     features, (measured, _) = ours.reset(), theirs.reset(seed=[5, 6, 7])
-    memory, begins, ends = None, np.ones(3, bool), 0
-    for _ in range(100):
+    memory, begins, ends, moved = None, np.ones(3, bool), 0, np.zeros(2)
+    for _ in range(800):
+        reading = decode(measured)
+        moved = np.maximum(moved, [np.abs(reading.r_ref).max(), np.abs(reading.T_1_ref).max()])
         mean, _ = learner.algorithm.policy.predict(features, deterministic=True)
         action, memory = agent.predict(measured, memory, begins)
         assert mean == pytest.approx(action, abs=1e-5)
@@ -49,6 +52,7 @@ def test_it_begins_as_the_agent_that_it_goes_on_from() -> None:
             assert infos[i]["terminal_observation"][: last[0].shape[1]] == pytest.approx(last[0][0].numpy(), abs=1e-5)
             ends += 1
     assert ends == 3
+    assert (moved > [1e-4, 1.0]).all()  # references that move tell "history" from "measured"
     assert memory.shape == (3, STATE)
 
 
