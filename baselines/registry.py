@@ -56,7 +56,7 @@ def _tuned(name: str, meaning: str) -> Entry:
 
 IN_TABLE = 0.02
 """Pull step RMS [mm/min] of the family's member that runs by default: a table of radius errors is fair only if an LQG
-as active as the most active agent stands in it."""
+about as active as the agents stands in it. So it is on ``randomized``; on ``hard`` they move more."""
 
 
 def _lqg_at(activity: float) -> Entry:

@@ -80,7 +80,7 @@ class _OfWhitened(nn.Module):
 
 
 class GradientLearner:
-    """A :class:`.filter_bank.FilterBank` that follows the gradient of the reward's own cost."""
+    """A :class:`.filter_bank.FilterBank` that follows the gradient of the recipe's cost, window by window."""
 
     def __init__(self, recipe: Gradient, seed: int, config: Config, logger: Logger, done: int) -> None:
         torch.set_num_threads(recipe.threads)

@@ -102,7 +102,7 @@ class Rewarded(Recipe):
 
 @dataclass(frozen=True, kw_only=True)
 class Gradient(Rewarded):
-    """The exact gradient of the reward's cost, through policy, memory and plant; from nothing."""
+    """The gradient of the reward's cost, with ``weights``, through policy, memory and plant; from nothing."""
 
     name: str = "gradient"
     observation: str = "measured"
