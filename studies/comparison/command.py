@@ -22,11 +22,11 @@ STEPS = between(1, 10**9)
 """The type of an option that counts environment steps."""
 ABOUT = """
 Agents are judged on {crystals} validation crystals of `{scenario}` that did not choose a run's agent, and on those of
-`{transfer}` with the same seeds; of each run the agent of least cost on the validation that selects. In brackets: 95 % intervals,
-bootstrap over training seeds and crystals; with few training seeds they are somewhat too narrow. Differences are
-taken on the same crystals and training seeds, negative is better. Cost: of a step, as the environment's reward counts
-it; a lost crystal counts ten there, and 8 mm. *At equal activity*: RMSE over what the LQG's frontier has at that pull
-step RMS, by means; 1 is as good.
+`{transfer}` with the same seeds; of each run the agent of least cost on the validation that selects. In brackets:
+95 % intervals, bootstrap over training seeds and crystals; with few training seeds they are somewhat too narrow.
+Differences are taken on the same crystals and training seeds, negative is better. Cost: of a step, as the
+environment's reward counts it; a lost crystal counts ten there, and 8 mm. *At equal activity*: RMSE over what the
+LQG's frontier has at that pull step RMS, by means; 1 is as good.
 """
 
 
