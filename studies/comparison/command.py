@@ -25,8 +25,7 @@ Agents are judged on {crystals} validation crystals of `{scenario}` that did not
 `{transfer}` with the same seeds; of each run the agent of least cost on the validation that selects. In brackets:
 95 % intervals, bootstrap over training seeds and crystals; with few training seeds they are somewhat too narrow.
 Differences are taken on the same crystals and training seeds, negative is better. Cost: of a step, as the
-environment's reward counts it; a lost crystal counts ten there, and 8 mm. *At equal activity*: RMSE over what the
-LQG's frontier has at that pull step RMS, by means; 1 is as good.
+environment's reward counts it; a lost crystal counts ten there, and 8 mm.
 """
 
 
@@ -103,7 +102,6 @@ def compare(study: Study, plan: Plan, chosen: Sequence[Variant], seeds: Sequence
 def _write(study: Study, plan: Plan, seeds: Sequence[int]) -> None:
     """Write table and figures from everything that is finished."""
     from .figures import curves, forest
-    from .lqg_family import lqg_family
     from .results import SCENARIO, TRANSFER
     from .table import tabulate, to_csv, to_markdown
     from .training import is_finished, result_of
@@ -112,11 +110,10 @@ def _write(study: Study, plan: Plan, seeds: Sequence[int]) -> None:
     for task in ((variant, seed) for variant in study.variants for seed in seeds):
         if is_finished(plan, task):
             runs.setdefault(task[0].name, {})[task[1]] = result_of(plan, task)
-    family = lqg_family(plan)
-    lines = tabulate(study.variants, runs, family)
+    lines = tabulate(study.variants, runs)
     about = ABOUT.strip().format(crystals=len(plan.crystals), scenario=SCENARIO, transfer=TRANSFER)
     meanings = [f"- **{variant.name}**: {variant.meaning}" for variant in study.variants if variant.name in runs]
-    text = [f"# {study.title}", "", about, "", *to_markdown(lines, family), "", *meanings, ""]
+    text = [f"# {study.title}", "", about, "", *to_markdown(lines), "", *meanings, ""]
     files = {"table.md": "\n".join(text).encode(), "table.csv": to_csv(lines).encode()}
     files |= {"forest.png": forest(lines), "curves.png": curves(lines)}
     write_files({plan.out / name: content for name, content in files.items()})

@@ -57,15 +57,14 @@ def curves(lines: Sequence[Line]) -> bytes:
     """
     figure = canvas(9.4, 4.6)
     panels = figure.subplots(1, 2, sharey=True)
-    drawn = [line for line in lines if line.trained("steps") is not None]
     for axis, (column, unit, title) in zip(panels, AGAINST, strict=True):
-        for line, style in zip(drawn, styles([line.name for line in drawn]).values(), strict=True):
+        for line, style in zip(lines, styles([line.name for line in lines]).values(), strict=True):
             for place, run in enumerate(line.runs.values()):
                 spent = [row[column] / unit for row in run.validations]
                 error = [row["validation_rmse_mm"] for row in run.validations]
                 label = line.name if place == 0 and axis is panels[0] else None
                 axis.plot(spent, error, color=style.colour, marker=style.marker, ms=2.5, lw=1.0, label=label)
-        for name, rmse in _references(drawn).items():
+        for name, rmse in _references(lines).items():
             axis.axhline(rmse, color=INK, lw=0.9, ls="--")
             if axis is panels[0]:
                 axis.annotate(name, (0.99, rmse), (0, 2), axis.get_yaxis_transform(), textcoords="offset points",

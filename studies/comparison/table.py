@@ -14,7 +14,6 @@ import numpy as np
 from cz_gym.evaluation.files import csv_text
 from cz_gym.evaluation.statistics import Estimate, Resamples, means
 
-from .lqg_family import Family, at_equal_activity
 from .results import ACTIVITY, COST, FIGURES, LOST, RMSE, TRANSFER, Result
 from .variants import Variant
 
@@ -40,7 +39,7 @@ class Cell(NamedTuple):
 
 
 class Line(NamedTuple):
-    """One line of the table: a variant, or a controller, which has no training seeds."""
+    """One line of the table: a variant."""
 
     name: str
     base: str
@@ -49,19 +48,16 @@ class Line(NamedTuple):
     cells: Mapping[str, Cell]
     """By figure."""
 
-    def trained(self, column: str) -> float | None:
-        """What the runs' progress said at their end, on average over the training seeds; None for a controller."""
-        ends = [run.validations[-1][column] for run in self.runs.values() if run.validations]
-        return float(np.mean(ends)) if ends else None
+    def trained(self, column: str) -> float:
+        """What the runs' progress said at their end, on average over the training seeds."""
+        return float(np.mean([run.validations[-1][column] for run in self.runs.values()]))
 
 
-def tabulate(variants: Sequence[Variant], runs: Mapping[str, Mapping[int, Result]], family: Family) -> list[Line]:
-    """A line for each variant with finished runs, then one for each of the family."""
-    bases = {variant.name: variant.base for variant in variants} | dict.fromkeys(family, "")
-    everything = {**runs, **{name: {0: result} for name, result in family.items()}}
+def tabulate(variants: Sequence[Variant], runs: Mapping[str, Mapping[int, Result]]) -> list[Line]:
+    """A line for each variant with finished runs."""
     lines = []
-    for name, base in bases.items():
-        mine, others = everything.get(name, {}), everything.get(base, {})
+    for name, base in ((variant.name, variant.base) for variant in variants):
+        mine, others = runs.get(name, {}), runs.get(base, {})
         if mine:
             values = np.array([run.figures for run in mine.values()])
             weights = Resamples.draw(values.shape[1])
@@ -84,21 +80,15 @@ def to_csv(lines: Sequence[Line]) -> str:
     return csv_text(heads, rows)
 
 
-def to_markdown(lines: Sequence[Line], family: Family) -> list[str]:
+def to_markdown(lines: Sequence[Line]) -> list[str]:
     """The table's lines: means with their intervals, differences beneath them."""
-    heads = ("", "seeds", *(head for head, *_ in COLUMNS), "at equal activity", "million steps", "minutes")
+    heads = ("", "seeds", *(head for head, *_ in COLUMNS), "million steps", "minutes")
     rows = [f"| {' | '.join(heads)} |", f"|---|{'--:|' * (len(heads) - 1)}"]
     for line in lines:
-        steps, seconds = line.trained("steps"), line.trained("seconds")
-        ratio = at_equal_activity(list(line.runs.values()), family)
-        ends = (
-            "-" if ratio is None else f"{ratio:.3f}",
-            "-" if steps is None else f"{1e-6 * steps:.1f}",
-            "-" if seconds is None else f"{seconds / 60.0:.0f}",
-        )
+        ends = f"{1e-6 * line.trained('steps'):.1f}", f"{line.trained('seconds') / 60.0:.0f}"
         figures = [line.cells[figure].mean.text(form, unit) for _, figure, unit, form in COLUMNS]
         rows.append(f"| **{line.name}** | {len(line.runs)} | {' | '.join((*figures, *ends))} |")
         differences = [(line.cells[figure].difference, unit, form) for _, figure, unit, form in COLUMNS]
         if apart := [difference.text(f"+{form}", unit) for difference, unit, form in differences if difference]:
-            rows.append(f"| less {line.base} | | {' | '.join(apart)} | | | |")
+            rows.append(f"| less {line.base} | | {' | '.join(apart)} | | |")
     return rows

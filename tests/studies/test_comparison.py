@@ -18,7 +18,7 @@ from cz_gym.agents.training.recipes import PPO, SAC, Imitation, RecurrentPPO
 from cz_gym.evaluation import cluster
 from cz_gym.evaluation.protocol import TEST_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.statistics import Resamples
-from studies.comparison import command, lqg_family, results, table, training
+from studies.comparison import command, results, table, training
 from studies.comparison import figures as figures_of_it
 from studies.comparison.results import ACTIVITY, FIGURES, LOST, RMSE, Plan, Result
 from studies.comparison.variants import Study, Variant
@@ -43,15 +43,10 @@ def figures(rmse: float, activity: float, lost: float = 0.0, crystals: int = 50)
     return values
 
 
-FAMILY = {"fast": Result(figures(1.0, 0.02)), "quiet": Result(figures(2.0, 0.01))}
-
-
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run, "PICKING", VALIDATION_SEEDS[:2])
     monkeypatch.setattr(validation, "JUDGING", CRYSTALS)
-    family = {name: Result(each.figures[:2]) for name, each in FAMILY.items()}
-    monkeypatch.setattr(lqg_family, "lqg_family", lambda plan: family)
 
 
 def test_what_judges_neither_selects_nor_tests() -> None:
@@ -90,7 +85,7 @@ def test_a_comparison_keeps_what_is_finished_and_goes_on(
     assert {"agent.onnx", "agent.json", "summary.json", "progress.csv"} <= left, "agents stay"
     assert "checkpoint.safetensors" not in left
     text = (out / "table.md").read_text()
-    for name in ("**few** | 1", "less ppo |", "**quiet** | 1", "- **sac**: SAC"):
+    for name in ("**few** | 1", "less ppo |", "- **sac**: SAC"):
         assert name in text
     assert (out / "curves.png").read_bytes().startswith(b"\x89PNG")
     capsys.readouterr()
@@ -198,36 +193,3 @@ def test_differences_are_paired_by_crystal_and_training_seed() -> None:
     assert len(rows) == 1 + 2 * len(FIGURES)
     assert {len(row) for row in rows} == {11}
     assert float(rows[-len(FIGURES)][8]) == pytest.approx(cell.difference.mean, rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("agent", "ratio"),
-    [
-        ((1.5, 0.02, 0.0), 1.5),
-        ((1.0, 0.01, 0.0), 0.5),
-        ((1.0, 0.04, 0.0), 1.0),
-        ((1.0, 0.005, 0.0), None),
-        ((1.0, 0.02, 0.1), None),
-    ],
-)
-def test_radius_errors_are_read_at_equal_activity(agent: tuple[float, float, float], ratio: float | None) -> None:
-    """None where an agent is quieter than the whole family, and where it loses crystals."""
-    assert lqg_family.at_equal_activity([Result(figures(*agent))], FAMILY) == ratio
-
-
-def test_the_lqgs_are_judged_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    judged: list[str] = []
-
-    def judge(plan: Plan, law: Any, config: Any) -> np.ndarray:
-        judged.append(law.settings.hash)
-        return figures(2.0 + law.settings.weights.pull_step, 1.0 / law.settings.weights.pull_step, crystals=2)
-
-    monkeypatch.setattr(lqg_family, "judge", judge)
-    plan = Plan(tmp_path, tmp_path, CRYSTALS)
-    found = lqg_family.lqg_family(plan)
-    assert len(found) == len(judged) == len(set(judged)) == 7
-    again = lqg_family.lqg_family(plan)
-    assert len(judged) == 7
-    assert {name: each.mean(RMSE) for name, each in again.items()} == {n: each.mean(RMSE) for n, each in found.items()}
-    for each in found.values():
-        assert lqg_family.at_equal_activity([each], found) == pytest.approx(1.0)
