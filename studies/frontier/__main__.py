@@ -41,25 +41,26 @@ def read_points(path: Path, metric: str) -> dict[str, Points]:
         raise ValueError(f"{path} is no benchmark.json") from None
 
 
-def table(results: Mapping[str, Points], episodes: Episodes | None = None) -> str:
-    """A line for every controller of every scenario that holds a frontier; with intervals if there are episodes."""
+def table(results: Mapping[str, Points], metric: str, episodes: Episodes | None = None) -> str:
+    """A Markdown table for every scenario that holds a frontier; ratios with intervals if there are episodes."""
     lines = []
     for scenario, points in results.items():
+        lines += ["", f"## {scenario}", ""]
         try:
             found = ratios(points, FAMILY)
             most = frontier([points[name] for name in FAMILY if name in points]).activity[-1]
         except ValueError as error:
-            lines.append(f"{scenario}: {error}")
+            lines.append(f"{error}.")
             continue
         spread = {} if episodes is None else _intervals(scenario, points, episodes.get(scenario, {}))
+        lines += [f"| controller | pull step RMS [mm/min] | {metric.removesuffix('_mm')} [mm] | of the LQG's |"]
+        lines += ["|---|--:|--:|--:|"]
         for name, (activity, rmse) in points.items():
-            rival = "quieter than any"
-            if name in found:
-                rival = f"{rmse / found[name]:.4f} mm, ratio {found[name]:.3f}"
-                rival += " [{:.3f}, {:.3f}]".format(*spread[name]) if name in spread else ""
-                rival += f", which lqg has at {most:.4f} and no better above" if activity > most else ""
-            lines.append(f"{scenario}: {name} {rmse:.4f} mm at {activity:.4f} mm/min; lqg there: {rival}")
-    return "\n".join(lines)
+            ratio = f"{found[name]:.3f}" if name in found else "quieter than any LQG"
+            ratio += " [{:.3f}, {:.3f}]".format(*spread[name]) if name in found and name in spread else ""
+            ratio += f", more active than any LQG ({most:.4f})" if activity > most else ""
+            lines.append(f"| {name} | {activity:.4f} | {rmse:.4f} | {ratio} |")
+    return "\n".join(lines[1:])
 
 
 def _intervals(scenario: str, points: Points, episodes: Mapping[str, Any]) -> dict[str, Point]:
@@ -85,7 +86,7 @@ def _compare(given: argparse.Namespace) -> int:
     results = read_points(given.benchmark, given.metric)
     beside = given.benchmark.with_name(EPISODES)
     episodes = read_episodes(beside, lambda _: (ACTIVITY, given.metric)) if beside.exists() else None
-    print(table(results, episodes))
+    print(table(results, given.metric, episodes))
     return 0
 
 

@@ -20,11 +20,10 @@ def test_a_benchmark_is_compared_at_equal_activity(tmp_path, capsys):
     file.write_text(json.dumps({"results": {"randomized": scenario, "nominal": {"ppo": entry(0.01, 0.2)}}}))
     assert frontier.main([str(file)]) == 0
     told = capsys.readouterr().out
-    assert "ppo 0.2000 mm at 0.0100 mm/min; lqg there: 0.1000 mm, ratio 2.00" in told
-    assert "industrial 0.4000 mm at 0.0010 mm/min; lqg there: quieter than any" in told
-    assert "lively 0.1000 mm at 0.0300 mm/min; lqg there: 0.0707 mm, ratio 1.41" in told
-    assert ", which lqg has at 0.0200 and no better above" in told
-    assert "nominal: a frontier needs two settings" in told
+    assert "| ppo | 0.0100 | 0.2000 | 2.000 |" in told
+    assert "| industrial | 0.0010 | 0.4000 | quieter than any LQG |" in told
+    assert "| lively | 0.0300 | 0.1000 | 1.414, more active than any LQG (0.0200) |" in told
+    assert "## nominal\n\na frontier needs two settings" in told
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"results": {"randomized": {"lqg": 1}}}'])
@@ -48,7 +47,7 @@ def test_episodes_beside_a_benchmark_give_intervals_unless_they_are_of_another_r
     path = tmp_path / "benchmark.json"
     path.write_text(json.dumps({"results": {"randomized": {name: entry(*pair) for name, pair in values.items()}}}))
     assert frontier.main([str(path)]) == 0
-    assert "ratio 1.044 [1.044, 1.044]" in capsys.readouterr().out
+    assert "| 1.044 [1.044, 1.044] |" in capsys.readouterr().out
     (tmp_path / "episodes.csv").write_text("\n".join([*lines[:-1], lines[-1].replace("0.06", "nan")]))
     assert "no episodes of a benchmark, or damaged" in refused(frontier.main, [str(path)])
     (tmp_path / "episodes.csv").write_text("\n".join(lines))
