@@ -256,12 +256,6 @@ def test_gains_are_apart_from_others_and_not_from_themselves(near: Any) -> None:
             assert values == pytest.approx([deviation] * 4, abs=1e-12)
 
 
-def test_what_cannot_be_meant_is_one_line(tmp_path: Any, capsys: Any, refused: Any) -> None:
-    assert "not 0" in refused(insight.main, ["--episodes", "0"])
-    assert insight.main(["--agent", "no-such.onnx", "--out", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.count("\n") <= 2
-
-
 def test_the_growth_of_a_loop_is_that_of_its_fastest_mode() -> None:
     grows, fades = np.exp(5.0 / 7200.0), np.exp(-5.0 / 60.0)
     loop = Loop(np.diag([fades, grows]), *[np.zeros((2, 2))] * 3, ("a", "b"), ("c", "d"), 5.0)

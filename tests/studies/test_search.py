@@ -129,18 +129,6 @@ def test_interrupted_trials_come_again_and_once(tmp_path: Path) -> None:
     assert study.ask(SPACE).params not in (RECIPE, lost.params, failed.params)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--trials", "0"], "--trials: must be between 1 and 10000, not 0"),
-        (["--finalists", "-1"], "--finalists: must be between 0"),
-        (["--seeds", "0"], "--seeds: must be between 1"),
-    ],
-)
-def test_mistakes_give_one_line(arguments: list[str], message: str, refused: Any) -> None:
-    assert message in refused(search.main, arguments)
-
-
 @pytest.mark.usefixtures("few_crystals")
 def test_an_attempt_goes_on_and_tells_all_its_validations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[float] = []

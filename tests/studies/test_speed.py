@@ -81,25 +81,15 @@ def test_ratios_are_of_like_with_like() -> None:
         Row("Cz-v0 batch, measured, 1 thread", 1024, 100.0), Row("Cz-v0 batch, measured, 2 threads", 1024, 180.0),
         Row("Cz-v0 batch, measured, 1 thread", 4096, 900.0), Row("Cz-v0 batch, history, 2 threads", 1024, 999.0),
         Row("EnvPool Pendulum-v1, 1 thread", 1024, 60.0), Row("EnvPool Pendulum-v1, 2 threads", 1024, 30.0),
-        Row("Cz-v0 batch without resets, 1 thread", 1024, 3.0),
-        Row("bare compiled plant and ring, 1 thread", 1024, 4.0),
         Row("SB3 adapter over the batch", 256, 50.0), Row("SB3 SubprocVecEnv, 2 processes", 2, 5.0),
         Row("SB3 SubprocVecEnv, 16 processes", 16, 10.0),
     ]  # fmt: skip
     found = {name: ratio(rows, asked) for name, asked in RATIOS.items()}
-    assert found == {
+    assert {name: value for name, value in found.items() if value is not None} == {
         "scalar_vs_pendulum": 3.0,
         "vector1024_vs_envpool_pendulum": 3.0,
-        "vector1024_vs_pcgym": None,
-        "vector1024_vs_kernel": 0.75,
-        "sb3_adapter_vs_subproc": 5.0,
-        "sb3_adapter_vs_dummy": None,
-        "derivatives_vs_step": None,
-        "sb3_make_vec_env_vs_pendulum": None,
-        "sync_vector_env_vs_pendulum": None,
         "vector1024_vs_envpool_pendulum_one_thread": 100.0 / 60.0,
-        "vector1024_vs_numpy": None,
-        "failing_vs_not_failing": None,
+        "sb3_adapter_vs_subproc": 5.0,
     }
     assert speed.growth(rows) == {"cost_per_step_4096_vs_1024": 100.0 / 900.0}
 
