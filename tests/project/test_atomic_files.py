@@ -216,20 +216,6 @@ def test_a_writer_that_fails_halfway_through_is_finished_by_the_next(
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == dict.fromkeys("abc", b"new")
 
 
-def test_an_interrupt_leaves_nothing_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(*arguments: Any) -> None:
-        raise KeyboardInterrupt
-
-    for call, left in (("fsync", [b"old", b"old"]), ("replace", [b"new", b"new"])):
-        write_files({tmp_path / "a": b"old", tmp_path / "b": b"old"})
-        with monkeypatch.context() as patch:
-            patch.setattr(atomic_files.os, call, interrupt)
-            with pytest.raises(KeyboardInterrupt):
-                write_files({tmp_path / "a": b"new", tmp_path / "b": b"new"})
-        finish_writing(tmp_path)
-        assert [(tmp_path / name).read_bytes() for name in names(tmp_path)] == left
-
-
 def test_a_folder_in_a_file_s_place_is_refused(tmp_path: Path) -> None:
     (tmp_path / "b").mkdir()
     with pytest.raises(IsADirectoryError, match="b is a folder"):
