@@ -104,7 +104,7 @@ def test_a_lost_node_loses_nothing(nodes: tuple[Any, Any], tmp_path: Path, monke
         made.remove_node(second, allow_graceful=False)
         (tmp_path / "work" / "go").touch()
 
-    losing = Thread(target=lose)
+    losing = Thread(target=lose, daemon=True)
     losing.start()
     assert search.main(command(tmp_path, 4)) == 0
     losing.join()
