@@ -53,12 +53,6 @@ def test_the_figure_shows_the_controllers_of_readme_s_table() -> None:
     assert names(chosen(many, COLUMNS)) == list(QUOTED)
 
 
-def test_many_agents_leave_room_for_what_they_are_compared_with() -> None:
-    agents = [sample(f"ppo-{i}", 9.0 - i, seeds=(0,)) for i in range(6)]
-    others = [sample("paper", 99.0), sample("lqg", 1.0), sample("pid", 2.0)]
-    assert names(chosen([*others, *agents], 4)) == ["paper", "lqg", "pid", "ppo-5"]
-
-
 def test_a_known_controller_looks_the_same_everywhere_and_no_colour_comes_twice() -> None:
     alone = styles(["lqg-at-0.02"])
     everyone = styles_of([sample(name, 1.0).controller for name in ("mine", *KNOWN, *(f"c{i}" for i in range(18)))])

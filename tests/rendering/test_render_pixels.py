@@ -162,12 +162,6 @@ def test_a_failed_crystal_has_a_picture_that_says_so(pull: float, ending: Ending
     assert banner.sum() > 0.3 * 20 * box.w
 
 
-def test_magnification_falls_as_the_error_grows(record: Record) -> None:
-    assert puller_panel.magnification(record) in puller_panel.MAGNIFICATIONS
-    largest = float(np.abs(record.error).max())
-    assert puller_panel.magnification(record) * largest <= puller_panel.LARGEST * record.puller.r_0
-
-
 def test_the_crucible_rises_by_what_the_crystal_took(record: Record) -> None:
     grown_mass = 2330 * np.pi * trapezoid(record.column("r_c") ** 2, record.column("length"))
     melt_mass = 2570 * np.pi * 0.28**2 * puller_panel.crucible_rise(record)

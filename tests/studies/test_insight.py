@@ -115,12 +115,6 @@ def test_loops_are_opened_as_the_design_table_opens_them(name: str, at: str) -> 
     assert np.allclose(loop.opened(at), theirs(opened(controller, puller, DT, at), DT, OMEGA), rtol=1e-8)
 
 
-def test_the_mean_derivative_is_the_mean_of_derivatives() -> None:
-    rows = np.stack([REST, REST + 0.05])
-    both, *each = (linear_agent(CONTENT, some, DT, CONTRACT.action) for some in (rows, *rows))
-    assert both.now == pytest.approx(0.5 * (each[0].now + each[1].now), rel=1e-9)
-
-
 def test_one_reading_is_answered_as_the_loops_own_simulation_does() -> None:
     loop = close(insight.controller("lqg").system, make_puller(lam=0.5), DT)
     at, x, expected = loop.inputs.index("camera"), loop.B[:, 3], [loop.D[:2, 3]]
