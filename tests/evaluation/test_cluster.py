@@ -1,7 +1,5 @@
 """A benchmark on a Ray cluster of several nodes: the same figures, also when a node is lost on the way."""
 
-from __future__ import annotations
-
 import io
 import socket
 import sys

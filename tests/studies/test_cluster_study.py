@@ -1,7 +1,5 @@
 """Time against nodes, measured on one and two of them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """The search: begins with the recipe, goes on from its journal, gives up the hopeless, confirms the best."""
 
-from __future__ import annotations
-
 import csv
 import time
 from dataclasses import asdict
