@@ -62,8 +62,6 @@ def test_what_there_is_not_is_one_line(name: str, message: str) -> None:
 def test_a_name_is_no_file() -> None:
     with pytest.raises(agents.AgentFileError, match=r"had by name: cz_gym\.agents\.load\('ppo'\)"):
         agents.OnnxPolicy.load("ppo")
-    with pytest.raises(ValueError, match="needs a Config, not 'hard'"):
-        agents.OnnxPolicy.load(agents.shipped("ppo"), "hard")  # type: ignore[arg-type]
 
 
 OTHERS: list[dict[str, Any]] = [{"action": "rate"}, {"control_interval": 2.0}]

@@ -16,7 +16,6 @@ from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 
 MM_PER_MIN = 1e-3 / 60
 ZERO = np.zeros(2, np.float32)
-OBSERVATIONS = ["measured", "history", "state"]
 
 
 def test_everything_advertised_is_there() -> None:

@@ -4,7 +4,6 @@ import csv
 import json
 import re
 import shlex
-import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -27,6 +26,7 @@ from cz_gym.observation import OBSERVATIONS
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from tests.contracts import LINEAR, facts, model_of
+from tests.processes import python
 
 FILES = ["benchmark.json", "crystal.png", "episodes.csv", "errors.png", "pareto.png", "report.html", "report.md"]
 SMALL = ["--episodes", "3", "--scenarios", "randomized,reference-b", "--controllers", "open-loop,paper"]
@@ -290,9 +290,7 @@ def test_the_benchmark_needs_neither_torch_nor_stable_baselines3(tmp_path: Path)
     arguments = [*ONE[:3], "paper", "--agent", str(agent), "--out", str(tmp_path / "out"), "--quiet"]
     loaded = "{'torch', 'stable_baselines3'} & {*sys.modules}"
     code = f"import sys, benchmark; sys.exit(benchmark.main({arguments!r}) or len({loaded}))"
-    folder = Path(benchmark.__file__).parent
-    done = subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=folder, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    python("-W", "error", "-c", code)
     assert (tmp_path / "out" / "report.md").read_text().startswith("No agent wins.")
 
 

@@ -8,8 +8,6 @@ import importlib
 import inspect
 import re
 import shlex
-import subprocess
-import sys
 import tomllib
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator
@@ -32,8 +30,8 @@ from cz_gym.engine.layout import INFO  # noqa: E402
 from cz_gym.observation import OBSERVATIONS  # noqa: E402
 from cz_gym.physics.parameters import describe  # noqa: E402
 from cz_gym.physics.plant import Disturbance, Inputs  # noqa: E402
+from tests.processes import ROOT, python  # noqa: E402
 
-ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
 SLOW = {"docs/paper.md", "docs/extend/meniscus.md"}
@@ -182,8 +180,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     makefile = (ROOT / "Makefile").read_text()
     recipe = re.search(r"^\t\$\(BIN\)/python (-m sphinx --fail-on-warning .*) build/docs$", makefile, re.MULTILINE)
     assert recipe is not None
-    done = subprocess.run([sys.executable, *recipe[1].split(), str(folder)], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    python(*recipe[1].split(), str(folder))
     return folder
 
 

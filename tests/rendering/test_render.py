@@ -21,9 +21,9 @@ from cz_gym import CzEnv
 from cz_gym.rendering import backend
 from cz_gym.rendering.scene import check_size
 from cz_gym.rendering.view import MODES
+from tests.processes import ROOT, python
 
 pygame = pytest.importorskip("pygame")
-ROOT = Path(__file__).parents[2]
 
 
 def trajectory(render_mode: str | None, scenario: str, steps: int = 60) -> list[Any]:
@@ -171,8 +171,7 @@ def test_without_pygame_nothing_is_declared_and_asking_says_what_to_install(monk
         "try:\n    cz_gym.CzEnv(render_mode='rgb_array')\n"
         "except Exception as error:\n    print(type(error).__name__, error)\n"
     )
-    done = subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert done.stdout == f"DependencyNotInstalled {backend.MISSING}\n", done.stderr
+    assert python("-W", "error", "-c", code) == f"DependencyNotInstalled {backend.MISSING}\n"
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(DependencyNotInstalled, match=r"pip install"):
         backend.load()
