@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import cz_gym
 from cz_gym import CzEnv, CzVectorEnv
 from cz_gym.agents import load
 from cz_gym.baselines import CompensatedPID, OpenLoop
@@ -167,6 +168,12 @@ def test_a_name_is_no_config(make: Any) -> None:
 def test_seeds_that_are_none_are_refused(seeds: Any) -> None:
     with pytest.raises(ValueError, match=r"needs a sequence of at least one seed, as \[1\]"):
         rollout(OpenLoop(), SHORT, seeds)
+
+
+def test_after_import_cz_gym_everything_is_there() -> None:
+    assert cz_gym.__getattr__("agents") is import_module("cz_gym.agents")
+    with pytest.raises(AttributeError, match="no attribute 'agent'"):
+        _ = cz_gym.agent
 
 
 def test_a_rollout_can_be_looked_at(tmp_path: Path) -> None:

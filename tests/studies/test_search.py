@@ -127,6 +127,10 @@ def test_interrupted_trials_come_again_and_once(tmp_path: Path) -> None:
     assert study.ask(SPACE).params not in (RECIPE, lost.params, failed.params)
 
 
+def test_a_number_beyond_its_limits_is_one_line(refused: Any) -> None:
+    assert "--trials: must be between 1 and 10000, not 0" in refused(search.main, ["--trials", "0"])
+
+
 @pytest.mark.usefixtures("few_crystals")
 def test_an_attempt_goes_on_and_tells_all_its_validations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[float] = []
