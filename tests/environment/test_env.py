@@ -134,6 +134,17 @@ def test_a_foreign_meniscus_is_another_plant() -> None:
     assert make_config(meniscus=MeniscusModel(*HURLE)).plant_hash == make_config().plant_hash
 
 
+def test_out_of_range_actions_are_clipped_and_said_so() -> None:
+    runs = []
+    for action, clipped in (([3.0, -math.inf], True), ([1.0, -1.0], False)):
+        env = CzEnv(info="all")
+        env.reset(seed=0)
+        observation, *_, info = env.step(np.array(action))
+        assert info["action_clipped"] is clipped
+        runs.append((observation.tolist(), info["v_p"], info["Q_H"]))
+    assert runs[0] == runs[1]
+
+
 def test_actions_are_pull_speed_and_power() -> None:
     env, p = CzEnv("nominal", info="all"), make_puller()
     _, start = env.reset(seed=0)
