@@ -23,8 +23,8 @@ import cz_gym  # noqa: F401  (registers Cz-v0)
 from cz_gym.agents import AgentFileError, OnnxPolicy, from_sb3
 from cz_gym.config import make_config
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from tests.processes import ROOT
 
-ROOT = Path(__file__).parents[2]
 ON = {"n_steps": 16, "batch_size": 32, "n_epochs": 1}
 OFF = {"learning_starts": 8, "buffer_size": 64, "batch_size": 8}
 KINDS: dict[str, tuple[Any, str, dict[str, Any]]] = {
@@ -99,30 +99,30 @@ def test_the_command_reads_what_stable_baselines3_and_rl_zoo_save(
 @pytest.mark.parametrize("kind", ["ppo", "sac"])
 def test_a_model_without_its_normalisation_is_refused(kind: str, tmp_path: Path) -> None:
     """A model that was saved and loaded has no environment that could tell."""
-    algorithm = KINDS[kind][0]
-    for normalised in (True, False):
-        model = trained(kind, normalised)
+    config = make_config(observation="history", action="smooth", control_interval=10.0)
+
+    def again(model: Any) -> Any:
         model.save(tmp_path / "model.zip")
-        loaded = algorithm.load(tmp_path / "model.zip", device="cpu")
-        config = make_config(observation="history", action="smooth", control_interval=10.0)
-        if normalised:
-            with pytest.raises(AgentFileError, match=r"trained on normalised observations: .*--vecnormalize"):
-                from_sb3.save_agent(tmp_path / "mine.onnx", loaded, "mine", config=config)
-            from_sb3.save_agent(tmp_path / "mine.onnx", loaded, "mine", model.get_vec_normalize_env(), config)
-        else:
-            from_sb3.save_agent(tmp_path / "mine.onnx", loaded, "mine", config=config)
+        return type(model).load(tmp_path / "model.zip", device="cpu")
+
+    normalised, plain = trained(kind, normalised=True), trained(kind)
+    with pytest.raises(AgentFileError, match=r"trained on normalised observations: .*--vecnormalize"):
+        from_sb3.save_agent(tmp_path / "mine.onnx", again(normalised), "mine", config=config)
+    environment = normalised.get_vec_normalize_env()
+    from_sb3.save_agent(tmp_path / "mine.onnx", again(normalised), "mine", environment, config)
+    from_sb3.save_agent(tmp_path / "mine.onnx", again(plain), "mine", config=config)
 
 
 def test_a_model_loaded_into_an_environment_still_lacks_its_normalisation(tmp_path: Path) -> None:
-    model, plain = trained("ppo", normalised=True, observation="state"), trained("ppo", observation="state")
-    for each in (model, plain):
-        each.save(tmp_path / "model.zip")
-        loaded = PPO.load(tmp_path / "model.zip", env=plain.get_env(), device="cpu")
-        if each is plain:
-            from_sb3.save_agent(str(tmp_path / "mine.onnx"), loaded, "mine")
-        else:
-            with pytest.raises(AgentFileError, match="trained on normalised observations"):
-                from_sb3.save_agent(tmp_path / "mine.onnx", loaded, "mine")
+    normalised, plain = trained("ppo", normalised=True, observation="state"), trained("ppo", observation="state")
+
+    def into_plain(model: Any) -> Any:
+        model.save(tmp_path / "model.zip")
+        return PPO.load(tmp_path / "model.zip", env=plain.get_env(), device="cpu")
+
+    with pytest.raises(AgentFileError, match="trained on normalised observations"):
+        from_sb3.save_agent(tmp_path / "mine.onnx", into_plain(normalised), "mine")
+    from_sb3.save_agent(str(tmp_path / "mine.onnx"), into_plain(plain), "mine")
     unknown = PPO("MlpPolicy", plain.get_env(), device="cpu", **ON)
     unknown.set_parameters(tmp_path / "model.zip")
     with pytest.warns(UserWarning, match="does not know how it was trained: if on normalised"):

@@ -12,13 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cz_gym.baselines.registry import find_controller
-from cz_gym.evaluation.protocol import find_row
 from cz_gym.evaluation.report.page import page
 from cz_gym.evaluation.report.page_signals import OWN, PANELS, SHARED
-from cz_gym.evaluation.results import Benchmark, Controller, ScenarioResult, summarise
-from cz_gym.evaluation.rollout import rollout
-from tests.samples import sample_of
+from cz_gym.evaluation.results import Benchmark
+from tests.samples import scenario_of
 
 selenium = pytest.importorskip("selenium", reason="selenium is absent: pip install '.[browser]'")
 from selenium import webdriver  # noqa: E402
@@ -44,20 +41,11 @@ RANGES = (
 LINES = "return document.getElementById('signals').data.map(t => [t.name, t.yaxis, Array.from(t.y)])"
 
 
-def scenario(name: str, episodes: int) -> ScenarioResult:
-    """Two controllers and an agent with a name that is markup."""
-    row = find_row(name)
-    config, seeds, samples = row.config(), row.seeds(episodes), []
-    for who in ("open-loop", "paper", "industrial"):
-        run = rollout(find_controller(who).make(config), config, seeds)
-        agent = Controller(EVIL, "measured", f"trained with {EVIL}", (4,)) if who == "industrial" else None
-        samples.append(sample_of(agent or Controller(who, "measured", f"what {who} is"), [run]))
-    return summarise(row, samples)
-
-
 @pytest.fixture(scope="module")
 def made() -> Benchmark:
-    return Benchmark((scenario("puller", 3), scenario("reference-b", 3)), "benchmark.py", ())
+    """Two controllers and an agent with a name that is markup."""
+    names = ("open-loop", "paper", "industrial")
+    return Benchmark(tuple(scenario_of(name, names, EVIL)[0] for name in ("puller", "reference-b")), "benchmark.py", ())
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,6 @@
 
 import hashlib
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +12,8 @@ import benchmark
 from cz_gym import SCENARIOS, CzVectorEnv, Parameters
 from tests.golden.digest import digest
 from tests.golden.trajectories import FILE, SIGNALS, trajectories, trajectory
+from tests.processes import ROOT, python
 
-ROOT = Path(__file__).parents[2]
 GOLDEN: dict[str, Any] = json.loads(FILE.read_text())
 
 
@@ -38,9 +36,7 @@ def test_goldens_notice_a_change_of_any_parameter(name: str) -> None:
 
 def test_the_same_bits_in_another_process() -> None:
     """And from an installed wheel: ``tests/project/test_packaging.py``."""
-    command = [sys.executable, "-m", "tests.golden.digest"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == [digest(), str(ROOT / "cz_gym" / "__init__.py")]
+    assert python("-m", "tests.golden.digest").split() == [digest(), str(ROOT / "cz_gym" / "__init__.py")]
 
 
 def test_thread_counts_do_not_change_bits() -> None:
@@ -63,8 +59,7 @@ def test_the_benchmark_writes_the_same_figures_twice(tmp_path: Path) -> None:
     here, there = tmp_path / "here", tmp_path / "there"
     options = ["--episodes", "2", "--controllers", "open-loop,paper", "--scenarios", "randomized,nominal", "--quiet"]
     assert benchmark.main([*options, "--out", str(here)]) == 0
-    command = [sys.executable, str(ROOT / "benchmark.py"), *options, "--out", str(there)]
-    subprocess.run(command, cwd=tmp_path, check=True)
+    python(str(ROOT / "benchmark.py"), *options, "--out", str(there), cwd=tmp_path)
     assert (here / "episodes.csv").read_bytes() == (there / "episodes.csv").read_bytes()
     ours, theirs = (json.loads((folder / "benchmark.json").read_text()) for folder in (here, there))
     for part in ("paired", "cvar5", "verdicts"):

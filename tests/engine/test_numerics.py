@@ -7,14 +7,13 @@ import pytest
 from conftest import Truth, integrated
 
 from cz_gym import CzEnv, CzVectorEnv, Parameters, make_puller
-from cz_gym.config import make_config
 from cz_gym.engine.lockstep import judged
 from cz_gym.episodes.draw import randomised
 from cz_gym.episodes.record import Factors
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.plant import Disturbance, Inputs, State, rk4
 from cz_gym.task import HEIGHT_MIN
-from tests.stress.__main__ import WIDE, campaign, cases, run_case
+from tests.stress.__main__ import WIDE, campaign, cases
 from tests.stress.adversaries import KINDS, Adversaries
 from tests.stress.checks import Broken, Watch
 
@@ -161,8 +160,3 @@ def test_a_longest_substep_at_the_limits_with_extreme_drives(lam: float, factor:
         for pull in (0.0, 2.0):
             u = Inputs(pull * p.v_0, p.Q_H_0 - 10e3 * side)
             assert _error(x, u, Disturbance(800.0 * side, 1.5 * hot, 0.9), p, 5.0) < bound
-
-
-def test_a_case_repeats_bit_for_bit() -> None:
-    config = make_config("puller", None, "history", 7.5, 900.0)
-    assert run_case(config, 2000, 3) == run_case(config, 2000, 3)

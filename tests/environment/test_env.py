@@ -2,7 +2,6 @@ import math
 from dataclasses import replace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.error import InvalidAction, ResetNeeded
@@ -10,25 +9,13 @@ from gymnasium.error import InvalidAction, ResetNeeded
 import cz_gym
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv, Parameters, Scenario, make_puller
 from cz_gym.config import Config, make_config
-from cz_gym.episodes.scenario import Actuators, Interface, Recipe
+from cz_gym.episodes.scenario import Actuators
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.plant import Disturbance, State, growth
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 
 MM_PER_MIN = 1e-3 / 60
 ZERO = np.zeros(2, np.float32)
-OBSERVATIONS = ["measured", "history", "state"]
-
-
-def test_registration() -> None:
-    assert isinstance(gym.make("cz_gym:Cz-v0", info="all").unwrapped, CzEnv)
-    spec = gym.spec("Cz-v0")
-    assert spec.max_episode_steps is None
-    batch = gym.make_vec(
-        "Cz-v0", num_envs=3, vectorization_mode="vector_entry_point", observation="history", info="all"
-    )
-    assert isinstance(batch, cz_gym.CzVectorEnv)
-    assert batch.observation_space.shape == (3, 72)
 
 
 def test_everything_advertised_is_there() -> None:
@@ -83,11 +70,6 @@ def test_bad_arguments_are_refused_in_one_line(make: Any, arguments: dict[str, A
     with pytest.raises(ValueError, match=says) as refusal:
         make(**arguments)
     assert "\n" not in str(refusal.value)
-
-
-def test_a_typo_is_not_swallowed() -> None:
-    with pytest.raises(TypeError, match="control_intervall"):
-        gym.make("Cz-v0", control_intervall=2.0)
 
 
 def test_a_drawn_puller_without_operating_point_is_drawn_again() -> None:
@@ -173,15 +155,6 @@ def test_actions_are_pull_speed_and_power() -> None:
         assert info["Q_H"] - p.Q_H_0 == pytest.approx(10e3 * heat)
 
 
-def test_an_episode_that_is_over_needs_a_reset() -> None:
-    env = CzEnv("nominal", horizon=10.0, info="all")
-    env.reset(seed=0)
-    assert env.step(ZERO)[2:4] == (False, False)
-    assert env.step(ZERO)[2:4] == (False, True)
-    with pytest.raises(ResetNeeded):
-        env.step(ZERO)
-
-
 def test_info_is_the_plant_in_si() -> None:
     env = CzEnv("only-interface", model=0.3, info="all")
     env.reset(seed=2)
@@ -218,16 +191,6 @@ def test_fast_and_slow_controllers_meet_the_same_crystal(interval: float) -> Non
     np.testing.assert_array_equal(runs[5.0][0].interface, runs[interval][0].interface)
     assert runs[5.0][0].slot["episode"] == runs[interval][0].slot["episode"]
     np.testing.assert_allclose(runs[interval][1], runs[5.0][1], rtol=1e-8)
-
-
-def test_a_scenario_of_ones_own_and_another_puller() -> None:
-    wide = Parameters(r_0=0.1, v_0=1.0 * MM_PER_MIN)
-    scenario = Scenario("mine", interface=Interface(sd=(0.2, 0.2)), recipe=Recipe())
-    env = gym.make("Cz-v0", scenario=scenario, parameters=wide, info="all")
-    _, info = env.reset(seed=1)
-    assert info["r_c"] == 0.1
-    *_, info = env.step(np.array([1.0, 0.0], np.float32))
-    assert info["v_p"] / MM_PER_MIN == pytest.approx(2.0)
 
 
 def test_one_episode_of_another_scenario() -> None:

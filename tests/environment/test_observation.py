@@ -5,13 +5,10 @@ import numpy as np
 import pytest
 from conftest import View, hold
 
-from cz_gym import SCENARIOS, CzEnv, Scenario, decode, make_puller
+from cz_gym import SCENARIOS, CzEnv, Scenario, decode
 from cz_gym.episodes.scenario import Faults, Sensor
 from cz_gym.episodes.schedule import bias_offset, pyrometer_drift
 from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED, OBSERVATIONS, lags
-
-P = make_puller()
-ZERO = np.zeros(2, np.float32)
 
 
 def run(env: CzEnv, steps: int, pull: float = 0.0, seed: int = 1) -> tuple[np.ndarray, list[dict[str, Any]], Any]:

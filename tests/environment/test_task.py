@@ -39,10 +39,8 @@ def test_limits() -> None:
 @given(st.integers(1, 2160))
 def test_dying_never_pays(step: int) -> None:
     """The cheapest failing step is worth no more than the worst life from that step to the horizon."""
-    steps = 2160
-    assert 1.0 + failure_penalty(step, steps) <= -9.0 * (steps - step + 1)
-    assert failure_penalty(steps, steps) == -10.0
-    assert failure_penalty(step, steps) == -10.0 * (steps - step + 1)
+    assert 1.0 + failure_penalty(step, 2160) <= -9.0 * (2160 - step + 1)
+    assert failure_penalty(2160, 2160) == -10.0
 
 
 def fly(model: str, pull: float, horizon: float = 10800.0) -> tuple[list[float], bool, bool, dict[str, Any]]:
@@ -69,20 +67,6 @@ def test_failure_is_terminated_never_truncated(model: str, pull: float, what: st
     terms = sum(info[f"cost_{name}"] for name in ("radius", "pull", "pull_step", "heater_step"))
     assert gained == pytest.approx(1 - 10 * terms / (10 + terms) - 10 * (2160 - k + 1))
     assert returns < -9.0 * 2160 + 10 * k
-
-
-def test_reward_of_a_step_is_made_of_what_info_says() -> None:
-    env = CzEnv("randomized", info="all")
-    _, before = env.reset(seed=3)
-    for action in ([0.1, 0.0], [-0.2, 0.3], [0.0, 0.3]):
-        _, gained, _, _, info = env.step(np.array(action, np.float32))
-        expected = cost_terms(
-            info["r_c"] - info["r_ref"], info["v_p"] - P.v_0, info["v_p"] - before["v_p"], info["Q_H"] - before["Q_H"]
-        )
-        names = ("cost_radius", "cost_pull", "cost_pull_step", "cost_heater_step")
-        assert [info[name] for name in names] == pytest.approx(list(expected), rel=1e-9)
-        assert gained == pytest.approx(reward(expected), rel=1e-9)
-        before = info
 
 
 def test_failure_inside_a_long_interval_is_latched() -> None:

@@ -16,12 +16,10 @@ from cz_gym.episodes.series import (
     Episode,
     Factors,
     Series,
-    Stream,
     draw_episode,
     draw_factors,
     new_series,
     randomised,
-    stream,
 )
 
 MM, MINUTE, SPAN = 1e-3, 60.0, 10800.0
@@ -174,12 +172,6 @@ def test_sensor_fault_and_puller_disturb_the_same_crystal_as_randomized() -> Non
             whole.recipe_amount, whole.drift_amount, whole.reference_amount,
         )  # fmt: skip
         np.testing.assert_array_equal(other.interface, series.interface)
-
-
-def test_streams_are_different() -> None:
-    named = Stream.__members__
-    first = {tuple(stream((1, 2), number).random(4)) for number in named.values()}
-    assert len(first) == len(named) == 8
 
 
 def test_interface_fluctuation_is_two_stationary_processes() -> None:

@@ -6,7 +6,6 @@ from cz_gym.episodes.schedule import (
     bias_offset,
     disturbance,
     drift,
-    progress,
     pyrometer_drift,
     quintic,
     recipe,
@@ -22,11 +21,6 @@ THREE_HOURS = 10800.0
 
 def episode(scenario: str) -> Episode:
     return draw_episode(SCENARIOS[scenario], (1, 2), new_series(10, 10))
-
-
-def test_progress_of_a_ramp() -> None:
-    t = np.array([0.0, 10.0, 15.0, 20.0, 100.0])
-    assert progress(t, 10.0, 10.0).tolist() == [0.0, 0.0, 0.5, 1.0, 1.0]
 
 
 def test_quintic_has_no_rate_and_no_curvature_at_its_ends() -> None:

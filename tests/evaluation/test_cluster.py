@@ -1,9 +1,6 @@
 """A benchmark on a Ray cluster of several nodes: the same figures, also when a node is lost on the way."""
 
-from __future__ import annotations
-
 import io
-import pickle
 import socket
 import sys
 from dataclasses import replace
@@ -15,7 +12,6 @@ import pytest
 from tqdm import tqdm
 
 import benchmark
-from cz_gym.agents import load
 from cz_gym.evaluation import cluster, runner
 from cz_gym.evaluation.protocol import Row, find_row
 from cz_gym.evaluation.results import Benchmark
@@ -96,10 +92,3 @@ def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ValueError, match=r'pip install "\.\[ray\]"'):
         cluster.connect("")
-
-
-def test_policies_pickle() -> None:
-    policy = load("gradient")
-    again = pickle.loads(pickle.dumps(policy))
-    seen = np.random.default_rng(0).normal(size=(3, policy.contract.channels)).astype(np.float32)
-    np.testing.assert_array_equal(again.predict(seen)[0], policy.predict(seen)[0])

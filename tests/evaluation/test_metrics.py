@@ -96,15 +96,6 @@ def test_drives_are_those_of_the_time_lived() -> None:
     assert found.pull_step_rms_mm_per_min == pytest.approx(0.1 / np.sqrt(50))
 
 
-def test_a_sine_on_the_pull_speed() -> None:
-    phase = 2 * np.pi * np.arange(720) / 72
-    found = of(made_up(720, v_p=V + 0.3 * MM_PER_MIN * np.sin(phase), v_g=V + 0.1 * MM_PER_MIN * np.cos(phase)))
-    assert found.pull_rms_mm_per_min == pytest.approx(0.3 / np.sqrt(2))
-    assert found.growth_rate_rms_mm_per_min == pytest.approx(0.1 / np.sqrt(2))
-    # The change over a step is 2 A sin(w/2) cos(...): RMS sqrt(2) A sin(w/2); the first step is from rest, as sin 0.
-    assert found.pull_step_rms_mm_per_min == pytest.approx(np.sqrt(2) * 0.3 * np.sin(np.pi / 72), rel=2e-3)
-
-
 def test_the_first_step_is_a_step() -> None:
     found = of(made_up(4, v_p=V + 0.2 * MM_PER_MIN, Q_H=Q + np.array([1e3, 1e3, -1e3, -1e3])))
     assert found.pull_step_rms_mm_per_min == pytest.approx(0.2 / 2)

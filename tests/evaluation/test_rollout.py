@@ -1,5 +1,6 @@
 """Rollouts against the scalar environment, step by step."""
 
+from collections.abc import Sequence
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -65,8 +66,9 @@ def test_a_rollout_looks_through_the_camera_of_its_settings() -> None:
     assert course.env.config is config
 
 
-def check_against_scalar(run: Rollout, policy: Any) -> None:
-    for i, seed in enumerate(run.seeds):
+def check_against_scalar(policy: Any, config: Config, seeds: Sequence[int]) -> Rollout:
+    run = rollout(policy, config, seeds)
+    for i, seed in enumerate(seeds):
         signals, total, failed = one_by_one(policy, run.config, seed)
         lived = len(signals["r_c"])
         assert run.alive[:, i].sum() == lived
@@ -76,19 +78,17 @@ def check_against_scalar(run: Rollout, policy: Any) -> None:
         assert not run.reward[lived:, i].any()
         for name, logged in zip(Signals._fields, run.signals, strict=True):
             np.testing.assert_array_equal(logged[:lived, i], signals[name], err_msg=name)
+    return run
 
 
 def test_every_signal_is_the_scalar_environments() -> None:
-    policy = CompensatedPID()
-    check_against_scalar(rollout(policy, make_config("sensor-fault", horizon=600.0), [3, 2_000_000, 17]), policy)
+    check_against_scalar(CompensatedPID(), make_config("sensor-fault", horizon=600.0), [3, 2_000_000, 17])
 
 
 def test_failed_episodes_end_where_the_scalar_ones_do() -> None:
-    policy = Playback([[1.0, 0.2]])
-    run = rollout(policy, SHORT, range(5))
+    run = check_against_scalar(Playback([[1.0, 0.2]]), SHORT, range(5))
     assert run.failed.all()
     assert len(set(run.alive.sum(axis=0).tolist())) > 1
-    check_against_scalar(run, policy)
 
 
 def test_policy_begins_again_where_the_crystal_does() -> None:

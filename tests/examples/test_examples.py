@@ -1,7 +1,5 @@
 """What users copy: each example learns, is judged, and leaves what it says."""
 
-import subprocess
-import sys
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,7 @@ from cz_gym.config import make_config
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from examples import cleanrl_ppo, sb3_ppo
 from studies.plain_tools import __main__ as plain_tools
+from tests.processes import python
 
 
 def test_the_stable_baselines_example_writes_an_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,7 +101,5 @@ def test_the_study_goes_on_from_what_is_finished(tmp_path: Path, capsys: pytest.
 @pytest.mark.slow
 def test_the_study_runs_examples_in_processes_of_their_own(tmp_path: Path) -> None:
     options = ["--seeds", "1", "--steps", "100", "--out", str(tmp_path / "out")]
-    command = [sys.executable, "-m", "studies.plain_tools", *options]
-    done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    python("-m", "studies.plain_tools", *options)
     assert [row.example for row in plain_tools.read(tmp_path / "out" / "runs.csv")] == ["cleanrl_ppo", "sb3_ppo"]

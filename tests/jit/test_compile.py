@@ -11,8 +11,8 @@ import pytest
 
 from cz_gym.jit.cache import Store, announce, cache_folder, source_hash
 from cz_gym.jit.compile import kernel
+from tests.processes import ROOT, python
 
-ROOT = Path(__file__).parents[2]
 DERIVE = """
 from cz_gym import Parameters
 from cz_gym.jit.cache import cache_folder
@@ -38,11 +38,7 @@ def run(code: str, folder: Path, cache: Path) -> list[str]:
     """What a fresh process prints, split at bars."""
     environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
     environment["CZ_GYM_CACHE_DIR"] = str(cache)
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code], cwd=folder, env=environment, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip().split("|")
+    return python("-W", "error", "-c", code, cwd=folder, env=environment).strip().split("|")
 
 
 def edit(file: Path, old: str, new: str) -> None:

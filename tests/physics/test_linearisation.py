@@ -5,8 +5,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from cz_gym import Parameters, make_puller
-from cz_gym.physics.linearisation import INPUTS, OUTPUTS, STATES, jacobian, linearise, radius_model
+from cz_gym import make_puller
+from cz_gym.physics.linearisation import INPUTS, linearise, radius_model
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.plant import NO_DISTURBANCE, Inputs, State, rates
 from cz_gym.units import MM
@@ -41,21 +41,6 @@ def test_complex_step_against_finite_differences():
         np.testing.assert_allclose(np.hstack([model.A, model.B])[:, j], column, rtol=2e-6, atol=1e-12)
 
 
-def test_jacobian_of_known_function():
-    found = jacobian(lambda x, y: (x * y, np.exp(x), y**3), (0.5, 2.0))
-    np.testing.assert_allclose(found, [[2.0, 0.5], [np.exp(0.5), 0.0], [0.0, 12.0]], rtol=1e-15)
-
-
-def test_thermal_chain_reaches_the_crystal_but_not_back():
-    model = linearise(make_puller())
-    thermal, crystal = slice(2, 5), slice(0, 2)
-    assert not model.A[thermal, crystal].any()
-    assert model.A[crystal, thermal].any()
-    assert np.all(np.linalg.eigvals(model.A[thermal, thermal]).real < 0)
-    assert model.A.shape == (len(STATES), len(STATES))
-    assert model.D.shape == (len(OUTPUTS), len(INPUTS))
-
-
 def test_transfer_functions_agree_with_the_state_space():
     p = make_puller()
     model, full = radius_model(p), linearise(p)
@@ -85,9 +70,3 @@ def test_small_step_follows_the_linear_model_with_second_order_error():
         block[:5, :5], block[:5, 5] = model.A * t, model.B[:, 0] * t * p.v_0 * share
         misses.append(end[0] - p.r_0 - expm(block)[0, 5])
     assert misses[0] / misses[1] == pytest.approx(4.0, rel=0.03)
-
-
-def test_another_puller_is_linearised_at_its_own_steady_state():
-    p = make_puller(Parameters(r_0=0.1, v_0=1.5e-5))
-    assert radius_model(p).poles[1] < 0 < radius_model(p).zero
-    np.testing.assert_allclose(rates(p.state_0, p.inputs_0, NO_DISTURBANCE, p, HURLE.slope), 0.0, atol=1e-12)

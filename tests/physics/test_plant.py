@@ -35,17 +35,14 @@ def drawn_inputs(rng: np.random.Generator, p: Puller, n: int) -> tuple[Inputs, D
     return u, Disturbance(rng.normal(0, 1000, n), rng.normal(0, 1, n), rng.uniform(0.9, 1, n))
 
 
-@given(st.sampled_from(MIXES), SPREAD, SPREAD, SPREAD, SPREAD, SPREAD)
-def test_operating_point_is_a_steady_state(
-    lam: float, sigma: float, k_l: float, kappa: float, G: float, eps: float
-) -> None:
+VARIED = ("sigma", "k_l", "kappa_12", "G_2b", "eps", "r_0", "v_0")
+
+
+@given(st.sampled_from(MIXES), st.lists(SPREAD, min_size=len(VARIED), max_size=len(VARIED)))
+def test_operating_point_is_a_steady_state(lam: float, factors: list[float]) -> None:
     q = Parameters()
-    p = make_puller(
-        q._replace(
-            sigma=q.sigma * sigma, k_l=q.k_l * k_l, kappa_12=q.kappa_12 * kappa, G_2b=q.G_2b * G, eps=q.eps * eps
-        ),
-        lam,
-    )
+    changes = {name: getattr(q, name) * factor for name, factor in zip(VARIED, factors, strict=True)}
+    p = make_puller(q._replace(**changes), lam)
     rate = rates(p.state_0, p.inputs_0, NO_DISTURBANCE, p, hurle_slope)
     assert abs(rate.r_c) < 1e-12 * p.v_0
     assert abs(rate.h_c) < 1e-12 * p.v_0

@@ -45,11 +45,6 @@ def test_shooting_against_collocation(r_c, h_c):
         assert math.atan(-found.sol(ring)[1]) == pytest.approx(PHI_B, rel=1e-6)
 
 
-def test_height_at_the_operating_point():
-    assert float(exact.solve_height(R_0, ALPHA_0, A)) == pytest.approx(6.62e-3, abs=5e-6)
-    assert PULLER.h_0 == pytest.approx(6.64e-3, abs=5e-6)
-
-
 def test_wide_crystal_is_planar():
     h = np.linspace(0.2, 1.2, 6) * A
     solution = exact.solve(1e4, h, A, PHI_B)

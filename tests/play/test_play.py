@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,6 @@ from cz_gym.units import KILO, MM_PER_MIN
 
 pygame = pytest.importorskip("pygame")
 SIZE = (480, 360)
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture

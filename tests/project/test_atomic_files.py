@@ -2,7 +2,6 @@
 
 import errno
 import os
-import subprocess
 import sys
 import threading
 import time
@@ -13,8 +12,8 @@ import pytest
 
 from cz_gym import atomic_files
 from cz_gym.atomic_files import BEGUN, COMPLETE, WRITER, finish_writing, locked, write_files
+from tests.processes import python
 
-ROOT = Path(__file__).parents[2]
 ALONE = f"""
 import importlib.util, os, signal, sys
 from pathlib import Path
@@ -108,15 +107,9 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def python(code: str, folder: Path) -> str:
-    done = subprocess.run([sys.executable, "-c", code, str(folder)], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="forks, or feigns Windows")
 def test_a_writer_killed_at_any_line_leaves_all_old_or_all_new(tmp_path: Path) -> None:
-    kills, finished = map(int, python(ALONE + KILL_AT_EVERY_LINE, tmp_path).split())
+    kills, finished = map(int, python("-c", ALONE + KILL_AT_EVERY_LINE, str(tmp_path)).split())
     assert kills > 50
     assert 10 < finished < kills
 
@@ -124,7 +117,7 @@ def test_a_writer_killed_at_any_line_leaves_all_old_or_all_new(tmp_path: Path) -
 @pytest.mark.skipif(sys.platform == "win32", reason="forks, or feigns Windows")
 def test_it_works_as_on_windows(tmp_path: Path) -> None:
     """Without ``fcntl`` and user numbers, and where a file that is open cannot be deleted."""
-    assert python(AS_ON_WINDOWS, tmp_path / "new") == "True\n['a', 'b']\n"
+    assert python("-c", AS_ON_WINDOWS, str(tmp_path / "new")) == "True\n['a', 'b']\n"
 
 
 def test_several_files_in_several_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,8 +150,8 @@ def test_a_folder_is_used_by_one_process(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="another process is at work"), locked(tmp_path / "new"):
             pass
         with pytest.raises(AssertionError, match="another process is at work"):
-            python(code, tmp_path / "new")
-    assert python(code, tmp_path / "new") == ""
+            python("-c", code, str(tmp_path / "new"))
+    assert python("-c", code, str(tmp_path / "new")) == ""
     assert names(tmp_path / "new") == []
 
 
@@ -214,20 +207,6 @@ def test_a_writer_that_fails_halfway_through_is_finished_by_the_next(
     assert caught.value.filename == str(tmp_path / "b")
     write_files({tmp_path / "c": b"new"})
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == dict.fromkeys("abc", b"new")
-
-
-def test_an_interrupt_leaves_nothing_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(*arguments: Any) -> None:
-        raise KeyboardInterrupt
-
-    for call, left in (("fsync", [b"old", b"old"]), ("replace", [b"new", b"new"])):
-        write_files({tmp_path / "a": b"old", tmp_path / "b": b"old"})
-        with monkeypatch.context() as patch:
-            patch.setattr(atomic_files.os, call, interrupt)
-            with pytest.raises(KeyboardInterrupt):
-                write_files({tmp_path / "a": b"new", tmp_path / "b": b"new"})
-        finish_writing(tmp_path)
-        assert [(tmp_path / name).read_bytes() for name in names(tmp_path)] == left
 
 
 def test_a_folder_in_a_file_s_place_is_refused(tmp_path: Path) -> None:

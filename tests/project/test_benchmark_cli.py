@@ -4,7 +4,6 @@ import csv
 import json
 import re
 import shlex
-import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -27,6 +26,7 @@ from cz_gym.observation import OBSERVATIONS
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from tests.contracts import LINEAR, facts, model_of
+from tests.processes import python
 
 FILES = ["benchmark.json", "crystal.png", "episodes.csv", "errors.png", "pareto.png", "report.html", "report.md"]
 SMALL = ["--episodes", "3", "--scenarios", "randomized,reference-b", "--controllers", "open-loop,paper"]
@@ -105,13 +105,11 @@ def test_json_names_every_metric_of_everyone(data: dict[str, Any]) -> None:
         assert list(scenario) == ["open-loop", "paper", "ppo"]
         for controller, found in scenario.items():
             assert set(found) == {*metric_names(), "microseconds_per_step"}
-            for metric, estimate in found.items():
-                assert set(estimate) == {"mean", "ci95", "n"}
-                assert estimate["n"] == (3 if name == "randomized" else 1)
-                random = name == "randomized" and metric != "microseconds_per_step"
-                interval = estimate["ci95"]
-                assert (interval is not None) == (random or (controller == "ppo" and metric in metric_names()))
-                assert interval is None or interval[0] <= estimate["mean"] <= interval[1]
+            for metric in metric_names():
+                mean, interval, n = (found[metric][part] for part in ("mean", "ci95", "n"))
+                assert n == (3 if name == "randomized" else 1)
+                assert (interval is not None) == (name == "randomized" or controller == "ppo")
+                assert interval is None or interval[0] <= mean <= interval[1]
 
 
 def test_an_agent_that_does_nothing_is_open_loop(data: dict[str, Any]) -> None:
@@ -147,10 +145,7 @@ def test_provenance_says_what_was_run(data: dict[str, Any]) -> None:
     assert told["scenarios"]["randomized"]["hash"] == make_config("randomized").scenario.hash
     assert told["scenarios"]["randomized"]["first_seed"] == 2_000_000
     assert told["scenarios"]["reference-b"]["model"] == "I"
-    assert told["packages"]["numpy"] == np.__version__
     assert [agent["training_seed"] for agent in told["agents"]] == [3, 8]
-    assert told["controllers"]["ppo"]["training_seeds"] == [3, 8]
-    assert told["controllers"]["paper"]["privileged"] is False
     assert "--episodes 3" in told["command"]
 
 
@@ -295,24 +290,17 @@ def test_the_benchmark_needs_neither_torch_nor_stable_baselines3(tmp_path: Path)
     arguments = [*ONE[:3], "paper", "--agent", str(agent), "--out", str(tmp_path / "out"), "--quiet"]
     loaded = "{'torch', 'stable_baselines3'} & {*sys.modules}"
     code = f"import sys, benchmark; sys.exit(benchmark.main({arguments!r}) or len({loaded}))"
-    folder = Path(benchmark.__file__).parent
-    done = subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=folder, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    python("-W", "error", "-c", code)
     assert (tmp_path / "out" / "report.md").read_text().startswith("No agent wins.")
 
 
 def test_rows_have_the_settings_that_their_names_say() -> None:
-    for row in ROWS:
-        assert find_row(row.name) is row
-        assert row.config().steps == round(10_800 / row.control_interval)
-        assert row.design_config().meniscus == HURLE
-        deterministic = row.name.startswith(("paper-", "reference-", "nominal"))
-        assert len(row.seeds(500)) == (1 if deterministic else 500)
-        assert (row.config().plant_hash != row.design_config().plant_hash) == (row.name == "randomized-exact")
     assert find_row("hard").seeds(7) == range(2_000_000, 2_000_007)
+    assert len(find_row("reference-b").seeds(500)) == 1
     assert find_row("paper-ramp-II").config().mix == (0.0, 0.0)
     assert find_row("randomized-2s").config("history").control_interval == 2.0
-    assert find_row("randomized-exact").config().meniscus == YOUNG_LAPLACE
+    exact = find_row("randomized-exact")
+    assert (exact.config().meniscus, exact.design_config().meniscus) == (YOUNG_LAPLACE, HURLE)
 
 
 def test_an_agent_that_reads_the_true_state_is_a_bound_and_wins_nothing(tmp_path: Path) -> None:

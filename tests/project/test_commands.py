@@ -15,6 +15,7 @@ from cz_gym.play import __main__ as play
 from studies.design_table import __main__ as design_table
 from studies.film import __main__ as film
 from studies.industrial import __main__ as industrial
+from studies.insight import __main__ as insight
 from studies.paper import __main__ as paper
 from studies.speed import __main__ as speed
 from studies.young_laplace import __main__ as young_laplace
@@ -26,6 +27,7 @@ COMMANDS: list[tuple[Any, str, str, list[str]]] = [
     (tune_lqg, "--hist", "figures", ["--output", "new/folder/lqg.json"]),
     (design_table, "--puller", "table", ["--out", "new/folder"]),
     (industrial, "--episode", "rollout", []),
+    (insight, "--episode", "study", ["--out", "new/folder"]),
     (speed, "--qui", "run", ["--quick"]),
     (young_laplace, "--wri", "build", ["--write"]),
     (play, "--minute", "settings", []),

@@ -1,12 +1,11 @@
 """Imports run one way: no circle of modules or rooms, and nothing from a higher room."""
 
-import subprocess
-import sys
 from collections import Counter
 
 import pytest
 
-from tests.project.imports import FORBIDDEN, ROOT, arrows, between_rooms, circle, imports, main, modules, owner, within
+from tests.processes import python
+from tests.project.imports import FORBIDDEN, arrows, between_rooms, circle, imports, main, modules, owner, within
 
 
 def test_there_is_no_circle() -> None:
@@ -39,11 +38,10 @@ def test_the_command_prints_the_counts(capsys: pytest.CaptureFixture[str]) -> No
 )
 def test_importing_loads_nothing_that_is_not_needed(module: str, absent: set[str]) -> None:
     code = f"import sys, {module}; assert not {absent} & set(sys.modules)"
-    subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=ROOT, check=True)
+    python("-W", "error", "-c", code)
 
 
 @pytest.mark.parametrize("name", ["baselines", "agents"])
 def test_no_module_has_a_second_name(name: str) -> None:
     code = f"import cz_gym.{name}\ntry: import {name}.anything\nexcept ImportError as error: print(error)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert f"import cz_gym.{name}" in done.stdout
+    assert f"import cz_gym.{name}" in python("-c", code)

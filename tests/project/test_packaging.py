@@ -13,8 +13,8 @@ import pytest
 
 import cz_gym
 from tests.golden.digest import digest
+from tests.processes import ROOT, python
 
-ROOT = Path(__file__).parents[2]
 SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PROJECT = SETTINGS["project"]
 LINKS = {"baselines": "cz_gym.baselines", "agents": "cz_gym.agents"}
@@ -65,10 +65,7 @@ def printed(code: str, place: Path, cwd: Path) -> list[str]:
         f"sys.path[:] = [{str(place)!r}] + [p for p in sys.path if p not in ('', {str(ROOT)!r})]\n"
         f"site.addsitedir({str(place)!r})\n"
     )
-    command = [sys.executable, "-W", "error", "-c", prelude + code]
-    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.split()
+    return python("-W", "error", "-c", prelude + code, cwd=cwd).split()
 
 
 def test_every_package_is_listed() -> None:
@@ -150,9 +147,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def built(source: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """The source distribution and the wheel that is built from it."""
     folder = tmp_path_factory.mktemp("built")
-    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(source)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
+    python("-m", "build", "--no-isolation", "--outdir", str(folder), str(source))
     return next(folder.glob("*.tar.gz")), next(folder.glob("*.whl"))
 
 
@@ -183,8 +178,7 @@ def test_the_wheel_holds_one_package_and_what_it_needs(built: tuple[Path, Path],
 @pytest.mark.slow
 def test_an_editable_install_needs_no_links(source: Path, tmp_path: Path) -> None:
     code = f"from setuptools.build_meta import build_editable\nbuild_editable({str(tmp_path)!r})"
-    done = subprocess.run([sys.executable, "-c", code], cwd=source, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    python("-c", code, cwd=source)
     with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as archive:
         archive.extractall(tmp_path / "installed")
     modules = ["cz_gym/__init__.py", "baselines/registry.py", "agents/agent_file/contract.py"]

@@ -1,7 +1,5 @@
 """The ablation's and the algorithms' rows: each changes what it says, and every recipe can be learned."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 from typing import Any
 

@@ -24,11 +24,6 @@ def test_every_shipped_agent_has_a_card_and_the_committed_ones_are_of_the_commit
         assert ("`puller`" in section.split("Fails: ")[1].split("\n")[0]) == (found["failure_rate"]["mean"] > 0.0)
 
 
-def test_an_imitation_s_card_counts_its_demonstrations() -> None:
-    section = (RESULTS / "cards" / "cards.md").read_text().split("## `imitation`")[1].split("\n## ")[0]
-    assert "25 % 2 times as wide among them; 8.3 million steps of demonstrations a run" in section
-
-
 def test_another_file_is_refused_in_one_line(tmp_path: Path, refused: Any) -> None:
     (tmp_path / "some.json").write_text("[]")
     command = ["--benchmark", str(tmp_path / "some.json"), "--out", str(tmp_path / "cards.md")]

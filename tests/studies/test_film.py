@@ -64,15 +64,6 @@ def test_each_side_is_drawn_in_its_own_colour() -> None:
         assert min(near.values()) == 0
 
 
-def test_the_film_shows_the_shipped_agent_unless_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("onnxruntime")
-    agent = min(agents.MODELS.glob("*.onnx"))
-    monkeypatch.setattr("cz_gym.agents.shipped", lambda: agent)
-    _, learned = film.contestants("randomized", 1)
-    assert learned.policy.contract.sha256 == agents.OnnxPolicy.load(agent).contract.sha256
-    assert learned.name == f"learned: {learned.policy.contract.algorithm}"
-
-
 @pytest.mark.parametrize("samples", [200, 2160])
 def test_the_scale_that_is_told_is_the_one_that_is_drawn(samples: int, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("onnxruntime")

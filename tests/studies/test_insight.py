@@ -115,12 +115,6 @@ def test_loops_are_opened_as_the_design_table_opens_them(name: str, at: str) -> 
     assert np.allclose(loop.opened(at), theirs(opened(controller, puller, DT, at), DT, OMEGA), rtol=1e-8)
 
 
-def test_the_mean_derivative_is_the_mean_of_derivatives() -> None:
-    rows = np.stack([REST, REST + 0.05])
-    both, *each = (linear_agent(CONTENT, some, DT, CONTRACT.action) for some in (rows, *rows))
-    assert both.now == pytest.approx(0.5 * (each[0].now + each[1].now), rel=1e-9)
-
-
 def test_one_reading_is_answered_as_the_loops_own_simulation_does() -> None:
     loop = close(insight.controller("lqg").system, make_puller(lam=0.5), DT)
     at, x, expected = loop.inputs.index("camera"), loop.B[:, 3], [loop.D[:2, 3]]
@@ -254,12 +248,6 @@ def test_gains_are_apart_from_others_and_not_from_themselves(near: Any) -> None:
     for other, deviation in ((mine, 0.0), (twice, 1.0)):
         for values in apart(other, mine, DT).values():
             assert values == pytest.approx([deviation] * 4, abs=1e-12)
-
-
-def test_what_cannot_be_meant_is_one_line(tmp_path: Any, capsys: Any, refused: Any) -> None:
-    assert "not 0" in refused(insight.main, ["--episodes", "0"])
-    assert insight.main(["--agent", "no-such.onnx", "--out", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.count("\n") <= 2
 
 
 def test_the_growth_of_a_loop_is_that_of_its_fastest_mode() -> None:

@@ -19,7 +19,6 @@ from studies.paper.beyond_paper import SEEDS, noise_result
 from studies.paper.comparison import coefficients
 from studies.paper.experiments import (
     BARE,
-    case_difference,
     cycle_numbers,
     errors,
     inverse_response,
@@ -42,17 +41,6 @@ def test_the_committed_numbers_come_out(numbers):
     assert list(numbers) == list(committed)
     for quantity, found in numbers.items():
         assert found["ours"] == pytest.approx(committed[quantity]["ours"], rel=1e-4), quantity
-
-
-def test_what_the_paper_does_not_show(numbers):
-    """A sustained pull change turns into a true error above 1 mm that r_tilde hides."""
-    for model in ("I", "II"):
-        true, seen, lowest = (
-            numbers[f"ramp, {what}, Model {model}"]["ours"]
-            for what in ("largest true error", "largest error of r_tilde", "lowest pull speed")
-        )
-        assert true > 1.0 > seen
-        assert lowest > 0.6
 
 
 @pytest.mark.slow
@@ -142,17 +130,6 @@ def test_compensated_measurement_is_what_the_controller_saw():
     integral = lfilter([0.5 * dt / pid.T_i, 0.5 * dt / pid.T_i], [1.0, -1.0], lead)
     expected = run.signals.v_p[0] + pid.K_p * (lead + integral)
     np.testing.assert_allclose(run.signals.v_p[1:], expected[:-1], atol=1e-3 * run.signals.v_p[0])
-
-
-def test_cases_that_scale_differ_by_nothing():
-    run = pull_change("I", horizon=600.0)
-    fifth = run.signals._replace(**{name: value[0] + (value - value[0]) / 5 for name, value in _named(run)})
-    assert max(case_difference(run, run._replace(signals=fifth))) < 1e-12
-    assert case_difference(run, run).v_p == pytest.approx(4.0)
-
-
-def _named(run):
-    return [(name, getattr(run.signals, name)) for name in ("r_c", "h_c", "alpha_c", "v_p")]
 
 
 def test_expected_noise_in_the_pull_speed():

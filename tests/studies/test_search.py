@@ -1,7 +1,5 @@
 """The search: begins with the recipe, goes on from its journal, gives up the hopeless, confirms the best."""
 
-from __future__ import annotations
-
 import csv
 import time
 from dataclasses import asdict
@@ -104,7 +102,7 @@ def test_a_lost_node_loses_nothing(nodes: tuple[Any, Any], tmp_path: Path, monke
         made.remove_node(second, allow_graceful=False)
         (tmp_path / "work" / "go").touch()
 
-    losing = Thread(target=lose)
+    losing = Thread(target=lose, daemon=True)
     losing.start()
     assert search.main(command(tmp_path, 4)) == 0
     losing.join()
@@ -129,16 +127,8 @@ def test_interrupted_trials_come_again_and_once(tmp_path: Path) -> None:
     assert study.ask(SPACE).params not in (RECIPE, lost.params, failed.params)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--trials", "0"], "--trials: must be between 1 and 10000, not 0"),
-        (["--finalists", "-1"], "--finalists: must be between 0"),
-        (["--seeds", "0"], "--seeds: must be between 1"),
-    ],
-)
-def test_mistakes_give_one_line(arguments: list[str], message: str, refused: Any) -> None:
-    assert message in refused(search.main, arguments)
+def test_a_number_beyond_its_limits_is_one_line(refused: Any) -> None:
+    assert "--trials: must be between 1 and 10000, not 0" in refused(search.main, ["--trials", "0"])
 
 
 @pytest.mark.usefixtures("few_crystals")

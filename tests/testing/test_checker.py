@@ -11,7 +11,7 @@ from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from cz_gym.testing.checker import Checked, NotConforming, check_vector_env, main
-from cz_gym.testing.nested_arrays import KEEPERS, NamedArray, difference, flatten, keep
+from cz_gym.testing.nested_arrays import KEEPERS, NamedArray, keep
 
 MODES = list(AutoresetMode)
 
@@ -292,15 +292,6 @@ def test_every_way_to_keep_an_array_sees_a_later_write(number: int, dtype: type)
     assert kept.unchanged
     array[2, 1] = 1
     assert not kept.unchanged
-
-
-def test_differences_in_words() -> None:
-    one = {"a": np.array([1.0, np.nan]), "_a": np.array([True, False])}
-    assert difference(flatten(one), flatten(one)) is None
-    other = {"a": np.array([1.0, 7.0]), "_a": np.array([True, False])}
-    assert difference(flatten(one), flatten(other)) == "a of slot 1 is nan and 7.0"
-    assert difference(flatten(one), flatten(other), masked=True) is None
-    assert difference(flatten(np.zeros(2)), flatten(np.zeros(3))) == " is float64 (2,) and float64 (3,)"
 
 
 @pytest.mark.parametrize("argv", [["--steps", "3"], ["--slots", "1"], ["--stepps", "60"]])

@@ -1,9 +1,7 @@
 """Agents' graphs: what may run, and that hostile ones are refused before anything large or foreign happens."""
 
-import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,8 +16,8 @@ from cz_gym.config import make_config
 from cz_gym.observation import MEASURED
 from tests import contracts
 from tests.contracts import LINEAR, facts, graph_of, value
+from tests.processes import python
 
-ROOT = Path(__file__).parents[3]
 CHANNELS = len(MEASURED)
 WEIGHTS = {"weight": np.full((CHANNELS, 2), 0.01, np.float32), "bias": np.zeros(2, np.float32)}
 
@@ -290,8 +288,7 @@ def test_hostile_graphs_stay_within_a_small_memory() -> None:
         "    sys.exit(name)\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    python("-c", code)
 
 
 def test_every_operator_is_a_standard_one_without_control_flow() -> None:

@@ -59,12 +59,6 @@ def test_knowing_a_nominal_puller_is_the_lqg():
     np.testing.assert_allclose(told.signals.v_p, plain.signals.v_p, rtol=1e-5)
 
 
-def test_before_it_knows_anything_it_is_the_lqg():
-    for observation in observations(steps=3):
-        expected = LQG().predict(observation)[0]
-        np.testing.assert_array_equal(lqg_bounds.PrivilegedLQG().predict(observation)[0], expected)
-
-
 def test_other_slots_than_the_known_ones_are_refused():
     told = lqg_bounds.PrivilegedLQG().for_episodes(make_config("randomized"), [1, 2])
     with pytest.raises(ValueError, match="2 pullers are known, got 3 slots"):

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,22 +16,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import benchmark
-from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config
 from cz_gym.env import CzEnv
-from cz_gym.evaluation.protocol import find_row
-from cz_gym.evaluation.report.canvas import styles, styles_of
+from cz_gym.evaluation.report.canvas import styles_of
 from cz_gym.evaluation.report.page import _asset, embedded, page
 from cz_gym.evaluation.report.page_figures import DISTRIBUTIONS, errors, pareto, plain
 from cz_gym.evaluation.report.page_signals import OWN, PANELS, SHARED, crystals, pack
 from cz_gym.evaluation.report.tables import DRIVES, ERROR, comparison
-from cz_gym.evaluation.results import Benchmark, Controller, ScenarioResult, summarise
-from cz_gym.evaluation.rollout import Rollout, rollout
+from cz_gym.evaluation.results import Benchmark
 from cz_gym.observation import MEASURED, scales
-from tests.samples import sample_of
+from tests.samples import scenario_of
 
 EVIL = "</script><img src=x onerror=alert(1)>\"'&amp;<b>\u2028%{x}"
-ROWS = ("puller", "reference-b")
+ROWS, NAMES = ("puller", "reference-b"), ("open-loop", "paper", "industrial")
 
 
 class Parts(HTMLParser):
@@ -89,24 +85,13 @@ class Made:
     one crystal less."""
 
     def __init__(self) -> None:
-        self.runs: dict[tuple[str, str], Rollout] = {}
-        scenarios = tuple(self.scenario(name, ("open-loop", "paper", "industrial")) for name in ROWS)
+        scenarios, runs = zip(*(scenario_of(name, NAMES, EVIL, (4, 7), fewer=1) for name in ROWS), strict=True)
+        self.runs = {(name, who): run for name, some in zip(ROWS, runs, strict=True) for who, run in some.items()}
         self.benchmark = Benchmark(scenarios, f"benchmark.py --agent '{EVIL}'", ())
         self.text = page(self.benchmark)
         self.parts = Parts(self.text)
         self.data = json.loads(self.parts.texts["data"])
         self.crystals = [scenario["crystals"] for scenario in self.data["scenarios"]]
-
-    def scenario(self, name: str, names: Sequence[str]) -> ScenarioResult:
-        row, samples = find_row(name), []
-        config, seeds = row.config(), row.seeds(3)
-        for who in names:
-            evil = who == names[-1]
-            run = rollout(find_controller(who).make(config), config, seeds[: len(seeds) - evil] or seeds)
-            self.runs[name, who] = run
-            agent = Controller(EVIL, "measured", f"agent trained with {EVIL}", (4, 7)) if evil else None
-            samples.append(sample_of(agent or Controller(who, "measured", f"what {who} is"), [run, run][: 1 + evil]))
-        return summarise(row, samples)
 
 
 @pytest.fixture(scope="module")
@@ -282,9 +267,7 @@ def test_the_same_results_give_the_same_bytes(made: Made) -> None:
 
 
 def test_without_the_reference_there_is_no_comparison() -> None:
-    few = Made.__new__(Made)
-    few.runs = {}
-    alone = Benchmark((few.scenario("reference-b", ("open-loop",)),), "", ())
+    alone = Benchmark((scenario_of("reference-b", ("open-loop",), "some")[0],), "", ())
     assert comparison(alone.scenarios[0]) == ()
     assert len(Parts(page(alone)).rows[0]) == 1 + len(ERROR) + len(DRIVES)
 
@@ -294,8 +277,3 @@ def test_json_alone_needs_no_plotly(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     arguments = ["--scenarios", "reference-b", "--controllers", "open-loop", "--quiet"]
     assert benchmark.main([*arguments, "--json", str(tmp_path / "lone.json")]) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["lone.json"]
-
-
-def test_every_controller_has_a_line_of_its_own() -> None:
-    drawn: dict[str, Any] = styles([f"c{i}" for i in range(24)])
-    assert len({(one.colour, one.dash) for one in drawn.values()}) == len(drawn)

@@ -1,0 +1,14 @@
+"""Python in a process of its own."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+
+
+def python(*arguments: str, cwd: Path = ROOT, env: dict[str, str] | None = None) -> str:
+    """What Python prints, given these arguments; it must end well."""
+    done = subprocess.run([sys.executable, *arguments], cwd=cwd, env=env, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
