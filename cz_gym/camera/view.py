@@ -12,10 +12,9 @@ x points from the crystal's axis towards the camera, y to its right, z up; z = 0
 from __future__ import annotations
 
 import math
-from numbers import Real
-from typing import Annotated, Any, NamedTuple, get_type_hints
+from typing import Annotated, Any, NamedTuple
 
-from cz_gym.physics.parameters import Parameters, Quantity
+from cz_gym.physics.parameters import Parameters, Quantity, check_numbers
 from cz_gym.units import MM
 
 ROWS, COLUMNS = 120, 160
@@ -80,12 +79,6 @@ class Camera(NamedTuple):
     ] = 2.0
 
 
-def describe_camera() -> dict[str, Quantity]:
-    """Name of each parameter to its :class:`cz_gym.physics.parameters.Quantity`."""
-    hints = get_type_hints(Camera, include_extras=True)
-    return {name: hints[name].__metadata__[0] for name in Camera._fields}
-
-
 def camera_for(parameters: Parameters) -> Camera:
     """The default camera at a puller of these parameters: aimed at its crystal, the shield's opening in proportion."""
     default = Camera()
@@ -107,11 +100,8 @@ def check_camera(camera: Camera, parameters: Parameters) -> Camera:
     """Return the camera, or raise ValueError naming what cannot be at a puller of these parameters."""
     if not isinstance(camera, Camera):
         raise ValueError(f"camera must be a cz_gym.camera.Camera, not {camera!r}")
+    check_numbers("camera parameter", camera, _MAY_BE_ZERO)
     for name, value in camera._asdict().items():
-        number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-        if not number or value < 0 or (value == 0 and name not in _MAY_BE_ZERO):
-            unit = describe_camera()[name].unit
-            raise ValueError(f"camera parameter {name} = {value!r} must be a positive finite number [{unit}]")
         if name in _AT_MOST_ONE and value > 1:
             raise ValueError(f"camera parameter {name} = {value!r} must not exceed 1")
     if camera.reflections not in range(1, MOST_REFLECTIONS + 1):
