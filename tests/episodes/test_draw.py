@@ -10,19 +10,10 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from cz_gym import SCENARIOS, Parameters, Scenario, make_puller
+from cz_gym.episodes.draw import randomised
+from cz_gym.episodes.record import FREEZES, Episode, Factors
 from cz_gym.episodes.scenario import Faults, Interface, Pullers, Recipe, Reference, Sensor
-from cz_gym.episodes.series import (
-    FREEZES,
-    Episode,
-    Factors,
-    Series,
-    Stream,
-    draw_episode,
-    draw_factors,
-    new_series,
-    randomised,
-    stream,
-)
+from cz_gym.episodes.series import Series, draw_episode, draw_factors, new_series
 
 MM, MINUTE, SPAN = 1e-3, 60.0, 10800.0
 WORD = st.integers(0, 2**64 - 1)
@@ -174,12 +165,6 @@ def test_sensor_fault_and_puller_disturb_the_same_crystal_as_randomized() -> Non
             whole.recipe_amount, whole.drift_amount, whole.reference_amount,
         )  # fmt: skip
         np.testing.assert_array_equal(other.interface, series.interface)
-
-
-def test_streams_are_different() -> None:
-    named = Stream.__members__
-    first = {tuple(stream((1, 2), number).random(4)) for number in named.values()}
-    assert len(first) == len(named) == 8
 
 
 def test_interface_fluctuation_is_two_stationary_processes() -> None:
