@@ -14,8 +14,8 @@ from cz_gym.agents.agent_file.contract import Contract, read_agent
 from cz_gym.agents.training.recipes import ALL, RECIPES, SPECIALISTS, Gradient, Imitation
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser
+from cz_gym.evaluation.report.tables import markdown as table
 from studies.algorithms.__main__ import ROWS
-from studies.markdown import table
 
 _LEARNED = {row.name: row.meaning for row in ROWS} | {
     recipe.name: f"going on from `{recipe.start}`, for "

@@ -26,8 +26,8 @@ from cz_gym.baselines.registry import make_controller
 from cz_gym.commands import OneLineParser, between
 from cz_gym.evaluation.cluster import completed, connect
 from cz_gym.evaluation.protocol import find_row
+from cz_gym.evaluation.report.tables import markdown as table
 from cz_gym.evaluation.runner import Piece, run_piece
-from studies.markdown import table
 
 MACHINES = (1, 2, 10, 100, 1000, 10_000)
 EMPTY = 300

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cz_gym.evaluation.files import csv_text
+from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.statistics import Estimate, Resamples, means
 
 from .lqg_family import Family, at_equal_activity
@@ -84,10 +85,10 @@ def to_csv(lines: Sequence[Line]) -> str:
     return csv_text(heads, rows)
 
 
-def to_markdown(lines: Sequence[Line], family: Family) -> list[str]:
-    """The table's lines: means with their intervals, differences beneath them."""
+def to_markdown(lines: Sequence[Line], family: Family) -> str:
+    """The table: means with their intervals, differences beneath them."""
     heads = ("", "seeds", *(head for head, *_ in COLUMNS), "at equal activity", "million steps", "minutes")
-    rows = [f"| {' | '.join(heads)} |", f"|---|{'--:|' * (len(heads) - 1)}"]
+    rows: list[tuple[str, ...]] = []
     for line in lines:
         steps, seconds = line.trained("steps"), line.trained("seconds")
         ratio = at_equal_activity(list(line.runs.values()), family)
@@ -97,8 +98,8 @@ def to_markdown(lines: Sequence[Line], family: Family) -> list[str]:
             "-" if seconds is None else f"{seconds / 60.0:.0f}",
         )
         figures = [line.cells[figure].mean.text(form, unit) for _, figure, unit, form in COLUMNS]
-        rows.append(f"| **{line.name}** | {len(line.runs)} | {' | '.join((*figures, *ends))} |")
+        rows.append((f"**{line.name}**", str(len(line.runs)), *figures, *ends))
         differences = [(line.cells[figure].difference, unit, form) for _, figure, unit, form in COLUMNS]
         if apart := [difference.text(f"+{form}", unit) for difference, unit, form in differences if difference]:
-            rows.append(f"| less {line.base} | | {' | '.join(apart)} | | | |")
-    return rows
+            rows.append((f"less {line.base}", "", *apart, "", "", ""))
+    return markdown(heads, rows)

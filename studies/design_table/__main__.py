@@ -26,10 +26,10 @@ from cz_gym.baselines.registry import CONTROLLERS, find_controller
 from cz_gym.commands import OneLineParser, between
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from cz_gym.evaluation.report.tables import markdown
 from cz_gym.physics.linearisation import StateSpace, radius_model
 from cz_gym.physics.plant import Puller, make_puller
 from cz_gym.units import KILO, MM, MM_PER_MIN
-from studies import markdown
 
 FAST, SLOW = 30.0, 780.0
 """Correlation times of the interface's fluctuations [s]."""
@@ -156,7 +156,7 @@ def as_markdown(rows: Sequence[Row], skipped: Sequence[str]) -> str:
         (controller, plant, *("-" if math.isnan(value) else f"{value:.3g}" for value in figures.values()))
         for controller, plant, figures in rows
     ]
-    parts = ["# Design of the linear controllers", "", markdown.table(meanings, lines, "---"), ""]
+    parts = ["# Design of the linear controllers", "", markdown(meanings, lines, "---"), ""]
     parts += [f"- **{head}**: {meaning}" for head, meaning in meanings.items()]
     return "\n".join([*parts, "", *(f"No linear form: {line}." for line in skipped)]).rstrip() + "\n"
 

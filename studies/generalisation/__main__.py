@@ -15,8 +15,8 @@ from typing import NamedTuple
 from cz_gym.atomic_files import write_files
 from cz_gym.commands import OneLineParser
 from cz_gym.evaluation.files import EPISODES, read_episodes
+from cz_gym.evaluation.report.tables import markdown as table
 from cz_gym.evaluation.statistics import Estimate, Floats, Resamples, differences, means
-from studies.markdown import table
 
 OBSERVABLE = ("sensor-fault", "puller")
 """Rows with an offset that no sensor shows: the error against what can be seen is counted there."""
