@@ -1,12 +1,7 @@
 """The camera's view of the meniscus: one set of parameters, and what follows from it.
 
-A pinhole camera above the melt looks down at the near part of the bright ring. Its rays meet the crystal (a straight
-cylinder), the meniscus (Hurle's profile as a surface of revolution) or the flat melt; where they meet melt they are
-mirrored to the crucible's hot wall, the heat shield, the crystal, the opening above, or melt again
-(:mod:`cz_gym.camera.rays`). Nothing draws a ring: it is the part of the meniscus steep enough to mirror the wall.
-
 x points from the crystal's axis towards the camera, y to its right, z up; z = 0 is the melt far from the crystal.
-``python -m studies.camera`` measures the view and draws ``results/camera``.
+docs/camera.md says how the image is made.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""The LQG's settings on the crystals that a comparison is judged on: radius error is to be read at equal activity.
-
-An agent that learns to move the pull less has a larger radius error, and one that moves it more a smaller; the LQG's
-frontier says what the same moves buy without learning.
-"""
+"""The LQG's settings on the crystals that a comparison is judged on: radius error is to be read at equal activity."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""The table of a comparison: means over training seeds and crystals, and paired differences to a base.
-
-Every variant meets the same crystals and the same training seeds. So a difference is taken crystal by crystal and seed
-by seed; its interval resamples both.
-"""
+"""The table of a comparison: means over training seeds and crystals, and differences to a base, paired in both."""
 
 from __future__ import annotations
 

@@ -1,9 +1,7 @@
 """Design table of the linear controllers: ``python -m studies.design_table --out results/design``.
 
-Each controller is linearised from the code that runs (:mod:`cz_gym.baselines.analysis.sampled_loop`) and joined, at
-its control interval, with the plant: nominal Model I, nominal Model II, and the pullers of the first validation
-episodes, of which every column shows the worst. Where a scenario has settings of its own, these follow; a late camera
-is part of the loop.
+Each controller is linearised from the code that runs (:mod:`cz_gym.baselines.analysis.sampled_loop`) and joined with
+the nominal plants and with the pullers of the first validation episodes, of which every column shows the worst.
 """
 
 from __future__ import annotations

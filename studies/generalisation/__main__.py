@@ -1,7 +1,5 @@
-"""Agents on other plants: ``python -m studies.generalisation results/generalisation`` tabulates a benchmark's episodes.
-
-The benchmark of the rows an agent was not trained on, made by ``benchmark.py --scenarios randomized,hard,...``: radius
-error, lost crystals and the paired difference to one controller, with 95 % intervals over training seeds and crystals.
+"""Agents on other plants: ``python -m studies.generalisation results/generalisation`` tabulates a benchmark's episodes:
+radius error, lost crystals and the paired difference to one controller, with 95 % intervals.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""What an agent does that other controllers do not: ``python -m studies.insight --out results/insight``.
-
-Answers to single events on a nominal puller, the network's exact local gain and the margins of its loop beside the
-LQG's, how large an event each survives, and which property of the real puller costs it crystals.
-"""
+"""What an agent does that other controllers do not: ``python -m studies.insight --out results/insight``."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """An agent near a point: the exact derivative of its network, and what that makes of the past as a linear system.
 
-An agent on "history" is a static function of channels that are themselves linear in the past: readings now, their
-means over past samples, the integral of the ring's error. So near a point its whole behaviour is one matrix of
-derivatives, and a frequency response follows without simulation.
+An agent on "history" is a static function of channels that are themselves linear in the past: near a point its whole
+behaviour is one matrix of derivatives.
 """
 
 from __future__ import annotations
