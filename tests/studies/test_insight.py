@@ -22,6 +22,7 @@ from cz_gym.baselines.analysis.sampled_loop import Loop, close, root_mean_square
 from cz_gym.baselines.registry import find_controller
 from cz_gym.episodes.scenarios import HARD, PULLER, RANDOMIZED
 from cz_gym.observation import HISTORY
+from cz_gym.physics.linearisation import StateSpace
 from cz_gym.physics.plant import make_puller
 from cz_gym.units import MINUTE, MM, MM_PER_MIN
 from studies.insight import __main__ as insight
@@ -78,9 +79,10 @@ def test_the_derivative_is_the_chain_rules() -> None:
     assert jacobian(actor_onnx(network.actor), at[None]) == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
-def test_a_linear_agent_answers_alike_as_state_space_and_in_frequency(near: Any) -> None:
-    found = response(near.state_space(), DT, OMEGA[[0, 4, 8]])[:, :, AT]
-    assert np.allclose(found, near.response(OMEGA[[0, 4, 8]]), rtol=1e-9, atol=1e-12)
+def test_the_frequency_response_is_python_controls() -> None:
+    system = insight.controller("lqg").system
+    alone = StateSpace(system.A, system.B[:, :1], system.C[:1], system.D[:1, :1])
+    assert np.allclose(response(system, DT, OMEGA)[:, 0, 0], theirs(alone, DT, OMEGA), rtol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["imitation", "gradient"])
@@ -118,7 +120,7 @@ def test_loops_are_opened_as_the_design_table_opens_them(name: str, at: str) -> 
 def test_the_mean_derivative_is_the_mean_of_derivatives() -> None:
     rows = np.stack([REST, REST + 0.05])
     both, *each = (linear_agent(CONTENT, some, DT, CONTRACT.action) for some in (rows, *rows))
-    assert both.now == pytest.approx(0.5 * (each[0].now + each[1].now), rel=1e-9)
+    assert pytest.approx(0.5 * (each[0].D + each[1].D), rel=1e-9) == both.D
 
 
 def test_one_reading_is_answered_as_the_loops_own_simulation_does() -> None:
@@ -198,7 +200,7 @@ def answers() -> dict[str, dict[str, Any]]:
 
 @pytest.fixture(scope="module")
 def loop(near: Any) -> Any:
-    one = Contender("one", LEARNED, lambda _: None, near.state_space(), near.response)
+    one = Contender("one", LEARNED, lambda _: None, near)
     return one.loop(frequencies(DT, 60), 1.0, DT)
 
 
@@ -248,8 +250,9 @@ def test_tables_say_what_was_found(answers: Any, loop: Any) -> None:
 
 
 def test_gains_are_apart_from_others_and_not_from_themselves(near: Any) -> None:
-    mine = Contender("one", LEARNED, lambda _: None, near.state_space(), near.response)
-    twice = mine._replace(response=lambda omega: near.response(omega) * np.array([2.0, 1.0, 1.0, 1.0]))
+    mine = Contender("one", LEARNED, lambda _: None, near)
+    seen = np.where(np.arange(near.B.shape[1]) == AT[0], 2.0, 1.0)
+    twice = mine._replace(system=near._replace(B=near.B * seen, D=near.D * seen))
     for other, deviation in ((mine, 0.0), (twice, 1.0)):
         for values in apart(other, mine, DT).values():
             assert values == pytest.approx([deviation] * 4, abs=1e-12)
@@ -263,7 +266,7 @@ def test_what_cannot_be_meant_is_one_line(tmp_path: Any, capsys: Any, refused: A
 
 def test_the_growth_of_a_loop_is_that_of_its_fastest_mode() -> None:
     grows, fades = np.exp(5.0 / 7200.0), np.exp(-5.0 / 60.0)
-    loop = Loop(np.diag([fades, grows]), *[np.zeros((2, 2))] * 3, ("a", "b"), ("c", "d"), 5.0)
+    loop = Loop(np.diag([fades, grows]), *[np.zeros((2, 2))] * 3, 5.0)
     assert loop.growth == pytest.approx(7200.0)
     assert not loop.stable
     calm = loop._replace(A=np.diag([fades, -0.5]))
