@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from scipy.signal import dimpulse
-from scipy.sparse import csc_array, eye_array
+from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 from cz_gym.baselines.analysis import frequency, sampled_loop
@@ -99,7 +99,7 @@ class Responses(NamedTuple):
 def response(system: StateSpace, dt: float, omega: Floats) -> Complex:
     """Frequency response of a discrete state space, which may be large if it is sparse, (points, outputs, inputs)."""
     A, B, C, D = csc_array(system.A), system.B.astype(np.complex128), system.C, system.D
-    one = eye_array(len(B), format="csc")
+    one = csc_array(np.eye(len(B)))
     return np.stack([C @ splu(z * one - A).solve(B) + D for z in np.exp(1j * omega * dt)])
 
 
