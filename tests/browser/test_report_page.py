@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +64,7 @@ def made() -> Benchmark:
 def browser(made: Benchmark, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """Chromium with the page open, its first crystal drawn."""
     path = tmp_path_factory.mktemp("page") / "report.html"
-    path.write_text(page(made, {}), "utf-8")
+    path.write_text(page(made), "utf-8")
     os.environ["SE_OFFLINE"] = "true"
     options = webdriver.ChromeOptions()
     options.binary_location = CHROMIUM or ""
@@ -182,10 +183,24 @@ def test_zoom_is_linked_and_outlives_another_crystal(browser: Any) -> None:
     until(browser, lambda: browser.execute_script(RANGES) == [[0, 180]] * len(PANELS))
 
 
-def test_another_scenario_changes_every_part(browser: Any) -> None:
+def test_another_scenario_changes_every_part(made: Benchmark, browser: Any) -> None:
     choose(browser, "scenario", "reference-b")
     until(browser, lambda: len(browser.find_elements("css selector", "#seed option")) == 1)
     assert "reference-b" in browser.find_elements("css selector", ".scenario .note")[1].text
+    rmse = made.scenarios[1].outcomes[1].means["rmse_mm"].mean
+    points, boxes = (
+        browser.execute_script(f"return document.getElementById('picture-{i}')._fullData.map(t => [...t.{axis}])")
+        for i, axis in enumerate("yx")
+    )
+    assert points[1] == [pytest.approx(rmse, rel=1e-5)]
+    assert boxes[1] == [pytest.approx(rmse, rel=1e-5)]
+    largest = made.scenarios[1].outcomes[1].means["max_error_mm"].mean
+    pressed = (
+        "const b = document.getElementById('picture-1'); Plotly.update(b, ...b.layout.updatemenus[0].buttons[2].args)"
+    )
+    browser.execute_script(pressed)
+    found = "return document.getElementById('picture-1')._fullData[1].x"
+    until(browser, lambda: list(browser.execute_script(found)) == [pytest.approx(largest, rel=1e-5)])
 
 
 @pytest.mark.parametrize("width", [1366, 400])
@@ -196,7 +211,8 @@ def test_no_window_needs_sideways_scrolling(browser: Any, width: int) -> None:
     until(browser, lambda: browser.execute_script("return document.documentElement.scrollWidth <= window.innerWidth"))
 
 
-def test_in_a_narrow_window_the_crystal_is_inside_it(browser: Any) -> None:
+def test_a_narrow_window_has_one_column_and_nothing_covers_anything(browser: Any) -> None:
+    """Pictures below each other, inside the window, titles clear of the menu."""
     resize(browser, 400)
 
     def box(selector: str) -> dict[str, float]:
@@ -204,7 +220,19 @@ def test_in_a_narrow_window_the_crystal_is_inside_it(browser: Any) -> None:
         return dict(browser.execute_script(script, selector))
 
     until(browser, lambda: box("#signals svg")["right"] <= 400)
-    assert box("#signals .nsewdrag")["width"] > 100
+    upper, lower = box("#picture-0"), box("#picture-1")
+    assert lower["top"] >= upper["bottom"]
+    for part in ("#picture-0", "#picture-1", "#signals"):
+        assert box(f"{part} svg")["right"] <= 400
+        assert box(f"{part} .nsewdrag")["width"] > 100
+    for title in ("#picture-0 .gtitle", "#picture-1 .gtitle"):
+        assert box(title)["right"] <= 400
+    assert box("#picture-1 .gtitle")["right"] <= box("#picture-1 .updatemenu-header")["left"]
+    assert box("#picture-0 .nsewdrag")["height"] > 150
+    for part in ("#picture-0", "#picture-1"):
+        labels = browser.find_elements("css selector", f"{part} .xtick text")
+        ends = sorted((label.rect["x"], label.rect["x"] + label.rect["width"]) for label in labels)
+        assert all(right <= left for (_, right), (left, _) in pairwise(ends)), "numbers at an axis collide"
 
 
 def test_no_complaint_at_the_end_either(browser: Any) -> None:

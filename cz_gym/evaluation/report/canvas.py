@@ -18,8 +18,11 @@ COLOURS = (
     "#FF00FF", "#FF004B", "#1E4B00", "#E178FF", "#E17869", "#690F2D", "#0078FF", "#8700A5",
 )  # fmt: skip
 """Okabe and Ito's palette, safe for colour-blind readers, with more for a long table."""
-MARKERS = "osD^vP*Xph<>"
-"""Matplotlib's."""
+MARKERS = {
+    "o": "circle", "s": "square", "D": "diamond", "^": "triangle-up", "v": "triangle-down", "P": "cross", "*": "star",
+    "X": "x", "p": "pentagon", "h": "hexagon", "<": "triangle-left", ">": "triangle-right",
+}  # fmt: skip
+"""Matplotlib's markers and plotly's names of them."""
 DASHES = ("solid", "dash", "dot")
 """Plotly's lines: the next one where the colours begin again."""
 DPI = 160
@@ -38,9 +41,9 @@ class Style(NamedTuple):
 
 def styles(names: Sequence[str]) -> dict[str, Style]:
     """One style a controller: that of its place among :data:`KNOWN`, or one of those after them, in turn."""
-    places = [*KNOWN, *(name for name in names if name not in KNOWN)]
+    markers, places = list(MARKERS), [*KNOWN, *(name for name in names if name not in KNOWN)]
     found = {
-        name: Style(COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)], DASHES[i // len(COLOURS) % len(DASHES)])
+        name: Style(COLOURS[i % len(COLOURS)], markers[i % len(markers)], DASHES[i // len(COLOURS) % len(DASHES)])
         for i, name in enumerate(places)
     }
     return {name: found[name] for name in names}

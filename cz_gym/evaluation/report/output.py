@@ -62,7 +62,7 @@ def write(folder: Path | None, lone: Path | None, done: Benchmark, quoted: Path 
         files |= {folder / name: image for name, image in figures.items()}
         files[folder / EPISODES] = to_csv(done).encode()
         files[folder / "report.md"] = markdown(done, figures).encode()
-        files[folder / "report.html"] = page(done, figures).encode()
+        files[folder / "report.html"] = page(done).encode()
         files[folder / RESULTS] = text
         if quoted and quoted.is_file():
             files[quoted] = fill_in(quoted.read_text("utf-8"), done).encode()

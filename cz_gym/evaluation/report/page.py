@@ -1,4 +1,4 @@
-"""``report.html``: the benchmark as one page that opens from disk: table, figures, and the first episodes' signals.
+"""``report.html``: the benchmark as one page that opens from disk: table, pictures, and the first episodes' signals.
 
 Everything is inside the file, plotly.js included, and its content policy forbids the browser to fetch anything else.
 Names come from agent files and are untrusted: they are escaped for HTML, for plotly, and as JSON inside a script.
@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import json
 import re
-from base64 import b64encode
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from html import escape
 from importlib.resources import files
 from typing import Any
 
+from plotly.graph_objects import Figure
 from plotly.offline import get_plotlyjs
 
 from cz_gym.evaluation.results import Benchmark, Outcome, ScenarioResult
@@ -22,14 +22,15 @@ from cz_gym.units import HOUR, MINUTE
 from . import tables
 from .canvas import styles_of
 from .markdown import measured_from
+from .page_figures import errors, pareto
 from .page_signals import OWN, PANELS, SHARED, crystals, frame
 from .verdict import headline
 
 _SLOT = re.compile(r"<!-- slot:(\w+) -->")
 
 
-def page(benchmark: Benchmark, figures: Mapping[str, bytes]) -> str:
-    """The page, with those of the ``figures`` (PNG, by file name) that are of all crystals."""
+def page(benchmark: Benchmark) -> str:
+    """The page; the same results give the same text."""
     config, scenarios = benchmark.scenarios[0].row.config(), benchmark.scenarios
     most = max(len(scenario.seeds) for scenario in scenarios)
     parts = {
@@ -43,7 +44,6 @@ def page(benchmark: Benchmark, figures: Mapping[str, bytes]) -> str:
         f"{config.horizon / HOUR:g} h at one action every {config.control_interval:g} s.",
         "scenarios": _each("option", (scenario.row.name for scenario in scenarios)),
         "tables": "\n".join(_table(scenario) for scenario in scenarios),
-        "figures": "\n".join(_image(figures[name]) for name in ("pareto.png", "errors.png") if name in figures),
         "controllers": "\n".join(
             "<tr>"
             + _each("td", (each.name, each.observation, each.meaning, ", ".join(map(str, each.training_seeds))))
@@ -63,13 +63,17 @@ def _data(benchmark: Benchmark) -> dict[str, Any]:
     return {
         "minutes": config.control_interval / MINUTE,
         "resolutions": [[PANELS[panel].resolution for panel, _ in lines] for lines in (OWN, SHARED)],
-        "frame": json.loads(frame(benchmark.controllers, rivals, styles, config.horizon).to_json()),
-        "crystals": [crystals(each) for each in benchmark.scenarios],
+        "frame": _figure(frame(benchmark.controllers, rivals, styles, config.horizon)),
+        "scenarios": [
+            {"pictures": [_figure(draw(each, styles)) for draw in (pareto, errors)], "crystals": crystals(each)}
+            for each in benchmark.scenarios
+        ],
     }
 
 
-def _image(png: bytes) -> str:
-    return f'<img alt="" src="data:image/png;base64,{b64encode(png).decode()}">'
+def _figure(figure: Figure) -> Any:
+    margin = {"l": 60, "r": 10, "t": 50, "b": 40}
+    return json.loads(figure.update_layout(template="plotly_white", margin=margin, hoverlabel_namelength=-1).to_json())
 
 
 def embedded(value: Any) -> str:

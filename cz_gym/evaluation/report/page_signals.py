@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from html import escape
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,17 +24,10 @@ from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 from cz_gym.vector import CzVectorEnv
 
 from .canvas import GREY, INK, Style
+from .page_figures import plain
 
 OUTLIERS = 0.001
 """Share of the values at either end that a panel's range need not hold."""
-LONGEST = 32
-"""Characters of a name that the legend has room for."""
-
-
-def plain(name: str) -> str:
-    """A name as plotly may draw it: its own markup switched off, one line, not too long."""
-    short = name if len(name) <= LONGEST else f"{name[: LONGEST - 1]}…"
-    return escape("".join(letter if letter.isprintable() else " " for letter in short), quote=False)
 
 
 class Panel(NamedTuple):
@@ -197,5 +189,4 @@ def frame(
     figure.update_xaxes(range=[0.0, horizon / MINUTE], hoverformat=".2f")
     figure.update_xaxes(title="time [min]", row=len(PANELS), col=1)
     legend = {"orientation": "h", "y": 1.02, "yanchor": "bottom", "groupclick": "togglegroup"}
-    figure.update_layout(template="plotly_white", margin={"l": 60, "r": 10, "t": 50, "b": 40}, hoverlabel_namelength=-1)
     return figure.update_layout(legend=legend, height=150 * len(PANELS), hovermode="x", uirevision="same")

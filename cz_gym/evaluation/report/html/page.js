@@ -23,17 +23,19 @@ function makeSortable(heading) {
 }
 
 function showScenario() {
+  const { pictures, crystals } = DATA.scenarios[scenario.selectedIndex];
   document.querySelectorAll(".scenario").forEach((table, i) => (table.hidden = i !== scenario.selectedIndex));
-  seed.replaceChildren(...DATA.crystals[scenario.selectedIndex].map((crystal) => new Option(crystal.seed)));
+  pictures.forEach((figure, i) => Plotly.react(`picture-${i}`, figure.data, figure.layout, CONFIG));
+  seed.replaceChildren(...crystals.map((crystal) => new Option(crystal.seed)));
   showCrystal();
 }
 
 /** Draw the chosen crystal into the panels: a controller's traces stand in the order of its packed lines. */
 async function showCrystal() {
-  const crystal = DATA.crystals[scenario.selectedIndex][seed.selectedIndex];
+  const crystal = DATA.scenarios[scenario.selectedIndex].crystals[seed.selectedIndex];
   const [own, shared] = DATA.resolutions, last = crystal.packed.length - 1;
   const lines = await Promise.all(crystal.packed.map((text, i) => unpack(text, i < last ? own : shared)));
-  if (crystal !== DATA.crystals[scenario.selectedIndex][seed.selectedIndex]) return;
+  if (crystal !== DATA.scenarios[scenario.selectedIndex].crystals[seed.selectedIndex]) return;
   const traces = lines.flat().map((y, i) => {
     const x = y.map((_, k) => (k + 1) * DATA.minutes);
     return { name: crystal.names[Math.floor(i / own.length)], ...DATA.frame.data[i], x, y };
