@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 try:
-    from cz_gym.commands import OneLineParser, guarded
+    from cz_gym.commands import OneLineParser, between, guarded
     from cz_gym.names import unknown
 except ModuleNotFoundError as error:
     sys.exit(f"train.py: {error}")
@@ -37,7 +37,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     about = f"one of {', '.join(RECIPES)} (default: {DEFAULT}, or the resumed run's)"
     parser.add_argument("--algo", type=_named("recipe", RECIPES), metavar="RECIPE", help=about)
     which = parser.add_mutually_exclusive_group()
-    which.add_argument("--seed", type=_whole(0), help="training seed (default: 0, or the resumed run's)")
+    which.add_argument("--seed", type=between(0, 2**63 - 1), help="training seed (default: 0, or the resumed run's)")
     which.add_argument(
         "--seeds",
         type=_seeds,
@@ -53,7 +53,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument(
         "--steps",
-        type=_whole(1),
+        type=between(1, 10**12),
         help="environment steps of learning from reward (default: the recipe's, or the resumed run's)",
     )
     parser.add_argument(
@@ -247,19 +247,6 @@ def _named(kind: str, known: Iterable[str]) -> Callable[[str], str]:
         return text
 
     return name
-
-
-def _whole(least: int) -> Callable[[str], int]:
-    def read(text: str) -> int:
-        try:
-            value = int(text.replace("_", ""))
-        except ValueError:
-            value = least - 1
-        if value < least:
-            raise argparse.ArgumentTypeError(f"must be a whole number of at least {least}, not {text!r}")
-        return value
-
-    return read
 
 
 def _seeds(text: str) -> range:

@@ -7,7 +7,7 @@ model is a pickle, and reading one can run any code: convert only what you train
 from __future__ import annotations
 
 import argparse
-import importlib
+import pkgutil
 import sys
 import warnings
 from collections.abc import Callable
@@ -19,7 +19,7 @@ import numpy as np
 from cz_gym.agents.agent_file.contract import AgentFileError, Contract, facts_of, make_contract, write_agent
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.agents.training.validation import JUDGING, validate
-from cz_gym.commands import OneLineParser, guarded
+from cz_gym.commands import OneLineParser
 from cz_gym.config import Config, check_config, make_config
 from cz_gym.env import CzEnv, observation_space
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.vec_env import VecNormalize
 
-PROG = "python -m cz_gym.agents.from_sb3"
 ALGORITHMS = {
     "a2c": "stable_baselines3.A2C",
     "ddpg": "stable_baselines3.DDPG",
@@ -189,7 +188,7 @@ def main(argv: list[str] | None = None) -> int:
     """Convert a saved model."""
     description = "Write a model of stable-baselines3 or RL-Zoo as an agent file, which the benchmark runs."
     epilog = "A saved model is a pickle: reading one can run any code, so convert only what you trained."
-    parser = OneLineParser(PROG, description, epilog)
+    parser = OneLineParser("python -m cz_gym.agents.from_sb3", description, epilog)
     parser.add_argument("model", type=Path, help="saved model (.zip)")
     parser.add_argument("--algo", choices=sorted(ALGORITHMS), required=True, help="algorithm, by RL-Zoo's name")
     parser.add_argument(
@@ -202,22 +201,15 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--control-interval", type=float, default=5.0, help="in seconds (default: %(default)s)")
     parser.add_argument("--seed", type=int, help="training seed (default: the model's)")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="agent file to write (.onnx)")
-    given = parser.parse_args(argv)
-    return guarded(PROG, lambda: _convert(given), "agents")
+    return parser.run(_convert, argv, "agents")
 
 
-def _convert(given: argparse.Namespace) -> int:
+def _convert(given: argparse.Namespace) -> None:
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-    module, _, name = ALGORITHMS[given.algo].partition(".")
-    algorithm = getattr(importlib.import_module(module), name)
+    algorithm: Any = pkgutil.resolve_name(ALGORITHMS[given.algo].replace(".", ":"))
     model = _read(given.model, f"a model of {given.algo}", lambda: algorithm.load(given.model, device="cpu"))
-    config = make_config(
-        given.scenario,
-        observation=given.observation,
-        action=given.action,
-        control_interval=given.control_interval,
-    )
+    config = make_config(given.scenario, None, given.observation, given.control_interval, action=given.action)
     _check_spaces(model, config)
     normalisation = None
     if given.vecnormalize:
@@ -225,17 +217,10 @@ def _convert(given: argparse.Namespace) -> int:
         normalisation = _read(
             given.vecnormalize, "a VecNormalize", lambda: VecNormalize.load(str(given.vecnormalize), env)
         )
-    contract = save_agent(
-        given.out,
-        model,
-        given.out.stem if given.name is None else given.name,
-        normalisation,
-        config,
-        given.seed,
-    )
+    name = given.out.stem if given.name is None else given.name
+    contract = save_agent(given.out, model, name, normalisation, config, given.seed)
     said = f"mean RMSE {contract.validation_rmse_mm:.3f} mm on {len(JUDGING)} validation episodes"
     print(f"wrote {given.out}: {contract.algorithm} after {contract.training_steps:,} steps, {said}")
-    return 0
 
 
 def _read(path: Path, what: str, load: Callable[[], Any]) -> Any:

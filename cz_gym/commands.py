@@ -1,4 +1,4 @@
-"""What the project's commands share: a parser that says what is wrong in one line, and the end of an interrupt."""
+"""What the project's commands share: whatever is wrong with one, or ends it early, is said in one line."""
 
 from __future__ import annotations
 
@@ -8,9 +8,6 @@ from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 from gymnasium.error import DependencyNotInstalled
-
-INTERRUPTED = 130
-"""Exit code of a command that Ctrl-C ended."""
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -65,12 +62,7 @@ def guarded(prog: str, body: Callable[[], int], extra: str, left: str = "nothing
     except (ValueError, DependencyNotInstalled) as error:
         said = str(error)
     except KeyboardInterrupt:
-        return interrupted(prog, left)
+        print(f"{prog}: interrupted; {left}", file=sys.stderr)
+        return 130
     print(f"{prog}: {' '.join(said.split())}", file=sys.stderr)
     return 2
-
-
-def interrupted(prog: str, left: str = "nothing written") -> int:
-    """Say in one line that Ctrl-C ended the command, and what it left; returns the exit code."""
-    print(f"{prog}: interrupted; {left}", file=sys.stderr)
-    return INTERRUPTED

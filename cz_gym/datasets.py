@@ -27,7 +27,7 @@ from scipy.signal import lfilter
 
 import cz_gym
 from cz_gym.atomic_files import check_writable
-from cz_gym.commands import OneLineParser, between, guarded
+from cz_gym.commands import OneLineParser, between
 from cz_gym.config import Config, check_config, make_config
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from cz_gym.names import unknown
@@ -35,7 +35,6 @@ from cz_gym.observation import DRIVE_CHANNELS, to_measured
 from cz_gym.task import drives_of
 from cz_gym.vector import CzVectorEnv
 
-PROG = "python -m cz_gym.datasets"
 CONTROLLERS, AGENTS = "cz_gym.baselines.registry:CONTROLLERS", "cz_gym.agents:load"
 """Where policies come from: looked up by name, since this package imports none."""
 EPISODES, NOISE = 100, 0.2
@@ -170,7 +169,8 @@ def write(
 
 def main(argv: list[str] | None = None) -> int:
     """Write datasets and say a line of each; 0 when done, 2 for bad input, 130 when interrupted."""
-    parser = OneLineParser(PROG, "Write Minari datasets of policies on training crystals, with noise on their drives.")
+    about = "Write Minari datasets of policies on training crystals, with noise on their drives."
+    parser = OneLineParser("python -m cz_gym.datasets", about)
     add, policies = parser.add_argument, "paper,paper-tuned,lqg-at-0.02,gradient"
     add("--policies", default=policies, metavar="NAMES", help="controllers and shipped agents (%(default)s)")
     add("--scenarios", default="randomized,sensor-fault", metavar="NAMES", help="(%(default)s)")
@@ -178,11 +178,10 @@ def main(argv: list[str] | None = None) -> int:
     add("--noise", type=float, default=NOISE, metavar="X", help="highest level of the excitation (%(default)s)")
     add("--out", type=Path, metavar="FOLDER", help="instead of $MINARI_DATASETS_PATH or ~/.minari/datasets")
     add("--overwrite", action="store_true", help="write again what is there already")
-    given = parser.parse_args(argv)
-    return guarded(PROG, lambda: _write_all(given), "data", "the datasets named above are complete")
+    return parser.run(_write_all, argv, "data", "the datasets named above are complete")
 
 
-def _write_all(given: argparse.Namespace) -> int:
+def _write_all(given: argparse.Namespace) -> None:
     if given.out is not None:
         os.environ["MINARI_DATASETS_PATH"] = str(given.out.resolve())
     sources = [
@@ -195,7 +194,6 @@ def _write_all(given: argparse.Namespace) -> int:
         dataset = write(*each, TRAINING_SEEDS[: given.episodes], given.noise, overwrite=given.overwrite)
         said = f"{dataset.id}: {dataset.total_episodes} episodes, {dataset.total_steps:,} steps, "
         print(f"{said}{dataset.storage.get_size():.0f} MB, {time.perf_counter() - began:.1f} s", flush=True)
-    return 0
 
 
 if __name__ == "__main__":

@@ -173,7 +173,7 @@ class CzEnv(gym.Env[Observation, Action]):
         given = check_options(options)
         scenario = find_scenario(given["scenario"]) if "scenario" in given else None
         if "state" in given:
-            self._check_state(given["state"])
+            check_state(given["state"], self._batch)
         super().reset(seed=seed)
         if "state" in given:
             self.set_state(given["state"])
@@ -213,7 +213,7 @@ class CzEnv(gym.Env[Observation, Action]):
 
     def set_state(self, state: EnvState) -> None:
         """Continue from a value of :meth:`get_state`; ValueError if it was saved under other settings."""
-        self._check_state(state)
+        check_state(state, self._batch)
         self._batch.restore([0], [state.slot], self._out)
         self.np_random.bit_generator.state = state.random
         self._look()
@@ -231,9 +231,6 @@ class CzEnv(gym.Env[Observation, Action]):
             self._look()
         for name, fact in zip(_FACTS, saved["facts"], strict=True):
             setattr(self, name, fact)
-
-    def _check_state(self, state: Any) -> None:
-        check_state(state, self._batch)
 
     def render(self) -> Frame | None:
         """The picture, uint8 of shape (height, width, 3), for "rgb_array"; "human" shows it at every reset and step.

@@ -1,8 +1,4 @@
-"""Conversions between SI and the units people read; no other module spells these numbers.
-
-A value in SI times nothing is SI; multiply by a constant to enter SI (``0.5 * MM``), divide to leave it
-(``r_c / MM``).
-"""
+"""Conversions between SI and the units people read: ``0.5 * MM`` enters SI, ``r_c / MM`` leaves it."""
 
 from __future__ import annotations
 

@@ -44,8 +44,8 @@ class Agent(nn.Module):
 
     def __init__(self, channels: int, actions: int, log_std: float) -> None:
         super().__init__()
-        self.actor = nn.Sequential(*layers(channels), output(actions, 0.01))
-        self.critic = nn.Sequential(*layers(channels), output(1, 1.0))
+        self.actor = network(channels, actions, 0.01)
+        self.critic = network(channels, 1, 1.0)
         self.log_std = nn.Parameter(torch.full((actions,), log_std))
         self.mean, self.var, self.count = torch.zeros(channels), torch.ones(channels), 1e-4
 
@@ -71,24 +71,15 @@ class Agent(nn.Module):
             return self.actor(self.normalise(observation)).clamp(-1.0, 1.0).numpy(), state
 
 
-def layers(channels: int) -> list[nn.Module]:
-    """Two hidden layers."""
-    found: list[nn.Module] = []
-    for wide, narrow in ((channels, 64), (64, 64)):
-        found += [orthogonal(nn.Linear(wide, narrow), 2.0**0.5), nn.Tanh()]
-    return found
-
-
-def output(outputs: int, gain: float) -> nn.Linear:
-    """The last layer."""
-    return orthogonal(nn.Linear(64, outputs), gain)
-
-
-def orthogonal(layer: nn.Linear, gain: float) -> nn.Linear:
-    """A layer as PPO begins it."""
-    nn.init.orthogonal_(layer.weight, gain)
-    nn.init.zeros_(layer.bias)
-    return layer
+def network(inputs: int, outputs: int, gain: float) -> nn.Sequential:
+    """Two hidden layers, all as PPO begins them; ``gain`` is that of the last."""
+    layers: list[nn.Module] = []
+    for wide, narrow, spread in ((inputs, 64, 2.0**0.5), (64, 64, 2.0**0.5), (64, outputs, gain)):
+        layer = nn.Linear(wide, narrow)
+        nn.init.orthogonal_(layer.weight, spread)
+        nn.init.zeros_(layer.bias)
+        layers += [layer, nn.Tanh()]
+    return nn.Sequential(*layers[:-1])
 
 
 def main(args: Args) -> Validation:
@@ -102,12 +93,7 @@ def main(args: Args) -> Validation:
     optimiser = torch.optim.Adam(agent.parameters(), args.learning_rate, eps=1e-5)
     shape = (args.num_steps, args.num_envs)
     seen, done_after = torch.zeros(*shape, channels), torch.zeros(shape)
-    acted, logps, values, rewards = (
-        torch.zeros(*shape, actions),
-        torch.zeros(shape),
-        torch.zeros(shape),
-        torch.zeros(shape),
-    )
+    acted, (logps, values, rewards) = torch.zeros(*shape, actions), torch.zeros(3, *shape)
     worst = -10.0 / (1.0 - args.gamma)  # a failing step costs -10 for each step lost: no more than the discount sees
     updates = max(args.steps // (args.num_steps * args.num_envs), 1)
     for update in range(updates):

@@ -30,6 +30,8 @@ _AT_REST = np.array([float(channel.name == "valid") for channel in MEASURED])
 """Observation at rest: nothing but a valid camera."""
 _DISTURBED = ("v_p", "Q_d", "dT_i", "camera", "pyrometer")
 """Inputs of a joined loop."""
+_ANSWERS = ("v_p", "Q_H", "r_c", "r_br")
+"""Its outputs: both commands and both radii."""
 
 
 class NotLinearError(ValueError):
@@ -43,8 +45,6 @@ class Loop(NamedTuple):
     B: Floats
     C: Floats
     D: Floats
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
     dt: float
     """Control interval [s]."""
 
@@ -65,7 +65,7 @@ class Loop(NamedTuple):
 
     def pick(self, output: str, inputs: tuple[str, ...]) -> StateSpace:
         """The part from some inputs to one output."""
-        row, columns = self.outputs.index(output), [self.inputs.index(name) for name in inputs]
+        row, columns = _ANSWERS.index(output), [_DISTURBED.index(name) for name in inputs]
         return StateSpace(self.A, self.B[:, columns], self.C[[row]], self.D[np.ix_([row], columns)])
 
 
@@ -170,8 +170,6 @@ def close(controller: StateSpace, puller: Puller, dt: float, broken: str = "") -
         np.vstack([disturbed + apply @ closed @ direct, B @ noise]),
         np.vstack([command, radii]),
         np.vstack([direct, np.zeros((2, inputs))]),
-        _DISTURBED,
-        ("v_p", "Q_H", "r_c", "r_br"),
         dt,
     )
 

@@ -21,8 +21,6 @@ from cz_gym.observation import HEATER_SCALE, STATE, scales
 from .future import future_of
 from .trajectory import INPUTS, Trajectory, limits_of, optimise, predicted_cost
 
-BATCH = 25
-"""Episodes optimised at once."""
 _CHANNELS = tuple(channel.name for channel in STATE)
 _X = ("r_c_error", "h_c", "T_1", "T_2", "T_b")
 
@@ -61,8 +59,7 @@ class Clairvoyant:
 
     def for_episodes(self, config: Config, seeds: Sequence[int]) -> Clairvoyant:
         """The same for those episodes, one a slot."""
-        parts = [make_plan(config, seeds[i : i + BATCH]) for i in range(0, len(seeds), BATCH)]
-        return Clairvoyant(parts[0] if len(parts) == 1 else _joined(parts))
+        return Clairvoyant(make_plan(config, seeds))
 
     def predict(
         self, observation: Any, state: Memory | None = None, episode_start: Any = None, deterministic: bool = True
@@ -95,11 +92,3 @@ def make_plan(config: Config, seeds: Sequence[int]) -> Plan:
         np.stack(np.broadcast_arrays(*values), axis=-1) for values in (future.puller.state_0, future.puller.inputs_0)
     )
     return Plan(best, state_0, inputs_0, predicted_cost(future, best))
-
-
-def _joined(plans: Sequence[Plan]) -> Plan:
-    bests = [plan.best for plan in plans]
-    x, u, feedback = (np.concatenate([best[i] for best in bests], axis=1) for i in range(3))
-    moves = np.concatenate([best.last_move for best in bests])
-    best = Trajectory(x, u, feedback, moves)
-    return Plan(best, *(np.concatenate([plan[i] for plan in plans]) for i in range(1, len(Plan._fields))))

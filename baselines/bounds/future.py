@@ -14,8 +14,10 @@ import numpy.typing as npt
 from cz_gym.baselines.policy import Floats, stack
 from cz_gym.config import Config
 from cz_gym.engine.batch import first_key
+from cz_gym.episodes.draw import randomised
+from cz_gym.episodes.record import GRID, Episode
 from cz_gym.episodes.schedule import disturbance, reference
-from cz_gym.episodes.series import GRID, Episode, draw_episode, draw_factors, new_series, randomised
+from cz_gym.episodes.series import draw_episode, draw_factors, new_series
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.plant import Disturbance, Inputs, Puller, State, make_puller, rk4
 

@@ -1,21 +1,15 @@
 """The camera's view of the meniscus: one set of parameters, and what follows from it.
 
-A pinhole camera above the melt looks down at the near part of the bright ring. Its rays meet the crystal (a straight
-cylinder), the meniscus (Hurle's profile as a surface of revolution) or the flat melt; where they meet melt they are
-mirrored to the crucible's hot wall, the heat shield, the crystal, the opening above, or melt again
-(:mod:`cz_gym.camera.rays`). Nothing draws a ring: it is the part of the meniscus steep enough to mirror the wall.
-
 x points from the crystal's axis towards the camera, y to its right, z up; z = 0 is the melt far from the crystal.
-``python -m studies.camera`` measures the view and draws ``results/camera``.
+docs/camera.md says how the image is made.
 """
 
 from __future__ import annotations
 
 import math
-from numbers import Real
-from typing import Annotated, Any, NamedTuple, get_type_hints
+from typing import Annotated, Any, NamedTuple
 
-from cz_gym.physics.parameters import Parameters, Quantity
+from cz_gym.physics.parameters import Parameters, Quantity, check_numbers
 from cz_gym.units import MM
 
 ROWS, COLUMNS = 120, 160
@@ -80,12 +74,6 @@ class Camera(NamedTuple):
     ] = 2.0
 
 
-def describe_camera() -> dict[str, Quantity]:
-    """Name of each parameter to its :class:`cz_gym.physics.parameters.Quantity`."""
-    hints = get_type_hints(Camera, include_extras=True)
-    return {name: hints[name].__metadata__[0] for name in Camera._fields}
-
-
 def camera_for(parameters: Parameters) -> Camera:
     """The default camera at a puller of these parameters: aimed at its crystal, the shield's opening in proportion."""
     default = Camera()
@@ -107,11 +95,8 @@ def check_camera(camera: Camera, parameters: Parameters) -> Camera:
     """Return the camera, or raise ValueError naming what cannot be at a puller of these parameters."""
     if not isinstance(camera, Camera):
         raise ValueError(f"camera must be a cz_gym.camera.Camera, not {camera!r}")
+    check_numbers("camera parameter", camera, _MAY_BE_ZERO)
     for name, value in camera._asdict().items():
-        number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-        if not number or value < 0 or (value == 0 and name not in _MAY_BE_ZERO):
-            unit = describe_camera()[name].unit
-            raise ValueError(f"camera parameter {name} = {value!r} must be a positive finite number [{unit}]")
         if name in _AT_MOST_ONE and value > 1:
             raise ValueError(f"camera parameter {name} = {value!r} must not exceed 1")
     if camera.reflections not in range(1, MOST_REFLECTIONS + 1):

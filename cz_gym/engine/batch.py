@@ -144,20 +144,8 @@ class Batch:
         self._infos = BufferPool((len(INFO), info_width(num_envs)), np.float64)
         out, which, keys = self.new_out(), np.zeros(1, np.int64), np.zeros((1, 2), np.uint64)
         stepped = (self.memory, self.actions, self._all, self.clock, self.drives, self.reading, out, 0, 1)
-        drawn = (
-            self.memory,
-            which,
-            keys,
-            self._record,
-            self._mix,
-            self._parameters,
-            self.clock,
-            self.reading,
-            out,
-            0,
-            1,
-        )
-        self._step, self._draw = entry(self.kernels.step, stepped), entry(self.kernels.draw, drawn)
+        drawn = self._drawing(which, keys, self._record, self._mix, out)
+        self._step, self._draw = entry(self.kernels.step, stepped), entry(self.kernels.draw, (*drawn, 0, 1))
         threads = threads or os.cpu_count() or 1
         self._parts = max(1, min(threads, num_envs // (1 if self._camera else SLOTS_PER_THREAD)))
         if self._camera:
@@ -216,15 +204,15 @@ class Batch:
             record, mix = record_of(scenario), np.array(self.config.with_scenario(scenario).mix, np.float64)
         slots = np.array(which, np.int64)
         words = np.array(list(keys), np.uint64).reshape(-1, 2)
-        arguments = (
-            self.memory, slots, words, record, mix, self._parameters, self.clock, self.reading, out,
-        )  # fmt: skip
+        arguments = self._drawing(slots, words, record, mix, out)
         if max(self._run(self._draw, arguments, len(slots), DRAWS_PER_THREAD, DRAWS_AT_ONCE)) >= 0:
             raise ValueError(NO_OPERATING_POINT)
         if self._camera:
-            drawn = np.zeros(self.num_envs, np.bool_)
-            drawn[slots] = True
-            self._photograph(out, drawn)
+            self._photograph(out, np.isin(np.arange(self.num_envs), slots))
+
+    def _drawing(self, which: Any, keys: Any, record: Any, mix: Any, out: Out) -> tuple[Any, ...]:
+        """Arguments of the compiled draw, without the range of slots."""
+        return self.memory, which, keys, record, mix, self._parameters, self.clock, self.reading, out
 
     def step(self, actions: npt.ArrayLike, out: Out, active: npt.NDArray[np.bool_] | None = None) -> int:
         """Advance the active slots by one control interval; actions of shape (num_envs, 2), not NaN.
@@ -302,9 +290,7 @@ class Batch:
                 rows[i] = getattr(state, name)
         self.kernels.show(self.memory, np.array(which, np.int64), self.clock, self.reading, out, 0, len(which))
         if self._camera:
-            shown = np.zeros(self.num_envs, np.bool_)
-            shown[list(which)] = True
-            self._photograph(out, shown)
+            self._photograph(out, np.isin(np.arange(self.num_envs), which))
 
     def _saved(self) -> tuple[npt.NDArray[Any], ...]:
         memory = self.memory

@@ -15,16 +15,12 @@ import numpy.typing as npt
 from cz_gym.jit.compile import kernel
 
 from . import draw as draws
-from .draw import STREAMS, randomised, seed_streams, skip_constants
+from .draw import STREAMS, seed_streams, skip_constants
 from .noise import draw_series
-from .record import FREEZES, GRID, Episode, Factors, Stream, record_of
+from .record import FREEZES, Episode, Factors, record_of
 from .rng import WORDS
 from .scenario import Range, Scenario
 
-__all__ = [
-    "FREEZES", "GRID", "Episode", "Factors", "Series", "Stream", "draw_episode", "draw_factors", "new_series",
-    "randomised", "series_of", "stream",
-]  # fmt: skip
 Floats = npt.NDArray[np.float64]
 
 
@@ -42,11 +38,6 @@ class Series(NamedTuple):
 def new_series(grid_points: int, samples: int) -> Series:
     """Series of zeros."""
     return Series(np.zeros(grid_points), np.zeros((samples, 2)), np.zeros((FREEZES, 2)))
-
-
-def stream(key: tuple[int, int], number: Stream) -> np.random.Generator:
-    """NumPy's own form of that stream of an episode's key (two 64-bit words)."""
-    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(key, spawn_key=(int(number),))))
 
 
 def draw_factors(scenario: Scenario, mix: Range, key: tuple[int, int]) -> Factors:

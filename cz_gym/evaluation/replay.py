@@ -1,7 +1,6 @@
 """What another controller would have done on the same melt: :func:`replay`.
 
-Both trajectories share every disturbance, every sensor's noise and every fault, from the start or from a moment on:
-the environment's state is saved there and continued bit for bit, so that all that differs is the controller.
+The environment's state is saved and continued bit for bit, so that all that differs is the controller.
 """
 
 from __future__ import annotations

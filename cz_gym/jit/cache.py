@@ -46,9 +46,10 @@ DIGEST = hashlib.sha256().digest_size
 
 
 def compiled_sources(folder: Path | None = None) -> list[Path]:
-    """Every source of the package that compiled code may have taken a function or a constant from, sorted."""
+    """Every file of the package that compiled code may have taken a function or a constant from, sorted."""
     folder = folder or PACKAGE
-    return sorted(file for file in folder.rglob("*.py") if file.relative_to(folder).parts[0] not in NEVER_COMPILED)
+    files = (file for kind in ("*.py", "*.json") for file in folder.rglob(kind))
+    return sorted(file for file in files if file.relative_to(folder).parts[0] not in NEVER_COMPILED)
 
 
 def source_hash(folder: Path | None = None) -> str:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from numbers import Real
-from typing import Annotated, NamedTuple, get_type_hints
+from typing import Annotated, Any, NamedTuple, get_type_hints
 
 from cz_gym.units import MM, MM_PER_MIN
 
@@ -66,27 +67,31 @@ class Parameters(NamedTuple):
     )
 
 
-def describe() -> dict[str, Quantity]:
-    """Name of each parameter to its :class:`Quantity`."""
-    hints = get_type_hints(Parameters, include_extras=True)
-    return {name: hints[name].__metadata__[0] for name in Parameters._fields}
+def describe(kind: type[Any] = Parameters) -> dict[str, Quantity]:
+    """Name of each parameter of that kind of tuple to its :class:`Quantity`."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {name: hints[name].__metadata__[0] for name in kind._fields}
 
 
 _MAY_BE_ZERO = frozenset({"alpha_0", "T_a", "T_e"})
-
-
 MOST_V_0 = 1e-3
 """Largest nominal pull speed [m/s]; silicon is pulled at hundredths of it."""
+
+
+def check_numbers(what: str, values: Any, may_be_zero: Collection[str]) -> None:
+    """ValueError names a field of a tuple of quantities that is no positive finite number."""
+    for name, value in values._asdict().items():
+        number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+        if not number or value < 0 or (value == 0 and name not in may_be_zero):
+            unit = describe(type(values))[name].unit
+            raise ValueError(f"{what} {name} = {value!r} must be a positive finite number [{unit}]")
 
 
 def check_parameters(parameters: Parameters) -> Parameters:
     """Return the parameters, or raise ValueError naming the one that is not a usable number."""
     if not isinstance(parameters, Parameters):
         raise ValueError(f"parameters must be a cz_gym.Parameters, not {parameters!r}")
-    for name, value in parameters._asdict().items():
-        number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-        if not number or value < 0 or (value == 0 and name not in _MAY_BE_ZERO):
-            raise ValueError(f"parameter {name} = {value!r} must be a positive finite number [{describe()[name].unit}]")
+    check_numbers("parameter", parameters, _MAY_BE_ZERO)
     if parameters.alpha_0 >= math.pi / 2:
         raise ValueError(
             f"parameter alpha_0 = {parameters.alpha_0!r} rad must be below a right angle: is it in degrees?"

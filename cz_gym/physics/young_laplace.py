@@ -10,14 +10,15 @@ point phi = pi/2 - theta. :data:`YOUNG_LAPLACE` is the solution as polynomials t
 
     gym.make("Cz-v0", meniscus=YOUNG_LAPLACE)
 
-``python -m studies.young_laplace`` computes the polynomials anew; ``--write`` puts them into
-``young_laplace_table.py``.
+``python -m studies.young_laplace`` computes the polynomials anew; ``--write`` puts them into ``young_laplace.json``.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,10 +29,12 @@ from scipy.special import k0e, k1e
 from cz_gym.jit.compile import physics
 
 from .meniscus import MeniscusModel, hurle_height, profile, ring_point
-from .young_laplace_table import RING, SLOPE, TAIL
 
 Floats = npt.NDArray[np.float64]
 SQRT_2 = math.sqrt(2.0)
+TABLE = Path(__file__).with_suffix(".json")
+SLOPE, RING, TAIL = (np.array(rows) for rows in json.loads(TABLE.read_text()).values())
+"""Coefficients of the polynomials [-], shapes (9, 16), (9, 22) and (7, 8)."""
 TAIL_HEIGHT = 1e-6
 """Height at which the linear tail hands over to the shooting [a]."""
 NARROWEST = 0.3

@@ -15,10 +15,11 @@ from docutils.parsers.rst import Directive
 from docutils.statemachine import StringList
 
 from cz_gym import SCENARIOS, Scenario
-from cz_gym.camera.view import Camera, describe_camera
+from cz_gym.camera.view import Camera
 from cz_gym.engine.layout import INFO_ROWS
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED, STATE, Channel
+from cz_gym.physics.parameters import describe
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from . import nomenclature
@@ -155,7 +156,7 @@ def camera() -> list[str]:
     default = Camera()
     rows = (
         (code(name), f"{getattr(default, name):.6g}", units(q.unit), q.meaning, q.source)
-        for name, q in describe_camera().items()
+        for name, q in describe(Camera).items()
     )
     return markdown(("code", "value", "unit", "meaning", "source"), rows)
 

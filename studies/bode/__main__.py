@@ -22,8 +22,8 @@ from cz_gym.baselines.registry import make_controller
 from cz_gym.commands import OneLineParser
 from cz_gym.config import make_config
 from cz_gym.evaluation import user_code
+from cz_gym.evaluation.report.tables import markdown as table
 from cz_gym.physics.plant import Puller, make_puller
-from studies.markdown import table
 
 PLACES = {"camera": "ring", "v_p": "pull speed"}
 """Where the loop is opened, and what it is called."""

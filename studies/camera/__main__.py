@@ -1,8 +1,4 @@
-"""What the camera sees, measured: ``python -m studies.camera [--out FOLDER]``.
-
-Frames a second; the detector against the closed-form ring and against the exactly traced edge, in pixels; how far each
-moves with radius and height; and their answers to a sudden change of the pull speed. About a minute.
-"""
+"""What the camera sees, measured: ``python -m studies.camera [--out FOLDER]``, about a minute."""
 
 from __future__ import annotations
 

@@ -13,11 +13,10 @@ from cz_gym.agents import MODELS, shipped_seeds
 from cz_gym.agents.agent_file.contract import Contract, read_agent
 from cz_gym.agents.training.recipes import ALL, RECIPES, SPECIALISTS, Gradient, Imitation
 from cz_gym.atomic_files import check_writable, write_files
-from cz_gym.commands import OneLineParser, guarded
+from cz_gym.commands import OneLineParser
+from cz_gym.evaluation.report.tables import markdown as table
 from studies.algorithms.__main__ import ROWS
-from studies.markdown import table
 
-PROG = "python -m studies.cards"
 _LEARNED = {row.name: row.meaning for row in ROWS} | {
     recipe.name: f"going on from `{recipe.start}`, for "
     + ("all four scenarios" if recipe is ALL else f"`{recipe.scenario}`")
@@ -129,7 +128,7 @@ No agent was trained or tested on a real puller: none may control one.
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser(prog=PROG, description=__doc__)
+    parser = OneLineParser("python -m studies.cards", __doc__)
     results, out = Path("results"), Path("results/cards/cards.md")
     parser.add_argument(
         "--benchmark",
@@ -139,11 +138,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="results; an agent's are taken from the first that has it (default: of benchmark and frontier)",
     )
     parser.add_argument("--out", type=Path, default=out, help="file to write (default: %(default)s)")
-    given = parser.parse_args(arguments)
-    return guarded(PROG, lambda: _main(given), "benchmark")
+    return parser.run(_main, arguments, "benchmark")
 
 
-def _main(given: argparse.Namespace) -> int:
+def _main(given: argparse.Namespace) -> None:
     check_writable(given.out.parent)
     results = read_results(given.benchmark)
     cards = [
@@ -151,7 +149,6 @@ def _main(given: argparse.Namespace) -> int:
     ]
     write_files({given.out: "\n".join([ABOUT, *cards]).encode()})
     print(f"wrote {given.out}")
-    return 0
 
 
 if __name__ == "__main__":

@@ -1,14 +1,7 @@
 """Measure a benchmark's tasks on one and two Ray nodes of a processor each, and say what many machines would do.
 
-The model has four numbers: a cluster of N machines does K tasks in
-
-    T(N) = connect + load + ceil(K / N) t + K d
-
-``connect``: joining the cluster, with the check of its nodes' sources. ``load``: the first task in a new process, less
-a task. ``t``: a task on its node. ``d``: what the driver needs to hand a task out and to take its result, one after the
-other for all tasks; measured by tasks that do nothing but return such a result, so it is an upper bound. The time on
-two nodes is no part of the fit: it tests the model. All figures need a quiet machine with three free processors: two
-nodes and the driver.
+A cluster of N machines does K tasks in T(N) = connect + load + ceil(K / N) t + K d. The time on two nodes is no part of
+the fit: it tests the model. All figures need a quiet machine with three free processors: two nodes and the driver.
 """
 
 from __future__ import annotations
@@ -26,8 +19,8 @@ from cz_gym.baselines.registry import make_controller
 from cz_gym.commands import OneLineParser, between
 from cz_gym.evaluation.cluster import completed, connect
 from cz_gym.evaluation.protocol import find_row
+from cz_gym.evaluation.report.tables import markdown as table
 from cz_gym.evaluation.runner import Piece, run_piece
-from studies.markdown import table
 
 MACHINES = (1, 2, 10, 100, 1000, 10_000)
 EMPTY = 300
@@ -38,9 +31,13 @@ class Model(NamedTuple):
     """What a run of tasks takes [s]."""
 
     connect: float
+    """Joining the cluster, with the check of its nodes' sources."""
     load: float
+    """The first task in a new process, less a task."""
     t: float
+    """A task on its node."""
     d: float
+    """What the driver needs to hand a task out and to take its result; measured by tasks that only return one."""
 
     def seconds(self, tasks: int, machines: int) -> float:
         """Time of so many tasks."""

@@ -113,7 +113,7 @@ def _write(study: Study, plan: Plan, seeds: Sequence[int]) -> None:
     lines = tabulate(study.variants, runs)
     about = ABOUT.strip().format(crystals=len(plan.crystals), scenario=SCENARIO, transfer=TRANSFER)
     meanings = [f"- **{variant.name}**: {variant.meaning}" for variant in study.variants if variant.name in runs]
-    text = [f"# {study.title}", "", about, "", *to_markdown(lines), "", *meanings, ""]
+    text = [f"# {study.title}", "", about, "", to_markdown(lines), "", *meanings, ""]
     files = {"table.md": "\n".join(text).encode(), "table.csv": to_csv(lines).encode()}
     files |= {"forest.png": forest(lines), "curves.png": curves(lines)}
     write_files({plan.out / name: content for name, content in files.items()})

@@ -1,7 +1,6 @@
 """Judging agents and controllers on validation crystals; each result is cached as one small JSON file.
 
-A file's name ends in a hash of everything that the result depends on: settings, training seed, crystals, scenarios,
-plant, and the code of all. So results of other settings lie beside each other, and none passes for another.
+A file's name ends in a hash of everything that the result depends on: settings, crystals, scenarios, plant, code.
 """
 
 from __future__ import annotations

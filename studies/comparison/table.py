@@ -1,8 +1,4 @@
-"""The table of a comparison: means over training seeds and crystals, and paired differences to a base.
-
-Every variant meets the same crystals and the same training seeds. So a difference is taken crystal by crystal and seed
-by seed; its interval resamples both.
-"""
+"""The table of a comparison: means over training seeds and crystals, and differences to a base, paired in both."""
 
 from __future__ import annotations
 
@@ -12,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cz_gym.evaluation.files import csv_text
+from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.statistics import Estimate, Resamples, means
 
 from .results import ACTIVITY, COST, FIGURES, LOST, RMSE, TRANSFER, Result
@@ -80,15 +77,15 @@ def to_csv(lines: Sequence[Line]) -> str:
     return csv_text(heads, rows)
 
 
-def to_markdown(lines: Sequence[Line]) -> list[str]:
-    """The table's lines: means with their intervals, differences beneath them."""
+def to_markdown(lines: Sequence[Line]) -> str:
+    """The table: means with their intervals, differences beneath them."""
     heads = ("", "seeds", *(head for head, *_ in COLUMNS), "million steps", "minutes")
-    rows = [f"| {' | '.join(heads)} |", f"|---|{'--:|' * (len(heads) - 1)}"]
+    rows: list[tuple[str, ...]] = []
     for line in lines:
         ends = f"{1e-6 * line.trained('steps'):.1f}", f"{line.trained('seconds') / 60.0:.0f}"
         figures = [line.cells[figure].mean.text(form, unit) for _, figure, unit, form in COLUMNS]
-        rows.append(f"| **{line.name}** | {len(line.runs)} | {' | '.join((*figures, *ends))} |")
+        rows.append((f"**{line.name}**", str(len(line.runs)), *figures, *ends))
         differences = [(line.cells[figure].difference, unit, form) for _, figure, unit, form in COLUMNS]
         if apart := [difference.text(f"+{form}", unit) for difference, unit, form in differences if difference]:
-            rows.append(f"| less {line.base} | | {' | '.join(apart)} | | |")
-    return rows
+            rows.append((f"less {line.base}", "", *apart, "", ""))
+    return markdown(heads, rows)

@@ -1,9 +1,7 @@
 """Design table of the linear controllers: ``python -m studies.design_table --out results/design``.
 
-Each controller is linearised from the code that runs (:mod:`cz_gym.baselines.analysis.sampled_loop`) and joined, at
-its control interval, with the plant: nominal Model I, nominal Model II, and the pullers of the first validation
-episodes, of which every column shows the worst. Where a scenario has settings of its own, these follow; a late camera
-is part of the loop.
+Each controller is linearised from the code that runs (:mod:`cz_gym.baselines.analysis.sampled_loop`) and joined with
+the nominal plants and with the pullers of the first validation episodes, of which every column shows the worst.
 """
 
 from __future__ import annotations
@@ -26,10 +24,10 @@ from cz_gym.baselines.registry import CONTROLLERS, find_controller
 from cz_gym.commands import OneLineParser, between
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from cz_gym.evaluation.report.tables import markdown
 from cz_gym.physics.linearisation import StateSpace, radius_model
 from cz_gym.physics.plant import Puller, make_puller
 from cz_gym.units import KILO, MM, MM_PER_MIN
-from studies import markdown
 
 FAST, SLOW = 30.0, 780.0
 """Correlation times of the interface's fluctuations [s]."""
@@ -156,7 +154,7 @@ def as_markdown(rows: Sequence[Row], skipped: Sequence[str]) -> str:
         (controller, plant, *("-" if math.isnan(value) else f"{value:.3g}" for value in figures.values()))
         for controller, plant, figures in rows
     ]
-    parts = ["# Design of the linear controllers", "", markdown.table(meanings, lines, "---"), ""]
+    parts = ["# Design of the linear controllers", "", markdown(meanings, lines, "---"), ""]
     parts += [f"- **{head}**: {meaning}" for head, meaning in meanings.items()]
     return "\n".join([*parts, "", *(f"No linear form: {line}." for line in skipped)]).rstrip() + "\n"
 

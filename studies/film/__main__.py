@@ -1,8 +1,4 @@
-"""The README's animated picture: ``python -m studies.film [--seed N] [--scenario NAME] [--agent FILE] [--out FILE]``.
-
-The paper's controller and an agent, the shipped one by default, pull the same crystal side by side. GIF, because it
-plays everywhere.
-"""
+"""The README's animated picture: the paper's controller and an agent pull the same crystal side by side."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
-"""Agents on other plants: ``python -m studies.generalisation results/generalisation`` tabulates a benchmark's episodes.
-
-The benchmark of the rows an agent was not trained on, made by ``benchmark.py --scenarios randomized,hard,...``: radius
-error, lost crystals and the paired difference to one controller, with 95 % intervals over training seeds and crystals.
+"""Agents on other plants: ``python -m studies.generalisation results/generalisation`` tabulates a benchmark's episodes:
+radius error, lost crystals and the paired difference to one controller, with 95 % intervals.
 """
 
 from __future__ import annotations
@@ -15,8 +13,8 @@ from typing import NamedTuple
 from cz_gym.atomic_files import write_files
 from cz_gym.commands import OneLineParser
 from cz_gym.evaluation.files import EPISODES, read_episodes
+from cz_gym.evaluation.report.tables import markdown as table
 from cz_gym.evaluation.statistics import Estimate, Floats, Resamples, differences, means
-from studies.markdown import table
 
 OBSERVABLE = ("sensor-fault", "puller")
 """Rows with an offset that no sensor shows: the error against what can be seen is counted there."""

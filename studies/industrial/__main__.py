@@ -1,8 +1,5 @@
-"""Does the plant look like the logs? ``python -m studies.industrial`` measures the logged facts on this plant.
-
-It runs the ``industrial`` law on validation episodes and reports size and correlation time of the diameter error, the
-share of time in the dead zone, the depth of the autocorrelation's negative lobe (deep where the error oscillates), and
-the sign of the pull-speed gain that identification from these logs would give.
+"""Does the plant look like the logs? ``python -m studies.industrial`` measures the logged facts on this plant, under
+the ``industrial`` law on validation episodes.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""What an agent does that other controllers do not: ``python -m studies.insight --out results/insight``.
-
-Answers to single events on a nominal puller, the network's exact local gain and the margins of its loop beside the
-LQG's, how large an event each survives, and which property of the real puller costs it crystals.
-"""
+"""What an agent does that other controllers do not: ``python -m studies.insight --out results/insight``."""
 
 from __future__ import annotations
 
@@ -26,12 +22,12 @@ from cz_gym.episodes.scenarios import PULLER, RANDOMIZED
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import Course, rollout
-from cz_gym.physics.linearisation import Floats, StateSpace, radius_model
+from cz_gym.physics.linearisation import radius_model
 from cz_gym.physics.plant import make_puller
 from cz_gym.units import MINUTE
 
-from .linear_agent import AT, linear_agent, remembering_agent
-from .loop import A_CRYSTAL, Contender, apart, margins, noise_gains, one_reading, response
+from .linear_agent import linear_agent, remembering_agent
+from .loop import A_CRYSTAL, Contender, apart, margins, noise_gains, one_reading
 from .step_tests import (
     LIMITS,
     MIX,
@@ -71,9 +67,9 @@ def contenders(path: Path | None) -> tuple[Contender, ...]:
         where = config.control_interval, contract.action, config.parameters.v_0
         if policy.remembers:
             system = remembering_agent(content, course.observation, course.memory, *where)
-            return Contender(label, interface, lambda _: policy, system, _response(system, config.control_interval))
-        near = linear_agent(content, course.observation, *where)
-        return Contender(label, interface, lambda _: policy, near.state_space(), near.response)
+        else:
+            system = linear_agent(content, course.observation, *where)
+        return Contender(label, interface, lambda _: policy, system)
 
     return (
         agent(contract.algorithm, usual_noise(policy, interface)),
@@ -85,12 +81,7 @@ def contenders(path: Path | None) -> tuple[Contender, ...]:
 def controller(name: str) -> Contender:
     """A controller of the registry."""
     make = registry.find_controller(name).make
-    system, _, dt = linear_form(make(crystal(1.0, Interface())))
-    return Contender(name, Interface(), make, system, _response(system, dt))
-
-
-def _response(system: StateSpace, dt: float) -> Callable[[Floats], Any]:
-    return lambda omega: response(system, dt, omega)[:, :, AT]
+    return Contender(name, Interface(), make, linear_form(make(crystal(1.0, Interface()))).controller)
 
 
 def puller_parts(contender: Contender, episodes: int) -> dict[str, dict[str, float]]:

@@ -1,13 +1,12 @@
 """An agent near a point: the exact derivative of its network, and what that makes of the past as a linear system.
 
-An agent on "history" is a static function of channels that are themselves linear in the past: readings now, their
-means over past samples, the integral of the ring's error. So near a point its whole behaviour is one matrix of
-derivatives, and a frequency response follows without simulation.
+An agent on "history" is a static function of channels that are themselves linear in the past: near a point its whole
+behaviour is one matrix of derivatives.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,71 +26,24 @@ from cz_gym.observation import (
 from cz_gym.physics.linearisation import Floats, StateSpace
 from cz_gym.task import drives_of
 
-Complex = npt.NDArray[np.complex128]
 SEEN = ("ring_error", "T_1", "v_p", "Q_H")
 """Readings through which the plant reaches an agent: ring [m], pyrometer [K], applied drives [m/s, W]."""
 _STEP = 1e-6
 AT = [[channel.name for channel in MEASURED].index(name) for name in SEEN]
 """Where they stand among the channels of MEASURED."""
-_REMEMBERED = [SEEN.index(name) for name in LAGGED]
-
-
-class LinearAgent(NamedTuple):
-    """Derivatives of the drives asked for, v_p [m/s] and Q_H [W], at one observation; SI units."""
-
-    now: Floats
-    """By the readings of MEASURED, shape (2, channels)."""
-    integral: Floats
-    """By the integral of the ring's error [m s], shape (2,)."""
-    lagged: Floats
-    """By the means over past samples, shape (2, lags, 4), the last axis as LAGGED."""
-    dt: float
-    """Control interval [s]."""
-
-    def response(self, omega: npt.ArrayLike) -> Complex:
-        """Drives by the readings of SEEN at angular frequencies [rad/s], shape (points, 2, 4).
-
-        The applied drives are counted as readings of their own; feeding them back is the loop's affair.
-        """
-        z = np.exp(1j * self.dt * np.atleast_1d(np.asarray(omega, np.float64)))
-        found = np.zeros((len(z), 2, len(SEEN)), np.complex128) + self.now[:, AT]
-        for lag, (newest, oldest) in enumerate(zip(*lags(self.dt), strict=True)):
-            mean = (z[:, None] ** -np.arange(newest, oldest + 1.0)).mean(axis=1)
-            found[:, :, _REMEMBERED] += mean[:, None, None] * self.lagged[:, lag]
-        found[:, :, 0] += self.integral * (self.dt / (1.0 - 1.0 / z))[:, None]
-        return found
-
-    def state_space(self) -> StateSpace:
-        """The same in discrete time: inputs the channels of MEASURED, outputs the two drives, deviations in SI.
-
-        States: past samples of the remembered channels, newest first, channel by channel; the integral.
-        """
-        newest, oldest = lags(self.dt)
-        depth, remembered = int(oldest[-1]), len(LAGGED)
-        n = depth * remembered + 1
-        A, B = np.zeros((n, n)), np.zeros((n, len(MEASURED)))
-        C, D = np.zeros((2, n)), self.now.copy()
-        for channel in range(remembered):
-            first = channel * depth
-            A[first + 1 : first + depth, first : first + depth - 1] = np.eye(depth - 1)
-            B[first, AT[_REMEMBERED[channel]]] = 1.0
-            for lag, (new, old) in enumerate(zip(newest, oldest, strict=True)):
-                C[:, first + new - 1 : first + old] += self.lagged[:, lag, channel, None] / (old - new + 1)
-        A[-1, -1], B[-1, AT[0]] = 1.0, self.dt
-        C[:, -1] = self.integral
-        D[:, AT[0]] += self.integral * self.dt
-        return StateSpace(A, B, C, D)
 
 
 def linear_agent(
     onnx_bytes: bytes, observations: npt.ArrayLike, dt: float, action: str, v_0: float = PULL_SCALE
-) -> LinearAgent:
+) -> StateSpace:
     """The agent of these (checked) ONNX bytes near "history" observations; v_0 [m/s] scales the pull speed.
 
     ``action`` says what its outputs mean; the drives asked for follow from them and from those applied.
 
     Of several observations, shape (n, channels), it is the mean derivative: for Gaussian ones the best linear
-    approximation there is (Stein's lemma). ValueError if the file reads another observation or remembers something.
+    approximation there is (Stein's lemma). Inputs are the channels of MEASURED, outputs the two drives, deviations in
+    SI; the states are past samples of the remembered channels, newest first, channel by channel, then the integral.
+    ValueError if the file reads another observation or remembers something.
     """
     rows = np.atleast_2d(np.asarray(observations, np.float64))
     if rows.shape[1] != len(HISTORY):
@@ -99,7 +51,19 @@ def linear_agent(
     slopes = _asked(jacobian(onnx_bytes, rows), dt, action, v_0) / scales(HISTORY, v_0)
     slopes = slopes @ np.linalg.inv(undo_differences()).T
     now, integral, means = np.split(slopes, (len(MEASURED), len(MEASURED) + 1), axis=1)
-    return LinearAgent(now, integral[:, 0], means.reshape(2, len(LAGS), len(LAGGED)), dt)
+    lagged, (newest, oldest) = means.reshape(2, len(LAGS), len(LAGGED)), lags(dt)
+    depth = int(oldest[-1])
+    n = depth * len(LAGGED) + 1
+    A, B, C = np.zeros((n, n)), np.zeros((n, len(MEASURED))), np.zeros((2, n))
+    for channel, name in enumerate(LAGGED):
+        first = channel * depth
+        A[first + 1 : first + depth, first : first + depth - 1] = np.eye(depth - 1)
+        B[first, AT[SEEN.index(name)]] = 1.0
+        for lag, (new, old) in enumerate(zip(newest, oldest, strict=True)):
+            C[:, first + new - 1 : first + old] += lagged[:, lag, channel, None] / (old - new + 1)
+    A[-1, -1], B[-1, AT[0]], C[:, -1] = 1.0, dt, integral[:, 0]
+    now[:, AT[0]] += integral[:, 0] * dt
+    return StateSpace(A, B, C, now)
 
 
 def remembering_agent(

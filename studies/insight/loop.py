@@ -12,16 +12,20 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from scipy.signal import dimpulse
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import splu
 
 from cz_gym.baselines.analysis import frequency, sampled_loop
 from cz_gym.physics.linearisation import Floats, StateSpace
 from cz_gym.physics.plant import make_puller
 from cz_gym.units import HOUR, KILO, MM, MM_PER_MIN
 
-from .linear_agent import Complex
+from .linear_agent import AT
 from .step_tests import MIX, Interface
 
+Complex = npt.NDArray[np.complex128]
 RING, PYROMETER = 0, 1
 A_CRYSTAL = 3.0 * HOUR
 """How long a crystal is grown [s]."""
@@ -40,13 +44,12 @@ class Contender(NamedTuple):
     """Builds it for an environment's settings."""
     system: StateSpace
     """Readings of MEASURED to v_p [m/s] and Q_H [W]."""
-    response: Callable[[Floats], Any]
-    """Its frequency response, drives by the readings of SEEN, shape (points, 2, 4)."""
 
     def loop(self, omega: Floats, lam: float, dt: float) -> Responses:
         """With a nominal puller, at some frequencies."""
         plant = sampled_loop.sampled_plant(make_puller(lam=lam), dt)
-        return Responses(omega, self.response(omega), response(plant, dt, omega)[:, 1:, :2], dt)
+        own = response(self.system, dt, omega)[:, :, AT]
+        return Responses(omega, own, response(plant, dt, omega)[:, 1:, :2], dt)
 
 
 class Responses(NamedTuple):
@@ -94,12 +97,10 @@ class Responses(NamedTuple):
 
 
 def response(system: StateSpace, dt: float, omega: Floats) -> Complex:
-    """Frequency response of a discrete state space of moderate order, shape (points, outputs, inputs)."""
-    A, B, C, D = system
-    z = np.exp(1j * omega * dt)
-    inputs: Any = np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, np.broadcast_to(B, (len(z), *B.shape)))
-    found: Complex = C @ inputs + D
-    return found
+    """Frequency response of a discrete state space, which may be large if it is sparse, (points, outputs, inputs)."""
+    A, B, C, D = csc_array(system.A), system.B.astype(np.complex128), system.C, system.D
+    one = csc_array(np.eye(len(B)))
+    return np.stack([C @ splu(z * one - A).solve(B) + D for z in np.exp(1j * omega * dt)])
 
 
 def _solve(matrices: Any, rights: Any) -> Complex:

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from cz_gym.evaluation.report.tables import markdown as table
 from cz_gym.evaluation.rollout import Floats, Signals
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
-from studies.markdown import table
 
 from .loop import BANDS
 from .step_tests import BEGIN, DRAWS, JUMPS, LIMITS, RIPPLE, SPANS, STEP_TESTS

@@ -1,8 +1,4 @@
-"""``python -m studies.paper --out results/paper``: Part II of the paper, redone on our plant.
-
-Writes ``report.md``, its figures and ``numbers.json``, and prints the comparison. Each file is written whole or not at
-all.
-"""
+"""``python -m studies.paper --out results/paper``: Part II of the paper, redone on our plant."""
 
 from __future__ import annotations
 

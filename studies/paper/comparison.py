@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 from cz_gym import make_puller
 from cz_gym.baselines.pid.compensated_pid import Compensator
+from cz_gym.evaluation.report.tables import markdown as table
 from cz_gym.physics.linearisation import RadiusModel
 from cz_gym.units import HOUR, MM
 
@@ -154,11 +155,9 @@ def number(value: float | None) -> str:
 def as_markdown(found: list[Row]) -> str:
     """The comparison as a Markdown table."""
     lines = [
-        f"| {row.quantity} | {row.unit} | {number(row.published)} | {number(row.ours)} | {row.difference} | {row.why} |"
-        for row in found
+        (row.quantity, row.unit, number(row.published), number(row.ours), row.difference, row.why) for row in found
     ]
-    head = ["| quantity | unit | published | ours | difference | why |", "|---|---|---:|---:|---:|---|"]
-    return "\n".join(head + lines)
+    return table(("quantity", "unit", "published", "ours", "difference", "why"), lines, "---")
 
 
 def numbers() -> dict[str, Any]:

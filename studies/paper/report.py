@@ -8,9 +8,9 @@ from itertools import product
 import numpy as np
 
 from cz_gym import HURLE, make_puller
+from cz_gym.evaluation.report.tables import markdown as table
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.units import MM
-from studies.markdown import table
 
 from . import beyond_paper as beyond
 from . import experiments as ex

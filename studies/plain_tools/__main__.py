@@ -12,7 +12,7 @@ from pathlib import Path
 
 from cz_gym.commands import OneLineParser, between
 from cz_gym.evaluation.files import csv_text
-from studies.markdown import table
+from cz_gym.evaluation.report.tables import markdown as table
 
 from .runs import Row, timed
 

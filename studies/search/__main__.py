@@ -1,11 +1,4 @@
-"""Search the ``ppo`` recipe's hyperparameters: ``python -m studies.search --trials 30``.
-
-Ray Tune runs the trials, on this machine's processors or on a cluster's. Optuna's tree-structured Parzen estimator
-proposes, beginning with the recipe as it stands; a trial whose validations are worse than the others' median is given
-up. What counts is the agent's cost on validation crystals. The best few then meet other validation crystals and other
-training seeds beside the recipe. Optuna's journal holds every trial, and the same command goes on from it;
-``history.csv`` is the same for people.
-"""
+"""Search the ``ppo`` recipe's hyperparameters: ``python -m studies.search --trials 30`` (docs/ablation.md)."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 from unittest.mock import patch
 
 from cz_gym.atomic_files import check_writable, write_files
-from cz_gym.commands import OneLineParser, guarded
+from cz_gym.commands import OneLineParser
 
 from .cases import SLOTS, THREADS, Case, Stepper, cases, stepper
 from .costs import costs, environment_share
@@ -183,11 +183,10 @@ def main(argv: list[str] | None = None) -> int:
     parser = OneLineParser(prog="python -m studies.speed", description="Measure speed beside installed peers.")
     parser.add_argument("--quick", action="store_true", help="fewer repeats, up to 4,096 slots: under 40 s")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures here")
-    arguments = parser.parse_args(argv)
-    return guarded(parser.prog, lambda: _measure(arguments), "benchmark")
+    return parser.run(_measure, argv, "benchmark")
 
 
-def _measure(arguments: argparse.Namespace) -> int:
+def _measure(arguments: argparse.Namespace) -> None:
     if arguments.json is not None:
         if arguments.json.is_dir():
             raise IsADirectoryError(f"{arguments.json} is a folder")
@@ -201,7 +200,6 @@ def _measure(arguments: argparse.Namespace) -> int:
     print(table(result))
     if arguments.json is not None:
         write_files({arguments.json: (json.dumps(result, indent=1, allow_nan=False) + "\n").encode()})
-    return 0
 
 
 def _say(what: str) -> None:

@@ -1,4 +1,4 @@
-"""Compute the polynomials of the exact meniscus and write them to ``young_laplace_table.py``.
+"""Compute the polynomials of the exact meniscus and write them to ``cz_gym/physics/young_laplace.json``.
 
 ``python -m studies.young_laplace`` compares them with the table there is, and writes only with ``--write``. The exact
 solution is sampled at Chebyshev points, where interpolation converges as fast as the function is smooth; what is stored
@@ -8,9 +8,9 @@ are the powers' coefficients.
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -21,9 +21,7 @@ from cz_gym.commands import OneLineParser
 from cz_gym.physics import young_laplace as exact
 from cz_gym.physics.linearisation import Floats
 from cz_gym.physics.meniscus import profile, ring_point
-from cz_gym.physics.young_laplace_table import RING, SLOPE, TAIL
-
-TABLE = Path(exact.__file__).with_name("young_laplace_table.py")
+from cz_gym.physics.young_laplace import RING, SLOPE, TABLE, TAIL
 
 
 def build() -> dict[str, Floats]:
@@ -81,27 +79,8 @@ def _tail_correction(x: Floats, y: Floats) -> Floats:
     return r * (moved / (X_b - exact.RING_REFERENCE) - 1.0)
 
 
-def render(tables: dict[str, Floats]) -> str:
-    """The text of the module that holds the tables."""
-    lines = [
-        '"""Polynomials of the exact meniscus, computed by ``python -m studies.young_laplace``; not edited by hand."""',
-        "",
-        "# fmt: off",
-        "import numpy as np",
-        "",
-    ]
-    for name, table in tables.items():
-        lines.append(f"{name} = np.array([")
-        for row in table:
-            numbers = [f"{value!r}" for value in row.tolist()]
-            groups = [", ".join(numbers[first : first + 4]) for first in range(0, len(numbers), 4)]
-            lines += ["    [", *(f"        {group}," for group in groups), "    ],"]
-        lines += ["])", f'"""Coefficients [-], shape {table.shape}."""', ""]
-    return "\n".join(lines).rstrip("\n") + "\n"
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code. Compares, and with ``--write`` replaces the table next to this module."""
+    """Command line; returns the exit code. Compares, and with ``--write`` replaces the table."""
     parser = OneLineParser(
         "python -m studies.young_laplace", "Compute the exact meniscus and compare it with the table."
     )
@@ -114,7 +93,8 @@ def _compare(given: argparse.Namespace) -> None:
         check_writable(TABLE.parent)
     tables = build()
     if given.write:
-        write_files({TABLE: render(tables).encode()})
+        rows = {name: table.tolist() for name, table in tables.items()}
+        write_files({TABLE: (json.dumps(rows, indent=1) + "\n").encode()})
     worst = max(float(np.max(np.abs(new - old))) for new, old in zip(tables.values(), (SLOPE, RING, TAIL), strict=True))
     print(f"largest difference from the coefficients there were: {worst:.2g}")
     print(f"wrote {TABLE.name}" if given.write else f"nothing written; --write replaces {TABLE.name}")

@@ -18,12 +18,12 @@ from cz_gym.camera.view import (
     Camera,
     camera_for,
     check_camera,
-    describe_camera,
     make_view,
     project,
 )
 from cz_gym.config import make_config
 from cz_gym.physics.meniscus import hurle_ring_offset
+from cz_gym.physics.parameters import describe
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 
 PULLER = make_puller()
@@ -148,7 +148,7 @@ def test_projection_of_the_aim_is_the_middle() -> None:
 
 
 def test_every_parameter_of_the_camera_has_unit_meaning_and_source() -> None:
-    described = describe_camera()
+    described = describe(Camera)
     assert tuple(described) == Camera._fields
     assert all(quantity.unit and quantity.meaning and quantity.source for quantity in described.values())
 

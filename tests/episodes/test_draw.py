@@ -10,17 +10,10 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from cz_gym import SCENARIOS, Parameters, Scenario, make_puller
+from cz_gym.episodes.draw import randomised
+from cz_gym.episodes.record import FREEZES, Episode, Factors
 from cz_gym.episodes.scenario import Faults, Interface, Pullers, Recipe, Reference, Sensor
-from cz_gym.episodes.series import (
-    FREEZES,
-    Episode,
-    Factors,
-    Series,
-    draw_episode,
-    draw_factors,
-    new_series,
-    randomised,
-)
+from cz_gym.episodes.series import Series, draw_episode, draw_factors, new_series
 
 MM, MINUTE, SPAN = 1e-3, 60.0, 10800.0
 WORD = st.integers(0, 2**64 - 1)

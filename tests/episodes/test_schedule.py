@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from cz_gym import SCENARIOS, make_puller
+from cz_gym.episodes.record import Episode
 from cz_gym.episodes.schedule import (
     bias_offset,
     disturbance,
@@ -12,7 +13,7 @@ from cz_gym.episodes.schedule import (
     reference,
     ripple,
 )
-from cz_gym.episodes.series import Episode, draw_episode, new_series
+from cz_gym.episodes.series import draw_episode, new_series
 from cz_gym.physics.plant import hidden_load
 
 MINUTE = 60.0

@@ -12,8 +12,7 @@ from cz_gym import Parameters, make_puller
 from cz_gym.physics import young_laplace as exact
 from cz_gym.physics.linearisation import radius_model
 from cz_gym.physics.meniscus import HURLE, profile, ring_point
-from cz_gym.physics.young_laplace import YOUNG_LAPLACE
-from cz_gym.physics.young_laplace_table import RING, SLOPE, TAIL
+from cz_gym.physics.young_laplace import RING, SLOPE, TAIL, YOUNG_LAPLACE
 from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
 from studies.young_laplace.__main__ import build
 

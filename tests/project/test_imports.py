@@ -31,7 +31,7 @@ def test_the_command_prints_the_counts(capsys: pytest.CaptureFixture[str]) -> No
 @pytest.mark.parametrize(
     ("module", "absent"),
     [
-        ("cz_gym", {"cz_gym.physics.young_laplace", "cz_gym.physics.young_laplace_table"}),
+        ("cz_gym", {"cz_gym.physics.young_laplace"}),
         ("cz_gym.play", {"torch", "pygame", "PIL", "onnxruntime"}),
         ("studies.film.__main__", {"torch", "pygame", "PIL"}),
     ],

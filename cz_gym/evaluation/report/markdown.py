@@ -10,19 +10,8 @@ import numpy as np
 from cz_gym.evaluation.results import BOUND, REFERENCE, Benchmark, Outcome, ScenarioResult, common
 from cz_gym.units import HOUR, PERCENT
 
-from .tables import (
-    DRIVES,
-    ERROR,
-    FAILURES,
-    HEATER_STEP,
-    NOTHING,
-    PULL_STEP,
-    RMSE,
-    Column,
-    comparison,
-    crystals,
-    rows,
-)
+from .tables import DRIVES, ERROR, FAILURES, HEATER_STEP, NOTHING, PULL_STEP, RMSE, Column, comparison, crystals, rows
+from .tables import markdown as table
 from .verdict import headline
 
 QUOTED = ("paper", "paper-tuned", "lqg-at-0.02", "gradient", "ppo")
@@ -44,7 +33,7 @@ def summary(benchmark: Benchmark) -> str:
         (name, *here, *others)
         for (name, *others), here in zip(rows(first, extras), zip(*errors, strict=True), strict=True)
     ]
-    return f"{caption}\n\n{_table(('controller', *headings), lines)}"
+    return f"{caption}\n\n{table(('controller', *headings), lines)}"
 
 
 def brief(benchmark: Benchmark) -> str:
@@ -61,7 +50,7 @@ def brief(benchmark: Benchmark) -> str:
         plain = [" / ".join(text.partition(" [")[0] for text in texts) for texts in (steps[:1], failures)]
         lines.append((name, *errors, *plain))
     headings = [*(scenario.row.name for scenario in scenarios), PULL_STEP.heading, FAILURES.heading]
-    return _table(("controller", *headings), lines)
+    return table(("controller", *headings), lines)
 
 
 def fill_in(page: str, benchmark: Benchmark) -> str:
@@ -87,7 +76,7 @@ def markdown(benchmark: Benchmark, figures: Iterable[str]) -> str:
         summary(benchmark),
         *(f"![{name.removesuffix('.png')}]({name})" for name in figures),
         "## Who took part",
-        _table(
+        table(
             ("controller", "reads", "what it is", "training seeds"),
             [
                 (each.name, each.observation, each.meaning, ", ".join(map(str, each.training_seeds)) or NOTHING)
@@ -118,7 +107,7 @@ def _scenario(scenario: ScenarioResult) -> list[str]:
 
 
 def _metrics(scenario: ScenarioResult, columns: Sequence[Column]) -> str:
-    return _table(("controller", *(column.heading for column in columns)), rows(scenario, columns))
+    return table(("controller", *(column.heading for column in columns)), rows(scenario, columns))
 
 
 def measured_from(scenario: ScenarioResult) -> str:
@@ -150,9 +139,4 @@ def _training_seeds(pooled: Sequence[Outcome]) -> str:
         losers = ", ".join(losses) or "none"
         lines.append((outcome.controller.name, str(len(seeds)), *figures, worst, losers, str(len(sample.seeds))))
     figures_of = ("best [mm]", "median [mm]", "worst [mm]")
-    return _table(("agent", "training seeds", *figures_of, "worst seed", "crystals lost", "of"), lines)
-
-
-def _table(headings: Sequence[str], lines: Sequence[Sequence[str]], rule: str = "--:") -> str:
-    ruled = ["---", *(rule for _ in headings[1:])]
-    return "\n".join(f"| {' | '.join(line)} |" for line in (headings, ruled, *lines))
+    return table(("agent", "training seeds", *figures_of, "worst seed", "crystals lost", "of"), lines)

@@ -1,7 +1,7 @@
 """The page's crystals: every signal of the first episodes in panels over one time axis, rounded and packed small.
 
 A packed text is base64 of zlib's deflate of 32-bit differences along time, in steps of the panel's resolution: first
-the low bytes of all numbers, then the next ones. Smooth signals take about half a byte a value.
+the low bytes of all numbers, then the next ones.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 from cz_gym.evaluation.results import REFERENCE, SPEED, Outcome, ScenarioResult
@@ -88,6 +88,13 @@ def rows(scenario: ScenarioResult, columns: Sequence[Column]) -> list[tuple[str,
         (label(outcome, scenario), *(column.text(column.estimate(outcome)) for column in columns))
         for outcome in scenario.outcomes
     ]
+
+
+def markdown(heads: Iterable[str], rows: Iterable[Iterable[str]], rule: str = "--:") -> str:
+    """A table in Markdown; ``rule`` is the line under the heads of all columns but the first."""
+    first, *others = heads
+    lines = [f"| {' | '.join(row)} |" for row in ((first, *others), *rows)]
+    return "\n".join([lines[0], "|---|" + f"{rule}|" * len(others), *lines[1:]])
 
 
 def count(number: int, what: str) -> str:

@@ -111,8 +111,8 @@ def test_interrupting_before_learning_gives_one_line(
     ("arguments", "message"),
     [
         (["--algo", "dqn"], "unknown recipe 'dqn'; choose from gradient"),
-        (["--steps", "0"], "at least 1, not '0'"),
-        (["--seed", "minus"], "at least 0, not 'minus'"),
+        (["--steps", "0"], "between 1 and 1000000000000, not 0"),
+        (["--seed", "minus"], "between 0 and 9223372036854775807, not minus"),
         (["--checkpoint-seconds", "-1"], "at least 0, not '-1'"),
         (["--checkpoint-seconds", "nan"], "at least 0, not 'nan'"),
         (["--sceanrio", "hard"], "unrecognized arguments"),

@@ -209,14 +209,6 @@ def test_slow_narrow_and_stepping_drives_are_respected_and_followed():
     assert run.signals.r_c == pytest.approx(policy.plan.best.x[1:, :, 0], abs=0.05 * MM)
 
 
-def test_many_episodes_are_planned_in_parts(monkeypatch):
-    _, whole = planned(horizon=300.0)
-    monkeypatch.setattr("cz_gym.baselines.bounds.clairvoyant.BATCH", 2)
-    _, parts = planned(horizon=300.0)
-    assert parts.plan.best.u == pytest.approx(whole.plan.best.u, rel=1e-9)
-    assert parts.plan.cost == pytest.approx(whole.plan.cost, rel=1e-9)
-
-
 def test_it_refuses_to_act_without_a_plan_or_on_other_slots():
     with pytest.raises(RuntimeError, match="for_episodes"):
         Clairvoyant().predict(np.zeros((1, 17)))
