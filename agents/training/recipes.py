@@ -261,16 +261,18 @@ class RandomSearch(Reinforcement):
     learning_rate: float = 0.01
 
 
-LQG_COST = CostWeights(pull=0.11, pull_step=0.049, heater_step=23.4)
+LQG_COST = CostWeights(pull=0.0178, pull_step=0.1, heater_step=51.6)
 """The cost that the regulator of lqg-at-0.02 was made for, as multiples of the environment's."""
-GRADIENT_COST = replace(LQG_COST, pull_step=0.07, observable=True)
-"""The cost that the recipe gradient follows: calmer, and without what no sensor shows."""
+GRADIENT_COST = CostWeights(pull=0.11, pull_step=0.07, heater_step=23.4, observable=True)
+"""The cost that the recipe gradient follows: near an LQG's for the radius, without what no sensor shows."""
+RADIUS_COST = replace(GRADIENT_COST, pull=0.018, pull_step=0.14)
+"""The cost that its specialists follow: the pull speed may go where it wants, as the frontier's LQGs have it."""
 _OTHERS = ("sensor-fault", 1.0, 0.3), ("", 2.0, 0.03)
-_ON = Gradient(start="gradient", steps=Gradient.steps // 4, whitened=True, learning_rate=2e-3, weights=GRADIENT_COST)
+_ON = Gradient(start="gradient", steps=Gradient.steps // 4, whitened=True, learning_rate=2e-3, weights=RADIUS_COST)
 SPECIALISTS = (
     replace(_ON, name="gradient-randomized", also=_OTHERS),
-    replace(_ON, name="gradient-randomized-calm", also=_OTHERS, weights=replace(GRADIENT_COST, pull_step=0.2)),
-    replace(_ON, name="gradient-randomized-agile", also=_OTHERS, weights=replace(GRADIENT_COST, pull_step=0.04)),
+    replace(_ON, name="gradient-randomized-calm", also=_OTHERS, weights=replace(RADIUS_COST, pull_step=0.28)),
+    replace(_ON, name="gradient-randomized-agile", also=_OTHERS, weights=replace(RADIUS_COST, pull_step=0.08)),
     replace(
         _ON,
         name="gradient-hard",
@@ -278,10 +280,18 @@ SPECIALISTS = (
         also=(("sensor-fault", 1.0, 0.2), ("", 1.3, 0.1), ("puller", 1.0, 0.1)),
     ),
     replace(_ON, name="gradient-sensor-fault", scenario="sensor-fault", also=_OTHERS[1:]),
-    replace(_ON, name="gradient-puller", scenario="puller", also=(), whitened=False, learning_rate=4e-3),
+    replace(
+        _ON,
+        name="gradient-puller",
+        scenario="puller",
+        also=(),
+        whitened=False,
+        learning_rate=4e-3,
+        weights=GRADIENT_COST,
+    ),
 )
 """The recipe gradient for one scenario each; for ``randomized`` at three activities."""
-ALL = replace(_ON, name="gradient-all", steps=Gradient.steps // 2, learning_rate=3e-3)
+ALL = replace(_ON, name="gradient-all", also=Gradient.also, learning_rate=3e-3)
 """The recipe gradient further, on its own crystals of all four scenarios."""
 RECIPES: dict[str, Recipe] = {
     recipe.name: recipe
