@@ -9,7 +9,6 @@ from functools import partial
 from cz_gym.baselines.bounds import lqg as lqg_bounds
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
 from cz_gym.baselines.lqg import settings as lqg_settings
-from cz_gym.baselines.lqg.controller import LQG
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
 from cz_gym.baselines.pid.open_loop import OpenLoop
 from cz_gym.baselines.pid.settings import tuned
@@ -59,14 +58,13 @@ IN_TABLE = 0.02
 about as active as the agents stands in it. So it is on ``randomized``; on ``hard`` they move more."""
 
 
+def _lqg(name: str, meaning: str, default: bool = True) -> Entry:
+    return Entry(name, partial(lqg_settings.lqg, name), "measured", meaning, default)
+
+
 def _lqg_at(activity: float) -> Entry:
-    return Entry(
-        lqg_settings.family_name(activity),
-        partial(lqg_settings.lqg_at, activity),
-        "measured",
-        f"the same LQG, its weight on pull steps made for {activity:g} mm/min of them",
-        default=activity == IN_TABLE,
-    )
+    meaning = f"the same LQG, tuned for the radius error with pull steps of {activity:g} mm/min at most"
+    return _lqg(lqg_settings.family_name(activity), meaning, default=activity == IN_TABLE)
 
 
 def _ekf_mpc(config: Config) -> Policy:
@@ -78,7 +76,8 @@ def _ekf_mpc(config: Config) -> Policy:
 _bound = partial(Entry, default=False, privileged=True)
 
 
-def _privileged(name: str, make: Callable[[Config], LQG]) -> Entry:
+def _privileged(name: str) -> Entry:
+    make = partial(lqg_settings.lqg, name)
     meaning = f"bound: {name} given the puller's parameters and how strong each crystal's fluctuations are"
     return _bound(f"{name}-privileged", lambda config: lqg_bounds.privileged(make(config)), "measured", meaning)
 
@@ -91,13 +90,12 @@ CONTROLLERS: tuple[Entry, ...] = (
     _tuned("paper-tuned", "compensator and PID re-tuned, with a slow trim of the heater"),
     _tuned("pid-conventional", "tuned PID without compensator, crossover below half the right-half-plane zero"),
     _tuned("industrial", "incremental pull-speed law of a logged puller, with automatic growth control"),
-    Entry("lqg", lqg_settings.lqg, "measured", "Kalman filter and LQ regulator of pull and heater, for the reward"),
-    Entry("lqg-quiet", lqg_settings.lqg_quiet, "measured", "the same for low pull activity"),
+    _lqg("lqg", "Kalman filter and LQ regulator of pull and heater, for the reward"),
+    _lqg("lqg-quiet", "the same for low pull activity"),
     *(_lqg_at(activity) for activity in lqg_settings.ACTIVITIES),
     Entry("ekf-mpc", _ekf_mpc, "measured", "nonlinear MPC on a bank of lqg's filters", default=False, slow=True),
     _bound("lqg-true", lqg_bounds.lqg_true, "measured", "bound: lqg given the puller's parameters"),
-    _privileged("lqg-quiet", lqg_settings.lqg_quiet),
-    *(_privileged(lqg_settings.family_name(each), partial(lqg_settings.lqg_at, each)) for each in (0.013, IN_TABLE)),
+    *map(_privileged, ("lqg-quiet", *map(lqg_settings.family_name, (0.013, IN_TABLE)))),
     _bound("full-information", lqg_bounds.full_information, "state", "bound: lqg's regulator, true state seen"),
     _bound(
         "clairvoyant",

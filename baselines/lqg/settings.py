@@ -6,8 +6,6 @@ own use those of ``randomized``.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from cz_gym.config import Config
 from cz_gym.units import MM
 
@@ -16,166 +14,61 @@ from .model import NoiseModel
 from .regulator import Weights
 from .ring_model import RingModel
 
-REWARD = LQGSettings(
-    noise=NoiseModel(
-        fast_sd=0.3106,
-        slow_sd=0.369,
-        drift_rate_sd=0.0007519,
-        drift_rate_tau=2113.0,
-        heater_walk=0.3833,
-        thermal_walk=0.002862,
-        recipe_share=0.2398,
-        pyrometer_sd=0.08655,
-    ),
-    weights=Weights(pull=0.1556, pull_step=0.06564, heater_step=0.5706),
-)
-"""``lqg``: as much reward as a mean radius error of 0.062 mm allows."""
-QUIET = LQGSettings(
-    noise=NoiseModel(
-        fast_sd=0.2614,
-        slow_sd=0.311,
-        drift_rate_sd=0.0005758,
-        drift_rate_tau=2265.0,
-        heater_walk=0.3219,
-        thermal_walk=0.002207,
-        recipe_share=0.2513,
-        pyrometer_sd=0.06289,
-    ),
-    weights=Weights(pull=0.05482, pull_step=0.3051, heater_step=1.168),
-)
-"""``lqg-quiet``: the radius as well as pull steps of 0.0095 mm/min allow."""
 PULLER_RING = RingModel(latency=5.0, ripple_sd=0.08 * MM)
 """The camera of ``puller``: its latency and rotation, and what amplitudes between 0 and 0.2 mm come to on average."""
-PULLER_REWARD = LQGSettings(
-    noise=NoiseModel(
-        fast_sd=0.5188,
-        slow_sd=0.2875,
-        drift_rate_sd=0.001395,
-        drift_rate_tau=3324.0,
-        heater_walk=2.462,
-        thermal_walk=0.002528,
-        recipe_share=0.3956,
-        pyrometer_sd=0.08621,
-    ),
-    weights=Weights(pull=0.1095, pull_step=0.06209, heater_step=1.577),
-    ring=PULLER_RING,
-)
-"""``lqg`` on ``puller``: the observable radius as well as pull steps of 0.016 mm/min allow."""
-PULLER_QUIET = LQGSettings(
-    noise=NoiseModel(
-        fast_sd=0.205,
-        slow_sd=0.1956,
-        drift_rate_sd=0.001543,
-        drift_rate_tau=4256.0,
-        heater_walk=0.7207,
-        thermal_walk=0.001945,
-        recipe_share=0.4671,
-        pyrometer_sd=0.06032,
-    ),
-    weights=Weights(pull=0.0539, pull_step=0.3026, heater_step=18.05),
-    ring=PULLER_RING,
-)
-"""``lqg-quiet`` on ``puller``: the same with pull steps of 0.01 mm/min."""
-FAULTY_REWARD = replace(REWARD, weights=replace(REWARD.weights, heater_step=1.712))
-"""``lqg`` on ``sensor-fault``: the reward there."""
-FAULTY_QUIET = LQGSettings(
-    noise=NoiseModel(
-        fast_sd=0.2612,
-        slow_sd=0.3085,
-        drift_rate_sd=0.0006116,
-        drift_rate_tau=2265.0,
-        heater_walk=0.322,
-        thermal_walk=0.002208,
-        recipe_share=0.2515,
-        pyrometer_sd=0.06288,
-    ),
-    weights=Weights(pull=0.08919, pull_step=0.3056, heater_step=1.162),
-)
-"""``lqg-quiet`` on ``sensor-fault``."""
-ACTIVE_HARD = LQGSettings(
-    noise=NoiseModel(
-        fast_sd=0.42,
-        slow_sd=0.534,
-        drift_rate_sd=0.0007372,
-        drift_rate_tau=2585.0,
-        heater_walk=0.5908,
-        thermal_walk=0.003217,
-        recipe_share=0.2228,
-        pyrometer_sd=0.09231,
-    ),
-    weights=Weights(pull=0.03605, pull_step=0.03241, heater_step=8.442),
-)
-"""``lqg-active`` on ``hard``: the radius as well as pull steps of 0.03 mm/min allow. No controller of its own: a
-member of the family below."""
-ACTIVE_FAULTY = LQGSettings(
-    noise=NoiseModel(
-        fast_sd=0.2746,
-        slow_sd=0.3879,
-        drift_rate_sd=0.0006,
-        drift_rate_tau=1919.0,
-        heater_walk=0.5296,
-        thermal_walk=0.002281,
-        recipe_share=0.2213,
-        pyrometer_sd=0.08107,
-    ),
-    weights=Weights(pull=0.04006, pull_step=0.03163, heater_step=2.848),
-)
-"""``lqg-active`` on ``sensor-fault``: the observable radius as well as pull steps of 0.02 mm/min allow."""
-SHIPPED: dict[tuple[str, str], LQGSettings] = {
-    ("lqg", "randomized"): REWARD,
-    ("lqg-quiet", "randomized"): QUIET,
-    ("lqg", "puller"): PULLER_REWARD,
-    ("lqg-quiet", "puller"): PULLER_QUIET,
-    ("lqg", "sensor-fault"): FAULTY_REWARD,
-    ("lqg-quiet", "sensor-fault"): FAULTY_QUIET,
-    ("lqg-active", "hard"): ACTIVE_HARD,
-    ("lqg-active", "sensor-fault"): ACTIVE_FAULTY,
+WEIGHTS = "pull", "pull_step", "heater_step"
+NOISE = "fast_sd", "slow_sd", "drift_rate_sd", "drift_rate_tau"
+NOISE += "heater_walk", "thermal_walk", "pyrometer_sd", "recipe_share"
+SEARCHED = (*(f"weights.{name}" for name in WEIGHTS), *(f"noise.{name}" for name in NOISE))
+"""What a search chooses of the settings, fields joined by dots."""
+SHIPPED: dict[str, dict[str, tuple[float, ...]]] = {}
+"""By controller and scenario: the values of SEARCHED."""
+SHIPPED["lqg"] = {
+    "randomized": (0.1556, 0.06564, 0.5706, 0.3106, 0.369, 0.0007519, 2113.0, 0.3833, 0.002862, 0.08655, 0.2398),
+    "sensor-fault": (0.1556, 0.06564, 1.712, 0.3106, 0.369, 0.0007519, 2113.0, 0.3833, 0.002862, 0.08655, 0.2398),
+    "puller": (0.1095, 0.06209, 1.577, 0.5188, 0.2875, 0.001395, 3324.0, 2.462, 0.002528, 0.08621, 0.3956),
 }
-"""By controller and scenario."""
-
-
-MEMBERS: dict[str, dict[float, tuple[str, float]]] = {
-    "randomized": {
-        0.003: ("lqg-quiet", 23.83),
-        0.005: ("lqg-quiet", 3.011),
-        0.008: ("lqg-quiet", 0.4969),
-        0.013: ("lqg-quiet", 0.07386),
-        0.02: ("lqg-quiet", 0.01232),
-        0.03: ("lqg-quiet", 0.004767),
-    },
-    "hard": {
-        0.003: ("lqg", 16.8),
-        0.005: ("lqg-active", 21.99),
-        0.008: ("lqg-active", 3.874),
-        0.013: ("lqg-active", 0.672),
-        0.02: ("lqg-active", 0.1405),
-        0.03: ("lqg-active", 0.03068),
-    },
-    "sensor-fault": {
-        0.003: ("lqg", 29.58),
-        0.005: ("lqg-quiet", 3.599),
-        0.008: ("lqg-quiet", 0.591),
-        0.013: ("lqg-active", 0.1511),
-        0.02: ("lqg-active", 0.0291),
-        0.03: ("lqg-active", 0.005465),
-    },
-    "puller": {
-        0.003: ("lqg-quiet", 40.07),
-        0.005: ("lqg-quiet", 4.025),
-        0.008: ("lqg-quiet", 0.556),
-        0.013: ("lqg", 0.1428),
-        0.02: ("lqg", 0.00467),
-        0.03: ("lqg", 0.0009702),
-    },
+SHIPPED["lqg-quiet"] = {
+    "randomized": (0.05482, 0.3051, 1.168, 0.2614, 0.311, 0.0005758, 2265.0, 0.3219, 0.002207, 0.06289, 0.2513),
+    "sensor-fault": (0.08919, 0.3056, 1.162, 0.2612, 0.3085, 0.0006116, 2265.0, 0.322, 0.002208, 0.06288, 0.2515),
+    "puller": (0.0539, 0.3026, 18.05, 0.205, 0.1956, 0.001543, 4256.0, 0.7207, 0.001945, 0.06032, 0.4671),
 }
-"""By scenario and pull step RMS [mm/min]: a shipped LQG, and the weight on pull steps that makes it a member of the
-family; chosen by ``python -m cz_gym.baselines.tuning.lqg_frontier``."""
-ACTIVITIES = tuple(MEMBERS["randomized"])
-"""Pull step RMS [mm/min] that the members are made for."""
+SHIPPED["lqg-at-0.005"] = {
+    "randomized": (0.06819, 2.177, 21.29, 0.268, 0.2347, 0.0004393, 1878.0, 0.2029, 0.001509, 0.04786, 0.186),
+    "hard": (0.1203, 7.731, 65.77, 0.3968, 0.2511, 0.000434, 2081.0, 0.3209, 0.00168, 0.09346, 0.169),
+    "sensor-fault": (0.08746, 2.219, 21.25, 0.2665, 0.2343, 0.000425, 2836.0, 0.2, 0.001301, 0.04757, 0.09942),
+    "puller": (0.05424, 3.151, 32.13, 0.2817, 0.1474, 0.001524, 5017.0, 0.7618, 0.001187, 0.05227, 0.4436),
+}
+SHIPPED["lqg-at-0.008"] = {
+    "randomized": (0.01523, 0.456, 28.15, 0.2674, 0.2534, 0.0004875, 2724.0, 0.1891, 0.0009058, 0.04916, 0.1245),
+    "hard": (0.06182, 1.474, 17.77, 0.3521, 0.283, 0.0003514, 1758.0, 0.3411, 0.001205, 0.08939, 0.1761),
+    "sensor-fault": (0.02854, 0.4296, 25.02, 0.25, 0.2397, 0.0004108, 2377.0, 0.1691, 0.001065, 0.04579, 0.1651),
+    "puller": (0.04922, 0.6152, 17.81, 0.2598, 0.186, 0.001556, 5586.0, 0.8904, 0.002071, 0.04711, 0.3978),
+}
+SHIPPED["lqg-at-0.013"] = {
+    "randomized": (0.01691, 0.08806, 19.53, 0.2547, 0.2575, 0.0006169, 2070.0, 0.2052, 0.001683, 0.06757, 0.1713),
+    "hard": (0.02796, 0.3237, 23.68, 0.3443, 0.3294, 0.000469, 1856.0, 0.3631, 0.001409, 0.06889, 0.1616),
+    "sensor-fault": (0.01784, 0.09144, 24.14, 0.2502, 0.2634, 0.0005843, 4219.0, 0.2024, 0.001317, 0.04976, 0.1323),
+    "puller": (0.1034, 0.1998, 3.906, 0.4948, 0.3275, 0.001769, 3223.0, 2.171, 0.002446, 0.08341, 0.3781),
+}
+SHIPPED["lqg-at-0.02"] = {
+    "randomized": (0.008875, 0.025, 2.578, 0.2618, 0.2928, 0.000594, 2651.0, 0.2195, 0.001497, 0.04472, 0.1782),
+    "hard": (0.01486, 0.08585, 7.014, 0.3567, 0.3582, 0.000581, 1727.0, 0.3833, 0.001785, 0.09446, 0.1537),
+    "sensor-fault": (0.009926, 0.02396, 3.646, 0.2531, 0.2771, 0.0005666, 1880.0, 0.1815, 0.001457, 0.0593, 0.1146),
+    "puller": (0.1123, 0.02543, 4.599, 0.5263, 0.2761, 0.001387, 3231.0, 2.467, 0.002457, 0.08634, 0.396),
+}
+SHIPPED["lqg-at-0.03"] = {
+    "randomized": (0.004128, 0.006732, 2.685, 0.251, 0.2861, 0.0005686, 2077.0, 0.1983, 0.001488, 0.05271, 0.205),
+    "hard": (0.008398, 0.0236, 2.526, 0.3493, 0.3773, 0.0005131, 1658.0, 0.3898, 0.0015, 0.06514, 0.1722),
+    "sensor-fault": (0.004386, 0.007273, 2.767, 0.2642, 0.2799, 0.0005114, 1688.0, 0.2092, 0.001668, 0.03648, 0.2068),
+    "puller": (0.1095, 0.004902, 2.593, 0.5171, 0.2868, 0.001392, 3235.0, 2.462, 0.002528, 0.08625, 0.3957),
+}
+ACTIVITIES = 0.005, 0.008, 0.013, 0.02, 0.03
+"""Largest pull step RMS [mm/min] that the members of the family are tuned for."""
 
 
 def family_name(activity: float) -> str:
-    """Name of the LQG made for that pull step RMS [mm/min]."""
+    """Name of the LQG tuned for the radius with that pull step RMS [mm/min] at most."""
     return f"lqg-at-{activity:g}"
 
 
@@ -184,37 +77,18 @@ FAMILY = ("lqg-quiet", *map(family_name, ACTIVITIES))
 
 
 def settings_of(controller: str, scenario: str) -> LQGSettings:
-    """The frozen settings of "lqg", "lqg-quiet" or "lqg-active" for that scenario."""
-    where = scenario if (controller, scenario) in SHIPPED else "randomized"
-    return SHIPPED[controller, where]
+    """The frozen settings of an LQG for that scenario."""
+    shipped = SHIPPED[controller]
+    where = scenario if scenario in shipped else "randomized"
+    weights, noise = shipped[where][: len(WEIGHTS)], shipped[where][len(WEIGHTS) :]
+    return LQGSettings(
+        NoiseModel(**dict(zip(NOISE, noise, strict=True))),
+        Weights(**dict(zip(WEIGHTS, weights, strict=True))),
+        ring=PULLER_RING if where == "puller" else None,
+    )
 
 
-def member_settings(activity: float, scenario: str) -> LQGSettings:
-    """The frozen settings of the member for that pull step RMS [mm/min], one of ACTIVITIES, on that scenario."""
-    where = scenario if scenario in MEMBERS else "randomized"
-    base, pull_step = MEMBERS[where][activity]
-    return with_pull_step(settings_of(base, where), pull_step)
-
-
-def with_pull_step(settings: LQGSettings, weight: float) -> LQGSettings:
-    """The same settings with another weight on pull steps."""
-    return replace(settings, weights=replace(settings.weights, pull_step=weight))
-
-
-def _lqg(settings: LQGSettings, config: Config) -> LQG:
+def lqg(name: str, config: Config) -> LQG:
+    """The LQG of that name for an environment's settings."""
+    settings = settings_of(name, config.scenario.name)
     return LQG(settings, config.control_interval, config.parameters, config.meniscus)
-
-
-def lqg(config: Config) -> LQG:
-    """The LQG tuned to the reward."""
-    return _lqg(settings_of("lqg", config.scenario.name), config)
-
-
-def lqg_quiet(config: Config) -> LQG:
-    """The LQG tuned to low pull activity."""
-    return _lqg(settings_of("lqg-quiet", config.scenario.name), config)
-
-
-def lqg_at(activity: float, config: Config) -> LQG:
-    """The LQG made for that pull step RMS [mm/min]."""
-    return _lqg(member_settings(activity, config.scenario.name), config)

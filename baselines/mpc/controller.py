@@ -14,11 +14,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from cz_gym.baselines.bounds.trajectory import SCALES, Limits, limits_of
-from cz_gym.baselines.lqg import settings as lqg_settings
 from cz_gym.baselines.lqg.controller import LQG, Memory, memory_at_rest, optimal_inputs
 from cz_gym.baselines.lqg.filter_bank import FilterBank, Hypotheses, filter_bank
 from cz_gym.baselines.lqg.model import PLANT
 from cz_gym.baselines.lqg.regulator import Regulator, Weights, quadratic_cost
+from cz_gym.baselines.lqg.settings import lqg as shipped_lqg
 from cz_gym.baselines.policy import Floats, MeasuredController
 from cz_gym.config import Config
 from cz_gym.episodes.scenario import Actuators
@@ -142,7 +142,7 @@ def newton(
 
 def ekf_mpc(config: Config) -> EkfMpc:
     """``ekf-mpc`` as it ships: ``lqg`` with smaller weights on moves, the limits of the scenario's drives."""
-    lqg, f = lqg_settings.lqg(config), WEIGHT_FACTOR
+    lqg, f = shipped_lqg("lqg", config), WEIGHT_FACTOR
     w = lqg.settings.weights
     weights = replace(w, pull=f * w.pull, pull_step=f * w.pull_step, heater_step=f * w.heater_step)
     return EkfMpc(replace(lqg, settings=replace(lqg.settings, weights=weights)), actuators=config.scenario.actuators)

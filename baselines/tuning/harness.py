@@ -65,10 +65,10 @@ Score = tuple[float, dict[str, Any]]
 
 
 def measure(policy: Any, config: Config, seeds: Sequence[int]) -> Figures:
-    """Run a controller on those episodes."""
+    """Run a controller on those episodes; figures to six digits, as the history keeps them."""
     found = metrics(rollout(policy, config, seeds))
     names = "rmse_observable_mm", "pull_step_rms_mm_per_min", "heater_step_rms_kw", "return_", "failure_rate"
-    return Figures._make([*(float(getattr(found, name).mean()) for name in names), config.steps])
+    return Figures._make([*(float(f"{getattr(found, name).mean():.6g}") for name in names), config.steps])
 
 
 def value_at(settings: Any, path: str) -> float:
@@ -170,10 +170,9 @@ class Search(ABC):
         try:
             found = json.loads(path.read_text())
             begun = {name: found["budget"][name] for name in ("episodes", "survive")}
-            entries = [(entry.pop("values"), entry.pop("score"), entry) for entry in found["history"]]
-            if any(list(values) != self._paths for values, _, _ in entries):
+            if found["parameters"] != self._paths:
                 raise ValueError(f"its parameters are not those of {self.controller}")
-            return begun, [Trial(tuple(values.values()), score, facts) for values, score, facts in entries]
+            return begun, [Trial(tuple(values), score, facts) for values, score, facts in found["history"]]
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} is no history of this search: {error!r}") from None
 
@@ -193,6 +192,6 @@ class Search(ABC):
             "scenario_hash": self.config.scenario.hash,
             "budget": self.budget,
         }
-        lines = ",\n  ".join(json.dumps(self._entry(trial)) for trial in self.trials)
-        head = json.dumps({**about, **choice}, indent=1).removesuffix("\n}")
+        lines = ",\n  ".join(map(json.dumps, self.trials))
+        head = json.dumps({**about, **choice, "parameters": self._paths}, indent=1).removesuffix("\n}")
         write_files({self.path: f'{head},\n "history": [\n  {lines}\n ]\n}}\n'.encode()})

@@ -99,10 +99,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--controller", choices=sorted({name for name, _ in GOALS}), default="lqg")
     parser.add_argument("--scenario", choices=sorted({scenario for _, scenario in GOALS}), default="randomized")
     add = parser.add_argument
-    add("--budget", type=between(1, 100_000), default=60, help="candidates to try")
+    add("--budget", type=between(1, 100_000), default=100, help="candidates to try")
     add("--episodes", type=between(1, 10_000), default=100, help="training episodes a candidate")
     add("--survive", type=between(0, 10_000), default=20, help="more that must be survived, failures only")
-    add("--validation", type=between(1, len(VALIDATION_SEEDS)), default=250, help="validation episodes a finalist")
+    add("--validation", type=between(1, len(VALIDATION_SEEDS)), default=200, help="validation episodes a finalist")
     add("--finals", type=between(1, 10_000), default=200, help="training episodes a finalist must survive")
     add("--finalists", type=between(1, 1000), default=3, help="candidates that meet the validation seeds")
     parser.add_argument("--history", type=Path, help="choose again from this kept history, without a search")

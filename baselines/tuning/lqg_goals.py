@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from cz_gym.baselines.lqg.controller import LQGSettings
 from cz_gym.baselines.lqg.regulator import Weights
-from cz_gym.baselines.lqg.settings import PULLER_RING, QUIET, REWARD
+from cz_gym.baselines.lqg.settings import ACTIVITIES, PULLER_RING, SEARCHED, family_name, settings_of
 
 from .harness import Figures, Parameter
 
@@ -14,14 +14,11 @@ FAILURE_PENALTY = 100.0
 """What losing every crystal costs, in units of a score of order ten."""
 _MISS_PENALTY = 20.0
 _EMPHASIS = 10.0
-PARAMETERS = tuple(
-    Parameter(path, 1e-4, 1e4)
-    for path in (
-        *(f"weights.{name}" for name in ("pull", "pull_step", "heater_step")),
-        *(f"noise.{name}" for name in ("fast_sd", "slow_sd", "drift_rate_sd", "drift_rate_tau")),
-        *(f"noise.{name}" for name in ("heater_walk", "thermal_walk", "pyrometer_sd", "recipe_share")),
-    )
-)
+_QUIET_STEP = 0.0095
+_ANY_ERROR = 0.3
+SCENARIOS = "randomized", "hard", "sensor-fault", "puller"
+"""Where the family has members of its own."""
+PARAMETERS = tuple(Parameter(path, 1e-4, 1e4) for path in SEARCHED)
 """Searched on logarithmic scales."""
 
 
@@ -57,6 +54,7 @@ class Goal:
 
 
 _AGGRESSIVE_START = LQGSettings(weights=Weights(pull=0.12, pull_step=0.06, heater_step=0.08))
+_REWARD, _QUIET = settings_of("lqg", "randomized"), settings_of("lqg-quiet", "randomized")
 _QUIET_START = LQGSettings(weights=Weights(pull=0.1, pull_step=0.2, heater_step=0.1))
 
 
@@ -65,14 +63,22 @@ def _on_puller(settings: LQGSettings) -> LQGSettings:
     return replace(settings, noise=replace(settings.noise, heater_walk=1.0), ring=PULLER_RING)
 
 
+def _member(activity: float, scenario: str) -> Goal:
+    """A member of the family: the search begins from a shipped LQG, its weight on pull steps by a rule of thumb."""
+    quiet = scenario != "puller" or activity < _QUIET_STEP
+    base, step = (settings_of("lqg-quiet", scenario), _QUIET_STEP) if quiet else (settings_of("lqg", scenario), 0.016)
+    pull_step = base.weights.pull_step * (step / activity) ** 4
+    start = replace(base, weights=replace(base.weights, pull_step=pull_step))
+    return Goal(_ANY_ERROR, activity, False, start, scenario, (scenario,))
+
+
 GOALS = {
     ("lqg", "randomized"): Goal(0.062, 0.02, True, _AGGRESSIVE_START),
-    ("lqg-quiet", "randomized"): Goal(0.075, 0.0095, False, _QUIET_START),
-    ("lqg-active", "hard"): Goal(0.12, 0.03, False, REWARD, "hard", ("hard",)),
-    ("lqg-active", "sensor-fault"): Goal(0.06, 0.02, False, REWARD, "sensor-fault", ("sensor-fault",)),
-    ("lqg", "puller"): Goal(0.09, 0.016, False, _on_puller(REWARD), "puller", ("puller",)),
-    ("lqg-quiet", "puller"): Goal(0.1, 0.01, False, _on_puller(QUIET), "puller", ("puller",)),
-    ("lqg", "sensor-fault"): Goal(0.063, 0.02, True, REWARD, "sensor-fault", ("sensor-fault",)),
-    ("lqg-quiet", "sensor-fault"): Goal(0.076, 0.0095, False, QUIET, "sensor-fault", ("sensor-fault",)),
+    ("lqg-quiet", "randomized"): Goal(0.075, _QUIET_STEP, False, _QUIET_START),
+    ("lqg", "puller"): Goal(0.09, 0.016, False, _on_puller(_REWARD), "puller", ("puller",)),
+    ("lqg-quiet", "puller"): Goal(0.1, 0.01, False, _on_puller(_QUIET), "puller", ("puller",)),
+    ("lqg", "sensor-fault"): Goal(0.063, 0.02, True, _REWARD, "sensor-fault", ("sensor-fault",)),
+    ("lqg-quiet", "sensor-fault"): Goal(0.076, _QUIET_STEP, False, _QUIET, "sensor-fault", ("sensor-fault",)),
+    **{(family_name(each), scenario): _member(each, scenario) for scenario in SCENARIOS for each in ACTIVITIES},
 }
 """By name and scenario: what the shipped versions are tuned to."""

@@ -6,10 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cz_gym.baselines.lqg import settings as lqg_settings
 from cz_gym.baselines.lqg.controller import LQGSettings
 from cz_gym.baselines.tuning import lqg as lqg_tuning
-from cz_gym.baselines.tuning import lqg_frontier
 from cz_gym.baselines.tuning.harness import Figures, value_at
 from cz_gym.baselines.tuning.lqg import LQGSearch
 from cz_gym.baselines.tuning.lqg_goals import GOALS, PARAMETERS, Goal
@@ -114,19 +112,3 @@ def test_the_command_writes_what_the_search_chose(search, tmp_path, capsys):
     written = json.loads(output.read_text())
     assert len(written["history"]) >= 20
     assert f"pull_step={written['chosen']['values']['weights.pull_step']}" in capsys.readouterr().out
-
-
-def test_the_weight_for_an_activity_is_read_off_between(monkeypatch, tmp_path):
-    def by_weight(settings, scenario, seeds):
-        """Pull steps fall with the square root of their weight; the quiet base holds the radius better."""
-        step = 0.01 * settings.weights.pull_step**-0.5
-        return Figures(0.05 + 0.01 * (settings.noise == lqg_settings.REWARD.noise), step, 0.0, 0.0, 0.0, 2160)
-
-    monkeypatch.setattr(lqg_frontier, "figures", by_weight)
-    output = tmp_path / "frontier.json"
-    assert lqg_frontier.main(["--output", str(output)]) == 0
-    found = json.loads(output.read_text())["chosen"]
-    assert [chosen["activity"] for chosen in found] == list(lqg_settings.ACTIVITIES)
-    assert {chosen["base"] for chosen in found} == {"lqg-quiet"}
-    for chosen in found:
-        assert chosen["validation"]["pull_step"] == pytest.approx(chosen["activity"], rel=1e-2)

@@ -100,7 +100,7 @@ def test_the_command_chooses_on_validation_and_never_sees_test(monkeypatch, tmp_
     arguments = ["--controller", "paper-filtered", "--trials", "12", "--episodes", "4", "--survive", "2"]
     assert pid_tuning.main([*arguments, "--finalists", "3", "--validation", "5", "--out", str(tmp_path)]) == 0
     found = json.loads((tmp_path / "paper-filtered.json").read_text())
-    tried = sorted({entry["values"]["T_f"] for entry in found["history"]})
+    tried = sorted({values[found["parameters"].index("T_f")] for values, *_ in found["history"]})
     assert len(found["history"]) == 12
     assert found["chosen"]["values"]["T_f"] == tried[2]
     validation = list(range(1_000_000, 1_000_005))
