@@ -10,7 +10,7 @@ BROWSER_READY := $(VENV)/.ready-browser
 # A worker that runs out of tests takes some of the other's: files differ too much in time to be dealt out whole.
 IN_PARALLEL := --numprocesses auto --dist worksteal
 
-.PHONY: help venv lint types test test-all test-lowest test-newest test-wheel audit test-browser benchmark benchmark-full paper docs notebooks clean
+.PHONY: help venv lint types test test-all test-lowest test-newest test-wheel audit test-browser benchmark benchmark-full paper docs tables notebooks clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -78,6 +78,9 @@ paper: $(BENCHMARK_READY) ## the paper's numbers beside ours
 
 docs: $(DOCS_READY) ## the documentation site, into build/docs; warnings are errors
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -c docs . build/docs
+
+tables: $(DOCS_READY) ## the tables that pages take from the code, into the pages
+	PYTHONPATH=docs $(BIN)/python -m czdocs.tables
 
 notebooks: $(DOCS_READY) ## the example pages as Jupyter notebooks, into build/notebooks
 	$(BIN)/python docs/notebooks.py build/notebooks

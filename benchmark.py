@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 try:
-    from cz_gym.commands import OneLineParser, guarded
+    from cz_gym.commands import OneLineParser, guarded, shown
 except ModuleNotFoundError as error:
     sys.exit(f"benchmark.py: {error}")
 
@@ -25,8 +25,10 @@ FOLDER = Path(__file__).resolve().parent / "results" / "benchmark"
 """Where the committed results are."""
 README = FOLDER.parents[1] / "README.md"
 """Where the committed results are quoted, between two markers."""
-OWN = Path("runs/benchmark")
-"""Results with the user's own controllers or scenarios, unless told otherwise."""
+OWN = Path("runs")
+"""Results with the user's own controllers, agents or scenarios go into a folder of their names here."""
+BESIDE = ["paper", "paper-tuned", "lqg", "lqg-at-0.02"]
+"""What runs beside controllers of the user's own, unless others are named."""
 CACHE = FOLDER.parent / "cache"
 """Where episodes of slow controllers are cached."""
 BOUNDS = FOLDER.parent / "bounds"
@@ -47,7 +49,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     add("--episodes", type=int, default=EPISODES, metavar="N", help="first N test episodes (%(default)s)")
     add("--controllers", type=_names, metavar="A,B", help='controllers and agents by name, or "all"')
     add("--scenarios", type=_names, metavar="A,B", help="scenarios by name")
-    add("--out", type=Path, metavar="DIR", help="folder for the results (results/benchmark)")
+    add("--out", type=Path, metavar="DIR", help="folder for the results (results/benchmark; of your own: runs/NAME)")
     add("--json", type=Path, metavar="FILE", help="write benchmark.json to FILE, and only that unless --out is given")
     agent_help = (
         "agent file, by default in place of the shipped ones; those of one NAME (default: the algorithm's) are "
@@ -59,7 +61,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
         action="append",
         default=[],
         metavar="FILE.py:NAME",
-        help="controller of your own, beside the others",
+        help=f"controller of your own, beside others: {', '.join(BESIDE)} unless --controllers names some",
     )
     add(
         "--scenario",
@@ -98,9 +100,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the benchmark; 0 when done, 2 for bad input, 130 when interrupted."""
     arguments = parse(argv)
     if arguments.out is None and arguments.json is None:
-        mine = bool(arguments.controller or arguments.scenario)
-        arguments.out = OWN if mine else FOLDER
-        arguments.overwrite |= mine
+        mine = [place.rpartition(":")[2] for place in (*arguments.controller, *arguments.scenario)]
+        mine += [name or file.stem for name, file in arguments.agent]
+        arguments.out = OWN / "-".join(dict.fromkeys(mine)) if mine else FOLDER
+    if arguments.controller and not (arguments.controllers or arguments.slow):
+        arguments.controllers = BESIDE
     command = shlex.join(["benchmark.py", *(sys.argv[1:] if argv is None else argv)])
     return guarded("benchmark.py", lambda: benchmark(arguments, command), "benchmark")
 
@@ -132,12 +136,14 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
     quoted = README if not smaller and arguments.out and arguments.out.resolve() == FOLDER else None
     write(arguments.out, arguments.json, done, quoted)
     if not arguments.quiet:
-        print(f"{terminal(done)}\nwrote {', '.join(str(path) for path in (arguments.out, arguments.json) if path)}")
+        print(terminal(done))
         if arguments.controllers == ["all"] and (missing := left_out(plan)):
             print(
                 f"left out of all: {', '.join(missing)}, which are slow and not cached for every episode asked for; "
                 f"add --slow to run them ({BOUNDS.relative_to(README.parent)}/report.md has their earlier results)"
             )
+        wrote = ", ".join(shown(path) for path in (arguments.out, arguments.json) if path)
+        print(f"wrote {wrote}" + (f"; open {shown(arguments.out / 'report.html')}" if arguments.out else ""))
     return 0
 
 
@@ -187,7 +193,6 @@ def _classical(entry: Entry) -> Contender:
 def _given(files: Sequence[tuple[str, Path]]) -> dict[str, Contender]:
     """The agents of files, each with a name or "" for its algorithm's."""
     from cz_gym.agents import shipped_names
-    from cz_gym.evaluation.contenders import agent
 
     policies: dict[str, list[Any]] = {}
     for name, file in files:
@@ -195,14 +200,21 @@ def _given(files: Sequence[tuple[str, Path]]) -> dict[str, Contender]:
             raise ValueError(f"--agent takes a file; {file} is shipped and runs by its name: --controllers {file}")
         policy = _load(file)
         policies.setdefault(name or policy.contract.algorithm, []).append(policy)
-    return {name: agent(name, some, own=True) for name, some in policies.items()}
+    return {name: _agent(name, some, own=True) for name, some in policies.items()}
 
 
 def _shipped(name: str) -> Contender:
     from cz_gym.agents import shipped_seeds
+
+    return _agent(name, [_load(file) for file in shipped_seeds(name)])
+
+
+def _agent(name: str, policies: Sequence[Any], own: bool = False) -> Contender:
+    from cz_gym.agents.training.run_files import trained_on
     from cz_gym.evaluation.contenders import agent
 
-    return agent(name, [_load(file) for file in shipped_seeds(name)])
+    contract = policies[0].contract
+    return agent(name, policies, own, trained_on(contract.algorithm, contract.scenario))
 
 
 def _load(file: Path) -> Any:

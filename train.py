@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 try:
-    from cz_gym.commands import OneLineParser, between, guarded
+    from cz_gym.commands import OneLineParser, between, guarded, interpreter
     from cz_gym.names import unknown
 except ModuleNotFoundError as error:
     sys.exit(f"train.py: {error}")
@@ -104,7 +104,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _resume(arguments: argparse.Namespace) -> str:
     """The command that goes on with a run: the folder knows its algorithm, seed and steps."""
-    words = ["python", "train.py", "--resume", "--out", str(arguments.out)]
+    words = [interpreter(), "train.py", "--resume", "--out", str(arguments.out)]
     if arguments.seeds:
         words += ["--seeds", f"{arguments.seeds[0]}-{arguments.seeds[-1]}"]
     if arguments.ray is not None:
@@ -145,7 +145,7 @@ def train(arguments: argparse.Namespace) -> int:
             arguments.plot,
         )
         total = run.learner.total
-        print(f"{recipe.name}, seed {arguments.seed}, {total:,} steps on {recipe.scenario!r}, into {folder}")
+        print(f"{recipe.name}, seed {arguments.seed}, {total:,} steps on {_crystals(recipe)}, into {folder}")
         with tqdm(total=total, unit="step", unit_scale=True, dynamic_ncols=True, mininterval=1.0) as bar:
             try:
                 run.learn(bar)
@@ -177,12 +177,18 @@ def _train_seeds(arguments: argparse.Namespace, recipe: Recipe, folders: dict[in
     if arguments.ray is not None:
         connect(arguments.ray)
         check_shared(jobs[0].folder)
-    print(f"{recipe.name}, {len(jobs)} seeds on {recipe.scenario!r}, into {arguments.out}")
+    print(f"{recipe.name}, {len(jobs)} seeds on {_crystals(recipe)}, into {arguments.out}")
     with tqdm(total=len(jobs), bar_format="{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}") as bar:
         for job, summary in train_seeds(jobs, in_processes if arguments.ray is None else completed, bar):
             bar.write(f"seed {job.seed}: {_said(summary)}")
     print(f"wrote agent.onnx into {len(jobs)} folders of {arguments.out}")
     return 0
+
+
+def _crystals(recipe: Recipe) -> str:
+    from cz_gym.agents.training.run_files import trained_on
+
+    return trained_on(recipe.name, recipe.scenario)
 
 
 def _said(summary: dict[str, float]) -> str:

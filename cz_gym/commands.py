@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NoReturn
 
 from gymnasium.error import DependencyNotInstalled
@@ -66,3 +67,14 @@ def guarded(prog: str, body: Callable[[], int], extra: str, left: str = "nothing
         return 130
     print(f"{prog}: {' '.join(said.split())}", file=sys.stderr)
     return 2
+
+
+def shown(path: str | Path) -> str:
+    """A path as people write it: relative to the current folder if it lies below it."""
+    whole, here = Path(path).absolute(), Path.cwd()
+    return str(whole.relative_to(here) if whole.is_relative_to(here) else whole)
+
+
+def interpreter() -> str:
+    """The Python that runs, as a command names it."""
+    return shown(sys.executable) if sys.executable else "python"

@@ -7,12 +7,16 @@ crystals while it learns from nothing, by reward.
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import numpy as np
-import torch
-from torch import nn
+try:
+    import numpy as np
+    import torch
+    from torch import nn
+except ModuleNotFoundError as error:
+    sys.exit(f'{error.name} is missing: make venv, then .venv/bin/python, or pip install ".[agents]"')
 
 from cz_gym import CzVectorEnv
 from cz_gym.agents.training.validation import Validation, validate
@@ -142,7 +146,7 @@ def main(args: Args) -> Validation:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
+    parser = argparse.ArgumentParser(description=__doc__)
     for name, value in asdict(Args()).items():
         parser.add_argument(f"--{name.replace('_', '-')}", type=type(value), default=value)
     main(Args(**vars(parser.parse_args())))

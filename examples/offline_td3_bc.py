@@ -12,10 +12,13 @@ import copy
 import sys
 from typing import Any
 
-import minari
-import numpy as np
-import torch
-from torch import nn
+try:
+    import minari
+    import numpy as np
+    import torch
+    from torch import nn
+except ModuleNotFoundError as error:
+    sys.exit(f'{error.name} is missing: make venv, then .venv/bin/python, or pip install ".[agents,data]"')
 
 from cz_gym.agents.training.validation import Validation, validate
 from cz_gym.config import make_config
@@ -118,7 +121,7 @@ def main(names: list[str], seed: int = 0, updates: int = 9000) -> Validation:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", nargs="+", default=["cz/randomized/paper-tuned-v0"], metavar="NAME")
     for name, value in {"seed": 0, "updates": 9000}.items():
         parser.add_argument(f"--{name}", type=int, default=value)

@@ -1,24 +1,28 @@
 """Train RLlib's PPO on the native batch, from nothing, by reward: ``python -m examples.rllib_ppo``, 5 minutes.
 
-Run by hand where ``ray[rllib]`` and torch are installed: they are too large for the test suite. It prints what the
-agent is worth on validation crystals while it learns.
+It needs more than ``make venv`` installs: ``pip install "ray[rllib]"``, which is too large for the test suite.
+It prints what the agent is worth on validation crystals while it learns.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from typing import Any
 
-import numpy as np
-import ray
-import torch
-from gymnasium.vector import VectorWrapper
-from gymnasium.wrappers.vector import NormalizeObservation, TransformReward
-from ray.rllib.algorithms.ppo import PPOConfig
-from ray.rllib.core.columns import Columns
-from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
-from ray.tune.registry import register_env
+try:
+    import numpy as np
+    import ray
+    import torch
+    from gymnasium.vector import VectorWrapper
+    from gymnasium.wrappers.vector import NormalizeObservation, TransformReward
+    from ray.rllib.algorithms.ppo import PPOConfig
+    from ray.rllib.core.columns import Columns
+    from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
+    from ray.tune.registry import register_env
+except ModuleNotFoundError as error:
+    sys.exit(f"{error.name} is missing: .venv/bin/python -m pip install 'ray[rllib]' torch")
 
 from cz_gym import CzVectorEnv
 from cz_gym.agents.training.validation import Validation, validate
@@ -104,7 +108,7 @@ def main(seed: int = 0, steps: int = 3_000_000, slots: int = 128) -> Validation:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
+    parser = argparse.ArgumentParser(description=__doc__)
     for name, value in {"seed": 0, "steps": 3_000_000, "slots": 128}.items():
         parser.add_argument(f"--{name}", type=int, default=value)
     main(**vars(parser.parse_args()))

@@ -5,13 +5,17 @@ Then judge it on validation crystals. ``python benchmark.py --agent runs/sb3-ppo
 
 from __future__ import annotations
 
+import argparse
 import sys
 from pathlib import Path
 from typing import Any
 
-import torch
-from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import VecNormalize
+try:
+    import torch
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import VecNormalize
+except ModuleNotFoundError as error:
+    sys.exit(f'{error.name} is missing: make venv, then .venv/bin/python, or pip install ".[agents]"')
 
 from cz_gym import CzVectorEnv
 from cz_gym.agents import load
@@ -29,11 +33,17 @@ def main(seed: int = 0, steps: int = 10_000_000, out: Path = Path("runs/sb3-ppo.
     env = VecNormalize(TrainingReward(CzVecEnv(crystals, stagger=seed), gamma=0.99), norm_reward=False)
     settings: Any = {"n_steps": 64, "batch_size": 4096, "n_epochs": 5, "policy_kwargs": {"log_std_init": -0.7}}
     model = PPO("MlpPolicy", env, lambda left: 1e-3 * left, gamma=0.99, seed=seed, device="cpu", **settings)
-    model.learn(steps, progress_bar=sys.stderr.isatty())
+    try:
+        model.learn(steps, progress_bar=sys.stderr.isatty())
+    except KeyboardInterrupt:
+        print(f"interrupted after {model.num_timesteps:,} steps; what was learned goes into {out}", file=sys.stderr)
     save_agent(out, model, "sb3-ppo")
     return validate(load(out), crystals.config, VALIDATION_SEEDS[:100])
 
 
 if __name__ == "__main__":
-    found = main()
+    parser = argparse.ArgumentParser(description=__doc__)
+    for name, value in {"seed": 0, "steps": 10_000_000}.items():
+        parser.add_argument(f"--{name}", type=int, default=value)
+    found = main(**vars(parser.parse_args()))
     print(f"radius error {found.rmse_mm:.3f} mm, {100.0 * found.failure_rate:.0f} % of crystals lost")

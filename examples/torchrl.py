@@ -1,12 +1,21 @@
-"""TorchRL on Cz-v0 as it stands: ``python -m examples.torchrl``, by hand where torchrl is installed."""
+"""TorchRL on Cz-v0 as it stands: ``python -m examples.torchrl``.
+
+It needs more than ``make venv`` installs: ``pip install torchrl``.
+"""
 
 from __future__ import annotations
 
-import torch
-import torchrl
-from tensordict.nn import TensorDictModule
-from torchrl.collectors import Collector
-from torchrl.envs import GymEnv, check_env_specs
+import argparse
+import sys
+
+try:
+    import torch
+    import torchrl
+    from tensordict.nn import TensorDictModule
+    from torchrl.collectors import Collector
+    from torchrl.envs import GymEnv, check_env_specs
+except ModuleNotFoundError as error:
+    sys.exit(f"{error.name} is missing: .venv/bin/python -m pip install torchrl torch")
 
 import cz_gym  # noqa: F401
 
@@ -25,4 +34,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     main()

@@ -42,9 +42,13 @@ class OnnxPolicy:
         """
         path = Path(path)
         if not path.suffix and not path.exists():
+            if (file := path.with_name(f"{path.name}.onnx")).exists():
+                raise AgentFileError(f"{path}: no agent file; did you mean {file}?")
             raise AgentFileError(
                 f"{path}: no agent file; a shipped agent is had by name: cz_gym.agents.load({str(path)!r})"
             )
+        if path.suffix != ".onnx":
+            raise AgentFileError(f"{path}: not an .onnx agent file")
         return cls.of(*read_agent(path), config, path)
 
     @classmethod

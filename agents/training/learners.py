@@ -28,7 +28,14 @@ def make_learner(
 
     ``logs`` is where TensorBoard's files go; None for none.
     """
-    logger = configure_logger(0, str(logs), "run", reset_num_timesteps=False) if logs else Logger(None, [])
+    logger = Logger(None, [])
+    learner = _learner(recipe, seed, controllers, logger, done)
+    if logs:  # made last: a recipe that is refused leaves no folder
+        logger.output_formats = configure_logger(0, str(logs), "run", reset_num_timesteps=False).output_formats
+    return learner
+
+
+def _learner(recipe: Recipe, seed: int, controllers: Controllers, logger: Logger, done: int) -> Learner:
     if isinstance(recipe, Imitation):
         config = recipe.config
         measured = make_config(recipe.scenario, control_interval=recipe.control_interval)

@@ -14,6 +14,8 @@ from typing import Any
 from cz_gym.agents.agent_file.contract import MAX_JSON_BYTES, AgentFileError, read_bounded, read_json
 from cz_gym.evaluation.files import software
 
+from .recipes import RECIPES
+
 REFERENCES = ("paper", "paper-tuned", "lqg")
 """Classical controllers that an agent is shown beside while it learns."""
 COLUMNS = (
@@ -27,6 +29,13 @@ COLUMNS = (
 )
 """Columns of ``progress.csv``; the references' figures are the same in every row."""
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "stable-baselines3", "torch", "onnx", "onnxruntime")
+
+
+def trained_on(algorithm: str, scenario: str) -> str:
+    """The scenarios, in words, whose crystals an agent of that recipe and scenario learned on."""
+    also = (name for name, *_ in getattr(RECIPES.get(algorithm), "also", ()) if name)
+    *others, last = dict.fromkeys((scenario, *also))
+    return f"{', '.join(others)} and {last}" if others else last
 
 
 def read_settings(path: Path) -> dict[str, Any]:

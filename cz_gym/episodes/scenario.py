@@ -154,6 +154,8 @@ class Actuators:
 MAX_FLAGGED, MAX_UNFLAGGED = 3, 1
 MAX_LENGTH = 5.0 * MM
 """Largest error of the camera [m]; a crystal is lost long before."""
+MAX_NOISE = 2.0 * MM
+"""Largest standard deviation of the camera's noise [m]."""
 MAX_LATENCY = 60.0
 """Oldest camera frame a scenario may deliver [s]."""
 
@@ -219,7 +221,7 @@ class Scenario:
                 value = getattr(getattr(self, family), name)
                 length = max(map(abs, value if isinstance(value, tuple) else (value,)))
                 said = f"{family}.{name} of {length:g} m is {1e3 * length:g} mm: did you mean {length:g} * MM?"
-                need(length <= MAX_LENGTH, said)
+                need(length <= (MAX_NOISE if name == "camera_noise" else MAX_LENGTH), said)
         for family, names in _NOT_NEGATIVE.items():
             for name in names:
                 value = getattr(getattr(self, family), name)

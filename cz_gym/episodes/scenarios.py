@@ -138,7 +138,8 @@ def find_scenario(scenario: str | Scenario) -> Scenario:
     name, _, row = scenario.rpartition("-") if isinstance(scenario, str) else ("", "", "")
     if name in SCENARIOS and row in _ROWS:
         raise ValueError(f"{scenario!r} is a row of the benchmark: the scenario is {name!r}, with {_ROWS[row]}")
-    raise ValueError(unknown("scenario", scenario, SCENARIOS, ", or pass a cz_gym.Scenario"))
+    also = "" if isinstance(scenario, str) else ", or pass a cz_gym.Scenario"
+    raise ValueError(unknown("scenario", scenario, SCENARIOS, also))
 
 
 def mix_of(model: str | float | None, scenario: Scenario) -> tuple[float, float]:

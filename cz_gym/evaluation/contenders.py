@@ -31,10 +31,11 @@ class Contender:
         return self.controller.name
 
 
-def agent(name: str, policies: Sequence[Any], own: bool = False) -> Contender:
+def agent(name: str, policies: Sequence[Any], own: bool = False, trained_on: str = "") -> Contender:
     """A learned contender: policies with a ``contract``, one a training seed of the same agent.
 
-    It is the user's ``own`` if it was given as a file.
+    It is the user's ``own`` if it was given as a file. ``trained_on`` says on what, if it was more than the scenario of
+    its contract.
 
     Raises ValueError if they are no such set.
     """
@@ -47,9 +48,8 @@ def agent(name: str, policies: Sequence[Any], own: bool = False) -> Contender:
     if len({contract.scenario_hash for contract in contracts}) > 1:
         trained = ", ".join(sorted({contract.scenario for contract in contracts}))
         raise ValueError(f"agent {name!r}: its training seeds were trained on different scenarios: {trained}")
-    meaning = (
-        f"agent trained with {contracts[0].algorithm} on {contracts[0].scenario}{', given as a file' if own else ''}"
-    )
+    on = trained_on or contracts[0].scenario
+    meaning = f"agent trained with {contracts[0].algorithm} on {on}{', given as a file' if own else ''}"
     controller = Controller(name, contracts[0].observation, meaning, seeds, action=contracts[0].action, own=own)
     return Contender(
         controller, lambda config: policies, contracts=tuple(_writable(contract) for contract in contracts)

@@ -11,6 +11,7 @@ from typing import Any
 
 from cz_gym.config import Config
 from cz_gym.episodes.scenario import Scenario
+from cz_gym.episodes.scenarios import SCENARIOS
 from cz_gym.names import unknown
 
 from .contenders import Contender
@@ -21,8 +22,11 @@ PREFIX = "cz_gym_user_"
 """Of the names that modules from the user's files have."""
 
 
-def load(place: str) -> tuple[str, Any]:
-    """The name and the object at ``FILE.py:NAME``; ValueError says in one line why there is none."""
+def load(place: str, kind: str, fits: Callable[[Any, str], bool]) -> tuple[str, Any]:
+    """The name and the object at ``FILE.py:NAME``; ValueError says in one line why there is none.
+
+    ``fits`` says of an object and the module's name whether the file may offer it as one of that ``kind``.
+    """
     file, colon, name = place.rpartition(":")
     path = Path(file)
     if not colon or path.suffix != ".py" or not name.isidentifier():
@@ -38,8 +42,8 @@ def load(place: str) -> tuple[str, Any]:
     except Exception as error:  # whatever the user's file raises
         raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
     if not hasattr(module, name):
-        public = [each for each in vars(module) if not each.startswith("_")]
-        raise ValueError(f"{path}: {unknown('name', name, public)}")
+        offered = [each for each, value in vars(module).items() if each[0] != "_" and fits(value, module_name)]
+        raise ValueError(f"{path}: {unknown(kind, name, offered)}")
     return name, getattr(module, name)
 
 
@@ -50,10 +54,17 @@ def controller(place: str) -> Contender:
     names. Its attributes ``observation`` and ``action`` say what it reads and what its actions mean; "measured" and
     "direct" without.
     """
-    name, found = load(place)
+    name, found = load(place, "controller", _controls)
     made = _maker(place, found)
     reads, acts = str(getattr(found, "observation", "measured")), str(getattr(found, "action", "direct"))
     return Contender(Controller(name, reads, f"of {place}", action=acts, own=True), lambda config: [made(config)])
+
+
+def _controls(value: Any, module: str) -> bool:
+    """Whether it is a controller, or a class or function of that module that makes one."""
+    own = getattr(value, "__module__", "") == module
+    acts = hasattr(value, "predict") and (own or not inspect.isclass(value))
+    return acts or (own and inspect.isfunction(value))
 
 
 def _maker(place: str, found: Any) -> Callable[[Config], Any]:
@@ -72,7 +83,7 @@ def _maker(place: str, found: Any) -> Callable[[Config], Any]:
 
 def row(place: str) -> Row:
     """A row of a scenario, a :class:`cz_gym.Scenario`."""
-    _, found = load(place)
+    _, found = load(place, "scenario", lambda value, _: isinstance(value, Scenario) and value.name not in SCENARIOS)
     if not isinstance(found, Scenario):
         raise ValueError(f"{place}: no scenario: a {type(found).__name__}, not a cz_gym.Scenario")
     return Row(found.name, found, f"of {place}", default=False, file=place)

@@ -1,4 +1,7 @@
-"""Tables that the site takes from the code: a block ``{generated} name`` stands where one goes."""
+"""Tables that pages take from the code, between ``<!-- table:NAME -->`` and ``<!-- table:end -->``.
+
+``make tables`` writes them into the pages anew; a test compares.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,8 @@ import re
 from collections.abc import Callable, Iterable
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
-
-from docutils import nodes
-from docutils.parsers.rst import Directive
-from docutils.statemachine import StringList
 
 from cz_gym import SCENARIOS, Scenario
 from cz_gym.camera.view import Camera
@@ -146,7 +146,7 @@ def symbols(part: str) -> list[str]:
     """A part of the nomenclature."""
     rows = []
     for row in nomenclature.ROWS[part]():
-        where = ", ".join(f'<a href="physics.html#eq-{n}">({n})</a>' for n in row.equations) or ABSENT
+        where = ", ".join(f"[({n})](physics.md#eq-{n})" for n in row.equations) or ABSENT
         rows.append((f"${row.symbol}$", code(row.code), row.value, units(row.unit), row.meaning, where, row.source))
     return markdown(("symbol", "code", "value", "unit", "meaning", "equation", "source"), rows)
 
@@ -176,22 +176,31 @@ TABLES: dict[str, Callable[[], list[str]]] = {
 """Every table, by the name a page asks for it with."""
 
 
-class Generated(Directive):
-    """Stands for a table of :data:`TABLES`."""
+DOCS = Path(__file__).parents[1]
+CONTENTS = DOCS / "_contents.md"
+"""The site's contents, which stand behind the first page: GitHub would show them as code."""
+_BETWEEN = re.compile(r"(?<=<!-- table:)(?!end)([\w-]+)( -->\n).*?(?=<!-- table:end -->)", re.DOTALL)
+_EQUATION = re.compile(r"\[(\(\d+\))\]\(physics\.md(#eq-\d+)\)")
 
-    required_arguments = 1
 
-    def run(self) -> list[nodes.Node]:
-        """Parse the table where it stands."""
-        name = self.arguments[0]
-        if name not in TABLES:
-            raise self.error(f"no table {name!r}; there are {', '.join(TABLES)}")
-        box = nodes.container(classes=["generated", name])
-        self.state.nested_parse(StringList(TABLES[name](), source=f"table {name}"), self.content_offset, box)
-        return [box]
+def filled(page: str) -> str:
+    """A page with its tables as the code has them."""
+    return _BETWEEN.sub(lambda found: f"{found[1]}{found[2]}" + "\n".join(TABLES[found[1]]()), page)
+
+
+def read(app: Any, name: str, source: list[str]) -> None:
+    """What the site reads in place of a page: the first one's contents behind it, links to equations as anchors."""
+    if name == app.config.root_doc:
+        source[0] += CONTENTS.read_text()
+    source[0] = _EQUATION.sub(r'<a href="physics.html\2">\1</a>', source[0])
 
 
 def setup(app: Any) -> dict[str, bool]:
-    """Register the block."""
-    app.add_directive("generated", Generated)
+    """Listen to what is read."""
+    app.connect("source-read", read)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
+
+
+if __name__ == "__main__":
+    for path in DOCS.rglob("*.md"):
+        path.write_text(filled(path.read_text()))

@@ -1,6 +1,6 @@
 """Bode plot, margins and sensitivity of a controller's loop with the nominal plant, near rest.
 
-``python -m studies.bode lqg`` takes a shipped controller, ``python -m studies.bode my.py:SlowPI`` one of your own: its
+``python -m studies.bode lqg`` takes a shipped controller, ``python -m studies.bode my.py:SlowPID`` one of your own: its
 ``state`` is a NamedTuple of arrays, so that its linear form can be read off.
 """
 

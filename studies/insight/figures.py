@@ -36,6 +36,7 @@ def looks(names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
 
 def _legend(figure: Any, axis: Any) -> None:
     handles, names = axis.get_legend_handles_labels()
+    names = [name.replace(" at rest", " at rest (no noise)") for name in names]
     figure.legend(handles, names, loc="outside lower center", ncols=len(names), frameon=False, fontsize=9)
 
 
@@ -57,7 +58,7 @@ def response_figure(answers: Mapping[str, Mapping[str, Signals]], dt: float) -> 
     for axis, label in zip(axes[:, 0], ("radius error [mm]", *MOVES), strict=True):
         axis.set_ylabel(label)
     _legend(figure, axes[0, 0])
-    figure.suptitle("One nominal puller without noise, four events", fontsize=11)
+    figure.suptitle("One nominal puller, four events; no noise but that of the last", fontsize=11)
     return png(figure)
 
 

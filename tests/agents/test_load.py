@@ -1,5 +1,6 @@
 """Shipped agents by name."""
 
+import re
 from typing import Any
 
 import gymnasium as gym
@@ -60,6 +61,11 @@ def test_what_there_is_not_is_one_line(name: str, message: str) -> None:
 
 
 def test_a_name_is_no_file() -> None:
+    file = agents.shipped_seeds("ppo")[0]
+    with pytest.raises(agents.AgentFileError, match=f"did you mean {re.escape(str(file))}\\?"):
+        agents.OnnxPolicy.load(file.with_suffix(""))
+    with pytest.raises(agents.AgentFileError, match=r"not an \.onnx agent file"):
+        agents.OnnxPolicy.load(file.with_suffix(".json"))
     with pytest.raises(agents.AgentFileError, match=r"had by name: cz_gym\.agents\.load\('ppo'\)"):
         agents.OnnxPolicy.load("ppo")
 

@@ -109,7 +109,7 @@ def test_it_opens_from_disk_without_a_complaint_and_fetches_nothing(browser: Any
 
 
 def test_the_first_line_is_the_verdict_and_names_are_text(browser: Any) -> None:
-    assert browser.find_element("tag name", "body").text.startswith("No verdict from ")
+    assert browser.find_element("tag name", "body").text.startswith("No verdict: ")
     assert browser.title == "Cz-v0 benchmark"
     assert EVIL in names(browser)
     assert browser.find_elements("css selector", "img, svg a") == []

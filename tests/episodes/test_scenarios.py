@@ -94,6 +94,7 @@ def test_nonsense_is_refused_in_one_line(where: tuple[str, str], value: object) 
         ("sensor", "outlier_probability", 2.0),
         ("sensor", "outlier_sd", -1.0),
         ("sensor", "camera_noise", (0.0, 0.05)),
+        ("sensor", "camera_noise", (0.0, 0.0021)),
         ("sensor", "bias_offset", (-1.0, 1.0)),
         ("pullers", "start_radius_sd", 0.2),
         ("reference", "amount", (-2.5, 2.5)),

@@ -1,5 +1,8 @@
 """What users copy: each example learns, is judged, and leaves what it says."""
 
+import re
+import subprocess
+import sys
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -23,7 +26,31 @@ def test_the_stable_baselines_example_writes_an_agent(tmp_path: Path, monkeypatc
     assert found.cost > 0.0
     contract = agents.load(tmp_path / "some.onnx").contract
     assert (contract.action, contract.algorithm, contract.training_steps) == ("smooth", "sb3-ppo", 65_536)
-    assert len(Path(sb3_ppo.__file__).read_text().splitlines()) <= 40
+    assert len(Path(sb3_ppo.__file__).read_text().splitlines()) <= 54
+
+
+@pytest.mark.parametrize("name", ["sb3_ppo", "cleanrl_ppo", "offline_td3_bc", "rllib_ppo", "torchrl"])
+def test_an_example_without_its_packages_says_in_one_line_what_to_install(name: str) -> None:
+    command = [sys.executable, "-S", "-m", f"examples.{name}"]  # -S: nothing but Python's own modules
+    done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert re.fullmatch(r"\w+ is missing: .*pip install .*\n", done.stderr)
+
+
+def test_an_interrupted_stable_baselines_example_saves_what_it_learned(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(*arguments: Any, **named: Any) -> None:
+        raise KeyboardInterrupt
+
+    saved: list[Path] = []
+    monkeypatch.setattr(sb3_ppo.PPO, "learn", interrupt)
+    monkeypatch.setattr(sb3_ppo, "save_agent", lambda out, model, name: saved.append(out))
+    monkeypatch.setattr(sb3_ppo, "load", lambda out: None)
+    monkeypatch.setattr(sb3_ppo, "validate", lambda *arguments: "judged")
+    assert str(sb3_ppo.main(out=Path("some.onnx"))) == "judged"
+    assert saved == [Path("some.onnx")]
+    assert capsys.readouterr().err == "interrupted after 0 steps; what was learned goes into some.onnx\n"
 
 
 @pytest.mark.parametrize("steps", [8192, pytest.param(262_144, marks=pytest.mark.slow)])

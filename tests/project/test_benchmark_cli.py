@@ -93,7 +93,7 @@ def test_the_folder_holds_every_file_and_nothing_else(finished: Path) -> None:
     assert sorted(path.name for path in finished.iterdir()) == FILES
     assert (finished.parent / "copy.json").read_bytes() == (finished / "benchmark.json").read_bytes()
     report = (finished / "report.md").read_text()
-    assert report.startswith("No verdict from ")
+    assert report.startswith("No verdict: 3 crystals, ")
     for image in finished.glob("*.png"):
         assert image.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
         assert f"]({image.name})" in report
@@ -201,6 +201,17 @@ def test_a_contract_that_cannot_be_recorded_is_refused_at_once(odd: dict[str, An
     policy = replace(policy, contract=replace(policy.contract, **odd))
     with pytest.raises(ValueError, match=f"agent 'ppo': its contract's {next(iter(odd))} cannot be written"):
         agent("it", [policy], lambda config: [policy])
+
+
+def test_an_agent_s_line_says_every_scenario_that_its_recipe_has(tmp_path: Path) -> None:
+    file = constant_agent(tmp_path / "some.onnx", algorithm="mine")
+    plan = make_plan("--controllers", "gradient,ppo,mine,gradient-puller", "--agent", str(file))
+    assert {each.name: each.controller.meaning.partition(" on ")[2] for each in plan.contenders} == {
+        "gradient": "randomized, hard, sensor-fault and puller",
+        "gradient-puller": "puller",
+        "ppo": "randomized",
+        "mine": "randomized, given as a file",
+    }
 
 
 def test_a_file_may_be_named_and_stand_beside_the_shipped_agents(tmp_path: Path) -> None:
@@ -331,6 +342,23 @@ later = replace(REFERENCE_B, name="later")
 """
 
 
+def test_one_s_own_controller_runs_beside_a_few_into_its_own_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], refusal: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text(MINE)
+    command = ["--scenarios", "reference-b", "--controller", "mine.py:Still"]
+    assert benchmark.main(command) == 0
+    assert capsys.readouterr().out.endswith("\nwrote runs/Still; open runs/Still/report.html\n")
+    results = json.loads(Path("runs/Still/benchmark.json").read_text())["results"]["reference-b"]
+    assert list(results) == [*benchmark.BESIDE, "Still"]
+    assert "runs/Still/" in (line := refusal(command))
+    assert "exists and this run is partial: add --overwrite" in line
+    agent = constant_agent(tmp_path / "some.onnx")
+    assert benchmark.main([*ONE, "--agent", str(agent), "--scenario", "mine.py:later"]) == 0
+    assert Path("runs/later-some/report.html").exists()
+
+
 def test_controllers_and_scenarios_of_one_s_own_file_take_part(tmp_path: Path) -> None:
     mine = tmp_path / "mine.py"
     mine.write_text(MINE)
@@ -340,7 +368,6 @@ def test_controllers_and_scenarios_of_one_s_own_file_take_part(tmp_path: Path) -
     results = json.loads((out / "benchmark.json").read_text())["results"]["later"]
     assert list(results) == ["open-loop", "Still", "still", "made"]
     assert len({each["rmse_mm"]["mean"] for each in results.values()}) == 1
-    assert benchmark.parse(["--controller", "a.py:B"]).out is None
 
 
 def test_a_report_on_one_s_own_shows_it_and_prints_a_command_that_runs(
@@ -373,7 +400,13 @@ def test_a_report_on_one_s_own_shows_it_and_prints_a_command_that_runs(
     [
         ("--controller", "mine.py", "must be FILE.py:NAME"),
         ("--controller", "nobody.py:Still", "no such file"),
-        ("--controller", "mine.py:Stil", "unknown name 'Stil': did you mean 'Still'"),
+        (
+            "--controller",
+            "mine.py:Stil",
+            "unknown controller 'Stil': did you mean 'Still'? Choose from Still, still, made\n",
+        ),
+        ("--scenario", "mine.py:soon", "unknown scenario 'soon'; choose from later\n"),
+        ("--scenarios", "soon", "randomized-exact\n"),
         ("--controller", "mine.py:number", "no controller"),
         ("--controller", "mine.py:later", "no controller"),
         ("--scenario", "mine.py:Still", "no scenario"),

@@ -1,6 +1,7 @@
 """Every command: one line for options that cannot be meant, one line for Ctrl-C, and nothing left behind."""
 
 import importlib
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import benchmark
 from cz_gym import datasets
 from cz_gym.baselines.tuning import lqg as tune_lqg
 from cz_gym.baselines.tuning import pid as tune_pid
-from cz_gym.commands import OneLineParser, guarded
+from cz_gym.commands import OneLineParser, guarded, interpreter
 from cz_gym.play import __main__ as play
 from studies.design_table import __main__ as design_table
 from studies.film import __main__ as film
@@ -93,6 +94,15 @@ def test_the_meniscus_is_written_only_when_asked_for(
     assert not list(tmp_path.iterdir())
     assert young_laplace.main(["--write"]) == 0
     assert (tmp_path / "table.json").read_bytes() == table.TABLE.read_bytes()
+
+
+def test_the_interpreter_is_named_as_it_is_run_from_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", str(tmp_path / ".venv" / "bin" / "python"))
+    assert interpreter() == str(tmp_path / ".venv" / "bin" / "python")
+    monkeypatch.chdir(tmp_path)
+    assert interpreter() == ".venv/bin/python"
+    monkeypatch.setattr(sys, "executable", "")
+    assert interpreter() == "python"
 
 
 def test_a_message_of_several_lines_becomes_one(capsys: pytest.CaptureFixture[str]) -> None:

@@ -34,6 +34,7 @@ from tests.processes import ROOT, python  # noqa: E402
 
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
+LATER = {"docs/ablation.md", "docs/controllers/bounds.md", "docs/controllers/lqg.md"}
 SLOW = {"docs/paper.md", "docs/extend/meniscus.md"}
 SMALL = {
     "num_envs=10_000": "num_envs=100",
@@ -242,6 +243,29 @@ def test_the_environment_page_has_gymnasiums_headings_and_the_arguments_as_they_
     rows = re.findall(r"^\| `(\w+)` \| `([^`]*)` \|", text[text.index("## Arguments") :], re.MULTILINE)
     arguments = inspect.signature(CzEnv).parameters
     assert list(rows) == [(name, repr(given.default).replace("'", '"')) for name, given in arguments.items()]
+
+
+def test_pages_read_well_on_github_and_their_tables_are_the_code_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only the pages of the code's own names, and the site's contents, have blocks that GitHub shows as they stand."""
+    monkeypatch.syspath_prepend(str(DOCS))
+    tables = importlib.import_module("czdocs.tables")
+    assert set(tables.TABLES) == set(
+        re.findall(r"<!-- table:(?!end)([\w-]+) -->", "".join(p.read_text() for p in PAGES))
+    )
+    for page in PAGES:
+        text = page.read_text()
+        assert tables.filled(text) == text, f"{page}: make tables"
+        blocks = set(re.findall(r"^```\{([\w-]+)\}", text, re.MULTILINE))
+        assert blocks <= (
+            {"eval-rst"} if page.parent.name == "api" else {"toctree"} if page == tables.CONTENTS else set()
+        )
+
+
+def test_shell_blocks_name_the_environment_s_python() -> None:
+    """Left out are pages that are written by others at the moment."""
+    for page in PAGES:
+        if str(page.relative_to(ROOT)) not in LATER:
+            assert re.findall(r"^ *(?:\$ )?python (?:-m|\w+\.py) ?.*", page.read_text(), re.MULTILINE) == [], page
 
 
 @pytest.fixture

@@ -26,6 +26,7 @@ from cz_gym.physics.linearisation import StateSpace
 from cz_gym.physics.plant import make_puller
 from cz_gym.units import MINUTE, MM, MM_PER_MIN
 from studies.insight import __main__ as insight
+from studies.insight import figures
 from studies.insight.figures import gain_figure, jump_figure, loop_figure, response_figure, ripple_figure, share_figure
 from studies.insight.linear_agent import AT, jacobian, linear_agent
 from studies.insight.loop import Contender, apart, noise_gains, one_reading, response
@@ -115,6 +116,14 @@ def test_loops_are_opened_as_the_design_table_opens_them(name: str, at: str) -> 
     controller, puller = insight.controller(name).system, make_puller(lam=0.5)
     loop = insight.controller(name).loop(OMEGA, 0.5, DT)
     assert np.allclose(loop.opened(at), theirs(opened(controller, puller, DT, at), DT, OMEGA), rtol=1e-8)
+
+
+def test_the_legend_says_what_at_rest_means() -> None:
+    figure = figures.canvas(4.0, 3.0)
+    axis = figure.subplots()
+    axis.plot([0.0, 1.0], label="gradient at rest")
+    figures._legend(figure, axis)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["gradient at rest (no noise)"]
 
 
 def test_one_reading_is_answered_as_the_loops_own_simulation_does() -> None:

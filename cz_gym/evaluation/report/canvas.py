@@ -28,7 +28,12 @@ DASHES = ("solid", "dash", "dot")
 DPI = 160
 INK, GREY = "#222222", "#999999"
 KNOWN = ("ppo", "gradient", "lqg-at-0.02", "paper", "paper-tuned")
-"""Controllers of README's table: each looks the same in every figure, by its place here."""
+"""Controllers of README's table, which figures prefer."""
+ORDER = (
+    *KNOWN, "lqg", "lqg-quiet", "gradient-all", "imitation", "ppo-recurrent", "sac", "random-search", "industrial",
+    "pid-conventional", "paper-filtered", "open-loop", "pid-uncompensated",
+)  # fmt: skip
+"""What runs by default: each looks the same in every figure of every run, by its place here."""
 
 
 class Style(NamedTuple):
@@ -40,8 +45,8 @@ class Style(NamedTuple):
 
 
 def styles(names: Sequence[str]) -> dict[str, Style]:
-    """One style a controller: that of its place among :data:`KNOWN`, or one of those after them, in turn."""
-    markers, places = list(MARKERS), [*KNOWN, *(name for name in names if name not in KNOWN)]
+    """One style a controller: that of its place in :data:`ORDER`, or one of those after it, in turn."""
+    markers, places = list(MARKERS), [*ORDER, *(name for name in names if name not in ORDER)]
     found = {
         name: Style(COLOURS[i % len(COLOURS)], markers[i % len(markers)], DASHES[i // len(COLOURS) % len(DASHES)])
         for i, name in enumerate(places)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from cz_gym.evaluation.results import Sample, ScenarioResult
 from cz_gym.evaluation.rollout import Floats, Signals
@@ -20,14 +21,15 @@ COLUMNS = 5
 ROOM = (0.01 * MM, 3.0 * MM)
 """Least and largest radius error that the figure has room for, beyond the reference's own range [m]."""
 SMOOTH = 5.0 * MINUTE
-"""Length of the running mean drawn over noisy signals [s]."""
+"""Length of the running mean of noisy signals [s]; drawn pale beside it, :data:`PALE`."""
+PALE = MINUTE
 
 
 class _Panel(NamedTuple):
     label: str
     value: Callable[[Signals], Floats]
     noisy: bool = False
-    """Whether to draw it pale, with its mean over five minutes on top."""
+    """Whether to draw its mean over a minute pale, with that over five minutes on top: single steps fill a panel."""
 
 
 _PANELS = (
@@ -48,16 +50,18 @@ def crystal(scenario: ScenarioResult, style: Mapping[str, Style]) -> bytes:
     for column, sample in enumerate(samples):
         _draw(axes[:, column], sample, style[sample.controller.name].colour, longest.r_ref)
     for row, panel in enumerate(_PANELS):
-        axes[row, 0].set_ylabel(panel.label)
+        axes[row, 0].set_ylabel(panel.label.replace(" [", "\n["))
+    figure.align_ylabels(axes[:, 0])
     _set_limits(axes, samples, longest)
     figure.suptitle(f"One crystal of {scenario.row.name} (test seed {samples[0].seeds[0]:,})", fontsize=10.5)
     lines: tuple[dict[str, Any], ...] = (
         {"color": INK, "lw": 1.2, "ls": "--", "label": "reference"},
-        {"color": GREY, "lw": 1.2, "label": "what the camera reports"},
-        {"ls": "none", "label": "in colour: true value; of a drive its 5 min mean"},
+        {"color": GREY, "lw": 1.2, "label": "ring as the camera reports it"},
+        {"ls": "none", "label": "in colour: true value"},
+        {"ls": "none", "label": "of a drive: its 5 min mean, pale its 1 min mean"},
     )
     handles = [Line2D([], [], **line) for line in lines]
-    columns = 1 if len(samples) < 4 else len(lines)
+    columns = 1 if len(samples) < 4 else 2
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=8.5, frameon=False)
     return png(figure)
 
@@ -70,10 +74,10 @@ def _draw(axes: Any, sample: Sample, colour: str, reference: Floats) -> None:
     for axis, panel in zip(axes, _PANELS, strict=True):
         values = panel.value(signals)
         if panel.noisy:
-            axis.plot(minutes, values, color=colour, lw=0.3, alpha=0.15)
-            window = min(round(SMOOTH / dt), len(values))
-            mean = np.convolve(values, np.full(window, 1.0 / window), "valid")
-            axis.plot(minutes[window - 1 :] - 0.5 * (window - 1) * dt / MINUTE, mean, color=colour, lw=1.4)
+            for length, look in ((PALE, {"lw": 0.6, "alpha": 0.4}), (SMOOTH, {"lw": 1.4})):
+                window = min(max(round(length / dt), 1), len(values))
+                mean = np.convolve(values, np.full(window, 1.0 / window), "valid")
+                axis.plot(minutes[window - 1 :] - 0.5 * (window - 1) * dt / MINUTE, mean, color=colour, **look)
         else:
             axis.plot(minutes, values, color=colour, lw=1.1)
     rmse = float(sample.metric("rmse_mm")[0, 0])
@@ -101,6 +105,7 @@ def _set_limits(axes: Any, samples: Sequence[Sample], longest: Signals) -> None:
     axes[0, 0].set_ylim(*(ends / MM))
     axes[1, 0].set_ylim(*((ends + np.median(longest.r_br - longest.r_c)) / MM))
     axes[0, 0].set_xlim(0.0, len(longest.r_c) * samples[0].control_interval / MINUTE)
+    axes[0, 0].xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 3, 6, 10]))
     for axis in axes.flat:
         axis.ticklabel_format(axis="y", useOffset=False)
 

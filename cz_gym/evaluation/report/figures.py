@@ -86,11 +86,10 @@ def _spread(axis: Any, values: Floats, place: int, colour: str) -> None:
 def pareto(scenarios: Sequence[ScenarioResult], style: Mapping[str, Style]) -> bytes:
     """Mean RMSE against mean pull step RMS with 95 % intervals, both logarithmic; lower left is better.
 
-    Some controllers are named (:func:`.canvas.chosen` on the first scenario), by hollow markers, so that one behind
-    another is seen; the others are grey dots. Who has more than :data:`FAR` times the least error of those that move
-    the pull speed is not drawn.
+    Some controllers are :func:`named`, by hollow markers, so that one behind another is seen; the others are grey
+    dots. Who has more than :data:`FAR` times the least error of those that move the pull speed is listed, not drawn.
     """
-    named = [sample.controller.name for sample in chosen([each.sample for each in scenarios[0].outcomes], NAMED)]
+    names = named(scenarios)
     figure = canvas(9.0 if len(scenarios) > 1 else 6.8, max(2.9 * -(-len(scenarios) // 2) + 1.0, 4.6))
     moving = [outcome.means[PULL_STEP.metric].mean for scenario in scenarios for outcome in scenario.outcomes]
     floor = min((value for value in moving if value > 0.0), default=1.0) / 3.0
@@ -103,24 +102,34 @@ def pareto(scenarios: Sequence[ScenarioResult], style: Mapping[str, Style]) -> b
         for outcome in scenario.outcomes:
             name = outcome.controller.name
             if outcome.means[RMSE.metric].mean <= most:
-                _point(axis, outcome, style[name] if name in named else None, floor)
-            elif name in named:
+                _point(axis, outcome, style[name] if name in names else None, floor)
+            else:
                 far.append(name)
         axis.set_title(scenario.row.name, fontsize=9.5)
         if far:
             place = {"transform": axis.transAxes, "va": "top", "ha": "right", "fontsize": 8}
-            axis.text(0.995, 0.995, fill(f"above: {', '.join(far)}", 50, break_on_hyphens=False), **place)
+            axis.text(0.995, 0.995, fill(f"above the picture: {', '.join(far)}", 50, break_on_hyphens=False), **place)
     handles = [
         Line2D([], [], ls="none", marker=one.marker, color=one.colour, ms=7, mfc="none", mew=1.6, label=name)
         for name, one in style.items()
-        if name in named
+        if name in names
     ]
-    if len(named) < len(scenarios[0].outcomes):
+    if len(names) < len(scenarios[0].outcomes):
         handles.append(Line2D([], [], ls="none", marker="o", color=GREY, ms=3, label="others"))
-    columns = int(figure.get_figwidth() / (0.6 + LETTER * max(len(name) for name in named)))
+    columns = int(figure.get_figwidth() / (0.6 + LETTER * max(len(name) for name in names)))
     figure.legend(handles=handles, loc="outside lower center", ncols=max(columns, 1), frameon=False, fontsize=9)
     figure.suptitle("Error against pull activity: lower left is better, bars are 95 % intervals", fontsize=11)
     return png(figure)
+
+
+def named(scenarios: Sequence[ScenarioResult]) -> list[str]:
+    """Who is named: the best classical controller of each scenario, and :func:`.canvas.chosen` others of the first."""
+    best = set()
+    for scenario in scenarios:
+        classical = [each for each in scenario.outcomes if not (each.controller.learned or each.controller.bound)]
+        best |= {min(classical, key=lambda each: each.means[RMSE.metric].mean).controller.name} if classical else set()
+    others = [each.sample for each in scenarios[0].outcomes if each.controller.name not in best]
+    return [*best, *(sample.controller.name for sample in chosen(others, NAMED - len(best)))]
 
 
 def _point(axis: Any, outcome: Outcome, style: Style | None, floor: float) -> None:

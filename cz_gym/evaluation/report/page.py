@@ -59,11 +59,12 @@ def page(benchmark: Benchmark) -> str:
 def _data(benchmark: Benchmark) -> dict[str, Any]:
     """What the page's script draws."""
     config, styles = benchmark.scenarios[0].row.config(), styles_of(benchmark.controllers)
-    rivals = [verdict.rival for verdict in benchmark.scenarios[0].verdicts]
+    best = min(benchmark.scenarios[0].verdicts, key=lambda verdict: verdict.difference.mean, default=None)
+    drawn = [best.rival, best.agent] if best else []
     return {
         "minutes": config.control_interval / MINUTE,
         "resolutions": [[PANELS[panel].resolution for panel, _ in lines] for lines in (OWN, SHARED)],
-        "frame": _figure(frame(benchmark.controllers, rivals, styles, config.horizon)),
+        "frame": _figure(frame(benchmark.controllers, drawn, styles, config.horizon)),
         "scenarios": [
             {"pictures": [_figure(draw(each, styles)) for draw in (pareto, errors)], "crystals": crystals(each)}
             for each in benchmark.scenarios

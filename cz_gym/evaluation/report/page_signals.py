@@ -160,15 +160,15 @@ def pack(lines: Sequence[Line]) -> str:
 
 
 def frame(
-    controllers: Sequence[Controller], rivals: Sequence[str], styles: Mapping[str, Style], horizon: float
+    controllers: Sequence[Controller], best: Sequence[str], styles: Mapping[str, Style], horizon: float
 ) -> go.Figure:
     """The panels over the ``horizon`` [s], without values: traces in the order in which a crystal's lines are packed.
 
-    The user's own, the learned, the reference and their ``rivals`` are drawn; a click in the legend draws others.
+    The user's own, the reference and the ``best`` are drawn; a click in the legend draws others.
     """
     titles = [f"{panel.title} [{panel.unit}]" for panel in PANELS]
     figure = make_subplots(len(PANELS), 1, shared_xaxes=True, vertical_spacing=0.02, subplot_titles=titles)
-    some = {each.name for each in controllers if each.own or each.learned or each.name in (REFERENCE, *rivals)}
+    some = {each.name for each in controllers if each.own or each.name in (REFERENCE, *best)}
     for group, controller in enumerate(controllers):
         style, drawn = styles[controller.name], controller.name in some or not some
         for number, (panel, name) in enumerate(OWN):
@@ -186,7 +186,8 @@ def frame(
             figure.add_hline(
                 level, row=panel + 1, col=1, line={"color": GREY, "width": 1, "dash": "dot"}, layer="below"
             )
-    figure.update_xaxes(range=[0.0, horizon / MINUTE], hoverformat=".2f")
+    # Ten numbers at most: 0, 20 ... 180 min, and finer ones in a zoom.
+    figure.update_xaxes(range=[0.0, horizon / MINUTE], hoverformat=".2f", nticks=10)
     figure.update_xaxes(title="time [min]", row=len(PANELS), col=1)
     legend = {"orientation": "h", "y": 1.02, "yanchor": "bottom", "groupclick": "togglegroup"}
     return figure.update_layout(legend=legend, height=150 * len(PANELS), hovermode="x", uirevision="same")

@@ -23,7 +23,7 @@ def headline(benchmark: Benchmark) -> str:
         return "No classical controller took part in this run to compare the agents with."
     deciding = [scenario for scenario in benchmark.scenarios if len(scenario.seeds) > 1] or list(benchmark.scenarios)
     if 1 < len(deciding[0].seeds) < FEWEST:
-        return f"No verdict from {len(deciding[0].seeds)} crystals: it needs {FEWEST}."
+        return f"No verdict: {len(deciding[0].seeds)} crystals, and a verdict needs at least {FEWEST}."
     winners = [[verdict.agent for verdict in scenario.verdicts if verdict.wins] for scenario in deciding]
     if always := [agent for agent in agents if all(agent in some for some in winners)]:
         first = f"{', '.join(always)} win{'s' if len(always) == 1 else ''} on every scenario."

@@ -11,6 +11,7 @@ import train
 from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.training import run, run_files
 from cz_gym.agents.training.recipes import PPO, RECIPES, Gradient
+from cz_gym.commands import interpreter
 
 ROOT = Path(__file__).parents[3]
 
@@ -32,6 +33,8 @@ def test_a_run_leaves_everything_and_goes_on(
 ) -> None:
     folder = tmp_path / "run"
     assert train.main(["--algo", algorithm, "--steps", "20000", "--seed", "3", "--out", str(folder), "--plot"]) == 0
+    also = ", hard, sensor-fault and puller" if algorithm == "gradient" else ""
+    assert f" steps on randomized{also}, into {folder}\n" in capsys.readouterr().out
     assert (folder / "progress.png").read_bytes().startswith(b"\x89PNG")
     saved = json.loads((folder / "settings.json").read_text())
     assert saved["seed"] == 3
@@ -85,7 +88,7 @@ def test_an_interrupted_run_keeps_its_checkpoint(
     folder = tmp_path / "run"
     assert train.main(["--steps", "10000", "--out", str(folder)]) == 130
     assert (folder / "checkpoint.safetensors").exists()
-    assert f"saved, python train.py --resume --out {folder} goes on" in capsys.readouterr().err
+    assert f"saved, {interpreter()} train.py --resume --out {folder} goes on" in capsys.readouterr().err
 
 
 def test_interrupting_before_learning_gives_one_line(
@@ -104,7 +107,7 @@ def test_interrupting_before_learning_gives_one_line(
         assert train.main(given) == 130
         said = capsys.readouterr().err
         assert said.count("\n") == 1
-        assert f"python train.py --resume {resumes} goes on" in said
+        assert f"{interpreter()} train.py --resume {resumes} goes on" in said
 
 
 @pytest.mark.parametrize(
@@ -126,6 +129,13 @@ def test_interrupting_before_learning_gives_one_line(
 def test_mistakes_give_one_line(tmp_path: Path, arguments: list[str], message: str, refused: Any) -> None:
     assert message in refused(train.main, [*arguments, "--out", str(tmp_path / "run")])
     assert not (tmp_path / "run").exists()
+
+
+def test_a_run_that_is_refused_leaves_no_logs(tmp_path: Path, refused: Any) -> None:
+    assert "no such file" in refused(
+        train.main, ["--from", str(tmp_path / "none.onnx"), "--out", str(tmp_path / "run")]
+    )
+    assert not list(tmp_path.rglob("tensorboard"))
 
 
 @pytest.mark.parametrize(

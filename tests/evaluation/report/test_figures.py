@@ -1,6 +1,7 @@
 """Figures: who is shown when there are many, colours, and a crystal that nothing disturbs."""
 
 import io
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -11,9 +12,9 @@ from cz_gym.baselines import OpenLoop
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.protocol import find_row
-from cz_gym.evaluation.report.canvas import COLOURS, DPI, KNOWN, chosen, styles, styles_of
+from cz_gym.evaluation.report.canvas import COLOURS, DPI, KNOWN, ORDER, chosen, styles, styles_of
 from cz_gym.evaluation.report.crystal import COLUMNS
-from cz_gym.evaluation.report.figures import NAMED, draw_figures
+from cz_gym.evaluation.report.figures import NAMED, draw_figures, named
 from cz_gym.evaluation.report.markdown import QUOTED
 from cz_gym.evaluation.results import Benchmark, Controller, Sample, summarise
 from cz_gym.evaluation.rollout import rollout
@@ -53,9 +54,27 @@ def test_the_figure_shows_the_controllers_of_readme_s_table() -> None:
     assert names(chosen(many, COLUMNS)) == list(QUOTED)
 
 
+def test_the_best_classical_controller_of_each_scenario_is_named() -> None:
+    def scenario(best: str) -> Any:
+        many = [sample(f"c{i}", 1.0) for i in range(NAMED)] + [sample("paper", 3.0), sample("lqg-quiet", 2.0)]
+        many = [*many, sample("ppo", 0.1, seeds=(0,)), sample("bound", 0.1, "state")]
+        means = [0.5 if each.controller.name == best else float(each.values.mean()) for each in many]
+        return SimpleNamespace(
+            outcomes=[
+                SimpleNamespace(sample=each, controller=each.controller, means={"rmse_mm": SimpleNamespace(mean=mean)})
+                for each, mean in zip(many, means, strict=True)
+            ]
+        )
+
+    found = named([scenario("c3"), scenario("lqg-quiet")])
+    assert len(found) == len(set(found)) == NAMED
+    assert {"paper", "ppo", "c3", "lqg-quiet"} < set(found)
+
+
 def test_a_known_controller_looks_the_same_everywhere_and_no_colour_comes_twice() -> None:
-    alone = styles(["lqg-at-0.02"])
-    everyone = styles_of([sample(name, 1.0).controller for name in ("mine", *KNOWN, *(f"c{i}" for i in range(18)))])
+    assert set(ORDER) == {each.name for each in benchmark.classical() if each.default} | set(benchmark.SHIPPED)
+    alone, others = styles(["lqg-at-0.02"]), (f"c{i}" for i in range(len(COLOURS) - 1 - len(ORDER)))
+    everyone = styles_of([sample(name, 1.0).controller for name in ("mine", *ORDER, *others)])
     assert everyone["lqg-at-0.02"] == alone["lqg-at-0.02"]
     assert len({one.colour for one in everyone.values()}) == len(everyone) == len(COLOURS)
     assert len(COLOURS) >= NAMED

@@ -21,9 +21,9 @@ from cz_gym.env import CzEnv
 from cz_gym.evaluation.report.canvas import styles_of
 from cz_gym.evaluation.report.page import _asset, embedded, page
 from cz_gym.evaluation.report.page_figures import DISTRIBUTIONS, errors, pareto, plain
-from cz_gym.evaluation.report.page_signals import OWN, PANELS, SHARED, crystals, pack
+from cz_gym.evaluation.report.page_signals import OWN, PANELS, SHARED, crystals, frame, pack
 from cz_gym.evaluation.report.tables import DRIVES, ERROR, comparison
-from cz_gym.evaluation.results import Benchmark
+from cz_gym.evaluation.results import Benchmark, Controller
 from cz_gym.observation import MEASURED, scales
 from tests.samples import scenario_of
 
@@ -142,6 +142,16 @@ def test_pictures_are_the_results(made: Made) -> None:
             assert (point.y[0] - point.error_y.arrayminus[0], point.y[0] + point.error_y.array[0]) == pytest.approx(
                 (low, high)
             )
+
+
+def test_at_first_the_reference_the_best_and_one_s_own_are_drawn_over_all_the_time() -> None:
+    who = [Controller(name, "measured", "", (0,)) for name in ("agent", "worse")]
+    who += [Controller(name, "measured", "", own=name == "mine") for name in ("paper", "lqg", "pid", "mine")]
+    drawn = frame(who, ["lqg", "agent"], styles_of(who), 10800.0)
+    seen = {each.legendgroup for each in drawn.data if each.visible is True}
+    assert [who[int(group)].name for group in sorted(seen)] == ["agent", "paper", "lqg", "mine"]
+    assert drawn.layout.xaxis.range[1] % 20.0 == 0.0
+    assert drawn.layout.xaxis.nticks == 10, "plotly then writes a number every 20 min, the last one too"
 
 
 def test_numbers_at_a_logarithmic_axis_are_plotly_s_own(made: Made) -> None:

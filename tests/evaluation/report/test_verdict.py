@@ -51,7 +51,7 @@ def test_a_single_crystal_does_not_count_beside_others() -> None:
 def test_a_few_crystals_give_no_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
     few = made(one=[BETTER])
     monkeypatch.setattr(verdict, "FEWEST", verdict.FEWEST + 1)
-    assert headline(few) == "No verdict from 20 crystals: it needs 21."
+    assert headline(few) == "No verdict: 20 crystals, and a verdict needs at least 21."
 
 
 def test_without_agents_or_rivals_it_says_so() -> None:
