@@ -6,6 +6,8 @@ own use those of ``randomized``.
 
 from __future__ import annotations
 
+from typing import Any
+
 from cz_gym.config import Config
 from cz_gym.units import MM
 
@@ -17,8 +19,10 @@ from .ring_model import RingModel
 PULLER_RING = RingModel(latency=5.0, ripple_sd=0.08 * MM)
 """The camera of ``puller``: its latency and rotation, and what amplitudes between 0 and 0.2 mm come to on average."""
 WEIGHTS = "pull", "pull_step", "heater_step"
-NOISE = "fast_sd", "slow_sd", "drift_rate_sd", "drift_rate_tau"
-NOISE += "heater_walk", "thermal_walk", "pyrometer_sd", "recipe_share"
+NOISE = (
+    *("fast_sd", "slow_sd", "drift_rate_sd", "drift_rate_tau"),
+    *("heater_walk", "thermal_walk", "pyrometer_sd", "recipe_share"),
+)
 SEARCHED = (*(f"weights.{name}" for name in WEIGHTS), *(f"noise.{name}" for name in NOISE))
 """What a search chooses of the settings, fields joined by dots."""
 SHIPPED: dict[str, dict[str, tuple[float, ...]]] = {}
@@ -80,10 +84,10 @@ def settings_of(controller: str, scenario: str) -> LQGSettings:
     """The frozen settings of an LQG for that scenario."""
     shipped = SHIPPED[controller]
     where = scenario if scenario in shipped else "randomized"
-    weights, noise = shipped[where][: len(WEIGHTS)], shipped[where][len(WEIGHTS) :]
+    values: dict[str, Any] = dict(zip(SEARCHED, shipped[where], strict=True))
     return LQGSettings(
-        NoiseModel(**dict(zip(NOISE, noise, strict=True))),
-        Weights(**dict(zip(WEIGHTS, weights, strict=True))),
+        NoiseModel(**{name: values[f"noise.{name}"] for name in NOISE}),
+        Weights(**{name: values[f"weights.{name}"] for name in WEIGHTS}),
         ring=PULLER_RING if where == "puller" else None,
     )
 

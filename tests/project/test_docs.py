@@ -34,7 +34,6 @@ from tests.processes import ROOT, python  # noqa: E402
 
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
-LATER = {"docs/ablation.md", "docs/controllers/bounds.md", "docs/controllers/lqg.md"}
 SLOW = {"docs/paper.md", "docs/extend/meniscus.md"}
 SMALL = {
     "num_envs=10_000": "num_envs=100",
@@ -262,10 +261,8 @@ def test_pages_read_well_on_github_and_their_tables_are_the_code_s(monkeypatch: 
 
 
 def test_shell_blocks_name_the_environment_s_python() -> None:
-    """Left out are pages that are written by others at the moment."""
     for page in PAGES:
-        if str(page.relative_to(ROOT)) not in LATER:
-            assert re.findall(r"^ *(?:\$ )?python (?:-m|\w+\.py) ?.*", page.read_text(), re.MULTILINE) == [], page
+        assert re.findall(r"^ *(?:\$ )?python (?:-m|\w+\.py) ?.*", page.read_text(), re.MULTILINE) == [], page
 
 
 @pytest.fixture
