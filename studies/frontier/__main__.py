@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from cz_gym.atomic_files import write_files
 from cz_gym.baselines.lqg.settings import FAMILY
 from cz_gym.commands import OneLineParser, guarded
 from cz_gym.evaluation.equal_activity import Point, frontier, intervals, ratios
@@ -78,6 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = OneLineParser(prog="python -m studies.frontier", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("benchmark", type=Path, help="a benchmark.json with lqg's settings among its controllers")
     parser.add_argument("--metric", choices=("rmse_mm", "rmse_observable_mm"), default="rmse_mm")
+    parser.add_argument("--out", type=Path, help="write the tables into this file; they are printed all the same")
     given = parser.parse_args(arguments)
     return guarded(parser.prog, lambda: _compare(given), "benchmark")
 
@@ -86,7 +88,10 @@ def _compare(given: argparse.Namespace) -> int:
     results = read_points(given.benchmark, given.metric)
     beside = given.benchmark.with_name(EPISODES)
     episodes = read_episodes(beside, lambda _: (ACTIVITY, given.metric)) if beside.exists() else None
-    print(table(results, given.metric, episodes))
+    text = table(results, given.metric, episodes)
+    print(text)
+    if given.out is not None:
+        write_files({given.out: f"# Error at equal activity\n\n{text}\n".encode()})
     return 0
 
 

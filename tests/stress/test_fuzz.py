@@ -228,5 +228,5 @@ def test_files_cut_short_anywhere_are_read_or_refused(known: dict[str, Target], 
 def test_pipes_devices_and_folders_are_refused_at_once(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.onnx")
     for path in (tmp_path / "pipe.onnx", Path("/dev/zero"), tmp_path, Path("a\0b.onnx"), Path("")):
-        with pytest.raises(AgentFileError, match=r"regular file|cannot be read|null"):
+        with pytest.raises(AgentFileError, match=r"regular file|cannot be read|null|not an .onnx agent file"):
             OnnxPolicy.load(path)

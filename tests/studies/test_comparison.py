@@ -167,15 +167,15 @@ def finished(random: np.random.Generator, seeds: range, shift: float) -> dict[in
 
 def test_curves_stand_beside_the_classical_controllers() -> None:
     runs = {"ppo": finished(np.random.default_rng(0), range(1), 0.0)}
-    assert figures_of_it._references(table.tabulate(VARIANTS, runs, {})) == {}
+    assert figures_of_it._references(table.tabulate(VARIANTS, runs)) == {}
     runs["ppo"][0] = runs["ppo"][0]._replace(validations=[{"lqg_rmse_mm": 0.06, "validation_rmse_mm": 0.05}])
-    assert figures_of_it._references(table.tabulate(VARIANTS, runs, {})) == {"lqg": 0.06}
+    assert figures_of_it._references(table.tabulate(VARIANTS, runs)) == {"lqg": 0.06}
 
 
 def test_differences_are_paired_by_crystal_and_training_seed() -> None:
     random = np.random.default_rng(0)
     runs = {"ppo": finished(random, range(3), 0.0), "sac": finished(random, range(2), 0.1)}
-    base, other = table.tabulate(VARIANTS, runs, {})
+    base, other = table.tabulate(VARIANTS, runs)
     assert base.cells[RMSE].difference is None
     values, reference = (np.array([runs[name][seed].figures[:, 0] for seed in range(2)]) for name in ("sac", "ppo"))
     cell = other.cells[RMSE]

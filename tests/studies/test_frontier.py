@@ -46,7 +46,8 @@ def test_episodes_beside_a_benchmark_give_intervals_unless_they_are_of_another_r
     (tmp_path / "episodes.csv").write_text("\n".join(lines))
     path = tmp_path / "benchmark.json"
     path.write_text(json.dumps({"results": {"randomized": {name: entry(*pair) for name, pair in values.items()}}}))
-    assert frontier.main([str(path)]) == 0
+    assert frontier.main([str(path), "--out", str(tmp_path / "ratios.md")]) == 0
+    assert "| 1.044 [1.044, 1.044] |" in (tmp_path / "ratios.md").read_text()
     assert "| 1.044 [1.044, 1.044] |" in capsys.readouterr().out
     (tmp_path / "episodes.csv").write_text("\n".join([*lines[:-1], lines[-1].replace("0.06", "nan")]))
     assert "no episodes of a benchmark, or damaged" in refused(frontier.main, [str(path)])
