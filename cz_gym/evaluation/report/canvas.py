@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from itertools import chain, count
 from typing import IO, NamedTuple
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -45,13 +46,14 @@ class Style(NamedTuple):
 
 
 def styles(names: Sequence[str]) -> dict[str, Style]:
-    """One style a controller: that of its place in :data:`ORDER`, or one of those after it, in turn."""
-    markers, places = list(MARKERS), [*ORDER, *(name for name in names if name not in ORDER)]
-    found = {
+    """One style a controller: that of its place in :data:`ORDER`, or in turn one that no other here has."""
+    markers, absent = list(MARKERS), [i for i, name in enumerate(ORDER) if name not in names]
+    free = chain(range(len(ORDER), len(COLOURS)), absent, count(len(COLOURS)))
+    places = {name: ORDER.index(name) if name in ORDER else next(free) for name in names}
+    return {
         name: Style(COLOURS[i % len(COLOURS)], markers[i % len(markers)], DASHES[i // len(COLOURS) % len(DASHES)])
-        for i, name in enumerate(places)
+        for name, i in places.items()
     }
-    return {name: found[name] for name in names}
 
 
 def styles_of(controllers: Sequence[Controller]) -> dict[str, Style]:

@@ -77,6 +77,8 @@ def test_a_known_controller_looks_the_same_everywhere_and_no_colour_comes_twice(
     everyone = styles_of([sample(name, 1.0).controller for name in ("mine", *ORDER, *others)])
     assert everyone["lqg-at-0.02"] == alone["lqg-at-0.02"]
     assert len({one.colour for one in everyone.values()}) == len(everyone) == len(COLOURS)
+    few = styles(["lqg-at-0.02", *(f"c{i}" for i in range(len(COLOURS) - 1))])
+    assert len({one.colour for one in few.values()}) == len(COLOURS), "colours of those who are absent are free"
     assert len(COLOURS) >= NAMED
     many = styles([f"c{i}" for i in range(40)]).values()
     assert len({(one.colour, one.dash) for one in many}) == 40, "on a page every one has a line of its own"
