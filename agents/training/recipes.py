@@ -264,7 +264,7 @@ class RandomSearch(Reinforcement):
 LQG_COST = CostWeights(pull=0.0178, pull_step=0.1, heater_step=51.6)
 """The cost that the regulator of lqg-at-0.02 was made for, as multiples of the environment's."""
 GRADIENT_COST = CostWeights(pull=0.11, pull_step=0.07, heater_step=23.4, observable=True)
-"""The cost that the recipe gradient follows: near an LQG's for the radius, without what no sensor shows."""
+"""The cost that the recipe gradient follows: near that of lqg-quiet, without what no sensor shows."""
 RADIUS_COST = replace(GRADIENT_COST, pull=0.018, pull_step=0.14)
 """The cost that its specialists follow: the pull speed may go where it wants, as the frontier's LQGs have it."""
 _OTHERS = ("sensor-fault", 1.0, 0.3), ("", 2.0, 0.03)

@@ -72,7 +72,8 @@ def markdown(benchmark: Benchmark, figures: Iterable[str]) -> str:
         "95 % bootstrap interval; a scenario without randomness is one crystal and has no interval. After a failure "
         "the radius error counts 8 mm to the end; drives, growth rate and ground-off are those of the time before it. "
         f"No failure in n crystals still allows a rate of up to 3/n, {3 / most / PERCENT:.2g} % at n = {most}. "
-        "docs/benchmark.md has the protocol and every formula.",
+        "The first line compares radius errors alone: who moves the pull speed more can have less. "
+        "docs/controllers/bounds.md compares at equal pull steps, docs/benchmark.md has the protocol and every formula.",
         summary(benchmark),
         *(f"![{name.removesuffix('.png')}]({name})" for name in figures),
         "## Who took part",
