@@ -73,7 +73,8 @@ def markdown(benchmark: Benchmark, figures: Iterable[str]) -> str:
         "the radius error counts 8 mm to the end; drives, growth rate and ground-off are those of the time before it. "
         f"No failure in n crystals still allows a rate of up to 3/n, {3 / most / PERCENT:.2g} % at n = {most}. "
         "The first line compares radius errors alone: who moves the pull speed more can have less. "
-        "docs/controllers/bounds.md compares at equal pull steps, docs/benchmark.md has the protocol and every formula.",
+        "docs/controllers/bounds.md compares at equal pull steps, "
+        "docs/benchmark.md has the protocol and every formula.",
         summary(benchmark),
         *(f"![{name.removesuffix('.png')}]({name})" for name in figures),
         "## Who took part",
