@@ -44,6 +44,9 @@ class LQGSearch(Search):
     """COBYLA from the goal's start."""
 
     def __init__(self, controller: str, scenario: str, budget: Mapping[str, int]) -> None:
+        if (controller, scenario) not in GOALS:
+            known = ", ".join(where for name, where in GOALS if name == controller)
+            raise ValueError(f"{controller} has no goal on {scenario!r}, but on {known}")
         self.goal = GOALS[controller, scenario]
         super().__init__(controller, scenario, self.goal.start, PARAMETERS, budget)
 

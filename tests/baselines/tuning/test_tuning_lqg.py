@@ -105,6 +105,11 @@ def test_another_scenario_is_tuned_on_its_own_training_seeds(search, tmp_path):
     assert met == {"puller": {*range(4), *range(100_000, 100_003), *VALIDATION_SEEDS[:7]}}
 
 
+def test_a_controller_without_a_goal_on_a_scenario_is_refused_in_a_line(tmp_path, refused):
+    arguments = ["--controller", "lqg", "--scenario", "hard", "--output", str(tmp_path / "lqg.json")]
+    assert "lqg has no goal on 'hard', but on randomized" in refused(lqg_tuning.main, arguments)
+
+
 def test_the_command_writes_what_the_search_chose(search, tmp_path, capsys):
     search()
     output = tmp_path / "lqg.json"
