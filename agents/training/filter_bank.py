@@ -71,7 +71,9 @@ _STRENGTHS = 1 + len(NOISY) + 1 + len(SWINGS)
 UNLED = _STRENGTHS + 1 + CLEANED
 """Features that no action is chosen for: outliers and ripples, and what schedules the linear map."""
 HELD = 2
-"""Place in :data:`TIMES` of the mean that stands in for a reading that failed."""
+"""Place in :data:`TIMES` of the mean that stands in for a reading that failed, where nothing better is learned."""
+REMEMBERED = MEANS + len(MEASURED)
+"""How many means and readings there are."""
 _BEGUN = len(SIGNALS) * len(TIMES)
 """Place of the first mean of "valid"."""
 _GROWTH = len(SIGNALS) * (len(TIMES) + 1) + 4
@@ -92,6 +94,8 @@ class FilterBank(nn.Module):
     features: torch.Tensor
     gains: torch.Tensor
     ring: torch.Tensor
+    expected: torch.Tensor
+    """What a reading that failed is taken to be, of means and readings, shape (MEANS + 11, 1)."""
     ones: torch.Tensor
     spread: torch.Tensor
     gather: torch.Tensor
@@ -110,6 +114,7 @@ class FilterBank(nn.Module):
         self._constant("features", features)
         self._constant("gains", np.array(GAINS))
         self._constant("ring", np.eye(1, len(MEASURED), _AT["ring_error"]))
+        self.register_buffer("expected", torch.eye(REMEMBERED, REMEMBERED)[:, HELD : HELD + 1].clone())
         swings = np.zeros((MEANS, len(SWINGS)))
         for band, pair in enumerate(SWINGS):
             swings[len(TIMES) * SIGNALS.index("v_p") + np.array(pair), band] = 1.0, -1.0
@@ -145,7 +150,7 @@ class FilterBank(nn.Module):
         first = held(columns(means, range(_BEGUN, _BEGUN + 1)) * -1e6 + 1.0, 0.0, 1.0)
         with torch.no_grad():
             ring, valid = (columns(measured, range(_AT[name], _AT[name] + 1)) for name in ("ring_error", "valid"))
-            failed = (columns(means, range(HELD, HELD + 1)) - ring) * (valid * -1.0 + 1.0)
+            failed = (joined([means, measured]) @ self.expected - ring) * (valid * -1.0 + 1.0)
         measured = measured + failed @ self.ring
         means = means * self.keep + measured @ self.gain
         with torch.no_grad():

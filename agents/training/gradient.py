@@ -23,8 +23,9 @@ from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from cz_gym.observation import MEASURED, scales
 from cz_gym.task import COST_CAP, RADIUS_SCALE, Cost, cost_terms, drives_of
 
-from .crystals import Crystals
+from .crystals import Crystals, Evenness
 from .demonstrations import widened
+from .expectation import Expectation
 from .filter_bank import MEANS, STATE, UNLED, FilterBank, read_bank
 from .learner import Parts, Watch
 from .networks import whitening
@@ -99,6 +100,8 @@ class GradientLearner:
             if recipe.whitened and isinstance(layer, nn.Linear) and layer.in_features == width:
                 self.whitened.append((layer, _OfWhitened(width)))
                 register_parametrization(layer, "weight", self.whitened[-1][1])
+        self.expectation = Expectation() if recipe.expects else None
+        self.evenness: Evenness | None = None
         self.products, self.seen = torch.zeros(width, width, dtype=torch.float64), 0
         weights = self.network.parameters()
         self.optimiser = torch.optim.Adam(weights, recipe.learning_rate, betas=(0.9, recipe.beta2))
@@ -116,6 +119,8 @@ class GradientLearner:
         memory = torch.zeros(n, STATE)
         windows = self.config.steps // recipe.window
         left = self.random.integers(1, windows, n, endpoint=True)
+        if recipe.evenly:
+            self.evenness = Evenness(batch, windows)
         while self.steps < self.total:
             progress = self.steps / self.total
             self.optimiser.param_groups[0]["lr"] = recipe.learning_rate * (1.0 - progress)
@@ -126,6 +131,9 @@ class GradientLearner:
                 self._standardise(features)
             if recipe.whitened:
                 self._whiten(features, progress)
+            if self.expectation and progress >= WARM_UP:
+                self.expectation.teach(self.network)
+                self.expectation = None
             measured, memory = window.measured, window.memory
             left -= 1
             over = np.flatnonzero(~batch.grows | (left == 0)).tolist()
@@ -133,6 +141,8 @@ class GradientLearner:
                 measured = batch.reset(self._seeds(len(over)), over)
                 memory[over] = 0.0
                 left[over] = windows
+                if self.evenness:
+                    self.evenness.begin(over)
             self.steps += self.per_update
             watch(self.steps, "")
         batch.close()
@@ -151,7 +161,10 @@ class GradientLearner:
         features, costs, beyond, jacobians = [], [], [], []
         with torch.no_grad():
             for _ in range(self.recipe.window):
-                seen, memory = self.network.remember(torch.from_numpy(measured), memory)
+                readings = torch.from_numpy(measured)
+                if self.expectation:
+                    self.expectation.see(memory, readings)
+                seen, memory = self.network.remember(readings, memory)
                 action = self.network.act(seen).numpy()
                 step = self._weighed(batch.step(action))
                 beyond.append(self._beyond(measured, action, step))
@@ -189,7 +202,10 @@ class GradientLearner:
         What the network's action makes of its features has its derivatives taken for some steps at once.
         """
         cost = window.costs @ self.weights
+        capped = COST_CAP * cost / (COST_CAP + cost)
         by_cost = (COST_CAP / (COST_CAP + cost)) ** 2 / cost.size
+        if self.evenness:
+            by_cost *= self.evenness.weights(capped.mean(axis=0))
         steps, n = cost.shape
         rows, by_memory = np.zeros((n, len(STATES) + len(self.weights))), np.zeros((n, MEANS), np.float32)
         weights = list(self.network.parameters())
@@ -215,7 +231,7 @@ class GradientLearner:
             return
         self.norms[1:], self.norms[0] = self.norms[:-1].clone(), norm
         self.optimiser.step()
-        self.logger.record("gradient/cost", float((COST_CAP * cost / (COST_CAP + cost)).mean()))
+        self.logger.record("gradient/cost", float(capped.mean()))
         self.logger.record("gradient/norm", float(norm))
 
     def _standardise(self, seen: torch.Tensor) -> None:

@@ -127,6 +127,11 @@ class Gradient(Rewarded):
     """Whether the linear map depends on noise, swings, the reference and the crystal's age."""
     whitened: bool = False
     """Whether, after a warm-up, weights are learned as those of whitened features."""
+    expects: bool = False
+    """Whether a reading that fails is replaced by what is to be expected of means and other readings, as the warm-up
+    shows it, instead of by a mean of 23 s."""
+    evenly: bool = False
+    """Whether a crystal counts by the root of its cost, as in a mean of RMS errors; without, by its cost."""
     learning_rate: float = 1.2e-2
     """Of Adam at the start; it falls linearly to zero."""
     beta2: float = 0.9
@@ -268,7 +273,15 @@ GRADIENT_COST = CostWeights(pull=0.11, pull_step=0.07, heater_step=23.4, observa
 RADIUS_COST = replace(GRADIENT_COST, pull=0.018, pull_step=0.14)
 """The cost that its specialists follow: the pull speed may go where it wants, as the frontier's LQGs have it."""
 _OTHERS = ("sensor-fault", 1.0, 0.3), ("", 2.0, 0.03)
-_ON = Gradient(start="gradient", steps=Gradient.steps // 4, whitened=True, learning_rate=2e-3, weights=RADIUS_COST)
+_ON = Gradient(
+    start="gradient",
+    steps=Gradient.steps * 3 // 8,
+    whitened=True,
+    expects=True,
+    evenly=True,
+    learning_rate=2e-3,
+    weights=RADIUS_COST,
+)
 SPECIALISTS = (
     replace(_ON, name="gradient-randomized", also=_OTHERS),
     replace(_ON, name="gradient-randomized-calm", also=_OTHERS, weights=replace(RADIUS_COST, pull_step=0.28)),
@@ -285,7 +298,10 @@ SPECIALISTS = (
         name="gradient-puller",
         scenario="puller",
         also=(),
+        steps=Gradient.steps // 4,
         whitened=False,
+        expects=False,
+        evenly=False,
         learning_rate=4e-3,
         weights=GRADIENT_COST,
     ),
