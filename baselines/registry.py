@@ -9,6 +9,7 @@ from functools import partial
 from cz_gym.baselines.bounds import lqg as lqg_bounds
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
 from cz_gym.baselines.lqg import settings as lqg_settings
+from cz_gym.baselines.lqg.adaptive import adaptive
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
 from cz_gym.baselines.pid.open_loop import OpenLoop
 from cz_gym.baselines.pid.settings import tuned
@@ -67,6 +68,12 @@ def _lqg_at(activity: float) -> Entry:
     return _lqg(lqg_settings.family_name(activity), meaning, default=activity == IN_TABLE)
 
 
+def _adaptive(name: str) -> Entry:
+    make = partial(lqg_settings.lqg, name)
+    meaning = f"{name} with filters for weak to strong fluctuations, weighed by how well they predict"
+    return Entry(f"{name}-adaptive", lambda config: adaptive(make(config)), "measured", meaning, default=False)
+
+
 def _ekf_mpc(config: Config) -> Policy:
     from cz_gym.baselines.mpc.controller import ekf_mpc
 
@@ -82,6 +89,8 @@ def _privileged(name: str) -> Entry:
     return _bound(f"{name}-privileged", lambda config: lqg_bounds.privileged(make(config)), "measured", meaning)
 
 
+_TOLD = "lqg-quiet", *map(lqg_settings.family_name, (0.013, IN_TABLE))
+"""LQGs that there are adaptive and privileged ones of."""
 CONTROLLERS: tuple[Entry, ...] = (
     Entry("open-loop", lambda config: OpenLoop(), "measured", "nominal pull speed and heater power, no feedback"),
     Entry("paper", _paper, "measured", "the paper's compensator and PID as printed, Table 1"),
@@ -93,9 +102,10 @@ CONTROLLERS: tuple[Entry, ...] = (
     _lqg("lqg", "Kalman filter and LQ regulator of pull and heater, for the reward"),
     _lqg("lqg-quiet", "the same for low pull activity"),
     *(_lqg_at(activity) for activity in lqg_settings.ACTIVITIES),
+    *map(_adaptive, _TOLD),
     Entry("ekf-mpc", _ekf_mpc, "measured", "nonlinear MPC on a bank of lqg's filters", default=False, slow=True),
     _bound("lqg-true", lqg_bounds.lqg_true, "measured", "bound: lqg given the puller's parameters"),
-    *map(_privileged, ("lqg-quiet", *map(lqg_settings.family_name, (0.013, IN_TABLE)))),
+    *map(_privileged, _TOLD),
     _bound("full-information", lqg_bounds.full_information, "state", "bound: lqg's regulator, true state seen"),
     _bound(
         "clairvoyant",

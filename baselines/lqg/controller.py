@@ -126,12 +126,13 @@ class LQG(MeasuredController):
 
     def step(self, seen: Measured, memory: Memory) -> tuple[Floats, Floats, Memory]:
         """Pull speed and heater power above nominal, and the new memory."""
-        gains, share = self.gains, self.settings.noise.recipe_share
+        return self.step_with(self.gains.filter, self.law, seen, memory)
 
-        def law(estimate: Floats, plan: Floats, previous: Floats) -> Floats:
-            return optimal_inputs(estimate, plan, previous, gains.regulator, share, self.v_0)
-
-        return self.step_with(gains.filter, law, seen, memory)
+    def law(self, estimate: Floats, plan: Floats, previous: Floats) -> Floats:
+        """The regulator's inputs; arguments as of :func:`optimal_inputs`."""
+        return optimal_inputs(
+            estimate, plan, previous, self.gains.regulator, self.settings.noise.recipe_share, self.v_0
+        )
 
     def step_with(
         self,
