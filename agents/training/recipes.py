@@ -307,8 +307,17 @@ SPECIALISTS = (
     ),
 )
 """The recipe gradient for one scenario each; for ``randomized`` at three activities."""
-ALL = replace(_ON, name="gradient-all", also=Gradient.also, learning_rate=3e-3)
-"""The recipe gradient further, on its own crystals of all four scenarios."""
+ALL = replace(
+    _ON,
+    name="gradient-all",
+    also=(("", 2.0, 0.05), ("hard", 1.0, 0.2), ("sensor-fault", 1.0, 0.3), ("puller", 1.0, 0.25)),
+    num_envs=64,
+    window=540,
+    learning_rate=3e-3,
+    weights=replace(RADIUS_COST, pull=0.05),
+)
+"""The recipe gradient further, on crystals of all four scenarios. A pull speed at the limits of ``puller`` leaves the
+rest to the heater, whose effect shows after more than 15 min: hence the longer windows."""
 RECIPES: dict[str, Recipe] = {
     recipe.name: recipe
     for recipe in (
