@@ -273,42 +273,32 @@ GRADIENT_COST = CostWeights(pull=0.11, pull_step=0.07, heater_step=23.4, observa
 RADIUS_COST = replace(GRADIENT_COST, pull=0.018, pull_step=0.14)
 """The cost that its specialists follow: the pull speed may go where it wants, as the frontier's LQGs have it."""
 _OTHERS = ("sensor-fault", 1.0, 0.3), ("", 2.0, 0.03)
-_ON = Gradient(
-    start="gradient",
-    steps=Gradient.steps * 3 // 8,
-    whitened=True,
-    expects=True,
-    evenly=True,
-    learning_rate=2e-3,
-    weights=RADIUS_COST,
-)
+_ON = Gradient(start="gradient", steps=Gradient.steps // 4, whitened=True, learning_rate=2e-3, weights=RADIUS_COST)
+_FURTHER = replace(_ON, steps=Gradient.steps * 3 // 8, expects=True, evenly=True)
 SPECIALISTS = (
     replace(_ON, name="gradient-randomized", also=_OTHERS),
     replace(_ON, name="gradient-randomized-calm", also=_OTHERS, weights=replace(RADIUS_COST, pull_step=0.28)),
     replace(_ON, name="gradient-randomized-agile", also=_OTHERS, weights=replace(RADIUS_COST, pull_step=0.08)),
     replace(
-        _ON,
+        _FURTHER,
         name="gradient-hard",
         scenario="hard",
         also=(("sensor-fault", 1.0, 0.2), ("", 1.3, 0.1), ("puller", 1.0, 0.1)),
     ),
-    replace(_ON, name="gradient-sensor-fault", scenario="sensor-fault", also=_OTHERS[1:]),
+    replace(_FURTHER, name="gradient-sensor-fault", scenario="sensor-fault", also=_OTHERS[1:]),
     replace(
         _ON,
         name="gradient-puller",
         scenario="puller",
         also=(),
-        steps=Gradient.steps // 4,
         whitened=False,
-        expects=False,
-        evenly=False,
         learning_rate=4e-3,
         weights=GRADIENT_COST,
     ),
 )
 """The recipe gradient for one scenario each; for ``randomized`` at three activities."""
 ALL = replace(
-    _ON,
+    _FURTHER,
     name="gradient-all",
     also=(("", 2.0, 0.05), ("hard", 1.0, 0.2), ("sensor-fault", 1.0, 0.3), ("puller", 1.0, 0.25)),
     num_envs=64,

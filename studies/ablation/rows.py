@@ -14,8 +14,7 @@ from studies.comparison.variants import Variant
 
 GRADIENT: Any = replace(RECIPES["gradient"], steps=350 * Gradient.num_envs * Gradient.window)  # type: ignore[call-arg]
 """An eighth of the recipe: it holds every crystal, and what helps shows."""
-_CHANGES: Any = {"steps": GRADIENT.steps, "weights": GRADIENT.weights, "expects": False, "evenly": False}
-SPECIALIST: Any = replace(RECIPES["gradient-randomized"], **_CHANGES)
+SPECIALIST: Any = replace(RECIPES["gradient-randomized"], steps=GRADIENT.steps, weights=GRADIENT.weights)  # type: ignore[call-arg]
 PPO: Any = replace(RECIPES["ppo"], steps=1_500_000)  # type: ignore[call-arg]
 
 
