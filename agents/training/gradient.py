@@ -100,7 +100,7 @@ class GradientLearner:
             if recipe.whitened and isinstance(layer, nn.Linear) and layer.in_features == width:
                 self.whitened.append((layer, _OfWhitened(width)))
                 register_parametrization(layer, "weight", self.whitened[-1][1])
-        self.expectation = Expectation() if recipe.expects else None
+        self.expectation = Expectation() if recipe.expects and done < WARM_UP * self.total else None
         self.evenness: Evenness | None = None
         self.products, self.seen = torch.zeros(width, width, dtype=torch.float64), 0
         weights = self.network.parameters()

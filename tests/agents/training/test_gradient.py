@@ -231,6 +231,7 @@ def test_a_reading_that_fails_is_replaced_by_what_is_to_be_expected() -> None:
 
 
 def test_specialists_learn_what_to_expect_in_their_warm_up() -> None:
+    """And go on with it: a run that is resumed later does not learn it anew."""
     recipe: Any = replace(RECIPES["gradient-sensor-fault"], num_envs=16, window=40, steps=16 * 40 * 21)
     learner = GradientLearner(recipe, 0, recipe.config, Logger(None, []), 0)
     before = learner.network.expected.clone()
@@ -238,6 +239,10 @@ def test_specialists_learn_what_to_expect_in_their_warm_up() -> None:
     assert learner.expectation is None
     assert not torch.equal(learner.network.expected, before)
     assert bool(learner.network.expected.isfinite().all())
+    resumed = GradientLearner(recipe, 0, recipe.config, Logger(None, []), 16 * 40 * 10)
+    resumed.network.load_state_dict(learner.network.state_dict())
+    resumed.learn(lambda steps, doing: None)
+    assert torch.equal(resumed.network.expected, learner.network.expected)
 
 
 def test_crystals_count_by_the_root_of_their_cost() -> None:
