@@ -90,7 +90,7 @@ def _privileged(name: str) -> Entry:
 
 
 _TOLD = "lqg-quiet", *map(lqg_settings.family_name, (0.013, IN_TABLE))
-"""LQGs that there are adaptive and privileged ones of."""
+"""LQGs that there are privileged ones of; but for the first, adaptive ones too."""
 CONTROLLERS: tuple[Entry, ...] = (
     Entry("open-loop", lambda config: OpenLoop(), "measured", "nominal pull speed and heater power, no feedback"),
     Entry("paper", _paper, "measured", "the paper's compensator and PID as printed, Table 1"),
@@ -102,7 +102,7 @@ CONTROLLERS: tuple[Entry, ...] = (
     _lqg("lqg", "Kalman filter and LQ regulator of pull and heater, for the reward"),
     _lqg("lqg-quiet", "the same for low pull activity"),
     *(_lqg_at(activity) for activity in lqg_settings.ACTIVITIES),
-    *map(_adaptive, _TOLD),
+    *map(_adaptive, _TOLD[1:]),
     Entry("ekf-mpc", _ekf_mpc, "measured", "nonlinear MPC on a bank of lqg's filters", default=False, slow=True),
     _bound("lqg-true", lqg_bounds.lqg_true, "measured", "bound: lqg given the puller's parameters"),
     *map(_privileged, _TOLD),

@@ -25,6 +25,11 @@ class Expectation:
         self.products = torch.zeros(REMEMBERED, REMEMBERED, dtype=torch.float64)
         self.with_ring = torch.zeros(REMEMBERED, dtype=torch.float64)
 
+    @property
+    def seen(self) -> bool:
+        """Whether readings were seen that were not taught yet."""
+        return bool(self.products.any())
+
     def see(self, memory: torch.Tensor, measured: torch.Tensor) -> None:
         """Readings, shape (n, 11), and what was remembered before them, shape (n, STATE)."""
         x = torch.cat([memory[:, :MEANS], measured], dim=1)[measured[:, _VALID] > 0.5].double()
@@ -34,9 +39,11 @@ class Expectation:
         self.with_ring += x.T @ ring
 
     def teach(self, network: FilterBank) -> None:
-        """Have the network expect what was seen; nothing if nothing was."""
-        if not self.products.any():
+        """Have the network expect what was seen, and forget it; nothing if nothing was."""
+        if not self.seen:
             return
         scale = torch.clamp(self.products.diagonal().sqrt(), 1e-12)
         alike = self.products / scale / scale[:, None] + RIDGE * torch.eye(REMEMBERED, dtype=torch.float64)
         network.expected[:, 0] = (torch.linalg.solve(alike, self.with_ring / scale) / scale).float()
+        self.products.zero_()
+        self.with_ring.zero_()

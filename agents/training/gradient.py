@@ -100,9 +100,9 @@ class GradientLearner:
             if recipe.whitened and isinstance(layer, nn.Linear) and layer.in_features == width:
                 self.whitened.append((layer, _OfWhitened(width)))
                 register_parametrization(layer, "weight", self.whitened[-1][1])
-        self.expectation = Expectation() if recipe.expects and done < WARM_UP * self.total else None
+        self.expectation = Expectation() if recipe.expects else None
         self.evenness: Evenness | None = None
-        self.products, self.seen = torch.zeros(width, width, dtype=torch.float64), 0
+        self.products, self.seen = (torch.zeros(size, dtype=torch.float64) for size in ((width, width), (1,)))
         weights = self.network.parameters()
         self.optimiser = torch.optim.Adam(weights, recipe.learning_rate, betas=(0.9, recipe.beta2))
         self.norms = torch.zeros(LAST_GRADIENTS)
@@ -133,7 +133,6 @@ class GradientLearner:
                 self._whiten(features, progress)
             if self.expectation and progress >= WARM_UP:
                 self.expectation.teach(self.network)
-                self.expectation = None
             measured, memory = window.measured, window.memory
             left -= 1
             over = np.flatnonzero(~batch.grows | (left == 0)).tolist()
@@ -159,11 +158,14 @@ class GradientLearner:
     def _drive(self, batch: Crystals, measured: Any, memory: torch.Tensor) -> Window:
         """Drive each crystal through a window."""
         features, costs, beyond, jacobians = [], [], [], []
+        expectation = self.expectation
+        if expectation and self.steps >= WARM_UP * self.total and not expectation.seen:
+            expectation = None
         with torch.no_grad():
             for _ in range(self.recipe.window):
                 readings = torch.from_numpy(measured)
-                if self.expectation:
-                    self.expectation.see(memory, readings)
+                if expectation:
+                    expectation.see(memory, readings)
                 seen, memory = self.network.remember(readings, memory)
                 action = self.network.act(seen).numpy()
                 step = self._weighed(batch.step(action))
@@ -253,7 +255,7 @@ class GradientLearner:
             x = self.network.normalised(features).double()
             self.products += x.T @ x
             self.seen += len(x)
-        elif self.seen:
+        elif bool(self.seen):
             covariance = (self.products / self.seen).numpy()[:-UNLED, :-UNLED]
             scaling = torch.eye(len(self.products))
             scaling[:-UNLED, :-UNLED] = torch.from_numpy(
@@ -265,14 +267,18 @@ class GradientLearner:
                 layer.weight = weight
             self.optimiser.state.clear()
             self.norms.zero_()
-            self.seen = 0
+            self.products.zero_()
+            self.seen.zero_()
 
     def _seeds(self, count: int) -> list[int]:
         return [int(seed) for seed in self.random.choice(len(TRAINING_SEEDS), count)]
 
     def parts(self) -> Parts:
-        """Network, optimiser and the last gradients' norms."""
-        return Parts({"network": self.network}, {"optimiser": self.optimiser}, {"norms": self.norms})
+        """Network, optimiser, the last gradients' norms, and what the warm-up has gathered."""
+        variables = {"norms": self.norms, "products": self.products, "seen": self.seen}
+        if self.expectation:
+            variables |= {"expectation": self.expectation.products, "expectation_ring": self.expectation.with_ring}
+        return Parts({"network": self.network}, {"optimiser": self.optimiser}, variables)
 
     def exported(self) -> bytes:
         """The network with its memory."""

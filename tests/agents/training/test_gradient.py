@@ -1,6 +1,7 @@
 """Learning from the gradient: it is the cost's own, the exported memory is the trained one, and it learns."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from cz_gym import agents
 from cz_gym.agents import AgentFileError, OnnxPolicy
 from cz_gym.agents.agent_file.contract import facts_of, make_contract
 from cz_gym.agents.training import filter_bank, gradient
+from cz_gym.agents.training.checkpoint import load_checkpoint, restore, to_bytes
 from cz_gym.agents.training.crystals import Crystals, Evenness
 from cz_gym.agents.training.expectation import Expectation
 from cz_gym.agents.training.filter_bank import STATE, FilterBank
@@ -230,19 +232,39 @@ def test_a_reading_that_fails_is_replaced_by_what_is_to_be_expected() -> None:
     np.testing.assert_allclose(after[:, means], as_expected[:, means], atol=5e-3)
 
 
-def test_specialists_learn_what_to_expect_in_their_warm_up() -> None:
-    """And go on with it: a run that is resumed later does not learn it anew."""
-    recipe: Any = replace(RECIPES["gradient-sensor-fault"], num_envs=16, window=40, steps=16 * 40 * 21)
-    learner = GradientLearner(recipe, 0, recipe.config, Logger(None, []), 0)
-    before = learner.network.expected.clone()
-    learner.learn(lambda steps, doing: None)
-    assert learner.expectation is None
-    assert not torch.equal(learner.network.expected, before)
-    assert bool(learner.network.expected.isfinite().all())
-    resumed = GradientLearner(recipe, 0, recipe.config, Logger(None, []), 16 * 40 * 10)
-    resumed.network.load_state_dict(learner.network.state_dict())
-    resumed.learn(lambda steps, doing: None)
-    assert torch.equal(resumed.network.expected, learner.network.expected)
+class Stopped(Exception):
+    """Ends a run."""
+
+
+@pytest.mark.parametrize("stop", [1, 2, 3, 4])
+def test_what_a_warm_up_gathers_is_not_lost_where_a_run_is_resumed(stop: int, tmp_path: Path) -> None:
+    """A warm-up of three updates ends in one expectation, and one whitening, wherever the run was stopped."""
+    recipe: Any = replace(RECIPES["gradient-sensor-fault"], num_envs=8, window=24, steps=8 * 24 * 60)
+    path, per_update = tmp_path / "checkpoint.safetensors", 8 * 24
+    first, other = (
+        GradientLearner(recipe, 0, recipe.config, Logger(None, []), done * per_update) for done in (0, stop)
+    )
+
+    def watch(learner: GradientLearner, until: int) -> None:
+        def stopped(steps: int, doing: str) -> None:
+            if steps >= until * per_update:
+                path.write_bytes(to_bytes(learner, 1.0, None))
+                raise Stopped
+
+        with pytest.raises(Stopped):
+            learner.learn(stopped)
+
+    plain = first.network.expected.clone()
+    watch(first, stop)
+    restore(other, load_checkpoint(path)[1], path)
+    before, whitened = other.network.expected.clone(), other.whitened[0][1].scaling.clone()
+    assert torch.equal(before, plain) == (stop < 4)
+    watch(other, 6)
+    assert torch.equal(other.network.expected, before) == (stop == 4)
+    assert torch.equal(other.whitened[0][1].scaling, whitened) == (stop == 4)
+    assert bool(other.network.expected.isfinite().all())
+    assert not other.expectation.seen
+    assert not other.products.any()
 
 
 def test_crystals_count_by_the_root_of_their_cost() -> None:
