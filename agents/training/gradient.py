@@ -158,9 +158,8 @@ class GradientLearner:
     def _drive(self, batch: Crystals, measured: Any, memory: torch.Tensor) -> Window:
         """Drive each crystal through a window."""
         features, costs, beyond, jacobians = [], [], [], []
-        expectation = self.expectation
-        if expectation and self.steps >= WARM_UP * self.total and not expectation.seen:
-            expectation = None
+        warm = self.steps >= WARM_UP * self.total
+        expectation = None if warm and self.expectation and not self.expectation.seen else self.expectation
         with torch.no_grad():
             for _ in range(self.recipe.window):
                 readings = torch.from_numpy(measured)
@@ -255,7 +254,7 @@ class GradientLearner:
             x = self.network.normalised(features).double()
             self.products += x.T @ x
             self.seen += len(x)
-        elif bool(self.seen):
+        elif self.seen.any():
             covariance = (self.products / self.seen).numpy()[:-UNLED, :-UNLED]
             scaling = torch.eye(len(self.products))
             scaling[:-UNLED, :-UNLED] = torch.from_numpy(

@@ -14,7 +14,7 @@ from cz_gym.baselines.policy import Floats
 from cz_gym.observation import Measured
 
 from .controller import LQG, Memory, memory_at_rest
-from .filter_bank import FilterBank, Hypotheses, filter_bank
+from .filter_bank import Hypotheses
 
 FACTORS = 0.2, 0.6, 1.0, 1.4, 1.8
 """Standard deviations that are held possible, in units of those that the LQG assumes [-]. Where an LQG assumes the root
@@ -38,14 +38,11 @@ class AdaptiveLQG(LQG):
     def at_rest(self, seen: Measured) -> Memory:
         """The filters at their initial covariance."""
         n = len(seen.v_p)
-        return memory_at_rest(n, self._bank(n), self.control_interval)
+        return memory_at_rest(n, self.bank(self.hypotheses, n), self.control_interval)
 
     def step(self, seen: Measured, memory: Memory) -> tuple[Floats, Floats, Memory]:
         """Pull speed and heater power above nominal, and the new memory."""
-        return self.step_with(self._bank(len(seen.v_p)), self.law, seen, memory)
-
-    def _bank(self, n: int) -> FilterBank:
-        return filter_bank(self.gains.filter, self.hypotheses, n)
+        return self.step_with(self.bank(self.hypotheses, len(seen.v_p)), self.law, seen, memory)
 
 
 def adaptive(lqg: LQG) -> AdaptiveLQG:

@@ -26,7 +26,7 @@ from cz_gym.physics.plant import Puller, make_puller
 from cz_gym.units import KILO
 
 from .estimator import PlantFilter
-from .filter_bank import FilterBank
+from .filter_bank import FilterBank, Hypotheses, filter_bank
 from .model import STATES, NoiseModel, plant_model
 from .preview import look_ahead, samples_ahead
 from .regulator import Regulator, Weights, regulator
@@ -120,6 +120,10 @@ class LQG(MeasuredController):
         """Gains of the design point."""
         return _at_design_point(self.settings, self.control_interval, self.parameters, self.meniscus)
 
+    def bank(self, hypotheses: Hypotheses, n: int) -> FilterBank:
+        """A bank of the design point's filters for n slots."""
+        return _bank(self.settings, self.control_interval, self.parameters, self.meniscus, hypotheses, n)
+
     def at_rest(self, seen: Measured) -> Memory:
         """The filter at its initial covariance."""
         return memory_at_rest(len(seen.v_p), self.gains.filter, self.control_interval)
@@ -155,6 +159,13 @@ class LQG(MeasuredController):
 @lru_cache(maxsize=16)
 def _at_design_point(settings: LQGSettings, dt: float, parameters: Parameters, meniscus: MeniscusModel) -> Gains:
     return solve(settings, dt, make_puller(parameters, settings.lam, meniscus), meniscus)
+
+
+@lru_cache(maxsize=2)
+def _bank(
+    settings: LQGSettings, dt: float, parameters: Parameters, meniscus: MeniscusModel, hypotheses: Hypotheses, n: int
+) -> FilterBank:
+    return filter_bank(_at_design_point(settings, dt, parameters, meniscus).filter, hypotheses, n)
 
 
 def memory_at_rest(n: int, state_filter: PlantFilter | FilterBank, dt: float) -> Memory:

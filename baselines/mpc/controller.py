@@ -15,7 +15,7 @@ import numpy as np
 
 from cz_gym.baselines.bounds.trajectory import SCALES, Limits, limits_of
 from cz_gym.baselines.lqg.controller import LQG, Memory, memory_at_rest, optimal_inputs
-from cz_gym.baselines.lqg.filter_bank import FilterBank, Hypotheses, filter_bank
+from cz_gym.baselines.lqg.filter_bank import Hypotheses
 from cz_gym.baselines.lqg.model import PLANT
 from cz_gym.baselines.lqg.regulator import Regulator, Weights, quadratic_cost
 from cz_gym.baselines.lqg.settings import lqg as shipped_lqg
@@ -83,14 +83,11 @@ class EkfMpc(MeasuredController):
     def at_rest(self, seen: Measured) -> Memory:
         """The filters at their initial covariance."""
         n = len(seen.v_p)
-        return memory_at_rest(n, self._filter_bank(n), self.lqg.control_interval)
+        return memory_at_rest(n, self.lqg.bank(self.hypotheses, n), self.lqg.control_interval)
 
     def step(self, seen: Measured, memory: Memory) -> tuple[Floats, Floats, Memory]:
         """Pull speed and heater power above nominal, and the new memory."""
-        return self.lqg.step_with(self._filter_bank(len(seen.v_p)), self.optimal_inputs, seen, memory)
-
-    def _filter_bank(self, n: int) -> FilterBank:
-        return filter_bank(self.lqg.gains.filter, self.hypotheses, n)
+        return self.lqg.step_with(self.lqg.bank(self.hypotheses, len(seen.v_p)), self.optimal_inputs, seen, memory)
 
     def optimal_inputs(self, estimate: Floats, plan: Floats, previous: Floats) -> Floats:
         """Inputs [m/s, W], deviations, shape (n, 2); the LQG's own where the prediction fails.

@@ -1,7 +1,6 @@
 """Learning from the gradient: it is the cost's own, the exported memory is the trained one, and it learns."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,9 +15,7 @@ from cz_gym import agents
 from cz_gym.agents import AgentFileError, OnnxPolicy
 from cz_gym.agents.agent_file.contract import facts_of, make_contract
 from cz_gym.agents.training import filter_bank, gradient
-from cz_gym.agents.training.checkpoint import load_checkpoint, restore, to_bytes
-from cz_gym.agents.training.crystals import Crystals, Evenness
-from cz_gym.agents.training.expectation import Expectation
+from cz_gym.agents.training.crystals import Crystals
 from cz_gym.agents.training.filter_bank import STATE, FilterBank
 from cz_gym.agents.training.gradient import GradientLearner
 from cz_gym.agents.training.plant_step import PlantStep
@@ -204,97 +201,6 @@ def test_a_reading_that_failed_is_not_believed() -> None:
             seen[1, 0], seen[1, VALID] = (9.0, 0.0) if 200 <= k < 230 else (0.5, 1.0)
             features, memory = network.remember(seen, memory)
             torch.testing.assert_close(features[1, ring], features[0, ring], rtol=0.0, atol=0.05)
-
-
-def test_a_reading_that_fails_is_replaced_by_what_is_to_be_expected() -> None:
-    """The regression finds a linear law of means and other readings, takes no failed reading for one, and changes
-    nothing where nothing was seen. What fails, the network then reads as that law has it."""
-    random, network, expectation = np.random.default_rng(0), FilterBank(5.0, ()), Expectation()
-    expectation.teach(network)
-    assert torch.equal(network.expected, FilterBank(5.0, ()).expected)
-    law = random.normal(size=(filter_bank.REMEMBERED, 1))
-    law[[filter_bank.MEANS, filter_bank.MEANS + VALID]] = 0.0
-    memory = torch.from_numpy(random.normal(size=(4000, STATE))).float()
-    seen = torch.from_numpy(random.normal(size=(4000, len(MEASURED)))).float()
-    seen[:, VALID] = torch.from_numpy(random.random(4000) < 0.5).float()
-    wanted = torch.cat([memory[:, : filter_bank.MEANS], seen], dim=1) @ torch.from_numpy(law).float()
-    readings = seen.clone()
-    readings[:, :1] = torch.where(seen[:, VALID : VALID + 1] > 0.5, wanted, torch.tensor(99.0))
-    expectation.see(memory, readings)
-    expectation.teach(network)
-    np.testing.assert_allclose(network.expected, law, atol=1e-3)
-    failed, whole = readings[readings[:, VALID] < 0.5], readings[readings[:, VALID] < 0.5].clone()
-    whole[:, 0] = wanted[readings[:, VALID] < 0.5, 0]
-    before = memory[readings[:, VALID] < 0.5]
-    with torch.no_grad():
-        after, as_expected = (network.remember(each, before)[1] for each in (failed, whole))
-    means = slice(0, len(filter_bank.TIMES))
-    np.testing.assert_allclose(after[:, means], as_expected[:, means], atol=5e-3)
-
-
-class Stopped(Exception):
-    """Ends a run."""
-
-
-@pytest.mark.parametrize("stop", [1, 2, 3, 4])
-def test_what_a_warm_up_gathers_is_not_lost_where_a_run_is_resumed(stop: int, tmp_path: Path) -> None:
-    """A warm-up of three updates ends in one expectation, and one whitening, wherever the run was stopped."""
-    recipe: Any = replace(RECIPES["gradient-sensor-fault"], num_envs=8, window=24, steps=8 * 24 * 60)
-    path, per_update = tmp_path / "checkpoint.safetensors", 8 * 24
-    first, other = (
-        GradientLearner(recipe, 0, recipe.config, Logger(None, []), done * per_update) for done in (0, stop)
-    )
-
-    def watch(learner: GradientLearner, until: int) -> None:
-        def stopped(steps: int, doing: str) -> None:
-            if steps >= until * per_update:
-                path.write_bytes(to_bytes(learner, 1.0, None))
-                raise Stopped
-
-        with pytest.raises(Stopped):
-            learner.learn(stopped)
-
-    plain = first.network.expected.clone()
-    watch(first, stop)
-    restore(other, load_checkpoint(path)[1], path)
-    before, whitened = other.network.expected.clone(), other.whitened[0][1].scaling.clone()
-    assert torch.equal(before, plain) == (stop < 4)
-    watch(other, 6)
-    assert torch.equal(other.network.expected, before) == (stop == 4)
-    assert torch.equal(other.whitened[0][1].scaling, whitened) == (stop == 4)
-    assert bool(other.network.expected.isfinite().all())
-    assert not other.expectation.seen
-    assert not other.products.any()
-
-
-def test_crystals_count_by_the_root_of_their_cost() -> None:
-    """Of three scenarios' crystals with 1, 100 and 0 times a cost that falls with their age, two rough ones have four
-    times the cost of the calm: their gradients come to count half as much. A new crystal counts as any other."""
-    evenness = Evenness(Crystals([(CONFIG, 4), (CONFIG, 4), (CONFIG, 1)]), 12)
-    size, roughness = np.array([1.0] * 4 + [100.0] * 4 + [0.0]), np.array([1.0, 1.0, 4.0, 4.0] * 2 + [1.0])
-    for _ in range(10):
-        for age in range(12):
-            weights = evenness.weights(size * roughness / (1.0 + age))
-        evenness.begin([0, *range(1, 9)])
-    np.testing.assert_allclose(weights[[2, 3, 6, 7]] / weights[[0, 1, 4, 5]], 0.5, rtol=0.1)
-    assert np.isfinite(weights).all()
-    np.testing.assert_allclose(evenness._relative, 1.0)
-
-
-def test_crystals_of_several_scenarios_are_those_of_each_alone() -> None:
-    other = CONFIG.with_scenario("puller")
-    both, alone = Crystals([(CONFIG, 3), (other, 2)]), [DifferentiableBatch(each, 2) for each in (CONFIG, other)]
-    both.reset(range(5))
-    seen = both.reset([7, 8, 7, 8], [1, 2, 3, 4])
-    actions = np.random.default_rng(0).normal(0.0, 0.3, (5, 2))
-    actions[3:] = actions[1:3]
-    for place, batch in zip((slice(1, 3), slice(3, 5)), alone, strict=True):
-        np.testing.assert_array_equal(seen[place], batch.reset([7, 8])[1])
-    step = both.step(actions)
-    for place, batch in zip((slice(1, 3), slice(3, 5)), alone, strict=True):
-        for ours, theirs in zip(step, batch.step(actions[place]), strict=True):
-            np.testing.assert_array_equal(ours[place], theirs)
-    assert both.grows.shape == (5,)
 
 
 @pytest.mark.parametrize("deviation", [0.0, 0.003, 0.03, 0.1])
