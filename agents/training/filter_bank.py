@@ -230,7 +230,7 @@ class FilterBank(nn.Module):
         own = self._graph()[0].tensors
         found = {each.name: each for each in onnx.load_from_string(content).graph.initializer}
         if any(name not in found or list(each.shape) != list(found[name].dims) for name, each in own.items()):
-            raise ValueError("not an agent of the recipe gradient")
+            raise ValueError("not an agent of this release's recipe gradient")
         for name, tensor in own.items():
             tensor.copy_(torch.from_numpy(numpy_helper.to_array(found[name]).copy()))
 
