@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 try:
     from cz_gym.commands import OneLineParser, guarded, shown
+    from cz_gym.errors import CzError
 except ModuleNotFoundError as error:
     sys.exit(f"benchmark.py: {error}")
 
@@ -197,7 +198,7 @@ def _given(files: Sequence[tuple[str, Path]]) -> dict[str, Contender]:
     policies: dict[str, list[Any]] = {}
     for name, file in files:
         if str(file) in shipped_names() and not file.exists():
-            raise ValueError(f"--agent takes a file; {file} is shipped and runs by its name: --controllers {file}")
+            raise CzError(f"--agent takes a file; {file} is shipped and runs by its name: --controllers {file}")
         policy = _load(file)
         policies.setdefault(name or policy.contract.algorithm, []).append(policy)
     return {name: _agent(name, some, own=True) for name, some in policies.items()}

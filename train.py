@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 try:
     from cz_gym.commands import OneLineParser, between, guarded, interpreter
+    from cz_gym.errors import CzError
     from cz_gym.names import unknown
 except ModuleNotFoundError as error:
     sys.exit(f"train.py: {error}")
@@ -212,7 +213,7 @@ def _take_up(arguments: argparse.Namespace, folders: list[Path]) -> int | None:
 
     begun = [folder for folder in folders if (folder / "settings.json").exists()]
     if begun and not arguments.resume:
-        raise ValueError(f"{begun[0]} holds a run already: --resume it, or name another --out")
+        raise CzError(f"{begun[0]} holds a run already: --resume it, or name another --out")
     saved = read_settings((begun or folders)[0] / "settings.json") if arguments.resume else {}
     settings = saved.get("settings")
     scenario = settings.get("scenario") if isinstance(settings, dict) else None
@@ -227,7 +228,7 @@ def _take_up(arguments: argparse.Namespace, folders: list[Path]) -> int | None:
         if getattr(arguments, name) is None:
             setattr(arguments, name, value if isinstance(value, type(default)) else default)
     if arguments.algo not in RECIPES:
-        raise ValueError(f"{arguments.out}: begun with {arguments.algo!r}, which is no recipe here: name one by --algo")
+        raise CzError(f"{arguments.out}: begun with {arguments.algo!r}, which is no recipe here: name one by --algo")
     return saved.get("steps")
 
 
@@ -242,7 +243,7 @@ def _asked_for(recipe: Recipe, arguments: argparse.Namespace, saved_steps: int |
     if isinstance(recipe, Rewarded):
         return replace(recipe, steps=arguments.steps or saved_steps or recipe.steps)
     if arguments.steps:
-        raise ValueError(f"{recipe.name} takes no --steps: its length is that of its demonstrations")
+        raise CzError(f"{recipe.name} takes no --steps: its length is that of its demonstrations")
     return recipe
 
 

@@ -14,6 +14,7 @@ from cz_gym.baselines.pid.compensated_pid import CompensatedPID
 from cz_gym.baselines.pid.open_loop import OpenLoop
 from cz_gym.baselines.pid.settings import tuned
 from cz_gym.config import Config, check_config
+from cz_gym.errors import CzError
 from cz_gym.names import unknown
 
 from .policy import Policy
@@ -123,7 +124,7 @@ def find_controller(name: str) -> Entry:
     for entry in CONTROLLERS:
         if entry.name == name:
             return entry
-    raise ValueError(unknown("controller", name, [entry.name for entry in CONTROLLERS]))
+    raise CzError(unknown("controller", name, [entry.name for entry in CONTROLLERS]))
 
 
 def make_controller(name: str, config: Config) -> Policy:

@@ -18,6 +18,8 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
+from cz_gym.errors import CzError
+
 try:
     import fcntl
 except ImportError:  # Windows
@@ -67,7 +69,7 @@ def locked(folder: Path, patience: float = 0.0) -> Iterator[None]:
         try:
             stack.enter_context(_lock(folder / USER, patience))
         except TimeoutError:
-            raise ValueError(f"{folder}: another process is at work in this folder") from None
+            raise CzError(f"{folder}: another process is at work in this folder") from None
         yield
 
 

@@ -10,6 +10,8 @@ from typing import NoReturn
 
 from gymnasium.error import DependencyNotInstalled
 
+from cz_gym.errors import CzError
+
 
 class OneLineParser(argparse.ArgumentParser):
     """Takes options only as they are written out, and says in one line what is wrong with them."""
@@ -60,7 +62,7 @@ def guarded(prog: str, body: Callable[[], int], extra: str, left: str = "nothing
         said = f'{absent} is missing: pip install ".[{extra}]"' if absent else str(error)
     except OSError as error:
         said = f"{error.filename or 'output'}: {error.strerror}" if error.strerror else str(error)
-    except (ValueError, DependencyNotInstalled) as error:
+    except (CzError, DependencyNotInstalled) as error:
         said = str(error)
     except KeyboardInterrupt:
         print(f"{prog}: interrupted; {left}", file=sys.stderr)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 from cz_gym.camera.view import Camera, camera_for, check_camera
 from cz_gym.episodes.scenario import Range, Scenario
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario, mix_of
+from cz_gym.errors import CzError
 from cz_gym.jit.cache import hashed
 from cz_gym.names import needs, unknown
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
@@ -135,18 +136,18 @@ def make_config(
     found = find_scenario(scenario)
     mix_of(model, found)
     if not isinstance(observation, str) or observation not in (*OBSERVATIONS, CAMERA):
-        raise ValueError(unknown("observation", observation, [*OBSERVATIONS, CAMERA]))
+        raise CzError(unknown("observation", observation, [*OBSERVATIONS, CAMERA]))
     if action not in ACTIONS:
-        raise ValueError(unknown("action", action, ACTIONS))
+        raise CzError(unknown("action", action, ACTIONS))
     if camera is not None and observation != CAMERA:
-        raise ValueError(f'a camera is of use with observation="camera" only, not with {observation!r}')
+        raise CzError(f'a camera is of use with observation="camera" only, not with {observation!r}')
     interval = positive("control_interval", control_interval)
     length = positive("horizon", horizon)
     steps = length / interval
     if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:
-        raise ValueError(f"horizon {horizon} s must be a whole number of control intervals of {control_interval} s")
+        raise CzError(f"horizon {horizon} s must be a whole number of control intervals of {control_interval} s")
     if meniscus is not None and not isinstance(meniscus, MeniscusModel):
-        raise ValueError(f"meniscus must be a cz_gym.MeniscusModel, not {meniscus!r}")
+        raise CzError(f"meniscus must be a cz_gym.MeniscusModel, not {meniscus!r}")
     checked = check_parameters(parameters if parameters is not None else Parameters())
     check_height(make_puller(checked, meniscus=meniscus or HURLE))
     looking = check_camera(camera_for(checked) if camera is None else camera, checked)
@@ -165,5 +166,5 @@ def positive(name: str, value: float) -> float:
     """The value as a float; ValueError unless it is a positive, finite number [s]."""
     number = isinstance(value, Real) and not isinstance(value, bool)
     if not number or not math.isfinite(value) or value <= 0:
-        raise ValueError(f"{name} must be a positive number of seconds, not {value!r}")
+        raise CzError(f"{name} must be a positive number of seconds, not {value!r}")
     return float(value)

@@ -29,6 +29,7 @@ import cz_gym
 from cz_gym.atomic_files import check_writable
 from cz_gym.commands import OneLineParser, between
 from cz_gym.config import Config, check_config, make_config
+from cz_gym.errors import CzError
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from cz_gym.names import unknown
 from cz_gym.observation import DRIVE_CHANNELS, to_measured
@@ -66,7 +67,7 @@ def find_source(name: str, config: Config) -> Source:
     try:
         contract = load(name).contract
     except ValueError as error:
-        raise ValueError(unknown("policy", name, controllers, f"; or an agent: {error}")) from None
+        raise CzError(unknown("policy", name, controllers, f"; or an agent: {error}")) from None
     reads, acts = contract.observation, contract.action
     return Source(load(name, replace(config, observation=reads, action=acts)), reads, acts)
 
@@ -138,13 +139,13 @@ def write(
     settings: dict[str, Any] = {"scenario": scenario, "observation": "history", "horizon": horizon}
     config, place = make_config(**settings), f"cz/{scenario}/{name.replace('.', '_')}-v0"
     if not seeds or not set(seeds) <= set(TRAINING_SEEDS):
-        raise ValueError(f"seeds must be some of the training seeds, {TRAINING_SEEDS[0]} to {TRAINING_SEEDS[-1]}")
+        raise CzError(f"seeds must be some of the training seeds, {TRAINING_SEEDS[0]} to {TRAINING_SEEDS[-1]}")
     if not 0.0 <= noise <= 1.0:
-        raise ValueError(f"noise must be between 0 and 1, not {noise:g}")
+        raise CzError(f"noise must be between 0 and 1, not {noise:g}")
     folder = Path(os.environ.get("MINARI_DATASETS_PATH", "~/.minari/datasets")).expanduser() / place
     check_writable(folder)
     if folder.exists() and not overwrite:
-        raise ValueError(f"{place} is there already: overwrite it, or give another folder ({folder})")
+        raise CzError(f"{place} is there already: overwrite it, or give another folder ({folder})")
 
     def buffers(first: int) -> list[Any]:
         episodes = record(source, config, seeds[first : first + AT_ONCE], noise)

@@ -20,6 +20,7 @@ from cz_gym.engine.buffers import BufferPool
 from cz_gym.engine.layout import INFO, Out
 from cz_gym.engine.tangents import ACTIONS, ROWS, SCRATCH, SMOOTH, build_tangents
 from cz_gym.episodes.record import GRID
+from cz_gym.errors import CzError
 from cz_gym.observation import MEASURED, scales
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.task import Cost
@@ -73,15 +74,15 @@ class DifferentiableBatch:
 
     def __init__(self, config: Config, num_envs: int, threads: int | None = 1) -> None:
         if not isinstance(config, Config):
-            raise ValueError(f"a config is needed, as make_config({config!r:.80}) makes one")
+            raise CzError(f"a config is needed, as make_config({config!r:.80}) makes one")
         if not isinstance(num_envs, int | np.integer) or isinstance(num_envs, bool) or num_envs < 1:
-            raise ValueError(f"num_envs must be a positive whole number, not {num_envs!r}")
+            raise CzError(f"num_envs must be a positive whole number, not {num_envs!r}")
         parts = GRID / config.control_interval
         if abs(parts - round(parts)) > 1e-9 or round(parts) < 1:
-            raise ValueError(f"control_interval must divide {GRID:g} s, not be {config.control_interval:g} s")
+            raise CzError(f"control_interval must divide {GRID:g} s, not be {config.control_interval:g} s")
         latency = config.scenario.sensor.latency
         if latency > config.control_interval:
-            raise ValueError(f"the camera's latency of {latency:g} s is longer than the control interval")
+            raise CzError(f"the camera's latency of {latency:g} s is longer than the control interval")
         self.config, self.num_envs = config, int(num_envs)
         self._batch = Batch(config, self.num_envs, threads)
         self._gather, self._tangents = _compiled(config.meniscus)
@@ -101,13 +102,13 @@ class DifferentiableBatch:
         """
         slots = list(range(self.num_envs) if which is None else which)
         if len(seeds) != len(slots):
-            raise ValueError(f"expected a seed for each of {len(slots)} slots, not {len(seeds)}")
+            raise CzError(f"expected a seed for each of {len(slots)} slots, not {len(seeds)}")
         if len(set(slots)) != len(slots) or not set(slots) <= set(range(self.num_envs)):
-            raise ValueError(f"slots must be different ones of 0 to {self.num_envs - 1}, not {slots!r:.80}")
+            raise CzError(f"slots must be different ones of 0 to {self.num_envs - 1}, not {slots!r:.80}")
         try:
             keys = [first_key(index(seed)) for seed in seeds]
         except TypeError:
-            raise ValueError(f"seeds must be whole numbers, not {seeds!r:.80}") from None
+            raise CzError(f"seeds must be whole numbers, not {seeds!r:.80}") from None
         self._out = self._copied()
         self._batch.reset(slots, keys, self._out)
         self._grows = self._grows.copy()

@@ -18,6 +18,7 @@ from cz_gym.engine.batch import Batch, SlotState, new_key
 from cz_gym.engine.layout import INFO, LEAN, check_info
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import find_scenario
+from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
@@ -59,13 +60,13 @@ def observation_space(observation: str) -> Any:
 def check_options(options: dict[str, Any] | None, allowed: tuple[str, ...] = _OPTIONS) -> dict[str, Any]:
     """A copy of reset's options; ValueError unless a mapping of known ones, of scenario and state one at most."""
     if options is not None and not isinstance(options, Mapping):
-        raise ValueError(f"reset options must be a dict, not {options!r}")
+        raise CzError(f"reset options must be a dict, not {options!r}")
     given = dict(options or {})
     for key in given:
         if key not in allowed:
-            raise ValueError(unknown("reset option", key, allowed))
+            raise CzError(unknown("reset option", key, allowed))
     if "scenario" in given and "state" in given:
-        raise ValueError("reset options 'scenario' and 'state' exclude each other: a state has its own episode")
+        raise CzError("reset options 'scenario' and 'state' exclude each other: a state has its own episode")
     return given
 
 
@@ -281,13 +282,13 @@ class Info(dict[str, Any]):
 def check_state(state: Any, batch: Batch) -> None:
     """ValueError, in one line, unless a state that a slot of this batch can go on from."""
     if not isinstance(state, EnvState):
-        raise ValueError(f"expected a state made by get_state, not {type(state).__name__}")
+        raise CzError(f"expected a state made by get_state, not {type(state).__name__}")
     batch.check(state.slot)
     try:
         random: Any = np.random.PCG64(0)
         random.state = state.random
     except (ValueError, TypeError, KeyError, OverflowError):
-        raise ValueError("this state is damaged: its random stream is none of PCG64") from None
+        raise CzError("this state is damaged: its random stream is none of PCG64") from None
 
 
 def check_action(action: Any) -> Any:

@@ -6,11 +6,13 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import Any
 
+from cz_gym.errors import CzError
+
 
 def needs(kind: type, value: Any, how: str) -> Any:
     """The value itself; ValueError, which says how one is made, unless it is of that kind."""
     if not isinstance(value, kind):
-        raise ValueError(f"this needs a {kind.__name__}, not {value!r:.80}: {how}")
+        raise CzError(f"this needs a {kind.__name__}, not {value!r:.80}: {how}")
     return value
 
 

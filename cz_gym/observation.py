@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.errors import CzError
 from cz_gym.physics.parameters import Parameters
 
 from .units import KILO, MINUTE, MM
@@ -157,7 +158,7 @@ def decode(observation: npt.ArrayLike, v_0: float = PULL_SCALE) -> Measured:
     """
     array = np.asarray(observation, dtype=np.float64)
     if array.ndim == 0 or array.shape[-1] not in (len(MEASURED), len(HISTORY)):
-        raise ValueError(
+        raise CzError(
             f"expected an observation of {len(MEASURED)} (measured) or {len(HISTORY)} (history) channels, "
             f"got shape {array.shape}"
         )

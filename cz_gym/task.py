@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cz_gym.errors import CzError
 from cz_gym.jit.compile import physics
 from cz_gym.physics.plant import Puller
 
@@ -94,7 +95,7 @@ def check_height(puller: Puller) -> None:
     """ValueError unless the puller's operating point lies inside the meniscus' limits."""
     highest = HEIGHT_MAX_IN_A * puller.a
     if not HEIGHT_MIN <= puller.h_0 <= highest:
-        raise ValueError(
+        raise CzError(
             f"the nominal meniscus height {puller.h_0 / MM:.3g} mm of these parameters lies outside its limits, "
             f"{HEIGHT_MIN / MM:.3g} to {highest / MM:.3g} mm; check r_0, alpha_0, sigma and rho_l"
         )

@@ -18,6 +18,7 @@ from cz_gym.engine.batch import Batch, new_key
 from cz_gym.engine.layout import INFO, LEAN, Out, check_info
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import find_scenario
+from cz_gym.errors import CzError
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.processors import processors
@@ -68,7 +69,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
             scenario, model, observation, control_interval, horizon, parameters, meniscus, camera, action
         )
         if render_mode is not None:
-            raise ValueError(f"a batch does not render: render_mode must be None, not {render_mode!r}")
+            raise CzError(f"a batch does not render: render_mode must be None, not {render_mode!r}")
         self._setup(config, num_envs, autoreset_mode, threads, info)
 
     @classmethod
@@ -90,10 +91,10 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
     ) -> None:
         self._everything, self._settings = check_info(info), (config, num_envs, autoreset_mode, threads, info)
         if not isinstance(num_envs, int | np.integer) or isinstance(num_envs, bool) or num_envs < 1:
-            raise ValueError(f"num_envs must be a positive whole number, not {num_envs!r}")
+            raise CzError(f"num_envs must be a positive whole number, not {num_envs!r}")
         num_envs = int(num_envs)
         if threads is not None and (not isinstance(threads, int) or threads < 1):
-            raise ValueError(f"threads must be a positive whole number or None, not {threads!r}")
+            raise CzError(f"threads must be a positive whole number or None, not {threads!r}")
         self.config = config
         self.render_mode = None
         self.num_envs = num_envs
@@ -237,7 +238,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
             seed = [int(seed) + i for i in range(self.num_envs)]
         seeds = list(seed)
         if len(seeds) != self.num_envs:
-            raise ValueError(f"expected {self.num_envs} seeds, one a slot, got {len(seeds)}")
+            raise CzError(f"expected {self.num_envs} seeds, one a slot, got {len(seeds)}")
         for i in np.flatnonzero(mask).tolist():
             if (own := seeds[i]) is not None:
                 self._randoms[i], self._seeds[i] = seeding.np_random(int(own) if isinstance(own, np.integer) else own)
@@ -248,7 +249,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
             raise TypeError(f"options['reset_mask'] must be a numpy array of bool, not {mask!r}")
         if mask.shape != (self.num_envs,) or not mask.any():
-            raise ValueError(f"options['reset_mask'] must have shape ({self.num_envs},) and a True, got {mask!r}")
+            raise CzError(f"options['reset_mask'] must have shape ({self.num_envs},) and a True, got {mask!r}")
         if not self._begun and not mask.all():
             raise ResetNeeded("the first reset must be of every slot")
         return mask.copy()
@@ -276,7 +277,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
     def _check_states(self, states: Any) -> None:
         several = isinstance(states, Sequence) and len(states) == self.num_envs
         if not several or not all(isinstance(state, EnvState) for state in states):
-            raise ValueError(f"expected {self.num_envs} states made by get_state, one a slot")
+            raise CzError(f"expected {self.num_envs} states made by get_state, one a slot")
         for state in states:
             check_state(state, self._batch)
 

@@ -14,6 +14,7 @@ from typing import Any
 
 from cz_gym.atomic_files import write_files
 from cz_gym.config import Config
+from cz_gym.errors import CzError
 from cz_gym.observation import CLIP, OBSERVATIONS
 
 FORMAT = "cz-gym-agent"
@@ -28,7 +29,7 @@ MAX_WHOLE = 2**63 - 1
 """Largest whole number in a contract."""
 
 
-class AgentFileError(ValueError):
+class AgentFileError(CzError):
     """An agent file is missing, broken, or made for something else; the message is one line."""
 
 

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from cz_gym.errors import CzError
+
 OPERATORS = (
     "Add", "Clip", "Concat", "Div", "Elu", "Gather", "Gemm", "Identity", "LeakyRelu", "MatMul", "Mul", "Neg", "Relu",
     "Sigmoid", "Slice", "Softplus", "Split", "Sqrt", "Sub", "Tanh",
@@ -28,7 +30,7 @@ MAX_ACTIVATIONS = 32_768
 MAX_RANK = 3
 
 
-class GraphError(ValueError):
+class GraphError(CzError):
     """A graph is no agent's; the message says why."""
 
 

@@ -13,6 +13,7 @@ from cz_gym.action import made_for
 from cz_gym.agents.agent_file.contract import AgentFileError, Contract, observation_hash, read_agent
 from cz_gym.agents.agent_file.graph import GraphError, checked
 from cz_gym.config import Config, check_config
+from cz_gym.errors import CzError
 from cz_gym.observation import OBSERVATIONS
 from cz_gym.task import ACTIONS
 
@@ -109,7 +110,7 @@ class OnnxPolicy:
         """
         array = np.asarray(observation, np.float32)
         if array.ndim not in (1, 2) or array.shape[-1] != self.contract.channels:
-            raise ValueError(
+            raise CzError(
                 f"expected {self.contract.channels} channels ({self.observation}), got shape {array.shape}: "
                 'gym.make("Cz-v0", **agent.settings) gives them'
             )

@@ -20,6 +20,7 @@ from cz_gym.agents import MODELS
 from cz_gym.agents.agent_file.contract import AgentFileError, read_agent
 from cz_gym.agents.agent_file.graph import checked
 from cz_gym.config import Config
+from cz_gym.errors import CzError
 from cz_gym.observation import MEASURED
 
 from .export import OnnxGraph
@@ -230,7 +231,7 @@ class FilterBank(nn.Module):
         own = self._graph()[0].tensors
         found = {each.name: each for each in onnx.load_from_string(content).graph.initializer}
         if any(name not in found or list(each.shape) != list(found[name].dims) for name, each in own.items()):
-            raise ValueError("not an agent of this release's recipe gradient")
+            raise CzError("not an agent of this release's recipe gradient")
         for name, tensor in own.items():
             tensor.copy_(torch.from_numpy(numpy_helper.to_array(found[name]).copy()))
 

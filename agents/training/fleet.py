@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from cz_gym.agents.agent_file.contract import read_json
 from cz_gym.atomic_files import locked
+from cz_gym.errors import CzError
 
 from .learners import Controllers
 from .recipes import Recipe
@@ -97,7 +98,7 @@ def train_seeds(jobs: Sequence[Job], perform: Perform, bar: Any) -> Iterator[tup
             yield missing[number], found
     look()
     if failed:
-        raise ValueError("; ".join(failed))
+        raise CzError("; ".join(failed))
 
 
 def _standing(job: Job) -> tuple[float, str]:

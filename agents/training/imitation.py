@@ -16,6 +16,7 @@ from gymnasium.spaces import Box
 from stable_baselines3.common.logger import Logger
 
 from cz_gym.config import Config
+from cz_gym.errors import CzError
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from cz_gym.observation import CLIP, DRIVE_CHANNELS, HISTORY
 
@@ -41,7 +42,7 @@ class Imitator:
 
     def __init__(self, recipe: Imitation, seed: int, teacher: Any, config: Config, logger: Logger, done: int) -> None:
         if recipe.rounds < 1:
-            raise ValueError(f"an imitation needs at least one round, not {recipe.rounds}")
+            raise CzError(f"an imitation needs at least one round, not {recipe.rounds}")
         torch.set_num_threads(recipe.threads)
         self.recipe, self.seed, self.teacher, self.config, self.logger = recipe, seed, teacher, config, logger
         self.total = recipe.rounds * recipe.episodes * config.steps

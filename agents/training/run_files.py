@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from cz_gym.agents.agent_file.contract import MAX_JSON_BYTES, AgentFileError, read_bounded, read_json
+from cz_gym.errors import CzError
 from cz_gym.evaluation.files import software
 
 from .recipes import RECIPES
@@ -103,7 +104,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         rows = list(csv.DictReader(io.StringIO(read_bounded(path, MAX_JSON_BYTES).decode(), newline="")))
         for row in rows:
             if list(row) != list(COLUMNS) or not all(math.isfinite(float(value)) for value in row.values()):
-                raise ValueError("a row is not one of numbers")
+                raise CzError("a row is not one of numbers")
     except (ValueError, TypeError, csv.Error):
         raise AgentFileError(f"{path}: damaged; without it the run can be resumed") from None
     return rows

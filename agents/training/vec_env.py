@@ -16,6 +16,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
 from cz_gym import CzVectorEnv
+from cz_gym.errors import CzError
 from cz_gym.observation import CLIP, OBSERVATIONS, STATE
 
 
@@ -29,11 +30,9 @@ class CzVecEnv(VecEnv):
 
     def __init__(self, env: CzVectorEnv, privileged: bool = False, stagger: int | None = None) -> None:
         if env.autoreset_mode != AutoresetMode.SAME_STEP:
-            raise ValueError(
-                "CzVecEnv needs autoreset_mode=AutoresetMode.SAME_STEP, as stable-baselines3 resets itself"
-            )
+            raise CzError("CzVecEnv needs autoreset_mode=AutoresetMode.SAME_STEP, as stable-baselines3 resets itself")
         if privileged and env.config.observation != "history":
-            raise ValueError('privileged=True needs observation="history"')
+            raise CzError('privileged=True needs observation="history"')
         self.env = env
         self.privileged = privileged
         self.render_mode = env.render_mode
@@ -111,7 +110,7 @@ class CzVecEnv(VecEnv):
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Set an attribute of the whole batch."""
         if indices is not None:
-            raise ValueError("the slots share their attributes: set_attr takes no indices")
+            raise CzError("the slots share their attributes: set_attr takes no indices")
         setattr(self.env, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:

@@ -15,6 +15,7 @@ from scipy.linalg import LinAlgError, schur, solve_sylvester
 from scipy.signal import ss2tf
 
 from cz_gym.baselines.pid.compensated_pid import Compensator, SeriesPID
+from cz_gym.errors import CzError
 from cz_gym.physics.linearisation import RadiusModel, StateSpace
 
 CUT_OFF = Compensator().slow
@@ -22,7 +23,7 @@ CUT_OFF = Compensator().slow
 _ROUNDING = 1e3 * float(np.finfo(np.float64).eps)
 
 
-class NoSplitError(ValueError):
+class NoSplitError(CzError):
     """A system has no usable stable part, or its halves cannot be told apart."""
 
 
@@ -109,7 +110,7 @@ def design_compensator(model: RadiusModel, cut_off: float = CUT_OFF) -> Compensa
     II, whose plant has no stable pole, leaves only the high-pass filter, and removing its gain leaves nothing.
     """
     if not cut_off > 0.0:
-        raise ValueError(f"cut_off must be a positive frequency [rad/s], not {cut_off!r}")
+        raise CzError(f"cut_off must be a positive frequency [rad/s], not {cut_off!r}")
     stable = split_stable(high_passed(ideal_compensator(model), cut_off)).stable
     poles = np.linalg.eigvals(stable.A)
     if len(poles) != 2 or np.any(np.abs(poles.imag) > 0.0):

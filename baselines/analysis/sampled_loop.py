@@ -16,6 +16,7 @@ import numpy as np
 from scipy.signal import cont2discrete
 
 from cz_gym.baselines.policy import Floats, map_arrays
+from cz_gym.errors import CzError
 from cz_gym.observation import HEATER_SCALE, MEASURED, PULL_SCALE, Measured, scales
 from cz_gym.physics.linearisation import INPUTS, OUTPUTS, STATES, StateSpace, linearise
 from cz_gym.physics.plant import Puller
@@ -34,7 +35,7 @@ _ANSWERS = ("v_p", "Q_H", "r_c", "r_br")
 """Its outputs: both commands and both radii."""
 
 
-class NotLinearError(ValueError):
+class NotLinearError(CzError):
     """A controller that has no state space near rest."""
 
 

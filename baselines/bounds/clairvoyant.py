@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from cz_gym.baselines.policy import Floats, batched, fresh, to_action
 from cz_gym.config import Config
+from cz_gym.errors import CzError
 from cz_gym.observation import HEATER_SCALE, STATE, scales
 
 from .future import future_of
@@ -70,7 +71,7 @@ class Clairvoyant:
         array, single = batched(observation)
         n, best, inputs_0 = len(array), self.plan.best, self.plan.inputs_0
         if n != len(inputs_0):
-            raise ValueError(f"clairvoyant has a plan for {len(inputs_0)} episodes, not {n}")
+            raise CzError(f"clairvoyant has a plan for {len(inputs_0)} episodes, not {n}")
         memory = fresh(state, Memory(np.zeros(n), np.zeros((n, INPUTS))), episode_start)
         k, slot = np.minimum(memory.step.astype(int), len(best.u) - 1), np.arange(n)
         seen = array * scales(STATE, float(inputs_0[0, 0]))

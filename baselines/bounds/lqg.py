@@ -22,6 +22,7 @@ from cz_gym.baselines.lqg.preview import look_ahead, samples_ahead
 from cz_gym.baselines.lqg.settings import settings_of
 from cz_gym.baselines.policy import Floats, batched, fresh, to_action
 from cz_gym.config import Config
+from cz_gym.errors import CzError
 from cz_gym.observation import HEATER_SCALE, STATE, Measured, scales
 from cz_gym.physics.plant import hidden_load
 
@@ -58,7 +59,7 @@ class PrivilegedLQG(LQG):
         """ValueError for another number of slots than of known pullers."""
         known = slots if self.gains_by_slot is None else len(self.gains_by_slot.filter.plant.A)
         if known != slots:
-            raise ValueError(f"{known} pullers are known, got {slots} slots: one puller a slot is needed")
+            raise CzError(f"{known} pullers are known, got {slots} slots: one puller a slot is needed")
 
     def for_episodes(self, config: Config, seeds: Sequence[int]) -> PrivilegedLQG:
         """The same controller for those episodes, one a slot."""

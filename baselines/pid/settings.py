@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from cz_gym.config import Config
+from cz_gym.errors import CzError
 from cz_gym.names import unknown
 
 from .compensated_pid import Compensator, SeriesPID
@@ -98,7 +99,7 @@ SHIPPED: dict[tuple[str, str], FilteredPID | Industrial] = {
 def settings_of(controller: str, scenario: str) -> FilteredPID | Industrial:
     """The controller with its frozen settings for that scenario; ValueError if it has none."""
     if (controller, DEFAULT_SCENARIO) not in SHIPPED:
-        raise ValueError(unknown("controller with settings", controller, sorted({name for name, _ in SHIPPED})))
+        raise CzError(unknown("controller with settings", controller, sorted({name for name, _ in SHIPPED})))
     return SHIPPED.get((controller, scenario), SHIPPED[controller, DEFAULT_SCENARIO])
 
 

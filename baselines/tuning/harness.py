@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.config import Config, make_config
+from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 
@@ -155,7 +156,7 @@ class Search(ABC):
         elif path.exists():
             begun, self.trials = self._read(path)
             if begun != {name: self.budget[name] for name in begun}:
-                raise ValueError(f"{path} was begun with {begun}; ask for the same, or write another file")
+                raise CzError(f"{path} was begun with {begun}; ask for the same, or write another file")
         if history is None:
             self.run()
         found = (
@@ -171,10 +172,10 @@ class Search(ABC):
             found = json.loads(path.read_text())
             begun = {name: found["budget"][name] for name in ("episodes", "survive")}
             if found["parameters"] != self._paths:
-                raise ValueError(f"its parameters are not those of {self.controller}")
+                raise CzError(f"its parameters are not those of {self.controller}")
             return begun, [Trial(tuple(values), score, facts) for values, score, facts in found["history"]]
         except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{path} is no history of this search: {error!r}") from None
+            raise CzError(f"{path} is no history of this search: {error!r}") from None
 
     def _entry(self, trial: Trial) -> dict[str, Any]:
         return {"score": trial.score, "values": dict(zip(self._paths, trial.values, strict=True)), **trial.facts}

@@ -20,6 +20,7 @@ from cz_gym.baselines.lqg.controller import LQG, LQGSettings
 from cz_gym.baselines.policy import Floats
 from cz_gym.commands import OneLineParser, between
 from cz_gym.config import make_config
+from cz_gym.errors import CzError
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 
 from .harness import Figures, Score, Search, file_name, measure, rounded, value_at
@@ -46,7 +47,7 @@ class LQGSearch(Search):
     def __init__(self, controller: str, scenario: str, budget: Mapping[str, int]) -> None:
         if (controller, scenario) not in GOALS:
             known = ", ".join(where for name, where in GOALS if name == controller)
-            raise ValueError(f"{controller} has no goal on {scenario!r}, but on {known}")
+            raise CzError(f"{controller} has no goal on {scenario!r}, but on {known}")
         self.goal = GOALS[controller, scenario]
         super().__init__(controller, scenario, self.goal.start, PARAMETERS, budget)
 

@@ -14,6 +14,7 @@ from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.industrial import Industrial
 from cz_gym.baselines.pid.settings import DEFAULT_SCENARIO, settings_of
 from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
+from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.physics.linearisation import radius_model
 from cz_gym.physics.plant import make_puller
@@ -127,4 +128,4 @@ def space_of(name: str, scenario: str) -> Space:
             more = ROBUST if scenario in ("puller", "sensor-fault") and isinstance(space.base, FilteredPID) else ()
             base = space.base if scenario == DEFAULT_SCENARIO else settings_of(name, DEFAULT_SCENARIO)
             return space._replace(base=base, parameters=(*space.parameters, *more))
-    raise ValueError(unknown("controller to tune", name, [space.name for space in SPACES]))
+    raise CzError(unknown("controller to tune", name, [space.name for space in SPACES]))

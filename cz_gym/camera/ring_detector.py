@@ -19,6 +19,7 @@ from scipy.integrate import trapezoid
 from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
+from cz_gym.errors import CzError
 from cz_gym.physics.plant import Puller
 from cz_gym.units import MM
 
@@ -104,7 +105,7 @@ class RingDetector:
             self.shape = edges - edges.mean()
         self.bias = self.read(picture(puller.r_0, puller.h_0, puller, view)).radius - puller.r_0
         if not math.isfinite(self.bias):
-            raise ValueError(
+            raise CzError(
                 "this camera shows no bright ring at the puller's operating point: the wall it mirrors "
                 "or the ring itself lies outside the image; check tilt, aim and wall_height"
             )

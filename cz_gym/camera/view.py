@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, NamedTuple
 
+from cz_gym.errors import CzError
 from cz_gym.physics.parameters import Parameters, Quantity, check_numbers
 from cz_gym.units import MM
 
@@ -94,24 +95,24 @@ _AT_MOST_ONE = frozenset({"wall_emissivity", "shield_emissivity", "melt_emissivi
 def check_camera(camera: Camera, parameters: Parameters) -> Camera:
     """Return the camera, or raise ValueError naming what cannot be at a puller of these parameters."""
     if not isinstance(camera, Camera):
-        raise ValueError(f"camera must be a cz_gym.camera.Camera, not {camera!r}")
+        raise CzError(f"camera must be a cz_gym.camera.Camera, not {camera!r}")
     check_numbers("camera parameter", camera, _MAY_BE_ZERO)
     for name, value in camera._asdict().items():
         if name in _AT_MOST_ONE and value > 1:
-            raise ValueError(f"camera parameter {name} = {value!r} must not exceed 1")
+            raise CzError(f"camera parameter {name} = {value!r} must not exceed 1")
     if camera.reflections not in range(1, MOST_REFLECTIONS + 1):
         allowed = f"one of 1 to {MOST_REFLECTIONS}"
-        raise ValueError(f"camera parameter reflections = {camera.reflections!r} must be {allowed}")
+        raise CzError(f"camera parameter reflections = {camera.reflections!r} must be {allowed}")
     if camera.tilt >= 0.5 * math.pi:
-        raise ValueError(f"camera parameter tilt = {camera.tilt!r} must be less than pi / 2 [rad]")
+        raise CzError(f"camera parameter tilt = {camera.tilt!r} must be less than pi / 2 [rad]")
     if not parameters.r_0 < camera.shield_radius < camera.crucible_radius:
-        raise ValueError(
+        raise CzError(
             f"the heat shield's opening (shield_radius = {camera.shield_radius} m) must be wider than the crystal "
             f"(r_0 = {parameters.r_0} m) and narrower than the crucible ({camera.crucible_radius} m)"
         )
     height = camera.distance * math.cos(camera.tilt)
     if height <= camera.wall_height:
-        raise ValueError(
+        raise CzError(
             f"the lens, {height:.3g} m above the melt, must be above the heat shield "
             f"(wall_height = {camera.wall_height} m)"
         )

@@ -24,6 +24,7 @@ from cz_gym.config import Config, Identity
 from cz_gym.episodes.record import GRID, Episode, record_of
 from cz_gym.episodes.scenario import MAX_LATENCY, Scenario
 from cz_gym.episodes.series import series_of
+from cz_gym.errors import CzError
 from cz_gym.jit.compile import entry
 from cz_gym.observation import HISTORY, LAGGED, MEASURED, STATE, lags, relative, scales, span_scales
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
@@ -206,7 +207,7 @@ class Batch:
         words = np.array(list(keys), np.uint64).reshape(-1, 2)
         arguments = self._drawing(slots, words, record, mix, out)
         if max(self._run(self._draw, arguments, len(slots), DRAWS_PER_THREAD, DRAWS_AT_ONCE)) >= 0:
-            raise ValueError(NO_OPERATING_POINT)
+            raise CzError(NO_OPERATING_POINT)
         if self._camera:
             self._photograph(out, np.isin(np.arange(self.num_envs), slots))
 
@@ -267,21 +268,19 @@ class Batch:
     def check(self, state: SlotState) -> None:
         """Raise ValueError if this is no saved state, or one saved under other settings."""
         if not isinstance(state, SlotState):
-            raise ValueError(f"expected a state made by get_state, not {type(state).__name__}")
+            raise CzError(f"expected a state made by get_state, not {type(state).__name__}")
         saved = getattr(state, "identity", None)
         if not isinstance(saved, Identity):
-            raise ValueError("this state was saved by another version of cz_gym")
+            raise CzError("this state was saved by another version of cz_gym")
         odd = saved.difference(self.identity)
         if odd is not None:
-            raise ValueError(f"this state was saved under other settings than this environment's: {odd}")
+            raise CzError(f"this state was saved under other settings than this environment's: {odd}")
         for name, rows in zip(_SAVED, self._saved(), strict=True):
             array = getattr(state, name)
             if not isinstance(array, np.ndarray) or (array.dtype, array.shape) != (rows.dtype, rows.shape[1:]):
-                raise ValueError(
-                    f"this state was saved by another version of cz_gym, or damaged: its {name} does not fit"
-                )
+                raise CzError(f"this state was saved by another version of cz_gym, or damaged: its {name} does not fit")
         if not 0 <= int(state.slot["k"]) <= self.clock.steps:
-            raise ValueError(f"this state is damaged: sample {int(state.slot['k'])} of {self.clock.steps}")
+            raise CzError(f"this state is damaged: sample {int(state.slot['k'])} of {self.clock.steps}")
 
     def restore(self, which: Sequence[int], states: Sequence[SlotState], out: Out) -> None:
         """Continue slots from states that :meth:`check` let pass and write their last samples into ``out``."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from cz_gym.episodes.record import FREEZES, Episode, Stream
 from cz_gym.episodes.rng import WORDS
+from cz_gym.errors import CzError
 from cz_gym.physics.plant import Puller, State
 
 
@@ -163,7 +164,7 @@ INFO_CHOICES = ("lean", "all")
 def check_info(info: str) -> bool:
     """Whether all of ``info`` is asked for; ValueError names what may be."""
     if info not in INFO_CHOICES:
-        raise ValueError(f"info must be one of {', '.join(INFO_CHOICES)}, not {info!r}")
+        raise CzError(f"info must be one of {', '.join(INFO_CHOICES)}, not {info!r}")
     return info == "all"
 
 

@@ -13,6 +13,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
+from cz_gym.errors import CzError
 from cz_gym.units import HOUR, MM
 
 Range = tuple[float, float]
@@ -178,7 +179,7 @@ class Scenario:
         for family in dataclasses.fields(self)[1:]:
             expected, value = _FAMILIES[family.name], getattr(self, family.name)
             if not isinstance(value, expected):
-                raise ValueError(f"scenario {self.name!r}: {family.name} must be a {expected.__name__}, not {value!r}")
+                raise CzError(f"scenario {self.name!r}: {family.name} must be a {expected.__name__}, not {value!r}")
             for member in dataclasses.fields(value):
                 _check(
                     f"scenario {self.name!r}: {family.name}.{member.name}", member.default, getattr(value, member.name)
@@ -188,7 +189,7 @@ class Scenario:
     def _check_sense(self) -> None:
         def need(fact: bool, what: str) -> None:
             if not fact:
-                raise ValueError(f"scenario {self.name!r}: {what}")
+                raise CzError(f"scenario {self.name!r}: {what}")
 
         need(bool(self.name) and isinstance(self.name, str), "needs a name")
         need(
@@ -281,15 +282,15 @@ def _check(where: str, default: Any, value: Any) -> None:
     """Raise ValueError unless the value has its default's form: a number, or a pair (low, high)."""
     if isinstance(default, tuple):
         if not (isinstance(value, tuple) and len(value) == 2):
-            raise ValueError(f"{where} must be a pair (low, high), not {value!r}")
+            raise CzError(f"{where} must be a pair (low, high), not {value!r}")
         if isinstance(default[0], int) and not all(isinstance(part, int) for part in value):
-            raise ValueError(f"{where} must be a pair of whole numbers, not {value!r}")
+            raise CzError(f"{where} must be a pair of whole numbers, not {value!r}")
         if not (all(_is_number(part) and math.isfinite(part) for part in value) and value[0] <= value[1]):
-            raise ValueError(f"{where} must be a pair of finite numbers low <= high, not {value!r}")
+            raise CzError(f"{where} must be a pair of finite numbers low <= high, not {value!r}")
     elif not _is_number(value) or (math.isinf(value) and not math.isinf(default)):
-        raise ValueError(f"{where} must be a finite number, not {value!r}")
+        raise CzError(f"{where} must be a finite number, not {value!r}")
     elif isinstance(default, int) and not isinstance(value, int):
-        raise ValueError(f"{where} must be a whole number, not {value!r}")
+        raise CzError(f"{where} must be a whole number, not {value!r}")
 
 
 def _plain(default: Any, value: Any) -> Any:

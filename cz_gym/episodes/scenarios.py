@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from numbers import Real
 
+from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
@@ -137,9 +138,9 @@ def find_scenario(scenario: str | Scenario) -> Scenario:
         return SCENARIOS[scenario]
     name, _, row = scenario.rpartition("-") if isinstance(scenario, str) else ("", "", "")
     if name in SCENARIOS and row in _ROWS:
-        raise ValueError(f"{scenario!r} is a row of the benchmark: the scenario is {name!r}, with {_ROWS[row]}")
+        raise CzError(f"{scenario!r} is a row of the benchmark: the scenario is {name!r}, with {_ROWS[row]}")
     also = "" if isinstance(scenario, str) else ", or pass a cz_gym.Scenario"
-    raise ValueError(unknown("scenario", scenario, SCENARIOS, also))
+    raise CzError(unknown("scenario", scenario, SCENARIOS, also))
 
 
 def mix_of(model: str | float | None, scenario: Scenario) -> tuple[float, float]:
@@ -150,4 +151,4 @@ def mix_of(model: str | float | None, scenario: Scenario) -> tuple[float, float]
         return (1.0, 1.0) if model == "I" else (0.0, 0.0)
     if isinstance(model, Real) and not isinstance(model, bool) and 0.0 <= model <= 1.0:
         return float(model), float(model)
-    raise ValueError(f'model must be "I", "II", a mix in [0, 1] or None, not {model!r}')
+    raise CzError(f'model must be "I", "II", a mix in [0, 1] or None, not {model!r}')

@@ -20,6 +20,7 @@ from threading import Thread
 from typing import Any
 
 import cz_gym
+from cz_gym.errors import CzError
 from cz_gym.processors import processors
 
 from .user_code import PREFIX
@@ -47,14 +48,14 @@ def connect(address: str, *more: str) -> None:
     try:
         import ray
     except ModuleNotFoundError:
-        raise ValueError('ray is missing: pip install ".[ray]"') from None
+        raise CzError('ray is missing: pip install ".[ray]"') from None
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if not ray.is_initialized():
         _check_answers(address)
         try:
             ray.init(address=address or None, **quiet)
         except (ConnectionError, ValueError, RuntimeError, OSError) as error:
-            raise ValueError(f"no Ray cluster at {address or 'this machine'}: {' '.join(str(error).split())}") from None
+            raise CzError(f"no Ray cluster at {address or 'this machine'}: {' '.join(str(error).split())}") from None
     _check_nodes(facts_of_sources(*more), *more)
 
 
@@ -67,18 +68,16 @@ def _check_answers(address: str) -> None:
                 connection.sendall(HTTP2_HELLO)
                 answer = connection.recv(len(HTTP2_HELLO))
         except (OSError, OverflowError) as error:
-            raise ValueError(f"no Ray cluster at {address}: {error}") from None
+            raise CzError(f"no Ray cluster at {address}: {error}") from None
         if answer[3:4] != SETTINGS:
-            raise ValueError(f"no Ray cluster at {address}: what answers there is something else")
+            raise CzError(f"no Ray cluster at {address}: what answers there is something else")
 
 
 def _check_nodes(ours: tuple[str, str], *more: str) -> None:
     """ValueError names a node whose :func:`facts_of_sources` are others."""
     for node, theirs in _answers(facts_of_sources, *more):
         if theirs != ours:
-            raise ValueError(
-                f"node {node} has cz_gym {' '.join(theirs)}, this machine {' '.join(ours)}: install the same"
-            )
+            raise CzError(f"node {node} has cz_gym {' '.join(theirs)}, this machine {' '.join(ours)}: install the same")
 
 
 def check_shared(folder: Path) -> None:
@@ -86,7 +85,7 @@ def check_shared(folder: Path) -> None:
     with tempfile.NamedTemporaryFile(dir=folder) as file:
         for node, sees in _answers(os.path.exists, file.name):
             if not sees:
-                raise ValueError(f"node {node} does not see {folder}: it must be on a file system that all nodes share")
+                raise CzError(f"node {node} does not see {folder}: it must be on a file system that all nodes share")
 
 
 def _answers(question: Callable[..., Any], *arguments: Any) -> Iterator[tuple[str, Any]]:
@@ -103,7 +102,7 @@ def _answers(question: Callable[..., Any], *arguments: Any) -> Iterator[tuple[st
             yield node, ray.get(answer)
         except ray.exceptions.RayError as error:
             cause = getattr(error, "cause", None) or error
-            raise ValueError(f"node {node} cannot run cz_gym: {' '.join(str(cause).split())[:200]}") from None
+            raise CzError(f"node {node} cannot run cz_gym: {' '.join(str(cause).split())[:200]}") from None
 
 
 def facts_of_sources(*more: str) -> tuple[str, str]:
@@ -127,7 +126,7 @@ def _facts_of_sources(more: tuple[str, ...]) -> tuple[str, str]:
 def _same_sources(ours: tuple[str, str], function: Callable[[Any], Any], task: Any) -> Any:
     """What a function makes of a task; ValueError where the sources are others, as on a node that came later."""
     if facts_of_sources() != ours:
-        raise ValueError(f"node {socket.gethostname()} has another cz_gym or numpy than this machine: install the same")
+        raise CzError(f"node {socket.gethostname()} has another cz_gym or numpy than this machine: install the same")
     return function(task)
 
 
@@ -158,7 +157,7 @@ def completed(
             except ray.exceptions.RayTaskError as error:
                 raise error.cause from None
             except ray.exceptions.RayError as error:
-                raise ValueError(f"the cluster lost a task {RETRIES} times: {' '.join(str(error).split())}") from None
+                raise CzError(f"the cluster lost a task {RETRIES} times: {' '.join(str(error).split())}") from None
             yield numbers.pop(reference), result
         if look:
             look()
@@ -179,7 +178,7 @@ def in_processes(
                 if look:
                     look()
         except BrokenProcessPool:
-            raise ValueError("a process was killed: is there enough memory?") from None
+            raise CzError("a process was killed: is there enough memory?") from None
         finally:
             if numbers:
                 for process in active_children():

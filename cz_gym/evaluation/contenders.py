@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from cz_gym.config import Config
+from cz_gym.errors import CzError
 from cz_gym.names import unknown
 
 from .protocol import SLOW_EPISODES, Row
@@ -42,12 +43,12 @@ def agent(name: str, policies: Sequence[Any], own: bool = False, trained_on: str
     contracts = [policy.contract for policy in policies]
     seeds = tuple(contract.training_seed for contract in contracts)
     if len(set(seeds)) < len(seeds):
-        raise ValueError(f"agent {name!r}: a training seed appears twice among {', '.join(map(str, seeds))}")
+        raise CzError(f"agent {name!r}: a training seed appears twice among {', '.join(map(str, seeds))}")
     if len({(contract.observation, contract.action) for contract in contracts}) > 1:
-        raise ValueError(f"agent {name!r}: its training seeds read different observations, or act differently")
+        raise CzError(f"agent {name!r}: its training seeds read different observations, or act differently")
     if len({contract.scenario_hash for contract in contracts}) > 1:
         trained = ", ".join(sorted({contract.scenario for contract in contracts}))
-        raise ValueError(f"agent {name!r}: its training seeds were trained on different scenarios: {trained}")
+        raise CzError(f"agent {name!r}: its training seeds were trained on different scenarios: {trained}")
     on = trained_on or contracts[0].scenario
     meaning = f"agent trained with {contracts[0].algorithm} on {on}{', given as a file' if own else ''}"
     controller = Controller(name, contracts[0].observation, meaning, seeds, action=contracts[0].action, own=own)
@@ -61,7 +62,7 @@ def check_intervals(contenders: Sequence[Contender], rows: Sequence[Row]) -> Non
     for contender in contenders:
         for row in rows:
             for trained in {contract["control_interval"] for contract in contender.contracts} - {row.control_interval}:
-                raise ValueError(
+                raise CzError(
                     f"agent {contender.name!r}: trained at {trained:g} s control, {row.name} runs at "
                     f"{row.control_interval:g} s"
                 )
@@ -74,7 +75,7 @@ def _writable(contract: Any) -> dict[str, Any]:
         try:
             json.dumps(value, ensure_ascii=False, allow_nan=False).encode()
         except ValueError:
-            raise ValueError(
+            raise CzError(
                 f"agent {contract.algorithm!r}: its contract's {name} cannot be written: {value!r:.80}"
             ) from None
     return facts
@@ -99,18 +100,18 @@ def choose(
     learned = list(dict.fromkeys((*given, *shipped)))
     for name in given:
         if name in names:
-            raise ValueError(f"an agent may not be called {name!r}: a controller has that name; name it NAME=FILE")
+            raise CzError(f"an agent may not be called {name!r}: a controller has that name; name it NAME=FILE")
     if wanted is None or wanted == ["all"]:
         some = [each for each in classical if each.name in slow or not each.controller.slow]
         wanted = [each.name for each in some if wanted or each.controller.slow or each.default]
         wanted += list(given or usual)
     for name in wanted:
         if name not in names + learned:
-            raise ValueError(unknown("controller", name, names + learned, ", or all"))
+            raise CzError(unknown("controller", name, names + learned, ", or all"))
     chosen = [each for each in classical if each.name in wanted]
     for each in chosen:
         if each.controller.slow and each.name not in slow:
-            raise ValueError(f"{each.name!r} is slow: add --slow to run it on the first {SLOW_EPISODES} episodes")
+            raise CzError(f"{each.name!r} is slow: add --slow to run it on the first {SLOW_EPISODES} episodes")
     for name in learned:
         if name in given:
             chosen.append(given[name])

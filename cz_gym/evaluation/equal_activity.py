@@ -17,6 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from cz_gym.errors import CzError
+
 from .statistics import LEVEL, Floats, Resamples
 
 Point = tuple[float, float]
@@ -38,7 +40,7 @@ class Frontier(NamedTuple):
         Raises ValueError below the quietest member, where the family gives no answer.
         """
         if not activity >= self.activity[0]:
-            raise ValueError(f"a pull step RMS of {activity} mm/min is below the frontier's {self.activity[0]:.4g}")
+            raise CzError(f"a pull step RMS of {activity} mm/min is below the frontier's {self.activity[0]:.4g}")
         if activity >= self.activity[-1]:
             return float(self.rmse[-1])
         curve = PchipInterpolator(np.log(self.activity), np.log(self.rmse))
@@ -53,14 +55,14 @@ def frontier(points: Sequence[Point]) -> Frontier:
     kept: list[Point] = []
     for activity, rmse in sorted(points):
         if not (0.0 < activity < np.inf and 0.0 < rmse < np.inf):
-            raise ValueError(f"activity and radius error must be positive numbers, not {activity} and {rmse}")
+            raise CzError(f"activity and radius error must be positive numbers, not {activity} and {rmse}")
         if not kept or rmse < kept[-1][1]:
             # Two activities whose logarithms are equal are one point of the curve: the better one.
             if kept and not np.log(activity) > np.log(kept[-1][0]):
                 kept.pop()
             kept.append((activity, rmse))
     if len(kept) < 2:
-        raise ValueError(f"a frontier needs two settings of which neither beats the other, found {len(kept)}")
+        raise CzError(f"a frontier needs two settings of which neither beats the other, found {len(kept)}")
     activities, errors = np.array(kept).T
     return Frontier(activities, errors)
 

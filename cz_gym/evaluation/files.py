@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.episodes.scenarios import find_scenario
+from cz_gym.errors import CzError
 
 from .metrics import metric_names
 from .results import BOUND, REFERENCE, Benchmark, Outcome, ScenarioResult
@@ -170,5 +171,5 @@ def read_episodes(path: Path, columns: Callable[[str], Sequence[str]]) -> Episod
         if not all(np.isfinite(values).all() for by_name in arrays.values() for values in by_name.values()):
             raise ValueError
     except (KeyError, TypeError, ValueError, csv.Error):
-        raise ValueError(f"{path}: no episodes of a benchmark, or damaged") from None
+        raise CzError(f"{path}: no episodes of a benchmark, or damaged") from None
     return arrays

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from cz_gym.config import Config, make_config
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import find_scenario
+from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
@@ -107,11 +108,11 @@ def find_row(name: str) -> Row:
     for row in ROWS:
         if row.name == name:
             return row
-    raise ValueError(unknown("scenario", name, [row.name for row in ROWS]))
+    raise CzError(unknown("scenario", name, [row.name for row in ROWS]))
 
 
 def check_episodes(episodes: int) -> int:
     """The number of test episodes; ValueError if the protocol does not have so many."""
     if not 1 <= episodes <= len(TEST_SEEDS):
-        raise ValueError(f"episodes must be between 1 and {len(TEST_SEEDS)}, not {episodes}")
+        raise CzError(f"episodes must be between 1 and {len(TEST_SEEDS)}, not {episodes}")
     return episodes

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.config import Config
+from cz_gym.errors import CzError
 
 from .rollout import Course, Rollout, answer, check_policy
 
@@ -35,7 +36,7 @@ class Playback:
         """Take actions of shape (steps, 2) for every episode alike, or (steps, episodes, 2); ValueError otherwise."""
         self.actions = np.array(actions, np.float32)
         if self.actions.ndim not in (2, 3) or self.actions.shape[-1] != 2 or len(self.actions) == 0:
-            raise ValueError(
+            raise CzError(
                 f"logged actions must be of shape (steps, 2) or (steps, episodes, 2), not {self.actions.shape}"
             )
 
@@ -61,9 +62,9 @@ def replay(
     for one in (policy, instead):
         check_policy(one, config)
     if not seeds:
-        raise ValueError("a replay needs at least one seed")
+        raise CzError("a replay needs at least one seed")
     if not 0.0 <= at <= config.horizon:
-        raise ValueError(f"at must lie in the episode, 0 to {config.horizon:g} s, not {at!r}")
+        raise CzError(f"at must lie in the episode, 0 to {config.horizon:g} s, not {at!r}")
     policy, instead = (
         one.for_episodes(config, list(seeds)) if hasattr(one, "for_episodes") else one for one in (policy, instead)
     )

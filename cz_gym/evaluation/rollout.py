@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.config import Config, check_config
+from cz_gym.errors import CzError
 from cz_gym.units import MICRO
 from cz_gym.vector import CzVectorEnv
 
@@ -80,7 +81,7 @@ def rollout(
     """
     check_policy(policy, config)
     if not isinstance(seeds, Sequence | np.ndarray) or len(seeds) == 0:
-        raise ValueError("a rollout needs a sequence of at least one seed, as [1]")
+        raise CzError("a rollout needs a sequence of at least one seed, as [1]")
     before = time.perf_counter()
     if hasattr(policy, "for_episodes"):
         policy = policy.for_episodes(config, list(seeds))
@@ -96,21 +97,21 @@ def check_policy(policy: Any, config: Config) -> None:
     check_config(config)
     if isinstance(policy, type) or not (hasattr(policy, "predict") or hasattr(policy, "for_episodes")):
         named = f", as make_controller({policy!r}, config) makes one" if isinstance(policy, str) else ""
-        raise ValueError(f"{policy!r:.80} is no policy: an object with {PREDICT} is needed{named}")
+        raise CzError(f"{policy!r:.80} is no policy: an object with {PREDICT} is needed{named}")
     if hasattr(policy, "predict"):
         try:
             signature(policy.predict).bind(None, state=None, episode_start=None, deterministic=True)
         except TypeError as error:
-            raise ValueError(f"{type(policy).__name__}.predict: {error}; it must be {PREDICT}") from None
+            raise CzError(f"{type(policy).__name__}.predict: {error}; it must be {PREDICT}") from None
     made_for = getattr(getattr(policy, "contract", policy), "control_interval", None)
     if made_for is not None and made_for != config.control_interval:
-        raise ValueError(
+        raise CzError(
             f"this {type(policy).__name__} was made for an action every {made_for:g} s, "
             f"the environment takes one every {config.control_interval:g} s"
         )
     acts = getattr(policy, "action", None)
     if isinstance(acts, str) and acts != config.action:
-        raise ValueError(
+        raise CzError(
             f"this {type(policy).__name__} gives actions {acts!r}, the environment takes {config.action!r}: "
             f"make_config(action={acts!r})"
         )
@@ -120,9 +121,9 @@ def answer(policy: Any, observation: Any, state: Any, begins: Any) -> tuple[Any,
     """Actions of shape (n, 2) and what the policy remembers; ValueError for anything else."""
     found = policy.predict(observation, state=state, episode_start=begins, deterministic=True)
     if not (isinstance(found, tuple) and len(found) == 2):
-        raise ValueError(f"predict must return a tuple (action, state), not {type(found).__name__}")
+        raise CzError(f"predict must return a tuple (action, state), not {type(found).__name__}")
     if np.shape(found[0]) != (len(observation), 2):
-        raise ValueError(
+        raise CzError(
             f"predict must return actions of shape {(len(observation), 2)} for {len(observation)} observations, "
             f"not {np.shape(found[0])}"
         )

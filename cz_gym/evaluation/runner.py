@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cz_gym.config import Config
+from cz_gym.errors import CzError
 
 from .cache import BLOCK, SlowEpisodes, earlier_bound
 from .contenders import Contender
@@ -147,7 +148,7 @@ class Job:
         if controller.slow:
             policies = contender.make(design)
             if plan.cache is None or len(policies) != 1:
-                raise ValueError(
+                raise CzError(
                     f"the slow controller {controller.name!r} needs a folder for its episodes, and one policy"
                 )
             self.slow = SlowEpisodes(controller, policies[0], self.config, plan.cache)

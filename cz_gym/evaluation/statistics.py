@@ -14,6 +14,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.errors import CzError
+
 Floats = npt.NDArray[np.float64]
 RESAMPLES = 10_000
 """Bootstrap resamples."""
@@ -62,7 +64,7 @@ class Resamples:
 
 def _weights(items: int, count: int, random: np.random.Generator) -> Floats:
     if items < 1:
-        raise ValueError(f"a bootstrap needs at least one item, not {items}")
+        raise CzError(f"a bootstrap needs at least one item, not {items}")
     return random.multinomial(items, np.full(items, 1.0 / items), size=count) / items
 
 

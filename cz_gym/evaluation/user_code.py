@@ -12,6 +12,7 @@ from typing import Any
 from cz_gym.config import Config
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import SCENARIOS
+from cz_gym.errors import CzError
 from cz_gym.names import unknown
 
 from .contenders import Contender
@@ -30,9 +31,9 @@ def load(place: str, kind: str, fits: Callable[[Any, str], bool]) -> tuple[str, 
     file, colon, name = place.rpartition(":")
     path = Path(file)
     if not colon or path.suffix != ".py" or not name.isidentifier():
-        raise ValueError(f"must be FILE.py:NAME, not {place!r:.80}")
+        raise CzError(f"must be FILE.py:NAME, not {place!r:.80}")
     if not path.is_file():
-        raise ValueError(f"{path}: no such file")
+        raise CzError(f"{path}: no such file")
     module_name = f"{PREFIX}{path.stem}"
     spec: Any = importlib.util.spec_from_file_location(module_name, path)
     # Dataclasses look their module up.
@@ -40,10 +41,10 @@ def load(place: str, kind: str, fits: Callable[[Any, str], bool]) -> tuple[str, 
     try:
         spec.loader.exec_module(module)
     except Exception as error:  # whatever the user's file raises
-        raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
+        raise CzError(f"{path}: {type(error).__name__}: {error}") from error
     if not hasattr(module, name):
         offered = [each for each, value in vars(module).items() if each[0] != "_" and fits(value, module_name)]
-        raise ValueError(f"{path}: {unknown(kind, name, offered)}")
+        raise CzError(f"{path}: {unknown(kind, name, offered)}")
     return name, getattr(module, name)
 
 
@@ -71,7 +72,7 @@ def _maker(place: str, found: Any) -> Callable[[Config], Any]:
     if not inspect.isclass(found) and hasattr(found, "predict"):
         return lambda config: found
     if not callable(found) or (inspect.isclass(found) and not hasattr(found, "predict")):
-        raise ValueError(f"{place}: no controller: it has no method predict(observation, state, ...)")
+        raise CzError(f"{place}: no controller: it has no method predict(observation, state, ...)")
     known = inspect.signature(found).parameters
 
     def make(config: Config) -> Any:
@@ -85,7 +86,7 @@ def row(place: str) -> Row:
     """A row of a scenario, a :class:`cz_gym.Scenario`."""
     _, found = load(place, "scenario", lambda value, _: isinstance(value, Scenario) and value.name not in SCENARIOS)
     if not isinstance(found, Scenario):
-        raise ValueError(f"{place}: no scenario: a {type(found).__name__}, not a cz_gym.Scenario")
+        raise CzError(f"{place}: no scenario: a {type(found).__name__}, not a cz_gym.Scenario")
     return Row(found.name, found, f"of {place}", default=False, file=place)
 
 
@@ -93,4 +94,4 @@ def check_apart(names: Sequence[str], kind: str) -> None:
     """ValueError for a name that appears twice."""
     for name in names:
         if names.count(name) > 1:
-            raise ValueError(f"two {kind}s are called {name!r}: rename yours")
+            raise CzError(f"two {kind}s are called {name!r}: rename yours")

@@ -7,6 +7,7 @@ from collections.abc import Collection
 from numbers import Real
 from typing import Annotated, Any, NamedTuple, get_type_hints
 
+from cz_gym.errors import CzError
 from cz_gym.units import MM, MM_PER_MIN
 
 
@@ -84,22 +85,20 @@ def check_numbers(what: str, values: Any, may_be_zero: Collection[str]) -> None:
         number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
         if not number or value < 0 or (value == 0 and name not in may_be_zero):
             unit = describe(type(values))[name].unit
-            raise ValueError(f"{what} {name} = {value!r} must be a positive finite number [{unit}]")
+            raise CzError(f"{what} {name} = {value!r} must be a positive finite number [{unit}]")
 
 
 def check_parameters(parameters: Parameters) -> Parameters:
     """Return the parameters, or raise ValueError naming the one that is not a usable number."""
     if not isinstance(parameters, Parameters):
-        raise ValueError(f"parameters must be a cz_gym.Parameters, not {parameters!r}")
+        raise CzError(f"parameters must be a cz_gym.Parameters, not {parameters!r}")
     check_numbers("parameter", parameters, _MAY_BE_ZERO)
     if parameters.alpha_0 >= math.pi / 2:
-        raise ValueError(
-            f"parameter alpha_0 = {parameters.alpha_0!r} rad must be below a right angle: is it in degrees?"
-        )
+        raise CzError(f"parameter alpha_0 = {parameters.alpha_0!r} rad must be below a right angle: is it in degrees?")
     if parameters.v_0 > MOST_V_0:
-        raise ValueError(f"parameter v_0 = {parameters.v_0!r} m/s is above {MOST_V_0:g} m/s: is it in mm/min?")
+        raise CzError(f"parameter v_0 = {parameters.v_0!r} m/s is above {MOST_V_0:g} m/s: is it in mm/min?")
     if parameters.R_cr <= parameters.r_0:
-        raise ValueError(
+        raise CzError(
             f"the crucible (R_cr = {parameters.R_cr} m) must be wider than the crystal (r_0 = {parameters.r_0} m)"
         )
     return Parameters(*map(float, parameters))

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cz_gym.errors import CzError
 from cz_gym.jit.compile import physics, within
 
 from .meniscus import HURLE, MeniscusModel, ring_point
@@ -176,7 +177,7 @@ def make_puller(parameters: Parameters | None = None, lam: float = 1.0, meniscus
     that are not numbers, out of range or without a finite operating point.
     """
     if not 0.0 <= lam <= 1.0:
-        raise ValueError(f"lam (share of conduction) must lie in [0, 1], not {lam!r}")
+        raise CzError(f"lam (share of conduction) must lie in [0, 1], not {lam!r}")
     q = check_parameters(parameters or Parameters())
     with np.errstate(all="ignore"):
         puller = derive_puller(q, float(lam), meniscus.height, meniscus.ring_offset)
@@ -187,12 +188,12 @@ def check_puller(puller: Puller, meniscus: MeniscusModel = HURLE) -> Puller:
     """Return the puller, or raise ValueError if it has no finite operating point on the meniscus."""
     if np.isfinite(puller.a) and not np.all(np.isfinite([puller.h_0, puller.ring_bias])):
         covers = f" ({meniscus.covers}; a = {puller.a:.4g} m)" if meniscus.covers else ""
-        raise ValueError(
+        raise CzError(
             f"r_0 = {puller.r_0:g} m, alpha_0 or phi_b lies outside the range of the meniscus {meniscus.name!r}{covers}"
             f": its height is {puller.h_0:.4g} m, its bright ring {puller.ring_bias:.4g} m outside the crystal"
         )
     if not np.all(np.isfinite(puller)):
-        raise ValueError(NO_OPERATING_POINT)
+        raise CzError(NO_OPERATING_POINT)
     return puller
 
 

@@ -12,6 +12,7 @@ from gymnasium.error import Error
 
 from cz_gym.commands import OneLineParser, between
 from cz_gym.config import Config, make_config
+from cz_gym.errors import CzError
 from cz_gym.rendering.scene import check_size
 from cz_gym.rendering.view import Window
 from cz_gym.units import MINUTE
@@ -49,28 +50,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def settings(arguments: argparse.Namespace) -> tuple[Config, tuple[int, int]]:
     """The environment's settings and the window's size; ValueError names what was given and what is allowed."""
     if not SLOWEST <= arguments.speed <= FASTEST:
-        raise ValueError(f"--speed must be {SLOWEST:g} to {FASTEST:g}, not {arguments.speed:g}")
+        raise CzError(f"--speed must be {SLOWEST:g} to {FASTEST:g}, not {arguments.speed:g}")
     if not 1.0 <= arguments.minutes <= 6000.0:
-        raise ValueError(f"--minutes must be 1 to 6000, not {arguments.minutes:g}")
+        raise CzError(f"--minutes must be 1 to 6000, not {arguments.minutes:g}")
     try:
         width, height = map(int, arguments.size.split("x"))
     except ValueError:
-        raise ValueError(f"--size must be WxH in pixels, such as 960x720, not {arguments.size!r}") from None
+        raise CzError(f"--size must be WxH in pixels, such as 960x720, not {arguments.size!r}") from None
     return make_config(arguments.scenario, horizon=arguments.minutes * MINUTE), check_size((width, height))
 
 
 def _play(arguments: argparse.Namespace) -> None:
     config, size = settings(arguments)
     if sys.platform.startswith(("linux", "freebsd")) and not any(map(os.environ.get, DISPLAYS)):
-        raise ValueError(NO_DISPLAY)
+        raise CzError(NO_DISPLAY)
     paper = pkgutil.resolve_name(CONTROLLERS)("paper").make(config)
     try:
         window = Window(size, "Cz-v0: pull a crystal")
     except Error as error:
-        raise ValueError(str(error)) from None
+        raise CzError(str(error)) from None
     try:
         if not window.visible:
-            raise ValueError(NO_DISPLAY)
+            raise CzError(NO_DISPLAY)
         scores = Game(window, size, config, arguments.seed, arguments.speed, paper, arguments.blind).play()
     finally:
         window.close()

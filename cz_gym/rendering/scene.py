@@ -6,6 +6,7 @@ from collections.abc import Callable
 from numbers import Integral
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from cz_gym.errors import CzError
 from cz_gym.units import HOUR, MINUTE, MM
 
 from . import gauges, palette, puller_panel, ring_panel, strip_charts, triple_point
@@ -42,7 +43,7 @@ def check_size(size: Any) -> tuple[int, int]:
     except (TypeError, ValueError):
         fits = False
     if not fits:
-        raise ValueError(
+        raise CzError(
             f"render_size must be (width, height), whole numbers of {SMALLEST} to {LARGEST} pixels, not {size!r}"
         )
     return int(width), int(height)

@@ -9,6 +9,7 @@ import numpy.typing as npt
 from gymnasium.error import DependencyNotInstalled, Error, ResetNeeded
 
 from cz_gym.config import Config
+from cz_gym.errors import CzError
 from cz_gym.names import unknown
 
 from .backend import MISSING, available, load
@@ -40,7 +41,7 @@ def make_view(render_mode: str | None, size: Any, config: Config) -> View | None
     if render_mode is None:
         return None
     if render_mode not in MODES:
-        raise ValueError(unknown("render_mode", render_mode, ["None", *MODES]))
+        raise CzError(unknown("render_mode", render_mode, ["None", *MODES]))
     if not available():
         raise DependencyNotInstalled(MISSING)
     return View(render_mode, width, height, config)

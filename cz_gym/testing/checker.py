@@ -20,6 +20,7 @@ from gymnasium.vector.utils import batch_space
 
 from cz_gym.commands import OneLineParser, between
 from cz_gym.episodes import scenarios
+from cz_gym.errors import CzError
 from cz_gym.observation import CAMERA, OBSERVATIONS
 
 from .driver import Checked, Driver, MakeScalar, MakeVector, NotConforming
@@ -52,7 +53,7 @@ def check_vector_env(
     (views, buffers, ctypes), and that writing into it or into the actions changes nothing inside.
     """
     if num_envs < 2 or steps < 2 or not modes:
-        raise ValueError(f"a check needs num_envs >= 2, steps >= 2 and a mode, not {num_envs}, {steps}, {modes!r}")
+        raise CzError(f"a check needs num_envs >= 2, steps >= 2 and a mode, not {num_envs}, {steps}, {modes!r}")
     total = Checked()
     for mode in modes:
         driver = Driver(make_vector, make_scalar, num_envs, steps, seed, AutoresetMode(mode))

@@ -21,6 +21,7 @@ from cz_gym.baselines.analysis.sampled_loop import close
 from cz_gym.baselines.registry import make_controller
 from cz_gym.commands import OneLineParser
 from cz_gym.config import make_config
+from cz_gym.errors import CzError
 from cz_gym.evaluation import user_code
 from cz_gym.evaluation.report.tables import markdown as table
 from cz_gym.physics.plant import Puller, make_puller
@@ -81,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(given: argparse.Namespace) -> None:
     if not 0.0 <= given.mix <= 1.0:
-        raise ValueError(f"--mix must lie in [0, 1], not {given.mix:g}")
+        raise CzError(f"--mix must lie in [0, 1], not {given.mix:g}")
     check_writable(given.out.parent)
     form, puller = form_of(given.controller), make_puller(lam=given.mix)
     found = {at: margins(form, puller, at) for at in PLACES}

@@ -14,6 +14,7 @@ from cz_gym.agents.agent_file.contract import Contract, read_agent
 from cz_gym.agents.training.recipes import ALL, RECIPES, SPECIALISTS, Gradient, Imitation
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser
+from cz_gym.errors import CzError
 from cz_gym.evaluation.report.tables import markdown as table
 from studies.algorithms.__main__ import ROWS
 
@@ -47,7 +48,7 @@ def read_results(paths: Sequence[Path]) -> Results:
                 for metric in FIGURES:
                     float(of[name][metric]["mean"])
     except (ValueError, KeyError, TypeError, AttributeError):
-        raise ValueError(f"no benchmark.json with {', '.join(AGENTS)}: {', '.join(map(str, paths))}") from None
+        raise CzError(f"no benchmark.json with {', '.join(AGENTS)}: {', '.join(map(str, paths))}") from None
     return found
 
 

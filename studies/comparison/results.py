@@ -22,6 +22,7 @@ from cz_gym.agents.training.validation import costs
 from cz_gym.atomic_files import write_files
 from cz_gym.baselines import lqg
 from cz_gym.config import Config, make_config
+from cz_gym.errors import CzError
 from cz_gym.evaluation.cache import hash_sources
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import Floats, rollout
@@ -119,5 +120,5 @@ def _read(path: Path, crystals: int) -> Result:
     except (KeyError, TypeError, ValueError, AttributeError):
         figures, validations = np.zeros(0), []
     if figures.shape != (crystals, len(FIGURES)) or not np.isfinite(figures).all():
-        raise ValueError(f"{path}: damaged; move it away to run it again")
+        raise CzError(f"{path}: damaged; move it away to run it again")
     return Result(figures, validations)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from cz_gym.agents.training.recipes import Recipe, Rewarded
+from cz_gym.errors import CzError
 from cz_gym.names import unknown
 
 
@@ -49,5 +50,5 @@ class Study(NamedTuple):
         names = known if wanted is None else wanted.split(",")
         for name in names:
             if name not in known:
-                raise ValueError(unknown("row", name, known))
+                raise CzError(unknown("row", name, known))
         return names

@@ -14,6 +14,7 @@ from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.baselines.registry import find_controller
 from cz_gym.commands import OneLineParser, between
 from cz_gym.env import CzEnv
+from cz_gym.errors import CzError
 from cz_gym.rendering import palette as c
 from cz_gym.rendering.canvas import Canvas
 from cz_gym.rendering.pixels import colours
@@ -49,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _make(arguments: argparse.Namespace) -> None:
     if arguments.out.suffix != ".gif":
-        raise ValueError(f"--out must end in .gif, not {str(arguments.out)!r}")
+        raise CzError(f"--out must end in .gif, not {str(arguments.out)!r}")
     import PIL.Image  # noqa: F401  (missing? say so before the work, not after it)
 
     check_writable(arguments.out.resolve().parent)
@@ -76,7 +77,7 @@ def contestants(scenario: str, seed: int, agent: Path | None = None) -> tuple[Si
     paper = find_controller("paper").make(env.config)
     learned = agents.OnnxPolicy.load(agent or agents.shipped(), env.config)
     if learned.contract.control_interval != env.config.control_interval:
-        raise ValueError(f"{agent}: acts every {learned.contract.control_interval:g} s, not every 5 s")
+        raise CzError(f"{agent}: acts every {learned.contract.control_interval:g} s, not every 5 s")
     other = CzEnv(scenario, observation=learned.observation, action=learned.action, render_mode="rgb_array")
     name = f"learned: {learned.contract.algorithm}"
     return Side("the paper's controller", paper, env, PAPER, seed), Side(name, learned, other, c.TRUE, seed)

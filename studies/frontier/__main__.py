@@ -19,6 +19,7 @@ import numpy as np
 from cz_gym.atomic_files import write_files
 from cz_gym.baselines.lqg.settings import FAMILY
 from cz_gym.commands import OneLineParser, guarded
+from cz_gym.errors import CzError
 from cz_gym.evaluation.equal_activity import Point, frontier, intervals, ratios
 from cz_gym.evaluation.files import EPISODES, Episodes, read_episodes
 from cz_gym.evaluation.statistics import Resamples
@@ -39,7 +40,7 @@ def read_points(path: Path, metric: str) -> dict[str, Points]:
             for scenario, controllers in results.items()
         }
     except (ValueError, KeyError, TypeError, AttributeError):
-        raise ValueError(f"{path} is no benchmark.json") from None
+        raise CzError(f"{path} is no benchmark.json") from None
 
 
 def table(results: Mapping[str, Points], metric: str, episodes: Episodes | None = None) -> str:
@@ -68,7 +69,7 @@ def _intervals(scenario: str, points: Points, episodes: Mapping[str, Any]) -> di
     """Intervals of those who met all the crystals; ValueError if the episodes are not of that run."""
     for name, (_, rmse) in points.items():
         if name not in episodes or not np.isclose(episodes[name][..., 1].mean(), rmse, rtol=1e-4):
-            raise ValueError(f"{EPISODES} is of another run: {name} on {scenario}")
+            raise CzError(f"{EPISODES} is of another run: {name} on {scenario}")
     crystals = max(values.shape[1] for values in episodes.values())
     complete = {name: values for name, values in episodes.items() if values.shape[1] == crystals}
     return intervals(complete, FAMILY, Resamples.draw(crystals, RESAMPLES))

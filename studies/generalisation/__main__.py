@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from cz_gym.atomic_files import write_files
 from cz_gym.commands import OneLineParser
+from cz_gym.errors import CzError
 from cz_gym.evaluation.files import EPISODES, read_episodes
 from cz_gym.evaluation.report.tables import markdown as table
 from cz_gym.evaluation.statistics import Estimate, Floats, Resamples, differences, means
@@ -47,10 +48,10 @@ def figures(row: str) -> tuple[str, ...]:
 def tabulate(episodes: Mapping[str, Mapping[str, Floats]], against: str) -> list[Cell]:
     """A cell a row and controller; ValueError unless the compared one took part in every row, on the same crystals."""
     if len({values.shape[1] for by_name in episodes.values() for values in by_name.values()}) != 1:
-        raise ValueError("every controller and row needs the same crystals, and at least one")
+        raise CzError("every controller and row needs the same crystals, and at least one")
     for row, by_name in episodes.items():
         if against not in by_name:
-            raise ValueError(f"{against!r} took no part in {row!r}; choose from {', '.join(by_name)}")
+            raise CzError(f"{against!r} took no part in {row!r}; choose from {', '.join(by_name)}")
     weights = Resamples.draw(next(iter(next(iter(episodes.values())).values())).shape[1])
     cells = []
     for row, by_name in episodes.items():

@@ -16,6 +16,7 @@ from cz_gym.baselines.pid.settings import tuned
 from cz_gym.baselines.policy import Floats
 from cz_gym.commands import OneLineParser, between
 from cz_gym.config import make_config
+from cz_gym.errors import CzError
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import Rollout, rollout
 from cz_gym.units import MINUTE, MM, MM_PER_MIN
@@ -65,7 +66,7 @@ def facts(run: Rollout) -> Facts:
     """The facts of a rollout, failed episodes left out; ValueError if all failed."""
     kept = ~run.failed
     if not kept.any():
-        raise ValueError("every episode failed: there is no operation to describe")
+        raise CzError("every episode failed: there is no operation to describe")
     dt = run.config.control_interval
     first, lags = round(SETTLED / dt), round(60.0 * MINUTE / dt)
     signals = run.signals

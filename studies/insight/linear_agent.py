@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.errors import CzError
 from cz_gym.observation import (
     DRIVE_CHANNELS,
     HEATER_SCALE,
@@ -47,7 +48,7 @@ def linear_agent(
     """
     rows = np.atleast_2d(np.asarray(observations, np.float64))
     if rows.shape[1] != len(HISTORY):
-        raise ValueError(f'an agent without a state is linear here only on "history" ({len(HISTORY)} channels)')
+        raise CzError(f'an agent without a state is linear here only on "history" ({len(HISTORY)} channels)')
     slopes = _asked(jacobian(onnx_bytes, rows), dt, action, v_0) / scales(HISTORY, v_0)
     slopes = slopes @ np.linalg.inv(undo_differences()).T
     now, integral, means = np.split(slopes, (len(MEASURED), len(MEASURED) + 1), axis=1)
@@ -81,7 +82,7 @@ def remembering_agent(
     """
     seen, n = np.asarray(observations, np.float64), len(MEASURED)
     if seen.shape[1] != n:
-        raise ValueError(f'an agent that remembers is linear here only on "measured" ({n} channels)')
+        raise CzError(f'an agent that remembers is linear here only on "measured" ({n} channels)')
     found = jacobian(onnx_bytes, seen, np.asarray(states, np.float64))
     asked = _asked(found[:2], dt, action, v_0)
     found[2:, :n] /= scales(MEASURED, v_0)
@@ -122,7 +123,7 @@ def _in_double(onnx_bytes: bytes, inputs: tuple[str, ...]) -> Any:
 
     model = onnx.load_model_from_string(onnx_bytes)
     if tuple(value.name for value in model.graph.input) != inputs:
-        raise ValueError(f"the agent must read {' and '.join(inputs)}, and nothing else")
+        raise CzError(f"the agent must read {' and '.join(inputs)}, and nothing else")
     for weight in model.graph.initializer:
         if weight.data_type == TensorProto.FLOAT:
             weight.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(weight).astype(np.float64), weight.name))

@@ -18,6 +18,7 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 from cz_gym.baselines.analysis import frequency, sampled_loop
+from cz_gym.errors import CzError
 from cz_gym.physics.linearisation import Floats, StateSpace
 from cz_gym.physics.plant import make_puller
 from cz_gym.units import HOUR, KILO, MM, MM_PER_MIN
@@ -90,7 +91,7 @@ class Responses(NamedTuple):
             camera: Complex = -np.einsum("ki,ki->k", self.plant[:, RING], self._without_camera())
             return camera
         if at != "v_p":
-            raise ValueError(f"a loop is opened at camera or v_p, not {at!r}")
+            raise CzError(f"a loop is opened at camera or v_p, not {at!r}")
         around = self._recalled + self.controller[:, :, :2] @ self.plant
         heater = around[:, 1, 0] / (1.0 - around[:, 1, 1])
         return -(around[:, 0, 0] + around[:, 0, 1] * heater)

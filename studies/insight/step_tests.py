@@ -10,6 +10,7 @@ import numpy as np
 
 from cz_gym.config import Config, make_config
 from cz_gym.episodes.scenario import Scenario
+from cz_gym.errors import CzError
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import Course, Floats, Signals
 from cz_gym.units import HOUR, MICRO, MINUTE, MM
@@ -259,5 +260,5 @@ def parts_of(whole: Scenario, base: Scenario) -> dict[str, Scenario]:
         found[name] = with_part(base, family, members, f"{base.name}: {name}")
         all_of_it = with_part(all_of_it, family, members, whole.name)
     if all_of_it != whole:
-        raise ValueError(f"{whole.name!r} differs from {base.name!r} in more than {', '.join(PROPERTIES)}")
+        raise CzError(f"{whole.name!r} differs from {base.name!r} in more than {', '.join(PROPERTIES)}")
     return found

@@ -11,6 +11,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from cz_gym.commands import OneLineParser, between
+from cz_gym.errors import CzError
 from cz_gym.evaluation.files import csv_text
 from cz_gym.evaluation.report.tables import markdown as table
 
@@ -60,7 +61,7 @@ def read(path: Path) -> list[Row]:
         rows = list(csv.DictReader(path.read_text().splitlines()))
         return [Row(row["example"], int(row["seed"]), *(float(row[name]) for name in Row._fields[2:])) for row in rows]
     except (KeyError, TypeError, ValueError):
-        raise ValueError(f"{path}: damaged; move it away to run everything again") from None
+        raise CzError(f"{path}: damaged; move it away to run everything again") from None
 
 
 def to_csv(rows: Sequence[Row]) -> bytes:

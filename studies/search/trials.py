@@ -22,6 +22,7 @@ from tqdm import tqdm
 from cz_gym.agents.training.recipes import PPO
 from cz_gym.agents.training.validation import PICKING
 from cz_gym.atomic_files import write_files
+from cz_gym.errors import CzError
 from cz_gym.evaluation.cluster import completed
 from cz_gym.evaluation.files import csv_text
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
@@ -143,7 +144,7 @@ def run(search: Search) -> Study:
         ),
     )
     for error in tuner.fit().errors:
-        raise ValueError(f"a trial failed: {str(error).strip().splitlines()[-1]}")
+        raise CzError(f"a trial failed: {str(error).strip().splitlines()[-1]}")
     return study
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from cz_gym.atomic_files import check_writable, write_files
+from cz_gym.errors import CzError
 from cz_gym.evaluation.files import EPISODES, FILES, RESULTS, is_benchmark_json, to_csv, to_json
 from cz_gym.evaluation.results import Benchmark
 
@@ -14,9 +15,9 @@ def check_targets(folder: Path | None, lone: Path | None, partial: bool, overwri
     protected = protected_files(folder, lone, partial)
     if protected and not overwrite:
         path, why = protected[0]
-        raise ValueError(f"{path} exists and {why}: add --overwrite, or name another --out or --json")
+        raise CzError(f"{path} exists and {why}: add --overwrite, or name another --out or --json")
     if lone and lone.is_dir():
-        raise ValueError(f"--json {lone} is a folder")
+        raise CzError(f"--json {lone} is a folder")
     for place in (folder, lone and lone.parent):
         if place:
             check_writable(place)

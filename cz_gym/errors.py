@@ -1,0 +1,10 @@
+"""The error that this project raises on purpose."""
+
+from __future__ import annotations
+
+
+class CzError(ValueError):
+    """An error whose message tells the user what to change.
+
+    Commands print it as one line; every other exception is a bug, the user's or ours, and keeps its traceback.
+    """
