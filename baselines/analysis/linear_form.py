@@ -1,4 +1,4 @@
-"""A controller's state space for the design table, whatever keeps its code from being linear at rest set aside."""
+"""A controller's state space, without what keeps its code from being linear at rest."""
 
 from __future__ import annotations
 

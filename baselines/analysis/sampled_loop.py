@@ -1,7 +1,7 @@
 """Sampled loops, linearised from the code that runs: a controller's ``predict``, the plant and what they make together.
 
 A controller whose memory is a NamedTuple of arrays is linear near rest, so feeding its own ``predict`` one unit of each
-memory entry and of each observation channel yields its state space: the design table judges the shipped code and no
+memory entry and of each observation channel yields its state space: margins are those of the shipped code and no
 second description of it. Timing as in the environment: measure at t_k, act at once; the v_p and Q_H observed at
 t_k are those applied over the interval before.
 """

@@ -16,8 +16,6 @@ from cz_gym import CzEnv, agents, datasets
 from cz_gym.config import make_config
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from examples import cleanrl_ppo, sb3_ppo
-from studies.plain_tools import __main__ as plain_tools
-from tests.processes import python
 
 
 def test_the_stable_baselines_example_writes_an_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -112,21 +110,3 @@ def test_the_offline_example_holds_crystals_after_learning_from_others(
     found = offline.main(recorded(100), updates=6000)
     assert found.failure_rate == 0.0
     assert found.rmse_mm < 0.15
-
-
-def test_the_study_goes_on_from_what_is_finished(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rows = [plain_tools.Row("sb3_ppo", seed, 1.5, 0.125, 0.02, 0.0) for seed in range(2)]
-    (tmp_path / "runs.csv").write_bytes(plain_tools.to_csv(rows))
-    assert plain_tools.read(tmp_path / "runs.csv") == rows
-    assert plain_tools.main(["--examples", "sb3_ppo", "--seeds", "2", "--out", str(tmp_path)]) == 0
-    assert capsys.readouterr().out.count("| sb3_ppo | ") == 2
-    (tmp_path / "runs.csv").write_text("example,seed\nsb3_ppo,first\n")
-    assert plain_tools.main(["--out", str(tmp_path)]) == 2
-    assert "damaged" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_the_study_runs_examples_in_processes_of_their_own(tmp_path: Path) -> None:
-    options = ["--seeds", "1", "--steps", "100", "--out", str(tmp_path / "out")]
-    python("-m", "studies.plain_tools", *options)
-    assert [row.example for row in plain_tools.read(tmp_path / "out" / "runs.csv")] == ["cleanrl_ppo", "sb3_ppo"]

@@ -13,9 +13,7 @@ from cz_gym.baselines.tuning import lqg as tune_lqg
 from cz_gym.baselines.tuning import pid as tune_pid
 from cz_gym.commands import OneLineParser, guarded, interpreter
 from cz_gym.play import __main__ as play
-from studies.design_table import __main__ as design_table
 from studies.film import __main__ as film
-from studies.industrial import __main__ as industrial
 from studies.insight import __main__ as insight
 from studies.paper import __main__ as paper
 from studies.speed import __main__ as speed
@@ -26,8 +24,6 @@ COMMANDS: list[tuple[Any, str, str, list[str]]] = [
     (paper, "--ou", "contents", ["--out", "new/folder"]),
     (tune_pid, "--trial", "measure", ["--controller", "industrial", "--out", "new/folder"]),
     (tune_lqg, "--hist", "figures", ["--output", "new/folder/lqg.json"]),
-    (design_table, "--puller", "table", ["--out", "new/folder"]),
-    (industrial, "--episode", "rollout", []),
     (insight, "--episode", "study", ["--out", "new/folder"]),
     (speed, "--qui", "run", ["--quick"]),
     (young_laplace, "--wri", "build", ["--write"]),

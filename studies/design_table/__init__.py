@@ -1,1 +1,0 @@
-"""Margins and noise gains of the linear controllers: ``python -m studies.design_table``."""

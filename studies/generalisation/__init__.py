@@ -1,1 +1,0 @@
-"""Agents where they were not trained: ``python -m studies.generalisation``."""

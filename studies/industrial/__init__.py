@@ -1,1 +1,0 @@
-"""The plant beside the logs of a real puller: ``python -m studies.industrial``."""

@@ -1,1 +1,0 @@
-"""A search of a recipe's hyperparameters: ``python -m studies.search``."""
