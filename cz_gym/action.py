@@ -1,21 +1,32 @@
-"""An agent's action knows which environment it is for, so that another one does not take it in silence."""
+"""Actions that know which environment they were made for, so that another one refuses them."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium.error import InvalidAction
 
-from .config import Config
+
+class MadeFor(NamedTuple):
+    """The environment that a controller or an agent was made for."""
+
+    action: str
+    """Meaning of its actions: "direct", "smooth" or "rate" (:func:`cz_gym.task.drives_of`)."""
+    control_interval: float
+    """Time between its actions [s]."""
+    plant: str
+    """Hash of the plant (:attr:`cz_gym.config.Config.plant_hash`)."""
+
+    def __str__(self) -> str:
+        return f"action={self.action!r}, control_interval={self.control_interval:g}, plant {self.plant}"
 
 
-class AgentAction(np.ndarray[Any, np.dtype[np.float32]]):
-    """An action, or a row of some, as an agent gave it; what is computed from it is a plain array."""
+class MarkedAction(np.ndarray[Any, np.dtype[Any]]):
+    """An action, or one a row, that carries what it was made for; whatever is computed from it is a plain array."""
 
-    made_for: tuple[str, float] | None
-    """What it means ("direct", "smooth" or "rate") and the time between actions [s]."""
+    made_for: MadeFor | None
 
     def __array_finalize__(self, other: Any) -> None:
         self.made_for = getattr(other, "made_for", None)
@@ -24,19 +35,26 @@ class AgentAction(np.ndarray[Any, np.dtype[np.float32]]):
         return np.asarray(array)[()]
 
 
-def made_for(action: npt.NDArray[np.float32], kind: str, control_interval: float) -> AgentAction:
-    """The same action for environments of that kind of actions and that control interval [s] only."""
-    marked = action.view(AgentAction)
-    marked.made_for = kind, control_interval
+def mark(action: npt.NDArray[Any], made_for: MadeFor | None) -> npt.NDArray[Any]:
+    """The same action, refused by every environment but the one it was made for; with None, taken by every one."""
+    if made_for is None:
+        return action
+    marked = action.view(MarkedAction)
+    marked.made_for = made_for
     return marked
 
 
-def check_made_for(action: AgentAction, config: Config) -> None:
-    """InvalidAction for an agent's action that is meant for another environment than one of these settings."""
-    made = action.made_for
-    if made is not None and made != (config.action, config.control_interval):
-        raise InvalidAction(
-            f"this agent is made for action={made[0]!r}, control_interval={made[1]:g}; the environment has "
-            f'{config.action!r}, {config.control_interval:g}: gym.make("Cz-v0", **agent.settings) makes the agent\'s '
-            "(np.asarray(action) passes nevertheless)"
-        )
+def check_marked(action: Any, own: MadeFor) -> None:
+    """Raise InvalidAction for a marked action that was made for another environment than ``own``."""
+    if type(action) is MarkedAction and (message := mismatch(action.made_for, own)):
+        raise InvalidAction(f"{message} (np.asarray(action) is taken all the same)")
+
+
+def mismatch(made_for: MadeFor | None, own: MadeFor) -> str:
+    """How an environment differs from the one that a controller or agent was made for; empty if it does not."""
+    if made_for is None or made_for == own:
+        return ""
+    return (
+        f"this controller or agent was made for {made_for}; the environment has {own}: "
+        'gym.make("Cz-v0", **controller.settings) makes the one that it was made for'
+    )

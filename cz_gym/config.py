@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from numbers import Real
 from typing import NamedTuple
 
@@ -19,6 +20,7 @@ from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters, check_parameters
 from cz_gym.physics.plant import make_puller
 
+from .action import MadeFor
 from .observation import CAMERA, OBSERVATIONS
 from .task import ACTIONS, check_height
 
@@ -83,9 +85,12 @@ class Config:
     @property
     def plant_hash(self) -> str:
         """SHA-256 of what the crystal obeys: version, meniscus and parameters (16 hex digits)."""
-        numbers = {name: float(value) + 0.0 for name, value in self.parameters._asdict().items()}
-        text = json.dumps([VERSION, _name(self.meniscus), numbers], sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
+        return _plant_hash(self.parameters, self.meniscus)
+
+    @property
+    def made_for(self) -> MadeFor:
+        """What controllers and agents of this environment are made for."""
+        return MadeFor(self.action, self.control_interval, self.plant_hash)
 
     @property
     def hash(self) -> str:
@@ -152,6 +157,13 @@ def make_config(
     check_height(make_puller(checked, meniscus=meniscus or HURLE))
     looking = check_camera(camera_for(checked) if camera is None else camera, checked)
     return Config(found, model, observation, action, interval, length, checked, meniscus or HURLE, looking)
+
+
+@lru_cache(maxsize=64)
+def _plant_hash(parameters: Parameters, meniscus: MeniscusModel) -> str:
+    numbers = {name: float(value) + 0.0 for name, value in parameters._asdict().items()}
+    text = json.dumps([VERSION, _name(meniscus), numbers], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _name(meniscus: MeniscusModel) -> str:

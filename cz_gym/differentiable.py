@@ -14,7 +14,9 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.error import InvalidAction, ResetNeeded
 
+from cz_gym.action import check_marked
 from cz_gym.config import Config
+from cz_gym.cost import Cost
 from cz_gym.engine.batch import Batch, first_key
 from cz_gym.engine.buffers import BufferPool
 from cz_gym.engine.layout import INFO, Out
@@ -23,7 +25,6 @@ from cz_gym.episodes.record import GRID
 from cz_gym.errors import CzError
 from cz_gym.observation import MEASURED, scales
 from cz_gym.physics.meniscus import MeniscusModel
-from cz_gym.task import Cost
 
 Floats = npt.NDArray[np.float64]
 _COSTS = [INFO.index(f"cost_{name}") for name in Cost._fields]
@@ -43,7 +44,7 @@ class Step(NamedTuple):
     measured: npt.NDArray[np.float32]
     """The "measured" observation, shape (n, 11)."""
     cost: Floats
-    """The four terms of the cost (:class:`cz_gym.task.Cost`), shape (n, 4)."""
+    """The four terms of the cost (:class:`cz_gym.cost.Cost`), shape (n, 4)."""
     error: Floats
     """The true radius error r_c - r_ref [m], shape (n,)."""
     offset: Floats
@@ -83,7 +84,7 @@ class DifferentiableBatch:
         latency = config.scenario.sensor.latency
         if latency > config.control_interval:
             raise CzError(f"the camera's latency of {latency:g} s is longer than the control interval")
-        self.config, self.num_envs = config, int(num_envs)
+        self.config, self._made_for, self.num_envs = config, config.made_for, int(num_envs)
         self._batch = Batch(config, self.num_envs, threads)
         self._gather, self._tangents = _compiled(config.meniscus)
         self._out = self._batch.new_out()
@@ -119,8 +120,10 @@ class DifferentiableBatch:
     def step(self, actions: npt.ArrayLike) -> Step:
         """Hold actions, shape (n, 2), for one control interval; crystals that are lost or at their end stay.
 
-        InvalidAction for NaN or another shape, ResetNeeded before every slot had its first reset.
+        InvalidAction for NaN, another shape, and actions made for another environment;
+        ResetNeeded before every slot had its first reset.
         """
+        check_marked(actions, self._made_for)
         if not self._begun.all():
             raise ResetNeeded("every slot needs a crystal: call reset()")
         before, n = self._state, self.num_envs

@@ -24,7 +24,7 @@ from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.rendering.view import FPS, Frame, declared_modes, make_view
 
-from .action import AgentAction, check_made_for
+from .action import check_marked
 from .config import Config, check_config, make_config
 from .observation import CAMERA, CLIP, OBSERVATIONS
 
@@ -149,7 +149,7 @@ class CzEnv(gym.Env[Observation, Action]):
 
     def _setup(self, config: Config, render_mode: str | None, render_size: tuple[int, int], info: str) -> None:
         self._everything, self._settings = check_info(info), (config, render_mode, render_size, info)
-        self.config = config
+        self.config, self._made_for = config, config.made_for
         self.render_mode = render_mode
         self.action_space = action_space()
         self.observation_space = observation_space(config.observation)
@@ -187,13 +187,12 @@ class CzEnv(gym.Env[Observation, Action]):
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Hold an action, shape (2,), for one control interval; see :class:`gymnasium.Env`.
 
-        Raises InvalidAction for NaN, another shape, and an agent made for other actions or another control interval;
+        Raises InvalidAction for NaN, another shape, and an action made for another environment (:mod:`cz_gym.action`);
         ResetNeeded once the episode is over.
         """
         if self._over:
             raise ResetNeeded("the episode is over (or never began): call reset()")
-        if type(action) is AgentAction:
-            check_made_for(action, self.config)
+        check_marked(action, self._made_for)
         self._action[0] = check_action(action)
         self._step()
         out = self._out

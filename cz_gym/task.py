@@ -1,4 +1,4 @@
-"""The task: limits, reward and its terms. The benchmark's metrics never read the reward."""
+"""The task: the limits within which a crystal grows, and what an action asks of the drives."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cz_gym.errors import CzError
-from cz_gym.jit.compile import physics
+from cz_gym.jit.compile import jittable
 from cz_gym.physics.plant import Puller
 
-from .observation import HEATER_SCALE
-from .units import KILO, MM, MM_PER_MIN
+from .units import KILO, MM
 
 RADIUS_LIMIT = 8.0 * MM
 """Largest |r_c - r_ref| [m]."""
@@ -20,21 +19,12 @@ HEIGHT_MIN = 1.2 * MM
 """Lowest meniscus before it freezes [m]."""
 HEIGHT_MAX_IN_A = 1.24
 """Highest meniscus before it detaches [capillary constants]."""
-HEATER_RANGE = HEATER_SCALE
-"""Q_H = Q_H0 +- this [W]."""
+HEATER_RANGE = 10.0 * KILO
+"""Range of the heater's drive [W]: Q_H = Q_H0 +- HEATER_RANGE."""
 SMOOTH_TIME = 50.0
 """Time constant with which ``action="smooth"`` moves both drives [s]."""
 SMOOTH_PULL, SMOOTH_HEATER = 1.0, 0.5
 """Where a held smooth action of 1 brings the drives to: shares of v_0 and of the heater's range [-]."""
-RADIUS_SCALE = 0.5 * MM
-PULL_DEVIATION = 0.36 * MM_PER_MIN
-PULL_STEP_SCALE = 0.06 * MM_PER_MIN
-HEATER_STEP_SCALE = 1.0 * KILO
-PULL_WEIGHT, PULL_STEP_WEIGHT, HEATER_STEP_WEIGHT = 0.5, 0.25, 0.05
-COST_CAP = 10.0
-"""What the saturated cost approaches [-]."""
-FAILURE_COST = 10.0
-"""Cost of the failing step and of each step lost to it [-]."""
 
 
 class Drives(NamedTuple):
@@ -76,16 +66,7 @@ def drives_of(action: str, control_interval: float) -> Drives:
     return Drives(keep, SMOOTH_PULL * share, SMOOTH_HEATER * share)
 
 
-class Cost(NamedTuple):
-    """Terms of the cost, each weighted and dimensionless."""
-
-    radius: Any
-    pull: Any
-    pull_step: Any
-    heater_step: Any
-
-
-@physics
+@jittable
 def within_limits(r_c: Any, h_c: Any, r_ref: Any, a: Any) -> Any:
     """Whether the crystal still grows: false for NaN, freezing, detachment and a lost radius."""
     return (np.abs(r_c - r_ref) <= RADIUS_LIMIT) & (h_c >= HEIGHT_MIN) & (h_c <= HEIGHT_MAX_IN_A * a)
@@ -99,31 +80,3 @@ def check_height(puller: Puller) -> None:
             f"the nominal meniscus height {puller.h_0 / MM:.3g} mm of these parameters lies outside its limits, "
             f"{HEIGHT_MIN / MM:.3g} to {highest / MM:.3g} mm; check r_0, alpha_0, sigma and rho_l"
         )
-
-
-@physics
-def cost_terms(radius_error: Any, pull: Any, pull_step: Any, heater_step: Any) -> Any:
-    """Terms from the true radius error [m], v_p - v_0 [m/s], and step changes of v_p [m/s] and Q_H [W]."""
-    return Cost(
-        (radius_error / RADIUS_SCALE) ** 2,
-        PULL_WEIGHT * (pull / PULL_DEVIATION) ** 2,
-        PULL_STEP_WEIGHT * (pull_step / PULL_STEP_SCALE) ** 2,
-        HEATER_STEP_WEIGHT * (heater_step / HEATER_STEP_SCALE) ** 2,
-    )
-
-
-@physics
-def reward(cost: Any) -> Any:
-    """1 - 10 cost / (10 + cost): saturating, never flat, between -9 and 1."""
-    total = cost.radius + cost.pull + cost.pull_step + cost.heater_step
-    return 1.0 - COST_CAP * total / (COST_CAP + total)
-
-
-@physics
-def failure_penalty(step: Any, steps: Any) -> Any:
-    """Added to the reward when step ``step`` of ``steps``, the first being 1, fails: for this step and each one lost.
-
-    So a failing step earns at most 1 - 10 (steps - step + 1), never more than the worst life from it to the horizon,
-    over -9 (steps - step + 1): dying never pays, also in the last steps.
-    """
-    return -FAILURE_COST * (steps - step + 1)

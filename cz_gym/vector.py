@@ -23,7 +23,7 @@ from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.processors import processors
 
-from .action import AgentAction, check_made_for
+from .action import check_marked
 from .config import Config, check_config, make_config
 from .env import CzEnv, EnvState, action_space, check_options, check_state, observation_space
 
@@ -95,7 +95,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         num_envs = int(num_envs)
         if threads is not None and (not isinstance(threads, int) or threads < 1):
             raise CzError(f"threads must be a positive whole number or None, not {threads!r}")
-        self.config = config
+        self.config, self._made_for = config, config.made_for
         self.render_mode = None
         self.num_envs = num_envs
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -147,11 +147,10 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Hold actions, shape (num_envs, 2), for one control interval in every slot.
 
-        Raises InvalidAction for NaN, another shape, and an agent made for other actions or another control interval;
+        Raises InvalidAction for NaN, another shape, and an action made for another environment (:mod:`cz_gym.action`);
         ResetNeeded before the first reset and, with autoreset disabled, while any episode is over.
         """
-        if type(actions) is AgentAction:
-            check_made_for(actions, self.config)
+        check_marked(actions, self._made_for)
         actions = self._check_actions(actions)
         if not self._begun:
             raise ResetNeeded("call reset() first")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.action import made_for
+from cz_gym.action import MadeFor, mark
 from cz_gym.agents.agent_file.contract import AgentFileError, Contract, observation_hash, read_agent
 from cz_gym.agents.agent_file.graph import GraphError, checked
 from cz_gym.config import Config, check_config
@@ -94,6 +94,11 @@ class OnnxPolicy:
         return self.contract.action
 
     @property
+    def made_for(self) -> MadeFor:
+        """The environment it was trained in: what its actions mean, how often it acts, and on which plant."""
+        return MadeFor(self.action, self.contract.control_interval, self.contract.plant_hash)
+
+    @property
     def settings(self) -> dict[str, Any]:
         """What ``gym.make("Cz-v0", ...)`` must be given for it: observation, action and control interval [s]."""
         return {name: getattr(self.contract, name) for name in ("observation", "action", "control_interval")}
@@ -103,7 +108,7 @@ class OnnxPolicy:
     ) -> tuple[npt.NDArray[np.float32], Any]:
         """Actions, shape (n, 2) or (2,), of observations of shape (n, channels) or (channels,).
 
-        Environments of other actions or of another control interval refuse them.
+        Environments of other actions, of another control interval or with another plant refuse them.
 
         An agent that remembers takes and returns ``state``, shape (n, k) or (k,); None, and rows where
         ``episode_start``, begin at zero. One that does not returns it as it was.
@@ -134,7 +139,7 @@ class OnnxPolicy:
         shapes = [(len(inputs["observation"]), width) for width in (2, self.remembers) if width]
         if [output.shape for output in outputs] != shapes or not all(np.isfinite(output).all() for output in outputs):
             raise AgentFileError(f"agent {self.contract.sha256[:12]}: its action is not two finite numbers")
-        outputs[0] = made_for(outputs[0], self.action, self.contract.control_interval)
+        outputs[0] = mark(outputs[0], self.made_for)
         return outputs
 
 

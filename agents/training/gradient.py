@@ -18,10 +18,11 @@ from torch.autograd import backward, grad
 from torch.nn.utils.parametrize import register_parametrization
 
 from cz_gym.config import Config
+from cz_gym.cost import Cost, cost_slopes, cost_terms, saturated, saturated_slope
 from cz_gym.differentiable import STATES, Step
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from cz_gym.observation import MEASURED, scales
-from cz_gym.task import COST_CAP, RADIUS_SCALE, Cost, cost_terms, drives_of
+from cz_gym.task import drives_of
 
 from .crystals import Crystals, Evenness
 from .demonstrations import widened
@@ -181,7 +182,7 @@ class GradientLearner:
             return step
         error = np.where(step.grows, step.error + step.offset, 0.0)
         step.cost[:, _RADIUS] = cost_terms(error, 0.0, 0.0, 0.0).radius
-        slope = 2.0 * error / RADIUS_SCALE**2
+        slope = cost_slopes(error, 0.0, 0.0, 0.0).radius
         step.jacobian[:, len(STATES) + _RADIUS] = slope[:, None] * step.jacobian[:, STATES.index("r_c")]
         return step
 
@@ -194,7 +195,7 @@ class GradientLearner:
         deviation = measured[:, _V_P] * self.v_p_scale
         asked = (self.drives.keep - 1.0) * deviation + self.drives.pull * self.config.parameters.v_0 * action[:, 0]
         charged = cost_terms(0.0, 0.0, asked, 0.0).pull_step
-        gain = 2.0 * charged / np.where(asked == 0.0, 1.0, asked) * self.drives.pull * self.config.parameters.v_0
+        gain = cost_slopes(0.0, 0.0, asked, 0.0).pull_step * self.drives.pull * self.config.parameters.v_0
         return np.where(step.grows & (charged > 1.001 * step.cost[:, _PULL_STEP] + 1e-9), gain, 0.0)
 
     def _follow(self, window: Window, measured_by_state: Any) -> None:
@@ -203,8 +204,8 @@ class GradientLearner:
         What the network's action makes of its features has its derivatives taken for some steps at once.
         """
         cost = window.costs @ self.weights
-        capped = COST_CAP * cost / (COST_CAP + cost)
-        by_cost = (COST_CAP / (COST_CAP + cost)) ** 2 / cost.size
+        capped = saturated(cost)
+        by_cost = saturated_slope(cost) / cost.size
         if self.evenness:
             by_cost *= self.evenness.weights(capped.mean(axis=0))
         steps, n = cost.shape

@@ -16,9 +16,9 @@ from sb3_contrib import ARS
 from sb3_contrib.ars.policies import ARSLinearPolicy
 from torch import nn
 
+from cz_gym.cost import FAILURE_COST
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from cz_gym.observation import HISTORY
-from cz_gym.task import FAILURE_COST
 
 from .networks import Normalise, whitening
 

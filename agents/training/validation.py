@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.config import Config
+from cz_gym.cost import FAILURE_COST, cost_terms
 from cz_gym.evaluation.metrics import Metrics, metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.task import FAILURE_COST, cost_terms
 from cz_gym.units import KILO, MM, MM_PER_MIN
 
 from .recipes import OWN_WEIGHTS, CostWeights

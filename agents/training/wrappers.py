@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvWrapper
 
-from cz_gym.task import FAILURE_COST, Cost, cost_terms, reward
+from cz_gym.cost import FAILURE_COST, Cost, cost_terms, reward
 
 from .recipes import OWN_WEIGHTS, CostWeights
 from .vec_env import CzVecEnv

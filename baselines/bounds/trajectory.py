@@ -14,9 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from cz_gym.baselines.policy import Floats
+from cz_gym.cost import Cost, cost_terms
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.physics.plant import Inputs, State
-from cz_gym.task import HEATER_RANGE, HEIGHT_MAX_IN_A, HEIGHT_MIN, Cost, cost_terms
+from cz_gym.task import HEATER_RANGE, HEIGHT_MAX_IN_A, HEIGHT_MIN
 from cz_gym.units import KILO, MM, MM_PER_MIN
 
 from .future import Future

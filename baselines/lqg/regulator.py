@@ -14,15 +14,7 @@ import numpy as np
 from scipy.linalg import solve_discrete_are
 
 from cz_gym.baselines.policy import Floats
-from cz_gym.task import (
-    HEATER_STEP_SCALE,
-    HEATER_STEP_WEIGHT,
-    PULL_DEVIATION,
-    PULL_STEP_SCALE,
-    PULL_STEP_WEIGHT,
-    PULL_WEIGHT,
-    RADIUS_SCALE,
-)
+from cz_gym.cost import WEIGHTS, coefficients
 
 from .model import DRIFT, PLANT, STATES, PlantModel
 
@@ -32,15 +24,15 @@ STEP_TIME = 5.0
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights on the terms of the cost, each over its scale in :mod:`cz_gym.task`; the defaults are the reward's."""
+    """Weights on the terms of the cost, each over its scale in :mod:`cz_gym.cost`; the defaults are the reward's."""
 
-    radius: float = 1.0
+    radius: float = WEIGHTS.radius
     """On (r_c - r_ref)^2."""
-    pull: float = PULL_WEIGHT
+    pull: float = WEIGHTS.pull
     """On (v_p - v_0)^2."""
-    pull_step: float = PULL_STEP_WEIGHT
+    pull_step: float = WEIGHTS.pull_step
     """On the squared step of v_p."""
-    heater_step: float = HEATER_STEP_WEIGHT
+    heater_step: float = WEIGHTS.heater_step
     """On the squared step of Q_H."""
 
 
@@ -77,12 +69,11 @@ class Cost(NamedTuple):
 def quadratic_cost(weights: Weights, dt: float) -> Cost:
     """The cost's matrices for a control interval of dt [s]."""
     Q, N = np.zeros((PLANT + 2, PLANT + 2)), np.zeros((PLANT + 2, 2))
-    pull = weights.pull / PULL_DEVIATION**2
-    per_step = (STEP_TIME / dt) ** 2
-    Q[0, 0] = weights.radius / RADIUS_SCALE**2
-    Q[PLANT, PLANT] = N[PLANT, 0] = pull
-    moves = weights.pull_step / PULL_STEP_SCALE**2, weights.heater_step / HEATER_STEP_SCALE**2
-    return Cost(Q, N, np.diag([pull + per_step * moves[0], per_step * moves[1]]))
+    per_square, per_step = coefficients(weights), (STEP_TIME / dt) ** 2
+    Q[0, 0] = per_square.radius
+    Q[PLANT, PLANT] = N[PLANT, 0] = per_square.pull
+    moves = per_square.pull + per_step * per_square.pull_step, per_step * per_square.heater_step
+    return Cost(Q, N, np.diag(moves))
 
 
 def regulator(model: PlantModel, weights: Weights, dt: float, ahead: int) -> Regulator:

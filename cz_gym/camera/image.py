@@ -15,7 +15,7 @@ import numpy.typing as npt
 from cz_gym.episodes.record import Stream
 from cz_gym.episodes.rng import WORDS, normal, seed_stream
 from cz_gym.jit.cache import hashed
-from cz_gym.jit.compile import kernel, physics
+from cz_gym.jit.compile import jittable, kernel
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.plant import Puller
 
@@ -46,13 +46,13 @@ def new_scratch(n: int) -> Scratch:
     return Scratch(np.zeros((n, 2, COLUMNS // 2 + 1)), np.zeros((n, WORDS), np.uint64))
 
 
-@physics
+@jittable
 def grey_value(row: Any, column: Any, scene: Any, view: Any) -> Any:
     """Brightness at pixel coordinates [grey values], not rounded."""
     return view.gain * radiance(sight(row, column, view), scene, view)
 
 
-@physics
+@jittable
 def _pixel(row: Any, column: Any, corners: Any, scene: Any, view: Any) -> Any:
     """Brightness of a pixel whose upper and lower corners stand in the two rows of ``corners``.
 
@@ -72,14 +72,14 @@ def _pixel(row: Any, column: Any, corners: Any, scene: Any, view: Any) -> Any:
     return total / (SUB * SUB)
 
 
-@physics
+@jittable
 def _rounded(value: Any, noisy: Any, stream: Any, view: Any) -> Any:
     if noisy:
         value += np.sqrt(max(value, 0.0) / view.electrons) * normal(stream)
     return np.uint8(min(max(value + 0.5, 0.0), 255.0))
 
 
-@physics
+@jittable
 def expose(scene: Any, view: Any, corners: Any, noisy: Any, stream: Any, image: Any) -> None:
     """Write the image of a scene, uint8 (ROWS, COLUMNS, 1); with shot noise from ``stream`` if ``noisy``.
 

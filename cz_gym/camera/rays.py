@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.jit.compile import physics
+from cz_gym.jit.compile import jittable
 from cz_gym.physics.meniscus import hurle_slope, profile_scale
 
 from .view import COLUMNS, ROWS
@@ -68,7 +68,7 @@ class Hit(NamedTuple):
     q: Any
 
 
-@physics
+@jittable
 def make_scene(r_c: Any, h_c: Any, p: Any) -> Any:
     """The scene of a crystal of radius r_c [m] on Hurle's meniscus of height h_c [m]; ``p.a`` [m]."""
     _, cos_theta = hurle_slope(r_c, h_c, p)
@@ -78,14 +78,14 @@ def make_scene(r_c: Any, h_c: Any, p: Any) -> Any:
     return Scene(r_c, h_c, M, q_c, X_c, r_c + M * (FLAT / SQRT_2 - SQRT_2 - X_c))
 
 
-@physics
+@jittable
 def _sech_tanh(q: Any) -> Any:
     e = np.exp(-q)
     per = 1.0 / (1.0 + e * e)
     return 2.0 * e * per, (1.0 - e * e) * per
 
 
-@physics
+@jittable
 def profile_at(q: Any, scene: Any) -> Any:
     """Radius and height [m] of the meniscus at q, and their derivatives by q."""
     sech, tanh = _sech_tanh(q)
@@ -94,14 +94,14 @@ def profile_at(q: Any, scene: Any) -> Any:
     return r, M * SQRT_2 * sech, M * (1.0 / SQRT_2 - SQRT_2 * sech * sech), -M * SQRT_2 * sech * tanh
 
 
-@physics
+@jittable
 def slope_at(q: Any) -> Any:
     """Sine and cosine of the meniscus' slope against the horizontal."""
     sech, tanh = _sech_tanh(q)
     return 2.0 * sech * tanh, 1.0 - 2.0 * sech * sech
 
 
-@physics
+@jittable
 def _gap(q: Any, ray: Any, scene: Any) -> Any:
     """Distance of the ray from the axis less the profile's radius, at the profile's height; and its derivative."""
     r, z, dr, dz = profile_at(q, scene)
@@ -112,7 +112,7 @@ def _gap(q: Any, ray: Any, scene: Any) -> Any:
     return distance - r, outward * dz - dr
 
 
-@physics
+@jittable
 def _zero_of_gap(ray: Any, scene: Any, outside: Any, inside: Any, q: Any) -> Any:
     """q where the ray meets the profile, by Newton's method held between a q outside the melt and one inside it."""
     for _ in range(_TURNS):
@@ -130,7 +130,7 @@ def _zero_of_gap(ray: Any, scene: Any, outside: Any, inside: Any, q: Any) -> Any
     return q
 
 
-@physics
+@jittable
 def _meet_below(ray: Any, scene: Any, q: Any) -> Any:
     """q where a sinking ray that is outside the profile at ``q`` meets it, or -1: the melt is flat there."""
     t = -ray.z / ray.dz
@@ -143,7 +143,7 @@ def _meet_below(ray: Any, scene: Any, q: Any) -> Any:
     return _zero_of_gap(ray, scene, q, FLAT, max(guess, q))
 
 
-@physics
+@jittable
 def _meet_above(ray: Any, scene: Any, q: Any) -> Any:
     """q where a rising ray that is outside the profile at ``q`` meets it, or -1: it passes the triple point outside."""
     if ray.x * ray.dx + ray.y * ray.dy >= 0.0:
@@ -152,7 +152,7 @@ def _meet_above(ray: Any, scene: Any, q: Any) -> Any:
     return _zero_of_gap(ray, scene, q, scene.q_c, 0.5 * (q + scene.q_c)) if gap < 0.0 else -1.0
 
 
-@physics
+@jittable
 def _meet_cylinder(ray: Any, radius: Any, outwards: Any) -> Any:
     """Time at which the ray enters a cylinder about the axis, or leaves it; -1: never."""
     a = ray.dx * ray.dx + ray.dy * ray.dy
@@ -165,7 +165,7 @@ def _meet_cylinder(ray: Any, radius: Any, outwards: Any) -> Any:
     return (root - b) / a if outwards else (-root - b) / a
 
 
-@physics
+@jittable
 def _meet_crystal(ray: Any, scene: Any) -> Any:
     """Time at which the ray meets the crystal's wall, or passes its underside into it; -1: never."""
     inside = ray.x * ray.x + ray.y * ray.y < scene.r_c * scene.r_c
@@ -173,25 +173,25 @@ def _meet_crystal(ray: Any, scene: Any) -> Any:
     return t if t > 0.0 and ray.z + t * ray.dz > scene.h_c else -1.0
 
 
-@physics
+@jittable
 def _at(what: Any, ray: Any, t: Any) -> Any:
     return Hit(what, ray.x + t * ray.dx, ray.y + t * ray.dy, ray.z + t * ray.dz, -1.0)
 
 
-@physics
+@jittable
 def _beyond(hit: Any, radius: Any) -> Any:
     """Whether a point lies outside a cylinder about the axis."""
     return hit.x * hit.x + hit.y * hit.y > radius * radius
 
 
-@physics
+@jittable
 def _at_profile(ray: Any, q: Any, scene: Any) -> Any:
     _, z, _, _ = profile_at(q, scene)
     t = (z - ray.z) / ray.dz
     return Hit(MELT, ray.x + t * ray.dx, ray.y + t * ray.dy, z, q)
 
 
-@physics
+@jittable
 def _rising(ray: Any, q: Any, scene: Any, view: Any) -> Any:
     """What a ray hits that does not sink."""
     camera = view.camera
@@ -207,7 +207,7 @@ def _rising(ray: Any, q: Any, scene: Any, view: Any) -> Any:
     return shield if _beyond(shield, camera.shield_radius) else _at(OPENING, ray, 1.0)
 
 
-@physics
+@jittable
 def _sinking(ray: Any, q: Any, scene: Any, view: Any) -> Any:
     """What a ray hits that sinks."""
     camera = view.camera
@@ -227,13 +227,13 @@ def _sinking(ray: Any, q: Any, scene: Any, view: Any) -> Any:
     return melt
 
 
-@physics
+@jittable
 def first_hit(ray: Any, q: Any, scene: Any, view: Any) -> Any:
     """What a ray meets first; it is outside the melt at the meniscus' ``q``: the triple point's, or where it starts."""
     return _sinking(ray, q, scene, view) if ray.dz < 0.0 else _rising(ray, q, scene, view)
 
 
-@physics
+@jittable
 def mirror(ray: Any, hit: Any) -> Any:
     """The ray that leaves the melt where another met it: the angle of reflection is the angle of incidence."""
     sine, cosine = (0.0, 1.0)
@@ -245,7 +245,7 @@ def mirror(ray: Any, hit: Any) -> Any:
     return Ray(hit.x, hit.y, hit.z, ray.dx - twice * n_x, ray.dy - twice * n_y, ray.dz - twice * cosine)
 
 
-@physics
+@jittable
 def _just_off(q: Any, ray: Any) -> Any:
     """q a little along the profile from where a ray leaves the melt: there it is outside."""
     if q < 0.0:
@@ -253,7 +253,7 @@ def _just_off(q: Any, ray: Any) -> Any:
     return q + _APART if ray.dz < 0.0 else q - _APART
 
 
-@physics
+@jittable
 def emitted(hit: Any, scene: Any, view: Any) -> Any:
     """Radiance of what was hit, light that it mirrors apart."""
     if hit.what == MELT:
@@ -270,7 +270,7 @@ def emitted(hit: Any, scene: Any, view: Any) -> Any:
     return view.opening
 
 
-@physics
+@jittable
 def radiance(ray: Any, scene: Any, view: Any) -> Any:
     """Radiance that comes back along a ray from above the melt."""
     light, share, q = 0.0, 1.0, scene.q_c
@@ -285,7 +285,7 @@ def radiance(ray: Any, scene: Any, view: Any) -> Any:
     return light
 
 
-@physics
+@jittable
 def sight(row: Any, column: Any, view: Any) -> Any:
     """The ray from the lens through pixel coordinates of :func:`cz_gym.camera.project`."""
     u = (column - 0.5 * COLUMNS) * view.pixel

@@ -10,13 +10,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cz_gym.cost import Cost, cost_terms, failure_penalty, reward
 from cz_gym.episodes.draw import draw_episode, draw_factors, randomised, seed_streams
 from cz_gym.episodes.noise import first_fluctuation, fluctuation, sample_noise
 from cz_gym.jit.cache import hashed
-from cz_gym.jit.compile import fetch, inlined, kernel, physics
+from cz_gym.jit.compile import fetch, inlined, jittable, kernel
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.plant import Disturbance, State, derive_puller, growth
-from cz_gym.task import HEATER_RANGE, Cost, cost_terms, failure_penalty, reward
+from cz_gym.task import HEATER_RANGE
 
 from .layout import EPISODE_AT, INFO, LEAN, PULLER_AT, SLOT
 from .lockstep import LANES, advance, height_inside
@@ -31,7 +32,7 @@ _LINE = 8
 _NUMBERS, _INFOS = SLOT.itemsize // 8, len(INFO)
 
 
-@physics
+@jittable
 def _begin(slot: Any) -> None:
     """Put a slot with drawn constants at the start of its episode."""
     p, e = slot.puller, slot.episode
@@ -45,7 +46,7 @@ def _begin(slot: Any) -> None:
     slot.k = slot.frames = slot.over = slot.point = 0
 
 
-@physics
+@jittable
 def next_speed(v_p: Any, pull: Any, drives: Any, p: Any, e: Any, interval: Any) -> Any:
     """The pull speed [m/s] that an action asks for, within window and slew."""
     speed = drives.keep * ((v_p - p.v_0) / p.v_0) + drives.pull * clip(pull, 1.0)
@@ -53,7 +54,7 @@ def next_speed(v_p: Any, pull: Any, drives: Any, p: Any, e: Any, interval: Any) 
     return v_p + clip(wanted - v_p, e.pull_slew * interval)
 
 
-@physics
+@jittable
 def next_power(Q_H: Any, heat: Any, drives: Any, p: Any, e: Any, interval: Any) -> Any:
     """The heater power [W] that an action asks for, within its slew, before it is rounded to whole steps."""
     share = drives.keep * ((Q_H - p.Q_H_0) / HEATER_RANGE) + drives.heater * clip(heat, 1.0)
@@ -62,7 +63,7 @@ def next_power(Q_H: Any, heat: Any, drives: Any, p: Any, e: Any, interval: Any) 
     return Q_H + clip(power - Q_H, e.heater_slew * interval)
 
 
-@physics
+@jittable
 def _drive(slot: Any, pull: Any, heat: Any, drives: Any, interval: Any) -> None:
     """Move the drives as an action asks, the heater in whole steps."""
     p, e = slot.puller, slot.episode
@@ -117,21 +118,21 @@ _sample_alone = kernel(_read, keep=False, allocates=False)
 """A sample as a function of its own: with the step's options, so that what it calls is compiled only once."""
 
 
-@physics
+@jittable
 def _fetch_slot(numbers: Any, i: Any) -> None:
     """Have slot i brought to the cache: the slots of a large batch are further away than one step is long."""
     for at in range(0, _NUMBERS, _LINE):
         fetch(numbers, i * _NUMBERS + at)
 
 
-@physics
+@jittable
 def _fetch_info(info: Any, i: Any) -> None:
     """Have the lines brought that the info of slot i and of those after it is written to."""
     for row in range(_INFOS):
         fetch(info, row * info.shape[1] + i)
 
 
-@physics
+@jittable
 def _fetch_history(slot: Any, history: Any, before: Any) -> None:
     """Have the samples brought at which the remembered spans of a slot's past end."""
     depth, channels = history.shape

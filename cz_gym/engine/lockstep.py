@@ -14,7 +14,7 @@ import numpy as np
 from cz_gym.episodes.noise import fluctuation, next_fluctuation
 from cz_gym.episodes.record import GRID
 from cz_gym.episodes.schedule import drift, melt_left, reference
-from cz_gym.jit.compile import inlined, physics, scratch
+from cz_gym.jit.compile import inlined, jittable, scratch
 from cz_gym.physics.plant import Disturbance, Inputs, Puller, State, growth, hidden_load, rk4
 from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN, within_limits
 from cz_gym.units import MM
@@ -34,7 +34,7 @@ _LOW = 5.0 * MM
 _JUMP = HEIGHT_MIN
 
 
-@physics
+@jittable
 def height_inside(h_c: Any, p: Any) -> Any:
     """Meniscus height held inside its limits, so that a failed state is still measured."""
     top = HEIGHT_MAX_IN_A * p.a
@@ -43,7 +43,7 @@ def height_inside(h_c: Any, p: Any) -> Any:
     return top if h_c.real > top else h_c
 
 
-@physics
+@jittable
 def judged(x: Any, new: Any, u: Any, d: Any, p: Any, dt: Any, r_ref: Any, slope: Any) -> Any:
     """A substep's new state and whether the crystal still grows; a jump no crystal makes keeps the state before.
 
@@ -59,7 +59,7 @@ def judged(x: Any, new: Any, u: Any, d: Any, p: Any, dt: Any, r_ref: Any, slope:
     return new, grows
 
 
-@physics
+@jittable
 def _disturb(slot: Any, j: Any) -> Any:
     """The disturbance at grid point j, this one or the next; the hidden load is solved only while the drift moves."""
     p, e = slot.puller, slot.episode
@@ -73,30 +73,30 @@ def _disturb(slot: Any, j: Any) -> Any:
     return Disturbance(slot.Q_d, slot.dT_i, melt_left(j * GRID, e))
 
 
-@physics
+@jittable
 def _state(lanes: Any, at: Any, lane: Any) -> Any:
     return State(
         lanes[at, lane], lanes[at + 1, lane], lanes[at + 2, lane], lanes[at + 3, lane], lanes[at + 4, lane]
     )  # fmt: skip
 
 
-@physics
+@jittable
 def _put(lanes: Any, at: Any, lane: Any, x: Any) -> None:
     lanes[at, lane], lanes[at + 1, lane], lanes[at + 2, lane] = x.r_c, x.h_c, x.T_1
     lanes[at + 3, lane], lanes[at + 4, lane] = x.T_2, x.T_b
 
 
-@physics
+@jittable
 def _inputs(lanes: Any, lane: Any) -> Any:
     return Inputs(lanes[_U_AT, lane], lanes[_U_AT + 1, lane])
 
 
-@physics
+@jittable
 def _disturbance(lanes: Any, lane: Any) -> Any:
     return Disturbance(lanes[_D_AT, lane], lanes[_D_AT + 1, lane], lanes[_D_AT + 2, lane])
 
 
-@physics
+@jittable
 def _puller(c: Any, i: Any) -> Any:
     return Puller(
         c[0, i], c[1, i], c[2, i], c[3, i], c[4, i], c[5, i], c[6, i], c[7, i], c[8, i],
@@ -105,7 +105,7 @@ def _puller(c: Any, i: Any) -> Any:
     )  # fmt: skip
 
 
-@physics
+@jittable
 def _begin(slot: Any, numbers: Any, lanes: Any, lane: Any, interval: Any) -> None:
     """Bring a slot to its lane, at the start of a control interval."""
     for constant in range(_P):
@@ -115,7 +115,7 @@ def _begin(slot: Any, numbers: Any, lanes: Any, lane: Any, interval: Any) -> Non
     lanes[_T, lane] = slot.k * interval
 
 
-@physics
+@jittable
 def _prepare(slot: Any, lanes: Any, lane: Any, interval: Any) -> None:
     """The next substep: to the next point of the 5 s grid, or to the end of the interval."""
     t, end = lanes[_T, lane], (slot.k + 1) * interval
@@ -137,7 +137,7 @@ def _integrate(lanes: Any, found: Any, count: Any, slope: Any) -> None:
         _put(found, 0, lane, rk4(x, u, d, _puller(lanes, lane), lanes[_DT, lane], slope))
 
 
-@physics
+@jittable
 def _judge(
     slot: Any, frames: Any, lanes: Any, found: Any, lane: Any, interval: Any, slope: Any, ring_offset: Any
 ) -> Any:
@@ -154,7 +154,7 @@ def _judge(
     return grows and within
 
 
-@physics
+@jittable
 def advance(memory: Any, active: Any, first: Any, count: Any, clock: Any, slope: Any, ring_offset: Any) -> None:
     """Integrate the active ones of up to :data:`LANES` slots over one control interval, split at the 5 s grid.
 

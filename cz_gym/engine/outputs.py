@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cz_gym.episodes.schedule import bias_offset, recipe, reference
-from cz_gym.jit.compile import physics, scratch
+from cz_gym.jit.compile import jittable, scratch
 from cz_gym.observation import CLIP, INTEGRAL_SCALE, LAGGED, MEASURED, PREVIEWS, STATE, Measured
 
 _AHEAD_1, _AHEAD_2 = PREVIEWS[1:]
@@ -17,7 +17,7 @@ _RING = _REMEMBERED[0]
 _RING_SCALE = MEASURED[_RING].scale
 
 
-@physics
+@jittable
 def clip(value: Any, limit: Any) -> Any:
     """The value held within +-limit, a complex one by its real part; NaN passes."""
     if value.real < -limit:
@@ -25,7 +25,7 @@ def clip(value: Any, limit: Any) -> Any:
     return limit if value.real > limit else value
 
 
-@physics
+@jittable
 def measure(slot: Any, t: Any) -> Any:
     """The "measured" channels in SI units."""
     p, e = slot.puller, slot.episode
@@ -45,14 +45,14 @@ def measure(slot: Any, t: Any) -> Any:
     )
 
 
-@physics
+@jittable
 def write_measured(measured: Any, per_scale: Any, out: Any) -> None:
     """Write the "measured" channels, scaled and clipped."""
     for channel in range(_M):
         out[channel] = clip(measured[channel] * per_scale[channel], CLIP)
 
 
-@physics
+@jittable
 def remember(slot: Any, history: Any, interval: Any, out: Any) -> None:
     """Add the sample's scaled channels to the running sums, and the ring error to its integral."""
     depth = history.shape[0]
@@ -70,7 +70,7 @@ def remember(slot: Any, history: Any, interval: Any, out: Any) -> None:
         history[at, channel] = history[before, channel] + out[_REMEMBERED[channel]]
 
 
-@physics
+@jittable
 def recall(slot: Any, measured: Any, history: Any, reading: Any, out: Any) -> None:
     """Turn "measured" channels into "history": integral, differences of successive spans' means, relative channels."""
     depth, later = history.shape[0], scratch(1, _L)
@@ -91,7 +91,7 @@ def recall(slot: Any, measured: Any, history: Any, reading: Any, out: Any) -> No
         out[place[row]] = clip(difference * (reading.measured[place[row]] * change[row]), CLIP)
 
 
-@physics
+@jittable
 def write_state(slot: Any, measured: Any, t: Any, per_scale: Any, out: Any) -> None:
     """Write the "state" channels."""
     p, x = slot.puller, slot.x
@@ -105,7 +105,7 @@ def write_state(slot: Any, measured: Any, t: Any, per_scale: Any, out: Any) -> N
         out[channel] = clip(truth[channel] * per_scale[channel], CLIP)
 
 
-@physics
+@jittable
 def write_info(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, at_interface: Any, info: Any) -> None:
     """Write the info rows, all but the last; ``h_c`` is the height held inside its limits, ``ring`` the ring there."""
     p, x = slot.puller, slot.x

@@ -8,12 +8,12 @@ import numpy as np
 
 from cz_gym.episodes.record import FREEZES
 from cz_gym.episodes.schedule import bias_offset, pyrometer_drift, ripple
-from cz_gym.jit.compile import physics
+from cz_gym.jit.compile import jittable
 
 _EPS = 1e-9
 
 
-@physics
+@jittable
 def photograph(slot: Any, frames: Any, t: Any, ring: Any, h_c: Any) -> None:
     """Keep the ring [m] and the meniscus height [m] as a frame taken at t."""
     at = slot.frames % frames.shape[0]
@@ -23,7 +23,7 @@ def photograph(slot: Any, frames: Any, t: Any, ring: Any, h_c: Any) -> None:
     slot.frames = slot.frames + 1
 
 
-@physics
+@jittable
 def _delivered(slot: Any, frames: Any, t: Any) -> Any:
     """Index of the newest frame as old as the latency, or of the oldest there is."""
     depth = frames.shape[0]
@@ -34,7 +34,7 @@ def _delivered(slot: Any, frames: Any, t: Any) -> Any:
     return index % depth
 
 
-@physics
+@jittable
 def _freezes(slot: Any, t: Any) -> Any:
     """Whether the camera is frozen at t, and whether it says so."""
     frozen, flagged = False, False
@@ -45,7 +45,7 @@ def _freezes(slot: Any, t: Any) -> Any:
     return frozen, flagged
 
 
-@physics
+@jittable
 def sense(slot: Any, camera: Any, pyrometer: Any, frames: Any, t: Any, ring: Any, h_c: Any) -> None:
     """Read pyrometer and camera at t; ``ring`` [m] is what a camera without latency sees, less the operator's bias,
     on a meniscus of height ``h_c`` [m].

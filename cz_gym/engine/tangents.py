@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from cz_gym.cost import Cost, cost_slopes
 from cz_gym.episodes.record import GRID
 from cz_gym.episodes.schedule import melt_left, reference
 from cz_gym.jit.cache import hashed
-from cz_gym.jit.compile import kernel, physics, within
+from cz_gym.jit.compile import force_inlined, jittable, kernel
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.plant import Disturbance, Inputs, State, along, rates
-from cz_gym.task import Cost, cost_terms
 
 from .kernels import next_power, next_speed
 from .lockstep import height_inside
@@ -35,13 +35,13 @@ _V, _Q, _RING, _READING = (SMOOTH.index(name) for name in ("v_p", "Q_H", "ring",
 _COST = _ACT = len(SMOOTH)
 
 
-@within
+@force_inlined
 def _step(value: Any) -> Any:
     """The value with an imaginary step."""
     return complex(value, _H)
 
 
-@within
+@force_inlined
 def _column(A: Any, j: Any, k: Any) -> None:
     """Derivatives of the rates along one of their arguments."""
     A[0, j], A[1, j], A[2, j], A[3, j], A[4, j] = (
@@ -49,7 +49,7 @@ def _column(A: Any, j: Any, k: Any) -> None:
     )  # fmt: skip
 
 
-@within
+@force_inlined
 def _rates_by(A: Any, x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
     """The rates; their derivatives into ``A``.
 
@@ -73,7 +73,7 @@ def _rates_by(A: Any, x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
     return State(k.r_c.real, k.h_c.real, k.T_1.real, k.T_2.real, k.T_b.real)
 
 
-@within
+@force_inlined
 def _stage(work: Any, weight: Any, ahead: Any, x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
     """A stage of Runge and Kutta's: its rates, and what they depend on.
 
@@ -93,7 +93,7 @@ def _stage(work: Any, weight: Any, ahead: Any, x: Any, u: Any, d: Any, p: Any, s
     return k
 
 
-@physics
+@jittable
 def rk4_by(work: Any, x: Any, u: Any, d: Any, p: Any, dt: Any, slope: Any) -> None:
     """Derivatives of :func:`cz_gym.physics.plant.rk4` by state and inputs, into ``work[3]``, shape (5, 7)."""
     for i in range(_X):
@@ -145,15 +145,8 @@ def build_tangents(meniscus: MeniscusModel) -> tuple[Any, Any]:
             h_c = height_inside(x.h_c, p)
             ring_by_r = 1.0 + ring_offset(_step(x.r_c), h_c, p).imag / _H
             ring_by_h = ring_offset(x.r_c, _step(h_c), p).imag / _H
-            error, pulled, heated = (
-                x.r_c - p.r_0 - reference(slot.k * dt, e),
-                slot.v_p - slot.v_p_before,
-                slot.Q_H - slot.Q_H_before,
-            )
-            radius = cost_terms(_step(error), 0.0, 0.0, 0.0).radius.imag / _H
-            deviation = cost_terms(0.0, _step(slot.v_p - p.v_0), 0.0, 0.0).pull.imag / _H
-            pull_step = cost_terms(0.0, 0.0, _step(pulled), 0.0).pull_step.imag / _H
-            heater_step = cost_terms(0.0, 0.0, 0.0, _step(heated)).heater_step.imag / _H
+            error = x.r_c - p.r_0 - reference(slot.k * dt, e)
+            slopes = cost_slopes(error, slot.v_p - p.v_0, slot.v_p - slot.v_p_before, slot.Q_H - slot.Q_H_before)
             for j in range(_ACT + ACTIONS):
                 drive = _V if j in (_V, _ACT) else _Q
                 if j < _X:
@@ -165,10 +158,10 @@ def build_tangents(meniscus: MeniscusModel) -> tuple[Any, Any]:
                 for row in range(_X):
                     J[row, j] = share * work[3, row, column]
                 J[_RING, j] = ring_by_r * J[0, j] + ring_by_h * J[1, j]
-                J[_COST, j] = radius * J[0, j]
-                J[_COST + 1, j] = deviation * J[_V, j]
-                J[_COST + 2, j] = pull_step * (J[_V, j] - (1.0 if j == _V else 0.0))
-                J[_COST + 3, j] = heater_step * (J[_Q, j] - (1.0 if j == _Q else 0.0))
+                J[_COST, j] = slopes.radius * J[0, j]
+                J[_COST + 1, j] = slopes.pull * J[_V, j]
+                J[_COST + 2, j] = slopes.pull_step * (J[_V, j] - (1.0 if j == _V else 0.0))
+                J[_COST + 3, j] = slopes.heater_step * (J[_Q, j] - (1.0 if j == _Q else 0.0))
             fresh, late = slot.k_seen == slot.k, e.latency > 0.0
             for j in range(_ACT + ACTIONS):
                 if fresh and not late:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from cz_gym.jit.compile import physics
+from cz_gym.jit.compile import jittable
 from cz_gym.physics.parameters import Parameters
 
 from .record import FREEZES, GRID, Episode, Factors, Stream
@@ -28,25 +28,25 @@ _FACTORS, _FAULT_NUMBERS = len(Factors._fields), 5 + 3 * FREEZES
 _INTERFACE_NUMBERS, _SENSOR_NUMBERS = 2, 8
 
 
-@physics
+@jittable
 def seed_streams(streams: Any, key: Any) -> None:
     """Seed an episode's streams, shape (streams, 4), from its key, two 64-bit words."""
     for number in range(STREAMS):
         seed_stream(streams[number], key, number)
 
 
-@physics
+@jittable
 def between(limits: Any, u: Any) -> Any:
     """The number at share u of a range."""
     return limits[0] + (limits[1] - limits[0]) * u
 
 
-@physics
+@jittable
 def _factor(spread: Any, u: Any) -> Any:
     return 1.0 + spread * (2.0 * u - 1.0)
 
 
-@physics
+@jittable
 def _uniforms(s: Any, count: Any) -> Any:
     """The stream's next numbers in [0, 1); one loop compiles in a fraction of the time of as many calls."""
     u = np.zeros(count)
@@ -55,7 +55,7 @@ def _uniforms(s: Any, count: Any) -> Any:
     return u
 
 
-@physics
+@jittable
 def draw_factors(record: Any, mix: Any, streams: Any) -> Any:
     """Draw the puller: its mix of models and the factors on its parameters."""
     u, spread = _uniforms(streams[_PARAMETERS], _FACTORS), record.pullers
@@ -70,7 +70,7 @@ def draw_factors(record: Any, mix: Any, streams: Any) -> Any:
     )
 
 
-@physics
+@jittable
 def randomised(q: Any, f: Any) -> Any:
     """The parameters of the drawn puller: factors on a, k_l and the conductances."""
     return Parameters(
@@ -80,7 +80,7 @@ def randomised(q: Any, f: Any) -> Any:
     )  # fmt: skip
 
 
-@physics
+@jittable
 def draw_episode(record: Any, streams: Any, freezes: Any) -> Any:
     """Draw ramps and constants; freezes [s], shape (FREEZES, 2), are written."""
     recipe, drift, reference, sensor, drives = (
@@ -118,14 +118,14 @@ def draw_episode(record: Any, streams: Any, freezes: Any) -> Any:
     )  # fmt: skip
 
 
-@physics
+@jittable
 def skip_constants(streams: Any) -> None:
     """Move fresh streams to where :func:`draw_episode` leaves those that series are drawn from."""
     _uniforms(streams[_INTERFACE], _INTERFACE_NUMBERS)
     _uniforms(streams[_SENSOR], _SENSOR_NUMBERS)
 
 
-@physics
+@jittable
 def _draw_faults(faults: Any, s: Any, freezes: Any) -> Any:
     """Place the freezes; return start [s], length [s] and size [m] of the ring's drift, and the drop-outs' share."""
     u = _uniforms(s, _FAULT_NUMBERS)
@@ -146,7 +146,7 @@ def _draw_faults(faults: Any, s: Any, freezes: Any) -> Any:
     )
 
 
-@physics
+@jittable
 def _place_freezes(lengths: Any, order: Any, share: Any, freezes: Any) -> None:
     """Place disjoint windows uniformly: sorted starts in the time left over, lengths put back in between.
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cz_gym.jit.compile import physics
+from cz_gym.jit.compile import jittable
 
 from .record import Stream
 from .rng import normal, two_normals, uniform
@@ -20,26 +20,26 @@ _INTERFACE, _SENSOR = int(Stream.INTERFACE), int(Stream.SENSOR)
 _DROPOUTS, _OUTLIERS = int(Stream.DROPOUTS), int(Stream.OUTLIERS)
 
 
-@physics
+@jittable
 def first_fluctuation(e: Any, streams: Any) -> Any:
     """The interface's two stationary processes at t = 0 [standard deviations]."""
     return two_normals(streams[_INTERFACE]) if e.sd_fast > 0.0 or e.sd_slow > 0.0 else (0.0, 0.0)
 
 
-@physics
+@jittable
 def next_fluctuation(e: Any, streams: Any, fast: Any, slow: Any) -> Any:
     """The two processes one point of the grid on, discretised exactly: x <- keep x + sqrt(1 - keep^2) n."""
     first, second = two_normals(streams[_INTERFACE]) if e.sd_fast > 0.0 or e.sd_slow > 0.0 else (0.0, 0.0)
     return e.keep_fast * fast + e.kick_fast * first, e.keep_slow * slow + e.kick_slow * second
 
 
-@physics
+@jittable
 def fluctuation(e: Any, fast: Any, slow: Any) -> Any:
     """dT_i [K] of the two processes."""
     return e.sd_fast * fast + e.sd_slow * slow
 
 
-@physics
+@jittable
 def sample_noise(e: Any, streams: Any) -> Any:
     """Camera [m] and pyrometer [K] noise of the next sample; a camera's NaN is a drop-out."""
     noisy = e.camera_sd > 0.0 or e.pyrometer_sd > 0.0
@@ -52,7 +52,7 @@ def sample_noise(e: Any, streams: Any) -> Any:
     return camera, pyrometer
 
 
-@physics
+@jittable
 def draw_series(e: Any, streams: Any, interface: Any, noise: Any) -> None:
     """Write dT_i [K] on the grid, shape (points,), and the noise of each sample, shape (samples, 2)."""
     fast, slow = first_fluctuation(e, streams)

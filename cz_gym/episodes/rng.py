@@ -18,7 +18,7 @@ except ImportError as error:
         f"cz_gym reads the tables of normal numbers from numba 0.60 to 0.68; this numba: {error}"
     ) from None
 
-from cz_gym.jit.compile import physics
+from cz_gym.jit.compile import jittable
 
 WORDS = 4
 """64-bit words of a stream."""
@@ -34,7 +34,7 @@ _DOUBLE_SHIFT, _DOUBLE = _U(11), 1.0 / 9007199254740992.0
 _INDEX, _INDEX_SHIFT, _MANTISSA = _U(0xFF), _U(8), _U(0x000FFFFFFFFFFFFF)
 
 
-@physics
+@jittable
 def _product_high(a: Any, b: Any) -> Any:
     """High 64 bits of the 128-bit product."""
     a_low, a_high, b_low, b_high = a & _LOW, a >> _HALF, b & _LOW, b >> _HALF
@@ -43,7 +43,7 @@ def _product_high(a: Any, b: Any) -> Any:
     return a_high * b_high + (middle >> _HALF) + (other >> _HALF)
 
 
-@physics
+@jittable
 def _moved(high: Any, low: Any, s: Any) -> Any:
     """The state after (high, low): state * multiplier + increment, modulo 2^128."""
     product = low * _PCG_LOW
@@ -52,27 +52,27 @@ def _moved(high: Any, low: Any, s: Any) -> Any:
     return _product_high(low, _PCG_LOW) + high * _PCG_LOW + low * _PCG_HIGH + s[2] + carry, moved
 
 
-@physics
+@jittable
 def _output(high: Any, low: Any) -> Any:
     """64 random bits from a state (XSL-RR)."""
     mixed, turn = high ^ low, high >> _TOP
     return (mixed >> turn) | (mixed << ((_ROTATE - turn) & _MASK))
 
 
-@physics
+@jittable
 def next_word(s: Any) -> Any:
     """The stream's next 64 random bits."""
     s[0], s[1] = _moved(s[0], s[1], s)
     return _output(s[0], s[1])
 
 
-@physics
+@jittable
 def uniform(s: Any) -> Any:
     """The stream's next number in [0, 1)."""
     return np.int64(next_word(s) >> _DOUBLE_SHIFT) * _DOUBLE
 
 
-@physics
+@jittable
 def _layer(word: Any) -> Any:
     """NumPy's ziggurat of 256 layers: the layer and place that a word picks, and the number there."""
     layer, word = word & _INDEX, word >> _INDEX_SHIFT
@@ -81,7 +81,7 @@ def _layer(word: Any) -> Any:
     return layer, inside, -x if word & _ONE else x
 
 
-@physics
+@jittable
 def normal(s: Any) -> Any:
     """The stream's next standard normal number."""
     while True:
@@ -94,7 +94,7 @@ def normal(s: Any) -> Any:
             return x
 
 
-@physics
+@jittable
 def two_normals(s: Any) -> Any:
     """The stream's next two standard normal numbers; 98 times in 100 both lie inside their layers."""
     high, low = _moved(s[0], s[1], s)
@@ -108,7 +108,7 @@ def two_normals(s: Any) -> Any:
     return x, normal(s)
 
 
-@physics
+@jittable
 def _tail(s: Any, inside: Any) -> Any:
     """A normal number beyond the ziggurat's last layer (Marsaglia)."""
     while True:
@@ -119,20 +119,20 @@ def _tail(s: Any, inside: Any) -> Any:
             return -x if (inside >> _INDEX_SHIFT) & _ONE else x
 
 
-@physics
+@jittable
 def _scrambled(value: Any, constant: Any, factor: Any) -> Any:
     """SeedSequence's hash of a 32-bit word with a running constant."""
     value = ((value ^ constant) * ((constant * factor) & _LOW)) & _LOW
     return value ^ (value >> _SHIFT)
 
 
-@physics
+@jittable
 def _mixed(x: Any, y: Any) -> Any:
     value = (_MIX_L * x - _MIX_R * y) & _LOW
     return value ^ (value >> _SHIFT)
 
 
-@physics
+@jittable
 def seed_stream(s: Any, key: Any, number: Any) -> None:
     """Make ``s`` the stream of ``PCG64(SeedSequence(key, spawn_key=(number,)))``; key: two 64-bit words."""
     pool = np.zeros(5, np.uint64)
@@ -157,7 +157,7 @@ def seed_stream(s: Any, key: Any, number: Any) -> None:
     _start(s, pool)
 
 
-@physics
+@jittable
 def _start(s: Any, pool: Any) -> None:
     """SeedSequence's output of four 64-bit words, and PCG64's first steps from them."""
     constant = _INIT_B

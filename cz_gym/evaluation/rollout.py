@@ -157,7 +157,9 @@ class Course:
                 progress(len(self.seeds))
 
     def _step(self, action: Any) -> None:
-        self.observation, gained, terminated, truncated, info = self.env.step(action)
+        self.observation, gained, terminated, truncated, info = self.env.step(
+            np.asarray(action)
+        )  # check_policy has said what fits
         # A slot that is over is drawn anew by the next step: only then does its policy begin again.
         self.begins, self.over = self.over, terminated | truncated
         for log, name in zip(self.signals, Signals._fields, strict=True):

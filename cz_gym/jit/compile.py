@@ -1,6 +1,6 @@
 """How the equations are compiled.
 
-Physics stands once, in plain functions marked :data:`physics`: called from Python they take floats, arrays or
+Physics stands once, in plain functions marked :func:`jittable`: called from Python they take floats, arrays or
 complex numbers; called from a :func:`kernel` they compile into its loop. numba's disk cache looks only at
 the file of the outermost function, so a changed equation in another module would run the old physics; here
 the cache folder is named by a hash of every source of the package that can be compiled in.
@@ -24,7 +24,7 @@ default_options = private("core.options", "DefaultOptions")
 _NO_COUNTS = "_nrt"
 
 
-def physics(function: F) -> F:
+def jittable(function: F) -> F:
     """Mark a function as an equation: plain Python outside a kernel, compiled inside it.
 
     Compiled, as on arrays, division by zero gives inf or NaN, never an exception (``error_model="numpy"``).
@@ -32,8 +32,8 @@ def physics(function: F) -> F:
     return register_jitable(error_model="numpy")(function)
 
 
-def within(function: F) -> F:
-    """A :data:`physics` whose machine code is put into its callers', so that a loop around it can be vectorised."""
+def force_inlined(function: F) -> F:
+    """A :func:`jittable` whose machine code is put into its callers', so that a loop around it can be vectorised."""
     return register_jitable(error_model="numpy", forceinline=True)(function)
 
 

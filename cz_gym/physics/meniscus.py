@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.jit.compile import physics
+from cz_gym.jit.compile import jittable
 
 SQRT_2, SQRT_HALF = math.sqrt(2.0), math.sqrt(0.5)
 
@@ -22,7 +22,7 @@ class MeniscusModel(NamedTuple):
     """A meniscus the plant can run on: its name and its functions.
 
     ``slope`` and ``ring_offset`` take ``(r_c, h_c, p)``, ``height`` takes ``(r_c, theta, a)``. All three are marked
-    ``cz_gym.jit.compile.physics`` and compile into the step, which makes no array: they hold arithmetic, ``np.sqrt``
+    ``cz_gym.jit.compile.jittable`` and compile into the step, which makes no array: they hold arithmetic, ``np.sqrt``
     and its like, ``min`` and ``max`` on numbers, but not ``np.where``.
     """
 
@@ -39,7 +39,7 @@ class MeniscusModel(NamedTuple):
         return self.slope, self.ring_offset, self.height
 
 
-@physics
+@jittable
 def hurle_slope(r_c: Any, h_c: Any, p: Any) -> Any:
     """Sine and cosine of theta, solving Hurle's A cos(theta) + sin(theta) = B in closed form.
 
@@ -55,21 +55,21 @@ def hurle_slope(r_c: Any, h_c: Any, p: Any) -> Any:
     return (width * width * B - h_c * root) * per, width * (h_c * B + root) * per
 
 
-@physics
+@jittable
 def hurle_height(r_c: Any, theta: Any, a: Any) -> Any:
     """Meniscus height [m] at which Hurle's meniscus leaves the crystal at angle theta [rad]."""
     half = a * np.cos(theta) / (4.0 * r_c)
     return a * (np.sqrt(half * half + 1.0 - np.sin(theta)) - half)
 
 
-@physics
+@jittable
 def profile_scale(r_c: Any, h_c: Any, cos_theta: Any, a: Any) -> Any:
     """Scale M [m] of Hurle's meniscus profile: 1 / M^2 = 1 / a^2 + cos(theta) / (2 r_c h_c)."""
     curved = 2.0 * r_c * h_c
     return a * np.sqrt(curved / (curved + a * a * cos_theta))
 
 
-@physics
+@jittable
 def profile(z: Any, M: Any) -> Any:
     """Horizontal coordinate X(z) [m] of Hurle's profile at height z [m] above the melt, scale M [m].
 
@@ -79,13 +79,13 @@ def profile(z: Any, M: Any) -> Any:
     return M * SQRT_HALF * np.log((SQRT_2 * M + width) / z) - width
 
 
-@physics
+@jittable
 def ring_point(phi_b: Any) -> Any:
     """X(z_b) / M at the profile's point of slope phi_b [rad], z_b = M sqrt(1 - cos(phi_b)); M cancels."""
     return profile(np.sqrt(1.0 - np.cos(phi_b)), 1.0)
 
 
-@physics
+@jittable
 def hurle_ring_offset(r_c: Any, h_c: Any, p: Any) -> Any:
     """Distance X(z_b) - X(h_c) [m] from the triple point out to the bright ring; NaN for h_c >= sqrt(2) a."""
     _, cos_theta = hurle_slope(r_c, h_c, p)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cz_gym.errors import CzError
-from cz_gym.jit.compile import physics, within
+from cz_gym.jit.compile import force_inlined, jittable
 
 from .meniscus import HURLE, MeniscusModel, ring_point
 from .parameters import Parameters, check_parameters
@@ -146,7 +146,7 @@ class _RingPuller(NamedTuple):
     X_b: Any
 
 
-@physics
+@jittable
 def derive_puller(q: Any, lam: Any, height: Any, ring_offset: Any) -> Any:
     """Solve the operating point in order: h_0, Phi_l0, Phi_s, Q_i, T_2, T_1, Q_H0, ring bias."""
     a = np.sqrt(2.0 * q.sigma / (q.rho_l * q.g))
@@ -197,7 +197,7 @@ def check_puller(puller: Puller, meniscus: MeniscusModel = HURLE) -> Puller:
     return puller
 
 
-@within
+@force_inlined
 def growth(x: Any, d: Any, p: Any, slope: Any) -> Any:
     """Growth rate from the interface's heat balance, and the cone angle from the meniscus slope."""
     Phi_l = p.k_l * (x.T_b + d.dT_i - p.T_m) * (p.lam / x.h_c + (1.0 - p.lam) / p.h_0)
@@ -208,14 +208,14 @@ def growth(x: Any, d: Any, p: Any, slope: Any) -> Any:
     return Growth(v_g, sin_alpha / cos_alpha)
 
 
-@physics
+@jittable
 def fourth_power(T: Any) -> Any:
     """T^4, as two squarings."""
     square = T * T
     return square * square
 
 
-@within
+@force_inlined
 def rates(x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
     """Time derivatives of the state [m/s, m/s, K/s, K/s, K/s]; design equations of section 2."""
     at_interface = growth(x, d, p, slope)
@@ -231,13 +231,13 @@ def rates(x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
     )
 
 
-@physics
+@jittable
 def along(x: Any, s: Any, k: Any) -> Any:
     """The state x + s k."""
     return State(x.r_c + s * k.r_c, x.h_c + s * k.h_c, x.T_1 + s * k.T_1, x.T_2 + s * k.T_2, x.T_b + s * k.T_b)
 
 
-@within
+@force_inlined
 def rk4(x: Any, u: Any, d: Any, p: Any, dt: Any, slope: Any) -> Any:
     """One classical Runge-Kutta step of dt [s], inputs and disturbance held."""
     k_1 = rates(x, u, d, p, slope)
@@ -247,7 +247,7 @@ def rk4(x: Any, u: Any, d: Any, p: Any, dt: Any, slope: Any) -> Any:
     return along(along(along(along(x, dt / 6.0, k_1), dt / 3.0, k_2), dt / 3.0, k_3), dt / 6.0, k_4)
 
 
-@physics
+@jittable
 def hidden_load(p_drift: Any, p: Any) -> Any:
     """Heat load Q_d [W] that a recipe shifted by p_drift [K] would exactly cancel (static equivalence).
 

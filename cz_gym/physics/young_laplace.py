@@ -26,7 +26,7 @@ import numpy.typing as npt
 from scipy.integrate import solve_ivp
 from scipy.special import k0e, k1e
 
-from cz_gym.jit.compile import physics
+from cz_gym.jit.compile import jittable
 
 from .meniscus import MeniscusModel, hurle_height, profile, ring_point
 
@@ -145,7 +145,7 @@ def _integrate(slopes: Callable[[float, Floats], Floats], first: Floats, second:
     return r, other
 
 
-@physics
+@jittable
 def polynomial(c: Any, x: Any, y: Any) -> Any:
     """Sum of c[i, j] x^i y^j by Horner's rule; c of shape (m, n)."""
     total = 0.0 * (x + y)
@@ -157,13 +157,13 @@ def polynomial(c: Any, x: Any, y: Any) -> Any:
     return total
 
 
-@physics
+@jittable
 def _inside(beyond: Any) -> Any:
     """One inside the table, NaN beyond: NaN to the power of zero is one. No ``np.where``, which makes arrays."""
     return np.power(np.nan, 1.0 * beyond)
 
 
-@physics
+@jittable
 def _curvature(r_c: Any, a: Any) -> Any:
     """a / r_c mapped to [-1, 1], and the ratio itself; NaN for a crystal narrower than the table's."""
     ratio = a / r_c
@@ -171,7 +171,7 @@ def _curvature(r_c: Any, a: Any) -> Any:
     return 2.0 * ratio / NARROWEST - 1.0, ratio
 
 
-@physics
+@jittable
 def lift(r_c: Any, h_c: Any, a: Any) -> Any:
     """1 - sin(theta), tabulated as (h_c/a)^2 (1 + (a/r_c) P): the planar meniscus is exact, P analytic in h_c^2."""
     x, ratio = _curvature(r_c, a)
@@ -179,14 +179,14 @@ def lift(r_c: Any, h_c: Any, a: Any) -> Any:
     return square * (1.0 + ratio * polynomial(SLOPE, x, 2.0 * square / (HIGHEST * HIGHEST) - 1.0))
 
 
-@physics
+@jittable
 def exact_slope(r_c: Any, h_c: Any, p: Any) -> Any:
     """Sine and cosine of theta on the exact meniscus; radius and height [m], ``p.a`` the capillary constant [m]."""
     raised = lift(r_c, h_c, p.a)
     return 1.0 - raised, np.sqrt(raised * (2.0 - raised))
 
 
-@physics
+@jittable
 def exact_height(r_c: Any, theta: Any, a: Any) -> Any:
     """Height [m] at which the tabulated meniscus leaves the crystal at angle theta [rad]; undoes ``exact_slope``.
 
@@ -205,12 +205,12 @@ X_LOW, X_HIGH = float(ring_point(RING_SLOPES[1])), float(ring_point(RING_SLOPES[
 """Range of the tail table's X_b [-]."""
 
 
-@physics
+@jittable
 def _between(value: Any, low: Any, high: Any) -> Any:
     return (2.0 * value - (low + high)) / (high - low)
 
 
-@physics
+@jittable
 def exact_ring_offset(r_c: Any, h_c: Any, p: Any) -> Any:
     """Distance [m] from the triple point out to the bright ring; NaN for h_c >= sqrt(2) a or phi_b off the table.
 

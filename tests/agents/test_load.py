@@ -11,6 +11,8 @@ from gymnasium.error import InvalidAction
 from cz_gym import CzVectorEnv, agents
 from cz_gym.agents.agent_file.contract import read_agent
 from cz_gym.config import make_config
+from cz_gym.physics.parameters import Parameters
+from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 
 SHIPPED = {
     "gradient": 10,
@@ -70,7 +72,11 @@ def test_a_name_is_no_file() -> None:
         agents.OnnxPolicy.load("ppo")
 
 
-OTHERS: list[dict[str, Any]] = [{"action": "rate"}, {"control_interval": 2.0}]
+OTHERS: list[dict[str, Any]] = [
+    {"action": "rate"},
+    {"control_interval": 2.0},
+]
+PLANTS: list[dict[str, Any]] = [{"parameters": Parameters(v_0=3e-5)}, {"meniscus": YOUNG_LAPLACE}]
 
 
 @pytest.mark.parametrize("other", [*OTHERS, {"observation": "measured"}])
@@ -89,12 +95,14 @@ def test_an_environment_refuses_an_agent_that_is_not_made_for_it(name: str) -> N
     observation, _ = own.reset(seed=1)
     action, _ = agent.predict(observation)
     own.step(action)
-    for other in OTHERS:
+    for other in [*OTHERS, *PLANTS]:
         env = gym.make("Cz-v0", **{**agent.settings, **other})
         envs = CzVectorEnv(2, **{**agent.settings, **other})
         observation, _ = env.reset(seed=1)
         many, _ = envs.reset(seed=1)
-        with pytest.raises(InvalidAction, match=r"made for action='smooth', control_interval=5; the environment has"):
+        with pytest.raises(
+            InvalidAction, match=r"made for action='smooth', control_interval=5, plant .*; the environment has"
+        ):
             env.step(agent.predict(observation)[0])
         with pytest.raises(InvalidAction, match="made for action='smooth'"):
             envs.step(agent.predict(many)[0])

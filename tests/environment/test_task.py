@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cz_gym import CzEnv, make_puller
-from cz_gym.task import cost_terms, failure_penalty, reward, within_limits
+from cz_gym.cost import cost_terms, failure_penalty, reward
+from cz_gym.task import within_limits
 
 MM, MM_PER_MIN = 1e-3, 1e-3 / 60
 P = make_puller()

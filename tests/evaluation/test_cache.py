@@ -135,7 +135,7 @@ def test_code_counts_and_text_does_not(tmp_path: Path) -> None:
     assert hashes[0] == hashes[1] != hashes[2]
 
 
-@pytest.mark.parametrize("room", ["physics", "episodes", "engine", "task.py", "evaluation/metrics.py"])
+@pytest.mark.parametrize("room", ["physics", "episodes", "engine", "cost.py", "evaluation/metrics.py"])
 def test_whatever_makes_a_figure_is_in_the_key(room: str) -> None:
     """Kernels, sensors, draws and random streams were once left out."""
     place, sources = Path(cz_gym.__file__).parent / room, sources_behind(Snail.__module__)

@@ -155,9 +155,9 @@ def test_a_cache_that_vanishes_is_no_failure(tmp_path: Path) -> None:
 def test_a_users_meniscus_is_never_run_from_a_cache(package: Path, tmp_path: Path) -> None:
     (package / "mine.py").write_text(
         "from cz_gym import HURLE\n"
-        "from cz_gym.jit.compile import physics\n"
+        "from cz_gym.jit.compile import jittable\n"
         "from cz_gym.physics.meniscus import hurle_height\n"
-        "@physics\n"
+        "@jittable\n"
         "def height(r_c, theta, a):\n"
         "    return 1.0 * hurle_height(r_c, theta, a)\n"
         "MINE = HURLE._replace(name='mine', height=height)\n"
@@ -175,9 +175,9 @@ def test_hash_sees_names_and_contents(package: Path) -> None:
     folder = package / "cz_gym"
     first = source_hash(folder)
     assert first == source_hash(ROOT / "cz_gym")
-    edit(folder / "task.py", "FAILURE_COST = 10.0", "FAILURE_COST = 11.0")
+    edit(folder / "cost.py", "FAILURE_COST = 10.0", "FAILURE_COST = 11.0")
     second = source_hash(folder)
-    (folder / "task.py").rename(folder / "tasks.py")
+    (folder / "cost.py").rename(folder / "costs.py")
     third = source_hash(folder)
     edit(folder / "rendering" / "pixels.py", "from __future__", "# changed\nfrom __future__")
     fourth = source_hash(folder)

@@ -21,10 +21,10 @@ from cz_gym.agents.training.gradient import GradientLearner
 from cz_gym.agents.training.plant_step import PlantStep
 from cz_gym.agents.training.recipes import LQG_COST, RECIPES, Gradient
 from cz_gym.agents.training.validation import Validation, validate
+from cz_gym.cost import COST_CAP, SCALES, Cost
 from cz_gym.differentiable import STATES, DifferentiableBatch
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.observation import MEASURED
-from cz_gym.task import COST_CAP, RADIUS_SCALE, Cost
 from tests.contracts import facts
 
 FEW = Gradient(num_envs=16, window=20, steps=16 * 20 * 2, hidden=(8,))
@@ -146,7 +146,7 @@ def test_an_observable_cost_counts_what_sensors_can_show(scenario: str, drives: 
         return learner._weighed(true), cost
 
     step, true = stepped([0.06, 0.1])
-    wanted = ((step.error + step.offset) / RADIUS_SCALE) ** 2
+    wanted = ((step.error + step.offset) / SCALES.radius) ** 2
     np.testing.assert_allclose(step.cost[:, 0], wanted, rtol=1e-12)
     np.testing.assert_array_equal(step.cost[:, 1:], true[:, 1:])
     assert float(np.abs(step.cost[:, 0] - true[:, 0]).max()) > 1e-3

@@ -15,9 +15,9 @@ from cz_gym.agents.training.networks import whitening
 from cz_gym.agents.training.recipes import RECIPES, Imitation
 from cz_gym.baselines.registry import find_controller, make_controller
 from cz_gym.config import make_config
+from cz_gym.cost import WEIGHTS
 from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.observation import DRIVE_CHANNELS, HISTORY
-from cz_gym.task import HEATER_STEP_WEIGHT, PULL_STEP_WEIGHT, PULL_WEIGHT
 
 CONFIG = make_config("randomized", observation="history", horizon=600.0, action="smooth")
 FEW = Imitation(name="few", teacher="lqg", hidden=(16, 16), rounds=2, episodes=8, wide_share=0.25, epochs=1)
@@ -185,6 +185,6 @@ def test_it_is_judged_by_the_cost_that_its_teacher_s_regulator_was_made_for() ->
     assert isinstance(recipe, Imitation)
     teacher: Any = find_controller(recipe.teacher).make(make_config("randomized"))
     theirs, ours = teacher.settings.weights, recipe.weights
-    assert ours.pull * PULL_WEIGHT == pytest.approx(theirs.pull, rel=0.01)
-    assert ours.pull_step * PULL_STEP_WEIGHT == pytest.approx(theirs.pull_step, rel=0.01)
-    assert ours.heater_step * HEATER_STEP_WEIGHT == pytest.approx(theirs.heater_step, rel=0.01)
+    assert ours.pull * WEIGHTS.pull == pytest.approx(theirs.pull, rel=0.01)
+    assert ours.pull_step * WEIGHTS.pull_step == pytest.approx(theirs.pull_step, rel=0.01)
+    assert ours.heater_step * WEIGHTS.heater_step == pytest.approx(theirs.heater_step, rel=0.01)

@@ -10,7 +10,7 @@ from cz_gym import CzVectorEnv
 from cz_gym.agents.training.recipes import CostWeights
 from cz_gym.agents.training.vec_env import CzVecEnv
 from cz_gym.agents.training.wrappers import Held, TrainingReward
-from cz_gym.task import Cost, cost_terms, reward
+from cz_gym.cost import Cost, cost_terms, reward
 
 
 def slots(**settings: Any) -> CzVecEnv:

@@ -14,7 +14,7 @@ from cz_gym.baselines.lqg import kalman
 from cz_gym.baselines.lqg.controller import LQG, LQGSettings, solve
 from cz_gym.baselines.lqg.model import FAST, PLANT, SLOW, STATES, NoiseModel
 from cz_gym.baselines.lqg.ring_model import RingModel
-from cz_gym.task import cost_terms
+from cz_gym.cost import cost_terms
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 from tests.observed import measured
 
