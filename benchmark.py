@@ -34,7 +34,7 @@ CACHE = FOLDER.parent / "cache"
 """Where episodes of slow controllers are cached."""
 BOUNDS = FOLDER.parent / "bounds"
 """Committed results of the slow controllers; their bound serves runs without one."""
-SHIPPED = ("gradient", "gradient-all", "ppo", "ppo-recurrent", "sac", "random-search", "imitation")
+SHIPPED = ("gradient", "ppo", "sac", "imitation")
 """Shipped agents that take part by default, each with all its training seeds; specialists only if named."""
 EPISODES = 500
 

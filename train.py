@@ -27,8 +27,7 @@ CHECKPOINT_SECONDS = 60.0
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
     """Read the command line; exits with code 2 and one line for anything that cannot be meant."""
-    from cz_gym.agents import DEFAULT
-    from cz_gym.agents.training.recipes import RECIPES
+    from cz_gym.agents.training.recipes import DEFAULT, RECIPES
 
     parser = OneLineParser(
         prog="train.py",
@@ -60,9 +59,9 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--from",
         dest="start",
-        type=lambda file: str(Path(file).resolve()),
-        metavar="FILE",
-        help="agent file of a recipe gradient that such a recipe, or --algo ppo, goes on from",
+        type=lambda path: str(Path(path).resolve()),
+        metavar="PATH",
+        help="agent that a gradient recipe continues from: its file, or a folder of --seeds",
     )
     parser.add_argument("--scenario", help="scenario to train on (default: the recipe's, or the resumed run's)")
     parser.add_argument(
@@ -84,12 +83,10 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     arguments = parser.parse_args(argv)
     if arguments.ray is not None and not arguments.seeds:
         parser.error("--ray needs --seeds")
-    if arguments.start and arguments.algo == "ppo":
-        arguments.algo = "ppo-after-gradient"
-    recipe = RECIPES[arguments.algo or DEFAULT]
-    wanting = arguments.algo == "ppo-after-gradient" and not arguments.start
-    if not arguments.resume and (wanting or (arguments.start and not hasattr(recipe, "start"))):
-        parser.error("--from FILE goes with --algo ppo or gradient: both go on from an agent of a recipe gradient")
+    if arguments.start and not arguments.resume and not hasattr(RECIPES[arguments.algo or DEFAULT], "start"):
+        parser.error("--from goes with gradient recipes only: --algo gradient")
+    if arguments.algo == "gradient" and not arguments.start and not arguments.resume:
+        parser.error("gradient continues from an agent of gradient-start: train that first, then add --from PATH")
     one = "" if arguments.seeds else f"-seed{arguments.seed or 0}"
     arguments.out = arguments.out or Path("runs") / f"{arguments.algo or DEFAULT}{one}"
     return arguments
@@ -207,8 +204,7 @@ def _take_up(arguments: argparse.Namespace, folders: list[Path]) -> int | None:
 
     Returns the steps that the resumed run was begun with. ValueError if there is a run that is not to be resumed.
     """
-    from cz_gym.agents import DEFAULT
-    from cz_gym.agents.training.recipes import RECIPES
+    from cz_gym.agents.training.recipes import DEFAULT, RECIPES
     from cz_gym.agents.training.run_files import read_settings
 
     begun = [folder for folder in folders if (folder / "settings.json").exists()]
@@ -234,11 +230,11 @@ def _take_up(arguments: argparse.Namespace, folders: list[Path]) -> int | None:
 
 def _asked_for(recipe: Recipe, arguments: argparse.Namespace, saved_steps: int | None) -> Recipe:
     """The recipe with the scenario and the steps that the command line, or the resumed run, asks for."""
-    from cz_gym.agents.training.recipes import Gradient, Refinement, Rewarded
+    from cz_gym.agents.training.recipes import Gradient, Rewarded
     from cz_gym.episodes.scenarios import find_scenario
 
     recipe = replace(recipe, scenario=find_scenario(arguments.scenario or recipe.scenario).name)
-    if isinstance(recipe, Refinement | Gradient):
+    if isinstance(recipe, Gradient):
         recipe = replace(recipe, start=arguments.start or recipe.start)
     if isinstance(recipe, Rewarded):
         return replace(recipe, steps=arguments.steps or saved_steps or recipe.steps)

@@ -13,7 +13,6 @@ import numpy as np
 import onnx
 import torch
 from onnx import TensorProto, helper, numpy_helper
-from sb3_contrib.ars.policies import ARSPolicy
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from cz_gym.observation import DRIVE_CHANNELS, HISTORY
@@ -149,8 +148,6 @@ def actor_of(policy: Any) -> Actor:
         if lstm is not None and lstm.num_layers > 1:
             raise TypeError("a policy with more than one layer of LSTM cannot be written as an agent file")
         return Actor(policy.pi_features_extractor, lstm, [net, policy.action_net])
-    if isinstance(policy, ARSPolicy):
-        return Actor(policy.features_extractor, None, [policy.action_net])
     actor = getattr(policy, "actor", None)
     if actor is None:
         raise TypeError(f"{type(policy).__name__} has no actor that gives two continuous actions")

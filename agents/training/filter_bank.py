@@ -244,11 +244,15 @@ class FilterBank(nn.Module):
 
 
 def read_bank(start: str, seed: int, config: Config, hidden: tuple[int, ...], scheduled: bool = True) -> FilterBank:
-    """The network of an agent that another goes on from: a file, or shipped agents by name, the one of that seed.
+    """The network of an agent that training continues from: of a file, or of this seed in a folder or by shipped name.
 
     AgentFileError for an agent of another recipe, action or control interval.
     """
-    path = Path(start) if Path(start).suffix else MODELS / f"{start}-seed{seed}.onnx"
+    path = Path(start)
+    if path.is_dir():
+        path = path / f"seed{seed}" / "agent.onnx"
+    elif not path.suffix:
+        path = MODELS / f"{start}-seed{seed}.onnx"
     contract, content = read_agent(path)
     bank = FilterBank(config.control_interval, hidden, scheduled)
     if (contract.control_interval, contract.action) != (config.control_interval, config.action):

@@ -120,8 +120,8 @@ class Gradient(Rewarded):
     """Other crystals that it learns on: scenario ("": its own), how far everything random is spread in units of the
     scenario's own, and their share of all."""
     start: str = ""
-    """Agent of such a recipe that it goes on from: a file, or a name of shipped ones, of which each training seed takes
-    its own; "": from nothing."""
+    """Agent of such a recipe that training continues from: a file, a folder of ``train.py --seeds``, or a shipped name,
+    of which each training seed takes its own; "": none, random initial weights."""
     hidden: tuple[int, ...] = (64,)
     scheduled: bool = True
     """Whether the linear map depends on noise, swings, the reference and the crystal's age."""
@@ -188,37 +188,6 @@ class PPO(OnPolicy):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Refinement(PPO):
-    """Proximal policy optimisation that goes on from an agent of the recipe ``gradient``."""
-
-    name: str = "ppo-after-gradient"
-    start: str = ""
-    """That agent, as in :class:`Gradient`."""
-    observation: str = "measured"
-    action: str = "rate"
-    steps: int = 3_000_000
-    learning_rate: float = 1e-4
-    noise: float = 0.1
-    """Spread of the exploration at the start, in outputs of the network before its gains [-]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RecurrentPPO(OnPolicy):
-    """Proximal policy optimisation of a network that remembers (an LSTM), from nothing."""
-
-    name: str = "ppo-recurrent"
-    steps: int = 1_000_000
-    num_envs: int = 64
-    hidden: tuple[int, ...] = (64,)
-    units: int = 64
-    """Of the actor's LSTM and of the critic's."""
-    n_steps: int = 128
-    batch_size: int = 2048
-    n_epochs: int = 4
-    learning_rate: float = 1e-3
-
-
-@dataclass(frozen=True, kw_only=True)
 class SAC(Reinforcement):
     """Soft actor-critic on the same batch, from nothing.
 
@@ -246,80 +215,37 @@ class SAC(Reinforcement):
     """Weight of the entropy at the start, in units of the reward times 1 - gamma; it adapts."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class RandomSearch(Reinforcement):
-    """Augmented random search of a linear policy, from nothing: no gradient, no critic, no discount."""
-
-    name: str = "random-search"
-    steps: int = 160_000_000
-    num_envs: int = 512
-    """Shared out among the candidates, each of which meets the same crystals."""
-    gamma: float = 0.0
-    n_delta: int = 32
-    """Directions of a round; either way along each is a candidate."""
-    n_top: int = 16
-    """Best directions of a round that are followed."""
-    delta_std: float = 0.04
-    """Spread of the candidates' weights."""
-    part: int = 1440
-    """Steps of an episode that candidates are compared on."""
-    learning_rate: float = 0.01
-
-
 LQG_COST = CostWeights(pull=0.0178, pull_step=0.1, heater_step=51.6)
 """The cost that the regulator of lqg-at-0.02 was made for, as multiples of the environment's."""
 GRADIENT_COST = CostWeights(pull=0.11, pull_step=0.07, heater_step=23.4, observable=True)
 """The cost that the recipe gradient follows: near that of lqg-quiet, without what no sensor shows."""
 RADIUS_COST = replace(GRADIENT_COST, pull=0.018, pull_step=0.14)
-"""The cost that its specialists follow: the pull speed may go where it wants, as the frontier's LQGs have it."""
-_OTHERS = ("sensor-fault", 1.0, 0.3), ("", 2.0, 0.03)
+"""The cost that agents which go on from others follow: the pull speed may go where it wants."""
 _ON = Gradient(start="gradient", steps=Gradient.steps // 4, whitened=True, learning_rate=2e-3, weights=RADIUS_COST)
-_FURTHER = replace(_ON, steps=Gradient.steps * 3 // 8, expects=True, evenly=True)
-SPECIALISTS = (
-    replace(_ON, name="gradient-randomized", also=_OTHERS),
-    replace(_ON, name="gradient-randomized-calm", also=_OTHERS, weights=replace(RADIUS_COST, pull_step=0.28)),
-    replace(_ON, name="gradient-randomized-agile", also=_OTHERS, weights=replace(RADIUS_COST, pull_step=0.08)),
-    replace(
-        _FURTHER,
-        name="gradient-hard",
-        scenario="hard",
-        also=(("sensor-fault", 1.0, 0.2), ("", 1.3, 0.1), ("puller", 1.0, 0.1)),
-    ),
-    replace(_FURTHER, name="gradient-sensor-fault", scenario="sensor-fault", also=_OTHERS[1:]),
-    replace(
-        _ON,
-        name="gradient-puller",
-        scenario="puller",
-        also=(),
-        whitened=False,
-        learning_rate=4e-3,
-        weights=GRADIENT_COST,
-    ),
-)
-"""The recipe gradient for one scenario each; for ``randomized`` at three activities."""
-ALL = replace(
-    _FURTHER,
-    name="gradient-all",
+GRADIENT = Gradient(
+    steps=Gradient.steps * 3 // 8,
     also=(("", 2.0, 0.05), ("hard", 1.0, 0.2), ("sensor-fault", 1.0, 0.3), ("puller", 1.0, 0.25)),
     num_envs=64,
     window=540,
+    whitened=True,
+    expects=True,
+    evenly=True,
     learning_rate=3e-3,
     weights=replace(RADIUS_COST, pull=0.05),
 )
-"""The recipe gradient further, on crystals of all four scenarios. A pull speed at the limits of ``puller`` leaves the
-rest to the heater, whose effect shows after more than 15 min: hence the longer windows."""
+"""Goes on from an agent of ``gradient-start``. A pull speed at the limits of ``puller`` leaves the rest to the heater,
+whose effect shows after more than 15 min: hence the longer windows."""
 RECIPES: dict[str, Recipe] = {
     recipe.name: recipe
     for recipe in (
-        Gradient(weights=GRADIENT_COST),
-        ALL,
-        *SPECIALISTS,
         PPO(),
-        Refinement(weights=GRADIENT_COST),
-        RecurrentPPO(),
         SAC(),
-        RandomSearch(),
         Imitation(name="imitation", weights=LQG_COST),
+        Gradient(name="gradient-start", weights=GRADIENT_COST),
+        GRADIENT,
+        replace(_ON, name="gradient-specialist", also=(("sensor-fault", 1.0, 0.3), ("", 2.0, 0.03))),
     )
 }
 """By name: what ``train.py --algo`` offers."""
+DEFAULT = "ppo"
+"""The recipe that train.py follows unless another is named."""

@@ -12,21 +12,17 @@ import numpy as np
 import stable_baselines3
 import torch
 from gymnasium.vector import AutoresetMode
-from sb3_contrib import RecurrentPPO as RecurrentPPOAlgorithm
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 
 from cz_gym import CzVectorEnv
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 
-from . import random_search
 from .callbacks import Statistics, Watching
 from .export import actor_of, actor_onnx
-from .filter_bank import read_bank
 from .learner import Parts, Watch
 from .networks import AsymmetricPolicy, Normalise
-from .recipes import OWN_WEIGHTS, PPO, SAC, Gradient, RandomSearch, RecurrentPPO, Refinement, Reinforcement
-from .refinement import BankPolicy, Remembering
+from .recipes import OWN_WEIGHTS, PPO, SAC, Reinforcement
 from .vec_env import CzVecEnv
 from .wrappers import Held, TrainingReward
 
@@ -48,10 +44,7 @@ class SoftActorCritic(stable_baselines3.SAC):
 
 KINDS: dict[type[Reinforcement], tuple[Any, Any]] = {
     PPO: (stable_baselines3.PPO, AsymmetricPolicy),
-    Refinement: (stable_baselines3.PPO, BankPolicy),
-    RecurrentPPO: (RecurrentPPOAlgorithm, "MlpLstmPolicy"),
     SAC: (SoftActorCritic, "MlpPolicy"),
-    RandomSearch: (random_search.RandomSearch, random_search.WhitenedLinearPolicy),
 }
 """The algorithm and the policy of each kind of recipe."""
 
@@ -92,17 +85,15 @@ class Reinforced:
 
     def exported(self) -> bytes:
         """The deterministic actor."""
-        policy = self.algorithm.policy
-        return policy.bank.onnx() if isinstance(policy, BankPolicy) else actor_onnx(actor_of(policy))
+        return actor_onnx(actor_of(self.algorithm.policy))
 
 
 def make_slots(recipe: Reinforcement, seed: int, done: int) -> CzVecEnv:
     """The batch that is trained on."""
-    observation = "history" if isinstance(recipe, Refinement) else recipe.observation
-    config = replace(recipe.config, observation=observation, horizon=recipe.length)
+    config = replace(recipe.config, horizon=recipe.length)
     info = "lean" if recipe.weights == OWN_WEIGHTS else "all"
     env = CzVectorEnv.from_config(config, recipe.num_envs, AutoresetMode.SAME_STEP, info=info)
-    return CzVecEnv(env, recipe.privileged_critic, stagger=None if isinstance(recipe, RandomSearch) else seed + done)
+    return CzVecEnv(env, recipe.privileged_critic, stagger=seed + done)
 
 
 def make_algorithm(recipe: Reinforcement, slots: CzVecEnv, seed: int) -> BaseAlgorithm:
@@ -110,34 +101,23 @@ def make_algorithm(recipe: Reinforcement, slots: CzVecEnv, seed: int) -> BaseAlg
     torch.manual_seed(seed)
     env: Any = TrainingReward(slots, recipe.gamma, recipe.weights, recipe.failure_costs)
     env = Held(env, recipe.held) if isinstance(recipe, SAC) else env
-    if isinstance(recipe, Refinement):
-        bank = read_bank(recipe.start, seed, recipe.config, Gradient.hidden)
-        env, options = Remembering(env, bank), {"bank": bank, "hidden": recipe.hidden, "noise": recipe.noise}
-    else:
-        options = _network(recipe)
     algorithm, policy = KINDS[type(recipe)]
     known = {name for kind in algorithm.__mro__ for name in inspect.signature(kind.__init__).parameters}
     settings = {name: value for name, value in asdict(recipe).items() if name in known}
     settings["learning_rate"] = linear(recipe.learning_rate, recipe.learning_rate / 20.0)
-    made: BaseAlgorithm = algorithm(policy, env, policy_kwargs=options, seed=seed, device="cpu", **settings)
+    made: BaseAlgorithm = algorithm(policy, env, policy_kwargs=_network(recipe), seed=seed, device="cpu", **settings)
     if isinstance(made, SoftActorCritic) and isinstance(recipe, SAC):
         made.begin_with(recipe.noise)
     return made
 
 
 def _network(recipe: Reinforcement) -> dict[str, Any]:
-    """Options of the policy: normalised observations, layers, an LSTM on request."""
-    if isinstance(recipe, RandomSearch):
-        return {}
-    layers = list(recipe.hidden)
+    """Options of the policy: normalised observations, and layers."""
     seeing = {"features_extractor_class": Normalise, "features_extractor_kwargs": {"memory": recipe.memory}}
     if isinstance(recipe, SAC):
-        return {**seeing, "net_arch": layers}
-    if isinstance(recipe, PPO):
-        return {**seeing, "hidden": recipe.hidden, "log_std_init": float(np.log(recipe.noise))}
-    arch = {"pi": layers, "vf": layers}
-    assert isinstance(recipe, RecurrentPPO)
-    return {**seeing, "net_arch": arch, "lstm_hidden_size": recipe.units, "log_std_init": float(np.log(recipe.noise))}
+        return {**seeing, "net_arch": list(recipe.hidden)}
+    assert isinstance(recipe, PPO)
+    return {**seeing, "hidden": recipe.hidden, "log_std_init": float(np.log(recipe.noise))}
 
 
 def linear(start: float, end: float) -> Callable[[float], float]:

@@ -1,4 +1,4 @@
-"""The rows of the ablation: recipes ``gradient``, ``gradient-randomized`` and ``ppo``, cut short, and each with one
+"""The rows of the ablation: recipes ``gradient-start``, ``gradient-specialist`` and ``ppo``, cut short, and each with one
 thing changed.
 """
 
@@ -12,9 +12,9 @@ from cz_gym.agents.training.recipes import OWN_WEIGHTS, RECIPES, Gradient, Recip
 from cz_gym.units import MINUTE
 from studies.comparison.variants import Variant
 
-GRADIENT: Any = replace(RECIPES["gradient"], steps=350 * Gradient.num_envs * Gradient.window)  # type: ignore[call-arg]
+GRADIENT: Any = replace(RECIPES["gradient-start"], steps=350 * Gradient.num_envs * Gradient.window)  # type: ignore[call-arg]
 """An eighth of the recipe: it holds every crystal, and what helps shows."""
-SPECIALIST: Any = replace(RECIPES["gradient-randomized"], steps=GRADIENT.steps, weights=GRADIENT.weights)  # type: ignore[call-arg]
+SPECIALIST: Any = replace(RECIPES["gradient-specialist"], steps=GRADIENT.steps, weights=GRADIENT.weights)  # type: ignore[call-arg]
 PPO: Any = replace(RECIPES["ppo"], steps=1_500_000)  # type: ignore[call-arg]
 
 

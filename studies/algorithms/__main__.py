@@ -14,14 +14,12 @@ from studies.comparison.variants import Study, Variant
 
 ROWS = (
     Variant(
-        RECIPES["gradient"],
+        RECIPES["gradient-start"],
         "the cost's gradient through policy and plant, from nothing; the plant is known; of its "
         "crystals, 70 % are wide, or of hard, sensor-fault and puller",
     ),
     Variant(RECIPES["ppo"], "proximal policy optimisation from nothing; the critic also sees the true state"),
-    Variant(RECIPES["ppo-recurrent"], "the same of an LSTM; actor and critic see the past", "ppo"),
     Variant(RECIPES["sac"], "soft actor-critic from nothing; both see the past; it learns with actions of 20 s", "ppo"),
-    Variant(RECIPES["random-search"], "augmented random search of a linear policy, from nothing", "ppo"),
     Variant(RECIPES["imitation"], "no reward: DAgger, the teacher is a privileged LQG", "ppo"),
 )
 """Every row, in the order of the table."""

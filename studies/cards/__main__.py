@@ -11,18 +11,14 @@ from typing import Any
 
 from cz_gym.agents import MODELS, shipped_seeds
 from cz_gym.agents.agent_file.contract import Contract, read_agent
-from cz_gym.agents.training.recipes import ALL, RECIPES, SPECIALISTS, Gradient, Imitation
+from cz_gym.agents.training.recipes import RECIPES, Gradient, Imitation
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser
 from cz_gym.errors import CzError
 from cz_gym.evaluation.report.tables import markdown as table
 from studies.algorithms.__main__ import ROWS
 
-_LEARNED = {row.name: row.meaning for row in ROWS} | {
-    recipe.name: f"going on from `{recipe.start}`, for "
-    + ("all four scenarios" if recipe is ALL else f"`{recipe.scenario}`")
-    for recipe in (ALL, *SPECIALISTS)
-}
+_LEARNED = {row.name: row.meaning for row in ROWS} | {"gradient": "continued from `gradient-start`, on all four scenarios"}
 AGENTS = {name: how for name, how in _LEARNED.items() if any(MODELS.glob(f"{name}-seed*.onnx"))}
 """Shipped agents, and how each learned."""
 FIGURES = {

@@ -53,7 +53,7 @@ def test_a_lost_node_changes_nothing(nodes: tuple[Any, Any]) -> None:
     assert there.n == here.n == plan().steps
     for name, ours in values(wanted).items():
         np.testing.assert_array_equal(values(found)[name], ours, err_msg=name)
-    assert len(values(wanted)["gradient"]) == 10
+    assert len(values(wanted)["gradient"]) == 5
 
 
 def test_a_node_with_other_sources_is_named(nodes: tuple[Any, Any]) -> None:

@@ -81,12 +81,10 @@ def make_plan(*arguments: str) -> runner.Plan:
     return benchmark.make_plan(benchmark.parse(arguments), "")
 
 
-def test_a_specialist_takes_part_if_it_is_named() -> None:
-    usual = [each.name for each in make_plan().contenders]
-    assert set(benchmark.SHIPPED) <= set(usual)
-    assert "gradient-puller" not in usual
-    (specialist,) = make_plan("--controllers", "gradient-puller").contenders
-    assert len(specialist.make(ROWS[0].config())) == 5
+def test_every_shipped_agent_takes_part() -> None:
+    assert set(benchmark.SHIPPED) <= {each.name for each in make_plan().contenders}
+    (gradient,) = make_plan("--controllers", "gradient").contenders
+    assert len(gradient.make(ROWS[0].config())) == 5
 
 
 def test_the_folder_holds_every_file_and_nothing_else(finished: Path) -> None:
@@ -189,7 +187,7 @@ def test_agent_files_that_cannot_be_used_get_one_line(tmp_path: Path, refusal: A
     other = constant_agent(tmp_path / "other.onnx", training_seed=1, scenario="hard", scenario_hash="0" * 16)
     assert "different scenarios: hard, randomized" in refusal(["--agent", twice, "--agent", str(other)])
     assert "choose from" in (line := refusal(["--agent", f"mine={twice}", "--controllers", "your"]))
-    assert "mine, gradient, gradient-all, ppo, ppo-recurrent, sac, random-search, imitation, gradient-hard," in line
+    assert "mine, gradient, ppo, sac, imitation," in line
 
 
 @pytest.mark.parametrize(
@@ -205,10 +203,9 @@ def test_a_contract_that_cannot_be_recorded_is_refused_at_once(odd: dict[str, An
 
 def test_an_agent_s_line_says_every_scenario_that_its_recipe_has(tmp_path: Path) -> None:
     file = constant_agent(tmp_path / "some.onnx", algorithm="mine")
-    plan = make_plan("--controllers", "gradient,ppo,mine,gradient-puller", "--agent", str(file))
+    plan = make_plan("--controllers", "gradient,ppo,mine", "--agent", str(file))
     assert {each.name: each.controller.meaning.partition(" on ")[2] for each in plan.contenders} == {
         "gradient": "randomized, hard, sensor-fault and puller",
-        "gradient-puller": "puller",
         "ppo": "randomized",
         "mine": "randomized, given as a file",
     }

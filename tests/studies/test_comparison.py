@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("sb3_contrib")
+pytest.importorskip("stable_baselines3")
 pytest.importorskip("matplotlib")
 
 from cz_gym.agents.training import run, validation
-from cz_gym.agents.training.recipes import PPO, SAC, Imitation, RecurrentPPO
+from cz_gym.agents.training.recipes import PPO, SAC, Imitation
 from cz_gym.evaluation import cluster
 from cz_gym.evaluation.protocol import TEST_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.statistics import Resamples
@@ -29,7 +29,6 @@ BASE = Variant(PPO(**SMALL, n_steps=16, batch_size=64, n_epochs=1), "as it is")
 VARIANTS = (
     BASE,
     Variant(SAC(**SMALL, learning_starts=16, buffer_size=64, batch_size=8), "SAC", "ppo"),
-    Variant(RecurrentPPO(**SMALL, units=4, n_steps=16, batch_size=64), "LSTM", "ppo"),
     Variant(Imitation(name="few", teacher="lqg", rounds=1, episodes=2, control_interval=60.0), "DAgger", "ppo"),
 )
 STUDY = Study("some", "Some question", VARIANTS, 128)
@@ -74,7 +73,7 @@ def test_a_comparison_keeps_what_is_finished_and_goes_on(
     (first,) = (out / "runs").iterdir()
     before = first.read_bytes()
     assert command.main(STUDY, options) == 0
-    assert trained == ["ppo", "sac", "sac", "ppo-recurrent", "few"]
+    assert trained == ["ppo", "sac", "sac", "few"]
     assert first.read_bytes() == before
     told = json.loads(before)
     assert told["key"]["settings"]["recipe"]["num_envs"] == 4
@@ -90,12 +89,12 @@ def test_a_comparison_keeps_what_is_finished_and_goes_on(
     assert (out / "curves.png").read_bytes().startswith(b"\x89PNG")
     capsys.readouterr()
     assert command.main(STUDY, [*options, "--list"]) == 0
-    assert capsys.readouterr().out.count("1/1") == 4
+    assert capsys.readouterr().out.count("1/1") == 3
     assert command.main(STUDY, [*options, "--list", "--rows", "few,sac", "--steps", "64"]) == 0
     listed = capsys.readouterr().out.splitlines()
     assert [line.split()[:2] for line in listed] == [["sac", "0/1"], ["few", "1/1"]], "--steps are not an imitation's"
     assert command.main(STUDY, options) == 0
-    assert len(trained) == 5
+    assert len(trained) == 4
 
 
 @pytest.mark.slow
@@ -146,7 +145,7 @@ def test_a_damaged_result_is_named(content: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--rows", "ppo,sacc"], "unknown row 'sacc': did you mean 'sac'? Choose from ppo, sac, ppo-recurrent, few"),
+        (["--rows", "ppo,sacc"], "unknown row 'sacc': did you mean 'sac'? Choose from ppo, sac, few"),
         (["--seeds", "0"], "--seeds: must be between 1 and 100, not 0"),
         (["--steps", "-5"], "--steps: must be between 1"),
         (["--jobs", "0"], "--jobs: must be between 1 and 64, not 0"),

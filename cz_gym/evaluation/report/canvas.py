@@ -31,7 +31,7 @@ INK, GREY = "#222222", "#999999"
 KNOWN = ("ppo", "gradient", "lqg-at-0.02", "paper", "paper-tuned")
 """Controllers of README's table, which figures prefer."""
 ORDER = (
-    *KNOWN, "lqg", "lqg-quiet", "gradient-all", "imitation", "ppo-recurrent", "sac", "random-search", "industrial",
+    *KNOWN, "lqg", "lqg-quiet", "imitation", "sac", "industrial",
     "pid-conventional", "paper-filtered", "open-loop", "pid-uncompensated",
 )  # fmt: skip
 """What runs by default: each looks the same in every figure of every run, by its place here."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("sb3_contrib")
+pytest.importorskip("stable_baselines3")
 
 from cz_gym.agents.training.crystals import Crystals, Evenness
 from cz_gym.agents.training.recipes import Gradient

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("sb3_contrib")
+pytest.importorskip("stable_baselines3")
 
 from stable_baselines3.common.logger import Logger
 
@@ -227,8 +227,8 @@ def test_the_noise_of_camera_and_pyrometer_is_estimated(deviation: float) -> Non
 
 def test_a_specialist_goes_on_from_the_shipped_agent_of_its_seed() -> None:
     """And keeps its standardisation; a run that is resumed has its own weights; what is no such agent is refused."""
-    specialist: Any = RECIPES["gradient-puller"]
-    few = replace(specialist, num_envs=4, window=20, steps=4 * 20)
+    specialist: Any = RECIPES["gradient-specialist"]
+    few = replace(specialist, num_envs=4, window=20, steps=4 * 20, whitened=False)
     shipped = agents.shipped_seeds("gradient")
     for seed in (0, 3):
         learner = GradientLearner(few, seed, few.config, Logger(None, []), 0)
@@ -245,7 +245,7 @@ def test_a_specialist_goes_on_from_the_shipped_agent_of_its_seed() -> None:
 
 def test_whitening_changes_what_is_learned_and_not_the_policy() -> None:
     """Before and after it the network acts alike; its state, and its agent file, are read by another learner."""
-    recipe: Any = replace(RECIPES["gradient-randomized"], num_envs=4, window=20, steps=80)
+    recipe: Any = replace(RECIPES["gradient-specialist"], num_envs=4, window=20, steps=80)
     first, second = (GradientLearner(recipe, 0, recipe.config, Logger(None, []), 0) for _ in range(2))
     network = first.network
     width, random = len(network.mean), np.random.default_rng(0)
@@ -267,7 +267,7 @@ def test_whitening_changes_what_is_learned_and_not_the_policy() -> None:
 
 def test_it_learns_from_nothing() -> None:
     """Forty updates on a third of the recipe's crystals: from losing all crystals to holding most of them."""
-    recipe: Any = replace(RECIPES["gradient"], num_envs=64, steps=64 * 180 * 40, hidden=(), also=())
+    recipe: Any = replace(RECIPES["gradient-start"], num_envs=64, steps=64 * 180 * 40, hidden=(), also=())
     learner, config = GradientLearner(recipe, 0, recipe.config, Logger(None, []), 0), recipe.config
 
     def judged() -> Validation:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("sb3_contrib")
+pytest.importorskip("stable_baselines3")
 
 from cz_gym.agents.training import callbacks
 from cz_gym.agents.training.callbacks import Statistics

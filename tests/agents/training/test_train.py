@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[3]
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch, few_crystals: None) -> None:
     monkeypatch.setitem(RECIPES, "ppo", PPO(num_envs=64, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,)))
-    monkeypatch.setitem(RECIPES, "gradient", Gradient(num_envs=16, window=12, steps=10_000, hidden=()))
+    monkeypatch.setitem(RECIPES, "gradient-start", Gradient(name="gradient-start", num_envs=16, window=12, steps=10_000, hidden=()))
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -27,13 +27,13 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 @pytest.mark.usefixtures("quick")
-@pytest.mark.parametrize("algorithm", ["gradient", "ppo"])
+@pytest.mark.parametrize("algorithm", ["gradient-start", "ppo"])
 def test_a_run_leaves_everything_and_goes_on(
     algorithm: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "run"
     assert train.main(["--algo", algorithm, "--steps", "20000", "--seed", "3", "--out", str(folder), "--plot"]) == 0
-    also = ", hard, sensor-fault and puller" if algorithm == "gradient" else ""
+    also = ", hard, sensor-fault and puller" if algorithm == "gradient-start" else ""
     assert f" steps on randomized{also}, into {folder}\n" in capsys.readouterr().out
     assert (folder / "progress.png").read_bytes().startswith(b"\x89PNG")
     saved = json.loads((folder / "settings.json").read_text())
@@ -113,7 +113,7 @@ def test_interrupting_before_learning_gives_one_line(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--algo", "dqn"], "unknown recipe 'dqn'; choose from gradient"),
+        (["--algo", "dqn"], "unknown recipe 'dqn'; choose from ppo"),
         (["--steps", "0"], "between 1 and 1000000000000, not 0"),
         (["--seed", "minus"], "between 0 and 9223372036854775807, not minus"),
         (["--checkpoint-seconds", "-1"], "at least 0, not '-1'"),
@@ -124,6 +124,8 @@ def test_interrupting_before_learning_gives_one_line(
         (["--algo", "imitation", "--steps", "9"], "imitation takes no --steps"),
         (["--algo", "imitation", "--resume"], "nothing to resume"),
         (["--resume"], "nothing to resume"),
+        (["--algo", "gradient"], "gradient continues from an agent of gradient-start"),
+        (["--from", "some.onnx"], "--from goes with gradient recipes only"),
     ],
 )
 def test_mistakes_give_one_line(tmp_path: Path, arguments: list[str], message: str, refused: Any) -> None:
@@ -133,7 +135,7 @@ def test_mistakes_give_one_line(tmp_path: Path, arguments: list[str], message: s
 
 def test_a_run_that_is_refused_leaves_no_logs(tmp_path: Path, refused: Any) -> None:
     assert "no such file" in refused(
-        train.main, ["--from", str(tmp_path / "none.onnx"), "--out", str(tmp_path / "run")]
+        train.main, ["--algo", "gradient", "--from", str(tmp_path / "none.onnx"), "--out", str(tmp_path / "run")]
     )
     assert not list(tmp_path.rglob("tensorboard"))
 
