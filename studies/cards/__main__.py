@@ -18,7 +18,9 @@ from cz_gym.errors import CzError
 from cz_gym.evaluation.report.tables import markdown as table
 from studies.algorithms.__main__ import ROWS
 
-_LEARNED = {row.name: row.meaning for row in ROWS} | {"gradient": "continued from `gradient-start`, on all four scenarios"}
+_LEARNED = {row.name: row.meaning for row in ROWS} | {
+    "gradient": "continued from `gradient-start`, on all four scenarios"
+}
 AGENTS = {name: how for name, how in _LEARNED.items() if any(MODELS.glob(f"{name}-seed*.onnx"))}
 """Shipped agents, and how each learned."""
 FIGURES = {

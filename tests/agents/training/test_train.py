@@ -19,7 +19,9 @@ ROOT = Path(__file__).parents[3]
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch, few_crystals: None) -> None:
     monkeypatch.setitem(RECIPES, "ppo", PPO(num_envs=64, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,)))
-    monkeypatch.setitem(RECIPES, "gradient-start", Gradient(name="gradient-start", num_envs=16, window=12, steps=10_000, hidden=()))
+    monkeypatch.setitem(
+        RECIPES, "gradient-start", Gradient(name="gradient-start", num_envs=16, window=12, steps=10_000, hidden=())
+    )
 
 
 def rows(path: Path) -> list[dict[str, str]]:
