@@ -1,5 +1,5 @@
-"""The rows of the ablation: recipes ``gradient-start``, ``gradient-specialist`` and ``ppo``, cut short, and each with one
-thing changed.
+"""The rows of the ablation: the recipes ``gradient-start``, ``gradient-specialist`` and ``ppo``, cut short, and each
+with one thing changed.
 """
 
 from __future__ import annotations
