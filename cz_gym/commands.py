@@ -1,4 +1,4 @@
-"""What the project's commands share: whatever is wrong with one, or ends it early, is said in one line."""
+"""What the project's commands share: errors that are meant for the user, and interrupts, print one line."""
 
 from __future__ import annotations
 
@@ -12,9 +12,16 @@ from gymnasium.error import DependencyNotInstalled
 
 from cz_gym.errors import CzError
 
+OPTIONAL = (
+    "casadi", "control", "envpool", "filelock", "h5py", "matplotlib", "minari", "moviepy", "onnx", "onnxruntime",
+    "optuna", "pcgym", "plotly", "pygame", "ray", "safetensors", "sb3_contrib", "selenium", "stable_baselines3",
+    "tensorboard", "torch", "tqdm",
+)  # fmt: skip
+"""Modules of the packages in the extras of ``pyproject.toml``."""
+
 
 class OneLineParser(argparse.ArgumentParser):
-    """Takes options only as they are written out, and says in one line what is wrong with them."""
+    """Parser of a command line without abbreviated options, whose error messages are one line each."""
 
     def __init__(self, prog: str, description: str | None = None, epilog: str | None = None) -> None:
         super().__init__(prog=prog, description=description, epilog=epilog, allow_abbrev=False)
@@ -30,13 +37,13 @@ class OneLineParser(argparse.ArgumentParser):
         extra: str,
         left: str = "nothing written",
     ) -> int:
-        """Run a command's body on what was given, as :func:`guarded` does; returns the exit code."""
+        """Parse the arguments and run the command's body on them, as :func:`guarded` does; returns the exit code."""
         given = self.parse_args(arguments)
         return guarded(self.prog, lambda: body(given) or 0, extra, left)
 
 
 def between(least: int, most: int) -> Callable[[str], int]:
-    """The type of an option that is a whole number in that range, ends included."""
+    """Return a parser of whole numbers from ``least`` to ``most``, for an option's ``type``."""
 
     def number(text: str) -> int:
         try:
@@ -51,32 +58,34 @@ def between(least: int, most: int) -> Callable[[str], int]:
 
 
 def guarded(prog: str, body: Callable[[], int], extra: str, left: str = "nothing written") -> int:
-    """Run a command's body, its exit code; what ends it early is said in one line.
+    """Run a command's body and return its exit code.
 
-    ``extra`` names the extras of the package that hold what the command imports, ``left`` what an interrupt leaves.
+    One line on stderr tells of a :class:`CzError`, a missing package of the project's extras, and Ctrl-C; every other
+    exception is a bug, the user's or ours, and keeps its traceback. ``extra`` names the extras of what the command
+    imports, ``left`` says what an interrupt leaves behind.
     """
     try:
         return body()
-    except ImportError as error:
-        absent = isinstance(error, ModuleNotFoundError) and error.name
-        said = f'{absent} is missing: pip install ".[{extra}]"' if absent else str(error)
-    except OSError as error:
-        said = f"{error.filename or 'output'}: {error.strerror}" if error.strerror else str(error)
     except (CzError, DependencyNotInstalled) as error:
-        said = str(error)
+        message = str(error)
+    except ModuleNotFoundError as error:
+        module = (error.name or "").partition(".")[0]
+        if module not in OPTIONAL:
+            raise
+        message = f'{module} is missing: pip install ".[{extra}]"'
     except KeyboardInterrupt:
         print(f"{prog}: interrupted; {left}", file=sys.stderr)
         return 130
-    print(f"{prog}: {' '.join(said.split())}", file=sys.stderr)
+    print(f"{prog}: {' '.join(message.split())}", file=sys.stderr)
     return 2
 
 
 def shown(path: str | Path) -> str:
-    """A path as people write it: relative to the current folder if it lies below it."""
+    """Return the path relative to the current folder if it lies below it, else absolute."""
     whole, here = Path(path).absolute(), Path.cwd()
     return str(whole.relative_to(here) if whole.is_relative_to(here) else whole)
 
 
 def interpreter() -> str:
-    """The Python that runs, as a command names it."""
+    """Return the path of the running Python as a command line would name it."""
     return shown(sys.executable) if sys.executable else "python"

@@ -2,12 +2,15 @@
 
 A checkpoint fits only the learner it was made from: every tensor must have the name, shape and type of one that is
 there, so no file can ask for more memory than it has bytes. Hyperparameters are not in it; they are the run's settings.
+The files that belong to it (the best agent, the progress) are in it too, as bytes: one file is replaced at one moment,
+and a resumed run writes the others anew.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -20,11 +23,15 @@ from cz_gym.agents.agent_file.contract import AgentFileError, read_bounded
 from .learner import Learner, Parts
 from .replay_buffer import PREFIX, fits, latest, refill
 
-FORMAT = "cz-gym-checkpoint-3"
+FORMAT = "cz-gym-checkpoint-4"
 MAX_BYTES = 64_000_000
 """Largest checkpoint that is read."""
 MAX_HEADER = 1_000_000
 """Largest list of its tensors [bytes]."""
+FILES = ("agent.onnx", "agent.json", "progress.csv", "progress.png", "summary.json")
+"""Files of a run that its checkpoint may hold."""
+IN_FILE = "file/"
+"""Beginning of a file's name among the tensors."""
 COUNTS = ("step", "exp_avg_sq")
 """What Adam remembers of a parameter and is never negative."""
 
@@ -43,8 +50,10 @@ class Progress:
     """Least validation cost so far [-]; None before the first."""
 
 
-def to_bytes(learner: Learner, seconds: float, best_cost: float | None) -> bytes:
-    """The checkpoint of a learner; of a replay buffer the latest transitions.
+def to_bytes(
+    learner: Learner, seconds: float, best_cost: float | None, files: Mapping[str, bytes] | None = None
+) -> bytes:
+    """The checkpoint of a learner, of a replay buffer the latest transitions, and the run's ``files`` by name.
 
     AgentFileError if it learned numbers that are not finite: no run could go on from them.
     """
@@ -55,12 +64,15 @@ def to_bytes(learner: Learner, seconds: float, best_cost: float | None) -> bytes
         if tensor.is_floating_point() and not tensor.isfinite().all():
             raise AgentFileError(f"the training went wrong: {name!r:.80} is not finite; the last checkpoint stays")
     header = {"format": FORMAT, "progress": json.dumps(asdict(progress))}
-    content: bytes = save(copies | latest(parts.replay_buffer), header)
+    held = {
+        IN_FILE + name: torch.frombuffer(bytearray(data), dtype=torch.uint8) for name, data in (files or {}).items()
+    }
+    content: bytes = save(copies | latest(parts.replay_buffer) | held, header)
     return content
 
 
-def load_checkpoint(path: Path) -> tuple[Progress, Tensors]:
-    """Read a checkpoint; AgentFileError says why it cannot be."""
+def load_checkpoint(path: Path) -> tuple[Progress, Tensors, dict[str, bytes]]:
+    """Progress, tensors and the run's files of a checkpoint; AgentFileError says why it cannot be read."""
     content = read_bounded(path, MAX_BYTES)
     end = 8 + int.from_bytes(content[:8], "little")
     if end > MAX_HEADER:
@@ -80,7 +92,11 @@ def load_checkpoint(path: Path) -> tuple[Progress, Tensors]:
     whole = type(progress.steps) is int and 0 <= progress.steps < 2**63
     if not whole or not all(type(each) is float and 0.0 <= each < math.inf for each in (progress.seconds, best)):
         raise AgentFileError(f"{path}: does not say where the run stood")
-    return progress, tensors
+    held = {name: tensors.pop(name) for name in [name for name in tensors if name.startswith(IN_FILE)]}
+    files = {name.removeprefix(IN_FILE): bytes(each.flatten().view(torch.uint8).numpy()) for name, each in held.items()}
+    if not files.keys() <= {*FILES} or any(each.dtype != torch.uint8 for each in held.values()):
+        raise AgentFileError(f"{path}: holds a file that is none of {', '.join(FILES)}")
+    return progress, tensors, files
 
 
 def restore(learner: Learner, tensors: Tensors, path: Path) -> None:

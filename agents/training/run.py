@@ -6,14 +6,14 @@ import dataclasses
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from cz_gym.agents.agent_file.contract import AgentFileError, Contract, agent_files, facts_of, make_contract, read_agent
 from cz_gym.agents.policies.onnx import OnnxPolicy
-from cz_gym.atomic_files import finish_writing, write_files
-from cz_gym.config import Config, make_config
+from cz_gym.atomic_files import write_files
+from cz_gym.config import make_config
 
 from .checkpoint import load_checkpoint, restore, to_bytes
 from .learner import Learner
@@ -36,8 +36,9 @@ class Run:
 
     ``controllers`` makes a classical controller from its name and an environment's settings: the teacher of an
     imitation, and the references, which run the same validation episodes and are shown beside the agent. ``resume``
-    goes on from the folder's checkpoint, saved anew every ``checkpoint_seconds``. Checkpoint, progress and best agent
-    are replaced together, so that they agree whenever a run is killed; with ``plot`` a picture of the progress too.
+    goes on from the folder's checkpoint, saved anew every ``checkpoint_seconds``. It holds the best agent and the
+    progress (with ``plot`` a picture of it too), which are written beside it and, where a kill came between, anew when
+    the run is resumed.
     Raises AgentFileError if the folder cannot be used.
     """
 
@@ -62,19 +63,18 @@ class Run:
         self.sessions: list[dict[str, Any]] = []
         self.began = self.saved = time.monotonic()
         self.saved_steps = -1
-        self.unsaved: dict[Path, bytes] = {}
+        self.files: dict[str, bytes] = {}
         logs = folder / "tensorboard"
         if not resume:
             self.learner: Learner = make_learner(recipe, seed, controllers, logs)
             self.save()
         else:
-            if folder.is_dir():
-                finish_writing(folder)
             self.sessions = check_settings(folder, recipe, seed)
-            progress, tensors = load_checkpoint(folder / CHECKPOINT)
+            progress, tensors, self.files = load_checkpoint(folder / CHECKPOINT)
+            write_files({folder / name: content for name, content in self.files.items()})
             self.began -= progress.seconds
             self.rows = read_rows(folder / "progress.csv")
-            if progress.best_cost is not None and _usable(folder / "agent.onnx", self.config):
+            if progress.best_cost is not None:
                 self.best = progress.best_cost
             self.learner = make_learner(recipe, seed, controllers, logs, progress.steps)
             restore(self.learner, tensors, folder / CHECKPOINT)
@@ -105,11 +105,15 @@ class Run:
             report(self.learner.steps, self._validate(bar))
 
     def save(self) -> None:
-        """Write a checkpoint, and with it what a validation left to be written."""
+        """Write a checkpoint, then the files that it holds."""
         best = self.best if math.isfinite(self.best) else None
-        content = to_bytes(self.learner, time.monotonic() - self.began, best)
-        write_files({**self.unsaved, self.folder / CHECKPOINT: content})
-        self.unsaved, self.saved, self.saved_steps = {}, time.monotonic(), self.learner.steps
+        content = to_bytes(self.learner, time.monotonic() - self.began, best, self.files)
+        write_files({self.folder / name: content for name, content in {CHECKPOINT: content, **self.files}.items()})
+        self.saved, self.saved_steps = time.monotonic(), self.learner.steps
+
+    def _hold(self, files: Mapping[Path, bytes]) -> None:
+        """Take files of the folder into the next checkpoint."""
+        self.files |= {path.name: content for path, content in files.items()}
 
     def finish(self) -> dict[str, float]:
         """Judge the best agent on episodes that did not pick it; the contents of ``summary.json``."""
@@ -128,7 +132,8 @@ class Run:
             "seconds": time.monotonic() - self.began,
         }
         judged = dataclasses.replace(contract, validation_cost=found.cost, validation_rmse_mm=found.rmse_mm)
-        write_files({**agent_files(path, content, judged), self.folder / "summary.json": to_json(summary)})
+        self._hold({**agent_files(path, content, judged), self.folder / "summary.json": to_json(summary)})
+        self.save()
         return summary
 
     def best_policy(self) -> OnnxPolicy:
@@ -144,15 +149,15 @@ class Run:
         if found.cost < self.best:
             self.best = found.cost
             contract = dataclasses.replace(contract, validation_cost=found.cost, validation_rmse_mm=found.rmse_mm)
-            self.unsaved |= agent_files(self.folder / "agent.onnx", content, contract)
+            self._hold(agent_files(self.folder / "agent.onnx", content, contract))
         seconds = round(time.monotonic() - self.began, 1)
         row = (learner.steps, seconds, *found, *self.references.values())
         self.rows.append(dict(zip(COLUMNS, row, strict=True)))
-        self.unsaved[self.folder / "progress.csv"] = to_csv(self.rows)
+        self._hold({self.folder / "progress.csv": to_csv(self.rows)})
         if self.plot:
             from .plot import progress
 
-            self.unsaved[self.folder / "progress.png"] = progress(self.rows, f"{self.recipe.name}, seed {self.seed}")
+            self._hold({self.folder / "progress.png": progress(self.rows, f"{self.recipe.name}, seed {self.seed}")})
         self.save()
         for name, figure in found._asdict().items():
             learner.logger.record(f"validation/{name}", figure)
@@ -205,11 +210,3 @@ def check_settings(folder: Path, recipe: Recipe, seed: int) -> list[dict[str, An
         if saved.get(name) != value:
             raise AgentFileError(f"{path}: the run was begun with another {name}; resume it with the same options")
     return list(saved["sessions"])
-
-
-def _usable(path: Path, config: Config) -> bool:
-    try:
-        OnnxPolicy.load(path, config)
-    except AgentFileError:
-        return False
-    return True

@@ -16,7 +16,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cz_gym.atomic_files import check_writable, write_files
+from cz_gym.atomic_files import check_writable, naming, write_files
 from cz_gym.config import Config, make_config
 from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
@@ -169,7 +169,8 @@ class Search(ABC):
     def _read(self, path: Path) -> tuple[dict[str, int], list[Trial]]:
         """Training episodes and trials of a file; ValueError if it is none, or of another search."""
         try:
-            found = json.loads(path.read_text())
+            with naming(path):
+                found = json.loads(path.read_text("utf-8"))
             begun = {name: found["budget"][name] for name in ("episodes", "survive")}
             if found["parameters"] != self._paths:
                 raise CzError(f"its parameters are not those of {self.controller}")

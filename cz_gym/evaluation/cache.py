@@ -91,7 +91,7 @@ def earlier_bound(folder: Path, row: Row, samples: Sequence[Sample]) -> Sample |
     try:
         found = read_episodes(folder / EPISODES, lambda scenario: columns if scenario == row.name else ())[row.name]
         (episodes,) = found[BOUND]
-    except (OSError, ValueError, KeyError):
+    except (ValueError, KeyError):
         return None
     seeds = row.seeds(len(episodes))
     agree = [

@@ -155,7 +155,7 @@ def completed(
             try:
                 result = ray.get(reference)
             except ray.exceptions.RayTaskError as error:
-                raise error.cause from None
+                raise error.cause from error  # whose text has the traceback of the other process
             except ray.exceptions.RayError as error:
                 raise CzError(f"the cluster lost a task {RETRIES} times: {' '.join(str(error).split())}") from None
             yield numbers.pop(reference), result

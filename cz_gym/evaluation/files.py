@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.atomic_files import naming
 from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.errors import CzError
 
@@ -159,8 +160,10 @@ def read_episodes(path: Path, columns: Callable[[str], Sequence[str]]) -> Episod
     did not meet the same number of crystals.
     """
     found: dict[str, dict[str, dict[str, list[list[float]]]]] = {}
+    with naming(path):
+        text = path.read_text("utf-8")
     try:
-        for line in csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))):
+        for line in csv.DictReader(io.StringIO(text)):
             by_seed = found.setdefault(line["scenario"], {}).setdefault(line["controller"], {})
             figures = [float(line[name]) for name in columns(line["scenario"])]
             by_seed.setdefault(line["training_seed"], []).append(figures)

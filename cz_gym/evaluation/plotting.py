@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cz_gym.atomic_files import write_files
 from cz_gym.names import needs
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
@@ -48,5 +49,5 @@ def plot(run: Rollout, episode: int = 0, path: str | Path | None = None) -> Figu
     ended = "lost" if run.failed[episode] else "held"
     figure.suptitle(f"{config.scenario.name}, seed {run.seeds[episode]}: {ended}", fontsize=10)
     if path is not None:
-        Path(path).write_bytes(png(figure))
+        write_files({Path(path): png(figure)})
     return figure

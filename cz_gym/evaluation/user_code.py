@@ -24,7 +24,9 @@ PREFIX = "cz_gym_user_"
 
 
 def load(place: str, kind: str, fits: Callable[[Any, str], bool]) -> tuple[str, Any]:
-    """The name and the object at ``FILE.py:NAME``; ValueError says in one line why there is none.
+    """Return the name and the object at ``FILE.py:NAME``; CzError says why there is none.
+
+    What the user's file itself raises is raised here, with its traceback.
 
     ``fits`` says of an object and the module's name whether the file may offer it as one of that ``kind``.
     """
@@ -38,10 +40,7 @@ def load(place: str, kind: str, fits: Callable[[Any, str], bool]) -> tuple[str, 
     spec: Any = importlib.util.spec_from_file_location(module_name, path)
     # Dataclasses look their module up.
     module = sys.modules[module_name] = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:  # whatever the user's file raises
-        raise CzError(f"{path}: {type(error).__name__}: {error}") from error
+    spec.loader.exec_module(module)
     if not hasattr(module, name):
         offered = [each for each, value in vars(module).items() if each[0] != "_" and fits(value, module_name)]
         raise CzError(f"{path}: {unknown(kind, name, offered)}")

@@ -12,7 +12,7 @@ from typing import Any
 from cz_gym.agents import MODELS, shipped_seeds
 from cz_gym.agents.agent_file.contract import Contract, read_agent
 from cz_gym.agents.training.recipes import RECIPES, Gradient, Imitation
-from cz_gym.atomic_files import check_writable, write_files
+from cz_gym.atomic_files import check_writable, naming, write_files
 from cz_gym.commands import OneLineParser
 from cz_gym.errors import CzError
 from cz_gym.evaluation.report.tables import markdown as table
@@ -39,13 +39,15 @@ def read_results(paths: Sequence[Path]) -> Results:
     try:
         found: dict[str, dict[str, Any]] = {}
         for path in reversed(paths):
-            for scenario, of in json.loads(path.read_text())["results"].items():
+            with naming(path):
+                text = path.read_text("utf-8")
+            for scenario, of in json.loads(text)["results"].items():
                 found.setdefault(scenario, {}).update(of)
         for name in AGENTS:
             for of in _seen(name, found).values():
                 for metric in FIGURES:
                     float(of[name][metric]["mean"])
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError):
         raise CzError(f"no benchmark.json with {', '.join(AGENTS)}: {', '.join(map(str, paths))}") from None
     return found
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from cz_gym.atomic_files import write_files
+from cz_gym.atomic_files import naming, write_files
 from cz_gym.baselines.lqg.settings import FAMILY
 from cz_gym.commands import OneLineParser, guarded
 from cz_gym.errors import CzError
@@ -34,12 +34,13 @@ Points = Mapping[str, Point]
 def read_points(path: Path, metric: str) -> dict[str, Points]:
     """The points of each scenario in a benchmark.json; ValueError for any other file."""
     try:
-        results = json.loads(path.read_text())["results"]
+        with naming(path):
+            results = json.loads(path.read_text("utf-8"))["results"]
         return {
             scenario: {name: (float(m[ACTIVITY]["mean"]), float(m[metric]["mean"])) for name, m in controllers.items()}
             for scenario, controllers in results.items()
         }
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError):
         raise CzError(f"{path} is no benchmark.json") from None
 
 
@@ -51,7 +52,7 @@ def table(results: Mapping[str, Points], metric: str, episodes: Episodes | None 
         try:
             found = ratios(points, FAMILY)
             most = frontier([points[name] for name in FAMILY if name in points]).activity[-1]
-        except ValueError as error:
+        except CzError as error:
             lines.append(f"{error}.")
             continue
         spread = {} if episodes is None else _intervals(scenario, points, episodes.get(scenario, {}))

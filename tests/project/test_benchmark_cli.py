@@ -17,6 +17,7 @@ import benchmark
 from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.agent_file.contract import write_agent
 from cz_gym.config import make_config
+from cz_gym.errors import CzError
 from cz_gym.evaluation import runner
 from cz_gym.evaluation.contenders import agent
 from cz_gym.evaluation.metrics import metric_names
@@ -407,7 +408,6 @@ def test_a_report_on_one_s_own_shows_it_and_prints_a_command_that_runs(
         ("--controller", "mine.py:number", "no controller"),
         ("--controller", "mine.py:later", "no controller"),
         ("--scenario", "mine.py:Still", "no scenario"),
-        ("--controller", "broken.py:Still", "ZeroDivisionError"),
         ("--controller", "lqg.py:lqg", "two controllers are called 'lqg'"),
         ("--controller", "lqg.py:gradient", "two controllers are called 'gradient'"),
     ],
@@ -417,6 +417,34 @@ def test_files_of_one_s_own_that_do_not_fit_get_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("mine.py").write_text(MINE)
-    Path("broken.py").write_text("1 / 0")
     Path("lqg.py").write_text(f"{MINE}\nlqg = gradient = still")
     assert message in refusal([option, place])
+
+
+RAISES = """
+def helper():
+    return [1, 2][7]
+
+class Mine:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        {}
+
+made = Mine()
+"""
+
+
+@pytest.mark.parametrize(
+    ("body", "place", "line"),
+    [("return helper(), state", "Mine", 3), ("observation + [1, 2, 3, 4, 5]", "made", 7), ("pass\n1 / 0", "Mine", 8)],
+)
+def test_a_bug_in_one_s_own_file_shows_its_file_and_line(
+    body: str, place: str, line: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether it is in ``predict`` or stops the import."""
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text(RAISES.format(body))
+    with pytest.raises((IndexError, ValueError, ZeroDivisionError)) as caught:
+        benchmark.main(["--controllers", "open-loop", "--controller", f"mine.py:{place}", *ONE[:2], "--quiet"])
+    assert not isinstance(caught.value, CzError)
+    last = caught.traceback[-1]
+    assert (Path(last.path).name, last.lineno + 1) == ("mine.py", line)

@@ -1,17 +1,21 @@
 """Every command: one line for options that cannot be meant, one line for Ctrl-C, and nothing left behind."""
 
 import importlib
+import re
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
+from gymnasium.error import DependencyNotInstalled
 
 import benchmark
 from cz_gym import datasets
 from cz_gym.baselines.tuning import lqg as tune_lqg
 from cz_gym.baselines.tuning import pid as tune_pid
-from cz_gym.commands import OneLineParser, guarded, interpreter
+from cz_gym.commands import OPTIONAL, OneLineParser, guarded, interpreter
+from cz_gym.errors import CzError
 from cz_gym.play import __main__ as play
 from studies.film import __main__ as film
 from studies.insight import __main__ as insight
@@ -111,20 +115,37 @@ def test_a_message_of_several_lines_becomes_one(capsys: pytest.CaptureFixture[st
     ("error", "code", "said"),
     [
         (None, 0, ""),
-        (ModuleNotFoundError("none", name="absent"), 2, 'prog: absent is missing: pip install ".[agents]"\n'),
-        (ImportError("cannot import name 'one'", name="present"), 2, "prog: cannot import name 'one'\n"),
-        (ValueError("first line\nsecond line"), 2, "prog: first line second line\n"),
-        (FileNotFoundError(2, "No such file", "there.csv"), 2, "prog: there.csv: No such file\n"),
+        (ModuleNotFoundError("none", name="torch.nn"), 2, 'prog: torch is missing: pip install ".[agents]"\n'),
+        (CzError("first line\nsecond line"), 2, "prog: first line second line\n"),
+        (DependencyNotInstalled("no pygame"), 2, "prog: no pygame\n"),
         (KeyboardInterrupt(), 130, "prog: interrupted; runs are complete\n"),
+        (ModuleNotFoundError("none", name="their_own"), None, ""),
+        (ImportError("cannot import name 'one'", name="torch"), None, ""),
+        (ValueError("operands could not be broadcast together"), None, ""),
+        (FileNotFoundError(2, "No such file", "there.csv"), None, ""),
     ],
+    ids=repr,
 )
-def test_whatever_ends_a_command_is_one_line(
-    error: BaseException | None, code: int, said: str, capsys: pytest.CaptureFixture[str]
+def test_only_what_is_meant_for_the_user_is_one_line_and_a_bug_keeps_its_traceback(
+    error: BaseException | None, code: int | None, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def body() -> int:
         if error is not None:
             raise error
         return 0
 
-    assert guarded("prog", body, "agents", "runs are complete") == code
+    if code is None and error is not None:
+        with pytest.raises(type(error)):
+            guarded("prog", body, "agents")
+    else:
+        assert guarded("prog", body, "agents", "runs are complete") == code
     assert capsys.readouterr().err == said
+
+
+def test_every_package_of_the_extras_is_known_as_optional() -> None:
+    project = tomllib.loads(Path("pyproject.toml").read_text())["project"]
+    building = {"ruff", "mypy", "build", "setuptools", "pytest", "pytest_xdist", "hypothesis", "sybil", "scipy_stubs"}
+    documenting = {"sphinx", "myst_parser", "furo", "latex2mathml", "jupytext"}
+    optional = project["optional-dependencies"]
+    needed = {re.split(r"[^\w-]", line)[0].replace("-", "_") for extra in optional.values() for line in extra}
+    assert needed - building - documenting - {"cz_gym", "pygame_ce"} == {*OPTIONAL} - {"h5py"}

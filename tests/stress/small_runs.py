@@ -16,7 +16,7 @@ from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.training import run
 from cz_gym.agents.training.checkpoint import load_checkpoint
 from cz_gym.agents.training.recipes import PPO, RECIPES, Imitation
-from cz_gym.atomic_files import finish_writing
+from cz_gym.atomic_files import write_files
 from cz_gym.baselines import registry
 from cz_gym.baselines.pid.open_loop import OpenLoop
 from cz_gym.evaluation import runner
@@ -37,24 +37,25 @@ REINFORCEMENT = {
     "start-up": ("cz_gym.agents.training.run:provenance:1", 0),
     "rollout": ("stable_baselines3.common.buffers:RolloutBuffer.add:20", 1280),
     "update": ("stable_baselines3:PPO.train:1>torch.nn.utils:clip_grad_norm_:5", 3328),
-    "checkpoint, before it counts": (f"{RUN}.save:5>os:rename:1", 3584),
+    "checkpoint, before it counts": (f"{RUN}.save:5>os:replace:1", 3584),
     "first validation": (f"{RUN}._validate:1>{STEP}:100", 7616),
-    "one after a validation, before it counts": (f"{RUN}._validate:1>os:rename:1", 9664),
+    "one after a validation, before it counts": (f"{RUN}._validate:1>os:replace:1", 9664),
     "checkpoint, as it moves": (f"{RUN}._validate:1>os:replace:2", 9664),
     "judging": (f"{RUN}.finish:1>{STEP}:100", 9664),
     "summary, as it moves": (f"{RUN}.finish:1>os:replace:2", 9664),
 }
 """The same of PPO, of which rollouts have 2,048 steps, and a validation follows every second one."""
 WRITING = "cz_gym.evaluation.report.output:write_files:1"
-BENCHMARK = {
+BENCHMARK: dict[str, tuple[str | None, str | None]] = {
     "episodes": (f"cz_gym.evaluation.runner:rollout:1>{STEP}:1000", None),
     "slow episodes": (f"cz_gym.evaluation.runner:rollout:3>{STEP}:1000", None),
     "figures": ("cz_gym.evaluation.report.figures:draw_figures:1", None),
-    "first results, as they move": (f"{WRITING}>os:replace:3", "open-loop"),
-    "other results, before they count": (f"{WRITING}>os:rename:1", "open-loop"),
-    "other results, as they move": (f"{WRITING}>os:replace:3", "paper"),
+    "first results, before benchmark.json": (f"{WRITING}>os:replace:7", None),
+    "first results, not killed": (None, "open-loop"),
+    "other results, before any moves": (f"{WRITING}>os:replace:1", "open-loop"),
+    "other results, as they move": (f"{WRITING}>os:replace:3", "open-loop"),
 }
-"""Where benchmark.py is killed, one run after another into one folder, and whose results are there then."""
+"""Where benchmark.py is killed, one run after another into one folder, and whose benchmark.json is there then."""
 
 
 def training(arguments: list[str]) -> int:
@@ -84,15 +85,13 @@ def slow_benchmark(arguments: list[str]) -> int:
     return benchmark.main([*options, *arguments])
 
 
-def settle(folder: Path) -> bool:
-    """Finish what a killed writer left in a folder; whether there was anything."""
-
-    def left() -> bool:
-        return any(path.is_dir() for path in folder.glob(".writ*"))
-
-    torn = left()
-    finish_writing(folder)
-    check(not left(), "leftovers")
+def resume(folder: Path) -> bool:
+    """Write the files of the checkpoint anew, as a resumed run does first; whether one of them was an older one."""
+    if not (folder / run.CHECKPOINT).exists():
+        return False
+    files = {folder / name: content for name, content in load_checkpoint(folder / run.CHECKPOINT)[2].items()}
+    torn = any(not file.exists() or file.read_bytes() != content for file, content in files.items())
+    write_files(files)
     return torn
 
 
@@ -101,7 +100,7 @@ def check_training(out: Path) -> int:
     if not (out / run.CHECKPOINT).exists():
         check(not (out / "settings.json").exists(), "settings without a checkpoint")
         return 0
-    progress, _ = load_checkpoint(out / run.CHECKPOINT)
+    progress, *_ = load_checkpoint(out / run.CHECKPOINT)
     rows = _rows(out / "progress.csv")
     best = min((float(row["validation_cost"]) for row in rows), default=None)
     check(best == progress.best_cost, f"best {progress.best_cost} in the checkpoint, {best} in the progress")
@@ -115,16 +114,15 @@ def check_training(out: Path) -> int:
 
 
 def check_benchmark(out: Path) -> str | None:
-    """The controller beside the slow one whose results a killed benchmark.py left; they are all of one run."""
+    """The controller beside the slow one in the ``benchmark.json`` that a killed benchmark.py left, None if none."""
+    check(all(file.stat().st_size > 0 for file in out.glob("*.*")), "an empty file")
     if not (out / "benchmark.json").exists():
-        check(not list(out.glob("*.*")), "a part of the results")
         return None
     content = (out / "benchmark.json").read_bytes()
     check(is_benchmark_json(content), "benchmark.json is damaged")
-    who, report = set(json.loads(content)["results"]["randomized"]), (out / "report.md").read_text()
-    check({row["controller"] for row in _rows(out / "episodes.csv")} == who, "files of two runs")
-    check(all(f"| {name}" in report for name in who), "files of two runs")
-    (other,) = who - {"slow"}
+    check((out / "report.md").read_text().endswith("benchmark.json.\n"), "report.md is damaged")
+    check(len(_rows(out / "episodes.csv")) == 12, "episodes.csv is damaged")
+    (other,) = set(json.loads(content)["results"]["randomized"]) - {"slow"}
     return str(other)
 
 

@@ -1,10 +1,10 @@
-"""Writing a benchmark's results, all files or none; files of other origin are replaced only with ``overwrite``."""
+"""Writing a benchmark's results, each file whole; files of other origin are replaced only with ``overwrite``."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from cz_gym.atomic_files import check_writable, write_files
+from cz_gym.atomic_files import check_writable, naming, write_files
 from cz_gym.errors import CzError
 from cz_gym.evaluation.files import EPISODES, FILES, RESULTS, is_benchmark_json, to_csv, to_json
 from cz_gym.evaluation.results import Benchmark
@@ -44,16 +44,17 @@ def protected_files(folder: Path | None, lone: Path | None, partial: bool) -> li
 
 def is_benchmark(path: Path) -> bool:
     """Whether a file is the JSON of an earlier benchmark."""
-    return path.is_file() and is_benchmark_json(path.read_bytes())
+    with naming(path):
+        return path.is_file() and is_benchmark_json(path.read_bytes())
 
 
 def write(folder: Path | None, lone: Path | None, done: Benchmark, quoted: Path | None = None) -> None:
-    """Write the files; the table between the markers of the page ``quoted``, if there is one, as well.
+    """Write the files, ``benchmark.json`` last, and the table between the markers of the page ``quoted``, if it exists.
 
     Needs matplotlib and plotly if there is a folder.
     """
     text = to_json(done).encode()
-    files = {lone: text} if lone else {}
+    files: dict[Path, bytes] = {}
     if folder:
         from .figures import draw_figures
         from .markdown import fill_in, markdown
@@ -64,7 +65,11 @@ def write(folder: Path | None, lone: Path | None, done: Benchmark, quoted: Path 
         files[folder / EPISODES] = to_csv(done).encode()
         files[folder / "report.md"] = markdown(done, figures).encode()
         files[folder / "report.html"] = page(done).encode()
-        files[folder / RESULTS] = text
         if quoted and quoted.is_file():
-            files[quoted] = fill_in(quoted.read_text("utf-8"), done).encode()
+            with naming(quoted):
+                text_of_page = quoted.read_text("utf-8")
+            files[quoted] = fill_in(text_of_page, done).encode()
+        files[folder / RESULTS] = text
+    if lone:
+        files[lone] = text
     write_files(files)

@@ -18,7 +18,7 @@ from tests.small_learners import SMALL, SMALL_SAC, made, trained
 def test_a_checkpoint_continues_and_refuses_what_does_not_fit(ppo: Any, tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.safetensors"
     path.write_bytes(to_bytes(ppo, 12.0, 0.5))
-    progress, tensors = load_checkpoint(path)
+    progress, tensors, _ = load_checkpoint(path)
     assert (progress.steps, progress.seconds, progress.best_cost) == (ppo.steps, 12.0, 0.5)
     other = made(SMALL, 1, progress.steps)
     restore(other, tensors, path)
@@ -122,7 +122,7 @@ def test_tensors_that_do_not_belong_are_refused(
     path = tmp_path / "checkpoint.safetensors"
     learner, other = (sac, made(SMALL_SAC, 1)) if name.startswith("replay/") else (ppo, made(SMALL, 1))
     path.write_bytes(to_bytes(learner, 1.0, None))
-    _, tensors = load_checkpoint(path)
+    _, tensors, _ = load_checkpoint(path)
     tensors[name] = change(tensors.get(name))
     with pytest.raises(AgentFileError, match=message):
         restore(other, {key: tensor for key, tensor in tensors.items() if tensor is not None}, path)
