@@ -34,12 +34,6 @@ def train_held_seed(job: fleet.Job) -> dict[str, float]:
     return train_small_seed(job)
 
 
-def held(function: Callable[[Any], Any], task: Any) -> Any:
-    """Do a comparison's task, held."""
-    hold()
-    return function(task)
-
-
 def hold() -> None:
     """Few validation episodes in this process, each after there is a file ``go`` beside the run folders."""
     run.PICKING, run.JUDGING = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4]

@@ -1,1 +1,1 @@
-"""Algorithms side by side at one budget: ``python -m studies.algorithms``."""
+"""Learning algorithms, and changes of a recipe, side by side: ``python -m studies.algorithms``."""

@@ -1,34 +1,97 @@
-"""Algorithms side by side: ``python -m studies.algorithms`` trains each recipe of train.py and judges its agents.
+"""Train recipes over several seeds and compare their agents: ``python -m studies.algorithms [ablation]``.
 
-The agents stay in the folders of their runs (``--work``); those that are shipped were made so.
+Every run is an ordinary folder of train.py below ``--work``; a finished one is not trained again, an interrupted one
+goes on from its checkpoint. Agents are evaluated anew each time, so a table never mixes figures of different code.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from cz_gym.agents.training.recipes import RECIPES
-from studies.comparison.command import main as compare
-from studies.comparison.variants import Study, Variant
+from cz_gym.atomic_files import check_writable, write_files
+from cz_gym.baselines.registry import make_controller
+from cz_gym.commands import OneLineParser, between
+from cz_gym.evaluation import cluster
 
-ROWS = (
-    Variant(
-        RECIPES["gradient-start"],
-        "the cost's gradient through policy and plant, from nothing; the plant is known; of its "
-        "crystals, 70 % are wide, or of hard, sensor-fault and puller",
-    ),
-    Variant(RECIPES["ppo"], "proximal policy optimisation from nothing; the critic also sees the true state"),
-    Variant(RECIPES["sac"], "soft actor-critic from nothing; both see the past; it learns with actions of 20 s", "ppo"),
-    Variant(RECIPES["imitation"], "no reward: DAgger, the teacher is a privileged LQG", "ppo"),
-)
-"""Every row, in the order of the table."""
-STUDY = Study("algorithms", "Algorithms side by side: the recipes of train.py on the same crystals", ROWS, None)
+from .variants import COMPARISONS, Comparison, Variant
+
+if TYPE_CHECKING:
+    from cz_gym.agents.training.fleet import Job
+
+    from .results import Result
+
+CHECKPOINT_SECONDS = 60.0
+"""Time between the checkpoints of a run [s]."""
+Perform = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
+"""Does tasks, here or elsewhere: the number of each and its result, as they come."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    return compare(STUDY, arguments)
+    parser = OneLineParser("python -m studies.algorithms", (__doc__ or "").split("\n")[0])
+    parser.add_argument("comparison", choices=COMPARISONS, nargs="?", default="algorithms", help="(%(default)s)")
+    parser.add_argument("--rows", help="rows to run, joined by commas (default: all)")
+    parser.add_argument("--seeds", type=between(1, 100), default=3, help="training seeds a row (default: %(default)s)")
+    about = "environment steps of recipes that learn from reward (default: the recipe's own)"
+    parser.add_argument("--steps", type=between(1, 10**9), help=about)
+    parser.add_argument("--jobs", type=between(1, 64), default=2, help="runs at once here (default: %(default)s)")
+    about = "run on a Ray cluster, without an address on this machine's; all its machines must share --work"
+    parser.add_argument("--ray", nargs="?", const="", metavar="HOST:PORT", help=about)
+    parser.add_argument("--out", type=Path, help="folder of the results (default: results/COMPARISON)")
+    parser.add_argument("--work", type=Path, help="folder of the runs (default: runs/COMPARISON)")
+    parser.add_argument("--list", action="store_true", help="list the rows and how many of their runs are finished")
+    return parser.run(_main, arguments, "agents,benchmark", "the same command goes on from the runs' checkpoints")
+
+
+def _main(given: argparse.Namespace) -> None:
+    comparison = COMPARISONS[given.comparison]
+    out, work = (getattr(given, name) or Path(top) / given.comparison for name, top in
+                 (("out", "results"), ("work", "runs")))  # fmt: skip
+    variants = [variant.lasting(given.steps) for variant in comparison.chosen(given.rows)]
+    jobs = make_jobs(variants, given.seeds, work)
+    if given.list:
+        for variant in variants:
+            done = sum(job.recipe == variant.recipe and job.summary is not None for job in jobs)
+            print(f"{variant.name:24} {done}/{given.seeds}  {variant.meaning}")
+        return
+    check_writable(out)
+    perform: Perform = partial(cluster.in_processes, processes=given.jobs)
+    if given.ray is not None:
+        cluster.connect(given.ray, "studies")
+        work.mkdir(parents=True, exist_ok=True)
+        cluster.check_shared(work)
+        perform = cluster.completed
+    compare(comparison._replace(variants=tuple(variants)), jobs, out, perform)
+
+
+def make_jobs(variants: Sequence[Variant], seeds: int, work: Path) -> list[Job]:
+    """A run for each training seed and variant; seed by seed, so that a stopped comparison has run every variant."""
+    from cz_gym.agents.training.fleet import Job
+
+    return [
+        Job((work / f"{each.name}-seed{seed}").resolve(), each.recipe, seed, make_controller, CHECKPOINT_SECONDS, False,
+            sys.argv)
+        for seed in range(seeds)
+        for each in variants
+    ]  # fmt: skip
+
+
+def compare(comparison: Comparison, jobs: Sequence[Job], out: Path, perform: Perform) -> None:
+    """Train and evaluate the jobs; the table and figure are written after each."""
+    from .report import report
+    from .results import train_and_evaluate
+
+    results: dict[str, dict[int, Result]] = {}
+    for number, result in perform(train_and_evaluate, jobs):
+        job = jobs[number]
+        results.setdefault(job.recipe.name, {})[job.seed] = result
+        write_files({out / name: content for name, content in report(comparison, results).items()})
+        print(f"{job.recipe.name}, seed {job.seed}: done, {out / 'table.md'} is written", flush=True)
 
 
 if __name__ == "__main__":

@@ -16,9 +16,9 @@ from cz_gym.atomic_files import check_writable, naming, write_files
 from cz_gym.commands import OneLineParser
 from cz_gym.errors import CzError
 from cz_gym.evaluation.report.tables import markdown as table
-from studies.algorithms.__main__ import ROWS
+from studies.algorithms.variants import ALGORITHMS
 
-_LEARNED = {row.name: row.meaning for row in ROWS} | {
+_LEARNED = {row.name: row.meaning for row in ALGORITHMS} | {
     "gradient": "continued from `gradient-start`, on all four scenarios"
 }
 AGENTS = {name: how for name, how in _LEARNED.items() if any(MODELS.glob(f"{name}-seed*.onnx"))}

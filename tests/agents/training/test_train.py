@@ -68,7 +68,7 @@ def test_a_run_leaves_everything_and_goes_on(
     [
         ("train.py", "train.py"),
         (str(ROOT / "train.py"), "train.py"),
-        (str(ROOT / "studies" / "ablation" / "__main__.py"), "-m studies.ablation"),
+        (str(ROOT / "studies" / "algorithms" / "__main__.py"), "-m studies.algorithms"),
         ("/elsewhere/bin/pytest", "pytest"),
     ],
 )

@@ -1,0 +1,147 @@
+"""The table of a comparison, means and paired differences with 95 % intervals, and its figure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.ticker import FixedLocator, NullLocator
+
+from cz_gym.agents.training import validation
+from cz_gym.agents.training.run_files import REFERENCES
+from cz_gym.evaluation.report.canvas import COLOURS, INK, canvas, png, styles
+from cz_gym.evaluation.report.tables import markdown
+from cz_gym.evaluation.statistics import Estimate, Resamples, means
+
+from .results import SCENARIO, TRANSFER, Result
+from .variants import Comparison
+
+MICRON, PERCENT = 1e-3, 1e-2
+"""A micrometre in millimetres, and a hundredth."""
+COLUMNS = (
+    ("RMSE [um]", MICRON, ".1f"),
+    ("cost", 1.0, ".4f"),
+    ("pull step [um/min]", MICRON, ".1f"),
+    ("lost [%]", PERCENT, ".1f"),
+    (f"{TRANSFER}: RMSE [um]", MICRON, ".1f"),
+    ("lost [%]", PERCENT, ".1f"),
+)
+"""Heading, unit and format of each of FIGURES."""
+PANELS = (("RMSE of the radius [µm]", 1.0), ("cost of a step [-]", 0.01), ("pull step RMS [µm/min]", 1.0))
+"""Axes of the forest plot, for the first figures; and half width of each axis' linear middle, in the figure's unit."""
+AXES = (("steps", 1e6, "environment steps [million]"), ("seconds", 60.0, "minutes on a core, validation included"))
+"""What learning curves are drawn against: column of a run's progress, unit, axis."""
+ABOUT = """Agents are evaluated on {crystals} validation crystals of `{scenario}` that did not choose a run's agent, and
+on those of `{transfer}` with the same seeds; of each run the agent of least cost on the validation that selects. In
+brackets: 95 % intervals, bootstrap over training seeds and crystals; with few training seeds they are somewhat too
+narrow. Differences are taken on the same crystals and training seeds, negative is better. Cost: of a step, as the
+environment's reward counts it; a lost crystal counts ten there, and 8 mm."""
+Results = Mapping[str, Mapping[int, Result]]
+"""By variant and training seed."""
+
+
+class Line(NamedTuple):
+    """One variant: its figures, and their differences to its base if that has been trained."""
+
+    name: str
+    base: str
+    runs: Mapping[int, Result]
+    means: tuple[Estimate, ...]
+    differences: tuple[Estimate, ...]
+
+
+def report(comparison: Comparison, results: Results) -> dict[str, bytes]:
+    """``table.md`` and the comparison's figure, by file name."""
+    lines = tabulate(comparison, results)
+    about = ABOUT.format(crystals=len(validation.JUDGING), scenario=SCENARIO, transfer=TRANSFER)
+    meanings = (f"- **{each.name}**: {each.meaning}" for each in comparison.variants if each.name in results)
+    text = "\n".join([f"# {comparison.title}", "", about, "", to_markdown(lines), "", *meanings, ""])
+    draw = {"curves": curves, "forest": forest}[comparison.figure]
+    return {"table.md": text.encode(), f"{comparison.figure}.png": draw(lines)}
+
+
+def tabulate(comparison: Comparison, results: Results) -> list[Line]:
+    """A line for each variant with results."""
+    lines = []
+    for name, base in ((variant.name, variant.base) for variant in comparison.variants if variant.name in results):
+        mine, others = results[name], results.get(base, {})
+        values = np.array([run.figures for run in mine.values()])
+        weights = Resamples.draw(values.shape[1])
+        paired = [run.figures - others[seed].figures for seed, run in mine.items() if seed in others]
+        lines.append(Line(name, base, mine, means(values, weights), means(np.array(paired), weights) if paired else ()))
+    return lines
+
+
+def to_markdown(lines: list[Line]) -> str:
+    """Means with their intervals, differences beneath them."""
+    rows: list[tuple[str, ...]] = []
+    for line in lines:
+        last = [run.progress[-1] for run in line.runs.values()]
+        spent = (
+            f"{1e-6 * np.mean([row['steps'] for row in last]):.1f}",
+            f"{np.mean([row['seconds'] for row in last]) / 60:.0f}",
+        )
+        figures = (each.text(form, unit) for each, (_, unit, form) in zip(line.means, COLUMNS, strict=True))
+        rows.append((f"**{line.name}**", str(len(line.runs)), *figures, *spent))
+        if line.differences:
+            apart = (
+                each.text(f"+{form}", unit) for each, (_, unit, form) in zip(line.differences, COLUMNS, strict=True)
+            )
+            rows.append((f"less {line.base}", "", *apart, "", ""))
+    return markdown(("", "seeds", *(head for head, *_ in COLUMNS), "million steps", "minutes"), rows)
+
+
+def forest(lines: list[Line]) -> bytes:
+    """Each variant's paired differences to its base with their intervals, as PNG; left is better."""
+    drawn = [line for line in lines if line.differences]
+    figure = canvas(9.4, 0.3 * len(drawn) + 1.5)
+    axes = figure.subplots(1, len(PANELS), sharey=True, squeeze=False)[0]
+    for number, (axis, (title, middle)) in enumerate(zip(axes, PANELS, strict=True)):
+        unit = COLUMNS[number][1]
+        axis.axvline(0.0, color=INK, lw=0.8)
+        for place, line in enumerate(drawn):
+            difference = line.differences[number]
+            axis.plot([end / unit for end in difference.ends], [place] * 2, color=COLOURS[1], lw=1.3)
+            axis.plot([difference.mean / unit], [place], marker="o", color=COLOURS[1], ms=5)
+        axis.set_xscale("symlog", linthresh=middle)
+        axis.xaxis.set_major_locator(FixedLocator([0.0, *(s * middle * 10.0**k for s in (-1, 1) for k in (0, 2, 4))]))
+        axis.xaxis.set_minor_locator(NullLocator())
+        axis.xaxis.set_major_formatter(lambda value, position: f"{value:g}")
+        axis.set(xlabel=title, ylim=(len(drawn) - 0.4, -0.6))
+    axes[0].set_yticks(range(len(drawn)), [f"{line.name} less {line.base} ({len(line.runs)})" for line in drawn])
+    figure.suptitle(
+        "Less than zero is better: differences on the same crystals (training seeds), 95 % intervals", fontsize=11
+    )
+    return png(figure)
+
+
+def curves(lines: list[Line]) -> bytes:
+    """Validation RMSE while learning against steps and minutes, a line a training seed, as PNG.
+
+    Dashed: the classical controllers on the same crystals.
+    """
+    figure = canvas(9.4, 4.6)
+    panels = figure.subplots(1, 2, sharey=True)
+    style, last = styles([line.name for line in lines]), next(iter(lines[0].runs.values())).progress[-1]
+    for axis, (column, unit, title) in zip(panels, AXES, strict=True):
+        for line in lines:
+            for place, run in enumerate(line.runs.values()):
+                spent = [row[column] / unit for row in run.progress]
+                error = [row["validation_rmse_mm"] for row in run.progress]
+                look = {"color": style[line.name].colour, "marker": style[line.name].marker}
+                label = line.name if place == 0 and axis is panels[0] else None
+                axis.plot(spent, error, ms=2.5, lw=1.0, label=label, **look)
+        for name in REFERENCES:
+            rmse = last[f"{name}_rmse_mm"]
+            axis.axhline(rmse, color=INK, lw=0.9, ls="--")
+            if axis is panels[0]:
+                axis.annotate(name, (0.99, rmse), (0, 2), axis.get_yaxis_transform(), textcoords="offset points",
+                              ha="right", fontsize=8, color=INK)  # fmt: skip
+        axis.set(xscale="log", yscale="log", xlabel=title)
+        for each in (axis.xaxis, axis.yaxis):
+            each.set_major_formatter(lambda value, position: f"{value:g}")
+    panels[0].set_ylabel("validation RMSE of the radius [mm]")
+    figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+    figure.suptitle("Radius error on validation crystals while learning: a line a training seed", fontsize=11)
+    return png(figure)

@@ -1,0 +1,95 @@
+"""The recipes that are compared: every recipe of train.py, and ``ppo`` with one thing changed at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+from cz_gym.agents.training.recipes import RECIPES, Recipe, Rewarded
+from cz_gym.errors import CzError
+from cz_gym.names import unknown
+from cz_gym.units import MINUTE
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One row of a comparison: a recipe that is trained over several seeds."""
+
+    recipe: Recipe
+    meaning: str
+    """What the recipe does, in one line."""
+    base: str = ""
+    """Name of the row that it is compared with; empty for none."""
+
+    @property
+    def name(self) -> str:
+        """Name of its agents."""
+        return self.recipe.name
+
+    def lasting(self, steps: int | None) -> Variant:
+        """The same with that many environment steps if it learns from reward; None: its recipe's own number."""
+        if steps is None or not isinstance(self.recipe, Rewarded):
+            return self
+        return replace(self, recipe=replace(self.recipe, steps=steps))
+
+
+class Comparison(NamedTuple):
+    """Rows that answer one question."""
+
+    title: str
+    variants: tuple[Variant, ...]
+    figure: str
+    """What is drawn: "curves" (validation error while learning) or "forest" (differences to the base)."""
+
+    def chosen(self, names: str | None) -> list[Variant]:
+        """The rows of those names, joined by commas; all rows for None. CzError names the rows there are."""
+        known = [variant.name for variant in self.variants]
+        wanted = known if names is None else names.split(",")
+        for name in wanted:
+            if name not in known:
+                raise CzError(unknown("row", name, known))
+        return [variant for variant in self.variants if variant.name in wanted]
+
+
+PPO: Any = replace(RECIPES["ppo"], steps=1_500_000)  # type: ignore[call-arg]
+
+
+def _ppo(name: str, meaning: str, **changes: Any) -> Variant:
+    return Variant(replace(PPO, name=f"ppo-{name}", **changes), meaning, "ppo")
+
+
+ALGORITHMS = (
+    Variant(
+        RECIPES["gradient-start"],
+        "the cost's gradient through policy and plant, from nothing; the plant is known; of its "
+        "crystals, 70 % are wide, or of hard, sensor-fault and puller",
+    ),
+    Variant(RECIPES["ppo"], "proximal policy optimisation from nothing; the critic also sees the true state"),
+    Variant(RECIPES["sac"], "soft actor-critic from nothing; both see the past; it learns with actions of 20 s", "ppo"),
+    Variant(RECIPES["imitation"], "no reward: DAgger, the teacher is a privileged LQG", "ppo"),
+)
+ABLATION = (
+    Variant(PPO, "from nothing, by reward; smooth actions, differences of the past, a critic that sees the true state"),
+    _ppo("rate", "an action moves the drives from where they are: no return to nominal", action="rate"),
+    _ppo("direct", "an action sets the drives, within their whole range", action="direct"),
+    _ppo("means", "means of past spans as they are, not their differences", basis="means"),
+    _ppo("memory-none", "no past samples: what is measured now, and the integral", memory=0.0),
+    _ppo("memory-4min", "past samples up to 4 min old, not 20", memory=4.0 * MINUTE),
+    _ppo("alive-bonus", "every step earns, and a lost crystal costs nothing but the steps left", failure_costs=False),
+    _ppo("gamma-0.95", "a horizon of 20 steps, not of 100", gamma=0.95),
+    _ppo("gamma-0.998", "a horizon of 500 steps", gamma=0.998),
+    _ppo("lambda-0.8", "a shorter advantage window, 5 steps", gae_lambda=0.8),
+    _ppo("lambda-0.99", "a longer advantage window, 100 steps", gae_lambda=0.99),
+    _ppo("little-noise", "exploration begins with a fifth of the spread", noise=0.1),
+    _ppo("much-noise", "exploration begins with twice the spread", noise=1.0),
+    _ppo("blind-critic", "the critic sees what the actor sees", privileged_critic=False),
+    _ppo("interval-10s", "a control interval of 10 s, not of 5", control_interval=10.0),
+    _ppo("half-crystals", "crystals of 1.5 h while it learns, not of 3 h", length=5400.0),
+    _ppo("linear", "no hidden layers", hidden=()),
+)
+COMPARISONS = {
+    "algorithms": Comparison(
+        "Algorithms side by side: the recipes of train.py on the same crystals", ALGORITHMS, "curves"
+    ),
+    "ablation": Comparison("What helps ppo: one change at a time, after 1.5 million steps", ABLATION, "forest"),
+}
