@@ -44,9 +44,9 @@ def mark(action: npt.NDArray[Any], made_for: MadeFor | None) -> npt.NDArray[Any]
     return marked
 
 
-def check_marked(action: Any, own: MadeFor) -> None:
-    """Raise InvalidAction for a marked action that was made for another environment than ``own``."""
-    if type(action) is MarkedAction and (message := mismatch(action.made_for, own)):
+def check_marked(action: MarkedAction, own: MadeFor) -> None:
+    """Raise InvalidAction for an action that was made for another environment than ``own``."""
+    if message := mismatch(action.made_for, own):
         raise InvalidAction(f"{message} (np.asarray(action) is taken all the same)")
 
 

@@ -14,17 +14,17 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.error import InvalidAction, ResetNeeded
 
-from cz_gym.action import check_marked
+from cz_gym.action import MarkedAction, check_marked
 from cz_gym.config import Config
 from cz_gym.cost import Cost
 from cz_gym.engine.batch import Batch, first_key
 from cz_gym.engine.buffers import BufferPool
-from cz_gym.engine.layout import INFO, Out
+from cz_gym.engine.layout import Out
 from cz_gym.engine.tangents import ACTIONS, ROWS, SCRATCH, SMOOTH, build_tangents
 from cz_gym.episodes.record import GRID
 from cz_gym.errors import CzError
-from cz_gym.observation import MEASURED, scales
 from cz_gym.physics.meniscus import MeniscusModel
+from cz_gym.signals import INFO, MEASURED, scales
 
 Floats = npt.NDArray[np.float64]
 _COSTS = [INFO.index(f"cost_{name}") for name in Cost._fields]
@@ -123,7 +123,8 @@ class DifferentiableBatch:
         InvalidAction for NaN, another shape, and actions made for another environment;
         ResetNeeded before every slot had its first reset.
         """
-        check_marked(actions, self._made_for)
+        if type(actions) is MarkedAction:
+            check_marked(actions, self._made_for)
         if not self._begun.all():
             raise ResetNeeded("every slot needs a crystal: call reset()")
         before, n = self._state, self.num_envs

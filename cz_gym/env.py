@@ -15,7 +15,7 @@ from gymnasium.spaces import Box
 
 from cz_gym.camera.view import IMAGE, Camera
 from cz_gym.engine.batch import Batch, SlotState, new_key
-from cz_gym.engine.layout import INFO, LEAN, check_info
+from cz_gym.engine.layout import check_info
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.errors import CzError
@@ -24,9 +24,10 @@ from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.rendering.view import FPS, Frame, declared_modes, make_view
 
-from .action import check_marked
+from .action import MarkedAction, check_marked
 from .config import Config, check_config, make_config
 from .observation import CAMERA, CLIP, OBSERVATIONS
+from .signals import INFO, LEAN
 
 Observation = npt.NDArray[Any]
 Action = npt.NDArray[np.float32]
@@ -104,7 +105,7 @@ class CzEnv(gym.Env[Observation, Action]):
     ``scenario`` (name or :class:`cz_gym.Scenario`), ``model`` ("I", "II", a mix in [0, 1], or None for the
     scenario's draw), ``observation``, ``action`` ("direct", "smooth" or "rate"), ``control_interval`` [s],
     ``horizon`` [s], ``info`` ("lean": true radius and its reference; "all": every signal, see
-    :data:`cz_gym.engine.layout.INFO_ROWS`; with observation "history" also the true ``state``, for critics),
+    :class:`cz_gym.signals.Logged`; with observation "history" also the true ``state``, for critics),
     ``render_mode``, ``parameters`` (:class:`cz_gym.Parameters`), ``meniscus`` (:class:`cz_gym.MeniscusModel`),
     ``camera`` (:class:`cz_gym.camera.Camera`, with observation "camera" only). Bad values raise ValueError.
     ``render_mode`` is None, "rgb_array" or "human", ``render_size`` the picture's width and height [px]; rendering
@@ -192,7 +193,8 @@ class CzEnv(gym.Env[Observation, Action]):
         """
         if self._over:
             raise ResetNeeded("the episode is over (or never began): call reset()")
-        check_marked(action, self._made_for)
+        if type(action) is MarkedAction:
+            check_marked(action, self._made_for)
         self._action[0] = check_action(action)
         self._step()
         out = self._out

@@ -15,7 +15,7 @@ from gymnasium.vector.utils import batch_space
 
 from cz_gym.camera.view import Camera
 from cz_gym.engine.batch import Batch, new_key
-from cz_gym.engine.layout import INFO, LEAN, Out, check_info
+from cz_gym.engine.layout import Out, check_info
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.errors import CzError
@@ -23,9 +23,10 @@ from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.processors import processors
 
-from .action import check_marked
+from .action import MarkedAction, check_marked
 from .config import Config, check_config, make_config
 from .env import CzEnv, EnvState, action_space, check_options, check_state, observation_space
+from .signals import INFO, LEAN
 
 _MASKS = tuple(f"_{name}" for name in INFO)
 _LEAN_MASKS = tuple(f"_{name}" for name in LEAN)
@@ -150,7 +151,8 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         Raises InvalidAction for NaN, another shape, and an action made for another environment (:mod:`cz_gym.action`);
         ResetNeeded before the first reset and, with autoreset disabled, while any episode is over.
         """
-        check_marked(actions, self._made_for)
+        if type(actions) is MarkedAction:
+            check_marked(actions, self._made_for)
         actions = self._check_actions(actions)
         if not self._begun:
             raise ResetNeeded("call reset() first")

@@ -26,15 +26,16 @@ from cz_gym.episodes.scenario import MAX_LATENCY, Scenario
 from cz_gym.episodes.series import series_of
 from cz_gym.errors import CzError
 from cz_gym.jit.compile import entry
-from cz_gym.observation import HISTORY, LAGGED, MEASURED, STATE, lags, relative, scales, span_scales
+from cz_gym.observation import HISTORY, LAGGED, lags, past_scale_changes, relative_channels
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.physics.plant import NO_OPERATING_POINT
+from cz_gym.signals import INFO, MEASURED, STATE, scales
 from cz_gym.task import drives_of
 
 from .buffers import BufferPool
 from .kernels import KERNELS, Kernels, build_kernels
-from .layout import INFO, SLOT, Clock, Memory, Out, Reading, info_width
+from .layout import SLOT, Clock, Memory, ObservationScales, Out, info_width
 
 SLOTS_PER_THREAD, SLOTS_AT_ONCE = 256, 128
 """Fewest slots worth a thread of their own in a step, and how many a thread takes at once."""
@@ -110,14 +111,14 @@ class Batch:
         self._camera = config.observation == "camera"
         ages = lags(config.control_interval)
         v_0 = config.parameters.v_0
-        self.reading = Reading(
+        self.scales = ObservationScales(
             1.0 / scales(MEASURED, v_0),
             1.0 / scales(STATE, v_0),
             ages.newest,
             ages.oldest + 1,
             1.0 / (ages.oldest - ages.newest + 1),
-            span_scales(),
-            relative(),
+            past_scale_changes(),
+            relative_channels(),
             everything,
         )
         depth = int(ages.oldest[-1]) + 2 if config.observation == "history" else 0
@@ -144,7 +145,7 @@ class Batch:
         self._images = BufferPool((num_envs, *IMAGE) if self._camera else (num_envs, 0, 0, 0), np.uint8)
         self._infos = BufferPool((len(INFO), info_width(num_envs)), np.float64)
         out, which, keys = self.new_out(), np.zeros(1, np.int64), np.zeros((1, 2), np.uint64)
-        stepped = (self.memory, self.actions, self._all, self.clock, self.drives, self.reading, out, 0, 1)
+        stepped = (self.memory, self.actions, self._all, self.clock, self.drives, self.scales, out, 0, 1)
         drawn = self._drawing(which, keys, self._record, self._mix, out)
         self._step, self._draw = entry(self.kernels.step, stepped), entry(self.kernels.draw, (*drawn, 0, 1))
         threads = threads or os.cpu_count() or 1
@@ -179,7 +180,7 @@ class Batch:
     def bound_step(self, actions: npt.NDArray[np.float64], out: Out) -> Any:
         """``step`` of all slots from and into always the same arrays, called without arguments."""
         n = self.num_envs
-        step = partial(self._step, self.memory, actions, self._all, self.clock, self.drives, self.reading, out, 0, n)
+        step = partial(self._step, self.memory, actions, self._all, self.clock, self.drives, self.scales, out, 0, n)
         if not self._camera:
             return step
 
@@ -213,7 +214,7 @@ class Batch:
 
     def _drawing(self, which: Any, keys: Any, record: Any, mix: Any, out: Out) -> tuple[Any, ...]:
         """Arguments of the compiled draw, without the range of slots."""
-        return self.memory, which, keys, record, mix, self._parameters, self.clock, self.reading, out
+        return self.memory, which, keys, record, mix, self._parameters, self.clock, self.scales, out
 
     def step(self, actions: npt.ArrayLike, out: Out, active: npt.NDArray[np.bool_] | None = None) -> int:
         """Advance the active slots by one control interval; actions of shape (num_envs, 2), not NaN.
@@ -223,7 +224,7 @@ class Batch:
         if actions is not self.actions:
             self.actions[:] = actions
         active = self._all if active is None else active
-        arguments = (self.memory, self.actions, active, self.clock, self.drives, self.reading, out)
+        arguments = (self.memory, self.actions, active, self.clock, self.drives, self.scales, out)
         ended: int = sum(self._run(self._step, arguments, self.num_envs, SLOTS_PER_THREAD, SLOTS_AT_ONCE))
         self._photograph(out, active)
         return ended
@@ -287,7 +288,7 @@ class Batch:
         for i, state in zip(which, states, strict=True):
             for name, rows in zip(_SAVED, self._saved(), strict=True):
                 rows[i] = getattr(state, name)
-        self.kernels.show(self.memory, np.array(which, np.int64), self.clock, self.reading, out, 0, len(which))
+        self.kernels.show(self.memory, np.array(which, np.int64), self.clock, self.scales, out, 0, len(which))
         if self._camera:
             self._photograph(out, np.isin(np.arange(self.num_envs), which))
 

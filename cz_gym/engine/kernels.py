@@ -17,11 +17,12 @@ from cz_gym.jit.cache import hashed
 from cz_gym.jit.compile import fetch, inlined, jittable, kernel
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.plant import Disturbance, State, derive_puller, growth
+from cz_gym.signals import INFO, LEAN, logged, measure, true_state
 from cz_gym.task import HEATER_RANGE
 
-from .layout import EPISODE_AT, INFO, LEAN, PULLER_AT, SLOT
+from .layout import EPISODE_AT, PULLER_AT, SLOT
 from .lockstep import LANES, advance, height_inside
-from .outputs import clip, measure, recall, remember, write_info, write_measured, write_state
+from .outputs import clip, recall, remember, write_channels, write_info
 from .sensors import sense
 
 TRIES = 100
@@ -78,7 +79,7 @@ def _drive(slot: Any, pull: Any, heat: Any, drives: Any, interval: Any) -> None:
 
 
 @inlined
-def _sample(memory: Any, i: Any, fresh: Any, clock: Any, reading: Any, out: Any, slope: Any, ring_offset: Any) -> Any:
+def _sample(memory: Any, i: Any, fresh: Any, clock: Any, scales: Any, out: Any, slope: Any, ring_offset: Any) -> Any:
     """Read slot i, or repeat its last reading, and write observation and info; returns the step's cost."""
     slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
     t, h_c = slot.k * clock.interval, height_inside(x.h_c, p)
@@ -88,28 +89,28 @@ def _sample(memory: Any, i: Any, fresh: Any, clock: Any, reading: Any, out: Any,
         sense(slot, camera, pyrometer, memory.frames[i], t, ring - p.ring_bias, h_c)
     measured = measure(slot, t)
     row = out.observation[i]
-    write_measured(measured, reading.measured, row)
+    write_channels(measured, scales.measured, row)
     if memory.history.shape[1] > 0:
         if fresh:
             remember(slot, memory.history[i], clock.interval, row)
-        recall(slot, measured, memory.history[i], reading, row)
+        recall(slot, measured, memory.history[i], scales, row)
     if out.state.shape[1] > 0:
-        write_state(slot, measured, t, reading.state, out.state[i])
+        write_channels(true_state(slot, measured, t), scales.state, out.state[i])
     error = x.r_c - p.r_0 - measured.r_ref
     cost = cost_terms(error, measured.v_p, slot.v_p - slot.v_p_before, slot.Q_H - slot.Q_H_before)
     if slot.k == 0:
         cost = Cost(0.0, 0.0, 0.0, 0.0)
-    if reading.everything:
+    if scales.everything:
         at_interface = growth(State(x.r_c, h_c, x.T_1, x.T_2, x.T_b), Disturbance(slot.Q_d, slot.dT_i, 1.0), p, slope)
-        write_info(slot, measured, cost, t, ring, at_interface, out.info[:, i])
+        write_info(logged(slot, measured, cost, t, ring, at_interface), out.info[:, i])
     else:
         out.info[_R_C, i], out.info[_R_REF, i] = x.r_c, p.r_0 + measured.r_ref
-    out.info[_CLIPPED, i] = slot.clipped
+        out.info[_CLIPPED, i] = slot.clipped
     return cost
 
 
-def _read(memory: Any, i: Any, fresh: Any, clock: Any, reading: Any, out: Any, slope: Any, ring_offset: Any) -> None:
-    _sample(memory, i, fresh, clock, reading, out, slope, ring_offset)
+def _read(memory: Any, i: Any, fresh: Any, clock: Any, scales: Any, out: Any, slope: Any, ring_offset: Any) -> None:
+    _sample(memory, i, fresh, clock, scales, out, slope, ring_offset)
     out.reward[i] = 0.0
     out.terminated[i] = out.truncated[i] = False
 
@@ -146,14 +147,14 @@ class Kernels(NamedTuple):
     """The compiled loops for one meniscus model."""
 
     step: Any
-    """``step(memory, actions, active, clock, drives, reading, out, start, stop)``: one control interval of the active
+    """``step(memory, actions, active, clock, drives, scales, out, start, stop)``: one control interval of the active
     slots; returns how many episodes ended."""
     draw: Any
-    """``draw(memory, which, keys, record, mix, parameters, clock, reading, out, start, stop)``: new episodes, each
+    """``draw(memory, which, keys, record, mix, parameters, clock, scales, out, start, stop)``: new episodes, each
     from its key, for the slots ``which[start:stop]``, with their first sample; returns a slot for which no puller with
     an operating point was found in :data:`TRIES` draws, or -1."""
     show: Any
-    """``show(memory, which, clock, reading, out, start, stop)``: the last sample of the slots ``which[start:stop]``
+    """``show(memory, which, clock, scales, out, start, stop)``: the last sample of the slots ``which[start:stop]``
     again."""
     plant: Any
     """``plant(memory, actions, active, clock, drives, rings, start, stop)``: drives, plant and ring of all slots alone,
@@ -167,7 +168,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
     slope, ring_offset, height = meniscus.slope, meniscus.ring_offset, meniscus.height
 
     def step(
-        memory: Any, actions: Any, active: Any, clock: Any, drives: Any, reading: Any, out: Any, start: int, stop: int
+        memory: Any, actions: Any, active: Any, clock: Any, drives: Any, scales: Any, out: Any, start: int, stop: int
     ) -> int:
         ended, remembers = 0, memory.history.shape[1] > 0
         for first in range(start, stop, LANES):
@@ -176,16 +177,16 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
                 if active[i]:
                     _drive(memory.slots[i], actions[i, 0], actions[i, 1], drives, clock.interval)
             advance(memory, active, first, count, clock, slope, ring_offset)
-            if reading.everything:
+            if scales.everything:
                 _fetch_info(out.info, first + LANES)
             for i in range(first, first + count):
                 _fetch_slot(memory.numbers, i + LANES)
                 if remembers and i + 1 < first + count:
-                    _fetch_history(memory.slots[i + 1], memory.history[i + 1], reading.before)
+                    _fetch_history(memory.slots[i + 1], memory.history[i + 1], scales.before)
                 if not active[i]:
                     continue
                 slot, grows = memory.slots[i], memory.slots[i].over == 0
-                cost = _sample(memory, i, True, clock, reading, out, slope, ring_offset)
+                cost = _sample(memory, i, True, clock, scales, out, slope, ring_offset)
                 ends = slot.k >= clock.steps
                 out.reward[i] = reward(cost) + (0.0 if grows else failure_penalty(slot.k, clock.steps))
                 out.terminated[i] = not grows
@@ -195,7 +196,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
         return ended
 
     def draw(
-        memory: Any, which: Any, keys: Any, record: Any, mix: Any, parameters: Any, clock: Any, reading: Any, out: Any,
+        memory: Any, which: Any, keys: Any, record: Any, mix: Any, parameters: Any, clock: Any, scales: Any, out: Any,
         start: int, stop: int,
     ) -> int:  # fmt: skip
         impossible = -1
@@ -217,12 +218,12 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
             for number in range(len(episode)):
                 numbers[EPISODE_AT + number] = episode[number]
             _begin(slot)
-            _sample_alone(memory, i, True, clock, reading, out, slope, ring_offset)
+            _sample_alone(memory, i, True, clock, scales, out, slope, ring_offset)
         return impossible
 
-    def show(memory: Any, which: Any, clock: Any, reading: Any, out: Any, start: int, stop: int) -> None:
+    def show(memory: Any, which: Any, clock: Any, scales: Any, out: Any, start: int, stop: int) -> None:
         for at in range(start, stop):
-            _sample_alone(memory, which[at], False, clock, reading, out, slope, ring_offset)
+            _sample_alone(memory, which[at], False, clock, scales, out, slope, ring_offset)
 
     def plant(
         memory: Any, actions: Any, active: Any, clock: Any, drives: Any, rings: Any, start: int, stop: int

@@ -55,8 +55,8 @@ belongs to, the sample number ``k``, the number of camera frames taken, whether 
 was drawn from, the drives [m/s, W] of the step before and whether the action was clipped: a sample can be written
 again from its slot. Then the 5 s grid point that ``dT_i`` belongs to with its two processes [standard deviations], and
 the episode's random streams, as far as they are drawn from."""
-PULLER_AT, EPISODE_AT = 0, len(Puller._fields)
-"""Where a slot's constants begin, in numbers of eight bytes."""
+PULLER_AT, EPISODE_AT, STATE_AT = np.cumsum([0, len(Puller._fields), len(Episode._fields)]).tolist()
+"""Where a slot's constants and its plant state begin, in numbers of eight bytes."""
 
 
 class Clock(NamedTuple):
@@ -100,64 +100,30 @@ class Out(NamedTuple):
     truncated: Any
     """Bool, shape (n,)."""
     info: Any
-    """Rows of :data:`INFO`, float64, shape (rows, n or a little more: see :func:`info_width`)."""
+    """Rows of :class:`cz_gym.signals.Logged`, float64, shape (rows, n or a little more: see :func:`info_width`)."""
 
 
-class Reading(NamedTuple):
-    """Constants of reading a slot."""
+class ObservationScales(NamedTuple):
+    """Constants with which a slot's signals become an observation."""
 
     measured: Any
     """One over the scales of the measured channels, shape (channels,)."""
     state: Any
     """One over the scales of the state channels, shape (channels,)."""
-    upto: Any
+    newest: Any
     """Age of the newest sample of each remembered span, shape (lags,)."""
     before: Any
-    """Age of the sample before its oldest, shape (lags,)."""
+    """Age of the sample before the oldest one of each span, shape (lags,)."""
     share: Any
-    """One over the samples in it, shape (lags,)."""
-    span: Any
-    """From the scale of a remembered channel to that of its differences, shape (remembered channels,)."""
+    """One over the number of samples in each span, shape (lags,)."""
+    past: Any
+    """Scale of each remembered signal over that of its past differences, shape (remembered signals,)."""
     relative: Any
-    """Places of the channels that "history" holds relative to another one, of those others, and the change of scale:
-    three arrays of shape (channels,)."""
+    """The signals that "history" holds relative to another one (:class:`cz_gym.observation.RelativeChannels`)."""
     everything: bool
-    """Whether all rows of ``info`` are written; otherwise the rows :data:`LEAN` and ``action_clipped``."""
+    """Whether all of ``info`` is written; otherwise only ``LEAN`` and ``action_clipped``."""
 
 
-class InfoRow(NamedTuple):
-    """One number of ``info``."""
-
-    name: str
-    unit: str
-    meaning: str
-
-
-INFO_ROWS = (
-    InfoRow("r_c", "m", "true crystal radius"),
-    InfoRow("r_br", "m", "true radius of the bright ring"),
-    InfoRow("r_ref", "m", "radius reference"),
-    InfoRow("h_c", "m", "true meniscus height"),
-    InfoRow("alpha_c", "rad", "cone angle of the crystal's wall"),
-    InfoRow("v_g", "m/s", "growth rate"),
-    InfoRow("v_p", "m/s", "applied pull speed"),
-    InfoRow("Q_H", "W", "applied heater power"),
-    InfoRow("T_1", "K", "true heater temperature"),
-    InfoRow("T_1_ref", "K", "recipe of the heater temperature"),
-    InfoRow("T_b", "K", "true melt temperature"),
-    InfoRow("r_br_measured", "m", "the camera's reading, with noise and offset"),
-    InfoRow("ring_offset", "m", "offset of the ring that no sensor shows"),
-    InfoRow("cost_radius", "1", "the cost's term of the radius error"),
-    InfoRow("cost_pull", "1", "the cost's term of the pull speed"),
-    InfoRow("cost_pull_step", "1", "the cost's term of the step of the pull speed"),
-    InfoRow("cost_heater_step", "1", "the cost's term of the step of the heater power"),
-    InfoRow("action_clipped", "bool", "whether the action lay outside its box"),
-)
-"""What a step says beside the observation, SI units."""
-INFO = tuple(row.name for row in INFO_ROWS)
-"""Names of the info rows."""
-LEAN = ("r_c", "r_ref")
-"""What ``info`` holds unless all of it is asked for: libraries copy it key by key, which costs more than the step."""
 INFO_CHOICES = ("lean", "all")
 
 

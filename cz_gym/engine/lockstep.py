@@ -14,12 +14,12 @@ import numpy as np
 from cz_gym.episodes.noise import fluctuation, next_fluctuation
 from cz_gym.episodes.record import GRID
 from cz_gym.episodes.schedule import drift, melt_left, reference
-from cz_gym.jit.compile import inlined, jittable, scratch
+from cz_gym.jit.compile import column, inlined, jittable, scratch, set_column
 from cz_gym.physics.plant import Disturbance, Inputs, Puller, State, growth, hidden_load, rk4
 from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN, within_limits
 from cz_gym.units import MM
 
-from .layout import PULLER_AT
+from .layout import PULLER_AT, STATE_AT
 from .sensors import photograph
 
 LANES = 8
@@ -74,44 +74,12 @@ def _disturb(slot: Any, j: Any) -> Any:
 
 
 @jittable
-def _state(lanes: Any, at: Any, lane: Any) -> Any:
-    return State(
-        lanes[at, lane], lanes[at + 1, lane], lanes[at + 2, lane], lanes[at + 3, lane], lanes[at + 4, lane]
-    )  # fmt: skip
-
-
-@jittable
-def _put(lanes: Any, at: Any, lane: Any, x: Any) -> None:
-    lanes[at, lane], lanes[at + 1, lane], lanes[at + 2, lane] = x.r_c, x.h_c, x.T_1
-    lanes[at + 3, lane], lanes[at + 4, lane] = x.T_2, x.T_b
-
-
-@jittable
-def _inputs(lanes: Any, lane: Any) -> Any:
-    return Inputs(lanes[_U_AT, lane], lanes[_U_AT + 1, lane])
-
-
-@jittable
-def _disturbance(lanes: Any, lane: Any) -> Any:
-    return Disturbance(lanes[_D_AT, lane], lanes[_D_AT + 1, lane], lanes[_D_AT + 2, lane])
-
-
-@jittable
-def _puller(c: Any, i: Any) -> Any:
-    return Puller(
-        c[0, i], c[1, i], c[2, i], c[3, i], c[4, i], c[5, i], c[6, i], c[7, i], c[8, i],
-        c[9, i], c[10, i], c[11, i], c[12, i], c[13, i], c[14, i], c[15, i], c[16, i], c[17, i],
-        c[18, i], c[19, i], c[20, i], c[21, i], c[22, i], c[23, i], c[24, i], c[25, i], c[26, i],
-    )  # fmt: skip
-
-
-@jittable
 def _begin(slot: Any, numbers: Any, lanes: Any, lane: Any, interval: Any) -> None:
     """Bring a slot to its lane, at the start of a control interval."""
     for constant in range(_P):
         lanes[constant, lane] = numbers[PULLER_AT + constant]
-    _put(lanes, _X_AT, lane, slot.x)
-    lanes[_U_AT, lane], lanes[_U_AT + 1, lane] = slot.v_p, slot.Q_H
+    set_column(State, slot.x, lanes, _X_AT, lane)
+    set_column(Inputs, slot, lanes, _U_AT, lane)
     lanes[_T, lane] = slot.k * interval
 
 
@@ -121,8 +89,7 @@ def _prepare(slot: Any, lanes: Any, lane: Any, interval: Any) -> None:
     t, end = lanes[_T, lane], (slot.k + 1) * interval
     j = int(t / GRID + _EPS)
     upto = min((j + 1) * GRID, end)
-    d = _disturb(slot, j)
-    lanes[_D_AT, lane], lanes[_D_AT + 1, lane], lanes[_D_AT + 2, lane] = d.Q_d, d.dT_i, d.melt
+    set_column(Disturbance, _disturb(slot, j), lanes, _D_AT, lane)
     lanes[_DT, lane], lanes[_T, lane] = upto - t, upto
 
 
@@ -133,8 +100,9 @@ def _integrate(lanes: Any, found: Any, count: Any, slope: Any) -> None:
     No branch, no call, no array both read and written: so the compiler takes several lanes at once.
     """
     for lane in range(count):
-        x, u, d = _state(lanes, _X_AT, lane), _inputs(lanes, lane), _disturbance(lanes, lane)
-        _put(found, 0, lane, rk4(x, u, d, _puller(lanes, lane), lanes[_DT, lane], slope))
+        x, u = column(State, lanes, _X_AT, lane), column(Inputs, lanes, _U_AT, lane)
+        d, p = column(Disturbance, lanes, _D_AT, lane), column(Puller, lanes, 0, lane)
+        set_column(State, rk4(x, u, d, p, lanes[_DT, lane], slope), found, 0, lane)
 
 
 @jittable
@@ -143,15 +111,16 @@ def _judge(
 ) -> Any:
     """Accept a substep, or not; returns whether the slot has another one to do."""
     p, e, upto = slot.puller, slot.episode, lanes[_T, lane]
-    x, u, d = _state(lanes, _X_AT, lane), _inputs(lanes, lane), _disturbance(lanes, lane)
-    new, grows = judged(x, _state(found, 0, lane), u, d, p, lanes[_DT, lane], p.r_0 + reference(upto, e), slope)
-    _put(lanes, _X_AT, lane, new)
+    x, u = column(State, lanes, _X_AT, lane), column(Inputs, lanes, _U_AT, lane)
+    d, new = column(Disturbance, lanes, _D_AT, lane), column(State, found, 0, lane)
+    new, grows = judged(x, new, u, d, p, lanes[_DT, lane], p.r_0 + reference(upto, e), slope)
+    set_column(State, new, lanes, _X_AT, lane)
     slot.over = 0 if grows else 1
-    within = upto < (slot.k + 1) * interval - _EPS
-    if within and e.latency > 0.0:
+    more = upto < (slot.k + 1) * interval - _EPS
+    if more and e.latency > 0.0:
         h_c = height_inside(new.h_c, p)
         photograph(slot, frames, upto, new.r_c + ring_offset(new.r_c, h_c, p) - p.ring_bias, h_c)
-    return grows and within
+    return grows and more
 
 
 @jittable
@@ -180,7 +149,6 @@ def advance(memory: Any, active: Any, first: Any, count: Any, clock: Any, slope:
                     going -= 1
     for lane in range(count):
         if active[first + lane]:
-            slot = memory.slots[first + lane]
-            slot.x.r_c, slot.x.h_c, slot.x.T_1 = lanes[_X_AT, lane], lanes[_X_AT + 1, lane], lanes[_X_AT + 2, lane]
-            slot.x.T_2, slot.x.T_b = lanes[_X_AT + 3, lane], lanes[_X_AT + 4, lane]
-            slot.k = slot.k + 1
+            for row in range(_X):
+                memory.numbers[first + lane, STATE_AT + row] = lanes[_X_AT + row, lane]
+            memory.slots[first + lane].k += 1

@@ -60,13 +60,13 @@ def draw_factors(record: Any, mix: Any, streams: Any) -> Any:
     """Draw the puller: its mix of models and the factors on its parameters."""
     u, spread = _uniforms(streams[_PARAMETERS], _FACTORS), record.pullers
     return Factors(
-        between(mix, u[0]),
-        _factor(spread.capillary, u[1]),
-        _factor(spread.conductivity, u[2]),
-        _factor(spread.conductance, u[3]),
-        _factor(spread.conductance, u[4]),
-        _factor(spread.conductance, u[5]),
-        _factor(spread.conductance, u[6]),
+        lam=between(mix, u[0]),
+        a=_factor(spread.capillary, u[1]),
+        k_l=_factor(spread.conductivity, u[2]),
+        kappa_12=_factor(spread.conductance, u[3]),
+        G_1a=_factor(spread.conductance, u[4]),
+        G_2b=_factor(spread.conductance, u[5]),
+        kappa_b=_factor(spread.conductance, u[6]),
     )
 
 
@@ -74,9 +74,10 @@ def draw_factors(record: Any, mix: Any, streams: Any) -> Any:
 def randomised(q: Any, f: Any) -> Any:
     """The parameters of the drawn puller: factors on a, k_l and the conductances."""
     return Parameters(
-        q.sigma * f.a**2, q.rho_l, q.alpha_0, q.g, q.sigma_SB, q.k_l * f.k_l, q.rho_s, q.dH, q.T_m, q.dT_0, q.phi_b,
-        q.r_0, q.v_0, q.C_1, q.C_2, q.C_b, q.kappa_12 * f.kappa_12, q.G_1a * f.G_1a, q.T_a, q.G_2b * f.G_2b,
-        q.eps * f.kappa_b, q.R_cr, q.T_e,
+        sigma=q.sigma * f.a**2, rho_l=q.rho_l, alpha_0=q.alpha_0, g=q.g, sigma_SB=q.sigma_SB, k_l=q.k_l * f.k_l,
+        rho_s=q.rho_s, dH=q.dH, T_m=q.T_m, dT_0=q.dT_0, phi_b=q.phi_b, r_0=q.r_0, v_0=q.v_0,
+        C_1=q.C_1, C_2=q.C_2, C_b=q.C_b, kappa_12=q.kappa_12 * f.kappa_12, G_1a=q.G_1a * f.G_1a, T_a=q.T_a,
+        G_2b=q.G_2b * f.G_2b, eps=q.eps * f.kappa_b, R_cr=q.R_cr, T_e=q.T_e,
     )  # fmt: skip
 
 
@@ -101,21 +102,43 @@ def draw_episode(record: Any, streams: Any, freezes: Any) -> Any:
     keep_fast, keep_slow = np.exp(-GRID / record.interface.tau_fast), np.exp(-GRID / record.interface.tau_slow)
     fault = _draw_faults(record.faults, streams[_FAULTS], freezes)
     return Episode(
-        record.pullers.start_radius_sd * normal(streams[_START]),
-        between(recipe.start, plan[2]), max(recipe_length, SHORTEST), between(recipe.rate, plan[0]) * recipe_length,
-        between(drift.start, plan[5]), max(between(drift.duration, plan[4]), SHORTEST),
-        between(drift.amount, plan[3]), drift.rate,
-        between(reference.start, plan[9]), max(between(reference.duration, plan[8]), SHORTEST),
-        between(reference.amount, plan[7]) * moved,
-        record.pullers.melt_loss, between(sensor.bias_offset, read[2]) + between(sensor.level_offset, read[3]),
-        fault[0], fault[1], fault[2],
-        between(sensor.ripple, read[4]), 2.0 * math.pi * between(sensor.rotation, read[5]), 2.0 * math.pi * read[6],
-        between(sensor.pyrometer_drift, read[7]), sensor.latency,
-        drives.pull_window, drives.pull_slew, drives.heater_slew, drives.heater_step,
-        sd_fast, sd_slow, keep_fast, keep_slow, np.sqrt(1.0 - keep_fast**2), np.sqrt(1.0 - keep_slow**2),
-        between(sensor.camera_noise, read[0]), between(sensor.pyrometer_noise, read[1]), fault[3],
-        sensor.outlier_probability, sensor.outlier_sd,
-    )  # fmt: skip
+        r_c_start=record.pullers.start_radius_sd * normal(streams[_START]),
+        recipe_start=between(recipe.start, plan[2]),
+        recipe_duration=max(recipe_length, SHORTEST),
+        recipe_amount=between(recipe.rate, plan[0]) * recipe_length,
+        drift_start=between(drift.start, plan[5]),
+        drift_duration=max(between(drift.duration, plan[4]), SHORTEST),
+        drift_amount=between(drift.amount, plan[3]),
+        drift_rate=drift.rate,
+        reference_start=between(reference.start, plan[9]),
+        reference_duration=max(between(reference.duration, plan[8]), SHORTEST),
+        reference_amount=between(reference.amount, plan[7]) * moved,
+        melt_loss=record.pullers.melt_loss,
+        ring_offset=between(sensor.bias_offset, read[2]) + between(sensor.level_offset, read[3]),
+        bias_drift_start=fault[0],
+        bias_drift_duration=fault[1],
+        bias_drift_amount=fault[2],
+        ripple_amplitude=between(sensor.ripple, read[4]),
+        ripple_omega=2.0 * math.pi * between(sensor.rotation, read[5]),
+        ripple_phase=2.0 * math.pi * read[6],
+        pyrometer_drift=between(sensor.pyrometer_drift, read[7]),
+        latency=sensor.latency,
+        pull_window=drives.pull_window,
+        pull_slew=drives.pull_slew,
+        heater_slew=drives.heater_slew,
+        heater_step=drives.heater_step,
+        sd_fast=sd_fast,
+        sd_slow=sd_slow,
+        keep_fast=keep_fast,
+        keep_slow=keep_slow,
+        kick_fast=np.sqrt(1.0 - keep_fast**2),
+        kick_slow=np.sqrt(1.0 - keep_slow**2),
+        camera_sd=between(sensor.camera_noise, read[0]),
+        pyrometer_sd=between(sensor.pyrometer_noise, read[1]),
+        dropout=fault[3],
+        outlier_probability=sensor.outlier_probability,
+        outlier_sd=sensor.outlier_sd,
+    )
 
 
 @jittable

@@ -111,6 +111,38 @@ def _compiled_fetch(array: Any, at: Any) -> Any:
     return compiled
 
 
+def column(kind: Any, array: Any, at: Any, lane: Any) -> Any:
+    """The named tuple of a kind whose fields stand in a column of an array, from row ``at`` on."""
+    return kind(*(array[at + row, lane] for row in range(len(kind._fields))))
+
+
+def set_column(kind: Any, values: Any, array: Any, at: Any, lane: Any) -> None:
+    """Write the fields of a named tuple, or of a record with the same ones, to a column of an array."""
+    for row, name in enumerate(kind._fields):
+        array[at + row, lane] = getattr(values, name)
+
+
+@overload(column, strict=False)
+def _compiled_column(kind: Any, array: Any, at: Any, lane: Any) -> Any:
+    fields = kind.instance_class._fields
+    values = (f"{name}=array[at + {row}, lane]" for row, name in enumerate(fields))
+    return _written(f"def compiled(kind, array, at, lane): return kind({', '.join(values)})")
+
+
+@overload(set_column, strict=False)
+def _compiled_set_column(kind: Any, values: Any, array: Any, at: Any, lane: Any) -> Any:
+    fields = kind.instance_class._fields
+    lines = (f"    array[at + {row}, lane] = values.{name}" for row, name in enumerate(fields))
+    return _written("\n".join(["def compiled(kind, values, array, at, lane):", *lines]))
+
+
+def _written(source: str) -> Any:
+    """The function ``compiled`` of a text: one statement a field, for a loop over fields would not be unrolled."""
+    names: dict[str, Any] = {}
+    exec(source, names)
+    return names["compiled"]
+
+
 @intrinsic(prefer_literal=True)
 def _on_stack(typing_context: Any, rows: Any, columns: Any) -> Any:
     if not isinstance(rows, types.IntegerLiteral) or not isinstance(columns, types.IntegerLiteral):

@@ -161,12 +161,14 @@ def derive_puller(q: Any, lam: Any, height: Any, ring_offset: Any) -> Any:
     T_2_0 = T_b_0 + through / q.G_2b
     T_1_0 = np.sqrt(np.sqrt(T_2_0**4 + through / q.kappa_12))
     Q_H_0 = through + q.G_1a * (T_1_0 - q.T_a)
-    ring = _RingPuller(a, np.sin(q.alpha_0), np.cos(q.alpha_0), ring_point(q.phi_b))
+    ring = _RingPuller(a=a, sin_alpha_0=np.sin(q.alpha_0), cos_alpha_0=np.cos(q.alpha_0), X_b=ring_point(q.phi_b))
     bias = ring_offset(q.r_0, h_0, ring)
     return Puller(
-        lam, a, ring.sin_alpha_0, ring.cos_alpha_0, ring.X_b, q.k_l, rho_dH, q.T_m,
-        q.C_1, q.C_2, q.C_b, q.kappa_12, q.G_1a, q.T_a, q.G_2b, kappa_b, q.T_e,
-        q.r_0, q.v_0, h_0, Phi_s, Q_i, T_1_0, T_2_0, T_b_0, Q_H_0, bias,
+        lam=lam, a=a, sin_alpha_0=ring.sin_alpha_0, cos_alpha_0=ring.cos_alpha_0, X_b=ring.X_b,
+        k_l=q.k_l, rho_dH=rho_dH, T_m=q.T_m, C_1=q.C_1, C_2=q.C_2, C_b=q.C_b,
+        kappa_12=q.kappa_12, G_1a=q.G_1a, T_a=q.T_a, G_2b=q.G_2b, kappa_b=kappa_b, T_e=q.T_e,
+        r_0=q.r_0, v_0=q.v_0, h_0=h_0, Phi_s=Phi_s, Q_i=Q_i,
+        T_1_0=T_1_0, T_2_0=T_2_0, T_b_0=T_b_0, Q_H_0=Q_H_0, ring_bias=bias,
     )  # fmt: skip
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.config import Config
-from cz_gym.engine.layout import INFO
 from cz_gym.physics.plant import Puller
+from cz_gym.signals import INFO
 from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT
 
 Floats = npt.NDArray[np.float64]

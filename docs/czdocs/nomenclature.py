@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cz_gym import Parameters, Puller, State
-from cz_gym.engine.layout import INFO_ROWS
 from cz_gym.physics.parameters import describe
 from cz_gym.physics.plant import Disturbance, Inputs
+from cz_gym.signals import INFO_ROWS
 
 from .attributes import attributes
 
@@ -83,7 +83,11 @@ def _row(name: str, unit: str, meaning: str, value: str = "", source: str = "") 
 def seen() -> list[Row]:
     """Rows of ``info`` that have a symbol and are neither states nor inputs."""
     known = {*State._fields, *Inputs._fields, *WITHOUT_SYMBOL}
-    return [_row(*row) for row in INFO_ROWS if row.name not in known and not row.name.startswith("cost_")]
+    return [
+        _row(row.name, row.unit, row.meaning)
+        for row in INFO_ROWS
+        if row.name not in known and not row.name.startswith("cost_")
+    ]
 
 
 def parameters() -> list[Row]:

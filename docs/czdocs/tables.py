@@ -16,10 +16,10 @@ from typing import Any
 
 from cz_gym import SCENARIOS, Scenario
 from cz_gym.camera.view import Camera
-from cz_gym.engine.layout import INFO_ROWS
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED, STATE, Channel
 from cz_gym.physics.parameters import describe
+from cz_gym.signals import INFO_ROWS
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from . import nomenclature

@@ -26,10 +26,10 @@ from markdown_it import MarkdownIt  # noqa: E402
 from sybil.parsers.markdown import CodeBlockParser  # noqa: E402
 
 from cz_gym import SCENARIOS, CzEnv, Parameters, Puller, State  # noqa: E402
-from cz_gym.engine.layout import INFO  # noqa: E402
 from cz_gym.observation import OBSERVATIONS  # noqa: E402
 from cz_gym.physics.parameters import describe  # noqa: E402
 from cz_gym.physics.plant import Disturbance, Inputs  # noqa: E402
+from cz_gym.signals import INFO  # noqa: E402
 from tests.processes import ROOT, python  # noqa: E402
 
 DOCS = ROOT / "docs"

@@ -14,9 +14,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from cz_gym.config import Config, make_config
-from cz_gym.engine.layout import INFO
 from cz_gym.episodes.scenario import Interface
 from cz_gym.episodes.scenarios import HARD, PULLER, SCENARIOS
+from cz_gym.signals import INFO
 from cz_gym.units import HOUR, MM
 from cz_gym.vector import CzVectorEnv
 

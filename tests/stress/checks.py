@@ -7,10 +7,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.cost import COST_CAP, FAILURE_COST
-from cz_gym.engine.layout import INFO
 from cz_gym.episodes.schedule import melt_left
 from cz_gym.observation import CLIP
 from cz_gym.physics.plant import fourth_power
+from cz_gym.signals import INFO
 from cz_gym.task import HEATER_RANGE, HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT
 from cz_gym.vector import CzVectorEnv
 
