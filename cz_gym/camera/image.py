@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.episodes.record import Stream
+from cz_gym.episodes.record import FIRST_FRAME
 from cz_gym.episodes.rng import WORDS, normal, seed_stream
 from cz_gym.jit.cache import hashed
 from cz_gym.jit.compile import jittable, kernel
@@ -26,8 +26,6 @@ SUB = 4
 """Rays across a pixel that holds an edge."""
 TOLERANCE = 12.0
 """Difference between a pixel's corners that counts as an edge [grey values]."""
-FRAME_STREAMS = len(Stream)
-"""Frame k draws its shot noise from the episode's stream of number FRAME_STREAMS + k."""
 _RADIUS_TURNS = 4
 _GOLDEN = 0.6180339887498949
 
@@ -132,7 +130,7 @@ def build_look(meniscus: MeniscusModel = HURLE) -> Any:
             for _ in range(_RADIUS_TURNS):
                 r_c = ring - ring_offset(r_c, slot.h_seen, p)
             stream = scratch.stream[i]
-            seed_stream(stream, slot.key, FRAME_STREAMS + slot.k_seen)
+            seed_stream(stream, slot.key, FIRST_FRAME + slot.k_seen)
             noisy = slot.episode.camera_sd > 0.0
             expose(make_scene(r_c, slot.h_seen, p), view, scratch.corners[i], noisy, stream, image)
 

@@ -1,6 +1,6 @@
 """The draw of an episode, compiled: streams from one key, then the puller, ramps, constants and freezes.
 
-Stream n of an episode is ``SeedSequence(key, spawn_key=(n,))``, so that families never share a random number.
+Each stream is seeded with its own number (:func:`.record.stream_number`), so that families never share a random number.
 Scalars come first on each stream; what is random at every step follows as the episode goes
 (:mod:`cz_gym.episodes.noise`), so a longer horizon extends a draw and never changes it.
 """
@@ -15,11 +15,12 @@ import numpy as np
 from cz_gym.jit.compile import jittable
 from cz_gym.physics.parameters import Parameters
 
-from .record import FREEZES, GRID, Episode, Factors, Stream
+from .record import FREEZES, GRID, Episode, Factors, Stream, stream_number
 from .rng import normal, seed_stream, uniform
 from .scenario import DRAW_SPAN, MAX_FLAGGED
 
 STREAMS = len(Stream)
+_NUMBERS = tuple(map(stream_number, range(STREAMS)))
 SHORTEST = 1e-9
 """Length [s] of a ramp that is a jump."""
 _START, _PARAMETERS, _SCHEDULE = int(Stream.START), int(Stream.PARAMETERS), int(Stream.SCHEDULE)
@@ -31,8 +32,8 @@ _INTERFACE_NUMBERS, _SENSOR_NUMBERS = 2, 8
 @jittable
 def seed_streams(streams: Any, key: Any) -> None:
     """Seed an episode's streams, shape (streams, 4), from its key, two 64-bit words."""
-    for number in range(STREAMS):
-        seed_stream(streams[number], key, number)
+    for index in range(STREAMS):
+        seed_stream(streams[index], key, _NUMBERS[index])
 
 
 @jittable

@@ -19,8 +19,15 @@ FREEZES = MAX_FLAGGED + MAX_UNFLAGGED
 """Freeze windows an episode can hold; the last is the unflagged one."""
 
 
+FIRST_FRAME = 8
+"""Number of the random stream from which the camera's first frame draws its shot noise; frame k draws from
+FIRST_FRAME + k. Written into every image: it stays, however many members :class:`Stream` has."""
+MOST_FRAMES = 2**31
+"""Streams that are reserved for frames."""
+
+
 class Stream(IntEnum):
-    """The independent random streams of an episode."""
+    """The independent random streams of an episode; a new one goes last."""
 
     START = 0
     PARAMETERS = 1
@@ -30,6 +37,11 @@ class Stream(IntEnum):
     FAULTS = 5
     DROPOUTS = 6
     OUTLIERS = 7
+
+
+def stream_number(index: int) -> int:
+    """Number n of an episode's stream, ``SeedSequence(key, spawn_key=(n,))``: its index, beyond the frames' numbers."""
+    return index if index < FIRST_FRAME else MOST_FRAMES + index
 
 
 class Episode(NamedTuple):

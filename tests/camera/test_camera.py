@@ -22,6 +22,8 @@ from cz_gym.camera.view import (
     project,
 )
 from cz_gym.config import make_config
+from cz_gym.episodes.record import stream_number
+from cz_gym.episodes.scenario import Scenario, Sensor
 from cz_gym.physics.meniscus import hurle_ring_offset
 from cz_gym.physics.parameters import describe
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
@@ -109,6 +111,25 @@ def test_nominal_images_are_still_and_noisy_ones_are_not() -> None:
     assert np.std(np.diff(dark, axis=1)) / math.sqrt(2) == pytest.approx(
         math.hypot(expected, 1 / math.sqrt(12)), rel=0.15
     )
+
+
+def test_a_new_random_stream_of_an_episode_changes_no_image() -> None:
+    """Frame k draws from NumPy's stream 8 + k whatever members Stream has; no member shares a frame's numbers."""
+    faint = Scenario("faint-noise", sensor=Sensor(camera_noise=(1e-12, 1e-12)))
+    env = CzEnv(faint, observation="camera")
+    image, _ = env.reset(seed=0)
+    key = env._slots["key"][0].tolist()
+    still = picture(PULLER.r_0, PULLER.h_0, PULLER, VIEW)[..., 0].astype(float)
+    for k in range(2):
+        numbers = np.random.Generator(np.random.PCG64(np.random.SeedSequence(key, spawn_key=(8 + k,))))
+        # Each pixel of the left half draws, then its mirror image.
+        left, right = np.moveaxis(numbers.standard_normal((ROWS, COLUMNS // 2, 2)), 2, 0)
+        noise = np.hstack([left, right[:, ::-1]]) * np.sqrt(still / VIEW.electrons)
+        assert np.abs(image[..., 0] - np.minimum(still + noise, 255.0)).max() < 1.1
+        image, *_ = env.step(np.zeros(2, np.float32))
+    assert [stream_number(index) for index in range(8)] == [*range(8)]
+    horizon = 10_000_000
+    assert not {stream_number(index) for index in range(8, 100)} & set(range(8, 8 + horizon))
 
 
 def test_the_ring_follows_geometry_and_closed_form_within_a_pixel(detector: RingDetector) -> None:
