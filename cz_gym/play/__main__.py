@@ -20,17 +20,17 @@ from cz_gym.units import MINUTE
 from .game import FASTEST, SLOWEST, Game
 
 CONTROLLERS = "cz_gym.baselines.registry:find_controller"
-"""Where the paper's controller comes from: looked up by name, since this package imports no controller."""
+"""Function that finds the paper's controller, looked up by name because this package imports no controller."""
 NO_DISPLAY = "no display: a crystal is pulled by hand in a window; set DISPLAY or WAYLAND_DISPLAY"
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
-"""Environment variables one of which names a display, on systems that have such."""
+"""Environment variables that can name a display, on systems that have such."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Play until the window is closed; 0 when done, 2 for bad input or without window, 130 when interrupted."""
+    """Play until the window is closed; 0 when done, 2 for bad input or without a window, 130 when interrupted."""
     parser = OneLineParser(
         "python -m cz_gym.play",
-        "Pull a crystal by hand, in a window, and be compared with the paper's controller on the same one.",
+        "Pull a crystal by hand in a window; the score compares you with the paper's controller on the same crystal.",
         "Keys: up and down the pull speed, right and left the heater (with shift: in large steps), space starts "
         "and pauses, + and - change the speed of time, R begins again, N takes the next crystal, H shows help, Q ends.",
     )
@@ -42,13 +42,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--speed", type=float, default=60.0, metavar="FACTOR", help="times faster than real (%(default)g)"
     )
     parser.add_argument("--minutes", type=float, default=180.0, metavar="M", help="length of the run (%(default)g)")
-    parser.add_argument("--blind", action="store_true", help="show what an operator sees: the ring, not the crystal")
+    parser.add_argument("--blind", action="store_true", help="show only the sensors, as an operator sees them")
     parser.add_argument("--size", default="960x720", metavar="WxH", help="size of the window in pixels (%(default)s)")
     return parser.run(_play, arguments, "render")
 
 
 def settings(arguments: argparse.Namespace) -> tuple[Config, tuple[int, int]]:
-    """The environment's settings and the window's size; ValueError names what was given and what is allowed."""
+    """The environment's settings and the window's size; CzError names what was given and what is allowed."""
     if not SLOWEST <= arguments.speed <= FASTEST:
         raise CzError(f"--speed must be {SLOWEST:g} to {FASTEST:g}, not {arguments.speed:g}")
     if not 1.0 <= arguments.minutes <= 6000.0:

@@ -13,7 +13,7 @@ from cz_gym.env import CzEnv
 from cz_gym.rendering import palette
 from cz_gym.rendering.backend import load
 from cz_gym.rendering.canvas import TIMES, Box, Canvas
-from cz_gym.rendering.gauges import SetPoints
+from cz_gym.rendering.numbers_panel import SetPoints
 from cz_gym.rendering.record import Record
 from cz_gym.rendering.scene import Scene
 from cz_gym.rendering.view import FPS, Window, record_of
@@ -25,7 +25,7 @@ from .score import Result, Score, score
 SLOWEST, FASTEST = 1.0, 3600.0
 """Limits of the speed of time: seconds of growth a second of watching."""
 PULL_STEP, HEATER_STEP = 0.01 * MM_PER_MIN, 0.1 * KILO
-"""What a key changes the pull speed [m/s] and the heater [W] by; with shift ten times as much."""
+"""Changes of the pull speed [m/s] and of the heater [W] by a key; with shift ten times as large."""
 HELP = (
     ("\N{UPWARDS ARROW} \N{DOWNWARDS ARROW}", "pull speed: more makes the crystal thinner"),
     ("\N{RIGHTWARDS ARROW} \N{LEFTWARDS ARROW}", "heater: more makes it thinner, minutes later"),
@@ -38,10 +38,10 @@ HELP = (
 
 
 class Game:
-    """One player at one window.
+    """One player at one window, compared with the controller ``rival`` on the same crystal.
 
-    ``rival`` is the controller to be compared with. Time stands still until the player starts it. ``blind`` shows what
-    a puller's sensors do, and the truth only with the score.
+    Time stands still until the player starts it. A ``blind`` player sees what a puller's sensors show, and the truth
+    only with the score.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class Game:
         self.begin(seed)
 
     def begin(self, seed: int) -> None:
-        """A crystal from its beginning, time standing still."""
+        """Begin a crystal, with time standing still."""
         self.seed = seed
         self.env.reset(seed=seed)
         self.actions: list[npt.NDArray[np.float32]] = []
@@ -74,7 +74,7 @@ class Game:
 
     @property
     def record(self) -> Record:
-        """What the picture is drawn from."""
+        """The episode so far, from which the picture is drawn."""
         return record_of(self.env)
 
     def play(self) -> list[Score]:
@@ -85,8 +85,7 @@ class Game:
             for event in pygame.event.get():
                 self.handle(event)
             self.advance(1.0 / FPS)
-            hidden = self.blind and self.score is None
-            self.window.show(self.scene.draw(self.record, self.set_points, self.overlay, hidden))
+            self.window.show(self.draw())
         if self.score is None:
             self.finish(failed=False)
         self.env.close()
@@ -101,7 +100,7 @@ class Game:
             self._keys[event.key](self, 10.0 if event.mod & pygame.KMOD_SHIFT else 1.0)
 
     def change(self, pull: float, heat: float) -> None:
-        """Change the set-points by so much [m/s, W], inside the range of the drives."""
+        """Add to the set-points [m/s, W], within the range of the drives."""
         p = self.record.puller
         v_p = min(max(self.set_points.v_p + pull, 0.0), 2.0 * p.v_0)
         Q_H = min(max(self.set_points.Q_H + heat, p.Q_H_0 - HEATER_RANGE), p.Q_H_0 + HEATER_RANGE)
@@ -112,12 +111,12 @@ class Game:
         self.speed = min(max(self.speed * factor, SLOWEST), FASTEST)
 
     def start_or_pause(self) -> None:
-        """Start or pause."""
+        """Start or pause time; starting closes the help."""
         self.paused = not self.paused
         self.helping = self.helping and self.paused
 
     def advance(self, seconds: float) -> None:
-        """Let so much of the player's time pass [s]."""
+        """Let a time pass for the player [s], and the control intervals that fall into it for the crystal."""
         if self.paused or self.score is not None:
             return
         self.due += seconds * self.speed
@@ -126,7 +125,7 @@ class Game:
             self.step()
 
     def step(self) -> None:
-        """One control interval with the set-points as they stand."""
+        """Hold the set-points for one control interval."""
         p = self.record.puller
         action = np.array(
             [self.set_points.v_p / p.v_0 - 1.0, (self.set_points.Q_H - p.Q_H_0) / HEATER_RANGE], np.float32
@@ -137,50 +136,53 @@ class Game:
             self.finish(failed=terminated)
 
     def finish(self, failed: bool) -> None:
-        """Score what was done, if anything was."""
+        """Score the actions so far, if there are any."""
         if self.actions:
             self.score = score(self.config, self.seed, self.actions, failed, self.rival)
             self.scores.append(self.score)
 
-    def overlay(self, canvas: Canvas) -> None:
+    def draw(self) -> Any:
+        """The picture that the player sees, a pygame surface."""
+        return self.scene.draw(self.record, self.set_points, self._overlay, self.blind and self.score is None)
+
+    def _overlay(self, canvas: Canvas) -> None:
         """Help, pause and score on top of the picture."""
-        unit, chart = canvas.unit, self.scene.layout.charts[0]
-        hint = f"time {TIMES}{self.speed:.0f}   H: help"
-        canvas.text(chart.right - 10 * unit, chart.y + 4 * unit, hint, 9.5, palette.FAINT, "right")
+        unit, box = canvas.unit, self.scene.layout.numbers
+        y = box.bottom - 18 * unit
+        canvas.text(box.x + 8 * unit, y, f"time {TIMES}{self.speed:.0f}", colour=palette.FAINT)
+        canvas.text(box.right - 8 * unit, y, "H: help", colour=palette.FAINT, anchor="right")
         if self.score is not None:
             both = (("you", self.score.player), ("paper", self.score.controller))
-            rows = tuple((name, _words(result)) for name, result in sorted(both, key=lambda one: one[1].rmse_mm))
-            _card(canvas, "The run is over: least error first", rows, "R: again   N: next crystal   Q: end")
+            rows = tuple((name, _in_words(result)) for name, result in sorted(both, key=lambda one: one[1].rmse_mm))
+            _draw_card(canvas, "The run is over: least error first", rows, "R: again   N: next crystal   Q: end")
         elif self.helping:
-            _card(canvas, "Pull a crystal by hand", HELP, "hold the radius on its reference; space starts")
+            _draw_card(canvas, "Pull a crystal by hand", HELP, "hold the radius on its reference; space starts")
         elif self.paused:
-            _card(canvas, "Paused", (), "space goes on")
+            _draw_card(canvas, "Paused", (), "space continues")
 
 
-def _card(canvas: Canvas, title: str, rows: tuple[tuple[str, str], ...], foot: str) -> None:
-    """A card in the picture's middle."""
+def _draw_card(canvas: Canvas, title: str, rows: tuple[tuple[str, str], ...], foot: str) -> None:
+    """A card of a title, rows and a last line in the picture's middle."""
     unit = canvas.unit
     width, height = 330.0 * unit, (62.0 + 18.0 * len(rows)) * unit
     box = Box((canvas.width - width) / 2.0, (0.66 * canvas.height - height) / 2.0, width, height)
-    rim = box.inner(-2 * unit, -2 * unit, -2 * unit, -2 * unit)
-    canvas.remove_text(rim)
-    canvas.rectangle(palette.RIM, rim, 8.0)
-    canvas.rectangle(palette.BACK, box, 7.0)
-    canvas.text(box.x + 16 * unit, box.y + 11 * unit, title, 14, palette.INK, bold=True)
+    canvas.cover(palette.RIM, box.inner(-2 * unit, -2 * unit, -2 * unit, -2 * unit))
+    canvas.cover(palette.BACK, box)
+    canvas.text(box.x + 16 * unit, box.y + 11 * unit, title, 14, bold=True)
     for i, (left, right) in enumerate(rows):
         y = box.y + (36.0 + 18.0 * i) * unit
         canvas.text(box.x + 16 * unit, y, left, 11, palette.CAMERA, bold=True)
-        canvas.text(box.x + 76 * unit, y, right, 11, palette.INK)
+        canvas.text(box.x + 76 * unit, y, right, 11)
     canvas.text(box.x + 16 * unit, box.bottom - 22 * unit, foot, 10, palette.FAINT)
 
 
-def _words(result: Result) -> str:
+def _in_words(result: Result) -> str:
     failed = "    failed" if result.failed else ""
     return f"RMSE {result.rmse_mm:.3f} mm    return {result.reward:,.0f}{failed}"
 
 
 def _keys() -> dict[int, Callable[[Game, float], None]]:
-    """What each key does, given the game and how many steps at once."""
+    """The effect of each key, given the game and a number of steps."""
     k = load()
     keys: dict[int, Callable[[Game, float], None]] = {
         k.K_UP: lambda game, steps: game.change(steps * PULL_STEP, 0.0),

@@ -1,4 +1,4 @@
-"""The score of a crystal that was pulled by hand, beside a controller's on the same crystal."""
+"""The score of a crystal pulled by hand, beside a controller's on the same crystal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cz_gym.units import MINUTE
 
 
 class Result(NamedTuple):
-    """How one of them did."""
+    """The result of one episode."""
 
     rmse_mm: float
     """RMSE of the true radius [mm], as the benchmark counts it."""
@@ -27,7 +27,7 @@ class Result(NamedTuple):
 
 
 class Score(NamedTuple):
-    """Both on the same crystal over the same time."""
+    """The results of player and controller on the same crystal over the same time."""
 
     scenario: str
     seed: int
@@ -36,7 +36,7 @@ class Score(NamedTuple):
     controller: Result
 
     def line(self) -> str:
-        """The score for a terminal."""
+        """The score in one line."""
         both = zip((self.player, self.controller), ("by hand", "by the paper's controller"), strict=True)
         errors = (f"{one.rmse_mm:.3f} mm {who}{' (failed)' if one.failed else ''}" for one, who in both)
         return (
@@ -47,9 +47,9 @@ class Score(NamedTuple):
 
 
 def score(config: Config, seed: int, actions: Sequence[npt.NDArray[np.float32]], failed: bool, rival: Any) -> Score:
-    """The score of these actions, each of shape (2,), beside a controller's.
+    """The score of a player's actions, each of shape (2,), and of a controller.
 
-    A run that was left early ends there; a failed one counts to the horizon, as everywhere: failing early never pays.
+    A run that the player left early ends there for both. A failed one counts to the horizon, as in the benchmark.
     """
     if not failed:
         config = replace(config, horizon=len(actions) * config.control_interval)

@@ -1,4 +1,4 @@
-"""pygame, loaded when the first picture is drawn, quietly and without touching the user's environment."""
+"""pygame, loaded when the first picture is drawn, without output and with the user's environment unchanged."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def available() -> bool:
 def load() -> Any:
     """The pygame module; :class:`gymnasium.error.DependencyNotInstalled` says how to get it.
 
-    pygame greets on standard output and warns of what its own imports do; neither is the user's concern.
+    pygame prints a greeting and its imports warn; both are suppressed.
     """
     try:
         with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():

@@ -12,13 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from .backend import load
-from .palette import BACK, FAINT, INK, PANEL, Colour, mix
+from .geometry import paired
+from .palette import BACK, INK, PANEL, Colour
 from .pixels import halve
 
 if TYPE_CHECKING:
     from pygame import Surface
 
-Points = npt.NDArray[np.float64]
 FINE = 2
 """Drawn pixels along each side of a pixel of the picture, which is their mean."""
 FONTS = Path(__file__).parent / "fonts"
@@ -51,97 +51,86 @@ class Box(NamedTuple):
 
 
 class Canvas:
-    """A picture of a given width and height [px]; all coordinates are pixels of the picture, floats welcome."""
+    """A picture of a given width and height [px]. Coordinates are pixels of the picture, as floats.
+
+    Widths of lines and sizes of text are in nominal pixels: :attr:`unit` pixels of the picture each.
+    """
 
     def __init__(self, width: int, height: int) -> None:
         self.pygame = load()
         self.width, self.height = width, height
         self.unit = min(width / BASE[0], height / BASE[1])
-        """Size of a nominal pixel [px]."""
         self._fine: Surface = self.pygame.Surface((FINE * width, FINE * height), 0, 32)
         self._picture: Surface = self.pygame.Surface((width, height), 0, 32)
-        self._background: Surface = self._fine.copy()
-        self._panels: tuple[Box, ...] | None = None
-        self._labels: list[tuple[Surface, tuple[int, int]]] = []
-        """Images of text with their upper left corners [px], drawn when the picture is finished."""
+        self._on_top: list[tuple[Surface, tuple[int, int]]] = []
+        """Text and covers with their upper left corners [px], drawn when the picture is finished."""
 
     def begin(self, panels: tuple[Box, ...]) -> None:
         """Begin a new picture with these panels on it."""
-        if panels != self._panels:  # drawn once: pygame takes long for round corners
-            self._background.fill(BACK)
-            for box in panels:
-                radius = round(6 * self.unit * FINE)
-                self.pygame.draw.rect(self._background, PANEL, _rounded(box), border_radius=radius)
-            self._panels = panels
-        self._fine.blit(self._background, (0, 0))
-        self._labels = []
+        self._on_top = []
+        self._fine.fill(BACK)
+        for box in panels:
+            self.rectangle(PANEL, box)
 
     def finish(self) -> Surface:
         """The picture; the next one is drawn into the same surface."""
         halve(self._fine, self._picture)
-        for image, corner in self._labels:
-            self._picture.blit(image, corner)
+        self._picture.blits(self._on_top, False)
         return self._picture
 
     @contextmanager
     def clip(self, box: Box) -> Iterator[None]:
         """Draw shapes inside the box only, and inside the box of a clip around this one."""
         before = self._fine.get_clip()
-        self._fine.set_clip(before.clip(_rounded(box)))
+        self._fine.set_clip(before.clip(_fine_box(box)))
         try:
             yield
         finally:
             self._fine.set_clip(before)
 
-    def rectangle(self, colour: Colour, box: Box, round_by: float = 0.0, line: int = 0) -> None:
-        """A rectangle, its corners rounded by that radius [nominal px]; filled, or a line of that width [fine px]."""
-        radius = round(round_by * self.unit * FINE)
-        self.pygame.draw.rect(self._fine, colour, _rounded(box), line, border_radius=radius)
+    def rectangle(self, colour: Colour, box: Box, line: float | None = None) -> None:
+        """A rectangle, filled or with a rim of that width."""
+        self.pygame.draw.rect(self._fine, colour, _fine_box(box), 0 if line is None else self._thickness(line))
 
-    def polygon(self, colour: Colour, points: Points) -> None:
-        """A filled polygon, points of shape (n, 2); nothing with fewer than three."""
-        if len(points) > 2:
-            self.pygame.draw.polygon(self._fine, colour, _fine(points))
+    def polygon(self, colour: Colour, points: npt.ArrayLike) -> None:
+        """A filled polygon, points of shape (n, 2); nothing for fewer than three."""
+        fine = _fine_points(points)
+        if len(fine) > 2:
+            self.pygame.draw.polygon(self._fine, colour, fine)
 
-    def lines(self, colour: Colour, points: Points, width: float = 1.5) -> None:
-        """Straight lines from point to point, shape (n, 2), of that width [nominal px]."""
-        if len(points) > 1:
-            self.pygame.draw.lines(self._fine, colour, False, _fine(points), self._thickness(width))
+    def lines(self, colour: Colour, points: npt.ArrayLike, width: float = 1.5) -> None:
+        """Straight lines from point to point, shape (n, 2); nothing for a single point."""
+        fine = _fine_points(points)
+        if len(fine) > 1:
+            self.pygame.draw.lines(self._fine, colour, False, fine, self._thickness(width))
 
-    def line(self, colour: Colour, start: tuple[float, float], end: tuple[float, float], width: float = 1.5) -> None:
-        """A straight line of that width [nominal px]."""
-        ends = [(x * FINE, y * FINE) for x, y in (start, end)]
-        self.pygame.draw.line(self._fine, colour, *ends, self._thickness(width))
-
-    def dashes(self, colour: Colour, points: Points, width: float = 1.2, dash: float = 5.0, gap: float = 4.0) -> None:
-        """Dashed lines from point to point; dash and gap in nominal px along the line."""
-        if len(points) < 2:
-            return
-        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    def dashes(
+        self, colour: Colour, points: npt.ArrayLike, width: float = 1.2, dash: float = 5.0, gap: float = 4.0
+    ) -> None:
+        """Dashed lines from point to point, with lengths of dash and gap along the line."""
+        x, y = np.asarray(points, np.float64).T
+        along = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
         starts = np.arange(0.0, along[-1], (dash + gap) * self.unit)
         ends = np.minimum(starts + dash * self.unit, along[-1])
-        fine = _fine(paired(*(np.interp(np.concatenate([starts, ends]), along, axis) for axis in points.T)))
-        for start, end in zip(fine[: len(starts)], fine[len(starts) :], strict=True):
+        at = np.stack([starts, ends], axis=1).ravel()
+        fine = _fine_points(paired(np.interp(at, along, x), np.interp(at, along, y)))
+        for start, end in zip(fine[::2], fine[1::2], strict=True):
             self.pygame.draw.line(self._fine, colour, start, end, self._thickness(width))
 
     def dot(self, colour: Colour, at: tuple[float, float], radius: float) -> None:
-        """A filled circle of that radius [nominal px]."""
+        """A filled circle."""
         centre = (round(at[0] * FINE), round(at[1] * FINE))
         self.pygame.draw.circle(self._fine, colour, centre, self._thickness(radius))
 
-    def _thickness(self, width: float) -> int:
-        """A width of so many nominal pixels [fine px]."""
-        return max(1, round(width * self.unit * FINE))
-
-    def glow(self, colour: Colour, x: float, y: float, radius: float) -> None:
-        """Light around a point, fading over that radius [nominal px]."""
-        size = max(2, round(radius * self.unit * FINE))
-        corner = (round(x * FINE) - size, round(y * FINE) - size)
+    def glow(self, colour: Colour, at: tuple[float, float], radius: float) -> None:
+        """Light around a point, fading over the radius."""
+        size = self._thickness(radius)
+        corner = (round(at[0] * FINE) - size, round(at[1] * FINE) - size)
         self._fine.blit(_glow(colour, size), corner, special_flags=self.pygame.BLEND_RGB_ADD)
 
     def shade(self, box: Box, top: Colour, bottom: Colour) -> None:
         """A box whose colour runs from top to bottom."""
-        x, y, w, h = _rounded(box)
+        x, y, w, h = _fine_box(box)
         self._fine.blit(_gradient(w, h, top, bottom), (x, y))
 
     def text(
@@ -149,42 +138,36 @@ class Canvas:
         x: float,
         y: float,
         text: str,
-        size: float = 11.0,
+        size: float = 9.5,
         colour: Colour = INK,
         anchor: str = "left",
         bold: bool = False,
     ) -> None:
-        """Text whose top is at y and whose left, centre or right (``anchor``) is at x; size in nominal px."""
-        image = _glyphs(text, max(7, round(size * self.unit)), colour, bold)
+        """Text whose top is at y and whose left, centre or right (``anchor``) is at x; it lies above all shapes."""
+        image = _text(text, max(7, round(size * self.unit)), colour, bold)
         left = {"left": 0.0, "centre": 0.5, "right": 1.0}[anchor] * image.get_width()
-        self._labels.append((image, (round(x - left), round(y))))
+        self._on_top.append((image, (round(x - left), round(y))))
 
-    def title(self, box: Box, title: str) -> None:
-        """A panel's title."""
-        self.text(box.x + 8 * self.unit, box.y + 5 * self.unit, title, 9.5, FAINT)
+    def cover(self, colour: Colour, box: Box) -> None:
+        """A filled rectangle above all shapes and the text so far."""
+        image = self.pygame.Surface((round(box.w), round(box.h)), 0, 32)
+        image.fill(colour)
+        self._on_top.append((image, (round(box.x), round(box.y))))
 
-    def remove_text(self, box: Box) -> None:
-        """Remove the text that reaches into a box, which something else will cover."""
-        area = self.pygame.Rect(*map(round, box))
-        self._labels = [(image, at) for image, at in self._labels if not image.get_rect(topleft=at).colliderect(area)]
-
-
-def paired(x: npt.ArrayLike, y: npt.ArrayLike) -> Points:
-    """Points of coordinates that broadcast to one axis, shape (n, 2)."""
-    points = np.empty((np.broadcast(x, y).size, 2))
-    points[:, 0], points[:, 1] = x, y
-    return points
+    def _thickness(self, width: float) -> int:
+        """A width in nominal pixels as drawn pixels."""
+        return max(1, round(width * self.unit * FINE))
 
 
-def _rounded(box: Box) -> tuple[int, int, int, int]:
+def _fine_box(box: Box) -> tuple[int, int, int, int]:
     left, top = round(box.x * FINE), round(box.y * FINE)
     return left, top, round(box.right * FINE) - left, round(box.bottom * FINE) - top
 
 
-def _fine(points: Points) -> list[list[float]]:
-    """Points as the drawing functions take them; far-off ones are limited, since pygame's integers would overflow."""
-    limited: list[list[float]] = np.minimum(np.maximum(points * float(FINE), -20_000.0), 20_000.0).tolist()
-    return limited
+def _fine_points(points: npt.ArrayLike) -> list[list[float]]:
+    """Points as pygame takes them; those far outside are clipped, because its integers would overflow."""
+    fine: list[list[float]] = np.clip(np.asarray(points) * float(FINE), -20_000.0, 20_000.0).tolist()
+    return fine
 
 
 @lru_cache(maxsize=8)
@@ -195,32 +178,29 @@ def _font(size: int, bold: bool) -> Any:
 
 
 @lru_cache(maxsize=2048)
-def _glyphs(text: str, size: int, colour: Colour, bold: bool) -> Any:
+def _text(text: str, size: int, colour: Colour, bold: bool) -> Any:
     try:
         return _font(size, bold).render(text, True, colour)
     except load().error:
-        # pygame.quit(), called by anybody, makes every font invalid.
+        # A pygame.quit() anywhere makes every font invalid.
         _font.cache_clear()
         return _font(size, bold).render(text, True, colour)
 
 
 @lru_cache(maxsize=16)
 def _glow(colour: Colour, size: int) -> Any:
+    pygame = load()
     at = np.arange(-size, size) + 0.5
-    distance = np.hypot(at[:, None], at[None, :]) / size
-    light = np.clip(1.0 - distance, 0.0, 1.0) ** 2.2
-    return _image((light[..., None] * np.array(colour)).astype(np.uint8))
+    light = np.clip(1.0 - np.hypot(at[:, None], at) / size, 0.0, 1.0) ** 2.2
+    image = pygame.Surface(light.shape, 0, 32)
+    pygame.surfarray.blit_array(image, (light[..., None] * np.array(colour)).astype(np.uint8))
+    return image
 
 
 @lru_cache(maxsize=16)
 def _gradient(width: int, height: int, top: Colour, bottom: Colour) -> Any:
-    column = np.array([mix(top, bottom, row / max(height - 1, 1)) for row in range(height)], np.uint8)
-    return _image(np.broadcast_to(column, (width, height, 3)))
-
-
-def _image(pixels: npt.NDArray[np.uint8]) -> Any:
-    """A surface in the canvas' own format of pixels of shape (width, height, 3)."""
     pygame = load()
-    image = pygame.Surface(pixels.shape[:2], 0, 32)
-    pygame.surfarray.blit_array(image, pixels)
-    return image
+    ends = pygame.Surface((1, 2), 0, 32)
+    ends.set_at((0, 0), top)
+    ends.set_at((0, 1), bottom)
+    return pygame.transform.smoothscale(ends, (width, height))

@@ -1,4 +1,4 @@
-"""Colours of the pictures: Okabe and Ito's where a colour means something, safe for colour-blind readers."""
+"""Colours of the pictures: Okabe and Ito's where a colour has a meaning, safe for colour-blind readers."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ PANEL: Colour = (22, 27, 36)
 RIM: Colour = (56, 66, 82)
 INK: Colour = (236, 239, 244)
 FAINT: Colour = (150, 160, 176)
-TRACK: Colour = (44, 52, 66)
 BAND: Colour = (38, 50, 62)
 
 TRUE: Colour = (86, 180, 233)
 """The true crystal."""
 CAMERA: Colour = (240, 228, 66)
-"""The bright ring and what the camera makes of it."""
+"""The bright ring, and the radius that the camera reads from it."""
 REFERENCE: Colour = (255, 255, 255)
 DRIVE: Colour = (204, 121, 167)
 """Pull speed and heater."""
 TEMPERATURE: Colour = (230, 159, 0)
-RECIPE: Colour = (0, 190, 140)
+WELL: Colour = (0, 190, 140)
 ALARM: Colour = (213, 94, 0)
 
 GAS: Colour = (15, 19, 27)
 MELT_TOP: Colour = (255, 168, 84)
 MELT_DEEP: Colour = (160, 52, 22)
+ON_MELT: Colour = (60, 20, 0)
+"""Words on the bright melt."""
 CRYSTAL_HOT: Colour = (176, 150, 138)
 CRYSTAL_COLD: Colour = (84, 98, 120)
 SEED: Colour = (62, 72, 90)
 QUARTZ: Colour = (120, 128, 140)
-GRAPHITE: Colour = (58, 30, 26)
 GLOW: Colour = (255, 236, 180)
 
 

@@ -1,6 +1,6 @@
-"""Loops over pixels: a picture from one of twice its resolution, and its colours as an array.
+"""Compiled loops over pixels: a picture from one of twice its resolution, and its colours as an array.
 
-pygame's own ``smoothscale`` took a third of a frame's time.
+pygame's own ``smoothscale`` and ``array3d`` take ten times as long: half of a frame's time.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What an environment with a ``render_mode`` owns: the episode's record, its picture and, for "human", the window."""
+"""The view of an environment with a ``render_mode``: the episode's record, its picture and, for "human", a window."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def declared_modes() -> list[str]:
 def make_view(render_mode: str | None, size: Any, config: Config) -> View | None:
     """The view of a render mode, None without one.
 
-    Raises ValueError for a mode or size that is not allowed, DependencyNotInstalled where pygame is missing.
+    Raises CzError for a mode or size that is not allowed, DependencyNotInstalled where pygame is missing.
     """
     width, height = check_size(size)
     if render_mode is None:
@@ -57,7 +57,7 @@ def record_of(env: Any) -> Record:
 
 
 class View:
-    """Records an episode as it is stepped, and draws it when asked."""
+    """The record of an episode, drawn when asked or, for "human", at every reset and step."""
 
     def __init__(self, mode: str, width: int, height: int, config: Config) -> None:
         self.mode, self.size, self.config = mode, (width, height), config
@@ -66,13 +66,13 @@ class View:
         self._window: Window | None = None
 
     def begin(self, info: npt.NDArray[np.float64], slot: Any, scenario: str) -> None:
-        """Start the record of an episode from its first sample, or from wherever a state was restored."""
+        """Begin the record of an episode at its first sample, or at the one where a state was restored."""
         self.record = Record(self.config, slot, scenario)
         self.record.add(info, float(slot["valid"]))
         self._show()
 
     def add(self, info: npt.NDArray[np.float64], valid: float, terminated: bool, truncated: bool) -> None:
-        """Record a step."""
+        """Add a step to the record."""
         if self.record is not None:
             self.record.add(info, valid, terminated, truncated)
             self._show()
@@ -120,7 +120,7 @@ class Window:
 
     @property
     def visible(self) -> bool:
-        """Whether anybody could see it: SDL opens windows that nobody sees where there is no display."""
+        """Whether it is on a display: without one, SDL opens a window that nobody sees."""
         driver: str = self._pygame.display.get_driver()
         return driver != "offscreen"
 
@@ -132,5 +132,5 @@ class Window:
         self._pygame.display.flip()
 
     def close(self) -> None:
-        """Close it."""
+        """Close the window."""
         self._pygame.display.quit()

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cz_gym.env import CzEnv
-from cz_gym.rendering import palette, puller_panel, strip_charts, triple_point
+from cz_gym.rendering import chart, palette, puller_panel, triple_point
 from cz_gym.rendering.canvas import TIMES, Box, Canvas
+from cz_gym.rendering.geometry import TOLERANCE, error_range
 from cz_gym.rendering.palette import Colour
 from cz_gym.rendering.record import Ending, Record
 from cz_gym.rendering.scene import draw_ending
@@ -49,19 +50,18 @@ class Side:
 def draw(canvas: Canvas, sides: Sequence[Side]) -> Surface:
     """Each side's crystal and triple point, and below them both errors on one chart."""
     unit = canvas.unit
-    gap, chart = 6.0 * unit, 0.27 * canvas.height
+    gap, below = 6.0 * unit, 0.27 * canvas.height
     width = (canvas.width - (len(sides) + 1) * gap) / len(sides)
     magnified = min(puller_panel.magnification(side.record) for side in sides)
-    limit = max(triple_point.error_range(side.record.error) for side in sides)
-    bottom = Box(gap, canvas.height - chart - gap, canvas.width - 2.0 * gap, chart)
-    boxes = [Box(gap + i * (width + gap), gap, width, canvas.height - chart - 3.0 * gap) for i in range(len(sides))]
+    limit = error_range(*(side.record.error for side in sides))
+    bottom = Box(gap, canvas.height - below - gap, canvas.width - 2.0 * gap, below)
+    boxes = [Box(gap + i * (width + gap), gap, width, canvas.height - below - 3.0 * gap) for i in range(len(sides))]
     canvas.begin((bottom, *boxes))
-    strip_charts.draw_errors(canvas, bottom, [(side.record, side.colour) for side in sides])
+    traces = [chart.Trace(side.record.t, side.record.error, side.colour) for side in sides]
+    chart.draw_traces(canvas, bottom, sides[0].record.config.horizon, traces)
     x, y = bottom.x + 38.0 * unit, bottom.y + 4 * unit
     canvas.text(x, y, "true radius error [mm]", 9.5, palette.FAINT)
-    told = (
-        f"{TIMES}{magnified:g}: drawn {magnified:g} times as large; shaded: within {triple_point.TOLERANCE / MM:g} mm"
-    )
+    told = f"{TIMES}{magnified:g}: drawn {magnified:g} times as large; shaded: within {TOLERANCE / MM:g} mm"
     canvas.text(bottom.right - 10.0 * unit, y, told, 9.5, palette.FAINT, "right")
     for i, (side, box) in enumerate(zip(sides, boxes, strict=True)):
         canvas.text(x + (125 + 140 * i) * unit, y, side.name, 9.5, side.colour, bold=True)

@@ -19,7 +19,6 @@ from cz_gym.config import Config
 from cz_gym.evaluation.metrics import TOLERANCE
 from cz_gym.evaluation.results import REFERENCE, Controller, Sample, ScenarioResult
 from cz_gym.evaluation.rollout import Floats, Signals
-from cz_gym.rendering.strip_charts import running_mean
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 from cz_gym.vector import CzVectorEnv
 
@@ -105,6 +104,20 @@ def crystals(scenario: ScenarioResult) -> list[dict[str, Any]]:
             }
         )
     return found
+
+
+SMOOTH = 5.0 * MINUTE
+"""Length of the running mean [s]."""
+
+
+def running_mean(values: Floats, interval: float) -> Floats:
+    """The mean of each value and those of the SMOOTH seconds before it, as far as there are any."""
+    size = max(round(SMOOTH / interval), 1)
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    ends = np.arange(1, len(values) + 1)
+    starts = np.maximum(ends - size, 0)
+    mean: Floats = (sums[ends] - sums[starts]) / (ends - starts)
+    return mean
 
 
 Line = tuple[int, Floats]
