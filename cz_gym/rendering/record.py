@@ -62,7 +62,8 @@ class Record:
     @property
     def t(self) -> Floats:
         """Time of every sample since the episode began [s]."""
-        return (self._first + np.arange(self._count)) * self.config.control_interval
+        samples: Floats = self._first + np.arange(self._count, dtype=np.float64)
+        return samples * self.config.control_interval
 
     @property
     def error(self) -> Floats:
@@ -78,7 +79,7 @@ class Record:
     @property
     def length(self) -> Floats:
         """Length grown at every sample since the record began [m]: what was pulled less what the meniscus rose."""
-        pulled = np.cumsum(self.column("v_p")) - self.column("v_p")[0]
+        pulled: Floats = np.cumsum(self.column("v_p")) - self.column("v_p")[0]
         return pulled * self.config.control_interval - (self.column("h_c") - self.column("h_c")[0])
 
     def surface(self, height: float = np.inf) -> tuple[Floats, Floats, Floats]:
