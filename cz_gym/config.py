@@ -14,18 +14,18 @@ from cz_gym.camera.view import Camera, camera_for, check_camera
 from cz_gym.episodes.scenario import Range, Scenario
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario, mix_of
 from cz_gym.errors import CzError
-from cz_gym.jit.cache import hashed
+from cz_gym.jit.code_hash import function_hash
 from cz_gym.names import needs, unknown
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters, check_parameters
-from cz_gym.physics.plant import make_puller
+from cz_gym.physics.plant import EQUATIONS, make_puller
 
 from .action import MadeFor
 from .observation import CAMERA, OBSERVATIONS
 from .task import ACTIONS, check_height
 
 VERSION = 0
-"""Version of physics and contract; a change of either makes a Cz-v1."""
+"""Version of the environment's contract; a change of it, or of physics, makes a Cz-v1."""
 
 
 class Identity(NamedTuple):
@@ -84,7 +84,7 @@ class Config:
 
     @property
     def plant_hash(self) -> str:
-        """SHA-256 of what the crystal obeys: version, meniscus and parameters (16 hex digits)."""
+        """SHA-256 of what the crystal obeys: the equations' code, the meniscus' and the parameters (16 hex digits)."""
         return _plant_hash(self.parameters, self.meniscus)
 
     @property
@@ -162,16 +162,13 @@ def make_config(
 @lru_cache(maxsize=64)
 def _plant_hash(parameters: Parameters, meniscus: MeniscusModel) -> str:
     numbers = {name: float(value) + 0.0 for name, value in parameters._asdict().items()}
-    text = json.dumps([VERSION, _name(meniscus), numbers], sort_keys=True)
+    text = json.dumps([VERSION, _equations_hash(meniscus), numbers], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _name(meniscus: MeniscusModel) -> str:
-    """The name of a meniscus model; with its functions' full names where they are not this package's own."""
-    if hashed(*meniscus.functions):
-        return meniscus.name
-    names = [f"{getattr(f, '__module__', '')}.{getattr(f, '__qualname__', repr(f))}" for f in meniscus.functions]
-    return " ".join([meniscus.name, *names])
+@lru_cache(maxsize=64)
+def _equations_hash(meniscus: MeniscusModel) -> str:
+    return function_hash(*EQUATIONS, *meniscus.functions)
 
 
 def positive(name: str, value: float) -> float:

@@ -264,3 +264,7 @@ def hidden_load(p_drift: Any, p: Any) -> Any:
         excess = p.kappa_12 * cube * T_2 + p.G_2b * T_2 - hot
         T_2 = T_2 - excess / (4.0 * p.kappa_12 * cube + p.G_2b)
     return -p.G_2b * (T_2 - p.T_2_0)
+
+
+EQUATIONS = (derive_puller, rates, rk4, hidden_load)
+"""The functions that the plant is, whatever its meniscus and its parameters."""

@@ -1,0 +1,98 @@
+"""The plant's hash follows from its equations, not from their formatting, nor from a number bumped by hand (trap 5)."""
+
+import importlib.util
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cz_gym import HURLE, MeniscusModel, config
+from cz_gym.config import make_config
+from cz_gym.jit.code_hash import function_hash
+from cz_gym.jit.compile import jittable
+from cz_gym.physics import plant
+
+SOURCE = '''
+import math
+import numpy as np
+SLOPE = 2.0
+def inner(x):
+    return SLOPE * x
+def outer(x, by=1.0):
+    """Say."""
+    # why
+    return by * np.sqrt(inner(x)) + math.pi
+'''
+
+
+@pytest.fixture
+def load(tmp_path: Path) -> Callable[[str], Any]:
+    """Function ``outer`` of a text."""
+
+    def of(text: str) -> Any:
+        file = tmp_path / f"m{len(list(tmp_path.iterdir()))}.py"
+        file.write_text(text)
+        spec = importlib.util.spec_from_file_location(file.stem, file)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module.outer
+
+    return of
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "same"),
+    [
+        ("    # why\n", "", True),
+        ('"""Say."""', '"""Say something else."""', True),
+        ("by * np.sqrt(inner(x))", "(by * np.sqrt(\n        inner(x)))", True),
+        ("def outer(x, by=1.0):", "def outer(x: float, by: float = 1.0) -> float:", True),
+        ("SLOPE = 2.0", "SLOPE = 2.0\nOTHER = 3.0", True),
+        ("SLOPE = 2.0", "SLOPE = 2.000001", False),
+        ("SLOPE * x", "SLOPE + x", False),
+        ("by=1.0", "by=1.5", False),
+        ("np.sqrt", "np.cbrt", False),
+        ("math.pi", "math.e", False),
+    ],
+)
+def test_hash_of_a_function_follows_from_what_it_computes(
+    load: Callable[[str], Any], before: str, after: str, same: bool
+) -> None:
+    assert (function_hash(load(SOURCE)) == function_hash(load(SOURCE.replace(before, after)))) is same
+
+
+def test_a_changed_equation_is_another_plant(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fourth_power(T: Any) -> Any:
+        return T**4.01
+
+    before = make_config().plant_hash
+    monkeypatch.setattr(plant, "fourth_power", fourth_power)
+    for cached in (config._plant_hash, config._equations_hash):
+        cached.cache_clear()
+    assert make_config().plant_hash != before
+    monkeypatch.undo()
+    for cached in (config._plant_hash, config._equations_hash):
+        cached.cache_clear()
+    assert make_config().plant_hash == before
+
+
+def stretched(by: float) -> MeniscusModel:
+    """Hurle's meniscus, its height stretched."""
+
+    @jittable
+    def height(r_c: Any, theta: Any, a: Any) -> Any:
+        return by * HURLE.height(r_c, theta, a)
+
+    return HURLE._replace(name="stretched", height=height)
+
+
+def test_two_menisci_of_one_factory_are_two_plants() -> None:
+    hashes = {make_config(meniscus=stretched(by)).plant_hash for by in (1.0, 1.01, 1.02)}
+    assert len({*hashes, make_config().plant_hash}) == 4
+    assert make_config(meniscus=stretched(1.01)).plant_hash in hashes
+    assert make_config(meniscus=HURLE._replace(name="another name")).plant_hash == make_config().plant_hash
+    lambdas = [HURLE._replace(height=f) for f in (lambda r, t, a: 1.0 * a, lambda r, t, a: 1.1 * a)]
+    assert function_hash(*lambdas[0].functions) != function_hash(*lambdas[1].functions)
