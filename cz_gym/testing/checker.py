@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import closing, nullcontext
+from copy import deepcopy
 from itertools import product
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import batch_space
+from gymnasium.vector.utils import batch_space, iterate
 
 from cz_gym.commands import OneLineParser, between
 from cz_gym.episodes import scenarios
@@ -24,7 +26,7 @@ from cz_gym.errors import CzError
 from cz_gym.observation import CAMERA, OBSERVATIONS
 
 from .driver import Checked, Driver, MakeScalar, MakeVector, NotConforming
-from .nested_arrays import KEEPERS, Kept, NamedArray, difference, flatten, keep, overwrite
+from .nested_arrays import KEEPERS, Kept, difference, flatten, keep, overwrite
 
 __all__ = ["Checked", "NotConforming", "check_vector_env"]
 
@@ -80,31 +82,24 @@ def _check_spaces(driver: Driver) -> None:
             driver.require(batched == expected, f"{name} is {batched}, the batch of {n} is {expected}")
 
 
-def _first(driver: Driver, seed: Any, env: Any = None) -> list[list[NamedArray]]:
-    """Copies of the first observation of every slot."""
-    if env is None:
-        with driver.vector() as fresh:
-            return _first(driver, seed, fresh)
-    arrays = flatten(env.reset(seed=seed)[0])
-    return [[array.at(i) for array in arrays] for i in range(driver.num_envs)]
+def _first(driver: Driver, seed: Any, env: Any = None) -> list[Any]:
+    """Copies of the first observation of every slot; of a new environment unless one is given."""
+    with driver.vector() if env is None else nullcontext(env) as env:
+        return deepcopy(list(iterate(env.observation_space, env.reset(seed=seed)[0])))
 
 
 def _check_seeds(driver: Driver, random_start: bool, rtol: float) -> None:
     seed, n = driver.seed, driver.num_envs
-
-    def same(one: list[list[NamedArray]], other: list[list[NamedArray]]) -> bool:
-        return all(difference(*pair) is None for pair in zip(one, other, strict=True))
-
     expected = _first(driver, seed)
     with driver.vector() as env:
         for what in ("a second environment", "a second reset"):
-            again = same(_first(driver, seed, env), expected)
+            again = data_equivalence(_first(driver, seed, env), expected, exact=True)
             driver.require(again, f"seed {seed} gives another first observation in {what}")
         unseeded = _first(driver, None, env)
     seeds = [seed + 7 * (n - i) for i in range(n)]
     for i, slot in enumerate(_first(driver, seeds)):
         with closing(driver.make_scalar()) as scalar:
-            differs = difference(slot, flatten(scalar.reset(seed=seeds[i])[0]), rtol)
+            differs = difference(flatten(slot), flatten(scalar.reset(seed=seeds[i])[0]), rtol)
         driver.require(not differs, f"seed list: slot {i} with seed {seeds[i]} differs from the scalar with that seed")
     if not random_start:
         return
@@ -113,22 +108,23 @@ def _check_seeds(driver: Driver, random_start: bool, rtol: float) -> None:
         (unseeded, "a reset without seed repeats the last one: both give"),
         (_first(driver, None), f"no seed and seed {seed} give"),
     ):
-        driver.require(not same(other, expected), f"{what} the same first observations")
+        alike = data_equivalence(other, expected, exact=True)
+        driver.require(not alike, f"{what} the same first observations")
     for i in range(1, n):
-        unlike = difference(expected[i], expected[0])
-        driver.require(unlike, f"slots 0 and {i} have the same first observation")
+        alike = data_equivalence(expected[i], expected[0], exact=True)
+        driver.require(not alike, f"slots 0 and {i} have the same first observation")
 
 
 def _check_equality(driver: Driver, random_start: bool, rtol: float) -> None:
-    """Everything as the scalars have it, and a new first observation after every end."""
-    begun: list[list[list[NamedArray]]] = [[] for _ in range(driver.num_envs)]
+    """Every result equals the scalars', and every episode of a slot has a first observation of its own."""
+    begun: list[list[Any]] = [[] for _ in range(driver.num_envs)]
     with driver.vector() as env, driver.scalars() as oracle:
         for one, other in zip(driver.run(env), driver.run(oracle, oracle=True), strict=True):
+            slots = list(iterate(env.observation_space, one.result[0]))
             for i in np.flatnonzero(one.first).tolist() if random_start else ():
-                new = [array.at(i) for array in flatten(one.result[0])]
-                again = any(difference(new, old) is None for old in begun[i])
+                again = any(data_equivalence(slots[i], old, exact=True) for old in begun[i])
                 driver.require(not again, f"{one.call}: slot {i} begins again with a first observation it had before")
-                begun[i].append(new)
+                begun[i].append(deepcopy(slots[i]))
             driver.require(one.call == other.call, f"{one.call} where the scalars have {other.call}")
             names = _RESULT if len(one.result) == 5 else (_RESULT[0], _RESULT[-1])
             for name, ours, theirs in zip(names, one.result, other.result, strict=True):
@@ -140,9 +136,9 @@ def _check_equality(driver: Driver, random_start: bool, rtol: float) -> None:
 
 
 def _check_kept(driver: Driver, every: bool) -> None:
-    """Keep every array, each in another way, or one array of each call alone; look again at the end.
+    """Keep every array, or one of each call alone, each in another way; all must be unchanged at the end.
 
-    One alone, because memory that is used again once nobody needs it would be used again around it.
+    One alone, because an environment that recycles arrays nobody holds would find the others free.
     """
     kept: list[tuple[str, Kept]] = []
     with driver.vector() as env:
@@ -160,7 +156,7 @@ def _check_kept(driver: Driver, every: bool) -> None:
 
 
 def _check_writes(driver: Driver) -> None:
-    """Overwrite all that one of two equal environments returns, and the actions it was given."""
+    """Overwrite the results and actions of one of two equal environments; both must go on alike."""
     with driver.vector() as plain, driver.vector() as overwritten:
         for one, other in zip(driver.run(plain), driver.run(overwritten, oracle=True, overwrites=True), strict=True):
             found = difference(flatten(other.result, "result"), flatten(one.result, "result"), masked=True)
@@ -169,13 +165,13 @@ def _check_writes(driver: Driver) -> None:
 
 
 def _check_cz(scenario: str, observation: str, num_envs: int, steps: int) -> Checked:
-    """Check ``Cz-v0`` in short episodes of long steps, so that many end; few images, which cost."""
+    """Check ``Cz-v0`` in short episodes of long steps, so that many end; images, which are slow, for fewer steps."""
     images = observation == CAMERA
     settings: dict[str, Any] = {
         "scenario": scenario, "observation": observation, "control_interval": 60.0,
         "horizon": 180.0 if images else 1200.0,
     }  # fmt: skip
-    # A first image may be black, as another one: on "sensor-fault" images do not tell episodes apart.
+    # Two first images of "sensor-fault" may both be black, so images do not tell its episodes apart.
     alike = {("only-sensor", "state"), ("sensor-fault", CAMERA)}
     random_at_start = scenario in {"randomized", "hard", "sensor-fault", "puller", "only-sensor"}
     return check_vector_env(

@@ -1,4 +1,4 @@
-"""An environment run for a check: sampled actions, resets as its autoreset mode wants them."""
+"""Runs of an environment for a check, with sampled actions and the resets that its autoreset mode needs."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ MakeScalar = Callable[[], Any]
 
 
 class NotConforming(AssertionError):
-    """A vector environment is not what a vector of its scalar form would be; the message is one line."""
+    """A vector environment differs from a vector of its scalar form; the message is one line."""
 
 
 class Checked(NamedTuple):
-    """What a check has seen."""
+    """Counts of a check."""
 
     steps: int = 0
     """Batched steps of the native form."""
     episodes: int = 0
     """Episodes that ended, all slots together."""
     failures: int = 0
-    """Those that ended by ``terminated``."""
+    """Episodes that ended by ``terminated``."""
     held: int = 0
     """Returned arrays that were kept through later calls."""
 
     def __str__(self) -> str:
-        """In words."""
+        """The counts in words."""
         return (
             f"{self.steps} steps, {self.episodes} episodes, {self.failures} of them failures, "
             f"{self.held} arrays kept through later calls"
         )
 
     def __add__(self, other: Any) -> Checked:
-        """Both together."""
+        """The sums of both."""
         return Checked(*(one + more for one, more in zip(self, other, strict=True)))
 
 
 class Event(NamedTuple):
-    """One call and what it returned."""
+    """A call and its result."""
 
     call: str
     result: tuple[Any, ...]
@@ -56,7 +56,7 @@ class Event(NamedTuple):
 
 @dataclass
 class Driver:
-    """Runs environments in one autoreset mode, and counts what it sees of the native form."""
+    """Runs environments in one autoreset mode, and counts the native form's steps and episodes."""
 
     make_vector: MakeVector
     make_scalar: MakeScalar
@@ -67,22 +67,22 @@ class Driver:
     seen: Checked = field(default_factory=Checked)
 
     def vector(self) -> Any:
-        """A native form."""
+        """A new native form, as a context."""
         return closing(self.make_vector(self.num_envs, self.mode))
 
     def scalars(self) -> Any:
-        """The oracle: Gymnasium's vector of scalars."""
+        """The oracle as a context: Gymnasium's vector of scalars."""
         return closing(SyncVectorEnv([self.make_scalar] * self.num_envs, autoreset_mode=self.mode))
 
     def require(self, fact: Any, message: str) -> None:
-        """Raise :class:`NotConforming` unless the fact is one."""
+        """Raise :class:`NotConforming` unless the fact is true."""
         if not fact:
             raise NotConforming(f"[{self.mode.value}] {message}")
 
     def run(self, env: VectorEnv[Any, Any, Any], oracle: bool = False, overwrites: bool = False) -> Iterator[Event]:
-        """Reset and step with sampled actions; ended episodes are reset as the mode wants.
+        """Reset and step with sampled actions; where the mode is ``DISABLED``, reset the slots that ended.
 
-        An ``oracle`` is not counted; ``overwrites``: the actions are overwritten once they were given.
+        An ``oracle`` is not counted. ``overwrites`` overwrites each action after its step.
         """
         env.action_space.seed(self.seed)
         over, none = np.zeros(self.num_envs, np.bool_), np.zeros(self.num_envs, np.bool_)

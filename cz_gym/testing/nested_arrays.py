@@ -1,4 +1,4 @@
-"""Nested results as flat lists of named arrays: compared, kept in several ways, overwritten."""
+"""Nested results as flat lists of named arrays, to be compared, kept in several ways or overwritten."""
 
 from __future__ import annotations
 
@@ -18,15 +18,11 @@ class NamedArray(NamedTuple):
     name: str
     value: Array
     mask: Array | None = None
-    """Slots where an info holds something, bool; None: all."""
-
-    def at(self, i: int) -> NamedArray:
-        """A copy of slot i alone."""
-        return NamedArray(self.name, np.array(self.value[i]))
+    """Slots for which an info has a value, bool; None: all."""
 
 
 def flatten(value: Any, name: str = "") -> list[NamedArray]:
-    """The arrays of a nested value of mappings, sequences and object arrays, in order; an info goes with its mask."""
+    """The arrays of nested mappings, sequences and object arrays, in order; those of an info with its mask."""
     if isinstance(value, dict):
         found = []
         for key in sorted(value, key=str):
@@ -41,9 +37,9 @@ def flatten(value: Any, name: str = "") -> list[NamedArray]:
 
 
 def difference(one: list[NamedArray], other: list[NamedArray], rtol: float = 0.0, masked: bool = False) -> str | None:
-    """What differs first, in words; None if nothing does.
+    """The first difference, in words; None if there is none.
 
-    ``masked``: only where masks say there is something; dtypes but bool may differ, as infos' do.
+    ``masked`` compares only where the masks are true, and allows other dtypes except for bool, as infos have them.
     """
     names = [[array.name for array in arrays] for arrays in (one, other)]
     if names[0] != names[1]:
@@ -72,7 +68,7 @@ def _close(a: Array, b: Array, rtol: float) -> Array:
 
 
 def overwrite(value: Any) -> None:
-    """Overwrite every array of a nested value that can be written."""
+    """Overwrite every writeable array of a nested value with ones."""
     for array in flatten(value):
         if array.value.flags.writeable and array.value.dtype != object:
             array.value[...] = 1
@@ -83,7 +79,7 @@ def _bytes(array: Any) -> bytes:
 
 
 def _ctypes(array: Array) -> Any:
-    """A ctypes buffer over the array's memory: nothing but the exported buffer keeps the array alive."""
+    """A ctypes buffer over the array's memory; only the exported buffer keeps the array alive."""
     return (ctypes.c_char * array.nbytes).from_buffer(_view(array).cast("B"))
 
 
@@ -99,11 +95,11 @@ KEEPERS: dict[str, tuple[Callable[[Array], Any], Callable[[Any], bytes]]] = {
     "a ctypes buffer": (_ctypes, bytes),
     "an iterator": (lambda array: array.flat, lambda kept: _bytes(kept.base)),
 }
-"""Ways to keep an array: how it is made from the array, and how what it shows is read."""
+"""Ways to keep an array: a function that makes the keeper from the array, and one that reads the bytes from it."""
 
 
 class Kept(NamedTuple):
-    """An array as somebody keeps it, and what was in it."""
+    """An array held by a keeper, and its bytes at that time."""
 
     name: str
     keeper: str
@@ -112,12 +108,12 @@ class Kept(NamedTuple):
 
     @property
     def unchanged(self) -> bool:
-        """Whether it still shows what was in the array."""
+        """Whether the keeper still shows the same bytes."""
         return KEEPERS[self.keeper][1](self.kept) == self.content
 
 
 def keep(array: NamedArray, number: int) -> Kept:
-    """Keep an array in the way of that number, counted round; by itself where that way cannot."""
+    """Keep an array in way ``number`` modulo their count, or as itself where that way is impossible."""
     value = array.value
     simple = value.ndim > 0 and value.size > 0 and value.flags.c_contiguous and value.flags.writeable
     keeper = list(KEEPERS)[number % len(KEEPERS) if simple else 0]
