@@ -1,4 +1,4 @@
-"""The camera above the melt: its view, ray-traced images, and the bright ring found in them."""
+"""The camera above the melt: its view, ray-traced images, and the detector of the bright ring in them."""
 
 from __future__ import annotations
 

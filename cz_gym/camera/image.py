@@ -1,8 +1,7 @@
-"""From rays to an image: pixels, shot noise, and what a slot's camera shows.
+"""From rays to images: radiance, pixels, shot noise, and the images of an environment's slots.
 
-The loop of a frame first follows a ray through each corner of the pixels. A pixel whose corners agree takes their
-mean; where they differ, at the ring and other edges, it takes the mean of SUB x SUB rays, so that an edge moves by
-fractions of a pixel.
+A ray is traced through each corner of the pixels. A pixel whose corners agree has their mean; where they differ, at the
+ring and other edges, it has the mean of SUB x SUB rays, so that an edge can move by fractions of a pixel.
 """
 
 from __future__ import annotations
@@ -19,29 +18,81 @@ from cz_gym.jit.compile import jittable, kernel
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.plant import Puller
 
-from .rays import make_scene, radiance, sight
+from .rays import CRYSTAL, FLAT, MELT, SHIELD, WALL, Ray, first_hit, make_scene, mirror
 from .view import COLUMNS, IMAGE, ROWS, View
 
 SUB = 4
-"""Rays across a pixel that holds an edge."""
+"""Rays along each side of a pixel with an edge."""
 TOLERANCE = 12.0
 """Difference between a pixel's corners that counts as an edge [grey values]."""
-_RADIUS_TURNS = 4
+_RADIUS_STEPS = 4
+"""Steps of the fixed point that gives the crystal's radius for a reading of the ring."""
+_APART = 1e-4
+"""Distance in q of a mirrored ray's bracket from its start [-]."""
 _GOLDEN = 0.6180339887498949
+"""Golden ratio: shifts the rays of successive columns evenly."""
 
 
 class Scratch(NamedTuple):
-    """Working memory of a frame, one row a slot."""
+    """Working memory of the images, one row a slot."""
 
     corners: Any
-    """Brightness of two rows of corners [grey values], shape (n, 2, COLUMNS // 2 + 1)."""
+    """Brightness of two rows of pixel corners [grey values], shape (n, 2, COLUMNS // 2 + 1)."""
     stream: Any
-    """A random stream, shape (n, WORDS)."""
+    """The frame's random stream, shape (n, WORDS)."""
 
 
 def new_scratch(n: int) -> Scratch:
     """Working memory for n slots."""
     return Scratch(np.zeros((n, 2, COLUMNS // 2 + 1)), np.zeros((n, WORDS), np.uint64))
+
+
+@jittable
+def sight(row: Any, column: Any, view: Any) -> Any:
+    """The ray from the lens through pixel coordinates (:func:`cz_gym.camera.view.project`)."""
+    u = (column - 0.5 * COLUMNS) * view.pixel
+    v = (row - 0.5 * ROWS) * view.pixel
+    return Ray(view.x, 0.0, view.z, v * view.cos_tilt - view.sin_tilt, u, -view.cos_tilt - v * view.sin_tilt)
+
+
+@jittable
+def _just_off(q: Any, ray: Any) -> Any:
+    """q on the profile beside the point where a ray leaves the melt; the ray is outside the melt there."""
+    if q < 0.0:
+        return FLAT
+    return q + _APART if ray.dz < 0.0 else q - _APART
+
+
+@jittable
+def emitted(hit: Any, scene: Any, view: Any) -> Any:
+    """Radiance that a surface itself emits, without the light that it mirrors."""
+    if hit.what == MELT:
+        return view.melt
+    if hit.what == WALL:
+        return view.wall
+    if hit.what == SHIELD:
+        return view.shield
+    if hit.what == CRYSTAL:
+        far = view.camera.crystal_far_temperature
+        cooled = np.exp(-(hit.z - scene.h_c) / view.camera.crystal_cooling)
+        T = far + (view.camera.crystal_temperature - far) * cooled
+        return view.camera.crystal_emissivity * np.exp(view.wien * (1.0 / view.camera.wall_temperature - 1.0 / T))
+    return view.opening
+
+
+@jittable
+def radiance(ray: Any, scene: Any, view: Any) -> Any:
+    """Radiance that arrives along a ray from the lens, mirrored ``view.reflections`` times at most."""
+    light, share, q = 0.0, 1.0, scene.q_c
+    for _ in range(int(view.reflections) + 1):
+        hit = first_hit(ray, q, scene, view)
+        light += share * emitted(hit, scene, view)
+        if hit.what != MELT:
+            break
+        share *= view.mirrored
+        ray = mirror(ray, hit)
+        q = _just_off(hit.q, ray)
+    return light
 
 
 @jittable
@@ -52,10 +103,10 @@ def grey_value(row: Any, column: Any, scene: Any, view: Any) -> Any:
 
 @jittable
 def _pixel(row: Any, column: Any, corners: Any, scene: Any, view: Any) -> Any:
-    """Brightness of a pixel whose upper and lower corners stand in the two rows of ``corners``.
+    """Brightness of a pixel whose upper and lower corners are in the two rows of ``corners``.
 
-    No two of the rays through an edge share a row or a column, so that also a level edge has SUB x SUB steps; these
-    fall elsewhere in each column, so that a ring of many columns has none.
+    No two rays of a pixel share a row or a column, so that a level edge also moves in SUB x SUB steps. They are
+    shifted from column to column, so that an edge across many columns moves smoothly.
     """
     above, below = row % 2, (row + 1) % 2
     a, b = corners[above, column], corners[above, column + 1]
@@ -81,7 +132,7 @@ def _rounded(value: Any, noisy: Any, stream: Any, view: Any) -> Any:
 def expose(scene: Any, view: Any, corners: Any, noisy: Any, stream: Any, image: Any) -> None:
     """Write the image of a scene, uint8 (ROWS, COLUMNS, 1); with shot noise from ``stream`` if ``noisy``.
 
-    The left half is followed, the right half is its mirror image: nothing stands beside the axis.
+    The left half is traced; the right half is its mirror image, because everything is symmetric about the axis.
     """
     for row in range(-1, ROWS):
         for column in range(COLUMNS // 2 + 1):
@@ -111,8 +162,8 @@ def picture(r_c: float, h_c: float, puller: Puller, view: View) -> npt.NDArray[n
 def build_look(meniscus: MeniscusModel = HURLE) -> Any:
     """Compile ``look(slots, active, view, scratch, images, start, stop)``: the images of the active slots.
 
-    A slot shows the crystal whose bright ring is its last reading, errors included, on the meniscus at that reading;
-    black while the reading is flagged invalid. ``images`` of shape (n, ROWS, COLUMNS, 1), uint8.
+    A slot's image shows the crystal whose bright ring is at the last reading, errors included, on the meniscus of that
+    moment. It is black while the reading is flagged invalid. ``images``: uint8 of shape (n, ROWS, COLUMNS, 1).
     """
     ring_offset = meniscus.ring_offset
 
@@ -127,7 +178,7 @@ def build_look(meniscus: MeniscusModel = HURLE) -> Any:
                 continue
             ring = slot.ring + p.ring_bias
             r_c = ring - p.ring_bias
-            for _ in range(_RADIUS_TURNS):
+            for _ in range(_RADIUS_STEPS):
                 r_c = ring - ring_offset(r_c, slot.h_seen, p)
             stream = scratch.stream[i]
             seed_stream(stream, slot.key, FIRST_FRAME + slot.k_seen)

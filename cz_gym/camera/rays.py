@@ -1,10 +1,11 @@
-"""Rays: what they hit, how melt mirrors them, and how bright they are.
+"""Geometry of rays: the surface that each meets first, and how the melt mirrors it.
 
-The meniscus is Hurle's profile, z / M = sqrt(2) sech(q) and X / M = q / sqrt(2) - sqrt(2) tanh(q) with q from the
-triple point outwards (the same curve as :func:`cz_gym.physics.meniscus.profile`, whose arccosh(sqrt(2) M / z) is q),
-turned about the crystal's axis. Its slope phi against the horizontal has sin(phi / 2) = sech(q). Along a ray that
-sinks, distance from the axis less radius of the profile is a function of q alone with a single zero below the triple
-point. Directions need not be of unit length. Radii, coordinates [m], radiances as in :class:`cz_gym.camera.View`.
+The meniscus is Hurle's profile, turned about the crystal's axis: z / M = sqrt(2) sech(q) and
+X / M = q / sqrt(2) - sqrt(2) tanh(q), with q increasing outwards from the triple point. It is the curve of
+:func:`cz_gym.physics.meniscus.profile`, where q is arccosh(sqrt(2) M / z). Its slope phi against the horizontal has
+sin(phi / 2) = sech(q). Where a sinking ray has the height of the profile at q, its distance from the axis minus the
+profile's radius is a function of q with a single zero below the triple point; Newton's method finds it.
+Directions need not have unit length. Coordinates are those of :mod:`cz_gym.camera.view`, in [m].
 """
 
 from __future__ import annotations
@@ -17,21 +18,19 @@ import numpy as np
 from cz_gym.jit.compile import jittable
 from cz_gym.physics.meniscus import hurle_slope, profile_scale
 
-from .view import COLUMNS, ROWS
-
 SQRT_2 = math.sqrt(2.0)
 FLAT = 9.5
-"""q beyond which the melt is flat: its slope there is less than 0.02 degrees, its height a micrometre."""
+"""q beyond which the melt counts as flat [-]: its slope is below 0.02 degrees, its height a micrometre."""
 CRYSTAL, MELT, WALL, SHIELD, OPENING = range(5)
-"""What a ray can hit."""
-_APART = 1e-4
-_TURNS = 60
+"""Surfaces that a ray can hit."""
+_MOST_STEPS = 60
+"""Largest number of Newton steps; three or four are usual."""
 _CLOSE = 1e-7
-"""Newton step after which the next, its square, is rounding error [-]."""
+"""Newton step below which the next one, about its square, is rounding error [-]."""
 
 
 class Scene(NamedTuple):
-    """Crystal and meniscus at an instant."""
+    """Crystal and meniscus in one image."""
 
     r_c: Any
     """Radius of the crystal [m]."""
@@ -59,7 +58,7 @@ class Ray(NamedTuple):
 
 
 class Hit(NamedTuple):
-    """What a ray meets first, where [m], and q there for melt [-]."""
+    """The surface that a ray meets first, the point [m], and q there; q = -1 off the meniscus."""
 
     what: Any
     x: Any
@@ -70,7 +69,7 @@ class Hit(NamedTuple):
 
 @jittable
 def make_scene(r_c: Any, h_c: Any, p: Any) -> Any:
-    """The scene of a crystal of radius r_c [m] on Hurle's meniscus of height h_c [m]; ``p.a`` [m]."""
+    """The scene of a crystal of radius r_c on Hurle's meniscus of height h_c [m]; ``p`` is the puller."""
     _, cos_theta = hurle_slope(r_c, h_c, p)
     M = profile_scale(r_c, h_c, cos_theta, p.a)
     q_c = np.arccosh(max(SQRT_2 * M / h_c, 1.0))
@@ -87,7 +86,7 @@ def _sech_tanh(q: Any) -> Any:
 
 @jittable
 def profile_at(q: Any, scene: Any) -> Any:
-    """Radius and height [m] of the meniscus at q, and their derivatives by q."""
+    """Radius and height [m] of the meniscus at q, and their derivatives with respect to q."""
     sech, tanh = _sech_tanh(q)
     M = scene.M
     r = scene.r_c + M * (q / SQRT_2 - SQRT_2 * tanh - scene.X_c)
@@ -103,7 +102,7 @@ def slope_at(q: Any) -> Any:
 
 @jittable
 def _gap(q: Any, ray: Any, scene: Any) -> Any:
-    """Distance of the ray from the axis less the profile's radius, at the profile's height; and its derivative."""
+    """Distance of the ray from the axis minus the profile's radius, at the profile's height, and its derivative."""
     r, z, dr, dz = profile_at(q, scene)
     t = (z - ray.z) / ray.dz
     x, y = ray.x + t * ray.dx, ray.y + t * ray.dy
@@ -114,8 +113,8 @@ def _gap(q: Any, ray: Any, scene: Any) -> Any:
 
 @jittable
 def _zero_of_gap(ray: Any, scene: Any, outside: Any, inside: Any, q: Any) -> Any:
-    """q where the ray meets the profile, by Newton's method held between a q outside the melt and one inside it."""
-    for _ in range(_TURNS):
+    """q where the ray meets the profile, by Newton's method between a q outside the melt and one inside it."""
+    for _ in range(_MOST_STEPS):
         gap, rate = _gap(q, ray, scene)
         step = gap / rate
         if abs(step) < _CLOSE:
@@ -132,7 +131,7 @@ def _zero_of_gap(ray: Any, scene: Any, outside: Any, inside: Any, q: Any) -> Any
 
 @jittable
 def _meet_below(ray: Any, scene: Any, q: Any) -> Any:
-    """q where a sinking ray that is outside the profile at ``q`` meets it, or -1: the melt is flat there."""
+    """q where a sinking ray, outside the profile at ``q``, meets it; -1 where the melt is flat."""
     t = -ray.z / ray.dz
     x, y = ray.x + t * ray.dx, ray.y + t * ray.dy
     beyond = np.sqrt(x * x + y * y) - scene.r_flat
@@ -145,7 +144,7 @@ def _meet_below(ray: Any, scene: Any, q: Any) -> Any:
 
 @jittable
 def _meet_above(ray: Any, scene: Any, q: Any) -> Any:
-    """q where a rising ray that is outside the profile at ``q`` meets it, or -1: it passes the triple point outside."""
+    """q where a rising ray, outside the profile at ``q``, meets it; -1 if it passes outside the triple point."""
     if ray.x * ray.dx + ray.y * ray.dy >= 0.0:
         return -1.0
     gap, _ = _gap(scene.q_c, ray, scene)
@@ -154,7 +153,7 @@ def _meet_above(ray: Any, scene: Any, q: Any) -> Any:
 
 @jittable
 def _meet_cylinder(ray: Any, radius: Any, outwards: Any) -> Any:
-    """Time at which the ray enters a cylinder about the axis, or leaves it; -1: never."""
+    """Time at which the ray enters a cylinder about the axis, or (``outwards``) leaves it; -1 if never."""
     a = ray.dx * ray.dx + ray.dy * ray.dy
     b = ray.x * ray.dx + ray.y * ray.dy
     c = ray.x * ray.x + ray.y * ray.y - radius * radius
@@ -167,7 +166,7 @@ def _meet_cylinder(ray: Any, radius: Any, outwards: Any) -> Any:
 
 @jittable
 def _meet_crystal(ray: Any, scene: Any) -> Any:
-    """Time at which the ray meets the crystal's wall, or passes its underside into it; -1: never."""
+    """Time at which the ray meets the crystal, through its wall or its underside; -1 if never."""
     inside = ray.x * ray.x + ray.y * ray.y < scene.r_c * scene.r_c
     t = _meet_cylinder(ray, scene.r_c, inside)
     return t if t > 0.0 and ray.z + t * ray.dz > scene.h_c else -1.0
@@ -193,7 +192,7 @@ def _at_profile(ray: Any, q: Any, scene: Any) -> Any:
 
 @jittable
 def _rising(ray: Any, q: Any, scene: Any, view: Any) -> Any:
-    """What a ray hits that does not sink."""
+    """The first hit of a ray that does not sink."""
     camera = view.camera
     t = _meet_crystal(ray, scene)
     shield = _at(SHIELD, ray, (camera.wall_height - ray.z) / ray.dz)
@@ -209,7 +208,7 @@ def _rising(ray: Any, q: Any, scene: Any, view: Any) -> Any:
 
 @jittable
 def _sinking(ray: Any, q: Any, scene: Any, view: Any) -> Any:
-    """What a ray hits that sinks."""
+    """The first hit of a sinking ray."""
     camera = view.camera
     t = _meet_crystal(ray, scene)
     if ray.z > camera.wall_height:
@@ -229,65 +228,17 @@ def _sinking(ray: Any, q: Any, scene: Any, view: Any) -> Any:
 
 @jittable
 def first_hit(ray: Any, q: Any, scene: Any, view: Any) -> Any:
-    """What a ray meets first; it is outside the melt at the meniscus' ``q``: the triple point's, or where it starts."""
+    """The first hit of a ray that is outside the melt at ``q``: the triple point's q, or the one where it starts."""
     return _sinking(ray, q, scene, view) if ray.dz < 0.0 else _rising(ray, q, scene, view)
 
 
 @jittable
 def mirror(ray: Any, hit: Any) -> Any:
-    """The ray that leaves the melt where another met it: the angle of reflection is the angle of incidence."""
-    sine, cosine = (0.0, 1.0)
+    """The reflected ray of one that met the melt: the angle of reflection is the angle of incidence."""
+    sine, cosine = 0.0, 1.0
     if hit.q >= 0.0:
         sine, cosine = slope_at(hit.q)
     r = np.sqrt(hit.x * hit.x + hit.y * hit.y)
     n_x, n_y = sine * hit.x / r, sine * hit.y / r
     twice = 2.0 * (ray.dx * n_x + ray.dy * n_y + ray.dz * cosine)
     return Ray(hit.x, hit.y, hit.z, ray.dx - twice * n_x, ray.dy - twice * n_y, ray.dz - twice * cosine)
-
-
-@jittable
-def _just_off(q: Any, ray: Any) -> Any:
-    """q a little along the profile from where a ray leaves the melt: there it is outside."""
-    if q < 0.0:
-        return FLAT
-    return q + _APART if ray.dz < 0.0 else q - _APART
-
-
-@jittable
-def emitted(hit: Any, scene: Any, view: Any) -> Any:
-    """Radiance of what was hit, light that it mirrors apart."""
-    if hit.what == MELT:
-        return view.melt
-    if hit.what == WALL:
-        return view.wall
-    if hit.what == SHIELD:
-        return view.shield
-    if hit.what == CRYSTAL:
-        far = view.camera.crystal_far_temperature
-        cooled = np.exp(-(hit.z - scene.h_c) / view.camera.crystal_cooling)
-        T = far + (view.camera.crystal_temperature - far) * cooled
-        return view.camera.crystal_emissivity * np.exp(view.wien * (1.0 / view.camera.wall_temperature - 1.0 / T))
-    return view.opening
-
-
-@jittable
-def radiance(ray: Any, scene: Any, view: Any) -> Any:
-    """Radiance that comes back along a ray from above the melt."""
-    light, share, q = 0.0, 1.0, scene.q_c
-    for _ in range(int(view.reflections) + 1):
-        hit = first_hit(ray, q, scene, view)
-        light += share * emitted(hit, scene, view)
-        if hit.what != MELT:
-            break
-        share *= view.mirrored
-        ray = mirror(ray, hit)
-        q = _just_off(hit.q, ray)
-    return light
-
-
-@jittable
-def sight(row: Any, column: Any, view: Any) -> Any:
-    """The ray from the lens through pixel coordinates of :func:`cz_gym.camera.project`."""
-    u = (column - 0.5 * COLUMNS) * view.pixel
-    v = (row - 0.5 * ROWS) * view.pixel
-    return Ray(view.x, 0.0, view.z, v * view.cos_tilt - view.sin_tilt, u, -view.cos_tilt - v * view.sin_tilt)

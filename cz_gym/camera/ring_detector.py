@@ -1,11 +1,10 @@
-"""The bright ring found in an image, and turned back into a radius.
+"""Detector of the bright ring in an image, which returns the crystal's radius.
 
-Scan lines run from the melt towards the axis, at fixed angles about it, in the plane where the ring's outer edge lies
-at the operating point, where the camera's geometry puts each sample. The edge is near where the grey value first rises
-halfway from the dark melt to the ring, and exactly where a sharp step would hold as much light: pixels add up light,
-so this hardly depends on where in a pixel the edge falls. A circle about the puller's axis is fitted by SciPy's
-robust least squares, so that single lines may be wrong. As in the plant, the operator's bias is taken off: what the
-detector says of this puller's own steady state, less r_0.
+Scan lines run from the melt towards the axis, at fixed angles about it, in the horizontal plane of the ring's outer
+edge at the operating point. The edge lies near the first sample halfway between dark melt and ring. Its exact place is
+that of a sharp step with the same total light: pixels add up light, so this hardly depends on where in a pixel the edge
+falls. SciPy's robust least squares fits a circle about the axis, so that a few lines may be wrong. The operator's bias,
+the reading at the puller's steady state minus r_0, is subtracted, as in the plant.
 """
 
 from __future__ import annotations
@@ -31,24 +30,24 @@ Floats = npt.NDArray[np.float64]
 ANGLES = np.radians(np.linspace(-24.0, 24.0, 121))
 """Angles of the scan lines about the axis, 0 towards the camera [rad]."""
 OUTER, INNER, SPACING = 16.0 * MM, 10.0 * MM, 0.1 * MM
-"""A scan line begins so far outside r_0, ends so far inside, with a sample every so often [m]."""
+"""Start of the scan lines outside r_0, their end inside r_0, and the distance of their samples [m]."""
 REACH = (2.0, 1.5)
-"""How far outside and inside its first guess an edge is looked at [pixels]."""
+"""Reach of the integral over an edge, outside and inside the first guess [pixels]."""
 LEAST_CONTRAST = 40.0
-"""Least rise from the dark melt to the ring [grey values]."""
+"""Smallest rise from dark melt to ring that counts as an edge [grey values]."""
 LEAST_SHARE = 0.95
-"""Least contrast, as a share of the operating point's: a ring too thin to fill a pixel is none."""
+"""Smallest contrast of a ring, as a share of the operating point's; a ring thinner than a pixel has less."""
 LEAST_LINES = 60
-"""Least scan lines with an edge."""
+"""Smallest number of scan lines with an edge."""
 ROBUST = 0.1 * MM
-"""Distance from the circle beyond which an edge counts for less [m]."""
+"""Scale of the robust loss: distance from the circle beyond which an edge has less weight [m]."""
 
 
 class Ring(NamedTuple):
-    """What a detector says of an image."""
+    """The ring in an image."""
 
     radius: float
-    """Radius of the ring's outer edge less the operator's bias [m]; NaN where no ring was found."""
+    """Radius of the ring's outer edge minus the operator's bias [m]; NaN without a ring."""
     edges: Floats
     """Radius at each scan line, bias included [m], shape (lines,); NaN where there is no edge."""
 
@@ -65,10 +64,10 @@ class Edge(NamedTuple):
 
 
 def wall_edge(scene: Scene, view: View) -> Edge:
-    """The point nearest to the camera that mirrors the upper end of the wall into it: the ring's outer edge, exactly.
+    """The ring's exact outer edge: the nearest point to the camera that mirrors the wall's upper end into it.
 
-    There the normal halves the angle between camera and wall's end, phi = (gamma + beta) / 2, both from the vertical.
-    NaN if the meniscus is nowhere as steep.
+    Its normal halves the angle between camera and wall's end: phi = (gamma + beta) / 2, both from the vertical. NaN if
+    the meniscus is nowhere steep enough.
     """
     slope, edge = 0.0, Edge(0.0, scene.r_c, scene.h_c)
     for _ in range(60):
@@ -84,10 +83,9 @@ def wall_edge(scene: Scene, view: View) -> Edge:
 class RingDetector:
     """Reads the ring's radius from images of one view of one puller.
 
-    ``bias`` [m] is what it takes off, measured on the puller's own steady state, and ``shape`` [m] by how much each
-    scan line differs there (seen from the side another slope mirrors the wall); ``height`` [m] the plane of its scan
-    lines; ``pixel`` [m] a pixel's height there. Raises ValueError if the view shows no
-    ring there.
+    It is calibrated on the puller's steady state: ``bias`` [m] is the operator's, ``shape`` [m] the deviation of each
+    scan line from the mean (seen from the side, another slope mirrors the wall). ``height`` [m] is that of the scan
+    lines' plane, ``pixel`` [m] the height of a pixel in it. Raises CzError if the view shows no ring in that state.
     """
 
     def __init__(self, view: View, puller: Puller) -> None:
@@ -100,10 +98,11 @@ class RingDetector:
         self.pixel = SPACING / float(rows[1] - rows[0])
         self._reach = tuple(round(pixels * self.pixel / SPACING) for pixels in REACH)
         self.bias, self.shape, self.contrast = 0.0, np.zeros(len(ANGLES)), 0.0
-        edges, self.contrast = self.find_edges(picture(puller.r_0, puller.h_0, puller, view))
+        image = picture(puller.r_0, puller.h_0, puller, view)
+        edges, self.contrast = self.find_edges(image)
         if np.isfinite(edges).all():
             self.shape = edges - edges.mean()
-        self.bias = self.read(picture(puller.r_0, puller.h_0, puller, view)).radius - puller.r_0
+        self.bias = self.read(image).radius - puller.r_0
         if not math.isfinite(self.bias):
             raise CzError(
                 "this camera shows no bright ring at the puller's operating point: the wall it mirrors "
@@ -111,7 +110,7 @@ class RingDetector:
             )
 
     def read(self, image: npt.NDArray[np.uint8]) -> Ring:
-        """Find the ring in an image, shape (ROWS, COLUMNS) or (ROWS, COLUMNS, 1)."""
+        """The ring in an image of shape (ROWS, COLUMNS) or (ROWS, COLUMNS, 1)."""
         edges, contrast = self.find_edges(image)
         found = np.isfinite(edges)
         if found.sum() < LEAST_LINES or contrast < LEAST_SHARE * self.contrast:
@@ -125,7 +124,7 @@ class RingDetector:
         return Ring(float(fit.x[0]) - self.bias, edges)
 
     def find_edges(self, image: npt.NDArray[np.uint8]) -> tuple[Floats, float]:
-        """Radius of the ring's outer edge on each scan line [m], NaN where there is none, and its contrast [greys]."""
+        """Radius of the outer edge on each scan line [m], NaN without an edge; and the contrast [grey values]."""
         grey = np.asarray(image, np.float64).reshape(image.shape[:2])
         lines = map_coordinates(grey, [self._where.row - 0.5, self._where.column - 0.5], order=1, mode="nearest")
         peak = np.argmax(lines, axis=1)

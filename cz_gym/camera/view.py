@@ -1,7 +1,7 @@
-"""The camera's view of the meniscus: one set of parameters, and what follows from it.
+"""The camera's parameters, and the view that follows from them.
 
 x points from the crystal's axis towards the camera, y to its right, z up; z = 0 is the melt far from the crystal.
-docs/camera.md says how the image is made.
+docs/camera.md describes how the image is made.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ _EMISSIVITIES = "order and range: Watanabe et al., High Temp. High Press. 31, 58
 
 
 class Camera(NamedTuple):
-    """Camera, hot zone and surfaces as the image needs them; SI units, kelvin, radians.
+    """Parameters of the camera, of the hot zone and of the surfaces in its image; SI units, kelvin, radians.
 
-    Another view is another instance: ``Camera(tilt=0.4)``. The temperatures do not follow the plant's: an industrial
-    camera sets its exposure by itself. :func:`camera_for` aims the camera at another puller's crystal.
+    For another view give other values: ``Camera(tilt=0.4)``. The temperatures do not follow the plant's state, because
+    an industrial camera adjusts its exposure. :func:`camera_for` aims the camera at another puller's crystal.
     """
 
     tilt: Annotated[float, Quantity("rad", "angle of the optical axis from the vertical", _ESTIMATE)] = math.radians(20)
@@ -76,7 +76,7 @@ class Camera(NamedTuple):
 
 
 def camera_for(parameters: Parameters) -> Camera:
-    """The default camera at a puller of these parameters: aimed at its crystal, the shield's opening in proportion."""
+    """The default camera for a puller: aimed at its crystal, with the heat shield's opening in proportion."""
     default = Camera()
     opening = (default.shield_radius - _SILICON.r_0) / (_SILICON.R_cr - _SILICON.r_0)
     return default._replace(
@@ -93,7 +93,7 @@ _AT_MOST_ONE = frozenset({"wall_emissivity", "shield_emissivity", "melt_emissivi
 
 
 def check_camera(camera: Camera, parameters: Parameters) -> Camera:
-    """Return the camera, or raise ValueError naming what cannot be at a puller of these parameters."""
+    """Return the camera, or raise CzError naming the parameter that is impossible at this puller."""
     if not isinstance(camera, Camera):
         raise CzError(f"camera must be a cz_gym.camera.Camera, not {camera!r}")
     check_numbers("camera parameter", camera, _MAY_BE_ZERO)
@@ -101,10 +101,11 @@ def check_camera(camera: Camera, parameters: Parameters) -> Camera:
         if name in _AT_MOST_ONE and value > 1:
             raise CzError(f"camera parameter {name} = {value!r} must not exceed 1")
     if camera.reflections not in range(1, MOST_REFLECTIONS + 1):
-        allowed = f"one of 1 to {MOST_REFLECTIONS}"
-        raise CzError(f"camera parameter reflections = {camera.reflections!r} must be {allowed}")
+        raise CzError(
+            f"camera parameter reflections = {camera.reflections!r} must be a whole number, 1 to {MOST_REFLECTIONS}"
+        )
     if camera.tilt >= 0.5 * math.pi:
-        raise CzError(f"camera parameter tilt = {camera.tilt!r} must be less than pi / 2 [rad]")
+        raise CzError(f"camera parameter tilt = {camera.tilt!r} must be below pi / 2 [rad]: is it in degrees?")
     if not parameters.r_0 < camera.shield_radius < camera.crucible_radius:
         raise CzError(
             f"the heat shield's opening (shield_radius = {camera.shield_radius} m) must be wider than the crystal "
@@ -120,17 +121,17 @@ def check_camera(camera: Camera, parameters: Parameters) -> Camera:
 
 
 class View(NamedTuple):
-    """A camera, and what the rays use of it: where it stands, how its pixels lie, how bright each thing is.
+    """A camera with the numbers derived from it: position, orientation, pixels, and the radiance of each surface.
 
     A ray through pixel coordinates (row, column) has direction ``forward + right u + down v``, with u and v the
-    distances from the image's centre in focal lengths. Radiances count black bodies as hot as the wall as one.
+    distances from the image's centre in focal lengths. The unit of radiance is a black body as hot as the wall.
     """
 
     camera: Camera
     x: float
-    """Lens, distance from the axis [m]; y = 0."""
+    """Distance of the lens from the axis [m]; it is at y = 0."""
     z: float
-    """Lens, height above the melt [m]."""
+    """Height of the lens above the melt [m]."""
     sin_tilt: float
     cos_tilt: float
     pixel: float
@@ -140,22 +141,22 @@ class View(NamedTuple):
     shield: float
     """Radiance of the heat shield [-]."""
     opening: float
-    """Radiance of what the shield's opening shows [-]."""
+    """Radiance seen through the shield's opening [-]."""
     melt: float
-    """What the melt itself emits [-]; it mirrors the rest."""
+    """Radiance that the melt emits itself [-]."""
     mirrored: float
-    """Share of light that the melt mirrors [-]."""
+    """Reflectivity of the melt [-]."""
     wien: float
-    """Second radiation constant over the wavelength [K]."""
+    """Second radiation constant divided by the wavelength [K]."""
     gain: float
-    """Grey values for each unit of radiance."""
+    """Grey values of a unit of radiance."""
     electrons: float
-    """Electrons for each grey value [-]."""
+    """Electrons of a grey value [-]."""
     reflections: int
 
 
 def make_view(camera: Camera) -> View:
-    """The view of a camera that :func:`check_camera` let pass."""
+    """The view of a camera that :func:`check_camera` has accepted."""
     c, wien = camera, SECOND_RADIATION / camera.wavelength
     sin_tilt, cos_tilt = math.sin(c.tilt), math.cos(c.tilt)
 
@@ -182,7 +183,7 @@ def make_view(camera: Camera) -> View:
 
 
 class Point(NamedTuple):
-    """Where something appears in the image: coordinates of :func:`project`, arrays of one shape."""
+    """Pixel coordinates of :func:`project`, numbers or arrays of one shape."""
 
     row: Any
     column: Any

@@ -80,7 +80,8 @@ class Record:
     def length(self) -> Floats:
         """Length grown at every sample since the record began [m]: what was pulled less what the meniscus rose."""
         pulled: Floats = np.cumsum(self.column("v_p")) - self.column("v_p")[0]
-        return pulled * self.config.control_interval - (self.column("h_c") - self.column("h_c")[0])
+        length: Floats = pulled * self.config.control_interval - (self.column("h_c") - self.column("h_c")[0])
+        return length
 
     def surface(self, height: float = np.inf) -> tuple[Floats, Floats, Floats]:
         """The grown surface: radius, reference [m] and height above the melt [m], newest (lowest) first.

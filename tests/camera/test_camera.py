@@ -210,6 +210,7 @@ def test_another_puller_is_in_the_picture() -> None:
     np.testing.assert_array_equal(image, picture(puller.r_0, puller.h_0, puller, view))
 
 
+@pytest.mark.slow  # compiles step and image for another meniscus
 def test_the_exact_meniscus_is_in_the_picture() -> None:
     puller = make_puller(meniscus=YOUNG_LAPLACE)
     detector = RingDetector(VIEW, puller)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from cz_gym import make_puller
+from cz_gym.camera.image import radiance, sight
 from cz_gym.camera.rays import (  # fmt: skip
     CRYSTAL,
     FLAT,
@@ -19,8 +20,6 @@ from cz_gym.camera.rays import (  # fmt: skip
     make_scene,
     mirror,
     profile_at,
-    radiance,
-    sight,
     slope_at,
 )
 from cz_gym.camera.ring_detector import wall_edge
@@ -174,7 +173,6 @@ def _compiled(row: float, column: float, scene: Scene, view: object) -> float:
     return radiance(sight(row, column, view), scene, view)
 
 
-@pytest.mark.slow
 def test_compiled_equals_uncompiled() -> None:
     rng = np.random.default_rng(3)
     for h_c in (1.2e-3, 4e-3, 6.64e-3, 9.3e-3):

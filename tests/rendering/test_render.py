@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 import cz_gym
 from cz_gym import CzEnv
-from cz_gym.rendering import backend
+from cz_gym.rendering import backend, view
 from cz_gym.rendering.scene import check_size
 from cz_gym.rendering.view import MODES, record_of
 from tests.processes import ROOT, python
@@ -50,7 +50,8 @@ def test_gymnasiums_checker_renders_every_mode_without_a_warning(mode: str | Non
 
 @pytest.mark.parametrize("scenario", ["randomized", "puller"])
 @pytest.mark.parametrize("mode", MODES)
-def test_rendering_changes_nothing(mode: str, scenario: str) -> None:
+def test_rendering_changes_nothing(mode: str, scenario: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(view, "FPS", 0)  # as fast as it can
     assert pickle.dumps(trajectory(mode, scenario)) == pickle.dumps(trajectory(None, scenario))
 
 
