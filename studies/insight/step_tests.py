@@ -1,4 +1,4 @@
-"""Step tests: one crystal, one event, several controllers; and how large an event each of them survives."""
+"""Single events on a crystal: how a controller reacts, and the largest event that it survives."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ BEGIN = 10.0 * MINUTE
 AT_ONCE = 16
 """Amplitudes tried in one batch."""
 JUMPS = np.array([1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 300.0]) * MICRO
-"""Jumps of the radius whose answers are compared [m]."""
+"""Sizes of the jumps of the radius [m]."""
 DRAWS, CRYSTALS = 5, 32
-"""Draws of noise that an event is survived under; crystals that an answer under noise is averaged over."""
+"""Draws of noise for each limit; crystals over which answers under noise are averaged."""
 RIPPLE = 0.1 * MM
-"""Amplitude of the ripple whose answer is shown [m]."""
+"""Amplitude of the ripple [m]."""
 ROTATIONS = np.linspace(8.0, 15.0, CRYSTALS) / MINUTE
-"""Crystal rotations that it is averaged over [rev/s]."""
+"""Crystal rotations over which the answer is averaged [rev/s]."""
 SPANS = 12
-"""Spans of ten minutes that it is followed for."""
+"""Number of spans of ten minutes."""
 PROPERTIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "melt loss": ("pullers", ("melt_loss",)),
     "steady drift": ("drift", ("rate",)),
@@ -44,18 +44,18 @@ PROPERTIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "heater slew": ("actuators", ("heater_slew",)),
     "heater steps": ("actuators", ("heater_step",)),
 }
-"""What the real puller adds to randomized: family and members of each property."""
+"""Properties that the scenario puller adds to randomized: the family and its members."""
 
 
 class Event(NamedTuple):
-    """Something that happens to a slot at a time [s]: ``change(slot record, amplitude)`` alters the record."""
+    """A change of a slot's record, ``change(record, amplitude)``, at a time [s]."""
 
     at: float
     change: Callable[[Any, float], None]
 
 
 def _set(*fields: tuple[str, float | None]) -> Callable[[Any, float], None]:
-    """A change that sets fields of the episode; None: to the amplitude."""
+    """A change that sets fields of the episode, to the amplitude where the value is None."""
 
     def change(slot: Any, amplitude: float) -> None:
         for name, value in fields:
@@ -71,7 +71,7 @@ def _interface(slot: Any, kelvin: float) -> None:
 
 
 def _load(slot: Any, kelvin: float) -> None:
-    """A hot zone that drifts at once, by what this change of the recipe would make up for; the recipe does not know."""
+    """A sudden drift of the hot zone by this many kelvin, which the heater recipe does not compensate."""
     for kind, amount in (("drift", kelvin), ("recipe", -kelvin)):
         _set((f"{kind}_start", BEGIN), (f"{kind}_duration", 5.0), (f"{kind}_amount", None))(slot, amount)
 
@@ -87,41 +87,35 @@ USUAL_NOISE = Event(0.0, _set(("camera_sd", 0.025 * MM), ("pyrometer_sd", 0.05))
 
 
 class StepTest(NamedTuple):
-    """A crystal with events."""
+    """One crystal on which events happen, each with the same amplitude."""
 
-    name: str
     title: str
-    """What happens, for people."""
     events: tuple[Event, ...]
     amplitude: float
-    """What the events are given."""
     minutes: float
     """Length [min]."""
 
 
 STEP_TESTS = (
-    StepTest("interface", "interface 0.3 K hotter", (Event(BEGIN, _interface),), 0.3, 60.0),
-    StepTest("load", "hot zone 1 K hotter, unannounced", (Event(0.0, _load),), 1.0, 120.0),
-    StepTest("reference", "reference falls 1 mm in 30 min", (Event(0.0, _reference),), -1.0 * MM, 60.0),
-    StepTest(
-        "noise", "camera noise 0.05 mm, 10 min", (Event(BEGIN, _noise), Event(2.0 * BEGIN, _silence)), 0.05 * MM, 40.0
-    ),
+    StepTest("interface 0.3 K hotter", (Event(BEGIN, _interface),), 0.3, 60.0),
+    StepTest("hot zone 1 K hotter, unannounced", (Event(0.0, _load),), 1.0, 120.0),
+    StepTest("reference falls 1 mm in 30 min", (Event(0.0, _reference),), -1.0 * MM, 60.0),
+    StepTest("camera noise 0.05 mm, 10 min", (Event(BEGIN, _noise), Event(2.0 * BEGIN, _silence)), 0.05 * MM, 40.0),
 )
-"""What the pictures show, on a nominal puller without noise."""
+"""The events of the first figure, on a nominal puller without noise."""
 
 
 class Limit(NamedTuple):
-    """An event that grows until the crystal is lost."""
+    """An event whose amplitude grows until the crystal is lost."""
 
     name: str
     meaning: str
     unit: str
     scale: float
-    """What the unit is in SI."""
+    """The unit in SI."""
     most: float
     """Largest amplitude tried, in that unit."""
     event: Event
-    """What happens under the usual noise."""
 
 
 LIMITS = (
@@ -134,19 +128,24 @@ LIMITS = (
     Limit("camera noise", "standard deviation from the start", "mm", MM, 2.0, Event(0.0, _noise)),
     Limit("late camera", "age of the newest frame", "s", 1.0, 60.0, Event(0.0, _latency)),
 )
-"""What the table of limits tries, on the nominal puller with the usual noise."""
+"""Rows of the table of limits, on the nominal puller with the usual noise."""
 
 
 class Interface(NamedTuple):
-    """How a policy meets the environment: arguments of ``gym.make``."""
+    """Arguments of ``gym.make`` that a policy was made for."""
 
     observation: str = "measured"
     action: str = "direct"
 
 
 def crystal(minutes: float, interface: Interface) -> Config:
-    """The nominal puller for that long."""
+    """A crystal of that length [min] on the nominal puller."""
     return make_config("nominal", MIX, interface.observation, horizon=minutes * MINUTE, action=interface.action)
+
+
+def control_interval() -> float:
+    """Time between actions [s]."""
+    return crystal(1.0, Interface()).control_interval
 
 
 def run_events(
@@ -156,7 +155,7 @@ def run_events(
     amplitudes: Sequence[float],
     seeds: Sequence[int] | None = None,
 ) -> Course:
-    """Run a policy on one crystal a slot, each with its amplitude; the finished course. Noise differs by seed alone."""
+    """Run a policy on one crystal for each amplitude; the finished course. Only the seed changes the noise."""
     course = Course(config, seeds or [VALIDATION_SEEDS[0]] * len(amplitudes))
     for event in sorted(events, key=lambda event: event.at):
         course.run(policy, round(event.at / config.control_interval))
@@ -177,15 +176,15 @@ def respond(policy: Any, config: Config, test: StepTest) -> Signals:
 
 
 class Survival(NamedTuple):
-    """How much of an event a controller survives: amplitudes below which every one tried was survived, limit's unit."""
+    """Largest amplitude of an event below which every one tried was survived, in the limit's unit."""
 
     largest: float
     """Median over the draws of noise."""
     least: float
     most: float
-    """The smallest and the largest of them."""
+    """Largest over the draws."""
     capped: bool
-    """Whether ``most`` is all that was tried."""
+    """Whether ``most`` is the largest amplitude tried."""
 
 
 def survive(policy: Any, limit: Limit, interface: Interface) -> Survival:
@@ -220,8 +219,8 @@ def jump_gains(policy: Any, interface: Interface, noisy: bool) -> Floats:
     return gains
 
 
-def ripple_answers(policy: Any, interface: Interface) -> Floats:
-    """How much of the pull speed is the answer to a ripple, RMS over that of the ripple, shape (SPANS,) [1/s].
+def ripple_gains(policy: Any, interface: Interface) -> Floats:
+    """RMS of the pull speed's answer to a ripple over the RMS of the ripple, shape (SPANS,) [1/s].
 
     The difference to the same crystal without the ripple, ten minutes at a time, over all :data:`ROTATIONS`.
     """
@@ -240,15 +239,15 @@ def ripple_answers(policy: Any, interface: Interface) -> Floats:
 
 
 def usual_noise(policy: Any, interface: Interface) -> Course:
-    """An hour of the usual noise, a slot a seed of :data:`CRYSTALS`."""
+    """An hour on CRYSTALS crystals with the usual noise and no event."""
     seeds = VALIDATION_SEEDS[:CRYSTALS]
     return run_events(policy, crystal(60.0, interface), (USUAL_NOISE,), [0.0] * CRYSTALS, seeds)
 
 
 def parts_of(whole: Scenario, base: Scenario) -> dict[str, Scenario]:
-    """What ``whole`` adds to ``base``, one property at a time: scenarios by the property's name.
+    """Scenarios by property: ``base`` with one property of ``whole`` each.
 
-    ValueError if the properties named here are not all that differs.
+    CzError if PROPERTIES does not cover every difference of the two.
     """
 
     def with_part(scenario: Scenario, family: str, members: tuple[str, ...], name: str) -> Scenario:
