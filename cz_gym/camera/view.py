@@ -31,7 +31,9 @@ class Camera(NamedTuple):
     an industrial camera adjusts its exposure. :func:`camera_for` aims the camera at another puller's crystal.
     """
 
-    tilt: Annotated[float, Quantity("rad", "angle of the optical axis from the vertical", _ESTIMATE)] = math.radians(20)
+    tilt: Annotated[float, Quantity("rad", "angle of the optical axis from the vertical", _ESTIMATE, 0.0)] = (
+        math.radians(20)
+    )
     distance: Annotated[float, Quantity("m", "from the lens to the melt, along the optical axis", _ESTIMATE)] = 1.0
     aim: Annotated[float, Quantity("m", "radius at which the optical axis meets the melt", f"{_ESTIMATE}: r_0")] = (
         _SILICON.r_0
@@ -88,7 +90,6 @@ def camera_for(parameters: Parameters) -> Camera:
     )
 
 
-_MAY_BE_ZERO = frozenset({"tilt"})
 _AT_MOST_ONE = frozenset({"wall_emissivity", "shield_emissivity", "melt_emissivity", "crystal_emissivity"})
 
 
@@ -96,7 +97,7 @@ def check_camera(camera: Camera, parameters: Parameters) -> Camera:
     """Return the camera, or raise CzError naming the parameter that is impossible at this puller."""
     if not isinstance(camera, Camera):
         raise CzError(f"camera must be a cz_gym.camera.Camera, not {camera!r}")
-    check_numbers("camera parameter", camera, _MAY_BE_ZERO)
+    check_numbers("camera parameter", camera)
     for name, value in camera._asdict().items():
         if name in _AT_MOST_ONE and value > 1:
             raise CzError(f"camera parameter {name} = {value!r} must not exceed 1")

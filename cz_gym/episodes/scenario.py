@@ -11,9 +11,22 @@ import hashlib
 import json
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from enum import Enum
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from cz_gym.errors import CzError
+from cz_gym.plausible import (
+    IN_K_PER_MIN,
+    IN_MM,
+    IN_MM_PER_MIN,
+    IN_MM_PER_MIN2,
+    IN_PERCENT,
+    IN_REV_PER_MIN,
+    Slip,
+    check_plausible,
+)
 from cz_gym.units import HOUR, MM
 
 Range = tuple[float, float]
@@ -22,21 +35,72 @@ DRAW_SPAN = 3.0 * HOUR
 """Span [s] over which "uniform over the episode" is drawn, whatever the horizon: a draw never depends on it."""
 
 
+MAX_LENGTH = 5.0 * MM
+"""Largest error of the camera [m]; a crystal is lost long before."""
+MAX_NOISE = 2.0 * MM
+"""Largest standard deviation of the camera's noise [m]."""
+MAX_LATENCY = 60.0
+"""Oldest camera frame a scenario may deliver [s]."""
+MAX_FLAGGED, MAX_UNFLAGGED = 3, 1
+"""Most freezes of each kind in an episode."""
+_LONGEST = 1e6
+_BELOW_HALF, _BELOW_ONE = math.nextafter(0.5, 0.0), math.nextafter(1.0, 0.0)
+_FASTEST_PULL, _FASTEST_SLEW, _FASTEST_RAMP = 1e-3, 1e-5, 0.1
+
+
+class Draw(Enum):
+    """When a member of a scenario makes its episodes differ from each other."""
+
+    NEVER = "never"
+    """It is a constant, or matters only beside another member."""
+    RANGE = "range"
+    """Where the ends of its range differ: the value is drawn between them."""
+    NONZERO = "nonzero"
+    """Wherever it is not zero: the size or the number of something random."""
+    CHANCE = "chance"
+    """Between 0 and 1: the probability that something happens."""
+
+    def differs(self, value: Any) -> bool:
+        """Whether a member of this kind and value makes episodes differ."""
+        if self is Draw.RANGE:
+            return bool(value[0] != value[1])
+        if self is Draw.CHANCE:
+            return bool(0.0 < value < 1.0)
+        return self is Draw.NONZERO and bool(np.any(value))
+
+
+class Member(NamedTuple):
+    """What a scenario's member says of itself: the metadata ``member`` of its field."""
+
+    draw: Draw
+    low: float
+    """Smallest allowed value."""
+    high: float
+    """Largest allowed value, the default apart."""
+    slip: Slip | None
+    """Unit that the number may have been typed in by mistake."""
+
+
+def member(default: Any, draw: Draw, low: float, high: float, slip: Slip | None = None) -> Any:
+    """A field of a family of disturbances; every one says whether it is random and what is plausible."""
+    return field(default=default, metadata={"member": Member(draw, low, high, slip)})
+
+
 @dataclass(frozen=True)
 class Pullers:
     """Spread of the pullers: a uniform factor 1 +- spread on each group, and the mix of models."""
 
-    mix: Range = (1.0, 1.0)
+    mix: Range = member((1.0, 1.0), Draw.RANGE, 0.0, 1.0)
     """Share of conduction lambda [-]."""
-    capillary: float = 0.0
+    capillary: float = member(0.0, Draw.NONZERO, 0.0, _BELOW_HALF, IN_PERCENT)
     """Spread of the capillary constant a [-]."""
-    conductivity: float = 0.0
+    conductivity: float = member(0.0, Draw.NONZERO, 0.0, _BELOW_HALF, IN_PERCENT)
     """Spread of k_l [-]."""
-    conductance: float = 0.0
+    conductance: float = member(0.0, Draw.NONZERO, 0.0, _BELOW_HALF, IN_PERCENT)
     """Spread of kappa_12, G_1a, G_2b and kappa_b, each on its own [-]."""
-    start_radius_sd: float = 0.0
+    start_radius_sd: float = member(0.0, Draw.NONZERO, 0.0, MAX_LENGTH, IN_MM)
     """Standard deviation of r_c(0) - r_0 [m]."""
-    melt_loss: float = 0.0
+    melt_loss: float = member(0.0, Draw.NEVER, 0.0, _BELOW_ONE, IN_PERCENT)
     """Share of the melt's heat capacity lost, linearly over 3 h, then held [-]."""
 
 
@@ -44,11 +108,11 @@ class Pullers:
 class Recipe:
     """Error e(t) of the temperature recipe: linear at a rate, for a while, then held."""
 
-    rate: Range = NONE
+    rate: Range = member(NONE, Draw.RANGE, -_FASTEST_RAMP, _FASTEST_RAMP, IN_K_PER_MIN)
     """Rate of T_1,ref [K/s]."""
-    duration: Range = NONE
+    duration: Range = member(NONE, Draw.RANGE, 0.0, _LONGEST)
     """Length of the ramp [s]."""
-    start: Range = NONE
+    start: Range = member(NONE, Draw.RANGE, 0.0, _LONGEST)
     """Start of the ramp [s]."""
 
 
@@ -56,13 +120,13 @@ class Recipe:
 class Drift:
     """Drift p(t) of the hot zone, hidden in the melt's heat load and followed by a perfect recipe."""
 
-    amount: Range = NONE
+    amount: Range = member(NONE, Draw.RANGE, -500.0, 500.0)
     """Final drift [K]."""
-    duration: Range = NONE
+    duration: Range = member(NONE, Draw.RANGE, 0.0, _LONGEST)
     """Length of the ramp [s]."""
-    start: Range = NONE
+    start: Range = member(NONE, Draw.RANGE, 0.0, _LONGEST)
     """Start of the ramp [s]."""
-    rate: float = 0.0
+    rate: float = member(0.0, Draw.NEVER, -_FASTEST_RAMP, _FASTEST_RAMP, IN_K_PER_MIN)
     """Steady rate on top, from t = 0 on [K/s]."""
 
 
@@ -70,11 +134,11 @@ class Drift:
 class Interface:
     """Fluctuation dT_i of the interface temperature: two stationary Ornstein-Uhlenbeck processes."""
 
-    sd: Range = NONE
+    sd: Range = member(NONE, Draw.NONZERO, 0.0, 100.0)
     """Standard deviation of each, drawn separately [K]."""
-    tau_fast: float = 30.0
+    tau_fast: float = member(30.0, Draw.NEVER, 1e-3, _LONGEST)
     """Correlation time of the fast one [s]."""
-    tau_slow: float = 780.0
+    tau_slow: float = member(780.0, Draw.NEVER, 1e-3, _LONGEST)
     """Correlation time of the slow one [s]."""
 
 
@@ -82,13 +146,13 @@ class Interface:
 class Reference:
     """Change of the radius reference along the quintic 10 s^3 - 15 s^4 + 6 s^5."""
 
-    probability: float = 0.0
+    probability: float = member(0.0, Draw.CHANCE, 0.0, 1.0, IN_PERCENT)
     """Share of episodes with a change [-]."""
-    amount: Range = NONE
+    amount: Range = member(NONE, Draw.RANGE, -MAX_LENGTH, MAX_LENGTH, IN_MM)
     """Change [m]."""
-    duration: Range = NONE
+    duration: Range = member(NONE, Draw.RANGE, 0.0, _LONGEST)
     """Length [s]."""
-    start: Range = NONE
+    start: Range = member(NONE, Draw.RANGE, 0.0, _LONGEST)
     """Start [s]."""
 
 
@@ -96,25 +160,25 @@ class Reference:
 class Sensor:
     """Camera and pyrometer."""
 
-    camera_noise: Range = NONE
+    camera_noise: Range = member(NONE, Draw.NONZERO, 0.0, MAX_NOISE, IN_MM)
     """Standard deviation of the white noise on the ring [m]."""
-    pyrometer_noise: Range = NONE
+    pyrometer_noise: Range = member(NONE, Draw.NONZERO, 0.0, 100.0)
     """Standard deviation of the white noise on T_1 [K]."""
-    pyrometer_drift: Range = NONE
+    pyrometer_drift: Range = member(NONE, Draw.RANGE, -500.0, 500.0)
     """Drift of the pyrometer, linear over 3 h, then held [K]."""
-    bias_offset: Range = NONE
+    bias_offset: Range = member(NONE, Draw.RANGE, -MAX_LENGTH, MAX_LENGTH, IN_MM)
     """Constant offset of the ring from a wrong bias [m]."""
-    level_offset: Range = NONE
+    level_offset: Range = member(NONE, Draw.RANGE, -MAX_LENGTH, MAX_LENGTH, IN_MM)
     """Constant offset of the ring from the melt level [m]."""
-    ripple: Range = NONE
+    ripple: Range = member(NONE, Draw.NONZERO, 0.0, MAX_LENGTH, IN_MM)
     """Amplitude of the rotation-synchronous ripple [m]."""
-    rotation: Range = NONE
+    rotation: Range = member(NONE, Draw.RANGE, 0.0, 2.0, IN_REV_PER_MIN)
     """Crystal rotation [rev/s]."""
-    latency: float = 0.0
+    latency: float = member(0.0, Draw.NEVER, 0.0, MAX_LATENCY)
     """Age of the newest camera frame [s]; frames are taken at samples and on the 5 s grid."""
-    outlier_probability: float = 0.0
+    outlier_probability: float = member(0.0, Draw.NONZERO, 0.0, 1.0, IN_PERCENT)
     """Share of samples that carry an outlier [-]."""
-    outlier_sd: float = 0.0
+    outlier_sd: float = member(0.0, Draw.NEVER, 0.0, MAX_LENGTH, IN_MM)
     """Standard deviation of an outlier [m]."""
 
 
@@ -122,19 +186,19 @@ class Sensor:
 class Faults:
     """Faults of the camera: freezes show the last value; starts are uniform over 3 h, freezes disjoint."""
 
-    flagged: tuple[int, int] = (0, 0)
+    flagged: tuple[int, int] = member((0, 0), Draw.NONZERO, 0, MAX_FLAGGED)
     """Least and largest number of freezes with valid = 0; at most 3."""
-    flagged_duration: Range = NONE
+    flagged_duration: Range = member(NONE, Draw.RANGE, 0.0, _LONGEST)
     """Their length [s]."""
-    unflagged: int = 0
+    unflagged: int = member(0, Draw.NONZERO, 0, MAX_UNFLAGGED)
     """Number of freezes with valid = 1; at most 1."""
-    unflagged_duration: Range = NONE
+    unflagged_duration: Range = member(NONE, Draw.RANGE, 0.0, _LONGEST)
     """Its length [s]."""
-    dropout: Range = NONE
+    dropout: Range = member(NONE, Draw.NONZERO, 0.0, 1.0, IN_PERCENT)
     """Probability of a sample with valid = 0 [-]."""
-    bias_drift: Range = NONE
+    bias_drift: Range = member(NONE, Draw.NONZERO, -MAX_LENGTH, MAX_LENGTH, IN_MM)
     """Final unflagged drift of the ring [m]."""
-    bias_drift_duration: Range = NONE
+    bias_drift_duration: Range = member(NONE, Draw.RANGE, 0.0, _LONGEST)
     """Its length [s]."""
 
 
@@ -142,23 +206,14 @@ class Faults:
 class Actuators:
     """Limits of the drives beyond the action box; infinite or zero where there are none."""
 
-    pull_window: float = math.inf
+    pull_window: float = member(math.inf, Draw.NEVER, 0.0, _FASTEST_PULL, IN_MM_PER_MIN)
     """Largest |v_p - v_0| [m/s]."""
-    pull_slew: float = math.inf
+    pull_slew: float = member(math.inf, Draw.NEVER, 0.0, _FASTEST_SLEW, IN_MM_PER_MIN2)
     """Largest rate of change of v_p [m/s2]."""
-    heater_slew: float = math.inf
+    heater_slew: float = member(math.inf, Draw.NEVER, 0.0, 1e6)
     """Largest rate of change of Q_H [W/s]."""
-    heater_step: float = 0.0
+    heater_step: float = member(0.0, Draw.NEVER, 0.0, 1e5)
     """Resolution of Q_H - Q_H0 [W]."""
-
-
-MAX_FLAGGED, MAX_UNFLAGGED = 3, 1
-MAX_LENGTH = 5.0 * MM
-"""Largest error of the camera [m]; a crystal is lost long before."""
-MAX_NOISE = 2.0 * MM
-"""Largest standard deviation of the camera's noise [m]."""
-MAX_LATENCY = 60.0
-"""Oldest camera frame a scenario may deliver [s]."""
 
 
 @dataclass(frozen=True)
@@ -176,60 +231,18 @@ class Scenario:
     actuators: Actuators = field(default_factory=Actuators)
 
     def __post_init__(self) -> None:
+        if not (self.name and isinstance(self.name, str)):
+            raise CzError(f"a scenario needs a name, not {self.name!r}")
         for family in dataclasses.fields(self)[1:]:
-            expected, value = _FAMILIES[family.name], getattr(self, family.name)
-            if not isinstance(value, expected):
-                raise CzError(f"scenario {self.name!r}: {family.name} must be a {expected.__name__}, not {value!r}")
-            for member in dataclasses.fields(value):
-                _check(
-                    f"scenario {self.name!r}: {family.name}.{member.name}", member.default, getattr(value, member.name)
-                )
-        self._check_sense()
-
-    def _check_sense(self) -> None:
-        def need(fact: bool, what: str) -> None:
-            if not fact:
-                raise CzError(f"scenario {self.name!r}: {what}")
-
-        need(bool(self.name) and isinstance(self.name, str), "needs a name")
-        need(
-            0.0 <= self.pullers.mix[0] <= self.pullers.mix[1] <= 1.0,
-            f"pullers.mix = {self.pullers.mix} must lie in [0, 1]",
-        )
-        for spread in ("capillary", "conductivity", "conductance"):
-            need(0.0 <= getattr(self.pullers, spread) < 0.5, f"pullers.{spread} must lie in [0, 0.5)")
-        need(0.0 <= self.pullers.melt_loss < 1.0, "pullers.melt_loss must lie in [0, 1)")
-        need(0.0 <= self.reference.probability <= 1.0, "reference.probability must lie in [0, 1]")
-        need(0.0 <= self.sensor.outlier_probability <= 1.0, "sensor.outlier_probability must lie in [0, 1]")
-        need(0.0 <= self.faults.dropout[0] <= self.faults.dropout[1] <= 1.0, "faults.dropout must lie in [0, 1]")
-        need(
-            0 <= self.faults.flagged[0] <= self.faults.flagged[1] <= MAX_FLAGGED,
-            f"faults.flagged must lie in 0..{MAX_FLAGGED}",
-        )
-        need(0 <= self.faults.unflagged <= MAX_UNFLAGGED, f"faults.unflagged must lie in 0..{MAX_UNFLAGGED}")
-        longest = (
-            self.faults.flagged[1] * self.faults.flagged_duration[1]
-            + self.faults.unflagged * self.faults.unflagged_duration[1]
-        )
-        need(longest <= DRAW_SPAN, f"freezes of {longest} s do not fit into {DRAW_SPAN} s")
-        need(
-            self.interface.tau_fast > 0 and self.interface.tau_slow > 0, "interface correlation times must be positive"
-        )
-        need(0.0 <= self.sensor.latency <= MAX_LATENCY, f"sensor.latency must lie in [0, {MAX_LATENCY}] s")
-        need(min(vars(self.actuators).values()) >= 0, "actuator limits must not be negative")
-        for family, names in _LENGTHS.items():
-            for name in names:
-                value = getattr(getattr(self, family), name)
-                length = max(map(abs, value if isinstance(value, tuple) else (value,)))
-                said = f"{family}.{name} of {length:g} m is {1e3 * length:g} mm: did you mean {length:g} * MM?"
-                need(length <= (MAX_NOISE if name == "camera_noise" else MAX_LENGTH), said)
-        for family, names in _NOT_NEGATIVE.items():
-            for name in names:
-                value = getattr(getattr(self, family), name)
-                need(
-                    min(value if isinstance(value, tuple) else (value,)) >= 0,
-                    f"{family}.{name} = {value} must not be negative",
-                )
+            value, kind = getattr(self, family.name), _kind(family)
+            if not isinstance(value, kind):
+                raise CzError(f"scenario {self.name!r}: {family.name} must be a {kind.__name__}, not {value!r}")
+            for each in dataclasses.fields(kind):
+                _check(f"scenario {self.name!r}: {family.name}.{each.name}", each, getattr(value, each.name))
+        faults = self.faults
+        longest = faults.flagged[1] * faults.flagged_duration[1] + faults.unflagged * faults.unflagged_duration[1]
+        if longest > DRAW_SPAN:
+            raise CzError(f"scenario {self.name!r}: freezes of {longest} s do not fit into {DRAW_SPAN} s")
 
     @property
     def hash(self) -> str:
@@ -245,41 +258,29 @@ class Scenario:
 
     @property
     def deterministic(self) -> bool:
-        """Whether every draw is the same."""
-        return all(not _is_random(getattr(self, family.name)) for family in dataclasses.fields(self)[1:])
+        """Whether all its episodes are the same: every member says when it is random (:class:`Draw`)."""
+        families = (getattr(self, family.name) for family in dataclasses.fields(self)[1:])
+        members = ((family, each) for family in families for each in dataclasses.fields(family))
+        return not any(each.metadata["member"].draw.differs(getattr(family, each.name)) for family, each in members)
 
 
-_FAMILIES: dict[str, type[Any]] = {
-    "pullers": Pullers,
-    "recipe": Recipe,
-    "drift": Drift,
-    "interface": Interface,
-    "reference": Reference,
-    "sensor": Sensor,
-    "faults": Faults,
-    "actuators": Actuators,
-}
-_LENGTHS = {
-    "pullers": ("start_radius_sd",),
-    "reference": ("amount",),
-    "sensor": ("camera_noise", "bias_offset", "level_offset", "ripple", "outlier_sd"),
-    "faults": ("bias_drift",),
-}
-_NOT_NEGATIVE = {
-    "pullers": ("start_radius_sd",),
-    "recipe": ("duration", "start"),
-    "drift": ("duration", "start"),
-    "interface": ("sd",),
-    "reference": ("duration", "start"),
-    "sensor": ("camera_noise", "pyrometer_noise", "ripple", "rotation", "outlier_sd"),
-    "faults": ("flagged_duration", "unflagged_duration", "bias_drift_duration"),
-}
-_ALWAYS_RANDOM = ("start_radius_sd", "capillary", "conductivity", "conductance", "outlier_probability", "unflagged")
-_RANDOM_UNLESS_ZERO = ("sd", "camera_noise", "pyrometer_noise", "dropout", "ripple", "flagged", "bias_drift")
+def _kind(family: dataclasses.Field[Any]) -> type[Any]:
+    """The class of a family of disturbances."""
+    kind: Any = family.default_factory
+    return kind  # type: ignore[no-any-return]
 
 
-def _check(where: str, default: Any, value: Any) -> None:
-    """Raise ValueError unless the value has its default's form: a number, or a pair (low, high)."""
+def _check(where: str, each: dataclasses.Field[Any], value: Any) -> None:
+    """Raise CzError unless a member's value has its default's form and lies in its range."""
+    _check_form(where, each.default, value)
+    _, low, high, slip = each.metadata["member"]
+    if value != each.default:
+        for number in value if isinstance(value, tuple) else (value,):
+            check_plausible(where, number, low, high, slip=slip)
+
+
+def _check_form(where: str, default: Any, value: Any) -> None:
+    """Raise CzError unless the value has its default's form: a number, or a pair (low, high)."""
     if isinstance(default, tuple):
         if not (isinstance(value, tuple) and len(value) == 2):
             raise CzError(f"{where} must be a pair (low, high), not {value!r}")
@@ -302,14 +303,3 @@ def _plain(default: Any, value: Any) -> Any:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
-
-
-def _is_random(family: Any) -> bool:
-    for member, value in vars(family).items():
-        if member in _ALWAYS_RANDOM and value:
-            return True
-        if member == "probability" and 0.0 < value < 1.0:
-            return True
-        if isinstance(value, tuple) and (value[0] != value[1] or (member in _RANDOM_UNLESS_ZERO and any(value))):
-            return True
-    return False

@@ -3,25 +3,42 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
 from numbers import Real
 from typing import Annotated, Any, NamedTuple, get_type_hints
 
 from cz_gym.errors import CzError
+from cz_gym.plausible import (
+    IN_CELSIUS,
+    IN_DEGREES,
+    IN_KILO,
+    IN_MILLI,
+    IN_MM,
+    IN_MM_PER_MIN,
+    IN_PERCENT,
+    Slip,
+    check_plausible,
+)
 from cz_gym.units import MM, MM_PER_MIN
 
 
 class Quantity(NamedTuple):
-    """What a number is: its unit, its meaning and where its value comes from."""
+    """What a number is: unit, meaning, where its value comes from, and the range in which it is plausible."""
 
     unit: str
     meaning: str
     source: str
+    low: float | None = None
+    """Smallest plausible value; None: any above zero."""
+    high: float = math.inf
+    """Largest plausible value."""
+    slip: Slip | None = None
+    """Unit that the number may have been typed in by mistake."""
 
 
 _LITERATURE = "silicon literature"
 _ESTIMATE = "estimate"
 _PART_II = "Bukhari, Hovd, Winkler, Part II"
+_BELOW_RIGHT_ANGLE = math.nextafter(math.pi / 2.0, 0.0)
 
 
 class Parameters(NamedTuple):
@@ -32,40 +49,65 @@ class Parameters(NamedTuple):
     ``Parameters(r_0=0.1)`` or ``Parameters()._replace(sigma=0.83)``.
     """
 
-    sigma: Annotated[float, Quantity("N/m", "surface tension of the melt", f"{_LITERATURE}, 0.72-0.83")] = 0.72
-    rho_l: Annotated[float, Quantity("kg/m3", "density of the melt", f"{_LITERATURE}, 2510-2570")] = 2570.0
-    alpha_0: Annotated[float, Quantity("rad", "contact (growth) angle", _LITERATURE)] = math.radians(11.0)
-    g: Annotated[float, Quantity("m/s2", "gravity", "fixed")] = 9.81
-    sigma_SB: Annotated[float, Quantity("W/m2/K4", "Stefan-Boltzmann constant", "CODATA")] = 5.670374419e-8
-    k_l: Annotated[float, Quantity("W/m/K", "thermal conductivity of the melt", _LITERATURE)] = 62.0
-    rho_s: Annotated[float, Quantity("kg/m3", "density of the crystal", _LITERATURE)] = 2330.0
-    dH: Annotated[float, Quantity("J/kg", "latent heat of fusion", _LITERATURE)] = 1.8e6
-    T_m: Annotated[float, Quantity("K", "melting temperature", _LITERATURE)] = 1685.0
+    sigma: Annotated[
+        float, Quantity("N/m", "surface tension of the melt", f"{_LITERATURE}, 0.72-0.83", 0.01, 5.0, IN_MILLI)
+    ] = 0.72
+    rho_l: Annotated[
+        float, Quantity("kg/m3", "density of the melt", f"{_LITERATURE}, 2510-2570", 100.0, 3e4, IN_KILO)
+    ] = 2570.0
+    alpha_0: Annotated[
+        float, Quantity("rad", "contact (growth) angle", _LITERATURE, 0.0, _BELOW_RIGHT_ANGLE, IN_DEGREES)
+    ] = math.radians(11.0)
+    g: Annotated[float, Quantity("m/s2", "gravity", "fixed", None, 100.0)] = 9.81
+    sigma_SB: Annotated[float, Quantity("W/m2/K4", "Stefan-Boltzmann constant", "CODATA", None, 1e-6)] = 5.670374419e-8
+    k_l: Annotated[float, Quantity("W/m/K", "thermal conductivity of the melt", _LITERATURE, 0.1, 1e3)] = 62.0
+    rho_s: Annotated[float, Quantity("kg/m3", "density of the crystal", _LITERATURE, 100.0, 3e4, IN_KILO)] = 2330.0
+    dH: Annotated[float, Quantity("J/kg", "latent heat of fusion", _LITERATURE, 1e4, 1e8, IN_KILO)] = 1.8e6
+    T_m: Annotated[float, Quantity("K", "melting temperature", _LITERATURE, 200.0, 5e3, IN_CELSIUS)] = 1685.0
     dT_0: Annotated[
-        float, Quantity("K", "nominal superheat of the melt bulk", f"fitted: stable pole of {_PART_II}")
+        float, Quantity("K", "nominal superheat of the melt bulk", f"fitted: stable pole of {_PART_II}", None, 500.0)
     ] = 5.02
     phi_b: Annotated[
         float,
         Quantity(
-            "rad", "effective reflection slope of the bright ring, not a camera pose", f"fitted: G_m of {_PART_II}"
+            "rad",
+            "effective reflection slope of the bright ring, not a camera pose",
+            f"fitted: G_m of {_PART_II}",
+            None,
+            _BELOW_RIGHT_ANGLE,
+            IN_DEGREES,
         ),
     ] = math.radians(3.5)
-    r_0: Annotated[float, Quantity("m", "nominal crystal radius", _PART_II)] = 87.5 * MM
-    v_0: Annotated[float, Quantity("m/s", "nominal pull speed", _PART_II)] = 1.2 * MM_PER_MIN
-    C_1: Annotated[float, Quantity("J/K", "heat capacity of the heater", f"{_ESTIMATE}: 30 kg graphite")] = 5.7e4
+    r_0: Annotated[float, Quantity("m", "nominal crystal radius", _PART_II, None, 2.0, IN_MM)] = 87.5 * MM
+    v_0: Annotated[float, Quantity("m/s", "nominal pull speed", _PART_II, None, 1e-3, IN_MM_PER_MIN)] = 1.2 * MM_PER_MIN
+    C_1: Annotated[
+        float, Quantity("J/K", "heat capacity of the heater", f"{_ESTIMATE}: 30 kg graphite", 500.0, 1e9, IN_KILO)
+    ] = 5.7e4
     C_2: Annotated[
-        float, Quantity("J/K", "heat capacity of susceptor and crucible", f"{_ESTIMATE}: susceptor and quartz")
+        float,
+        Quantity(
+            "J/K",
+            "heat capacity of susceptor and crucible",
+            f"{_ESTIMATE}: susceptor and quartz",
+            500.0,
+            1e9,
+            IN_KILO,
+        ),
     ] = 1.0e5
-    C_b: Annotated[float, Quantity("J/K", "heat capacity of the melt bulk", f"{_ESTIMATE}: 80 kg melt")] = 8.0e4
-    kappa_12: Annotated[float, Quantity("W/K4", "radiative link heater to susceptor", _ESTIMATE)] = 2.8e-8
-    G_1a: Annotated[float, Quantity("W/K", "insulation loss of the heater", _ESTIMATE)] = 30.0
-    T_a: Annotated[float, Quantity("K", "ambient (shell) temperature", _ESTIMATE)] = 350.0
-    G_2b: Annotated[float, Quantity("W/K", "conductance of the quartz wall", _ESTIMATE)] = 200.0
-    eps: Annotated[float, Quantity("1", "emissivity of the melt surface", f"{_ESTIMATE}: liquid silicon")] = 0.2
-    R_cr: Annotated[float, Quantity("m", "inner radius of the crucible", _ESTIMATE)] = 0.28
-    T_e: Annotated[float, Quantity("K", "effective temperature the melt surface sees", f"{_ESTIMATE}: heat shield")] = (
-        1300.0
-    )
+    C_b: Annotated[
+        float, Quantity("J/K", "heat capacity of the melt bulk", f"{_ESTIMATE}: 80 kg melt", 500.0, 1e9, IN_KILO)
+    ] = 8.0e4
+    kappa_12: Annotated[float, Quantity("W/K4", "radiative link heater to susceptor", _ESTIMATE, None, 1e-4)] = 2.8e-8
+    G_1a: Annotated[float, Quantity("W/K", "insulation loss of the heater", _ESTIMATE, None, 1e5)] = 30.0
+    T_a: Annotated[float, Quantity("K", "ambient (shell) temperature", _ESTIMATE, 200.0, 2e3, IN_CELSIUS)] = 350.0
+    G_2b: Annotated[float, Quantity("W/K", "conductance of the quartz wall", _ESTIMATE, None, 1e5)] = 200.0
+    eps: Annotated[
+        float, Quantity("1", "emissivity of the melt surface", f"{_ESTIMATE}: liquid silicon", None, 1.0, IN_PERCENT)
+    ] = 0.2
+    R_cr: Annotated[float, Quantity("m", "inner radius of the crucible", _ESTIMATE, None, 5.0, IN_MM)] = 0.28
+    T_e: Annotated[
+        float, Quantity("K", "effective temperature the melt surface sees", f"{_ESTIMATE}: heat shield", 0.0)
+    ] = 1300.0
 
 
 def describe(kind: type[Any] = Parameters) -> dict[str, Quantity]:
@@ -74,31 +116,27 @@ def describe(kind: type[Any] = Parameters) -> dict[str, Quantity]:
     return {name: hints[name].__metadata__[0] for name in kind._fields}
 
 
-_MAY_BE_ZERO = frozenset({"alpha_0", "T_a", "T_e"})
-MOST_V_0 = 1e-3
-"""Largest nominal pull speed [m/s]; silicon is pulled at hundredths of it."""
-
-
-def check_numbers(what: str, values: Any, may_be_zero: Collection[str]) -> None:
-    """ValueError names a field of a tuple of quantities that is no positive finite number."""
+def check_numbers(what: str, values: Any) -> None:
+    """Raise CzError naming a field of a tuple of quantities that is no number, or no plausible one."""
     for name, value in values._asdict().items():
+        unit, _, _, low, high, slip = describe(type(values))[name]
         number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-        if not number or value < 0 or (value == 0 and name not in may_be_zero):
-            unit = describe(type(values))[name].unit
+        if not number or value < 0 or (value == 0 and low != 0):
             raise CzError(f"{what} {name} = {value!r} must be a positive finite number [{unit}]")
+        check_plausible(f"{what} {name}", float(value), low or 0.0, high, unit, slip)
 
 
 def check_parameters(parameters: Parameters) -> Parameters:
-    """Return the parameters, or raise ValueError naming the one that is not a usable number."""
+    """Return the parameters; raise CzError naming the one that is no plausible number."""
     if not isinstance(parameters, Parameters):
         raise CzError(f"parameters must be a cz_gym.Parameters, not {parameters!r}")
-    check_numbers("parameter", parameters, _MAY_BE_ZERO)
-    if parameters.alpha_0 >= math.pi / 2:
-        raise CzError(f"parameter alpha_0 = {parameters.alpha_0!r} rad must be below a right angle: is it in degrees?")
-    if parameters.v_0 > MOST_V_0:
-        raise CzError(f"parameter v_0 = {parameters.v_0!r} m/s is above {MOST_V_0:g} m/s: is it in mm/min?")
-    if parameters.R_cr <= parameters.r_0:
-        raise CzError(
-            f"the crucible (R_cr = {parameters.R_cr} m) must be wider than the crystal (r_0 = {parameters.r_0} m)"
-        )
+    check_numbers("parameter", parameters)
+    r_0, R_cr, T_m, T_e = parameters.r_0, parameters.R_cr, parameters.T_m, parameters.T_e
+    if R_cr <= r_0:
+        raise CzError(f"the crucible (R_cr = {R_cr} m) must be wider than the crystal (r_0 = {r_0} m)")
+    if T_e >= T_m:
+        raise CzError(f"parameter T_e = {T_e:g} K, what the melt surface sees, must be below T_m = {T_m:g} K")
+    silicon = Parameters()
+    if parameters.dH == silicon.dH and abs(T_m + 273.15 - silicon.T_m) < 5.0:
+        raise CzError(f"parameter T_m = {T_m:g} K is silicon's in degrees Celsius: did you mean {T_m + 273.15:g}?")
     return Parameters(*map(float, parameters))

@@ -76,7 +76,7 @@ def test_a_drawn_puller_without_operating_point_is_drawn_again() -> None:
     """In a crucible as hot as this, every third draw has none: a training died of it in the middle of a step."""
     scenario = SCENARIOS["randomized"]
     spread = replace(scenario.pullers, conductance=0.3, conductivity=0.3)
-    hot = make_config(replace(scenario, name="hot", pullers=spread), horizon=25.0, parameters=Parameters(T_e=2450.0))
+    hot = Config(replace(scenario, name="hot", pullers=spread), horizon=25.0, parameters=Parameters(T_e=2450.0))
     env = CzVectorEnv.from_config(hot, 200, info="all")
     env.reset(seed=0)
     for _ in range(12):

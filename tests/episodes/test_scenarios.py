@@ -2,13 +2,15 @@ import dataclasses
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from cz_gym import SCENARIOS, Scenario
-from cz_gym.episodes.scenario import Drift, Faults, Interface, Pullers, Recipe
+from cz_gym.episodes.scenario import Draw, Drift, Faults, Interface, Pullers, Recipe, Reference, Sensor
 from cz_gym.episodes.scenarios import mix_of
+from cz_gym.episodes.series import draw_episode, draw_factors, new_series
 
 MM, MINUTE = 1e-3, 60.0
 FAMILIES = [field.name for field in dataclasses.fields(Scenario)[1:]]
@@ -33,6 +35,17 @@ MEMBERS = [
 ]
 
 
+def draw(scenario: Scenario, key: tuple[int, int]) -> tuple[Any, ...]:
+    """An episode's puller, constants and series; what has no effect there is zero."""
+    series = new_series(40, 400)
+    e = draw_episode(scenario, key, series)
+    e = e._replace(
+        ripple_phase=e.ripple_phase * (e.ripple_amplitude != 0.0),
+        bias_drift_start=e.bias_drift_start * (e.bias_drift_amount != 0.0),
+    )
+    return draw_factors(scenario, scenario.pullers.mix, key), e, *series
+
+
 def changed(scenario: Scenario, family: str, member: str, value: Any) -> Scenario:
     """The scenario with one number replaced, which may raise."""
     part = dataclasses.replace(getattr(scenario, family), **{member: value})
@@ -55,7 +68,7 @@ def test_every_number_counts_in_the_hash(where: tuple[str, str]) -> None:
     if isinstance(old, tuple):
         new: Any = (old[0], old[1] if old[1] == 3 else old[1] + (1 if isinstance(old[1], int) else 1e-7))
     else:
-        new = 1.0 if math.isinf(old) else old * 0.5 if old else 0.0125
+        new = 1e-6 if math.isinf(old) else old * 0.5 if old else 0.00125
     if new == old or (family, member) in (("pullers", "mix"), ("faults", "flagged")):
         new = (old[0], old[0])
     if member == "unflagged":
@@ -122,6 +135,48 @@ def test_families_of_another_kind_no_name_and_freezes_that_do_not_fit_are_refuse
 ) -> None:
     with pytest.raises(ValueError, match=message):
         Scenario(**{"name": "mine", **arguments})
+
+
+@pytest.mark.parametrize(
+    ("family", "member", "value", "meant"),
+    [
+        ("actuators", "pull_window", 0.3, r"5e-06 \(0.3 mm/min\)"),
+        ("actuators", "pull_slew", 0.3, r"8.33333e-08 \(0.3 mm/min2\)"),
+        ("recipe", "rate", (-0.5, 0.5), r"-0.00833333 \(-0.5 K/min\)"),
+        ("sensor", "rotation", (8.0, 15.0), r"0.133333 \(8 rev/min\)"),
+        ("sensor", "ripple", (0.0, 0.2), r"0.0002 \(0.2 mm\)"),
+        ("pullers", "capillary", 3.0, r"0.03 \(3 %\)"),
+    ],
+)
+def test_a_number_in_the_wrong_unit_is_refused_with_a_guess(
+    family: str, member: str, value: object, meant: str
+) -> None:
+    with pytest.raises(ValueError, match=rf"{family}.{member} = .* did you mean {meant}\?"):
+        changed(SCENARIOS["nominal"], family, member, value)
+
+
+@pytest.mark.parametrize(("family", "member"), MEMBERS)
+def test_every_member_says_whether_it_is_random(family: str, member: str) -> None:
+    """What a member says of itself agrees with what two seeds draw (trap 4)."""
+    base = dataclasses.replace(
+        SCENARIOS["nominal"],
+        sensor=Sensor(outlier_sd=1e-4, rotation=(0.1, 0.1)),
+        faults=Faults(flagged_duration=(50.0, 50.0), unflagged_duration=(50.0, 50.0)),
+        recipe=Recipe(duration=(50.0, 50.0)),
+        reference=Reference(1.0, (1e-3, 1e-3), (50.0, 50.0)),
+    )
+    (field,) = (each for each in dataclasses.fields(getattr(base, family)) if each.name == member)
+    says = field.metadata["member"]
+    high = min(says.high, 100.0) if isinstance(field.default, tuple) else min(0.5 * says.high, 100.0)
+    whole = isinstance(field.default, int) or (isinstance(field.default, tuple) and isinstance(field.default[0], int))
+    low = 0 if whole else 0.5 * high
+    value: Any = (low, high) if isinstance(field.default, tuple) else says.high if whole else high
+    scenario = changed(base, family, member, value)
+    episodes = zip(draw(scenario, (1, 1)), draw(scenario, (2, 1)), strict=True)
+    differ = any(not np.array_equal(one, other, equal_nan=True) for one, other in episodes)
+    assert scenario.deterministic is (says.draw is Draw.NEVER)
+    assert not (scenario.deterministic and differ)
+    assert differ or member in ("flagged_duration", "unflagged_duration") or scenario.deterministic
 
 
 def test_equal_contents_have_equal_hashes() -> None:
