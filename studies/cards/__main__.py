@@ -1,4 +1,4 @@
-"""Write a card of each shipped agent from the benchmark's results: what it saw, what it reaches, where it fails."""
+"""Model cards of the shipped agents, with the benchmark's figures: training, results and failures."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cz_gym.agents import MODELS, shipped_seeds
+from cz_gym.agents import shipped_seeds
 from cz_gym.agents.agent_file.contract import Contract, read_agent
 from cz_gym.agents.training.recipes import RECIPES, Gradient, Imitation
 from cz_gym.atomic_files import check_writable, naming, write_files
 from cz_gym.commands import OneLineParser
 from cz_gym.errors import CzError
 from cz_gym.evaluation.report.tables import markdown as table
-from studies.algorithms.variants import ALGORITHMS
 
-_LEARNED = {row.name: row.meaning for row in ALGORITHMS} | {
-    "gradient": "continued from `gradient-start`, on all four scenarios"
+AGENTS = {
+    "gradient": "the cost's gradient through policy and plant, continued from `gradient-start`; the plant is known",
+    "ppo": "proximal policy optimisation from nothing, from the reward",
+    "sac": "soft actor-critic from nothing, from the reward",
+    "imitation": "DAgger: it imitates a privileged LQG",
 }
-AGENTS = {name: how for name, how in _LEARNED.items() if any(MODELS.glob(f"{name}-seed*.onnx"))}
 """Shipped agents, and how each learned."""
 FIGURES = {
     "rmse_mm": "RMSE [mm]",
@@ -34,40 +35,28 @@ Results = Mapping[str, Mapping[str, Mapping[str, Any]]]
 """The benchmark's estimates, by scenario, controller and metric."""
 
 
-def read_results(paths: Sequence[Path]) -> Results:
-    """Results of benchmark.json files, an agent's of the first that has it; ValueError if none has, or another file."""
+def read_results(path: Path) -> Results:
+    """Results of a benchmark.json with all shipped agents; CzError for another file."""
     try:
-        found: dict[str, dict[str, Any]] = {}
-        for path in reversed(paths):
-            with naming(path):
-                text = path.read_text("utf-8")
-            for scenario, of in json.loads(text)["results"].items():
-                found.setdefault(scenario, {}).update(of)
-        for name in AGENTS:
-            for of in _seen(name, found).values():
+        with naming(path):
+            results: Results = json.loads(path.read_text("utf-8"))["results"]
+        for by_name in results.values():
+            for name in AGENTS:
                 for metric in FIGURES:
-                    float(of[name][metric]["mean"])
+                    float(by_name[name][metric]["mean"])
     except (json.JSONDecodeError, KeyError, TypeError, AttributeError):
-        raise CzError(f"no benchmark.json with {', '.join(AGENTS)}: {', '.join(map(str, paths))}") from None
-    return found
-
-
-def _seen(name: str, results: Results) -> Results:
-    """The scenarios that have an agent; KeyError if none has it."""
-    found = {scenario: of for scenario, of in results.items() if name in of}
-    if not found:
-        raise KeyError(name)
-    return found
+        raise CzError(f"{path}: no benchmark.json with {', '.join(AGENTS)}") from None
+    return results
 
 
 def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -> str:
     """An agent's section."""
-    first, seen = contracts[0], _seen(name, results)
+    first = contracts[0]
     rows = [
         [scenario, *(_estimate(of[name][metric], 100.0 if metric == "failure_rate" else 1.0) for metric in FIGURES)]
-        for scenario, of in seen.items()
+        for scenario, of in results.items()
     ]
-    fails = [f"`{scenario}`" for scenario, of in seen.items() if of[name]["failure_rate"]["mean"] > 0.0]
+    fails = [f"`{scenario}`" for scenario, of in results.items() if of[name]["failure_rate"]["mean"] > 0.0]
     return "\n".join(
         [
             f"## `{name}`",
@@ -85,7 +74,7 @@ def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -
 
 
 def _seen_in_training(name: str, contract: Contract) -> str:
-    """What its crystals were, with the shares of those that are not the scenario's own."""
+    """Its training crystals, with the shares of those that are not the scenario's own."""
     recipe = RECIPES.get(name)
     also = recipe.also if isinstance(recipe, Gradient) else ()
     if isinstance(recipe, Imitation):
@@ -98,7 +87,7 @@ def _seen_in_training(name: str, contract: Contract) -> str:
 
 
 def _steps(name: str, contracts: Sequence[Contract]) -> str:
-    """How many steps a run learned from; a contract counts only those that it learned from by reward."""
+    """Number of steps that a run learned from; of an imitation, of demonstrations."""
     recipe = RECIPES.get(name)
     if isinstance(recipe, Imitation):
         return f"{recipe.rounds * recipe.episodes * recipe.config.steps / 1e6:.1f} million steps of demonstrations"
@@ -120,8 +109,7 @@ ABOUT = """# Model cards
 
 What each shipped agent saw, what it reaches and where it fails, on test crystals that took no part in its training. All
 training seeds of a name are pooled; in brackets the 95 % interval over crystals and training seeds. The figures are of
-[the benchmark](../benchmark/report.md) and, of agents for one scenario, [the frontier](../frontier/report.md);
-`python -m studies.cards` wrote this page.
+[the benchmark](../benchmark/report.md); `python -m studies.cards` wrote this page.
 
 No agent was trained or tested on a real puller: none may control one. The linear loop of `gradient` has an unstable
 mode, which its schedule keeps small ([what it does](../../docs/insight.md)).
@@ -131,15 +119,11 @@ mode, which its schedule keeps small ([what it does](../../docs/insight.md)).
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser("python -m studies.cards", __doc__)
-    results, out = Path("results"), Path("results/cards/cards.md")
-    parser.add_argument(
-        "--benchmark",
-        type=Path,
-        nargs="+",
-        default=[results / name / "benchmark.json" for name in ("benchmark", "frontier")],
-        help="results; an agent's are taken from the first that has it (default: of benchmark and frontier)",
-    )
-    parser.add_argument("--out", type=Path, default=out, help="file to write (default: %(default)s)")
+    for option, default, about in (
+        ("--benchmark", "results/benchmark/benchmark.json", "results"),
+        ("--out", "results/cards/cards.md", "file to write"),
+    ):
+        parser.add_argument(option, type=Path, default=Path(default), help=f"{about} (default: %(default)s)")
     return parser.run(_main, arguments, "benchmark")
 
 

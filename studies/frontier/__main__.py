@@ -1,8 +1,8 @@
-"""What the LQG's radius error would be at another's pull activity: ``python -m studies.frontier benchmark.json``.
+"""Radius errors over the LQG's at equal pull activity: ``python -m studies.frontier benchmark.json``.
 
 The LQG's settings (:data:`cz_gym.baselines.lqg.settings.FAMILY`) are the reference family of
-:mod:`cz_gym.evaluation.equal_activity`. Where ``episodes.csv`` stands beside the file, each ratio has a 95 % bootstrap
-interval over crystals and training seeds.
+:mod:`cz_gym.evaluation.equal_activity`. With ``episodes.csv`` beside the file, each ratio has a 95 % bootstrap interval
+over crystals and training seeds.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ import numpy as np
 
 from cz_gym.atomic_files import naming, write_files
 from cz_gym.baselines.lqg.settings import FAMILY
-from cz_gym.commands import OneLineParser, guarded
+from cz_gym.commands import OneLineParser
 from cz_gym.errors import CzError
 from cz_gym.evaluation.equal_activity import Point, frontier, intervals, ratios
 from cz_gym.evaluation.files import EPISODES, Episodes, read_episodes
+from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.statistics import Resamples
 
 ACTIVITY = "pull_step_rms_mm_per_min"
@@ -32,7 +33,7 @@ Points = Mapping[str, Point]
 
 
 def read_points(path: Path, metric: str) -> dict[str, Points]:
-    """The points of each scenario in a benchmark.json; ValueError for any other file."""
+    """The points of each scenario in a benchmark.json; CzError for another file."""
     try:
         with naming(path):
             results = json.loads(path.read_text("utf-8"))["results"]
@@ -46,28 +47,28 @@ def read_points(path: Path, metric: str) -> dict[str, Points]:
 
 def table(results: Mapping[str, Points], metric: str, episodes: Episodes | None = None) -> str:
     """A Markdown table for every scenario that holds a frontier; ratios with intervals if there are episodes."""
-    lines = []
+    heads = ("controller", "pull step RMS [mm/min]", f"{metric.removesuffix('_mm')} [mm]", "of the LQG's")
+    sections = []
     for scenario, points in results.items():
-        lines += ["", f"## {scenario}", ""]
         try:
             found = ratios(points, FAMILY)
             most = frontier([points[name] for name in FAMILY if name in points]).activity[-1]
         except CzError as error:
-            lines.append(f"{error}.")
+            sections.append(f"## {scenario}\n\n{error}.")
             continue
         spread = {} if episodes is None else _intervals(scenario, points, episodes.get(scenario, {}))
-        lines += [f"| controller | pull step RMS [mm/min] | {metric.removesuffix('_mm')} [mm] | of the LQG's |"]
-        lines += ["|---|--:|--:|--:|"]
+        rows = []
         for name, (activity, rmse) in points.items():
             ratio = f"{found[name]:.3f}" if name in found else "quieter than any LQG"
             ratio += " [{:.3f}, {:.3f}]".format(*spread[name]) if name in found and name in spread else ""
             ratio += f", more active than any LQG ({most:.4f})" if activity > most else ""
-            lines.append(f"| {name} | {activity:.4f} | {rmse:.4f} | {ratio} |")
-    return "\n".join(lines[1:])
+            rows.append((name, f"{activity:.4f}", f"{rmse:.4f}", ratio))
+        sections.append(f"## {scenario}\n\n{markdown(heads, rows)}")
+    return "\n\n".join(sections)
 
 
 def _intervals(scenario: str, points: Points, episodes: Mapping[str, Any]) -> dict[str, Point]:
-    """Intervals of those who met all the crystals; ValueError if the episodes are not of that run."""
+    """Intervals of the controllers that met all crystals; CzError if the episodes are not of that run."""
     for name, (_, rmse) in points.items():
         if name not in episodes or not np.isclose(episodes[name][..., 1].mean(), rmse, rtol=1e-4):
             raise CzError(f"{EPISODES} is of another run: {name} on {scenario}")
@@ -77,16 +78,15 @@ def _intervals(scenario: str, points: Points, episodes: Mapping[str, Any]) -> di
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command."""
+    """Command line; returns the exit code."""
     parser = OneLineParser(prog="python -m studies.frontier", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("benchmark", type=Path, help="a benchmark.json with lqg's settings among its controllers")
     parser.add_argument("--metric", choices=("rmse_mm", "rmse_observable_mm"), default="rmse_mm")
     parser.add_argument("--out", type=Path, help="write the tables into this file; they are printed all the same")
-    given = parser.parse_args(arguments)
-    return guarded(parser.prog, lambda: _compare(given), "benchmark")
+    return parser.run(_compare, arguments, "benchmark")
 
 
-def _compare(given: argparse.Namespace) -> int:
+def _compare(given: argparse.Namespace) -> None:
     results = read_points(given.benchmark, given.metric)
     beside = given.benchmark.with_name(EPISODES)
     episodes = read_episodes(beside, lambda _: (ACTIVITY, given.metric)) if beside.exists() else None
@@ -94,7 +94,6 @@ def _compare(given: argparse.Namespace) -> int:
     print(text)
     if given.out is not None:
         write_files({given.out: f"# Error at equal activity\n\n{text}\n".encode()})
-    return 0
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from .comparison import as_markdown, numbers, rows
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code, 2 for bad input or a missing package."""
+    """Command line; returns the exit code."""
     parser = OneLineParser(prog="python -m studies.paper", description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("results/paper"), help="folder for the results")
     return parser.run(_compare, arguments, "benchmark")
@@ -33,7 +33,7 @@ def _compare(given: argparse.Namespace) -> None:
 
 def contents() -> dict[str, bytes]:
     """The report, its figures and the numbers by file name; runs every experiment."""
-    from .gallery import FIGURES
+    from .figures import FIGURES
     from .report import report
 
     text = json.dumps(numbers(), indent=2, allow_nan=False) + "\n"

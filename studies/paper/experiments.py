@@ -1,4 +1,4 @@
-"""The paper's design and its experiments on the nonlinear plant, each computed when it is first asked for."""
+"""The paper's design and its experiments on the nonlinear plant; each result is computed once."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import dlsim
 
 from cz_gym import HURLE, MeniscusModel, Scenario, make_puller
 from cz_gym.baselines.analysis.compensator_design import Margins, design_compensator, margins
-from cz_gym.baselines.analysis.sampled_loop import sampled_plant
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID, Compensator
 from cz_gym.config import make_config
 from cz_gym.episodes.schedule import quintic
@@ -34,8 +32,6 @@ FINE = 1.0
 """Time between actions in open loop [s]."""
 SUDDEN = 1e-3
 """Duration of a sudden change [s]."""
-STEPS = (-0.01, -0.1)
-"""Pull-speed steps compared with the linear model, as shares of v_0 [-]."""
 BEFORE = 120.0
 """Rest before the pull change in the figures [s]."""
 
@@ -54,7 +50,7 @@ def compensator(source: str) -> Compensator:
 
 @cache
 def loop_margins(source: str, model: str, compensated: bool = True) -> Margins:
-    """Of the loop with the printed PID."""
+    """Margins of the loop with the printed PID."""
     return margins(linear_model(source, model), compensator(source) if compensated else None, PID)
 
 
@@ -111,11 +107,6 @@ def pull_change(
     """Change the pull speed by a share of v_0 along the quintic, at constant heater power; times in s."""
     middle = FINE * (np.arange(round(horizon / FINE)) + 0.5) - before
     share = change * quintic(np.clip(middle / over, 0.0, 1.0))
-    return _open_loop(share, model)
-
-
-def _open_loop(share: Floats, model: str) -> Trace:
-    """Pull speed by the clock, heater at its nominal power; ``share[k]`` is v_p / v_0 - 1 during step k."""
     actions = np.column_stack([share, np.zeros(len(share))])
     return trace(Playback(actions), model, horizon=len(share) * FINE, interval=FINE)
 
@@ -132,35 +123,6 @@ def inverse_response(run: Trace, change: float = -0.1) -> InverseResponse:
     k = lowest + int(later[0])
     back = run.t[k - 1] + (run.t[k] - run.t[k - 1]) * wrong[k - 1] / (wrong[k - 1] - wrong[k])
     return InverseResponse(float(wrong[lowest]), float(back))
-
-
-class StepComparison(NamedTuple):
-    """A pull-speed step on the plant and on its linear model; deviations [m], shape (samples,)."""
-
-    t: Floats
-    share: float
-    """Step as a share of v_0 [-]."""
-    plant: tuple[Floats, Floats]
-    """r_c and r_br."""
-    linear: tuple[Floats, Floats]
-    """The same, from the linear model."""
-
-    def worst(self, output: int) -> float:
-        """Largest difference over the largest deviation of the plant [-]."""
-        gap = np.max(np.abs(self.plant[output] - self.linear[output]))
-        return float(gap / np.max(np.abs(self.plant[output])))
-
-
-@cache
-def step_comparison(model: str, share: float, horizon: float = 600.0) -> StepComparison:
-    """Step the pull speed of plant and linear model by a share of v_0."""
-    run = _open_loop(np.full(round(horizon / FINE), share), model)
-    puller = make_puller(lam=MODELS[model])
-    A, B, C, D = sampled_plant(puller, FINE)
-    path: Any = dlsim((A, B[:, :1], C[:2], D[:2, :1], FINE), np.full(len(run.t), puller.v_0 * share))[1]
-    r_c, r_br = path.T
-    s = run.signals
-    return StepComparison(run.t, share, (s.r_c - s.r_c[0], s.r_br - s.r_br[0]), (r_c, r_br))
 
 
 class CaseDifference(NamedTuple):

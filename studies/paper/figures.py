@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from cz_gym import make_puller
 from cz_gym.baselines.analysis.compensator_design import open_loop
+from cz_gym.evaluation.report.canvas import GREY, canvas, png
 from cz_gym.physics.linearisation import Floats
 from cz_gym.units import MINUTE, MM, MM_PER_MIN
 
@@ -18,11 +21,8 @@ from .experiments import Trace
 from .published import PID
 
 DEGREE = np.pi / 180.0
-BLUE, ORANGE, GREEN, GREY = "#1f5fa8", "#d1661f", "#2b8a4b", "#777777"
-STYLE: Any = {
-    "font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False, "axes.spines.right": False,
-    "lines.linewidth": 1.4, "legend.frameon": False, "legend.fontsize": 8, "axes.formatter.useoffset": False,
-}  # fmt: skip
+BLUE, ORANGE, GREEN = "#1f5fa8", "#d1661f", "#2b8a4b"
+DIAGRAMS = Path(__file__).parent / "diagrams"
 SHOWN = {
     "r_c": (MM, "radius [mm]"),
     "r_ref": (MM, "radius [mm]"),
@@ -37,10 +37,8 @@ SHOWN = {
 
 def sheet(rows: int, columns: int, size: tuple[float, float], **grid: Any) -> tuple[Figure, Any]:
     """A figure of that size [in] and its array of axes."""
-    with rc_context(STYLE):
-        figure = Figure(figsize=size, layout="constrained")
-        axes = figure.subplots(rows, columns, squeeze=False, **grid)
-    return figure, axes
+    figure = canvas(*size)
+    return figure, figure.subplots(rows, columns, squeeze=False, **grid)
 
 
 def label(axis: Any, x: str, y: str, legend: bool = False) -> None:
@@ -195,9 +193,8 @@ def ramp_temperatures() -> Figure:
 def ramp_response(model: str) -> Figure:
     """Closed-loop responses to the ramp in the paper's layout: radii; pull speed, height; growth rate, cone angle."""
     run = ex.ramp(model)
-    figure = Figure(figsize=(7.2, 7.0), layout="constrained")
-    with rc_context(STYLE):
-        panels = figure.subplot_mosaic([["r", "r"], ["v_p", "h_c"], ["v_g", "alpha_c"]], sharex=True)
+    figure = canvas(7.2, 7.0)
+    panels = figure.subplot_mosaic([["r", "r"], ["v_p", "h_c"], ["v_g", "alpha_c"]], sharex=True)
     radii = panels.pop("r")
     draw_signal(radii, run, "r_ref", "time [min]", ":", color=GREY, label="$r_{c,ref}$")
     draw_signal(radii, run, "r_c", "time [min]", label="$r_c$ (true)")
@@ -209,3 +206,45 @@ def ramp_response(model: str) -> Figure:
     for name, axis in panels.items():
         draw_signal(axis, run, name, "time [min]" if name in ("v_g", "alpha_c") else "")
     return figure
+
+
+class Shown(NamedTuple):
+    """A figure of the report."""
+
+    file: str
+    caption: str
+    draw: Callable[[], Figure] | None = None
+    """None for a block diagram, which is a file."""
+
+    def png(self) -> bytes:
+        """The figure as a PNG file."""
+        return png(self.draw()) if self.draw else (DIAGRAMS / self.file).read_bytes()
+
+
+FIGURES = (
+    Shown("figure_01_pull_profile.png", "Paper's figure 1: pull speed.", pull_profile),
+    *(
+        Shown(f"figure_0{number}_open_loop_{model}.png",
+              f"Paper's figure {number}: plant at constant power, Model {model}.", partial(open_loop_response, model))
+        for number, model in ((2, "I"), (3, "II"))
+    ),
+    Shown("figure_04_series.png", "Paper's figure 4: plant and measurement."),
+    Shown("figure_05_feedback.png", "Paper's figure 5: feedback."),
+    Shown("figure_06_bode_sketch.png",
+          "Paper's figure 6, there a sketch, here the uncompensated plant: the PID's crossover lies beyond the zero.",
+          margin_sketch),
+    Shown("figure_07_parallel.png", "Paper's figure 7: parallel compensation."),
+    Shown("figure_08_loop.png", "Paper's figure 8: the linear loop."),
+    Shown("figure_09_bode.png", "Paper's figure 9: compensated loops.", frequency_responses),
+    Shown("figure_10_tested_loop.png", "Paper's figure 10: the loop on the plant."),
+    Shown("figure_11_cases.png", "Paper's figure 11: cases A and B.", case_comparison),
+    Shown("figure_12_temperatures.png",
+          "Paper's figure 12: temperatures; Model II's are identical, as the thermal chain does not depend on it.",
+          ramp_temperatures),
+    *(
+        Shown(f"figure_{number}_ramp_{model}.png", f"Paper's figure {number}: the ramp, Model {model}.",
+              partial(ramp_response, model))
+        for number, model in ((13, "I"), (14, "II"))
+    ),
+)  # fmt: skip
+"""Every figure, in the paper's order."""

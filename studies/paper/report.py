@@ -7,15 +7,15 @@ from itertools import product
 
 import numpy as np
 
-from cz_gym import HURLE, make_puller
+from cz_gym import HURLE
 from cz_gym.evaluation.report.tables import markdown as table
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.units import MM
 
 from . import beyond_paper as beyond
 from . import experiments as ex
-from .comparison import as_markdown, number, rows
-from .gallery import FIGURES
+from .comparison import as_markdown, rows
+from .figures import FIGURES
 from .published import CROSSOVER, MODEL_II, PHASE_MARGIN_DEG, PID
 
 
@@ -87,11 +87,6 @@ def _linear() -> str:
          f"{m.lead:.4f} s + {m.constant:.4f}", f"{m.zero:.5f}", f"{m.numerator * m.constant:.7f}")
         for name, m in ((name, ex.linear_model("own", name)) for name in ex.MODELS)
     ]  # fmt: skip
-    gaps = [
-        (name, f"{100 * share:.0f} %", *(f"{100 * ex.step_comparison(name, share).worst(i):.2f} %" for i in (0, 1)))
-        for name in ex.MODELS
-        for share in ex.STEPS
-    ]
     head = "model | numerator of G_p [1/s] | poles [rad/s] | G_m | zero [rad/s] | gain, numerator x constant [1/s]"
     return f"""## 2. Linearisation
 
@@ -99,12 +94,7 @@ Derivatives by complex step through the functions that are simulated; melt tempe
 
 {_table(head, functions)}
 
-Largest difference between plant and linear model over 10 min after a pull-speed step, relative to the largest
-deviation. The ring is the less linear of the two, its offset bending with the height of the meniscus:
-
-{_table("model | step | r_c | r_br", gaps)}
-
-{_shown("figure_04", "extra_a")}"""
+{_shown("figure_04")}"""
 
 
 def _compensator() -> str:
@@ -177,8 +167,8 @@ plant, whose pull speed has limits, shows in the temperature ramp of the next se
 
 In Model II the instability costs the crystal. In Model I, where a rising meniscus freezes faster, it ends in a bounded
 limit cycle between the limits of the pull speed, which no puller should be asked for; yet the true radius is off by
-{kept:.3f} mm RMS, against {held:.3f} mm with the compensator. The cycle holds the ring, and the ring's mean is honest;
-what costs the compensated loop its radius is the compensator's washout (section 6). The RMSE of a lost crystal is
+{kept:.3f} mm RMS, against {held:.3f} mm with the compensator. The cycle holds the ring, whose mean is that of the
+crystal; the compensated loop loses accuracy by the compensator's washout (section 6). The RMSE of a lost crystal is
 over the time it lived."""
 
 
@@ -206,15 +196,6 @@ def _beyond() -> str:
         "cut-off [rad/s] | r_c, I [mm] | r_tilde, I [mm] | r_c, II [mm] | r_tilde, II [mm] | margin, I [deg] | "
         "margin, II [deg]"
     )
-    noise = [
-        (f"{n.noise / MM:.2f}", f"{n.expected_pull_rms_mm_per_min:.2f}", f"{n.pull_rms_mm_per_min:.2f}",
-         f"{100 * n.clipped:.0f} %", f"{n.rmse_mm:.3f}", f"{100 * n.failures:.0f} %")
-        for n in map(beyond.noise_result, beyond.NOISES)
-    ]  # fmt: skip
-    noise_head = (
-        "camera noise, sd [mm] | RMS of v_p expected [mm/min] | RMS of v_p - v_0 [mm/min] | time at a limit | "
-        "true RMSE [mm] | lost"
-    )
     return f"""## 6. What the paper does not show
 
 **The washout.** A warmer melt grows more slowly, so the loop must pull more slowly for good. The compensator answers a
@@ -222,47 +203,27 @@ lasting change of pull speed with a correction that fades only at the high-pass 
 r_tilde and the crystal is off by the correction. Raising the cut-off shortens it, at little cost in margin until
 it nears the zero. Largest errors in the ramp, compensator redesigned from our Model I for each cut-off:
 
-{_table(head, cut_offs)}
-
-**Noise.** The PID's gain at high frequency is K_p N = {PID.K_p * PID.N:.0f} mm/s per mm.
-White camera noise, {ex.INTERVAL:.0f} s samples,
-reference held for an hour, mean of {len(beyond.SEEDS)} episodes. The pull speed is spoilt long before the crystal is:
-
-{_table(noise_head, noise)}
-
-{_shown("extra_b", "extra_c", "extra_d")}"""
+{_table(head, cut_offs)}"""
 
 
 def _meniscus() -> str:
-    lines = [
-        (f"{r_c / MM:.1f}", f"{one.h / MM:.4f}", f"{exact.h / MM:.4f}", f"{100 * (one.h / exact.h - 1):+.2f} %",
-         f"{one.slope_rate * MM:.4f}", f"{exact.slope_rate * MM:.4f}", f"{one.ring_offset / MM:.3f}",
-         f"{exact.ring_offset / MM:.3f}", f"{one.zero:.4f}", f"{exact.zero:.4f}")
-        for r_c, one, exact in beyond.compare_menisci()
-    ]  # fmt: skip
-    head = (
-        "r_c [mm] | h, Hurle [mm] | h, exact [mm] | difference | d alpha_c/d h, Hurle [rad/mm] | exact | "
-        "ring offset, Hurle [mm] | exact | zero, Hurle [rad/s] | exact"
-    )
-    slopes = [(f"{phi_b:g}", *(f"{lead:.2f}" for lead in leads)) for phi_b, *leads in beyond.compare_ring_slopes()]
-    exact_h, hurle_h = beyond.exact_height() / MM, make_puller().h_0 / MM
+    lines = [(name, *(f"{value:.4f}" for value in both)) for name, both in beyond.compare_menisci().items()]
     largest, hurles = (
         ex.ramp_numbers(ex.ramp("I", meniscus=meniscus))["max_error_mm"] for meniscus in (YOUNG_LAPLACE, HURLE)
     )
+    hurle, exact = beyond.ring_slopes()
+    slopes = f"{beyond.RING_SLOPES_DEG[0]:g} to {beyond.RING_SLOPES_DEG[-1]:g} degrees"
     return f"""## 7. Hurle against the exact meniscus
 
-At the operating point the axisymmetric Young-Laplace equation gives {number(exact_h)} mm, Hurle's closed form
-{number(hurle_h)} mm.
-On a plant with the exact meniscus the printed controller's largest error in the ramp is
-{largest:.3f} mm against {hurles:.3f} mm (Model I).
+At the operating point, Hurle's closed form and the axisymmetric Young-Laplace equation:
 
-{_table(head, lines)}
+{_table("quantity | Hurle | exact", lines)}
 
-The zero differs most. It hangs on how fast the ring moves with the height, which Hurle's profile overstates: on the
-exact meniscus the coefficient of s in G_m hardly depends on where the ring is seen, and with the capillary constant
-that gives the paper's G_p no slope phi_b gives its {MODEL_II.lead:.1f} s. That number belongs to the approximate
-profile; the exact meniscus makes the inverse response somewhat milder.
+On a plant with the exact meniscus the printed controller's largest error in the ramp is {largest:.3f} mm against
+{hurles:.3f} mm (Model I).
 
-{_table("phi_b [deg] | coefficient of s, Hurle [s] | exact [s]", slopes)}
-
-{_shown("extra_e")}"""
+The zero differs most. It depends on how fast the ring moves with the height, which Hurle's profile overstates. For ring
+slopes phi_b of {slopes} the coefficient of s in G_m lies between {min(hurle):.1f} and {max(hurle):.1f} s on Hurle's
+meniscus, and between {min(exact):.1f} and {max(exact):.1f} s on the exact one: there, with the capillary constant that
+gives the paper's G_p, no slope gives its {MODEL_II.lead:.1f} s. So that number belongs to the approximate profile; the
+exact meniscus makes the inverse response somewhat milder."""

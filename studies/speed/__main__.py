@@ -23,15 +23,15 @@ from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser
 
 from .cases import SLOTS, THREADS, Case, Stepper, cases, stepper
-from .costs import costs, environment_share
+from .costs import costs
 
 
 class Plan(NamedTuple):
-    """How long to measure."""
+    """Length of a measurement."""
 
     repeats: int
     seconds: float
-    """What a case gets in each round, about."""
+    """Time of a case in each round, about [s]."""
 
 
 QUICK, FULL = Plan(3, 0.1), Plan(9, 0.5)
@@ -46,19 +46,19 @@ class Row(NamedTuple):
 
 
 class Skipped(NamedTuple):
-    """What cannot be measured here."""
+    """A case that cannot be measured here."""
 
     name: str
     why: str
 
 
 class Ratio(NamedTuple):
-    """Speed of the fastest row whose name begins so over that of another, of rows of 1,024 slots if there are any."""
+    """Speed of one row over that of another: of each the fastest whose name begins so, of 1,024 slots if any."""
 
     row: str
     over: str
     promised: float | None = None
-    """What it should be at least; None: only reported."""
+    """Least value that is aimed at; None for a ratio that is only reported."""
 
 
 OURS = "Cz-v0 batch, measured"
@@ -76,7 +76,6 @@ RATIOS = {
     "sync_vector_env_vs_pendulum": Ratio("SyncVectorEnv, cz_gym:Cz-v0", "SyncVectorEnv, Pendulum-v1", 1.5),
     "vector1024_vs_envpool_pendulum_one_thread": Ratio(f"{OURS}, 1 thread", "EnvPool Pendulum-v1, 1 thread"),
     "vector1024_vs_numpy": Ratio(f"{OURS}, 1 thread", "plain NumPy plant and ring"),
-    "failing_vs_not_failing": Ratio("open loop on hard, failing episodes", "open loop on hard, no failures"),
 }
 
 
@@ -107,7 +106,7 @@ def measure(
 
 
 def calls_in(timer: timeit.Timer, seconds: float) -> int:
-    """How many calls take about that long."""
+    """Number of calls that takes about that long."""
     calls = 1
     while (took := timer.timeit(calls)) < 0.1 * seconds:
         calls *= 4
@@ -132,14 +131,8 @@ def ratio(rows: Sequence[Row], asked: Ratio) -> float | None:
     return None if math.isnan(value) else value
 
 
-def growth(rows: Sequence[Row]) -> dict[str, float]:
-    """Cost per step of the largest batch over that of 1,024 slots."""
-    speed = {row.num_envs: row.steps_per_s for row in rows if row.name == f"{OURS}, 1 thread"}
-    return {f"cost_per_step_{max(speed)}_vs_{SLOTS}": speed[SLOTS] / speed[max(speed)]} if SLOTS in speed else {}
-
-
 def table(result: dict[str, Any]) -> str:
-    """The whole result as text."""
+    """The result as text."""
     lines = [f"{'':44}{'slots':>7}{'steps/s':>14}{'us/step':>10}"]
     for name, num_envs, speed in (row.values() for row in result["rows"]):
         lines.append(f"{name:44}{num_envs:7d}{speed:14,.0f}{1e6 / speed:10.3f}")
@@ -152,26 +145,17 @@ def table(result: dict[str, Any]) -> str:
 
 
 def run(quick: bool, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Measure everything: the JSON's contents."""
+    """Measure everything; the content of the JSON file."""
     plan, wanted = QUICK if quick else FULL, cases(quick)
     progress("memory, resets, start-up")
-    measured_costs, share, skipped = costs(quick), {}, []
-    if not quick:
-        progress("share of a training")
-        try:
-            share["ppo_share_in_environment"] = environment_share()
-        except Exception as error:  # what training needs must not end the run
-            skipped.append(Skipped("ppo_share_in_environment", why(error)))
-    rows: list[Row] = []
-    for together in ([case for case in wanted if not case.alone], *([case] for case in wanted if case.alone)):
-        more, missing = measure(together, plan, progress)
-        rows, skipped = rows + more, skipped + missing
+    measured_costs = costs(quick)
+    rows, skipped = measure(wanted, plan, progress)
     found = {name: ratio(rows, asked) for name, asked in RATIOS.items()}
     reported = {name: value for name, value in found.items() if RATIOS[name].promised is None and value is not None}
     return {
         "ratios": {name: value for name, value in found.items() if RATIOS[name].promised is not None},
         "rows": [row._asdict() for row in rows],
-        "figures": growth(rows) | reported | share,
+        "figures": reported,
         "costs": measured_costs,
         "skipped": [one._asdict() for one in skipped],
         "threads": THREADS,
@@ -181,7 +165,7 @@ def run(quick: bool, progress: Callable[[str], None] = lambda _: None) -> dict[s
 def main(argv: list[str] | None = None) -> int:
     """Measure and print; 2 if the file cannot be written."""
     parser = OneLineParser(prog="python -m studies.speed", description="Measure speed beside installed peers.")
-    parser.add_argument("--quick", action="store_true", help="fewer repeats, up to 4,096 slots: under 40 s")
+    parser.add_argument("--quick", action="store_true", help="fewer repeats: under 40 s")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures here")
     return parser.run(_measure, argv, "benchmark")
 

@@ -1,4 +1,4 @@
-"""What ``python -m studies.speed`` steps: this package's environments beside others, one entry a row of the table."""
+"""Rows of the speed table: this package's environments beside others."""
 
 from __future__ import annotations
 
@@ -22,20 +22,18 @@ from cz_gym.physics.plant import NO_DISTURBANCE, Inputs, State, make_puller, rk4
 from cz_gym.processors import processors
 from cz_gym.vector import CzVectorEnv
 
-from .costs import KIB, available_memory
-
 THREADS = processors()
 """Threads that the larger cases may use."""
 SLOTS, SB3_SLOTS = 1024, 256
 """Slots of the batches that are compared, and of those behind stable-baselines3."""
-SMALL, LARGE = (1, 16, 256, SLOTS, 4096), (16384, 65536)
-"""Slots whose cost a step is compared; the large ones are measured alone."""
+SIZES = (1, 16, 256, SLOTS, 4096)
+"""Slots whose cost a step is compared."""
 UNFAILED = 50
 """Steps that every crystal survives in open loop."""
 
 
 class Stepper(NamedTuple):
-    """Something that steps."""
+    """An environment or loop whose steps are timed."""
 
     num_envs: int
     step: Callable[[], Any]
@@ -48,18 +46,16 @@ class Case(NamedTuple):
 
     name: str
     make: Callable[[], Any]
-    """Makes a :class:`Stepper`, or any environment, scalar or batched, which is stepped with actions of zero."""
-    alone: bool = False
-    """Whether nothing else may be in memory."""
+    """Makes a :class:`Stepper`, or an environment, scalar or batched, that is stepped with actions of zero."""
 
 
 def cases(quick: bool) -> list[Case]:
-    """Every row, in the table's order; what is not installed or fails is skipped by name when it is made."""
+    """Every row, in the table's order."""
     threads = sorted({1, THREADS})
     one, *more = threads
     return [
         *(Case(f"{name} scalar", partial(gym.make, name)) for name in ("Cz-v0", "Pendulum-v1", "CartPole-v1")),
-        *(Case(f"Cz-v0 batch, measured, {_threads(one)}", partial(ours, n)) for n in SMALL),
+        *(Case(f"Cz-v0 batch, measured, {_threads(one)}", partial(ours, n)) for n in SIZES),
         *(Case(f"Cz-v0 batch, measured, {_threads(n)}", partial(ours, SLOTS, n)) for n in more),
         *(Case(f"Cz-v0 batch, history, {_threads(n)}", partial(ours, SLOTS, n, "history")) for n in threads),
         *(
@@ -70,8 +66,6 @@ def cases(quick: bool) -> list[Case]:
         Case("step without derivatives", partial(differentiable, False)),
         Case("step with derivatives", partial(differentiable, True)),
         Case("plain NumPy plant and ring", partial(plain_numpy, SLOTS)),
-        Case("open loop on hard, no failures", partial(open_loop, SLOTS, fails=False)),
-        Case("open loop on hard, failing episodes", partial(open_loop, SLOTS, fails=True)),
         Case("CartPole-v1 native batch", lambda: gym.make_vec("CartPole-v1", SLOTS, "vector_entry_point")),
         *(Case(f"EnvPool Pendulum-v1, {_threads(n)}", partial(_envpool, SLOTS, n)) for n in threads),
         Case("pc-gym CSTR", _pcgym),
@@ -89,7 +83,6 @@ def cases(quick: bool) -> list[Case]:
         Case("render() of a record of 15 min", partial(rendered, 15)),
         Case("render() of a record of 3 h", partial(rendered, 179)),
         Case("Cz-v0 scalar, camera", partial(CzEnv, "nominal", observation="camera")),
-        *(Case(f"Cz-v0 batch, measured, {_threads(one)}", partial(ours, n), alone=True) for n in LARGE if not quick),
     ]
 
 
@@ -112,7 +105,7 @@ def stepper(made: Any) -> Stepper:
 
 
 def batched(env: Any, num_envs: int) -> Stepper:
-    """A batch, begun already, of whatever library."""
+    """A batch that has been reset, of any library."""
     space = getattr(env, "single_action_space", env.action_space)
     action = np.zeros((num_envs, *space.shape), space.dtype)
     return Stepper(num_envs, lambda: env.step(action), env.close)
@@ -120,8 +113,6 @@ def batched(env: Any, num_envs: int) -> Stepper:
 
 def ours(num_envs: int, threads: int = 1, observation: str = "measured") -> Stepper:
     """The native batch, its slots at random places of their episodes, so that resets are spread out."""
-    if available_memory() < 100.0 * KIB * num_envs:
-        raise MemoryError(f"{num_envs} slots need more memory than there is")
     env = CzVectorEnv(num_envs, observation=observation, threads=threads)
     spread_out(env)
     return batched(env, num_envs)
@@ -134,7 +125,7 @@ def spread_out(env: CzVectorEnv) -> None:
 
 
 def without_resets(num_envs: int, threads: int) -> Stepper:
-    """The native batch over and over the same first minutes: no resets, to compare with the bare loop."""
+    """The native batch, repeating the same first minutes without resets, to compare with the bare loop."""
     env = CzVectorEnv(num_envs, threads=threads)
     env.reset(seed=0)
     return repeated(env._batch, batched(env, num_envs))
@@ -184,21 +175,8 @@ def plain_numpy(num_envs: int) -> Stepper:
     return Stepper(num_envs, step)
 
 
-def open_loop(num_envs: int, fails: bool) -> Stepper:
-    """Open loop on "hard": as episodes keep failing, or over and over the first steps, before any does."""
-    env = CzVectorEnv(num_envs, scenario="hard", autoreset_mode=AutoresetMode.SAME_STEP)
-    found = batched(env, num_envs)
-    if not fails:
-        env.reset(seed=0)
-        return repeated(env._batch, found)
-    spread_out(env)
-    for _ in range(env.config.steps):
-        found.step()
-    return found
-
-
 def rendered(minutes: int) -> Stepper:
-    """Pictures, 640 x 480, of a crystal that the paper's controller has pulled for so long, again and again."""
+    """Repeated rendering, 640 x 480, of a crystal pulled by the paper's controller for that many minutes."""
     env = CzEnv("randomized", observation="measured", render_mode="rgb_array")
     paper, state = find_controller("paper").make(env.config), None
     observation, _ = env.reset(seed=1)
@@ -242,7 +220,7 @@ def _sb3_adapter() -> Any:
 
 
 def _make_vec_env(name: str) -> Any:
-    """As most who come from stable-baselines3 begin."""
+    """Stable-baselines3's usual way to make a vector of environments."""
     return importlib.import_module("stable_baselines3.common.env_util").make_vec_env(name, 16)
 
 

@@ -1,4 +1,4 @@
-"""What ``python -m studies.speed`` measures besides steps: memory, resets, start-up, and the share of a training."""
+"""Memory of a slot, time of a reset and of starting up."""
 
 from __future__ import annotations
 
@@ -8,18 +8,15 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from cz_gym.baselines.registry import make_controller
 from cz_gym.env import CzEnv
 from cz_gym.jit.cache import CACHE_VARIABLE
 from cz_gym.units import MICRO
 from cz_gym.vector import CzVectorEnv
 
 KIB = 1024.0
-_UPDATES = 3
 _FIRST_STEP = """
 import gymnasium, cz_gym
 env = gymnasium.make("Cz-v0")
@@ -40,7 +37,7 @@ print((resident() - before) / n)
 
 
 def costs(quick: bool) -> dict[str, float]:
-    """Memory a slot, time of a reset and of the first step in a new process."""
+    """Memory of a slot [KiB], time of a reset [us] and of the first step in a new process [s]."""
     found = {"memory_per_slot_randomized_kib": memory_per_slot("randomized", "measured") / KIB}
     if not quick:
         found["memory_per_slot_puller_history_kib"] = memory_per_slot("puller", "history") / KIB
@@ -62,17 +59,8 @@ def resident() -> int:
         return 0
 
 
-def available_memory() -> float:
-    """Memory that is free [B]; infinite where the system does not say."""
-    try:
-        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-        return int(lines["MemAvailable"].split()[0]) * KIB
-    except (OSError, ValueError, KeyError):
-        return float("inf")
-
-
 def memory_per_slot(scenario: str, observation: str) -> float:
-    """What a slot costs a process that steps a batch at the default horizon, two results included [B]."""
+    """Memory of a slot of a batch that is stepped, two results included [B]."""
     return float(_python(_MEMORY.format(scenario=scenario, observation=observation)))
 
 
@@ -100,33 +88,3 @@ def _python(code: str, cache: str | None = None) -> str:
     if done.returncode:
         raise RuntimeError(f"a process that was to be measured failed: {done.stderr.strip()[-300:]}")
     return done.stdout
-
-
-def environment_share() -> float:
-    """Share of the first updates of train.py's own PPO spent in the adapter's step, environment included [-]."""
-    from cz_gym.agents.training.learners import make_learner
-    from cz_gym.agents.training.recipes import PPO
-
-    recipe = PPO()
-    learner: Any = make_learner(recipe, 0, make_controller)
-    algorithm, update = learner.algorithm, recipe.n_steps * recipe.num_envs
-    algorithm.learn(update)
-    spent: list[float] = []
-    slots = algorithm.env.slots
-    slots.step_wait = _timed(slots.step_wait, spent)
-    began = time.perf_counter()
-    algorithm.learn(_UPDATES * update, reset_num_timesteps=False)
-    whole = time.perf_counter() - began
-    algorithm.env.close()
-    return sum(spent) / whole
-
-
-def _timed(step: Callable[..., Any], spent: list[float]) -> Callable[..., Any]:
-    def run(*arguments: Any) -> Any:
-        began = time.perf_counter()
-        try:
-            return step(*arguments)
-        finally:
-            spent.append(time.perf_counter() - began)
-
-    return run

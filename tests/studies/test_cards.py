@@ -7,21 +7,26 @@ from typing import Any
 from cz_gym import agents
 from studies.cards import __main__ as cards
 
-RESULTS = Path(__file__).parents[2] / "results"
-BENCHMARK, FRONTIER = (RESULTS / name / "benchmark.json" for name in ("benchmark", "frontier"))
+FIGURES = {key: {"mean": 0.0, "ci95": [0.0, 0.5]} for key in cards.FIGURES}
 
 
-def test_every_shipped_agent_has_a_card_and_the_committed_ones_are_of_the_committed_results(tmp_path: Path) -> None:
+def test_every_shipped_agent_has_a_card_with_the_benchmark_s_figures(tmp_path: Path) -> None:
     assert {path.stem.rpartition("-seed")[0] for path in agents.MODELS.glob("*.onnx")} == set(cards.AGENTS)
-    assert cards.main(["--benchmark", str(BENCHMARK), str(FRONTIER), "--out", str(tmp_path / "cards.md")]) == 0
-    page = (tmp_path / "cards.md").read_text()
-    benchmark, frontier = (json.loads(path.read_text())["results"]["puller"] for path in (BENCHMARK, FRONTIER))
-    assert (RESULTS / "cards" / "cards.md").read_text() == page
-    for name in cards.AGENTS:
-        section = page.split(f"## `{name}`")[1].split("\n## ")[0]
-        found = benchmark.get(name) or frontier[name]
-        assert f"| puller | {found['rmse_mm']['mean']:.4f} [" in section
-        assert ("`puller`" in section.split("Fails: ")[1].split("\n")[0]) == (found["failure_rate"]["mean"] > 0.0)
+    lost = {**FIGURES, "rmse_mm": {"mean": 1.25, "ci95": [1.0, 2.0]}, "failure_rate": {"mean": 0.25, "ci95": None}}
+    results = {
+        "hard": dict.fromkeys(cards.AGENTS, FIGURES),
+        "puller": {**dict.fromkeys(cards.AGENTS, FIGURES), "ppo": lost},
+    }
+    (tmp_path / "benchmark.json").write_text(json.dumps({"results": results}))
+    command = ["--benchmark", str(tmp_path / "benchmark.json"), "--out", str(tmp_path / "cards.md")]
+    assert cards.main(command) == 0
+    sections = (tmp_path / "cards.md").read_text().split("\n## ")[1:]
+    assert [section.split("`")[1] for section in sections] == list(cards.AGENTS)
+    for section in sections:
+        fails = section.startswith("`ppo`")
+        assert (
+            ("loses crystals of `puller`." in section) == fails == ("| puller | 1.2500 [1.0000, 2.0000] |" in section)
+        )
 
 
 def test_another_file_is_refused_in_one_line(tmp_path: Path, refused: Any) -> None:

@@ -1,4 +1,4 @@
-"""The film: a short one, whose agent it shows, and what it says when it cannot."""
+"""The film: a short one, whose agent it shows."""
 
 from pathlib import Path
 from typing import Any

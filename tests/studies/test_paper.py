@@ -5,17 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from scipy.signal import lfilter
 
 from cz_gym import make_puller
 from cz_gym.baselines import CompensatedPID
 from cz_gym.baselines.pid.compensated_pid import SeriesPID
 from cz_gym.physics.linearisation import radius_model
-from cz_gym.units import MM
 from studies.paper import __main__ as paper
-from studies.paper import beyond_paper, comparison, gallery
-from studies.paper.beyond_paper import SEEDS, noise_result
+from studies.paper import beyond_paper, comparison
 from studies.paper.comparison import coefficients
 from studies.paper.experiments import (
     BARE,
@@ -24,10 +21,9 @@ from studies.paper.experiments import (
     inverse_response,
     pull_change,
     ramp,
-    step_comparison,
     trace,
 )
-from studies.paper.gallery import FIGURES
+from studies.paper.figures import FIGURES
 from studies.paper.published import COMPENSATOR, ODE
 
 
@@ -44,30 +40,19 @@ def test_the_committed_numbers_come_out(numbers):
 
 
 @pytest.mark.slow
-def test_files(tmp_path, numbers, monkeypatch):
-    """The command's output folder, with two cut-offs, one noise and small figures for speed."""
-    monkeypatch.setattr(gallery, "DPI", 60)
+def test_the_command_writes_the_report_with_its_figures(tmp_path, numbers, monkeypatch):
+    """With two cut-offs, for speed."""
     monkeypatch.setattr(beyond_paper, "CUT_OFFS", (2e-4, 2e-3))
-    monkeypatch.setattr(beyond_paper, "NOISES", (0.01 * MM,))
-    out = tmp_path / "deep" / "folder"
-    assert paper.main(["--out", str(out)]) == 0
-    assert json.loads((out / "numbers.json").read_text()) == numbers
-    report = (out / "report.md").read_text()
+    assert paper.main(["--out", str(tmp_path)]) == 0
+    assert json.loads((tmp_path / "numbers.json").read_text()) == numbers
+    report = (tmp_path / "report.md").read_text()
+    assert {path.name for path in tmp_path.iterdir()} == {f.file for f in FIGURES} | {"report.md", "numbers.json"}
     for figure in FIGURES:
-        picture = (out / figure.file).read_bytes()
-        assert picture.startswith(b"\x89PNG")
+        assert (tmp_path / figure.file).read_bytes().startswith(b"\x89PNG")
         assert figure.file in report
-        if figure.draw is None:
-            with Image.open(gallery.DIAGRAMS / figure.file) as diagram, Image.open(out / figure.file) as shown:
-                assert shown.height > diagram.height, "a title stands above it"
-    assert {path.name for path in out.iterdir()} == {figure.file for figure in FIGURES} | {"report.md", "numbers.json"}
-    assert sum(path.stat().st_size for path in out.iterdir()) < 2_500_000
     assert "nan" not in report
     for printed in ("0.03275", "do not follow from the", "-0.22517", "0.001884", "3.368e-07", "chain does not depend"):
         assert printed in report
-    cycle, lost = cycle_numbers(ramp("I", BARE)), cycle_numbers(ramp("II", BARE))
-    for number in (f"{cycle['rmse_mm']:.3f}", f"lost after {lost['lived_min']:.0f} min"):
-        assert number in report
 
 
 def test_ode_follows_from_the_printed_poles():
@@ -113,14 +98,6 @@ def test_what_model_ii_leaves_out():
         np.testing.assert_array_equal(*(getattr(ramp(m).signals, name) for m in ("I", "II")))
 
 
-def test_linear_model_holds_for_small_steps():
-    for model in ("I", "II"):
-        small, large = (step_comparison(model, share) for share in (-0.001, -0.01))
-        for output in (0, 1):
-            assert small.worst(output) < 0.005
-            assert large.worst(output) / small.worst(output) == pytest.approx(10.0, rel=0.1)
-
-
 def test_compensated_measurement_is_what_the_controller_saw():
     """r_tilde, through the printed PID, gives back the pull speed that was applied."""
     pid, dt = SeriesPID(), 5.0
@@ -130,18 +107,3 @@ def test_compensated_measurement_is_what_the_controller_saw():
     integral = lfilter([0.5 * dt / pid.T_i, 0.5 * dt / pid.T_i], [1.0, -1.0], lead)
     expected = run.signals.v_p[0] + pid.K_p * (lead + integral)
     np.testing.assert_allclose(run.signals.v_p[1:], expected[:-1], atol=1e-3 * run.signals.v_p[0])
-
-
-def test_expected_noise_in_the_pull_speed():
-    pid = SeriesPID()
-    found = noise_result(0.002 * MM, pid)
-    b_0, b_1, a_1 = pid.lead(5.0)
-    noise = np.random.default_rng(0).normal(size=200_000)
-    assert found.expected_pull_rms_mm_per_min == pytest.approx(
-        0.002 * pid.K_p * np.std(lfilter([b_0, b_1], [1.0, a_1], noise)) * 60.0, rel=0.01
-    )
-    # Far from the limits the loop amplifies a little more than K alone.
-    assert found.pull_rms_mm_per_min == pytest.approx(found.expected_pull_rms_mm_per_min, rel=0.1)
-    assert found.clipped == 0.0
-    assert min(SEEDS) >= 1_000_000
-    assert max(SEEDS) < 2_000_000
