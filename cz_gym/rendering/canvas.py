@@ -90,7 +90,10 @@ class Canvas:
 
     def rectangle(self, colour: Colour, box: Box, line: float | None = None) -> None:
         """A rectangle, filled or with a rim of that width."""
-        self.pygame.draw.rect(self._fine, colour, _fine_box(box), 0 if line is None else self._thickness(line))
+        if line is None:
+            self._fine.fill(colour, _fine_box(box))
+        else:
+            self.pygame.draw.rect(self._fine, colour, _fine_box(box), self._thickness(line))
 
     def polygon(self, colour: Colour, points: npt.ArrayLike) -> None:
         """A filled polygon, points of shape (n, 2); nothing for fewer than three."""
@@ -166,7 +169,8 @@ def _fine_box(box: Box) -> tuple[int, int, int, int]:
 
 def _fine_points(points: npt.ArrayLike) -> list[list[float]]:
     """Points as pygame takes them; those far outside are clipped, because its integers would overflow."""
-    fine: list[list[float]] = np.clip(np.asarray(points) * float(FINE), -20_000.0, 20_000.0).tolist()
+    scaled = np.asarray(points) * float(FINE)
+    fine: list[list[float]] = np.minimum(np.maximum(scaled, -20_000.0), 20_000.0).tolist()
     return fine
 
 

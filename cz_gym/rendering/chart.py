@@ -35,9 +35,9 @@ class Trace(NamedTuple):
 def draw(canvas: Canvas, box: Box, record: Record, blind: bool = False) -> None:
     """The radius error by the camera, and the true one unless ``blind``."""
     camera, true = Trace(record.t, record.camera_error, NOISE, 0.8), Trace(record.t, record.error, palette.TRUE)
-    draw_traces(
-        canvas, box, record.config.horizon, [camera] if blind else [camera, true], None if blind else true.error
-    )
+    # The camera's outliers must not set the scale where the truth can.
+    limit = error_range(camera.error if blind else true.error)
+    draw_traces(canvas, box, record.config.horizon, limit, [camera] if blind else [camera, true])
     x, y = box.x + 38 * canvas.unit, box.y + 4 * canvas.unit
     canvas.text(x, y, "radius error [mm]", colour=palette.FAINT)
     canvas.text(x + 98 * canvas.unit, y, "by the camera", colour=palette.CAMERA)
@@ -45,16 +45,13 @@ def draw(canvas: Canvas, box: Box, record: Record, blind: bool = False) -> None:
         canvas.text(x + 182 * canvas.unit, y, "true", colour=palette.TRUE)
 
 
-def draw_traces(
-    canvas: Canvas, box: Box, horizon: float, traces: Sequence[Trace], fitted: Floats | None = None
-) -> None:
-    """Radius errors against time, from 0 to the horizon [s]; a dot is the newest value of the last trace.
+def draw_traces(canvas: Canvas, box: Box, horizon: float, limit: float, traces: Sequence[Trace]) -> None:
+    """Radius errors from -limit to limit [m] against time from 0 to the horizon [s].
 
-    The axis fits the errors of all traces, or those ``fitted`` alone.
+    A dot is the newest value of the last trace.
     """
     unit = canvas.unit
     plot = box.inner(*(margin * unit for margin in MARGINS))
-    limit = error_range(*(trace.error for trace in traces)) if fitted is None else error_range(fitted)
 
     def placed(trace: Trace) -> Floats:
         return paired(plot.x + trace.t / horizon * plot.w, plot.y + (0.5 - 0.5 * trace.error / limit) * plot.h)

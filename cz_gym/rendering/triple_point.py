@@ -75,15 +75,16 @@ def _draw_gas_and_meniscus(canvas: Canvas, box: Box, scale: Scale, record: Recor
     level, r_c, h_c = scale.y_0, record.last("r_c"), record.last("h_c")
     beside = np.concatenate([[[surface[-1, 0], box.y]], surface[::-1]])
     if record.ending is Ending.DETACHED:
-        canvas.polygon(palette.GAS, [*beside, (box.right, beside[-1, 1]), (box.right, box.y)])
+        canvas.polygon(palette.GAS, np.concatenate([beside, [[box.right, beside[-1, 1]], [box.right, box.y]]]))
         foot = float(scale.y(h_c))
         canvas.rectangle(palette.GAS, Box(box.x, foot, box.w, level - foot))
         return
     meniscus = scale.points(*meniscus_curve(r_c, h_c, record.puller, record.config.meniscus))
-    canvas.polygon(palette.GAS, [*beside, *meniscus, (box.right + 9, meniscus[-1, 1]), (box.right + 9, box.y)])
+    corners = [[box.right + 9, meniscus[-1, 1]], [box.right + 9, box.y]]
+    canvas.polygon(palette.GAS, np.concatenate([beside, meniscus, corners]))
     edge = meniscus[0].tolist()
-    melt = [(box.x, edge[1]), *meniscus, (box.right, level + 1), (box.x, level + 1)]
-    canvas.polygon(palette.MELT_TOP, melt)
+    melt = [[box.right, level + 1], [box.x, level + 1], [box.x, edge[1]]]
+    canvas.polygon(palette.MELT_TOP, np.concatenate([meniscus, melt]))
     canvas.lines(palette.GLOW, [(box.x, edge[1]), edge], 1.2)
     canvas.lines(palette.mix(palette.MELT_TOP, palette.GLOW, 0.6), meniscus, 1.0)
 

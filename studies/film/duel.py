@@ -58,7 +58,7 @@ def draw(canvas: Canvas, sides: Sequence[Side]) -> Surface:
     boxes = [Box(gap + i * (width + gap), gap, width, canvas.height - below - 3.0 * gap) for i in range(len(sides))]
     canvas.begin((bottom, *boxes))
     traces = [chart.Trace(side.record.t, side.record.error, side.colour) for side in sides]
-    chart.draw_traces(canvas, bottom, sides[0].record.config.horizon, traces)
+    chart.draw_traces(canvas, bottom, sides[0].record.config.horizon, limit, traces)
     x, y = bottom.x + 38.0 * unit, bottom.y + 4 * unit
     canvas.text(x, y, "true radius error [mm]", 9.5, palette.FAINT)
     told = f"{TIMES}{magnified:g}: drawn {magnified:g} times as large; shaded: within {TOLERANCE / MM:g} mm"

@@ -100,7 +100,7 @@ def test_the_chart_has_a_gap_where_the_camera_has_no_reading(monkeypatch: pytest
     canvas = Canvas(*SIZE)
     monkeypatch.setattr(canvas, "lines", lambda colour, points, width: drawn.append((colour, len(points))))
     error = np.array([0.0, 1.0, np.nan, np.nan, 2.0, 3.0, 1.0]) * MM
-    chart.draw_traces(canvas, layout(*SIZE).chart, 60.0, [chart.Trace(np.arange(7.0), error, palette.CAMERA)])
+    chart.draw_traces(canvas, layout(*SIZE).chart, 60.0, 4.0 * MM, [chart.Trace(np.arange(7.0), error, palette.CAMERA)])
     assert [points for colour, points in drawn if colour == palette.CAMERA and points] == [2, 3]
 
 
