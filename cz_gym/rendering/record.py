@@ -41,7 +41,7 @@ class Record:
         return self._count
 
     def add(self, info: Floats, valid: float, terminated: bool = False, truncated: bool = False) -> None:
-        """Add a sample: the row of info (:data:`cz_gym.engine.layout.INFO`), and 1 if the camera's reading is valid."""
+        """Add a sample: the row of info (:data:`cz_gym.signals.INFO`), and 1 if the camera's reading is valid."""
         row = self._samples[self._count]
         row[:-1], row[-1] = info, valid
         self._count += 1

@@ -10,7 +10,6 @@ import pytest
 from cz_gym import CzEnv
 from cz_gym.baselines.registry import find_controller
 from cz_gym.config import Config, make_config
-from cz_gym.engine.layout import INFO
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.play import __main__ as play
@@ -18,6 +17,7 @@ from cz_gym.play import game as hand
 from cz_gym.play.score import score
 from cz_gym.rendering import backend
 from cz_gym.rendering.view import Window
+from cz_gym.signals import INFO
 from cz_gym.units import KILO, MM_PER_MIN
 
 pygame = pytest.importorskip("pygame")

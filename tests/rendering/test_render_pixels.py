@@ -8,7 +8,6 @@ import pytest
 from scipy.integrate import trapezoid
 
 from cz_gym import HURLE, CzEnv, Parameters, make_puller
-from cz_gym.engine.layout import INFO
 from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.rendering import chart, geometry, palette, pixels, triple_point
@@ -18,6 +17,7 @@ from cz_gym.rendering.numbers_panel import SetPoints, groups
 from cz_gym.rendering.record import Ending, Record, how_it_failed
 from cz_gym.rendering.scene import layout
 from cz_gym.rendering.view import record_of
+from cz_gym.signals import INFO
 from cz_gym.task import HEIGHT_MIN
 from cz_gym.units import KILO, MM, MM_PER_MIN
 
