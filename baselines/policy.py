@@ -4,13 +4,20 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.config import positive
-from cz_gym.observation import HEATER_SCALE, Measured, decode
+from cz_gym.action import MadeFor, mark
+from cz_gym.config import Config, positive
+from cz_gym.errors import CzError
+from cz_gym.observation import Measured, decode
+from cz_gym.physics.meniscus import HURLE, MeniscusModel
+from cz_gym.physics.parameters import Parameters
+from cz_gym.task import HEATER_RANGE
 
 Floats = npt.NDArray[np.float64]
 
@@ -20,8 +27,8 @@ class Policy(Protocol):
     """Anything that acts on observations.
 
     Settings are immutable; what a policy remembers travels in ``state``. ``observation`` has shape (n, channels) or
-    (channels,), the action shape (n, 2) or (2,), float32; ``episode_start`` (bool, shape (n,)) marks slots that begin
-    an episode, whose memory starts anew; None means none of them does, except when ``state`` is None.
+    (channels,), the action shape (n, 2) or (2,), float32. ``episode_start`` (bool, shape (n,)) marks slots that begin
+    an episode and whose memory starts anew; None marks none of them, unless ``state`` is None.
     """
 
     def predict(
@@ -31,33 +38,80 @@ class Policy(Protocol):
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[npt.NDArray[np.float32], Any]:
-        """The action and the next state."""
+        """Return the action and the next state."""
         ...
 
 
-class MeasuredController(ABC):
-    """A controller that reads "measured" (or "history") observations.
+class State(NamedTuple):
+    """The memory of a :class:`MeasuredController`."""
 
-    A subclass works in SI units on a batch of n crystals: it says what it remembers at first, and what it does with a
-    sample. Its memory is a tuple of arrays with a leading axis n, or a tuple of such tuples. ValueError for a
-    ``control_interval`` [s] that is not positive.
+    readings: Measured
+    """Last number that was read from each channel, SI units, each of shape (n,)."""
+    memory: Any
+    """The controller's own memory."""
+
+
+@dataclass(frozen=True)
+class MeasuredController(ABC):
+    """A controller that reads "measured" (or "history") observations; base class of the package's own.
+
+    A subclass works in SI units on a batch of n crystals and defines its memory at the start of an episode
+    (:meth:`at_rest`) and its answer to a sample (:meth:`step`). Its memory is a NamedTuple of arrays with a leading
+    axis n, or of such tuples. Readings that are not valid or not finite never reach it (:func:`readable`). Its actions
+    are refused by other environments than the one it was made for.
     """
 
+    observation: ClassVar[str] = "measured"
+    """Observation that it reads."""
     action: ClassVar[str] = "direct"
-    """What its actions mean."""
+    """Meaning of its actions."""
+    estimates_temperature: ClassVar[bool] = False
+    """Whether a pyrometer reading that is not finite reaches it as such, instead of the last one."""
+
+    control_interval: float = 5.0
+    """Time between actions [s]."""
+    parameters: Parameters = field(default=Parameters(), kw_only=True)
+    """Parameters of the nominal puller."""
+    meniscus: MeniscusModel = field(default=HURLE, kw_only=True)
+    """Meniscus of the nominal puller."""
+    any_environment: bool = field(default=False, kw_only=True)
+    """Whether every environment takes its actions (``made_for`` is None)."""
 
     def __post_init__(self) -> None:
         positive("control_interval", self.control_interval)
 
     @property
-    @abstractmethod
-    def control_interval(self) -> float:
-        """Time between actions that it is made for [s]."""
+    def v_0(self) -> float:
+        """Nominal pull speed [m/s]."""
+        return self.parameters.v_0
+
+    @cached_property
+    def made_for(self) -> MadeFor | None:
+        """The environment that takes its actions; None: every one does."""
+        if self.any_environment:
+            return None
+        return Config(
+            action=self.action,
+            control_interval=self.control_interval,
+            parameters=self.parameters,
+            meniscus=self.meniscus,
+        ).made_for
 
     @property
-    @abstractmethod
-    def v_0(self) -> float:
-        """Nominal pull speed of the environment's parameters [m/s]."""
+    def settings(self) -> dict[str, Any]:
+        """Arguments of ``gym.make("Cz-v0", ...)`` for the environment that it was made for."""
+        given = {"observation": self.observation, "action": self.action, "control_interval": self.control_interval}
+        plant = {"parameters": (self.parameters, Parameters()), "meniscus": (self.meniscus, HURLE)}
+        return given | {name: own for name, (own, default) in plant.items() if own != default}
+
+    def for_config(self, config: Config) -> Self:
+        """The same controller for the control interval and the puller of an environment."""
+        return replace(
+            self,
+            control_interval=config.control_interval,
+            parameters=config.parameters,
+            meniscus=config.meniscus,
+        )
 
     @abstractmethod
     def at_rest(self, seen: Measured) -> Any:
@@ -70,11 +124,28 @@ class MeasuredController(ABC):
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[npt.NDArray[np.float32], Any]:
-        """The action and the next memory; arguments as of :class:`Policy`."""
+        """Return the action and the next memory; arguments as of :class:`Policy`."""
         array, single = batched(observation)
         seen = decode(array, self.v_0)
-        pull, power, memory = self.step(seen, fresh(state, self.at_rest(seen), episode_start))
-        return to_action(pull / self.v_0, power / HEATER_SCALE, single), memory
+        if state is None or (episode_start is not None and np.any(episode_start)):
+            first = Measured(*(np.where(np.isfinite(channel), channel, 0.0) for channel in seen))
+            state = fresh(state, State(first, self.at_rest(first)), episode_start)
+        read = readable(seen, state.readings)
+        given = read._replace(T_1=seen.T_1) if self.estimates_temperature else read
+        pull, power, memory = self.step(given, state.memory)
+        action = to_action(pull / self.v_0, power / HEATER_RANGE, single)
+        return mark(action, self.made_for), State(read, memory)
+
+
+def readable(seen: Measured, last: Measured) -> Measured:
+    """A sample with the ``last`` reading wherever a channel is not finite or the ring is not valid."""
+    finite = Measured(*map(np.isfinite, seen))
+    valid = (seen.valid > 0.5) & finite.ring_error
+    if valid.all() and all(channel.all() for channel in finite):
+        return seen
+    kept = Measured(*map(np.where, finite, seen, last))
+    ring_error = np.where(valid, seen.ring_error, last.ring_error + last.r_ref - kept.r_ref)
+    return kept._replace(ring_error=ring_error, valid=valid.astype(np.float64))
 
 
 def batched(observation: Any) -> tuple[Floats, bool]:
@@ -90,7 +161,7 @@ def to_action(pull: Floats, heat: Floats, single: bool) -> npt.NDArray[np.float3
 
 
 def fresh(state: Any, zeros: Any, episode_start: Any) -> Any:
-    """The state, a tuple of arrays or of such tuples, with ``zeros``, the state at rest, where an episode begins."""
+    """The state, with ``zeros``, the state at rest, where an episode begins; both are nested tuples of arrays."""
     if state is None:
         return zeros
     if episode_start is None:
@@ -100,17 +171,26 @@ def fresh(state: Any, zeros: Any, episode_start: Any) -> Any:
 
 
 def select(where: npt.NDArray[np.bool_], one: Any, other: Any) -> Any:
-    """``one`` in the slots where ``where`` is true, ``other`` elsewhere; both as a state in :func:`fresh`."""
+    """``one`` in the slots where ``where`` is true, ``other`` elsewhere; both nested tuples of arrays."""
     return map_arrays(lambda a, b: np.where(where.reshape(-1, *(1,) * (b.ndim - 1)), a, b), one, other)
 
 
 def map_arrays(function: Callable[..., Any], *values: Any) -> Any:
-    """A nested NamedTuple with the function's result in place of each array; ``values`` are nested alike."""
+    """The nested NamedTuple of the function's results for the arrays of ``values``, which are nested alike."""
     if isinstance(values[0], tuple):
         return type(values[0])(*(map_arrays(function, *parts) for parts in zip(*values, strict=True)))
     return function(*values)
 
 
 def stack(values: Sequence[Any]) -> Any:
-    """NamedTuples of one kind as one of arrays, with a new leading axis."""
+    """NamedTuples of one kind as one NamedTuple of arrays, with a new leading axis."""
     return map_arrays(lambda *parts: np.stack(parts), *values)
+
+
+def check_numbers(owner: Any, positive: Sequence[str] = (), not_negative: Sequence[str] = ()) -> None:
+    """Raise CzError for a field of ``owner`` that is not positive, or negative, or no number."""
+    for names, least, what in ((positive, False, "positive"), (not_negative, True, "zero or positive")):
+        for name in names:
+            value = getattr(owner, name)
+            if not (value > 0.0 or (least and value == 0.0)):
+                raise CzError(f"{type(owner).__name__}.{name} must be {what}, not {value!r}")

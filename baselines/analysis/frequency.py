@@ -1,4 +1,4 @@
-"""Margins of sampled loops, by python-control from their frequency response (no polynomial of order twenty needed)."""
+"""Margins of sampled loops, computed by python-control from their frequency response."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import numpy.typing as npt
 from cz_gym.physics.linearisation import Floats, StateSpace
 from cz_gym.physics.plant import Puller
 
-from .sampled_loop import Loop, close
+from .sampled_loop import close
 
 SLOWEST = 1e-4
-"""Lowest frequency of the tables [rad/s]: 17 hours a turn, below the drift of any episode."""
+"""Lowest frequency [rad/s]: a period of 17 hours, slower than the drift of any episode."""
 
 
 class LoopMargins(NamedTuple):
-    """How much one broken place of a stable loop bears; NaN where a bound does not exist."""
+    """Margins of a stable loop at the place where it was opened; NaN where one does not exist."""
 
     crossover: float
     """Highest frequency where the loop's gain falls through one [rad/s]."""
     gain_up: float
     """Factor by which the gain may grow [-]."""
     gain_down: float
-    """Factor by which it may fall [-]."""
+    """Factor by which the gain may fall [-]."""
     phase_deg: float
     """Least phase margin over all crossings [degrees]."""
     delay: float
@@ -47,8 +47,8 @@ def response(system: StateSpace, dt: float, omega: Floats) -> npt.NDArray[np.com
 
 
 def opened(controller: StateSpace, puller: Puller, dt: float, at: str) -> StateSpace:
-    """Minus the way around the loop, opened at "camera" (the plant alone is uncertain) or at "v_p" (the paper's view,
-    where what the controller knows of its own pull speed counts as plant)."""
+    """The open loop L, opened at "camera" (only the plant is uncertain) or at "v_p" (as in the paper, where the
+    controller's use of its own pull speed counts as plant)."""
     A, B, C, D = close(controller, puller, dt, broken=at).pick("r_br" if at == "camera" else "v_p", (at,))
     return StateSpace(A, B, -C, -D)
 
@@ -60,7 +60,7 @@ def crossover(controller: StateSpace, puller: Puller, dt: float, at: str = "came
 
 
 def crossover_of(values: npt.NDArray[np.complex128], omega: Floats) -> float:
-    """The same of an opened loop's frequency response."""
+    """The crossover of an open loop's frequency response, as :func:`crossover`."""
     gain = np.log(np.abs(values))
     falls = np.flatnonzero((gain[:-1] > 0.0) & (gain[1:] <= 0.0))
     if not len(falls):
@@ -77,14 +77,14 @@ def sensitivity(controller: StateSpace, puller: Puller, dt: float, points: int =
 
 
 def loop_margins(controller: StateSpace, puller: Puller, dt: float, at: str = "camera") -> LoopMargins:
-    """Margins of the loop opened there; all NaN but the crossover if the closed loop is unstable."""
+    """Margins of the loop opened there; if the closed loop is unstable, all but the crossover are NaN."""
     omega = frequencies(dt)
     values = response(opened(controller, puller, dt, at), dt, omega)
     return margins_of(values, omega, dt, close(controller, puller, dt).stable)
 
 
 def margins_of(values: npt.NDArray[np.complex128], omega: Floats, dt: float, stable: bool) -> LoopMargins:
-    """The same from an opened loop's response up to the Nyquist frequency, and whether it is stable closed."""
+    """Margins of an open loop's response up to the Nyquist frequency; ``stable`` is whether the closed loop is."""
     import control
 
     found = crossover_of(values, omega)
@@ -103,15 +103,10 @@ def margins_of(values: npt.NDArray[np.complex128], omega: Floats, dt: float, sta
 
 
 def _late_at_nyquist(value: complex, dt: float) -> Floats:
-    """Delay [s] that turns a loop gain above one at the Nyquist frequency, which is real, to the critical side."""
+    """Delay [s] that turns a real loop gain above one at the Nyquist frequency to the critical point's side."""
     turn = np.mod(np.angle(value) + np.pi, 2.0 * np.pi)
     return np.array([turn * dt / np.pi] if np.abs(value) > 1.0 else [])
 
 
 def _least(values: Any, pick: Any) -> float:
     return float(pick(values)) if len(values) else float("nan")
-
-
-def peak(loop: Loop, output: str, cause: str, points: int = 600) -> float:
-    """Largest gain over frequency from a disturbance to an output, SI."""
-    return float(np.abs(response(loop.pick(output, (cause,)), loop.dt, frequencies(loop.dt, points))).max())

@@ -1,9 +1,8 @@
-"""Sampled loops, linearised from the code that runs: a controller's ``predict``, the plant and what they make together.
+"""Sampled loops, linearised from the code that runs: a controller's ``predict`` and the plant.
 
-A controller whose memory is a NamedTuple of arrays is linear near rest, so feeding its own ``predict`` one unit of each
-memory entry and of each observation channel yields its state space: margins are those of the shipped code and no
-second description of it. Timing as in the environment: measure at t_k, act at once; the v_p and Q_H observed at
-t_k are those applied over the interval before.
+The state space of a controller comes from its own ``predict``, called with one unit of each memory entry and of each
+observation channel; its memory must be a NamedTuple of arrays. So the margins are those of the shipped code. Timing is
+that of the environment: measure at t_k, act at once; the v_p and Q_H observed at t_k were applied before.
 """
 
 from __future__ import annotations
@@ -15,24 +14,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.signal import cont2discrete
 
-from cz_gym.baselines.policy import Floats, map_arrays
+from cz_gym.baselines.policy import Floats, State, map_arrays
 from cz_gym.errors import CzError
 from cz_gym.observation import HEATER_SCALE, MEASURED, PULL_SCALE, Measured, scales
 from cz_gym.physics.linearisation import INPUTS, OUTPUTS, STATES, StateSpace, linearise
 from cz_gym.physics.plant import Puller
 
 _SMALL = 1e-6
-"""Observed amplitude that no limit, gate or dead zone notices [-]; float32 actions keep their relative precision."""
+"""Observed amplitude below every limit, gate and dead zone [-]; float32 actions keep their relative precision."""
 _SEEN = ("ring_error", "T_1", "v_p", "Q_H")
 """Channels through which the plant reaches the controller."""
-_DOUBLINGS = 40
-"""2^40 samples, beyond any memory of a stable loop."""
 _AT_REST = np.array([float(channel.name == "valid") for channel in MEASURED])
-"""Observation at rest: nothing but a valid camera."""
+"""Observation at rest: zeros and a valid camera."""
 _DISTURBED = ("v_p", "Q_d", "dT_i", "camera", "pyrometer")
-"""Inputs of a joined loop."""
+"""Inputs of a loop."""
 _ANSWERS = ("v_p", "Q_H", "r_c", "r_br")
-"""Its outputs: both commands and both radii."""
+"""Outputs of a loop: both commands and both radii."""
 
 
 class NotLinearError(CzError):
@@ -40,7 +37,7 @@ class NotLinearError(CzError):
 
 
 class Loop(NamedTuple):
-    """Plant and controller in one: z(k+1) = A z + B w, y = C z + D w, w and y as named, at one control interval."""
+    """Plant and controller together, z(k+1) = A z + B w, y = C z + D w, with w of _DISTURBED and y of _ANSWERS."""
 
     A: Floats
     B: Floats
@@ -65,13 +62,13 @@ class Loop(NamedTuple):
         return float(np.abs(np.linalg.eigvals(self.A)).max())
 
     def pick(self, output: str, inputs: tuple[str, ...]) -> StateSpace:
-        """The part from some inputs to one output."""
+        """The system from some inputs to one output."""
         row, columns = _ANSWERS.index(output), [_DISTURBED.index(name) for name in inputs]
         return StateSpace(self.A, self.B[:, columns], self.C[[row]], self.D[np.ix_([row], columns)])
 
 
 class _Nothing(NamedTuple):
-    """What a controller without memory remembers."""
+    """The memory of a controller without memory."""
 
 
 def linear_controller(
@@ -79,17 +76,18 @@ def linear_controller(
 ) -> StateSpace:
     """The controller in discrete time: inputs the channels of Measured, outputs v_p - v_0 [m/s] and Q_H - Q_H0 [W].
 
-    ``rest`` is its memory at rest, by default that after one sample of zeros. ``free`` names the parts of it that move,
-    "filter.mean" say, by default all; the others (a covariance, say) keep their value. Raises NotLinearError if the
-    controller does not rest there, or if the answer to twice the input is not twice the answer.
+    ``rest`` is its memory at rest, by default that after one sample of zeros. ``free`` names the parts of it that move
+    ("memory.filter.mean"), by default all but the last readings; the others, such as a covariance, keep their value.
+    Raises NotLinearError if the controller does not rest there, or if twice the input does not double the answer.
     """
     channels, name = len(MEASURED), type(policy).__name__
     rest = policy.predict(_AT_REST[None])[1] if rest is None else rest
     rest = _Nothing() if rest is None else rest
     if not hasattr(rest, "_fields"):
-        raise NotLinearError(f"{name} remembers no named tuple of arrays: it has no state space here")
+        raise NotLinearError(f"{name} has a memory that is no named tuple of arrays, so it has no state space here")
     parts = _parts(rest)
-    free = list(parts) if free is None else free
+    if free is None:
+        free = [part for part in parts if not (isinstance(rest, State) and part.startswith("readings."))]
     memory = sum(parts[part].size for part in free)
     probes = np.eye(memory + channels) * _SMALL
     still, once, twice = (_answer(policy, factor * probes, rest, free) for factor in (0.0, 1.0, 2.0))
@@ -108,7 +106,7 @@ def linear_controller(
 
 
 def _parts(memory: Any, name: str = "") -> dict[str, Floats]:
-    """The arrays of a memory's first slot, by their place in the nested tuple."""
+    """The arrays of a memory's first slot, by their names in the nested tuple."""
     if not isinstance(memory, tuple):
         return {name: np.asarray(memory, np.float64)[:1]}
     found: dict[str, Floats] = {}
@@ -118,7 +116,7 @@ def _parts(memory: Any, name: str = "") -> dict[str, Floats]:
 
 
 def _answer(policy: Any, probes: Floats, rest: Any, free: Sequence[str]) -> Floats:
-    """Next free memory and action for rows of (free memory, observation), both relative to rest."""
+    """The next free memory and the action for rows of (free memory, observation), both relative to rest."""
     n, start, parts = len(probes), 0, {}
     for name, value in _parts(rest).items():
         parts[name] = np.repeat(value, n, axis=0)
@@ -132,7 +130,7 @@ def _answer(policy: Any, probes: Floats, rest: Any, free: Sequence[str]) -> Floa
 
 
 def sampled_plant(puller: Puller, dt: float) -> StateSpace:
-    """The plant by zero-order hold: inputs v_p, Q_H, Q_d, dT_i; outputs r_c, r_br, T_1; deviations in SI."""
+    """The plant with held inputs v_p, Q_H, Q_d, dT_i and outputs r_c, r_br, T_1; deviations in SI units."""
     A, B, C, _ = linearise(puller)
     pyrometer = np.zeros((1, len(STATES)))
     pyrometer[0, STATES.index("T_1")] = 1.0
@@ -142,12 +140,12 @@ def sampled_plant(puller: Puller, dt: float) -> StateSpace:
 
 
 def close(controller: StateSpace, puller: Puller, dt: float, broken: str = "") -> Loop:
-    """Join controller and plant.
+    """The loop of controller and plant.
 
     Inputs: v_p (added to the command), Q_d, dT_i, camera and pyrometer noise; references held. Outputs: v_p and Q_H
-    (the commands), r_c, r_br. ``broken="camera"`` opens the loop there: the controller reads the input ``camera``
-    alone; ``broken="v_p"`` opens it at the pull speed: plant and controller see the input ``v_p`` alone. The state is
-    (plant, v_p and Q_H applied last, controller).
+    (the commands), r_c, r_br. ``broken="camera"`` opens the loop at the camera: the controller reads only the input
+    ``camera``. ``broken="v_p"`` opens it at the pull speed: plant and controller see only the input ``v_p``. The state
+    is (plant, last applied v_p and Q_H, controller).
     """
     plant, n, inputs = sampled_plant(puller, dt), len(STATES), len(_DISTURBED)
     at = [Measured._fields.index(name) for name in _SEEN]
@@ -173,37 +171,3 @@ def close(controller: StateSpace, puller: Puller, dt: float, broken: str = "") -
         np.vstack([direct, np.zeros((2, inputs))]),
         dt,
     )
-
-
-def late(controller: StateSpace, samples: int) -> StateSpace:
-    """The controller reading the camera that many samples late."""
-    camera = np.zeros((1, controller.B.shape[1]))
-    camera[0, Measured._fields.index("ring_error")] = 1.0
-    for _ in range(samples):
-        A, B, C, D = controller
-        controller = StateSpace(
-            np.block([[A, B @ camera.T], [np.zeros((1, len(A) + 1))]]),
-            np.vstack([B * (1.0 - camera), camera]),
-            np.hstack([C, D @ camera.T]),
-            D * (1.0 - camera),
-        )
-    return controller
-
-
-def root_mean_square(system: StateSpace, difference: bool = False) -> float:
-    """Standard deviation of the output for white noise of unit standard deviation per sample; NaN if unstable.
-
-    It solves the Lyapunov equation by doubling, so that badly scaled slow loops lose no positive variance to rounding.
-    ``difference`` takes the standard deviation of the step-to-step change.
-    """
-    A, B, C, D = system
-    if np.abs(np.linalg.eigvals(A)).max() >= 1.0:
-        return float("nan")
-    if difference:
-        n = len(A)
-        A, B = np.block([[A, np.zeros((n, 1))], [C, np.zeros((1, 1))]]), np.vstack([B, D])
-        C = np.hstack([C, -np.ones((1, 1))])
-    covariance, power = B @ B.T, A
-    for _ in range(_DOUBLINGS):
-        covariance, power = covariance + power @ covariance @ power.T, power @ power
-    return float(np.sqrt((C @ covariance @ C.T + D @ D.T)[0, 0]))

@@ -1,8 +1,8 @@
-"""The bound that nothing can beat: true state, parameters and every future disturbance are known.
+"""The lowest bound: the optimal trajectory for known parameters, state and future disturbances.
 
-Before an episode the whole trajectory is optimised for the reward's own cost
-(:mod:`cz_gym.baselines.bounds.trajectory`). During it the optimal inputs are played. The optimum's own feedback on the
-true state corrects what the plan cannot know: a heater that moves in steps.
+The trajectory is optimised before the episode, for the reward's own cost (:mod:`cz_gym.baselines.bounds.trajectory`).
+During the episode its inputs are applied. The optimum's own feedback on the true state corrects what the plan does not
+contain: a heater that moves in steps.
 """
 
 from __future__ import annotations
@@ -14,58 +14,66 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.action import MadeFor, mark
 from cz_gym.baselines.policy import Floats, batched, fresh, to_action
 from cz_gym.config import Config
 from cz_gym.errors import CzError
-from cz_gym.observation import HEATER_SCALE, STATE, scales
+from cz_gym.observation import STATE, scales
+from cz_gym.task import HEATER_RANGE
 
 from .future import future_of
-from .trajectory import INPUTS, Trajectory, limits_of, optimise, predicted_cost
+from .trajectory import INPUTS, MOST_STEPS, TOLERANCE, Trajectory, limits_of, optimise, predicted_cost
 
 _CHANNELS = tuple(channel.name for channel in STATE)
 _X = ("r_c_error", "h_c", "T_1", "T_2", "T_b")
 
 
 class Plan(NamedTuple):
-    """What the clairvoyant knows of its slots."""
+    """The optima of the slots."""
 
     best: Trajectory
     state_0: Floats
     """Each puller's operating point, shape (n, 5)."""
     inputs_0: Floats
-    """Its inputs, shape (n, 2)."""
+    """Inputs at the operating point, shape (n, 2)."""
     cost: Floats
-    """The objective at the optimum, summed over the episode, shape (n,)."""
+    """The cost at the optimum, summed over the episode, shape (n,)."""
+    made_for: MadeFor
 
 
 class Memory(NamedTuple):
-    """What it remembers."""
+    """The memory of the clairvoyant."""
 
     step: Floats
-    """Steps taken, shape (n,)."""
+    """Number of steps taken, shape (n,)."""
     correction: Floats
-    """Last inputs less the planned ones [m/s, W], shape (n, 2)."""
+    """Last inputs minus the planned ones [m/s, W], shape (n, 2)."""
 
 
 @dataclass(frozen=True)
 class Clairvoyant:
-    """Plays the optimum of each slot's episode, on "state" observations; :meth:`for_episodes` makes the plan."""
+    """The optimal inputs of each slot's episode, on "state" observations; :meth:`for_episodes` makes the plan."""
 
     plan: Plan | None = field(default=None, compare=False, repr=False)
 
     @property
     def hash(self) -> str:
-        """Hash of its settings: it has none, and its constants are part of the code."""
+        """Hash of its settings, of which there are none."""
         return ""
 
+    @property
+    def made_for(self) -> MadeFor | None:
+        """The environment of the plan; None without a plan."""
+        return self.plan and self.plan.made_for
+
     def for_episodes(self, config: Config, seeds: Sequence[int]) -> Clairvoyant:
-        """The same for those episodes, one a slot."""
+        """The clairvoyant of those episodes, one a slot; CzError if the optimum of one was not reached."""
         return Clairvoyant(make_plan(config, seeds))
 
     def predict(
         self, observation: Any, state: Memory | None = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[npt.NDArray[np.float32], Memory]:
-        """The action and what to remember."""
+        """Return the action and the next memory; arguments as of :class:`cz_gym.baselines.policy.Policy`."""
         if self.plan is None:
             raise RuntimeError("clairvoyant has no plan: call for_episodes(config, seeds) first, as a rollout does")
         array, single = batched(observation)
@@ -80,16 +88,22 @@ class Clairvoyant:
         deviation = np.concatenate([x - best.x[k, slot], memory.correction], axis=-1)
         correction = memory.correction + (best.feedback[k, slot] @ deviation[:, :, None])[:, :, 0]
         inputs = best.u[k, slot] + correction - inputs_0
-        action = to_action(inputs[:, 0] / inputs_0[:, 0], inputs[:, 1] / HEATER_SCALE, single)
-        return action, Memory(memory.step + 1.0, correction)
+        action = to_action(inputs[:, 0] / inputs_0[:, 0], inputs[:, 1] / HEATER_RANGE, single)
+        return mark(action, self.made_for), Memory(memory.step + 1.0, correction)
 
 
 def make_plan(config: Config, seeds: Sequence[int]) -> Plan:
-    """Optimise the first episodes that those seeds draw."""
+    """Optimise the first episode of each seed; CzError names those whose optimum was not reached."""
     future = future_of(config, seeds)
     limits = limits_of(config.scenario.actuators, config.parameters.v_0, config.control_interval)
     best = optimise(future, limits)
+    if not best.converged.all():
+        lost = ", ".join(str(seed) for seed, reached in zip(seeds, best.converged, strict=True) if not reached)
+        raise CzError(
+            f"clairvoyant is no bound on {config.scenario.name!r}: after {MOST_STEPS} Newton steps the optimum of seed "
+            f"{lost} was not reached (last move {best.last_move.max():.1g}, at most {TOLERANCE:g} is allowed)"
+        )
     state_0, inputs_0 = (
         np.stack(np.broadcast_arrays(*values), axis=-1) for values in (future.puller.state_0, future.puller.inputs_0)
     )
-    return Plan(best, state_0, inputs_0, predicted_cost(future, best))
+    return Plan(best, state_0, inputs_0, predicted_cost(future, best), config.made_for)

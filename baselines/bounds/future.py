@@ -1,6 +1,6 @@
-"""What will happen in an episode: its puller, its start, its reference and every disturbance to come.
+"""The future of an episode: its puller, its start, its reference and every disturbance to come.
 
-All comes from the environment's own draws and schedules. It is for bounds alone; no controller may read it.
+It comes from the environment's own draws and schedules, and is for bounds only; no controller may read it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from cz_gym.baselines.policy import Floats, stack
 from cz_gym.config import Config
-from cz_gym.engine.batch import first_key
+from cz_gym.engine.batch import Key, first_key
 from cz_gym.episodes.draw import randomised
 from cz_gym.episodes.record import GRID, Episode
 from cz_gym.episodes.schedule import disturbance, reference
@@ -25,7 +25,7 @@ _EPS = 1e-9
 
 
 class Substeps(NamedTuple):
-    """How the control intervals fall into integration steps, split at the 5 s grid as the environment does."""
+    """Integration steps of the control intervals, split at the 5 s grid as in the environment."""
 
     point: npt.NDArray[np.int64]
     """Grid point whose disturbance holds, shape (steps, substeps)."""
@@ -34,7 +34,7 @@ class Substeps(NamedTuple):
 
 
 class Future(NamedTuple):
-    """n episodes of some steps, known to the end; SI units."""
+    """n episodes, known to their end; SI units."""
 
     puller: Puller
     """Fields of shape (n,)."""
@@ -43,13 +43,13 @@ class Future(NamedTuple):
     r_ref: Floats
     """Radius reference at the end of each step [m], shape (steps, n)."""
     disturbances: tuple[Disturbance, ...]
-    """By substep; fields of shape (steps, n)."""
+    """Disturbances by substep; fields of shape (steps, n)."""
     lengths: Floats
     """Length of each substep [s], shape (substeps, steps, 1)."""
     meniscus: MeniscusModel
 
     def advance(self, x: State, u: Inputs, steps: slice) -> State:
-        """The state at the end of those steps, each from its own start; fields real or complex, shape (..., n)."""
+        """The state at the end of those steps, each from its own start; fields are real or complex, shape (..., n)."""
         for d, dt in zip(self.disturbances, self.lengths, strict=True):
             held = Disturbance(*(value[steps] for value in d))
             x = rk4(x, u, held, self.puller, dt[steps], self.meniscus.slope)
@@ -57,26 +57,26 @@ class Future(NamedTuple):
 
 
 def pullers_of(config: Config, seeds: Sequence[int]) -> tuple[Puller, ...]:
-    """The pullers of the first episodes that those seeds draw."""
+    """The pullers of the first episode of each seed."""
     pullers = []
-    for seed in seeds:
-        factors = draw_factors(config.scenario, config.mix, first_key(seed))
+    for key in _keys(seeds):
+        factors = draw_factors(config.scenario, config.mix, key)
         pullers.append(make_puller(randomised(config.parameters, factors), factors.lam, config.meniscus))
     return tuple(pullers)
 
 
 def fluctuations_of(config: Config, seeds: Sequence[int]) -> tuple[tuple[float, float], ...]:
-    """Standard deviations of fast and slow interface fluctuation [K] of those seeds' first episodes."""
-    drawn = (draw_episode(config.scenario, first_key(seed), new_series(1, 0)) for seed in seeds)
+    """Standard deviations of the fast and the slow interface fluctuation [K] in the first episode of each seed."""
+    drawn = (draw_episode(config.scenario, key, new_series(1, 0)) for key in _keys(seeds))
     return tuple((float(episode.sd_fast), float(episode.sd_slow)) for episode in drawn)
 
 
 def future_of(config: Config, seeds: Sequence[int]) -> Future:
-    """The future of the first episode that each seed draws."""
+    """The future of the first episode of each seed."""
     puller = stack(pullers_of(config, seeds))
     substeps = substeps_of(config.control_interval, config.steps)
     points = int(substeps.point.max()) + 1
-    drawn = [_drawn(config, seed, points) for seed in seeds]
+    drawn = [_drawn(config, key, points) for key in _keys(seeds)]
     e = stack([episode for episode, _ in drawn])
     dT_i = np.stack([interface for _, interface in drawn], axis=1)
     on_grid = disturbance(np.arange(points)[:, None] * GRID, dT_i, e, puller)
@@ -106,6 +106,12 @@ def substeps_of(interval: float, steps: int) -> Substeps:
     return Substeps(point[:, used], length[:, used])
 
 
-def _drawn(config: Config, seed: int, points: int) -> tuple[Episode, Floats]:
+def _keys(seeds: Sequence[int]) -> list[Key]:
+    """The key of each seed's first episode; seeds may be an array."""
+    return [first_key(int(seed)) for seed in seeds]
+
+
+def _drawn(config: Config, key: Key, points: int) -> tuple[Episode, Floats]:
+    """The episode of that key and its interface fluctuation on the grid."""
     series = new_series(points, 0)
-    return draw_episode(config.scenario, first_key(seed), series), series.interface
+    return draw_episode(config.scenario, key, series), series.interface

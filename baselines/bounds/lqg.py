@@ -1,45 +1,48 @@
-"""Privileged LQGs: bounds on what a perfect model, and a perfect view of the present, would be worth.
+"""Privileged LQGs: bounds on the worth of a perfect model, and of a perfect view of the present.
 
-They know what no controller can know, and stand in tables as bounds, never as contenders. They get their knowledge
-through ``for_episodes``, which a rollout calls with the episodes that it is about to run.
+They know what no controller can know, and stand in tables as bounds, never as contenders. Their method
+``for_episodes``, which a rollout calls, gives them this knowledge of the episodes that it is about to run.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.action import mark
 from cz_gym.baselines.lqg import kalman
-from cz_gym.baselines.lqg.controller import LQG, Gains, LQGSettings, Memory, optimal_inputs, solve_each
-from cz_gym.baselines.lqg.model import DRIFT, FAST, PLANT, SLOW, STATES, NoiseModel, load_per_drift
-from cz_gym.baselines.lqg.preview import look_ahead, samples_ahead
-from cz_gym.baselines.lqg.settings import settings_of
+from cz_gym.baselines.lqg.controller import LQG, Gains, LQGDesign, solve_each
+from cz_gym.baselines.lqg.designs import lqg
+from cz_gym.baselines.lqg.estimator import PlantFilter
+from cz_gym.baselines.lqg.filter_bank import FilterBank
+from cz_gym.baselines.lqg.model import DRIFT, DRIFT_RATE, FAST, PLANT, SLOW, STATES, NoiseModel, load_per_drift
 from cz_gym.baselines.policy import Floats, batched, fresh, to_action
 from cz_gym.config import Config
-from cz_gym.errors import CzError
-from cz_gym.observation import HEATER_SCALE, STATE, Measured, scales
+from cz_gym.observation import STATE, scales
 from cz_gym.physics.plant import hidden_load
+from cz_gym.task import HEATER_RANGE
 
 from .future import fluctuations_of, pullers_of
 
 _LEAST_SD = 0.01
-"""Least standard deviation of a fluctuation [K]: a filter that expects none would not see what its model leaves out."""
+"""Least standard deviation of a fluctuation [K]: a filter that expects none cannot follow what its model leaves out."""
 _TINY = 1e-9
-"""Share of the fluctuations' variance by which their sum is taken to be uncertain, for Riccati's equation."""
+"""Uncertainty of the sum of the fluctuations in Riccati's equation, as a share of its variance [-]."""
 
 
 @dataclass(frozen=True)
 class PrivilegedLQG(LQG):
-    """The LQG with each slot's own puller as its model: what knowing the parameters is worth.
+    """The LQG with each slot's own puller as its model: a bound on the worth of the parameters.
 
-    With ``knows_fluctuations`` its filter also has each crystal's own strength of the interface fluctuations, where
-    other LQGs assume the average. Before ``for_episodes`` it is the LQG with the nominal puller.
+    With ``knows_fluctuations`` its filter also has the strength of each crystal's interface fluctuations, where other
+    LQGs assume the average. Before ``for_episodes`` it is the LQG of the nominal puller.
     """
 
     gains_by_slot: Gains | None = None
@@ -50,85 +53,81 @@ class PrivilegedLQG(LQG):
         """Gains of the slots' own pullers."""
         return super().gains if self.gains_by_slot is None else self.gains_by_slot
 
-    def at_rest(self, seen: Measured) -> Memory:
-        """The filter at its initial covariance; ValueError for another number of slots than of known pullers."""
-        self.check_slots(len(seen.v_p))
-        return super().at_rest(seen)
+    def estimator(self, n: int) -> PlantFilter | FilterBank:
+        """The filter; ValueError for another number of slots than of known pullers."""
+        known = n if self.gains_by_slot is None else len(self.gains_by_slot.filter.plant.A)
+        if known != n:
+            raise ValueError(f"{known} pullers are known, got {n} slots: one puller a slot is needed")
+        return super().estimator(n)
 
-    def check_slots(self, slots: int) -> None:
-        """ValueError for another number of slots than of known pullers."""
-        known = slots if self.gains_by_slot is None else len(self.gains_by_slot.filter.plant.A)
-        if known != slots:
-            raise CzError(f"{known} pullers are known, got {slots} slots: one puller a slot is needed")
-
-    def for_episodes(self, config: Config, seeds: Sequence[int]) -> PrivilegedLQG:
+    def for_episodes(self, config: Config, seeds: Sequence[int]) -> Self:
         """The same controller for those episodes, one a slot."""
-        settings = [self.settings] * len(seeds)
+        designs = [self.design] * len(seeds)
         if self.knows_fluctuations:
-            settings = [_with_fluctuations(self.settings, *each) for each in fluctuations_of(config, seeds)]
-        solved = solve_each(settings, config.control_interval, pullers_of(config, seeds), config.meniscus)
+            designs = [_with_fluctuations(self.design, *each) for each in fluctuations_of(config, seeds)]
+        solved = solve_each(designs, config.control_interval, pullers_of(config, seeds), config.meniscus)
         return replace(self, gains_by_slot=solved)
 
 
-def _with_fluctuations(settings: LQGSettings, fast: float, slow: float) -> LQGSettings:
-    """The settings for fluctuations of those standard deviations [K]."""
-    noise = replace(settings.noise, fast_sd=max(fast, _LEAST_SD), slow_sd=max(slow, _LEAST_SD))
-    return replace(settings, noise=noise)
+def _with_fluctuations(design: LQGDesign, fast: float, slow: float) -> LQGDesign:
+    """The design for fluctuations of those standard deviations [K]."""
+    noise = replace(design.noise, fast_sd=max(fast, _LEAST_SD), slow_sd=max(slow, _LEAST_SD))
+    return replace(design, noise=noise)
 
 
-class FullMemory(NamedTuple):
-    """What the full-information regulator remembers."""
+class Exact(NamedTuple):
+    """The true state in place of an estimate."""
 
-    fluctuation: Floats
-    """The fast and the slow part of the interface fluctuation [K], shape (n, 2)."""
-    drift: Floats
-    """Drift of the hot zone at the last sample [K], shape (n,)."""
-    plan: Floats
-    """Recipe ahead, shape (n, 2, samples + 1)."""
-    started: Floats
-    """1 once the slot has seen a sample, shape (n,)."""
+    mean: Floats
+    """State of the augmented plant, deviations in SI units, shape (n, 10)."""
+
+
+class TrueState(NamedTuple):
+    """A filter that sees the state and the present disturbances.
+
+    Only the sum of the two interface fluctuations is seen: a noise-free Kalman filter of two states separates them.
+    The drift is the one whose static load is seen, its rate the last change.
+    """
+
+    models: PlantFilter
+
+    def at_rest(self, n: int) -> Exact:
+        """The state before the first sample of n slots."""
+        return Exact(np.zeros((n, len(STATES))))
+
+    def step(
+        self, state: Exact, applied: Floats, drift_moved: Floats, seen: Any, starts: npt.NDArray[np.bool_]
+    ) -> Exact:
+        """The state at a sample, given the one before."""
+        dt, before, mean = self.models.dt, state.mean, np.zeros(state.mean.shape)
+        mean[:, :PLANT] = np.stack([seen.r_c_error + seen.r_ref, seen.h_c, seen.T_1, seen.T_2, seen.T_b], axis=-1)
+        mean[:, [FAST, SLOW]] = _separated(before[:, [FAST, SLOW]], seen.dT_i, starts, self.models.noise, dt)
+        mean[:, DRIFT] = _drift(seen.Q_d, self.models.puller)
+        mean[:, DRIFT_RATE] = np.where(starts, 0.0, mean[:, DRIFT] - before[:, DRIFT]) / dt
+        return Exact(mean)
 
 
 @dataclass(frozen=True)
-class FullInformation:
-    """The LQG's regulator on the true state and the present disturbances ("state" observations); no future.
+class FullInformation(PrivilegedLQG):
+    """The LQG's regulator on the true state and the present disturbances ("state" observations), without the future."""
 
-    It knows each slot's puller too. The interface fluctuation is seen as a sum: a noise-free Kalman filter of two
-    states separates fast and slow. The drift is the one whose static load is seen, its rate the last change.
-    """
+    observation: ClassVar[str] = "state"
 
-    lqg: PrivilegedLQG = field(default_factory=PrivilegedLQG)
-
-    def for_episodes(self, config: Config, seeds: Sequence[int]) -> FullInformation:
-        """The same regulator for those episodes, one a slot."""
-        return FullInformation(self.lqg.for_episodes(config, seeds))
+    def estimator(self, n: int) -> Any:
+        """The true state of n slots."""
+        super().estimator(n)
+        return TrueState(self.gains.filter)
 
     def predict(
-        self, observation: Any, state: FullMemory | None = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[npt.NDArray[np.float32], FullMemory]:
-        """The action and what to remember."""
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[npt.NDArray[np.float32], Any]:
+        """Return the action and the next memory; arguments as of :class:`cz_gym.baselines.policy.Policy`."""
         array, single = batched(observation)
-        n = len(array)
-        self.lqg.check_slots(n)
-        gains, v_0 = self.lqg.gains, self.lqg.v_0
-        p, dt = gains.filter.puller, gains.filter.dt
-        seen = dict(zip((channel.name for channel in STATE), (array * scales(STATE, v_0)).T, strict=True))
-        rest = FullMemory(np.zeros((n, 2)), np.zeros(n), np.zeros((n, 2, samples_ahead(dt) + 1)), np.zeros(n))
-        memory = fresh(state, rest, episode_start)
-        starts = memory.started == 0.0
-        fluctuation = _separated(memory.fluctuation, seen["dT_i"], starts, gains.filter.noise, dt)
-        drift = _drift(seen["Q_d"], p)
-        plan = look_ahead(memory.plan, _recipe(seen), starts, dt)
-        x = np.zeros((n, len(STATES)))
-        x[:, :PLANT] = np.stack([seen[name] for name in ("r_c_error", "h_c", "T_1", "T_2", "T_b")], axis=-1)
-        x[:, 0] += seen["r_ref"]
-        x[:, [FAST, SLOW]] = fluctuation
-        x[:, DRIFT] = drift
-        x[:, DRIFT + 1] = np.where(starts, 0.0, drift - memory.drift) / dt
-        applied = np.stack([seen["v_p"], seen["Q_H"]], axis=-1)
-        inputs = optimal_inputs(x, plan, applied, gains.regulator, 0.0, v_0)
-        action = to_action(inputs[:, 0] / v_0, inputs[:, 1] / HEATER_SCALE, single)
-        return action, FullMemory(fluctuation, drift, plan, np.ones(n))
+        seen: Any = SimpleNamespace(
+            **dict(zip((channel.name for channel in STATE), (array * scales(STATE, self.v_0)).T, strict=True))
+        )
+        pull, power, memory = self.step(seen, fresh(state, self.at_rest(seen), episode_start))
+        return mark(to_action(pull / self.v_0, power / HEATER_RANGE, single), self.made_for), memory
 
 
 @lru_cache(maxsize=16)
@@ -142,7 +141,7 @@ def _separation(noise: NoiseModel, dt: float) -> tuple[Floats, Floats, Floats]:
 
 
 def _separated(old: Floats, total: Floats, starts: npt.NDArray[np.bool_], noise: NoiseModel, dt: float) -> Floats:
-    """The fluctuation [K] as fast and slow part, shape (n, 2)."""
+    """The fast and the slow part of the fluctuation [K], shape (n, 2), from its ``total`` and the ``old`` parts."""
     keep, gain, first = _separation(noise, dt)
     predicted = old * keep
     parts: Floats = predicted + np.where(starts[:, None], first, gain) * (total - predicted.sum(axis=-1))[:, None]
@@ -158,23 +157,24 @@ def _drift(Q_d: Floats, p: Any) -> Floats:
     return drift
 
 
-def _recipe(seen: dict[str, Floats]) -> Measured:
-    """The recipe's channels as a "measured" observation has them; what is not the recipe is zero."""
-    zero = np.zeros_like(seen["r_ref"])
-    return Measured(*(seen[name] if "_ref" in name else zero for name in Measured._fields))
-
-
-def privileged(lqg: LQG) -> PrivilegedLQG:
-    """Bound: that LQG, knowing each puller's parameters and each crystal's fluctuations."""
-    return PrivilegedLQG(lqg.settings, lqg.control_interval, lqg.parameters, lqg.meniscus, knows_fluctuations=True)
+def privileged(plain: LQG) -> PrivilegedLQG:
+    """Bound: that LQG with each puller's parameters and the strength of each crystal's fluctuations."""
+    return PrivilegedLQG(
+        plain.control_interval,
+        plain.design,
+        parameters=plain.parameters,
+        meniscus=plain.meniscus,
+        knows_fluctuations=True,
+    )
 
 
 def lqg_true(config: Config) -> PrivilegedLQG:
-    """Bound: the LQG, knowing each puller's parameters."""
-    settings = settings_of("lqg", config.scenario.name)
-    return PrivilegedLQG(settings, config.control_interval, config.parameters, config.meniscus)
+    """Bound: ``lqg`` with each puller's parameters."""
+    return replace(privileged(lqg("lqg", config)), knows_fluctuations=False)
 
 
 def full_information(config: Config) -> FullInformation:
-    """Bound: the LQG's regulator on the true state and the present disturbances."""
-    return FullInformation(lqg_true(config))
+    """Bound: the regulator of ``lqg`` on the true state and the present disturbances."""
+    design = lqg("lqg", config).design
+    exact = replace(design, noise=replace(design.noise, recipe_share=0.0), heater_slack=0.0)
+    return FullInformation(design=exact).for_config(config)

@@ -1,4 +1,4 @@
-"""Linear-quadratic problems in stages, solved for a batch at once by Riccati's recursion.
+"""Linear-quadratic problems in stages, solved for a batch by Riccati's recursion.
 
 minimise sum_k 1/2 z' Q z + q' z (after each stage) + 1/2 w' R w + r' w, subject to z_{k+1} = A z_k + B w_k + c_k:
 the Newton step of a trajectory. One sweep back and one forward; time grows with the number of stages, not its cube.
@@ -21,15 +21,15 @@ class Stages(NamedTuple):
     B: Floats
     """Shape (N, n, states, inputs)."""
     c: Floats
-    """What the linear model misses of the next state, shape (N, n, states)."""
+    """Constant term of the next state, shape (N, n, states)."""
     Q: Floats
     """Curvature of the cost by the state after the stage, shape (N, n, states)."""
     q: Floats
-    """Its slope, shape (N, n, states)."""
+    """Slope of the cost by the state after the stage, shape (N, n, states)."""
     R: Floats
     """Curvature of the cost by the stage's input, shape (N, n, inputs)."""
     r: Floats
-    """Its slope, shape (N, n, inputs)."""
+    """Slope of the cost by the stage's input, shape (N, n, inputs)."""
 
 
 class Law(NamedTuple):
@@ -42,7 +42,7 @@ class Law(NamedTuple):
 
 
 def sweep_back(stages: Stages) -> Law:
-    """The optimal law; exact for any starting state."""
+    """The law that is optimal for every starting state."""
     N, n, states, inputs = stages.B.shape
     law = Law(np.empty((N, n, inputs, states)), np.empty((N, n, inputs)))
     P, p = np.zeros((n, states, states)), np.zeros((n, states))

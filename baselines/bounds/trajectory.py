@@ -1,4 +1,4 @@
-"""The best whole-episode trajectory for a known future: Newton steps by Riccati sweeps, limits by an interior point.
+"""The optimal trajectory of an episode with a known future: Newton steps by Riccati sweeps, limits by interior points.
 
 Direct multiple shooting (Bock and Plitt 1984): states and inputs of all steps are unknowns. The dynamics of all steps
 are linearised at once, by complex step through the environment's own equations. Riccati sweeps solve the banded problem
@@ -12,6 +12,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from cz_gym.baselines.policy import Floats
 from cz_gym.cost import Cost, cost_terms
@@ -25,15 +26,15 @@ from .riccati import Law, Stages, sweep_back, sweep_forward
 
 STATES, INPUTS = len(State._fields), len(Inputs._fields)
 SCALES = np.array([MM, MM, 1.0, 1.0, 1.0, MM_PER_MIN, KILO])
-"""Units in which state and inputs are of one order."""
+"""Units [m, m, K, K, K, m/s, W] in which state and inputs are of the same order."""
 TOLERANCE = 1e-7
-"""Largest last move, in SCALES, at which the search ends."""
-MOST_STEPS = 60
-"""Most Newton steps."""
+"""Largest last move, in SCALES, of a converged optimum."""
+MOST_STEPS = 200
+"""Limit of the number of Newton steps; most optima need ten to twenty."""
 BARRIER, BARRIER_END, BARRIER_CUT = 1e-2, 1e-9, 0.1
 """Weight of the barrier at the start and at the end, in the cost of a step, and its factor from step to step."""
 BOUNDARY = 0.99
-"""Largest share of the way to a limit that one step goes [-]."""
+"""Largest share of the distance to a limit that one step covers [-]."""
 _STEP = 1e-30
 
 
@@ -47,7 +48,7 @@ class Limits(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """The optimum of each slot; SI units."""
+    """The optimum of each slot, where ``converged``; SI units."""
 
     x: Floats
     """State at the start of each step and at the end, shape (N + 1, n, 5)."""
@@ -58,6 +59,11 @@ class Trajectory(NamedTuple):
     last_move: Floats
     """Largest last move of any unknown, in :data:`SCALES`, shape (n,)."""
 
+    @property
+    def converged(self) -> npt.NDArray[np.bool_]:
+        """Whether the search for the optimum ended, shape (n,)."""
+        return self.last_move < TOLERANCE
+
 
 def limits_of(actuators: Actuators, v_0: float, interval: float) -> Limits:
     """The limits of the action box and of the drives, for a control interval [s]."""
@@ -67,7 +73,7 @@ def limits_of(actuators: Actuators, v_0: float, interval: float) -> Limits:
 
 
 def optimise(future: Future, limits: Limits) -> Trajectory:
-    """Minimise the reward's unsaturated cost over the whole episode within the drives' limits."""
+    """Minimise the reward's unsaturated cost over whole episodes within the drives' limits."""
     N, n = future.r_ref.shape
     nominal = np.stack([np.broadcast_to(value, n) for value in future.puller.inputs_0], axis=-1)
     x = np.broadcast_to(np.stack(future.start, axis=-1), (N + 1, n, STATES)).copy()
@@ -125,9 +131,9 @@ def linearised(future: Future, x: Floats, u: Floats) -> tuple[Floats, Floats]:
 
 
 _BLOCK = 128
-"""Steps linearised at once: what fits a processor's cache."""
+"""Number of steps that are linearised together: they fit a processor's cache."""
 _WEIGHTS = Cost(*cost_terms(MM, MM_PER_MIN, MM_PER_MIN, KILO))
-"""The cost of one unit of :data:`SCALES` in each term."""
+"""Cost terms of one unit of :data:`SCALES`."""
 _CURVATURE = 2.0 * np.array([_WEIGHTS.radius, 0.0, 0.0, 0.0, 0.0, _WEIGHTS.pull, 0.0])
 _MOVE_CURVATURE = 2.0 * np.array([_WEIGHTS.pull_step, _WEIGHTS.heater_step])
 
@@ -135,7 +141,7 @@ _MOVE_CURVATURE = 2.0 * np.array([_WEIGHTS.pull_step, _WEIGHTS.heater_step])
 def _stages(
     future: Future, x: Floats, u: Floats, nominal: Floats, slack: Floats, force: Floats, barrier: float
 ) -> Stages:
-    """The Newton step's problem in deviations from (x, u); its states are x and the inputs held."""
+    """The problem of a Newton step in deviations from (x, u); its states are x and the held inputs."""
     after, slopes = linearised(future, x, u)
     N, n = future.r_ref.shape
     slopes = slopes * (SCALES / SCALES[:STATES, None])
@@ -157,14 +163,14 @@ def _stages(
 
 
 def _slacks(u: Floats, nominal: Floats, limits: Limits) -> Floats:
-    """How far each limit is: above, below, moving up, moving down; shape (4, N, n, 2)."""
+    """Distances to the limits: above, below, of moves up, of moves down; shape (4, N, n, 2)."""
     held = (u - nominal) / SCALES[STATES:]
     moves = np.diff(u, axis=0, prepend=nominal[None]) / SCALES[STATES:]
     return np.stack([limits.span - held, limits.span + held, limits.move - moves, limits.move + moves])
 
 
 def _slopes(held: Floats, moves: Floats) -> Floats:
-    """How the slacks change with inputs and moves."""
+    """Changes of the slacks with inputs and moves."""
     return np.stack([-held, held, -moves, moves])
 
 

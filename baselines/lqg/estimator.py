@@ -1,8 +1,8 @@
 """The LQG's state estimator: an extended Kalman filter of the augmented plant on bright ring and pyrometer.
 
-The mean is predicted through the plant's own equations (or, with ``nonlinear=False``, through the linearised ones), the
-covariance through the linearised plant. The ring's slope is taken at the estimated meniscus, because a growing radius
-nearly doubles it and halves the RHP zero. The camera's noise is estimated from the innovations.
+The mean is predicted with the plant's own equations (or, with ``nonlinear=False``, with the linearised ones), the
+covariance with the linearised plant. The ring's slope is taken at the estimated meniscus, because a growing radius
+nearly doubles it and halves the right-half-plane zero. The camera's noise is estimated from the innovations.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from .ring_model import RIPPLE, RIPPLE_STATES, RingModel, RippleSearch
 
 _RADIUS, _HEIGHT, _PYROMETER = (STATES.index(name) for name in ("r_c", "h_c", "T_1"))
 _LARGEST = np.array([RADIUS_LIMIT, 1.0, 50.0, 50.0, 50.0, 5.0, 5.0, 30.0, 1.0 / MINUTE, 5.0 * KILO])
-"""Estimates are held within these, beyond which the equations mean nothing; the height has limits of its own."""
+"""Limits of the estimates, SI units; beyond them the equations are meaningless. The height has its own limits."""
 _INSIDE = 0.9
-"""Share of the way to freezing or detachment that the estimated height may go [-]."""
+"""Limit of the estimated height, as a share of the way to freezing or detachment [-]."""
 _STEP = 1e-30
 
 
 class FilterState(NamedTuple):
-    """What the filter remembers, by slot."""
+    """The memory of the filter, by slot."""
 
     mean: Floats
     """Estimated state of the augmented plant, deviations in SI units, shape (n, states)."""
@@ -45,21 +45,21 @@ class FilterState(NamedTuple):
 
 
 class PlantFilter(NamedTuple):
-    """The filter's models; ``puller`` and ``plant`` are of one puller, or of one a slot.
+    """The filter of one puller, or of one puller a slot.
 
     With one a slot, fields of ``puller`` have shape (n,) and arrays of ``plant`` a leading axis n.
     """
 
     puller: Any
     plant: PlantModel
-    """The linear model, augmented where ``ring`` is given."""
+    """The linear model, augmented if ``ring`` is given."""
     noise: NoiseModel
     meniscus: MeniscusModel
     dt: float
     """Control interval [s]."""
     nonlinear: bool
     gate: float
-    """Innovations count up to this many standard deviations [-]."""
+    """Limit of the innovations, in standard deviations [-]."""
     ring: RingModel | None = None
 
     def at_rest(self, n: int) -> FilterState:
@@ -74,12 +74,12 @@ class PlantFilter(NamedTuple):
     def step(
         self, state: FilterState, applied: Floats, drift_moved: Floats, seen: Measured, starts: npt.NDArray[np.bool_]
     ) -> FilterState:
-        """One sample: predict under what was applied since, but not where an episode starts, and correct."""
+        """Predict one interval with the applied inputs, except where an episode starts, and correct by the sample."""
         predicted = self.predict(state, applied, drift_moved)
         return self.correct(select(starts, state, predicted) if starts.any() else predicted, seen)
 
     def predict(self, state: FilterState, applied: Floats, drift_moved: Floats) -> FilterState:
-        """One interval on, under applied inputs [m/s, W], shape (n, 2), and a known movement of the drift [K]."""
+        """The state one interval later, under applied inputs [m/s, W], (n, 2), and a known step of the drift [K]."""
         mean = (self.plant.A @ state.mean[..., None] + self.plant.B @ applied[..., None])[..., 0]
         if self.nonlinear:
             mean[:, :PLANT] = self._moved_plant(state.mean, applied)
@@ -91,11 +91,13 @@ class PlantFilter(NamedTuple):
         return state._replace(mean=self._clipped(mean), covariance=covariance)
 
     def correct(self, state: FilterState, seen: Measured) -> FilterState:
-        """Use the pyrometer and, where the frame is valid, the camera."""
+        """The state after the pyrometer where it is finite, and the camera where its frame is valid."""
         n, noise = len(state.mean), self.noise
         row = np.zeros(state.mean.shape)
         row[:, _PYROMETER] = 1.0
-        pyrometer = Measurement(seen.T_1 - state.mean[:, _PYROMETER], row, np.full(n, noise.pyrometer_sd**2))
+        known = np.isfinite(seen.T_1)
+        innovation = np.where(known, seen.T_1 - state.mean[:, _PYROMETER], 0.0)
+        pyrometer = Measurement(innovation, row, np.where(known, noise.pyrometer_sd**2, np.inf))
         estimate = kalman.correct(Gaussian(state.mean, state.covariance), pyrometer, self.gate)
         ring, row = self.expected_frame(estimate.mean)
         valid = seen.valid > 0.5
@@ -115,7 +117,7 @@ class PlantFilter(NamedTuple):
         return self._search_ripple(new, residual, valid, self.ring)
 
     def expected_frame(self, mean: Floats) -> tuple[Floats, Floats]:
-        """Ring that the camera delivers [m], shape (n,), and its derivative by the state, shape (n, states)."""
+        """The ring that the camera delivers [m], shape (n,), and its derivative by the state, shape (n, states)."""
         now, row = self._expected_ring(mean)
         if self.ring is None:
             return now, row
@@ -125,7 +127,7 @@ class PlantFilter(NamedTuple):
         return newest * now + np.einsum("ni,ni->n", mean[:, RIPPLE:], delivered[:, RIPPLE:]), delivered
 
     def _expected_ring(self, mean: Floats) -> tuple[Floats, Floats]:
-        """Bright ring now [m] less its nominal, shape (n,), and its derivative by the state, shape (n, states)."""
+        """The present ring minus its nominal [m], shape (n,), and its derivative by the state, shape (n, states)."""
         H = self.plant.H[..., 0, :]
         slope = H if self.ring is None else ring_model.undelayed_row(self.plant, self.ring, self.dt)
         if not self.nonlinear:
@@ -147,7 +149,7 @@ class PlantFilter(NamedTuple):
         return np.stack([value - nominal for value, nominal in zip(new, p.state_0, strict=True)], axis=-1)
 
     def _moved_ring(self, state: FilterState, ring: RingModel) -> tuple[Floats, Floats]:
-        """Ripple and past rings one interval on, shape (n, states - 10), and the covariance of all states."""
+        """Ripple and past rings one interval later, shape (n, states - 10), and the covariance of all states."""
         now, row = self._expected_ring(state.mean)
         A = ring_model.transition(self.plant.A, row, state.ripple.omega, ring, self.dt)
         mean = (A @ state.mean[..., None])[..., 0]
@@ -161,7 +163,7 @@ class PlantFilter(NamedTuple):
     def _search_ripple(
         self, state: FilterState, residual: Floats, valid: npt.NDArray[np.bool_], ring: RingModel
     ) -> FilterState:
-        """Go on with the search for the ripple's frequency; where one is found, begin to estimate the ripple."""
+        """One more sample of the search for the ripple's frequency; slots that find it begin to estimate the ripple."""
         search, new, ripple = ring_model.search_step(state.ripple, residual, valid, ring, self.dt)
         if not new.any():
             return state._replace(ripple=search)
@@ -173,7 +175,7 @@ class PlantFilter(NamedTuple):
         return FilterState(mean, covariance, np.where(new, reduced, state.camera_variance), search)
 
     def _clipped(self, mean: Floats) -> Floats:
-        """Estimates held where the plant's equations mean something."""
+        """The estimates, clipped to where the plant's equations are meaningful."""
         if not self.nonlinear:
             return mean
         p, clipped = self.puller, mean.copy()
@@ -184,7 +186,7 @@ class PlantFilter(NamedTuple):
 
 
 def _without_ripple(covariance: Floats, where: npt.NDArray[np.bool_]) -> Floats:
-    """The covariance without the ripple's part in those slots: nothing of it is known or estimated."""
+    """The covariance without the ripple's part in those slots, where the ripple is not estimated."""
     if not where.any():
         return covariance
     reduced = covariance.copy()

@@ -1,15 +1,14 @@
-"""Multiple-model estimation: a bank of the LQG's filters, weighed by how well each predicts the ring.
+"""Multiple-model estimation: a bank of the LQG's filters, weighted by how well each predicts the ring.
 
 Crystals differ in the strength of their interface fluctuations. A filter made for the average trusts its camera too
 little where they are strong and too much where they are weak. Each filter of the bank assumes one pair of standard
-deviations. Bayes' rule on the ring's innovations gives the probability of each (Magill 1965), and the estimate is the
-mean over the filters.
+deviations. Bayes' rule on the ring's innovations gives its probability (Magill 1965), and the estimate is the mean over
+the filters.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from itertools import product
 from typing import NamedTuple
 
@@ -18,36 +17,34 @@ import numpy.typing as npt
 
 from cz_gym.baselines.policy import Floats, map_arrays, select
 from cz_gym.observation import Measured
-from cz_gym.physics.meniscus import MeniscusModel
-from cz_gym.physics.plant import Puller
 
 from .estimator import FilterState, PlantFilter
-from .model import NoiseModel, plant_model
-from .ring_model import RingModel, augmented
+from .model import plant_model
+from .ring_model import augmented
 
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """Standard deviations that are held possible; every pair of them, equally likely at first."""
+    """Standard deviations of the fluctuations that are considered possible; each pair is equally likely at first."""
 
     fast_sd: tuple[float, ...] = (0.1, 0.3, 0.5)
-    """Of the fast interface fluctuation [K]."""
+    """Standard deviations of the fast interface fluctuation [K]."""
     slow_sd: tuple[float, ...] = (0.15, 0.35)
-    """Of the slow one [K]; with one as large as 0.6 the heater chases the radius and slow drives lose crystals."""
+    """Standard deviations of the slow one [K]; with 0.6 the heater chases the radius and slow drives lose crystals."""
 
     @property
     def count(self) -> int:
-        """How many filters there are."""
+        """Number of filters."""
         return len(self.fast_sd) * len(self.slow_sd)
 
 
 class BankState(NamedTuple):
-    """What the filters remember, by slot and hypothesis."""
+    """The memory of the filters, by slot and hypothesis."""
 
     filters: FilterState
     """Arrays with leading axes (n, m)."""
     evidence: Floats
-    """Logarithm of each hypothesis's probability, up to a constant, shape (n, m)."""
+    """Logarithm of each hypothesis' probability, up to a constant, shape (n, m)."""
 
     @property
     def probability(self) -> Floats:
@@ -58,13 +55,13 @@ class BankState(NamedTuple):
 
     @property
     def mean(self) -> Floats:
-        """The estimated state, the mean over the hypotheses, shape (n, states)."""
+        """Mean of the estimated state over the hypotheses, shape (n, states)."""
         mean: Floats = np.einsum("nm,nmi->ni", self.probability, self.filters.mean)
         return mean
 
 
 class FilterBank(NamedTuple):
-    """All filters of n slots as one filter of n m rows: slot by slot, hypothesis by hypothesis."""
+    """The filters of n slots and m hypotheses, computed as one filter of n m rows, slot by slot."""
 
     rows: PlantFilter
     hypotheses: Hypotheses
@@ -77,14 +74,14 @@ class FilterBank(NamedTuple):
     def step(
         self, state: BankState, applied: Floats, drift_moved: Floats, seen: Measured, starts: npt.NDArray[np.bool_]
     ) -> BankState:
-        """One sample; arguments as of :meth:`cz_gym.baselines.lqg.estimator.PlantFilter.step`, one a slot."""
+        """Predict and correct by one sample; arguments as of :meth:`PlantFilter.step`, one a slot."""
         m = self.hypotheses.count
         rows = self.rows.predict(_by_row(state.filters), np.repeat(applied, m, axis=0), np.repeat(drift_moved, m))
         predicted = BankState(_by_slot(rows, m), state.evidence)
         return self.correct(select(starts, state, predicted) if starts.any() else predicted, seen)
 
     def correct(self, state: BankState, seen: Measured) -> BankState:
-        """Use the measurements: to weigh the filters, then by each of them."""
+        """The state after the measurements, which weight the filters and then correct each of them."""
         m, rows = self.hypotheses.count, _by_row(state.filters)
         repeated = Measured(*(np.repeat(channel, m) for channel in seen))
         evidence = state.evidence + self._log_likelihood(rows, repeated).reshape(state.evidence.shape)
@@ -92,7 +89,7 @@ class FilterBank(NamedTuple):
         return BankState(corrected, evidence - evidence.max(axis=1, keepdims=True))
 
     def _log_likelihood(self, state: FilterState, seen: Measured) -> Floats:
-        """Of the ring under each filter, up to a constant; innovations count up to the gate."""
+        """Log likelihood of the ring under each filter, up to a constant, with innovations clipped to the gate."""
         ring, row = self.rows.expected_frame(state.mean)
         variance = np.einsum("ri,rij,rj->r", row, state.covariance, row) + state.camera_variance
         square = np.minimum(np.square(seen.ring_error + seen.r_ref - ring) / variance, self.rows.gate**2)
@@ -100,36 +97,23 @@ class FilterBank(NamedTuple):
 
 
 def filter_bank(single: PlantFilter, hypotheses: Hypotheses, n: int) -> FilterBank:
-    """The bank of n slots, made of one filter; its process noise and initial covariance are the hypotheses' own."""
-    Q, start = _noises(single.puller, single.noise, single.ring, single.dt, single.meniscus, hypotheses)
-    plant = single.plant._replace(Q=np.tile(Q, (n, 1, 1)), start=np.tile(start, (n, 1, 1)))
-    return FilterBank(single._replace(plant=plant), hypotheses)
+    """The bank of n slots: one filter, with the process noise and initial covariance of each hypothesis."""
+    models = []
+    for fast, slow in product(hypotheses.fast_sd, hypotheses.slow_sd):
+        noise = replace(single.noise, fast_sd=fast, slow_sd=slow)
+        model = plant_model(single.puller, noise, single.dt, single.meniscus)
+        models.append(model if single.ring is None else augmented(model, single.ring, single.dt))
+    Q, start = (np.tile([getattr(model, name) for model in models], (n, 1, 1)) for name in ("Q", "start"))
+    return FilterBank(single._replace(plant=single.plant._replace(Q=Q, start=start)), hypotheses)
 
 
 def _by_row(state: FilterState) -> FilterState:
-    """Arrays of leading axes (n, m) with one axis n m instead."""
+    """The state with one axis n m in place of the leading axes (n, m)."""
     joined: FilterState = map_arrays(lambda part: part.reshape(part.shape[0] * part.shape[1], *part.shape[2:]), state)
     return joined
 
 
 def _by_slot(state: FilterState, m: int) -> FilterState:
-    """The reverse."""
+    """The reverse of :func:`_by_row`."""
     split: FilterState = map_arrays(lambda part: part.reshape(len(part) // m, m, *part.shape[1:]), state)
     return split
-
-
-@lru_cache(maxsize=8)
-def _noises(
-    puller: Puller,
-    noise: NoiseModel,
-    ring: RingModel | None,
-    dt: float,
-    meniscus: MeniscusModel,
-    hypotheses: Hypotheses,
-) -> tuple[Floats, Floats]:
-    """Process noise and initial covariance of each hypothesis, shape (m, states, states)."""
-    pairs = product(hypotheses.fast_sd, hypotheses.slow_sd)
-    models = [plant_model(puller, replace(noise, fast_sd=fast, slow_sd=slow), dt, meniscus) for fast, slow in pairs]
-    if ring is not None:
-        models = [augmented(model, ring, dt) for model in models]
-    return np.stack([model.Q for model in models]), np.stack([model.start for model in models])

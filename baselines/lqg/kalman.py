@@ -1,8 +1,8 @@
 """An extended Kalman filter for a batch of slots, one scalar measurement at a time.
 
-Every slot has a covariance of its own. So the start of an episode, a missing frame, a ring whose slope changes with the
-meniscus and a camera of unknown noise are no special cases. On a linear plant with constant noise the filter settles at
-the solution of the Riccati equation.
+Every slot has its own covariance, because episodes start, frames are missing, the ring's slope changes with the
+meniscus, and the camera's noise is unknown. On a linear plant with constant noise the filter settles at the solution of
+the Riccati equation.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Gaussian(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """One scalar measurement by slot."""
+    """One scalar measurement, by slot."""
 
     innovation: Floats
     """Measured less expected value, shape (n,)."""
@@ -37,16 +37,16 @@ class Measurement(NamedTuple):
 
 
 def predicted_covariance(P: Floats, A: Floats, Q: Floats) -> Floats:
-    """A P A' + Q; P of shape (n, states, states), A and Q of the same or shared by the slots."""
+    """A P A' + Q for P of shape (n, states, states); A and Q have the same shape or are shared by the slots."""
     predicted: Floats = A @ P @ np.swapaxes(A, -1, -2) + Q
     return predicted
 
 
 def correct(estimate: Gaussian, measurement: Measurement, gate: float) -> Gaussian:
-    """Use one measurement: K = P h / (h' P h + R).
+    """The estimate after one measurement, with the gain K = P h / (h' P h + R).
 
-    An innovation beyond ``gate`` standard deviations counts as that many (Huber's limit): an outlier does little harm,
-    and a real change is still followed.
+    Innovations are clipped to +-``gate`` standard deviations (Huber's limit): an outlier does little harm, and a real
+    change is still followed.
     """
     P = estimate.covariance
     Ph = (P @ measurement.row[..., None])[..., 0]
@@ -76,9 +76,8 @@ def matched_variance(
 ) -> Floats:
     """Variance of a sensor's noise by covariance matching: a running mean of innovation^2 - h' P h (Mehra 1972).
 
-    ``variance`` is the present one and ``keep`` its share in the new one; ``predicted`` is h' P h. Innovations beyond
-    ``gate`` standard deviations count as that many, samples that are not ``valid`` change nothing, and the variance
-    stays within ``limits``.
+    ``variance`` is the old value and ``keep`` its weight in the new one; ``predicted`` is h' P h. Innovations are
+    clipped to +-``gate`` standard deviations, the variance to ``limits``; samples that are not ``valid`` are left out.
     """
     square = np.minimum(np.square(innovation), gate**2 * (predicted + variance))
     matched = keep * variance + (1.0 - keep) * (square - predicted)
@@ -86,7 +85,7 @@ def matched_variance(
 
 
 def steady_state(A: Floats, H: Floats, Q: Floats, R: Floats) -> Floats:
-    """Covariance of the prediction error at which a linear filter settles (SciPy's Riccati solver).
+    """Stationary covariance of a linear filter's prediction error (SciPy's Riccati solver).
 
     P = A P A' - A P H' (H P H' + R)^-1 H P A' + Q
     """

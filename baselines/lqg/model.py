@@ -1,9 +1,9 @@
-"""The LQG's model of the plant: linearised, sampled, and augmented by what disturbs it.
+"""The LQG's model of the plant: linearised, sampled, and augmented by disturbance states.
 
 x = (r_c, h_c, T_1, T_2, T_b, fast, slow, drift, drift_rate, heater), deviations from the operating point, SI units:
-two Ornstein-Uhlenbeck fluctuations of the interface temperature [K], the hot zone's drift p [K] and its rate [K/s]
-(a slow Ornstein-Uhlenbeck process, so that the drift is ramp-like), and an unknown heater power [W], a random walk
-that lets T_1 agree with the pyrometer without offset. Of the recipe's known movement a share moves the drift.
+two Ornstein-Uhlenbeck fluctuations of the interface temperature [K], the hot zone's drift p [K], its rate [K/s] (a slow
+Ornstein-Uhlenbeck process, so the drift is a slowly bending ramp), and an unknown heater power [W] (a random walk that
+removes the offset between T_1 and the pyrometer). The drift also follows a share of the recipe's known movement.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import expm
 from scipy.signal import cont2discrete
 
-from cz_gym.baselines.policy import Floats
+from cz_gym.baselines.policy import Floats, check_numbers
 from cz_gym.physics.linearisation import INPUTS, OUTPUTS, linearise
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.plant import Puller, hidden_load
@@ -24,43 +24,48 @@ from cz_gym.units import MINUTE, MM
 STATES = ("r_c", "h_c", "T_1", "T_2", "T_b", "fast", "slow", "drift", "drift_rate", "heater")
 """States of the augmented plant."""
 PLANT = 5
-"""How many of them are the plant's own."""
+"""Number of the plant's own states, which come first."""
 FAST, SLOW, DRIFT, DRIFT_RATE, HEATER = range(PLANT, len(STATES))
 _STEP = 1e-30
 
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """The Kalman filter's model of disturbances and sensors; tuned, not read from a scenario."""
+    """The Kalman filter's model of disturbances and sensors; tuned, not derived from a scenario."""
 
     fast_sd: float = 0.25
     """Standard deviation of the fast interface fluctuation [K]."""
     fast_tau: float = 30.0
-    """Its correlation time [s]."""
+    """Correlation time of the fast interface fluctuation [s]."""
     slow_sd: float = 0.3
     """Standard deviation of the slow interface fluctuation [K]."""
     slow_tau: float = 780.0
-    """Its correlation time [s]."""
+    """Correlation time of the slow interface fluctuation [s]."""
     drift_rate_sd: float = 0.02 / MINUTE
-    """Standard deviation of the drift's rate [K/s]; too large a value makes the loop fail."""
+    """Standard deviation of the drift's rate [K/s]; the loop fails if it is too large."""
     drift_rate_tau: float = 40.0 * MINUTE
-    """Its correlation time [s]."""
+    """Correlation time of the drift's rate [s]."""
     heater_walk: float = 1.0
     """Random walk of the heater's power balance [W/sqrt(s)]."""
     thermal_walk: float = 0.004
     """Random walk of the three temperatures, for the puller's unknown conductances [K/sqrt(s)]."""
     recipe_share: float = 0.5
-    """Share of the recipe's movement that the drift is expected to follow [-]."""
+    """Share of the recipe's movement that the drift follows [-]."""
     camera_sd: float = 0.025 * MM
-    """Standard deviation of the camera's noise at the start [m]."""
+    """Initial estimate of the camera noise's standard deviation [m]."""
     camera_sd_range: tuple[float, float] = (0.005 * MM, 0.2 * MM)
-    """Range its estimate stays in [m]."""
+    """Lower and upper limit of that estimate [m]."""
     camera_memory: float = 10.0 * MINUTE
-    """Time over which it is estimated from the innovations [s]; infinite: it stays as it starts."""
+    """Averaging time of that estimate [s]; infinite for a constant one."""
     pyrometer_sd: float = 0.1
     """Standard deviation of the pyrometer's noise [K]."""
     start_radius_sd: float = 0.2 * MM
     """Standard deviation of the initial radius [m]."""
+
+    def __post_init__(self) -> None:
+        taus = ("fast_tau", "slow_tau", "drift_rate_tau", "camera_memory")
+        walks = ("heater_walk", "thermal_walk", "start_radius_sd")
+        check_numbers(self, (*taus, "camera_sd", "pyrometer_sd"), ("fast_sd", "slow_sd", "drift_rate_sd", *walks))
 
 
 class PlantModel(NamedTuple):
@@ -79,12 +84,12 @@ class PlantModel(NamedTuple):
 
 
 def load_per_drift(puller: Puller) -> Any:
-    """dQ_d/dp at p = 0 [W/K], by complex step through the plant's own static equivalence; floats or arrays."""
+    """dQ_d/dp at p = 0 [W/K] for one puller or many, by complex step through :func:`hidden_load`."""
     return np.imag(hidden_load(complex(0.0, _STEP), puller)) / _STEP
 
 
 def plant_model(puller: Puller, noise: NoiseModel, dt: float, meniscus: MeniscusModel = HURLE) -> PlantModel:
-    """The augmented plant at that puller's operating point, inputs held over dt [s] and noise sampled exactly."""
+    """The augmented plant at the puller's operating point, with inputs held over dt [s] and exactly sampled noise."""
     F, G, H = _continuous(puller, noise, meniscus)
     W = np.zeros(len(STATES))
     W[2:PLANT] = noise.thermal_walk**2
@@ -100,7 +105,7 @@ def plant_model(puller: Puller, noise: NoiseModel, dt: float, meniscus: Meniscus
 
 
 def sampled_noise(F: Floats, W: Floats, dt: float) -> Floats:
-    """Integral of exp(F s) W exp(F' s) over dt [s], W the intensity of white noise (Van Loan 1978)."""
+    """Integral of exp(F s) W exp(F' s) over dt [s], with W the intensity of white noise (Van Loan 1978)."""
     n = len(F)
     both = expm(np.block([[-F, W], [np.zeros((n, n)), F.T]]) * dt)
     Q: Floats = both[n:, n:].T @ both[:n, n:]

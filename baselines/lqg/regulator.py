@@ -1,39 +1,26 @@
 """Linear-quadratic regulator with costs on input moves, known disturbances and a previewed reference.
 
-States of the regulator are the plant's five and the previous inputs (v, q); its inputs are the moves of both. The cost
-is the reward's, before it saturates. What drives the plant without being moved by it (the disturbance states) enters by
-a Sylvester equation instead of the Riccati equation, which would call an integrating disturbance unstabilisable.
+Its states are the plant's five and the previous inputs (v, q); its inputs are the moves of both. The cost is the
+reward's, before it saturates. The disturbance states, which drive the plant and are not moved by it, enter by a
+Sylvester equation: in the Riccati equation an integrating disturbance would be unstabilisable.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from scipy.linalg import solve_discrete_are
 
 from cz_gym.baselines.policy import Floats
-from cz_gym.cost import WEIGHTS, coefficients
+from cz_gym.cost import Weights, coefficients
+from cz_gym.observation import PREVIEWS, Measured
 
 from .model import DRIFT, PLANT, STATES, PlantModel
 
 STEP_TIME = 5.0
-"""Control interval [s] that the weights on moves are meant for; at others they keep the same continuous-time law."""
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Weights on the terms of the cost, each over its scale in :mod:`cz_gym.cost`; the defaults are the reward's."""
-
-    radius: float = WEIGHTS.radius
-    """On (r_c - r_ref)^2."""
-    pull: float = WEIGHTS.pull
-    """On (v_p - v_0)^2."""
-    pull_step: float = WEIGHTS.pull_step
-    """On the squared step of v_p."""
-    heater_step: float = WEIGHTS.heater_step
-    """On the squared step of Q_H."""
+"""Control interval [s] of the weights on moves; at other intervals the continuous-time law stays the same."""
 
 
 class Regulator(NamedTuple):
@@ -55,7 +42,7 @@ class Regulator(NamedTuple):
     """Shape (7, 5)."""
 
 
-class Cost(NamedTuple):
+class QuadraticCost(NamedTuple):
     """sum z' Q z + 2 z' N du + du' R du with z = (plant's five states, previous inputs)."""
 
     Q: Floats
@@ -66,18 +53,19 @@ class Cost(NamedTuple):
     """Shape (2, 2)."""
 
 
-def quadratic_cost(weights: Weights, dt: float) -> Cost:
-    """The cost's matrices for a control interval of dt [s]."""
+def quadratic_cost(weights: Weights, dt: float) -> QuadraticCost:
+    """The matrices of the cost for a control interval of dt [s]."""
     Q, N = np.zeros((PLANT + 2, PLANT + 2)), np.zeros((PLANT + 2, 2))
-    per_square, per_step = coefficients(weights), (STEP_TIME / dt) ** 2
+    per_square = coefficients(weights)
+    per_step = (STEP_TIME / dt) ** 2
     Q[0, 0] = per_square.radius
     Q[PLANT, PLANT] = N[PLANT, 0] = per_square.pull
-    moves = per_square.pull + per_step * per_square.pull_step, per_step * per_square.heater_step
-    return Cost(Q, N, np.diag(moves))
+    R = np.diag([per_square.pull + per_step * per_square.pull_step, per_step * per_square.heater_step])
+    return QuadraticCost(Q, N, R)
 
 
-def regulator(model: PlantModel, weights: Weights, dt: float, ahead: int) -> Regulator:
-    """The optimal moves for that plant and cost, with a preview of ``ahead`` samples.
+def regulator(model: PlantModel, weights: Weights, dt: float) -> Regulator:
+    """The optimal moves for that plant and cost, with the preview of the observations.
 
     With P the Riccati solution, S = R + B' P B and A_c the closed loop, a known later change f_j of the state calls for
     -S^-1 B' (A_c')^j P f_j now; disturbances x_d' = A_d x_d entering by E add X = A_c' (P E + X A_d).
@@ -98,9 +86,32 @@ def regulator(model: PlantModel, weights: Weights, dt: float, ahead: int) -> Reg
     moves = np.linalg.solve(S, B.T)
     reference, drift = [], []
     later_reference, later_drift = P[:, 0], X[:, DRIFT - PLANT]
-    for _ in range(ahead):
+    for _ in range(samples_ahead(dt)):
         reference.append(moves @ later_reference)
         drift.append(-moves @ later_drift)
         later_reference, later_drift = A_c.T @ later_reference, A_c.T @ later_drift
     feedback = np.hstack([K[:, :PLANT], K_d, K[:, PLANT:]])
     return Regulator(feedback, np.array(reference), np.array(drift), P, X)
+
+
+def samples_ahead(dt: float) -> int:
+    """Number of samples in the preview; the nearest whole number if dt [s] does not divide it."""
+    return max(1, round(PREVIEWS[-1] / dt))
+
+
+def look_ahead(plan: Floats, seen: Measured, starts: npt.NDArray[np.bool_], dt: float) -> Floats:
+    """The recipe ahead after one more sample.
+
+    ``plan`` holds r_ref [m] and T_1_ref [K] (deviations) from now to the end of the preview, shape
+    (n, 2, samples ahead + 1). In slots that start it is interpolated from the three previewed samples.
+    """
+    radius = seen.r_ref, seen.r_ref_1min, seen.r_ref_5min
+    temperature = seen.T_1_ref, seen.T_1_ref_1min, seen.T_1_ref_5min
+    previewed = np.array([radius, temperature]).transpose(2, 0, 1)
+    moved = np.concatenate([plan[:, :, 1:], previewed[:, :, -1:]], axis=2)
+    moved[:, :, 0] = previewed[:, :, 0]
+    if starts.any():
+        t = np.minimum(np.arange(plan.shape[2]) * dt, PREVIEWS[-1])
+        shares = np.array([np.interp(t, PREVIEWS, one) for one in np.eye(len(PREVIEWS))])
+        moved[starts] = (previewed[..., None] * shares).sum(axis=2)[starts]
+    return moved

@@ -1,9 +1,8 @@
-"""A camera with latency, and a ring that ripples with the crystal's rotation: what they add to the LQG's plant model.
+"""A camera with latency and a ring that ripples with the crystal's rotation, as states of the LQG's plant model.
 
-Latency: the rings of past samples are states, so that a frame some seconds old corrects the state of that time. Ripple:
-an oscillator of two states whose phase wanders slowly (a narrow-band process), at the rotation's frequency as the
-samples show it, aliased. That frequency is not known. It is found as the peak in the spectrum of what the plant does
-not explain.
+Latency: the rings of past samples are states, so a frame some seconds old corrects the state of that time. Ripple: an
+oscillator of two states with a slowly wandering phase (a narrow-band process), at the rotation's frequency, aliased by
+sampling. This frequency is unknown; it is found as the peak in the spectrum of the ring's residual.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.baselines.policy import Floats
+from cz_gym.baselines.policy import Floats, check_numbers
 from cz_gym.units import MINUTE, MM
 
 from .model import STATES, PlantModel
@@ -29,22 +28,25 @@ RIPPLE_STATES = slice(RIPPLE, RIPPLE + 2)
 
 @dataclass(frozen=True)
 class RingModel:
-    """What is known of such a camera; the numbers of a puller, and tuned ones."""
+    """The numbers of such a camera, and of the search for the ripple's frequency."""
 
     latency: float = 0.0
     """Age of a frame when it is delivered [s]."""
     ripple_sd: float = 0.0
-    """Standard deviation of the ripple [m]; 0: there is none."""
+    """Standard deviation of the ripple [m]; 0 for no ripple."""
     ripple_tau: float = 60.0 * MINUTE
-    """Time over which it keeps phase and amplitude [s]."""
+    """Correlation time of the ripple's phase and amplitude [s]."""
     rotation: tuple[float, float] = (8.0 / MINUTE, 15.0 / MINUTE)
-    """Range of the crystal's rotation [rev/s]; with both equal it is known."""
+    """Range of the crystal's rotation [rev/s]; both ends equal if it is known."""
     memory: float = 10.0 * MINUTE
-    """Time over which the spectrum is averaged [s]."""
+    """Averaging time of the spectrum [s]."""
     lowest: float = 0.001
-    """Lowest frequency that is searched [Hz]; below, ripple and radius cannot be told apart in time."""
+    """Lowest frequency of the search [Hz]; below it, ripple and radius cannot be told apart in time."""
     clear: float = 8.0
-    """Power of a peak over the spectrum's mean at which it is a ripple [-]."""
+    """Least power of a peak that counts as a ripple, in multiples of the spectrum's mean [-]."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self, ("ripple_tau", "memory"), ("latency", "ripple_sd"))
 
     @property
     def has_ripple(self) -> bool:
@@ -58,21 +60,21 @@ class RingModel:
 
     @property
     def first_past(self) -> int:
-        """Index of the first of the states that hold past rings."""
+        """Index of the first state that holds a past ring."""
         return RIPPLE + 2 * self.has_ripple
 
     def delay(self, dt: float) -> tuple[int, float]:
-        """Past samples to keep, and the weight of the oldest in what is delivered; the next one has the rest."""
+        """Number of past samples to keep, and the weight of the oldest in the delivered ring; the next has the rest."""
         samples = math.ceil(self.latency / dt - 1e-9)
         return samples, self.latency / dt - samples + 1.0
 
     def states(self, dt: float) -> int:
-        """Number of states of plant, ripple and past rings together."""
+        """Number of states of plant, ripple and past rings."""
         return self.first_past + self.delay(dt)[0]
 
 
 def augmented(model: PlantModel, ring: RingModel, dt: float) -> PlantModel:
-    """The model with ripple and past rings; the ripple at the middle of the rotation's range."""
+    """The model with ripple and past rings, with the ripple at the middle of the rotation's range."""
     n, extra = len(STATES), ring.states(dt) - len(STATES)
     A, Q, start = (np.pad(matrix, (0, extra)) for matrix in (model.A, model.Q, model.start))
     B, H = np.pad(model.B, ((0, extra), (0, 0))), np.pad(model.H, ((0, 0), (0, extra)))
@@ -92,7 +94,7 @@ def augmented(model: PlantModel, ring: RingModel, dt: float) -> PlantModel:
 
 
 def undelayed_row(model: PlantModel, ring: RingModel, dt: float) -> Floats:
-    """Derivative by the state of the ring as it is now, shape (..., states), from an augmented model."""
+    """Derivative of the present ring by the state, shape (..., states), from an augmented model."""
     if ring.delay(dt)[0]:
         return model.A[..., ring.first_past, :]
     row = model.H[..., 0, :].copy()
@@ -108,7 +110,7 @@ def oscillator(omega: Floats, ring: RingModel, dt: float) -> Floats:
 
 
 def transition(A: Floats, row: Floats, omega: Floats, ring: RingModel, dt: float) -> Floats:
-    """The model's A with each slot's ripple frequency and slope of the ring, shape (n, states, states)."""
+    """The model's A with the ripple frequency and the ring's slope of each slot, shape (n, states, states)."""
     n, states = row.shape
     moved = np.broadcast_to(A, (n, states, states)).copy()
     if ring.has_ripple:
@@ -119,7 +121,7 @@ def transition(A: Floats, row: Floats, omega: Floats, ring: RingModel, dt: float
 
 
 def delivered_row(row: Floats, ring: RingModel, dt: float) -> Floats:
-    """Derivative by the state of what the camera delivers, shape (n, states), from that of the ring now."""
+    """Derivative of the delivered ring by the state, shape (n, states), from that of the present ring."""
     samples, oldest = ring.delay(dt)
     delivered = row.copy()
     if samples:
@@ -133,14 +135,14 @@ def delivered_row(row: Floats, ring: RingModel, dt: float) -> Floats:
 
 
 class RippleSearch(NamedTuple):
-    """What is remembered of the search for the ripple's frequency, by slot."""
+    """The memory of the search for the ripple's frequency, by slot."""
 
     spectrum: Floats
     """Real and imaginary parts of the running Fourier sums, shape (n, frequencies, 2)."""
     omega: Floats
-    """The ripple's frequency [rad/s], 0 where none is found, shape (n,)."""
+    """Frequency of the ripple [rad/s], 0 before it is found, shape (n,)."""
     samples: Floats
-    """Samples seen, shape (n,)."""
+    """Number of samples so far, shape (n,)."""
 
 
 class Found(NamedTuple):
@@ -148,14 +150,14 @@ class Found(NamedTuple):
 
     search: RippleSearch
     new: npt.NDArray[np.bool_]
-    """Where a ripple is found, or found at another frequency than before, shape (n,)."""
+    """Whether a ripple was found by this sample, for the first time or at another frequency, shape (n,)."""
     ripple: Floats
-    """The ripple's two states by the spectrum's peak [m], shape (n, 2)."""
+    """Two states of the ripple at the spectrum's peak [m], shape (n, 2)."""
 
 
 @lru_cache(maxsize=16)
 def frequencies(ring: RingModel, dt: float) -> Floats:
-    """Frequencies that are searched [rad/s], as samples every dt [s] show them."""
+    """Frequencies of the search [rad/s], aliased by sampling every dt [s]."""
     spacing = 0.25 / ring.memory
     if not ring.has_ripple or ring.frequency_known:
         return np.zeros(0)
@@ -165,7 +167,7 @@ def frequencies(ring: RingModel, dt: float) -> Floats:
 
 
 def search_at_rest(n: int, ring: RingModel | None, dt: float) -> RippleSearch:
-    """Before the first sample of n slots."""
+    """The search before the first sample of n slots."""
     if ring is None:
         return RippleSearch(np.zeros((n, 0, 2)), np.zeros(n), np.zeros(n))
     omega = math.pi * sum(ring.rotation) if ring.frequency_known else 0.0
@@ -175,11 +177,11 @@ def search_at_rest(n: int, ring: RingModel | None, dt: float) -> RippleSearch:
 def search_step(
     search: RippleSearch, residual: Floats, valid: npt.NDArray[np.bool_], ring: RingModel, dt: float
 ) -> Found:
-    """Go on with the search: ``residual`` [m] is what the plant does not explain, shape (n,), used where ``valid``.
+    """The search after one more ``residual`` [m] of the ring, shape (n,), which counts where ``valid``.
 
-    Running sums Z <- (1 - 1/m) e^(i omega dt) Z + residual/m with m samples of memory, fewer at the start; the peak is
-    refined by a parabola through its neighbours' log power. The spectrum's ends, where a slow transient shows, are no
-    peaks.
+    Running sums Z <- (1 - 1/m) e^(i omega dt) Z + residual/m with m samples of memory, fewer at the start. A parabola
+    through the log power of the peak and its neighbours refines the frequency. The ends of the spectrum, where slow
+    transients appear, do not count as peaks.
     """
     omega = frequencies(ring, dt)
     samples = search.samples + 1.0

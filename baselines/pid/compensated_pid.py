@@ -1,7 +1,7 @@
 """The paper's controller: parallel compensator, series PID on pull speed, PI on heater temperature.
 
 Bukhari, Hovd and Winkler, Part II, equations of the compensator and of K(s), Table 1. Lead and integrator of K are
-discretised by Tustin, the compensator by zero-order hold, the temperature loop by forward Euler; every state
+discretised by Tustin's rule, the compensator by zero-order hold, the temperature loop by forward Euler; every state
 starts at zero. Radii [m], speeds [m/s], temperatures [K], power [W].
 """
 
@@ -15,13 +15,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import cont2discrete
 
-from cz_gym.baselines.policy import Floats, MeasuredController
-from cz_gym.observation import HEATER_SCALE, PULL_SCALE, Measured
+from cz_gym.baselines.policy import Floats, MeasuredController, check_numbers
+from cz_gym.observation import Measured
+from cz_gym.task import HEATER_RANGE
 from cz_gym.units import KILO
 
 
 class PIDState(NamedTuple):
-    """What a series PID remembers, each of shape (n,)."""
+    """The memory of a series PID; each of shape (n,)."""
 
     lead_in: Floats
     """Input term of the lead [m]."""
@@ -44,13 +45,16 @@ class SeriesPID:
     N: float = 100.0
     """Derivative filter [-]."""
 
+    def __post_init__(self) -> None:
+        check_numbers(self, positive=("K_p", "T_i", "N"), not_negative=("T_d",))
+
     def lead(self, dt: float) -> tuple[float, float, float]:
-        """The lead by Tustin's rule at a sample time dt [s]: y_k = b_0 e_k + b_1 e_(k-1) - a_1 y_(k-1)."""
+        """b_0, b_1 and a_1 of the lead y_k = b_0 e_k + b_1 e_(k-1) - a_1 y_(k-1), by Tustin's rule for dt [s]."""
         slow, fast = 2.0 * self.T_d / dt, 2.0 * self.T_d / (self.N * dt)
         return (1.0 + slow) / (1.0 + fast), (1.0 - slow) / (1.0 + fast), (1.0 - fast) / (1.0 + fast)
 
     def step(self, error: Floats, state: PIDState, dt: float) -> tuple[Floats, PIDState]:
-        """Pull speed [m/s] for an error [m], both of shape (n,), and the new state; one sample takes dt [s]."""
+        """Pull speed [m/s] for an error [m], both of shape (n,), and the new state after one sample of dt [s]."""
         b_0, b_1, a_1 = self.lead(dt)
         lead = b_0 * error + state.lead_in
         integral = state.integral + 0.5 * dt / self.T_i * (state.lead_out + lead)
@@ -64,13 +68,16 @@ class Compensator:
     gain: float = -0.22517
     """Numerator [1/s]."""
     fast: float = 1.684e-3
-    """Plant's stable pole [rad/s]."""
+    """Stable pole of the plant [rad/s]."""
     slow: float = 2.0e-4
-    """High-pass cut-off [rad/s]."""
+    """Cut-off of the high-pass filter [rad/s]."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self, positive=("fast", "slow"))
 
     @lru_cache(maxsize=16)  # noqa: B019  (frozen settings, few of them)
     def discrete(self, dt: float) -> tuple[Floats, Floats, Floats]:
-        """Zero-order hold: A (2, 2), B (2,), C (2,)."""
+        """Zero-order hold over dt [s]: A (2, 2), B (2,), C (2,)."""
         A = np.array([[0.0, 1.0], [-self.fast * self.slow, -(self.fast + self.slow)]])
         B, C = np.array([[0.0], [1.0]]), np.array([[0.0, self.gain]])
         A_d, B_d, C_d, _, _ = cont2discrete((A, B, C, np.zeros((1, 1))), dt, method="zoh")
@@ -98,7 +105,7 @@ class Compensator:
 def compensated_error(
     compensator: Compensator | None, seen: Measured, state: Floats, dt: float
 ) -> tuple[Floats, Floats]:
-    """r_tilde - r_ref [m], and the compensator's state, moved on by the pull speed applied since the last sample."""
+    """r_tilde - r_ref [m], and the compensator's state after the pull speed applied since the last sample."""
     if compensator is None:
         return seen.ring_error, np.zeros_like(state)
     y_pc, state = compensator.step(seen.v_p, state, dt)
@@ -106,7 +113,7 @@ def compensated_error(
 
 
 class Memory(NamedTuple):
-    """What the controller remembers."""
+    """The memory of :class:`CompensatedPID`."""
 
     compensator: Floats
     """State of the compensator, shape (n, 2)."""
@@ -117,23 +124,23 @@ class Memory(NamedTuple):
 
 @dataclass(frozen=True)
 class CompensatedPID(MeasuredController):
-    """The paper's controller as printed; ``compensator=None`` leaves the PID alone, which is unstable.
+    """The paper's controller as printed; with ``compensator=None`` the PID alone, which is unstable.
 
-    v_p = v_0 - K (r_ref - r_tilde), r_tilde = r_br - bias + y_pc, the compensator driven by the applied pull speed;
-    Q_H = Q_H0 + K_T (1 + 1/(T_iT s)) (T_1,ref - T_1), integrating only while Q_H is inside its range (the paper gives
-    no gains for this loop). While the camera is invalid, the observation holds the last reading. No anti-windup.
+    v_p = v_0 - K (r_ref - r_tilde), r_tilde = r_br - bias + y_pc, with the compensator driven by the applied pull
+    speed; Q_H = Q_H0 + K_T (1 + 1/(T_iT s)) (T_1,ref - T_1), which integrates only while Q_H is inside its range (the
+    paper gives no gains for this loop). There is no anti-windup of the pull speed.
     """
 
-    control_interval: float = 5.0
-    """Time between actions [s]."""
     pid: SeriesPID = SeriesPID()
     compensator: Compensator | None = Compensator()
     K_T: float = 1.0 * KILO
     """Gain of the temperature loop [W/K]."""
     T_iT: float = 300.0
-    """Its integral time [s]."""
-    v_0: float = PULL_SCALE
-    """Nominal pull speed of the environment's parameters [m/s]."""
+    """Integral time of the temperature loop [s]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_numbers(self, positive=("T_iT",), not_negative=("K_T",))
 
     def at_rest(self, seen: Measured) -> Memory:
         """Every state at zero."""
@@ -147,6 +154,6 @@ class CompensatedPID(MeasuredController):
         pull, pid = self.pid.step(error, memory.pid, dt)
         temperature_error = seen.T_1_ref - seen.T_1
         power = self.K_T * (temperature_error + memory.heat)
-        inside = np.abs(power) <= HEATER_SCALE
+        inside = np.abs(power) <= HEATER_RANGE
         heat = memory.heat + np.where(inside, dt / self.T_iT * temperature_error, 0.0)
         return pull, power, Memory(compensator, pid, heat)

@@ -1,4 +1,4 @@
-"""How puller control computers hold the diameter: an incremental pull-speed law, and automatic growth control.
+"""The diameter control of a production puller: an incremental pull-speed law, and automatic growth control.
 
 The law and its numbers come from a public analysis of 38 logged silicon body segments (GitHub,
 Tommy840602/czochralski-virtual-plc, docs/control_analysis.md). It speaks of diameters in mm and of pull speed in
@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.baselines.policy import Floats, MeasuredController
-from cz_gym.observation import PULL_SCALE, Measured
+from cz_gym.baselines.policy import Floats, MeasuredController, check_numbers
+from cz_gym.observation import Measured
 from cz_gym.units import MINUTE, MM, MM_PER_MIN
 
 from .temperature_loop import Heat, TemperatureLoop
@@ -23,11 +23,11 @@ from .temperature_loop import Heat, TemperatureLoop
 LAW_INTERVAL = 5.0
 """Time between increments of the logged law [s]."""
 RATE_INTERVAL = 10.0
-"""Time the law's rates refer to [s]: (now - 60 s ago) / 6 is a change per 10 s."""
+"""Time that the law's rates refer to [s]: (now - 60 s ago) / 6 is a change per 10 s."""
 
 
 class Memory(NamedTuple):
-    """What the controller remembers, each of shape (n,), ``diameters`` (n, samples in 60 s)."""
+    """The memory of :class:`Industrial`; each of shape (n,) but ``diameters``, (n, samples in 60 s)."""
 
     mean: Floats
     """Averaged diameter error [mm]."""
@@ -46,14 +46,12 @@ def dead_zone(error: npt.ArrayLike) -> Floats:
 
 @dataclass(frozen=True)
 class Industrial(MeasuredController):
-    """v_p gains 1.15 (G_p E + G_v dD60 + G_d dDbar) every 5 s on the pull speed applied, hence no wind-up.
+    """v_p = applied v_p + 1.15 (G_p E + G_v dD60 + G_d dDbar) every 5 s; being incremental, it cannot wind up.
 
     dD60 = (averaged diameter now - 60 s ago)/6, dDbar the exponentially averaged rate, both per 10 s; E as in
     :func:`dead_zone`. Heater: :class:`TemperatureLoop` with its trim, the automatic growth control.
     """
 
-    control_interval: float = 5.0
-    """Time between actions [s]."""
     gain: float = 1.15
     """Common gain of the increment [-]."""
     G_p: float = 0.0004
@@ -65,18 +63,20 @@ class Industrial(MeasuredController):
     forgetting: float = 1.0 / 24.0
     """Share of the newest rate in the averaged one, every 5 s [-]."""
     T_f: float = 10.0
-    """Averaging time of the diameter [s]: about two revolutions of the crystal (the logs do not say)."""
+    """Averaging time of the diameter [s], about two revolutions of the crystal; the logs do not give it."""
     heater: TemperatureLoop = field(default_factory=TemperatureLoop)
-    v_0: float = PULL_SCALE
-    """Nominal pull speed of the environment's parameters [m/s]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_numbers(self, positive=("gain", "T_f", "forgetting"))
 
     @property
     def samples(self) -> int:
-        """Samples in 60 s."""
+        """Number of samples in 60 s."""
         return max(round(MINUTE / self.control_interval), 1)
 
     def at_rest(self, seen: Measured) -> Memory:
-        """The diameter found has been there for long; the power applied now goes on."""
+        """The first diameter counts as the one of the last minute; the applied power continues."""
         diameter = 2.0 * (seen.r_ref + seen.ring_error) / MM
         diameters = np.repeat(diameter[:, None], self.samples, axis=1)
         return Memory(diameter, diameters, np.zeros_like(diameter), self.heater.at_rest(seen))

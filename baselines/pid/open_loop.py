@@ -1,9 +1,9 @@
-"""No controller at all: nominal pull speed and heater power."""
+"""No control: nominal pull speed and heater power."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +13,9 @@ from cz_gym.baselines.policy import batched, to_action
 
 @dataclass(frozen=True)
 class OpenLoop:
-    """Holds the nominal inputs; what the plant does by itself."""
+    """The nominal inputs at every sample: the plant without feedback."""
+
+    made_for: ClassVar[None] = None
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True

@@ -1,14 +1,16 @@
-"""Settings found by ``python -m cz_gym.baselines.tuning.pid``, frozen; their histories are in results/tuning.
+"""Tuned settings of the PID controllers (``python -m cz_gym.baselines.tuning``); histories are in results/tuning.
 
-Each was searched on training seeds and chosen on validation seeds of its scenario. Scenarios without settings of their
-own use those of ``randomized``.
+Each was searched on training seeds and chosen on validation seeds of its scenario. Other scenarios have the settings of
+the tuned one that contains what they contain (:func:`cz_gym.baselines.tuned_for.tuned_scenario`).
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+from cz_gym.baselines.tuned_for import tuned_scenario
 from cz_gym.config import Config
+from cz_gym.episodes.scenario import Scenario
 from cz_gym.errors import CzError
 from cz_gym.names import unknown
 
@@ -16,9 +18,6 @@ from .compensated_pid import Compensator, SeriesPID
 from .filtered_pid import FilteredPID
 from .industrial import Industrial
 from .temperature_loop import TemperatureLoop
-
-DEFAULT_SCENARIO = "randomized"
-"""Its settings serve on scenarios that have none of their own."""
 
 _CONVENTIONAL = FilteredPID(
     pid=SeriesPID(K_p=0.001757, T_i=376.4, T_d=1069.0, N=25.27),
@@ -93,17 +92,17 @@ SHIPPED: dict[tuple[str, str], FilteredPID | Industrial] = {
         heater=TemperatureLoop(K=300.0, T_i=66.21, share=0.7286, K_pull=19.71, T_pull=6438.0, T_mean=1049.0),
     ),
 }
-"""By controller and scenario."""
+"""The settings, by controller and scenario."""
 
 
-def settings_of(controller: str, scenario: str) -> FilteredPID | Industrial:
-    """The controller with its frozen settings for that scenario; ValueError if it has none."""
-    if (controller, DEFAULT_SCENARIO) not in SHIPPED:
+def settings_of(controller: str, scenario: Scenario) -> FilteredPID | Industrial:
+    """The controller with its tuned settings for that scenario; CzError if there are none of that name."""
+    among = [where for name, where in SHIPPED if name == controller]
+    if not among:
         raise CzError(unknown("controller with settings", controller, sorted({name for name, _ in SHIPPED})))
-    return SHIPPED.get((controller, scenario), SHIPPED[controller, DEFAULT_SCENARIO])
+    return SHIPPED[controller, tuned_scenario(scenario, among, controller)]
 
 
 def tuned(controller: str, config: Config) -> FilteredPID | Industrial:
-    """The controller with the settings for that environment; ValueError if it has none."""
-    frozen = settings_of(controller, config.scenario.name)
-    return replace(frozen, control_interval=config.control_interval, v_0=config.parameters.v_0)
+    """The controller with its tuned settings for that environment; CzError if there are none of that name."""
+    return settings_of(controller, config.scenario).for_config(config)

@@ -1,30 +1,31 @@
-"""Heater side of a puller: a PI loop on the pyrometer, and the slow loop that brings mean pull speed back.
+"""The heater of a puller: a PI loop on the pyrometer, and automatic growth control.
 
-Growers call the second one automatic growth control: pulling faster than the recipe for long means that the melt is
-too cold for the recipe's pull speed, so the temperature set-point rises until the mean pull speed is nominal again.
-Temperatures [K], powers [W], speeds [m/s], all as deviations from this puller's nominal.
+Automatic growth control is a slow outer loop: a mean pull speed above nominal for long means that the melt is too cold
+for the recipe, so the temperature set-point rises until the mean pull speed is nominal again. Temperatures [K], powers
+[W], speeds [m/s], all as deviations from the puller's nominal.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from cz_gym.baselines.policy import Floats
-from cz_gym.observation import HEATER_SCALE
+from cz_gym.baselines.policy import Floats, check_numbers
+from cz_gym.observation import Measured
+from cz_gym.task import HEATER_RANGE
 from cz_gym.units import KILO
 
 
 class Heat(NamedTuple):
-    """What the loop remembers, each of shape (n,)."""
+    """The memory of the loop; each of shape (n,)."""
 
     integral: Floats
     """Integral of the temperature error, over T_i [K]."""
     command: Floats
-    """Power asked for last [W]."""
+    """Last commanded power [W]."""
     mean_pull: Floats
     """Averaged pull speed over v_0, minus one [-]."""
     trim: Floats
@@ -35,9 +36,9 @@ class Heat(NamedTuple):
 class TemperatureLoop:
     """Q_H = Q_H0 + K (1 + 1/(T_i s)) (T_1,set - T_1), T_1,set = share T_1,ref + trim.
 
-    trim = K_pull (1 + 1/(T_pull s)) m, m the pull speed's relative deviation behind a first-order filter T_mean;
-    ``K_pull = 0`` leaves the recipe alone. Forward Euler; the integrator is brought back by what the drive applied
-    (back-calculation), the trim by its limit.
+    trim = K_pull (1 + 1/(T_pull s)) m, with m the pull speed's relative deviation behind a first-order filter T_mean;
+    ``K_pull = 0`` is no trim. Forward Euler; back-calculation from the applied power limits the integrator, ``limit``
+    the trim.
     """
 
     K: float = 1.0 * KILO
@@ -45,7 +46,7 @@ class TemperatureLoop:
     T_i: float = 300.0
     """Integral time [s]."""
     T_track: float = 60.0
-    """Time in which the integrator follows a limited drive [s]."""
+    """Time constant with which the integrator follows a limited drive [s]."""
     share: float = 1.0
     """Share of the recipe's change that is followed [-]."""
     K_pull: float = 0.0
@@ -57,13 +58,16 @@ class TemperatureLoop:
     limit: float = 15.0
     """Largest integral part of the trim [K]."""
 
-    def at_rest(self, seen: Any) -> Heat:
-        """Memory at the first sample: the power applied now goes on."""
+    def __post_init__(self) -> None:
+        check_numbers(self, positive=("K", "T_i", "T_track", "T_pull", "T_mean"), not_negative=("K_pull", "limit"))
+
+    def at_rest(self, seen: Measured) -> Heat:
+        """The memory before the first sample: the applied power continues."""
         zero = np.zeros_like(seen.T_1)
         return Heat(seen.Q_H / self.K, np.array(seen.Q_H), zero, zero)
 
-    def step(self, seen: Any, memory: Heat, dt: float, v_0: float) -> tuple[Floats, Heat]:
-        """Power above nominal [W], shape (n,), and the memory after it; dt in s, v_0 in m/s."""
+    def step(self, seen: Measured, memory: Heat, dt: float, v_0: float) -> tuple[Floats, Heat]:
+        """Power above nominal [W], shape (n,), and the new memory; dt in s, v_0 in m/s."""
         mean = memory.mean_pull - math.expm1(-dt / self.T_mean) * (seen.v_p / v_0 - memory.mean_pull)
         kept = memory.trim if self.K_pull > 0.0 else 0.0
         trim = np.clip(kept + self.K_pull * dt / self.T_pull * mean, -self.limit, self.limit)
@@ -72,4 +76,4 @@ class TemperatureLoop:
         integral = memory.integral + min(dt / self.T_track, 1.0) * missed
         power = self.K * (error + integral)
         integral = integral + dt / self.T_i * error
-        return power, Heat(integral, np.clip(power, -2.0 * HEATER_SCALE, 2.0 * HEATER_SCALE), mean, trim)
+        return power, Heat(integral, np.clip(power, -2.0 * HEATER_RANGE, 2.0 * HEATER_RANGE), mean, trim)

@@ -1,1 +1,1 @@
-"""The commands that tuned what ships, on training and validation seeds."""
+"""Searches of controller settings: ``python -m cz_gym.baselines.tuning --controller paper-tuned --scenario puller``."""

@@ -48,6 +48,12 @@ def margins(form: LinearForm, puller: Puller, at: str) -> tuple[Any, LoopMargins
     return values, margins_of(values, omega, form.dt, close(form.controller, puller, form.dt).stable)
 
 
+def phase_of(values: Any) -> Any:
+    """Continuous phase of a response [degrees]; it begins between -360 and 0, so that margins are read at -180."""
+    phase = np.degrees(np.unwrap(np.angle(values)))
+    return phase - 360.0 * (phase[0] // 360.0 + 1.0)
+
+
 def picture(name: str, form: LinearForm, responses: dict[str, Any]) -> bytes:
     """Gain and phase of the loop, and its sensitivity, as PNG."""
     from cz_gym.evaluation.report.canvas import COLOURS, GREY, canvas, png
@@ -58,7 +64,7 @@ def picture(name: str, form: LinearForm, responses: dict[str, Any]) -> bytes:
     for (at, values), colour in zip(responses.items(), COLOURS, strict=False):
         label = f"opened at the {PLACES[at]}"
         gain.loglog(omega, np.abs(values), color=colour, lw=1.2, label=label)
-        phase.semilogx(omega, np.degrees(np.unwrap(np.angle(values))), color=colour, lw=1.2)
+        phase.semilogx(omega, phase_of(values), color=colour, lw=1.2)
         sensitivity.loglog(omega, 1.0 / np.abs(1.0 + values), color=colour, lw=1.2)
     for panel, label in ((gain, "|L| [-]"), (phase, "phase of L [deg]"), (sensitivity, "|1 / (1 + L)| [-]")):
         panel.set_ylabel(label)

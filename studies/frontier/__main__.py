@@ -1,6 +1,6 @@
 """Radius errors over the LQG's at equal pull activity: ``python -m studies.frontier benchmark.json``.
 
-The LQG's settings (:data:`cz_gym.baselines.lqg.settings.FAMILY`) are the reference family of
+The LQG's settings (:data:`cz_gym.baselines.lqg.designs.FAMILY`) are the reference family of
 :mod:`cz_gym.evaluation.equal_activity`. With ``episodes.csv`` beside the file, each ratio has a 95 % bootstrap interval
 over crystals and training seeds.
 """
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from cz_gym.atomic_files import naming, write_files
-from cz_gym.baselines.lqg.settings import FAMILY
+from cz_gym.baselines.lqg.designs import FAMILY
 from cz_gym.commands import OneLineParser
 from cz_gym.errors import CzError
 from cz_gym.evaluation.equal_activity import Point, frontier, intervals, ratios

@@ -78,7 +78,7 @@ def trace(
 ) -> Trace:
     """Run a policy once on one model of the paper."""
     config = make_config(scenario, model, control_interval=interval, horizon=horizon, meniscus=meniscus)
-    run = rollout(policy, config, [0])
+    run = rollout(policy.for_config(config) if hasattr(policy, "for_config") else policy, config, [0])
     lived = int(run.alive.sum())
     logged = Signals(
         *(np.concatenate([start[0], log[:lived, 0]]) for start, log in zip(run.start, run.signals, strict=True))

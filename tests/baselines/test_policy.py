@@ -1,16 +1,31 @@
 """What every controller on "measured" observations has in common: batches, memories, shapes, control intervals."""
 
+import math
 from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.error import InvalidAction
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from cz_gym import CzVectorEnv, Parameters
+from cz_gym.baselines import CompensatedPID, Compensator, SeriesPID
+from cz_gym.baselines.lqg.controller import LQG
+from cz_gym.baselines.lqg.model import NoiseModel
+from cz_gym.baselines.lqg.ring_model import RingModel
+from cz_gym.baselines.pid.filtered_pid import FilteredPID
+from cz_gym.baselines.pid.industrial import Industrial
+from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
 from cz_gym.baselines.policy import Policy, map_arrays
 from cz_gym.baselines.registry import CONTROLLERS, find_controller, make_controller
 from cz_gym.config import make_config
+from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
-from tests.observed import observations
+from cz_gym.observation import MEASURED
+from tests.observed import measured, observations
 
 CASES = [(entry.name, "randomized") for entry in CONTROLLERS if entry.observation == "measured" and not entry.slow]
 TUNED = ("pid-conventional", "paper-filtered", "paper-tuned", "industrial", "lqg")
@@ -52,8 +67,8 @@ def test_slots_do_not_disturb_each_other_and_begin_anew(name, scenario, seen):
 @pytest.mark.parametrize("name", ["open-loop", "paper", "paper-tuned", "industrial", "lqg"])
 def test_history_is_read_like_measured(name):
     policy = make(name, "randomized")
-    for measured, history in zip(observations(steps=2), observations(steps=2, observation="history"), strict=True):
-        np.testing.assert_allclose(policy.predict(measured)[0], policy.predict(history)[0], rtol=1e-6)
+    for row, history in zip(observations(steps=2), observations(steps=2, observation="history"), strict=True):
+        np.testing.assert_allclose(policy.predict(row)[0], policy.predict(history)[0], rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["paper", "paper-filtered", "paper-tuned", "pid-conventional", "industrial", "lqg"])
@@ -78,3 +93,122 @@ def test_every_control_interval_holds_the_radius_alike(name, dt):
 def test_without_disturbance_it_stays_where_it_is(name):
     config = make_config("nominal", control_interval=2.0, horizon=3600.0)
     assert metrics(rollout(make_controller(name, config), config, [0])).max_error_mm[0] < 1e-3
+
+
+# What a controller was made for
+
+OTHER = {"parameters": Parameters(r_0=0.1), "control_interval": 2.0}
+
+
+@pytest.mark.parametrize("name", [entry.name for entry in CONTROLLERS if entry.name != "open-loop"])
+def test_actions_are_for_the_environment_of_the_controller_alone(name):
+    if name == "ekf-mpc":
+        pytest.importorskip("casadi", reason="needs the extra mpc")
+    entry = find_controller(name)
+    config = make_config("nominal", observation=entry.observation, horizon=60.0, **OTHER)
+    policy = entry.make(config)
+    if hasattr(policy, "for_episodes"):
+        policy = policy.for_episodes(config, np.arange(1))
+    env = CzVectorEnv.from_config(config, 1)
+    action, _ = policy.predict(env.reset(seed=0)[0])
+    assert policy.made_for == config.made_for
+    env.step(action)
+    for option in OTHER:
+        other = CzVectorEnv.from_config(replace(config, **{option: getattr(make_config(), option)}), 1)
+        other.reset(seed=0)
+        with pytest.raises(InvalidAction, match="was made for"):
+            other.step(action)
+
+
+@pytest.mark.parametrize("policy", [CompensatedPID(), FilteredPID(), Industrial(), LQG()])
+@pytest.mark.parametrize("option", OTHER)
+def test_another_environment_refuses_a_controller_unless_it_is_for_any(policy, option):
+    env = CzVectorEnv(1, scenario="nominal", **{option: OTHER[option]})
+    observation, _ = env.reset(seed=0)
+    with pytest.raises(InvalidAction, match="made for"):
+        env.step(policy.predict(observation)[0])
+    own = policy.for_config(make_config(**{option: OTHER[option]}))
+    assert own.settings[option] == OTHER[option]
+    anywhere = replace(policy, any_environment=True)
+    assert anywhere.made_for is None
+    for accepted in (own, anywhere):
+        env.step(accepted.predict(observation)[0])
+    with gym.make("Cz-v0", scenario="nominal", **policy.settings) as usual:
+        usual.step(policy.predict(usual.reset(seed=0)[0])[0])
+
+
+# Readings that are no numbers, and settings that are none
+
+READERS = [entry.name for entry in CONTROLLERS if entry.observation != "state" and entry.name != "ekf-mpc"]
+BAD = st.lists(st.sets(st.integers(0, len(MEASURED) - 1), min_size=1), min_size=1, max_size=4)
+ROW = measured(ring_error=1e-5, r_ref=2e-4, r_ref_1min=2e-4, r_ref_5min=2e-4, T_1=0.1, v_p=1e-7, Q_H=50.0)
+
+
+def actions_of(policy, rows):
+    state, found = None, []
+    for row in rows:
+        action, state = policy.predict(row, state)
+        found.append(action[0])
+    return np.array(found)
+
+
+@pytest.mark.parametrize("name", READERS)
+@settings(max_examples=6, deadline=None)
+@given(bad=BAD, value=st.sampled_from([math.nan, math.inf, -math.inf]), start=st.integers(0, 2))
+def test_what_is_no_number_is_not_read(name, bad, value, start):
+    """A PID goes on as if the last readings had been repeated; an LQG forgets that it read less."""
+    policy = make_controller(name, make_config())
+    rows = np.repeat(ROW[None], 3 + len(bad) + 60 * name.startswith("lqg"), axis=0)
+    usual = actions_of(policy, rows)
+    for k, channels in enumerate(bad, start):
+        rows[k, :, list(channels)] = value
+    found = actions_of(policy, rows)
+    assert np.isfinite(found).all()
+    if start > 0:
+        np.testing.assert_allclose(found[-1], usual[-1], atol=5e-3 if name.startswith("lqg") else 1e-7)
+
+
+def test_the_predictive_controller_does_not_read_it_either():
+    pytest.importorskip("casadi", reason="needs the extra mpc")
+    rows = np.repeat(ROW[None], 4, axis=0)
+    rows[1, :, :] = math.nan
+    assert np.isfinite(actions_of(make_controller("ekf-mpc", make_config()), rows)).all()
+
+
+@pytest.mark.parametrize("name", ["paper", "paper-tuned", "industrial", "lqg"])
+@pytest.mark.parametrize("garbage", [math.nan, 0.0, 9.0])
+def test_a_ring_that_is_not_valid_is_not_read(name, garbage):
+    """It counts as the last valid ring, also while the reference moves."""
+    rows = np.stack([measured(ring_error=3e-5 - r_ref, r_ref=r_ref) for r_ref in np.linspace(0.0, 1e-4, 6)])
+    held = rows.copy()
+    held[2:4, :, 1] = rows[2:4, :, 1] = 0.0
+    rows[2:4, :, 0] = garbage
+    policy = make_controller(name, make_config())
+    np.testing.assert_allclose(actions_of(policy, rows), actions_of(policy, held), rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("kind", "wrong"),
+    [
+        (SeriesPID, {"K_p": -0.01}),
+        (SeriesPID, {"K_p": 0.0}),
+        (SeriesPID, {"T_i": 0.0}),
+        (SeriesPID, {"T_d": -1.0}),
+        (SeriesPID, {"N": math.nan}),
+        (Compensator, {"fast": -1e-3}),
+        (CompensatedPID, {"T_iT": 0.0}),
+        (CompensatedPID, {"control_interval": 0.0}),
+        (FilteredPID, {"T_f": -1.0}),
+        (FilteredPID, {"T_track": 0.0}),
+        (TemperatureLoop, {"T_i": 0.0}),
+        (TemperatureLoop, {"K": -1.0}),
+        (Industrial, {"T_f": 0.0}),
+        (NoiseModel, {"slow_tau": 0.0}),
+        (NoiseModel, {"pyrometer_sd": 0.0}),
+        (RingModel, {"latency": -5.0}),
+    ],
+)
+def test_impossible_settings_are_refused_at_once(kind, wrong):
+    (name,) = wrong
+    with pytest.raises(CzError, match=f"{name} must be"):
+        kind(**wrong)

@@ -12,8 +12,7 @@ from gymnasium.error import DependencyNotInstalled
 
 import benchmark
 from cz_gym import datasets
-from cz_gym.baselines.tuning import lqg as tune_lqg
-from cz_gym.baselines.tuning import pid as tune_pid
+from cz_gym.baselines.tuning import __main__ as tuning
 from cz_gym.commands import OPTIONAL, OneLineParser, guarded, interpreter
 from cz_gym.errors import CzError
 from cz_gym.play import __main__ as play
@@ -26,8 +25,7 @@ from studies.young_laplace import __main__ as young_laplace
 COMMANDS: list[tuple[Any, str, str, list[str]]] = [
     (benchmark, "--episode", "benchmark", ["--out", "new/folder"]),
     (paper, "--ou", "contents", ["--out", "new/folder"]),
-    (tune_pid, "--trial", "measure", ["--controller", "industrial", "--out", "new/folder"]),
-    (tune_lqg, "--hist", "figures", ["--output", "new/folder/lqg.json"]),
+    (tuning, "--trial", "measure", ["--controller", "industrial", "--out", "new/folder"]),
     (insight, "--episode", "study", ["--out", "new/folder"]),
     (speed, "--qui", "run", ["--quick"]),
     (young_laplace, "--wri", "build", ["--write"]),
@@ -49,7 +47,7 @@ def name(part: Any) -> str | None:
 @pytest.mark.parametrize("abbreviated", [False, True])
 @pytest.mark.parametrize(("module", "beginning"), [row[:2] for row in COMMANDS], ids=name)
 def test_bad_options_get_one_line(module: Any, beginning: str, abbreviated: bool, refused: Any) -> None:
-    required = ["--controller", "industrial"] if module is tune_pid else []
+    required = ["--controller", "industrial"] if module is tuning else []
     line = refused(module.main, [*required, beginning if abbreviated else "--frobnicate"])
     assert "unrecognized arguments" in line
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 pytest.importorskip("control")
@@ -37,6 +38,16 @@ def test_a_controllers_margins_are_the_design_tables(tmp_path: Path, capsys: pyt
     form = bode.form_of("lqg")
     expected = loop_margins(form.controller, make_puller(lam=0.5), form.dt)
     assert f"| ring | {expected.crossover:.2e} | {expected.gain_up:.3g} |" in capsys.readouterr().out
+
+
+def test_phases_are_read_against_minus_180_degrees() -> None:
+    """Where the gain is one, the phase above -180 degrees is python-control's phase margin."""
+    form, puller = bode.form_of("paper"), make_puller(lam=1.0)
+    values, found = bode.margins(form, puller, "v_p")
+    phase = bode.phase_of(values)
+    assert -360.0 <= phase[0] < 0.0
+    at = np.argmin(np.abs(np.log(bode.frequencies(form.dt) / found.crossover)))
+    assert phase[at] + 180.0 == pytest.approx(found.phase_deg, abs=1.0)
 
 
 def test_one_of_the_users_own_is_taken_from_its_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

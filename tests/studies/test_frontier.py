@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from cz_gym.baselines.lqg.settings import ACTIVITIES, family_name
+from cz_gym.baselines.lqg.designs import ACTIVITIES, family_name
 from cz_gym.baselines.registry import find_controller
 from studies.frontier import __main__ as frontier
 

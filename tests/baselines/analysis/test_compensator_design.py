@@ -4,26 +4,18 @@ import math
 
 import numpy as np
 import pytest
-from scipy.signal import residue
+from scipy.signal import invres, residue
 
 from cz_gym import make_puller
 from cz_gym.baselines.analysis.compensator_design import (
-    NoSplitError,
+    NoCompensatorError,
     design_compensator,
-    high_passed,
-    ideal_compensator,
     margins,
     open_loop,
-    split_stable,
 )
 from cz_gym.baselines.pid.compensated_pid import SeriesPID
-from cz_gym.physics.linearisation import StateSpace, radius_model
+from cz_gym.physics.linearisation import radius_model
 from studies.paper.published import COMPENSATOR, MODEL_I, MODEL_II
-
-
-def gain(system, s):
-    A, B, C, D = system
-    return (C @ np.linalg.solve(s * np.eye(len(A)) - A, B) + D)[0, 0]
 
 
 def test_printed_compensator_to_five_digits():
@@ -33,59 +25,24 @@ def test_printed_compensator_to_five_digits():
     assert found.slow == pytest.approx(2e-4, rel=1e-9)
 
 
-def test_stable_part_against_partial_fractions():
-    """G_pc G_hpf multiplied out by hand; its stable residues, put together again, give the numerator."""
-    n, (p_0, p_1), lead, constant = MODEL_I
+@pytest.mark.parametrize("model", [MODEL_I, radius_model(make_puller(lam=1.0)), radius_model(make_puller(lam=0.7))])
+@pytest.mark.parametrize("cut_off", [2e-4, 5e-3])
+def test_compensator_is_the_ideal_one_but_for_unstable_poles_and_steady_gain(model, cut_off):
+    """SciPy's partial fractions of G_p (1 - G_m) s/(s + cut_off): the stable ones, put together again."""
+    n, (p_0, p_1), lead, constant = model
     numerator = -n * lead * np.poly([0.0, (1.0 - constant) / lead])
-    residues, poles, _ = residue(numerator, np.poly([p_0, p_1, -2e-4]), tol=1e-9)
-    stable = split_stable(high_passed(ideal_compensator(MODEL_I))).stable
-    for s in (1e-4j, 2e-3j, 0.3j):
-        expected = sum(r / (s - p) for r, p in zip(residues, poles, strict=True) if p.real < 0)
-        assert gain(stable, s) == pytest.approx(expected, rel=1e-8)
-    lead_of_stable = sum(r for r, p in zip(residues, poles, strict=True) if p.real < 0)
-    assert design_compensator(MODEL_I).gain == pytest.approx(lead_of_stable.real, rel=1e-8)
+    residues, poles, _ = residue(numerator, np.poly([p_0, p_1, -cut_off]), tol=1e-9)
+    stable, denominator = invres(residues[poles.real < 0.0], poles[poles.real < 0.0], [], tol=1e-9)
+    found = design_compensator(model, cut_off)
+    assert found.gain == pytest.approx(stable[0].real, rel=1e-8)
+    assert np.poly([-found.fast, -found.slow]) == pytest.approx(denominator.real, rel=1e-8)
 
 
-@pytest.mark.parametrize(("stable", "unstable"), [(1, 1), (3, 2), (2, 5), (4, 0)])
-@pytest.mark.parametrize("seed", range(3))
-def test_split_adds_up(stable, unstable, seed):
-    random = np.random.default_rng(seed)
-    n = stable + unstable
-    poles = np.concatenate([-random.uniform(0.1, 3.0, stable), random.uniform(0.0, 3.0, unstable)])
-    basis = random.normal(size=(n, n)) + 2.0 * np.eye(n)
-    A = basis @ np.diag(poles) @ np.linalg.inv(basis)
-    system = StateSpace(A, random.normal(size=(n, 1)), random.normal(size=(1, n)), np.array([[0.7]]))
-    parts = split_stable(system)
-    assert len(parts.stable.A) == stable
-    assert len(parts.unstable.A) == unstable
-    np.testing.assert_allclose(np.sort(np.linalg.eigvals(parts.stable.A).real), np.sort(poles[:stable]), rtol=1e-6)
-    for s in (0.3j, 2.0j, 10.0j):
-        assert sum(gain(part, s) for part in parts) == pytest.approx(gain(system, s), rel=1e-7)
-
-
-def test_split_keeps_complex_pairs_together():
-    A = np.array([[-0.1, 2.0, 1.0, 0.0], [-2.0, -0.1, 0.0, 1.0], [0.0, 0.0, 0.2, 3.0], [0.0, 0.0, -3.0, 0.2]])
-    parts = split_stable(StateSpace(A, np.ones((4, 1)), np.ones((1, 4)), np.zeros((1, 1))))
-    np.testing.assert_allclose(np.linalg.eigvals(parts.stable.A).real, -0.1, rtol=1e-9)
-    np.testing.assert_allclose(np.linalg.eigvals(parts.unstable.A).real, 0.2, rtol=1e-9)
-
-
-def test_integrator_counts_as_unstable():
-    parts = split_stable(StateSpace(np.diag([-1.0, 0.0]), np.ones((2, 1)), np.ones((1, 2)), np.zeros((1, 1))))
-    np.testing.assert_allclose(parts.unstable.A, [[0.0]], atol=1e-12)
-
-
-def test_no_split_is_said_clearly():
-    def diagonal(*poles):
-        n = len(poles)
-        return StateSpace(np.diag(poles), np.ones((n, 1)), np.ones((1, n)), np.zeros((1, 1)))
-
-    with pytest.raises(NoSplitError, match="no stable part: every eigenvalue"):
-        split_stable(diagonal(1.0, 2.0))
-    with pytest.raises(NoSplitError, match="agree to"):
-        split_stable(diagonal(-3e-13, 1e-20, 1.0))
-    with pytest.raises(NoSplitError, match="no compensator comes of this plant"):
+def test_a_plant_without_compensator_and_a_bad_cut_off_are_refused():
+    with pytest.raises(NoCompensatorError, match="needs two stable poles"):
         design_compensator(MODEL_II)
+    with pytest.raises(NoCompensatorError, match="needs two stable poles"):
+        design_compensator(MODEL_I, -MODEL_I.poles[1])
     with pytest.raises(ValueError, match="cut_off must be a positive frequency"):
         design_compensator(MODEL_I, 0.0)
 

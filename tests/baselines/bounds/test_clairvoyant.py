@@ -7,14 +7,16 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+from cz_gym.baselines.bounds import trajectory
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
 from cz_gym.baselines.bounds.future import future_of
 from cz_gym.baselines.bounds.riccati import Stages, sweep_back, sweep_forward
-from cz_gym.baselines.bounds.trajectory import TOLERANCE, Limits, limits_of, linearised, optimise, predicted_cost
+from cz_gym.baselines.bounds.trajectory import Limits, limits_of, linearised, optimise, predicted_cost
 from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.episodes.scenarios import HARD, RANDOMIZED
+from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.replay import Playback
 from cz_gym.evaluation.rollout import rollout
@@ -27,7 +29,7 @@ SEEDS = (1_000_000, 1_000_001, 1_000_002)
 
 def planned(scenario=RANDOMIZED, horizon=0.5 * HOUR):
     config = make_config(scenario, observation="state", horizon=horizon)
-    return config, Clairvoyant().for_episodes(config, SEEDS)
+    return config, Clairvoyant().for_episodes(config, np.array(SEEDS))
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +128,7 @@ def test_the_environment_replays_what_was_planned(optimum):
     assert run.signals.r_c == pytest.approx(policy.plan.best.x[1:, :, 0], abs=1e-6 * MM)
     assert power == pytest.approx(policy.plan.best.u[:, :, 1], abs=0.01)
     assert episode_cost(run) == pytest.approx(policy.plan.cost, rel=1e-6)
-    assert (policy.plan.best.last_move < TOLERANCE).all()
+    assert policy.plan.best.converged.all()
 
 
 def test_no_nearby_inputs_are_cheaper_and_the_slope_is_zero(optimum):
@@ -215,3 +217,13 @@ def test_it_refuses_to_act_without_a_plan_or_on_other_slots():
     _, policy = planned(horizon=60.0)
     with pytest.raises(ValueError, match="a plan for 3 episodes, not 2"):
         policy.predict(np.zeros((2, 17)))
+
+
+def test_an_optimum_that_was_not_reached_is_no_bound(monkeypatch):
+    config = make_config("randomized", observation="state", horizon=300.0)
+    monkeypatch.setattr(trajectory, "MOST_STEPS", 3)
+    future = future_of(config, SEEDS)
+    limits = limits_of(config.scenario.actuators, config.parameters.v_0, config.control_interval)
+    assert not optimise(future, limits).converged.all()
+    with pytest.raises(CzError, match=r"clairvoyant is no bound on 'randomized': .* 1000000, .* was not reached"):
+        rollout(Clairvoyant(), config, SEEDS)

@@ -8,7 +8,7 @@ import pytest
 from cz_gym import CzVectorEnv, make_puller
 from cz_gym.baselines.bounds import lqg as lqg_bounds
 from cz_gym.baselines.bounds.future import fluctuations_of, pullers_of
-from cz_gym.baselines.lqg.controller import LQG, LQGSettings
+from cz_gym.baselines.lqg.controller import LQG, LQGDesign
 from cz_gym.baselines.lqg.model import plant_model
 from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config
@@ -35,10 +35,10 @@ def test_the_bounds_know_the_pullers_and_fluctuations_that_the_environment_draws
 
 def test_each_filter_has_the_noise_of_its_own_crystal():
     config = make_config("only-interface", horizon=900.0)
-    bound = lqg_bounds.PrivilegedLQG(LQGSettings(lam=1.0), knows_fluctuations=True)
-    known = bound.for_episodes(config, [0, 1, 2]).gains.filter.plant.Q
+    bound = lqg_bounds.PrivilegedLQG(design=LQGDesign(lam=1.0), knows_fluctuations=True)
+    known = bound.for_episodes(config, np.arange(3)).gains.filter.plant.Q
     for slot, (fast, slow) in enumerate(fluctuations_of(config, [0, 1, 2])):
-        noise = replace(LQGSettings().noise, fast_sd=fast, slow_sd=slow)
+        noise = replace(LQGDesign().noise, fast_sd=fast, slow_sd=slow)
         puller = pullers_of(config, [slot])[0]
         np.testing.assert_allclose(known[slot], plant_model(puller, noise, config.control_interval).Q, rtol=1e-12)
 
@@ -52,10 +52,8 @@ def test_knowing_puller_and_fluctuations_buys_something():
 
 
 def test_knowing_a_nominal_puller_is_the_lqg():
-    settings = LQGSettings(lam=1.0)
-    config = make_config("only-interface", horizon=900.0)
-    told = rollout(lqg_bounds.PrivilegedLQG(settings), config, [0, 1, 2])
-    plain = rollout(LQG(settings), config, [0, 1, 2])
+    design, config = LQGDesign(lam=1.0), make_config("only-interface", horizon=900.0)
+    told, plain = (rollout(kind(design=design), config, [0, 1, 2]) for kind in (lqg_bounds.PrivilegedLQG, LQG))
     np.testing.assert_allclose(told.signals.v_p, plain.signals.v_p, rtol=1e-5)
 
 

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cz_gym.baselines.lqg.adaptive import AdaptiveLQG, adaptive
-from cz_gym.baselines.lqg.settings import lqg
+from cz_gym.baselines.lqg.controller import LQG
+from cz_gym.baselines.lqg.designs import FACTORS, adaptive, lqg
+from cz_gym.baselines.lqg.filter_bank import Hypotheses
 from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Interface
@@ -16,8 +17,8 @@ from cz_gym.evaluation.rollout import rollout
 from cz_gym.units import HOUR
 
 
-class Watched(AdaptiveLQG):
-    """Keeps the bank's last state."""
+class Watched(LQG):
+    """Keeps the last state of its bank."""
 
     def step(self, seen, memory):
         pull, heater, memory = super().step(seen, memory)
@@ -28,7 +29,8 @@ class Watched(AdaptiveLQG):
 def test_with_one_hypothesis_it_is_the_lqg():
     config = make_config("sensor-fault", horizon=1800.0)
     plain = lqg("lqg-at-0.02", config)
-    one = replace(adaptive(plain), factors=(1.0,))
+    noise = plain.design.noise
+    one = replace(plain, hypotheses=Hypotheses((noise.fast_sd,), (noise.slow_sd,)))
     ours, theirs = (rollout(each, config, range(4)) for each in (one, plain))
     np.testing.assert_allclose(ours.signals.v_p, theirs.signals.v_p, rtol=1e-6)
 
@@ -39,10 +41,9 @@ def test_it_finds_how_strong_the_fluctuations_are(strength, factor):
     config = make_config("randomized", horizon=HOUR)
     config = config.with_scenario(replace(config.scenario, name="one", interface=Interface(sd=(strength, strength))))
     controller = adaptive(lqg("lqg-at-0.02", config))
-    watched = Watched(**{name: getattr(controller, name) for name in controller.__dataclass_fields__})
+    watched = Watched(design=controller.design, hypotheses=controller.hypotheses)
     rollout(watched, config, range(20))
-    fast = np.repeat(watched.factors, len(watched.factors))
-    expected = watched.last.probability @ fast
+    expected = watched.last.probability @ np.repeat(FACTORS, len(FACTORS))
     assert (np.abs(expected - factor) < 0.4).mean() >= 0.9
 
 

@@ -11,7 +11,7 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from cz_gym import make_puller
 from cz_gym.baselines.lqg import kalman
-from cz_gym.baselines.lqg.controller import LQG, LQGSettings, solve
+from cz_gym.baselines.lqg.controller import LQG, LQGDesign, solve
 from cz_gym.baselines.lqg.model import FAST, PLANT, SLOW, STATES, NoiseModel
 from cz_gym.baselines.lqg.ring_model import RingModel
 from cz_gym.cost import cost_terms
@@ -19,7 +19,7 @@ from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 from tests.observed import measured
 
 PULLER = make_puller(lam=0.5)
-LINEAR = LQGSettings(nonlinear=False, gate=np.inf, noise=NoiseModel(camera_memory=np.inf, recipe_share=0.0))
+LINEAR = LQGDesign(nonlinear=False, gate=np.inf, noise=NoiseModel(camera_memory=np.inf, recipe_share=0.0))
 KNOWN = RingModel(5.0, 0.1 * MM, 10.0 * MINUTE, rotation=(10.0 / MINUTE, 10.0 / MINUTE))
 SCALES = np.array([MM, MM, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0 / HOUR, KILO])
 """Units in which the plant's states are of one order: in SI the covariance equation is ill-conditioned."""
@@ -111,7 +111,7 @@ def test_cost_through_predict_matches_the_covariance_equation(ring, dt):
     kicks = np.vstack([root(plant.Q[both]).T, np.zeros((2, m))])
     glitches = np.vstack([np.zeros((m, 2)), np.diag(noise_sds(gains))])
     x, u, state, cost, settle = np.zeros((m + 2, m)), np.zeros((m + 2, 2)), None, [], 700
-    controller = LQG(replace(LINEAR, ring=ring), dt)
+    controller = LQG(dt, replace(LINEAR, ring=ring))
     for k in range(settle + 1200):
         y = x @ H.T + glitches * (k == settle)
         action, state = controller.predict(measured(ring_error=y[:, 0], T_1=y[:, 1], v_p=u[:, 0], Q_H=u[:, 1]), state)

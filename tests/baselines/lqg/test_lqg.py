@@ -9,8 +9,8 @@ from scipy.integrate import solve_ivp
 from cz_gym import make_puller
 from cz_gym.baselines.lqg.controller import LQG
 from cz_gym.baselines.lqg.model import DRIFT, FAST, HEATER, PLANT, SLOW, STATES, NoiseModel, plant_model
-from cz_gym.baselines.lqg.preview import look_ahead, samples_ahead
-from cz_gym.baselines.lqg.regulator import Weights, quadratic_cost, regulator
+from cz_gym.baselines.lqg.regulator import look_ahead, quadratic_cost, regulator, samples_ahead
+from cz_gym.cost import Weights
 from cz_gym.episodes.schedule import quintic
 from cz_gym.observation import Measured
 from cz_gym.physics.meniscus import HURLE
@@ -88,7 +88,7 @@ def test_the_first_move_is_that_of_the_whole_horizon(what):
     dt, ahead = 30.0, 10
     noise = replace(NOISE, drift_rate_tau=600.0)
     model, weights = plant_model(PULLER, noise, dt), Weights(heater_step=0.5)
-    law = regulator(model, weights, dt, ahead)
+    law = regulator(model, weights, dt)
     z, reference, drift = np.zeros(len(STATES) + 2), np.zeros(ahead), np.zeros(ahead)
     if what == "state":
         z[:] = [1e-4, 1e-4, 1.0, 0.5, 0.2, 0.1, 0.2, 0.0, 0.0, 10.0, 1e-6, 100.0]
@@ -106,7 +106,7 @@ def test_the_first_move_is_that_of_the_whole_horizon(what):
 
 
 def test_the_weights_on_moves_keep_the_same_law_at_other_intervals():
-    laws = [regulator(plant_model(PULLER, NOISE, dt), Weights(), dt, 1).feedback / dt for dt in (0.5, 1.0)]
+    laws = [regulator(plant_model(PULLER, NOISE, dt), Weights(), dt).feedback / dt for dt in (0.5, 1.0)]
     np.testing.assert_allclose(laws[0][0, :2], laws[1][0, :2], rtol=0.05)
 
 
@@ -133,6 +133,6 @@ def test_the_plan_is_the_recipe_five_minutes_ahead(dt):
 
 def test_while_the_camera_is_out_its_reading_is_not_believed():
     _, first = LQG().predict(measured())
-    states = [LQG().predict(measured(ring_error=wrong, valid=0.0), first)[1].filter for wrong in (0.0, 5e-3)]
+    states = [LQG().predict(measured(ring_error=wrong, valid=0.0), first)[1].memory.filter for wrong in (0.0, 5e-3)]
     np.testing.assert_array_equal(states[0].mean, states[1].mean)
     assert states[0].covariance[0, 0, 0] > 0.0

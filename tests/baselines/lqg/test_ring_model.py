@@ -7,18 +7,20 @@ import pytest
 
 from cz_gym import make_puller
 from cz_gym.baselines.lqg import ring_model
-from cz_gym.baselines.lqg.controller import LQG, LQGSettings
+from cz_gym.baselines.lqg.controller import LQG, LQGDesign
+from cz_gym.baselines.lqg.designs import design_of, ring_of
 from cz_gym.baselines.lqg.model import STATES, NoiseModel, plant_model
 from cz_gym.baselines.lqg.ring_model import RingModel, frequencies, search_step
-from cz_gym.baselines.lqg.settings import PULLER_RING, settings_of
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Interface, Scenario, Sensor
 from cz_gym.episodes.scenarios import PULLER as PULLER_SCENARIO
+from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.units import MINUTE, MM
 
 PULLER = make_puller(lam=0.5)
+PULLER_RING = ring_of(PULLER_SCENARIO.sensor)
 
 
 @pytest.mark.parametrize("latency", [0.0, 2.0, 5.0, 7.0])
@@ -83,7 +85,7 @@ def with_and_without_search(sensor):
     """Metrics on crystals with that camera: with the search for a ripple, and with the latency alone."""
     scenario = Scenario("camera", interface=Interface(sd=(0.2, 0.2)), sensor=sensor)
     config = make_config(scenario, horizon=3600.0)
-    policies = (LQG(replace(settings_of("lqg", "randomized"), ring=ring)) for ring in (PULLER_RING, RingModel(5.0)))
+    policies = (LQG(design=replace(design_of("lqg", RANDOMIZED), ring=ring)) for ring in (PULLER_RING, RingModel(5.0)))
     return [metrics(rollout(policy, config, range(12))) for policy in policies]
 
 
@@ -104,7 +106,7 @@ def test_a_ring_that_is_neither_late_nor_shaken_adds_nothing():
     for plain, with_ring in zip(model, ring_model.augmented(model, RingModel(), 5.0), strict=True):
         np.testing.assert_allclose(with_ring, plain, rtol=1e-12, atol=1e-30)
     config = make_config("randomized", horizon=1200.0)
-    plain, with_ring = (rollout(LQG(replace(LQGSettings(), ring=ring)), config, [3]) for ring in (None, RingModel()))
+    plain, with_ring = (rollout(LQG(design=LQGDesign(ring=ring)), config, [3]) for ring in (None, RingModel()))
     np.testing.assert_allclose(with_ring.signals.v_p, plain.signals.v_p, rtol=1e-6)
 
 

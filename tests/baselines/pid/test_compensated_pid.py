@@ -46,7 +46,7 @@ def test_compensator_is_the_papers_driven_by_the_applied_pull(dt: float, rng: np
     controller = CompensatedPID(dt)
     for seen in [0.0, *applied]:
         _, state = controller.predict(measured(v_p=seen), state)
-        y.append(state.compensator[0] @ [0.0, -0.22517])
+        y.append(state.memory.compensator[0] @ [0.0, -0.22517])
     np.testing.assert_allclose(y, exact, rtol=1e-9, atol=1e-12)
 
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from cz_gym.baselines.pid.industrial import Industrial, dead_zone
-from cz_gym.observation import MEASURED, PULL_SCALE, Measured
+from cz_gym.observation import PULL_SCALE, Measured
 from cz_gym.units import MM_PER_MIN
+from tests.observed import measured
 
 RING, PULL = Measured._fields.index("ring_error"), Measured._fields.index("v_p")
 
@@ -34,7 +35,7 @@ def follow(policy, diameters):
     """Pull speeds [mm/min above nominal] when every command is applied."""
     state, pull, found = None, 0.0, []
     for diameter in diameters:
-        row = np.zeros((1, len(MEASURED)))
+        row = measured()
         row[0, RING], row[0, PULL] = diameter / 2.0, pull
         action, state = policy.predict(row, state)
         pull = float(action[0, 0])
@@ -63,7 +64,7 @@ def test_other_intervals_follow_the_same_law(dt):
 
 def test_no_wind_up_on_a_stuck_drive():
     policy, state = Industrial(), None
-    row = np.zeros((1, len(MEASURED)))
+    row = measured()
     row[0, RING], row[0, PULL] = 0.4, 0.2
     for _ in range(500):
         action, state = policy.predict(row, state)
@@ -75,8 +76,8 @@ def test_a_held_diameter_and_a_moving_target():
     """The rates are those of the diameter itself; a falling target shows in the error alone."""
     policy, state, r_ref = Industrial(T_f=1e-9), None, Measured._fields.index("r_ref")
     for k in range(30):
-        row = np.zeros((1, len(MEASURED)))
+        row = measured()
         row[0, r_ref], row[0, RING] = -0.01 * k, 0.01 * k
         _, state = policy.predict(row, state)
-    assert abs(state.rate[0]) < 1e-9
-    np.testing.assert_allclose(state.diameters, 0.0, atol=1e-9)
+    assert abs(state.memory.rate[0]) < 1e-9
+    np.testing.assert_allclose(state.memory.diameters, 0.0, atol=1e-9)

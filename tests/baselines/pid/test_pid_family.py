@@ -13,13 +13,14 @@ from cz_gym.baselines.analysis.frequency import crossover, response
 from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.analysis.sampled_loop import linear_controller
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID, SeriesPID
-from cz_gym.baselines.pid.filtered_pid import INVERSE_GAIN, FilteredPID, reference_derivatives
+from cz_gym.baselines.pid.filtered_pid import FilteredPID, reference_derivatives
 from cz_gym.baselines.pid.settings import SHIPPED, tuned
 from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
-from cz_gym.baselines.tuning.pid_spaces import over_half_the_zero
+from cz_gym.baselines.tuning.goals import over_half_the_zero
 from cz_gym.config import make_config
 from cz_gym.observation import MEASURED, PULL_SCALE, Measured
 from cz_gym.physics.linearisation import StateSpace, radius_model
+from cz_gym.physics.parameters import Parameters
 from cz_gym.units import MM, MM_PER_MIN
 from tests.observed import measured, pulls
 
@@ -71,7 +72,7 @@ def test_switching_on_moves_nothing(applied):
     assert action[0, 1] == pytest.approx(700.0 / SCALES["Q_H"], rel=1e-6)
     abrupt, _ = replace(policy, T_start=0.0).predict(start)
     assert abs(abrupt[0, 0] * PULL_SCALE - applied) > 0.05 * MM_PER_MIN
-    np.testing.assert_allclose(memory.start, 0.3 * MM * math.exp(-5.0 / 200.0))
+    np.testing.assert_allclose(memory.memory.start, 0.3 * MM * math.exp(-5.0 / 200.0))
 
 
 def test_integrator_waits_where_the_drive_is_stuck():
@@ -82,18 +83,18 @@ def test_integrator_waits_where_the_drive_is_stuck():
     state = None
     for _ in range(400):
         _, state = policy.predict(stuck, state)
-    assert state.command[0] - 0.3 * MM_PER_MIN == pytest.approx(0.01 * 0.2 * MM * 50.0 / 1000.0, rel=1e-6)
+    assert state.memory.command[0] - 0.3 * MM_PER_MIN == pytest.approx(0.01 * 0.2 * MM * 50.0 / 1000.0, rel=1e-6)
     wound = None
     for _ in range(400):
         _, wound = replace(policy, T_track=np.inf).predict(stuck, wound)
     wound_up = 0.01 * 0.2 * MM * (1.0 + 399.5 * 5.0 / 1000.0)
-    assert wound.command[0] - 0.3 * MM_PER_MIN == pytest.approx(wound_up, rel=1e-6)
+    assert wound.memory.command[0] - 0.3 * MM_PER_MIN == pytest.approx(wound_up, rel=1e-6)
 
 
 def test_an_outlier_moves_the_filter_by_no_more_than_it_believes():
     policy = FilteredPID(compensator=None, T_f=40.0, jump=0.1 * MM)
     _, state = policy.predict(measured(ring_error=5.0 * MM))
-    assert state.filtered[0] == pytest.approx((1.0 - math.exp(-5.0 / 40.0)) * 0.1 * MM)
+    assert state.memory.filtered[0] == pytest.approx((1.0 - math.exp(-5.0 / 40.0)) * 0.1 * MM)
 
 
 def test_reference_derivatives_from_its_preview():
@@ -106,12 +107,12 @@ def test_reference_derivatives_from_its_preview():
     assert curvature == pytest.approx(c)
 
 
-def test_feed_forward_is_the_inverse_plant():
-    assert pytest.approx(radius_model(make_puller(lam=0.0)).numerator, rel=1e-3) == INVERSE_GAIN
-    c = 1e-8
+@pytest.mark.parametrize("sigma", [0.72, 0.8])
+def test_feed_forward_is_the_inverse_of_its_own_plant(sigma):
+    parameters, c = Parameters(sigma=sigma), 1e-8
     shown = {"r_ref_1min": 0.5 * c * 60.0**2, "r_ref_5min": 0.5 * c * 300.0**2}
-    found = pulls(FilteredPID(K_ff=1.0), [measured(**shown)])
-    assert found[0] == pytest.approx(c / INVERSE_GAIN, rel=1e-5)
+    found = pulls(FilteredPID(K_ff=1.0, parameters=parameters), [measured(**shown)])
+    assert found[0] == pytest.approx(c / radius_model(make_puller(parameters, lam=0.0)).numerator, rel=1e-5)
 
 
 @pytest.mark.parametrize("dt", [2.0, 5.0, 10.0])

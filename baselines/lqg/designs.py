@@ -1,32 +1,37 @@
-"""The LQGs that ship: chosen by ``python -m cz_gym.baselines.tuning.lqg``, frozen, hashed; histories in results/tuning.
+"""Tuned designs of the LQGs (``python -m cz_gym.baselines.tuning``); histories are in results/tuning.
 
-Each was searched on training seeds and chosen on validation seeds of its scenario. Scenarios without settings of their
-own use those of ``randomized``.
+Each was searched on training seeds and chosen on validation seeds of its scenario. Other scenarios have the design of
+the tuned one that contains what they contain (:func:`cz_gym.baselines.tuned_for.tuned_scenario`).
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
+from cz_gym.baselines.tuned_for import tuned_scenario
 from cz_gym.config import Config
-from cz_gym.units import MM
+from cz_gym.cost import Weights
+from cz_gym.episodes.scenario import Scenario, Sensor
 
-from .controller import LQG, LQGSettings
+from .controller import LQG, LQGDesign
+from .filter_bank import Hypotheses
 from .model import NoiseModel
-from .regulator import Weights
 from .ring_model import RingModel
 
-PULLER_RING = RingModel(latency=5.0, ripple_sd=0.08 * MM)
-"""The camera of ``puller``: its latency and rotation, and what amplitudes between 0 and 0.2 mm come to on average."""
+MEAN_RIPPLE = 0.4
+"""Standard deviation of a ripple whose amplitude is uniform from zero to A, in units of A: 1/sqrt(6), rounded."""
+FACTORS = 0.2, 0.6, 1.0, 1.4, 1.8
+"""Standard deviations of the fluctuations that adaptive LQGs consider possible, in units of the design's own [-]."""
 WEIGHTS = "pull", "pull_step", "heater_step"
 NOISE = (
     *("fast_sd", "slow_sd", "drift_rate_sd", "drift_rate_tau"),
     *("heater_walk", "thermal_walk", "pyrometer_sd", "recipe_share"),
 )
 SEARCHED = (*(f"weights.{name}" for name in WEIGHTS), *(f"noise.{name}" for name in NOISE))
-"""What a search chooses of the settings, fields joined by dots."""
+"""The fields of a design that are searched, joined by dots."""
 SHIPPED: dict[str, dict[str, tuple[float, ...]]] = {}
-"""By controller and scenario: the values of SEARCHED."""
+"""The values of SEARCHED, by controller and scenario."""
 SHIPPED["lqg"] = {
     "randomized": (0.1556, 0.06564, 0.5706, 0.3106, 0.369, 0.0007519, 2113.0, 0.3833, 0.002862, 0.08655, 0.2398),
     "sensor-fault": (0.1556, 0.06564, 1.712, 0.3106, 0.369, 0.0007519, 2113.0, 0.3833, 0.002862, 0.08655, 0.2398),
@@ -72,7 +77,7 @@ ACTIVITIES = 0.005, 0.008, 0.013, 0.02, 0.03
 
 
 def family_name(activity: float) -> str:
-    """Name of the LQG tuned for the radius with that pull step RMS [mm/min] at most."""
+    """Name of the LQG tuned for the radius with a pull step RMS [mm/min] of at most ``activity``."""
     return f"lqg-at-{activity:g}"
 
 
@@ -80,19 +85,35 @@ FAMILY = ("lqg-quiet", *map(family_name, ACTIVITIES))
 """Names of the LQGs that are tuned for the radius: the reference family of :mod:`cz_gym.evaluation.equal_activity`."""
 
 
-def settings_of(controller: str, scenario: str) -> LQGSettings:
-    """The frozen settings of an LQG for that scenario."""
+def ring_of(sensor: Sensor) -> RingModel | None:
+    """The model of a scenario's camera; None for one without latency and ripple."""
+    if sensor.latency == 0.0 and not any(sensor.ripple):
+        return None
+    return RingModel(sensor.latency, MEAN_RIPPLE * sensor.ripple[1], rotation=sensor.rotation)
+
+
+def design_of(controller: str, scenario: Scenario) -> LQGDesign:
+    """The tuned design of an LQG for that scenario, with the model of its camera."""
     shipped = SHIPPED[controller]
-    where = scenario if scenario in shipped else "randomized"
-    values: dict[str, Any] = dict(zip(SEARCHED, shipped[where], strict=True))
-    return LQGSettings(
+    chosen = shipped[tuned_scenario(scenario, shipped, controller)]
+    values: dict[str, Any] = dict(zip(SEARCHED, chosen, strict=True))
+    return LQGDesign(
         NoiseModel(**{name: values[f"noise.{name}"] for name in NOISE}),
         Weights(**{name: values[f"weights.{name}"] for name in WEIGHTS}),
-        ring=PULLER_RING if where == "puller" else None,
+        ring=ring_of(scenario.sensor),
     )
 
 
 def lqg(name: str, config: Config) -> LQG:
-    """The LQG of that name for an environment's settings."""
-    settings = settings_of(name, config.scenario.name)
-    return LQG(settings, config.control_interval, config.parameters, config.meniscus)
+    """The LQG of that name for an environment."""
+    return LQG(design=design_of(name, config.scenario)).for_config(config)
+
+
+def adaptive(plain: LQG) -> LQG:
+    """The same LQG with a bank of filters that estimates the strength of each crystal's interface fluctuations.
+
+    Its filters assume FACTORS times the standard deviations of the design, each pair equally likely at first.
+    """
+    noise = plain.design.noise
+    fast, slow = (tuple(factor * sd for factor in FACTORS) for sd in (noise.fast_sd, noise.slow_sd))
+    return replace(plain, hypotheses=Hypotheses(fast, slow))

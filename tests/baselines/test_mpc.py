@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from cz_gym.baselines.lqg.controller import LQG, LQGSettings, optimal_inputs
+from cz_gym.baselines.lqg.controller import LQG, LQGDesign, optimal_inputs
+from cz_gym.baselines.lqg.designs import ring_of
 from cz_gym.baselines.lqg.filter_bank import Hypotheses, filter_bank
 from cz_gym.baselines.lqg.model import DRIFT, HEATER, PLANT, STATES
-from cz_gym.baselines.lqg.settings import PULLER_RING
 from cz_gym.baselines.policy import map_arrays
 from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Actuators
-from cz_gym.episodes.scenarios import RANDOMIZED
+from cz_gym.episodes.scenarios import PULLER, RANDOMIZED
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.observation import decode
 from cz_gym.physics.plant import Disturbance, Inputs, State, hidden_load, rk4
@@ -25,11 +25,17 @@ from tests.observed import measured
 pytest.importorskip("casadi", reason="needs the extra mpc")
 
 from cz_gym.baselines.bounds.trajectory import SCALES, Limits
-from cz_gym.baselines.mpc.controller import EkfMpc, ekf_mpc, newton
-from cz_gym.baselines.mpc.limits import best_corrections
-from cz_gym.baselines.mpc.prediction import expected_disturbances, held, predict_under_law
+from cz_gym.baselines.mpc import (
+    EkfMpc,
+    best_corrections,
+    ekf_mpc,
+    expected_disturbances,
+    held,
+    newton,
+    predict_under_law,
+)
 
-LINEAR = LQGSettings(nonlinear=False)
+LINEAR = LQGDesign(nonlinear=False)
 SHARE = LINEAR.noise.recipe_share
 
 
@@ -58,37 +64,36 @@ class Watched:
 
 def parts(mpc, estimate, plan, previous):
     """Prediction, curvature and slope as the controller makes them."""
-    gains, shape = mpc.lqg.gains, mpc.shape
+    gains, shape = mpc.gains, mpc.shape
     disturbances = expected_disturbances(estimate, plan, gains, SHARE, shape.stages)
     z = np.concatenate([estimate[:, :PLANT], previous], axis=1) / SCALES
     prediction = predict_under_law(z, plan, disturbances, gains, SHARE, shape)
     last = held(plan, shape.stages)[:, -1, 0], disturbances[:, -1]
-    H, g = newton(prediction, *last, gains.regulator, mpc.lqg.settings.weights, shape)
+    H, g = newton(prediction, *last, gains.regulator, mpc.design.weights, shape.dt)
     return prediction, H, g, disturbances
 
 
 @pytest.mark.parametrize(("dt", "blocks"), [(5.0, (1, 1, 2, 4, 8, 16)), (10.0, (1, 3)), (2.0, (1, 40))])
 def test_on_a_linear_plant_without_limits_it_is_the_lqr(dt, blocks):
-    lqg = LQG(LINEAR, dt)
-    mpc = EkfMpc(lqg, blocks=blocks)
+    lqg, mpc = LQG(dt, LINEAR), EkfMpc(dt, LINEAR, blocks=blocks)
     estimate, plan, previous = situation()
     plan = np.pad(plan, ((0, 0), (0, 0), (0, 90)), "edge")[:, :, : round(300.0 / dt) + 1]
     law = optimal_inputs(estimate, plan, previous, lqg.gains.regulator, SHARE, lqg.parameters.v_0)
-    assert mpc.optimal_inputs(estimate, plan, previous) == pytest.approx(law, rel=1e-8)
+    assert mpc.law(estimate, plan, previous) == pytest.approx(law, rel=1e-8)
 
 
 def test_casadi_predicts_what_the_plant_does():
-    mpc = EkfMpc(LQG(LQGSettings()))
+    mpc = EkfMpc()
     estimate, plan, previous = situation(reference=1.0 * MM)
     prediction, _, _, disturbances = parts(mpc, estimate, plan, previous)
-    p = mpc.lqg.gains.filter.puller
+    p = mpc.gains.filter.puller
     for i in range(len(estimate)):
         x = State(*(np.array(p.state_0) + estimate[i, :PLANT]))
         for k in range(mpc.shape.stages):
             d = disturbances[i, k]
             pull, power = prediction.outputs[i, k, 1:3] * SCALES[PLANT:]
             load = Disturbance(hidden_load(d[DRIFT - PLANT], p), d[0] + d[1], 1.0)
-            x = rk4(x, Inputs(p.v_0 + pull, p.Q_H_0 + power + d[HEATER - PLANT]), load, p, 5.0, mpc.lqg.meniscus.slope)
+            x = rk4(x, Inputs(p.v_0 + pull, p.Q_H_0 + power + d[HEATER - PLANT]), load, p, 5.0, mpc.meniscus.slope)
             error = prediction.outputs[i, k, 0] * MM
             assert error == pytest.approx(x.r_c - p.r_0 - held(plan, k + 1)[i, -1, 0], abs=1e-13)
         assert prediction.last[i, :PLANT] * SCALES[:PLANT] == pytest.approx(np.array(x) - p.state_0, abs=1e-9)
@@ -96,12 +101,12 @@ def test_casadi_predicts_what_the_plant_does():
 
 def test_the_sensitivities_agree_with_finite_differences():
     """The first block's correction acts on the first move alone, as a change of the previous inputs would but for K."""
-    mpc = EkfMpc(LQG(LQGSettings()), blocks=(1, 2, 4))
+    mpc = EkfMpc(blocks=(1, 2, 4))
     estimate, plan, previous = situation(n=2)
     prediction, _, _, _ = parts(mpc, estimate, plan, previous)
     assert prediction.outputs_c.shape == (2, 60, 5, 6)
     size = np.array([1e-3, 1e-3])
-    K = mpc.lqg.gains.regulator.feedback[:, -2:] * SCALES[PLANT:] / SCALES[PLANT:, None]
+    K = mpc.gains.regulator.feedback[:, -2:] * SCALES[PLANT:] / SCALES[PLANT:, None]
     for j in range(2):
         change = np.zeros(2)
         change[j] = size[j]
@@ -117,7 +122,7 @@ def test_the_sensitivities_agree_with_finite_differences():
 
 def test_limits_are_kept_at_least_cost():
     random = np.random.default_rng(2)
-    mpc = EkfMpc(LQG(LQGSettings()))
+    mpc = EkfMpc()
     prediction, H, g, _ = parts(mpc, *situation())
     g = g + 0.2 * random.normal(size=g.shape) * np.sqrt(np.diagonal(H, axis1=1, axis2=2))
     limits = Limits(np.array([0.3, 2.0]), np.array([0.03, 0.6]))
@@ -143,7 +148,7 @@ def test_limits_are_kept_at_least_cost():
 
 
 def test_where_not_all_limits_can_be_kept_those_of_now_are():
-    mpc = EkfMpc(LQG(LQGSettings()))
+    mpc = EkfMpc()
     prediction, H, g, _ = parts(mpc, *situation())
     limits = Limits(np.array([0.2, 0.5]), np.array([0.02, 0.1]))
     corrections = best_corrections(H, g, prediction, mpc.blocks, limits)
@@ -156,9 +161,10 @@ def test_what_it_asks_for_is_within_the_drives_limits():
         pull_window=0.02 * MM_PER_MIN, pull_slew=0.05 * MM_PER_MIN / MINUTE, heater_slew=0.5 * KILO / MINUTE
     )
     config = make_config(replace(RANDOMIZED, name="narrow", actuators=actuators), horizon=0.1 * HOUR)
-    watched = Watched(ekf_mpc(config))
+    with pytest.warns(UserWarning, match=r"lqg was not tuned for actuators\.pull_window"):
+        watched = Watched(ekf_mpc(config))
     run = rollout(watched, config, range(1_000_000, 1_000_003))
-    wanted = np.array([state.command for state in watched.states])
+    wanted = np.array([state.memory.command for state in watched.states])
     pull = run.signals.v_p - config.parameters.v_0
     assert not run.failed.any()
     # The drives follow to the last digit: nothing was asked for that they could not do.
@@ -168,12 +174,12 @@ def test_what_it_asks_for_is_within_the_drives_limits():
     assert np.abs(pull).max() == pytest.approx(actuators.pull_window, rel=1e-3)
 
 
-@pytest.mark.parametrize("ring", [None, PULLER_RING])
+@pytest.mark.parametrize("ring", [None, ring_of(PULLER.sensor)])
 def test_one_filter_is_the_lqgs_own(ring):
     config = make_config("sensor-fault", horizon=0.25 * HOUR)
-    lqg = LQG(replace(LINEAR, ring=ring))
-    noise = LINEAR.noise
-    mpc = EkfMpc(lqg, Hypotheses((noise.fast_sd,), (noise.slow_sd,)))
+    design, noise = replace(LINEAR, ring=ring), LINEAR.noise
+    lqg = LQG(design=design)
+    mpc = EkfMpc(design=design, hypotheses=Hypotheses((noise.fast_sd,), (noise.slow_sd,)))
     seeds = range(1_000_000, 1_000_003)
     ours, theirs = rollout(mpc, config, seeds), rollout(lqg, config, seeds)
     assert ours.signals.v_p == pytest.approx(theirs.signals.v_p, rel=1e-6)
@@ -181,7 +187,7 @@ def test_one_filter_is_the_lqgs_own(ring):
 
 
 def test_the_bank_weighs_its_filters_by_bayes_rule():
-    single, hypotheses = LQG(LINEAR).gains.filter, Hypotheses((0.05, 0.5), (0.3,))
+    single, hypotheses = LQG(design=LINEAR).gains.filter, Hypotheses((0.05, 0.5), (0.3,))
     bank = filter_bank(single, hypotheses, 1)
     state, evidence, row = bank.at_rest(1), np.zeros(2), single.plant.H[0]
     random = np.random.default_rng(3)
@@ -199,29 +205,25 @@ def test_the_bank_weighs_its_filters_by_bayes_rule():
 
 
 def test_the_bank_tells_weak_fluctuations_from_strong_ones():
-    """Under the LQR's moves: the predictive part costs time and decides nothing here."""
+    """Under the moves of the LQG with such a bank."""
     hypotheses = Hypotheses((0.05, 0.5), (0.3,))
-
-    class BankLQG(EkfMpc):
-        def optimal_inputs(self, estimate, plan, previous):
-            return optimal_inputs(estimate, plan, previous, self.lqg.gains.regulator, SHARE, self.v_0)
 
     for which, sd in enumerate(hypotheses.fast_sd):
         scenario = replace(RANDOMIZED, name="known", interface=replace(RANDOMIZED.interface, sd=(sd, sd)))
-        watched = Watched(BankLQG(hypotheses=hypotheses))
+        watched = Watched(LQG(hypotheses=hypotheses))
         rollout(watched, make_config(scenario, horizon=1.0 * HOUR), range(1_000_000, 1_000_004))
-        assert (watched.states[-1].filter.probability[:, which] > 0.9).mean() >= 0.75
+        assert (watched.states[-1].memory.filter.probability[:, which] > 0.9).mean() >= 0.75
 
 
 def test_estimates_beyond_the_equations_fall_back_on_the_law():
-    mpc = EkfMpc(LQG(LQGSettings()))
+    mpc = EkfMpc()
     estimate, plan, previous = situation()
     estimate[0, 1] = 20.0 * MM
-    inputs = mpc.optimal_inputs(estimate, plan, previous)
-    law = optimal_inputs(estimate, plan, previous, mpc.lqg.gains.regulator, SHARE, mpc.lqg.parameters.v_0)
+    inputs = mpc.law(estimate, plan, previous)
+    law = optimal_inputs(estimate, plan, previous, mpc.gains.regulator, SHARE, mpc.parameters.v_0)
     assert np.isfinite(inputs).all()
     assert inputs[0] == pytest.approx(law[0])
-    alone = mpc.optimal_inputs(estimate[:1], plan[:1], previous[:1])
+    alone = mpc.law(estimate[:1], plan[:1], previous[:1])
     assert alone[0] == pytest.approx(law[0])
 
 

@@ -1,1 +1,0 @@
-"""Nonlinear model-predictive control with CasADi."""

@@ -1,0 +1,272 @@
+"""The goals of all searches: parameters, ranges, prices and rules of each controller."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from cz_gym.baselines.analysis.frequency import crossover, sensitivity
+from cz_gym.baselines.analysis.linear_form import linear_form
+from cz_gym.baselines.lqg.controller import LQG, LQGDesign
+from cz_gym.baselines.lqg.designs import ACTIVITIES, SEARCHED, SHIPPED, design_of, family_name, ring_of
+from cz_gym.baselines.pid.compensated_pid import Compensator, SeriesPID
+from cz_gym.baselines.pid.filtered_pid import FilteredPID
+from cz_gym.baselines.pid.industrial import Industrial
+from cz_gym.baselines.pid.settings import settings_of
+from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
+from cz_gym.baselines.tuned_for import beyond
+from cz_gym.config import Config
+from cz_gym.cost import Weights
+from cz_gym.episodes.scenario import Scenario
+from cz_gym.episodes.scenarios import PULLER, RANDOMIZED, find_scenario
+from cz_gym.errors import CzError
+from cz_gym.names import unknown
+from cz_gym.physics.linearisation import radius_model
+from cz_gym.physics.plant import Puller, make_puller
+from cz_gym.units import HOUR, MINUTE, MM
+
+from .optimisers import cobyla, explore_and_refine
+from .search import Figures, Goal, Parameter, Search, Trial
+
+
+@dataclass(frozen=True)
+class PIDGoal(Goal):
+    """Least observable RMSE plus priced pull steps, failures and broken rules [mm]."""
+
+    failure_price: ClassVar[float] = 5.0
+    step_price: ClassVar[float] = 0.2
+    """Price of the pull step RMS [mm per mm/min]."""
+    excess_price: ClassVar[float] = 20.0
+    """Price of its excess over ``allowed_step`` [mm per mm/min]."""
+    rule_price: ClassVar[float] = 2.0
+    """Price of broken rules [mm]."""
+
+    allowed_step: float = np.inf
+    """Pull step RMS without extra price [mm/min]."""
+    rules: tuple[Callable[[Any], float], ...] = ()
+    """Functions of the controller that return its relative breach of a rule; 0 if it keeps the rule."""
+
+    def policy(self, settings: Any, config: Config) -> Any:
+        """The controller, which is its own settings, for an environment."""
+        return settings.for_config(config)
+
+    def cost(self, found: Figures, policy: Any) -> float:
+        """The priced sum [mm]."""
+        excess = max(0.0, found.pull_step - self.allowed_step)
+        return (
+            found.rmse_mm
+            + self.step_price * found.pull_step
+            + self.excess_price * excess
+            + self.failure_price * found.failure_rate
+            + self.rule_price * sum(rule(policy) for rule in self.rules)
+        )
+
+    def propose(self, search: Search) -> None:
+        """Explore, then refine."""
+        explore_and_refine(search)
+
+
+# A gain above 2 kW/K would improve the radius, and pass the pyrometer's noise to the heater.
+HEATER = (
+    Parameter("heater.K", 300.0, 2000.0),
+    Parameter("heater.T_i", 60.0, 0.5 * HOUR),
+    Parameter("heater.share", 0.0, 1.0, log=False),
+    Parameter("heater.K_pull", 1.0, 100.0),
+    Parameter("heater.T_pull", 3.0 * MINUTE, 3.0 * HOUR),
+    Parameter("heater.T_mean", 10.0, 0.5 * HOUR),
+)
+LOOP = (
+    Parameter("pid.K_p", 3e-4, 5e-2),
+    Parameter("pid.T_i", 300.0, 3.0 * HOUR),
+    Parameter("pid.T_d", 30.0, 2000.0),
+    Parameter("pid.N", 2.0, 100.0),
+    Parameter("T_f", 2.0, 200.0),
+    Parameter("T_start", 5.0, 0.5 * HOUR),
+    Parameter("ring_lead", -MINUTE, MINUTE, log=False),
+    Parameter("K_ff", 0.0, 1.3, log=False),
+    *HEATER,
+)
+COMPENSATOR = (
+    Parameter("compensator.gain", -1.0, -0.1, log=False),
+    Parameter("compensator.fast", 2e-4, 1e-2),
+    Parameter("compensator.slow", 5e-5, 5e-2),
+)
+ROBUST = (Parameter("T_track", 10.0, HOUR), Parameter("jump", 0.05 * MM, 2.0 * MM))
+"""Parameters for limited drives and faulty cameras."""
+SENSITIVITY = 2.7
+"""Limit of the sensitivity peak of a tuned loop, that of the printed controller [-]."""
+SENSITIVITY_PRICE = 0.02
+"""Weight of the sensitivity peak's excess in comparison with other rules [-]."""
+
+
+def models_of(policy: FilteredPID) -> tuple[Puller, Puller]:
+    """Models I and II of the puller that the controller was made for."""
+    return make_puller(policy.parameters, 1.0, policy.meniscus), make_puller(policy.parameters, 0.0, policy.meniscus)
+
+
+def too_sensitive(policy: FilteredPID) -> float:
+    """Excess of the sensitivity peak over SENSITIVITY on the worse of Models I and II: relative, priced [-]."""
+    free, dt = linear_form(policy).free, policy.control_interval
+    return SENSITIVITY_PRICE * max(0.0, *(sensitivity(free, p, dt) / SENSITIVITY - 1.0 for p in models_of(policy)))
+
+
+def over_half_the_zero(policy: FilteredPID) -> float:
+    """Relative excess of the crossover over half the zero on Models I and II [-], the paper's rule without compensator.
+
+    The loop is sampled.
+    """
+    free, dt = linear_form(policy).free, policy.control_interval
+    zeros = ((p, radius_model(p, policy.meniscus).zero) for p in models_of(policy))
+    return max(0.0, *(crossover(free, p, dt) / (0.5 * zero) - 1.0 for p, zero in zeros))
+
+
+_ALLOWED_STEP = 0.029
+_TUNED = FilteredPID(
+    pid=SeriesPID(K_p=0.028, T_i=1700.0, T_d=440.0, N=12.0),
+    compensator=Compensator(gain=-0.6, fast=1.8e-3, slow=5.3e-3),
+    T_f=78.0,
+    T_start=190.0,
+    T_track=300.0,
+    ring_lead=18.0,
+    K_ff=1.0,
+    heater=TemperatureLoop(K=510.0, T_i=200.0, share=0.52, K_pull=5.8, T_pull=440.0, T_mean=43.0),
+)
+_CONVENTIONAL = FilteredPID(
+    pid=SeriesPID(K_p=1.6e-3, T_i=400.0, T_d=1066.0, N=25.0),
+    compensator=None,
+    T_f=9.8,
+    T_start=600.0,
+    T_track=300.0,
+    ring_lead=5.0,
+    K_ff=0.13,
+    heater=TemperatureLoop(K=2000.0, T_i=300.0, share=0.32, K_pull=8.0, T_pull=1000.0, T_mean=380.0),
+)
+_INDUSTRIAL = Industrial(heater=TemperatureLoop(K_pull=3.0))
+_HARD = ("hard",)
+PIDS = {
+    "paper-tuned": PIDGoal(_TUNED, (*LOOP, *COMPENSATOR), _HARD, _ALLOWED_STEP, (too_sensitive,)),
+    "paper-filtered": PIDGoal(FilteredPID(), (Parameter("T_f", 2.0, 200.0),), _HARD),
+    "pid-conventional": PIDGoal(_CONVENTIONAL, LOOP, _HARD, _ALLOWED_STEP, (over_half_the_zero, too_sensitive)),
+    "industrial": PIDGoal(_INDUSTRIAL, (Parameter("T_f", 1.0, MINUTE), *HEATER), _HARD),
+}
+"""Goals of the PIDs on ``randomized``."""
+
+
+def _pid_goal(name: str, scenario: Scenario) -> PIDGoal:
+    """The goal of a PID; on other scenarios than ``randomized`` its search begins with the settings for that one."""
+    goal = PIDS[name]
+    if scenario == RANDOMIZED:
+        return goal
+    more = ROBUST if beyond(scenario, RANDOMIZED) and isinstance(goal.start, FilteredPID) else ()
+    return replace(goal, start=settings_of(name, RANDOMIZED), parameters=(*goal.parameters, *more), survive=())
+
+
+@dataclass(frozen=True)
+class LQGGoal(Goal):
+    """Most return, or least radius error, within limits of radius error and pull steps; of order ten."""
+
+    failure_price: ClassVar[float] = 100.0
+    miss_price: ClassVar[float] = 20.0
+    """Price of the relative excess over a limit."""
+    emphasis: ClassVar[float] = 10.0
+    """Weight of the return of a step, or of the relative radius error."""
+    heater_factors: ClassVar[tuple[float, ...]] = (1.0, 3.0, 10.0)
+    """Factors on the weight of heater steps, tried with every finalist: the search hardly sees this weight."""
+
+    rmse_mm: float
+    """Limit of the observable radius error [mm]."""
+    pull_step: float
+    """Limit of the pull step RMS [mm/min]."""
+    by_return: bool
+    """Whether the mean return is maximised, or the radius error minimised."""
+
+    def policy(self, settings: LQGDesign, config: Config) -> LQG:
+        """The LQG of a design for an environment."""
+        return LQG(design=settings).for_config(config)
+
+    def objective(self, found: Figures) -> float:
+        """What is minimised within the limits, failures included."""
+        cost = -found.mean_return / found.steps if self.by_return else found.rmse_mm / self.rmse_mm
+        return self.emphasis * cost + self.failure_price * found.failure_rate
+
+    def slack(self, found: Figures) -> tuple[float, float]:
+        """Relative distances to the limits, negative beyond them."""
+        return 1.0 - found.rmse_mm / self.rmse_mm, 1.0 - found.pull_step / self.pull_step
+
+    def cost(self, found: Figures, policy: Any) -> float:
+        """The objective plus the price of missed limits."""
+        return self.objective(found) + self.miss_price * sum(max(0.0, -slack) for slack in self.slack(found))
+
+    def propose(self, search: Search) -> None:
+        """COBYLA from the goal's start."""
+        cobyla(search, self.objective, self.slack)
+
+    def finalists(self, best: list[Trial]) -> list[tuple[float, ...]]:
+        """The best candidates, each also with heavier weights on heater steps."""
+        at = [p.path for p in self.parameters].index("weights.heater_step")
+        return [
+            (*values[:at], factor * values[at], *values[at + 1 :])
+            for values in (trial.values for trial in best)
+            for factor in self.heater_factors
+        ]
+
+
+LQG_PARAMETERS = tuple(Parameter(path, 1e-4, 1e4) for path in SEARCHED)
+FAMILY_SCENARIOS = "randomized", "hard", "sensor-fault", "puller"
+"""Scenarios on which the family has members of its own."""
+_QUIET_STEP = 0.0095
+
+
+def _lqg_goals() -> dict[tuple[str, str], LQGGoal]:
+    """The goals by controller and scenario."""
+    reward, quiet = design_of("lqg", RANDOMIZED), design_of("lqg-quiet", RANDOMIZED)
+
+    def goal(start: LQGDesign, survive: tuple[str, ...], *limits: Any) -> LQGGoal:
+        return LQGGoal(start, LQG_PARAMETERS, survive, *limits)
+
+    def on_puller(design: LQGDesign) -> LQGDesign:
+        """The design with that camera and a drifting pyrometer."""
+        return replace(design, noise=replace(design.noise, heater_walk=1.0), ring=ring_of(PULLER.sensor))
+
+    def member(activity: float, scenario: str) -> LQGGoal:
+        """A member of the family: begin with a shipped LQG, its weight on pull steps by a rule of thumb."""
+        like_quiet = scenario != "puller" or activity < _QUIET_STEP
+        name, step = ("lqg-quiet", _QUIET_STEP) if like_quiet else ("lqg", 0.016)
+        base = design_of(name, find_scenario(scenario))
+        pull_step = base.weights.pull_step * (step / activity) ** 4
+        start = replace(base, weights=base.weights._replace(pull_step=pull_step))
+        return goal(start, (scenario,), 0.3, activity, False)
+
+    start = LQGDesign(weights=Weights(pull=0.12, pull_step=0.06, heater_step=0.08))
+    quiet_start = LQGDesign(weights=Weights(pull=0.1, pull_step=0.2, heater_step=0.1))
+    harder = ("hard", "puller")
+    return {
+        ("lqg", "randomized"): goal(start, harder, 0.062, 0.02, True),
+        ("lqg-quiet", "randomized"): goal(quiet_start, harder, 0.075, _QUIET_STEP, False),
+        ("lqg", "puller"): goal(on_puller(reward), ("puller",), 0.09, 0.016, True),
+        ("lqg-quiet", "puller"): goal(on_puller(quiet), ("puller",), 0.1, 0.01, False),
+        ("lqg", "sensor-fault"): goal(reward, ("sensor-fault",), 0.063, 0.02, True),
+        ("lqg-quiet", "sensor-fault"): goal(quiet, ("sensor-fault",), 0.076, _QUIET_STEP, False),
+        **{(family_name(each), name): member(each, name) for name in FAMILY_SCENARIOS for each in ACTIVITIES},
+    }
+
+
+LQGS = _lqg_goals()
+"""Goals of the LQGs, by controller and scenario."""
+TUNABLE = (*PIDS, *SHIPPED)
+"""Names of the controllers that can be tuned."""
+
+
+def goal_of(name: str, scenario: Scenario) -> Goal:
+    """The goal of a controller's search on a scenario; CzError if there is none."""
+    if name in PIDS:
+        return _pid_goal(name, scenario)
+    if (name, scenario.name) in LQGS:
+        return LQGS[name, scenario.name]
+    if name not in SHIPPED:
+        raise CzError(unknown("controller to tune", name, TUNABLE))
+    known = ", ".join(where for each, where in LQGS if each == name)
+    raise CzError(f"{name} has no goal on {scenario.name!r}, but on {known}")

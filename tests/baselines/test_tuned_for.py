@@ -1,0 +1,61 @@
+"""Settings follow what a scenario contains, whatever its name is."""
+
+from dataclasses import replace
+
+import pytest
+
+from cz_gym.baselines.lqg.designs import SHIPPED as LQG_SHIPPED
+from cz_gym.baselines.lqg.designs import design_of, ring_of
+from cz_gym.baselines.lqg.ring_model import RingModel
+from cz_gym.baselines.pid.settings import SHIPPED, settings_of
+from cz_gym.baselines.registry import make_controller
+from cz_gym.baselines.tuned_for import TUNED
+from cz_gym.config import make_config
+from cz_gym.episodes.scenario import Sensor
+from cz_gym.episodes.scenarios import HARD, PULLER, RANDOMIZED, SCENARIOS, SENSOR_FAULT
+from cz_gym.units import MINUTE, MM
+
+NAMES = [scenario.name for scenario in TUNED]
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)
+def test_named_scenarios_have_their_own_settings_or_those_of_randomized(scenario):
+    for name, shipped in LQG_SHIPPED.items():
+        own = scenario.name if scenario.name in shipped else "randomized"
+        weights = design_of(name, scenario).weights
+        assert (weights.pull, weights.pull_step, weights.heater_step) == shipped[own][:3]
+    for name in ("paper-tuned", "industrial"):
+        assert settings_of(name, scenario) == SHIPPED.get((name, scenario.name), SHIPPED[name, "randomized"])
+
+
+@pytest.mark.parametrize("scenario", ["randomized", "hard", "nominal", "paper-ramp", "reference-a", "only-sensor"])
+def test_designs_are_those_that_were_published(scenario):
+    assert design_of("lqg", SCENARIOS[scenario]).hash == "769324959cc3ed6e"
+    assert design_of("lqg-quiet", SCENARIOS[scenario]).hash == "f4a3e50fb1dcf8af"
+
+
+@pytest.mark.parametrize("scenario", [RANDOMIZED, HARD, SENSOR_FAULT, PULLER], ids=NAMES)
+def test_another_name_changes_nothing(scenario):
+    other = replace(scenario, name="mine", drift=replace(scenario.drift, amount=(-1.0, 1.0)))
+    for name in ("lqg", "lqg-at-0.02", "paper-tuned", "industrial"):
+        made, expected = (make_controller(name, make_config(each)) for each in (other, scenario))
+        assert made == expected
+
+
+def test_the_model_of_the_camera_follows_the_scenario():
+    assert ring_of(RANDOMIZED.sensor) is None
+    assert ring_of(PULLER.sensor) == RingModel(5.0, 0.08 * MM, rotation=(8.0 / MINUTE, 15.0 / MINUTE))
+    slow = replace(PULLER, name="slow", sensor=replace(PULLER.sensor, latency=2.0, ripple=(0.0, 0.1 * MM)))
+    assert design_of("lqg", slow).ring == RingModel(2.0, 0.04 * MM, rotation=(8.0 / MINUTE, 15.0 / MINUTE))
+    assert ring_of(Sensor(latency=3.0)) == RingModel(3.0, 0.0, rotation=Sensor().rotation)
+
+
+def test_what_no_settings_were_tuned_for_is_said():
+    scenario = replace(PULLER, name="both", faults=SENSOR_FAULT.faults)
+    for name in ("lqg", "paper-tuned"):
+        with pytest.warns(UserWarning, match=rf"{name} was not tuned for faults\.flagged, .* of scenario 'both'"):
+            made = make_controller(name, make_config(scenario))
+        assert made == make_controller(name, make_config("puller"))
+    late = replace(PULLER, name="late", sensor=replace(PULLER.sensor, latency=20.0))
+    with pytest.warns(UserWarning, match=r"tuned for sensor\.latency of scenario 'late': it has .* for 'puller'"):
+        assert design_of("lqg", late).ring.latency == 20.0
