@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import pkgutil
+import re
 import sys
 import warnings
 from collections.abc import Callable
@@ -41,14 +42,20 @@ ALGORITHMS = {
     "tqc": "sb3_contrib.TQC",
     "trpo": "sb3_contrib.TRPO",
 }
-"""RL-Zoo's names and what they stand for."""
+"""Algorithms by RL-Zoo's names."""
 VALID = "valid"
-"""The camera's flag among the channels."""
+"""Name of the camera's flag among the channels."""
 GIVE_IT = "give the VecNormalize it was trained in (save_agent's normalisation, --vecnormalize of the command)"
 SAMPLES, SLOTS = 50, 8
-"""Samples of as many pullers on which file and model must agree."""
+"""Samples, each of SLOTS crystals, on which file and model must agree."""
 TOLERANCE = 1e-3
-"""Most that they may differ [action units]."""
+"""Largest difference between their actions [action units]."""
+HARMLESS = (
+    "Monitor", "TimeLimit", "OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatistics", "RecordVideo",
+    "HumanRendering", "NormalizeReward", "TransformReward", "ClipReward", "VecMonitor", "VecNormalize", "VecCheckNan",
+    "VecVideoRecorder", "TrainingReward",
+)  # fmt: skip
+"""Wrappers that leave observations and actions as they are; what VecNormalize does is in the agent file."""
 
 
 def save_agent(
@@ -59,12 +66,12 @@ def save_agent(
     config: Config | None = None,
     seed: int | None = None,
 ) -> Contract:
-    """Write a trained model as an agent file called ``name``; its contract, with its figures on validation crystals.
+    """Write a trained model as an agent file called ``name``; returns its contract, with its validation figures.
 
-    ``normalisation`` is what its observations went through, ``config`` the settings of the environment it was trained
-    in, ``seed`` its training seed: by default the model's own. Raises AgentFileError for a model that cannot be
-    written, among them any whose file does not act as it does, and one that was trained on normalised observations
-    while no ``normalisation`` is given; warns of a model that does not know how it was trained.
+    By default ``normalisation``, ``config`` (the settings of its training environment) and training ``seed`` are the
+    model's own. Raises AgentFileError for a model that cannot be written: among others where the file would not act as
+    the model does, where a wrapper may change observations or actions, where the normalisation is missing, and where
+    its environments differ. Warns of a model that does not know how it was trained.
     """
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.vec_env import VecNormalize
@@ -77,7 +84,8 @@ def save_agent(
         needs(VecNormalize, normalisation, "VecNormalize.load(file, env) reads one")
     if config is not None:
         check_config(config)
-    normalisation, config = normalisation or model.get_vec_normalize_env(), config or _config_of(model)
+    normalisation, config = normalisation or model.get_vec_normalize_env(), _config_of(model, config)
+    _check_wrappers(model)
     _check_spaces(model, config)
     _check_normalisation(model, normalisation, config.observation)
     content = to_onnx(model, normalisation, config.observation)
@@ -102,7 +110,7 @@ def save_agent(
 
 
 def to_onnx(model: BaseAlgorithm, normalisation: VecNormalize | None, observation: str) -> bytes:
-    """The model's deterministic action as a serialised ONNX model; AgentFileError if it cannot be written as one."""
+    """The model's deterministic actor, a serialised ONNX model; AgentFileError if it cannot be written as one."""
     from stable_baselines3.common.torch_layers import FlattenExtractor
 
     from cz_gym.agents.training.export import OnnxGraph, actor_of
@@ -145,15 +153,54 @@ def disagreement(
     return apart
 
 
-def _config_of(model: BaseAlgorithm) -> Config:
-    """The settings of the environment that a model is in."""
+def _config_of(model: BaseAlgorithm, given: Config | None = None) -> Config:
+    """The settings of the environments that a model is in, or those given; AgentFileError if these do not agree."""
     try:
-        (config, *_) = model.get_env().get_attr("config")  # type: ignore[union-attr]  # there may be none: said below
+        configs: list[Config] = model.get_env().get_attr("config")  # type: ignore[union-attr]  # None: said below
     except AttributeError:
-        raise AgentFileError("the model is in no environment of Cz-v0: say in which it was trained (config)") from None
-    if not isinstance(config, Config):
-        raise AgentFileError(f"the model's environment is not Cz-v0's: its config is {config!r:.80}")
+        if given is None:
+            raise AgentFileError(
+                "the model is in no environment of Cz-v0: say in which it was trained (config)"
+            ) from None
+        return given
+    config = given or configs[0]
+    for each in configs:
+        if not isinstance(each, Config):
+            raise AgentFileError(f"the model's environment is not Cz-v0's: its config is {each!r:.80}")
+        if (each.observation, each.made_for) != (config.observation, config.made_for):
+            raise AgentFileError(
+                f"the model's environments differ, or differ from the given config: {each.observation}, "
+                f"{each.made_for} and {config.observation}, {config.made_for}; an agent is made for one of them"
+            )
+        if given is None and each.scenario != config.scenario:
+            raise AgentFileError(
+                f"the model's environments have several scenarios, {config.scenario.name!r} and "
+                f"{each.scenario.name!r}: say by config which one the agent file shall name"
+            )
     return config
+
+
+def _check_wrappers(model: BaseAlgorithm) -> None:
+    """AgentFileError if a wrapper may change observations or actions, which the agent file would leave out."""
+    from stable_baselines3.common.vec_env import VecEnvWrapper
+
+    from cz_gym.agents.training.vec_env import CzVecEnv
+
+    env, names = model.get_env(), list[str]()
+    while isinstance(env, VecEnvWrapper):
+        names.append(type(env).__name__)
+        env = env.venv
+    if env is not None and not isinstance(env, CzVecEnv):
+        for chain in set(env.env_method("__str__")):  # as "<TimeLimit<OrderEnforcing<CzEnv<Cz-v0>>>>"
+            wrappers, inner, _ = chain.partition(f"<{CzEnv.__name__}")
+            names += re.findall(r"\w+", wrappers if inner else chain)
+    for name in names:
+        if name not in HARMLESS:
+            raise AgentFileError(
+                f"the model is wrapped in {name}, which may change observations or actions; the agent file would act "
+                f"without it. If it changes neither, model.set_env(an environment without it) first. "
+                f"Known to be harmless: {', '.join(HARMLESS)}"
+            )
 
 
 def _check_spaces(model: BaseAlgorithm, config: Config) -> None:
@@ -168,10 +215,10 @@ def _check_spaces(model: BaseAlgorithm, config: Config) -> None:
 
 
 def _check_normalisation(model: BaseAlgorithm, normalisation: VecNormalize | None, observation: str) -> None:
-    """AgentFileError if the model was trained on normalised observations and nothing is here to normalise them.
+    """AgentFileError if the model was trained on normalised observations, and their normalisation is missing.
 
-    Its file keeps what it saw last, where the camera's flag is 0 or 1, and nothing else once it is normalised. Loaded
-    into an environment it has lost that, but not what came before a VecNormalize.
+    A saved model keeps its last observation: there the camera's flag is 0 or 1 unless it is normalised. A model that is
+    loaded into an environment has lost that, but keeps the last original observation before a VecNormalize.
     """
     if normalisation is not None:
         return
@@ -224,7 +271,7 @@ def _convert(given: argparse.Namespace) -> None:
 
 
 def _read(path: Path, what: str, load: Callable[[], Any]) -> Any:
-    """What a file of stable-baselines3 holds; AgentFileError in one line, whatever its many ways to be broken raise."""
+    """The content of a file of stable-baselines3; AgentFileError whatever a broken file makes it raise."""
     if not path.is_file():
         raise AgentFileError(f"{path}: no such file")
     try:

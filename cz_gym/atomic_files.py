@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from cz_gym.errors import CzError
@@ -61,13 +61,13 @@ def write_files(files: Mapping[Path, bytes]) -> None:
 
 @contextmanager
 def locked(folder: Path, patience: float = 0.0) -> Iterator[None]:
-    """Context in which this process alone uses a folder, made if need be.
+    """Context in which this process alone uses a folder, made if need be, and removed if it stays empty.
 
     Raises CzError if another process uses it for longer than ``patience`` [s].
     """
     from filelock import FileLock, Timeout
 
-    lock = FileLock(folder / LOCK, timeout=patience)
+    lock, made = FileLock(folder / LOCK, timeout=patience), _missing(folder)
     with naming(folder):
         folder.mkdir(parents=True, exist_ok=True)
         try:
@@ -80,6 +80,14 @@ def locked(folder: Path, patience: float = 0.0) -> Iterator[None]:
         if os.name == "posix":  # whoever waits for the lock sees that its file is gone, and makes a new one
             (folder / LOCK).unlink(missing_ok=True)
         lock.release()
+        with suppress(OSError):  # not empty
+            for each in made:
+                each.rmdir()
+
+
+def _missing(folder: Path) -> list[Path]:
+    """Those of a folder and its parents that do not exist, innermost first."""
+    return [each for each in (folder, *folder.parents) if not each.exists()]
 
 
 def check_writable(path: Path) -> None:

@@ -9,7 +9,6 @@ from cz_gym.agents.training import fleet, run
 from cz_gym.agents.training.learners import make_learner
 from cz_gym.agents.training.recipes import PPO, SAC, Imitation, Recipe
 from cz_gym.atomic_files import locked
-from cz_gym.baselines.registry import make_controller
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
 SMALL = PPO(num_envs=4, hidden=(16, 16), steps=64, n_steps=16, batch_size=32, n_epochs=1)
@@ -80,7 +79,7 @@ def tell_and_wait(task: Any) -> None:
 
 
 def made(recipe: Recipe, seed: int = 0, done: int = 0) -> Any:
-    return make_learner(recipe, seed, make_controller, done=done)
+    return make_learner(recipe, seed, done=done)
 
 
 def trained(recipe: Recipe, seed: int = 0) -> Any:

@@ -122,8 +122,9 @@ def read_agent(path: Path) -> tuple[Contract, bytes]:
 def read_bounded(path: Path, limit: int) -> bytes:
     """The contents of a regular file of at most ``limit`` bytes; AgentFileError for others, pipes and devices too."""
     try:
-        # Without O_NONBLOCK, opening a pipe would wait for somebody to write into it.
-        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
+        # O_NONBLOCK: opening a pipe would wait for a writer. O_BINARY: Windows would end the file at a Ctrl-Z.
+        flags = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+        with open(os.open(path, os.O_RDONLY | flags), "rb") as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
                 raise AgentFileError(f"{path}: not a regular file")
             content = file.read(limit + 1)
@@ -132,7 +133,7 @@ def read_bounded(path: Path, limit: int) -> bytes:
     except OSError as error:
         raise AgentFileError(f"{path}: cannot be read ({error.strerror})") from None
     except ValueError as error:
-        # AgentFileError is one; the other is a name that no file can have.
+        # AgentFileError is a ValueError; the other one is of a name that no file can have.
         raise error if isinstance(error, AgentFileError) else AgentFileError(f"{path!r}: {error}") from None
     if len(content) > limit:
         raise AgentFileError(f"{path}: larger than {limit} bytes")
@@ -174,8 +175,8 @@ def _check(given: Mapping[str, Any], where: Path | str) -> None:
 def _wrong(kind: str, value: Any) -> str | None:
     """What a value of this kind must be, if this one is not."""
     if kind == "str":
-        plain = isinstance(value, str) and 0 < len(value) <= MAX_TEXT and value.isprintable()
-        return None if plain else f"printable text of 1 to {MAX_TEXT} characters"
+        plain = isinstance(value, str) and 0 < len(value) <= MAX_TEXT and value.isprintable() and "|" not in value
+        return None if plain else f"printable text of 1 to {MAX_TEXT} characters without |"  # it stands in tables
     if isinstance(value, bool) or not isinstance(value, int if kind == "int" else (int, float)):
         return kind
     if isinstance(value, int):

@@ -1,4 +1,4 @@
-"""Callbacks of stable-baselines3: observation statistics, and the progress of learning."""
+"""A callback of stable-baselines3 that keeps the statistics which observations are normalised with."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from cz_gym.observation import HISTORY, PULL_SCALE, scales, undo_differences
 
-from .learner import Watch
 from .networks import Normalise
 
 STD_FLOOR = 0.02
-"""Least standard deviation an observation is divided by."""
+"""Least standard deviation that an observation is divided by."""
 RECENT = 400
-"""An off-policy learner's statistics are those of its last so many steps; they are taken anew twice as often."""
+"""Window of an off-policy learner's statistics [steps of all slots], refreshed every half window."""
 
 
 class Statistics(BaseCallback):
-    """Sets the network's normalisation from what it sees: freely at first, then slowly, then never again.
+    """Sets the network's normalisation from the observations: freely at first, then slowly, after ``until`` no more.
 
-    Works for on-policy learners at the end of each rollout, for off-policy ones from when learning starts.
+    Works for on-policy learners at the end of each rollout, for off-policy ones from when learning starts. ``known``:
+    a resumed learner has statistics already.
     """
 
     def __init__(self, until: int, basis: str = "differences", known: bool = False) -> None:
@@ -33,7 +33,7 @@ class Statistics(BaseCallback):
 
     def _on_training_start(self) -> None:
         if not any(bool(module.mean.any()) for module in self._normalisations()):
-            self.rounds = 0  # also of a run that was cut short before it knew any
+            self.rounds = 0  # a resumed run may have ended before its first statistics
 
     def _normalisations(self) -> list[Normalise]:
         return [module for module in self.model.policy.modules() if isinstance(module, Normalise)]
@@ -66,15 +66,3 @@ class Statistics(BaseCallback):
             mean = mean + share * (seen.mean(axis=0) - mean)
             var = var + share * ((seen @ basis).var(axis=0) - var)
             module.set(mean, basis / np.maximum(np.sqrt(var), STD_FLOOR))
-
-
-class Watching(BaseCallback):
-    """Reports after every step of all slots how many environment steps have been taken."""
-
-    def __init__(self, watch: Watch) -> None:
-        super().__init__()
-        self.watch = watch
-
-    def _on_step(self) -> bool:
-        self.watch(self.num_timesteps, "")
-        return True

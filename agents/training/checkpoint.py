@@ -1,9 +1,9 @@
-"""Checkpoints: tensors and numbers in one safetensors file, which holds nothing that could be executed.
+"""Checkpoints: learner, best agent and progress in one safetensors file, which holds nothing that could be executed.
 
 A checkpoint fits only the learner it was made from: every tensor must have the name, shape and type of one that is
 there, so no file can ask for more memory than it has bytes. Hyperparameters are not in it; they are the run's settings.
-The files that belong to it (the best agent, the progress) are in it too, as bytes: one file is replaced at one moment,
-and a resumed run writes the others anew.
+The run's other files (best agent, progress) are in it too, as bytes: one file is replaced at one moment, and a resumed
+run writes the others again.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ FORMAT = "cz-gym-checkpoint-4"
 MAX_BYTES = 64_000_000
 """Largest checkpoint that is read."""
 MAX_HEADER = 1_000_000
-"""Largest list of its tensors [bytes]."""
+"""Largest header of a checkpoint, the list of its tensors [bytes]."""
 FILES = ("agent.onnx", "agent.json", "progress.csv", "progress.png", "summary.json")
 """Files of a run that its checkpoint may hold."""
 IN_FILE = "file/"
-"""Beginning of a file's name among the tensors."""
+"""Prefix of a file's name among the tensors."""
 COUNTS = ("step", "exp_avg_sq")
-"""What Adam remembers of a parameter and is never negative."""
+"""Adam's tensors that are never negative."""
 
 Tensors = dict[str, torch.Tensor]
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a training run stands."""
+    """The state of a training run beside its learner."""
 
     steps: int
     """Environment steps taken."""
@@ -53,9 +53,9 @@ class Progress:
 def to_bytes(
     learner: Learner, seconds: float, best_cost: float | None, files: Mapping[str, bytes] | None = None
 ) -> bytes:
-    """The checkpoint of a learner, of a replay buffer the latest transitions, and the run's ``files`` by name.
+    """The checkpoint of a learner, with the latest transitions of a replay buffer, and the run's ``files`` by name.
 
-    AgentFileError if it learned numbers that are not finite: no run could go on from them.
+    AgentFileError if it learned numbers that are not finite: no run could continue from them.
     """
     parts, progress = learner.parts(), Progress(int(learner.steps), seconds, best_cost)
     # Modules that share a tensor each get their copy: the format knows no sharing.
@@ -120,16 +120,19 @@ def restore(learner: Learner, tensors: Tensors, path: Path) -> None:
 
 def _tensors(parts: Parts) -> Tensors:
     """Every tensor that training changes, by name."""
-    found = {f"{name}/{key}": value for name, part in parts.modules.items() for key, value in part.state_dict().items()}
-    found |= {f"{name}/": variable for name, variable in parts.variables.items()}
+    tensors = {
+        f"{name}/{key}": value for name, part in parts.modules.items() for key, value in part.state_dict().items()
+    }
+    tensors |= {f"{name}/": variable for name, variable in parts.variables.items()}
     for name, optimiser in parts.optimisers.items():
-        every = [parameter for group in optimiser.param_groups for parameter in group["params"]]
-        for index, parameter in enumerate(every):
-            # As Adam itself begins a parameter at its first update.
-            begun = {"step": torch.zeros(()), **{key: torch.zeros_like(parameter) for key in ("exp_avg", "exp_avg_sq")}}
-            state = optimiser.state.setdefault(parameter, begun)
-            found |= {f"{name}/{index}/{key}": state[key] for key in begun}
-    return found
+        parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
+        for index, parameter in enumerate(parameters):
+            # As Adam itself initialises a parameter at its first update.
+            initial = {key: torch.zeros_like(parameter) for key in ("exp_avg", "exp_avg_sq")}
+            initial["step"] = torch.zeros(())
+            state = optimiser.state.setdefault(parameter, initial)
+            tensors |= {f"{name}/{index}/{key}": state[key] for key in initial}
+    return tensors
 
 
 def _alike(one: torch.Tensor, other: torch.Tensor) -> bool:

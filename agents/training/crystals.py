@@ -12,15 +12,15 @@ from cz_gym.config import Config
 from cz_gym.differentiable import DifferentiableBatch, Step
 
 MOST_SHARE, ENOUGH = 0.1, 8
-"""What is usual moves by this share towards the mean of so many crystals or more; by less towards that of fewer."""
+"""Smoothing factor of the running mean cost; smaller below ENOUGH crystals."""
 LEAST_COST = 1e-9
-"""Least usual cost that a cost is divided by [-]."""
+"""Least running mean cost that a cost is divided by [-]."""
 RELATIVE = 0.05, 20.0
-"""Range that a crystal's cost relative to the usual one is held within [-]."""
+"""Range that a crystal's cost, relative to the running mean, is clipped to."""
 
 
 class Crystals:
-    """So many slots of each configuration, numbered through; the configurations differ in their scenario alone."""
+    """Slots of several configurations, which differ in their scenario alone, with one numbering."""
 
     def __init__(self, parts: Sequence[tuple[Config, int]]) -> None:
         self.batches = [DifferentiableBatch(config, slots) for config, slots in parts if slots]
@@ -31,12 +31,12 @@ class Crystals:
     def reset(self, seeds: Sequence[int], which: Sequence[int] | None = None) -> npt.NDArray[np.float32]:
         """Draw the episodes of these seeds for the slots ``which``, by default all. Returns "measured"."""
         slots, given = np.arange(self.num_envs) if which is None else np.asarray(which), np.asarray(seeds)
-        of, found = np.searchsorted(self.ends, slots, side="right"), []
+        part, seen = np.searchsorted(self.ends, slots, side="right"), []
         for place, batch in enumerate(self.batches):
-            mine = of == place
+            mine = part == place
             first = self.ends[place] - batch.num_envs
-            found.append(batch.reset(given[mine].tolist(), (slots[mine] - first).tolist())[1])
-        return np.concatenate(found)
+            seen.append(batch.reset(given[mine].tolist(), (slots[mine] - first).tolist())[1])
+        return np.concatenate(seen)
 
     def step(self, actions: npt.NDArray[Any]) -> Step:
         """One control interval of all (:meth:`cz_gym.differentiable.DifferentiableBatch.step`)."""
@@ -55,32 +55,32 @@ class Crystals:
             batch.close()
 
 
-class Evenness:
-    """What a crystal's gradient is multiplied by, so that it counts by the root of its cost and not by its cost.
+class CostNormaliser:
+    """Factors of the crystals' gradients by which each crystal counts by the root of its cost instead of its cost.
 
-    Its cost so far is taken relative to what is usual of its scenario at its age, because every crystal starts with a
-    radius error.
+    A crystal's cost so far is relative to the running mean cost of its scenario at its age, because every crystal
+    starts with a radius error.
     """
 
     def __init__(self, batch: Crystals, windows: int) -> None:
         self._windows = windows
         self._scenario = np.searchsorted(batch.ends, np.arange(batch.num_envs), side="right")
-        self._usual = np.zeros(len(batch.ends) * windows)
+        self._running = np.zeros(len(batch.ends) * windows)
         self._age = np.zeros(batch.num_envs, np.int64)
         self._relative = np.ones(batch.num_envs)
 
     def weights(self, cost: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """Of each crystal, from the mean cost of its present window; both of shape (n,)."""
-        at = self._scenario * self._windows + self._age
-        many = np.bincount(at, minlength=self._usual.size)
-        mean = np.bincount(at, cost, self._usual.size) / np.maximum(many, 1)
-        share = np.where(self._usual == 0.0, 1.0, MOST_SHARE * np.minimum(1.0, many / ENOUGH)) * (many > 0)
-        self._usual += share * (mean - self._usual)
+        """Each crystal's factor, from the mean cost of its present window; both of shape (n,)."""
+        cell = self._scenario * self._windows + self._age
+        crystals = np.bincount(cell, minlength=self._running.size)
+        mean = np.bincount(cell, cost, self._running.size) / np.maximum(crystals, 1)
+        smoothing = np.where(self._running == 0.0, 1.0, MOST_SHARE * np.minimum(1.0, crystals / ENOUGH))
+        self._running += smoothing * (crystals > 0) * (mean - self._running)
         self._age += 1
-        self._relative += (cost / np.maximum(self._usual[at], LEAST_COST) - self._relative) / (self._age + 1)
-        held: npt.NDArray[np.float64] = np.clip(self._relative, *RELATIVE)
-        return 1.0 / np.sqrt(held)
+        self._relative += (cost / np.maximum(self._running[cell], LEAST_COST) - self._relative) / (self._age + 1)
+        clipped: npt.NDArray[np.float64] = np.clip(self._relative, *RELATIVE)
+        return 1.0 / np.sqrt(clipped)
 
     def begin(self, slots: Sequence[int]) -> None:
-        """New crystals grow in these slots."""
+        """Start new crystals in these slots."""
         self._age[slots], self._relative[slots] = 0, 1.0

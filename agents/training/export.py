@@ -17,7 +17,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from cz_gym.observation import DRIVE_CHANNELS, HISTORY
 
-from .networks import NORMALISED_LIMIT, Actor, Beside, Normalise
+from .networks import NORMALISED_LIMIT, Actor, Normalise, SkipConcat
 
 OPSET, IR_VERSION = 17, 9
 ACTIVATIONS: dict[type[torch.nn.Module], tuple[str, dict[str, str]]] = {
@@ -65,18 +65,18 @@ class OnnxGraph:
         parameters = {"weight": weight, "bias": torch.zeros(len(weight)) if bias is None else bias}
         return self.node("Gemm", [x, *(self.constant(f"{name}_{k}", v) for k, v in parameters.items())], name, transB=1)
 
-    def through(self, x: str, modules: Iterable[torch.nn.Module]) -> str:
+    def apply(self, x: str, modules: Iterable[torch.nn.Module]) -> str:
         """x through torch's modules, one after the other; TypeError for one that is not known here."""
         for module in modules:
             name = f"module_{len(self._nodes)}"
             if isinstance(module, torch.nn.Sequential):
-                x = self.through(x, module)
+                x = self.apply(x, module)
             elif isinstance(module, torch.nn.Linear):
                 x = self.linear(x, module.weight, module.bias, name)
             elif isinstance(module, torch.nn.Hardtanh):
                 x = self.clip(x, module.min_val, module.max_val, name)
-            elif isinstance(module, Beside):
-                x = self.node("Concat", [self.through(x, [module.layers]), x], f"{name}_beside", axis=1)
+            elif isinstance(module, SkipConcat):
+                x = self.node("Concat", [self.apply(x, [module.layers]), x], f"{name}_beside", axis=1)
             elif isinstance(module, torch.nn.SiLU):
                 x = self.node("Mul", [x, self.node("Sigmoid", [x], f"{name}_gate")], name)
             elif type(module) in ACTIVATIONS:
@@ -110,7 +110,7 @@ class OnnxGraph:
     def acted(self, x: str, actor: Actor, name: str) -> str:
         """The actor's output, within -1 and 1."""
         x = x if actor.lstm is None else self.lstm_step(x, actor.lstm)
-        return self.clip(self.through(x, actor.layers), -1.0, 1.0, name)
+        return self.clip(self.apply(x, actor.layers), -1.0, 1.0, name)
 
     def clip(self, x: str, low: float, high: float, name: str) -> str:
         """x within [low, high]."""

@@ -27,7 +27,7 @@ from .export import OnnxGraph
 from .networks import NORMALISED_LIMIT, tanh_layers
 from .notch import STATE as NOTCH
 from .notch import cleaned
-from .symbolic import Value, columns, held, joined, parted, rectified, through
+from .symbolic import Value, apply, clamp, columns, concat, relu, split
 
 TIMES = tuple(float(time) for time in np.geomspace(3.0, 3600.0, 8))
 """Time constants of the leaky means [s]."""
@@ -40,41 +40,41 @@ NOISY = ("ring_error", "T_1")
 NOISE_TIME = 600.0
 """Time constant of the estimates [s]."""
 USUAL = 0.01
-"""Standard deviation that the estimates begin with; a variance so large counts half of the largest [scaled units]."""
+"""Initial standard deviation of the estimates; its variance maps to a strength of one half [scaled units]."""
 LARGE = 0.1
 """The same of a second scale of the camera's noise: ripples and outliers [scaled units]."""
 OUTLIER = 9.0
-"""A squared second difference counts at most so many times what is usual of it [-]."""
+"""Limit of a squared second difference, in multiples of its running mean [-]."""
 SWINGS = ((2, 3), (5, 6))
-"""Pairs of the pull speed's means, by their places in :data:`TIMES`, whose differences say how the melt fluctuates."""
+"""Pairs of means of the pull speed (indices into :data:`TIMES`) whose differences measure how the melt fluctuates."""
 SWING_TIME = 1200.0
 """Time constant of the squares of these differences [s]."""
 USUAL_SWINGS = (1e-3, 2e-4)
-"""Squares that count half of the largest [scaled units]."""
+"""Squares that map to a strength of one half [scaled units]."""
 SCHEDULE_LIMIT = 2.0
-"""What schedules the linear map does so up to so many standard deviations from its mean [-]."""
+"""Scheduling variables are clamped to +-SCHEDULE_LIMIT standard deviations [-]."""
 INTEGRAL_TIME = 1000.0
-"""A scaled ring error of one held so long gives an integral of one [s]."""
+"""Time for which a constant scaled ring error of one gives an integral of one [s]."""
 GAINS = (0.2, 0.08)
 """Action for an output of one: pull speed and heater [-]."""
 _AT = {channel.name: place for place, channel in enumerate(MEASURED)}
 _NOISY = [_AT[name] for name in NOISY]
 MEANS = len(SIGNALS) * len(TIMES) + len(BEGUN) + 1
-"""How many means it remembers, the integral with them."""
+"""Number of means, the integral included."""
 CLEANED = 4
-"""The fastest :data:`TIMES` over which what :mod:`.notch` takes from the readings is averaged too."""
+"""Number of the fastest :data:`TIMES` over which the signal that :mod:`.notch` removes is averaged too."""
 _PARTS = [MEANS, *[len(NOISY)] * 3, len(SWINGS), NOTCH, CLEANED]
 STATE = sum(_PARTS)
-"""Numbers that it remembers: means of each signal, fastest first, with the integral of the ring error; of noisy
-channels the last readings, their last differences, and the variances less the usual ones; the squared swings; the notch
-and means of what it takes away."""
+"""Length of its state: means of each signal, fastest first, and the integral of the ring error; the last readings of
+noisy channels, their last differences, and their variances less USUAL**2; the squared swings; the notch's state, and
+means of what the notch removes."""
 _STRENGTHS = 1 + len(NOISY) + 1 + len(SWINGS)
-UNLED = _STRENGTHS + 1 + CLEANED
-"""Features that no action is chosen for: outliers and ripples, and what schedules the linear map."""
+N_DETACHED = _STRENGTHS + 1 + CLEANED
+"""Number of features without gradient: outliers, ripples and scheduling variables."""
 HELD = 2
-"""Place in :data:`TIMES` of the mean that stands in for a reading that failed, where nothing better is learned."""
+"""Index into :data:`TIMES` of the mean that replaces a failed reading, where no regression is learned."""
 REMEMBERED = MEANS + len(MEASURED)
-"""How many means and readings there are."""
+"""Number of means and readings."""
 _BEGUN = len(SIGNALS) * len(TIMES)
 """Place of the first mean of "valid"."""
 _GROWTH = len(SIGNALS) * (len(TIMES) + 1) + 4
@@ -96,7 +96,7 @@ class FilterBank(nn.Module):
     gains: torch.Tensor
     ring: torch.Tensor
     expected: torch.Tensor
-    """What a reading that failed is taken to be, of means and readings, shape (MEANS + 11, 1)."""
+    """Linear estimate of a failed ring reading from means and readings, shape (MEANS + 11, 1)."""
     ones: torch.Tensor
     spread: torch.Tensor
     gather: torch.Tensor
@@ -127,7 +127,7 @@ class FilterBank(nn.Module):
         shares = 1.0 - np.exp(-control_interval / np.array(TIMES[:CLEANED]))
         self._constant("cleaned_keep", 1.0 - shares)
         self._constant("cleaned_gain", shares[None])
-        width = features.shape[1] + UNLED
+        width = features.shape[1] + N_DETACHED
         self.register_buffer("mean", torch.zeros(width))
         self.register_buffer("per_std", torch.ones(width))
         self.layers = tanh_layers([width, *hidden])
@@ -147,11 +147,11 @@ class FilterBank(nn.Module):
 
     def remember(self, measured: Any, state: Any) -> tuple[Any, Any]:
         """Features, shape (n, width), and the next state, from readings (n, 11) and the state (n, STATE)."""
-        means, last, change, excess, squares, notch, taken = parted(state, _PARTS)
-        first = held(columns(means, range(_BEGUN, _BEGUN + 1)) * -1e6 + 1.0, 0.0, 1.0)
+        means, last, change, excess, squares, notch, taken = split(state, _PARTS)
+        first = clamp(columns(means, range(_BEGUN, _BEGUN + 1)) * -1e6 + 1.0, 0.0, 1.0)
         with torch.no_grad():
             ring, valid = (columns(measured, range(_AT[name], _AT[name] + 1)) for name in ("ring_error", "valid"))
-            failed = (joined([means, measured]) @ self.expected - ring) * (valid * -1.0 + 1.0)
+            failed = (concat([means, measured]) @ self.expected - ring) * (valid * -1.0 + 1.0)
         measured = measured + failed @ self.ring
         means = means * self.keep + measured @ self.gain
         with torch.no_grad():
@@ -159,7 +159,7 @@ class FilterBank(nn.Module):
             difference, variance = now - last, excess + USUAL**2
             bend = difference - change
             square = bend * bend * (1.0 / 6.0)
-            used = square - rectified(square - variance * OUTLIER)
+            used = square - relu(square - variance * OUTLIER)
             excess = excess + (used - variance) * valid * self.noise_share
             variance = excess + USUAL**2
             noise = variance / (variance + USUAL**2)
@@ -169,8 +169,8 @@ class FilterBank(nn.Module):
             strong = squares / (squares + self.usual)
             take, ripple, notch = cleaned(columns(now, range(1)), notch, first, self.interval)
             taken = taken * self.cleaned_keep + take @ self.cleaned_gain
-        features = joined([joined([measured, means]) @ self.features, take, taken, ripple, noise, large, strong])
-        return features, joined([means, now, difference, excess, squares, notch, taken])
+        features = concat([concat([measured, means]) @ self.features, take, taken, ripple, noise, large, strong])
+        return features, concat([means, now, difference, excess, squares, notch, taken])
 
     def back(self, by_features: Any, by_means: Any) -> tuple[Any, Any]:
         """Gradients with respect to readings (n, 11) and means before, from those of features and means after.
@@ -178,40 +178,40 @@ class FilterBank(nn.Module):
         Arrays. Noise, swings, outliers, ripples and readings that failed are taken as they are: no action is chosen for
         what it does to their estimates.
         """
-        by_seen = by_features[:, :-UNLED] @ self.features.numpy().T
+        by_seen = by_features[:, :-N_DETACHED] @ self.features.numpy().T
         by_means = by_means + by_seen[:, len(MEASURED) :]
         return by_seen[:, : len(MEASURED)] + by_means @ self.gain.numpy().T, by_means * self.keep.numpy()
 
     def act(self, features: Any) -> Any:
-        """The action, shape (..., 2), not yet held within its box, from features of shape (..., width)."""
+        """The action, shape (..., 2), not yet clamped to its box, from features of shape (..., width)."""
         x = self.normalised(features)
-        lines = through(x, self.linear)
+        lines = apply(x, self.linear)
         if self.scheduled:
             lines = lines * (self._schedule(x, features) @ self.spread + self.ones)
         action = lines @ self.gather
         if self.bent is not None:
-            action = action + through(through(x, self.layers), self.bent) * self.gains
+            action = action + apply(apply(x, self.layers), self.bent) * self.gains
         return action
 
     def normalised(self, features: Any) -> Any:
-        """The features less their mean, in standard deviations, held within bounds."""
-        return held((features - self.mean) * self.per_std, -NORMALISED_LIMIT, NORMALISED_LIMIT)
+        """The features less their mean, in standard deviations, clamped."""
+        return clamp((features - self.mean) * self.per_std, -NORMALISED_LIMIT, NORMALISED_LIMIT)
 
     def _schedule(self, x: Any, features: Any) -> Any:
         """What the linear map is scheduled on, each in a column."""
         width = len(self.mean)
-        strengths = held(columns(x, range(width - _STRENGTHS, width)), -SCHEDULE_LIMIT, SCHEDULE_LIMIT)
-        ripple, noise, _, _, *swings = parted(strengths, [1] * _STRENGTHS)
-        ages = range(width - UNLED - len(BEGUN), width - UNLED)
+        strengths = clamp(columns(x, range(width - _STRENGTHS, width)), -SCHEDULE_LIMIT, SCHEDULE_LIMIT)
+        ripple, noise, _, _, *swings = split(strengths, [1] * _STRENGTHS)
+        ages = range(width - N_DETACHED - len(BEGUN), width - N_DETACHED)
         large = width - len(SWINGS) - 1
         growth = columns(x, range(_GROWTH, _GROWTH + 1))
-        return joined(
+        return concat(
             [
                 ripple,
                 noise,
                 noise * noise - 1.0,
                 *swings,
-                held(growth, -SCHEDULE_LIMIT, SCHEDULE_LIMIT),
+                clamp(growth, -SCHEDULE_LIMIT, SCHEDULE_LIMIT),
                 columns(features, range(large, large + 1)),
                 columns(features, ages) * -1.0 + 1.0,
             ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -14,10 +15,9 @@ from cz_gym.agents.agent_file.contract import read_json
 from cz_gym.atomic_files import locked
 from cz_gym.errors import CzError
 
-from .learners import Controllers
 from .recipes import Recipe
-from .run import Run, check_settings
-from .run_files import read_rows
+from .run import MakeController, Run
+from .run_files import check_settings, read_rows
 
 LOST = 120.0
 """Longest time that a lost machine's lock on a folder outlives it [s]."""
@@ -29,7 +29,7 @@ class Job(NamedTuple):
     folder: Path
     recipe: Recipe
     seed: int
-    controllers: Controllers
+    make_controller: MakeController
     checkpoint_seconds: float
     plot: bool
     command: Sequence[str]
@@ -37,7 +37,7 @@ class Job(NamedTuple):
 
     @property
     def begun(self) -> bool:
-        """Whether its folder holds a run; AgentFileError if that is another one."""
+        """Whether its folder holds this run; AgentFileError if it holds another one."""
         exists = (self.folder / "settings.json").exists()
         return exists and bool(check_settings(self.folder, self.recipe, self.seed))
 
@@ -45,9 +45,9 @@ class Job(NamedTuple):
     def summary(self) -> dict[str, float] | None:
         """The summary of the run; None before its end."""
         path = self.folder / "summary.json"
-        found = read_json(path) if self.begun and path.exists() else None
-        steps = found.get("steps") if isinstance(found, dict) else None
-        return found if isinstance(steps, int) and steps >= getattr(self.recipe, "steps", 0) else None
+        saved = read_json(path) if self.begun and path.exists() else None
+        steps = saved.get("steps") if isinstance(saved, dict) else None
+        return saved if isinstance(steps, int) and steps >= self.recipe.steps else None
 
 
 Perform = Callable[[Callable[[Job], Any], Sequence[Job], Callable[[], None]], Iterator[tuple[int, Any]]]
@@ -60,28 +60,31 @@ def train_seed(job: Job) -> dict[str, float]:
         if summary := job.summary:
             return summary
         sys.argv = list(job.command)
-        run = Run(job.folder, job.recipe, job.seed, job.controllers, job.begun, job.checkpoint_seconds, job.plot)
+        run = Run(job.folder, job.recipe, job.seed, job.make_controller, job.begun, job.checkpoint_seconds, job.plot)
         run.learn(bar)
         return run.finish()
 
 
 def _tried(train: Callable[[Job], dict[str, float]], job: Job) -> dict[str, float] | Exception:
-    """What training a seed comes to, or why not: one seed's mistake is no reason to stop the others."""
+    """The summary of a seed, or the exception that ended its training: it stops no other seed."""
     try:
         return train(job)
-    except (ValueError, OSError, ArithmeticError) as error:
+    except CzError as error:
+        return error
+    except Exception as error:
+        error.add_note(traceback.format_exc())  # a traceback itself does not reach another process
         return error
 
 
 def train_seeds(jobs: Sequence[Job], perform: Perform, bar: Any) -> Iterator[tuple[Job, dict[str, float]]]:
     """Train what is not finished; each seed with its summary, as they come. ``bar`` is tqdm's and counts seeds.
 
-    ValueError names the seeds that failed, once the others are done.
+    Once the others are done, CzError names the seeds that failed; any other exception of a seed is raised as it is.
     """
 
     def look() -> None:
-        shares, told = zip(*map(_standing, jobs), strict=True)
-        bar.set_postfix_str("  ".join(told), refresh=False)
+        shares, lines = zip(*map(_standing, jobs), strict=True)
+        bar.set_postfix_str("  ".join(lines), refresh=False)
         bar.update(sum(shares) - bar.n)
 
     missing = []
@@ -90,22 +93,26 @@ def train_seeds(jobs: Sequence[Job], perform: Perform, bar: Any) -> Iterator[tup
             yield job, summary
         else:
             missing.append(job)
-    failed = []
-    for number, found in perform(partial(_tried, train_seed), missing, look):
-        if isinstance(found, Exception):
-            failed.append(f"seed {missing[number].seed}: {found}")
+    failed: list[tuple[int, Exception]] = []
+    for number, result in perform(partial(_tried, train_seed), missing, look):
+        if isinstance(result, Exception):
+            failed.append((missing[number].seed, result))
         else:
-            yield missing[number], found
+            yield missing[number], result
     look()
+    for seed, error in failed:
+        if not isinstance(error, CzError):
+            error.add_note(f"seed {seed}")
+            raise error
     if failed:
-        raise CzError("; ".join(failed))
+        raise CzError("; ".join(f"seed {seed}: {error}" for seed, error in failed))
 
 
 def _standing(job: Job) -> tuple[float, str]:
-    """The share of a run that is done at its last validation [-], and what that found."""
+    """The share of a run that was done at its last validation [-], and a few words on it."""
     rows = read_rows(job.folder / "progress.csv")
     if not rows:
         return 0.0, f"{job.seed}: 0%"
     steps = float(rows[-1]["steps"])
-    share = min(steps / getattr(job.recipe, "steps", steps), 1.0)
+    share = min(steps / (job.recipe.steps or steps), 1.0)
     return share, f"{job.seed}: {share:.0%} {float(rows[-1]['validation_rmse_mm']):.3f} mm"

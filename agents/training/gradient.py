@@ -18,16 +18,16 @@ from torch.autograd import backward, grad
 from torch.nn.utils.parametrize import register_parametrization
 
 from cz_gym.config import Config
-from cz_gym.cost import Cost, cost_slopes, cost_terms, saturated, saturated_slope
+from cz_gym.cost import WEIGHTS, Cost, cost_slopes, cost_terms, saturated, saturated_slope
 from cz_gym.differentiable import STATES, Step
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from cz_gym.observation import MEASURED, scales
 from cz_gym.task import drives_of
 
-from .crystals import Crystals, Evenness
+from .crystals import CostNormaliser, Crystals
 from .demonstrations import widened
 from .expectation import Expectation
-from .filter_bank import MEANS, STATE, UNLED, FilterBank, read_bank
+from .filter_bank import MEANS, N_DETACHED, STATE, FilterBank, read_bank
 from .learner import Parts, Watch
 from .networks import whitening
 from .recipes import Gradient
@@ -39,34 +39,35 @@ MOST_STD, LEAST_STD = 10.0, 1e-4
 LEAST_VARIANCE = 1e-4
 """Added to the variances that whitening divides by [-]."""
 MOST_GRADIENT = 2.0
-"""A gradient is cut to so many times the median norm of the last ones [-]: of a crystal that is nearly lost it is
-thousands of times as large, and says little."""
+"""Gradient-norm clip, in multiples of the running median norm [-]: the gradient of a crystal that is nearly lost is
+thousands of times as large, and has no useful direction."""
 LAST_GRADIENTS = 100
+"""Window of that median [updates]."""
 AT_ONCE = 12
-"""Steps whose actions are differentiated at once: few enough for a processor's cache."""
+"""Steps whose actions are differentiated in one call: their arrays fit into a processor's cache."""
 _V_P = [channel.name for channel in MEASURED].index("v_p")
 _RADIUS, _PULL_STEP = (Cost._fields.index(name) for name in ("radius", "pull_step"))
 
 
 class Window(NamedTuple):
-    """What some steps of all crystals were, with all that a gradient needs."""
+    """Some steps of all crystals, with all that a gradient needs."""
 
     features: torch.Tensor
-    """What the network made of readings and memory, shape (steps, n, width)."""
+    """The network's features, shape (steps, n, width)."""
     costs: Any
     """Terms of the cost, shape (steps, n, 4)."""
     beyond: Any
-    """What :meth:`GradientLearner._beyond` adds to the gradient, shape (steps, n)."""
+    """Gradient of moves that a limit cuts off (:meth:`GradientLearner._beyond`), shape (steps, n)."""
     jacobians: list[Any]
-    """Of each step (:class:`cz_gym.differentiable.Step`)."""
+    """Each step's jacobian (:class:`cz_gym.differentiable.Step`)."""
     measured: Any
     """The last readings, shape (n, 11)."""
     memory: torch.Tensor
-    """What the network remembers after them, shape (n, :data:`.filter_bank.STATE`)."""
+    """The network's state after them, shape (n, :data:`.filter_bank.STATE`)."""
 
 
 class _OfWhitened(nn.Module):
-    """A layer's weights, learned as weights of its inputs whitened; the layer itself stays as it is."""
+    """Parametrisation of a layer's weights by weights of its whitened inputs."""
 
     scaling: torch.Tensor
 
@@ -101,8 +102,8 @@ class GradientLearner:
             if recipe.whitened and isinstance(layer, nn.Linear) and layer.in_features == width:
                 self.whitened.append((layer, _OfWhitened(width)))
                 register_parametrization(layer, "weight", self.whitened[-1][1])
-        self.expectation = Expectation() if recipe.expects else None
-        self.evenness: Evenness | None = None
+        self.expectation = Expectation() if recipe.imputes_failed_readings else None
+        self.normaliser: CostNormaliser | None = None
         self.products, self.seen = (torch.zeros(size, dtype=torch.float64) for size in ((width, width), (1,)))
         weights = self.network.parameters()
         self.optimiser = torch.optim.Adam(weights, recipe.learning_rate, betas=(0.9, recipe.beta2))
@@ -110,7 +111,7 @@ class GradientLearner:
         self.random = np.random.default_rng([seed, done])
         self.drives = drives_of(config.action, config.control_interval)
         self.v_p_scale = float(scales(MEASURED, config.parameters.v_0)[_V_P])
-        self.weights = np.array([1.0, recipe.weights.pull, recipe.weights.pull_step, recipe.weights.heater_step])
+        self.weights = np.array(recipe.weights) / np.array(WEIGHTS)
 
     def learn(self, watch: Watch) -> None:
         """Take the updates that are left."""
@@ -120,8 +121,8 @@ class GradientLearner:
         memory = torch.zeros(n, STATE)
         windows = self.config.steps // recipe.window
         left = self.random.integers(1, windows, n, endpoint=True)
-        if recipe.evenly:
-            self.evenness = Evenness(batch, windows)
+        if recipe.normalise_cost:
+            self.normaliser = CostNormaliser(batch, windows)
         while self.steps < self.total:
             progress = self.steps / self.total
             self.optimiser.param_groups[0]["lr"] = recipe.learning_rate * (1.0 - progress)
@@ -141,17 +142,17 @@ class GradientLearner:
                 measured = batch.reset(self._seeds(len(over)), over)
                 memory[over] = 0.0
                 left[over] = windows
-                if self.evenness:
-                    self.evenness.begin(over)
+                if self.normaliser:
+                    self.normaliser.begin(over)
             self.steps += self.per_update
             watch(self.steps, "")
         batch.close()
 
     def _crystals(self) -> Crystals:
-        """The crystals that are learned on: the recipe's scenario, and its share of each other."""
+        """The training crystals: the recipe's scenario, and its mixture."""
         slots = self.recipe.num_envs
         others = []
-        for name, width, share in self.recipe.also:
+        for name, width, share in self.recipe.mixture:
             scenario = widened(self.config.with_scenario(name or self.recipe.scenario).scenario, width)
             others.append((self.config.with_scenario(scenario), round(share * slots)))
         return Crystals([(self.config, slots - sum(many for _, many in others)), *others])
@@ -178,7 +179,7 @@ class GradientLearner:
 
     def _weighed(self, step: Step) -> Step:
         """The same with the radius error's cost as the recipe counts it."""
-        if not self.recipe.weights.observable:
+        if not self.recipe.observable:
             return step
         error = np.where(step.grows, step.error + step.offset, 0.0)
         step.cost[:, _RADIUS] = cost_terms(error, 0.0, 0.0, 0.0).radius
@@ -206,8 +207,8 @@ class GradientLearner:
         cost = window.costs @ self.weights
         capped = saturated(cost)
         by_cost = saturated_slope(cost) / cost.size
-        if self.evenness:
-            by_cost *= self.evenness.weights(capped.mean(axis=0))
+        if self.normaliser:
+            by_cost *= self.normaliser.weights(capped.mean(axis=0))
         steps, n = cost.shape
         rows, by_memory = np.zeros((n, len(STATES) + len(self.weights))), np.zeros((n, MEANS), np.float32)
         weights = list(self.network.parameters())
@@ -237,7 +238,7 @@ class GradientLearner:
         self.logger.record("gradient/norm", float(norm))
 
     def _standardise(self, seen: torch.Tensor) -> None:
-        """Move the features' mean and standard deviation towards what is seen; the first time wholly."""
+        """Update the running mean and standard deviation of the features; the first update sets them."""
         network = self.network
         share = 0.1 if bool(network.mean.any()) else 1.0
         network.mean += share * (seen.mean(dim=0) - network.mean)
@@ -256,9 +257,9 @@ class GradientLearner:
             self.products += x.T @ x
             self.seen += len(x)
         elif self.seen.any():
-            covariance = (self.products / self.seen).numpy()[:-UNLED, :-UNLED]
+            covariance = (self.products / self.seen).numpy()[:-N_DETACHED, :-N_DETACHED]
             scaling = torch.eye(len(self.products))
-            scaling[:-UNLED, :-UNLED] = torch.from_numpy(
+            scaling[:-N_DETACHED, :-N_DETACHED] = torch.from_numpy(
                 whitening(covariance + LEAST_VARIANCE * np.eye(len(covariance)))
             )
             for layer, inputs in self.whitened:

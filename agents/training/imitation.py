@@ -23,7 +23,7 @@ from cz_gym.observation import CLIP, DRIVE_CHANNELS, HISTORY
 from .demonstrations import Demonstrations, Floats, demonstrate, widened
 from .export import actor_onnx
 from .learner import Parts, Watch
-from .networks import Actor, Beside, Normalise, tanh_layers, whitening
+from .networks import Actor, Normalise, SkipConcat, tanh_layers, whitening
 from .recipes import Imitation
 
 RIDGE = 1e-6
@@ -109,7 +109,7 @@ class ImitationNetwork(torch.nn.Module):
         super().__init__()
         channels = len(HISTORY)
         self.normalise = Normalise(Box(-CLIP, CLIP, (channels,), np.float32), memory)
-        self.layers = Beside(tanh_layers([channels, *hidden]))
+        self.layers = SkipConcat(tanh_layers([channels, *hidden]))
         self.last = torch.nn.Linear((channels, *hidden)[-1] + channels, len(DRIVE_CHANNELS))
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:

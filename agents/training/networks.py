@@ -74,7 +74,7 @@ class Normalise(BaseFeaturesExtractor):
         return torch.clamp(centred @ self.scaling, -NORMALISED_LIMIT, NORMALISED_LIMIT)
 
 
-class Beside(nn.Module):
+class SkipConcat(nn.Module):
     """What layers make of their input, and beside it the input itself."""
 
     def __init__(self, layers: nn.Module) -> None:

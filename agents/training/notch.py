@@ -12,7 +12,7 @@ from __future__ import annotations
 from math import exp
 from typing import Any
 
-from .symbolic import held, joined, parted, rectified, root
+from .symbolic import clamp, concat, relu, root, split
 
 SLOW = 25.0
 """Time constant, twice, of the readings' slow part [s]."""
@@ -39,24 +39,24 @@ def cleaned(reading: Any, state: Any, first: Any, interval: float) -> tuple[Any,
 
     ``first`` is 1 for a crystal's first reading, and 0 for all others.
     """
-    mean, slow, excess, before, last, along, across, seen, delayed, earlier, power = parted(state, [1] * STATE)
+    mean, slow, excess, before, last, along, across, seen, delayed, earlier, power = split(state, [1] * STATE)
     share, noise_share, patience = (1.0 - exp(-interval / time) for time in (SLOW, NOISE_TIME, PATIENCE))
     variance, energy = BEGIN[0] ** 2, BEGIN[1] ** 2
 
     mean, slow = mean + (reading - mean) * first, slow + (reading - slow) * first
     off = reading - mean
-    most = root(rectified(excess + variance)) * OUTLIER
-    off = off - rectified(off - most) + rectified(off * -1.0 - most)
+    most = root(relu(excess + variance)) * OUTLIER
+    off = off - relu(off - most) + relu(off * -1.0 - most)
     excess = excess + (off * off - excess - variance) * noise_share
     believed = mean + off
     mean = mean + off * share
     slow = slow + (mean - slow) * share
 
-    turn = held(along / (across + (energy + 1e-8)), LEAST, MOST)
+    turn = clamp(along / (across + (energy + 1e-8)), LEAST, MOST)
     now = believed - mean * 2.0 + slow + last * turn * (2.0 * RADIUS) - before * RADIUS**2
     along = along + (last * (now + before) - along) * patience
     across = across + (last * last * 2.0 - across - energy) * patience
-    turn = held(along / (across + (energy + 1e-8)), LEAST, MOST)
+    turn = clamp(along / (across + (energy + 1e-8)), LEAST, MOST)
 
     scale = (turn * (-2.0 * RADIUS) + (1.0 + RADIUS**2)) / (turn * -2.0 + 2.0)
     change = believed - seen - (reading - seen) * first
@@ -67,5 +67,5 @@ def cleaned(reading: Any, state: Any, first: Any, interval: float) -> tuple[Any,
     return (
         reading - believed + ripple * strength,
         strength,
-        joined([mean, slow, excess, last, now, along, across, believed, delayed, ripple * -(RADIUS**2), power]),
+        concat([mean, slow, excess, last, now, along, across, believed, delayed, ripple * -(RADIUS**2), power]),
     )

@@ -7,7 +7,7 @@ from typing import Any
 
 from cz_gym.evaluation.report.canvas import COLOURS, INK, canvas, png
 
-from .run_files import REFERENCES
+from .validation import REFERENCES
 
 
 def progress(rows: Sequence[dict[str, Any]], title: str) -> bytes:

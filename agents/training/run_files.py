@@ -1,4 +1,4 @@
-"""The files of a run's folder but for its checkpoint: settings with provenance, and the progress of validations."""
+"""The files of a run's folder beside its checkpoint: settings with provenance, and the progress of validations."""
 
 from __future__ import annotations
 
@@ -8,39 +8,51 @@ import json
 import math
 import subprocess
 import sys
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from cz_gym.agents.agent_file.contract import MAX_JSON_BYTES, AgentFileError, read_bounded, read_json
-from cz_gym.errors import CzError
 from cz_gym.evaluation.files import software
 
-from .recipes import RECIPES
+from .recipes import RECIPES, Recipe
+from .validation import COLUMNS
 
-REFERENCES = ("paper", "paper-tuned", "lqg")
-"""Classical controllers that an agent is shown beside while it learns."""
-COLUMNS = (
-    "steps",
-    "seconds",
-    "validation_cost",
-    "validation_rmse_mm",
-    "pull_step_rms_mm_per_min",
-    "failure_rate",
-    *(f"{name}_rmse_mm" for name in REFERENCES),
-)
-"""Columns of ``progress.csv``; the references' figures are the same in every row."""
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "stable-baselines3", "torch", "onnx", "onnxruntime")
 
 
 def trained_on(algorithm: str, scenario: str) -> str:
-    """The scenarios, in words, whose crystals an agent of that recipe and scenario learned on."""
-    also = (name for name, *_ in getattr(RECIPES.get(algorithm), "also", ()) if name)
-    *others, last = dict.fromkeys((scenario, *also))
+    """The scenarios, in words, that an agent of that recipe and scenario was trained on."""
+    mixture = (share.scenario for share in getattr(RECIPES.get(algorithm), "mixture", ()) if share.scenario)
+    *others, last = dict.fromkeys((scenario, *mixture))
     return f"{', '.join(others)} and {last}" if others else last
 
 
+def check_settings(folder: Path, recipe: Recipe, seed: int) -> list[dict[str, Any]]:
+    """The sessions of the run in this folder; AgentFileError if it is another run."""
+    path = folder / "settings.json"
+    saved = read_settings(path)
+    for name, value in identity(recipe, seed).items():
+        if saved.get(name) != value:
+            raise AgentFileError(f"{path}: the run was begun with another {name}; resume it with the same options")
+    return list(saved["sessions"])
+
+
+def identity(recipe: Recipe, seed: int) -> dict[str, Any]:
+    """The settings that a resumed run must share with the one that was begun; it may be longer."""
+    settings = {name: value for name, value in asdict(recipe).items() if name != "steps"}
+    return {
+        "algorithm": recipe.name,
+        "seed": seed,
+        "settings": json.loads(json.dumps(settings)),
+        "plant_hash": recipe.config.plant_hash,
+        "scenario_hash": recipe.config.scenario.hash,
+    }
+
+
 def read_settings(path: Path) -> dict[str, Any]:
-    """What ``settings.json`` says of a run; AgentFileError unless a run wrote it."""
+    """The contents of ``settings.json``; AgentFileError unless a run wrote it."""
     try:
         saved = read_json(path)
     except AgentFileError:
@@ -53,7 +65,7 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 
 def provenance() -> dict[str, Any]:
-    """The command, and what it runs on: git commit, Python, packages."""
+    """The command, and the software it runs on: git commit, Python, packages."""
     return {
         "command": " ".join([Path(sys.executable).name, *_program(), *sys.argv[1:]]),
         "git_commit": _git_commit(),
@@ -62,7 +74,7 @@ def provenance() -> dict[str, Any]:
 
 
 def _program() -> list[str]:
-    """What Python runs, as its command says it: a module of this checkout, or a program's name."""
+    """The program as a command line names it: a module of this checkout, or a program's name."""
     path = Path(sys.argv[0])
     here = Path(__file__).resolve().parents[2]
     if path.is_absolute() and path.is_relative_to(here):
@@ -87,8 +99,8 @@ def to_json(content: Any) -> bytes:
     return (json.dumps(content, indent=2) + "\n").encode()
 
 
-def to_csv(rows: list[dict[str, Any]]) -> bytes:
-    """``progress.csv``: a line a validation."""
+def to_csv(rows: Sequence[dict[str, Any]]) -> bytes:
+    """The contents of ``progress.csv``: a line a validation."""
     text = io.StringIO()
     writer = csv.DictWriter(text, fieldnames=COLUMNS)
     writer.writeheader()
@@ -97,14 +109,13 @@ def to_csv(rows: list[dict[str, Any]]) -> bytes:
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """The validations before this session; AgentFileError if the file is not one that a run wrote."""
+    """The rows of ``progress.csv``; none without a file. AgentFileError if no run wrote it."""
     if not path.exists():
         return []
     try:
         rows = list(csv.DictReader(io.StringIO(read_bounded(path, MAX_JSON_BYTES).decode(), newline="")))
-        for row in rows:
-            if list(row) != list(COLUMNS) or not all(math.isfinite(float(value)) for value in row.values()):
-                raise CzError("a row is not one of numbers")
+        if not all(list(row) == list(COLUMNS) and all(math.isfinite(float(row[name])) for name in row) for row in rows):
+            raise ValueError
     except (ValueError, TypeError, csv.Error):
         raise AgentFileError(f"{path}: damaged; without it the run can be resumed") from None
     return rows

@@ -51,7 +51,7 @@ class Value:
         return self.node("MatMul", other)
 
 
-def joined(parts: Sequence[Any]) -> Any:
+def concat(parts: Sequence[Any]) -> Any:
     """Side by side, along the last axis."""
     first = parts[0]
     return first.node("Concat", *parts[1:], axis=1) if isinstance(first, Value) else torch.cat(list(parts), dim=-1)
@@ -64,13 +64,13 @@ def columns(x: Any, at: Sequence[int]) -> Any:
     return x[..., at.start : at.stop] if isinstance(at, range) else x[..., list(at)]
 
 
-def parted(x: Any, widths: Sequence[int]) -> list[Any]:
+def split(x: Any, widths: Sequence[int]) -> list[Any]:
     """Neighbouring columns, in parts of these widths."""
     ends = np.cumsum(widths).tolist()
     return [columns(x, range(end - width, end)) for width, end in zip(widths, ends, strict=True)]
 
 
-def rectified(x: Any) -> Any:
+def relu(x: Any) -> Any:
     """The positive part."""
     return x.node("Relu") if isinstance(x, Value) else torch.relu(x)
 
@@ -80,13 +80,13 @@ def root(x: Any) -> Any:
     return x.node("Sqrt") if isinstance(x, Value) else torch.sqrt(x)
 
 
-def held(x: Any, low: float, high: float) -> Any:
+def clamp(x: Any, low: float, high: float) -> Any:
     """Within [low, high]."""
     if isinstance(x, Value):
         return x.node("Clip", np.float32(low), np.float32(high))
     return torch.clamp(x, low, high)
 
 
-def through(x: Any, module: nn.Module) -> Any:
+def apply(x: Any, module: nn.Module) -> Any:
     """Through a module of torch."""
-    return Value(x.graph, x.graph.through(x.name, [module])) if isinstance(x, Value) else module(x)
+    return Value(x.graph, x.graph.apply(x.name, [module])) if isinstance(x, Value) else module(x)

@@ -1,4 +1,4 @@
-"""How good an agent is while it trains, and when it has."""
+"""How good an agent is, on validation crystals."""
 
 from __future__ import annotations
 
@@ -9,47 +9,67 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.config import Config
-from cz_gym.cost import FAILURE_COST, cost_terms
+from cz_gym.cost import FAILURE_COST, WEIGHTS, Weights, cost_terms
 from cz_gym.evaluation.metrics import Metrics, metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.units import KILO, MM, MM_PER_MIN
 
-from .recipes import OWN_WEIGHTS, CostWeights
-
 Floats = npt.NDArray[np.float64]
 PICKING = VALIDATION_SEEDS[:64]
-"""Seeds of the crystals that pick the best agent of a run."""
+"""Seeds of the crystals that choose the best agent of a run."""
 JUDGING = VALIDATION_SEEDS[64:264]
-"""Seeds of those that say what it is worth; they pick nothing within a run."""
+"""Seeds of the crystals that a finished run's agent is tested on; they choose nothing within a run."""
+
+REFERENCES = ("paper", "paper-tuned", "lqg")
+"""Classical controllers that an agent is shown beside while it learns."""
+COLUMNS = (
+    "steps",
+    "seconds",
+    "validation_cost",
+    "validation_rmse_mm",
+    "pull_step_rms_mm_per_min",
+    "failure_rate",
+    *(f"{name}_rmse_mm" for name in REFERENCES),
+)
+"""Figures of a validation; those of the references are the same in every row."""
 
 
 class Validation(NamedTuple):
     """Mean figures over validation episodes."""
 
     cost: float
-    """Of a step, weighed as in training; ten at most, which is what a lost episode costs [-]."""
+    """Mean cost of a step with the recipe's weights, at most ten; that of a lost crystal is ten [-]."""
     rmse_mm: float
     pull_step_rms_mm_per_min: float
     failure_rate: float
 
 
-def validate(policy: Any, config: Config, seeds: Sequence[int], weights: CostWeights = OWN_WEIGHTS) -> Validation:
-    """Run the episodes of those seeds."""
-    found = metrics(rollout(policy, config, seeds))
-    figures = costs(found, weights), found.rmse_mm, found.pull_step_rms_mm_per_min, found.failure_rate
+def validate(
+    policy: Any, config: Config, seeds: Sequence[int], weights: Weights = WEIGHTS, observable: bool = False
+) -> Validation:
+    """Run one episode a seed."""
+    measured = metrics(rollout(policy, config, seeds))
+    figures = (
+        costs(measured, weights, observable),
+        measured.rmse_mm,
+        measured.pull_step_rms_mm_per_min,
+        measured.failure_rate,
+    )
     return Validation(*(float(figure.mean()) for figure in figures))
 
 
-def costs(found: Metrics, weights: CostWeights) -> Floats:
-    """Mean cost of a step of each episode, as :class:`Validation` says, shape (episodes,)."""
-    error = found.rmse_observable_mm if weights.observable else found.rmse_mm
+def costs(measured: Metrics, weights: Weights = WEIGHTS, observable: bool = False) -> Floats:
+    """Mean cost of a step of each episode (:attr:`Validation.cost`), shape (episodes,).
+
+    With ``observable``, the radius error leaves out the offset that no sensor shows.
+    """
+    error = measured.rmse_observable_mm if observable else measured.rmse_mm
     terms = cost_terms(
         error * MM,
-        found.pull_rms_mm_per_min * MM_PER_MIN,
-        found.pull_step_rms_mm_per_min * MM_PER_MIN,
-        found.heater_step_rms_kw * KILO,
+        measured.pull_rms_mm_per_min * MM_PER_MIN,
+        measured.pull_step_rms_mm_per_min * MM_PER_MIN,
+        measured.heater_step_rms_kw * KILO,
+        weights,
     )
-    cost = terms.radius + weights.pull * terms.pull
-    cost += weights.pull_step * terms.pull_step + weights.heater_step * terms.heater_step
-    return np.where(found.failure_rate > 0, FAILURE_COST, np.minimum(cost, FAILURE_COST))
+    return np.where(measured.failure_rate > 0, FAILURE_COST, np.minimum(sum(terms), FAILURE_COST))

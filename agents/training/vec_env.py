@@ -17,18 +17,20 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from cz_gym import CzVectorEnv
 from cz_gym.errors import CzError
+from cz_gym.names import needs
 from cz_gym.observation import CLIP, OBSERVATIONS, STATE
 
 
 class CzVecEnv(VecEnv):
-    """A :class:`cz_gym.CzVectorEnv` as stable-baselines3 wants it.
+    """A :class:`cz_gym.CzVectorEnv` with the interface of stable-baselines3's vector environments.
 
-    Observations are float32, shape (num_envs, channels); ``infos`` are empty but for slots whose episode ended, which
-    carry ``terminal_observation``, ``TimeLimit.truncated`` and ``episode`` (return, length, time). With ``stagger``, a
+    Observations are float32, shape (num_envs, channels); ``infos`` are empty except for slots whose episode ended: they
+    hold ``terminal_observation``, ``TimeLimit.truncated`` and ``episode`` (return, length, time). With ``stagger``, a
     seed, each slot's first episode is cut (truncated) at a random step, so that slots are not all in the same minute.
     """
 
     def __init__(self, env: CzVectorEnv, privileged: bool = False, stagger: int | None = None) -> None:
+        needs(CzVectorEnv, env, "without wrappers of gymnasium around it")
         if env.autoreset_mode != AutoresetMode.SAME_STEP:
             raise CzError("CzVecEnv needs autoreset_mode=AutoresetMode.SAME_STEP, as stable-baselines3 resets itself")
         if privileged and env.config.observation != "history":
@@ -39,7 +41,7 @@ class CzVecEnv(VecEnv):
         channels = len(OBSERVATIONS[env.config.observation]) + (len(STATE) if privileged else 0)
         super().__init__(env.num_envs, Box(-CLIP, CLIP, (channels,), np.float32), env.single_action_space)
         self.info: dict[str, Any] = {}
-        """What the batch said of its last step."""
+        """The batch's info of its last step."""
         self._actions = np.zeros((env.num_envs, 2), np.float32)
         self._returns = np.zeros(env.num_envs)
         self._lengths = np.zeros(env.num_envs, np.int64)
@@ -50,7 +52,7 @@ class CzVecEnv(VecEnv):
             self._cuts = np.random.default_rng(stagger).integers(1, env.config.steps, env.num_envs, endpoint=True)
 
     def seed_slots(self, seeds: Sequence[int]) -> None:
-        """Seeds of the slots' episodes from the next reset on."""
+        """Set the seeds of the slots' episodes from the next reset on."""
         self._seeds = list(seeds)
 
     def reset(self) -> Any:

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.ticker import FixedLocator, NullLocator
 
 from cz_gym.agents.training import validation
-from cz_gym.agents.training.run_files import REFERENCES
+from cz_gym.agents.training.validation import REFERENCES
 from cz_gym.evaluation.report.canvas import COLOURS, INK, canvas, png, styles
 from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.statistics import Estimate, Resamples, means

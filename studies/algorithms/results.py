@@ -10,7 +10,6 @@ import numpy as np
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.agents.training import validation
 from cz_gym.agents.training.fleet import Job, train_seed
-from cz_gym.agents.training.recipes import OWN_WEIGHTS
 from cz_gym.agents.training.run_files import read_rows
 from cz_gym.config import Config
 from cz_gym.evaluation.metrics import metrics
@@ -45,6 +44,6 @@ def evaluate(policy: Any, config: Config) -> Floats:
     own, transfer = (
         metrics(rollout(policy, config.with_scenario(name), validation.JUDGING)) for name in (SCENARIO, TRANSFER)
     )
-    cost = validation.costs(own, OWN_WEIGHTS)
+    cost = validation.costs(own)
     columns = own.rmse_mm, cost, own.pull_step_rms_mm_per_min, own.failure_rate, transfer.rmse_mm, transfer.failure_rate
     return np.stack(columns, axis=-1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from cz_gym.agents.training.recipes import RECIPES, Recipe, Rewarded
+from cz_gym.agents.training.recipes import RECIPES, Recipe
 from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.units import MINUTE
@@ -28,7 +28,7 @@ class Variant:
 
     def lasting(self, steps: int | None) -> Variant:
         """The same with that many environment steps if it learns from reward; None: its recipe's own number."""
-        if steps is None or not isinstance(self.recipe, Rewarded):
+        if steps is None or not self.recipe.steps:
             return self
         return replace(self, recipe=replace(self.recipe, steps=steps))
 
@@ -51,7 +51,7 @@ class Comparison(NamedTuple):
         return [variant for variant in self.variants if variant.name in wanted]
 
 
-PPO: Any = replace(RECIPES["ppo"], steps=1_500_000)  # type: ignore[call-arg]
+PPO: Any = replace(RECIPES["ppo"], steps=1_500_000)
 
 
 def _ppo(name: str, meaning: str, **changes: Any) -> Variant:
@@ -84,7 +84,7 @@ ABLATION = (
     _ppo("much-noise", "exploration begins with twice the spread", noise=1.0),
     _ppo("blind-critic", "the critic sees what the actor sees", privileged_critic=False),
     _ppo("interval-10s", "a control interval of 10 s, not of 5", control_interval=10.0),
-    _ppo("half-crystals", "crystals of 1.5 h while it learns, not of 3 h", length=5400.0),
+    _ppo("half-crystals", "crystals of 1.5 h while it learns, not of 3 h", episode_length=5400.0),
     _ppo("linear", "no hidden layers", hidden=()),
 )
 COMPARISONS = {

@@ -11,7 +11,7 @@ from typing import Any
 
 from cz_gym.agents import shipped_seeds
 from cz_gym.agents.agent_file.contract import Contract, read_agent
-from cz_gym.agents.training.recipes import RECIPES, Gradient, Imitation
+from cz_gym.agents.training.recipes import RECIPES, Gradient, Imitation, Share
 from cz_gym.atomic_files import check_writable, naming, write_files
 from cz_gym.commands import OneLineParser
 from cz_gym.errors import CzError
@@ -76,12 +76,12 @@ def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -
 def _seen_in_training(name: str, contract: Contract) -> str:
     """Its training crystals, with the shares of those that are not the scenario's own."""
     recipe = RECIPES.get(name)
-    also = recipe.also if isinstance(recipe, Gradient) else ()
+    mixture = recipe.mixture if isinstance(recipe, Gradient) else ()
     if isinstance(recipe, Imitation):
-        also = (("", recipe.width, recipe.wide_share),)
+        mixture = (Share("", recipe.width, recipe.wide_share),)
     others = [
         f"{100.0 * share:.0f} % " + (f"of `{other}`" if other else f"{width:g} times as wide")
-        for other, width, share in also
+        for other, width, share in mixture
     ]
     return f"crystals of `{contract.scenario}`" + (f", with {', '.join(others)} among them" if others else "")
 

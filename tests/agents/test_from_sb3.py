@@ -5,6 +5,7 @@ import shlex
 import subprocess
 import sys
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,15 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box
+from gymnasium.wrappers import RecordEpisodeStatistics, RescaleAction, TransformAction
 from sb3_contrib import TQC, RecurrentPPO
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecMonitor, VecNormalize
 
-import cz_gym  # noqa: F401  (registers Cz-v0)
+from cz_gym import CzEnv
 from cz_gym.agents import AgentFileError, OnnxPolicy, from_sb3
 from cz_gym.config import make_config
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
@@ -127,6 +130,44 @@ def test_a_model_loaded_into_an_environment_still_lacks_its_normalisation(tmp_pa
     unknown.set_parameters(tmp_path / "model.zip")
     with pytest.warns(UserWarning, match="does not know how it was trained: if on normalised"):
         from_sb3.save_agent(tmp_path / "mine.onnx", unknown, "mine")
+
+
+def in_environments(*wrapped: Callable[[], Any], outer: Callable[[Any], Any] = lambda env: env) -> PPO:
+    return PPO("MlpPolicy", outer(DummyVecEnv([*wrapped])), device="cpu", n_steps=8, batch_size=8)
+
+
+def doubled(action: Any) -> Any:
+    return np.clip(2.0 * action, -1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("model", "said"),
+    [
+        (lambda: in_environments(lambda: RescaleAction(CzEnv(), -0.1, 0.1)), "wrapped in RescaleAction"),
+        (
+            lambda: in_environments(lambda: Monitor(TransformAction(gym.make("Cz-v0"), doubled, None))),
+            "wrapped in TransformAction",
+        ),
+        (lambda: in_environments(CzEnv, outer=lambda env: VecFrameStack(env, 1)), "wrapped in VecFrameStack"),
+        (lambda: in_environments(CzEnv, lambda: CzEnv(scenario="hard")), "several scenarios, 'randomized' and 'hard'"),
+        (lambda: in_environments(CzEnv, lambda: CzEnv(action="smooth")), "environments differ"),
+        (lambda: in_environments(CzEnv, lambda: CzEnv(control_interval=2.0)), "environments differ"),
+    ],
+)
+def test_a_model_whose_file_would_be_another_agent_is_refused(model: Any, said: str, tmp_path: Path) -> None:
+    """The figures of a wrapped model would be those of an agent that acts without the wrapper."""
+    with pytest.raises(AgentFileError, match=said):
+        from_sb3.save_agent(tmp_path / "mine.onnx", model(), "mine")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_model_of_several_scenarios_is_written_for_the_one_that_is_given(tmp_path: Path) -> None:
+    model = in_environments(lambda: RecordEpisodeStatistics(CzEnv()), lambda: CzEnv(scenario="hard"), outer=VecMonitor)
+    model.learn(16)
+    contract = from_sb3.save_agent(tmp_path / "mine.onnx", model, "mine", config=make_config("hard"))
+    assert contract.scenario == "hard"
+    with pytest.raises(AgentFileError, match="differ from the given config"):
+        from_sb3.save_agent(tmp_path / "mine.onnx", model, "mine", config=make_config(action="rate"))
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,6 @@ pytest.importorskip("matplotlib")
 from cz_gym.agents.training import run, validation
 from cz_gym.agents.training.learners import make_learner
 from cz_gym.agents.training.recipes import PPO, SAC, Imitation
-from cz_gym.baselines.registry import make_controller
 from cz_gym.evaluation.protocol import TEST_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.statistics import Resamples
 from studies.algorithms import __main__ as command
@@ -127,7 +126,7 @@ def test_a_row_changes_one_thing_and_can_be_learned(row: Variant) -> None:
     base, mine = asdict(ABLATION[0].recipe), asdict(row.recipe)
     assert len({name for name in base if base[name] != mine[name]} - {"name"}) == (row.base != "")
     few: dict[str, Any] = {"n_steps": 8, "batch_size": 32, "steps": 32, "num_envs": 4}
-    learner = make_learner(replace(row.recipe, **few), 0, make_controller)
+    learner = make_learner(replace(row.recipe, **few), 0)
     before = learner.exported()
     learner.learn(lambda steps, doing: None)
     assert learner.steps == learner.total

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("stable_baselines3")
 
-from cz_gym.agents.training.crystals import Crystals, Evenness
+from cz_gym.agents.training.crystals import CostNormaliser, Crystals
 from cz_gym.agents.training.recipes import Gradient
 from cz_gym.differentiable import DifferentiableBatch
 
@@ -31,12 +31,12 @@ def test_crystals_of_several_scenarios_are_those_of_each_alone() -> None:
 def test_crystals_count_by_the_root_of_their_cost() -> None:
     """Of three scenarios' crystals with 1, 100 and 0 times a cost that falls with their age, two rough ones have four
     times the cost of the calm: their gradients come to count half as much. A new crystal counts as any other."""
-    evenness = Evenness(Crystals([(CONFIG, 4), (CONFIG, 4), (CONFIG, 1)]), 12)
+    normaliser = CostNormaliser(Crystals([(CONFIG, 4), (CONFIG, 4), (CONFIG, 1)]), 12)
     size, roughness = np.array([1.0] * 4 + [100.0] * 4 + [0.0]), np.array([1.0, 1.0, 4.0, 4.0] * 2 + [1.0])
     for _ in range(10):
         for age in range(12):
-            weights = evenness.weights(size * roughness / (1.0 + age))
-        evenness.begin([0, *range(1, 9)])
+            weights = normaliser.weights(size * roughness / (1.0 + age))
+        normaliser.begin([0, *range(1, 9)])
     np.testing.assert_allclose(weights[[2, 3, 6, 7]] / weights[[0, 1, 4, 5]], 0.5, rtol=0.1)
     assert np.isfinite(weights).all()
-    np.testing.assert_allclose(evenness._relative, 1.0)
+    np.testing.assert_allclose(normaliser._relative, 1.0)

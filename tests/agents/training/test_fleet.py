@@ -101,7 +101,7 @@ def test_an_unfinished_seed_goes_on_and_longer_runs_do_too(
 
     def killed(self: run.Run) -> Any:
         if self.seed == 1:
-            raise ValueError("killed")
+            raise AgentFileError("killed")
         return finish(self)
 
     command = ["--algo", "ppo", "--seeds", "0-1", "--out", str(tmp_path)]
@@ -117,17 +117,32 @@ def test_an_unfinished_seed_goes_on_and_longer_runs_do_too(
     assert trained == [0, 1, 1, 0, 1]
 
 
+@pytest.mark.parametrize("error", [AgentFileError("the training went wrong"), ValueError("could not be broadcast")])
 def test_one_seed_that_fails_stops_no_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trained: list[int], capsys: pytest.CaptureFixture[str]
+    error: Exception,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    trained: list[int],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    """An error that the project raises on purpose is one line; any other one is raised with its traceback."""
+
     def failing(job: fleet.Job) -> Any:
         if job.seed == 1:
-            raise AgentFileError("the training went wrong")
+            raise error
         return train_small_seed(job)
 
     monkeypatch.setattr(fleet, "train_seed", failing)
-    assert train.main(["--algo", "imitation", "--seeds", "0-2", "--out", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.splitlines()[-1] == "train.py: seed 1: the training went wrong"
+    command = ["--algo", "imitation", "--seeds", "0-2", "--out", str(tmp_path)]
+    if isinstance(error, AgentFileError):
+        assert train.main(command) == 2
+        assert capsys.readouterr().err.splitlines()[-1] == "train.py: seed 1: the training went wrong"
+    else:
+        with pytest.raises(ValueError, match="could not be broadcast") as caught:
+            train.main(command)
+        notes = "".join(caught.value.__notes__)
+        assert "in failing" in notes
+        assert "seed 1" in notes
     assert sorted(agents(tmp_path)) == ["seed0", "seed2"]
 
 

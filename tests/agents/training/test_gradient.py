@@ -134,7 +134,7 @@ def test_an_observable_cost_counts_what_sensors_can_show(scenario: str, drives: 
     """With ``observable`` weights, the radius error less what no sensor shows is charged, and its derivatives are those
     of differences. The heater of ``puller`` moves in whole steps, which only differences see."""
     config, row = CONFIG.with_scenario(scenario), len(STATES) + Cost._fields.index("radius")
-    learner = GradientLearner(replace(FEW, weights=replace(LQG_COST, observable=True)), 0, CONFIG, Logger(None, []), 0)
+    learner = GradientLearner(replace(FEW, weights=LQG_COST, observable=True), 0, CONFIG, Logger(None, []), 0)
 
     def stepped(action: list[float]) -> Any:
         batch = DifferentiableBatch(config, 8)
@@ -256,8 +256,8 @@ def test_whitening_changes_what_is_learned_and_not_the_policy() -> None:
     first._whiten(features, 1.0)
     assert torch.allclose(network.act(features), before, atol=1e-4)
     assert not all(map(torch.equal, network.parameters(), learned))
-    inputs = network.normalised(features)[:, : -filter_bank.UNLED].double()
-    scaling = first.whitened[0][1].scaling[: -filter_bank.UNLED, : -filter_bank.UNLED].double()
+    inputs = network.normalised(features)[:, : -filter_bank.N_DETACHED].double()
+    scaling = first.whitened[0][1].scaling[: -filter_bank.N_DETACHED, : -filter_bank.N_DETACHED].double()
     strengths = torch.linalg.svdvals(inputs @ scaling) / 20.0
     assert strengths[:3].numpy() == pytest.approx(1.0, abs=0.05)
     assert float(strengths[3]) < 1e-2
@@ -267,7 +267,7 @@ def test_whitening_changes_what_is_learned_and_not_the_policy() -> None:
 
 def test_it_learns_from_nothing() -> None:
     """Forty updates on a third of the recipe's crystals: from losing all crystals to holding most of them."""
-    recipe: Any = replace(RECIPES["gradient-start"], num_envs=64, steps=64 * 180 * 40, hidden=(), also=())
+    recipe: Any = replace(RECIPES["gradient-start"], num_envs=64, steps=64 * 180 * 40, hidden=(), mixture=())
     learner, config = GradientLearner(recipe, 0, recipe.config, Logger(None, []), 0), recipe.config
 
     def judged() -> Validation:

@@ -1,24 +1,35 @@
 """``train.py``: a run leaves what it promises, goes on where it stopped, and answers mistakes in one line."""
 
 import csv
+import itertools
 import json
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 import train
 from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.training import run, run_files
+from cz_gym.agents.training.checkpoint import load_checkpoint
 from cz_gym.agents.training.recipes import PPO, RECIPES, Gradient
 from cz_gym.commands import interpreter
 
 ROOT = Path(__file__).parents[3]
 
 
+SMALL = PPO(num_envs=64, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,))
+
+
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch, few_crystals: None) -> None:
-    monkeypatch.setitem(RECIPES, "ppo", PPO(num_envs=64, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,)))
+    monkeypatch.setitem(RECIPES, "ppo", SMALL)
     monkeypatch.setitem(
         RECIPES, "gradient-start", Gradient(name="gradient-start", num_envs=16, window=12, steps=10_000, hidden=())
     )
@@ -79,37 +90,58 @@ def test_the_command_is_told_without_the_machine_s_paths(
     assert run_files.provenance()["command"].endswith(f" {said} --seed 3")
 
 
-@pytest.mark.usefixtures("quick")
-def test_an_interrupted_run_keeps_its_checkpoint(
+@pytest.fixture
+def ctrl_c() -> Iterator[None]:
+    """Ctrl-C as in a terminal, also where pytest itself runs in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("quick", "ctrl_c")
+@pytest.mark.skipif(sys.platform == "win32", reason="signals as POSIX has them")
+def test_ctrl_c_in_the_middle_of_an_update_saves_after_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def interrupt(self: Any, bar: Any) -> None:
-        raise KeyboardInterrupt
+    """An update is four optimiser steps: two batches in each of two epochs, of which the second is interrupted."""
+    clip, calls = torch.nn.utils.clip_grad_norm_, itertools.count(1)
 
-    monkeypatch.setattr(run.Run, "_validate", interrupt)
+    def interrupted(*arguments: Any) -> Any:
+        if next(calls) == 6:
+            os.kill(os.getpid(), signal.SIGINT)
+        return clip(*arguments)
+
+    monkeypatch.setitem(RECIPES, "ppo", replace(SMALL, n_epochs=2))
+    monkeypatch.setattr("torch.nn.utils.clip_grad_norm_", interrupted)
     folder = tmp_path / "run"
-    assert train.main(["--steps", "10000", "--out", str(folder)]) == 130
-    assert (folder / "checkpoint.safetensors").exists()
-    assert f"saved, {interpreter()} train.py --resume --out {folder} goes on" in capsys.readouterr().err
+    assert train.main(["--steps", "12000", "--out", str(folder)]) == 130
+    assert f"{interpreter()} train.py --resume --out {folder} continues" in capsys.readouterr().err
+    progress, tensors, _ = load_checkpoint(folder / run.CHECKPOINT)
+    assert 2 * 2048 < progress.steps < 3 * 2048
+    assert float(tensors["policy.optimizer/0/step"]) == 8.0
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_interrupting_before_learning_gives_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("given", "resumes"),
+    [
+        (["--algo", "ppo", "--seed", "3"], "--out runs/ppo-seed3"),
+        (["--algo", "ppo", "--seeds", "1-3"], "--out runs/ppo --seeds 1-3"),
+        (["--out", "two words"], "--out 'two words'"),
+    ],
+)
+def test_interrupting_before_learning_prints_one_line(
+    given: list[str], resumes: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupt(arguments: Any) -> int:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(train, "train", interrupt)
     monkeypatch.chdir(tmp_path)
-    for given, resumes in (
-        (["--algo", "ppo", "--seed", "3"], "--out runs/ppo-seed3"),
-        (["--algo", "ppo", "--seeds", "1-3"], "--out runs/ppo --seeds 1-3"),
-        (["--out", "two words"], "--out 'two words'"),
-    ):
-        assert train.main(given) == 130
-        said = capsys.readouterr().err
-        assert said.count("\n") == 1
-        assert f"{interpreter()} train.py --resume {resumes} goes on" in said
+    assert train.main(given) == 130
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert f"{interpreter()} train.py --resume {resumes} continues from the last checkpoint" in said
 
 
 @pytest.mark.parametrize(
@@ -135,11 +167,12 @@ def test_mistakes_give_one_line(tmp_path: Path, arguments: list[str], message: s
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_that_is_refused_leaves_no_logs(tmp_path: Path, refused: Any) -> None:
+def test_a_run_that_is_refused_leaves_no_folder(tmp_path: Path, refused: Any) -> None:
     assert "no such file" in refused(
-        train.main, ["--algo", "gradient", "--from", str(tmp_path / "none.onnx"), "--out", str(tmp_path / "run")]
+        train.main,
+        ["--algo", "gradient", "--from", str(tmp_path / "none.onnx"), "--out", str(tmp_path / "new" / "run")],
     )
-    assert not list(tmp_path.rglob("tensorboard"))
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ pytest.importorskip("stable_baselines3")
 
 from cz_gym.agents.training.learners import make_learner
 from cz_gym.agents.training.recipes import RECIPES
-from cz_gym.baselines.registry import make_controller
 
 
 @pytest.mark.parametrize("name", ["ppo", "sac"])
@@ -17,7 +16,7 @@ def test_no_two_training_seeds_meet_the_same_crystals(name: str) -> None:
     recipe: Any = replace(RECIPES[name], num_envs=8, hidden=(4,), batch_size=64)  # type: ignore[call-arg]
     met: list[set[int]] = []
     for seed, done in ((0, 0), (1, 0), (2, 0), (1, 327_680)):
-        learner: Any = make_learner(recipe, seed, make_controller, done=done)
+        learner: Any = make_learner(recipe, seed, done=done)
         met.append({int(each) for each in learner.algorithm.env.unwrapped._seeds})
         learner.algorithm.env.close()
     assert [len(each) for each in met] == [8] * 4
@@ -27,7 +26,7 @@ def test_no_two_training_seeds_meet_the_same_crystals(name: str) -> None:
 @pytest.mark.parametrize("name", ["ppo", "sac"])
 def test_the_numbers_of_a_recipe_reach_its_algorithm(name: str) -> None:
     recipe: Any = replace(RECIPES[name], num_envs=64)  # type: ignore[call-arg]
-    algorithm = make_learner(recipe, 0, make_controller).algorithm  # type: ignore[attr-defined]
+    algorithm = make_learner(recipe, 0).algorithm  # type: ignore[attr-defined]
     given = {}
     for field, wanted in asdict(recipe).items():
         found = getattr(algorithm, f"{field}_schedule", getattr(algorithm, field, None))

@@ -7,9 +7,9 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from cz_gym import CzVectorEnv
-from cz_gym.agents.training.recipes import CostWeights
+from cz_gym.agents.training.recipes import relative
 from cz_gym.agents.training.vec_env import CzVecEnv
-from cz_gym.agents.training.wrappers import Held, TrainingReward
+from cz_gym.agents.training.wrappers import ActionRepeat, TrainingReward
 from cz_gym.cost import Cost, cost_terms, reward
 
 
@@ -22,7 +22,7 @@ def slots(**settings: Any) -> CzVecEnv:
 
 
 def test_a_failure_costs_the_worst_for_ever() -> None:
-    env = TrainingReward(slots(), 0.9, CostWeights())
+    env = TrainingReward(slots(), 0.9)
     env.reset()
     for _ in range(2000):
         _, gained, done, infos = env.step(np.array([[1.0, 1.0], [0.0, 0.0]], np.float32))
@@ -33,7 +33,7 @@ def test_a_failure_costs_the_worst_for_ever() -> None:
 
 
 def test_without_costs_of_failure_every_step_earns_and_the_last_nothing() -> None:
-    env = TrainingReward(slots(), 0.9, CostWeights(), failure_costs=False)
+    env = TrainingReward(slots(), 0.9, failure_costs=False)
     env.reset()
     least = np.inf
     for _ in range(2000):
@@ -48,7 +48,7 @@ def test_without_costs_of_failure_every_step_earns_and_the_last_nothing() -> Non
 @pytest.mark.parametrize("observable", [False, True])
 def test_the_weighted_reward_is_the_weighted_cost_s(observable: bool) -> None:
     base = slots(scenario="puller")
-    env = TrainingReward(base, 0.9, CostWeights(pull=0.5, pull_step=3.0, heater_step=2.0, observable=observable))
+    env = TrainingReward(base, 0.9, relative(0.5, 3.0, 2.0), observable)
     env.reset()
     _, gained, done, _ = env.step(np.full((2, 2), 0.1, np.float32))
     assert not done.any()
@@ -63,7 +63,7 @@ def test_the_weighted_reward_is_the_weighted_cost_s(observable: bool) -> None:
 @pytest.mark.parametrize("steps", [50, 6])
 def test_a_held_action_is_as_many_steps_and_ends_with_an_episode(steps: int) -> None:
     """Beside the same steps one by one; episodes of 6 steps end in the middle of the second action."""
-    held, plain = Held(slots(horizon=5.0 * steps), 4), slots(horizon=5.0 * steps)
+    held, plain = ActionRepeat(slots(horizon=5.0 * steps), 4), slots(horizon=5.0 * steps)
     held.reset()
     plain.reset()
     random = np.random.default_rng(0)
