@@ -143,7 +143,10 @@ def doubled(action: Any) -> Any:
 @pytest.mark.parametrize(
     ("model", "said"),
     [
-        (lambda: in_environments(lambda: RescaleAction(CzEnv(), -0.1, 0.1)), "wrapped in RescaleAction"),
+        (
+            lambda: in_environments(lambda: RescaleAction(CzEnv(), np.float32(-0.1), np.float32(0.1))),
+            "wrapped in RescaleAction",
+        ),
         (
             lambda: in_environments(lambda: Monitor(TransformAction(gym.make("Cz-v0"), doubled, None))),
             "wrapped in TransformAction",
