@@ -44,14 +44,14 @@ def closed_form(r_c: float, h_c: float) -> float:
 
 
 @pytest.mark.filterwarnings("error")
-def test_both_checkers() -> None:
+def test_gymnasiums_and_sb3s_checkers_pass() -> None:
     env = gym.make("Cz-v0", observation="camera", horizon=600.0)
     check_with_gymnasium(env.unwrapped, skip_render_check=True)
     check_with_sb3(env, warn=True)
     assert env.observation_space == gym.spaces.Box(0, 255, (120, 160, 1), np.uint8)
 
 
-def test_physics_and_info_are_those_of_the_other_observations() -> None:
+def test_steps_and_info_equal_those_of_measured() -> None:
     camera, measured = CzEnv("puller", observation="camera"), CzEnv("puller")
     assert repr(camera.reset(seed=3)[1]) == repr(measured.reset(seed=3)[1])
     for action in ACTIONS[:10, 0]:
@@ -78,7 +78,7 @@ def test_the_image_shows_the_reading_not_the_truth(detector: RingDetector) -> No
     assert np.std(errors) < 0.5 * np.std(truths)
 
 
-def test_flagged_readings_are_black_and_unflagged_freezes_repeat() -> None:
+def test_flagged_readings_are_black_and_unflagged_freezes_repeat_the_image() -> None:
     env, measured = (CzEnv("sensor-fault", observation=name, horizon=600.0) for name in ("camera", "measured"))
     black = frozen = 0
     over, rest = True, np.zeros(2, np.float32)
@@ -100,7 +100,7 @@ def test_flagged_readings_are_black_and_unflagged_freezes_repeat() -> None:
     assert frozen > 0
 
 
-def test_nominal_images_are_still_and_noisy_ones_are_not() -> None:
+def test_shot_noise_has_its_statistics_and_nominal_images_have_none() -> None:
     still = CzEnv("nominal", observation="camera")
     first, _ = still.reset(seed=0)
     np.testing.assert_array_equal(first, picture(PULLER.r_0, PULLER.h_0, PULLER, VIEW))
@@ -142,14 +142,14 @@ def test_the_ring_follows_geometry_and_closed_form_within_a_pixel(detector: Ring
             assert abs(radius - (wall_edge(make_scene(r_c, h_c, PULLER), VIEW).r - at_rest)) < 0.15 * detector.pixel
 
 
-def test_a_change_of_radius_is_read_as_itself(detector: RingDetector) -> None:
+def test_the_detectors_slope_of_the_radius_is_one(detector: RingDetector) -> None:
     step = np.linspace(-2e-3, 2e-3, 21)
     read = [detector.read(picture(PULLER.r_0 + dr, PULLER.h_0, PULLER, VIEW)).radius for dr in step]
     assert np.polyfit(step, read, 1)[0] == pytest.approx(1.0, abs=0.02)
     assert np.max(np.abs(np.array(read) - PULLER.r_0 - step)) < 0.1 * detector.pixel
 
 
-def test_no_ring_is_said_to_be_none(detector: RingDetector) -> None:
+def test_an_image_without_a_ring_reads_as_nan(detector: RingDetector) -> None:
     flat = picture(PULLER.r_0, 3e-3, PULLER, VIEW)
     for image in (np.zeros(IMAGE, np.uint8), np.full(IMAGE, 200, np.uint8), flat):
         assert math.isnan(detector.read(image).radius)
@@ -157,21 +157,18 @@ def test_no_ring_is_said_to_be_none(detector: RingDetector) -> None:
         RingDetector(make_view(Camera(aim=0.02)), PULLER)
 
 
-def test_a_spoilt_line_hardly_moves_the_ring(detector: RingDetector) -> None:
+def test_a_few_wrong_scan_lines_hardly_move_the_ring(detector: RingDetector) -> None:
     image = picture(PULLER.r_0, PULLER.h_0, PULLER, VIEW)
     image[64:, 70:75] = 255
     assert abs(detector.read(image).radius - PULLER.r_0) < 0.1 * detector.pixel
 
 
-def test_projection_of_the_aim_is_the_middle() -> None:
-    aimed = project(Camera().aim, 0.0, 0.0, VIEW)
-    assert (aimed.row, aimed.column) == pytest.approx((0.5 * ROWS, 0.5 * COLUMNS))
+def test_the_optical_axis_meets_the_aim() -> None:
+    assert project(Camera().aim, 0.0, 0.0, VIEW) == pytest.approx((0.5 * ROWS, 0.5 * COLUMNS))
 
 
 def test_every_parameter_of_the_camera_has_unit_meaning_and_source() -> None:
-    described = describe(Camera)
-    assert tuple(described) == Camera._fields
-    assert all(quantity.unit and quantity.meaning and quantity.source for quantity in described.values())
+    assert all(quantity.unit and quantity.meaning and quantity.source for quantity in describe(Camera).values())
 
 
 @pytest.mark.parametrize(
@@ -193,7 +190,7 @@ def test_impossible_cameras_are_refused_in_one_line(change: dict[str, Any], says
     assert "\n" not in str(raised.value)
 
 
-def test_a_camera_belongs_to_its_observation() -> None:
+def test_a_camera_needs_the_camera_observation_and_changes_the_hash() -> None:
     with pytest.raises(ValueError, match="observation"):
         make_config(camera=Camera())
     with pytest.raises(ValueError, match=r"cz_gym\.camera\.Camera"):
@@ -202,7 +199,7 @@ def test_a_camera_belongs_to_its_observation() -> None:
     assert looking[0] != looking[1]
 
 
-def test_another_puller_is_in_the_picture() -> None:
+def test_images_and_detector_follow_another_puller() -> None:
     parameters = Parameters(r_0=0.06, R_cr=0.2)
     puller, view = make_puller(parameters), make_view(camera_for(parameters))
     assert abs(RingDetector(view, puller).read(picture(0.061, puller.h_0, puller, view)).radius - 0.061) < 1e-4
@@ -211,7 +208,7 @@ def test_another_puller_is_in_the_picture() -> None:
 
 
 @pytest.mark.slow  # compiles step and image for another meniscus
-def test_the_exact_meniscus_is_in_the_picture() -> None:
+def test_images_and_detector_follow_the_exact_meniscus() -> None:
     puller = make_puller(meniscus=YOUNG_LAPLACE)
     detector = RingDetector(VIEW, puller)
     env = CzEnv("nominal", observation="camera", meniscus=YOUNG_LAPLACE, info="all")
