@@ -1,4 +1,4 @@
-"""Learned controllers: training with stable-baselines3, and running what was trained without it.
+"""Learned controllers: trained with stable-baselines3 or by exact gradients, run by onnxruntime alone.
 
 ``load("gradient")`` is a trained agent, ready to act. Importing this package needs neither torch nor
 stable-baselines3; training (:mod:`cz_gym.agents.training.learners`) needs both.
@@ -23,11 +23,11 @@ DEFAULT = "gradient"
 
 
 def load(name: str | Path = DEFAULT, config: Config | None = None) -> OnnxPolicy:
-    """A trained agent, ready for ``predict``: the shipped one of that name, or that of an agent file (.onnx).
+    """A trained agent, ready for ``predict``: a shipped one by its name, or an agent file (.onnx).
 
-    With a config, it must have been trained on the same nominal plant, and for its observation, actions and control
-    interval; without, ``gym.make("Cz-v0", **agent.settings)`` makes an environment for it. AgentFileError says in one
-    line why an agent cannot be had, or names what there is.
+    With a config, the agent must be made for its plant, observation, actions and control interval; without,
+    ``gym.make("Cz-v0", **agent.settings)`` makes an environment for the agent. AgentFileError says in one line why the
+    agent cannot be loaded.
     """
     policy = OnnxPolicy.load(name if Path(name).suffix == ".onnx" else shipped(str(name)), config)
     for setting, value in policy.settings.items():
@@ -45,16 +45,13 @@ def shipped_names() -> list[str]:
 
 
 def shipped_seeds(name: str = DEFAULT) -> list[Path]:
-    """Paths of the trained agents of that name that come with the package, one a training seed, in their order.
-
-    AgentFileError names what there is.
-    """
-    found = {int(path.stem.removeprefix(f"{name}-seed")): path for path in MODELS.glob(f"{name}-seed[0-9]*.onnx")}
-    if not found:
+    """Paths of the shipped agents of that name, by training seed; AgentFileError lists the names there are."""
+    paths = {int(path.stem.removeprefix(f"{name}-seed")): path for path in MODELS.glob(f"{name}-seed[0-9]*.onnx")}
+    if not paths:
         raise AgentFileError(unknown("shipped agent", name, shipped_names()))
-    return [found[seed] for seed in sorted(found)]
+    return [paths[seed] for seed in sorted(paths)]
 
 
 def shipped(name: str = DEFAULT) -> Path:
-    """Path of the one of :func:`shipped_seeds` of least cost on validation episodes that picked nothing before."""
+    """Path of the shipped agent of that name with the least validation cost."""
     return min(shipped_seeds(name), key=lambda path: read_agent(path)[0].validation_cost)

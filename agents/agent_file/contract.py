@@ -1,4 +1,4 @@
-"""What an agent file promises: the JSON beside each ONNX file, and the errors for files that break it."""
+"""The contract of an agent file, the JSON beside each ONNX file; and reading and writing both."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ class AgentFileError(CzError):
 
 @dataclass(frozen=True)
 class Contract:
-    """What the agent saw, on which plant it was trained, and how it came about."""
+    """What an agent reads, how it acts, and how it was trained."""
 
     observation: str
-    """Observation mode it reads."""
+    """Name of the observation that it reads."""
     channels: int
     """Length of that observation."""
     observation_hash: str
-    """Hash of that observation's channels: names, units and scales in their order."""
+    """Hash of that observation's channels: their names, units and scales, in order."""
     action: str
-    """What its actions mean: "direct", "smooth" or "rate" (:func:`cz_gym.task.drives_of`)."""
+    """Meaning of its actions: "direct", "smooth" or "rate" (:func:`cz_gym.task.drives_of`)."""
     control_interval: float
-    """Time between actions it was trained at [s]."""
+    """Time between its actions [s]."""
     plant_hash: str
     """Hash of the nominal plant it was trained on."""
     scenario: str
@@ -54,27 +54,27 @@ class Contract:
     scenario_hash: str
     """Hash of that scenario."""
     algorithm: str
-    """Name of the recipe that it was trained by."""
+    """Name of the recipe that trained it."""
     training_seed: int
     """Seed of the training run."""
     training_steps: int
-    """Environment steps of learning from reward behind these weights; 0 for an imitation."""
+    """Environment steps of learning from reward or cost; 0 for an imitation."""
     validation_cost: float
-    """Mean cost of a step, weighed as in training [-], on validation episodes: those that judge a run at its end."""
+    """Mean cost of a step with the training's weights [-], on the validation episodes that choose no agent."""
     validation_rmse_mm: float
-    """Mean RMSE on the same [mm]."""
+    """Mean RMSE on the same episodes [mm]."""
     sha256: str
     """Hash of the ONNX file."""
 
 
 def observation_hash(name: str) -> str:
-    """Hash of an observation mode's channels (16 hex digits); their explanations do not count."""
+    """Hash of an observation's channels (16 hex digits): names, units and scales, not their explanations."""
     channels = [(channel.name, channel.unit, channel.scale) for channel in OBSERVATIONS[name]]
     return hashlib.sha256(json.dumps([channels, CLIP]).encode()).hexdigest()[:16]
 
 
 def facts_of(config: Config) -> dict[str, Any]:
-    """What a contract says of the environment's settings."""
+    """The fields of a contract that follow from the environment's settings."""
     return {
         "observation": config.observation,
         "channels": len(OBSERVATIONS[config.observation]),
@@ -87,9 +87,9 @@ def facts_of(config: Config) -> dict[str, Any]:
 
 
 def make_contract(onnx_bytes: bytes, **facts: Any) -> Contract:
-    """The contract of an ONNX file; ``facts`` are Contract's fields without the hashes of observation and file.
+    """The contract of an ONNX file; ``facts`` are its fields without the hashes of observation and file.
 
-    AgentFileError for a fact that no contract may hold.
+    AgentFileError for a value that no contract may hold.
     """
     digest = hashlib.sha256(onnx_bytes).hexdigest()
     known = {**facts, "observation_hash": observation_hash(facts["observation"]), "sha256": digest}
@@ -104,14 +104,14 @@ def agent_files(path: Path, onnx_bytes: bytes, contract: Contract) -> dict[Path,
 
 
 def write_agent(path: Path, onnx_bytes: bytes, **facts: Any) -> Contract:
-    """Write an agent file with its contract, both or none; ``facts`` as for :func:`make_contract`."""
+    """Write an agent file with its contract; ``facts`` as for :func:`make_contract`."""
     contract = make_contract(onnx_bytes, **facts)
     write_files(agent_files(path, onnx_bytes, contract))
     return contract
 
 
 def read_agent(path: Path) -> tuple[Contract, bytes]:
-    """The contract and the ONNX bytes of an agent file; AgentFileError with the reason if anything is wrong."""
+    """The contract and the ONNX bytes of an agent file; AgentFileError says what is wrong."""
     onnx_bytes = read_bounded(path, MAX_BYTES)
     contract = _parse(path.with_suffix(".json"))
     if hashlib.sha256(onnx_bytes).hexdigest() != contract.sha256:
@@ -120,7 +120,7 @@ def read_agent(path: Path) -> tuple[Contract, bytes]:
 
 
 def read_bounded(path: Path, limit: int) -> bytes:
-    """The contents of a regular file of at most ``limit`` bytes; AgentFileError for others, pipes and devices too."""
+    """The contents of a regular file of at most ``limit`` bytes; AgentFileError for others, also pipes and devices."""
     try:
         # O_NONBLOCK: opening a pipe would wait for a writer. O_BINARY: Windows would end the file at a Ctrl-Z.
         flags = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
@@ -141,7 +141,7 @@ def read_bounded(path: Path, limit: int) -> bytes:
 
 
 def read_json(path: Path) -> Any:
-    """What a JSON file of bounded size says; AgentFileError if it is none."""
+    """The content of a JSON file of bounded size; AgentFileError if it is none."""
     content = read_bounded(path, MAX_JSON_BYTES)
     try:
         return json.loads(content)
@@ -166,14 +166,14 @@ def _parse(path: Path) -> Contract:
 
 
 def _check(given: Mapping[str, Any], where: Path | str) -> None:
-    """AgentFileError unless every value is what a contract's field of that name holds."""
+    """AgentFileError unless every value is one that the contract's field may hold."""
     for field in fields(Contract):
         if wrong := _wrong(str(field.type), given[field.name]):
             raise AgentFileError(f"{where}: field {field.name!r} must be {wrong}, not {given[field.name]!r:.80}")
 
 
 def _wrong(kind: str, value: Any) -> str | None:
-    """What a value of this kind must be, if this one is not."""
+    """What is wrong with a value of this kind: the text after "must be"; None if nothing is."""
     if kind == "str":
         plain = isinstance(value, str) and 0 < len(value) <= MAX_TEXT and value.isprintable() and "|" not in value
         return None if plain else f"printable text of 1 to {MAX_TEXT} characters without |"  # it stands in tables

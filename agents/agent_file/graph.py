@@ -1,8 +1,8 @@
-"""What an agent's ONNX graph may hold: a small feed-forward network, with a state on request, and nothing else.
+"""The check of an agent's ONNX graph: a small feed-forward network, optionally with a state, and nothing else.
 
-The graph is read and judged here before onnxruntime sees it, and what onnxruntime gets is written anew from what was
-judged. Every bound is known before anything is computed: no operator loops, branches, reads other files or makes a
-tensor larger than its inputs say, and a puller's action depends on that puller's row alone.
+The graph is checked here before onnxruntime sees it, and onnxruntime gets a graph rebuilt from the checked parts. Every
+bound is known before anything is computed: no operator loops, branches, reads other files or makes a tensor larger than
+its inputs say, and a puller's action depends on that puller's row alone.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ OPERATORS = (
 )  # fmt: skip
 """Operators an agent may use, of the standard ONNX domain."""
 OPSETS = range(13, 22)
-"""Versions of the standard operators that are known here."""
+"""Versions of the standard operators that an agent may use."""
 INPUTS, OUTPUTS = ("observation", "state"), ("action", "next_state")
-"""What a graph is given and gives; the second of each only if the agent remembers."""
+"""Names of a graph's inputs and outputs; the second of each only with a memory."""
 MAX_NODES = 256
 MAX_PARAMETERS = 1_000_000
-"""Most numbers that weights may hold, each counted as often as it is used."""
+"""Largest number of weights, each counted as often as it is used."""
 MAX_ACTIVATIONS = 32_768
-"""Most numbers that all results of a puller's row may hold together."""
+"""Largest number of results for a puller's row, over all nodes."""
 MAX_RANK = 3
 
 
 class GraphError(CzError):
-    """A graph is no agent's; the message says why."""
+    """A graph that no agent may have; the message says why."""
 
 
 def checked(onnx_bytes: bytes, channels: int) -> tuple[bytes, int]:
-    """A graph that may be run, written anew, and the length of its state (0: none). Raises GraphError, ImportError."""
+    """The checked graph, rebuilt, and the length of its state (0: none). Raises GraphError, ImportError."""
     import onnx
     from google.protobuf.message import Error as ProtobufError
 
@@ -59,7 +59,7 @@ def checked(onnx_bytes: bytes, channels: int) -> tuple[bytes, int]:
 
 
 def _check_model(model: Any) -> None:
-    """Refuse everything but one graph of plain nodes, before any of its contents are used."""
+    """Refuse everything except one graph of plain nodes, before any of its contents are used."""
     graph = model.graph
     if not len(model.opset_import):
         raise GraphError("not a sound ONNX model")
@@ -87,7 +87,7 @@ def _check_model(model: Any) -> None:
 
 
 def _clean(graph: Any, channels: int) -> tuple[Any, int]:
-    """The same graph made anew: nodes, float weights of honest size, inputs and outputs by name; its state's length."""
+    """The graph rebuilt from its nodes, weights, inputs and outputs; and its state's length."""
     from onnx import TensorProto, helper, numpy_helper
 
     weights = {tensor.name: _array(tensor) for tensor in graph.initializer}
@@ -140,7 +140,7 @@ def _node(node: Any) -> Any:
 
 
 def _width(value: Any) -> int:
-    """k of a float32 value (n, k) with an open n; 0 if it is none."""
+    """The width k of a float32 value of shape (n, k) with open n; 0 for any other value."""
     tensor = value.type.tensor_type
     dims = [*tensor.shape.dim]
     floats = value.type.HasField("tensor_type") and tensor.elem_type == 1
@@ -156,7 +156,7 @@ def _state_length(inputs: list[Any], outputs: list[Any]) -> int:
 
 
 def _check_shapes(graph: Any) -> None:
-    """Refuse a graph whose results have unknown or large shapes, or that mixes the rows of different pullers."""
+    """Refuse a graph whose results have unknown or large shapes, or that may mix the rows of different pullers."""
     shapes = {
         value.name: value.type.tensor_type.shape.dim for value in (*graph.input, *graph.value_info, *graph.output)
     }
@@ -165,7 +165,7 @@ def _check_shapes(graph: Any) -> None:
     for node in graph.node:
         given = [name for name in node.input if name in rows]
         ranks, per_row = {len(shapes[name]) for name in given}, bool(given)
-        # Of other ranks, or on the right of a matrix product, n would meet another axis than its own.
+        # With other ranks, or on the right of a matrix product, n would meet another axis than its own.
         if len(ranks) > 1 or (node.op_type in ("MatMul", "Gemm") and node.input[1] in rows and ranks == {2}):
             raise GraphError(f"its {node.op_type} may mix the rows of different pullers")
         for name in filter(None, node.output):

@@ -22,14 +22,14 @@ Floats = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class OnnxPolicy:
-    """A deterministic, batched agent; what it remembers, if anything, travels in ``state``."""
+    """A deterministic, batched agent; its memory, if it has one, travels in ``state``."""
 
     contract: Contract
     session: Any = field(repr=False, compare=False)
     remembers: int = 0
     """Length of its state; 0 if it has none."""
     content: bytes = field(default=b"", repr=False, compare=False)
-    """The ONNX graph as it was read, so that a policy pickles."""
+    """The ONNX file, so that a policy pickles."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self).of, (self.contract, self.content)
@@ -38,16 +38,14 @@ class OnnxPolicy:
     def load(cls, path: str | Path, config: Config | None = None) -> OnnxPolicy:
         """Load an agent file (.onnx with its .json beside it).
 
-        With a config, the agent must have been trained on the same nominal plant. Raises AgentFileError with one line
-        that says why a file is refused. Nothing in the file is executed but its tensor operations.
+        With a config, the agent must have been trained on the same nominal plant. Raises AgentFileError, whose one line
+        says why the file is refused. Nothing in the file is executed except its tensor operations.
         """
         path = Path(path)
         if not path.suffix and not path.exists():
             if (file := path.with_name(f"{path.name}.onnx")).exists():
                 raise AgentFileError(f"{path}: no agent file; did you mean {file}?")
-            raise AgentFileError(
-                f"{path}: no agent file; a shipped agent is had by name: cz_gym.agents.load({str(path)!r})"
-            )
+            raise AgentFileError(f"{path}: no agent file; cz_gym.agents.load({str(path)!r}) loads a shipped agent")
         if path.suffix != ".onnx":
             raise AgentFileError(f"{path}: not an .onnx agent file")
         return cls.of(*read_agent(path), config, path)
@@ -56,7 +54,7 @@ class OnnxPolicy:
     def of(
         cls, contract: Contract, onnx_bytes: bytes, config: Config | None = None, path: str | Path = "agent"
     ) -> OnnxPolicy:
-        """An agent of what its files say; ``path`` names it in errors."""
+        """An agent from its contract and ONNX file; ``path`` names it in errors."""
         if contract.observation not in OBSERVATIONS:
             raise AgentFileError(
                 f"{path}: reads observation {contract.observation!r}, which this release does not have"
@@ -85,12 +83,12 @@ class OnnxPolicy:
 
     @property
     def observation(self) -> str:
-        """The observation mode the agent reads."""
+        """The observation that the agent reads."""
         return self.contract.observation
 
     @property
     def action(self) -> str:
-        """What its actions mean, as the environment's argument of that name says it."""
+        """The meaning of its actions, the environment's argument ``action``."""
         return self.contract.action
 
     @property
@@ -100,18 +98,17 @@ class OnnxPolicy:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What ``gym.make("Cz-v0", ...)`` must be given for it: observation, action and control interval [s]."""
+        """Its arguments of ``gym.make("Cz-v0", ...)``: observation, action and control interval [s]."""
         return {name: getattr(self.contract, name) for name in ("observation", "action", "control_interval")}
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[npt.NDArray[np.float32], Any]:
-        """Actions, shape (n, 2) or (2,), of observations of shape (n, channels) or (channels,).
+        """Actions, shape (n, 2) or (2,), for observations of shape (n, channels) or (channels,).
 
-        Environments of other actions, of another control interval or with another plant refuse them.
-
-        An agent that remembers takes and returns ``state``, shape (n, k) or (k,); None, and rows where
-        ``episode_start``, begin at zero. One that does not returns it as it was.
+        Environments that the agent was not made for refuse them. An agent with a memory takes and returns ``state``,
+        shape (n, k) or (k,); it starts at zero where ``state`` is None or ``episode_start`` is true. An agent without
+        one returns ``state`` unchanged.
         """
         array = np.asarray(observation, np.float32)
         if array.ndim not in (1, 2) or array.shape[-1] != self.contract.channels:
@@ -144,7 +141,7 @@ class OnnxPolicy:
 
 
 def _session(path: str | Path, onnx_bytes: bytes, channels: int) -> tuple[Any, int]:
-    """The graph, ready to run, and the length of its state."""
+    """The session that runs the graph, and the length of its state."""
     try:
         import onnxruntime
 

@@ -1,4 +1,4 @@
-"""Demonstrations: what a controller, the teacher, would do on crystals that it or its imitation drives."""
+"""Demonstrations: a controller's actions on crystals that it or its imitation drives."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from cz_gym.task import drives_of
 
 Floats = npt.NDArray[np.float32]
 SAMPLE_EVERY = 4
-"""Control intervals between the samples that are demonstrated."""
+"""Control intervals between demonstrated samples."""
 
 
 class Demonstrations(NamedTuple):
-    """Observations, and what the teacher would do there."""
+    """Observations, and the teacher's actions there."""
 
     observation: Floats
     """Shape (samples, channels)."""
     action: Floats
-    """What the teacher's answer is in the environment's actions; may lie outside their box. Shape (samples, 2)."""
+    """The teacher's answer as an action of the environment, not clipped; shape (samples, 2)."""
 
     @classmethod
-    def joined(cls, parts: Iterable[Demonstrations]) -> Demonstrations:
-        """All of them as one."""
+    def concatenated(cls, parts: Iterable[Demonstrations]) -> Demonstrations:
+        """Several demonstrations as one."""
         return cls(*map(np.concatenate, zip(*parts, strict=True)))
 
 
@@ -42,11 +42,11 @@ def demonstrate(
     driver: Callable[[Floats], Floats] | None = None,
     progress: Callable[[int], None] = lambda steps: None,
 ) -> Demonstrations:
-    """Ask the teacher, ``predict`` on "history" to drives, at every sample of one episode a seed.
+    """Label one episode a seed with the actions of a teacher, whose ``predict`` maps "history" to drives.
 
-    A privileged teacher (``for_episodes``) knows what no sensor shows of those episodes. The teacher drives, or a
-    ``driver``, a function of the observation; noise of that spread is added. A lost crystal demonstrates nothing more.
-    ``progress`` hears of the environment steps taken.
+    A privileged teacher (``for_episodes``) knows what no sensor shows of those episodes. The teacher drives, or the
+    ``driver``, a function of the observation; ``noise`` is the standard deviation added to its actions. Samples
+    after a crystal is lost are left out. ``progress`` receives the environment steps taken.
     """
     n = len(seeds)
     if hasattr(teacher, "for_episodes"):
@@ -70,11 +70,11 @@ def demonstrate(
         running &= ~over
         progress(n)
     env.close()
-    return Demonstrations.joined(samples)
+    return Demonstrations.concatenated(samples)
 
 
 def widened(scenario: Scenario, width: float) -> Scenario:
-    """The scenario with its pullers, ramps, fluctuations and noises spread that many times as wide."""
+    """The scenario with the spread of its pullers, ramps, fluctuations and noises multiplied by ``width``."""
     if width == 1.0:
         return scenario
     s, pullers = scenario, scenario.pullers

@@ -1,7 +1,7 @@
 """From a trained network to an ONNX file: normalisation, layers and clipping in one graph.
 
-Written operator by operator, because torch's exporter without further packages is the deprecated one, whose graphs
-hold operators that agents' files may not (:mod:`cz_gym.agents.agent_file.graph`).
+The graph is built operator by operator, because torch's exporter without further packages is the deprecated one, whose
+graphs hold operators that agent files may not (:mod:`cz_gym.agents.agent_file.graph`).
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ ACTIVATIONS: dict[type[torch.nn.Module], tuple[str, dict[str, str]]] = {
     torch.nn.ELU: ("Elu", {"alpha": "alpha"}),
     torch.nn.LeakyReLU: ("LeakyRelu", {"alpha": "negative_slope"}),
 }
-"""Modules of one ONNX operator, with its attributes and what torch calls them."""
+"""Modules that are one ONNX operator: its name, and its attributes with torch's names for them."""
 
 
 class OnnxGraph:
-    """An agent's graph in the making; every node is named after its output."""
+    """Builds an agent's graph; every node is named after its output."""
 
     def __init__(self) -> None:
         self._nodes: list[Any] = []
         self._constants: list[Any] = []
         self.tensors: dict[str, torch.Tensor] = {}
-        """The tensors that its constants were made of, by the constants' names."""
+        """The tensors behind its constants, by the constants' names."""
 
     def unused(self, kind: str) -> str:
-        """A name that nothing in the graph has yet."""
+        """A name that is not used in the graph yet."""
         return f"{kind.lower()}_{len(self._nodes)}_{len(self._constants)}"
 
     def constant(self, name: str, value: Any) -> str:
-        """A weight, of a tensor or of numbers; its name."""
+        """Add a constant, from a tensor or from numbers; returns its name."""
         if isinstance(value, torch.Tensor):
             self.tensors[name] = value = value.detach()
         array = np.asarray(value)
@@ -52,21 +52,21 @@ class OnnxGraph:
         return name
 
     def node(self, operator: str, inputs: list[str], output: str, **attributes: Any) -> str:
-        """An operator with one output; its name."""
+        """Add an operator with one output; returns its name."""
         self.nodes_of(operator, inputs, [output], **attributes)
         return output
 
     def nodes_of(self, operator: str, inputs: list[str], outputs: list[str], **attributes: Any) -> None:
-        """An operator with several outputs."""
+        """Add an operator with several outputs."""
         self._nodes.append(helper.make_node(operator, inputs, outputs, **attributes))
 
     def linear(self, x: str, weight: torch.Tensor, bias: torch.Tensor | None, name: str) -> str:
-        """A layer of weight (out, in) and bias (out,)."""
+        """Add a layer with weight (out, in) and bias (out,)."""
         parameters = {"weight": weight, "bias": torch.zeros(len(weight)) if bias is None else bias}
         return self.node("Gemm", [x, *(self.constant(f"{name}_{k}", v) for k, v in parameters.items())], name, transB=1)
 
     def apply(self, x: str, modules: Iterable[torch.nn.Module]) -> str:
-        """x through torch's modules, one after the other; TypeError for one that is not known here."""
+        """Apply torch's modules to x, one after the other; TypeError for a module that cannot be exported."""
         for module in modules:
             name = f"module_{len(self._nodes)}"
             if isinstance(module, torch.nn.Sequential):
@@ -87,9 +87,9 @@ class OnnxGraph:
         return x
 
     def lstm_step(self, x: str, lstm: torch.nn.LSTM) -> str:
-        """One step of torch's LSTM; the new hidden values. Gates (input, forget, cell, output) = W x + U h + b.
+        """Add one step of torch's LSTM; returns the new hidden values.
 
-        Hidden and cell values stand side by side in ``state`` and ``next_state``.
+        Gates (input, forget, cell, output) = W x + U h + b; the states are hidden and cell values, concatenated.
         """
         half = self.constant("halves", np.full(2, lstm.hidden_size))
         quarter = self.constant("quarters", np.full(4, lstm.hidden_size))
@@ -108,17 +108,17 @@ class OnnxGraph:
         return hidden
 
     def acted(self, x: str, actor: Actor, name: str) -> str:
-        """The actor's output, within -1 and 1."""
+        """Add the actor's layers; their output is clipped to [-1, 1]."""
         x = x if actor.lstm is None else self.lstm_step(x, actor.lstm)
         return self.clip(self.apply(x, actor.layers), -1.0, 1.0, name)
 
     def clip(self, x: str, low: float, high: float, name: str) -> str:
-        """x within [low, high]."""
+        """Add a clip of x to [low, high]."""
         limits = [self.constant(f"{name}_{end}", np.float32(value)) for end, value in (("low", low), ("high", high))]
         return self.node("Clip", [x, *limits], name)
 
     def normalised(self, normalise: Normalise) -> str:
-        """The normalised observation, of the channels that an actor may see."""
+        """Add the normalisation of the channels that an actor may see."""
         n = min(len(normalise.mean), len(HISTORY))
         scaling = (normalise.visible[:n, None] * normalise.scaling[:n, :n]).contiguous()
         x = self.node("Sub", ["observation", self.constant("mean", normalise.mean[:n])], "centred")
@@ -126,7 +126,7 @@ class OnnxGraph:
         return self.clip(x, -NORMALISED_LIMIT, NORMALISED_LIMIT, "normalised")
 
     def finished(self, channels: int, state: int = 0) -> bytes:
-        """The model, checked and serialised; it remembers so many numbers."""
+        """The model, checked and serialised; ``state`` is the length of its state."""
 
         def value(name: str, width: int) -> Any:
             return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", width])
@@ -142,7 +142,7 @@ class OnnxGraph:
 
 
 def actor_of(policy: Any) -> Actor:
-    """The actor of a policy of any algorithm; TypeError if it has none, or one that an agent file cannot hold."""
+    """The actor of any algorithm's policy; TypeError if it has none, or one that an agent file cannot hold."""
     if isinstance(policy, ActorCriticPolicy):
         lstm, net = getattr(policy, "lstm_actor", None), policy.mlp_extractor.policy_net
         if lstm is not None and lstm.num_layers > 1:
@@ -157,10 +157,7 @@ def actor_of(policy: Any) -> Actor:
 
 
 def actor_onnx(actor: Actor) -> bytes:
-    """An actor that begins with :class:`.networks.Normalise`.
-
-    The hidden and cell values of an LSTM travel in the file's ``state``, shape (n, 2 units): nothing in the file loops.
-    """
+    """The ONNX model of an actor that begins with :class:`.networks.Normalise`."""
     assert isinstance(actor.extractor, Normalise)
     graph = OnnxGraph()
     graph.acted(graph.normalised(actor.extractor), actor, "action")

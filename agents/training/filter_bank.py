@@ -175,8 +175,8 @@ class FilterBank(nn.Module):
     def back(self, by_features: Any, by_means: Any) -> tuple[Any, Any]:
         """Gradients with respect to readings (n, 11) and means before, from those of features and means after.
 
-        Arrays. Noise, swings, outliers, ripples and readings that failed are taken as they are: no action is chosen for
-        what it does to their estimates.
+        Noise, swings, outliers, ripples and failed readings have no gradient: no action is chosen for its effect on their
+        estimates.
         """
         by_seen = by_features[:, :-N_DETACHED] @ self.features.numpy().T
         by_means = by_means + by_seen[:, len(MEASURED) :]
@@ -198,7 +198,7 @@ class FilterBank(nn.Module):
         return clamp((features - self.mean) * self.per_std, -NORMALISED_LIMIT, NORMALISED_LIMIT)
 
     def _schedule(self, x: Any, features: Any) -> Any:
-        """What the linear map is scheduled on, each in a column."""
+        """The scheduling variables, each in a column."""
         width = len(self.mean)
         strengths = clamp(columns(x, range(width - _STRENGTHS, width)), -SCHEDULE_LIMIT, SCHEDULE_LIMIT)
         ripple, noise, _, _, *swings = split(strengths, [1] * _STRENGTHS)
@@ -223,7 +223,7 @@ class FilterBank(nn.Module):
         return self.act(features), after
 
     def onnx(self) -> bytes:
-        """The same as an agent's graph."""
+        """The network as an agent's ONNX model."""
         return self._graph()[1]
 
     def load(self, content: bytes) -> None:
@@ -244,7 +244,7 @@ class FilterBank(nn.Module):
 
 
 def read_bank(start: str, seed: int, config: Config, hidden: tuple[int, ...], scheduled: bool = True) -> FilterBank:
-    """The network of an agent that training continues from: of a file, or of this seed in a folder or by shipped name.
+    """The network of an agent that training continues from: a file, a folder of runs, or a shipped name and this seed.
 
     AgentFileError for an agent of another recipe, action or control interval.
     """
@@ -265,7 +265,7 @@ def read_bank(start: str, seed: int, config: Config, hidden: tuple[int, ...], sc
 
 
 def _filters(interval: float) -> tuple[Any, Any, Any]:
-    """What is kept of the means a step, what a reading adds, and what features are made of both.
+    """Matrices of the leaky means: their decay in a step, the gain of readings, and the features of both.
 
     Shapes (means,), (11, means), (11 + means, width).
     """

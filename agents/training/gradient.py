@@ -1,8 +1,7 @@
 """Learning from the gradient of the cost: through policy, memory and plant, window by window of the crystal.
 
-The plant's derivatives are the exact ones of :class:`cz_gym.differentiable.DifferentiableBatch`. What the network
-estimates beside its means (noise, swings, ripple) and the schedule that follows from it are taken as given. No critic,
-no teacher.
+The plant's derivatives are the exact ones of :class:`cz_gym.differentiable.DifferentiableBatch`. The network's
+estimates beside its means (noise, swings, ripple) and its schedule have no gradient. No critic, no teacher.
 """
 
 from __future__ import annotations
@@ -114,7 +113,7 @@ class GradientLearner:
         self.weights = np.array(recipe.weights) / np.array(WEIGHTS)
 
     def learn(self, watch: Watch) -> None:
-        """Take the updates that are left."""
+        """Make the updates that are left."""
         recipe, n = self.recipe, self.recipe.num_envs
         batch = self._crystals()
         measured = batch.reset(self._seeds(n))
@@ -178,7 +177,7 @@ class GradientLearner:
         return Window(torch.stack(features), np.stack(costs), np.stack(beyond), jacobians, measured, memory)
 
     def _weighed(self, step: Step) -> Step:
-        """The same with the radius error's cost as the recipe counts it."""
+        """The step with the radius error's cost as the recipe counts it."""
         if not self.recipe.observable:
             return step
         error = np.where(step.grows, step.error + step.offset, 0.0)
@@ -188,7 +187,7 @@ class GradientLearner:
         return step
 
     def _beyond(self, measured: Any, action: Any, step: Step) -> Any:
-        """What each action adds to the gradient where a limit of the pull speed cuts its move off, shape (n,).
+        """The gradient of each action where a limit of the pull speed cuts its move off, shape (n,).
 
         The cost does not depend on the action there, so a policy that asks for more than the drive does would never
         learn to ask for less. The move that was asked for is charged instead.
@@ -200,9 +199,9 @@ class GradientLearner:
         return np.where(step.grows & (charged > 1.001 * step.cost[:, _PULL_STEP] + 1e-9), gain, 0.0)
 
     def _follow(self, window: Window, measured_by_state: Any) -> None:
-        """Follow the gradient of the window's cost: back through plant and memory step by step, then into the weights.
+        """Update the weights by the gradient of the window's cost, back through plant and memory step by step.
 
-        What the network's action makes of its features has its derivatives taken for some steps at once.
+        The derivatives of actions by features are computed for AT_ONCE steps at a time.
         """
         cost = window.costs @ self.weights
         capped = saturated(cost)
@@ -247,10 +246,10 @@ class GradientLearner:
         network.per_std.copy_(1.0 / torch.clamp(variance.sqrt(), LEAST_STD, MOST_STD))
 
     def _whiten(self, features: torch.Tensor, progress: float) -> None:
-        """Gather how the features vary together; after the warm-up have the weights learned of whitened ones.
+        """Estimate the features' covariance; after the warm-up, change to weights of whitened features.
 
-        The means' differences are alike, so that a step that changes one weight alone changes the action little. What
-        no action is chosen for stays as it is. The policy stays the same, and the optimiser begins anew.
+        The means' differences are strongly correlated, so that a step in one weight alone changes the action little.
+        Features without gradient are not whitened. The policy stays the same, and the optimiser begins anew.
         """
         if progress < WARM_UP:
             x = self.network.normalised(features).double()
@@ -275,7 +274,7 @@ class GradientLearner:
         return [int(seed) for seed in self.random.choice(len(TRAINING_SEEDS), count)]
 
     def parts(self) -> Parts:
-        """Network, optimiser, the last gradients' norms, and what the warm-up has gathered."""
+        """Network, optimiser, the last gradients' norms, and the sums of the warm-up."""
         variables = {"norms": self.norms, "products": self.products, "seen": self.seen}
         if self.expectation:
             variables |= {"expectation": self.expectation.products, "expectation_ring": self.expectation.with_ring}

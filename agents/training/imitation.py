@@ -1,8 +1,8 @@
 """Imitation learning: a network is fitted to a teacher's demonstrations (DAgger; Ross, Gordon, Bagnell 2011).
 
-The teacher first controls crystals itself while noise disturbs its actions, so that its answers to mistakes are seen
-too; then the imitation controls while the teacher says what it would have done. The linear path is a ridge regression
-on the whitened observations of the first round; then the whole actor is fitted by gradient, round by round.
+In the first round the teacher controls crystals, with noise on its actions, so that it also demonstrates corrections.
+In later rounds the imitation controls them, and the teacher labels what it would have done. The linear path is a ridge
+regression on the whitened observations of the first round; then the whole actor is fitted by gradient, round by round.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from .recipes import Imitation
 RIDGE = 1e-6
 """Regularisation of the regression, in units of the whitened observation's variance."""
 SPREAD_FLOOR = 1e-6
-"""Least spread of the demonstrated outputs that a loss is divided by [-]."""
+"""Least spread of the demonstrated actions that a loss is divided by [-]."""
 BATCH = 4096
 
 
 class Imitator:
     """A learner that imitates the teacher which its recipe names.
 
-    ``config`` is the scenario's own environment. An imitation that is interrupted begins again: what it learned from
-    is not in a checkpoint.
+    ``config`` is the recipe's environment. An imitation that is interrupted begins again, because a checkpoint does not
+    hold its demonstrations.
     """
 
     def __init__(self, recipe: Imitation, seed: int, teacher: Any, config: Config, logger: Logger, done: int) -> None:
@@ -57,12 +57,12 @@ class Imitator:
         torch.manual_seed(self.seed)
         demonstrations: Demonstrations | None = None
         for turn in range(recipe.rounds):
-            found = self._round(turn, watch)
+            new = self._round(turn, watch)
             if demonstrations is None:
-                demonstrations = found
-                fit_linear_path(self.network, found)
+                demonstrations = new
+                fit_linear_path(self.network, new)
             else:
-                demonstrations = Demonstrations.joined([demonstrations, found])
+                demonstrations = Demonstrations.concatenated([demonstrations, new])
             taken = (turn + 1) * recipe.episodes * self.config.steps
             watch(taken, f"round {turn + 1} of {recipe.rounds}: fits {len(demonstrations.action):,} samples")
             self.logger.record("imitation/loss", fit(self.network, demonstrations, recipe))
@@ -75,7 +75,7 @@ class Imitator:
         recipe = self.recipe
         first = (self.seed * 20_011 + 500_000) % (len(TRAINING_SEEDS) - recipe.rounds * recipe.episodes)
         seeds = range(first + turn * recipe.episodes, first + (turn + 1) * recipe.episodes)
-        many, taken = round(recipe.wide_share * recipe.episodes), turn * recipe.episodes * self.config.steps
+        wide_episodes, taken = round(recipe.wide_share * recipe.episodes), turn * recipe.episodes * self.config.steps
         wide = self.config.with_scenario(widened(self.config.scenario, recipe.width))
 
         def progress(steps: int) -> None:
@@ -84,9 +84,9 @@ class Imitator:
             watch(taken, f"round {turn + 1} of {recipe.rounds}: {recipe.teacher} demonstrates")
 
         driver = mean_action(self.network) if turn else None
-        return Demonstrations.joined(
+        return Demonstrations.concatenated(
             demonstrate(self.teacher, config, some, recipe.noise, driver, progress)
-            for config, some in ((wide, seeds[:many]), (self.config, seeds[many:]))
+            for config, some in ((wide, seeds[:wide_episodes]), (self.config, seeds[wide_episodes:]))
             if some
         )
 
@@ -100,9 +100,9 @@ class Imitator:
 
 
 class ImitationNetwork(torch.nn.Module):
-    """Normalised observation -> tanh layers, and beside them the observation itself -> linear -> action.
+    """Normalised observation -> tanh layers, concatenated with the observation itself -> linear -> action.
 
-    The linear path carries what a linear controller would do, the layers what bends it.
+    The linear path carries the linear part of the controller, the layers the nonlinear part.
     """
 
     def __init__(self, hidden: tuple[int, ...], memory: float) -> None:
@@ -119,18 +119,18 @@ class ImitationNetwork(torch.nn.Module):
 
     @property
     def actor(self) -> Actor:
-        """What is exported."""
+        """The actor to export."""
         return Actor(self.normalise, None, [self.layers, self.last])
 
 
 def make_network(recipe: Imitation, seed: int) -> ImitationNetwork:
-    """The network with that training seed's first weights."""
+    """The network with the initial weights of a training seed."""
     torch.manual_seed(seed)
     return ImitationNetwork(recipe.hidden, recipe.memory)
 
 
 def mean_action(network: ImitationNetwork) -> Callable[[Floats], Floats]:
-    """The network's action, within its box, as a function of "history" observations."""
+    """The network's clipped action as a function of "history" observations."""
 
     def act(observation: Floats) -> Floats:
         with torch.no_grad():
@@ -157,7 +157,7 @@ def fit_linear_path(network: ImitationNetwork, demonstrations: Demonstrations) -
 
 
 def fit(network: ImitationNetwork, demonstrations: Demonstrations, recipe: Imitation) -> float:
-    """Fit the actor by gradient and return the last loss: Huber's, of outputs of unit spread, in one cycle of rates."""
+    """Fit the actor by gradient, with Huber's loss of scaled outputs and a one-cycle learning rate; the last loss."""
     wanted = demonstrations.action
     spread = torch.as_tensor(np.maximum(np.quantile(np.abs(wanted), 0.68, axis=0), SPREAD_FLOOR).astype(np.float32))
     features = _features(network, demonstrations.observation)

@@ -1,4 +1,4 @@
-"""Networks: normalised observations, a critic that may see more than its actor, a linear path beside layers."""
+"""Networks: normalised observations, a critic that may see more than its actor, a skip connection."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ VARIANCE_FLOOR = 1e-6
 
 
 def visible_channels(channels: int, memory: float) -> npt.NDArray[np.float32]:
-    """1 for what networks see, 0 for past samples older than ``memory`` [s], shape (channels,)."""
+    """1 for channels that networks see, 0 for past samples older than ``memory`` [s], shape (channels,)."""
     visible = np.ones(channels, np.float32)
     if channels >= len(HISTORY):
         lagged = visible[len(HISTORY) - len(LAGS) * len(LAGGED) : len(HISTORY)]
@@ -32,7 +32,7 @@ def visible_channels(channels: int, memory: float) -> npt.NDArray[np.float32]:
 
 
 def whitening(covariance: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-    """The symmetric scaling that makes channels of this covariance uncorrelated, of variance one."""
+    """The symmetric matrix that makes channels of this covariance uncorrelated, with variance one."""
     variances, axes = np.linalg.eigh(covariance)
     scaling: npt.NDArray[np.float64] = axes / np.sqrt(np.maximum(variances, VARIANCE_FLOOR)) @ axes.T
     return scaling
@@ -47,7 +47,7 @@ def tanh_layers(sizes: Sequence[int]) -> nn.Sequential:
 
 
 class Normalise(BaseFeaturesExtractor):
-    """Normalised observation; part of the saved policy."""
+    """Normalises observations; part of the saved policy."""
 
     visible: torch.Tensor
     mean: torch.Tensor
@@ -61,7 +61,7 @@ class Normalise(BaseFeaturesExtractor):
         self.register_buffer("scaling", torch.eye(channels))
 
     def set(self, mean: npt.NDArray[Any], scaling: npt.NDArray[Any]) -> None:
-        """Set what observations are normalised with: (observation - mean) @ scaling, shapes (channels,) and square.
+        """Set mean and scaling of (observation - mean) @ scaling, shapes (channels,) and square.
 
         Channels that are not visible count as their mean.
         """
@@ -75,7 +75,7 @@ class Normalise(BaseFeaturesExtractor):
 
 
 class SkipConcat(nn.Module):
-    """What layers make of their input, and beside it the input itself."""
+    """The output of layers, concatenated with their input."""
 
     def __init__(self, layers: nn.Module) -> None:
         super().__init__()
@@ -87,7 +87,7 @@ class SkipConcat(nn.Module):
 
 
 class ActorCritic(nn.Module):
-    """The layers of both: the actor sees the first ``measured`` channels, the critic all."""
+    """Layers of actor and critic: the actor sees the first ``measured`` channels, the critic all."""
 
     def __init__(self, channels: int, measured: int, hidden: tuple[int, ...]) -> None:
         super().__init__()
@@ -96,7 +96,7 @@ class ActorCritic(nn.Module):
         self.latent_dim_pi, self.latent_dim_vf = (measured, *hidden)[-1], (channels, *hidden)[-1]
 
     def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Latents of actor and critic."""
+        """Last hidden layers of actor and critic."""
         return self.forward_actor(features), self.forward_critic(features)
 
     def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
@@ -111,7 +111,7 @@ class ActorCritic(nn.Module):
 
 
 class AsymmetricPolicy(ActorCriticPolicy):
-    """PPO's policy, whose actor sees the measured channels alone; what the true state adds is the critic's."""
+    """PPO's policy, whose actor sees the measured channels alone and whose critic also sees the true state."""
 
     mlp_extractor: ActorCritic  # type: ignore[assignment]  # has all of MlpExtractor that ActorCriticPolicy uses
 
@@ -124,15 +124,15 @@ class AsymmetricPolicy(ActorCriticPolicy):
 
 
 class Actor(NamedTuple):
-    """A deterministic actor, as it is exported."""
+    """A deterministic actor, ready to export."""
 
     extractor: nn.Module
-    """What its observations go through first."""
+    """First module of the actor: its features extractor."""
     lstm: nn.LSTM | None
     """Its LSTM; None without one."""
     layers: Sequence[nn.Module]
 
     @property
     def remembers(self) -> int:
-        """Numbers that it carries from step to step: hidden and cell values of its LSTM."""
+        """Length of its state: hidden and cell values of its LSTM."""
         return 2 * self.lstm.hidden_size if self.lstm is not None else 0

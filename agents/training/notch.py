@@ -1,4 +1,4 @@
-"""What of the ring's readings is outlier or ripple: an adaptive notch filter, after Dragosevic and Stankovic (1995).
+"""Removes outliers and ripple from the ring's readings: an adaptive notch filter, after Dragosevic and Stankovic (1995).
 
 Rotation makes the ring ripple at a frequency that differs from crystal to crystal; sampled, it may look slow. A
 resonator at the frequency found so far is driven by the readings less their slow part; what it does says how the
@@ -15,27 +15,27 @@ from typing import Any
 from .symbolic import clamp, concat, relu, root, split
 
 SLOW = 25.0
-"""Time constant, twice, of the readings' slow part [s]."""
+"""Time constant of the two low-passes for the readings' slow part [s]."""
 NOISE_TIME = 600.0
 """Time constant of the variance about it [s]."""
 PATIENCE = 1600.0
-"""Time constant of what the frequency is found from [s]."""
+"""Time constant of the frequency's estimate [s]."""
 OUTLIER = 3.0
-"""So many standard deviations from the slow part are the most that is believed [-]."""
+"""Limit of a reading, in standard deviations from the slow part [-]."""
 RADIUS = 0.9
-"""Of the poles of resonator and notch [-]."""
+"""Radius of the poles of resonator and notch [-]."""
 LEAST, MOST = -0.999, 0.98
 """Cosine of the turn from reading to reading: slower ripples, longer than 25 readings, are left alone."""
 SEEN = 0.02
-"""Ripples so large count half."""
+"""Amplitude of a ripple whose strength is one half."""
 BEGIN = 0.05, 0.01
-"""Standard deviation of the readings, and of the resonator's output, that it begins with."""
+"""Initial standard deviations of the readings and of the resonator's output."""
 STATE = 11
-"""Numbers that it remembers."""
+"""Length of its state."""
 
 
 def cleaned(reading: Any, state: Any, first: Any, interval: float) -> tuple[Any, Any, Any]:
-    """What to take from a reading, how strong its ripple is, from 0 to 1, and the next state, shape (n, STATE).
+    """The part of a reading to remove, the strength of its ripple, from 0 to 1, and the next state, shape (n, STATE).
 
     ``first`` is 1 for a crystal's first reading, and 0 for all others.
     """

@@ -13,7 +13,7 @@ from cz_gym.differentiable import STATES, DifferentiableBatch
 class PlantStep(torch.autograd.Function):
     """State, measured and cost from state and action: ``PlantStep.apply(state, action, batch)``.
 
-    The batch goes on by a step; the state passed in says only what gradients belong to.
+    The batch advances by a step; the state passed in only says which state the gradients belong to.
     """
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""The latest transitions of a replay buffer, as tensors of a checkpoint: an off-policy learner goes on from them."""
+"""The latest transitions of a replay buffer as tensors of a checkpoint, for off-policy learners."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy.typing as npt
 import torch
 
 MOST = 50_000
-"""Transitions in a checkpoint at most: 30 MB of "history" observations."""
+"""Largest number of transitions in a checkpoint: 30 MB of "history" observations."""
 PREFIX = "replay/"
 FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 FLAGS = ("dones", "timeouts")
@@ -49,6 +49,6 @@ def refill(buffer: Any, tensors: Tensors) -> None:
 
 
 def _alike(array: npt.NDArray[Any], tensor: torch.Tensor, flags: bool) -> bool:
-    """Whether a tensor holds rows of this array, which are zero or one if they are flags."""
+    """Whether a tensor holds rows of this array; flags must be zero or one."""
     alike = tuple(tensor.shape[1:]) == array.shape[1:] and tensor.dtype == torch.from_numpy(array).dtype
     return alike and (not flags or bool(((tensor == 0) | (tensor == 1)).all()))

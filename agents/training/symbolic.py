@@ -1,4 +1,4 @@
-"""Arithmetic that torch's tensors and an agent's graph share: a law written once is trained and exported as it is.
+"""Arithmetic on torch's tensors or on an agent's graph, so that a law written once is both trained and exported.
 
 A :class:`Value` stands for a result in the graph, shape (n, width); the functions here take tensors or values. Numbers
 and tensors that meet a value stand to its right, and become weights of the graph.
@@ -23,7 +23,7 @@ class Value:
         self.graph, self.name = graph, name
 
     def node(self, operator: str, *others: Any, **attributes: Any) -> Value:
-        """What an operator makes of this value and others."""
+        """The result of an operator on this value and others."""
         names = [self.name, *map(self._name_of, others)]
         return Value(self.graph, self.graph.node(operator, names, self.graph.unused(operator), **attributes))
 
@@ -52,7 +52,7 @@ class Value:
 
 
 def concat(parts: Sequence[Any]) -> Any:
-    """Side by side, along the last axis."""
+    """Concatenation along the last axis."""
     first = parts[0]
     return first.node("Concat", *parts[1:], axis=1) if isinstance(first, Value) else torch.cat(list(parts), dim=-1)
 
@@ -65,7 +65,7 @@ def columns(x: Any, at: Sequence[int]) -> Any:
 
 
 def split(x: Any, widths: Sequence[int]) -> list[Any]:
-    """Neighbouring columns, in parts of these widths."""
+    """Neighbouring columns, split into these widths."""
     ends = np.cumsum(widths).tolist()
     return [columns(x, range(end - width, end)) for width, end in zip(widths, ends, strict=True)]
 
@@ -81,12 +81,12 @@ def root(x: Any) -> Any:
 
 
 def clamp(x: Any, low: float, high: float) -> Any:
-    """Within [low, high]."""
+    """x clamped to [low, high]."""
     if isinstance(x, Value):
         return x.node("Clip", np.float32(low), np.float32(high))
     return torch.clamp(x, low, high)
 
 
 def apply(x: Any, module: nn.Module) -> Any:
-    """Through a module of torch."""
+    """A module of torch, applied to x."""
     return Value(x.graph, x.graph.apply(x.name, [module])) if isinstance(x, Value) else module(x)

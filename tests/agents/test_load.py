@@ -59,7 +59,7 @@ def test_a_name_is_no_file() -> None:
         agents.OnnxPolicy.load(file.with_suffix(""))
     with pytest.raises(agents.AgentFileError, match=r"not an \.onnx agent file"):
         agents.OnnxPolicy.load(file.with_suffix(".json"))
-    with pytest.raises(agents.AgentFileError, match=r"had by name: cz_gym\.agents\.load\('ppo'\)"):
+    with pytest.raises(agents.AgentFileError, match=r"cz_gym\.agents\.load\('ppo'\) loads a shipped agent"):
         agents.OnnxPolicy.load("ppo")
 
 
