@@ -175,8 +175,8 @@ class FilterBank(nn.Module):
     def back(self, by_features: Any, by_means: Any) -> tuple[Any, Any]:
         """Gradients with respect to readings (n, 11) and means before, from those of features and means after.
 
-        Noise, swings, outliers, ripples and failed readings have no gradient: no action is chosen for its effect on their
-        estimates.
+        Noise, swings, outliers, ripples and failed readings have no gradient: no action is chosen for its effect on
+        their estimates.
         """
         by_seen = by_features[:, :-N_DETACHED] @ self.features.numpy().T
         by_means = by_means + by_seen[:, len(MEASURED) :]

@@ -1,4 +1,4 @@
-"""Removes outliers and ripple from the ring's readings: an adaptive notch filter, after Dragosevic and Stankovic (1995).
+"""Removes outliers and ripple from the ring's readings: an adaptive notch filter (Dragosevic and Stankovic, 1995).
 
 Rotation makes the ring ripple at a frequency that differs from crystal to crystal; sampled, it may look slow. A
 resonator at the frequency found so far is driven by the readings less their slow part; what it does says how the
