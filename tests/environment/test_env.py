@@ -10,7 +10,6 @@ import cz_gym
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv, Parameters, Scenario, make_puller
 from cz_gym.config import Config, make_config
 from cz_gym.episodes.scenario import Actuators
-from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.plant import Disturbance, State, growth
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 
@@ -121,17 +120,6 @@ def test_equal_plants_have_equal_hashes() -> None:
     assert make_config(action="smooth").plant_hash == make_config().plant_hash
     assert make_config(action="smooth").hash != make_config().hash
     assert make_config("nominal", -0.0).hash == make_config("nominal", 0).hash
-
-
-def test_a_foreign_meniscus_is_another_plant() -> None:
-    """Its name alone does not make it Hurle's."""
-
-    def slope(r_c: Any, h_c: Any, p: Any) -> Any:
-        return HURLE.slope(r_c, h_c, p)
-
-    foreign = MeniscusModel(HURLE.name, slope, HURLE.ring_offset, HURLE.height)
-    assert make_config(meniscus=foreign).plant_hash != make_config().plant_hash
-    assert make_config(meniscus=MeniscusModel(*HURLE)).plant_hash == make_config().plant_hash
 
 
 def test_out_of_range_actions_are_clipped_and_said_so() -> None:

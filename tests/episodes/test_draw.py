@@ -12,7 +12,7 @@ from scipy import stats
 from cz_gym import SCENARIOS, Parameters, Scenario, make_puller
 from cz_gym.episodes.draw import randomised
 from cz_gym.episodes.record import FREEZES, Episode, Factors
-from cz_gym.episodes.scenario import Faults, Interface, Pullers, Recipe, Reference, Sensor
+from cz_gym.episodes.scenario import Draw, Faults, Interface, Recipe, Reference, Sensor
 from cz_gym.episodes.series import Series, draw_episode, draw_factors, new_series
 
 MM, MINUTE, SPAN = 1e-3, 60.0, 10800.0
@@ -105,28 +105,35 @@ def test_a_draw_is_made_from_its_key_alone(name: str) -> None:
     assert (same(first, other) and factors[0] == factors[1]) == SCENARIOS[name].deterministic
 
 
-FIXED = [
-    ("pullers", Pullers(mix=(0.5, 0.5), melt_loss=0.1)),
-    ("recipe", Recipe((0.01, 0.01), (60.0, 60.0), (60.0, 60.0))),
-    ("reference", Reference(0.5, (1e-3, 1e-3), (60.0, 60.0))),
-    ("reference", Reference(1.0, (1e-3, 1e-3), (60.0, 60.0))),
-    ("interface", Interface((0.1, 0.1))),
-    ("sensor", Sensor(bias_offset=(1e-4, 1e-4), latency=5.0)),
-    ("sensor", Sensor(ripple=(1e-4, 1e-4), rotation=(0.2, 0.2))),
-    ("sensor", Sensor(camera_noise=(1e-5, 1e-5))),
-    ("sensor", Sensor(outlier_probability=0.5, outlier_sd=1e-3)),
-    ("faults", Faults(flagged=(1, 1), flagged_duration=(60.0, 60.0))),
-    ("faults", Faults(unflagged=1, unflagged_duration=(60.0, 60.0))),
-    ("faults", Faults(dropout=(0.5, 0.5))),
-    ("faults", Faults(bias_drift=(-1e-4, -1e-4), bias_drift_duration=(60.0, 60.0))),
-]
+BESIDE = dataclasses.replace(
+    Scenario("deterministic"),
+    recipe=Recipe(duration=(50.0, 50.0)),
+    reference=Reference(1.0, (1e-3, 1e-3), (50.0, 50.0)),
+    sensor=Sensor(outlier_sd=1e-4, rotation=(0.1, 0.1)),
+    faults=Faults(flagged_duration=(50.0, 50.0), unflagged_duration=(50.0, 50.0)),
+)
+"""Every episode is the same, but a member that is random takes effect."""
+FAMILIES = [family.name for family in dataclasses.fields(Scenario)[1:]]
+MEMBERS = [(family, each) for family in FAMILIES for each in dataclasses.fields(getattr(BESIDE, family))]
 
 
-@pytest.mark.parametrize(("family", "part"), FIXED)
-def test_deterministic_means_that_every_draw_is_the_same(family: str, part: Any) -> None:
-    scenario = dataclasses.replace(Scenario("mine"), **{family: part})
-
-    assert all(same(felt(scenario, keys(1)[0]), felt(scenario, key)) for key in keys(12)) == scenario.deterministic
+@pytest.mark.parametrize("spread", [0.0, 0.5])
+@pytest.mark.parametrize(("family", "member"), MEMBERS, ids=lambda part: getattr(part, "name", part))
+def test_every_member_says_whether_it_is_random(family: str, member: Any, spread: float) -> None:
+    """What is called deterministic draws the same episode for every key; a member that says nothing fails."""
+    says, whole = member.metadata["member"], isinstance(np.ravel(member.default)[0].item(), int)
+    high = says.high if whole else min(0.5 * says.high, 100.0)
+    low = high if not spread else 0 if whole else spread * high
+    value = (low, high) if isinstance(member.default, tuple) else low if says.draw is Draw.CHANCE else high
+    part = dataclasses.replace(getattr(BESIDE, family), **{member.name: value})
+    scenario = dataclasses.replace(BESIDE, **{family: part})
+    random = says.draw in (Draw.NONZERO, Draw.CHANCE) or (says.draw is Draw.RANGE and low != high)
+    assert scenario.deterministic is not random
+    drawn = [
+        (draw_factors(scenario, part.mix, key) if family == "pullers" else (), felt(scenario, key)) for key in keys(12)
+    ]
+    equal = all(one[0] == drawn[0][0] and same(one[1], drawn[0][1]) for one in drawn)
+    assert equal is scenario.deterministic or (equal and "flagged_duration" in member.name)
 
 
 @pytest.mark.parametrize("name", list(SCENARIOS))

@@ -2,15 +2,13 @@ import dataclasses
 import math
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from cz_gym import SCENARIOS, Scenario
-from cz_gym.episodes.scenario import Draw, Drift, Faults, Interface, Pullers, Recipe, Reference, Sensor
+from cz_gym.episodes.scenario import Drift, Faults, Interface, Pullers, Recipe
 from cz_gym.episodes.scenarios import mix_of
-from cz_gym.episodes.series import draw_episode, draw_factors, new_series
 
 MM, MINUTE = 1e-3, 60.0
 FAMILIES = [field.name for field in dataclasses.fields(Scenario)[1:]]
@@ -33,17 +31,6 @@ FROZEN = {
 MEMBERS = [
     (family, member.name) for family in FAMILIES for member in dataclasses.fields(getattr(SCENARIOS["nominal"], family))
 ]
-
-
-def draw(scenario: Scenario, key: tuple[int, int]) -> tuple[Any, ...]:
-    """An episode's puller, constants and series; what has no effect there is zero."""
-    series = new_series(40, 400)
-    e = draw_episode(scenario, key, series)
-    e = e._replace(
-        ripple_phase=e.ripple_phase * (e.ripple_amplitude != 0.0),
-        bias_drift_start=e.bias_drift_start * (e.bias_drift_amount != 0.0),
-    )
-    return draw_factors(scenario, scenario.pullers.mix, key), e, *series
 
 
 def changed(scenario: Scenario, family: str, member: str, value: Any) -> Scenario:
@@ -153,30 +140,6 @@ def test_a_number_in_the_wrong_unit_is_refused_with_a_guess(
 ) -> None:
     with pytest.raises(ValueError, match=rf"{family}.{member} = .* did you mean {meant}\?"):
         changed(SCENARIOS["nominal"], family, member, value)
-
-
-@pytest.mark.parametrize(("family", "member"), MEMBERS)
-def test_every_member_says_whether_it_is_random(family: str, member: str) -> None:
-    """What a member says of itself agrees with what two seeds draw (trap 4)."""
-    base = dataclasses.replace(
-        SCENARIOS["nominal"],
-        sensor=Sensor(outlier_sd=1e-4, rotation=(0.1, 0.1)),
-        faults=Faults(flagged_duration=(50.0, 50.0), unflagged_duration=(50.0, 50.0)),
-        recipe=Recipe(duration=(50.0, 50.0)),
-        reference=Reference(1.0, (1e-3, 1e-3), (50.0, 50.0)),
-    )
-    (field,) = (each for each in dataclasses.fields(getattr(base, family)) if each.name == member)
-    says = field.metadata["member"]
-    high = min(says.high, 100.0) if isinstance(field.default, tuple) else min(0.5 * says.high, 100.0)
-    whole = isinstance(field.default, int) or (isinstance(field.default, tuple) and isinstance(field.default[0], int))
-    low = 0 if whole else 0.5 * high
-    value: Any = (low, high) if isinstance(field.default, tuple) else says.high if whole else high
-    scenario = changed(base, family, member, value)
-    episodes = zip(draw(scenario, (1, 1)), draw(scenario, (2, 1)), strict=True)
-    differ = any(not np.array_equal(one, other, equal_nan=True) for one, other in episodes)
-    assert scenario.deterministic is (says.draw is Draw.NEVER)
-    assert not (scenario.deterministic and differ)
-    assert differ or member in ("flagged_duration", "unflagged_duration") or scenario.deterministic
 
 
 def test_equal_contents_have_equal_hashes() -> None:
