@@ -15,7 +15,7 @@ from gymnasium.spaces import Box
 
 from cz_gym.camera.view import IMAGE, Camera
 from cz_gym.engine.batch import Batch, SlotState, new_key
-from cz_gym.engine.layout import check_info
+from cz_gym.engine.layout import Out, check_info
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.errors import CzError
@@ -34,8 +34,6 @@ Action = npt.NDArray[np.float32]
 _OPTIONS = ("scenario", "state")
 _LEAN_ROWS = tuple((name, INFO.index(name)) for name in LEAN)
 _CLIPPED = INFO.index("action_clipped")
-_FACTS = ("_np_random", "_np_random_seed", "_over", "_begun", "spec", "action_space", "observation_space")
-"""What a copy of an environment has beside its settings and its slot."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,35 @@ def check_options(options: dict[str, Any] | None, allowed: tuple[str, ...] = _OP
     return given
 
 
-class CzEnv(gym.Env[Observation, Action]):
+class Copyable:
+    """Pickling of both forms of the environment: a copy goes on bit for bit."""
+
+    FACTS: tuple[str, ...] = ("_over", "_begun", "spec", "action_space", "observation_space")
+    """Attributes that a copy has beside its settings and its slots."""
+    _setup: Any
+    _settings: tuple[Any, ...]
+    _batch: Batch
+    _out: Out
+    _begun: bool
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Settings, every slot's state and random stream."""
+        slots = [self._batch.save(i) for i in range(self._batch.num_envs)] if self._begun else None
+        return {"settings": self._settings, "slots": slots, "facts": {name: getattr(self, name) for name in self.FACTS}}
+
+    def __setstate__(self, saved: dict[str, Any]) -> None:
+        self._setup(*saved["settings"])
+        if saved["slots"] is not None:
+            self._batch.restore(range(len(saved["slots"])), saved["slots"], self._out)
+            self._restart_view()
+        for name, fact in saved["facts"].items():
+            setattr(self, name, fact)
+
+    def _restart_view(self) -> None:
+        """Show the crystal from here on, where it is shown."""
+
+
+class CzEnv(Copyable, gym.Env[Observation, Action]):
     """Czochralski growth of a silicon ingot: hold the true radius, seeing only the camera's bright ring.
 
     ## Action Space
@@ -114,6 +140,7 @@ class CzEnv(gym.Env[Observation, Action]):
     """
 
     metadata: dict[str, Any] = {"render_modes": declared_modes(), "render_fps": FPS}  # noqa: RUF012  (Gymnasium's own)
+    FACTS = (*Copyable.FACTS, "_np_random", "_np_random_seed")
 
     def __init__(
         self,
@@ -159,7 +186,7 @@ class CzEnv(gym.Env[Observation, Action]):
         self._out = self._batch.new_out()
         self._action = np.zeros((1, 2))
         self._shown = self._batch.shown(self._out)[0]
-        self._said, self._valid = self._out.info[:, 0], self._slots["valid"]
+        self._signals, self._valid = self._out.info[:, 0], self._slots["valid"]
         self._step = self._batch.bound_step(self._action, self._out)
         self._over, self._begun = True, False
         self._view = make_view(render_mode, render_size, self.config)
@@ -181,7 +208,7 @@ class CzEnv(gym.Env[Observation, Action]):
             self.set_state(given["state"])
         else:
             self._batch.reset([0], [new_key(self.np_random)], self._out, scenario)
-            self._look(scenario)
+            self._restart_view(scenario)
         self._over, self._begun = bool(self._slots["over"][0]), True
         return self._shown.copy(), self._info()
 
@@ -201,7 +228,7 @@ class CzEnv(gym.Env[Observation, Action]):
         terminated, truncated = out.terminated.item(), out.truncated.item()
         self._over = terminated or truncated
         if self._view is not None:
-            self._view.add(self._said, self._valid.item(), terminated, truncated)
+            self._view.add(self._signals, self._valid.item(), terminated, truncated)
         return self._shown.copy(), out.reward.item(), terminated, truncated, self._info()
 
     def get_state(self) -> EnvState:
@@ -218,21 +245,8 @@ class CzEnv(gym.Env[Observation, Action]):
         check_state(state, self._batch)
         self._batch.restore([0], [state.slot], self._out)
         self.np_random.bit_generator.state = state.random
-        self._look()
+        self._restart_view()
         self._over, self._begun = bool(self._slots["over"][0]), True
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Settings, the present state and the random stream: a copy goes on bit for bit."""
-        slot = self._batch.save(0) if self._begun else None
-        return {"settings": self._settings, "slot": slot, "facts": [getattr(self, name) for name in _FACTS]}
-
-    def __setstate__(self, saved: dict[str, Any]) -> None:
-        self._setup(*saved["settings"])
-        if saved["slot"] is not None:
-            self._batch.restore([0], [saved["slot"]], self._out)
-            self._look()
-        for name, fact in zip(_FACTS, saved["facts"], strict=True):
-            setattr(self, name, fact)
 
     def render(self) -> Frame | None:
         """The picture, uint8 of shape (height, width, 3), for "rgb_array"; "human" shows it at every reset and step.
@@ -250,20 +264,19 @@ class CzEnv(gym.Env[Observation, Action]):
             self._view.close()
         self._batch.close()
 
-    def _look(self, scenario: Scenario | None = None) -> None:
-        """Show the crystal from here on."""
+    def _restart_view(self, scenario: Scenario | None = None) -> None:
         if self._view is not None:
-            self._view.begin(self._said, self._slots[0], (scenario or self.config.scenario).name)
+            self._view.begin(self._signals, self._slots[0], (scenario or self.config.scenario).name)
 
     def _info(self) -> dict[str, Any]:
         if self._everything:
-            info = Info(zip(INFO, self._said.tolist(), strict=True))
+            info = Info(zip(INFO, self._signals.tolist(), strict=True))
             info["action_clipped"] = info["action_clipped"] > 0.0
         else:
             info = Info()
             for name, row in _LEAN_ROWS:
-                info[name] = self._said.item(row)
-            if self._said.item(_CLIPPED) > 0.0:
+                info[name] = self._signals.item(row)
+            if self._signals.item(_CLIPPED) > 0.0:
                 info["action_clipped"] = True
         if self.config.observation == "history":
             info["state"] = self._out.state[0].copy()

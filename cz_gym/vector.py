@@ -25,20 +25,17 @@ from cz_gym.processors import processors
 
 from .action import MarkedAction, check_marked
 from .config import Config, check_config, make_config
-from .env import CzEnv, EnvState, action_space, check_options, check_state, observation_space
+from .env import Copyable, CzEnv, EnvState, action_space, check_options, check_state, observation_space
 from .signals import INFO, LEAN
 
-_MASKS = tuple(f"_{name}" for name in INFO)
-_LEAN_MASKS = tuple(f"_{name}" for name in LEAN)
-_LEAN_ROWS = tuple((name, INFO.index(name)) for name in LEAN)
 _CLIPPED = INFO.index("action_clipped")
-_FACTS = ("_randoms", "_seeds", "_over", "_waiting", "_begun", "spec", "action_space", "observation_space")
-"""What a copy of a batch has beside its settings and its slots."""
+_ROWS = {everything: [(n, f"_{n}", INFO.index(n)) for n in (INFO if everything else LEAN)] for everything in (0, 1)}
+"""Entries of ``info``, their masks and their rows, for lean and for all of it."""
 Array = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
 
 
-class CzVectorEnv(VectorEnv[Array, Array, Array]):
+class CzVectorEnv(Copyable, VectorEnv[Array, Array, Array]):
     """Many pullers at once in one compiled loop; slot i with seed s equals :class:`CzEnv` with seed s bit for bit.
 
     Arguments are those of :class:`CzEnv`, with ``num_envs``, ``autoreset_mode`` (a
@@ -48,6 +45,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+    FACTS = (*Copyable.FACTS, "_randoms", "_seeds", "_waiting")
 
     def __init__(
         self,
@@ -197,18 +195,6 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         self._waiting = bool(self._over.any())
         self._begun = True
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Settings, every slot's state and random stream: a copy goes on bit for bit."""
-        slots = [self._batch.save(i) for i in range(self.num_envs)] if self._begun else None
-        return {"settings": self._settings, "slots": slots, "facts": [getattr(self, name) for name in _FACTS]}
-
-    def __setstate__(self, saved: dict[str, Any]) -> None:
-        self._setup(*saved["settings"])
-        if saved["slots"] is not None:
-            self._batch.restore(range(self.num_envs), saved["slots"], self._out)
-        for name, fact in zip(_FACTS, saved["facts"], strict=True):
-            setattr(self, name, fact)
-
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the threads."""
         # Gymnasium up to 1.1 closes what was refused when it was made, and so never had any.
@@ -276,8 +262,7 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         self._batch.reset(which, (new_key(self._random(i)) for i in which), out)
 
     def _check_states(self, states: Any) -> None:
-        several = isinstance(states, Sequence) and len(states) == self.num_envs
-        if not several or not all(isinstance(state, EnvState) for state in states):
+        if not isinstance(states, Sequence) or len(states) != self.num_envs:
             raise CzError(f"expected {self.num_envs} states made by get_state, one a slot")
         for state in states:
             check_state(state, self._batch)
@@ -306,22 +291,17 @@ class CzVectorEnv(VectorEnv[Array, Array, Array]):
         return {"final_obs": final_obs, "_final_obs": over.copy(), "final_info": info, "_final_info": over.copy()}
 
     def _infos(self, out: Out, mask: Mask | None = None) -> dict[str, Any]:
-        everything = mask is None or bool(mask.all())
+        whole = mask is None or bool(mask.all())
         mask = self._everybody.copy() if mask is None else mask
         rows: Any = out.info[:, : self.num_envs]
-        infos: dict[str, Any]
-        if self._everything:
-            infos = dict.fromkeys(_MASKS, mask)
-            infos.update(zip(INFO, rows if everything else np.where(mask, rows, 0.0), strict=True))
-            infos["action_clipped"] = infos["action_clipped"] > 0.0
-        else:
-            infos = {name: rows[row] if everything else np.where(mask, rows[row], 0.0) for name, row in _LEAN_ROWS}
-            infos.update(dict.fromkeys(_LEAN_MASKS, mask))
-            clipped = (rows[_CLIPPED] > 0.0) & mask
-            if clipped.any():
-                infos["action_clipped"], infos["_action_clipped"] = clipped, clipped.copy()
+        clipped = (rows[_CLIPPED] > 0.0) & mask
+        infos: dict[str, Any] = {}
+        for name, key, row in _ROWS[self._everything]:
+            infos[name], infos[key] = rows[row] if whole else np.where(mask, rows[row], 0.0), mask
+        if self._everything or clipped.any():
+            infos["action_clipped"], infos["_action_clipped"] = clipped, mask if self._everything else clipped.copy()
         if self.config.observation == "history":
-            infos["state"] = out.state if everything else np.where(mask[:, None], out.state, np.float32(0))
+            infos["state"] = out.state if whole else np.where(mask[:, None], out.state, np.float32(0))
             infos["_state"] = mask
         return infos
 
