@@ -1,4 +1,4 @@
-"""What an environment is made with: one frozen, checked value shared by the scalar and the batched form."""
+"""The settings of an environment: one frozen, checked value, shared by its scalar and its batched form."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ VERSION = 0
 
 
 class Identity(NamedTuple):
-    """What a saved state belongs to: two environments with equal ones continue each other's states."""
+    """The settings that a saved state depends on: environments in which they are equal continue each other's states."""
 
     version: int
     """:data:`VERSION`."""
@@ -47,7 +47,7 @@ class Identity(NamedTuple):
     """[s]."""
 
     def difference(self, other: Identity) -> str | None:
-        """What differs first, in words; None if nothing does."""
+        """The first difference in words; None if there is none."""
         for name, mine, its in zip(self._fields, self, other, strict=True):
             if mine != its:
                 return f"{name.replace('_', ' ')} {mine}, not {its}"
@@ -70,7 +70,7 @@ class Config:
     parameters: Parameters = field(default_factory=Parameters)
     meniscus: MeniscusModel = HURLE
     camera: Camera = field(default_factory=Camera)
-    """What ``observation="camera"`` looks through; nothing else depends on it."""
+    """The camera of ``observation="camera"``; nothing else depends on it."""
 
     @property
     def steps(self) -> int:
@@ -105,7 +105,7 @@ class Config:
 
     @property
     def identity(self) -> Identity:
-        """What a saved state belongs to."""
+        """The settings that a saved state depends on."""
         scenario = f"{self.scenario.name!r} ({self.scenario.hash})"
         low, high = self.mix
         mix = float(low) + 0.0, float(high) + 0.0
@@ -118,7 +118,7 @@ class Config:
 
 
 def check_config(config: Config) -> Config:
-    """The config itself; ValueError for anything else, such as the name of a scenario."""
+    """Return the config; raise CzError for anything else, such as the name of a scenario."""
     given = repr(config) if isinstance(config, str) else ""
     checked: Config = needs(
         Config, config, f"cz_gym.config.make_config({given}) makes one, env.unwrapped.config is one"
@@ -137,9 +137,9 @@ def make_config(
     camera: Camera | None = None,
     action: str = "direct",
 ) -> Config:
-    """Check the arguments of the environment; ValueError names what was given and what is allowed."""
-    found = find_scenario(scenario)
-    mix_of(model, found)
+    """Check the arguments of the environment; CzError names what was given and what is allowed."""
+    drawn_from = find_scenario(scenario)
+    mix_of(model, drawn_from)
     if not isinstance(observation, str) or observation not in (*OBSERVATIONS, CAMERA):
         raise CzError(unknown("observation", observation, [*OBSERVATIONS, CAMERA]))
     if action not in ACTIONS:
@@ -155,8 +155,8 @@ def make_config(
         raise CzError(f"meniscus must be a cz_gym.MeniscusModel, not {meniscus!r}")
     checked = check_parameters(parameters if parameters is not None else Parameters())
     check_height(make_puller(checked, meniscus=meniscus or HURLE))
-    looking = check_camera(camera_for(checked) if camera is None else camera, checked)
-    return Config(found, model, observation, action, interval, length, checked, meniscus or HURLE, looking)
+    checked_camera = check_camera(camera_for(checked) if camera is None else camera, checked)
+    return Config(drawn_from, model, observation, action, interval, length, checked, meniscus or HURLE, checked_camera)
 
 
 @lru_cache(maxsize=64)
@@ -172,7 +172,7 @@ def _equations_hash(meniscus: MeniscusModel) -> str:
 
 
 def positive(name: str, value: float) -> float:
-    """The value as a float; ValueError unless it is a positive, finite number [s]."""
+    """Return the value as a float; raise CzError unless it is a positive, finite number of seconds."""
     number = isinstance(value, Real) and not isinstance(value, bool)
     if not number or not math.isfinite(value) or value <= 0:
         raise CzError(f"{name} must be a positive number of seconds, not {value!r}")

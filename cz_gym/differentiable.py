@@ -37,7 +37,7 @@ def _compiled(meniscus: MeniscusModel) -> tuple[Any, Any]:
 
 
 class Step(NamedTuple):
-    """What a step led to, a row a slot, and its derivatives."""
+    """The result of a step, one row per slot, and its derivatives."""
 
     state: Floats
     """The numbers of :data:`STATES`, SI units, shape (n, 9)."""
@@ -48,9 +48,9 @@ class Step(NamedTuple):
     error: Floats
     """The true radius error r_c - r_ref [m], shape (n,)."""
     offset: Floats
-    """What of the bright ring's offset no sensor shows [m], shape (n,)."""
+    """Offset of the bright ring that no sensor shows [m], shape (n,)."""
     grows: npt.NDArray[np.bool_]
-    """Whether the crystal grew, shape (n,). One that is lost, or was at its end, stays as it is; its cost and
+    """Whether the crystal grew, shape (n,). One that is lost or whose episode is over stays as it is; its cost and its
     derivatives are 0."""
     jacobian: Floats
     """Derivatives of the next state and of the cost's terms, shape (n, 13, 11): rows are state and cost, columns the
@@ -63,14 +63,13 @@ the camera's reading of it [m]. All else that a step depends on (disturbances, n
 
 
 class DifferentiableBatch:
-    """Many crystals stepped side by side, each step with its derivatives.
+    """Many crystals that are stepped together, each step with its derivatives.
 
-    ``config`` is the environment's (:func:`cz_gym.config.make_config`). ValueError unless its control interval fits
-    whole into the 5 s that disturbances are held for, its camera's latency into the control interval, and there is a
-    slot at least.
+    ``config`` is the environment's (:func:`cz_gym.config.make_config`). Its control interval must divide the 5 s for
+    which disturbances are held, and its camera's latency must not be longer than the control interval.
 
-    Noise, freezes and drop-outs are there as in the environment; a reading that is held depends on the state that it
-    was taken of. Whole steps of the heater and the rounding of observations are passed as if they were not.
+    Noise, freezes and drop-outs are those of the environment; a held reading depends on the state at which it was
+    taken. The derivatives ignore that the heater moves in whole steps and that observations are rounded.
     """
 
     def __init__(self, config: Config, num_envs: int, threads: int | None = 1) -> None:
@@ -93,7 +92,7 @@ class DifferentiableBatch:
         self._work = np.zeros(SCRATCH)
         self._jacobians = BufferPool((self.num_envs, len(ROWS), len(STATES) + ACTIONS), np.float64)
         self.measured_by_state = _measured_by_state(config)
-        """Derivatives of the "measured" observation with respect to the state it is of, shape (11, 9)."""
+        """Derivatives of the "measured" observation with respect to the state, shape (11, 9)."""
 
     def reset(self, seeds: Sequence[int], which: Sequence[int] | None = None) -> tuple[Floats, npt.NDArray[np.float32]]:
         """Draw the episodes of these seeds, one for each of the slots ``which``, by default all; the others stay.
@@ -118,7 +117,7 @@ class DifferentiableBatch:
         return self._state, self._out.observation
 
     def step(self, actions: npt.ArrayLike) -> Step:
-        """Hold actions, shape (n, 2), for one control interval; crystals that are lost or at their end stay.
+        """Hold actions, shape (n, 2), for one control interval; crystals that are lost or whose episode is over stay.
 
         InvalidAction for NaN, another shape, and actions made for another environment;
         ResetNeeded before every slot had its first reset.
@@ -146,7 +145,7 @@ class DifferentiableBatch:
         return Step(self._state, out.observation, cost, error, info[_OFFSET], self._grows, jacobian)
 
     def _copied(self) -> Out:
-        """New arrays that hold what the last step wrote."""
+        """A copy of the last step's results in new arrays."""
         out = self._batch.new_out()
         for new, old in zip(out, self._out, strict=True):
             new[...] = old

@@ -38,7 +38,7 @@ _CLIPPED = INFO.index("action_clipped")
 
 @dataclass(frozen=True)
 class EnvState:
-    """A saved environment: its slot and its random stream. Picklable."""
+    """The saved state of an environment: its slot and its random stream. Picklable."""
 
     slot: SlotState
     random: dict[str, Any]
@@ -57,7 +57,7 @@ def observation_space(observation: str) -> Any:
 
 
 def check_options(options: dict[str, Any] | None, allowed: tuple[str, ...] = _OPTIONS) -> dict[str, Any]:
-    """A copy of reset's options; ValueError unless a mapping of known ones, of scenario and state one at most."""
+    """Return a copy of reset's options; raise CzError for unknown ones, and for a scenario together with a state."""
     if options is not None and not isinstance(options, Mapping):
         raise CzError(f"reset options must be a dict, not {options!r}")
     given = dict(options or {})
@@ -170,7 +170,7 @@ class CzEnv(Copyable, gym.Env[Observation, Action]):
         render_size: tuple[int, int] = (640, 480),
         info: str = "lean",
     ) -> CzEnv:
-        """The environment of settings that were checked when they were made (:func:`cz_gym.config.make_config`)."""
+        """Make the environment from settings that :func:`cz_gym.config.make_config` has checked."""
         env = cls.__new__(cls)
         env._setup(check_config(config), render_mode, render_size, info)
         return env
@@ -294,7 +294,7 @@ class Info(dict[str, Any]):
 
 
 def check_state(state: Any, batch: Batch) -> None:
-    """ValueError, in one line, unless a state that a slot of this batch can go on from."""
+    """Raise CzError unless a slot of this batch can continue from the state."""
     if not isinstance(state, EnvState):
         raise CzError(f"expected a state made by get_state, not {type(state).__name__}")
     batch.check(state.slot)
@@ -302,11 +302,11 @@ def check_state(state: Any, batch: Batch) -> None:
         random: Any = np.random.PCG64(0)
         random.state = state.random
     except (ValueError, TypeError, KeyError, OverflowError):
-        raise CzError("this state is damaged: its random stream is none of PCG64") from None
+        raise CzError("this state is damaged: its random stream is not one of PCG64") from None
 
 
 def check_action(action: Any) -> Any:
-    """The action as float64, shape (2,); InvalidAction names what was given."""
+    """Return the action as float64, shape (2,); raise InvalidAction for anything else."""
     try:
         array = np.asarray(action, np.float64)
     except (TypeError, ValueError):

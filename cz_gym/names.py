@@ -1,4 +1,4 @@
-"""What is said of a name that does not exist, and of one where an object belongs."""
+"""Messages for a name that does not exist, and for a name given where an object is needed."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from cz_gym.errors import CzError
 
 
 def needs(kind: type, value: Any, how: str) -> Any:
-    """The value itself; ValueError, which says how one is made, unless it is of that kind."""
+    """Return the value; raise CzError with a hint on how to make one unless it is of this type."""
     if not isinstance(value, kind):
         raise CzError(f"this needs a {kind.__name__}, not {value!r:.80}: {how}")
     return value
 
 
 def unknown(kind: str, name: object, known: Iterable[str], also: str = "") -> str:
-    """One line: what was given, what may have been meant, what there is, and what ``also`` may be given."""
-    there = list(known)
-    close = get_close_matches(name, there, 1, 0.65) if isinstance(name, str) else []
+    """One line: the unknown name, the closest known one, all known ones, and what else (``also``) is accepted."""
+    names = list(known)
+    close = get_close_matches(name, names, 1, 0.65) if isinstance(name, str) else []
     meant = f": did you mean {close[0]!r}? Choose" if close else "; choose"
-    return f"unknown {kind} {name!r:.80}{meant} from {', '.join(there) or 'none'}{also}"
+    return f"unknown {kind} {name!r:.80}{meant} from {', '.join(names) or 'none'}{also}"

@@ -31,7 +31,7 @@ TEMPERATURE_SCALE = 5.0
 
 
 class Relative(NamedTuple):
-    """How "history" shows a signal that it holds relative to another one."""
+    """How "history" shows a signal relative to another one."""
 
     to: str
     """Name of the other signal."""

@@ -24,21 +24,21 @@ HEATER_RANGE = 10.0 * KILO
 SMOOTH_TIME = 50.0
 """Time constant with which ``action="smooth"`` moves both drives [s]."""
 SMOOTH_PULL, SMOOTH_HEATER = 1.0, 0.5
-"""Where a held smooth action of 1 brings the drives to: shares of v_0 and of the heater's range [-]."""
+"""Drive deviations that a held smooth action of 1 settles at, in shares of v_0 and of the heater's range [-]."""
 
 
 class Drives(NamedTuple):
-    """What an action asks of the drives, in shares of v_0 and of the heater's range: keep * applied + gain * action."""
+    """How an action moves the drives, in shares of v_0 and of the heater's range: keep * applied + gain * action."""
 
     keep: float
-    """Share of the applied deviation that stays [-]."""
+    """Share of the present deviation that is left after one step [-]."""
     pull: float
-    """Gain of the pull speed [-]."""
+    """Gain from the action to the pull speed [-]."""
     heater: float
-    """Gain of the heater [-]."""
+    """Gain from the action to the heater power [-]."""
 
     def asked(self, wanted: Any, applied: Any) -> Any:
-        """The action that brings the applied drives to those wanted, all of shape (..., 2), in shares of their ranges.
+        """The action that moves the drives from ``applied`` to ``wanted``, shape (..., 2), in shares of their ranges.
 
         It may lie outside the box of actions.
         """
@@ -46,13 +46,13 @@ class Drives(NamedTuple):
 
 
 DIRECT = Drives(0.0, 1.0, 1.0)
-"""The action is the drives' deviation from nominal itself."""
+"""The drives of ``action="direct"``: the action is their deviation from nominal."""
 ACTIONS = ("direct", "smooth", "rate")
-"""What the two numbers of an action may mean."""
+"""Names of the meanings that an action can have."""
 
 
 def drives_of(action: str, control_interval: float) -> Drives:
-    """How actions of that kind move the drives at that control interval [s].
+    """How the drives follow actions of this kind at this control interval [s].
 
     "smooth": first-order lags. A held action a brings the pull speed to v_0 (1 + a) and the heater to
     Q_H0 + 5 kW a with a time constant of 50 s; left alone they return to nominal. So noise on the action is bounded,
@@ -68,12 +68,12 @@ def drives_of(action: str, control_interval: float) -> Drives:
 
 @jittable
 def within_limits(r_c: Any, h_c: Any, r_ref: Any, a: Any) -> Any:
-    """Whether the crystal still grows: false for NaN, freezing, detachment and a lost radius."""
+    """Whether the crystal still grows; false if the meniscus freezes or detaches, the radius is lost, or one is NaN."""
     return (np.abs(r_c - r_ref) <= RADIUS_LIMIT) & (h_c >= HEIGHT_MIN) & (h_c <= HEIGHT_MAX_IN_A * a)
 
 
 def check_height(puller: Puller) -> None:
-    """ValueError unless the puller's operating point lies inside the meniscus' limits."""
+    """Raise CzError unless the meniscus is within its limits at the puller's operating point."""
     highest = HEIGHT_MAX_IN_A * puller.a
     if not HEIGHT_MIN <= puller.h_0 <= highest:
         raise CzError(

@@ -80,7 +80,7 @@ class CzVectorEnv(Copyable, VectorEnv[Array, Array, Array]):
         threads: int | None = None,
         info: str = "lean",
     ) -> CzVectorEnv:
-        """The batch of settings that were checked when they were made (:func:`cz_gym.config.make_config`)."""
+        """Make the batch from settings that :func:`cz_gym.config.make_config` has checked."""
         env = cls.__new__(cls)
         env._setup(check_config(config), num_envs, autoreset_mode, threads, info)
         return env
@@ -208,7 +208,7 @@ class CzVectorEnv(Copyable, VectorEnv[Array, Array, Array]):
 
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
-        """The seeds the slots' streams began with."""
+        """The seeds of the slots' random streams."""
         return tuple(self._seeds)
 
     def _random(self, i: int) -> np.random.Generator:
@@ -242,7 +242,7 @@ class CzVectorEnv(Copyable, VectorEnv[Array, Array, Array]):
         return mask.copy()
 
     def _check_actions(self, actions: Any) -> npt.NDArray[np.float64]:
-        """The actions as the batch's own float64 array; InvalidAction names what was given."""
+        """Copy the actions into the batch's float64 array and return it; raise InvalidAction for anything else."""
         array = self._batch.actions
         try:
             shape = np.shape(actions)
@@ -253,9 +253,8 @@ class CzVectorEnv(Copyable, VectorEnv[Array, Array, Array]):
         if shape != array.shape:
             raise InvalidAction(f"actions must have shape {array.shape}, not {shape}")
         if math.isnan(array.min()):
-            raise InvalidAction(
-                f"actions must not be NaN; slots {np.flatnonzero(np.isnan(array).any(axis=1))[:10].tolist()} are"
-            )
+            slots = np.flatnonzero(np.isnan(array).any(axis=1))[:10].tolist()
+            raise InvalidAction(f"actions must not be NaN; those of slots {slots} are")
         return array
 
     def _redraw(self, which: list[int], out: Out) -> None:

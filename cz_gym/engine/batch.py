@@ -38,12 +38,12 @@ from .kernels import KERNELS, Kernels, build_kernels
 from .layout import SLOT, Clock, Memory, ObservationScales, Out, info_width
 
 SLOTS_PER_THREAD, SLOTS_AT_ONCE = 256, 128
-"""Fewest slots worth a thread of their own in a step, and how many a thread takes at once."""
+"""Slots below which a step gets no further thread, and the slots that a thread takes at once."""
 DRAWS_PER_THREAD, DRAWS_AT_ONCE = 16, 16
-"""Fewest draws worth a thread of their own in a reset, and how many a thread takes at once."""
+"""Draws below which a reset gets no further thread, and the draws that a thread takes at once."""
 _SAVED = ("slot", "history", "frames")
 Key = tuple[int, int]
-"""128 random bits that an episode is drawn from, as two 64-bit words."""
+"""The 128 random bits from which an episode is drawn, as two 64-bit words."""
 
 
 @lru_cache(maxsize=8)
@@ -63,13 +63,13 @@ def new_key(random: np.random.Generator) -> Key:
 
 
 def first_key(seed: int) -> Key:
-    """The key of the episode that an environment draws first after ``reset(seed=seed)``."""
+    """The key of the first episode after ``reset(seed=seed)``."""
     return new_key(seeding.np_random(seed)[0])
 
 
 @dataclass(frozen=True)
 class SlotState:
-    """Everything one slot is at an instant; picklable, continued bit-exactly by :meth:`Batch.restore`."""
+    """The whole state of a slot; picklable, continued bit for bit by :meth:`Batch.restore`."""
 
     identity: Identity
     slot: npt.NDArray[Any]
@@ -94,7 +94,7 @@ class SlotState:
 
 
 class Batch:
-    """``num_envs`` slots of one configuration.
+    """The slots of ``num_envs`` crystals with the same settings, and the compiled loops over them.
 
     The arrays of :meth:`new_out` are never written again while anything refers to them.
     """
@@ -158,7 +158,7 @@ class Batch:
         self._owner = os.getpid()
 
     def new_out(self) -> Out:
-        """Arrays to write into, on memory that nothing else refers to."""
+        """New arrays for the results of a step, in memory that nothing else refers to."""
         n = self.num_envs
         return Out(
             self._observations.new(),
@@ -171,14 +171,14 @@ class Batch:
         )
 
     def shown(self, out: Out) -> npt.NDArray[Any]:
-        """The observations among what a step wrote, a row a slot."""
+        """The observations among the results of a step, one row per slot."""
         shown: npt.NDArray[Any] = {"state": out.state, "camera": out.image}.get(
             self.config.observation, out.observation
         )
         return shown
 
     def bound_step(self, actions: npt.NDArray[np.float64], out: Out) -> Any:
-        """``step`` of all slots from and into always the same arrays, called without arguments."""
+        """``step`` of all slots, bound to these arrays: it is called without arguments."""
         n = self.num_envs
         step = partial(self._step, self.memory, actions, self._all, self.clock, self.drives, self.scales, out, 0, n)
         if not self._camera:
@@ -230,15 +230,14 @@ class Batch:
         return ended
 
     def advance(self, rings: npt.NDArray[np.float64]) -> None:
-        """Drives, plant and ring [m] of every slot, and nothing else: what the speed of a step is measured against."""
+        """Advance drives and plant and write the rings [m], nothing else: the reference for the speed of a step."""
         arguments = (self.memory, self.actions, self._all, self.clock, self.drives, rings)
         self._run(self.kernels.plant, arguments, self.num_envs, SLOTS_PER_THREAD, SLOTS_AT_ONCE)
 
     def _run(self, loop: Any, arguments: tuple[Any, ...], count: int, least: int, share: int = 1) -> list[Any]:
-        """Run a loop over ``count`` rows, on a thread for every ``least`` rows; what its calls return.
+        """Run a loop over ``count`` rows, on one thread for every ``least`` rows; return the results of its calls.
 
-        Rows are taken ``share`` at a time by whoever is free: a thread that is late, or whose core is busy, costs
-        no more than what it would have done.
+        A free thread takes the next ``share`` rows: so a late or busy one delays nobody.
         """
         parts = min(self._parts, count // least)
         if parts <= 1:
@@ -258,10 +257,10 @@ class Batch:
         finally:
             begun = [future for future in futures if not future.cancel()]
             wait(begun)
-        return [*mine, *(found for future in begun for found in future.result())]
+        return [*mine, *(result for future in begun for result in future.result())]
 
     def save(self, i: int) -> SlotState:
-        """A copy of everything slot i is."""
+        """A copy of the state of slot i."""
         # array[i] of a structured array is a view that np.copy does not copy; array[i, ...] is an array.
         slot, history, frames = (rows[i, ...].copy() for rows in self._saved())
         return SlotState(self.identity, slot, history, frames, self.clock)
@@ -284,7 +283,7 @@ class Batch:
             raise CzError(f"this state is damaged: sample {int(state.slot['k'])} of {self.clock.steps}")
 
     def restore(self, which: Sequence[int], states: Sequence[SlotState], out: Out) -> None:
-        """Continue slots from states that :meth:`check` let pass and write their last samples into ``out``."""
+        """Continue slots from states that passed :meth:`check`; write their last samples into ``out``."""
         for i, state in zip(which, states, strict=True):
             for name, rows in zip(_SAVED, self._saved(), strict=True):
                 rows[i] = getattr(state, name)

@@ -1,4 +1,4 @@
-"""A pool of memory for the arrays that a step returns: a block is reused once nothing refers to it.
+"""A pool of memory for the arrays that a step returns; a block is reused once nothing refers to it.
 
 Large new arrays come as untouched pages, and writing those for the first time costs a good part of a step.
 """
@@ -22,7 +22,7 @@ Block = npt.NDArray[np.uint8]
 
 
 class _Use(weakref.ref[Any]):
-    """A weak reference to what a block is seen through: its callback returns the block to the pool."""
+    """A weak reference to the buffer around a block; its callback returns the block to the pool."""
 
     __slots__ = ("block",)
     block: Block
@@ -44,7 +44,7 @@ class BufferPool:
         self._in_use: dict[int, _Use] = {}
 
     def new(self) -> npt.NDArray[Any]:
-        """An array of any content."""
+        """An array with arbitrary content."""
         if self._type is None:
             return np.empty(self._shape, self._dtype)
         try:
@@ -64,7 +64,7 @@ class BufferPool:
 
 
 def _block(size: int) -> Block:
-    """Memory that begins at a line of the cache."""
+    """Memory that begins at a cache line."""
     memory = np.empty(size + _ALIGNED, np.uint8)
     start = -memory.ctypes.data % _ALIGNED
     return memory[start : start + size]

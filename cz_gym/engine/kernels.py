@@ -26,10 +26,10 @@ from .outputs import clip, recall, remember, write_channels, write_info
 from .sensors import sense
 
 TRIES = 100
-"""A puller without an operating point is drawn again, from the same stream, at most so often in all."""
+"""Largest number of draws of a puller, all from one stream, until one has an operating point."""
 _R_C, _R_REF, _CLIPPED = (INFO.index(name) for name in (*LEAN, "action_clipped"))
 _LINE = 8
-"""Numbers of eight bytes in a line of the cache."""
+"""Eight-byte numbers in a cache line."""
 _NUMBERS, _INFOS = SLOT.itemsize // 8, len(INFO)
 
 
@@ -49,7 +49,7 @@ def _begin(slot: Any) -> None:
 
 @jittable
 def next_speed(v_p: Any, pull: Any, drives: Any, p: Any, e: Any, interval: Any) -> Any:
-    """The pull speed [m/s] that an action asks for, within window and slew."""
+    """The pull speed [m/s] after an action, within its window and slew rate."""
     speed = drives.keep * ((v_p - p.v_0) / p.v_0) + drives.pull * clip(pull, 1.0)
     wanted = p.v_0 + clip(p.v_0 * clip(speed, 1.0), e.pull_window)
     return v_p + clip(wanted - v_p, e.pull_slew * interval)
@@ -57,7 +57,7 @@ def next_speed(v_p: Any, pull: Any, drives: Any, p: Any, e: Any, interval: Any) 
 
 @jittable
 def next_power(Q_H: Any, heat: Any, drives: Any, p: Any, e: Any, interval: Any) -> Any:
-    """The heater power [W] that an action asks for, within its slew, before it is rounded to whole steps."""
+    """The heater power [W] after an action, within its slew rate, before it is rounded to whole steps."""
     share = drives.keep * ((Q_H - p.Q_H_0) / HEATER_RANGE) + drives.heater * clip(heat, 1.0)
     power = p.Q_H_0 + HEATER_RANGE * clip(share, 1.0)
     power = power if power.real > 0.0 else 0.0
@@ -66,7 +66,7 @@ def next_power(Q_H: Any, heat: Any, drives: Any, p: Any, e: Any, interval: Any) 
 
 @jittable
 def _drive(slot: Any, pull: Any, heat: Any, drives: Any, interval: Any) -> None:
-    """Move the drives as an action asks, the heater in whole steps."""
+    """Move the drives by an action, the heater in whole steps."""
     p, e = slot.puller, slot.episode
     slot.v_p_before, slot.Q_H_before = slot.v_p, slot.Q_H
     slot.clipped = 1.0 if (np.abs(pull) > 1.0 or np.abs(heat) > 1.0) else 0.0
@@ -80,7 +80,7 @@ def _drive(slot: Any, pull: Any, heat: Any, drives: Any, interval: Any) -> None:
 
 @inlined
 def _sample(memory: Any, i: Any, fresh: Any, clock: Any, scales: Any, out: Any, slope: Any, ring_offset: Any) -> Any:
-    """Read slot i, or repeat its last reading, and write observation and info; returns the step's cost."""
+    """Read the sensors of slot i if ``fresh``, write observation and info, and return the terms of the step's cost."""
     slot, p, x = memory.slots[i], memory.slots[i].puller, memory.slots[i].x
     t, h_c = slot.k * clock.interval, height_inside(x.h_c, p)
     ring = x.r_c + ring_offset(x.r_c, h_c, p)
@@ -116,26 +116,26 @@ def _read(memory: Any, i: Any, fresh: Any, clock: Any, scales: Any, out: Any, sl
 
 
 _sample_alone = kernel(_read, keep=False, allocates=False)
-"""A sample as a function of its own: with the step's options, so that what it calls is compiled only once."""
+"""A sample as a compiled function, with the options of the step, so that the functions it calls compile only once."""
 
 
 @jittable
 def _fetch_slot(numbers: Any, i: Any) -> None:
-    """Have slot i brought to the cache: the slots of a large batch are further away than one step is long."""
+    """Prefetch slot i: fetching a slot of a large batch takes longer than a step."""
     for at in range(0, _NUMBERS, _LINE):
         fetch(numbers, i * _NUMBERS + at)
 
 
 @jittable
 def _fetch_info(info: Any, i: Any) -> None:
-    """Have the lines brought that the info of slot i and of those after it is written to."""
+    """Prefetch the info columns from slot i on."""
     for row in range(_INFOS):
         fetch(info, row * info.shape[1] + i)
 
 
 @jittable
 def _fetch_history(slot: Any, history: Any, before: Any) -> None:
-    """Have the samples brought at which the remembered spans of a slot's past end."""
+    """Prefetch the samples at which the spans of a slot's past end."""
     depth, channels = history.shape
     at = slot.k % depth
     for lag in range(before.size):
@@ -151,11 +151,11 @@ class Kernels(NamedTuple):
     slots; returns how many episodes ended."""
     draw: Any
     """``draw(memory, which, keys, record, mix, parameters, clock, scales, out, start, stop)``: new episodes, each
-    from its key, for the slots ``which[start:stop]``, with their first sample; returns a slot for which no puller with
-    an operating point was found in :data:`TRIES` draws, or -1."""
+    from its key, for the slots ``which[start:stop]``, with their first sample; returns -1, or a slot whose
+    :data:`TRIES` draws gave no puller with an operating point."""
     show: Any
-    """``show(memory, which, clock, scales, out, start, stop)``: the last sample of the slots ``which[start:stop]``
-    again."""
+    """``show(memory, which, clock, scales, out, start, stop)``: writes the last sample of the slots
+    ``which[start:stop]`` again."""
     plant: Any
     """``plant(memory, actions, active, clock, drives, rings, start, stop)``: drives, plant and ring of all slots alone,
     to measure speed against."""

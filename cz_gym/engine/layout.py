@@ -1,4 +1,4 @@
-"""The arrays of the compiled loop: what a slot holds, what a step reads and where it writes."""
+"""The arrays of the compiled loops: the memory of a slot, the constants of a step and its results."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Clock(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What the slots read and remember, one row a slot."""
+    """The memory of the slots, one row per slot."""
 
     slots: Any
     """Records of :data:`SLOT`, shape (n,)."""
@@ -84,12 +84,12 @@ class Memory(NamedTuple):
 
 
 class Out(NamedTuple):
-    """Where a step writes, one row a slot."""
+    """The results of a step, one row per slot."""
 
     observation: Any
     """The "measured" or "history" channels, float32, shape (n, channels)."""
     state: Any
-    """The "state" channels, float32, shape (n, channels); width 0: not written."""
+    """The "state" channels, float32, shape (n, channels); of width 0 if not wanted."""
     image: Any
     """The camera's image, uint8, shape (n, rows, columns, 1); empty unless it is the observation. Written after the
     step, by :mod:`cz_gym.camera.image`."""
@@ -128,7 +128,7 @@ INFO_CHOICES = ("lean", "all")
 
 
 def check_info(info: str) -> bool:
-    """Whether all of ``info`` is asked for; ValueError names what may be."""
+    """Return whether all of ``info`` is wanted; raise CzError for anything but "lean" and "all"."""
     if info not in INFO_CHOICES:
         raise CzError(f"info must be one of {', '.join(INFO_CHOICES)}, not {info!r}")
     return info == "all"

@@ -1,4 +1,4 @@
-"""The plant of several slots in lockstep: the equations of one slot wait for each other, those of eight do not.
+"""The plant of eight slots in lockstep, so that the processor works on eight independent equations at once.
 
 Each slot has a lane, a column of a small array on the stack. Its substeps are prepared and judged one slot after the
 other; the integration between runs over all lanes at once, with the processor's vector instructions. Those do the same
@@ -36,7 +36,7 @@ _JUMP = HEIGHT_MIN
 
 @jittable
 def height_inside(h_c: Any, p: Any) -> Any:
-    """Meniscus height held inside its limits, so that a failed state is still measured."""
+    """The meniscus height limited to its range, so that a failed state can still be measured."""
     top = HEIGHT_MAX_IN_A * p.a
     if h_c.real < HEIGHT_MIN:
         return HEIGHT_MIN
@@ -45,7 +45,7 @@ def height_inside(h_c: Any, p: Any) -> Any:
 
 @jittable
 def judged(x: Any, new: Any, u: Any, d: Any, p: Any, dt: Any, r_ref: Any, slope: Any) -> Any:
-    """A substep's new state and whether the crystal still grows; a jump no crystal makes keeps the state before.
+    """The state after a substep and whether the crystal still grows; after an impossible jump the state before it.
 
     Over a melt far too cold a low meniscus freezes within seconds, and a step across that singularity can end anywhere,
     inside the limits too. There the height falls faster and faster, so half the step at the first rate tells.
@@ -75,7 +75,7 @@ def _disturb(slot: Any, j: Any) -> Any:
 
 @jittable
 def _begin(slot: Any, numbers: Any, lanes: Any, lane: Any, interval: Any) -> None:
-    """Bring a slot to its lane, at the start of a control interval."""
+    """Copy a slot into its lane at the start of a control interval."""
     for constant in range(_P):
         lanes[constant, lane] = numbers[PULLER_AT + constant]
     set_column(State, slot.x, lanes, _X_AT, lane)
@@ -85,7 +85,7 @@ def _begin(slot: Any, numbers: Any, lanes: Any, lane: Any, interval: Any) -> Non
 
 @jittable
 def _prepare(slot: Any, lanes: Any, lane: Any, interval: Any) -> None:
-    """The next substep: to the next point of the 5 s grid, or to the end of the interval."""
+    """Prepare the next substep, to the next point of the 5 s grid or to the end of the interval."""
     t, end = lanes[_T, lane], (slot.k + 1) * interval
     j = int(t / GRID + _EPS)
     upto = min((j + 1) * GRID, end)
@@ -109,7 +109,7 @@ def _integrate(lanes: Any, found: Any, count: Any, slope: Any) -> None:
 def _judge(
     slot: Any, frames: Any, lanes: Any, found: Any, lane: Any, interval: Any, slope: Any, ring_offset: Any
 ) -> Any:
-    """Accept a substep, or not; returns whether the slot has another one to do."""
+    """Accept or reject a substep; return whether the slot needs another one."""
     p, e, upto = slot.puller, slot.episode, lanes[_T, lane]
     x, u = column(State, lanes, _X_AT, lane), column(Inputs, lanes, _U_AT, lane)
     d, new = column(Disturbance, lanes, _D_AT, lane), column(State, found, 0, lane)

@@ -16,7 +16,7 @@ _RING_SCALE = MEASURED[_RING].scale
 
 @jittable
 def clip(value: Any, limit: Any) -> Any:
-    """The value held within +-limit, a complex one by its real part; NaN passes."""
+    """The value limited to +-limit, a complex one by its real part; NaN stays NaN."""
     if value.real < -limit:
         return -limit
     return limit if value.real > limit else value

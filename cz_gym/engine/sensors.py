@@ -15,7 +15,7 @@ _EPS = 1e-9
 
 @jittable
 def photograph(slot: Any, frames: Any, t: Any, ring: Any, h_c: Any) -> None:
-    """Keep the ring [m] and the meniscus height [m] as a frame taken at t."""
+    """Store ring [m] and meniscus height [m] as the camera frame taken at t [s]."""
     at = slot.frames % frames.shape[0]
     frames[at, 0] = t
     frames[at, 1] = ring
@@ -25,7 +25,7 @@ def photograph(slot: Any, frames: Any, t: Any, ring: Any, h_c: Any) -> None:
 
 @jittable
 def _delivered(slot: Any, frames: Any, t: Any) -> Any:
-    """Index of the newest frame as old as the latency, or of the oldest there is."""
+    """Index of the newest frame that is at least as old as the latency, or else of the oldest frame."""
     depth = frames.shape[0]
     index = slot.frames - 1
     oldest = max(slot.frames - depth, 0)
@@ -36,7 +36,7 @@ def _delivered(slot: Any, frames: Any, t: Any) -> Any:
 
 @jittable
 def _freezes(slot: Any, t: Any) -> Any:
-    """Whether the camera is frozen at t, and whether it says so."""
+    """Whether the camera is frozen at t [s], and whether it is flagged as such."""
     frozen, flagged = False, False
     for which in range(FREEZES):
         if slot.freezes[which, 0] <= t < slot.freezes[which, 1]:

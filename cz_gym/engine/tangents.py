@@ -1,8 +1,8 @@
-"""Derivatives of a step: complex steps through the very functions it is made of, and the chain rule over them.
+"""Derivatives of a step, by complex steps through its own functions and the chain rule.
 
-A slot's differentiable state are the numbers of :data:`SMOOTH`; :func:`build_tangents` compiles the loop that writes
-how the next ones, and the cost, depend on them and on the action. f'(x) = Im f(x + i h) / h with an h so small that
-nothing is subtracted (Squire and Trapp, SIAM Review 1998).
+The differentiable state of a slot is :data:`SMOOTH`; :func:`build_tangents` compiles the loop that writes the
+derivatives of the next state and of the cost by this state and by the action. f'(x) = Im f(x + i h) / h, where nothing
+is subtracted, so that h can be as small as one likes (Squire and Trapp, SIAM Review 1998).
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ SMOOTH = ("r_c", "h_c", "T_1", "T_2", "T_b", "v_p", "Q_H", "ring", "reading")
 bright ring [m] and the camera's reading of it, without the operator's bias [m]."""
 ACTIONS = 2
 ROWS = (*SMOOTH, *Cost._fields)
-"""What is differentiated: the next state and the terms of the step's cost."""
+"""Rows of the Jacobian: the next state and the terms of the step's cost."""
 SCRATCH = (4, len(State._fields), len(State._fields) + len(Inputs._fields))
-"""Shape of what the loop works on."""
+"""Shape of the loop's work array."""
 _H = 2.0**-100
 """The imaginary step: a power of two, by which a compiler divides as quickly as it multiplies."""
 _X, _INPUTS = len(State._fields), len(Inputs._fields)
@@ -37,7 +37,7 @@ _COST = _ACT = len(SMOOTH)
 
 @force_inlined
 def _step(value: Any) -> Any:
-    """The value with an imaginary step."""
+    """The value plus an imaginary step."""
     return complex(value, _H)
 
 
@@ -75,7 +75,7 @@ def _rates_by(A: Any, x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
 
 @force_inlined
 def _stage(work: Any, weight: Any, ahead: Any, x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
-    """A stage of Runge and Kutta's: its rates, and what they depend on.
+    """One stage of RK4: its rates, and their derivatives.
 
     ``work`` holds the derivatives of the rates, of this stage's and the last one's as functions of where the step began
     (K), and of the step so far. This stage is at ``ahead`` [s] times the last one's rates; it counts ``weight`` [s].

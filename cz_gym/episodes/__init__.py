@@ -1,1 +1,1 @@
-"""What a crystal is drawn from: scenarios, and the draw of one episode from its random streams."""
+"""Scenarios, and the draw of an episode from its random streams."""

@@ -1,4 +1,4 @@
-"""What is random at every step: interface fluctuation, sensor noise, drop-outs, outliers.
+"""The random numbers of every step: interface fluctuation, sensor noise, drop-outs and outliers.
 
 ``streams`` are the episode's (:mod:`cz_gym.episodes.rng`), ``e`` its :class:`cz_gym.episodes.record.Episode`. Each
 kind is drawn front to back on a stream of its own, so that it is settled by the episode's key whenever it is drawn:

@@ -1,4 +1,4 @@
-"""A scenario as one flat record that compiled draws read, and an episode's draw: its ramps and constants."""
+"""A scenario as one record for the compiled draws, and the constants of a drawn episode."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def stream_number(index: int) -> int:
 
 
 class Episode(NamedTuple):
-    """What an episode's ramps, sensors and drives are made of; every field a float."""
+    """The constants of an episode's ramps, sensors and drives; every field is a float."""
 
     r_c_start: float = 0.0
     """r_c(0) - r_0 [m]."""
@@ -102,13 +102,13 @@ class Episode(NamedTuple):
     sd_slow: float = 0.0
     """Standard deviation of its slow fluctuation [K]."""
     keep_fast: float = 0.0
-    """What the fast fluctuation keeps over the grid's interval [-]."""
+    """Factor of the fast fluctuation over one interval of the grid [-]."""
     keep_slow: float = 0.0
-    """What the slow one keeps [-]."""
+    """The same of the slow fluctuation [-]."""
     kick_fast: float = 0.0
-    """Standard deviation of what it gains, sqrt(1 - keep_fast^2) [-]."""
+    """Standard deviation of the fast fluctuation's new part, sqrt(1 - keep_fast^2) [-]."""
     kick_slow: float = 0.0
-    """What the slow one gains [-]."""
+    """The same of the slow fluctuation [-]."""
     camera_sd: float = 0.0
     """Standard deviation of the ring's white noise [m]."""
     pyrometer_sd: float = 0.0

@@ -1,4 +1,4 @@
-"""What a scenario is: a frozen value that says what an episode's draw is made from.
+"""Scenarios: frozen values that hold the distributions from which episodes are drawn.
 
 A range is a pair ``(low, high)`` of a uniform distribution, in SI units; ``(x, x)`` is the value x. A family
 left at its default is absent. Two scenarios with equal contents have equal :attr:`Scenario.hash`.
@@ -106,7 +106,7 @@ class Pullers:
 
 @dataclass(frozen=True)
 class Recipe:
-    """Error e(t) of the temperature recipe: linear at a rate, for a while, then held."""
+    """Error e(t) of the temperature recipe: a linear ramp, then constant."""
 
     rate: Range = member(NONE, Draw.RANGE, -_FASTEST_RAMP, _FASTEST_RAMP, IN_K_PER_MIN)
     """Rate of T_1,ref [K/s]."""

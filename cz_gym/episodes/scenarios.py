@@ -127,11 +127,11 @@ _ROWS = {
     "10s": "control_interval=10.0",
     "exact": "meniscus=cz_gym.physics.young_laplace.YOUNG_LAPLACE",
 }
-"""What the benchmark's rows add to the name of their scenario, as arguments of the environment."""
+"""Suffixes of the benchmark's rows, and the arguments of the environment that they stand for."""
 
 
 def find_scenario(scenario: str | Scenario) -> Scenario:
-    """The scenario of that name, or the given one; ValueError names what there is."""
+    """Return the scenario of this name, or the given one; raise CzError with all names if there is none."""
     if isinstance(scenario, Scenario):
         return scenario
     if isinstance(scenario, str) and scenario in SCENARIOS:
@@ -144,7 +144,7 @@ def find_scenario(scenario: str | Scenario) -> Scenario:
 
 
 def mix_of(model: str | float | None, scenario: Scenario) -> tuple[float, float]:
-    """Range of lambda [-] for the environment's ``model`` argument; ValueError for anything else."""
+    """Range of lambda [-] for the environment's ``model`` argument; CzError for anything else."""
     if model is None:
         return scenario.pullers.mix
     if isinstance(model, str) and model in ("I", "II"):

@@ -1,4 +1,4 @@
-"""What time does to an episode: reference, recipe, hidden drift and melt loss, as pure functions of t [s].
+"""The signals of an episode that follow from time: reference, recipe, hidden drift and melt loss at t [s].
 
 ``e`` is an :class:`cz_gym.episodes.record.Episode` or a record with its fields, ``p`` a puller.
 """
@@ -19,7 +19,7 @@ SPAN = DRAW_SPAN
 
 @jittable
 def progress(t: Any, start: Any, duration: Any) -> Any:
-    """Share of a ramp that has passed [-], between 0 and 1."""
+    """Share of a ramp that is done at t [-], from 0 to 1."""
     return np.minimum(np.maximum((t - start) / duration, 0.0), 1.0)
 
 
@@ -37,7 +37,7 @@ def drift(t: Any, e: Any) -> Any:
 
 @jittable
 def recipe(t: Any, e: Any) -> Any:
-    """T_1,ref(t) - T_1,0 = e(t) + p(t) [K]: what the recipe asks for, error and drift together."""
+    """T_1,ref(t) - T_1,0 = e(t) + p(t) [K]: what the recipe asks for: error plus drift."""
     return e.recipe_amount * progress(t, e.recipe_start, e.recipe_duration) + drift(t, e)
 
 

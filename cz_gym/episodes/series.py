@@ -25,7 +25,7 @@ Floats = npt.NDArray[np.float64]
 
 
 class Series(NamedTuple):
-    """What is random at every step."""
+    """The random series of an episode."""
 
     interface: Floats
     """dT_i on the 5 s grid [K], shape (grid points,)."""

@@ -33,7 +33,7 @@ NEVER_COMPILED = ("agents", "baselines", "evaluation", "play", "testing")
 
 
 def private(module: str, name: str) -> Any:
-    """A private part of numba, or None where this numba has none of that name."""
+    """A private object of numba; None if this version has none of that name."""
     try:
         return getattr(importlib.import_module(f"numba.{module}"), name)
     except (ImportError, AttributeError):
@@ -94,17 +94,17 @@ def hashed(*functions: Callable[..., Any]) -> bool:
 
 
 class Store:
-    """The files of one function; stands where numba's index and its files would."""
+    """The files of one function's compiled code, in place of numba's index and files."""
 
     def __init__(self, folder: Path, name: str) -> None:
         self.folder, self.name = folder, name
 
     def path(self, key: Any) -> Path:
-        """Where the code for these types, this processor and this text is kept."""
+        """The file of the code for these types, this processor and these sources."""
         return self.folder / f"{self.name}.{hashlib.sha256(repr(key).encode()).hexdigest()[:32]}.code"
 
     def load(self, key: Any) -> Any:
-        """What was saved for this key, or None; files that are damaged count as none."""
+        """The code saved for this key; None if there is none or its file is damaged."""
         try:
             content = self.path(key).read_bytes()
         except OSError:
@@ -115,7 +115,7 @@ class Store:
         return data if made_for == key else None
 
     def save(self, key: Any, data: Any) -> None:
-        """Keep it, if there is room: a full disk costs time, not the run."""
+        """Save code if the disk has room; without room it is compiled again next time."""
         content: bytes = dumps((key, data))
         temporary = None
         try:
@@ -138,7 +138,7 @@ class CachedCode(FunctionCache):  # type: ignore[misc]
         self._cache_file = files
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Compiled code for this signature, or None: whatever cannot be put together again is compiled again."""
+        """Compiled code for this signature; None if there is none that can be loaded."""
         try:
             found = super().load_overload(sig, target_context)
         except Exception:
@@ -150,6 +150,6 @@ class CachedCode(FunctionCache):  # type: ignore[misc]
 
 @cache
 def announce() -> None:
-    """Say once, to whoever sits before a terminal, what the first use waits for."""
+    """Print once, on a terminal, why the first use takes long."""
     if sys.stderr.isatty():
         print("cz_gym: compiling the plant for this machine, once; about 20 s", file=sys.stderr, flush=True)

@@ -1,9 +1,9 @@
-"""How the equations are compiled.
+"""Compilation of the equations.
 
-Physics stands once, in plain functions marked :func:`jittable`: called from Python they take floats, arrays or
-complex numbers; called from a :func:`kernel` they compile into its loop. numba's disk cache looks only at
-the file of the outermost function, so a changed equation in another module would run the old physics; here
-the cache folder is named by a hash of every source of the package that can be compiled in.
+Every equation is written once, as a plain function marked :func:`jittable`. Called from Python it takes floats, arrays
+or complex numbers; called from a :func:`kernel` it compiles into its loop. numba's disk cache looks only at the file of
+the outermost function, so a changed equation in another module would run the old physics; here the cache folder is
+named by a hash of every source of the package that can be compiled in.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ def jittable(function: F) -> F:
 
 
 def force_inlined(function: F) -> F:
-    """A :func:`jittable` whose machine code is put into its callers', so that a loop around it can be vectorised."""
+    """A :func:`jittable` whose machine code is inlined into its callers, so that loops can be vectorised."""
     return register_jitable(error_model="numpy", forceinline=True)(function)
 
 
 def inlined(function: F) -> F:
-    """A part of kernels alone, its text put into each: passing a step's arrays on costs a tenth of the step.
+    """Mark a part of kernels whose text is inlined into each: a call with a step's arrays costs a tenth of the step.
 
-    Put in before types are inferred; as an inlined :func:`physics` it and all it calls would compile twice.
+    It is inlined before types are inferred; as an inlined :func:`physics` it and all it calls would compile twice.
     For module level only: kept in a closure it would change the key of the kernel on disk in every process.
     """
     return cast(F, numba.njit(error_model="numpy", inline="always")(function))
@@ -74,7 +74,7 @@ def kernel(function: F, keep: bool = True, allocates: bool = True) -> F:
 
 
 def entry(loop: Any, arguments: tuple[Any, ...]) -> Any:
-    """The compiled form of a kernel for arguments of these types, and only these.
+    """The compiled form of a kernel for the types of these arguments only.
 
     It skips the search for the right form at every call, which costs several times a slot's step.
     """
@@ -85,7 +85,7 @@ def entry(loop: Any, arguments: tuple[Any, ...]) -> Any:
 
 @intrinsic
 def _fetch(typing_context: Any, array: Any, at: Any) -> Any:
-    """The processor's hint itself: for writing (1), to be kept (3), data (1)."""
+    """The prefetch instruction: for writing (1), high locality (3), data (1)."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         held = context.make_array(signature.args[0])(context, builder, arguments[0])
@@ -100,7 +100,7 @@ def _fetch(typing_context: Any, array: Any, at: Any) -> Any:
 
 
 def fetch(array: Any, at: Any) -> None:
-    """In a kernel, have number ``at`` of a contiguous array brought to the cache; it may lie outside. Else nothing."""
+    """In a kernel, prefetch number ``at`` of a contiguous array, also one outside of it; uncompiled, do nothing."""
 
 
 @overload(fetch, inline="never")

@@ -19,7 +19,7 @@ SQRT_2, SQRT_HALF = math.sqrt(2.0), math.sqrt(0.5)
 
 
 class MeniscusModel(NamedTuple):
-    """A meniscus the plant can run on: its name and its functions.
+    """A model of the meniscus for the plant: its name and its functions.
 
     ``slope`` and ``ring_offset`` take ``(r_c, h_c, p)``, ``height`` takes ``(r_c, theta, a)``. All three are marked
     ``cz_gym.jit.compile.jittable`` and compile into the step, which makes no array: they hold arithmetic, ``np.sqrt``
@@ -31,7 +31,7 @@ class MeniscusModel(NamedTuple):
     ring_offset: Callable[[Any, Any, Any], Any]
     height: Callable[[Any, Any, Any], Any]
     covers: str = ""
-    """What the functions cover, for people; empty: no bounds of its own."""
+    """The range in which the functions hold, for people; empty: everywhere."""
 
     @property
     def functions(self) -> tuple[Callable[[Any, Any, Any], Any], ...]:

@@ -56,7 +56,7 @@ class Disturbance(NamedTuple):
 
 
 class Growth(NamedTuple):
-    """What happens at the interface."""
+    """Growth at the interface."""
 
     v_g: Any
     """Growth rate [m/s]."""
@@ -65,7 +65,7 @@ class Growth(NamedTuple):
 
 
 class Puller(NamedTuple):
-    """One puller's constants: the parameters the rates use, and what its operating point implies."""
+    """The constants of one puller: the parameters in the rates, and those that follow from its operating point."""
 
     lam: float
     """Share of conduction in the interface flux [-]: 1 is Model I, 0 is Model II."""
@@ -175,8 +175,8 @@ def derive_puller(q: Any, lam: Any, height: Any, ring_offset: Any) -> Any:
 def make_puller(parameters: Parameters | None = None, lam: float = 1.0, meniscus: MeniscusModel = HURLE) -> Puller:
     """The puller of these parameters at its own steady state.
 
-    ``lam`` is the share of conduction [-], 1 for Model I and 0 for Model II. Raises ValueError for parameters
-    that are not numbers, out of range or without a finite operating point.
+    ``lam`` is the share of conduction [-], 1 for Model I and 0 for Model II. Raises CzError for parameters
+    that are no plausible numbers or have no finite operating point.
     """
     if not 0.0 <= lam <= 1.0:
         raise CzError(f"lam (share of conduction) must lie in [0, 1], not {lam!r}")
@@ -187,7 +187,7 @@ def make_puller(parameters: Parameters | None = None, lam: float = 1.0, meniscus
 
 
 def check_puller(puller: Puller, meniscus: MeniscusModel = HURLE) -> Puller:
-    """Return the puller, or raise ValueError if it has no finite operating point on the meniscus."""
+    """Return the puller; raise CzError if it has no finite operating point on the meniscus."""
     if np.isfinite(puller.a) and not np.all(np.isfinite([puller.h_0, puller.ring_bias])):
         covers = f" ({meniscus.covers}; a = {puller.a:.4g} m)" if meniscus.covers else ""
         raise CzError(
