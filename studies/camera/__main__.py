@@ -1,4 +1,4 @@
-"""What the camera sees, measured: ``python -m studies.camera [--out FOLDER]``, about a minute."""
+"""The camera's view, measured and drawn in about a minute: ``python -m studies.camera``."""
 
 from __future__ import annotations
 

@@ -23,19 +23,13 @@ DETECTED, CLOSED, TRUE, TRACED, EDGE = COLOURS[1], COLOURS[0], INK, COLOURS[2], 
 
 
 def view_figure(bench: Bench) -> bytes:
-    """The image at a low, the nominal and a high meniscus, and the grey values down its middle."""
-    figure = canvas(9.6, 5.4)
-    axes = figure.subplots(2, 3, height_ratios=(1.0, 0.75))
-    for (above, below), h_c in zip(axes.T, (5.0 * MM, bench.puller.h_0, 8.0 * MM), strict=True):
-        image = picture(bench.puller.r_0, h_c, bench.puller, bench.view)
-        _draw_image(above, bench, h_c, image)
-        _draw_middle(below, bench, h_c, image)
-    axes[0, 0].set_ylabel("row")
-    axes[1, 0].set_ylabel("grey value")
-    for axis in axes[:, 1:].flat:
-        axis.tick_params(labelleft=False)
-    axes[0, 0].legend(fontsize=7, loc="upper center", framealpha=0.85)
-    axes[1, 0].legend(fontsize=7, loc="center right", framealpha=1.0)
+    """The image at a low, the nominal and a high meniscus."""
+    figure = canvas(9.6, 3.2)
+    axes = figure.subplots(1, 3, sharey=True)
+    for axis, h_c in zip(axes, (5.0 * MM, bench.puller.h_0, 8.0 * MM), strict=True):
+        _draw_image(axis, bench, h_c, picture(bench.puller.r_0, h_c, bench.puller, bench.view))
+    axes[0].set_ylabel("row")
+    axes[0].legend(fontsize=7, loc="upper center", framealpha=0.85)
     return png(figure)
 
 
@@ -60,19 +54,6 @@ def _draw_image(axis: Any, bench: Bench, h_c: float, image: Any) -> None:
 def _closed_form(p: Puller, h_c: float) -> float:
     """Radius of the plant's bright ring at r_0 [m]."""
     return p.r_0 + float(hurle_ring_offset(p.r_0, h_c, p))
-
-
-def _draw_middle(axis: Any, bench: Bench, h_c: float, image: Any) -> None:
-    view, p, _ = bench
-    axis.step(np.arange(ROWS) + 0.5, image[:, COLUMNS // 2, 0], where="mid", color=INK, lw=1.0)
-    edge = wall_edge(make_scene(p.r_0, h_c, p), view)
-    for name, r, z, colour in (
-        ("triple point", p.r_0, h_c, GREY),
-        ("mirrors the wall's end", edge.r, edge.z, EDGE),
-        ("closed-form ring", _closed_form(p, h_c), 0.0, CLOSED),
-    ):
-        axis.axvline(float(project(r, 0.0, z, view).row), color=colour, lw=1.0, ls="--", label=name)
-    axis.set(xlim=(35, ROWS), ylim=(0, 255), xlabel="row of the middle column")
 
 
 def section_figure(bench: Bench) -> bytes:

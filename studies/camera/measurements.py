@@ -1,12 +1,8 @@
-"""What the camera sees, measured: three readings of the ring, their slopes, and their answers to a change of pull."""
+"""Three readings of the bright ring: their slopes, and their responses to a change of the pull speed."""
 
 from __future__ import annotations
 
 import math
-import statistics
-import time
-import timeit
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +26,6 @@ PULLS, MODELS = (-0.1, -0.5), ("I", "II")
 """Sudden changes of the pull speed, share of v_0, the paper's first; models they are made on."""
 INTERVAL, HORIZON = 2.0, 240.0
 """Between images, and of a response [s]."""
-FRAMES = 300
 
 
 class Bench(NamedTuple):
@@ -42,7 +37,7 @@ class Bench(NamedTuple):
 
 
 class Rings(NamedTuple):
-    """Three readings of the same crystals less what each says at the operating point [m], arrays of one shape."""
+    """Three readings of the same crystals, less their values at the operating point [m]; arrays of one shape."""
 
     closed: Floats
     """The plant's bright ring, at its effective slope."""
@@ -65,11 +60,11 @@ class Response(NamedTuple):
     rings: Rings
 
     def depth(self, ring: Floats) -> float:
-        """How far the ring goes the wrong way [m]."""
+        """Largest excursion of the ring in the wrong direction [m]."""
         return float(np.nanmax(ring * np.sign(self.change)))
 
     def recovery(self, ring: Floats) -> float | None:
-        """Time after which it is back and stays back [s]; None if it never is."""
+        """Time after which the ring is back and stays back [s]; None if it never is."""
         wrong = np.flatnonzero(ring * np.sign(self.change) > 0.0)
         if wrong.size == 0 or wrong[-1] + 1 >= len(self.t) or np.isnan(ring[wrong[-1] + 1]):
             return None
@@ -77,7 +72,7 @@ class Response(NamedTuple):
 
 
 def make_bench() -> Bench:
-    """What everything is measured with."""
+    """The default camera, puller and detector."""
     view, puller = make_view(Camera()), make_puller()
     return Bench(view, puller, RingDetector(view, puller))
 
@@ -121,15 +116,8 @@ def respond(bench: Bench, model: str, change: float) -> Response:
     return Response(model, change, np.linspace(0.0, HORIZON, len(shown)), r_c - bench.puller.r_0, rings)
 
 
-def frames_per_second(bench: Bench) -> float:
-    """Images of the operating point a second of one core's time, the median of FRAMES."""
-    p = bench.puller
-    draw = partial(picture, p.r_0, p.h_0, p, bench.view)
-    return 1.0 / statistics.median(timeit.repeat(draw, timer=time.process_time, number=1, repeat=FRAMES))
-
-
 def numbers(bench: Bench, responses: list[Response]) -> dict[str, object]:
-    """What was measured, as ``camera.json`` says it."""
+    """The content of ``camera.json``."""
     view, p, detector = bench
     edge = wall_edge(make_scene(p.r_0, p.h_0, p), view)
     grid = read_rings(bench, p.r_0 + RADII[:, None], p.h_0 + HEIGHTS)
@@ -139,7 +127,6 @@ def numbers(bench: Bench, responses: list[Response]) -> dict[str, object]:
         for name, ring in (("closed", grid.closed), ("traced", grid.traced))
     }
     return {
-        "frames_per_s": frames_per_second(bench),
         "pixel_mm": detector.pixel / MM,
         "edge_slope_deg": math.degrees(edge.slope),
         "edge_height_mm": edge.z / MM,

@@ -11,7 +11,7 @@ from typing import Any
 
 from cz_gym import agents
 from cz_gym.atomic_files import check_writable, write_files
-from cz_gym.baselines.registry import find_controller
+from cz_gym.baselines.registry import make_controller
 from cz_gym.commands import OneLineParser, between
 from cz_gym.env import CzEnv
 from cz_gym.errors import CzError
@@ -35,13 +35,11 @@ PAPER = (255, 130, 205)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Film and write; 0 when done, 2 for bad input or a missing package, 130 when interrupted."""
+    """Command line; returns the exit code."""
     parser = OneLineParser("python -m studies.film", "Film the paper's controller and an agent on the same crystal.")
-    parser.add_argument("--scenario", default="randomized", metavar="NAME", help="scenario (%(default)s)")
     parser.add_argument(
         "--seed", type=between(0, 2**63 - 1), default=SEED, metavar="N", help="which crystal (%(default)s)"
     )
-    parser.add_argument("--agent", type=Path, metavar="FILE", help="agent file in place of the shipped one")
     about = "frames of the film (%(default)s)"
     parser.add_argument("--frames", type=between(2, 1000), default=92, metavar="N", help=about)
     parser.add_argument("--out", type=Path, default=OUT, metavar="FILE", help="file to write (results/media/duel.gif)")
@@ -54,14 +52,14 @@ def _make(arguments: argparse.Namespace) -> None:
     import PIL.Image  # noqa: F401  (missing? say so before the work, not after it)
 
     check_writable(arguments.out.resolve().parent)
-    content = film(arguments.scenario, arguments.seed, arguments.frames, arguments.agent)
+    content = film(arguments.seed, arguments.frames)
     write_files({arguments.out.resolve(): content})
     print(f"wrote {arguments.out}: {arguments.frames} frames, {len(content) / 1e6:.2f} MB")
 
 
-def film(scenario: str, seed: int, frames: int, agent: Path | None = None) -> bytes:
+def film(seed: int, frames: int) -> bytes:
     """The GIF: both sides stepped together, ``frames`` pictures equally far apart in time."""
-    sides, canvas = contestants(scenario, seed, agent), Canvas(*SIZE)
+    sides, canvas = contestants(seed), Canvas(*SIZE)
     steps = sides[0].env.config.steps
     pictures = []
     for number in range(frames):
@@ -71,15 +69,13 @@ def film(scenario: str, seed: int, frames: int, agent: Path | None = None) -> by
     return gif(pictures)
 
 
-def contestants(scenario: str, seed: int, agent: Path | None = None) -> tuple[Side, Side]:
-    """The paper's controller and the agent of a file, or the shipped one, each with an environment of its own."""
-    env = CzEnv(scenario, observation="measured", render_mode="rgb_array")
-    paper = find_controller("paper").make(env.config)
-    learned = agents.OnnxPolicy.load(agent or agents.shipped(), env.config)
-    if learned.contract.control_interval != env.config.control_interval:
-        raise CzError(f"{agent}: acts every {learned.contract.control_interval:g} s, not every 5 s")
-    other = CzEnv(scenario, observation=learned.observation, action=learned.action, render_mode="rgb_array")
+def contestants(seed: int) -> tuple[Side, Side]:
+    """The paper's controller and the shipped agent, each with an environment of its own."""
+    env = CzEnv(render_mode="rgb_array")
+    learned = agents.load()
+    other = CzEnv(**learned.settings, render_mode="rgb_array")
     name = f"learned: {learned.contract.algorithm}"
+    paper = make_controller("paper", env.config)
     return Side("the paper's controller", paper, env, PAPER, seed), Side(name, learned, other, c.TRUE, seed)
 
 

@@ -15,7 +15,6 @@ from studies.camera import measurements
 def test_the_study_measures_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measurements, "RADII", np.linspace(-8.0, 8.0, 3) * MM)
     monkeypatch.setattr(measurements, "HEIGHTS", np.zeros(1))
-    monkeypatch.setattr(measurements, "FRAMES", 3)
     monkeypatch.setattr(measurements, "HORIZON", 20.0)
     assert study.main(["--out", str(tmp_path)]) == 0
     found = json.loads((tmp_path / "camera.json").read_text())

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cz_gym import agents
 from cz_gym.rendering import palette
 from cz_gym.rendering.canvas import TIMES, Canvas
 from cz_gym.rendering.pixels import colours
@@ -22,8 +21,6 @@ pytest.importorskip("pygame")
         (["--frames", "1"], "--frames: must be between 2 and 1000"),
         (["--seed", "-3"], "--seed: must be between 0 and"),
         (["--out", "film.mp4"], "--out must end in .gif"),
-        (["--scenario", "nonsense"], "unknown scenario"),
-        (["--agent", "none.onnx"], "none.onnx"),
     ],
 )
 def test_a_film_of_nothing_is_one_line(
@@ -39,8 +36,7 @@ def test_a_short_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     Image = pytest.importorskip("PIL.Image")
     pytest.importorskip("onnxruntime")
     out = tmp_path / "new" / "film.gif"
-    agent = min(agents.MODELS.glob("*.onnx"))
-    assert film.main(["--frames", "3", "--agent", str(agent), "--out", str(out)]) == 0
+    assert film.main(["--frames", "3", "--out", str(out)]) == 0
     with Image.open(out) as picture:
         assert picture.n_frames == 3
         assert picture.size == film.SIZE
@@ -54,7 +50,7 @@ def test_a_short_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
 
 def test_each_side_is_drawn_in_its_own_colour() -> None:
     pytest.importorskip("onnxruntime")
-    sides, canvas = film.contestants("randomized", 1), Canvas(*film.SIZE)
+    sides, canvas = film.contestants(1), Canvas(*film.SIZE)
     for side in sides:
         side.step_to(200)
     picture = colours(draw(canvas, sides)).astype(np.float64)[: film.SIZE[1] * 7 // 10]
@@ -67,7 +63,7 @@ def test_each_side_is_drawn_in_its_own_colour() -> None:
 @pytest.mark.parametrize("samples", [200, 2160])
 def test_the_scale_that_is_told_is_the_one_that_is_drawn(samples: int, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("onnxruntime")
-    sides, canvas = film.contestants("randomized", film.SEED), Canvas(*film.SIZE)
+    sides, canvas = film.contestants(film.SEED), Canvas(*film.SIZE)
     for side in sides:
         side.step_to(samples)
     told: list[str] = []
