@@ -9,9 +9,10 @@ from typing import Any
 
 from cz_gym import Parameters
 from cz_gym.camera.view import Camera
+from cz_gym.observation import Measured
 
-DESCRIBED: tuple[Any, ...] = (Parameters, Camera)
-"""What has its fields, with values and sources, in a table."""
+DESCRIBED: tuple[Any, ...] = (Parameters, Camera, Measured)
+"""Records whose fields are in a table of a page."""
 LONGEST = 25
 """Longest default in a signature [characters]."""
 PLACE = "Alias for field number"
