@@ -258,7 +258,7 @@ class Scenario:
 
     @property
     def deterministic(self) -> bool:
-        """Whether all its episodes are the same: every member says when it is random (:class:`Draw`)."""
+        """Whether all its episodes are the same: no member makes them differ (``Draw`` at each member)."""
         families = (getattr(self, family.name) for family in dataclasses.fields(self)[1:])
         members = ((family, each) for family in families for each in dataclasses.fields(family))
         return not any(each.metadata["member"].draw.differs(getattr(family, each.name)) for family, each in members)
