@@ -16,9 +16,10 @@ from scipy.signal import cont2discrete
 
 from cz_gym.baselines.policy import Floats, State, map_arrays
 from cz_gym.errors import CzError
-from cz_gym.observation import HEATER_SCALE, MEASURED, PULL_SCALE, Measured, scales
+from cz_gym.observation import MEASURED, PULL_SCALE, Measured, scales
 from cz_gym.physics.linearisation import INPUTS, OUTPUTS, STATES, StateSpace, linearise
 from cz_gym.physics.plant import Puller
+from cz_gym.task import HEATER_RANGE
 
 _SMALL = 1e-6
 """Observed amplitude below every limit, gate and dead zone [-]; float32 actions keep their relative precision."""
@@ -99,7 +100,7 @@ def linear_controller(
         raise NotLinearError(f"{name} is not linear near rest")
     gains = once.T / _SMALL
     gains[:, memory:] /= scales(MEASURED, v_0)
-    gains[memory:] *= np.array([[v_0], [HEATER_SCALE]])
+    gains[memory:] *= np.array([[v_0], [HEATER_RANGE]])
     return StateSpace(
         gains[:memory, :memory], gains[:memory, memory:], gains[memory:, :memory], gains[memory:, memory:]
     )

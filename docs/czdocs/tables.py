@@ -19,7 +19,7 @@ from cz_gym.camera.view import Camera
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED, STATE, Channel
 from cz_gym.physics.parameters import describe
-from cz_gym.signals import INFO_ROWS
+from cz_gym.signals import INFO_ROWS, PULL_SCALE
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from . import nomenclature
@@ -71,7 +71,8 @@ def remembered() -> list[str]:
     at = {channel.name: i for i, channel in enumerate(HISTORY)}
     spans = [HISTORY[at[f"{name}_{LAGS[0]:g}s"]] for name in LAGGED]
     scales = [
-        "0.1 $v_0$" if name == "v_p" else f"{c.scale:g} {units(c.unit)}" for name, c in zip(LAGGED, spans, strict=True)
+        f"{c.scale / PULL_SCALE:g} $v_0$" if name == "v_p" else f"{c.scale:g} {units(c.unit)}"
+        for name, c in zip(LAGGED, spans, strict=True)
     ]
     heads = [f"{code(name)} [{scale}]" for name, scale in zip(LAGGED, scales, strict=True)]
     rows = (

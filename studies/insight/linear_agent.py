@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.errors import CzError
-from cz_gym.observation import DRIVE_CHANNELS, HEATER_SCALE, MEASURED, scales
+from cz_gym.observation import DRIVE_CHANNELS, MEASURED, scales
 from cz_gym.physics.linearisation import Floats, StateSpace
-from cz_gym.task import drives_of
+from cz_gym.task import HEATER_RANGE, drives_of
 
 _STEP = 1e-6
 
@@ -28,7 +28,7 @@ def linear_agent(
     slopes = jacobian(onnx_bytes, np.asarray(observations, np.float64), np.asarray(states, np.float64))
     slopes[:2] *= np.array([[drives.pull], [drives.heater]])
     slopes[[0, 1], DRIVE_CHANNELS] += drives.keep
-    slopes[:2] *= np.array([[v_0], [HEATER_SCALE]])
+    slopes[:2] *= np.array([[v_0], [HEATER_RANGE]])
     slopes[:, :n] /= scales(MEASURED, v_0)
     return StateSpace(slopes[2:, n:], slopes[2:, :n], slopes[:2, n:], slopes[:2, :n])
 
