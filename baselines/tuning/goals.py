@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,17 +11,13 @@ import numpy as np
 from cz_gym.baselines.analysis.frequency import crossover, sensitivity
 from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign
-from cz_gym.baselines.lqg.designs import ACTIVITIES, SEARCHED, SHIPPED, design_of, family_name, ring_of
-from cz_gym.baselines.pid.compensated_pid import Compensator, SeriesPID
+from cz_gym.baselines.lqg.designs import ACTIVITIES, SEARCHED, SHIPPED, design_of, family_name
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
-from cz_gym.baselines.pid.industrial import Industrial
 from cz_gym.baselines.pid.settings import settings_of
-from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
 from cz_gym.baselines.tuned_for import beyond
 from cz_gym.config import Config
-from cz_gym.cost import Weights
 from cz_gym.episodes.scenario import Scenario
-from cz_gym.episodes.scenarios import PULLER, RANDOMIZED, find_scenario
+from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.physics.linearisation import radius_model
@@ -123,45 +119,30 @@ def over_half_the_zero(policy: FilteredPID) -> float:
     return max(0.0, *(crossover(free, p, dt) / (0.5 * zero) - 1.0 for p, zero in zeros))
 
 
-_ALLOWED_STEP = 0.029
-_TUNED = FilteredPID(
-    pid=SeriesPID(K_p=0.028, T_i=1700.0, T_d=440.0, N=12.0),
-    compensator=Compensator(gain=-0.6, fast=1.8e-3, slow=5.3e-3),
-    T_f=78.0,
-    T_start=190.0,
-    T_track=300.0,
-    ring_lead=18.0,
-    K_ff=1.0,
-    heater=TemperatureLoop(K=510.0, T_i=200.0, share=0.52, K_pull=5.8, T_pull=440.0, T_mean=43.0),
-)
-_CONVENTIONAL = FilteredPID(
-    pid=SeriesPID(K_p=1.6e-3, T_i=400.0, T_d=1066.0, N=25.0),
-    compensator=None,
-    T_f=9.8,
-    T_start=600.0,
-    T_track=300.0,
-    ring_lead=5.0,
-    K_ff=0.13,
-    heater=TemperatureLoop(K=2000.0, T_i=300.0, share=0.32, K_pull=8.0, T_pull=1000.0, T_mean=380.0),
-)
-_INDUSTRIAL = Industrial(heater=TemperatureLoop(K_pull=3.0))
-_HARD = ("hard",)
-PIDS = {
-    "paper-tuned": PIDGoal(_TUNED, (*LOOP, *COMPENSATOR), _HARD, _ALLOWED_STEP, (too_sensitive,)),
-    "paper-filtered": PIDGoal(FilteredPID(), (Parameter("T_f", 2.0, 200.0),), _HARD),
-    "pid-conventional": PIDGoal(_CONVENTIONAL, LOOP, _HARD, _ALLOWED_STEP, (over_half_the_zero, too_sensitive)),
-    "industrial": PIDGoal(_INDUSTRIAL, (Parameter("T_f", 1.0, MINUTE), *HEATER), _HARD),
+PIDS: dict[str, dict[str, Any]] = {
+    "paper-tuned": {
+        "parameters": (*LOOP, *COMPENSATOR),
+        "allowed_step": 0.029,
+        "rules": (too_sensitive,),
+    },
+    "paper-filtered": {"parameters": (Parameter("T_f", 2.0, 200.0),)},
+    "pid-conventional": {
+        "parameters": LOOP,
+        "allowed_step": 0.029,
+        "rules": (over_half_the_zero, too_sensitive),
+    },
+    "industrial": {"parameters": (Parameter("T_f", 1.0, MINUTE), *HEATER)},
 }
-"""Goals of the PIDs on ``randomized``."""
+"""Parameters and rules of the PIDs, as arguments of :class:`PIDGoal`."""
 
 
 def _pid_goal(name: str, scenario: Scenario) -> PIDGoal:
-    """The goal of a PID; on other scenarios than ``randomized`` its search begins with the settings for that one."""
-    goal = PIDS[name]
+    """The goal of a PID; its search begins with the settings for ``randomized``."""
+    start, given = settings_of(name, RANDOMIZED), PIDS[name]
     if scenario == RANDOMIZED:
-        return goal
-    more = ROBUST if beyond(scenario, RANDOMIZED) and isinstance(goal.start, FilteredPID) else ()
-    return replace(goal, start=settings_of(name, RANDOMIZED), parameters=(*goal.parameters, *more), survive=())
+        return PIDGoal(start, survive=("hard",), **given)
+    more = ROBUST if beyond(scenario, RANDOMIZED) and isinstance(start, FilteredPID) else ()
+    return PIDGoal(start, survive=(), **given | {"parameters": (*given["parameters"], *more)})
 
 
 @dataclass(frozen=True)
@@ -217,56 +198,34 @@ class LQGGoal(Goal):
 LQG_PARAMETERS = tuple(Parameter(path, 1e-4, 1e4) for path in SEARCHED)
 FAMILY_SCENARIOS = "randomized", "hard", "sensor-fault", "puller"
 """Scenarios on which the family has members of its own."""
-_QUIET_STEP = 0.0095
+LQG_LIMITS: dict[tuple[str, str], tuple[float, float, bool]] = {
+    ("lqg", "randomized"): (0.062, 0.02, True),
+    ("lqg", "puller"): (0.09, 0.016, True),
+    ("lqg", "sensor-fault"): (0.063, 0.02, True),
+    ("lqg-quiet", "randomized"): (0.075, 0.0095, False),
+    ("lqg-quiet", "puller"): (0.1, 0.01, False),
+    ("lqg-quiet", "sensor-fault"): (0.076, 0.0095, False),
+    **{(family_name(each), name): (0.3, each, False) for name in FAMILY_SCENARIOS for each in ACTIVITIES},
+}
+"""Last three arguments of :class:`LQGGoal`, by controller and scenario."""
 
 
-def _lqg_goals() -> dict[tuple[str, str], LQGGoal]:
-    """The goals by controller and scenario."""
-    reward, quiet = design_of("lqg", RANDOMIZED), design_of("lqg-quiet", RANDOMIZED)
-
-    def goal(start: LQGDesign, survive: tuple[str, ...], *limits: Any) -> LQGGoal:
-        return LQGGoal(start, LQG_PARAMETERS, survive, *limits)
-
-    def on_puller(design: LQGDesign) -> LQGDesign:
-        """The design with that camera and a drifting pyrometer."""
-        return replace(design, noise=replace(design.noise, heater_walk=1.0), ring=ring_of(PULLER.sensor))
-
-    def member(activity: float, scenario: str) -> LQGGoal:
-        """A member of the family: begin with a shipped LQG, its weight on pull steps by a rule of thumb."""
-        like_quiet = scenario != "puller" or activity < _QUIET_STEP
-        name, step = ("lqg-quiet", _QUIET_STEP) if like_quiet else ("lqg", 0.016)
-        base = design_of(name, find_scenario(scenario))
-        pull_step = base.weights.pull_step * (step / activity) ** 4
-        start = replace(base, weights=base.weights._replace(pull_step=pull_step))
-        return goal(start, (scenario,), 0.3, activity, False)
-
-    start = LQGDesign(weights=Weights(pull=0.12, pull_step=0.06, heater_step=0.08))
-    quiet_start = LQGDesign(weights=Weights(pull=0.1, pull_step=0.2, heater_step=0.1))
-    harder = ("hard", "puller")
-    return {
-        ("lqg", "randomized"): goal(start, harder, 0.062, 0.02, True),
-        ("lqg-quiet", "randomized"): goal(quiet_start, harder, 0.075, _QUIET_STEP, False),
-        ("lqg", "puller"): goal(on_puller(reward), ("puller",), 0.09, 0.016, True),
-        ("lqg-quiet", "puller"): goal(on_puller(quiet), ("puller",), 0.1, 0.01, False),
-        ("lqg", "sensor-fault"): goal(reward, ("sensor-fault",), 0.063, 0.02, True),
-        ("lqg-quiet", "sensor-fault"): goal(quiet, ("sensor-fault",), 0.076, _QUIET_STEP, False),
-        **{(family_name(each), name): member(each, name) for name in FAMILY_SCENARIOS for each in ACTIVITIES},
-    }
+def _lqg_goal(name: str, scenario: Scenario) -> LQGGoal:
+    """The goal of an LQG; its search begins with the design that ships for the scenario."""
+    if (name, scenario.name) not in LQG_LIMITS:
+        known = ", ".join(where for each, where in LQG_LIMITS if each == name)
+        raise CzError(f"{name} has no goal on {scenario.name!r}, but on {known}")
+    both = name in ("lqg", "lqg-quiet") and scenario.name == "randomized"
+    survive = ("hard", "puller") if both else (scenario.name,)
+    return LQGGoal(design_of(name, scenario), LQG_PARAMETERS, survive, *LQG_LIMITS[name, scenario.name])
 
 
-LQGS = _lqg_goals()
-"""Goals of the LQGs, by controller and scenario."""
 TUNABLE = (*PIDS, *SHIPPED)
 """Names of the controllers that can be tuned."""
 
 
 def goal_of(name: str, scenario: Scenario) -> Goal:
     """The goal of a controller's search on a scenario; CzError if there is none."""
-    if name in PIDS:
-        return _pid_goal(name, scenario)
-    if (name, scenario.name) in LQGS:
-        return LQGS[name, scenario.name]
-    if name not in SHIPPED:
+    if name not in TUNABLE:
         raise CzError(unknown("controller to tune", name, TUNABLE))
-    known = ", ".join(where for each, where in LQGS if each == name)
-    raise CzError(f"{name} has no goal on {scenario.name!r}, but on {known}")
+    return _pid_goal(name, scenario) if name in PIDS else _lqg_goal(name, scenario)

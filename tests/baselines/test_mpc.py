@@ -8,19 +8,14 @@ import pytest
 from scipy.optimize import minimize
 
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign, optimal_inputs
-from cz_gym.baselines.lqg.designs import ring_of
-from cz_gym.baselines.lqg.filter_bank import Hypotheses, filter_bank
 from cz_gym.baselines.lqg.model import DRIFT, HEATER, PLANT, STATES
-from cz_gym.baselines.policy import map_arrays
 from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Actuators
-from cz_gym.episodes.scenarios import PULLER, RANDOMIZED
+from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.observation import decode
 from cz_gym.physics.plant import Disturbance, Inputs, State, hidden_load, rk4
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
-from tests.observed import measured
 
 pytest.importorskip("casadi", reason="needs the extra mpc")
 
@@ -172,47 +167,6 @@ def test_what_it_asks_for_is_within_the_drives_limits():
     power = np.diff(run.signals.Q_H, axis=0)
     assert power == pytest.approx(np.diff(wanted[:, :, 1], axis=0), abs=0.01)
     assert np.abs(pull).max() == pytest.approx(actuators.pull_window, rel=1e-3)
-
-
-@pytest.mark.parametrize("ring", [None, ring_of(PULLER.sensor)])
-def test_one_filter_is_the_lqgs_own(ring):
-    config = make_config("sensor-fault", horizon=0.25 * HOUR)
-    design, noise = replace(LINEAR, ring=ring), LINEAR.noise
-    lqg = LQG(design=design)
-    mpc = EkfMpc(design=design, hypotheses=Hypotheses((noise.fast_sd,), (noise.slow_sd,)))
-    seeds = range(1_000_000, 1_000_003)
-    ours, theirs = rollout(mpc, config, seeds), rollout(lqg, config, seeds)
-    assert ours.signals.v_p == pytest.approx(theirs.signals.v_p, rel=1e-6)
-    assert ours.signals.r_c == pytest.approx(theirs.signals.r_c, abs=1e-5 * MM)
-
-
-def test_the_bank_weighs_its_filters_by_bayes_rule():
-    single, hypotheses = LQG(design=LINEAR).gains.filter, Hypotheses((0.05, 0.5), (0.3,))
-    bank = filter_bank(single, hypotheses, 1)
-    state, evidence, row = bank.at_rest(1), np.zeros(2), single.plant.H[0]
-    random = np.random.default_rng(3)
-    for _ in range(5):
-        rows = bank.rows.predict(map_arrays(lambda part: part[0], state.filters), np.zeros((2, 2)), np.zeros(2))
-        seen = decode(measured(ring_error=random.normal() * 0.02 * MM))
-        for j in range(2):
-            variance = row @ rows.covariance[j] @ row + rows.camera_variance[j]
-            innovation = seen.ring_error[0] - row @ rows.mean[j]
-            evidence[j] += -0.5 * innovation**2 / variance - 0.5 * np.log(variance)
-        state = bank.step(state, np.zeros((1, 2)), np.zeros(1), seen, np.zeros(1, bool))
-    weight = np.exp(evidence - evidence.max())
-    assert state.probability[0] == pytest.approx(weight / weight.sum(), rel=1e-9)
-    assert state.mean[0] == pytest.approx(state.probability[0] @ state.filters.mean[0])
-
-
-def test_the_bank_tells_weak_fluctuations_from_strong_ones():
-    """Under the moves of the LQG with such a bank."""
-    hypotheses = Hypotheses((0.05, 0.5), (0.3,))
-
-    for which, sd in enumerate(hypotheses.fast_sd):
-        scenario = replace(RANDOMIZED, name="known", interface=replace(RANDOMIZED.interface, sd=(sd, sd)))
-        watched = Watched(LQG(hypotheses=hypotheses))
-        rollout(watched, make_config(scenario, horizon=1.0 * HOUR), range(1_000_000, 1_000_004))
-        assert (watched.states[-1].memory.filter.probability[:, which] > 0.9).mean() >= 0.75
 
 
 def test_estimates_beyond_the_equations_fall_back_on_the_law():

@@ -71,15 +71,6 @@ def test_history_is_read_like_measured(name):
         np.testing.assert_allclose(policy.predict(row)[0], policy.predict(history)[0], rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["paper", "paper-filtered", "paper-tuned", "pid-conventional", "industrial", "lqg"])
-def test_interval_and_pull_speed_are_the_environments(name):
-    config = make_config("nominal", control_interval=2.0)
-    policy = find_controller(name).make(config)
-    assert (policy.control_interval, policy.v_0) == (2.0, config.parameters.v_0)
-    with pytest.raises(ValueError, match="control_interval must be a positive number of seconds, not 0"):
-        replace(policy, control_interval=0)
-
-
 @pytest.mark.parametrize("name", TUNED)
 @pytest.mark.parametrize("dt", [2.0, 10.0])
 def test_every_control_interval_holds_the_radius_alike(name, dt):

@@ -5,16 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cz_gym.baselines.lqg.controller import LQG
+from cz_gym.baselines.lqg.controller import LQG, LQGDesign
 from cz_gym.baselines.lqg.designs import FACTORS, adaptive, lqg
-from cz_gym.baselines.lqg.filter_bank import Hypotheses
+from cz_gym.baselines.lqg.filter_bank import Hypotheses, filter_bank
+from cz_gym.baselines.policy import map_arrays
 from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Interface
 from cz_gym.evaluation.equal_activity import ratios
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.units import HOUR
+from cz_gym.observation import decode
+from cz_gym.units import HOUR, MM
+from tests.observed import measured
 
 
 class Watched(LQG):
@@ -26,13 +29,32 @@ class Watched(LQG):
         return pull, heater, memory
 
 
-def test_with_one_hypothesis_it_is_the_lqg():
-    config = make_config("sensor-fault", horizon=1800.0)
+@pytest.mark.parametrize("scenario", ["sensor-fault", "puller"])
+def test_with_one_hypothesis_it_is_the_lqg(scenario):
+    config = make_config(scenario, horizon=1800.0)
     plain = lqg("lqg-at-0.02", config)
     noise = plain.design.noise
     one = replace(plain, hypotheses=Hypotheses((noise.fast_sd,), (noise.slow_sd,)))
     ours, theirs = (rollout(each, config, range(4)) for each in (one, plain))
     np.testing.assert_allclose(ours.signals.v_p, theirs.signals.v_p, rtol=1e-6)
+
+
+def test_the_bank_weights_its_filters_by_bayes_rule():
+    single, hypotheses = LQG(design=LQGDesign(nonlinear=False)).gains.filter, Hypotheses((0.05, 0.5), (0.3,))
+    bank = filter_bank(single, hypotheses, 1)
+    state, evidence, row = bank.at_rest(1), np.zeros(2), single.plant.H[0]
+    random = np.random.default_rng(3)
+    for _ in range(5):
+        rows = bank.rows.predict(map_arrays(lambda part: part[0], state.filters), np.zeros((2, 2)), np.zeros(2))
+        seen = decode(measured(ring_error=random.normal() * 0.02 * MM))
+        for j in range(2):
+            variance = row @ rows.covariance[j] @ row + rows.camera_variance[j]
+            innovation = seen.ring_error[0] - row @ rows.mean[j]
+            evidence[j] += -0.5 * innovation**2 / variance - 0.5 * np.log(variance)
+        state = bank.step(state, np.zeros((1, 2)), np.zeros(1), seen, np.zeros(1, bool))
+    weight = np.exp(evidence - evidence.max())
+    assert state.probability[0] == pytest.approx(weight / weight.sum(), rel=1e-9)
+    assert state.mean[0] == pytest.approx(state.probability[0] @ state.filters.mean[0])
 
 
 @pytest.mark.parametrize(("strength", "factor"), [(0.05, 0.2), (0.5, 1.8)])

@@ -7,7 +7,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from cz_gym import make_puller
-from cz_gym.baselines.lqg.controller import LQG
 from cz_gym.baselines.lqg.model import DRIFT, FAST, HEATER, PLANT, SLOW, STATES, NoiseModel, plant_model
 from cz_gym.baselines.lqg.regulator import look_ahead, quadratic_cost, regulator, samples_ahead
 from cz_gym.cost import Weights
@@ -15,7 +14,6 @@ from cz_gym.episodes.schedule import quintic
 from cz_gym.observation import Measured
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.plant import Disturbance, Inputs, State, hidden_load, rates
-from tests.observed import measured
 
 PULLER = make_puller(lam=0.5)
 NOISE = NoiseModel()
@@ -129,10 +127,3 @@ def test_the_plan_is_the_recipe_five_minutes_ahead(dt):
             future = recipe((k + np.arange(samples + 1)) * dt)
             np.testing.assert_allclose(plan[0, 0], future, atol=1e-15)
             np.testing.assert_allclose(plan[0, 1], 2.0 * future, atol=1e-15)
-
-
-def test_while_the_camera_is_out_its_reading_is_not_believed():
-    _, first = LQG().predict(measured())
-    states = [LQG().predict(measured(ring_error=wrong, valid=0.0), first)[1].memory.filter for wrong in (0.0, 5e-3)]
-    np.testing.assert_array_equal(states[0].mean, states[1].mean)
-    assert states[0].covariance[0, 0, 0] > 0.0

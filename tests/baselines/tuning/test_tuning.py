@@ -12,7 +12,7 @@ from cz_gym.baselines.lqg.controller import LQGDesign
 from cz_gym.baselines.pid import settings as pid_settings
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.tuning import __main__ as command
-from cz_gym.baselines.tuning.goals import FAMILY_SCENARIOS, LQG_PARAMETERS, LQGS, PIDS, LQGGoal, PIDGoal, goal_of
+from cz_gym.baselines.tuning.goals import FAMILY_SCENARIOS, LQG_PARAMETERS, PIDS, LQGGoal, PIDGoal, goal_of
 from cz_gym.baselines.tuning.optimisers import first
 from cz_gym.baselines.tuning.search import Figures, Parameter, Search, file_name, measure, value_at
 from cz_gym.config import make_config
@@ -183,10 +183,11 @@ def test_every_parameter_sets_what_it_names(name, scenario):
     assert all(each.low < each.high for each in search.parameters)
 
 
+@pytest.mark.parametrize("scenario", ["randomized", "sensor-fault"])
 @pytest.mark.parametrize("name", PIDS)
-def test_a_search_elsewhere_begins_with_the_settings_of_randomized(name):
+def test_a_search_begins_with_the_settings_of_randomized(name, scenario):
     """But for an infinite jump, which is clipped to the range of its parameter."""
-    search = Search(name, goal_of(name, find_scenario("sensor-fault")), make_config("sensor-fault"), BUDGET)
+    search = Search(name, goal_of(name, find_scenario(scenario)), make_config(scenario), BUDGET)
     highest = max((each.high for each in search.parameters if each.path == "jump"), default=None)
     frozen = pid_settings.SHIPPED[name, "randomized"]
     assert search.settings(first(search)) == (frozen if highest is None else replace(frozen, jump=highest))
@@ -293,8 +294,8 @@ def test_a_search_uses_training_and_validation_seeds_only(tmp_path):
         met.setdefault(config.scenario.name, set()).update(seeds)
         return made_up(policy)
 
-    goal = replace(LQGS["lqg", "puller"], start=START)
     config = make_config("puller")
+    goal = replace(goal_of("lqg", config.scenario), start=START)
     lqg_search(watched, goal, config, trials=15, episodes=4, survive=3, finals=2).tune(tmp_path / "lqg.json")
     assert met == {"puller": {*range(4), *range(100_000, 100_003), *VALIDATION_SEEDS[:7]}}
 
