@@ -29,8 +29,8 @@ import numpy.typing as npt
 from cz_gym.baselines.bounds.trajectory import SCALES, Limits, limits_of
 from cz_gym.baselines.lqg.controller import LQG, Gains
 from cz_gym.baselines.lqg.designs import lqg
-from cz_gym.baselines.lqg.filter_bank import Hypotheses
 from cz_gym.baselines.lqg.model import DRIFT, FAST, HEATER, PLANT, SLOW, STATES
+from cz_gym.baselines.lqg.multiple_model import Hypotheses
 from cz_gym.baselines.lqg.regulator import Regulator, quadratic_cost
 from cz_gym.baselines.policy import Floats
 from cz_gym.config import Config

@@ -21,8 +21,8 @@ from cz_gym.baselines.lqg import kalman
 from cz_gym.baselines.lqg.controller import LQG, Gains, LQGDesign, solve_each
 from cz_gym.baselines.lqg.designs import lqg
 from cz_gym.baselines.lqg.estimator import PlantFilter
-from cz_gym.baselines.lqg.filter_bank import FilterBank
 from cz_gym.baselines.lqg.model import DRIFT, DRIFT_RATE, FAST, PLANT, SLOW, STATES, NoiseModel, load_per_drift
+from cz_gym.baselines.lqg.multiple_model import MultipleModelFilter
 from cz_gym.baselines.policy import Floats, batched, fresh, to_action
 from cz_gym.config import Config
 from cz_gym.observation import STATE, scales
@@ -53,7 +53,7 @@ class PrivilegedLQG(LQG):
         """Gains of the slots' own pullers."""
         return super().gains if self.gains_by_slot is None else self.gains_by_slot
 
-    def estimator(self, n: int) -> PlantFilter | FilterBank:
+    def estimator(self, n: int) -> PlantFilter | MultipleModelFilter:
         """The filter; ValueError for another number of slots than of known pullers."""
         known = n if self.gains_by_slot is None else len(self.gains_by_slot.filter.plant.A)
         if known != n:

@@ -28,8 +28,8 @@ from cz_gym.task import HEATER_RANGE
 from cz_gym.units import KILO
 
 from .estimator import PlantFilter
-from .filter_bank import FilterBank, Hypotheses, filter_bank
 from .model import STATES, NoiseModel, plant_model
+from .multiple_model import Hypotheses, MultipleModelFilter, multiple_model_filter
 from .regulator import Regulator, look_ahead, regulator, samples_ahead
 from .ring_model import RingModel, augmented
 
@@ -116,7 +116,7 @@ class LQG(MeasuredController):
         """Gains of the design point."""
         return _at_design_point(self.design, self.control_interval, self.parameters, self.meniscus)
 
-    def estimator(self, n: int) -> PlantFilter | FilterBank:
+    def estimator(self, n: int) -> PlantFilter | MultipleModelFilter:
         """The filter, or the bank of filters, for n slots."""
         if self.hypotheses is None:
             return self.gains.filter
@@ -152,8 +152,8 @@ def _at_design_point(design: LQGDesign, dt: float, parameters: Parameters, menis
 @lru_cache(maxsize=2)
 def _bank(
     design: LQGDesign, dt: float, parameters: Parameters, meniscus: MeniscusModel, hypotheses: Hypotheses, n: int
-) -> FilterBank:
-    return filter_bank(_at_design_point(design, dt, parameters, meniscus).filter, hypotheses, n)
+) -> MultipleModelFilter:
+    return multiple_model_filter(_at_design_point(design, dt, parameters, meniscus).filter, hypotheses, n)
 
 
 def previous_inputs(applied: Floats, command: Floats, starts: npt.NDArray[np.bool_], heater_slack: float) -> Floats:

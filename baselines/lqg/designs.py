@@ -15,20 +15,20 @@ from cz_gym.cost import Weights
 from cz_gym.episodes.scenario import Scenario, Sensor
 
 from .controller import LQG, LQGDesign
-from .filter_bank import Hypotheses
 from .model import NoiseModel
+from .multiple_model import Hypotheses
 from .ring_model import RingModel
 
 MEAN_RIPPLE = 0.4
 """Standard deviation of a ripple whose amplitude is uniform from zero to A, in units of A: 1/sqrt(6), rounded."""
 FACTORS = 0.2, 0.6, 1.0, 1.4, 1.8
 """Standard deviations of the fluctuations that adaptive LQGs consider possible, in units of the design's own [-]."""
-WEIGHTS = "pull", "pull_step", "heater_step"
-NOISE = (
+_WEIGHTS = "pull", "pull_step", "heater_step"
+_NOISE = (
     *("fast_sd", "slow_sd", "drift_rate_sd", "drift_rate_tau"),
     *("heater_walk", "thermal_walk", "pyrometer_sd", "recipe_share"),
 )
-SEARCHED = (*(f"weights.{name}" for name in WEIGHTS), *(f"noise.{name}" for name in NOISE))
+SEARCHED = (*(f"weights.{name}" for name in _WEIGHTS), *(f"noise.{name}" for name in _NOISE))
 """The fields of a design that are searched, joined by dots."""
 SHIPPED: dict[str, dict[str, tuple[float, ...]]] = {}
 """The values of SEARCHED, by controller and scenario."""
@@ -98,8 +98,8 @@ def design_of(controller: str, scenario: Scenario) -> LQGDesign:
     chosen = shipped[tuned_scenario(scenario, shipped, controller)]
     values: dict[str, Any] = dict(zip(SEARCHED, chosen, strict=True))
     return LQGDesign(
-        NoiseModel(**{name: values[f"noise.{name}"] for name in NOISE}),
-        Weights(**{name: values[f"weights.{name}"] for name in WEIGHTS}),
+        NoiseModel(**{name: values[f"noise.{name}"] for name in _NOISE}),
+        Weights(**{name: values[f"weights.{name}"] for name in _WEIGHTS}),
         ring=ring_of(scenario.sensor),
     )
 

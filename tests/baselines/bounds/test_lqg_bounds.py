@@ -46,21 +46,21 @@ def test_each_filter_has_the_noise_of_its_own_crystal():
 def test_knowing_puller_and_fluctuations_buys_something():
     config = make_config("randomized", horizon=2.0 * HOUR)
     names = "lqg-quiet", "lqg-quiet-privileged"
-    plain, told = (metrics(rollout(find_controller(name).make(config), config, range(20))) for name in names)
-    assert told.rmse_mm.mean() < plain.rmse_mm.mean()
-    assert told.pull_step_rms_mm_per_min.mean() < plain.pull_step_rms_mm_per_min.mean()
+    plain, privileged = (metrics(rollout(find_controller(name).make(config), config, range(20))) for name in names)
+    assert privileged.rmse_mm.mean() < plain.rmse_mm.mean()
+    assert privileged.pull_step_rms_mm_per_min.mean() < plain.pull_step_rms_mm_per_min.mean()
 
 
 def test_knowing_a_nominal_puller_is_the_lqg():
     design, config = LQGDesign(lam=1.0), make_config("only-interface", horizon=900.0)
-    told, plain = (rollout(kind(design=design), config, [0, 1, 2]) for kind in (lqg_bounds.PrivilegedLQG, LQG))
-    np.testing.assert_allclose(told.signals.v_p, plain.signals.v_p, rtol=1e-5)
+    privileged, plain = (rollout(kind(design=design), config, [0, 1, 2]) for kind in (lqg_bounds.PrivilegedLQG, LQG))
+    np.testing.assert_allclose(privileged.signals.v_p, plain.signals.v_p, rtol=1e-5)
 
 
 def test_other_slots_than_the_known_ones_are_refused():
-    told = lqg_bounds.PrivilegedLQG().for_episodes(make_config("randomized"), [1, 2])
+    privileged = lqg_bounds.PrivilegedLQG().for_episodes(make_config("randomized"), [1, 2])
     with pytest.raises(ValueError, match="2 pullers are known, got 3 slots"):
-        told.predict(next(observations()))
+        privileged.predict(next(observations()))
 
 
 def test_the_drift_is_read_off_its_load():

@@ -7,7 +7,7 @@ import pytest
 
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign
 from cz_gym.baselines.lqg.designs import FACTORS, adaptive, lqg
-from cz_gym.baselines.lqg.filter_bank import Hypotheses, filter_bank
+from cz_gym.baselines.lqg.multiple_model import Hypotheses, multiple_model_filter
 from cz_gym.baselines.policy import map_arrays
 from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config
@@ -41,7 +41,7 @@ def test_with_one_hypothesis_it_is_the_lqg(scenario):
 
 def test_the_bank_weights_its_filters_by_bayes_rule():
     single, hypotheses = LQG(design=LQGDesign(nonlinear=False)).gains.filter, Hypotheses((0.05, 0.5), (0.3,))
-    bank = filter_bank(single, hypotheses, 1)
+    bank = multiple_model_filter(single, hypotheses, 1)
     state, evidence, row = bank.at_rest(1), np.zeros(2), single.plant.H[0]
     random = np.random.default_rng(3)
     for _ in range(5):

@@ -38,7 +38,7 @@ class Hypotheses:
         return len(self.fast_sd) * len(self.slow_sd)
 
 
-class BankState(NamedTuple):
+class MultipleModelState(NamedTuple):
     """The memory of the filters, by slot and hypothesis."""
 
     filters: FilterState
@@ -60,33 +60,38 @@ class BankState(NamedTuple):
         return mean
 
 
-class FilterBank(NamedTuple):
+class MultipleModelFilter(NamedTuple):
     """The filters of n slots and m hypotheses, computed as one filter of n m rows, slot by slot."""
 
     rows: PlantFilter
     hypotheses: Hypotheses
 
-    def at_rest(self, n: int) -> BankState:
+    def at_rest(self, n: int) -> MultipleModelState:
         """The state before the first sample of n slots."""
         m = self.hypotheses.count
-        return BankState(_by_slot(self.rows.at_rest(n * m), m), np.zeros((n, m)))
+        return MultipleModelState(_by_slot(self.rows.at_rest(n * m), m), np.zeros((n, m)))
 
     def step(
-        self, state: BankState, applied: Floats, drift_moved: Floats, seen: Measured, starts: npt.NDArray[np.bool_]
-    ) -> BankState:
+        self,
+        state: MultipleModelState,
+        applied: Floats,
+        drift_moved: Floats,
+        seen: Measured,
+        starts: npt.NDArray[np.bool_],
+    ) -> MultipleModelState:
         """Predict and correct by one sample; arguments as of :meth:`PlantFilter.step`, one a slot."""
         m = self.hypotheses.count
         rows = self.rows.predict(_by_row(state.filters), np.repeat(applied, m, axis=0), np.repeat(drift_moved, m))
-        predicted = BankState(_by_slot(rows, m), state.evidence)
+        predicted = MultipleModelState(_by_slot(rows, m), state.evidence)
         return self.correct(select(starts, state, predicted) if starts.any() else predicted, seen)
 
-    def correct(self, state: BankState, seen: Measured) -> BankState:
+    def correct(self, state: MultipleModelState, seen: Measured) -> MultipleModelState:
         """The state after the measurements, which weight the filters and then correct each of them."""
         m, rows = self.hypotheses.count, _by_row(state.filters)
         repeated = Measured(*(np.repeat(channel, m) for channel in seen))
         evidence = state.evidence + self._log_likelihood(rows, repeated).reshape(state.evidence.shape)
         corrected = _by_slot(self.rows.correct(rows, repeated), m)
-        return BankState(corrected, evidence - evidence.max(axis=1, keepdims=True))
+        return MultipleModelState(corrected, evidence - evidence.max(axis=1, keepdims=True))
 
     def _log_likelihood(self, state: FilterState, seen: Measured) -> Floats:
         """Log likelihood of the ring under each filter, up to a constant, with innovations clipped to the gate."""
@@ -96,7 +101,7 @@ class FilterBank(NamedTuple):
         return np.where(seen.valid > 0.5, -0.5 * (square + np.log(variance)), 0.0)
 
 
-def filter_bank(single: PlantFilter, hypotheses: Hypotheses, n: int) -> FilterBank:
+def multiple_model_filter(single: PlantFilter, hypotheses: Hypotheses, n: int) -> MultipleModelFilter:
     """The bank of n slots: one filter, with the process noise and initial covariance of each hypothesis."""
     models = []
     for fast, slow in product(hypotheses.fast_sd, hypotheses.slow_sd):
@@ -104,7 +109,7 @@ def filter_bank(single: PlantFilter, hypotheses: Hypotheses, n: int) -> FilterBa
         model = plant_model(single.puller, noise, single.dt, single.meniscus)
         models.append(model if single.ring is None else augmented(model, single.ring, single.dt))
     Q, start = (np.tile([getattr(model, name) for model in models], (n, 1, 1)) for name in ("Q", "start"))
-    return FilterBank(single._replace(plant=single.plant._replace(Q=Q, start=start)), hypotheses)
+    return MultipleModelFilter(single._replace(plant=single.plant._replace(Q=Q, start=start)), hypotheses)
 
 
 def _by_row(state: FilterState) -> FilterState:
