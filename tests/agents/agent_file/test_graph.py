@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper, numpy_helper, parser
 
 from cz_gym.agents import AgentFileError, OnnxPolicy, shipped
 from cz_gym.agents.agent_file.contract import make_contract, read_agent
@@ -45,14 +45,20 @@ def test_the_shipped_agent_is_run_as_it_is_stored(name: str) -> None:
         np.testing.assert_array_equal(numpy_helper.to_array(one), numpy_helper.to_array(two))
 
 
+def nodes_of(text: str) -> list[Any]:
+    """Nodes in ONNX's text format."""
+    return list(parser.parse_graph(f"graph (float[n] observation) => (float[n] action) {{ {text} }}").node)
+
+
+def written(text: str, **weights: Any) -> Any:
+    """A model of these nodes."""
+    return model_of(nodes_of(text), {**WEIGHTS, **weights})
+
+
 def test_an_agent_with_a_memory_begins_each_episode_at_zero() -> None:
     """A counter: state + 1 each step, shown as the action."""
-    nodes = [
-        helper.make_node("Add", ["state", "one"], ["next_state"]),
-        helper.make_node("MatMul", ["observation", "nothing"], ["still"]),
-        helper.make_node("Add", ["still", "next_state"], ["action"]),
-    ]
-    weights = {"one": np.float32([[0.25, 0.5]]), "nothing": np.zeros((CHANNELS, 2), np.float32)}
+    nodes = nodes_of("next_state = Add(state, one) still = MatMul(observation, zero) action = Add(still, next_state)")
+    weights = {"one": np.float32([[0.25, 0.5]]), "zero": np.zeros((CHANNELS, 2), np.float32)}
     both = {
         "inputs": [value("observation", "n", CHANNELS), value("state", "n", 2)],
         "outputs": [value("action", "n", 2), value("next_state", "n", 2)],
@@ -68,24 +74,18 @@ def test_an_agent_with_a_memory_begins_each_episode_at_zero() -> None:
     assert policy.predict(seen[0], state)[0][0] == 0.5
 
 
-def loop() -> Any:
-    body = helper.make_graph(
-        [helper.make_node("Identity", ["go"], ["on"]), helper.make_node("Identity", ["x"], ["y"])],
-        "body",
-        [
-            helper.make_tensor_value_info("i", TensorProto.INT64, []),
-            helper.make_tensor_value_info("go", TensorProto.BOOL, []),
-            value("x", "n", 2),
-        ],
-        [helper.make_tensor_value_info("on", TensorProto.BOOL, []), value("y", "n", 2)],
-    )
-    return helper.make_node("Loop", ["", "", "a"], ["action"], body=body)
+LOOP = """
+    a = Gemm(observation, weight)
+    action = Loop("", "", a) <body = body (int64 i, bool go, float[n,2] x) => (bool on, float[n,2] y) {
+        on = Identity(go) y = Identity(x)
+    }>
+"""
 
 
 def branch() -> Any:
-    node = helper.make_node("Identity", ["observation"], ["action"])
-    node.attribute.append(helper.make_attribute("then_branch", graph_of([LINEAR], WEIGHTS, CHANNELS)))
-    return model_of([node])
+    model = written("action = Identity(observation)")
+    model.graph.node[0].attribute.append(helper.make_attribute("then_branch", graph_of([LINEAR], WEIGHTS, CHANNELS)))
+    return model
 
 
 def external(location: str) -> Any:
@@ -106,18 +106,15 @@ def changed(change: Callable[[Any], Any]) -> Any:
 
 
 def deep(nodes: int, width: int) -> Any:
-    weights = {"first": np.ones((CHANNELS, width), np.float32), "one": np.ones(1, np.float32)}
-    chain = [helper.make_node("MatMul", ["observation", "first"], ["x0"])]
-    chain += [helper.make_node("Mul", [f"x{i}", "one"], [f"x{i + 1}"]) for i in range(nodes)]
-    last = {"last": np.ones((width, 2), np.float32)}
-    return model_of([*chain, helper.make_node("MatMul", [f"x{nodes}", "last"], ["action"])], weights | last)
+    chain = "".join(f"x{i + 1} = Mul(x{i}, one) " for i in range(nodes))
+    first, last = np.ones((CHANNELS, width), np.float32), np.ones((width, 2), np.float32)
+    text = f"x0 = MatMul(observation, first) {chain} action = MatMul(x{nodes}, last)"
+    return written(text, first=first, last=last, one=np.ones(1, np.float32))
 
 
 def broadcast_bomb() -> Any:
-    weights = {name: np.zeros((1000,) + (1,) * (i + 2), np.float32) for i, name in enumerate("abc")} | WEIGHTS
-    names = ["observation", "x", "y", "z"]
-    nodes = [helper.make_node("Add", [names[i], "abc"[i]], [names[i + 1]]) for i in range(3)]
-    return model_of([*nodes, LINEAR], weights)
+    weights = {name: np.zeros((1000,) + (1,) * (i + 2), np.float32) for i, name in enumerate("abc")}
+    return written("x = Add(observation, a) y = Add(x, b) z = Add(y, c) action = Gemm(z, weight, bias)", **weights)
 
 
 def honest_shape(model: Any, dims: list[int]) -> None:
@@ -125,18 +122,14 @@ def honest_shape(model: Any, dims: list[int]) -> None:
     model.graph.initializer[0].dims.extend(dims)
 
 
+ONES = np.ones((CHANNELS, 2), np.float32)
 HOSTILE = {
     "external weights": (lambda: external("../../../etc/passwd"), "another file"),
-    "endless loop": (lambda: model_of([helper.make_node("Gemm", ["observation", "weight"], ["a"]), loop()]), "'Loop'"),
+    "endless loop": (lambda: written(LOOP), "'Loop'"),
     "branch in an attribute": (branch, "an attribute that is not a number"),
     "tensor made of a shape": (
-        lambda: model_of([helper.make_node("ConstantOfShape", ["big"], ["action"])], {"big": np.int64([10**6, 10**6])}),
-        "'ConstantOfShape'",
-    ),
-    "scripted operator": (
-        lambda: model_of([helper.make_node("PyOp", ["observation"], ["action"], domain="ai.onnx.contrib")]),
-        "'ai.onnx.contrib:PyOp'",
-    ),
+        lambda: written("action = ConstantOfShape(big)", big=np.int64([10**6, 10**6])), "'ConstantOfShape'"),
+    "scripted operator": (lambda: written("action = ai.onnx.contrib.PyOp(observation)"), "'ai.onnx.contrib:PyOp'"),
     "foreign operators": (
         lambda: changed(lambda model: model.opset_import.append(helper.make_opsetid("com.microsoft", 1))),
         "beyond the standard",
@@ -153,26 +146,20 @@ HOSTILE = {
     "training": (lambda: changed(lambda model: model.training_info.add()), "more than a graph"),
     "broadcast bomb": (broadcast_bomb, "more than 3 axes"),
     "broadcast over pullers": (
-        lambda: model_of(
-            [
-                helper.make_node("Add", ["observation", "five"], ["x"]),
-                helper.make_node("MatMul", ["five", "w"], ["y"]),
-                helper.make_node("Gemm", ["observation", "w"], ["action"]),
-            ],
-            {"five": np.zeros((5, 1, CHANNELS), np.float32), "w": np.ones((CHANNELS, 2), np.float32)},
+        lambda: written(
+            "x = Add(observation, five) y = MatMul(five, w) action = Gemm(observation, w)",
+            five=np.zeros((5, 1, CHANNELS), np.float32), w=ONES,
         ),
         "row of known length",
     ),
     "deep graph": (lambda: deep(MAX_NODES, 2), f"{MAX_NODES + 2} nodes"),
     "wide graph": (lambda: deep(8, MAX_ACTIVATIONS // 8), "for each puller"),
     "weights used again and again": (
-        lambda: model_of(
-            [
-                helper.make_node("Gemm", [f"x{i}" if i else "observation", "w"], [f"x{i + 1}"])
-                for i in range(MAX_NODES - 1)
-            ]
-            + [LINEAR],
-            {**WEIGHTS, "w": np.ones((CHANNELS, 900 * CHANNELS), np.float32)},
+        lambda: written(
+            "x1 = Gemm(observation, w) "
+            + "".join(f"x{i + 1} = Gemm(x{i}, w) " for i in range(1, MAX_NODES - 1))
+            + "action = Gemm(observation, weight, bias)",
+            w=np.ones((CHANNELS, 900 * CHANNELS), np.float32),
         ),
         "more than 1000000 weights",
     ),
@@ -188,44 +175,29 @@ HOSTILE = {
     ),
     "too narrow": (lambda: model_of(inputs=[value("observation", "n", CHANNELS - 1)]), "must map observation"),
     "fixed number of pullers": (lambda: model_of(inputs=[value("observation", 1, CHANNELS)]), "must map observation"),
-    "constant action": (
-        lambda: model_of([helper.make_node("Identity", ["a"], ["action"])], {"a": np.zeros((2, 2), np.float32)}),
-        "do not depend",
-    ),
+    "constant action": (lambda: written("action = Identity(a)", a=np.zeros((2, 2), np.float32)), "do not depend"),
     "rows of others": (
-        lambda: model_of(
-            [
-                helper.make_node("Gather", ["observation", "first"], ["x"], axis=0),
-                helper.make_node("Add", ["observation", "x"], ["y"]),
-                helper.make_node("MatMul", ["y", "weight"], ["action"]),
-            ],
-            {**WEIGHTS, "first": np.int64([0])},
+        lambda: written(
+            "x = Gather <axis = 0> (observation, first) y = Add(observation, x) action = MatMul(y, weight)",
+            first=np.int64([0]),
         ),
         "row of known length",
     ),
     "products of others": (
-        lambda: model_of(
-            [
-                helper.make_node("Gemm", ["observation", "observation"], ["x"], transA=1),
-                helper.make_node("MatMul", ["observation", "x"], ["y"]),
-                helper.make_node("MatMul", ["y", "weight"], ["action"]),
-            ]
+        lambda: written(
+            "x = Gemm <transA = 1> (observation, observation) y = MatMul(observation, x) action = MatMul(y, weight)"
         ),
         "may mix the rows",
     ),
     "two pullers read as two numbers": (
-        lambda: model_of(
-            [
-                helper.make_node("Gemm", ["observation", "weight", "bias"], ["linear"]),
-                helper.make_node("Gather", ["linear", "both"], ["pairs"], axis=1),
-                helper.make_node("Add", ["pairs", "linear"], ["x"]),
-                helper.make_node("Gather", ["x", "first"], ["action"], axis=1),
-            ],
-            {**WEIGHTS, "both": np.int64([[0, 1], [0, 1]]), "first": np.int64(0)},
+        lambda: written(
+            """linear = Gemm(observation, weight, bias) pairs = Gather <axis = 1> (linear, both)
+            x = Add(pairs, linear) action = Gather <axis = 1> (x, first)""",
+            both=np.int64([[0, 1], [0, 1]]), first=np.int64(0),
         ),
         "may mix the rows",
     ),
-    "cycle": (lambda: model_of([helper.make_node("Add", ["action", "action"], ["action"])]), "not a sound"),
+    "cycle": (lambda: written("action = Add(action, action)"), "not a sound"),
     "unknown attribute": (
         lambda: changed(lambda model: model.graph.node[0].attribute.append(helper.make_attribute("path", 1))),
         "not a sound",
