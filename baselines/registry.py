@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 
 from cz_gym.baselines.bounds import lqg as lqg_bounds
@@ -14,37 +13,15 @@ from cz_gym.baselines.pid.compensated_pid import CompensatedPID
 from cz_gym.baselines.pid.open_loop import OpenLoop
 from cz_gym.baselines.pid.settings import tuned
 from cz_gym.config import Config, check_config
+from cz_gym.contender import Contender
 from cz_gym.errors import CzError
 from cz_gym.names import unknown
 
 from .policy import Policy
 
 
-@dataclass(frozen=True)
-class Entry:
-    """A named controller."""
-
-    name: str
-    make: Callable[[Config], Policy]
-    """Builds the controller for an environment's settings."""
-    observation: str
-    """Observation mode it reads: "measured" or "history"; "state" marks a bound, which no sensor could feed."""
-    meaning: str
-    """Description in one line."""
-    default: bool = True
-    """Whether a benchmark that names no controllers runs it."""
-    privileged: bool = False
-    """Whether it is a bound: it knows what no controller can know."""
-    slow: bool = False
-    """Whether it runs only with ``--slow``, on the first few episodes."""
-
-    def __post_init__(self) -> None:
-        make = self.make
-        object.__setattr__(self, "make", lambda config: make(check_config(config)))
-
-
-def _tuned(name: str, meaning: str) -> Entry:
-    return Entry(name, lambda config: tuned(name, config), "measured", meaning)
+def _tuned(name: str, meaning: str, quoted: bool = False) -> Contender:
+    return Contender(name, lambda config: tuned(name, config), "measured", meaning, quoted=quoted)
 
 
 IN_TABLE = 0.02
@@ -52,19 +29,20 @@ IN_TABLE = 0.02
 agents, so their radius errors can be compared. On ``hard`` the agents are more active."""
 
 
-def _lqg(name: str, meaning: str, default: bool = True) -> Entry:
-    return Entry(name, partial(designs.lqg, name), "measured", meaning, default)
+def _lqg(name: str, meaning: str, default: bool = True) -> Contender:
+    return Contender(name, partial(designs.lqg, name), "measured", meaning, default)
 
 
-def _lqg_at(activity: float) -> Entry:
+def _lqg_at(activity: float) -> Contender:
     meaning = f"the same LQG, tuned for the radius error with pull steps of {activity:g} mm/min at most"
-    return _lqg(designs.family_name(activity), meaning, default=activity == IN_TABLE)
+    found = _lqg(designs.family_name(activity), meaning, default=activity == IN_TABLE)
+    return replace(found, quoted=found.default)
 
 
-def _adaptive(name: str) -> Entry:
+def _adaptive(name: str) -> Contender:
     make = partial(designs.lqg, name)
     meaning = f"{name} with filters for weak to strong fluctuations, weighted by how well they predict"
-    return Entry(f"{name}-adaptive", lambda config: adaptive(make(config)), "measured", meaning, default=False)
+    return Contender(f"{name}-adaptive", lambda config: adaptive(make(config)), "measured", meaning, default=False)
 
 
 def _ekf_mpc(config: Config) -> Policy:
@@ -73,10 +51,10 @@ def _ekf_mpc(config: Config) -> Policy:
     return ekf_mpc(config)
 
 
-_bound = partial(Entry, default=False, privileged=True)
+_bound = partial(Contender, default=False, privileged=True)
 
 
-def _privileged(name: str) -> Entry:
+def _privileged(name: str) -> Contender:
     make = partial(designs.lqg, name)
     meaning = f"bound: {name} given the puller's parameters and how strong each crystal's fluctuations are"
     return _bound(f"{name}-privileged", lambda config: lqg_bounds.privileged(make(config)), "measured", meaning)
@@ -86,24 +64,30 @@ WITH_ADAPTIVE = tuple(map(designs.family_name, (0.013, IN_TABLE)))
 """LQGs with an adaptive version."""
 WITH_PRIVILEGED = ("lqg-quiet", *WITH_ADAPTIVE)
 """LQGs with a privileged version."""
-CONTROLLERS: tuple[Entry, ...] = (
-    Entry("open-loop", lambda config: OpenLoop(), "measured", "nominal pull speed and heater power, no feedback"),
-    Entry("paper", CompensatedPID().for_config, "measured", "the paper's compensator and PID as printed, Table 1"),
-    Entry(
+CONTROLLERS: tuple[Contender, ...] = (
+    Contender("open-loop", lambda config: OpenLoop(), "measured", "nominal pull speed and heater power, no feedback"),
+    Contender(
+        "paper",
+        CompensatedPID().for_config,
+        "measured",
+        "the paper's compensator and PID as printed, Table 1",
+        quoted=True,
+    ),
+    Contender(
         "pid-uncompensated",
         CompensatedPID(compensator=None).for_config,
         "measured",
         "the same PID without the compensator: unstable",
     ),
     _tuned("paper-filtered", "the paper's controller with a measurement filter and anti-windup"),
-    _tuned("paper-tuned", "compensator and PID re-tuned, with a slow trim of the heater"),
+    _tuned("paper-tuned", "compensator and PID re-tuned, with a slow trim of the heater", quoted=True),
     _tuned("pid-conventional", "tuned PID without compensator, crossover below half the right-half-plane zero"),
     _tuned("industrial", "incremental pull-speed law of a logged puller, with automatic growth control"),
     _lqg("lqg", "Kalman filter and LQ regulator of pull and heater, for the reward"),
     _lqg("lqg-quiet", "the same for low pull activity"),
     *(_lqg_at(activity) for activity in designs.ACTIVITIES),
     *map(_adaptive, WITH_ADAPTIVE),
-    Entry("ekf-mpc", _ekf_mpc, "measured", "nonlinear MPC on a bank of lqg's filters", default=False, slow=True),
+    Contender("ekf-mpc", _ekf_mpc, "measured", "nonlinear MPC on a bank of lqg's filters", default=False, slow=True),
     _bound("lqg-true", lqg_bounds.lqg_true, "measured", "bound: lqg given the puller's parameters"),
     *map(_privileged, WITH_PRIVILEGED),
     _bound("full-information", lqg_bounds.full_information, "state", "bound: lqg's regulator, true state seen"),
@@ -118,7 +102,7 @@ CONTROLLERS: tuple[Entry, ...] = (
 """Every named controller, in the order of tables."""
 
 
-def find_controller(name: str) -> Entry:
+def find_controller(name: str) -> Contender:
     """The controller of that name; CzError lists the known ones for another."""
     for entry in CONTROLLERS:
         if entry.name == name:
@@ -128,4 +112,5 @@ def find_controller(name: str) -> Entry:
 
 def make_controller(name: str, config: Config) -> Policy:
     """The controller of that name for an environment; CzError lists the known ones for another name."""
-    return find_controller(name).make(config)
+    made: Policy = find_controller(name).make(check_config(config))
+    return made

@@ -1,24 +1,33 @@
 """Samples of rollouts, as a benchmark makes them of its parts."""
 
 from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
 
 from cz_gym.baselines.registry import find_controller
+from cz_gym.contender import Contender
 from cz_gym.evaluation.protocol import find_row
-from cz_gym.evaluation.results import EXAMPLES, Controller, Part, Sample, ScenarioResult, summarise
+from cz_gym.evaluation.results import Result, Sample, summarise
 from cz_gym.evaluation.rollout import Rollout, rollout
 
 
-def sample_of(controller: Controller, runs: Sequence[Rollout]) -> Sample:
-    """Of a controller's rollouts, one a training seed, all on the same episodes."""
-    seeds = runs[0].seeds
-    parts = [[Part.of(run, frozenset(seeds[:EXAMPLES]))] for run in runs]
-    return Sample.joined(controller, seeds, parts, runs[0].config.control_interval)
+def contender(name: str, meaning: str = "", training_seeds: tuple[int, ...] = (), **facts: Any) -> Contender:
+    """A contender that is never run; an agent if it has training seeds."""
+    trained: tuple[Any, ...] = tuple(SimpleNamespace(contract=None) for _ in training_seeds)
+    facts = {"observation": "measured", "make": lambda config: None, **facts}
+    return Contender(name, meaning=meaning, training_seeds=training_seeds, trained=trained, **facts)
 
 
-def scenario_of(
+def sample_of(who: Contender, runs: Sequence[Rollout]) -> Sample:
+    """A contender's sample of rollouts, one a training seed, all on the same episodes."""
+    parts = [Sample.of(copy, run) for copy, run in zip(who.copies(), runs, strict=True)]
+    return Sample.joined(who, runs[0].seeds, parts)
+
+
+def result_of(
     name: str, names: Sequence[str], last: str, training_seeds: tuple[int, ...] = (4,), fewer: int = 0
-) -> tuple[ScenarioResult, dict[str, Rollout]]:
-    """What controllers make of three crystals (one of a scenario without randomness), and their rollouts.
+) -> tuple[Result, dict[str, Rollout]]:
+    """What controllers come to on three crystals (one of a scenario without randomness), and their rollouts.
 
     The last is shown as an agent of that name, trained with the given seeds, and meets so many crystals less.
     """
@@ -26,10 +35,9 @@ def scenario_of(
     config, seeds = row.config(), row.seeds(3)
     for who in names:
         learned = who == names[-1]
-        runs[who] = run = rollout(
-            find_controller(who).make(config), config, seeds[: len(seeds) - fewer * learned] or seeds
-        )
-        agent = Controller(last, "measured", f"agent trained with {last}", training_seeds)
-        shown = agent if learned else Controller(who, "measured", f"what {who} is")
+        met = seeds[: len(seeds) - fewer * learned] or seeds
+        runs[who] = run = rollout(find_controller(who).make(config), config, met)
+        agent = contender(last, f"agent trained with {last}", training_seeds)
+        shown = agent if learned else contender(who, f"what {who} is", quoted=who == "paper")
         samples.append(sample_of(shown, [run] * (len(training_seeds) if learned else 1)))
     return summarise(row, samples), runs

@@ -1,18 +1,18 @@
 """Episodes that need not run again: a slow controller's, cached on disk, and the bound's of an earlier benchmark.
 
-The cache has one file an episode, in a folder named by controller, scenario and a hash of all that its results depend
-on: the controller's settings, the environment's (plant, scenario, interval, horizon), and the code of both.
+The cache has one file an episode, in a folder named by controller, scenario and a hash of all that the results depend
+on: the controller's settings, the environment's (plant, scenario, interval, horizon), the code of both, and the
+packages that compute.
 """
 
 from __future__ import annotations
 
-import ast
 import hashlib
 import io
 import json
 import sys
 import zipfile
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,47 +20,54 @@ from typing import Any
 import numpy as np
 
 from cz_gym.atomic_files import write_files
-from cz_gym.config import Config
-from cz_gym.jit.cache import compiled_sources
+from cz_gym.contender import Contender
+from cz_gym.hashing import hash_files
+from cz_gym.jit.cache import PACKAGE, compiled_sources
 
-from .files import EPISODES, read_episodes
+from .files import EPISODES, read_episodes, software
 from .metrics import metric_names
 from .protocol import Row
-from .results import BOUND, Controller, Part, Sample
+from .results import BOUND, Sample
 from .rollout import Floats, Signals
 
-BLOCK = 10
-"""Episodes run at once."""
 MAX_BYTES = 64_000_000
 """Largest cached episode that is read, packed or not."""
 PRINTED = 1e-4
 """Relative precision of the figures in ``episodes.csv``, five digits [-]."""
+COMPUTING = ("numpy", "scipy", "numba", "casadi")
+"""Packages whose version the figures may depend on."""
+PICTURES = ("camera", "rendering")
+"""Sub-packages that draw: no cached figure depends on them."""
 
 
 class SlowEpisodes:
-    """The cached episodes of a slow controller, whose ``policy`` has a ``hash`` of its settings."""
+    """The cached episodes of a slow controller on a row; its policy has a ``hash`` of its settings."""
 
-    def __init__(self, controller: Controller, policy: Any, config: Config, folder: Path) -> None:
-        parts = [controller.name, policy.hash, code_behind(type(policy).__module__), config.hash, *metric_names()]
+    def __init__(self, contender: Contender, row: Row, folder: Path) -> None:
+        config = row.config(contender.observation, contender.action)
+        policy = contender.make(row.design_config(contender.observation, contender.action))
+        code, versions = code_behind(type(policy).__module__), software(COMPUTING)["packages"]
+        parts = [contender.name, policy.hash, code, versions, config.hash, *metric_names()]
         digest = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
-        self.place = folder / f"{controller.name}-{config.scenario.name}-{digest}"
+        self.contender, self.place = contender, folder / f"{contender.name}-{config.scenario.name}-{digest}"
 
-    def read(self, seeds: Sequence[int], examples: Collection[int]) -> list[Part]:
-        """Those of some seeds that are there, each a part; of the ``examples`` those that have their signals."""
-        found = (read_episode(self.place / f"{seed}.npz", seed in examples) for seed in seeds)
-        return [part for part in found if part]
+    def read(self, seeds: Sequence[int]) -> list[Sample]:
+        """Samples of single episodes, of those that are there; the first counts only with its signals."""
+        found = (read_episode(self.contender, self.place / f"{seed}.npz", seed == seeds[0]) for seed in seeds)
+        return [sample for sample in found if sample]
 
-    def write(self, part: Part) -> None:
-        """Keep a part."""
-        none, packed = np.zeros((0, 0)), {}
-        for seed, row in zip(part.seeds, part.values, strict=True):
-            file, signals = io.BytesIO(), part.signals.get(seed, none)
-            np.savez_compressed(file, values=row, microseconds=part.microseconds, signals=signals)
+    def write(self, sample: Sample) -> None:
+        """Keep the episodes of a sample, and the signals of its first."""
+        packed = {}
+        for i, seed in enumerate(sample.seeds):
+            signals = np.stack(sample.example) if sample.example and i == 0 else np.zeros((0, 0))
+            file = io.BytesIO()
+            np.savez_compressed(file, values=sample.values[0, i], microseconds=sample.microseconds, signals=signals)
             packed[self.place / f"{seed}.npz"] = file.getvalue()
         write_files(packed)
 
 
-def read_episode(path: Path, example: bool) -> Part | None:
+def read_episode(contender: Contender, path: Path, example: bool) -> Sample | None:
     """A cached episode, with its signals if it is an ``example``; None if there is none that can be used."""
     try:
         with open(path, "rb") as file:
@@ -78,11 +85,11 @@ def read_episode(path: Path, example: bool) -> Part | None:
     sound = values.dtype == signals.dtype == np.float64 and values.shape == (len(metric_names()),)
     if not sound or (example and not logged):
         return None
-    return Part((seed,), values[None], microseconds, {seed: signals} if example else {})
+    return Sample(contender, (seed,), values[None, None], microseconds, Signals(*signals) if example else None)
 
 
 def earlier_bound(folder: Path, row: Row, samples: Sequence[Sample]) -> Sample | None:
-    """The bound on that row from a folder of benchmark results, which has neither its signals nor its time.
+    """The bound on a row from a folder of benchmark results, which has neither its signals nor its time.
 
     None unless the folder has the row's first test episodes, and each classical controller that ran then and now, one
     at least, has the same figures on them: another plant or scenario, and other code, make other figures.
@@ -94,15 +101,16 @@ def earlier_bound(folder: Path, row: Row, samples: Sequence[Sample]) -> Sample |
     except (ValueError, KeyError):
         return None
     seeds = row.seeds(len(episodes))
-    agree = [
-        _agree(sample, found[sample.controller.name][0])
-        for sample in samples
-        if sample.controller.name in found and not sample.controller.learned
-    ]
+    classical = [sample for sample in samples if sample.name in found and not sample.contender.learned]
+    agree = [_agree(sample, found[sample.name][0]) for sample in classical]
     if episodes[:, 0].tolist() != list(seeds) or not agree or not all(agree):
         return None
-    controller = Controller(BOUND, "state", "bound of an earlier run", privileged=True, slow=True)
-    return Sample(controller, tuple(seeds), episodes[None, :, 1:], float("nan"), (), row.control_interval)
+    contender = Contender(BOUND, _not_made, "state", "bound of an earlier run", privileged=True, slow=True)
+    return Sample(contender, tuple(seeds), episodes[None, :, 1:], float("nan"))
+
+
+def _not_made(config: Any) -> Any:
+    raise NotImplementedError("an earlier run's bound is only read")
 
 
 def _agree(sample: Sample, earlier: Floats) -> bool:
@@ -114,29 +122,18 @@ def _agree(sample: Sample, earlier: Floats) -> bool:
 
 @cache
 def code_behind(module: str) -> str:
-    """Hash of all code that the episodes of a policy of that module come from."""
-    return hash_sources(sources_behind(module))
+    """Hash of all code that the episodes of a policy of that module come from, comments and docstrings left out."""
+    return "".join(hash_files(files, root, code_only=True) for root, files in sources_behind(module).items())
 
 
-def sources_behind(module: str) -> list[Path]:
-    """Sources of plant, environment and metrics, and the policy's module, or the whole package of it if it is ours."""
+def sources_behind(module: str) -> dict[Path, list[Path]]:
+    """Sources that compute the figures of a policy, by the folder that they lie in.
+
+    These are plant, environment and metrics, and the policy's module, or the whole package of it if it is ours.
+    """
+    plant = [file for file in compiled_sources() if file.relative_to(PACKAGE).parts[0] not in PICTURES]
+    metrics = [Path(__file__).with_name(name) for name in ("rollout.py", "metrics.py")]
     package = ".".join(module.split(".")[:2]) if module.startswith("cz_gym.") else module
     file = Path(str(sys.modules[package].__file__))
     policy = sorted(file.parent.rglob("*.py")) if file.name == "__init__.py" else [file]
-    return [*compiled_sources(), *(Path(__file__).with_name(name) for name in ("rollout.py", "metrics.py")), *policy]
-
-
-def hash_sources(files: Iterable[Path]) -> str:
-    """SHA-256 of what these Python files say but for comments, docstrings and line breaks (16 hex digits)."""
-    digest = hashlib.sha256()
-    for file in files:
-        tree = ast.parse(file.read_bytes())
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
-                node.body = [
-                    part
-                    for part in node.body
-                    if not (isinstance(part, ast.Expr) and isinstance(part.value, ast.Constant))
-                ]
-        digest.update(file.name.encode() + b"\0" + ast.dump(tree).encode() + b"\0")
-    return digest.hexdigest()[:16]
+    return {PACKAGE: plant + metrics, file.parent: policy}

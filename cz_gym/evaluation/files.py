@@ -8,7 +8,6 @@ import json
 import platform
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.errors import CzError
 
 from .metrics import metric_names
-from .results import BOUND, REFERENCE, Benchmark, Outcome, ScenarioResult
+from .results import BOUND, REFERENCE, Estimates, Result
 from .statistics import RESAMPLES, SEED, Estimate
 
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime", "casadi")
@@ -33,36 +32,26 @@ Episodes = dict[str, dict[str, npt.NDArray[np.float64]]]
 """By scenario and controller: metrics of shape (training seeds, crystals, metrics)."""
 
 
-def to_json(benchmark: Benchmark) -> str:
+def to_json(results: Sequence[Result], command: str) -> str:
     """``benchmark.json``: results, paired differences, tails, verdicts and provenance."""
 
-    def by_controller(pick: Callable[[Outcome], Any]) -> dict[str, dict[str, Any]]:
-        """What each outcome of each scenario holds; outcomes that hold nothing are left out."""
-        return {
-            scenario.row.name: {each.controller.name: found for each in scenario.outcomes if (found := pick(each))}
-            for scenario in benchmark.scenarios
-        }
+    def each(table: Callable[[Result], Mapping[str, Any]]) -> dict[str, Any]:
+        return {result.row.name: _plain(table(result)) for result in results}
 
-    gaps = by_controller(lambda outcome: _plain(outcome.gap))
-    radius_gaps = by_controller(lambda outcome: _plain(outcome.gap_radius))
     data = {
-        "results": by_controller(lambda outcome: _by_metric(outcome.means)),
-        "paired": by_controller(_paired),
-        "cvar5": by_controller(lambda outcome: _by_metric(outcome.cvar5)),
-        "optimality_gap": {name: found for name, found in gaps.items() if found},
-        "optimality_gap_radius": {name: found for name, found in radius_gaps.items() if found},
+        "results": each(lambda result: result.means),
+        "paired": each(_paired),
+        "cvar5": each(lambda result: result.cvar5),
+        "optimality_gap": _without_empty(each(lambda result: _one(result.gaps, "cost"))),
+        "optimality_gap_radius": _without_empty(each(lambda result: _one(result.gaps, "rmse_mm"))),
         "verdicts": {
-            scenario.row.name: {
-                verdict.agent: {
-                    "rival": verdict.rival,
-                    "rmse_mm_difference": _plain(verdict.difference),
-                    "wins": verdict.wins,
-                }
-                for verdict in scenario.verdicts
+            result.row.name: {
+                agent: {"rival": result.rival, "rmse_mm_difference": _plain(difference), "wins": result.wins(agent)}
+                for agent, difference in result.verdicts.items()
             }
-            for scenario in benchmark.scenarios
+            for result in results
         },
-        "provenance": _provenance(benchmark),
+        "provenance": _provenance(results, command),
     }
     return json.dumps(data, indent=1, allow_nan=False) + "\n"
 
@@ -76,55 +65,64 @@ def is_benchmark_json(content: bytes) -> bool:
     return isinstance(data, dict) and {"results", "paired", "cvar5", "verdicts", "provenance"} <= set(data)
 
 
-def _plain(estimate: Estimate | None) -> dict[str, Any] | None:
-    return estimate._asdict() if estimate else None
+def _plain(value: Any) -> Any:
+    """Estimates as dictionaries, at any depth of a mapping."""
+    if isinstance(value, Mapping):
+        return {name: _plain(each) for name, each in value.items()}
+    return value._asdict() if isinstance(value, Estimate) else value
 
 
-def _by_metric(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
-    return {name: _plain(estimate) for name, estimate in estimates.items()}
+def _one(estimates: Estimates, metric: str) -> dict[str, Estimate]:
+    return {name: found[metric] for name, found in estimates.items() if metric in found}
 
 
-def _paired(outcome: Outcome) -> dict[str, Any]:
-    found = _by_metric(outcome.paired)
-    if outcome.improvement is not None:
-        found["rmse_mm"]["probability_of_improvement"] = _plain(outcome.improvement)
+def _without_empty(by_row: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: found for name, found in by_row.items() if found}
+
+
+def _paired(result: Result) -> dict[str, Any]:
+    """The differences, with the probability of improvement beside that of RMSE."""
+    found: dict[str, Any] = _plain(result.paired)
+    for name, each in result.improvement.items():
+        found[name]["rmse_mm"]["probability_of_improvement"] = _plain(each["rmse_mm"])
     return found
 
 
-def _provenance(benchmark: Benchmark) -> dict[str, Any]:
-    config = benchmark.scenarios[0].row.config()
+def _provenance(results: Sequence[Result], command: str) -> dict[str, Any]:
+    config, contenders = results[0].row.config(), [sample.contender for sample in results[0].samples]
     return {
-        "command": benchmark.command,
+        "command": command,
         **software(PACKAGES),
         "plant_hash": config.plant_hash,
+        "parameters": config.parameters._asdict(),
         "control_interval_s": config.control_interval,
         "horizon_s": config.horizon,
-        "scenarios": {scenario.row.name: _crystals(scenario) for scenario in benchmark.scenarios},
-        "controllers": {controller.name: asdict(controller) for controller in benchmark.controllers},
-        "agents": [dict(contract) for contract in benchmark.agents],
+        "scenarios": {result.row.name: _crystals(result) for result in results},
+        "controllers": {each.name: each.facts() for each in contenders},
+        "agents": [contract for each in contenders for contract in each.contracts()],
         "bootstrap": {"resamples": RESAMPLES, "seed": SEED, "paired_against": REFERENCE},
         "gap_measured_from": BOUND,
         "gap_from_cached_episodes": {
-            s.row.name: len(s.earlier_bound.seeds) for s in benchmark.scenarios if s.earlier_bound
+            result.row.name: len(result.earlier_bound.seeds) for result in results if result.earlier_bound
         },
     }
 
 
-def _crystals(scenario: ScenarioResult) -> dict[str, Any]:
-    row = scenario.row
+def _crystals(result: Result) -> dict[str, Any]:
+    row, scenario = result.row, find_scenario(result.row.scenario)
     return {
-        "scenario": find_scenario(row.scenario).name,
-        "hash": find_scenario(row.scenario).hash,
+        "scenario": scenario.name,
+        "hash": scenario.hash,
         "model": row.model,
         "control_interval_s": row.control_interval,
         "meniscus": row.meniscus.name,
-        "first_seed": scenario.seeds[0],
-        "episodes": len(scenario.seeds),
+        "first_seed": result.seeds[0],
+        "episodes": len(result.seeds),
     }
 
 
 def software(packages: Sequence[str]) -> dict[str, Any]:
-    """Versions of Python and of the packages, None for one that is not installed."""
+    """Return the versions of Python and of the packages, None for one that is not installed."""
     found: dict[str, str | None] = dict.fromkeys(packages)
     for name in packages:
         with suppress(PackageNotFoundError):
@@ -132,32 +130,30 @@ def software(packages: Sequence[str]) -> dict[str, Any]:
     return {"python": platform.python_version(), "packages": found}
 
 
-def to_csv(benchmark: Benchmark) -> str:
+def to_csv(results: Sequence[Result]) -> str:
     """``episodes.csv``: one line an episode."""
     rows = (
-        (scenario.row.name, outcome.controller.name, training_seed, seed, *(f"{value:.5g}" for value in values))
-        for scenario in benchmark.scenarios
-        for outcome in scenario.outcomes
-        for training_seed, episodes in zip(
-            outcome.controller.training_seeds or ("",), outcome.sample.values, strict=True
-        )
-        for seed, values in zip(outcome.sample.seeds, episodes, strict=True)
+        (result.row.name, sample.name, training_seed, seed, *(f"{value:.5g}" for value in values))
+        for result in results
+        for sample in result.samples
+        for training_seed, episodes in zip(sample.contender.training_seeds or ("",), sample.values, strict=True)
+        for seed, values in zip(sample.seeds, episodes, strict=True)
     )
     return csv_text(("scenario", "controller", "training_seed", "seed", *metric_names()), rows)
 
 
 def csv_text(heads: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
-    """A table as CSV."""
+    """Return a table as the text of a CSV file."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([heads, *rows])
     return text.getvalue()
 
 
 def read_episodes(path: Path, columns: Callable[[str], Sequence[str]]) -> Episodes:
-    """The columns that are wanted of each scenario in an ``episodes.csv``, crystals in the file's order.
+    """Read the wanted columns of each scenario of an ``episodes.csv``, crystals in the file's order.
 
-    ValueError if the file is none of a benchmark's, holds what is no finite number, or a controller's training seeds
-    did not meet the same number of crystals.
+    Raises CzError if the file is none of a benchmark's, holds what is no finite number, or a controller's training
+    seeds did not meet the same number of crystals.
     """
     found: dict[str, dict[str, dict[str, list[list[float]]]]] = {}
     with naming(path):

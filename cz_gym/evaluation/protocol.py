@@ -11,6 +11,7 @@ from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
+from cz_gym.units import MM, MM_PER_MIN
 
 TRAINING_SEEDS = range(1_000_000)
 """Seeds of the episodes that controllers are tuned and agents are trained on."""
@@ -48,9 +49,16 @@ class Row:
             self.scenario, self.model, observation, self.control_interval, meniscus=self.meniscus, action=action
         )
 
-    def design_config(self, observation: str = "measured") -> Config:
+    def design_config(self, observation: str = "measured", action: str = "direct") -> Config:
         """The settings that a controller is designed for: the same on Hurle's meniscus."""
-        return make_config(self.scenario, self.model, observation, self.control_interval)
+        return make_config(self.scenario, self.model, observation, self.control_interval, action=action)
+
+    @property
+    def puller(self) -> str:
+        """The puller that the crystals grow on, for people: its radius, nominal pull speed and plant hash."""
+        config = self.config()
+        r_0, v_0 = config.parameters.r_0 / MM, config.parameters.v_0 / MM_PER_MIN
+        return f"radius {r_0:g} mm, pull speed {v_0:g} mm/min, plant {config.plant_hash}"
 
     def seeds(self, episodes: int) -> range:
         """The first test seeds; one where every draw is the same."""

@@ -1,6 +1,6 @@
-"""What another controller would have done on the same melt: :func:`replay`.
+"""Counterfactuals: the same episodes with another controller from some moment on.
 
-The environment's state is saved and continued bit for bit, so that all that differs is the controller.
+The environment's state is saved and continued bit for bit, so that the controller is all that differs.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ import numpy.typing as npt
 from cz_gym.config import Config
 from cz_gym.errors import CzError
 
-from .rollout import Course, Rollout, answer, check_policy
+from .rollout import Course, Rollout, answer, check_policy, check_seeds
 
 
 @dataclass(frozen=True)
 class Counterfactual:
-    """What happened, and what would have happened under another controller."""
+    """Episodes as they went, and as they would have gone under another controller."""
 
     at: float
-    """When the other controller takes over [s]."""
+    """Moment at which the other controller takes over [s]."""
     actual: Rollout
     instead: Rollout
     """Equal to ``actual`` up to ``at``."""
 
 
 class Playback:
-    """A policy that plays logged actions back, whatever it observes; beyond the log it holds the last."""
+    """Policy that repeats logged actions, whatever it observes; after the last one it repeats that."""
 
     def __init__(self, actions: npt.ArrayLike) -> None:
-        """Take actions of shape (steps, 2) for every episode alike, or (steps, episodes, 2); ValueError otherwise."""
+        """``actions`` has shape (steps, 2), for every episode alike, or (steps, episodes, 2); CzError otherwise."""
         self.actions = np.array(actions, np.float32)
         if self.actions.ndim not in (2, 3) or self.actions.shape[-1] != 2 or len(self.actions) == 0:
             raise CzError(
@@ -43,26 +43,30 @@ class Playback:
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[npt.NDArray[np.float32], Any]:
-        """The next logged action of each episode; ``state`` is the number of actions played."""
+        """Return the next logged action of each episode; ``state`` is the number of actions played."""
         k = 0 if state is None else state
         action = self.actions[min(k, len(self.actions) - 1)]
         return np.broadcast_to(action, (len(observation), 2)).copy(), k + 1
 
 
 def replay(
-    policy: Any, instead: Any, config: Config, seeds: Sequence[int], at: float = 0.0, watches: bool = False
+    policy: Any,
+    instead: Any,
+    config: Config,
+    seeds: Sequence[int] | npt.NDArray[Any],
+    at: float = 0.0,
+    watches: bool = False,
 ) -> Counterfactual:
     """Run ``policy`` on one episode a seed, and again with ``instead`` from ``at`` [s] on.
 
     ``policy`` may be a :class:`Playback` of logged actions. ``instead`` begins with an empty memory at ``at``, as in a
     new episode, unless it ``watches``: then it has seen every observation before, and its actions were not taken.
-    ``at`` is rounded to the control interval. Raises ValueError without a seed, for a moment
-    outside the horizon, and for policies that cannot run there.
+    ``at`` is rounded to the control interval. Raises CzError without a seed, for a moment outside the horizon, and for
+    policies that were made for another environment.
     """
     for one in (policy, instead):
         check_policy(one, config)
-    if not seeds:
-        raise CzError("a replay needs at least one seed")
+    seeds = check_seeds(seeds)
     if not 0.0 <= at <= config.horizon:
         raise CzError(f"at must lie in the episode, 0 to {config.horizon:g} s, not {at!r}")
     policy, instead = (

@@ -1,13 +1,14 @@
-"""The benchmark's results: typed, frozen, computed from samples."""
+"""The benchmark's results: samples, which were measured, and for each row the estimates that are computed from them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, NamedTuple
 
 import numpy as np
+
+from cz_gym.contender import Contender
 
 from .metrics import metric_names, metrics
 from .protocol import Row
@@ -22,90 +23,45 @@ SPEED = "microseconds_per_step"
 """Name of the one metric that is not per episode: time in ``predict`` per step and episode, batched [us]."""
 TAIL_METRICS = ("rmse_mm", "rmse_observable_mm", "max_error_mm")
 """Metrics whose worst 5 % are reported."""
-EXAMPLES = 8
-"""Episodes of a sample that keep their signals, the first ones: 2 MB a sample of 3 h episodes at 5 s."""
-
-
-@dataclass(frozen=True)
-class Controller:
-    """Who was measured."""
-
-    name: str
-    observation: str
-    meaning: str
-    training_seeds: tuple[int, ...] = ()
-    """Training seeds of a learned controller, empty for the others."""
-    privileged: bool = False
-    """Whether it knows what no sensor shows."""
-    slow: bool = False
-    """Whether it meets only the first few episodes, and these are cached."""
-    action: str = "direct"
-    """What its actions mean (:func:`cz_gym.task.drives_of`)."""
-    own: bool = False
-    """Whether it comes from the user's own file: figures show it first."""
-
-    @property
-    def learned(self) -> bool:
-        """Whether it was trained."""
-        return bool(self.training_seeds)
-
-    @property
-    def bound(self) -> bool:
-        """Whether it knows or reads what no sensor shows: no contender, a bound."""
-        return self.privileged or self.observation == "state"
-
-
-class Part(NamedTuple):
-    """What some episodes of one policy come to."""
-
-    seeds: tuple[int, ...]
-    values: Floats
-    """Shape (episodes, metrics), metrics in the order of :func:`metric_names`."""
-    microseconds: float
-    """Time in the policy per step and episode [us]."""
-    signals: dict[int, Floats]
-    """By seed, of those episodes that keep them: up to the episode's end, shape (signals, steps)."""
-
-    @classmethod
-    def of(cls, run: Rollout, examples: Collection[int]) -> Part:
-        """Of a rollout; the episodes among ``examples`` keep their signals."""
-        signals = {seed: np.stack(run.episode(i)) for i, seed in enumerate(run.seeds) if seed in examples}
-        return cls(run.seeds, np.stack(metrics(run), axis=-1), run.microseconds_per_step, signals)
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One controller on one scenario."""
+    """What a contender came to on some episodes of a row."""
 
-    controller: Controller
+    contender: Contender
     seeds: tuple[int, ...]
     values: Floats
     """Shape (training seeds or 1, episodes, metrics), metrics in the order of :func:`metric_names`."""
-    microseconds_per_step: float
-    examples: tuple[Signals, ...]
-    """Signals of the first :data:`EXAMPLES` episodes up to their ends, each of shape (steps,); those of the first
-    training seed."""
-    control_interval: float
+    microseconds: float
+    """Time in the policy per step and episode [us]."""
+    example: Signals | None = None
+    """Signals of the first episode up to its end, each of shape (steps,), of the first training seed."""
 
     @classmethod
-    def joined(
-        cls, controller: Controller, seeds: Sequence[int], parts: Sequence[Sequence[Part]], control_interval: float
-    ) -> Sample:
-        """The sample of the parts of each training seed, in any order, which together hold the episodes."""
-        values = []
-        for policy in parts:
-            rows = {seed: row for part in policy for seed, row in zip(part.seeds, part.values, strict=True)}
-            values.append([rows[seed] for seed in seeds])
-        signals = {seed: Signals(*found) for part in parts[0] for seed, found in part.signals.items()}
-        every = [(part.microseconds, len(part.seeds)) for policy in parts for part in policy]
-        microseconds = float(np.average([each for each, _ in every], weights=[episodes for _, episodes in every]))
-        examples = tuple(signals[seed] for seed in seeds[:EXAMPLES])
-        return cls(controller, tuple(seeds), np.array(values), microseconds, examples, control_interval)
+    def of(cls, contender: Contender, run: Rollout) -> Sample:
+        """Measure a rollout of one policy."""
+        values = np.stack(metrics(run), axis=-1)[None]
+        return cls(contender, run.seeds, values, run.microseconds_per_step, run.episode(0))
+
+    @classmethod
+    def joined(cls, contender: Contender, seeds: Sequence[int], parts: Sequence[Sample]) -> Sample:
+        """Join parts of one training seed each, in any order, which together hold the episodes of ``seeds``."""
+        rows = {
+            (part.contender.training_seeds, seed): values
+            for part in parts
+            for seed, values in zip(part.seeds, part.values[0], strict=True)
+        }
+        copies = [copy.training_seeds for copy in contender.copies()]
+        values = np.array([[rows[copy, seed] for seed in seeds] for copy in copies])
+        microseconds = np.average([part.microseconds for part in parts], weights=[len(part.seeds) for part in parts])
+        first = [p.example for p in parts if p.seeds[0] == seeds[0] and p.contender.training_seeds == copies[0]]
+        return cls(contender, tuple(seeds), values, float(microseconds), first[0])
 
     @property
-    def example(self) -> Signals:
-        """Signals of the first episode up to its end, each of shape (steps,)."""
-        return self.examples[0]
+    def name(self) -> str:
+        """Name of the contender."""
+        return self.contender.name
 
     def metric(self, name: str) -> Floats:
         """One metric, shape (training seeds or 1, episodes)."""
@@ -113,97 +69,83 @@ class Sample:
 
     def first(self, episodes: int) -> Sample:
         """The same sample on its first episodes."""
-        seeds, values, examples = self.seeds[:episodes], self.values[:, :episodes], self.examples[:episodes]
-        return replace(self, seeds=seeds, values=values, examples=examples)
+        return replace(self, seeds=self.seeds[:episodes], values=self.values[:, :episodes])
+
+
+Estimates = Mapping[str, Mapping[str, Estimate]]
+"""Estimates by contender and metric."""
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """The estimates made from a sample."""
-
-    sample: Sample
-    means: Mapping[str, Estimate]
-    """By metric, :data:`SPEED` included."""
-    cvar5: Mapping[str, Estimate]
-    """Mean of the worst 5 % of episodes, by metric of :data:`TAIL_METRICS`."""
-    paired: Mapping[str, Estimate]
-    """Mean difference against :data:`REFERENCE` on the same crystals, by metric; empty without it."""
-    improvement: Estimate | None
-    """Probability of a lower RMSE than :data:`REFERENCE` on the same crystal."""
-    gap: Estimate | None = None
-    """(J - J_bound) / (J_reference - J_bound), J the cost that the bound minimises; None without :data:`BOUND`."""
-    gap_radius: Estimate | None = None
-    """The same with J the mean squared radius error, which is only a part of that cost."""
-
-    @property
-    def controller(self) -> Controller:
-        """Who was measured."""
-        return self.sample.controller
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """A learned controller against the best classical one that reads sensors."""
-
-    agent: str
-    rival: str
-    difference: Estimate
-    """Mean paired difference of RMSE, agent less rival [mm]."""
-
-    @property
-    def wins(self) -> bool:
-        """Whether the agent's RMSE is lower: the whole interval of the difference, or the one episode."""
-        return self.difference.ends[1] < 0.0
-
-    @property
-    def loses(self) -> bool:
-        """Whether the rival's RMSE is lower, in the same sense."""
-        return self.difference.ends[0] > 0.0
-
-
-@dataclass(frozen=True)
-class ScenarioResult:
-    """Every controller on one scenario."""
+class Result:
+    """What all contenders came to on one row."""
 
     row: Row
-    outcomes: tuple[Outcome, ...]
-    verdicts: tuple[Verdict, ...]
+    samples: tuple[Sample, ...]
+    means: Estimates
+    """Mean over crystals and training seeds, :data:`SPEED` included."""
+    cvar5: Estimates
+    """Mean of the worst 5 % of episodes, of :data:`TAIL_METRICS`."""
+    paired: Estimates
+    """Mean difference against :data:`REFERENCE` on the same crystals; no contender without it."""
+    improvement: Estimates
+    """Probability of a lower ``rmse_mm`` than :data:`REFERENCE` on the same crystal."""
+    gaps: Estimates
+    """(J - J_bound) / (J_reference - J_bound), with J the ``cost``, which the bound minimises, or the square of
+    ``rmse_mm``, which is only a part of it; no contender without :data:`BOUND`."""
+    rival: str | None
+    """The classical controller of the lowest mean RMSE that reads sensors."""
+    verdicts: Mapping[str, Estimate]
+    """Mean paired difference of RMSE of each agent, agent less rival [mm]."""
     earlier_bound: Sample | None = None
-    """What gaps are measured from where :data:`BOUND` took no part in the run: its episodes of an earlier run."""
+    """Sample of an earlier run that gaps are measured from where :data:`BOUND` took no part."""
 
     @property
     def seeds(self) -> tuple[int, ...]:
         """Seeds of its episodes; a slow controller may have met only the first of them."""
-        return max((outcome.sample.seeds for outcome in self.outcomes), key=len)
+        return max((sample.seeds for sample in self.samples), key=len)
+
+    def wins(self, agent: str) -> bool:
+        """Whether the agent's RMSE is lower than the rival's: the whole interval of the difference is below zero."""
+        return self.verdicts[agent].ends[1] < 0.0
+
+    def loses(self, agent: str) -> bool:
+        """Whether the rival's RMSE is lower, in the same sense."""
+        return self.verdicts[agent].ends[0] > 0.0
 
 
-@dataclass(frozen=True)
-class Benchmark:
-    """A whole run."""
+def summarise(row: Row, samples: Sequence[Sample], earlier_bound: Sample | None = None) -> Result:
+    """Means, tails, paired differences, gaps and verdicts of one row.
 
-    scenarios: tuple[ScenarioResult, ...]
-    command: str
-    agents: tuple[Mapping[str, Any], ...]
-    """Contracts of the agent files."""
-
-    @property
-    def controllers(self) -> tuple[Controller, ...]:
-        """Who took part."""
-        return tuple(outcome.controller for outcome in self.scenarios[0].outcomes)
-
-
-def summarise(row: Row, samples: Sequence[Sample], earlier_bound: Sample | None = None) -> ScenarioResult:
-    """Means, tails, paired differences, gaps and verdicts of one scenario.
-
-    Controllers that met the same episodes share their resamples; two that met different numbers are compared on those
+    Contenders that met the same episodes share their resamples; two that met different numbers are compared on those
     that both met. ``earlier_bound`` stands in for :data:`BOUND` if that is not among the samples.
     """
     resamples = cache(Resamples.draw)
-    named = {sample.controller.name: sample for sample in samples}
-    earlier_bound = None if BOUND in named else earlier_bound
+    named = {sample.name: sample for sample in samples}
+    reference = named.get(REFERENCE)
+    if BOUND in named:
+        earlier_bound = None
     bound = named.get(BOUND, earlier_bound)
-    outcomes = tuple(_outcome(sample, named.get(REFERENCE), bound, resamples) for sample in samples)
-    return ScenarioResult(row, outcomes, _verdicts(samples, resamples), earlier_bound)
+    against = [sample for sample in samples if reference is not None and sample is not reference]
+    return Result(
+        row,
+        tuple(samples),
+        {sample.name: _means(sample, resamples) for sample in samples},
+        {
+            sample.name: {name: cvar(sample.metric(name), resamples(len(sample.seeds))) for name in TAIL_METRICS}
+            for sample in samples
+        },
+        {sample.name: _paired(*common(sample, named[REFERENCE]), resamples) for sample in against},
+        {sample.name: _improvement(*common(sample, named[REFERENCE]), resamples) for sample in against},
+        {}
+        if reference is None or bound is None
+        else {sample.name: _gaps(*common(sample, reference, bound), resamples) for sample in samples},
+        *_verdicts(samples, resamples),
+        earlier_bound,
+    )
+
+
+Draw = Callable[[int], Resamples]
 
 
 def common(*samples: Sample) -> tuple[Sample, ...]:
@@ -212,39 +154,40 @@ def common(*samples: Sample) -> tuple[Sample, ...]:
     return tuple(sample.first(fewest) for sample in samples)
 
 
-def _outcome(
-    sample: Sample, reference: Sample | None, bound: Sample | None, resamples: Callable[[int], Resamples]
-) -> Outcome:
-    names, own = metric_names(), resamples(len(sample.seeds))
-    found = dict(zip(names, means(sample.values, own), strict=True))
-    found[SPEED] = Estimate(sample.microseconds_per_step, None, len(sample.seeds))
-    outcome = Outcome(sample, found, {name: cvar(sample.metric(name), own) for name in TAIL_METRICS}, {}, None)
-    if reference is not None and bound is not None:
-        ours, theirs, best = common(sample, reference, bound)
-        shared = resamples(len(ours.seeds))
-        cost, error = ([one.metric(name) for one in (ours, theirs, best)] for name in ("cost", "rmse_mm"))
-        gap = optimality_gap(cost[0], cost[1], cost[2], shared)
-        gap_radius = optimality_gap(error[0] ** 2, error[1] ** 2, error[2] ** 2, shared)
-        outcome = replace(outcome, gap=gap, gap_radius=gap_radius)
-    if reference is not None and sample is not reference:
-        ours, theirs = common(sample, reference)
-        shared = resamples(len(ours.seeds))
-        paired = dict(zip(names, differences(ours.values, theirs.values, shared), strict=True))
-        better = probability_of_improvement(ours.metric("rmse_mm"), theirs.metric("rmse_mm"), shared)
-        outcome = replace(outcome, paired=paired, improvement=better)
-    return outcome
+def _means(sample: Sample, resamples: Draw) -> dict[str, Estimate]:
+    found = dict(zip(metric_names(), means(sample.values, resamples(len(sample.seeds))), strict=True))
+    return {**found, SPEED: Estimate(sample.microseconds, None, len(sample.seeds))}
 
 
-def _verdicts(samples: Sequence[Sample], resamples: Callable[[int], Resamples]) -> tuple[Verdict, ...]:
-    rivals = [sample for sample in samples if not (sample.controller.learned or sample.controller.bound)]
+def _paired(ours: Sample, theirs: Sample, resamples: Draw) -> dict[str, Estimate]:
+    found = differences(ours.values, theirs.values, resamples(len(ours.seeds)))
+    return dict(zip(metric_names(), found, strict=True))
+
+
+def _improvement(ours: Sample, theirs: Sample, resamples: Draw) -> dict[str, Estimate]:
+    errors = ours.metric("rmse_mm"), theirs.metric("rmse_mm")
+    return {"rmse_mm": probability_of_improvement(*errors, resamples(len(ours.seeds)))}
+
+
+def _gaps(ours: Sample, theirs: Sample, bound: Sample, resamples: Draw) -> dict[str, Estimate]:
+    found = {}
+    for metric, power in (("cost", 1), ("rmse_mm", 2)):
+        losses = [one.metric(metric) ** power for one in (ours, theirs, bound)]
+        if gap := optimality_gap(*losses, resamples(len(ours.seeds))):
+            found[metric] = gap
+    return found
+
+
+def _verdicts(samples: Sequence[Sample], resamples: Draw) -> tuple[str | None, dict[str, Estimate]]:
+    """The rival, and the difference of each agent's RMSE from its."""
+    able = [sample for sample in samples if not sample.contender.bound]
+    rivals = [sample for sample in able if not sample.contender.learned]
     if not rivals:
-        return ()
-    best = min(common(*rivals), key=lambda sample: float(sample.metric("rmse_mm").mean())).controller
-    rival = next(sample for sample in rivals if sample.controller is best)
-    verdicts = []
-    for sample in samples:
-        if sample.controller.learned and not sample.controller.bound:
-            ours, theirs = (one.metric("rmse_mm")[:, :, None] for one in common(sample, rival))
-            difference = differences(ours, theirs, resamples(ours.shape[1]))[0]
-            verdicts.append(Verdict(sample.controller.name, best.name, difference))
-    return tuple(verdicts)
+        return None, {}
+    best = min(common(*rivals), key=lambda sample: float(sample.metric("rmse_mm").mean())).name
+    (rival,) = (sample for sample in rivals if sample.name == best)
+    found = {}
+    for agent in (sample for sample in able if sample.contender.learned):
+        ours, theirs = (one.metric("rmse_mm")[:, :, None] for one in common(agent, rival))
+        found[agent.name] = differences(ours, theirs, resamples(ours.shape[1]))[0]
+    return best, found

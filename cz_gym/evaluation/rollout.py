@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.action import mismatch
 from cz_gym.config import Config, check_config
 from cz_gym.errors import CzError
 from cz_gym.units import MICRO
@@ -68,20 +69,23 @@ class Rollout:
 
 
 def rollout(
-    policy: Any, config: Config, seeds: Sequence[int], progress: Callable[[int], None] | None = None
+    policy: Any,
+    config: Config,
+    seeds: Sequence[int] | npt.NDArray[Any],
+    progress: Callable[[int], None] | None = None,
+    designed_for: Config | None = None,
 ) -> Rollout:
     """Run ``policy.predict`` on one episode a seed, all in one batch.
 
-    ValueError without a seed, and for a policy that was made for another control interval than the config's, or whose
-    attribute ``action`` names another kind of actions.
+    Raises CzError without a seed, and for a policy that was made for another environment: other actions, another
+    control interval, another plant. To run it there on purpose, say what it is ``designed_for``.
 
     ``progress`` is called with the number of steps done since its last call. A failed episode stops counting; its
     slot goes on with another crystal, which nothing reads. A bound with a method ``for_episodes(config, seeds)`` is
     replaced by what it returns, which knows those episodes.
     """
-    check_policy(policy, config)
-    if not isinstance(seeds, Sequence | np.ndarray) or len(seeds) == 0:
-        raise CzError("a rollout needs a sequence of at least one seed, as [1]")
+    check_policy(policy, config, designed_for)
+    seeds = check_seeds(seeds)
     before = time.perf_counter()
     if hasattr(policy, "for_episodes"):
         policy = policy.for_episodes(config, list(seeds))
@@ -92,8 +96,20 @@ def rollout(
     return course.finish()
 
 
-def check_policy(policy: Any, config: Config) -> None:
-    """ValueError unless a policy that can run in the environment of these settings."""
+def check_seeds(seeds: Sequence[int] | npt.NDArray[Any]) -> tuple[int, ...]:
+    """Return the seeds of a list, range or array as whole numbers; CzError unless there is at least one, each >= 0."""
+    array = np.asarray(seeds)
+    if array.ndim != 1 or not len(array) or array.dtype.kind not in "iu" or array.min() < 0:
+        raise CzError(f"seeds must be a sequence of at least one whole number from 0 on, as [1], not {seeds!r:.80}")
+    return tuple(array.tolist())
+
+
+def check_policy(policy: Any, config: Config, designed_for: Config | None = None) -> None:
+    """Raise CzError unless the policy can run in the environment of these settings.
+
+    Its attribute ``made_for``, or without one its attributes ``action`` and ``control_interval``, must fit ``config``,
+    or what it is ``designed_for``; a ``made_for`` of None fits everywhere.
+    """
     check_config(config)
     if isinstance(policy, type) or not (hasattr(policy, "predict") or hasattr(policy, "for_episodes")):
         named = f", as make_controller({policy!r}, config) makes one" if isinstance(policy, str) else ""
@@ -103,22 +119,18 @@ def check_policy(policy: Any, config: Config) -> None:
             signature(policy.predict).bind(None, state=None, episode_start=None, deterministic=True)
         except TypeError as error:
             raise CzError(f"{type(policy).__name__}.predict: {error}; it must be {PREDICT}") from None
-    made_for = getattr(getattr(policy, "contract", policy), "control_interval", None)
-    if made_for is not None and made_for != config.control_interval:
-        raise CzError(
-            f"this {type(policy).__name__} was made for an action every {made_for:g} s, "
-            f"the environment takes one every {config.control_interval:g} s"
-        )
-    acts = getattr(policy, "action", None)
-    if isinstance(acts, str) and acts != config.action:
-        raise CzError(
-            f"this {type(policy).__name__} gives actions {acts!r}, the environment takes {config.action!r}: "
-            f"make_config(action={acts!r})"
-        )
+    own = (designed_for or config).made_for
+    acts, interval = getattr(policy, "action", None), getattr(policy, "control_interval", None)
+    said = own._replace(
+        action=acts if isinstance(acts, str) else own.action,
+        control_interval=own.control_interval if interval is None else interval,
+    )
+    if message := mismatch(getattr(policy, "made_for", said), own):
+        raise CzError(f"{type(policy).__name__}: {message}")
 
 
 def answer(policy: Any, observation: Any, state: Any, begins: Any) -> tuple[Any, Any]:
-    """Actions of shape (n, 2) and what the policy remembers; ValueError for anything else."""
+    """Return actions of shape (n, 2) and what the policy remembers; CzError if ``predict`` returns anything else."""
     found = policy.predict(observation, state=state, episode_start=begins, deterministic=True)
     if not (isinstance(found, tuple) and len(found) == 2):
         raise CzError(f"predict must return a tuple (action, state), not {type(found).__name__}")
@@ -157,9 +169,8 @@ class Course:
                 progress(len(self.seeds))
 
     def _step(self, action: Any) -> None:
-        self.observation, gained, terminated, truncated, info = self.env.step(
-            np.asarray(action)
-        )  # check_policy has said what fits
+        # An action may be marked with what it was made for; check_policy has said what fits.
+        self.observation, gained, terminated, truncated, info = self.env.step(np.asarray(action))
         # A slot that is over is drawn anew by the next step: only then does its policy begin again.
         self.begins, self.over = self.over, terminated | truncated
         for log, name in zip(self.signals, Signals._fields, strict=True):

@@ -1,4 +1,4 @@
-"""Controllers and scenarios of the user's own files, by ``FILE.py:NAME``: the file is run as Python."""
+"""Controllers and scenarios from the user's own Python files, by ``FILE.py:NAME``."""
 
 from __future__ import annotations
 
@@ -10,17 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from cz_gym.config import Config
+from cz_gym.contender import Contender
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import SCENARIOS
 from cz_gym.errors import CzError
 from cz_gym.names import unknown
 
-from .contenders import Contender
 from .protocol import Row
-from .results import Controller
 
 PREFIX = "cz_gym_user_"
-"""Of the names that modules from the user's files have."""
+"""Beginning of the names of modules that are made of the user's files."""
 
 
 def load(place: str, kind: str, fits: Callable[[Any, str], bool]) -> tuple[str, Any]:
@@ -48,7 +47,7 @@ def load(place: str, kind: str, fits: Callable[[Any, str], bool]) -> tuple[str, 
 
 
 def controller(place: str) -> Contender:
-    """A controller to take part: an object with ``predict``, or a class or function that makes one.
+    """Return the contender at ``FILE.py:NAME``: an object with ``predict``, or a class or function that makes one.
 
     It is made without arguments, with ``config`` (the environment's settings) or ``control_interval`` [s], whichever it
     names. Its attributes ``observation`` and ``action`` say what it reads and what its actions mean; "measured" and
@@ -57,7 +56,7 @@ def controller(place: str) -> Contender:
     name, found = load(place, "controller", _controls)
     made = _maker(place, found)
     reads, acts = str(getattr(found, "observation", "measured")), str(getattr(found, "action", "direct"))
-    return Contender(Controller(name, reads, f"of {place}", action=acts, own=True), lambda config: [made(config)])
+    return Contender(name, made, reads, f"of {place}", action=acts, own=True)
 
 
 def _controls(value: Any, module: str) -> bool:
@@ -82,7 +81,7 @@ def _maker(place: str, found: Any) -> Callable[[Config], Any]:
 
 
 def row(place: str) -> Row:
-    """A row of a scenario, a :class:`cz_gym.Scenario`."""
+    """Return a row of the scenario at ``FILE.py:NAME``, a :class:`cz_gym.Scenario`, on the default puller."""
     _, found = load(place, "scenario", lambda value, _: isinstance(value, Scenario) and value.name not in SCENARIOS)
     if not isinstance(found, Scenario):
         raise CzError(f"{place}: no scenario: a {type(found).__name__}, not a cz_gym.Scenario")
@@ -90,7 +89,7 @@ def row(place: str) -> Row:
 
 
 def check_apart(names: Sequence[str], kind: str) -> None:
-    """ValueError for a name that appears twice."""
+    """Raise CzError for a name that appears twice."""
     for name in names:
         if names.count(name) > 1:
             raise CzError(f"two {kind}s are called {name!r}: rename yours")

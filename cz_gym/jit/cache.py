@@ -25,6 +25,8 @@ import llvmlite
 import numba
 import numpy as np
 
+from cz_gym.hashing import hash_files
+
 PACKAGE = Path(__file__).parents[1]
 CACHE_VARIABLE = "CZ_GYM_CACHE_DIR"
 """Environment variable naming the folder for compiled code; empty means: keep none."""
@@ -55,10 +57,7 @@ def compiled_sources(folder: Path | None = None) -> list[Path]:
 def source_hash(folder: Path | None = None) -> str:
     """SHA-256 of the names and contents of :func:`compiled_sources` (32 hex digits)."""
     folder = folder or PACKAGE
-    digest = hashlib.sha256()
-    for file in compiled_sources(folder):
-        digest.update(file.relative_to(folder).as_posix().encode() + b"\0" + file.read_bytes() + b"\0")
-    return digest.hexdigest()[:32]
+    return hash_files(compiled_sources(folder), folder)
 
 
 @cache

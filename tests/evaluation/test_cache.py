@@ -4,7 +4,6 @@ import csv
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,22 +12,22 @@ from tqdm import tqdm
 
 import benchmark
 import cz_gym
+import cz_gym.agents
 from cz_gym.baselines import registry
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
 from cz_gym.baselines.pid.open_loop import OpenLoop
 from cz_gym.config import make_config
-from cz_gym.evaluation import results, runner
-from cz_gym.evaluation.cache import code_behind, hash_sources, sources_behind
-from cz_gym.evaluation.contenders import Contender
+from cz_gym.contender import Contender
+from cz_gym.evaluation import cache, runner
+from cz_gym.evaluation.cache import code_behind, sources_behind
 from cz_gym.evaluation.metrics import metric_names
-from cz_gym.evaluation.results import Controller, Sample
+from cz_gym.evaluation.protocol import Row
+from cz_gym.evaluation.results import Sample
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.evaluation.runner import Job
 from tests.samples import sample_of
 
 CONFIG = make_config(horizon=300.0)
 SEEDS = range(5)
-WHO = Controller("snail", "measured", "slow", slow=True)
 
 
 @dataclass(frozen=True)
@@ -42,14 +41,29 @@ class Snail(OpenLoop):
         return repr(self)
 
 
+def slow(policy: Any) -> Contender:
+    return Contender("snail", lambda config: policy, "measured", "slow", slow=True)
+
+
+class Fixed(Row):
+    """A row of given settings and seeds."""
+
+    given: Any = CONFIG
+    these: Any = SEEDS
+
+    def config(self, *arguments: Any) -> Any:
+        return self.given
+
+    design_config = config
+
+    def seeds(self, episodes: int) -> Any:
+        return self.these
+
+
 def sample(folder: Path, policy: Any = None, config: Any = CONFIG, seeds: Any = SEEDS) -> Sample:
-    row: Any = SimpleNamespace(name="some", config=lambda *_: config, design_config=lambda *_: config)
-    bar = tqdm(disable=True)
-    plan: Any = SimpleNamespace(cache=folder, seeds=lambda *_: seeds)
-    job = Job(plan, row, Contender(WHO, lambda _: [policy or Snail()]))
-    for number, part in runner.in_turn(job.pieces, bar):
-        job.keep(job.pieces[number], part)
-    return job.sample()
+    row = type("Some", (Fixed,), {"given": config, "these": seeds})("some", "randomized", "")
+    (result,) = runner.run([slow(policy or Snail())], [row], 500, tqdm(disable=True), folder)
+    return result.samples[0]
 
 
 @pytest.fixture
@@ -57,11 +71,11 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Seeds of every episode that was really run; with a -1 before it, the next block is interrupted."""
     ran: list[int] = []
 
-    def counting(policy: Any, config: Any, seeds: Any, progress: Any) -> Any:
+    def counting(policy: Any, config: Any, seeds: Any, *more: Any) -> Any:
         if ran[-1:] == [-1]:
             raise KeyboardInterrupt
         ran.extend(seeds)
-        return rollout(policy, config, seeds, progress)
+        return rollout(policy, config, seeds, *more)
 
     monkeypatch.setattr(runner, "rollout", counting)
     monkeypatch.setattr(runner, "BLOCK", 2)
@@ -70,13 +84,13 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 def test_episodes_are_run_once_and_are_those_of_one_rollout(tmp_path: Path, counted: list[int]) -> None:
     first, again = sample(tmp_path, seeds=range(2)), sample(tmp_path)
-    direct = sample_of(WHO, [rollout(OpenLoop(), CONFIG, SEEDS)])
+    direct = sample_of(slow(Snail()), [rollout(OpenLoop(), CONFIG, SEEDS)])
     assert counted == [0, 1, 2, 3, 4]
     assert again.seeds == direct.seeds
-    assert again.microseconds_per_step > 0.0
+    assert again.microseconds > 0.0
     np.testing.assert_allclose(again.values, direct.values, rtol=1e-12)
     np.testing.assert_array_equal(again.values[:, :2], first.values)
-    for ours, theirs in zip(again.example, direct.example, strict=True):
+    for ours, theirs in zip(again.example or (), direct.example or (), strict=True):
         np.testing.assert_array_equal(ours, theirs)
 
 
@@ -111,45 +125,49 @@ def test_a_damaged_file_is_run_again(tmp_path: Path, counted: list[int]) -> None
     assert counted == [0, 1, 1]
 
 
-def test_only_the_first_episodes_have_signals(
-    tmp_path: Path, counted: list[int], monkeypatch: pytest.MonkeyPatch
+def test_a_first_episode_without_signals_is_run_again(tmp_path: Path, counted: list[int]) -> None:
+    sample(tmp_path, seeds=range(2))
+    assert sample(tmp_path, seeds=range(1, 2)).example is not None
+    assert counted == [0, 1, 1]
+
+
+@pytest.mark.parametrize("package", cache.COMPUTING)
+def test_another_version_of_what_computes_runs_them_again(
+    package: str, tmp_path: Path, counted: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    direct = rollout(OpenLoop(), CONFIG, SEEDS)
-    for examples in (1, 3, 2):
-        for module in (runner, results):
-            monkeypatch.setattr(module, "EXAMPLES", examples)
-        found = sample(tmp_path)
-        assert len(found.examples) == examples
-        for i, signals in enumerate(found.examples):
-            np.testing.assert_array_equal(signals.r_c, direct.signals.r_c[:, i])
-    # Asked for more signals, episodes that were cached without them run again; asked for fewer, none does.
-    assert counted == [0, 1, 2, 3, 4, 1, 2]
+    sample(tmp_path, seeds=range(1))
+    software = cache.software(cache.COMPUTING)
+    other = {"packages": {**software["packages"], package: "99"}}
+    monkeypatch.setattr(cache, "software", lambda packages: other)
+    sample(tmp_path, seeds=range(1))
+    assert counted == [0, 0]
 
 
-def test_code_counts_and_text_does_not(tmp_path: Path) -> None:
-    module = tmp_path / "thing.py"
-    hashes = []
-    for text in ('"""A."""\nx = 1\n"""B."""\n', '"""C."""\n# why\nx = (\n    1\n)\n', "x = 2\n"):
-        module.write_text(text)
-        hashes.append(hash_sources([module]))
-    assert hashes[0] == hashes[1] != hashes[2]
-
-
-@pytest.mark.parametrize("room", ["physics", "episodes", "engine", "cost.py", "evaluation/metrics.py"])
+@pytest.mark.parametrize("room", ["physics", "episodes", "engine", "task.py", "cost.py", "evaluation/metrics.py"])
 def test_whatever_makes_a_figure_is_in_the_key(room: str) -> None:
     """Kernels, sensors, draws and random streams were once left out."""
     place, sources = Path(cz_gym.__file__).parent / room, sources_behind(Snail.__module__)
-    assert {*(place.rglob("*.py") if place.is_dir() else [place])} <= {*sources}
-    assert sources[-1] == Path(__file__)
-    assert code_behind(Snail.__module__) == hash_sources(sources) != code_behind(Clairvoyant.__module__)
+    files = {file for files in sources.values() for file in files}
+    assert {*(place.rglob("*.py") if place.is_dir() else [place])} <= files
+    assert Path(__file__) in files
+    assert code_behind(Snail.__module__) != code_behind(Clairvoyant.__module__)
+
+
+@pytest.mark.parametrize("room", ["rendering/palette.py", "camera", "evaluation/report"])
+def test_what_only_draws_is_not_in_the_key(room: str) -> None:
+    """An edited palette once threw hours of episodes away."""
+    place = Path(cz_gym.__file__).parent / room
+    drawing = {*(place.rglob("*.py") if place.is_dir() else [place])}
+    assert drawing
+    assert not drawing & {file for files in sources_behind(Snail.__module__).values() for file in files}
 
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """A registry of two quick controllers and a slow one that is a bound, two episodes for it, no agents."""
-    snail = registry.Entry("clairvoyant", lambda config: Snail(), "measured", "slow", False, privileged=True, slow=True)
+    snail = replace(slow(Snail()), name="clairvoyant", default=False, privileged=True)
     quick = tuple(registry.find_controller(name) for name in ("open-loop", "paper"))
-    monkeypatch.setattr(benchmark, "SHIPPED", ())
+    monkeypatch.setattr(cz_gym.agents, "shipped_names", list)
     monkeypatch.setattr(registry, "CONTROLLERS", (*quick, snail))
     monkeypatch.setattr(runner, "SLOW_EPISODES", 2)
     monkeypatch.setattr(benchmark, "CACHE", tmp_path / "cache")
@@ -171,8 +189,8 @@ def test_the_command_says_how_many_episodes_a_slow_controller_met(small: Path) -
 
 
 def taking_part(arguments: list[str]) -> list[str]:
-    plan = benchmark.make_plan(benchmark.parse([*arguments, "--scenarios", "randomized,nominal"]), "")
-    return [contender.controller.name for contender in plan.contenders]
+    given = benchmark.parse([*arguments, "--scenarios", "randomized,nominal"])
+    return [each.name for each in benchmark.contenders_of(given, benchmark.rows_of(given))]
 
 
 def test_slow_controllers_run_only_when_asked_for(small: Path, refused: Any) -> None:

@@ -1,10 +1,11 @@
 """A benchmark on a Ray cluster of several nodes: the same figures, also when a node is lost on the way."""
 
 import io
-import socket
+import multiprocessing
+import os
 import sys
+import time
 from dataclasses import replace
-from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,14 @@ import pytest
 from tqdm import tqdm
 
 import benchmark
+from cz_gym.contender import Contender
+from cz_gym.errors import CzError
 from cz_gym.evaluation import cluster, runner
 from cz_gym.evaluation.protocol import Row, find_row
-from cz_gym.evaluation.results import Benchmark
+from cz_gym.evaluation.results import Result
+from tests.processes import python
 
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
+pytestmark = pytest.mark.filterwarnings("ignore")
 
 
 class Short(Row):
@@ -26,69 +30,106 @@ class Short(Row):
         return replace(super().config(*arguments), horizon=600.0)
 
 
-def plan() -> runner.Plan:
+ROW = Short(*(getattr(find_row("randomized"), name) for name in ("name", "scenario", "meaning")))
+
+
+def run(bar: Any, perform: Any = runner.in_turn) -> Result:
     given = benchmark.parse(["--controllers", "paper,lqg,gradient", "--scenarios", "randomized", "--episodes", "4"])
-    row = find_row("randomized")
-    return replace(benchmark.make_plan(given, ""), rows=(Short(row.name, row.scenario, row.meaning),))
+    contenders: list[Contender] = benchmark.contenders_of(given, [ROW])
+    (result,) = runner.run(contenders, [ROW], 4, bar, benchmark.CACHE, None, perform)
+    return result
 
 
-def values(found: Benchmark) -> dict[str, Any]:
-    return {outcome.controller.name: outcome.sample.values for outcome in found.scenarios[0].outcomes}
-
-
+@pytest.mark.slow
 def test_a_lost_node_changes_nothing(nodes: tuple[Any, Any]) -> None:
     made, second = nodes
     lost = []
 
     def losing(pieces: Any, bar: Any) -> Any:
-        for number, part in runner.on_cluster(pieces, bar):
+        for number, sample in runner.on_cluster(pieces, bar):
             if not lost:
                 lost.append(number)
                 made.remove_node(second, allow_graceful=False)
-            yield number, part
+            yield number, sample
 
     here, there = tqdm(file=io.StringIO()), tqdm(file=io.StringIO())
-    wanted, found = runner.run(plan(), here), runner.run(plan(), there, losing)
+    wanted, found = run(here), run(there, losing)
     assert lost
-    assert there.n == here.n == plan().steps
-    for name, ours in values(wanted).items():
-        np.testing.assert_array_equal(values(found)[name], ours, err_msg=name)
-    assert len(values(wanted)["gradient"]) == 5
+    assert there.n == here.n == here.total
+    for ours, theirs in zip(wanted.samples, found.samples, strict=True):
+        np.testing.assert_array_equal(theirs.values, ours.values, err_msg=ours.name)
+    assert len(found.samples[-1].values) == 5
 
 
-def test_a_node_with_other_sources_is_named(nodes: tuple[Any, Any]) -> None:
-    with pytest.raises(ValueError, match=r"has cz_gym 0\.1\.0 .*, this machine 0\.0\.0 elsewhere: install the same"):
-        cluster._check_nodes(("0.0.0", "elsewhere"))
-
-
-def test_what_a_task_raises_is_raised_here(nodes: tuple[Any, Any]) -> None:
-    with pytest.raises(ZeroDivisionError):
+@pytest.mark.slow
+def test_what_a_task_raises_is_raised_here_with_its_traceback(nodes: tuple[Any, Any]) -> None:
+    with pytest.raises(ZeroDivisionError) as caught:
         list(cluster.completed(lambda task: 1 // task, [1, 0]))
+    assert "test_cluster.py" in str(caught.value.__cause__)
 
 
+@pytest.mark.slow
 def test_without_a_cluster_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("ray")
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
-    with pytest.raises(ValueError, match=r"no Ray cluster at 127\.0\.0\.1:1") as refusal:
+    with pytest.raises(CzError, match=r"no Ray cluster at 127\.0\.0\.1:1"):
         cluster.connect("127.0.0.1:1")
-    assert "\n" not in str(refusal.value)
 
 
-def test_what_is_no_cluster_is_one_line() -> None:
-    """Ray would try for minutes."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        Thread(target=lambda: server.accept()[0].sendall(b"220 mail.example.org ready\r\n"), daemon=True).start()
-        with pytest.raises(ValueError, match="what answers there is something else"):
-            cluster._check_answers(f"127.0.0.1:{server.getsockname()[1]}")
-
-
-def test_a_node_that_came_later_with_other_sources_does_nothing() -> None:
+def test_a_node_with_other_sources_does_nothing() -> None:
     assert cluster._same_sources(cluster.facts_of_sources(), abs, -1) == 1
-    with pytest.raises(ValueError, match="has another cz_gym or numpy than this machine: install the same"):
-        cluster._same_sources(("0.0.0", "elsewhere"), abs, -1)
+    with pytest.raises(CzError, match=r"has cz_gym 0\.1\.0 .*, this machine 0\.0\.0 elsewhere 1\.26: install the same"):
+        cluster._same_sources(("0.0.0", "elsewhere", "1.26"), abs, -1)
 
 
 def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(ValueError, match=r'pip install "\.\[ray\]"'):
+    with pytest.raises(CzError, match=r'pip install "\.\[ray\]"'):
         cluster.connect("")
+
+
+def number_and_process(task: int) -> tuple[int, int]:
+    return task, os.getpid()
+
+
+def fail_or_sleep(task: int) -> None:
+    if task == 0:
+        raise IndexError("task 0")
+    time.sleep(600.0)
+
+
+def test_processes_bring_results_and_end_alone() -> None:
+    """A process that the caller has of its own goes on."""
+    own = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(600.0,))
+    own.start()
+    try:
+        found = dict(result for _, result in cluster.in_processes(number_and_process, [3, 4], processes=2))
+        assert found.keys() == {3, 4}
+        began = time.monotonic()
+        with pytest.raises(IndexError, match="task 0") as caught:
+            list(cluster.in_processes(fail_or_sleep, [1, 0, 2], processes=2))
+        assert "fail_or_sleep" in str(caught.value.__cause__), "the traceback of the other process"
+        assert time.monotonic() - began < 120.0
+        assert own.is_alive()
+    finally:
+        own.kill()
+        own.join()
+
+
+def test_processes_end_with_a_caller_that_is_killed() -> None:
+    code = (
+        "import os, signal, time; from cz_gym.evaluation.cluster import in_processes\n"
+        "from tests.evaluation.test_cluster import number_and_process\n"
+        "if __name__ == '__main__':\n"
+        "    (_, (_, worker)), *_ = [next(in_processes(number_and_process, [1], processes=1))]\n"
+        "    print(worker)"
+    )
+    worker = int(python("-c", code))
+    end = time.monotonic() + 60.0
+    while time.monotonic() < end:
+        try:
+            os.kill(worker, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.1)
+    pytest.fail("the worker outlived its caller")

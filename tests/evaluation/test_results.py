@@ -1,7 +1,9 @@
 """What a benchmark makes of its samples: pairs on common episodes, the optimality gap, and an earlier run's bound."""
 
 import csv
+import itertools
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,14 +16,14 @@ from cz_gym.atomic_files import write_files
 from cz_gym.baselines import CompensatedPID
 from cz_gym.config import make_config
 from cz_gym.evaluation.cache import earlier_bound
-from cz_gym.evaluation.files import to_csv, to_json
+from cz_gym.evaluation.files import to_csv
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.protocol import TEST_SEEDS, find_row
 from cz_gym.evaluation.report.markdown import markdown
-from cz_gym.evaluation.results import Benchmark, Controller, Sample, summarise
-from cz_gym.evaluation.rollout import Signals, rollout
+from cz_gym.evaluation.results import Result, Sample, summarise
+from cz_gym.evaluation.rollout import rollout
 from cz_gym.evaluation.statistics import Resamples, optimality_gap
-from tests.samples import sample_of
+from tests.samples import contender, sample_of
 
 
 def made(name: str, errors: list[float], costs: list[float] | None = None, **facts: Any) -> Sample:
@@ -29,12 +31,11 @@ def made(name: str, errors: list[float], costs: list[float] | None = None, **fac
     values = np.zeros((1, len(errors), len(metric_names())))
     values[0, :, 0] = errors
     values[0, :, metric_names().index("cost")] = errors if costs is None else costs
-    signals = Signals(*(np.zeros(3) for _ in Signals._fields))
-    return Sample(Controller(name, "measured", "", **facts), tuple(range(len(errors))), values, 1.0, (signals,), 5.0)
+    return Sample(contender(name, **facts), tuple(range(len(errors))), values, 1.0)
 
 
-def benchmark_of(*samples: Sample) -> Benchmark:
-    return Benchmark((summarise(find_row("randomized"), samples),), "", ())
+def results_of(*samples: Sample) -> list[Result]:
+    return [summarise(find_row("randomized"), samples)]
 
 
 def test_the_gap_is_zero_at_the_bound_and_one_at_the_reference() -> None:
@@ -58,36 +59,32 @@ def test_different_numbers_of_episodes_meet_on_those_of_both() -> None:
         made("ppo", [0.4, 0.3, 9.0], training_seeds=(0,)),
     ]
     result = summarise(find_row("randomized"), samples)
-    by_name = {outcome.controller.name: outcome for outcome in result.outcomes}
     assert len(result.seeds) == 3
-    assert by_name["mpc"].paired["rmse_mm"][::2] == pytest.approx((0.55 - 1.5, 2))
-    assert by_name["lqg"].paired["rmse_mm"][::2] == pytest.approx((9.9 / 3 - 11.0, 3))
-    assert by_name["mpc"].improvement[::2] == (1.0, 2)
-    gap, gap_radius = by_name["lqg"].gap, by_name["lqg"].gap_radius
-    assert gap is not None
-    assert gap_radius is not None
-    assert gap.mean == pytest.approx((2.0 - 1.0) / (6.0 - 1.0))
-    assert gap_radius.mean == pytest.approx(((0.25 + 0.16) / 2 - 0.005) / (2.5 - 0.005))
-    assert {name: outcome.gap.n for name, outcome in by_name.items()} == dict.fromkeys(by_name, 2)
+    assert result.paired["mpc"]["rmse_mm"][::2] == pytest.approx((0.55 - 1.5, 2))
+    assert result.paired["lqg"]["rmse_mm"][::2] == pytest.approx((9.9 / 3 - 11.0, 3))
+    assert result.improvement["mpc"]["rmse_mm"][::2] == (1.0, 2)
+    assert result.gaps["lqg"]["cost"].mean == pytest.approx((2.0 - 1.0) / (6.0 - 1.0))
+    assert result.gaps["lqg"]["rmse_mm"].mean == pytest.approx(((0.25 + 0.16) / 2 - 0.005) / (2.5 - 0.005))
+    assert {name: gaps["cost"].n for name, gaps in result.gaps.items()} == dict.fromkeys(result.means, 2)
     # On the two episodes of all, lqg is the better rival; on its own three it would seem worse than mpc.
-    assert result.verdicts[0].rival == "lqg"
-    assert result.verdicts[0].difference[::2] == pytest.approx((-0.2 / 3, 3))
+    assert result.rival == "lqg"
+    assert result.verdicts["ppo"][::2] == pytest.approx((-0.2 / 3, 3))
 
 
 @pytest.fixture(scope="module")
 def paper() -> Sample:
     """The paper's controller on two crystals."""
     run = rollout(CompensatedPID(), find_row("randomized").config(), TEST_SEEDS[:2])
-    return sample_of(Controller("paper", "measured", ""), [run])
+    return sample_of(contender("paper"), [run])
 
 
 @pytest.fixture
 def earlier(tmp_path: Path, paper: Sample) -> Path:
     """A folder with the results of an earlier run with a bound, on two crystals."""
     samples = (paper, made("clairvoyant", [0.1, 0.2], [0.3, 0.5], privileged=True, slow=True))
-    done = benchmark_of(*(replace(sample, seeds=TEST_SEEDS[:2]) for sample in samples))
+    results = results_of(*(replace(sample, seeds=TEST_SEEDS[:2]) for sample in samples))
     folder = tmp_path / "earlier"
-    write_files({folder / "benchmark.json": to_json(done).encode(), folder / "episodes.csv": to_csv(done).encode()})
+    write_files({folder / "episodes.csv": to_csv(results).encode()})
     return folder
 
 
@@ -123,13 +120,13 @@ def test_a_bound_is_used_only_beside_the_same_figures_of_the_same_controller(ear
     found = earlier_bound(earlier, row, [paper])
     assert found is not None
     assert found.seeds == (2_000_000, 2_000_001)
-    assert found.controller.bound
+    assert found.contender.bound
     np.testing.assert_allclose(found.metric("cost"), [[0.3, 0.5]])
     assert earlier_bound(earlier, row, [replace(paper, values=paper.values * 1.001)]) is None
-    assert earlier_bound(earlier, row, [replace(paper, controller=replace(paper.controller, name="other"))]) is None
+    assert earlier_bound(earlier, row, [replace(paper, contender=contender("other"))]) is None
     assert earlier_bound(earlier, find_row("hard"), [paper]) is None
     other = make_config("randomized", parameters=make_config().parameters._replace(k_l=62.1))
-    moved = sample_of(paper.controller, [rollout(CompensatedPID(), other, paper.seeds)])
+    moved = sample_of(paper.contender, [rollout(CompensatedPID(), other, paper.seeds)])
     assert earlier_bound(earlier, row, [moved]) is None
 
 
@@ -154,8 +151,19 @@ def test_the_table_of_training_seeds_names_those_that_lost_crystals() -> None:
     values = np.repeat(sample.values, 3, axis=0)
     values[1, :, metric_names().index("failure_rate")] = [0.0, 1.0, 1.0]
     values[1, :, 0] = 5.0
-    report = markdown(benchmark_of(replace(sample, values=values)), ())
+    report = markdown(results_of(replace(sample, values=values)), "", ())
     assert "| ppo | 3 | 0.200 | 0.200 | 5.000 | 7 | 2 by seed 7 | 3 |" in report
     values[1, :, metric_names().index("failure_rate")] = 0.0
-    report = markdown(benchmark_of(replace(sample, values=values)), ())
+    report = markdown(results_of(replace(sample, values=values)), "", ())
     assert "| 7 | none | 3 |" in report
+
+
+def test_a_name_with_a_bar_breaks_no_table() -> None:
+    """Agents may be called anything."""
+    sample = made("a|b", [0.1, 0.2], training_seeds=(1, 2))
+    two = replace(sample, values=np.repeat(sample.values, 2, axis=0))
+    lines = [line for line in markdown(results_of(made("paper", [1.0, 2.0]), two), "", ()).splitlines() if "|" in line]
+    rows = [re.split(r"(?<!\\)\|", line) for line in lines]
+    assert sum(r" a\|b " in row for row in rows) == 6
+    for one, other in itertools.pairwise(rows):
+        assert len(one) == len(other) or other[1] in (" controller ", " agent ")

@@ -1,6 +1,7 @@
 """Rollouts against the scalar environment, step by step."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -14,13 +15,15 @@ import cz_gym
 from cz_gym import CzEnv, CzVectorEnv
 from cz_gym.agents import load
 from cz_gym.baselines import CompensatedPID, OpenLoop
-from cz_gym.baselines.registry import find_controller, make_controller
+from cz_gym.baselines.registry import make_controller
 from cz_gym.camera import Camera
 from cz_gym.config import Config, make_config
+from cz_gym.errors import CzError
 from cz_gym.evaluation import plot
 from cz_gym.evaluation.replay import Playback
-from cz_gym.evaluation.rollout import Course, Rollout, Signals, rollout
+from cz_gym.evaluation.rollout import Course, Rollout, Signals, check_seeds, rollout
 from cz_gym.observation import MEASURED
+from cz_gym.physics.parameters import Parameters
 
 SHORT = make_config("randomized", horizon=600.0)
 CHANNELS = [channel.name for channel in MEASURED]
@@ -124,17 +127,17 @@ WITHOUT_TUPLE = SimpleNamespace(predict=lambda observation, **rest: np.zeros((le
 @pytest.mark.parametrize(
     ("policy", "config", "message"),
     [
-        (CompensatedPID(control_interval=2.0), SHORT, "was made for an action every 2 s, the environment takes one"),
+        (CompensatedPID(control_interval=2.0), SHORT, "made for .*control_interval=2,.* has .*control_interval=5,"),
         (OF_ONE, SHORT, r"actions of shape \(1, 2\) for 1 observations, not \(2,\)"),
         (WITHOUT_STATE, SHORT, r"unexpected keyword argument 'state'; it must be predict\(observation, state=None"),
         (CompensatedPID, SHORT, "is no policy: an object with predict"),
         (lambda observation: observation, SHORT, "is no policy: an object with predict"),
         (WITHOUT_TUPLE, SHORT, r"predict must return a tuple \(action, state\), not ndarray"),
-        (CompensatedPID(), make_config(action="smooth"), r"gives actions 'direct', the environment takes 'smooth'"),
+        (CompensatedPID(), make_config(action="smooth"), r"made for action='direct'.* has action='smooth'"),
         (
             load("gradient"),
             SHORT,
-            r"gives actions 'rate', the environment takes 'direct': make_config\(action='rate'\)",
+            r"made for action='rate'.* has action='direct'",
         ),
         (
             OpenLoop(),
@@ -144,7 +147,7 @@ WITHOUT_TUPLE = SimpleNamespace(predict=lambda observation, **rest: np.zeros((le
         ("paper", SHORT, r"as make_controller\('paper', config\) makes one"),
     ],
 )
-def test_silent_traps_speak(policy: Any, config: Any, message: str) -> None:
+def test_a_policy_that_does_not_fit_is_refused(policy: Any, config: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         rollout(policy, config, [1])
 
@@ -155,7 +158,7 @@ def test_silent_traps_speak(policy: Any, config: Any, message: str) -> None:
         CzEnv.from_config,
         CzVectorEnv.from_config,
         partial(make_controller, "paper"),
-        find_controller("lqg").make,
+        partial(make_controller, "lqg"),
         partial(load, "ppo"),
     ],
 )
@@ -164,16 +167,36 @@ def test_a_name_is_no_config(make: Any) -> None:
         make("hard")
 
 
-@pytest.mark.parametrize("seeds", [[], 5])
-def test_seeds_that_are_none_are_refused(seeds: Any) -> None:
-    with pytest.raises(ValueError, match=r"needs a sequence of at least one seed, as \[1\]"):
-        rollout(OpenLoop(), SHORT, seeds)
-
-
 def test_after_import_cz_gym_everything_is_there() -> None:
     assert cz_gym.__getattr__("agents") is import_module("cz_gym.agents")
     with pytest.raises(AttributeError, match="no attribute 'agent'"):
         _ = cz_gym.agent
+
+
+def other_plant() -> Config:
+    settings = {**load("gradient").settings, "horizon": 60.0}
+    return make_config("randomized", parameters=Parameters(k_l=66.0), **settings)
+
+
+def test_an_agent_of_another_plant_is_refused_unless_that_is_said() -> None:
+    agent, config = load("gradient"), other_plant()
+    with pytest.raises(CzError, match=f"made for .*; the environment has .*plant {config.plant_hash}: gym.make"):
+        rollout(agent, config, [1])
+    there = replace(config, parameters=Parameters())
+    assert not rollout(agent, config, [1], designed_for=there).failed.any()
+    assert not rollout(SimpleNamespace(predict=agent.predict, made_for=None), config, [1]).failed.any()
+
+
+@pytest.mark.parametrize("seeds", [[3, 4], (3, 4), range(3, 5), np.array([3, 4]), np.array([3, 4], np.uint8)])
+def test_seeds_may_be_any_sequence_of_whole_numbers(seeds: Any) -> None:
+    assert check_seeds(seeds) == (3, 4)
+    assert rollout(OpenLoop(), replace(SHORT, horizon=10.0), seeds).seeds == (3, 4)
+
+
+@pytest.mark.parametrize("seeds", [[], 3, 5.0, "12", [1.0], [[1]], [-1], {1}, np.array([True])])
+def test_other_seeds_are_refused(seeds: Any) -> None:
+    with pytest.raises(CzError, match="seeds must be a sequence of at least one whole number from 0 on"):
+        rollout(OpenLoop(), SHORT, seeds)
 
 
 def test_a_rollout_can_be_looked_at(tmp_path: Path) -> None:

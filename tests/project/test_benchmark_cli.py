@@ -6,7 +6,6 @@ import re
 import shlex
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +13,15 @@ import numpy as np
 import pytest
 
 import benchmark
-from cz_gym.agents import OnnxPolicy
+from cz_gym.agents import shipped_names
 from cz_gym.agents.agent_file.contract import write_agent
+from cz_gym.baselines.registry import CONTROLLERS
 from cz_gym.config import make_config
+from cz_gym.contender import Contender
 from cz_gym.errors import CzError
 from cz_gym.evaluation import runner
-from cz_gym.evaluation.contenders import agent
 from cz_gym.evaluation.metrics import metric_names
-from cz_gym.evaluation.protocol import ROWS, TEST_SEEDS, find_row
+from cz_gym.evaluation.protocol import TEST_SEEDS, find_row
 from cz_gym.evaluation.report.output import check_targets
 from cz_gym.observation import OBSERVATIONS
 from cz_gym.physics.meniscus import HURLE
@@ -78,14 +78,16 @@ def refusal(refused: Any) -> Callable[[list[str]], str]:
     return run
 
 
-def make_plan(*arguments: str) -> runner.Plan:
-    return benchmark.make_plan(benchmark.parse(arguments), "")
+def contenders(*arguments: str) -> list[Contender]:
+    given = benchmark.parse(arguments)
+    return benchmark.contenders_of(given, benchmark.rows_of(given))
 
 
-def test_every_shipped_agent_takes_part() -> None:
-    assert set(benchmark.SHIPPED) <= {each.name for each in make_plan().contenders}
-    (gradient,) = make_plan("--controllers", "gradient").contenders
-    assert len(gradient.make(ROWS[0].config())) == 5
+def test_everyone_by_default_is_of_the_registry_or_shipped() -> None:
+    usual = [each.name for each in CONTROLLERS if each.default] + shipped_names()
+    assert [each.name for each in contenders()] == usual
+    (gradient,) = contenders("--controllers", "gradient")
+    assert len(gradient.trained) == len(list(gradient.copies())) == 5
 
 
 def test_the_folder_holds_every_file_and_nothing_else(finished: Path) -> None:
@@ -174,38 +176,29 @@ def test_agent_files_that_cannot_be_used_get_one_line(tmp_path: Path, refusal: A
     broken.write_bytes(b"not a model")
     assert "broken.onnx" in refusal(["--agent", str(broken)])
     strange = constant_agent(tmp_path / "strange.onnx", plant_hash="0" * 16)
-    assert "trained on plant 0000000000000000" in refusal(["--agent", str(strange)])
+    assert "plant 0000000000000000; the environment has" in refusal(["--agent", str(strange)])
     for given in ("ppo", "mine=ppo"):
         assert "ppo is shipped and runs by its name: --controllers ppo" in refusal(["--agent", given])
     fast = str(constant_agent(tmp_path / "fast.onnx"))
     slow = constant_agent(tmp_path / "slow.onnx", control_interval=10.0)
-    assert "trained at 10 s control, randomized runs at 5 s" in refusal(["--agent", str(slow)])
-    assert "randomized-2s runs at 2 s" in refusal(["--agent", fast, "--scenarios", "randomized-2s"])
+    assert "agent 'ppo' on randomized: OnnxPolicy: this controller or agent was made for" in refusal(
+        ["--agent", str(slow)]
+    )
+    assert "control_interval=5, plant" in refusal(["--agent", fast, "--scenarios", "randomized-2s"])
     twice = str(constant_agent(tmp_path / "twice.onnx"))
     assert "appears twice" in refusal(["--agent", twice, "--agent", twice])
     called = constant_agent(tmp_path / "called.onnx", algorithm="paper")
-    assert "may not be called 'paper'" in refusal(["--agent", str(called)])
+    assert "two controllers are called 'paper'" in refusal(["--agent", str(called)])
     other = constant_agent(tmp_path / "other.onnx", training_seed=1, scenario="hard", scenario_hash="0" * 16)
     assert "different scenarios: hard, randomized" in refusal(["--agent", twice, "--agent", str(other)])
     assert "choose from" in (line := refusal(["--agent", f"mine={twice}", "--controllers", "your"]))
-    assert "mine, gradient, ppo, sac, imitation," in line
-
-
-@pytest.mark.parametrize(
-    "odd", [{"validation_rmse_mm": float("nan")}, {"validation_rmse_mm": float("inf")}, {"scenario": "\ud800"}]
-)
-def test_a_contract_that_cannot_be_recorded_is_refused_at_once(odd: dict[str, Any], tmp_path: Path) -> None:
-    policy = OnnxPolicy.load(constant_agent(tmp_path / "agent.onnx"))
-    assert agent("it", [policy], lambda config: [policy]).contracts[0]["scenario"] == "randomized"
-    policy = replace(policy, contract=replace(policy.contract, **odd))
-    with pytest.raises(ValueError, match=f"agent 'ppo': its contract's {next(iter(odd))} cannot be written"):
-        agent("it", [policy], lambda config: [policy])
+    assert "clairvoyant, mine, gradient, imitation, ppo, sac, or all" in line
 
 
 def test_an_agent_s_line_says_every_scenario_that_its_recipe_has(tmp_path: Path) -> None:
     file = constant_agent(tmp_path / "some.onnx", algorithm="mine")
-    plan = make_plan("--controllers", "gradient,ppo,mine", "--agent", str(file))
-    assert {each.name: each.controller.meaning.partition(" on ")[2] for each in plan.contenders} == {
+    found = contenders("--controllers", "gradient,ppo,mine", "--agent", str(file))
+    assert {each.name: each.meaning.partition(" on ")[2] for each in found} == {
         "gradient": "randomized, hard, sensor-fault and puller",
         "ppo": "randomized",
         "mine": "randomized, given as a file",
@@ -214,12 +207,12 @@ def test_an_agent_s_line_says_every_scenario_that_its_recipe_has(tmp_path: Path)
 
 def test_a_file_may_be_named_and_stand_beside_the_shipped_agents(tmp_path: Path) -> None:
     file, shipped = constant_agent(tmp_path / "some.onnx", algorithm="ppo"), "imitation"
-    plan = make_plan("--controllers", f"paper,mine,{shipped}", "--agent", f"mine={file}")
-    assert [each.name for each in plan.contenders] == ["paper", "mine", shipped]
-    assert plan.contenders[1].controller.meaning.endswith("given as a file")
-    assert len(plan.agents) == 1 + len(plan.contenders[2].controller.training_seeds)
-    alone = make_plan("--controllers", "paper", "--agent", str(file))
-    assert [each.name for each in alone.contenders] == ["paper", "ppo"]
+    found = contenders("--controllers", f"paper,mine,{shipped}", "--agent", f"mine={file}")
+    assert [each.name for each in found] == ["paper", "mine", shipped]
+    assert found[1].meaning.endswith("given as a file")
+    assert [len(each.contracts()) for each in found] == [0, 1, len(found[2].training_seeds)]
+    alone = contenders("--controllers", "paper", "--agent", str(file))
+    assert [each.name for each in alone] == ["paper", "ppo"]
     assert benchmark.parse(["--agent", "a=b=c.onnx", "--agent", "x/a=b.onnx"]).agent == [
         ("a", Path("b=c.onnx")),
         ("", Path("x/a=b.onnx")),
@@ -272,7 +265,7 @@ def test_a_full_run_is_quoted_in_the_readme(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(benchmark, "README", page)
     assert benchmark.main([*ONE, "--overwrite"]) == 0
     assert "old" in page.read_text()
-    monkeypatch.setattr(benchmark, "is_partial", lambda arguments, plan: False)
+    monkeypatch.setattr(benchmark, "is_partial", lambda *_: False)
     assert benchmark.main(ONE) == 0
     text = page.read_text()
     assert text.startswith("before\n<!-- benchmark:begin -->\n")
@@ -349,7 +342,7 @@ def test_one_s_own_controller_runs_beside_a_few_into_its_own_folder(
     assert benchmark.main(command) == 0
     assert capsys.readouterr().out.endswith("\nwrote runs/Still; open runs/Still/report.html\n")
     results = json.loads(Path("runs/Still/benchmark.json").read_text())["results"]["reference-b"]
-    assert list(results) == [*benchmark.BESIDE, "Still"]
+    assert list(results) == ["paper", "paper-tuned", "lqg-at-0.02", "Still"]
     assert "runs/Still/" in (line := refusal(command))
     assert "exists and this run is partial: add --overwrite" in line
     agent = constant_agent(tmp_path / "some.onnx")
@@ -381,16 +374,12 @@ def test_a_report_on_one_s_own_shows_it_and_prints_a_command_that_runs(
     assert told
     command = shlex.split(told[1])[1:]
     arguments = benchmark.parse(command)
-    assert [row.name for row in make_plan(*command).rows] == ["later"]
+    assert [row.name for row in benchmark.rows_of(arguments)] == ["later"]
     check_targets(arguments.out, arguments.json, True, arguments.overwrite)
-    page = Path("out/report.html").read_text()
+    page, puller = Path("out/report.html").read_text(), make_config().plant_hash
     assert "5 controllers, 1 scenario, up to 1 crystal each" in page
-    found = re.search('<script type="application/json" id="data">(.*?)</script>', page)
-    assert found
-    drawn = {
-        trace.get("legendgroup") for trace in json.loads(found[1])["frame"]["data"] if trace.get("visible") is True
-    }
-    assert drawn == {"1", "4"}, "the reference and one's own, without agents"
+    for text in (page, Path("out/report.md").read_text()):
+        assert f"on the default puller: radius 87.5 mm, pull speed 1.2 mm/min, plant {puller}." in text
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from cz_gym.agents.training.recipes import PPO, RECIPES, Imitation
 from cz_gym.atomic_files import write_files
 from cz_gym.baselines import registry
 from cz_gym.baselines.pid.open_loop import OpenLoop
+from cz_gym.contender import Contender
 from cz_gym.evaluation import runner
 from cz_gym.evaluation.files import is_benchmark_json
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
@@ -77,7 +78,7 @@ class Slow(OpenLoop):
 
 def slow_benchmark(arguments: list[str]) -> int:
     """benchmark.py with a slow controller whose six episodes are cached, two at a time, beside the results."""
-    slow = registry.Entry("slow", lambda config: Slow(), "measured", "does nothing", default=False, slow=True)
+    slow = Contender("slow", lambda config: Slow(), "measured", "does nothing", default=False, slow=True)
     registry.CONTROLLERS = (*registry.CONTROLLERS, slow)
     benchmark.CACHE = Path(arguments[-1]).parent / "cache"
     runner.BLOCK = 2

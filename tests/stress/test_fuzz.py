@@ -27,6 +27,7 @@ from cz_gym.evaluation.cache import read_episode
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.rollout import Signals
 from cz_gym.jit.cache import Store
+from tests.samples import contender
 from tests.small_learners import SMALL_SAC, trained
 
 SPARE = 1_000_000_000
@@ -96,7 +97,7 @@ def known(ppo: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[s
         "sac checkpoint": kept(to_bytes(sac, 1.0, 0.5), "sac.safetensors", restored(sac)),
         "settings.json": kept(settings.encode(), "settings.json", read_settings),
         "progress.csv": kept(progress.encode(), "progress.csv", read_rows),
-        "cached episode": kept(episode.getvalue(), "0.npz", lambda path: read_episode(path, True)),
+        "cached episode": kept(episode.getvalue(), "0.npz", lambda path: read_episode(contender("slow"), path, True)),
         "compiled code": kept(store.path("key").read_bytes(), store.path("key").name, code),
     }
     assert targets.keys() == MUTANTS.keys()

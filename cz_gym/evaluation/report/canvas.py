@@ -1,17 +1,16 @@
-"""What the figures share: how each controller is drawn, a canvas without a display, PNG bytes."""
+"""What figures share: the style of each controller, a canvas without a display, PNG bytes."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from itertools import chain, count
 from typing import IO, NamedTuple
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from cz_gym.evaluation.results import REFERENCE, Controller, Sample
+from cz_gym.evaluation.results import REFERENCE, Sample
 
 COLOURS = (
     "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#4B0055", "#7F5FB0", "#8C6D1F",
@@ -23,22 +22,15 @@ MARKERS = {
     "o": "circle", "s": "square", "D": "diamond", "^": "triangle-up", "v": "triangle-down", "P": "cross", "*": "star",
     "X": "x", "p": "pentagon", "h": "hexagon", "<": "triangle-left", ">": "triangle-right",
 }  # fmt: skip
-"""Matplotlib's markers and plotly's names of them."""
+"""Matplotlib's markers with plotly's names for them."""
 DASHES = ("solid", "dash", "dot")
-"""Plotly's lines: the next one where the colours begin again."""
+"""Plotly's dashes; the next one is used where the colours begin again."""
 DPI = 160
 INK, GREY = "#222222", "#999999"
-KNOWN = ("ppo", "gradient", "lqg-at-0.02", "paper", "paper-tuned")
-"""Controllers of README's table, which figures prefer."""
-ORDER = (
-    *KNOWN, "lqg", "lqg-quiet", "imitation", "sac", "industrial",
-    "pid-conventional", "paper-filtered", "open-loop", "pid-uncompensated",
-)  # fmt: skip
-"""What runs by default: each looks the same in every figure of every run, by its place here."""
 
 
 class Style(NamedTuple):
-    """How a controller is drawn, the same in every figure."""
+    """Colour, marker and dashes of a controller, the same in every figure of a run."""
 
     colour: str
     marker: str
@@ -46,47 +38,47 @@ class Style(NamedTuple):
 
 
 def styles(names: Sequence[str]) -> dict[str, Style]:
-    """One style a controller: that of its place in :data:`ORDER`, or in turn one that no other here has."""
-    markers, absent = list(MARKERS), [i for i, name in enumerate(ORDER) if name not in names]
-    free = chain(range(len(ORDER), len(COLOURS)), absent, count(len(COLOURS)))
-    places = {name: ORDER.index(name) if name in ORDER else next(free) for name in names}
+    """Return one style a controller, in turn; no two are alike in a run."""
+    markers = list(MARKERS)
     return {
         name: Style(COLOURS[i % len(COLOURS)], markers[i % len(markers)], DASHES[i // len(COLOURS) % len(DASHES)])
-        for name, i in places.items()
+        for i, name in enumerate(dict.fromkeys(names))
     }
 
 
-def styles_of(controllers: Sequence[Controller]) -> dict[str, Style]:
-    """One style a controller; after the known ones come the user's own, then the learned."""
-    return styles([each.name for each in sorted(controllers, key=lambda each: (not each.own, not each.learned))])
+def styles_of(samples: Sequence[Sample]) -> dict[str, Style]:
+    """Return one style a contender: the user's own come first, then the quoted, agents, and the others."""
+    contenders = [sample.contender for sample in samples]
+    return styles([each.name for each in sorted(contenders, key=lambda c: (not c.own, not c.quoted, not c.learned))])
 
 
 def chosen(samples: Sequence[Sample], most: int) -> list[Sample]:
-    """At most so many of them, in their order, for a figure that has no room for all.
+    """Return at most so many of them, in their order, for a figure that has no room for all.
 
-    The reference, the user's own, the known ones, the best learned one, then the others; bounds last. Among equals the
-    lowest mean RMSE comes first.
+    The reference, the user's own, the best agent, the quoted ones, other agents, then the others; bounds last. Among
+    equals the lowest mean RMSE comes first.
     """
     ranked = sorted(samples, key=lambda sample: float(sample.metric("rmse_mm").mean()))
-    learned = [sample.controller.name for sample in ranked if sample.controller.learned]
+    learned = [sample.name for sample in ranked if sample.contender.learned and not sample.contender.bound]
 
     def place(sample: Sample) -> tuple[bool, ...]:
-        who = sample.controller
-        return who.name != REFERENCE, not who.own, who.name not in KNOWN, who.name not in learned[:1], who.bound
+        who = sample.contender
+        first = who.name != REFERENCE, not who.own, who.name not in learned[:1], not who.quoted
+        return *first, who.bound, not who.learned
 
-    names = [sample.controller.name for sample in sorted(ranked, key=place)[:most]]
-    return [sample for sample in samples if sample.controller.name in names]
+    names = [sample.name for sample in sorted(ranked, key=place)[:most]]
+    return [sample for sample in samples if sample.name in names]
 
 
 def canvas(width: float, height: float) -> Figure:
-    """A figure of that size [in]."""
+    """Return an empty figure of that size [in]."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def png(figure: Figure) -> bytes:
-    """The figure as a PNG file, its axes in the house's style."""
+    """Return the figure as a PNG file, its axes in the house's style."""
     for axis in figure.axes:
         axis.grid(True, color="#dddddd", lw=0.5)
         axis.set_axisbelow(True)
@@ -101,7 +93,7 @@ def png(figure: Figure) -> bytes:
 
 
 def small(image: IO[bytes]) -> bytes:
-    """A PNG of at most 256 colours, a third of the size of one that has them all: figures have few."""
+    """Return the image as a PNG of at most 256 colours, which is a third of the size; figures have few colours."""
     palette = Image.open(image).convert("RGB").quantize(256, dither=Image.Dither.NONE)
     packed = io.BytesIO()
     palette.save(packed, format="png", optimize=True)

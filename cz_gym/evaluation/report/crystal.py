@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from cz_gym.evaluation.results import Sample, ScenarioResult
+from cz_gym.evaluation.results import Result, Sample
 from cz_gym.evaluation.rollout import Floats, Signals
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
@@ -23,6 +23,13 @@ ROOM = (0.01 * MM, 3.0 * MM)
 SMOOTH = 5.0 * MINUTE
 """Length of the running mean of noisy signals [s]; drawn pale beside it, :data:`PALE`."""
 PALE = MINUTE
+
+
+def example(sample: Sample) -> Signals:
+    """Return the signals of a sample's first crystal, which every sample of a run has."""
+    if sample.example is None:
+        raise ValueError(f"the sample of {sample.name} has no signals")
+    return sample.example
 
 
 class _Panel(NamedTuple):
@@ -41,19 +48,19 @@ _PANELS = (
 )
 
 
-def crystal(scenario: ScenarioResult, style: Mapping[str, Style]) -> bytes:
-    """The first crystal of a scenario under each controller: radius, ring, pull, heater, melt against time."""
-    samples = chosen([outcome.sample for outcome in scenario.outcomes], COLUMNS)
+def crystal(result: Result, style: Mapping[str, Style]) -> bytes:
+    """Draw the first crystal of a scenario under some controllers: radius, ring, pull, heater, melt against time."""
+    samples = chosen(result.samples, COLUMNS)
     figure = canvas(max(1.62 * len(samples) + 1.0, 5.0), 7.6)
     axes = figure.subplots(len(_PANELS), len(samples), sharex=True, sharey="row", squeeze=False)
-    longest = max((sample.example for sample in samples), key=lambda signals: len(signals.r_c))
+    longest = max(map(example, samples), key=lambda signals: len(signals.r_c))
     for column, sample in enumerate(samples):
-        _draw(axes[:, column], sample, style[sample.controller.name].colour, longest.r_ref)
+        _draw(axes[:, column], sample, result.row.control_interval, style[sample.name].colour, longest.r_ref)
     for row, panel in enumerate(_PANELS):
         axes[row, 0].set_ylabel(panel.label.replace(" [", "\n["))
     figure.align_ylabels(axes[:, 0])
-    _set_limits(axes, samples, longest)
-    figure.suptitle(f"One crystal of {scenario.row.name} (test seed {samples[0].seeds[0]:,})", fontsize=10.5)
+    _set_limits(axes, samples, longest, result.row.control_interval)
+    figure.suptitle(f"One crystal of {result.row.name} (test seed {samples[0].seeds[0]:,})", fontsize=10.5)
     lines: tuple[dict[str, Any], ...] = (
         {"color": INK, "lw": 1.2, "ls": "--", "label": "reference"},
         {"color": GREY, "lw": 1.2, "label": "ring as the camera reports it"},
@@ -66,8 +73,8 @@ def crystal(scenario: ScenarioResult, style: Mapping[str, Style]) -> bytes:
     return png(figure)
 
 
-def _draw(axes: Any, sample: Sample, colour: str, reference: Floats) -> None:
-    signals, dt = sample.example, sample.control_interval
+def _draw(axes: Any, sample: Sample, dt: float, colour: str, reference: Floats) -> None:
+    signals = example(sample)
     minutes = _minutes(len(signals.r_c), dt)
     axes[0].plot(_minutes(len(reference), dt), reference / MM, color=INK, lw=1.0, ls="--", zorder=3)
     axes[1].plot(minutes, signals.r_br_measured / MM, color=GREY, lw=0.4)
@@ -81,10 +88,10 @@ def _draw(axes: Any, sample: Sample, colour: str, reference: Floats) -> None:
         else:
             axis.plot(minutes, values, color=colour, lw=1.1)
     rmse = float(sample.metric("rmse_mm")[0, 0])
-    name = fill(sample.controller.name, 18)
+    name = fill(sample.name, 18)
     axes[0].set_title(f"{name}\nRMSE {rmse:.3g} mm", fontsize=9, color=INK, fontweight="bold")
     axes[-1].set_xlabel("time [min]")
-    if _failed(sample):
+    if lost(sample):
         for axis in axes:
             axis.axvline(minutes[-1], color=INK, lw=0.8, ls=":")
         side = {"ha": "left"} if minutes[-1] < 90.0 else {"ha": "right"}
@@ -92,19 +99,20 @@ def _draw(axes: Any, sample: Sample, colour: str, reference: Floats) -> None:
         axes[0].annotate(f" failed \n at {minutes[-1]:.0f} min ", (minutes[-1], 0.96), **place)
 
 
-def _failed(sample: Sample) -> bool:
+def lost(sample: Sample) -> bool:
+    """Return whether the first crystal was lost, with the first training seed."""
     return bool(sample.metric("failure_rate")[0, 0])
 
 
-def _set_limits(axes: Any, samples: Sequence[Sample], longest: Signals) -> None:
+def _set_limits(axes: Any, samples: Sequence[Sample], longest: Signals, dt: float) -> None:
     """Scale by the crystals that did not fail: one that did leaves the picture, it does not set the scale."""
-    whole = [sample for sample in samples if not _failed(sample)] or samples
-    worst = max(float(np.abs(sample.example.r_c - sample.example.r_ref).max()) for sample in whole)
+    whole = [sample for sample in samples if not lost(sample)] or samples
+    worst = max(float(np.abs(example(sample).r_c - example(sample).r_ref).max()) for sample in whole)
     width = 1.15 * float(np.clip(worst, *ROOM))
     ends = np.array([longest.r_ref.min() - width, longest.r_ref.max() + width])
     axes[0, 0].set_ylim(*(ends / MM))
     axes[1, 0].set_ylim(*((ends + np.median(longest.r_br - longest.r_c)) / MM))
-    axes[0, 0].set_xlim(0.0, len(longest.r_c) * samples[0].control_interval / MINUTE)
+    axes[0, 0].set_xlim(0.0, len(longest.r_c) * dt / MINUTE)
     axes[0, 0].xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 3, 6, 10]))
     for axis in axes.flat:
         axis.ticklabel_format(axis="y", useOffset=False)

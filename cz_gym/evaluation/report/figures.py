@@ -11,8 +11,9 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from cz_gym.evaluation.results import Benchmark, Outcome, ScenarioResult
+from cz_gym.evaluation.results import Result
 from cz_gym.evaluation.rollout import Floats
+from cz_gym.evaluation.statistics import Estimate
 
 from .canvas import GREY, INK, Style, canvas, chosen, png, styles_of
 from .crystal import crystal
@@ -28,46 +29,44 @@ NAMED = 8
 """Most controllers that :func:`pareto` names: with more, points hide each other and colours are hard to tell apart."""
 
 
-def draw_figures(benchmark: Benchmark) -> dict[str, bytes]:
-    """Every figure by file name; a figure with nothing to show is left out."""
-    style = styles_of(benchmark.controllers)
-    random = [scenario for scenario in benchmark.scenarios if len(scenario.seeds) > 1]
+def draw_figures(results: Sequence[Result]) -> dict[str, bytes]:
+    """Draw every figure, by file name; a figure with nothing to show is left out."""
+    style = styles_of(results[0].samples)
+    random = [result for result in results if len(result.seeds) > 1]
     with rc_context({"text.parse_math": False}):  # a name with dollar signs is no formula
-        figures = {"crystal.png": crystal(benchmark.scenarios[0], style)}
+        figures = {"crystal.png": crystal(results[0], style)}
         if random:
             figures["errors.png"] = errors(random, style)
             figures["pareto.png"] = pareto(random, style)
     return figures
 
 
-def _axes(
-    figure: Figure, scenarios: Sequence[ScenarioResult], labels: tuple[str, str]
-) -> Iterator[tuple[Any, ScenarioResult]]:
-    """An axis a scenario, in two columns, logarithmic along x, with labels at the outside."""
-    columns = min(len(scenarios), 2)
-    axes = figure.subplots(-(-len(scenarios) // columns), columns, sharex=True, sharey=True, squeeze=False)
+def _axes(figure: Figure, results: Sequence[Result], labels: tuple[str, str]) -> Iterator[tuple[Any, Result]]:
+    """Yield an axis for each scenario, in two columns, logarithmic along x, with labels at the outside."""
+    columns = min(len(results), 2)
+    axes = figure.subplots(-(-len(results) // columns), columns, sharex=True, sharey=True, squeeze=False)
     for axis in axes[-1]:
         axis.set_xlabel(labels[0])
     for axis in axes[:, 0]:
         axis.set_ylabel(labels[1])
-    for axis in axes.flat[len(scenarios) :]:
+    for axis in axes.flat[len(results) :]:
         axis.set_visible(False)
-    for axis, scenario in zip(axes.flat, scenarios, strict=False):
+    for axis, result in zip(axes.flat, results, strict=False):
         axis.set_xscale("log")
         axis.tick_params(which="both", labelbottom=True)
         _plain_log(axis.xaxis)
-        yield axis, scenario
+        yield axis, result
 
 
-def errors(scenarios: Sequence[ScenarioResult], style: Mapping[str, Style]) -> bytes:
-    """Distribution of RMSE over the episodes: median, quartiles, 5 to 95 %, and the episodes beyond."""
-    names = [outcome.controller.name for outcome in scenarios[0].outcomes]
-    rows = -(-len(scenarios) // 2)
-    figure = canvas(4.6 * min(len(scenarios), 2) + 1.0, rows * (0.36 * len(names) + 1.0) + 0.6)
-    for axis, scenario in _axes(figure, scenarios, ("RMSE of the radius [mm]", "")):
-        for place, outcome in enumerate(scenario.outcomes):
-            _spread(axis, outcome.sample.metric(RMSE.metric).ravel(), place, style[outcome.controller.name].colour)
-        axis.set_title(f"{scenario.row.name} ({len(scenario.seeds)} crystals)", fontsize=9.5)
+def errors(results: Sequence[Result], style: Mapping[str, Style]) -> bytes:
+    """Draw the distribution of RMSE over the episodes: median, quartiles, 5 to 95 %, and the episodes beyond."""
+    names = [sample.name for sample in results[0].samples]
+    rows = -(-len(results) // 2)
+    figure = canvas(4.6 * min(len(results), 2) + 1.0, rows * (0.36 * len(names) + 1.0) + 0.6)
+    for axis, result in _axes(figure, results, ("RMSE of the radius [mm]", "")):
+        for place, sample in enumerate(result.samples):
+            _spread(axis, sample.metric(RMSE.metric).ravel(), place, style[sample.name].colour)
+        axis.set_title(f"{result.row.name} ({len(result.seeds)} crystals)", fontsize=9.5)
         axis.set_yticks(range(len(names)), names)
         axis.set_ylim(len(names) - 0.4, -0.6)
     figure.suptitle("Radius error by crystal: median, quartiles, 5 to 95 %, crystals beyond", fontsize=11)
@@ -83,29 +82,30 @@ def _spread(axis: Any, values: Floats, place: int, colour: str) -> None:
     axis.plot(beyond, np.full(len(beyond), place), ls="none", marker="|", ms=6, mew=0.6, color=colour, alpha=0.7)
 
 
-def pareto(scenarios: Sequence[ScenarioResult], style: Mapping[str, Style]) -> bytes:
-    """Mean RMSE against mean pull step RMS with 95 % intervals, both logarithmic; lower left is better.
+def floor_of(results: Sequence[Result]) -> float:
+    """Return the pull step RMS at which controllers stand that never move the pull speed [mm/min]."""
+    moving = [each[PULL_STEP.metric].mean for result in results for each in result.means.values()]
+    return min((value for value in moving if value > 0.0), default=1.0) / 3.0
+
+
+def pareto(results: Sequence[Result], style: Mapping[str, Style]) -> bytes:
+    """Draw mean RMSE against mean pull step RMS with 95 % intervals, both logarithmic; lower left is better.
 
     Some controllers are :func:`named`, by hollow markers, so that one behind another is seen; the others are grey
     dots. Who has more than :data:`FAR` times the least error of those that move the pull speed is listed, not drawn.
     """
-    names = named(scenarios)
-    figure = canvas(9.0 if len(scenarios) > 1 else 6.8, max(2.9 * -(-len(scenarios) // 2) + 1.0, 4.6))
-    moving = [outcome.means[PULL_STEP.metric].mean for scenario in scenarios for outcome in scenario.outcomes]
-    floor = min((value for value in moving if value > 0.0), default=1.0) / 3.0
-    for axis, scenario in _axes(figure, scenarios, (PULL_STEP.heading, "RMSE of the radius [mm]")):
+    names, floor = named(results), floor_of(results)
+    figure = canvas(9.0 if len(results) > 1 else 6.8, max(2.9 * -(-len(results) // 2) + 1.0, 4.6))
+    for axis, result in _axes(figure, results, (PULL_STEP.heading, "RMSE of the radius [mm]")):
         axis.set_yscale("log")
         axis.tick_params(which="both", labelleft=True)
         _plain_log(axis.yaxis)
-        least = [each.means[RMSE.metric].mean for each in scenario.outcomes if each.means[PULL_STEP.metric].mean > 0.0]
-        most, far = FAR * min(least, default=np.inf), []
-        for outcome in scenario.outcomes:
-            name = outcome.controller.name
-            if outcome.means[RMSE.metric].mean <= most:
-                _point(axis, outcome, style[name] if name in names else None, floor)
-            else:
-                far.append(name)
-        axis.set_title(scenario.row.name, fontsize=9.5)
+        least = [each[RMSE.metric].mean for each in result.means.values() if each[PULL_STEP.metric].mean > 0.0]
+        most = FAR * min(least, default=np.inf)
+        far = [name for name, each in result.means.items() if each[RMSE.metric].mean > most]
+        for name in (name for name in result.means if name not in far):
+            _point(axis, result.means[name], style[name] if name in names else None, floor)
+        axis.set_title(result.row.name, fontsize=9.5)
         if far:
             place = {"transform": axis.transAxes, "va": "top", "ha": "right", "fontsize": 8}
             axis.text(0.995, 0.995, fill(f"above the picture: {', '.join(far)}", 50, break_on_hyphens=False), **place)
@@ -114,7 +114,7 @@ def pareto(scenarios: Sequence[ScenarioResult], style: Mapping[str, Style]) -> b
         for name, one in style.items()
         if name in names
     ]
-    if len(names) < len(scenarios[0].outcomes):
+    if len(names) < len(results[0].samples):
         handles.append(Line2D([], [], ls="none", marker="o", color=GREY, ms=3, label="others"))
     columns = int(figure.get_figwidth() / (0.6 + LETTER * max(len(name) for name in names)))
     figure.legend(handles=handles, loc="outside lower center", ncols=max(columns, 1), frameon=False, fontsize=9)
@@ -122,19 +122,16 @@ def pareto(scenarios: Sequence[ScenarioResult], style: Mapping[str, Style]) -> b
     return png(figure)
 
 
-def named(scenarios: Sequence[ScenarioResult]) -> list[str]:
-    """Who is named: the best classical controller of each scenario, and :func:`.canvas.chosen` others of the first."""
-    best = set()
-    for scenario in scenarios:
-        classical = [each for each in scenario.outcomes if not (each.controller.learned or each.controller.bound)]
-        best |= {min(classical, key=lambda each: each.means[RMSE.metric].mean).controller.name} if classical else set()
-    others = [each.sample for each in scenarios[0].outcomes if each.controller.name not in best]
-    return [*best, *(sample.controller.name for sample in chosen(others, NAMED - len(best)))]
+def named(results: Sequence[Result]) -> list[str]:
+    """Return who is named: the best classical controller of each scenario, and chosen others of the first."""
+    best = sorted({result.rival for result in results if result.rival})
+    others = [sample for sample in results[0].samples if sample.name not in best]
+    return [*best, *(sample.name for sample in chosen(others, NAMED - len(best)))]
 
 
-def _point(axis: Any, outcome: Outcome, style: Style | None, floor: float) -> None:
-    """A marker with its intervals in that style, or a grey dot."""
-    error, activity = outcome.means[RMSE.metric], outcome.means[PULL_STEP.metric]
+def _point(axis: Any, means: Mapping[str, Estimate], style: Style | None, floor: float) -> None:
+    """Draw a marker with its intervals in that style, or a grey dot."""
+    error, activity = means[RMSE.metric], means[PULL_STEP.metric]
     x = max(activity.mean, floor)
     if style is None:
         axis.plot(x, error.mean, ls="none", marker="o", ms=3, color=GREY, zorder=1)

@@ -1,115 +1,92 @@
-"""``report.html``: the benchmark as one page that opens from disk: table, pictures, and the first episodes' signals.
+"""``report.html``: the benchmark as one page that opens from disk: tables, and plotly's interactive pictures.
 
 Everything is inside the file, plotly.js included, and its content policy forbids the browser to fetch anything else.
-Names come from agent files and are untrusted: they are escaped for HTML, for plotly, and as JSON inside a script.
+Names come from agent files and are untrusted: they are escaped for HTML and for plotly.
 """
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from html import escape
 from importlib.resources import files
-from typing import Any
 
 from plotly.graph_objects import Figure
 from plotly.offline import get_plotlyjs
 
-from cz_gym.evaluation.results import Benchmark, Outcome, ScenarioResult
-from cz_gym.units import HOUR, MINUTE
+from cz_gym.evaluation.results import Result, Sample
+from cz_gym.units import HOUR
 
 from . import tables
 from .canvas import styles_of
 from .markdown import measured_from
-from .page_figures import errors, pareto
-from .page_signals import OWN, PANELS, SHARED, crystals, frame
+from .page_crystal import crystal
+from .page_pictures import errors, pareto
 from .verdict import headline
 
 _SLOT = re.compile(r"<!-- slot:(\w+) -->")
 
 
-def page(benchmark: Benchmark) -> str:
-    """The page; the same results give the same text."""
-    config, scenarios = benchmark.scenarios[0].row.config(), benchmark.scenarios
-    most = max(len(scenario.seeds) for scenario in scenarios)
+def page(results: Sequence[Result], command: str) -> str:
+    """Return the page; the same results give the same text."""
+    row, styles = results[0].row, styles_of(results[0].samples)
+    config, most = row.config(), max(len(result.seeds) for result in results)
     parts = {
         "style": _asset("page.css"),
         "plotly": get_plotlyjs(),
-        "script": _asset("page.js"),
-        "data": embedded(_data(benchmark)),
-        "verdict": escape(headline(benchmark)),
-        "lede": f"{tables.count(len(benchmark.controllers), 'controller')}, "
-        f"{tables.count(len(scenarios), 'scenario')}, up to {tables.crystals(most)} each, the same for everyone: "
-        f"{config.horizon / HOUR:g} h at one action every {config.control_interval:g} s.",
-        "scenarios": _each("option", (scenario.row.name for scenario in scenarios)),
-        "tables": "\n".join(_table(scenario) for scenario in scenarios),
+        "verdict": escape(headline(results)),
+        "lede": f"{tables.count(len(results[0].samples), 'controller')}, {tables.count(len(results), 'scenario')}, "
+        f"up to {tables.crystals(most)} each, the same for everyone: {config.horizon / HOUR:g} h at one action every "
+        f"{config.control_interval:g} s, on the default puller: {row.puller}.",
+        "tables": "\n".join(_table(result, is_open=result is results[0]) for result in results),
+        "pareto": _html(pareto(results, styles), "pareto"),
+        "errors": _html(errors(results, styles), "errors"),
+        "crystal": _html(crystal(results, styles), "crystal"),
         "controllers": "\n".join(
             "<tr>"
             + _each("td", (each.name, each.observation, each.meaning, ", ".join(map(str, each.training_seeds))))
             + "</tr>"
-            for each in benchmark.controllers
+            for each in (sample.contender for sample in results[0].samples)
         ),
-        "resolutions": ", ".join(f"{panel.title} {panel.resolution:g} {panel.unit}" for panel in PANELS),
-        "command": escape(benchmark.command),
+        "command": escape(command),
     }
     return _SLOT.sub(lambda slot: parts[slot[1]], _asset("page.html"))
 
 
-def _data(benchmark: Benchmark) -> dict[str, Any]:
-    """What the page's script draws."""
-    config, styles = benchmark.scenarios[0].row.config(), styles_of(benchmark.controllers)
-    best = min(benchmark.scenarios[0].verdicts, key=lambda verdict: verdict.difference.mean, default=None)
-    drawn = [best.rival, best.agent] if best else []
-    return {
-        "minutes": config.control_interval / MINUTE,
-        "resolutions": [[PANELS[panel].resolution for panel, _ in lines] for lines in (OWN, SHARED)],
-        "frame": _figure(frame(benchmark.controllers, drawn, styles, config.horizon)),
-        "scenarios": [
-            {"pictures": [_figure(draw(each, styles)) for draw in (pareto, errors)], "crystals": crystals(each)}
-            for each in benchmark.scenarios
-        ],
-    }
+def _html(figure: Figure, name: str) -> str:
+    margin = {"l": 60, "r": 10, "t": 90, "b": 40}
+    figure.update_layout(template="plotly_white", margin=margin, hoverlabel_namelength=-1)
+    config = {"displayModeBar": False, "responsive": True}
+    text: str = figure.to_html(config, full_html=False, include_plotlyjs=False, div_id=name)
+    return text
 
 
-def _figure(figure: Figure) -> Any:
-    margin = {"l": 60, "r": 10, "t": 50, "b": 40}
-    return json.loads(figure.update_layout(template="plotly_white", margin=margin, hoverlabel_namelength=-1).to_json())
-
-
-def embedded(value: Any) -> str:
-    """A value as JSON that stays JSON inside a script element: ASCII, and nothing that HTML could read as markup."""
-    text = json.dumps(value, allow_nan=False, separators=(",", ":"))
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
-def _table(scenario: ScenarioResult) -> str:
-    """Every metric of a scenario, the lowest RMSE first."""
-    columns = (*tables.ERROR, *tables.comparison(scenario), *tables.DRIVES)
+def _table(result: Result, is_open: bool) -> str:
+    """Every metric of a scenario, the lowest RMSE first, to unfold."""
+    columns = (*tables.ERROR, *tables.comparison(result), *tables.DRIVES)
     heads = _each("th", ("controller", *(column.heading for column in columns)))
-    ranked = sorted(scenario.outcomes, key=lambda outcome: outcome.means[tables.RMSE.metric].mean)
+    ranked = sorted(result.samples, key=lambda sample: result.means[sample.name][tables.RMSE.metric].mean)
     lines = "\n".join(
-        f"<tr>{_name(outcome, scenario)}{''.join(_cell(outcome, column) for column in columns)}</tr>"
-        for outcome in ranked
+        f"<tr>{_name(sample, result)}{''.join(_cell(result, sample.name, column) for column in columns)}</tr>"
+        for sample in ranked
     )
-    row, count = scenario.row, tables.crystals(len(scenario.seeds))
-    about = escape(f"{row.name}: {row.meaning}. {count}. {measured_from(scenario).replace('`', '')}")
+    about = escape(f"{result.row.meaning}. {measured_from(result).replace('`', '')}")
     return (
-        f'<div class="scenario"><p class="note">{about}</p><div class="scroll"><table class="metrics">\n'
-        f"<thead><tr>{heads}</tr></thead>\n<tbody>\n{lines}\n</tbody></table></div></div>"
+        f"<details{' open' if is_open else ''}><summary>{escape(result.row.name)} "
+        f'({tables.crystals(len(result.seeds))})</summary><p class="note">{about}</p>'
+        f'<div class="scroll"><table class="metrics">\n<thead><tr>{heads}</tr></thead>\n'
+        f"<tbody>\n{lines}\n</tbody></table></div></details>"
     )
 
 
-def _name(outcome: Outcome, scenario: ScenarioResult) -> str:
-    name, who = escape(tables.label(outcome, scenario)), outcome.controller
-    bound = "<small>bound: knows what no sensor shows</small>" if who.bound else ""
-    return f'<th data-value="{name}" title="{escape(who.meaning)}">{name}{bound}</th>'
+def _name(sample: Sample, result: Result) -> str:
+    bound = "<small>bound: knows what no sensor shows</small>" if sample.contender.bound else ""
+    return f"<th>{escape(tables.label(sample, result))}{bound}</th>"
 
 
-def _cell(outcome: Outcome, column: tables.Column) -> str:
-    estimate = column.estimate(outcome)
-    mean, _, interval = column.text(estimate).partition(" ")
-    return f'<td data-value="{estimate.mean if estimate else ""}">{mean}<small>{interval}</small></td>'
+def _cell(result: Result, name: str, column: tables.Column) -> str:
+    mean, _, interval = column.text(column.estimate(result, name)).partition(" ")
+    return f"<td>{mean}<small>{interval}</small></td>"
 
 
 def _each(tag: str, texts: Iterable[str]) -> str:

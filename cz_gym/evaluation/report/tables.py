@@ -1,11 +1,11 @@
-"""What every table of results shares: its columns, the estimates in them, and how numbers are written."""
+"""What every table of results shares: its columns, the estimates in them, and how numbers and names are written."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from cz_gym.evaluation.results import REFERENCE, SPEED, Outcome, ScenarioResult
+from cz_gym.evaluation.results import REFERENCE, SPEED, Estimates, Result, Sample
 from cz_gym.evaluation.statistics import Estimate
 from cz_gym.units import PERCENT
 
@@ -13,22 +13,23 @@ NOTHING = "-"
 
 
 class Column(NamedTuple):
-    """A column of a table: by default the mean of a metric."""
+    """A column of a table: a metric of one of a result's kinds of estimates."""
 
     metric: str
     heading: str
     decimals: int
     unit: float = 1.0
     """The table's unit in the metric's own."""
-    find: Callable[[Outcome], Estimate | None] | None = None
-    """The estimate, where it is not the mean of ``metric``."""
+    kind: str = "means"
+    """Name of the estimates, an attribute of :class:`Result`."""
 
-    def estimate(self, outcome: Outcome) -> Estimate | None:
-        """The column's estimate of an outcome in the metric's unit; None where there is none."""
-        return self.find(outcome) if self.find else outcome.means[self.metric]
+    def estimate(self, result: Result, name: str) -> Estimate | None:
+        """Return the estimate of a contender in the metric's unit; None where there is none."""
+        estimates: Estimates = getattr(result, self.kind)
+        return estimates.get(name, {}).get(self.metric)
 
     def text(self, estimate: Estimate | None) -> str:
-        """The mean in the column's unit, with its interval if it has one."""
+        """Return the mean in the column's unit, with its interval if it has one."""
         return estimate.text(f"z.{self.decimals}f", self.unit) if estimate else NOTHING
 
 
@@ -55,53 +56,50 @@ DRIVES = (
     Column(SPEED, "compute [us/step]", 2),
 )
 _COMPARISON = (
-    Column("rmse_mm", "worst 5 % RMSE [mm]", 3, find=lambda outcome: outcome.cvar5["rmse_mm"]),
-    Column("rmse_mm", f"RMSE less {REFERENCE}'s [mm]", 3, find=lambda outcome: outcome.paired.get("rmse_mm")),
-    Column("rmse_mm", f"better than {REFERENCE} with probability", 3, find=lambda outcome: outcome.improvement),
-    PULL_STEP._replace(
-        heading=f"pull step RMS less {REFERENCE}'s [mm/min]", find=lambda outcome: outcome.paired.get(PULL_STEP.metric)
-    ),
+    RMSE._replace(heading="worst 5 % RMSE [mm]", kind="cvar5"),
+    RMSE._replace(heading=f"RMSE less {REFERENCE}'s [mm]", kind="paired"),
+    RMSE._replace(heading=f"better than {REFERENCE} with probability", kind="improvement"),
+    PULL_STEP._replace(heading=f"pull step RMS less {REFERENCE}'s [mm/min]", kind="paired"),
 )
 _GAPS = (
-    Column("cost", f"optimality gap in cost [% of {REFERENCE}'s]", 3, PERCENT, lambda outcome: outcome.gap),
-    Column("rmse_mm", f"in squared radius error [% of {REFERENCE}'s]", 1, PERCENT, lambda outcome: outcome.gap_radius),
+    Column("cost", f"optimality gap in cost [% of {REFERENCE}'s]", 3, PERCENT, "gaps"),
+    Column("rmse_mm", f"in squared radius error [% of {REFERENCE}'s]", 1, PERCENT, "gaps"),
 )
 
 
-def comparison(scenario: ScenarioResult) -> tuple[Column, ...]:
-    """Columns that compare with the reference on the same crystals, empty without it; gaps where there are some."""
-    if not any(outcome.paired for outcome in scenario.outcomes):
+def comparison(result: Result) -> tuple[Column, ...]:
+    """Return the columns that compare with the reference on the same crystals, with gaps if there are any."""
+    if not result.paired:
         return ()
-    gaps = (gap for gap in _GAPS if any(gap.estimate(outcome) for outcome in scenario.outcomes))
-    return (*_COMPARISON, *gaps)
+    return (*_COMPARISON, *(gap for gap in _GAPS if any(gap.metric in found for found in result.gaps.values())))
 
 
-def label(outcome: Outcome, scenario: ScenarioResult) -> str:
-    """The controller's name, and how many crystals it met if fewer than the scenario has."""
-    met = len(outcome.sample.seeds)
-    return outcome.controller.name + (f" (n = {met})" if met < len(scenario.seeds) else "")
+def label(sample: Sample, result: Result) -> str:
+    """Return the contender's name, and how many crystals it met if fewer than the row has."""
+    met = len(sample.seeds)
+    return sample.name + (f" (n = {met})" if met < len(result.seeds) else "")
 
 
-def rows(scenario: ScenarioResult, columns: Sequence[Column]) -> list[tuple[str, ...]]:
-    """One row a controller: its label, then the columns' texts."""
+def rows(result: Result, columns: Sequence[Column]) -> list[tuple[str, ...]]:
+    """Return one row a contender: its label, then the columns' texts."""
     return [
-        (label(outcome, scenario), *(column.text(column.estimate(outcome)) for column in columns))
-        for outcome in scenario.outcomes
+        (label(sample, result), *(column.text(column.estimate(result, sample.name)) for column in columns))
+        for sample in result.samples
     ]
 
 
 def markdown(heads: Iterable[str], rows: Iterable[Iterable[str]], rule: str = "--:") -> str:
-    """A table in Markdown; ``rule`` is the line under the heads of all columns but the first."""
-    first, *others = heads
-    lines = [f"| {' | '.join(row)} |" for row in ((first, *others), *rows)]
-    return "\n".join([lines[0], "|---|" + f"{rule}|" * len(others), *lines[1:]])
+    """Return a table in Markdown; ``rule`` is the line under the heads of all columns but the first."""
+    grid = [[cell.replace("|", "\\|") for cell in row] for row in (heads, *rows)]
+    lines = [f"| {' | '.join(row)} |" for row in grid]
+    return "\n".join([lines[0], "|---|" + f"{rule}|" * (len(grid[0]) - 1), *lines[1:]])
 
 
 def count(number: int, what: str) -> str:
-    """ "2 scenarios", "1 scenario"."""
+    """Return "2 scenarios", "1 scenario"."""
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def crystals(number: int) -> str:
-    """ "500 crystals", "1 crystal"."""
+    """Return "500 crystals", "1 crystal"."""
     return count(number, "crystal")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from cz_gym.evaluation.results import REFERENCE, SPEED, Benchmark, Outcome, ScenarioResult
+from collections.abc import Sequence
+
+from cz_gym.evaluation.results import REFERENCE, SPEED, Result
 from cz_gym.units import PERCENT
 
 from .tables import RMSE, Column, crystals, label
@@ -16,26 +18,30 @@ COLUMNS = (
     Column("failure_rate", "failures [%]", 1, PERCENT),
     Column(SPEED, "compute [us/step]", 2),
 )
-"""Columns between RMSE and its paired difference, which alone have intervals."""
+"""Columns without intervals, between RMSE and its paired difference."""
+LESS = RMSE._replace(heading=f"RMSE less {REFERENCE}'s [mm]", kind="paired")
 
 
-def terminal(benchmark: Benchmark) -> str:
-    """The short table: RMSE with its interval, then means, and the paired difference of RMSE."""
-    return "\n\n".join([*(_scenario(scenario) for scenario in benchmark.scenarios), headline(benchmark)])
+def terminal(results: Sequence[Result]) -> str:
+    """Return the short table: RMSE with its interval, then means, and the paired difference of RMSE."""
+    return "\n\n".join([*map(_scenario, results), headline(results)])
 
 
-def _scenario(scenario: ScenarioResult) -> str:
-    headings = ["controller", *(column.heading for column in (RMSE, *COLUMNS)), f"RMSE less {REFERENCE}'s [mm]"]
+def _scenario(result: Result) -> str:
+    headings = ["controller", *(column.heading for column in (RMSE, *COLUMNS, LESS))]
     names, units = zip(*(heading.rstrip("]").partition(" [")[::2] for heading in headings), strict=True)
-    grid = [names, units, *((label(outcome, scenario), *_cells(outcome)) for outcome in scenario.outcomes)]
+    grid = [names, units, *((label(sample, result), *_cells(result, sample.name)) for sample in result.samples)]
     widths = [max(map(len, column)) for column in zip(*grid, strict=True)]
-    lines = [f"{scenario.row.name} ({crystals(len(scenario.seeds))})"]
+    row = result.row
+    lines = [
+        f"{row.name} ({crystals(len(result.seeds))}){f', on the default puller: {row.puller}' if row.file else ''}"
+    ]
     for name, *cells in grid:
         padded = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
         lines.append("  ".join([f"  {name:<{widths[0]}}", *padded]).rstrip())
     return "\n".join(lines)
 
 
-def _cells(outcome: Outcome) -> list[str]:
-    means = [column.text(outcome.means[column.metric]._replace(ci95=None)) for column in COLUMNS]
-    return [RMSE.text(RMSE.estimate(outcome)), *means, RMSE.text(outcome.paired.get("rmse_mm"))]
+def _cells(result: Result, name: str) -> list[str]:
+    means = [column.text(result.means[name][column.metric]._replace(ci95=None)) for column in COLUMNS]
+    return [RMSE.text(RMSE.estimate(result, name)), *means, LESS.text(LESS.estimate(result, name))]

@@ -1,47 +1,48 @@
-"""Whether the agents win, in one plain line: the first of the report."""
+"""The verdict, whether the agents win, in one plain line: the first of the report."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from cz_gym.evaluation.results import Benchmark, ScenarioResult, Verdict
+from cz_gym.evaluation.results import Result
 
 FEWEST = 20
 """Crystals that a verdict on a scenario with randomness needs."""
 
 
-def headline(benchmark: Benchmark) -> str:
-    """One line: whether the agents win, and where they do not.
+def headline(results: Sequence[Result]) -> str:
+    """Return one line: whether the agents win, and where they do not.
 
     Scenarios of a single crystal do not count, unless there are no others; nor does an agent that is a bound. A few
     crystals of a random scenario give no verdict.
     """
-    agents = [controller.name for controller in benchmark.controllers if controller.learned and not controller.bound]
+    contenders = [sample.contender for sample in results[0].samples]
+    agents = [each.name for each in contenders if each.learned and not each.bound]
     if not agents:
         return "No learned agent took part in this run."
-    if not benchmark.scenarios[0].verdicts:
+    if results[0].rival is None:
         return "No classical controller took part in this run to compare the agents with."
-    deciding = [scenario for scenario in benchmark.scenarios if len(scenario.seeds) > 1] or list(benchmark.scenarios)
+    deciding = [result for result in results if len(result.seeds) > 1] or list(results)
     if 1 < len(deciding[0].seeds) < FEWEST:
         return f"No verdict: {len(deciding[0].seeds)} crystals, and a verdict needs at least {FEWEST}."
-    winners = [[verdict.agent for verdict in scenario.verdicts if verdict.wins] for scenario in deciding]
-    if always := [agent for agent in agents if all(agent in some for some in winners)]:
+    if always := [agent for agent in agents if all(result.wins(agent) for result in deciding)]:
         first = f"{', '.join(always)} win{'s' if len(always) == 1 else ''} on every scenario."
     else:
-        first = "No agent wins on every scenario." if any(winners) else "No agent wins."
-    return f"{first} {'; '.join(_among(scenario, len(agents)) for scenario in deciding)}."
+        some = any(result.wins(agent) for result in deciding for agent in agents)
+        first = "No agent wins on every scenario." if some else "No agent wins."
+    return f"{first} {'; '.join(_among(result) for result in deciding)}."
 
 
-def _among(scenario: ScenarioResult, agents: int) -> str:
+def _among(result: Result) -> str:
     """Who is better than whom on one scenario, the best classical controller or each agent."""
-    rival, verdicts = scenario.verdicts[0].rival, scenario.verdicts
+    agents, rival = list(result.verdicts), result.rival
 
-    def named(some: Sequence[Verdict]) -> str:
-        return f"all {agents} agents" if len(some) == agents > 1 else ", ".join(each.agent for each in some)
+    def named(some: Sequence[str]) -> str:
+        return f"all {len(agents)} agents" if len(some) == len(agents) > 1 else ", ".join(some)
 
-    won, lost = [each for each in verdicts if each.wins], [each for each in verdicts if each.loses]
-    rest = [each for each in verdicts if not (each.wins or each.loses)]
-    said = [f"{named(won)} better than {rival}"] if won else []
-    said += [f"{rival} better than {named(lost)}"] if lost else []
-    said += [f"no clear difference between {rival} and {named(rest)}"] if rest else []
-    return f"{scenario.row.name}: {', '.join(said)}"
+    won, lost = list(filter(result.wins, agents)), list(filter(result.loses, agents))
+    rest = [agent for agent in agents if agent not in won + lost]
+    parts = [f"{named(won)} better than {rival}"] if won else []
+    parts += [f"{rival} better than {named(lost)}"] if lost else []
+    parts += [f"no clear difference between {rival} and {named(rest)}"] if rest else []
+    return f"{result.row.name}: {', '.join(parts)}"

@@ -1,97 +1,99 @@
 """Figures: who is shown when there are many, colours, and a crystal that nothing disturbs."""
 
 import io
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
+import pytest
 from PIL import Image
 
-import benchmark
 from cz_gym.baselines import OpenLoop
+from cz_gym.baselines.registry import CONTROLLERS
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.protocol import find_row
-from cz_gym.evaluation.report.canvas import COLOURS, DPI, KNOWN, ORDER, chosen, styles, styles_of
+from cz_gym.evaluation.report.canvas import COLOURS, DPI, chosen, styles, styles_of
 from cz_gym.evaluation.report.crystal import COLUMNS
 from cz_gym.evaluation.report.figures import NAMED, draw_figures, named
-from cz_gym.evaluation.report.markdown import QUOTED
-from cz_gym.evaluation.results import Benchmark, Controller, Sample, summarise
+from cz_gym.evaluation.report.markdown import brief
+from cz_gym.evaluation.results import Result, Sample, summarise
 from cz_gym.evaluation.rollout import rollout
-from tests.samples import sample_of
+from tests.samples import contender, sample_of
+
+AGENTS = {"gradient": 0.05, "imitation": 0.07, "ppo": 0.06, "sac": 0.2}
+"""Shipped agents with their RMSE [mm], as on the test crystals."""
 
 
-def sample(
-    name: str, rmse: float, observation: str = "measured", seeds: tuple[int, ...] = (), own: bool = False
-) -> Sample:
+def sample(name: str, rmse: float, **facts: Any) -> Sample:
     values = np.full((1, 1, len(metric_names())), rmse)
-    return Sample(Controller(name, observation, "", seeds, own=own), (7,), values, 0.0, cast(Any, None), 5.0)
+    return Sample(contender(name, **facts), (7,), values, 0.0)
+
+
+def agent(name: str, rmse: float) -> Sample:
+    return sample(name, rmse, training_seeds=(0,))
 
 
 def names(samples: list[Sample]) -> list[str]:
-    return [one.controller.name for one in samples]
+    return [one.name for one in samples]
+
+
+def everyone() -> list[Sample]:
+    """The default table: classical controllers of the registry, and the shipped agents."""
+    default = [each for each in CONTROLLERS if each.default]
+    return [Sample(each, (7,), np.full((1, 1, len(metric_names())), 0.1), 0.0) for each in default] + [
+        agent(*each) for each in AGENTS.items()
+    ]
 
 
 def test_many_controllers_are_chosen_by_a_rule() -> None:
-    many = [sample("bound", 0.1, "state"), sample("paper", 9.0), *(sample(f"c{i}", 1.0 + i) for i in range(6))]
-    many.append(sample("ppo", 99.0, seeds=(0,)))
+    many = [sample("bound", 0.1, observation="state"), sample("paper", 9.0)]
+    many += [*(sample(f"c{i}", 1.0 + i) for i in range(6)), agent("ppo", 99.0)]
     shown = chosen(many, 4)
     assert names(shown) == ["paper", "c0", "c1", "ppo"]
     assert chosen(many[::-1], 4) == shown[::-1]
     assert chosen(many, 99) == many
 
 
-def test_one_s_own_is_shown_beside_the_reference() -> None:
-    many = [sample(name, 1.0, seeds=(0,) * (name in ("gradient", "ppo"))) for name in QUOTED]
-    many.append(sample("mine", 50.0, own=True))
-    assert {"paper", "mine"} < set(names(chosen(many, COLUMNS)))
+def test_the_default_figure_shows_who_is_quoted_and_the_best_agents_and_one_s_own_first() -> None:
+    assert names(chosen(everyone(), COLUMNS)) == ["paper", "paper-tuned", "lqg-at-0.02", "gradient", "ppo"]
+    mine = [*everyone(), sample("mine", 50.0, own=True)]
+    assert {"paper", "mine", "gradient"} < set(names(chosen(mine, COLUMNS)))
 
 
-def test_the_figure_shows_the_controllers_of_readme_s_table() -> None:
-    assert set(KNOWN) == set(QUOTED)
-    many = [sample(each.name, 0.01) for each in benchmark.classical() if each.default]
-    many += [sample(name, 0.001 * len(name), seeds=(0,)) for name in benchmark.SHIPPED]
-    assert names(chosen(many, COLUMNS)) == list(QUOTED)
+def test_the_short_table_has_the_quoted_controllers_and_the_best_agents() -> None:
+    lines = brief([summarise(find_row("nominal"), everyone())]).splitlines()
+    assert [line.split(" | ")[0].strip("| ") for line in lines[2:]] == names(chosen(everyone(), COLUMNS))
 
 
 def test_the_best_classical_controller_of_each_scenario_is_named() -> None:
-    def scenario(best: str) -> Any:
+    def scenario(best: str) -> Result:
         many = [sample(f"c{i}", 1.0) for i in range(NAMED)] + [sample("paper", 3.0), sample("lqg-quiet", 2.0)]
-        many = [*many, sample("ppo", 0.1, seeds=(0,)), sample("bound", 0.1, "state")]
-        means = [0.5 if each.controller.name == best else float(each.values.mean()) for each in many]
-        return SimpleNamespace(
-            outcomes=[
-                SimpleNamespace(sample=each, controller=each.controller, means={"rmse_mm": SimpleNamespace(mean=mean)})
-                for each, mean in zip(many, means, strict=True)
-            ]
-        )
+        many = [*many, agent("ppo", 0.1), sample("bound", 0.1, observation="state")]
+        shown = [sample(best, 0.5) if each.name == best else each for each in many]
+        return summarise(find_row("nominal"), shown)
 
     found = named([scenario("c3"), scenario("lqg-quiet")])
     assert len(found) == len(set(found)) == NAMED
     assert {"paper", "ppo", "c3", "lqg-quiet"} < set(found)
 
 
-def test_a_known_controller_looks_the_same_everywhere_and_no_colour_comes_twice() -> None:
-    assert set(ORDER) == {each.name for each in benchmark.classical() if each.default} | set(benchmark.SHIPPED)
-    alone, others = styles(["lqg-at-0.02"]), (f"c{i}" for i in range(len(COLOURS) - 1 - len(ORDER)))
-    everyone = styles_of([sample(name, 1.0).controller for name in ("mine", *ORDER, *others)])
-    assert everyone["lqg-at-0.02"] == alone["lqg-at-0.02"]
-    assert len({one.colour for one in everyone.values()}) == len(everyone) == len(COLOURS)
-    few = styles(["lqg-at-0.02", *(f"c{i}" for i in range(len(COLOURS) - 1))])
-    assert len({one.colour for one in few.values()}) == len(COLOURS), "colours of those who are absent are free"
+def test_no_two_controllers_look_alike() -> None:
     assert len(COLOURS) >= NAMED
+    known = styles_of(everyone())
+    assert len({one.colour for one in known.values()}) == len(known) == len(everyone())
     many = styles([f"c{i}" for i in range(40)]).values()
     assert len({(one.colour, one.dash) for one in many}) == 40, "on a page every one has a line of its own"
 
 
+@pytest.mark.filterwarnings("error")
 def test_figures_of_a_crystal_that_nothing_disturbs_and_of_a_name_that_seems_a_formula() -> None:
     results = []
     for name in ("nominal", "randomized"):
         row = find_row(name)
         run = rollout(OpenLoop(), make_config(name, horizon=600.0), row.seeds(2))
-        names = ["a $\\frac$ b", *(f"c{i}" for i in range(COLUMNS))]
-        results.append(summarise(row, [sample_of(Controller(name, "measured", "", (1,)), [run]) for name in names]))
-    figures = draw_figures(Benchmark(tuple(results), "", ()))
+        who = ["a $\\frac$ b", *(f"c{i}" for i in range(COLUMNS))]
+        results.append(summarise(row, [sample_of(contender(each, training_seeds=(1,)), [run]) for each in who]))
+    figures = draw_figures(results)
     assert set(figures) == {"crystal.png", "errors.png", "pareto.png"}
     assert all(image.startswith(b"\x89PNG") for image in figures.values())
     inches = Image.open(io.BytesIO(figures["crystal.png"])).width / DPI

@@ -1,31 +1,32 @@
 """The report's first line: whether the agents win, and where they do not."""
 
-from types import SimpleNamespace
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
+from cz_gym.evaluation.protocol import Row
 from cz_gym.evaluation.report import verdict
 from cz_gym.evaluation.report.verdict import headline
-from cz_gym.evaluation.results import Verdict
+from cz_gym.evaluation.results import Result, Sample
 from cz_gym.evaluation.statistics import Estimate
+from tests.samples import contender
 
 BETTER, WORSE, EITHER = Estimate(-1.0, (-2.0, -0.5), 9), Estimate(1.0, (0.5, 2.0), 9), Estimate(0.1, (-1.0, 1.0), 9)
 
 
-def made(**scenarios: Any) -> Any:
-    """A benchmark of agents a, b, ...; each scenario gives their differences, "single" stands for one crystal."""
-    rows = []
+def made(**scenarios: Any) -> list[Result]:
+    """Results of agents a, b, ...; each scenario gives their differences, "single" stands for one crystal."""
+    results = []
     for name, differences in scenarios.items():
-        verdicts = tuple(
-            Verdict(agent, "lqg", difference) for agent, difference in zip("abc", differences, strict=False)
-        )
+        verdicts = dict(zip("abc", differences, strict=False))
         seeds = (0,) if name.startswith("single") else tuple(range(verdict.FEWEST))
-        rows.append(SimpleNamespace(row=SimpleNamespace(name=name), verdicts=verdicts, seeds=seeds))
-    agents = [SimpleNamespace(name=each.agent, learned=True, bound=False) for each in rows[0].verdicts]
-    return SimpleNamespace(
-        controllers=[SimpleNamespace(name="lqg", learned=False, bound=False), *agents], scenarios=rows
-    )
+        who = [contender("lqg"), *(contender(agent, training_seeds=(0,)) for agent in verdicts)]
+        samples = tuple(Sample(each, seeds, np.zeros((1, 1, 1)), 0.0) for each in who)
+        row = Row(name, "randomized", "")
+        results.append(Result(row, samples, {}, {}, {}, {}, {}, "lqg", verdicts))
+    return results
 
 
 def test_agents_and_scenarios_are_compared_in_one_line() -> None:
@@ -55,9 +56,10 @@ def test_a_few_crystals_give_no_verdict(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_without_agents_or_rivals_it_says_so() -> None:
-    nobody = made(one=[])
-    assert headline(nobody) == "No learned agent took part in this run."
-    nobody.controllers.append(SimpleNamespace(name="a", learned=True, bound=True))
-    assert headline(nobody) == "No learned agent took part in this run."
-    nobody.controllers.append(SimpleNamespace(name="b", learned=True, bound=False))
-    assert headline(nobody).startswith("No classical controller took part")
+    (nobody,) = made(one=[])
+    assert headline([nobody]) == "No learned agent took part in this run."
+    seer = replace(nobody.samples[0], contender=contender("a", training_seeds=(0,), privileged=True))
+    assert headline([replace(nobody, samples=(seer,))]) == "No learned agent took part in this run."
+    agent = replace(seer, contender=contender("b", training_seeds=(0,)))
+    alone = replace(nobody, samples=(agent,), rival=None)
+    assert headline([alone]).startswith("No classical controller took part")

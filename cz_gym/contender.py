@@ -1,0 +1,64 @@
+"""Who takes part in a comparison: a controller or an agent by name, and how it is built."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from cz_gym.config import Config
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A controller or an agent that can be asked for by name."""
+
+    name: str
+    make: Callable[[Config], Any]
+    """Builds the policy for an environment's settings; of an agent it returns the one of the first training seed."""
+    observation: str
+    """Observation mode it reads; "state" marks a bound, which no sensor could feed."""
+    meaning: str
+    """Description of one line."""
+    default: bool = True
+    """Whether a benchmark that names no controllers runs it."""
+    privileged: bool = False
+    """Whether it knows what no controller can know, which makes it a bound."""
+    slow: bool = False
+    """Whether it meets only the first few episodes, which are cached, and runs only when slow ones are asked for."""
+    quoted: bool = False
+    """Whether it stands in short tables and small figures, and beside a controller of the user's own."""
+    action: str = "direct"
+    """Meaning of its actions (:func:`cz_gym.task.drives_of`)."""
+    own: bool = False
+    """Whether it comes from the user's own file: figures show it first."""
+    training_seeds: tuple[int, ...] = ()
+    """Training seeds of an agent, empty for a controller."""
+    trained: tuple[Any, ...] = ()
+    """Policies of an agent, one a training seed."""
+
+    @property
+    def learned(self) -> bool:
+        """Whether it was trained."""
+        return bool(self.training_seeds)
+
+    @property
+    def bound(self) -> bool:
+        """Whether it knows or reads what no sensor shows, so that it is a bound on controllers and not one of them."""
+        return self.privileged or self.observation == "state"
+
+    def copies(self) -> Iterator[Contender]:
+        """Yield the contender itself, or one contender of a single training seed for each of an agent's."""
+        if not self.trained:
+            yield self
+        for seed, policy in zip(self.training_seeds, self.trained, strict=bool(self.trained)):
+            yield replace(self, make=lambda config, policy=policy: policy, training_seeds=(seed,), trained=(policy,))
+
+    def facts(self) -> dict[str, Any]:
+        """What ``benchmark.json`` says of it."""
+        known = ("name", "observation", "meaning", "training_seeds", "privileged", "slow", "action", "own")
+        return {name: getattr(self, name) for name in known}
+
+    def contracts(self) -> list[dict[str, Any]]:
+        """The contracts of an agent's files."""
+        return [asdict(policy.contract) for policy in self.trained]
