@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 from cz_gym.config import Config
@@ -52,7 +53,7 @@ class Contender:
         if not self.trained:
             yield self
         for seed, policy in zip(self.training_seeds, self.trained, strict=bool(self.trained)):
-            yield replace(self, make=lambda config, policy=policy: policy, training_seeds=(seed,), trained=(policy,))
+            yield replace(self, make=partial(_given, policy), training_seeds=(seed,), trained=(policy,))
 
     def facts(self) -> dict[str, Any]:
         """What ``benchmark.json`` says of it."""
@@ -62,3 +63,7 @@ class Contender:
     def contracts(self) -> list[dict[str, Any]]:
         """The contracts of an agent's files."""
         return [asdict(policy.contract) for policy in self.trained]
+
+
+def _given(policy: Any, config: Config) -> Any:
+    return policy

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import socket
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -19,7 +21,7 @@ from typing import Any
 
 import cz_gym
 from cz_gym.errors import CzError
-from cz_gym.hashing import hash_files
+from cz_gym.jit.code_hash import hash_files
 from cz_gym.processors import processors
 
 from .user_code import PREFIX
@@ -45,7 +47,7 @@ def connect(address: str) -> None:
         raise CzError('ray is missing: pip install ".[ray]"') from None
     if not ray.is_initialized():
         try:
-            ray.init(address=address or None, log_to_driver=False, logging_level="ERROR")
+            ray.init(address=address or None, log_to_driver=False, logging_level=logging.ERROR)
         except (ConnectionError, ValueError, RuntimeError, OSError) as error:
             raise CzError(f"no Ray cluster at {address or 'this machine'}: {error}") from None
 
@@ -65,6 +67,24 @@ def _same_sources(ours: tuple[str, str, str], function: Callable[[Any], Any], ta
         node, told = socket.gethostname(), " ".join(theirs)
         raise CzError(f"node {node} has cz_gym {told}, this machine {' '.join(ours)}: install the same")
     return function(task)
+
+
+def check_shared(folder: Path) -> None:
+    """Raise CzError for a node that does not see what is written into a folder here."""
+    with tempfile.NamedTemporaryFile(dir=folder) as file:
+        for node, sees in _who_sees(file.name):
+            if not sees:
+                raise CzError(f"node {node} does not see {folder}: it must be on a file system that all nodes share")
+
+
+def _who_sees(file: str) -> Iterator[tuple[str, bool]]:
+    """Address of every node, and whether it sees a file."""
+    import ray
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy as On
+
+    for node in (node for node in ray.nodes() if node["Alive"]):
+        there = ray.remote(os.path.exists).options(num_cpus=0, scheduling_strategy=On(node["NodeID"], soft=False))
+        yield node["NodeManagerAddress"], ray.get(there.remote(file))
 
 
 def completed(

@@ -135,11 +135,11 @@ def summarise(row: Row, samples: Sequence[Sample], earlier_bound: Sample | None 
             sample.name: {name: cvar(sample.metric(name), resamples(len(sample.seeds))) for name in TAIL_METRICS}
             for sample in samples
         },
-        {sample.name: _paired(*common(sample, named[REFERENCE]), resamples) for sample in against},
-        {sample.name: _improvement(*common(sample, named[REFERENCE]), resamples) for sample in against},
+        {sample.name: _paired(resamples, *common(sample, named[REFERENCE])) for sample in against},
+        {sample.name: _improvement(resamples, *common(sample, named[REFERENCE])) for sample in against},
         {}
         if reference is None or bound is None
-        else {sample.name: _gaps(*common(sample, reference, bound), resamples) for sample in samples},
+        else {sample.name: _gaps(resamples, *common(sample, reference, bound)) for sample in samples},
         *_verdicts(samples, resamples),
         earlier_bound,
     )
@@ -159,21 +159,21 @@ def _means(sample: Sample, resamples: Draw) -> dict[str, Estimate]:
     return {**found, SPEED: Estimate(sample.microseconds, None, len(sample.seeds))}
 
 
-def _paired(ours: Sample, theirs: Sample, resamples: Draw) -> dict[str, Estimate]:
+def _paired(resamples: Draw, ours: Sample, theirs: Sample) -> dict[str, Estimate]:
     found = differences(ours.values, theirs.values, resamples(len(ours.seeds)))
     return dict(zip(metric_names(), found, strict=True))
 
 
-def _improvement(ours: Sample, theirs: Sample, resamples: Draw) -> dict[str, Estimate]:
+def _improvement(resamples: Draw, ours: Sample, theirs: Sample) -> dict[str, Estimate]:
     errors = ours.metric("rmse_mm"), theirs.metric("rmse_mm")
     return {"rmse_mm": probability_of_improvement(*errors, resamples(len(ours.seeds)))}
 
 
-def _gaps(ours: Sample, theirs: Sample, bound: Sample, resamples: Draw) -> dict[str, Estimate]:
+def _gaps(resamples: Draw, ours: Sample, theirs: Sample, bound: Sample) -> dict[str, Estimate]:
     found = {}
     for metric, power in (("cost", 1), ("rmse_mm", 2)):
-        losses = [one.metric(metric) ** power for one in (ours, theirs, bound)]
-        if gap := optimality_gap(*losses, resamples(len(ours.seeds))):
+        one, reference, best = (sample.metric(metric) ** power for sample in (ours, theirs, bound))
+        if gap := optimality_gap(one, reference, best, resamples(len(ours.seeds))):
             found[metric] = gap
     return found
 

@@ -25,7 +25,7 @@ import llvmlite
 import numba
 import numpy as np
 
-from cz_gym.hashing import hash_files
+from .code_hash import hash_files
 
 PACKAGE = Path(__file__).parents[1]
 CACHE_VARIABLE = "CZ_GYM_CACHE_DIR"

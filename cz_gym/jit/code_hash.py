@@ -1,4 +1,4 @@
-"""A hash of what functions compute, whatever their formatting and comments."""
+"""Hashes of code: of what functions compute, and of what files say, whatever their formatting and comments."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import hashlib
 import inspect
 import json
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
@@ -28,6 +29,20 @@ def function_hash(*functions: Callable[..., Any]) -> str:
     seen: dict[int, int] = {}
     content = [_value(function, seen) for function in functions]
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
+
+
+def hash_files(files: Iterable[Path], root: Path, code_only: bool = False) -> str:
+    """SHA-256 of the files' names below ``root`` and of their contents (32 hex digits).
+
+    With ``code_only`` a Python file counts as its syntax tree without docstrings: an edit of text changes nothing.
+    """
+    digest = hashlib.sha256()
+    for file in files:
+        content = file.read_bytes()
+        if code_only and file.suffix == ".py":
+            content = json.dumps(_tree(ast.parse(content))).encode()
+        digest.update(file.relative_to(root).as_posix().encode() + b"\0" + content + b"\0")
+    return digest.hexdigest()[:32]
 
 
 def _value(value: Any, seen: dict[int, int]) -> Any:

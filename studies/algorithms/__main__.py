@@ -62,7 +62,7 @@ def _main(given: argparse.Namespace) -> None:
     check_writable(out)
     perform: Perform = partial(cluster.in_processes, processes=given.jobs)
     if given.ray is not None:
-        cluster.connect(given.ray, "studies")
+        cluster.connect(given.ray)
         work.mkdir(parents=True, exist_ok=True)
         cluster.check_shared(work)
         perform = cluster.completed

@@ -33,11 +33,7 @@ PLACES = {"camera": "ring", "v_p": "pull speed"}
 def form_of(name: str) -> LinearForm:
     """The linear form of a shipped controller, or of ``FILE.py:NAME``; ValueError says in one line why it has none."""
     config = make_config("nominal")
-    if ":" in name:
-        (policy,) = user_code.controller(name).make(config)
-    else:
-        policy = make_controller(name, config)
-    return linear_form(policy)
+    return linear_form(user_code.controller(name).make(config) if ":" in name else make_controller(name, config))
 
 
 def margins(form: LinearForm, puller: Puller, at: str) -> tuple[Any, LoopMargins]:

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cz_gym.evaluation.report.page_signals import OWN, PANELS, SHARED
 
 from cz_gym.evaluation.report.page import page
-from cz_gym.evaluation.report.page_signals import OWN, PANELS, SHARED
 from cz_gym.evaluation.results import Benchmark
 from tests.samples import scenario_of
 

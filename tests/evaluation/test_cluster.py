@@ -18,7 +18,6 @@ from cz_gym.errors import CzError
 from cz_gym.evaluation import cluster, runner
 from cz_gym.evaluation.protocol import Row, find_row
 from cz_gym.evaluation.results import Result
-from tests.processes import python
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 
@@ -114,22 +113,3 @@ def test_processes_bring_results_and_end_alone() -> None:
     finally:
         own.kill()
         own.join()
-
-
-def test_processes_end_with_a_caller_that_is_killed() -> None:
-    code = (
-        "import os, signal, time; from cz_gym.evaluation.cluster import in_processes\n"
-        "from tests.evaluation.test_cluster import number_and_process\n"
-        "if __name__ == '__main__':\n"
-        "    (_, (_, worker)), *_ = [next(in_processes(number_and_process, [1], processes=1))]\n"
-        "    print(worker)"
-    )
-    worker = int(python("-c", code))
-    end = time.monotonic() + 60.0
-    while time.monotonic() < end:
-        try:
-            os.kill(worker, 0)
-        except ProcessLookupError:
-            return
-        time.sleep(0.1)
-    pytest.fail("the worker outlived its caller")

@@ -9,7 +9,7 @@ import pytest
 
 from cz_gym import HURLE, MeniscusModel, config
 from cz_gym.config import make_config
-from cz_gym.jit.code_hash import function_hash
+from cz_gym.jit.code_hash import function_hash, hash_files
 from cz_gym.jit.compile import jittable
 from cz_gym.physics import plant
 
@@ -96,3 +96,13 @@ def test_two_menisci_of_one_factory_are_two_plants() -> None:
     assert make_config(meniscus=HURLE._replace(name="another name")).plant_hash == make_config().plant_hash
     lambdas = [HURLE._replace(height=f) for f in (lambda r, t, a: 1.0 * a, lambda r, t, a: 1.1 * a)]
     assert function_hash(*lambdas[0].functions) != function_hash(*lambdas[1].functions)
+
+
+def test_of_files_code_counts_and_text_does_not(tmp_path: Path) -> None:
+    module, hashes = tmp_path / "thing.py", []
+    for text in ('"""A."""\nx = 1\n"""B."""\n', '"""C."""\n# why\nx = (\n    1\n)\n', "x = 2\n"):
+        module.write_text(text)
+        hashes.append([hash_files([module], tmp_path, code_only) for code_only in (True, False)])
+    assert hashes[0][0] == hashes[1][0] != hashes[2][0]
+    assert len({each for _, each in hashes}) == 3
+    assert hash_files([module], tmp_path) != hash_files([module.rename(tmp_path / "other.py")], tmp_path)

@@ -127,7 +127,8 @@ def _points(values: Floats, step: int) -> npt.NDArray[np.float32]:
     """Means of so many steps each, up to the first that is no number: a crystal that broke the equations."""
     steps = int(np.isfinite(values).cumprod().sum())
     blocks = values[: steps // step * step].reshape(-1, step)
-    return blocks.mean(axis=1).astype(np.float32)
+    points: npt.NDArray[np.float32] = blocks.mean(axis=1).astype(np.float32)
+    return points
 
 
 def _name(sample: Sample) -> str:

@@ -174,7 +174,7 @@ def test_impossible_arguments_exit_with_2(arguments: list[str], message: str, re
 
 
 def test_a_node_that_does_not_see_the_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "_answers", lambda *question: [("10.0.0.1", True), ("10.0.0.2", False)])
+    monkeypatch.setattr(cluster, "_who_sees", lambda file: [("10.0.0.1", True), ("10.0.0.2", False)])
     with pytest.raises(ValueError, match=r"^node 10\.0\.0\.2 does not see .*: it must be on a file system that all"):
         cluster.check_shared(tmp_path)
 
