@@ -254,7 +254,12 @@ def main(argv: list[str] | None = None) -> int:
 def _convert(given: argparse.Namespace) -> None:
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-    algorithm: Any = pkgutil.resolve_name(ALGORITHMS[given.algo].replace(".", ":"))
+    try:
+        algorithm: Any = pkgutil.resolve_name(ALGORITHMS[given.algo].replace(".", ":"))
+    except ModuleNotFoundError as error:
+        if error.name != "sb3_contrib":
+            raise
+        raise AgentFileError(f"{given.algo} is missing: pip install sb3-contrib") from None
     model = _read(given.model, f"a model of {given.algo}", lambda: algorithm.load(given.model, device="cpu"))
     config = make_config(given.scenario, None, given.observation, given.control_interval, action=given.action)
     _check_spaces(model, config)

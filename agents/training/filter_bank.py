@@ -107,7 +107,7 @@ class FilterBank(nn.Module):
     mean: torch.Tensor
     per_std: torch.Tensor
 
-    def __init__(self, control_interval: float, hidden: tuple[int, ...], scheduled: bool = True) -> None:
+    def __init__(self, control_interval: float, hidden: tuple[int, ...]) -> None:
         super().__init__()
         keep, gain, features = _filters(control_interval)
         self._constant("keep", keep)
@@ -131,8 +131,7 @@ class FilterBank(nn.Module):
         self.register_buffer("mean", torch.zeros(width))
         self.register_buffer("per_std", torch.ones(width))
         self.layers = tanh_layers([width, *hidden])
-        self.scheduled = scheduled
-        schedules = scheduled * (5 + len(BEGUN) + len(SWINGS))
+        schedules = 5 + len(BEGUN) + len(SWINGS)
         self.linear = nn.Linear(width, len(GAINS) * (1 + schedules))
         self._constant("ones", np.tile(np.eye(1, 1 + schedules), len(GAINS)))
         self._constant("spread", np.tile(np.eye(1 + schedules)[1:], len(GAINS)))
@@ -186,8 +185,7 @@ class FilterBank(nn.Module):
         """The action, shape (..., 2), not yet clamped to its box, from features of shape (..., width)."""
         x = self.normalised(features)
         lines = apply(x, self.linear)
-        if self.scheduled:
-            lines = lines * (self._schedule(x, features) @ self.spread + self.ones)
+        lines = lines * (self._schedule(x, features) @ self.spread + self.ones)
         action = lines @ self.gather
         if self.bent is not None:
             action = action + apply(apply(x, self.layers), self.bent) * self.gains
@@ -243,7 +241,7 @@ class FilterBank(nn.Module):
         return graph, graph.finished(len(MEASURED), state=STATE)
 
 
-def read_bank(start: str, seed: int, config: Config, hidden: tuple[int, ...], scheduled: bool = True) -> FilterBank:
+def read_bank(start: str, seed: int, config: Config, hidden: tuple[int, ...]) -> FilterBank:
     """The network of an agent that training continues from: a file, a folder of runs, or a shipped name and this seed.
 
     AgentFileError for an agent of another recipe, action or control interval.
@@ -254,7 +252,7 @@ def read_bank(start: str, seed: int, config: Config, hidden: tuple[int, ...], sc
     elif not path.suffix:
         path = MODELS / f"{start}-seed{seed}.onnx"
     contract, content = read_agent(path)
-    bank = FilterBank(config.control_interval, hidden, scheduled)
+    bank = FilterBank(config.control_interval, hidden)
     if (contract.control_interval, contract.action) != (config.control_interval, config.action):
         raise AgentFileError(f"{path}: not an agent of the recipe gradient")
     try:

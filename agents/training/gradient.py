@@ -92,9 +92,9 @@ class GradientLearner:
         self.total = math.ceil(recipe.steps / self.per_update) * self.per_update
         self.steps = done
         if recipe.start and not done:
-            self.network = read_bank(recipe.start, seed, config, recipe.hidden, recipe.scheduled)
+            self.network = read_bank(recipe.start, seed, config, recipe.hidden)
         else:
-            self.network = FilterBank(config.control_interval, recipe.hidden, recipe.scheduled)
+            self.network = FilterBank(config.control_interval, recipe.hidden)
         width = len(self.network.mean)
         self.whitened: list[tuple[nn.Linear, _OfWhitened]] = []
         for layer in (self.network.linear, *self.network.layers):

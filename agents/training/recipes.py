@@ -112,8 +112,6 @@ class Gradient(Recipe):
     """Agent of such a recipe that training continues from: a file, a folder of ``train.py --seeds``, or a shipped name,
     of which each training seed takes its own; "": none, random initial weights."""
     hidden: tuple[int, ...] = (64,)
-    scheduled: bool = True
-    """Whether the linear map depends on noise, swings, the reference and the crystal's age."""
     whitened: bool = False
     """Whether, after a warm-up, the learned weights are those of whitened features."""
     imputes_failed_readings: bool = False

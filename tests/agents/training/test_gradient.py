@@ -1,6 +1,8 @@
 """Learning from the gradient: it is the cost's own, the exported memory is the trained one, and it learns."""
 
+import shutil
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -225,14 +227,20 @@ def test_the_noise_of_camera_and_pyrometer_is_estimated(deviation: float) -> Non
     assert 0.0 < float(features[:, -5:-2].min()) < float(features[:, -5:-2].max()) < 1.0
 
 
-def test_a_specialist_goes_on_from_the_shipped_agent_of_its_seed() -> None:
-    """And keeps its standardisation; a run that is resumed has its own weights; what is no such agent is refused."""
+def test_a_specialist_continues_from_the_agent_of_its_seed(tmp_path: Path) -> None:
+    """Shipped, or in a folder of runs. It keeps the standardisation; a resumed run has weights of its own; any other
+    agent is refused."""
     specialist: Any = RECIPES["gradient-specialist"]
     few = replace(specialist, num_envs=4, window=20, steps=4 * 20, whitened=False)
     shipped = agents.shipped_seeds("gradient")
     for seed in (0, 3):
         learner = GradientLearner(few, seed, few.config, Logger(None, []), 0)
         assert learner.exported() == shipped[seed].read_bytes()
+    (tmp_path / "seed3").mkdir()
+    for file in (shipped[3], shipped[3].with_suffix(".json")):
+        shutil.copy(file, tmp_path / "seed3" / f"agent{file.suffix}")
+    learner = GradientLearner(replace(few, start=str(tmp_path)), 3, few.config, Logger(None, []), 0)
+    assert learner.exported() == shipped[3].read_bytes()
     mean = learner.network.mean.clone()
     learner.learn(lambda steps, doing: None)
     assert learner.exported() != shipped[3].read_bytes()
