@@ -82,7 +82,7 @@ def make_jobs(variants: Sequence[Variant], seeds: int, work: Path) -> list[Job]:
 
 
 def compare(comparison: Comparison, jobs: Sequence[Job], out: Path, perform: Perform) -> None:
-    """Train and evaluate the jobs; the table and figure are written after each."""
+    """Train and evaluate the jobs; table and figure are written after each."""
     from .report import report
     from .results import train_and_evaluate
 

@@ -1,4 +1,4 @@
-"""The table of a comparison, means and paired differences with 95 % intervals, and its figure."""
+"""The table of a comparison, means and paired differences with 95 % intervals, and the learning curves."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.ticker import FixedLocator, NullLocator
 
 from cz_gym.agents.training import validation
 from cz_gym.agents.training.validation import REFERENCES
-from cz_gym.evaluation.report.canvas import COLOURS, INK, canvas, png, styles
+from cz_gym.evaluation.report.canvas import INK, canvas, png, styles
 from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.statistics import Estimate, Resamples, means
 
@@ -28,8 +27,6 @@ COLUMNS = (
     ("lost [%]", PERCENT, ".1f"),
 )
 """Heading, unit and format of each of FIGURES."""
-PANELS = (("RMSE of the radius [µm]", 1.0), ("cost of a step [-]", 0.01), ("pull step RMS [µm/min]", 1.0))
-"""Axes of the forest plot, for the first figures; and half width of each axis' linear middle, in the figure's unit."""
 AXES = (("steps", 1e6, "environment steps [million]"), ("seconds", 60.0, "minutes on a core, validation included"))
 """What learning curves are drawn against: column of a run's progress, unit, axis."""
 ABOUT = """Agents are evaluated on {crystals} validation crystals of `{scenario}` that did not choose a run's agent, and
@@ -52,13 +49,12 @@ class Line(NamedTuple):
 
 
 def report(comparison: Comparison, results: Results) -> dict[str, bytes]:
-    """``table.md`` and the comparison's figure, by file name."""
+    """``table.md`` and ``curves.png``, by file name."""
     lines = tabulate(comparison, results)
     about = ABOUT.format(crystals=len(validation.JUDGING), scenario=SCENARIO, transfer=TRANSFER)
     meanings = (f"- **{each.name}**: {each.meaning}" for each in comparison.variants if each.name in results)
     text = "\n".join([f"# {comparison.title}", "", about, "", to_markdown(lines), "", *meanings, ""])
-    draw = {"curves": curves, "forest": forest}[comparison.figure]
-    return {"table.md": text.encode(), f"{comparison.figure}.png": draw(lines)}
+    return {"table.md": text.encode(), "curves.png": curves(lines)}
 
 
 def tabulate(comparison: Comparison, results: Results) -> list[Line]:
@@ -90,30 +86,6 @@ def to_markdown(lines: list[Line]) -> str:
             )
             rows.append((f"less {line.base}", "", *apart, "", ""))
     return markdown(("", "seeds", *(head for head, *_ in COLUMNS), "million steps", "minutes"), rows)
-
-
-def forest(lines: list[Line]) -> bytes:
-    """Each variant's paired differences to its base with their intervals, as PNG; left is better."""
-    drawn = [line for line in lines if line.differences]
-    figure = canvas(9.4, 0.3 * len(drawn) + 1.5)
-    axes = figure.subplots(1, len(PANELS), sharey=True, squeeze=False)[0]
-    for number, (axis, (title, middle)) in enumerate(zip(axes, PANELS, strict=True)):
-        unit = COLUMNS[number][1]
-        axis.axvline(0.0, color=INK, lw=0.8)
-        for place, line in enumerate(drawn):
-            difference = line.differences[number]
-            axis.plot([end / unit for end in difference.ends], [place] * 2, color=COLOURS[1], lw=1.3)
-            axis.plot([difference.mean / unit], [place], marker="o", color=COLOURS[1], ms=5)
-        axis.set_xscale("symlog", linthresh=middle)
-        axis.xaxis.set_major_locator(FixedLocator([0.0, *(s * middle * 10.0**k for s in (-1, 1) for k in (0, 2, 4))]))
-        axis.xaxis.set_minor_locator(NullLocator())
-        axis.xaxis.set_major_formatter(lambda value, position: f"{value:g}")
-        axis.set(xlabel=title, ylim=(len(drawn) - 0.4, -0.6))
-    axes[0].set_yticks(range(len(drawn)), [f"{line.name} less {line.base} ({len(line.runs)})" for line in drawn])
-    figure.suptitle(
-        "Less than zero is better: differences on the same crystals (training seeds), 95 % intervals", fontsize=11
-    )
-    return png(figure)
 
 
 def curves(lines: list[Line]) -> bytes:

@@ -38,8 +38,6 @@ class Comparison(NamedTuple):
 
     title: str
     variants: tuple[Variant, ...]
-    figure: str
-    """What is drawn: "curves" (validation error while learning) or "forest" (differences to the base)."""
 
     def chosen(self, names: str | None) -> list[Variant]:
         """The rows of those names, joined by commas; all rows for None. CzError names the rows there are."""
@@ -88,8 +86,6 @@ ABLATION = (
     _ppo("linear", "no hidden layers", hidden=()),
 )
 COMPARISONS = {
-    "algorithms": Comparison(
-        "Algorithms side by side: the recipes of train.py on the same crystals", ALGORITHMS, "curves"
-    ),
-    "ablation": Comparison("What helps ppo: one change at a time, after 1.5 million steps", ABLATION, "forest"),
+    "algorithms": Comparison("Algorithms side by side: the recipes of train.py on the same crystals", ALGORITHMS),
+    "ablation": Comparison("What helps ppo: one change at a time, after 1.5 million steps", ABLATION),
 }

@@ -122,7 +122,6 @@ def study(agent: Path, episodes: int) -> dict[str, bytes]:
         "responses.png": figures.response_figure(answers),
         "jumps.png": figures.jump_figure(jumps),
         "ripple.png": figures.ripple_figure(ripples),
-        "loop.png": figures.loop_figure(systems),
         "insight.md": text.encode(),
     }
 

@@ -1,4 +1,4 @@
-"""Figures of an agent beside other controllers: answers to events, jumps and ripples, and the loop's gains."""
+"""Figures of an agent beside other controllers: answers to events, jumps and ripples."""
 
 from __future__ import annotations
 
@@ -7,34 +7,27 @@ from typing import Any
 
 import numpy as np
 
-from cz_gym.baselines.analysis import frequency
-from cz_gym.evaluation.report.canvas import GREY, INK, canvas, png, styles
+from cz_gym.evaluation.report.canvas import GREY, canvas, png, styles
 from cz_gym.evaluation.rollout import Floats, Signals
-from cz_gym.physics.linearisation import StateSpace, radius_model
-from cz_gym.physics.plant import make_puller
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
-from .step_tests import BEGIN, JUMPS, MIX, RIPPLE, SPANS, StepTest, control_interval
+from .step_tests import BEGIN, JUMPS, RIPPLE, SPANS, StepTest, control_interval
 
 _LINES = ("solid", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (2, 1.2)))
 
 
 def looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     """How each controller's line is drawn; the first, the agent, is the boldest."""
-    agent, *_ = names
-    colours = {name: style.colour for name, style in styles(names).items()}
     return {
-        # The agent without noise has the agent's colour.
-        name: {"color": colours[agent if name.startswith(f"{agent} ") else name], "lw": 1.3 if i else 2.0,
-               "ls": _LINES[i % len(_LINES)], "zorder": 3 - 0.1 * i, "label": name}
-        for i, name in enumerate(names)
+        name: {"color": style.colour, "lw": 1.3 if i else 2.0, "ls": _LINES[i % len(_LINES)], "zorder": 3 - 0.1 * i,
+               "label": name}
+        for i, (name, style) in enumerate(styles(names).items())
     }  # fmt: skip
 
 
 def _finished(figure: Any, title: str) -> bytes:
     """The figure as PNG, with a title and one legend, that of its first panel."""
     handles, names = figure.axes[0].get_legend_handles_labels()
-    names = [name.replace(" at rest", " at rest (no noise)") for name in names]
     figure.legend(handles, names, loc="outside lower center", ncols=len(names), frameon=False, fontsize=9)
     figure.suptitle(title, fontsize=11)
     return png(figure)
@@ -86,26 +79,3 @@ def ripple_figure(ripples: Mapping[str, Floats]) -> bytes:
         axis.plot(minutes, ripples[name] * MM / MM_PER_MIN, marker="o", ms=3.5, **look)
     axis.set(xlabel="time since the crystal began [min]", ylabel="pull speed moved [mm/min per mm]", ylim=(0.0, None))
     return _finished(figure, f"How strongly a ripple of {RIPPLE / MM:g} mm is answered")
-
-
-def loop_figure(systems: Mapping[str, StateSpace]) -> bytes:
-    """Loop gain at the pull speed, and the sensitivity at the camera, small signals under the usual noise."""
-    figure = canvas(9.6, 4.2)
-    gain, sensitivity = figure.subplots(1, 2)
-    dt, puller = control_interval(), make_puller(lam=MIX)
-    omega, zero = frequency.frequencies(dt, 400), radius_model(puller).zero
-    for name, look in looks(tuple(systems)).items():
-        pull, camera = (
-            frequency.response(frequency.opened(systems[name], puller, dt, at), dt, omega) for at in ("v_p", "camera")
-        )
-        gain.loglog(omega, np.abs(pull), **look)
-        sensitivity.loglog(omega, 1.0 / np.abs(1.0 + camera), **look)
-    titles = ("loop gain, opened at the pull speed", "sensitivity |1/(1 + L)|, opened at the camera")
-    for axis, title in zip((gain, sensitivity), titles, strict=True):
-        axis.axhline(1.0, color=GREY, lw=0.8)
-        axis.axvline(zero, color=GREY, lw=0.8, ls=":")
-        axis.set_title(title, fontsize=9.5)
-        axis.set_xlabel("angular frequency [rad/s]")
-    gain.annotate("right-half-plane zero", (zero, gain.get_ylim()[1]), (-3, -4), textcoords="offset points",
-                  rotation=90, ha="right", va="top", fontsize=8, color=INK)  # fmt: skip
-    return _finished(figure, "The loop from pull speed to ring and back, small signals under the usual noise")

@@ -147,7 +147,6 @@ def test_tables_and_figures_show_what_was_measured(tuned: insight.Contender) -> 
         figures.response_figure(answers),
         figures.jump_figure(jumps),
         figures.ripple_figure(ripples),
-        figures.loop_figure({"one": tuned.systems[""]}),
     ):
         assert picture.startswith(b"\x89PNG")
 
