@@ -29,8 +29,9 @@ from .env import Copyable, CzEnv, EnvState, action_space, check_options, check_s
 from .signals import INFO, LEAN
 
 _CLIPPED = INFO.index("action_clipped")
-_ROWS = {everything: [(n, f"_{n}", INFO.index(n)) for n in (INFO if everything else LEAN)] for everything in (0, 1)}
-"""Entries of ``info``, their masks and their rows, for lean and for all of it."""
+_LEAN_ROWS = tuple(map(INFO.index, LEAN))
+_KEYS = {everything: (n, tuple(f"_{name}" for name in n)) for everything, n in ((False, LEAN), (True, INFO))}
+"""Entries of ``info`` and of their masks, for lean and for all of it."""
 Array = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
 
@@ -294,9 +295,10 @@ class CzVectorEnv(Copyable, VectorEnv[Array, Array, Array]):
         mask = self._everybody.copy() if mask is None else mask
         rows: Any = out.info[:, : self.num_envs]
         clipped = (rows[_CLIPPED] > 0.0) & mask
-        infos: dict[str, Any] = {}
-        for name, key, row in _ROWS[self._everything]:
-            infos[name], infos[key] = rows[row] if whole else np.where(mask, rows[row], 0.0), mask
+        names, masks = _KEYS[self._everything]
+        shown = rows if self._everything else [rows[row] for row in _LEAN_ROWS]
+        infos: dict[str, Any] = dict.fromkeys(masks, mask)
+        infos.update(zip(names, shown if whole else np.where(mask, shown, 0.0), strict=True))
         if self._everything or clipped.any():
             infos["action_clipped"], infos["_action_clipped"] = clipped, mask if self._everything else clipped.copy()
         if self.config.observation == "history":
