@@ -11,6 +11,7 @@ from gymnasium.error import InvalidAction
 from cz_gym import CzVectorEnv, agents
 from cz_gym.agents.agent_file.contract import read_agent
 from cz_gym.config import make_config
+from cz_gym.evaluation.rollout import rollout
 from cz_gym.physics.parameters import Parameters
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 
@@ -96,6 +97,8 @@ def test_an_environment_refuses_an_agent_that_is_not_made_for_it() -> None:
             env.step(agent.predict(observation)[0])
         with pytest.raises(InvalidAction, match="made for action='smooth'"):
             envs.step(agent.predict(many)[0])
+        with pytest.raises(ValueError, match="made for action='smooth'"):
+            rollout(agent, make_config(**{**agent.settings, **other}), [1])
         env.step(np.asarray(agent.predict(observation)[0]))
         env.step(np.clip(2.0 * agent.predict(observation)[0], -1.0, 1.0).astype(np.float32))
     with pytest.raises(ValueError, match=r"expected 72 channels \(history\), got shape \(11,\): gym.make"):
