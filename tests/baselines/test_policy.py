@@ -118,6 +118,8 @@ def test_another_environment_refuses_a_controller_unless_it_is_for_any(policy, o
     observation, _ = env.reset(seed=0)
     with pytest.raises(InvalidAction, match="made for"):
         env.step(policy.predict(observation)[0])
+    with pytest.raises(CzError, match="made for"):
+        rollout(policy, make_config("nominal", horizon=60.0, **{option: OTHER[option]}), [0])
     own = policy.for_config(make_config(**{option: OTHER[option]}))
     assert own.settings[option] == OTHER[option]
     anywhere = replace(policy, any_environment=True)
