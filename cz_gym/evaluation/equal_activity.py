@@ -1,4 +1,4 @@
-"""What error would the reference family have at this pull activity?
+"""Radius error at equal pull activity: how a controller compares with a family of references as active as itself.
 
 A controller that moves the pull speed more can hold the radius better, so two radius errors are comparable only at
 equal activity, the RMS of the pull step. A *reference family* is one controller tuned for several activities; its
@@ -26,7 +26,7 @@ Point = tuple[float, float]
 
 
 class Frontier(NamedTuple):
-    """Radius error against pull activity, from the quietest member to the most active one."""
+    """A family's radius error against its pull activity, from the quietest member to the most active one."""
 
     activity: Floats
     """Pull step RMS [mm/min], increasing, shape (members,)."""
@@ -34,10 +34,10 @@ class Frontier(NamedTuple):
     """Radius error [mm], decreasing, shape (members,)."""
 
     def at(self, activity: float) -> float:
-        """The family's radius error [mm] at that pull step RMS [mm/min].
+        """Return the family's radius error [mm] at a pull step RMS [mm/min].
 
         Above the most active member it is that member's error, since nobody has to use all the activity allowed.
-        Raises ValueError below the quietest member, where the family gives no answer.
+        Raises CzError below the quietest member, where the family gives no answer.
         """
         if not activity >= self.activity[0]:
             raise CzError(f"a pull step RMS of {activity} mm/min is below the frontier's {self.activity[0]:.4g}")
@@ -48,9 +48,9 @@ class Frontier(NamedTuple):
 
 
 def frontier(points: Sequence[Point]) -> Frontier:
-    """The frontier of these points; a point is left out if another has less activity and less error.
+    """Return the frontier of these points; a point is left out if another has less activity and less error.
 
-    Raises ValueError for numbers that are not positive, and if fewer than two points are left.
+    Raises CzError for numbers that are not positive, and if fewer than two points are left.
     """
     kept: list[Point] = []
     for activity, rmse in sorted(points):
@@ -68,10 +68,10 @@ def frontier(points: Sequence[Point]) -> Frontier:
 
 
 def ratios(points: Mapping[str, Point], family: Sequence[str]) -> dict[str, float]:
-    """Each controller's radius error over the family's at the same activity [-]; below 1 it beats the family.
+    """Return each controller's radius error over the family's at the same activity [-]; below 1 it beats the family.
 
     ``family`` names the members; names that ``points`` lacks are passed over. Controllers quieter than every member
-    are left out. Raises ValueError if too few members are there.
+    are left out. Raises CzError if too few members are there.
     """
     curve = frontier([points[name] for name in family if name in points])
     return {
@@ -80,10 +80,10 @@ def ratios(points: Mapping[str, Point], family: Sequence[str]) -> dict[str, floa
 
 
 def intervals(episodes: Mapping[str, Floats], family: Sequence[str], resamples: Resamples) -> dict[str, Point]:
-    """95 % bootstrap interval of each controller's ratio, over crystals and training seeds.
+    """Return the 95 % bootstrap interval of each controller's ratio, over crystals and training seeds.
 
     ``episodes`` has activity [mm/min] and radius error [mm] by controller, shape (training seeds, crystals, 2). Every
-    resample has a frontier of its own. Left out is who is quieter than every member in some resample.
+    resample has a frontier of its own. A controller quieter than every member in some resample is left out.
     """
     means = {}
     for of, (name, values) in enumerate(episodes.items()):

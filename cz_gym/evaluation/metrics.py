@@ -17,9 +17,9 @@ Floats = npt.NDArray[np.float64]
 TOLERANCE = 0.5 * MM
 """Half width of the tolerance band [m]."""
 PULL_WINDOW = 30.0 * MINUTE
-"""Length of the mean that v/G hangs on [s]."""
+"""Length of the running mean of the pull speed, on which v/G depends [s]."""
 PULL_TOLERANCE = 0.03
-"""Share of nominal pull the mean may be off [-]."""
+"""Largest deviation of that mean from the nominal pull speed, relative [-]."""
 
 
 class Metrics(NamedTuple):
@@ -59,12 +59,12 @@ class Metrics(NamedTuple):
 
 
 def metric_names() -> tuple[str, ...]:
-    """Names of the metrics as they stand in files and tables."""
+    """Return the names of the metrics as files and tables have them."""
     return tuple(name.rstrip("_") for name in Metrics._fields)
 
 
 def metrics(run: Rollout) -> Metrics:
-    """Metrics of a rollout."""
+    """Compute the metrics of a rollout."""
     s, alive = run.signals, run.alive
     v_0 = run.config.parameters.v_0
     lost = ~alive | (run.failed & _last(alive))

@@ -1,4 +1,4 @@
-"""The benchmark's protocol: which scenarios, which episodes, at which settings."""
+"""The benchmark's protocol: its scenarios, their episodes and settings."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ TEST_SEEDS = range(2_000_000, 2_000_500)
 """Seeds of the test episodes; nothing is tuned, selected or stopped on them."""
 
 SLOW_EPISODES = 50
-"""Most test episodes of a controller that is slow: the first ones."""
+"""Number of test episodes that a slow controller meets: the first ones."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A scenario as the benchmark runs it."""
+    """A scenario with the settings that the benchmark runs it with."""
 
     name: str
     scenario: str | Scenario
     meaning: str
-    """One line for people."""
+    """Description of one line."""
     model: str | None = None
     """ "I" or "II", or None for the scenario's own draw."""
     default: bool = True
@@ -39,18 +39,18 @@ class Row:
     control_interval: float = 5.0
     """Time between actions [s]."""
     meniscus: MeniscusModel = HURLE
-    """What the crystals grow on; controllers and agents know Hurle's, whatever it is."""
+    """Meniscus of the plant; controllers and agents are made for Hurle's, whatever it is."""
     file: str = ""
-    """Where a scenario of the user's own comes from: FILE.py:NAME."""
+    """Source of a scenario of the user's own: FILE.py:NAME."""
 
     def config(self, observation: str = "measured", action: str = "direct") -> Config:
-        """The environment's settings: three hours, this row's scenario, model, interval and meniscus."""
+        """Return the environment's settings: three hours of this row's scenario, model, interval and meniscus."""
         return make_config(
             self.scenario, self.model, observation, self.control_interval, meniscus=self.meniscus, action=action
         )
 
     def design_config(self, observation: str = "measured", action: str = "direct") -> Config:
-        """The settings that a controller is designed for: the same on Hurle's meniscus."""
+        """Return the settings that a controller is designed for: the same on Hurle's meniscus."""
         return make_config(self.scenario, self.model, observation, self.control_interval, action=action)
 
     @property
@@ -61,7 +61,7 @@ class Row:
         return f"radius {r_0:g} mm, pull speed {v_0:g} mm/min, plant {config.plant_hash}"
 
     def seeds(self, episodes: int) -> range:
-        """The first test seeds; one where every draw is the same."""
+        """Return the first test seeds; one seed where every draw is the same."""
         return TEST_SEEDS[: 1 if find_scenario(self.scenario).deterministic else episodes]
 
 
@@ -112,7 +112,7 @@ ROWS: tuple[Row, ...] = (
 
 
 def find_row(name: str) -> Row:
-    """The row of that name; ValueError names what there is."""
+    """Return the row of that name; CzError names those that exist."""
     for row in ROWS:
         if row.name == name:
             return row
@@ -120,7 +120,7 @@ def find_row(name: str) -> Row:
 
 
 def check_episodes(episodes: int) -> int:
-    """The number of test episodes; ValueError if the protocol does not have so many."""
+    """Return the number of test episodes; CzError if the protocol has fewer."""
     if not 1 <= episodes <= len(TEST_SEEDS):
         raise CzError(f"episodes must be between 1 and {len(TEST_SEEDS)}, not {episodes}")
     return episodes

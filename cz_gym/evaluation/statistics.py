@@ -24,7 +24,7 @@ SEED = 1895
 LEVEL = 0.95
 """Level of the intervals [-]."""
 TAIL = 0.05
-"""Share of episodes that the worst-case mean (CVaR) is taken over [-]."""
+"""Share of the worst episodes whose mean is the CVaR [-]."""
 _BLOCK = 500
 
 
@@ -37,11 +37,11 @@ class Estimate(NamedTuple):
 
     @property
     def ends(self) -> tuple[float, float]:
-        """The interval's ends; twice the mean without one."""
+        """Ends of the interval; the mean twice where there is none."""
         return self.ci95 or (self.mean, self.mean)
 
     def text(self, form: str, unit: float = 1.0) -> str:
-        """The mean in some unit, with its interval if it has one."""
+        """Return the mean in a unit, with its interval if it has one."""
         mean, *ends = (f"{value / unit:{form}}" for value in (self.mean, *(self.ci95 or ())))
         return f"{mean} [{', '.join(ends)}]" if ends else mean
 
@@ -54,11 +54,11 @@ class Resamples:
 
     @classmethod
     def draw(cls, episodes: int, count: int = RESAMPLES, seed: int = SEED) -> Resamples:
-        """Multinomial counts over ``episodes``, ``count`` times. Raises ValueError for no episodes."""
+        """Draw multinomial counts over ``episodes``, ``count`` times. Raises CzError without episodes."""
         return cls(_weights(episodes, count, np.random.default_rng(seed)))
 
     def training_seeds(self, number: int, of: int = 0) -> Floats:
-        """Weights of ``number`` training seeds, shape (resamples, number); another ``of`` draws other ones."""
+        """Draw weights of ``number`` training seeds, shape (resamples, number); another ``of`` gives other ones."""
         return _weights(number, len(self.episodes), np.random.default_rng([SEED, 1 + of]))
 
 
@@ -69,12 +69,12 @@ def _weights(items: int, count: int, random: np.random.Generator) -> Floats:
 
 
 def means(values: Floats, resamples: Resamples) -> tuple[Estimate, ...]:
-    """Mean of each metric over seeds and episodes."""
+    """Estimate the mean of each metric over seeds and episodes."""
     return _estimates(values.mean(axis=(0, 1)), _resampled_means(values, resamples), values.shape[:2])
 
 
 def differences(values: Floats, reference: Floats, resamples: Resamples) -> tuple[Estimate, ...]:
-    """Mean of each metric less the reference's on the same crystals."""
+    """Estimate the difference of each metric's mean from the reference's on the same crystals."""
     point = values.mean(axis=(0, 1)) - reference.mean(axis=(0, 1))
     spread = _resampled_means(values, resamples) - _resampled_means(reference, resamples, of=1)
     shape = max(len(values), len(reference)), values.shape[1]
@@ -82,7 +82,7 @@ def differences(values: Floats, reference: Floats, resamples: Resamples) -> tupl
 
 
 def probability_of_improvement(values: Floats, reference: Floats, resamples: Resamples) -> Estimate:
-    """Chance that one metric (lower is better) is lower than the reference's on the same crystal, ties half.
+    """Estimate how often one metric (lower is better) is lower than the reference's on a crystal, ties half.
 
     ``values`` and ``reference`` have shape (training seeds, episodes).
     """
@@ -92,7 +92,7 @@ def probability_of_improvement(values: Floats, reference: Floats, resamples: Res
 
 
 def cvar(values: Floats, resamples: Resamples, tail: float = TAIL) -> Estimate:
-    """Mean of the worst (largest) ``tail`` of one metric over seeds and episodes, shape (training seeds, episodes).
+    """Estimate the mean of the worst (largest) ``tail`` of one metric, shape (training seeds, episodes).
 
     Rockafellar and Uryasev's conditional value at risk: where the tail is no whole number of episodes, the last one
     counts in part; with fewer than 1/tail episodes it is the maximum.
@@ -110,7 +110,7 @@ def cvar(values: Floats, resamples: Resamples, tail: float = TAIL) -> Estimate:
 
 
 def optimality_gap(costs: Floats, reference: Floats, bound: Floats, resamples: Resamples) -> Estimate | None:
-    """(J - J_bound) / (J_reference - J_bound), J the mean loss over seeds and the same episodes.
+    """Estimate (J - J_bound) / (J_reference - J_bound), with J the mean loss over seeds and the same episodes.
 
     All three have shape (training seeds, episodes). 0 is the bound, 1 the reference; None where the two are equal.
     """
