@@ -42,6 +42,7 @@ def run(bar: Any, perform: Any = runner.in_turn) -> Result:
 @pytest.mark.slow
 def test_a_lost_node_changes_nothing(nodes: tuple[Any, Any]) -> None:
     made, second = nodes
+    pytest.importorskip("ray").cloudpickle.register_pickle_by_value(sys.modules[__name__])  # the row's class
     lost = []
 
     def losing(pieces: Any, bar: Any) -> Any:
