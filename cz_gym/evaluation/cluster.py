@@ -30,6 +30,8 @@ NUMBERS = "numpy", "scipy", "numba"
 """Packages whose version the figures may depend on."""
 RETRIES = 20
 """Times that a task begins again whose node is lost."""
+TIMEOUT = 5.0
+"""Longest wait for a cluster's address to answer [s]."""
 WAIT = 1.0
 """Longest time between two looks at what is done [s]."""
 Look = Callable[[], None]
@@ -46,9 +48,12 @@ def connect(address: str) -> None:
     except ModuleNotFoundError:
         raise CzError('ray is missing: pip install ".[ray]"') from None
     if not ray.is_initialized():
+        host, colon, port = address.rpartition(":")
         try:
+            if colon and port.isdecimal():  # where nobody listens, Ray would wait for minutes and then end the process
+                socket.create_connection((host, int(port)), TIMEOUT).close()
             ray.init(address=address or None, log_to_driver=False, logging_level=logging.ERROR)
-        except (ConnectionError, ValueError, RuntimeError, OSError) as error:
+        except (ConnectionError, ValueError, RuntimeError, OSError, OverflowError) as error:
             raise CzError(f"no Ray cluster at {address or 'this machine'}: {error}") from None
 
 
