@@ -22,7 +22,8 @@ from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
-from cz_gym.rendering.view import FPS, Frame, declared_modes, make_view
+from cz_gym.rendering.canvas import Frame
+from cz_gym.rendering.view import FPS, declared_modes, make_view
 
 from .action import MarkedAction, check_marked
 from .config import Config, check_config, make_config

@@ -1,4 +1,4 @@
-"""Pull a crystal by hand: ``python -m cz_gym.play [--scenario NAME] [--seed N] [--blind] ...``."""
+"""Pull a crystal by hand: ``python -m cz_gym.play [--scenario NAME] [--seed N] ...``."""
 
 from __future__ import annotations
 
@@ -42,7 +42,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--speed", type=float, default=60.0, metavar="FACTOR", help="times faster than real (%(default)g)"
     )
     parser.add_argument("--minutes", type=float, default=180.0, metavar="M", help="length of the run (%(default)g)")
-    parser.add_argument("--blind", action="store_true", help="show only the sensors, as an operator sees them")
     parser.add_argument("--size", default="960x720", metavar="WxH", help="size of the window in pixels (%(default)s)")
     return parser.run(_play, arguments, "render")
 
@@ -72,7 +71,7 @@ def _play(arguments: argparse.Namespace) -> None:
     try:
         if not window.visible:
             raise CzError(NO_DISPLAY)
-        scores = Game(window, size, config, arguments.seed, arguments.speed, paper, arguments.blind).play()
+        scores = Game(window, size, config, arguments.seed, arguments.speed, paper).play()
     finally:
         window.close()
     for score in scores:

@@ -12,7 +12,7 @@ from cz_gym.config import Config
 from cz_gym.env import CzEnv
 from cz_gym.rendering import palette
 from cz_gym.rendering.backend import load
-from cz_gym.rendering.canvas import TIMES, Box, Canvas
+from cz_gym.rendering.canvas import TIMES, Box, Canvas, Frame
 from cz_gym.rendering.numbers_panel import SetPoints
 from cz_gym.rendering.record import Record
 from cz_gym.rendering.scene import Scene
@@ -40,21 +40,13 @@ HELP = (
 class Game:
     """One player at one window, compared with the controller ``rival`` on the same crystal.
 
-    Time stands still until the player starts it. A ``blind`` player sees what a puller's sensors show, and the truth
-    only with the score.
+    Time stands still until the player starts it.
     """
 
     def __init__(
-        self,
-        window: Window,
-        size: tuple[int, int],
-        config: Config,
-        seed: int,
-        speed: float,
-        rival: Any,
-        blind: bool = False,
+        self, window: Window, size: tuple[int, int], config: Config, seed: int, speed: float, rival: Any
     ) -> None:
-        self.window, self.config, self.speed, self.rival, self.blind = window, config, speed, rival, blind
+        self.window, self.config, self.speed, self.rival = window, config, speed, rival
         self.env = CzEnv.from_config(config, "rgb_array", size, info="all")
         self.scene = Scene(*size)
         self.scores: list[Score] = []
@@ -141,9 +133,9 @@ class Game:
             self.score = score(self.config, self.seed, self.actions, failed, self.rival)
             self.scores.append(self.score)
 
-    def draw(self) -> Any:
-        """The picture that the player sees, a pygame surface."""
-        return self.scene.draw(self.record, self.set_points, self._overlay, self.blind and self.score is None)
+    def draw(self) -> Frame:
+        """The picture that the player sees."""
+        return self.scene.draw(self.record, self.set_points, self._overlay)
 
     def _overlay(self, canvas: Canvas) -> None:
         """Help, pause and score on top of the picture."""
@@ -166,8 +158,8 @@ def _draw_card(canvas: Canvas, title: str, rows: tuple[tuple[str, str], ...], fo
     unit = canvas.unit
     width, height = 330.0 * unit, (62.0 + 18.0 * len(rows)) * unit
     box = Box((canvas.width - width) / 2.0, (0.66 * canvas.height - height) / 2.0, width, height)
-    canvas.cover(palette.RIM, box.inner(-2 * unit, -2 * unit, -2 * unit, -2 * unit))
-    canvas.cover(palette.BACK, box)
+    canvas.rectangle(palette.RIM, box.inner(-2 * unit, -2 * unit, -2 * unit, -2 * unit))
+    canvas.rectangle(palette.BACK, box)
     canvas.text(box.x + 16 * unit, box.y + 11 * unit, title, 14, bold=True)
     for i, (left, right) in enumerate(rows):
         y = box.y + (36.0 + 18.0 * i) * unit

@@ -1,4 +1,4 @@
-"""A canvas: shapes at twice the picture's resolution, so that their edges are smooth, and text on top."""
+"""A canvas of shapes and text at twice the picture's resolution; the mean of four pixels gives smooth edges."""
 
 from __future__ import annotations
 
@@ -11,20 +11,24 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.jit.compile import kernel
+
 from .backend import load
-from .geometry import paired
 from .palette import BACK, INK, PANEL, Colour
-from .pixels import halve
 
 if TYPE_CHECKING:
     from pygame import Surface
 
+Frame = npt.NDArray[np.uint8]
 FINE = 2
 """Drawn pixels along each side of a pixel of the picture, which is their mean."""
 FONTS = Path(__file__).parent / "fonts"
 TIMES = "\N{MULTIPLICATION SIGN}"
 BASE = (640, 480)
 """Width and height [px] at which text and lines have their nominal size."""
+
+
+_TWO = np.uint32(2)
 
 
 class Box(NamedTuple):
@@ -61,39 +65,32 @@ class Canvas:
         self.width, self.height = width, height
         self.unit = min(width / BASE[0], height / BASE[1])
         self._fine: Surface = self.pygame.Surface((FINE * width, FINE * height), 0, 32)
-        self._picture: Surface = self.pygame.Surface((width, height), 0, 32)
-        self._on_top: list[tuple[Surface, tuple[int, int]]] = []
-        """Text and covers with their upper left corners [px], drawn when the picture is finished."""
 
     def begin(self, panels: tuple[Box, ...]) -> None:
         """Begin a new picture with these panels on it."""
-        self._on_top = []
         self._fine.fill(BACK)
         for box in panels:
             self.rectangle(PANEL, box)
 
-    def finish(self) -> Surface:
-        """The picture; the next one is drawn into the same surface."""
-        halve(self._fine, self._picture)
-        self._picture.blits(self._on_top, False)
-        return self._picture
+    def finish(self) -> Frame:
+        """The picture, shape (height, width, 3), an array of the caller's own."""
+        frame = np.empty((self.height, self.width, 3), np.uint8)
+        rows = np.asarray(self._fine.get_view("2")).T
+        _mean_of_four(rows.view(np.uint8).reshape(*rows.shape, 4), frame)
+        return frame
 
     @contextmanager
     def clip(self, box: Box) -> Iterator[None]:
-        """Draw shapes inside the box only, and inside the box of a clip around this one."""
-        before = self._fine.get_clip()
-        self._fine.set_clip(before.clip(_fine_box(box)))
+        """Draw inside the box only."""
+        self._fine.set_clip(_fine_box(box))
         try:
             yield
         finally:
-            self._fine.set_clip(before)
+            self._fine.set_clip(None)
 
-    def rectangle(self, colour: Colour, box: Box, line: float | None = None) -> None:
-        """A rectangle, filled or with a rim of that width."""
-        if line is None:
-            self._fine.fill(colour, _fine_box(box))
-        else:
-            self.pygame.draw.rect(self._fine, colour, _fine_box(box), self._thickness(line))
+    def rectangle(self, colour: Colour, box: Box) -> None:
+        """A filled rectangle."""
+        self._fine.fill(colour, _fine_box(box))
 
     def polygon(self, colour: Colour, points: npt.ArrayLike) -> None:
         """A filled polygon, points of shape (n, 2); nothing for fewer than three."""
@@ -107,34 +104,10 @@ class Canvas:
         if len(fine) > 1:
             self.pygame.draw.lines(self._fine, colour, False, fine, self._thickness(width))
 
-    def dashes(
-        self, colour: Colour, points: npt.ArrayLike, width: float = 1.2, dash: float = 5.0, gap: float = 4.0
-    ) -> None:
-        """Dashed lines from point to point, with lengths of dash and gap along the line."""
-        x, y = np.asarray(points, np.float64).T
-        along = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
-        starts = np.arange(0.0, along[-1], (dash + gap) * self.unit)
-        ends = np.minimum(starts + dash * self.unit, along[-1])
-        at = np.stack([starts, ends], axis=1).ravel()
-        fine = _fine_points(paired(np.interp(at, along, x), np.interp(at, along, y)))
-        for start, end in zip(fine[::2], fine[1::2], strict=True):
-            self.pygame.draw.line(self._fine, colour, start, end, self._thickness(width))
-
     def dot(self, colour: Colour, at: tuple[float, float], radius: float) -> None:
         """A filled circle."""
         centre = (round(at[0] * FINE), round(at[1] * FINE))
         self.pygame.draw.circle(self._fine, colour, centre, self._thickness(radius))
-
-    def glow(self, colour: Colour, at: tuple[float, float], radius: float) -> None:
-        """Light around a point, fading over the radius."""
-        size = self._thickness(radius)
-        corner = (round(at[0] * FINE) - size, round(at[1] * FINE) - size)
-        self._fine.blit(_glow(colour, size), corner, special_flags=self.pygame.BLEND_RGB_ADD)
-
-    def shade(self, box: Box, top: Colour, bottom: Colour) -> None:
-        """A box whose colour runs from top to bottom."""
-        x, y, w, h = _fine_box(box)
-        self._fine.blit(_gradient(w, h, top, bottom), (x, y))
 
     def text(
         self,
@@ -146,20 +119,28 @@ class Canvas:
         anchor: str = "left",
         bold: bool = False,
     ) -> None:
-        """Text whose top is at y and whose left, centre or right (``anchor``) is at x; it lies above all shapes."""
-        image = _text(text, max(7, round(size * self.unit)), colour, bold)
+        """Text whose top is at y and whose left, centre or right (``anchor``) is at x."""
+        image = _text(text, FINE * max(7, round(size * self.unit)), colour, bold)
         left = {"left": 0.0, "centre": 0.5, "right": 1.0}[anchor] * image.get_width()
-        self._on_top.append((image, (round(x - left), round(y))))
-
-    def cover(self, colour: Colour, box: Box) -> None:
-        """A filled rectangle above all shapes and the text so far."""
-        image = self.pygame.Surface((round(box.w), round(box.h)), 0, 32)
-        image.fill(colour)
-        self._on_top.append((image, (round(box.x), round(box.y))))
+        self._fine.blit(image, (round(FINE * x - left), round(FINE * y)))
 
     def _thickness(self, width: float) -> int:
         """A width in nominal pixels as drawn pixels."""
         return max(1, round(width * self.unit * FINE))
+
+
+def _mean(fine: Any, frame: Any) -> None:
+    """Each pixel becomes the rounded mean of four: (2 h, 2 w, 4) of blue, green, red and nothing, to (h, w, 3)."""
+    for i in range(frame.shape[0]):
+        for j in range(frame.shape[1]):
+            for channel in range(3):
+                total = _TWO
+                for k in range(4):
+                    total += np.uint32(fine[2 * i + k // 2, 2 * j + k % 2, 2 - channel])
+                frame[i, j, channel] = total >> _TWO
+
+
+_mean_of_four = kernel(_mean)
 
 
 def _fine_box(box: Box) -> tuple[int, int, int, int]:
@@ -189,22 +170,3 @@ def _text(text: str, size: int, colour: Colour, bold: bool) -> Any:
         # A pygame.quit() anywhere makes every font invalid.
         _font.cache_clear()
         return _font(size, bold).render(text, True, colour)
-
-
-@lru_cache(maxsize=16)
-def _glow(colour: Colour, size: int) -> Any:
-    pygame = load()
-    at = np.arange(-size, size) + 0.5
-    light = np.clip(1.0 - np.hypot(at[:, None], at) / size, 0.0, 1.0) ** 2.2
-    image = pygame.Surface(light.shape, 0, 32)
-    pygame.surfarray.blit_array(image, (light[..., None] * np.array(colour)).astype(np.uint8))
-    return image
-
-
-@lru_cache(maxsize=16)
-def _gradient(width: int, height: int, top: Colour, bottom: Colour) -> Any:
-    pygame = load()
-    ends = pygame.Surface((1, 2), 0, 32)
-    ends.set_at((0, 0), top)
-    ends.set_at((0, 1), bottom)
-    return pygame.transform.smoothscale(ends, (width, height))

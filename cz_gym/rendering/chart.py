@@ -32,17 +32,15 @@ class Trace(NamedTuple):
     width: float = 1.7
 
 
-def draw(canvas: Canvas, box: Box, record: Record, blind: bool = False) -> None:
-    """The radius error by the camera, and the true one unless ``blind``."""
+def draw(canvas: Canvas, box: Box, record: Record) -> None:
+    """The radius error by the camera, and the true one."""
     camera, true = Trace(record.t, record.camera_error, NOISE, 0.8), Trace(record.t, record.error, palette.TRUE)
-    # The camera's outliers must not set the scale where the truth can.
-    limit = error_range(camera.error if blind else true.error)
-    draw_traces(canvas, box, record.config.horizon, limit, [camera] if blind else [camera, true])
+    # The camera's outliers must not set the scale.
+    draw_traces(canvas, box, record.config.horizon, error_range(true.error), [camera, true])
     x, y = box.x + 38 * canvas.unit, box.y + 4 * canvas.unit
     canvas.text(x, y, "radius error [mm]", colour=palette.FAINT)
     canvas.text(x + 98 * canvas.unit, y, "by the camera", colour=palette.CAMERA)
-    if not blind:
-        canvas.text(x + 182 * canvas.unit, y, "true", colour=palette.TRUE)
+    canvas.text(x + 182 * canvas.unit, y, "true", colour=palette.TRUE)
 
 
 def draw_traces(canvas: Canvas, box: Box, horizon: float, limit: float, traces: Sequence[Trace]) -> None:

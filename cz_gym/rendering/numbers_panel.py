@@ -31,10 +31,10 @@ class Row(NamedTuple):
     colour: Colour = palette.FAINT
 
 
-def groups(record: Record, set_points: SetPoints | None = None, blind: bool = False) -> list[list[Row]]:
+def groups(record: Record, set_points: SetPoints | None = None) -> list[list[Row]]:
     """The rows of a record's newest sample; the first of each group is a signal, those below it its references.
 
-    ``set_points`` of the drives are added; ``blind`` leaves out what no sensor of a puller shows.
+    ``set_points`` of the drives are added.
     """
     p, last, asked = record.puller, record.last, set_points
     pull, heater = last("v_p") / MM_PER_MIN, last("Q_H") / KILO
@@ -47,23 +47,21 @@ def groups(record: Record, set_points: SetPoints | None = None, blind: bool = Fa
         drives[1].append(Row("set by hand", f"{asked.Q_H / KILO:.2f}", palette.INK))
     T_1 = [Row("heater T_1", f"{last('T_1'):.1f} K", palette.TEMPERATURE), Row("recipe", f"{last('T_1_ref'):.1f}")]
     T_b = [Row("melt T_b", f"{last('T_b'):.2f} K", palette.TEMPERATURE), Row("nominal", f"{p.T_b_0:.2f}")]
-    return [*drives, T_1] if blind else [*drives, T_1, T_b]
+    return [*drives, T_1, T_b]
 
 
-def draw(canvas: Canvas, box: Box, record: Record, set_points: SetPoints | None = None, blind: bool = False) -> None:
-    """The radius error in large figures, true or (``blind``) by the camera, then the groups of rows."""
+def draw(canvas: Canvas, box: Box, record: Record, set_points: SetPoints | None = None) -> None:
+    """The true radius error in large figures, then the groups of rows."""
     unit, left, right = canvas.unit, box.x + 8 * canvas.unit, box.right - 8 * canvas.unit
-    camera = float(record.camera_error[-1])
-    error, colour = (camera, palette.CAMERA) if blind else (float(record.error[-1]), palette.TRUE)
-    title = "error by the camera" if blind else "true radius error"
-    canvas.text(left, box.y + 5 * unit, title, colour=palette.FAINT)
-    canvas.text(box.x + box.w / 2.0, box.y + 18 * unit, _in_mm(error, "+.2f"), 19, colour, "centre", True)
+    canvas.text(left, box.y + 5 * unit, "true radius error", colour=palette.FAINT)
+    error = _in_mm(float(record.error[-1]), "+.2f")
+    canvas.text(box.x + box.w / 2.0, box.y + 18 * unit, error, 19, palette.TRUE, "centre", True)
     radius = [
-        Row("by the camera", _in_mm(camera + record.last("r_ref")), palette.CAMERA),
+        Row("by the camera", _in_mm(float(record.camera_error[-1]) + record.last("r_ref")), palette.CAMERA),
         Row("reference", _in_mm(record.last("r_ref")), palette.REFERENCE),
     ]
     y = box.y + 45 * unit
-    for group in (radius, *groups(record, set_points, blind)):
+    for group in (radius, *groups(record, set_points)):
         for row in group:
             canvas.text(left, y, row.name, colour=palette.FAINT)
             canvas.text(right, y, row.value, 9.5, row.colour, "right", row is group[0])

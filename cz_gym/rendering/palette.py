@@ -23,15 +23,11 @@ WELL: Colour = (0, 190, 140)
 ALARM: Colour = (213, 94, 0)
 
 GAS: Colour = (15, 19, 27)
-MELT_TOP: Colour = (255, 168, 84)
-MELT_DEEP: Colour = (160, 52, 22)
+MELT: Colour = (242, 138, 66)
 ON_MELT: Colour = (60, 20, 0)
 """Words on the bright melt."""
-CRYSTAL_HOT: Colour = (176, 150, 138)
-CRYSTAL_COLD: Colour = (84, 98, 120)
-SEED: Colour = (62, 72, 90)
+CRYSTAL: Colour = (104, 112, 128)
 QUARTZ: Colour = (120, 128, 140)
-GLOW: Colour = (255, 236, 180)
 
 
 def mix(low: Colour, high: Colour, share: float) -> Colour:

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from numbers import Integral
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from cz_gym.errors import CzError
 from cz_gym.units import HOUR, MINUTE, MM
 
 from . import chart, numbers_panel, palette, puller_panel, triple_point
-from .canvas import BASE, Box, Canvas
+from .canvas import BASE, Box, Canvas, Frame
 from .numbers_panel import SetPoints
 from .record import Ending, Record
-
-if TYPE_CHECKING:
-    from pygame import Surface
 
 SMALLEST, LARGEST = 360, 3840
 """Fewest and most pixels along a side."""
@@ -73,45 +70,35 @@ class Scene:
         record: Record,
         set_points: SetPoints | None = None,
         overlay: Callable[[Canvas], None] | None = None,
-        blind: bool = False,
-    ) -> Surface:
-        """The picture of a record's newest sample; the next call draws into the same surface.
+    ) -> Frame:
+        """The picture of a record's newest sample, shape (height, width, 3).
 
-        ``set_points`` are a player's, ``overlay`` draws on top, ``blind`` leaves only what the puller's sensors show.
+        ``set_points`` are a player's, ``overlay`` draws on top.
         """
         canvas, boxes = self.canvas, self.layout
-        seen = boxes.chart
-        if blind:
-            width = boxes.triple_point.right - boxes.puller.x
-            seen = Box(boxes.puller.x, boxes.puller.y, width, boxes.chart.bottom - boxes.puller.y)
-        canvas.begin((boxes.numbers, seen) if blind else (boxes.puller, boxes.numbers, seen))
-        self._draw_header(record, blind)
-        if not blind:
-            canvas.text(
-                boxes.puller.x + 8 * canvas.unit, boxes.puller.y + 5 * canvas.unit, "crystal", 9.5, palette.FAINT
-            )
-            puller_panel.draw(canvas, boxes.puller, record)
-            triple_point.draw(canvas, boxes.triple_point, record)
-        numbers_panel.draw(canvas, boxes.numbers, record, set_points, blind)
-        chart.draw(canvas, seen, record, blind)
+        canvas.begin((boxes.puller, boxes.numbers, boxes.chart))
+        self._draw_header(record)
+        puller_panel.draw(canvas, boxes.puller, record)
+        canvas.text(boxes.puller.x + 8 * canvas.unit, boxes.puller.y + 5 * canvas.unit, "crystal", 9.5, palette.FAINT)
+        triple_point.draw(canvas, boxes.triple_point, record)
+        numbers_panel.draw(canvas, boxes.numbers, record, set_points)
+        chart.draw(canvas, boxes.chart, record)
         if record.ending is not None:
             draw_ending(canvas, boxes.triple_point, record.ending)
         if overlay is not None:
             overlay(canvas)
         return canvas.finish()
 
-    def _draw_header(self, record: Record, blind: bool) -> None:
-        """Scenario, time, length grown unless ``blind``, and whether the crystal grows."""
+    def _draw_header(self, record: Record) -> None:
+        """Scenario, time, length grown, and whether the crystal grows."""
         canvas, unit = self.canvas, self.canvas.unit
         left, middle, right = self.layout.header.x, self.layout.triple_point.x, self.layout.header.right
         hours, rest = divmod(round(float(record.t[-1])), round(HOUR))
         minutes, seconds = divmod(rest, round(MINUTE))
         canvas.text(left + 4 * unit, 7 * unit, "Cz-v0", 14, bold=True)
         canvas.text(left + 58 * unit, 10 * unit, record.scenario, 11, palette.FAINT)
-        facts = [(0, 30, "time", f"{hours}:{minutes:02d}:{seconds:02d}")]
-        if not blind:
-            facts.append((112, 152, "grown", f"{record.length[-1] / MM:.1f} mm"))
-        for x, after, name, value in facts:
+        time, grown = f"{hours}:{minutes:02d}:{seconds:02d}", f"{record.length[-1] / MM:.1f} mm"
+        for x, after, name, value in ((0, 30, "time", time), (112, 152, "grown", grown)):
             canvas.text(middle + x * unit, 10 * unit, name, 11, palette.FAINT)
             canvas.text(middle + after * unit, 7.5 * unit, value, 13, bold=True)
         status, colour = ("growing", palette.WELL) if record.ending is None else ("ended", palette.ALARM)

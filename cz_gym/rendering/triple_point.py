@@ -1,7 +1,4 @@
-"""The triple point to scale: crystal edge with the grown surface above it, meniscus, melt, bright ring.
-
-Beside it is the same surface, at the same heights, with its error against the reference magnified.
-"""
+"""The triple point to scale: crystal edge with the grown surface above it, meniscus, melt, bright ring."""
 
 from __future__ import annotations
 
@@ -12,16 +9,13 @@ import numpy as np
 from cz_gym.units import MM
 
 from . import palette
-from .canvas import TIMES, Box, Canvas
+from .canvas import Box, Canvas
 from .geometry import (
-    TOLERANCE,
     Floats,
     Scale,
     clipped_height,
-    error_range,
     first_at_least,
     meniscus_curve,
-    paired,
     ring_height,
 )
 from .palette import Colour
@@ -43,20 +37,17 @@ def scale_of(box: Box, record: Record) -> Scale:
     return Scale(x_0, record.puller.r_0, box.bottom - BELOW * per_metre, per_metre)
 
 
-def draw(canvas: Canvas, box: Box, record: Record, limit: float | None = None, colour: Colour = palette.TRUE) -> None:
-    """The cross-section and the magnified surface, the crystal's in a colour.
-
-    ``limit`` [m] is the half width of the magnified error; None fits it to the error.
-    """
+def draw(canvas: Canvas, box: Box, record: Record, colour: Colour = palette.TRUE) -> None:
+    """The cross-section, the crystal's surface in a colour."""
     scale, unit = scale_of(box, record), canvas.unit
     r_c, r_ref, z = record.surface(max((scale.y_0 - box.y) / scale.per_metre - record.last("h_c"), 0.0))
     surface = scale.points(r_c, z)
     with canvas.clip(box):
         # Crystal and melt fill the panel; then the gas is cut out.
-        canvas.shade(Box(box.x, box.y, box.w, scale.y_0 - box.y), palette.CRYSTAL_COLD, palette.CRYSTAL_HOT)
-        canvas.shade(Box(box.x, scale.y_0, box.w, box.bottom - scale.y_0), palette.MELT_TOP, palette.MELT_DEEP)
+        canvas.rectangle(palette.CRYSTAL, box)
+        canvas.rectangle(palette.MELT, Box(box.x, scale.y_0, box.w, box.bottom - scale.y_0))
         _draw_gas_and_meniscus(canvas, box, scale, record, surface)
-        canvas.dashes(palette.REFERENCE, scale.points(np.append(r_ref[0], r_ref), np.append(0.0, z)), 1.2)
+        canvas.lines(palette.REFERENCE, scale.points(np.append(r_ref[0], r_ref), np.append(0.0, z)), 0.8)
         canvas.lines(colour, surface, 2.2)
         if record.ending is not Ending.DETACHED:
             _draw_ring(canvas, box, scale, record)
@@ -65,10 +56,8 @@ def draw(canvas: Canvas, box: Box, record: Record, limit: float | None = None, c
         canvas.dot(colour, edge, 2.2)
     _draw_axis(canvas, box, scale)
     canvas.text(box.x + 7.0 * unit, box.y + 30 * unit, "crystal", 10)
-    canvas.text(box.x + 7.0 * unit, scale.y_0 + 8 * unit, "melt", colour=palette.ON_MELT, bold=True)
-    x, right = float(scale.x(record.puller.r_0 + 0.62 * INSIDE)), box.right - 8.0 * unit
-    inset = Box(x, box.y + 44.0 * unit, right - x, scale.y_0 - box.y - 70.0 * unit)
-    _draw_magnified(canvas, inset, scale, r_c - r_ref, z, limit or error_range(r_c - r_ref), colour)
+    canvas.text(box.x + 7.0 * unit, scale.y_0 + 24 * unit, "melt", colour=palette.ON_MELT, bold=True)
+    canvas.text(float(scale.x(r_ref[-1])) + 5 * unit, box.y + 30 * unit, "reference")
 
 
 def _draw_gas_and_meniscus(canvas: Canvas, box: Box, scale: Scale, record: Record, surface: Floats) -> None:
@@ -84,9 +73,7 @@ def _draw_gas_and_meniscus(canvas: Canvas, box: Box, scale: Scale, record: Recor
     canvas.polygon(palette.GAS, np.concatenate([beside, meniscus, corners]))
     edge = meniscus[0].tolist()
     melt = [[box.right, level + 1], [box.x, level + 1], [box.x, edge[1]]]
-    canvas.polygon(palette.MELT_TOP, np.concatenate([meniscus, melt]))
-    canvas.lines(palette.GLOW, [(box.x, edge[1]), edge], 1.2)
-    canvas.lines(palette.mix(palette.MELT_TOP, palette.GLOW, 0.6), meniscus, 1.0)
+    canvas.polygon(palette.MELT, np.concatenate([meniscus, melt]))
 
 
 def _draw_ring(canvas: Canvas, box: Box, scale: Scale, record: Record) -> None:
@@ -94,8 +81,7 @@ def _draw_ring(canvas: Canvas, box: Box, scale: Scale, record: Record) -> None:
     r_c, h_c, p, unit = record.last("r_c"), record.last("h_c"), record.puller, canvas.unit
     z_b = ring_height(r_c, h_c, p, record.config.meniscus, record.config.parameters.phi_b)
     x, y, bottom = float(scale.x(record.last("r_br"))), float(scale.y(z_b)), box.bottom - 21.0 * unit
-    canvas.glow(palette.GLOW, (x, y), 17.0)
-    canvas.dot(palette.CAMERA, (x, y), 2.6)
+    canvas.dot(palette.CAMERA, (x, y), 3.2)
     canvas.lines(palette.CAMERA, [(x, y), (x, bottom)], 1.0)
     edge = float(scale.x(r_c))
     canvas.lines(EDGE_MARK, [(edge, float(scale.y(clipped_height(h_c, p.a)))), (edge, bottom)], 1.0)
@@ -118,26 +104,3 @@ def _draw_axis(canvas: Canvas, box: Box, scale: Scale) -> None:
         if box.x + 8 * unit < x < box.right - 52 * unit:
             canvas.text(x, y + 4 * unit, f"{number * step / MM:g}", 9.0, palette.FAINT, "centre")
     canvas.text(box.right - 4 * unit, y + 4 * unit, "r [mm]", 9.0, palette.FAINT, "right")
-
-
-def _draw_magnified(
-    canvas: Canvas, box: Box, scale: Scale, error: Floats, z: Floats, limit: float, colour: Colour
-) -> None:
-    """The surface's error [m] between -limit and limit."""
-    unit, middle, per_metre = canvas.unit, box.x + box.w / 2.0, box.w / 2.0 / limit
-    canvas.rectangle(palette.PANEL, box)
-    band = min(TOLERANCE * per_metre, box.w / 2.0)
-    canvas.rectangle(palette.BAND, Box(middle - band, box.y, 2.0 * band, box.h))
-    canvas.dashes(palette.REFERENCE, [(middle, box.y), (middle, box.bottom)], 1.0)
-    with canvas.clip(box):
-        canvas.lines(colour, paired(middle + error * per_metre, scale.y(z)), 2.0)
-    canvas.rectangle(palette.RIM, box, 0.5)
-    title = f"surface error {TIMES}{per_metre / scale.per_metre:.0f}"
-    canvas.text(middle, box.y - 13 * unit, title, 9.5, colour, "centre")
-    labels = (
-        (box.x, "left", f"{-limit / MM:+g}"),
-        (middle, "centre", "0 mm"),
-        (box.right, "right", f"{limit / MM:+g}"),
-    )
-    for x, anchor, text in labels:
-        canvas.text(x, box.bottom + 2 * unit, text, 9.0, palette.FAINT, anchor)

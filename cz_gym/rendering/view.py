@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,14 +13,10 @@ from cz_gym.errors import CzError
 from cz_gym.names import unknown
 
 from .backend import MISSING, available, load
-from .pixels import colours
+from .canvas import Frame
 from .record import Record
 from .scene import Scene, check_size
 
-if TYPE_CHECKING:
-    from pygame import Surface
-
-Frame = npt.NDArray[np.uint8]
 MODES = ("human", "rgb_array")
 FPS = 30
 """Frames a second of a window or a video; each frame is one control interval."""
@@ -92,7 +88,7 @@ class View:
             self._scene = Scene(*self.size)
         picture = self._scene.draw(self.record)
         if self.mode == "rgb_array":
-            return colours(picture)
+            return picture
         if self._window is None:
             self._window = Window(self.size, CAPTION)
         self._window.show(picture)
@@ -112,7 +108,7 @@ class Window:
         self._pygame = load()
         try:
             self._pygame.display.init()
-            self.screen: Surface = self._pygame.display.set_mode(size)
+            self.screen = self._pygame.display.set_mode(size)
         except self._pygame.error as error:
             raise Error(f"cannot open a window: {error}; render_mode='rgb_array' needs none") from None
         self._pygame.display.set_caption(caption)
@@ -124,9 +120,9 @@ class Window:
         driver: str = self._pygame.display.get_driver()
         return driver != "offscreen"
 
-    def show(self, picture: Surface) -> None:
+    def show(self, picture: Frame) -> None:
         """Show a picture, at most FPS a second."""
-        self.screen.blit(picture, (0, 0))
+        self._pygame.surfarray.blit_array(self.screen, picture.swapaxes(0, 1))
         self._pygame.event.pump()
         self._clock.tick(FPS)
         self._pygame.display.flip()

@@ -17,7 +17,6 @@ from cz_gym.env import CzEnv
 from cz_gym.errors import CzError
 from cz_gym.rendering import palette as c
 from cz_gym.rendering.canvas import Canvas
-from cz_gym.rendering.pixels import colours
 
 from .duel import Side, draw
 
@@ -65,7 +64,7 @@ def film(seed: int, frames: int) -> bytes:
     for number in range(frames):
         for side in sides:
             side.step_to(round((number + 1) * steps / frames))
-        pictures.append(colours(draw(canvas, sides)))
+        pictures.append(draw(canvas, sides))
     return gif(pictures)
 
 
@@ -96,8 +95,8 @@ def gif(pictures: Sequence[Any]) -> bytes:
 
 def _palette(picture: Any, Image: Any) -> Any:
     """COLOURS colours: those that mean something, however few their pixels, and the rest as the picture needs them."""
-    marker = c.mix(c.CAMERA, c.MELT_TOP, 0.5)
-    meaning = (c.BACK, c.PANEL, c.INK, c.TRUE, c.CAMERA, marker, c.REFERENCE, PAPER, c.ALARM, c.GLOW)
+    marker = c.mix(c.CAMERA, c.MELT, 0.5)
+    meaning = (c.BACK, c.PANEL, c.INK, c.TRUE, c.CAMERA, marker, c.REFERENCE, PAPER, c.ALARM)
     needed = picture.quantize(COLOURS - len(meaning), method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     channels = [*needed.getpalette()[: 3 * (COLOURS - len(meaning))], *sum(meaning, ())]
     found = Image.new("P", (1, 1))

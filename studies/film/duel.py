@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from cz_gym.env import CzEnv
 from cz_gym.rendering import chart, palette, puller_panel, triple_point
-from cz_gym.rendering.canvas import TIMES, Box, Canvas
+from cz_gym.rendering.canvas import TIMES, Box, Canvas, Frame
 from cz_gym.rendering.geometry import TOLERANCE, error_range
 from cz_gym.rendering.palette import Colour
 from cz_gym.rendering.record import Ending, Record
@@ -17,9 +17,6 @@ from cz_gym.rendering.scene import draw_ending
 from cz_gym.rendering.view import record_of
 from cz_gym.task import RADIUS_LIMIT
 from cz_gym.units import MM
-
-if TYPE_CHECKING:
-    from pygame import Surface
 
 
 class Side:
@@ -47,7 +44,7 @@ class Side:
         return min(float(np.sqrt(np.mean(np.square(error)))), RADIUS_LIMIT) if len(error) else 0.0
 
 
-def draw(canvas: Canvas, sides: Sequence[Side]) -> Surface:
+def draw(canvas: Canvas, sides: Sequence[Side]) -> Frame:
     """Each side's crystal and triple point, and below them both errors on one chart."""
     unit = canvas.unit
     gap, below = 6.0 * unit, 0.27 * canvas.height
@@ -65,11 +62,11 @@ def draw(canvas: Canvas, sides: Sequence[Side]) -> Surface:
     canvas.text(bottom.right - 10.0 * unit, y, told, 9.5, palette.FAINT, "right")
     for i, (side, box) in enumerate(zip(sides, boxes, strict=True)):
         canvas.text(x + (125 + 140 * i) * unit, y, side.name, 9.5, side.colour, bold=True)
-        _draw_side(canvas, box, side, magnified, limit)
+        _draw_side(canvas, box, side, magnified)
     return canvas.finish()
 
 
-def _draw_side(canvas: Canvas, box: Box, side: Side, magnified: float, limit: float) -> None:
+def _draw_side(canvas: Canvas, box: Box, side: Side, magnified: float) -> None:
     unit, record = canvas.unit, side.record
     canvas.text(box.x + 10 * unit, box.y + 7 * unit, side.name, 13, side.colour, bold=True)
     rmse = f"RMSE {side.rmse() / MM:.2f} mm"
@@ -78,6 +75,6 @@ def _draw_side(canvas: Canvas, box: Box, side: Side, magnified: float, limit: fl
     crystal = Box(below.x, below.y, 0.44 * below.w, below.h)
     edge = Box(crystal.right, below.y, below.right - crystal.right, below.h)
     puller_panel.draw(canvas, crystal, record, magnified, side.colour)
-    triple_point.draw(canvas, edge, record, limit, side.colour)
+    triple_point.draw(canvas, edge, record, side.colour)
     if record.ending not in (None, Ending.HORIZON):
         draw_ending(canvas, edge, record.ending)

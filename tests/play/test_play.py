@@ -17,7 +17,6 @@ from cz_gym.play import game as hand
 from cz_gym.play.score import score
 from cz_gym.rendering import backend
 from cz_gym.rendering.view import Window
-from cz_gym.signals import INFO
 from cz_gym.units import KILO, MM_PER_MIN
 
 pygame = pytest.importorskip("pygame")
@@ -94,30 +93,6 @@ def test_a_whole_run_in_the_window_ends_with_the_score(game: hand.Game) -> None:
     paper = metrics(rollout(game.rival, game.config, [1]))
     assert outcome.controller == (paper.rmse_mm[0], paper.return_[0], False)
     assert "by hand" in outcome.line()
-
-
-def test_blind_shows_the_readings_alone_until_the_score(game: hand.Game) -> None:
-    """Two records whose true states differ and whose readings do not give the same picture."""
-    game.blind = True
-    handle(game, pygame.K_SPACE)
-    game.advance(2.0)
-
-    def picture() -> np.ndarray:
-        return np.array(pygame.surfarray.array3d(game.draw()))
-
-    before = picture()
-    for name in set(INFO) - {"r_ref", "r_br_measured", "v_p", "Q_H", "T_1", "T_1_ref"}:
-        game.record.column(name)[:] *= 1.001
-    assert np.array_equal(picture(), before)
-    game.record.column("r_br_measured")[-1] += 3e-4
-    assert not np.array_equal(picture(), before)
-    game.record.column("valid")[:] = 0.0
-    blind = picture()
-    game.finish(failed=False)
-    told = picture()
-    game.record.column("r_c")[-1] += 3e-4
-    assert not np.array_equal(told, blind)
-    assert not np.array_equal(picture(), told)
 
 
 def test_again_and_the_next_crystal(game: hand.Game) -> None:
@@ -200,13 +175,10 @@ def test_without_a_display_it_says_so(monkeypatch: pytest.MonkeyPatch, refused: 
     monkeypatch.setenv("SDL_VIDEODRIVER", "offscreen")
     assert refused(play.main, []) == f"python -m cz_gym.play: {play.NO_DISPLAY}\n"
     assert not pygame.display.get_init()
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="displays have names on Linux")
-def test_where_no_display_is_named_none_is_tried(monkeypatch: pytest.MonkeyPatch, refused: Any) -> None:
-    for name in play.DISPLAYS:
-        monkeypatch.delenv(name, raising=False)
-    assert refused(play.main, []) == f"python -m cz_gym.play: {play.NO_DISPLAY}\n"
+    if sys.platform.startswith("linux"):  # where displays have names
+        for name in play.DISPLAYS:
+            monkeypatch.delenv(name, raising=False)
+        assert refused(play.main, []) == f"python -m cz_gym.play: {play.NO_DISPLAY}\n"
 
 
 def test_the_command_prints_the_score(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ from scipy.integrate import trapezoid
 from cz_gym import HURLE, CzEnv, Parameters, make_puller
 from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
-from cz_gym.rendering import chart, geometry, palette, pixels, triple_point
+from cz_gym.rendering import chart, geometry, palette, triple_point
 from cz_gym.rendering.canvas import Canvas
 from cz_gym.rendering.geometry import error_range, meniscus_curve, ring_height
 from cz_gym.rendering.numbers_panel import SetPoints, groups
@@ -172,14 +172,3 @@ def test_the_picture_of_a_failed_crystal_has_a_band_that_says_so(pull: float, en
     assert record.ending is ending
     box = layout(*SIZE).triple_point
     assert near(frame, palette.ALARM, 5.0)[round(box.y) : round(box.y) + 30].sum() > 0.3 * 20 * box.w
-
-
-def test_a_picture_is_the_mean_of_one_of_twice_its_resolution(rng: np.random.Generator) -> None:
-    fine, half = pygame.Surface((86, 34), 0, 32), pygame.Surface((43, 17), 0, 32)
-    colours = rng.integers(0, 256, (86, 34, 3), np.uint8)
-    colours[:4, :4] = (255, 0, 255)
-    pygame.surfarray.blit_array(fine, colours)
-    pixels.halve(fine, half)
-    mean = np.floor(colours.reshape(43, 2, 17, 2, 3).mean(axis=(1, 3)) + 0.5)
-    np.testing.assert_array_equal(pygame.surfarray.array3d(half), mean)
-    np.testing.assert_array_equal(pixels.colours(half), mean.swapaxes(0, 1))

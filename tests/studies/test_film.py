@@ -8,7 +8,6 @@ import pytest
 
 from cz_gym.rendering import palette
 from cz_gym.rendering.canvas import TIMES, Canvas
-from cz_gym.rendering.pixels import colours
 from studies.film import __main__ as film
 from studies.film.duel import draw
 
@@ -53,7 +52,7 @@ def test_each_side_is_drawn_in_its_own_colour() -> None:
     sides, canvas = film.contestants(1), Canvas(*film.SIZE)
     for side in sides:
         side.step_to(200)
-    picture = colours(draw(canvas, sides)).astype(np.float64)[: film.SIZE[1] * 7 // 10]
+    picture = draw(canvas, sides).astype(np.float64)[: film.SIZE[1] * 7 // 10]
     for side, half in zip(sides, np.array_split(picture, 2, axis=1), strict=True):
         near = {one.colour: (np.linalg.norm(half - one.colour, axis=-1) < 30.0).sum() for one in sides}
         assert max(near, key=lambda colour: near[colour]) == side.colour
