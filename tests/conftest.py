@@ -23,7 +23,7 @@ settings.register_profile("long", deadline=None, database=None, max_examples=20_
 settings.load_profile("repeatable")
 
 HOUR = 3600.0
-TRAINING = ("torch", "stable_baselines3", "sb3_contrib", "safetensors", "optuna", "tensorboard")
+TRAINING = ("torch", "stable_baselines3", "sb3_contrib", "safetensors", "tensorboard")
 ABSENT = tuple(name for name in TRAINING if importlib.util.find_spec(name) is None)
 if sys.platform == "win32":
     collect_ignore = ["stress"]  # signals, pipes and limits of memory as POSIX has them

@@ -6,8 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import numpy as np
-
 from cz_gym.baselines.analysis.frequency import crossover, sensitivity
 from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign
@@ -24,45 +22,33 @@ from cz_gym.physics.linearisation import radius_model
 from cz_gym.physics.plant import Puller, make_puller
 from cz_gym.units import HOUR, MINUTE, MM
 
-from .optimisers import cobyla, explore_and_refine
-from .search import Figures, Goal, Parameter, Search, Trial
+from .search import Figures, Goal, Parameter
 
 
 @dataclass(frozen=True)
 class PIDGoal(Goal):
-    """Least observable RMSE plus priced pull steps, failures and broken rules [mm]."""
+    """Least observable RMSE plus priced pull steps, failures and broken limits [mm]."""
 
     failure_price: ClassVar[float] = 5.0
+    miss_price: ClassVar[float] = 2.0
+    """Price of a broken limit [mm]."""
     step_price: ClassVar[float] = 0.2
     """Price of the pull step RMS [mm per mm/min]."""
-    excess_price: ClassVar[float] = 20.0
-    """Price of its excess over ``allowed_step`` [mm per mm/min]."""
-    rule_price: ClassVar[float] = 2.0
-    """Price of broken rules [mm]."""
 
-    allowed_step: float = np.inf
-    """Pull step RMS without extra price [mm/min]."""
-    rules: tuple[Callable[[Any], float], ...] = ()
-    """Functions of the controller that return its relative breach of a rule; 0 if it keeps the rule."""
+    limits: tuple[Callable[[Figures, Any], float], ...] = ()
+    """Slacks by figures and controller."""
 
     def policy(self, settings: Any, config: Config) -> Any:
         """The controller, which is its own settings, for an environment."""
         return settings.for_config(config)
 
-    def cost(self, found: Figures, policy: Any) -> float:
+    def objective(self, found: Figures) -> float:
         """The priced sum [mm]."""
-        excess = max(0.0, found.pull_step - self.allowed_step)
-        return (
-            found.rmse_mm
-            + self.step_price * found.pull_step
-            + self.excess_price * excess
-            + self.failure_price * found.failure_rate
-            + self.rule_price * sum(rule(policy) for rule in self.rules)
-        )
+        return found.rmse_mm + self.step_price * found.pull_step + self.failure_price * found.failure_rate
 
-    def propose(self, search: Search) -> None:
-        """Explore, then refine."""
-        explore_and_refine(search)
+    def slack(self, found: Figures, policy: Any) -> tuple[float, ...]:
+        """The slack of each limit."""
+        return tuple(limit(found, policy) for limit in self.limits)
 
 
 # A gain above 2 kW/K would improve the radius, and pass the pyrometer's noise to the heater.
@@ -94,8 +80,10 @@ ROBUST = (Parameter("T_track", 10.0, HOUR), Parameter("jump", 0.05 * MM, 2.0 * M
 """Parameters for limited drives and faulty cameras."""
 SENSITIVITY = 2.7
 """Limit of the sensitivity peak of a tuned loop, that of the printed controller [-]."""
-SENSITIVITY_PRICE = 0.02
-"""Weight of the sensitivity peak's excess in comparison with other rules [-]."""
+SENSITIVITY_WEIGHT = 0.02
+"""Weight of the relative slack of the sensitivity peak [-]."""
+STEP, STEP_WEIGHT = 0.029, 10.0
+"""Limit of the pull step RMS [mm/min], and the weight of its slack [1/(mm/min)]."""
 
 
 def models_of(policy: FilteredPID) -> tuple[Puller, Puller]:
@@ -103,37 +91,34 @@ def models_of(policy: FilteredPID) -> tuple[Puller, Puller]:
     return make_puller(policy.parameters, 1.0, policy.meniscus), make_puller(policy.parameters, 0.0, policy.meniscus)
 
 
-def too_sensitive(policy: FilteredPID) -> float:
-    """Excess of the sensitivity peak over SENSITIVITY on the worse of Models I and II: relative, priced [-]."""
+def calm(found: Figures, policy: FilteredPID) -> float:
+    """Slack of the pull steps, weighted [-]."""
+    return STEP_WEIGHT * (STEP - found.pull_step)
+
+
+def insensitive(found: Figures, policy: FilteredPID) -> float:
+    """Relative slack of the sensitivity peak on the worse of Models I and II, weighted [-]."""
     free, dt = linear_form(policy).free, policy.control_interval
-    return SENSITIVITY_PRICE * max(0.0, *(sensitivity(free, p, dt) / SENSITIVITY - 1.0 for p in models_of(policy)))
+    return SENSITIVITY_WEIGHT * (1.0 - max(sensitivity(free, p, dt) for p in models_of(policy)) / SENSITIVITY)
 
 
-def over_half_the_zero(policy: FilteredPID) -> float:
-    """Relative excess of the crossover over half the zero on Models I and II [-], the paper's rule without compensator.
+def below_half_the_zero(found: Figures, policy: FilteredPID) -> float:
+    """Relative slack of the crossover below half the zero on Models I and II [-]: the paper's rule without compensator.
 
-    The loop is sampled.
+    The loop is sampled. Where the gain never falls through one, the rule is kept.
     """
     free, dt = linear_form(policy).free, policy.control_interval
     zeros = ((p, radius_model(p, policy.meniscus).zero) for p in models_of(policy))
-    return max(0.0, *(crossover(free, p, dt) / (0.5 * zero) - 1.0 for p, zero in zeros))
+    return 1.0 - max(0.0, *(crossover(free, p, dt) / (0.5 * zero) for p, zero in zeros))
 
 
 PIDS: dict[str, dict[str, Any]] = {
-    "paper-tuned": {
-        "parameters": (*LOOP, *COMPENSATOR),
-        "allowed_step": 0.029,
-        "rules": (too_sensitive,),
-    },
+    "paper-tuned": {"parameters": (*LOOP, *COMPENSATOR), "limits": (calm, insensitive)},
     "paper-filtered": {"parameters": (Parameter("T_f", 2.0, 200.0),)},
-    "pid-conventional": {
-        "parameters": LOOP,
-        "allowed_step": 0.029,
-        "rules": (over_half_the_zero, too_sensitive),
-    },
+    "pid-conventional": {"parameters": LOOP, "limits": (calm, below_half_the_zero, insensitive)},
     "industrial": {"parameters": (Parameter("T_f", 1.0, MINUTE), *HEATER)},
 }
-"""Parameters and rules of the PIDs, as arguments of :class:`PIDGoal`."""
+"""Parameters and limits of the PIDs, as arguments of :class:`PIDGoal`."""
 
 
 def _pid_goal(name: str, scenario: Scenario) -> PIDGoal:
@@ -154,8 +139,6 @@ class LQGGoal(Goal):
     """Price of the relative excess over a limit."""
     emphasis: ClassVar[float] = 10.0
     """Weight of the return of a step, or of the relative radius error."""
-    heater_factors: ClassVar[tuple[float, ...]] = (1.0, 3.0, 10.0)
-    """Factors on the weight of heater steps, tried with every finalist: the search hardly sees this weight."""
 
     rmse_mm: float
     """Limit of the observable radius error [mm]."""
@@ -173,26 +156,9 @@ class LQGGoal(Goal):
         cost = -found.mean_return / found.steps if self.by_return else found.rmse_mm / self.rmse_mm
         return self.emphasis * cost + self.failure_price * found.failure_rate
 
-    def slack(self, found: Figures) -> tuple[float, float]:
+    def slack(self, found: Figures, policy: Any) -> tuple[float, float]:
         """Relative distances to the limits, negative beyond them."""
         return 1.0 - found.rmse_mm / self.rmse_mm, 1.0 - found.pull_step / self.pull_step
-
-    def cost(self, found: Figures, policy: Any) -> float:
-        """The objective plus the price of missed limits."""
-        return self.objective(found) + self.miss_price * sum(max(0.0, -slack) for slack in self.slack(found))
-
-    def propose(self, search: Search) -> None:
-        """COBYLA from the goal's start."""
-        cobyla(search, self.objective, self.slack)
-
-    def finalists(self, best: list[Trial]) -> list[tuple[float, ...]]:
-        """The best candidates, each also with heavier weights on heater steps."""
-        at = [p.path for p in self.parameters].index("weights.heater_step")
-        return [
-            (*values[:at], factor * values[at], *values[at + 1 :])
-            for values in (trial.values for trial in best)
-            for factor in self.heater_factors
-        ]
 
 
 LQG_PARAMETERS = tuple(Parameter(path, 1e-4, 1e4) for path in SEARCHED)

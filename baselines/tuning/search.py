@@ -1,8 +1,9 @@
 """A search of a controller's settings: candidates, history, resume, choice on validation seeds.
 
-Candidates are scored on training seeds, and every one of them is kept in a file. The best ones, the finalists, are
-scored on validation seeds; the best of these is chosen and written into the same file. Test seeds are never used. The
-same command continues a search that was stopped.
+SciPy's COBYLA proposes candidates, beginning with the settings that ship. They are scored on training seeds, and every
+one of them is kept in a file. The best ones, the finalists, are scored on validation seeds; the best of these is chosen
+and written into the same file. Test seeds are never used. COBYLA is deterministic: the same command meets the
+candidates of a search that was stopped again, measures none of them again, and continues.
 """
 
 from __future__ import annotations
@@ -17,8 +18,11 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
+import numpy as np
+
 from cz_gym.atomic_files import check_writable, naming, write_files
 from cz_gym.baselines.lqg.regulator import STEP_TIME
+from cz_gym.baselines.policy import Floats
 from cz_gym.config import Config
 from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
@@ -27,8 +31,14 @@ from cz_gym.evaluation.rollout import rollout
 
 DIGITS = 4
 """Number of significant digits of a candidate's values."""
+FIRST_STEP = 0.5
+"""COBYLA's first step, in natural logarithms of the parameters."""
+LINEAR = 5.0
+"""Length of a range that is not searched logarithmically, in the same units."""
+FINALISTS = 3
+"""Number of candidates that are scored on validation seeds, on twice as many episodes as training candidates."""
 SURVIVAL_SEEDS = TRAINING_SEEDS[100_000:]
-"""Training seeds of the episodes that only have to be survived."""
+"""Training seeds of the episodes that only have to be survived: a fifth of the episodes of a candidate."""
 
 
 class Parameter(NamedTuple):
@@ -40,6 +50,16 @@ class Parameter(NamedTuple):
     high: float
     log: bool = True
     """Whether the range is searched logarithmically."""
+
+    def coordinate(self, value: float) -> float:
+        """The place of a value in the space of the search."""
+        inside = min(max(value, self.low), self.high)
+        return math.log(inside) if self.log else LINEAR * (inside - self.low) / (self.high - self.low)
+
+    def value(self, coordinate: float) -> float:
+        """The value at a place, within the range, with the digits of a candidate."""
+        free = math.exp(coordinate) if self.log else self.low + (self.high - self.low) * coordinate / LINEAR
+        return float(f"{min(max(free, self.low), self.high):.{DIGITS}g}")
 
 
 class Figures(NamedTuple):
@@ -97,11 +117,6 @@ def with_value(settings: Any, path: str, value: float) -> Any:
     return change(**{head: new})
 
 
-def rounded(values: Iterable[float]) -> tuple[float, ...]:
-    """Values to the significant digits of a candidate."""
-    return tuple(float(f"{value:.{DIGITS}g}") for value in values)
-
-
 def file_name(controller: str, scenario: str) -> str:
     """Name of a search's file in results/tuning."""
     return f"{controller}.json" if scenario == "randomized" else f"{controller}-{scenario}.json"
@@ -109,7 +124,7 @@ def file_name(controller: str, scenario: str) -> str:
 
 @dataclass(frozen=True)
 class Goal(ABC):
-    """The aim of a controller's search on a scenario."""
+    """The aim of a controller's search on a scenario: the least objective within limits."""
 
     start: Any
     """Settings with which the search begins; what is no parameter stays as it is here."""
@@ -119,47 +134,79 @@ class Goal(ABC):
 
     failure_price: ClassVar[float]
     """Cost of losing every crystal."""
+    miss_price: ClassVar[float]
+    """Price of a negative slack."""
 
     @abstractmethod
     def policy(self, settings: Any, config: Config) -> Any:
         """The controller with these settings."""
 
     @abstractmethod
-    def cost(self, found: Figures, policy: Any) -> float:
-        """Score of the figures on the scenario itself, failures included; less is better."""
+    def objective(self, found: Figures) -> float:
+        """What is minimised within the limits, failures included."""
 
     @abstractmethod
-    def propose(self, search: Search) -> None:
-        """Add candidates to the search, as its budget allows."""
+    def slack(self, found: Figures, policy: Any) -> tuple[float, ...]:
+        """Distances to the limits, negative beyond them."""
 
-    def finalists(self, best: list[Trial]) -> list[tuple[float, ...]]:
-        """Values of the candidates that are scored on validation seeds."""
-        return [trial.values for trial in best]
+    def cost(self, found: Figures, policy: Any) -> float:
+        """The objective plus the price of missed limits: the score of the figures on the scenario itself."""
+        return self.objective(found) + self.miss_price * sum(max(0.0, -each) for each in self.slack(found, policy))
 
 
 class Search:
     """The search of a controller's settings in an environment."""
 
     def __init__(
-        self, controller: str, goal: Goal, config: Config, budget: Mapping[str, int], measure: Measure = measure
+        self, controller: str, goal: Goal, config: Config, trials: int, episodes: int, measure: Measure = measure
     ) -> None:
-        """``budget`` holds the options of the command line that bound the search; tests replace ``measure``."""
+        """At most ``trials`` candidates, each on ``episodes`` training episodes; tests replace ``measure``."""
         self.controller, self.goal, self.config, self.measure = controller, goal, config, measure
-        self.parameters, self.budget, self.trials = goal.parameters, dict(budget), list[Trial]()
+        self.budget, self.trials = {"trials": trials, "episodes": episodes}, list[Trial]()
         self.path: Path | None = None
         """File of the trials; None for none."""
+
+    @property
+    def first(self) -> tuple[float, ...]:
+        """The values with which the search begins: those of the goal's start, within their ranges."""
+        return tuple(p.value(p.coordinate(value_at(self.goal.start, p.path))) for p in self.goal.parameters)
 
     def settings(self, values: Iterable[float]) -> Any:
         """The settings with these values of the parameters."""
         settings = self.goal.start
-        for parameter, value in zip(self.parameters, values, strict=True):
+        for parameter, value in zip(self.goal.parameters, values, strict=True):
             settings = with_value(settings, parameter.path, value)
         return settings
 
-    def add(self, values: Iterable[float]) -> Trial:
+    def explore(self) -> None:
+        """Minimise the objective with COBYLA while every slack is positive."""
+        from scipy.optimize import NonlinearConstraint, minimize
+
+        goal = self.goal
+
+        def found(point: Floats) -> tuple[Figures, Any]:
+            values = tuple(p.value(x) for p, x in zip(goal.parameters, point, strict=True))
+            known = {trial.values: trial for trial in self.trials}
+            figures = (known.get(values) or self.add(values)).facts["figures"]
+            return Figures(**figures), goal.policy(self.settings(values), self.config)
+
+        def slack(point: Floats) -> tuple[float, ...]:
+            return goal.slack(*found(point))
+
+        start = np.array([p.coordinate(value) for p, value in zip(goal.parameters, self.first, strict=True)])
+        limits: Any = [NonlinearConstraint(slack, 0.0, np.inf)] if slack(start) else []
+        options: Any = {"maxiter": self.budget["trials"], "rhobeg": FIRST_STEP, "tol": 1e-3}
+
+        def minimised(point: Floats) -> float:
+            return goal.objective(found(point)[0])
+
+        minimize(minimised, start, method="COBYLA", constraints=limits, options=options)
+
+    def add(self, values: tuple[float, ...]) -> Trial:
         """Score a candidate on training episodes; one that would be the best must also survive other scenarios."""
-        values = rounded(values)
-        trial = self._scored(values, TRAINING_SEEDS[: self.budget["episodes"]], self.budget["survive"], self.best_score)
+        episodes = self.budget["episodes"]
+        best = min((trial.score for trial in self.trials), default=math.inf)
+        trial = self._scored(values, TRAINING_SEEDS[:episodes], episodes // 5, best)
         self.trials.append(trial)
         self._write({})
         return trial
@@ -180,40 +227,33 @@ class Search:
         return Trial(values, score + self.goal.failure_price * sum(lost.values()), facts)
 
     def best(self, count: int) -> list[Trial]:
-        """The best candidates without repetition, best first."""
-        each = {trial.values: trial for trial in self.trials}
-        return sorted(each.values(), key=lambda trial: trial.score)[:count]
-
-    @property
-    def best_score(self) -> float:
-        """The best score so far."""
-        return min((trial.score for trial in self.trials), default=math.inf)
+        """The best candidates, best first."""
+        return sorted(self.trials, key=lambda trial: trial.score)[:count]
 
     def tune(self, path: Path) -> Trial:
         """Search, choose, and write the file at ``path``; a search that was stopped continues from its file."""
         check_writable(path.parent)
         self.path = path
         if path.exists():
-            begun, self.trials = self._read(path)
-            if begun != {name: self.budget[name] for name in begun}:
-                raise CzError(f"{path} was begun with {begun}; ask for the same, or write another file")
-        self.goal.propose(self)
-        seeds = VALIDATION_SEEDS[: self.budget["validation"]]
-        finalists = self.goal.finalists(self.best(self.budget["finalists"]))
-        found = [self._scored(rounded(values), seeds, self.budget["finals"]) for values in finalists]
+            episodes, self.trials = self._read(path)
+            if episodes != self.budget["episodes"]:
+                raise CzError(f"{path} was begun with {episodes} episodes; ask for as many, or write another file")
+        self.explore()
+        twice = 2 * self.budget["episodes"]
+        found = [self._scored(trial.values, VALIDATION_SEEDS[:twice], twice) for trial in self.best(FINALISTS)]
         judged = sorted(found, key=lambda trial: trial.score)
         self._write({"chosen": self._entry(judged[0]), "finalists": [self._entry(trial) for trial in judged]})
         return judged[0]
 
-    def _read(self, path: Path) -> tuple[dict[str, int], list[Trial]]:
+    def _read(self, path: Path) -> tuple[int, list[Trial]]:
         """Training episodes and trials of a file; CzError if it is none, or of another search."""
         try:
             with naming(path):
                 found = json.loads(path.read_text("utf-8"))
-            begun = {name: found["budget"][name] for name in ("episodes", "survive")}
             if found["parameters"] != self._paths:
                 raise CzError(f"its parameters are not those of {self.controller}")
-            return begun, [Trial(tuple(values), score, facts) for values, score, facts in found["history"]]
+            trials = [Trial(tuple(values), score, facts) for values, score, facts in found["history"]]
+            return found["budget"]["episodes"], trials
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise CzError(f"{path} is no history of this search: {error!r}") from None
 
@@ -222,7 +262,7 @@ class Search:
 
     @property
     def _paths(self) -> list[str]:
-        return [parameter.path for parameter in self.parameters]
+        return [parameter.path for parameter in self.goal.parameters]
 
     def _write(self, choice: Mapping[str, Any]) -> None:
         if self.path is None:

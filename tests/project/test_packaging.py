@@ -115,7 +115,7 @@ def test_pins_lie_in_the_open_ranges(file: str) -> None:
 
 
 def test_environment_and_baselines_need_neither_torch_nor_plots(tmp_path: Path) -> None:
-    absent = {"torch", "stable_baselines3", "sb3_contrib", "matplotlib", "onnxruntime", "onnx", "optuna", "tensorboard"}
+    absent = {"torch", "stable_baselines3", "sb3_contrib", "matplotlib", "onnxruntime", "onnx", "tensorboard"}
     absent |= {"control", "tqdm", "pygame", "casadi"}
     printed(ABSENT.replace("{absent}", repr(absent)) + SMOKE, ROOT, tmp_path)
 
