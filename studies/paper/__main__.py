@@ -33,12 +33,11 @@ def _compare(given: argparse.Namespace) -> None:
 
 def contents() -> dict[str, bytes]:
     """The report, its figures and the numbers by file name; runs every experiment."""
-    from .figures import FIGURES
+    from .figures import drawn
     from .report import report
 
     text = json.dumps(numbers(), indent=2, allow_nan=False) + "\n"
-    figures = {figure.file: figure.png() for figure in FIGURES}
-    return {**figures, "report.md": report().encode(), "numbers.json": text.encode()}
+    return {**drawn(), "report.md": report().encode(), "numbers.json": text.encode()}
 
 
 if __name__ == "__main__":

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
-from cz_gym import make_puller
-from cz_gym.baselines.pid.compensated_pid import Compensator
 from cz_gym.evaluation.report.tables import markdown as table
 from cz_gym.physics.linearisation import RadiusModel
 from cz_gym.units import HOUR, MM
 
-from . import beyond_paper as beyond
 from . import experiments as ex
 from .published import COMPENSATOR, CROSSOVER, ODE, PHASE_MARGIN_DEG, PUBLISHED, ZERO
 
@@ -39,7 +37,7 @@ class Row(NamedTuple):
 def rows() -> list[Row]:
     """The whole comparison, in the paper's order."""
     parts = [_linear_rows(model, ex.linear_model("own", model)) for model in ex.MODELS]
-    parts += [part() for part in (_compensator_rows, _margin_rows, _response_rows, _meniscus_rows)]
+    parts += [part() for part in (_compensator_rows, _margin_rows, _response_rows)]
     return [row for part in parts for row in part]
 
 
@@ -80,26 +78,15 @@ def _linear_rows(model: str, ours: RadiusModel) -> list[Row]:
 
 def _compensator_rows() -> list[Row]:
     published, own = (ex.compensator(source) for source in ex.SOURCES)
-    found = [
+    poles = COMPENSATOR.fast, COMPENSATOR.slow
+    return [
         Row("compensator numerator, procedure on published functions", "1/s", COMPENSATOR.gain, published.gain),
         Row("compensator numerator, procedure on our plant", "1/s", COMPENSATOR.gain, own.gain, "our G_p and G_m"),
         Row("compensator fast pole, our plant", "rad/s", COMPENSATOR.fast, own.fast, "the plant's stable pole"),
         Row("compensator slow pole", "rad/s", COMPENSATOR.slow, own.slow, "the high-pass cut-off"),
+        Row("differential equation, y_pc', printed poles", "rad/s", ODE[0], sum(poles), "sum of the poles"),
+        Row("differential equation, y_pc, printed poles", "rad2/s2", ODE[1], math.prod(poles), "their product"),
     ]
-    for name, found_by, *why in (
-        ("printed poles", COMPENSATOR, "sum of the poles", "their product"),
-        ("published functions", published, "", ""),
-        ("our plant", own, "our stable pole", "our stable pole"),
-    ):
-        for i, (term, unit) in enumerate((("y_pc'", "rad/s"), ("y_pc", "rad2/s2"))):
-            ours = coefficients(found_by)[i]
-            found.append(Row(f"differential equation, {term}, {name}", unit, ODE[i], ours, why[i]))
-    return found
-
-
-def coefficients(found: Compensator) -> tuple[float, float]:
-    """Coefficients of y_pc' [rad/s] and y_pc [(rad/s)^2] in the time domain."""
-    return found.fast + found.slow, found.fast * found.slow
 
 
 def _margin_rows() -> list[Row]:
@@ -128,7 +115,7 @@ def _response_rows() -> list[Row]:
             found.append(Row(f"inverse response, {change}, recovery, Model {m}", "s", None, response.recovery))
         found += [
             Row(f"cases, max of A - 5 B over max of A, {name}, Model {m}", "-", None, value, "plotted, not given")
-            for name, value in ex.case_difference(*ex.cases(m))._asdict().items()
+            for name, value in ex.case_difference(m).items()
         ]
         n = ex.ramp_numbers(ex.ramp(m))
         found += [
@@ -138,13 +125,6 @@ def _response_rows() -> list[Row]:
             Row(f"ramp, lowest pull speed, Model {m}", "mm/min", None, n["v_p_min_mm_per_min"]),
         ]
     return found
-
-
-def _meniscus_rows() -> list[Row]:
-    return [
-        Row("meniscus height, Hurle", "mm", None, make_puller().h_0 / MM),
-        Row("meniscus height, exact Young-Laplace", "mm", None, beyond.exact_height() / MM),
-    ]
 
 
 def number(value: float | None) -> str:

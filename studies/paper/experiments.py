@@ -6,7 +6,6 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from cz_gym import HURLE, MeniscusModel, Scenario, make_puller
 from cz_gym.baselines.analysis.compensator_design import Margins, design_compensator, margins
@@ -65,6 +64,11 @@ class Trace(NamedTuple):
     """Ring minus bias plus compensator [m]; without a compensator, ring minus bias."""
     failed: bool
     """Whether the episode ended in a failure."""
+
+    @property
+    def minutes(self) -> Floats:
+        """Time [min]."""
+        return self.t / MINUTE
 
 
 @cache
@@ -125,23 +129,13 @@ def inverse_response(run: Trace, change: float = -0.1) -> InverseResponse:
     return InverseResponse(float(wrong[lowest]), float(back))
 
 
-class CaseDifference(NamedTuple):
-    """max |A - 5 B| / max |A| of the deviations from the operating point [-]."""
-
-    r_c: float
-    h_c: float
-    alpha_c: float
-    v_p: float
-
-
-def case_difference(a: Trace, b: Trace, scale: float = 5.0) -> CaseDifference:
-    """How nonlinear the loop is between cases A and B."""
-    gaps = []
-    for name in CaseDifference._fields:
-        large, small = (getattr(run.signals, name) for run in (a, b))
-        deviation = large - large[0]
-        gaps.append(np.max(np.abs(deviation - scale * (small - small[0]))) / np.max(np.abs(deviation)))
-    return CaseDifference(*map(float, gaps))
+def case_difference(model: str) -> dict[str, float]:
+    """How nonlinear the loop is between cases A and B: max |A - 5 B| / max |A| of the deviations from rest [-]."""
+    gaps = {}
+    for name in ("r_c", "h_c", "alpha_c", "v_p"):
+        large, small = (getattr(run.signals, name) - getattr(run.signals, name)[0] for run in cases(model))
+        gaps[name] = float(np.max(np.abs(large - 5.0 * small)) / np.max(np.abs(large)))
+    return gaps
 
 
 def cases(model: str) -> tuple[Trace, Trace]:
@@ -155,37 +149,20 @@ def ramp(model: str, policy: Any = PRINTED, meniscus: MeniscusModel = HURLE) -> 
 
 
 def ramp_numbers(run: Trace) -> dict[str, float]:
-    """Errors and lowest pull speed of a ramp."""
+    """Errors of a ramp, how far its crystal swings and how hard its drive works; a lost crystal up to its end."""
     true, seen = errors(run)
+    v_p, v_0, late = run.signals.v_p[1:], make_puller().v_0, run.signals.r_c[run.t >= run.t[-1] - HOUR]
     return {
         "max_error_mm": float(abs(true).max()) / MM,
         "rmse_mm": float((true[1:] ** 2).mean() ** 0.5) / MM,
         "max_compensated_error_mm": float(abs(seen).max()) / MM,
-        "v_p_min_mm_per_min": float(run.signals.v_p.min()) / MM_PER_MIN,
-    }
-
-
-def cycle_numbers(run: Trace) -> dict[str, float]:
-    """How far a ramp's crystal swings and how hard its drive works; a lost crystal up to its end."""
-    late = run.signals.r_c[run.t >= run.t[-1] - HOUR]
-    return {
-        **ramp_numbers(run),
+        "v_p_min_mm_per_min": float(v_p.min()) / MM_PER_MIN,
         "lived_min": float(run.t[-1]) / MINUTE,
-        "at_limit": float(at_pull_limit(run.signals.v_p[1:], make_puller().v_0).mean()),
+        "at_limit": float((np.abs(v_p - v_0) > (1.0 - 1e-6) * v_0).mean()),
         "late_swing_mm": float(late.max() - late.min()) / MM,
     }
-
-
-def at_pull_limit(v_p: Floats, v_0: float) -> npt.NDArray[np.bool_]:
-    """Where a pull speed [m/s] stands at one of its limits, 0 and 2 v_0."""
-    return np.abs(v_p - v_0) > (1.0 - 1e-6) * v_0
 
 
 def errors(run: Trace) -> tuple[Floats, Floats]:
     """r_c - r_ref and r_tilde - r_ref [m]."""
     return run.signals.r_c - run.signals.r_ref, run.r_tilde - run.signals.r_ref
-
-
-def minutes(run: Trace) -> Floats:
-    """Time [min]."""
-    return run.t / MINUTE

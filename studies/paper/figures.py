@@ -1,11 +1,10 @@
-"""The paper's data figures, drawn from our runs in the paper's layout."""
+"""The paper's figures of data, drawn from our runs in the paper's layout."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -22,7 +21,6 @@ from .published import PID
 
 DEGREE = np.pi / 180.0
 BLUE, ORANGE, GREEN = "#1f5fa8", "#d1661f", "#2b8a4b"
-DIAGRAMS = Path(__file__).parent / "diagrams"
 SHOWN = {
     "r_c": (MM, "radius [mm]"),
     "r_ref": (MM, "radius [mm]"),
@@ -58,7 +56,7 @@ def values(run: Trace, name: str) -> Floats:
 
 def draw_signal(axis: Any, run: Trace, name: str, x: str, *style: str, **line: Any) -> None:
     """A signal against time, blue by default, with its axes named; ``x`` names the time axis, "" for one below."""
-    axis.plot(ex.minutes(run), values(run, name), *style, **({"color": BLUE} | line))
+    axis.plot(run.minutes, values(run, name), *style, **({"color": BLUE} | line))
     label(axis, x, SHOWN[name][1])
 
 
@@ -76,7 +74,7 @@ def pull_profile() -> Figure:
     """Pull speed of the open-loop experiment."""
     figure, ((axis,),) = sheet(1, 1, (5.0, 2.4))
     run = _pull_change("I")
-    axis.step(ex.minutes(run)[1:], values(run, "v_p")[1:], color=BLUE)
+    axis.step(run.minutes[1:], values(run, "v_p")[1:], color=BLUE)
     axis.set_ylim(1.05, 1.23)
     label(axis, "time [min]", SHOWN["v_p"][1])
     return figure
@@ -87,7 +85,7 @@ def open_loop_response(model: str) -> Figure:
     run = _pull_change(model)
     figure, ((radii, cone), (height, growth)) = sheet(2, 2, (7.2, 4.8), sharex=True)
     draw_signal(radii, run, "r_c", "", label="$r_c$")
-    radii.plot(ex.minutes(run), ring(run), color=ORANGE, label="$r_{br}$ - bias")
+    radii.plot(run.minutes, ring(run), color=ORANGE, label="$r_{br}$ - bias")
     radii.legend(frameon=False, fontsize=8, loc="lower right")
     inset = radii.inset_axes((0.16, 0.55, 0.5, 0.42))
     early = (run.t >= ex.BEFORE) & (run.t <= ex.BEFORE + 300.0)
@@ -115,8 +113,8 @@ def _frequency(loop: Any, omega: Floats) -> tuple[Floats, Floats]:
     return 20.0 * np.log10(np.abs(response)), phase - 360.0 * np.round((phase[-1] + 135.0) / 360.0)
 
 
-def _bode(compensated: bool) -> tuple[Figure, Any, Any]:
-    """Bode diagram of both models, published functions and our plant, with or without their compensators."""
+def frequency_responses() -> Figure:
+    """Bode diagram of both compensated plants with the PID: published functions and our plant."""
     figure, ((gain,), (phase,)) = sheet(2, 1, (6.4, 5.2), sharex=True)
     omega = np.logspace(-5, 0.5, 500)
     for source, name, line in (
@@ -124,20 +122,12 @@ def _bode(compensated: bool) -> tuple[Figure, Any, Any]:
         ("published", "published", {"linewidth": 1.0, "linestyle": "--"}),
     ):
         for model, color in zip(ex.MODELS, (BLUE, ORANGE), strict=True):
-            loop = open_loop(ex.linear_model(source, model), ex.compensator(source) if compensated else None, PID)
+            loop = open_loop(ex.linear_model(source, model), ex.compensator(source), PID)
             for axis, curve in zip((gain, phase), _frequency(loop, omega), strict=True):
                 axis.semilogx(omega, curve, color=color, label=f"Model {model}, {name}", **line)
-    gain.axhline(0.0, color=GREY, linewidth=0.8)
-    phase.axhline(-180.0, color=GREY, linewidth=0.8)
-    label(phase, "frequency [rad/s]", "phase of L [deg]")
-    return figure, gain, phase
-
-
-def frequency_responses() -> Figure:
-    """Bode diagram of both compensated plants with the PID: published functions and our plant."""
-    figure, gain, phase = _bode(compensated=True)
     margin = ex.loop_margins("own", "I")
-    for axis in (gain, phase):
+    for axis, level in ((gain, 0.0), (phase, -180.0)):
+        axis.axhline(level, color=GREY, linewidth=0.8)
         axis.axvline(margin.crossover, color=GREY, linewidth=0.8, linestyle=":")
     phase.annotate(
         rf"$\omega_c$ = {margin.crossover:.3f} rad/s, $\varphi_m$ = {margin.phase_margin_deg:.0f}° (our Model I)",
@@ -145,18 +135,7 @@ def frequency_responses() -> Figure:
         arrowprops={"arrowstyle": "-", "color": GREY},
     )  # fmt: skip
     label(gain, "", "|L| [dB]", legend=True)
-    return figure
-
-
-def margin_sketch() -> Figure:
-    """The paper's sketch of a Bode diagram with a right half plane zero, drawn with the uncompensated plant itself."""
-    figure, gain, phase = _bode(compensated=False)
-    model = ex.linear_model("own", "I")
-    for axis in (gain, phase):
-        axis.axvspan(2.0 * model.poles[0], 0.5 * model.zero, color=GREY, alpha=0.15, label="room for the crossover")
-        axis.axvline(model.zero, color="black", linestyle=":", linewidth=1.0, label="right half plane zero")
-    gain.set_xlim(1e-5, 10.0**0.5)
-    label(gain, "", "|L| [dB]", legend=True)
+    label(phase, "frequency [rad/s]", "phase of L [deg]")
     return figure
 
 
@@ -170,10 +149,10 @@ def case_comparison() -> Figure:
         for axis, name in zip(column, names, strict=True):
             draw_signal(axis, a, name, "time [min]" if name == "v_p" else "", label="case A")
             large, small = values(a, name)[0], values(b, name)
-            axis.plot(ex.minutes(b), large + 5.0 * (small - small[0]), "--", color=ORANGE, label="case B, scaled by 5")
+            axis.plot(b.minutes, large + 5.0 * (small - small[0]), "--", color=ORANGE, label="case B, scaled by 5")
             axis.set_ylabel(SHOWN[name][1] if model == "I" else "")
             axis.set_xlim(0.0, 90.0)
-        column[0].plot(ex.minutes(a), values(a, "r_ref"), ":", color=GREY, label="reference of case A")
+        column[0].plot(a.minutes, values(a, "r_ref"), ":", color=GREY, label="reference of case A")
     axes[0, 0].legend(frameon=False, fontsize=8)
     return figure
 
@@ -182,9 +161,9 @@ def ramp_temperatures() -> Figure:
     """Heater temperature with its reference, and the melt's, during the ramp (Model I)."""
     run = ex.ramp("I")
     figure, ((heater,), (melt,)) = sheet(2, 1, (6.4, 4.2), sharex=True)
-    heater.plot(ex.minutes(run), run.signals.T_1_ref, "--", color=GREY, label="$T_{1,ref}$")
-    heater.plot(ex.minutes(run), run.signals.T_1, color=BLUE, label="$T_1$")
-    melt.plot(ex.minutes(run), run.signals.T_b, color=ORANGE, label="$T_{bulk}$")
+    heater.plot(run.minutes, run.signals.T_1_ref, "--", color=GREY, label="$T_{1,ref}$")
+    heater.plot(run.minutes, run.signals.T_1, color=BLUE, label="$T_1$")
+    melt.plot(run.minutes, run.signals.T_b, color=ORANGE, label="$T_{bulk}$")
     label(heater, "", "temperature [K]", legend=True)
     label(melt, "time [min]", "temperature [K]", legend=True)
     return figure
@@ -198,9 +177,9 @@ def ramp_response(model: str) -> Figure:
     radii = panels.pop("r")
     draw_signal(radii, run, "r_ref", "time [min]", ":", color=GREY, label="$r_{c,ref}$")
     draw_signal(radii, run, "r_c", "time [min]", label="$r_c$ (true)")
-    radii.plot(ex.minutes(run), ring(run), color=ORANGE, linewidth=0.9, label="$r_{br}$ - bias")
+    radii.plot(run.minutes, ring(run), color=ORANGE, linewidth=0.9, label="$r_{br}$ - bias")
     tilde = r"$\tilde r$ (what the controller holds)"
-    radii.plot(ex.minutes(run), values(run, "r_tilde"), "--", color=GREEN, label=tilde)
+    radii.plot(run.minutes, values(run, "r_tilde"), "--", color=GREEN, label=tilde)
     radii.tick_params(labelbottom=True)
     radii.legend(frameon=False, fontsize=8)
     for name, axis in panels.items():
@@ -208,43 +187,22 @@ def ramp_response(model: str) -> Figure:
     return figure
 
 
-class Shown(NamedTuple):
-    """A figure of the report."""
-
-    file: str
-    caption: str
-    draw: Callable[[], Figure] | None = None
-    """None for a block diagram, which is a file."""
-
-    def png(self) -> bytes:
-        """The figure as a PNG file."""
-        return png(self.draw()) if self.draw else (DIAGRAMS / self.file).read_bytes()
-
-
-FIGURES = (
-    Shown("figure_01_pull_profile.png", "Paper's figure 1: pull speed.", pull_profile),
-    *(
-        Shown(f"figure_0{number}_open_loop_{model}.png",
-              f"Paper's figure {number}: plant at constant power, Model {model}.", partial(open_loop_response, model))
-        for number, model in ((2, "I"), (3, "II"))
+FIGURES: dict[str, tuple[str, Callable[[], Figure]]] = {
+    "figure_01_pull_profile.png": ("Figure 1: pull speed.", pull_profile),
+    "figure_02_open_loop_I.png": ("Figure 2: plant at constant power, Model I.", partial(open_loop_response, "I")),
+    "figure_03_open_loop_II.png": ("Figure 3: plant at constant power, Model II.", partial(open_loop_response, "II")),
+    "figure_09_bode.png": ("Figure 9: compensated loops.", frequency_responses),
+    "figure_11_cases.png": ("Figure 11: cases A and B.", case_comparison),
+    "figure_12_temperatures.png": (
+        "Figure 12: temperatures; Model II's are identical, as the thermal chain does not depend on it.",
+        ramp_temperatures,
     ),
-    Shown("figure_04_series.png", "Paper's figure 4: plant and measurement."),
-    Shown("figure_05_feedback.png", "Paper's figure 5: feedback."),
-    Shown("figure_06_bode_sketch.png",
-          "Paper's figure 6, there a sketch, here the uncompensated plant: the PID's crossover lies beyond the zero.",
-          margin_sketch),
-    Shown("figure_07_parallel.png", "Paper's figure 7: parallel compensation."),
-    Shown("figure_08_loop.png", "Paper's figure 8: the linear loop."),
-    Shown("figure_09_bode.png", "Paper's figure 9: compensated loops.", frequency_responses),
-    Shown("figure_10_tested_loop.png", "Paper's figure 10: the loop on the plant."),
-    Shown("figure_11_cases.png", "Paper's figure 11: cases A and B.", case_comparison),
-    Shown("figure_12_temperatures.png",
-          "Paper's figure 12: temperatures; Model II's are identical, as the thermal chain does not depend on it.",
-          ramp_temperatures),
-    *(
-        Shown(f"figure_{number}_ramp_{model}.png", f"Paper's figure {number}: the ramp, Model {model}.",
-              partial(ramp_response, model))
-        for number, model in ((13, "I"), (14, "II"))
-    ),
-)  # fmt: skip
-"""Every figure, in the paper's order."""
+    "figure_13_ramp_I.png": ("Figure 13: the ramp, Model I.", partial(ramp_response, "I")),
+    "figure_14_ramp_II.png": ("Figure 14: the ramp, Model II.", partial(ramp_response, "II")),
+}
+"""Captions and functions of the figures by file name, numbered as in the paper."""
+
+
+def drawn() -> dict[str, bytes]:
+    """The figures as PNG by file name."""
+    return {name: png(draw()) for name, (_, draw) in FIGURES.items()}

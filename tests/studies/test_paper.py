@@ -12,15 +12,14 @@ from cz_gym.baselines import CompensatedPID
 from cz_gym.baselines.pid.compensated_pid import SeriesPID
 from cz_gym.physics.linearisation import radius_model
 from studies.paper import __main__ as paper
-from studies.paper import beyond_paper, comparison
-from studies.paper.comparison import coefficients
+from studies.paper import comparison, report
 from studies.paper.experiments import (
     BARE,
-    cycle_numbers,
     errors,
     inverse_response,
     pull_change,
     ramp,
+    ramp_numbers,
     trace,
 )
 from studies.paper.figures import FIGURES
@@ -42,24 +41,23 @@ def test_the_committed_numbers_come_out(numbers):
 @pytest.mark.slow
 def test_the_command_writes_the_report_with_its_figures(tmp_path, numbers, monkeypatch):
     """With two cut-offs, for speed."""
-    monkeypatch.setattr(beyond_paper, "CUT_OFFS", (2e-4, 2e-3))
+    monkeypatch.setattr(report, "CUT_OFFS", (2e-4, 2e-3))
     assert paper.main(["--out", str(tmp_path)]) == 0
     assert json.loads((tmp_path / "numbers.json").read_text()) == numbers
-    report = (tmp_path / "report.md").read_text()
-    assert {path.name for path in tmp_path.iterdir()} == {f.file for f in FIGURES} | {"report.md", "numbers.json"}
+    written = (tmp_path / "report.md").read_text()
+    assert {path.name for path in tmp_path.iterdir()} == {*FIGURES} | {"report.md", "numbers.json"}
     for figure in FIGURES:
-        assert (tmp_path / figure.file).read_bytes().startswith(b"\x89PNG")
-        assert figure.file in report
-    assert "nan" not in report
+        assert (tmp_path / figure).read_bytes().startswith(b"\x89PNG")
+        assert figure in written
+    assert "nan" not in written
     for printed in ("0.03275", "do not follow from the", "-0.22517", "0.001884", "3.368e-07", "chain does not depend"):
-        assert printed in report
+        assert printed in written
 
 
 def test_ode_follows_from_the_printed_poles():
     """The paper's time-domain form of its compensator has the same two poles."""
     poles = sorted(np.roots([1.0, *ODE]))
     assert poles == pytest.approx([-COMPENSATOR.fast, -COMPENSATOR.slow], rel=1e-3)
-    assert coefficients(COMPENSATOR) == pytest.approx(ODE, rel=1e-3)
 
 
 def test_without_the_compensator():
@@ -67,7 +65,7 @@ def test_without_the_compensator():
     bare = {m: ramp(m, BARE) for m in ("I", "II")}
     assert bare["II"].failed
     assert not bare["I"].failed
-    cycle, printed = (cycle_numbers(run) for run in (bare["I"], ramp("I")))
+    cycle, printed = (ramp_numbers(run) for run in (bare["I"], ramp("I")))
     assert cycle["at_limit"] > 0.3 > 0.001 > printed["at_limit"]
     assert cycle["late_swing_mm"] < 2.0
     assert cycle["rmse_mm"] < 0.5 < printed["rmse_mm"]
@@ -82,11 +80,6 @@ def test_inverse_response_against_a_double_integrator():
     rate = abs(model.numerator * puller.v_0 * change)
     assert found.depth == pytest.approx(rate * model.lead**2 / (2.0 * model.constant), rel=0.01)
     assert found.recovery == pytest.approx(2.0 / model.zero, rel=0.01)
-
-
-def test_no_inverse_response_is_said():
-    with pytest.raises(ArithmeticError, match="no inverse response"):
-        inverse_response(pull_change("I", 0.0, horizon=60.0))
 
 
 def test_what_model_ii_leaves_out():
