@@ -23,7 +23,6 @@ from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser
 
 from .cases import SLOTS, THREADS, Case, Stepper, cases, stepper
-from .costs import costs
 
 
 class Plan(NamedTuple):
@@ -139,24 +138,17 @@ def table(result: dict[str, Any]) -> str:
     lines += [f"{skipped['name']:44}skipped: {skipped['why']}" for skipped in result["skipped"]] + [""]
     for name, value in result["ratios"].items():
         shown = "-" if value is None else f"{value:.2f}"
-        lines.append(f"{name:44}{shown:>10} x   (at least {RATIOS[name].promised:g} x)")
-    lines += [f"{name:44}{value:10.2f}" for name, value in {**result["figures"], **result["costs"]}.items()]
+        aim = RATIOS[name].promised
+        lines.append(f"{name:44}{shown:>10} x" + (f"   (at least {aim:g} x)" if aim else ""))
     return "\n".join(lines)
 
 
 def run(quick: bool, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
     """Measure everything; the content of the JSON file."""
-    plan, wanted = QUICK if quick else FULL, cases(quick)
-    progress("memory, resets, start-up")
-    measured_costs = costs(quick)
-    rows, skipped = measure(wanted, plan, progress)
-    found = {name: ratio(rows, asked) for name, asked in RATIOS.items()}
-    reported = {name: value for name, value in found.items() if RATIOS[name].promised is None and value is not None}
+    rows, skipped = measure(cases(quick), QUICK if quick else FULL, progress)
     return {
-        "ratios": {name: value for name, value in found.items() if RATIOS[name].promised is not None},
+        "ratios": {name: ratio(rows, asked) for name, asked in RATIOS.items()},
         "rows": [row._asdict() for row in rows],
-        "figures": reported,
-        "costs": measured_costs,
         "skipped": [one._asdict() for one in skipped],
         "threads": THREADS,
     }

@@ -12,7 +12,6 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config
 from cz_gym.differentiable import DifferentiableBatch
 from cz_gym.engine.batch import Batch
@@ -26,8 +25,6 @@ THREADS = processors()
 """Threads that the larger cases may use."""
 SLOTS, SB3_SLOTS = 1024, 256
 """Slots of the batches that are compared, and of those behind stable-baselines3."""
-SIZES = (1, 16, 256, SLOTS, 4096)
-"""Slots whose cost a step is compared."""
 UNFAILED = 50
 """Steps that every crystal survives in open loop."""
 
@@ -52,12 +49,13 @@ class Case(NamedTuple):
 def cases(quick: bool) -> list[Case]:
     """Every row, in the table's order."""
     threads = sorted({1, THREADS})
-    one, *more = threads
     return [
-        *(Case(f"{name} scalar", partial(gym.make, name)) for name in ("Cz-v0", "Pendulum-v1", "CartPole-v1")),
-        *(Case(f"Cz-v0 batch, measured, {_threads(one)}", partial(ours, n)) for n in SIZES),
-        *(Case(f"Cz-v0 batch, measured, {_threads(n)}", partial(ours, SLOTS, n)) for n in more),
-        *(Case(f"Cz-v0 batch, history, {_threads(n)}", partial(ours, SLOTS, n, "history")) for n in threads),
+        *(Case(f"{name} scalar", partial(gym.make, name)) for name in ("Cz-v0", "Pendulum-v1")),
+        *(
+            Case(f"Cz-v0 batch, {seen}, {_threads(n)}", partial(ours, SLOTS, n, seen))
+            for seen in ("measured", "history")
+            for n in threads
+        ),
         *(
             Case(f"{name}, {_threads(n)}", partial(make, SLOTS, n))
             for n in threads
@@ -66,7 +64,6 @@ def cases(quick: bool) -> list[Case]:
         Case("step without derivatives", partial(differentiable, False)),
         Case("step with derivatives", partial(differentiable, True)),
         Case("plain NumPy plant and ring", partial(plain_numpy, SLOTS)),
-        Case("CartPole-v1 native batch", lambda: gym.make_vec("CartPole-v1", SLOTS, "vector_entry_point")),
         *(Case(f"EnvPool Pendulum-v1, {_threads(n)}", partial(_envpool, SLOTS, n)) for n in threads),
         Case("pc-gym CSTR", _pcgym),
         Case("SB3 adapter over the batch", _sb3_adapter),
@@ -80,8 +77,6 @@ def cases(quick: bool) -> list[Case]:
             Case(f"SB3 SubprocVecEnv, {n} processes", partial(_sb3, "SubprocVecEnv", n, start_method=_START))
             for n in ((2,) if quick else (2, 16))
         ),
-        Case("render() of a record of 15 min", partial(rendered, 15)),
-        Case("render() of a record of 3 h", partial(rendered, 179)),
         Case("Cz-v0 scalar, camera", partial(CzEnv, "nominal", observation="camera")),
     ]
 
@@ -173,17 +168,6 @@ def plain_numpy(num_envs: int) -> Stepper:
         HURLE.ring_offset(x.r_c, x.h_c, p)
 
     return Stepper(num_envs, step)
-
-
-def rendered(minutes: int) -> Stepper:
-    """Repeated rendering, 640 x 480, of a crystal pulled by the paper's controller for that many minutes."""
-    env = CzEnv("randomized", observation="measured", render_mode="rgb_array")
-    paper, state = find_controller("paper").make(env.config), None
-    observation, _ = env.reset(seed=1)
-    for _ in range(round(60 * minutes / env.config.control_interval)):
-        action, state = paper.predict(observation, state)
-        observation, *_ = env.step(action)
-    return Stepper(1, env.render, env.close)
 
 
 def _envpool(num_envs: int, threads: int) -> Stepper:
