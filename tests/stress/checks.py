@@ -1,6 +1,5 @@
 """What must hold after every step of every slot, whatever was done: :class:`Watch`."""
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -31,20 +30,6 @@ class Broken(AssertionError):
     """Something that must hold after every step does not; the message is one line."""
 
 
-Extremes = dict[str, tuple[float, float]]
-"""The least and the greatest of each value that was seen, SI units."""
-
-
-def joined(parts: Iterable[Extremes]) -> Extremes:
-    """The extremes of all."""
-    whole: Extremes = {}
-    for part in parts:
-        for name, (least, most) in part.items():
-            known = whole.get(name, (least, most))
-            whole[name] = min(known[0], least), max(known[1], most)
-    return whole
-
-
 class Watch:
     """Checks everything an environment returns, and its heat balance; autoreset NEXT_STEP."""
 
@@ -54,7 +39,7 @@ class Watch:
         self._over = np.zeros(env.num_envs, np.bool_)
         self._call = 0
         self.episodes = self.failures = 0
-        self.extremes: Extremes = {}
+        self.missing_heat = 0.0
 
     def begin(self, observation: Array, infos: dict[str, Any]) -> None:
         """Check what the reset returned."""
@@ -74,10 +59,9 @@ class Watch:
         self._check_ends(ran, terminated, truncated, infos)
         self._check_rewards(ran, reward, terminated)
         self._check_drives(ran, actions, infos)
-        missing = self._check_heat(ran & ~terminated, infos)
+        self._check_heat(ran & ~terminated, infos)
         self.episodes, self.failures = self.episodes + int(over.sum()), self.failures + int(terminated.sum())
         self._over = over
-        self._note(reward, infos, missing)
 
     def _need(self, fact: Any, what: str) -> None:
         if not np.all(fact):
@@ -129,8 +113,8 @@ class Watch:
         said = infos["action_clipped"] == (np.abs(actions) > 1.0).any(axis=1)
         self._need(~ran | said, "info 'action_clipped' is wrong")
 
-    def _check_heat(self, living: Array, infos: dict[str, Any]) -> Array:
-        """Heat stored over the step is what flowed in less what flowed out; returns what is missing, as a share."""
+    def _check_heat(self, living: Array, infos: dict[str, Any]) -> None:
+        """Heat stored over the step is what flowed in less what flowed out."""
         p, old, new = self._slots["puller"], self._old["x"], self._slots["x"]
         middle = (self._slots["k"] - 0.5) * self._dt
         melt = melt_left(middle, self._slots["episode"].view(np.recarray))
@@ -141,16 +125,9 @@ class Watch:
         )
         flows = 0.5 * (_losses(p, old) + _losses(p, new))
         gained = self._dt * (infos["Q_H"] - flows - p["Q_i"] + self._slots["Q_d"])
-        missing: Array = np.where(living, np.abs(stored - gained) / (self._dt * p["Q_H_0"]), 0.0)
+        missing = np.where(living, np.abs(stored - gained) / (self._dt * p["Q_H_0"]), 0.0)
         self._need(missing <= BALANCE, "heat appears or disappears")
-        return missing
-
-    def _note(self, reward: Array, infos: dict[str, Any], missing: Array) -> None:
-        x = self._slots["x"]
-        seen = {"radius error": np.abs(infos["r_c"] - infos["r_ref"]), "reward": reward, "missing heat": missing}
-        seen |= {name: infos[name] for name in ("h_c", "alpha_c", "v_g")} | {name: x[name] for name in ("T_1", "T_b")}
-        found = {name: (float(values.min()), float(values.max())) for name, values in seen.items()}
-        self.extremes = joined([self.extremes, found])
+        self.missing_heat = max(self.missing_heat, float(missing.max()))
 
 
 def _losses(p: Array, x: Array) -> Array:

@@ -7,20 +7,17 @@ import io
 import json
 import os
 import resource
-import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import onnx
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from cz_gym.agents import AgentFileError, OnnxPolicy, shipped
 from cz_gym.agents.agent_file.contract import make_contract, read_agent
-from cz_gym.agents.agent_file.graph import OPERATORS
 from cz_gym.agents.training.checkpoint import load_checkpoint, restore, to_bytes
 from cz_gym.agents.training.run_files import COLUMNS, read_rows, read_settings
 from cz_gym.evaluation.cache import read_episode
@@ -28,24 +25,11 @@ from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.rollout import Signals
 from cz_gym.jit.cache import Store
 from tests.samples import contender
-from tests.small_learners import SMALL_SAC, trained
 
 SPARE = 1_000_000_000
 """Memory beyond what is used already [bytes]."""
 ODD = st.sampled_from(
-    (
-        b"",
-        b"\0",
-        b"\xff" * 8,
-        b"\x80\x04.",
-        b"../../../etc/passwd",
-        b"NaN",
-        b"1e999",
-        b"-1",
-        b"x",
-        b"[" * 200,
-        b'{"a":' * 50,
-    )
+    (b"", b"\0", b"\xff" * 8, b"\x80\x04.", b"../../../etc/passwd", b"NaN", b"1e999", b"-1", b"[" * 200, b'{"a":' * 50)
 )
 VALUES = st.one_of(
     st.none(), st.booleans(), st.integers(), st.floats(), st.text(), st.lists(st.integers(), max_size=2),
@@ -71,7 +55,7 @@ def known(ppo: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[s
     folder, contract, network = tmp_path_factory.mktemp("hostile"), *read_agent(shipped())
     facts = {name: value for name, value in vars(contract).items() if name not in ("observation_hash", "sha256")}
     (folder / "agent.onnx").write_bytes(network)
-    sac, store = trained(SMALL_SAC), Store(folder, "kernel")
+    store = Store(folder, "kernel")
     store.save("key", {"code": b"x" * 100})
     episode = io.BytesIO()
     signals = np.zeros((len(Signals._fields), 4))
@@ -85,16 +69,15 @@ def known(ppo: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[s
     def code(path: Path) -> None:
         assert store.load("key") in (None, {"code": b"x" * 100})
 
-    def restored(learner: Any) -> Callable[[Path], None]:
-        return lambda path: restore(learner, load_checkpoint(path)[1], path)
+    def restored(path: Path) -> None:
+        restore(ppo, load_checkpoint(path)[1], path)
 
     targets = {
         "agent.onnx": Target(network, lambda content: OnnxPolicy.of(make_contract(content, **facts), content)),
         "agent.json": kept(
             shipped().with_suffix(".json").read_bytes(), "agent.json", lambda _: read_agent(folder / "agent.onnx")
         ),
-        "checkpoint": kept(to_bytes(ppo, 1.0, 0.5), "ppo.safetensors", restored(ppo)),
-        "sac checkpoint": kept(to_bytes(sac, 1.0, 0.5), "sac.safetensors", restored(sac)),
+        "checkpoint": kept(to_bytes(ppo, 1.0, 0.5), "ppo.safetensors", restored),
         "settings.json": kept(settings.encode(), "settings.json", read_settings),
         "progress.csv": kept(progress.encode(), "progress.csv", read_rows),
         "cached episode": kept(episode.getvalue(), "0.npz", lambda path: read_episode(contender("slow"), path, True)),
@@ -156,57 +139,9 @@ def odd_header(draw: Any, seed: bytes) -> bytes:
     return said.to_bytes(8, "little") + text + seed[8 + size :]
 
 
-@st.composite
-def odd_archive(draw: Any, seed: bytes) -> bytes:
-    """A cached episode whose parts unpack to far more than the file, or claim shapes they do not have."""
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name in ("values", "microseconds", "signals"):
-            shapes = "()", "(15,)", "(13, 4)", "(99999999999,)", "(-1,)", "(1000000, 1000000)"
-            shape, kind = draw(st.sampled_from(shapes)), draw(st.sampled_from(("<f8", "|O", "<f4", "<U9", "<c16")))
-            header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
-            magic = b"\x93NUMPY\x01\0" + len(header).to_bytes(2, "little")
-            rest = b"\0" * draw(st.sampled_from((0, 8, 120, 10_000_000)))
-            archive.writestr(f"{name}.npy", magic + header.encode() + rest)
-    return file.getvalue()
-
-
-@st.composite
-def odd_graph(draw: Any, seed: bytes) -> bytes:
-    """A sound file of an unsound graph: nodes, attributes, shapes and types changed."""
-    model = onnx.load_from_string(seed)
-    nodes = model.graph.node
-    operators = (*OPERATORS, "Loop", "If", "Scan", "Expand", "Tile", "ConstantOfShape", "Einsum")
-    for change in draw(st.lists(st.integers(0, 8), min_size=1, max_size=4)):
-        node, tensor = draw(st.sampled_from(list(nodes))), draw(st.sampled_from(list(model.graph.initializer)))
-        if change == 0:
-            node.op_type = draw(st.sampled_from(operators))
-        elif change == 1 and len(node.input):
-            names = [name for other in nodes for name in (*other.input, *other.output)]
-            node.input[draw(st.integers(0, len(node.input) - 1))] = draw(st.sampled_from(names))
-        elif change == 2:
-            name = draw(st.sampled_from(("axis", "transA", "alpha", "to")))
-            node.attribute.append(onnx.helper.make_attribute(name, 1))
-        elif change == 3:
-            tensor.dims[:] = draw(st.lists(st.sampled_from((0, 1, 2, 72, 2**20, 2**40, -1)), max_size=4))
-        elif change == 4:
-            tensor.data_type = draw(st.integers(0, 23))
-        elif change == 5:
-            tensor.raw_data = draw(st.binary(max_size=600))
-        elif change == 6:
-            tensor.data_location = onnx.TensorProto.EXTERNAL
-            tensor.external_data.add(key="location", value="../../etc/passwd")
-        elif change == 7:
-            nodes.append(node)
-        else:
-            model.opset_import[0].version = draw(st.sampled_from((0, 1, 9, 13, 18, 21, 99, -1)))
-    content: bytes = model.SerializeToString()
-    return content
-
-
 MUTANTS: dict[str, Any] = {
-    "agent.onnx": odd_graph, "agent.json": odd_json, "checkpoint": odd_header, "sac checkpoint": odd_header,
-    "settings.json": odd_json, "progress.csv": odd_bytes, "cached episode": odd_archive, "compiled code": odd_bytes,
+    "agent.onnx": odd_bytes, "agent.json": odd_json, "checkpoint": odd_header, "settings.json": odd_json,
+    "progress.csv": odd_bytes, "cached episode": odd_bytes, "compiled code": odd_bytes,
 }  # fmt: skip
 
 
@@ -217,13 +152,6 @@ def test_damaged_files_are_read_or_refused(known: dict[str, Target], kind: str, 
     assert not refused(read, seed)
     for content in data.draw(st.tuples(MUTANTS[kind](seed), odd_bytes(seed), st.binary(max_size=300))):
         refused(read, content)
-
-
-@pytest.mark.parametrize("kind", MUTANTS)
-def test_files_cut_short_anywhere_are_read_or_refused(known: dict[str, Target], kind: str) -> None:
-    seed, read = known[kind]
-    for end in np.linspace(0, len(seed) - 1, 60).astype(int):
-        refused(read, seed[:end])
 
 
 def test_pipes_devices_and_folders_are_refused_at_once(tmp_path: Path) -> None:
