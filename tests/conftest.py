@@ -16,7 +16,8 @@ from hypothesis import settings
 from scipy.integrate import solve_ivp
 
 os.environ["SDL_VIDEODRIVER"] = os.environ["SDL_AUDIODRIVER"] = "dummy"  # no test opens a window
-os.environ.setdefault("CZ_GYM_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "cz-gym"))
+CACHE = Path(__file__).parents[1] / ".pytest_cache" / "cz-gym"
+os.environ.setdefault("CZ_GYM_CACHE_DIR", str(CACHE))
 
 settings.register_profile("repeatable", deadline=None, derandomize=True, database=None, max_examples=40)
 settings.register_profile("long", deadline=None, database=None, max_examples=20_000)
@@ -27,6 +28,18 @@ TRAINING = ("torch", "stable_baselines3", "sb3_contrib", "safetensors", "tensorb
 ABSENT = tuple(name for name in TRAINING if importlib.util.find_spec(name) is None)
 if sys.platform == "win32":
     collect_ignore = ["stress"]  # signals, pipes and limits of memory as POSIX has them
+
+
+def pytest_sessionstart() -> None:
+    """Of parallel workers one compiles what most tests need, the camera's images too; the others then load it."""
+    if "PYTEST_XDIST_WORKER" in os.environ and importlib.util.find_spec("filelock"):
+        from cz_gym import CzEnv
+        from cz_gym.atomic_files import locked
+
+        with locked(CACHE.with_name("compiling"), patience=600.0):
+            env = CzEnv(observation="camera")
+            env.reset(seed=0)
+            env.step(np.zeros(2, np.float32))
 
 
 def lacks(error: BaseException | None) -> bool:
