@@ -148,7 +148,7 @@ def ekf_mpc(config: Config) -> EkfMpc:
     design = lqg("lqg", config).design
     radius, *others = design.weights
     weights = Weights(radius, *(WEIGHT_FACTOR * weight for weight in others))
-    return EkfMpc(design=replace(design, weights=weights), actuators=config.scenario.actuators).for_config(config)
+    return EkfMpc(design=replace(design, weights=weights), actuators=config.sole_scenario.actuators).for_config(config)
 
 
 def expected_disturbances(estimate: Floats, plan: Floats, gains: Gains, share: float, stages: int) -> Floats:

@@ -11,8 +11,9 @@ from numbers import Real
 from typing import NamedTuple
 
 from cz_gym.camera.view import Camera, camera_for, check_camera
+from cz_gym.episodes.mixture import AnyScenario, Distribution
 from cz_gym.episodes.scenario import Range, Scenario
-from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario, mix_of
+from cz_gym.episodes.scenarios import RANDOMIZED, find_distribution, find_scenario, mix_of
 from cz_gym.errors import CzError
 from cz_gym.jit.code_hash import function_hash
 from cz_gym.names import needs, unknown
@@ -58,7 +59,8 @@ class Identity(NamedTuple):
 class Config:
     """Settings of ``gym.make("Cz-v0", ...)``, checked on construction by :func:`make_config`."""
 
-    scenario: Scenario = RANDOMIZED
+    scenario: Distribution = RANDOMIZED
+    """The scenario, or the mixture of scenarios, from which episodes are drawn."""
     model: str | float | None = None
     observation: str = "measured"
     action: str = "direct"
@@ -76,6 +78,11 @@ class Config:
     def steps(self) -> int:
         """Steps in an episode."""
         return round(self.horizon / self.control_interval)
+
+    @property
+    def sole_scenario(self) -> Scenario:
+        """The scenario of all episodes; CzError if it is a mixture."""
+        return find_scenario(self.scenario)
 
     @property
     def mix(self) -> Range:
@@ -112,9 +119,9 @@ class Config:
         seen = f"camera {tuple(self.camera)}" if self.observation == CAMERA else self.observation
         return Identity(VERSION, self.plant_hash, scenario, mix, seen, self.action, self.control_interval, self.horizon)
 
-    def with_scenario(self, scenario: str | Scenario) -> Config:
-        """The same settings on another scenario."""
-        return replace(self, scenario=find_scenario(scenario))
+    def with_scenario(self, scenario: AnyScenario) -> Config:
+        """The same settings on another scenario or mixture."""
+        return replace(self, scenario=find_distribution(scenario))
 
 
 def check_config(config: Config) -> Config:
@@ -127,7 +134,7 @@ def check_config(config: Config) -> Config:
 
 
 def make_config(
-    scenario: str | Scenario = "randomized",
+    scenario: AnyScenario = "randomized",
     model: str | float | None = None,
     observation: str = "measured",
     control_interval: float = 5.0,
@@ -138,7 +145,7 @@ def make_config(
     action: str = "direct",
 ) -> Config:
     """Check the arguments of the environment; CzError names what was given and what is allowed."""
-    drawn_from = find_scenario(scenario)
+    drawn_from = find_distribution(scenario)
     mix_of(model, drawn_from)
     if not isinstance(observation, str) or observation not in (*OBSERVATIONS, CAMERA):
         raise CzError(unknown("observation", observation, [*OBSERVATIONS, CAMERA]))

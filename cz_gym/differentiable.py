@@ -80,7 +80,7 @@ class DifferentiableBatch:
         parts = GRID / config.control_interval
         if abs(parts - round(parts)) > 1e-9 or round(parts) < 1:
             raise CzError(f"control_interval must divide {GRID:g} s, not be {config.control_interval:g} s")
-        latency = config.scenario.sensor.latency
+        latency = max(scenario.sensor.latency for scenario in config.scenario.scenarios)
         if latency > config.control_interval:
             raise CzError(f"the camera's latency of {latency:g} s is longer than the control interval")
         self.config, self._made_for, self.num_envs = config, config.made_for, int(num_envs)
@@ -160,6 +160,11 @@ class DifferentiableBatch:
     def grows(self) -> npt.NDArray[np.bool_]:
         """Which crystals grew in the last step, shape (n,)."""
         return self._grows
+
+    @property
+    def scenarios(self) -> npt.NDArray[Any]:
+        """Name of each crystal's scenario, shape (n,)."""
+        return self._batch.scenarios.copy()
 
     def close(self) -> None:
         """Stop the threads."""

@@ -16,8 +16,8 @@ from gymnasium.spaces import Box
 from cz_gym.camera.view import IMAGE, Camera
 from cz_gym.engine.batch import Batch, SlotState, new_key
 from cz_gym.engine.layout import Out, check_info
-from cz_gym.episodes.scenario import Scenario
-from cz_gym.episodes.scenarios import find_scenario
+from cz_gym.episodes.mixture import AnyScenario, Mixture
+from cz_gym.episodes.scenarios import find_distribution
 from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.physics.meniscus import MeniscusModel
@@ -73,7 +73,7 @@ def check_options(options: dict[str, Any] | None, allowed: tuple[str, ...] = _OP
 class Copyable:
     """Pickling of both forms of the environment: a copy goes on bit for bit."""
 
-    FACTS: tuple[str, ...] = ("_over", "_begun", "spec", "action_space", "observation_space")
+    FACTS: tuple[str, ...] = ("_over", "_begun", "_named", "spec", "action_space", "observation_space")
     """Attributes that a copy has beside its settings and its slots."""
     _setup: Any
     _settings: tuple[Any, ...]
@@ -129,7 +129,8 @@ class CzEnv(Copyable, gym.Env[Observation, Action]):
     truncated after ``horizon``.
 
     ## Arguments
-    ``scenario`` (name or :class:`cz_gym.Scenario`), ``model`` ("I", "II", a mix in [0, 1], or None for the
+    ``scenario`` (name, :class:`cz_gym.Scenario`, a dict of several with their shares of the episodes, or "all"; of
+    several, ``info["scenario"]`` names the episode's own), ``model`` ("I", "II", a mix in [0, 1], or None for the
     scenario's draw), ``observation``, ``action`` ("direct", "smooth" or "rate"), ``control_interval`` [s],
     ``horizon`` [s], ``info`` ("lean": true radius and its reference; "all": every signal, see
     :class:`cz_gym.signals.Logged`; with observation "history" also the true ``state``, for critics),
@@ -145,7 +146,7 @@ class CzEnv(Copyable, gym.Env[Observation, Action]):
 
     def __init__(
         self,
-        scenario: str | Scenario = "randomized",
+        scenario: AnyScenario = "randomized",
         model: str | float | None = None,
         observation: str = "measured",
         control_interval: float = 5.0,
@@ -189,7 +190,7 @@ class CzEnv(Copyable, gym.Env[Observation, Action]):
         self._shown = self._batch.shown(self._out)[0]
         self._signals, self._valid = self._out.info[:, 0], self._slots["valid"]
         self._step = self._batch.bound_step(self._action, self._out)
-        self._over, self._begun = True, False
+        self._over, self._begun, self._named = True, False, isinstance(config.scenario, Mixture)
         self._view = make_view(render_mode, render_size, self.config)
 
     def reset(
@@ -197,11 +198,11 @@ class CzEnv(Copyable, gym.Env[Observation, Action]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Draw an episode; see :class:`gymnasium.Env`.
 
-        ``options={"scenario": ...}`` draws this one episode from another scenario; ``options={"state": ...}`` goes
-        on from a value of :meth:`get_state`. Raises ValueError for other options.
+        ``options={"scenario": ...}`` draws this one episode from another scenario or mixture;
+        ``options={"state": ...}`` goes on from a value of :meth:`get_state`. Raises ValueError for other options.
         """
         given = check_options(options)
-        scenario = find_scenario(given["scenario"]) if "scenario" in given else None
+        scenario = find_distribution(given["scenario"]) if "scenario" in given else None
         if "state" in given:
             check_state(given["state"], self._batch)
         super().reset(seed=seed)
@@ -209,7 +210,8 @@ class CzEnv(Copyable, gym.Env[Observation, Action]):
             self.set_state(given["state"])
         else:
             self._batch.reset([0], [new_key(self.np_random)], self._out, scenario)
-            self._restart_view(scenario)
+            self._named |= isinstance(scenario, Mixture)
+            self._restart_view()
         self._over, self._begun = bool(self._slots["over"][0]), True
         return self._shown.copy(), self._info()
 
@@ -265,9 +267,9 @@ class CzEnv(Copyable, gym.Env[Observation, Action]):
             self._view.close()
         self._batch.close()
 
-    def _restart_view(self, scenario: Scenario | None = None) -> None:
+    def _restart_view(self) -> None:
         if self._view is not None:
-            self._view.begin(self._signals, self._slots[0], (scenario or self.config.scenario).name)
+            self._view.begin(self._signals, self._slots[0], self._batch.scenarios[0])
 
     def _info(self) -> dict[str, Any]:
         if self._everything:
@@ -279,17 +281,19 @@ class CzEnv(Copyable, gym.Env[Observation, Action]):
                 info[name] = self._signals.item(row)
             if self._signals.item(_CLIPPED) > 0.0:
                 info["action_clipped"] = True
+        if self._named:
+            info["scenario"] = self._batch.scenarios[0]
         if self.config.observation == "history":
             info["state"] = self._out.state[0].copy()
         return info
 
 
 class Info(dict[str, Any]):
-    """A step's ``info``. Stable-baselines3 copies it deeply at every step: numbers alone are copied at once."""
+    """A step's ``info``. Stable-baselines3 copies it deeply at every step: numbers and names are copied at once."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Info:
         for value in self.values():
-            if type(value) is not float and type(value) is not bool:
+            if type(value) not in (float, bool, str):
                 return Info(deepcopy(dict(self), memo))
         return Info(self)
 

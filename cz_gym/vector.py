@@ -16,8 +16,8 @@ from gymnasium.vector.utils import batch_space
 from cz_gym.camera.view import Camera
 from cz_gym.engine.batch import Batch, new_key
 from cz_gym.engine.layout import Out, check_info
-from cz_gym.episodes.scenario import Scenario
-from cz_gym.episodes.scenarios import find_scenario
+from cz_gym.episodes.mixture import AnyScenario, Mixture
+from cz_gym.episodes.scenarios import find_distribution
 from cz_gym.errors import CzError
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
@@ -51,7 +51,7 @@ class CzVectorEnv(Copyable, VectorEnv[Array, Array, Array]):
     def __init__(
         self,
         num_envs: int = 1,
-        scenario: str | Scenario = "randomized",
+        scenario: AnyScenario = "randomized",
         model: str | float | None = None,
         observation: str = "measured",
         control_interval: float = 5.0,
@@ -109,7 +109,7 @@ class CzVectorEnv(Copyable, VectorEnv[Array, Array, Array]):
         self._everybody: Mask = np.ones(num_envs, np.bool_)
         self._over = self._everybody.copy()
         self._waiting = True
-        self._begun = False
+        self._begun, self._named = False, isinstance(config.scenario, Mixture)
         self._randoms: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int | None] = [None] * num_envs
 
@@ -121,13 +121,13 @@ class CzVectorEnv(Copyable, VectorEnv[Array, Array, Array]):
     ) -> tuple[Array, dict[str, Any]]:
         """Draw episodes; slot i is seeded with seed + i, or with seed[i].
 
-        ``options={"scenario": ...}`` draws these episodes from another scenario, ``{"state": states}`` goes on from a
-        value of :meth:`get_state`, ``{"reset_mask": mask}`` resets only some slots. Raises ValueError or TypeError for
-        anything else.
+        ``options={"scenario": ...}`` draws these episodes from another scenario or mixture, ``{"state": states}`` goes
+        on from a value of :meth:`get_state`, ``{"reset_mask": mask}`` resets only some slots. Raises ValueError or
+        TypeError for anything else.
         """
         given = check_options(options, ("scenario", "state", "reset_mask"))
         mask = self._reset_mask(given.get("reset_mask"))
-        scenario = find_scenario(given["scenario"]) if "scenario" in given else None
+        scenario = find_distribution(given["scenario"]) if "scenario" in given else None
         if "state" in given:
             self._check_states(given["state"])
         self._seed(seed, mask)
@@ -139,6 +139,7 @@ class CzVectorEnv(Copyable, VectorEnv[Array, Array, Array]):
             self._restore(given["state"], which)
         else:
             self._batch.reset(which, (new_key(self._random(i)) for i in which), self._out, scenario)
+            self._named |= isinstance(scenario, Mixture)
         self._over[mask] = self._batch.memory.slots["over"][mask] > 0
         self._waiting = bool(self._over.any())
         self._begun = True
@@ -301,6 +302,10 @@ class CzVectorEnv(Copyable, VectorEnv[Array, Array, Array]):
         infos.update(zip(names, shown if whole else np.where(mask, shown, 0.0), strict=True))
         if self._everything or clipped.any():
             infos["action_clipped"], infos["_action_clipped"] = clipped, mask if self._everything else clipped.copy()
+        if self._named:
+            scenarios = self._batch.scenarios.copy()
+            scenarios[~mask] = None
+            infos["scenario"], infos["_scenario"] = scenarios, mask
         if self.config.observation == "history":
             infos["state"] = out.state if whole else np.where(mask[:, None], out.state, np.float32(0))
             infos["_state"] = mask

@@ -95,7 +95,7 @@ class Clairvoyant:
 def make_plan(config: Config, seeds: Sequence[int]) -> Plan:
     """Optimise the first episode of each seed; CzError names those whose optimum was not reached."""
     future = future_of(config, seeds)
-    limits = limits_of(config.scenario.actuators, config.parameters.v_0, config.control_interval)
+    limits = limits_of(config.sole_scenario.actuators, config.parameters.v_0, config.control_interval)
     best = optimise(future, limits)
     if not best.converged.all():
         lost = ", ".join(str(seed) for seed, reached in zip(seeds, best.converged, strict=True) if not reached)

@@ -60,14 +60,14 @@ def pullers_of(config: Config, seeds: Sequence[int]) -> tuple[Puller, ...]:
     """The pullers of the first episode of each seed."""
     pullers = []
     for key in _keys(seeds):
-        factors = draw_factors(config.scenario, config.mix, key)
+        factors = draw_factors(config.sole_scenario, config.mix, key)
         pullers.append(make_puller(randomised(config.parameters, factors), factors.lam, config.meniscus))
     return tuple(pullers)
 
 
 def fluctuations_of(config: Config, seeds: Sequence[int]) -> tuple[tuple[float, float], ...]:
     """Standard deviations of the fast and the slow interface fluctuation [K] in the first episode of each seed."""
-    drawn = (draw_episode(config.scenario, key, new_series(1, 0)) for key in _keys(seeds))
+    drawn = (draw_episode(config.sole_scenario, key, new_series(1, 0)) for key in _keys(seeds))
     return tuple((float(episode.sd_fast), float(episode.sd_slow)) for episode in drawn)
 
 
@@ -114,4 +114,4 @@ def _keys(seeds: Sequence[int]) -> list[Key]:
 def _drawn(config: Config, key: Key, points: int) -> tuple[Episode, Floats]:
     """The episode of that key and its interface fluctuation on the grid."""
     series = new_series(points, 0)
-    return draw_episode(config.scenario, key, series), series.interface
+    return draw_episode(config.sole_scenario, key, series), series.interface

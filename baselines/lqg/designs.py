@@ -106,7 +106,7 @@ def design_of(controller: str, scenario: Scenario) -> LQGDesign:
 
 def lqg(name: str, config: Config) -> LQG:
     """The LQG of that name for an environment."""
-    return LQG(design=design_of(name, config.scenario)).for_config(config)
+    return LQG(design=design_of(name, config.sole_scenario)).for_config(config)
 
 
 def adaptive(plain: LQG) -> LQG:

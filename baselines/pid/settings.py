@@ -105,4 +105,4 @@ def settings_of(controller: str, scenario: Scenario) -> FilteredPID | Industrial
 
 def tuned(controller: str, config: Config) -> FilteredPID | Industrial:
     """The controller with its tuned settings for that environment; CzError if there are none of that name."""
-    return settings_of(controller, config.scenario).for_config(config)
+    return settings_of(controller, config.sole_scenario).for_config(config)

@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def tune(given: argparse.Namespace) -> None:
     """Search, choose, and print the chosen settings."""
     config = make_config(given.scenario, control_interval=given.control_interval)
-    goal = goal_of(given.controller, config.scenario)
+    goal = goal_of(given.controller, config.sole_scenario)
     search = Search(given.controller, goal, config, given.trials, given.episodes, measure)
     chosen = search.tune(given.out / file_name(given.controller, given.scenario))
     print(f"{given.controller} on {given.scenario}: {chosen.score:.4f} {chosen.facts}")

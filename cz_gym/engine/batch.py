@@ -21,8 +21,9 @@ from gymnasium.utils import seeding
 from cz_gym.camera.image import build_look, new_scratch
 from cz_gym.camera.view import IMAGE, make_view
 from cz_gym.config import Config, Identity
-from cz_gym.episodes.record import GRID, Episode, record_of
-from cz_gym.episodes.scenario import MAX_LATENCY, Scenario
+from cz_gym.episodes.mixture import Distribution
+from cz_gym.episodes.record import GRID, Episode, Lots, lots_of
+from cz_gym.episodes.scenario import MAX_LATENCY
 from cz_gym.episodes.series import series_of
 from cz_gym.errors import CzError
 from cz_gym.jit.compile import entry
@@ -76,6 +77,8 @@ class SlotState:
     history: npt.NDArray[np.float64]
     frames: npt.NDArray[np.float64]
     clock: Clock
+    scenario: str
+    """Name of the scenario that the episode was drawn from."""
 
     @property
     def interface(self) -> npt.NDArray[np.float64]:
@@ -135,8 +138,8 @@ class Batch:
             np.zeros((num_envs, frames, 3)),
         )
         self.memory.slots["over"] = 1
-        self._record = record_of(config.scenario)
-        self._mix = np.array(config.mix, np.float64)
+        self._lots = lots_of(config.scenario, config.model)
+        self.scenarios = np.full(num_envs, "", object)
         self._parameters = Parameters(*map(float, config.parameters))
         self.actions = np.zeros((num_envs, 2))
         self._all = np.ones(num_envs, np.bool_)
@@ -146,7 +149,7 @@ class Batch:
         self._infos = BufferPool((len(INFO), info_width(num_envs)), np.float64)
         out, which, keys = self.new_out(), np.zeros(1, np.int64), np.zeros((1, 2), np.uint64)
         stepped = (self.memory, self.actions, self._all, self.clock, self.drives, self.scales, out, 0, 1)
-        drawn = self._drawing(which, keys, self._record, self._mix, out)
+        drawn = self._drawing(which, keys, self._lots, out)
         self._step, self._draw = entry(self.kernels.step, stepped), entry(self.kernels.draw, (*drawn, 0, 1))
         threads = threads or os.cpu_count() or 1
         self._parts = max(1, min(threads, num_envs // (1 if self._camera else SLOTS_PER_THREAD)))
@@ -196,25 +199,28 @@ class Batch:
             arguments = (self.memory.slots, active, self._view, self._scratch, out.image)
             self._run(self._look, arguments, self.num_envs, 1)
 
-    def reset(self, which: Sequence[int], keys: Iterable[Key], out: Out, scenario: Scenario | None = None) -> None:
+    def reset(self, which: Sequence[int], keys: Iterable[Key], out: Out, given: Distribution | None = None) -> None:
         """Draw new episodes for the slots ``which`` and write their first sample into ``out``.
+
+        They are drawn from the given scenario or mixture, by default the batch's own.
 
         A puller without a finite operating point is drawn again; ValueError if none is found.
         """
-        record, mix = self._record, self._mix
-        if scenario is not None:
-            record, mix = record_of(scenario), np.array(self.config.with_scenario(scenario).mix, np.float64)
+        lots = self._lots if given is None else lots_of(given, self.config.model)
         slots = np.array(which, np.int64)
         words = np.array(list(keys), np.uint64).reshape(-1, 2)
-        arguments = self._drawing(slots, words, record, mix, out)
+        arguments = self._drawing(slots, words, lots, out)
         if max(self._run(self._draw, arguments, len(slots), DRAWS_PER_THREAD, DRAWS_AT_ONCE)) >= 0:
             raise CzError(NO_OPERATING_POINT)
+        members, drawn = (given or self.config.scenario).scenarios, self.memory.slots["scenario"]
+        for i in which:
+            self.scenarios[i] = members[drawn.item(i)].name
         if self._camera:
             self._photograph(out, np.isin(np.arange(self.num_envs), slots))
 
-    def _drawing(self, which: Any, keys: Any, record: Any, mix: Any, out: Out) -> tuple[Any, ...]:
+    def _drawing(self, which: Any, keys: Any, lots: Lots, out: Out) -> tuple[Any, ...]:
         """Arguments of the compiled draw, without the range of slots."""
-        return self.memory, which, keys, record, mix, self._parameters, self.clock, self.scales, out
+        return self.memory, which, keys, lots, self._parameters, self.clock, self.scales, out
 
     def step(self, actions: npt.ArrayLike, out: Out, active: npt.NDArray[np.bool_] | None = None) -> int:
         """Advance the active slots by one control interval; actions of shape (num_envs, 2), not NaN.
@@ -263,7 +269,7 @@ class Batch:
         """A copy of the state of slot i."""
         # array[i] of a structured array is a view that np.copy does not copy; array[i, ...] is an array.
         slot, history, frames = (rows[i, ...].copy() for rows in self._saved())
-        return SlotState(self.identity, slot, history, frames, self.clock)
+        return SlotState(self.identity, slot, history, frames, self.clock, self.scenarios[i])
 
     def check(self, state: SlotState) -> None:
         """Raise ValueError if this is no saved state, or one saved under other settings."""
@@ -287,6 +293,7 @@ class Batch:
         for i, state in zip(which, states, strict=True):
             for name, rows in zip(_SAVED, self._saved(), strict=True):
                 rows[i] = getattr(state, name)
+            self.scenarios[i] = state.scenario
         self.kernels.show(self.memory, np.array(which, np.int64), self.clock, self.scales, out, 0, len(which))
         if self._camera:
             self._photograph(out, np.isin(np.arange(self.num_envs), which))

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cz_gym.cost import Cost, cost_terms, failure_penalty, reward
-from cz_gym.episodes.draw import draw_episode, draw_factors, randomised, seed_streams
+from cz_gym.episodes.draw import draw_episode, draw_factors, draw_scenario, randomised, seed_streams
 from cz_gym.episodes.noise import first_fluctuation, fluctuation, sample_noise
 from cz_gym.jit.cache import hashed
 from cz_gym.jit.compile import fetch, inlined, jittable, kernel
@@ -150,7 +150,7 @@ class Kernels(NamedTuple):
     """``step(memory, actions, active, clock, drives, scales, out, start, stop)``: one control interval of the active
     slots; returns how many episodes ended."""
     draw: Any
-    """``draw(memory, which, keys, record, mix, parameters, clock, scales, out, start, stop)``: new episodes, each
+    """``draw(memory, which, keys, lots, parameters, clock, scales, out, start, stop)``: new episodes, each
     from its key, for the slots ``which[start:stop]``, with their first sample; returns -1, or a slot whose
     :data:`TRIES` draws gave no puller with an operating point."""
     show: Any
@@ -196,7 +196,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
         return ended
 
     def draw(
-        memory: Any, which: Any, keys: Any, record: Any, mix: Any, parameters: Any, clock: Any, scales: Any, out: Any,
+        memory: Any, which: Any, keys: Any, lots: Any, parameters: Any, clock: Any, scales: Any, out: Any,
         start: int, stop: int,
     ) -> int:  # fmt: skip
         impossible = -1
@@ -205,16 +205,18 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
             slot, numbers = memory.slots[i], memory.numbers[i]
             slot.key[0], slot.key[1] = keys[at, 0], keys[at, 1]
             seed_streams(slot.streams, slot.key)
+            slot.scenario = draw_scenario(lots.upto, slot.key)
+            record, mix = lots.records[slot.scenario], lots.mixes[slot.scenario]
             tries, sound = 0, False
             while not sound and tries < TRIES:
-                factors = draw_factors(record[0], mix, slot.streams)
+                factors = draw_factors(record, mix, slot.streams)
                 puller = derive_puller(randomised(parameters, factors), factors.lam, height, ring_offset)
                 tries, sound = tries + 1, True
                 for number in range(len(puller)):
                     numbers[PULLER_AT + number] = puller[number]
                     sound = sound and np.isfinite(puller[number])
             impossible = impossible if sound else i
-            episode = draw_episode(record[0], slot.streams, slot.freezes)
+            episode = draw_episode(record, slot.streams, slot.freezes)
             for number in range(len(episode)):
                 numbers[EPISODE_AT + number] = episode[number]
             _begin(slot)

@@ -38,6 +38,7 @@ SLOT = np.dtype(
         ("over", np.int64),
         ("k_seen", np.int64),
         ("key", np.uint64, (2,)),
+        ("scenario", np.int64),
         ("v_p_before", np.float64),
         ("Q_H_before", np.float64),
         ("clipped", np.float64),
@@ -52,9 +53,9 @@ SLOT = np.dtype(
 the last readings (``ring`` [m] without the operator's bias, with the meniscus height ``h_seen`` [m] and the sample
 ``k_seen`` it was taken at, ``T_1`` [K], ``valid``), the integral of the scaled ring error, the drift [K] that ``Q_d``
 belongs to, the sample number ``k``, the number of camera frames taken, whether the episode is over, the ``key`` it
-was drawn from, the drives [m/s, W] of the step before and whether the action was clipped: a sample can be written
-again from its slot. Then the 5 s grid point that ``dT_i`` belongs to with its two processes [standard deviations], and
-the episode's random streams, as far as they are drawn from."""
+was drawn from and the index of its ``scenario`` in the mixture, the drives [m/s, W] of the step before and whether the
+action was clipped: a sample can be written again from its slot. Then the 5 s grid point that ``dT_i`` belongs to with
+its two processes [standard deviations], and the episode's random streams, as far as they are drawn from."""
 PULLER_AT, EPISODE_AT, STATE_AT = np.cumsum([0, len(Puller._fields), len(Episode._fields)]).tolist()
 """Where a slot's constants and its plant state begin, in numbers of eight bytes."""
 

@@ -15,8 +15,8 @@ import numpy as np
 from cz_gym.jit.compile import jittable
 from cz_gym.physics.parameters import Parameters
 
-from .record import FREEZES, GRID, Episode, Factors, Stream, stream_number
-from .rng import normal, seed_stream, uniform
+from .record import FREEZES, GRID, MIXTURE_STREAM, Episode, Factors, Stream, stream_number
+from .rng import WORDS, normal, seed_stream, uniform
 from .scenario import DRAW_SPAN, MAX_FLAGGED
 
 STREAMS = len(Stream)
@@ -25,7 +25,7 @@ SHORTEST = 1e-9
 """Length [s] of a ramp that is a jump."""
 _START, _PARAMETERS, _SCHEDULE = int(Stream.START), int(Stream.PARAMETERS), int(Stream.SCHEDULE)
 _INTERFACE, _SENSOR, _FAULTS = int(Stream.INTERFACE), int(Stream.SENSOR), int(Stream.FAULTS)
-_FACTORS, _FAULT_NUMBERS = len(Factors._fields), 5 + 3 * FREEZES
+_SPREAD_NUMBERS, _HOT_ZONE_NUMBERS, _FAULT_NUMBERS = 7, 7, 5 + 3 * FREEZES
 _INTERFACE_NUMBERS, _SENSOR_NUMBERS = 2, 8
 
 
@@ -48,6 +48,30 @@ def _factor(spread: Any, u: Any) -> Any:
 
 
 @jittable
+def _log_factor(limits: Any, u: Any) -> Any:
+    """The number at share u of a range on a logarithmic scale."""
+    return np.exp(np.log(limits[0]) + np.log(limits[1] / limits[0]) * u)
+
+
+@jittable
+def _varies(limits: Any) -> Any:
+    return limits[0] != 1.0 or limits[1] != 1.0
+
+
+@jittable
+def draw_scenario(upto: Any, key: Any) -> Any:
+    """Index of the scenario that an episode is drawn from; ``upto``: running sums of the scenarios' shares."""
+    index = 0
+    if upto.size > 1:
+        stream = np.zeros(WORDS, np.uint64)
+        seed_stream(stream, key, MIXTURE_STREAM)
+        u = uniform(stream)
+        while index < upto.size - 1 and u >= upto[index]:
+            index += 1
+    return index
+
+
+@jittable
 def _uniforms(s: Any, count: Any) -> Any:
     """The stream's next numbers in [0, 1); one loop compiles in a fraction of the time of as many calls."""
     u = np.zeros(count)
@@ -59,25 +83,33 @@ def _uniforms(s: Any, count: Any) -> Any:
 @jittable
 def draw_factors(record: Any, mix: Any, streams: Any) -> Any:
     """Draw the puller: its mix of models and the factors on its parameters."""
-    u, spread = _uniforms(streams[_PARAMETERS], _FACTORS), record.pullers
+    spread = record.pullers
+    capacity, melt, conductance = spread.capacity_factor, spread.melt_capacity_factor, spread.conductance_factor
+    u, v = _uniforms(streams[_PARAMETERS], _SPREAD_NUMBERS), np.zeros(_HOT_ZONE_NUMBERS)
+    if _varies(capacity) or _varies(melt) or _varies(conductance):
+        v = _uniforms(streams[_PARAMETERS], _HOT_ZONE_NUMBERS)
     return Factors(
         lam=between(mix, u[0]),
         a=_factor(spread.capillary, u[1]),
         k_l=_factor(spread.conductivity, u[2]),
-        kappa_12=_factor(spread.conductance, u[3]),
-        G_1a=_factor(spread.conductance, u[4]),
-        G_2b=_factor(spread.conductance, u[5]),
-        kappa_b=_factor(spread.conductance, u[6]),
+        kappa_12=_factor(spread.conductance, u[3]) * _log_factor(conductance, v[3]),
+        G_1a=_factor(spread.conductance, u[4]) * _log_factor(conductance, v[4]),
+        G_2b=_factor(spread.conductance, u[5]) * _log_factor(conductance, v[5]),
+        kappa_b=_factor(spread.conductance, u[6]) * _log_factor(conductance, v[6]),
+        C_1=_log_factor(capacity, v[0]),
+        C_2=_log_factor(capacity, v[1]),
+        C_b=_log_factor(melt, v[2]),
     )
 
 
 @jittable
 def randomised(q: Any, f: Any) -> Any:
-    """The parameters of the drawn puller: factors on a, k_l and the conductances."""
+    """The parameters of the drawn puller: factors on a, k_l, the conductances and the heat capacities."""
     return Parameters(
         sigma=q.sigma * f.a**2, rho_l=q.rho_l, alpha_0=q.alpha_0, g=q.g, sigma_SB=q.sigma_SB, k_l=q.k_l * f.k_l,
         rho_s=q.rho_s, dH=q.dH, T_m=q.T_m, dT_0=q.dT_0, phi_b=q.phi_b, r_0=q.r_0, v_0=q.v_0,
-        C_1=q.C_1, C_2=q.C_2, C_b=q.C_b, kappa_12=q.kappa_12 * f.kappa_12, G_1a=q.G_1a * f.G_1a, T_a=q.T_a,
+        C_1=q.C_1 * f.C_1, C_2=q.C_2 * f.C_2, C_b=q.C_b * f.C_b,
+        kappa_12=q.kappa_12 * f.kappa_12, G_1a=q.G_1a * f.G_1a, T_a=q.T_a,
         G_2b=q.G_2b * f.G_2b, eps=q.eps * f.kappa_b, R_cr=q.R_cr, T_e=q.T_e,
     )  # fmt: skip
 

@@ -11,7 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from .mixture import Distribution
 from .scenario import MAX_FLAGGED, MAX_UNFLAGGED, Scenario
+from .scenarios import mix_of
 
 GRID = 5.0
 """Interval [s] of the grid on which physical fluctuations live; held in between."""
@@ -24,6 +26,8 @@ FIRST_FRAME = 8
 FIRST_FRAME + k. Written into every image: it stays, however many members :class:`Stream` has."""
 MOST_FRAMES = 2**31
 """Streams that are reserved for frames."""
+MIXTURE_STREAM = 2**32 - 1
+"""Number of the random stream from which a mixture's episode draws its scenario: the last one there is."""
 
 
 class Stream(IntEnum):
@@ -131,6 +135,9 @@ class Factors(NamedTuple):
     G_1a: float = 1.0
     G_2b: float = 1.0
     kappa_b: float = 1.0
+    C_1: float = 1.0
+    C_2: float = 1.0
+    C_b: float = 1.0
 
 
 def _members(scenario: Scenario) -> list[tuple[str, dict[str, Any]]]:
@@ -146,12 +153,27 @@ RECORD = np.dtype([(family, _record(members)) for family, members in _members(Sc
 """A scenario as the compiled draws read it: a record of families, each a number or a pair a member."""
 
 
+class Lots(NamedTuple):
+    """What episodes are drawn from, as the compiled draws read it; read-only arrays, one row a scenario."""
+
+    records: npt.NDArray[Any]
+    """The scenarios' numbers: records of :data:`RECORD`."""
+    mixes: npt.NDArray[np.float64]
+    """Range of the share of conduction [-], shape (scenarios, 2)."""
+    upto: npt.NDArray[np.float64]
+    """Running sums of the scenarios' shares [-]."""
+
+
 @lru_cache(maxsize=64)
-def record_of(scenario: Scenario) -> npt.NDArray[Any]:
-    """The scenario's numbers, a read-only array of one :data:`RECORD`."""
-    record = np.zeros(1, RECORD)
-    for family, members in _members(scenario):
-        for member, value in members.items():
-            record[family][member] = value
-    record.setflags(write=False)
-    return record
+def lots_of(distribution: Distribution, model: str | float | None = None) -> Lots:
+    """The numbers of a scenario, or of each scenario of a mixture, under the environment's ``model`` argument."""
+    records = np.zeros(len(distribution.scenarios), RECORD)
+    for row, scenario in enumerate(distribution.scenarios):
+        for family, members in _members(scenario):
+            for member, value in members.items():
+                records[family][member][row] = value
+    mixes = np.array([mix_of(model, scenario) for scenario in distribution.scenarios], np.float64)
+    lots = Lots(records, mixes, np.cumsum(distribution.shares))
+    for array in lots:
+        array.setflags(write=False)
+    return lots

@@ -31,6 +31,7 @@ from cz_gym.units import HOUR, MM
 
 Range = tuple[float, float]
 NONE: Range = (0.0, 0.0)
+ONE: Range = (1.0, 1.0)
 DRAW_SPAN = 3.0 * HOUR
 """Span [s] over which "uniform over the episode" is drawn, whatever the horizon: a draw never depends on it."""
 
@@ -44,6 +45,7 @@ MAX_LATENCY = 60.0
 MAX_FLAGGED, MAX_UNFLAGGED = 3, 1
 """Most freezes of each kind in an episode."""
 _LONGEST = 1e6
+_FACTORS = 0.1, 10.0
 _BELOW_HALF, _BELOW_ONE = math.nextafter(0.5, 0.0), math.nextafter(1.0, 0.0)
 _FASTEST_PULL, _FASTEST_SLEW, _FASTEST_RAMP = 1e-3, 1e-5, 0.1
 
@@ -79,18 +81,20 @@ class Member(NamedTuple):
     """Largest allowed value, the default apart."""
     slip: Slip | None
     """Unit that the number may have been typed in by mistake."""
+    later: bool
+    """Whether it was added after hashes were published: its default is then no part of the hash."""
 
 
-def member(default: Any, draw: Draw, low: float, high: float, slip: Slip | None = None) -> Any:
+def member(default: Any, draw: Draw, low: float, high: float, slip: Slip | None = None, later: bool = False) -> Any:
     """A field of a family of disturbances; every one says whether it is random and what is plausible."""
-    return field(default=default, metadata={"member": Member(draw, low, high, slip)})
+    return field(default=default, metadata={"member": Member(draw, low, high, slip, later)})
 
 
 @dataclass(frozen=True)
 class Pullers:
-    """Spread of the pullers: a uniform factor 1 +- spread on each group, and the mix of models."""
+    """Spread of the pullers: factors on their design parameters, uniform in 1 +- spread, and the mix of models."""
 
-    mix: Range = member((1.0, 1.0), Draw.RANGE, 0.0, 1.0)
+    mix: Range = member(ONE, Draw.RANGE, 0.0, 1.0)
     """Share of conduction lambda [-]."""
     capillary: float = member(0.0, Draw.NONZERO, 0.0, _BELOW_HALF, IN_PERCENT)
     """Spread of the capillary constant a [-]."""
@@ -102,6 +106,12 @@ class Pullers:
     """Standard deviation of r_c(0) - r_0 [m]."""
     melt_loss: float = member(0.0, Draw.NEVER, 0.0, _BELOW_ONE, IN_PERCENT)
     """Share of the melt's heat capacity lost, linearly over 3 h, then held [-]."""
+    capacity_factor: Range = member(ONE, Draw.RANGE, *_FACTORS, later=True)
+    """Log-uniform factor on C_1 and C_2, each on its own [-]."""
+    melt_capacity_factor: Range = member(ONE, Draw.RANGE, *_FACTORS, later=True)
+    """Log-uniform factor on C_b [-]."""
+    conductance_factor: Range = member(ONE, Draw.RANGE, *_FACTORS, later=True)
+    """Log-uniform factor on kappa_12, G_1a, G_2b and kappa_b, each on its own, beside their uniform one [-]."""
 
 
 @dataclass(frozen=True)
@@ -245,13 +255,25 @@ class Scenario:
             raise CzError(f"scenario {self.name!r}: freezes of {longest} s do not fit into {DRAW_SPAN} s")
 
     @property
+    def scenarios(self) -> tuple[Scenario, ...]:
+        """The scenario itself: a mixture has several (:class:`cz_gym.episodes.mixture.Mixture`)."""
+        return (self,)
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """Its share of the episodes, 1."""
+        return (1.0,)
+
+    @property
     def hash(self) -> str:
-        """SHA-256 of the scenario's contents (16 hex digits)."""
+        """SHA-256 of the scenario's contents (16 hex digits); a ``later`` member counts only off its default."""
         contents: dict[str, Any] = {"name": self.name}
         for family in dataclasses.fields(self)[1:]:
             value = getattr(self, family.name)
             contents[family.name] = {
-                member.name: _plain(member.default, getattr(value, member.name)) for member in dataclasses.fields(value)
+                each.name: _plain(each.default, getattr(value, each.name))
+                for each in dataclasses.fields(value)
+                if not each.metadata["member"].later or getattr(value, each.name) != each.default
             }
         text = json.dumps(contents, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -273,7 +295,7 @@ def _kind(family: dataclasses.Field[Any]) -> type[Any]:
 def _check(where: str, each: dataclasses.Field[Any], value: Any) -> None:
     """Raise CzError unless a member's value has its default's form and lies in its range."""
     _check_form(where, each.default, value)
-    _, low, high, slip = each.metadata["member"]
+    _, low, high, slip, _ = each.metadata["member"]
     if value != each.default:
         for number in value if isinstance(value, tuple) else (value,):
             check_plausible(where, number, low, high, slip=slip)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from numbers import Real
 
@@ -9,6 +10,7 @@ from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
+from .mixture import AnyScenario, Distribution, Mixture, make_mixture
 from .scenario import Actuators, Drift, Faults, Interface, Pullers, Recipe, Reference, Scenario, Sensor
 
 K_PER_MIN = 1.0 / MINUTE
@@ -94,6 +96,18 @@ PULLER = replace(
     ),
 )
 
+HOT_ZONE = replace(
+    RANDOMIZED,
+    name="hot-zone",
+    pullers=replace(
+        RANDOMIZED.pullers,
+        conductance=0.0,
+        capacity_factor=(0.5, 2.0),
+        melt_capacity_factor=(0.7, 1.4),
+        conductance_factor=(0.75, 1.33),
+    ),
+)
+
 _ONE_FAMILY = (
     Scenario("only-recipe", recipe=RANDOMIZED.recipe),
     Scenario("only-drift", drift=RANDOMIZED.drift),
@@ -114,11 +128,13 @@ SCENARIOS: dict[str, Scenario] = {
         HARD,
         SENSOR_FAULT,
         PULLER,
+        HOT_ZONE,
         *_ONE_FAMILY,
     )
 }
 """Every named scenario."""
-
+ALL = make_mixture([(RANDOMIZED, 0.3), *((each, 0.175) for each in (HARD, SENSOR_FAULT, PULLER, HOT_ZONE))])
+"""The mixture "all": every random scenario of the benchmark's default table."""
 
 _ROWS = {
     "I": "model='I'",
@@ -130,23 +146,35 @@ _ROWS = {
 """Suffixes of the benchmark's rows, and the arguments of the environment that they stand for."""
 
 
-def find_scenario(scenario: str | Scenario) -> Scenario:
-    """Return the scenario of this name, or the given one; raise CzError with all names if there is none."""
+def find_distribution(given: AnyScenario) -> Distribution:
+    """The scenario or mixture that is meant by a name ("all" too), a scenario, a mixture, or scenarios with shares."""
+    if isinstance(given, str) and given == "all":
+        return ALL
+    if isinstance(given, Mapping):
+        return make_mixture([(find_scenario(each), share) for each, share in given.items()])
+    return given if isinstance(given, Mixture) else find_scenario(given)
+
+
+def find_scenario(scenario: AnyScenario) -> Scenario:
+    """Return the scenario of this name, or the given one; raise CzError if there is none, and for a mixture."""
     if isinstance(scenario, Scenario):
         return scenario
+    if isinstance(scenario, Mixture | Mapping) or scenario == "all":
+        raise CzError(f"this needs one scenario, not the mixture {find_distribution(scenario).name!r}")
     if isinstance(scenario, str) and scenario in SCENARIOS:
         return SCENARIOS[scenario]
     name, _, row = scenario.rpartition("-") if isinstance(scenario, str) else ("", "", "")
     if name in SCENARIOS and row in _ROWS:
         raise CzError(f"{scenario!r} is a row of the benchmark: the scenario is {name!r}, with {_ROWS[row]}")
-    also = "" if isinstance(scenario, str) else ", or pass a cz_gym.Scenario"
-    raise CzError(unknown("scenario", scenario, SCENARIOS, also))
+    also = "" if isinstance(scenario, str) else ", or pass a cz_gym.Scenario, or a dict of scenarios and their shares"
+    raise CzError(unknown("scenario", scenario, [*SCENARIOS, "all"], also))
 
 
-def mix_of(model: str | float | None, scenario: Scenario) -> tuple[float, float]:
+def mix_of(model: str | float | None, distribution: Distribution) -> tuple[float, float]:
     """Range of lambda [-] for the environment's ``model`` argument; CzError for anything else."""
     if model is None:
-        return scenario.pullers.mix
+        lows, highs = zip(*(scenario.pullers.mix for scenario in distribution.scenarios), strict=True)
+        return min(lows), max(highs)
     if isinstance(model, str) and model in ("I", "II"):
         return (1.0, 1.0) if model == "I" else (0.0, 0.0)
     if isinstance(model, Real) and not isinstance(model, bool) and 0.0 <= model <= 1.0:

@@ -87,6 +87,7 @@ ROWS: tuple[Row, ...] = (
     Row("hard", "hard", "the same families, half as wide again or more"),
     Row("sensor-fault", "sensor-fault", "randomized with frozen frames, drop-outs and a drifting ring"),
     Row("puller", "puller", "randomized with latency, ripple, outliers, a wrong ring bias and slow, narrow drives"),
+    Row("hot-zone", "hot-zone", "randomized on hot zones that differ from the design values by up to a factor of two"),
     Row("paper-ramp-I", "paper-ramp", _RAMP, "I"),
     Row("paper-ramp-II", "paper-ramp", _RAMP, "II"),
     Row("reference-a", "reference-a", _FALL.format(2.5), "I"),

@@ -193,11 +193,29 @@ def test_interface_deviations_are_drawn_separately() -> None:
 
 def test_draws_are_uniform() -> None:
     factors = np.array([draw_factors(SCENARIOS["randomized"], (0.0, 1.0), key) for key in keys(2000)])
+    assert (factors[:, 7:] == 1.0).all()
     widths = np.array([0.5, 0.03, 0.1, 0.1, 0.1, 0.1, 0.1])
     middle = np.array([0.5, 1, 1, 1, 1, 1, 1])
-    for column in ((factors - middle) / widths).T:
-        assert stats.kstest(column, stats.uniform(-1, 2).cdf).pvalue > 1e-3
-    assert np.abs(np.corrcoef(factors.T) - np.eye(7)).max() < 0.1
+    check_uniform(0.5 + 0.5 * (factors[:, :7] - middle) / widths)
+
+
+def test_hot_zone_draws_are_log_uniform_on_the_crystals_of_randomized() -> None:
+    hot_zone, randomized = (
+        np.array([draw_factors(SCENARIOS[name], (0.0, 1.0), key) for key in keys(2000)])
+        for name in ("hot-zone", "randomized")
+    )
+    np.testing.assert_array_equal(hot_zone[:, :3], randomized[:, :3])
+    assert draw("hot-zone", (5, 6))[0] == draw("randomized", (5, 6))[0]
+    low = np.log([0.75] * 4 + [0.5, 0.5, 0.7])
+    high = np.log([1.33] * 4 + [2.0, 2.0, 1.4])
+    check_uniform((np.log(hot_zone[:, 3:]) - low) / (high - low))
+
+
+def check_uniform(columns: Any) -> None:
+    """Each column is uniform in [0, 1], and independent of the others."""
+    for column in columns.T:
+        assert stats.kstest(column, stats.uniform().cdf).pvalue > 1e-3
+    assert np.abs(np.corrcoef(columns.T) - np.eye(columns.shape[1])).max() < 0.1
 
 
 def test_half_the_references_move_and_the_start_is_normal() -> None:

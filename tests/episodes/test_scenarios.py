@@ -21,6 +21,7 @@ FROZEN = {
     "hard": "f3b0f280a51eb76d",
     "sensor-fault": "a2ba81372aa15e66",
     "puller": "2104861fe7b255c8",
+    "hot-zone": "21ba3a8c3fadda41",
     "only-recipe": "986d178b78f3b36e",
     "only-drift": "35df8d2d49bfbfbe",
     "only-interface": "8b4a530df4f47e75",
