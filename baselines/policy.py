@@ -138,6 +138,21 @@ class MeasuredController(ABC):
         return mark(action, self.made_for), State(read, memory)
 
 
+@dataclass(frozen=True)
+class OpenLoop:
+    """The nominal inputs at every sample: the plant without feedback."""
+
+    made_for: ClassVar[None] = None
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[npt.NDArray[np.float32], Any]:
+        """Zero action of the batch's shape."""
+        array, single = batched(observation)
+        zero = np.zeros(len(array))
+        return to_action(zero, zero, single), state
+
+
 def readable(seen: Measured, last: Measured) -> Measured:
     """A sample with the ``last`` reading wherever a channel is not finite or the ring is not valid."""
     finite = Measured(*map(np.isfinite, seen))

@@ -10,14 +10,13 @@ from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
 from cz_gym.baselines.lqg import designs
 from cz_gym.baselines.lqg.designs import adaptive
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
-from cz_gym.baselines.pid.open_loop import OpenLoop
 from cz_gym.baselines.pid.settings import tuned
 from cz_gym.config import Config, check_config
 from cz_gym.contender import Contender
 from cz_gym.errors import CzError
 from cz_gym.names import unknown
 
-from .policy import Policy
+from .policy import OpenLoop, Policy
 
 
 def _tuned(name: str, meaning: str, quoted: bool = False) -> Contender:

@@ -65,24 +65,17 @@ def controller_transfer(pid: SeriesPID) -> Any:
     return control.tf(numerator, np.polymul([pid.T_i, 0.0], [pid.T_d / pid.N, 1.0]))
 
 
-def compensator_transfer(compensator: Compensator) -> Any:
-    """G_pc(s) as a python-control transfer function."""
-    import control
-
-    return control.tf([compensator.gain, 0.0], np.poly([-compensator.fast, -compensator.slow]))
-
-
-def open_loop(model: RadiusModel, compensator: Compensator | None, pid: SeriesPID | None = None) -> Any:
+def open_loop(model: RadiusModel, compensator: Compensator | None, pid: SeriesPID) -> Any:
     """L = -K (G_m G_p + G_pc) as a python-control transfer function; minus, since pulling faster thins the crystal."""
     import control
 
     seen = control.tf([model.numerator * model.lead, model.numerator * model.constant], np.poly(model.poles))
     if compensator is not None:
-        seen = seen + compensator_transfer(compensator)
-    return -controller_transfer(pid or SeriesPID()) * seen
+        seen += control.tf([compensator.gain, 0.0], np.poly([-compensator.fast, -compensator.slow]))
+    return -controller_transfer(pid) * seen
 
 
-def margins(model: RadiusModel, compensator: Compensator | None, pid: SeriesPID | None = None) -> Margins:
+def margins(model: RadiusModel, compensator: Compensator | None, pid: SeriesPID) -> Margins:
     """Crossover, phase margin and closed-loop poles of the continuous loop; NaN where the gain never crosses one."""
     import control
 

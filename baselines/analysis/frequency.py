@@ -53,14 +53,8 @@ def opened(controller: StateSpace, puller: Puller, dt: float, at: str) -> StateS
     return StateSpace(A, B, -C, -D)
 
 
-def crossover(controller: StateSpace, puller: Puller, dt: float, at: str = "camera", points: int = 400) -> float:
-    """Highest frequency [rad/s] where the opened loop's gain falls through one; NaN if it never does."""
-    omega = frequencies(dt, points)
-    return crossover_of(response(opened(controller, puller, dt, at), dt, omega), omega)
-
-
 def crossover_of(values: npt.NDArray[np.complex128], omega: Floats) -> float:
-    """The crossover of an open loop's frequency response, as :func:`crossover`."""
+    """Highest frequency [rad/s] where the gain of an open loop's response falls through one; NaN if it never does."""
     gain = np.log(np.abs(values))
     falls = np.flatnonzero((gain[:-1] > 0.0) & (gain[1:] <= 0.0))
     if not len(falls):
@@ -68,12 +62,6 @@ def crossover_of(values: npt.NDArray[np.complex128], omega: Floats) -> float:
     k = falls[-1]
     share = gain[k] / (gain[k] - gain[k + 1])
     return float(omega[k] * (omega[k + 1] / omega[k]) ** share)
-
-
-def sensitivity(controller: StateSpace, puller: Puller, dt: float, points: int = 400) -> float:
-    """Peak of |1/(1 + L)| with the loop opened at the camera [-]."""
-    values = response(opened(controller, puller, dt, "camera"), dt, frequencies(dt, points))
-    return float(np.max(1.0 / np.abs(1.0 + values)))
 
 
 def loop_margins(controller: StateSpace, puller: Puller, dt: float, at: str = "camera") -> LoopMargins:

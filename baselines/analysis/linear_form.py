@@ -9,8 +9,7 @@ import numpy as np
 
 from cz_gym.baselines.lqg.controller import LQG
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
-from cz_gym.baselines.pid.open_loop import OpenLoop
-from cz_gym.baselines.policy import map_arrays
+from cz_gym.baselines.policy import OpenLoop, map_arrays
 from cz_gym.config import Config
 from cz_gym.episodes.scenario import Sensor
 from cz_gym.episodes.scenarios import RANDOMIZED

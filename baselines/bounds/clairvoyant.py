@@ -22,7 +22,7 @@ from cz_gym.observation import STATE, scales
 from cz_gym.task import HEATER_RANGE
 
 from .future import future_of
-from .trajectory import INPUTS, MOST_STEPS, TOLERANCE, Trajectory, limits_of, optimise, predicted_cost
+from .trajectory import INPUTS, MOST_STEPS, TOLERANCE, Trajectory, limits_of, optimise
 
 _CHANNELS = tuple(channel.name for channel in STATE)
 _X = ("r_c_error", "h_c", "T_1", "T_2", "T_b")
@@ -36,8 +36,6 @@ class Plan(NamedTuple):
     """Each puller's operating point, shape (n, 5)."""
     inputs_0: Floats
     """Inputs at the operating point, shape (n, 2)."""
-    cost: Floats
-    """The cost at the optimum, summed over the episode, shape (n,)."""
     made_for: MadeFor
 
 
@@ -106,4 +104,4 @@ def make_plan(config: Config, seeds: Sequence[int]) -> Plan:
     state_0, inputs_0 = (
         np.stack(np.broadcast_arrays(*values), axis=-1) for values in (future.puller.state_0, future.puller.inputs_0)
     )
-    return Plan(best, state_0, inputs_0, predicted_cost(future, best), config.made_for)
+    return Plan(best, state_0, inputs_0, config.made_for)

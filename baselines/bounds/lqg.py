@@ -15,9 +15,9 @@ from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import solve_discrete_are
 
 from cz_gym.action import mark
-from cz_gym.baselines.lqg import kalman
 from cz_gym.baselines.lqg.controller import LQG, Gains, LQGDesign, solve_each
 from cz_gym.baselines.lqg.designs import lqg
 from cz_gym.baselines.lqg.estimator import PlantFilter
@@ -136,7 +136,7 @@ def _separation(noise: NoiseModel, dt: float) -> tuple[Floats, Floats, Floats]:
     keep = np.array([math.exp(-dt / noise.fast_tau), math.exp(-dt / noise.slow_tau)])
     variance = np.array([noise.fast_sd, noise.slow_sd]) ** 2
     tiny = _TINY * variance.sum()
-    P = kalman.steady_state(np.diag(keep), np.ones((1, 2)), np.diag((1.0 - keep**2) * variance), np.array([[tiny]]))
+    P = solve_discrete_are(np.diag(keep), np.ones((2, 1)), np.diag((1.0 - keep**2) * variance), np.array([[tiny]]))
     return keep, P.sum(axis=1) / (P.sum() + tiny), variance / variance.sum()
 
 

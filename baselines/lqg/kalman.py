@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import solve_discrete_are
 
 from cz_gym.baselines.policy import Floats
 
@@ -82,12 +81,3 @@ def matched_variance(
     square = np.minimum(np.square(innovation), gate**2 * (predicted + variance))
     matched = keep * variance + (1.0 - keep) * (square - predicted)
     return np.where(valid, np.clip(matched, *limits), variance)
-
-
-def steady_state(A: Floats, H: Floats, Q: Floats, R: Floats) -> Floats:
-    """Stationary covariance of a linear filter's prediction error (SciPy's Riccati solver).
-
-    P = A P A' - A P H' (H P H' + R)^-1 H P A' + Q
-    """
-    P: Floats = np.asarray(solve_discrete_are(A.T, H.T, Q, R), np.float64)
-    return P

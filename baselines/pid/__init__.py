@@ -1,1 +1,1 @@
-"""PID controllers: the paper's, filtered, re-tuned and conventional ones, the industrial law, and no control at all."""
+"""PID controllers: the paper's, filtered, re-tuned and conventional ones, and the industrial law."""

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from cz_gym.baselines.analysis.frequency import crossover, sensitivity
+from cz_gym.baselines.analysis.frequency import LoopMargins, frequencies, margins_of, opened, response
 from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign
 from cz_gym.baselines.lqg.designs import ACTIVITIES, SEARCHED, SHIPPED, design_of, family_name
@@ -86,9 +86,15 @@ STEP, STEP_WEIGHT = 0.029, 10.0
 """Limit of the pull step RMS [mm/min], and the weight of its slack [1/(mm/min)]."""
 
 
-def models_of(policy: FilteredPID) -> tuple[Puller, Puller]:
-    """Models I and II of the puller that the controller was made for."""
-    return make_puller(policy.parameters, 1.0, policy.meniscus), make_puller(policy.parameters, 0.0, policy.meniscus)
+def margins(policy: FilteredPID) -> list[tuple[LoopMargins, Puller]]:
+    """Margins of the sampled loop opened at the camera, without anti-windup, on Models I and II of the puller.
+
+    They are those of a stable loop, whether it is stable or not.
+    """
+    free, dt = linear_form(policy).free, policy.control_interval
+    omega = frequencies(dt, 400)
+    pullers = [make_puller(policy.parameters, lam, policy.meniscus) for lam in (1.0, 0.0)]
+    return [(margins_of(response(opened(free, p, dt, "camera"), dt, omega), omega, dt, True), p) for p in pullers]
 
 
 def calm(found: Figures, policy: FilteredPID) -> float:
@@ -98,18 +104,16 @@ def calm(found: Figures, policy: FilteredPID) -> float:
 
 def insensitive(found: Figures, policy: FilteredPID) -> float:
     """Relative slack of the sensitivity peak on the worse of Models I and II, weighted [-]."""
-    free, dt = linear_form(policy).free, policy.control_interval
-    return SENSITIVITY_WEIGHT * (1.0 - max(sensitivity(free, p, dt) for p in models_of(policy)) / SENSITIVITY)
+    return SENSITIVITY_WEIGHT * (1.0 - max(loop.sensitivity for loop, _ in margins(policy)) / SENSITIVITY)
 
 
 def below_half_the_zero(found: Figures, policy: FilteredPID) -> float:
     """Relative slack of the crossover below half the zero on Models I and II [-]: the paper's rule without compensator.
 
-    The loop is sampled. Where the gain never falls through one, the rule is kept.
+    Where the gain never falls through one, the rule is kept.
     """
-    free, dt = linear_form(policy).free, policy.control_interval
-    zeros = ((p, radius_model(p, policy.meniscus).zero) for p in models_of(policy))
-    return 1.0 - max(0.0, *(crossover(free, p, dt) / (0.5 * zero) for p, zero in zeros))
+    zeros = ((loop, radius_model(puller, policy.meniscus).zero) for loop, puller in margins(policy))
+    return 1.0 - max(0.0, *(loop.crossover / (0.5 * zero) for loop, zero in zeros))
 
 
 PIDS: dict[str, dict[str, Any]] = {

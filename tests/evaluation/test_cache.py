@@ -13,9 +13,8 @@ from tqdm import tqdm
 import benchmark
 import cz_gym
 import cz_gym.agents
-from cz_gym.baselines import registry
+from cz_gym.baselines import OpenLoop, registry
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
-from cz_gym.baselines.pid.open_loop import OpenLoop
 from cz_gym.config import make_config
 from cz_gym.contender import Contender
 from cz_gym.evaluation import cache, runner

@@ -1,4 +1,4 @@
-"""The clairvoyant bound: its parts against independent solutions, its plan against the environment itself."""
+"""The clairvoyant bound: its optimum against a general optimiser, its plan against the environment itself."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -10,10 +10,9 @@ from scipy.optimize import minimize
 from cz_gym.baselines.bounds import trajectory
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
 from cz_gym.baselines.bounds.future import future_of
-from cz_gym.baselines.bounds.riccati import Stages, sweep_back, sweep_forward
-from cz_gym.baselines.bounds.trajectory import Limits, limits_of, linearised, optimise, predicted_cost
-from cz_gym.baselines.registry import find_controller
+from cz_gym.baselines.bounds.trajectory import Limits, limits_of, optimise
 from cz_gym.config import make_config
+from cz_gym.cost import cost_terms
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.episodes.scenarios import HARD, RANDOMIZED
 from cz_gym.errors import CzError
@@ -47,6 +46,14 @@ def episode_cost(run):
     return metrics(run).cost * run.config.steps
 
 
+def planned_cost(future, x, u):
+    """The objective of states and inputs, summed over the steps."""
+    v_0, Q_H_0 = future.puller.inputs_0
+    v_p, Q_H = u[..., 0], u[..., 1]
+    moves = (np.diff(v, axis=0, prepend=np.broadcast_to(rest, v[:1].shape)) for v, rest in ((v_p, v_0), (Q_H, Q_H_0)))
+    return sum(cost_terms(x[1:, :, 0] - future.r_ref, v_p - v_0, *moves)).sum(axis=0)
+
+
 def played(u, inputs_0):
     """A policy that plays inputs v_p [m/s] and Q_H [W], shape (steps, n, 2)."""
     full = np.stack([inputs_0[:, 0], np.full(len(inputs_0), 10 * KILO)], axis=-1)
@@ -71,55 +78,6 @@ def test_the_known_future_is_the_one_the_environment_brings(interval):
         assert getattr(x, name) == pytest.approx(info[name], rel=1e-12), name
 
 
-def test_the_derivatives_agree_with_finite_differences():
-    config = make_config("randomized", horizon=60.0)
-    future = future_of(config, SEEDS)
-    N, n = future.r_ref.shape
-    x = np.broadcast_to(np.stack(future.start, axis=-1), (N + 1, n, 5)).copy()
-    u = np.broadcast_to(np.stack(np.broadcast_arrays(*future.puller.inputs_0), axis=-1), (N, n, 2)).copy()
-    after, slopes = linearised(future, x, u)
-    for j, size in enumerate((1e-5, 1e-6, 0.1, 0.1, 0.01, 1e-6, 100.0)):
-        shifted = []
-        for sign in (1.0, -1.0):
-            x_s, u_s = x.copy(), u.copy()
-            (x_s if j < 5 else u_s)[..., j if j < 5 else j - 5] += sign * size
-            shifted.append(linearised(future, x_s, u_s)[0])
-        found = (shifted[0] - shifted[1]) / (2.0 * size)
-        assert slopes[..., j] == pytest.approx(found, rel=1e-5, abs=1e-6 * np.abs(found).max())
-    assert after[0, :, 1] == pytest.approx(x[0, :, 1], rel=1e-2)
-
-
-def problem(N, n, states, inputs):
-    random = np.random.default_rng(3)
-    return Stages(
-        random.normal(size=(N, n, states, states)) * 0.5, random.normal(size=(N, n, states, inputs)),
-        random.normal(size=(N, n, states)), random.uniform(0, 2, (N, n, states)), random.normal(size=(N, n, states)),
-        random.uniform(0.5, 2, (N, n, inputs)), random.normal(size=(N, n, inputs)),
-    )  # fmt: skip
-
-
-def test_the_sweeps_solve_the_same_equations_as_a_dense_solver():
-    N, n, s, m = 5, 3, 4, 2
-    stages, start = problem(N, n, s, m), np.random.default_rng(4).normal(size=(n, s))
-    after, inputs = sweep_forward(stages, sweep_back(stages), start)
-    for i in range(n):
-        # Unknowns z_1..z_N, w_0..w_{N-1}; constraints z_{k+1} - A z_k - B w_k = c_k.
-        H = np.diag(np.concatenate([stages.Q[:, i].ravel(), stages.R[:, i].ravel()]))
-        g = np.concatenate([stages.q[:, i].ravel(), stages.r[:, i].ravel()])
-        E, f = np.zeros((N * s, N * (s + m))), stages.c[:, i].copy()
-        f[0] += stages.A[0, i] @ start[i]
-        for k in range(N):
-            rows = slice(k * s, (k + 1) * s)
-            E[rows, rows] = np.eye(s)
-            E[rows, N * s + k * m : N * s + (k + 1) * m] = -stages.B[k, i]
-            if k:
-                E[rows, (k - 1) * s : k * s] = -stages.A[k, i]
-        kkt = np.block([[H, E.T], [E, np.zeros((N * s, N * s))]])
-        dense = np.linalg.solve(kkt, np.concatenate([-g, f.ravel()]))
-        assert after[:, i].ravel() == pytest.approx(dense[: N * s], rel=1e-9, abs=1e-10)
-        assert inputs[:, i].ravel() == pytest.approx(dense[N * s : N * (s + m)], rel=1e-9, abs=1e-10)
-
-
 def test_the_environment_replays_what_was_planned(optimum):
     config, policy = optimum
     run = replay(config, policy)
@@ -127,7 +85,6 @@ def test_the_environment_replays_what_was_planned(optimum):
     assert not run.failed.any()
     assert run.signals.r_c == pytest.approx(policy.plan.best.x[1:, :, 0], abs=1e-6 * MM)
     assert power == pytest.approx(policy.plan.best.u[:, :, 1], abs=0.01)
-    assert episode_cost(run) == pytest.approx(policy.plan.cost, rel=1e-6)
     assert policy.plan.best.converged.all()
 
 
@@ -148,15 +105,6 @@ def test_no_nearby_inputs_are_cheaper_and_the_slope_is_zero(optimum):
         assert (np.abs(costs[2] - costs[0]) < 0.02 * rise).all()
 
 
-def test_it_is_cheaper_than_every_other_controller(optimum):
-    config, policy = optimum
-    ours = episode_cost(replay(config, policy))
-    for name in ("open-loop", "paper", "lqg", "lqg-quiet", "lqg-true", "full-information"):
-        entry = find_controller(name)
-        other = replace(config, observation=entry.observation)
-        assert (ours < episode_cost(rollout(entry.make(other), other, SEEDS))).all(), name
-
-
 def test_within_tight_limits_it_agrees_with_a_general_optimiser():
     config = make_config("hard", observation="state", horizon=60.0)
     future = future_of(config, SEEDS[:1])
@@ -172,7 +120,7 @@ def test_within_tight_limits_it_agrees_with_a_general_optimiser():
         for k in range(N):
             after = future.advance(State(*x[-1].T), Inputs(*u[k].T), slice(k, k + 1))
             x.append(np.stack([value[0] for value in after], axis=-1))
-        return predicted_cost(future, found._replace(x=np.array(x), u=u))
+        return planned_cost(future, np.array(x), u)
 
     def slope(w):
         return costs(w + 1e-30j * np.eye(2 * N)).imag / 1e-30
@@ -188,7 +136,7 @@ def test_within_tight_limits_it_agrees_with_a_general_optimiser():
     )  # fmt: skip
     assert np.abs(np.diff(peer.x[::2], prepend=0.0)).max() == pytest.approx(limits.move[0], rel=1e-6)
     assert np.abs(peer.x[::2]).max() == pytest.approx(limits.span[0], rel=1e-6)
-    assert predicted_cost(future, found)[0] == pytest.approx(peer.fun, rel=1e-6)
+    assert planned_cost(future, found.x, found.u)[0] == pytest.approx(peer.fun, rel=1e-6)
     assert (found.u[:, 0, 0] - nominal[0]) / MM_PER_MIN == pytest.approx(peer.x[::2], abs=1e-5)
 
 

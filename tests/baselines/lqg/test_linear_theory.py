@@ -7,10 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.linalg import solve_discrete_lyapunov
+from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
 from cz_gym import make_puller
-from cz_gym.baselines.lqg import kalman
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign, solve
 from cz_gym.baselines.lqg.model import FAST, PLANT, SLOW, STATES, NoiseModel
 from cz_gym.baselines.lqg.ring_model import RingModel
@@ -48,7 +47,7 @@ def steady_gain(gains):
     """Kalman gain of (r_br, T_1) at which the filter settles, shape (states, 2)."""
     A, _, H, Q, _ = gains.filter.plant
     R = np.diag(noise_sds(gains) ** 2)
-    P = kalman.steady_state(A, H, Q, R)
+    P = solve_discrete_are(A.T, H.T, Q, R)
     return P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
 
 

@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from cz_gym import make_puller
 from cz_gym.baselines.analysis.compensator_design import controller_transfer
-from cz_gym.baselines.analysis.frequency import crossover, response
+from cz_gym.baselines.analysis.frequency import loop_margins, response
 from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.analysis.sampled_loop import linear_controller
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID, SeriesPID
@@ -138,7 +138,7 @@ def test_conventional_loop_keeps_the_papers_rule():
     assert math.isfinite(policy.T_track)
     assert policy.T_start > 0.0
     puller = make_puller()
-    assert crossover(linear_form(policy).free, puller, 5.0) < 0.5 * radius_model(puller).zero
+    assert loop_margins(linear_form(policy).free, puller, 5.0).crossover < 0.5 * radius_model(puller).zero
 
 
 def test_rule_measures_its_breach():
