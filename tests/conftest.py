@@ -36,7 +36,8 @@ def pytest_sessionstart() -> None:
         from cz_gym import CzEnv
         from cz_gym.atomic_files import locked
 
-        with locked(CACHE.with_name("compiling"), patience=600.0):
+        CACHE.mkdir(parents=True, exist_ok=True)
+        with locked(CACHE, patience=600.0):
             env = CzEnv(observation="camera")
             env.reset(seed=0)
             env.step(np.zeros(2, np.float32))
