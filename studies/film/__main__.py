@@ -12,7 +12,7 @@ from typing import Any
 from cz_gym import agents
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.baselines.registry import make_controller
-from cz_gym.commands import OneLineParser, between
+from cz_gym.commands import OneLineParser
 from cz_gym.env import CzEnv
 from cz_gym.errors import CzError
 from cz_gym.rendering import palette as c
@@ -23,6 +23,8 @@ from .duel import Side, draw
 OUT = Path(__file__).resolve().parents[2] / "results" / "media" / "duel.gif"
 SEED = 2_000_000
 """The first test crystal, the one in the benchmark's figure."""
+FRAMES = 92
+"""Number of pictures."""
 RATE = 11
 """Frames a second."""
 HOLD = 1.8
@@ -36,11 +38,6 @@ PAPER = (255, 130, 205)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser("python -m studies.film", "Film the paper's controller and an agent on the same crystal.")
-    parser.add_argument(
-        "--seed", type=between(0, 2**63 - 1), default=SEED, metavar="N", help="which crystal (%(default)s)"
-    )
-    about = "frames of the film (%(default)s)"
-    parser.add_argument("--frames", type=between(2, 1000), default=92, metavar="N", help=about)
     parser.add_argument("--out", type=Path, default=OUT, metavar="FILE", help="file to write (results/media/duel.gif)")
     return parser.run(_make, arguments, "render,benchmark")
 
@@ -51,19 +48,19 @@ def _make(arguments: argparse.Namespace) -> None:
     import PIL.Image  # noqa: F401  (missing? say so before the work, not after it)
 
     check_writable(arguments.out.resolve().parent)
-    content = film(arguments.seed, arguments.frames)
+    content = film()
     write_files({arguments.out.resolve(): content})
-    print(f"wrote {arguments.out}: {arguments.frames} frames, {len(content) / 1e6:.2f} MB")
+    print(f"wrote {arguments.out}: {FRAMES} frames, {len(content) / 1e6:.2f} MB")
 
 
-def film(seed: int, frames: int) -> bytes:
-    """The GIF: both sides stepped together, ``frames`` pictures equally far apart in time."""
-    sides, canvas = contestants(seed), Canvas(*SIZE)
+def film() -> bytes:
+    """The GIF: both sides stepped together, FRAMES pictures equally far apart in time."""
+    sides, canvas = contestants(SEED), Canvas(*SIZE)
     steps = sides[0].env.config.steps
     pictures = []
-    for number in range(frames):
+    for number in range(FRAMES):
         for side in sides:
-            side.step_to(round((number + 1) * steps / frames))
+            side.step_to(round((number + 1) * steps / FRAMES))
         pictures.append(draw(canvas, sides))
     return gif(pictures)
 

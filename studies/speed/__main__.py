@@ -9,18 +9,16 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 import statistics
 import sys
 import timeit
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
-from unittest.mock import patch
 
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser
+from cz_gym.errors import CzError
 
 from .cases import SLOTS, THREADS, Case, Stepper, cases, stepper
 
@@ -78,14 +76,13 @@ RATIOS = {
 }
 
 
-def measure(
-    wanted: Sequence[Case], plan: Plan, progress: Callable[[str], None] = lambda _: None
-) -> tuple[list[Row], list[Skipped]]:
+def measure(wanted: Sequence[Case], plan: Plan) -> tuple[list[Row], list[Skipped]]:
     """Median speeds of interleaved rounds; cases that cannot be made are skipped by name."""
+    from tqdm import tqdm
+
     running: dict[Case, tuple[Stepper, timeit.Timer, int]] = {}
     skipped = []
     for case in wanted:
-        progress(case.name)
         try:
             made = stepper(case.make())
             made.step()
@@ -95,9 +92,8 @@ def measure(
         timer = timeit.Timer(made.step, "import gc; gc.enable()")
         running[case] = made, timer, calls_in(timer, plan.seconds)
     speeds: dict[Case, list[float]] = {case: [] for case in running}
-    for repeat in range(plan.repeats):
+    for _ in tqdm(range(plan.repeats), desc="rounds", disable=None):
         for case, (made, timer, calls) in running.items():
-            progress(f"{case.name}, {made.num_envs} slots, round {repeat + 1} of {plan.repeats}")
             speeds[case].append(calls * made.num_envs / timer.timeit(calls))
     for made, *_ in running.values():
         made.close()
@@ -143,9 +139,9 @@ def table(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def run(quick: bool, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+def run(quick: bool) -> dict[str, Any]:
     """Measure everything; the content of the JSON file."""
-    rows, skipped = measure(cases(quick), QUICK if quick else FULL, progress)
+    rows, skipped = measure(cases(quick), QUICK if quick else FULL)
     return {
         "ratios": {name: ratio(rows, asked) for name, asked in RATIOS.items()},
         "rows": [row._asdict() for row in rows],
@@ -165,22 +161,12 @@ def main(argv: list[str] | None = None) -> int:
 def _measure(arguments: argparse.Namespace) -> None:
     if arguments.json is not None:
         if arguments.json.is_dir():
-            raise IsADirectoryError(f"{arguments.json} is a folder")
+            raise CzError(f"{arguments.json} is a folder")
         check_writable(arguments.json.parent)
-    try:
-        # Peers warn, and so do the processes they start.
-        with patch.dict(os.environ, PYTHONWARNINGS="ignore"), warnings.catch_warnings(action="ignore"):
-            result = run(arguments.quick, _say)
-    finally:
-        _say("")
+    result = run(arguments.quick)
     print(table(result))
     if arguments.json is not None:
         write_files({arguments.json: (json.dumps(result, indent=1, allow_nan=False) + "\n").encode()})
-
-
-def _say(what: str) -> None:
-    if sys.stderr.isatty():
-        print(f"\r{what:100.100}", end="" if what else "\r", file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

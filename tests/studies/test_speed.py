@@ -3,14 +3,9 @@
 import inspect
 import itertools
 import json
-import os
-import subprocess
-import sys
 import timeit
-import warnings
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -114,19 +109,3 @@ def test_cases_without_resets_have_none() -> None:
             assert not memory["slots"]["over"].any()
         assert memory["slots"].tobytes() == memory["first"].tobytes()
         case.close()
-
-
-@pytest.mark.usefixtures("tiny")
-def test_a_peer_that_warns_is_not_heard(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
-    def step() -> None:
-        warnings.warn("look at me", UserWarning, stacklevel=1)
-        subprocess.run([sys.executable, "-c", "import warnings; warnings.warn('me too')"], check=True)
-
-    def loud(quick: bool) -> list[Any]:
-        return [Case("loud", lambda: Stepper(1, step))]
-
-    monkeypatch.setattr(speed, "cases", loud)
-    monkeypatch.delenv("PYTHONWARNINGS", raising=False)
-    assert main(["--quick"]) == 0
-    assert capfd.readouterr().err == ""
-    assert "PYTHONWARNINGS" not in os.environ
