@@ -181,6 +181,7 @@ def test_crystals_at_their_end_stay() -> None:
     assert not ends[-1].cost.any()
 
 
+@pytest.mark.slow  # compiles for another meniscus
 def test_the_exact_meniscus_has_derivatives_too() -> None:
     batch = DifferentiableBatch(make_config(meniscus=YOUNG_LAPLACE), 4)
     batch.reset(range(4))

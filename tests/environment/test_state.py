@@ -19,10 +19,10 @@ def run(env: CzEnv, steps: int, first: int = 0) -> list[Any]:
     said: list[Any] = []
     for k in range(first, first + steps):
         observation, gained, terminated, truncated, info = env.step(ACTIONS[k])
-        said.append((observation.tolist(), gained, terminated, truncated, sorted(info.items(), key=str)))
+        said.append((observation.tobytes(), gained, terminated, truncated, sorted(info.items(), key=str)))
         if terminated or truncated:
             observation, info = env.reset()
-            said.append((observation.tolist(), sorted(info.items(), key=str)))
+            said.append((observation.tobytes(), sorted(info.items(), key=str)))
     return [repr(row) for row in said]
 
 

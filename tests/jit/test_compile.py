@@ -179,7 +179,7 @@ def test_hash_sees_names_and_contents(package: Path) -> None:
     second = source_hash(folder)
     (folder / "cost.py").rename(folder / "costs.py")
     third = source_hash(folder)
-    edit(folder / "rendering" / "pixels.py", "from __future__", "# changed\nfrom __future__")
+    edit(folder / "rendering" / "canvas.py", "from __future__", "# changed\nfrom __future__")
     fourth = source_hash(folder)
     (folder / "evaluation" / "report" / "markdown.py").write_text("nothing of it is compiled")
     assert len({first, second, third, fourth}) == 4
