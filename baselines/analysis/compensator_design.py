@@ -17,10 +17,6 @@ _ROUNDING = 1e-9
 """Smallest pole that is stable, in units of the largest [-]."""
 
 
-class NoCompensatorError(CzError):
-    """A plant for which the design gives no compensator."""
-
-
 class Margins(NamedTuple):
     """Margins of an open loop and the poles of the closed one."""
 
@@ -41,7 +37,7 @@ def design_compensator(model: RadiusModel, cut_off: float = CUT_OFF) -> Compensa
     """Part II's design from a linear model of the plant and the high-pass cut-off [rad/s].
 
     The ideal compensator G_p (1 - G_m) turns the ring into the radius. It is high-pass filtered by s / (s + cut_off),
-    its partial fractions with stable poles are kept, and their steady-state gain is removed. NoCompensatorError unless
+    its partial fractions with stable poles are kept, and their steady-state gain is removed. CzError unless
     the stable part has two poles: Model II has none of its own, so only that of the filter would remain.
     """
     if not cut_off > 0.0:
@@ -50,7 +46,7 @@ def design_compensator(model: RadiusModel, cut_off: float = CUT_OFF) -> Compensa
     stable = np.unique(poles[poles < -_ROUNDING * np.abs(poles).max()])
     if len(stable) != 2:
         shown = ", ".join(f"{pole:.4g}" for pole in poles)
-        raise NoCompensatorError(f"a compensator needs two stable poles; those of plant and filter are {shown} rad/s")
+        raise CzError(f"a compensator needs two stable poles; those of plant and filter are {shown} rad/s")
     numerator = model.numerator * np.array([-model.lead, 1.0 - model.constant, 0.0])
     residues = [np.polyval(numerator, pole) / np.prod(pole - poles[poles != pole]) for pole in stable]
     fast, slow = -stable

@@ -11,8 +11,6 @@ from dataclasses import replace
 from cz_gym.baselines.tuned_for import tuned_scenario
 from cz_gym.config import Config
 from cz_gym.episodes.scenario import Scenario
-from cz_gym.errors import CzError
-from cz_gym.names import unknown
 
 from .compensated_pid import Compensator, SeriesPID
 from .filtered_pid import FilteredPID
@@ -96,13 +94,11 @@ SHIPPED: dict[tuple[str, str], FilteredPID | Industrial] = {
 
 
 def settings_of(controller: str, scenario: Scenario) -> FilteredPID | Industrial:
-    """The controller with its tuned settings for that scenario; CzError if there are none of that name."""
+    """The controller with its tuned settings for that scenario."""
     among = [where for name, where in SHIPPED if name == controller]
-    if not among:
-        raise CzError(unknown("controller with settings", controller, sorted({name for name, _ in SHIPPED})))
     return SHIPPED[controller, tuned_scenario(scenario, among, controller)]
 
 
 def tuned(controller: str, config: Config) -> FilteredPID | Industrial:
-    """The controller with its tuned settings for that environment; CzError if there are none of that name."""
+    """The controller with its tuned settings for that environment."""
     return settings_of(controller, config.sole_scenario).for_config(config)

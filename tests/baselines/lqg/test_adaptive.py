@@ -69,6 +69,7 @@ def test_it_finds_how_strong_the_fluctuations_are(strength, factor):
     assert (np.abs(expected - factor) < 0.4).mean() >= 0.9
 
 
+@pytest.mark.slow
 def test_knowing_this_gains_radius_error_at_equal_activity():
     config, family = make_config("randomized", horizon=2.0 * HOUR), ("lqg-at-0.013", "lqg-at-0.02", "lqg-at-0.03")
     points = {}

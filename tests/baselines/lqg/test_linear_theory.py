@@ -1,4 +1,4 @@
-"""The LQG on the linear plant against theory: separation principle, and its cost by the covariance equation.
+"""The LQG on the linear plant against theory: its cost by the covariance equation.
 
 The filter is the steady one: noise of known variance, every frame valid, no limit reached.
 """
@@ -11,7 +11,7 @@ from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
 from cz_gym import make_puller
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign, solve
-from cz_gym.baselines.lqg.model import FAST, PLANT, SLOW, STATES, NoiseModel
+from cz_gym.baselines.lqg.model import PLANT, STATES, NoiseModel
 from cz_gym.baselines.lqg.ring_model import RingModel
 from cz_gym.cost import cost_terms
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
@@ -83,20 +83,6 @@ def stationary_cost(gains):
     P = solve_discrete_lyapunov(A, B @ B.T, method="direct") * np.outer(scales, scales)
     by_state, by_noise = np.split(signals, [len(A)], axis=1)
     return np.array(cost_terms(*np.sqrt(np.diag(by_state @ P @ by_state.T + by_noise @ by_noise.T))))
-
-
-def test_separation_the_loop_has_the_poles_of_regulator_and_filter():
-    gains = gains_of()
-    plant, n = gains.filter.plant, len(STATES)
-    found = np.linalg.eigvals(closed_loop(gains)[0])
-    A = np.block([[plant.A[:PLANT, :PLANT], plant.B[:PLANT]], [np.zeros((2, PLANT)), np.eye(2)]])
-    B = np.vstack([plant.B[:PLANT], np.eye(2)])
-    regulated = A - B @ gains.regulator.feedback[:, [*range(PLANT), n, n + 1]]
-    filtered = plant.A @ (np.eye(n) - steady_gain(gains) @ plant.H)
-    fluctuations = np.diag(plant.A)[[FAST, SLOW]]
-    expected = np.concatenate([np.linalg.eigvals(regulated), np.linalg.eigvals(filtered), fluctuations])
-    np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(expected), atol=1e-5)
-    assert np.abs(found).max() < 1.0
 
 
 @pytest.mark.parametrize(("ring", "dt"), [(None, 5.0), (KNOWN, 5.0), (RingModel(5.0), 10.0)])

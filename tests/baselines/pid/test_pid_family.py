@@ -144,8 +144,3 @@ def test_conventional_loop_keeps_the_papers_rule():
 def test_rule_measures_its_breach():
     fast = FilteredPID(pid=SeriesPID(K_p=0.02, T_i=2000.0, T_d=300.0, N=6.0), compensator=None, T_f=10.0)
     assert below_half_the_zero(None, fast) < -0.2
-
-
-def test_unknown_settings_are_named():
-    with pytest.raises(ValueError, match="unknown controller with settings 'nobody'"):
-        tuned("nobody", make_config())

@@ -132,17 +132,6 @@ def test_the_cost_of_a_pid_is_its_priced_sum():
     assert goal.cost(found, None) == pytest.approx(0.06 + 0.2 * 0.01 + 5.0 * 0.1 + 2.0 * 0.75)
 
 
-@pytest.mark.parametrize(("controller", "scenario"), sorted(pid_settings.SHIPPED))
-def test_shipped_pids_are_those_a_search_chose(controller, scenario):
-    found, config = kept(controller, scenario), make_config(scenario)
-    search = Search(controller, goal_of(controller, config.scenario), config, 1, 5)
-    values = found["chosen"]["values"]
-    assert list(values) == [parameter.path for parameter in search.goal.parameters]
-    assert search.settings(values.values()) == pid_settings.SHIPPED[controller, scenario]
-    assert list(values.values()) in [tried for tried, *_ in found["history"]]
-    assert found["scenario_hash"] == config.scenario.hash
-
-
 # LQGs
 
 START = LQGDesign()
@@ -201,21 +190,30 @@ def test_a_search_uses_training_and_validation_seeds_only(tmp_path):
     assert met == {"puller": {*range(10), *survived, *VALIDATION_SEEDS[:20]}}
 
 
-@pytest.mark.parametrize(
-    ("controller", "scenario"), [(name, where) for name, shipped in designs.SHIPPED.items() for where in shipped]
-)
-def test_shipped_lqgs_are_those_a_search_chose(controller, scenario):
-    """Finalists of the searches that chose them were also tried with heavier weights on heater steps."""
-    found, config = kept(controller, scenario), make_config(scenario)
+# Shipped settings
+
+LQGS = [(name, where) for name, shipped in designs.SHIPPED.items() for where in shipped]
+HEATER_STEP = designs.SEARCHED.index("weights.heater_step")
+
+
+@pytest.mark.parametrize(("controller", "scenario"), [*sorted(pid_settings.SHIPPED), *LQGS])
+def test_shipped_settings_are_those_a_search_chose(controller, scenario):
+    """Finalists of the searches that chose the LQGs were also tried with heavier weights on heater steps."""
+    found, config, varied = kept(controller, scenario), make_config(scenario), []
     search = Search(controller, goal_of(controller, config.scenario), config, 1, 5)
-    values = list(found["chosen"]["values"].values())
-    chosen = search.settings(values)
-    assert chosen == designs.design_of(controller, config.scenario)
-    assert chosen.hash == found["chosen"]["hash"]
-    assert not found["chosen"]["figures"]["failure_rate"]
-    heater_step = designs.SEARCHED.index("weights.heater_step")
-    history = [np.delete(tried, heater_step).tolist() for tried, *_ in found["history"]]
-    assert np.delete(values, heater_step).tolist() in history
+    values = found["chosen"]["values"]
+    assert list(values) == [parameter.path for parameter in search.goal.parameters]
+    chosen = search.settings(values.values())
+    if controller in PIDS:
+        assert chosen == pid_settings.SHIPPED[controller, scenario]
+    else:
+        varied = [HEATER_STEP]
+        assert chosen == designs.design_of(controller, config.scenario)
+        assert chosen.hash == found["chosen"]["hash"]
+        assert not found["chosen"]["figures"]["failure_rate"]
+    history = [np.delete(tried, varied).tolist() for tried, *_ in found["history"]]
+    assert np.delete([*values.values()], varied).tolist() in history
+    assert found["scenario_hash"] == config.scenario.hash
 
 
 @pytest.mark.parametrize("scenario", FAMILY_SCENARIOS)
