@@ -13,7 +13,6 @@ from gymnasium.error import Error
 from cz_gym.commands import OneLineParser, between
 from cz_gym.config import Config, make_config
 from cz_gym.errors import CzError
-from cz_gym.rendering.scene import check_size
 from cz_gym.rendering.view import Window
 from cz_gym.units import MINUTE
 
@@ -21,6 +20,8 @@ from .game import FASTEST, SLOWEST, Game
 
 CONTROLLERS = "cz_gym.baselines.registry:find_controller"
 """Function that finds the paper's controller, looked up by name because this package imports no controller."""
+SIZE = (960, 720)
+"""Width and height of the window [px]."""
 NO_DISPLAY = "no display: a crystal is pulled by hand in a window; set DISPLAY or WAYLAND_DISPLAY"
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
 """Environment variables that can name a display, on systems that have such."""
@@ -42,36 +43,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--speed", type=float, default=60.0, metavar="FACTOR", help="times faster than real (%(default)g)"
     )
     parser.add_argument("--minutes", type=float, default=180.0, metavar="M", help="length of the run (%(default)g)")
-    parser.add_argument("--size", default="960x720", metavar="WxH", help="size of the window in pixels (%(default)s)")
     return parser.run(_play, arguments, "render")
 
 
-def settings(arguments: argparse.Namespace) -> tuple[Config, tuple[int, int]]:
-    """The environment's settings and the window's size; CzError names what was given and what is allowed."""
+def settings(arguments: argparse.Namespace) -> Config:
+    """The environment's settings; CzError names what was given and what is allowed."""
     if not SLOWEST <= arguments.speed <= FASTEST:
         raise CzError(f"--speed must be {SLOWEST:g} to {FASTEST:g}, not {arguments.speed:g}")
     if not 1.0 <= arguments.minutes <= 6000.0:
         raise CzError(f"--minutes must be 1 to 6000, not {arguments.minutes:g}")
-    try:
-        width, height = map(int, arguments.size.split("x"))
-    except ValueError:
-        raise CzError(f"--size must be WxH in pixels, such as 960x720, not {arguments.size!r}") from None
-    return make_config(arguments.scenario, horizon=arguments.minutes * MINUTE), check_size((width, height))
+    return make_config(arguments.scenario, horizon=arguments.minutes * MINUTE)
 
 
 def _play(arguments: argparse.Namespace) -> None:
-    config, size = settings(arguments)
+    config = settings(arguments)
     if sys.platform.startswith(("linux", "freebsd")) and not any(map(os.environ.get, DISPLAYS)):
         raise CzError(NO_DISPLAY)
     paper = pkgutil.resolve_name(CONTROLLERS)("paper").make(config)
     try:
-        window = Window(size, "Cz-v0: pull a crystal")
+        window = Window(SIZE, "Cz-v0: pull a crystal")
     except Error as error:
         raise CzError(str(error)) from None
     try:
         if not window.visible:
             raise CzError(NO_DISPLAY)
-        scores = Game(window, size, config, arguments.seed, arguments.speed, paper).play()
+        scores = Game(window, SIZE, config, arguments.seed, arguments.speed, paper).play()
     finally:
         window.close()
     for score in scores:

@@ -19,8 +19,6 @@ TICKS = (1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0)
 """Steps of the time axis [min]."""
 MARGINS = (38.0, 18.0, 10.0, 14.0)
 """Room for the axes' numbers and the legend: left, top, right, bottom [nominal px]."""
-NOISE = palette.mix(palette.PANEL, palette.CAMERA, 0.55)
-"""The camera's line, dim since its noise fills an area."""
 
 
 class Trace(NamedTuple):
@@ -34,7 +32,7 @@ class Trace(NamedTuple):
 
 def draw(canvas: Canvas, box: Box, record: Record) -> None:
     """The radius error by the camera, and the true one."""
-    camera, true = Trace(record.t, record.camera_error, NOISE, 0.8), Trace(record.t, record.error, palette.TRUE)
+    camera, true = Trace(record.t, record.camera_error, palette.NOISE, 0.8), Trace(record.t, record.error, palette.TRUE)
     # The camera's outliers must not set the scale.
     draw_traces(canvas, box, record.config.horizon, error_range(true.error), [camera, true])
     x, y = box.x + 38 * canvas.unit, box.y + 4 * canvas.unit

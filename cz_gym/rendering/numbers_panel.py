@@ -23,52 +23,42 @@ class SetPoints(NamedTuple):
     """Heater power [W]."""
 
 
-class Row(NamedTuple):
-    """A line of the column."""
-
-    name: str
-    value: str
-    colour: Colour = palette.FAINT
+Row = tuple[str, str, Colour]
+"""Name, value and its colour."""
 
 
 def groups(record: Record, set_points: SetPoints | None = None) -> list[list[Row]]:
-    """The rows of a record's newest sample; the first of each group is a signal, those below it its references.
+    """The rows of a record's newest sample; the first of each group is a signal, those below it its references."""
+    p, last = record.puller, record.last
+    rows = [
+        [_row("by the camera", record.camera_error[-1] + last("r_ref"), MM, "mm", palette.CAMERA),
+         _row("reference", last("r_ref"), MM, "mm", palette.REFERENCE)],
+        [_row("pull speed", last("v_p"), MM_PER_MIN, "mm/min", palette.DRIVE), _row("nominal", p.v_0, MM_PER_MIN)],
+        [_row("heater", last("Q_H"), KILO, "kW", palette.DRIVE), _row("nominal", p.Q_H_0, KILO)],
+        [_row("heater T_1", last("T_1"), 1.0, "K", palette.TEMPERATURE), _row("recipe", last("T_1_ref"))],
+        [_row("melt T_b", last("T_b"), 1.0, "K", palette.TEMPERATURE), _row("nominal", p.T_b_0)],
+    ]  # fmt: skip
+    if set_points is not None:
+        rows[1].append(_row("set by hand", set_points.v_p, MM_PER_MIN, colour=palette.INK))
+        rows[2].append(_row("set by hand", set_points.Q_H, KILO, colour=palette.INK))
+    return rows
 
-    ``set_points`` of the drives are added.
-    """
-    p, last, asked = record.puller, record.last, set_points
-    pull, heater = last("v_p") / MM_PER_MIN, last("Q_H") / KILO
-    drives = [
-        [Row("pull speed", f"{pull:.2f} mm/min", palette.DRIVE), Row("nominal", f"{p.v_0 / MM_PER_MIN:.2f}")],
-        [Row("heater", f"{heater:.2f} kW", palette.DRIVE), Row("nominal", f"{p.Q_H_0 / KILO:.2f}")],
-    ]
-    if asked is not None:
-        drives[0].append(Row("set by hand", f"{asked.v_p / MM_PER_MIN:.2f}", palette.INK))
-        drives[1].append(Row("set by hand", f"{asked.Q_H / KILO:.2f}", palette.INK))
-    T_1 = [Row("heater T_1", f"{last('T_1'):.1f} K", palette.TEMPERATURE), Row("recipe", f"{last('T_1_ref'):.1f}")]
-    T_b = [Row("melt T_b", f"{last('T_b'):.2f} K", palette.TEMPERATURE), Row("nominal", f"{p.T_b_0:.2f}")]
-    return [*drives, T_1, T_b]
+
+def _row(name: str, value: float, scale: float = 1.0, unit: str = "", colour: Colour = palette.FAINT) -> Row:
+    """A row of a value in SI units; what is not a number is a reading that failed."""
+    return name, f"{value / scale:.2f} {unit}".rstrip() if np.isfinite(value) else "no reading", colour
 
 
 def draw(canvas: Canvas, box: Box, record: Record, set_points: SetPoints | None = None) -> None:
     """The true radius error in large figures, then the groups of rows."""
     unit, left, right = canvas.unit, box.x + 8 * canvas.unit, box.right - 8 * canvas.unit
     canvas.text(left, box.y + 5 * unit, "true radius error", colour=palette.FAINT)
-    error = _in_mm(float(record.error[-1]), "+.2f")
+    error = f"{record.error[-1] / MM:+.2f} mm"
     canvas.text(box.x + box.w / 2.0, box.y + 18 * unit, error, 19, palette.TRUE, "centre", True)
-    radius = [
-        Row("by the camera", _in_mm(float(record.camera_error[-1]) + record.last("r_ref")), palette.CAMERA),
-        Row("reference", _in_mm(record.last("r_ref")), palette.REFERENCE),
-    ]
     y = box.y + 45 * unit
-    for group in (radius, *groups(record, set_points)):
-        for row in group:
-            canvas.text(left, y, row.name, colour=palette.FAINT)
-            canvas.text(right, y, row.value, 9.5, row.colour, "right", row is group[0])
+    for group in groups(record, set_points):
+        for name, value, colour in group:
+            canvas.text(left, y, name, colour=palette.FAINT)
+            canvas.text(right, y, value, 9.5, colour, "right", name == group[0][0])
             y += 13 * unit
         y += 9 * unit
-
-
-def _in_mm(length: float, form: str = ".2f") -> str:
-    """A length in mm; what is not a number is a reading that failed."""
-    return f"{length / MM:{form}} mm" if np.isfinite(length) else "no reading"

@@ -15,6 +15,8 @@ TRUE: Colour = (86, 180, 233)
 """The true crystal."""
 CAMERA: Colour = (240, 228, 66)
 """The bright ring, and the radius that the camera reads from it."""
+NOISE: Colour = (142, 138, 52)
+"""The camera's line in the chart, dim since its noise fills an area."""
 REFERENCE: Colour = (255, 255, 255)
 DRIVE: Colour = (204, 121, 167)
 """Pull speed and heater."""
@@ -28,10 +30,3 @@ ON_MELT: Colour = (60, 20, 0)
 """Words on the bright melt."""
 CRYSTAL: Colour = (104, 112, 128)
 QUARTZ: Colour = (120, 128, 140)
-
-
-def mix(low: Colour, high: Colour, share: float) -> Colour:
-    """The colour at that share of the way from low to high, clipped to them."""
-    share = min(max(share, 0.0), 1.0)
-    red, green, blue = (round(a + share * (b - a)) for a, b in zip(low, high, strict=True))
-    return red, green, blue

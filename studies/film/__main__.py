@@ -92,8 +92,7 @@ def gif(pictures: Sequence[Any]) -> bytes:
 
 def _palette(picture: Any, Image: Any) -> Any:
     """COLOURS colours: those that mean something, however few their pixels, and the rest as the picture needs them."""
-    marker = c.mix(c.CAMERA, c.MELT, 0.5)
-    meaning = (c.BACK, c.PANEL, c.INK, c.TRUE, c.CAMERA, marker, c.REFERENCE, PAPER, c.ALARM)
+    meaning = (c.BACK, c.PANEL, c.INK, c.TRUE, c.CAMERA, c.REFERENCE, PAPER, c.ALARM)
     needed = picture.quantize(COLOURS - len(meaning), method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     channels = [*needed.getpalette()[: 3 * (COLOURS - len(meaning))], *sum(meaning, ())]
     found = Image.new("P", (1, 1))

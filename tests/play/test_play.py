@@ -157,8 +157,6 @@ def test_a_failed_run_counts_to_the_horizon() -> None:
         (["--speed", "nan"], "--speed must be 1 to 3600, not nan"),
         (["--minutes", "inf"], "--minutes must be 1 to 6000, not inf"),
         (["--seed", "-1"], "--seed: must be between 0 and"),
-        (["--size", "large"], "--size must be WxH in pixels"),
-        (["--size", "10x10"], "360 to 3840"),
     ],
 )
 def test_bad_options_are_one_line(options: list[str], says: str, refused: Any) -> None:
@@ -188,5 +186,5 @@ def test_the_command_prints_the_score(monkeypatch: pytest.MonkeyPatch, capsys: p
         return self.scores
 
     monkeypatch.setattr(hand.Game, "play", play_on)
-    assert play.main(["--minutes", "5", "--size", "480x360"]) == 0
+    assert play.main(["--minutes", "5"]) == 0
     assert capsys.readouterr().out.startswith("randomized, crystal 1, 5 min: RMSE of the true radius ")
