@@ -18,7 +18,7 @@ from contextlib import closing
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -46,30 +46,24 @@ STREAM = 1
 CODE = "https://github.com/cz-gym/cz-gym"
 
 
-class Source(NamedTuple):
-    """A policy to be recorded."""
-
-    policy: Any
-    """Anything with ``predict``."""
-    observation: str = "measured"
-    """What it reads: "measured" or "history"."""
-    action: str = "direct"
-    """What its actions mean (:func:`cz_gym.task.drives_of`)."""
-
-
-def find_source(name: str, config: Config) -> Source:
-    """The controller or shipped agent of that name; ValueError names what there is."""
+def find_policy(name: str, config: Config) -> Any:
+    """The controller or shipped agent of that name for a config; CzError names what there is."""
     controllers = {entry.name: entry for entry in pkgutil.resolve_name(CONTROLLERS) if not entry.privileged}
     check_config(config)
     if name in controllers:
-        return Source(controllers[name].make(config), controllers[name].observation)
+        return controllers[name].make(config)
     load = pkgutil.resolve_name(AGENTS)
     try:
-        contract = load(name).contract
+        settings = settings_of(load(name))
     except ValueError as error:
         raise CzError(unknown("policy", name, controllers, f"; or an agent: {error}")) from None
-    reads, acts = contract.observation, contract.action
-    return Source(load(name, replace(config, observation=reads, action=acts)), reads, acts)
+    return load(name, replace(config, **settings))
+
+
+def settings_of(policy: Any) -> dict[str, Any]:
+    """The observation that a policy reads and what its actions mean; "measured" and "direct" where it does not say."""
+    told = {"observation": "measured", "action": "direct"} | getattr(policy, "settings", {})
+    return {name: told[name] for name in ("observation", "action")}
 
 
 def excitation(seed: int, config: Config, noise: float) -> tuple[float, npt.NDArray[np.float64]]:
@@ -84,9 +78,10 @@ def excitation(seed: int, config: Config, noise: float) -> tuple[float, npt.NDAr
     return level, lfilter([1.0], [1.0, -drives.keep], white, axis=0)
 
 
-def record(source: Source, config: Config, seeds: Sequence[int], noise: float) -> list[dict[str, Any]]:
+def record(policy: Any, config: Config, seeds: Sequence[int], noise: float) -> list[dict[str, Any]]:
     """One episode a seed, all in one batch: the fields of Minari's ``EpisodeBuffer``, each up to the episode's end."""
-    n, drives = len(seeds), drives_of(source.action, config.control_interval)
+    settings, n = settings_of(policy), len(seeds)
+    drives = drives_of(settings["action"], config.control_interval)
     gains, place = np.array([drives.pull, drives.heater]), list(DRIVE_CHANNELS)
     added = np.stack([excitation(seed, config, noise)[1] for seed in seeds], axis=1)
     begins, over, memory, before = np.ones(n, np.bool_), np.zeros(n, np.bool_), None, np.zeros((n, 2))
@@ -94,9 +89,9 @@ def record(source: Source, config: Config, seeds: Sequence[int], noise: float) -
         observation, info = env.reset(seed=list(seeds))
         seen, taken = [(observation, info["r_c"], info["r_ref"], info["state"])], []
         for noise_now in added:
-            measured = source.observation == "measured"
+            measured = settings["observation"] == "measured"
             shown = to_measured(observation, config.parameters.v_0) if measured else observation
-            found, memory = source.policy.predict(shown, state=memory, episode_start=begins, deterministic=True)
+            found, memory = policy.predict(shown, state=memory, episode_start=begins, deterministic=True)
             # An action that moves the drives moves them from where the policy alone would have them.
             wanted = drives.keep * (observation[:, place] - before) + gains * found
             action = np.clip(wanted + noise_now, -1.0, 1.0).astype(np.float32)
@@ -124,7 +119,7 @@ def record(source: Source, config: Config, seeds: Sequence[int], noise: float) -
 
 def write(
     name: str,
-    source: Source,
+    policy: Any,
     scenario: str = "randomized",
     seeds: Sequence[int] = TRAINING_SEEDS[:EPISODES],
     noise: float = NOISE,
@@ -148,7 +143,7 @@ def write(
         raise CzError(f"{place} is there already: overwrite it, or give another folder ({folder})")
 
     def buffers(first: int) -> list[Any]:
-        episodes = record(source, config, seeds[first : first + AT_ONCE], noise)
+        episodes = record(policy, config, seeds[first : first + AT_ONCE], noise)
         return [minari.data_collector.EpisodeBuffer(**episode) for episode in episodes]
 
     begun = buffers(0)
@@ -185,12 +180,12 @@ def main(argv: list[str] | None = None) -> int:
 def _write_all(given: argparse.Namespace) -> None:
     if given.out is not None:
         os.environ["MINARI_DATASETS_PATH"] = str(given.out.resolve())
-    sources = [
-        (name, find_source(name, make_config(scenario, observation="history")), scenario)
+    chosen = [
+        (name, find_policy(name, make_config(scenario, observation="history")), scenario)
         for scenario in given.scenarios.split(",")
         for name in given.policies.split(",")
     ]
-    for each in sources:
+    for each in chosen:
         began = time.perf_counter()
         dataset = write(*each, TRAINING_SEEDS[: given.episodes], given.noise, overwrite=given.overwrite)
         said = f"{dataset.id}: {dataset.total_episodes} episodes, {dataset.total_steps:,} steps, "

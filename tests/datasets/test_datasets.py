@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from cz_gym import CzVectorEnv, datasets
 from cz_gym.baselines import CompensatedPID
 from cz_gym.config import make_config
-from cz_gym.datasets import Source, excitation, find_source, main, record, write
+from cz_gym.datasets import excitation, find_policy, main, record, settings_of, write
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.replay import Playback
 from cz_gym.evaluation.rollout import rollout
@@ -46,7 +46,7 @@ def again(dataset: Any, episode: int) -> None:
 
 def test_an_episode_can_be_made_again_from_its_seed_and_actions(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(datasets, "AT_ONCE", 2)
-    write("lqg-at-0.02", find_source("lqg-at-0.02", CONFIG), "sensor-fault", TRAINING_SEEDS[7:10], horizon=600.0)
+    write("lqg-at-0.02", find_policy("lqg-at-0.02", CONFIG), "sensor-fault", TRAINING_SEEDS[7:10], horizon=600.0)
     dataset = minari.load_dataset("cz/sensor-fault/lqg-at-0_02-v0")
     assert (dataset.total_episodes, dataset.total_steps) == (3, 360)
     facts = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
@@ -59,7 +59,7 @@ def test_an_episode_can_be_made_again_from_its_seed_and_actions(place: Path, mon
 
 def test_a_lost_crystal_ends_its_episode(place: Path) -> None:
     """A policy that pulls at full speed loses each crystal."""
-    dataset = write("fast", Source(Playback([[1.0, 0.0]])), seeds=TRAINING_SEEDS[:2], horizon=3600.0)
+    dataset = write("fast", Playback([[1.0, 0.0]]), seeds=TRAINING_SEEDS[:2], horizon=3600.0)
     for episode, kept in enumerate(dataset.iterate_episodes()):
         assert kept.terminations.tolist() == [False] * (len(kept) - 1) + [True]
         assert not kept.truncations.any()
@@ -73,10 +73,10 @@ def test_without_excitation_a_policy_acts_as_in_the_benchmark(name: str) -> None
     """Whatever it reads and its actions mean: "measured" and "direct", "measured" and "rate", "history", "smooth"."""
     if name != "paper-tuned":
         pytest.importorskip("onnxruntime")
-    source, seeds = find_source(name, CONFIG), TRAINING_SEEDS[:3]
-    own = make_config("randomized", observation=source.observation, action=source.action, horizon=CONFIG.horizon)
-    expected = rollout(source.policy, own, seeds).signals.r_c
-    found = np.stack([each["infos"]["r_c"][1:] for each in record(source, CONFIG, seeds, 0.0)], axis=1)
+    policy, seeds = find_policy(name, CONFIG), TRAINING_SEEDS[:3]
+    own = make_config("randomized", horizon=CONFIG.horizon, **settings_of(policy))
+    expected = rollout(policy, own, seeds).signals.r_c
+    found = np.stack([each["infos"]["r_c"][1:] for each in record(policy, CONFIG, seeds, 0.0)], axis=1)
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-7)  # 0.2 um
 
 
@@ -84,9 +84,9 @@ def test_without_excitation_a_policy_acts_as_in_the_benchmark(name: str) -> None
 def test_excitation_neither_piles_up_nor_depends_on_the_batch(name: str) -> None:
     if name != "paper-tuned":
         pytest.importorskip("onnxruntime")
-    source = find_source(name, CONFIG)
-    quiet, several = (record(source, CONFIG, TRAINING_SEEDS[:4], noise) for noise in (0.0, 0.2))
-    (alone,) = record(source, CONFIG, TRAINING_SEEDS[3:4], 0.2)
+    policy = find_policy(name, CONFIG)
+    quiet, several = (record(policy, CONFIG, TRAINING_SEEDS[:4], noise) for noise in (0.0, 0.2))
+    (alone,) = record(policy, CONFIG, TRAINING_SEEDS[3:4], 0.2)
     np.testing.assert_allclose(alone["actions"], several[3]["actions"], atol=1e-6)
     assert all(each["truncations"][-1] for each in several)
     without, with_noise = (np.std([each["actions"][:, 0] for each in some]) for some in (quiet, several))
@@ -135,7 +135,7 @@ def test_bad_input_gets_one_line_and_leaves_nothing(options: list[str], said: st
 @given(seeds=st.lists(st.integers(-5, 2_000_010), max_size=3).filter(lambda s: not s or max(s) > 999_999 or min(s) < 0))
 def test_only_training_seeds_are_recorded(seeds: list[int]) -> None:
     with pytest.raises(ValueError, match="training seeds, 0 to 999999"):
-        write("paper", Source(CompensatedPID()), seeds=seeds)
+        write("paper", CompensatedPID(), seeds=seeds)
     assert not set(VALIDATION_SEEDS) & set(TRAINING_SEEDS)
 
 
@@ -171,6 +171,6 @@ def test_without_minari_one_line_says_how_to_install_it(
 def test_policies_that_do_not_fit_are_refused() -> None:
     pytest.importorskip("onnxruntime")
     with pytest.raises(ValueError, match=r"ppo is made for control_interval=5.0, this config has 2.0"):
-        find_source("ppo", replace(CONFIG, control_interval=2.0))
+        find_policy("ppo", replace(CONFIG, control_interval=2.0))
     with pytest.raises(ValueError, match="needs a Config, not 'hard'"):
-        find_source("paper", "hard")  # type: ignore[arg-type]
+        find_policy("paper", "hard")  # type: ignore[arg-type]

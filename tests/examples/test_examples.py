@@ -79,7 +79,7 @@ def offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 def recorded(crystals: int) -> list[str]:
     """The name of a dataset of the re-tuned PID."""
-    source = datasets.find_source("paper-tuned", make_config("randomized"))
+    source = datasets.find_policy("paper-tuned", make_config("randomized"))
     return [datasets.write("paper-tuned", source, seeds=TRAINING_SEEDS[:crystals]).id]
 
 

@@ -1,4 +1,4 @@
-"""The import graph of the packages: ``python -m tests.project.imports`` prints rooms, imports between them and circles.
+"""The import graph of the packages.
 
 A room is a package, or a module that stands beside packages (``cz_gym.env``, ``cz_gym.baselines.policy``, ``train``).
 """
@@ -8,7 +8,6 @@ import os
 from collections import Counter
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
-from itertools import pairwise
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -96,18 +95,3 @@ def circle(pairs: Arrows) -> list[str]:
     except CycleError as error:
         return list(error.args[1])
     return []
-
-
-def main() -> None:
-    """Print what there is."""
-    pairs, rooms = between_rooms(), {room(name) for name in modules()}
-    for package in FORBIDDEN:
-        mine = {each for each in rooms if owner(each) == package}
-        inside = sum(one in mine and other in mine for one, other in pairs)
-        print(f"{package:16s} {len(mine):3d} rooms, {inside:3d} arrows between them")
-    print(f"{'all':16s} {len(rooms):3d} rooms, {len(pairs):3d} arrows, {sum(pairs.values())} imports")
-    print("circles", " ".join(f"{one} -> {other};" for one, other in pairwise(circle(pairs))) or "none")
-
-
-if __name__ == "__main__":
-    main()

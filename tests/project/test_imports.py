@@ -5,7 +5,7 @@ from collections import Counter
 import pytest
 
 from tests.processes import python
-from tests.project.imports import FORBIDDEN, arrows, between_rooms, circle, imports, main, modules, owner, within
+from tests.project.imports import FORBIDDEN, arrows, between_rooms, circle, imports, modules, owner, within
 
 
 def test_there_is_no_circle() -> None:
@@ -21,11 +21,6 @@ def test_nothing_is_imported_from_above(package: str) -> None:
     for name, file in mine.items():
         upward = [each for each in imports(name, file) if any(within(each, other) for other in FORBIDDEN[package])]
         assert not upward, f"{name} imports {upward}"
-
-
-def test_the_command_prints_the_counts(capsys: pytest.CaptureFixture[str]) -> None:
-    main()
-    assert "circles none" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
