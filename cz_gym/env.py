@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import gymnasium as gym
 import numpy as np
@@ -58,7 +58,7 @@ def observation_space(observation: str) -> Any:
 
 
 def check_options(options: dict[str, Any] | None, allowed: tuple[str, ...] = _OPTIONS) -> dict[str, Any]:
-    """Return a copy of reset's options; raise CzError for unknown ones, and for a scenario together with a state."""
+    """Reset's options, the scenario found; raise CzError for unknown ones, and for a scenario together with a state."""
     if options is not None and not isinstance(options, Mapping):
         raise CzError(f"reset options must be a dict, not {options!r}")
     given = dict(options or {})
@@ -67,11 +67,13 @@ def check_options(options: dict[str, Any] | None, allowed: tuple[str, ...] = _OP
             raise CzError(unknown("reset option", key, allowed))
     if "scenario" in given and "state" in given:
         raise CzError("reset options 'scenario' and 'state' exclude each other: a state has its own episode")
+    if "scenario" in given:
+        given["scenario"] = find_distribution(given["scenario"])
     return given
 
 
-class Copyable:
-    """Pickling of both forms of the environment: a copy goes on bit for bit."""
+class Form:
+    """What the scalar and the batched form of the environment share: settings, and pickled copies that go on alike."""
 
     FACTS: tuple[str, ...] = ("_over", "_begun", "_named", "spec", "action_space", "observation_space")
     """Attributes that a copy has beside its settings and its slots."""
@@ -80,6 +82,17 @@ class Copyable:
     _batch: Batch
     _out: Out
     _begun: bool
+
+    @classmethod
+    def from_config(cls, config: Config, *settings: Any, **named: Any) -> Self:
+        """Make the environment from settings that :func:`cz_gym.config.make_config` has checked.
+
+        What the config does not hold follows: of :class:`CzEnv` ``render_mode``, ``render_size`` and ``info``, of
+        :class:`cz_gym.CzVectorEnv` ``num_envs``, ``autoreset_mode``, ``threads`` and ``info``.
+        """
+        env = cls.__new__(cls)
+        env._setup(check_config(config), *settings, **named)
+        return env
 
     def __getstate__(self) -> dict[str, Any]:
         """Settings, every slot's state and random stream."""
@@ -98,7 +111,7 @@ class Copyable:
         """Show the crystal from here on, where it is shown."""
 
 
-class CzEnv(Copyable, gym.Env[Observation, Action]):
+class CzEnv(Form, gym.Env[Observation, Action]):
     """Czochralski growth of a silicon ingot: hold the true radius, seeing only the camera's bright ring.
 
     ## Action Space
@@ -142,7 +155,7 @@ class CzEnv(Copyable, gym.Env[Observation, Action]):
     """
 
     metadata: dict[str, Any] = {"render_modes": declared_modes(), "render_fps": FPS}  # noqa: RUF012  (Gymnasium's own)
-    FACTS = (*Copyable.FACTS, "_np_random", "_np_random_seed")
+    FACTS = (*Form.FACTS, "_np_random", "_np_random_seed")
 
     def __init__(
         self,
@@ -164,20 +177,13 @@ class CzEnv(Copyable, gym.Env[Observation, Action]):
         )
         self._setup(config, render_mode, render_size, info)
 
-    @classmethod
-    def from_config(
-        cls,
+    def _setup(
+        self,
         config: Config,
         render_mode: str | None = None,
         render_size: tuple[int, int] = (640, 480),
         info: str = "lean",
-    ) -> CzEnv:
-        """Make the environment from settings that :func:`cz_gym.config.make_config` has checked."""
-        env = cls.__new__(cls)
-        env._setup(check_config(config), render_mode, render_size, info)
-        return env
-
-    def _setup(self, config: Config, render_mode: str | None, render_size: tuple[int, int], info: str) -> None:
+    ) -> None:
         self._everything, self._settings = check_info(info), (config, render_mode, render_size, info)
         self.config, self._made_for = config, config.made_for
         self.render_mode = render_mode
@@ -202,15 +208,14 @@ class CzEnv(Copyable, gym.Env[Observation, Action]):
         ``options={"state": ...}`` goes on from a value of :meth:`get_state`. Raises ValueError for other options.
         """
         given = check_options(options)
-        scenario = find_distribution(given["scenario"]) if "scenario" in given else None
         if "state" in given:
             check_state(given["state"], self._batch)
         super().reset(seed=seed)
         if "state" in given:
             self.set_state(given["state"])
         else:
-            self._batch.reset([0], [new_key(self.np_random)], self._out, scenario)
-            self._named |= isinstance(scenario, Mixture)
+            self._batch.reset([0], [new_key(self.np_random)], self._out, given.get("scenario"))
+            self._named |= isinstance(given.get("scenario"), Mixture)
             self._restart_view()
         self._over, self._begun = bool(self._slots["over"][0]), True
         return self._shown.copy(), self._info()

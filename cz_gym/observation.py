@@ -14,39 +14,16 @@ import numpy.typing as npt
 
 from cz_gym.errors import CzError
 
-from .signals import (
-    HEATER_SCALE,
-    MEASURED,
-    PREVIEWS,
-    PULL_SCALE,
-    STATE,
-    Channel,
-    Measured,
-    Relative,
-    scales,
-    signals,
-)
-
-__all__ = [
-    "CAMERA",
-    "CLIP",
-    "DRIVE_CHANNELS",
-    "HEATER_SCALE",
-    "HISTORY",
-    "LAGGED",
-    "LAGS",
-    "MEASURED",
-    "OBSERVATIONS",
-    "PREVIEWS",
-    "PULL_SCALE",
-    "STATE",
-    "Channel",
-    "Measured",
-    "decode",
-    "scales",
-    "to_measured",
-    "undo_differences",
-]
+from .signals import HEATER_SCALE as HEATER_SCALE
+from .signals import MEASURED as MEASURED
+from .signals import PREVIEWS as PREVIEWS
+from .signals import PULL_SCALE as PULL_SCALE
+from .signals import STATE as STATE
+from .signals import Channel as Channel
+from .signals import Measured as Measured
+from .signals import scales as scales
+from .signals import signals
+from .units import KILO, MM
 
 CLIP = 10.0
 """Largest observed value after scaling [-]."""
@@ -54,13 +31,30 @@ INTEGRAL_SCALE = 1.0
 """Scale of the error's integral, one metre second: 1 mm held for 1000 s [m s]."""
 DRIVE_CHANNELS = tuple(Measured._fields.index(name) for name in ("v_p", "Q_H"))
 """Where "measured" and "history" hold the applied drives, in units of the action."""
-LAGGED = ("ring_error", "v_p", "T_1", "Q_H")
+_PAST_SCALES = {"ring_error": 0.2 * MM, "v_p": 0.2 * PULL_SCALE, "T_1": 0.5, "Q_H": 0.5 * KILO}
+LAGGED = tuple(_PAST_SCALES)
 """Signals whose past "history" shows."""
 LAGS = (5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0, 240.0, 360.0, 480.0, 720.0, 960.0, 1200.0)
 """Ages [s] that "history" reaches back to, in spans: each span holds the samples since the age before."""
-_PAST_SCALES = {name: scale for name in LAGGED if (scale := signals(Measured)[name].past_scale) is not None}
-_RELATIVE: dict[str, Relative] = {
-    name: signal.relative for name, signal in signals(Measured).items() if signal.relative is not None
+
+
+class Relative(NamedTuple):
+    """How "history" shows a signal relative to another one."""
+
+    to: str
+    """Name of the other signal."""
+    scale: float
+    """Scale of the difference [unit of the signal]."""
+    meaning: str
+    """What the difference is, for people."""
+
+
+_RELATIVE = {
+    "r_ref_1min": Relative("r_ref", 0.1 * MM, "change of the radius reference within 1 minute"),
+    "r_ref_5min": Relative("r_ref", 0.5 * MM, "change of the radius reference within 5 minutes"),
+    "T_1_ref_1min": Relative("T_1_ref", 0.2, "change of the recipe within 1 minute"),
+    "T_1_ref_5min": Relative("T_1_ref", 1.0, "change of the recipe within 5 minutes"),
+    "T_1": Relative("T_1_ref", 2.0, "pyrometer reading minus recipe"),
 }
 
 

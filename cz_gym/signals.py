@@ -30,17 +30,6 @@ TEMPERATURE_SCALE = 5.0
 """Scale of temperatures [K]."""
 
 
-class Relative(NamedTuple):
-    """How "history" shows a signal relative to another one."""
-
-    to: str
-    """Name of the other signal."""
-    scale: float
-    """Scale of the difference [unit of the signal]."""
-    meaning: str
-    """What the difference is, for people."""
-
-
 class Signal(NamedTuple):
     """What a number is."""
 
@@ -50,10 +39,6 @@ class Signal(NamedTuple):
     """An observation holds the number over this [unit]."""
     meaning: str
     """What it is, for people."""
-    past_scale: float | None = None
-    """Scale of the differences of its past means in "history" [unit]; None: its past is not observed."""
-    relative: Relative | None = None
-    """How "history" shows it, if not as "measured" does."""
 
 
 class Channel(NamedTuple):
@@ -72,59 +57,18 @@ class Measured(NamedTuple):
     """
 
     ring_error: Annotated[
-        Any, Signal("m", MM, "camera reading minus bias minus r_ref; the last valid reading while invalid", 0.2 * MM)
+        Any, Signal("m", MM, "camera reading minus bias minus r_ref; the last valid reading while invalid")
     ]
     valid: Annotated[Any, Signal("1", 1.0, "1 if the camera says this reading is good, else 0")]
     r_ref: Annotated[Any, Signal("m", MM, "radius reference minus r_0, now")]
-    r_ref_1min: Annotated[
-        Any,
-        Signal(
-            "m",
-            MM,
-            "the same in 1 minute",
-            relative=Relative("r_ref", 0.1 * MM, "change of the radius reference within 1 minute"),
-        ),
-    ]
-    r_ref_5min: Annotated[
-        Any,
-        Signal(
-            "m",
-            MM,
-            "the same in 5 minutes",
-            relative=Relative("r_ref", 0.5 * MM, "change of the radius reference within 5 minutes"),
-        ),
-    ]
+    r_ref_1min: Annotated[Any, Signal("m", MM, "the same in 1 minute")]
+    r_ref_5min: Annotated[Any, Signal("m", MM, "the same in 5 minutes")]
     T_1_ref: Annotated[Any, Signal("K", TEMPERATURE_SCALE, "recipe of the heater temperature minus nominal, now")]
-    T_1_ref_1min: Annotated[
-        Any,
-        Signal(
-            "K",
-            TEMPERATURE_SCALE,
-            "the same in 1 minute",
-            relative=Relative("T_1_ref", 0.2, "change of the recipe within 1 minute"),
-        ),
-    ]
-    T_1_ref_5min: Annotated[
-        Any,
-        Signal(
-            "K",
-            TEMPERATURE_SCALE,
-            "the same in 5 minutes",
-            relative=Relative("T_1_ref", 1.0, "change of the recipe within 5 minutes"),
-        ),
-    ]
-    T_1: Annotated[
-        Any,
-        Signal(
-            "K",
-            TEMPERATURE_SCALE,
-            "pyrometer reading minus nominal",
-            0.5,
-            relative=Relative("T_1_ref", 2.0, "pyrometer reading minus recipe"),
-        ),
-    ]
-    v_p: Annotated[Any, Signal("m/s", PULL_SCALE, "applied pull speed minus v_0; the scale is v_0", 0.2 * PULL_SCALE)]
-    Q_H: Annotated[Any, Signal("W", HEATER_SCALE, "applied heater power minus nominal", 0.5 * KILO)]
+    T_1_ref_1min: Annotated[Any, Signal("K", TEMPERATURE_SCALE, "the same in 1 minute")]
+    T_1_ref_5min: Annotated[Any, Signal("K", TEMPERATURE_SCALE, "the same in 5 minutes")]
+    T_1: Annotated[Any, Signal("K", TEMPERATURE_SCALE, "pyrometer reading minus nominal")]
+    v_p: Annotated[Any, Signal("m/s", PULL_SCALE, "applied pull speed minus v_0; the scale is v_0")]
+    Q_H: Annotated[Any, Signal("W", HEATER_SCALE, "applied heater power minus nominal")]
 
 
 @jittable
@@ -147,16 +91,14 @@ def measure(slot: Any, t: Any) -> Any:
     )
 
 
-def _as_measured(name: str) -> Any:
-    """The entry of :class:`TrueState` for a signal that "measured" shows as well."""
-    return signals(Measured)[name]._replace(past_scale=None, relative=None)
-
-
 @cache
 def signals(kind: Any) -> dict[str, Signal]:
     """The rows of one of the classes above, by name."""
     hints = get_type_hints(kind, include_extras=True)
     return {name: hints[name].__metadata__[0] for name in kind._fields}
+
+
+_SHARED = signals(Measured)
 
 
 class TrueState(NamedTuple):
@@ -167,14 +109,14 @@ class TrueState(NamedTuple):
     T_1: Annotated[Any, Signal("K", TEMPERATURE_SCALE, "true heater temperature minus nominal")]
     T_2: Annotated[Any, Signal("K", TEMPERATURE_SCALE, "true susceptor temperature minus nominal")]
     T_b: Annotated[Any, Signal("K", TEMPERATURE_SCALE, "true melt temperature minus nominal")]
-    r_ref: Annotated[Any, _as_measured("r_ref")]
-    r_ref_1min: Annotated[Any, _as_measured("r_ref_1min")]
-    r_ref_5min: Annotated[Any, _as_measured("r_ref_5min")]
-    T_1_ref: Annotated[Any, _as_measured("T_1_ref")]
-    T_1_ref_1min: Annotated[Any, _as_measured("T_1_ref_1min")]
-    T_1_ref_5min: Annotated[Any, _as_measured("T_1_ref_5min")]
-    v_p: Annotated[Any, _as_measured("v_p")]
-    Q_H: Annotated[Any, _as_measured("Q_H")]
+    r_ref: Annotated[Any, _SHARED["r_ref"]]
+    r_ref_1min: Annotated[Any, _SHARED["r_ref_1min"]]
+    r_ref_5min: Annotated[Any, _SHARED["r_ref_5min"]]
+    T_1_ref: Annotated[Any, _SHARED["T_1_ref"]]
+    T_1_ref_1min: Annotated[Any, _SHARED["T_1_ref_1min"]]
+    T_1_ref_5min: Annotated[Any, _SHARED["T_1_ref_5min"]]
+    v_p: Annotated[Any, _SHARED["v_p"]]
+    Q_H: Annotated[Any, _SHARED["Q_H"]]
     dT_i: Annotated[Any, Signal("K", 1.0, "interface fluctuation now")]
     Q_d: Annotated[Any, Signal("W", KILO, "heat load on the melt now")]
     ring_offset: Annotated[Any, Signal("m", MM, "offset of the ring that no sensor shows")]

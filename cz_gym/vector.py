@@ -17,15 +17,14 @@ from cz_gym.camera.view import Camera
 from cz_gym.engine.batch import Batch, new_key
 from cz_gym.engine.layout import Out, check_info
 from cz_gym.episodes.mixture import AnyScenario, Mixture
-from cz_gym.episodes.scenarios import find_distribution
 from cz_gym.errors import CzError
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.processors import processors
 
 from .action import MarkedAction, check_marked
-from .config import Config, check_config, make_config
-from .env import Copyable, CzEnv, EnvState, action_space, check_options, check_state, observation_space
+from .config import Config, make_config
+from .env import CzEnv, EnvState, Form, action_space, check_options, check_state, observation_space
 from .signals import INFO, LEAN
 
 _CLIPPED = INFO.index("action_clipped")
@@ -36,7 +35,7 @@ Array = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
 
 
-class CzVectorEnv(Copyable, VectorEnv[Array, Array, Array]):
+class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
     """Many pullers at once in one compiled loop; slot i with seed s equals :class:`CzEnv` with seed s bit for bit.
 
     Arguments are those of :class:`CzEnv`, with ``num_envs``, ``autoreset_mode`` (a
@@ -46,7 +45,7 @@ class CzVectorEnv(Copyable, VectorEnv[Array, Array, Array]):
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
-    FACTS = (*Copyable.FACTS, "_randoms", "_seeds", "_waiting")
+    FACTS = (*Form.FACTS, "_randoms", "_seeds", "_waiting")
 
     def __init__(
         self,
@@ -72,22 +71,13 @@ class CzVectorEnv(Copyable, VectorEnv[Array, Array, Array]):
             raise CzError(f"a batch does not render: render_mode must be None, not {render_mode!r}")
         self._setup(config, num_envs, autoreset_mode, threads, info)
 
-    @classmethod
-    def from_config(
-        cls,
+    def _setup(
+        self,
         config: Config,
         num_envs: int = 1,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         threads: int | None = None,
         info: str = "lean",
-    ) -> CzVectorEnv:
-        """Make the batch from settings that :func:`cz_gym.config.make_config` has checked."""
-        env = cls.__new__(cls)
-        env._setup(check_config(config), num_envs, autoreset_mode, threads, info)
-        return env
-
-    def _setup(
-        self, config: Config, num_envs: int, autoreset_mode: AutoresetMode | str, threads: int | None, info: str
     ) -> None:
         self._everything, self._settings = check_info(info), (config, num_envs, autoreset_mode, threads, info)
         if not isinstance(num_envs, int | np.integer) or isinstance(num_envs, bool) or num_envs < 1:
@@ -127,7 +117,6 @@ class CzVectorEnv(Copyable, VectorEnv[Array, Array, Array]):
         """
         given = check_options(options, ("scenario", "state", "reset_mask"))
         mask = self._reset_mask(given.get("reset_mask"))
-        scenario = find_distribution(given["scenario"]) if "scenario" in given else None
         if "state" in given:
             self._check_states(given["state"])
         self._seed(seed, mask)
@@ -138,11 +127,9 @@ class CzVectorEnv(Copyable, VectorEnv[Array, Array, Array]):
         if "state" in given:
             self._restore(given["state"], which)
         else:
-            self._batch.reset(which, (new_key(self._random(i)) for i in which), self._out, scenario)
-            self._named |= isinstance(scenario, Mixture)
-        self._over[mask] = self._batch.memory.slots["over"][mask] > 0
-        self._waiting = bool(self._over.any())
-        self._begun = True
+            self._batch.reset(which, (new_key(self._random(i)) for i in which), self._out, given.get("scenario"))
+            self._named |= isinstance(given.get("scenario"), Mixture)
+        self._begin()
         return self._observations(), self._infos(self._out, mask)
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
@@ -193,9 +180,12 @@ class CzVectorEnv(Copyable, VectorEnv[Array, Array, Array]):
         self._check_states(states)
         self._out = self._batch.new_out()
         self._restore(states, list(range(self.num_envs)))
+        self._begin()
+
+    def _begin(self) -> None:
+        """Note which slots hold a crystal that still grows."""
         self._over = self._batch.memory.slots["over"] > 0
-        self._waiting = bool(self._over.any())
-        self._begun = True
+        self._waiting, self._begun = bool(self._over.any()), True
 
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the threads."""

@@ -116,6 +116,16 @@ class View:
             setattr(self, name, float(record[name]))
 
 
+def drawn(env: Any) -> Any:
+    """The random series of a scalar environment's episode, drawn from its key as a whole."""
+    from cz_gym.episodes.series import draw_episode, new_series
+
+    config = env.config
+    series = new_series(int(config.horizon // 5.0) + 2, config.steps + 1)
+    draw_episode(config.sole_scenario, tuple(env.get_state().slot.slot["key"].tolist()), series)
+    return series
+
+
 def hold(info: dict[str, Any], p: Any) -> float:
     """Pull action that holds any crystal, from its true state: poles near 0.01 rad/s."""
     return float(1000 * (info["r_c"] - info["r_ref"]) - 700 * (info["h_c"] - p.h_0))

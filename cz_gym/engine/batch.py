@@ -22,9 +22,8 @@ from cz_gym.camera.image import build_look, new_scratch
 from cz_gym.camera.view import IMAGE, make_view
 from cz_gym.config import Config, Identity
 from cz_gym.episodes.mixture import Distribution
-from cz_gym.episodes.record import GRID, Episode, Lots, lots_of
+from cz_gym.episodes.record import GRID, Lots, lots_of
 from cz_gym.episodes.scenario import MAX_LATENCY
-from cz_gym.episodes.series import series_of
 from cz_gym.errors import CzError
 from cz_gym.jit.compile import entry
 from cz_gym.observation import HISTORY, LAGGED, lags, past_scale_changes, relative_channels
@@ -76,24 +75,8 @@ class SlotState:
     slot: npt.NDArray[Any]
     history: npt.NDArray[np.float64]
     frames: npt.NDArray[np.float64]
-    clock: Clock
     scenario: str
     """Name of the scenario that the episode was drawn from."""
-
-    @property
-    def interface(self) -> npt.NDArray[np.float64]:
-        """dT_i on the 5 s grid [K], shape (grid points,)."""
-        return self._series()[0]
-
-    @property
-    def noise(self) -> npt.NDArray[np.float64]:
-        """Camera [m] (NaN: dropped) and pyrometer [K] noise, shape (samples, 2)."""
-        return self._series()[1]
-
-    def _series(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        first, second = self.slot["key"].tolist()
-        episode = Episode(*self.slot["episode"].item())
-        return series_of(episode, (first, second), self.clock.grid_points, self.clock.steps + 1)
 
 
 class Batch:
@@ -269,7 +252,7 @@ class Batch:
         """A copy of the state of slot i."""
         # array[i] of a structured array is a view that np.copy does not copy; array[i, ...] is an array.
         slot, history, frames = (rows[i, ...].copy() for rows in self._saved())
-        return SlotState(self.identity, slot, history, frames, self.clock, self.scenarios[i])
+        return SlotState(self.identity, slot, history, frames, self.scenarios[i])
 
     def check(self, state: SlotState) -> None:
         """Raise ValueError if this is no saved state, or one saved under other settings."""

@@ -26,7 +26,6 @@ SHORTEST = 1e-9
 _START, _PARAMETERS, _SCHEDULE = int(Stream.START), int(Stream.PARAMETERS), int(Stream.SCHEDULE)
 _INTERFACE, _SENSOR, _FAULTS = int(Stream.INTERFACE), int(Stream.SENSOR), int(Stream.FAULTS)
 _SPREAD_NUMBERS, _HOT_ZONE_NUMBERS, _FAULT_NUMBERS = 7, 7, 5 + 3 * FREEZES
-_INTERFACE_NUMBERS, _SENSOR_NUMBERS = 2, 8
 
 
 @jittable
@@ -126,8 +125,8 @@ def draw_episode(record: Any, streams: Any, freezes: Any) -> Any:
     )
     plan, at, read = (
         _uniforms(streams[_SCHEDULE], 10),
-        _uniforms(streams[_INTERFACE], _INTERFACE_NUMBERS),
-        _uniforms(streams[_SENSOR], _SENSOR_NUMBERS),
+        _uniforms(streams[_INTERFACE], 2),
+        _uniforms(streams[_SENSOR], 8),
     )
     recipe_length = between(recipe.duration, plan[1])
     moved = 1.0 if plan[6] < reference.probability else 0.0
@@ -172,13 +171,6 @@ def draw_episode(record: Any, streams: Any, freezes: Any) -> Any:
         outlier_probability=sensor.outlier_probability,
         outlier_sd=sensor.outlier_sd,
     )
-
-
-@jittable
-def skip_constants(streams: Any) -> None:
-    """Move fresh streams to where :func:`draw_episode` leaves those that series are drawn from."""
-    _uniforms(streams[_INTERFACE], _INTERFACE_NUMBERS)
-    _uniforms(streams[_SENSOR], _SENSOR_NUMBERS)
 
 
 @jittable

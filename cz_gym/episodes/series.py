@@ -15,7 +15,7 @@ import numpy.typing as npt
 from cz_gym.jit.compile import kernel
 
 from . import draw as draws
-from .draw import STREAMS, seed_streams, skip_constants
+from .draw import STREAMS, seed_streams
 from .noise import draw_series
 from .record import FREEZES, Episode, Factors, lots_of
 from .rng import WORDS
@@ -50,13 +50,6 @@ def draw_episode(scenario: Scenario, key: tuple[int, int], out: Series) -> Episo
     return Episode(*_episode(lots_of(scenario).records, _words(key), _streams(), out.interface, out.noise, out.freezes))
 
 
-def series_of(episode: Episode, key: tuple[int, int], grid_points: int, samples: int) -> tuple[Floats, Floats]:
-    """The series of an episode drawn before: dT_i [K], shape (grid points,), and noise, shape (samples, 2)."""
-    interface, noise, _ = new_series(grid_points, samples)
-    _series(episode, _words(key), _streams(), interface, noise)
-    return interface, noise
-
-
 def _words(key: tuple[int, int]) -> npt.NDArray[np.uint64]:
     return np.array(key, np.uint64)
 
@@ -77,10 +70,3 @@ def _episode(record: Any, key: Any, streams: Any, interface: Any, noise: Any, fr
     e = draws.draw_episode(record[0], streams, freezes)
     draw_series(e, streams, interface, noise)
     return e
-
-
-@kernel
-def _series(e: Any, key: Any, streams: Any, interface: Any, noise: Any) -> None:
-    seed_streams(streams, key)
-    skip_constants(streams)
-    draw_series(e, streams, interface, noise)

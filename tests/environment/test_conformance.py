@@ -45,7 +45,7 @@ def test_the_native_batch_is_a_vector_of_scalars(settings: dict[str, Any], mode:
     assert checked.held > 2000
 
 
-@pytest.mark.parametrize("scenario", ["hard", "sensor-fault", "puller"])
+@pytest.mark.parametrize("scenario", ["sensor-fault", pytest.param("puller", marks=pytest.mark.slow)])
 def test_a_batch_of_images_is_a_vector_of_scalars(scenario: str) -> None:
     settings: dict[str, Any] = {"scenario": scenario, "observation": "camera", **SHORT, "horizon": 180.0, "info": "all"}
     checked = check_vector_env(

@@ -176,7 +176,6 @@ def test_fast_and_slow_controllers_meet_the_same_crystal(interval: float) -> Non
         steps = [env.step(ZERO)[4] for _ in range(round(2400.0 / dt))]
         at_common_times = steps[round(10 / dt) - 1 :: round(10 / dt)]
         runs[dt] = saved, np.array([[i["r_c"], i["h_c"], i["T_1"], i["T_b"], i["r_ref"]] for i in at_common_times])
-    np.testing.assert_array_equal(runs[5.0][0].interface, runs[interval][0].interface)
     assert runs[5.0][0].slot["episode"] == runs[interval][0].slot["episode"]
     np.testing.assert_allclose(runs[interval][1], runs[5.0][1], rtol=1e-8)
 

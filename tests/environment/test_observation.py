@@ -3,7 +3,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import View, hold
+from conftest import View, drawn, hold
 
 from cz_gym import SCENARIOS, CzEnv, Scenario, decode
 from cz_gym.episodes.scenario import Faults, Sensor
@@ -54,7 +54,7 @@ def test_measured_holds_what_the_control_computer_has_and_nothing_else(scenario:
     t = 5.0 * np.arange(401)
     e = View(start.slot["episode"])
     drift = np.array([pyrometer_drift(now, e) for now in t])
-    pyrometer = column(infos, "T_1") + drift + start.noise[:401, 1] - nominal["T_1_0"]
+    pyrometer = column(infos, "T_1") + drift + drawn(env).noise[:401, 1] - nominal["T_1_0"]
     np.testing.assert_allclose(seen.T_1, pyrometer, atol=1e-5)
     assert set(np.unique(seen.valid)) <= {0.0, 1.0}
 
@@ -118,7 +118,7 @@ def test_state_is_the_plant() -> None:
     assert row["h_c"] == pytest.approx((infos[-1]["h_c"] - p["h_0"]) / 1e-3, rel=1e-5)
     for name in ("T_1", "T_2", "T_b"):
         assert row[name] == pytest.approx((slot["x"][name] - p[f"{name}_0"]) / 5.0, rel=1e-4)
-    assert row["dT_i"] == pytest.approx(start.interface[49], rel=1e-5)
+    assert row["dT_i"] == pytest.approx(drawn(env).interface[49], rel=1e-5)
     assert row["Q_d"] == pytest.approx(float(slot["Q_d"]) / 1e3, rel=1e-5)
     assert row["ring_offset"] == pytest.approx(infos[-1]["ring_offset"] / 1e-3, rel=1e-5)
     assert row["lam"] == pytest.approx(float(p["lam"]))
@@ -144,10 +144,10 @@ def test_faulty_camera_shows_the_last_value() -> None:
     scenario = Scenario("mine", sensor=SCENARIOS["hard"].sensor, faults=SCENARIOS["sensor-fault"].faults)
     env = CzEnv(scenario, info="all")
     rows, infos, start = run(env, 2160, 0.01, seed=2)
-    e, windows = View(start.slot["episode"]), start.slot["freezes"]
+    noise, e, windows = drawn(env).noise, View(start.slot["episode"]), start.slot["freezes"]
     shown, invalid, silent = np.nan, 0, 0
     for k, info in enumerate(infos):
-        t, camera = 5.0 * k, start.noise[k, 0]
+        t, camera = 5.0 * k, noise[k, 0]
         flagged = any(low <= t < high for low, high in windows[:3])
         frozen = windows[3, 0] <= t < windows[3, 1]
         if not (flagged or frozen or np.isnan(camera)):
@@ -182,9 +182,10 @@ def test_outliers_are_not_flagged() -> None:
 def test_camera_noise_is_per_sample_whatever_the_interval() -> None:
     scenario = Scenario("mine", sensor=Sensor(camera_noise=(1e-4, 1e-4)))
     for interval in (2.0, 10.0):
-        _, infos, start = run(CzEnv(scenario, control_interval=interval, info="all"), 100)
+        env = CzEnv(scenario, control_interval=interval, info="all")
+        _, infos, _ = run(env, 100)
         noise = column(infos, "r_br_measured") - column(infos, "r_br")
-        np.testing.assert_allclose(noise, start.noise[:101, 0], atol=1e-12)
+        np.testing.assert_allclose(noise, drawn(env).noise[:101, 0], atol=1e-12)
 
 
 def test_observations_are_clipped_not_lost() -> None:

@@ -2,6 +2,7 @@ import copy
 import dataclasses
 import pickle
 from collections.abc import Callable
+from itertools import product
 from typing import Any
 
 import gymnasium as gym
@@ -26,8 +27,13 @@ def run(env: CzEnv, steps: int, first: int = 0) -> list[Any]:
     return [repr(row) for row in said]
 
 
-@pytest.mark.parametrize("scenario", ["randomized", "sensor-fault", "puller"])
-@pytest.mark.parametrize("observation", ["measured", "history", "state", "camera"])
+@pytest.mark.parametrize(
+    ("scenario", "observation"),
+    [
+        *product(("randomized", "sensor-fault", "puller"), ("measured", "history", "state")),
+        pytest.param("sensor-fault", "camera", marks=pytest.mark.slow),
+    ],
+)
 def test_a_saved_state_continues_bit_for_bit(scenario: str, observation: str) -> None:
     env = CzEnv(scenario, observation=observation, horizon=200.0)
     env.reset(seed=9)

@@ -3,7 +3,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import HOUR, Truth, View, design_rates, hold, integrated
+from conftest import HOUR, Truth, View, design_rates, drawn, hold, integrated
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
@@ -126,7 +126,7 @@ def test_runge_kutta_is_of_fourth_order() -> None:
 def test_an_hour_of_driven_motion_agrees_with_scipy(interval: float, scenario: str | Scenario) -> None:
     env = CzEnv(scenario, control_interval=interval, horizon=HOUR, info="all")
     env.reset(seed=5)
-    saved = env.get_state().slot
+    saved, interface = env.get_state().slot, drawn(env).interface
     p, e, x = View(saved.slot["puller"]), View(saved.slot["episode"]), np.array(saved.slot["x"].tolist())
     steps = round(HOUR / interval)
     worst, heights, feedback = 0.0, [], 0.0
@@ -138,7 +138,7 @@ def test_an_hour_of_driven_motion_agrees_with_scipy(interval: float, scenario: s
         while t < (k + 1) * interval - 1e-6:
             j = int(t // 5.0)
             upto = min(5.0 * (j + 1), (k + 1) * interval)
-            d = disturbance(5.0 * j, saved.interface[j], e, p)
+            d = disturbance(5.0 * j, interface[j], e, p)
             x = integrated(x, Truth(info["v_p"], info["Q_H"], *d), p, upto - t).y[:, -1]
             t = upto
         ours = [info["r_c"], info["h_c"], info["T_1"], x[3], info["T_b"]]
