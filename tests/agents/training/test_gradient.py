@@ -20,7 +20,7 @@ from cz_gym.agents.training import filter_bank, gradient
 from cz_gym.agents.training.crystals import Crystals
 from cz_gym.agents.training.filter_bank import STATE, FilterBank
 from cz_gym.agents.training.gradient import GradientLearner
-from cz_gym.agents.training.plant_step import PlantStep
+from cz_gym.agents.apg.plant_step import PlantStep
 from cz_gym.agents.training.recipes import LQG_COST, RECIPES, Gradient
 from cz_gym.agents.training.validation import Validation, validate
 from cz_gym.cost import COST_CAP, SCALES, Cost
