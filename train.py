@@ -20,6 +20,7 @@ except ModuleNotFoundError as error:
 
 if TYPE_CHECKING:
     from cz_gym.agents.training.recipes import Recipe
+    from cz_gym.agents.training.validation import References
 
 CHECKPOINT_SECONDS = 60.0
 """Default time between checkpoints [s]."""
@@ -45,8 +46,6 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     add("--ray", nargs="?", const="", metavar="HOST:PORT", help=about)
     about = "environment steps of learning (default: the recipe's, or the resumed run's)"
     add("--steps", type=between(1, 10**12), help=about)
-    about = "agent that a gradient recipe continues from: its file, or a folder of --seeds"
-    add("--from", dest="start", type=lambda path: str(Path(path).resolve()), metavar="PATH", help=about)
     add("--scenario", help="scenario to train on (default: the recipe's, or the resumed run's)")
     about = (
         "run folder (default: runs/<algo>-seed<seed>); with --seeds the folder of their folders seed0, seed1 ... "
@@ -55,15 +54,11 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     add("--out", type=Path, help=about)
     add("--plot", action="store_true", help="draw the progress into the run folder: progress.png")
     add("--resume", action="store_true", help="continue from the run folder's checkpoint")
-    about = "time between checkpoints: the most that a crash loses (default: %(default)g; an imitation begins again)"
+    about = "time between checkpoints: the most that a crash loses (default: %(default)g)"
     add("--checkpoint-seconds", type=_seconds, default=CHECKPOINT_SECONDS, metavar="S", help=about)
     arguments = parser.parse_args(argv)
     if arguments.ray is not None and not arguments.seeds:
         parser.error("--ray needs --seeds")
-    if arguments.start and not arguments.resume and not hasattr(RECIPES[arguments.algo or DEFAULT], "start"):
-        parser.error("--from goes with gradient recipes only: --algo gradient")
-    if arguments.algo == "gradient" and not arguments.start and not arguments.resume:
-        parser.error("gradient continues from an agent of gradient-start: train that first, then add --from PATH")
     suffix = "" if arguments.seeds else f"-seed{arguments.seed or 0}"
     arguments.out = arguments.out or Path("runs") / f"{arguments.algo or DEFAULT}{suffix}"
     return arguments
@@ -96,14 +91,14 @@ def _train_one(arguments: argparse.Namespace, recipe: Recipe) -> int:
     from cz_gym.agents.training.run import Run
     from cz_gym.agents.training.run_files import trained_on
     from cz_gym.atomic_files import locked
-    from cz_gym.baselines.registry import make_controller
 
     folder, seed, resume = arguments.out, arguments.seed, arguments.resume
     with locked(folder):
-        run = Run(folder, recipe, seed, make_controller, resume, arguments.checkpoint_seconds, arguments.plot)
-        total, crystals = run.learner.total, trained_on(recipe.name, recipe.scenario)
-        print(f"{recipe.name}, seed {seed}, {total:,} steps on {crystals}, into {folder}")
-        with tqdm(total=total, unit="step", unit_scale=True, dynamic_ncols=True, mininterval=1.0) as bar:
+        beside = _references(recipe)
+        run = Run(folder, recipe, seed, beside, resume, arguments.checkpoint_seconds, arguments.plot)
+        crystals = trained_on(recipe.name, recipe.scenario)
+        print(f"{recipe.name}, seed {seed}, {recipe.steps:,} steps on {crystals}, into {folder}")
+        with tqdm(total=recipe.steps, unit="step", unit_scale=True, dynamic_ncols=True, mininterval=1.0) as bar:
             run.learn(bar)
         summary = run.finish()
     print(_summary_line(summary))
@@ -118,10 +113,9 @@ def _train_seeds(arguments: argparse.Namespace, recipe: Recipe, folders: dict[in
     from cz_gym.agents.training.fleet import Job, train_seeds
     from cz_gym.agents.training.run_files import trained_on
     from cz_gym.atomic_files import locked
-    from cz_gym.baselines.registry import make_controller
     from cz_gym.evaluation.cluster import check_shared, completed, connect, in_processes
 
-    options = make_controller, arguments.checkpoint_seconds, arguments.plot, sys.argv
+    options = _references(recipe), arguments.checkpoint_seconds, arguments.plot, sys.argv
     jobs = [Job(folder, recipe, seed, *options) for seed, folder in folders.items()]
     for job in jobs:
         with locked(job.folder):
@@ -136,6 +130,16 @@ def _train_seeds(arguments: argparse.Namespace, recipe: Recipe, folders: dict[in
             bar.write(f"seed {job.seed}: {_summary_line(summary)}")
     print(f"wrote agent.onnx into {len(jobs)} folders of {arguments.out}")
     return 0
+
+
+def _references(recipe: Recipe) -> References:
+    """What classical controllers reach on the validation crystals."""
+    from cz_gym.agents.training.validation import REFERENCES, references
+    from cz_gym.baselines.registry import make_controller
+    from cz_gym.config import make_config
+
+    config = make_config(recipe.scenario, control_interval=recipe.control_interval)
+    return references({name: make_controller(name, config) for name in REFERENCES}, config)
 
 
 def _summary_line(summary: dict[str, float]) -> str:
@@ -183,7 +187,6 @@ def _fill_from_resumed_run(arguments: argparse.Namespace, folders: list[Path]) -
         "algo": (saved.get("algorithm"), DEFAULT),
         "seed": (saved.get("seed"), 0),
         "scenario": (settings.get("scenario"), ""),
-        "start": (settings.get("start"), ""),
     }
     for name, (value, default) in values.items():
         if getattr(arguments, name) is None:
@@ -194,19 +197,13 @@ def _fill_from_resumed_run(arguments: argparse.Namespace, folders: list[Path]) -
 
 
 def _recipe_from(arguments: argparse.Namespace, saved_steps: int | None) -> Recipe:
-    """The recipe with scenario, start and steps of the command line or the resumed run."""
-    from cz_gym.agents.training.recipes import RECIPES, Gradient
+    """The recipe with scenario and steps of the command line or the resumed run."""
+    from cz_gym.agents.training.recipes import RECIPES
     from cz_gym.episodes.scenarios import find_scenario
 
     recipe = RECIPES[arguments.algo]
-    recipe = replace(recipe, scenario=find_scenario(arguments.scenario or recipe.scenario).name)
-    if isinstance(recipe, Gradient):
-        recipe = replace(recipe, start=arguments.start or recipe.start)
-    if recipe.steps:
-        return replace(recipe, steps=arguments.steps or saved_steps or recipe.steps)
-    if arguments.steps:
-        raise CzError(f"{recipe.name} takes no --steps: its length is that of its demonstrations")
-    return recipe
+    scenario = find_scenario(arguments.scenario or recipe.scenario).name
+    return replace(recipe, scenario=scenario, steps=arguments.steps or saved_steps or recipe.steps)
 
 
 def _named(kind: str, known: Iterable[str]) -> Callable[[str], str]:

@@ -1,7 +1,7 @@
 """Learned controllers: trained with stable-baselines3 or by exact gradients, run by onnxruntime alone.
 
 ``load("gradient")`` is a trained agent, ready to act. Importing this package needs neither torch nor
-stable-baselines3; training (:mod:`cz_gym.agents.training.learners`) needs both.
+stable-baselines3; training (:mod:`cz_gym.agents.apg`, ``train.py``) needs both.
 """
 
 from __future__ import annotations

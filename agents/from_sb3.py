@@ -76,6 +76,8 @@ def save_agent(
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.vec_env import VecNormalize
 
+    from cz_gym.agents.export import to_onnx
+
     path = Path(path)
     if path.suffix != ".onnx":
         raise AgentFileError(f"{path}: an agent file ends in .onnx")
@@ -88,7 +90,7 @@ def save_agent(
     _check_wrappers(model)
     _check_spaces(model, config)
     _check_normalisation(model, normalisation, config.observation)
-    content = to_onnx(model, normalisation, config.observation)
+    content = to_onnx(model.policy, len(OBSERVATIONS[config.observation]), normalisation)
     facts = {
         **facts_of(config),
         "algorithm": name,
@@ -107,31 +109,6 @@ def save_agent(
     found = validate(agent, config, JUDGING)
     facts |= {"validation_cost": found.cost, "validation_rmse_mm": found.rmse_mm}
     return write_agent(path, content, **facts)
-
-
-def to_onnx(model: BaseAlgorithm, normalisation: VecNormalize | None, observation: str) -> bytes:
-    """The model's deterministic actor, a serialised ONNX model; AgentFileError if it cannot be written as one."""
-    from stable_baselines3.common.torch_layers import FlattenExtractor
-
-    from cz_gym.agents.training.export import OnnxGraph, actor_of
-
-    graph, x = OnnxGraph(), "observation"
-    if normalisation is not None and normalisation.norm_obs:
-        rms: Any = normalisation.obs_rms
-        spread = np.sqrt(rms.var + normalisation.epsilon)
-        x = graph.node("Sub", [x, graph.constant("mean", np.float32(rms.mean))], "centred")
-        x = graph.node("Div", [x, graph.constant("spread", np.float32(spread))], "scaled")
-        x = graph.clip(x, -normalisation.clip_obs, normalisation.clip_obs, "normalised")
-    try:
-        actor = actor_of(model.policy)
-        if not isinstance(actor.extractor, FlattenExtractor):
-            raise TypeError(
-                f"a policy with {type(actor.extractor).__name__} before its layers cannot be written as one"
-            )
-        graph.acted(x, actor, "action")
-    except TypeError as error:
-        raise AgentFileError(str(error)) from None
-    return graph.finished(len(OBSERVATIONS[observation]), actor.remembers)
 
 
 def disagreement(
@@ -184,7 +161,7 @@ def _check_wrappers(model: BaseAlgorithm) -> None:
     """AgentFileError if a wrapper may change observations or actions, which the agent file would leave out."""
     from stable_baselines3.common.vec_env import VecEnvWrapper
 
-    from cz_gym.agents.training.vec_env import CzVecEnv
+    from cz_gym.sb3 import CzVecEnv
 
     env, names = model.get_env(), list[str]()
     while isinstance(env, VecEnvWrapper):

@@ -21,9 +21,9 @@ from cz_gym import CzVectorEnv
 from cz_gym.agents import load
 from cz_gym.agents.from_sb3 import save_agent
 from cz_gym.agents.training.validation import Validation, validate
-from cz_gym.agents.training.vec_env import CzVecEnv
 from cz_gym.agents.training.wrappers import TrainingReward
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from cz_gym.sb3 import CzVecEnv
 
 
 def main(seed: int = 0, steps: int = 10_000_000, out: Path = Path("runs/sb3-ppo.onnx")) -> Validation:

@@ -167,16 +167,16 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[[Callable[[list[str]
 @pytest.fixture
 def few_crystals(monkeypatch: pytest.MonkeyPatch) -> None:
     """Training runs of this process pick and judge on two crystals each."""
-    from cz_gym.agents.training import run
+    from cz_gym.agents.training import validation
     from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
-    monkeypatch.setattr(run, "PICKING", VALIDATION_SEEDS[:2])
-    monkeypatch.setattr(run, "JUDGING", VALIDATION_SEEDS[2:4])
+    monkeypatch.setattr(validation, "PICKING", VALIDATION_SEEDS[:2])
+    monkeypatch.setattr(validation, "JUDGING", VALIDATION_SEEDS[2:4])
 
 
 @pytest.fixture(scope="session")
 def ppo() -> Any:
-    """A learner that has learned a little, for tests that leave it as it is."""
+    """An algorithm that has learned a little, for tests that leave it as it is."""
     from tests.small_learners import SMALL, trained
 
     return trained(SMALL)

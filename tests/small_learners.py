@@ -5,9 +5,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from cz_gym.agents.training import fleet, run
-from cz_gym.agents.training.learners import make_learner
-from cz_gym.agents.training.recipes import PPO, SAC, Imitation, Recipe
+from cz_gym.agents.training import fleet, run, validation
+from cz_gym.agents.training.algorithms import make_algorithm
+from cz_gym.agents.training.callbacks import Statistics
+from cz_gym.agents.training.recipes import APG, PPO, SAC, Recipe, Reinforcement
 from cz_gym.atomic_files import locked
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
@@ -15,15 +16,14 @@ SMALL = PPO(num_envs=4, hidden=(16, 16), steps=64, n_steps=16, batch_size=32, n_
 SMALL_SAC = SAC(
     num_envs=4, hidden=(16, 16), steps=64, buffer_size=256, learning_starts=32, batch_size=16, gradient_steps=1
 )
-SMALL_IMITATION = Imitation(
-    name="imitation", teacher="lqg", rounds=2, episodes=4, epochs=1, hidden=(16,), control_interval=30.0
-)
+SMALL_APG = APG(num_envs=4, window=20, steps=160)
+REFERENCES = dict.fromkeys(validation.REFERENCES, (0.2, 0.1))
 TRAIN_SEED = fleet.train_seed
 
 
 def train_small_seed(job: fleet.Job) -> dict[str, float]:
     """As :func:`fleet.train_seed`, with few validation episodes, in whatever process."""
-    run.PICKING, run.JUDGING = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4]
+    validation.PICKING, validation.JUDGING = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4]
     return TRAIN_SEED(job)
 
 
@@ -34,16 +34,15 @@ def train_held_seed(job: fleet.Job) -> dict[str, float]:
 
 
 def hold() -> None:
-    """Few validation episodes in this process, each after there is a file ``go`` beside the run folders."""
-    run.PICKING, run.JUDGING = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4]
-    validate = run.Run._validate
+    """Validations in this process wait until there is a file ``go`` beside the run folders."""
+    validate = run.Run.validate
 
-    def wait(self: run.Run, bar: Any) -> Any:
+    def wait(self: run.Run, bar: Any) -> None:
         while not (self.folder.parent / "go").exists():
             time.sleep(0.1)
-        return validate(self, bar)
+        validate(self, bar)
 
-    run.Run._validate = wait  # type: ignore[method-assign]
+    run.Run.validate = wait  # type: ignore[method-assign]
 
 
 def losing(nodes: tuple[Any, Any], folder: Path) -> Callable[[], None]:
@@ -78,11 +77,11 @@ def tell_and_wait(task: Any) -> None:
     print("still there", flush=True)
 
 
-def made(recipe: Recipe, seed: int = 0, done: int = 0) -> Any:
-    return make_learner(recipe, seed, done=done)
+def learned(algorithm: Any, recipe: Recipe) -> Any:
+    """The algorithm after what is left of the recipe's steps, as a run lets it learn."""
+    callbacks = [Statistics(recipe.steps // 4)] if isinstance(recipe, Reinforcement) else []
+    return algorithm.learn(recipe.steps - algorithm.num_timesteps, callbacks, reset_num_timesteps=False)
 
 
 def trained(recipe: Recipe, seed: int = 0) -> Any:
-    learner = made(recipe, seed)
-    learner.learn(lambda steps, doing: None)
-    return learner
+    return learned(make_algorithm(recipe, seed), recipe)

@@ -8,27 +8,24 @@ that is estimated from rewards. The method knows the plant's equations while it 
 from __future__ import annotations
 
 import math
-from collections import deque
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from cz_gym.config import Config
-from cz_gym.cost import saturated
-from cz_gym.differentiable import STATES, DifferentiableBatch
+from cz_gym.cost import WEIGHTS, Weights
 from cz_gym.errors import CzError
+from cz_gym.evaluation.protocol import TRAINING_SEEDS
 
-from .plant_step import PlantStep
+from .mixture import Mixture
+from .plant_step import PlantStep, StepCost
 from .policy import RecurrentPolicy
 
-TRAINING_SEEDS = 1_000_000
-"""Crystals are drawn from the seeds below this one."""
 WARM_UP = 0.05
 """Share of the training during which the features' statistics are updated."""
 CLIP_AT = 2.0
@@ -44,8 +41,9 @@ class APG(BaseAlgorithm):
 
     ``env`` says what is learned: a vector environment of Cz-v0 with ``observation="measured"``. Training steps a
     differentiable twin of it with as many slots; ``env`` itself is only asked for its settings. ``window`` is the
-    number of steps that a gradient goes back through; each update takes ``window * num_envs`` environment steps. The
-    other arguments are stable-baselines3's. Raises CzError for an environment that is not Cz-v0's, or reads another
+    number of steps that a gradient goes back through; each update takes ``window * num_envs`` environment steps.
+    ``weights`` are those of the cost (:class:`.plant_step.StepCost`); a constant ``learning_rate`` falls linearly to 0.
+    The other arguments are stable-baselines3's. Raises CzError for an environment that is not Cz-v0's, or reads another
     observation.
     """
 
@@ -58,6 +56,8 @@ class APG(BaseAlgorithm):
         env: GymEnv | str | None,
         learning_rate: float | Schedule = 4e-3,
         window: int = 180,
+        weights: Weights = WEIGHTS,
+        mixture: dict[str, float] | None = None,
         policy_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -83,10 +83,9 @@ class APG(BaseAlgorithm):
             device,
             support_multi_env=True,
             seed=seed,
-            supported_action_spaces=(Box,),
         )
-        self.window = window
-        self._norms: deque[float] = deque(maxlen=NORMS)
+        self.window, self.weights, self.mixture = window, weights, mixture
+        self.norms = torch.zeros(NORMS)
         if _init_setup_model:
             self._setup_model()
 
@@ -101,9 +100,10 @@ class APG(BaseAlgorithm):
 
     def _config(self) -> Config:
         """The settings of the environment that is learned on."""
-        config = self.env.get_attr("config")[0] if self.env is not None else None
-        if not isinstance(config, Config):
-            raise CzError("APG differentiates the plant of Cz-v0: env must be made of Cz-v0 environments")
+        try:
+            config: Config = self.get_env().get_attr("config")[0]  # type: ignore[union-attr]  # None: said below
+        except AttributeError:
+            raise CzError("APG differentiates the plant of Cz-v0: env must be made of Cz-v0 environments") from None
         if config.observation != "measured":
             raise CzError(f'APG reads observation="measured" and remembers itself, not {config.observation!r}')
         return config
@@ -121,7 +121,9 @@ class APG(BaseAlgorithm):
         total_timesteps, watch = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
-        crystals = _Crystals(self._config(), self.n_envs, self.window, [self.seed or 0, self.num_timesteps])
+        crystals = _Crystals(
+            self._config(), self.n_envs, self.window, [self.seed or 0, self.num_timesteps], self.mixture
+        )
         memory = self.policy.initial_memory(self.n_envs)
         watch.on_training_start(locals(), globals())
         going, updates = True, 0
@@ -147,31 +149,36 @@ class APG(BaseAlgorithm):
         self, crystals: _Crystals, memory: torch.Tensor, watch: BaseCallback
     ) -> tuple[torch.Tensor, torch.Tensor, bool]:
         """Drive every crystal through a window: its mean cost, differentiable, the memory, and whether to go on."""
-        policy, total, going = self.policy, torch.zeros(()), True
+        policy, going = self.policy, True
+        warm = self._current_progress_remaining > 1.0 - WARM_UP
         policy.set_training_mode(True)
-        state = torch.zeros(self.n_envs, len(STATES), dtype=torch.float64)
-        measured, seen = crystals.measured, []
+        cost_of = StepCost(self._config(), self.weights)
+        state, measured = crystals.state, crystals.measured
+        costs, seen = [], []
         for _ in range(self.window):
-            with torch.no_grad():
-                seen.append(policy.remember(measured, memory)[0])
+            if warm:
+                with torch.no_grad():
+                    seen.append(policy.remember(measured, memory)[0])
             action, memory = policy(measured, memory)
-            state, measured, cost = PlantStep.apply(state, action, crystals.batch)
-            total = total + saturated(cost.sum(dim=1)).mean()
+            before = state
+            state, measured, grows, target = PlantStep.apply(before, action, crystals.batch)
+            costs.append(cost_of(before, action, state, grows, target))
             self.num_timesteps += self.n_envs
             going = watch.on_step() and going
-        crystals.measured = measured.detach()
-        if self._current_progress_remaining > 1.0 - WARM_UP:
+        crystals.state, crystals.measured = state.detach(), measured.detach()
+        if warm:
             policy.observe_statistics(torch.cat(seen))
-        return total / self.window, memory.detach(), going
+        return torch.stack(costs).mean(), memory.detach(), going
 
     def _follow(self, loss: torch.Tensor) -> None:
         """Take a step along the gradient, unless it is not finite."""
         self.policy.optimizer.zero_grad()
         loss.backward()
-        limit = CLIP_AT * float(np.median(self._norms)) if self._norms else math.inf
+        norms = self.norms[self.norms > 0.0].numpy()
+        limit = CLIP_AT * float(np.median(norms)) if norms.size else math.inf
         norm = float(torch.nn.utils.clip_grad_norm_(self.policy.parameters(), limit))
         if math.isfinite(norm):
-            self._norms.append(norm)
+            self.norms[1:], self.norms[0] = self.norms[:-1].clone(), norm
             self.policy.optimizer.step()
         self._n_updates += 1
         self.logger.record("train/gradient_norm", norm)
@@ -183,21 +190,22 @@ class APG(BaseAlgorithm):
         return self.policy.predict(observation, state, episode_start, deterministic)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", "policy.optimizer"], []
+        return ["policy", "policy.optimizer"], ["norms"]
 
 
 class _Crystals:
     """Crystals of the training seeds in a differentiable batch; slots are at different times of their episodes."""
 
-    def __init__(self, config: Config, n: int, window: int, seed: list[int]) -> None:
-        self.batch = DifferentiableBatch(config, n)
+    def __init__(self, config: Config, n: int, window: int, seed: list[int], mixture: dict[str, float] | None) -> None:
+        self.batch = Mixture(config, n, mixture)
         self._random = np.random.default_rng(seed)
         self._windows = max(config.steps // window, 1)
         self._left = self._random.integers(1, self._windows, n, endpoint=True)
-        self.measured = torch.from_numpy(self.batch.reset(self._seeds(n))[1])
+        self._draw(list(range(n)))
 
-    def _seeds(self, count: int) -> list[int]:
-        return self._random.integers(TRAINING_SEEDS, size=count).tolist()
+    def _draw(self, slots: list[int]) -> None:
+        seeds = self._random.integers(len(TRAINING_SEEDS), size=len(slots)).tolist()
+        self.state, self.measured = map(torch.from_numpy, self.batch.reset(seeds, slots))
 
     def renew(self) -> tuple[int, list[int]]:
         """Draw new crystals for those that were lost or have grown to their end: how many were lost, and all slots."""
@@ -205,6 +213,6 @@ class _Crystals:
         self._left -= 1
         over = np.flatnonzero(lost | (self._left == 0)).tolist()
         if over:
-            self.measured = torch.from_numpy(self.batch.reset(self._seeds(len(over)), over)[1])
+            self._draw(over)
             self._left[over] = self._windows
         return int(lost.sum()), over

@@ -1,33 +1,64 @@
-"""A step of the batch as a function that torch differentiates, for networks of any shape."""
+"""A step of the batch as a function that torch differentiates, for networks of any shape, and the cost of a step."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
 
+from cz_gym.config import Config
+from cz_gym.cost import Weights, cost_terms, saturated
 from cz_gym.differentiable import STATES, DifferentiableBatch
+from cz_gym.task import drives_of
+
+R_C, V_P, Q_H = (STATES.index(name) for name in ("r_c", "v_p", "Q_H"))
 
 
 class PlantStep(torch.autograd.Function):
-    """State, measured and cost from state and action: ``PlantStep.apply(state, action, batch)``.
+    """The batch advances by a step: ``PlantStep.apply(state, action, batch)``.
 
-    The batch advances by a step; the state passed in only says which state the gradients belong to.
+    ``state`` is the batch's present one; gradients go back through it to the step before.
     """
 
     @staticmethod
     def forward(ctx: Any, state: torch.Tensor, action: torch.Tensor, batch: DifferentiableBatch) -> Any:
-        """State (n, 9), measured (n, 11) and the cost's terms (n, 4) after the action, shape (n, 2)."""
+        """State (n, 9) and "measured" (n, 11) after the action (n, 2); whether each crystal grew; and its target.
+
+        The target (n,) is the radius at which sensors would show no error [m]: the reference less the bright ring's
+        offset, which no sensor shows.
+        """
         step = batch.step(action.numpy())
-        ctx.jacobian, ctx.measured_by_state = step.jacobian, batch.measured_by_state
-        return torch.from_numpy(step.state), torch.from_numpy(step.measured), torch.from_numpy(step.cost).float()
+        ctx.jacobian, ctx.measured_by_state = step.jacobian[:, : len(STATES)], batch.measured_by_state
+        grows, target = torch.from_numpy(step.grows), torch.from_numpy(step.state[:, R_C] - step.error - step.offset)
+        ctx.mark_non_differentiable(grows, target)
+        return torch.from_numpy(step.state), torch.from_numpy(step.measured), grows, target
 
     @staticmethod
     def backward(ctx: Any, *gradients: torch.Tensor) -> Any:
         """Gradients with respect to state and action."""
-        by_state, by_measured, by_cost = gradients
-        whole = by_state.numpy() + by_measured.double().numpy() @ ctx.measured_by_state
-        rows = np.concatenate([whole, by_cost.double().numpy()], axis=1)
-        back = torch.from_numpy(np.matmul(rows[:, None, :], ctx.jacobian)[:, 0])
+        by_state, by_measured, *_ = gradients
+        rows = by_state + by_measured.double() @ torch.from_numpy(ctx.measured_by_state)
+        back = torch.einsum("ni,nij->nj", rows, torch.from_numpy(ctx.jacobian))
         return back[:, : len(STATES)], back[:, len(STATES) :].float(), None
+
+
+class StepCost:
+    """The cost of a step that APG follows; it differs from the reward's in two terms.
+
+    The radius error is the one that sensors can show: without the bright ring's offset. The pull step is the one that
+    the action asks for: where a limit of the drive cuts it, the step that is taken no longer depends on the action, and
+    a policy that asks for more than the drive does would never learn to ask for less.
+    """
+
+    def __init__(self, config: Config, weights: Weights) -> None:
+        self.drives, self.v_0 = drives_of(config.action, config.control_interval), config.parameters.v_0
+        self.weights = Weights(*weights)  # a saved model has them as a list
+
+    def __call__(
+        self, before: torch.Tensor, action: torch.Tensor, after: torch.Tensor, grows: torch.Tensor, target: torch.Tensor
+    ) -> torch.Tensor:
+        """The saturated sum of the four terms, shape (n,), from the states before and after; 0 if it does not grow."""
+        asked = (self.drives.keep - 1.0) * (before[:, V_P] - self.v_0) + self.drives.pull * self.v_0 * action[:, 0]
+        error, heater_step = after[:, R_C] - target, after[:, Q_H] - before[:, Q_H]
+        terms = cost_terms(error, after[:, V_P] - self.v_0, asked, heater_step, self.weights)
+        return torch.where(grows, saturated(sum(terms)), 0.0)

@@ -1,9 +1,9 @@
-"""Checkpoints: learner, best agent and progress in one safetensors file, which holds nothing that could be executed.
+"""Checkpoints: algorithm, best agent and progress in one safetensors file, which holds nothing that could be executed.
 
-A checkpoint fits only the learner it was made from: every tensor must have the name, shape and type of one that is
-there, so no file can ask for more memory than it has bytes. Hyperparameters are not in it; they are the run's settings.
-The run's other files (best agent, progress) are in it too, as bytes: one file is replaced at one moment, and a resumed
-run writes the others again.
+A checkpoint fits only an algorithm like the one it was made from: every tensor must have the name, shape and type of
+one that is there, so no file can ask for more memory than it has bytes. Hyperparameters are not in it; they are the
+run's settings. The run's other files (best agent, progress) are in it too, as bytes: one file is replaced at one
+moment, and a resumed run writes the others again.
 """
 
 from __future__ import annotations
@@ -12,15 +12,17 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load, save
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from cz_gym.agents.agent_file.contract import AgentFileError, read_bounded
 
-from .learner import Learner, Parts
 from .replay_buffer import PREFIX, fits, latest, refill
 
 FORMAT = "cz-gym-checkpoint-4"
@@ -40,7 +42,7 @@ Tensors = dict[str, torch.Tensor]
 
 @dataclass(frozen=True)
 class Progress:
-    """The state of a training run beside its learner."""
+    """The state of a training run beside its algorithm."""
 
     steps: int
     """Environment steps taken."""
@@ -51,15 +53,15 @@ class Progress:
 
 
 def to_bytes(
-    learner: Learner, seconds: float, best_cost: float | None, files: Mapping[str, bytes] | None = None
+    algorithm: BaseAlgorithm, seconds: float, best_cost: float | None, files: Mapping[str, bytes] | None = None
 ) -> bytes:
-    """The checkpoint of a learner, with the latest transitions of a replay buffer, and the run's ``files`` by name.
+    """The checkpoint of an algorithm, with the latest transitions of a replay buffer, and the run's ``files`` by name.
 
     AgentFileError if it learned numbers that are not finite: no run could continue from them.
     """
-    parts, progress = learner.parts(), Progress(int(learner.steps), seconds, best_cost)
+    progress = Progress(int(algorithm.num_timesteps), seconds, best_cost)
     # Modules that share a tensor each get their copy: the format knows no sharing.
-    copies = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in _tensors(parts).items()}
+    copies = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in _tensors(algorithm).items()}
     for name, tensor in copies.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():
             raise AgentFileError(f"the training went wrong: {name!r:.80} is not finite; the last checkpoint stays")
@@ -67,7 +69,7 @@ def to_bytes(
     held = {
         IN_FILE + name: torch.frombuffer(bytearray(data), dtype=torch.uint8) for name, data in (files or {}).items()
     }
-    content: bytes = save(copies | latest(parts.replay_buffer) | held, header)
+    content: bytes = save(copies | latest(_buffer(algorithm)) | held, header)
     return content
 
 
@@ -99,13 +101,12 @@ def load_checkpoint(path: Path) -> tuple[Progress, Tensors, dict[str, bytes]]:
     return progress, tensors, files
 
 
-def restore(learner: Learner, tensors: Tensors, path: Path) -> None:
-    """Put a checkpoint's tensors into a learner made with the same settings; AgentFileError if they do not fit."""
-    parts = learner.parts()
-    live, transitions = _tensors(parts), {name: part for name, part in tensors.items() if name.startswith(PREFIX)}
+def restore(algorithm: BaseAlgorithm, tensors: Tensors, path: Path) -> None:
+    """Put a checkpoint's tensors into an algorithm made with the same settings; AgentFileError if they do not fit."""
+    live, transitions = _tensors(algorithm), {name: part for name, part in tensors.items() if name.startswith(PREFIX)}
     learned = {name: tensor for name, tensor in tensors.items() if name not in transitions}
     alike = set(learned) == set(live) and all(_alike(live[name], tensor) for name, tensor in learned.items())
-    if not alike or not fits(parts.replay_buffer, transitions):
+    if not alike or not fits(_buffer(algorithm), transitions):
         raise AgentFileError(f"{path}: does not fit this run's settings")
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():
@@ -115,22 +116,29 @@ def restore(learner: Learner, tensors: Tensors, path: Path) -> None:
     with torch.no_grad():
         for name, tensor in learned.items():
             live[name].copy_(tensor)
-    refill(parts.replay_buffer, transitions)
+    refill(_buffer(algorithm), transitions)
 
 
-def _tensors(parts: Parts) -> Tensors:
+def _buffer(algorithm: BaseAlgorithm) -> Any:
+    """The replay buffer of an off-policy algorithm."""
+    return getattr(algorithm, "replay_buffer", None)
+
+
+def _tensors(algorithm: BaseAlgorithm) -> Tensors:
     """Every tensor that training changes, by name."""
-    tensors = {
-        f"{name}/{key}": value for name, part in parts.modules.items() for key, value in part.state_dict().items()
-    }
-    tensors |= {f"{name}/": variable for name, variable in parts.variables.items()}
-    for name, optimiser in parts.optimisers.items():
-        parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
+    states, lone = algorithm._get_torch_save_params()
+    tensors: Tensors = {f"{name}/": attrgetter(name)(algorithm) for name in lone}
+    for name in states:
+        part = attrgetter(name)(algorithm)
+        if not isinstance(part, torch.optim.Optimizer):
+            tensors |= {f"{name}/{key}": value for key, value in part.state_dict().items()}
+            continue
+        parameters = [parameter for group in part.param_groups for parameter in group["params"]]
         for index, parameter in enumerate(parameters):
             # As Adam itself initialises a parameter at its first update.
             initial = {key: torch.zeros_like(parameter) for key in ("exp_avg", "exp_avg_sq")}
             initial["step"] = torch.zeros(())
-            state = optimiser.state.setdefault(parameter, initial)
+            state = part.state.setdefault(parameter, initial)
             tensors |= {f"{name}/{index}/{key}": state[key] for key in initial}
     return tensors
 

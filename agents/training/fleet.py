@@ -16,8 +16,9 @@ from cz_gym.atomic_files import locked
 from cz_gym.errors import CzError
 
 from .recipes import Recipe
-from .run import MakeController, Run
+from .run import Run
 from .run_files import check_settings, read_rows
+from .validation import References
 
 LOST = 120.0
 """Longest time that a lost machine's lock on a folder outlives it [s]."""
@@ -29,7 +30,7 @@ class Job(NamedTuple):
     folder: Path
     recipe: Recipe
     seed: int
-    make_controller: MakeController
+    references: References
     checkpoint_seconds: float
     plot: bool
     command: Sequence[str]
@@ -60,7 +61,7 @@ def train_seed(job: Job) -> dict[str, float]:
         if summary := job.summary:
             return summary
         sys.argv = list(job.command)
-        run = Run(job.folder, job.recipe, job.seed, job.make_controller, job.begun, job.checkpoint_seconds, job.plot)
+        run = Run(job.folder, job.recipe, job.seed, job.references, job.begun, job.checkpoint_seconds, job.plot)
         run.learn(bar)
         return run.finish()
 
@@ -114,5 +115,5 @@ def _standing(job: Job) -> tuple[float, str]:
     if not rows:
         return 0.0, f"{job.seed}: 0%"
     steps = float(rows[-1]["steps"])
-    share = min(steps / (job.recipe.steps or steps), 1.0)
+    share = min(steps / job.recipe.steps, 1.0)
     return share, f"{job.seed}: {share:.0%} {float(rows[-1]['validation_rmse_mm']):.3f} mm"

@@ -6,22 +6,28 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.utils import configure_logger
+
 from cz_gym.agents.agent_file.contract import Contract, agent_files, facts_of, make_contract, read_agent
+from cz_gym.agents.export import to_onnx
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.atomic_files import write_files
-from cz_gym.config import Config, make_config
+from cz_gym.observation import OBSERVATIONS
 
+from . import validation
+from .algorithms import make_algorithm
+from .callbacks import Statistics
 from .checkpoint import load_checkpoint, restore, to_bytes
-from .learners import make_learner
-from .recipes import Imitation, Recipe
+from .recipes import Recipe, Reinforcement
 from .run_files import check_settings, identity, provenance, read_rows, to_csv, to_json
-from .validation import COLUMNS, JUDGING, PICKING, REFERENCES, Validation, validate
+from .validation import COLUMNS, REFERENCES, References, Validation, validate
 
 CHECKPOINT = "checkpoint.safetensors"
 CHECKPOINT_SECONDS = 60.0
@@ -31,17 +37,13 @@ VALIDATE_EVERY = 200_000
 MAX_SESSIONS = 100
 """Number of sessions that settings list, beside the first and the present one."""
 
-MakeController = Callable[[str, Config], Any]
-"""Makes a classical controller from its name and an environment's settings."""
-
 
 class Run:
     """One training run.
 
-    ``make_controller`` makes the teacher of an imitation, and the references: classical controllers whose validation
-    RMSE is shown beside the agent's. ``resume`` continues from the folder's checkpoint, which is saved every
-    ``checkpoint_seconds``. It holds the run's other files too: best agent, progress and, with ``plot``, a picture of
-    it. Raises AgentFileError if the folder cannot be used.
+    ``references`` are the RMSEs of classical controllers on the same crystals, shown beside the agent's. ``resume``
+    continues from the folder's checkpoint, which is saved every ``checkpoint_seconds``. It holds the run's other files
+    too: best agent, progress and, with ``plot``, a picture of it. Raises AgentFileError if the folder cannot be used.
     """
 
     def __init__(
@@ -49,19 +51,14 @@ class Run:
         folder: Path,
         recipe: Recipe,
         seed: int,
-        make_controller: MakeController,
+        references: References,
         resume: bool = False,
         checkpoint_seconds: float = CHECKPOINT_SECONDS,
         plot: bool = False,
     ) -> None:
         self.folder, self.recipe, self.seed, self.plot = folder, recipe, seed, plot
-        self.checkpoint_seconds = checkpoint_seconds
+        self.checkpoint_seconds, self.references = checkpoint_seconds, references
         self.config = recipe.config
-        self._measured = make_config(recipe.scenario, control_interval=recipe.control_interval)
-        self._references = {name: make_controller(name, self._measured) for name in REFERENCES}
-        self.references = self._validate_references(PICKING)
-        teacher = make_controller(recipe.teacher, self._measured) if isinstance(recipe, Imitation) else None
-        logs = folder / "tensorboard"
         self.files: dict[str, bytes] = {}
         self.rows: list[dict[str, Any]] = []
         self.best: float | None = None
@@ -73,50 +70,46 @@ class Run:
             write_files({folder / name: content for name, content in self.files.items()})
             self.rows, self.best = read_rows(folder / "progress.csv"), progress.best_cost
             self.began -= progress.seconds
-            self.learner = make_learner(recipe, seed, teacher, logs, progress.steps)
-            restore(self.learner, tensors, folder / CHECKPOINT)
-            self.saved, self.saved_steps = time.monotonic(), self.learner.steps
+            self.algorithm = make_algorithm(recipe, seed, progress.steps)
+            restore(self.algorithm, tensors, folder / CHECKPOINT)
+            self.saved, self.saved_steps = time.monotonic(), self.steps
         else:
-            self.learner = make_learner(recipe, seed, teacher, logs)
+            self.algorithm = make_algorithm(recipe, seed)
             self.save()
-        self.validate_every = max(self.learner.total // 24, VALIDATE_EVERY)
+        # Made last: a run that is refused leaves no folder.
+        self.logger = configure_logger(0, str(folder / "tensorboard"), "run", reset_num_timesteps=False)
+        self.algorithm.set_logger(self.logger)
+        self.validate_every = max(recipe.steps // 24, VALIDATE_EVERY)
         self._write_settings(sessions)
 
-    def learn(self, bar: Any, report: Callable[[int, Validation], None] = lambda steps, figures: None) -> None:
+    @property
+    def steps(self) -> int:
+        """Environment steps taken."""
+        return self.algorithm.num_timesteps
+
+    def learn(self, bar: Any) -> None:
         """Learn to the end, validating and saving on the way; nothing if that is done.
 
-        ``bar`` counts environment steps, as tqdm's does; ``report`` receives each validation. Ctrl-C ends the run
-        between two updates, with a checkpoint, by KeyboardInterrupt.
+        ``bar`` counts environment steps, as tqdm's does. Ctrl-C ends the run between two updates, with a checkpoint, by
+        KeyboardInterrupt.
         """
-        bar.update(self.learner.steps - bar.n)
-        due = self.learner.steps + self.validate_every
+        bar.update(self.steps - bar.n)
         with deferred_interrupt() as interrupted:
-
-            def watch(steps: int, doing: str) -> None:
-                nonlocal due
-                bar.update(steps - bar.n)
-                if doing:
-                    bar.set_postfix_str(doing)
-                if self.learner.steps >= due:
-                    report(self.learner.steps, self._validate(bar))
-                    due = self.learner.steps + self.validate_every
-                new = self.learner.steps > self.saved_steps
-                if new and (interrupted() or time.monotonic() >= self.saved + self.checkpoint_seconds):
-                    self.save()
-                if interrupted():
-                    raise KeyboardInterrupt
-
-            self.learner.learn(watch)
-            if not self.rows or int(self.rows[-1]["steps"]) < self.learner.steps:
-                report(self.learner.steps, self._validate(bar))
+            callbacks: list[BaseCallback] = [_Watch(self, bar, interrupted)]
+            if isinstance(self.recipe, Reinforcement):
+                callbacks.append(Statistics(self.recipe.steps // 4, self.recipe.basis, known=self.steps > 0))
+            if self.steps < self.recipe.steps:
+                self.algorithm.learn(self.recipe.steps - self.steps, callbacks, reset_num_timesteps=False)
+            if not self.rows or int(self.rows[-1]["steps"]) < self.steps:
+                self.validate(bar)
             if interrupted():
                 raise KeyboardInterrupt
 
     def save(self) -> None:
         """Write a checkpoint, then the files that it holds; only between updates."""
-        content = to_bytes(self.learner, time.monotonic() - self.began, self.best, self.files)
+        content = to_bytes(self.algorithm, time.monotonic() - self.began, self.best, self.files)
         write_files({self.folder / name: content for name, content in {CHECKPOINT: content, **self.files}.items()})
-        self.saved, self.saved_steps = time.monotonic(), self.learner.steps
+        self.saved, self.saved_steps = time.monotonic(), self.steps
 
     def _hold(self, files: Mapping[Path, bytes]) -> None:
         """Put files of the folder into the next checkpoint."""
@@ -124,18 +117,18 @@ class Run:
 
     def finish(self) -> dict[str, float]:
         """Test the best agent on episodes that did not choose it; the contents of ``summary.json``."""
-        figures = self._figures(self.best_policy(), JUDGING)
+        figures = self._figures(self.best_policy(), validation.JUDGING)
         path = self.folder / "agent.onnx"
         contract, content = read_agent(path)
         summary = {
-            "validation_episodes": len(JUDGING),
+            "validation_episodes": len(validation.JUDGING),
             "validation_cost": figures.cost,
             "validation_rmse_mm": figures.rmse_mm,
-            **{f"{name}_rmse_mm": rmse for name, rmse in self._validate_references(JUDGING).items()},
+            **{f"{name}_rmse_mm": judged for name, (_, judged) in self.references.items()},
             "pull_step_rms_mm_per_min": figures.pull_step_rms_mm_per_min,
             "failure_rate": figures.failure_rate,
             "training_steps": contract.training_steps,
-            "steps": self.learner.steps,
+            "steps": self.steps,
             "seconds": time.monotonic() - self.began,
         }
         self._hold(agent_files(path, content, _with_figures(contract, figures)))
@@ -147,24 +140,24 @@ class Run:
         """The agent of least validation cost."""
         return OnnxPolicy.load(self.folder / "agent.onnx", self.config)
 
-    def _validate(self, bar: Any) -> Validation:
+    def validate(self, bar: Any) -> None:
         """Export the actor as it stands and run the file itself on validation episodes; keep it if it is the best."""
-        content = self.learner.exported()
+        content = to_onnx(self.algorithm.policy, len(OBSERVATIONS[self.config.observation]))
         contract = make_contract(
             content,
             **facts_of(self.config),
             algorithm=self.recipe.name,
             training_seed=self.seed,
-            training_steps=self.learner.steps if self.recipe.steps else 0,
+            training_steps=self.steps,
             validation_cost=0.0,
             validation_rmse_mm=0.0,
         )
-        figures = self._figures(OnnxPolicy.of(contract, content, self.config), PICKING)
+        figures = self._figures(OnnxPolicy.of(contract, content, self.config), validation.PICKING)
         if self.best is None or figures.cost < self.best:
             self.best = figures.cost
             self._hold(agent_files(self.folder / "agent.onnx", content, _with_figures(contract, figures)))
-        seconds = round(time.monotonic() - self.began, 1)
-        row = (self.learner.steps, seconds, *figures, *self.references.values())
+        picked = [picked for picked, _ in self.references.values()]
+        row = self.steps, round(time.monotonic() - self.began, 1), *figures, *picked
         self.rows.append(dict(zip(COLUMNS, row, strict=True)))
         self._hold({self.folder / "progress.csv": to_csv(self.rows)})
         if self.plot:
@@ -173,24 +166,41 @@ class Run:
             self._hold({self.folder / "progress.png": progress(self.rows, f"{self.recipe.name}, seed {self.seed}")})
         self.save()
         for name, figure in figures._asdict().items():
-            self.learner.logger.record(f"validation/{name}", figure)
-        beside = ", ".join(f"{name} {rmse:.3f}" for name, rmse in self.references.items())
+            self.logger.record(f"validation/{name}", figure)
+        beside = ", ".join(f"{name} {rmse:.3f}" for name, rmse in zip(REFERENCES, picked, strict=True))
         bar.set_postfix_str(f"RMSE {figures.rmse_mm:.3f} mm, {figures.failure_rate:.0%} lost ({beside})")
-        return figures
 
-    def _figures(self, policy: OnnxPolicy, seeds: Sequence[int]) -> Validation:
+    def _figures(self, policy: OnnxPolicy, seeds: range) -> Validation:
         return validate(policy, self.config, seeds, self.recipe.weights, self.recipe.observable)
-
-    def _validate_references(self, seeds: Sequence[int]) -> dict[str, float]:
-        return {name: validate(each, self._measured, seeds).rmse_mm for name, each in self._references.items()}
 
     def _write_settings(self, sessions: list[dict[str, Any]]) -> None:
         """Write the run's settings; each time it is begun or resumed adds a session."""
-        session = {"from_step": self.learner.steps, **provenance()}
+        session = {"from_step": self.steps, **provenance()}
         first = sessions[0] if sessions else session
         sessions = [*sessions[:1], *sessions[1:][-MAX_SESSIONS:], session]
-        facts = {**identity(self.recipe, self.seed), "steps": self.learner.total, **first, "sessions": sessions}
+        facts = {**identity(self.recipe, self.seed), "steps": self.recipe.steps, **first, "sessions": sessions}
         write_files({self.folder / "settings.json": to_json(facts)})
+
+
+class _Watch(BaseCallback):
+    """Validates, saves and ends a run when it is due; called at every step, never in the middle of an update."""
+
+    def __init__(self, run: Run, bar: Any, interrupted: Callable[[], bool]) -> None:
+        super().__init__()
+        self.run, self.bar, self.interrupted = run, bar, interrupted
+        self.due = run.steps + run.validate_every
+
+    def _on_step(self) -> bool:
+        run, interrupted = self.run, self.interrupted()
+        self.bar.update(run.steps - self.bar.n)
+        if run.steps >= self.due:
+            run.validate(self.bar)
+            self.due = run.steps + run.validate_every
+        if run.steps > run.saved_steps and (interrupted or time.monotonic() >= run.saved + run.checkpoint_seconds):
+            run.save()
+        if interrupted:
+            raise KeyboardInterrupt
+        return True
 
 
 def _with_figures(contract: Contract, figures: Validation) -> Contract:

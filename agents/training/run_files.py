@@ -24,8 +24,7 @@ PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "stable-baselines3
 
 def trained_on(algorithm: str, scenario: str) -> str:
     """The scenarios, in words, that an agent of that recipe and scenario was trained on."""
-    mixture = (share.scenario for share in getattr(RECIPES.get(algorithm), "mixture", ()) if share.scenario)
-    *others, last = dict.fromkeys((scenario, *mixture))
+    *others, last = getattr(RECIPES.get(algorithm), "mixture", None) or [scenario]
     return f"{', '.join(others)} and {last}" if others else last
 
 

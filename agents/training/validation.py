@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +23,8 @@ JUDGING = VALIDATION_SEEDS[64:264]
 
 REFERENCES = ("paper", "paper-tuned", "lqg")
 """Classical controllers that an agent is shown beside while it learns."""
+References = Mapping[str, tuple[float, float]]
+"""Mean RMSE of each reference [mm], on the crystals of PICKING and of JUDGING."""
 COLUMNS = (
     "steps",
     "seconds",
@@ -57,6 +59,14 @@ def validate(
         measured.failure_rate,
     )
     return Validation(*(float(figure.mean()) for figure in figures))
+
+
+def references(controllers: Mapping[str, Any], config: Config) -> References:
+    """What the classical controllers reach in an environment of these settings."""
+    return {
+        name: (validate(each, config, PICKING).rmse_mm, validate(each, config, JUDGING).rmse_mm)
+        for name, each in controllers.items()
+    }
 
 
 def costs(measured: Metrics, weights: Weights = WEIGHTS, observable: bool = False) -> Floats:

@@ -8,8 +8,7 @@ import numpy as np
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvWrapper
 
 from cz_gym.cost import FAILURE_COST, WEIGHTS, Cost, Weights, cost_terms, reward
-
-from .vec_env import CzVecEnv
+from cz_gym.sb3 import CzVecEnv
 
 
 class TrainingReward(VecEnvWrapper):

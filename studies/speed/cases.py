@@ -199,7 +199,7 @@ def _pcgym() -> Any:
 
 
 def _sb3_adapter() -> Any:
-    adapter = importlib.import_module("cz_gym.agents.training.vec_env").CzVecEnv
+    adapter = importlib.import_module("cz_gym.sb3").CzVecEnv
     return adapter(CzVectorEnv(SB3_SLOTS, autoreset_mode=AutoresetMode.SAME_STEP))
 
 

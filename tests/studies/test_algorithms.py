@@ -11,8 +11,9 @@ import pytest
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("matplotlib")
 
-from cz_gym.agents.training import run, validation
 from cz_gym.agents.training.learners import make_learner
+
+from cz_gym.agents.training import run, validation
 from cz_gym.agents.training.recipes import PPO, SAC, Imitation
 from cz_gym.evaluation.protocol import TEST_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.statistics import Resamples

@@ -10,17 +10,19 @@ import pytest
 import torch
 
 from cz_gym.agents import AgentFileError
+from cz_gym.agents.training.algorithms import make_algorithm
 from cz_gym.agents.training.checkpoint import load_checkpoint, restore, to_bytes
 from cz_gym.agents.training.networks import Normalise
-from tests.small_learners import SMALL, SMALL_SAC, made, trained
+from cz_gym.agents.training.recipes import Recipe
+from tests.small_learners import SMALL, SMALL_APG, SMALL_SAC, learned, trained
 
 
 def test_a_checkpoint_continues_and_refuses_what_does_not_fit(ppo: Any, tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.safetensors"
     path.write_bytes(to_bytes(ppo, 12.0, 0.5))
     progress, tensors, _ = load_checkpoint(path)
-    assert (progress.steps, progress.seconds, progress.best_cost) == (ppo.steps, 12.0, 0.5)
-    other = made(SMALL, 1, progress.steps)
+    assert (progress.steps, progress.seconds, progress.best_cost) == (ppo.num_timesteps, 12.0, 0.5)
+    other = make_algorithm(SMALL, 1, progress.steps)
     restore(other, tensors, path)
     path.write_bytes(to_bytes(other, 12.0, 0.5))
     again = load_checkpoint(path)
@@ -28,38 +30,42 @@ def test_a_checkpoint_continues_and_refuses_what_does_not_fit(ppo: Any, tmp_path
     assert set(again[1]) == set(tensors)
     assert all(torch.equal(again[1][name], tensor) for name, tensor in tensors.items())
     with pytest.raises(AgentFileError, match="does not fit"):
-        restore(made(replace(SMALL, hidden=(8, 8))), tensors, path)
+        restore(make_algorithm(replace(SMALL, hidden=(8, 8)), 0), tensors, path)
 
 
 def test_what_is_not_finite_is_not_saved() -> None:
-    learner = made(SMALL)
+    learner = make_algorithm(SMALL, 0)
     with torch.no_grad():
-        next(learner.algorithm.policy.parameters()).fill_(math.nan)
+        next(learner.policy.parameters()).fill_(math.nan)
     with pytest.raises(AgentFileError, match=r"the training went wrong: .* is not finite; the last checkpoint stays"):
         to_bytes(learner, 1.0, None)
 
 
-def test_a_learner_restored_before_its_first_update_learns_as_the_one_it_came_from(tmp_path: Path) -> None:
-    path, first, second = tmp_path / "checkpoint.safetensors", made(SMALL), made(SMALL)
+@pytest.mark.parametrize("recipe", [SMALL, SMALL_APG], ids=lambda recipe: recipe.name)
+def test_an_algorithm_restored_before_its_first_update_learns_as_the_one_it_came_from(
+    recipe: Recipe, tmp_path: Path
+) -> None:
+    path, first, second = tmp_path / "checkpoint.safetensors", make_algorithm(recipe, 0), make_algorithm(recipe, 0)
     path.write_bytes(to_bytes(first, 0.0, None))
     restore(second, load_checkpoint(path)[1], path)
-    unsaved = made(SMALL)
-    for learner in (first, second, unsaved):
-        learner.algorithm.set_random_seed(3)
-        learner.learn(lambda steps, doing: None)
-    assert first.exported() == second.exported() == unsaved.exported()
+    unsaved = make_algorithm(recipe, 0)
+    for algorithm in (first, second, unsaved):
+        algorithm.set_random_seed(3)
+        learned(algorithm, recipe)
+    parameters = [torch.cat([each.flatten() for each in one.policy.parameters()]) for one in (first, second, unsaved)]
+    assert all(torch.equal(each, parameters[0]) for each in parameters)
 
 
 def test_a_resumed_sac_keeps_its_temperature(tmp_path: Path) -> None:
     """stable-baselines3 counts it as a variable, not among the parameters."""
     path = tmp_path / "checkpoint.safetensors"
-    learner, other = made(SMALL_SAC), made(SMALL_SAC, 1)
+    learner, other = make_algorithm(SMALL_SAC, 0), make_algorithm(SMALL_SAC, 1)
     with torch.no_grad():
-        learner.algorithm.log_ent_coef.fill_(-1.25)
+        learner.log_ent_coef.fill_(-1.25)
     path.write_bytes(to_bytes(learner, 1.0, None))
     restore(other, load_checkpoint(path)[1], path)
-    assert other.algorithm.log_ent_coef.item() == -1.25
-    assert other.algorithm.log_ent_coef in other.algorithm.ent_coef_optimizer.param_groups[0]["params"]
+    assert other.log_ent_coef.item() == -1.25
+    assert other.log_ent_coef in other.ent_coef_optimizer.param_groups[0]["params"]
 
 
 @pytest.fixture(scope="module")
@@ -75,22 +81,22 @@ def test_a_resumed_sac_keeps_its_latest_transitions(
     monkeypatch.setattr("cz_gym.agents.training.replay_buffer.MOST", most)
     path = tmp_path / "checkpoint.safetensors"
     path.write_bytes(to_bytes(sac, 1.0, None))
-    other = made(replace(SMALL_SAC, steps=320), 1, sac.steps)
+    other = make_algorithm(SMALL_SAC, 1, sac.num_timesteps)
     restore(other, load_checkpoint(path)[1], path)
-    before, after = sac.algorithm.replay_buffer, other.algorithm.replay_buffer
+    before, after = sac.replay_buffer, other.replay_buffer
     assert before.full
     assert after.size() == steps
     for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
         was = np.roll(getattr(before, name), -before.pos, axis=0)[-steps:]
         np.testing.assert_array_equal(getattr(after, name)[:steps], was)
-    other.learn(lambda steps, doing: None)
+    learned(other, replace(SMALL_SAC, steps=320))
     assert after.pos == (steps + 10) % 64
 
 
 def test_normalisation_is_found_by_a_run_that_was_cut_short_before_it_knew_any() -> None:
-    learner = made(SMALL_SAC, done=8)
-    learner.learn(lambda steps, doing: None)
-    found = [module.mean for module in learner.algorithm.policy.modules() if isinstance(module, Normalise)]
+    learner = make_algorithm(SMALL_SAC, 0, 8)
+    learned(learner, SMALL_SAC)
+    found = [module.mean for module in learner.policy.modules() if isinstance(module, Normalise)]
     assert found
     assert all(mean.any() for mean in found)
 
@@ -120,14 +126,16 @@ def test_tensors_that_do_not_belong_are_refused(
     sac: Any, ppo: Any, name: str, change: Any, message: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "checkpoint.safetensors"
-    learner, other = (sac, made(SMALL_SAC, 1)) if name.startswith("replay/") else (ppo, made(SMALL, 1))
+    learner, other = (
+        (sac, make_algorithm(SMALL_SAC, 1)) if name.startswith("replay/") else (ppo, make_algorithm(SMALL, 1))
+    )
     path.write_bytes(to_bytes(learner, 1.0, None))
     _, tensors, _ = load_checkpoint(path)
     tensors[name] = change(tensors.get(name))
     with pytest.raises(AgentFileError, match=message):
         restore(other, {key: tensor for key, tensor in tensors.items() if tensor is not None}, path)
     if learner is sac:
-        assert other.algorithm.replay_buffer.size() == 0
+        assert other.replay_buffer.size() == 0
 
 
 def test_more_transitions_than_are_kept_are_refused(sac: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,4 +143,4 @@ def test_more_transitions_than_are_kept_are_refused(sac: Any, tmp_path: Path, mo
     path.write_bytes(to_bytes(sac, 1.0, None))
     monkeypatch.setattr("cz_gym.agents.training.replay_buffer.MOST", 80)
     with pytest.raises(AgentFileError, match="does not fit"):
-        restore(made(SMALL_SAC, 1), load_checkpoint(path)[1], path)
+        restore(make_algorithm(SMALL_SAC, 1), load_checkpoint(path)[1], path)

@@ -19,9 +19,8 @@ from cz_gym.agents import AgentFileError
 from cz_gym.agents.training import fleet, run
 from cz_gym.agents.training.recipes import PPO, RECIPES, Recipe
 from cz_gym.atomic_files import locked
-from cz_gym.baselines.registry import make_controller
 from cz_gym.evaluation import cluster
-from tests.small_learners import SMALL_IMITATION, losing, train_held_seed, train_small_seed
+from tests.small_learners import REFERENCES, losing, train_held_seed, train_small_seed
 
 pytestmark = pytest.mark.usefixtures("few_crystals")
 ROOT = Path(__file__).parents[3]
@@ -47,7 +46,6 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     monkeypatch.setattr(fleet, "train_seed", counted)
     monkeypatch.setattr(cluster, "in_processes", in_turn)
-    monkeypatch.setitem(RECIPES, "imitation", SMALL_IMITATION)
     monkeypatch.setitem(RECIPES, "ppo", SMALL_PPO)
     return seeds
 
@@ -62,8 +60,8 @@ def sessions(folder: Path) -> list[int]:
     return [len(each["sessions"]) for each in every]
 
 
-def jobs(folder: Path, seeds: range, recipe: Recipe = SMALL_IMITATION) -> list[fleet.Job]:
-    options = make_controller, 0.0, False, ["train.py", "--seeds"]
+def jobs(folder: Path, seeds: range, recipe: Recipe = SMALL_PPO) -> list[fleet.Job]:
+    options = REFERENCES, 0.0, False, ["train.py", "--seeds"]
     return [fleet.Job(folder / f"seed{seed}", recipe, seed, *options) for seed in seeds]
 
 
@@ -79,9 +77,9 @@ def test_seeds_come_out_as_one_by_one_and_only_once(
     trained: list[int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     several, one = tmp_path / "several", tmp_path / "one"
-    assert train.main(["--algo", "imitation", "--seeds", "3-4", "--out", str(several)]) == 0
+    assert train.main(["--algo", "ppo", "--seeds", "3-4", "--out", str(several)]) == 0
     assert "seed 4: best agent on 2 validation episodes" in capsys.readouterr().out
-    assert train.main(["--algo", "imitation", "--seed", "4", "--out", str(one)]) == 0
+    assert train.main(["--algo", "ppo", "--seed", "4", "--out", str(one)]) == 0
     found = agents(several)
     assert list(found) == ["seed3", "seed4"]
     assert found["seed4"] == (one / "agent.onnx").read_bytes() != found["seed3"]
@@ -133,7 +131,7 @@ def test_one_seed_that_fails_stops_no_other(
         return train_small_seed(job)
 
     monkeypatch.setattr(fleet, "train_seed", failing)
-    command = ["--algo", "imitation", "--seeds", "0-2", "--out", str(tmp_path)]
+    command = ["--algo", "ppo", "--seeds", "0-2", "--out", str(tmp_path)]
     if isinstance(error, AgentFileError):
         assert train.main(command) == 2
         assert capsys.readouterr().err.splitlines()[-1] == "train.py: seed 1: the training went wrong"
@@ -154,7 +152,7 @@ def test_a_task_that_runs_again_after_its_end_does_nothing(tmp_path: Path, train
 
 def test_a_folder_in_use_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], trained: list[int]) -> None:
     with locked(tmp_path / "seed1"):
-        assert train.main(["--algo", "imitation", "--seeds", "0-1", "--out", str(tmp_path)]) == 2
+        assert train.main(["--algo", "ppo", "--seeds", "0-1", "--out", str(tmp_path)]) == 2
     assert capsys.readouterr().err == f"train.py: {tmp_path}/seed1: another process is at work in this folder\n"
     assert not trained
 

@@ -9,12 +9,13 @@ import pytest
 pytest.importorskip("stable_baselines3")
 
 from cz_gym.agents.training import callbacks
+from cz_gym.agents.training.algorithms import make_algorithm
 from cz_gym.agents.training.callbacks import Statistics
-from tests.small_learners import SMALL_SAC, made
+from tests.small_learners import SMALL_SAC, learned
 
 
 def test_its_first_actions_are_those_of_a_gentle_policy():
-    algorithm: Any = made(replace(SMALL_SAC, noise=0.2)).algorithm
+    algorithm: Any = make_algorithm(replace(SMALL_SAC, noise=0.2), 0)
     algorithm._setup_learn(64)
     drawn = [algorithm._sample_action(10**6, None, 4)[0] for _ in range(200)]
     assert np.std(drawn, axis=(0, 1)) == pytest.approx([0.2, 0.2], rel=0.2)
@@ -30,6 +31,6 @@ def test_observations_are_normalised_anew_until_a_quarter_of_the_training(monkey
         update(self, observations)
 
     monkeypatch.setattr(Statistics, "_update", noted)
-    learner = made(replace(SMALL_SAC, steps=320))
-    learner.learn(lambda steps, doing: None)
+    recipe = replace(SMALL_SAC, steps=320)
+    learned(make_algorithm(recipe, 0), recipe)
     assert taken == [(28, 6), (44, 8), (60, 8), (76, 8)]

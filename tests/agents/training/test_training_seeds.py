@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("stable_baselines3")
 
-from cz_gym.agents.training.learners import make_learner
+from cz_gym.agents.training.algorithms import make_algorithm
 from cz_gym.agents.training.recipes import RECIPES
 
 
@@ -16,21 +16,21 @@ def test_no_two_training_seeds_meet_the_same_crystals(name: str) -> None:
     recipe: Any = replace(RECIPES[name], num_envs=8, hidden=(4,), batch_size=64)  # type: ignore[call-arg]
     met: list[set[int]] = []
     for seed, done in ((0, 0), (1, 0), (2, 0), (1, 327_680)):
-        learner: Any = make_learner(recipe, seed, done=done)
-        met.append({int(each) for each in learner.algorithm.env.unwrapped._seeds})
-        learner.algorithm.env.close()
+        env: Any = make_algorithm(recipe, seed, done).env
+        met.append({int(each) for each in env.unwrapped._seeds})
+        env.close()
     assert [len(each) for each in met] == [8] * 4
     assert len(set.union(*met)) == 4 * 8
 
 
-@pytest.mark.parametrize("name", ["ppo", "sac"])
+@pytest.mark.parametrize("name", RECIPES)
 def test_the_numbers_of_a_recipe_reach_its_algorithm(name: str) -> None:
-    recipe: Any = replace(RECIPES[name], num_envs=64)  # type: ignore[call-arg]
-    algorithm = make_learner(recipe, 0).algorithm  # type: ignore[attr-defined]
+    recipe: Any = replace(RECIPES[name], num_envs=64)
+    algorithm = make_algorithm(recipe, 0)
     given = {}
     for field, wanted in asdict(recipe).items():
         found = getattr(algorithm, f"{field}_schedule", getattr(algorithm, field, None))
-        if isinstance(wanted, (int, float)) and found is not None and field != "learning_rate":
+        if isinstance(wanted, (int, float, tuple)) and found is not None and field != "learning_rate":
             given[field] = wanted
             assert (found(1.0) if callable(found) else found) == wanted, field
-    assert len(given) >= 4
+    assert len(given) >= 2

@@ -7,10 +7,9 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from cz_gym import CzVectorEnv
-from cz_gym.agents.training.recipes import relative
-from cz_gym.agents.training.vec_env import CzVecEnv
 from cz_gym.agents.training.wrappers import ActionRepeat, TrainingReward
-from cz_gym.cost import Cost, cost_terms, reward
+from cz_gym.cost import Cost, Weights, cost_terms, reward
+from cz_gym.sb3 import CzVecEnv
 
 
 def slots(**settings: Any) -> CzVecEnv:
@@ -48,7 +47,7 @@ def test_without_costs_of_failure_every_step_earns_and_the_last_nothing() -> Non
 @pytest.mark.parametrize("observable", [False, True])
 def test_the_weighted_reward_is_the_weighted_cost_s(observable: bool) -> None:
     base = slots(scenario="puller")
-    env = TrainingReward(base, 0.9, relative(0.5, 3.0, 2.0), observable)
+    env = TrainingReward(base, 0.9, Weights(1.0, 0.25, 0.75, 0.1), observable)
     env.reset()
     _, gained, done, _ = env.step(np.full((2, 2), 0.1, np.float32))
     assert not done.any()

@@ -1,7 +1,7 @@
-"""stable-baselines3's ``VecEnv`` over the native batch: no processes, no per-slot Python on the way.
+"""stable-baselines3's ``VecEnv`` over the native batch: no processes, no Python loop over slots.
 
-With ``observation="history"`` and ``privileged=True`` the true state is appended to each observation, for a critic
-that sees more than the policy (:mod:`cz_gym.agents.training.networks` lets the actor see only the head).
+``make_vec_env(16, observation="history", action="smooth")`` is an environment for any of its algorithms. This module
+needs stable-baselines3; nothing else of the package imports it.
 """
 
 from __future__ import annotations
@@ -15,18 +15,25 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
-from cz_gym import CzVectorEnv
 from cz_gym.errors import CzError
 from cz_gym.names import needs
 from cz_gym.observation import CLIP, OBSERVATIONS, STATE
+from cz_gym.vector import CzVectorEnv
+
+
+def make_vec_env(num_envs: int, **settings: Any) -> CzVecEnv:
+    """Many environments for stable-baselines3; ``settings`` are the keywords of ``gym.make("Cz-v0", ...)``."""
+    return CzVecEnv(CzVectorEnv(num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings))
 
 
 class CzVecEnv(VecEnv):
     """A :class:`cz_gym.CzVectorEnv` with the interface of stable-baselines3's vector environments.
 
     Observations are float32, shape (num_envs, channels); ``infos`` are empty except for slots whose episode ended: they
-    hold ``terminal_observation``, ``TimeLimit.truncated`` and ``episode`` (return, length, time). With ``stagger``, a
-    seed, each slot's first episode is cut (truncated) at a random step, so that slots are not all in the same minute.
+    hold ``terminal_observation``, ``TimeLimit.truncated`` and ``episode``: return, length and time, as those of
+    stable-baselines3's ``Monitor``. With ``stagger``, a seed, each slot's first episode is cut (truncated) at a random
+    step, so that slots are not all in the same minute. With ``observation="history"`` and ``privileged`` the true state
+    follows each observation, for a critic that sees more than the policy.
     """
 
     def __init__(self, env: CzVectorEnv, privileged: bool = False, stagger: int | None = None) -> None:

@@ -8,7 +8,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from cz_gym import CzEnv, CzVectorEnv
-from cz_gym.agents.training.vec_env import CzVecEnv
+from cz_gym.sb3 import CzVecEnv
 
 N = 3
 SETTINGS: dict[str, Any] = {"scenario": "hard", "observation": "history", "control_interval": 20.0, "horizon": 400.0}

@@ -1,0 +1,127 @@
+"""From a policy of stable-baselines3 to an ONNX model: normalisation, network and clipping in one graph."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import onnx
+import torch
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from torch import nn
+
+from cz_gym.agents.agent_file.contract import AgentFileError
+from cz_gym.agents.agent_file.graph import INPUTS, OUTPUTS
+from cz_gym.agents.apg import RecurrentPolicy
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecNormalize
+
+OPSET, IR_VERSION = 17, 9
+
+
+class Deterministic(nn.Module):
+    """The deterministic action of a policy, clipped to [-1, 1], for observations as the environment gives them.
+
+    A recurrent policy also takes its state, of length ``memory``, and returns the next one. ``channels`` is the length
+    of the observation; a policy trained on a longer one sees zeros behind it.
+    """
+
+    mean: torch.Tensor
+    spread: torch.Tensor
+
+    def __init__(self, policy: BasePolicy, channels: int, normalisation: VecNormalize | None = None) -> None:
+        super().__init__()
+        self.policy: Any = policy
+        self.limit, self.memory = 0.0, 0
+        self.lstm: nn.LSTM | None = getattr(policy, "lstm_actor", None)
+        """The LSTM of sb3-contrib's recurrent policies."""
+        if isinstance(policy, RecurrentPolicy):
+            self.memory = policy.initial_memory(1).shape[1]
+        elif self.lstm is not None:
+            if self.lstm.num_layers > 1:
+                raise AgentFileError("a policy with more than one layer of LSTM cannot be written as an agent file")
+            self.memory = 2 * self.lstm.hidden_size
+        elif not isinstance(policy, ActorCriticPolicy) and not hasattr(policy, "actor"):
+            raise AgentFileError(f"{type(policy).__name__} has no actor that gives two continuous actions")
+        if normalisation is not None and normalisation.norm_obs:
+            rms: Any = normalisation.obs_rms
+            self.limit = normalisation.clip_obs
+            self.register_buffer("mean", torch.as_tensor(rms.mean, dtype=torch.float32))
+            self.register_buffer("spread", torch.as_tensor(np.sqrt(rms.var + normalisation.epsilon)).float())
+        seen = (policy.observation_space.shape or (channels,))[0]
+        self.register_buffer("padding", torch.eye(channels, seen) if seen > channels else None)
+
+    def forward(self, observation: torch.Tensor, *state: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Shape (n, channels) and, with a memory, (n, memory), to the action (n, 2) and the next state."""
+        x, policy = observation, self.policy
+        if self.limit:
+            x = torch.clamp((x - self.mean) / self.spread, -self.limit, self.limit)
+        x = x if self.padding is None else x @ self.padding
+        if isinstance(policy, RecurrentPolicy):
+            action, *state = policy(x, *state)
+        elif isinstance(policy, ActorCriticPolicy):
+            x = _features(policy.pi_features_extractor, x)
+            if self.lstm is not None:
+                x, *state = lstm_step(x, *state, self.lstm)
+            action = policy.action_net(policy.mlp_extractor.forward_actor(x))
+        else:
+            actor = policy.actor
+            x = _features(actor.features_extractor, x)
+            action = torch.tanh(actor.mu(actor.latent_pi(x))) if hasattr(actor, "latent_pi") else actor.mu(x)
+        return (action.clamp(-1.0, 1.0), *state)
+
+
+def _features(extractor: nn.Module, x: torch.Tensor) -> Any:
+    """Observations of shape (n, channels) are flat already."""
+    return x if isinstance(extractor, FlattenExtractor) else extractor(x)
+
+
+def lstm_step(x: torch.Tensor, state: torch.Tensor, lstm: nn.LSTM) -> tuple[torch.Tensor, torch.Tensor]:
+    """The hidden values and the next state of an LSTM, whose state is hidden and cell values side by side.
+
+    In plain operations: agent files may not have ONNX's LSTM, whose output has a time axis.
+    """
+    hidden, cell = state.split(lstm.hidden_size, dim=1)
+    weight_x, weight_h, bias_x, bias_h = lstm.all_weights[0]
+    gates = nn.functional.linear(x, weight_x, bias_x) + nn.functional.linear(hidden, weight_h, bias_h)
+    gain, forget, new, emit = gates.split(lstm.hidden_size, dim=1)
+    cell = torch.sigmoid(forget) * cell + torch.sigmoid(gain) * torch.tanh(new)
+    hidden = torch.sigmoid(emit) * torch.tanh(cell)
+    return hidden, torch.cat([hidden, cell], dim=1)
+
+
+def to_onnx(policy: BasePolicy, channels: int, normalisation: VecNormalize | None = None) -> bytes:
+    """The policy as a serialised ONNX model; AgentFileError if it cannot be written as one.
+
+    torch's older exporter: the newer one needs more packages and takes a second.
+    """
+    policy.set_training_mode(False)
+    module = Deterministic(policy, channels, normalisation).eval()
+    examples = [torch.zeros(2, channels), torch.zeros(2, module.memory)][: 2 if module.memory else 1]
+    inputs, outputs = (list(names[: len(examples)]) for names in (INPUTS, OUTPUTS))
+    rows = {name: {0: "n"} for name in (*inputs, *outputs)}
+    file = io.BytesIO()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that it is the older one, and of values it takes as constants
+            torch.onnx.export(
+                module, tuple(examples), file, dynamo=False, opset_version=OPSET, input_names=inputs,
+                output_names=outputs, dynamic_axes=rows,
+            )  # fmt: skip
+    except (torch.onnx.errors.OnnxExporterError, RuntimeError, TypeError, NotImplementedError) as error:
+        raise AgentFileError(f"{type(policy).__name__} cannot be written as an agent file: {error}") from None
+    model = onnx.load_from_string(file.getvalue())
+    weights = [node for node in model.graph.node if node.op_type == "Constant"]
+    for node in weights:
+        value = node.attribute[0].t
+        value.name = node.output[0]
+        model.graph.initializer.append(value)
+        model.graph.node.remove(node)
+    model.ir_version = IR_VERSION
+    onnx.checker.check_model(model)
+    serialised: bytes = model.SerializeToString()
+    return serialised

@@ -1,0 +1,222 @@
+"""Analytic policy gradients: the gradient is that of differences, and the algorithm has stable-baselines3's interface."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("stable_baselines3")
+
+from stable_baselines3.common.env_util import make_vec_env as scalar_environments
+
+from cz_gym.agents.apg import APG, RecurrentPolicy
+from cz_gym.agents.apg.plant_step import PlantStep, StepCost
+from cz_gym.config import make_config
+from cz_gym.cost import SCALES, WEIGHTS, Weights, saturated
+from cz_gym.differentiable import STATES, DifferentiableBatch
+from cz_gym.errors import CzError
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.sb3 import make_vec_env
+
+SETTINGS: dict[str, Any] = {"observation": "measured", "action": "rate"}
+CONFIG = make_config(**SETTINGS)
+QUIET = Weights(1.0, 0.025, 0.035, 1.17)
+
+
+def algorithm(n: int = 8, window: int = 20, seed: int = 0, **options: Any) -> APG:
+    torch.set_num_threads(1)
+    return APG("RecurrentPolicy", make_vec_env(n, **SETTINGS), window=window, seed=seed, **options)
+
+
+def some_policy(interval: float = 5.0) -> RecurrentPolicy:
+    """A policy with random weights, which moves both drives a little."""
+    torch.manual_seed(0)
+    policy = algorithm().policy
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            parameter.copy_(0.05 * torch.randn_like(parameter))
+        policy.mean.copy_(0.01 * torch.randn_like(policy.mean))
+        policy.std.copy_(1.0 + torch.rand_like(policy.std))
+    return policy
+
+
+def driven(policy: RecurrentPolicy, batch: DifferentiableBatch, steps: int, weights: Weights = QUIET) -> torch.Tensor:
+    """Mean cost of crystals that the policy drives."""
+    state, measured = map(torch.from_numpy, batch.reset(range(batch.num_envs)))
+    memory, cost_of, costs = policy.initial_memory(batch.num_envs), StepCost(batch.config, weights), []
+    for _ in range(steps):
+        action, memory = policy(measured, memory)
+        before = state
+        state, measured, grows, target = PlantStep.apply(before, action, batch)
+        costs.append(cost_of(before, action, state, grows, target))
+    return torch.stack(costs).mean()
+
+
+@pytest.mark.parametrize(("scenario", "apart"), [("randomized", 0.01), ("sensor-fault", 0.01), ("puller", 0.05)])
+def test_the_gradient_is_that_of_differences(scenario: str, apart: float) -> None:
+    """Along a random direction of all weights, through 40 steps of plant, sensors, memory and policy.
+
+    The heater of ``puller`` moves in whole steps, which differences see and the gradient does not.
+    """
+    policy, batch = some_policy(), DifferentiableBatch(CONFIG.with_scenario(scenario), 12)
+    driven(policy, batch, 40).backward()
+    parameters = list(policy.parameters())
+    directions = [torch.randn_like(parameter) for parameter in parameters]
+    along = sum(float((one.grad * by).sum()) for one, by in zip(parameters, directions, strict=True))  # type: ignore[operator]
+    costs = []
+    with torch.no_grad():
+        for share in (2e-3, -4e-3):
+            for parameter, direction in zip(parameters, directions, strict=True):
+                parameter += share * direction
+            costs.append(float(driven(policy, batch, 40)))
+    assert along == pytest.approx((costs[0] - costs[1]) / 4e-3, rel=apart)
+
+
+def stepped(scenario: str, action: str, actions: Any) -> tuple[Any, Any, Any, Any, StepCost]:
+    """States before and after a step of four crystals, the actions, the batch's own record of it, and the cost."""
+    config = make_config(scenario, observation="measured", action=action)
+    batch, twin = (DifferentiableBatch(config, 4) for _ in range(2))
+    for each in (batch, twin):
+        each.reset(range(4))
+        for _ in range(30):
+            each.step(np.full((4, 2), 0.02))
+    before = torch.from_numpy(twin._state)
+    after = PlantStep.apply(before, torch.from_numpy(np.float32(actions)), twin)
+    return before, after, torch.from_numpy(np.float32(actions)), batch.step(actions), StepCost(config, WEIGHTS)
+
+
+@pytest.mark.parametrize("action", ["rate", "smooth", "direct"])
+def test_the_cost_is_the_environment_s_but_for_what_no_sensor_shows(action: str) -> None:
+    before, (after, _, grows, target), actions, step, cost_of = stepped("sensor-fault", action, np.full((4, 2), 0.05))
+    assert np.abs(step.offset).max() > 1e-6
+    terms = step.cost.copy()
+    terms[:, 0] = ((step.error + step.offset) / SCALES.radius) ** 2
+    np.testing.assert_allclose(cost_of(before, actions, after, grows, target), saturated(terms.sum(axis=1)), rtol=1e-5)
+
+
+def test_a_pull_step_that_a_limit_cuts_is_charged_as_asked() -> None:
+    """On ``puller`` the pull speed moves by 0.025 mm/min in 5 s: its cost and derivative go on beyond."""
+    asked = np.array([[0.05, 0.0], [0.5, 0.0], [-0.5, 0.0], [1.0, 0.0]])
+    before, (after, _, grows, target), actions, step, cost_of = stepped("puller", "rate", asked)
+    assert np.abs(step.jacobian[1:, len(STATES) + 2, len(STATES)]).max() == 0.0, "no limit cuts these"
+    cost_of.weights = Weights(0.0, 0.0, 1.0, 0.0)
+    actions.requires_grad_()
+    cost = cost_of(before, actions, after, grows, target)
+    pull = 0.1 * CONFIG.parameters.v_0 * asked[:, 0]
+    np.testing.assert_allclose(cost.detach(), saturated((pull / SCALES.pull_step) ** 2), rtol=1e-5)
+    cost.sum().backward()
+    assert actions.grad is not None
+    np.testing.assert_array_equal(np.sign(actions.grad[:, 0].numpy()), np.sign(asked[:, 0]))
+
+
+def test_a_lost_crystal_costs_nothing_and_has_no_gradient() -> None:
+    batch = DifferentiableBatch(CONFIG, 2)
+    state, _ = map(torch.from_numpy, batch.reset(range(2)))
+    batch._batch.memory.slots["x"]["r_c"][1] += 9e-3
+    action = torch.zeros(2, 2, requires_grad=True)
+    after, _, grows, target = PlantStep.apply(state, action, batch)
+    cost = StepCost(CONFIG, WEIGHTS)(state, action, after, grows, target)
+    cost.sum().backward()
+    assert grows.tolist() == [True, False]
+    assert cost[1] == 0.0 < cost[0]
+    assert action.grad is not None
+    assert not action.grad[1].any()
+
+
+def test_predict_is_the_network_step_by_step_and_forgets_where_an_episode_begins() -> None:
+    policy = some_policy()
+    random, state, memory = np.random.default_rng(0), None, policy.initial_memory(3)
+    for step in range(12):
+        starts = np.array([step == 0, step == 0, step == 6])
+        seen = random.normal(0.0, 0.3, (3, 11)).astype(np.float32)
+        memory[starts] = 0.0
+        with torch.no_grad():
+            wanted, memory = policy(torch.from_numpy(seen), memory)
+        action, state = policy.predict(seen, state, starts)
+        np.testing.assert_array_equal(action, wanted.clamp(-1.0, 1.0))
+    single, _ = policy.predict(seen[0], None, True)
+    assert single.shape == (2,)
+
+
+def test_leaky_means_follow_a_step_as_first_order_lags() -> None:
+    policy, memory, seen = some_policy(), some_policy().initial_memory(1), torch.zeros(1, 11)
+    seen[0, 0] = 1.0
+    for _ in range(100):
+        features, means = policy.remember(seen, memory)
+        memory = torch.cat([means, memory[:, means.shape[1] :]], dim=1)
+    times = np.geomspace(3.0, 3600.0, 8)
+    np.testing.assert_allclose(memory[0, :8], 1.0 - np.exp(-500.0 / times), rtol=1e-4)
+    np.testing.assert_allclose(features[0, :9].sum(), 1.0, rtol=1e-5)
+
+
+def parameters_of(model: APG) -> torch.Tensor:
+    return torch.cat([each.flatten() for each in model.policy.parameters()])
+
+
+def test_a_saved_model_acts_and_goes_on_as_it_did(tmp_path: Path) -> None:
+    model = algorithm().learn(320)
+    model.save(tmp_path / "model.zip")
+    again = APG.load(tmp_path / "model.zip", env=make_vec_env(8, **SETTINGS))
+    assert (again.num_timesteps, again.window) == (320, 20)
+    seen = np.random.default_rng(0).normal(size=(4, 11)).astype(np.float32)
+    np.testing.assert_array_equal(again.predict(seen)[0], model.predict(seen)[0])
+    for each in (model, again):
+        each.learn(320, reset_num_timesteps=False)
+        assert each.num_timesteps == 640
+    assert torch.equal(parameters_of(again), parameters_of(model))
+
+
+def test_callbacks_see_every_step_and_end_the_training() -> None:
+    seen: list[int] = []
+
+    def callback(known: Any, _: Any) -> bool:
+        seen.append(known["self"].num_timesteps)
+        return len(seen) < 5
+
+    assert algorithm().learn(10_000, callback).num_timesteps == 160
+    assert seen[:5] == [8, 16, 24, 32, 40]
+
+
+def test_two_seeds_learn_from_other_crystals_and_one_seed_repeats() -> None:
+    first, again, other = (parameters_of(algorithm(seed=seed).learn(160)) for seed in (0, 0, 1))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+@pytest.mark.parametrize(
+    ("env", "said"),
+    [
+        (lambda: "CartPole-v1", "env must be made of Cz-v0 environments"),
+        (lambda: make_vec_env(2, observation="history"), "reads observation=\"measured\".*not 'history'"),
+    ],
+)
+def test_another_environment_is_refused(env: Any, said: str) -> None:
+    with pytest.raises(CzError, match=said):
+        APG("RecurrentPolicy", env())
+
+
+def test_scalar_environments_learn_too() -> None:
+    env = scalar_environments("Cz-v0", n_envs=2, env_kwargs=SETTINGS)
+    assert APG("RecurrentPolicy", env, window=10).learn(40).num_timesteps == 40
+
+
+def test_the_cost_falls_in_a_few_updates() -> None:
+    """On the same crystals before and after: from losing them to following the reference for half an hour."""
+    model, batch = algorithm(24, 90), DifferentiableBatch(CONFIG, 24)
+    before = driven(model.policy, batch, 360).item()
+    model.learn(24 * 90 * 30)
+    assert driven(model.policy, batch, 360).item() < 0.5 * before
+
+
+@pytest.mark.slow
+def test_it_holds_crystals_after_half_a_million_steps() -> None:
+    """From losing all crystals to holding most of them."""
+    model = algorithm(64, 180, weights=QUIET)
+    seeds = VALIDATION_SEEDS[:16]
+    assert metrics(rollout(model, CONFIG, seeds)).failure_rate.mean() > 0.8
+    model.learn(64 * 180 * 45)
+    assert metrics(rollout(model, CONFIG, seeds)).failure_rate.mean() < 0.3
