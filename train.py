@@ -20,7 +20,6 @@ except ModuleNotFoundError as error:
 
 if TYPE_CHECKING:
     from cz_gym.agents.training.recipes import Recipe
-    from cz_gym.agents.training.validation import References
 
 CHECKPOINT_SECONDS = 60.0
 """Default time between checkpoints [s]."""
@@ -90,11 +89,13 @@ def _train_one(arguments: argparse.Namespace, recipe: Recipe) -> int:
 
     from cz_gym.agents.training.run import Run
     from cz_gym.agents.training.run_files import trained_on
+    from cz_gym.agents.training.validation import references
     from cz_gym.atomic_files import locked
+    from cz_gym.baselines.registry import make_controller
 
     folder, seed, resume = arguments.out, arguments.seed, arguments.resume
     with locked(folder):
-        beside = _references(recipe)
+        beside = references(make_controller, recipe)
         run = Run(folder, recipe, seed, beside, resume, arguments.checkpoint_seconds, arguments.plot)
         crystals = trained_on(recipe.name, recipe.scenario)
         print(f"{recipe.name}, seed {seed}, {recipe.steps:,} steps on {crystals}, into {folder}")
@@ -112,10 +113,12 @@ def _train_seeds(arguments: argparse.Namespace, recipe: Recipe, folders: dict[in
 
     from cz_gym.agents.training.fleet import Job, train_seeds
     from cz_gym.agents.training.run_files import trained_on
+    from cz_gym.agents.training.validation import references
     from cz_gym.atomic_files import locked
+    from cz_gym.baselines.registry import make_controller
     from cz_gym.evaluation.cluster import check_shared, completed, connect, in_processes
 
-    options = _references(recipe), arguments.checkpoint_seconds, arguments.plot, sys.argv
+    options = references(make_controller, recipe), arguments.checkpoint_seconds, arguments.plot, sys.argv
     jobs = [Job(folder, recipe, seed, *options) for seed, folder in folders.items()]
     for job in jobs:
         with locked(job.folder):
@@ -130,16 +133,6 @@ def _train_seeds(arguments: argparse.Namespace, recipe: Recipe, folders: dict[in
             bar.write(f"seed {job.seed}: {_summary_line(summary)}")
     print(f"wrote agent.onnx into {len(jobs)} folders of {arguments.out}")
     return 0
-
-
-def _references(recipe: Recipe) -> References:
-    """What classical controllers reach on the validation crystals."""
-    from cz_gym.agents.training.validation import REFERENCES, references
-    from cz_gym.baselines.registry import make_controller
-    from cz_gym.config import make_config
-
-    config = make_config(recipe.scenario, control_interval=recipe.control_interval)
-    return references({name: make_controller(name, config) for name in REFERENCES}, config)
 
 
 def _summary_line(summary: dict[str, float]) -> str:

@@ -58,7 +58,7 @@ class Contract:
     training_seed: int
     """Seed of the training run."""
     training_steps: int
-    """Environment steps of learning from reward or cost; 0 for an imitation."""
+    """Environment steps of learning."""
     validation_cost: float
     """Mean cost of a step with the training's weights [-], on the validation episodes that choose no agent."""
     validation_rmse_mm: float

@@ -95,9 +95,10 @@ class Run:
         """
         bar.update(self.steps - bar.n)
         with deferred_interrupt() as interrupted:
-            callbacks: list[BaseCallback] = [_Watch(self, bar, interrupted)]
+            callbacks: list[BaseCallback] = []
             if isinstance(self.recipe, Reinforcement):
                 callbacks.append(Statistics(self.recipe.steps // 4, self.recipe.basis, known=self.steps > 0))
+            callbacks.append(_Watch(self, bar, interrupted))
             if self.steps < self.recipe.steps:
                 self.algorithm.learn(self.recipe.steps - self.steps, callbacks, reset_num_timesteps=False)
             if not self.rows or int(self.rows[-1]["steps"]) < self.steps:

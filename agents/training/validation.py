@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.config import Config
+from cz_gym.config import Config, make_config
 from cz_gym.cost import FAILURE_COST, WEIGHTS, Weights, cost_terms
 from cz_gym.evaluation.metrics import Metrics, metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.units import KILO, MM, MM_PER_MIN
+
+from .recipes import Recipe
 
 Floats = npt.NDArray[np.float64]
 PICKING = VALIDATION_SEEDS[:64]
@@ -61,12 +63,14 @@ def validate(
     return Validation(*(float(figure.mean()) for figure in figures))
 
 
-def references(controllers: Mapping[str, Any], config: Config) -> References:
-    """What the classical controllers reach in an environment of these settings."""
-    return {
-        name: (validate(each, config, PICKING).rmse_mm, validate(each, config, JUDGING).rmse_mm)
-        for name, each in controllers.items()
-    }
+def references(make_controller: Callable[[str, Config], Any], recipe: Recipe) -> References:
+    """What the classical controllers reach on the crystals of a recipe; ``make_controller`` makes one by its name."""
+    config = make_config(recipe.scenario, control_interval=recipe.control_interval)
+    found = {}
+    for name in REFERENCES:
+        policy = make_controller(name, config)
+        found[name] = validate(policy, config, PICKING).rmse_mm, validate(policy, config, JUDGING).rmse_mm
+    return found
 
 
 def costs(measured: Metrics, weights: Weights = WEIGHTS, observable: bool = False) -> Floats:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cz_gym.atomic_files import check_writable, write_files
-from cz_gym.baselines.registry import make_controller
 from cz_gym.commands import OneLineParser, between
 from cz_gym.evaluation import cluster
 
@@ -74,7 +73,7 @@ def make_jobs(variants: Sequence[Variant], seeds: int, work: Path) -> list[Job]:
     from cz_gym.agents.training.fleet import Job
 
     return [
-        Job((work / f"{each.name}-seed{seed}").resolve(), each.recipe, seed, make_controller, CHECKPOINT_SECONDS, False,
+        Job((work / f"{each.name}-seed{seed}").resolve(), each.recipe, seed, {}, CHECKPOINT_SECONDS, False,
             sys.argv)
         for seed in range(seeds)
         for each in variants

@@ -11,6 +11,8 @@ from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.agents.training import validation
 from cz_gym.agents.training.fleet import Job, train_seed
 from cz_gym.agents.training.run_files import read_rows
+from cz_gym.agents.training.validation import references
+from cz_gym.baselines.registry import make_controller
 from cz_gym.config import Config
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import Floats, rollout
@@ -33,7 +35,8 @@ class Result(NamedTuple):
 
 def train_and_evaluate(job: Job) -> Result:
     """Train a run to its end, from its checkpoint if there is one, and evaluate its best agent."""
-    train_seed(job)
+    if job.summary is None:
+        train_seed(job._replace(references=references(make_controller, job.recipe)))
     config = job.recipe.config
     rows = [{name: float(value) for name, value in row.items()} for row in read_rows(job.folder / "progress.csv")]
     return Result(evaluate(OnnxPolicy.load(job.folder / "agent.onnx", config), config), rows)

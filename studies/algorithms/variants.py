@@ -58,13 +58,12 @@ def _ppo(name: str, meaning: str, **changes: Any) -> Variant:
 
 ALGORITHMS = (
     Variant(
-        RECIPES["gradient-start"],
-        "the cost's gradient through policy and plant, from nothing; the plant is known; of its "
-        "crystals, 70 % are wide, or of hard, sensor-fault and puller",
+        RECIPES["gradient"],
+        "analytic policy gradients from nothing: the cost's gradient through policy and plant, which is known; of its "
+        "crystals, 65 % are of hard, sensor-fault and puller",
     ),
     Variant(RECIPES["ppo"], "proximal policy optimisation from nothing; the critic also sees the true state"),
     Variant(RECIPES["sac"], "soft actor-critic from nothing; both see the past; it learns with actions of 20 s", "ppo"),
-    Variant(RECIPES["imitation"], "no reward: DAgger, the teacher is a privileged LQG", "ppo"),
 )
 ABLATION = (
     Variant(PPO, "from nothing, by reward; smooth actions, differences of the past, a critic that sees the true state"),

@@ -11,17 +11,16 @@ from typing import Any
 
 from cz_gym.agents import shipped_seeds
 from cz_gym.agents.agent_file.contract import Contract, read_agent
-from cz_gym.agents.training.recipes import RECIPES, Gradient, Imitation, Share
+from cz_gym.agents.training.recipes import RECIPES
 from cz_gym.atomic_files import check_writable, naming, write_files
 from cz_gym.commands import OneLineParser
 from cz_gym.errors import CzError
 from cz_gym.evaluation.report.tables import markdown as table
 
 AGENTS = {
-    "gradient": "the cost's gradient through policy and plant, continued from `gradient-start`; the plant is known",
+    "gradient": "analytic policy gradients: the cost's gradient through policy and plant; the plant is known",
     "ppo": "proximal policy optimisation from nothing, from the reward",
     "sac": "soft actor-critic from nothing, from the reward",
-    "imitation": "DAgger: it imitates a privileged LQG",
 }
 """Shipped agents, and how each learned."""
 FIGURES = {
@@ -62,7 +61,7 @@ def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -
             f"## `{name}`",
             "",
             f"- How it learned: {how}.",
-            f"- Saw: {_seen_in_training(name, first)}; {_steps(name, contracts)} a run.",
+            f"- Saw: {_seen_in_training(name, first)}; {_steps(contracts)} a run.",
             f"- Reads: `{first.observation}`; acts every {first.control_interval:g} s; its action is `{first.action}`.",
             f"- Training seeds: {len(contracts)}. `agents.load({name!r})` is the one of least validation cost.",
             "- Fails: " + (f"loses crystals of {', '.join(fails)}." if fails else "on none of these."),
@@ -74,23 +73,14 @@ def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -
 
 
 def _seen_in_training(name: str, contract: Contract) -> str:
-    """Its training crystals, with the shares of those that are not the scenario's own."""
-    recipe = RECIPES.get(name)
-    mixture = recipe.mixture if isinstance(recipe, Gradient) else ()
-    if isinstance(recipe, Imitation):
-        mixture = (Share("", recipe.width, recipe.wide_share),)
-    others = [
-        f"{100.0 * share:.0f} % " + (f"of `{other}`" if other else f"{width:g} times as wide")
-        for other, width, share in mixture
-    ]
-    return f"crystals of `{contract.scenario}`" + (f", with {', '.join(others)} among them" if others else "")
+    """Its training crystals, with their shares if they are of several scenarios."""
+    shares = getattr(RECIPES.get(name), "mixture", None) or {contract.scenario: 1.0}
+    parts = [f"`{scenario}`" + (f" ({share:.0%})" if len(shares) > 1 else "") for scenario, share in shares.items()]
+    return f"crystals of {', '.join(parts)}"
 
 
-def _steps(name: str, contracts: Sequence[Contract]) -> str:
-    """Number of steps that a run learned from; of an imitation, of demonstrations."""
-    recipe = RECIPES.get(name)
-    if isinstance(recipe, Imitation):
-        return f"{recipe.rounds * recipe.episodes * recipe.config.steps / 1e6:.1f} million steps of demonstrations"
+def _steps(contracts: Sequence[Contract]) -> str:
+    """Number of environment steps that a run learned from."""
     taken = [contract.training_steps / 1e6 for contract in contracts]
     steps = [f"{least_or_most(taken):.0f}" for least_or_most in (min, max)]
     return f"{' to '.join(dict.fromkeys(steps))} million steps"

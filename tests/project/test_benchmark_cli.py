@@ -192,7 +192,7 @@ def test_agent_files_that_cannot_be_used_get_one_line(tmp_path: Path, refusal: A
     other = constant_agent(tmp_path / "other.onnx", training_seed=1, scenario="hard", scenario_hash="0" * 16)
     assert "different scenarios: hard, randomized" in refusal(["--agent", twice, "--agent", str(other)])
     assert "choose from" in (line := refusal(["--agent", f"mine={twice}", "--controllers", "your"]))
-    assert "clairvoyant, mine, gradient, imitation, ppo, sac, or all" in line
+    assert "clairvoyant, mine, gradient, ppo, sac, or all" in line
 
 
 def test_an_agent_s_line_says_every_scenario_that_its_recipe_has(tmp_path: Path) -> None:
@@ -206,7 +206,7 @@ def test_an_agent_s_line_says_every_scenario_that_its_recipe_has(tmp_path: Path)
 
 
 def test_a_file_may_be_named_and_stand_beside_the_shipped_agents(tmp_path: Path) -> None:
-    file, shipped = constant_agent(tmp_path / "some.onnx", algorithm="ppo"), "imitation"
+    file, shipped = constant_agent(tmp_path / "some.onnx", algorithm="ppo"), "sac"
     found = contenders("--controllers", f"paper,mine,{shipped}", "--agent", f"mine={file}")
     assert [each.name for each in found] == ["paper", "mine", shipped]
     assert found[1].meaning.endswith("given as a file")

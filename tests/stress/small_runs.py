@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 import train
 from cz_gym.agents import OnnxPolicy
-from cz_gym.agents.training import run
+from cz_gym.agents.training import run, validation
 from cz_gym.agents.training.checkpoint import load_checkpoint
 from cz_gym.agents.training.recipes import PPO, RECIPES
 from cz_gym.atomic_files import write_files
@@ -22,9 +22,9 @@ PHASES = {
     "rollout": ("stable_baselines3.common.buffers:RolloutBuffer.add:20", 1280),
     "update": ("stable_baselines3:PPO.train:1>torch.nn.utils:clip_grad_norm_:5", 3328),
     "checkpoint, before it counts": (f"{RUN}.save:5>os:replace:1", 3584),
-    "first validation": (f"{RUN}._validate:1>{STEP}:100", 7616),
-    "one after a validation, before it counts": (f"{RUN}._validate:1>os:replace:1", 9664),
-    "checkpoint, as it moves": (f"{RUN}._validate:1>os:replace:2", 9664),
+    "first validation": (f"{RUN}.validate:1>{STEP}:100", 7616),
+    "one after a validation, before it counts": (f"{RUN}.validate:1>os:replace:1", 9664),
+    "checkpoint, as it moves": (f"{RUN}.validate:1>os:replace:2", 9664),
     "summary, as it moves": (f"{RUN}.finish:1>os:replace:2", 9664),
 }
 """Where one run of PPO is killed, resumed, killed ...: the point, counted from where it goes on, and the step at which
@@ -34,7 +34,7 @@ a run stands that was killed there. Rollouts have 2,048 steps, and a validation 
 def training(arguments: list[str]) -> int:
     """train.py on less of everything; a checkpoint at every step."""
     tqdm.set_lock(threading.RLock())  # its own is a semaphore, which a killed process leaves behind
-    run.PICKING, run.JUDGING, run.VALIDATE_EVERY = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4], 4096
+    validation.PICKING, validation.JUDGING, run.VALIDATE_EVERY = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4], 4096
     RECIPES["ppo"] = PPO(
         steps=8192, num_envs=64, n_steps=32, batch_size=512, n_epochs=2, hidden=(16,), control_interval=30.0
     )

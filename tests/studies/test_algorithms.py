@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("matplotlib")
 
-from cz_gym.agents.training.learners import make_learner
-
 from cz_gym.agents.training import run, validation
-from cz_gym.agents.training.recipes import PPO, SAC, Imitation
+from cz_gym.agents.training.algorithms import make_algorithm
+from cz_gym.agents.training.recipes import APG, PPO, SAC
 from cz_gym.evaluation.protocol import TEST_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.statistics import Resamples
 from studies.algorithms import __main__ as command
@@ -27,7 +27,7 @@ SMALL: dict[str, Any] = {"num_envs": 4, "hidden": (4,), "steps": 128}
 VARIANTS = (
     Variant(PPO(**SMALL, n_steps=16, batch_size=64, n_epochs=1), "as it is"),
     Variant(SAC(**SMALL, learning_starts=16, buffer_size=64, batch_size=8), "SAC", "ppo"),
-    Variant(Imitation(name="few", teacher="lqg", rounds=1, episodes=2, control_interval=60.0), "DAgger", "ppo"),
+    Variant(APG(name="few", num_envs=4, window=16, steps=128), "APG", "ppo"),
 )
 SOME = Comparison("Some question", VARIANTS)
 
@@ -46,9 +46,8 @@ def test_finished_runs_are_kept_and_evaluated_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A stopped comparison goes on; a changed metric shows although no run is trained again."""
-    monkeypatch.setattr(run, "PICKING", VALIDATION_SEEDS[:2])
-    for module in (run, validation):
-        monkeypatch.setattr(module, "JUDGING", VALIDATION_SEEDS[2:4])
+    monkeypatch.setattr(validation, "PICKING", VALIDATION_SEEDS[:2])
+    monkeypatch.setattr(validation, "JUDGING", VALIDATION_SEEDS[2:4])
     monkeypatch.setitem(COMPARISONS, "some", SOME)
     learn, trained = run.Run.learn, []
 
@@ -85,7 +84,7 @@ def test_finished_runs_are_kept_and_evaluated_anew(
     [
         (
             ["--rows", "ppo,sacc"],
-            "unknown row 'sacc': did you mean 'sac'? Choose from gradient-start, ppo, sac, imitation",
+            "unknown row 'sacc': did you mean 'sac'? Choose from gradient, ppo, sac",
         ),
         (["--seeds", "0"], "--seeds: must be between 1 and 100, not 0"),
         (["--steps", "-5"], "--steps: must be between 1"),
@@ -126,11 +125,10 @@ def test_a_row_changes_one_thing_and_can_be_learned(row: Variant) -> None:
     base, mine = asdict(ABLATION[0].recipe), asdict(row.recipe)
     assert len({name for name in base if base[name] != mine[name]} - {"name"}) == (row.base != "")
     few: dict[str, Any] = {"n_steps": 8, "batch_size": 32, "steps": 32, "num_envs": 4}
-    learner = make_learner(replace(row.recipe, **few), 0)
-    before = learner.exported()
-    learner.learn(lambda steps, doing: None)
-    assert learner.steps == learner.total
-    assert learner.exported() != before
+    algorithm = make_algorithm(replace(row.recipe, **few), 0)
+    before = [each.clone() for each in algorithm.policy.parameters()]
+    algorithm.learn(32)
+    assert not all(map(torch.equal, algorithm.policy.parameters(), before))
 
 
 @pytest.mark.parametrize("comparison", COMPARISONS.values(), ids=COMPARISONS)

@@ -68,7 +68,7 @@ def test_a_linear_agent_moves_as_the_agent_does_after_a_small_jump(gradient: ins
 
 
 def test_an_agent_without_a_memory_is_refused() -> None:
-    _, content = read_agent(agents.shipped("imitation"))
+    _, content = read_agent(agents.shipped("ppo"))
     with pytest.raises(ValueError, match="a state of their own"):
         jacobian(content, np.zeros((1, 72)), np.zeros((1, 0)))
 

@@ -1,4 +1,4 @@
-"""Analytic policy gradients: the gradient is that of differences, and the algorithm has stable-baselines3's interface."""
+"""Analytic policy gradients: the gradient is that of differences, and the interface stable-baselines3's."""
 
 from pathlib import Path
 from typing import Any

@@ -126,9 +126,8 @@ def test_tensors_that_do_not_belong_are_refused(
     sac: Any, ppo: Any, name: str, change: Any, message: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "checkpoint.safetensors"
-    learner, other = (
-        (sac, make_algorithm(SMALL_SAC, 1)) if name.startswith("replay/") else (ppo, make_algorithm(SMALL, 1))
-    )
+    learner, recipe = (sac, SMALL_SAC) if name.startswith("replay/") else (ppo, SMALL)
+    other = make_algorithm(recipe, 1)
     path.write_bytes(to_bytes(learner, 1.0, None))
     _, tensors, _ = load_checkpoint(path)
     tensors[name] = change(tensors.get(name))

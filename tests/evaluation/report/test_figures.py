@@ -20,7 +20,7 @@ from cz_gym.evaluation.results import Result, Sample, summarise
 from cz_gym.evaluation.rollout import rollout
 from tests.samples import contender, sample_of
 
-AGENTS = {"gradient": 0.05, "imitation": 0.07, "ppo": 0.06, "sac": 0.2}
+AGENTS = {"gradient": 0.05, "ppo": 0.06, "sac": 0.2}
 """Shipped agents with their RMSE [mm], as on the test crystals."""
 
 
