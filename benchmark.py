@@ -181,11 +181,9 @@ def shipped_agent(name: str) -> Contender:
 
 
 def _agent(name: str, policies: Sequence[Any], own: bool = False) -> Contender:
-    from cz_gym.agents.training.run_files import trained_on
     from cz_gym.evaluation.contenders import agent
 
-    contract = policies[0].contract
-    return agent(name, policies, own, trained_on(contract.algorithm, contract.scenario))
+    return agent(name, policies, own)
 
 
 def left_out(contenders: Sequence[Contender]) -> list[str]:

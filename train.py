@@ -45,7 +45,10 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     add("--ray", nargs="?", const="", metavar="HOST:PORT", help=about)
     about = "environment steps of learning (default: the recipe's, or the resumed run's)"
     add("--steps", type=between(1, 10**12), help=about)
-    add("--scenario", help="scenario to train on (default: the recipe's, or the resumed run's)")
+    about = (
+        "scenario to train on: a name, all, FILE.py:NAME, or A=0.6,B=0.4 (default: the recipe's, or the resumed run's)"
+    )
+    add("--scenario", help=about)
     about = (
         "run folder (default: runs/<algo>-seed<seed>); with --seeds the folder of their folders seed0, seed1 ... "
         "(default: runs/<algo>)"
@@ -88,7 +91,6 @@ def _train_one(arguments: argparse.Namespace, recipe: Recipe) -> int:
     from tqdm import tqdm
 
     from cz_gym.agents.training.run import Run
-    from cz_gym.agents.training.run_files import trained_on
     from cz_gym.agents.training.validation import references
     from cz_gym.atomic_files import locked
     from cz_gym.baselines.registry import make_controller
@@ -97,7 +99,7 @@ def _train_one(arguments: argparse.Namespace, recipe: Recipe) -> int:
     with locked(folder):
         beside = references(make_controller, recipe)
         run = Run(folder, recipe, seed, beside, resume, arguments.checkpoint_seconds, arguments.plot)
-        crystals = trained_on(recipe.name, recipe.scenario)
+        crystals = recipe.config.scenario.name
         print(f"{recipe.name}, seed {seed}, {recipe.steps:,} steps on {crystals}, into {folder}")
         with tqdm(total=recipe.steps, unit="step", unit_scale=True, dynamic_ncols=True, mininterval=1.0) as bar:
             run.learn(bar)
@@ -112,7 +114,6 @@ def _train_seeds(arguments: argparse.Namespace, recipe: Recipe, folders: dict[in
     from tqdm import tqdm
 
     from cz_gym.agents.training.fleet import Job, train_seeds
-    from cz_gym.agents.training.run_files import trained_on
     from cz_gym.agents.training.validation import references
     from cz_gym.atomic_files import locked
     from cz_gym.baselines.registry import make_controller
@@ -126,8 +127,7 @@ def _train_seeds(arguments: argparse.Namespace, recipe: Recipe, folders: dict[in
     if arguments.ray is not None:
         connect(arguments.ray)
         check_shared(jobs[0].folder)
-    crystals = trained_on(recipe.name, recipe.scenario)
-    print(f"{recipe.name}, {len(jobs)} seeds on {crystals}, into {arguments.out}")
+    print(f"{recipe.name}, {len(jobs)} seeds on {recipe.config.scenario.name}, into {arguments.out}")
     with tqdm(total=len(jobs), bar_format="{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}") as bar:
         for job, summary in train_seeds(jobs, in_processes if arguments.ray is None else completed, bar):
             bar.write(f"seed {job.seed}: {_summary_line(summary)}")
@@ -192,11 +192,13 @@ def _fill_from_resumed_run(arguments: argparse.Namespace, folders: list[Path]) -
 def _recipe_from(arguments: argparse.Namespace, saved_steps: int | None) -> Recipe:
     """The recipe with scenario and steps of the command line or the resumed run."""
     from cz_gym.agents.training.recipes import RECIPES
-    from cz_gym.episodes.scenarios import find_scenario
+    from cz_gym.config import check_config
 
     recipe = RECIPES[arguments.algo]
-    scenario = find_scenario(arguments.scenario or recipe.scenario).name
-    return replace(recipe, scenario=scenario, steps=arguments.steps or saved_steps or recipe.steps)
+    steps = arguments.steps or saved_steps or recipe.steps
+    recipe = replace(recipe, scenario=arguments.scenario or recipe.scenario, steps=steps)
+    check_config(recipe.config)
+    return recipe
 
 
 def _named(kind: str, known: Iterable[str]) -> Callable[[str], str]:

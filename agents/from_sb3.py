@@ -24,6 +24,7 @@ from cz_gym.commands import OneLineParser
 from cz_gym.config import Config, check_config, make_config
 from cz_gym.env import CzEnv, observation_space
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from cz_gym.evaluation.user_code import scenarios
 from cz_gym.names import needs
 from cz_gym.observation import DRIVE_CHANNELS, OBSERVATIONS
 from cz_gym.vector import CzVectorEnv
@@ -219,7 +220,8 @@ def main(argv: list[str] | None = None) -> int:
         "--vecnormalize", type=Path, metavar="PKL", help="saved VecNormalize, if it was trained with one"
     )
     parser.add_argument("--name", help="what the agent is called (default: the agent file's name)")
-    parser.add_argument("--scenario", default="randomized", help="scenario it was trained on (default: %(default)s)")
+    about = "what it was trained on: a scenario's name, all, FILE.py:NAME or A=0.6,B=0.4 (default: %(default)s)"
+    parser.add_argument("--scenario", default="randomized", help=about)
     parser.add_argument("--observation", default="history", help="observation it reads (default: %(default)s)")
     parser.add_argument("--action", default="direct", help="direct, smooth or rate (default: %(default)s)")
     parser.add_argument("--control-interval", type=float, default=5.0, help="in seconds (default: %(default)s)")
@@ -238,7 +240,8 @@ def _convert(given: argparse.Namespace) -> None:
             raise
         raise AgentFileError(f"{given.algo} is missing: pip install sb3-contrib") from None
     model = _read(given.model, f"a model of {given.algo}", lambda: algorithm.load(given.model, device="cpu"))
-    config = make_config(given.scenario, None, given.observation, given.control_interval, action=given.action)
+    crystals = scenarios(given.scenario)
+    config = make_config(crystals, None, given.observation, given.control_interval, action=given.action)
     _check_spaces(model, config)
     normalisation = None
     if given.vecnormalize:

@@ -23,7 +23,7 @@ MAX_BYTES = 4_000_000
 """Largest agent file that is read."""
 MAX_JSON_BYTES = 1_000_000
 """Largest JSON file that is read."""
-MAX_TEXT = 80
+MAX_TEXT = 160
 """Longest text in a contract."""
 MAX_WHOLE = 2**63 - 1
 """Largest whole number in a contract."""
@@ -50,7 +50,7 @@ class Contract:
     plant_hash: str
     """Hash of the nominal plant it was trained on."""
     scenario: str
-    """Scenario it was trained on."""
+    """Scenario, or shares of scenarios, that it was trained on."""
     scenario_hash: str
     """Hash of that scenario."""
     algorithm: str

@@ -19,10 +19,10 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 
 from cz_gym.config import Config
 from cz_gym.cost import WEIGHTS, Weights
+from cz_gym.differentiable import DifferentiableBatch
 from cz_gym.errors import CzError
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 
-from .mixture import Mixture
 from .plant_step import PlantStep, StepCost
 from .policy import RecurrentPolicy
 
@@ -57,7 +57,6 @@ class APG(BaseAlgorithm):
         learning_rate: float | Schedule = 4e-3,
         window: int = 180,
         weights: Weights = WEIGHTS,
-        mixture: dict[str, float] | None = None,
         policy_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -84,7 +83,7 @@ class APG(BaseAlgorithm):
             support_multi_env=True,
             seed=seed,
         )
-        self.window, self.weights, self.mixture = window, weights, mixture
+        self.window, self.weights = window, weights
         self.norms = torch.zeros(NORMS)
         if _init_setup_model:
             self._setup_model()
@@ -121,9 +120,7 @@ class APG(BaseAlgorithm):
         total_timesteps, watch = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
-        crystals = _Crystals(
-            self._config(), self.n_envs, self.window, [self.seed or 0, self.num_timesteps], self.mixture
-        )
+        crystals = _Crystals(self._config(), self.n_envs, self.window, [self.seed or 0, self.num_timesteps])
         memory = self.policy.initial_memory(self.n_envs)
         watch.on_training_start(locals(), globals())
         going, updates = True, 0
@@ -196,8 +193,8 @@ class APG(BaseAlgorithm):
 class _Crystals:
     """Crystals of the training seeds in a differentiable batch; slots are at different times of their episodes."""
 
-    def __init__(self, config: Config, n: int, window: int, seed: list[int], mixture: dict[str, float] | None) -> None:
-        self.batch = Mixture(config, n, mixture)
+    def __init__(self, config: Config, n: int, window: int, seed: list[int]) -> None:
+        self.batch = DifferentiableBatch(config, n)
         self._random = np.random.default_rng(seed)
         self._windows = max(config.steps // window, 1)
         self._left = self._random.integers(1, self._windows, n, endpoint=True)

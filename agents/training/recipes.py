@@ -6,11 +6,11 @@ A new recipe needs a line in :data:`RECIPES`; a new kind needs a dataclass here 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 from cz_gym.config import Config, make_config
 from cz_gym.cost import WEIGHTS, Weights
+from cz_gym.evaluation.user_code import scenarios
 
 QUIET = Weights(pull=0.025, pull_step=0.035, heater_step=1.17)
 """Weights near those of lqg-quiet: pull speed and its steps are cheaper than in the reward, heater steps dearer."""
@@ -32,7 +32,7 @@ class Recipe:
     action: str = "smooth"
     """Meaning of the network's two outputs (:func:`cz_gym.task.drives_of`)."""
     scenario: str = "randomized"
-    """Scenario of the training and validation crystals."""
+    """Scenario or mixture of the training and validation crystals (:func:`cz_gym.evaluation.user_code.scenarios`)."""
     control_interval: float = 5.0
     """Time between actions [s]."""
     weights: Weights = WEIGHTS
@@ -43,8 +43,9 @@ class Recipe:
     @property
     def config(self) -> Config:
         """The environment that the recipe's agents act in."""
+        crystals = scenarios(self.scenario)
         return make_config(
-            self.scenario, observation=self.observation, control_interval=self.control_interval, action=self.action
+            crystals, observation=self.observation, control_interval=self.control_interval, action=self.action
         )
 
 
@@ -58,6 +59,7 @@ class APG(Recipe):
     learning_rate: float = 4e-3
     observation: str = "measured"
     action: str = "rate"
+    scenario: str = "randomized=0.35,hard=0.2,sensor-fault=0.2,puller=0.25"
     weights: Weights = QUIET
     observable: bool = True
     window: int = 180
@@ -65,8 +67,6 @@ class APG(Recipe):
     betas: tuple[float, float] = (0.9, 0.9)
     """Adam's decays. The first gradients, of lost crystals, are a thousand times those that follow: their squares must
     be forgotten soon."""
-    mixture: Mapping[str, float] | None = None
-    """Shares of the training crystals by scenario; None: all are the recipe's scenario's own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,8 +140,7 @@ class SAC(Reinforcement):
     """Initial weight of the entropy, in units of the reward times 1 - gamma; it adapts."""
 
 
-MIXTURE = {"randomized": 0.35, "hard": 0.2, "sensor-fault": 0.2, "puller": 0.25}
-RECIPES: dict[str, Recipe] = {recipe.name: recipe for recipe in (PPO(), SAC(), APG(mixture=MIXTURE))}
+RECIPES: dict[str, Recipe] = {recipe.name: recipe for recipe in (PPO(), SAC(), APG())}
 """Recipes by name: the choices of ``train.py --algo``."""
 DEFAULT = "ppo"
 """The recipe that train.py follows unless another is named."""

@@ -16,16 +16,10 @@ from typing import Any
 from cz_gym.agents.agent_file.contract import MAX_JSON_BYTES, AgentFileError, read_bounded, read_json
 from cz_gym.evaluation.files import software
 
-from .recipes import RECIPES, Recipe
+from .recipes import Recipe
 from .validation import COLUMNS
 
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "stable-baselines3", "torch", "onnx", "onnxruntime")
-
-
-def trained_on(algorithm: str, scenario: str) -> str:
-    """The scenarios, in words, that an agent of that recipe and scenario was trained on."""
-    *others, last = getattr(RECIPES.get(algorithm), "mixture", None) or [scenario]
-    return f"{', '.join(others)} and {last}" if others else last
 
 
 def check_settings(folder: Path, recipe: Recipe, seed: int) -> list[dict[str, Any]]:

@@ -65,10 +65,12 @@ def validate(
 
 def references(make_controller: Callable[[str, Config], Any], recipe: Recipe) -> References:
     """What the classical controllers reach on the crystals of a recipe; ``make_controller`` makes one by its name."""
-    config = make_config(recipe.scenario, control_interval=recipe.control_interval)
+    config = make_config(recipe.config.scenario, control_interval=recipe.control_interval)
+    # Classical controllers are designed for one scenario.
+    design = config if len(config.scenario.scenarios) == 1 else config.with_scenario("randomized")
     found = {}
     for name in REFERENCES:
-        policy = make_controller(name, config)
+        policy = make_controller(name, design)
         found[name] = validate(policy, config, PICKING).rmse_mm, validate(policy, config, JUDGING).rmse_mm
     return found
 

@@ -14,11 +14,11 @@ from .protocol import SLOW_EPISODES, Row
 from .rollout import check_policy
 
 
-def agent(name: str, policies: Sequence[Any], own: bool = False, trained_on: str = "") -> Contender:
+def agent(name: str, policies: Sequence[Any], own: bool = False) -> Contender:
     """An agent from its policies with a ``contract``, one a training seed.
 
-    It is the user's ``own`` if it was given as a file. ``trained_on`` says on what, if it was more than the scenario of
-    its contract. Raises CzError if the policies are not training seeds of one agent.
+    It is the user's ``own`` if it was given as a file. Raises CzError if the policies are not training seeds of one
+    agent.
     """
     contracts = [policy.contract for policy in policies]
     seeds = tuple(contract.training_seed for contract in contracts)
@@ -30,7 +30,7 @@ def agent(name: str, policies: Sequence[Any], own: bool = False, trained_on: str
         trained = ", ".join(sorted({contract.scenario for contract in contracts}))
         raise CzError(f"agent {name!r}: its training seeds were trained on different scenarios: {trained}")
     one = contracts[0]
-    meaning = f"agent trained with {one.algorithm} on {trained_on or one.scenario}{', given as a file' if own else ''}"
+    meaning = f"agent trained with {one.algorithm} on {one.scenario}{', given as a file' if own else ''}"
     make, trained_policies = partial(_first, policies[0]), tuple(policies)
     return Contender(
         name, make, one.observation, meaning,

@@ -11,8 +11,9 @@ from typing import Any
 
 from cz_gym.config import Config
 from cz_gym.contender import Contender
+from cz_gym.episodes.mixture import Distribution
 from cz_gym.episodes.scenario import Scenario
-from cz_gym.episodes.scenarios import SCENARIOS
+from cz_gym.episodes.scenarios import SCENARIOS, find_distribution
 from cz_gym.errors import CzError
 from cz_gym.names import unknown
 
@@ -44,6 +45,28 @@ def load(place: str, kind: str, fits: Callable[[Any, str], bool]) -> tuple[str, 
         offered = [each for each, value in vars(module).items() if each[0] != "_" and fits(value, module_name)]
         raise CzError(f"{path}: {unknown(kind, name, offered)}")
     return name, getattr(module, name)
+
+
+def scenarios(text: str) -> Distribution:
+    """Return the scenario or mixture that a text names; CzError if there is none.
+
+    It is a scenario's name, "all", ``FILE.py:NAME``, or several scenarios with their shares: "randomized=0.6,hard=0.4".
+    """
+
+    def one(name: str) -> Any:
+        return row(name).scenario if ":" in name else name
+
+    if "=" not in text:
+        return find_distribution(one(text))
+    shares = {}
+    for part in text.split(","):
+        name, _, share = part.rpartition("=")
+        try:
+            number = float(share)
+        except ValueError:
+            raise CzError(f"{part!r} in {text!r:.80} is no scenario with its share, such as hard=0.4") from None
+        shares[one(name)] = number
+    return find_distribution(shares)
 
 
 def controller(place: str) -> Contender:

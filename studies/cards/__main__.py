@@ -11,7 +11,6 @@ from typing import Any
 
 from cz_gym.agents import shipped_seeds
 from cz_gym.agents.agent_file.contract import Contract, read_agent
-from cz_gym.agents.training.recipes import RECIPES
 from cz_gym.atomic_files import check_writable, naming, write_files
 from cz_gym.commands import OneLineParser
 from cz_gym.errors import CzError
@@ -61,7 +60,7 @@ def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -
             f"## `{name}`",
             "",
             f"- How it learned: {how}.",
-            f"- Saw: {_seen_in_training(name, first)}; {_steps(contracts)} a run.",
+            f"- Saw: crystals of {first.scenario}; {_steps(contracts)} a run.",
             f"- Reads: `{first.observation}`; acts every {first.control_interval:g} s; its action is `{first.action}`.",
             f"- Training seeds: {len(contracts)}. `agents.load({name!r})` is the one of least validation cost.",
             "- Fails: " + (f"loses crystals of {', '.join(fails)}." if fails else "on none of these."),
@@ -70,13 +69,6 @@ def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -
             "",
         ]
     )
-
-
-def _seen_in_training(name: str, contract: Contract) -> str:
-    """Its training crystals, with their shares if they are of several scenarios."""
-    shares = getattr(RECIPES.get(name), "mixture", None) or {contract.scenario: 1.0}
-    parts = [f"`{scenario}`" + (f" ({share:.0%})" if len(shares) > 1 else "") for scenario, share in shares.items()]
-    return f"crystals of {', '.join(parts)}"
 
 
 def _steps(contracts: Sequence[Contract]) -> str:

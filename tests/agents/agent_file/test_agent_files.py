@@ -12,6 +12,7 @@ import pytest
 from cz_gym import Parameters
 from cz_gym.agents import AgentFileError, OnnxPolicy, shipped
 from cz_gym.agents.agent_file.contract import MAX_BYTES, write_agent
+from cz_gym.agents.export import to_onnx
 from cz_gym.baselines import CompensatedPID
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metrics
@@ -25,7 +26,7 @@ CONFIG = make_config(observation="history")
 @pytest.fixture
 def agent(ppo: Any, tmp_path: Path) -> Path:
     path = tmp_path / "agent.onnx"
-    write_agent(path, ppo.exported(), **facts())
+    write_agent(path, to_onnx(ppo.policy, 72), **facts())
     return path
 
 
@@ -52,7 +53,7 @@ def test_agent_for_another_plant_is_refused(agent: Path) -> None:
         ({"format_version": 1}, "format version 1, this release reads 4"),
         ({"sha256": "0" * 64}, "SHA-256 differs"),
         ({"surprise": 1}, "'surprise' is unknown"),
-        ({"algorithm": "mine | yours"}, r"must be printable text of 1 to 80 characters without \|"),
+        ({"algorithm": "mine | yours"}, r"must be printable text of 1 to 160 characters without \|"),
         ({"validation_rmse_mm": float("nan")}, "must be finite"),
         ({"validation_rmse_mm": float("inf")}, "must be finite"),
     ],
@@ -72,7 +73,8 @@ def last_bias(model: Any, value: Any) -> None:
 
 def infinity_less_infinity(model: Any) -> None:
     last_bias(model, np.full(2, 3e38, np.float32))
-    model.graph.node[-2].attribute.append(onnx.helper.make_attribute("beta", 2.0))
+    (beta,) = (each for each in model.graph.node[-2].attribute if each.name == "beta")
+    beta.f = 2.0
     clip = model.graph.node[-1]
     clip.CopyFrom(onnx.helper.make_node("Sub", [clip.input[0], clip.input[0]], [clip.output[0]]))
 

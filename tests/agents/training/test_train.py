@@ -44,12 +44,14 @@ def test_a_run_leaves_everything_and_goes_on(
 ) -> None:
     folder = tmp_path / "run"
     assert train.main(["--algo", algorithm, "--steps", "20000", "--seed", "3", "--out", str(folder), "--plot"]) == 0
-    also = ", hard, sensor-fault and puller" if algorithm == "gradient" else ""
-    assert f" steps on randomized{also}, into {folder}\n" in capsys.readouterr().out
+    crystals = (
+        "0.2 hard + 0.25 puller + 0.35 randomized + 0.2 sensor-fault" if algorithm == "gradient" else "randomized"
+    )
+    assert f" steps on {crystals}, into {folder}\n" in capsys.readouterr().out
     assert (folder / "progress.png").read_bytes().startswith(b"\x89PNG")
     saved = json.loads((folder / "settings.json").read_text())
     assert saved["seed"] == 3
-    assert saved["settings"]["scenario"] == "randomized"
+    assert saved["settings"]["scenario"] == RECIPES[algorithm].scenario
     assert saved["packages"]["stable-baselines3"]
     assert {"command", "git_commit", "plant_hash", "scenario_hash"} <= set(saved)
     policy = OnnxPolicy.load(folder / "agent.onnx")
@@ -153,6 +155,9 @@ def test_interrupting_before_learning_prints_one_line(
         (["--sceanrio", "hard"], "unrecognized arguments"),
         (["--scen", "hard"], "unrecognized arguments"),
         (["--scenario", "quiet"], "unknown scenario 'quiet'"),
+        (["--scenario", "hard=much"], "'hard=much' is no scenario with its share"),
+        (["--scenario", "hard=0.5,quiet=0.5"], "unknown scenario 'quiet'"),
+        (["--scenario", "none.py:quiet"], "none.py: no such file"),
         (["--resume"], "nothing to resume"),
     ],
 )
