@@ -65,24 +65,9 @@ def ring(run: Trace) -> Floats:
     return (run.signals.r_br - make_puller().ring_bias) / MM
 
 
-def _pull_change(model: str) -> Trace:
-    """The smooth pull change, beginning at ``BEFORE``."""
-    return ex.pull_change(model, before=ex.BEFORE, horizon=1200.0 + ex.BEFORE)
-
-
-def pull_profile() -> Figure:
-    """Pull speed of the open-loop experiment."""
-    figure, ((axis,),) = sheet(1, 1, (5.0, 2.4))
-    run = _pull_change("I")
-    axis.step(run.minutes[1:], values(run, "v_p")[1:], color=BLUE)
-    axis.set_ylim(1.05, 1.23)
-    label(axis, "time [min]", SHOWN["v_p"][1])
-    return figure
-
-
 def open_loop_response(model: str) -> Figure:
     """Radius and ring, cone angle, height, growth rate after the pull change; an inset shows the inverse response."""
-    run = _pull_change(model)
+    run = ex.pull_change(model, before=ex.BEFORE, horizon=1200.0 + ex.BEFORE)
     figure, ((radii, cone), (height, growth)) = sheet(2, 2, (7.2, 4.8), sharex=True)
     draw_signal(radii, run, "r_c", "", label="$r_c$")
     radii.plot(run.minutes, ring(run), color=ORANGE, label="$r_{br}$ - bias")
@@ -188,7 +173,6 @@ def ramp_response(model: str) -> Figure:
 
 
 FIGURES: dict[str, tuple[str, Callable[[], Figure]]] = {
-    "figure_01_pull_profile.png": ("Figure 1: pull speed.", pull_profile),
     "figure_02_open_loop_I.png": ("Figure 2: plant at constant power, Model I.", partial(open_loop_response, "I")),
     "figure_03_open_loop_II.png": ("Figure 3: plant at constant power, Model II.", partial(open_loop_response, "II")),
     "figure_09_bode.png": ("Figure 9: compensated loops.", frequency_responses),

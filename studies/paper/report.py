@@ -48,7 +48,7 @@ A dash means that the paper gives no number.
 The pull speed falls by 10 % within 600 s. The paper shows its profile without numbers, so the shapes can be compared
 and not the values.
 
-{_figures("figure_01", "figure_02", "figure_03")}
+{_figures("figure_02", "figure_03")}
 
 ## 4. PID
 

@@ -72,7 +72,6 @@ RATIOS = {
     "sb3_make_vec_env_vs_pendulum": Ratio("SB3 make_vec_env, cz_gym:Cz-v0", "SB3 make_vec_env, Pendulum-v1", 1.8),
     "sync_vector_env_vs_pendulum": Ratio("SyncVectorEnv, cz_gym:Cz-v0", "SyncVectorEnv, Pendulum-v1", 1.5),
     "vector1024_vs_envpool_pendulum_one_thread": Ratio(f"{OURS}, 1 thread", "EnvPool Pendulum-v1, 1 thread"),
-    "vector1024_vs_numpy": Ratio(f"{OURS}, 1 thread", "plain NumPy plant and ring"),
 }
 
 

@@ -16,8 +16,6 @@ from cz_gym.config import make_config
 from cz_gym.differentiable import DifferentiableBatch
 from cz_gym.engine.batch import Batch
 from cz_gym.env import CzEnv
-from cz_gym.physics.meniscus import HURLE
-from cz_gym.physics.plant import NO_DISTURBANCE, Inputs, State, make_puller, rk4
 from cz_gym.processors import processors
 from cz_gym.vector import CzVectorEnv
 
@@ -51,11 +49,7 @@ def cases(quick: bool) -> list[Case]:
     threads = sorted({1, THREADS})
     return [
         *(Case(f"{name} scalar", partial(gym.make, name)) for name in ("Cz-v0", "Pendulum-v1")),
-        *(
-            Case(f"Cz-v0 batch, {seen}, {_threads(n)}", partial(ours, SLOTS, n, seen))
-            for seen in ("measured", "history")
-            for n in threads
-        ),
+        *(Case(f"Cz-v0 batch, measured, {_threads(n)}", partial(ours, SLOTS, n)) for n in threads),
         *(
             Case(f"{name}, {_threads(n)}", partial(make, SLOTS, n))
             for n in threads
@@ -63,7 +57,6 @@ def cases(quick: bool) -> list[Case]:
         ),
         Case("step without derivatives", partial(differentiable, False)),
         Case("step with derivatives", partial(differentiable, True)),
-        Case("plain NumPy plant and ring", partial(plain_numpy, SLOTS)),
         *(Case(f"EnvPool Pendulum-v1, {_threads(n)}", partial(_envpool, SLOTS, n)) for n in threads),
         Case("pc-gym CSTR", _pcgym),
         Case("SB3 adapter over the batch", _sb3_adapter),
@@ -106,17 +99,12 @@ def batched(env: Any, num_envs: int) -> Stepper:
     return Stepper(num_envs, lambda: env.step(action), env.close)
 
 
-def ours(num_envs: int, threads: int = 1, observation: str = "measured") -> Stepper:
-    """The native batch, its slots at random places of their episodes, so that resets are spread out."""
-    env = CzVectorEnv(num_envs, observation=observation, threads=threads)
-    spread_out(env)
-    return batched(env, num_envs)
-
-
-def spread_out(env: CzVectorEnv) -> None:
-    """Reset a batch and move its slots to random steps of their episodes, as after hours of running."""
+def ours(num_envs: int, threads: int = 1) -> Stepper:
+    """The native batch, its slots at random steps of their episodes, so that resets are spread out."""
+    env = CzVectorEnv(num_envs, threads=threads)
     env.reset(seed=0)
-    env._batch.memory.slots["k"] = np.random.default_rng(0).integers(0, env.config.steps, env.num_envs)
+    env._batch.memory.slots["k"] = np.random.default_rng(0).integers(0, env.config.steps, num_envs)
+    return batched(env, num_envs)
 
 
 def without_resets(num_envs: int, threads: int) -> Stepper:
@@ -153,21 +141,6 @@ def differentiable(derivatives: bool) -> Stepper:
     inner, out, action = batch._batch, batch._batch.new_out(), np.zeros((256, 2))
     step = (lambda: batch.step(action)) if derivatives else (lambda: inner.step(action, out))
     return repeated(inner, Stepper(256, step, batch.close))
-
-
-def plain_numpy(num_envs: int) -> Stepper:
-    """The same equations uncompiled on arrays: plant and ring alone, nominal pullers."""
-    p = make_puller()
-    x = State(*(np.full(num_envs, value) for value in p.state_0))
-    u = Inputs(p.v_0, p.Q_H_0)
-
-    def step() -> None:
-        new = rk4(x, u, NO_DISTURBANCE, p, 5.0, HURLE.slope)
-        for old, value in zip(x, new, strict=True):
-            old[:] = value
-        HURLE.ring_offset(x.r_c, x.h_c, p)
-
-    return Stepper(num_envs, step)
 
 
 def _envpool(num_envs: int, threads: int) -> Stepper:

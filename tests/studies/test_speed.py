@@ -8,10 +8,8 @@ from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
-import numpy as np
 import pytest
 
-from cz_gym import CzEnv
 from studies.speed import __main__ as speed
 from studies.speed import cases
 from studies.speed.__main__ import RATIOS, Plan, Row, main, measure, ratio
@@ -20,9 +18,8 @@ from studies.speed.cases import Case, Stepper
 SMALL = [
     Case("Cz-v0 scalar", partial(gym.make, "Cz-v0")),
     Case("Pendulum-v1 scalar", partial(gym.make, "Pendulum-v1")),
-    Case("Cz-v0 batch, history, 2 threads", partial(cases.ours, 8, 2, "history")),
+    Case("Cz-v0 batch, measured, 2 threads", partial(cases.ours, 8, 2)),
     Case("bare compiled plant and ring, 1 thread", partial(cases.bare, 8, 1)),
-    Case("plain NumPy plant and ring", partial(cases.plain_numpy, 8)),
     Case("Cz-v0 batch, measured, 1 thread", partial(cases.ours, 8)),
 ]
 
@@ -89,14 +86,6 @@ def test_ratios_are_of_like_with_like() -> None:
         "vector1024_vs_envpool_pendulum_one_thread": 100.0 / 60.0,
         "sb3_adapter_vs_subproc": 5.0,
     }
-
-
-def test_the_plain_numpy_batch_runs_the_same_plant() -> None:
-    step = cases.plain_numpy(3).step
-    state = inspect.getclosurevars(step).nonlocals["x"]
-    for _ in range(10):
-        step()
-    np.testing.assert_allclose(state.r_c, CzEnv().config.parameters.r_0, rtol=1e-9)
 
 
 def test_cases_without_resets_have_none() -> None:
