@@ -25,6 +25,8 @@ SUB = 4
 """Rays along each side of a pixel with an edge."""
 TOLERANCE = 12.0
 """Difference between a pixel's corners that counts as an edge [grey values]."""
+REFLECTIONS = 2
+"""The first makes the ring's outer part and edge, the second the part nearer to the crystal."""
 _RADIUS_STEPS = 4
 """Steps of the fixed point that gives the crystal's radius for a reading of the ring."""
 _APART = 1e-4
@@ -82,9 +84,9 @@ def emitted(hit: Any, scene: Any, view: Any) -> Any:
 
 @jittable
 def radiance(ray: Any, scene: Any, view: Any) -> Any:
-    """Radiance that arrives along a ray from the lens, mirrored ``view.reflections`` times at most."""
+    """Radiance that arrives along a ray from the lens, mirrored by the melt REFLECTIONS times at most."""
     light, share, q = 0.0, 1.0, scene.q_c
-    for _ in range(int(view.reflections) + 1):
+    for _ in range(REFLECTIONS + 1):
         hit = first_hit(ray, q, scene, view)
         light += share * emitted(hit, scene, view)
         if hit.what != MELT:

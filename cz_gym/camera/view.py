@@ -18,7 +18,6 @@ IMAGE = (ROWS, COLUMNS, 1)
 """Shape of ``observation="camera"``, uint8."""
 SECOND_RADIATION = 1.438776877e-2
 """Second radiation constant h c / k_B [m K] (CODATA)."""
-MOST_REFLECTIONS = 8
 _ESTIMATE = "estimate"
 _SILICON = Parameters()
 _EMISSIVITIES = "order and range: Watanabe et al., High Temp. High Press. 31, 587 (1999)"
@@ -71,10 +70,6 @@ class Camera(NamedTuple):
     crystal_emissivity: Annotated[float, Quantity("1", "solid silicon, hot", f"{_ESTIMATE}; {_EMISSIVITIES}")] = 0.46
     white: Annotated[float, Quantity("1", "grey value 255, in black bodies as hot as the wall", _ESTIMATE)] = 1.0
     full_well: Annotated[float, Quantity("1", "electrons of a binned pixel at grey value 255", _ESTIMATE)] = 1e4
-    reflections: Annotated[
-        float,
-        Quantity("1", "times a ray is mirrored by melt, at most", "1: off the meniscus; 2: and off melt before it"),
-    ] = 2.0
 
 
 def camera_for(parameters: Parameters) -> Camera:
@@ -101,10 +96,6 @@ def check_camera(camera: Camera, parameters: Parameters) -> Camera:
     for name, value in camera._asdict().items():
         if name in _AT_MOST_ONE and value > 1:
             raise CzError(f"camera parameter {name} = {value!r} must not exceed 1")
-    if camera.reflections not in range(1, MOST_REFLECTIONS + 1):
-        raise CzError(
-            f"camera parameter reflections = {camera.reflections!r} must be a whole number, 1 to {MOST_REFLECTIONS}"
-        )
     if camera.tilt >= 0.5 * math.pi:
         raise CzError(f"camera parameter tilt = {camera.tilt!r} must be below pi / 2 [rad]: is it in degrees?")
     if not parameters.r_0 < camera.shield_radius < camera.crucible_radius:
@@ -153,7 +144,6 @@ class View(NamedTuple):
     """Grey values of a unit of radiance."""
     electrons: float
     """Electrons of a grey value [-]."""
-    reflections: int
 
 
 def make_view(camera: Camera) -> View:
@@ -179,7 +169,6 @@ def make_view(camera: Camera) -> View:
         wien=wien,
         gain=255.0 / c.white,
         electrons=c.full_well / 255.0,
-        reflections=int(c.reflections),
     )
 
 

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from cz_gym.evaluation.report.page import page
-from cz_gym.evaluation.report.page_crystal import PANELS
 from cz_gym.evaluation.results import Result
 from tests.samples import result_of
 
@@ -34,11 +33,6 @@ FLAGS = (
     "--disable-component-update",
 )  # fmt: skip
 PICTURES = ("pareto", "errors", "crystal")
-RANGES = (
-    "return Object.entries(document.getElementById('crystal')._fullLayout)"
-    ".filter(([key]) => /^xaxis\\d*$/.test(key)).map(([, axis]) => axis.range)"
-)
-"""Times that the panels show [min]."""
 
 
 @pytest.fixture(scope="module")
@@ -117,30 +111,6 @@ def test_the_first_line_is_the_verdict_and_names_are_text(browser: Any) -> None:
     assert browser.find_elements("css selector", "img, svg a") == []
     legend = browser.execute_script("return [...document.querySelectorAll('.legendtext')].map(t => t.textContent)")
     assert any(name.startswith("</script><img src=x") for name in legend)
-
-
-def test_a_click_unfolds_a_scenario_s_table(browser: Any) -> None:
-    _, other = browser.find_elements("css selector", "details")
-    table = other.find_element("css selector", "table")
-    assert not table.is_displayed()
-    other.find_element("css selector", "summary").click()
-    assert table.is_displayed()
-
-
-def test_zoom_is_linked(browser: Any) -> None:
-    """A drag in one panel zooms the time of all of them, a double click shows all of it again."""
-    assert browser.execute_script(RANGES) == [[0, 180]] * len(PANELS)
-    pane = browser.find_element("css selector", "#crystal .draglayer .xy .nsewdrag")
-    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", pane)
-    quarter = int(pane.rect["width"] / 4)
-    drag = ActionChains(browser).move_to_element_with_offset(pane, -quarter, 0)
-    drag.click_and_hold().move_by_offset(quarter, 0).release().perform()
-    until(browser, lambda: browser.execute_script(RANGES)[0] != [0, 180])
-    zoomed = browser.execute_script(RANGES)
-    assert zoomed == [zoomed[0]] * len(PANELS)
-    assert zoomed[0] == pytest.approx([45, 90], abs=1)
-    ActionChains(browser).double_click(pane).perform()
-    until(browser, lambda: browser.execute_script(RANGES) == [[0, 180]] * len(PANELS))
 
 
 def test_the_menus_choose_the_scenario(made: list[Result], browser: Any) -> None:

@@ -180,7 +180,6 @@ def test_every_parameter_of_the_camera_has_unit_meaning_and_source() -> None:
         ({"pixel_pitch": math.nan}, "pixel_pitch"),
         ({"melt_emissivity": 1.2}, "must not exceed 1"),
         ({"shield_radius": 0.05}, "opening"),
-        ({"reflections": 0.5}, "reflections"),
         ({"wall_temperature": "hot"}, "wall_temperature"),
     ],
 )

@@ -160,14 +160,6 @@ def test_the_rings_edge_halves_the_angle_between_camera_and_walls_end(tilt: floa
     assert math.acos(slope_at(hit.q)[1]) == pytest.approx(edge.slope, abs=1e-7)
 
 
-def test_one_reflection_already_makes_the_ring() -> None:
-    view = make_view(Camera(reflections=1.0))
-    scene = scene_at()
-    edge = wall_edge(scene, view)
-    row = float(project(edge.r, 0.0, edge.z, view).row)
-    assert radiance(sight(row - 0.5, 80.0, view), scene, view) == pytest.approx(view.melt + view.mirrored * view.wall)
-
-
 @numba.njit(error_model="numpy")
 def _compiled(row: float, column: float, scene: Scene, view: object) -> float:
     return radiance(sight(row, column, view), scene, view)

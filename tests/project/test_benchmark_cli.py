@@ -121,23 +121,15 @@ def test_an_agent_that_does_nothing_is_open_loop(data: dict[str, Any]) -> None:
     assert data["verdicts"]["reference-b"]["ppo"]["rival"] == "paper"
 
 
-def test_pairs_and_tails_follow_from_the_episodes(finished: Path, data: dict[str, Any]) -> None:
+def test_every_episode_is_in_the_table(finished: Path, data: dict[str, Any]) -> None:
     with (finished / "episodes.csv").open() as file:
         lines = list(csv.DictReader(file))
     assert {line["training_seed"] for line in lines if line["controller"] == "ppo"} == {"3", "8"}
-
-    def rmse(controller: str) -> np.ndarray:
-        chosen = [line for line in lines if (line["scenario"], line["controller"]) == ("randomized", controller)]
-        assert [line["seed"] for line in chosen[:3]] == [str(seed) for seed in TEST_SEEDS[:3]]
-        return np.array([float(line["rmse_mm"]) for line in chosen[:3]])
-
-    ours, theirs = rmse("open-loop"), rmse("paper")
-    paired = data["paired"]["randomized"]
-    assert list(paired) == ["open-loop", "ppo"]
-    assert set(paired["open-loop"]) == set(metric_names())
-    assert paired["open-loop"]["rmse_mm"]["mean"] == pytest.approx((ours - theirs).mean(), rel=1e-4)
-    assert paired["open-loop"]["rmse_mm"]["probability_of_improvement"]["mean"] == (ours < theirs).mean()
-    assert data["cvar5"]["randomized"]["paper"]["rmse_mm"]["mean"] == pytest.approx(theirs.max(), rel=1e-4)
+    chosen = [line for line in lines if (line["scenario"], line["controller"]) == ("randomized", "paper")]
+    assert [line["seed"] for line in chosen] == [str(seed) for seed in TEST_SEEDS[:3]]
+    mean = np.mean([float(line["rmse_mm"]) for line in chosen])
+    assert data["results"]["randomized"]["paper"]["rmse_mm"]["mean"] == pytest.approx(mean, rel=1e-4)
+    assert list(data["paired"]["randomized"]) == ["open-loop", "ppo"]
 
 
 def test_provenance_says_what_was_run(data: dict[str, Any]) -> None:
