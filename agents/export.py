@@ -32,6 +32,7 @@ class Deterministic(nn.Module):
 
     mean: torch.Tensor
     spread: torch.Tensor
+    padding: torch.Tensor | None
 
     def __init__(self, policy: BasePolicy, channels: int, normalisation: VecNormalize | None = None) -> None:
         super().__init__()
@@ -60,19 +61,20 @@ class Deterministic(nn.Module):
         x, policy = observation, self.policy
         if self.limit:
             x = torch.clamp((x - self.mean) / self.spread, -self.limit, self.limit)
-        x = x if self.padding is None else x @ self.padding
+        x = x if self.padding is None else torch.matmul(x, self.padding)
+        after: list[torch.Tensor] = []
         if isinstance(policy, RecurrentPolicy):
-            action, *state = policy(x, *state)
+            action, *after = policy(x, *state)
         elif isinstance(policy, ActorCriticPolicy):
             x = _features(policy.pi_features_extractor, x)
             if self.lstm is not None:
-                x, *state = lstm_step(x, *state, self.lstm)
+                x, *after = lstm_step(x, state[0], self.lstm)
             action = policy.action_net(policy.mlp_extractor.forward_actor(x))
         else:
             actor = policy.actor
             x = _features(actor.features_extractor, x)
             action = torch.tanh(actor.mu(actor.latent_pi(x))) if hasattr(actor, "latent_pi") else actor.mu(x)
-        return (action.clamp(-1.0, 1.0), *state)
+        return (action.clamp(-1.0, 1.0), *after)
 
 
 def _features(extractor: nn.Module, x: torch.Tensor) -> Any:
@@ -85,10 +87,10 @@ def lstm_step(x: torch.Tensor, state: torch.Tensor, lstm: nn.LSTM) -> tuple[torc
 
     In plain operations: agent files may not have ONNX's LSTM, whose output has a time axis.
     """
-    hidden, cell = state.split(lstm.hidden_size, dim=1)
+    hidden, cell = torch.split(state, lstm.hidden_size, dim=1)
     weight_x, weight_h, bias_x, bias_h = lstm.all_weights[0]
     gates = nn.functional.linear(x, weight_x, bias_x) + nn.functional.linear(hidden, weight_h, bias_h)
-    gain, forget, new, emit = gates.split(lstm.hidden_size, dim=1)
+    gain, forget, new, emit = torch.split(gates, lstm.hidden_size, dim=1)
     cell = torch.sigmoid(forget) * cell + torch.sigmoid(gain) * torch.tanh(new)
     hidden = torch.sigmoid(emit) * torch.tanh(cell)
     return hidden, torch.cat([hidden, cell], dim=1)
@@ -104,7 +106,7 @@ def to_onnx(policy: BasePolicy, channels: int, normalisation: VecNormalize | Non
     examples = [torch.zeros(2, channels), torch.zeros(2, module.memory)][: 2 if module.memory else 1]
     inputs, outputs = (list(names[: len(examples)]) for names in (INPUTS, OUTPUTS))
     rows = {name: {0: "n"} for name in (*inputs, *outputs)}
-    file = io.BytesIO()
+    file: Any = io.BytesIO()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that it is the older one, and of values it takes as constants

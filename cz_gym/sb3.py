@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 from cz_gym.errors import CzError
@@ -21,9 +22,12 @@ from cz_gym.observation import CLIP, OBSERVATIONS, STATE
 from cz_gym.vector import CzVectorEnv
 
 
-def make_vec_env(num_envs: int, **settings: Any) -> CzVecEnv:
-    """Many environments for stable-baselines3; ``settings`` are the keywords of ``gym.make("Cz-v0", ...)``."""
-    return CzVecEnv(CzVectorEnv(num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings))
+def make_vec_env(num_envs: int, stagger: int | None = None, **settings: Any) -> CzVecEnv:
+    """Many environments for stable-baselines3; ``settings`` are the keywords of ``gym.make("Cz-v0", ...)``.
+
+    ``stagger`` is :class:`CzVecEnv`'s.
+    """
+    return CzVecEnv(CzVectorEnv(num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings), stagger=stagger)
 
 
 class CzVecEnv(VecEnv):
@@ -128,8 +132,8 @@ class CzVecEnv(VecEnv):
         return [result] * len(list(self._get_indices(indices)))
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """No slot is wrapped."""
-        return [False] * len(list(self._get_indices(indices)))
+        """Whether the slots do what a wrapper does: each reports its episodes as ``Monitor`` does."""
+        return [wrapper_class is Monitor] * len(list(self._get_indices(indices)))
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """The native batch does not render."""

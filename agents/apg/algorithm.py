@@ -1,6 +1,6 @@
 """Analytic policy gradients (APG) with the interface of stable-baselines3's algorithms.
 
-The plant's step is differentiated exactly (:class:`.plant_step.PlantStep`), so that torch's autograd gives the gradient
+The plant's step is differentiated exactly (:func:`.plant_step.advance`), so that torch's autograd gives the gradient
 of the cost by the policy's weights: back-propagation through time over windows of an episode, in place of a gradient
 that is estimated from rewards. The method knows the plant's equations while it trains; the policy reads sensors alone.
 """
@@ -23,7 +23,7 @@ from cz_gym.differentiable import DifferentiableBatch
 from cz_gym.errors import CzError
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 
-from .plant_step import PlantStep, StepCost
+from .plant_step import StepCost, advance
 from .policy import RecurrentPolicy
 
 WARM_UP = 0.05
@@ -158,7 +158,7 @@ class APG(BaseAlgorithm):
                     seen.append(policy.remember(measured, memory)[0])
             action, memory = policy(measured, memory)
             before = state
-            state, measured, grows, target = PlantStep.apply(before, action, crystals.batch)
+            state, measured, grows, target = advance(before, action, crystals.batch)
             costs.append(cost_of(before, action, state, grows, target))
             self.num_timesteps += self.n_envs
             going = watch.on_step() and going
@@ -170,7 +170,7 @@ class APG(BaseAlgorithm):
     def _follow(self, loss: torch.Tensor) -> None:
         """Take a step along the gradient, unless it is not finite."""
         self.policy.optimizer.zero_grad()
-        loss.backward()
+        torch.autograd.backward(loss)
         norms = self.norms[self.norms > 0.0].numpy()
         limit = CLIP_AT * float(np.median(norms)) if norms.size else math.inf
         norm = float(torch.nn.utils.clip_grad_norm_(self.policy.parameters(), limit))

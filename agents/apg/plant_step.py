@@ -14,19 +14,18 @@ from cz_gym.task import drives_of
 R_C, V_P, Q_H = (STATES.index(name) for name in ("r_c", "v_p", "Q_H"))
 
 
-class PlantStep(torch.autograd.Function):
-    """The batch advances by a step: ``PlantStep.apply(state, action, batch)``.
+def advance(state: torch.Tensor, action: torch.Tensor, batch: DifferentiableBatch) -> Any:
+    """State (n, 9) and "measured" (n, 11) after an action (n, 2), whether each crystal grew, and its target.
 
-    ``state`` is the batch's present one; gradients go back through it to the step before.
+    ``state`` is the batch's present one; gradients go back through it to the step before. The target (n,) is the radius
+    at which sensors would show no error [m]: the reference less the bright ring's offset, which no sensor shows.
     """
+    return _PlantStep.apply(state, action, batch)  # type: ignore[no-untyped-call]
 
+
+class _PlantStep(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, state: torch.Tensor, action: torch.Tensor, batch: DifferentiableBatch) -> Any:
-        """State (n, 9) and "measured" (n, 11) after the action (n, 2); whether each crystal grew; and its target.
-
-        The target (n,) is the radius at which sensors would show no error [m]: the reference less the bright ring's
-        offset, which no sensor shows.
-        """
         step = batch.step(action.numpy())
         ctx.jacobian, ctx.measured_by_state = step.jacobian[:, : len(STATES)], batch.measured_by_state
         grows, target = torch.from_numpy(step.grows), torch.from_numpy(step.state[:, R_C] - step.error - step.offset)
@@ -35,7 +34,6 @@ class PlantStep(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: torch.Tensor) -> Any:
-        """Gradients with respect to state and action."""
         by_state, by_measured, *_ = gradients
         rows = by_state + by_measured.double() @ torch.from_numpy(ctx.measured_by_state)
         back = torch.einsum("ni,nij->nj", rows, torch.from_numpy(ctx.jacobian))

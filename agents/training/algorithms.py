@@ -43,6 +43,7 @@ def make_algorithm(recipe: Recipe, seed: int, done: int = 0) -> BaseAlgorithm:
     """The algorithm of a recipe for a training seed; a resumed one has taken ``done`` steps before."""
     torch.set_num_threads(1)  # small networks are quicker so
     torch.manual_seed(seed)
+    env: Any
     made: BaseAlgorithm
     match recipe:
         case APG():

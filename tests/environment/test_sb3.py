@@ -5,10 +5,12 @@ from typing import Any
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3 import PPO
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from cz_gym import CzEnv, CzVectorEnv
-from cz_gym.sb3 import CzVecEnv
+from cz_gym.sb3 import CzVecEnv, make_vec_env
 
 N = 3
 SETTINGS: dict[str, Any] = {"scenario": "hard", "observation": "history", "control_interval": 20.0, "horizon": 400.0}
@@ -52,6 +54,22 @@ def test_episodes_report_return_and_length() -> None:
         assert done[0] == (k == 19)
     assert infos[0]["episode"]["l"] == 20
     assert infos[0]["episode"]["r"] == pytest.approx(total, rel=1e-6)
+
+
+def test_evaluation_sees_the_environment_s_own_returns() -> None:
+    """Also where a wrapper changes the reward that the algorithm learns from."""
+    env = make_vec_env(2, scenario="nominal", **{name: SETTINGS[name] for name in ("control_interval", "horizon")})
+    scaled = VecNormalize(env, norm_reward=True, training=False)
+    model = PPO("MlpPolicy", scaled, n_steps=8, batch_size=16, device="cpu", seed=0)
+    scaled.ret_rms.var = np.array(1e4)
+    returns, lengths = evaluate_policy(model, scaled, 2, return_episode_rewards=True)
+    assert lengths == [20, 20]
+    scalar = CzEnv(scenario="nominal", control_interval=20.0, horizon=400.0)
+    observation, total = scalar.reset(seed=0)[0], 0.0
+    for _ in range(20):
+        observation, reward, *_ = scalar.step(model.predict(scaled.normalize_obs(observation), deterministic=True)[0])
+        total += reward
+    assert returns == pytest.approx([total, total], rel=1e-4)
 
 
 def test_a_privileged_critic_sees_the_state_after_the_history() -> None:

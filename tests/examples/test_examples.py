@@ -15,7 +15,7 @@ pytest.importorskip("stable_baselines3")
 from cz_gym import CzEnv, agents, datasets
 from cz_gym.config import make_config
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
-from examples import cleanrl_ppo, sb3_ppo
+from examples import cleanrl_ppo, gradient, sb3_ppo
 
 
 def test_the_stable_baselines_example_writes_an_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -27,7 +27,15 @@ def test_the_stable_baselines_example_writes_an_agent(tmp_path: Path, monkeypatc
     assert len(Path(sb3_ppo.__file__).read_text().splitlines()) <= 54
 
 
-@pytest.mark.parametrize("name", ["sb3_ppo", "cleanrl_ppo", "offline_td3_bc", "rllib_ppo", "torchrl"])
+def test_the_gradient_example_writes_an_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cz_gym.agents.from_sb3.JUDGING", sb3_ppo.VALIDATION_SEEDS[:2])
+    contract = gradient.main(steps=1440, num_envs=8, out=tmp_path / "some.onnx")
+    assert (contract.action, contract.observation, contract.training_steps) == ("rate", "measured", 1440)
+    assert "0.175 hot-zone" in contract.scenario
+    assert agents.load(tmp_path / "some.onnx").contract == contract
+
+
+@pytest.mark.parametrize("name", ["gradient", "sb3_ppo", "cleanrl_ppo", "offline_td3_bc", "rllib_ppo", "torchrl"])
 def test_an_example_without_its_packages_says_in_one_line_what_to_install(name: str) -> None:
     command = [sys.executable, "-S", "-m", f"examples.{name}"]  # -S: nothing but Python's own modules
     done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True)

@@ -12,7 +12,7 @@ pytest.importorskip("stable_baselines3")
 from stable_baselines3.common.env_util import make_vec_env as scalar_environments
 
 from cz_gym.agents.apg import APG, RecurrentPolicy
-from cz_gym.agents.apg.plant_step import PlantStep, StepCost
+from cz_gym.agents.apg.plant_step import StepCost, advance
 from cz_gym.config import make_config
 from cz_gym.cost import SCALES, WEIGHTS, Weights, saturated
 from cz_gym.differentiable import STATES, DifferentiableBatch
@@ -51,7 +51,7 @@ def driven(policy: RecurrentPolicy, batch: DifferentiableBatch, steps: int, weig
     for _ in range(steps):
         action, memory = policy(measured, memory)
         before = state
-        state, measured, grows, target = PlantStep.apply(before, action, batch)
+        state, measured, grows, target = advance(before, action, batch)
         costs.append(cost_of(before, action, state, grows, target))
     return torch.stack(costs).mean()
 
@@ -85,7 +85,7 @@ def stepped(scenario: str, action: str, actions: Any) -> tuple[Any, Any, Any, An
         for _ in range(30):
             each.step(np.full((4, 2), 0.02))
     before = torch.from_numpy(twin._state)
-    after = PlantStep.apply(before, torch.from_numpy(np.float32(actions)), twin)
+    after = advance(before, torch.from_numpy(np.float32(actions)), twin)
     return before, after, torch.from_numpy(np.float32(actions)), batch.step(actions), StepCost(config, WEIGHTS)
 
 
@@ -118,7 +118,7 @@ def test_a_lost_crystal_costs_nothing_and_has_no_gradient() -> None:
     state, _ = map(torch.from_numpy, batch.reset(range(2)))
     batch._batch.memory.slots["x"]["r_c"][1] += 9e-3
     action = torch.zeros(2, 2, requires_grad=True)
-    after, _, grows, target = PlantStep.apply(state, action, batch)
+    after, _, grows, target = advance(state, action, batch)
     cost = StepCost(CONFIG, WEIGHTS)(state, action, after, grows, target)
     cost.sum().backward()
     assert grows.tolist() == [True, False]
