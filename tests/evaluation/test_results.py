@@ -14,6 +14,7 @@ import pytest
 import benchmark
 from cz_gym.atomic_files import write_files
 from cz_gym.baselines import CompensatedPID
+from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config
 from cz_gym.evaluation.cache import earlier_bound
 from cz_gym.evaluation.files import to_csv
@@ -126,7 +127,7 @@ def test_a_bound_is_used_only_beside_the_same_figures_of_the_same_controller(ear
     assert earlier_bound(earlier, row, [replace(paper, contender=contender("other"))]) is None
     assert earlier_bound(earlier, find_row("hard"), [paper]) is None
     other = make_config("randomized", parameters=make_config().parameters._replace(k_l=62.1))
-    moved = sample_of(paper.contender, [rollout(CompensatedPID(), other, paper.seeds)])
+    moved = sample_of(paper.contender, [rollout(find_controller("paper").make(other), other, paper.seeds)])
     assert earlier_bound(earlier, row, [moved]) is None
 
 
