@@ -215,7 +215,7 @@ class CzEnv(Form, gym.Env[Observation, Action]):
             self.set_state(given["state"])
         else:
             self._batch.reset([0], [new_key(self.np_random)], self._out, given.get("scenario"))
-            self._named |= isinstance(given.get("scenario"), Mixture)
+            self._named = self._named or isinstance(given.get("scenario"), Mixture)
             self._restart_view()
         self._over, self._begun = bool(self._slots["over"][0]), True
         return self._shown.copy(), self._info()

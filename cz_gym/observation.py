@@ -31,8 +31,9 @@ INTEGRAL_SCALE = 1.0
 """Scale of the error's integral, one metre second: 1 mm held for 1000 s [m s]."""
 DRIVE_CHANNELS = tuple(Measured._fields.index(name) for name in ("v_p", "Q_H"))
 """Where "measured" and "history" hold the applied drives, in units of the action."""
-_PAST_SCALES = {"ring_error": 0.2 * MM, "v_p": 0.2 * PULL_SCALE, "T_1": 0.5, "Q_H": 0.5 * KILO}
-LAGGED = tuple(_PAST_SCALES)
+PAST_SCALES = {"ring_error": 0.2 * MM, "v_p": 0.2 * PULL_SCALE, "T_1": 0.5, "Q_H": 0.5 * KILO}
+"""Scales of the differences of past means in "history", of each signal whose past it shows [unit of the signal]."""
+LAGGED = tuple(PAST_SCALES)
 """Signals whose past "history" shows."""
 LAGS = (5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0, 240.0, 360.0, 480.0, 720.0, 960.0, 1200.0)
 """Ages [s] that "history" reaches back to, in spans: each span holds the samples since the age before."""
@@ -49,18 +50,19 @@ class Relative(NamedTuple):
     """What the difference is, for people."""
 
 
-_RELATIVE = {
+RELATIVE = {
     "r_ref_1min": Relative("r_ref", 0.1 * MM, "change of the radius reference within 1 minute"),
     "r_ref_5min": Relative("r_ref", 0.5 * MM, "change of the radius reference within 5 minutes"),
     "T_1_ref_1min": Relative("T_1_ref", 0.2, "change of the recipe within 1 minute"),
     "T_1_ref_5min": Relative("T_1_ref", 1.0, "change of the recipe within 5 minutes"),
     "T_1": Relative("T_1_ref", 2.0, "pyrometer reading minus recipe"),
 }
+"""The signals that "history" shows relative to another one."""
 
 
 def _history() -> tuple[Channel, ...]:
     present = [
-        c._replace(scale=_RELATIVE[c.name].scale, meaning=_RELATIVE[c.name].meaning) if c.name in _RELATIVE else c
+        c._replace(scale=RELATIVE[c.name].scale, meaning=RELATIVE[c.name].meaning) if c.name in RELATIVE else c
         for c in MEASURED
     ]
     integral = Channel("integral", "m s", INTEGRAL_SCALE, "integral of ring_error since the start, held within +-10")
@@ -69,7 +71,7 @@ def _history() -> tuple[Channel, ...]:
         Channel(
             f"{name}_{age:g}s",
             signals(Measured)[name].unit,
-            _PAST_SCALES[name],
+            PAST_SCALES[name],
             f"{name}: mean over the span up to {age:g} s ago, minus {subtracted}",
         )
         for age, subtracted in zip(LAGS, later, strict=False)
@@ -102,7 +104,7 @@ def decode(observation: npt.ArrayLike, v_0: float = PULL_SCALE) -> Measured:
     if array.shape[-1] == len(MEASURED):
         return values
     return values._replace(
-        **{name: getattr(values, name) + getattr(values, relative.to) for name, relative in _RELATIVE.items()}
+        **{name: getattr(values, name) + getattr(values, relative.to) for name, relative in RELATIVE.items()}
     )
 
 
@@ -112,29 +114,11 @@ def to_measured(history: npt.ArrayLike, v_0: float = PULL_SCALE) -> npt.NDArray[
     return np.clip(measured, -CLIP, CLIP).astype(np.float32)
 
 
-class RelativeChannels(NamedTuple):
-    """The channels that "history" holds relative to another one; arrays of shape (channels,)."""
-
-    place: npt.NDArray[np.int64]
-    """Where each stands."""
-    to: npt.NDArray[np.int64]
-    """Where the other one stands."""
-    change: npt.NDArray[np.float64]
-    """Its scale in "measured" over its scale in "history" [-]."""
-
-
-def relative_channels() -> RelativeChannels:
-    """The relative channels of :data:`HISTORY`."""
-    place, table = Measured._fields.index, signals(Measured)
-    rows = [(place(name), place(r.to), table[name].scale / r.scale) for name, r in _RELATIVE.items()]
-    return RelativeChannels(*map(np.array, zip(*rows, strict=True)))
-
-
 def undo_differences() -> npt.NDArray[np.float64]:
     """The 0/1 matrix that turns a "history" row vector in SI units into readings and means of spans."""
     place = {channel.name: at for at, channel in enumerate(HISTORY)}
     undo = np.eye(len(HISTORY))
-    for name, relative in _RELATIVE.items():
+    for name, relative in RELATIVE.items():
         undo[place[relative.to], place[name]] = 1.0
     for name in LAGGED:
         so_far = undo[:, place[name]].copy()
@@ -144,22 +128,11 @@ def undo_differences() -> npt.NDArray[np.float64]:
     return undo
 
 
-def past_scale_changes() -> npt.NDArray[np.float64]:
-    """Scale of each remembered signal over the scale of its past differences [-], shape (LAGGED,)."""
-    return np.array([signals(Measured)[name].scale / _PAST_SCALES[name] for name in LAGGED])
+def lags(control_interval: float) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Ages, in samples, of the newest and the oldest sample of each span, at that control interval [s].
 
-
-class Lags(NamedTuple):
-    """The ages of "history" in samples."""
-
-    newest: npt.NDArray[np.int64]
-    """Age of the newest sample of each mean."""
-    oldest: npt.NDArray[np.int64]
-    """Age of the oldest sample of each mean."""
-
-
-def lags(control_interval: float) -> Lags:
-    """Sample ages for that control interval [s]; each mean holds at least one sample."""
+    Each span holds at least one sample.
+    """
     oldest = np.maximum(np.rint(np.array(LAGS) / control_interval).astype(np.int64), 1)
     before = np.concatenate([[0], oldest[:-1]])
-    return Lags(np.minimum(before + 1, oldest), oldest)
+    return np.minimum(before + 1, oldest), oldest

@@ -128,7 +128,7 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
             self._restore(given["state"], which)
         else:
             self._batch.reset(which, (new_key(self._random(i)) for i in which), self._out, given.get("scenario"))
-            self._named |= isinstance(given.get("scenario"), Mixture)
+            self._named = self._named or isinstance(given.get("scenario"), Mixture)
         self._begin()
         return self._observations(), self._infos(self._out, mask)
 

@@ -26,7 +26,7 @@ from cz_gym.episodes.record import GRID, Lots, lots_of
 from cz_gym.episodes.scenario import MAX_LATENCY
 from cz_gym.errors import CzError
 from cz_gym.jit.compile import entry
-from cz_gym.observation import HISTORY, LAGGED, lags, past_scale_changes, relative_channels
+from cz_gym.observation import HISTORY, LAGGED, lags
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.physics.plant import NO_OPERATING_POINT
@@ -95,19 +95,17 @@ class Batch:
         self.channels = len(HISTORY) if config.observation == "history" else len(MEASURED)
         self.state_channels = len(STATE) if config.observation in ("history", "state") else 0
         self._camera = config.observation == "camera"
-        ages = lags(config.control_interval)
+        newest, oldest = lags(config.control_interval)
         v_0 = config.parameters.v_0
         self.scales = ObservationScales(
             1.0 / scales(MEASURED, v_0),
             1.0 / scales(STATE, v_0),
-            ages.newest,
-            ages.oldest + 1,
-            1.0 / (ages.oldest - ages.newest + 1),
-            past_scale_changes(),
-            relative_channels(),
+            newest,
+            oldest + 1,
+            1.0 / (oldest - newest + 1),
             everything,
         )
-        depth = int(ages.oldest[-1]) + 2 if config.observation == "history" else 0
+        depth = int(oldest[-1]) + 2 if config.observation == "history" else 0
         frames = (
             math.ceil(MAX_LATENCY / config.control_interval)
             + math.ceil((MAX_LATENCY + config.control_interval) / GRID)
@@ -122,7 +120,7 @@ class Batch:
         )
         self.memory.slots["over"] = 1
         self._lots = lots_of(config.scenario, config.model)
-        self.scenarios = np.full(num_envs, "", object)
+        self.scenarios, self._drawn = np.full(num_envs, "", object), slots["scenario"]
         self._parameters = Parameters(*map(float, config.parameters))
         self.actions = np.zeros((num_envs, 2))
         self._all = np.ones(num_envs, np.bool_)
@@ -195,9 +193,9 @@ class Batch:
         arguments = self._drawing(slots, words, lots, out)
         if max(self._run(self._draw, arguments, len(slots), DRAWS_PER_THREAD, DRAWS_AT_ONCE)) >= 0:
             raise CzError(NO_OPERATING_POINT)
-        members, drawn = (given or self.config.scenario).scenarios, self.memory.slots["scenario"]
+        members = (given or self.config.scenario).scenarios
         for i in which:
-            self.scenarios[i] = members[drawn.item(i)].name
+            self.scenarios[i] = members[self._drawn.item(i)].name
         if self._camera:
             self._photograph(out, np.isin(np.arange(self.num_envs), slots))
 

@@ -117,10 +117,6 @@ class ObservationScales(NamedTuple):
     """Age of the sample before the oldest one of each span, shape (lags,)."""
     share: Any
     """One over the number of samples in each span, shape (lags,)."""
-    past: Any
-    """Scale of each remembered signal over that of its past differences, shape (remembered signals,)."""
-    relative: Any
-    """The signals that "history" holds relative to another one (:class:`cz_gym.observation.RelativeChannels`)."""
     everything: bool
     """Whether all of ``info`` is written; otherwise only ``LEAN`` and ``action_clipped``."""
 

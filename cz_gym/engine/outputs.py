@@ -5,11 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 from cz_gym.jit.compile import jittable, scratch
-from cz_gym.observation import CLIP, INTEGRAL_SCALE, LAGGED
+from cz_gym.observation import CLIP, INTEGRAL_SCALE, LAGGED, PAST_SCALES, RELATIVE
 from cz_gym.signals import MEASURED, Measured
 
 _M, _L = len(MEASURED), len(LAGGED)
 _REMEMBERED = tuple(Measured._fields.index(name) for name in LAGGED)
+_PAST_CHANGE = tuple(MEASURED[at].scale / PAST_SCALES[name] for at, name in zip(_REMEMBERED, LAGGED, strict=True))
+"""Scale of each remembered signal over that of its past differences."""
+_PLACE = tuple(Measured._fields.index(name) for name in RELATIVE)
+_TO = tuple(Measured._fields.index(relative.to) for relative in RELATIVE.values())
+_CHANGE = tuple(MEASURED[at].scale / relative.scale for at, relative in zip(_PLACE, RELATIVE.values(), strict=True))
+"""Signals shown relative to another one: where they stand, where the other one does, and how their scale changes."""
 _RING = _REMEMBERED[0]
 _RING_SCALE = MEASURED[_RING].scale
 
@@ -60,12 +66,11 @@ def recall(slot: Any, measured: Any, history: Any, scales: Any, out: Any) -> Non
         newest, before = newest if newest >= 0 else newest + depth, before if before >= 0 else before + depth
         for channel in range(_L):
             mean = (history[newest, channel] - history[before, channel]) * scales.share[lag]
-            out[_M + 1 + lag * _L + channel] = clip((mean - later[0, channel]) * scales.past[channel], CLIP)
+            out[_M + 1 + lag * _L + channel] = clip((mean - later[0, channel]) * _PAST_CHANGE[channel], CLIP)
             later[0, channel] = mean
-    place, to, change = scales.relative
-    for row in range(place.size):
-        difference = measured[place[row]] - measured[to[row]]
-        out[place[row]] = clip(difference * (scales.measured[place[row]] * change[row]), CLIP)
+    for row in range(len(_PLACE)):
+        difference = measured[_PLACE[row]] - measured[_TO[row]]
+        out[_PLACE[row]] = clip(difference * (scales.measured[_PLACE[row]] * _CHANGE[row]), CLIP)
 
 
 @jittable

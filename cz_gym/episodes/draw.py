@@ -49,7 +49,7 @@ def _factor(spread: Any, u: Any) -> Any:
 @jittable
 def _log_factor(limits: Any, u: Any) -> Any:
     """The number at share u of a range on a logarithmic scale."""
-    return np.exp(np.log(limits[0]) + np.log(limits[1] / limits[0]) * u)
+    return limits[0] * np.exp(np.log(limits[1] / limits[0]) * u) if limits[0] < limits[1] else limits[0]
 
 
 @jittable
