@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -15,7 +15,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from cz_gym import CzVectorEnv
 from cz_gym.agents import apg
-from cz_gym.cost import WEIGHTS
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from cz_gym.sb3 import CzVecEnv
 
@@ -68,11 +67,8 @@ def make_algorithm(recipe: Recipe, seed: int, done: int = 0) -> BaseAlgorithm:
 
 def _rewarded(recipe: Reinforcement, stagger: int) -> Any:
     """The training crystals with the recipe's reward."""
-    config = replace(recipe.config, horizon=recipe.episode_length)
-    info = "lean" if recipe.weights == WEIGHTS and not recipe.observable else "all"
-    batch = CzVectorEnv.from_config(config, recipe.num_envs, AutoresetMode.SAME_STEP, info=info)
-    slots = CzVecEnv(batch, recipe.privileged_critic, stagger)
-    return TrainingReward(slots, recipe.gamma, recipe.weights, recipe.observable, recipe.failure_costs)
+    batch = CzVectorEnv.from_config(recipe.config, recipe.num_envs, AutoresetMode.SAME_STEP)
+    return TrainingReward(CzVecEnv(batch, recipe.privileged_critic, stagger), recipe.gamma, recipe.failure_costs)
 
 
 def _made(algorithm: Any, policy: Any, env: Any, recipe: Recipe, seed: int, policy_kwargs: dict[str, Any]) -> Any:
@@ -81,8 +77,7 @@ def _made(algorithm: Any, policy: Any, env: Any, recipe: Recipe, seed: int, poli
     settings = {name: getattr(recipe, name) for name in asdict(recipe) if name in known}
     if isinstance(recipe, Reinforcement):
         settings["learning_rate"] = partial(linear, recipe.learning_rate, recipe.learning_rate / 20.0)
-        network = {"features_extractor_class": Normalise, "features_extractor_kwargs": {"memory": recipe.memory}}
-        policy_kwargs = {**network, **policy_kwargs}
+        policy_kwargs = {"features_extractor_class": Normalise, **policy_kwargs}
     return algorithm(policy, env, policy_kwargs=policy_kwargs, seed=seed, device="cpu", **settings)
 
 

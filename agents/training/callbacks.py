@@ -8,8 +8,6 @@ import numpy as np
 import numpy.typing as npt
 from stable_baselines3.common.callbacks import BaseCallback
 
-from cz_gym.observation import HISTORY, PULL_SCALE, scales, undo_differences
-
 from .networks import Normalise
 
 STD_FLOOR = 0.02
@@ -25,10 +23,9 @@ class Statistics(BaseCallback):
     a resumed learner has statistics already.
     """
 
-    def __init__(self, until: int, basis: str = "differences", known: bool = False) -> None:
+    def __init__(self, until: int, known: bool = False) -> None:
         super().__init__()
         self.until = until
-        self.basis = basis
         self.rounds = 10 if known else 0
 
     def _on_training_start(self) -> None:
@@ -55,14 +52,10 @@ class Statistics(BaseCallback):
 
     def _update(self, observations: npt.NDArray[np.float32]) -> None:
         seen = observations.reshape(-1, observations.shape[-1])
-        basis = np.eye(seen.shape[1])
-        if self.basis == "means":
-            scale = scales(HISTORY, PULL_SCALE)
-            basis[: len(scale), : len(scale)] = scale[:, None] * undo_differences() / scale
         self.rounds += 1
         share = max(1.0 / self.rounds, 0.1)
         for module in self._normalisations():
-            mean, var = module.mean.numpy(), module.scaling.diagonal().numpy() ** -2.0
+            mean, var = module.mean.numpy(), module.std.numpy() ** 2
             mean = mean + share * (seen.mean(axis=0) - mean)
-            var = var + share * ((seen @ basis).var(axis=0) - var)
-            module.set(mean, basis / np.maximum(np.sqrt(var), STD_FLOOR))
+            var = var + share * (seen.var(axis=0) - var)
+            module.set(mean, np.maximum(np.sqrt(var), STD_FLOOR))

@@ -75,18 +75,12 @@ class Reinforcement(Recipe):
 
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers, of actor and critic alike."""
-    basis: str = "differences"
-    """How networks see the past: as "differences" between the means of successive spans, or as these "means"."""
-    memory: float = 1200.0
-    """Age of the oldest past sample that networks see [s]; 0: only the integral."""
     gamma: float = 0.99
     batch_size: int
     noise: float
     """Standard deviation of the initial exploration [-]."""
     privileged_critic: bool = False
     """Whether the critic also sees the true state."""
-    episode_length: float = 10800.0
-    """Length of the training episodes [s]; validation episodes have their full length."""
     failure_costs: bool = True
     """Whether a lost crystal costs what is left of it; without, rewards are positive and end there."""
 

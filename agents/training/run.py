@@ -97,7 +97,7 @@ class Run:
         with deferred_interrupt() as interrupted:
             callbacks: list[BaseCallback] = []
             if isinstance(self.recipe, Reinforcement):
-                callbacks.append(Statistics(self.recipe.steps // 4, self.recipe.basis, known=self.steps > 0))
+                callbacks.append(Statistics(self.recipe.steps // 4, known=self.steps > 0))
             callbacks.append(_Watch(self, bar, interrupted))
             if self.steps < self.recipe.steps:
                 self.algorithm.learn(self.recipe.steps - self.steps, callbacks, reset_num_timesteps=False)

@@ -7,28 +7,18 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvWrapper
 
-from cz_gym.cost import FAILURE_COST, WEIGHTS, Cost, Weights, cost_terms, reward
-from cz_gym.sb3 import CzVecEnv
+from cz_gym.cost import FAILURE_COST
 
 
 class TrainingReward(VecEnvWrapper):
     """Reward for a discounting learner: scaled by 1 - gamma; a failure costs the worst step for the discounted rest.
 
-    The environment's own failure penalty, -10 a lost step, is the same thing undiscounted. ``weights`` and
-    ``observable`` are a recipe's; the last step of an episode keeps the environment's own weights. Without
-    ``failure_costs`` every reward is raised to be positive, and a failure only ends the rewards.
+    The environment's own failure penalty, -10 a lost step, is the same thing undiscounted. Without ``failure_costs``
+    every reward is raised to be positive, and a failure only ends the rewards.
     """
 
-    def __init__(
-        self,
-        slots: CzVecEnv,
-        gamma: float,
-        weights: Weights = WEIGHTS,
-        observable: bool = False,
-        failure_costs: bool = True,
-    ) -> None:
-        super().__init__(slots)
-        self.slots, self.weights, self.observable = slots, weights, observable
+    def __init__(self, venv: VecEnv, gamma: float, failure_costs: bool = True) -> None:
+        super().__init__(venv)
         self.scale = 1.0 - gamma
         self.floor = -FAILURE_COST / self.scale if failure_costs else -FAILURE_COST
         self.raised = 0.0 if failure_costs else FAILURE_COST
@@ -38,20 +28,10 @@ class TrainingReward(VecEnvWrapper):
         return self.venv.reset()
 
     def step_wait(self) -> Any:
-        """Advance every slot; weigh and scale the reward."""
+        """Advance every slot; scale the reward."""
         observation, given, done, infos = self.venv.step_wait()
-        if self.weights != WEIGHTS or self.observable:
-            given = np.where(done, given, self.reward(self.slots.info))
         earned = (np.maximum(given, self.floor) + self.raised) * self.scale
         return observation, earned.astype(np.float32), done, infos
-
-    def reward(self, info: dict[str, Any]) -> Any:
-        """The reward with the wrapper's own weights, from the info of a step."""
-        terms = {name: info[f"cost_{name}"] for name in Cost._fields}
-        if self.observable:
-            terms["radius"] = cost_terms(info["r_c"] - info["r_ref"] + info["ring_offset"], 0.0, 0.0, 0.0).radius
-        factors = {name: getattr(self.weights, name) / getattr(WEIGHTS, name) for name in Cost._fields}
-        return reward(Cost(*(factors[name] * terms[name] for name in Cost._fields)))
 
 
 class ActionRepeat(VecEnvWrapper):

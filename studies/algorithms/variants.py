@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 from cz_gym.agents.training.recipes import RECIPES, Recipe
 from cz_gym.errors import CzError
 from cz_gym.names import unknown
-from cz_gym.units import MINUTE
 
 
 @dataclass(frozen=True)
@@ -69,9 +68,6 @@ ABLATION = (
     Variant(PPO, "from nothing, by reward; smooth actions, differences of the past, a critic that sees the true state"),
     _ppo("rate", "an action moves the drives from where they are: no return to nominal", action="rate"),
     _ppo("direct", "an action sets the drives, within their whole range", action="direct"),
-    _ppo("means", "means of past spans as they are, not their differences", basis="means"),
-    _ppo("memory-none", "no past samples: what is measured now, and the integral", memory=0.0),
-    _ppo("memory-4min", "past samples up to 4 min old, not 20", memory=4.0 * MINUTE),
     _ppo("alive-bonus", "every step earns, and a lost crystal costs nothing but the steps left", failure_costs=False),
     _ppo("gamma-0.95", "a horizon of 20 steps, not of 100", gamma=0.95),
     _ppo("gamma-0.998", "a horizon of 500 steps", gamma=0.998),
@@ -81,7 +77,6 @@ ABLATION = (
     _ppo("much-noise", "exploration begins with twice the spread", noise=1.0),
     _ppo("blind-critic", "the critic sees what the actor sees", privileged_critic=False),
     _ppo("interval-10s", "a control interval of 10 s, not of 5", control_interval=10.0),
-    _ppo("half-crystals", "crystals of 1.5 h while it learns, not of 3 h", episode_length=5400.0),
     _ppo("linear", "no hidden layers", hidden=()),
 )
 COMPARISONS = {
