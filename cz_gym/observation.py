@@ -114,20 +114,6 @@ def to_measured(history: npt.ArrayLike, v_0: float = PULL_SCALE) -> npt.NDArray[
     return np.clip(measured, -CLIP, CLIP).astype(np.float32)
 
 
-def undo_differences() -> npt.NDArray[np.float64]:
-    """The 0/1 matrix that turns a "history" row vector in SI units into readings and means of spans."""
-    place = {channel.name: at for at, channel in enumerate(HISTORY)}
-    undo = np.eye(len(HISTORY))
-    for name, relative in RELATIVE.items():
-        undo[place[relative.to], place[name]] = 1.0
-    for name in LAGGED:
-        so_far = undo[:, place[name]].copy()
-        for age in LAGS:
-            so_far[place[f"{name}_{age:g}s"]] = 1.0
-            undo[:, place[f"{name}_{age:g}s"]] = so_far
-    return undo
-
-
 def lags(control_interval: float) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Ages, in samples, of the newest and the oldest sample of each span, at that control interval [s].
 
