@@ -34,16 +34,17 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecNormalize
 
 ALGORITHMS = {
-    "a2c": "stable_baselines3.A2C",
-    "ddpg": "stable_baselines3.DDPG",
-    "ppo": "stable_baselines3.PPO",
-    "ppo_lstm": "sb3_contrib.RecurrentPPO",
-    "sac": "stable_baselines3.SAC",
-    "td3": "stable_baselines3.TD3",
-    "tqc": "sb3_contrib.TQC",
-    "trpo": "sb3_contrib.TRPO",
+    "a2c": "stable_baselines3:A2C",
+    "apg": "cz_gym.agents.apg:APG",
+    "ddpg": "stable_baselines3:DDPG",
+    "ppo": "stable_baselines3:PPO",
+    "ppo_lstm": "sb3_contrib:RecurrentPPO",
+    "sac": "stable_baselines3:SAC",
+    "td3": "stable_baselines3:TD3",
+    "tqc": "sb3_contrib:TQC",
+    "trpo": "sb3_contrib:TRPO",
 }
-"""Algorithms by RL-Zoo's names."""
+"""Algorithms by RL-Zoo's names, and this package's own."""
 VALID = "valid"
 """Name of the camera's flag among the channels."""
 GIVE_IT = "give the VecNormalize it was trained in (save_agent's normalisation, --vecnormalize of the command)"
@@ -234,7 +235,7 @@ def _convert(given: argparse.Namespace) -> None:
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
     try:
-        algorithm: Any = pkgutil.resolve_name(ALGORITHMS[given.algo].replace(".", ":"))
+        algorithm: Any = pkgutil.resolve_name(ALGORITHMS[given.algo])
     except ModuleNotFoundError as error:
         if error.name != "sb3_contrib":
             raise

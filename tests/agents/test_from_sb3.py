@@ -22,8 +22,9 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecMonitor, VecNormalize
 
-from cz_gym import CzEnv
+from cz_gym import CzEnv, sb3
 from cz_gym.agents import AgentFileError, OnnxPolicy, from_sb3
+from cz_gym.agents.apg import APG
 from cz_gym.config import make_config
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from tests.processes import ROOT
@@ -97,6 +98,16 @@ def test_the_command_reads_what_stable_baselines3_and_rl_zoo_save(
     assert (agent.contract.algorithm, agent.contract.training_seed, agent.contract.scenario) == ("zoo", 7, "hard")
     assert (agent.contract.action, agent.contract.control_interval) == ("smooth", 10.0)
     assert from_sb3.disagreement(agent, model, model.get_vec_normalize_env()) < 1e-4
+
+
+def test_the_command_reads_analytic_policy_gradients_of_a_mixture(tmp_path: Path) -> None:
+    model = APG("RecurrentPolicy", sb3.make_vec_env(2, action="rate"), window=4, seed=3).learn(16)
+    model.save(tmp_path / "model.zip")
+    command = f"{tmp_path / 'model.zip'} --algo apg --out {tmp_path / 'own.onnx'} --observation measured --action rate"
+    assert from_sb3.main([*command.split(), "--scenario", "randomized=0.5,hard=0.5"]) == 0
+    agent = OnnxPolicy.load(tmp_path / "own.onnx")
+    assert (agent.contract.scenario, agent.contract.training_seed) == ("0.5 hard + 0.5 randomized", 3)
+    assert from_sb3.disagreement(agent, model, None) < 1e-6
 
 
 @pytest.mark.parametrize("kind", ["ppo", "sac"])
