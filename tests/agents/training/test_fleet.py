@@ -61,7 +61,7 @@ def sessions(folder: Path) -> list[int]:
 
 
 def jobs(folder: Path, seeds: range, recipe: Recipe = SMALL_PPO) -> list[fleet.Job]:
-    options = REFERENCES, 0.0, False, ["train.py", "--seeds"]
+    options = REFERENCES, 60.0, False, ["train.py", "--seeds"]
     return [fleet.Job(folder / f"seed{seed}", recipe, seed, *options) for seed in seeds]
 
 
@@ -206,6 +206,7 @@ def test_processes_end_with_a_killed_caller() -> None:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_lost_node_loses_nothing(nodes: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The seed that is lost before its first checkpoint after the start begins again, and ends with the same agent."""
     watch = losing(nodes, tmp_path / "there")
     cluster.check_shared(tmp_path)
 
