@@ -187,11 +187,11 @@ def test_agent_files_that_cannot_be_used_get_one_line(tmp_path: Path, refusal: A
     assert "clairvoyant, mine, gradient, ppo, sac, or all" in line
 
 
-def test_an_agent_s_line_says_every_scenario_that_its_recipe_has(tmp_path: Path) -> None:
+def test_an_agent_s_line_says_the_scenarios_that_it_was_trained_on(tmp_path: Path) -> None:
     file = constant_agent(tmp_path / "some.onnx", algorithm="mine")
     found = contenders("--controllers", "gradient,ppo,mine", "--agent", str(file))
     assert {each.name: each.meaning.partition(" on ")[2] for each in found} == {
-        "gradient": "randomized, hard, sensor-fault and puller",
+        "gradient": "0.2 hard + 0.25 puller + 0.25 randomized + 0.3 sensor-fault",
         "ppo": "randomized",
         "mine": "randomized, given as a file",
     }
