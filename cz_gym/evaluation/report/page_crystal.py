@@ -21,7 +21,7 @@ from .canvas import GREY, INK, Style, chosen
 from .crystal import example, lost
 from .page_pictures import choice, plain
 
-POINT = 30.0
+POINT = 45.0
 """Time over which a point is the mean [s]."""
 MOST = 5
 """Most controllers whose signals are on the page, so that it stays small."""

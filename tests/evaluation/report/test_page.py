@@ -27,7 +27,7 @@ from tests.samples import result_of
 
 EVIL = "</script><img src=x onerror=alert(1)>\"'&amp;<b>\u2028%{x}|"
 ROWS, NAMES = ("puller", "reference-b"), ("open-loop", "paper", "industrial")
-STEP = 6
+STEP = 9
 """Steps of 5 s that a point of a line is the mean of."""
 
 
@@ -143,7 +143,7 @@ def test_numbers_at_a_logarithmic_axis_are_plotly_s_own(made: Made) -> None:
 
 
 @pytest.mark.parametrize("row", ROWS)
-def test_lines_are_means_of_the_rollouts_over_half_a_minute(made: Made, row: str) -> None:
+def test_lines_are_means_of_the_rollouts_over_45_seconds(made: Made, row: str) -> None:
     for who, run in made.runs[row].items():
         signals = run.episode(0)
         wanted = {
