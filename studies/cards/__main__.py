@@ -94,7 +94,7 @@ training seeds of a name are pooled; in brackets the 95 % interval over crystals
 [the benchmark](../benchmark/report.md); `python -m studies.cards` wrote this page.
 
 No agent was trained or tested on a real puller: none may control one. The linear loop of `gradient` has an unstable
-mode, which its schedule keeps small ([what it does](../../docs/insight.md)).
+mode, which its schedule keeps small.
 """
 
 

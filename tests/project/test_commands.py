@@ -17,7 +17,6 @@ from cz_gym.commands import OPTIONAL, OneLineParser, guarded, interpreter
 from cz_gym.errors import CzError
 from cz_gym.play import __main__ as play
 from studies.film import __main__ as film
-from studies.insight import __main__ as insight
 from studies.paper import __main__ as paper
 from studies.speed import __main__ as speed
 from studies.young_laplace import __main__ as young_laplace
@@ -26,7 +25,6 @@ COMMANDS: list[tuple[Any, str, str, list[str]]] = [
     (benchmark, "--episode", "benchmark", ["--out", "new/folder"]),
     (paper, "--ou", "contents", ["--out", "new/folder"]),
     (tuning, "--trial", "measure", ["--controller", "industrial", "--out", "new/folder"]),
-    (insight, "--episode", "study", ["--out", "new/folder"]),
     (speed, "--qui", "run", ["--quick"]),
     (young_laplace, "--wri", "build", ["--write"]),
     (play, "--minute", "settings", []),
