@@ -26,7 +26,7 @@ from .statistics import RESAMPLES, SEED, Estimate
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime", "casadi")
 """Packages whose versions are recorded."""
 RESULTS, EPISODES = "benchmark.json", "episodes.csv"
-FILES = (RESULTS, EPISODES, "report.md", "report.html", "crystal.png", "errors.png", "pareto.png")
+FILES = (RESULTS, EPISODES, "report.md", "report.html", "crystal.png", "pareto.png")
 """Everything a folder of results may hold."""
 Episodes = dict[str, dict[str, npt.NDArray[np.float64]]]
 """By scenario and controller: metrics of shape (training seeds, crystals, metrics)."""

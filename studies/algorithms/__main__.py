@@ -1,7 +1,7 @@
 """Train recipes over several seeds and compare their agents: ``python -m studies.algorithms [ablation]``.
 
-Every run is an ordinary folder of train.py below ``--work``; a finished one is not trained again, an interrupted one
-goes on from its checkpoint. Agents are evaluated anew each time, so a table never mixes figures of different code.
+Every run is an ordinary folder of train.py below ``--work``. A finished run is not trained again, an interrupted one
+continues from its checkpoint. All agents are evaluated each time, so a table never mixes figures of different code.
 """
 
 from __future__ import annotations
@@ -9,20 +9,23 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser, between
+from cz_gym.errors import CzError
 from cz_gym.evaluation import cluster
+from cz_gym.names import unknown
 
 from .variants import COMPARISONS, Comparison, Variant
 
 if TYPE_CHECKING:
     from cz_gym.agents.training.fleet import Job
 
-    from .results import Result
+    from .report import Result
 
 CHECKPOINT_SECONDS = 60.0
 """Time between the checkpoints of a run [s]."""
@@ -43,21 +46,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--ray", nargs="?", const="", metavar="HOST:PORT", help=about)
     parser.add_argument("--out", type=Path, help="folder of the results (default: results/COMPARISON)")
     parser.add_argument("--work", type=Path, help="folder of the runs (default: runs/COMPARISON)")
-    parser.add_argument("--list", action="store_true", help="list the rows and how many of their runs are finished")
     return parser.run(_main, arguments, "agents,benchmark", "the same command goes on from the runs' checkpoints")
 
 
 def _main(given: argparse.Namespace) -> None:
     comparison = COMPARISONS[given.comparison]
-    out, work = (getattr(given, name) or Path(top) / given.comparison for name, top in
-                 (("out", "results"), ("work", "runs")))  # fmt: skip
-    variants = [variant.lasting(given.steps) for variant in comparison.chosen(given.rows)]
-    jobs = make_jobs(variants, given.seeds, work)
-    if given.list:
-        for variant in variants:
-            done = sum(job.recipe == variant.recipe and job.summary is not None for job in jobs)
-            print(f"{variant.name:24} {done}/{given.seeds}  {variant.meaning}")
-        return
+    out, work = given.out or Path("results", given.comparison), given.work or Path("runs", given.comparison)
+    known = [variant.name for variant in comparison.variants]
+    wanted = given.rows.split(",") if given.rows else known
+    for name in wanted:
+        if name not in known:
+            raise CzError(unknown("row", name, known))
+    variants = [variant for variant in comparison.variants if variant.name in wanted]
+    if given.steps:
+        variants = [
+            replace(each, recipe=replace(each.recipe, steps=given.steps)) if each.recipe.steps else each
+            for each in variants
+        ]
     check_writable(out)
     perform: Perform = partial(cluster.in_processes, processes=given.jobs)
     if given.ray is not None:
@@ -65,11 +70,12 @@ def _main(given: argparse.Namespace) -> None:
         work.mkdir(parents=True, exist_ok=True)
         cluster.check_shared(work)
         perform = cluster.completed
+    jobs = make_jobs(variants, given.seeds, work)
     compare(comparison._replace(variants=tuple(variants)), jobs, out, perform)
 
 
 def make_jobs(variants: Sequence[Variant], seeds: int, work: Path) -> list[Job]:
-    """A run for each training seed and variant; seed by seed, so that a stopped comparison has run every variant."""
+    """A run for each training seed and variant, seed by seed: a stopped comparison has trained every variant."""
     from cz_gym.agents.training.fleet import Job
 
     return [
@@ -82,8 +88,7 @@ def make_jobs(variants: Sequence[Variant], seeds: int, work: Path) -> list[Job]:
 
 def compare(comparison: Comparison, jobs: Sequence[Job], out: Path, perform: Perform) -> None:
     """Train and evaluate the jobs; table and figure are written after each."""
-    from .report import report
-    from .results import train_and_evaluate
+    from .report import report, train_and_evaluate
 
     results: dict[str, dict[int, Result]] = {}
     for number, result in perform(train_and_evaluate, jobs):

@@ -1,21 +1,29 @@
-"""The table of a comparison, means and paired differences with 95 % intervals, and the learning curves."""
+"""Evaluation of trained agents, and the table and learning curves of a comparison."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.agents.training import validation
-from cz_gym.agents.training.validation import REFERENCES
+from cz_gym.agents.training.fleet import Job, train_seed
+from cz_gym.agents.training.run_files import read_rows
+from cz_gym.agents.training.validation import REFERENCES, references
+from cz_gym.baselines.registry import make_controller
+from cz_gym.config import Config
+from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.report.canvas import INK, canvas, png, styles
 from cz_gym.evaluation.report.tables import markdown
+from cz_gym.evaluation.rollout import Floats, rollout
 from cz_gym.evaluation.statistics import Estimate, Resamples, means
 
-from .results import SCENARIO, TRANSFER, Result
 from .variants import Comparison
 
+SCENARIO, TRANSFER = "randomized", "hard"
+"""Scenario of the crystals, whatever an agent was trained on; and a harder scenario to transfer to."""
 MICRON, PERCENT = 1e-3, 1e-2
 """A micrometre in millimetres, and a hundredth."""
 COLUMNS = (
@@ -26,7 +34,7 @@ COLUMNS = (
     (f"{TRANSFER}: RMSE [um]", MICRON, ".1f"),
     ("lost [%]", PERCENT, ".1f"),
 )
-"""Heading, unit and format of each of FIGURES."""
+"""Heading, unit and format of each figure of :func:`evaluate`."""
 AXES = (("steps", 1e6, "environment steps [million]"), ("seconds", 60.0, "minutes on a core, validation included"))
 """What learning curves are drawn against: column of a run's progress, unit, axis."""
 ABOUT = """Agents are evaluated on {crystals} validation crystals of `{scenario}` that did not choose a run's agent, and
@@ -34,12 +42,45 @@ on those of `{transfer}` with the same seeds; of each run the agent of least cos
 brackets: 95 % intervals, bootstrap over training seeds and crystals; with few training seeds they are somewhat too
 narrow. Differences are taken on the same crystals and training seeds, negative is better. Cost: of a step, as the
 environment's reward counts it; a lost crystal counts ten there, and 8 mm."""
+
+
+class Result(NamedTuple):
+    """Figures of one training run."""
+
+    figures: Floats
+    """Those of :func:`evaluate`, shape (crystals, figures)."""
+    progress: Sequence[Mapping[str, float]]
+    """Rows of the run's ``progress.csv``."""
+
+
+def train_and_evaluate(job: Job) -> Result:
+    """Train a run to its end, from its checkpoint if there is one, and evaluate its best agent."""
+    if job.summary is None:
+        train_seed(job._replace(references=references(make_controller, job.recipe)))
+    config = job.recipe.config
+    rows = [{name: float(value) for name, value in row.items()} for row in read_rows(job.folder / "progress.csv")]
+    return Result(evaluate(OnnxPolicy.load(job.folder / "agent.onnx", config), config), rows)
+
+
+def evaluate(policy: Any, config: Config) -> Floats:
+    """Figures of :data:`COLUMNS` on the validation crystals that chose no agent, shape (crystals, figures).
+
+    The cost is the mean over the steps, as the reward counts it; a lost crystal has cost 10.
+    """
+    own, transfer = (
+        metrics(rollout(policy, config.with_scenario(name), validation.JUDGING)) for name in (SCENARIO, TRANSFER)
+    )
+    cost = validation.costs(own)
+    columns = own.rmse_mm, cost, own.pull_step_rms_mm_per_min, own.failure_rate, transfer.rmse_mm, transfer.failure_rate
+    return np.stack(columns, axis=-1)
+
+
 Results = Mapping[str, Mapping[int, Result]]
 """By variant and training seed."""
 
 
 class Line(NamedTuple):
-    """One variant: its figures, and their differences to its base if that has been trained."""
+    """Figures of one variant, and their differences to its base if that has been trained."""
 
     name: str
     base: str

@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from cz_gym.agents.training.recipes import RECIPES, Recipe
-from cz_gym.errors import CzError
-from cz_gym.names import unknown
 
 
 @dataclass(frozen=True)
@@ -22,14 +20,8 @@ class Variant:
 
     @property
     def name(self) -> str:
-        """Name of its agents."""
+        """Name of the recipe and of its agents."""
         return self.recipe.name
-
-    def lasting(self, steps: int | None) -> Variant:
-        """The same with that many environment steps if it learns from reward; None: its recipe's own number."""
-        if steps is None or not self.recipe.steps:
-            return self
-        return replace(self, recipe=replace(self.recipe, steps=steps))
 
 
 class Comparison(NamedTuple):
@@ -37,15 +29,6 @@ class Comparison(NamedTuple):
 
     title: str
     variants: tuple[Variant, ...]
-
-    def chosen(self, names: str | None) -> list[Variant]:
-        """The rows of those names, joined by commas; all rows for None. CzError names the rows there are."""
-        known = [variant.name for variant in self.variants]
-        wanted = known if names is None else names.split(",")
-        for name in wanted:
-            if name not in known:
-                raise CzError(unknown("row", name, known))
-        return [variant for variant in self.variants if variant.name in wanted]
 
 
 PPO: Any = replace(RECIPES["ppo"], steps=1_500_000)

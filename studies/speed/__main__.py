@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import statistics
 import sys
 import timeit
@@ -18,20 +17,11 @@ from typing import Any, NamedTuple
 
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser
-from cz_gym.errors import CzError
 
 from .cases import SLOTS, THREADS, Case, Stepper, cases, stepper
 
-
-class Plan(NamedTuple):
-    """Length of a measurement."""
-
-    repeats: int
-    seconds: float
-    """Time of a case in each round, about [s]."""
-
-
-QUICK, FULL = Plan(3, 0.1), Plan(9, 0.5)
+QUICK, FULL = 3, 15
+"""Rounds of a measurement."""
 
 
 class Row(NamedTuple):
@@ -40,13 +30,6 @@ class Row(NamedTuple):
     name: str
     num_envs: int
     steps_per_s: float
-
-
-class Skipped(NamedTuple):
-    """A case that cannot be measured here."""
-
-    name: str
-    why: str
 
 
 class Ratio(NamedTuple):
@@ -75,23 +58,23 @@ RATIOS = {
 }
 
 
-def measure(wanted: Sequence[Case], plan: Plan) -> tuple[list[Row], list[Skipped]]:
-    """Median speeds of interleaved rounds; cases that cannot be made are skipped by name."""
+def measure(wanted: Sequence[Case], rounds: int) -> tuple[list[Row], dict[str, str]]:
+    """Median speeds over interleaved rounds, and by name why a case was skipped that cannot be made here."""
     from tqdm import tqdm
 
     running: dict[Case, tuple[Stepper, timeit.Timer, int]] = {}
-    skipped = []
+    skipped = {}
     for case in wanted:
         try:
             made = stepper(case.make())
             made.step()
         except Exception as error:  # what a peer lacks must not end the run
-            skipped.append(Skipped(case.name, why(error)))
+            skipped[case.name] = f"{type(error).__name__}: {' '.join(str(error).split())}"[:100]
             continue
         timer = timeit.Timer(made.step, "import gc; gc.enable()")
-        running[case] = made, timer, calls_in(timer, plan.seconds)
+        running[case] = made, timer, timer.autorange()[0]
     speeds: dict[Case, list[float]] = {case: [] for case in running}
-    for _ in tqdm(range(plan.repeats), desc="rounds", disable=None):
+    for _ in tqdm(range(rounds), desc="rounds", disable=None):
         for case, (made, timer, calls) in running.items():
             speeds[case].append(calls * made.num_envs / timer.timeit(calls))
     for made, *_ in running.values():
@@ -99,30 +82,15 @@ def measure(wanted: Sequence[Case], plan: Plan) -> tuple[list[Row], list[Skipped
     return [Row(case.name, running[case][0].num_envs, statistics.median(speeds[case])) for case in running], skipped
 
 
-def calls_in(timer: timeit.Timer, seconds: float) -> int:
-    """Number of calls that takes about that long."""
-    calls = 1
-    while (took := timer.timeit(calls)) < 0.1 * seconds:
-        calls *= 4
-    return max(1, round(calls * seconds / took))
-
-
-def why(error: Exception) -> str:
-    """Why something is skipped, in one line."""
-    if isinstance(error, ImportError):
-        return f"{error.name or error} is not installed"
-    return " ".join(f"{type(error).__name__}: {error}".split())[:100]
-
-
 def ratio(rows: Sequence[Row], asked: Ratio) -> float | None:
     """A ratio of the table's rows; None where one is missing."""
     speeds = []
     for begins in (asked.row, asked.over):
         found = [row for row in rows if row.name.startswith(begins)]
-        alike = [row for row in found if row.num_envs == SLOTS] or found
-        speeds.append(max((row.steps_per_s for row in alike), default=math.nan))
-    value = speeds[0] / speeds[1]
-    return None if math.isnan(value) else value
+        speeds += (
+            [max(row.steps_per_s for row in [row for row in found if row.num_envs == SLOTS] or found)] if found else []
+        )
+    return speeds[0] / speeds[1] if len(speeds) == 2 else None
 
 
 def table(result: dict[str, Any]) -> str:
@@ -130,7 +98,7 @@ def table(result: dict[str, Any]) -> str:
     lines = [f"{'':44}{'slots':>7}{'steps/s':>14}{'us/step':>10}"]
     for name, num_envs, speed in (row.values() for row in result["rows"]):
         lines.append(f"{name:44}{num_envs:7d}{speed:14,.0f}{1e6 / speed:10.3f}")
-    lines += [f"{skipped['name']:44}skipped: {skipped['why']}" for skipped in result["skipped"]] + [""]
+    lines += [f"{name:44}skipped: {why}" for name, why in result["skipped"].items()] + [""]
     for name, value in result["ratios"].items():
         shown = "-" if value is None else f"{value:.2f}"
         aim = RATIOS[name].promised
@@ -144,7 +112,7 @@ def run(quick: bool) -> dict[str, Any]:
     return {
         "ratios": {name: ratio(rows, asked) for name, asked in RATIOS.items()},
         "rows": [row._asdict() for row in rows],
-        "skipped": [one._asdict() for one in skipped],
+        "skipped": skipped,
         "threads": THREADS,
     }
 
@@ -159,8 +127,6 @@ def main(argv: list[str] | None = None) -> int:
 
 def _measure(arguments: argparse.Namespace) -> None:
     if arguments.json is not None:
-        if arguments.json.is_dir():
-            raise CzError(f"{arguments.json} is a folder")
         check_writable(arguments.json.parent)
     result = run(arguments.quick)
     print(table(result))

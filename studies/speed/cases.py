@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
-import os
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode
 
 from cz_gym.config import make_config
 from cz_gym.differentiable import DifferentiableBatch
@@ -46,28 +44,34 @@ class Case(NamedTuple):
 
 def cases(quick: bool) -> list[Case]:
     """Every row, in the table's order."""
-    threads = sorted({1, THREADS})
+    threads = {n: "1 thread" if n == 1 else f"{n} threads" for n in sorted({1, THREADS})}
     return [
         *(Case(f"{name} scalar", partial(gym.make, name)) for name in ("Cz-v0", "Pendulum-v1")),
-        *(Case(f"Cz-v0 batch, measured, {_threads(n)}", partial(ours, SLOTS, n)) for n in threads),
         *(
-            Case(f"{name}, {_threads(n)}", partial(make, SLOTS, n))
-            for n in threads
-            for name, make in (("Cz-v0 batch without resets", without_resets), ("bare compiled plant and ring", bare))
+            Case(f"{name}, {named}", partial(make, SLOTS, n))
+            for name, make in (
+                ("Cz-v0 batch, measured", ours),
+                ("Cz-v0 batch without resets", without_resets),
+                ("bare compiled plant and ring", bare),
+                ("EnvPool Pendulum-v1", _envpool),
+            )
+            for n, named in threads.items()
         ),
         Case("step without derivatives", partial(differentiable, False)),
         Case("step with derivatives", partial(differentiable, True)),
-        *(Case(f"EnvPool Pendulum-v1, {_threads(n)}", partial(_envpool, SLOTS, n)) for n in threads),
         Case("pc-gym CSTR", _pcgym),
-        Case("SB3 adapter over the batch", _sb3_adapter),
+        Case("SB3 adapter over the batch", lambda: import_module("cz_gym.sb3").make_vec_env(SB3_SLOTS)),
         *(
             Case(f"{loop}, {name}", partial(make, name))
-            for loop, make in (("SB3 make_vec_env", _make_vec_env), ("SyncVectorEnv", _sync))
+            for loop, make in (
+                ("SB3 make_vec_env", _sb3_make_vec_env),
+                ("SyncVectorEnv", partial(gym.make_vec, num_envs=4, vectorization_mode="sync")),
+            )
             for name in ("cz_gym:Cz-v0", "Pendulum-v1")
         ),
-        Case("SB3 DummyVecEnv", lambda: _sb3("DummyVecEnv", SB3_SLOTS)),
+        Case("SB3 DummyVecEnv", partial(_sb3, "DummyVecEnv", SB3_SLOTS)),
         *(
-            Case(f"SB3 SubprocVecEnv, {n} processes", partial(_sb3, "SubprocVecEnv", n, start_method=_START))
+            Case(f"SB3 SubprocVecEnv, {n} processes", partial(_sb3, "SubprocVecEnv", n))
             for n in ((2,) if quick else (2, 16))
         ),
         Case("Cz-v0 scalar, camera", partial(CzEnv, "nominal", observation="camera")),
@@ -144,7 +148,7 @@ def differentiable(derivatives: bool) -> Stepper:
 
 
 def _envpool(num_envs: int, threads: int) -> Stepper:
-    envpool = importlib.import_module("envpool")
+    envpool = import_module("envpool")
     env = envpool.make("Pendulum-v1", env_type="gymnasium", num_envs=num_envs, num_threads=threads)
     env.reset()
     return batched(env, num_envs)
@@ -152,7 +156,7 @@ def _envpool(num_envs: int, threads: int) -> Stepper:
 
 def _pcgym() -> Any:
     """Its documentation's CSTR: three states, one input, 100 steps of 0.26 min."""
-    return importlib.import_module("pcgym").make_env(
+    return import_module("pcgym").make_env(
         {
             "N": 100,
             "tsim": 26,
@@ -171,27 +175,10 @@ def _pcgym() -> Any:
     )
 
 
-def _sb3_adapter() -> Any:
-    adapter = importlib.import_module("cz_gym.sb3").CzVecEnv
-    return adapter(CzVectorEnv(SB3_SLOTS, autoreset_mode=AutoresetMode.SAME_STEP))
+def _sb3_make_vec_env(name: str) -> Any:
+    return import_module("stable_baselines3.common.env_util").make_vec_env(name, 16)
 
 
-def _make_vec_env(name: str) -> Any:
-    """Stable-baselines3's usual way to make a vector of environments."""
-    return importlib.import_module("stable_baselines3.common.env_util").make_vec_env(name, 16)
-
-
-def _sync(name: str) -> Any:
-    return gym.make_vec(name, 4, vectorization_mode="sync")
-
-
-_START = "forkserver" if os.name == "posix" else "spawn"
-
-
-def _sb3(kind: str, num_envs: int, **arguments: Any) -> Any:
-    make = getattr(importlib.import_module("stable_baselines3.common.vec_env"), kind)
-    return make([partial(gym.make, "cz_gym:Cz-v0")] * num_envs, **arguments)
-
-
-def _threads(count: int) -> str:
-    return "1 thread" if count == 1 else f"{count} threads"
+def _sb3(kind: str, num_envs: int) -> Any:
+    make = getattr(import_module("stable_baselines3.common.vec_env"), kind)
+    return make([partial(gym.make, "cz_gym:Cz-v0")] * num_envs)

@@ -29,7 +29,7 @@ from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from tests.contracts import LINEAR, facts, model_of
 from tests.processes import python
 
-FILES = ["benchmark.json", "crystal.png", "episodes.csv", "errors.png", "pareto.png", "report.html", "report.md"]
+FILES = ["benchmark.json", "crystal.png", "episodes.csv", "pareto.png", "report.html", "report.md"]
 SMALL = ["--episodes", "3", "--scenarios", "randomized,reference-b", "--controllers", "open-loop,paper"]
 ONE = ["--scenarios", "reference-b", "--controllers", "open-loop", "--quiet"]
 

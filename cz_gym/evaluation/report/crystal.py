@@ -21,8 +21,7 @@ COLUMNS = 5
 ROOM = (0.01 * MM, 3.0 * MM)
 """Least and largest radius error that the figure has room for, beyond the reference's own range [m]."""
 SMOOTH = 5.0 * MINUTE
-"""Length of the running mean of noisy signals [s]; drawn pale beside it, :data:`PALE`."""
-PALE = MINUTE
+"""Length of the running mean of the drives [s], drawn over their single steps."""
 
 
 def example(sample: Sample) -> Signals:
@@ -36,7 +35,7 @@ class _Panel(NamedTuple):
     label: str
     value: Callable[[Signals], Floats]
     noisy: bool = False
-    """Whether to draw its mean over a minute pale, with that over five minutes on top: single steps fill a panel."""
+    """Whether to draw single steps pale, with their running mean on top."""
 
 
 _PANELS = (
@@ -61,15 +60,12 @@ def crystal(result: Result, style: Mapping[str, Style]) -> bytes:
     figure.align_ylabels(axes[:, 0])
     _set_limits(axes, samples, longest, result.row.control_interval)
     figure.suptitle(f"One crystal of {result.row.name} (test seed {samples[0].seeds[0]:,})", fontsize=10.5)
-    lines: tuple[dict[str, Any], ...] = (
-        {"color": INK, "lw": 1.2, "ls": "--", "label": "reference"},
-        {"color": GREY, "lw": 1.2, "label": "ring as the camera reports it"},
-        {"ls": "none", "label": "in colour: true value"},
-        {"ls": "none", "label": "of a drive: its 5 min mean, pale its 1 min mean"},
-    )
-    handles = [Line2D([], [], **line) for line in lines]
-    columns = 1 if len(samples) < 4 else 2
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=8.5, frameon=False)
+    handles = [
+        Line2D([], [], color=INK, lw=1.2, ls="--", label="reference"),
+        Line2D([], [], color=GREY, lw=1.2, label="ring as the camera reports it"),
+        Line2D([], [], ls="none", label="in colour: true value; of a drive, its 5 min mean over single steps"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", fontsize=8.5, frameon=False)
     return png(figure)
 
 
@@ -80,23 +76,18 @@ def _draw(axes: Any, sample: Sample, dt: float, colour: str, reference: Floats) 
     axes[1].plot(minutes, signals.r_br_measured / MM, color=GREY, lw=0.4)
     for axis, panel in zip(axes, _PANELS, strict=True):
         values = panel.value(signals)
+        axis.plot(minutes, values, color=colour, **({"lw": 0.4, "alpha": 0.4} if panel.noisy else {"lw": 1.1}))
         if panel.noisy:
-            for length, look in ((PALE, {"lw": 0.6, "alpha": 0.4}), (SMOOTH, {"lw": 1.4})):
-                window = min(max(round(length / dt), 1), len(values))
-                mean = np.convolve(values, np.full(window, 1.0 / window), "valid")
-                axis.plot(minutes[window - 1 :] - 0.5 * (window - 1) * dt / MINUTE, mean, color=colour, **look)
-        else:
-            axis.plot(minutes, values, color=colour, lw=1.1)
-    rmse = float(sample.metric("rmse_mm")[0, 0])
-    name = fill(sample.name, 18)
-    axes[0].set_title(f"{name}\nRMSE {rmse:.3g} mm", fontsize=9, color=INK, fontweight="bold")
-    axes[-1].set_xlabel("time [min]")
+            window = min(max(round(SMOOTH / dt), 1), len(values))
+            mean = np.convolve(values, np.full(window, 1.0 / window), "valid")
+            axis.plot(minutes[window - 1 :] - 0.5 * (window - 1) * dt / MINUTE, mean, color=colour, lw=1.4)
+    rmse = f"RMSE {float(sample.metric('rmse_mm')[0, 0]):.3g} mm"
     if lost(sample):
+        rmse = f"lost at {minutes[-1]:.0f} min"
         for axis in axes:
             axis.axvline(minutes[-1], color=INK, lw=0.8, ls=":")
-        side = {"ha": "left"} if minutes[-1] < 90.0 else {"ha": "right"}
-        place = {"xycoords": ("data", "axes fraction"), "va": "top", "fontsize": 7.5, **side}
-        axes[0].annotate(f" failed \n at {minutes[-1]:.0f} min ", (minutes[-1], 0.96), **place)
+    axes[0].set_title(f"{fill(sample.name, 18)}\n{rmse}", fontsize=9, color=INK, fontweight="bold")
+    axes[-1].set_xlabel("time [min]")
 
 
 def lost(sample: Sample) -> bool:

@@ -19,7 +19,7 @@ from cz_gym.vector import CzVectorEnv
 
 from .canvas import GREY, INK, Style, chosen
 from .crystal import example, lost
-from .page_pictures import choice, plain
+from .page_pictures import add_menu, plain
 
 POINT = 45.0
 """Time over which a point is the mean [s]."""
@@ -74,25 +74,21 @@ def crystal(results: Sequence[Result], styles: Mapping[str, Style]) -> go.Figure
     """Draw the first crystal of each scenario, one scenario at a time, under the controllers of :func:`chosen`."""
     titles = [f"{panel.title} [{panel.unit}]" for panel in PANELS]
     figure = make_subplots(len(PANELS), 1, shared_xaxes=True, vertical_spacing=0.02, subplot_titles=titles)
-    owners, layouts = [], []
-    for number, result in enumerate(results):
-        before = len(figure.data)
-        layouts.append(_draw(figure, result, styles))
-        owners += [number] * (len(figure.data) - before)
-    for panel in range(len(PANELS)):
-        for level in PANELS[panel].levels:
+    layouts = [_draw(figure, number, result, styles) for number, result in enumerate(results)]
+    for row, panel in enumerate(PANELS, 1):
+        for level in panel.levels:
             line = {"color": GREY, "width": 1, "dash": "dot"}
-            figure.add_hline(level, row=panel + 1, col=1, line=line, layer="below")
+            figure.add_hline(level, row=row, col=1, line=line, layer="below")
     figure.update_xaxes(range=[0.0, results[0].row.config().horizon / MINUTE], hoverformat=".2f", nticks=10)
     figure.update_xaxes(title="time [min]", row=len(PANELS), col=1)
     legend = {"orientation": "h", "y": -0.04, "yanchor": "top", "groupclick": "togglegroup"}
     figure.update_layout(legend=legend, height=150 * len(PANELS), hovermode="x")
-    choice(figure, results, owners, layouts)
+    add_menu(figure, results, layouts)
     return figure
 
 
-def _draw(figure: go.Figure, result: Result, styles: Mapping[str, Style]) -> dict[str, Any]:
-    """Add a scenario's lines; the ranges of the panels, which are those of the crystals that were not lost."""
+def _draw(figure: go.Figure, scenario: int, result: Result, styles: Mapping[str, Style]) -> dict[str, Any]:
+    """Add the lines of a scenario and return the ranges of its panels: those of the crystals that were not lost."""
     samples, interval = chosen(result.samples, MOST), result.row.control_interval
     bias, step = ring_bias(result.row, result.seeds[0]), max(round(POINT / interval), 1)
     time = {"x0": 0.5 * step * interval / MINUTE, "dx": step * interval / MINUTE}
@@ -114,7 +110,7 @@ def _draw(figure: go.Figure, result: Result, styles: Mapping[str, Style]) -> dic
                 figure.add_scatter(
                     row=number + 1, col=1, y=values, **time, **look, mode="lines",
                     line={**line, "dash": style.dash if own else "dash"}, opacity=0.35 if name == "camera" else 1.0,
-                    legendgroup=sample.name if own else name,
+                    legendgroup=sample.name if own else name, meta=scenario,
                 )  # fmt: skip
                 if len(values) and (not own or sample.name in whole):
                     ends += np.quantile(values, [OUTLIERS, 1.0 - OUTLIERS]).tolist()

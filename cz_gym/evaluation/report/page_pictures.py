@@ -28,27 +28,16 @@ def plain(name: str) -> str:
     return escape("".join(letter if letter.isprintable() else " " for letter in short), quote=False)
 
 
-def choice(
-    figure: go.Figure, results: Sequence[Result], owners: Sequence[int], layouts: Sequence[Mapping[str, Any]]
-) -> None:
-    """Add a menu that shows the traces of one scenario, with its layout; ``owners`` has each trace's scenario.
-
-    A trace of the first scenario keeps its visibility, so that "legendonly" ones stay hidden when it is shown again.
-    """
-    visible = [trace.visible or True for trace in figure.data]
-    shown = [
-        [seen if owner == i else False for seen, owner in zip(visible, owners, strict=True)]
-        for i in range(len(results))
-    ]
-    for trace, seen in zip(figure.data, shown[0], strict=True):
-        trace.visible = seen
-    figure.update_layout(**layouts[0])
-    buttons = [
-        {"label": plain(result.row.name), "method": "update", "args": [{"visible": seen}, dict(layout)]}
-        for result, seen, layout in zip(results, shown, layouts, strict=True)
-    ]
+def add_menu(figure: go.Figure, results: Sequence[Result], layouts: Sequence[Mapping[str, Any]] = ()) -> None:
+    """Add a menu that shows the traces of one scenario, with its layout; a trace's meta is its scenario's number."""
+    buttons = []
+    for number, result in enumerate(results):
+        arguments: list[Any] = [{"visible": [trace.meta == number for trace in figure.data]}]
+        arguments += [dict(layouts[number])] if layouts else []
+        buttons.append({"label": plain(result.row.name), "method": "update", "args": arguments})
+    figure.for_each_trace(lambda trace: trace.update(visible=trace.meta == 0))
     menu = {"buttons": buttons, "x": 0, "xanchor": "left", "y": 1, "yanchor": "bottom", "pad": {"b": 8}}
-    figure.update_layout(updatemenus=[menu] if len(results) > 1 else [])
+    figure.update_layout(updatemenus=[menu] if len(results) > 1 else [], **(layouts[0] if layouts else {}))
 
 
 def pareto(results: Sequence[Result], styles: Mapping[str, Style]) -> go.Figure:
@@ -56,7 +45,7 @@ def pareto(results: Sequence[Result], styles: Mapping[str, Style]) -> go.Figure:
 
     A controller that never moves the pull speed stands left of all others.
     """
-    figure, owners = go.Figure(), []
+    figure = go.Figure()
     for number, result in enumerate(results):
         floor = floor_of([result])
         for name, means in result.means.items():
@@ -64,6 +53,7 @@ def pareto(results: Sequence[Result], styles: Mapping[str, Style]) -> go.Figure:
             still, style = activity.mean < floor, styles[name]
             figure.add_scatter(
                 name=plain(name),
+                meta=number,
                 x=[max(activity.mean, floor)],
                 y=[error.mean],
                 error_x={"visible": False} if still else _bars(activity),
@@ -74,11 +64,10 @@ def pareto(results: Sequence[Result], styles: Mapping[str, Style]) -> go.Figure:
                 marker={"color": style.colour, "symbol": f"{MARKERS[style.marker]}-open", "size": 10, "line_width": 2},
                 hovertemplate=f"RMSE {RMSE.text(error)} mm<br>pull step RMS {PULL_STEP.text(activity)} mm/min",
             )
-            owners.append(number)
     figure.update_xaxes(LOG, title=f"mean {PULL_STEP.heading}", nticks=4)
     figure.update_yaxes(LOG, title=f"mean {RMSE.heading}")
     figure.update_layout(height=560, legend={"orientation": "h", "y": -0.2}, showlegend=True)
-    choice(figure, results, owners, [{} for _ in results])
+    add_menu(figure, results)
     return figure
 
 
@@ -89,7 +78,7 @@ def _bars(estimate: Estimate) -> dict[str, Any]:
 
 def errors(results: Sequence[Result], styles: Mapping[str, Style]) -> go.Figure:
     """Draw the distribution of RMSE over the crystals and training seeds: median, quartiles, 5 to 95 %."""
-    figure, owners = go.Figure(), []
+    figure = go.Figure()
     for number, result in enumerate(results):
         for sample in reversed(result.samples):
             low, first, median, third, high = (
@@ -97,11 +86,10 @@ def errors(results: Sequence[Result], styles: Mapping[str, Style]) -> go.Figure:
             )
             figure.add_box(
                 y=[plain(sample.name)], lowerfence=low, q1=first, median=median, q3=third, upperfence=high,
-                orientation="h", marker={"color": styles[sample.name].colour}, name=plain(sample.name),
+                orientation="h", marker={"color": styles[sample.name].colour}, name=plain(sample.name), meta=number,
             )  # fmt: skip
-            owners.append(number)
     figure.update_xaxes(LOG, title=RMSE.heading)
     figure.update_yaxes(automargin=True)
     figure.update_layout(showlegend=False, height=140 + 24 * len(results[0].samples))
-    choice(figure, results, owners, [{} for _ in results])
+    add_menu(figure, results)
     return figure

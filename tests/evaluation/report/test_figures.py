@@ -14,9 +14,9 @@ from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.protocol import find_row
 from cz_gym.evaluation.report.canvas import COLOURS, DPI, chosen, styles, styles_of
 from cz_gym.evaluation.report.crystal import COLUMNS
-from cz_gym.evaluation.report.figures import NAMED, draw_figures, named
+from cz_gym.evaluation.report.figures import NAMED, draw_figures
 from cz_gym.evaluation.report.markdown import brief
-from cz_gym.evaluation.results import Result, Sample, summarise
+from cz_gym.evaluation.results import Sample, summarise
 from cz_gym.evaluation.rollout import rollout
 from tests.samples import contender, sample_of
 
@@ -65,18 +65,6 @@ def test_the_short_table_has_the_quoted_controllers_and_the_best_agents() -> Non
     assert [line.split(" | ")[0].strip("| ") for line in lines[2:]] == names(chosen(everyone(), COLUMNS))
 
 
-def test_the_best_classical_controller_of_each_scenario_is_named() -> None:
-    def scenario(best: str) -> Result:
-        many = [sample(f"c{i}", 1.0) for i in range(NAMED)] + [sample("paper", 3.0), sample("lqg-quiet", 2.0)]
-        many = [*many, agent("ppo", 0.1), sample("bound", 0.1, observation="state")]
-        shown = [sample(best, 0.5) if each.name == best else each for each in many]
-        return summarise(find_row("nominal"), shown)
-
-    found = named([scenario("c3"), scenario("lqg-quiet")])
-    assert len(found) == len(set(found)) == NAMED
-    assert {"paper", "ppo", "c3", "lqg-quiet"} < set(found)
-
-
 def test_no_two_controllers_look_alike() -> None:
     assert len(COLOURS) >= NAMED
     known = styles_of(everyone())
@@ -94,7 +82,7 @@ def test_figures_of_a_crystal_that_nothing_disturbs_and_of_a_name_that_seems_a_f
         who = ["a $\\frac$ b", *(f"c{i}" for i in range(COLUMNS))]
         results.append(summarise(row, [sample_of(contender(each, training_seeds=(1,)), [run]) for each in who]))
     figures = draw_figures(results)
-    assert set(figures) == {"crystal.png", "errors.png", "pareto.png"}
+    assert set(figures) == {"crystal.png", "pareto.png"}
     assert all(image.startswith(b"\x89PNG") for image in figures.values())
     inches = Image.open(io.BytesIO(figures["crystal.png"])).width / DPI
     assert 830.0 / inches * 8.0 / 72.0 > 10.0, "8 point text is too small where a page shows the figure 830 pixels wide"
