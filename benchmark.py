@@ -6,13 +6,13 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 try:
     from cz_gym.commands import OneLineParser, guarded, shown
     from cz_gym.errors import CzError
+    from cz_gym.names import unknown
 except ModuleNotFoundError as error:
     sys.exit(f"benchmark.py: {error}")
 
@@ -114,10 +114,8 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
     if not arguments.quiet:
         print(terminal(results))
         if arguments.controllers == ["all"] and (missing := left_out(contenders)):
-            print(
-                f"left out of all: {', '.join(missing)}, which are slow and not cached for every episode asked for; "
-                f"add --slow to run them ({BOUNDS.relative_to(README.parent)}/report.md has their earlier results)"
-            )
+            names = ", ".join(missing)
+            print(f"left out of all: {names}, which are slow and not cached for every episode; add --slow to run them")
         wrote = ", ".join(shown(path) for path in (arguments.out, arguments.json) if path)
         print(f"wrote {wrote}" + (f"; open {shown(arguments.out / 'report.html')}" if arguments.out else ""))
     return 0
@@ -136,26 +134,43 @@ def rows_of(arguments: argparse.Namespace) -> list[Row]:
 
 
 def contenders_of(arguments: argparse.Namespace, rows: Sequence[Row]) -> list[Contender]:
-    """Controllers and agents that the command line asks for; CzError names what was given and what is allowed."""
-    from cz_gym.agents import shipped_names
+    """Controllers and agents that the command line asks for, classical controllers first.
+
+    Controllers and agents from files of the user's always take part. Shipped agents do by default if no agent is given.
+    Slow controllers do if ``--slow`` asks for them, or if they are named and all their episodes cached. CzError names
+    what was given and what is allowed.
+    """
+    from cz_gym.agents import OnnxPolicy, shipped_names, shipped_seeds
     from cz_gym.baselines.registry import CONTROLLERS
     from cz_gym.evaluation import user_code
-    from cz_gym.evaluation.contenders import check_agents, choose
+    from cz_gym.evaluation.contenders import agent, check_agents
+    from cz_gym.evaluation.protocol import SLOW_EPISODES
     from cz_gym.evaluation.runner import is_cached
 
-    own = [user_code.controller(place) for place in arguments.controller]
-    given, shipped = given_agents(arguments), {name: partial(shipped_agent, name) for name in shipped_names()}
-    reserved = dict.fromkeys([*(each.name for each in CONTROLLERS), *shipped])
-    also = [*(name for name in given if name not in shipped), *(each.name for each in own)]
-    user_code.check_apart([*reserved, *also], "controller")
-    wanted = arguments.controllers
-    if own and not (wanted or arguments.slow):
+    own, given = [user_code.controller(place) for place in arguments.controller], given_agents(arguments)
+    registered, shipped = [each.name for each in CONTROLLERS], shipped_names()
+    new = [name for name in given if name not in shipped]
+    user_code.check_apart([*registered, *shipped, *new, *(each.name for each in own)], "controller")
+
+    def may_run(each: Contender) -> bool:
+        return not each.slow or arguments.slow or is_cached(each, rows, arguments.episodes, CACHE)
+
+    wanted, agents = arguments.controllers, list(given) or shipped
+    if not wanted and own and not arguments.slow:
         wanted = [each.name for each in CONTROLLERS if each.quoted]
-
-    def cached(each: Contender) -> bool:
-        return is_cached(each, rows, arguments.episodes, CACHE)
-
-    chosen = choose(wanted, CONTROLLERS, given, shipped, arguments.slow, cached)
+    elif not wanted:
+        wanted = [each.name for each in CONTROLLERS if (arguments.slow if each.slow else each.default)] + agents
+    elif wanted == ["all"]:
+        wanted = [each.name for each in CONTROLLERS if may_run(each)] + agents
+    for name in wanted:
+        if name not in (known := [*registered, *new, *shipped]):
+            raise CzError(unknown("controller", name, known, ", or all"))
+    chosen = [each for each in CONTROLLERS if each.name in wanted]
+    for each in chosen:
+        if not may_run(each):
+            raise CzError(f"{each.name!r} is slow: add --slow to run it on the first {SLOW_EPISODES} episodes")
+    files = {name: shipped_seeds(name) for name in shipped if name in wanted and name not in given}
+    chosen += [*given.values(), *(agent(name, [*map(OnnxPolicy.load, some)]) for name, some in files.items())]
     check_agents(chosen, rows)
     return [*chosen, *own]
 
@@ -163,6 +178,7 @@ def contenders_of(arguments: argparse.Namespace, rows: Sequence[Row]) -> list[Co
 def given_agents(arguments: argparse.Namespace) -> dict[str, Contender]:
     """Agents of files by name: the files of one name are its training seeds."""
     from cz_gym.agents import OnnxPolicy, shipped_names
+    from cz_gym.evaluation.contenders import agent
 
     policies: dict[str, list[OnnxPolicy]] = {}
     for name, file in arguments.agent:
@@ -170,20 +186,7 @@ def given_agents(arguments: argparse.Namespace) -> dict[str, Contender]:
             raise CzError(f"--agent takes a file; {file} is shipped and runs by its name: --controllers {file}")
         policy = OnnxPolicy.load(file)
         policies.setdefault(name or policy.contract.algorithm, []).append(policy)
-    return {name: _agent(name, some, own=True) for name, some in policies.items()}
-
-
-def shipped_agent(name: str) -> Contender:
-    """The shipped agent of that name, with all its training seeds."""
-    from cz_gym.agents import OnnxPolicy, shipped_seeds
-
-    return _agent(name, [OnnxPolicy.load(file) for file in shipped_seeds(name)])
-
-
-def _agent(name: str, policies: Sequence[Any], own: bool = False) -> Contender:
-    from cz_gym.evaluation.contenders import agent
-
-    return agent(name, policies, own)
+    return {name: agent(name, some, own=True) for name, some in policies.items()}
 
 
 def left_out(contenders: Sequence[Contender]) -> list[str]:

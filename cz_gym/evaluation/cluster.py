@@ -58,38 +58,31 @@ def connect(address: str) -> None:
 
 
 @cache
-def facts_of_sources() -> tuple[str, str, str]:
+def software_here() -> str:
     """Version of ``cz_gym``, hash of all its sources, and the versions of :data:`NUMBERS`."""
     specs = [find_spec(name) for name in ("cz_gym", "cz_gym.agents", "cz_gym.baselines")]
-    folders = [Path(str(spec.origin)).parent for spec in specs if spec]
-    sources = [hash_files(sorted(folder.rglob("*.py")), folder)[:12] for folder in folders]
-    return cz_gym.__version__, "-".join(sources), " ".join(map(version, NUMBERS))
+    files = [file for spec in specs for file in sorted(Path(str(spec and spec.origin)).parent.rglob("*.py"))]
+    return " ".join([cz_gym.__version__, hash_files(files), *map(version, NUMBERS)])
 
 
-def _same_sources(ours: tuple[str, str, str], function: Callable[[Any], Any], task: Any) -> Any:
+def _same_sources(ours: str, function: Callable[[Any], Any], task: Any) -> Any:
     """Run a task; CzError on a node with another ``cz_gym`` or other :data:`NUMBERS`, whenever it joined."""
-    if (theirs := facts_of_sources()) != ours:
-        node, told = socket.gethostname(), " ".join(theirs)
-        raise CzError(f"node {node} has cz_gym {told}, this machine {' '.join(ours)}: install the same")
+    if (theirs := software_here()) != ours:
+        raise CzError(f"node {socket.gethostname()} has cz_gym {theirs}, this machine {ours}: install the same")
     return function(task)
 
 
 def check_shared(folder: Path) -> None:
     """Raise CzError for a node that does not see what is written into a folder here."""
-    with tempfile.NamedTemporaryFile(dir=folder) as file:
-        for node, sees in _who_sees(file.name):
-            if not sees:
-                raise CzError(f"node {node} does not see {folder}: it must be on a file system that all nodes share")
-
-
-def _who_sees(file: str) -> Iterator[tuple[str, bool]]:
-    """Address of every node, and whether it sees a file."""
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy as On
 
-    for node in (node for node in ray.nodes() if node["Alive"]):
-        there = ray.remote(os.path.exists).options(num_cpus=0, scheduling_strategy=On(node["NodeID"], soft=False))
-        yield node["NodeManagerAddress"], ray.get(there.remote(file))
+    with tempfile.NamedTemporaryFile(dir=folder) as file:
+        for node in (node for node in ray.nodes() if node["Alive"]):
+            there = ray.remote(os.path.exists).options(num_cpus=0, scheduling_strategy=On(node["NodeID"], soft=False))
+            if not ray.get(there.remote(file.name)):
+                place = node["NodeManagerAddress"]
+                raise CzError(f"node {place} does not see {folder}: it must be on a file system that all nodes share")
 
 
 def completed(
@@ -105,7 +98,7 @@ def completed(
         if name.startswith(PREFIX):  # other machines do not have the user's files
             ray.cloudpickle.register_pickle_by_value(module)
     remote: Any = ray.remote(_same_sources).options(num_cpus=1, max_retries=RETRIES)
-    ours = facts_of_sources()
+    ours = software_here()
     numbers = {remote.remote(ours, function, task): number for number, task in enumerate(tasks)}
     while numbers:
         done, _ = ray.wait(list(numbers), timeout=WAIT)

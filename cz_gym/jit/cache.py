@@ -1,10 +1,9 @@
 """Compiled code on disk: one file a function and signature, checked before it is used.
 
 numba keeps an index beside numbered files. Two processes that compile at once, or one that is killed between the two
-writes, can leave an index that names the code of another signature, which then runs on arguments it was not made for;
-and a file cut short raises wherever it is read. Here a file is named by what it was compiled for, says so itself,
-carries the hash of its contents and is replaced whole: any other is compiled again. It is code all the same, to be
-trusted as ``__pycache__`` is.
+writes, can leave an index that names the code of another signature, which then runs on arguments it was not made for.
+Here a file is named by the types that it was compiled for, repeats them inside, and is replaced whole; code that cannot
+be loaded is compiled again. A file is trusted as those of ``__pycache__`` are.
 """
 
 from __future__ import annotations
@@ -25,6 +24,9 @@ import llvmlite
 import numba
 import numpy as np
 
+from cz_gym.atomic_files import write_files
+from cz_gym.errors import CzError
+
 from .code_hash import hash_files
 
 PACKAGE = Path(__file__).parents[1]
@@ -44,7 +46,6 @@ def private(module: str, name: str) -> Any:
 
 FunctionCache: Any = private("core.caching", "FunctionCache") or object
 dumps: Any = private("core.serialize", "dumps")
-DIGEST = hashlib.sha256().digest_size
 
 
 def compiled_sources(folder: Path | None = None) -> list[Path]:
@@ -56,8 +57,7 @@ def compiled_sources(folder: Path | None = None) -> list[Path]:
 
 def source_hash(folder: Path | None = None) -> str:
     """SHA-256 of the names and contents of :func:`compiled_sources` (32 hex digits)."""
-    folder = folder or PACKAGE
-    return hash_files(compiled_sources(folder), folder)
+    return hash_files(compiled_sources(folder))
 
 
 @cache
@@ -103,29 +103,17 @@ class Store:
         return self.folder / f"{self.name}.{hashlib.sha256(repr(key).encode()).hexdigest()[:32]}.code"
 
     def load(self, key: Any) -> Any:
-        """The code saved for this key; None if there is none or its file is damaged."""
+        """The code saved for this key; None if there is none. A damaged file raises pickle's errors."""
         try:
-            content = self.path(key).read_bytes()
+            made_for, data = pickle.loads(self.path(key).read_bytes())
         except OSError:
             return None
-        if hashlib.sha256(content[DIGEST:]).digest() != content[:DIGEST]:
-            return None
-        made_for, data = pickle.loads(content[DIGEST:])
         return data if made_for == key else None
 
     def save(self, key: Any, data: Any) -> None:
         """Save code if the disk has room; without room it is compiled again next time."""
-        content: bytes = dumps((key, data))
-        temporary = None
-        try:
-            handle, temporary = tempfile.mkstemp(dir=self.folder, prefix=".code-")
-            with os.fdopen(handle, "wb") as file:
-                file.write(hashlib.sha256(content).digest() + content)
-            os.replace(temporary, self.path(key))
-        except OSError:
-            if temporary is not None:
-                with suppress(OSError):
-                    os.unlink(temporary)
+        with suppress(CzError):
+            write_files({self.path(key): dumps((key, data))})
 
 
 class CachedCode(FunctionCache):  # type: ignore[misc]

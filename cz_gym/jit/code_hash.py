@@ -31,8 +31,8 @@ def function_hash(*functions: Callable[..., Any]) -> str:
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
-def hash_files(files: Iterable[Path], root: Path, code_only: bool = False) -> str:
-    """SHA-256 of the files' names below ``root`` and of their contents (32 hex digits).
+def hash_files(files: Iterable[Path], code_only: bool = False) -> str:
+    """SHA-256 of the files' names, with their folder's, and contents (32 hex digits).
 
     With ``code_only`` a Python file counts as its syntax tree without docstrings: an edit of text changes nothing.
     """
@@ -41,7 +41,7 @@ def hash_files(files: Iterable[Path], root: Path, code_only: bool = False) -> st
         content = file.read_bytes()
         if code_only and file.suffix == ".py":
             content = json.dumps(_tree(ast.parse(content))).encode()
-        digest.update(file.relative_to(root).as_posix().encode() + b"\0" + content + b"\0")
+        digest.update(f"{file.parent.name}/{file.name}".encode() + b"\0" + content + b"\0")
     return digest.hexdigest()[:32]
 
 

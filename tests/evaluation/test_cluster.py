@@ -77,9 +77,9 @@ def test_without_a_cluster_there_is_one_line(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_a_node_with_other_sources_does_nothing() -> None:
-    assert cluster._same_sources(cluster.facts_of_sources(), abs, -1) == 1
+    assert cluster._same_sources(cluster.software_here(), abs, -1) == 1
     with pytest.raises(CzError, match=r"has cz_gym 0\.1\.0 .*, this machine 0\.0\.0 elsewhere 1\.26: install the same"):
-        cluster._same_sources(("0.0.0", "elsewhere", "1.26"), abs, -1)
+        cluster._same_sources("0.0.0 elsewhere 1.26", abs, -1)
 
 
 def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -102,7 +102,7 @@ def test_of_files_code_counts_and_text_does_not(tmp_path: Path) -> None:
     module, hashes = tmp_path / "thing.py", []
     for text in ('"""A."""\nx = 1\n"""B."""\n', '"""C."""\n# why\nx = (\n    1\n)\n', "x = 2\n"):
         module.write_text(text)
-        hashes.append([hash_files([module], tmp_path, code_only) for code_only in (True, False)])
+        hashes.append([hash_files([module], code_only) for code_only in (True, False)])
     assert hashes[0][0] == hashes[1][0] != hashes[2][0]
     assert len({each for _, each in hashes}) == 3
-    assert hash_files([module], tmp_path) != hash_files([module.rename(tmp_path / "other.py")], tmp_path)
+    assert hash_files([module]) != hash_files([module.rename(tmp_path / "other.py")])

@@ -62,15 +62,13 @@ def test_changed_physics_is_never_run_from_an_old_cache(package: Path, tmp_path:
 
 @pytest.mark.slow
 def test_damaged_code_is_compiled_again(tmp_path: Path) -> None:
-    """Changed in one bit; cut short and overwritten: ``tests/stress/test_fuzz.py``."""
     cache = tmp_path / "cache"
     folder, height, _ = run(DERIVE, ROOT, cache)
     (file,) = Path(folder).rglob("*derive*.code")
-    whole = file.read_bytes()
-    file.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    file.write_bytes(file.read_bytes()[:1000])
     assert run(DERIVE, ROOT, cache) == [folder, height, "0"]
     assert run(DERIVE, ROOT, cache) == [folder, height, "1"]
-    assert not list(Path(folder).rglob(".code-*"))
+    assert not list(Path(folder).rglob("*.new"))
 
 
 def test_code_for_other_types_is_not_used(tmp_path: Path) -> None:
@@ -88,7 +86,7 @@ def test_a_full_disk_keeps_nothing_and_fails_nothing(tmp_path: Path, monkeypatch
     def full(*arguments: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("cz_gym.jit.cache.os.replace", full)
+    monkeypatch.setattr("cz_gym.atomic_files.os.replace", full)
     store = Store(tmp_path, "kernel")
     store.save("floats", 1)
     assert store.load("floats") is None

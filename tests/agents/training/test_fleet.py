@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 from tqdm import tqdm
@@ -172,7 +173,11 @@ def test_impossible_arguments_exit_with_2(arguments: list[str], message: str, re
 
 
 def test_a_node_that_does_not_see_the_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "_who_sees", lambda file: [("10.0.0.1", True), ("10.0.0.2", False)])
+    ray = pytest.importorskip("ray")
+    node = {"Alive": True, "NodeID": "0" * 56, "NodeManagerAddress": "10.0.0.2"}
+    monkeypatch.setattr(ray, "nodes", lambda: [node])
+    monkeypatch.setattr(ray, "remote", MagicMock())
+    monkeypatch.setattr(ray, "get", lambda reference: False)
     with pytest.raises(ValueError, match=r"^node 10\.0\.0\.2 does not see .*: it must be on a file system that all"):
         cluster.check_shared(tmp_path)
 
