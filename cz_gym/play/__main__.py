@@ -35,23 +35,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "Keys: up and down the pull speed, right and left the heater (with shift: in large steps), space starts "
         "and pauses, + and - change the speed of time, R begins again, N takes the next crystal, H shows help, Q ends.",
     )
-    parser.add_argument("--scenario", default="randomized", metavar="NAME", help="scenario (%(default)s)")
-    parser.add_argument(
-        "--seed", type=between(0, 2**63 - 1), default=1, metavar="N", help="which crystal (%(default)s)"
-    )
-    parser.add_argument(
-        "--speed", type=float, default=60.0, metavar="FACTOR", help="times faster than real (%(default)g)"
-    )
-    parser.add_argument("--minutes", type=float, default=180.0, metavar="M", help="length of the run (%(default)g)")
+    add = parser.add_argument
+    add("--scenario", default="randomized", metavar="NAME", help="scenario (%(default)s)")
+    add("--seed", type=between(0, 2**63 - 1), default=1, metavar="N", help="which crystal (%(default)s)")
+    add("--speed", type=between(SLOWEST, FASTEST), default=60, metavar="N", help="times faster than real (%(default)s)")
+    add("--minutes", type=between(1, 6000), default=180, metavar="M", help="length of the run (%(default)s)")
     return parser.run(_play, arguments, "render")
 
 
 def settings(arguments: argparse.Namespace) -> Config:
-    """The environment's settings; CzError names what was given and what is allowed."""
-    if not SLOWEST <= arguments.speed <= FASTEST:
-        raise CzError(f"--speed must be {SLOWEST:g} to {FASTEST:g}, not {arguments.speed:g}")
-    if not 1.0 <= arguments.minutes <= 6000.0:
-        raise CzError(f"--minutes must be 1 to 6000, not {arguments.minutes:g}")
+    """The environment's settings."""
     return make_config(arguments.scenario, horizon=arguments.minutes * MINUTE)
 
 

@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from cz_gym.config import Config
 from cz_gym.env import CzEnv
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.replay import Playback
+from cz_gym.evaluation.rollout import rollout
 from cz_gym.rendering import palette
-from cz_gym.rendering.backend import load
-from cz_gym.rendering.canvas import TIMES, Box, Canvas, Frame
-from cz_gym.rendering.numbers_panel import SetPoints
+from cz_gym.rendering.canvas import TIMES, Box, Canvas, Frame, load
 from cz_gym.rendering.record import Record
-from cz_gym.rendering.scene import Scene
+from cz_gym.rendering.scene import Scene, SetPoints
 from cz_gym.rendering.view import FPS, Window, record_of
 from cz_gym.task import HEATER_RANGE
-from cz_gym.units import KILO, MM_PER_MIN
+from cz_gym.units import KILO, MINUTE, MM_PER_MIN
 
-from .score import Result, Score, score
-
-SLOWEST, FASTEST = 1.0, 3600.0
+SLOWEST, FASTEST = 1, 3600
 """Limits of the speed of time: seconds of growth a second of watching."""
 PULL_STEP, HEATER_STEP = 0.01 * MM_PER_MIN, 0.1 * KILO
 """Changes of the pull speed [m/s] and of the heater [W] by a key; with shift ten times as large."""
@@ -35,6 +35,48 @@ HELP = (
     ("R  N", "this crystal again, the next crystal"),
     ("H  Q", "help, end"),
 )
+
+
+class Result(NamedTuple):
+    """The result of one episode."""
+
+    rmse_mm: float
+    """RMSE of the true radius [mm], as the benchmark counts it."""
+    reward: float
+    """Return: the sum of rewards [-]."""
+    failed: bool
+
+
+class Score(NamedTuple):
+    """The results of player and controller on the same crystal over the same time."""
+
+    scenario: str
+    seed: int
+    minutes: float
+    player: Result
+    controller: Result
+
+    def line(self) -> str:
+        """The score in one line."""
+        both = zip((self.player, self.controller), ("by hand", "by the paper's controller"), strict=True)
+        errors = (f"{one.rmse_mm:.3f} mm {who}{' (failed)' if one.failed else ''}" for one, who in both)
+        return (
+            f"{self.scenario}, crystal {self.seed}, {self.minutes:.0f} min: "
+            f"RMSE of the true radius {', '.join(errors)}; "
+            f"return {self.player.reward:,.1f} and {self.controller.reward:,.1f}"
+        )
+
+
+def score(config: Config, seed: int, actions: Sequence[npt.NDArray[np.float32]], failed: bool, rival: Any) -> Score:
+    """The score of a player's actions, each of shape (2,), and of a controller.
+
+    A run that the player left early ends there for both. A failed one counts to the horizon, as in the benchmark.
+    """
+    if not failed:
+        config = replace(config, horizon=len(actions) * config.control_interval)
+    found = (metrics(rollout(policy, config, [seed])) for policy in (Playback(actions), rival))
+    results = (Result(float(one.rmse_mm[0]), float(one.return_[0]), bool(one.failure_rate[0])) for one in found)
+    return Score(config.scenario.name, seed, config.horizon / MINUTE, *results)
 
 
 class Game:
@@ -118,10 +160,8 @@ class Game:
 
     def step(self) -> None:
         """Hold the set-points for one control interval."""
-        p = self.record.puller
-        action = np.array(
-            [self.set_points.v_p / p.v_0 - 1.0, (self.set_points.Q_H - p.Q_H_0) / HEATER_RANGE], np.float32
-        )
+        p, (v_p, Q_H) = self.record.puller, self.set_points
+        action = np.array([v_p / p.v_0 - 1.0, (Q_H - p.Q_H_0) / HEATER_RANGE], np.float32)
         self.actions.append(action.clip(-1.0, 1.0))
         _, _, terminated, truncated, _ = self.env.step(self.actions[-1])
         if terminated or truncated:
@@ -139,13 +179,15 @@ class Game:
 
     def _overlay(self, canvas: Canvas) -> None:
         """Help, pause and score on top of the picture."""
-        unit, box = canvas.unit, self.scene.layout.numbers
-        y = box.bottom - 18 * unit
-        canvas.text(box.x + 8 * unit, y, f"time {TIMES}{self.speed:.0f}", colour=palette.FAINT)
-        canvas.text(box.right - 8 * unit, y, "H: help", colour=palette.FAINT, anchor="right")
+        box = self.scene.layout.numbers
+        canvas.text(box.x + 8, box.bottom - 18, f"time {TIMES}{self.speed:.0f}", palette.FAINT)
+        canvas.text(box.right - 8, box.bottom - 18, "H: help", palette.FAINT, anchor=1.0)
         if self.score is not None:
-            both = (("you", self.score.player), ("paper", self.score.controller))
-            rows = tuple((name, _in_words(result)) for name, result in sorted(both, key=lambda one: one[1].rmse_mm))
+            both = sorted([(self.score.player, "you"), (self.score.controller, "paper")])  # by the error
+            rows = tuple(
+                (name, f"RMSE {rmse:.3f} mm    return {reward:,.0f}{'    failed' if failed else ''}")
+                for (rmse, reward, failed), name in both
+            )
             _draw_card(canvas, "The run is over: least error first", rows, "R: again   N: next crystal   Q: end")
         elif self.helping:
             _draw_card(canvas, "Pull a crystal by hand", HELP, "hold the radius on its reference; space starts")
@@ -155,22 +197,15 @@ class Game:
 
 def _draw_card(canvas: Canvas, title: str, rows: tuple[tuple[str, str], ...], foot: str) -> None:
     """A card of a title, rows and a last line in the picture's middle."""
-    unit = canvas.unit
-    width, height = 330.0 * unit, (62.0 + 18.0 * len(rows)) * unit
-    box = Box((canvas.width - width) / 2.0, (0.66 * canvas.height - height) / 2.0, width, height)
-    canvas.rectangle(palette.RIM, box.inner(-2 * unit, -2 * unit, -2 * unit, -2 * unit))
+    width, height = 330.0, 62.0 + 18.0 * len(rows)
+    box = Box((canvas.box.w - width) / 2.0, (0.66 * canvas.box.h - height) / 2.0, width, height)
+    canvas.rectangle(palette.RIM, box.inner(-2.0, -2.0, -2.0, -2.0))
     canvas.rectangle(palette.BACK, box)
-    canvas.text(box.x + 16 * unit, box.y + 11 * unit, title, 14, bold=True)
+    canvas.text(box.x + 16, box.y + 11, title, size=14, bold=True)
     for i, (left, right) in enumerate(rows):
-        y = box.y + (36.0 + 18.0 * i) * unit
-        canvas.text(box.x + 16 * unit, y, left, 11, palette.CAMERA, bold=True)
-        canvas.text(box.x + 76 * unit, y, right, 11)
-    canvas.text(box.x + 16 * unit, box.bottom - 22 * unit, foot, 10, palette.FAINT)
-
-
-def _in_words(result: Result) -> str:
-    failed = "    failed" if result.failed else ""
-    return f"RMSE {result.rmse_mm:.3f} mm    return {result.reward:,.0f}{failed}"
+        canvas.text(box.x + 16, box.y + 36 + 18 * i, left, palette.CAMERA, 11, bold=True)
+        canvas.text(box.x + 76, box.y + 36 + 18 * i, right, size=11)
+    canvas.text(box.x + 16, box.bottom - 22, foot, palette.FAINT, 10)
 
 
 def _keys() -> dict[int, Callable[[Game, float], None]]:

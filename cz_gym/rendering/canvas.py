@@ -1,38 +1,55 @@
-"""A canvas of shapes and text at twice the picture's resolution; the mean of four pixels gives smooth edges."""
+"""A canvas of shapes and text: pygame draws at twice the picture's resolution, so that its mean has smooth edges."""
 
 from __future__ import annotations
 
+import contextlib
+import importlib
+import importlib.util
+import io
+import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium.error import DependencyNotInstalled
 
-from cz_gym.jit.compile import kernel
-
-from .backend import load
 from .palette import BACK, INK, PANEL, Colour
 
-if TYPE_CHECKING:
-    from pygame import Surface
-
 Frame = npt.NDArray[np.uint8]
+MISSING = 'rendering needs pygame: pip install ".[render]"'
 FINE = 2
-"""Drawn pixels along each side of a pixel of the picture, which is their mean."""
+"""Drawn pixels along each side of a pixel of the picture."""
 FONTS = Path(__file__).parent / "fonts"
 TIMES = "\N{MULTIPLICATION SIGN}"
 BASE = (640, 480)
-"""Width and height [px] at which text and lines have their nominal size."""
+"""Width and height of a picture whose pixels are nominal ones."""
+FAR = 20_000.0
+"""Drawn pixels beyond which points are clipped, because pygame's integers would overflow."""
 
 
-_TWO = np.uint32(2)
+def available() -> bool:
+    """Whether pygame can be found."""
+    return importlib.util.find_spec("pygame") is not None
+
+
+def load() -> Any:
+    """The pygame module, loaded without its greeting and warnings when the first picture is drawn.
+
+    Raises :class:`gymnasium.error.DependencyNotInstalled` where it is missing.
+    """
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return importlib.import_module("pygame")
+    except ImportError:
+        raise DependencyNotInstalled(MISSING) from None
 
 
 class Box(NamedTuple):
-    """A rectangle of the picture [px]; y runs down."""
+    """A rectangle of the picture [nominal px]; y runs down."""
 
     x: float
     y: float
@@ -50,23 +67,23 @@ class Box(NamedTuple):
         return self.y + self.h
 
     def inner(self, left: float, top: float, right: float, bottom: float) -> Box:
-        """The box without margins of these widths [px]."""
+        """The box without margins of these widths [nominal px]."""
         return Box(self.x + left, self.y + top, self.w - left - right, self.h - top - bottom)
 
 
 class Canvas:
-    """A picture of a given width and height [px]. Coordinates are pixels of the picture, as floats.
+    """A picture of a given width and height [px].
 
-    Widths of lines and sizes of text are in nominal pixels: :attr:`unit` pixels of the picture each.
+    Coordinates, widths of lines and sizes of text are in nominal pixels: the picture is a ``box`` of at least BASE.
     """
 
     def __init__(self, width: int, height: int) -> None:
-        self.pygame = load()
-        self.width, self.height = width, height
+        self.pygame, self._size = load(), (width, height)
         self.unit = min(width / BASE[0], height / BASE[1])
-        self._fine: Surface = self.pygame.Surface((FINE * width, FINE * height), 0, 32)
+        self.box = Box(0.0, 0.0, width / self.unit, height / self.unit)
+        self._fine = self.pygame.Surface((FINE * width, FINE * height), 0, 32)
 
-    def begin(self, panels: tuple[Box, ...]) -> None:
+    def begin(self, *panels: Box) -> None:
         """Begin a new picture with these panels on it."""
         self._fine.fill(BACK)
         for box in panels:
@@ -74,15 +91,14 @@ class Canvas:
 
     def finish(self) -> Frame:
         """The picture, shape (height, width, 3), an array of the caller's own."""
-        frame = np.empty((self.height, self.width, 3), np.uint8)
-        rows = np.asarray(self._fine.get_view("2")).T
-        _mean_of_four(rows.view(np.uint8).reshape(*rows.shape, 4), frame)
-        return frame
+        picture = self.pygame.transform.smoothscale(self._fine, self._size)
+        pixels = bytearray(self.pygame.image.tostring(picture, "RGB"))
+        return np.frombuffer(pixels, np.uint8).reshape(*self._size[::-1], 3)
 
-    @contextmanager
+    @contextlib.contextmanager
     def clip(self, box: Box) -> Iterator[None]:
         """Draw inside the box only."""
-        self._fine.set_clip(_fine_box(box))
+        self._fine.set_clip(self._rectangle(box))
         try:
             yield
         finally:
@@ -90,69 +106,47 @@ class Canvas:
 
     def rectangle(self, colour: Colour, box: Box) -> None:
         """A filled rectangle."""
-        self._fine.fill(colour, _fine_box(box))
+        self._fine.fill(colour, self._rectangle(box))
 
-    def polygon(self, colour: Colour, points: npt.ArrayLike) -> None:
-        """A filled polygon, points of shape (n, 2); nothing for fewer than three."""
-        fine = _fine_points(points)
-        if len(fine) > 2:
-            self.pygame.draw.polygon(self._fine, colour, fine)
+    def polygon(self, colour: Colour, x: npt.ArrayLike, y: npt.ArrayLike) -> None:
+        """A filled polygon; nothing for fewer than three points."""
+        points = self._points(x, y)
+        if len(points) > 2:
+            self.pygame.draw.polygon(self._fine, colour, points)
 
-    def lines(self, colour: Colour, points: npt.ArrayLike, width: float = 1.5) -> None:
-        """Straight lines from point to point, shape (n, 2); nothing for a single point."""
-        fine = _fine_points(points)
-        if len(fine) > 1:
-            self.pygame.draw.lines(self._fine, colour, False, fine, self._thickness(width))
+    def lines(self, colour: Colour, x: npt.ArrayLike, y: npt.ArrayLike, width: float = 1.0) -> None:
+        """Straight lines from point to point; nothing for a single point."""
+        points = self._points(x, y)
+        if len(points) > 1:
+            self.pygame.draw.lines(self._fine, colour, False, points, max(1, self._fine_pixels(width)))
 
-    def dot(self, colour: Colour, at: tuple[float, float], radius: float) -> None:
+    def dot(self, colour: Colour, x: float, y: float, radius: float) -> None:
         """A filled circle."""
-        centre = (round(at[0] * FINE), round(at[1] * FINE))
-        self.pygame.draw.circle(self._fine, colour, centre, self._thickness(radius))
+        self.pygame.draw.circle(self._fine, colour, [*map(self._fine_pixels, (x, y))], self._fine_pixels(radius))
 
     def text(
-        self,
-        x: float,
-        y: float,
-        text: str,
-        size: float = 9.5,
-        colour: Colour = INK,
-        anchor: str = "left",
+        self, x: float, y: float, text: str, colour: Colour = INK, size: float = 9.5, anchor: float = 0.0,
         bold: bool = False,
-    ) -> None:
-        """Text whose top is at y and whose left, centre or right (``anchor``) is at x."""
+    ) -> None:  # fmt: skip
+        """Text whose top is at y; x is at its left, or at the share ``anchor`` of its width: 0.5 centre, 1 right."""
         image = _text(text, FINE * max(7, round(size * self.unit)), colour, bold)
-        left = {"left": 0.0, "centre": 0.5, "right": 1.0}[anchor] * image.get_width()
-        self._fine.blit(image, (round(FINE * x - left), round(FINE * y)))
+        left, top = self._fine_pixels(x), self._fine_pixels(y)
+        self._fine.blit(image, (left - round(anchor * image.get_width()), top))
 
-    def _thickness(self, width: float) -> int:
-        """A width in nominal pixels as drawn pixels."""
-        return max(1, round(width * self.unit * FINE))
+    def _fine_pixels(self, length: float) -> int:
+        """A length or coordinate in drawn pixels."""
+        return round(length * self.unit * FINE)
 
+    def _rectangle(self, box: Box) -> tuple[int, int, int, int]:
+        left, top, right, bottom = map(self._fine_pixels, (box.x, box.y, box.right, box.bottom))
+        return left, top, right - left, bottom - top
 
-def _mean(fine: Any, frame: Any) -> None:
-    """Each pixel becomes the rounded mean of four: (2 h, 2 w, 4) of blue, green, red and nothing, to (h, w, 3)."""
-    for i in range(frame.shape[0]):
-        for j in range(frame.shape[1]):
-            for channel in range(3):
-                total = _TWO
-                for k in range(4):
-                    total += np.uint32(fine[2 * i + k // 2, 2 * j + k % 2, 2 - channel])
-                frame[i, j, channel] = total >> _TWO
-
-
-_mean_of_four = kernel(_mean)
-
-
-def _fine_box(box: Box) -> tuple[int, int, int, int]:
-    left, top = round(box.x * FINE), round(box.y * FINE)
-    return left, top, round(box.right * FINE) - left, round(box.bottom * FINE) - top
-
-
-def _fine_points(points: npt.ArrayLike) -> list[list[float]]:
-    """Points as pygame takes them; those far outside are clipped, because its integers would overflow."""
-    scaled = np.asarray(points) * float(FINE)
-    fine: list[list[float]] = np.minimum(np.maximum(scaled, -20_000.0), 20_000.0).tolist()
-    return fine
+    def _points(self, x: npt.ArrayLike, y: npt.ArrayLike) -> list[list[float]]:
+        """Points of coordinates that broadcast to one axis, as pygame takes them."""
+        points = np.empty((np.broadcast(x, y).size, 2))
+        points[:, 0], points[:, 1] = x, y
+        fine: list[list[float]] = np.clip(points * (self.unit * FINE), -FAR, FAR).tolist()
+        return fine
 
 
 @lru_cache(maxsize=8)

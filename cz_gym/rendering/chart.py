@@ -11,10 +11,13 @@ from cz_gym.units import HOUR, MINUTE, MM
 
 from . import palette
 from .canvas import Box, Canvas
-from .geometry import TOLERANCE, Floats, error_range, first_at_least, paired
 from .palette import Colour
-from .record import Record
+from .record import Floats, Record
 
+RANGES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+"""Half widths of an axis of radius errors [mm]."""
+TOLERANCE = 0.5 * MM
+"""Half width of the shaded band around no error [m]: the benchmark's tolerance."""
 TICKS = (1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0)
 """Steps of the time axis [min]."""
 MARGINS = (38.0, 18.0, 10.0, 14.0)
@@ -30,15 +33,26 @@ class Trace(NamedTuple):
     width: float = 1.7
 
 
+def first_at_least(value: float, steps: Sequence[float]) -> float:
+    """The first of increasing steps that is at least a value, or the last."""
+    return next((step for step in steps if step >= value), steps[-1])
+
+
+def error_range(*errors: Floats) -> float:
+    """Half width of an axis on which all these radius errors fit [m]; NaN does not count."""
+    largest = max(float(np.nanmax(np.abs(error), initial=0.0)) for error in errors)
+    return first_at_least(1.1 * largest / MM, RANGES) * MM
+
+
 def draw(canvas: Canvas, box: Box, record: Record) -> None:
     """The radius error by the camera, and the true one."""
     camera, true = Trace(record.t, record.camera_error, palette.NOISE, 0.8), Trace(record.t, record.error, palette.TRUE)
     # The camera's outliers must not set the scale.
     draw_traces(canvas, box, record.config.horizon, error_range(true.error), [camera, true])
-    x, y = box.x + 38 * canvas.unit, box.y + 4 * canvas.unit
-    canvas.text(x, y, "radius error [mm]", colour=palette.FAINT)
-    canvas.text(x + 98 * canvas.unit, y, "by the camera", colour=palette.CAMERA)
-    canvas.text(x + 182 * canvas.unit, y, "true", colour=palette.TRUE)
+    for x, text, colour in (
+        (38, "radius error [mm]", palette.FAINT), (136, "by the camera", palette.CAMERA), (220, "true", palette.TRUE),
+    ):  # fmt: skip
+        canvas.text(box.x + x, box.y + 4, text, colour)
 
 
 def draw_traces(canvas: Canvas, box: Box, horizon: float, limit: float, traces: Sequence[Trace]) -> None:
@@ -46,38 +60,31 @@ def draw_traces(canvas: Canvas, box: Box, horizon: float, limit: float, traces: 
 
     A dot is the newest value of the last trace.
     """
-    unit = canvas.unit
-    plot = box.inner(*(margin * unit for margin in MARGINS))
-
-    def placed(trace: Trace) -> Floats:
-        return paired(plot.x + trace.t / horizon * plot.w, plot.y + (0.5 - 0.5 * trace.error / limit) * plot.h)
-
-    band = min(TOLERANCE / limit, 1.0) * plot.h
-    canvas.rectangle(palette.BAND, Box(plot.x, plot.y + 0.5 * (plot.h - band), plot.w, band))
+    plot = box.inner(*MARGINS)
+    middle, per_metre = plot.y + 0.5 * plot.h, 0.5 * plot.h / limit
+    band = min(TOLERANCE, limit) * per_metre
+    canvas.rectangle(palette.BAND, Box(plot.x, middle - band, plot.w, 2.0 * band))
     _draw_time_axis(canvas, plot, horizon)
-    for share, text in ((0.0, f"{limit / MM:+g}"), (0.5, "0"), (1.0, f"{-limit / MM:+g}")):
-        y = plot.y + share * plot.h
-        canvas.lines(palette.RIM, [(plot.x, y), (plot.right, y)], 0.6)
-        canvas.text(plot.x - 4 * unit, y - 6 * unit, text, 9.0, palette.FAINT, "right")
+    for y, text in ((plot.y, f"{limit / MM:+g}"), (middle, "0"), (plot.bottom, f"{-limit / MM:+g}")):
+        canvas.lines(palette.RIM, [plot.x, plot.right], y, 0.6)
+        canvas.text(plot.x - 4, y - 6, text, palette.FAINT, 9.0, 1.0)
     with canvas.clip(plot):
         for trace in traces:
-            points = placed(trace)
-            gaps = np.flatnonzero(np.isnan(trace.error))
-            for piece in np.split(points, gaps):
-                canvas.lines(trace.colour, piece[np.isfinite(piece[:, 1])], trace.width)
-    x, y = placed(traces[-1])[-1].tolist()
-    if np.isfinite(y):
-        canvas.dot(traces[-1].colour, (x, min(max(y, plot.y), plot.bottom)), 2.6)
+            x, y_line = plot.x + trace.t / horizon * plot.w, middle - trace.error * per_metre
+            for piece in np.split(np.arange(len(x)), np.flatnonzero(np.isnan(y_line))):
+                piece = piece[np.isfinite(y_line[piece])]
+                canvas.lines(trace.colour, x[piece], y_line[piece], trace.width)
+    if np.isfinite(y_line[-1]):
+        canvas.dot(traces[-1].colour, x[-1], min(max(y_line[-1], plot.y), plot.bottom), 2.6)
 
 
 def _draw_time_axis(canvas: Canvas, plot: Box, horizon: float) -> None:
-    unit, y = canvas.unit, plot.bottom + 2 * canvas.unit
-    step = first_at_least(horizon / MINUTE / 9.0, TICKS) * MINUTE
+    y, step = plot.bottom + 2, first_at_least(horizon / MINUTE / 9.0, TICKS) * MINUTE
     for number in range(int(horizon / step + 1e-9) + 1):
         x = plot.x + number * step / horizon * plot.w
-        canvas.lines(palette.RIM, [(x, plot.y), (x, plot.bottom)], 0.6)
-        if x < plot.right - 46 * unit:
+        canvas.lines(palette.RIM, x, [plot.y, plot.bottom], 0.6)
+        if x < plot.right - 46:
             hours, minutes = divmod(round(number * step / MINUTE), 60)
             # The first one, centred, would touch the lowest number of the other axis.
-            canvas.text(x, y, f"{hours}:{minutes:02d}", 9.0, palette.FAINT, "centre" if number else "left")
-    canvas.text(plot.right, y, f"{horizon / HOUR:.3g} h", 9.0, palette.FAINT, "right")
+            canvas.text(x, y, f"{hours}:{minutes:02d}", palette.FAINT, 9.0, 0.5 if number else 0.0)
+    canvas.text(plot.right, y, f"{horizon / HOUR:.3g} h", palette.FAINT, 9.0, 1.0)

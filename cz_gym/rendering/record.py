@@ -46,8 +46,7 @@ class Record:
         row[:-1], row[-1] = info, valid
         self._count += 1
         if terminated:
-            error, h_c = float(self.error[-1]), self.last("h_c")
-            self.ending = how_it_failed(h_c, error, self.puller.a)
+            self.ending = how_it_failed(self.last("h_c"), float(self.error[-1]), self.puller.a)
         elif truncated:
             self.ending = Ending.HORIZON
 

@@ -3,58 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from numbers import Integral
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from cz_gym.errors import CzError
-from cz_gym.units import HOUR, MINUTE, MM
+import numpy as np
 
-from . import chart, numbers_panel, palette, puller_panel, triple_point
-from .canvas import BASE, Box, Canvas, Frame
-from .numbers_panel import SetPoints
+from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
+
+from . import chart, palette, puller_panel, triple_point
+from .canvas import Box, Canvas, Frame
+from .palette import Colour
 from .record import Ending, Record
 
-SMALLEST, LARGEST = 360, 3840
-"""Fewest and most pixels along a side."""
+
+class SetPoints(NamedTuple):
+    """What a player asks of the drives."""
+
+    v_p: float
+    """Pull speed [m/s]."""
+    Q_H: float
+    """Heater power [W]."""
 
 
 class Layout(NamedTuple):
     """The boxes of the panels."""
 
-    header: Box
     puller: Box
     triple_point: Box
     numbers: Box
     chart: Box
 
 
-def check_size(size: Any) -> tuple[int, int]:
-    """Width and height of a picture [px]; CzError names what was given and what is allowed."""
-    try:
-        width, height = size
-        numbers = all(isinstance(side, Integral) and not isinstance(side, bool) for side in (width, height))
-        fits = numbers and min(width, height) >= SMALLEST and max(width, height) <= LARGEST
-    except (TypeError, ValueError):
-        fits = False
-    if not fits:
-        raise CzError(
-            f"render_size must be (width, height), whole numbers of {SMALLEST} to {LARGEST} pixels, not {size!r}"
-        )
-    return int(width), int(height)
-
-
-def layout(width: int, height: int) -> Layout:
-    """The panels of a picture of that size; the triple point gets what the others leave."""
-    unit = min(width / BASE[0], height / BASE[1])
-    gap, side, head, column, below = 6.0 * unit, 188.0 * unit, 28.0 * unit, 150.0 * unit, 0.24 * height
-    top = head + gap
-    main = height - top - below - 2.0 * gap
+def layout(box: Box) -> Layout:
+    """The panels of a picture; the triple point gets what the others leave."""
+    top, below = 34.0, 0.24 * box.h
+    main = box.h - top - below - 12.0
     return Layout(
-        header=Box(gap, 0.0, width - 2.0 * gap, head),
-        puller=Box(gap, top, side, main),
-        triple_point=Box(side + 2.0 * gap, top, width - side - column - 4.0 * gap, main),
-        numbers=Box(width - column - gap, top, column, main),
-        chart=Box(gap, top + main + gap, width - 2.0 * gap, below),
+        puller=Box(6.0, top, 188.0, main),
+        triple_point=Box(200.0, top, box.w - 362.0, main),
+        numbers=Box(box.w - 156.0, top, 150.0, main),
+        chart=Box(6.0, top + main + 6.0, box.w - 12.0, below),
     )
 
 
@@ -63,7 +50,7 @@ class Scene:
 
     def __init__(self, width: int, height: int) -> None:
         self.canvas = Canvas(width, height)
-        self.layout = layout(width, height)
+        self.layout = layout(self.canvas.box)
 
     def draw(
         self,
@@ -76,12 +63,12 @@ class Scene:
         ``set_points`` are a player's, ``overlay`` draws on top.
         """
         canvas, boxes = self.canvas, self.layout
-        canvas.begin((boxes.puller, boxes.numbers, boxes.chart))
-        self._draw_header(record)
+        canvas.begin(boxes.puller, boxes.numbers, boxes.chart)
+        _draw_header(canvas, boxes.triple_point.x, record)
         puller_panel.draw(canvas, boxes.puller, record)
-        canvas.text(boxes.puller.x + 8 * canvas.unit, boxes.puller.y + 5 * canvas.unit, "crystal", 9.5, palette.FAINT)
+        canvas.text(boxes.puller.x + 8, boxes.puller.y + 5, "crystal", palette.FAINT)
         triple_point.draw(canvas, boxes.triple_point, record)
-        numbers_panel.draw(canvas, boxes.numbers, record, set_points)
+        _draw_numbers(canvas, boxes.numbers, record, set_points)
         chart.draw(canvas, boxes.chart, record)
         if record.ending is not None:
             draw_ending(canvas, boxes.triple_point, record.ending)
@@ -89,27 +76,64 @@ class Scene:
             overlay(canvas)
         return canvas.finish()
 
-    def _draw_header(self, record: Record) -> None:
-        """Scenario, time, length grown, and whether the crystal grows."""
-        canvas, unit = self.canvas, self.canvas.unit
-        left, middle, right = self.layout.header.x, self.layout.triple_point.x, self.layout.header.right
-        hours, rest = divmod(round(float(record.t[-1])), round(HOUR))
-        minutes, seconds = divmod(rest, round(MINUTE))
-        canvas.text(left + 4 * unit, 7 * unit, "Cz-v0", 14, bold=True)
-        canvas.text(left + 58 * unit, 10 * unit, record.scenario, 11, palette.FAINT)
-        time, grown = f"{hours}:{minutes:02d}:{seconds:02d}", f"{record.length[-1] / MM:.1f} mm"
-        for x, after, name, value in ((0, 30, "time", time), (112, 152, "grown", grown)):
-            canvas.text(middle + x * unit, 10 * unit, name, 11, palette.FAINT)
-            canvas.text(middle + after * unit, 7.5 * unit, value, 13, bold=True)
-        status, colour = ("growing", palette.WELL) if record.ending is None else ("ended", palette.ALARM)
-        if record.ending is None and record.last("valid") <= 0.0:
-            status, colour = "camera: no reading", palette.CAMERA
-        canvas.text(right - 4 * unit, 10 * unit, status, 11, colour, "right", True)
+
+def _draw_header(canvas: Canvas, middle: float, record: Record) -> None:
+    """Scenario, time, length grown, and whether the crystal grows."""
+    hours, rest = divmod(round(float(record.t[-1])), round(HOUR))
+    minutes, seconds = divmod(rest, round(MINUTE))
+    canvas.text(10, 7, "Cz-v0", size=14, bold=True)
+    canvas.text(64, 10, record.scenario, palette.FAINT, 11)
+    time, grown = f"{hours}:{minutes:02d}:{seconds:02d}", f"{record.length[-1] / MM:.1f} mm"
+    for x, after, name, value in ((0, 30, "time", time), (112, 152, "grown", grown)):
+        canvas.text(middle + x, 10, name, palette.FAINT, 11)
+        canvas.text(middle + after, 7.5, value, size=13, bold=True)
+    status, colour = ("growing", palette.WELL) if record.ending is None else ("ended", palette.ALARM)
+    if record.ending is None and record.last("valid") <= 0.0:
+        status, colour = "camera: no reading", palette.CAMERA
+    canvas.text(canvas.box.right - 10, 10, status, colour, 11, 1.0, True)
+
+
+Row = tuple[str, str, Colour]
+"""Name, value and its colour."""
+
+
+def numbers(record: Record, set_points: SetPoints | None = None) -> list[list[Row]]:
+    """The rows of a record's newest sample; the first of each group is a signal, those below it its references."""
+    p, last = record.puller, record.last
+    rows = [
+        [_row("by the camera", record.camera_error[-1] + last("r_ref"), MM, "mm", palette.CAMERA),
+         _row("reference", last("r_ref"), MM, "mm", palette.REFERENCE)],
+        [_row("pull speed", last("v_p"), MM_PER_MIN, "mm/min", palette.DRIVE), _row("nominal", p.v_0, MM_PER_MIN)],
+        [_row("heater", last("Q_H"), KILO, "kW", palette.DRIVE), _row("nominal", p.Q_H_0, KILO)],
+        [_row("heater T_1", last("T_1"), 1.0, "K", palette.TEMPERATURE), _row("recipe", last("T_1_ref"))],
+        [_row("melt T_b", last("T_b"), 1.0, "K", palette.TEMPERATURE), _row("nominal", p.T_b_0)],
+    ]  # fmt: skip
+    if set_points is not None:
+        rows[1].append(_row("set by hand", set_points.v_p, MM_PER_MIN, colour=palette.INK))
+        rows[2].append(_row("set by hand", set_points.Q_H, KILO, colour=palette.INK))
+    return rows
+
+
+def _row(name: str, value: float, scale: float = 1.0, unit: str = "", colour: Colour = palette.FAINT) -> Row:
+    """A row of a value in SI units; what is not a number is a reading that failed."""
+    return name, f"{value / scale:.2f} {unit}".rstrip() if np.isfinite(value) else "no reading", colour
+
+
+def _draw_numbers(canvas: Canvas, box: Box, record: Record, set_points: SetPoints | None) -> None:
+    """The true radius error in large figures, then the groups of rows."""
+    left, right, y = box.x + 8, box.right - 8, box.y + 45
+    canvas.text(left, box.y + 5, "true radius error", palette.FAINT)
+    canvas.text(box.x + box.w / 2.0, box.y + 18, f"{record.error[-1] / MM:+.2f} mm", palette.TRUE, 19, 0.5, True)
+    for group in numbers(record, set_points):
+        for name, value, colour in group:
+            canvas.text(left, y, name, palette.FAINT)
+            canvas.text(right, y, value, colour, 9.5, 1.0, name == group[0][0])
+            y += 13
+        y += 9
 
 
 def draw_ending(canvas: Canvas, box: Box, ending: Ending) -> None:
     """A band across a panel that says how the episode ended."""
-    unit = canvas.unit
-    band = Box(box.x, box.y + 6 * unit, box.w, 20 * unit)
+    band = Box(box.x, box.y + 6, box.w, 20)
     canvas.rectangle(palette.RIM if ending is Ending.HORIZON else palette.ALARM, band)
-    canvas.text(box.x + box.w / 2.0, band.y + 3.5 * unit, ending.value, 11, palette.INK, "centre", True)
+    canvas.text(box.x + box.w / 2.0, band.y + 3.5, ending.value, size=11, anchor=0.5, bold=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -12,20 +13,32 @@ from cz_gym.config import Config
 from cz_gym.errors import CzError
 from cz_gym.names import unknown
 
-from .backend import MISSING, available, load
-from .canvas import Frame
+from .canvas import MISSING, Frame, available, load
 from .record import Record
-from .scene import Scene, check_size
+from .scene import Scene
 
 MODES = ("human", "rgb_array")
 FPS = 30
 """Frames a second of a window or a video; each frame is one control interval."""
-CAPTION = "Cz-v0: Czochralski growth"
+SMALLEST, LARGEST = 360, 3840
+"""Fewest and most pixels along a side."""
 
 
 def declared_modes() -> list[str]:
     """The render modes that can be drawn here: none without pygame."""
     return list(MODES) if available() else []
+
+
+def check_size(size: Any) -> tuple[int, int]:
+    """Width and height of a picture [px]; CzError names what was given and what is allowed."""
+    try:
+        width, height = size
+        whole = all(isinstance(side, Integral) and not isinstance(side, bool) for side in (width, height))
+        if whole and min(width, height) >= SMALLEST and max(width, height) <= LARGEST:
+            return int(width), int(height)
+    except (TypeError, ValueError):
+        pass
+    raise CzError(f"render_size must be (width, height), whole numbers of {SMALLEST} to {LARGEST} pixels, not {size!r}")
 
 
 def make_view(render_mode: str | None, size: Any, config: Config) -> View | None:
@@ -90,7 +103,7 @@ class View:
         if self.mode == "rgb_array":
             return picture
         if self._window is None:
-            self._window = Window(self.size, CAPTION)
+            self._window = Window(self.size, "Cz-v0: Czochralski growth")
         self._window.show(picture)
         return None
 

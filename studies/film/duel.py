@@ -10,7 +10,6 @@ import numpy as np
 from cz_gym.env import CzEnv
 from cz_gym.rendering import chart, palette, puller_panel, triple_point
 from cz_gym.rendering.canvas import TIMES, Box, Canvas, Frame
-from cz_gym.rendering.geometry import TOLERANCE, error_range
 from cz_gym.rendering.palette import Colour
 from cz_gym.rendering.record import Ending, Record
 from cz_gym.rendering.scene import draw_ending
@@ -46,35 +45,27 @@ class Side:
 
 def draw(canvas: Canvas, sides: Sequence[Side]) -> Frame:
     """Each side's crystal and triple point, and below them both errors on one chart."""
-    unit = canvas.unit
-    gap, below = 6.0 * unit, 0.27 * canvas.height
-    width = (canvas.width - (len(sides) + 1) * gap) / len(sides)
+    whole, gap = canvas.box, 6.0
+    below, width = 0.27 * whole.h, (whole.w - (len(sides) + 1) * gap) / len(sides)
     magnified = min(puller_panel.magnification(side.record) for side in sides)
-    limit = error_range(*(side.record.error for side in sides))
-    bottom = Box(gap, canvas.height - below - gap, canvas.width - 2.0 * gap, below)
-    boxes = [Box(gap + i * (width + gap), gap, width, canvas.height - below - 3.0 * gap) for i in range(len(sides))]
-    canvas.begin((bottom, *boxes))
+    bottom = Box(gap, whole.h - below - gap, whole.w - 2.0 * gap, below)
+    boxes = [Box(gap + i * (width + gap), gap, width, whole.h - below - 3.0 * gap) for i in range(len(sides))]
+    canvas.begin(bottom, *boxes)
     traces = [chart.Trace(side.record.t, side.record.error, side.colour) for side in sides]
+    limit = chart.error_range(*(trace.error for trace in traces))
     chart.draw_traces(canvas, bottom, sides[0].record.config.horizon, limit, traces)
-    x, y = bottom.x + 38.0 * unit, bottom.y + 4 * unit
-    canvas.text(x, y, "true radius error [mm]", 9.5, palette.FAINT)
-    told = f"{TIMES}{magnified:g}: drawn {magnified:g} times as large; shaded: within {TOLERANCE / MM:g} mm"
-    canvas.text(bottom.right - 10.0 * unit, y, told, 9.5, palette.FAINT, "right")
+    x, y = bottom.x + 38, bottom.y + 4
+    canvas.text(x, y, "true radius error [mm]", palette.FAINT)
+    scale = f"{TIMES}{magnified:g}: drawn {magnified:g} times as large; shaded: within {chart.TOLERANCE / MM:g} mm"
+    canvas.text(bottom.right - 10, y, scale, palette.FAINT, anchor=1.0)
     for i, (side, box) in enumerate(zip(sides, boxes, strict=True)):
-        canvas.text(x + (125 + 140 * i) * unit, y, side.name, 9.5, side.colour, bold=True)
-        _draw_side(canvas, box, side, magnified)
+        canvas.text(x + 125 + 140 * i, y, side.name, side.colour, bold=True)
+        canvas.text(box.x + 10, box.y + 7, side.name, side.colour, 13, bold=True)
+        canvas.text(box.right - 10, box.y + 7, f"RMSE {side.rmse() / MM:.2f} mm", size=13, anchor=1.0, bold=True)
+        crystal = Box(box.x, box.y + 26, 0.44 * box.w, box.h - 26)
+        edge = Box(crystal.right, crystal.y, 0.56 * box.w, crystal.h)
+        puller_panel.draw(canvas, crystal, side.record, magnified, side.colour)
+        triple_point.draw(canvas, edge, side.record, side.colour)
+        if side.record.ending not in (None, Ending.HORIZON):
+            draw_ending(canvas, edge, side.record.ending)
     return canvas.finish()
-
-
-def _draw_side(canvas: Canvas, box: Box, side: Side, magnified: float) -> None:
-    unit, record = canvas.unit, side.record
-    canvas.text(box.x + 10 * unit, box.y + 7 * unit, side.name, 13, side.colour, bold=True)
-    rmse = f"RMSE {side.rmse() / MM:.2f} mm"
-    canvas.text(box.right - 10 * unit, box.y + 7 * unit, rmse, 13, palette.INK, "right", True)
-    below = box.inner(0.0, 26.0 * unit, 0.0, 0.0)
-    crystal = Box(below.x, below.y, 0.44 * below.w, below.h)
-    edge = Box(crystal.right, below.y, below.right - crystal.right, below.h)
-    puller_panel.draw(canvas, crystal, record, magnified, side.colour)
-    triple_point.draw(canvas, edge, record, side.colour)
-    if record.ending not in (None, Ending.HORIZON):
-        draw_ending(canvas, edge, record.ending)

@@ -14,8 +14,8 @@ from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.play import __main__ as play
 from cz_gym.play import game as hand
-from cz_gym.play.score import score
-from cz_gym.rendering import backend
+from cz_gym.play.game import score
+from cz_gym.rendering import canvas
 from cz_gym.rendering.view import Window
 from cz_gym.units import KILO, MM_PER_MIN
 
@@ -153,9 +153,8 @@ def test_a_failed_run_counts_to_the_horizon() -> None:
     ("options", "says"),
     [
         (["--scenario", "nonsense"], "unknown scenario 'nonsense'"),
-        (["--speed", "0"], "--speed must be 1 to 3600, not 0"),
-        (["--speed", "nan"], "--speed must be 1 to 3600, not nan"),
-        (["--minutes", "inf"], "--minutes must be 1 to 6000, not inf"),
+        (["--speed", "0"], "--speed: must be between 1 and 3600, not 0"),
+        (["--minutes", "inf"], "--minutes: must be between 1 and 6000, not inf"),
         (["--seed", "-1"], "--seed: must be between 0 and"),
     ],
 )
@@ -165,7 +164,7 @@ def test_bad_options_are_one_line(options: list[str], says: str, refused: Any) -
 
 def test_without_pygame_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch, refused: Any) -> None:
     monkeypatch.setitem(sys.modules, "pygame", None)
-    assert refused(play.main, []) == f"python -m cz_gym.play: {backend.MISSING}\n"
+    assert refused(play.main, []) == f"python -m cz_gym.play: {canvas.MISSING}\n"
 
 
 def test_without_a_display_it_says_so(monkeypatch: pytest.MonkeyPatch, refused: Any) -> None:

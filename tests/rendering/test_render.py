@@ -11,16 +11,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.error import DependencyNotInstalled, ResetNeeded
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
-from hypothesis import example, given
-from hypothesis import strategies as st
 
 import cz_gym
 from cz_gym import CzEnv
-from cz_gym.rendering import backend, view
-from cz_gym.rendering.scene import check_size
-from cz_gym.rendering.view import MODES, record_of
+from cz_gym.rendering import canvas, view
+from cz_gym.rendering.view import MODES, check_size, record_of
 from tests.processes import ROOT, python
 
 pygame = pytest.importorskip("pygame")
@@ -75,21 +72,16 @@ def test_the_size_is_the_users(size: tuple[int, int]) -> None:
     assert env.render().shape == (size[1], size[0], 3)  # type: ignore[union-attr]
 
 
-@given(st.one_of(st.none(), st.integers(), st.text(), st.tuples(st.floats(), st.floats()), st.tuples(st.integers())))
-@example((359, 480))
-@example((640, 3841))
-@example((True, 480))
+@pytest.mark.parametrize("size", [None, 640, "640x480", (640.0, 480.0), (640,), (359, 480), (640, 3841), (True, 480)])
 def test_other_sizes_are_refused_in_one_line(size: Any) -> None:
-    with pytest.raises(ValueError, match=r"render_size must be \(width, height\)") as said:
+    with pytest.raises(ValueError, match=r"^render_size must be \(width, height\), .*not .*$"):
         check_size(size)
-    assert "\n" not in str(said.value).replace(repr(size), "")
 
 
 def test_before_the_first_reset_there_is_no_crystal() -> None:
-    with pytest.raises(ResetNeeded):
-        gym.make("Cz-v0", render_mode="rgb_array").render()
-    with pytest.raises(ResetNeeded):
-        CzEnv(render_mode="rgb_array").render()
+    for env in (gym.make("Cz-v0", render_mode="rgb_array"), CzEnv(render_mode="rgb_array")):
+        with pytest.raises(ResetNeeded):
+            env.render()
 
 
 def test_without_a_mode_render_warns_as_gymnasiums_environments_do(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -98,8 +90,7 @@ def test_without_a_mode_render_warns_as_gymnasiums_environments_do(monkeypatch: 
     env = CzEnv()
     env.reset(seed=1)
     assert env.render() is None
-    assert len(said) == 1
-    assert "rgb_array" in said[0]
+    assert ["rgb_array" in each for each in said] == [True]
 
 
 def test_a_frame_is_the_callers_own() -> None:
@@ -155,7 +146,7 @@ def test_record_video(tmp_path: Path) -> None:
     assert video.stat().st_size > 5000
 
 
-def test_without_pygame_nothing_is_declared_and_asking_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pygame_nothing_is_declared_and_asking_says_what_to_install() -> None:
     code = (
         "import sys\nsys.modules['pygame'] = None\n"
         "import importlib.util\n"
@@ -167,10 +158,7 @@ def test_without_pygame_nothing_is_declared_and_asking_says_what_to_install(monk
         "try:\n    cz_gym.CzEnv(render_mode='rgb_array')\n"
         "except Exception as error:\n    print(type(error).__name__, error)\n"
     )
-    assert python("-W", "error", "-c", code) == f"DependencyNotInstalled {backend.MISSING}\n"
-    monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(DependencyNotInstalled, match=r"pip install"):
-        backend.load()
+    assert python("-W", "error", "-c", code) == f"DependencyNotInstalled {canvas.MISSING}\n"
 
 
 def test_a_batch_does_not_render() -> None:

@@ -10,29 +10,26 @@ from scipy.integrate import trapezoid
 from cz_gym import HURLE, CzEnv, Parameters, make_puller
 from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
-from cz_gym.rendering import chart, geometry, palette, triple_point
-from cz_gym.rendering.canvas import Canvas
-from cz_gym.rendering.geometry import error_range, meniscus_curve, ring_height
-from cz_gym.rendering.numbers_panel import SetPoints, groups
+from cz_gym.rendering import chart, palette, triple_point
+from cz_gym.rendering.canvas import Canvas, Frame
 from cz_gym.rendering.record import Ending, Record, how_it_failed
-from cz_gym.rendering.scene import layout
+from cz_gym.rendering.scene import SetPoints, layout, numbers
 from cz_gym.rendering.view import record_of
 from cz_gym.signals import INFO
 from cz_gym.task import HEIGHT_MIN
 from cz_gym.units import KILO, MM, MM_PER_MIN
 
 pygame = pytest.importorskip("pygame")
-SIZE = (640, 480)
-Frame = npt.NDArray[np.uint8]
+CANVAS = Canvas(640, 480)
+PANELS = layout(CANVAS.box)
 
 
-def grown(steps: int = 240, seed: int = 4, pull: float = 0.0, **arguments: Any) -> tuple[Frame, Record]:
+def grown(steps: int = 240, pull: float = 0.0, **arguments: Any) -> tuple[Frame, Record]:
     """A crystal pulled with a slow swing of the pull speed, so that its surface is not straight."""
     env = CzEnv(render_mode="rgb_array", observation="measured", **arguments)
-    env.reset(seed=seed)
+    env.reset(seed=4)
     for k in range(steps):
-        swing = 0.25 * np.sin(0.06 * k)
-        if env.step(np.array([pull + swing, 0.0], np.float32))[2]:
+        if env.step(np.array([pull + 0.25 * np.sin(0.06 * k), 0.0], np.float32))[2]:
             break
     frame = env.render()
     assert frame is not None
@@ -42,6 +39,12 @@ def grown(steps: int = 240, seed: int = 4, pull: float = 0.0, **arguments: Any) 
 def near(frame: Frame, colour: palette.Colour, within: float = 70.0) -> npt.NDArray[np.bool_]:
     """Pixels close to a colour, shape (height, width)."""
     return np.linalg.norm(frame.astype(float) - colour, axis=-1) < within
+
+
+def check_near(pixels: npt.NDArray[np.bool_], expected: float, reach: int) -> None:
+    """The pixels of a line that are set within ``reach`` of the expected coordinate are centred on it, to one pixel."""
+    first = round(expected) - reach
+    assert np.flatnonzero(pixels[first : first + 2 * reach]).mean() + first + 0.5 == pytest.approx(expected, abs=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -56,57 +59,45 @@ def record(picture: tuple[Frame, Record]) -> Record:
 
 def test_the_drawn_surface_is_the_logged_radius(picture: tuple[Frame, Record]) -> None:
     frame, record = picture
-    box = layout(*SIZE).triple_point
-    scale = triple_point.scale_of(box, record)
+    scale = triple_point.scale_of(PANELS.triple_point, record)
     r_c, _, z = record.surface()
     blue = near(frame, palette.TRUE)
-    rows = range(round(float(scale.y(z[-1]))) + 8, round(float(scale.y(z[0]))) - 8)
+    rows = range(round(scale.y(z[-1])) + 8, round(scale.y(z[0])) - 8)
     for row in rows:
-        height = (scale.y_0 - (row + 0.5)) / scale.per_metre
-        expected = float(scale.x(np.interp(height, z, r_c)))
-        left = round(expected) - 12
-        found = left + np.flatnonzero(blue[row, left : left + 24])
-        assert found.size
-        assert abs(found.mean() + 0.5 - expected) <= 1.0
+        check_near(blue[row], scale.x(np.interp((scale.y_0 - (row + 0.5)) / scale.per_metre, z, r_c)), 12)
     assert len(rows) > 50
     assert np.ptp(r_c) > 0.05 * MM
 
 
-@pytest.mark.parametrize("pull", [-0.3, 0.0, 0.3])
-@pytest.mark.parametrize("r_0", [87.5e-3, 20e-3, 150e-3])
+@pytest.mark.parametrize(("pull", "r_0"), [(-0.3, 87.5e-3), (0.3, 87.5e-3), (0.0, 20e-3), (0.0, 150e-3)])
 def test_the_rings_mark_is_at_the_rings_radius(pull: float, r_0: float) -> None:
     frame, record = grown(60, pull=pull, parameters=Parameters(r_0=r_0))
-    scale = triple_point.scale_of(layout(*SIZE).triple_point, record)
-    expected = float(scale.x(record.last("r_br")))
-    left = round(expected) - 8
-    row = round(scale.y_0 + 34)  # in the melt, where the mark's line goes down from the ring
-    found = left + np.flatnonzero(near(frame, palette.CAMERA)[row, left : left + 16])
-    assert found.size
-    assert abs(found.mean() + 0.5 - expected) <= 1.0
+    scale = triple_point.scale_of(PANELS.triple_point, record)
+    # In the melt, where the mark's line goes down from the ring.
+    check_near(near(frame, palette.CAMERA)[round(scale.y_0 + 34)], scale.x(record.last("r_br")), 8)
 
 
 def test_the_chart_ends_at_the_true_error(picture: tuple[Frame, Record]) -> None:
     frame, record = picture
-    plot = layout(*SIZE).chart.inner(*chart.MARGINS)
-    x = plot.x + record.t[-1] / record.config.horizon * plot.w
-    y = plot.y + plot.h / 2 - record.error[-1] / error_range(record.error) * plot.h / 2
-    window = near(frame, palette.TRUE)[:, round(x) : round(x) + 3]
-    rows = np.flatnonzero(window.any(axis=1) & (np.abs(np.arange(SIZE[1]) - y) < 8))
-    assert abs(rows.mean() + 0.5 - y) <= 1.0
+    plot = PANELS.chart.inner(*chart.MARGINS)
+    x = round(plot.x + record.t[-1] / record.config.horizon * plot.w)
+    y = plot.y + plot.h / 2 - record.error[-1] / chart.error_range(record.error) * plot.h / 2
+    check_near(near(frame, palette.TRUE)[:, x : x + 3].any(axis=1), y, 8)
 
 
 def test_the_chart_has_a_gap_where_the_camera_has_no_reading(monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn: list[tuple[Any, int]] = []
-    canvas = Canvas(*SIZE)
-    monkeypatch.setattr(canvas, "lines", lambda colour, points, width: drawn.append((colour, len(points))))
+    drawn: list[int] = []
+    monkeypatch.setattr(
+        CANVAS, "lines", lambda colour, x, y, width: drawn.extend([np.size(y)] * (colour == palette.CAMERA))
+    )
     error = np.array([0.0, 1.0, np.nan, np.nan, 2.0, 3.0, 1.0]) * MM
-    chart.draw_traces(canvas, layout(*SIZE).chart, 60.0, 4.0 * MM, [chart.Trace(np.arange(7.0), error, palette.CAMERA)])
-    assert [points for colour, points in drawn if colour == palette.CAMERA and points] == [2, 3]
+    chart.draw_traces(CANVAS, PANELS.chart, 60.0, 4.0 * MM, [chart.Trace(np.arange(7.0), error, palette.CAMERA)])
+    assert [size for size in drawn if size] == [2, 3]
 
 
 def test_the_numbers_are_the_records_in_the_units_they_name(record: Record) -> None:
     p, last = record.puller, record.last
-    rows = [row[:2] for group in groups(record, SetPoints(p.v_0, p.Q_H_0)) for row in group]
+    rows = [row[:2] for group in numbers(record, SetPoints(p.v_0, p.Q_H_0)) for row in group]
     assert rows == [
         ("by the camera", f"{(last('r_br_measured') - p.ring_bias) / MM:.2f} mm"),
         ("reference", f"{last('r_ref') / MM:.2f} mm"),
@@ -117,7 +108,7 @@ def test_the_numbers_are_the_records_in_the_units_they_name(record: Record) -> N
         ("melt T_b", f"{last('T_b'):.2f} K"), ("nominal", f"{p.T_b_0:.2f}"),
     ]  # fmt: skip
     record.column("valid")[-1] = 0.0
-    assert groups(record)[0][0][1] == "no reading"
+    assert numbers(record)[0][0][1] == "no reading"
     record.column("valid")[-1] = 1.0
 
 
@@ -126,12 +117,11 @@ def test_the_drawn_meniscus_leaves_the_triple_point_and_meets_the_ring(
     model: Any, tolerance: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Hurle's curve leaves at Hurle's slope; through the exact model's slope it passes near the exact ring."""
-    monkeypatch.setattr(geometry, "POINTS", 20_001)
+    monkeypatch.setattr(triple_point, "POINTS", 20_001)
     p = make_puller(meniscus=model)
     for h_c in (0.004, p.h_0, 0.0085) if model is HURLE else (p.h_0,):
-        r, z = meniscus_curve(p.r_0, h_c, p, model)
+        r, z, z_b = triple_point.meniscus_curve(p.r_0, h_c, p, model, Parameters().phi_b)
         assert (r[0], z[0]) == (p.r_0, h_c)
-        z_b = ring_height(p.r_0, h_c, p, model, Parameters().phi_b)
         ring = p.r_0 + model.ring_offset(p.r_0, h_c, p)
         assert np.interp(-z_b, -z, r) == pytest.approx(ring, abs=tolerance)
         if model is HURLE:
@@ -175,5 +165,5 @@ def test_the_picture_of_a_failed_crystal_has_a_band_that_says_so(pull: float, en
     # Model I finds a balance without any pull; Model II grows on, and freezes.
     frame, record = grown(900, pull=pull, scenario="nominal", model="II")
     assert record.ending is ending
-    box = layout(*SIZE).triple_point
+    box = PANELS.triple_point
     assert near(frame, palette.ALARM, 5.0)[round(box.y) : round(box.y) + 30].sum() > 0.3 * 20 * box.w
