@@ -8,14 +8,13 @@ import pytest
 
 from cz_gym.units import MM
 from studies.camera import __main__ as study
-from studies.camera import measurements
 
 
 @pytest.mark.slow
 def test_the_study_measures_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(measurements, "RADII", np.linspace(-8.0, 8.0, 3) * MM)
-    monkeypatch.setattr(measurements, "HEIGHTS", np.zeros(1))
-    monkeypatch.setattr(measurements, "HORIZON", 20.0)
+    monkeypatch.setattr(study, "RADII", np.linspace(-8.0, 8.0, 3) * MM)
+    monkeypatch.setattr(study, "HEIGHTS", np.zeros(1))
+    monkeypatch.setattr(study, "HORIZON", 20.0)
     assert study.main(["--out", str(tmp_path)]) == 0
     found = json.loads((tmp_path / "camera.json").read_text())
     assert found["images"] == 3
