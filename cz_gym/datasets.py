@@ -1,7 +1,7 @@
 """Datasets for offline learning, in Minari's format: ``python -m cz_gym.datasets`` (extra ``data``).
 
-Every policy is recorded alike: "history" observations, "direct" actions, the reward, and radius and true state as info.
-So datasets of different policies can be joined, and an episode can be made again from its seed and its actions.
+All policies are recorded in one form: "history" observations, "direct" actions, rewards, and as info the radius and the
+true state. Datasets of different policies can therefore be joined, and seed and actions reproduce an episode.
 """
 
 from __future__ import annotations
@@ -37,17 +37,18 @@ from cz_gym.task import drives_of
 from cz_gym.vector import CzVectorEnv
 
 CONTROLLERS, AGENTS = "cz_gym.baselines.registry:CONTROLLERS", "cz_gym.agents:load"
-"""Where policies come from: looked up by name, since this package imports none."""
+"""Names of the objects that provide policies; imported only when needed, because this package knows no policy."""
 EPISODES, NOISE = 100, 0.2
+"""Default number of episodes, and default highest level of the excitation [-]."""
 AT_ONCE = 100
-"""Episodes that run in one batch."""
+"""Number of episodes in one batch."""
 STREAM = 1
-"""Keeps the random numbers of the excitation apart from those of the crystal with the same seed."""
+"""Random stream of the excitation, separate from that of the crystal with the same seed."""
 CODE = "https://github.com/cz-gym/cz-gym"
 
 
 def find_policy(name: str, config: Config) -> Any:
-    """The controller or shipped agent of that name for a config; CzError names what there is."""
+    """The controller or shipped agent of that name, made for a config; CzError lists the known names."""
     controllers = {entry.name: entry for entry in pkgutil.resolve_name(CONTROLLERS) if not entry.privileged}
     check_config(config)
     if name in controllers:
@@ -61,16 +62,16 @@ def find_policy(name: str, config: Config) -> Any:
 
 
 def settings_of(policy: Any) -> dict[str, Any]:
-    """The observation that a policy reads and what its actions mean; "measured" and "direct" where it does not say."""
-    told = {"observation": "measured", "action": "direct"} | getattr(policy, "settings", {})
-    return {name: told[name] for name in ("observation", "action")}
+    """The environment settings "observation" and "action" of a policy; by default "measured" and "direct"."""
+    settings = {"observation": "measured", "action": "direct"} | getattr(policy, "settings", {})
+    return {name: settings[name] for name in ("observation", "action")}
 
 
 def excitation(seed: int, config: Config, noise: float) -> tuple[float, npt.NDArray[np.float64]]:
-    """Noise on the drives of one episode: its level [-], and its course in "direct" actions, shape (steps, 2).
+    """Noise that excites the drives in one episode: its level [-], and "direct" actions of shape (steps, 2).
 
-    White noise on a "smooth" action, which the lags of 50 s make slow. Its standard deviation, the level, is uniform
-    between 0 and ``noise``: a dataset has quiet and excited episodes.
+    It is white noise passed through the lags of "smooth" actions (50 s). The level is the white noise's standard
+    deviation, drawn uniformly between 0 and ``noise``, so that a dataset has quiet and excited episodes.
     """
     random, drives = np.random.default_rng([seed, STREAM]), drives_of("smooth", config.control_interval)
     level = noise * random.uniform()
@@ -79,7 +80,7 @@ def excitation(seed: int, config: Config, noise: float) -> tuple[float, npt.NDAr
 
 
 def record(policy: Any, config: Config, seeds: Sequence[int], noise: float) -> list[dict[str, Any]]:
-    """One episode a seed, all in one batch: the fields of Minari's ``EpisodeBuffer``, each up to the episode's end."""
+    """Run one episode per seed, all in one batch; the fields of Minari's ``EpisodeBuffer`` for each episode."""
     settings, n = settings_of(policy), len(seeds)
     drives = drives_of(settings["action"], config.control_interval)
     gains, place = np.array([drives.pull, drives.heater]), list(DRIVE_CHANNELS)
@@ -92,13 +93,13 @@ def record(policy: Any, config: Config, seeds: Sequence[int], noise: float) -> l
             measured = settings["observation"] == "measured"
             shown = to_measured(observation, config.parameters.v_0) if measured else observation
             found, memory = policy.predict(shown, state=memory, episode_start=begins, deterministic=True)
-            # An action that moves the drives moves them from where the policy alone would have them.
+            # "smooth" and "rate" actions act on the drives without the excitation of the step before.
             wanted = drives.keep * (observation[:, place] - before) + gains * found
             action = np.clip(wanted + noise_now, -1.0, 1.0).astype(np.float32)
             observation, reward, terminated, truncated, info = env.step(action)
             seen.append((observation, info["r_c"], info["r_ref"], info["state"]))
             taken.append((action, reward, terminated, truncated))
-            # A slot that is over is drawn anew by the next step: only then does its policy begin again.
+            # A slot whose episode has ended is reset by the next step; its policy restarts there.
             begins, over, before = over, terminated | truncated, noise_now
     observations, r_c, r_ref, state = map(np.stack, zip(*seen, strict=True))
     actions, rewards, terminations, truncations = map(np.stack, zip(*taken, strict=True))
@@ -126,9 +127,10 @@ def write(
     horizon: float = 10800.0,
     overwrite: bool = False,
 ) -> Any:
-    """Write the Minari dataset ``cz/<scenario>/<name>-v0`` and return it; a dot in a name becomes "_".
+    """Write the Minari dataset ``cz/<scenario>/<name>-v0`` and return it; a dot in the name becomes "_".
 
-    ValueError for seeds that are no training seeds, and for a dataset that is there. An error or Ctrl-C leaves none.
+    Raises CzError for seeds that are not training seeds, and for a dataset that exists unless ``overwrite`` is set.
+    Nothing is left of a dataset whose writing fails or is interrupted.
     """
     minari, _ = import_module("minari"), import_module("h5py")
     settings: dict[str, Any] = {"scenario": scenario, "observation": "history", "horizon": horizon}
@@ -140,7 +142,7 @@ def write(
     folder = Path(os.environ.get("MINARI_DATASETS_PATH", "~/.minari/datasets")).expanduser() / place
     check_writable(folder)
     if folder.exists() and not overwrite:
-        raise CzError(f"{place} is there already: overwrite it, or give another folder ({folder})")
+        raise CzError(f"{place} exists already: overwrite it, or give another folder ({folder})")
 
     def buffers(first: int) -> list[Any]:
         episodes = record(policy, config, seeds[first : first + AT_ONCE], noise)
@@ -164,7 +166,7 @@ def write(
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Write datasets and say a line of each; 0 when done, 2 for bad input, 130 when interrupted."""
+    """Write datasets and print one line about each; 0 when done, 2 for bad input, 130 when interrupted."""
     about = "Write Minari datasets of policies on training crystals, with noise on their drives."
     parser = OneLineParser("python -m cz_gym.datasets", about)
     add, policies = parser.add_argument, "paper,paper-tuned,lqg-at-0.02,gradient"
@@ -173,7 +175,7 @@ def main(argv: list[str] | None = None) -> int:
     add("--episodes", type=between(1, len(TRAINING_SEEDS)), default=EPISODES, metavar="N", help="of each (%(default)s)")
     add("--noise", type=float, default=NOISE, metavar="X", help="highest level of the excitation (%(default)s)")
     add("--out", type=Path, metavar="FOLDER", help="instead of $MINARI_DATASETS_PATH or ~/.minari/datasets")
-    add("--overwrite", action="store_true", help="write again what is there already")
+    add("--overwrite", action="store_true", help="replace datasets that exist")
     return parser.run(_write_all, argv, "data", "the datasets named above are complete")
 
 

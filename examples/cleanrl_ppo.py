@@ -1,7 +1,7 @@
 """PPO in one file, in the manner of CleanRL, on the native batch: ``python -m examples.cleanrl_ppo``, 4 minutes.
 
-Nothing but torch and the batch: copy it and change what you like. It prints the mean radius error on validation
-crystals while it learns from nothing, by reward.
+It needs nothing but torch: copy it and change what you like. While it learns from the reward, it prints the mean radius
+error on validation crystals.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 try:
     import numpy as np
     import torch
+    from gymnasium.wrappers.utils import RunningMeanStd
     from torch import nn
 except ModuleNotFoundError as error:
     sys.exit(f'{error.name} is missing: make venv, then .venv/bin/python, or pip install ".[agents]"')
@@ -44,27 +45,24 @@ class Args:
 
 
 class Agent(nn.Module):
-    """Actor and critic, and the running mean and variance of what they see."""
+    """Actor and critic, and the running mean and variance of their observations."""
 
     def __init__(self, channels: int, actions: int, log_std: float) -> None:
         super().__init__()
         self.actor = network(channels, actions, 0.01)
         self.critic = network(channels, 1, 1.0)
         self.log_std = nn.Parameter(torch.full((actions,), log_std))
-        self.mean, self.var, self.count = torch.zeros(channels), torch.ones(channels), 1e-4
+        self.seen = RunningMeanStd(shape=(channels,))
 
     def normalise(self, observation: np.ndarray, learn: bool = False) -> torch.Tensor:
-        """The observation in units of its spread so far."""
-        x = torch.as_tensor(observation)
+        """Observations with mean 0 and variance 1; ``learn`` updates the statistics."""
         if learn:
-            mean, var, n = x.mean(0), x.var(0, correction=0), len(x)
-            apart, total = mean - self.mean, self.count + n
-            self.var = (self.var * self.count + var * n + apart**2 * self.count * n / total) / total
-            self.mean, self.count = self.mean + apart * n / total, total
-        return ((x - self.mean) / (self.var + 1e-8).sqrt()).clamp(-10.0, 10.0)
+            self.seen.update(observation)
+        x = (observation - self.seen.mean) / np.sqrt(self.seen.var + 1e-8)
+        return torch.as_tensor(x.clip(-10.0, 10.0), dtype=torch.float32)
 
     def distribution(self, x: torch.Tensor) -> torch.distributions.Normal:
-        """What actions are drawn from."""
+        """The distribution of the actions."""
         return torch.distributions.Normal(self.actor(x), self.log_std.exp())
 
     def predict(
@@ -76,7 +74,7 @@ class Agent(nn.Module):
 
 
 def network(inputs: int, outputs: int, gain: float) -> nn.Sequential:
-    """Two hidden layers, all as PPO begins them; ``gain`` is that of the last."""
+    """Two hidden layers with orthogonal weights; ``gain`` scales those of the last layer."""
     layers: list[nn.Module] = []
     for wide, narrow, spread in ((inputs, 64, 2.0**0.5), (64, 64, 2.0**0.5), (64, outputs, gain)):
         layer = nn.Linear(wide, narrow)

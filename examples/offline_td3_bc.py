@@ -1,8 +1,7 @@
 """Learn from recorded episodes alone: TD3+BC in one file, ``python -m examples.offline_td3_bc``, 2 minutes.
 
-The data comes first, from ``python -m cz_gym.datasets``; the extras ``data`` and ``agents`` are needed. No crystal is
-pulled while it learns. It prints what the agent is worth on 100 validation crystals, which choose nothing: after
-behaviour cloning, the first third of the updates, and at the end.
+Record the data first with ``python -m cz_gym.datasets``; the extras ``data`` and ``agents`` are needed. The agent is
+judged on 100 validation crystals twice: after behaviour cloning, the first third of the updates, and at the end.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ class Policy:
 
 
 def read(names: list[str]) -> list[Any]:
-    """Observations and true states, each as :func:`scaled` gives them; "smooth" actions, rewards, lost crystals."""
+    """Scaled observations, scaled true states, "smooth" actions, rewards, and whether a step lost its crystal."""
     drives, parts = drives_of("smooth", CONFIG.control_interval), []
     for episode in (each for name in names for each in minari.load_dataset(name).iterate_episodes()):
         seen, state = episode.observations, episode.infos["state"]
@@ -67,7 +66,7 @@ def read(names: list[str]) -> list[Any]:
 
 
 def scaled(now: torch.Tensor, following: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Both in units of their spread, with mean and spread."""
+    """Both with mean 0 and standard deviation 1, then that mean and standard deviation."""
     mean, spread = now.mean(0), now.std(0) + 1e-3
     return (now - mean) / spread, (following - mean) / spread, mean, spread
 

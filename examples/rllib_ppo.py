@@ -64,34 +64,13 @@ def main(seed: int = 0, steps: int = 3_000_000, slots: int = 128) -> Validation:
     fragment = 64
     register_env("crystals", crystals)
     settings = PPOConfig().environment("crystals").debugging(seed=seed)
-    settings.env_runners(
-        num_env_runners=0,
-        num_envs_per_env_runner=slots,
-        gym_env_vectorize_mode="vector_entry_point",
-        rollout_fragment_length=fragment,
-    )
-    settings.training(
-        train_batch_size_per_learner=fragment * slots,
-        minibatch_size=2048,
-        num_epochs=5,
-        lr=[[0, 1e-3], [steps, 1e-5]],
-        gamma=GAMMA,
-        lambda_=0.95,
-        clip_param=0.2,
-        vf_loss_coeff=0.5,
-        vf_clip_param=1e3,
-        use_kl_loss=False,
-        entropy_coeff=0.0,
-        grad_clip=0.5,
-    )
-    settings.rl_module(
-        model_config=DefaultModelConfig(
-            fcnet_hiddens=[64, 64],
-            fcnet_activation="tanh",
-            vf_share_layers=False,
-            free_log_std=True,
-        )
-    )
+    settings.env_runners(num_env_runners=0, num_envs_per_env_runner=slots, rollout_fragment_length=fragment)
+    settings.env_runners(gym_env_vectorize_mode="vector_entry_point")
+    settings.training(train_batch_size_per_learner=fragment * slots, minibatch_size=2048, num_epochs=5)
+    settings.training(lr=[[0, 1e-3], [steps, 1e-5]], gamma=GAMMA, lambda_=0.95, clip_param=0.2, grad_clip=0.5)
+    settings.training(vf_loss_coeff=0.5, vf_clip_param=1e3, use_kl_loss=False, entropy_coeff=0.0)
+    network: Any = {"fcnet_hiddens": [64, 64], "fcnet_activation": "tanh", "vf_share_layers": False}
+    settings.rl_module(model_config=DefaultModelConfig(free_log_std=True, **network))
     algorithm = settings.build_algo()
     began, done, said = time.monotonic(), 0, 0
     while done < steps:

@@ -142,13 +142,6 @@ def test_the_ring_follows_geometry_and_closed_form_within_a_pixel(detector: Ring
             assert abs(radius - (wall_edge(make_scene(r_c, h_c, PULLER), VIEW).r - at_rest)) < 0.15 * detector.pixel
 
 
-def test_the_detectors_slope_of_the_radius_is_one(detector: RingDetector) -> None:
-    step = np.linspace(-2e-3, 2e-3, 21)
-    read = [detector.read(picture(PULLER.r_0 + dr, PULLER.h_0, PULLER, VIEW)).radius for dr in step]
-    assert np.polyfit(step, read, 1)[0] == pytest.approx(1.0, abs=0.02)
-    assert np.max(np.abs(np.array(read) - PULLER.r_0 - step)) < 0.1 * detector.pixel
-
-
 def test_an_image_without_a_ring_reads_as_nan(detector: RingDetector) -> None:
     flat = picture(PULLER.r_0, 3e-3, PULLER, VIEW)
     for image in (np.zeros(IMAGE, np.uint8), np.full(IMAGE, 200, np.uint8), flat):

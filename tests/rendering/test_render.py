@@ -5,7 +5,6 @@ import pickle
 import subprocess
 import sys
 import warnings
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -130,20 +129,6 @@ def test_window_and_list_wrappers() -> None:
     listed.reset(seed=1)
     listed.step(listed.action_space.sample())
     assert len(listed.render()) == 2  # type: ignore[arg-type]
-
-
-def test_record_video(tmp_path: Path) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        pytest.importorskip("moviepy")
-        env = gym.wrappers.RecordVideo(gym.make("Cz-v0", render_mode="rgb_array", horizon=50.0), str(tmp_path / "new"))
-        env.reset(seed=1)
-        over = False
-        while not over:
-            over = env.step(env.action_space.sample())[3]
-        env.close()
-    (video,) = (tmp_path / "new").glob("*.mp4")
-    assert video.stat().st_size > 5000
 
 
 def test_without_pygame_nothing_is_declared_and_asking_says_what_to_install() -> None:

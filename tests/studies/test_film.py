@@ -38,18 +38,6 @@ def test_a_short_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     assert "3 frames" in capsys.readouterr().out
 
 
-def test_each_side_is_drawn_in_its_own_colour() -> None:
-    pytest.importorskip("onnxruntime")
-    sides, canvas = film.contestants(1), Canvas(*film.SIZE)
-    for side in sides:
-        side.step_to(200)
-    picture = draw(canvas, sides).astype(np.float64)[: film.SIZE[1] * 7 // 10]
-    for side, half in zip(sides, np.array_split(picture, 2, axis=1), strict=True):
-        near = {one.colour: (np.linalg.norm(half - one.colour, axis=-1) < 30.0).sum() for one in sides}
-        assert max(near, key=lambda colour: near[colour]) == side.colour
-        assert min(near.values()) == 0
-
-
 @pytest.mark.parametrize("samples", [200, 2160])
 def test_the_scale_that_is_told_is_the_one_that_is_drawn(samples: int, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("onnxruntime")
