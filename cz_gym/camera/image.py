@@ -6,7 +6,7 @@ ring and other edges, it has the mean of SUB x SUB rays, so that an edge can mov
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -33,20 +33,6 @@ _APART = 1e-4
 """Distance in q of a mirrored ray's bracket from its start [-]."""
 _GOLDEN = 0.6180339887498949
 """Golden ratio: shifts the rays of successive columns evenly."""
-
-
-class Scratch(NamedTuple):
-    """Working memory of the images, one row a slot."""
-
-    corners: Any
-    """Brightness of two rows of pixel corners [grey values], shape (n, 2, COLUMNS // 2 + 1)."""
-    stream: Any
-    """The frame's random stream, shape (n, WORDS)."""
-
-
-def new_scratch(n: int) -> Scratch:
-    """Working memory for n slots."""
-    return Scratch(np.zeros((n, 2, COLUMNS // 2 + 1)), np.zeros((n, WORDS), np.uint64))
 
 
 @jittable
@@ -131,11 +117,12 @@ def _rounded(value: Any, noisy: Any, stream: Any, view: Any) -> Any:
 
 
 @jittable
-def expose(scene: Any, view: Any, corners: Any, noisy: Any, stream: Any, image: Any) -> None:
+def expose(scene: Any, view: Any, noisy: Any, stream: Any, image: Any) -> None:
     """Write the image of a scene, uint8 (ROWS, COLUMNS, 1); with shot noise from ``stream`` if ``noisy``.
 
     The left half is traced; the right half is its mirror image, because everything is symmetric about the axis.
     """
+    corners = np.zeros((2, COLUMNS // 2 + 1))
     for row in range(-1, ROWS):
         for column in range(COLUMNS // 2 + 1):
             corners[(row + 1) % 2, column] = grey_value(1.0 * (row + 1), 1.0 * column, scene, view)
@@ -147,8 +134,8 @@ def expose(scene: Any, view: Any, corners: Any, noisy: Any, stream: Any, image: 
             image[row, COLUMNS - 1 - column, 0] = _rounded(value, noisy, stream, view)
 
 
-def _show(scene: Any, view: Any, scratch: Any, image: Any) -> None:
-    expose(scene, view, scratch.corners[0], False, scratch.stream[0], image)
+def _show(scene: Any, view: Any, image: Any) -> None:
+    expose(scene, view, False, np.zeros(WORDS, np.uint64), image)
 
 
 _show_scene = kernel(_show)
@@ -157,19 +144,20 @@ _show_scene = kernel(_show)
 def picture(r_c: float, h_c: float, puller: Puller, view: View) -> npt.NDArray[np.uint8]:
     """The image, without noise, of a crystal of radius r_c on a meniscus of height h_c [m]; shape of IMAGE."""
     image = np.zeros(IMAGE, np.uint8)
-    _show_scene(make_scene(r_c, h_c, puller), view, new_scratch(1), image)
+    _show_scene(make_scene(r_c, h_c, puller), view, image)
     return image
 
 
 def build_look(meniscus: MeniscusModel = HURLE) -> Any:
-    """Compile ``look(slots, active, view, scratch, images, start, stop)``: the images of the active slots.
+    """Compile ``look(slots, active, view, images, start, stop)``: the images of the active slots.
 
     A slot's image shows the crystal whose bright ring is at the last reading, errors included, on the meniscus of that
     moment. It is black while the reading is flagged invalid. ``images``: uint8 of shape (n, ROWS, COLUMNS, 1).
     """
     ring_offset = meniscus.ring_offset
 
-    def look(slots: Any, active: Any, view: Any, scratch: Any, images: Any, start: int, stop: int) -> None:
+    def look(slots: Any, active: Any, view: Any, images: Any, start: int, stop: int) -> None:
+        stream = np.zeros(WORDS, np.uint64)
         for i in range(start, stop):
             if not active[i]:
                 continue
@@ -182,9 +170,8 @@ def build_look(meniscus: MeniscusModel = HURLE) -> Any:
             r_c = ring - p.ring_bias
             for _ in range(_RADIUS_STEPS):
                 r_c = ring - ring_offset(r_c, slot.h_seen, p)
-            stream = scratch.stream[i]
             seed_stream(stream, slot.key, FIRST_FRAME + slot.k_seen)
             noisy = slot.episode.camera_sd > 0.0
-            expose(make_scene(r_c, slot.h_seen, p), view, scratch.corners[i], noisy, stream, image)
+            expose(make_scene(r_c, slot.h_seen, p), view, noisy, stream, image)
 
     return kernel(look, hashed(*meniscus.functions))

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.utils import seeding
 
-from cz_gym.camera.image import build_look, new_scratch
+from cz_gym.camera.image import build_look
 from cz_gym.camera.view import IMAGE, make_view
 from cz_gym.config import Config, Identity
 from cz_gym.episodes.mixture import Distribution
@@ -135,8 +135,8 @@ class Batch:
         threads = threads or os.cpu_count() or 1
         self._parts = max(1, min(threads, num_envs // (1 if self._camera else SLOTS_PER_THREAD)))
         if self._camera:
-            self._view, self._scratch = make_view(config.camera), new_scratch(num_envs)
-            seen = (self.memory.slots, self._all, self._view, self._scratch, out.image, 0, 1)
+            self._view = make_view(config.camera)
+            seen = (self.memory.slots, self._all, self._view, out.image, 0, 1)
             self._look = entry(_look(config.meniscus), seen)
         self._pool: ThreadPoolExecutor | None = None
         self._owner = os.getpid()
@@ -177,7 +177,7 @@ class Batch:
     def _photograph(self, out: Out, active: npt.NDArray[np.bool_]) -> None:
         """Write the images of the active slots, where images are observed."""
         if self._camera:
-            arguments = (self.memory.slots, active, self._view, self._scratch, out.image)
+            arguments = (self.memory.slots, active, self._view, out.image)
             self._run(self._look, arguments, self.num_envs, 1)
 
     def reset(self, which: Sequence[int], keys: Iterable[Key], out: Out, given: Distribution | None = None) -> None:

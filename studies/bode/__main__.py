@@ -1,7 +1,7 @@
 """Bode plot, margins and sensitivity of a controller's loop with the nominal plant, near rest.
 
-``python -m studies.bode lqg`` takes a shipped controller, ``python -m studies.bode my.py:SlowPID`` one of your own: its
-``state`` is a NamedTuple of arrays, so that its linear form can be read off.
+``python -m studies.bode lqg`` takes a shipped controller, ``python -m studies.bode my.py:SlowPID`` one of your own,
+whose ``state`` must be a NamedTuple of arrays.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from cz_gym.evaluation.report.tables import markdown as table
 from cz_gym.physics.plant import Puller, make_puller
 
 PLACES = {"camera": "ring", "v_p": "pull speed"}
-"""Where the loop is opened, and what it is called."""
+"""Places where the loop is opened, and their names."""
 
 
 def form_of(name: str) -> LinearForm:
@@ -88,12 +88,11 @@ def _main(given: argparse.Namespace) -> None:
     check_writable(given.out.parent)
     form, puller = form_of(given.controller), make_puller(lam=given.mix)
     found = {at: margins(form, puller, at) for at in PLACES}
-    rows = []
-    for at, (_, each) in found.items():
-        crossing, *figures = each
-        shown = (f"{figure:.3g}" if figure == figure else "none" for figure in figures)
-        rows.append((PLACES[at], f"{crossing:.2e}", *shown))
     heads = ("opened at", "crossover [rad/s]", "gain up", "gain down", "phase [deg]", "delay [s]", "sensitivity")
+    rows = [
+        (PLACES[at], f"{first:.2e}", *("none" if np.isnan(value) else f"{value:.3g}" for value in rest))
+        for at, (_, (first, *rest)) in found.items()
+    ]
     print(table(heads, rows))
     if not close(form.controller, puller, form.dt).stable:
         print("the closed loop is unstable: it has no margins")
