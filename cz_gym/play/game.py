@@ -1,4 +1,4 @@
-"""Pulling a crystal by hand: keys, time, the picture with its help, and the score beside another controller's."""
+"""The game of pulling a crystal by hand: keys, time, picture, help, and a score beside a controller's."""
 
 from __future__ import annotations
 
@@ -46,6 +46,9 @@ class Result(NamedTuple):
     """Return: the sum of rewards [-]."""
     failed: bool
 
+    def __str__(self) -> str:
+        return f"RMSE {self.rmse_mm:.3f} mm, return {self.reward:,.0f}{', failed' if self.failed else ''}"
+
 
 class Score(NamedTuple):
     """The results of player and controller on the same crystal over the same time."""
@@ -58,13 +61,8 @@ class Score(NamedTuple):
 
     def line(self) -> str:
         """The score in one line."""
-        both = zip((self.player, self.controller), ("by hand", "by the paper's controller"), strict=True)
-        errors = (f"{one.rmse_mm:.3f} mm {who}{' (failed)' if one.failed else ''}" for one, who in both)
-        return (
-            f"{self.scenario}, crystal {self.seed}, {self.minutes:.0f} min: "
-            f"RMSE of the true radius {', '.join(errors)}; "
-            f"return {self.player.reward:,.1f} and {self.controller.reward:,.1f}"
-        )
+        crystal = f"{self.scenario}, crystal {self.seed}, {self.minutes:.0f} min"
+        return f"{crystal}: by hand {self.player}; by the paper's controller {self.controller}"
 
 
 def score(config: Config, seed: int, actions: Sequence[npt.NDArray[np.float32]], failed: bool, rival: Any) -> Score:
@@ -112,7 +110,7 @@ class Game:
         return record_of(self.env)
 
     def play(self) -> list[Score]:
-        """Run until the player ends it; every score, that of a run ended early among them."""
+        """Run until the player ends the game; returns the scores of all runs, the last one included."""
         pygame = load()
         pygame.key.set_repeat(250, 40)
         while self.running:
@@ -150,7 +148,7 @@ class Game:
         self.helping = self.helping and self.paused
 
     def advance(self, seconds: float) -> None:
-        """Let a time pass for the player [s], and the control intervals that fall into it for the crystal."""
+        """Advance the player's time by some seconds, and the crystal by the control intervals in them."""
         if self.paused or self.score is not None:
             return
         self.due += seconds * self.speed
@@ -184,10 +182,7 @@ class Game:
         canvas.text(box.right - 8, box.bottom - 18, "H: help", palette.FAINT, anchor=1.0)
         if self.score is not None:
             both = sorted([(self.score.player, "you"), (self.score.controller, "paper")])  # by the error
-            rows = tuple(
-                (name, f"RMSE {rmse:.3f} mm    return {reward:,.0f}{'    failed' if failed else ''}")
-                for (rmse, reward, failed), name in both
-            )
+            rows = tuple((name, str(result)) for result, name in both)
             _draw_card(canvas, "The run is over: least error first", rows, "R: again   N: next crystal   Q: end")
         elif self.helping:
             _draw_card(canvas, "Pull a crystal by hand", HELP, "hold the radius on its reference; space starts")

@@ -1,4 +1,4 @@
-"""What a picture is drawn from: the samples of one episode so far, copied from the environment."""
+"""The samples of one episode so far, from which its pictures are drawn."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Ending(Enum):
 
 
 class Record:
-    """The samples of one episode, oldest first: the signals of ``info`` in SI units, and what follows from them."""
+    """The samples of one episode, oldest first: signals of ``info`` in SI units, and quantities derived from them."""
 
     def __init__(self, config: Config, slot: Any, scenario: str) -> None:
         self.config, self.scenario = config, scenario
@@ -85,11 +85,11 @@ class Record:
     def surface(self, height: float = np.inf) -> tuple[Floats, Floats, Floats]:
         """The grown surface: radius, reference [m] and height above the melt [m], newest (lowest) first.
 
-        What solidified when the crystal had length L is now at h_c + (L_now - L). It ends just above ``height`` [m]
-        over the triple point.
+        A ring that solidified at length L is now at the height h_c + (L_now - L). The surface ends just above
+        ``height`` [m] over the triple point.
         """
         length = self.length
-        # What was melted back is gone: its length is above one that came later.
+        # Crystal that was melted back again is left out: the length was smaller at a later sample.
         remains = length <= np.minimum.accumulate(length[::-1])[::-1]
         inside = np.flatnonzero(remains & (length >= length[-1] - height))
         remains[: max(int(inside[0]) - 1, 0)] = False

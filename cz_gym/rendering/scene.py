@@ -16,7 +16,7 @@ from .record import Ending, Record
 
 
 class SetPoints(NamedTuple):
-    """What a player asks of the drives."""
+    """Set-points of the drives, chosen by a player."""
 
     v_p: float
     """Pull speed [m/s]."""
@@ -115,7 +115,7 @@ def numbers(record: Record, set_points: SetPoints | None = None) -> list[list[Ro
 
 
 def _row(name: str, value: float, scale: float = 1.0, unit: str = "", colour: Colour = palette.FAINT) -> Row:
-    """A row of a value in SI units; what is not a number is a reading that failed."""
+    """A row for a value in SI units; NaN is a failed reading."""
     return name, f"{value / scale:.2f} {unit}".rstrip() if np.isfinite(value) else "no reading", colour
 
 

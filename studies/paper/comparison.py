@@ -36,9 +36,8 @@ class Row(NamedTuple):
 
 def rows() -> list[Row]:
     """The whole comparison, in the paper's order."""
-    parts = [_linear_rows(model, ex.linear_model("own", model)) for model in ex.MODELS]
-    parts += [part() for part in (_compensator_rows, _margin_rows, _response_rows)]
-    return [row for part in parts for row in part]
+    linear = [row for model in ex.MODELS for row in _linear_rows(model, ex.linear_model("own", model))]
+    return linear + _compensator_rows() + _margin_rows() + _response_rows()
 
 
 def _linear_rows(model: str, ours: RadiusModel) -> list[Row]:
@@ -127,16 +126,12 @@ def _response_rows() -> list[Row]:
     return found
 
 
-def number(value: float | None) -> str:
-    """Five significant digits; a dash for None."""
-    return "-" if value is None else f"{value:.5g}"
-
-
 def as_markdown(found: list[Row]) -> str:
-    """The comparison as a Markdown table."""
-    lines = [
-        (row.quantity, row.unit, number(row.published), number(row.ours), row.difference, row.why) for row in found
-    ]
+    """The comparison as a Markdown table, numbers with five significant digits."""
+    lines = []
+    for row in found:
+        published = "-" if row.published is None else f"{row.published:.5g}"
+        lines.append((row.quantity, row.unit, published, f"{row.ours:.5g}", row.difference, row.why))
     return table(("quantity", "unit", "published", "ours", "difference", "why"), lines, "---")
 
 

@@ -96,12 +96,12 @@ def trace(
 
 
 class InverseResponse(NamedTuple):
-    """The ring after a pull-speed change: first the wrong way, then across its old value."""
+    """Inverse response of the bright ring to a change of the pull speed."""
 
     depth: float
-    """Largest excursion the wrong way [m]."""
+    """Largest excursion in the wrong direction [m]."""
     recovery: float
-    """Time from the start of the change until the ring is back where it was [s]."""
+    """Time from the start of the change until the ring is back at its first radius [s]."""
 
 
 @cache
@@ -130,7 +130,7 @@ def inverse_response(run: Trace, change: float = -0.1) -> InverseResponse:
 
 
 def case_difference(model: str) -> dict[str, float]:
-    """How nonlinear the loop is between cases A and B: max |A - 5 B| / max |A| of the deviations from rest [-]."""
+    """Nonlinearity between cases A and B: max |A - 5 B| / max |A| of the deviations from rest [-]."""
     gaps = {}
     for name in ("r_c", "h_c", "alpha_c", "v_p"):
         large, small = (getattr(run.signals, name) - getattr(run.signals, name)[0] for run in cases(model))

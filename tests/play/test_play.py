@@ -146,7 +146,7 @@ def test_a_failed_run_counts_to_the_horizon() -> None:
     assert found.player.failed
     assert found.minutes == 90.0
     assert found.player.rmse_mm > 4.0
-    assert "(failed)" in found.line()
+    assert ", failed; by the paper's controller RMSE" in found.line()
 
 
 @pytest.mark.parametrize(
@@ -186,4 +186,4 @@ def test_the_command_prints_the_score(monkeypatch: pytest.MonkeyPatch, capsys: p
 
     monkeypatch.setattr(hand.Game, "play", play_on)
     assert play.main(["--minutes", "5"]) == 0
-    assert capsys.readouterr().out.startswith("randomized, crystal 1, 5 min: RMSE of the true radius ")
+    assert capsys.readouterr().out.startswith("randomized, crystal 1, 5 min: by hand RMSE ")
