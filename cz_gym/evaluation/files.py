@@ -20,7 +20,7 @@ from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.errors import CzError
 
 from .metrics import metric_names
-from .results import BOUND, REFERENCE, Estimates, Result
+from .results import BOUND, REFERENCE, Result
 from .statistics import RESAMPLES, SEED, Estimate
 
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime", "casadi")
@@ -42,8 +42,8 @@ def to_json(results: Sequence[Result], command: str) -> str:
         "results": each(lambda result: result.means),
         "paired": each(_paired),
         "cvar5": each(lambda result: result.cvar5),
-        "optimality_gap": _without_empty(each(lambda result: _one(result.gaps, "cost"))),
-        "optimality_gap_radius": _without_empty(each(lambda result: _one(result.gaps, "rmse_mm"))),
+        "optimality_gap": _gaps(results, "cost"),
+        "optimality_gap_radius": _gaps(results, "rmse_mm"),
         "verdicts": {
             result.row.name: {
                 agent: {"rival": result.rival, "rmse_mm_difference": _plain(difference), "wins": result.wins(agent)}
@@ -56,15 +56,6 @@ def to_json(results: Sequence[Result], command: str) -> str:
     return json.dumps(data, indent=1, allow_nan=False) + "\n"
 
 
-def is_benchmark_json(content: bytes) -> bool:
-    """Whether these bytes were written by :func:`to_json`, by this release or an earlier one."""
-    try:
-        data = json.loads(content)
-    except (ValueError, RecursionError):
-        return False
-    return isinstance(data, dict) and {"results", "paired", "cvar5", "verdicts", "provenance"} <= set(data)
-
-
 def _plain(value: Any) -> Any:
     """Estimates as dictionaries, at any depth of a mapping."""
     if isinstance(value, Mapping):
@@ -72,12 +63,13 @@ def _plain(value: Any) -> Any:
     return value._asdict() if isinstance(value, Estimate) else value
 
 
-def _one(estimates: Estimates, metric: str) -> dict[str, Estimate]:
-    return {name: found[metric] for name, found in estimates.items() if metric in found}
-
-
-def _without_empty(by_row: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: found for name, found in by_row.items() if found}
+def _gaps(results: Sequence[Result], metric: str) -> dict[str, Any]:
+    """The gaps in one metric, of the scenarios that have any."""
+    found = {
+        result.row.name: {name: _plain(gaps[metric]) for name, gaps in result.gaps.items() if metric in gaps}
+        for result in results
+    }
+    return {row: gaps for row, gaps in found.items() if gaps}
 
 
 def _paired(result: Result) -> dict[str, Any]:

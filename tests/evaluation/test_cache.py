@@ -210,7 +210,7 @@ def test_all_takes_those_that_are_cached_and_names_the_others(small: Path, capsy
     arguments = ["--controllers", "clairvoyant", "--slow", "--scenarios", "nominal", "--episodes", "2", "--quiet"]
     assert benchmark.main([*arguments, "--json", str(small.parent / "one.json")]) == 0
     assert "clairvoyant" not in taking_part(everyone)  # nominal is cached, randomized is not
-    assert benchmark.main([*everyone, *nominal]) == 0
+    assert benchmark.main([*everyone, *nominal, "--overwrite"]) == 0
     assert "left out" not in capsys.readouterr().out
     data = json.loads((small.parent / "all.json").read_text())
     assert "clairvoyant" in data["results"]["nominal"]

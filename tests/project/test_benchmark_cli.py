@@ -101,6 +101,7 @@ def test_the_folder_holds_every_file_and_nothing_else(finished: Path) -> None:
 
 
 def test_json_names_every_metric_of_everyone(data: dict[str, Any]) -> None:
+    """The agent does nothing, as open-loop does."""
     assert list(data["results"]) == ["randomized", "reference-b"]
     for name, scenario in data["results"].items():
         assert list(scenario) == ["open-loop", "paper", "ppo"]
@@ -111,17 +112,12 @@ def test_json_names_every_metric_of_everyone(data: dict[str, Any]) -> None:
                 assert n == (3 if name == "randomized" else 1)
                 assert (interval is not None) == (name == "randomized" or controller == "ppo")
                 assert interval is None or interval[0] <= mean <= interval[1]
+                assert scenario["ppo"][metric]["mean"] == pytest.approx(scenario["open-loop"][metric]["mean"])
+    verdict = data["verdicts"]["reference-b"]["ppo"]
+    assert (verdict["wins"], verdict["rival"]) == (False, "paper")
 
 
-def test_an_agent_that_does_nothing_is_open_loop(data: dict[str, Any]) -> None:
-    for scenario in data["results"].values():
-        for metric in metric_names():
-            assert scenario["ppo"][metric]["mean"] == pytest.approx(scenario["open-loop"][metric]["mean"])
-    assert data["verdicts"]["reference-b"]["ppo"]["wins"] is False
-    assert data["verdicts"]["reference-b"]["ppo"]["rival"] == "paper"
-
-
-def test_every_episode_is_in_the_table(finished: Path, data: dict[str, Any]) -> None:
+def test_every_episode_is_in_the_table_and_provenance_says_what_was_run(finished: Path, data: dict[str, Any]) -> None:
     with (finished / "episodes.csv").open() as file:
         lines = list(csv.DictReader(file))
     assert {line["training_seed"] for line in lines if line["controller"] == "ppo"} == {"3", "8"}
@@ -130,9 +126,6 @@ def test_every_episode_is_in_the_table(finished: Path, data: dict[str, Any]) -> 
     mean = np.mean([float(line["rmse_mm"]) for line in chosen])
     assert data["results"]["randomized"]["paper"]["rmse_mm"]["mean"] == pytest.approx(mean, rel=1e-4)
     assert list(data["paired"]["randomized"]) == ["open-loop", "ppo"]
-
-
-def test_provenance_says_what_was_run(data: dict[str, Any]) -> None:
     told = data["provenance"]
     assert told["plant_hash"] == make_config().plant_hash
     assert told["scenarios"]["randomized"]["hash"] == make_config("randomized").scenario.hash
@@ -212,39 +205,23 @@ def test_a_file_may_be_named_and_stand_beside_the_shipped_agents(tmp_path: Path)
 
 
 @pytest.mark.usefixtures("no_work")
-def test_a_partial_run_replaces_no_results(
+def test_files_are_replaced_by_a_full_run_or_when_told_to(
     tmp_path: Path, finished: Path, monkeypatch: pytest.MonkeyPatch, refusal: Any
 ) -> None:
-    """Unless it is told to, whatever names the results; a full run may renew them."""
+    """Whatever names the results, and whatever else the files are."""
     monkeypatch.setattr(benchmark, "FOLDER", finished)
-    results = finished / "benchmark.json"
-    for arguments in ([], ["--out", str(finished)], ["--json", str(results)]):
-        for some in (SMALL, ["--controllers", "paper"]):
-            line = refusal([*some, *arguments])
-            assert "partial" in line
-            assert "--overwrite" in line
-    (tmp_path / "lone.json").write_bytes(results.read_bytes())
-    for arguments in (["--json", str(tmp_path / "lone.json")], ["--out", str(finished), "--overwrite"]):
-        with pytest.raises(AssertionError, match="work was done"):
-            benchmark.main([*SMALL, *arguments, "--quiet"])
-    check_targets(finished, results, partial=False, overwrite=False)
-
-
-@pytest.mark.usefixtures("no_work")
-def test_files_of_other_origin_are_not_replaced(tmp_path: Path, finished: Path, refusal: Any) -> None:
-    """A report in a folder, a page and a table named by --json, whether the run is partial or full."""
-    foreign, page = tmp_path / "foreign", tmp_path / "page.md"
-    foreign.mkdir()
-    (foreign / "report.html").write_text("precious")
+    results, page = finished / "benchmark.json", tmp_path / "report.html"
     page.write_text("precious")
-    for folder, lone in ((foreign, None), (None, page), (None, finished / "episodes.csv")):
-        line = refusal([*SMALL, "--out" if folder else "--json", str(folder or lone)])
-        assert str(folder or lone) in line
-        assert "--overwrite" in line
+    for arguments in ([], ["--out", str(finished)], ["--json", str(results)], ["--out", str(tmp_path)]):
+        for some in (SMALL, ["--controllers", "paper"]):
+            assert "exists: add --overwrite" in refusal([*some, *arguments])
+    for folder, lone in ((tmp_path, None), (None, page)):
         with pytest.raises(ValueError, match="--overwrite"):
             check_targets(folder, lone, partial=False, overwrite=False)
-    with pytest.raises(AssertionError, match="work was done"):
-        benchmark.main([*SMALL, "--json", str(page), "--overwrite", "--quiet"])
+    for arguments in (["--json", str(page)], ["--out", str(finished)]):
+        with pytest.raises(AssertionError, match="work was done"):
+            benchmark.main([*SMALL, *arguments, "--overwrite", "--quiet"])
+    check_targets(finished, None, partial=False, overwrite=False)
 
 
 def test_a_full_run_is_quoted_in_the_readme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -335,8 +312,7 @@ def test_one_s_own_controller_runs_beside_a_few_into_its_own_folder(
     assert capsys.readouterr().out.endswith("\nwrote runs/Still; open runs/Still/report.html\n")
     results = json.loads(Path("runs/Still/benchmark.json").read_text())["results"]["reference-b"]
     assert list(results) == ["paper", "paper-tuned", "lqg-at-0.02", "Still"]
-    assert "runs/Still/" in (line := refusal(command))
-    assert "exists and this run is partial: add --overwrite" in line
+    assert "runs/Still/benchmark.json exists: add --overwrite" in refusal(command)
     monkeypatch.setattr(benchmark, "benchmark", lambda arguments, command: folders.append(arguments.out) or 0)
     folders: list[Path] = []
     benchmark.main([*ONE, "--agent", "some.onnx", "--scenario", "mine.py:later"])
@@ -373,11 +349,7 @@ def test_a_report_on_one_s_own_shows_it_and_prints_a_command_that_runs(
     [
         ("--controller", "mine.py", "must be FILE.py:NAME"),
         ("--controller", "nobody.py:Still", "no such file"),
-        (
-            "--controller",
-            "mine.py:Stil",
-            "unknown controller 'Stil': did you mean 'Still'? Choose from Still, still, made\n",
-        ),
+        ("--controller", "mine.py:Stil", "controller 'Stil': did you mean 'Still'? Choose from Still, still, made\n"),
         ("--scenario", "mine.py:soon", "unknown scenario 'soon'; choose from later\n"),
         ("--scenarios", "soon", "randomized-exact\n"),
         ("--controller", "mine.py:number", "no controller"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,7 +15,6 @@ from .tables import (
     DRIVES,
     ERROR,
     FAILURES,
-    HEATER_STEP,
     NOTHING,
     PULL_STEP,
     RMSE,
@@ -34,38 +34,27 @@ BEGIN, END = "<!-- benchmark:begin -->", "<!-- benchmark:end -->"
 
 
 def summary(results: Sequence[Result]) -> str:
-    """Return one table: RMSE on every scenario, then drives and failures on the first."""
-    first, extras = results[0], (PULL_STEP, HEATER_STEP, FAILURES)
-    caption = (
-        f"RMSE of the true radius [mm] on each scenario; the last {len(extras)} columns are of {first.row.name}. "
-        "In brackets: 95 % interval."
-    )
-    headings = [*(result.row.name for result in results), *(column.heading for column in extras)]
-    errors = [[text for _, text in rows(result, (RMSE,))] for result in results]
-    lines = [
-        (name, *here, *others)
-        for (name, *others), here in zip(rows(first, extras), zip(*errors, strict=True), strict=True)
-    ]
-    return f"{caption}\n\n{table(('controller', *headings), lines)}"
+    """Return one table: RMSE and failures on each scenario, pull steps on the first."""
+    columns = (RMSE, PULL_STEP._replace(interval=False), FAILURES._replace(interval=False))
+    found = [{name: row for name, *row in rows(result, columns)} for result in results]
+    lines = []
+    for name in (label(sample, results[0]) for sample in results[0].samples):
+        errors, steps, failures = zip(*(each[name] for each in found), strict=True)
+        lines.append((name, *errors, steps[0], " / ".join(failures)))
+    return table(("controller", *(result.row.name for result in results), PULL_STEP.heading, FAILURES.heading), lines)
 
 
 def brief(results: Sequence[Result]) -> str:
-    """Return a table for readers in a hurry: the quoted controllers and the best agents, or all if there are none.
+    """Return :func:`summary` of the random scenarios for the quoted controllers and the best agents.
 
-    RMSE and failures on each scenario with randomness, pull steps on the first.
+    Everything is there if nobody is quoted, or nothing is random.
     """
     results = [result for result in results if len(result.seeds) > 1] or list(results)
-    found = [{name: row for name, *row in rows(result, (RMSE, PULL_STEP, FAILURES))} for result in results]
-    samples = sorted(results[0].samples, key=lambda sample: results[0].means[sample.name][RMSE.metric].mean)
-    best = [sample for sample in samples if sample.contender.learned and not sample.contender.bound][:BEST]
-    shown = [sample for sample in results[0].samples if sample.contender.quoted or sample in best]
-    lines = []
-    for name in (label(sample, results[0]) for sample in shown or results[0].samples):
-        errors, steps, failures = zip(*(each[name] for each in found), strict=True)
-        plain = [" / ".join(text.partition(" [")[0] for text in texts) for texts in (steps[:1], failures)]
-        lines.append((name, *errors, *plain))
-    headings = [*(result.row.name for result in results), PULL_STEP.heading, FAILURES.heading]
-    return table(("controller", *headings), lines)
+    means = results[0].means
+    samples = sorted(results[0].samples, key=lambda sample: means[sample.name][RMSE.metric].mean)
+    best = [sample.name for sample in samples if sample.contender.learned and not sample.contender.bound][:BEST]
+    shown = [sample for sample in results[0].samples if sample.contender.quoted or sample.name in best]
+    return summary([replace(results[0], samples=tuple(shown or results[0].samples)), *results[1:]])
 
 
 def fill_in(page: str, results: Sequence[Result]) -> str:
@@ -90,6 +79,7 @@ def markdown(results: Sequence[Result], command: str, figures: Iterable[str]) ->
         f"{3 / most / PERCENT:.2g} % at n = {most}. The first line compares radius errors alone: who moves the pull "
         "speed more can have less. docs/controllers/bounds.md compares at equal pull steps, docs/benchmark.md has the "
         "protocol and every formula.",
+        "RMSE of the true radius [mm] with 95 % interval and failures on each scenario, pull steps on the first.",
         summary(results),
         *(f"![{name.removesuffix('.png')}]({name})" for name in figures),
         "## Who took part",
@@ -132,9 +122,8 @@ def measured_from(result: Result) -> str:
     """Return a sentence on where the optimality gap comes from, or how to get it."""
     row, bound = result.row, result.earlier_bound
     if bound is not None:
-        count = len(common(bound, *result.samples)[0].seeds)
-        met = "the only crystal" if len(result.seeds) == 1 else f"the first {count} crystals"
-        return f"Optimality gaps are measured from `{BOUND}` of an earlier run (results/bounds), on {met}."
+        count = crystals(len(common(bound, *result.samples)[0].seeds))
+        return f"Optimality gaps are measured from `{BOUND}` of an earlier run (results/bounds), on the first {count}."
     if any(result.gaps.values()):
         return f"Optimality gaps are measured from `{BOUND}` on the crystals that it met."
     place = f"--scenario {shlex.quote(row.file)}" if row.file else f"--scenarios {row.name}"

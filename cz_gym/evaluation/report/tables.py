@@ -22,6 +22,8 @@ class Column(NamedTuple):
     """The table's unit in the metric's own."""
     kind: str = "means"
     """Name of the estimates, an attribute of :class:`Result`."""
+    interval: bool = True
+    """Whether the intervals are shown."""
 
     def estimate(self, result: Result, name: str) -> Estimate | None:
         """Return the estimate of a contender in the metric's unit; None where there is none."""
@@ -29,7 +31,9 @@ class Column(NamedTuple):
         return estimates.get(name, {}).get(self.metric)
 
     def text(self, estimate: Estimate | None) -> str:
-        """Return the mean in the column's unit, with its interval if it has one."""
+        """Return the mean in the column's unit, with its interval if it has one that is shown."""
+        if estimate and not self.interval:
+            estimate = estimate._replace(ci95=None)
         return estimate.text(f"z.{self.decimals}f", self.unit) if estimate else NOTHING
 
 

@@ -7,15 +7,15 @@ from collections.abc import Sequence
 from cz_gym.evaluation.results import REFERENCE, SPEED, Result
 from cz_gym.units import PERCENT
 
-from .tables import RMSE, Column, crystals, label
+from .tables import FAILURES, HEATER_STEP, PULL_STEP, RMSE, Column, crystals, rows
 from .verdict import headline
 
 COLUMNS = (
-    Column("max_error_mm", "max [mm]", 2),
-    Column("within_half_mm", "in 0.5 mm [%]", 1, PERCENT),
-    Column("pull_step_rms_mm_per_min", "pull step [mm/min]", 4),
-    Column("heater_step_rms_kw", "heater step [kW]", 3),
-    Column("failure_rate", "failures [%]", 1, PERCENT),
+    Column("max_error_mm", "max [mm]", 2, interval=False),
+    Column("within_half_mm", "in 0.5 mm [%]", 1, PERCENT, interval=False),
+    PULL_STEP._replace(heading="pull step [mm/min]", interval=False),
+    HEATER_STEP._replace(heading="heater step [kW]", interval=False),
+    FAILURES._replace(interval=False),
     Column(SPEED, "compute [us/step]", 2),
 )
 """Columns without intervals, between RMSE and its paired difference."""
@@ -28,9 +28,10 @@ def terminal(results: Sequence[Result]) -> str:
 
 
 def _scenario(result: Result) -> str:
-    headings = ["controller", *(column.heading for column in (RMSE, *COLUMNS, LESS))]
+    columns = (RMSE, *COLUMNS, LESS)
+    headings = ["controller", *(column.heading for column in columns)]
     names, units = zip(*(heading.rstrip("]").partition(" [")[::2] for heading in headings), strict=True)
-    grid = [names, units, *((label(sample, result), *_cells(result, sample.name)) for sample in result.samples)]
+    grid = [names, units, *rows(result, columns)]
     widths = [max(map(len, column)) for column in zip(*grid, strict=True)]
     row = result.row
     lines = [
@@ -40,8 +41,3 @@ def _scenario(result: Result) -> str:
         padded = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
         lines.append("  ".join([f"  {name:<{widths[0]}}", *padded]).rstrip())
     return "\n".join(lines)
-
-
-def _cells(result: Result, name: str) -> list[str]:
-    means = [column.text(result.means[name][column.metric]._replace(ci95=None)) for column in COLUMNS]
-    return [RMSE.text(RMSE.estimate(result, name)), *means, LESS.text(LESS.estimate(result, name))]
