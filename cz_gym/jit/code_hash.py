@@ -75,8 +75,12 @@ def _function(function: FunctionType, seen: dict[int, int]) -> Any:
     closed = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
     scope = {**function.__globals__, **{name: cell.cell_contents for name, cell in closed}}
     tree = _syntax(function)
-    code = _code(function.__code__) if tree is None else _tree(tree)
-    names = _names_of_code(function.__code__) if tree is None else _names(tree, scope)
+    compiled = function.__code__
+    if tree is None:
+        constants = [repr(each) for each in compiled.co_consts if not isinstance(each, CodeType)]
+        code, names = [compiled.co_code.hex(), constants], {*compiled.co_names, *compiled.co_freevars}
+    else:
+        code, names = _tree(tree), _names(tree, scope)
     meant = {name: scope[name.partition(".")[0]] for name in names if name.partition(".")[0] in scope}
     meant |= {name: getattr(meant[name], name.partition(".")[2], None) for name in meant if "." in name}
     defaults = _value([*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values()], seen)
@@ -111,16 +115,6 @@ def _names(tree: ast.AST, scope: dict[str, Any]) -> set[str]:
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in modules
     }
     return read - modules | parts
-
-
-def _names_of_code(code: CodeType) -> set[str]:
-    inner = (_names_of_code(part) for part in code.co_consts if isinstance(part, CodeType))
-    return {*code.co_names, *code.co_freevars}.union(*inner)
-
-
-def _code(code: CodeType) -> Any:
-    constants = [_code(part) if isinstance(part, CodeType) else repr(part) for part in code.co_consts]
-    return [code.co_code.hex(), list(code.co_names), list(code.co_varnames), constants]
 
 
 def _tree(node: Any) -> Any:

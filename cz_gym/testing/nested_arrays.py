@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable
+from ctypes import c_char
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,26 +74,14 @@ def overwrite(value: Any) -> None:
             array.value[...] = 1
 
 
-def _bytes(array: Any) -> bytes:
-    return np.asarray(array).tobytes()
-
-
-def _ctypes(array: Array) -> Any:
-    """A ctypes buffer over the array's memory; only the exported buffer keeps the array alive."""
-    return (ctypes.c_char * array.nbytes).from_buffer(_view(array).cast("B"))
-
-
-def _view(array: Any) -> memoryview[int]:
-    return memoryview(array)
-
-
-KEEPERS: dict[str, tuple[Callable[[Array], Any], Callable[[Any], bytes]]] = {
-    "itself": (lambda array: array, _bytes),
-    "a view": (lambda array: array[...].view(), _bytes),
-    "a slice": (lambda array: array[::1].T, lambda kept: _bytes(kept.T)),
-    "a memoryview": (_view, bytes),
-    "a ctypes buffer": (_ctypes, bytes),
-    "an iterator": (lambda array: array.flat, lambda kept: _bytes(kept.base)),
+KEEPERS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], bytes]]] = {
+    "itself": (lambda array: array, np.ndarray.tobytes),
+    "a view": (lambda array: array[...].view(), np.ndarray.tobytes),
+    "a slice": (lambda array: array[::1].T, lambda kept: kept.T.tobytes()),
+    "a memoryview": (memoryview, bytes),
+    # Only the exported buffer keeps the array alive.
+    "a ctypes buffer": (lambda array: (c_char * array.nbytes).from_buffer(memoryview(array).cast("B")), bytes),
+    "an iterator": (lambda array: array.flat, lambda kept: kept.base.tobytes()),
 }
 """Ways to keep an array: a function that makes the keeper from the array, and one that reads the bytes from it."""
 

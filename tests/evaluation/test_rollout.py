@@ -204,7 +204,7 @@ def test_a_rollout_can_be_looked_at(tmp_path: Path) -> None:
     run = rollout(OpenLoop(), SHORT, [1, 2])
     figure = plot(run, 1, tmp_path / "crystal.png")
     assert (tmp_path / "crystal.png").read_bytes().startswith(b"\x89PNG")
-    assert figure.axes[0].get_ylabel() == "radius error [mm]"
+    assert figure.axes[0].get_ylabel() == "crystal radius\n[mm]"
     with pytest.raises(ValueError, match=r"needs a Rollout, not 'paper': .*rollout\(policy, config, seeds\) makes one"):
         plot("paper")  # type: ignore[arg-type]
     with pytest.raises(IndexError, match="below 2"):

@@ -1,4 +1,4 @@
-"""The figure of one disturbed crystal under each controller."""
+"""The figure of one disturbed crystal under one or more controllers."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from textwrap import fill
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
@@ -47,30 +48,51 @@ _PANELS = (
 )
 
 
-def crystal(result: Result, style: Mapping[str, Style]) -> bytes:
-    """Draw the first crystal of a scenario under some controllers: radius, ring, pull, heater, melt against time."""
-    samples = chosen(result.samples, COLUMNS)
-    figure = canvas(max(1.62 * len(samples) + 1.0, 5.0), 7.6)
-    axes = figure.subplots(len(_PANELS), len(samples), sharex=True, sharey="row", squeeze=False)
-    longest = max(map(example, samples), key=lambda signals: len(signals.r_c))
-    for column, sample in enumerate(samples):
-        _draw(axes[:, column], sample, result.row.control_interval, style[sample.name].colour, longest.r_ref)
+class Column(NamedTuple):
+    """A crystal under one controller."""
+
+    title: str
+    signals: Signals
+    colour: str
+    lost: bool
+
+
+def draw(columns: Sequence[Column], dt: float, title: str) -> Figure:
+    """Draw a crystal under some controllers: radius, ring, pull, heater, melt against time, at steps of ``dt`` [s]."""
+    figure = canvas(max(1.62 * len(columns) + 1.0, 5.0), 7.6)
+    axes = figure.subplots(len(_PANELS), len(columns), sharex=True, sharey="row", squeeze=False)
+    longest = max((column.signals for column in columns), key=lambda signals: len(signals.r_c))
+    for place, column in enumerate(columns):
+        _draw(axes[:, place], column, dt, longest.r_ref)
     for row, panel in enumerate(_PANELS):
         axes[row, 0].set_ylabel(panel.label.replace(" [", "\n["))
     figure.align_ylabels(axes[:, 0])
-    _set_limits(axes, samples, longest, result.row.control_interval)
-    figure.suptitle(f"One crystal of {result.row.name} (test seed {samples[0].seeds[0]:,})", fontsize=10.5)
+    _set_limits(axes, columns, longest, dt)
+    figure.suptitle(title, fontsize=10.5)
     handles = [
         Line2D([], [], color=INK, lw=1.2, ls="--", label="reference"),
         Line2D([], [], color=GREY, lw=1.2, label="ring as the camera reports it"),
         Line2D([], [], ls="none", label="in colour: true value; of a drive, its 5 min mean over single steps"),
     ]
     figure.legend(handles=handles, loc="outside lower center", fontsize=8.5, frameon=False)
-    return png(figure)
+    return figure
 
 
-def _draw(axes: Any, sample: Sample, dt: float, colour: str, reference: Floats) -> None:
-    signals = example(sample)
+def crystal(result: Result, style: Mapping[str, Style]) -> bytes:
+    """Draw the first crystal of a scenario under the controllers of :func:`.chosen`."""
+    samples = chosen(result.samples, COLUMNS)
+    columns = []
+    for sample in samples:
+        rmse = f"RMSE {sample.metric('rmse_mm')[0, 0]:.3g} mm"
+        columns.append(
+            Column(f"{fill(sample.name, 18)}\n{rmse}", example(sample), style[sample.name].colour, lost(sample))
+        )
+    title = f"One crystal of {result.row.name} (test seed {samples[0].seeds[0]:,})"
+    return png(draw(columns, result.row.control_interval, title))
+
+
+def _draw(axes: Any, column: Column, dt: float, reference: Floats) -> None:
+    signals, colour = column.signals, column.colour
     minutes = _minutes(len(signals.r_c), dt)
     axes[0].plot(_minutes(len(reference), dt), reference / MM, color=INK, lw=1.0, ls="--", zorder=3)
     axes[1].plot(minutes, signals.r_br_measured / MM, color=GREY, lw=0.4)
@@ -81,12 +103,9 @@ def _draw(axes: Any, sample: Sample, dt: float, colour: str, reference: Floats) 
             window = min(max(round(SMOOTH / dt), 1), len(values))
             mean = np.convolve(values, np.full(window, 1.0 / window), "valid")
             axis.plot(minutes[window - 1 :] - 0.5 * (window - 1) * dt / MINUTE, mean, color=colour, lw=1.4)
-    rmse = f"RMSE {float(sample.metric('rmse_mm')[0, 0]):.3g} mm"
-    if lost(sample):
-        rmse = f"lost at {minutes[-1]:.0f} min"
-        for axis in axes:
+        if column.lost:
             axis.axvline(minutes[-1], color=INK, lw=0.8, ls=":")
-    axes[0].set_title(f"{fill(sample.name, 18)}\n{rmse}", fontsize=9, color=INK, fontweight="bold")
+    axes[0].set_title(column.title + ", lost" * column.lost, fontsize=9, color=INK, fontweight="bold")
     axes[-1].set_xlabel("time [min]")
 
 
@@ -95,10 +114,10 @@ def lost(sample: Sample) -> bool:
     return bool(sample.metric("failure_rate")[0, 0])
 
 
-def _set_limits(axes: Any, samples: Sequence[Sample], longest: Signals, dt: float) -> None:
-    """Scale by the crystals that did not fail: one that did leaves the picture, it does not set the scale."""
-    whole = [sample for sample in samples if not lost(sample)] or samples
-    worst = max(float(np.abs(example(sample).r_c - example(sample).r_ref).max()) for sample in whole)
+def _set_limits(axes: Any, columns: Sequence[Column], longest: Signals, dt: float) -> None:
+    """Scale by the crystals that were not lost: one that was leaves the picture, it does not set the scale."""
+    whole = [column.signals for column in columns if not column.lost] or [column.signals for column in columns]
+    worst = max(float(np.abs(signals.r_c - signals.r_ref).max()) for signals in whole)
     width = 1.15 * float(np.clip(worst, *ROOM))
     ends = np.array([longest.r_ref.min() - width, longest.r_ref.max() + width])
     axes[0, 0].set_ylim(*(ends / MM))
