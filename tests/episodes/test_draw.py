@@ -36,41 +36,39 @@ def within(value: float, low: float, high: float, unit: float = 1.0) -> bool:
     return low * unit - 1e-12 <= value <= high * unit + 1e-12
 
 
-@given(KEY)
-def test_randomized_draws_lie_in_the_designs_ranges(key: tuple[int, int]) -> None:
-    e, _ = draw("randomized", key)
-    f = draw_factors(SCENARIOS["randomized"], (0.0, 1.0), key)
+RANGES = {
+    "randomized": {
+        "recipe_duration": (5, 10, MINUTE), "recipe_start": (10, 110, MINUTE), "drift_amount": (-5, 5, 1),
+        "drift_duration": (20, 100, MINUTE), "drift_start": (0, 100, MINUTE), "reference_amount": (-2.5, 2.5, MM),
+        "reference_duration": (20, 50, MINUTE), "reference_start": (10, 110, MINUTE), "ring_offset": (0, 0, 1),
+        **dict.fromkeys(("bias_drift_amount", "ripple_amplitude", "pyrometer_drift", "melt_loss"), (0, 0, 1)),
+    },
+    "puller": {
+        "ring_offset": (-0.4, 0.4, MM), "ripple_amplitude": (0, 0.2, MM), "ripple_omega": (8, 15, 2 * math.pi / MINUTE),
+        "ripple_phase": (0, 2 * math.pi, 1), "pyrometer_drift": (-2, 2, 1),
+    },
+    "sensor-fault": {
+        "bias_drift_amount": (-0.3, 0.3, MM), "bias_drift_duration": (1, 2, 3600), "bias_drift_start": (0, SPAN, 1),
+    },
+}  # fmt: skip
+"""Least value, largest value and their unit, of an episode's numbers by scenario."""
+
+
+@given(KEY, st.sampled_from(sorted(RANGES)))
+def test_draws_lie_in_the_designs_ranges(key: tuple[int, int], scenario: str) -> None:
+    e, _ = draw(scenario, key)
+    for name, ends in RANGES[scenario].items():
+        assert within(getattr(e, name), *ends), name
+    f = draw_factors(SCENARIOS[scenario], (0.0, 1.0), key)
+    assert within(e.recipe_amount / e.recipe_duration, -0.5, 0.5, 1 / MINUTE)
     assert within(f.lam, 0, 1)
     assert within(f.a, 0.97, 1.03)
     assert all(within(factor, 0.9, 1.1) for factor in (f.k_l, f.kappa_12, f.G_1a, f.G_2b, f.kappa_b))
-    assert within(e.recipe_duration, 5, 10, MINUTE)
-    assert within(e.recipe_amount / e.recipe_duration, -0.5, 0.5, 1 / MINUTE)
-    assert within(e.recipe_start, 10, 110, MINUTE)
-    assert within(e.drift_amount, -5, 5)
-    assert within(e.drift_duration, 20, 100, MINUTE)
-    assert within(e.drift_start, 0, 100, MINUTE)
-    assert within(e.reference_amount, -2.5, 2.5, MM)
-    assert within(e.reference_duration, 20, 50, MINUTE)
-    assert within(e.reference_start, 10, 110, MINUTE)
-    assert (e.ring_offset, e.bias_drift_amount, e.ripple_amplitude, e.pyrometer_drift, e.melt_loss) == (0,) * 5
 
 
 @given(KEY)
-def test_puller_draws_lie_in_the_designs_ranges(key: tuple[int, int]) -> None:
-    e, _ = draw("puller", key)
-    assert within(e.ring_offset, -0.4, 0.4, MM)
-    assert within(e.ripple_amplitude, 0, 0.2, MM)
-    assert within(e.ripple_omega, 8, 15, 2 * math.pi / MINUTE)
-    assert within(e.ripple_phase, 0, 2 * math.pi)
-    assert within(e.pyrometer_drift, -2, 2)
-
-
-@given(KEY)
-def test_faults_lie_in_the_designs_ranges_and_freezes_are_disjoint(key: tuple[int, int]) -> None:
-    e, series = draw("sensor-fault", key)
-    assert within(e.bias_drift_amount, -0.3, 0.3, MM)
-    assert within(e.bias_drift_duration, 1, 2, 3600)
-    assert within(e.bias_drift_start, 0, SPAN)
+def test_freezes_last_as_designed_and_are_disjoint(key: tuple[int, int]) -> None:
+    _, series = draw("sensor-fault", key)
     lengths = series.freezes[:, 1] - series.freezes[:, 0]
     flagged = lengths[: FREEZES - 1]
     assert 1 <= np.count_nonzero(flagged) <= 3
@@ -234,17 +232,13 @@ def test_camera_and_pyrometer_noise_are_white_and_normal() -> None:
     assert abs(np.mean(noise[:, 0] * noise[:, 1])) < 4 / math.sqrt(len(noise))
 
 
-def test_outliers_are_rare_and_normal() -> None:
-    scenario = Scenario("mine", sensor=Sensor(outlier_probability=0.02, outlier_sd=1e-3))
-    camera = draw(scenario, (3, 4), samples=100_000)[1].noise[:, 0]
+def test_outliers_are_rare_and_normal_and_dropouts_have_their_probability() -> None:
+    sensor, faults = Sensor(outlier_probability=0.02, outlier_sd=1e-3), Faults(dropout=(0.03, 0.03))
+    camera = draw(Scenario("mine", sensor=sensor), (3, 4), samples=100_000)[1].noise[:, 0]
     hit = camera[camera != 0]
     assert len(hit) == pytest.approx(2000, abs=4 * math.sqrt(2000))
     assert stats.kstest(hit / 1e-3, "norm").pvalue > 1e-3
-
-
-def test_dropouts_have_their_probability() -> None:
-    scenario = Scenario("mine", faults=Faults(dropout=(0.03, 0.03)))
-    camera = draw(scenario, (3, 4), samples=50_000)[1].noise[:, 0]
+    camera = draw(Scenario("mine", faults=faults), (3, 4), samples=50_000)[1].noise[:, 0]
     assert np.isnan(camera).mean() == pytest.approx(0.03, abs=4 * math.sqrt(0.03 / 50_000))
 
 

@@ -102,20 +102,6 @@ def next_first(observation: Any, *rest: Any) -> Any:
     return observation, *rest
 
 
-class Coupled(Conforming):
-    """Slot 0's action moves every slot."""
-
-    def step(self, actions: Any) -> Any:
-        return super().step(np.repeat(actions[:1], self.num_envs, axis=0))
-
-
-class Reused(Conforming):
-    """Observations are returned without a copy."""
-
-    def __init__(self, num_envs: int, mode: AutoresetMode) -> None:
-        SyncVectorEnv.__init__(self, [Walk] * num_envs, autoreset_mode=mode, copy=False)
-
-
 class Recycled(Conforming):
     """Rewards alternate between two arrays."""
 
@@ -149,11 +135,16 @@ class KeepsActions(ReadBack):
         return actions[:, 0], actions[:, 0].copy()
 
 
-class WritesActions(Conforming):
-    def step(self, actions: Any) -> Any:
-        result = super().step(actions)
-        actions *= 0.5
-        return result
+def acting(change: Callable[[Any], Any], after: Callable[[Any], Any] = lambda actions: None) -> type[Conforming]:
+    """A vector that takes other actions, as ``change(actions)`` gives them, or does something to them afterwards."""
+
+    class Acting(Conforming):
+        def step(self, actions: Any) -> Any:
+            result = super().step(change(actions))
+            after(actions)
+            return result
+
+    return Acting
 
 
 REWARD = stepping(lambda observation, reward, *rest: (observation, reward * [1.0, 1.0 + 1e-12, 1.0], *rest))
@@ -162,70 +153,41 @@ TIMEOUT = stepping(lambda o, r, terminated, truncated, i: (o, r, terminated | tr
 NEXT, SAME, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
 BROKEN: dict[str, tuple[type[Conforming], str, AutoresetMode]] = {
     "space": (made(lambda env: setattr(env, "single_action_space", Box(-2, 2, (1,)))), "single_action_space is", NEXT),
-    "batched": (
-        made(lambda env: setattr(env, "action_space", env.single_action_space)),
-        "action_space is .* the batch of 3 is",
-        NEXT,
-    ),
+    "batched": (made(lambda env: setattr(env, "action_space", env.single_action_space)),
+                "action_space is .* the batch of 3 is", NEXT),
     "mode": (made(always=NEXT), r"metadata\['autoreset_mode'\] is", SAME),
     "fewer": (made(fewer=1), "num_envs is 2, asked for 3", NEXT),
-    "seedless": (
-        resetting(lambda seed, options: {"seed": None}),
-        "seed 0 gives another first observation in a second environment",
-        NEXT,
-    ),
-    "stuck": (
-        resetting(lambda seed, options: {"seed": None if "reset_mask" in (options or {}) else 5}),
-        "differs from the scalar with that seed",
-        NEXT,
-    ),
-    "alike": (
-        resetting(lambda seed, options: {"seed": [seed] * 3 if isinstance(seed, int) else seed}),
-        "slots 0 and 1 have the same first observation",
-        NEXT,
-    ),
-    "seed list read as its first": (
-        resetting(lambda seed, options: {"seed": seed[0] if isinstance(seed, list) else seed}),
-        "seed list: slot 1 with seed 14 differs",
-        NEXT,
-    ),
+    "seedless": (resetting(lambda seed, options: {"seed": None}),
+                 "seed 0 gives another first observation in a second environment", NEXT),
+    "stuck": (resetting(lambda seed, options: {"seed": None if "reset_mask" in (options or {}) else 5}),
+              "differs from the scalar with that seed", NEXT),
+    "alike": (resetting(lambda seed, options: {"seed": [seed] * 3 if isinstance(seed, int) else seed}),
+              "slots 0 and 1 have the same first observation", NEXT),
+    "first of a seed list": (resetting(lambda seed, options: {"seed": seed[0] if isinstance(seed, list) else seed}),
+                             "seed list: slot 1 with seed 14 differs", NEXT),
     "repeating": (Repeating, "the same first observations", NEXT),
-    "rewards of 32 bits": (
-        stepping(lambda observation, reward, *rest: (observation, reward.astype(np.float32), *rest)),
-        "reward is float32 .3,. and float64 .3,.",
-        NEXT,
-    ),
-    "observations of 64 bits": (
-        stepping(lambda shown, *rest: ({name: part.astype(np.float64) for name, part in shown.items()}, *rest)),
-        r"observation\['t'\] is float64 .* and float32",
-        NEXT,
-    ),
-    "unmasked": (
-        stepping(lambda *result: (*result[:4], {key: each for key, each in result[4].items() if key != "_far"})),
-        r"info\['_far'\] is in one only",
-        NEXT,
-    ),
+    "rewards of 32 bits": (stepping(lambda shown, reward, *rest: (shown, reward.astype(np.float32), *rest)),
+                           "reward is float32 .3,. and float64 .3,.", NEXT),
+    "observations of 64 bits": (stepping(lambda shown, *rest: ({k: v.astype(float) for k, v in shown.items()}, *rest)),
+                                r"observation\['t'\] is float64 .* and float32", NEXT),
+    "unmasked": (stepping(lambda *result: (*result[:4], {k: each for k, each in result[4].items() if k != "_far"})),
+                 r"info\['_far'\] is in one only", NEXT),
     "reward": (REWARD, "reward of slot 1 is .* and", NEXT),
     "time limit": (TIMEOUT, "terminated of slot . is True and False", NEXT),
-    "info": (
-        stepping(lambda *result: (*result[:4], {**result[4], "far": result[4]["far"] + 1e-9})),
-        r"info\['far'\] of slot 0 is",
-        NEXT,
-    ),
-    "extra": (
-        stepping(lambda *result: (*result[:4], {**result[4], "secret": np.zeros(3), "_secret": np.ones(3, np.bool_)})),
-        r"info\['_secret'\], info\['secret'\] is in one only",
-        NEXT,
-    ),
+    "info": (stepping(lambda *result: (*result[:4], {**result[4], "far": result[4]["far"] + 1e-9})),
+             r"info\['far'\] of slot 0 is", NEXT),
+    "extra": (stepping(lambda *result: (*result[:4], {**result[4], "odd": np.ones(3), "_odd": np.ones(3, bool)})),
+              r"info\['_odd'\], info\['odd'\] is in one only", NEXT),
     "final": (stepping(next_first), r"info\['final_obs'\]\[.\]\['t'\]", SAME),
-    "coupled": (Coupled, r"observation\['x'\] of slot 1", NEXT),
-    "reused": (Reused, "was written by a later call", NEXT),
+    "coupled": (acting(lambda actions: np.repeat(actions[:1], len(actions), axis=0)),
+                r"observation\['x'\] of slot 1", NEXT),
+    "reused": (made(lambda env: setattr(env, "copy", False)), "was written by a later call", NEXT),
     "recycled": (Recycled, r"\[1\] .kept as .* was written by a later call", NEXT),
     "reads results back": (ReadBack, "writing into earlier results or actions changed", NEXT),
     "keeps actions": (KeepsActions, "writing into earlier results or actions changed", NEXT),
-    "writes actions": (WritesActions, "wrote into the actions", NEXT),
+    "writes actions": (acting(lambda actions: actions, lambda actions: actions.fill(0.5)), "wrote into the", NEXT),
     "resets all": (resetting(lambda seed, options: {"options": None}), "reset of ended slots", DISABLED),
-}
+}  # fmt: skip
 """Each with what is said of it, and the mode that shows it."""
 
 
