@@ -55,7 +55,7 @@ TOLERANCE = 1e-3
 HARMLESS = (
     "Monitor", "TimeLimit", "OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatistics", "RecordVideo",
     "HumanRendering", "NormalizeReward", "TransformReward", "ClipReward", "VecMonitor", "VecNormalize", "VecCheckNan",
-    "VecVideoRecorder", "TrainingReward",
+    "VecVideoRecorder", "ActionRepeat",
 )  # fmt: skip
 """Wrappers that leave observations and actions as they are; what VecNormalize does is in the agent file."""
 
@@ -224,7 +224,7 @@ def main(argv: list[str] | None = None) -> int:
     about = "what it was trained on: a scenario's name, all, FILE.py:NAME or A=0.6,B=0.4 (default: %(default)s)"
     parser.add_argument("--scenario", default="randomized", help=about)
     parser.add_argument("--observation", default="history", help="observation it reads (default: %(default)s)")
-    parser.add_argument("--action", default="direct", help="direct, smooth or rate (default: %(default)s)")
+    parser.add_argument("--action", default="smooth", help="direct, smooth or rate (default: %(default)s)")
     parser.add_argument("--control-interval", type=float, default=5.0, help="in seconds (default: %(default)s)")
     parser.add_argument("--seed", type=int, help="training seed (default: the model's)")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="agent file to write (.onnx)")

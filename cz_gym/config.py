@@ -62,8 +62,8 @@ class Config:
     scenario: Distribution = RANDOMIZED
     """The scenario, or the mixture of scenarios, from which episodes are drawn."""
     model: str | float | None = None
-    observation: str = "measured"
-    action: str = "direct"
+    observation: str = "history"
+    action: str = "smooth"
     """What an action means: "direct", "smooth" or "rate" (:func:`cz_gym.task.drives_of`)."""
     control_interval: float = 5.0
     """Time between actions [s]."""
@@ -136,13 +136,13 @@ def check_config(config: Config) -> Config:
 def make_config(
     scenario: AnyScenario = "randomized",
     model: str | float | None = None,
-    observation: str = "measured",
+    observation: str = "history",
     control_interval: float = 5.0,
     horizon: float = 10800.0,
     parameters: Parameters | None = None,
     meniscus: MeniscusModel | None = None,
     camera: Camera | None = None,
-    action: str = "direct",
+    action: str = "smooth",
 ) -> Config:
     """Check the arguments of the environment; CzError names what was given and what is allowed."""
     drawn_from = find_distribution(scenario)

@@ -86,7 +86,7 @@ def record(policy: Any, config: Config, seeds: Sequence[int], noise: float) -> l
     gains, place = np.array([drives.pull, drives.heater]), list(DRIVE_CHANNELS)
     added = np.stack([excitation(seed, config, noise)[1] for seed in seeds], axis=1)
     begins, over, memory, before = np.ones(n, np.bool_), np.zeros(n, np.bool_), None, np.zeros((n, 2))
-    with closing(CzVectorEnv.from_config(config, n)) as env:
+    with closing(CzVectorEnv.from_config(config, n, info="all")) as env:
         observation, info = env.reset(seed=list(seeds))
         seen, taken = [(observation, info["r_c"], info["r_ref"], info["state"])], []
         for noise_now in added:
@@ -133,7 +133,7 @@ def write(
     Nothing is left of a dataset whose writing fails or is interrupted.
     """
     minari, _ = import_module("minari"), import_module("h5py")
-    settings: dict[str, Any] = {"scenario": scenario, "observation": "history", "horizon": horizon}
+    settings: dict[str, Any] = {"scenario": scenario, "observation": "history", "action": "direct", "horizon": horizon}
     config, place = make_config(**settings), f"cz/{scenario}/{name.replace('.', '_')}-v0"
     if not seeds or not set(seeds) <= set(TRAINING_SEEDS):
         raise CzError(f"seeds must be some of the training seeds, {TRAINING_SEEDS[0]} to {TRAINING_SEEDS[-1]}")

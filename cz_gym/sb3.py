@@ -1,7 +1,7 @@
 """stable-baselines3's ``VecEnv`` over the native batch: no processes, no Python loop over slots.
 
-``make_vec_env(16, observation="history", action="smooth")`` is an environment for any of its algorithms. This module
-needs stable-baselines3; nothing else of the package imports it.
+``make_vec_env(16)`` is an environment for any of its algorithms. This module needs stable-baselines3; nothing else of
+the package imports it.
 """
 
 from __future__ import annotations
@@ -11,23 +11,23 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from cz_gym.errors import CzError
 from cz_gym.names import needs
-from cz_gym.observation import CLIP, OBSERVATIONS, STATE
 from cz_gym.vector import CzVectorEnv
 
 
-def make_vec_env(num_envs: int, stagger: int | None = None, **settings: Any) -> CzVecEnv:
+def make_vec_env(num_envs: int, stagger: int | None = None, action_repeat: int = 1, **settings: Any) -> VecEnv:
     """Many environments for stable-baselines3; ``settings`` are the keywords of ``gym.make("Cz-v0", ...)``.
 
-    ``stagger`` is :class:`CzVecEnv`'s.
+    ``stagger`` is :class:`CzVecEnv`'s. With ``action_repeat`` above 1 each action is held for as many steps while an
+    agent learns, whose effect is then easier to see (:class:`ActionRepeat`); a trained agent acts at every step.
     """
-    return CzVecEnv(CzVectorEnv(num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings), stagger=stagger)
+    env = CzVecEnv(CzVectorEnv(num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings), stagger=stagger)
+    return env if action_repeat == 1 else ActionRepeat(env, action_repeat)
 
 
 class CzVecEnv(VecEnv):
@@ -36,21 +36,16 @@ class CzVecEnv(VecEnv):
     Observations are float32, shape (num_envs, channels); ``infos`` are empty except for slots whose episode ended: they
     hold ``terminal_observation``, ``TimeLimit.truncated`` and ``episode``: return, length and time, as those of
     stable-baselines3's ``Monitor``. With ``stagger``, a seed, each slot's first episode is cut (truncated) at a random
-    step, so that slots are not all in the same minute. With ``observation="history"`` and ``privileged`` the true state
-    follows each observation, for a critic that sees more than the policy.
+    step, so that slots are not all in the same minute.
     """
 
-    def __init__(self, env: CzVectorEnv, privileged: bool = False, stagger: int | None = None) -> None:
+    def __init__(self, env: CzVectorEnv, stagger: int | None = None) -> None:
         needs(CzVectorEnv, env, "without wrappers of gymnasium around it")
         if env.autoreset_mode != AutoresetMode.SAME_STEP:
             raise CzError("CzVecEnv needs autoreset_mode=AutoresetMode.SAME_STEP, as stable-baselines3 resets itself")
-        if privileged and env.config.observation != "history":
-            raise CzError('privileged=True needs observation="history"')
         self.env = env
-        self.privileged = privileged
         self.render_mode = env.render_mode
-        channels = len(OBSERVATIONS[env.config.observation]) + (len(STATE) if privileged else 0)
-        super().__init__(env.num_envs, Box(-CLIP, CLIP, (channels,), np.float32), env.single_action_space)
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self.info: dict[str, Any] = {}
         """The batch's info of its last step."""
         self._actions = np.zeros((env.num_envs, 2), np.float32)
@@ -70,14 +65,14 @@ class CzVecEnv(VecEnv):
         """Draw new episodes, with the seeds and options given before."""
         seeds = list(self._seeds)
         options = self._options[0] if self._options and self._options[0] else None
-        observation, info = self.env.reset(seed=seeds, options=options)
+        observation, _ = self.env.reset(seed=seeds, options=options)
         self._reset_seeds()
         self._reset_options()
         self._returns[:] = 0.0
         self._lengths[:] = 0
         self._k = 0
         self.reset_infos = [{} for _ in range(self.num_envs)]
-        return self._seen(observation, info)
+        return observation
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions for :meth:`step_wait`."""
@@ -90,23 +85,19 @@ class CzVecEnv(VecEnv):
         self._returns += reward
         self._lengths += 1
         self._k += 1
-        seen = self._seen(observation, info)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         done = terminated | truncated
         for i in np.flatnonzero(done).tolist():
-            final = info["final_obs"][i]
-            if self.privileged:
-                final = np.concatenate([final, info["final_info"]["state"][i]])
-            infos[i] = self._final(i, final, bool(truncated[i]))
+            infos[i] = self._final(i, info["final_obs"][i], bool(truncated[i]))
         cut = (self._cuts == self._k) & ~done
         if cut.any():
             for i in np.flatnonzero(cut).tolist():
-                infos[i] = self._final(i, seen[i].copy(), True)
-            seen[cut] = self._seen(*self.env.reset(options={"reset_mask": cut}))[cut]
+                infos[i] = self._final(i, observation[i].copy(), True)
+            observation[cut] = self.env.reset(options={"reset_mask": cut})[0][cut]
             done = done | cut
         self._returns[done] = 0.0
         self._lengths[done] = 0
-        return seen, reward.astype(np.float32), done, infos
+        return observation, reward.astype(np.float32), done, infos
 
     def _final(self, i: int, observation: np.ndarray, truncated: bool) -> dict[str, Any]:
         episode = {"r": float(self._returns[i]), "l": int(self._lengths[i]), "t": round(time.time() - self._began, 6)}
@@ -139,5 +130,34 @@ class CzVecEnv(VecEnv):
         """The native batch does not render."""
         return [None] * self.num_envs
 
-    def _seen(self, observation: np.ndarray, info: dict[str, Any]) -> np.ndarray:
-        return np.concatenate([observation, info["state"]], axis=1) if self.privileged else observation
+
+class ActionRepeat(VecEnvWrapper):
+    """Repeats each action for ``times`` steps; the reward is the sum of theirs.
+
+    An episode that ends among these steps ends the transition; the steps of the next episode until the action's end
+    earn nothing.
+    """
+
+    def __init__(self, venv: VecEnv, times: int) -> None:
+        super().__init__(venv)
+        self.times = times
+
+    def reset(self) -> Any:
+        """Reset every slot."""
+        return self.venv.reset()
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep the actions for :meth:`step_wait`."""
+        self.actions = actions
+        self.venv.step_async(actions)
+
+    def step_wait(self) -> Any:
+        """Advance every slot by ``times`` steps."""
+        observation, earned, done, infos = self.venv.step_wait()
+        for _ in range(self.times - 1):
+            self.venv.step_async(self.actions)
+            observation, more, over, others = self.venv.step_wait()
+            earned = earned + np.where(done, np.float32(0.0), more)
+            infos = [one if one else other for one, other in zip(infos, others, strict=True)]
+            done = done | over
+        return observation, earned, done, infos

@@ -52,7 +52,7 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
         num_envs: int = 1,
         scenario: AnyScenario = "randomized",
         model: str | float | None = None,
-        observation: str = "measured",
+        observation: str = "history",
         control_interval: float = 5.0,
         horizon: float = 10800.0,
         render_mode: str | None = None,
@@ -61,7 +61,7 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         threads: int | None = None,
         camera: Camera | None = None,
-        action: str = "direct",
+        action: str = "smooth",
         info: str = "lean",
     ) -> None:
         config = make_config(
@@ -296,7 +296,7 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
             scenarios = self._batch.scenarios.copy()
             scenarios[~mask] = None
             infos["scenario"], infos["_scenario"] = scenarios, mask
-        if self.config.observation == "history":
+        if self._everything and self.config.observation == "history":
             infos["state"] = out.state if whole else np.where(mask[:, None], out.state, np.float32(0))
             infos["_state"] = mask
         return infos

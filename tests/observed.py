@@ -8,6 +8,9 @@ import numpy as np
 from cz_gym import CzVectorEnv
 from cz_gym.observation import MEASURED, PULL_SCALE, scales
 
+PLAIN: dict[str, Any] = {"observation": "measured", "action": "direct"}
+"""Settings of an environment for classical controllers."""
+
 
 def measured(**values: Any) -> np.ndarray:
     """A "measured" observation of these values [SI], of shape (n,) or numbers; the rest zero, the camera valid."""

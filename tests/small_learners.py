@@ -6,15 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from cz_gym.agents.training import fleet, run, validation
-from cz_gym.agents.training.algorithms import make_algorithm
-from cz_gym.agents.training.callbacks import Statistics
-from cz_gym.agents.training.recipes import APG, PPO, SAC, Recipe, Reinforcement
+from cz_gym.agents.training.algorithms import make_algorithm, repeat_of
+from cz_gym.agents.training.recipes import APG, PPO, SAC, Recipe
 from cz_gym.atomic_files import locked
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
-SMALL = PPO(num_envs=4, hidden=(16, 16), steps=64, n_steps=16, batch_size=32, n_epochs=1)
+SMALL = PPO(num_envs=4, hidden=(16, 16), steps=128, n_steps=16, batch_size=32, n_epochs=1)
 SMALL_SAC = SAC(
-    num_envs=4, hidden=(16, 16), steps=64, buffer_size=256, learning_starts=32, batch_size=16, gradient_steps=1
+    num_envs=4, hidden=(16, 16), steps=256, buffer_size=256, learning_starts=32, batch_size=16, gradient_steps=1
 )
 SMALL_APG = APG(num_envs=4, window=20, steps=160)
 REFERENCES = dict.fromkeys(validation.REFERENCES, (0.2, 0.1))
@@ -79,8 +78,8 @@ def tell_and_wait(task: Any) -> None:
 
 def learned(algorithm: Any, recipe: Recipe) -> Any:
     """The algorithm after what is left of the recipe's steps, as a run lets it learn."""
-    callbacks = [Statistics(recipe.steps // 4)] if isinstance(recipe, Reinforcement) else []
-    return algorithm.learn(recipe.steps - algorithm.num_timesteps, callbacks, reset_num_timesteps=False)
+    left = recipe.steps // repeat_of(recipe) - algorithm.num_timesteps
+    return algorithm.learn(left, reset_num_timesteps=False)
 
 
 def trained(recipe: Recipe, seed: int = 0) -> Any:

@@ -18,7 +18,6 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from cz_gym.config import Config
-from cz_gym.cost import WEIGHTS, Weights
 from cz_gym.differentiable import DifferentiableBatch
 from cz_gym.errors import CzError
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
@@ -42,7 +41,7 @@ class APG(BaseAlgorithm):
     ``env`` says what is learned: a vector environment of Cz-v0 with ``observation="measured"``. Training steps a
     differentiable twin of it with as many slots; ``env`` itself is only asked for its settings. ``window`` is the
     number of steps that a gradient goes back through; each update takes ``window * num_envs`` environment steps.
-    ``weights`` are those of the cost (:class:`.plant_step.StepCost`); a constant ``learning_rate`` falls linearly to 0.
+    The cost is :class:`.plant_step.StepCost`; a constant ``learning_rate`` falls linearly to 0.
     The other arguments are stable-baselines3's. Raises CzError for an environment that is not Cz-v0's, or reads another
     observation.
     """
@@ -56,7 +55,6 @@ class APG(BaseAlgorithm):
         env: GymEnv | str | None,
         learning_rate: float | Schedule = 4e-3,
         window: int = 180,
-        weights: Weights = WEIGHTS,
         policy_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -83,7 +81,7 @@ class APG(BaseAlgorithm):
             support_multi_env=True,
             seed=seed,
         )
-        self.window, self.weights = window, weights
+        self.window = window
         self.norms = torch.zeros(NORMS)
         if _init_setup_model:
             self._setup_model()
@@ -149,7 +147,7 @@ class APG(BaseAlgorithm):
         policy, going = self.policy, True
         warm = self._current_progress_remaining > 1.0 - WARM_UP
         policy.set_training_mode(True)
-        cost_of = StepCost(self._config(), self.weights)
+        cost_of = StepCost(self._config())
         state, measured = crystals.state, crystals.measured
         costs, seen = [], []
         for _ in range(self.window):

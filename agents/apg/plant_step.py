@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from cz_gym.config import Config
-from cz_gym.cost import Weights, cost_terms, saturated
+from cz_gym.cost import cost_terms, saturated
 from cz_gym.differentiable import STATES, DifferentiableBatch
 from cz_gym.task import drives_of
 
@@ -41,16 +41,14 @@ class _PlantStep(torch.autograd.Function):
 
 
 class StepCost:
-    """The cost of a step that APG follows; it differs from the reward's in two terms.
+    """The cost of a step that APG follows: the reward's, but for moves that a limit of the drive cuts off.
 
-    The radius error is the one that sensors can show: without the bright ring's offset. The pull step is the one that
-    the action asks for: where a limit of the drive cuts it, the step that is taken no longer depends on the action, and
+    The pull step is the one that the action asks for: the one that is taken no longer depends on the action there, and
     a policy that asks for more than the drive does would never learn to ask for less.
     """
 
-    def __init__(self, config: Config, weights: Weights) -> None:
+    def __init__(self, config: Config) -> None:
         self.drives, self.v_0 = drives_of(config.action, config.control_interval), config.parameters.v_0
-        self.weights = Weights(*weights)  # a saved model has them as a list
 
     def __call__(
         self, before: torch.Tensor, action: torch.Tensor, after: torch.Tensor, grows: torch.Tensor, target: torch.Tensor
@@ -58,5 +56,5 @@ class StepCost:
         """The saturated sum of the four terms, shape (n,), from the states before and after; 0 if it does not grow."""
         asked = (self.drives.keep - 1.0) * (before[:, V_P] - self.v_0) + self.drives.pull * self.v_0 * action[:, 0]
         error, heater_step = after[:, R_C] - target, after[:, Q_H] - before[:, Q_H]
-        terms = cost_terms(error, after[:, V_P] - self.v_0, asked, heater_step, self.weights)
+        terms = cost_terms(error, after[:, V_P] - self.v_0, asked, heater_step)
         return torch.where(grows, saturated(sum(terms)), 0.0)

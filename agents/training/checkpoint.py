@@ -25,7 +25,7 @@ from cz_gym.agents.agent_file.contract import AgentFileError, read_bounded
 
 from .replay_buffer import PREFIX, fits, latest, refill
 
-FORMAT = "cz-gym-checkpoint-4"
+FORMAT = "cz-gym-checkpoint-5"
 MAX_BYTES = 64_000_000
 """Largest checkpoint that is read."""
 MAX_HEADER = 1_000_000
@@ -34,8 +34,10 @@ FILES = ("agent.onnx", "agent.json", "progress.csv", "progress.png", "summary.js
 """Files of a run that its checkpoint may hold."""
 IN_FILE = "file/"
 """Prefix of a file's name among the tensors."""
-COUNTS = ("step", "exp_avg_sq")
-"""Adam's tensors that are never negative."""
+MOMENTS = ("mean", "var", "count")
+"""What VecNormalize knows of observations and returns."""
+COUNTS = ("step", "exp_avg_sq", "var", "count")
+"""Tensors that are never negative."""
 
 Tensors = dict[str, torch.Tensor]
 
@@ -116,6 +118,9 @@ def restore(algorithm: BaseAlgorithm, tensors: Tensors, path: Path) -> None:
     with torch.no_grad():
         for name, tensor in learned.items():
             live[name].copy_(tensor)
+    for name, statistics in _statistics(algorithm).items():
+        for key in MOMENTS:
+            setattr(statistics, key, learned[f"{name}/{key}"].numpy()[()])
     refill(_buffer(algorithm), transitions)
 
 
@@ -140,7 +145,15 @@ def _tensors(algorithm: BaseAlgorithm) -> Tensors:
             initial["step"] = torch.zeros(())
             state = part.state.setdefault(parameter, initial)
             tensors |= {f"{name}/{index}/{key}": state[key] for key in initial}
+    for name, statistics in _statistics(algorithm).items():
+        tensors |= {f"{name}/{key}": torch.tensor(getattr(statistics, key), dtype=torch.float64) for key in MOMENTS}
     return tensors
+
+
+def _statistics(algorithm: BaseAlgorithm) -> dict[str, Any]:
+    """The running means that observations and rewards are normalised with, by name."""
+    env: Any = algorithm.get_vec_normalize_env()
+    return {} if env is None else {"obs_rms": env.obs_rms, "ret_rms": env.ret_rms}
 
 
 def _alike(one: torch.Tensor, other: torch.Tensor) -> bool:

@@ -9,11 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from cz_gym.config import Config, make_config
-from cz_gym.cost import WEIGHTS, Weights
 from cz_gym.evaluation.user_code import scenarios
-
-QUIET = Weights(pull=0.025, pull_step=0.035, heater_step=1.17)
-"""Weights near those of lqg-quiet: pull speed and its steps are cheaper than in the reward, heater steps dearer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +19,7 @@ class Recipe:
     name: str
     """Name of the agents that it trains."""
     steps: int
-    """Environment steps that it learns for."""
+    """Environment steps that it learns for, with those of repeated actions."""
     num_envs: int
     """Crystals at a time."""
     learning_rate: float
@@ -31,14 +27,10 @@ class Recipe:
     observation: str = "history"
     action: str = "smooth"
     """Meaning of the network's two outputs (:func:`cz_gym.task.drives_of`)."""
-    scenario: str = "randomized"
+    scenario: str = "all"
     """Scenario or mixture of the training and validation crystals (:func:`cz_gym.evaluation.user_code.scenarios`)."""
     control_interval: float = 5.0
     """Time between actions [s]."""
-    weights: Weights = WEIGHTS
-    """Weights of the cost's terms, in training and validation."""
-    observable: bool = False
-    """Whether the cost's radius error leaves out the offset that no sensor shows."""
 
     @property
     def config(self) -> Config:
@@ -59,9 +51,6 @@ class APG(Recipe):
     learning_rate: float = 4e-3
     observation: str = "measured"
     action: str = "rate"
-    scenario: str = "randomized=0.35,hard=0.2,sensor-fault=0.2,puller=0.25"
-    weights: Weights = QUIET
-    observable: bool = True
     window: int = 180
     """Steps of a crystal that a gradient goes back through."""
     betas: tuple[float, float] = (0.9, 0.9)
@@ -71,67 +60,54 @@ class APG(Recipe):
 
 @dataclass(frozen=True, kw_only=True)
 class Reinforcement(Recipe):
-    """Learns from reward, by trying."""
+    """Learns from reward, by trying; observations and reward are normalised by stable-baselines3's ``VecNormalize``."""
 
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers, of actor and critic alike."""
+    action_repeat: int
+    """Environment steps that an action is held for in training: the effect of one of 5 s is lost in the noise."""
     gamma: float = 0.99
+    """Discount of an action's steps together."""
     batch_size: int
-    noise: float
-    """Standard deviation of the initial exploration [-]."""
-    privileged_critic: bool = False
-    """Whether the critic also sees the true state."""
-    failure_costs: bool = True
-    """Whether a lost crystal costs what is left of it; without, rewards are positive and end there."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PPO(Reinforcement):
-    """Proximal policy optimisation; the critic sees the true state."""
+    """Proximal policy optimisation."""
 
     name: str = "ppo"
-    steps: int = 20_000_000
+    steps: int = 24_000_000
     num_envs: int = 512
-    privileged_critic: bool = True
+    action_repeat: int = 2
     n_steps: int = 64
-    """Steps of each crystal between updates."""
+    """Actions on each crystal between updates."""
     batch_size: int = 2048
     n_epochs: int = 5
     learning_rate: float = 1e-3
     gae_lambda: float = 0.95
-    clip_range: float = 0.2
-    ent_coef: float = 0.0
-    vf_coef: float = 0.5
-    max_grad_norm: float = 0.5
-    noise: float = 0.5
+    log_std_init: float = -0.7
+    """Logarithm of the initial standard deviation of the actions."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SAC(Reinforcement):
-    """Soft actor-critic.
-
-    While it learns, each action is repeated for 20 s: the effect of one action of 5 s is lost in the critic's errors.
-    """
+    """Soft actor-critic."""
 
     name: str = "sac"
-    steps: int = 1_500_000
-    """Actions, each of which is repeated."""
+    steps: int = 6_000_000
     num_envs: int = 64
     action_repeat: int = 4
-    """Environment steps that an action is repeated for in training."""
     gamma: float = 0.97
-    failure_costs: bool = False
-    noise: float = 0.2
     buffer_size: int = 1_000_000
     learning_starts: int = 10_000
     """Actions before the first update."""
     batch_size: int = 512
     gradient_steps: int = 4
-    """Updates after each step of all crystals."""
+    """Updates after each action of all crystals."""
     learning_rate: float = 5e-4
     tau: float = 0.01
     ent_coef: str = "auto_0.005"
-    """Initial weight of the entropy, in units of the reward times 1 - gamma; it adapts."""
+    """Initial weight of the entropy; it adapts."""
 
 
 RECIPES: dict[str, Recipe] = {recipe.name: recipe for recipe in (PPO(), SAC(), APG())}

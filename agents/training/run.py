@@ -22,10 +22,9 @@ from cz_gym.atomic_files import write_files
 from cz_gym.observation import OBSERVATIONS
 
 from . import validation
-from .algorithms import make_algorithm
-from .callbacks import Statistics
+from .algorithms import make_algorithm, repeat_of
 from .checkpoint import load_checkpoint, restore, to_bytes
-from .recipes import Recipe, Reinforcement
+from .recipes import Recipe
 from .run_files import check_settings, identity, provenance, read_rows, to_csv, to_json
 from .validation import COLUMNS, REFERENCES, References, Validation, validate
 
@@ -85,7 +84,7 @@ class Run:
     @property
     def steps(self) -> int:
         """Environment steps taken."""
-        return self.algorithm.num_timesteps
+        return self.algorithm.num_timesteps * repeat_of(self.recipe)
 
     def learn(self, bar: Any) -> None:
         """Learn to the end, validating and saving on the way; nothing if that is done.
@@ -95,12 +94,9 @@ class Run:
         """
         bar.update(self.steps - bar.n)
         with deferred_interrupt() as interrupted:
-            callbacks: list[BaseCallback] = []
-            if isinstance(self.recipe, Reinforcement):
-                callbacks.append(Statistics(self.recipe.steps // 4, known=self.steps > 0))
-            callbacks.append(_Watch(self, bar, interrupted))
             if self.steps < self.recipe.steps:
-                self.algorithm.learn(self.recipe.steps - self.steps, callbacks, reset_num_timesteps=False)
+                left = -(-(self.recipe.steps - self.steps) // repeat_of(self.recipe))
+                self.algorithm.learn(left, _Watch(self, bar, interrupted), reset_num_timesteps=False)
             if not self.rows or int(self.rows[-1]["steps"]) < self.steps:
                 self.validate(bar)
             if interrupted():
@@ -143,7 +139,8 @@ class Run:
 
     def validate(self, bar: Any) -> None:
         """Export the actor as it stands and run the file itself on validation episodes; keep it if it is the best."""
-        content = to_onnx(self.algorithm.policy, len(OBSERVATIONS[self.config.observation]))
+        algorithm, channels = self.algorithm, len(OBSERVATIONS[self.config.observation])
+        content = to_onnx(algorithm.policy, channels, algorithm.get_vec_normalize_env())
         contract = make_contract(
             content,
             **facts_of(self.config),
@@ -172,7 +169,7 @@ class Run:
         bar.set_postfix_str(f"RMSE {figures.rmse_mm:.3f} mm, {figures.failure_rate:.0%} lost ({beside})")
 
     def _figures(self, policy: OnnxPolicy, seeds: range) -> Validation:
-        return validate(policy, self.config, seeds, self.recipe.weights, self.recipe.observable)
+        return validate(policy, self.config, seeds)
 
     def _write_settings(self, sessions: list[dict[str, Any]]) -> None:
         """Write the run's settings; each time it is begun or resumed adds a session."""

@@ -9,11 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.config import Config, make_config
-from cz_gym.cost import FAILURE_COST, WEIGHTS, Weights, cost_terms
+from cz_gym.cost import COST_CAP
 from cz_gym.evaluation.metrics import Metrics, metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.units import KILO, MM, MM_PER_MIN
 
 from .recipes import Recipe
 
@@ -43,19 +42,17 @@ class Validation(NamedTuple):
     """Mean figures over validation episodes."""
 
     cost: float
-    """Mean cost of a step with the recipe's weights, at most ten; that of a lost crystal is ten [-]."""
+    """Mean cost of a step before it saturates, at most ten; that of a lost crystal is ten [-]."""
     rmse_mm: float
     pull_step_rms_mm_per_min: float
     failure_rate: float
 
 
-def validate(
-    policy: Any, config: Config, seeds: Sequence[int], weights: Weights = WEIGHTS, observable: bool = False
-) -> Validation:
+def validate(policy: Any, config: Config, seeds: Sequence[int]) -> Validation:
     """Run one episode a seed."""
     measured = metrics(rollout(policy, config, seeds))
     figures = (
-        costs(measured, weights, observable),
+        costs(measured),
         measured.rmse_mm,
         measured.pull_step_rms_mm_per_min,
         measured.failure_rate,
@@ -65,7 +62,7 @@ def validate(
 
 def references(make_controller: Callable[[str, Config], Any], recipe: Recipe) -> References:
     """What the classical controllers reach on the crystals of a recipe; ``make_controller`` makes one by its name."""
-    config = make_config(recipe.config.scenario, control_interval=recipe.control_interval)
+    config = make_config(recipe.config.scenario, None, "measured", recipe.control_interval, action="direct")
     # Classical controllers are designed for one scenario.
     design = config if len(config.scenario.scenarios) == 1 else config.with_scenario("randomized")
     found = {}
@@ -75,17 +72,6 @@ def references(make_controller: Callable[[str, Config], Any], recipe: Recipe) ->
     return found
 
 
-def costs(measured: Metrics, weights: Weights = WEIGHTS, observable: bool = False) -> Floats:
-    """Mean cost of a step of each episode (:attr:`Validation.cost`), shape (episodes,).
-
-    With ``observable``, the radius error leaves out the offset that no sensor shows.
-    """
-    error = measured.rmse_observable_mm if observable else measured.rmse_mm
-    terms = cost_terms(
-        error * MM,
-        measured.pull_rms_mm_per_min * MM_PER_MIN,
-        measured.pull_step_rms_mm_per_min * MM_PER_MIN,
-        measured.heater_step_rms_kw * KILO,
-        weights,
-    )
-    return np.where(measured.failure_rate > 0, FAILURE_COST, np.minimum(sum(terms), FAILURE_COST))
+def costs(measured: Metrics) -> Floats:
+    """Mean cost of a step of each episode (:attr:`Validation.cost`), shape (episodes,)."""
+    return np.where(measured.failure_rate > 0, COST_CAP, np.minimum(measured.cost, COST_CAP))

@@ -16,7 +16,7 @@ from cz_gym.config import Config
 from cz_gym.engine.batch import Key, first_key
 from cz_gym.episodes.draw import randomised
 from cz_gym.episodes.record import GRID, Episode
-from cz_gym.episodes.schedule import disturbance, reference
+from cz_gym.episodes.schedule import bias_offset, disturbance, reference
 from cz_gym.episodes.series import draw_episode, draw_factors, new_series
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.plant import Disturbance, Inputs, Puller, State, make_puller, rk4
@@ -40,8 +40,8 @@ class Future(NamedTuple):
     """Fields of shape (n,)."""
     start: State
     """State at t = 0, fields of shape (n,)."""
-    r_ref: Floats
-    """Radius reference at the end of each step [m], shape (steps, n)."""
+    target: Floats
+    """Radius of no cost at the end of each step [m]: the reference less the ring's hidden offset, shape (steps, n)."""
     disturbances: tuple[Disturbance, ...]
     """Disturbances by substep; fields of shape (steps, n)."""
     lengths: Floats
@@ -84,7 +84,7 @@ def future_of(config: Config, seeds: Sequence[int]) -> Future:
     return Future(
         puller,
         puller.state_0._replace(r_c=puller.r_0 + e.r_c_start),
-        puller.r_0 + reference(end, e),
+        puller.r_0 + reference(end, e) - bias_offset(end, e),
         tuple(Disturbance(*(np.asarray(value)[column] for value in on_grid)) for column in substeps.point.T),
         substeps.length.T[:, :, None],
         config.meniscus,

@@ -100,7 +100,8 @@ class TrueState(NamedTuple):
     ) -> Exact:
         """The state at a sample, given the one before."""
         dt, before, mean = self.models.dt, state.mean, np.zeros(state.mean.shape)
-        mean[:, :PLANT] = np.stack([seen.r_c_error + seen.r_ref, seen.h_c, seen.T_1, seen.T_2, seen.T_b], axis=-1)
+        radius = seen.r_c_error + seen.r_ref + seen.ring_offset  # of no cost where the ring shows r_ref
+        mean[:, :PLANT] = np.stack([radius, seen.h_c, seen.T_1, seen.T_2, seen.T_b], axis=-1)
         mean[:, [FAST, SLOW]] = _separated(before[:, [FAST, SLOW]], seen.dT_i, starts, self.models.noise, dt)
         mean[:, DRIFT] = _drift(seen.Q_d, self.models.puller)
         mean[:, DRIFT_RATE] = np.where(starts, 0.0, mean[:, DRIFT] - before[:, DRIFT]) / dt

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.baselines.policy import Floats
-from cz_gym.cost import Cost, cost_terms
+from cz_gym.cost import beyond_band, coefficients
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.physics.plant import Inputs, State
 from cz_gym.task import HEATER_RANGE, HEIGHT_MAX_IN_A, HEIGHT_MIN
@@ -144,10 +144,10 @@ def limits_of(actuators: Actuators, v_0: float, interval: float) -> Limits:
 
 def optimise(future: Future, limits: Limits) -> Trajectory:
     """Minimise the reward's unsaturated cost over whole episodes within the drives' limits."""
-    N, n = future.r_ref.shape
+    N, n = future.target.shape
     nominal = np.stack([np.broadcast_to(value, n) for value in future.puller.inputs_0], axis=-1)
     x = np.broadcast_to(np.stack(future.start, axis=-1), (N + 1, n, STATES)).copy()
-    x[1:, :, 0] = future.r_ref
+    x[1:, :, 0] = future.target
     u = np.broadcast_to(nominal, (N, n, INPUTS)).copy()
     slack = _slacks(u, nominal, limits)
     force = BARRIER / slack
@@ -173,7 +173,7 @@ def optimise(future: Future, limits: Limits) -> Trajectory:
 
 def linearised(future: Future, x: Floats, u: Floats) -> tuple[Floats, Floats]:
     """The state after each step, shape (N, n, 5), and its derivatives by state and inputs, shape (N, n, 5, 7)."""
-    N, n = future.r_ref.shape
+    N, n = future.target.shape
     after, slopes = np.empty((N, n, STATES)), np.empty((N, n, STATES, STATES + INPUTS))
     point = np.concatenate([x[:-1], u], axis=-1)
     for first in range(0, N, _BLOCK):
@@ -188,10 +188,10 @@ def linearised(future: Future, x: Floats, u: Floats) -> tuple[Floats, Floats]:
 
 _BLOCK = 128
 """Number of steps that are linearised together: they fit a processor's cache."""
-_WEIGHTS = Cost(*cost_terms(MM, MM_PER_MIN, MM_PER_MIN, KILO))
-"""Cost terms of one unit of :data:`SCALES`."""
-_CURVATURE = 2.0 * np.array([_WEIGHTS.radius, 0.0, 0.0, 0.0, 0.0, _WEIGHTS.pull, 0.0])
-_MOVE_CURVATURE = 2.0 * np.array([_WEIGHTS.pull_step, _WEIGHTS.heater_step])
+_PER_SQUARE = np.array(coefficients()) * np.array([MM, MM_PER_MIN, MM_PER_MIN, KILO]) ** 2
+"""Cost terms of one unit of :data:`SCALES`; that of the pull speed beyond its band."""
+_CURVATURE = 2.0 * np.array([_PER_SQUARE[0], 0.0, 0.0, 0.0, 0.0, _PER_SQUARE[1], 0.0])
+_MOVE_CURVATURE = 2.0 * _PER_SQUARE[2:]
 
 
 def _stages(
@@ -199,7 +199,7 @@ def _stages(
 ) -> Stages:
     """The problem of a Newton step in deviations from (x, u); its states are x and the held inputs."""
     after, slopes = linearised(future, x, u)
-    N, n = future.r_ref.shape
+    N, n = future.target.shape
     slopes = slopes * (SCALES / SCALES[:STATES, None])
     A = np.zeros((N, n, STATES + INPUTS, STATES + INPUTS))
     A[:, :, :STATES] = slopes
@@ -210,9 +210,12 @@ def _stages(
     upper, lower, up, down = range(4)
     curvature, slope = force / slack, barrier / slack
     Q, q = np.broadcast_to(_CURVATURE, c.shape).copy(), np.zeros(c.shape)
+    held = u - nominal
+    held[:, :, 0] = beyond_band(held[:, :, 0])
+    Q[:, :, STATES] *= held[:, :, 0] != 0.0
     Q[:, :, STATES:] += curvature[upper] + curvature[lower]
-    q[:, :, 0] = _CURVATURE[0] * (x[1:, :, 0] - future.r_ref) / MM
-    q[:, :, STATES:] = _CURVATURE[STATES:] * (u - nominal) / SCALES[STATES:] + slope[upper] - slope[lower]
+    q[:, :, 0] = _CURVATURE[0] * (x[1:, :, 0] - future.target) / MM
+    q[:, :, STATES:] = _CURVATURE[STATES:] * held / SCALES[STATES:] + slope[upper] - slope[lower]
     R = _MOVE_CURVATURE + curvature[up] + curvature[down]
     r = _MOVE_CURVATURE * moves + slope[up] - slope[down]
     return Stages(A, A[:, :, :, STATES:], c, Q, q, R, r)

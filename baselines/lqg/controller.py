@@ -40,6 +40,7 @@ class LQGDesign:
 
     noise: NoiseModel = field(default_factory=NoiseModel)
     weights: Weights = WEIGHTS
+    """Weights of the regulator's quadratic cost, whose term of the pull speed has no band."""
     lam: float = 0.5
     """Share of conduction at the design point [-]."""
     nonlinear: bool = True

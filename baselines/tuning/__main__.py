@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def tune(given: argparse.Namespace) -> None:
     """Search, choose, and print the chosen settings."""
-    config = make_config(given.scenario, control_interval=given.control_interval)
+    config = make_config(given.scenario, None, "measured", given.control_interval, action="direct")
     goal = goal_of(given.controller, config.sole_scenario)
     search = Search(given.controller, goal, config, given.trials, given.episodes, measure)
     chosen = search.tune(given.out / file_name(given.controller, given.scenario))

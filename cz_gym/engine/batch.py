@@ -93,7 +93,8 @@ class Batch:
         self.clock = Clock(config.control_interval, config.steps, math.ceil(config.horizon / GRID) + 1)
         self.drives = drives_of(config.action, config.control_interval)
         self.channels = len(HISTORY) if config.observation == "history" else len(MEASURED)
-        self.state_channels = len(STATE) if config.observation in ("history", "state") else 0
+        shows_state = config.observation == "state" or (everything and config.observation == "history")
+        self.state_channels = len(STATE) if shows_state else 0
         self._camera = config.observation == "camera"
         newest, oldest = lags(config.control_interval)
         v_0 = config.parameters.v_0

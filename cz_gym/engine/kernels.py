@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.cost import Cost, cost_terms, failure_penalty, reward
+from cz_gym.cost import Cost, cost_terms, reward
 from cz_gym.episodes.draw import draw_episode, draw_factors, draw_scenario, randomised, seed_streams
 from cz_gym.episodes.noise import first_fluctuation, fluctuation, sample_noise
+from cz_gym.episodes.schedule import bias_offset
 from cz_gym.jit.cache import hashed
 from cz_gym.jit.compile import fetch, inlined, jittable, kernel
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
@@ -96,7 +97,7 @@ def _sample(memory: Any, i: Any, fresh: Any, clock: Any, scales: Any, out: Any, 
         recall(slot, measured, memory.history[i], scales, row)
     if out.state.shape[1] > 0:
         write_channels(true_state(slot, measured, t), scales.state, out.state[i])
-    error = x.r_c - p.r_0 - measured.r_ref
+    error = x.r_c - p.r_0 - measured.r_ref + bias_offset(t, slot.episode)
     cost = cost_terms(error, measured.v_p, slot.v_p - slot.v_p_before, slot.Q_H - slot.Q_H_before)
     if slot.k == 0:
         cost = Cost(0.0, 0.0, 0.0, 0.0)
@@ -188,7 +189,7 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
                 slot, grows = memory.slots[i], memory.slots[i].over == 0
                 cost = _sample(memory, i, True, clock, scales, out, slope, ring_offset)
                 ends = slot.k >= clock.steps
-                out.reward[i] = reward(cost) + (0.0 if grows else failure_penalty(slot.k, clock.steps))
+                out.reward[i] = reward(cost, grows)
                 out.terminated[i] = not grows
                 out.truncated[i] = grows and ends
                 slot.over = 1 if (not grows or ends) else 0

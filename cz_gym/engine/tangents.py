@@ -11,7 +11,7 @@ from typing import Any
 
 from cz_gym.cost import Cost, cost_slopes
 from cz_gym.episodes.record import GRID
-from cz_gym.episodes.schedule import melt_left, reference
+from cz_gym.episodes.schedule import bias_offset, melt_left, reference
 from cz_gym.jit.cache import hashed
 from cz_gym.jit.compile import force_inlined, jittable, kernel
 from cz_gym.physics.meniscus import MeniscusModel
@@ -145,7 +145,7 @@ def build_tangents(meniscus: MeniscusModel) -> tuple[Any, Any]:
             h_c = height_inside(x.h_c, p)
             ring_by_r = 1.0 + ring_offset(_step(x.r_c), h_c, p).imag / _H
             ring_by_h = ring_offset(x.r_c, _step(h_c), p).imag / _H
-            error = x.r_c - p.r_0 - reference(slot.k * dt, e)
+            error = x.r_c - p.r_0 - reference(slot.k * dt, e) + bias_offset(slot.k * dt, e)
             slopes = cost_slopes(error, slot.v_p - p.v_0, slot.v_p - slot.v_p_before, slot.Q_H - slot.Q_H_before)
             for j in range(_ACT + ACTIONS):
                 drive = _V if j in (_V, _ACT) else _Q

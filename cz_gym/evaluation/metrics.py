@@ -83,7 +83,7 @@ def metrics(run: Rollout) -> Metrics:
         heater_step_rms_kw=_rms(heater_step, alive) / KILO,
         growth_rate_rms_mm_per_min=_rms(s.v_g - v_0, alive) / MM_PER_MIN,
         ground_off_pct=_ground_off(s.r_c, alive),
-        cost=_cost(error, s.v_p - v_0, pull_step, heater_step, alive),
+        cost=_cost(observable, s.v_p - v_0, pull_step, heater_step, alive),
         failure_rate=run.failed.astype(np.float64),
         return_=run.reward.sum(axis=0),
     )

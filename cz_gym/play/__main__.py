@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def settings(arguments: argparse.Namespace) -> Config:
     """The environment's settings."""
-    return make_config(arguments.scenario, horizon=arguments.minutes * MINUTE)
+    return make_config(arguments.scenario, None, "measured", horizon=arguments.minutes * MINUTE, action="direct")
 
 
 def _play(arguments: argparse.Namespace) -> None:

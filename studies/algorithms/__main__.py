@@ -1,4 +1,4 @@
-"""Train recipes over several seeds and compare their agents: ``python -m studies.algorithms [ablation]``.
+"""Train recipes over several seeds and compare their agents: ``python -m studies.algorithms``.
 
 Every run is an ordinary folder of train.py below ``--work``. A finished run is not trained again, an interrupted one
 continues from its checkpoint. All agents are evaluated each time, so a table never mixes figures of different code.

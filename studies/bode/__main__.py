@@ -32,7 +32,7 @@ PLACES = {"camera": "ring", "v_p": "pull speed"}
 
 def form_of(name: str) -> LinearForm:
     """The linear form of a shipped controller, or of ``FILE.py:NAME``; ValueError says in one line why it has none."""
-    config = make_config("nominal")
+    config = make_config("nominal", observation="measured", action="direct")
     return linear_form(user_code.controller(name).make(config) if ":" in name else make_controller(name, config))
 
 

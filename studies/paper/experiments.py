@@ -81,7 +81,7 @@ def trace(
     meniscus: MeniscusModel = HURLE,
 ) -> Trace:
     """Run a policy once on one model of the paper."""
-    config = make_config(scenario, model, control_interval=interval, horizon=horizon, meniscus=meniscus)
+    config = make_config(scenario, model, "measured", interval, horizon, meniscus=meniscus, action="direct")
     run = rollout(policy.for_config(config) if hasattr(policy, "for_config") else policy, config, [0])
     lived = int(run.alive.sum())
     logged = Signals(

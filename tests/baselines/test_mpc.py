@@ -16,6 +16,7 @@ from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.physics.plant import Disturbance, Inputs, State, hidden_load, rk4
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
+from tests.observed import PLAIN
 
 pytest.importorskip("casadi", reason="needs the extra mpc")
 
@@ -155,7 +156,7 @@ def test_what_it_asks_for_is_within_the_drives_limits():
     actuators = Actuators(
         pull_window=0.02 * MM_PER_MIN, pull_slew=0.05 * MM_PER_MIN / MINUTE, heater_slew=0.5 * KILO / MINUTE
     )
-    config = make_config(replace(RANDOMIZED, name="narrow", actuators=actuators), horizon=0.1 * HOUR)
+    config = make_config(replace(RANDOMIZED, name="narrow", actuators=actuators), horizon=0.1 * HOUR, **PLAIN)
     with pytest.warns(UserWarning, match=r"lqg was not tuned for actuators\.pull_window"):
         watched = Watched(ekf_mpc(config))
     run = rollout(watched, config, range(1_000_000, 1_000_003))
@@ -184,11 +185,11 @@ def test_estimates_beyond_the_equations_fall_back_on_the_law():
 def test_without_casadi_one_line_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "casadi", None)
     with pytest.raises(ImportError, match=r"^this needs the package casadi: pip install '\.\[mpc\]'$"):
-        find_controller("ekf-mpc").make(make_config())
+        find_controller("ekf-mpc").make(make_config(**PLAIN))
 
 
 def test_settings_tell_results_apart():
-    config = make_config("randomized")
+    config = make_config("randomized", **PLAIN)
     assert ekf_mpc(config).hash == ekf_mpc(config).hash
-    others = (replace(ekf_mpc(config), horizon=400.0), EkfMpc(), ekf_mpc(make_config("puller")))
+    others = (replace(ekf_mpc(config), horizon=400.0), EkfMpc(), ekf_mpc(make_config("puller", **PLAIN)))
     assert len({ekf_mpc(config).hash, *(other.hash for other in others)}) == 4

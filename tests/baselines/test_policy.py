@@ -25,7 +25,7 @@ from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.observation import MEASURED
-from tests.observed import measured, observations
+from tests.observed import PLAIN, measured, observations
 
 CASES = [(entry.name, "randomized") for entry in CONTROLLERS if entry.observation == "measured" and not entry.slow]
 TUNED = ("pid-conventional", "paper-filtered", "paper-tuned", "industrial", "lqg")
@@ -35,7 +35,7 @@ CASES += [("paper-tuned", "puller"), ("lqg", "puller"), ("ekf-mpc", "puller")]
 def make(name, scenario):
     if name == "ekf-mpc":
         pytest.importorskip("casadi", reason="needs the extra mpc")
-    return make_controller(name, make_config(scenario))
+    return make_controller(name, make_config(scenario, **PLAIN))
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_history_is_read_like_measured(name):
 @pytest.mark.parametrize("name", TUNED)
 @pytest.mark.parametrize("dt", [2.0, 10.0])
 def test_every_control_interval_holds_the_radius_alike(name, dt):
-    usual, other = (make_config("randomized", control_interval=each, horizon=5400.0) for each in (5.0, dt))
+    usual, other = (make_config("randomized", control_interval=each, horizon=5400.0, **PLAIN) for each in (5.0, dt))
     found = [metrics(rollout(make_controller(name, config), config, range(8))) for config in (usual, other)]
     assert not np.any([m.failure_rate for m in found])
     assert found[1].rmse_mm.mean() == pytest.approx(found[0].rmse_mm.mean(), rel=0.25)
@@ -82,7 +82,7 @@ def test_every_control_interval_holds_the_radius_alike(name, dt):
 
 @pytest.mark.parametrize("name", TUNED)
 def test_without_disturbance_it_stays_where_it_is(name):
-    config = make_config("nominal", control_interval=2.0, horizon=3600.0)
+    config = make_config("nominal", control_interval=2.0, horizon=3600.0, **PLAIN)
     assert metrics(rollout(make_controller(name, config), config, [0])).max_error_mm[0] < 1e-3
 
 
@@ -105,7 +105,7 @@ def test_actions_are_for_the_environment_of_the_controller_alone(name):
     assert policy.made_for == config.made_for
     env.step(action)
     for option in OTHER:
-        other = CzVectorEnv.from_config(replace(config, **{option: getattr(make_config(), option)}), 1)
+        other = CzVectorEnv.from_config(replace(config, **{option: getattr(make_config(**PLAIN), option)}), 1)
         other.reset(seed=0)
         with pytest.raises(InvalidAction, match="was made for"):
             other.step(action)
@@ -150,7 +150,7 @@ def actions_of(policy, rows):
 @given(bad=BAD, value=st.sampled_from([math.nan, math.inf, -math.inf]), start=st.integers(0, 2))
 def test_what_is_no_number_is_not_read(name, bad, value, start):
     """A PID goes on as if the last readings had been repeated; an LQG forgets that it read less."""
-    policy = make_controller(name, make_config())
+    policy = make_controller(name, make_config(**PLAIN))
     rows = np.repeat(ROW[None], 3 + len(bad) + 60 * name.startswith("lqg"), axis=0)
     usual = actions_of(policy, rows)
     for k, channels in enumerate(bad, start):
@@ -165,7 +165,7 @@ def test_the_predictive_controller_does_not_read_it_either():
     pytest.importorskip("casadi", reason="needs the extra mpc")
     rows = np.repeat(ROW[None], 4, axis=0)
     rows[1, :, :] = math.nan
-    assert np.isfinite(actions_of(make_controller("ekf-mpc", make_config()), rows)).all()
+    assert np.isfinite(actions_of(make_controller("ekf-mpc", make_config(**PLAIN)), rows)).all()
 
 
 @pytest.mark.parametrize("name", ["paper", "paper-tuned", "industrial", "lqg"])
@@ -176,7 +176,7 @@ def test_a_ring_that_is_not_valid_is_not_read(name, garbage):
     held = rows.copy()
     held[2:4, :, 1] = rows[2:4, :, 1] = 0.0
     rows[2:4, :, 0] = garbage
-    policy = make_controller(name, make_config())
+    policy = make_controller(name, make_config(**PLAIN))
     np.testing.assert_allclose(actions_of(policy, rows), actions_of(policy, held), rtol=1e-5, atol=1e-9)
 
 

@@ -14,6 +14,7 @@ from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Sensor
 from cz_gym.episodes.scenarios import HARD, PULLER, RANDOMIZED, SCENARIOS, SENSOR_FAULT
 from cz_gym.units import MINUTE, MM
+from tests.observed import PLAIN
 
 NAMES = [scenario.name for scenario in TUNED]
 
@@ -38,7 +39,7 @@ def test_designs_are_those_that_were_published(scenario):
 def test_another_name_changes_nothing(scenario):
     other = replace(scenario, name="mine", drift=replace(scenario.drift, amount=(-1.0, 1.0)))
     for name in ("lqg", "lqg-at-0.02", "paper-tuned", "industrial"):
-        made, expected = (make_controller(name, make_config(each)) for each in (other, scenario))
+        made, expected = (make_controller(name, make_config(each, **PLAIN)) for each in (other, scenario))
         assert made == expected
 
 
@@ -54,8 +55,8 @@ def test_what_no_settings_were_tuned_for_is_said():
     scenario = replace(PULLER, name="both", faults=SENSOR_FAULT.faults)
     for name in ("lqg", "paper-tuned"):
         with pytest.warns(UserWarning, match=rf"{name} was not tuned for faults\.flagged, .* of scenario 'both'"):
-            made = make_controller(name, make_config(scenario))
-        assert made == make_controller(name, make_config("puller"))
+            made = make_controller(name, make_config(scenario, **PLAIN))
+        assert made == make_controller(name, make_config("puller", **PLAIN))
     late = replace(PULLER, name="late", sensor=replace(PULLER.sensor, latency=20.0))
     with pytest.warns(UserWarning, match=r"tuned for sensor\.latency of scenario 'late': it has .* for 'puller'"):
         assert design_of("lqg", late).ring.latency == 20.0

@@ -12,6 +12,7 @@ import benchmark
 from cz_gym import SCENARIOS, CzVectorEnv, Parameters
 from tests.golden.digest import digest
 from tests.golden.trajectories import FILE, SIGNALS, trajectories, trajectory
+from tests.observed import PLAIN
 from tests.processes import ROOT, python
 
 GOLDEN: dict[str, Any] = json.loads(FILE.read_text())
@@ -42,7 +43,7 @@ def test_the_same_bits_in_another_process() -> None:
 def test_thread_counts_do_not_change_bits() -> None:
     digests = set()
     for threads in (1, 2, 3):
-        env = CzVectorEnv(780, "puller", horizon=50.0, threads=threads, info="all")
+        env = CzVectorEnv(780, "puller", horizon=50.0, threads=threads, info="all", **PLAIN)
         assert env._batch._parts == threads
         found, rng = hashlib.sha256(env.reset(seed=3)[0].tobytes()), np.random.default_rng(1)
         for _ in range(14):

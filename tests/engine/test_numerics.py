@@ -13,6 +13,7 @@ from cz_gym.episodes.record import Factors
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.plant import Disturbance, Inputs, State, rk4
 from cz_gym.task import HEIGHT_MIN
+from tests.observed import PLAIN
 from tests.stress.__main__ import WIDE, campaign, cases
 from tests.stress.adversaries import KINDS, Adversaries
 from tests.stress.checks import Broken, Watch
@@ -47,7 +48,7 @@ def test_a_short_campaign() -> None:
     ],
 )
 def test_what_is_wrong_is_found(where: str, value: Any, says: str) -> None:
-    env = CzVectorEnv(2, "nominal", threads=1, info="all")
+    env = CzVectorEnv(2, "nominal", threads=1, info="all", **PLAIN)
     watch = Watch(env)
     watch.begin(*env.reset(seed=0))
     watch.before()
@@ -66,7 +67,7 @@ def test_a_heater_never_cools() -> None:
     nominal = make_puller(small).Q_H_0
     assert nominal < 10e3
     for scenario in ("nominal", "puller"):
-        env = CzEnv(scenario, parameters=small, info="all")
+        env = CzEnv(scenario, parameters=small, info="all", **PLAIN)
         env.reset(seed=0)
         powers = [env.step(np.array([0.0, -1.0], np.float32))[4]["Q_H"] for _ in range(100)]
         assert min(powers) == 0.0
@@ -74,7 +75,7 @@ def test_a_heater_never_cools() -> None:
 
 def _visited(n: int) -> list[tuple[State, Inputs, Disturbance, Any]]:
     """States and drives that adversaries reach on wide pullers, the last before failures among them."""
-    env = CzVectorEnv(2 * len(KINDS), WIDE, horizon=3600.0, threads=1, info="all")
+    env = CzVectorEnv(2 * len(KINDS), WIDE, horizon=3600.0, threads=1, info="all", **PLAIN)
     slots, adversaries = env._batch.memory.slots, Adversaries(2 * len(KINDS), 5)
     _, infos = env.reset(seed=11)
     found: list[Any] = []

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from cz_gym import CzEnv, CzVectorEnv, make_puller
+from cz_gym.signals import INFO
 
 P = make_puller()
 
@@ -76,18 +77,22 @@ def test_window_slew_and_heater_steps_hold_for_smooth_actions_too() -> None:
 
 
 def test_info_is_lean_unless_all_is_asked_for() -> None:
-    for env, keys in ((CzEnv(), {"r_c", "r_ref"}), (CzEnv(observation="history"), {"r_c", "r_ref", "state"})):
+    for env, keys in (
+        (CzEnv(), {"r_c", "r_ref"}),
+        (CzEnv(info="all"), {*INFO, "state"}),
+        (CzEnv(info="all", observation="measured"), set(INFO)),
+    ):
         _, info = env.reset(seed=0)
         assert set(info) == keys
         *_, info = env.step(np.array([0.5, 0.5], np.float32))
         assert set(info) == keys
         *_, info = env.step(np.array([1.5, 0.5], np.float32))
-        assert set(info) == {*keys, "action_clipped"}
+        assert set(info) == keys | {"action_clipped"}
         assert info["action_clipped"] is True
 
 
 def test_a_deep_copy_of_info_shares_nothing() -> None:
-    for env in CzEnv(), CzEnv(observation="history"), CzEnv(info="all"):
+    for env in CzEnv(), CzEnv(observation="measured"), CzEnv(info="all"):
         _, info = env.reset(seed=0)
         info["of a wrapper"] = {"inside": [1.0]}
         before, copy = deepcopy(dict(info)), deepcopy(info)

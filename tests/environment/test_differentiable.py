@@ -14,6 +14,7 @@ from cz_gym.physics.linearisation import jacobian
 from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.plant import Disturbance, Inputs, State, make_puller, rk4
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
+from tests.observed import PLAIN
 
 STEPS = {"r_c": 1e-7, "h_c": 1e-7, "T_1": 1.0, "T_2": 1.0, "T_b": 1e-2, "v_p": 1e-9, "Q_H": 100.0, "a": 1e-3}
 """How far each number is moved for differences."""
@@ -42,7 +43,7 @@ def moved(batch: DifferentiableBatch, slots: Any, frames: Any, actions: Any, col
 @pytest.mark.parametrize("action", ["smooth", "direct", "rate"])
 def test_derivatives_are_those_of_the_steps(scenario: str, action: str) -> None:
     n, random = 24, np.random.default_rng(0)
-    batch = DifferentiableBatch(make_config(scenario, action=action), n)
+    batch = DifferentiableBatch(make_config(scenario, action=action, observation="measured"), n)
     batch.reset(range(n))
     gain = 0.02 if action == "rate" else 0.1
     for _ in range(40):
@@ -65,11 +66,11 @@ def test_derivatives_are_those_of_the_steps(scenario: str, action: str) -> None:
 
 def test_a_reading_that_is_held_or_late_depends_on_the_one_before() -> None:
     ring, reading = STATES.index("ring"), STATES.index("reading")
-    late = DifferentiableBatch(make_config("puller"), 8)
+    late = DifferentiableBatch(make_config("puller", **PLAIN), 8)
     late.reset(range(8))
     step = late.step(np.zeros((8, 2)))
     np.testing.assert_array_equal(step.jacobian[:, reading, ring], 1.0)
-    fault = DifferentiableBatch(make_config("sensor-fault"), 64)
+    fault = DifferentiableBatch(make_config("sensor-fault", **PLAIN), 64)
     fault.reset(range(64))
     held = np.zeros(64, bool)
     for _ in range(100):
@@ -83,7 +84,7 @@ def test_a_reading_that_is_held_or_late_depends_on_the_one_before() -> None:
 
 
 def test_window_and_slew_stop_derivatives() -> None:
-    batch = DifferentiableBatch(make_config("puller"), 4)
+    batch = DifferentiableBatch(make_config("puller", **PLAIN), 4)
     batch.reset(range(4))
     step = batch.step(np.full((4, 2), 0.9))
     v, Q, n = STATES.index("v_p"), STATES.index("Q_H"), len(STATES)
@@ -92,7 +93,7 @@ def test_window_and_slew_stop_derivatives() -> None:
 
 
 def test_a_lost_crystal_stops_counting() -> None:
-    batch = DifferentiableBatch(make_config("randomized"), 8)
+    batch = DifferentiableBatch(make_config("randomized", **PLAIN), 8)
     batch.reset(range(8))
     actions = np.zeros((8, 2))
     actions[:4] = 1.0
@@ -113,7 +114,10 @@ def test_a_lost_crystal_stops_counting() -> None:
 def test_the_environment_s_own_crystals_and_observations() -> None:
     from cz_gym import CzVectorEnv
 
-    batch, env = DifferentiableBatch(make_config("hard", action="smooth"), 4), CzVectorEnv(4, "hard", action="smooth")
+    batch, env = (
+        DifferentiableBatch(make_config("hard", action="smooth", observation="measured"), 4),
+        CzVectorEnv(4, "hard", action="smooth", observation="measured"),
+    )
     _, measured = batch.reset([5, 6, 7, 8])
     np.testing.assert_array_equal(measured, env.reset(seed=5)[0])
     actions = np.random.default_rng(0).uniform(-0.2, 0.2, (50, 4, 2))
@@ -137,12 +141,12 @@ def test_the_chain_rule_over_rk4_is_exact() -> None:
 @pytest.mark.parametrize(
     ("config", "slots", "message"),
     [
-        (make_config(control_interval=10.0), 2, "must divide 5 s"),
-        (make_config(control_interval=2.0), 2, "must divide 5 s"),
-        (make_config("puller", control_interval=2.5), 2, "latency of 5 s is longer"),
+        (make_config(control_interval=10.0, **PLAIN), 2, "must divide 5 s"),
+        (make_config(control_interval=2.0, **PLAIN), 2, "must divide 5 s"),
+        (make_config("puller", control_interval=2.5, **PLAIN), 2, "latency of 5 s is longer"),
         ("randomized", 2, "a config is needed"),
-        (make_config(), 0, "num_envs must be"),
-        (make_config(), 2.0, "num_envs must be"),
+        (make_config(**PLAIN), 0, "num_envs must be"),
+        (make_config(**PLAIN), 2.0, "num_envs must be"),
     ],
 )
 def test_what_has_no_derivatives_is_refused(config: Any, slots: Any, message: str) -> None:
@@ -152,14 +156,14 @@ def test_what_has_no_derivatives_is_refused(config: Any, slots: Any, message: st
 
 @pytest.mark.parametrize("actions", [np.full((2, 2), np.nan), np.zeros(2), np.zeros((3, 2))])
 def test_actions_that_are_none_are_refused(actions: np.ndarray) -> None:
-    batch = DifferentiableBatch(make_config(), 2)
+    batch = DifferentiableBatch(make_config(**PLAIN), 2)
     batch.reset([1, 2])
     with pytest.raises(InvalidAction, match=r"shape \(2, 2\)"):
         batch.step(actions)
 
 
 def test_resets_that_are_none_are_refused() -> None:
-    batch = DifferentiableBatch(make_config(), np.int64(2))
+    batch = DifferentiableBatch(make_config(**PLAIN), np.int64(2))
     with pytest.raises(ResetNeeded, match="every slot needs a crystal"):
         batch.step(np.zeros((2, 2)))
     batch.reset([1], [0])
@@ -173,7 +177,7 @@ def test_resets_that_are_none_are_refused() -> None:
 
 
 def test_crystals_at_their_end_stay() -> None:
-    batch = DifferentiableBatch(make_config(horizon=50.0), 2)
+    batch = DifferentiableBatch(make_config(horizon=50.0, **PLAIN), 2)
     batch.reset([1, 2])
     ends = [batch.step(np.zeros((2, 2))) for _ in range(12)]
     assert [step.grows.all() for step in ends] == [True] * 10 + [False] * 2
@@ -183,7 +187,7 @@ def test_crystals_at_their_end_stay() -> None:
 
 @pytest.mark.slow  # compiles for another meniscus
 def test_the_exact_meniscus_has_derivatives_too() -> None:
-    batch = DifferentiableBatch(make_config(meniscus=YOUNG_LAPLACE), 4)
+    batch = DifferentiableBatch(make_config(meniscus=YOUNG_LAPLACE, **PLAIN), 4)
     batch.reset(range(4))
     slots, frames = batch._batch.memory.slots.copy(), batch._batch.memory.frames.copy()
     column, by = STATES.index("h_c"), 1e-7

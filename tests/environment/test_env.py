@@ -12,6 +12,7 @@ from cz_gym.config import Config, make_config
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.physics.plant import Disturbance, State, growth
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
+from tests.observed import PLAIN
 
 MM_PER_MIN = 1e-3 / 60
 ZERO = np.zeros(2, np.float32)
@@ -94,7 +95,7 @@ def test_a_drawn_puller_without_operating_point_is_drawn_again() -> None:
     [[math.nan, 0.0], [0.0], [0.0, 0.0, 0.0], [[0.0, 0.0]], 0.0, "up", None, ["a", "b"], np.zeros((2, 3)),
      np.full((2, 2), math.nan), [[0.0, 0.0], [0.0]]],
 )  # fmt: skip
-@pytest.mark.parametrize("make", [CzEnv, lambda: CzVectorEnv(2)])
+@pytest.mark.parametrize("make", [CzEnv, lambda: CzVectorEnv(2, **PLAIN)])
 def test_bad_actions_are_refused(make: Any, action: Any) -> None:
     env = make()
     with pytest.raises(ResetNeeded):
@@ -108,24 +109,24 @@ def test_bad_actions_are_refused(make: Any, action: Any) -> None:
 @pytest.mark.parametrize("number", [np.int64, np.float32, np.float64])
 def test_numpy_numbers_are_numbers(number: Any) -> None:
     parameters = Parameters()._replace(T_m=number(1685), C_1=number(57000))
-    given = make_config("nominal", number(1), "measured", number(5), number(100), parameters)
-    plain = make_config("nominal", 1.0, "measured", 5.0, 100.0)
+    given = make_config("nominal", number(1), "measured", number(5), number(100), parameters, action="direct")
+    plain = make_config("nominal", 1.0, "measured", 5.0, 100.0, action="direct")
     assert (given.hash, given.steps, given.mix) == (plain.hash, 20, (1.0, 1.0))
 
 
 def test_equal_plants_have_equal_hashes() -> None:
-    zero, minus_zero = (make_config(parameters=Parameters(T_e=T_e)) for T_e in (0.0, -0.0))
+    zero, minus_zero = (make_config(parameters=Parameters(T_e=T_e), **PLAIN) for T_e in (0.0, -0.0))
     assert zero.plant_hash == minus_zero.plant_hash == Config(parameters=Parameters(T_e=0)).plant_hash
-    assert Config(parameters=Parameters(T_m=1685)).plant_hash == make_config().plant_hash
-    assert make_config(action="smooth").plant_hash == make_config().plant_hash
-    assert make_config(action="smooth").hash != make_config().hash
-    assert make_config("nominal", -0.0).hash == make_config("nominal", 0).hash
+    assert Config(parameters=Parameters(T_m=1685)).plant_hash == make_config(**PLAIN).plant_hash
+    assert make_config(action="smooth", observation="measured").plant_hash == make_config(**PLAIN).plant_hash
+    assert make_config(action="smooth", observation="measured").hash != make_config(**PLAIN).hash
+    assert make_config("nominal", -0.0, **PLAIN).hash == make_config("nominal", 0, **PLAIN).hash
 
 
 def test_out_of_range_actions_are_clipped_and_said_so() -> None:
     runs = []
     for action, clipped in (([3.0, -math.inf], True), ([1.0, -1.0], False)):
-        env = CzEnv(info="all")
+        env = CzEnv(info="all", **PLAIN)
         env.reset(seed=0)
         observation, *_, info = env.step(np.array(action))
         assert info["action_clipped"] is clipped
@@ -134,7 +135,7 @@ def test_out_of_range_actions_are_clipped_and_said_so() -> None:
 
 
 def test_actions_are_pull_speed_and_power() -> None:
-    env, p = CzEnv("nominal", info="all"), make_puller()
+    env, p = CzEnv("nominal", info="all", **PLAIN), make_puller()
     _, start = env.reset(seed=0)
     assert (start["v_p"], start["Q_H"]) == (p.v_0, p.Q_H_0)
     for pull, heat in ((1.0, 0.0), (-1.0, 1.0), (0.5, -0.25)):
@@ -144,7 +145,7 @@ def test_actions_are_pull_speed_and_power() -> None:
 
 
 def test_info_is_the_plant_in_si() -> None:
-    env = CzEnv("only-interface", model=0.3, info="all")
+    env = CzEnv("only-interface", model=0.3, info="all", **PLAIN)
     env.reset(seed=2)
     p = make_puller(lam=0.3)
     for _ in range(5):
@@ -160,7 +161,10 @@ def test_info_is_the_plant_in_si() -> None:
 
 
 def test_a_critic_may_see_the_state_beside_the_history() -> None:
-    history, state = CzEnv(observation="history", info="all"), CzEnv(observation="state", info="all")
+    history, state = (
+        CzEnv(observation="history", info="all", action="direct"),
+        CzEnv(observation="state", info="all", action="direct"),
+    )
     np.testing.assert_array_equal(history.reset(seed=4)[1]["state"], state.reset(seed=4)[0])
     np.testing.assert_array_equal(history.step(ZERO)[4]["state"], state.step(ZERO)[0])
 
@@ -170,7 +174,7 @@ def test_fast_and_slow_controllers_meet_the_same_crystal(interval: float) -> Non
     """Open loop, the trajectories agree to integration error at the common times."""
     runs = {}
     for dt in (5.0, interval):
-        env = CzEnv("randomized", control_interval=dt, horizon=2400.0, info="all")
+        env = CzEnv("randomized", control_interval=dt, horizon=2400.0, info="all", **PLAIN)
         env.reset(seed=17)
         saved = env.get_state().slot
         steps = [env.step(ZERO)[4] for _ in range(round(2400.0 / dt))]
@@ -181,9 +185,9 @@ def test_fast_and_slow_controllers_meet_the_same_crystal(interval: float) -> Non
 
 
 def test_one_episode_of_another_scenario() -> None:
-    env = CzEnv("nominal", observation="state", info="all")
+    env = CzEnv("nominal", observation="state", info="all", action="direct")
     given, _ = env.reset(seed=5, options={"scenario": "hard"})
-    hard, _ = CzEnv("hard", observation="state", info="all").reset(seed=5)
+    hard, _ = CzEnv("hard", observation="state", info="all", action="direct").reset(seed=5)
     np.testing.assert_array_equal(given, hard)
     assert env.reset()[1]["r_c"] == make_puller().r_0
 
@@ -192,7 +196,7 @@ def test_drives_obey_window_slew_and_steps() -> None:
     limits = Actuators(
         pull_window=0.5 * MM_PER_MIN, pull_slew=0.3 * MM_PER_MIN / 60, heater_slew=2000.0 / 60, heater_step=100.0
     )
-    env, p = CzEnv(Scenario("mine", actuators=limits), info="all"), make_puller()
+    env, p = CzEnv(Scenario("mine", actuators=limits), info="all", **PLAIN), make_puller()
     env.reset(seed=0)
     infos = [env.step(np.array([1.0, 0.553], np.float32))[4] for _ in range(60)]
     pull = np.array([(info["v_p"] - p.v_0) / MM_PER_MIN for info in infos])

@@ -9,11 +9,12 @@ from gymnasium.error import InvalidAction
 from cz_gym import CzEnv, CzVectorEnv, Parameters
 from cz_gym.action import mark
 from cz_gym.config import make_config
-from cz_gym.cost import Weights, coefficients, cost_slopes, cost_terms, saturated, saturated_slope
+from cz_gym.cost import PULL_BAND, Weights, coefficients, cost_slopes, cost_terms, saturated, saturated_slope
 from cz_gym.differentiable import DifferentiableBatch
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
+from tests.observed import PLAIN
 
-OWN = make_config(horizon=600.0)
+OWN = make_config(horizon=600.0, **PLAIN)
 
 
 @pytest.fixture(params=["scalar", "vector", "differentiable"])
@@ -44,17 +45,19 @@ def test_step_refuses_what_was_made_for_another_environment(step: Any, other: di
         take(theirs)
     take(np.asarray(theirs))
     take(np.clip(2.0 * theirs, -1.0, 1.0))
-    take(mark(action, make_config("hard").made_for))
+    take(mark(action, make_config("hard", **PLAIN).made_for))
     take(mark(action, None))
 
 
 @pytest.mark.parametrize("weights", [Weights(), Weights(2.0, 0.3, 0.7, 23.4)])
 def test_slopes_are_the_derivatives_of_the_terms(weights: Weights) -> None:
-    at = np.array([1e-4, -2e-6, 3e-7, 150.0])
+    at = np.array([1e-4, -9e-6, 3e-7, 150.0])
     for i in range(4):
         stepped = at.astype(complex)
         stepped[i] += 1e-30j
         found = np.imag(cost_terms(*stepped, weights)) / 1e-30
         np.testing.assert_allclose(found[i], cost_slopes(*at, weights)[i], rtol=1e-14)
-    np.testing.assert_allclose(coefficients(weights) * at**2, cost_terms(*at, weights), rtol=1e-14)
+    counted = at + np.array([0.0, PULL_BAND, 0.0, 0.0])
+    np.testing.assert_allclose(coefficients(weights) * counted**2, cost_terms(*at, weights), rtol=1e-14)
+    assert cost_terms(*at / 2.0, weights).pull == cost_slopes(*at / 2.0, weights).pull == 0.0
     assert np.imag(saturated(3.0 + 1e-30j)) / 1e-30 == pytest.approx(saturated_slope(3.0), rel=1e-14)

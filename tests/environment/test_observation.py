@@ -9,6 +9,7 @@ from cz_gym import SCENARIOS, CzEnv, Scenario, decode
 from cz_gym.episodes.scenario import Faults, Sensor
 from cz_gym.episodes.schedule import bias_offset, pyrometer_drift
 from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED, OBSERVATIONS, lags
+from tests.observed import PLAIN
 
 
 def run(env: CzEnv, steps: int, pull: float = 0.0, seed: int = 1) -> tuple[np.ndarray, list[dict[str, Any]], Any]:
@@ -40,7 +41,7 @@ def test_every_channel_is_documented() -> None:
 @pytest.mark.parametrize("scenario", ["randomized", "puller", "sensor-fault"])
 def test_measured_holds_what_the_control_computer_has_and_nothing_else(scenario: str) -> None:
     """Each channel is rebuilt from readings and recipes alone; what no instrument shows does not enter."""
-    env = CzEnv(scenario, info="all")
+    env = CzEnv(scenario, info="all", **PLAIN)
     rows, infos, start = run(env, 400, 0.05)
     p = start.slot["puller"]
     nominal = {name: float(p[name]) for name in ("r_0", "v_0", "T_1_0", "Q_H_0", "ring_bias")}
@@ -66,7 +67,7 @@ def test_the_recipe_is_known_one_and_five_minutes_ahead(interval: float, ahead: 
         recipe=replace(SCENARIOS["randomized"].recipe, start=(120.0, 120.0)),
         reference=replace(SCENARIOS["reference-b"].reference, start=(60.0, 60.0)),
     )
-    seen = decode(run(CzEnv(scenario, control_interval=interval, info="all"), 200)[0])
+    seen = decode(run(CzEnv(scenario, control_interval=interval, info="all", **PLAIN), 200)[0])
     assert np.ptp(seen.r_ref) > 0
     assert np.ptp(seen.T_1_ref) > 0
     for now, one, five in ((seen.r_ref, seen.r_ref_1min, seen.r_ref_5min), (seen.T_1_ref, *seen[6:8])):
@@ -109,7 +110,7 @@ def test_lags_at_the_default_interval_cover_the_past_without_gaps() -> None:
 
 
 def test_state_is_the_plant() -> None:
-    env = CzEnv("puller", observation="state", info="all")
+    env = CzEnv("puller", observation="state", info="all", action="direct")
     rows, infos, start = run(env, 50, 0.05)
     p, slot = start.slot["puller"], env.get_state().slot.slot
     names = [channel.name for channel in OBSERVATIONS["state"]]
@@ -128,9 +129,9 @@ def test_state_is_the_plant() -> None:
 def test_a_late_frame_is_the_newest_old_enough(interval: float, latency: float) -> None:
     """Frames are taken at samples and on the 5 s grid; the true ring of every second is the oracle."""
     scenario = Scenario("mine", interface=SCENARIOS["hard"].interface, sensor=Sensor(latency=latency))
-    every_second = CzEnv(replace(scenario, sensor=Sensor()), control_interval=1.0, info="all")
+    every_second = CzEnv(replace(scenario, sensor=Sensor()), control_interval=1.0, info="all", **PLAIN)
     ring = column(run(every_second, 200)[1], "r_br")
-    _, infos, _ = run(CzEnv(scenario, control_interval=interval, info="all"), round(200 / interval))
+    _, infos, _ = run(CzEnv(scenario, control_interval=interval, info="all", **PLAIN), round(200 / interval))
     frames = {*range(0, 201, 5), *range(0, 201, round(interval))}
     for k, measured in enumerate(column(infos, "r_br_measured")):
         t = k * interval
@@ -142,7 +143,7 @@ def test_a_late_frame_is_the_newest_old_enough(interval: float, latency: float) 
 def test_faulty_camera_shows_the_last_value() -> None:
     """Flagged freezes and drop-outs are invalid, the unflagged freeze is not; the bias drifts unflagged."""
     scenario = Scenario("mine", sensor=SCENARIOS["hard"].sensor, faults=SCENARIOS["sensor-fault"].faults)
-    env = CzEnv(scenario, info="all")
+    env = CzEnv(scenario, info="all", **PLAIN)
     rows, infos, start = run(env, 2160, 0.01, seed=2)
     noise, e, windows = drawn(env).noise, View(start.slot["episode"]), start.slot["freezes"]
     shown, invalid, silent = np.nan, 0, 0
@@ -164,7 +165,7 @@ def test_faulty_camera_shows_the_last_value() -> None:
 
 def test_ring_ripple_is_sampled_at_the_frame() -> None:
     scenario = Scenario("mine", sensor=Sensor(ripple=(1e-4, 1e-4), rotation=(11 / 60, 11 / 60)))
-    env = CzEnv(scenario, info="all")
+    env = CzEnv(scenario, info="all", **PLAIN)
     _, infos, start = run(env, 60)
     phase = float(start.slot["episode"]["ripple_phase"])
     expected = 1e-4 * np.sin(2 * np.pi * 11 / 60 * 5.0 * np.arange(61) + phase)
@@ -173,7 +174,7 @@ def test_ring_ripple_is_sampled_at_the_frame() -> None:
 
 def test_outliers_are_not_flagged() -> None:
     scenario = Scenario("mine", sensor=Sensor(outlier_probability=0.5, outlier_sd=1e-3), faults=Faults())
-    rows, infos, _ = run(CzEnv(scenario, info="all"), 100)
+    rows, infos, _ = run(CzEnv(scenario, info="all", **PLAIN), 100)
     wrong = column(infos, "r_br_measured") - column(infos, "r_br")
     assert 25 < np.count_nonzero(np.abs(wrong) > 1e-9) < 75
     assert (rows[:, 1] == 1.0).all()
@@ -182,7 +183,7 @@ def test_outliers_are_not_flagged() -> None:
 def test_camera_noise_is_per_sample_whatever_the_interval() -> None:
     scenario = Scenario("mine", sensor=Sensor(camera_noise=(1e-4, 1e-4)))
     for interval in (2.0, 10.0):
-        env = CzEnv(scenario, control_interval=interval, info="all")
+        env = CzEnv(scenario, control_interval=interval, info="all", **PLAIN)
         _, infos, _ = run(env, 100)
         noise = column(infos, "r_br_measured") - column(infos, "r_br")
         np.testing.assert_allclose(noise, drawn(env).noise[:101, 0], atol=1e-12)
@@ -190,7 +191,7 @@ def test_camera_noise_is_per_sample_whatever_the_interval() -> None:
 
 def test_observations_are_clipped_not_lost() -> None:
     sensor = Sensor(bias_offset=(5e-3, 5e-3), outlier_probability=1.0, outlier_sd=5e-3)
-    observations, infos, _ = run(CzEnv(Scenario("mine", sensor=sensor), info="all"), 50)
+    observations, infos, _ = run(CzEnv(Scenario("mine", sensor=sensor), info="all", **PLAIN), 50)
     assert column(infos, "r_br_measured").max() > 12e-3 + infos[0]["r_br"]
     assert observations[:, 0].max() == 10.0
 

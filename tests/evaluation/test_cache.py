@@ -23,9 +23,10 @@ from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.protocol import Row
 from cz_gym.evaluation.results import Sample
 from cz_gym.evaluation.rollout import rollout
+from tests.observed import PLAIN
 from tests.samples import sample_of
 
-CONFIG = make_config(horizon=300.0)
+CONFIG = make_config(horizon=300.0, **PLAIN)
 SEEDS = range(5)
 
 

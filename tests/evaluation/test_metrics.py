@@ -9,6 +9,7 @@ from cz_gym.baselines.pid.compensated_pid import CompensatedPID
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import Metrics, metrics
 from cz_gym.evaluation.rollout import Rollout, Signals, rollout
+from tests.observed import PLAIN
 
 DT = 5.0
 R, V, Q = 0.0875, 2e-5, 60e3
@@ -17,7 +18,7 @@ MM_PER_MIN = 1e-3 / 60
 
 def made_up(steps: int, lived: int | None = None, **signals: Any) -> Rollout:
     """One episode of a perfect crystal but for the given signals; with ``lived``, it fails at that step."""
-    config = make_config("nominal", control_interval=DT, horizon=DT * steps)
+    config = make_config("nominal", control_interval=DT, horizon=DT * steps, **PLAIN)
     calm = dict.fromkeys(Signals._fields, 0.0) | {"r_c": R, "r_ref": R, "v_p": V, "v_g": V, "Q_H": Q}
     columns = {name: np.full((steps, 1), value) for name, value in calm.items()}
     for name, value in signals.items():
@@ -140,19 +141,21 @@ def test_return_is_the_sum_of_rewards_and_nothing_else_reads_them() -> None:
 def test_cost_is_that_of_the_reward_before_it_saturates() -> None:
     """Each term where it is one weight, by the printed scales: 0.5 mm, 0.36 and 0.06 mm/min, 1 kW."""
     assert of(made_up(100, r_c=R + 1e-3)).cost == pytest.approx(4.0)
-    assert of(made_up(100, v_p=V + 0.36 * MM_PER_MIN)).cost == pytest.approx(0.5 + 0.25 * 36.0 / 100)
-    assert of(made_up(100, Q_H=Q + 1e3 * (np.arange(100) % 2))).cost == pytest.approx(0.05 * 99 / 100)
+    assert of(made_up(100, v_p=V + 0.36 * MM_PER_MIN)).cost == pytest.approx(
+        0.5 * (0.12 / 0.36) ** 2 + 0.05 * 36.0 / 100
+    )
+    assert of(made_up(100, Q_H=Q + 1e3 * (np.arange(100) % 2))).cost == pytest.approx(0.5 * 99 / 100)
 
 
 def test_cost_of_a_failure_counts_the_lost_radius_to_the_end_and_drives_while_they_lived() -> None:
     found = of(made_up(10, lived=4, v_p=V + 0.36 * MM_PER_MIN))
-    assert found.cost == pytest.approx((7 * 16.0**2 + 4 * 0.5 + 0.25 * 36.0) / 10)
+    assert found.cost == pytest.approx((7 * 16.0**2 + 4 * 0.5 * (0.12 / 0.36) ** 2 + 0.05 * 36.0) / 10)
 
 
 def test_cost_gives_the_reward_of_every_step() -> None:
     """One step an episode: what the environment paid is the saturated cost."""
     for seed in range(3):
-        run = rollout(CompensatedPID(), make_config("randomized", horizon=DT), [seed])
+        run = rollout(CompensatedPID(), make_config("randomized", horizon=DT, **PLAIN), [seed])
         found = metrics(run)
         np.testing.assert_allclose(found.return_, 1.0 - 10.0 * found.cost / (10.0 + found.cost), rtol=1e-6)
 

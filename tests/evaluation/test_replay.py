@@ -10,8 +10,9 @@ from cz_gym.config import make_config
 from cz_gym.errors import CzError
 from cz_gym.evaluation.replay import Playback, replay
 from cz_gym.evaluation.rollout import Rollout, rollout
+from tests.observed import PLAIN
 
-CONFIG = make_config("puller", horizon=600.0)
+CONFIG = make_config("puller", horizon=600.0, **PLAIN)
 SEEDS = [3, 4, 5]
 
 
@@ -50,7 +51,7 @@ def test_until_the_takeover_both_are_one_and_then_the_disturbances_are() -> None
     for name in ("r_ref", "T_1_ref", "ring_offset"):
         np.testing.assert_array_equal(getattr(found.actual.signals, name), getattr(found.instead.signals, name))
     # By hand: the same actions, then none, on the same seeds.
-    env = CzVectorEnv(len(SEEDS), CONFIG.scenario, horizon=600.0)
+    env = CzVectorEnv(len(SEEDS), CONFIG.scenario, horizon=600.0, **PLAIN)
     env.reset(seed=SEEDS)
     for k in range(120):
         *_, info = env.step(actions()[k] if k < 60 else np.zeros((len(SEEDS), 2)))
@@ -58,7 +59,9 @@ def test_until_the_takeover_both_are_one_and_then_the_disturbances_are() -> None
 
 
 def test_a_failed_episode_stays_failed() -> None:
-    found = replay(Playback([[1.0, 0.0]]), Playback([[0.0, 0.0]]), make_config("hard", horizon=1800.0), SEEDS, 900.0)
+    found = replay(
+        Playback([[1.0, 0.0]]), Playback([[0.0, 0.0]]), make_config("hard", horizon=1800.0, **PLAIN), SEEDS, 900.0
+    )
     assert found.actual.failed.all()
     np.testing.assert_array_equal(found.instead.failed, found.actual.failed)
     np.testing.assert_array_equal(found.instead.alive, found.actual.alive)
@@ -74,7 +77,7 @@ def test_policies_of_another_environment_are_refused() -> None:
     agent, pid = load("gradient"), CompensatedPID()
     for one, other in ((agent, pid), (pid, agent)):
         with pytest.raises(CzError, match=r"made for action='rate', .* the environment has action='direct'"):
-            replay(one, other, make_config("randomized", horizon=600.0), [1])
+            replay(one, other, make_config("randomized", horizon=600.0, **PLAIN), [1])
 
 
 @pytest.mark.parametrize("log", [[], [1.0, 2.0], np.zeros((3, 3)), np.zeros((0, 2))])

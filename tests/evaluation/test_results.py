@@ -24,6 +24,7 @@ from cz_gym.evaluation.report.markdown import markdown
 from cz_gym.evaluation.results import Result, Sample, summarise
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.evaluation.statistics import Resamples, optimality_gap
+from tests.observed import PLAIN
 from tests.samples import contender, sample_of
 
 
@@ -126,7 +127,7 @@ def test_a_bound_is_used_only_beside_the_same_figures_of_the_same_controller(ear
     assert earlier_bound(earlier, row, [replace(paper, values=paper.values * 1.001)]) is None
     assert earlier_bound(earlier, row, [replace(paper, contender=contender("other"))]) is None
     assert earlier_bound(earlier, find_row("hard"), [paper]) is None
-    other = make_config("randomized", parameters=make_config().parameters._replace(k_l=62.1))
+    other = make_config("randomized", parameters=make_config(**PLAIN).parameters._replace(k_l=62.1), **PLAIN)
     moved = sample_of(paper.contender, [rollout(find_controller("paper").make(other), other, paper.seeds)])
     assert earlier_bound(earlier, row, [moved]) is None
 

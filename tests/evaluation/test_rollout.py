@@ -24,8 +24,9 @@ from cz_gym.evaluation.replay import Playback
 from cz_gym.evaluation.rollout import Course, Rollout, Signals, check_seeds, rollout
 from cz_gym.observation import MEASURED
 from cz_gym.physics.parameters import Parameters
+from tests.observed import PLAIN
 
-SHORT = make_config("randomized", horizon=600.0)
+SHORT = make_config("randomized", horizon=600.0, **PLAIN)
 CHANNELS = [channel.name for channel in MEASURED]
 
 
@@ -62,7 +63,7 @@ def one_by_one(policy: Any, config: Config, seed: int) -> tuple[dict[str, np.nda
 def test_a_rollout_looks_through_the_camera_of_its_settings() -> None:
     """It was dropped, while the settings' hash said that it was there."""
     near = Camera(tilt=0.4)
-    config = make_config("nominal", observation="camera", horizon=10.0, camera=near)
+    config = make_config("nominal", observation="camera", horizon=10.0, camera=near, action="direct")
     course = Course(config, [3])
     image, _ = CzEnv.from_config(config, info="all").reset(seed=3)
     np.testing.assert_array_equal(course.observation[0], image)
@@ -85,7 +86,7 @@ def check_against_scalar(policy: Any, config: Config, seeds: Sequence[int]) -> R
 
 
 def test_every_signal_is_the_scalar_environments() -> None:
-    check_against_scalar(CompensatedPID(), make_config("sensor-fault", horizon=600.0), [3, 2_000_000, 17])
+    check_against_scalar(CompensatedPID(), make_config("sensor-fault", horizon=600.0, **PLAIN), [3, 2_000_000, 17])
 
 
 def test_failed_episodes_end_where_the_scalar_ones_do() -> None:
@@ -108,7 +109,7 @@ def test_policy_begins_again_where_the_crystal_does() -> None:
 
 def test_start_is_the_state_before_the_first_step() -> None:
     run = rollout(OpenLoop(), SHORT, [7])
-    _, info = CzEnv(SHORT.scenario, horizon=SHORT.horizon, info="all").reset(seed=7)
+    _, info = CzEnv(SHORT.scenario, horizon=SHORT.horizon, info="all", **PLAIN).reset(seed=7)
     for name, value in zip(Signals._fields, run.start, strict=True):
         assert value.item() == info[name]
 
@@ -133,7 +134,11 @@ WITHOUT_TUPLE = SimpleNamespace(predict=lambda observation, **rest: np.zeros((le
         (CompensatedPID, SHORT, "is no policy: an object with predict"),
         (lambda observation: observation, SHORT, "is no policy: an object with predict"),
         (WITHOUT_TUPLE, SHORT, r"predict must return a tuple \(action, state\), not ndarray"),
-        (CompensatedPID(), make_config(action="smooth"), r"made for action='direct'.* has action='smooth'"),
+        (
+            CompensatedPID(),
+            make_config(action="smooth", observation="measured"),
+            r"made for action='direct'.* has action='smooth'",
+        ),
         (
             load("gradient"),
             SHORT,

@@ -12,7 +12,9 @@ def digest() -> str:
     """SHA-256 of everything that three scenarios return under random actions."""
     found = hashlib.sha256()
     for scenario in ("randomized", "puller", "sensor-fault"):
-        env = CzVectorEnv(3, scenario, observation="history", control_interval=20.0, horizon=600.0, info="all")
+        env = CzVectorEnv(
+            3, scenario, observation="history", control_interval=20.0, horizon=600.0, info="all", action="direct"
+        )
         observation, infos = env.reset(seed=4)
         rng = np.random.default_rng(0)
         for _ in range(70):

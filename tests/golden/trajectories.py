@@ -11,6 +11,7 @@ import numpy as np
 
 from cz_gym import SCENARIOS, CzEnv
 from cz_gym.physics.parameters import Parameters
+from tests.observed import PLAIN
 
 FILE = Path(__file__).with_name("trajectories.json")
 SIGNALS = ("r_c", "h_c", "T_1", "T_b", "Q_H", "r_br_measured", "r_ref", "T_1_ref", "v_g")
@@ -19,7 +20,7 @@ SEED, STEPS, EVERY = 12, 240, 120
 
 def trajectory(scenario: str, model: str, parameters: Parameters | None = None) -> list[list[float]]:
     """A row every 20 min: the signals in SI units, and the return so far."""
-    env = CzEnv(scenario, model, control_interval=10.0, horizon=2400.0, parameters=parameters, info="all")
+    env = CzEnv(scenario, model, control_interval=10.0, horizon=2400.0, parameters=parameters, info="all", **PLAIN)
     _, info = env.reset(seed=SEED)
     rows, earned, begun = [], 0.0, info["h_c"]
     for k in range(STEPS):

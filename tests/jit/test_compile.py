@@ -173,7 +173,7 @@ def test_hash_sees_names_and_contents(package: Path) -> None:
     folder = package / "cz_gym"
     first = source_hash(folder)
     assert first == source_hash(ROOT / "cz_gym")
-    edit(folder / "cost.py", "FAILURE_COST = 10.0", "FAILURE_COST = 11.0")
+    edit(folder / "cost.py", "FAILURE_COST = 1000.0", "FAILURE_COST = 1001.0")
     second = source_hash(folder)
     (folder / "cost.py").rename(folder / "costs.py")
     third = source_hash(folder)

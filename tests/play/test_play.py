@@ -18,6 +18,7 @@ from cz_gym.play.game import score
 from cz_gym.rendering import canvas
 from cz_gym.rendering.view import Window
 from cz_gym.units import KILO, MM_PER_MIN
+from tests.observed import PLAIN
 
 pygame = pytest.importorskip("pygame")
 SIZE = (480, 360)
@@ -25,7 +26,7 @@ SIZE = (480, 360)
 
 @pytest.fixture
 def config() -> Config:
-    return make_config("randomized", horizon=600.0)
+    return make_config("randomized", horizon=600.0, **PLAIN)
 
 
 @pytest.fixture
@@ -136,7 +137,7 @@ def test_the_score_of_the_same_controller_is_a_draw(config: Config, seed: int) -
 
 
 def test_a_failed_run_counts_to_the_horizon() -> None:
-    config = make_config("nominal", horizon=5400.0)
+    config = make_config("nominal", horizon=5400.0, **PLAIN)
     env, actions, over = CzEnv.from_config(config), [], False
     env.reset(seed=1)
     while not over:

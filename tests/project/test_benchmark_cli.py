@@ -27,6 +27,7 @@ from cz_gym.observation import OBSERVATIONS
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from tests.contracts import LINEAR, facts, model_of
+from tests.observed import PLAIN
 from tests.processes import python
 
 FILES = ["benchmark.json", "crystal.png", "episodes.csv", "pareto.png", "report.html", "report.md"]
@@ -127,8 +128,8 @@ def test_every_episode_is_in_the_table_and_provenance_says_what_was_run(finished
     assert data["results"]["randomized"]["paper"]["rmse_mm"]["mean"] == pytest.approx(mean, rel=1e-4)
     assert list(data["paired"]["randomized"]) == ["open-loop", "ppo"]
     told = data["provenance"]
-    assert told["plant_hash"] == make_config().plant_hash
-    assert told["scenarios"]["randomized"]["hash"] == make_config("randomized").scenario.hash
+    assert told["plant_hash"] == make_config(**PLAIN).plant_hash
+    assert told["scenarios"]["randomized"]["hash"] == make_config("randomized", **PLAIN).scenario.hash
     assert told["scenarios"]["randomized"]["first_seed"] == 2_000_000
     assert told["scenarios"]["reference-b"]["model"] == "I"
     assert [agent["training_seed"] for agent in told["agents"]] == [3, 8]
@@ -338,7 +339,7 @@ def test_a_report_on_one_s_own_shows_it_and_prints_a_command_that_runs(
     arguments = benchmark.parse(command)
     assert [row.name for row in benchmark.rows_of(arguments)] == ["later"]
     check_targets(arguments.out, arguments.json, True, arguments.overwrite)
-    page, puller = Path("out/report.html").read_text(), make_config().plant_hash
+    page, puller = Path("out/report.html").read_text(), make_config(**PLAIN).plant_hash
     assert "5 controllers, 1 scenario, up to 1 crystal each" in page
     for text in (page, Path("out/report.md").read_text()):
         assert f"on the default puller: radius 87.5 mm, pull speed 1.2 mm/min, plant {puller}." in text

@@ -18,6 +18,7 @@ from cz_gym.rendering.view import record_of
 from cz_gym.signals import INFO
 from cz_gym.task import HEIGHT_MIN
 from cz_gym.units import KILO, MM, MM_PER_MIN
+from tests.observed import PLAIN
 
 pygame = pytest.importorskip("pygame")
 CANVAS = Canvas(640, 480)
@@ -134,7 +135,7 @@ def test_length_grown_is_the_integral_of_the_growth_rate(record: Record) -> None
 
 
 def test_what_was_melted_back_is_not_drawn() -> None:
-    env = CzEnv("nominal", render_mode="rgb_array")
+    env = CzEnv("nominal", render_mode="rgb_array", **PLAIN)
     env.reset(seed=1)
     record = record_of(env)
     info = record._samples[0, :-1].copy()

@@ -17,13 +17,14 @@ import cz_gym
 from cz_gym import CzEnv
 from cz_gym.rendering import canvas, view
 from cz_gym.rendering.view import MODES, check_size, record_of
+from tests.observed import PLAIN
 from tests.processes import ROOT, python
 
 pygame = pytest.importorskip("pygame")
 
 
 def trajectory(render_mode: str | None, scenario: str, steps: int = 60) -> list[Any]:
-    env = CzEnv(scenario=scenario, render_mode=render_mode, observation="history")
+    env = CzEnv(scenario=scenario, render_mode=render_mode, observation="history", action="direct")
     generator = np.random.default_rng(4)
     found: list[Any] = [env.reset(seed=9)]
     for _ in range(steps):
@@ -41,7 +42,7 @@ def trajectory(render_mode: str | None, scenario: str, steps: int = 60) -> list[
 def test_gymnasiums_checker_renders_every_mode_without_a_warning(mode: str | None) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(gym.make("Cz-v0", horizon=600.0, render_mode=mode).unwrapped)
+        check_env(gym.make("Cz-v0", horizon=600.0, render_mode=mode, **PLAIN).unwrapped)
 
 
 @pytest.mark.parametrize("scenario", ["randomized", "puller"])
@@ -66,7 +67,7 @@ def test_the_users_environment_stays_as_it_was() -> None:
 
 @pytest.mark.parametrize("size", [(480, 360), (641, 483), (1280, 720)])
 def test_the_size_is_the_users(size: tuple[int, int]) -> None:
-    env = gym.make("Cz-v0", render_mode="rgb_array", render_size=size)
+    env = gym.make("Cz-v0", render_mode="rgb_array", render_size=size, **PLAIN)
     env.reset(seed=1)
     assert env.render().shape == (size[1], size[0], 3)  # type: ignore[union-attr]
 
@@ -78,7 +79,7 @@ def test_other_sizes_are_refused_in_one_line(size: Any) -> None:
 
 
 def test_before_the_first_reset_there_is_no_crystal() -> None:
-    for env in (gym.make("Cz-v0", render_mode="rgb_array"), CzEnv(render_mode="rgb_array")):
+    for env in (gym.make("Cz-v0", render_mode="rgb_array", **PLAIN), CzEnv(render_mode="rgb_array", **PLAIN)):
         with pytest.raises(ResetNeeded):
             env.render()
 
@@ -86,14 +87,14 @@ def test_before_the_first_reset_there_is_no_crystal() -> None:
 def test_without_a_mode_render_warns_as_gymnasiums_environments_do(monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
     monkeypatch.setattr(gym.logger, "warn", said.append)
-    env = CzEnv()
+    env = CzEnv(**PLAIN)
     env.reset(seed=1)
     assert env.render() is None
     assert ["rgb_array" in each for each in said] == [True]
 
 
 def test_a_frame_is_the_callers_own() -> None:
-    env = CzEnv(render_mode="rgb_array")
+    env = CzEnv(render_mode="rgb_array", **PLAIN)
     env.reset(seed=1)
     first = env.render()
     assert first is not None
@@ -108,7 +109,7 @@ def test_a_frame_is_the_callers_own() -> None:
 
 
 def test_a_restored_state_is_shown_from_there_on() -> None:
-    env = CzEnv(render_mode="rgb_array")
+    env = CzEnv(render_mode="rgb_array", **PLAIN)
     env.reset(seed=1)
     for _ in range(30):
         env.step(np.zeros(2, np.float32))
@@ -118,14 +119,14 @@ def test_a_restored_state_is_shown_from_there_on() -> None:
 
 
 def test_window_and_list_wrappers() -> None:
-    env = gym.wrappers.HumanRendering(gym.make("Cz-v0", render_mode="rgb_array"))
+    env = gym.wrappers.HumanRendering(gym.make("Cz-v0", render_mode="rgb_array", **PLAIN))
     env.reset(seed=1)
     env.step(env.action_space.sample())
     env.close()
-    again = CzEnv(render_mode="rgb_array")  # the wrapper's pygame.quit() took the fonts with it
+    again = CzEnv(render_mode="rgb_array", **PLAIN)  # the wrapper's pygame.quit() took the fonts with it
     again.reset(seed=1)
     assert again.render() is not None
-    listed = gym.make("Cz-v0", render_mode="rgb_array_list")
+    listed = gym.make("Cz-v0", render_mode="rgb_array_list", **PLAIN)
     listed.reset(seed=1)
     listed.step(listed.action_space.sample())
     assert len(listed.render()) == 2  # type: ignore[arg-type]
@@ -149,12 +150,12 @@ def test_without_pygame_nothing_is_declared_and_asking_says_what_to_install() ->
 def test_a_batch_does_not_render() -> None:
     assert cz_gym.CzVectorEnv.metadata["render_modes"] == []
     with pytest.raises(ValueError, match="a batch does not render"):
-        cz_gym.CzVectorEnv(2, render_mode="rgb_array")
+        cz_gym.CzVectorEnv(2, render_mode="rgb_array", **PLAIN)
 
 
 def test_a_window_that_cannot_open_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SDL_VIDEODRIVER", "nonsense")
     pygame.display.quit()
-    env = CzEnv(render_mode="human")
+    env = CzEnv(render_mode="human", **PLAIN)
     with pytest.raises(gym.error.Error, match=r"cannot open a window: .*rgb_array"):
         env.reset(seed=1)

@@ -56,7 +56,9 @@ class Totals(NamedTuple):
 def cases() -> list[Config]:
     """Each scenario and "wide" at each interval; models and observations take turns, so that all meet."""
     return [
-        make_config(scenario, MODELS[(at + turn) % 3], OBSERVATIONS[(at + 2 * turn) % 3], interval, 3.0 * HOUR)
+        make_config(
+            scenario, MODELS[(at + turn) % 3], OBSERVATIONS[(at + 2 * turn) % 3], interval, 3.0 * HOUR, action="direct"
+        )
         for at, scenario in enumerate((*SCENARIOS, WIDE))
         for turn, interval in enumerate(INTERVALS)
     ]

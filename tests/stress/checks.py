@@ -93,13 +93,12 @@ class Watch:
             self._need((T > COLDEST) & (T < HOTTEST), f"{name} outside {COLDEST:g} to {HOTTEST:g} K")
 
     def _check_rewards(self, ran: Array, reward: Array, terminated: Array) -> None:
-        """A failing step earns at most what the worst life from it to the horizon could."""
-        left = self._steps - self._slots["k"] + 1.0
+        """A failing step earns less than the worst hundred steps."""
         living = ran & ~terminated
         self._need(~living | ((reward > WORST) & (reward <= 1.0)), f"a living step earns {WORST:g} or less, or over 1")
         self._need(ran | (reward == 0.0), "a redrawn slot earns something")
-        self._need(~terminated | (reward <= WORST * left), "a failing step earns more than surviving could")
-        self._need(~terminated | (reward > WORST - FAILURE_COST * left), "a failure costs more than ten a step lost")
+        self._need(~terminated | (reward <= 1.0 - FAILURE_COST), "a failing step earns too much")
+        self._need(~terminated | (reward > WORST - FAILURE_COST), "a failure costs more than it should")
 
     def _check_drives(self, ran: Array, actions: Array, infos: dict[str, Any]) -> None:
         p, e, old = self._slots["puller"], self._slots["episode"], self._old

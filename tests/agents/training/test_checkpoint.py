@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from cz_gym.agents.training.networks import Normalise
 
 from cz_gym.agents import AgentFileError
 from cz_gym.agents.training.algorithms import make_algorithm
 from cz_gym.agents.training.checkpoint import load_checkpoint, restore, to_bytes
-from cz_gym.agents.training.networks import Normalise
 from cz_gym.agents.training.recipes import Recipe
 from tests.small_learners import SMALL, SMALL_APG, SMALL_SAC, learned, trained
 

@@ -8,9 +8,10 @@ import pytest
 
 pytest.importorskip("stable_baselines3")
 
+from cz_gym.agents.training.callbacks import Statistics
+
 from cz_gym.agents.training import callbacks
 from cz_gym.agents.training.algorithms import make_algorithm
-from cz_gym.agents.training.callbacks import Statistics
 from tests.small_learners import SMALL_SAC, learned
 
 

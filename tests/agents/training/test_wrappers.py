@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cz_gym.agents.training.wrappers import ActionRepeat, TrainingReward
 from gymnasium.vector import AutoresetMode
 
 from cz_gym import CzVectorEnv
-from cz_gym.agents.training.wrappers import ActionRepeat, TrainingReward
 from cz_gym.sb3 import CzVecEnv
 
 

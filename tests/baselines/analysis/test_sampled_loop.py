@@ -20,6 +20,7 @@ from cz_gym.episodes.scenario import Scenario, Sensor
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.physics.linearisation import StateSpace, radius_model
 from cz_gym.units import MM
+from tests.observed import PLAIN
 
 control = pytest.importorskip("control")
 PAPER = CompensatedPID()
@@ -90,7 +91,7 @@ def test_unstable_loop_has_no_margins():
 def test_noise_gains_are_those_of_the_simulated_plant():
     policy = FilteredPID(T_f=30.0)
     quiet = Scenario("camera-noise", sensor=Sensor(camera_noise=(0.002 * MM, 0.002 * MM)))
-    run = rollout(policy, make_config(quiet, "I"), range(40))
+    run = rollout(policy, make_config(quiet, "I", **PLAIN), range(40))
     controller = linear_controller(policy)
     loop = control.ss(*close(controller, make_puller(), 5.0).pick("v_p", ("camera",)), 5.0)
     kick = control.impulse_response(loop, T=5.0 * np.arange(2000)).y[0, 0] * 5.0  # python-control's has area 1

@@ -27,7 +27,7 @@ SEEDS = (1_000_000, 1_000_001, 1_000_002)
 
 
 def planned(scenario=RANDOMIZED, horizon=0.5 * HOUR):
-    config = make_config(scenario, observation="state", horizon=horizon)
+    config = make_config(scenario, observation="state", horizon=horizon, action="direct")
     return config, Clairvoyant().for_episodes(config, np.array(SEEDS))
 
 
@@ -51,7 +51,7 @@ def planned_cost(future, x, u):
     v_0, Q_H_0 = future.puller.inputs_0
     v_p, Q_H = u[..., 0], u[..., 1]
     moves = (np.diff(v, axis=0, prepend=np.broadcast_to(rest, v[:1].shape)) for v, rest in ((v_p, v_0), (Q_H, Q_H_0)))
-    return sum(cost_terms(x[1:, :, 0] - future.r_ref, v_p - v_0, *moves)).sum(axis=0)
+    return sum(cost_terms(x[1:, :, 0] - future.target, v_p - v_0, *moves)).sum(axis=0)
 
 
 def played(u, inputs_0):
@@ -62,9 +62,11 @@ def played(u, inputs_0):
 
 @pytest.mark.parametrize("interval", [2.0, 5.0, 7.5, 10.0])
 def test_the_known_future_is_the_one_the_environment_brings(interval):
-    config = make_config(HARD, observation="state", control_interval=interval, horizon=0.5 * HOUR)
+    config = make_config(HARD, observation="state", control_interval=interval, horizon=0.5 * HOUR, action="direct")
     future = future_of(config, SEEDS)
-    env = CzVectorEnv(3, HARD, observation="state", control_interval=interval, horizon=0.5 * HOUR, info="all")
+    env = CzVectorEnv(
+        3, HARD, observation="state", control_interval=interval, horizon=0.5 * HOUR, info="all", action="direct"
+    )
     env.reset(seed=list(SEEDS))
     actions = np.random.default_rng(0).uniform(-0.05, 0.05, (200, 3, 2)).astype(np.float32).astype(np.float64)
     x = future.start
@@ -73,7 +75,7 @@ def test_the_known_future_is_the_one_the_environment_brings(interval):
         v_p, Q_H = future.puller.v_0 * (1.0 + action[:, 0]), future.puller.Q_H_0 + 10.0 * KILO * action[:, 1]
         x = future.advance(State(*x), Inputs(v_p, Q_H), slice(k, k + 1))
         x = State(*(value[0] for value in x))
-        assert future.r_ref[k] == pytest.approx(info["r_ref"], rel=1e-14)
+        assert future.target[k] == pytest.approx(info["r_ref"] - info["ring_offset"], rel=1e-14)
     for name in ("r_c", "h_c", "T_1", "T_b"):
         assert getattr(x, name) == pytest.approx(info[name], rel=1e-12), name
 
@@ -106,12 +108,12 @@ def test_no_nearby_inputs_are_cheaper_and_the_slope_is_zero(optimum):
 
 
 def test_within_tight_limits_it_agrees_with_a_general_optimiser():
-    config = make_config("hard", observation="state", horizon=60.0)
+    config = make_config("hard", observation="state", horizon=60.0, action="direct")
     future = future_of(config, SEEDS[:1])
     limits = Limits(np.array([0.003, 0.1]), np.array([0.001, 0.03]))
     found = optimise(future, limits)
     nominal = np.array([future.puller.v_0[0], future.puller.Q_H_0[0]])
-    scale, N = np.array([MM_PER_MIN, KILO]), len(future.r_ref)
+    scale, N = np.array([MM_PER_MIN, KILO]), len(future.target)
 
     def costs(W):
         """Of candidates of shape (m, 2 N), which may be complex."""
@@ -168,7 +170,7 @@ def test_it_refuses_to_act_without_a_plan_or_on_other_slots():
 
 
 def test_an_optimum_that_was_not_reached_is_no_bound(monkeypatch):
-    config = make_config("randomized", observation="state", horizon=300.0)
+    config = make_config("randomized", observation="state", horizon=300.0, action="direct")
     monkeypatch.setattr(trajectory, "MOST_STEPS", 3)
     future = future_of(config, SEEDS)
     limits = limits_of(config.scenario.actuators, config.parameters.v_0, config.control_interval)

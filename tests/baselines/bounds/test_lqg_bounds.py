@@ -16,14 +16,14 @@ from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.physics.plant import hidden_load
 from cz_gym.units import HOUR
-from tests.observed import observations
+from tests.observed import PLAIN, observations
 
 PULLER = make_puller(lam=0.5)
 
 
 def test_the_bounds_know_the_pullers_and_fluctuations_that_the_environment_draws():
-    config, seeds = make_config("randomized", horizon=600.0), (5, 9, 2_000_000)
-    env = CzVectorEnv(3, horizon=600.0)
+    config, seeds = make_config("randomized", horizon=600.0, **PLAIN), (5, 9, 2_000_000)
+    env = CzVectorEnv(3, horizon=600.0, **PLAIN)
     env.reset(seed=list(seeds))
     slots = env._batch.memory.slots
     for drawn, puller in zip(slots["puller"], pullers_of(config, seeds), strict=True):
@@ -34,7 +34,7 @@ def test_the_bounds_know_the_pullers_and_fluctuations_that_the_environment_draws
 
 
 def test_each_filter_has_the_noise_of_its_own_crystal():
-    config = make_config("only-interface", horizon=900.0)
+    config = make_config("only-interface", horizon=900.0, **PLAIN)
     bound = lqg_bounds.PrivilegedLQG(design=LQGDesign(lam=1.0), knows_fluctuations=True)
     known = bound.for_episodes(config, np.arange(3)).gains.filter.plant.Q
     for slot, (fast, slow) in enumerate(fluctuations_of(config, [0, 1, 2])):
@@ -44,7 +44,7 @@ def test_each_filter_has_the_noise_of_its_own_crystal():
 
 
 def test_knowing_puller_and_fluctuations_buys_something():
-    config = make_config("randomized", horizon=2.0 * HOUR)
+    config = make_config("randomized", horizon=2.0 * HOUR, **PLAIN)
     names = "lqg-quiet", "lqg-quiet-privileged"
     plain, privileged = (metrics(rollout(find_controller(name).make(config), config, range(20))) for name in names)
     assert privileged.rmse_mm.mean() < plain.rmse_mm.mean()
@@ -52,13 +52,13 @@ def test_knowing_puller_and_fluctuations_buys_something():
 
 
 def test_knowing_a_nominal_puller_is_the_lqg():
-    design, config = LQGDesign(lam=1.0), make_config("only-interface", horizon=900.0)
+    design, config = LQGDesign(lam=1.0), make_config("only-interface", horizon=900.0, **PLAIN)
     privileged, plain = (rollout(kind(design=design), config, [0, 1, 2]) for kind in (lqg_bounds.PrivilegedLQG, LQG))
     np.testing.assert_allclose(privileged.signals.v_p, plain.signals.v_p, rtol=1e-5)
 
 
 def test_other_slots_than_the_known_ones_are_refused():
-    privileged = lqg_bounds.PrivilegedLQG().for_episodes(make_config("randomized"), [1, 2])
+    privileged = lqg_bounds.PrivilegedLQG().for_episodes(make_config("randomized", **PLAIN), [1, 2])
     with pytest.raises(ValueError, match="2 pullers are known, got 3 slots"):
         privileged.predict(next(observations()))
 
@@ -69,7 +69,7 @@ def test_the_drift_is_read_off_its_load():
 
 
 def test_full_information_beats_the_filter_on_the_same_episodes():
-    measured_config = make_config("randomized", horizon=3600.0)
+    measured_config = make_config("randomized", horizon=3600.0, **PLAIN)
     state_config = replace(measured_config, observation="state")
     seeds = range(12)
     full = metrics(rollout(lqg_bounds.FullInformation(), state_config, seeds))

@@ -17,7 +17,7 @@ from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.observation import decode
 from cz_gym.units import HOUR, MM
-from tests.observed import measured
+from tests.observed import PLAIN, measured
 
 
 class Watched(LQG):
@@ -31,7 +31,7 @@ class Watched(LQG):
 
 @pytest.mark.parametrize("scenario", ["sensor-fault", "puller"])
 def test_with_one_hypothesis_it_is_the_lqg(scenario):
-    config = make_config(scenario, horizon=1800.0)
+    config = make_config(scenario, horizon=1800.0, **PLAIN)
     plain = lqg("lqg-at-0.02", config)
     noise = plain.design.noise
     one = replace(plain, hypotheses=Hypotheses((noise.fast_sd,), (noise.slow_sd,)))
@@ -60,7 +60,7 @@ def test_the_bank_weights_its_filters_by_bayes_rule():
 @pytest.mark.parametrize(("strength", "factor"), [(0.05, 0.2), (0.5, 1.8)])
 def test_it_finds_how_strong_the_fluctuations_are(strength, factor):
     """After an hour, nine of ten crystals are most likely at the end of the hypotheses that is nearest."""
-    config = make_config("randomized", horizon=HOUR)
+    config = make_config("randomized", horizon=HOUR, **PLAIN)
     config = config.with_scenario(replace(config.scenario, name="one", interface=Interface(sd=(strength, strength))))
     controller = adaptive(lqg("lqg-at-0.02", config))
     watched = Watched(design=controller.design, hypotheses=controller.hypotheses)
@@ -71,7 +71,10 @@ def test_it_finds_how_strong_the_fluctuations_are(strength, factor):
 
 @pytest.mark.slow
 def test_knowing_this_gains_radius_error_at_equal_activity():
-    config, family = make_config("randomized", horizon=2.0 * HOUR), ("lqg-at-0.013", "lqg-at-0.02", "lqg-at-0.03")
+    config, family = (
+        make_config("randomized", horizon=2.0 * HOUR, **PLAIN),
+        ("lqg-at-0.013", "lqg-at-0.02", "lqg-at-0.03"),
+    )
     points = {}
     for name in (*family, "lqg-at-0.02-adaptive"):
         found = metrics(rollout(find_controller(name).make(config), config, range(30)))

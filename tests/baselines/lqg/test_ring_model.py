@@ -18,6 +18,7 @@ from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.units import MINUTE, MM
+from tests.observed import PLAIN
 
 PULLER = make_puller(lam=0.5)
 PULLER_RING = ring_of(PULLER_SCENARIO.sensor)
@@ -44,7 +45,7 @@ def test_a_ring_that_grows_evenly_is_delivered_as_old_as_the_latency(latency, dt
 @pytest.mark.parametrize("dt", [5.0, 10.0])
 def test_the_camera_of_the_environment_is_late_as_modelled(dt):
     late = Scenario("late", interface=Interface(sd=(0.3, 0.3)), sensor=Sensor(latency=5.0))
-    run = rollout(LQG(control_interval=dt), make_config(late, control_interval=dt, horizon=1200.0), [1])
+    run = rollout(LQG(control_interval=dt), make_config(late, control_interval=dt, horizon=1200.0, **PLAIN), [1])
     prompt, delivered = run.signals.r_br[:, 0], run.signals.r_br_measured[:, 0]
     samples, oldest = RingModel(5.0).delay(dt)
     assert samples == 1
@@ -84,7 +85,7 @@ def test_what_cannot_be_told_from_the_radius_is_not_searched():
 def with_and_without_search(sensor):
     """Metrics on crystals with that camera: with the search for a ripple, and with the latency alone."""
     scenario = Scenario("camera", interface=Interface(sd=(0.2, 0.2)), sensor=sensor)
-    config = make_config(scenario, horizon=3600.0)
+    config = make_config(scenario, horizon=3600.0, **PLAIN)
     policies = (LQG(design=replace(design_of("lqg", RANDOMIZED), ring=ring)) for ring in (PULLER_RING, RingModel(5.0)))
     return [metrics(rollout(policy, config, range(12))) for policy in policies]
 
@@ -105,7 +106,7 @@ def test_a_ring_that_is_neither_late_nor_shaken_adds_nothing():
     model = plant_model(PULLER, NoiseModel(), 5.0)
     for plain, with_ring in zip(model, ring_model.augmented(model, RingModel(), 5.0), strict=True):
         np.testing.assert_allclose(with_ring, plain, rtol=1e-12, atol=1e-30)
-    config = make_config("randomized", horizon=1200.0)
+    config = make_config("randomized", horizon=1200.0, **PLAIN)
     plain, with_ring = (rollout(LQG(design=LQGDesign(ring=ring)), config, [3]) for ring in (None, RingModel()))
     np.testing.assert_allclose(with_ring.signals.v_p, plain.signals.v_p, rtol=1e-6)
 

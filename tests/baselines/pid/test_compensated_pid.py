@@ -8,7 +8,7 @@ from cz_gym import make_puller
 from cz_gym.baselines import CompensatedPID, Compensator, SeriesPID
 from cz_gym.config import make_config
 from cz_gym.evaluation.rollout import rollout
-from tests.observed import measured, pulls
+from tests.observed import PLAIN, measured, pulls
 
 MM, V_0 = 1e-3, 1.2e-3 / 60
 
@@ -65,7 +65,7 @@ def test_heater_is_a_pi_loop_by_forward_euler(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize(("model", "dt", "peak_mm"), [("I", 5, 1.48), ("II", 5, 1.54), ("I", 2, 1.48), ("I", 10, 1.48)])
 def test_papers_ramp_peaks_where_the_printed_controller_puts_it(model: str, dt: float, peak_mm: float) -> None:
-    run = rollout(CompensatedPID(dt), make_config("paper-ramp", model, control_interval=dt), [0])
+    run = rollout(CompensatedPID(dt), make_config("paper-ramp", model, control_interval=dt, **PLAIN), [0])
     true, ring = ((signal - run.signals.r_ref)[:, 0] for signal in (run.signals.r_c, run.signals.r_br))
     assert not run.failed.any()
     assert np.abs(true).max() / MM == pytest.approx(peak_mm, rel=0.03)

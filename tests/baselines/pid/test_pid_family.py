@@ -22,7 +22,7 @@ from cz_gym.observation import MEASURED, PULL_SCALE, Measured
 from cz_gym.physics.linearisation import StateSpace, radius_model
 from cz_gym.physics.parameters import Parameters
 from cz_gym.units import MM, MM_PER_MIN
-from tests.observed import measured, pulls
+from tests.observed import PLAIN, measured, pulls
 
 SCALES = {channel.name: channel.scale for channel in MEASURED}
 
@@ -133,7 +133,7 @@ def test_trim_rises_while_pull_is_fast_and_stops_at_its_limit(dt):
 def test_conventional_loop_keeps_the_papers_rule():
     for (name, _), policy in SHIPPED.items():
         assert name != "pid-conventional" or below_half_the_zero(None, policy) >= 0.0
-    policy = tuned("pid-conventional", make_config("randomized"))
+    policy = tuned("pid-conventional", make_config("randomized", **PLAIN))
     assert policy.compensator is None
     assert math.isfinite(policy.T_track)
     assert policy.T_start > 0.0

@@ -17,10 +17,11 @@ from cz_gym.baselines.tuning.search import Figures, Parameter, Search, file_name
 from cz_gym.config import make_config
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from tests.observed import PLAIN
 
 RESULTS = Path(__file__).parents[3] / "results" / "tuning"
 FIGURES = Figures(0.06, 0.01, 0.02, 1900.0, 0.0, 2160)
-CONFIG = make_config("randomized")
+CONFIG = make_config("randomized", **PLAIN)
 PARAMETERS = Parameter("T_f", 1.0, 100.0), Parameter("K_ff", -1.0, 1.0, log=False)
 
 
@@ -91,14 +92,17 @@ def test_steps_are_judged_by_time_not_by_sample():
             return state + self.rise, state + self.rise
 
     for dt in (2.0, 5.0, 10.0):
-        found = measure(Ramp(dt), make_config("nominal", control_interval=dt, horizon=600.0), [0])
+        found = measure(Ramp(dt), make_config("nominal", control_interval=dt, horizon=600.0, **PLAIN), [0])
         assert (found.pull_step, found.heater_step) == pytest.approx((5e-5 * 1.2, 5e-5 * 10.0), rel=1e-3)
 
 
 @pytest.mark.parametrize("dt", [2.0, 5.0])
 @pytest.mark.parametrize("name", ["paper-filtered", "lqg"])
 def test_a_search_keeps_the_control_interval_and_puller_of_its_environment(name, dt):
-    config, met = make_config("randomized", control_interval=dt, parameters=CONFIG.parameters._replace(r_0=0.1)), []
+    config, met = (
+        make_config("randomized", control_interval=dt, parameters=CONFIG.parameters._replace(r_0=0.1), **PLAIN),
+        [],
+    )
 
     def figures(policy, config, seeds):
         met.append((policy.made_for, config.made_for))
@@ -117,7 +121,7 @@ def test_a_search_keeps_the_control_interval_and_puller_of_its_environment(name,
 @pytest.mark.parametrize("name", PIDS)
 def test_every_parameter_sets_what_it_names_and_a_search_begins_with_the_settings_of_randomized(name, scenario):
     """But for an infinite jump, which is clipped to the range of its parameter."""
-    search = Search(name, goal_of(name, find_scenario(scenario)), make_config(scenario), 1, 5)
+    search = Search(name, goal_of(name, find_scenario(scenario)), make_config(scenario, **PLAIN), 1, 5)
     parameters = search.goal.parameters
     values = [0.5 * (each.low + each.high) for each in parameters]
     assert [value_at(search.settings(values), each.path) for each in parameters] == values
@@ -183,7 +187,7 @@ def test_a_search_uses_training_and_validation_seeds_only(tmp_path):
         met.setdefault(config.scenario.name, set()).update(seeds)
         return made_up(policy)
 
-    config = make_config("puller")
+    config = make_config("puller", **PLAIN)
     goal = replace(goal_of("lqg", config.scenario), start=START)
     Search("lqg", goal, config, 15, 10, watched).tune(tmp_path / "lqg.json")
     survived = {*range(100_000, 100_020)}
@@ -199,7 +203,7 @@ HEATER_STEP = designs.SEARCHED.index("weights.heater_step")
 @pytest.mark.parametrize(("controller", "scenario"), [*sorted(pid_settings.SHIPPED), *LQGS])
 def test_shipped_settings_are_those_a_search_chose(controller, scenario):
     """Finalists of the searches that chose the LQGs were also tried with heavier weights on heater steps."""
-    found, config, varied = kept(controller, scenario), make_config(scenario), []
+    found, config, varied = kept(controller, scenario), make_config(scenario, **PLAIN), []
     search = Search(controller, goal_of(controller, config.scenario), config, 1, 5)
     values = found["chosen"]["values"]
     assert list(values) == [parameter.path for parameter in search.goal.parameters]

@@ -23,6 +23,7 @@ from cz_gym.evaluation.report.page_pictures import errors, pareto, plain
 from cz_gym.evaluation.report.tables import DRIVES, ERROR, comparison
 from cz_gym.evaluation.results import Result
 from cz_gym.observation import MEASURED, scales
+from tests.observed import PLAIN
 from tests.samples import result_of
 
 EVIL = "</script><img src=x onerror=alert(1)>\"'&amp;<b>\u2028%{x}|"
@@ -164,9 +165,9 @@ def test_lines_are_means_of_the_rollouts_over_45_seconds(made: Made, row: str) -
 def test_the_camera_reading_is_what_the_controller_gets(made: Made) -> None:
     """The environment's own observation, which is less the operator's bias and the reference, is the oracle."""
     camera = made.lines("puller", "radius error")["open-loop"][0]
-    env, read = CzEnv("puller"), []
+    env, read = CzEnv("puller", **PLAIN), []
     env.reset(seed=made.results[0].seeds[0])
-    scale = scales(MEASURED, make_config().parameters.v_0)[0]
+    scale = scales(MEASURED, make_config(**PLAIN).parameters.v_0)[0]
     for _ in range(40 * STEP):
         observation, *_ = env.step(np.zeros(2, np.float32))
         read.append(1e3 * observation[0] * scale)
