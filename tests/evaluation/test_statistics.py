@@ -61,16 +61,15 @@ def test_one_deterministic_episode_has_no_interval() -> None:
     assert cvar(np.array([[0.7]]), resamples) == (pytest.approx(0.7), None, 1)
 
 
-def test_training_seeds_carry_their_own_uncertainty() -> None:
-    """Two seeds at 0 and 1 on identical episodes: a resample's mean is 0, 1/2 or 1 with chances 1/4, 1/2, 1/4."""
-    values = np.stack([np.zeros((30, 1)), np.ones((30, 1))])
-    (estimate,) = means(values, Resamples.draw(30))
-    assert estimate == (0.5, (0.0, 1.0), 30)
+def test_training_seeds_carry_their_own_uncertainty(rng: np.random.Generator) -> None:
+    """Two seeds at 0 and 1 on identical episodes: a resample's mean is 0, 1/2 or 1 with chances 1/4, 1/2, 1/4.
 
-
-def test_training_seeds_that_agree_add_nothing(rng: np.random.Generator) -> None:
-    values = rng.normal(size=(1, 50, 3))
-    resamples = Resamples.draw(50)
+    Both sides of a difference are resampled on their own. Seeds that agree add nothing.
+    """
+    apart, resamples = np.stack([np.zeros((30, 1)), np.ones((30, 1))]), Resamples.draw(30)
+    assert means(apart, resamples) == ((0.5, (0.0, 1.0), 30),)
+    assert differences(apart, apart, resamples) == ((0.0, (-1.0, 1.0), 30),)
+    values = rng.normal(size=(1, 30, 3))
     for one, five in zip(means(values, resamples), means(np.repeat(values, 5, axis=0), resamples), strict=True):
         assert five.mean == pytest.approx(one.mean)
         assert five.ci95 == pytest.approx(one.ci95)
@@ -84,13 +83,6 @@ def test_spread_over_seeds_and_episodes_adds_up(rng: np.random.Generator) -> Non
     half = 1.96 * np.sqrt(seeds.var() / 40 + episodes.var() / 300)
     assert estimate.ci95 is not None
     assert np.diff(estimate.ci95)[0] == pytest.approx(2 * half, rel=0.06)
-
-
-def test_seeds_of_the_reference_are_resampled_on_their_own() -> None:
-    """Both at 0 or 1 by seed: differences of -1 and 1 happen only if the two draws are independent."""
-    values = np.stack([np.zeros((5, 1)), np.ones((5, 1))])
-    (estimate,) = differences(values, values, Resamples.draw(5))
-    assert estimate == (0.0, (-1.0, 1.0), 5)
 
 
 def test_probability_of_improvement_counts_wins_and_half_the_ties() -> None:

@@ -71,26 +71,24 @@ def test_damaged_code_is_compiled_again(tmp_path: Path) -> None:
     assert not list(Path(folder).rglob("*.new"))
 
 
-def test_code_for_other_types_is_not_used(tmp_path: Path) -> None:
+def test_code_for_other_types_is_not_used_and_a_full_disk_keeps_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     store = Store(tmp_path, "kernel")
     store.save("floats", 1)
     store.save("integers", 2)
     os.replace(store.path("floats"), store.path("integers"))
-    assert store.load("integers") is None
-    assert store.load("floats") is None
+    assert (store.load("integers"), store.load("floats")) == (None, None)
     store.save("integers", 3)
     assert store.load("integers") == 3
 
-
-def test_a_full_disk_keeps_nothing_and_fails_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*arguments: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("cz_gym.atomic_files.os.replace", full)
-    store = Store(tmp_path, "kernel")
     store.save("floats", 1)
     assert store.load("floats") is None
-    assert not list(tmp_path.iterdir())
+    assert list(tmp_path.iterdir()) == [store.path("integers")]
 
 
 @pytest.mark.slow
@@ -118,28 +116,20 @@ def test_no_vector_mathematics_that_rounds_otherwise(package: Path, tmp_path: Pa
     assert run(code, package, tmp_path / "cache") == ["1 False"]
 
 
-def test_an_empty_name_means_no_cache(fresh: pytest.MonkeyPatch) -> None:
-    fresh.setenv("CZ_GYM_CACHE_DIR", "")
-    assert cache_folder() is None
-    assert kernel(lambda x: x + 1)(1) == 2
-
-
-def test_a_home_that_is_not_there_means_no_cache(fresh: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_without_a_writable_folder_nothing_is_cached(fresh: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """No name, a home that is not there, a read-only file system."""
     (tmp_path / "file").write_text("in the way")
-    fresh.delenv("CZ_GYM_CACHE_DIR")
-    fresh.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    assert cache_folder() is None
+    for variable, value in (("CZ_GYM_CACHE_DIR", ""), ("XDG_CACHE_HOME", str(tmp_path / "file"))):
+        cache_folder.cache_clear()
+        fresh.setenv(variable, value)
+        assert cache_folder() is None
+        assert kernel(lambda x: x + 1)(1) == 2
+        fresh.delenv(variable)
     fresh.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     cache_folder.cache_clear()
     assert cache_folder() == next((tmp_path / "cache" / "cz-gym").iterdir())
-
-
-def test_a_read_only_cache_is_no_failure(fresh: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def refuse(*arguments: object, **more: object) -> None:
-        raise PermissionError("read-only file system")
-
-    fresh.setenv("CZ_GYM_CACHE_DIR", str(tmp_path))
-    fresh.setattr("tempfile.TemporaryFile", refuse)
+    cache_folder.cache_clear()
+    fresh.setattr("tempfile.TemporaryFile", lambda **options: os.stat("/no/such/place"))
     assert cache_folder() is None
 
 

@@ -5,7 +5,6 @@ A room is a package, or a module that stands beside packages (``cz_gym.env``, ``
 
 import ast
 import os
-from collections import Counter
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -19,8 +18,8 @@ FORBIDDEN = {
     "studies": ("tests", *PROGRAMS),
 }
 """Packages, and what nothing in each may import."""
-Arrows = Counter[tuple[str, str]]
-"""How often the first imports from the second."""
+Arrows = set[tuple[str, str]]
+"""Pairs of which the first imports from the second."""
 
 
 def modules() -> dict[str, Path]:
@@ -45,36 +44,17 @@ def imports(name: str, file: Path) -> Iterator[str]:
             yield from (f"{base}.{alias.name}" for alias in node.names)
 
 
-def owner(name: str) -> str | None:
-    """The innermost of the packages that a dotted name is or lies in."""
-    holders = [package for package in FORBIDDEN if within(name, package)]
-    return max(holders, key=len, default=None)
-
-
 def within(name: str, package: str) -> bool:
     """Whether a dotted name is a package or lies in it."""
     return name == package or name.startswith(f"{package}.")
 
 
 def arrows() -> Arrows:
-    """Between modules."""
+    """Arrows between modules."""
     known = modules()
-    found: Arrows = Counter()
-    for name, file in known.items():
-        for imported in imports(name, file):
-            target = imported if imported in known else imported.rpartition(".")[0]
-            if target in known and target != name:
-                found[name, target] += 1
-    return found
-
-
-def between_rooms() -> Arrows:
-    """Between rooms."""
-    found: Arrows = Counter()
-    for (one, other), times in arrows().items():
-        if room(one) != room(other):
-            found[room(one), room(other)] += times
-    return found
+    targets = ((name, each, each.rpartition(".")[0]) for name, file in known.items() for each in imports(name, file))
+    found = {(name, each if each in known else holder) for name, each, holder in targets}
+    return {(name, target) for name, target in found if target in known and target != name}
 
 
 def room(name: str) -> str:

@@ -63,14 +63,6 @@ def test_a_writer_killed_at_any_line_leaves_every_file_whole_and_the_last_one_la
     assert seen == "[0, 1, 2, 3]\n"
 
 
-def test_files_go_into_folders_that_are_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    files = {Path("one/a"): b"1", tmp_path / "two" / "deep" / "b": b"2", tmp_path / "one" / "c": b""}
-    write_files(files)
-    assert {path: path.read_bytes() for path in files} == files
-    assert names(tmp_path / "one") == ["a", "c"]
-
-
 @pytest.mark.parametrize("call", ["fsync", "replace"])
 def test_a_full_disk_leaves_what_was_there_and_names_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
@@ -117,11 +109,7 @@ def test_a_folder_is_used_by_one_process(tmp_path: Path) -> None:
         assert names(tmp_path / "new") == [LOCK]
     assert python("-c", code, str(tmp_path / "new")) == ""
     assert names(tmp_path) == []
-
-
-def test_a_link_in_the_place_of_the_lock_is_not_followed(tmp_path: Path) -> None:
-    """A folder from a stranger cannot have files made elsewhere."""
-    (tmp_path / LOCK).symlink_to(tmp_path / "elsewhere")
+    (tmp_path / LOCK).symlink_to(tmp_path / "elsewhere")  # a folder from a stranger has no file made elsewhere
     with pytest.raises(CzError, match=f"^{tmp_path}: "), locked(tmp_path):
         pass
     assert not (tmp_path / "elsewhere").exists()

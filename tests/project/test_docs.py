@@ -213,16 +213,14 @@ def test_pages_read_well_on_github_and_their_tables_are_the_code_s(monkeypatch: 
     )
     for page in PAGES:
         text = page.read_text()
+        assert re.findall(r"^ *(?:\$ )?python (?:-m|\w+\.py) ?.*", text, re.MULTILINE) == [], (
+            f"{page}: .venv/bin/python"
+        )
         assert tables.filled(text) == text, f"{page}: make tables"
         blocks = set(re.findall(r"^```\{([\w-]+)\}", text, re.MULTILINE))
         assert blocks <= (
             {"eval-rst"} if page.parent.name == "api" else {"toctree"} if page == tables.CONTENTS else set()
         )
-
-
-def test_shell_blocks_name_the_environment_s_python() -> None:
-    for page in PAGES:
-        assert re.findall(r"^ *(?:\$ )?python (?:-m|\w+\.py) ?.*", page.read_text(), re.MULTILINE) == [], page
 
 
 @pytest.fixture

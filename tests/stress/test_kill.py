@@ -1,25 +1,127 @@
 """Killed runs lose nothing but what came after the last checkpoint, wherever they are killed."""
 
+import csv
+import functools
+import importlib
+import itertools
+import json
+import multiprocessing
+import os
+import signal
+import threading
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import Any
 
 import pytest
+from tqdm import tqdm
 
-from tests.stress.kill_at import KILLED, ending
-from tests.stress.small_runs import PHASES, check_training, resume, training
+pytest.importorskip("torch")
+import train
+from cz_gym.agents import OnnxPolicy
+from cz_gym.agents.training import run, validation
+from cz_gym.agents.training.checkpoint import load_checkpoint
+from cz_gym.agents.training.recipes import PPO, RECIPES
+from cz_gym.atomic_files import write_files
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
-pytestmark = pytest.mark.slow
+FRESH = multiprocessing.get_context("forkserver")
+FRESH.set_forkserver_preload(["tests.stress.test_kill"])
+RUN = "cz_gym.agents.training.run:Run"
+PHASES = {
+    "rollout": ("stable_baselines3.common.buffers:RolloutBuffer.add:20", 1280),
+    "update": ("stable_baselines3:PPO.train:1>torch.nn.utils:clip_grad_norm_:5", 3328),
+    "checkpoint, before it counts": (f"{RUN}.save:5>os:replace:1", 3584),
+    "first validation": (f"{RUN}.validate:1>cz_gym.vector:CzVectorEnv.step:100", 7616),
+    "one after a validation, before it counts": (f"{RUN}.validate:1>os:replace:1", 9664),
+    "checkpoint, as it moves": (f"{RUN}.validate:1>os:replace:2", 9664),
+    "summary, as it moves": (f"{RUN}.finish:1>os:replace:2", 9664),
+}
+"""Where one run of PPO is killed, resumed, killed ..., and the step at which it stands then.
+
+``os:replace:2`` is the second call of ``os.replace`` since the process began; ``>`` begins to count at another call.
+Rollouts have 2,048 steps, and a validation follows every second one.
+"""
 
 
+def kill_at(point: str) -> None:
+    """Have this process kill itself in place of a call."""
+    here, _, later = point.partition(">")
+    module, name, turn = here.split(":")
+    *path, last = name.split(".")
+    owner: Any = functools.reduce(getattr, path, importlib.import_module(module))
+    function, calls = getattr(owner, last), itertools.count(1)
+
+    @functools.wraps(function)
+    def counted(*given: Any, **named: Any) -> Any:
+        if next(calls) == int(turn):
+            if not later:
+                os.kill(os.getpid(), signal.SIGKILL)
+            kill_at(later)
+        return function(*given, **named)
+
+    setattr(owner, last, counted)
+
+
+def training(arguments: list[str], point: str | None, log: Path) -> None:
+    """train.py on less of everything, with a checkpoint at every step, up to a point."""
+    tqdm.set_lock(threading.RLock())  # its own is a semaphore, which a killed process leaves behind
+    validation.PICKING, validation.JUDGING, run.VALIDATE_EVERY = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4], 4096
+    RECIPES["ppo"] = PPO(
+        steps=8192, num_envs=64, n_steps=32, batch_size=512, n_epochs=2, hidden=(16,), control_interval=30.0
+    )
+    if point is not None:
+        kill_at(point)
+    with log.open("a") as file, redirect_stdout(file), redirect_stderr(file):
+        code = train.main(["--algo", "ppo", "--checkpoint-seconds", "0", *arguments])
+    os._exit(code)
+
+
+def ended(arguments: list[str], point: str | None, log: Path) -> int | None:
+    """Exit code of a training in a process of its own."""
+    process = FRESH.Process(target=training, args=(arguments, point, log))
+    process.start()
+    process.join()
+    return process.exitcode
+
+
+def is_torn(folder: Path) -> bool:
+    """Whether a file is older than the checkpoint; all are written anew, as a resumed run does first."""
+    if not (folder / run.CHECKPOINT).exists():
+        return False
+    files = {folder / name: content for name, content in load_checkpoint(folder / run.CHECKPOINT)[2].items()}
+    torn = any(not file.exists() or file.read_bytes() != content for file, content in files.items())
+    write_files(files)
+    return torn
+
+
+def reached(out: Path) -> int:
+    """The step at which a killed run stands; what it left is whole and agrees with itself."""
+    if not (out / run.CHECKPOINT).exists():
+        assert not (out / "settings.json").exists(), "settings without a checkpoint"
+        return 0
+    progress, *_ = load_checkpoint(out / run.CHECKPOINT)
+    file, summary = out / "progress.csv", out / "summary.json"
+    rows: list[dict[str, Any]] = list(csv.DictReader(file.read_text().splitlines())) if file.exists() else []
+    best = min((float(row["validation_cost"]) for row in rows), default=None)
+    assert best == progress.best_cost
+    if best is not None:
+        found = {float(row["validation_rmse_mm"]) for row in rows if float(row["validation_cost"]) == best}
+        found |= {json.loads(summary.read_text())["validation_rmse_mm"]} if summary.exists() else set()
+        assert OnnxPolicy.load(out / "agent.onnx").contract.validation_rmse_mm in found, "not the best agent"
+    return progress.steps
+
+
+@pytest.mark.slow
 def test_a_training_run_killed_in_every_phase_goes_on(tmp_path: Path) -> None:
     """One run, killed at each point in turn and resumed until nothing is left to do."""
     out, log, torn = tmp_path / "run", tmp_path / "log", []
     for phase, (point, step) in PHASES.items():
         again = ["--resume"] * (out / "settings.json").exists()
-        code = ending(training, ["--out", str(out), *again], point, log)
-        assert code == KILLED, f"{phase}: {log.read_text()[-2000:]}"
-        torn += [phase] * resume(out)
-        assert check_training(out) == step, phase
+        assert ended(["--out", str(out), *again], point, log) == -signal.SIGKILL, f"{phase}: {log.read_text()[-2000:]}"
+        torn += [phase] * is_torn(out)
+        assert reached(out) == step, phase
     assert torn == [phase for phase in PHASES if "moves" in phase]
-    assert ending(training, ["--out", str(out), "--resume"], None, log) == 0, log.read_text()[-2000:]
-    assert check_training(out) == step
+    assert ended(["--out", str(out), "--resume"], None, log) == 0, log.read_text()[-2000:]
+    assert reached(out) == step
     assert (out / "summary.json").exists()

@@ -55,15 +55,13 @@ def test_many_controllers_are_chosen_by_a_rule() -> None:
     assert chosen(many, 99) == many
 
 
-def test_the_default_figure_shows_who_is_quoted_and_the_best_agents_and_one_s_own_first() -> None:
-    assert names(chosen(everyone(), COLUMNS)) == ["paper", "paper-tuned", "lqg-at-0.02", "gradient", "ppo"]
+def test_figure_and_short_table_show_who_is_quoted_the_best_agents_and_one_s_own() -> None:
+    usual = ["paper", "paper-tuned", "lqg-at-0.02", "gradient", "ppo"]
+    assert names(chosen(everyone(), COLUMNS)) == usual
     mine = [*everyone(), sample("mine", 50.0, own=True)]
     assert {"paper", "mine", "gradient"} < set(names(chosen(mine, COLUMNS)))
-
-
-def test_the_short_table_has_the_quoted_controllers_and_the_best_agents() -> None:
     lines = brief([summarise(find_row("nominal"), everyone())]).splitlines()
-    assert [line.split(" | ")[0].strip("| ") for line in lines[2:]] == names(chosen(everyone(), COLUMNS))
+    assert [line.split(" | ")[0].strip("| ") for line in lines[2:]] == usual
 
 
 def test_no_two_controllers_look_alike() -> None:
