@@ -1,4 +1,4 @@
-"""Cz-v0 under Gymnasium's checker, and its batch under ours; under stable-baselines3's in ``test_learners.py``."""
+"""Cz-v0 under Gymnasium's checker, and its batch under ours; under stable-baselines3's in ``test_sb3.py``."""
 
 import warnings
 from typing import Any

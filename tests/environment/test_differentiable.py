@@ -154,15 +154,7 @@ def test_what_has_no_derivatives_is_refused(config: Any, slots: Any, message: st
         DifferentiableBatch(config, slots)
 
 
-@pytest.mark.parametrize("actions", [np.full((2, 2), np.nan), np.zeros(2), np.zeros((3, 2))])
-def test_actions_that_are_none_are_refused(actions: np.ndarray) -> None:
-    batch = DifferentiableBatch(make_config(**PLAIN), 2)
-    batch.reset([1, 2])
-    with pytest.raises(InvalidAction, match=r"shape \(2, 2\)"):
-        batch.step(actions)
-
-
-def test_resets_that_are_none_are_refused() -> None:
+def test_resets_and_actions_that_are_none_are_refused() -> None:
     batch = DifferentiableBatch(make_config(**PLAIN), np.int64(2))
     with pytest.raises(ResetNeeded, match="every slot needs a crystal"):
         batch.step(np.zeros((2, 2)))
@@ -173,6 +165,9 @@ def test_resets_that_are_none_are_refused() -> None:
         with pytest.raises(ValueError, match=r"seeds must be whole|slots must be different"):
             batch.reset(seeds, which)  # type: ignore[arg-type]
     batch.reset([np.int64(1), 2])  # type: ignore[list-item]
+    for actions in (np.full((2, 2), np.nan), np.zeros(2), np.zeros((3, 2))):
+        with pytest.raises(InvalidAction, match=r"shape \(2, 2\)"):
+            batch.step(actions)
     assert batch.step(np.zeros((2, 2))).grows.all()
 
 

@@ -1,15 +1,18 @@
-"""The stable-baselines3 adapter against a vector of scalar environments."""
+"""Cz-v0 and its adapter under stable-baselines3's checker and wrappers, against a vector of scalar environments."""
 
+import warnings
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 from stable_baselines3 import PPO
+from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from cz_gym import CzEnv, CzVectorEnv
+from cz_gym import SCENARIOS, CzEnv, CzVectorEnv
 from cz_gym.sb3 import CzVecEnv, make_vec_env
 
 N = 3
@@ -110,3 +113,28 @@ def test_wrong_settings_are_refused() -> None:
         CzVecEnv(CzVectorEnv(2))
     with pytest.raises(ValueError, match="history"):
         adapter(observation="measured", privileged=True)
+
+
+@pytest.mark.parametrize("observation", ["measured", "history", "state"])
+def test_stable_baselines3s_checker_on_every_scenario(observation: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for scenario in SCENARIOS:
+            check_env(gym.make("Cz-v0", scenario=scenario, observation=observation, horizon=600.0), warn=True)
+
+
+@pytest.mark.parametrize("form", ["vector_entry_point", "sync"])
+def test_gymnasiums_wrapper_counts_the_episodes_of_both_forms(form: str) -> None:
+    """As single-file training loops make them; CleanRL's own is in ``tests/examples``."""
+    envs: Any = gym.make_vec("Cz-v0", num_envs=4, vectorization_mode=form, control_interval=20.0, horizon=400.0)
+    envs = gym.wrappers.vector.RecordEpisodeStatistics(envs)
+    envs.reset(seed=1)
+    random, earned, ends = np.random.default_rng(0), np.zeros(4), 0
+    for _ in range(96):
+        _, reward, terminated, truncated, infos = envs.step(random.uniform(-0.3, 0.3, (4, 2)).astype(np.float32))
+        earned += reward
+        for i in np.flatnonzero(terminated | truncated):
+            assert infos["episode"]["r"][i] == pytest.approx(earned[i], rel=1e-5)
+            earned[i], ends = 0.0, ends + 1
+    envs.close()
+    assert ends >= 16
