@@ -17,7 +17,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cz_gym.agents.agent_file.contract import AgentFileError, Contract, facts_of, make_contract, write_agent
+from cz_gym.agents.agent_file.contract import (
+    PLANT,
+    REWARD,
+    AgentFileError,
+    Contract,
+    facts_of,
+    make_contract,
+    write_agent,
+)
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.agents.training.validation import JUDGING, validate
 from cz_gym.commands import OneLineParser
@@ -78,6 +86,7 @@ def save_agent(
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.vec_env import VecNormalize
 
+    from cz_gym.agents.apg import APG
     from cz_gym.agents.export import to_onnx
 
     path = Path(path)
@@ -96,6 +105,7 @@ def save_agent(
     facts = {
         **facts_of(config),
         "algorithm": name,
+        "learned_from": PLANT if isinstance(model, APG) else REWARD,
         "training_seed": int((model.seed if seed is None else seed) or 0),
         "training_steps": int(model.num_timesteps),
         "validation_cost": 0.0,

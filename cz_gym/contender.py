@@ -9,6 +9,9 @@ from typing import Any
 
 from cz_gym.config import Config
 
+REWARD, PLANT = "reward", "plant"
+"""What an agent learned from: the reward alone, or gradients through the plant's equations."""
+
 
 @dataclass(frozen=True)
 class Contender:
@@ -47,6 +50,16 @@ class Contender:
     def bound(self) -> bool:
         """Whether it knows or reads what no sensor shows, so that it is a bound on controllers and not one of them."""
         return self.privileged or self.observation == "state"
+
+    @property
+    def knows(self) -> str:
+        """What it was told of the plant, for the groups of a table."""
+        if self.bound:
+            return "bounds, told what no sensor shows"
+        if not self.learned:
+            return "classical"
+        plant = any(policy.contract.learned_from == PLANT for policy in self.trained)
+        return "learned, plant known in training" if plant else "learned from the reward alone"
 
     def copies(self) -> Iterator[Contender]:
         """Yield the contender itself, or one contender of a single training seed for each of an agent's."""

@@ -1,8 +1,7 @@
 """The cost of a step: its four terms, their scales and weights, the reward that follows from it, and derivatives.
 
 Reward, gradients, regulators, bounds and reports all read this module. The weights are chosen so that the reward ranks
-controllers as their radius error at equal activity does (``python -m studies.ranking``): most of a good controller's
-cost is its radius error.
+controllers as their radius error at equal activity does, which ``python -m studies.frontier`` shows.
 """
 
 from __future__ import annotations

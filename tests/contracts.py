@@ -36,6 +36,7 @@ def facts(observation: str = "history", **changes: Any) -> dict[str, Any]:
     known = {
         **facts_of(config),
         "algorithm": "ppo",
+        "learned_from": "reward",
         "training_seed": 0,
         "training_steps": 64,
         "validation_cost": 0.1,

@@ -13,7 +13,8 @@ from cz_gym.evaluation.rollout import Rollout, rollout
 
 def contender(name: str, meaning: str = "", training_seeds: tuple[int, ...] = (), **facts: Any) -> Contender:
     """A contender that is never run; an agent if it has training seeds."""
-    trained: tuple[Any, ...] = tuple(SimpleNamespace(contract=None) for _ in training_seeds)
+    policy = SimpleNamespace(contract=SimpleNamespace(learned_from="reward"))
+    trained: tuple[Any, ...] = (policy,) * len(training_seeds)
     facts = {"observation": "measured", "make": lambda config: None, **facts}
     return Contender(name, meaning=meaning, training_seeds=training_seeds, trained=trained, **facts)
 

@@ -14,11 +14,13 @@ from typing import Any
 
 from cz_gym.atomic_files import write_files
 from cz_gym.config import Config
+from cz_gym.contender import PLANT as PLANT
+from cz_gym.contender import REWARD as REWARD
 from cz_gym.errors import CzError
 from cz_gym.observation import CLIP, OBSERVATIONS
 
 FORMAT = "cz-gym-agent"
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 MAX_BYTES = 4_000_000
 """Largest agent file that is read."""
 MAX_JSON_BYTES = 1_000_000
@@ -55,12 +57,14 @@ class Contract:
     """Hash of that scenario."""
     algorithm: str
     """Name of the recipe that trained it."""
+    learned_from: str
+    """:data:`REWARD` alone, or gradients through the :data:`PLANT`'s equations, which were known in training."""
     training_seed: int
     """Seed of the training run."""
     training_steps: int
     """Environment steps of learning."""
     validation_cost: float
-    """Mean cost of a step with the training's weights [-], on the validation episodes that choose no agent."""
+    """Mean cost of a step [-] on the validation episodes that choose no agent."""
     validation_rmse_mm: float
     """Mean RMSE on the same episodes [mm]."""
     sha256: str

@@ -46,7 +46,7 @@ class APG(Recipe):
     """Analytic policy gradients: follows the gradient of the cost through policy, memory and plant."""
 
     name: str = "gradient"
-    steps: int = 34_560_000
+    steps: int = 24_192_000
     num_envs: int = 192
     learning_rate: float = 4e-3
     observation: str = "measured"

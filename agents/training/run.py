@@ -15,7 +15,15 @@ from typing import Any
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import configure_logger
 
-from cz_gym.agents.agent_file.contract import Contract, agent_files, facts_of, make_contract, read_agent
+from cz_gym.agents.agent_file.contract import (
+    PLANT,
+    REWARD,
+    Contract,
+    agent_files,
+    facts_of,
+    make_contract,
+    read_agent,
+)
 from cz_gym.agents.export import to_onnx
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.atomic_files import write_files
@@ -24,7 +32,7 @@ from cz_gym.observation import OBSERVATIONS
 from . import validation
 from .algorithms import make_algorithm, repeat_of
 from .checkpoint import load_checkpoint, restore, to_bytes
-from .recipes import Recipe
+from .recipes import APG, Recipe
 from .run_files import check_settings, identity, provenance, read_rows, to_csv, to_json
 from .validation import COLUMNS, REFERENCES, References, Validation, validate
 
@@ -145,6 +153,7 @@ class Run:
             content,
             **facts_of(self.config),
             algorithm=self.recipe.name,
+            learned_from=PLANT if isinstance(self.recipe, APG) else REWARD,
             training_seed=self.seed,
             training_steps=self.steps,
             validation_cost=0.0,

@@ -93,9 +93,9 @@ def to_json(content: Any) -> bytes:
 
 
 def to_csv(rows: Sequence[dict[str, Any]]) -> bytes:
-    """The contents of ``progress.csv``: a line a validation."""
+    """The contents of a CSV file, as ``progress.csv``: a line a validation."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=COLUMNS)
+    writer = csv.DictWriter(text, fieldnames=list(rows[0]))
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue().encode()

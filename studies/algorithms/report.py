@@ -10,7 +10,7 @@ import numpy as np
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.agents.training import validation
 from cz_gym.agents.training.fleet import Job, train_seed
-from cz_gym.agents.training.run_files import read_rows
+from cz_gym.agents.training.run_files import read_rows, to_csv
 from cz_gym.agents.training.validation import REFERENCES, references
 from cz_gym.baselines.registry import make_controller
 from cz_gym.config import Config
@@ -90,12 +90,18 @@ class Line(NamedTuple):
 
 
 def report(comparison: Comparison, results: Results) -> dict[str, bytes]:
-    """``table.md`` and ``curves.png``, by file name."""
+    """``table.md``, ``curves.png`` and ``curves.csv``, by file name."""
     lines = tabulate(comparison, results)
     about = ABOUT.format(crystals=len(validation.JUDGING), scenario=SCENARIO, transfer=TRANSFER)
     meanings = (f"- **{each.name}**: {each.meaning}" for each in comparison.variants if each.name in results)
     text = "\n".join([f"# {comparison.title}", "", about, "", to_markdown(lines), "", *meanings, ""])
-    return {"table.md": text.encode(), "curves.png": curves(lines)}
+    rows = [
+        {"variant": name, "seed": seed, **row}
+        for name, runs in results.items()
+        for seed, run in runs.items()
+        for row in run.progress
+    ]
+    return {"table.md": text.encode(), "curves.png": curves(lines), "curves.csv": to_csv(rows)}
 
 
 def tabulate(comparison: Comparison, results: Results) -> list[Line]:

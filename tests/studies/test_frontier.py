@@ -10,7 +10,8 @@ from studies.frontier import __main__ as frontier
 
 
 def entry(activity, rmse):
-    return {"pull_step_rms_mm_per_min": {"mean": activity}, "rmse_mm": {"mean": rmse}}
+    found = {"pull_step_rms_mm_per_min": activity, "rmse_mm": rmse, "return": -rmse, "failure_rate": 0.0}
+    return {name: {"mean": value} for name, value in found.items()}
 
 
 def test_a_benchmark_is_compared_at_equal_activity(tmp_path, capsys):
@@ -20,9 +21,10 @@ def test_a_benchmark_is_compared_at_equal_activity(tmp_path, capsys):
     file.write_text(json.dumps({"results": {"randomized": scenario, "nominal": {"ppo": entry(0.01, 0.2)}}}))
     assert frontier.main([str(file)]) == 0
     told = capsys.readouterr().out
-    assert "| ppo | 0.0100 | 0.2000 | 2.000 |" in told
-    assert "| industrial | 0.0010 | 0.4000 | quieter than any LQG |" in told
-    assert "| lively | 0.0300 | 0.1000 | 1.414, more active than any LQG (0.0200) |" in told
+    assert "| ppo | 0.0100 | 0.2000 | 2.000 | -0 |" in told
+    assert "| industrial | 0.0010 | 0.4000 | quieter than any LQG | -0 |" in told
+    assert "| lively | 0.0300 | 0.1000 | 1.414, more active than any LQG (0.0200) | -0 |" in told
+    assert "Spearman's correlation of return and ratio, with its sign turned: 0.63 (4 rows)." in told
     assert "## nominal\n\na frontier needs two settings" in told
 
 
@@ -47,8 +49,8 @@ def test_episodes_beside_a_benchmark_give_intervals_unless_they_are_of_another_r
     path = tmp_path / "benchmark.json"
     path.write_text(json.dumps({"results": {"randomized": {name: entry(*pair) for name, pair in values.items()}}}))
     assert frontier.main([str(path), "--out", str(tmp_path / "ratios.md")]) == 0
-    assert "| 1.044 [1.044, 1.044] |" in (tmp_path / "ratios.md").read_text()
-    assert "| 1.044 [1.044, 1.044] |" in capsys.readouterr().out
+    assert "| 1.044 [1.044, 1.044] | -0 |" in (tmp_path / "ratios.md").read_text()
+    assert "| 1.044 [1.044, 1.044] | -0 |" in capsys.readouterr().out
     (tmp_path / "episodes.csv").write_text("\n".join([*lines[:-1], lines[-1].replace("0.06", "nan")]))
     assert "no episodes of a benchmark, or damaged" in refused(frontier.main, [str(path)])
     (tmp_path / "episodes.csv").write_text("\n".join(lines))

@@ -15,8 +15,10 @@ from .tables import (
     DRIVES,
     ERROR,
     FAILURES,
+    HEATER_STEP,
     NOTHING,
     PULL_STEP,
+    RETURN,
     RMSE,
     Column,
     comparison,
@@ -34,14 +36,19 @@ BEGIN, END = "<!-- benchmark:begin -->", "<!-- benchmark:end -->"
 
 
 def summary(results: Sequence[Result]) -> str:
-    """Return one table: RMSE and failures on each scenario, pull steps on the first."""
-    columns = (RMSE, PULL_STEP._replace(interval=False), FAILURES._replace(interval=False))
+    """Return one table: RMSE and failures on each scenario; activity and return on the first; by what was known."""
+    alone = [column._replace(interval=False) for column in (PULL_STEP, HEATER_STEP, RETURN)]
+    columns = (RMSE, FAILURES._replace(interval=False), *alone)
     found = [{name: row for name, *row in rows(result, columns)} for result in results]
-    lines = []
-    for name in (label(sample, results[0]) for sample in results[0].samples):
-        errors, steps, failures = zip(*(each[name] for each in found), strict=True)
-        lines.append((name, *errors, steps[0], " / ".join(failures)))
-    return table(("controller", *(result.row.name for result in results), PULL_STEP.heading, FAILURES.heading), lines)
+    groups: dict[str, list[tuple[str, ...]]] = {}
+    for sample in results[0].samples:
+        name = label(sample, results[0])
+        errors, failures, *others = zip(*(each[name] for each in found), strict=True)
+        line = name, *errors, *(first for first, *_ in others), " / ".join(failures)
+        groups.setdefault(sample.contender.knows, []).append(line)
+    heads = "controller", *(result.row.name for result in results), *(column.heading for column in alone)
+    lines = [line for group, listed in groups.items() for line in ((f"*{group}*", *[""] * len(heads)), *listed)]
+    return table((*heads, FAILURES.heading), lines)
 
 
 def brief(results: Sequence[Result]) -> str:

@@ -40,6 +40,7 @@ class Column(NamedTuple):
 RMSE = Column("rmse_mm", "RMSE [mm]", 3)
 FAILURES = Column("failure_rate", "failures [%]", 1, PERCENT)
 PULL_STEP = Column("pull_step_rms_mm_per_min", "pull step RMS [mm/min]", 4)
+RETURN = Column("return", "return", 0)
 HEATER_STEP = Column("heater_step_rms_kw", "heater step RMS [kW]", 3)
 ERROR = (
     RMSE,
@@ -56,7 +57,7 @@ DRIVES = (
     HEATER_STEP,
     Column("growth_rate_rms_mm_per_min", "growth rate RMS [mm/min]", 3),
     Column("cost", "cost", 4),
-    Column("return", "return", 0),
+    RETURN,
     Column(SPEED, "compute [us/step]", 2),
 )
 _COMPARISON = (

@@ -50,7 +50,7 @@ def test_agent_for_another_plant_is_refused(agent: Path) -> None:
         ({"channels": 71}, "reads 71 channels"),
         ({"channels": "72"}, "must be int"),
         ({"format": "zip"}, "not a cz-gym-agent contract"),
-        ({"format_version": 1}, "format version 1, this release reads 4"),
+        ({"format_version": 1}, "format version 1, this release reads 5"),
         ({"sha256": "0" * 64}, "SHA-256 differs"),
         ({"surprise": 1}, "'surprise' is unknown"),
         ({"algorithm": "mine | yours"}, r"must be printable text of 1 to 160 characters without \|"),
