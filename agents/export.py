@@ -26,15 +26,13 @@ OPSET, IR_VERSION = 17, 9
 class Deterministic(nn.Module):
     """The deterministic action of a policy, clipped to [-1, 1], for observations as the environment gives them.
 
-    A recurrent policy also takes its state, of length ``memory``, and returns the next one. ``channels`` is the length
-    of the observation; a policy trained on a longer one sees zeros behind it.
+    A recurrent policy also takes its state, of length ``memory``, and returns the next one.
     """
 
     mean: torch.Tensor
     spread: torch.Tensor
-    padding: torch.Tensor | None
 
-    def __init__(self, policy: BasePolicy, channels: int, normalisation: VecNormalize | None = None) -> None:
+    def __init__(self, policy: BasePolicy, normalisation: VecNormalize | None = None) -> None:
         super().__init__()
         self.policy: Any = policy
         self.limit, self.memory = 0.0, 0
@@ -53,15 +51,12 @@ class Deterministic(nn.Module):
             self.limit = normalisation.clip_obs
             self.register_buffer("mean", torch.as_tensor(rms.mean, dtype=torch.float32))
             self.register_buffer("spread", torch.as_tensor(np.sqrt(rms.var + normalisation.epsilon)).float())
-        seen = (policy.observation_space.shape or (channels,))[0]
-        self.register_buffer("padding", torch.eye(channels, seen) if seen > channels else None)
 
     def forward(self, observation: torch.Tensor, *state: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Shape (n, channels) and, with a memory, (n, memory), to the action (n, 2) and the next state."""
         x, policy = observation, self.policy
         if self.limit:
             x = torch.clamp((x - self.mean) / self.spread, -self.limit, self.limit)
-        x = x if self.padding is None else torch.matmul(x, self.padding)
         after: list[torch.Tensor] = []
         if isinstance(policy, RecurrentPolicy):
             action, *after = policy(x, *state)
@@ -102,7 +97,7 @@ def to_onnx(policy: BasePolicy, channels: int, normalisation: VecNormalize | Non
     torch's older exporter: the newer one needs more packages and takes a second.
     """
     policy.set_training_mode(False)
-    module = Deterministic(policy, channels, normalisation).eval()
+    module = Deterministic(policy, normalisation).eval()
     examples = [torch.zeros(2, channels), torch.zeros(2, module.memory)][: 2 if module.memory else 1]
     inputs, outputs = (list(names[: len(examples)]) for names in (INPUTS, OUTPUTS))
     rows = {name: {0: "n"} for name in (*inputs, *outputs)}

@@ -88,6 +88,7 @@ def save_agent(
 
     from cz_gym.agents.apg import APG
     from cz_gym.agents.export import to_onnx
+    from cz_gym.sb3 import environment_steps
 
     path = Path(path)
     if path.suffix != ".onnx":
@@ -107,7 +108,7 @@ def save_agent(
         "algorithm": name,
         "learned_from": PLANT if isinstance(model, APG) else REWARD,
         "training_seed": int((model.seed if seed is None else seed) or 0),
-        "training_steps": int(model.num_timesteps),
+        "training_steps": environment_steps(model),
         "validation_cost": 0.0,
         "validation_rmse_mm": 0.0,
     }

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_wrapper
 
 from cz_gym.errors import CzError
 from cz_gym.names import needs
@@ -46,8 +47,6 @@ class CzVecEnv(VecEnv):
         self.env = env
         self.render_mode = env.render_mode
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
-        self.info: dict[str, Any] = {}
-        """The batch's info of its last step."""
         self._actions = np.zeros((env.num_envs, 2), np.float32)
         self._returns = np.zeros(env.num_envs)
         self._lengths = np.zeros(env.num_envs, np.int64)
@@ -81,7 +80,6 @@ class CzVecEnv(VecEnv):
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Advance every slot."""
         observation, reward, terminated, truncated, info = self.env.step(self._actions)
-        self.info = info
         self._returns += reward
         self._lengths += 1
         self._k += 1
@@ -161,3 +159,10 @@ class ActionRepeat(VecEnvWrapper):
             infos = [one if one else other for one, other in zip(infos, others, strict=True)]
             done = done | over
         return observation, earned, done, infos
+
+
+def environment_steps(model: BaseAlgorithm) -> int:
+    """Environment steps that a model has learned for, with those of repeated actions."""
+    env = model.get_env()
+    repeat = None if env is None else unwrap_vec_wrapper(env, ActionRepeat)
+    return int(model.num_timesteps) * (1 if repeat is None else repeat.times)

@@ -24,7 +24,7 @@ from cz_gym.agents.training.validation import Validation, validate
 from cz_gym.config import make_config
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
-CONFIG = make_config("randomized", observation="history", action="smooth")
+CONFIG = make_config("randomized")
 
 
 @dataclass
@@ -96,7 +96,6 @@ def main(args: Args) -> Validation:
     shape = (args.num_steps, args.num_envs)
     seen, done_after = torch.zeros(*shape, channels), torch.zeros(shape)
     acted, (logps, values, rewards) = torch.zeros(*shape, actions), torch.zeros(3, *shape)
-    worst = -10.0 / (1.0 - args.gamma)  # a failing step costs -10 for each step lost: no more than the discount sees
     updates = max(args.steps // (args.num_steps * args.num_envs), 1)
     for update in range(updates):
         optimiser.param_groups[0]["lr"] = args.learning_rate * (1.0 - update / updates)
@@ -107,7 +106,7 @@ def main(args: Args) -> Validation:
                 acted[t] = drawn.sample()
                 logps[t], values[t] = drawn.log_prob(acted[t]).sum(-1), agent.critic(seen[t]).squeeze(-1)
             observation, reward, ended, cut, info = envs.step(acted[t].clamp(-1.0, 1.0).numpy())
-            rewards[t] = torch.as_tensor((1.0 - args.gamma) * np.maximum(reward, worst))
+            rewards[t] = torch.as_tensor((1.0 - args.gamma) * reward)
             done_after[t] = torch.as_tensor(ended | cut)
             if cut.any():  # an episode that ran out of time would have gone on
                 last = agent.normalise(np.stack(info["final_obs"][cut]))

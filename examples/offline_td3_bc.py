@@ -25,7 +25,7 @@ from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.observation import DRIVE_CHANNELS
 from cz_gym.task import drives_of
 
-CONFIG = make_config("randomized", observation="history", action="smooth")
+CONFIG = make_config("randomized")
 GAMMA, ALPHA = 0.98, 5.0
 """Discount, and weight of the critic's gradient beside that of the cloning."""
 BATCH, RATE, TARGET_RATE, TARGET_NOISE = 512, 1e-3, 0.05, 0.2
@@ -58,8 +58,7 @@ def read(names: list[str]) -> list[Any]:
     for episode in (each for name in names for each in minari.load_dataset(name).iterate_episodes()):
         seen, state = episode.observations, episode.infos["state"]
         action = drives.asked(episode.actions, seen[:-1, list(DRIVE_CHANNELS)])
-        # A lost crystal costs every step that is lost; a discount sees no more of it than this.
-        reward = (1.0 - GAMMA) * np.maximum(episode.rewards, -10.0 / (1.0 - GAMMA))
+        reward = (1.0 - GAMMA) * episode.rewards
         parts.append((seen[:-1], seen[1:], state[:-1], state[1:], action, reward, episode.terminations))
     columns = [torch.as_tensor(np.concatenate(each).astype(np.float32)) for each in zip(*parts, strict=True)]
     return [scaled(*columns[:2]), scaled(*columns[2:4]), *columns[4:]]

@@ -24,7 +24,7 @@ def main() -> None:
     """Check the specs, then gather frames with a linear policy; prints how many."""
     env = GymEnv("Cz-v0", control_interval=20.0, horizon=400.0)
     check_env_specs(env)
-    policy = TensorDictModule(torch.nn.Linear(11, 2), in_keys=["observation"], out_keys=["action"])
+    policy = TensorDictModule(torch.nn.Linear(72, 2), in_keys=["observation"], out_keys=["action"])
     frames, ended = 0, 0
     for batch in Collector(env, policy, frames_per_batch=64, total_frames=256):
         frames, ended = frames + batch.numel(), ended + int(batch["next", "done"].sum())

@@ -172,6 +172,7 @@ def few_crystals(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(validation, "PICKING", VALIDATION_SEEDS[:2])
     monkeypatch.setattr(validation, "JUDGING", VALIDATION_SEEDS[2:4])
+    monkeypatch.setattr("cz_gym.agents.from_sb3.JUDGING", VALIDATION_SEEDS[2:4])
 
 
 @pytest.fixture(scope="session")

@@ -22,6 +22,7 @@ from safetensors.torch import load, save
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from cz_gym.agents.agent_file.contract import AgentFileError, read_bounded
+from cz_gym.sb3 import environment_steps
 
 from .replay_buffer import PREFIX, fits, latest, refill
 
@@ -61,7 +62,7 @@ def to_bytes(
 
     AgentFileError if it learned numbers that are not finite: no run could continue from them.
     """
-    progress = Progress(int(algorithm.num_timesteps), seconds, best_cost)
+    progress = Progress(environment_steps(algorithm), seconds, best_cost)
     # Modules that share a tensor each get their copy: the format knows no sharing.
     copies = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in _tensors(algorithm).items()}
     for name, tensor in copies.items():

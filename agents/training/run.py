@@ -28,6 +28,7 @@ from cz_gym.agents.export import to_onnx
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.atomic_files import write_files
 from cz_gym.observation import OBSERVATIONS
+from cz_gym.sb3 import environment_steps
 
 from . import validation
 from .algorithms import make_algorithm, repeat_of
@@ -92,7 +93,7 @@ class Run:
     @property
     def steps(self) -> int:
         """Environment steps taken."""
-        return self.algorithm.num_timesteps * repeat_of(self.recipe)
+        return environment_steps(self.algorithm)
 
     def learn(self, bar: Any) -> None:
         """Learn to the end, validating and saving on the way; nothing if that is done.

@@ -67,7 +67,7 @@ def film() -> bytes:
 
 def contestants(seed: int) -> tuple[Side, Side]:
     """The paper's controller and the shipped agent, each with an environment of its own."""
-    env = CzEnv(render_mode="rgb_array")
+    env = CzEnv(observation="measured", action="direct", render_mode="rgb_array")
     learned = agents.load()
     other = CzEnv(**learned.settings, render_mode="rgb_array")
     name = f"learned: {learned.contract.algorithm}"

@@ -51,7 +51,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def trained(kind: str, normalised: bool = False, observation: str = "history") -> Any:
     algorithm, policy, options = KINDS[kind]
-    settings = {"observation": observation, "action": "smooth", "control_interval": 10.0}
+    settings = {"observation": observation, "control_interval": 10.0}
     env: Any = make_vec_env("Cz-v0", n_envs=2, env_kwargs=settings)
     if normalised:
         env = VecNormalize(env, clip_obs=3.0)
@@ -101,7 +101,9 @@ def test_the_command_reads_what_stable_baselines3_and_rl_zoo_save(
 
 
 def test_the_command_reads_analytic_policy_gradients_of_a_mixture(tmp_path: Path) -> None:
-    model = APG("RecurrentPolicy", sb3.make_vec_env(2, action="rate"), window=4, seed=3).learn(16)
+    model = APG("RecurrentPolicy", sb3.make_vec_env(2, observation="measured", action="rate"), window=4, seed=3).learn(
+        16
+    )
     model.save(tmp_path / "model.zip")
     command = f"{tmp_path / 'model.zip'} --algo apg --out {tmp_path / 'own.onnx'} --observation measured --action rate"
     assert from_sb3.main([*command.split(), "--scenario", "randomized=0.5,hard=0.5"]) == 0
@@ -113,7 +115,7 @@ def test_the_command_reads_analytic_policy_gradients_of_a_mixture(tmp_path: Path
 @pytest.mark.parametrize("kind", ["ppo", "sac"])
 def test_a_model_without_its_normalisation_is_refused(kind: str, tmp_path: Path) -> None:
     """A model that was saved and loaded has no environment that could tell."""
-    config = make_config(observation="history", action="smooth", control_interval=10.0)
+    config = make_config(control_interval=10.0)
 
     def again(model: Any) -> Any:
         model.save(tmp_path / "model.zip")
@@ -164,7 +166,7 @@ def doubled(action: Any) -> Any:
         ),
         (lambda: in_environments(CzEnv, outer=lambda env: VecFrameStack(env, 1)), "wrapped in VecFrameStack"),
         (lambda: in_environments(CzEnv, lambda: CzEnv(scenario="hard")), "several scenarios, 'randomized' and 'hard'"),
-        (lambda: in_environments(CzEnv, lambda: CzEnv(action="smooth")), "environments differ"),
+        (lambda: in_environments(CzEnv, lambda: CzEnv(action="rate")), "environments differ"),
         (lambda: in_environments(CzEnv, lambda: CzEnv(control_interval=2.0)), "environments differ"),
     ],
 )
@@ -265,7 +267,7 @@ def test_mistakes_are_one_line(
     arguments: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Any
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    env = gym.make("Cz-v0", observation="history")
+    env = gym.make("Cz-v0")
     PPO("MlpPolicy", env, device="cpu", n_steps=8, batch_size=8).save("good.zip")
     Path("broken.zip").write_bytes(b"not a model")
     before = set(os.listdir())

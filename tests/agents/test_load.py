@@ -101,4 +101,4 @@ def test_an_environment_refuses_an_agent_that_is_not_made_for_it() -> None:
         env.step(np.asarray(agent.predict(observation)[0]))
         env.step(np.clip(2.0 * agent.predict(observation)[0], -1.0, 1.0).astype(np.float32))
     with pytest.raises(ValueError, match=r"expected 72 channels \(history\), got shape \(11,\): gym.make"):
-        agent.predict(gym.make("Cz-v0").reset()[0])
+        agent.predict(gym.make("Cz-v0", observation="measured").reset()[0])

@@ -6,7 +6,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -16,12 +15,11 @@ from cz_gym import SCENARIOS, CzEnv, CzVectorEnv
 from cz_gym.sb3 import CzVecEnv, make_vec_env
 
 N = 3
-SETTINGS: dict[str, Any] = {"scenario": "hard", "observation": "history", "control_interval": 20.0, "horizon": 400.0}
+SETTINGS: dict[str, Any] = {"scenario": "hard", "control_interval": 20.0, "horizon": 400.0}
 
 
-def adapter(n: int = N, privileged: bool = False, stagger: int | None = None, **changes: Any) -> CzVecEnv:
-    env = CzVectorEnv(n, autoreset_mode=AutoresetMode.SAME_STEP, **{**SETTINGS, **changes})
-    return CzVecEnv(env, privileged, stagger)
+def adapter(n: int = N, stagger: int | None = None, **changes: Any) -> Any:
+    return make_vec_env(n, stagger, **{**SETTINGS, **changes})
 
 
 def test_equals_sb3s_own_vector_of_scalars() -> None:
@@ -75,17 +73,24 @@ def test_evaluation_sees_the_environment_s_own_returns() -> None:
     assert returns == pytest.approx([total, total], rel=1e-4)
 
 
-def test_a_privileged_critic_sees_the_state_after_the_history() -> None:
-    plain, privileged = adapter(), adapter(privileged=True)
-    for env in (plain, privileged):
-        env.seed(1)
-    first, whole = plain.reset(), privileged.reset()
-    assert whole.shape == (N, first.shape[1] + 17) == (N, *privileged.observation_space.shape)
-    np.testing.assert_array_equal(whole[:, : first.shape[1]], first)
-    for _ in range(20):
-        whole, _, done, infos = privileged.step(np.zeros((N, 2), np.float32))
-    for i in np.flatnonzero(done):
-        assert infos[i]["terminal_observation"].shape == whole[i].shape
+@pytest.mark.parametrize("steps", [50, 6])
+def test_a_repeated_action_earns_the_sum_of_its_steps_and_ends_with_an_episode(steps: int) -> None:
+    """Beside the same steps one by one; episodes of 6 steps end in the middle of the second action."""
+    settings: dict[str, Any] = {**SETTINGS, "horizon": 20.0 * steps}
+    repeated, plain = make_vec_env(N, action_repeat=4, **settings), make_vec_env(N, **settings)
+    for env in (repeated, plain):
+        env.seed(5)
+        env.reset()
+    for action in np.random.default_rng(0).normal(0.0, 0.1, (3, N, 2)).astype(np.float32):
+        observation, earned, done, infos = repeated.step(action)
+        singly = [plain.step(action) for _ in range(4)]
+        over = [bool(each[2].all()) for each in singly]
+        counted = singly[: over.index(True) + 1 if any(over) else 4]
+        np.testing.assert_array_equal(observation, singly[-1][0])
+        np.testing.assert_allclose(earned, np.sum([each[1] for each in counted], axis=0), rtol=1e-6)
+        assert done.all() == any(over)
+        if done.all():
+            np.testing.assert_array_equal(infos[0]["terminal_observation"], counted[-1][3][0]["terminal_observation"])
 
 
 def test_staggered_first_episodes_end_at_different_times() -> None:
@@ -111,8 +116,6 @@ def test_attributes_and_methods() -> None:
 def test_wrong_settings_are_refused() -> None:
     with pytest.raises(ValueError, match="SAME_STEP"):
         CzVecEnv(CzVectorEnv(2))
-    with pytest.raises(ValueError, match="history"):
-        adapter(observation="measured", privileged=True)
 
 
 @pytest.mark.parametrize("observation", ["measured", "history", "state"])

@@ -1,26 +1,23 @@
 """Comparisons of algorithms: runs are trained once and evaluated anew, and differences are paired."""
 
 from collections.abc import Iterator
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("matplotlib")
 
 from cz_gym.agents.training import run, validation
-from cz_gym.agents.training.algorithms import make_algorithm
 from cz_gym.agents.training.recipes import APG, PPO, SAC
 from cz_gym.evaluation.protocol import TEST_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.statistics import Resamples
 from studies.algorithms import __main__ as command
 from studies.algorithms import report
 from studies.algorithms.report import COLUMNS, Result, tabulate, to_markdown
-from studies.algorithms.variants import ABLATION, COMPARISONS, Comparison, Variant
+from studies.algorithms.variants import Comparison, Variant
 
 SMALL: dict[str, Any] = {"num_envs": 4, "hidden": (4,), "steps": 128}
 VARIANTS = (
@@ -109,21 +106,3 @@ def test_differences_are_paired_by_crystal_and_training_seed() -> None:
     # The spread of the crystals themselves, fifty times that of the difference, cancels.
     assert difference.ci95[1] - difference.ci95[0] < 0.02 < mean.ci95[1] - mean.ci95[0]
     assert to_markdown([base, other]).count("less ppo") == 1
-
-
-@pytest.mark.parametrize("row", ABLATION, ids=lambda row: row.name)
-def test_a_row_changes_one_thing_and_can_be_learned(row: Variant) -> None:
-    base, mine = asdict(ABLATION[0].recipe), asdict(row.recipe)
-    assert len({name for name in base if base[name] != mine[name]} - {"name"}) == (row.base != "")
-    few: dict[str, Any] = {"n_steps": 8, "batch_size": 32, "steps": 32, "num_envs": 4}
-    algorithm = make_algorithm(replace(row.recipe, **few), 0)
-    before = [each.clone() for each in algorithm.policy.parameters()]
-    algorithm.learn(32)
-    assert not all(map(torch.equal, algorithm.policy.parameters(), before))
-
-
-@pytest.mark.parametrize("comparison", COMPARISONS.values(), ids=COMPARISONS)
-def test_no_two_rows_are_alike(comparison: Comparison) -> None:
-    rows = comparison.variants
-    assert len({row.name for row in rows}) == len({repr(replace(row.recipe, name="")) for row in rows}) == len(rows)
-    assert {row.base for row in rows} <= {"", *(row.name for row in rows)}

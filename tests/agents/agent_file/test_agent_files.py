@@ -122,8 +122,7 @@ def test_an_oversized_file_is_refused(agent: Path) -> None:
 def test_shipped_agent_beats_the_paper_s_controller_on_validation() -> None:
     seeds = range(1_000_000, 1_000_030)
     policy = OnnxPolicy.load(shipped(), CONFIG)
-    agent = metrics(rollout(policy, make_config(observation=policy.observation, action=policy.action), seeds))
-    paper = metrics(rollout(CompensatedPID(), make_config(), seeds))
+    agent, paper = (metrics(rollout(each, make_config(**each.settings), seeds)) for each in (policy, CompensatedPID()))
     assert agent.rmse_mm.mean() < 0.3 * paper.rmse_mm.mean()
     assert agent.failure_rate.sum() == 0
     assert agent.pull_step_rms_mm_per_min.mean() < paper.pull_step_rms_mm_per_min.mean()

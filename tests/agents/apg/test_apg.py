@@ -14,7 +14,7 @@ from stable_baselines3.common.env_util import make_vec_env as scalar_environment
 from cz_gym.agents.apg import APG, RecurrentPolicy
 from cz_gym.agents.apg.plant_step import StepCost, advance
 from cz_gym.config import make_config
-from cz_gym.cost import SCALES, WEIGHTS, Weights, saturated
+from cz_gym.cost import SCALES, WEIGHTS, saturated
 from cz_gym.differentiable import STATES, DifferentiableBatch
 from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
@@ -24,7 +24,6 @@ from cz_gym.sb3 import make_vec_env
 
 SETTINGS: dict[str, Any] = {"observation": "measured", "action": "rate"}
 CONFIG = make_config(**SETTINGS)
-QUIET = Weights(1.0, 0.025, 0.035, 1.17)
 
 
 def algorithm(n: int = 8, window: int = 20, seed: int = 0, **options: Any) -> APG:
@@ -44,10 +43,10 @@ def some_policy(interval: float = 5.0) -> RecurrentPolicy:
     return policy
 
 
-def driven(policy: RecurrentPolicy, batch: DifferentiableBatch, steps: int, weights: Weights = QUIET) -> torch.Tensor:
+def driven(policy: RecurrentPolicy, batch: DifferentiableBatch, steps: int) -> torch.Tensor:
     """Mean cost of crystals that the policy drives."""
     state, measured = map(torch.from_numpy, batch.reset(range(batch.num_envs)))
-    memory, cost_of, costs = policy.initial_memory(batch.num_envs), StepCost(batch.config, weights), []
+    memory, cost_of, costs = policy.initial_memory(batch.num_envs), StepCost(batch.config), []
     for _ in range(steps):
         action, memory = policy(measured, memory)
         before = state
@@ -86,16 +85,15 @@ def stepped(scenario: str, action: str, actions: Any) -> tuple[Any, Any, Any, An
             each.step(np.full((4, 2), 0.02))
     before = torch.from_numpy(twin._state)
     after = advance(before, torch.from_numpy(np.float32(actions)), twin)
-    return before, after, torch.from_numpy(np.float32(actions)), batch.step(actions), StepCost(config, WEIGHTS)
+    return before, after, torch.from_numpy(np.float32(actions)), batch.step(actions), StepCost(config)
 
 
 @pytest.mark.parametrize("action", ["rate", "smooth", "direct"])
-def test_the_cost_is_the_environment_s_but_for_what_no_sensor_shows(action: str) -> None:
+def test_the_cost_is_the_environment_s(action: str) -> None:
     before, (after, _, grows, target), actions, step, cost_of = stepped("sensor-fault", action, np.full((4, 2), 0.05))
     assert np.abs(step.offset).max() > 1e-6
-    terms = step.cost.copy()
-    terms[:, 0] = ((step.error + step.offset) / SCALES.radius) ** 2
-    np.testing.assert_allclose(cost_of(before, actions, after, grows, target), saturated(terms.sum(axis=1)), rtol=1e-5)
+    wanted = saturated(step.cost.sum(axis=1))
+    np.testing.assert_allclose(cost_of(before, actions, after, grows, target), wanted, rtol=1e-5)
 
 
 def test_a_pull_step_that_a_limit_cuts_is_charged_as_asked() -> None:
@@ -103,11 +101,11 @@ def test_a_pull_step_that_a_limit_cuts_is_charged_as_asked() -> None:
     asked = np.array([[0.05, 0.0], [0.5, 0.0], [-0.5, 0.0], [1.0, 0.0]])
     before, (after, _, grows, target), actions, step, cost_of = stepped("puller", "rate", asked)
     assert np.abs(step.jacobian[1:, len(STATES) + 2, len(STATES)]).max() == 0.0, "no limit cuts these"
-    cost_of.weights = Weights(0.0, 0.0, 1.0, 0.0)
     actions.requires_grad_()
     cost = cost_of(before, actions, after, grows, target)
     pull = 0.1 * CONFIG.parameters.v_0 * asked[:, 0]
-    np.testing.assert_allclose(cost.detach(), saturated((pull / SCALES.pull_step) ** 2), rtol=1e-5)
+    asked_for = step.cost.sum(axis=1) - step.cost[:, 2] + WEIGHTS.pull_step * (pull / SCALES.pull_step) ** 2
+    np.testing.assert_allclose(cost.detach(), saturated(asked_for), rtol=1e-5)
     cost.sum().backward()
     assert actions.grad is not None
     np.testing.assert_array_equal(np.sign(actions.grad[:, 0].numpy()), np.sign(asked[:, 0]))
@@ -119,7 +117,7 @@ def test_a_lost_crystal_costs_nothing_and_has_no_gradient() -> None:
     batch._batch.memory.slots["x"]["r_c"][1] += 9e-3
     action = torch.zeros(2, 2, requires_grad=True)
     after, _, grows, target = advance(state, action, batch)
-    cost = StepCost(CONFIG, WEIGHTS)(state, action, after, grows, target)
+    cost = StepCost(CONFIG)(state, action, after, grows, target)
     cost.sum().backward()
     assert grows.tolist() == [True, False]
     assert cost[1] == 0.0 < cost[0]
@@ -215,7 +213,7 @@ def test_the_cost_falls_in_a_few_updates() -> None:
 @pytest.mark.slow
 def test_it_holds_crystals_after_half_a_million_steps() -> None:
     """From losing all crystals to holding most of them."""
-    model = algorithm(64, 180, weights=QUIET)
+    model = algorithm(64, 180)
     seeds = VALIDATION_SEEDS[:16]
     assert metrics(rollout(model, CONFIG, seeds)).failure_rate.mean() > 0.8
     model.learn(64 * 180 * 45)

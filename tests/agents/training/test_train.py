@@ -44,9 +44,7 @@ def test_a_run_leaves_everything_and_goes_on(
 ) -> None:
     folder = tmp_path / "run"
     assert train.main(["--algo", algorithm, "--steps", "20000", "--seed", "3", "--out", str(folder), "--plot"]) == 0
-    crystals = (
-        "0.2 hard + 0.25 puller + 0.35 randomized + 0.2 sensor-fault" if algorithm == "gradient" else "randomized"
-    )
+    crystals = "0.175 hard + 0.175 hot-zone + 0.175 puller + 0.3 randomized + 0.175 sensor-fault"
     assert f" steps on {crystals}, into {folder}\n" in capsys.readouterr().out
     assert (folder / "progress.png").read_bytes().startswith(b"\x89PNG")
     saved = json.loads((folder / "settings.json").read_text())
@@ -117,7 +115,7 @@ def test_ctrl_c_in_the_middle_of_an_update_saves_after_it(
     assert train.main(["--steps", "12000", "--out", str(folder)]) == 130
     assert f"{interpreter()} train.py --resume --out {folder} continues" in capsys.readouterr().err
     progress, tensors, _ = load_checkpoint(folder / run.CHECKPOINT)
-    assert 2 * 2048 < progress.steps < 3 * 2048
+    assert 2 * 4096 < progress.steps < 3 * 4096
     assert float(tensors["policy.optimizer/0/step"]) == 8.0
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
