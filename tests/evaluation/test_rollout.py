@@ -130,7 +130,11 @@ WITHOUT_TUPLE = SimpleNamespace(predict=lambda observation, **rest: np.zeros((le
         (CompensatedPID, SHORT, "is no policy: an object with predict"),
         (lambda observation: observation, SHORT, "is no policy: an object with predict"),
         (WITHOUT_TUPLE, SHORT, r"predict must return a tuple \(action, state\), not ndarray"),
-        (CompensatedPID(), make_config(action="smooth", observation="measured"), r"made for action='direct'.* has action"),
+        (
+            CompensatedPID(),
+            make_config(action="smooth", observation="measured"),
+            r"made for action='direct'.* has action",
+        ),
         (load("gradient"), SHORT, r"made for action='rate'.* has action='direct'"),
         (OpenLoop(), "hard", r"needs a Config, not 'hard': cz_gym.config.make_config\('hard'\) makes one"),
         ("paper", SHORT, r"as make_controller\('paper', config\) makes one"),
