@@ -81,30 +81,17 @@ def test_nonsense_is_refused_in_one_line(where: tuple[str, str], value: object) 
 @pytest.mark.parametrize(
     ("family", "member", "value"),
     [
-        ("faults", "flagged", (0.5, 1.0)),
-        ("faults", "flagged", (2, 9)),
-        ("faults", "unflagged", 0.5),
-        ("faults", "unflagged", 2),
-        ("faults", "dropout", (0.0, 1.5)),
-        ("pullers", "mix", (0.0, 1.5)),
-        ("pullers", "capillary", 0.9),
-        ("pullers", "melt_loss", 1.0),
-        ("reference", "probability", 1.5),
-        ("sensor", "latency", 1e4),
-        ("sensor", "latency", -5.0),
-        ("sensor", "outlier_probability", 2.0),
-        ("sensor", "outlier_sd", -1.0),
-        ("sensor", "camera_noise", (0.0, 0.05)),
-        ("sensor", "camera_noise", (0.0, 0.0021)),
-        ("sensor", "bias_offset", (-1.0, 1.0)),
-        ("pullers", "start_radius_sd", 0.2),
-        ("reference", "amount", (-2.5, 2.5)),
-        ("faults", "bias_drift", (-0.3, 0.3)),
-        ("interface", "tau_fast", 0.0),
-        ("interface", "sd", (-0.5, 0.5)),
+        ("faults", "flagged", (0.5, 1.0)), ("faults", "flagged", (2, 9)), ("faults", "unflagged", 0.5),
+        ("faults", "unflagged", 2), ("faults", "dropout", (0.0, 1.5)), ("pullers", "mix", (0.0, 1.5)),
+        ("pullers", "capillary", 0.9), ("pullers", "melt_loss", 1.0), ("reference", "probability", 1.5),
+        ("sensor", "latency", 1e4), ("sensor", "latency", -5.0), ("sensor", "outlier_probability", 2.0),
+        ("sensor", "outlier_sd", -1.0), ("sensor", "camera_noise", (0.0, 0.05)),
+        ("sensor", "camera_noise", (0.0, 0.0021)), ("sensor", "bias_offset", (-1.0, 1.0)),
+        ("pullers", "start_radius_sd", 0.2), ("reference", "amount", (-2.5, 2.5)),
+        ("faults", "bias_drift", (-0.3, 0.3)), ("interface", "tau_fast", 0.0), ("interface", "sd", (-0.5, 0.5)),
         ("actuators", "pull_slew", -1.0),
     ],
-)
+)  # fmt: skip
 def test_what_no_draw_can_be_made_from_is_refused(family: str, member: str, value: object) -> None:
     with pytest.raises(ValueError, match="scenario 'nominal'"):
         changed(SCENARIOS["nominal"], family, member, value)

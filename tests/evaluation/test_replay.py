@@ -71,6 +71,9 @@ def test_a_failed_episode_stays_failed() -> None:
 def test_bad_arguments_are_refused(arguments: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"at least one whole number|must lie in the episode"):
         replay(Playback([[0, 0]]), Playback([[0, 0]]), **{"config": CONFIG, "seeds": SEEDS, **arguments})
+    for log in ([], [1.0, 2.0], np.zeros((3, 3)), np.zeros((0, 2))):
+        with pytest.raises(ValueError, match="logged actions must be of shape"):
+            Playback(log)
 
 
 def test_policies_of_another_environment_are_refused() -> None:
@@ -78,9 +81,3 @@ def test_policies_of_another_environment_are_refused() -> None:
     for one, other in ((agent, pid), (pid, agent)):
         with pytest.raises(CzError, match=r"made for action='rate', .* the environment has action='direct'"):
             replay(one, other, make_config("randomized", horizon=600.0, **PLAIN), [1])
-
-
-@pytest.mark.parametrize("log", [[], [1.0, 2.0], np.zeros((3, 3)), np.zeros((0, 2))])
-def test_bad_logs_are_refused(log: Any) -> None:
-    with pytest.raises(ValueError, match="logged actions must be of shape"):
-        Playback(log)

@@ -2,7 +2,6 @@
 
 import importlib
 import re
-import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from gymnasium.error import DependencyNotInstalled
 import benchmark
 from cz_gym import datasets
 from cz_gym.baselines.tuning import __main__ as tuning
-from cz_gym.commands import OPTIONAL, OneLineParser, guarded, interpreter
+from cz_gym.commands import OPTIONAL, OneLineParser, guarded
 from cz_gym.errors import CzError
 from cz_gym.play import __main__ as play
 from studies.film import __main__ as film
@@ -90,15 +89,6 @@ def test_the_meniscus_is_written_only_when_asked_for(
     assert not list(tmp_path.iterdir())
     assert young_laplace.main(["--write"]) == 0
     assert (tmp_path / "table.json").read_bytes() == table.TABLE.read_bytes()
-
-
-def test_the_interpreter_is_named_as_it_is_run_from_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "executable", str(tmp_path / ".venv" / "bin" / "python"))
-    assert interpreter() == str(tmp_path / ".venv" / "bin" / "python")
-    monkeypatch.chdir(tmp_path)
-    assert interpreter() == ".venv/bin/python"
-    monkeypatch.setattr(sys, "executable", "")
-    assert interpreter() == "python"
 
 
 def test_a_message_of_several_lines_becomes_one(capsys: pytest.CaptureFixture[str]) -> None:

@@ -238,10 +238,3 @@ def test_every_symbol_has_unit_meaning_and_a_numbered_equation(nomenclature: Any
             assert row.equations, f"{row.code}: no numbered equation of docs/physics.md holds {row.symbol}"
     sources = {row.code: row.source for row in nomenclature.parameters()}
     assert sources == {name: quantity.source for name, quantity in describe().items()}
-
-
-def test_a_symbol_is_found_where_it_stands_alone(nomenclature: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    formula = r"C_1 \dot{T}_1 = a^2 T_{1,0} + G_{1a} T_{12} + \alpha b_0 + \frac{\rho_{sx}}{\rho_l g}"
-    monkeypatch.setattr(nomenclature, "formulas", lambda: {"1": formula})
-    symbols = ("C_1", "T_1", "a", "T_a", "b", "b_0", r"\rho_l", r"\rho_s", "g")
-    assert [tex for tex in symbols if nomenclature.equations(tex)] == ["C_1", "a", "b_0", r"\rho_l", "g"]
