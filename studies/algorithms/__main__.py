@@ -20,10 +20,9 @@ from cz_gym.errors import CzError
 from cz_gym.evaluation import cluster
 from cz_gym.names import unknown
 
-from .variants import COMPARISONS, Comparison, Variant
-
 if TYPE_CHECKING:
     from cz_gym.agents.training.fleet import Job
+    from cz_gym.agents.training.recipes import Recipe
 
     from .report import Result
 
@@ -36,65 +35,60 @@ Perform = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, An
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser("python -m studies.algorithms", (__doc__ or "").split("\n")[0])
-    parser.add_argument("comparison", choices=COMPARISONS, nargs="?", default="algorithms", help="(%(default)s)")
-    parser.add_argument("--rows", help="rows to run, joined by commas (default: all)")
-    parser.add_argument("--seeds", type=between(1, 100), default=3, help="training seeds a row (default: %(default)s)")
+    parser.add_argument("--rows", help="recipes to train, joined by commas (default: all)")
+    parser.add_argument(
+        "--seeds", type=between(1, 100), default=3, help="training seeds a recipe (default: %(default)s)"
+    )
     about = "environment steps of recipes that learn from reward (default: the recipe's own)"
     parser.add_argument("--steps", type=between(1, 10**9), help=about)
     parser.add_argument("--jobs", type=between(1, 64), default=2, help="runs at once here (default: %(default)s)")
     about = "run on a Ray cluster, without an address on this machine's; all its machines must share --work"
     parser.add_argument("--ray", nargs="?", const="", metavar="HOST:PORT", help=about)
-    parser.add_argument("--out", type=Path, help="folder of the results (default: results/COMPARISON)")
-    parser.add_argument("--work", type=Path, help="folder of the runs (default: runs/COMPARISON)")
+    about = "folder of the %s (default: %%(default)s)"
+    parser.add_argument("--out", type=Path, default=Path("results/algorithms"), help=about % "results")
+    parser.add_argument("--work", type=Path, default=Path("runs/algorithms"), help=about % "runs")
     return parser.run(_main, arguments, "agents,benchmark", "the same command goes on from the runs' checkpoints")
 
 
 def _main(given: argparse.Namespace) -> None:
-    comparison = COMPARISONS[given.comparison]
-    out, work = given.out or Path("results", given.comparison), given.work or Path("runs", given.comparison)
-    known = [variant.name for variant in comparison.variants]
-    wanted = given.rows.split(",") if given.rows else known
-    for name in wanted:
-        if name not in known:
-            raise CzError(unknown("row", name, known))
-    variants = [variant for variant in comparison.variants if variant.name in wanted]
+    from cz_gym.agents.training.recipes import RECIPES
+
+    for name in (wanted := given.rows.split(",") if given.rows else [*RECIPES]):
+        if name not in RECIPES:
+            raise CzError(unknown("row", name, RECIPES))
+    recipes = [recipe for name, recipe in RECIPES.items() if name in wanted]
     if given.steps:
-        variants = [
-            replace(each, recipe=replace(each.recipe, steps=given.steps)) if each.recipe.steps else each
-            for each in variants
-        ]
-    check_writable(out)
+        recipes = [replace(each, steps=given.steps) if each.steps else each for each in recipes]
+    check_writable(given.out)
     perform: Perform = partial(cluster.in_processes, processes=given.jobs)
     if given.ray is not None:
         cluster.connect(given.ray)
-        work.mkdir(parents=True, exist_ok=True)
-        cluster.check_shared(work)
+        given.work.mkdir(parents=True, exist_ok=True)
+        cluster.check_shared(given.work)
         perform = cluster.completed
-    jobs = make_jobs(variants, given.seeds, work)
-    compare(comparison._replace(variants=tuple(variants)), jobs, out, perform)
+    compare(make_jobs(recipes, given.seeds, given.work), given.out, perform)
 
 
-def make_jobs(variants: Sequence[Variant], seeds: int, work: Path) -> list[Job]:
-    """A run for each training seed and variant, seed by seed: a stopped comparison has trained every variant."""
+def make_jobs(recipes: Sequence[Recipe], seeds: int, work: Path) -> list[Job]:
+    """A run for each training seed and recipe, seed by seed: a stopped comparison has trained every recipe."""
     from cz_gym.agents.training.fleet import Job
 
     return [
-        Job((work / f"{each.name}-seed{seed}").resolve(), each.recipe, seed, {}, CHECKPOINT_SECONDS, False,
-            sys.argv)
+        Job((work / f"{each.name}-seed{seed}").resolve(), each, seed, {}, CHECKPOINT_SECONDS, False, sys.argv)
         for seed in range(seeds)
-        for each in variants
-    ]  # fmt: skip
+        for each in recipes
+    ]
 
 
-def compare(comparison: Comparison, jobs: Sequence[Job], out: Path, perform: Perform) -> None:
+def compare(jobs: Sequence[Job], out: Path, perform: Perform) -> None:
     """Train and evaluate the jobs; table and figure are written after each."""
     from .report import report, train_and_evaluate
 
-    results: dict[str, dict[int, Result]] = {}
+    results: dict[str, dict[int, Result]] = {job.recipe.name: {} for job in jobs}
     for number, result in perform(train_and_evaluate, jobs):
         job = jobs[number]
-        results.setdefault(job.recipe.name, {})[job.seed] = result
-        write_files({out / name: content for name, content in report(comparison, results).items()})
+        results[job.recipe.name][job.seed] = result
+        write_files({out / name: content for name, content in report(results).items()})
         print(f"{job.recipe.name}, seed {job.seed}: done, {out / 'table.md'} is written", flush=True)
 
 

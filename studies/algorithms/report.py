@@ -20,8 +20,8 @@ from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.rollout import Floats, rollout
 from cz_gym.evaluation.statistics import Estimate, Resamples, means
 
-from .variants import Comparison
-
+BASE = "ppo"
+"""Recipe that the others are compared with."""
 SCENARIO, TRANSFER = "randomized", "hard"
 """Scenario of the crystals, whatever an agent was trained on; and a harder scenario to transfer to."""
 MICRON, PERCENT = 1e-3, 1e-2
@@ -76,25 +76,24 @@ def evaluate(policy: Any, config: Config) -> Floats:
 
 
 Results = Mapping[str, Mapping[int, Result]]
-"""By variant and training seed."""
+"""By recipe and training seed."""
 
 
 class Line(NamedTuple):
-    """Figures of one variant, and their differences to its base if that has been trained."""
+    """Figures of one recipe, and their differences to :data:`BASE` if that has been trained."""
 
     name: str
-    base: str
     runs: Mapping[int, Result]
     means: tuple[Estimate, ...]
     differences: tuple[Estimate, ...]
 
 
-def report(comparison: Comparison, results: Results) -> dict[str, bytes]:
+def report(results: Results) -> dict[str, bytes]:
     """``table.md``, ``curves.png`` and ``curves.csv``, by file name."""
-    lines = tabulate(comparison, results)
+    lines = tabulate(results)
     about = ABOUT.format(crystals=len(validation.JUDGING), scenario=SCENARIO, transfer=TRANSFER)
-    meanings = (f"- **{each.name}**: {each.meaning}" for each in comparison.variants if each.name in results)
-    text = "\n".join([f"# {comparison.title}", "", about, "", to_markdown(lines), "", *meanings, ""])
+    title = "# Algorithms side by side: the recipes of train.py on the same crystals"
+    text = "\n".join([title, "", about, "", to_markdown(lines), ""])
     rows = [
         {"variant": name, "seed": seed, **row}
         for name, runs in results.items()
@@ -104,15 +103,15 @@ def report(comparison: Comparison, results: Results) -> dict[str, bytes]:
     return {"table.md": text.encode(), "curves.png": curves(lines), "curves.csv": to_csv(rows)}
 
 
-def tabulate(comparison: Comparison, results: Results) -> list[Line]:
-    """A line for each variant with results."""
+def tabulate(results: Results) -> list[Line]:
+    """A line for each recipe with results."""
     lines = []
-    for name, base in ((variant.name, variant.base) for variant in comparison.variants if variant.name in results):
-        mine, others = results[name], results.get(base, {})
+    for name, mine in ((name, runs) for name, runs in results.items() if runs):
+        others = results.get(BASE, {}) if name != BASE else {}
         values = np.array([run.figures for run in mine.values()])
         weights = Resamples.draw(values.shape[1])
         paired = [run.figures - others[seed].figures for seed, run in mine.items() if seed in others]
-        lines.append(Line(name, base, mine, means(values, weights), means(np.array(paired), weights) if paired else ()))
+        lines.append(Line(name, mine, means(values, weights), means(np.array(paired), weights) if paired else ()))
     return lines
 
 
@@ -131,7 +130,7 @@ def to_markdown(lines: list[Line]) -> str:
             apart = (
                 each.text(f"+{form}", unit) for each, (_, unit, form) in zip(line.differences, COLUMNS, strict=True)
             )
-            rows.append((f"less {line.base}", "", *apart, "", ""))
+            rows.append((f"less {BASE}", "", *apart, "", ""))
     return markdown(("", "seeds", *(head for head, *_ in COLUMNS), "million steps", "minutes"), rows)
 
 

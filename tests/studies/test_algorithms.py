@@ -17,15 +17,13 @@ from cz_gym.evaluation.statistics import Resamples
 from studies.algorithms import __main__ as command
 from studies.algorithms import report
 from studies.algorithms.report import COLUMNS, Result, tabulate, to_markdown
-from studies.algorithms.variants import Comparison, Variant
 
 SMALL: dict[str, Any] = {"num_envs": 4, "hidden": (4,), "steps": 128}
-VARIANTS = (
-    Variant(PPO(**SMALL, n_steps=16, batch_size=64, n_epochs=1), "as it is"),
-    Variant(SAC(**SMALL, learning_starts=16, buffer_size=64, batch_size=8), "SAC", "ppo"),
-    Variant(APG(name="few", num_envs=4, window=16, steps=128), "APG", "ppo"),
+SOME = (
+    PPO(**SMALL, n_steps=16, batch_size=64, n_epochs=1),
+    SAC(**SMALL, learning_starts=16, buffer_size=64, batch_size=8),
+    APG(name="few", num_envs=4, window=16, steps=128),
 )
-SOME = Comparison("Some question", VARIANTS)
 
 
 def in_turn(function: Any, tasks: Any) -> Iterator[tuple[int, Any]]:
@@ -51,18 +49,18 @@ def test_finished_runs_are_kept_and_evaluated_anew(tmp_path: Path, monkeypatch: 
             raise KeyboardInterrupt
 
     monkeypatch.setattr(run.Run, "learn", counted)
-    jobs = command.make_jobs(VARIANTS, 1, tmp_path / "work")
+    jobs = command.make_jobs(SOME, 1, tmp_path / "work")
     with pytest.raises(KeyboardInterrupt):
-        command.compare(SOME, jobs, tmp_path, in_turn)
-    command.compare(SOME, jobs, tmp_path, in_turn)
+        command.compare(jobs, tmp_path, in_turn)
+    command.compare(jobs, tmp_path, in_turn)
     assert trained == ["ppo", "sac", "sac", "few"]
     assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
     before = (tmp_path / "table.md").read_text()
-    for text in ("**few** | 1", "less ppo |", "- **sac**: SAC"):
+    for text in ("**few** | 1", "less ppo |"):
         assert text in before
     measured = report.metrics
     monkeypatch.setattr(report, "metrics", lambda found: (m := measured(found))._replace(rmse_mm=m.rmse_mm + 100.0))
-    command.compare(SOME, jobs, tmp_path, in_turn)
+    command.compare(jobs, tmp_path, in_turn)
     assert len(trained) == 4
     assert (tmp_path / "table.md").read_text() != before
 
@@ -70,10 +68,7 @@ def test_finished_runs_are_kept_and_evaluated_anew(tmp_path: Path, monkeypatch: 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            ["--rows", "ppo,sacc"],
-            "unknown row 'sacc': did you mean 'sac'? Choose from gradient, ppo, sac",
-        ),
+        (["--rows", "ppo,sacc"], "unknown row 'sacc': did you mean 'sac'? Choose from ppo, sac, gradient"),
         (["--seeds", "0"], "--seeds: must be between 1 and 100, not 0"),
         (["--steps", "-5"], "--steps: must be between 1"),
     ],
@@ -91,7 +86,7 @@ def results_of(seeds: range, shift: float) -> dict[int, Result]:
 
 def test_differences_are_paired_by_crystal_and_training_seed() -> None:
     found = {"ppo": results_of(range(3), 0.0), "sac": results_of(range(2), 0.1)}
-    base, other = tabulate(SOME, found)
+    base, other = tabulate(found)
     assert base.differences == ()
     values, reference = (np.array([found[name][seed].figures[:, 0] for seed in range(2)]) for name in ("sac", "ppo"))
     difference, mean = other.differences[0], other.means[0]
