@@ -63,10 +63,7 @@ def train_and_evaluate(job: Job) -> Result:
 
 
 def evaluate(policy: Any, config: Config) -> Floats:
-    """Figures of :data:`COLUMNS` on the validation crystals that chose no agent, shape (crystals, figures).
-
-    The cost is the mean over the steps, as the reward counts it; a lost crystal has cost 10.
-    """
+    """Figures of :data:`COLUMNS` on the validation crystals that chose no agent, shape (crystals, figures)."""
     own, transfer = (
         metrics(rollout(policy, config.with_scenario(name), validation.JUDGING)) for name in (SCENARIO, TRANSFER)
     )
