@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = OneLineParser("python -m studies.algorithms", (__doc__ or "").split("\n")[0])
     parser.add_argument("--rows", help="recipes to train, joined by commas (default: all)")
     parser.add_argument(
-        "--seeds", type=between(1, 100), default=3, help="training seeds a recipe (default: %(default)s)"
+        "--seeds", type=between(1, 100), default=5, help="training seeds a recipe (default: %(default)s)"
     )
     about = "environment steps of recipes that learn from reward (default: the recipe's own)"
     parser.add_argument("--steps", type=between(1, 10**9), help=about)
