@@ -56,8 +56,6 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     own = "scenario of your own, in place of others"
     add("--scenario", action="append", default=[], metavar="FILE.py:NAME", help=own)
     add("--slow", action="store_true", help="slow controllers too, on 50 episodes; resumed from results/cache")
-    ray = "run on a Ray cluster; without an address on this machine's"
-    add("--ray", nargs="?", const="", metavar="HOST:PORT", help=ray)
     add("--overwrite", action="store_true", help="replace files of earlier or other runs")
     add("--quiet", action="store_true", help="no progress bar, no table")
     return parser.parse_args(argv)
@@ -93,7 +91,7 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
 
     from cz_gym.evaluation.report.output import check_targets, write
     from cz_gym.evaluation.report.terminal import terminal
-    from cz_gym.evaluation.runner import in_turn, on_cluster, run
+    from cz_gym.evaluation.runner import run
 
     rows = rows_of(arguments)
     contenders = contenders_of(arguments, rows)
@@ -102,13 +100,8 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
     if arguments.out is not None:  # a missing package is named before the work, not after it
         import matplotlib  # noqa: F401
         import plotly  # noqa: F401
-    if arguments.ray is not None:
-        from cz_gym.evaluation.cluster import connect
-
-        connect(arguments.ray)
     with tqdm(unit="step", unit_scale=True, leave=False, disable=arguments.quiet) as bar:
-        perform = in_turn if arguments.ray is None else on_cluster
-        results = run(contenders, rows, arguments.episodes, bar, CACHE, BOUNDS, perform)
+        results = run(contenders, rows, arguments.episodes, bar, CACHE, BOUNDS)
     quoted = README if not smaller and arguments.out and arguments.out.resolve() == FOLDER else None
     write(arguments.out, arguments.json, results, command, quoted)
     if not arguments.quiet:

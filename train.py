@@ -41,8 +41,6 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     which.add_argument("--seed", type=between(0, 2**63 - 1), help="training seed (default: 0, or the resumed run's)")
     about = "training seeds side by side, a processor each; with --resume those that are not finished"
     which.add_argument("--seeds", type=_seeds, metavar="FIRST-LAST", help=about)
-    about = "train --seeds on a Ray cluster, without an address on this machine's; all its machines must share --out"
-    add("--ray", nargs="?", const="", metavar="HOST:PORT", help=about)
     about = "environment steps of learning (default: the recipe's, or the resumed run's)"
     add("--steps", type=between(1, 10**12), help=about)
     about = (
@@ -59,8 +57,6 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     about = "time between checkpoints: the most that a crash loses (default: %(default)g)"
     add("--checkpoint-seconds", type=_seconds, default=CHECKPOINT_SECONDS, metavar="S", help=about)
     arguments = parser.parse_args(argv)
-    if arguments.ray is not None and not arguments.seeds:
-        parser.error("--ray needs --seeds")
     suffix = "" if arguments.seeds else f"-seed{arguments.seed or 0}"
     arguments.out = arguments.out or Path("runs") / f"{arguments.algo or DEFAULT}{suffix}"
     return arguments
@@ -110,26 +106,23 @@ def _train_one(arguments: argparse.Namespace, recipe: Recipe) -> int:
 
 
 def _train_seeds(arguments: argparse.Namespace, recipe: Recipe, folders: dict[int, Path]) -> int:
-    """Train several seeds, each into its folder: on this machine, or on a cluster."""
+    """Train several seeds, each into its folder."""
     from tqdm import tqdm
 
     from cz_gym.agents.training.fleet import Job, train_seeds
     from cz_gym.agents.training.validation import references
     from cz_gym.atomic_files import locked
     from cz_gym.baselines.registry import make_controller
-    from cz_gym.evaluation.cluster import check_shared, completed, connect, in_processes
+    from cz_gym.evaluation.processes import in_processes
 
     options = references(make_controller, recipe), arguments.checkpoint_seconds, arguments.plot, sys.argv
     jobs = [Job(folder, recipe, seed, *options) for seed, folder in folders.items()]
     for job in jobs:
         with locked(job.folder):
             pass  # if another process has it, say so before the training
-    if arguments.ray is not None:
-        connect(arguments.ray)
-        check_shared(jobs[0].folder)
     print(f"{recipe.name}, {len(jobs)} seeds on {recipe.config.scenario.name}, into {arguments.out}")
     with tqdm(total=len(jobs), bar_format="{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}") as bar:
-        for job, summary in train_seeds(jobs, in_processes if arguments.ray is None else completed, bar):
+        for job, summary in train_seeds(jobs, in_processes, bar):
             bar.write(f"seed {job.seed}: {_summary_line(summary)}")
     print(f"wrote agent.onnx into {len(jobs)} folders of {arguments.out}")
     return 0
@@ -153,8 +146,6 @@ def _resume_command(arguments: argparse.Namespace) -> str:
     words = [interpreter(), "train.py", "--resume", "--out", str(arguments.out)]
     if arguments.seeds:
         words += ["--seeds", f"{arguments.seeds[0]}-{arguments.seeds[-1]}"]
-    if arguments.ray is not None:
-        words += filter(None, ["--ray", arguments.ray])
     if arguments.plot:
         words.append("--plot")
     if arguments.checkpoint_seconds != CHECKPOINT_SECONDS:

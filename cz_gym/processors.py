@@ -7,7 +7,7 @@ from typing import Any
 
 
 def processors() -> int:
-    """Return how many processors this process may use; taskset or a cluster may allow fewer than the machine has."""
+    """Return how many processors this process may use; taskset or a container may allow fewer than the machine has."""
     counts: Any = os  # Python 3.13 has the one, Linux the other
     if hasattr(counts, "process_cpu_count"):
         return counts.process_cpu_count() or 1

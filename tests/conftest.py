@@ -132,23 +132,6 @@ def hold(info: dict[str, Any], p: Any) -> float:
 
 
 @pytest.fixture
-def nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Any, Any]]:
-    """A Ray cluster of two nodes, a processor each, and the second of them."""
-    ray = pytest.importorskip("ray")
-    from ray.cluster_utils import Cluster
-
-    from cz_gym.evaluation.cluster import connect
-
-    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
-    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
-    second = made.add_node(num_cpus=1)
-    connect(made.address)
-    yield made, second
-    ray.shutdown()
-    made.shutdown()
-
-
-@pytest.fixture
 def refused(capsys: pytest.CaptureFixture[str]) -> Callable[[Callable[[list[str]], int], Sequence[str]], str]:
     """A function that runs a command which must refuse its arguments; the one line that it says."""
 

@@ -1,4 +1,4 @@
-"""Training seeds side by side, each a run in its own folder, in processes of this machine or of a cluster."""
+"""Training seeds side by side, each a run in its own folder, in processes of this machine."""
 
 from __future__ import annotations
 
@@ -19,9 +19,6 @@ from .recipes import Recipe
 from .run import Run
 from .run_files import check_settings, read_rows
 from .validation import References
-
-LOST = 120.0
-"""Longest time that a lost machine's lock on a folder outlives it [s]."""
 
 
 class Job(NamedTuple):
@@ -52,12 +49,12 @@ class Job(NamedTuple):
 
 
 Perform = Callable[[Callable[[Job], Any], Sequence[Job], Callable[[], None]], Iterator[tuple[int, Any]]]
-"""Does jobs: :func:`cz_gym.evaluation.cluster.in_processes` or :func:`cz_gym.evaluation.cluster.completed`."""
+"""Does jobs: :func:`cz_gym.evaluation.processes.in_processes`."""
 
 
 def train_seed(job: Job) -> dict[str, float]:
     """Train a seed to its end, from its checkpoint if there is one; the contents of ``summary.json``."""
-    with locked(job.folder, LOST), tqdm(disable=True) as bar:
+    with locked(job.folder), tqdm(disable=True) as bar:
         if summary := job.summary:
             return summary
         sys.argv = list(job.command)

@@ -1,8 +1,8 @@
-"""Running a benchmark: every contender on every row, piece by piece, here or on a cluster."""
+"""Running a benchmark: every contender on every row, piece by piece."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ BLOCK = 10
 
 
 class Piece(NamedTuple):
-    """Some episodes of one policy on one row: work that can be done anywhere, and comes out the same."""
+    """Some episodes of one policy on one row."""
 
     contender: Contender
     """A controller, or an agent of one training seed."""
@@ -33,10 +33,6 @@ class Piece(NamedTuple):
         return len(self.seeds) * self.row.config().steps
 
 
-Perform = Callable[[Sequence[Piece], Any], Iterable[tuple[int, Sample]]]
-"""Runs pieces, in whatever order: the number of each with its sample. It moves tqdm's bar on by the steps done."""
-
-
 def run_piece(piece: Piece, progress: Callable[[int], None] | None = None) -> Sample:
     """Make the policy and roll it out."""
     interface = piece.contender.observation, piece.contender.action
@@ -45,23 +41,6 @@ def run_piece(piece: Piece, progress: Callable[[int], None] | None = None) -> Sa
     return Sample.of(
         piece.contender, rollout(policy, piece.row.config(*interface), piece.seeds, progress, designed_for)
     )
-
-
-def in_turn(pieces: Sequence[Piece], bar: Any) -> Iterator[tuple[int, Sample]]:
-    """Run one piece after the other in this process."""
-    for number, piece in enumerate(pieces):
-        bar.set_description(f"{piece.row.name}, {piece.contender.name}")
-        yield number, run_piece(piece, bar.update)
-
-
-def on_cluster(pieces: Sequence[Piece], bar: Any) -> Iterator[tuple[int, Sample]]:
-    """Run all pieces on the Ray cluster that :func:`.cluster.connect` joined."""
-    from .cluster import completed
-
-    bar.set_description(f"{len(pieces)} pieces")
-    for number, sample in completed(run_piece, pieces):
-        yield number, sample
-        bar.update(pieces[number].steps)
 
 
 def episodes_of(contender: Contender, row: Row, episodes: int) -> range:
@@ -85,7 +64,6 @@ def run(
     bar: Any,
     cache: Path,
     bounds: Path | None = None,
-    perform: Perform = in_turn,
 ) -> list[Result]:
     """Roll every contender out on every row and summarise.
 
@@ -106,8 +84,9 @@ def run(
         blocks = [seeds[first : first + at_once] for first in range(0, len(seeds), at_once)]
         pieces += [Piece(copy, row, block) for copy in contender.copies() for block in blocks]
     bar.reset(total=sum(piece.steps for piece in pieces))
-    for number, sample in perform(pieces, bar):
-        key = pieces[number].row.name, pieces[number].contender.name
+    for piece in pieces:
+        bar.set_description(f"{piece.row.name}, {piece.contender.name}")
+        key, sample = (piece.row.name, piece.contender.name), run_piece(piece, bar.update)
         if key in stores:
             stores[key].write(sample)
         done[key].append(sample)

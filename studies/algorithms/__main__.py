@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser, between
 from cz_gym.errors import CzError
-from cz_gym.evaluation import cluster
+from cz_gym.evaluation.processes import in_processes
 from cz_gym.names import unknown
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 CHECKPOINT_SECONDS = 60.0
 """Time between the checkpoints of a run [s]."""
 Perform = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
-"""Does tasks, here or elsewhere: the number of each and its result, as they come."""
+"""Does tasks: the number of each and its result, as they come."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -41,9 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     about = "environment steps of recipes that learn from reward (default: the recipe's own)"
     parser.add_argument("--steps", type=between(1, 10**9), help=about)
-    parser.add_argument("--jobs", type=between(1, 64), default=2, help="runs at once here (default: %(default)s)")
-    about = "run on a Ray cluster, without an address on this machine's; all its machines must share --work"
-    parser.add_argument("--ray", nargs="?", const="", metavar="HOST:PORT", help=about)
+    parser.add_argument("--jobs", type=between(1, 64), default=2, help="runs at once (default: %(default)s)")
     about = "folder of the %s (default: %%(default)s)"
     parser.add_argument("--out", type=Path, default=Path("results/algorithms"), help=about % "results")
     parser.add_argument("--work", type=Path, default=Path("runs/algorithms"), help=about % "runs")
@@ -60,13 +58,8 @@ def _main(given: argparse.Namespace) -> None:
     if given.steps:
         recipes = [replace(each, steps=given.steps) if each.steps else each for each in recipes]
     check_writable(given.out)
-    perform: Perform = partial(cluster.in_processes, processes=given.jobs)
-    if given.ray is not None:
-        cluster.connect(given.ray)
-        given.work.mkdir(parents=True, exist_ok=True)
-        cluster.check_shared(given.work)
-        perform = cluster.completed
-    compare(make_jobs(recipes, given.seeds, given.work), given.out, perform)
+    jobs = make_jobs(recipes, given.seeds, given.work)
+    compare(jobs, given.out, partial(in_processes, processes=given.jobs))
 
 
 def make_jobs(recipes: Sequence[Recipe], seeds: int, work: Path) -> list[Job]:

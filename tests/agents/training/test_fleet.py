@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import io
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
-from unittest.mock import MagicMock
 
 import pytest
 from tqdm import tqdm
@@ -20,11 +16,10 @@ from cz_gym.agents import AgentFileError
 from cz_gym.agents.training import fleet, run
 from cz_gym.agents.training.recipes import PPO, RECIPES, Recipe
 from cz_gym.atomic_files import locked
-from cz_gym.evaluation import cluster
-from tests.small_learners import REFERENCES, losing, train_held_seed, train_small_seed
+from cz_gym.evaluation import processes
+from tests.small_learners import REFERENCES, train_small_seed
 
 pytestmark = pytest.mark.usefixtures("few_crystals")
-ROOT = Path(__file__).parents[3]
 SMALL_PPO = PPO(steps=4096, num_envs=64, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,), control_interval=30.0)
 
 
@@ -46,7 +41,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         return train_small_seed(job)
 
     monkeypatch.setattr(fleet, "train_seed", counted)
-    monkeypatch.setattr(cluster, "in_processes", in_turn)
+    monkeypatch.setattr(processes, "in_processes", in_turn)
     monkeypatch.setitem(RECIPES, "ppo", SMALL_PPO)
     return seeds
 
@@ -165,63 +160,15 @@ def test_a_folder_in_use_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixtu
         (["--seeds", "9-0"], "must be FIRST-LAST"),
         (["--seeds", "0-99999999999"], "at most 1000 seeds"),
         (["--seeds", "0-1", "--seed", "0"], "not allowed with"),
-        (["--ray"], "--ray needs --seeds"),
     ],
 )
 def test_impossible_arguments_exit_with_2(arguments: list[str], message: str, refused: Any) -> None:
     assert message in refused(train.main, arguments)
 
 
-def test_a_node_that_does_not_see_the_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ray = pytest.importorskip("ray")
-    node = {"Alive": True, "NodeID": "0" * 56, "NodeManagerAddress": "10.0.0.2"}
-    monkeypatch.setattr(ray, "nodes", lambda: [node])
-    monkeypatch.setattr(ray, "remote", MagicMock())
-    monkeypatch.setattr(ray, "get", lambda reference: False)
-    with pytest.raises(ValueError, match=r"^node 10\.0\.0\.2 does not see .*: it must be on a file system that all"):
-        cluster.check_shared(tmp_path)
-
-
 @pytest.mark.slow
 def test_processes_train_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fleet, "train_seed", train_small_seed)
-    assert sorted(done(jobs(tmp_path / "there", range(3)), cluster.in_processes)) == [0, 1, 2]
-    assert done(jobs(tmp_path / "here", range(3)), in_turn) == [0, 1, 2]
-    assert agents(tmp_path / "there") == agents(tmp_path / "here")
-
-
-@pytest.mark.slow
-def test_a_killed_process_is_one_line() -> None:
-    with pytest.raises(ValueError, match="a process was killed"):
-        list(cluster.in_processes(os._exit, [1]))
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="signals as POSIX has them")
-def test_processes_end_with_a_killed_caller() -> None:
-    code = "from cz_gym.evaluation.cluster import in_processes; from tests.small_learners import tell_and_wait"
-    main = 'if __name__ == "__main__": list(in_processes(tell_and_wait, [0]))'
-    with subprocess.Popen([sys.executable, "-c", f"{code}\n{main}"], cwd=ROOT, stdout=subprocess.PIPE) as caller:
-        assert caller.stdout is not None
-        assert caller.stdout.readline() == b"begun\n"
-        caller.kill()
-        assert caller.stdout.read() == b"", "a process outlived its caller"
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-def test_a_lost_node_loses_nothing(nodes: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The seed that is lost before its first checkpoint after the start begins again, and ends with the same agent."""
-    watch = losing(nodes, tmp_path / "there")
-    cluster.check_shared(tmp_path)
-
-    def perform(function: Any, tasks: Any, look: Callable[[], None]) -> Any:
-        return cluster.completed(function, tasks, lambda: (look(), watch()))
-
-    with monkeypatch.context() as patch:
-        patch.setattr(fleet, "train_seed", train_held_seed)
-        assert sorted(done(jobs(tmp_path / "there", range(3)), perform)) == [0, 1, 2]
-    monkeypatch.setattr(fleet, "train_seed", train_small_seed)
-    assert sorted(sessions(tmp_path / "there")) == [1, 1, 2], "one seed was resumed, none trained twice"
+    assert sorted(done(jobs(tmp_path / "there", range(3)), processes.in_processes)) == [0, 1, 2]
     assert done(jobs(tmp_path / "here", range(3)), in_turn) == [0, 1, 2]
     assert agents(tmp_path / "there") == agents(tmp_path / "here")

@@ -1,0 +1,62 @@
+"""The same work in several processes of this machine; results in the order they are done."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from threading import Thread
+from typing import Any
+
+from cz_gym.errors import CzError
+from cz_gym.processors import processors
+
+WAIT = 1.0
+"""Longest time between two looks at what is done [s]."""
+Look = Callable[[], None]
+"""What is called about every second while tasks run."""
+
+
+def in_processes(
+    function: Callable[[Any], Any], tasks: Sequence[Any], look: Look | None = None, processes: int | None = None
+) -> Iterator[tuple[int, Any]]:
+    """Run ``function`` on every task in a pool of processes (None: one a processor).
+
+    Yields the number of a task and its result, as they come. What a task raises is raised here, with its traceback.
+    When the caller stops early, or is killed, the pool's processes end; no other process does.
+    """
+    # Forking would copy the threads of torch and of the native batch in unknown states.
+    context = get_context("spawn")
+    leash, held = context.Pipe(duplex=False)
+    pool = ProcessPoolExecutor(
+        max(min(processes or processors(), len(tasks)), 1), context, initializer=_end_with, initargs=(leash,)
+    )
+    try:
+        numbers = {pool.submit(function, task): number for number, task in enumerate(tasks)}
+        while numbers:
+            for each in wait(numbers, WAIT, FIRST_COMPLETED).done:
+                yield numbers.pop(each), each.result()
+            if look:
+                look()
+        pool.shutdown()
+    except BrokenProcessPool:
+        raise CzError("a process was killed: is there enough memory?") from None
+    finally:
+        held.close()
+        pool.shutdown(cancel_futures=True)
+
+
+def _end_with(leash: Any) -> None:
+    """In a process of a pool: leave Ctrl-C to the caller, and end when the other end of the pipe is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def follow() -> None:
+        try:
+            leash.recv()
+        except EOFError:
+            os._exit(1)
+
+    Thread(target=follow, daemon=True).start()
