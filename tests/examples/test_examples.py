@@ -33,7 +33,7 @@ def test_the_gradient_example_writes_an_agent(tmp_path: Path) -> None:
     assert agents.load(tmp_path / "some.onnx").contract == contract
 
 
-@pytest.mark.parametrize("name", ["gradient", "cleanrl_ppo", "offline_td3_bc", "rllib_ppo", "torchrl"])
+@pytest.mark.parametrize("name", ["gradient", "cleanrl_ppo", "offline_td3_bc"])
 def test_an_example_without_its_packages_says_in_one_line_what_to_install(name: str) -> None:
     command = [sys.executable, "-S", "-m", f"examples.{name}"]  # -S: nothing but Python's own modules
     done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True)
