@@ -38,9 +38,9 @@ def first_at_least(value: float, steps: Sequence[float]) -> float:
     return next((step for step in steps if step >= value), steps[-1])
 
 
-def error_range(*errors: Floats) -> float:
-    """Half width of an axis on which all these radius errors fit [m]; NaN does not count."""
-    largest = max(float(np.nanmax(np.abs(error), initial=0.0)) for error in errors)
+def error_range(error: Floats) -> float:
+    """Half width of an axis on which these radius errors fit [m]; NaN does not count."""
+    largest = float(np.nanmax(np.abs(error), initial=0.0))
     return first_at_least(1.1 * largest / MM, RANGES) * MM
 
 

@@ -8,7 +8,6 @@ from cz_gym.units import MM
 
 from . import palette
 from .canvas import TIMES, Box, Canvas
-from .palette import Colour
 from .record import Ending, Record
 
 HALF_WIDTH = 0.29
@@ -31,12 +30,10 @@ def magnification(record: Record) -> float:
     return next((one for one in MAGNIFICATIONS if one <= room), 2.0)
 
 
-def draw(
-    canvas: Canvas, box: Box, record: Record, magnified: float | None = None, colour: Colour = palette.TRUE
-) -> None:
-    """Crucible, melt and crystal, its surface in a colour; ``magnified`` in place of :func:`magnification`."""
+def draw(canvas: Canvas, box: Box, record: Record) -> None:
+    """Crucible, melt and crystal."""
     scale, level = HALF_WIDTH * box.w / record.puller.r_0, box.y + MELT_LEVEL * box.h
-    magnified, bar = magnified or magnification(record), 50.0 * MM * scale
+    magnified, bar = magnification(record), 50.0 * MM * scale
     # The crucible is as wide as the panel has room for: the real one is wider.
     depth = record.config.parameters.R_cr * DEPTH_IN_R_CR * scale
     crucible = Box(box.x + 10.0, level - 14.0, box.w - 20.0, depth + 19.0)
@@ -44,16 +41,14 @@ def draw(
     canvas.rectangle(palette.PANEL, crucible.inner(5.0, 0.0, 5.0, 5.0))
     canvas.rectangle(palette.MELT, crucible.inner(5.0, 14.0, 5.0, 5.0))
     with canvas.clip(box):
-        _draw_crystal(canvas, box, level, scale, record, magnified, colour)
+        _draw_crystal(canvas, box, level, scale, record, magnified)
     x, y = box.right - 10.0, box.y + 24.0
     canvas.lines(palette.FAINT, [x - 3, x, x, x - 3], [y, y, y + bar, y + bar])
     canvas.text(x - 5, y + bar / 2 - 6, "50 mm", palette.FAINT, 9.0, 1.0)
-    canvas.text(box.x + 8, box.y + 18, f"error {TIMES}{magnified:g}", colour)
+    canvas.text(box.x + 8, box.y + 18, f"error {TIMES}{magnified:g}", palette.TRUE)
 
 
-def _draw_crystal(
-    canvas: Canvas, box: Box, level: float, scale: float, record: Record, magnified: float, colour: Colour
-) -> None:
+def _draw_crystal(canvas: Canvas, box: Box, level: float, scale: float, record: Record, magnified: float) -> None:
     """The crystal on its seed; ``level`` is the melt's surface, ``scale`` the pixels per metre."""
     x, (r_c, r_ref, z) = box.x + box.w / 2.0, record.surface()
     half, y = (r_ref + magnified * (r_c - r_ref)) * scale, level - z * scale
@@ -64,4 +59,4 @@ def _draw_crystal(
     canvas.polygon(palette.CRYSTAL, np.r_[x + outline, x - outline[::-1]], np.r_[down, down[::-1]])
     for side in (-1.0, 1.0):
         canvas.lines(palette.REFERENCE, x + side * r_ref * scale, y, 0.8)
-        canvas.lines(colour, x + side * half, y, 1.6)
+        canvas.lines(palette.TRUE, x + side * half, y, 1.6)

@@ -71,8 +71,8 @@ def meniscus_curve(
     return r_c + profile(z, M) - profile(h, M), z, M * math.sqrt(1.0 - math.cos(phi_b))
 
 
-def draw(canvas: Canvas, box: Box, record: Record, colour: Colour = palette.TRUE) -> None:
-    """The cross-section, the crystal's surface in a colour."""
+def draw(canvas: Canvas, box: Box, record: Record) -> None:
+    """The cross-section."""
     scale = scale_of(box, record)
     r_c, r_ref, z = record.surface(max((scale.y_0 - box.y) / scale.per_metre - record.last("h_c"), 0.0))
     x, y = scale.x(r_c), scale.y(z)
@@ -92,11 +92,11 @@ def draw(canvas: Canvas, box: Box, record: Record, colour: Colour = palette.TRUE
             canvas.polygon(palette.GAS, gas_x, gas_y)
             canvas.polygon(palette.MELT, np.r_[out, right, box.x, box.x], np.r_[down, level, level, down[0]])
         canvas.lines(palette.REFERENCE, scale.x(np.r_[r_ref[0], r_ref]), scale.y(np.r_[0.0, z]), 0.8)
-        canvas.lines(colour, x, y, 2.2)
+        canvas.lines(palette.TRUE, x, y, 2.2)
         if not detached:
             _draw_ring(canvas, box, scale, (scale.x(record.last("r_br")), scale.y(z_b)), (out[0], down[0]))
         canvas.dot(palette.INK, x[0], y[0], 3.2)
-        canvas.dot(colour, x[0], y[0], 2.2)
+        canvas.dot(palette.TRUE, x[0], y[0], 2.2)
     _draw_axis(canvas, box, scale)
     canvas.text(box.x + 7, box.y + 30, "crystal", size=10)
     canvas.text(box.x + 7, scale.y_0 + 24, "melt", palette.ON_MELT, bold=True)

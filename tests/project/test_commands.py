@@ -15,7 +15,6 @@ from cz_gym.baselines.tuning import __main__ as tuning
 from cz_gym.commands import OPTIONAL, OneLineParser, guarded
 from cz_gym.errors import CzError
 from cz_gym.play import __main__ as play
-from studies.film import __main__ as film
 from studies.paper import __main__ as paper
 from studies.speed import __main__ as speed
 from studies.young_laplace import __main__ as young_laplace
@@ -28,7 +27,6 @@ COMMANDS: list[tuple[Any, str, str, list[str]]] = [
     (young_laplace, "--wri", "build", ["--write"]),
     (play, "--minute", "settings", []),
     (datasets, "--episode", "record", ["--policies", "paper", "--out", "new/folder"]),
-    (film, "--frame", "film", ["--out", "new/film.gif"]),
 ]
 """Each with the beginning of an option, the function that does its work, and arguments that would write a file."""
 

@@ -29,7 +29,6 @@ def test_nothing_is_imported_from_above(package: str) -> None:
     [
         ("cz_gym", {"cz_gym.physics.young_laplace"}),
         ("cz_gym.play", {"torch", "pygame", "PIL", "onnxruntime"}),
-        ("studies.film.__main__", {"torch", "pygame", "PIL"}),
     ],
 )
 def test_importing_loads_nothing_that_is_not_needed(module: str, absent: set[str]) -> None:

@@ -1,1 +1,0 @@
-"""The README's animated picture: ``python -m studies.film``."""
