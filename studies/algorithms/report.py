@@ -1,4 +1,4 @@
-"""Evaluation of trained agents on the benchmark's random scenarios, and the table and learning curves of a comparison."""
+"""Evaluation of trained agents on every random scenario, and the table and learning curves of a comparison."""
 
 from __future__ import annotations
 
