@@ -47,9 +47,9 @@ def response(system: StateSpace, dt: float, omega: Floats) -> npt.NDArray[np.com
 
 
 def opened(controller: StateSpace, puller: Puller, dt: float, at: str) -> StateSpace:
-    """The open loop L, opened at "camera" (only the plant is uncertain) or at "v_p" (as in the paper, where the
-    controller's use of its own pull speed counts as plant)."""
-    A, B, C, D = close(controller, puller, dt, broken=at).pick("r_br" if at == "camera" else "v_p", (at,))
+    """The open loop L, opened at "camera" (only the plant is uncertain), at "v_p" (as in the paper, where the
+    controller's use of its own pull speed counts as plant), or at "Q_H" (only the hot zone is uncertain)."""
+    A, B, C, D = close(controller, puller, dt, broken=at).pick("r_br" if at == "camera" else at, (at,))
     return StateSpace(A, B, -C, -D)
 
 

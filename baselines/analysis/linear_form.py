@@ -36,7 +36,7 @@ def linear_form(policy: Any, sensor: Sensor = RANDOMIZED.sensor) -> LinearForm:
     """The linear form of a controller with an attribute ``control_interval`` (default 5 s); NotLinearError for none.
 
     An LQG that predicts with the plant's equations is taken with its linear prediction, and with the covariance on
-    which it settles under the mean noise of that ``sensor``, references held.
+    which it settles under the mean noise of that ``sensor``, references held; an adaptive LQG with a single filter.
     """
     if isinstance(policy, OpenLoop):
         raise NotLinearError("there is no loop")
@@ -51,7 +51,7 @@ def linear_form(policy: Any, sensor: Sensor = RANDOMIZED.sensor) -> LinearForm:
 
 
 def _lqg(policy: LQG, sensor: Sensor) -> LinearForm:
-    linear = replace(policy, design=replace(policy.design, nonlinear=False))
+    linear = replace(policy, design=replace(policy.design, nonlinear=False), hypotheses=None)
     random, state = np.random.default_rng(0), None
     scale = {channel.name: channel.scale for channel in MEASURED}
     noises = {"ring_error": np.mean(sensor.camera_noise), "T_1": np.mean(sensor.pyrometer_noise)}

@@ -9,16 +9,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.optimize import bisect
 from scipy.signal import cont2discrete
 
 from cz_gym.baselines.policy import Floats, State, map_arrays
 from cz_gym.errors import CzError
 from cz_gym.observation import MEASURED, PULL_SCALE, Measured, scales
 from cz_gym.physics.linearisation import INPUTS, OUTPUTS, STATES, StateSpace, linearise
-from cz_gym.physics.plant import Puller
+from cz_gym.physics.parameters import Parameters
+from cz_gym.physics.plant import Puller, make_puller
 from cz_gym.task import HEATER_RANGE
 
 _SMALL = 1e-6
@@ -27,8 +30,12 @@ _SEEN = ("ring_error", "T_1", "v_p", "Q_H")
 """Channels through which the plant reaches the controller."""
 _AT_REST = np.array([float(channel.name == "valid") for channel in MEASURED])
 """Observation at rest: zeros and a valid camera."""
-_DISTURBED = ("v_p", "Q_d", "dT_i", "camera", "pyrometer")
+_DISTURBED = ("v_p", "Q_H", "Q_d", "dT_i", "camera", "pyrometer")
 """Inputs of a loop."""
+HOT_ZONE = {name: name for name in ("C_1", "C_2", "C_b", "kappa_12", "G_1a", "G_2b")} | {"kappa_b": "eps"}
+"""Constants of a puller that follow from estimates, and the parameter that each is proportional to."""
+WIDEST = 4.0
+"""Largest factor on a parameter for which a loop's stability is asked; the smallest is its inverse [-]."""
 _ANSWERS = ("v_p", "Q_H", "r_c", "r_br")
 """Outputs of a loop: both commands and both radii."""
 
@@ -143,10 +150,12 @@ def sampled_plant(puller: Puller, dt: float) -> StateSpace:
 def close(controller: StateSpace, puller: Puller, dt: float, broken: str = "") -> Loop:
     """The loop of controller and plant.
 
-    Inputs: v_p (added to the command), Q_d, dT_i, camera and pyrometer noise; references held. Outputs: v_p and Q_H
-    (the commands), r_c, r_br. ``broken="camera"`` opens the loop at the camera: the controller reads only the input
-    ``camera``. ``broken="v_p"`` opens it at the pull speed: plant and controller see only the input ``v_p``. The state
-    is (plant, last applied v_p and Q_H, controller).
+    Inputs: v_p (added to the command), Q_H (heat that the controller does not see), Q_d, dT_i, camera and pyrometer
+    noise; references held. Outputs: v_p and Q_H (the commands), r_c, r_br. ``broken="camera"`` opens the loop at the
+    camera: the controller reads only the input ``camera``. ``broken="v_p"`` opens it at the pull speed: plant and
+    controller see only the input ``v_p``. ``broken="Q_H"`` opens it between heater and hot zone: the plant gets only
+    the input ``Q_H``, the controller sees its command applied. The state is (plant, last applied v_p and Q_H,
+    controller).
     """
     plant, n, inputs = sampled_plant(puller, dt), len(STATES), len(_DISTURBED)
     at = [Measured._fields.index(name) for name in _SEEN]
@@ -157,18 +166,38 @@ def close(controller: StateSpace, puller: Puller, dt: float, broken: str = "") -
     noise = np.stack([column["camera"], column["pyrometer"], np.zeros(inputs), np.zeros(inputs)])
     B, D = controller.B[:, at], controller.D[:, at]
     command, direct = np.hstack([D @ seen, controller.C]), D @ noise
-    closed = np.diag([float(broken != "v_p"), 1.0])
-    apply = np.vstack([plant.B[:, :2], np.eye(2)])
+    pulls, heats = float(broken != "v_p"), float(broken != "Q_H")
+    apply = np.vstack([plant.B[:, :2] @ np.diag([pulls, heats]), np.diag([pulls, 1.0])])
     own = np.zeros((n + 2, n + 2))
     own[:n, :n] = plant.A
-    disturbed = np.outer(apply[:, 0], column["v_p"])
-    disturbed[:n] += plant.B[:, 2:] @ np.stack([column["Q_d"], column["dT_i"]])
-    moved = np.hstack([own, np.zeros((n + 2, len(controller.A)))]) + apply @ closed @ command
+    disturbed = np.vstack([plant.B @ np.stack([column[name] for name in INPUTS]), column["v_p"], np.zeros(inputs)])
+    moved = np.hstack([own, np.zeros((n + 2, len(controller.A)))]) + apply @ command
     radii = np.hstack([plant.C[:2], np.zeros((2, command.shape[1] - n))])
     return Loop(
         np.vstack([moved, np.hstack([B @ seen, controller.A])]),
-        np.vstack([disturbed + apply @ closed @ direct, B @ noise]),
+        np.vstack([disturbed + apply @ direct, B @ noise]),
         np.vstack([command, radii]),
         np.vstack([direct, np.zeros((2, inputs))]),
         dt,
     )
+
+
+def stable_range(controller: StateSpace, dt: float, parameter: str, lam: float) -> tuple[float, float]:
+    """The range of a factor on that parameter of the default puller, around 1, in which the closed loop is stable.
+
+    It ends at 1/WIDEST and WIDEST; both ends are NaN if the loop is unstable with the puller as it is.
+    """
+    nominal = Parameters()
+
+    def stable(factor: float) -> bool:
+        puller = make_puller(nominal._replace(**{parameter: factor * getattr(nominal, parameter)}), lam)
+        return close(controller, puller, dt).stable
+
+    def end(farthest: float) -> float:
+        for inside, outside in pairwise(np.geomspace(1.0, farthest, 16)):
+            if not stable(outside):
+                edge = bisect(lambda factor: float(stable(factor)) - 0.5, inside, outside, rtol=1e-3)
+                return float(edge)
+        return farthest
+
+    return (end(1.0 / WIDEST), end(WIDEST)) if stable(1.0) else (math.nan, math.nan)

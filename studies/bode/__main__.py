@@ -1,4 +1,4 @@
-"""Bode plot, margins and sensitivity of a controller's loop with the nominal plant, near rest.
+"""Bode plot and margins of a controller's loop with the nominal plant near rest, and the hot zones that it survives.
 
 ``python -m studies.bode lqg`` takes a shipped controller, ``python -m studies.bode my.py:SlowPID`` one of your own,
 whose ``state`` must be a NamedTuple of arrays.
@@ -17,7 +17,7 @@ import numpy as np
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.baselines.analysis.frequency import LoopMargins, frequencies, margins_of, opened, response
 from cz_gym.baselines.analysis.linear_form import LinearForm, linear_form
-from cz_gym.baselines.analysis.sampled_loop import close
+from cz_gym.baselines.analysis.sampled_loop import HOT_ZONE, close, stable_range
 from cz_gym.baselines.registry import make_controller
 from cz_gym.commands import OneLineParser
 from cz_gym.config import make_config
@@ -26,7 +26,7 @@ from cz_gym.evaluation import user_code
 from cz_gym.evaluation.report.tables import markdown as table
 from cz_gym.physics.plant import Puller, make_puller
 
-PLACES = {"camera": "ring", "v_p": "pull speed"}
+PLACES = {"camera": "ring", "v_p": "pull speed", "Q_H": "heater"}
 """Places where the loop is opened, and their names."""
 
 
@@ -38,7 +38,7 @@ def form_of(name: str) -> LinearForm:
 
 def margins(form: LinearForm, puller: Puller, at: str) -> tuple[Any, LoopMargins]:
     """The loop opened there: its response at :func:`frequencies`, and its margins."""
-    controller = form.free if at == "v_p" else form.controller
+    controller = form.controller if at == "camera" else form.free
     omega = frequencies(form.dt)
     values = response(opened(controller, puller, form.dt, at), form.dt, omega)
     return values, margins_of(values, omega, form.dt, close(form.controller, puller, form.dt).stable)
@@ -87,7 +87,8 @@ def _main(given: argparse.Namespace) -> None:
         raise CzError(f"--mix must lie in [0, 1], not {given.mix:g}")
     check_writable(given.out.parent)
     form, puller = form_of(given.controller), make_puller(lam=given.mix)
-    found = {at: margins(form, puller, at) for at in PLACES}
+    heats = form.controller.C[1].any() or form.controller.D[1].any()
+    found = {at: margins(form, puller, at) for at in PLACES if heats or at != "Q_H"}
     heads = ("opened at", "crossover [rad/s]", "gain up", "gain down", "phase [deg]", "delay [s]", "sensitivity")
     rows = [
         (PLACES[at], f"{first:.2e}", *("none" if np.isnan(value) else f"{value:.3g}" for value in rest))
@@ -96,6 +97,8 @@ def _main(given: argparse.Namespace) -> None:
     print(table(heads, rows))
     if not close(form.controller, puller, form.dt).stable:
         print("the closed loop is unstable: it has no margins")
+    zones = [(name, *stable_range(form.controller, form.dt, of, given.mix)) for name, of in HOT_ZONE.items()]
+    print(table(("factor on", "stable from", "to"), [(name, f"{low:.2f}", f"{high:.2f}") for name, low, high in zones]))
     write_files({given.out: picture(given.controller, form, {at: values for at, (values, _) in found.items()})})
     print(f"wrote {given.out}")
 

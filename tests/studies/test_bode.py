@@ -53,9 +53,9 @@ def test_phases_are_read_against_minus_180_degrees() -> None:
 def test_one_of_the_users_own_is_taken_from_its_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "my.py").write_text(OWN)
     assert bode.main([f"{tmp_path / 'my.py'}:mine", "--out", str(tmp_path / "mine.png")]) == 0
-    mine = capsys.readouterr().out.splitlines()[:4]
+    mine = capsys.readouterr().out.splitlines()[:14]
     assert bode.main(["paper", "--out", str(tmp_path / "paper.png")]) == 0
-    assert capsys.readouterr().out.splitlines()[:4] == mine
+    assert capsys.readouterr().out.splitlines()[:14] == mine
 
 
 def test_a_gain_alone_needs_neither_memory_nor_interval(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

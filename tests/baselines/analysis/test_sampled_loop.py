@@ -11,14 +11,17 @@ from cz_gym.baselines import OpenLoop
 from cz_gym.baselines.analysis.compensator_design import controller_transfer
 from cz_gym.baselines.analysis.frequency import loop_margins, opened, response
 from cz_gym.baselines.analysis.linear_form import linear_form
-from cz_gym.baselines.analysis.sampled_loop import NotLinearError, close, linear_controller
+from cz_gym.baselines.analysis.sampled_loop import NotLinearError, close, linear_controller, stable_range
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
+from cz_gym.baselines.registry import make_controller
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Scenario, Sensor
 from cz_gym.evaluation.rollout import rollout
+from cz_gym.observation import MEASURED, Measured
 from cz_gym.physics.linearisation import StateSpace, radius_model
+from cz_gym.physics.parameters import Parameters
 from cz_gym.units import MM
 from tests.observed import PLAIN
 
@@ -79,6 +82,34 @@ def test_margins_are_where_the_closed_loop_turns_unstable(policy, lam):
     too_late = math.ceil(margins.delay / 5.0 - 1e-6)
     assert close(late(controller, too_late - 1), puller, 5.0).stable
     assert not close(late(controller, too_late), puller, 5.0).stable
+
+
+def with_heat(controller, factor):
+    """The controller with a heater of that many times the power, which it does not know."""
+    A, B, C, D = (part.copy() for part in controller)
+    power, shown = np.array([[1.0], [factor]]), np.ones(len(MEASURED))
+    shown[Measured._fields.index("Q_H")] = 1.0 / factor
+    return StateSpace(A, B * shown, power * C, power * D * shown)
+
+
+@pytest.mark.parametrize("name", ["lqg", "paper-tuned"])
+def test_margins_at_the_heater_are_the_factors_on_its_power_that_the_loop_survives(name):
+    form, puller = linear_form(make_controller(name, make_config("randomized", **PLAIN))), make_puller(lam=0.5)
+    margins = loop_margins(form.controller, puller, 5.0, "Q_H")
+    assert close(with_heat(form.controller, 1.02 * margins.gain_down), puller, 5.0).stable
+    assert not close(with_heat(form.controller, 0.98 * margins.gain_down), puller, 5.0).stable
+    if not math.isnan(margins.gain_up):
+        assert close(with_heat(form.controller, 0.98 * margins.gain_up), puller, 5.0).stable
+        assert not close(with_heat(form.controller, 1.02 * margins.gain_up), puller, 5.0).stable
+
+
+def test_a_range_of_hot_zones_ends_where_the_loop_turns_unstable():
+    form = linear_form(make_controller("lqg", make_config("randomized", **PLAIN)))
+    low, high = stable_range(form.controller, 5.0, "C_2", 0.5)
+    for factor, stable in ((0.99 * low, False), (1.01 * low, True), (0.99 * high, True), (1.01 * high, False)):
+        puller = make_puller(Parameters(C_2=factor * Parameters().C_2), 0.5)
+        assert close(form.controller, puller, 5.0).stable == stable
+    assert high < 1.3
 
 
 def test_unstable_loop_has_no_margins():
