@@ -53,7 +53,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     )
     add("--out", type=Path, help=about)
     add("--plot", action="store_true", help="draw the progress into the run folder: progress.png")
-    add("--resume", action="store_true", help="continue from the run folder's checkpoint")
+    add("--resume", action="store_true", help="continue from the run folder's checkpoint; sac with a new replay buffer")
     about = "time between checkpoints: the most that a crash loses (default: %(default)g)"
     add("--checkpoint-seconds", type=_seconds, default=CHECKPOINT_SECONDS, metavar="S", help=about)
     arguments = parser.parse_args(argv)

@@ -50,6 +50,8 @@ def make_algorithm(recipe: Recipe, seed: int, done: int = 0) -> BaseAlgorithm:
         env = VecNormalize(env, gamma=recipe.gamma, clip_reward=FOREVER)
         settings["learning_rate"] = partial(linear, recipe.learning_rate)
         options["net_arch"] = list(recipe.hidden)
+    if isinstance(recipe, SAC):  # a resumed one first fills a new replay buffer
+        settings["learning_starts"] += done // recipe.action_repeat
     made: BaseAlgorithm = kind(policy, env, policy_kwargs=options, seed=seed, device="cpu", **settings)
     # The algorithm's constructor has set the slots' seeds to ``seed`` and those after it: neighbouring training seeds
     # would meet the same crystals, and a resumed run its first ones again.

@@ -24,8 +24,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from cz_gym.agents.agent_file.contract import AgentFileError, read_bounded
 from cz_gym.sb3 import environment_steps
 
-from .replay_buffer import PREFIX, fits, latest, refill
-
 FORMAT = "cz-gym-checkpoint-5"
 MAX_BYTES = 64_000_000
 """Largest checkpoint that is read."""
@@ -58,7 +56,7 @@ class Progress:
 def to_bytes(
     algorithm: BaseAlgorithm, seconds: float, best_cost: float | None, files: Mapping[str, bytes] | None = None
 ) -> bytes:
-    """The checkpoint of an algorithm, with the latest transitions of a replay buffer, and the run's ``files`` by name.
+    """The checkpoint of an algorithm, without its replay buffer, and the run's ``files`` by name.
 
     AgentFileError if it learned numbers that are not finite: no run could continue from them.
     """
@@ -72,7 +70,7 @@ def to_bytes(
     held = {
         IN_FILE + name: torch.frombuffer(bytearray(data), dtype=torch.uint8) for name, data in (files or {}).items()
     }
-    content: bytes = save(copies | latest(_buffer(algorithm)) | held, header)
+    content: bytes = save(copies | held, header)
     return content
 
 
@@ -106,10 +104,8 @@ def load_checkpoint(path: Path) -> tuple[Progress, Tensors, dict[str, bytes]]:
 
 def restore(algorithm: BaseAlgorithm, tensors: Tensors, path: Path) -> None:
     """Put a checkpoint's tensors into an algorithm made with the same settings; AgentFileError if they do not fit."""
-    live, transitions = _tensors(algorithm), {name: part for name, part in tensors.items() if name.startswith(PREFIX)}
-    learned = {name: tensor for name, tensor in tensors.items() if name not in transitions}
-    alike = set(learned) == set(live) and all(_alike(live[name], tensor) for name, tensor in learned.items())
-    if not alike or not fits(_buffer(algorithm), transitions):
+    live = _tensors(algorithm)
+    if set(tensors) != set(live) or not all(_alike(live[name], tensor) for name, tensor in tensors.items()):
         raise AgentFileError(f"{path}: does not fit this run's settings")
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():
@@ -117,17 +113,11 @@ def restore(algorithm: BaseAlgorithm, tensors: Tensors, path: Path) -> None:
         if name.rpartition("/")[2] in COUNTS and (tensor < 0).any():
             raise AgentFileError(f"{path}: {name!r:.80} holds numbers below zero")
     with torch.no_grad():
-        for name, tensor in learned.items():
+        for name, tensor in tensors.items():
             live[name].copy_(tensor)
     for name, statistics in _statistics(algorithm).items():
         for key in MOMENTS:
-            setattr(statistics, key, learned[f"{name}/{key}"].numpy()[()])
-    refill(_buffer(algorithm), transitions)
-
-
-def _buffer(algorithm: BaseAlgorithm) -> Any:
-    """The replay buffer of an off-policy algorithm."""
-    return getattr(algorithm, "replay_buffer", None)
+            setattr(statistics, key, tensors[f"{name}/{key}"].numpy()[()])
 
 
 def _tensors(algorithm: BaseAlgorithm) -> Tensors:
