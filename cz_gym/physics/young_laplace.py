@@ -10,7 +10,9 @@ point phi = pi/2 - theta. :data:`YOUNG_LAPLACE` is the solution as polynomials t
 
     gym.make("Cz-v0", meniscus=YOUNG_LAPLACE)
 
-``python -m studies.young_laplace`` computes the polynomials anew; ``--write`` puts them into ``young_laplace.json``.
+The coefficients in ``young_laplace.json`` interpolate :func:`solve` at the Chebyshev points of both variables, turned
+into powers: ``SLOPE`` the correction in :func:`lift`, ``RING`` and ``TAIL`` those in :func:`exact_ring_offset`. A test
+compares them with :func:`solve`.
 """
 
 from __future__ import annotations
@@ -32,8 +34,7 @@ from .meniscus import MeniscusModel, hurle_height, profile, ring_point
 
 Floats = npt.NDArray[np.float64]
 SQRT_2 = math.sqrt(2.0)
-TABLE = Path(__file__).with_suffix(".json")
-SLOPE, RING, TAIL = (np.array(rows) for rows in json.loads(TABLE.read_text()).values())
+SLOPE, RING, TAIL = (np.array(rows) for rows in json.loads(Path(__file__).with_suffix(".json").read_text()).values())
 """Coefficients of the polynomials [-], shapes (9, 16), (9, 22) and (7, 8)."""
 TAIL_HEIGHT = 1e-6
 """Height at which the linear tail hands over to the shooting [a]."""
@@ -64,9 +65,9 @@ def solve(r_c: npt.ArrayLike, h_c: npt.ArrayLike, a: float, phi_b: npt.ArrayLike
     no such meniscus was found.
     """
     r, h, slope = (np.atleast_1d(part) for part in np.broadcast_arrays(np.divide(r_c, a), np.divide(h_c, a), phi_b))
-    start = shoot(lambda outer: rise(outer, h)[0], r + planar_width(h), r)
-    _, phi = rise(start, h)
-    ring, _ = turn(start, slope)
+    start = _shoot(lambda outer: _rise(outer, h)[0], r + _planar_width(h), r)
+    _, phi = _rise(start, h)
+    ring, _ = _turn(start, slope)
     shape = np.broadcast_shapes(np.shape(r_c), np.shape(h_c), np.shape(phi_b))
     return Solution((0.5 * math.pi - phi).reshape(shape), (a * (ring - r)).reshape(shape))
 
@@ -74,18 +75,18 @@ def solve(r_c: npt.ArrayLike, h_c: npt.ArrayLike, a: float, phi_b: npt.ArrayLike
 def solve_height(r_c: npt.ArrayLike, theta: npt.ArrayLike, a: float) -> Floats:
     """Exact height [m] at which the meniscus leaves a crystal of radius r_c [m] at angle theta [rad]."""
     r, phi = (np.atleast_1d(part) for part in np.broadcast_arrays(np.divide(r_c, a), 0.5 * math.pi - np.asarray(theta)))
-    start = shoot(lambda outer: turn(outer, phi)[0], r + planar_width(SQRT_2 * np.sin(0.5 * phi)), r)
-    height: Floats = a * turn(start, phi)[1]
+    start = _shoot(lambda outer: _turn(outer, phi)[0], r + _planar_width(SQRT_2 * np.sin(0.5 * phi)), r)
+    height: Floats = a * _turn(start, phi)[1]
     return height.reshape(np.broadcast_shapes(np.shape(r_c), np.shape(theta)))
 
 
-def planar_width(h: Floats) -> Floats:
+def _planar_width(h: Floats) -> Floats:
     """Distance from the height h to the tail's height on the planar meniscus [a]."""
     width: Floats = profile(TAIL_HEIGHT, 1.0) - profile(h, 1.0)
     return width
 
 
-def shoot(inner: Callable[[Floats], Floats], outer: Floats, wanted: Floats) -> Floats:
+def _shoot(inner: Callable[[Floats], Floats], outer: Floats, wanted: Floats) -> Floats:
     """Secant iteration on the tail's radius until the meniscus ends at the wanted radius."""
     miss = inner(outer) - wanted
     rate = np.ones_like(miss)
@@ -108,7 +109,7 @@ def _tail_slope(outer: Floats) -> Floats:
     return slope
 
 
-def rise(outer: Floats, h: Floats) -> tuple[Floats, Floats]:
+def _rise(outer: Floats, h: Floats) -> tuple[Floats, Floats]:
     """Radius and slope where the meniscus has risen to h, with log(z) as the running variable."""
     span = np.log(h / TAIL_HEIGHT)
 
@@ -122,7 +123,7 @@ def rise(outer: Floats, h: Floats) -> tuple[Floats, Floats]:
     return r, phi
 
 
-def turn(outer: Floats, phi_end: Floats) -> tuple[Floats, Floats]:
+def _turn(outer: Floats, phi_end: Floats) -> tuple[Floats, Floats]:
     """Radius and height where the meniscus has turned to the slope phi_end, with log(phi) running."""
     first = _tail_slope(outer)
     span = np.log(phi_end / first)

@@ -12,9 +12,8 @@ from cz_gym import Parameters, make_puller
 from cz_gym.physics import young_laplace as exact
 from cz_gym.physics.linearisation import radius_model
 from cz_gym.physics.meniscus import HURLE, profile, ring_point
-from cz_gym.physics.young_laplace import RING, SLOPE, TAIL, YOUNG_LAPLACE
+from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
-from studies.young_laplace.__main__ import build
 
 PULLER = make_puller()
 A, R_0, ALPHA_0, PHI_B = PULLER.a, PULLER.r_0, math.radians(11.0), math.radians(3.5)
@@ -51,15 +50,16 @@ def test_wide_crystal_is_planar():
     np.testing.assert_allclose(solution.ring_offset, A * (ring_point(PHI_B) - profile(h / A, 1.0)), rtol=1e-6)
 
 
-def test_table_against_the_exact_solution():
+@pytest.mark.parametrize(("narrowest", "slopes", "ring"), [(0.05, (1.0, 12.0), 1e-7), (A / 0.3, (0.5, 15.0), 2e-6)])
+def test_table_against_the_exact_solution(narrowest, slopes, ring):
     random = np.random.default_rng(0)
-    r, phi_b = random.uniform(0.05, 0.15, 200), np.radians(random.uniform(1.0, 12.0, 200))
+    r, phi_b = random.uniform(narrowest, 0.15, 200), np.radians(random.uniform(*slopes, 200))
     h = random.uniform(HEIGHT_MIN, HEIGHT_MAX_IN_A * A, 200)
     solution = exact.solve(r, h, A, phi_b)
     p = SimpleNamespace(a=A, X_b=ring_point(phi_b))
     sine, cosine = YOUNG_LAPLACE.slope(r, h, p)
     np.testing.assert_allclose(np.arctan2(sine, cosine), solution.theta, atol=1e-8)
-    np.testing.assert_allclose(YOUNG_LAPLACE.ring_offset(r, h, p), solution.ring_offset, atol=1e-7 * A)
+    np.testing.assert_allclose(YOUNG_LAPLACE.ring_offset(r, h, p), solution.ring_offset, atol=ring * A)
     np.testing.assert_allclose(YOUNG_LAPLACE.height(r, solution.theta, A), h, rtol=1e-9)
 
 
@@ -82,14 +82,6 @@ def test_ring_sensitivity_against_the_exact_solution(degrees):
     p = make_puller(Parameters(phi_b=phi_b), meniscus=YOUNG_LAPLACE)
     model = radius_model(p, YOUNG_LAPLACE)
     assert model.lead * model.numerator == pytest.approx((high - low) / (2.0 * step), rel=1e-5)
-
-
-def test_shipped_table_is_what_the_command_computes():
-    tables = build()
-    x = np.linspace(-1.0, 1.0, 9)
-    for shipped, built in zip((SLOPE, RING, TAIL), tables.values(), strict=True):
-        difference = exact.polynomial(shipped - built, x[:, None], x[None, :])
-        np.testing.assert_allclose(difference, 0.0, atol=1e-8)
 
 
 def test_hurle_is_within_its_known_error():

@@ -1,6 +1,5 @@
 """Every command: one line for options that cannot be meant, one line for Ctrl-C, and nothing left behind."""
 
-import importlib
 import re
 import tomllib
 from pathlib import Path
@@ -17,14 +16,12 @@ from cz_gym.errors import CzError
 from cz_gym.play import __main__ as play
 from studies.paper import __main__ as paper
 from studies.speed import __main__ as speed
-from studies.young_laplace import __main__ as young_laplace
 
 COMMANDS: list[tuple[Any, str, str, list[str]]] = [
     (benchmark, "--episode", "benchmark", ["--out", "new/folder"]),
     (paper, "--ou", "contents", ["--out", "new/folder"]),
     (tuning, "--trial", "measure", ["--controller", "industrial", "--out", "new/folder"]),
     (speed, "--qui", "run", ["--quick"]),
-    (young_laplace, "--wri", "build", ["--write"]),
     (play, "--minute", "settings", []),
     (datasets, "--episode", "record", ["--policies", "paper", "--out", "new/folder"]),
 ]
@@ -62,31 +59,12 @@ def test_an_interrupt_and_a_place_that_cannot_be_written_are_one_line_and_leave_
         (tmp_path / "new").write_text("not a folder")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(module, work, interrupt)
-    if module is young_laplace:
-        monkeypatch.setattr(module, "TABLE", tmp_path / "new" / "table.py")
     assert module.main(arguments) == (130 if writable else 2)
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.count("\n") == 1
     assert ("interrupted" if writable else "new is not a folder") in captured.err
     assert [path.name for path in tmp_path.iterdir()] == ([] if writable else ["new"])
-
-
-def test_the_meniscus_is_written_only_when_asked_for(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    table = importlib.import_module("cz_gym.physics.young_laplace")
-    shipped = {"SLOPE": table.SLOPE, "RING": table.RING, "TAIL": table.TAIL}
-    monkeypatch.setattr(young_laplace, "TABLE", tmp_path / "table.json")
-    monkeypatch.setattr(young_laplace, "build", lambda: shipped)
-    with pytest.raises(SystemExit, match="0"):
-        young_laplace.main(["--help"])
-    capsys.readouterr()
-    assert young_laplace.main([]) == 0
-    assert "nothing written" in capsys.readouterr().out
-    assert not list(tmp_path.iterdir())
-    assert young_laplace.main(["--write"]) == 0
-    assert (tmp_path / "table.json").read_bytes() == table.TABLE.read_bytes()
 
 
 def test_a_message_of_several_lines_becomes_one(capsys: pytest.CaptureFixture[str]) -> None:

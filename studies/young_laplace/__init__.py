@@ -1,1 +1,0 @@
-"""The polynomials of the exact meniscus: ``python -m studies.young_laplace``."""
