@@ -104,11 +104,6 @@ def test_reflection_law() -> None:
         assert np.linalg.norm(after) == pytest.approx(np.linalg.norm(before), rel=1e-14)
 
 
-def test_far_melt_is_a_plane_mirror() -> None:
-    out = mirror(Ray(0.4, 0.0, 0.9, -1.0, 0.2, -3.0), Hit(MELT, 0.2, 0.1, 0.0, -1.0))
-    assert tuple(out) == (0.2, 0.1, 0.0, -1.0, 0.2, 3.0)
-
-
 @pytest.mark.parametrize(
     ("ray", "what", "at"),
     [

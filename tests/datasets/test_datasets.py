@@ -7,18 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cz_gym import CzVectorEnv, datasets
+from cz_gym import datasets
 from cz_gym.baselines import CompensatedPID
 from cz_gym.config import make_config
 from cz_gym.datasets import excitation, find_policy, main, record, settings_of, write
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.replay import Playback
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.observation import to_measured
 
 minari = pytest.importorskip("minari")
 pytest.importorskip("h5py")
-CONFIG = make_config("randomized", observation="history", horizon=1200.0)
+CONFIG = make_config("randomized", observation="history", action="direct", horizon=1200.0)
 
 
 @pytest.fixture
@@ -30,7 +29,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def again(dataset: Any, episode: int) -> None:
     """Make an episode again, from its seed and its actions: everything is the same."""
     (facts,) = dataset.storage.get_episode_metadata([episode])
-    kept, env = dataset[episode], dataset.recover_environment()
+    kept, env = dataset[episode], dataset.recover_environment(info="all")
     observation, info = env.reset(seed=facts["seed"])
     for k in range(len(kept) + 1):
         np.testing.assert_array_equal(observation, kept.observations[k])
@@ -102,15 +101,6 @@ def test_excitation_is_a_smooth_action_of_white_noise() -> None:
     )
     assert np.corrcoef(noise[1:, 0], noise[:-1, 0])[0, 1] == pytest.approx(keep, abs=0.01)
     assert not excitation(3, config, 0.0)[1].any()
-
-
-def test_history_tells_what_is_measured() -> None:
-    pair = [CzVectorEnv(4, "sensor-fault", observation=each, horizon=600.0) for each in ("measured", "history")]
-    (measured, _), (history, _) = (env.reset(seed=5) for env in pair)
-    for _ in range(50):
-        np.testing.assert_allclose(to_measured(history), measured, atol=2e-5)
-        action = pair[0].action_space.sample()
-        (measured, *_), (history, *_) = (env.step(action) for env in pair)
 
 
 @pytest.mark.parametrize(

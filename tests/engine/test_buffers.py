@@ -2,7 +2,6 @@
 
 import gc
 import threading
-import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -60,15 +59,6 @@ def test_whoever_looks_keeps_the_memory(way: str) -> None:
     assert pool.new().ctypes.data == address, "let go, the memory is used again"
 
 
-def test_a_weak_reference_dies_with_its_array() -> None:
-    """A later array on the same memory is another object: a weak reference never shows it."""
-    pool = BufferPool(SHAPE, np.float64)
-    array = pool.new()
-    address, weak = array.ctypes.data, weakref.ref(array)
-    del array
-    assert (pool.new().ctypes.data, weak()) == (address, None)
-
-
 def test_threads_that_hold_and_let_go_never_see_another_value() -> None:
     pool, wrong = BufferPool((2048,), np.float64), []
 
@@ -87,21 +77,6 @@ def test_threads_that_hold_and_let_go_never_see_another_value() -> None:
     for thread in threads:
         thread.join()
     assert not wrong
-
-
-def test_few_blocks_are_kept() -> None:
-    pool = BufferPool(SHAPE, np.float64)
-    many = [pool.new() for _ in range(20)]
-    del many
-    assert len(pool._free) == SPARES
-
-
-def test_a_lent_array_is_like_any_other() -> None:
-    for shape in (SHAPE, (3, 2), (0, 4)):
-        array = BufferPool(shape, np.float32).new()
-        assert (array.shape, array.dtype, array.flags.c_contiguous, array.flags.writeable, array.flags.aligned) == (
-            shape, np.float32, True, True, True,
-        )  # fmt: skip
 
 
 @pytest.mark.parametrize("observation", ["measured", "state"])

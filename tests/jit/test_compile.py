@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cz_gym.jit.cache import Store, announce, cache_folder, source_hash
+from cz_gym.jit.cache import Store, cache_folder, source_hash
 from cz_gym.jit.compile import kernel
 from tests.processes import ROOT, python
 
@@ -134,12 +134,6 @@ def test_without_a_writable_folder_nothing_is_cached(fresh: pytest.MonkeyPatch, 
 
 
 @pytest.mark.slow
-def test_a_cache_that_vanishes_is_no_failure(tmp_path: Path) -> None:
-    code = "import shutil, cz_gym.jit.compile as c, cz_gym\nshutil.rmtree(c.cache_folder())\n" + DERIVE
-    assert float(run(code, ROOT, tmp_path / "cache")[1]) == pytest.approx(6.64e-3, rel=1e-3)
-
-
-@pytest.mark.slow
 def test_a_users_meniscus_is_never_run_from_a_cache(package: Path, tmp_path: Path) -> None:
     (package / "mine.py").write_text(
         "from cz_gym import HURLE\n"
@@ -172,15 +166,3 @@ def test_hash_sees_names_and_contents(package: Path) -> None:
     (folder / "evaluation" / "report" / "markdown.py").write_text("nothing of it is compiled")
     assert len({first, second, third, fourth}) == 4
     assert source_hash(folder) == fourth
-
-
-@pytest.mark.parametrize("terminal", [True, False])
-def test_compiling_is_announced_once_to_a_terminal(
-    terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
-    announce.cache_clear()
-    for _ in range(2):
-        announce()
-    assert capsys.readouterr().err.count("compiling the plant") == terminal
-    announce.cache_clear()

@@ -107,20 +107,6 @@ def test_again_and_the_next_crystal(game: hand.Game) -> None:
     assert game.record.last("r_c") != first
 
 
-def test_closing_the_window_ends_and_scores_what_was_played(game: hand.Game) -> None:
-    handle(game, pygame.K_SPACE)
-    game.advance(2.0)
-    pygame.event.post(pygame.event.Event(pygame.QUIT))
-    (outcome,) = game.play()
-    assert outcome.minutes == pytest.approx(2.0, abs=0.2)
-    assert not game.running
-
-
-def test_nothing_played_has_no_score(game: hand.Game) -> None:
-    press(pygame.K_ESCAPE)
-    assert game.play() == []
-
-
 @pytest.mark.parametrize("seed", [1, 12])
 def test_the_score_of_the_same_controller_is_a_draw(config: Config, seed: int) -> None:
     paper = find_controller("paper").make(config)
@@ -177,14 +163,3 @@ def test_without_a_display_it_says_so(monkeypatch: pytest.MonkeyPatch, refused: 
         for name in play.DISPLAYS:
             monkeypatch.delenv(name, raising=False)
         assert refused(play.main, []) == f"python -m cz_gym.play: {play.NO_DISPLAY}\n"
-
-
-def test_the_command_prints_the_score(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def play_on(self: hand.Game) -> list[Any]:
-        handle(self, pygame.K_SPACE)
-        self.advance(1e4)
-        return self.scores
-
-    monkeypatch.setattr(hand.Game, "play", play_on)
-    assert play.main(["--minutes", "5"]) == 0
-    assert capsys.readouterr().out.startswith("randomized, crystal 1, 5 min: by hand RMSE ")

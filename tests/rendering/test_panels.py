@@ -12,11 +12,10 @@ from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.rendering import chart, palette, triple_point
 from cz_gym.rendering.canvas import Canvas, Frame
-from cz_gym.rendering.record import Ending, Record, how_it_failed
+from cz_gym.rendering.record import Ending, Record
 from cz_gym.rendering.scene import SetPoints, layout, numbers
 from cz_gym.rendering.view import record_of
 from cz_gym.signals import INFO
-from cz_gym.task import HEIGHT_MIN
 from cz_gym.units import KILO, MM, MM_PER_MIN
 from tests.observed import PLAIN
 
@@ -86,16 +85,6 @@ def test_the_chart_ends_at_the_true_error(picture: tuple[Frame, Record]) -> None
     check_near(near(frame, palette.TRUE)[:, x : x + 3].any(axis=1), y, 8)
 
 
-def test_the_chart_has_a_gap_where_the_camera_has_no_reading(monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn: list[int] = []
-    monkeypatch.setattr(
-        CANVAS, "lines", lambda colour, x, y, width: drawn.extend([np.size(y)] * (colour == palette.CAMERA))
-    )
-    error = np.array([0.0, 1.0, np.nan, np.nan, 2.0, 3.0, 1.0]) * MM
-    chart.draw_traces(CANVAS, PANELS.chart, 60.0, 4.0 * MM, [chart.Trace(np.arange(7.0), error, palette.CAMERA)])
-    assert [size for size in drawn if size] == [2, 3]
-
-
 def test_the_numbers_are_the_records_in_the_units_they_name(record: Record) -> None:
     p, last = record.puller, record.last
     rows = [row[:2] for group in numbers(record, SetPoints(p.v_0, p.Q_H_0)) for row in group]
@@ -146,19 +135,6 @@ def test_what_was_melted_back_is_not_drawn() -> None:
     assert np.all(np.diff(z) >= 0)
     assert r_c == pytest.approx([0.0874, 0.0873, record.puller.r_0])
     assert env.render() is not None
-
-
-@pytest.mark.parametrize(
-    ("h_c", "error", "ending"),
-    [
-        (0.9 * HEIGHT_MIN, 0.0, Ending.FROZEN),
-        (HEIGHT_MIN * 1.001, 0.0, Ending.FROZEN),
-        (1.3 * 7.56 * MM, 0.001, Ending.DETACHED),
-        (6.6 * MM, -8.1 * MM, Ending.LOST),
-    ],
-)
-def test_failures_are_named(h_c: float, error: float, ending: Ending) -> None:
-    assert how_it_failed(h_c, error, 7.56 * MM) is ending
 
 
 @pytest.mark.parametrize(("pull", "ending"), [(1.0, Ending.DETACHED), (-1.0, Ending.FROZEN)])

@@ -11,7 +11,6 @@ from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from cz_gym.testing.checker import Checked, NotConforming, check_vector_env, main
-from cz_gym.testing.nested_arrays import KEEPERS, NamedArray, keep
 
 MODES = list(AutoresetMode)
 
@@ -243,17 +242,6 @@ def test_a_tolerance_forgives_rounding_alone() -> None:
 def test_bad_arguments_are_refused(arguments: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="a check needs num_envs"):
         check_vector_env(Conforming, Walk, **arguments)
-
-
-@pytest.mark.parametrize("number", range(len(KEEPERS)))
-@pytest.mark.parametrize("dtype", [np.float32, np.bool_])
-def test_every_way_to_keep_an_array_sees_a_later_write(number: int, dtype: type) -> None:
-    array = np.zeros((3, 2), dtype)
-    kept = keep(NamedArray("x", array), number)
-    assert kept.keeper == list(KEEPERS)[number]
-    assert kept.unchanged
-    array[2, 1] = 1
-    assert not kept.unchanged
 
 
 @pytest.mark.parametrize("argv", [["--steps", "3"], ["--slots", "1"], ["--stepps", "60"]])

@@ -1,7 +1,6 @@
 """Agent files: what is broken, or made for something else, is refused in one line."""
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -93,24 +92,6 @@ def test_networks_that_give_no_action_are_refused(change: Any, message: str, age
     write_agent(agent, model.SerializeToString(), **facts())
     with pytest.raises(AgentFileError, match=message):
         OnnxPolicy.load(agent)
-
-
-def test_agents_load_where_the_system_has_no_such_flag_and_opens_files_as_text(
-    agent: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As on Windows: no O_NONBLOCK, and an O_BINARY without which bytes would be changed."""
-    opened: list[int] = []
-    system = os.open
-
-    def noted(path: Any, flags: int, *mode: int) -> int:
-        opened.append(flags)
-        return system(path, flags & ~BINARY, *mode)
-
-    monkeypatch.delattr(os, "O_NONBLOCK", raising=False)
-    monkeypatch.setattr(os, "O_BINARY", BINARY := 1 << 30, raising=False)
-    monkeypatch.setattr(os, "open", noted)
-    assert OnnxPolicy.load(agent).contract.algorithm == "ppo"
-    assert opened == [os.O_RDONLY | BINARY] * 2
 
 
 def test_an_oversized_file_is_refused(agent: Path) -> None:

@@ -140,12 +140,6 @@ def test_one_seed_that_fails_stops_no_other(
     assert sorted(agents(tmp_path)) == ["seed0", "seed2"]
 
 
-def test_a_task_that_runs_again_after_its_end_does_nothing(tmp_path: Path, trained: list[int]) -> None:
-    (job,) = jobs(tmp_path, range(1))
-    assert fleet.train_seed(job) == fleet.train_seed(job)
-    assert sessions(tmp_path) == [1]
-
-
 def test_a_folder_in_use_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], trained: list[int]) -> None:
     with locked(tmp_path / "seed1"):
         assert train.main(["--algo", "ppo", "--seeds", "0-1", "--out", str(tmp_path)]) == 2

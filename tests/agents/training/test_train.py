@@ -162,12 +162,3 @@ def test_interrupting_before_learning_prints_one_line(
 def test_mistakes_give_one_line(tmp_path: Path, arguments: list[str], message: str, refused: Any) -> None:
     assert message in refused(train.main, [*arguments, "--out", str(tmp_path / "run")])
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize(
-    "settings",
-    ["[]", "[" * 100_000, '{"steps": true, "sessions": [{}]}', '{"steps": 9, "sessions": 3}', "x" * 2_000_000],
-)
-def test_settings_from_a_stranger_are_refused_in_one_line(tmp_path: Path, settings: str, refused: Any) -> None:
-    (tmp_path / "settings.json").write_text(settings)
-    assert "missing or damaged" in refused(train.main, ["--resume", "--out", str(tmp_path)])

@@ -5,17 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from cz_gym.baselines.pid.industrial import Industrial, dead_zone
+from cz_gym.baselines.pid.industrial import Industrial
 from cz_gym.observation import PULL_SCALE, Measured
 from cz_gym.units import MM_PER_MIN
 from tests.observed import measured
 
 RING, PULL = Measured._fields.index("ring_error"), Measured._fields.index("v_p")
-
-
-def test_dead_zone_as_logged():
-    e = [-5.0, -2.0, -1.5, -1.0, -0.4, 0.0, 0.4, 1.0, 1.5, 1.999, 2.0, 5.0]
-    np.testing.assert_allclose(dead_zone(e), [-3, -3, -2, -2, -0.8, 0, 0.8, 2, 2, 2, 3, 3], atol=1e-12)
 
 
 def literal(diameters):
