@@ -23,11 +23,10 @@ MM = 1e-3
 
 def test_a_short_campaign() -> None:
     """One case in seven, so that every interval and nearly every scenario comes."""
-    totals = campaign(cases()[::7], 60_000)
-    assert totals.steps > 50_000
-    assert totals.failures > 100
-    assert totals.episodes > totals.failures
-    assert totals.missing_heat < 1e-3
+    watches = campaign(cases()[::7], 60_000)
+    failures = sum(watch.failures for watch in watches)
+    assert sum(watch.episodes for watch in watches) > failures > 100
+    assert max(watch.missing_heat for watch in watches) < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -36,8 +35,8 @@ def test_a_short_campaign() -> None:
         ("observation", np.nan, "the observation is not finite"),
         ("observation", 11.0, "the observation is not finite and within"),
         ("reward", np.inf, "the reward is not finite"),
-        ("reward", -9.5, "a living step earns"),
-        ("terminated", True, "a failing step earns more than surviving could"),
+        ("reward", -8.5, "the reward does not follow from the cost"),
+        ("terminated", True, "the reward does not follow from the cost"),
         ("truncated", True, "truncated before or after the horizon"),
         ("r_c", np.nan, "info 'r_c' is not finite"),
         ("r_c", 0.2, "beyond a limit and not terminated"),

@@ -2,21 +2,18 @@
 
 Every scenario, control intervals from 0.5 to 60 s, both models and every mix, every observation, the drives of
 "puller", and pullers drawn far wider than any named scenario. After each step of each slot everything that leaves the
-environment is checked, and the stored heat is balanced against what flowed in and out. The first thing wrong stops
-the command with one line that names the case, the step and the slot.
+environment is checked, and the stored heat is balanced against the heat that flowed in and out. The first error stops
+the command and names the case, the step and the slot.
 """
 
 import argparse
-import sys
-import time
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 from cz_gym.config import Config, make_config
 from cz_gym.episodes.scenario import Interface
 from cz_gym.episodes.scenarios import HARD, PULLER, SCENARIOS
-from cz_gym.units import HOUR, MM
+from cz_gym.units import MM
 from cz_gym.vector import CzVectorEnv
 
 from .adversaries import KINDS, Adversaries
@@ -38,37 +35,23 @@ WIDE = replace(
     actuators=PULLER.actuators,
 )
 """Pullers and disturbances far beyond the named scenarios."""
-SHORT, CALLS, CALLS_IF_SHORT = 5.0, 460, 920
-"""Steps in a row that a large campaign takes in each case, twice as many at control intervals below ``SHORT`` [s]: the
-rest goes into more slots."""
-
-
-class Totals(NamedTuple):
-    """What a campaign has done."""
-
-    steps: int
-    episodes: int
-    failures: int
-    missing_heat: float
-    """Largest heat missing from a step's balance, as a share of the nominal heater power."""
+CALLS = 460
+"""Steps in a row that a large campaign takes in each case; the rest goes into more slots."""
 
 
 def cases() -> list[Config]:
     """Each scenario and "wide" at each interval; models and observations take turns, so that all meet."""
     return [
-        make_config(
-            scenario, MODELS[(at + turn) % 3], OBSERVATIONS[(at + 2 * turn) % 3], interval, 3.0 * HOUR, action="direct"
-        )
+        make_config(scenario, MODELS[(at + turn) % 3], OBSERVATIONS[(at + 2 * turn) % 3], interval, action="direct")
         for at, scenario in enumerate((*SCENARIOS, WIDE))
         for turn, interval in enumerate(INTERVALS)
     ]
 
 
-def run_case(config: Config, steps: int, seed: int) -> Totals:
-    """About ``steps`` slot steps of one case, at least one; raises :class:`Broken` at the first thing wrong."""
-    row = CALLS_IF_SHORT if config.control_interval < SHORT else CALLS
-    n = len(KINDS) * max(1, round(steps / row / len(KINDS)))
-    # At short intervals the horizon is cut so that every case meets ends by time as well.
+def run_case(config: Config, steps: int, seed: int) -> Watch:
+    """About ``steps`` slot steps of one case, at least one, all checked; raises :class:`Broken`."""
+    n = len(KINDS) * max(1, round(steps / CALLS / len(KINDS)))
+    # The horizon is cut so that every case meets ends by time as well.
     calls = max(1, round(steps / n))
     config = replace(config, horizon=min(config.horizon, max(1, 2 * calls // 3) * config.control_interval))
     env = CzVectorEnv.from_config(config, n, threads=1, info="all")
@@ -81,42 +64,29 @@ def run_case(config: Config, steps: int, seed: int) -> Totals:
         *result, infos = env.step(actions)
         watch.after(actions, *result, infos)
     env.close()
-    return Totals(n * calls, watch.episodes, watch.failures, watch.missing_heat)
+    return watch
 
 
-def campaign(configs: Sequence[Config], steps: int, seed: int = 0) -> Totals:
-    """Share ``steps`` among the cases, each told as it ends; raises :class:`Broken` with its name in front."""
-    parts = []
+def campaign(configs: Sequence[Config], steps: int, seed: int = 0) -> list[Watch]:
+    """Share ``steps`` among the cases; raises :class:`Broken` with the name of the case in front."""
+    watches = []
     for number, config in enumerate(configs):
-        name = f"{config.scenario.name}, model {config.model}, {config.observation}, {config.control_interval:g} s"
         try:
-            part = run_case(config, -(-steps // len(configs)), seed + 1000 * number)
+            watches.append(run_case(config, -(-steps // len(configs)), seed + number))
         except Broken as broken:
-            raise Broken(f"{name}, seed {seed + 1000 * number}: {broken}") from None
-        parts.append(part)
-        print(f"{name}: {part.steps} steps, {part.episodes} episodes, {part.failures} failures", flush=True)
-    *counts, missing_heat = zip(*parts, strict=True)
-    return Totals(*map(sum, counts), max(missing_heat))
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run a campaign and print what it saw; exit code 1 and one line at the first thing wrong."""
-    parser = argparse.ArgumentParser("python -m tests.stress", description="Adversarial steps, checked at each.")
-    parser.add_argument("--steps", type=int, default=1_000_000, help="slot steps in all (%(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of actions and episodes (%(default)s)")
-    arguments = parser.parse_args(argv)
-    configs, began = cases(), time.perf_counter()
-    try:
-        totals = campaign(configs, arguments.steps, arguments.seed)
-    except Broken as broken:
-        print(f"{parser.prog}: {broken}", file=sys.stderr)
-        return 1
-    print(
-        f"{len(configs)} cases, {totals.steps:,} steps, {totals.episodes:,} episodes, {totals.failures:,} failures "
-        f"in {time.perf_counter() - began:.0f} s; missing heat {totals.missing_heat:.1e} at most"
-    )
-    return 0
+            name = f"{config.scenario.name}, model {config.model}, {config.observation}, {config.control_interval:g} s"
+            raise Broken(f"{name}, seed {seed + number}: {broken}") from None
+    return watches
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = argparse.ArgumentParser("python -m tests.stress", description="Adversarial steps, checked at each.")
+    parser.add_argument("--steps", type=int, default=1_000_000, help="slot steps in all (%(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of actions and episodes (%(default)s)")
+    arguments = parser.parse_args()
+    watches = campaign(cases(), arguments.steps, arguments.seed)
+    print(
+        f"{len(watches)} cases, {sum(watch.episodes for watch in watches):,} episodes, "
+        f"{sum(watch.failures for watch in watches):,} failures; "
+        f"missing heat {max(watch.missing_heat for watch in watches):.1e} at most"
+    )

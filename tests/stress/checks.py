@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.cost import COST_CAP, FAILURE_COST
+from cz_gym.cost import Cost
 from cz_gym.episodes.schedule import melt_left
 from cz_gym.observation import CLIP
 from cz_gym.physics.plant import fourth_power
@@ -21,8 +21,6 @@ OVERSHOOT = HEIGHT_MIN
 BALANCE = 2e-3
 """Heat that may be missing from a step's balance, as a share of the nominal heater power: the fluxes are taken as
 straight lines over the step."""
-WORST = 1.0 - COST_CAP
-"""No living step earns as little as this [-]."""
 _EPS = 1e-9
 
 
@@ -57,7 +55,7 @@ class Watch:
         ran, over = ~self._over, terminated | truncated
         self._check_numbers(observation, reward, infos)
         self._check_ends(ran, terminated, truncated, infos)
-        self._check_rewards(ran, reward, terminated)
+        self._check_rewards(ran, reward, terminated, infos)
         self._check_drives(ran, actions, infos)
         self._check_heat(ran & ~terminated, infos)
         self.episodes, self.failures = self.episodes + int(over.sum()), self.failures + int(terminated.sum())
@@ -92,13 +90,12 @@ class Watch:
             T = self._slots["x"][name]
             self._need((T > COLDEST) & (T < HOTTEST), f"{name} outside {COLDEST:g} to {HOTTEST:g} K")
 
-    def _check_rewards(self, ran: Array, reward: Array, terminated: Array) -> None:
-        """A failing step earns less than the worst hundred steps."""
-        living = ran & ~terminated
-        self._need(~living | ((reward > WORST) & (reward <= 1.0)), f"a living step earns {WORST:g} or less, or over 1")
-        self._need(ran | (reward == 0.0), "a redrawn slot earns something")
-        self._need(~terminated | (reward <= 1.0 - FAILURE_COST), "a failing step earns too much")
-        self._need(~terminated | (reward > WORST - FAILURE_COST), "a failure costs more than it should")
+    def _check_rewards(self, ran: Array, reward: Array, terminated: Array, infos: dict[str, Any]) -> None:
+        """The reward is one minus the saturated cost of ``info``, and 1,000 less for a failing step."""
+        cost = sum(infos[f"cost_{name}"] for name in Cost._fields)
+        expected = np.where(ran, 1.0 - 10.0 * cost / (10.0 + cost) - 1000.0 * terminated, 0.0)
+        self._need(np.abs(reward - expected) < _EPS, "the reward does not follow from the cost")
+        self._need(cost >= 0.0, "a negative cost")
 
     def _check_drives(self, ran: Array, actions: Array, infos: dict[str, Any]) -> None:
         p, e, old = self._slots["puller"], self._slots["episode"], self._old
