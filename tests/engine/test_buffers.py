@@ -20,22 +20,16 @@ def torch_tensor(array: np.ndarray) -> Any:
 
 WAYS: dict[str, tuple[Callable[[np.ndarray], Any], Callable[[Any], Any]]] = {
     "itself": (lambda array: array, lambda held: held[0, 0]),
-    "row": (lambda array: array[0], lambda held: held[0]),
     "view of a view": (lambda array: array.T[:1][0][::-1].view(np.int64)[:5], lambda held: held.view(np.float64)[-1]),
-    "asarray": (np.asarray, lambda held: held[0, 0]),
     "frombuffer": (lambda array: np.frombuffer(array, array.dtype), lambda held: held[0]),
     "flat": (lambda array: array.flat, lambda held: held[0]),
     "as_strided": (lambda array: np.lib.stride_tricks.as_strided(array, (1,), (8,)), lambda held: held[0]),
-    "base": (lambda array: array.base, lambda held: np.frombuffer(held)[0]),
     "memoryview": (memoryview, lambda held: held[0, 0]),
-    "memoryview of a row": (lambda array: memoryview(array)[0:1], lambda held: np.asarray(held)[0, 0]),
     "ctypes pointer": (lambda array: array.ctypes.data_as(array.ctypes._ctypes.POINTER(
         array.ctypes._ctypes.c_double)), lambda held: held[0]),
     "dlpack": (lambda array: np.from_dlpack(array), lambda held: held[0, 0]),
     "capsule": (lambda array: array.__dlpack__(), lambda held: None),
     "torch": (torch_tensor, lambda held: float(held[0, 0])),
-    "torch's row": (lambda array: torch_tensor(array)[0], lambda held: float(held[0])),
-    "closure": (lambda array: lambda: array[0, 0], lambda held: held()),
 }  # fmt: skip
 
 

@@ -29,9 +29,10 @@ def test_gymnasiums_checker_on_every_scenario(observation: str) -> None:
         {"scenario": "puller", "observation": "history"},
         {"scenario": "hard", "observation": "state", "model": 0.2},
         {"scenario": "sensor-fault", "observation": "measured"},
-        {"scenario": "randomized", "observation": "history", "action": "smooth", "horizon": 1800.0},
+        {"scenario": "all", "observation": "history", "action": "smooth", "horizon": 1800.0},
+        {"scenario": {"randomized": 1.0, "puller": 1.0}, "info": "lean"},
     ],
-    ids=lambda settings: settings["scenario"],
+    ids=["puller", "hard", "sensor-fault", "all", "lean"],
 )
 def test_the_native_batch_is_a_vector_of_scalars(settings: dict[str, Any], mode: AutoresetMode) -> None:
     settings = {"info": "all", **SHORT, **settings}
@@ -42,7 +43,7 @@ def test_the_native_batch_is_a_vector_of_scalars(settings: dict[str, Any], mode:
         modes=[mode],
     )
     assert checked.episodes > checked.failures > 8
-    assert checked.held > 2000
+    assert checked.held > (2000 if settings["info"] == "all" else 700)
 
 
 @pytest.mark.parametrize("scenario", ["sensor-fault", pytest.param("puller", marks=pytest.mark.slow)])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from gymnasium.error import InvalidAction, ResetNeeded
 
+from cz_gym import CzVectorEnv
 from cz_gym.config import make_config
 from cz_gym.differentiable import STATES, DifferentiableBatch
 from cz_gym.engine.tangents import ROWS, SCRATCH, rk4_by
@@ -111,17 +112,15 @@ def test_a_lost_crystal_stops_counting() -> None:
     np.testing.assert_array_equal(batch.step(actions).state[:4], last)
 
 
-def test_the_environment_s_own_crystals_and_observations() -> None:
-    from cz_gym import CzVectorEnv
-
-    batch, env = (
-        DifferentiableBatch(make_config("hard", action="smooth", observation="measured"), 4),
-        CzVectorEnv(4, "hard", action="smooth", observation="measured"),
-    )
+@pytest.mark.parametrize("scenario", ["hard", "all"])
+def test_the_environment_s_own_crystals_and_observations(scenario: str) -> None:
+    config = make_config(scenario, action="smooth", observation="measured")
+    batch, env = DifferentiableBatch(config, 4), CzVectorEnv.from_config(config, 4)
     _, measured = batch.reset([5, 6, 7, 8])
-    np.testing.assert_array_equal(measured, env.reset(seed=5)[0])
-    actions = np.random.default_rng(0).uniform(-0.2, 0.2, (50, 4, 2))
-    for action in actions:
+    first, infos = env.reset(seed=5)
+    np.testing.assert_array_equal(measured, first)
+    np.testing.assert_array_equal(batch.scenarios, infos.get("scenario", scenario))
+    for action in np.random.default_rng(0).uniform(-0.2, 0.2, (50, 4, 2)):
         step = batch.step(action)
         np.testing.assert_array_equal(step.measured, env.step(action)[0])
     assert batch.measured_by_state.shape == (len(MEASURED), len(STATES))
@@ -143,7 +142,7 @@ def test_the_chain_rule_over_rk4_is_exact() -> None:
     [
         (make_config(control_interval=10.0, **PLAIN), 2, "must divide 5 s"),
         (make_config(control_interval=2.0, **PLAIN), 2, "must divide 5 s"),
-        (make_config("puller", control_interval=2.5, **PLAIN), 2, "latency of 5 s is longer"),
+        (make_config("all", control_interval=2.5, **PLAIN), 2, "latency of 5 s is longer"),
         ("randomized", 2, "a config is needed"),
         (make_config(**PLAIN), 0, "num_envs must be"),
         (make_config(**PLAIN), 2.0, "num_envs must be"),

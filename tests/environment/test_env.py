@@ -163,21 +163,6 @@ def test_a_critic_may_see_the_state_beside_the_history() -> None:
     np.testing.assert_array_equal(history.step(ZERO)[4]["state"], state.step(ZERO)[0])
 
 
-@pytest.mark.parametrize("interval", [2.0, 10.0])
-def test_fast_and_slow_controllers_meet_the_same_crystal(interval: float) -> None:
-    """Open loop, the trajectories agree to integration error at the common times."""
-    runs = {}
-    for dt in (5.0, interval):
-        env = CzEnv("randomized", control_interval=dt, horizon=2400.0, info="all", **PLAIN)
-        env.reset(seed=17)
-        saved = env.get_state().slot
-        steps = [env.step(ZERO)[4] for _ in range(round(2400.0 / dt))]
-        at_common_times = steps[round(10 / dt) - 1 :: round(10 / dt)]
-        runs[dt] = saved, np.array([[i["r_c"], i["h_c"], i["T_1"], i["T_b"], i["r_ref"]] for i in at_common_times])
-    assert runs[5.0][0].slot["episode"] == runs[interval][0].slot["episode"]
-    np.testing.assert_allclose(runs[interval][1], runs[5.0][1], rtol=1e-8)
-
-
 def test_one_episode_of_another_scenario() -> None:
     env = CzEnv("nominal", observation="state", info="all", action="direct")
     given, _ = env.reset(seed=5, options={"scenario": "hard"})

@@ -8,11 +8,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv
 from cz_gym.config import make_config
-from cz_gym.differentiable import DifferentiableBatch
 from cz_gym.engine.batch import first_key
 from cz_gym.episodes.record import MIXTURE_STREAM
 from cz_gym.episodes.scenario import Scenario
@@ -106,66 +104,6 @@ def test_an_episode_is_bit_for_bit_that_of_its_scenario_alone(model: str | None)
     assert met == set(BY_NAME)
 
 
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-@pytest.mark.parametrize("info", ["lean", "all"])
-def test_the_batch_equals_scalar_environments(mode: AutoresetMode, info: str) -> None:
-    n, settings = 6, {**SHORT, "info": info}
-    one = CzVectorEnv(n, MIX, autoreset_mode=mode, **settings)
-    many = SyncVectorEnv([lambda: CzEnv(MIX, **settings)] * n, autoreset_mode=mode)
-    pairs, finals = [(one.reset(seed=3), many.reset(seed=3))], 0
-    pairs += [(one.step(action), many.step(action)) for action in actions(n)]
-    for mine, theirs in pairs:
-        for a, b in zip(mine[:-1], theirs[:-1], strict=True):
-            np.testing.assert_array_equal(a, b)
-        assert mine[-1].keys() == theirs[-1].keys()
-        both = [(mine[-1], theirs[-1])]
-        if "final_info" in mine[-1]:
-            both.append((mine[-1]["final_info"], theirs[-1]["final_info"]))
-            finals += 1
-        for ours, its in both:
-            np.testing.assert_array_equal(ours["scenario"], its["scenario"])
-            np.testing.assert_array_equal(ours["_scenario"], its["_scenario"])
-            assert ours["scenario"].dtype == object
-    assert bool(finals) == (mode == AutoresetMode.SAME_STEP)
-    assert len({tuple(mine[-1]["scenario"]) for mine, _ in pairs}) > 2, "later steps leave returned names alone"
-
-
-@pytest.mark.parametrize("mask", [[True, False, True], [False, True, False]])
-def test_a_partial_reset_names_its_own_slots(mask: list[bool]) -> None:
-    env = CzVectorEnv(3, MIX, autoreset_mode=AutoresetMode.DISABLED)
-    before = env.reset(seed=1)[1]["scenario"]
-    _, infos = env.reset(seed=50, options={"reset_mask": np.array(mask)})
-    assert infos["_scenario"].tolist() == mask
-    assert [name is not None for name in infos["scenario"]] == mask
-    after = env.step(np.zeros((3, 2)))[4]["scenario"]
-    for slot, again in enumerate(mask):
-        assert after[slot] == (infos["scenario"][slot] if again else before[slot])
-
-
-def test_saved_states_and_copies_go_on() -> None:
-    env, batch = CzEnv(MIX, **SHORT), CzVectorEnv(4, MIX, **SHORT)
-    _, info = env.reset(seed=11)
-    batch.reset(seed=2)
-    states, copied = batch.get_state(), pickle.loads(pickle.dumps(env))
-    other, many = CzEnv(MIX, **SHORT), CzVectorEnv(4, MIX, **SHORT)
-    _, again = other.reset(options={"state": pickle.loads(pickle.dumps(env.get_state()))})
-    assert again["scenario"] == info["scenario"]
-    many.set_state(states)
-    for action in actions(4, 20):
-        expected, found = batch.step(action), many.step(action)
-        np.testing.assert_array_equal(expected[0], found[0])
-        np.testing.assert_array_equal(expected[4]["scenario"], found[4]["scenario"])
-    for _ in range(4):
-        for action in actions(1, 8):
-            steps = [each.step(action[0]) for each in (env, other, copied)]
-            for seen in steps[1:]:
-                np.testing.assert_array_equal(seen[0], steps[0][0])
-                assert (seen[1], seen[4]["scenario"]) == (steps[0][1], steps[0][4]["scenario"])
-        assert len({each.reset()[1]["scenario"] for each in (env, other, copied)}) == 1
-    with pytest.raises(ValueError, match=r"under other settings.* scenario"):
-        CzEnv("puller", **SHORT).set_state(env.get_state())
-
-
 def test_an_option_draws_one_episode_from_a_scenario_or_a_mixture() -> None:
     env, batch = gym.make("Cz-v0", scenario=MIX), gym.make_vec("Cz-v0", 2, "vector_entry_point", scenario=MIX)
     assert env.reset(seed=1, options={"scenario": "sensor-fault"})[1]["scenario"] == "sensor-fault"
@@ -177,22 +115,3 @@ def test_an_option_draws_one_episode_from_a_scenario_or_a_mixture() -> None:
     assert batch.reset(options={"scenario": {"nominal": 1.0}})[1]["scenario"].tolist() == ["nominal"] * 2
     assert pickle.loads(pickle.dumps(plain)).step(np.zeros(2))[4]["scenario"] == "nominal"
     assert plain.reset()[1]["scenario"] == "hard"
-
-
-def test_the_differentiable_batch_meets_the_same_crystals() -> None:
-    config = make_config(MIX, action="smooth", horizon=100.0)
-    batch, seeds = DifferentiableBatch(config, 8), range(20, 28)
-    _, seen = batch.reset(seeds)
-    names, steps = batch.scenarios, [batch.step(action) for action in actions(8, 10)]
-    assert set(names) == set(BY_NAME)
-    for name in BY_NAME:
-        mine = np.flatnonzero(names == name)
-        alone = DifferentiableBatch(config.with_scenario(BY_NAME[name]), len(mine))
-        np.testing.assert_array_equal(alone.reset([seeds[i] for i in mine])[1], seen[mine])
-        for action, step in zip(actions(8, 10), steps, strict=True):
-            for a, b in zip(alone.step(action[mine]), step, strict=True):
-                np.testing.assert_array_equal(a, b[mine])
-    batch.reset([28], [3])
-    assert batch.scenarios[3] == CzEnv.from_config(config).reset(seed=28)[1]["scenario"]
-    with pytest.raises(ValueError, match="latency of 5 s is longer"):
-        DifferentiableBatch(make_config(MIX, control_interval=2.5), 2)

@@ -180,15 +180,6 @@ def test_outliers_are_not_flagged() -> None:
     assert (rows[:, 1] == 1.0).all()
 
 
-def test_camera_noise_is_per_sample_whatever_the_interval() -> None:
-    scenario = Scenario("mine", sensor=Sensor(camera_noise=(1e-4, 1e-4)))
-    for interval in (2.0, 10.0):
-        env = CzEnv(scenario, control_interval=interval, info="all", **PLAIN)
-        _, infos, _ = run(env, 100)
-        noise = column(infos, "r_br_measured") - column(infos, "r_br")
-        np.testing.assert_allclose(noise, drawn(env).noise[:101, 0], atol=1e-12)
-
-
 def test_observations_are_clipped_not_lost() -> None:
     sensor = Sensor(bias_offset=(5e-3, 5e-3), outlier_probability=1.0, outlier_sd=5e-3)
     observations, infos, _ = run(CzEnv(Scenario("mine", sensor=sensor), info="all", **PLAIN), 50)

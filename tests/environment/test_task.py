@@ -59,20 +59,6 @@ def fly(model: str, pull: float, horizon: float = 10800.0) -> tuple[list[float],
             return rewards, terminated, truncated, info
 
 
-@pytest.mark.parametrize(
-    ("model", "pull", "what"), [("I", 1.0, "detachment"), ("II", 1.0, "detachment"), ("II", -1.0, "freezing")]
-)
-def test_failure_is_terminated_never_truncated(model: str, pull: float, what: str) -> None:
-    rewards, terminated, truncated, info = fly(model, pull)
-    k, gained = len(rewards), rewards[-1]
-    assert (terminated, truncated) == (True, False)
-    assert k < 2160
-    beyond = info["h_c"] > 1.24 * P.a if what == "detachment" else info["h_c"] < 1.2 * MM
-    assert beyond or abs(info["r_c"] - info["r_ref"]) > 8 * MM
-    terms = sum(info[f"cost_{name}"] for name in ("radius", "pull", "pull_step", "heater_step"))
-    assert gained == pytest.approx(1 - 10 * terms / (10 + terms) - 1000)
-
-
 def test_failure_inside_a_long_interval_is_latched() -> None:
     """Ten minutes at full pull detach the crystal; the state stays where it failed, finite and measured."""
     env = CzEnv("nominal", control_interval=600.0, horizon=6000.0, info="all", **PLAIN)

@@ -184,11 +184,6 @@ def test_interface_fluctuation_is_two_stationary_processes() -> None:
     assert stats.kstest(runs[:, 100] / math.sqrt(2), "norm").pvalue > 1e-3
 
 
-def test_interface_deviations_are_drawn_separately() -> None:
-    runs = np.array([draw("only-interface", key, grid=2)[1].interface[0] for key in keys(3000)])
-    assert np.var(runs) == pytest.approx(2 * 0.5**2 / 3, rel=0.12)
-
-
 def test_draws_are_uniform() -> None:
     factors = np.array([draw_factors(SCENARIOS["randomized"], (0.0, 1.0), key) for key in keys(2000)])
     assert (factors[:, 7:] == 1.0).all()

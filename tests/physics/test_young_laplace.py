@@ -63,16 +63,6 @@ def test_table_against_the_exact_solution(narrowest, slopes, ring):
     np.testing.assert_allclose(YOUNG_LAPLACE.height(r, solution.theta, A), h, rtol=1e-9)
 
 
-def test_slope_sensitivity_against_the_exact_solution():
-    step = 1e-4 * A
-    for r_c in (0.05, 0.0875, 0.15):
-        h = float(exact.solve_height(r_c, ALPHA_0, A))
-        low, high = exact.solve(r_c, h + np.array([-step, step]), A, PHI_B).theta
-        p = make_puller(Parameters(r_0=r_c), meniscus=YOUNG_LAPLACE)
-        rate = radius_model(p, YOUNG_LAPLACE).numerator / p.v_0
-        assert rate == pytest.approx((high - low) / (2.0 * step), rel=1e-6)
-
-
 @pytest.mark.parametrize("degrees", [1.0, 3.5, 10.0])
 def test_ring_sensitivity_against_the_exact_solution(degrees):
     """How fast the ring moves with the height, at the operating point: what G_m hangs on."""

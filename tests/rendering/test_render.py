@@ -13,7 +13,6 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
-import cz_gym
 from cz_gym import CzEnv
 from cz_gym.rendering import canvas, view
 from cz_gym.rendering.view import MODES, check_size, record_of
@@ -145,12 +144,6 @@ def test_without_pygame_nothing_is_declared_and_asking_says_what_to_install() ->
         "except Exception as error:\n    print(type(error).__name__, error)\n"
     )
     assert python("-W", "error", "-c", code) == f"DependencyNotInstalled {canvas.MISSING}\n"
-
-
-def test_a_batch_does_not_render() -> None:
-    assert cz_gym.CzVectorEnv.metadata["render_modes"] == []
-    with pytest.raises(ValueError, match="a batch does not render"):
-        cz_gym.CzVectorEnv(2, render_mode="rgb_array", **PLAIN)
 
 
 def test_a_window_that_cannot_open_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
