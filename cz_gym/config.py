@@ -7,7 +7,7 @@ import json
 import math
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from numbers import Real
+from numbers import Integral, Real
 from typing import NamedTuple
 
 from cz_gym.camera.view import Camera, camera_for, check_camera
@@ -176,6 +176,13 @@ def _plant_hash(parameters: Parameters, meniscus: MeniscusModel) -> str:
 @lru_cache(maxsize=64)
 def _equations_hash(meniscus: MeniscusModel) -> str:
     return function_hash(*EQUATIONS, *meniscus.functions)
+
+
+def positive_whole(name: str, value: int) -> int:
+    """Return the value as an int; raise CzError unless it is a positive whole number."""
+    if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
+        raise CzError(f"{name} must be a positive whole number, not {value!r}")
+    return int(value)
 
 
 def positive(name: str, value: float) -> float:

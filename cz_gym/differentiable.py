@@ -6,7 +6,6 @@ The plant is the environment's own; nothing is approximated (:mod:`cz_gym.engine
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from operator import index
 from typing import Any, NamedTuple
 
@@ -15,7 +14,7 @@ import numpy.typing as npt
 from gymnasium.error import InvalidAction, ResetNeeded
 
 from cz_gym.action import MarkedAction, check_marked
-from cz_gym.config import Config
+from cz_gym.config import Config, check_config, positive_whole
 from cz_gym.cost import Cost
 from cz_gym.engine.batch import Batch, first_key
 from cz_gym.engine.buffers import BufferPool
@@ -23,17 +22,11 @@ from cz_gym.engine.layout import Out
 from cz_gym.engine.tangents import ACTIONS, ROWS, SCRATCH, SMOOTH, build_tangents
 from cz_gym.episodes.record import GRID
 from cz_gym.errors import CzError
-from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.signals import INFO, MEASURED, scales
 
 Floats = npt.NDArray[np.float64]
 _COSTS = [INFO.index(f"cost_{name}") for name in Cost._fields]
 _RADIUS, _REFERENCE, _OFFSET = (INFO.index(name) for name in ("r_c", "r_ref", "ring_offset"))
-
-
-@lru_cache(maxsize=8)
-def _compiled(meniscus: MeniscusModel) -> tuple[Any, Any]:
-    return build_tangents(meniscus)
 
 
 class Step(NamedTuple):
@@ -73,19 +66,17 @@ class DifferentiableBatch:
     """
 
     def __init__(self, config: Config, num_envs: int, threads: int | None = 1) -> None:
-        if not isinstance(config, Config):
-            raise CzError(f"a config is needed, as make_config({config!r:.80}) makes one")
-        if not isinstance(num_envs, int | np.integer) or isinstance(num_envs, bool) or num_envs < 1:
-            raise CzError(f"num_envs must be a positive whole number, not {num_envs!r}")
+        check_config(config)
+        self.num_envs = positive_whole("num_envs", num_envs)
         parts = GRID / config.control_interval
         if abs(parts - round(parts)) > 1e-9 or round(parts) < 1:
             raise CzError(f"control_interval must divide {GRID:g} s, not be {config.control_interval:g} s")
         latency = max(scenario.sensor.latency for scenario in config.scenario.scenarios)
         if latency > config.control_interval:
             raise CzError(f"the camera's latency of {latency:g} s is longer than the control interval")
-        self.config, self._made_for, self.num_envs = config, config.made_for, int(num_envs)
+        self.config, self._made_for = config, config.made_for
         self._batch = Batch(config, self.num_envs, threads)
-        self._gather, self._tangents = _compiled(config.meniscus)
+        self._gather, self._tangents = build_tangents(config.meniscus)
         self._out = self._batch.new_out()
         self._state = np.zeros((num_envs, len(STATES)))
         self._grows, self._begun = np.ones(num_envs, np.bool_), np.zeros(num_envs, np.bool_)

@@ -23,7 +23,7 @@ from cz_gym.physics.parameters import Parameters
 from cz_gym.processors import processors
 
 from .action import MarkedAction, check_marked
-from .config import Config, make_config
+from .config import Config, make_config, positive_whole
 from .env import CzEnv, EnvState, Form, action_space, check_options, check_state, observation_space
 from .signals import INFO, LEAN
 
@@ -44,7 +44,7 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
     reused by a later call.
     """
 
-    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+    metadata: dict[str, Any] = CzEnv.metadata | {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
     FACTS = (*Form.FACTS, "_randoms", "_seeds", "_waiting")
 
     def __init__(
@@ -80,11 +80,8 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
         info: str = "lean",
     ) -> None:
         self._everything, self._settings = check_info(info), (config, num_envs, autoreset_mode, threads, info)
-        if not isinstance(num_envs, int | np.integer) or isinstance(num_envs, bool) or num_envs < 1:
-            raise CzError(f"num_envs must be a positive whole number, not {num_envs!r}")
-        num_envs = int(num_envs)
-        if threads is not None and (not isinstance(threads, int) or threads < 1):
-            raise CzError(f"threads must be a positive whole number or None, not {threads!r}")
+        num_envs = positive_whole("num_envs", num_envs)
+        threads = processors() if threads is None else positive_whole("threads", threads)
         self.config, self._made_for = config, config.made_for
         self.render_mode = None
         self.num_envs = num_envs
@@ -94,7 +91,7 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
         self.single_observation_space = observation_space(config.observation)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._batch = Batch(self.config, num_envs, threads or processors(), self._everything)
+        self._batch = Batch(self.config, num_envs, threads, self._everything)
         self._out = self._batch.new_out()
         self._everybody: Mask = np.ones(num_envs, np.bool_)
         self._over = self._everybody.copy()
@@ -300,6 +297,3 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
             infos["state"] = out.state if whole else np.where(mask[:, None], out.state, np.float32(0))
             infos["_state"] = mask
         return infos
-
-
-CzVectorEnv.metadata = {**CzEnv.metadata, "render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}

@@ -6,6 +6,7 @@ ring and other edges, it has the mean of SUB x SUB rays, so that an edge can mov
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -148,6 +149,7 @@ def picture(r_c: float, h_c: float, puller: Puller, view: View) -> npt.NDArray[n
     return image
 
 
+@lru_cache(maxsize=8)
 def build_look(meniscus: MeniscusModel = HURLE) -> Any:
     """Compile ``look(slots, active, view, images, start, stop)``: the images of the active slots.
 

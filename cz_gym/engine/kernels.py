@@ -6,6 +6,7 @@ compiled in; this module says in which order a slot goes through them.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -164,7 +165,8 @@ class Kernels(NamedTuple):
     """``derive(parameters, lam)``: the puller at its operating point."""
 
 
-def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
+@lru_cache(maxsize=8)
+def build_kernels(meniscus: MeniscusModel) -> Kernels:
     """Compile the loops for a meniscus model; those of this package's models are cached on disk."""
     slope, ring_offset, height = meniscus.slope, meniscus.ring_offset, meniscus.height
 
@@ -254,5 +256,5 @@ def build_kernels(meniscus: MeniscusModel = HURLE) -> Kernels:
     )
 
 
-KERNELS = build_kernels()
+KERNELS = build_kernels(HURLE)
 """The loops on Hurle's meniscus."""

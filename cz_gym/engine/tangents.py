@@ -7,6 +7,7 @@ is subtracted, so that h can be as small as one likes (Squire and Trapp, SIAM Re
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 from cz_gym.cost import Cost, cost_slopes
@@ -105,6 +106,7 @@ def rk4_by(work: Any, x: Any, u: Any, d: Any, p: Any, dt: Any, slope: Any) -> No
     _stage(work, dt / 6.0, dt, along(x, dt, k_3), u, d, p, slope)
 
 
+@lru_cache(maxsize=8)
 def build_tangents(meniscus: MeniscusModel) -> tuple[Any, Any]:
     """Compile the loops for a meniscus model.
 

@@ -116,18 +116,10 @@ def randomised(q: Any, f: Any) -> Any:
 @jittable
 def draw_episode(record: Any, streams: Any, freezes: Any) -> Any:
     """Draw ramps and constants; freezes [s], shape (FREEZES, 2), are written."""
-    recipe, drift, reference, sensor, drives = (
-        record.recipe,
-        record.drift,
-        record.reference,
-        record.sensor,
-        record.actuators,
-    )
-    plan, at, read = (
-        _uniforms(streams[_SCHEDULE], 10),
-        _uniforms(streams[_INTERFACE], 2),
-        _uniforms(streams[_SENSOR], 8),
-    )
+    recipe, drift, reference = record.recipe, record.drift, record.reference
+    sensor, drives = record.sensor, record.actuators
+    plan, read = _uniforms(streams[_SCHEDULE], 10), _uniforms(streams[_SENSOR], 8)
+    at = _uniforms(streams[_INTERFACE], 2)
     recipe_length = between(recipe.duration, plan[1])
     moved = 1.0 if plan[6] < reference.probability else 0.0
     sd_fast, sd_slow = between(record.interface.sd, at[0]), between(record.interface.sd, at[1])

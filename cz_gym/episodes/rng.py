@@ -10,13 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-
-try:
-    from numba.np.random._constants import fi_double, ki_double, wi_double, ziggurat_nor_inv_r, ziggurat_nor_r
-except ImportError as error:
-    raise ImportError(
-        f"cz_gym reads the tables of normal numbers from numba 0.60 to 0.68; this numba: {error}"
-    ) from None
+from numba.np.random._constants import fi_double, ki_double, wi_double, ziggurat_nor_inv_r, ziggurat_nor_r
 
 from cz_gym.jit.compile import jittable
 

@@ -14,8 +14,6 @@ from cz_gym.physics.plant import Disturbance, hidden_load
 
 from .scenario import DRAW_SPAN
 
-SPAN = DRAW_SPAN
-
 
 @jittable
 def progress(t: Any, start: Any, duration: Any) -> Any:
@@ -50,7 +48,7 @@ def reference(t: Any, e: Any) -> Any:
 @jittable
 def melt_left(t: Any, e: Any) -> Any:
     """Share of the melt's heat capacity left [-]."""
-    return 1.0 - e.melt_loss * progress(t, 0.0, SPAN)
+    return 1.0 - e.melt_loss * progress(t, 0.0, DRAW_SPAN)
 
 
 @jittable
@@ -74,4 +72,4 @@ def ripple(t: Any, e: Any) -> Any:
 @jittable
 def pyrometer_drift(t: Any, e: Any) -> Any:
     """Drift of the pyrometer [K]."""
-    return e.pyrometer_drift * progress(t, 0.0, SPAN)
+    return e.pyrometer_drift * progress(t, 0.0, DRAW_SPAN)

@@ -9,7 +9,6 @@ be loaded is compiled again. A file is trusted as those of ``__pycache__`` are.
 from __future__ import annotations
 
 import hashlib
-import importlib
 import os
 import pickle
 import sys
@@ -23,6 +22,7 @@ from typing import Any
 import llvmlite
 import numba
 import numpy as np
+from numba.core import caching, serialize
 
 from cz_gym.atomic_files import write_files
 from cz_gym.errors import CzError
@@ -34,18 +34,8 @@ CACHE_VARIABLE = "CZ_GYM_CACHE_DIR"
 """Environment variable naming the folder for compiled code; empty means: keep none."""
 NEVER_COMPILED = ("agents", "baselines", "evaluation", "play", "testing")
 """Sub-packages of which nothing is compiled in; all others count, whatever they hold."""
-
-
-def private(module: str, name: str) -> Any:
-    """A private object of numba; None if this version has none of that name."""
-    try:
-        return getattr(importlib.import_module(f"numba.{module}"), name)
-    except (ImportError, AttributeError):
-        return None
-
-
-FunctionCache: Any = private("core.caching", "FunctionCache") or object
-dumps: Any = private("core.serialize", "dumps")
+FunctionCache: Any = caching.FunctionCache
+dumps: Any = serialize.dumps
 
 
 def compiled_sources(folder: Path | None = None) -> list[Path]:
@@ -67,7 +57,7 @@ def cache_folder() -> Path | None:
     if named == "":
         return None
     try:
-        home = Path(named) if named else _user_cache()
+        home = Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cz-gym"
         versions = f"numba{numba.__version__}-llvmlite{llvmlite.__version__}-numpy{np.__version__}"
         folder = home / f"{source_hash()}-{versions}"
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -78,11 +68,6 @@ def cache_folder() -> Path | None:
     except (OSError, RuntimeError):
         return None
     return folder
-
-
-def _user_cache() -> Path:
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "cz-gym"
 
 
 def hashed(*functions: Callable[..., Any]) -> bool:

@@ -9,6 +9,7 @@ named by a hash of every source of the package that can be compiled in.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, TypeVar, cast
 
 import numba
@@ -16,12 +17,9 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic, overload, register_jitable
 
-from .cache import CachedCode, cache_folder, private
+from .cache import CachedCode, cache_folder
 
 F = TypeVar("F", bound=Callable[..., Any])
-
-default_options = private("core.options", "DefaultOptions")
-_NO_COUNTS = "_nrt"
 
 
 def jittable(function: F) -> F:
@@ -40,7 +38,7 @@ def force_inlined(function: F) -> F:
 def inlined(function: F) -> F:
     """Mark a part of kernels whose text is inlined into each: a call with a step's arrays costs a tenth of the step.
 
-    It is inlined before types are inferred; as an inlined :func:`physics` it and all it calls would compile twice.
+    It is inlined before types are inferred; as a :func:`force_inlined` it and all it calls would compile twice.
     For module level only: kept in a closure it would change the key of the kernel on disk in every process.
     """
     return cast(F, numba.njit(error_model="numpy", inline="always")(function))
@@ -53,24 +51,14 @@ def kernel(function: F, keep: bool = True, allocates: bool = True) -> F:
     ``allocates=False`` promises that the loop makes no array, so that views of its arguments need no reference counts.
     """
     folder = cache_folder() if keep else None
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
-    if not allocates and _NO_COUNTS in getattr(default_options, "__dict__", ()):
-        options[_NO_COUNTS] = False
-    settings: Any = numba.config
-    if folder is None:
-        return cast(F, numba.njit(**options)(function))
-    previous = settings.CACHE_DIR
-    settings.CACHE_DIR = str(folder)
-    try:
-        compiled: Any = numba.njit(**options)(function)
-        if hasattr(compiled, "_cache"):
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"} | ({} if allocates else {"_nrt": False})
+    compiled, settings = cast(Any, numba.njit(**options)(function)), cast(Any, numba.config)
+    if folder is not None and hasattr(compiled, "_cache"):
+        previous, settings.CACHE_DIR = settings.CACHE_DIR, str(folder)
+        with suppress(RuntimeError, OSError):  # a folder that cannot be written any more
             compiled._cache = CachedCode(function)
-        return cast(F, compiled)
-    except (RuntimeError, OSError, AttributeError, TypeError):
-        # No place to write; or a numba whose private parts, which CachedCode stands on, are others: nothing is cached.
-        return cast(F, numba.njit(**options)(function))
-    finally:
         settings.CACHE_DIR = previous
+    return cast(F, compiled)
 
 
 def entry(loop: Any, arguments: tuple[Any, ...]) -> Any:

@@ -183,11 +183,7 @@ def make_puller(parameters: Parameters | None = None, lam: float = 1.0, meniscus
     q = check_parameters(parameters or Parameters())
     with np.errstate(all="ignore"):
         puller = derive_puller(q, float(lam), meniscus.height, meniscus.ring_offset)
-    return check_puller(Puller(*map(float, puller)), meniscus)
-
-
-def check_puller(puller: Puller, meniscus: MeniscusModel = HURLE) -> Puller:
-    """Return the puller; raise CzError if it has no finite operating point on the meniscus."""
+    puller = Puller(*map(float, puller))
     if np.isfinite(puller.a) and not np.all(np.isfinite([puller.h_0, puller.ring_bias])):
         covers = f" ({meniscus.covers}; a = {puller.a:.4g} m)" if meniscus.covers else ""
         raise CzError(

@@ -14,10 +14,11 @@ from cz_gym.env import CzEnv
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.replay import Playback
 from cz_gym.evaluation.rollout import rollout
+from cz_gym.physics.plant import Inputs
 from cz_gym.rendering import palette
 from cz_gym.rendering.canvas import TIMES, Box, Canvas, Frame, load
 from cz_gym.rendering.record import Record
-from cz_gym.rendering.scene import Scene, SetPoints
+from cz_gym.rendering.scene import Scene
 from cz_gym.rendering.view import FPS, Window, record_of
 from cz_gym.task import HEATER_RANGE
 from cz_gym.units import KILO, MINUTE, MM_PER_MIN
@@ -101,8 +102,7 @@ class Game:
         self.actions: list[npt.NDArray[np.float32]] = []
         self.paused, self.due = True, 0.0
         self.score: Score | None = None
-        p = self.record.puller
-        self.set_points = SetPoints(p.v_0, p.Q_H_0)
+        self.set_points = self.record.puller.inputs_0
 
     @property
     def record(self) -> Record:
@@ -136,7 +136,7 @@ class Game:
         p = self.record.puller
         v_p = min(max(self.set_points.v_p + pull, 0.0), 2.0 * p.v_0)
         Q_H = min(max(self.set_points.Q_H + heat, p.Q_H_0 - HEATER_RANGE), p.Q_H_0 + HEATER_RANGE)
-        self.set_points = SetPoints(v_p, Q_H)
+        self.set_points = Inputs(v_p, Q_H)
 
     def change_speed(self, factor: float) -> None:
         """Let time run faster or slower."""

@@ -7,21 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cz_gym.physics.plant import Inputs
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 from . import chart, palette, puller_panel, triple_point
 from .canvas import Box, Canvas, Frame
 from .palette import Colour
 from .record import Ending, Record
-
-
-class SetPoints(NamedTuple):
-    """Set-points of the drives, chosen by a player."""
-
-    v_p: float
-    """Pull speed [m/s]."""
-    Q_H: float
-    """Heater power [W]."""
 
 
 class Layout(NamedTuple):
@@ -55,7 +47,7 @@ class Scene:
     def draw(
         self,
         record: Record,
-        set_points: SetPoints | None = None,
+        set_points: Inputs | None = None,
         overlay: Callable[[Canvas], None] | None = None,
     ) -> Frame:
         """The picture of a record's newest sample, shape (height, width, 3).
@@ -97,7 +89,7 @@ Row = tuple[str, str, Colour]
 """Name, value and its colour."""
 
 
-def numbers(record: Record, set_points: SetPoints | None = None) -> list[list[Row]]:
+def numbers(record: Record, set_points: Inputs | None = None) -> list[list[Row]]:
     """The rows of a record's newest sample; the first of each group is a signal, those below it its references."""
     p, last = record.puller, record.last
     rows = [
@@ -119,7 +111,7 @@ def _row(name: str, value: float, scale: float = 1.0, unit: str = "", colour: Co
     return name, f"{value / scale:.2f} {unit}".rstrip() if np.isfinite(value) else "no reading", colour
 
 
-def _draw_numbers(canvas: Canvas, box: Box, record: Record, set_points: SetPoints | None) -> None:
+def _draw_numbers(canvas: Canvas, box: Box, record: Record, set_points: Inputs | None) -> None:
     """The true radius error in large figures, then the groups of rows."""
     left, right, y = box.x + 8, box.right - 8, box.y + 45
     canvas.text(left, box.y + 5, "true radius error", palette.FAINT)

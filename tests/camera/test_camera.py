@@ -203,7 +203,7 @@ def test_images_and_detector_follow_another_puller() -> None:
 def test_images_and_detector_follow_the_exact_meniscus() -> None:
     puller = make_puller(meniscus=YOUNG_LAPLACE)
     detector = RingDetector(VIEW, puller)
-    env = CzEnv("nominal", observation="camera", meniscus=YOUNG_LAPLACE, info="all")
+    env = CzEnv("nominal", observation="camera", action="direct", meniscus=YOUNG_LAPLACE, info="all")
     image, _ = env.reset(seed=0)
     np.testing.assert_array_equal(image, picture(puller.r_0, puller.h_0, puller, VIEW))
     for _ in range(12):

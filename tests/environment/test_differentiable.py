@@ -143,7 +143,7 @@ def test_the_chain_rule_over_rk4_is_exact() -> None:
         (make_config(control_interval=10.0, **PLAIN), 2, "must divide 5 s"),
         (make_config(control_interval=2.0, **PLAIN), 2, "must divide 5 s"),
         (make_config("all", control_interval=2.5, **PLAIN), 2, "latency of 5 s is longer"),
-        ("randomized", 2, "a config is needed"),
+        ("randomized", 2, "this needs a Config, not .randomized."),
         (make_config(**PLAIN), 0, "num_envs must be"),
         (make_config(**PLAIN), 2.0, "num_envs must be"),
     ],

@@ -80,7 +80,7 @@ def test_history_is_differences_of_past_means_and_the_integral(interval: float) 
     arguments: dict[str, Any] = {"control_interval": interval, "info": "all"}
     steps = round(2000 / interval)
     rows, _, _ = run(CzEnv("randomized", observation="history", **arguments), steps, 0.05)
-    plain, _, _ = run(CzEnv("randomized", **arguments), steps, 0.05)
+    plain, _, _ = run(CzEnv("randomized", observation="measured", **arguments), steps, 0.05)
     names = [channel.name for channel in HISTORY]
     own = {channel.name: channel.scale for channel in MEASURED}
     ages = lags(interval)

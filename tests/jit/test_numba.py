@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from numba.core.errors import TypingError
 
-from cz_gym.jit import compile as _compile
 from cz_gym.jit.compile import kernel
 
 
@@ -21,17 +20,8 @@ def test_the_ziggurats_tables_are_those_this_was_written_with(table: str, digest
     assert hashlib.sha256(found.tobytes()).hexdigest()[:16] == digest, f"this numba's {table} is another one"
 
 
-def test_a_numba_with_other_private_parts_caches_nothing_and_fails_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Moved away, or made with other arguments."""
-    double = kernel(lambda x: 2 * x)
-    for other in (type("CachedCode", (), {}), lambda function: function._no_such_part):
-        monkeypatch.setattr(_compile, "CachedCode", other)
-        assert kernel(double.py_func)(3) == 6
-
-
 def test_loops_compile_without_reference_counts() -> None:
-    """A private option: without it everything runs, but the scalar step is several times slower."""
-    assert _compile._NO_COUNTS in _compile.default_options.__dict__, "this numba calls its option otherwise"
+    """A private option of numba's."""
     counting = kernel(lambda x: np.zeros(3)[0] + x, keep=False, allocates=False)
     with pytest.raises(TypingError, match="zeros"):
         counting(1.0)

@@ -13,7 +13,7 @@ from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.rendering import chart, palette, triple_point
 from cz_gym.rendering.canvas import Canvas, Frame
 from cz_gym.rendering.record import Ending, Record
-from cz_gym.rendering.scene import SetPoints, layout, numbers
+from cz_gym.rendering.scene import layout, numbers
 from cz_gym.rendering.view import record_of
 from cz_gym.signals import INFO
 from cz_gym.units import KILO, MM, MM_PER_MIN
@@ -87,7 +87,7 @@ def test_the_chart_ends_at_the_true_error(picture: tuple[Frame, Record]) -> None
 
 def test_the_numbers_are_the_records_in_the_units_they_name(record: Record) -> None:
     p, last = record.puller, record.last
-    rows = [row[:2] for group in numbers(record, SetPoints(p.v_0, p.Q_H_0)) for row in group]
+    rows = [row[:2] for group in numbers(record, p.inputs_0) for row in group]
     assert rows == [
         ("by the camera", f"{(last('r_br_measured') - p.ring_bias) / MM:.2f} mm"),
         ("reference", f"{last('r_ref') / MM:.2f} mm"),
