@@ -183,7 +183,7 @@ def _write_all(given: argparse.Namespace) -> None:
     if given.out is not None:
         os.environ["MINARI_DATASETS_PATH"] = str(given.out.resolve())
     chosen = [
-        (name, find_policy(name, make_config(scenario, observation="history")), scenario)
+        (name, find_policy(name, make_config(scenario)), scenario)
         for scenario in given.scenarios.split(",")
         for name in given.policies.split(",")
     ]

@@ -6,6 +6,7 @@ The plant is the environment's own; nothing is approximated (:mod:`cz_gym.engine
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from operator import index
 from typing import Any, NamedTuple
 
@@ -74,7 +75,8 @@ class DifferentiableBatch:
         latency = max(scenario.sensor.latency for scenario in config.scenario.scenarios)
         if latency > config.control_interval:
             raise CzError(f"the camera's latency of {latency:g} s is longer than the control interval")
-        self.config, self._made_for = config, config.made_for
+        self.config = config = replace(config, observation="measured")
+        self._made_for = config.made_for
         self._batch = Batch(config, self.num_envs, threads)
         self._gather, self._tangents = build_tangents(config.meniscus)
         self._out = self._batch.new_out()

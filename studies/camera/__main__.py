@@ -80,7 +80,7 @@ def read_rings(detector: RingDetector, r_c: Any, h_c: Any, images: Any = None) -
 
 def respond(detector: RingDetector, change: float, model: str) -> Response:
     """Change the pull speed of a crystal at rest, and watch it through ``observation="camera"``."""
-    env, over = CzEnv("nominal", model, "camera", INTERVAL, HORIZON, info="all"), False
+    env, over = CzEnv("nominal", model, "camera", INTERVAL, HORIZON, action="direct", info="all"), False
     shown = [env.reset(seed=0)]
     while not over:
         image, _, terminated, truncated, info = env.step(np.array([change, 0.0], np.float32))

@@ -105,7 +105,7 @@ def batched(env: Any, num_envs: int) -> Stepper:
 
 def ours(num_envs: int, threads: int = 1) -> Stepper:
     """The native batch, its slots at random steps of their episodes, so that resets are spread out."""
-    env = CzVectorEnv(num_envs, threads=threads)
+    env = CzVectorEnv(num_envs, observation="measured", threads=threads)
     env.reset(seed=0)
     env._batch.memory.slots["k"] = np.random.default_rng(0).integers(0, env.config.steps, num_envs)
     return batched(env, num_envs)
@@ -113,14 +113,14 @@ def ours(num_envs: int, threads: int = 1) -> Stepper:
 
 def without_resets(num_envs: int, threads: int) -> Stepper:
     """The native batch, repeating the same first minutes without resets, to compare with the bare loop."""
-    env = CzVectorEnv(num_envs, threads=threads)
+    env = CzVectorEnv(num_envs, observation="measured", threads=threads)
     env.reset(seed=0)
     return repeated(env._batch, batched(env, num_envs))
 
 
 def bare(num_envs: int, threads: int) -> Stepper:
     """The compiled plant and bright ring alone: no sensors, observation, reward, info or Python shell."""
-    batch = Batch(make_config(), num_envs, threads)
+    batch = Batch(make_config(observation="measured"), num_envs, threads)
     rings = np.zeros(num_envs)
     batch.reset(range(num_envs), [(i, i) for i in range(num_envs)], batch.new_out())
     return repeated(batch, Stepper(num_envs, lambda: batch.advance(rings), batch.close))

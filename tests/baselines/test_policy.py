@@ -96,7 +96,7 @@ def test_actions_are_for_the_environment_of_the_controller_alone(name):
     if name == "ekf-mpc":
         pytest.importorskip("casadi", reason="needs the extra mpc")
     entry = find_controller(name)
-    config = make_config("nominal", observation=entry.observation, horizon=60.0, **OTHER)
+    config = make_config("nominal", observation=entry.observation, action="direct", horizon=60.0, **OTHER)
     policy = entry.make(config)
     if hasattr(policy, "for_episodes"):
         policy = policy.for_episodes(config, np.arange(1))
@@ -114,13 +114,14 @@ def test_actions_are_for_the_environment_of_the_controller_alone(name):
 @pytest.mark.parametrize("policy", [CompensatedPID(), FilteredPID(), Industrial(), LQG()])
 @pytest.mark.parametrize("option", OTHER)
 def test_another_environment_refuses_a_controller_unless_it_is_for_any(policy, option):
-    env = CzVectorEnv(1, scenario="nominal", **{option: OTHER[option]})
+    settings = {**PLAIN, option: OTHER[option]}
+    env = CzVectorEnv(1, scenario="nominal", **settings)
     observation, _ = env.reset(seed=0)
     with pytest.raises(InvalidAction, match="made for"):
         env.step(policy.predict(observation)[0])
     with pytest.raises(CzError, match="made for"):
-        rollout(policy, make_config("nominal", horizon=60.0, **{option: OTHER[option]}), [0])
-    own = policy.for_config(make_config(**{option: OTHER[option]}))
+        rollout(policy, make_config("nominal", horizon=60.0, **settings), [0])
+    own = policy.for_config(make_config(**settings))
     assert own.settings[option] == OTHER[option]
     anywhere = replace(policy, any_environment=True)
     assert anywhere.made_for is None

@@ -114,8 +114,8 @@ def test_a_lost_crystal_stops_counting() -> None:
 
 @pytest.mark.parametrize("scenario", ["hard", "all"])
 def test_the_environment_s_own_crystals_and_observations(scenario: str) -> None:
-    config = make_config(scenario, action="smooth", observation="measured")
-    batch, env = DifferentiableBatch(config, 4), CzVectorEnv.from_config(config, 4)
+    """Also where the config observes something else."""
+    batch, env = DifferentiableBatch(make_config(scenario), 4), CzVectorEnv(4, scenario, observation="measured")
     _, measured = batch.reset([5, 6, 7, 8])
     first, infos = env.reset(seed=5)
     np.testing.assert_array_equal(measured, first)

@@ -35,7 +35,7 @@ SMALL = {
     "TEST_SEEDS[:50]": "TEST_SEEDS[:2]",
     "TRAINING_SEEDS[:20]": "TRAINING_SEEDS[:2]",
     "VALIDATION_SEEDS[:10]": "VALIDATION_SEEDS[:2]",
-    "learn(2_000_000)": "learn(8192)",
+    "learn(5_000_000)": "learn(8192)",
     "seeds=range(20)": "seeds=range(2)",
     "seeds=range(10)": "seeds=range(2)",
     "--scenarios randomized --out mine": "--scenarios reference-b --episodes 1 --quiet --out mine",
