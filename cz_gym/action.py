@@ -13,7 +13,7 @@ class MadeFor(NamedTuple):
     """The environment that a controller or an agent was made for."""
 
     action: str
-    """Meaning of its actions: "direct", "smooth" or "rate" (:func:`cz_gym.task.drives_of`)."""
+    """Mode of its actions: "direct", "smooth" or "rate" (:func:`cz_gym.task.drives_of`)."""
     control_interval: float
     """Time between its actions [s]."""
     plant: str

@@ -64,7 +64,7 @@ class Config:
     model: str | float | None = None
     observation: str = "history"
     action: str = "smooth"
-    """What an action means: "direct", "smooth" or "rate" (:func:`cz_gym.task.drives_of`)."""
+    """Action mode: "direct", "smooth" or "rate" (:func:`cz_gym.task.drives_of`)."""
     control_interval: float = 5.0
     """Time between actions [s]."""
     horizon: float = 10800.0
@@ -91,7 +91,7 @@ class Config:
 
     @property
     def plant_hash(self) -> str:
-        """SHA-256 of what the crystal obeys: the equations' code, the meniscus' and the parameters (16 hex digits)."""
+        """SHA-256 of the plant: code of its equations and its meniscus, and its parameters (16 hex digits)."""
         return _plant_hash(self.parameters, self.meniscus)
 
     @property

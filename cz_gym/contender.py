@@ -1,4 +1,4 @@
-"""Who takes part in a comparison: a controller or an agent by name, and how it is built."""
+"""Contenders: controllers and agents by name, and functions that build them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Contender:
     quoted: bool = False
     """Whether it stands in short tables and small figures, and beside a controller of the user's own."""
     action: str = "direct"
-    """Meaning of its actions (:func:`cz_gym.task.drives_of`)."""
+    """Mode of its actions (:func:`cz_gym.task.drives_of`)."""
     own: bool = False
     """Whether it comes from the user's own file: figures show it first."""
     training_seeds: tuple[int, ...] = ()
@@ -53,7 +53,7 @@ class Contender:
 
     @property
     def knows(self) -> str:
-        """What it was told of the plant, for the groups of a table."""
+        """Its group in tables, by its knowledge of the plant."""
         if self.bound:
             return "bounds, told what no sensor shows"
         if not self.learned:
@@ -69,7 +69,7 @@ class Contender:
             yield replace(self, make=partial(given, policy), training_seeds=(seed,), trained=(policy,))
 
     def facts(self) -> dict[str, Any]:
-        """What ``benchmark.json`` says of it."""
+        """Its entry in ``benchmark.json``."""
         known = ("name", "observation", "meaning", "training_seeds", "privileged", "slow", "action", "own")
         return {name: getattr(self, name) for name in known}
 

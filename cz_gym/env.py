@@ -58,7 +58,7 @@ def observation_space(observation: str) -> Any:
 
 
 def check_options(options: dict[str, Any] | None, allowed: tuple[str, ...] = _OPTIONS) -> dict[str, Any]:
-    """Reset's options, the scenario found; raise CzError for unknown ones, and for a scenario together with a state."""
+    """Return reset's options with the scenario as an object; raise CzError for unknown or conflicting ones."""
     if options is not None and not isinstance(options, Mapping):
         raise CzError(f"reset options must be a dict, not {options!r}")
     given = dict(options or {})
@@ -73,10 +73,10 @@ def check_options(options: dict[str, Any] | None, allowed: tuple[str, ...] = _OP
 
 
 class Form:
-    """What the scalar and the batched form of the environment share: settings, and pickled copies that go on alike."""
+    """Base of the scalar and the batched environment: construction from a config, and pickling."""
 
     FACTS: tuple[str, ...] = ("_over", "_begun", "_named", "spec", "action_space", "observation_space")
-    """Attributes that a copy has beside its settings and its slots."""
+    """Attributes that are pickled besides settings and slots."""
     _setup: Any
     _settings: tuple[Any, ...]
     _batch: Batch
@@ -87,15 +87,15 @@ class Form:
     def from_config(cls, config: Config, *settings: Any, **named: Any) -> Self:
         """Make the environment from settings that :func:`cz_gym.config.make_config` has checked.
 
-        What the config does not hold follows: of :class:`CzEnv` ``render_mode``, ``render_size`` and ``info``, of
-        :class:`cz_gym.CzVectorEnv` ``num_envs``, ``autoreset_mode``, ``threads`` and ``info``.
+        The other arguments are ``render_mode``, ``render_size`` and ``info`` for :class:`CzEnv`, and ``num_envs``,
+        ``autoreset_mode``, ``threads`` and ``info`` for :class:`cz_gym.CzVectorEnv`.
         """
         env = cls.__new__(cls)
         env._setup(check_config(config), *settings, **named)
         return env
 
     def __getstate__(self) -> dict[str, Any]:
-        """Settings, every slot's state and random stream."""
+        """The settings, the state of every slot, and the attributes named in ``FACTS``."""
         slots = [self._batch.save(i) for i in range(self._batch.num_envs)] if self._begun else None
         return {"settings": self._settings, "slots": slots, "facts": {name: getattr(self, name) for name in self.FACTS}}
 
@@ -108,7 +108,7 @@ class Form:
             setattr(self, name, fact)
 
     def _restart_view(self) -> None:
-        """Show the crystal from here on, where it is shown."""
+        """Restart the record of the picture; only the scalar form has one."""
 
 
 class CzEnv(Form, gym.Env[Observation, Action]):
@@ -294,7 +294,7 @@ class CzEnv(Form, gym.Env[Observation, Action]):
 
 
 class Info(dict[str, Any]):
-    """A step's ``info``. Stable-baselines3 copies it deeply at every step: numbers and names are copied at once."""
+    """A step's ``info`` with a fast deep copy: stable-baselines3 makes one at every step."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Info:
         for value in self.values():

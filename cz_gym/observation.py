@@ -1,8 +1,8 @@
-"""Observations: what an environment shows of its signals, scaled, and how to read it back.
+"""Observations: scaled and clipped signals, and their decoding.
 
 An observed value is ``quantity / scale`` clipped to +-10, float32; :mod:`cz_gym.signals` has quantities and scales.
-"history" adds the past: means over neighbouring spans of it differ by micrometres, the readings themselves by
-millimetres, so it is shown as differences of means, on scales of their own.
+"history" adds the past as differences of the means of neighbouring time spans. These differ by micrometres, readings by
+millimetres, so the differences have scales of their own.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ PAST_SCALES = {"ring_error": 0.2 * MM, "v_p": 0.2 * PULL_SCALE, "T_1": 0.5, "Q_H
 LAGGED = tuple(PAST_SCALES)
 """Signals whose past "history" shows."""
 LAGS = (5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0, 240.0, 360.0, 480.0, 720.0, 960.0, 1200.0)
-"""Ages [s] that "history" reaches back to, in spans: each span holds the samples since the age before."""
+"""Ages [s] at which the time spans of "history" end; each span starts at the age before."""
 
 
 class Relative(NamedTuple):
@@ -47,7 +47,7 @@ class Relative(NamedTuple):
     scale: float
     """Scale of the difference [unit of the signal]."""
     meaning: str
-    """What the difference is, for people."""
+    """Description for tables."""
 
 
 RELATIVE = {
@@ -109,7 +109,7 @@ def decode(observation: npt.ArrayLike, v_0: float = PULL_SCALE) -> Measured:
 
 
 def to_measured(history: npt.ArrayLike, v_0: float = PULL_SCALE) -> npt.NDArray[np.float32]:
-    """The "measured" observation beside a "history" one, shape (..., channels), to the rounding of float32."""
+    """Convert "history" observations, shape (..., channels), to "measured" ones, exact to the rounding of float32."""
     measured = np.stack(decode(history, v_0), axis=-1) / scales(MEASURED, v_0)
     return np.clip(measured, -CLIP, CLIP).astype(np.float32)
 

@@ -1,4 +1,4 @@
-"""Plausible ranges of the numbers that a user types in, and the unit that one outside of them was probably typed in."""
+"""Plausible ranges of numbers from the user, with a guess at the unit that was meant."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN, PERCENT
 
 
 class Slip(NamedTuple):
-    """A unit that numbers are often typed in by mistake: the SI value is ``number * factor + offset``."""
+    """A unit that is often used by mistake; the SI value is ``number * factor + offset``."""
 
     unit: str
     factor: float

@@ -1,7 +1,7 @@
 """The table of signals: every number that an observation or ``info`` holds, and the function that computes it.
 
-A signal is a field of :class:`Measured` (what sensors and recipe say), :class:`TrueState` (what the plant does) or
-:class:`Logged` (what ``info`` says); its annotation gives unit, scale and meaning. The function below each class
+A signal is a field of :class:`Measured` (readings and recipe), :class:`TrueState` (the plant) or :class:`Logged`
+(``info``); its annotation gives unit, scale and meaning. The function below each class
 computes its fields by name, in SI units. Channels, decoding, ``info`` and the pages' tables all follow from here.
 """
 
@@ -31,14 +31,14 @@ TEMPERATURE_SCALE = 5.0
 
 
 class Signal(NamedTuple):
-    """What a number is."""
+    """Unit, scale and meaning of a signal."""
 
     unit: str
     """SI unit; "1" for none."""
     scale: float
-    """An observation holds the number over this [unit]."""
+    """Observations hold the number divided by this [unit]."""
     meaning: str
-    """What it is, for people."""
+    """Description for tables."""
 
 
 class Channel(NamedTuple):
@@ -149,7 +149,7 @@ def true_state(slot: Any, measured: Any, t: Any) -> Any:
 
 
 class Logged(NamedTuple):
-    """What ``info`` says of a step, in SI units."""
+    """The entries of a step's ``info``, in SI units."""
 
     r_c: Annotated[Any, Signal("m", 1.0, "true crystal radius")]
     r_br: Annotated[Any, Signal("m", 1.0, "true radius of the bright ring")]
@@ -207,11 +207,11 @@ MEASURED = channels(Measured)
 STATE = channels(TrueState)
 """Channels of ``observation="state"``."""
 INFO_ROWS = channels(Logged)
-"""What ``info`` says beside the observation."""
+"""Channels of ``info``."""
 INFO = Logged._fields
 """Names of the entries of ``info``."""
 LEAN = ("r_c", "r_ref")
-"""What ``info`` holds unless all of it is asked for: libraries copy it key by key, which costs more than the step."""
+"""Entries of ``info="lean"``; libraries copy info key by key, which costs more than the step."""
 
 
 def scales(listed: tuple[Channel, ...], v_0: float) -> npt.NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""The task: the limits within which a crystal grows, and what an action asks of the drives."""
+"""The task: the limits within which a crystal grows, and the effect of an action on the drives."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ class Drives(NamedTuple):
 DIRECT = Drives(0.0, 1.0, 1.0)
 """The drives of ``action="direct"``: the action is their deviation from nominal."""
 ACTIONS = ("direct", "smooth", "rate")
-"""Names of the meanings that an action can have."""
+"""The action modes."""
 
 
 def drives_of(action: str, control_interval: float) -> Drives:
-    """How the drives follow actions of this kind at this control interval [s].
+    """The effect of actions in this mode on the drives, at this control interval [s].
 
     "smooth": first-order lags. A held action a brings the pull speed to v_0 (1 + a) and the heater to
     Q_H0 + 5 kW a with a time constant of 50 s; left alone they return to nominal. So noise on the action is bounded,

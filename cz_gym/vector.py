@@ -30,7 +30,7 @@ from .signals import INFO, LEAN
 _CLIPPED = INFO.index("action_clipped")
 _LEAN_ROWS = tuple(map(INFO.index, LEAN))
 _KEYS = {everything: (n, tuple(f"_{name}" for name in n)) for everything, n in ((False, LEAN), (True, INFO))}
-"""Entries of ``info`` and of their masks, for lean and for all of it."""
+"""Names of the entries of ``info`` and of their masks, for ``info="lean"`` (False) and ``"all"`` (True)."""
 Array = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
 
@@ -40,8 +40,8 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
 
     Arguments are those of :class:`CzEnv`, with ``num_envs``, ``autoreset_mode`` (a
     :class:`gymnasium.vector.AutoresetMode` or its value; each episode is re-drawn from the slot's own stream) and
-    ``threads`` (None: one per processor it may use and 256 slots; results do not depend on it). Nothing returned is
-    reused by a later call.
+    ``threads`` (None: one per processor it may use and 256 slots; results do not depend on it). Returned arrays
+    are never written again.
     """
 
     metadata: dict[str, Any] = CzEnv.metadata | {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
@@ -186,7 +186,7 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the threads."""
-        # Gymnasium up to 1.1 closes what was refused when it was made, and so never had any.
+        # Gymnasium 1.1 also closes an environment whose construction failed.
         if hasattr(self, "_batch"):
             self._batch.close()
 

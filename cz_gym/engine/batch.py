@@ -1,4 +1,4 @@
-"""A batch of slots: the arrays, the draws at reset and the compiled step, on as many threads as pay.
+"""A batch of slots: the arrays, the draws at reset and the compiled step, on several threads if large.
 
 The scalar environment is a batch of one; both environments are thin shells over this class.
 """
@@ -37,9 +37,9 @@ from .kernels import build_kernels
 from .layout import SLOT, Clock, Memory, ObservationScales, Out, info_width
 
 SLOTS_PER_THREAD, SLOTS_AT_ONCE = 256, 128
-"""Slots below which a step gets no further thread, and the slots that a thread takes at once."""
+"""Least slots per thread in a step, and slots that a thread takes at once."""
 DRAWS_PER_THREAD, DRAWS_AT_ONCE = 16, 16
-"""Draws below which a reset gets no further thread, and the draws that a thread takes at once."""
+"""Least draws per thread in a reset, and draws that a thread takes at once."""
 _SAVED = ("slot", "history", "frames")
 Key = tuple[int, int]
 """The 128 random bits from which an episode is drawn, as two 64-bit words."""

@@ -1,7 +1,7 @@
 """The compiled loops: draws, drives, plant, sensors, observation and reward, for one slot or ten thousand.
 
 The equations are the functions of :mod:`cz_gym.physics.plant`, :mod:`cz_gym.episodes.schedule` and :mod:`cz_gym.task`,
-compiled in; this module says in which order a slot goes through them.
+compiled in; this module calls them in order for each slot.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""From a slot's signals to the arrays of a step: scaled channels, the memory of "history", the rows of ``info``."""
+"""Output of a slot's signals: scaled channels, the memory of "history", the rows of ``info``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _PAST_CHANGE = tuple(MEASURED[at].scale / PAST_SCALES[name] for at, name in zip(
 _PLACE = tuple(Measured._fields.index(name) for name in RELATIVE)
 _TO = tuple(Measured._fields.index(relative.to) for relative in RELATIVE.values())
 _CHANGE = tuple(MEASURED[at].scale / relative.scale for at, relative in zip(_PLACE, RELATIVE.values(), strict=True))
-"""Signals shown relative to another one: where they stand, where the other one does, and how their scale changes."""
+"""Signals relative to another one: their index, the index of the other, and the change of their scale."""
 _RING = _REMEMBERED[0]
 _RING_SCALE = MEASURED[_RING].scale
 

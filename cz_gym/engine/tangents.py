@@ -1,8 +1,8 @@
 """Derivatives of a step, by complex steps through its own functions and the chain rule.
 
 The differentiable state of a slot is :data:`SMOOTH`; :func:`build_tangents` compiles the loop that writes the
-derivatives of the next state and of the cost by this state and by the action. f'(x) = Im f(x + i h) / h, where nothing
-is subtracted, so that h can be as small as one likes (Squire and Trapp, SIAM Review 1998).
+derivatives of the next state and of the cost by this state and by the action. f'(x) = Im f(x + i h) / h, without
+subtraction, so h can be arbitrarily small (Squire and Trapp, SIAM Review 1998).
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ def _column(A: Any, j: Any, k: Any) -> None:
 
 @force_inlined
 def _rates_by(A: Any, x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
-    """The rates; their derivatives into ``A``.
+    """Return the rates and write their derivatives into ``A``.
 
-    A number is complex only where a step is taken, and all are computed before any is written: so the compiler computes
-    once what they share.
+    Only the number that is stepped is complex, and all rates are computed before any is written: this lets the compiler
+    share their common terms.
     """
     by_r = rates(State(_step(x.r_c), x.h_c, x.T_1, x.T_2, x.T_b), u, d, p, slope)
     by_h = rates(State(x.r_c, _step(x.h_c), x.T_1, x.T_2, x.T_b), u, d, p, slope)

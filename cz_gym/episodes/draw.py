@@ -1,8 +1,8 @@
 """The draw of an episode, compiled: streams from one key, then the puller, ramps, constants and freezes.
 
 Each stream is seeded with its own number (:func:`.record.stream_number`), so that families never share a random number.
-Scalars come first on each stream; what is random at every step follows as the episode goes
-(:mod:`cz_gym.episodes.noise`), so a longer horizon extends a draw and never changes it.
+Scalars come first on each stream, and the noise of each step after them (:mod:`cz_gym.episodes.noise`), so a longer
+horizon extends a draw and never changes it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .scenario import DRAW_SPAN, MAX_FLAGGED
 STREAMS = len(Stream)
 _NUMBERS = tuple(map(stream_number, range(STREAMS)))
 SHORTEST = 1e-9
-"""Length [s] of a ramp that is a jump."""
+"""Least length of a ramp [s]; one of zero length is a jump."""
 _START, _PARAMETERS, _SCHEDULE = int(Stream.START), int(Stream.PARAMETERS), int(Stream.SCHEDULE)
 _INTERFACE, _SENSOR, _FAULTS = int(Stream.INTERFACE), int(Stream.SENSOR), int(Stream.FAULTS)
 _SPREAD_NUMBERS, _HOT_ZONE_NUMBERS, _FAULT_NUMBERS = 7, 7, 5 + 3 * FREEZES
@@ -37,7 +37,7 @@ def seed_streams(streams: Any, key: Any) -> None:
 
 @jittable
 def between(limits: Any, u: Any) -> Any:
-    """The number at share u of a range."""
+    """Linear interpolation in a range, u from 0 to 1."""
     return limits[0] + (limits[1] - limits[0]) * u
 
 
@@ -48,7 +48,7 @@ def _factor(spread: Any, u: Any) -> Any:
 
 @jittable
 def _log_factor(limits: Any, u: Any) -> Any:
-    """The number at share u of a range on a logarithmic scale."""
+    """Logarithmic interpolation in a range, u from 0 to 1."""
     return limits[0] * np.exp(np.log(limits[1] / limits[0]) * u) if limits[0] < limits[1] else limits[0]
 
 

@@ -1,8 +1,8 @@
 """The random numbers of every step: interface fluctuation, sensor noise, drop-outs and outliers.
 
 ``streams`` are the episode's (:mod:`cz_gym.episodes.rng`), ``e`` its :class:`cz_gym.episodes.record.Episode`. Each
-kind is drawn front to back on a stream of its own, so that it is settled by the episode's key whenever it is drawn:
-step by step as a slot goes, or as a whole series.
+kind is drawn in order of time from a stream of its own, so it depends on the episode's key alone, whether drawn step by
+step or as a whole series.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def first_fluctuation(e: Any, streams: Any) -> Any:
 
 @jittable
 def next_fluctuation(e: Any, streams: Any, fast: Any, slow: Any) -> Any:
-    """The two processes one point of the grid on, discretised exactly: x <- keep x + sqrt(1 - keep^2) n."""
+    """The two processes at the next grid point, discretised exactly: x <- keep x + sqrt(1 - keep^2) n."""
     first, second = two_normals(streams[_INTERFACE]) if e.sd_fast > 0.0 or e.sd_slow > 0.0 else (0.0, 0.0)
     return e.keep_fast * fast + e.kick_fast * first, e.keep_slow * slow + e.kick_slow * second
 

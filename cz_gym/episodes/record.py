@@ -150,11 +150,11 @@ def _record(members: dict[str, Any]) -> np.dtype[Any]:
 
 
 RECORD = np.dtype([(family, _record(members)) for family, members in _members(Scenario("plain"))])
-"""A scenario as the compiled draws read it: a record of families, each a number or a pair a member."""
+"""A scenario as a record for the compiled draws: families of numbers and pairs."""
 
 
 class Lots(NamedTuple):
-    """What episodes are drawn from, as the compiled draws read it; read-only arrays, one row a scenario."""
+    """Scenarios as read-only arrays for the compiled draws, one row a scenario."""
 
     records: npt.NDArray[Any]
     """The scenarios' numbers: records of :data:`RECORD`."""

@@ -72,7 +72,7 @@ class Draw(Enum):
 
 
 class Member(NamedTuple):
-    """What a scenario's member says of itself: the metadata ``member`` of its field."""
+    """Metadata of a scenario's number, under the key ``member`` of its field."""
 
     draw: Draw
     low: float
@@ -80,13 +80,13 @@ class Member(NamedTuple):
     high: float
     """Largest allowed value, the default apart."""
     slip: Slip | None
-    """Unit that the number may have been typed in by mistake."""
+    """Unit that users may have meant instead."""
     later: bool
-    """Whether it was added after hashes were published: its default is then no part of the hash."""
+    """Whether it was added after hashes were published; its default is then left out of the hash."""
 
 
 def member(default: Any, draw: Draw, low: float, high: float, slip: Slip | None = None, later: bool = False) -> Any:
-    """A field of a family of disturbances; every one says whether it is random and what is plausible."""
+    """A dataclass field with :class:`Member` metadata: its randomness and its plausible range."""
     return field(default=default, metadata={"member": Member(draw, low, high, slip, later)})
 
 

@@ -1,4 +1,4 @@
-"""The signals of an episode that follow from time: reference, recipe, hidden drift and melt loss at t [s].
+"""The signals of an episode that depend on time alone: reference, recipe, hidden drift and melt loss at t [s].
 
 ``e`` is an :class:`cz_gym.episodes.record.Episode` or a record with its fields, ``p`` a puller.
 """
@@ -35,7 +35,7 @@ def drift(t: Any, e: Any) -> Any:
 
 @jittable
 def recipe(t: Any, e: Any) -> Any:
-    """T_1,ref(t) - T_1,0 = e(t) + p(t) [K]: what the recipe asks for: error plus drift."""
+    """T_1,ref(t) - T_1,0 = e(t) + p(t) [K]: the recipe: its error plus the drift."""
     return e.recipe_amount * progress(t, e.recipe_start, e.recipe_duration) + drift(t, e)
 
 

@@ -1,8 +1,8 @@
 """An episode's draw: a value made at reset from one 128-bit key, and the series that follow from it.
 
-Ramps are kept as parameters and evaluated where needed (:mod:`cz_gym.episodes.schedule`); what is random at every step
-follows on the episode's own streams (:mod:`cz_gym.episodes.noise`), drawn by a slot as it goes, or here as whole
-series.
+Ramps are kept as parameters and evaluated where needed (:mod:`cz_gym.episodes.schedule`). The noise of each step comes
+from the episode's own streams (:mod:`cz_gym.episodes.noise`): the environment draws it step by step, this module as
+whole series.
 """
 
 from __future__ import annotations
@@ -42,30 +42,24 @@ def new_series(grid_points: int, samples: int) -> Series:
 
 def draw_factors(scenario: Scenario, mix: Range, key: tuple[int, int]) -> Factors:
     """Draw the puller; ``mix`` is the range of the share of conduction [-]."""
-    return Factors(*_factors(lots_of(scenario).records, np.array(mix, np.float64), _words(key), _streams()))
+    return Factors(*_factors(lots_of(scenario).records, np.array(mix, np.float64), np.array(key, np.uint64)))
 
 
 def draw_episode(scenario: Scenario, key: tuple[int, int], out: Series) -> Episode:
     """Draw an episode: ramps and constants are returned, series written into ``out``."""
-    return Episode(*_episode(lots_of(scenario).records, _words(key), _streams(), out.interface, out.noise, out.freezes))
-
-
-def _words(key: tuple[int, int]) -> npt.NDArray[np.uint64]:
-    return np.array(key, np.uint64)
-
-
-def _streams() -> npt.NDArray[np.uint64]:
-    return np.zeros((STREAMS, WORDS), np.uint64)
+    return Episode(*_episode(lots_of(scenario).records, np.array(key, np.uint64), *out))
 
 
 @kernel
-def _factors(record: Any, mix: Any, key: Any, streams: Any) -> Any:
+def _factors(record: Any, mix: Any, key: Any) -> Any:
+    streams = np.zeros((STREAMS, WORDS), np.uint64)
     seed_streams(streams, key)
     return draws.draw_factors(record[0], mix, streams)
 
 
 @kernel
-def _episode(record: Any, key: Any, streams: Any, interface: Any, noise: Any, freezes: Any) -> Any:
+def _episode(record: Any, key: Any, interface: Any, noise: Any, freezes: Any) -> Any:
+    streams = np.zeros((STREAMS, WORDS), np.uint64)
     seed_streams(streams, key)
     e = draws.draw_episode(record[0], streams, freezes)
     draw_series(e, streams, interface, noise)

@@ -1,4 +1,4 @@
-"""Hashes of code: of what functions compute, and of what files say, whatever their formatting and comments."""
+"""Hashes of functions and of files that ignore formatting and comments."""
 
 from __future__ import annotations
 

@@ -100,7 +100,7 @@ def _compiled_fetch(array: Any, at: Any) -> Any:
 
 
 def column(kind: Any, array: Any, at: Any, lane: Any) -> Any:
-    """The named tuple of a kind whose fields stand in a column of an array, from row ``at`` on."""
+    """Read a named tuple of this kind from a column of an array, from row ``at`` on."""
     return kind(*(array[at + row, lane] for row in range(len(kind._fields))))
 
 
@@ -125,7 +125,7 @@ def _compiled_set_column(kind: Any, values: Any, array: Any, at: Any, lane: Any)
 
 
 def _written(source: str) -> Any:
-    """The function ``compiled`` of a text: one statement a field, for a loop over fields would not be unrolled."""
+    """The function ``compiled`` that the source text defines; numba would not unroll a loop over fields."""
     names: dict[str, Any] = {}
     exec(source, names)
     return names["compiled"]

@@ -22,7 +22,7 @@ from cz_gym.units import MM, MM_PER_MIN
 
 
 class Quantity(NamedTuple):
-    """What a number is: unit, meaning, where its value comes from, and the range in which it is plausible."""
+    """Unit, meaning, source and plausible range of a parameter."""
 
     unit: str
     meaning: str
@@ -32,7 +32,7 @@ class Quantity(NamedTuple):
     high: float = math.inf
     """Largest plausible value."""
     slip: Slip | None = None
-    """Unit that the number may have been typed in by mistake."""
+    """Unit that users may have meant instead."""
 
 
 _LITERATURE = "silicon literature"
@@ -42,7 +42,7 @@ _BELOW_RIGHT_ANGLE = math.nextafter(math.pi / 2.0, 0.0)
 
 
 class Parameters(NamedTuple):
-    """Everything that is typed in about a puller and its material; SI units, kelvin, radians.
+    """The parameters of a puller and its material; SI units, kelvin, radians.
 
     Nominal temperatures, power, meniscus height and heat fluxes are *derived* from these by
     :func:`cz_gym.physics.plant.make_puller`. Another puller or material is another instance:
@@ -111,7 +111,7 @@ class Parameters(NamedTuple):
 
 
 def describe(kind: type[Any] = Parameters) -> dict[str, Quantity]:
-    """Name of each parameter of that kind of tuple to its :class:`Quantity`."""
+    """Map the name of each field of this kind of tuple to its :class:`Quantity`."""
     hints = get_type_hints(kind, include_extras=True)
     return {name: hints[name].__metadata__[0] for name in kind._fields}
 

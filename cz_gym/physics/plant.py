@@ -263,4 +263,4 @@ def hidden_load(p_drift: Any, p: Any) -> Any:
 
 
 EQUATIONS = (derive_puller, rates, rk4, hidden_load)
-"""The functions that the plant is, whatever its meniscus and its parameters."""
+"""The functions that define the plant, for :attr:`cz_gym.config.Config.plant_hash`."""

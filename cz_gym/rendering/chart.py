@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -11,7 +10,6 @@ from cz_gym.units import HOUR, MINUTE, MM
 
 from . import palette
 from .canvas import Box, Canvas
-from .palette import Colour
 from .record import Floats, Record
 
 RANGES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
@@ -22,15 +20,6 @@ TICKS = (1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0)
 """Steps of the time axis [min]."""
 MARGINS = (38.0, 18.0, 10.0, 14.0)
 """Room for the axes' numbers and the legend: left, top, right, bottom [nominal px]."""
-
-
-class Trace(NamedTuple):
-    """A line of the chart: times [s] and radius errors [m], NaN where there is none."""
-
-    t: Floats
-    error: Floats
-    colour: Colour
-    width: float = 1.7
 
 
 def first_at_least(value: float, steps: Sequence[float]) -> float:
@@ -45,22 +34,13 @@ def error_range(error: Floats) -> float:
 
 
 def draw(canvas: Canvas, box: Box, record: Record) -> None:
-    """The radius error by the camera, and the true one."""
-    camera, true = Trace(record.t, record.camera_error, palette.NOISE, 0.8), Trace(record.t, record.error, palette.TRUE)
-    # The camera's outliers must not set the scale.
-    draw_traces(canvas, box, record.config.horizon, error_range(true.error), [camera, true])
-    for x, text, colour in (
+    """The radius errors by the camera and the true ones, against time; a dot marks the newest true one."""
+    for left, text, colour in (
         (38, "radius error [mm]", palette.FAINT), (136, "by the camera", palette.CAMERA), (220, "true", palette.TRUE),
     ):  # fmt: skip
-        canvas.text(box.x + x, box.y + 4, text, colour)
-
-
-def draw_traces(canvas: Canvas, box: Box, horizon: float, limit: float, traces: Sequence[Trace]) -> None:
-    """Radius errors from -limit to limit [m] against time from 0 to the horizon [s].
-
-    A dot is the newest value of the last trace.
-    """
-    plot = box.inner(*MARGINS)
+        canvas.text(box.x + left, box.y + 4, text, colour)
+    # The camera's outliers must not set the scale.
+    plot, horizon, limit = box.inner(*MARGINS), record.config.horizon, error_range(record.error)
     middle, per_metre = plot.y + 0.5 * plot.h, 0.5 * plot.h / limit
     band = min(TOLERANCE, limit) * per_metre
     canvas.rectangle(palette.BAND, Box(plot.x, middle - band, plot.w, 2.0 * band))
@@ -69,13 +49,14 @@ def draw_traces(canvas: Canvas, box: Box, horizon: float, limit: float, traces: 
         canvas.lines(palette.RIM, [plot.x, plot.right], y, 0.6)
         canvas.text(plot.x - 4, y - 6, text, palette.FAINT, 9.0, 1.0)
     with canvas.clip(plot):
-        for trace in traces:
-            x, y_line = plot.x + trace.t / horizon * plot.w, middle - trace.error * per_metre
-            for piece in np.split(np.arange(len(x)), np.flatnonzero(np.isnan(y_line))):
-                piece = piece[np.isfinite(y_line[piece])]
-                canvas.lines(trace.colour, x[piece], y_line[piece], trace.width)
-    if np.isfinite(y_line[-1]):
-        canvas.dot(traces[-1].colour, x[-1], min(max(y_line[-1], plot.y), plot.bottom), 2.6)
+        x, camera = plot.x + record.t / horizon * plot.w, middle - record.camera_error * per_metre
+        for piece in np.split(np.arange(len(x)), np.flatnonzero(np.isnan(camera))):
+            piece = piece[np.isfinite(camera[piece])]
+            canvas.lines(palette.NOISE, x[piece], camera[piece], 0.8)
+        true = middle - record.error * per_metre
+        canvas.lines(palette.TRUE, x, true, 1.7)
+    if np.isfinite(true[-1]):
+        canvas.dot(palette.TRUE, x[-1], min(max(true[-1], plot.y), plot.bottom), 2.6)
 
 
 def _draw_time_axis(canvas: Canvas, plot: Box, horizon: float) -> None:

@@ -26,7 +26,7 @@ class Layout(NamedTuple):
 
 
 def layout(box: Box) -> Layout:
-    """The panels of a picture; the triple point gets what the others leave."""
+    """The panels of a picture; the triple point gets the remaining space."""
     top, below = 34.0, 0.24 * box.h
     main = box.h - top - below - 12.0
     return Layout(

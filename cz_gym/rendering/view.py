@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from numbers import Integral
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -31,13 +31,10 @@ def declared_modes() -> list[str]:
 
 def check_size(size: Any) -> tuple[int, int]:
     """Width and height of a picture [px]; CzError names what was given and what is allowed."""
-    try:
+    if isinstance(size, Sequence) and len(size) == 2:
         width, height = size
-        whole = all(isinstance(side, Integral) and not isinstance(side, bool) for side in (width, height))
-        if whole and min(width, height) >= SMALLEST and max(width, height) <= LARGEST:
+        if all(isinstance(side, int | np.integer) and SMALLEST <= side <= LARGEST for side in size):
             return int(width), int(height)
-    except (TypeError, ValueError):
-        pass
     raise CzError(f"render_size must be (width, height), whole numbers of {SMALLEST} to {LARGEST} pixels, not {size!r}")
 
 

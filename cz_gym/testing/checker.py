@@ -1,8 +1,8 @@
-"""Is a native vector environment what a vector of its scalar form would be? :func:`check_vector_env`.
+"""Comparison of a native vector environment with a vector of its scalar form: :func:`check_vector_env`.
 
-For any :class:`gymnasium.vector.VectorEnv` that has a scalar counterpart. The oracle is Gymnasium's own
-:class:`gymnasium.vector.SyncVectorEnv` of the scalars, in every autoreset mode; what it cannot show, that nothing
-returned is written again or read back, is attacked directly. ``python -m cz_gym.testing.checker`` runs it on ``Cz-v0``.
+It works for any :class:`gymnasium.vector.VectorEnv` that has a scalar counterpart. The reference is Gymnasium's own
+:class:`gymnasium.vector.SyncVectorEnv` of the scalars, in every autoreset mode; further checks show that returned
+arrays are never written or read again. ``python -m cz_gym.testing.checker`` runs it on ``Cz-v0``.
 """
 
 from __future__ import annotations

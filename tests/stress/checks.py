@@ -1,4 +1,4 @@
-"""What must hold after every step of every slot, whatever was done: :class:`Watch`."""
+"""Invariants of every step of every slot: :class:`Watch`."""
 
 from typing import Any
 
@@ -25,7 +25,7 @@ _EPS = 1e-9
 
 
 class Broken(AssertionError):
-    """Something that must hold after every step does not; the message is one line."""
+    """An invariant is violated; the message is one line."""
 
 
 class Watch:
