@@ -41,7 +41,8 @@ def _lqg_at(activity: float) -> Contender:
 def _adaptive(name: str) -> Contender:
     make = partial(designs.lqg, name)
     meaning = f"{name} with filters for weak to strong fluctuations, weighted by how well they predict"
-    return Contender(f"{name}-adaptive", lambda config: adaptive(make(config)), "measured", meaning, default=False)
+    default = name == designs.family_name(IN_TABLE)
+    return Contender(f"{name}-adaptive", lambda config: adaptive(make(config)), "measured", meaning, default)
 
 
 def _ekf_mpc(config: Config) -> Policy:
@@ -86,9 +87,11 @@ CONTROLLERS: tuple[Contender, ...] = (
     _lqg("lqg-quiet", "the same for low pull activity"),
     *(_lqg_at(activity) for activity in designs.ACTIVITIES),
     *map(_adaptive, WITH_ADAPTIVE),
+    _lqg(designs.TOLD, "lqg-at-0.02 as tuned on nominal hot zones alone: it loses crystals on other ones"),
     Contender("ekf-mpc", _ekf_mpc, "measured", "nonlinear MPC on a bank of lqg's filters", default=False, slow=True),
     _bound("lqg-true", lqg_bounds.lqg_true, "measured", "bound: lqg given the puller's parameters"),
     *map(_privileged, WITH_PRIVILEGED),
+    _bound("lqg-at-0.02-told", lqg_bounds.told, "measured", f"bound: {designs.TOLD} given the puller's parameters"),
     _bound("full-information", lqg_bounds.full_information, "state", "bound: lqg's regulator, true state seen"),
     _bound(
         "clairvoyant",

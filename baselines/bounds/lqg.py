@@ -19,7 +19,7 @@ from scipy.linalg import solve_discrete_are
 
 from cz_gym.action import mark
 from cz_gym.baselines.lqg.controller import LQG, Gains, LQGDesign, solve_each
-from cz_gym.baselines.lqg.designs import lqg
+from cz_gym.baselines.lqg.designs import TOLD, lqg
 from cz_gym.baselines.lqg.estimator import PlantFilter
 from cz_gym.baselines.lqg.model import DRIFT, DRIFT_RATE, FAST, PLANT, SLOW, STATES, NoiseModel, load_per_drift
 from cz_gym.baselines.lqg.multiple_model import MultipleModelFilter
@@ -172,6 +172,11 @@ def privileged(plain: LQG) -> PrivilegedLQG:
 def lqg_true(config: Config) -> PrivilegedLQG:
     """Bound: ``lqg`` with each puller's parameters."""
     return replace(privileged(lqg("lqg", config)), knows_fluctuations=False)
+
+
+def told(config: Config) -> PrivilegedLQG:
+    """Bound: the LQG that was tuned on a known hot zone, with each puller's parameters."""
+    return replace(privileged(lqg(TOLD, config)), knows_fluctuations=False)
 
 
 def full_information(config: Config) -> FullInformation:

@@ -78,8 +78,8 @@ SHIPPED: dict[tuple[str, str], FilteredPID | Industrial] = {
     ),
     ("pid-conventional", "sensor-fault"): replace(_CONVENTIONAL, jump=0.002),
     ("industrial", "randomized"): Industrial(
-        T_f=1.338,
-        heater=TemperatureLoop(K=407.2, T_i=64.27, share=0.8326, K_pull=36.0, T_pull=6343.0, T_mean=1611.0),
+        T_f=1.183,
+        heater=TemperatureLoop(K=381.4, T_i=85.5, share=0.7465, K_pull=32.57, T_pull=10800.0, T_mean=1800.0),
     ),
     ("industrial", "puller"): Industrial(
         T_f=1.069,

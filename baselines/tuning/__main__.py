@@ -9,8 +9,9 @@ from pathlib import Path
 
 from cz_gym.commands import OneLineParser, between
 from cz_gym.config import make_config
+from cz_gym.episodes.scenarios import find_scenario
 
-from .goals import TUNABLE, goal_of
+from .goals import TUNABLE, crystals, goal_of
 from .search import Search, file_name, measure
 
 
@@ -29,8 +30,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def tune(given: argparse.Namespace) -> None:
     """Search, choose, and print the chosen settings."""
-    config = make_config(given.scenario, None, "measured", given.control_interval, action="direct")
-    goal = goal_of(given.controller, config.sole_scenario)
+    scenario = find_scenario(given.scenario)
+    goal, scored_on = goal_of(given.controller, scenario), crystals(given.controller, scenario)
+    config = make_config(scored_on, None, "measured", given.control_interval, action="direct")
     search = Search(given.controller, goal, config, given.trials, given.episodes, measure)
     chosen = search.tune(given.out / file_name(given.controller, given.scenario))
     print(f"{given.controller} on {given.scenario}: {chosen.score:.4f} {chosen.facts}")

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from cz_gym.baselines import OpenLoop
 from cz_gym.baselines.analysis.compensator_design import controller_transfer
 from cz_gym.baselines.analysis.frequency import loop_margins, opened, response
 from cz_gym.baselines.analysis.linear_form import linear_form
-from cz_gym.baselines.analysis.sampled_loop import NotLinearError, close, linear_controller, stable_range
+from cz_gym.baselines.analysis.sampled_loop import HOT_ZONE, NotLinearError, close, linear_controller, stable_range
+from cz_gym.baselines.lqg.designs import FAMILY, TOLD
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
@@ -92,7 +94,7 @@ def with_heat(controller, factor):
     return StateSpace(A, B * shown, power * C, power * D * shown)
 
 
-@pytest.mark.parametrize("name", ["lqg", "paper-tuned"])
+@pytest.mark.parametrize("name", ["lqg", TOLD, "paper-tuned"])
 def test_margins_at_the_heater_are_the_factors_on_its_power_that_the_loop_survives(name):
     form, puller = linear_form(make_controller(name, make_config("randomized", **PLAIN))), make_puller(lam=0.5)
     margins = loop_margins(form.controller, puller, 5.0, "Q_H")
@@ -104,12 +106,20 @@ def test_margins_at_the_heater_are_the_factors_on_its_power_that_the_loop_surviv
 
 
 def test_a_range_of_hot_zones_ends_where_the_loop_turns_unstable():
-    form = linear_form(make_controller("lqg", make_config("randomized", **PLAIN)))
+    form = linear_form(make_controller(TOLD, make_config("randomized", **PLAIN)))
     low, high = stable_range(form.controller, 5.0, "C_2", 0.5)
     for factor, stable in ((0.99 * low, False), (1.01 * low, True), (0.99 * high, True), (1.01 * high, False)):
         puller = make_puller(Parameters(C_2=factor * Parameters().C_2), 0.5)
         assert close(form.controller, puller, 5.0).stable == stable
     assert high < 1.3
+
+
+@pytest.mark.parametrize("name", ["lqg", *FAMILY])
+def test_lqgs_survive_hot_zone_parameters_of_half_and_twice_the_design_value(name):
+    form, design = linear_form(make_controller(name, make_config("randomized", **PLAIN))), Parameters()
+    for lam, parameter, factor in product((0.0, 1.0), HOT_ZONE.values(), (0.5, 2.0)):
+        other = design._replace(**{parameter: factor * getattr(design, parameter)})
+        assert close(form.controller, make_puller(other, lam), 5.0).stable
 
 
 def test_unstable_loop_has_no_margins():

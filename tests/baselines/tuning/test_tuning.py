@@ -12,7 +12,16 @@ from cz_gym.baselines.lqg.controller import LQGDesign
 from cz_gym.baselines.pid import settings as pid_settings
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.tuning import __main__ as command
-from cz_gym.baselines.tuning.goals import FAMILY_SCENARIOS, LQG_PARAMETERS, PIDS, LQGGoal, PIDGoal, goal_of
+from cz_gym.baselines.tuning.goals import (
+    FAMILY_SCENARIOS,
+    LQG_LIMITS,
+    LQG_PARAMETERS,
+    PIDS,
+    LQGGoal,
+    PIDGoal,
+    crystals,
+    goal_of,
+)
 from cz_gym.baselines.tuning.search import Figures, Parameter, Search, file_name, measure, value_at
 from cz_gym.config import make_config
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
@@ -196,15 +205,15 @@ def test_a_search_uses_training_and_validation_seeds_only(tmp_path):
 
 # Shipped settings
 
-LQGS = [(name, where) for name, shipped in designs.SHIPPED.items() for where in shipped]
 HEATER_STEP = designs.SEARCHED.index("weights.heater_step")
 
 
-@pytest.mark.parametrize(("controller", "scenario"), [*sorted(pid_settings.SHIPPED), *LQGS])
+@pytest.mark.parametrize(("controller", "scenario"), [*sorted(pid_settings.SHIPPED), *LQG_LIMITS])
 def test_shipped_settings_are_those_a_search_chose(controller, scenario):
     """Finalists of the searches that chose the LQGs were also tried with heavier weights on heater steps."""
-    found, config, varied = kept(controller, scenario), make_config(scenario, **PLAIN), []
-    search = Search(controller, goal_of(controller, config.scenario), config, 1, 5)
+    found, tuned_on, varied = kept(controller, scenario), find_scenario(scenario), []
+    config = make_config(crystals(controller, tuned_on), **PLAIN)
+    search = Search(controller, goal_of(controller, tuned_on), config, 1, 5)
     values = found["chosen"]["values"]
     assert list(values) == [parameter.path for parameter in search.goal.parameters]
     chosen = search.settings(values.values())
@@ -212,8 +221,7 @@ def test_shipped_settings_are_those_a_search_chose(controller, scenario):
         assert chosen == pid_settings.SHIPPED[controller, scenario]
     else:
         varied = [HEATER_STEP]
-        assert chosen == designs.design_of(controller, config.scenario)
-        assert chosen.hash == found["chosen"]["hash"]
+        assert chosen == designs.design_of(controller, tuned_on)
         assert not found["chosen"]["figures"]["failure_rate"]
     history = [np.delete(tried, varied).tolist() for tried, *_ in found["history"]]
     assert np.delete([*values.values()], varied).tolist() in history
@@ -234,12 +242,21 @@ def test_the_family_has_less_error_the_more_it_may_move(scenario):
 # The command
 
 
-def test_the_command_writes_what_the_search_chose(monkeypatch, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("name", "kind", "trials", "scenario"),
+    [
+        ("paper-filtered", "FilteredPID(", 3, "randomized"),
+        ("lqg-at-0.02", "LQGDesign(", 13, "0.5 hot-zone + 0.5 randomized"),
+    ],
+)
+def test_the_command_writes_what_the_search_chose(name, kind, trials, scenario, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(command, "measure", lambda policy, config, seeds: FIGURES)
-    arguments = ["--controller", "paper-filtered", "--trials", "3", "--control-interval", "2", "--out", str(tmp_path)]
+    arguments = ["--controller", name, "--trials", f"{trials}", "--control-interval", "2", "--out", str(tmp_path)]
     assert command.main(arguments) == 0
-    assert len(json.loads((tmp_path / "paper-filtered.json").read_text())["history"]) == 3
-    assert "FilteredPID(" in capsys.readouterr().out
+    written = json.loads((tmp_path / f"{name}.json").read_text())
+    assert len(written["history"]) == trials
+    assert written["scenario"] == scenario
+    assert kind in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

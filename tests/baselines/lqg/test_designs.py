@@ -1,0 +1,26 @@
+"""The shipped designs on hot zones that they are not told."""
+
+import pytest
+
+from cz_gym.baselines.lqg.designs import FAMILY, TOLD
+from cz_gym.baselines.registry import WITH_ADAPTIVE, make_controller
+from cz_gym.config import make_config
+from cz_gym.evaluation.rollout import rollout
+from tests.observed import PLAIN
+
+CRYSTALS = range(16)
+
+
+@pytest.mark.parametrize("name", ["lqg", *FAMILY, *(f"{name}-adaptive" for name in WITH_ADAPTIVE)])
+def test_no_lqg_loses_a_crystal(name):
+    config = make_config("hot-zone", **PLAIN)
+    assert not rollout(make_controller(name, config), config, CRYSTALS).failed.any()
+
+
+def test_one_that_was_tuned_on_nominal_hot_zones_loses_some_and_told_of_them_none():
+    config = make_config("hot-zone", **PLAIN)
+    lost = [
+        rollout(make_controller(name, config), config, CRYSTALS).failed.sum() for name in (TOLD, "lqg-at-0.02-told")
+    ]
+    assert lost[0] > 2
+    assert lost[1] == 0
