@@ -16,7 +16,7 @@ from cz_gym.physics.parameters import Parameters
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 
 SHIPPED = {
-    "gradient": 5,
+    "gradient": 3,
     "ppo": 3,
     "sac": 3,
 }

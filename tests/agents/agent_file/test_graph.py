@@ -40,6 +40,8 @@ def test_the_shipped_agent_is_run_as_it_is_stored(name: str) -> None:
     clean, state = checked(content, contract.channels)
     assert (state > 0) == (name == "gradient")
     ours, theirs = onnx.load_from_string(clean).graph, onnx.load_from_string(content).graph
+    for node in theirs.node:
+        node.ClearField("name")
     assert [*ours.node] == [*theirs.node]
     for one, two in zip(ours.initializer, theirs.initializer, strict=True):
         np.testing.assert_array_equal(numpy_helper.to_array(one), numpy_helper.to_array(two))
