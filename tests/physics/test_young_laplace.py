@@ -50,8 +50,10 @@ def test_wide_crystal_is_planar():
     np.testing.assert_allclose(solution.ring_offset, A * (ring_point(PHI_B) - profile(h / A, 1.0)), rtol=1e-6)
 
 
-@pytest.mark.parametrize(("narrowest", "slopes", "ring"), [(0.05, (1.0, 12.0), 1e-7), (A / 0.3, (0.5, 15.0), 2e-6)])
-def test_table_against_the_exact_solution(narrowest, slopes, ring):
+@pytest.mark.parametrize(
+    ("narrowest", "slopes", "ring", "height"), [(0.05, (1.0, 12.0), 1e-7, 1e-9), (A / 0.3, (0.5, 15.0), 2e-6, 3e-9)]
+)
+def test_table_against_the_exact_solution(narrowest, slopes, ring, height):
     random = np.random.default_rng(0)
     r, phi_b = random.uniform(narrowest, 0.15, 200), np.radians(random.uniform(*slopes, 200))
     h = random.uniform(HEIGHT_MIN, HEIGHT_MAX_IN_A * A, 200)
@@ -60,7 +62,7 @@ def test_table_against_the_exact_solution(narrowest, slopes, ring):
     sine, cosine = YOUNG_LAPLACE.slope(r, h, p)
     np.testing.assert_allclose(np.arctan2(sine, cosine), solution.theta, atol=1e-8)
     np.testing.assert_allclose(YOUNG_LAPLACE.ring_offset(r, h, p), solution.ring_offset, atol=ring * A)
-    np.testing.assert_allclose(YOUNG_LAPLACE.height(r, solution.theta, A), h, rtol=1e-9)
+    np.testing.assert_allclose(YOUNG_LAPLACE.height(r, solution.theta, A), h, rtol=height)
 
 
 @pytest.mark.parametrize("degrees", [1.0, 3.5, 10.0])
