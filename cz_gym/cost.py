@@ -1,7 +1,7 @@
 """The cost of a step: its four terms, their scales and weights, the reward that follows from it, and derivatives.
 
-Reward, gradients, regulators, bounds and reports all read this module. The weights are chosen so that the reward ranks
-controllers as their radius error at equal activity does, which ``python -m studies.frontier`` shows.
+Reward, gradients, regulators, bounds and reports all read this module. The weights are chosen so that most of a good
+controller's cost is its radius error; ``python -m studies.frontier`` shows how well the return ranks controllers.
 """
 
 from __future__ import annotations
