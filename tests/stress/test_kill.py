@@ -68,7 +68,14 @@ def training(arguments: list[str], point: str | None, log: Path) -> None:
     tqdm.set_lock(threading.RLock())  # its own is a semaphore, which a killed process leaves behind
     validation.PICKING, validation.JUDGING, run.VALIDATE_EVERY = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4], 4096
     RECIPES["ppo"] = PPO(
-        steps=8192, num_envs=64, n_steps=32, batch_size=512, n_epochs=2, hidden=(16,), control_interval=30.0
+        steps=8192,
+        num_envs=64,
+        action_repeat=1,
+        n_steps=32,
+        batch_size=512,
+        n_epochs=2,
+        hidden=(16,),
+        control_interval=30.0,
     )
     if point is not None:
         kill_at(point)

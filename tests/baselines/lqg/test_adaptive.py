@@ -59,10 +59,13 @@ def test_the_bank_weights_its_filters_by_bayes_rule():
 
 @pytest.mark.parametrize(("strength", "factor"), [(0.05, 0.2), (0.5, 1.8)])
 def test_it_finds_how_strong_the_fluctuations_are(strength, factor):
-    """After an hour, nine of ten crystals are most likely at the end of the hypotheses that is nearest."""
+    """After an hour, nine of ten crystals are most likely at the end of the hypotheses that is nearest.
+
+    With the design for known hot zones: where the hot zone may be another one, its heat hides part of the fluctuations.
+    """
     config = make_config("randomized", horizon=HOUR, **PLAIN)
     config = config.with_scenario(replace(config.scenario, name="one", interface=Interface(sd=(strength, strength))))
-    controller = adaptive(lqg("lqg-at-0.02", config))
+    controller = adaptive(lqg("lqg-at-0.02-nominal", config))
     watched = Watched(design=controller.design, hypotheses=controller.hypotheses)
     rollout(watched, config, range(20))
     expected = watched.last.probability @ np.repeat(FACTORS, len(FACTORS))
