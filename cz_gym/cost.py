@@ -95,12 +95,6 @@ def saturated(total: Any) -> Any:
 
 
 @jittable
-def saturated_slope(total: Any) -> Any:
-    """The derivative of :func:`saturated`."""
-    return (COST_CAP / (COST_CAP + total)) ** 2
-
-
-@jittable
 def reward(cost: Any, grows: Any) -> Any:
     """The reward of a step with these cost terms: one minus their saturated sum, 1,000 less if the crystal is lost."""
     earned = 1.0 - saturated(cost.radius + cost.pull + cost.pull_step + cost.heater_step)

@@ -58,13 +58,6 @@ class RadiusModel(NamedTuple):
         """Zero of G_m [rad/s]; in the right half plane it is the inverse response."""
         return -self.constant / self.lead
 
-    def state_space(self) -> StateSpace:
-        """A realisation with the states (r_c, x), input v_p and outputs (r_c, r_br): r_c' = p_0 r_c + numerator x."""
-        first, second = self.poles
-        A = np.array([[first, self.numerator], [0.0, second]])
-        C = np.array([[1.0, 0.0], [self.constant + self.lead * first, self.lead * self.numerator]])
-        return StateSpace(A, np.array([[0.0], [1.0]]), C, np.zeros((2, 1)))
-
 
 def jacobian(function: Callable[..., Any], at: tuple[float, ...]) -> Floats:
     """Derivatives of a function of len(at) numbers that returns a tuple, by complex step; shape (values, len(at))."""

@@ -1,43 +1,36 @@
-"""The exact meniscus: the axisymmetric Young-Laplace equation, solved by shooting and tabulated for the plant.
+"""The exact meniscus: the axisymmetric Young-Laplace equation, tabulated for the plant.
 
 With the arc length s running inward from the flat melt, phi the slope against the horizontal and lengths in
 capillary constants (Huh and Scriven, J. Colloid Interface Sci. 30, 1969):
 
     r_s = -cos(phi),   z_s = sin(phi),   phi_s = 2 z + sin(phi) / r.
 
-Far out the surface is linear, z = c K_0(sqrt(2) r), which starts the shooting at a height of 1e-6. At the triple
-point phi = pi/2 - theta. :data:`YOUNG_LAPLACE` is the solution as polynomials that compile into the step::
+Far out the surface is linear, z = c K_0(sqrt(2) r); at the triple point phi = pi/2 - theta. :data:`YOUNG_LAPLACE` is
+the solution as polynomials that compile into the step::
 
     gym.make("Cz-v0", meniscus=YOUNG_LAPLACE)
 
-The coefficients in ``young_laplace.json`` interpolate :func:`solve` at the Chebyshev points of both variables, turned
-into powers: ``SLOPE`` the correction in :func:`lift`, ``RING`` and ``TAIL`` those in :func:`exact_ring_offset`. A test
-compares them with :func:`solve`.
+The coefficients in ``young_laplace.json`` interpolate solutions by shooting at the Chebyshev points of both variables,
+turned into powers: ``SLOPE`` corrects :func:`lift`, ``RING`` and ``TAIL`` correct :func:`exact_ring_offset`. A test
+solves the equation again and compares (``tests/physics/test_young_laplace.py``).
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-from scipy.integrate import solve_ivp
-from scipy.special import k0e, k1e
 
 from cz_gym.jit.compile import jittable
 
 from .meniscus import MeniscusModel, hurle_height, profile, ring_point
 
-Floats = npt.NDArray[np.float64]
 SQRT_2 = math.sqrt(2.0)
 SLOPE, RING, TAIL = (np.array(rows) for rows in json.loads(Path(__file__).with_suffix(".json").read_text()).values())
 """Coefficients of the polynomials [-], shapes (9, 16), (9, 22) and (7, 8)."""
-TAIL_HEIGHT = 1e-6
-"""Height at which the linear tail hands over to the shooting [a]."""
 NARROWEST = 0.3
 """Largest a / r_c in the table: crystals of at least 25 mm radius, in silicon."""
 LOWEST, HIGHEST = 0.1, 1.265
@@ -46,104 +39,6 @@ RING_SLOPES = (math.radians(0.5), math.radians(15.0))
 """Slopes phi_b of the bright ring in the table [rad]."""
 RING_REFERENCE = float(ring_point(math.radians(3.5)))
 """X_b at which the ring's first table stands [-]; the second moves it to another slope."""
-_RTOL, _ATOL, _SHOTS = 1e-11, 1e-13, 60
-
-
-class Solution(NamedTuple):
-    """Exact menisci, arrays of one shape."""
-
-    theta: Floats
-    """Angle between meniscus and vertical at the triple point [rad]."""
-    ring_offset: Floats
-    """Distance from the triple point out to the bright ring [m]."""
-
-
-def solve(r_c: npt.ArrayLike, h_c: npt.ArrayLike, a: float, phi_b: npt.ArrayLike) -> Solution:
-    """Solve the meniscus that rises to h_c [m] at a crystal of radius r_c [m]; arguments broadcast.
-
-    ``a`` is the capillary constant [m], ``phi_b`` the slope of the bright ring [rad]. Raises ArithmeticError if
-    no such meniscus was found.
-    """
-    r, h, slope = (np.atleast_1d(part) for part in np.broadcast_arrays(np.divide(r_c, a), np.divide(h_c, a), phi_b))
-    start = _shoot(lambda outer: _rise(outer, h)[0], r + _planar_width(h), r)
-    _, phi = _rise(start, h)
-    ring, _ = _turn(start, slope)
-    shape = np.broadcast_shapes(np.shape(r_c), np.shape(h_c), np.shape(phi_b))
-    return Solution((0.5 * math.pi - phi).reshape(shape), (a * (ring - r)).reshape(shape))
-
-
-def solve_height(r_c: npt.ArrayLike, theta: npt.ArrayLike, a: float) -> Floats:
-    """Exact height [m] at which the meniscus leaves a crystal of radius r_c [m] at angle theta [rad]."""
-    r, phi = (np.atleast_1d(part) for part in np.broadcast_arrays(np.divide(r_c, a), 0.5 * math.pi - np.asarray(theta)))
-    start = _shoot(lambda outer: _turn(outer, phi)[0], r + _planar_width(SQRT_2 * np.sin(0.5 * phi)), r)
-    height: Floats = a * _turn(start, phi)[1]
-    return height.reshape(np.broadcast_shapes(np.shape(r_c), np.shape(theta)))
-
-
-def _planar_width(h: Floats) -> Floats:
-    """Distance from the height h to the tail's height on the planar meniscus [a]."""
-    width: Floats = profile(TAIL_HEIGHT, 1.0) - profile(h, 1.0)
-    return width
-
-
-def _shoot(inner: Callable[[Floats], Floats], outer: Floats, wanted: Floats) -> Floats:
-    """Secant iteration on the tail's radius until the meniscus ends at the wanted radius."""
-    miss = inner(outer) - wanted
-    rate = np.ones_like(miss)
-    for _ in range(_SHOTS):
-        if np.max(np.abs(miss) / wanted) < 1e-12:
-            return outer
-        step = -miss / rate
-        missed = inner(outer + step) - wanted
-        moved = np.abs(step) > 1e-9 * wanted
-        rate = np.where(moved, (missed - miss) / np.where(moved, step, 1.0), rate)
-        outer, miss = outer + step, missed
-    if np.max(np.abs(miss) / wanted) < 1e-10:
-        return outer
-    raise ArithmeticError("no Young-Laplace meniscus found for these radii and heights")
-
-
-def _tail_slope(outer: Floats) -> Floats:
-    """Slope [rad] of z = c K_0(sqrt(2) r) where z is the tail's height."""
-    slope: Floats = np.arctan(TAIL_HEIGHT * SQRT_2 * k1e(SQRT_2 * outer) / k0e(SQRT_2 * outer))
-    return slope
-
-
-def _rise(outer: Floats, h: Floats) -> tuple[Floats, Floats]:
-    """Radius and slope where the meniscus has risen to h, with log(z) as the running variable."""
-    span = np.log(h / TAIL_HEIGHT)
-
-    def slopes(tau: float, y: Floats) -> Floats:
-        r, phi = y.reshape(2, -1)
-        z = TAIL_HEIGHT * np.exp(tau * span)
-        ds = z * span / np.sin(phi)
-        return np.concatenate([-np.cos(phi) * ds, (2.0 * z + np.sin(phi) / r) * ds])
-
-    r, phi = _integrate(slopes, outer, _tail_slope(outer))
-    return r, phi
-
-
-def _turn(outer: Floats, phi_end: Floats) -> tuple[Floats, Floats]:
-    """Radius and height where the meniscus has turned to the slope phi_end, with log(phi) running."""
-    first = _tail_slope(outer)
-    span = np.log(phi_end / first)
-
-    def slopes(tau: float, y: Floats) -> Floats:
-        r, z = y.reshape(2, -1)
-        phi = first * np.exp(tau * span)
-        ds = phi * span / (2.0 * z + np.sin(phi) / r)
-        return np.concatenate([-np.cos(phi) * ds, np.sin(phi) * ds])
-
-    return _integrate(slopes, outer, np.full_like(outer, TAIL_HEIGHT))
-
-
-def _integrate(slopes: Callable[[float, Floats], Floats], first: Floats, second: Floats) -> tuple[Floats, Floats]:
-    y = np.concatenate([first, second])
-    run = solve_ivp(slopes, (0.0, 1.0), y, method="DOP853", rtol=_RTOL, atol=_ATOL)
-    if not run.success:
-        raise ArithmeticError("no Young-Laplace meniscus rises that high at a crystal this narrow")
-    r, other = run.y[:, -1].reshape(2, -1)
-    return r, other
 
 
 @jittable

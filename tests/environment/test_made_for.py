@@ -9,7 +9,7 @@ from gymnasium.error import InvalidAction
 from cz_gym import CzEnv, CzVectorEnv, Parameters
 from cz_gym.action import mark
 from cz_gym.config import make_config
-from cz_gym.cost import PULL_BAND, Weights, coefficients, cost_slopes, cost_terms, saturated, saturated_slope
+from cz_gym.cost import PULL_BAND, Weights, coefficients, cost_slopes, cost_terms
 from cz_gym.differentiable import DifferentiableBatch
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from tests.observed import PLAIN
@@ -60,4 +60,3 @@ def test_slopes_are_the_derivatives_of_the_terms(weights: Weights) -> None:
     counted = at + np.array([0.0, PULL_BAND, 0.0, 0.0])
     np.testing.assert_allclose(coefficients(weights) * counted**2, cost_terms(*at, weights), rtol=1e-14)
     assert cost_terms(*at / 3.0, weights).pull == cost_slopes(*at / 3.0, weights).pull == 0.0
-    assert np.imag(saturated(3.0 + 1e-30j)) / 1e-30 == pytest.approx(saturated_slope(3.0), rel=1e-14)

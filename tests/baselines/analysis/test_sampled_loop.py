@@ -38,8 +38,9 @@ def test_loop_of_the_running_code_is_the_textbook_loop(lam, dt):
     puller, z = make_puller(lam=lam), np.exp(1j * OMEGA * dt)
     tustin = 2.0 / dt * (z - 1.0) / (z + 1.0)
     K = controller_transfer(PAPER.pid)(tustin)
-    A, B, C, D = radius_model(puller).state_space()
-    ring = control.sample_system(control.ss(A, B, C[1:], D[1:]), dt, "zoh")(z)
+    plant, s = radius_model(puller), control.tf("s")
+    growth = plant.numerator / ((s - plant.poles[0]) * (s - plant.poles[1]))
+    ring = control.sample_system((plant.lead * s + plant.constant) * growth, dt, "zoh")(z)
     compensator = control.ss([[-PAPER.compensator.fast, 1.0], [0.0, -PAPER.compensator.slow]], [[0.0], [1.0]],
                              PAPER.compensator.gain * np.array([[-PAPER.compensator.fast, 1.0]]), 0.0)  # fmt: skip
     added = control.sample_system(compensator, dt, "zoh")(z)
