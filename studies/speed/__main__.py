@@ -1,7 +1,7 @@
-"""How fast: ``python -m studies.speed [--quick] [--json FILE]``.
+"""Measure the speed of the environments beside that of others: ``python -m studies.speed [--quick] [--json FILE]``.
 
 Every case is measured in turn, the round is repeated, and medians are reported, so that a machine that is busy for a
-while is busy for all. Steps per second count every slot's step, resets included unless a name says otherwise.
+while slows all cases alike. Steps per second count every slot's step, resets included unless a name says otherwise.
 """
 
 from __future__ import annotations
@@ -11,110 +11,234 @@ import json
 import statistics
 import sys
 import timeit
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import gymnasium as gym
+import numpy as np
+
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser
-
-from .cases import SLOTS, THREADS, Case, Stepper, cases, stepper
+from cz_gym.config import make_config
+from cz_gym.differentiable import DifferentiableBatch
+from cz_gym.engine.batch import Batch
+from cz_gym.env import CzEnv
+from cz_gym.processors import processors
+from cz_gym.vector import CzVectorEnv
 
 QUICK, FULL = 3, 15
 """Rounds of a measurement."""
+THREADS = processors()
+"""Threads that the larger cases may use."""
+SLOTS, SB3_SLOTS = 1024, 256
+"""Slots of the batches that are compared, and of those behind stable-baselines3."""
+UNFAILED = 50
+"""Steps that every crystal survives in open loop."""
 
 
-class Row(NamedTuple):
-    """One line of the table."""
+class Stepper(NamedTuple):
+    """An environment or loop whose steps are timed."""
 
-    name: str
     num_envs: int
-    steps_per_s: float
+    step: Callable[[], Any]
+    """Makes one step of every slot."""
+    close: Callable[[], Any] = lambda: None
 
 
-class Ratio(NamedTuple):
-    """Speed of one row over that of another: of each the fastest whose name begins so, of 1,024 slots if any."""
-
-    row: str
-    over: str
-    promised: float | None = None
-    """Least value that is aimed at; None for a ratio that is only reported."""
-
-
-OURS = "Cz-v0 batch, measured"
 RATIOS = {
-    "scalar_vs_pendulum": Ratio("Cz-v0 scalar", "Pendulum-v1 scalar", 1.7),
-    "vector1024_vs_envpool_pendulum": Ratio(OURS, "EnvPool Pendulum-v1", 5.0),
-    "vector1024_vs_pcgym": Ratio(OURS, "pc-gym CSTR", 2000.0),
-    "vector1024_vs_kernel": Ratio(
-        "Cz-v0 batch without resets, 1 thread", "bare compiled plant and ring, 1 thread", 0.65
+    "scalar_vs_pendulum": ("Cz-v0 scalar", "Pendulum-v1 scalar", 1.7),
+    "vector1024_vs_envpool_pendulum": ("Cz-v0 batch, measured", "EnvPool Pendulum-v1", 5.0),
+    "vector1024_vs_pcgym": ("Cz-v0 batch, measured", "pc-gym CSTR", 2000.0),
+    "vector1024_vs_kernel": ("Cz-v0 batch without resets, 1 thread", "bare compiled plant and ring, 1 thread", 0.65),
+    "sb3_adapter_vs_subproc": ("SB3 adapter over the batch", "SB3 SubprocVecEnv", 100.0),
+    "sb3_adapter_vs_dummy": ("SB3 adapter over the batch", "SB3 DummyVecEnv", 12.0),
+    "derivatives_vs_step": ("step with derivatives", "step without derivatives", 0.125),
+    "sb3_make_vec_env_vs_pendulum": ("SB3 make_vec_env, cz_gym:Cz-v0", "SB3 make_vec_env, Pendulum-v1", 1.8),
+    "sync_vector_env_vs_pendulum": ("SyncVectorEnv, cz_gym:Cz-v0", "SyncVectorEnv, Pendulum-v1", 1.5),
+    "vector1024_vs_envpool_pendulum_one_thread": (
+        "Cz-v0 batch, measured, 1 thread", "EnvPool Pendulum-v1, 1 thread", None,
     ),
-    "sb3_adapter_vs_subproc": Ratio("SB3 adapter over the batch", "SB3 SubprocVecEnv", 100.0),
-    "sb3_adapter_vs_dummy": Ratio("SB3 adapter over the batch", "SB3 DummyVecEnv", 12.0),
-    "derivatives_vs_step": Ratio("step with derivatives", "step without derivatives", 0.125),
-    "sb3_make_vec_env_vs_pendulum": Ratio("SB3 make_vec_env, cz_gym:Cz-v0", "SB3 make_vec_env, Pendulum-v1", 1.8),
-    "sync_vector_env_vs_pendulum": Ratio("SyncVectorEnv, cz_gym:Cz-v0", "SyncVectorEnv, Pendulum-v1", 1.5),
-    "vector1024_vs_envpool_pendulum_one_thread": Ratio(f"{OURS}, 1 thread", "EnvPool Pendulum-v1, 1 thread"),
-}
+}  # fmt: skip
+"""Two rows, each the fastest whose name begins so, and the least ratio of their speeds that is aimed at, if any."""
 
 
-def measure(wanted: Sequence[Case], rounds: int) -> tuple[list[Row], dict[str, str]]:
-    """Median speeds over interleaved rounds, and by name why a case was skipped that cannot be made here."""
+def cases(quick: bool) -> dict[str, Callable[[], Any]]:
+    """Functions that make an environment, scalar or batched, or a :class:`Stepper`, by the name of their row."""
+    rows: dict[str, Callable[[], Any]] = {
+        f"{name} scalar": partial(gym.make, name) for name in ("Cz-v0", "Pendulum-v1")
+    }
+    for name, make in (
+        ("Cz-v0 batch, measured", our_batch),
+        ("Cz-v0 batch without resets", without_resets),
+        ("bare compiled plant and ring", bare_plant),
+        ("EnvPool Pendulum-v1", _envpool),
+    ):
+        for n in sorted({1, THREADS}):
+            rows[f"{name}, {n} thread{'s' * (n > 1)}"] = partial(make, SLOTS, n)
+    rows["step without derivatives"] = partial(differentiable, False)
+    rows["step with derivatives"] = partial(differentiable, True)
+    rows["pc-gym CSTR"] = _pcgym
+    rows["SB3 adapter over the batch"] = lambda: import_module("cz_gym.sb3").make_vec_env(SB3_SLOTS)
+    for name in ("cz_gym:Cz-v0", "Pendulum-v1"):
+        rows[f"SB3 make_vec_env, {name}"] = partial(_sb3_make_vec_env, name)
+        rows[f"SyncVectorEnv, {name}"] = partial(gym.make_vec, name, num_envs=4, vectorization_mode="sync")
+    rows["SB3 DummyVecEnv"] = partial(_sb3, "DummyVecEnv", SB3_SLOTS)
+    for n in (2,) if quick else (2, 16):
+        rows[f"SB3 SubprocVecEnv, {n} processes"] = partial(_sb3, "SubprocVecEnv", n)
+    rows["Cz-v0 scalar, camera"] = partial(CzEnv, "nominal", observation="camera")
+    return rows
+
+
+def stepper(env: Any) -> Stepper:
+    """The environment of any library, stepped with actions of zero and reset where it does not reset itself."""
+    if isinstance(env, Stepper):
+        return env
+    if getattr(env, "num_envs", None) is not None:
+        env.reset()
+        return batched(env, env.num_envs)
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape, env.action_space.dtype)[()]
+
+    def step() -> None:
+        _, _, terminated, truncated, _ = env.step(action)
+        if terminated or truncated:
+            env.reset()
+
+    return Stepper(1, step, env.close)
+
+
+def batched(env: Any, num_envs: int) -> Stepper:
+    """The batch of any library after its reset, stepped with actions of zero."""
+    space = getattr(env, "single_action_space", env.action_space)
+    action = np.zeros((num_envs, *space.shape), space.dtype)
+    return Stepper(num_envs, lambda: env.step(action), env.close)
+
+
+def our_batch(num_envs: int, threads: int = 1) -> Stepper:
+    """The native batch; its slots are at random steps of their episodes, so that resets are spread out."""
+    env = CzVectorEnv(num_envs, observation="measured", threads=threads)
+    env.reset(seed=0)
+    env._batch.memory.slots["k"] = np.random.default_rng(0).integers(0, env.config.steps, num_envs)
+    return batched(env, num_envs)
+
+
+def without_resets(num_envs: int, threads: int) -> Stepper:
+    """The native batch, which repeats the same first minutes without resets, to compare with the bare loop."""
+    env = CzVectorEnv(num_envs, observation="measured", threads=threads)
+    env.reset(seed=0)
+    return repeated(env._batch, batched(env, num_envs))
+
+
+def bare_plant(num_envs: int, threads: int) -> Stepper:
+    """The compiled plant and bright ring alone, without sensors, observation, reward, info or Python shell."""
+    batch = Batch(make_config(observation="measured"), num_envs, threads)
+    rings = np.zeros(num_envs)
+    batch.reset(range(num_envs), [(i, i) for i in range(num_envs)], batch.new_out())
+    return repeated(batch, Stepper(num_envs, lambda: batch.advance(rings), batch.close))
+
+
+def repeated(batch: Batch, stepper: Stepper) -> Stepper:
+    """The same stepper, whose slots go back to their present state before any crystal fails."""
+    slots, first = batch.memory.slots, batch.memory.slots.copy()
+
+    def step() -> None:
+        stepper.step()
+        if slots["k"][0] >= UNFAILED:
+            slots[:] = first
+
+    return stepper._replace(step=step)
+
+
+def differentiable(derivatives: bool) -> Stepper:
+    """A batch of 256 slots that repeats the same first minutes, with derivatives at each step or without."""
+    batch = DifferentiableBatch(make_config(), 256)
+    batch.reset(range(256))
+    inner, out, action = batch._batch, batch._batch.new_out(), np.zeros((256, 2))
+    step = (lambda: batch.step(action)) if derivatives else (lambda: inner.step(action, out))
+    return repeated(inner, Stepper(256, step, batch.close))
+
+
+def _envpool(num_envs: int, threads: int) -> Stepper:
+    envpool = import_module("envpool")
+    env = envpool.make("Pendulum-v1", env_type="gymnasium", num_envs=num_envs, num_threads=threads)
+    env.reset()
+    return batched(env, num_envs)
+
+
+def _pcgym() -> Any:
+    """The CSTR of pc-gym's documentation: three states, one input, 100 steps of 0.26 min."""
+    box = {"low": np.array([0.7, 300.0, 0.8]), "high": np.array([1.0, 350.0, 0.9])}
+    return import_module("pcgym").make_env(
+        {
+            "N": 100, "tsim": 26, "SP": {"Ca": [0.85] * 50 + [0.9] * 50}, "o_space": box,
+            "a_space": {"low": np.array([295.0]), "high": np.array([302.0])},
+            "x0": np.array([0.8, 330.0, 0.8]), "model": "cstr", "r_scale": {"Ca": 1e3},
+            "normalise_a": True, "normalise_o": True, "noise": True, "noise_percentage": 0.001,
+            "integration_method": "casadi",
+        }
+    )  # fmt: skip
+
+
+def _sb3_make_vec_env(name: str) -> Any:
+    return import_module("stable_baselines3.common.env_util").make_vec_env(name, 16)
+
+
+def _sb3(kind: str, num_envs: int) -> Any:
+    make = getattr(import_module("stable_baselines3.common.vec_env"), kind)
+    return make([partial(gym.make, "cz_gym:Cz-v0")] * num_envs)
+
+
+def measure(wanted: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, Any]:
+    """Median speeds over interleaved rounds, their ratios, and why a case was skipped: the content of the JSON file."""
     from tqdm import tqdm
 
-    running: dict[Case, tuple[Stepper, timeit.Timer, int]] = {}
+    running: dict[str, tuple[Stepper, timeit.Timer, int]] = {}
     skipped = {}
-    for case in wanted:
+    for name, make in wanted.items():
         try:
-            made = stepper(case.make())
+            made = stepper(make())
             made.step()
-        except Exception as error:  # what a peer lacks must not end the run
-            skipped[case.name] = f"{type(error).__name__}: {' '.join(str(error).split())}"[:100]
+        except Exception as error:  # a missing or broken peer must not end the run
+            skipped[name] = f"{type(error).__name__}: {' '.join(str(error).split())}"[:100]
             continue
         timer = timeit.Timer(made.step, "import gc; gc.enable()")
-        running[case] = made, timer, timer.autorange()[0]
-    speeds: dict[Case, list[float]] = {case: [] for case in running}
+        running[name] = made, timer, timer.autorange()[0]
+    speeds: dict[str, list[float]] = {name: [] for name in running}
     for _ in tqdm(range(rounds), desc="rounds", disable=None):
-        for case, (made, timer, calls) in running.items():
-            speeds[case].append(calls * made.num_envs / timer.timeit(calls))
+        for name, (made, timer, calls) in running.items():
+            speeds[name].append(calls * made.num_envs / timer.timeit(calls))
     for made, *_ in running.values():
         made.close()
-    return [Row(case.name, running[case][0].num_envs, statistics.median(speeds[case])) for case in running], skipped
+    medians = {name: statistics.median(values) for name, values in speeds.items()}
+    rows = [
+        {"name": name, "num_envs": running[name][0].num_envs, "steps_per_s": speed} for name, speed in medians.items()
+    ]
+    ratios = {name: ratio(medians, *pair) for name, (*pair, _) in RATIOS.items()}
+    return {"ratios": ratios, "rows": rows, "skipped": skipped, "threads": THREADS}
 
 
-def ratio(rows: Sequence[Row], asked: Ratio) -> float | None:
-    """A ratio of the table's rows; None where one is missing."""
-    speeds = []
-    for begins in (asked.row, asked.over):
-        found = [row for row in rows if row.name.startswith(begins)]
-        speeds += (
-            [max(row.steps_per_s for row in [row for row in found if row.num_envs == SLOTS] or found)] if found else []
-        )
-    return speeds[0] / speeds[1] if len(speeds) == 2 else None
+def ratio(speeds: Mapping[str, float], row: str, over: str) -> float | None:
+    """The ratio of the fastest rows whose names begin so; None where one is missing."""
+    above, below = (
+        max((speed for name, speed in speeds.items() if name.startswith(begins)), default=None)
+        for begins in (row, over)
+    )
+    return None if above is None or below is None else above / below
 
 
-def table(result: dict[str, Any]) -> str:
+def table(result: Mapping[str, Any]) -> str:
     """The result as text."""
     lines = [f"{'':44}{'slots':>7}{'steps/s':>14}{'us/step':>10}"]
     for name, num_envs, speed in (row.values() for row in result["rows"]):
         lines.append(f"{name:44}{num_envs:7d}{speed:14,.0f}{1e6 / speed:10.3f}")
     lines += [f"{name:44}skipped: {why}" for name, why in result["skipped"].items()] + [""]
     for name, value in result["ratios"].items():
-        shown = "-" if value is None else f"{value:.2f}"
-        aim = RATIOS[name].promised
+        shown, aim = "-" if value is None else f"{value:.2f}", RATIOS[name][2]
         lines.append(f"{name:44}{shown:>10} x" + (f"   (at least {aim:g} x)" if aim else ""))
     return "\n".join(lines)
-
-
-def run(quick: bool) -> dict[str, Any]:
-    """Measure everything; the content of the JSON file."""
-    rows, skipped = measure(cases(quick), QUICK if quick else FULL)
-    return {
-        "ratios": {name: ratio(rows, asked) for name, asked in RATIOS.items()},
-        "rows": [row._asdict() for row in rows],
-        "skipped": skipped,
-        "threads": THREADS,
-    }
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -128,7 +252,7 @@ def main(argv: list[str] | None = None) -> int:
 def _measure(arguments: argparse.Namespace) -> None:
     if arguments.json is not None:
         check_writable(arguments.json.parent)
-    result = run(arguments.quick)
+    result = measure(cases(arguments.quick), QUICK if arguments.quick else FULL)
     print(table(result))
     if arguments.json is not None:
         write_files({arguments.json: (json.dumps(result, indent=1, allow_nan=False) + "\n").encode()})

@@ -21,7 +21,7 @@ COMMANDS: list[tuple[Any, str, str, list[str]]] = [
     (benchmark, "--episode", "benchmark", ["--out", "new/folder"]),
     (paper, "--ou", "contents", ["--out", "new/folder"]),
     (tuning, "--trial", "measure", ["--controller", "industrial", "--out", "new/folder"]),
-    (speed, "--qui", "run", ["--quick"]),
+    (speed, "--qui", "measure", ["--quick"]),
     (play, "--minute", "settings", []),
     (datasets, "--episode", "record", ["--policies", "paper", "--out", "new/folder"]),
 ]
