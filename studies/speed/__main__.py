@@ -232,8 +232,9 @@ def ratio(speeds: Mapping[str, float], row: str, over: str) -> float | None:
 def table(result: Mapping[str, Any]) -> str:
     """The result as text."""
     lines = [f"{'':44}{'slots':>7}{'steps/s':>14}{'us/step':>10}"]
-    for name, num_envs, speed in (row.values() for row in result["rows"]):
-        lines.append(f"{name:44}{num_envs:7d}{speed:14,.0f}{1e6 / speed:10.3f}")
+    for row in result["rows"]:
+        speed = row["steps_per_s"]
+        lines.append(f"{row['name']:44}{row['num_envs']:7d}{speed:14,.0f}{1e6 / speed:10.3f}")
     lines += [f"{name:44}skipped: {why}" for name, why in result["skipped"].items()] + [""]
     for name, value in result["ratios"].items():
         shown, aim = "-" if value is None else f"{value:.2f}", RATIOS[name][2]
