@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from cz_gym.physics.plant import Inputs
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 from . import chart, palette, puller_panel, triple_point
@@ -44,28 +42,18 @@ class Scene:
         self.canvas = Canvas(width, height)
         self.layout = layout(self.canvas.box)
 
-    def draw(
-        self,
-        record: Record,
-        set_points: Inputs | None = None,
-        overlay: Callable[[Canvas], None] | None = None,
-    ) -> Frame:
-        """The picture of a record's newest sample, shape (height, width, 3).
-
-        ``set_points`` are a player's, ``overlay`` draws on top.
-        """
+    def draw(self, record: Record) -> Frame:
+        """The picture of a record's newest sample, shape (height, width, 3)."""
         canvas, boxes = self.canvas, self.layout
         canvas.begin(boxes.puller, boxes.numbers, boxes.chart)
         _draw_header(canvas, boxes.triple_point.x, record)
         puller_panel.draw(canvas, boxes.puller, record)
         canvas.text(boxes.puller.x + 8, boxes.puller.y + 5, "crystal", palette.FAINT)
         triple_point.draw(canvas, boxes.triple_point, record)
-        _draw_numbers(canvas, boxes.numbers, record, set_points)
+        _draw_numbers(canvas, boxes.numbers, record)
         chart.draw(canvas, boxes.chart, record)
         if record.ending is not None:
             draw_ending(canvas, boxes.triple_point, record.ending)
-        if overlay is not None:
-            overlay(canvas)
         return canvas.finish()
 
 
@@ -89,10 +77,10 @@ Row = tuple[str, str, Colour]
 """Name, value and its colour."""
 
 
-def numbers(record: Record, set_points: Inputs | None = None) -> list[list[Row]]:
+def numbers(record: Record) -> list[list[Row]]:
     """The rows of a record's newest sample; the first of each group is a signal, those below it its references."""
     p, last = record.puller, record.last
-    rows = [
+    return [
         [_row("by the camera", record.camera_error[-1] + last("r_ref"), MM, "mm", palette.CAMERA),
          _row("reference", last("r_ref"), MM, "mm", palette.REFERENCE)],
         [_row("pull speed", last("v_p"), MM_PER_MIN, "mm/min", palette.DRIVE), _row("nominal", p.v_0, MM_PER_MIN)],
@@ -100,10 +88,6 @@ def numbers(record: Record, set_points: Inputs | None = None) -> list[list[Row]]
         [_row("heater T_1", last("T_1"), 1.0, "K", palette.TEMPERATURE), _row("recipe", last("T_1_ref"))],
         [_row("melt T_b", last("T_b"), 1.0, "K", palette.TEMPERATURE), _row("nominal", p.T_b_0)],
     ]  # fmt: skip
-    if set_points is not None:
-        rows[1].append(_row("set by hand", set_points.v_p, MM_PER_MIN, colour=palette.INK))
-        rows[2].append(_row("set by hand", set_points.Q_H, KILO, colour=palette.INK))
-    return rows
 
 
 def _row(name: str, value: float, scale: float = 1.0, unit: str = "", colour: Colour = palette.FAINT) -> Row:
@@ -111,12 +95,12 @@ def _row(name: str, value: float, scale: float = 1.0, unit: str = "", colour: Co
     return name, f"{value / scale:.2f} {unit}".rstrip() if np.isfinite(value) else "no reading", colour
 
 
-def _draw_numbers(canvas: Canvas, box: Box, record: Record, set_points: Inputs | None) -> None:
+def _draw_numbers(canvas: Canvas, box: Box, record: Record) -> None:
     """The true radius error in large figures, then the groups of rows."""
     left, right, y = box.x + 8, box.right - 8, box.y + 45
     canvas.text(left, box.y + 5, "true radius error", palette.FAINT)
     canvas.text(box.x + box.w / 2.0, box.y + 18, f"{record.error[-1] / MM:+.2f} mm", palette.TRUE, 19, 0.5, True)
-    for group in numbers(record, set_points):
+    for group in numbers(record):
         for name, value, colour in group:
             canvas.text(left, y, name, palette.FAINT)
             canvas.text(right, y, value, colour, 9.5, 1.0, name == group[0][0])

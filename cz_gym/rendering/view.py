@@ -124,12 +124,6 @@ class Window:
         self._pygame.display.set_caption(caption)
         self._clock = self._pygame.time.Clock()
 
-    @property
-    def visible(self) -> bool:
-        """Whether it is on a display: without one, SDL opens a window that nobody sees."""
-        driver: str = self._pygame.display.get_driver()
-        return driver != "offscreen"
-
     def show(self, picture: Frame) -> None:
         """Show a picture, at most FPS a second."""
         self._pygame.surfarray.blit_array(self.screen, picture.swapaxes(0, 1))

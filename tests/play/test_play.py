@@ -1,5 +1,6 @@
-"""Pulling by hand: keys posted to a window nobody sees, the score, and what the commands say when they cannot."""
+"""Pulling by hand: keys posted to a window nobody sees, the score, and refusals in one line."""
 
+import itertools
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -7,140 +8,88 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cz_gym import CzEnv
+from cz_gym import CzEnv, play
 from cz_gym.baselines.registry import find_controller
-from cz_gym.config import Config, make_config
-from cz_gym.evaluation.metrics import metrics
-from cz_gym.evaluation.rollout import rollout
-from cz_gym.play import __main__ as play
-from cz_gym.play import game as hand
-from cz_gym.play.game import score
+from cz_gym.config import make_config
+from cz_gym.physics.plant import make_puller
 from cz_gym.rendering import canvas
-from cz_gym.rendering.view import Window
-from cz_gym.units import KILO, MM_PER_MIN
-from tests.observed import PLAIN
 
 pygame = pytest.importorskip("pygame")
-SIZE = (480, 360)
+gymnasium_play = pytest.importorskip("gymnasium.utils.play")
 
 
 @pytest.fixture
-def config() -> Config:
-    return make_config("randomized", horizon=600.0, **PLAIN)
+def quick(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A clock that does not wait, and matplotlib's backend as it was."""
+    backend = pytest.importorskip("matplotlib").rcParams["backend"]
+    monkeypatch.setattr(pygame.time, "Clock", lambda: type("Clock", (), {"tick": lambda *_: None}))
+    yield
+    sys.modules["matplotlib"].rcParams["backend"] = backend
 
 
-@pytest.fixture
-def game(config: Config) -> Iterator[hand.Game]:
-    window = Window(SIZE, "test")
-    yield hand.Game(window, SIZE, config, 1, 60.0, find_controller("paper").make(config))
-    window.close()
+def test_keys_move_the_drives_while_they_are_held() -> None:
+    keys, p = play.keys(), make_puller()
+    assert len(keys) == 17  # of three by three by two, all but none; shift alone does nothing
+    env = CzEnv("nominal", action="rate", info="all")
+    for pressed, pull, heat in (
+        ((pygame.K_UP,), 0.01, 0.0),
+        ((pygame.K_DOWN, pygame.K_LSHIFT), -0.1, 0.0),
+        ((pygame.K_LEFT, pygame.K_UP), 0.01, -0.005),
+        ((pygame.K_RIGHT, pygame.K_LSHIFT), 0.0, 0.05),
+    ):
+        env.reset(seed=1)
+        info = env.step(keys[tuple(sorted(pressed))])[-1]
+        assert info["v_p"] / p.v_0 - 1.0 == pytest.approx(pull, rel=1e-5, abs=1e-9)
+        assert (info["Q_H"] - p.Q_H_0) / 10e3 == pytest.approx(heat, rel=1e-5, abs=1e-9)
 
 
-def press(key: int, mod: int = 0) -> None:
-    pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=key, mod=mod))
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("leaves", [True, False])
+def test_a_run_ends_with_the_score(leaves: bool, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    """Up to the horizon of 5 min, or 21 steps: 20 without a key and one more that ends the game."""
+    shown, counter = [], itertools.count()
+    display = gymnasium_play.display_arr
+
+    def watch(screen: Any, picture: Any, **options: Any) -> None:
+        shown.append(int(picture.max()))
+        display(screen, picture, **options)
+        if leaves and next(counter) == 20:
+            pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_ESCAPE))
+
+    monkeypatch.setattr(gymnasium_play, "display_arr", watch)
+    assert play.main(["--minutes", "5", "--seed", "3"]) == 0
+    steps = 20 if leaves else 60
+    assert len(shown) == steps + 1
+    assert min(shown) > 200
+    config = make_config("randomized", None, "measured", horizon=300.0, action="rate")
+    assert capsys.readouterr().out == play.score(config, 3, [np.zeros(2, np.float32)] * steps, False) + "\n"
 
 
-def handle(game: hand.Game, *keys: int, mod: int = 0) -> None:
-    for key in keys:
-        game.handle(pygame.event.Event(pygame.KEYDOWN, key=key, mod=mod))
-
-
-def test_arrows_move_the_set_points_which_the_drives_follow(game: hand.Game) -> None:
-    p = game.record.puller
-    assert game.set_points == (p.v_0, p.Q_H_0)
-    handle(game, pygame.K_UP, pygame.K_UP, pygame.K_RIGHT, pygame.K_SPACE)
-    assert game.set_points == pytest.approx((p.v_0 + 0.02 * MM_PER_MIN, p.Q_H_0 + 0.1 * KILO))
-    game.advance(1.0)
-    assert game.record.t[-1] == 60.0
-    assert [game.record.last("v_p"), game.record.last("Q_H")] == pytest.approx(game.set_points, rel=1e-6)
-    handle(game, pygame.K_DOWN, pygame.K_LEFT, mod=pygame.KMOD_LSHIFT)
-    assert game.set_points == pytest.approx((p.v_0 - 0.08 * MM_PER_MIN, p.Q_H_0 - 0.9 * KILO))
-    handle(game, *[pygame.K_DOWN, pygame.K_LEFT] * 40, mod=pygame.KMOD_LSHIFT)
-    assert game.set_points == (0.0, p.Q_H_0 - 10 * KILO)
-
-
-def test_time_stands_still_while_paused_and_runs_at_the_speed_asked_for(game: hand.Game) -> None:
-    game.advance(10.0)
-    assert game.record.t[-1] == 0.0
-    handle(game, pygame.K_SPACE)
-    game.advance(1.0)
-    handle(game, pygame.K_SPACE)
-    game.advance(10.0)
-    assert game.record.t[-1] == 60.0
-    handle(game, pygame.K_PLUS)
-    assert game.speed == 90.0
-    handle(game, *[pygame.K_PLUS] * 30)
-    assert game.speed == hand.FASTEST
-    handle(game, *[pygame.K_MINUS] * 60)
-    assert game.speed == hand.SLOWEST
-
-
-def test_a_whole_run_in_the_window_ends_with_the_score(game: hand.Game) -> None:
-    game.speed = hand.FASTEST
-    press(pygame.K_SPACE)
-    brightest: list[int] = []
-    show = game.window.show
-
-    def watch(picture: Any) -> None:
-        show(picture)
-        brightest.append(int(pygame.surfarray.array3d(game.window.screen).max()))
-        if game.score is not None:
-            press(pygame.K_q)
-
-    game.window.show = watch  # type: ignore[method-assign]
-    (outcome,) = game.play()
-    assert max(brightest) > 200
-    assert outcome.minutes == 10.0
-    paper = metrics(rollout(game.rival, game.config, [1]))
-    assert outcome.controller == (paper.rmse_mm[0], paper.return_[0], False)
-    assert "by hand" in outcome.line()
-
-
-def test_again_and_the_next_crystal(game: hand.Game) -> None:
-    first = game.record.last("r_c")
-    handle(game, pygame.K_SPACE)
-    game.advance(2.0)
-    handle(game, pygame.K_r)
-    assert (game.record.last("r_c"), len(game.record), game.paused) == (first, 1, True)
-    handle(game, pygame.K_n)
-    assert game.seed == 2
-    assert game.record.last("r_c") != first
-
-
-@pytest.mark.parametrize("seed", [1, 12])
-def test_the_score_of_the_same_controller_is_a_draw(config: Config, seed: int) -> None:
+def test_the_score_of_the_same_controller_is_a_draw() -> None:
+    config = make_config("randomized", None, "measured", horizon=600.0, action="direct")
     paper = find_controller("paper").make(config)
-    env, state, actions, rewards, over = CzEnv.from_config(config), None, [], [], False
-    observation, _ = env.reset(seed=seed)
+    env, state, actions, over = CzEnv.from_config(config), None, [], False
+    observation, _ = env.reset(seed=12)
     while not over:
         action, state = paper.predict(observation, state)
         actions.append(action)
-        observation, reward, _, over, _ = env.step(action)
-        rewards.append(reward)
-    found = score(config, seed, actions, False, paper)
-    assert found.player == pytest.approx(found.controller, rel=1e-12)
-    assert found.player.reward == pytest.approx(sum(rewards), rel=1e-12)
+        observation, _, _, over, _ = env.step(action)
+    by_hand, by_paper = play.score(config, 12, actions, False).split("; ")
+    assert by_hand.partition("by hand ")[2] == by_paper.partition("controller ")[2]
 
 
 def test_a_failed_run_counts_to_the_horizon() -> None:
-    config = make_config("nominal", horizon=5400.0, **PLAIN)
-    env, actions, over = CzEnv.from_config(config), [], False
-    env.reset(seed=1)
-    while not over:
-        actions.append(np.array([1.0, 0.0], np.float32))
-        over = env.step(actions[-1])[2]
-    found = score(config, 1, actions, True, find_controller("paper").make(config))
-    assert found.player.failed
-    assert found.minutes == 90.0
-    assert found.player.rmse_mm > 4.0
-    assert ", failed; by the paper's controller RMSE" in found.line()
+    config = make_config("nominal", None, "measured", horizon=5400.0, action="rate")
+    line = play.score(config, 1, [np.ones(2, np.float32)] * 400, True)
+    assert line.startswith("nominal, crystal 1, 90 min: by hand RMSE ")
+    assert ", failed; by the paper's controller RMSE" in line
 
 
 @pytest.mark.parametrize(
     ("options", "says"),
     [
         (["--scenario", "nonsense"], "unknown scenario 'nonsense'"),
-        (["--speed", "0"], "--speed: must be between 1 and 3600, not 0"),
+        (["--speed", "0"], "--speed: must be between 5 and 300, not 0"),
         (["--minutes", "inf"], "--minutes: must be between 1 and 6000, not inf"),
         (["--seed", "-1"], "--seed: must be between 0 and"),
     ],
@@ -158,7 +107,7 @@ def test_without_a_display_it_says_so(monkeypatch: pytest.MonkeyPatch, refused: 
     pygame.display.quit()
     monkeypatch.setenv("SDL_VIDEODRIVER", "offscreen")
     assert refused(play.main, []) == f"python -m cz_gym.play: {play.NO_DISPLAY}\n"
-    assert not pygame.display.get_init()
+    pygame.display.quit()
     if sys.platform.startswith("linux"):  # where displays have names
         for name in play.DISPLAYS:
             monkeypatch.delenv(name, raising=False)

@@ -9,11 +9,10 @@ import pytest
 from gymnasium.error import DependencyNotInstalled
 
 import benchmark
-from cz_gym import datasets
+from cz_gym import datasets, play
 from cz_gym.baselines.tuning import __main__ as tuning
 from cz_gym.commands import OPTIONAL, OneLineParser, guarded
 from cz_gym.errors import CzError
-from cz_gym.play import __main__ as play
 from studies.paper import __main__ as paper
 from studies.speed import __main__ as speed
 

@@ -87,13 +87,12 @@ def test_the_chart_ends_at_the_true_error(picture: tuple[Frame, Record]) -> None
 
 def test_the_numbers_are_the_records_in_the_units_they_name(record: Record) -> None:
     p, last = record.puller, record.last
-    rows = [row[:2] for group in numbers(record, p.inputs_0) for row in group]
+    rows = [row[:2] for group in numbers(record) for row in group]
     assert rows == [
         ("by the camera", f"{(last('r_br_measured') - p.ring_bias) / MM:.2f} mm"),
         ("reference", f"{last('r_ref') / MM:.2f} mm"),
-        ("pull speed", f"{last('v_p') / MM_PER_MIN:.2f} mm/min"), ("nominal", "1.20"), ("set by hand", "1.20"),
+        ("pull speed", f"{last('v_p') / MM_PER_MIN:.2f} mm/min"), ("nominal", "1.20"),
         ("heater", f"{last('Q_H') / KILO:.2f} kW"), ("nominal", f"{p.Q_H_0 / KILO:.2f}"),
-        ("set by hand", f"{p.Q_H_0 / KILO:.2f}"),
         ("heater T_1", f"{last('T_1'):.2f} K"), ("recipe", f"{last('T_1_ref'):.2f}"),
         ("melt T_b", f"{last('T_b'):.2f} K"), ("nominal", f"{p.T_b_0:.2f}"),
     ]  # fmt: skip

@@ -1,0 +1,118 @@
+"""Pull a crystal by hand in Gymnasium's own player: ``python -m cz_gym.play [--scenario NAME] [--seed N] ...``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import pkgutil
+import sys
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.commands import OneLineParser, between
+from cz_gym.config import Config, make_config
+from cz_gym.env import CzEnv
+from cz_gym.errors import CzError
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.replay import Playback
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.rendering.canvas import load
+from cz_gym.units import MINUTE
+
+Action = npt.NDArray[np.float32]
+CONTROLLERS = "cz_gym.baselines.registry:find_controller"
+"""Function that finds the paper's controller, looked up by name because this package imports no controller."""
+SIZE = (960, 720)
+"""Width and height of the picture [px]."""
+NO_DISPLAY = "no display: a crystal is pulled by hand in a window; set DISPLAY or WAYLAND_DISPLAY"
+DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
+"""Environment variables that can name a display, on systems that have such."""
+STEP = 0.1
+"""Action of a key that is held down, in the mode "rate"; ten times as large with shift [-]."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Play one crystal; 0 when done, 2 for bad input or without a window, 130 when interrupted."""
+    parser = OneLineParser(
+        "python -m cz_gym.play",
+        "Pull a crystal by hand in a window; the score compares you with the paper's controller on the same crystal.",
+        "Keys: up and down change the pull speed, right and left the heater, ten times as fast with shift; Esc ends.",
+    )
+    add = parser.add_argument
+    add("--scenario", default="randomized", metavar="NAME", help="scenario (%(default)s)")
+    add("--seed", type=between(0, 2**31 - 1), default=1, metavar="N", help="which crystal (%(default)s)")
+    add("--speed", type=between(5, 300), default=60, metavar="N", help="times faster than real time (%(default)s)")
+    add("--minutes", type=between(1, 6000), default=180, metavar="M", help="length of the run (%(default)s)")
+    return parser.run(_play, arguments, "render")
+
+
+def settings(arguments: argparse.Namespace) -> Config:
+    """The environment's settings."""
+    return make_config(arguments.scenario, None, "measured", horizon=arguments.minutes * MINUTE, action="rate")
+
+
+def keys() -> dict[tuple[int, ...], Action]:
+    """The action of each combination of keys."""
+    k, actions = load(), {}
+    pulls, heats, shifts = ((0.0, 0), (STEP, k.K_UP), (-STEP, k.K_DOWN)), (0.0, STEP, -STEP), (1.0, 10.0)
+    for (pull, key), (heat, other), large in product(pulls, zip(heats, (0, k.K_RIGHT, k.K_LEFT), strict=True), shifts):
+        shift = k.K_LSHIFT if large > 1.0 else 0
+        pressed = tuple(sorted(one for one in (key, other, shift) if one))
+        if pressed:
+            actions[pressed] = np.array([large * pull, large * heat], np.float32)
+    return actions
+
+
+def score(config: Config, seed: int, actions: Sequence[Action], failed: bool) -> str:
+    """RMSE and return of a player's actions, and those of the paper's controller on the same crystal, in one line.
+
+    A run that the player left early ends there for both. A failed one counts to the horizon, as in the benchmark.
+    """
+    if not failed:
+        config = replace(config, horizon=len(actions) * config.control_interval)
+    direct = replace(config, action="direct")
+    paper = pkgutil.resolve_name(CONTROLLERS)("paper").make(direct)
+    results = []
+    for policy, own in ((Playback(actions), config), (paper, direct)):
+        found = metrics(rollout(policy, own, [seed]))
+        lost = ", failed" if found.failure_rate[0] else ""
+        results.append(f"RMSE {found.rmse_mm[0]:.3f} mm, return {found.return_[0]:,.0f}{lost}")
+    crystal = f"{config.scenario.name}, crystal {seed}, {config.horizon / MINUTE:.0f} min"
+    return f"{crystal}: by hand {results[0]}; by the paper's controller {results[1]}"
+
+
+def _play(arguments: argparse.Namespace) -> None:
+    config, pygame = settings(arguments), load()
+    if sys.platform.startswith(("linux", "freebsd")) and not any(map(os.environ.get, DISPLAYS)):
+        raise CzError(NO_DISPLAY)
+    pygame.display.init()
+    if pygame.display.get_driver() == "offscreen":  # SDL's last resort: a window that nobody sees
+        raise CzError(NO_DISPLAY)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # its plots need matplotlib, the game does not
+        from gymnasium.utils.play import play
+    actions: list[Action] = []
+    ended = failed = False
+
+    def watch(before: Any, after: Any, action: Action, reward: Any, terminated: bool, truncated: bool, _: Any) -> None:
+        nonlocal ended, failed
+        actions.append(action)
+        ended, failed = terminated or truncated, terminated
+        if ended:
+            pygame.event.post(pygame.event.Event(pygame.QUIT))
+
+    fps = max(1, round(arguments.speed / config.control_interval))
+    env = CzEnv.from_config(config, "rgb_array", SIZE)
+    play(env, fps=fps, callback=watch, keys_to_action=keys(), seed=arguments.seed, noop=np.zeros(2, np.float32))
+    if actions:
+        print(score(config, arguments.seed, actions, failed))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

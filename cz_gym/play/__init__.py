@@ -1,1 +1,0 @@
-"""Pull a crystal by hand: ``python -m cz_gym.play``."""
