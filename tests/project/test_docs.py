@@ -35,6 +35,8 @@ SMALL = {
     "TEST_SEEDS[:50]": "TEST_SEEDS[:2]",
     "TRAINING_SEEDS[:20]": "TRAINING_SEEDS[:2]",
     "VALIDATION_SEEDS[:10]": "VALIDATION_SEEDS[:2]",
+    "VALIDATION_SEEDS[:100]": "VALIDATION_SEEDS[:2]",
+    "range(3000)": "range(30)",
     "learn(5_000_000)": "learn(8192)",
     "seeds=range(20)": "seeds=range(2)",
     "seeds=range(10)": "seeds=range(2)",
