@@ -1,0 +1,431 @@
+"""A puller as a file: its numbers in TOML, with the unit in every key.
+
+:data:`KEYS` is the one table of keys: reader, writer, errors and the page's table follow from it. A number is read
+exactly (decimal text times the unit's size, rounded once), and written with the fewest digits that read back the same.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from decimal import Context, Decimal
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cz_gym.atomic_files import naming, write_files
+from cz_gym.episodes.scenario import MAX_LATENCY, Interface, Range, Sensor
+from cz_gym.errors import CzError
+from cz_gym.names import unknown
+from cz_gym.physics.parameters import Parameters, check_parameters
+from cz_gym.physics.plant import make_puller
+
+from .task import HEATER_RANGE, RADIUS_LIMIT, check_height
+from .units import KILO, MINUTE, MM, MM_PER_MIN, PERCENT
+
+FORMAT = 1
+"""Version of the file format."""
+FOLDER = Path(__file__).parent / "pullers"
+"""Folder of the files that ship."""
+
+
+class Drives(NamedTuple):
+    """Drives of pull speed and heater; None: as the scenario says, relative to v_0 and to the heater's range."""
+
+    heater_range: float = HEATER_RANGE
+    """Largest |Q_H - Q_H0|: what an action of 1 moves the heater by [W]"""
+    heater_max: float | None = None
+    """Largest power that the heater can have; narrows its range [W]"""
+    heater_slew: float | None = None
+    """Largest rate of change of the heater power [W/s]"""
+    heater_step: float | None = None
+    """Resolution of the heater power [W]"""
+    pull_max: float | None = None
+    """Largest pull speed; narrows its window [m/s]"""
+    pull_window: float | None = None
+    """Largest |v_p - v_0| [m/s]"""
+    pull_slew: float | None = None
+    """Largest rate of change of the pull speed [m/s2]"""
+
+
+class Sensors(NamedTuple):
+    """Camera and pyrometer; None: as the scenario says, lengths relative to r_0. A pair is a range, drawn from anew for
+    each crystal.
+    """
+
+    camera_noise: Range | None = None
+    """Standard deviation of the white noise on the ring [m]"""
+    pyrometer_noise: Range | None = None
+    """Standard deviation of the white noise on T_1 [K]"""
+    pyrometer_drift: Range | None = None
+    """Drift of the pyrometer over 3 h [K]"""
+    bias_offset: Range | None = None
+    """Constant offset of the ring from a wrong bias [m]"""
+    level_offset: Range | None = None
+    """Constant offset of the ring from the melt level [m]"""
+    ripple: Range | None = None
+    """Amplitude of the rotation-synchronous ripple [m]"""
+    rotation: Range | None = None
+    """Crystal rotation [rev/s]"""
+    latency: float | None = None
+    """Age of the newest camera frame [s]"""
+    outlier_probability: float | None = None
+    """Share of samples that carry an outlier [-]"""
+    outlier_sd: float | None = None
+    """Standard deviation of an outlier [m]"""
+
+
+class Melt(NamedTuple):
+    """Usual fluctuation of the interface's temperature; None: as the scenario says."""
+
+    sd: Range | None = None
+    """Standard deviation of the fast and of the slow fluctuation, each drawn on its own [K]"""
+    tau_fast: float | None = None
+    """Correlation time of the fast one [s]"""
+    tau_slow: float | None = None
+    """Correlation time of the slow one [s]"""
+
+
+class Unit(NamedTuple):
+    """A unit of keys."""
+
+    size: float
+    """Its size in SI units."""
+    slips: tuple[tuple[str, float, float], ...] = ()
+    """Units that users may have meant instead: name, factor and offset to this unit."""
+
+
+UNITS = {
+    "mm": Unit(MM, (("m", 1e3, 0.0), ("µm", 1e-3, 0.0))),
+    "mm_per_min": Unit(MM_PER_MIN, (("mm/h", 1.0 / MINUTE, 0.0), ("m/s", 1.0 / MM_PER_MIN, 0.0))),
+    "mm_per_min2": Unit(MM_PER_MIN / MINUTE, (("mm/s2", MINUTE * MINUTE, 0.0),)),
+    "deg": Unit(math.pi / 180.0, (("rad", 180.0 / math.pi, 0.0),)),
+    "K": Unit(1.0, (("°C", 1.0, 273.15),)),
+    "s": Unit(1.0, (("ms", 1e-3, 0.0), ("min", MINUTE, 0.0))),
+    "rpm": Unit(1.0 / MINUTE, (("rev/s", MINUTE, 0.0),)),
+    "percent": Unit(PERCENT),
+    "kW": Unit(KILO, (("W", 1e-3, 0.0), ("MW", 1e3, 0.0))),
+    "W": Unit(1.0, (("kW", KILO, 0.0),)),
+    "kW_per_min": Unit(KILO / MINUTE, (("W/s", MINUTE / KILO, 0.0),)),
+    "N_per_m": Unit(1.0, (("mN/m", 1e-3, 0.0),)),
+    "kg_per_m3": Unit(1.0, (("g/cm3", KILO, 0.0),)),
+    "J_per_kg": Unit(1.0, (("kJ/kg", KILO, 0.0),)),
+    "J_per_K": Unit(1.0, (("kJ/K", KILO, 0.0),)),
+    "W_per_K": Unit(1.0, (("kW/K", KILO, 0.0),)),
+    "W_per_mK": Unit(1.0, (("W/cm/K", 100.0, 0.0),)),
+    "W_per_K4": Unit(1.0),
+    "W_per_m2K4": Unit(1.0),
+    "m_per_s2": Unit(1.0),
+    "": Unit(1.0, (("%", PERCENT, 0.0),)),
+}
+"""Units of keys, by the keys' endings."""
+
+
+class Key(NamedTuple):
+    """A number of the file."""
+
+    table: str
+    stem: str
+    """The key without its unit."""
+    unit: str
+    """Its ending, of :data:`UNITS`."""
+    low: float
+    """Smallest plausible value, in the key's unit."""
+    high: float
+    """Largest plausible value."""
+    part: str = "parameters"
+    """Member of :class:`Puller` that has the number."""
+    member: str = ""
+    """Its name there, by default the stem; empty part: the member of :class:`Puller` itself."""
+
+    @property
+    def name(self) -> str:
+        """The key as it stands in the file."""
+        return f"{self.stem}_{self.unit}" if self.unit else self.stem
+
+    @property
+    def field(self) -> str:
+        """Name of the number in its part."""
+        return self.member or self.stem
+
+    @property
+    def size(self) -> Fraction:
+        """Size of the unit in SI units."""
+        return Fraction(UNITS[self.unit].size)
+
+    @property
+    def drawn(self) -> bool:
+        """Whether each crystal draws its own number from a range."""
+        return isinstance(getattr(_DRAWN.get(self.part), self.field, None), tuple)
+
+
+_DRAWN = {"sensors": Sensor(), "melt": Interface()}
+
+KEYS = (
+    Key("crystal", "radius", "mm", 2.0, 500.0, member="r_0"),
+    Key("crystal", "pull_speed", "mm_per_min", 0.005, 30.0, member="v_0"),
+    Key("crystal", "sigma", "N_per_m", 0.01, 5.0),
+    Key("crystal", "rho_l", "kg_per_m3", 100.0, 3e4),
+    Key("crystal", "rho_s", "kg_per_m3", 100.0, 3e4),
+    Key("crystal", "alpha_0", "deg", 0.0, 60.0),
+    Key("crystal", "k_l", "W_per_mK", 0.1, 1e3),
+    Key("crystal", "dH", "J_per_kg", 1e4, 1e8),
+    Key("crystal", "T_m", "K", 200.0, 5e3),
+    Key("hot_zone", "dT_0", "K", 0.01, 500.0),
+    Key("hot_zone", "C_1", "J_per_K", 500.0, 1e8),
+    Key("hot_zone", "C_2", "J_per_K", 500.0, 1e8),
+    Key("hot_zone", "C_b", "J_per_K", 500.0, 1e8),
+    Key("hot_zone", "kappa_12", "W_per_K4", 1e-12, 1e-5),
+    Key("hot_zone", "G_1a", "W_per_K", 0.01, 1e5),
+    Key("hot_zone", "T_a", "K", 200.0, 2e3),
+    Key("hot_zone", "G_2b", "W_per_K", 0.01, 1e5),
+    Key("hot_zone", "eps", "", 1e-3, 1.0),
+    Key("hot_zone", "R_cr", "mm", 5.0, 2e3),
+    Key("hot_zone", "T_e", "K", 0.0, 5e3),
+    Key("hot_zone", "g", "m_per_s2", 1e-3, 100.0),
+    Key("hot_zone", "sigma_SB", "W_per_m2K4", 1e-9, 1e-6),
+    Key("drives", "heater_range", "kW", 0.05, 500.0, "drives"),
+    Key("drives", "heater_max", "kW", 0.1, 5e3, "drives"),
+    Key("drives", "heater_slew", "kW_per_min", 0.01, 1e3, "drives"),
+    Key("drives", "heater_step", "W", 0.0, 1e4, "drives"),
+    Key("drives", "pull_max", "mm_per_min", 0.01, 60.0, "drives"),
+    Key("drives", "pull_window", "mm_per_min", 0.001, 60.0, "drives"),
+    Key("drives", "pull_slew", "mm_per_min2", 0.001, 600.0, "drives"),
+    Key("sensors", "interval", "s", 0.1, 60.0, "", "control_interval"),
+    Key("sensors", "phi_b", "deg", 0.01, 60.0),
+    Key("sensors", "camera_noise", "mm", 0.0, 2.0, "sensors"),
+    Key("sensors", "pyrometer_noise", "K", 0.0, 100.0, "sensors"),
+    Key("sensors", "pyrometer_drift", "K", -100.0, 100.0, "sensors"),
+    Key("sensors", "bias_offset", "mm", -5.0, 5.0, "sensors"),
+    Key("sensors", "level_offset", "mm", -5.0, 5.0, "sensors"),
+    Key("sensors", "ripple", "mm", 0.0, 5.0, "sensors"),
+    Key("sensors", "rotation", "rpm", 0.0, 100.0, "sensors"),
+    Key("sensors", "latency", "s", 0.0, MAX_LATENCY, "sensors"),
+    Key("sensors", "outlier_probability", "percent", 0.0, 100.0, "sensors"),
+    Key("sensors", "outlier_sd", "mm", 0.0, 5.0, "sensors"),
+    Key("melt", "fluctuation_sd", "K", 0.0, 100.0, "melt", "sd"),
+    Key("melt", "tau_fast", "s", 0.1, 1e5, "melt"),
+    Key("melt", "tau_slow", "s", 0.1, 1e6, "melt"),
+)
+"""Every key of the file, in order."""
+TABLES = tuple(dict.fromkeys(key.table for key in KEYS))
+"""Tables of the file."""
+
+
+@dataclass(frozen=True)
+class Puller:
+    """A machine: its operating point and hot zone, its drives, its sensors, and how its melt usually fluctuates.
+
+    CzError for numbers that are not plausible, impossible geometry, and drives that exclude the operating point.
+    """
+
+    name: str = "default"
+    parameters: Parameters = field(default_factory=Parameters)
+    drives: Drives = field(default_factory=Drives)
+    sensors: Sensors = field(default_factory=Sensors)
+    melt: Melt = field(default_factory=Melt)
+    control_interval: float = 5.0
+    """Time between actions [s]."""
+    missing: tuple[str, ...] = field(default=(), compare=False, repr=False)
+    """Keys that its file does not have: they keep the default's value."""
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.name, str) and self.name.strip() and len(self.name) <= 80 and self.name.isprintable()):
+            raise CzError(f"a puller's name must be up to 80 printable characters, not {self.name!r:.100}")
+        for key in KEYS:
+            _check(key, value_of(self, key))
+        object.__setattr__(self, "parameters", check_parameters(self.parameters))
+        plant = make_puller(self.parameters)
+        check_height(plant)
+        highest, fastest = self.drives.heater_max, self.drives.pull_max
+        if highest is not None and highest <= plant.Q_H_0:
+            raise CzError(
+                f"heater_max_kW = {highest / KILO:g} excludes the operating point, "
+                f"which needs {plant.Q_H_0 / KILO:.4g} kW"
+            )
+        if fastest is not None and fastest <= plant.v_0:
+            raise CzError(
+                f"pull_max_mm_per_min = {fastest / MM_PER_MIN:g} excludes the operating point, "
+                f"whose pull speed is {plant.v_0 / MM_PER_MIN:.4g} mm/min"
+            )
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 of everything but the name (16 hex digits)."""
+        numbers = [value_of(self, key) for key in KEYS]
+        plain = [value if value is None else (np.asarray(value, float) + 0.0).tolist() for value in numbers]
+        return hashlib.sha256(json.dumps([FORMAT, plain]).encode()).hexdigest()[:16]
+
+    @property
+    def label(self) -> str:
+        """Name and hash, for contracts, reports and errors; empty for the default puller, whatever its name."""
+        return "" if self.hash == DEFAULT.hash else f"{self.name} ({self.hash})"
+
+    @property
+    def heater_range(self) -> float:
+        """What an action of 1 moves the heater by [W]."""
+        highest = self.drives.heater_max
+        room = math.inf if highest is None else highest - make_puller(self.parameters).Q_H_0
+        return min(self.drives.heater_range, room)
+
+    @property
+    def scale(self) -> float:
+        """Its radius r_0 in units of the default puller's [-]."""
+        return self.parameters.r_0 / DEFAULT.parameters.r_0
+
+    @property
+    def radius_limit(self) -> float:
+        """Largest |r_c - r_ref| before the crystal is lost [m]."""
+        return RADIUS_LIMIT * self.scale
+
+
+def value_of(puller: Puller, key: Key) -> Any:
+    """The number, or range, of a key [SI units]; None: the scenario's own."""
+    return getattr(getattr(puller, key.part) if key.part else puller, key.field)
+
+
+def read_puller(path: str | Path) -> Puller:
+    """Read a puller file; CzError, one line that names the file, for anything that cannot be meant."""
+    path = Path(path)
+    with naming(path):
+        text = path.read_text("utf-8")
+    try:
+        return _puller(tomllib.loads(text, parse_float=Decimal), path.stem)
+    except (tomllib.TOMLDecodeError, CzError) as error:
+        raise CzError(f"{path}: {' '.join(str(error).split())}") from None
+
+
+def write_puller(puller: Puller, path: str | Path) -> None:
+    """Write a puller as a file that :func:`read_puller` reads as the same puller, bit for bit."""
+    write_files({Path(path): to_toml(puller).encode()})
+
+
+def find_puller(given: str | Path | Puller | None) -> Puller:
+    """The puller that is meant by a file, a shipped name, or itself; None is the default one."""
+    if given is None or isinstance(given, Puller):
+        return given or DEFAULT
+    if not isinstance(given, str | Path):
+        raise CzError(f"puller must be a puller file, a shipped name or a cz_gym.puller.Puller, not {given!r:.80}")
+    shipped = {file.stem: file for file in sorted(FOLDER.glob("*.toml"))}
+    if str(given) in shipped and not Path(given).exists():
+        return read_puller(shipped[str(given)])
+    if Path(given).suffix != ".toml" and not Path(given).exists():
+        raise CzError(unknown("puller", str(given), shipped, ", or a file NAME.toml"))
+    return read_puller(given)
+
+
+def to_toml(puller: Puller) -> str:
+    """The puller as the text of a file; numbers that are the scenario's own are left out."""
+    lines = [f"format = {FORMAT}", f"name = {json.dumps(puller.name, ensure_ascii=False)}"]
+    for table in TABLES:
+        lines += ["", f"[{table}]"]
+        for key in (each for each in KEYS if each.table == table):
+            value = value_of(puller, key)
+            if value is not None:
+                texts = [_shortest(number, key) for number in (value if isinstance(value, tuple) else (value,))]
+                single = texts[0] if len(set(texts)) == 1 else f"[{', '.join(texts)}]"
+                lines.append(f"{key.name} = {single}")
+    return "\n".join(lines) + "\n"
+
+
+def _puller(found: Mapping[str, Any], stem: str) -> Puller:
+    """The puller of a file's content; without a name it has the file's."""
+    if found.get("format") != FORMAT:
+        raise CzError(f"expected 'format = {FORMAT}' at the top, not {found.get('format', 'nothing')!r:.40}")
+    if odd := set(found) - {"format", "name", *TABLES}:
+        raise CzError(unknown("table", f"[{min(odd)}]", [f"[{table}]" for table in TABLES]))
+    numbers: dict[str, dict[str, Any]] = {"parameters": {}, "drives": {}, "sensors": {}, "melt": {}, "": {}}
+    missing = []
+    for table in TABLES:
+        given, known = found.get(table, {}), {key.name: key for key in KEYS if key.table == table}
+        if not isinstance(given, Mapping):
+            raise CzError(f"{table} must be a table [{table}], not {given!r:.40}")
+        for name, value in given.items():
+            if name not in known:
+                raise CzError(_misplaced(table, name, known))
+            numbers[known[name].part][known[name].field] = _number(known[name], value)
+        missing += [name for name in known if name not in given]
+    name = found.get("name", stem)
+    return Puller(
+        name,
+        Parameters(**numbers["parameters"]),
+        Drives(**numbers["drives"]),
+        Sensors(**numbers["sensors"]),
+        Melt(**numbers["melt"]),
+        missing=tuple(missing),
+        **numbers[""],
+    )
+
+
+def _misplaced(table: str, name: str, known: Mapping[str, Key]) -> str:
+    """The line on a key that a table does not have."""
+    for key in KEYS:
+        if key.name == name:
+            return f"{name} belongs in [{key.table}], not in [{table}]"
+        if key.table == table and name.startswith(f"{key.stem}_"):
+            return f"[{table}] has no key {name!r}: did you mean {key.name!r}?"
+    return unknown(f"key of [{table}]", name, known)
+
+
+def _number(key: Key, value: Any) -> Any:
+    """A value of the file in SI units: a number, or a pair where the number is drawn from a range."""
+    pair = key.drawn
+    if isinstance(value, list) and pair and len(value) == 2:
+        return _number(key, value[0])[0], _number(key, value[1])[0]
+    if isinstance(value, bool) or not isinstance(value, int | Decimal) or not Decimal(value).is_finite():
+        also = ", or a pair [low, high]" if pair else ""
+        raise CzError(f"{key.name} must be a number{also}, not {value!r:.40}")
+    number = _read(Decimal(value), key)
+    return (number, number) if pair else number
+
+
+def _read(text: Decimal, key: Key) -> float:
+    """A decimal number of the key's unit in SI units, rounded once."""
+    if abs(text.adjusted()) > 300:
+        raise CzError(f"{key.name} = {text} is no plausible number")
+    return float(Fraction(text) * key.size)
+
+
+def _shortest(value: float, key: Key) -> str:
+    """The shortest decimal number that :func:`_read` reads as this value."""
+    exact = Fraction(value) / key.size
+    for digits in range(1, 40):
+        context = Context(prec=digits)
+        text = context.divide(Decimal(exact.numerator), Decimal(exact.denominator))
+        if _read(text, key) == value:
+            break
+    plain = text.normalize(Context(prec=40))
+    return f"{plain:f}" if -5 < plain.adjusted() < 7 else f"{plain:E}"
+
+
+def _check(key: Key, value: Any) -> None:
+    """Raise CzError, with a guess at the unit that was meant, unless a key's value is plausible."""
+    if value is None and key.part not in ("", "parameters") and key.field != "heater_range":
+        return
+    pair = key.drawn
+    numbers = value if isinstance(value, tuple) else (value,)
+    sound = all(isinstance(each, int | float) and not isinstance(each, bool) for each in numbers)
+    if not sound or len(numbers) != (2 if pair else 1) or not numbers[0] <= numbers[-1]:
+        raise CzError(f"{key.name} must be {'a pair of numbers low <= high' if pair else 'a number'}, not {value!r}")
+    for number in numbers:
+        shown = number / UNITS[key.unit].size
+        if not key.low * (1.0 - 1e-12) <= shown <= key.high * (1.0 + 1e-12):
+            raise CzError(f"{key.name} = {shown:g} must lie within {key.low:g} to {key.high:g}{_meant(key, shown)}")
+
+
+def _meant(key: Key, shown: float) -> str:
+    for unit, factor, offset in UNITS[key.unit].slips:
+        guess = shown * factor + offset
+        if shown > 0.0 and key.low <= guess <= key.high:
+            return f": did you mean {guess:.6g} ({shown:g} {unit})?"
+    return ""
+
+
+DEFAULT = Puller()
+"""The puller that was invented for this project: that of every environment without another one."""
