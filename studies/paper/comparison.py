@@ -10,7 +10,7 @@ from cz_gym.physics.linearisation import RadiusModel
 from cz_gym.units import HOUR, MM
 
 from . import experiments as ex
-from .published import COMPENSATOR, CROSSOVER, ODE, PHASE_MARGIN_DEG, PUBLISHED, ZERO
+from .experiments import COMPENSATOR, CROSSOVER, ODE, PHASE_MARGIN_DEG, PUBLISHED, ZERO
 
 DAY = 24.0 * HOUR
 
@@ -109,9 +109,9 @@ def _response_rows() -> list[Row]:
     found = []
     for m in ex.MODELS:
         for change, over in (("-10 % over 600 s", 600.0), ("sudden -10 %", ex.SUDDEN)):
-            response = ex.inverse_response(ex.pull_change(m, over=over))
-            found.append(Row(f"inverse response, {change}, depth, Model {m}", "mm", None, response.depth / MM))
-            found.append(Row(f"inverse response, {change}, recovery, Model {m}", "s", None, response.recovery))
+            depth, recovery = ex.inverse_response(ex.pull_change(m, over=over))
+            found.append(Row(f"inverse response, {change}, depth, Model {m}", "mm", None, depth / MM))
+            found.append(Row(f"inverse response, {change}, recovery, Model {m}", "s", None, recovery))
         found += [
             Row(f"cases, max of A - 5 B over max of A, {name}, Model {m}", "-", None, value, "plotted, not given")
             for name, value in ex.case_difference(m).items()

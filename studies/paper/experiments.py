@@ -1,4 +1,9 @@
-"""The paper's design and its experiments on the nonlinear plant; each result is computed once."""
+"""What Part II prints, and its design and experiments on our nonlinear plant; each result is computed once.
+
+Bukhari, Hovd and Winkler, "Inverse response behaviour in the bright ring radius measurement of the Czochralski process
+II: Mitigation by control", Journal of Crystal Growth. Its controller's own numbers are the defaults that it is built
+with.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +14,7 @@ import numpy as np
 
 from cz_gym import HURLE, MeniscusModel, Scenario, make_puller
 from cz_gym.baselines.analysis.compensator_design import Margins, design_compensator, margins
-from cz_gym.baselines.pid.compensated_pid import CompensatedPID, Compensator
+from cz_gym.baselines.pid.compensated_pid import CompensatedPID, Compensator, SeriesPID
 from cz_gym.config import make_config
 from cz_gym.episodes.schedule import quintic
 from cz_gym.evaluation.replay import Playback
@@ -17,7 +22,22 @@ from cz_gym.evaluation.rollout import Signals, rollout
 from cz_gym.physics.linearisation import Floats, RadiusModel, radius_model
 from cz_gym.units import HOUR, MINUTE, MM, MM_PER_MIN
 
-from .published import PID, PUBLISHED
+MODEL_I = RadiusModel(numerator=-0.0047626, poles=(8.78e-6, -1.684e-3), lead=-47.1864, constant=1.0041)
+MODEL_II = RadiusModel(numerator=-0.0048849, poles=(4.63e-7, 7.602e-6), lead=-46.0050, constant=1.0043)
+PUBLISHED = {"I": MODEL_I, "II": MODEL_II}
+"""G_p and G_m by model, section on the linearised model."""
+ZERO = 0.021
+"""Right half plane zero of both models, as rounded in the text [rad/s]."""
+COMPENSATOR = Compensator()
+"""G_pc,real."""
+ODE = (1.884e-3, 3.368e-7)
+"""The same as a differential equation in time: coefficients of y_pc' [rad/s] and y_pc [(rad/s)^2]."""
+PID = SeriesPID()
+"""Table 1."""
+CROSSOVER = 0.03275
+"""Table 1 [rad/s]."""
+PHASE_MARGIN_DEG = 74.0
+"""Text below Table 1, "around 74 degrees for both models" [degrees]."""
 
 MODELS = {"I": 1.0, "II": 0.0}
 """Share of conduction of the paper's models [-]."""
@@ -95,15 +115,6 @@ def trace(
     return Trace(interval * np.arange(lived + 1, dtype=np.float64), logged, r_tilde, bool(run.failed[0]))
 
 
-class InverseResponse(NamedTuple):
-    """Inverse response of the bright ring to a change of the pull speed."""
-
-    depth: float
-    """Largest excursion in the wrong direction [m]."""
-    recovery: float
-    """Time from the start of the change until the ring is back at its first radius [s]."""
-
-
 @cache
 def pull_change(
     model: str, change: float = -0.1, over: float = 600.0, before: float = 0.0, horizon: float = 1200.0
@@ -115,8 +126,11 @@ def pull_change(
     return trace(Playback(actions), model, horizon=len(share) * FINE, interval=FINE)
 
 
-def inverse_response(run: Trace, change: float = -0.1) -> InverseResponse:
-    """Depth and recovery of a pull change that began at t = 0; ArithmeticError if the ring never comes back."""
+def inverse_response(run: Trace, change: float = -0.1) -> tuple[float, float]:
+    """Inverse response of the ring to a pull change at t = 0; ArithmeticError if the ring never comes back.
+
+    Its largest excursion in the wrong direction [m], and the time until it is back at its first radius [s].
+    """
     ring = run.signals.r_br - run.signals.r_br[0]
     # Pulling slower thickens the crystal; the ring's wrong way has the sign of the change.
     wrong = np.sign(change) * ring
@@ -126,7 +140,7 @@ def inverse_response(run: Trace, change: float = -0.1) -> InverseResponse:
         raise ArithmeticError("the ring shows no inverse response that recovers within the run")
     k = lowest + int(later[0])
     back = run.t[k - 1] + (run.t[k] - run.t[k - 1]) * wrong[k - 1] / (wrong[k - 1] - wrong[k])
-    return InverseResponse(float(wrong[lowest]), float(back))
+    return float(wrong[lowest]), float(back)
 
 
 def case_difference(model: str) -> dict[str, float]:

@@ -11,13 +11,12 @@ from matplotlib.figure import Figure
 
 from cz_gym import make_puller
 from cz_gym.baselines.analysis.compensator_design import open_loop
-from cz_gym.evaluation.report.canvas import GREY, canvas, png
+from cz_gym.evaluation.report.canvas import GREY, canvas
 from cz_gym.physics.linearisation import Floats
 from cz_gym.units import MINUTE, MM, MM_PER_MIN
 
 from . import experiments as ex
-from .experiments import Trace
-from .published import PID
+from .experiments import PID, Trace
 
 DEGREE = np.pi / 180.0
 BLUE, ORANGE, GREEN = "#1f5fa8", "#d1661f", "#2b8a4b"
@@ -166,8 +165,3 @@ FIGURES: dict[str, tuple[str, Callable[[], Figure]]] = {
     "figure_14_ramp_II.png": ("Figure 14: the ramp, Model II.", partial(ramp_response, "II")),
 }
 """Captions and functions of the figures by file name, numbered as in the paper."""
-
-
-def drawn() -> dict[str, bytes]:
-    """The figures as PNG by file name."""
-    return {name: png(draw()) for name, (_, draw) in FIGURES.items()}

@@ -18,7 +18,7 @@ from studies.speed import __main__ as speed
 
 COMMANDS: list[tuple[Any, str, str, list[str]]] = [
     (benchmark, "--episode", "benchmark", ["--out", "new/folder"]),
-    (paper, "--ou", "contents", ["--out", "new/folder"]),
+    (paper, "--ou", "report", ["--out", "new/folder"]),
     (tuning, "--trial", "measure", ["--controller", "industrial", "--out", "new/folder"]),
     (speed, "--qui", "measure", ["--quick"]),
     (play, "--minute", "settings", []),

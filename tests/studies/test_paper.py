@@ -12,16 +12,8 @@ from cz_gym.baselines import CompensatedPID
 from cz_gym.baselines.pid.compensated_pid import SeriesPID
 from cz_gym.physics.linearisation import radius_model
 from studies.paper import __main__ as paper
-from studies.paper import comparison, report
-from studies.paper.experiments import (
-    BARE,
-    errors,
-    inverse_response,
-    pull_change,
-    ramp,
-    ramp_numbers,
-    trace,
-)
+from studies.paper import comparison
+from studies.paper.experiments import BARE, errors, inverse_response, pull_change, ramp, ramp_numbers, trace
 from studies.paper.figures import FIGURES
 
 
@@ -40,7 +32,7 @@ def test_the_committed_numbers_come_out(numbers):
 @pytest.mark.slow
 def test_the_command_writes_the_report_with_its_figures(tmp_path, numbers, monkeypatch):
     """With two cut-offs, for speed."""
-    monkeypatch.setattr(report, "CUT_OFFS", (2e-4, 2e-3))
+    monkeypatch.setattr(paper, "CUT_OFFS", (2e-4, 2e-3))
     assert paper.main(["--out", str(tmp_path)]) == 0
     assert json.loads((tmp_path / "numbers.json").read_text()) == numbers
     written = (tmp_path / "report.md").read_text()
@@ -69,10 +61,10 @@ def test_inverse_response_against_a_double_integrator():
     puller = make_puller(lam=0.0)
     model = radius_model(puller)
     change = -1e-3
-    found = inverse_response(pull_change("II", change, over=1e-6, horizon=300.0), change)
+    depth, recovery = inverse_response(pull_change("II", change, over=1e-6, horizon=300.0), change)
     rate = abs(model.numerator * puller.v_0 * change)
-    assert found.depth == pytest.approx(rate * model.lead**2 / (2.0 * model.constant), rel=0.01)
-    assert found.recovery == pytest.approx(2.0 / model.zero, rel=0.01)
+    assert depth == pytest.approx(rate * model.lead**2 / (2.0 * model.constant), rel=0.01)
+    assert recovery == pytest.approx(2.0 / model.zero, rel=0.01)
 
 
 def test_what_model_ii_leaves_out():
