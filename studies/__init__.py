@@ -1,3 +1,3 @@
-"""Questions, each a folder with one command; nothing in the packages imports them, and no wheel holds them."""
+"""Questions, each answered by one command; nothing in the packages imports them, and no wheel holds them."""
 
 import cz_gym  # noqa: F401  (says in a line what is missing, before a study imports more)

@@ -13,8 +13,8 @@ from cz_gym import datasets, play
 from cz_gym.baselines.tuning import __main__ as tuning
 from cz_gym.commands import OPTIONAL, OneLineParser, guarded
 from cz_gym.errors import CzError
+from studies import speed
 from studies.paper import __main__ as paper
-from studies.speed import __main__ as speed
 
 COMMANDS: list[tuple[Any, str, str, list[str]]] = [
     (benchmark, "--episode", "benchmark", ["--out", "new/folder"]),

@@ -12,7 +12,7 @@ from cz_gym.baselines.analysis.frequency import loop_margins
 from cz_gym.observation import PULL_SCALE
 from cz_gym.physics.plant import make_puller
 from cz_gym.units import MM
-from studies.bode import __main__ as bode
+from studies import bode
 
 OWN = """
 from typing import NamedTuple

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cz_gym.units import MM
-from studies.camera import __main__ as study
+from studies import camera as study
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from cz_gym import agents
-from studies.cards import __main__ as cards
+from studies import cards
 
 FIGURES = {key: {"mean": 0.0, "ci95": [0.0, 0.5]} for key in cards.FIGURES}
 

@@ -6,7 +6,7 @@ import pytest
 
 from cz_gym.baselines.lqg.designs import ACTIVITIES, family_name
 from cz_gym.baselines.registry import find_controller
-from studies.frontier import __main__ as frontier
+from studies import frontier
 
 
 def entry(activity, rmse):

@@ -9,7 +9,7 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 
-from studies.speed import __main__ as speed
+from studies import speed
 
 SMALL = {
     "Cz-v0 scalar": partial(gym.make, "Cz-v0"),

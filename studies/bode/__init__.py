@@ -1,1 +1,0 @@
-"""Bode plot, margins and sensitivity of a controller's loop: ``python -m studies.bode my.py:SlowPID``."""

@@ -1,1 +1,0 @@
-"""What the camera sees, measured: ``python -m studies.camera``."""

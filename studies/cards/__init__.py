@@ -1,1 +1,0 @@
-"""Model cards of the shipped agents: ``python -m studies.cards``."""

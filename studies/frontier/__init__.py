@@ -1,1 +1,0 @@
-"""Error at equal activity: ``python -m studies.frontier``."""

@@ -1,1 +1,0 @@
-"""What a step costs, beside other environments: ``python -m studies.speed``."""
