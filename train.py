@@ -74,53 +74,32 @@ def train(arguments: argparse.Namespace) -> int:
     """Run the training that the command line asks for."""
     if arguments.plot:
         import matplotlib  # noqa: F401  # if it is missing, say so before the training
-    from cz_gym.atomic_files import check_writable
-
-    folders = {seed: arguments.out.resolve() / f"seed{seed}" for seed in arguments.seeds or ()}
-    saved_steps = _fill_from_resumed_run(arguments, list(folders.values()) or [arguments.out])
-    recipe = _recipe_from(arguments, saved_steps)
-    check_writable(arguments.out)
-    return _train_seeds(arguments, recipe, folders) if folders else _train_one(arguments, recipe)
-
-
-def _train_one(arguments: argparse.Namespace, recipe: Recipe) -> int:
     from tqdm import tqdm
 
-    from cz_gym.agents.training.run import Run
+    from cz_gym.agents.training.fleet import train_seed, train_seeds
+    from cz_gym.agents.training.run import Job
     from cz_gym.agents.training.validation import references
-    from cz_gym.atomic_files import locked
-    from cz_gym.baselines.registry import make_controller
-
-    folder, seed, resume = arguments.out, arguments.seed, arguments.resume
-    with locked(folder):
-        beside = references(make_controller, recipe)
-        run = Run(folder, recipe, seed, beside, resume, arguments.checkpoint_seconds, arguments.plot)
-        crystals = recipe.config.scenario.name
-        print(f"{recipe.name}, seed {seed}, {recipe.steps:,} steps on {crystals}, into {folder}")
-        with tqdm(total=recipe.steps, unit="step", unit_scale=True, dynamic_ncols=True, mininterval=1.0) as bar:
-            run.learn(bar)
-        summary = run.finish()
-    print(_summary_line(summary))
-    print(f"wrote {folder / 'agent.onnx'}")
-    return 0
-
-
-def _train_seeds(arguments: argparse.Namespace, recipe: Recipe, folders: dict[int, Path]) -> int:
-    """Train several seeds, each into its folder."""
-    from tqdm import tqdm
-
-    from cz_gym.agents.training.fleet import Job, train_seeds
-    from cz_gym.agents.training.validation import references
-    from cz_gym.atomic_files import locked
+    from cz_gym.atomic_files import check_writable, locked
     from cz_gym.baselines.registry import make_controller
     from cz_gym.evaluation.processes import in_processes
 
-    options = references(make_controller, recipe), arguments.checkpoint_seconds, arguments.plot, sys.argv
-    jobs = [Job(folder, recipe, seed, *options) for seed, folder in folders.items()]
-    for job in jobs:
-        with locked(job.folder):
+    folders = [arguments.out.resolve() / f"seed{seed}" for seed in arguments.seeds or ()] or [arguments.out]
+    saved_steps = _fill_from_resumed_run(arguments, folders)
+    recipe = _recipe_from(arguments, saved_steps)
+    check_writable(arguments.out)
+    for folder in folders:
+        with locked(folder):
             pass  # if another process has it, say so before the training
-    print(f"{recipe.name}, {len(jobs)} seeds on {recipe.config.scenario.name}, into {arguments.out}")
+    options = references(make_controller, recipe), arguments.checkpoint_seconds, arguments.plot, sys.argv
+    seeds = arguments.seeds or [arguments.seed]
+    jobs = [Job(folder, recipe, seed, *options) for folder, seed in zip(folders, seeds, strict=True)]
+    what = f"{len(jobs)} seeds" if arguments.seeds else f"seed {arguments.seed}, {recipe.steps:,} steps"
+    print(f"{recipe.name}, {what} on {recipe.config.scenario.name}, into {arguments.out}")
+    if not arguments.seeds:
+        with tqdm(total=recipe.steps, unit="step", unit_scale=True, dynamic_ncols=True, mininterval=1.0) as bar:
+            summary = train_seed(jobs[0], bar)
+        print(f"{_summary_line(summary)}\nwrote {arguments.out / 'agent.onnx'}")
+        return 0
     with tqdm(total=len(jobs), bar_format="{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}") as bar:
         for job, summary in train_seeds(jobs, in_processes, bar):
             bar.write(f"seed {job.seed}: {_summary_line(summary)}")

@@ -5,6 +5,7 @@ from typing import Any
 from cz_gym.agents.training import fleet, validation
 from cz_gym.agents.training.algorithms import make_algorithm, repeat_of
 from cz_gym.agents.training.recipes import APG, PPO, SAC, Recipe
+from cz_gym.agents.training.run import Job
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
 SMALL = PPO(num_envs=4, hidden=(16, 16), steps=128, n_steps=16, batch_size=32, n_epochs=1)
@@ -16,10 +17,10 @@ REFERENCES = dict.fromkeys(validation.REFERENCES, (0.2, 0.1))
 TRAIN_SEED = fleet.train_seed
 
 
-def train_small_seed(job: fleet.Job) -> dict[str, float]:
+def train_small_seed(job: Job, bar: Any = None) -> dict[str, float]:
     """As :func:`fleet.train_seed`, with few validation episodes, in whatever process."""
     validation.PICKING, validation.JUDGING = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4]
-    return TRAIN_SEED(job)
+    return TRAIN_SEED(job, bar)
 
 
 def learned(algorithm: Any, recipe: Recipe) -> Any:

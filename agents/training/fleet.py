@@ -6,60 +6,31 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from tqdm import tqdm
 
-from cz_gym.agents.agent_file.contract import read_json
 from cz_gym.atomic_files import locked
 from cz_gym.errors import CzError
 
-from .recipes import Recipe
-from .run import Run
-from .run_files import check_settings, read_rows
-from .validation import References
-
-
-class Job(NamedTuple):
-    """A training seed's run."""
-
-    folder: Path
-    recipe: Recipe
-    seed: int
-    references: References
-    checkpoint_seconds: float
-    plot: bool
-    command: Sequence[str]
-    """The command line, for the run's settings."""
-
-    @property
-    def begun(self) -> bool:
-        """Whether its folder holds this run; AgentFileError if it holds another one."""
-        exists = (self.folder / "settings.json").exists()
-        return exists and bool(check_settings(self.folder, self.recipe, self.seed))
-
-    @property
-    def summary(self) -> dict[str, float] | None:
-        """The summary of the run; None before its end."""
-        path = self.folder / "summary.json"
-        saved = read_json(path) if self.begun and path.exists() else None
-        steps = saved.get("steps") if isinstance(saved, dict) else None
-        return saved if isinstance(steps, int) and steps >= self.recipe.steps else None
-
+from .run import Job, Run
+from .run_files import read_rows
 
 Perform = Callable[[Callable[[Job], Any], Sequence[Job], Callable[[], None]], Iterator[tuple[int, Any]]]
 """Does jobs: :func:`cz_gym.evaluation.processes.in_processes`."""
 
 
-def train_seed(job: Job) -> dict[str, float]:
-    """Train a seed to its end, from its checkpoint if there is one; the contents of ``summary.json``."""
-    with locked(job.folder), tqdm(disable=True) as bar:
+def train_seed(job: Job, bar: Any = None) -> dict[str, float]:
+    """Train a seed to its end, from its checkpoint if there is one; the contents of ``summary.json``.
+
+    ``bar`` is tqdm's and counts environment steps.
+    """
+    with locked(job.folder):
         if summary := job.summary:
             return summary
         sys.argv = list(job.command)
-        run = Run(job.folder, job.recipe, job.seed, job.references, job.begun, job.checkpoint_seconds, job.plot)
-        run.learn(bar)
+        run = Run(job)
+        run.learn(tqdm(disable=True) if bar is None else bar)
         return run.finish()
 
 

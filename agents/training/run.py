@@ -6,11 +6,11 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import configure_logger
@@ -23,6 +23,7 @@ from cz_gym.agents.agent_file.contract import (
     facts_of,
     make_contract,
     read_agent,
+    read_json,
 )
 from cz_gym.agents.export import to_onnx
 from cz_gym.agents.policies.onnx import OnnxPolicy
@@ -38,42 +39,58 @@ from .run_files import check_settings, identity, provenance, read_rows, to_csv, 
 from .validation import COLUMNS, REFERENCES, References, Validation, validate
 
 CHECKPOINT = "checkpoint.safetensors"
-CHECKPOINT_SECONDS = 60.0
-"""Longest time between checkpoints, apart from validations and updates in between [s]."""
 VALIDATE_EVERY = 200_000
 """Least number of steps between validations."""
 MAX_SESSIONS = 100
 """Number of sessions that settings list, beside the first and the present one."""
 
 
-class Run:
-    """One training run.
+class Job(NamedTuple):
+    """A training seed's run."""
 
-    ``references`` are the RMSEs of classical controllers on the same crystals, shown beside the agent's. ``resume``
-    continues from the folder's checkpoint, which is saved every ``checkpoint_seconds``. It holds the run's other files
-    too: best agent, progress and, with ``plot``, a picture of it. Raises AgentFileError if the folder cannot be used.
+    folder: Path
+    recipe: Recipe
+    seed: int
+    references: References
+    """RMSEs of classical controllers on the same crystals, shown beside the agent's."""
+    checkpoint_seconds: float = 60.0
+    """Longest time between checkpoints, apart from validations and updates in between [s]."""
+    plot: bool = False
+    """Whether to draw the progress into the folder."""
+    command: Sequence[str] = ()
+    """The command line, for the run's settings."""
+
+    @property
+    def sessions(self) -> list[dict[str, Any]]:
+        """Sessions of the run in its folder, empty before the first; AgentFileError if that is another run."""
+        exists = (self.folder / "settings.json").exists()
+        return check_settings(self.folder, self.recipe, self.seed) if exists else []
+
+    @property
+    def summary(self) -> dict[str, float] | None:
+        """The summary of the run; None before its end."""
+        path = self.folder / "summary.json"
+        saved = read_json(path) if self.sessions and path.exists() else None
+        steps = saved.get("steps") if isinstance(saved, dict) else None
+        return saved if isinstance(steps, int) and steps >= self.recipe.steps else None
+
+
+class Run:
+    """One training run, continued from its folder's checkpoint if it has begun there.
+
+    The checkpoint holds the run's other files too: best agent, progress and, with ``plot``, a picture of it. Raises
+    AgentFileError if the folder cannot be used.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        recipe: Recipe,
-        seed: int,
-        references: References,
-        resume: bool = False,
-        checkpoint_seconds: float = CHECKPOINT_SECONDS,
-        plot: bool = False,
-    ) -> None:
-        self.folder, self.recipe, self.seed, self.plot = folder, recipe, seed, plot
-        self.checkpoint_seconds, self.references = checkpoint_seconds, references
+    def __init__(self, job: Job) -> None:
+        folder, recipe, seed = self.folder, self.recipe, self.seed = job[:3]
+        self.job = job
         self.config = recipe.config
         self.files: dict[str, bytes] = {}
         self.rows: list[dict[str, Any]] = []
         self.best: float | None = None
-        sessions: list[dict[str, Any]] = []
-        self.began = time.monotonic()
-        if resume:
-            sessions = check_settings(folder, recipe, seed)
+        self.began, sessions = time.monotonic(), job.sessions
+        if sessions:
             progress, tensors, self.files = load_checkpoint(folder / CHECKPOINT)
             write_files({folder / name: content for name, content in self.files.items()})
             self.rows, self.best = read_rows(folder / "progress.csv"), progress.best_cost
@@ -130,7 +147,7 @@ class Run:
             "validation_episodes": len(validation.JUDGING),
             "validation_cost": figures.cost,
             "validation_rmse_mm": figures.rmse_mm,
-            **{f"{name}_rmse_mm": judged for name, (_, judged) in self.references.items()},
+            **{f"{name}_rmse_mm": judged for name, (_, judged) in self.job.references.items()},
             "pull_step_rms_mm_per_min": figures.pull_step_rms_mm_per_min,
             "failure_rate": figures.failure_rate,
             "training_steps": contract.training_steps,
@@ -164,11 +181,11 @@ class Run:
         if self.best is None or figures.cost < self.best:
             self.best = figures.cost
             self._hold(agent_files(self.folder / "agent.onnx", content, _with_figures(contract, figures)))
-        picked = [picked for picked, _ in self.references.values()]
+        picked = [picked for picked, _ in self.job.references.values()]
         row = self.steps, round(time.monotonic() - self.began, 1), *figures, *picked
         self.rows.append(dict(zip(COLUMNS, row, strict=True)))
         self._hold({self.folder / "progress.csv": to_csv(self.rows)})
-        if self.plot:
+        if self.job.plot:
             from .plot import progress
 
             self._hold({self.folder / "progress.png": progress(self.rows, f"{self.recipe.name}, seed {self.seed}")})
@@ -204,7 +221,7 @@ class _Watch(BaseCallback):
         if run.steps >= self.due:
             run.validate(self.bar)
             self.due = run.steps + run.validate_every
-        if run.steps > run.saved_steps and (interrupted or time.monotonic() >= run.saved + run.checkpoint_seconds):
+        if run.steps > run.saved_steps and (interrupted or time.monotonic() >= run.saved + run.job.checkpoint_seconds):
             run.save()
         if interrupted:
             raise KeyboardInterrupt

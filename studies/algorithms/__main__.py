@@ -21,13 +21,11 @@ from cz_gym.evaluation.processes import in_processes
 from cz_gym.names import unknown
 
 if TYPE_CHECKING:
-    from cz_gym.agents.training.fleet import Job
     from cz_gym.agents.training.recipes import Recipe
+    from cz_gym.agents.training.run import Job
 
     from .report import Result
 
-CHECKPOINT_SECONDS = 60.0
-"""Time between the checkpoints of a run [s]."""
 Perform = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
 """Does tasks: the number of each and its result, as they come."""
 
@@ -64,10 +62,10 @@ def _main(given: argparse.Namespace) -> None:
 
 def make_jobs(recipes: Sequence[Recipe], seeds: int, work: Path) -> list[Job]:
     """A run for each training seed and recipe, seed by seed: a stopped comparison has trained every recipe."""
-    from cz_gym.agents.training.fleet import Job
+    from cz_gym.agents.training.run import Job
 
     return [
-        Job((work / f"{each.name}-seed{seed}").resolve(), each, seed, {}, CHECKPOINT_SECONDS, False, sys.argv)
+        Job((work / f"{each.name}-seed{seed}").resolve(), each, seed, {}, command=sys.argv)
         for seed in range(seeds)
         for each in recipes
     ]

@@ -9,7 +9,8 @@ import numpy as np
 
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.agents.training import validation
-from cz_gym.agents.training.fleet import Job, train_seed
+from cz_gym.agents.training.fleet import train_seed
+from cz_gym.agents.training.run import Job
 from cz_gym.agents.training.run_files import read_rows, to_csv
 from cz_gym.agents.training.validation import REFERENCES, references
 from cz_gym.baselines.registry import make_controller

@@ -36,9 +36,9 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Small runs in this process; the seeds that were trained, in turn."""
     seeds: list[int] = []
 
-    def counted(job: fleet.Job) -> Any:
+    def counted(job: run.Job, bar: Any = None) -> Any:
         seeds.append(job.seed)
-        return train_small_seed(job)
+        return train_small_seed(job, bar)
 
     monkeypatch.setattr(fleet, "train_seed", counted)
     monkeypatch.setattr(processes, "in_processes", in_turn)
@@ -56,12 +56,12 @@ def sessions(folder: Path) -> list[int]:
     return [len(each["sessions"]) for each in every]
 
 
-def jobs(folder: Path, seeds: range, recipe: Recipe = SMALL_PPO) -> list[fleet.Job]:
+def jobs(folder: Path, seeds: range, recipe: Recipe = SMALL_PPO) -> list[run.Job]:
     options = REFERENCES, 60.0, False, ["train.py", "--seeds"]
-    return [fleet.Job(folder / f"seed{seed}", recipe, seed, *options) for seed in seeds]
+    return [run.Job(folder / f"seed{seed}", recipe, seed, *options) for seed in seeds]
 
 
-def done(some: list[fleet.Job], perform: fleet.Perform) -> list[int]:
+def done(some: list[run.Job], perform: fleet.Perform) -> list[int]:
     """Seeds in the order they were finished; the bar has counted them all."""
     with tqdm(total=len(some), file=io.StringIO()) as bar:
         seeds = [job.seed for job, _ in fleet.train_seeds(some, perform, bar)]
@@ -80,7 +80,7 @@ def test_seeds_come_out_as_one_by_one_and_only_once(
     assert list(found) == ["seed3", "seed4"]
     assert found["seed4"] == (one / "agent.onnx").read_bytes() != found["seed3"]
     assert train.main(["--resume", "--seeds", "2-4", "--out", str(several)]) == 0, "the folder knows the recipe"
-    assert trained == [3, 4, 2]
+    assert trained == [3, 4, 4, 2]
     assert sessions(several) == [1, 1, 1]
     assert train.main(["--seeds", "4-5", "--out", str(several)]) == 2
     assert "seed4 holds a run already" in capsys.readouterr().err
@@ -121,7 +121,7 @@ def test_one_seed_that_fails_stops_no_other(
 ) -> None:
     """An error that the project raises on purpose is one line; any other one is raised with its traceback."""
 
-    def failing(job: fleet.Job) -> Any:
+    def failing(job: run.Job) -> Any:
         if job.seed == 1:
             raise error
         return train_small_seed(job)
