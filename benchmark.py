@@ -89,8 +89,8 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
     """Check what is asked for, run it, write and print the results."""
     from tqdm import tqdm
 
+    from cz_gym.evaluation.report.markdown import terminal
     from cz_gym.evaluation.report.output import check_targets, write
-    from cz_gym.evaluation.report.terminal import terminal
     from cz_gym.evaluation.runner import run
 
     rows = rows_of(arguments)
@@ -135,10 +135,10 @@ def contenders_of(arguments: argparse.Namespace, rows: Sequence[Row]) -> list[Co
     """
     from cz_gym.agents import OnnxPolicy, shipped_names, shipped_seeds
     from cz_gym.baselines.registry import CONTROLLERS
+    from cz_gym.contender import agent
     from cz_gym.evaluation import user_code
-    from cz_gym.evaluation.contenders import agent, check_agents
     from cz_gym.evaluation.protocol import SLOW_EPISODES
-    from cz_gym.evaluation.runner import is_cached
+    from cz_gym.evaluation.runner import check_agents, is_cached
 
     own, given = [user_code.controller(place) for place in arguments.controller], given_agents(arguments)
     registered, shipped = [each.name for each in CONTROLLERS], shipped_names()
@@ -171,7 +171,7 @@ def contenders_of(arguments: argparse.Namespace, rows: Sequence[Row]) -> list[Co
 def given_agents(arguments: argparse.Namespace) -> dict[str, Contender]:
     """Agents of files by name: the files of one name are its training seeds."""
     from cz_gym.agents import OnnxPolicy, shipped_names
-    from cz_gym.evaluation.contenders import agent
+    from cz_gym.contender import agent
 
     policies: dict[str, list[OnnxPolicy]] = {}
     for name, file in arguments.agent:

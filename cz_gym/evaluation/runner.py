@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cz_gym.contender import Contender
+from cz_gym.errors import CzError
 
 from .cache import SlowEpisodes, earlier_bound
 from .protocol import SLOW_EPISODES, Row
 from .results import Result, Sample, summarise
-from .rollout import rollout
+from .rollout import check_policy, rollout
 
 AT_ONCE = 500
 """Episodes that a policy runs at once."""
@@ -41,6 +42,18 @@ def run_piece(piece: Piece, progress: Callable[[int], None] | None = None) -> Sa
     return Sample.of(
         piece.contender, rollout(policy, piece.row.config(*interface), piece.seeds, progress, designed_for)
     )
+
+
+def check_agents(contenders: Sequence[Contender], rows: Sequence[Row]) -> None:
+    """Raise CzError for an agent that was trained for another environment than a row has, its control interval say."""
+    for each in contenders:
+        for row in rows:
+            config = row.design_config(each.observation, each.action)
+            for policy in each.trained:
+                try:
+                    check_policy(policy, config)
+                except CzError as error:
+                    raise CzError(f"agent {each.name!r} on {row.name}: {error}") from None
 
 
 def episodes_of(contender: Contender, row: Row, episodes: int) -> range:

@@ -8,7 +8,7 @@ arrays are never written or read again. ``python -m cz_gym.testing.checker`` run
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing, nullcontext
 from copy import deepcopy
 from itertools import product
@@ -26,7 +26,7 @@ from cz_gym.errors import CzError
 from cz_gym.observation import CAMERA, OBSERVATIONS
 
 from .driver import Checked, Driver, MakeScalar, MakeVector, NotConforming
-from .nested_arrays import KEEPERS, Kept, difference, flatten, keep, overwrite
+from .nested_arrays import KEEPERS, difference, flatten, keep, overwrite
 
 __all__ = ["Checked", "NotConforming", "check_vector_env"]
 
@@ -140,18 +140,16 @@ def _check_kept(driver: Driver, every: bool) -> None:
 
     One alone, because an environment that recycles arrays nobody holds would find the others free.
     """
-    kept: list[tuple[str, Kept]] = []
+    kept: list[tuple[str, str, Callable[[], bool]]] = []
     with driver.vector() as env:
         for number, event in enumerate(driver.run(env)):
             arrays = flatten(event.result)
-            if every:
-                kept += [(event.call, keep(array, len(kept) + i)) for i, array in enumerate(arrays)]
-            else:
-                kept.append((event.call, keep(arrays[number // len(KEEPERS) % len(arrays)], number)))
-            del arrays, event
-        for call, array in kept:
-            still = f"{call}: {array.name} (kept as {array.keeper}) was written by a later call"
-            driver.require(array.unchanged, still)
+            one = number // len(KEEPERS) % len(arrays)
+            some = enumerate(arrays, len(kept)) if every else [(number, arrays[one])]
+            kept += [(event.call, *keep(array, way)) for way, array in some]
+            del arrays, event, some
+        for call, name, unchanged in kept:
+            driver.require(unchanged(), f"{call}: {name} was written by a later call")
     driver.seen += Checked(held=len(kept))
 
 
@@ -185,13 +183,10 @@ def _check_cz(scenario: str, observation: str, num_envs: int, steps: int) -> Che
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Check ``Cz-v0`` on every scenario, observation and autoreset mode; print the counts."""
-    parser = OneLineParser(
-        "python -m cz_gym.testing.checker", "Check Cz-v0's native vector form against its scalar form."
-    )
-    parser.add_argument(
-        "--steps", type=between(50, 10**9), default=50, help="batched steps a case, images fewer (%(default)s)"
-    )
-    parser.add_argument("--slots", type=between(2, 10**6), default=3, help="slots of the batch (%(default)s)")
+    about = "Check Cz-v0's native vector form against its scalar form."
+    add = (parser := OneLineParser("python -m cz_gym.testing.checker", about)).add_argument
+    add("--steps", type=between(50, 10**9), default=50, help="batched steps a case, images fewer (%(default)s)")
+    add("--slots", type=between(2, 10**6), default=3, help="slots of the batch (%(default)s)")
     given = parser.parse_args(argv)
     total, cases = Checked(), list(product(scenarios.SCENARIOS, (*OBSERVATIONS, CAMERA)))
     for scenario, observation in cases:

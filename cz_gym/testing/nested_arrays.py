@@ -86,23 +86,14 @@ KEEPERS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], bytes]]] = {
 """Ways to keep an array: a function that makes the keeper from the array, and one that reads the bytes from it."""
 
 
-class Kept(NamedTuple):
-    """An array held by a keeper, and its bytes at that time."""
+def keep(array: NamedArray, number: int) -> tuple[str, Callable[[], bool]]:
+    """Keep an array in way ``number`` modulo their count, or as itself where that way is impossible.
 
-    name: str
-    keeper: str
-    kept: Any
-    content: bytes
-
-    @property
-    def unchanged(self) -> bool:
-        """Whether the keeper still shows the same bytes."""
-        return KEEPERS[self.keeper][1](self.kept) == self.content
-
-
-def keep(array: NamedArray, number: int) -> Kept:
-    """Keep an array in way ``number`` modulo their count, or as itself where that way is impossible."""
+    Returns its name with the way, and a function that says whether it shows the same bytes still.
+    """
     value = array.value
     simple = value.ndim > 0 and value.size > 0 and value.flags.c_contiguous and value.flags.writeable
-    keeper = list(KEEPERS)[number % len(KEEPERS) if simple else 0]
-    return Kept(array.name, keeper, KEEPERS[keeper][0](value), value.tobytes())
+    way = list(KEEPERS)[number % len(KEEPERS) if simple else 0]
+    make, read = KEEPERS[way]
+    kept, content = make(value), value.tobytes()  # nothing else may hold the array
+    return f"{array.name} (kept as {way})", lambda: read(kept) == content

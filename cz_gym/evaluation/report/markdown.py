@@ -1,4 +1,4 @@
-"""The benchmark's report in Markdown, whose first line is the verdict."""
+"""The benchmark's report as text: in Markdown, whose first line is the verdict, and as a short table for a terminal."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cz_gym.evaluation.results import BOUND, REFERENCE, Result, Sample, common
+from cz_gym.evaluation.results import BOUND, REFERENCE, SPEED, Result, Sample, common
 from cz_gym.units import HOUR, PERCENT
 
 from .tables import (
@@ -31,6 +31,16 @@ from .verdict import headline
 
 BEST = 2
 """Agents that :func:`brief` shows: those of the lowest RMSE."""
+SHORT = (
+    Column("max_error_mm", "max [mm]", 2, interval=False),
+    Column("within_half_mm", "in 0.5 mm [%]", 1, PERCENT, interval=False),
+    PULL_STEP._replace(heading="pull step [mm/min]", interval=False),
+    HEATER_STEP._replace(heading="heater step [kW]", interval=False),
+    FAILURES._replace(interval=False),
+    Column(SPEED, "compute [us/step]", 2),
+)
+"""Columns without intervals, between RMSE and its paired difference."""
+LESS = RMSE._replace(heading=f"RMSE less {REFERENCE}'s [mm]", kind="paired")
 BEGIN, END = "<!-- benchmark:begin -->", "<!-- benchmark:end -->"
 """Markers around the part of a page that :func:`fill_in` writes."""
 
@@ -154,3 +164,24 @@ def _training_seeds(pooled: Sequence[Sample]) -> str:
         lines.append((sample.name, str(len(seeds)), *figures, worst, losers, str(len(sample.seeds))))
     figures_of = ("best [mm]", "median [mm]", "worst [mm]")
     return table(("agent", "training seeds", *figures_of, "worst seed", "crystals lost", "of"), lines)
+
+
+def terminal(results: Sequence[Result]) -> str:
+    """Return the short table: RMSE with its interval, then means, and the paired difference of RMSE."""
+    return "\n\n".join([*map(_short, results), headline(results)])
+
+
+def _short(result: Result) -> str:
+    columns = (RMSE, *SHORT, LESS)
+    headings = ["controller", *(column.heading for column in columns)]
+    names, units = zip(*(heading.rstrip("]").partition(" [")[::2] for heading in headings), strict=True)
+    grid = [names, units, *rows(result, columns)]
+    widths = [max(map(len, column)) for column in zip(*grid, strict=True)]
+    row = result.row
+    lines = [
+        f"{row.name} ({crystals(len(result.seeds))}){f', on the default puller: {row.puller}' if row.file else ''}"
+    ]
+    for name, *cells in grid:
+        padded = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
+        lines.append("  ".join([f"  {name:<{widths[0]}}", *padded]).rstrip())
+    return "\n".join(lines)

@@ -20,8 +20,7 @@ from cz_gym.units import HOUR
 from . import tables
 from .canvas import styles_of
 from .markdown import measured_from
-from .page_crystal import crystal
-from .page_pictures import errors, pareto
+from .page_pictures import crystal, errors, pareto
 from .verdict import headline
 
 _SLOT = re.compile(r"<!-- slot:(\w+) -->")

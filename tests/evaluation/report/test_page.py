@@ -18,8 +18,7 @@ from cz_gym.config import make_config
 from cz_gym.env import CzEnv
 from cz_gym.evaluation.report.canvas import styles_of
 from cz_gym.evaluation.report.page import page
-from cz_gym.evaluation.report.page_crystal import PANELS, crystal
-from cz_gym.evaluation.report.page_pictures import errors, pareto, plain
+from cz_gym.evaluation.report.page_pictures import PANELS, crystal, errors, pareto, plain
 from cz_gym.evaluation.report.tables import DRIVES, ERROR, comparison
 from cz_gym.evaluation.results import Result
 from cz_gym.observation import MEASURED, scales
