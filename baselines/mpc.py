@@ -120,7 +120,7 @@ class EkfMpc(LQG):
     @property
     def limits(self) -> Limits:
         """The drives' limits, in the prediction's units."""
-        return limits_of(self.actuators, self.v_0, self.control_interval)
+        return limits_of(self.actuators, (self.v_0, self.heater_range), self.control_interval)
 
     def law(self, estimate: Floats, plan: Floats, previous: Floats) -> Floats:
         """The best inputs [m/s, W], deviations, shape (n, 2); the LQG's own in slots where the prediction fails.

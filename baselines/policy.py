@@ -17,7 +17,7 @@ from cz_gym.errors import CzError
 from cz_gym.observation import Measured, decode
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
-from cz_gym.task import HEATER_RANGE
+from cz_gym.puller import DEFAULT, Puller
 
 Floats = npt.NDArray[np.float64]
 
@@ -74,6 +74,8 @@ class MeasuredController(ABC):
     """Parameters of the nominal puller."""
     meniscus: MeniscusModel = field(default=HURLE, kw_only=True)
     """Meniscus of the nominal puller."""
+    puller: Puller = field(default=DEFAULT, kw_only=True)
+    """The machine that it is for."""
     any_environment: bool = field(default=False, kw_only=True)
     """Whether every environment takes its actions (``made_for`` is None)."""
 
@@ -85,6 +87,11 @@ class MeasuredController(ABC):
         """Nominal pull speed [m/s]."""
         return self.parameters.v_0
 
+    @property
+    def heater_range(self) -> float:
+        """What an action of 1 moves the heater by [W]."""
+        return self.puller.heater_range
+
     @cached_property
     def made_for(self) -> MadeFor | None:
         """The environment that takes its actions; None: every one does."""
@@ -95,13 +102,16 @@ class MeasuredController(ABC):
             control_interval=self.control_interval,
             parameters=self.parameters,
             meniscus=self.meniscus,
+            puller=self.puller,
         ).made_for
 
     @property
     def settings(self) -> dict[str, Any]:
         """Arguments of ``gym.make("Cz-v0", ...)`` for the environment that it was made for."""
         given = {"observation": self.observation, "action": self.action, "control_interval": self.control_interval}
-        plant = {"parameters": (self.parameters, Parameters()), "meniscus": (self.meniscus, HURLE)}
+        plant: dict[str, Any] = {"meniscus": (self.meniscus, HURLE), "puller": (self.puller, DEFAULT)}
+        if self.puller == DEFAULT:
+            plant["parameters"] = self.parameters, Parameters()
         return given | {name: own for name, (own, default) in plant.items() if own != default}
 
     def for_config(self, config: Config) -> Self:
@@ -111,6 +121,7 @@ class MeasuredController(ABC):
             control_interval=config.control_interval,
             parameters=config.parameters,
             meniscus=config.meniscus,
+            puller=config.puller,
         )
 
     @abstractmethod
@@ -126,7 +137,7 @@ class MeasuredController(ABC):
     ) -> tuple[npt.NDArray[np.float32], Any]:
         """Return the action and the next memory; arguments as of :class:`Policy`."""
         array, single = batched(observation)
-        seen = decode(array, self.v_0)
+        seen = decode(array, self.v_0, self.heater_range)
         if state is None or (episode_start is not None and np.any(episode_start)):
             first = Measured(*(np.where(np.isfinite(channel), channel, 0.0) for channel in seen))
             state = fresh(state, State(first, self.at_rest(first)), episode_start)
@@ -134,7 +145,7 @@ class MeasuredController(ABC):
         read = seen if good else readable(seen, state.readings)
         given = read._replace(T_1=seen.T_1) if self.estimates_temperature else read
         pull, power, memory = self.step(given, state.memory)
-        action = to_action(pull / self.v_0, power / HEATER_RANGE, single)
+        action = to_action(pull / self.v_0, power / self.heater_range, single)
         return mark(action, self.made_for), State(read, memory)
 
 

@@ -18,9 +18,12 @@ class MadeFor(NamedTuple):
     """Time between its actions [s]."""
     plant: str
     """Hash of the plant (:attr:`cz_gym.config.Config.plant_hash`)."""
+    puller: str = "default"
+    """Name and hash of the puller file (:attr:`cz_gym.puller.Puller.label`)."""
 
     def __str__(self) -> str:
-        return f"action={self.action!r}, control_interval={self.control_interval:g}, plant {self.plant}"
+        puller = "" if self.puller == "default" else f", puller {self.puller}"
+        return f"action={self.action!r}, control_interval={self.control_interval:g}, plant {self.plant}{puller}"
 
 
 class MarkedAction(np.ndarray[Any, np.dtype[Any]]):

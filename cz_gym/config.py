@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from numbers import Integral, Real
+from pathlib import Path
 from typing import NamedTuple
 
 from cz_gym.camera.view import Camera, camera_for, check_camera
@@ -23,6 +24,7 @@ from cz_gym.physics.plant import EQUATIONS, make_puller
 
 from .action import MadeFor
 from .observation import CAMERA, OBSERVATIONS
+from .puller import DEFAULT, Puller, find_puller, on
 from .task import ACTIONS, check_height
 
 VERSION = 0
@@ -46,6 +48,8 @@ class Identity(NamedTuple):
     """[s]."""
     horizon: float
     """[s]."""
+    puller: str = DEFAULT.label
+    """Name and hash of the puller file."""
 
     def difference(self, other: Identity) -> str | None:
         """The first difference in words; None if there is none."""
@@ -73,6 +77,23 @@ class Config:
     meniscus: MeniscusModel = HURLE
     camera: Camera = field(default_factory=Camera)
     """The camera of ``observation="camera"``; nothing else depends on it."""
+    puller: Puller = DEFAULT
+    """The machine; scenario, parameters and control interval follow from it in :func:`make_config`."""
+
+    @property
+    def ranges(self) -> tuple[float, float]:
+        """What an action of 1 moves pull speed [m/s] and heater power [W] by, and what both are observed in."""
+        return self.parameters.v_0, self.heater_range
+
+    @property
+    def heater_range(self) -> float:
+        """What an action of 1 moves the heater power by [W]."""
+        return self.puller.heater_range
+
+    @property
+    def radius_limit(self) -> float:
+        """Largest |r_c - r_ref| before the crystal is lost [m]."""
+        return self.puller.radius_limit
 
     @property
     def steps(self) -> int:
@@ -97,7 +118,7 @@ class Config:
     @property
     def made_for(self) -> MadeFor:
         """What controllers and agents of this environment are made for."""
-        return MadeFor(self.action, self.control_interval, self.plant_hash)
+        return MadeFor(self.action, self.control_interval, self.plant_hash, self.puller.label)
 
     @property
     def hash(self) -> str:
@@ -108,6 +129,8 @@ class Config:
             parts.append(list(self.camera))
         if self.action != "direct":
             parts.append(self.action)
+        if self.puller.hash != DEFAULT.hash:
+            parts.append(self.puller.hash)
         return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
 
     @property
@@ -117,11 +140,14 @@ class Config:
         low, high = self.mix
         mix = float(low) + 0.0, float(high) + 0.0
         seen = f"camera {tuple(self.camera)}" if self.observation == CAMERA else self.observation
-        return Identity(VERSION, self.plant_hash, scenario, mix, seen, self.action, self.control_interval, self.horizon)
+        return Identity(
+            *(VERSION, self.plant_hash, scenario, mix, seen, self.action, self.control_interval, self.horizon),
+            self.puller.label,
+        )
 
     def with_scenario(self, scenario: AnyScenario) -> Config:
         """The same settings on another scenario or mixture."""
-        return replace(self, scenario=find_distribution(scenario))
+        return replace(self, scenario=on(self.puller, find_distribution(scenario)))
 
 
 def check_config(config: Config) -> Config:
@@ -137,15 +163,19 @@ def make_config(
     scenario: AnyScenario = "randomized",
     model: str | float | None = None,
     observation: str = "history",
-    control_interval: float = 5.0,
+    control_interval: float | None = None,
     horizon: float = 10800.0,
     parameters: Parameters | None = None,
     meniscus: MeniscusModel | None = None,
     camera: Camera | None = None,
     action: str = "smooth",
+    puller: str | Path | Puller | None = None,
 ) -> Config:
     """Check the arguments of the environment; CzError names what was given and what is allowed."""
-    drawn_from = find_distribution(scenario)
+    machine = find_puller(puller)
+    if puller is not None and parameters is not None:
+        raise CzError(f"parameters are those of the puller {machine.name!r}: give one of both")
+    drawn_from = on(machine, find_distribution(scenario))
     mix_of(model, drawn_from)
     if not isinstance(observation, str) or observation not in (*OBSERVATIONS, CAMERA):
         raise CzError(unknown("observation", observation, [*OBSERVATIONS, CAMERA]))
@@ -153,17 +183,20 @@ def make_config(
         raise CzError(unknown("action", action, ACTIONS))
     if camera is not None and observation != CAMERA:
         raise CzError(f'a camera is of use with observation="camera" only, not with {observation!r}')
-    interval = positive("control_interval", control_interval)
+    interval = positive("control_interval", machine.control_interval if control_interval is None else control_interval)
     length = positive("horizon", horizon)
     steps = length / interval
     if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:
-        raise CzError(f"horizon {horizon} s must be a whole number of control intervals of {control_interval} s")
+        raise CzError(f"horizon {horizon} s must be a whole number of control intervals of {interval:g} s")
     if meniscus is not None and not isinstance(meniscus, MeniscusModel):
         raise CzError(f"meniscus must be a cz_gym.MeniscusModel, not {meniscus!r}")
-    checked = check_parameters(parameters if parameters is not None else Parameters())
+    checked = check_parameters(machine.parameters if parameters is None else parameters)
     check_height(make_puller(checked, meniscus=meniscus or HURLE))
     checked_camera = check_camera(camera_for(checked) if camera is None else camera, checked)
-    return Config(drawn_from, model, observation, action, interval, length, checked, meniscus or HURLE, checked_camera)
+    return Config(
+        *(drawn_from, model, observation, action, interval, length, checked, meniscus or HURLE, checked_camera),
+        puller=machine,
+    )
 
 
 @lru_cache(maxsize=64)

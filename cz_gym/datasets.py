@@ -82,7 +82,7 @@ def excitation(seed: int, config: Config, noise: float) -> tuple[float, npt.NDAr
 def record(policy: Any, config: Config, seeds: Sequence[int], noise: float) -> list[dict[str, Any]]:
     """Run one episode per seed, all in one batch; the fields of Minari's ``EpisodeBuffer`` for each episode."""
     settings, n = settings_of(policy), len(seeds)
-    drives = drives_of(settings["action"], config.control_interval)
+    drives = drives_of(settings["action"], config.control_interval, config.heater_range)
     gains, place = np.array([drives.pull, drives.heater]), list(DRIVE_CHANNELS)
     added = np.stack([excitation(seed, config, noise)[1] for seed in seeds], axis=1)
     begins, over, memory, before = np.ones(n, np.bool_), np.zeros(n, np.bool_), None, np.zeros((n, 2))
@@ -91,7 +91,7 @@ def record(policy: Any, config: Config, seeds: Sequence[int], noise: float) -> l
         seen, taken = [(observation, info["r_c"], info["r_ref"], info["state"])], []
         for noise_now in added:
             measured = settings["observation"] == "measured"
-            shown = to_measured(observation, config.parameters.v_0) if measured else observation
+            shown = to_measured(observation, *config.ranges) if measured else observation
             found, memory = policy.predict(shown, state=memory, episode_start=begins, deterministic=True)
             # "smooth" and "rate" actions act on the drives without the excitation of the step before.
             wanted = drives.keep * (observation[:, place] - before) + gains * found

@@ -59,8 +59,8 @@ the camera's reading of it [m]. All else that a step depends on (disturbances, n
 class DifferentiableBatch:
     """Many crystals that are stepped together, each step with its derivatives.
 
-    ``config`` is the environment's (:func:`cz_gym.config.make_config`). Its control interval must divide the 5 s for
-    which disturbances are held, and its camera's latency must not be longer than the control interval.
+    ``config`` is the environment's (:func:`cz_gym.config.make_config`). Its control interval may be up to the
+    5 s for which disturbances are held, and its camera's latency must not be longer than the control interval.
 
     Noise, freezes and drop-outs are those of the environment; a held reading depends on the state at which it was
     taken. The derivatives ignore that the heater moves in whole steps and that observations are rounded.
@@ -69,12 +69,14 @@ class DifferentiableBatch:
     def __init__(self, config: Config, num_envs: int, threads: int | None = 1) -> None:
         check_config(config)
         self.num_envs = positive_whole("num_envs", num_envs)
-        parts = GRID / config.control_interval
-        if abs(parts - round(parts)) > 1e-9 or round(parts) < 1:
-            raise CzError(f"control_interval must divide {GRID:g} s, not be {config.control_interval:g} s")
+        if config.control_interval > GRID:
+            raise CzError(f"control_interval must be at most {GRID:g} s, not {config.control_interval:g} s")
         latency = max(scenario.sensor.latency for scenario in config.scenario.scenarios)
         if latency > config.control_interval:
-            raise CzError(f"the camera's latency of {latency:g} s is longer than the control interval")
+            raise CzError(
+                f"the camera's latency of {latency:g} s is longer than the control interval; a puller file's latency_s "
+                "stands in place of the scenario's"
+            )
         self.config = config = replace(config, observation="measured")
         self._made_for = config.made_for
         self._batch = Batch(config, self.num_envs, threads)
@@ -124,13 +126,25 @@ class DifferentiableBatch:
         if given.shape != (n, ACTIONS) or np.isnan(given).any():
             raise InvalidAction(f"actions must be numbers of shape {(n, ACTIONS)}, not {actions!r:.80}")
         batch, out = self._batch, self._copied()
+        slots = batch.memory.slots
+        held = np.stack([slots["Q_d"], slots["dT_i"]], axis=1)
         active = self._grows & (batch.memory.slots["k"] < batch.clock.steps)
         batch.step(given, out, active)
         self._grows = active & ~out.terminated
         self._out, self._state = out, self._now()
         jacobian = self._jacobians.new()
         self._tangents(
-            batch.memory, before, batch.actions, self._grows, batch.clock, batch.drives, self._work, jacobian, 0, n
+            batch.memory,
+            before,
+            held,
+            batch.actions,
+            self._grows,
+            batch.clock,
+            batch.drives,
+            self._work,
+            jacobian,
+            0,
+            n,
         )
         info = out.info[:, :n]
         cost = np.where(self._grows, info[_COSTS], 0.0).T
@@ -167,7 +181,7 @@ class DifferentiableBatch:
 def _measured_by_state(config: Config) -> Floats:
     """Derivatives of "measured" with respect to the differentiable state, shape (11, 9)."""
     by_state = np.zeros((len(MEASURED), len(STATES)))
-    scale = dict(zip((channel.name for channel in MEASURED), scales(MEASURED, config.parameters.v_0), strict=True))
+    scale = dict(zip((channel.name for channel in MEASURED), scales(MEASURED, *config.ranges), strict=True))
     for row, channel in enumerate(MEASURED):
         of = {"ring_error": "reading", "T_1": "T_1", "v_p": "v_p", "Q_H": "Q_H"}.get(channel.name)
         if of is not None:

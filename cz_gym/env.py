@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Self
 
 import gymnasium as gym
@@ -28,6 +29,7 @@ from cz_gym.rendering.view import FPS, declared_modes, make_view
 from .action import MarkedAction, check_marked
 from .config import Config, check_config, make_config
 from .observation import CAMERA, CLIP, OBSERVATIONS
+from .puller import Puller
 from .signals import INFO, LEAN
 
 Observation = npt.NDArray[Any]
@@ -148,7 +150,8 @@ class CzEnv(Form, gym.Env[Observation, Action]):
     ``horizon`` [s], ``info`` ("lean": true radius and its reference; "all": every signal, see
     :class:`cz_gym.signals.Logged`; with observation "history" also the true ``state``, for critics),
     ``render_mode``, ``parameters`` (:class:`cz_gym.Parameters`), ``meniscus`` (:class:`cz_gym.MeniscusModel`),
-    ``camera`` (:class:`cz_gym.camera.Camera`, with observation "camera" only). Bad values raise ValueError.
+    ``camera`` (:class:`cz_gym.camera.Camera`, with observation "camera" only), ``puller`` (a file, or the name of a
+    shipped one; see docs/puller.md: parameters and control interval are then its own). Bad values raise ValueError.
     ``render_mode`` is None, "rgb_array" or "human", ``render_size`` the picture's width and height [px]; rendering
     needs the extra ``render``, without which no mode is declared and asking for one raises
     :class:`gymnasium.error.DependencyNotInstalled`.
@@ -162,7 +165,7 @@ class CzEnv(Form, gym.Env[Observation, Action]):
         scenario: AnyScenario = "randomized",
         model: str | float | None = None,
         observation: str = "history",
-        control_interval: float = 5.0,
+        control_interval: float | None = None,
         horizon: float = 10800.0,
         render_mode: str | None = None,
         parameters: Parameters | None = None,
@@ -171,9 +174,10 @@ class CzEnv(Form, gym.Env[Observation, Action]):
         camera: Camera | None = None,
         action: str = "smooth",
         info: str = "lean",
+        puller: str | Path | Puller | None = None,
     ) -> None:
         config = make_config(
-            scenario, model, observation, control_interval, horizon, parameters, meniscus, camera, action
+            scenario, model, observation, control_interval, horizon, parameters, meniscus, camera, action, puller
         )
         self._setup(config, render_mode, render_size, info)
 

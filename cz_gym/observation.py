@@ -88,8 +88,10 @@ CAMERA = "camera"
 """The observation that is an image instead of channels (:mod:`cz_gym.camera`)."""
 
 
-def decode(observation: npt.ArrayLike, v_0: float = PULL_SCALE) -> Measured:
+def decode(observation: npt.ArrayLike, v_0: float = PULL_SCALE, heater_range: float = HEATER_SCALE) -> Measured:
     """Read a "measured" or "history" observation, shape (..., channels), back into SI units.
+
+    ``v_0`` [m/s] and ``heater_range`` [W] are the puller's (:attr:`cz_gym.config.Config.ranges`).
 
     Raises ValueError if the last axis is neither.
     """
@@ -100,7 +102,7 @@ def decode(observation: npt.ArrayLike, v_0: float = PULL_SCALE) -> Measured:
             f"got shape {array.shape}"
         )
     present = (HISTORY if array.shape[-1] == len(HISTORY) else MEASURED)[: len(MEASURED)]
-    values = Measured(*np.moveaxis(array[..., : len(MEASURED)] * scales(present, v_0), -1, 0))
+    values = Measured(*np.moveaxis(array[..., : len(MEASURED)] * scales(present, v_0, heater_range), -1, 0))
     if array.shape[-1] == len(MEASURED):
         return values
     return values._replace(
@@ -108,9 +110,11 @@ def decode(observation: npt.ArrayLike, v_0: float = PULL_SCALE) -> Measured:
     )
 
 
-def to_measured(history: npt.ArrayLike, v_0: float = PULL_SCALE) -> npt.NDArray[np.float32]:
+def to_measured(
+    history: npt.ArrayLike, v_0: float = PULL_SCALE, heater_range: float = HEATER_SCALE
+) -> npt.NDArray[np.float32]:
     """Convert "history" observations, shape (..., channels), to "measured" ones, exact to the rounding of float32."""
-    measured = np.stack(decode(history, v_0), axis=-1) / scales(MEASURED, v_0)
+    measured = np.stack(decode(history, v_0, heater_range), axis=-1) / scales(MEASURED, v_0, heater_range)
     return np.clip(measured, -CLIP, CLIP).astype(np.float32)
 
 

@@ -11,20 +11,23 @@ import json
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from decimal import Context, Decimal
 from fractions import Fraction
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from cz_gym.atomic_files import naming, write_files
-from cz_gym.episodes.scenario import MAX_LATENCY, Interface, Range, Sensor
+from cz_gym.episodes.mixture import Distribution, Mixture
+from cz_gym.episodes.scenario import MAX_LATENCY, Interface, Range, Scenario, Sensor
 from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.physics.parameters import Parameters, check_parameters
 from cz_gym.physics.plant import make_puller
+from cz_gym.plausible import IN_MM, IN_MM_PER_MIN, IN_MM_PER_MIN2
 
 from .task import HEATER_RANGE, RADIUS_LIMIT, check_height
 from .units import KILO, MINUTE, MM, MM_PER_MIN, PERCENT
@@ -255,7 +258,7 @@ class Puller:
                 f"whose pull speed is {plant.v_0 / MM_PER_MIN:.4g} mm/min"
             )
 
-    @property
+    @cached_property
     def hash(self) -> str:
         """SHA-256 of everything but the name (16 hex digits)."""
         numbers = [value_of(self, key) for key in KEYS]
@@ -264,10 +267,10 @@ class Puller:
 
     @property
     def label(self) -> str:
-        """Name and hash, for contracts, reports and errors; empty for the default puller, whatever its name."""
-        return "" if self.hash == DEFAULT.hash else f"{self.name} ({self.hash})"
+        """Name and hash, for contracts, reports and errors; "default" for the default puller, whatever its name."""
+        return "default" if self.hash == DEFAULT.hash else f"{self.name} ({self.hash})"
 
-    @property
+    @cached_property
     def heater_range(self) -> float:
         """What an action of 1 moves the heater by [W]."""
         highest = self.drives.heater_max
@@ -387,7 +390,7 @@ def _number(key: Key, value: Any) -> Any:
 
 def _read(text: Decimal, key: Key) -> float:
     """A decimal number of the key's unit in SI units, rounded once."""
-    if abs(text.adjusted()) > 300:
+    if not -400 < text.adjusted() < 300:  # beyond, a float is infinite, or the fraction needs minutes
         raise CzError(f"{key.name} = {text} is no plausible number")
     return float(Fraction(text) * key.size)
 
@@ -415,7 +418,7 @@ def _check(key: Key, value: Any) -> None:
         raise CzError(f"{key.name} must be {'a pair of numbers low <= high' if pair else 'a number'}, not {value!r}")
     for number in numbers:
         shown = number / UNITS[key.unit].size
-        if not key.low * (1.0 - 1e-12) <= shown <= key.high * (1.0 + 1e-12):
+        if not key.low - 1e-12 * abs(key.low) <= shown <= key.high + 1e-12 * abs(key.high):
             raise CzError(f"{key.name} = {shown:g} must lie within {key.low:g} to {key.high:g}{_meant(key, shown)}")
 
 
@@ -429,3 +432,54 @@ def _meant(key: Key, shown: float) -> str:
 
 DEFAULT = Puller()
 """The puller that was invented for this project: that of every environment without another one."""
+
+
+@dataclass(frozen=True)
+class ScenarioOn(Scenario):
+    """A scenario on a puller: :func:`on` makes one."""
+
+    puller: str = ""
+    """Hash of the puller."""
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 of the scenario's contents and its puller (16 hex digits)."""
+        return hashlib.sha256(f"{super().hash} {self.puller}".encode()).hexdigest()[:16]
+
+
+def on(puller: Puller, distribution: Distribution) -> Distribution:
+    """The scenario, or each one of a mixture, on a puller.
+
+    What the puller's file says of drives, sensors and melt stands in place of the scenario's. Of the rest, shares,
+    temperatures and times stay as they are; lengths are in proportion to r_0, speeds to v_0, powers to the heater's
+    range. On the default puller nothing changes. CzError for a scenario on another puller.
+    """
+    if isinstance(distribution, Mixture):
+        members: Any = tuple(on(puller, each) for each in distribution.scenarios)
+        return replace(distribution, scenarios=members)
+    there = getattr(distribution, "puller", DEFAULT.hash)
+    if there == puller.hash:
+        return distribution
+    if isinstance(distribution, ScenarioOn):
+        raise CzError(f"scenario {distribution.name!r} is on another puller ({there}) than {puller.label}")
+    speed = puller.parameters.v_0 / DEFAULT.parameters.v_0
+    sizes = {IN_MM: puller.scale, IN_MM_PER_MIN: speed, IN_MM_PER_MIN2: speed}
+    power = puller.heater_range / DEFAULT.heater_range
+    drives, room = puller.drives, puller.drives.pull_max and puller.drives.pull_max - puller.parameters.v_0
+    window = min(room or math.inf, drives.pull_window or math.inf)
+    said = {
+        "actuators": {"pull_window": window if math.isfinite(window) else None, "pull_slew": drives.pull_slew,
+                      "heater_slew": drives.heater_slew, "heater_step": drives.heater_step},
+        "sensor": puller.sensors._asdict(),
+        "interface": puller.melt._asdict(),
+    }  # fmt: skip
+    families: dict[str, Any] = {}
+    for family in fields(Scenario)[1:]:
+        old, values = getattr(distribution, family.name), {}
+        for each in fields(old):
+            size = power if each.name.startswith("heater_") else sizes.get(each.metadata["member"].slip, 1.0)
+            stated, own = said.get(family.name, {}).get(each.name), getattr(old, each.name)
+            scaled = own if size == 1.0 else tuple(size * end for end in own) if isinstance(own, tuple) else size * own
+            values[each.name] = scaled if stated is None else stated
+        families[family.name] = type(old)(**values)
+    return ScenarioOn(distribution.name, puller=puller.hash, **families)

@@ -25,7 +25,7 @@ _IN_1_MIN, _IN_5_MIN = PREVIEWS[1:]
 PULL_SCALE = Parameters().v_0
 """Scale of pull speeds for the default puller, its v_0 [m/s]; another puller's are scaled with its own v_0."""
 HEATER_SCALE = 10.0 * KILO
-"""Scale of heater powers [W]."""
+"""Scale of heater powers for the default puller, its heater's range [W]; another puller's are scaled with its own."""
 TEMPERATURE_SCALE = 5.0
 """Scale of temperatures [K]."""
 
@@ -214,8 +214,12 @@ LEAN = ("r_c", "r_ref")
 """Entries of ``info="lean"``; libraries copy info key by key, which costs more than the step."""
 
 
-def scales(listed: tuple[Channel, ...], v_0: float) -> npt.NDArray[np.float64]:
-    """Scales of the channels for a puller of nominal pull speed v_0 [m/s], shape (channels,)."""
-    return np.array(
-        [v_0 * (channel.scale / PULL_SCALE) if channel.unit == "m/s" else channel.scale for channel in listed]
-    )
+def scales(listed: tuple[Channel, ...], v_0: float, heater_range: float = HEATER_SCALE) -> npt.NDArray[np.float64]:
+    """Scales of the channels for a puller of nominal pull speed v_0 [m/s] and heater range [W], shape (channels,)."""
+    own = {"m/s": (v_0, PULL_SCALE), "W": (heater_range, HEATER_SCALE)}
+
+    def scale(channel: Channel) -> float:
+        size, default = own.get(channel.unit, (1.0, 1.0))
+        return size * (channel.scale / default)
+
+    return np.array([scale(channel) for channel in listed])

@@ -14,13 +14,13 @@ from cz_gym.physics.plant import Puller
 from .units import KILO, MM
 
 RADIUS_LIMIT = 8.0 * MM
-"""Largest |r_c - r_ref| [m]."""
+"""Largest |r_c - r_ref| of the default puller [m]; another one's is in proportion to its r_0."""
 HEIGHT_MIN = 1.2 * MM
 """Lowest meniscus before it freezes [m]."""
 HEIGHT_MAX_IN_A = 1.24
 """Highest meniscus before it detaches [capillary constants]."""
 HEATER_RANGE = 10.0 * KILO
-"""Range of the heater's drive [W]: Q_H = Q_H0 +- HEATER_RANGE."""
+"""Range of the default puller's heater drive [W]: Q_H = Q_H0 +- HEATER_RANGE."""
 SMOOTH_TIME = 50.0
 """Time constant with which ``action="smooth"`` moves both drives [s]."""
 SMOOTH_PULL, SMOOTH_HEATER = 1.0, 0.5
@@ -36,6 +36,8 @@ class Drives(NamedTuple):
     """Gain from the action to the pull speed [-]."""
     heater: float
     """Gain from the action to the heater power [-]."""
+    power: float = HEATER_RANGE
+    """Range of the heater's drive [W]."""
 
     def asked(self, wanted: Any, applied: Any) -> Any:
         """The action that moves the drives from ``applied`` to ``wanted``, shape (..., 2), in shares of their ranges.
@@ -51,8 +53,8 @@ ACTIONS = ("direct", "smooth", "rate")
 """The action modes."""
 
 
-def drives_of(action: str, control_interval: float) -> Drives:
-    """The effect of actions in this mode on the drives, at this control interval [s].
+def drives_of(action: str, control_interval: float, heater_range: float = HEATER_RANGE) -> Drives:
+    """The effect of actions in this mode on the drives, at this control interval [s], with this heater range [W].
 
     "smooth": first-order lags. A held action a brings the pull speed to v_0 (1 + a) and the heater to
     Q_H0 + 5 kW a with a time constant of 50 s; left alone they return to nominal. So noise on the action is bounded,
@@ -60,16 +62,16 @@ def drives_of(action: str, control_interval: float) -> Drives:
     action of 1 moves the drives by v_0 and 5 kW every 50 s.
     """
     if action == "direct":
-        return DIRECT
+        return DIRECT._replace(power=heater_range)
     share = control_interval / SMOOTH_TIME
     keep, share = (1.0, share) if action == "rate" else (math.exp(-share), 1.0 - math.exp(-share))
-    return Drives(keep, SMOOTH_PULL * share, SMOOTH_HEATER * share)
+    return Drives(keep, SMOOTH_PULL * share, SMOOTH_HEATER * share, heater_range)
 
 
 @jittable
-def within_limits(r_c: Any, h_c: Any, r_ref: Any, a: Any) -> Any:
+def within_limits(r_c: Any, h_c: Any, r_ref: Any, a: Any, radius_limit: Any = RADIUS_LIMIT) -> Any:
     """Whether the crystal still grows; false if the meniscus freezes or detaches, the radius is lost, or one is NaN."""
-    return (np.abs(r_c - r_ref) <= RADIUS_LIMIT) & (h_c >= HEIGHT_MIN) & (h_c <= HEIGHT_MAX_IN_A * a)
+    return (np.abs(r_c - r_ref) <= radius_limit) & (h_c >= HEIGHT_MIN) & (h_c <= HEIGHT_MAX_IN_A * a)
 
 
 def check_height(puller: Puller) -> None:

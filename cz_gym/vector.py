@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from cz_gym.processors import processors
 from .action import MarkedAction, check_marked
 from .config import Config, make_config, positive_whole
 from .env import CzEnv, EnvState, Form, action_space, check_options, check_state, observation_space
+from .puller import Puller
 from .signals import INFO, LEAN
 
 _CLIPPED = INFO.index("action_clipped")
@@ -53,7 +55,7 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
         scenario: AnyScenario = "randomized",
         model: str | float | None = None,
         observation: str = "history",
-        control_interval: float = 5.0,
+        control_interval: float | None = None,
         horizon: float = 10800.0,
         render_mode: str | None = None,
         parameters: Parameters | None = None,
@@ -63,9 +65,10 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
         camera: Camera | None = None,
         action: str = "smooth",
         info: str = "lean",
+        puller: str | Path | Puller | None = None,
     ) -> None:
         config = make_config(
-            scenario, model, observation, control_interval, horizon, parameters, meniscus, camera, action
+            scenario, model, observation, control_interval, horizon, parameters, meniscus, camera, action, puller
         )
         if render_mode is not None:
             raise CzError(f"a batch does not render: render_mode must be None, not {render_mode!r}")

@@ -18,6 +18,7 @@ from cz_gym.contender import PLANT as PLANT
 from cz_gym.contender import REWARD as REWARD
 from cz_gym.errors import CzError
 from cz_gym.observation import CLIP, OBSERVATIONS
+from cz_gym.puller import DEFAULT
 
 FORMAT = "cz-gym-agent"
 FORMAT_VERSION = 5
@@ -69,6 +70,8 @@ class Contract:
     """Mean RMSE on the same episodes [mm]."""
     sha256: str
     """Hash of the ONNX file."""
+    puller: str = DEFAULT.label
+    """Name and hash of the puller file that it was trained for (:attr:`cz_gym.puller.Puller.label`)."""
 
 
 def observation_hash(name: str) -> str:
@@ -87,6 +90,7 @@ def facts_of(config: Config) -> dict[str, Any]:
         "plant_hash": config.plant_hash,
         "scenario": config.scenario.name,
         "scenario_hash": config.scenario.hash,
+        "puller": config.puller.label,
     }
 
 
@@ -96,7 +100,8 @@ def make_contract(onnx_bytes: bytes, **facts: Any) -> Contract:
     AgentFileError for a value that no contract may hold.
     """
     digest = hashlib.sha256(onnx_bytes).hexdigest()
-    known = {**facts, "observation_hash": observation_hash(facts["observation"]), "sha256": digest}
+    known = {"puller": DEFAULT.label, **facts, "sha256": digest}
+    known["observation_hash"] = observation_hash(facts["observation"])
     _check(known, "contract")
     return Contract(**known)
 
@@ -161,7 +166,8 @@ def _parse(path: Path) -> Contract:
         version = data.get("format_version")
         raise AgentFileError(f"{path}: format version {version!r:.80}, this release reads {FORMAT_VERSION}")
     wanted = {field.name for field in fields(Contract)}
-    given = {name: value for name, value in data.items() if name not in ("format", "format_version")}
+    given = {"puller": DEFAULT.label, **data}  # older files are for the default puller, and do not say so
+    del given["format"], given["format_version"]
     if set(given) != wanted:
         odd = sorted(set(given) ^ wanted)[0]
         raise AgentFileError(f"{path}: field {odd!r:.80} is {'missing' if odd in wanted else 'unknown'}")

@@ -70,7 +70,11 @@ class OnnxPolicy:
             )
         if contract.action not in ACTIONS:
             raise AgentFileError(f"{path}: gives actions {contract.action!r}, which this release does not have")
-        if config is not None and check_config(config).plant_hash != contract.plant_hash:
+        if config is not None and check_config(config).puller.label != contract.puller:
+            raise AgentFileError(
+                f"{path}: trained for puller {contract.puller}, this environment's is {config.puller.label}"
+            )
+        if config is not None and config.plant_hash != contract.plant_hash:
             raise AgentFileError(
                 f"{path}: trained on plant {contract.plant_hash}, this environment's is {config.plant_hash}"
             )
@@ -93,8 +97,9 @@ class OnnxPolicy:
 
     @property
     def made_for(self) -> MadeFor:
-        """The environment it was trained in: what its actions mean, how often it acts, and on which plant."""
-        return MadeFor(self.action, self.contract.control_interval, self.contract.plant_hash)
+        """The environment it was trained in: what its actions mean, how often it acts, on which plant and puller."""
+        contract = self.contract
+        return MadeFor(self.action, contract.control_interval, contract.plant_hash, contract.puller)
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from cz_gym.baselines.policy import OpenLoop, map_arrays
 from cz_gym.config import Config
 from cz_gym.episodes.scenario import Sensor
 from cz_gym.episodes.scenarios import RANDOMIZED
-from cz_gym.observation import MEASURED, PULL_SCALE, Measured
+from cz_gym.observation import HEATER_SCALE, MEASURED, PULL_SCALE, Measured, scales
 from cz_gym.physics.linearisation import StateSpace
 
 from .sampled_loop import NotLinearError, linear_controller
@@ -42,18 +42,18 @@ def linear_form(policy: Any, sensor: Sensor = RANDOMIZED.sensor) -> LinearForm:
         raise NotLinearError("there is no loop")
     if isinstance(policy, LQG):
         return _lqg(policy, sensor)
-    v_0 = getattr(policy, "v_0", PULL_SCALE)
-    controller = linear_controller(policy, v_0)
+    ranges = getattr(policy, "v_0", PULL_SCALE), getattr(policy, "heater_range", HEATER_SCALE)
+    controller = linear_controller(policy, ranges)
     if not (controller.C.any() or controller.D.any()):
         raise NotLinearError("there is no loop: nothing that is measured moves a drive")
-    free = linear_controller(replace(policy, T_track=np.inf), v_0) if isinstance(policy, FilteredPID) else controller
+    free = linear_controller(replace(policy, T_track=np.inf), ranges) if isinstance(policy, FilteredPID) else controller
     return LinearForm(controller, free, getattr(policy, "control_interval", Config().control_interval))
 
 
 def _lqg(policy: LQG, sensor: Sensor) -> LinearForm:
     linear = replace(policy, design=replace(policy.design, nonlinear=False), hypotheses=None)
     random, state = np.random.default_rng(0), None
-    scale = {channel.name: channel.scale for channel in MEASURED}
+    scale = dict(zip(Measured._fields, scales(MEASURED, policy.v_0, policy.heater_range), strict=True))
     noises = {"ring_error": np.mean(sensor.camera_noise), "T_1": np.mean(sensor.pyrometer_noise)}
     for _ in range(SETTLING):
         observation = np.zeros(len(MEASURED))
@@ -68,6 +68,9 @@ def _lqg(policy: LQG, sensor: Sensor) -> LinearForm:
         filter=settled._replace(mean=0.0 * settled.mean), plan=0.0 * memory.plan, command=0.0 * memory.command
     )
     found = linear_controller(
-        linear, policy.v_0, state._replace(readings=readings, memory=still), ("memory.filter.mean", "memory.command")
+        linear,
+        (policy.v_0, policy.heater_range),
+        state._replace(readings=readings, memory=still),
+        ("memory.filter.mean", "memory.command"),
     )
     return LinearForm(found, found, policy.control_interval)

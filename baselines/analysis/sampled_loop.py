@@ -80,12 +80,16 @@ class _Nothing(NamedTuple):
 
 
 def linear_controller(
-    policy: Any, v_0: float = PULL_SCALE, rest: Any = None, free: Sequence[str] | None = None
+    policy: Any,
+    ranges: tuple[float, float] = (PULL_SCALE, HEATER_RANGE),
+    rest: Any = None,
+    free: Sequence[str] | None = None,
 ) -> StateSpace:
     """The controller in discrete time: inputs the channels of Measured, outputs v_p - v_0 [m/s] and Q_H - Q_H0 [W].
 
-    ``rest`` is its memory at rest, by default that after one sample of zeros. ``free`` names the parts of it that move
-    ("memory.filter.mean"), by default all but the last readings; the others, such as a covariance, keep their value.
+    ``ranges`` [m/s, W] is what an action of 1 moves the drives by. ``rest`` is its memory at rest, by default that
+    after one sample of zeros. ``free`` names the parts of it that move ("memory.filter.mean"), by default all but the
+    last readings; the others, such as a covariance, keep their value.
     Raises NotLinearError if the controller does not rest there, or if twice the input does not double the answer.
     """
     channels, name = len(MEASURED), type(policy).__name__
@@ -106,8 +110,8 @@ def linear_controller(
     if np.any(np.abs(twice - 2.0 * once) > 1e-4 * largest):
         raise NotLinearError(f"{name} is not linear near rest")
     gains = once.T / _SMALL
-    gains[:, memory:] /= scales(MEASURED, v_0)
-    gains[memory:] *= np.array([[v_0], [HEATER_RANGE]])
+    gains[:, memory:] /= scales(MEASURED, *ranges)
+    gains[memory:] *= np.array(ranges)[:, None]
     return StateSpace(
         gains[:memory, :memory], gains[:memory, memory:], gains[memory:, :memory], gains[memory:, memory:]
     )

@@ -19,7 +19,6 @@ from cz_gym.baselines.policy import Floats, batched, fresh, to_action
 from cz_gym.config import Config
 from cz_gym.errors import CzError
 from cz_gym.observation import STATE, scales
-from cz_gym.task import HEATER_RANGE
 
 from .future import future_of
 from .trajectory import INPUTS, MOST_STEPS, TOLERANCE, Trajectory, limits_of, optimise
@@ -36,6 +35,8 @@ class Plan(NamedTuple):
     """Each puller's operating point, shape (n, 5)."""
     inputs_0: Floats
     """Inputs at the operating point, shape (n, 2)."""
+    ranges: tuple[float, float]
+    """What an action of 1 moves pull speed [m/s] and heater power [W] by."""
     made_for: MadeFor
 
 
@@ -80,20 +81,21 @@ class Clairvoyant:
             raise CzError(f"clairvoyant has a plan for {len(inputs_0)} episodes, not {n}")
         memory = fresh(state, Memory(np.zeros(n), np.zeros((n, INPUTS))), episode_start)
         k, slot = np.minimum(memory.step.astype(int), len(best.u) - 1), np.arange(n)
-        seen = array * scales(STATE, float(inputs_0[0, 0]))
+        seen = array * scales(STATE, *self.plan.ranges)
         x = seen[:, [_CHANNELS.index(name) for name in _X]] + self.plan.state_0
         x[:, 0] += seen[:, _CHANNELS.index("r_ref")]
         deviation = np.concatenate([x - best.x[k, slot], memory.correction], axis=-1)
         correction = memory.correction + (best.feedback[k, slot] @ deviation[:, :, None])[:, :, 0]
         inputs = best.u[k, slot] + correction - inputs_0
-        action = to_action(inputs[:, 0] / inputs_0[:, 0], inputs[:, 1] / HEATER_RANGE, single)
+        pull, power = (inputs / np.array(self.plan.ranges)).T
+        action = to_action(pull, power, single)
         return mark(action, self.made_for), Memory(memory.step + 1.0, correction)
 
 
 def make_plan(config: Config, seeds: Sequence[int]) -> Plan:
     """Optimise the first episode of each seed; CzError names those whose optimum was not reached."""
     future = future_of(config, seeds)
-    limits = limits_of(config.sole_scenario.actuators, config.parameters.v_0, config.control_interval)
+    limits = limits_of(config.sole_scenario.actuators, config.ranges, config.control_interval)
     best = optimise(future, limits)
     if not best.converged.all():
         lost = ", ".join(str(seed) for seed, reached in zip(seeds, best.converged, strict=True) if not reached)
@@ -104,4 +106,4 @@ def make_plan(config: Config, seeds: Sequence[int]) -> Plan:
     state_0, inputs_0 = (
         np.stack(np.broadcast_arrays(*values), axis=-1) for values in (future.puller.state_0, future.puller.inputs_0)
     )
-    return Plan(best, state_0, inputs_0, config.made_for)
+    return Plan(best, state_0, inputs_0, config.ranges, config.made_for)

@@ -27,7 +27,6 @@ from cz_gym.baselines.policy import Floats, batched, fresh, to_action
 from cz_gym.config import Config
 from cz_gym.observation import STATE, scales
 from cz_gym.physics.plant import hidden_load
-from cz_gym.task import HEATER_RANGE
 
 from .future import fluctuations_of, pullers_of
 
@@ -125,10 +124,16 @@ class FullInformation(PrivilegedLQG):
         """Return the action and the next memory; arguments as of :class:`cz_gym.baselines.policy.Policy`."""
         array, single = batched(observation)
         seen: Any = SimpleNamespace(
-            **dict(zip((channel.name for channel in STATE), (array * scales(STATE, self.v_0)).T, strict=True))
+            **dict(
+                zip(
+                    (channel.name for channel in STATE),
+                    (array * scales(STATE, self.v_0, self.heater_range)).T,
+                    strict=True,
+                )
+            )
         )
         pull, power, memory = self.step(seen, fresh(state, self.at_rest(seen), episode_start))
-        return mark(to_action(pull / self.v_0, power / HEATER_RANGE, single), self.made_for), memory
+        return mark(to_action(pull / self.v_0, power / self.heater_range, single), self.made_for), memory
 
 
 @lru_cache(maxsize=16)
@@ -165,6 +170,7 @@ def privileged(plain: LQG) -> PrivilegedLQG:
         plain.design,
         parameters=plain.parameters,
         meniscus=plain.meniscus,
+        puller=plain.puller,
         knows_fluctuations=True,
     )
 

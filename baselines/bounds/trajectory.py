@@ -19,7 +19,7 @@ from cz_gym.baselines.policy import Floats
 from cz_gym.cost import beyond_band, coefficients
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.physics.plant import Inputs, State
-from cz_gym.task import HEATER_RANGE, HEIGHT_MAX_IN_A, HEIGHT_MIN
+from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
 from cz_gym.units import KILO, MM, MM_PER_MIN
 
 from .future import Future
@@ -135,10 +135,10 @@ class Trajectory(NamedTuple):
         return self.last_move < TOLERANCE
 
 
-def limits_of(actuators: Actuators, v_0: float, interval: float) -> Limits:
-    """The limits of the action box and of the drives, for a control interval [s]."""
+def limits_of(actuators: Actuators, ranges: tuple[float, float], interval: float) -> Limits:
+    """The limits of the action box, ``ranges`` [m/s, W], and of the drives, for a control interval [s]."""
     scale = SCALES[STATES:]
-    span = np.array([min(v_0, actuators.pull_window), HEATER_RANGE])
+    span = np.array([min(ranges[0], actuators.pull_window), ranges[1]])
     return Limits(span / scale, np.array([actuators.pull_slew, actuators.heater_slew]) * interval / scale)
 
 

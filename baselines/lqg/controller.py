@@ -24,7 +24,6 @@ from cz_gym.observation import Measured
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.physics.plant import Puller, make_puller
-from cz_gym.task import HEATER_RANGE
 from cz_gym.units import KILO
 
 from .estimator import PlantFilter
@@ -142,7 +141,8 @@ class LQG(MeasuredController):
 
     def law(self, estimate: Floats, plan: Floats, previous: Floats) -> Floats:
         """The inputs for an estimate; arguments as of :func:`optimal_inputs`."""
-        return optimal_inputs(estimate, plan, previous, self.gains.regulator, self.design.noise.recipe_share, self.v_0)
+        limits = self.v_0, self.heater_range
+        return optimal_inputs(estimate, plan, previous, self.gains.regulator, self.design.noise.recipe_share, limits)
 
 
 @lru_cache(maxsize=16)
@@ -165,18 +165,18 @@ def previous_inputs(applied: Floats, command: Floats, starts: npt.NDArray[np.boo
 
 
 def optimal_inputs(
-    estimate: Floats, plan: Floats, previous: Floats, law: Regulator, recipe_share: float, v_0: float
+    estimate: Floats, plan: Floats, previous: Floats, law: Regulator, recipe_share: float, limits: tuple[float, float]
 ) -> Floats:
     """The regulator's inputs [m/s, W], deviations within the drives' range, shape (n, 2).
 
     ``estimate`` has shape (n, states), ``plan`` (n, 2, samples + 1), ``previous`` (n, 2). The drift is expected to
-    follow ``recipe_share`` of the recipe's movement. ``v_0`` is the nominal pull speed [m/s].
+    follow ``recipe_share`` of the recipe's movement. ``limits`` are the ranges of both drives [m/s, W].
     """
     error = estimate[:, : len(STATES)].copy()
     error[:, 0] -= plan[:, 0, 0]
     ahead = np.diff(plan, axis=-1)
     moves = -(law.feedback @ np.concatenate([error, previous], axis=-1)[..., None])[..., 0]
     moves += (ahead[:, :1] @ law.reference)[:, 0] + recipe_share * (ahead[:, 1:] @ law.drift)[:, 0]
-    limit = np.array([v_0, HEATER_RANGE])
+    limit = np.array(limits)
     inputs: Floats = np.clip(previous + moves, -limit, limit)
     return inputs

@@ -17,7 +17,6 @@ from scipy.signal import cont2discrete
 
 from cz_gym.baselines.policy import Floats, MeasuredController, check_numbers
 from cz_gym.observation import Measured
-from cz_gym.task import HEATER_RANGE
 from cz_gym.units import KILO
 
 
@@ -154,6 +153,6 @@ class CompensatedPID(MeasuredController):
         pull, pid = self.pid.step(error, memory.pid, dt)
         temperature_error = seen.T_1_ref - seen.T_1
         power = self.K_T * (temperature_error + memory.heat)
-        inside = np.abs(power) <= HEATER_RANGE
+        inside = np.abs(power) <= self.heater_range
         heat = memory.heat + np.where(inside, dt / self.T_iT * temperature_error, 0.0)
         return pull, power, Memory(compensator, pid, heat)

@@ -90,7 +90,7 @@ class FilteredPID(MeasuredController):
         pull, pid = self.pid.step(filtered, memory.pid._replace(integral=tracking), dt)
         if self.K_ff:
             pull = pull + self.K_ff * curvature / self.plant_gain
-        power, heat = self.heater.step(seen, memory.heat, dt, self.v_0)
+        power, heat = self.heater.step(seen, memory.heat, dt, self.v_0, self.heater_range)
         return pull, power, Memory(compensator, filtered, start, pid, pull, heat)
 
     def _filter(self, error: Floats, filtered: Floats) -> Floats:

@@ -93,6 +93,6 @@ class Industrial(MeasuredController):
         rate = memory.rate + share * (newest - memory.rate)
         rise = self.G_p * dead_zone(mean - target) + self.G_v * over_minute + self.G_d * rate
         pull = seen.v_p + self.gain * rise * (dt / LAW_INTERVAL) * MM_PER_MIN
-        power, heat = self.heater.step(seen, memory.heat, dt, self.v_0)
+        power, heat = self.heater.step(seen, memory.heat, dt, self.v_0, self.heater_range)
         diameters = np.concatenate([memory.diameters[:, 1:], mean[:, None]], axis=1)
         return pull, power, Memory(mean, diameters, rate, heat)

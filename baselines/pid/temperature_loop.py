@@ -15,7 +15,6 @@ import numpy as np
 
 from cz_gym.baselines.policy import Floats, check_numbers
 from cz_gym.observation import Measured
-from cz_gym.task import HEATER_RANGE
 from cz_gym.units import KILO
 
 
@@ -66,8 +65,8 @@ class TemperatureLoop:
         zero = np.zeros_like(seen.T_1)
         return Heat(seen.Q_H / self.K, np.array(seen.Q_H), zero, zero)
 
-    def step(self, seen: Measured, memory: Heat, dt: float, v_0: float) -> tuple[Floats, Heat]:
-        """Power above nominal [W], shape (n,), and the new memory; dt in s, v_0 in m/s."""
+    def step(self, seen: Measured, memory: Heat, dt: float, v_0: float, heater_range: float) -> tuple[Floats, Heat]:
+        """Power above nominal [W], shape (n,), and the new memory; dt in s, v_0 in m/s, the heater's range in W."""
         mean = memory.mean_pull - math.expm1(-dt / self.T_mean) * (seen.v_p / v_0 - memory.mean_pull)
         kept = memory.trim if self.K_pull > 0.0 else 0.0
         trim = np.clip(kept + self.K_pull * dt / self.T_pull * mean, -self.limit, self.limit)
@@ -76,4 +75,4 @@ class TemperatureLoop:
         integral = memory.integral + min(dt / self.T_track, 1.0) * missed
         power = self.K * (error + integral)
         integral = integral + dt / self.T_i * error
-        return power, Heat(integral, np.clip(power, -2.0 * HEATER_RANGE, 2.0 * HEATER_RANGE), mean, trim)
+        return power, Heat(integral, np.clip(power, -2.0 * heater_range, 2.0 * heater_range), mean, trim)

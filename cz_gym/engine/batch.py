@@ -29,6 +29,7 @@ from cz_gym.jit.compile import entry
 from cz_gym.observation import HISTORY, LAGGED, lags
 from cz_gym.physics.parameters import Parameters
 from cz_gym.physics.plant import NO_OPERATING_POINT
+from cz_gym.puller import on
 from cz_gym.signals import INFO, MEASURED, STATE, scales
 from cz_gym.task import drives_of
 
@@ -79,14 +80,15 @@ class Batch:
         self.identity = config.identity
         self.num_envs = num_envs
         self.kernels = build_kernels(config.meniscus)
-        self.clock = Clock(config.control_interval, config.steps, math.ceil(config.horizon / GRID) + 1)
-        self.drives = drives_of(config.action, config.control_interval)
+        points = math.ceil(config.horizon / GRID) + 1
+        self.clock = Clock(config.control_interval, config.steps, points, config.radius_limit)
+        self.drives = drives_of(config.action, config.control_interval, config.heater_range)
         self.channels = len(HISTORY) if config.observation == "history" else len(MEASURED)
         shows_state = config.observation == "state" or (everything and config.observation == "history")
         self.state_channels = len(STATE) if shows_state else 0
         self._camera = config.observation == "camera"
         newest, oldest = lags(config.control_interval)
-        measured, state = (1.0 / scales(channels, config.parameters.v_0) for channels in (MEASURED, STATE))
+        measured, state = (1.0 / scales(channels, *config.ranges) for channels in (MEASURED, STATE))
         share = 1.0 / (oldest - newest + 1)
         self.scales = ObservationScales(measured, state, newest, oldest + 1, share, everything)
         depth = int(oldest[-1]) + 2 if config.observation == "history" else 0
@@ -168,6 +170,7 @@ class Batch:
 
         A puller without a finite operating point is drawn again; ValueError if none is found.
         """
+        given = None if given is None else on(self.config.puller, given)
         lots = self._lots if given is None else lots_of(given, self.config.model)
         slots = np.array(which, np.int64)
         words = np.array(list(keys), np.uint64).reshape(-1, 2)

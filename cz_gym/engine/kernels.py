@@ -20,7 +20,6 @@ from cz_gym.jit.compile import fetch, inlined, jittable, kernel
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.plant import Disturbance, State, derive_puller, growth
 from cz_gym.signals import INFO, LEAN, logged, measure, true_state
-from cz_gym.task import HEATER_RANGE
 
 from .layout import EPISODE_AT, PULLER_AT, SLOT
 from .lockstep import LANES, advance, height_inside
@@ -60,8 +59,8 @@ def next_speed(v_p: Any, pull: Any, drives: Any, p: Any, e: Any, interval: Any) 
 @jittable
 def next_power(Q_H: Any, heat: Any, drives: Any, p: Any, e: Any, interval: Any) -> Any:
     """The heater power [W] after an action, within its slew rate, before it is rounded to whole steps."""
-    share = drives.keep * ((Q_H - p.Q_H_0) / HEATER_RANGE) + drives.heater * clip(heat, 1.0)
-    power = p.Q_H_0 + HEATER_RANGE * clip(share, 1.0)
+    share = drives.keep * ((Q_H - p.Q_H_0) / drives.power) + drives.heater * clip(heat, 1.0)
+    power = p.Q_H_0 + drives.power * clip(share, 1.0)
     power = power if power.real > 0.0 else 0.0
     return Q_H + clip(power - Q_H, e.heater_slew * interval)
 

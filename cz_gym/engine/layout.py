@@ -61,7 +61,7 @@ PULLER_AT, EPISODE_AT, STATE_AT = np.cumsum([0, len(Puller._fields), len(Episode
 
 
 class Clock(NamedTuple):
-    """Time base of the slots."""
+    """Time base of the slots, and the limit of their radius."""
 
     interval: float
     """Control interval [s]."""
@@ -69,6 +69,8 @@ class Clock(NamedTuple):
     """Steps in an episode."""
     grid_points: int
     """Points of the 5 s grid in an episode."""
+    radius_limit: float
+    """Largest |r_c - r_ref| [m]."""
 
 
 class Memory(NamedTuple):

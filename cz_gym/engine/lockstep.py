@@ -16,7 +16,7 @@ from cz_gym.episodes.record import GRID
 from cz_gym.episodes.schedule import drift, melt_left, reference
 from cz_gym.jit.compile import column, inlined, jittable, scratch, set_column
 from cz_gym.physics.plant import Disturbance, Inputs, Puller, State, growth, hidden_load, rk4
-from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN, within_limits
+from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT, within_limits
 from cz_gym.units import MM
 
 from .layout import PULLER_AT, STATE_AT
@@ -44,13 +44,15 @@ def height_inside(h_c: Any, p: Any) -> Any:
 
 
 @jittable
-def judged(x: Any, new: Any, u: Any, d: Any, p: Any, dt: Any, r_ref: Any, slope: Any) -> Any:
+def judged(
+    x: Any, new: Any, u: Any, d: Any, p: Any, dt: Any, r_ref: Any, slope: Any, radius_limit: Any = RADIUS_LIMIT
+) -> Any:
     """The state after a substep and whether the crystal still grows; after an impossible jump the state before it.
 
     Over a melt far too cold a low meniscus freezes within seconds, and a step across that singularity can end anywhere,
     inside the limits too. There the height falls faster and faster, so half the step at the first rate tells.
     """
-    inside = within_limits(new.r_c, new.h_c, r_ref, p.a)
+    inside = within_limits(new.r_c, new.h_c, r_ref, p.a, radius_limit)
     grows = inside
     if inside and x.h_c < _LOW:
         grows = x.h_c + 0.5 * dt * (u.v_p - growth(x, d, p, slope).v_g) >= HEIGHT_MIN
@@ -106,17 +108,15 @@ def _integrate(lanes: Any, found: Any, count: Any, slope: Any) -> None:
 
 
 @jittable
-def _judge(
-    slot: Any, frames: Any, lanes: Any, found: Any, lane: Any, interval: Any, slope: Any, ring_offset: Any
-) -> Any:
+def _judge(slot: Any, frames: Any, lanes: Any, found: Any, lane: Any, clock: Any, slope: Any, ring_offset: Any) -> Any:
     """Accept or reject a substep; return whether the slot needs another one."""
     p, e, upto = slot.puller, slot.episode, lanes[_T, lane]
     x, u = column(State, lanes, _X_AT, lane), column(Inputs, lanes, _U_AT, lane)
     d, new = column(Disturbance, lanes, _D_AT, lane), column(State, found, 0, lane)
-    new, grows = judged(x, new, u, d, p, lanes[_DT, lane], p.r_0 + reference(upto, e), slope)
+    new, grows = judged(x, new, u, d, p, lanes[_DT, lane], p.r_0 + reference(upto, e), slope, clock.radius_limit)
     set_column(State, new, lanes, _X_AT, lane)
     slot.over = 0 if grows else 1
-    more = upto < (slot.k + 1) * interval - _EPS
+    more = upto < (slot.k + 1) * clock.interval - _EPS
     if more and e.latency > 0.0:
         h_c = height_inside(new.h_c, p)
         photograph(slot, frames, upto, new.r_c + ring_offset(new.r_c, h_c, p) - p.ring_bias, h_c)
@@ -142,9 +142,7 @@ def advance(memory: Any, active: Any, first: Any, count: Any, clock: Any, slope:
         for lane in range(count):
             if lanes[_GOES, lane] > 0.0:
                 i = first + lane
-                if not _judge(
-                    memory.slots[i], memory.frames[i], lanes, found, lane, clock.interval, slope, ring_offset
-                ):
+                if not _judge(memory.slots[i], memory.frames[i], lanes, found, lane, clock, slope, ring_offset):
                     lanes[_GOES, lane] = 0.0
                     going -= 1
     for lane in range(count):

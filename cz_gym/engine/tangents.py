@@ -16,7 +16,7 @@ from cz_gym.episodes.schedule import bias_offset, melt_left, reference
 from cz_gym.jit.cache import hashed
 from cz_gym.jit.compile import force_inlined, jittable, kernel
 from cz_gym.physics.meniscus import MeniscusModel
-from cz_gym.physics.plant import Disturbance, Inputs, State, along, rates
+from cz_gym.physics.plant import Disturbance, Inputs, State, along, rates, rk4
 
 from .kernels import next_power, next_speed
 from .lockstep import height_inside
@@ -27,10 +27,11 @@ bright ring [m] and the camera's reading of it, without the operator's bias [m].
 ACTIONS = 2
 ROWS = (*SMOOTH, *Cost._fields)
 """Rows of the Jacobian: the next state and the terms of the step's cost."""
-SCRATCH = (4, len(State._fields), len(State._fields) + len(Inputs._fields))
+SCRATCH = (6, len(State._fields), len(State._fields) + len(Inputs._fields))
 """Shape of the loop's work array."""
 _H = 2.0**-100
 """The imaginary step: a power of two, by which a compiler divides as quickly as it multiplies."""
+_EPS = 1e-9
 _X, _INPUTS = len(State._fields), len(Inputs._fields)
 _V, _Q, _RING, _READING = (SMOOTH.index(name) for name in ("v_p", "Q_H", "ring", "reading"))
 _COST = _ACT = len(SMOOTH)
@@ -106,13 +107,34 @@ def rk4_by(work: Any, x: Any, u: Any, d: Any, p: Any, dt: Any, slope: Any) -> No
     _stage(work, dt / 6.0, dt, along(x, dt, k_3), u, d, p, slope)
 
 
+@jittable
+def _copy(work: Any, of: Any, to: Any) -> None:
+    """Copy one of the work array's matrices."""
+    for i in range(_X):
+        for j in range(_X + _INPUTS):
+            work[to, i, j] = work[of, i, j]
+
+
+@jittable
+def _after(work: Any) -> None:
+    """Derivatives of two substeps, one after the other: those of the first in ``work[4]``, of both in ``work[3]``."""
+    for i in range(_X):
+        for j in range(_X + _INPUTS):
+            work[5, i, j] = 0.0 if j < _X else work[3, i, j]
+            for between in range(_X):
+                work[5, i, j] += work[3, i, between] * work[4, between, j]
+    _copy(work, 5, 3)
+
+
 @lru_cache(maxsize=8)
 def build_tangents(meniscus: MeniscusModel) -> tuple[Any, Any]:
     """Compile the loops for a meniscus model.
 
-    ``gather(memory, state, start, stop)`` writes the differentiable states. ``tangents(memory, state, actions, grows,
-    clock, drives, work, jacobian, start, stop)`` writes the derivatives of the step that led from ``state`` to where
-    the slots are now, shape (n, rows, states + actions); zero for a slot that does not grow.
+    ``gather(memory, state, start, stop)`` writes the differentiable states. ``tangents(memory, state, held,
+    actions, grows, clock, drives, work, jacobian, start, stop)`` writes the derivatives of the step that led from
+    ``state`` to where the slots are now, shape (n, rows, states + actions); zero for a slot that does not grow.
+    ``held``, shape (n, 2), is Q_d [W] and dT_i [K] before the step, which may be 5 s long: those of its first substep
+    if a point of the grid lies inside.
     """
     slope, ring_offset = meniscus.slope, meniscus.ring_offset
 
@@ -125,8 +147,8 @@ def build_tangents(meniscus: MeniscusModel) -> tuple[Any, Any]:
             row[_READING] = slot.ring
 
     def tangents(
-        memory: Any, state: Any, actions: Any, grows: Any, clock: Any, drives: Any, work: Any, jacobian: Any,
-        start: int, stop: int,
+        memory: Any, state: Any, held: Any, actions: Any, grows: Any, clock: Any, drives: Any, work: Any,
+        jacobian: Any, start: int, stop: int,
     ) -> None:  # fmt: skip
         for i in range(start, stop):
             J = jacobian[i]
@@ -142,8 +164,22 @@ def build_tangents(meniscus: MeniscusModel) -> tuple[Any, Any]:
             # Whole steps of the heater are taken for a power that moves freely.
             J[_Q, _Q] = next_power(_step(Q), heat, drives, p, e, dt).imag / _H
             J[_Q, _ACT + 1] = next_power(Q, _step(heat), drives, p, e, dt).imag / _H
-            begun = State(now[0], now[1], now[2], now[3], now[4])
-            rk4_by(work, begun, Inputs(slot.v_p, slot.Q_H), d, p, dt, slope)
+            begun, u = State(now[0], now[1], now[2], now[3], now[4]), Inputs(slot.v_p, slot.Q_H)
+            point = int((slot.k - 1) * dt / GRID + _EPS)
+            at, late = (point + 1) * GRID, e.latency > 0.0
+            inside, left, seen_r, seen_h = at < slot.k * dt - _EPS, dt, 0.0, 0.0
+            if inside:
+                first = Disturbance(held[i, 0], held[i, 1], melt_left(point * GRID, e))
+                left = slot.k * dt - at
+                rk4_by(work, begun, u, first, p, dt - left, slope)
+                begun = rk4(begun, u, first, p, dt - left, slope)
+                _copy(work, 3, 4)
+                h_c = height_inside(begun.h_c, p)
+                seen_r = 1.0 + ring_offset(_step(begun.r_c), h_c, p).imag / _H
+                seen_h = ring_offset(begun.r_c, _step(h_c), p).imag / _H
+            rk4_by(work, begun, u, d, p, left, slope)
+            if inside:
+                _after(work)
             h_c = height_inside(x.h_c, p)
             ring_by_r = 1.0 + ring_offset(_step(x.r_c), h_c, p).imag / _H
             ring_by_h = ring_offset(x.r_c, _step(h_c), p).imag / _H
@@ -160,15 +196,20 @@ def build_tangents(meniscus: MeniscusModel) -> tuple[Any, Any]:
                 for row in range(_X):
                     J[row, j] = share * work[3, row, column]
                 J[_RING, j] = ring_by_r * J[0, j] + ring_by_h * J[1, j]
+                if inside:
+                    J[_READING, j] = share * (seen_r * work[4, 0, column] + seen_h * work[4, 1, column])
                 J[_COST, j] = slopes.radius * J[0, j]
                 J[_COST + 1, j] = slopes.pull * J[_V, j]
                 J[_COST + 2, j] = slopes.pull_step * (J[_V, j] - (1.0 if j == _V else 0.0))
                 J[_COST + 3, j] = slopes.heater_step * (J[_Q, j] - (1.0 if j == _Q else 0.0))
-            fresh, late = slot.k_seen == slot.k, e.latency > 0.0
+            # The camera's frame is of now, of the grid point inside the step, or of the sample before.
+            fresh, between = slot.k_seen == slot.k, inside and at <= slot.k * dt - e.latency + _EPS
             for j in range(_ACT + ACTIONS):
                 if fresh and not late:
                     J[_READING, j] = J[_RING, j]
-            if fresh and late:
+                elif not (fresh and between):
+                    J[_READING, j] = 0.0
+            if fresh and late and not between:
                 J[_READING, _RING] = 1.0
             if not fresh:
                 J[_READING, _READING] = 1.0

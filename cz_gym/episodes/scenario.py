@@ -36,8 +36,8 @@ DRAW_SPAN = 3.0 * HOUR
 """Span [s] over which "uniform over the episode" is drawn, whatever the horizon: a draw never depends on it."""
 
 
-MAX_LENGTH = 5.0 * MM
-"""Largest error of the camera [m]; a crystal is lost long before."""
+MAX_LENGTH = 20.0 * MM
+"""Largest error of the camera, and change of the reference [m]; a crystal is lost long before."""
 MAX_NOISE = 2.0 * MM
 """Largest standard deviation of the camera's noise [m]."""
 MAX_LATENCY = 60.0
@@ -243,7 +243,7 @@ class Scenario:
     def __post_init__(self) -> None:
         if not (self.name and isinstance(self.name, str)):
             raise CzError(f"a scenario needs a name, not {self.name!r}")
-        for family in dataclasses.fields(self)[1:]:
+        for family in dataclasses.fields(Scenario)[1:]:
             value, kind = getattr(self, family.name), _kind(family)
             if not isinstance(value, kind):
                 raise CzError(f"scenario {self.name!r}: {family.name} must be a {kind.__name__}, not {value!r}")
@@ -268,7 +268,7 @@ class Scenario:
     def hash(self) -> str:
         """SHA-256 of the scenario's contents (16 hex digits); a ``later`` member counts only off its default."""
         contents: dict[str, Any] = {"name": self.name}
-        for family in dataclasses.fields(self)[1:]:
+        for family in dataclasses.fields(Scenario)[1:]:
             value = getattr(self, family.name)
             contents[family.name] = {
                 each.name: _plain(each.default, getattr(value, each.name))
@@ -281,7 +281,7 @@ class Scenario:
     @property
     def deterministic(self) -> bool:
         """Whether all its episodes are the same: no member makes them differ (``Draw`` at each member)."""
-        families = (getattr(self, family.name) for family in dataclasses.fields(self)[1:])
+        families = (getattr(self, family.name) for family in dataclasses.fields(Scenario)[1:])
         members = ((family, each) for family in families for each in dataclasses.fields(family))
         return not any(each.metadata["member"].draw.differs(getattr(family, each.name)) for family, each in members)
 

@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.atomic_files import naming
-from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.errors import CzError
 
 from .metrics import metric_names
@@ -86,6 +85,7 @@ def _provenance(results: Sequence[Result], command: str) -> dict[str, Any]:
         "command": command,
         **software(PACKAGES),
         "plant_hash": config.plant_hash,
+        "puller": config.puller.label,
         "parameters": config.parameters._asdict(),
         "control_interval_s": config.control_interval,
         "horizon_s": config.horizon,
@@ -101,7 +101,7 @@ def _provenance(results: Sequence[Result], command: str) -> dict[str, Any]:
 
 
 def _crystals(result: Result) -> dict[str, Any]:
-    row, scenario = result.row, find_scenario(result.row.scenario)
+    row, scenario = result.row, result.row.config().sole_scenario
     return {
         "scenario": scenario.name,
         "hash": scenario.hash,

@@ -8,7 +8,6 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.cost import cost_terms
-from cz_gym.task import RADIUS_LIMIT
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from .rollout import Rollout
@@ -25,8 +24,8 @@ PULL_TOLERANCE = 0.03
 class Metrics(NamedTuple):
     """Metrics of each episode, shape (episodes,).
 
-    After a failure the radius error counts as 8 mm to the horizon; what describes the drives and the crystal is
-    taken over the steps up to the failure.
+    After a failure the radius error counts as the largest allowed one (8 mm on the default puller) to the horizon; what
+    describes the drives and the crystal is taken over the steps up to the failure.
     """
 
     rmse_mm: Floats
@@ -66,10 +65,10 @@ def metric_names() -> tuple[str, ...]:
 def metrics(run: Rollout) -> Metrics:
     """Compute the metrics of a rollout."""
     s, alive = run.signals, run.alive
-    v_0 = run.config.parameters.v_0
+    v_0, limit = run.config.parameters.v_0, run.config.radius_limit
     lost = ~alive | (run.failed & _last(alive))
-    error = np.where(lost, RADIUS_LIMIT, s.r_c - s.r_ref)
-    observable = np.where(lost, RADIUS_LIMIT, s.r_c - s.r_ref + s.ring_offset)
+    error = np.where(lost, limit, s.r_c - s.r_ref)
+    observable = np.where(lost, limit, s.r_c - s.r_ref + s.ring_offset)
     pull_step = np.diff(s.v_p, axis=0, prepend=run.start.v_p)
     heater_step = np.diff(s.Q_H, axis=0, prepend=run.start.Q_H)
     return Metrics(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from cz_gym.config import Config, make_config
 from cz_gym.episodes.scenario import Scenario
@@ -11,6 +11,7 @@ from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
+from cz_gym.puller import DEFAULT, Puller
 from cz_gym.units import MM, MM_PER_MIN
 
 TRAINING_SEEDS = range(1_000_000)
@@ -36,29 +37,35 @@ class Row:
     """ "I" or "II", or None for the scenario's own draw."""
     default: bool = True
     """Whether a benchmark that names no scenarios runs it."""
-    control_interval: float = 5.0
-    """Time between actions [s]."""
+    interval: float | None = None
+    """Time between actions [s]; None: the puller's."""
     meniscus: MeniscusModel = HURLE
     """Meniscus of the plant; controllers and agents are made for Hurle's, whatever it is."""
     file: str = ""
     """Source of a scenario of the user's own: FILE.py:NAME."""
+    puller: Puller = DEFAULT
+
+    @property
+    def control_interval(self) -> float:
+        """Time between actions [s]."""
+        return self.puller.control_interval if self.interval is None else self.interval
 
     def config(self, observation: str = "measured", action: str = "direct") -> Config:
         """Return the environment's settings: three hours of this row's scenario, model, interval and meniscus."""
-        return make_config(
-            self.scenario, self.model, observation, self.control_interval, meniscus=self.meniscus, action=action
-        )
+        return replace(self.design_config(observation, action), meniscus=self.meniscus)
 
     def design_config(self, observation: str = "measured", action: str = "direct") -> Config:
         """Return the settings that a controller is designed for: the same on Hurle's meniscus."""
-        return make_config(self.scenario, self.model, observation, self.control_interval, action=action)
+        interval, puller = self.control_interval, self.puller
+        return make_config(self.scenario, self.model, observation, interval, action=action, puller=puller)
 
     @property
-    def puller(self) -> str:
-        """The puller that the crystals grow on, for people: its radius, nominal pull speed and plant hash."""
+    def grown_on(self) -> str:
+        """The puller that the crystals grow on, for people: its name, radius, nominal pull speed and plant hash."""
         config = self.config()
+        name = "the default puller" if self.puller.label == DEFAULT.label else f"puller {self.puller.label}"
         r_0, v_0 = config.parameters.r_0 / MM, config.parameters.v_0 / MM_PER_MIN
-        return f"radius {r_0:g} mm, pull speed {v_0:g} mm/min, plant {config.plant_hash}"
+        return f"{name}: radius {r_0:g} mm, pull speed {v_0:g} mm/min, plant {config.plant_hash}"
 
     def seeds(self, episodes: int) -> range:
         """Return the first test seeds; one seed where every draw is the same."""
@@ -99,8 +106,8 @@ ROWS: tuple[Row, ...] = (
     ),
     Row("randomized-I", "randomized", "randomized, every puller conducting only: Model I", "I", default=False),
     Row("randomized-II", "randomized", "randomized, every puller convecting only: Model II", "II", default=False),
-    Row("randomized-2s", "randomized", "randomized, an action every 2 s", default=False, control_interval=2.0),
-    Row("randomized-10s", "randomized", "randomized, an action every 10 s", default=False, control_interval=10.0),
+    Row("randomized-2s", "randomized", "randomized, an action every 2 s", default=False, interval=2.0),
+    Row("randomized-10s", "randomized", "randomized, an action every 10 s", default=False, interval=10.0),
     Row(
         "randomized-exact",
         "randomized",

@@ -74,7 +74,7 @@ def test_on_a_linear_plant_without_limits_it_is_the_lqr(dt, blocks):
     lqg, mpc = LQG(dt, LINEAR), EkfMpc(dt, LINEAR, blocks=blocks)
     estimate, plan, previous = situation()
     plan = np.pad(plan, ((0, 0), (0, 0), (0, 90)), "edge")[:, :, : round(300.0 / dt) + 1]
-    law = optimal_inputs(estimate, plan, previous, lqg.gains.regulator, SHARE, lqg.parameters.v_0)
+    law = optimal_inputs(estimate, plan, previous, lqg.gains.regulator, SHARE, (lqg.v_0, lqg.heater_range))
     assert mpc.law(estimate, plan, previous) == pytest.approx(law, rel=1e-8)
 
 
@@ -175,7 +175,7 @@ def test_estimates_beyond_the_equations_fall_back_on_the_law():
     estimate, plan, previous = situation()
     estimate[0, 1] = 20.0 * MM
     inputs = mpc.law(estimate, plan, previous)
-    law = optimal_inputs(estimate, plan, previous, mpc.gains.regulator, SHARE, mpc.parameters.v_0)
+    law = optimal_inputs(estimate, plan, previous, mpc.gains.regulator, SHARE, (mpc.v_0, mpc.heater_range))
     assert np.isfinite(inputs).all()
     assert inputs[0] == pytest.approx(law[0])
     alone = mpc.law(estimate[:1], plan[:1], previous[:1])

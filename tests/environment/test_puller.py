@@ -1,14 +1,38 @@
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
+import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from cz_gym import SCENARIOS, CzVectorEnv, Scenario, decode, make_puller
+from cz_gym.config import Config, make_config
+from cz_gym.differentiable import DifferentiableBatch
+from cz_gym.env import CzEnv
+from cz_gym.episodes.scenarios import ALL, HARD, PULLER, RANDOMIZED
 from cz_gym.errors import CzError
 from cz_gym.physics.parameters import Parameters
-from cz_gym.puller import DEFAULT, KEYS, Puller, find_puller, read_puller, to_toml, value_of, write_puller
-from cz_gym.units import KILO, MM
+from cz_gym.puller import (
+    DEFAULT,
+    FOLDER,
+    KEYS,
+    Puller,
+    Sensors,
+    find_puller,
+    on,
+    read_puller,
+    to_toml,
+    value_of,
+    write_puller,
+)
+from cz_gym.units import KILO, MM, MM_PER_MIN
+from tests.observed import PLAIN
+
+SHIPPED = sorted(path.stem for path in FOLDER.glob("*.toml"))
+WIDE = find_puller("silicon-300mm")
 
 
 def file(folder: Path, text: str) -> Path:
@@ -37,6 +61,7 @@ def pullers(draw: st.DrawFn) -> Puller:
 
 @settings(max_examples=60, deadline=None)
 @given(puller=pullers())
+@example(puller=Puller("ends", sensors=Sensors(camera_noise=(5e-324, 1e-305), pyrometer_drift=(-100.0, 100.0))))
 def test_what_is_written_is_read_again_bit_for_bit(puller: Puller, tmp_path_factory: pytest.TempPathFactory) -> None:
     path = tmp_path_factory.mktemp("puller") / "mine.toml"
     write_puller(puller, path)
@@ -58,7 +83,7 @@ def test_what_a_file_does_not_say_keeps_the_defaults_value_and_is_listed(tmp_pat
 def test_the_default_file_is_the_puller_of_every_environment_without_one() -> None:
     default = find_puller("default")
     assert default == DEFAULT == find_puller(None)
-    assert default.label == ""
+    assert default.label == "default"
 
 
 @pytest.mark.parametrize(
@@ -106,3 +131,84 @@ def test_other_formats_and_unknown_pullers_are_refused(tmp_path: Path) -> None:
         find_puller("none.toml")
     with pytest.raises(CzError, match="excludes the operating point"):
         replace(DEFAULT, drives=DEFAULT.drives._replace(heater_max=20 * KILO))
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_one_many_and_differentiable_crystals_are_the_same_on_a_puller(name: str) -> None:
+    given = {"puller": name, "scenario": "hard", "info": "all"}
+    env: CzEnv = gym.make("Cz-v0", **given, **PLAIN).unwrapped  # type: ignore
+    many = CzVectorEnv(2, **given, **PLAIN)  # type: ignore[arg-type]
+    twin = DifferentiableBatch(many.config, 2)
+    assert env.config == many.config
+    assert env.config.control_interval == find_puller(name).control_interval
+    first, _ = env.reset(seed=3)
+    rows, _ = many.reset(seed=3)
+    np.testing.assert_array_equal(rows[0], first)
+    np.testing.assert_array_equal(twin.reset([3, 4])[1], rows)
+    for action in np.random.default_rng(0).uniform(-1.0, 1.0, (100, 2)).astype(np.float32):
+        seen, gained, terminated, _, info = env.step(action)
+        rows, rewards, lost, _, infos = many.step(np.tile(action, (2, 1)))
+        np.testing.assert_array_equal(rows[0], seen)
+        np.testing.assert_array_equal(twin.step(np.tile(action, (2, 1))).measured, rows)
+        assert (rewards[0], lost[0]) == (gained, terminated)
+        read = decode(seen, *env.config.ranges)
+        np.testing.assert_allclose(read.v_p + env.config.parameters.v_0, info["v_p"], rtol=1e-6)
+        assert infos["r_c"][0] == info["r_c"]
+    assert not terminated
+
+
+def test_the_default_file_changes_nothing() -> None:
+    mixed: Any = {"hard": 0.5, "puller": 0.5}
+    for scenario in (*SCENARIOS, ALL, mixed):
+        plain, filed = make_config(scenario), make_config(scenario, puller="default")
+        assert filed == plain
+        assert (filed.hash, filed.made_for, filed.identity) == (plain.hash, plain.made_for, plain.identity)
+
+
+def test_the_machine_is_the_files_and_the_crystal_the_scenarios() -> None:
+    scenario = on(WIDE, PULLER)
+    assert isinstance(scenario, Scenario)
+    longer, faster = 150.0 / 87.5, 0.8 / 1.2
+    assert scenario.sensor.camera_noise == WIDE.sensors.camera_noise
+    assert (scenario.sensor.latency, scenario.interface.tau_fast) == (1.0, 40.0)
+    assert scenario.actuators.pull_window == pytest.approx(0.3 * MM_PER_MIN)
+    assert scenario.sensor.bias_offset == pytest.approx((-0.3 * longer * MM, 0.3 * longer * MM))
+    assert scenario.recipe == PULLER.recipe
+    assert scenario.pullers.melt_loss == PULLER.pullers.melt_loss
+    bare: Any = replace(WIDE, drives=WIDE.drives._replace(pull_window=None, pull_slew=None, heater_slew=None))
+    assert on(bare, PULLER).actuators.pull_window == pytest.approx(0.5 * faster * MM_PER_MIN)  # type: ignore[union-attr]
+    assert on(bare, PULLER).actuators.heater_slew == pytest.approx(1.5 * 2000.0 / 60.0)
+    assert on(bare, HARD).hash != on(WIDE, HARD).hash != HARD.hash
+    assert on(WIDE, scenario) == scenario
+    assert on(WIDE, ALL).shares == ALL.shares  # type: ignore[union-attr]
+    with pytest.raises(CzError, match="is on another puller"):
+        on(bare, scenario)
+
+
+def test_limits_actions_and_episodes_are_in_proportion_to_the_puller() -> None:
+    config = make_config("randomized", puller=WIDE, **PLAIN)
+    assert config.control_interval == 2.0
+    assert config.radius_limit == pytest.approx(8.0 * MM * 150.0 / 87.5)
+    env = CzEnv.from_config(config, info="all")
+    env.reset(seed=1, options={"scenario": "nominal"})
+    power = env.step(np.array([1.0, 1.0], np.float32))[-1]["Q_H"]
+    nominal = make_puller(WIDE.parameters).Q_H_0
+    assert power - nominal == pytest.approx(3.0 * KILO * 2.0 / 60.0)  # its slew, on the nominal scenario too
+    ceiling = replace(WIDE, drives=WIDE.drives._replace(heater_max=nominal + 5 * KILO, pull_max=0.9 * MM_PER_MIN))
+    narrow = make_config("nominal", puller=ceiling)
+    assert narrow.heater_range == pytest.approx(5 * KILO)
+    assert narrow.scenario.scenarios[0].actuators.pull_window == pytest.approx(0.1 * MM_PER_MIN)
+
+
+def test_another_pullers_states_actions_and_parameters_are_refused() -> None:
+    env, other = CzEnv(puller=WIDE), CzEnv(puller=replace(WIDE, sensors=WIDE.sensors._replace(latency=2.0)))
+    env.reset(seed=1)
+    other.reset(seed=1)
+    with pytest.raises(CzError, match="saved under other settings"):
+        other.set_state(env.get_state())
+    with pytest.raises(CzError, match=r"parameters are those of the puller 'silicon-300mm'"):
+        make_config(puller=WIDE, parameters=Parameters())
+    with pytest.raises(CzError, match=r"puller must be a puller file"):
+        make_config(puller=Config())  # type: ignore[arg-type]
+    assert make_config().with_scenario("randomized").scenario == RANDOMIZED
+    assert "silicon-300mm (" in str(env.config.made_for)

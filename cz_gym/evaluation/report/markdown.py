@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from cz_gym.evaluation.results import BOUND, REFERENCE, SPEED, Result, Sample, common
+from cz_gym.puller import DEFAULT
 from cz_gym.units import HOUR, PERCENT
 
 from .tables import (
@@ -89,7 +90,7 @@ def markdown(results: Sequence[Result], command: str, figures: Iterable[str]) ->
         headline(results),
         "# Benchmark",
         f"Every controller meets the same crystals (test seeds), {config.horizon / HOUR:.3g} h each at "
-        f"{config.control_interval:g} s control, on the default puller: {row.puller}.",
+        f"{config.control_interval:g} s control, on {row.grown_on}.",
         "The tables show means over crystals with 95 % bootstrap intervals; a scenario without randomness is one "
         "crystal and has no interval. After a failure the radius error counts 8 mm to the end; drives, growth rate and "
         "ground-off are those of the time before it. No failure in n crystals still allows a rate of up to 3/n, "
@@ -178,9 +179,8 @@ def _short(result: Result) -> str:
     grid = [names, units, *rows(result, columns)]
     widths = [max(map(len, column)) for column in zip(*grid, strict=True)]
     row = result.row
-    lines = [
-        f"{row.name} ({crystals(len(result.seeds))}){f', on the default puller: {row.puller}' if row.file else ''}"
-    ]
+    grown_on = f", on {row.grown_on}" if row.file or row.puller != DEFAULT else ""
+    lines = [f"{row.name} ({crystals(len(result.seeds))}){grown_on}"]
     for name, *cells in grid:
         padded = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
         lines.append("  ".join([f"  {name:<{widths[0]}}", *padded]).rstrip())

@@ -36,7 +36,7 @@ def page(results: Sequence[Result], command: str) -> str:
         "verdict": escape(headline(results)),
         "lede": f"{tables.count(len(results[0].samples), 'controller')}, {tables.count(len(results), 'scenario')}, "
         f"up to {tables.crystals(most)} each, the same for everyone: {config.horizon / HOUR:g} h at one action every "
-        f"{config.control_interval:g} s, on the default puller: {row.puller}.",
+        f"{config.control_interval:g} s, on {row.grown_on}.",
         "tables": "\n".join(_table(result, is_open=result is results[0]) for result in results),
         "pareto": _html(pareto(results, styles), "pareto"),
         "errors": _html(errors(results, styles), "errors"),

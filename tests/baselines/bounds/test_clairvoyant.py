@@ -152,7 +152,7 @@ def test_slow_narrow_and_stepping_drives_are_respected_and_followed():
     config, policy = planned(replace(HARD, name="narrow", actuators=actuators))
     u, u_0 = policy.plan.best.u, policy.plan.inputs_0
     pull, power = u[:, :, 0] - u_0[:, 0], u[:, :, 1] - u_0[:, 1]
-    limits = limits_of(actuators, u_0[0, 0], config.control_interval)
+    limits = limits_of(actuators, (u_0[0, 0], config.heater_range), config.control_interval)
     assert np.abs(pull).max() < limits.span[0] * MM_PER_MIN
     assert np.abs(np.diff(pull, axis=0)).max() < limits.move[0] * MM_PER_MIN
     assert np.abs(np.diff(power, axis=0)).max() < limits.move[1] * KILO
@@ -173,7 +173,7 @@ def test_an_optimum_that_was_not_reached_is_no_bound(monkeypatch):
     config = make_config("randomized", observation="state", horizon=300.0, action="direct")
     monkeypatch.setattr(trajectory, "MOST_STEPS", 3)
     future = future_of(config, SEEDS)
-    limits = limits_of(config.scenario.actuators, config.parameters.v_0, config.control_interval)
+    limits = limits_of(config.scenario.actuators, config.ranges, config.control_interval)
     assert not optimise(future, limits).converged.all()
     with pytest.raises(CzError, match=r"clairvoyant is no bound on 'randomized': .* 1000000, .* was not reached"):
         rollout(Clairvoyant(), config, SEEDS)
