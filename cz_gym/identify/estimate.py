@@ -2,46 +2,44 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
-from scipy.linalg import toeplitz
 from scipy.optimize import least_squares, minimize
 from scipy.stats import chi2
 
+from cz_gym.errors import CzError
+from cz_gym.names import unknown
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
-from cz_gym.physics.plant import derive_puller
 
 from .log import Floats, Log
-from .model import Noise, Predicted, free_model, sensitivities
+from .model import Model, Noise, Predicted, sensitivities
 
-THERMAL = ("C_1", "C_2", "C_b", "kappa_12", "G_1a", "G_2b", "eps", "k_l")
+HEATER = ("C_1", "C_2", "C_b", "kappa_12", "G_1a", "G_2b", "eps", "k_l")
 """Parameters of the path from the heater."""
 PULL = ("sigma", "lam")
 """Parameters of the path from the pull speed to the ring; ``lam`` stands for the product lam dT_0."""
-PRIOR_SD = 0.35
-"""Standard deviation of a parameter's logarithm [-]: a factor of two either way is two of them."""
-NOISE_SD = 1.0
-"""The same of the noise's strengths [-]."""
+PRIOR_SD, NOISE_SD = 0.35, 1.0
+"""Standard deviation of the logarithm of a parameter, and of the strength of a noise [-]."""
 LAM, LAM_SD = 0.5, 0.3
-"""Mean and standard deviation of lam, about those of a uniform distribution [-]."""
+"""Mean and standard deviation of lam [-], about those of a uniform distribution."""
 INFORMED = 0.5
-"""Largest share of the prior's standard deviation that an informed parameter has left [-]."""
-MOVE, MOVES, PAST = 0.005, 20, 6
-"""A move counts from this share of nominal on; as much as 20 steps of 2 % must have happened."""
+"""An informed parameter keeps less than this share of the prior's standard deviation [-]."""
+MOVE, ENOUGH, PAST = 0.005, 20 * 0.02**2, 6
+"""Unexplained moves count from this share of nominal on; their squares must add up to those of 20 steps of 2 %. A move
+is explained by so many past samples."""
 LAGS, WHITE = 20, 0.01
-"""Lags of the whiteness test, and the probability below which residuals are called coloured."""
-SETTLED = 1e-3
-"""Largest gradient at the maximum, in units of the log posterior per standard deviation."""
+"""Lags of the whiteness test, and the probability below which residuals count as coloured."""
+CAUTIOUS = {"pyrometer_sd": 20.0, "camera_sd": 4.0}
+"""Factors on the noise where the search begins, so that a filter of a wrong model can follow the log."""
 
-
-WIDE={"pyrometer_sd":20.,"camera_sd":4.}
 
 class Estimate(NamedTuple):
-    """What a log says of one number."""
+    """What a log says of one number, SI units; of ``lam``, the product lam dT_0 [K]."""
 
     name: str
     prior: float
@@ -50,9 +48,9 @@ class Estimate(NamedTuple):
     """Lower end of the 95 % interval."""
     high: float
     left: float
-    """Standard deviation left, as a share of the prior's [-]; 1: the log says nothing."""
+    """Share of the prior's standard deviation that is left [-]."""
     why: str = ""
-    """Why it was not estimated at all."""
+    """The reason if it was not estimated at all."""
 
     @property
     def informed(self) -> bool:
@@ -68,138 +66,145 @@ class Identified:
     estimates: tuple[Estimate, ...]
     noise: tuple[Estimate, ...]
     excitation: tuple[float, float]
-    """Moves of pull speed and heater that the readings do not explain, in multiples of what is needed [-]."""
+    """Moves of pull speed and heater that no reading explains, in multiples of what is needed [-]."""
     predicted: Predicted
     whiteness: tuple[float, float]
-    """Probability that residuals as coloured as these are white: pyrometer, ring."""
+    """Probability of residuals as coloured as these if they were white: pyrometer, ring."""
+    settled: bool
+    """Whether the search has ended at a maximum."""
 
     @property
     def parameters(self) -> Parameters:
-        """The start's parameters with those that the log tells; lam is no parameter of the file."""
+        """The start's parameters with those that the log tells; lam is none of them."""
         found = {e.name: e.value for e in self.estimates if e.informed and e.name in Parameters._fields}
         return self.start._replace(**found)
 
-    def of(self, name: str) -> Estimate:
-        """The estimate of that name."""
-        return next(e for e in (*self.estimates, *self.noise) if e.name == name)
-
-
-def excitation(drive: Floats, readings: Floats) -> float:
-    """How much a drive moves on its own: squares of its moves that past readings and drives do not explain.
-
-    A linear regression of each move on the last samples of drive and readings explains what a controller does. What
-    is left counts where it exceeds MOVE; 1 is as much as MOVES steps of 2 %. ``drive`` is a share of nominal.
-    """
-    move = np.diff(drive)
-    past = [np.roll(series, lag)[:-1] for series in (drive, *readings.T) for lag in range(PAST)]
-    X, y = np.column_stack([*past, np.ones(len(move))])[PAST:], move[PAST:]
-    good = np.isfinite(X).all(axis=1) & np.isfinite(y)
-    if good.sum() < 2 * X.shape[1]:
-        return 0.0
-    X, y = X[good] - X[good].mean(axis=0), y[good]
-    X = np.column_stack([X / np.maximum(X.std(axis=0), 1e-12), np.ones(len(y))])
-    left = y - X @ np.linalg.lstsq(X, y, rcond=1e-10)[0]
-    return float(np.sum(np.square(left[np.abs(left) > MOVE])) / (MOVES * 0.02**2))
-
-
-def whiteness(error: Floats) -> float:
-    """Ljung and Box's probability that standardised errors are white, over LAGS lags."""
-    u = error[np.isfinite(error)] - np.nanmean(error)
-    n = len(u)
-    correlations = np.array([u[lag:] @ u[: n - lag] for lag in range(1, LAGS + 1)]) / (u @ u)
-    return float(chi2.sf(n * (n + 2) * np.sum(np.square(correlations) / (n - np.arange(1, LAGS + 1))), LAGS))
+    @property
+    def lam(self) -> float:
+        """Share of conduction at the maximum [-], with the start's dT_0."""
+        return next(e.value for e in self.estimates if e.name == "lam") / self.start.dT_0
 
 
 def identify(
     log: Log,
     start: Parameters | None = None,
     noise: Noise | None = None,
-    prior_sd: dict[str, float] | None = None,
+    prior_sd: Mapping[str, float] | None = None,
     meniscus: MeniscusModel = HURLE,
 ) -> Identified:
-    """Estimate what the log tells; parameters of a path without excitation are not touched."""
-    start, noise, given = start or Parameters(), noise or Noise(), prior_sd or {}
-    moved = _excitation(log, start)
-    free = (*(PULL if moved[0] >= 1.0 else ()), *(THERMAL if moved[1] >= 1.0 else ()))
-    names = (*free, *Noise._fields)
-    mean = np.array([LAM if name == "lam" else 0.0 for name in names])
-    sd = np.array([_sd(name, given) for name in names])
-    model = free_model(names, start, noise)
-    first = _static_start(log, names, mean, sd, model, meniscus)
+    """Estimate what the log tells of a puller; parameters of a path that is not excited are left alone.
 
-    def posterior(theta: Floats) -> tuple[float, Floats, Floats, Predicted]:
-        out, E, S = sensitivities(log, theta, model, meniscus)
-        e, s, away = out.error, out.variance, (theta - mean) / sd
-        if not (np.isfinite(e).all() and s.min() > 0.0 and np.isfinite(E).all() and np.isfinite(S).all()):
-            return np.inf, 0.0 * theta, np.eye(len(theta)), out
-        value = 0.5 * float(np.sum(np.log(s) + e * e / s) + away @ away)
-        slope = np.sum(e * E / s + 0.5 * S / s * (1.0 - e * e / s), axis=(1, 2)) + away / sd
-        A, B = (part.reshape(len(theta), -1) for part in (E / np.sqrt(s), S / s))
-        return value, slope, A @ A.T + 0.5 * B @ B.T + np.diag(1.0 / sd**2), out
-
-    theta, _, curvature, out = maximise(posterior, first, sd)
-    spread = np.sqrt(np.diag(np.linalg.inv(curvature)))
+    ``start`` and ``noise`` are the prior's medians, ``prior_sd`` standard deviations of logarithms other than PRIOR_SD.
+    """
+    start, noise = start or Parameters(), noise or Noise()
+    sds = dict.fromkeys((*HEATER, *PULL), PRIOR_SD) | dict.fromkeys(Noise._fields, NOISE_SD) | {"lam": LAM_SD}
+    for name, value in (prior_sd or {}).items():
+        if name not in sds or not value > 0.0:
+            raise CzError(unknown("parameter", name, sds) if name not in sds else f"prior of {name}: {value!r}")
+        sds[name] = value
+    moved = measure_excitation(log, start)
+    free = (*(HEATER if moved[1] >= 1.0 else ()), *(PULL if moved[0] >= 1.0 else ()))
+    model = Model((*free, *Noise._fields), start, noise, LAM, meniscus)
+    sd = np.array([sds[name] for name in model.names])
+    theta, spread, out, settled = _maximise(log, model, sd)
     found = {
-        name: _estimate(name, start, noise, theta[j], spread[j], sd[j]) for j, name in enumerate(names)
+        name: _estimate(model, name, *numbers) for name, *numbers in zip(model.names, theta, spread, sd, strict=True)
     }
-    asked = tuple(found.get(name) or _untold(name, start, moved) for name in (*THERMAL, *PULL))
-    white = np.where(out.variance == 1.0, np.nan, out.error / np.sqrt(out.variance))
-    return Identified(
-        start, asked, tuple(found[name] for name in Noise._fields), moved, out,
-        (whiteness(white[:, 0]), whiteness(white[:, 1])),
-    )  # fmt: skip
+    told = (found.get(name) or _untold(model, name) for name in (*HEATER, *PULL))
+    read = np.stack([log.T_1, log.ring], axis=1)
+    errors = np.where(np.isfinite(read), out.error / np.sqrt(out.variance), np.nan)
+    white = whiteness(errors[:, 0]), whiteness(errors[:, 1])
+    return Identified(start, tuple(told), tuple(map(found.__getitem__, Noise._fields)), moved, out, white, settled)
 
 
-def maximise(posterior, theta, sd):
-    known = {}
-    def at(scaled):
-        key = scaled.tobytes()
-        if key not in known:
-            known.clear(); known[key] = posterior(scaled * sd)
-        return known[key]
-    found = minimize(lambda x: at(x)[0], theta / sd, jac=lambda x: at(x)[1] * sd, hess=lambda x: at(x)[2] * np.outer(sd, sd), method="trust-exact", options={"gtol": SETTLED*10, "maxiter": 100})
-    print(found.message, found.nit, found.fun, np.abs(found.jac).max())
-    return (found.x * sd, *at(found.x)[1:])
+def measure_excitation(log: Log, start: Parameters) -> tuple[float, float]:
+    """:func:`excitation` of pull speed and heater."""
+    errors = np.stack([log.ring - np.nan_to_num(log.r_ref), log.T_1 - np.nan_to_num(log.T_1_ref)], axis=1)
+    return excitation(log.v_p / start.v_0, errors), excitation(log.Q_H / np.median(log.Q_H), errors)
 
 
-def _sd(name: str, given: dict[str, float]) -> float:
-    if name in given:
-        return given[name]
-    return LAM_SD if name == "lam" else NOISE_SD if name in Noise._fields else PRIOR_SD
+def excitation(drive: Floats, readings: Floats) -> float:
+    """How much a drive, in shares of nominal, moves on its own; 1 is just enough.
+
+    A linear regression of its moves on the last samples of drive and readings explains what a controller does. The
+    moves that it leaves unexplained count.
+    """
+    series = (drive, *readings.T)
+    past = np.stack([np.roll(each, lag)[PAST:-1] for each in series for lag in range(PAST)], axis=1)
+    move = np.diff(drive)[PAST:]
+    good = np.isfinite(past).all(axis=1)
+    if good.sum() < 2 * past.shape[1]:
+        return 0.0
+    X = past[good] - past[good].mean(axis=0)
+    X = np.column_stack([X / np.maximum(X.std(axis=0), 1e-12), np.ones(len(X))])
+    left = move[good] - X @ np.linalg.lstsq(X, move[good], rcond=1e-10)[0]
+    return float(np.square(left[np.abs(left) > MOVE]).sum() / ENOUGH)
 
 
-def _excitation(log: Log, start: Parameters) -> tuple[float, float]:
-    readings = np.column_stack([log.ring - np.where(np.isfinite(log.r_ref), log.r_ref, 0.0), log.T_1 - np.nan_to_num(log.T_1_ref)])
-    nominal = np.nanmedian(log.Q_H)
-    return excitation(log.v_p / start.v_0, readings), excitation(log.Q_H / nominal, readings)
+def whiteness(errors: Floats) -> float:
+    """Ljung and Box's probability over LAGS lags for errors of variance one; NaN where nothing was read."""
+    u = np.nan_to_num(errors - np.nanmean(errors))
+    n, lags = int(np.isfinite(errors).sum()), np.arange(1, LAGS + 1)
+    correlations = np.array([u[lag:] @ u[:-lag] for lag in lags]) / (u @ u)
+    return float(chi2.sf(n * (n + 2) * np.sum(np.square(correlations) / (n - lags)), LAGS))
 
 
-def _static_start(log, names, mean, sd, model, meniscus):
-    """Where the operating point has the log's mean temperature (within 5 K) and power (within 2 %)."""
-    mean = mean.copy()
-    for k in WIDE: mean[names.index(k)] = np.log(WIDE[k])
-    if "G_1a" not in names:
-        return mean
-    T_1, Q_H = np.nanmean(log.T_1), np.nanmean(log.Q_H)
+def _maximise(log: Log, model: Model, sd: Floats) -> tuple[Floats, Floats, Predicted, bool]:
+    """The posterior's maximum, standard deviations by its curvature, the filter's output there, and whether it settled.
 
-    def misfit(theta):
-        q, lam, _ = model(theta)
-        p = derive_puller(type(q)(*(float(np.real(v)) for v in q)), float(np.real(lam)), meniscus.height, meniscus.ring_offset)
-        return [*((theta - mean) / sd), (p.T_1_0 - T_1) / 5.0, (p.Q_H_0 / Q_H - 1.0) / 0.02]
+    The curvature is Fisher's information of Gaussian prediction errors, so no second derivatives are needed.
+    """
 
-    return least_squares(misfit, mean).x
+    @lru_cache(maxsize=2)
+    def posterior(packed: bytes) -> tuple[float, Floats, Floats, Predicted]:
+        away = np.frombuffer(packed)
+        out, E, S = sensitivities(log, model, model.mean + away * sd)
+        e, s = out.error, out.variance
+        if not (np.isfinite(E).all() and np.isfinite(S).all() and s.min() > 0.0):
+            return np.inf, np.zeros(len(away)), np.eye(len(away)), out
+        slope = np.sum(e * E / s + 0.5 * S / s * (1.0 - e * e / s), axis=(1, 2)) * sd + away
+        A, B = ((part.reshape(len(away), -1).T * sd).T for part in (E / np.sqrt(s), S / s))
+        value = 0.5 * float(np.sum(np.log(s) + e * e / s) + away @ away)
+        return value, slope, A @ A.T + 0.5 * B @ B.T + np.eye(len(away)), out
+
+    def part(index: int) -> Callable[[Floats], Any]:
+        return lambda x: posterior(x.tobytes())[index]
+
+    first = _plausible_start(log, model, sd)
+    found = minimize(
+        part(0), first, jac=part(1), hess=part(2), method="trust-exact", options={"gtol": 0.01, "maxiter": 200}
+    )
+    value, _, curvature, out = posterior(found.x.tobytes())
+    if not np.isfinite(value):
+        raise CzError("the filter cannot follow this log from these parameters: is it another puller's?")
+    spread = np.sqrt(np.diag(np.linalg.inv(curvature)))
+    return model.mean + found.x * sd, spread * sd, out, bool(found.success)
 
 
-def _estimate(name, start, noise, at, spread, sd):
-    wide = 1.96 * spread
-    if name == "lam":
-        prior, value, low, high = LAM * start.dT_0, at * start.dT_0, (at - wide) * start.dT_0, (at + wide) * start.dT_0
-        return Estimate("lam", prior, value, low, high, spread / sd)
-    prior = getattr(noise, name) if name in Noise._fields else getattr(start, name)
-    return Estimate(name, prior, *(float(prior * np.exp(at + shift)) for shift in (0.0, -wide, wide)), spread / sd)
+def _plausible_start(log: Log, model: Model, sd: Floats) -> Floats:
+    """A start in prior standard deviations: its operating point has the log's mean temperature and power, nearly."""
+    away = np.zeros(len(sd))
+    for name, factor in CAUTIOUS.items():
+        j = model.names.index(name)
+        away[j] = np.log(factor) / sd[j]
+    if "G_1a" not in model.names:
+        return away
+    T_1, Q_H = np.nanmean(log.T_1), np.mean(log.Q_H)
+
+    def misfit(x: Floats) -> Floats:
+        p = model.puller(model.mean + x * sd)
+        return np.array([*(x - away), (p.T_1_0 - T_1) / 5.0, (p.Q_H_0 / Q_H - 1.0) / 0.02])
+
+    found: Floats = least_squares(misfit, away).x
+    return found
 
 
-def _untold(name, start, moved):
+def _estimate(model: Model, name: str, at: float, spread: float, sd: float) -> Estimate:
+    low, value, high = (model.value(name, at + sign * 1.96 * spread) for sign in (-1.0, 0.0, 1.0))
+    return Estimate(name, model.value(name, LAM if name == "lam" else 0.0), value, low, high, spread / sd)
+
+
+def _untold(model: Model, name: str) -> Estimate:
     drive = "pull speed" if name in PULL else "heater"
-    prior = LAM * start.dT_0 if name == "lam" else getattr(start, name)
+    prior = model.value(name, LAM if name == "lam" else 0.0)
     return Estimate(name, prior, prior, prior, prior, 1.0, f"the {drive} was not excited")

@@ -87,7 +87,11 @@ class Excited:
         shown = np.array(observation, np.float64)
         seen, single = np.atleast_2d(shown), shown.ndim == 1
         n, parameters = len(seen), self.parameters
-        begins = np.ones(n, np.bool_) if state is None else np.zeros(n, np.bool_) | (episode_start is not None and np.asarray(episode_start))
+        begins = (
+            np.ones(n, np.bool_)
+            if state is None
+            else np.zeros(n, np.bool_) | (episode_start is not None and np.asarray(episode_start))
+        )
         last = state or Memory(None, np.zeros(n, np.int64), np.zeros((n, 2)), begins)
         step, before = np.where(begins, 0, last.step), np.where(begins[:, None], 0.0, last.added)
         error = decode(seen, parameters.v_0).ring_error
@@ -98,7 +102,7 @@ class Excited:
         added = np.where(stopped[:, None], 0.0, size * signs)
         seen[:, list(DRIVE_CHANNELS)] -= before
         action, inner = self.policy.predict(shown.astype(np.float32), last.inner, episode_start, deterministic)
-        acts = getattr(self.made_for, "action", None) or getattr(self.policy, "action", "direct")
+        acts = str(getattr(self.made_for or self.policy, "action", "direct"))
         moved = drives_of(acts, self.interval).asked(added, before)
         out = np.clip(np.asarray(action) + (moved[0] if single else moved), -1.0, 1.0).astype(np.float32)
         return mark(out, self.made_for), Memory(inner, step + 1, added, stopped)

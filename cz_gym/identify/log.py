@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from datetime import datetime
@@ -18,7 +17,7 @@ from cz_gym.atomic_files import naming, write_files
 from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.observation import decode
-from cz_gym.physics.parameters import Parameters
+from cz_gym.physics.plant import Puller
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 Floats = npt.NDArray[np.float64]
@@ -44,6 +43,8 @@ REQUIRED = 5
 """The first columns, which a log must have."""
 SHORTEST, FEWEST = 30.0 * MINUTE, 200
 """Least length [s] and number of rows of a log that says anything."""
+ABSENT = ("", "nan", "null", "none", "na", "n/a", "-")
+"""Fields that hold no number."""
 LONG_GAP = 2.0 * MINUTE
 """Gap [s] after which the filter begins anew."""
 OUTLIER = 6.0
@@ -80,14 +81,14 @@ def column_map(given: Sequence[str], file: Path | None = None) -> dict[str, tupl
 
     The file holds ``NAME = "COLUMN:UNIT"``. Raises CzError for names and units that there are not.
     """
-    pairs = []
+    pairs: list[tuple[str, Any]] = []
     if file is not None:
         with naming(file):
             try:
                 pairs = list(tomllib.loads(file.read_text(encoding="utf-8")).items())
             except tomllib.TOMLDecodeError as error:
                 raise CzError(f"{file}: {error}") from None
-    pairs += [tuple(text.partition("=")[::2]) for text in given]
+    pairs += [(text.partition("=")[0], text.partition("=")[2]) for text in given]
     found = {}
     for name, text in pairs:
         if name not in COLUMNS:
@@ -106,146 +107,162 @@ def read_log(path: str | Path, columns: Mapping[str, tuple[str, str]] | None = N
     """Read a CSV file; CzError names the row and what is wrong with it.
 
     ``columns`` gives column and unit of standard names that the file calls otherwise (:func:`column_map`). Repeated
-    times count once, with their last row; gaps and readings that are not valid, NaN or outliers of the ring stay NaN,
-    and drives hold.
+    times count once, with their last row. Readings that are absent, not valid or outliers of the ring become NaN, and
+    drives hold.
     """
-    path = Path(path)
     with naming(path):
-        text = path.read_text(encoding="utf-8-sig")
-    head = text.partition("\n")[0]
-    separator = max(",;\t", key=head.count)
-    rows = list(csv.reader(io.StringIO(text), delimiter=separator))
-    if not rows:
-        raise CzError(f"{path}: the file is empty")
-    header = [name.strip() for name in rows[0]]
+        text = Path(path).read_text(encoding="utf-8-sig")
+    separator = max(",;\t", key=text.partition("\n")[0].count)
+    header, *rows = [
+        [field.strip() for field in row] for row in csv.reader(io.StringIO(text), delimiter=separator)
+    ] or [[]]
     table: dict[str, Floats] = {}
-    for index, name in enumerate(COLUMNS):
-        column, unit = (columns or {}).get(name, (name, COLUMNS[name][1]))
-        if column in header:
-            table[name] = _numbers(path, rows, header.index(column), column, unit, separator)
-            table[name] = table[name] + TEMPERATURE[unit] if unit in TEMPERATURE else table[name] * COLUMNS[name][0][unit]
-        elif index < REQUIRED or name in (columns or {}):
-            raise CzError(f"{path}: {unknown('column', column, header)}; --column {name}=COLUMN:UNIT says which it is")
-    return _on_grid(path, table)
+    try:
+        for index, (name, (units, own)) in enumerate(COLUMNS.items()):
+            column, unit = (columns or {}).get(name, (name, own))
+            if column in header:
+                values = _numbers(rows, header.index(column), column, unit, decimal="," if separator == ";" else ".")
+                table[name] = values + units[unit] if units is TEMPERATURE else values * units[unit]
+            elif index < REQUIRED or name in (columns or {}):
+                raise CzError(f"{unknown('column', column, header)}; {name}=COLUMN:{own} says which one it is")
+        _check_rows(table)
+        return _on_grid(table)
+    except CzError as error:
+        raise CzError(f"{path}: {error}") from None
 
 
-def _numbers(path: Path, rows: list[list[str]], at: int, column: str, unit: str, separator: str) -> Floats:
-    """A column's numbers; an empty field and what reads as NaN are NaN."""
-    values = np.full(len(rows) - 1, np.nan)
-    for k, row in enumerate(rows[1:]):
-        text = row[at].strip() if at < len(row) else ""
+def _numbers(rows: list[list[str]], at: int, column: str, unit: str, decimal: str) -> Floats:
+    """A column's numbers; an empty field is NaN."""
+    values = np.full(len(rows), np.nan)
+    for k, row in enumerate(rows):
+        text = row[at] if at < len(row) else ""
         try:
             if unit == "iso":
                 values[k] = datetime.fromisoformat(text).timestamp()
-            elif text:
-                values[k] = float(text.replace(",", ".") if separator == ";" else text)
+            elif text.lower() not in ABSENT:
+                values[k] = float(text.replace(decimal, "."))
         except ValueError:
-            if text.lower() not in ("null", "none", "na", "n/a", "-"):
-                raise CzError(f"{path}, row {k + 2}: {column} = {text!r} is no {'time' if unit == 'iso' else 'number'}") from None
+            raise CzError(f"row {k + 2}: {column} = {text!r} is no {'time' if unit == 'iso' else 'number'}") from None
     return values
 
 
-def _on_grid(path: Path, table: dict[str, Floats]) -> Log:
-    """The table's rows at equal times, and what had to be done for it in words."""
+def _check_rows(table: dict[str, Floats]) -> None:
+    """Raise CzError for times that are absent or go back, drives without a first value, and a log that is too short."""
     time = table["time_s"]
-    for name in ("time_s", "pull_speed_mm_per_min", "heater_power_kW"):
-        if len(time) and not np.isfinite(table[name][0] if name != "time_s" else time).all():
-            row = 2 + int(np.argmin(np.isfinite(table[name])))
-            raise CzError(f"{path}, row {row}: {name} is missing")
-    step = np.diff(time)
-    if (step < 0.0).any():
-        row = int(np.argmax(step < 0.0)) + 3
-        raise CzError(f"{path}, row {row}: time goes back by {-step[row - 3]:g} s; sort the rows by time")
-    span = time[-1] - time[0] if len(time) else 0.0
-    if span < SHORTEST or len(time) < FEWEST:
-        raise CzError(f"{path}: {len(time)} rows over {span / MINUTE:.3g} min are too short: at least {FEWEST} rows over {SHORTEST / MINUTE:g} min are needed")
-    interval = float(np.median(step[step > 0.0]))
+    if not np.isfinite(time).all():
+        raise CzError(f"row {2 + int(np.argmin(np.isfinite(time)))}: the time is missing")
+    if len(time) < FEWEST or 0.0 <= time[-1] - time[0] < SHORTEST:
+        raise CzError(
+            f"{len(time)} rows over {np.ptp(time) / MINUTE if len(time) else 0.0:.3g} min are too short a log: "
+            f"it needs {FEWEST} rows and {SHORTEST / MINUTE:g} min"
+        )
+    back = np.diff(time) < 0.0
+    if back.any():
+        row = int(np.argmax(back)) + 1
+        raise CzError(f"row {row + 2}: time goes back by {time[row - 1] - time[row]:g} s; sort the rows by time")
+    for name in ("pull_speed_mm_per_min", "heater_power_kW"):
+        if not np.isfinite(table[name][0]):
+            raise CzError(f"row 2: {name} is missing")
+
+
+def _on_grid(table: dict[str, Floats]) -> Log:
+    """The table's rows at equal times, and what was left out or filled."""
+    time = table["time_s"]
+    interval = float(np.median(np.diff(np.unique(time))))
     index = np.rint((time - time[0]) / interval).astype(int)
-    n, last = index[-1] + 1, np.append(np.diff(index) > 0, True)
+    n, last = int(index[-1]) + 1, np.append(np.diff(index) > 0, True)
     if n > 50 * len(time):
-        raise CzError(f"{path}: gaps make up nearly all of it; are its times in another unit?")
-    missing = np.ones(n, np.bool_)
-    missing[index] = False
-    given = np.full((len(COLUMNS), n), np.nan)
-    for row, name in enumerate(COLUMNS):
+        raise CzError("nearly all of it are gaps: are its times in another unit?")
+    present = np.zeros(n, np.bool_)
+    present[index] = True
+    rows = np.arange(n)
+
+    def at_grid(name: str, held: bool = False) -> Floats:
+        values = np.full(n, np.nan)
         if name in table:
-            given[row, index[last]] = table[name][last]
-    grid = dict(zip(COLUMNS, given, strict=True))
-    for name in ("pull_speed_mm_per_min", "heater_power_kW", "r_ref_mm", "T_1_ref_K"):
-        held = np.maximum.accumulate(np.where(np.isfinite(grid[name]), np.arange(n), 0))
-        grid[name] = grid[name][held]
-    ring = grid["ring_radius_mm"]
-    invalid = (grid["valid"] < 0.5) & np.isfinite(ring) if "valid" in table else np.zeros(n, np.bool_)
+            values[index[last]] = table[name][last]
+        return values[np.maximum.accumulate(np.where(np.isfinite(values), rows, 0))] if held else values
+
+    ring, T_1 = at_grid("ring_radius_mm"), at_grid("T_1_K")
+    invalid = np.isfinite(ring) & (at_grid("valid") < 0.5)
     ring[invalid] = np.nan
-    outliers = _outliers(ring)
-    ring[outliers] = np.nan
-    for name in ("ring_radius_mm", "T_1_K"):
-        good = grid[name][np.isfinite(grid[name])]
+    outlier = _outliers(ring)
+    ring[outlier] = np.nan
+    for name, values in (("ring_radius_mm", ring), ("T_1_K", T_1)):
+        good = values[np.isfinite(values)]
         if len(good) < 0.3 * n:
-            raise CzError(f"{path}: {name} has only {len(good)} good readings in {n} rows")
+            raise CzError(f"{name} has only {len(good)} good readings in {n} rows")
         if np.ptp(good) == 0.0:
-            raise CzError(f"{path}: {name} is constant, so it says nothing")
-    since = np.arange(n) - np.maximum.accumulate(np.where(missing, 0, np.arange(n)))
-    gap = np.zeros(n, np.bool_)
-    gap[1:] = ~missing[1:] & (since[:-1] * interval > LONG_GAP)
+            raise CzError(f"{name} is constant, so it tells nothing")
+    seen = np.maximum.accumulate(np.where(present, rows, 0))
+    gap = np.diff(seen, prepend=0) * interval > LONG_GAP
     counts = {
-        "rows repeat a time": int(np.sum(~last)), "rows are missing": int(missing.sum()),
-        "readings of the ring are not valid": int(invalid.sum()), "are outliers of the ring": int(outliers.sum()),
-        "gaps are longer than 2 min": int(gap.sum()),
-    }  # fmt: skip
+        "rows repeat a time": len(time) - int(last.sum()),
+        "rows are missing": n - int(present.sum()),
+        f"gaps are longer than {LONG_GAP:g} s": int(gap.sum()),
+        "readings of the ring are not valid": int(invalid.sum()),
+        "readings of the ring are outliers": int(outlier.sum()),
+    }
+    held = (at_grid(name, held=True) for name in ("pull_speed_mm_per_min", "heater_power_kW", "r_ref_mm", "T_1_ref_K"))
+    v_p, Q_H, r_ref, T_1_ref = held
     notes = tuple(f"{count} {what}" for what, count in counts.items() if count)
-    drives = grid["pull_speed_mm_per_min"], grid["heater_power_kW"]
-    return Log(interval * np.arange(n), ring, *drives, grid["T_1_K"], grid["r_ref_mm"], grid["T_1_ref_K"], gap, interval, notes)
+    return Log(interval * np.arange(n, dtype=np.float64), ring, v_p, Q_H, T_1, r_ref, T_1_ref, gap, interval, notes)
 
 
 def _outliers(ring: Floats) -> npt.NDArray[np.bool_]:
-    """Readings far from the median of their eleven neighbours (Hampel's filter)."""
+    """The readings that are far from the median of the eleven around them (Hampel's filter)."""
     around = np.lib.stride_tricks.sliding_window_view(np.pad(ring, 5, constant_values=np.nan), 11)
-    with np.errstate(all="ignore"):
-        away = np.abs(ring - np.where(np.isfinite(around).any(axis=1), np.nanmedian(np.where(np.isfinite(around).any(axis=1)[:, None], around, 0.0), axis=1), np.nan))
-    return away > OUTLIER * max(1.4826 * float(np.nanmedian(away)), 1e-9)
+    known = np.isfinite(ring)
+    away = np.zeros(len(ring))
+    away[known] = np.abs(ring[known] - np.nanmedian(around[known], axis=1))
+    found: npt.NDArray[np.bool_] = away > OUTLIER * max(1.4826 * float(np.median(away[known])), 1e-9)
+    return found
 
 
-def check_puller(log: Log, parameters: Parameters, ring_bias: float) -> None:
-    """Raise CzError for a log in another unit than it says, or of another puller."""
-    T_m = parameters.T_m
+def check_puller(log: Log, puller: Puller) -> None:
+    """Raise CzError for a log in other units than it says, or of another puller."""
     for name, values, low, high in (
-        ("ring_radius_mm", log.ring - ring_bias, 0.8 * parameters.r_0, 1.25 * parameters.r_0),
-        ("pull_speed_mm_per_min", log.v_p, 0.4 * parameters.v_0, 2.5 * parameters.v_0),
-        ("T_1_K", log.T_1, T_m, T_m + 800.0),
-        ("heater_power_kW", log.Q_H, KILO, 1000.0 * KILO),
+        ("ring_radius_mm", log.ring - puller.ring_bias, 0.8 * puller.r_0, 1.25 * puller.r_0),
+        ("pull_speed_mm_per_min", log.v_p, 0.4 * puller.v_0, 2.5 * puller.v_0),
+        ("T_1_K", log.T_1, puller.T_m, puller.T_m + 800.0),
+        ("heater_power_kW", log.Q_H, KILO, KILO * KILO),
     ):
         units, own = COLUMNS[name]
         middle = float(np.nanmedian(values))
         if low <= middle <= high:
             continue
-        shift = name == "T_1_K"
-        fits = [u for u, f in units.items() if u != own and low <= (middle + f - units[own] if shift else middle * f / units[own]) <= high]
-        meant = f"; is it in {fits[0]}? --column {name}=COLUMN:{fits[0].replace(' ', '_')}" if fits else "; is it another puller's log?"
-        scale = 1.0 if shift else units[own]
-        raise CzError(f"{name}: its median {middle / scale:.4g} lies outside {low / scale:.4g} to {high / scale:.4g} of this puller{meant}")
+        added = units is TEMPERATURE
+        as_read = {unit: middle + f - units[own] if added else middle * f / units[own] for unit, f in units.items()}
+        meant = [unit for unit, value in as_read.items() if low <= value <= high]
+        guess = f'did you mean {name}="COLUMN:{meant[0]}"' if meant else "is it another puller's log"
+        middle, low, high = (value if added else value / units[own] for value in (middle, low, high))
+        raise CzError(f"{name} is {middle:.4g} in the middle, this puller's is {low:.4g} to {high:.4g}: {guess}?")
 
 
 def record_log(env: Any, policy: Any, path: str | Path, seed: int | None = None) -> int:
-    """Let a policy act for an episode of an environment made with ``info="all"``, and write its log; returns the rows."""
-    v_0 = env.unwrapped.config.parameters.v_0
+    """Run a policy for an episode of an environment made with ``info="all"``, and write its log; return the rows."""
+    config = env.unwrapped.config
     observation, info = env.reset(seed=seed)
     if "r_br_measured" not in info:
         raise CzError('record_log needs an environment made with info="all"')
-    lines, state, over, begins = [",".join(COLUMNS)], None, False, np.array([True])
+    lines, state, over = [",".join(COLUMNS)], None, False
     while True:
-        seen = decode(observation, v_0)
-        T_1 = info["T_1_ref"] - seen.T_1_ref + seen.T_1
-        row = {
-            "time_s": (len(lines) - 1) * env.unwrapped.config.control_interval, "ring_radius_mm": info["r_br_measured"] / MM,
-            "pull_speed_mm_per_min": info["v_p"] / MM_PER_MIN, "heater_power_kW": info["Q_H"] / KILO, "T_1_K": T_1,
-            "valid": seen.valid, "r_ref_mm": info["r_ref"] / MM, "T_1_ref_K": info["T_1_ref"],
-        }  # fmt: skip
-        lines.append(",".join(f"{row[name]:.10g}" for name in COLUMNS))
+        seen = decode(observation, config.parameters.v_0)
+        row = (
+            (len(lines) - 1) * config.control_interval,
+            info["r_br_measured"] / MM,
+            info["v_p"] / MM_PER_MIN,
+            info["Q_H"] / KILO,
+            info["T_1_ref"] - seen.T_1_ref + seen.T_1,
+            seen.valid,
+            info["r_ref"] / MM,
+            info["T_1_ref"],
+        )
+        lines.append(",".join(f"{value:.10g}" for value in row))
         if over:
             break
-        action, state = policy.predict(observation, state, begins, deterministic=True)
+        action, state = policy.predict(observation, state, np.array([state is None]), deterministic=True)
         observation, _, terminated, truncated, info = env.step(np.asarray(action))
-        over, begins = terminated or truncated, np.array([False])
+        over = terminated or truncated
     write_files({Path(path): ("\n".join(lines) + "\n").encode()})
     return len(lines) - 1

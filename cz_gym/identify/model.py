@@ -2,13 +2,13 @@
 
 Eleven states: the plant's five, a fast and a slow fluctuation of the interface temperature [K], a heat load on the melt
 [W] with its rate [W/s], and the constant offsets of pyrometer [K] and ring [m]. The mean moves by the plant's
-equations, the covariance by the plant linearised at its operating point. The loop takes complex numbers, so a complex step through
-it gives the derivatives of every prediction error, and of its variance, by a parameter.
+equations, the covariance by the plant linearised at its operating point. The loop takes complex numbers: a complex step
+through it gives the derivatives of every prediction error, and of its variance, by a parameter.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -24,7 +24,7 @@ from cz_gym.physics.plant import Disturbance, Inputs, State, derive_puller, rate
 from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
 from cz_gym.units import MM
 
-from .log import Log
+from .log import Floats, Log
 
 Numbers = npt.NDArray[np.complex128]
 STATES = (*State._fields, "fast", "slow", "load", "load_rate", "pyrometer_offset", "ring_offset")
@@ -66,9 +66,9 @@ FLOOR = 0.01, 3e-3 * MM
 class Predicted(NamedTuple):
     """Prediction errors of pyrometer [K] and ring [m], shape (rows, 2); 0 with variance 1 where nothing was read."""
 
-    error: Numbers
-    variance: Numbers
-    state: Numbers
+    error: Any
+    variance: Any
+    state: Any
     """Estimated states after each row, shape (rows, 11)."""
 
 
@@ -81,84 +81,94 @@ def build_filter(meniscus: MeniscusModel) -> Any:
         p: Any, A: Any, Q: Any, z: Any, start: Any, R: Any, read: Any, drives: Any, gap: Any, dt: Any, parts: Any,
         lowest: Any, highest: Any, error: Any, variance: Any, states: Any,
     ) -> None:  # fmt: skip
-        n, P, AP, H = z.size, start.copy(), np.zeros_like(A), np.zeros_like(z)
+        P, A_t = start, np.ascontiguousarray(A.T)
         for k in range(read.shape[0]):
             if k > 0:
                 x, u = State(z[0], z[1], z[2], z[3], z[4]), Inputs(drives[k, 0] + 0.0 * z[0], drives[k, 1] + 0.0 * z[0])
                 d = Disturbance(z[7], z[5] + z[6], 1.0 + 0.0 * z[0])
                 for _ in range(parts):
                     x = rk4(x, u, d, p, dt / parts, slope)
+                z = A @ z
                 z[0], z[1], z[2], z[3], z[4] = x.r_c, x.h_c, x.T_1, x.T_2, x.T_b
-                z[5], z[6], z[7], z[8] = A[5, 5] * z[5], A[6, 6] * z[6], z[7] + A[7, 8] * z[8], A[8, 8] * z[8]
-                for i in range(n):
-                    for j in range(n):
-                        AP[i, j] = 0.0
-                    for m in range(n):
-                        if A[i, m] != 0.0:
-                            for j in range(n):
-                                AP[i, j] += A[i, m] * P[m, j]
-                for i in range(n):
-                    for j in range(i, n):
-                        total = Q[i, j]
-                        for m in range(n):
-                            total += AP[i, m] * A[j, m]
-                        P[i, j], P[j, i] = total, total
-            if gap[k]:
-                P[:, :] = start
+                P = start if gap[k] else A @ P @ A_t + Q
             for sensor in range(2):
                 error[k, sensor], variance[k, sensor] = 0.0, 1.0
                 if np.isnan(read[k, sensor]):
                     continue
-                H[:] = 0.0
+                H = np.zeros_like(z)
                 if sensor == 0:
                     H[2], H[9], expected = 1.0, 1.0, z[2] + z[9]
                 else:
-                    near, far = 1e-6 * z[0], 1e-6 * z[1]
+                    near, far = _SHARE * z[0], _SHARE * z[1]
                     H[0] = 1.0 + (ring_offset(z[0] + near, z[1], p) - ring_offset(z[0] - near, z[1], p)) / (2.0 * near)
                     H[1] = (ring_offset(z[0], z[1] + far, p) - ring_offset(z[0], z[1] - far, p)) / (2.0 * far)
                     H[10], expected = 1.0, z[0] + ring_offset(z[0], z[1], p) + z[10]
-                PH = AP[0]
-                S = R[sensor]
-                for i in range(n):
-                    PH[i] = 0.0
-                    for j in range(n):
-                        PH[i] += P[i, j] * H[j]
-                for i in range(n):
-                    S += H[i] * PH[i]
-                e = read[k, sensor] - expected
-                error[k, sensor], variance[k, sensor] = e, S
-                for i in range(n):
-                    z[i] += PH[i] / S * e
-                    for j in range(n):
-                        P[i, j] -= PH[i] * PH[j] / S
-            if z[1].real < lowest:
-                z[1] = lowest
-            if z[1].real > highest:
-                z[1] = highest
-            for i in range(n):
-                states[k, i] = z[i]
+                PH = P @ H
+                error[k, sensor], variance[k, sensor] = read[k, sensor] - expected, (H * PH).sum() + R[sensor]
+                z = z + PH * (error[k, sensor] / variance[k, sensor])
+                P = P - np.outer(PH, PH / variance[k, sensor])
+            if not lowest < z[1].real < highest:
+                z[1] = min(max(z[1].real, lowest), highest)
+            states[k] = z
 
     return kernel(run, keep=hashed(*meniscus.functions))
 
 
-def predict(log: Log, q: Any, lam: Any, noise: Noise, meniscus: MeniscusModel = HURLE) -> Predicted:
-    """Run the filter over a log; ``q`` are parameters, ``lam`` the share of conduction, all real or complex."""
-    p = derive_puller(type(q)(*map(complex, q)), complex(lam), meniscus.height, meniscus.ring_offset)
+class Model(NamedTuple):
+    """The map from free numbers to a puller and its noise: logarithms of factors, and ``lam`` itself."""
+
+    names: tuple[str, ...]
+    """The free ones, of Parameters, Noise and ``lam``."""
+    start: Parameters
+    noise: Noise
+    lam: float
+    """Share of conduction if it is not free [-]."""
+    meniscus: MeniscusModel = HURLE
+
+    @property
+    def mean(self) -> Any:
+        """The free numbers of the start, shape (names,)."""
+        return np.array([self.lam if name == "lam" else 0.0 for name in self.names])
+
+    def value(self, name: str, at: float) -> float:
+        """The parameter or noise where its free number is ``at``; of ``lam``, the product lam dT_0 [K]."""
+        if name == "lam":
+            return at * self.start.dT_0
+        return float(getattr(self.noise if name in Noise._fields else self.start, name) * np.exp(at))
+
+    def puller(self, theta: Any) -> Any:
+        """The puller of free numbers, real or complex, shape (names,)."""
+        free = dict(zip(self.names, theta, strict=True))
+        factors = {name: np.exp(value) for name, value in free.items() if name in Parameters._fields}
+        q = self.start._replace(**{name: getattr(self.start, name) * factor for name, factor in factors.items()})
+        zero = 0.0 * theta[0]
+        numbers = Parameters(*(number + zero for number in q))
+        return derive_puller(numbers, free.get("lam", self.lam) + zero, self.meniscus.height, self.meniscus.ring_offset)
+
+    def noises(self, theta: Any) -> Noise:
+        """The noise of free numbers, as :meth:`puller`."""
+        free = {name: value for name, value in zip(self.names, theta, strict=True) if name in Noise._fields}
+        return self.noise._replace(**{name: getattr(self.noise, name) * np.exp(at) for name, at in free.items()})
+
+
+def predict(log: Log, model: Model, theta: Any) -> Predicted:
+    """Run the filter of the free numbers ``theta``, shape (names,), real or complex, over a log."""
+    p, noise, meniscus = model.puller(np.asarray(theta, np.complex128)), model.noises(theta), model.meniscus
     through = p.Q_H_0 - p.G_1a * (p.T_1_0 - p.T_a)
     A, Q = _sampled(p, noise, through, log.interval, meniscus)
     z, P = np.zeros(len(STATES), np.complex128), np.zeros((len(STATES),) * 2, np.complex128)
     z[:5] = p.state_0
-    z[0] = log.r_ref[0] if np.isfinite(log.r_ref[0]) else p.r_0
-    z[RING] = np.nanmedian(log.ring - log.r_ref if np.isfinite(log.r_ref).all() else log.ring - p.r_0.real) - p.ring_bias
-    P[range(5), range(5)] = np.square(START_SD)
-    P[[FAST, SLOW, LOAD], [FAST, SLOW, LOAD]] = noise.fast_sd**2, noise.slow_sd**2, (LOAD_SD * through) ** 2
-    P[RATE,RATE]=(noise.load_rate*through)**2
-    P[[PYROMETER, RING], [PYROMETER, RING]] = np.square(OFFSET_SD)
-    rows, parts = len(log.time), int(np.ceil(log.interval / LONGEST_STEP - 1e-9))
+    known = np.isfinite(log.r_ref).all()
+    z[0] = log.r_ref[0] if known else p.r_0
+    z[RING] = np.nanmedian(log.ring - (log.r_ref if known else p.r_0.real)) - p.ring_bias
+    start_sd = {FAST: noise.fast_sd, SLOW: noise.slow_sd, LOAD: LOAD_SD * through, RATE: noise.load_rate * through}
+    for state, sd in (*enumerate(START_SD), *start_sd.items(), (PYROMETER, OFFSET_SD[0]), (RING, OFFSET_SD[1])):
+        P[state, state] = sd**2
+    rows, parts = len(log.time), math.ceil(log.interval / LONGEST_STEP - 1e-9)
     out = Predicted(*(np.zeros((rows, width), np.complex128) for width in (2, 2, len(STATES))))
     R = np.array([noise.pyrometer_sd**2, noise.camera_sd**2], np.complex128) + np.square(FLOOR)
     read, drives = np.stack([log.T_1, log.ring], axis=1), np.stack([log.v_p, log.Q_H], axis=1)
-    limits = 1.05 * HEIGHT_MIN, HEIGHT_MAX_IN_A * float(p.a.real)
+    limits = HEIGHT_MIN, HEIGHT_MAX_IN_A * float(p.a.real)
     build_filter(meniscus)(p, A, Q, z, P, R, read, drives, log.gap, log.interval, parts, *limits, *out)
     return out
 
@@ -180,41 +190,18 @@ def _sampled(p: Any, noise: Noise, through: Any, dt: float, meniscus: MeniscusMo
             F[:5, state] = column
     F[LOAD, RATE] = 1.0
     A = expm(F * dt)
-    for state, sd, tau in ((FAST, noise.fast_sd, TAU_FAST), (SLOW, noise.slow_sd, TAU_SLOW), (RATE, noise.load_rate * through, TAU_RATE)):
+    for state, sd, tau in (
+        (FAST, noise.fast_sd, TAU_FAST),
+        (SLOW, noise.slow_sd, TAU_SLOW),
+        (RATE, noise.load_rate * through, TAU_RATE),
+    ):
         A[state, state] = np.exp(-dt / tau)
         Q[state, state] = sd**2 * (1.0 - A[state, state] ** 2)
     return A, Q
 
 
-def sensitivities(log: Log, theta: Any, model: Any, meniscus: MeniscusModel = HURLE) -> tuple[Predicted, Any, Any]:
-    """Prediction errors at ``theta``, and the derivatives of errors and variances, shape (parameters, rows, 2).
-
-    ``model(theta)`` returns parameters, share of conduction and noise.
-    """
-    errors, variances = [], []
-    out: Predicted | None = None
-    for j in range(len(theta)):
-        moved = np.array(theta, np.complex128)
-        moved[j] += 1j * _STEP
-        out = predict(log, *model(moved), meniscus)
-        errors.append(out.error.imag / _STEP)
-        variances.append(out.variance.imag / _STEP)
-    assert out is not None
-    return Predicted(*(part.real for part in out)), np.array(errors), np.array(variances)  # type: ignore[arg-type]
-
-
-def free_model(names: Sequence[str], start: Parameters, noise: Noise) -> Any:
-    """The function that turns logarithms of factors (``lam``: the value itself) into parameters, lam and noise."""
-
-    def model(theta: Any) -> tuple[Any, Any, Noise]:
-        q, lam, n = start, 0.5 + 0.0j, noise
-        for name, value in zip(names, theta, strict=True):
-            if name == "lam":
-                lam = value
-            elif name in Noise._fields:
-                n = n._replace(**{name: getattr(noise, name) * np.exp(value)})
-            else:
-                q = q._replace(**{name: getattr(start, name) * np.exp(value)})
-        return q, lam, n
-
-    return model
+def sensitivities(log: Log, model: Model, theta: Floats) -> tuple[Predicted, Floats, Floats]:
+    """The filter's output at ``theta``, and the derivatives of errors and variances, shape (names, rows, 2)."""
+    runs = [predict(log, model, theta + 1j * _STEP * unit) for unit in np.eye(len(theta))]
+    errors, variances = (np.stack([run[part].imag for run in runs]) / _STEP for part in (0, 1))
+    return Predicted(*(np.ascontiguousarray(part.real) for part in runs[0])), errors, variances

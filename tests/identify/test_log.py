@@ -1,0 +1,144 @@
+"""The log reader: other names and units, gaps, repeats, jitter; one line for what is wrong."""
+
+import csv
+import io
+from collections.abc import Callable
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cz_gym import make_puller
+from cz_gym.errors import CzError
+from cz_gym.identify.log import COLUMNS, check_puller, column_map, read_log
+
+Row = dict[str, str]
+
+
+def read(path: Path) -> list[Row]:
+    return list(csv.DictReader(path.open()))
+
+
+def write(path: Path, rows: list[Row], delimiter: str = ",") -> Path:
+    text = io.StringIO()
+    table = csv.DictWriter(text, list(rows[0]), delimiter=delimiter)
+    table.writeheader()
+    table.writerows(rows)
+    path.write_text(text.getvalue())
+    return path
+
+
+def test_other_names_units_and_separators_are_the_same_log(logs: tuple[Path, Path], tmp_path: Path) -> None:
+    start = datetime.fromisoformat("2024-05-01T23:00:00+02:00")
+    rows = [
+        {
+            "when": (start + timedelta(seconds=float(row["time_s"]))).isoformat(),
+            "DIA": f"{0.2 * float(row['ring_radius_mm']):.12g}".replace(".", ","),
+            "SPEED": f"{60.0 * float(row['pull_speed_mm_per_min']):.12g}".replace(".", ","),
+            "W": f"{1e3 * float(row['heater_power_kW']):.12g}".replace(".", ","),
+            "PYRO": f"{float(row['T_1_K']) - 273.15:.12g}".replace(".", ","),
+            "valid": row["valid"],
+        }
+        for row in read(logs[0])
+    ]
+    (tmp_path / "map.toml").write_text('ring_radius_mm = "DIA:diameter cm"\npull_speed_mm_per_min = "SPEED:mm/h"\n')
+    columns = column_map(["time_s=when:iso", "heater_power_kW=W:W", "T_1_K=PYRO:degC"], tmp_path / "map.toml")
+    mine, other = read_log(logs[0]), read_log(write(tmp_path / "other.csv", rows, ";"), columns)
+    for name in ("time", "ring", "v_p", "Q_H", "T_1"):
+        np.testing.assert_allclose(getattr(other, name), getattr(mine, name), rtol=1e-9, err_msg=name)
+    assert np.isnan(other.r_ref).all()
+    assert (mine.interval, mine.notes) == (5.0, ())
+
+
+def test_gaps_repeats_jitter_and_outliers_are_counted(logs: tuple[Path, Path], tmp_path: Path) -> None:
+    whole, rows = read_log(logs[0]), read(logs[0])
+    for k, row in enumerate(rows):
+        row["time_s"] = f"{float(row['time_s']) + 0.8 * np.sin(k):.3f}"
+    rows[50]["ring_radius_mm"], rows[60]["valid"], rows[70]["T_1_K"], rows[71]["heater_power_kW"] = (
+        "150",
+        "0",
+        "nan",
+        "",
+    )
+    rows[80]["time_s"] = rows[79]["time_s"]
+    rows[90]["time_s"] = rows[89]["time_s"]
+    log = read_log(write(tmp_path / "log.csv", rows[:100] + rows[140:]))
+    assert log.interval == pytest.approx(5.0, abs=0.1)
+    assert abs(len(log.time) - len(whole.time)) <= 1
+    assert log.notes == (
+        "2 rows repeat a time", "42 rows are missing", "1 gaps are longer than 120 s",
+        "1 readings of the ring are not valid", "1 readings of the ring are outliers",
+    )  # fmt: skip
+    assert np.flatnonzero(np.isnan(log.T_1)).tolist() == [70, 80, 90, *range(100, 140)]
+    assert np.isnan(log.ring[[50, 60, 120]]).all()
+    assert np.isfinite([log.v_p, log.Q_H]).all()
+    assert log.Q_H[71] == whole.Q_H[70]
+    assert np.flatnonzero(log.gap).tolist() == [140]
+
+
+def changed(name: str, value: str, at: int = 400) -> Callable[[list[Row]], list[Row]]:
+    return lambda rows: [row | {name: value} if k == at else row for k, row in enumerate(rows)]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (changed("heater_power_kW", "off"), "row 402: heater_power_kW = 'off' is no number"),
+        (changed("time_s", ""), "row 402: the time is missing"),
+        (changed("time_s", "10"), "row 402: time goes back by 1985 s"),
+        (lambda rows: rows[::-1], "row 3: time goes back by 5 s"),
+        (changed("pull_speed_mm_per_min", "", 0), "row 2: pull_speed_mm_per_min is missing"),
+        (lambda rows: rows[:300], "300 rows over 24.9 min are too short a log"),
+        (lambda rows: [rows[0] | {"time_s": "x"}], "row 2: time_s = 'x' is no number"),
+        (lambda rows: [row | {"T_1_K": "1800"} for row in rows], "T_1_K is constant"),
+        (lambda rows: [row | {"valid": "0"} for row in rows], "ring_radius_mm has only 0 good readings in 2161 rows"),
+        (
+            lambda rows: [{"T1" if k == "T_1_K" else k: v for k, v in row.items()} for row in rows],
+            "unknown column 'T_1_K'",
+        ),
+        (changed("time_s", "1e9", 2160), "nearly all of it are gaps"),
+    ],
+)
+def test_what_is_wrong_is_one_line_with_its_row(
+    change: Callable[[list[Row]], list[Row]], said: str, logs: tuple[Path, Path], tmp_path: Path
+) -> None:
+    with pytest.raises(CzError) as error:
+        read_log(write(tmp_path / "bad.csv", change(read(logs[0]))))
+    assert str(error.value).startswith(f"{tmp_path / 'bad.csv'}: ")
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"),
+    [
+        ({"ring": 2.0}, 'did you mean ring_radius_mm="COLUMN:diameter mm"'),
+        ({"v_p": 60.0}, 'did you mean pull_speed_mm_per_min="COLUMN:mm/h"'),
+        ({"Q_H": 1e3}, 'did you mean heater_power_kW="COLUMN:W"'),
+        ({"T_1": 1.0 - 273.15 / 1785.0}, 'did you mean T_1_K="COLUMN:degC"'),
+        ({"ring": 1.4}, "is it another puller's log?"),
+    ],
+)
+def test_wrong_units_and_other_pullers_are_noticed(
+    factor: dict[str, float], said: str, logs: tuple[Path, Path]
+) -> None:
+    log = read_log(logs[0])
+    check_puller(log, make_puller())
+    wrong = log._replace(**{name: getattr(log, name) * by for name, by in factor.items()})
+    with pytest.raises(CzError, match=said.replace("(", r"\(")):
+        check_puller(wrong, make_puller())
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("ring_mm=DIA", "unknown column 'ring_mm': did you mean 'ring_radius_mm'"),
+        ("T_1_K=PYRO:F", "unknown unit of T_1_K 'F'; choose from K, degC"),
+        ("T_1_K", "T_1_K: say which column it is"),
+    ],
+)
+def test_a_wrong_mapping_is_one_line(given: str, said: str) -> None:
+    with pytest.raises(CzError, match=said):
+        column_map([given])
+    assert set(column_map([f"{name}=x" for name in COLUMNS]).values()) == {("x", own) for _, own in COLUMNS.values()}
