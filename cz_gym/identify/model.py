@@ -51,12 +51,13 @@ class Noise(NamedTuple):
 
 TAU_FAST, TAU_SLOW, TAU_RATE = 30.0, 780.0, 2400.0
 """Correlation times of the interface temperature's fluctuations and of the load's rate [s]."""
-START_SD = (0.5 * MM, 0.2 * MM, 5.0, 5.0, 2.0)
+START_SD = (0.5 * MM, 0.1 * MM, 1.0, 0.5, 0.3)
 """Standard deviation of the plant's state at the log's first row; pyrometer and ring have offsets of their own."""
 OFFSET_SD = 5.0, 1.0 * MM
 """Standard deviation of the pyrometer's offset [K] and the ring's [m]."""
-LOAD_SD = 0.05
-"""Standard deviation of the heat load at the first row, in shares of the heat through the melt [-]."""
+DRIFT_SD = 5.0
+"""Standard deviation of the hot zone's drift at the first row: heater and susceptor are warmer, and a load on the melt
+takes the heat away [K]."""
 
 
 FLOOR = 0.01, 3e-3 * MM
@@ -161,9 +162,12 @@ def predict(log: Log, model: Model, theta: Any) -> Predicted:
     known = np.isfinite(log.r_ref).all()
     z[0] = log.r_ref[0] if known else p.r_0
     z[RING] = np.nanmedian(log.ring - (log.r_ref if known else p.r_0.real)) - p.ring_bias
-    start_sd = {FAST: noise.fast_sd, SLOW: noise.slow_sd, LOAD: LOAD_SD * through, RATE: noise.load_rate * through}
+    start_sd = {FAST: noise.fast_sd, SLOW: noise.slow_sd, RATE: noise.load_rate * through}
     for state, sd in (*enumerate(START_SD), *start_sd.items(), (PYROMETER, OFFSET_SD[0]), (RING, OFFSET_SD[1])):
         P[state, state] = sd**2
+    warmer = p.T_1_0**3 / (p.T_2_0**3 + p.G_2b / (4.0 * p.kappa_12))
+    drift = DRIFT_SD * np.array([0.0, 0.0, 1.0, warmer, 0.0, 0.0, 0.0, -p.G_2b * warmer, 0.0, 0.0, 0.0])
+    P = P + np.outer(drift, drift)
     rows, parts = len(log.time), math.ceil(log.interval / LONGEST_STEP - 1e-9)
     out = Predicted(*(np.zeros((rows, width), np.complex128) for width in (2, 2, len(STATES))))
     R = np.array([noise.pyrometer_sd**2, noise.camera_sd**2], np.complex128) + np.square(FLOOR)
