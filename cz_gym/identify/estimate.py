@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
+from cz_gym.puller import DEFAULT, Puller
 
 from .log import Floats, Log
 from .model import Model, Noise, Predicted, sensitivities
@@ -30,12 +31,12 @@ LAM, LAM_SD = 0.5, 0.3
 INFORMED = 0.5
 """An informed parameter keeps less than this share of the prior's standard deviation [-]."""
 MOVE, ENOUGH, PAST = 0.005, 20 * 0.02**2, 6
-"""Unexplained moves count from this share of nominal on; their squares must add up to those of 20 steps of 2 %. A move
-is explained by so many past samples."""
+"""Unexplained moves count from this share of nominal on; their squares must add up to those of 20 steps of 2 %. PAST
+values of every signal explain a move."""
 LAGS, WHITE = 20, 0.01
 """Lags of the whiteness test, and the probability below which residuals count as coloured."""
 CAUTIOUS = {"pyrometer_sd": 20.0, "camera_sd": 4.0}
-"""Factors on the noise where the search begins, so that a filter of a wrong model can follow the log."""
+"""Factors on the noise where the search begins, so that the filter of a wrong puller can follow the log."""
 
 
 class Estimate(NamedTuple):
@@ -49,8 +50,8 @@ class Estimate(NamedTuple):
     high: float
     left: float
     """Share of the prior's standard deviation that is left [-]."""
-    why: str = ""
-    """The reason if it was not estimated at all."""
+    excited: bool = True
+    """Whether its drive moved enough; without that it is not estimated."""
 
     @property
     def informed(self) -> bool:
@@ -62,87 +63,107 @@ class Estimate(NamedTuple):
 class Identified:
     """The result of an identification."""
 
-    start: Parameters
+    start: Puller
     estimates: tuple[Estimate, ...]
+    """Of HEATER and PULL."""
     noise: tuple[Estimate, ...]
+    """Of :class:`Noise`."""
     excitation: tuple[float, float]
     """Moves of pull speed and heater that no reading explains, in multiples of what is needed [-]."""
+    errors: Floats
+    """Prediction errors of pyrometer and ring in their standard deviations, shape (rows, 2); NaN without a reading."""
     predicted: Predicted
-    whiteness: tuple[float, float]
-    """Probability of residuals as coloured as these if they were white: pyrometer, ring."""
     settled: bool
     """Whether the search has ended at a maximum."""
 
     @property
-    def parameters(self) -> Parameters:
-        """The start's parameters with those that the log tells; lam is none of them."""
-        found = {e.name: e.value for e in self.estimates if e.informed and e.name in Parameters._fields}
-        return self.start._replace(**found)
+    def puller(self) -> Puller:
+        """The start with the numbers that the log tells: parameters, and the noise of camera and pyrometer.
+
+        ``lam`` is none of them: each crystal of a scenario draws its own.
+        """
+        told = {e.name: e.value for e in (*self.estimates, *self.noise) if e.informed}
+        sensors = {
+            name: (told[sd], told[sd])
+            for name, sd in (("camera_noise", "camera_sd"), ("pyrometer_noise", "pyrometer_sd"))
+            if sd in told
+        }
+        parameters = {name: value for name, value in told.items() if name in Parameters._fields}
+        return replace(
+            self.start,
+            parameters=self.start.parameters._replace(**parameters),
+            sensors=self.start.sensors._replace(**sensors),
+        )
 
     @property
-    def lam(self) -> float:
-        """Share of conduction at the maximum [-], with the start's dT_0."""
-        return next(e.value for e in self.estimates if e.name == "lam") / self.start.dT_0
+    def whiteness(self) -> tuple[float, float]:
+        """Probability of residuals as coloured as these if they were white: pyrometer, ring."""
+        return whiteness(self.errors[:, 0]), whiteness(self.errors[:, 1])
 
 
 def identify(
     log: Log,
-    start: Parameters | None = None,
-    noise: Noise | None = None,
+    start: Puller = DEFAULT,
     prior_sd: Mapping[str, float] | None = None,
     meniscus: MeniscusModel = HURLE,
 ) -> Identified:
     """Estimate what the log tells of a puller; parameters of a path that is not excited are left alone.
 
-    ``start`` and ``noise`` are the prior's medians, ``prior_sd`` standard deviations of logarithms other than PRIOR_SD.
+    ``start`` holds the prior's medians, ``prior_sd`` standard deviations of logarithms other than PRIOR_SD.
     """
-    start, noise = start or Parameters(), noise or Noise()
     sds = dict.fromkeys((*HEATER, *PULL), PRIOR_SD) | dict.fromkeys(Noise._fields, NOISE_SD) | {"lam": LAM_SD}
     for name, value in (prior_sd or {}).items():
-        if name not in sds or not value > 0.0:
+        if name not in sds or not 0.0 < value < np.inf:
             raise CzError(unknown("parameter", name, sds) if name not in sds else f"prior of {name}: {value!r}")
         sds[name] = value
     moved = measure_excitation(log, start)
     free = (*(HEATER if moved[1] >= 1.0 else ()), *(PULL if moved[0] >= 1.0 else ()))
-    model = Model((*free, *Noise._fields), start, noise, LAM, meniscus)
+    model = Model((*free, *Noise._fields), start.parameters, Noise(), LAM, meniscus)
     sd = np.array([sds[name] for name in model.names])
     theta, spread, out, settled = _maximise(log, model, sd)
-    found = {
-        name: _estimate(model, name, *numbers) for name, *numbers in zip(model.names, theta, spread, sd, strict=True)
-    }
-    told = (found.get(name) or _untold(model, name) for name in (*HEATER, *PULL))
-    read = np.stack([log.T_1, log.ring], axis=1)
-    errors = np.where(np.isfinite(read), out.error / np.sqrt(out.variance), np.nan)
-    white = whiteness(errors[:, 0]), whiteness(errors[:, 1])
-    return Identified(start, tuple(told), tuple(map(found.__getitem__, Noise._fields)), moved, out, white, settled)
+
+    def estimate(name: str) -> Estimate:
+        prior = model.value(name, LAM if name == "lam" else 0.0)
+        if name not in model.names:
+            return Estimate(name, prior, prior, prior, prior, 1.0, excited=False)
+        j = model.names.index(name)
+        low, value, high = (model.value(name, theta[j] + sign * 1.96 * spread[j]) for sign in (-1.0, 0.0, 1.0))
+        return Estimate(name, prior, value, low, high, spread[j] / sd[j])
+
+    read = np.isfinite([log.T_1, log.ring]).T
+    errors = np.where(read, out.error / np.sqrt(out.variance), np.nan)
+    told, noise = tuple(map(estimate, (*HEATER, *PULL))), tuple(map(estimate, Noise._fields))
+    return Identified(start, told, noise, moved, errors, out, settled)
 
 
-def measure_excitation(log: Log, start: Parameters) -> tuple[float, float]:
+def measure_excitation(log: Log, start: Puller = DEFAULT) -> tuple[float, float]:
     """:func:`excitation` of pull speed and heater."""
     errors = np.stack([log.ring - np.nan_to_num(log.r_ref), log.T_1 - np.nan_to_num(log.T_1_ref)], axis=1)
-    return excitation(log.v_p / start.v_0, errors), excitation(log.Q_H / np.median(log.Q_H), errors)
+    return excitation(log.v_p / start.parameters.v_0, errors), excitation(log.Q_H / np.median(log.Q_H), errors)
 
 
 def excitation(drive: Floats, readings: Floats) -> float:
     """How much a drive, in shares of nominal, moves on its own; 1 is just enough.
 
-    A linear regression of its moves on the last samples of drive and readings explains what a controller does. The
-    moves that it leaves unexplained count.
+    A linear regression of its moves on the last values of drive and readings explains what a controller does, at the
+    controller's own pace. The moves that it leaves unexplained count.
     """
-    series = (drive, *readings.T)
-    past = np.stack([np.roll(each, lag)[PAST:-1] for each in series for lag in range(PAST)], axis=1)
-    move = np.diff(drive)[PAST:]
+    at = np.flatnonzero(np.diff(drive)) + 1
+    pace = int(np.median(np.diff(at))) if len(at) > 1 else 1
+    at = at[at >= PAST * pace]
+    series = np.column_stack([drive, readings])
+    past = np.concatenate([series[at - 1 - lag * pace] for lag in range(PAST)], axis=1)
     good = np.isfinite(past).all(axis=1)
     if good.sum() < 2 * past.shape[1]:
         return 0.0
-    X = past[good] - past[good].mean(axis=0)
+    move, X = (drive[at] - drive[at - 1])[good], past[good] - past[good].mean(axis=0)
     X = np.column_stack([X / np.maximum(X.std(axis=0), 1e-12), np.ones(len(X))])
-    left = move[good] - X @ np.linalg.lstsq(X, move[good], rcond=1e-10)[0]
+    left = move - X @ np.linalg.lstsq(X, move, rcond=1e-10)[0]
     return float(np.square(left[np.abs(left) > MOVE]).sum() / ENOUGH)
 
 
 def whiteness(errors: Floats) -> float:
-    """Ljung and Box's probability over LAGS lags for errors of variance one; NaN where nothing was read."""
+    """Ljung and Box's probability over LAGS lags; NaN errors are where nothing was read."""
     u = np.nan_to_num(errors - np.nanmean(errors))
     n, lags = int(np.isfinite(errors).sum()), np.arange(1, LAGS + 1)
     correlations = np.array([u[lag:] @ u[:-lag] for lag in lags]) / (u @ u)
@@ -197,14 +218,3 @@ def _plausible_start(log: Log, model: Model, sd: Floats) -> Floats:
 
     found: Floats = least_squares(misfit, away).x
     return found
-
-
-def _estimate(model: Model, name: str, at: float, spread: float, sd: float) -> Estimate:
-    low, value, high = (model.value(name, at + sign * 1.96 * spread) for sign in (-1.0, 0.0, 1.0))
-    return Estimate(name, model.value(name, LAM if name == "lam" else 0.0), value, low, high, spread / sd)
-
-
-def _untold(model: Model, name: str) -> Estimate:
-    drive = "pull speed" if name in PULL else "heater"
-    prior = model.value(name, LAM if name == "lam" else 0.0)
-    return Estimate(name, prior, prior, prior, prior, 1.0, f"the {drive} was not excited")

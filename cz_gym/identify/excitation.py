@@ -76,6 +76,11 @@ class Excited:
         return float(getattr(self.policy, "control_interval", 5.0))
 
     @property
+    def heater_range(self) -> float:
+        """What an action of 1 moves the heater by [W]."""
+        return float(getattr(self.policy, "heater_range", HEATER_RANGE))
+
+    @property
     def made_for(self) -> Any:
         """What the policy was made for."""
         return getattr(self.policy, "made_for", None)
@@ -87,22 +92,22 @@ class Excited:
         shown = np.array(observation, np.float64)
         seen, single = np.atleast_2d(shown), shown.ndim == 1
         n, parameters = len(seen), self.parameters
-        begins = (
-            np.ones(n, np.bool_)
-            if state is None
-            else np.zeros(n, np.bool_) | (episode_start is not None and np.asarray(episode_start))
-        )
+        begins = np.zeros(n, np.bool_) if episode_start is None else np.asarray(episode_start, np.bool_)
+        if state is None:
+            begins = np.ones(n, np.bool_)
         last = state or Memory(None, np.zeros(n, np.int64), np.zeros((n, 2)), begins)
         step, before = np.where(begins, 0, last.step), np.where(begins[:, None], 0.0, last.added)
         error = decode(seen, parameters.v_0).ring_error
         stopped = (last.stopped & ~begins) | (np.abs(error) > self.limit)
         chip = (step * self.interval / self.clock + 1e-9).astype(np.int64)
-        size = self.pull, self.heater * make_puller(parameters).Q_H_0 / HEATER_RANGE
+        size = self.pull, self.heater * make_puller(parameters).Q_H_0 / self.heater_range
         signs = np.stack([SEQUENCE[chip % CHIPS], SEQUENCE[(chip + CHIPS // 2) % CHIPS]], axis=1)
-        added = np.where(stopped[:, None], 0.0, size * signs)
+        wanted = np.where(stopped[:, None], 0.0, size * signs)
         seen[:, list(DRIVE_CHANNELS)] -= before
         action, inner = self.policy.predict(shown.astype(np.float32), last.inner, episode_start, deterministic)
-        acts = str(getattr(self.made_for or self.policy, "action", "direct"))
-        moved = drives_of(acts, self.interval).asked(added, before)
-        out = np.clip(np.asarray(action) + (moved[0] if single else moved), -1.0, 1.0).astype(np.float32)
-        return mark(out, self.made_for), Memory(inner, step + 1, added, stopped)
+        drives = drives_of(str(getattr(self.made_for or self.policy, "action", "direct")), self.interval)
+        given = np.atleast_2d(np.asarray(action, np.float64))
+        out = np.clip(given + drives.asked(wanted, before), -1.0, 1.0)
+        added = drives.keep * before + (out - given) * (drives.pull, drives.heater)
+        marked = mark((out[0] if single else out).astype(np.float32), self.made_for)
+        return marked, Memory(inner, step + 1, added, stopped)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import tomllib
 from collections.abc import Mapping, Sequence
 from datetime import datetime
@@ -17,7 +16,8 @@ from cz_gym.atomic_files import naming, write_files
 from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.observation import decode
-from cz_gym.physics.plant import Puller
+from cz_gym.physics.plant import make_puller
+from cz_gym.puller import Puller
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 Floats = npt.NDArray[np.float64]
@@ -47,8 +47,9 @@ ABSENT = ("", "nan", "null", "none", "na", "n/a", "-")
 """Fields that hold no number."""
 LONG_GAP = 2.0 * MINUTE
 """Gap [s] after which the filter begins anew."""
-OUTLIER = 6.0
-"""Readings of the ring so many robust deviations from their neighbours' median count as not valid."""
+OUTLIER, STEADY = 6.0, 0.02 * MM
+"""Readings of the ring count as not valid so many robust deviations from their neighbours' median; a deviation is at
+least STEADY [m]."""
 
 
 class Log(NamedTuple):
@@ -104,24 +105,19 @@ def column_map(given: Sequence[str], file: Path | None = None) -> dict[str, tupl
 
 
 def read_log(path: str | Path, columns: Mapping[str, tuple[str, str]] | None = None) -> Log:
-    """Read a CSV file; CzError names the row and what is wrong with it.
+    """Read a CSV or Parquet file; CzError names the row and what is wrong with it.
 
     ``columns`` gives column and unit of standard names that the file calls otherwise (:func:`column_map`). Repeated
     times count once, with their last row. Readings that are absent, not valid or outliers of the ring become NaN, and
     drives hold.
     """
-    with naming(path):
-        text = Path(path).read_text(encoding="utf-8-sig")
-    separator = max(",;\t", key=text.partition("\n")[0].count)
-    header, *rows = [
-        [field.strip() for field in row] for row in csv.reader(io.StringIO(text), delimiter=separator)
-    ] or [[]]
+    header, rows, decimal = _fields(Path(path))
     table: dict[str, Floats] = {}
     try:
         for index, (name, (units, own)) in enumerate(COLUMNS.items()):
             column, unit = (columns or {}).get(name, (name, own))
             if column in header:
-                values = _numbers(rows, header.index(column), column, unit, decimal="," if separator == ";" else ".")
+                values = _numbers(rows, header.index(column), column, unit, decimal)
                 table[name] = values + units[unit] if units is TEMPERATURE else values * units[unit]
             elif index < REQUIRED or name in (columns or {}):
                 raise CzError(f"{unknown('column', column, header)}; {name}=COLUMN:{own} says which one it is")
@@ -129,6 +125,20 @@ def read_log(path: str | Path, columns: Mapping[str, tuple[str, str]] | None = N
         return _on_grid(table)
     except CzError as error:
         raise CzError(f"{path}: {error}") from None
+
+
+def _fields(path: Path) -> tuple[list[str], list[list[str]], str]:
+    """Header, fields and decimal sign of a file."""
+    with naming(path):
+        if path.suffix == ".parquet":
+            import pandas
+
+            frame = pandas.read_parquet(path)
+            return list(map(str, frame.columns)), frame.astype(str).to_numpy().tolist(), "."
+        text = path.read_text(encoding="utf-8-sig")
+    separator = max(",;\t", key=text.partition("\n")[0].count)
+    table = [[field.strip() for field in row] for row in csv.reader(text.rstrip().splitlines(), delimiter=separator)] or [[]]
+    return table[0], table[1:], "," if separator == ";" else "."
 
 
 def _numbers(rows: list[list[str]], at: int, column: str, unit: str, decimal: str) -> Floats:
@@ -215,12 +225,13 @@ def _outliers(ring: Floats) -> npt.NDArray[np.bool_]:
     known = np.isfinite(ring)
     away = np.zeros(len(ring))
     away[known] = np.abs(ring[known] - np.nanmedian(around[known], axis=1))
-    found: npt.NDArray[np.bool_] = away > OUTLIER * max(1.4826 * float(np.median(away[known])), 1e-9)
+    found: npt.NDArray[np.bool_] = away > OUTLIER * max(1.4826 * float(np.median(away[known])), STEADY)
     return found
 
 
-def check_puller(log: Log, puller: Puller) -> None:
+def check_puller(log: Log, machine: Puller) -> None:
     """Raise CzError for a log in other units than it says, or of another puller."""
+    puller = make_puller(machine.parameters)
     for name, values, low, high in (
         ("ring_radius_mm", log.ring - puller.ring_bias, 0.8 * puller.r_0, 1.25 * puller.r_0),
         ("pull_speed_mm_per_min", log.v_p, 0.4 * puller.v_0, 2.5 * puller.v_0),

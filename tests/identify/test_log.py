@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cz_gym import make_puller
 from cz_gym.errors import CzError
 from cz_gym.identify.log import COLUMNS, check_puller, column_map, read_log
+from cz_gym.puller import DEFAULT
 
 Row = dict[str, str]
 
 
 def read(path: Path) -> list[Row]:
-    return list(csv.DictReader(path.open()))
+    return list(csv.DictReader(path.read_text().splitlines()))
 
 
 def write(path: Path, rows: list[Row], delimiter: str = ",") -> Path:
@@ -124,10 +124,10 @@ def test_wrong_units_and_other_pullers_are_noticed(
     factor: dict[str, float], said: str, logs: tuple[Path, Path]
 ) -> None:
     log = read_log(logs[0])
-    check_puller(log, make_puller())
+    check_puller(log, DEFAULT)
     wrong = log._replace(**{name: getattr(log, name) * by for name, by in factor.items()})
     with pytest.raises(CzError, match=said.replace("(", r"\(")):
-        check_puller(wrong, make_puller())
+        check_puller(wrong, DEFAULT)
 
 
 @pytest.mark.parametrize(
