@@ -83,7 +83,7 @@ class Identified:
         ``lam`` is none of them: each crystal of a scenario draws its own.
         """
         told = {e.name: e.value for e in (*self.estimates, *self.noise) if e.informed}
-        sensors = {
+        sensors: dict[str, Any] = {
             name: (told[sd], told[sd])
             for name, sd in (("camera_noise", "camera_sd"), ("pyrometer_noise", "pyrometer_sd"))
             if sd in told

@@ -131,13 +131,18 @@ def _fields(path: Path) -> tuple[list[str], list[list[str]], str]:
     """Header, fields and decimal sign of a file."""
     with naming(path):
         if path.suffix == ".parquet":
-            import pandas
+            try:
+                import pandas
 
-            frame = pandas.read_parquet(path)
+                frame = pandas.read_parquet(path)
+            except ImportError as error:
+                raise CzError(f"{path}: Parquet needs pandas and pyarrow, CSV does not ({error})") from None
             return list(map(str, frame.columns)), frame.astype(str).to_numpy().tolist(), "."
         text = path.read_text(encoding="utf-8-sig")
     separator = max(",;\t", key=text.partition("\n")[0].count)
-    table = [[field.strip() for field in row] for row in csv.reader(text.rstrip().splitlines(), delimiter=separator)] or [[]]
+    table = [
+        [field.strip() for field in row] for row in csv.reader(text.rstrip().splitlines(), delimiter=separator)
+    ] or [[]]
     return table[0], table[1:], "," if separator == ";" else "."
 
 
@@ -223,6 +228,8 @@ def _outliers(ring: Floats) -> npt.NDArray[np.bool_]:
     """The readings that are far from the median of the eleven around them (Hampel's filter)."""
     around = np.lib.stride_tricks.sliding_window_view(np.pad(ring, 5, constant_values=np.nan), 11)
     known = np.isfinite(ring)
+    if not known.any():
+        return known
     away = np.zeros(len(ring))
     away[known] = np.abs(ring[known] - np.nanmedian(around[known], axis=1))
     found: npt.NDArray[np.bool_] = away > OUTLIER * max(1.4826 * float(np.median(away[known])), STEADY)
