@@ -15,7 +15,7 @@ def test_the_command_writes_the_puller_and_its_report(logs: tuple[Path, Path], t
     assert sorted(file.name for file in out.parent.iterdir()) == [
         "my-numbers.png", "my-readings.png", "my.md", "my.toml",
     ]  # fmt: skip
-    assert read_puller(out).parameters.C_1 == pytest.approx(TRUTH.C_1, rel=0.05)
+    assert abs(read_puller(out).parameters.C_1 / TRUTH.C_1 - 1.0) < 0.05
     text = out.with_suffix(".md").read_text()
     assert text.count("| told |") >= 8
     assert "says nothing about it" in text
