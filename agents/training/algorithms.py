@@ -20,9 +20,6 @@ from cz_gym.sb3 import ActionRepeat, CzVecEnv
 
 from .recipes import APG, PPO, SAC, Recipe, Reinforcement
 
-FOREVER = 1e9
-"""Limit of the normalised reward: a lost crystal costs what it costs."""
-
 
 def make_algorithm(recipe: Recipe, seed: int, done: int = 0) -> BaseAlgorithm:
     """The algorithm of a recipe for a training seed; a resumed one has taken ``done`` steps before."""
@@ -47,7 +44,7 @@ def make_algorithm(recipe: Recipe, seed: int, done: int = 0) -> BaseAlgorithm:
     settings = {name: getattr(recipe, name) for name in asdict(recipe) if name in known}
     if isinstance(recipe, Reinforcement):
         env = ActionRepeat(env, recipe.action_repeat)
-        env = VecNormalize(env, gamma=recipe.gamma, clip_reward=FOREVER)
+        env = VecNormalize(env, norm_obs=False, gamma=recipe.gamma)
         settings["learning_rate"] = partial(linear, recipe.learning_rate)
         options["net_arch"] = list(recipe.hidden)
     if isinstance(recipe, SAC):  # a resumed one first fills a new replay buffer

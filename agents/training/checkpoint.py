@@ -34,7 +34,7 @@ FILES = ("agent.onnx", "agent.json", "progress.csv", "progress.png", "summary.js
 IN_FILE = "file/"
 """Prefix of a file's name among the tensors."""
 MOMENTS = ("mean", "var", "count")
-"""What VecNormalize knows of observations and returns."""
+"""What VecNormalize knows of returns."""
 COUNTS = ("step", "exp_avg_sq", "var", "count")
 """Tensors that are never negative."""
 
@@ -142,9 +142,9 @@ def _tensors(algorithm: BaseAlgorithm) -> Tensors:
 
 
 def _statistics(algorithm: BaseAlgorithm) -> dict[str, Any]:
-    """The running means that observations and rewards are normalised with, by name."""
+    """The running means that rewards are normalised with, by name."""
     env: Any = algorithm.get_vec_normalize_env()
-    return {} if env is None else {"obs_rms": env.obs_rms, "ret_rms": env.ret_rms}
+    return {} if env is None else {"ret_rms": env.ret_rms}
 
 
 def _alike(one: torch.Tensor, other: torch.Tensor) -> bool:

@@ -60,7 +60,10 @@ class APG(Recipe):
 
 @dataclass(frozen=True, kw_only=True)
 class Reinforcement(Recipe):
-    """Learns from reward, by trying; observations and reward are normalised by stable-baselines3's ``VecNormalize``."""
+    """Learns from reward, by trying; stable-baselines3's ``VecNormalize`` scales the reward. Observations are scaled by
+    the environment: running means would remember the lost crystals of the first minutes, and make a reading that is
+    not valid, one in hundreds, an input of -10.
+    """
 
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers, of actor and critic alike."""

@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -32,18 +31,15 @@ def test_a_checkpoint_continues_and_refuses_what_does_not_fit(ppo: Any, tmp_path
         restore(make_algorithm(replace(SMALL, hidden=(8, 8)), 0), tensors, path)
 
 
-def test_a_resumed_run_normalises_observations_and_rewards_as_before(ppo: Any, tmp_path: Path) -> None:
+def test_a_resumed_run_normalises_rewards_as_before(ppo: Any, tmp_path: Path) -> None:
     path, other = tmp_path / "checkpoint.safetensors", make_algorithm(SMALL, 1)
     path.write_bytes(to_bytes(ppo, 1.0, None))
     restore(other, load_checkpoint(path)[1], path)
-    before, after = ppo.get_vec_normalize_env(), other.get_vec_normalize_env()
-    for one, again in ((before.obs_rms, after.obs_rms), (before.ret_rms, after.ret_rms)):
-        assert one.count > 60
-        np.testing.assert_array_equal(one.mean, again.mean)
-        np.testing.assert_array_equal(one.var, again.var)
-        assert one.count == again.count
+    before, after = ppo.get_vec_normalize_env().ret_rms, other.get_vec_normalize_env().ret_rms
+    assert before.count > 60
+    assert (before.mean, before.var, before.count) == (after.mean, after.var, after.count)
     learned(other, replace(SMALL, steps=256))
-    assert after.obs_rms.count > before.obs_rms.count
+    assert after.count > before.count
 
 
 def test_what_is_not_finite_is_not_saved() -> None:
