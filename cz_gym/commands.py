@@ -13,8 +13,8 @@ from gymnasium.error import DependencyNotInstalled
 from cz_gym.errors import CzError
 
 OPTIONAL = (
-    "casadi", "control", "envpool", "filelock", "h5py", "matplotlib", "minari", "onnx", "onnxruntime",
-    "pcgym", "plotly", "pygame", "safetensors", "sb3_contrib", "selenium", "stable_baselines3",
+    "aiohttp", "asyncua", "casadi", "control", "envpool", "filelock", "h5py", "matplotlib", "minari", "onnx",
+    "onnxruntime", "pcgym", "plotly", "pygame", "safetensors", "sb3_contrib", "selenium", "stable_baselines3",
     "tensorboard", "torch", "tqdm",
 )  # fmt: skip
 """Modules of the packages in the extras of ``pyproject.toml``."""

@@ -1,0 +1,331 @@
+"""The puller behind the tags: one crystal, its setpoints, and what happens when nobody renews them."""
+
+from __future__ import annotations
+
+import math
+import os
+import pkgutil
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from enum import IntFlag
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cz_gym.config import Config
+from cz_gym.env import CzEnv
+from cz_gym.errors import CzError
+from cz_gym.observation import decode
+from cz_gym.rendering.canvas import Frame
+from cz_gym.rendering.view import record_of
+from cz_gym.units import HOUR, KILO, MM, MM_PER_MIN
+
+CONTROLLERS = "cz_gym.baselines.registry:find_controller"
+"""Function that finds the fallback controller, looked up by name because this package imports no controller."""
+FALLBACK = "paper-tuned"
+"""The controller that takes over when setpoints are not renewed."""
+BLEND = 60.0
+"""Time from the fallback's takeover to its full authority; its first setpoints are the held ones [s]."""
+SIZE = (640, 480)
+"""Width and height of the picture [px]."""
+COLUMNS = (
+    "time_s", "ring_radius_mm", "valid", "pull_speed_mm_per_min", "heater_power_kW", "T_1_K", "r_ref_mm", "T_1_ref_K",
+)  # fmt: skip
+"""Columns of the log."""
+
+
+class Alarm(IntFlag):
+    """The bits of ``alarms``."""
+
+    CAMERA = 1
+    """The ring reading is not valid; the last valid one is shown."""
+    HELD = 2
+    """The setpoints were not renewed for this control interval."""
+    FALLBACK = 4
+    """The fallback controls, because the setpoints were not renewed within the watchdog time."""
+    MANUAL = 8
+    """The operator's setpoints hold; clients are refused."""
+    LATE = 16
+    """The server ran more than one control interval behind its clock, and catches up."""
+    ENDED = 32
+    """The crystal was lost, or the run is over."""
+
+
+class Tag(NamedTuple):
+    """A value that clients see."""
+
+    name: str
+    """The quantity, ending in its unit."""
+    kind: type
+    meaning: str
+    writable: bool = False
+
+
+TAGS = (
+    Tag("time_s", float, "time since the crystal's start"),
+    Tag("state", str, "growing, or how the crystal ended"),
+    Tag("control", str, "who sets the drives: client, held, fallback or manual"),
+    Tag("alarms", int, "sum of the alarm bits"),
+    Tag("ring_radius_mm", float, "radius of the bright ring as the camera gives it"),
+    Tag("valid", bool, "whether the camera says that this reading is good"),
+    Tag("T_1_K", float, "pyrometer reading of the heater temperature"),
+    Tag("pull_speed_mm_per_min", float, "applied pull speed"),
+    Tag("heater_power_kW", float, "applied heater power"),
+    Tag("r_ref_mm", float, "radius reference now"),
+    Tag("r_ref_1min_mm", float, "radius reference in 1 minute"),
+    Tag("r_ref_5min_mm", float, "radius reference in 5 minutes"),
+    Tag("T_1_ref_K", float, "recipe of the heater temperature now"),
+    Tag("T_1_ref_1min_K", float, "recipe in 1 minute"),
+    Tag("T_1_ref_5min_K", float, "recipe in 5 minutes"),
+    Tag("pull_speed_setpoint_mm_per_min", float, "setpoint of the pull speed", True),
+    Tag("heater_power_setpoint_kW", float, "setpoint of the heater power", True),
+    Tag("watchdog", int, "number of the step that the setpoints answer; writing it makes them act", True),
+    Tag("nominal_radius_mm", float, "crystal radius at this puller's operating point"),
+    Tag("ring_bias_mm", float, "the operator's bias: ring radius minus crystal radius there"),
+    Tag("nominal_pull_speed_mm_per_min", float, "pull speed there"),
+    Tag("nominal_heater_power_kW", float, "heater power there"),
+    Tag("nominal_T_1_K", float, "pyrometer reading there"),
+    Tag("pull_speed_min_mm_per_min", float, "lowest setpoint of the pull speed"),
+    Tag("pull_speed_max_mm_per_min", float, "highest setpoint of the pull speed"),
+    Tag("heater_power_min_kW", float, "lowest setpoint of the heater power"),
+    Tag("heater_power_max_kW", float, "highest setpoint of the heater power"),
+    Tag("control_interval_s", float, "length of a step"),
+    Tag("watchdog_s", float, "time after which setpoints that are not renewed give way to the fallback"),
+    Tag("scenario", str, "the scenario"),
+    Tag("puller", str, "name and hash of the puller file; empty for the default one"),
+    Tag("step", int, "number of the control interval that begins now; it changes after all other tags"),
+)
+"""Every tag, in the order in which they are written."""
+TOLERANCE = 1e-9
+"""Rounding of a setpoint that is forgiven at its limits [mm/min, kW]."""
+SETPOINTS = ("pull_speed_setpoint_mm_per_min", "heater_power_setpoint_kW")
+
+
+class Log:
+    """A CSV log that is whole up to its last row however the process ends; CzError if the file exists."""
+
+    def __init__(self, path: str | Path) -> None:
+        try:
+            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
+        except OSError as error:
+            raise CzError(f"{path}: {os.strerror(error.errno or 0)}") from None
+        self._write(",".join(COLUMNS))
+
+    def add(self, tags: dict[str, Any]) -> None:
+        """Add a row and wait until it is on the disk."""
+        self._write(",".join(f"{float(tags[name]):.10g}" for name in COLUMNS))
+
+    def _write(self, line: str) -> None:
+        os.write(self._file, f"{line}\n".encode())
+        os.fsync(self._file)
+
+    def close(self) -> None:
+        """Close the file."""
+        os.close(self._file)
+
+
+class Machine:
+    """A puller with one crystal, which :meth:`step` advances by one control interval.
+
+    Setpoints act from the step that begins now. Those of a client are held when it does not renew them, and after
+    ``watchdog`` seconds the fallback controls; those of the operator need no renewal. All methods may be called from
+    any thread.
+    """
+
+    def __init__(self, config: Config, seed: int, watchdog: float, log: Log | None = None) -> None:
+        self.env, self.interval, self.watchdog = (
+            CzEnv.from_config(config, "rgb_array", SIZE),
+            config.control_interval,
+            watchdog,
+        )
+        self._fallback = pkgutil.resolve_name(CONTROLLERS)(FALLBACK).make(config)
+        self._observation, _ = self.env.reset(seed=seed)
+        self._record, self._log, self._lock = record_of(self.env), log, threading.RLock()
+        p = self.puller = self._record.puller
+        self.nominal = np.array([p.v_0 / MM_PER_MIN, p.Q_H_0 / KILO])
+        self._ranges = config.ranges
+        self._reach = np.array([self._ranges[0] / MM_PER_MIN, self._ranges[1] / KILO])
+        lows, highs = (self.nominal - self._reach).tolist(), (self.nominal + self._reach).tolist()
+        self.limits = dict(zip(SETPOINTS, zip(lows, highs, strict=True), strict=True))
+        self._fixed = {
+            "nominal_radius_mm": p.r_0 / MM, "ring_bias_mm": p.ring_bias / MM, "nominal_T_1_K": p.T_1_0,
+            "nominal_pull_speed_mm_per_min": self.nominal[0], "nominal_heater_power_kW": self.nominal[1],
+            "pull_speed_min_mm_per_min": lows[0], "pull_speed_max_mm_per_min": highs[0],
+            "heater_power_min_kW": lows[1], "heater_power_max_kW": highs[1],
+            "control_interval_s": self.interval, "watchdog_s": watchdog, "scenario": self._record.scenario,
+            "puller": config.puller.label,
+        }  # fmt: skip
+        self.k, self.answered, self.late, self.manual = 0, -1, False, False
+        self._pending = dict(zip(SETPOINTS, self.nominal.tolist(), strict=True))
+        self._active = self.nominal
+        self._renewed, self._fallen, self._memory, self._held = -math.inf, -1, None, self._active
+        self.committed = threading.Condition(self._lock)
+        self.hour: deque[dict[str, Any]] = deque(maxlen=int(HOUR / self.interval) + 1)
+        """The tags of the last hour."""
+        self._publish()
+
+    def offer(self, writes: dict[str, Any]) -> dict[str, str]:
+        """Take a client's values, all or none; returns the reasons of those that are refused.
+
+        Setpoints are stored. They act once the client writes the number of the step that they answer to ``watchdog``.
+        """
+        with self._lock:
+            reasons = {name: reason for name, value in writes.items() if (reason := self._refusal(name, value))}
+            if not reasons:
+                self._pending |= {name: value for name, value in writes.items() if name in SETPOINTS}
+                if "watchdog" in writes:
+                    self.answered = writes["watchdog"]
+                    self._act()
+                    self.committed.notify_all()
+            return reasons
+
+    def by_hand(self, setpoints: dict[str, float]) -> dict[str, str]:
+        """Give the operator control with these setpoints, or, with none, give it back to the clients.
+
+        Returns the reasons of those that are refused.
+        """
+        with self._lock:
+            before, self.manual = self.manual, False
+            reasons = self.offer(setpoints)
+            self.manual = before if reasons else bool(setpoints)
+            if not reasons:
+                self._act()
+                self._renewed -= not setpoints  # held until a client comes
+            return reasons
+
+    def _refusal(self, name: str, value: Any) -> str:
+        if self.manual:
+            return "the operator has control"
+        if name in SETPOINTS:
+            low, high = self.limits[name]
+            inside = low - TOLERANCE <= value <= high + TOLERANCE  # false for NaN
+            return "" if inside else f"outside {low:.6g} to {high:.6g}"
+        return "" if self.answered < value <= self.k else f"step {self.k} is the newest, {self.answered} was answered"
+
+    def _act(self) -> None:
+        """Let the stored setpoints act."""
+        self._active, self._renewed = np.array([self._pending[name] for name in SETPOINTS]), self.k
+
+    @property
+    def control(self) -> str:
+        """Who sets the drives in the step that begins now."""
+        if self.manual:
+            return "manual"
+        if self._renewed == self.k:
+            return "client"
+        return "held" if (self.k - self._renewed) * self.interval < self.watchdog else "fallback"
+
+    @property
+    def over(self) -> bool:
+        """Whether the crystal has ended."""
+        return self._record.ending is not None
+
+    def step(self) -> dict[str, Any]:
+        """Advance by one control interval with the newest setpoints; returns the tags."""
+        with self._lock:
+            control = self.control
+            if control == "fallback":
+                self._fall_back()
+            else:
+                self._fallen = -1
+            self._observation, *_ = self.env.step((self._active - self.nominal) / self._reach)
+            self.k += 1
+            return self._publish(control)
+
+    def _fall_back(self) -> None:
+        """Set the active setpoints to the fallback's, which begin at the held ones."""
+        if self._fallen < 0:
+            self._fallen, self._memory, self._held = self.k, None, self._active
+        action, self._memory = self._fallback.predict(self._observation, self._memory)
+        own = self.nominal + self._reach * np.asarray(action)
+        share = min((self.k - self._fallen) * self.interval / BLEND, 1.0)
+        self._active = self._held + share * (own - self._held)
+
+    def _publish(self, control: str = "held") -> dict[str, Any]:
+        tags = self._tags(control)
+        self.hour.append(tags)
+        if self._log is not None:
+            self._log.add(tags)
+        return tags
+
+    def _tags(self, control: str) -> dict[str, Any]:
+        p, ending = self.puller, self._record.ending
+        seen = decode(self._observation.astype(float), *self._ranges)
+        bits = {
+            Alarm.CAMERA: seen.valid < 0.5, Alarm.HELD: control == "held", Alarm.FALLBACK: control == "fallback",
+            Alarm.MANUAL: control == "manual", Alarm.LATE: self.late, Alarm.ENDED: ending is not None,
+        }  # fmt: skip
+        radii = {f"{name}_mm": (getattr(seen, name) + p.r_0) / MM for name in ("r_ref", "r_ref_1min", "r_ref_5min")}
+        recipe = {f"{n}_K": getattr(seen, n) + p.T_1_0 for n in ("T_1_ref", "T_1_ref_1min", "T_1_ref_5min", "T_1")}
+        values = (
+            self._fixed
+            | radii
+            | recipe
+            | dict(zip(SETPOINTS, self._active, strict=True))
+            | {
+                "time_s": self.k * self.interval,
+                "state": "growing" if ending is None else ending.value.lower(),
+                "control": control,
+                "alarms": sum(bit for bit, holds in bits.items() if holds),
+                "ring_radius_mm": (seen.ring_error + seen.r_ref + p.r_0 + p.ring_bias) / MM,
+                "valid": seen.valid > 0.5,
+                "pull_speed_mm_per_min": (seen.v_p + p.v_0) / MM_PER_MIN,
+                "heater_power_kW": (seen.Q_H + p.Q_H_0) / KILO,
+                "watchdog": max(self.answered, 0),
+                "step": self.k,
+            }
+        )
+        return {tag.name: tag.kind(values[tag.name]) for tag in TAGS}
+
+    def picture(self) -> Frame:
+        """The picture of the crystal as it is now."""
+        with self._lock:
+            frame = self.env.render()
+        assert frame is not None  # it has the mode "rgb_array"
+        return frame
+
+
+class Clock(threading.Thread):
+    """Steps a machine in real time times ``speed``, in a thread of its own that no client can delay.
+
+    Step k ends at the start plus k intervals, whatever happened before: the clock does not drift, and steps that were
+    missed follow at once. With ``waits``, time begins with a client's first setpoints. At a speed of 0, every step
+    waits for its setpoints.
+    """
+
+    def __init__(
+        self, machine: Machine, speed: float, waits: bool, published: Callable[[dict[str, Any]], object]
+    ) -> None:
+        super().__init__(name="plant", daemon=True)
+        self.machine, self.speed, self.waits, self.published = machine, speed, waits or not speed, published
+        self.stopped = threading.Event()
+        self.error: BaseException | None = None
+
+    def run(self) -> None:
+        """Step until the crystal ends or the clock is stopped."""
+        try:
+            if self.waits:
+                self._answered(0)
+            start, first = time.monotonic(), self.machine.k
+            while not (self.stopped.is_set() or self.machine.over):
+                if self.speed:
+                    period = self.machine.interval / self.speed
+                    due = start + (self.machine.k - first + 1) * period
+                    self.stopped.wait(max(due - time.monotonic(), 0.0))
+                    self.machine.late = time.monotonic() > due + period
+                else:
+                    self._answered(self.machine.k)
+                if not self.stopped.is_set():
+                    self.published(self.machine.step())
+        except BaseException as error:
+            self.error = error
+            self.published({})
+
+    def _answered(self, step: int) -> None:
+        """Wait until a client has answered the step."""
+        with self.machine.committed:
+            while not (self.stopped.is_set() or self.machine.answered >= step):
+                self.machine.committed.wait(0.2)
