@@ -79,12 +79,13 @@ class PPO(Reinforcement):
     """Proximal policy optimisation."""
 
     name: str = "ppo"
-    steps: int = 24_000_000
-    num_envs: int = 512
-    action_repeat: int = 2
+    steps: int = 60_000_000
+    num_envs: int = 2048
+    """Many crystals at a time: what an action changes is small beside what the disturbances do."""
+    action_repeat: int = 4
     n_steps: int = 64
     """Actions on each crystal between updates."""
-    batch_size: int = 2048
+    batch_size: int = 4096
     n_epochs: int = 5
     learning_rate: float = 1e-3
     gae_lambda: float = 0.95
