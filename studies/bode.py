@@ -1,4 +1,4 @@
-"""Bode plot and margins of a controller's loop with the nominal plant near rest, and the hot zones that it survives.
+"""Bode plot and margins of a controller's loop with the default puller near rest, and the hot zones that it survives.
 
 ``python -m studies.bode lqg`` takes a shipped controller, ``python -m studies.bode my.py:SlowPID`` one of your own,
 whose ``state`` must be a NamedTuple of arrays.
@@ -69,7 +69,7 @@ def picture(name: str, form: LinearForm, responses: dict[str, Any]) -> bytes:
         panel.axhline(1.0, color=GREY, lw=0.8)
     sensitivity.set_xlabel("angular frequency [rad/s]")
     gain.legend(fontsize=8, frameon=False)
-    figure.suptitle(f"{name} with the nominal plant", fontsize=10)
+    figure.suptitle(f"{name} with the default puller (175 mm)", fontsize=10)
     return png(figure)
 
 

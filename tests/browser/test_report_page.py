@@ -9,7 +9,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from cz_gym.evaluation.report.page import page
@@ -19,7 +18,6 @@ from tests.samples import result_of
 selenium = pytest.importorskip("selenium", reason="selenium is absent: pip install '.[browser]'")
 from selenium import webdriver  # noqa: E402
 from selenium.webdriver.chrome.service import Service  # noqa: E402
-from selenium.webdriver.common.action_chains import ActionChains  # noqa: E402
 from selenium.webdriver.support.ui import WebDriverWait  # noqa: E402
 
 CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
@@ -73,24 +71,6 @@ def until(driver: Any, holds: Callable[[], Any]) -> Any:
     return WebDriverWait(driver, 60.0, 0.05).until(lambda _: holds())
 
 
-def shown(driver: Any, picture: str, axis: str = "y") -> list[list[float]]:
-    """Values of the lines that a picture shows."""
-    script = (
-        f"return document.getElementById('{picture}')._fullData.filter(t => t.visible === true)"
-        f".map(t => Array.from(t.{axis}))"
-    )
-    return list(driver.execute_script(script))
-
-
-def choose(driver: Any, picture: str, scenario: int) -> None:
-    """Choose a scenario in a picture's menu."""
-    menu = driver.find_element("css selector", f"#{picture} .updatemenu-header")
-    driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", menu)
-    ActionChains(driver).move_to_element(menu).click().perform()
-    button = until(driver, lambda: driver.find_elements("css selector", f"#{picture} .updatemenu-dropdown-button"))
-    ActionChains(driver).move_to_element(button[scenario]).click().perform()
-
-
 def test_it_opens_from_disk_without_a_complaint_and_fetches_nothing(browser: Any) -> None:
     assert browser.current_url.startswith("file://")
     sent = [json.loads(line["message"])["message"] for line in browser.get_log("performance")]
@@ -111,20 +91,6 @@ def test_the_first_line_is_the_verdict_and_names_are_text(browser: Any) -> None:
     assert browser.find_elements("css selector", "img, svg a") == []
     legend = browser.execute_script("return [...document.querySelectorAll('.legendtext')].map(t => t.textContent)")
     assert any(name.startswith("</script><img src=x") for name in legend)
-
-
-def test_the_menus_choose_the_scenario(made: list[Result], browser: Any) -> None:
-    first = shown(browser, "crystal")
-    for scenario in (1, 0, 1):
-        result = made[scenario]
-        errors = [[pytest.approx(result.means[sample.name]["rmse_mm"].mean)] for sample in result.samples]
-        choose(browser, "pareto", scenario)
-        until(browser, lambda errors=errors: shown(browser, "pareto") == errors)
-        medians = [[pytest.approx(np.median(each.metric("rmse_mm")))] for each in reversed(result.samples)]
-        choose(browser, "errors", scenario)
-        until(browser, lambda medians=medians: shown(browser, "errors", "median") == medians)
-        choose(browser, "crystal", scenario)
-        until(browser, lambda scenario=scenario: (shown(browser, "crystal") == first) == (scenario == 0))
 
 
 @pytest.mark.parametrize("width", [1280, 400])

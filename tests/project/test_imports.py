@@ -1,9 +1,83 @@
-"""Imports run one way: no circle of modules or rooms, and nothing from a higher room."""
+"""Imports run one way: no circle of modules or rooms, and nothing from a higher room.
+
+A room is a package, or a module that stands beside packages (``cz_gym.env``, ``cz_gym.baselines.policy``, ``train``).
+"""
+
+import ast
+import os
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
 
 import pytest
 
-from tests.processes import python
-from tests.project.imports import FORBIDDEN, arrows, circle, imports, modules, room, within
+from tests.processes import ROOT, python
+
+PROGRAMS = ("benchmark", "train")
+FORBIDDEN = {
+    "cz_gym": ("cz_gym.baselines", "cz_gym.agents", "studies", "examples", "tests", *PROGRAMS),
+    "cz_gym.baselines": ("cz_gym.agents", "studies", "examples", "tests", *PROGRAMS),
+    "cz_gym.agents": ("cz_gym.baselines", "studies", "examples", "tests", *PROGRAMS),
+    "studies": ("tests", *PROGRAMS),
+}
+"""Packages, and what nothing in each may import."""
+Arrows = set[tuple[str, str]]
+"""Pairs of which the first imports from the second."""
+
+
+def modules() -> dict[str, Path]:
+    """Every module by its one name."""
+    found = {name: ROOT / f"{name}.py" for name in PROGRAMS}
+    for top in ("cz_gym", "studies"):
+        for place, _, names in os.walk(ROOT / top, followlinks=True):
+            for file in (Path(place) / name for name in names if name.endswith(".py")):
+                found[".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")] = file
+    return dict(sorted(found.items()))
+
+
+def imports(name: str, file: Path) -> Iterator[str]:
+    """Dotted names that a module imports: modules, or names in them."""
+    package = name if file.name == "__init__.py" else name.rpartition(".")[0]
+    for node in ast.walk(ast.parse(file.read_bytes())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            base = ".".join([*above, *([node.module] if node.module else [])])
+            yield from (f"{base}.{alias.name}" for alias in node.names)
+
+
+def within(name: str, package: str) -> bool:
+    """Whether a dotted name is a package or lies in it."""
+    return name == package or name.startswith(f"{package}.")
+
+
+def arrows() -> Arrows:
+    """Arrows between modules."""
+    known = modules()
+    targets = ((name, each, each.rpartition(".")[0]) for name, file in known.items() for each in imports(name, file))
+    found = {(name, each if each in known else holder) for name, each, holder in targets}
+    return {(name, target) for name, target in found if target in known and target != name}
+
+
+def room(name: str) -> str:
+    """The room of a module: its package, or itself where packages stand beside it."""
+    package = name.rpartition(".")[0]
+    folder = ROOT / name.replace(".", "/")
+    several = any((beside / "__init__.py").exists() for beside in folder.parent.iterdir())
+    return name if folder.is_dir() or several or not package else package
+
+
+def circle(pairs: Arrows) -> list[str]:
+    """The first circle found, as a list of names; empty if there is none."""
+    graph: dict[str, set[str]] = {}
+    for one, other in pairs:
+        graph.setdefault(one, set()).add(other)
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
 
 
 def test_there_is_no_circle() -> None:

@@ -14,7 +14,6 @@ from cz_gym.rendering import chart, palette, triple_point
 from cz_gym.rendering.canvas import Canvas, Frame
 from cz_gym.rendering.record import Ending, Record
 from cz_gym.rendering.scene import layout, numbers
-from cz_gym.rendering.view import record_of
 from cz_gym.signals import INFO
 from cz_gym.units import KILO, MM, MM_PER_MIN
 from tests.observed import PLAIN
@@ -33,7 +32,7 @@ def grown(steps: int = 240, pull: float = 0.0, **arguments: Any) -> tuple[Frame,
             break
     frame = env.render()
     assert frame is not None
-    return frame, record_of(env)
+    return frame, env._view.record
 
 
 def near(frame: Frame, colour: palette.Colour, within: float = 70.0) -> npt.NDArray[np.bool_]:
@@ -125,7 +124,7 @@ def test_length_grown_is_the_integral_of_the_growth_rate(record: Record) -> None
 def test_what_was_melted_back_is_not_drawn() -> None:
     env = CzEnv("nominal", render_mode="rgb_array", **PLAIN)
     env.reset(seed=1)
-    record = record_of(env)
+    record = env._view.record
     info = record._samples[0, :-1].copy()
     for radius, v_p in (0.0871, 1e-3), (0.0872, 1e-3), (0.0873, -1.5e-3), (0.0874, 1e-4):
         info[[INFO.index("r_c"), INFO.index("v_p")]] = radius, v_p

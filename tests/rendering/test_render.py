@@ -15,7 +15,7 @@ from gymnasium.utils.env_checker import check_env
 
 from cz_gym import CzEnv
 from cz_gym.rendering import canvas, view
-from cz_gym.rendering.view import MODES, check_size, record_of
+from cz_gym.rendering.view import MODES, check_size
 from tests.observed import PLAIN
 from tests.processes import ROOT, python
 
@@ -109,7 +109,7 @@ def test_a_restored_state_is_shown_from_there_on() -> None:
     for _ in range(30):
         env.step(np.zeros(2, np.float32))
     env.reset(options={"state": env.get_state()})
-    assert record_of(env).t.tolist() == [150.0]
+    assert env._view.record.t.tolist() == [150.0]
     assert env.render() is not None
 
 
