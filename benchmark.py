@@ -86,7 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def benchmark(arguments: argparse.Namespace, command: str) -> int:
-    """Check what is asked for, run it, write and print the results."""
+    """Check the arguments, run the benchmark, write and print the results."""
     from tqdm import tqdm
 
     from cz_gym.evaluation.report.markdown import terminal

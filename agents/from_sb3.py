@@ -65,7 +65,7 @@ HARMLESS = (
     "HumanRendering", "NormalizeReward", "TransformReward", "ClipReward", "VecMonitor", "VecNormalize", "VecCheckNan",
     "VecVideoRecorder", "ActionRepeat",
 )  # fmt: skip
-"""Wrappers that leave observations and actions as they are; what VecNormalize does is in the agent file."""
+"""Wrappers that leave observations and actions as they are, and VecNormalize, which the agent file contains."""
 
 
 def save_agent(

@@ -1,4 +1,4 @@
-"""What the project's commands share: errors that are meant for the user, and interrupts, print one line."""
+"""Command lines of the project: errors that are meant for the user, and interrupts, print one line."""
 
 from __future__ import annotations
 

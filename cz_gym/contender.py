@@ -11,7 +11,7 @@ from cz_gym.config import Config
 from cz_gym.errors import CzError
 
 REWARD, PLANT = "reward", "plant"
-"""What an agent learned from: the reward alone, or gradients through the plant's equations."""
+"""Sources that an agent learned from: the reward alone, or gradients through the plant's equations."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Contender:
     default: bool = True
     """Whether a benchmark that names no controllers runs it."""
     privileged: bool = False
-    """Whether it knows what no controller can know, which makes it a bound."""
+    """Whether it knows the puller, the state or the future, which no controller can; that makes it a bound."""
     slow: bool = False
     """Whether it meets only the first few episodes, which are cached, and runs only when slow ones are asked for."""
     quoted: bool = False
@@ -49,7 +49,7 @@ class Contender:
 
     @property
     def bound(self) -> bool:
-        """Whether it knows or reads what no sensor shows, so that it is a bound on controllers and not one of them."""
+        """Whether it is a bound on controllers: it knows or reads something that no sensor shows."""
         return self.privileged or self.observation == "state"
 
     @property
@@ -80,7 +80,7 @@ class Contender:
 
 
 def given(policy: Any, config: Config) -> Any:
-    """Return the policy, whatever the settings."""
+    """Return the policy itself; the settings are ignored."""
     return policy
 
 

@@ -33,7 +33,7 @@ RADII, HEIGHTS = np.linspace(-8.0, 8.0, 17) * MM, np.linspace(-2.0, 2.0, 9) * MM
 CHANGES = [(change, model) for change in (-0.1, -0.5) for model in ("I", "II")]
 """Sudden changes of the pull speed, share of v_0, and the models they are made on."""
 INTERVAL, HORIZON = 2.0, 240.0
-"""Between images, and of a response [s]."""
+"""Time between images, and length of a response [s]."""
 VIEW, PULLER = make_view(Camera()), make_puller()
 
 
@@ -44,7 +44,7 @@ class Response(NamedTuple):
     change: float
     """Change of the pull speed, share of v_0 [-]."""
     t: Floats
-    """[s]"""
+    """Time [s]."""
     r_c: Floats
     """True radius less r_0 [m]."""
     rings: dict[str, Floats]

@@ -114,7 +114,7 @@ class APG(BaseAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> Self:
-        """Learn for at least so many environment steps; see :meth:`stable_baselines3.PPO.learn`."""
+        """Learn for at least ``total_timesteps`` environment steps; see :meth:`stable_baselines3.PPO.learn`."""
         total_timesteps, watch = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )

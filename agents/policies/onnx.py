@@ -97,7 +97,7 @@ class OnnxPolicy:
 
     @property
     def made_for(self) -> MadeFor:
-        """The environment it was trained in: what its actions mean, how often it acts, on which plant and puller."""
+        """The environment it was trained in: meaning of its actions, control interval, plant and puller."""
         contract = self.contract
         return MadeFor(self.action, contract.control_interval, contract.plant_hash, contract.puller)
 

@@ -34,7 +34,7 @@ FILES = ("agent.onnx", "agent.json", "progress.csv", "progress.png", "summary.js
 IN_FILE = "file/"
 """Prefix of a file's name among the tensors."""
 MOMENTS = ("mean", "var", "count")
-"""What VecNormalize knows of returns."""
+"""Running statistics of VecNormalize, of returns."""
 COUNTS = ("step", "exp_avg_sq", "var", "count")
 """Tensors that are never negative."""
 

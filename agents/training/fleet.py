@@ -17,7 +17,7 @@ from .run import Job, Run
 from .run_files import read_rows
 
 Perform = Callable[[Callable[[Job], Any], Sequence[Job], Callable[[], None]], Iterator[tuple[int, Any]]]
-"""Does jobs: :func:`cz_gym.evaluation.processes.in_processes`."""
+"""A function that runs jobs: :func:`cz_gym.evaluation.processes.in_processes`."""
 
 
 def train_seed(job: Job, bar: Any = None) -> dict[str, float]:
@@ -46,7 +46,7 @@ def _tried(train: Callable[[Job], dict[str, float]], job: Job) -> dict[str, floa
 
 
 def train_seeds(jobs: Sequence[Job], perform: Perform, bar: Any) -> Iterator[tuple[Job, dict[str, float]]]:
-    """Train what is not finished; each seed with its summary, as they come. ``bar`` is tqdm's and counts seeds.
+    """Train the seeds that are not finished; yields each with its summary. ``bar`` is tqdm's and counts seeds.
 
     Once the others are done, CzError names the seeds that failed; any other exception of a seed is raised as it is.
     """

@@ -14,7 +14,7 @@ from cz_gym.evaluation.user_code import scenarios
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """What every recipe has, whatever it learns from; fields have the names of stable-baselines3's arguments."""
+    """Hyperparameters of every learner; fields have the names of stable-baselines3's arguments."""
 
     name: str
     """Name of the agents that it trains."""

@@ -1,4 +1,4 @@
-"""How good an agent is, on validation crystals."""
+"""Cost, radius error and losses of an agent on validation crystals."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def validate(policy: Any, config: Config, seeds: Sequence[int]) -> Validation:
 
 
 def references(make_controller: Callable[[str, Config], Any], recipe: Recipe) -> References:
-    """What the classical controllers reach on the crystals of a recipe; ``make_controller`` makes one by its name."""
+    """RMSEs of the classical controllers on the crystals of a recipe; ``make_controller`` makes one by its name."""
     config = make_config(recipe.config.scenario, None, "measured", recipe.control_interval, action="direct")
     # Classical controllers are designed for one scenario.
     design = config if len(config.scenario.scenarios) == 1 else config.with_scenario("randomized")

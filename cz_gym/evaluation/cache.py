@@ -1,4 +1,4 @@
-"""Episodes that need not run again: a slow controller's, cached on disk, and the bound's of an earlier benchmark.
+"""Cached episodes of slow controllers, and the bound of an earlier benchmark: neither needs to run again.
 
 The cache has one file an episode, in a folder named by controller, scenario and a hash of all that the results depend
 on: the controller's settings, the environment's (plant, scenario, interval, horizon), the code of both, and the
@@ -48,7 +48,7 @@ class SlowEpisodes:
         self.contender, self.place = contender, folder / f"{contender.name}-{config.scenario.name}-{digest}"
 
     def read(self, seeds: Sequence[int]) -> list[Sample]:
-        """Samples of single episodes, of those that are there; the first counts only with its signals."""
+        """Samples of the cached episodes, one an episode; the first is left out if its signals were not kept."""
         found = (self._read(seed, seed == seeds[0]) for seed in seeds)
         return [sample for sample in found if sample]
 

@@ -1,4 +1,4 @@
-"""The same work in several processes of this machine; results in the order they are done."""
+"""One function on many tasks, in several processes of this machine; results in the order they are done."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from cz_gym.errors import CzError
 from cz_gym.processors import processors
 
 WAIT = 1.0
-"""Longest time between two looks at what is done [s]."""
+"""Longest time between two calls of :data:`Look` [s]."""
 Look = Callable[[], None]
-"""What is called about every second while tasks run."""
+"""A function that is called about once a second while tasks run."""
 
 
 def in_processes(

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from cz_gym.config import Config
 from cz_gym.errors import CzError
 
-from .rollout import Course, Rollout, answer, check_policy, check_seeds
+from .rollout import EpisodeBatch, Rollout, call_policy, check_policy, check_seeds
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def replay(
         one.for_episodes(config, list(seeds)) if hasattr(one, "for_episodes") else one for one in (policy, instead)
     )
     takeover = round(at / config.control_interval)
-    actual, watcher = Course(config, seeds), _Watched(policy, instead if watches else None)
+    actual, watcher = EpisodeBatch(config, seeds), _Watched(policy, instead if watches else None)
     actual.run(watcher, takeover)
     other = actual.fork()
     other.memory = watcher.memory
@@ -93,5 +93,5 @@ class _Watched:
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[Any, Any]:
         if self.watcher is not None:
-            _, self.memory = answer(self.watcher, observation.copy(), self.memory, episode_start)
-        return answer(self.policy, observation, state, episode_start)
+            _, self.memory = call_policy(self.watcher, observation.copy(), self.memory, episode_start)
+        return call_policy(self.policy, observation, state, episode_start)

@@ -27,7 +27,7 @@ TAIL_METRICS = ("rmse_mm", "rmse_observable_mm", "max_error_mm")
 
 @dataclass(frozen=True)
 class Sample:
-    """What a contender came to on some episodes of a row."""
+    """Metrics of a contender on some episodes of a row."""
 
     contender: Contender
     seeds: tuple[int, ...]
@@ -78,7 +78,7 @@ Estimates = Mapping[str, Mapping[str, Estimate]]
 
 @dataclass(frozen=True)
 class Result:
-    """What all contenders came to on one row."""
+    """Estimates of all contenders on one row."""
 
     row: Row
     samples: tuple[Sample, ...]

@@ -90,7 +90,7 @@ def rollout(
     if hasattr(policy, "for_episodes"):
         policy = policy.for_episodes(config, list(seeds))
     planning = time.perf_counter() - before
-    course = Course(config, seeds)  # its first one compiles: no time of the policy's
+    course = EpisodeBatch(config, seeds)  # its first one compiles: no time of the policy's
     course.seconds = planning
     course.run(policy, config.steps, progress)
     return course.finish()
@@ -129,8 +129,8 @@ def check_policy(policy: Any, config: Config, designed_for: Config | None = None
         raise CzError(f"{type(policy).__name__}: {message}")
 
 
-def answer(policy: Any, observation: Any, state: Any, begins: Any) -> tuple[Any, Any]:
-    """Return actions of shape (n, 2) and what the policy remembers; CzError if ``predict`` returns anything else."""
+def call_policy(policy: Any, observation: Any, state: Any, begins: Any) -> tuple[Any, Any]:
+    """Return actions, shape (n, 2), and the policy's memory; CzError if ``predict`` returns anything else."""
     found = policy.predict(observation, state=state, episode_start=begins, deterministic=True)
     if not (isinstance(found, tuple) and len(found) == 2):
         raise CzError(f"predict must return a tuple (action, state), not {type(found).__name__}")
@@ -142,7 +142,7 @@ def answer(policy: Any, observation: Any, state: Any, begins: Any) -> tuple[Any,
     return found
 
 
-class Course:
+class EpisodeBatch:
     """Episodes in progress, one a seed: run by a policy up to a step, copied, continued by another."""
 
     def __init__(self, config: Config, seeds: Sequence[int]) -> None:
@@ -154,7 +154,7 @@ class Course:
         self.failed, self.running = np.zeros(n, np.bool_), np.ones(n, np.bool_)
         self.begins, self.over = np.ones(n, np.bool_), np.zeros(n, np.bool_)
         self.memory: Any = None
-        """What the policy remembers."""
+        """The policy's memory."""
         self.observation, info = self.env.reset(seed=list(seeds))
         self.start = Signals(*(np.array(info[name])[None] for name in Signals._fields))
 
@@ -162,7 +162,7 @@ class Course:
         """Let the policy act until ``upto`` steps are done."""
         while self.k < upto:
             before = time.perf_counter()
-            action, self.memory = answer(policy, self.observation, self.memory, self.begins)
+            action, self.memory = call_policy(policy, self.observation, self.memory, self.begins)
             self.seconds += time.perf_counter() - before
             self._step(action)
             if progress is not None:
@@ -181,9 +181,9 @@ class Course:
         self.running &= ~self.over
         self.k += 1
 
-    def fork(self) -> Course:
-        """The same episodes at the same step, with what was logged; no policy has acted in them."""
-        other = Course(self.config, self.seeds)
+    def fork(self) -> EpisodeBatch:
+        """A copy of the episodes at this step, with their logs, for another policy to continue."""
+        other = EpisodeBatch(self.config, self.seeds)
         other.env.set_state(self.env.get_state())
         other.k, other.observation = self.k, self.observation.copy()
         other.signals = Signals(*(log.copy() for log in self.signals))

@@ -72,7 +72,7 @@ def meniscus_curve(
 
 
 def draw(canvas: Canvas, box: Box, record: Record) -> None:
-    """The cross-section."""
+    """Draw the cross-section of crystal edge, meniscus and melt."""
     scale = scale_of(box, record)
     r_c, r_ref, z = record.surface(max((scale.y_0 - box.y) / scale.per_metre - record.last("h_c"), 0.0))
     x, y = scale.x(r_c), scale.y(z)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from .report import Result
 
 Perform = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
-"""Does tasks: the number of each and its result, as they come."""
+"""A function that runs tasks and yields the number of each with its result."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

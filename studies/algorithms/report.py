@@ -26,7 +26,7 @@ from cz_gym.evaluation.statistics import Estimate, Resamples, means
 BASE = "ppo"
 """Recipe that the others are compared with."""
 SCENARIOS = tuple(row.name for row in ROWS if row.default and not find_scenario(row.scenario).deterministic)
-"""Scenarios of the crystals, whatever an agent was trained on; cost and pull step are of the first."""
+"""Scenarios of the crystals that judge every agent; cost and pull step are of the first."""
 MICRON, PERCENT = 1e-3, 1e-2
 """A micrometre in millimetres, and a hundredth."""
 COLUMNS = (
@@ -37,7 +37,7 @@ COLUMNS = (
 )
 """Heading, unit and format of each figure of :func:`evaluate`."""
 AXES = (("steps", 1e6, "environment steps [million]"), ("seconds", 60.0, "minutes on a core, validation included"))
-"""What learning curves are drawn against: column of a run's progress, unit, axis."""
+"""Horizontal axes of the learning curves: column of a run's progress, unit, label."""
 ABOUT = """RMSE of the radius on {crystals} validation crystals of each scenario that did not choose a run's agent; of
 each run the agent of least cost on the validation that selects. Lost: share of all these crystals. Cost and pull step:
 on `{scenario}`. In brackets: 95 % intervals, bootstrap over training seeds and crystals; with few training seeds they
@@ -48,7 +48,7 @@ class Result(NamedTuple):
     """Figures of one training run."""
 
     figures: Floats
-    """Those of :func:`evaluate`, shape (crystals, figures)."""
+    """Figures as :func:`evaluate` returns them, shape (crystals, figures)."""
     progress: Sequence[Mapping[str, float]]
     """Rows of the run's ``progress.csv``."""
 
@@ -71,7 +71,7 @@ def evaluate(policy: Any, config: Config) -> Floats:
 
 
 Results = Mapping[str, Mapping[int, Result]]
-"""By recipe and training seed."""
+"""Results by recipe and training seed."""
 
 
 class Line(NamedTuple):

@@ -21,7 +21,7 @@ class Row(NamedTuple):
     quantity: str
     unit: str
     published: float | None
-    """What Part II prints; None if it gives no number."""
+    """Value that Part II prints; None if it gives no number."""
     ours: float
     why: str = ""
 

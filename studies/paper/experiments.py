@@ -1,4 +1,4 @@
-"""What Part II prints, and its design and experiments on our nonlinear plant; each result is computed once.
+"""Numbers that Part II prints, its design, and its experiments on our nonlinear plant; each result is computed once.
 
 Bukhari, Hovd and Winkler, "Inverse response behaviour in the bright ring radius measurement of the Czochralski process
 II: Mitigation by control", Journal of Crystal Growth. Its controller's own numbers are the defaults that it is built
@@ -29,15 +29,15 @@ PUBLISHED = {"I": MODEL_I, "II": MODEL_II}
 ZERO = 0.021
 """Right half plane zero of both models, as rounded in the text [rad/s]."""
 COMPENSATOR = Compensator()
-"""G_pc,real."""
+"""The paper's compensator, G_pc,real."""
 ODE = (1.884e-3, 3.368e-7)
-"""The same as a differential equation in time: coefficients of y_pc' [rad/s] and y_pc [(rad/s)^2]."""
+"""The compensator as a differential equation in time: coefficients of y_pc' [rad/s] and y_pc [(rad/s)^2]."""
 PID = SeriesPID()
-"""Table 1."""
+"""The paper's PID, Table 1."""
 CROSSOVER = 0.03275
-"""Table 1 [rad/s]."""
+"""Crossover of Table 1 [rad/s]."""
 PHASE_MARGIN_DEG = 74.0
-"""Text below Table 1, "around 74 degrees for both models" [degrees]."""
+"""Phase margin below Table 1, "around 74 degrees for both models" [degrees]."""
 
 MODELS = {"I": 1.0, "II": 0.0}
 """Share of conduction of the paper's models [-]."""

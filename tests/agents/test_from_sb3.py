@@ -234,7 +234,7 @@ def test_a_file_that_would_act_otherwise_is_not_written(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_without_stable_baselines3_it_says_what_to_install() -> None:
+def test_converting_without_stable_baselines3_says_what_to_install() -> None:
     code = (
         "import sys; sys.modules['stable_baselines3'] = sys.modules['torch'] = None\n"
         "from cz_gym.agents import from_sb3\n"

@@ -41,7 +41,7 @@ def test_an_agent_is_loaded_by_its_file() -> None:
         ("nobody.onnx", "nobody.onnx: no such file"),
     ],
 )
-def test_what_there_is_not_is_one_line(name: str, message: str) -> None:
+def test_an_agent_that_does_not_exist_is_refused_in_one_line(name: str, message: str) -> None:
     with pytest.raises(agents.AgentFileError, match=message) as caught:
         agents.load(name)
     assert "\n" not in str(caught.value)

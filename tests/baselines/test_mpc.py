@@ -70,7 +70,7 @@ def parts(mpc, estimate, plan, previous):
 
 
 @pytest.mark.parametrize(("dt", "blocks"), [(5.0, (1, 1, 2, 4, 8, 16)), (10.0, (1, 3)), (2.0, (1, 40))])
-def test_on_a_linear_plant_without_limits_it_is_the_lqr(dt, blocks):
+def test_mpc_on_a_linear_plant_without_limits_is_the_lqr(dt, blocks):
     lqg, mpc = LQG(dt, LINEAR), EkfMpc(dt, LINEAR, blocks=blocks)
     estimate, plan, previous = situation()
     plan = np.pad(plan, ((0, 0), (0, 0), (0, 90)), "edge")[:, :, : round(300.0 / dt) + 1]
@@ -143,7 +143,7 @@ def test_limits_are_kept_at_least_cost():
         assert (np.abs(free + rows @ corrections[i]) > most - 1e-6).any(), "no limit was active"
 
 
-def test_where_not_all_limits_can_be_kept_those_of_now_are():
+def test_mpc_keeps_the_limits_of_now_where_not_all_can_be_kept():
     mpc = EkfMpc()
     prediction, H, g, _ = parts(mpc, *situation())
     limits = Limits(np.array([0.2, 0.5]), np.array([0.02, 0.1]))
@@ -152,7 +152,7 @@ def test_where_not_all_limits_can_be_kept_those_of_now_are():
     assert (np.abs(now) <= np.concatenate([limits.span, limits.move]) + 1e-7).all()
 
 
-def test_what_it_asks_for_is_within_the_drives_limits():
+def test_mpc_asks_for_nothing_beyond_the_limits_of_the_drives():
     actuators = Actuators(
         pull_window=0.02 * MM_PER_MIN, pull_slew=0.05 * MM_PER_MIN / MINUTE, heater_slew=0.5 * KILO / MINUTE
     )
@@ -188,7 +188,7 @@ def test_without_casadi_one_line_names_the_extra(monkeypatch):
         find_controller("ekf-mpc").make(make_config(**PLAIN))
 
 
-def test_settings_tell_results_apart():
+def test_the_hash_of_mpc_follows_its_settings():
     config = make_config("randomized", **PLAIN)
     assert ekf_mpc(config).hash == ekf_mpc(config).hash
     others = (replace(ekf_mpc(config), horizon=400.0), EkfMpc(), ekf_mpc(make_config("puller", **PLAIN)))

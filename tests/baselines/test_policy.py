@@ -79,7 +79,7 @@ def test_every_control_interval_holds_the_radius_alike(name, dt):
 
 
 @pytest.mark.parametrize("name", TUNED)
-def test_without_disturbance_it_stays_where_it_is(name):
+def test_a_controller_without_disturbances_stays_where_it_is(name):
     config = make_config("nominal", control_interval=2.0, horizon=3600.0, **PLAIN)
     assert metrics(rollout(make_controller(name, config), config, [0])).max_error_mm[0] < 1e-3
 
@@ -139,7 +139,7 @@ def actions_of(policy, rows):
 @pytest.mark.parametrize("name", READERS)
 @settings(max_examples=6, deadline=None)
 @given(bad=BAD, value=st.sampled_from([math.nan, math.inf, -math.inf]), start=st.integers(0, 2))
-def test_what_is_no_number_is_not_read(name, bad, value, start):
+def test_readings_that_are_not_finite_are_not_read(name, bad, value, start):
     """A PID goes on as if the last readings had been repeated; an LQG forgets that it read less."""
     policy = make_controller(name, make_config(**PLAIN))
     rows = np.repeat(ROW[None], 3 + len(bad) + 60 * name.startswith("lqg"), axis=0)
@@ -152,7 +152,7 @@ def test_what_is_no_number_is_not_read(name, bad, value, start):
         np.testing.assert_allclose(found[-1], usual[-1], atol=5e-3 if name.startswith("lqg") else 1e-7)
 
 
-def test_the_predictive_controller_does_not_read_it_either():
+def test_mpc_does_not_read_what_is_not_finite():
     pytest.importorskip("casadi", reason="needs the extra mpc")
     rows = np.repeat(ROW[None], 4, axis=0)
     rows[1, :, :] = math.nan

@@ -53,7 +53,7 @@ def test_the_model_of_the_camera_follows_the_scenario():
     assert ring_of(Sensor(latency=3.0)) == RingModel(3.0, 0.0, rotation=Sensor().rotation)
 
 
-def test_what_no_settings_were_tuned_for_is_said():
+def test_a_warning_names_what_no_settings_were_tuned_for():
     scenario = replace(PULLER, name="both", faults=SENSOR_FAULT.faults)
     for name in ("lqg", "paper-tuned"):
         with pytest.warns(UserWarning, match=rf"{name} was not tuned for faults\.flagged, .* of scenario 'both'"):

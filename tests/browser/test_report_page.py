@@ -71,7 +71,7 @@ def until(driver: Any, holds: Callable[[], Any]) -> Any:
     return WebDriverWait(driver, 60.0, 0.05).until(lambda _: holds())
 
 
-def test_it_opens_from_disk_without_a_complaint_and_fetches_nothing(browser: Any) -> None:
+def test_the_page_opens_from_disk_without_an_error_and_fetches_nothing(browser: Any) -> None:
     assert browser.current_url.startswith("file://")
     sent = [json.loads(line["message"])["message"] for line in browser.get_log("performance")]
     addresses = {
@@ -118,5 +118,5 @@ def test_no_window_needs_sideways_scrolling_and_nothing_covers_anything(browser:
         assert all(right <= left for (_, right), (left, _) in pairwise(ends)), "numbers at an axis collide"
 
 
-def test_no_complaint_at_the_end_either(browser: Any) -> None:
+def test_the_browser_logged_no_error(browser: Any) -> None:
     assert [line for line in browser.get_log("browser") if line["level"] != "INFO"] == []

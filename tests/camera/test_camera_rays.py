@@ -87,7 +87,7 @@ def test_rays_meet_the_melt_where_marching_says() -> None:
     assert met > 12
 
 
-def test_reflection_law() -> None:
+def test_rays_are_mirrored_by_the_law_of_reflection() -> None:
     rng = np.random.default_rng(2)
     scene = scene_at()
     for _ in range(50):
@@ -117,7 +117,7 @@ def test_reflection_law() -> None:
         (Ray(0.12, 0.0, 0.01, -1.0, 0.0, 0.5), CRYSTAL, (PULLER.r_0, 0.0, 0.01 + 0.5 * (0.12 - PULLER.r_0))),
     ],
 )
-def test_what_rays_hit(ray: Ray, what: int, at: tuple[float, float, float] | None) -> None:
+def test_rays_hit_the_first_surface_in_their_way(ray: Ray, what: int, at: tuple[float, float, float] | None) -> None:
     scene = scene_at()
     hit = first_hit(ray, FLAT if ray.dz > 0 else scene.q_c, scene, VIEW)
     assert hit.what == what

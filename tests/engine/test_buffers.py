@@ -34,7 +34,7 @@ WAYS: dict[str, tuple[Callable[[np.ndarray], Any], Callable[[Any], Any]]] = {
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_whoever_looks_keeps_the_memory(way: str) -> None:
+def test_memory_is_not_reused_while_a_reference_to_it_is_left(way: str) -> None:
     look, read = WAYS[way]
     pool = BufferPool(SHAPE, np.float64)
     array = pool.new()

@@ -46,7 +46,7 @@ def test_a_short_campaign() -> None:
         ("T_1", 2000.0, "heat appears or disappears"),
     ],
 )
-def test_what_is_wrong_is_found(where: str, value: Any, says: str) -> None:
+def test_each_violated_invariant_is_reported(where: str, value: Any, says: str) -> None:
     env = CzVectorEnv(2, "nominal", threads=1, info="all", **PLAIN)
     watch = Watch(env)
     watch.begin(*env.reset(seed=0))

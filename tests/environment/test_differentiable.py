@@ -161,7 +161,7 @@ def test_the_chain_rule_over_rk4_is_exact() -> None:
         (make_config(**PLAIN), 2.0, "num_envs must be"),
     ],
 )
-def test_what_has_no_derivatives_is_refused(config: Any, slots: Any, message: str) -> None:
+def test_a_config_without_derivatives_is_refused(config: Any, slots: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         DifferentiableBatch(config, slots)
 

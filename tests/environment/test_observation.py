@@ -109,7 +109,7 @@ def test_lags_at_the_default_interval_cover_the_past_without_gaps() -> None:
     assert newest.tolist() == [1, *(oldest[:-1] + 1).tolist()]
 
 
-def test_state_is_the_plant() -> None:
+def test_the_observation_state_is_that_of_the_plant() -> None:
     env = CzEnv("puller", observation="state", info="all", action="direct")
     rows, infos, start = run(env, 50, 0.05)
     p, slot = start.slot["puller"], env.get_state().slot.slot

@@ -22,7 +22,7 @@ def adapter(n: int = N, stagger: int | None = None, **changes: Any) -> Any:
     return make_vec_env(n, stagger, **{**SETTINGS, **changes})
 
 
-def test_equals_sb3s_own_vector_of_scalars() -> None:
+def test_the_adapter_equals_sb3s_own_vector_of_scalars() -> None:
     ours, theirs = adapter(), DummyVecEnv([lambda: CzEnv(**SETTINGS)] * N)
     rng = np.random.default_rng(0)
     for env in (ours, theirs):
@@ -93,7 +93,7 @@ def test_staggered_first_episodes_end_at_different_times() -> None:
     assert sum(ends) >= 64
 
 
-def test_attributes_and_methods() -> None:
+def test_the_adapter_has_the_attributes_and_methods_of_a_vec_env() -> None:
     env = adapter()
     assert [config.steps for config in env.get_attr("config")] == [20] * N
     assert len(env.get_attr("config", [0, 2])) == 2

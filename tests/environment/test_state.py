@@ -105,7 +105,9 @@ def test_states_travel_between_scalar_and_vector() -> None:
     ],
 )
 @pytest.mark.parametrize("form", [CzEnv, CzVectorEnv])
-def test_what_does_not_fit_is_named(form: Any, arguments: dict[str, Any], says: str) -> None:
+def test_a_state_of_other_settings_is_refused_with_the_name_of_the_setting(
+    form: Any, arguments: dict[str, Any], says: str
+) -> None:
     env = form()
     env.reset(seed=0)
     with pytest.raises(ValueError, match=f"other settings than this environment's: {says}") as refusal:

@@ -30,7 +30,7 @@ def test_reward_saturates_and_is_never_flat(error: float, more: float, pull: flo
     assert -9.0 < far < near <= 1.0
 
 
-def test_limits() -> None:
+def test_a_crystal_grows_within_its_limits_alone() -> None:
     for r_c in (P.r_0 - 7.9 * MM, P.r_0 + 7.9 * MM):
         for h_c in (1.21 * MM, 1.239 * P.a):
             assert within_limits(r_c, h_c, P.r_0, P.a)
@@ -41,7 +41,7 @@ def test_limits() -> None:
 
 
 @given(st.floats(0.0, 0.99), st.floats(0.0, 1e12))
-def test_dying_never_pays(discount: float, cost: float) -> None:
+def test_a_failure_never_pays(discount: float, cost: float) -> None:
     """A failing step earns no more than the worst life without an end, discounted."""
     zero = cost_terms(0.0, 0.0, 0.0, 0.0)
     worst = reward(zero._replace(radius=cost), True)

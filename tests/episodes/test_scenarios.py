@@ -40,7 +40,7 @@ def changed(scenario: Scenario, family: str, member: str, value: Any) -> Scenari
     return dataclasses.replace(scenario, **{family: part})
 
 
-def test_contents_are_frozen() -> None:
+def test_contents_of_the_scenarios_are_frozen() -> None:
     """A changed scenario is another benchmark: change a hash here only together with the committed results."""
     assert {scenario.name: scenario.hash for scenario in SCENARIOS.values()} == FROZEN
     assert list(SCENARIOS) == list(FROZEN)
@@ -92,7 +92,7 @@ def test_nonsense_is_refused_in_one_line(where: tuple[str, str], value: object) 
         ("actuators", "pull_slew", -1.0),
     ],
 )  # fmt: skip
-def test_what_no_draw_can_be_made_from_is_refused(family: str, member: str, value: object) -> None:
+def test_numbers_outside_their_range_are_refused(family: str, member: str, value: object) -> None:
     with pytest.raises(ValueError, match="scenario 'nominal'"):
         changed(SCENARIOS["nominal"], family, member, value)
 
@@ -136,7 +136,7 @@ def test_equal_contents_have_equal_hashes() -> None:
     assert (whole == same, whole.hash) == (True, same.hash)
 
 
-def test_model_and_mix() -> None:
+def test_a_model_sets_the_share_of_conduction() -> None:
     randomized = SCENARIOS["randomized"]
     assert mix_of(None, randomized) == (0.0, 1.0)
     assert mix_of(None, SCENARIOS["nominal"]) == (1.0, 1.0)

@@ -104,7 +104,7 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, counted: li
     assert counted == [2, 3, 4]
 
 
-def test_other_settings_plants_and_scenarios_share_nothing(tmp_path: Path, counted: list[int]) -> None:
+def test_cached_episodes_serve_no_other_settings_plant_or_scenario(tmp_path: Path, counted: list[int]) -> None:
     others = (
         (Snail(), CONFIG),
         (Snail(setting=1.0), CONFIG),
@@ -127,7 +127,7 @@ def test_a_damaged_file_and_a_first_episode_without_signals_are_run_again(tmp_pa
 
 
 @pytest.mark.parametrize("package", cache.COMPUTING)
-def test_another_version_of_what_computes_runs_them_again(
+def test_another_version_of_a_package_that_computes_runs_cached_episodes_again(
     package: str, tmp_path: Path, counted: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sample(tmp_path, seeds=range(1))
@@ -144,7 +144,7 @@ def test_another_version_of_what_computes_runs_them_again(
         *((name, False) for name in ("rendering/palette.py", "camera", "evaluation/report")),
     ],
 )
-def test_whatever_makes_a_figure_is_in_the_key_and_what_draws_is_not(room: str, computes: bool) -> None:
+def test_the_cache_key_holds_the_code_that_computes_and_not_the_code_that_draws(room: str, computes: bool) -> None:
     """Kernels, draws and random streams were once left out; an edited palette threw hours of episodes away."""
     place, sources = Path(cz_gym.__file__).parent / room, {*sources_behind(Snail.__module__)}
     files = {*(place.rglob("*.py") if place.is_dir() else [place])}

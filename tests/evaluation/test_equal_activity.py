@@ -18,7 +18,7 @@ def power_law(activity):
 
 @given(PAIRS)
 @example([(1e-4, 1.0), (0.00010000000000000002, 0.5), (1.0, 0.1)])
-def test_it_goes_through_its_points_and_never_rises(pairs):
+def test_a_frontier_goes_through_its_points_and_never_rises(pairs):
     try:
         curve = frontier(pairs)
     except ValueError:

@@ -34,7 +34,7 @@ def of(run: Rollout) -> Metrics:
     return Metrics(*(value.item() for value in metrics(run)))
 
 
-def test_a_perfect_crystal() -> None:
+def test_metrics_of_a_perfect_crystal_are_perfect() -> None:
     perfect = of(made_up(720))
     assert perfect == Metrics(0, 0, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0)
 
@@ -68,14 +68,14 @@ def test_a_failure_counts_eight_millimetres_to_the_end(steps: int) -> None:
     assert found.failure_rate == 1
 
 
-def test_dying_early_never_flatters() -> None:
+def test_an_early_failure_never_lowers_the_error() -> None:
     errors = [of(made_up(50, lived=lived, r_c=R + 7e-3)) for lived in range(1, 51)]
     rmse = [found.rmse_mm for found in errors]
     assert rmse == sorted(rmse, reverse=True)
     assert min(rmse) > of(made_up(50, r_c=R + 7e-3)).rmse_mm
 
 
-def test_nothing_after_the_end_counts() -> None:
+def test_signals_after_a_failure_do_not_count() -> None:
     """The slot goes on with another crystal, or with NaN: no metric reads it."""
     steps, lived = 800, 300
     rng = np.random.default_rng(1)
@@ -147,7 +147,7 @@ def test_cost_gives_the_reward_of_every_step() -> None:
         np.testing.assert_allclose(found.return_, 1.0 - 10.0 * found.cost / (10.0 + found.cost), rtol=1e-6)
 
 
-def test_episodes_do_not_mix() -> None:
+def test_metrics_of_a_batch_are_those_of_its_episodes() -> None:
     """A batch of three, one failing: the same values as one by one."""
     runs = [made_up(800, r_c=R + 1e-4), made_up(800, lived=500, v_p=1.01 * V), made_up(800, Q_H=Q + np.arange(800.0))]
     batch = Rollout(

@@ -43,7 +43,7 @@ def test_the_same_controller_instead_changes_nothing(at: float, watches: bool) -
         equal(found.actual, found.instead)
 
 
-def test_until_the_takeover_both_are_one_and_then_the_disturbances_are() -> None:
+def test_both_runs_are_equal_until_the_takeover_and_share_the_disturbances_after_it() -> None:
     found = replay(Playback(actions()), Playback(np.zeros((1, 2))), CONFIG, SEEDS, 300.0)
     equal(found.actual, found.instead, 0, 60)
     assert found.at == 300.0

@@ -21,7 +21,7 @@ from cz_gym.config import Config, make_config
 from cz_gym.errors import CzError
 from cz_gym.evaluation import plot
 from cz_gym.evaluation.replay import Playback
-from cz_gym.evaluation.rollout import Course, Rollout, Signals, check_seeds, rollout
+from cz_gym.evaluation.rollout import EpisodeBatch, Rollout, Signals, check_seeds, rollout
 from cz_gym.observation import MEASURED
 from cz_gym.physics.parameters import Parameters
 from tests.observed import PLAIN
@@ -64,7 +64,7 @@ def test_a_rollout_looks_through_the_camera_of_its_settings() -> None:
     """It was dropped, while the settings' hash said that it was there."""
     near = Camera(tilt=0.4)
     config = make_config("nominal", observation="camera", horizon=10.0, camera=near, action="direct")
-    course = Course(config, [3])
+    course = EpisodeBatch(config, [3])
     image, _ = CzEnv.from_config(config, info="all").reset(seed=3)
     np.testing.assert_array_equal(course.observation[0], image)
     assert course.env.config is config

@@ -82,7 +82,7 @@ def test_two_menisci_of_one_factory_are_two_plants() -> None:
     assert function_hash(*lambdas[0].functions) != function_hash(*lambdas[1].functions)
 
 
-def test_of_files_code_counts_and_text_does_not(tmp_path: Path) -> None:
+def test_the_hash_of_files_counts_code_and_not_text(tmp_path: Path) -> None:
     module, hashes = tmp_path / "thing.py", []
     for text in ('"""A."""\nx = 1\n"""B."""\n', '"""C."""\n# why\nx = (\n    1\n)\n', "x = 2\n"):
         module.write_text(text)

@@ -98,12 +98,12 @@ def test_bad_options_are_one_line(options: list[str], says: str, refused: Any) -
     assert says in refused(play.main, options)
 
 
-def test_without_pygame_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch, refused: Any) -> None:
+def test_playing_without_pygame_says_what_to_install(monkeypatch: pytest.MonkeyPatch, refused: Any) -> None:
     monkeypatch.setitem(sys.modules, "pygame", None)
     assert refused(play.main, []) == f"python -m cz_gym.play: {canvas.MISSING}\n"
 
 
-def test_without_a_display_it_says_so(monkeypatch: pytest.MonkeyPatch, refused: Any) -> None:
+def test_playing_without_a_display_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch, refused: Any) -> None:
     pygame.display.quit()
     monkeypatch.setenv("SDL_VIDEODRIVER", "offscreen")
     assert refused(play.main, []) == f"python -m cz_gym.play: {play.NO_DISPLAY}\n"

@@ -84,7 +84,7 @@ def contenders(*arguments: str) -> list[Contender]:
     return benchmark.contenders_of(given, benchmark.rows_of(given))
 
 
-def test_everyone_by_default_is_of_the_registry_or_shipped() -> None:
+def test_default_contenders_are_those_of_the_registry_and_the_shipped_agents() -> None:
     usual = [each.name for each in CONTROLLERS if each.default] + shipped_names()
     assert [each.name for each in contenders()] == usual
     (gradient,) = contenders("--controllers", "gradient")
@@ -184,8 +184,8 @@ def test_agent_files_that_cannot_be_used_get_one_line(tmp_path: Path, refusal: A
 def test_a_file_may_be_named_and_stand_beside_the_shipped_agents(tmp_path: Path) -> None:
     """Each agent's line says the scenarios that it was trained on."""
     file = constant_agent(tmp_path / "some.onnx", algorithm="ppo")
-    found = contenders("--controllers", "paper,mine,sac", "--agent", f"mine={file}")
-    assert [each.name for each in found] == ["paper", "mine", "sac"]
+    found = contenders("--controllers", "paper,mine,gradient", "--agent", f"mine={file}")
+    assert [each.name for each in found] == ["paper", "mine", "gradient"]
     everything = "0.175 hard + 0.175 hot-zone + 0.175 puller + 0.3 randomized + 0.175 sensor-fault"
     trained_on = [each.meaning.partition(" on ")[2] for each in found[1:]]
     assert trained_on == ["randomized, given as a file", everything]

@@ -121,7 +121,7 @@ def test_length_grown_is_the_integral_of_the_growth_rate(record: Record) -> None
     assert record.length[-1] == pytest.approx(trapezoid(record.column("v_g"), record.t), rel=2e-3)
 
 
-def test_what_was_melted_back_is_not_drawn() -> None:
+def test_crystal_that_melted_back_is_not_drawn() -> None:
     env = CzEnv("nominal", render_mode="rgb_array", **PLAIN)
     env.reset(seed=1)
     record = env._view.record

@@ -78,7 +78,7 @@ def test_a_gain_alone_needs_neither_memory_nor_interval(tmp_path: Path, capsys: 
         (["lqg", "--mix", "2"], "must lie in"),
     ],
 )
-def test_what_has_no_bode_plot_is_one_line(
+def test_a_controller_without_a_bode_plot_is_refused_in_one_line(
     given: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Any
 ) -> None:
     (tmp_path / "my.py").write_text(OWN)

@@ -45,7 +45,7 @@ def test_the_command_writes_the_report_with_its_figures(tmp_path, numbers, monke
         assert printed in written
 
 
-def test_without_the_compensator():
+def test_without_the_compensator_the_ramp_loses_the_crystal_or_cycles():
     """Model II is lost; Model I cycles between the pull limits, nearer to its radius than the printed controller."""
     bare = {m: ramp(m, BARE) for m in ("I", "II")}
     assert bare["II"].failed
@@ -67,7 +67,7 @@ def test_inverse_response_against_a_double_integrator():
     assert recovery == pytest.approx(2.0 / model.zero, rel=0.01)
 
 
-def test_what_model_ii_leaves_out():
+def test_growth_rate_of_model_ii_does_not_depend_on_the_meniscus():
     """Its growth rate does not depend on the meniscus; the thermal chain depends on neither model."""
     v_g = {model: pull_change(model).signals.v_g for model in ("I", "II")}
     assert np.ptp(v_g["II"]) < 1e-12 * v_g["II"][0]

@@ -24,7 +24,9 @@ def one_call(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(timeit.Timer, "autorange", lambda timer: (1, 0.0))
 
 
-def test_json_and_table(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_speed_command_writes_json_and_prints_a_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(speed, "cases", lambda quick: {**SMALL, "peer": partial(__import__, "no_such_package")})
     file = tmp_path / "new" / "speed.json"
     assert speed.main(["--quick", "--json", str(file)]) == 0

@@ -1,4 +1,4 @@
-"""What figures share: the style of each controller, a canvas without a display, PNG bytes."""
+"""Parts of every figure: the style of each controller, a canvas without a display, PNG bytes."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def styles_of(samples: Sequence[Sample]) -> dict[str, Style]:
 
 
 def chosen(samples: Sequence[Sample], most: int) -> list[Sample]:
-    """Return at most so many of them, in their order, for a figure that has no room for all.
+    """Return at most ``most`` of the samples, in their order, for a figure that has no room for all.
 
     The reference, the user's own, the best agent, the quoted ones, other agents, then the others; bounds last. Among
     equals the lowest mean RMSE comes first.

@@ -205,7 +205,7 @@ def _draw(figure: go.Figure, scenario: int, result: Result, styles: Mapping[str,
 
 
 def _points(values: Floats, step: int) -> npt.NDArray[np.float32]:
-    """Means of so many steps each, up to the first that is no number: a crystal that broke the equations."""
+    """Means over ``step`` steps each, up to the first value that is no number: a crystal that broke the equations."""
     steps = int(np.isfinite(values).cumprod().sum())
     blocks = values[: steps // step * step].reshape(-1, step)
     points: npt.NDArray[np.float32] = blocks.mean(axis=1).astype(np.float32)

@@ -1,4 +1,4 @@
-"""What every table of results shares: its columns, the estimates in them, and how numbers and names are written."""
+"""Columns of the tables of results, the estimates in them, and the format of numbers and names."""
 
 from __future__ import annotations
 

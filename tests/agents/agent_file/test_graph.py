@@ -271,7 +271,7 @@ def test_every_operator_is_a_standard_one_without_control_flow() -> None:
         assert not any("GRAPH" in str(attribute.type) for attribute in schema.attributes.values())
 
 
-def test_what_nobody_reads_is_not_handed_on() -> None:
+def test_metadata_of_a_graph_are_dropped() -> None:
     model = model_of()
     model.metadata_props.add(key="note", value="x" * 1000)
     model.graph.doc_string = "y" * 1000

@@ -202,7 +202,7 @@ def test_scalar_environments_learn_too() -> None:
     assert APG("RecurrentPolicy", env, window=10).learn(40).num_timesteps == 40
 
 
-def test_the_cost_falls_in_a_few_updates() -> None:
+def test_apg_lowers_the_cost_in_a_few_updates() -> None:
     """On the same crystals before and after: from losing them to following the reference for half an hour."""
     model, batch = algorithm(24, 90), DifferentiableBatch(CONFIG, 24)
     before = driven(model.policy, batch, 360).item()
@@ -211,7 +211,7 @@ def test_the_cost_falls_in_a_few_updates() -> None:
 
 
 @pytest.mark.slow
-def test_it_holds_crystals_after_half_a_million_steps() -> None:
+def test_apg_holds_crystals_after_half_a_million_steps() -> None:
     """From losing all crystals to holding most of them."""
     model = algorithm(64, 180)
     seeds = VALIDATION_SEEDS[:16]

@@ -42,7 +42,7 @@ def test_a_resumed_run_normalises_rewards_as_before(ppo: Any, tmp_path: Path) ->
     assert after.count > before.count
 
 
-def test_what_is_not_finite_is_not_saved() -> None:
+def test_weights_that_are_not_finite_are_not_saved() -> None:
     learner = make_algorithm(SMALL, 0)
     with torch.no_grad():
         next(learner.policy.parameters()).fill_(math.nan)

@@ -107,7 +107,7 @@ def test_no_nearby_inputs_are_cheaper_and_the_slope_is_zero(optimum):
         assert (np.abs(costs[2] - costs[0]) < 0.02 * rise).all()
 
 
-def test_within_tight_limits_it_agrees_with_a_general_optimiser():
+def test_the_clairvoyant_optimum_within_tight_limits_is_a_general_optimisers():
     config = make_config("hard", observation="state", horizon=60.0, action="direct")
     future = future_of(config, SEEDS[:1])
     limits = Limits(np.array([0.003, 0.1]), np.array([0.001, 0.03]))
@@ -161,7 +161,7 @@ def test_slow_narrow_and_stepping_drives_are_respected_and_followed():
     assert run.signals.r_c == pytest.approx(policy.plan.best.x[1:, :, 0], abs=0.05 * MM)
 
 
-def test_it_refuses_to_act_without_a_plan_or_on_other_slots():
+def test_the_clairvoyant_refuses_to_act_without_a_plan_or_on_other_slots():
     with pytest.raises(RuntimeError, match="for_episodes"):
         Clairvoyant().predict(np.zeros((1, 17)))
     _, policy = planned(horizon=60.0)

@@ -43,7 +43,7 @@ def test_each_filter_has_the_noise_of_its_own_crystal():
         np.testing.assert_allclose(known[slot], plant_model(puller, noise, config.control_interval).Q, rtol=1e-12)
 
 
-def test_knowing_puller_and_fluctuations_buys_something():
+def test_knowing_puller_and_fluctuations_lowers_error_and_activity():
     config = make_config("randomized", horizon=2.0 * HOUR, **PLAIN)
     names = "lqg-quiet", "lqg-quiet-privileged"
     plain, privileged = (metrics(rollout(find_controller(name).make(config), config, range(20))) for name in names)
@@ -51,7 +51,7 @@ def test_knowing_puller_and_fluctuations_buys_something():
     assert privileged.pull_step_rms_mm_per_min.mean() < plain.pull_step_rms_mm_per_min.mean()
 
 
-def test_knowing_a_nominal_puller_is_the_lqg():
+def test_the_privileged_lqg_of_a_nominal_puller_is_the_lqg():
     design, config = LQGDesign(lam=1.0), make_config("only-interface", horizon=900.0, **PLAIN)
     privileged, plain = (rollout(kind(design=design), config, [0, 1, 2]) for kind in (lqg_bounds.PrivilegedLQG, LQG))
     np.testing.assert_allclose(privileged.signals.v_p, plain.signals.v_p, rtol=1e-5)

@@ -30,7 +30,7 @@ class Watched(LQG):
 
 
 @pytest.mark.parametrize("scenario", ["sensor-fault", "puller"])
-def test_with_one_hypothesis_it_is_the_lqg(scenario):
+def test_the_adaptive_lqg_with_one_hypothesis_is_the_lqg(scenario):
     config = make_config(scenario, horizon=1800.0, **PLAIN)
     plain = lqg("lqg-at-0.02", config)
     noise = plain.design.noise
@@ -58,7 +58,7 @@ def test_the_bank_weights_its_filters_by_bayes_rule():
 
 
 @pytest.mark.parametrize(("strength", "factor"), [(0.05, 0.2), (0.5, 1.8)])
-def test_it_finds_how_strong_the_fluctuations_are(strength, factor):
+def test_the_adaptive_lqg_estimates_how_strong_the_fluctuations_are(strength, factor):
     """After an hour, nine of ten crystals are most likely at the end of the hypotheses that is nearest.
 
     With the design for known hot zones: where the hot zone may be another one, its heat hides part of the fluctuations.
@@ -73,7 +73,7 @@ def test_it_finds_how_strong_the_fluctuations_are(strength, factor):
 
 
 @pytest.mark.slow
-def test_knowing_this_gains_radius_error_at_equal_activity():
+def test_the_adaptive_lqg_has_less_radius_error_at_equal_activity():
     config, family = (
         make_config("randomized", horizon=2.0 * HOUR, **PLAIN),
         ("lqg-at-0.013", "lqg-at-0.02", "lqg-at-0.03"),

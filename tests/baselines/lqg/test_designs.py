@@ -17,7 +17,7 @@ def test_no_lqg_loses_a_crystal(name):
     assert not rollout(make_controller(name, config), config, CRYSTALS).failed.any()
 
 
-def test_one_that_was_tuned_on_nominal_hot_zones_loses_some_and_told_of_them_none():
+def test_an_lqg_tuned_on_nominal_hot_zones_loses_crystals_of_others_unless_told_of_them():
     config = make_config("hot-zone", **PLAIN)
     lost = [
         rollout(make_controller(name, config), config, CRYSTALS).failed.sum() for name in (TOLD, "lqg-at-0.02-told")

@@ -77,7 +77,7 @@ def test_a_tone_is_found_where_its_alias_is(rotation, dt):
     assert np.sqrt(np.mean((found.ripple[:, 0] - now) ** 2)) < PULLER_RING.ripple_sd
 
 
-def test_what_cannot_be_told_from_the_radius_is_not_searched():
+def test_frequencies_as_slow_as_the_radius_are_not_searched():
     assert frequencies(PULLER_RING, 5.0).min() >= 2.0 * np.pi * PULLER_RING.lowest
     assert not len(frequencies(RingModel(5.0, 0.1 * MM, rotation=(0.2, 0.2)), 5.0))
 
@@ -95,7 +95,7 @@ def test_where_there_is_no_ripple_the_search_for_one_costs_little():
     assert searching.rmse_mm.mean() < 1.05 * knowing.rmse_mm.mean()
 
 
-def test_once_found_the_ripple_is_left_out_of_the_radius():
+def test_a_ripple_that_was_identified_is_left_out_of_the_radius():
     rotation = PULLER_SCENARIO.sensor.rotation
     found, ignored = with_and_without_search(Sensor(latency=5.0, ripple=(0.2 * MM, 0.2 * MM), rotation=rotation))
     assert found.rmse_mm.mean() < 0.75 * ignored.rmse_mm.mean()

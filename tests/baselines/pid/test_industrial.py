@@ -38,7 +38,7 @@ def follow(policy, diameters):
     return np.array(found)
 
 
-def test_law_as_described(rng):
+def test_the_industrial_law_is_the_one_described(rng):
     diameters = np.cumsum(rng.normal(0.0, 0.1, 150))
     assert np.abs(diameters).max() > 1.0
     found = follow(Industrial(T_f=1e-9), diameters)

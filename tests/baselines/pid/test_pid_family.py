@@ -27,7 +27,7 @@ from tests.observed import PLAIN, measured, pulls
 SCALES = {channel.name: channel.scale for channel in MEASURED}
 
 
-def test_without_filter_it_is_the_printed_controller(rng):
+def test_the_filtered_pid_without_filter_is_the_printed_controller(rng):
     printed, filtered = CompensatedPID(), FilteredPID(T_f=0.0, T_track=np.inf, heater=TemperatureLoop(T_track=np.inf))
     states = [None, None]
     for k in range(200):
@@ -141,6 +141,6 @@ def test_conventional_loop_keeps_the_papers_rule():
     assert loop_margins(linear_form(policy).free, puller, 5.0).crossover < 0.5 * radius_model(puller).zero
 
 
-def test_rule_measures_its_breach():
+def test_the_rule_of_half_the_zero_measures_its_breach():
     fast = FilteredPID(pid=SeriesPID(K_p=0.02, T_i=2000.0, T_d=300.0, N=6.0), compensator=None, T_f=10.0)
     assert below_half_the_zero(None, fast) < -0.2

@@ -55,7 +55,7 @@ def test_a_few_crystals_give_no_verdict(monkeypatch: pytest.MonkeyPatch) -> None
     assert headline(few) == "No verdict: 20 crystals, and a verdict needs at least 21."
 
 
-def test_without_agents_or_rivals_it_says_so() -> None:
+def test_the_headline_says_that_no_agent_or_rival_took_part() -> None:
     (nobody,) = made(one=[])
     assert headline([nobody]) == "No learned agent took part in this run."
     seer = replace(nobody.samples[0], contender=contender("a", training_seeds=(0,), privileged=True))
