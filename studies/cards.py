@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from cz_gym.agents import shipped_seeds
 from cz_gym.agents.agent_file.contract import Contract, read_agent
-from cz_gym.atomic_files import check_writable, naming, write_files
+from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser
 from cz_gym.errors import CzError
+from cz_gym.evaluation.files import read_results
 from cz_gym.evaluation.report.tables import markdown as table
+from cz_gym.evaluation.statistics import Estimate
+from cz_gym.units import PERCENT
 
 AGENTS = {
     "gradient": "analytic policy gradients: the cost's gradient through policy and plant; the plant is known",
@@ -23,38 +24,24 @@ AGENTS = {
 }
 """Shipped agents, and how each learned."""
 FIGURES = {
-    "rmse_mm": "RMSE [mm]",
-    "rmse_observable_mm": "observable RMSE [mm]",
-    "pull_step_rms_mm_per_min": "pull step RMS [mm/min]",
-    "failure_rate": "lost [%]",
+    "rmse_mm": ("RMSE [mm]", ".4f", 1.0),
+    "rmse_observable_mm": ("observable RMSE [mm]", ".4f", 1.0),
+    "pull_step_rms_mm_per_min": ("pull step RMS [mm/min]", ".4f", 1.0),
+    "failure_rate": ("lost [%]", ".1f", PERCENT),
 }
-"""Metrics of a card, and their heads."""
-Results = Mapping[str, Mapping[str, Mapping[str, Any]]]
-"""The benchmark's estimates, by scenario, controller and metric."""
-
-
-def read_results(path: Path) -> Results:
-    """Results of a benchmark.json with all shipped agents; CzError for another file."""
-    try:
-        with naming(path):
-            results: Results = json.loads(path.read_text("utf-8"))["results"]
-        for by_name in results.values():
-            for name in AGENTS:
-                for metric in FIGURES:
-                    float(by_name[name][metric]["mean"])
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError):
-        raise CzError(f"{path}: no benchmark.json with {', '.join(AGENTS)}") from None
-    return results
+"""Heading, format and unit of each metric of a card."""
+Results = Mapping[str, Mapping[str, Mapping[str, Estimate]]]
+"""Estimates of the benchmark by scenario, controller and metric."""
 
 
 def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -> str:
     """An agent's section."""
     first = contracts[0]
     rows = [
-        [scenario, *(_estimate(of[name][metric], 100.0 if metric == "failure_rate" else 1.0) for metric in FIGURES)]
+        [scenario, *(of[name][metric].text(form, unit) for metric, (_, form, unit) in FIGURES.items())]
         for scenario, of in results.items()
     ]
-    fails = [f"`{scenario}`" for scenario, of in results.items() if of[name]["failure_rate"]["mean"] > 0.0]
+    fails = [f"`{scenario}`" for scenario, of in results.items() if of[name]["failure_rate"].mean > 0.0]
     return "\n".join(
         [
             f"## `{name}`",
@@ -65,7 +52,7 @@ def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -
             f"- Training seeds: {len(contracts)}. `agents.load({name!r})` is the one of least validation cost.",
             "- Fails: " + (f"loses crystals of {', '.join(fails)}." if fails else "on none of these."),
             "",
-            table(["scenario", *FIGURES.values()], rows),
+            table(["scenario", *(head for head, *_ in FIGURES.values())], rows),
             "",
         ]
     )
@@ -76,15 +63,6 @@ def _steps(contracts: Sequence[Contract]) -> str:
     taken = [contract.training_steps / 1e6 for contract in contracts]
     steps = [f"{least_or_most(taken):.0f}" for least_or_most in (min, max)]
     return f"{' to '.join(dict.fromkeys(steps))} million steps"
-
-
-def _estimate(found: Mapping[str, Any], scale: float) -> str:
-    mean, interval = scale * float(found["mean"]), found.get("ci95")
-    digits = 1 if scale > 1.0 else 4
-    if interval is None:
-        return f"{mean:.{digits}f}"
-    low, high = (scale * float(each) for each in interval)
-    return f"{mean:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
 ABOUT = """# Model cards
@@ -111,7 +89,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(given: argparse.Namespace) -> None:
     check_writable(given.out.parent)
-    results = read_results(given.benchmark)
+    results = read_results(given.benchmark, [*FIGURES])
+    if not all(AGENTS.keys() <= by_name.keys() for by_name in results.values()):
+        raise CzError(f"{given.benchmark}: no results of {', '.join(AGENTS)}")
     cards = [
         card(name, of, [read_agent(each)[0] for each in shipped_seeds(name)], results) for name, of in AGENTS.items()
     ]

@@ -11,7 +11,6 @@ over crystals and training seeds.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,15 +19,15 @@ from typing import Any
 import numpy as np
 from scipy.stats import spearmanr
 
-from cz_gym.atomic_files import naming, write_files
+from cz_gym.atomic_files import write_files
 from cz_gym.baselines.lqg.designs import FAMILY
 from cz_gym.baselines.registry import CONTROLLERS
 from cz_gym.commands import OneLineParser
 from cz_gym.errors import CzError
 from cz_gym.evaluation.equal_activity import Point, frontier, intervals, ratios
-from cz_gym.evaluation.files import EPISODES, Episodes, read_episodes
+from cz_gym.evaluation.files import EPISODES, Episodes, read_episodes, read_results
 from cz_gym.evaluation.report.tables import markdown
-from cz_gym.evaluation.statistics import Resamples
+from cz_gym.evaluation.statistics import Estimate, Resamples
 
 ACTIVITY, RETURN, FAILURES = "pull_step_rms_mm_per_min", "return", "failure_rate"
 RESAMPLES = 2_000
@@ -36,32 +35,16 @@ RESAMPLES = 2_000
 Points = Mapping[str, Point]
 """Mean activity [mm/min] and radius error [mm] by controller."""
 BOUNDS = frozenset(entry.name for entry in CONTROLLERS if entry.bound)
-Means = Mapping[str, Mapping[str, float]]
-"""Means of every metric by scenario and controller."""
-
-
-def read_means(path: Path, metric: str) -> dict[str, dict[str, dict[str, float]]]:
-    """The means of each scenario in a benchmark.json, by controller and metric; CzError for another file."""
-    try:
-        with naming(path):
-            results = json.loads(path.read_text("utf-8"))["results"]
-        return {
-            scenario: {
-                name: {each: float(found[each]["mean"]) for each in (metric, ACTIVITY, RETURN, FAILURES)}
-                for name, found in controllers.items()
-            }
-            for scenario, controllers in results.items()
-        }
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError):
-        raise CzError(f"{path} is no benchmark.json") from None
+Means = Mapping[str, Mapping[str, Estimate]]
+"""Estimates of the benchmark by controller and metric."""
 
 
 def ranking(means: Means, found: Mapping[str, float]) -> str:
     """A sentence: how well the return ranks the controllers that lose no crystal as the ratios ``found`` do."""
-    names = [name for name in found if means[name][FAILURES] == 0.0 and name not in BOUNDS]
+    names = [name for name in found if means[name][FAILURES].mean == 0.0 and name not in BOUNDS]
     if len(names) < 3:
         return ""
-    agreement = -spearmanr([means[name][RETURN] for name in names], [found[name] for name in names]).statistic
+    agreement = -spearmanr([means[name][RETURN].mean for name in names], [found[name] for name in names]).statistic
     return f"Spearman's correlation of return and ratio, with its sign turned: {agreement:.2f} ({len(names)} rows)."
 
 
@@ -70,7 +53,7 @@ def table(results: Mapping[str, Means], metric: str, episodes: Episodes | None =
     heads = ("controller", "pull step RMS [mm/min]", f"{metric.removesuffix('_mm')} [mm]", "of the LQG's", "return")
     sections = []
     for scenario, means in results.items():
-        points = {name: (found[ACTIVITY], found[metric]) for name, found in means.items()}
+        points = {name: (found[ACTIVITY].mean, found[metric].mean) for name, found in means.items()}
         try:
             found = ratios(points, FAMILY)
             most = frontier([points[name] for name in FAMILY if name in points]).activity[-1]
@@ -83,7 +66,7 @@ def table(results: Mapping[str, Means], metric: str, episodes: Episodes | None =
             ratio = f"{found[name]:.3f}" if name in found else "quieter than any LQG"
             ratio += " [{:.3f}, {:.3f}]".format(*spread[name]) if name in found and name in spread else ""
             ratio += f", more active than any LQG ({most:.4f})" if activity > most else ""
-            rows.append((name, f"{activity:.4f}", f"{rmse:.4f}", ratio, f"{means[name][RETURN]:.0f}"))
+            rows.append((name, f"{activity:.4f}", f"{rmse:.4f}", ratio, f"{means[name][RETURN].mean:.0f}"))
         sections.append(f"## {scenario}\n\n{markdown(heads, rows)}\n\n{ranking(means, found)}".rstrip())
     return "\n\n".join(sections)
 
@@ -108,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _compare(given: argparse.Namespace) -> None:
-    results = read_means(given.benchmark, given.metric)
+    results = read_results(given.benchmark, (given.metric, ACTIVITY, RETURN, FAILURES))
     beside = given.benchmark.with_name(EPISODES)
     episodes = read_episodes(beside, lambda _: (ACTIVITY, given.metric)) if beside.exists() else None
     text = table(results, given.metric, episodes)

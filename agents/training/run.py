@@ -140,8 +140,8 @@ class Run:
 
     def finish(self) -> dict[str, float]:
         """Test the best agent on episodes that did not choose it; the contents of ``summary.json``."""
-        figures = self._figures(self.best_policy(), validation.JUDGING)
         path = self.folder / "agent.onnx"
+        figures = validate(OnnxPolicy.load(path, self.config), self.config, validation.JUDGING)
         contract, content = read_agent(path)
         summary = {
             "validation_episodes": len(validation.JUDGING),
@@ -159,10 +159,6 @@ class Run:
         self.save()
         return summary
 
-    def best_policy(self) -> OnnxPolicy:
-        """The agent of least validation cost."""
-        return OnnxPolicy.load(self.folder / "agent.onnx", self.config)
-
     def validate(self, bar: Any) -> None:
         """Export the actor as it stands and run the file itself on validation episodes; keep it if it is the best."""
         algorithm, channels = self.algorithm, len(OBSERVATIONS[self.config.observation])
@@ -177,7 +173,7 @@ class Run:
             validation_cost=0.0,
             validation_rmse_mm=0.0,
         )
-        figures = self._figures(OnnxPolicy.of(contract, content, self.config), validation.PICKING)
+        figures = validate(OnnxPolicy.of(contract, content, self.config), self.config, validation.PICKING)
         if self.best is None or figures.cost < self.best:
             self.best = figures.cost
             self._hold(agent_files(self.folder / "agent.onnx", content, _with_figures(contract, figures)))
@@ -194,9 +190,6 @@ class Run:
             self.logger.record(f"validation/{name}", figure)
         beside = ", ".join(f"{name} {rmse:.3f}" for name, rmse in zip(REFERENCES, picked, strict=True))
         bar.set_postfix_str(f"RMSE {figures.rmse_mm:.3f} mm, {figures.failure_rate:.0%} lost ({beside})")
-
-    def _figures(self, policy: OnnxPolicy, seeds: range) -> Validation:
-        return validate(policy, self.config, seeds)
 
     def _write_settings(self, sessions: list[dict[str, Any]]) -> None:
         """Write the run's settings; each time it is begun or resumed adds a session."""

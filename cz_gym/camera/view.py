@@ -10,7 +10,8 @@ import math
 from typing import Annotated, Any, NamedTuple
 
 from cz_gym.errors import CzError
-from cz_gym.physics.parameters import Parameters, Quantity, check_numbers
+from cz_gym.physics.parameters import Parameters, check_numbers
+from cz_gym.physics.parameters import Quantity as Q
 from cz_gym.units import MM
 
 ROWS, COLUMNS = 120, 160
@@ -18,7 +19,7 @@ IMAGE = (ROWS, COLUMNS, 1)
 """Shape of ``observation="camera"``, uint8."""
 SECOND_RADIATION = 1.438776877e-2
 """Second radiation constant h c / k_B [m K] (CODATA)."""
-_ESTIMATE = "estimate"
+_E = "estimate"
 _SILICON = Parameters()
 _EMISSIVITIES = "order and range: Watanabe et al., High Temp. High Press. 31, 587 (1999)"
 
@@ -30,46 +31,32 @@ class Camera(NamedTuple):
     an industrial camera adjusts its exposure. :func:`camera_for` aims the camera at another puller's crystal.
     """
 
-    tilt: Annotated[float, Quantity("rad", "angle of the optical axis from the vertical", _ESTIMATE, 0.0)] = (
-        math.radians(20)
+    tilt: Annotated[float, Q("rad", "angle of the optical axis from the vertical", _E, 0.0)] = math.radians(20)
+    distance: Annotated[float, Q("m", "from the lens to the melt, along the optical axis", _E)] = 1.0
+    aim: Annotated[float, Q("m", "radius at which the optical axis meets the melt", f"{_E}: r_0")] = _SILICON.r_0
+    focal_length: Annotated[float, Q("m", "focal length", f"{_E}: a common lens")] = 50.0 * MM
+    pixel_pitch: Annotated[float, Q("m", "side of a pixel", f"{_E}: 3.75 um of a 1280 x 960 sensor, binned 8 x 8")] = (
+        30e-6
     )
-    distance: Annotated[float, Quantity("m", "from the lens to the melt, along the optical axis", _ESTIMATE)] = 1.0
-    aim: Annotated[float, Quantity("m", "radius at which the optical axis meets the melt", f"{_ESTIMATE}: r_0")] = (
-        _SILICON.r_0
-    )
-    focal_length: Annotated[float, Quantity("m", "focal length", f"{_ESTIMATE}: a common lens")] = 50.0 * MM
-    pixel_pitch: Annotated[
-        float, Quantity("m", "side of a pixel", f"{_ESTIMATE}: 3.75 um of a 1280 x 960 sensor, binned 8 x 8")
-    ] = 30e-6
-    wavelength: Annotated[
-        float, Quantity("m", "effective wavelength", f"{_ESTIMATE}: CCD behind an infrared filter")
-    ] = 0.9e-6
-    crucible_radius: Annotated[float, Quantity("m", "inner radius of the crucible's wall", "Parameters.R_cr")] = (
-        _SILICON.R_cr
-    )
-    wall_height: Annotated[
-        float, Quantity("m", "wall bare above the melt, up to the heat shield's underside", _ESTIMATE)
-    ] = 0.12
-    wall_temperature: Annotated[float, Quantity("K", "wall of the crucible", "the plant's T_2 at its nominal")] = 1763.0
-    wall_emissivity: Annotated[float, Quantity("1", "quartz with hot graphite behind", _ESTIMATE)] = 0.9
-    shield_radius: Annotated[float, Quantity("m", "radius of the heat shield's opening", _ESTIMATE)] = 0.18
-    shield_temperature: Annotated[float, Quantity("K", "heat shield", "Parameters.T_e")] = _SILICON.T_e
-    shield_emissivity: Annotated[float, Quantity("1", "graphite", _ESTIMATE)] = 0.8
-    opening_temperature: Annotated[float, Quantity("K", "what is seen through the shield's opening", _ESTIMATE)] = 600.0
-    melt_temperature: Annotated[float, Quantity("K", "melt's surface", "Parameters.T_m + dT_0")] = (
-        _SILICON.T_m + _SILICON.dT_0
-    )
-    melt_emissivity: Annotated[float, Quantity("1", "liquid silicon", f"Parameters.eps; {_EMISSIVITIES}")] = (
-        _SILICON.eps
-    )
-    crystal_temperature: Annotated[float, Quantity("K", "crystal at the triple point", "Parameters.T_m")] = _SILICON.T_m
-    crystal_far_temperature: Annotated[float, Quantity("K", "crystal far above the melt", _ESTIMATE)] = 800.0
+    wavelength: Annotated[float, Q("m", "effective wavelength", f"{_E}: CCD behind an infrared filter")] = 0.9e-6
+    crucible_radius: Annotated[float, Q("m", "inner radius of the crucible's wall", "Parameters.R_cr")] = _SILICON.R_cr
+    wall_height: Annotated[float, Q("m", "wall bare above the melt, up to the heat shield's underside", _E)] = 0.12
+    wall_temperature: Annotated[float, Q("K", "wall of the crucible", "the plant's T_2 at its nominal")] = 1763.0
+    wall_emissivity: Annotated[float, Q("1", "quartz with hot graphite behind", _E)] = 0.9
+    shield_radius: Annotated[float, Q("m", "radius of the heat shield's opening", _E)] = 0.18
+    shield_temperature: Annotated[float, Q("K", "heat shield", "Parameters.T_e")] = _SILICON.T_e
+    shield_emissivity: Annotated[float, Q("1", "graphite", _E)] = 0.8
+    opening_temperature: Annotated[float, Q("K", "what is seen through the shield's opening", _E)] = 600.0
+    melt_temperature: Annotated[float, Q("K", "melt's surface", "Parameters.T_m + dT_0")] = _SILICON.T_m + _SILICON.dT_0
+    melt_emissivity: Annotated[float, Q("1", "liquid silicon", f"Parameters.eps; {_EMISSIVITIES}")] = _SILICON.eps
+    crystal_temperature: Annotated[float, Q("K", "crystal at the triple point", "Parameters.T_m")] = _SILICON.T_m
+    crystal_far_temperature: Annotated[float, Q("K", "crystal far above the melt", _E)] = 800.0
     crystal_cooling: Annotated[
-        float, Quantity("m", "height over which the crystal cools by 1/e", f"{_ESTIMATE}: 5.9 K/mm, the plant's Phi_s")
+        float, Q("m", "height over which the crystal cools by 1/e", f"{_E}: 5.9 K/mm, the plant's Phi_s")
     ] = 0.15
-    crystal_emissivity: Annotated[float, Quantity("1", "solid silicon, hot", f"{_ESTIMATE}; {_EMISSIVITIES}")] = 0.46
-    white: Annotated[float, Quantity("1", "grey value 255, in black bodies as hot as the wall", _ESTIMATE)] = 1.0
-    full_well: Annotated[float, Quantity("1", "electrons of a binned pixel at grey value 255", _ESTIMATE)] = 1e4
+    crystal_emissivity: Annotated[float, Q("1", "solid silicon, hot", f"{_E}; {_EMISSIVITIES}")] = 0.46
+    white: Annotated[float, Q("1", "grey value 255, in black bodies as hot as the wall", _E)] = 1.0
+    full_well: Annotated[float, Q("1", "electrons of a binned pixel at grey value 255", _E)] = 1e4
 
 
 def camera_for(parameters: Parameters) -> Camera:

@@ -141,6 +141,26 @@ def csv_text(heads: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
     return text.getvalue()
 
 
+def read_results(path: Path, metrics: Sequence[str]) -> dict[str, dict[str, dict[str, Estimate]]]:
+    """Read the estimates of these metrics from a ``benchmark.json``, by scenario and controller; CzError for others."""
+    try:
+        with naming(path):
+            results = json.loads(path.read_text("utf-8"))["results"]
+        return {
+            scenario: {
+                name: {metric: _estimate(found[metric]) for metric in metrics} for name, found in by_name.items()
+            }
+            for scenario, by_name in results.items()
+        }
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError):
+        raise CzError(f"{path} is no benchmark.json") from None
+
+
+def _estimate(found: Mapping[str, Any]) -> Estimate:
+    interval = found.get("ci95")
+    return Estimate(float(found["mean"]), interval and (float(interval[0]), float(interval[1])), found.get("n", 0))
+
+
 def read_episodes(path: Path, columns: Callable[[str], Sequence[str]]) -> Episodes:
     """Read the wanted columns of each scenario of an ``episodes.csv``, crystals in the file's order.
 

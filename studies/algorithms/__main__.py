@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--seeds", type=between(1, 100), default=5, help="training seeds a recipe (default: %(default)s)"
     )
-    about = "environment steps of recipes that learn from reward (default: the recipe's own)"
+    about = "environment steps (default: the recipe's own)"
     parser.add_argument("--steps", type=between(1, 10**9), help=about)
     parser.add_argument("--jobs", type=between(1, 64), default=2, help="runs at once (default: %(default)s)")
     about = "folder of the %s (default: %%(default)s)"
@@ -54,7 +54,7 @@ def _main(given: argparse.Namespace) -> None:
             raise CzError(unknown("row", name, RECIPES))
     recipes = [recipe for name, recipe in RECIPES.items() if name in wanted]
     if given.steps:
-        recipes = [replace(each, steps=given.steps) if each.steps else each for each in recipes]
+        recipes = [replace(each, steps=given.steps) for each in recipes]
     check_writable(given.out)
     jobs = make_jobs(recipes, given.seeds, given.work)
     compare(jobs, given.out, partial(in_processes, processes=given.jobs))

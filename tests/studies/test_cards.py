@@ -32,4 +32,6 @@ def test_every_shipped_agent_has_a_card_with_the_benchmark_s_figures(tmp_path: P
 def test_another_file_is_refused_in_one_line(tmp_path: Path, refused: Any) -> None:
     (tmp_path / "some.json").write_text("[]")
     command = ["--benchmark", str(tmp_path / "some.json"), "--out", str(tmp_path / "cards.md")]
-    assert "no benchmark.json with gradient" in refused(cards.main, command)
+    assert "some.json is no benchmark.json" in refused(cards.main, command)
+    (tmp_path / "some.json").write_text('{"results": {"hard": {}}}')
+    assert "no results of gradient, ppo, sac" in refused(cards.main, command)
