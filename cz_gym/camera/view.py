@@ -10,8 +10,7 @@ import math
 from typing import Annotated, Any, NamedTuple
 
 from cz_gym.errors import CzError
-from cz_gym.physics.parameters import Parameters, check_numbers
-from cz_gym.physics.parameters import Quantity as Q
+from cz_gym.physics.parameters import Parameters, Q, check_numbers
 from cz_gym.units import MM
 
 ROWS, COLUMNS = 120, 160

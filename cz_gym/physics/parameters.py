@@ -35,10 +35,10 @@ class Quantity(NamedTuple):
     """Unit that users may have meant instead."""
 
 
-_LITERATURE = "silicon literature"
-_ESTIMATE = "estimate"
-_PART_II = "Bukhari, Hovd, Winkler, Part II"
-_BELOW_RIGHT_ANGLE = math.nextafter(math.pi / 2.0, 0.0)
+Q = Quantity
+_L, _E, _II = "silicon literature", "estimate", "Bukhari, Hovd, Winkler, Part II"
+_RIGHT = math.nextafter(math.pi / 2.0, 0.0)
+"""Largest angle below a right one [rad]."""
 
 
 class Parameters(NamedTuple):
@@ -49,65 +49,39 @@ class Parameters(NamedTuple):
     ``Parameters(r_0=0.1)`` or ``Parameters()._replace(sigma=0.83)``.
     """
 
-    sigma: Annotated[
-        float, Quantity("N/m", "surface tension of the melt", f"{_LITERATURE}, 0.72-0.83", 0.01, 5.0, IN_MILLI)
-    ] = 0.72
-    rho_l: Annotated[
-        float, Quantity("kg/m3", "density of the melt", f"{_LITERATURE}, 2510-2570", 100.0, 3e4, IN_KILO)
-    ] = 2570.0
-    alpha_0: Annotated[
-        float, Quantity("rad", "contact (growth) angle", _LITERATURE, 0.0, _BELOW_RIGHT_ANGLE, IN_DEGREES)
-    ] = math.radians(11.0)
-    g: Annotated[float, Quantity("m/s2", "gravity", "fixed", None, 100.0)] = 9.81
-    sigma_SB: Annotated[float, Quantity("W/m2/K4", "Stefan-Boltzmann constant", "CODATA", None, 1e-6)] = 5.670374419e-8
-    k_l: Annotated[float, Quantity("W/m/K", "thermal conductivity of the melt", _LITERATURE, 0.1, 1e3)] = 62.0
-    rho_s: Annotated[float, Quantity("kg/m3", "density of the crystal", _LITERATURE, 100.0, 3e4, IN_KILO)] = 2330.0
-    dH: Annotated[float, Quantity("J/kg", "latent heat of fusion", _LITERATURE, 1e4, 1e8, IN_KILO)] = 1.8e6
-    T_m: Annotated[float, Quantity("K", "melting temperature", _LITERATURE, 200.0, 5e3, IN_CELSIUS)] = 1685.0
+    sigma: Annotated[float, Q("N/m", "surface tension of the melt", f"{_L}, 0.72-0.83", 0.01, 5.0, IN_MILLI)] = 0.72
+    rho_l: Annotated[float, Q("kg/m3", "density of the melt", f"{_L}, 2510-2570", 100.0, 3e4, IN_KILO)] = 2570.0
+    alpha_0: Annotated[float, Q("rad", "contact (growth) angle", _L, 0.0, _RIGHT, IN_DEGREES)] = math.radians(11.0)
+    g: Annotated[float, Q("m/s2", "gravity", "fixed", None, 100.0)] = 9.81
+    sigma_SB: Annotated[float, Q("W/m2/K4", "Stefan-Boltzmann constant", "CODATA", None, 1e-6)] = 5.670374419e-8
+    k_l: Annotated[float, Q("W/m/K", "thermal conductivity of the melt", _L, 0.1, 1e3)] = 62.0
+    rho_s: Annotated[float, Q("kg/m3", "density of the crystal", _L, 100.0, 3e4, IN_KILO)] = 2330.0
+    dH: Annotated[float, Q("J/kg", "latent heat of fusion", _L, 1e4, 1e8, IN_KILO)] = 1.8e6
+    T_m: Annotated[float, Q("K", "melting temperature", _L, 200.0, 5e3, IN_CELSIUS)] = 1685.0
     dT_0: Annotated[
-        float, Quantity("K", "nominal superheat of the melt bulk", f"fitted: stable pole of {_PART_II}", None, 500.0)
+        float, Q("K", "nominal superheat of the melt bulk", f"fitted: stable pole of {_II}", None, 500.0)
     ] = 5.02
     phi_b: Annotated[
         float,
-        Quantity(
-            "rad",
-            "effective reflection slope of the bright ring, not a camera pose",
-            f"fitted: G_m of {_PART_II}",
-            None,
-            _BELOW_RIGHT_ANGLE,
-            IN_DEGREES,
-        ),
-    ] = math.radians(3.5)
-    r_0: Annotated[float, Quantity("m", "nominal crystal radius", _PART_II, None, 2.0, IN_MM)] = 87.5 * MM
-    v_0: Annotated[float, Quantity("m/s", "nominal pull speed", _PART_II, None, 1e-3, IN_MM_PER_MIN)] = 1.2 * MM_PER_MIN
-    C_1: Annotated[
-        float, Quantity("J/K", "heat capacity of the heater", f"{_ESTIMATE}: 30 kg graphite", 500.0, 1e9, IN_KILO)
-    ] = 5.7e4
+        Q("rad", "effective reflection slope of the bright ring, not a camera pose", f"fitted: G_m of {_II}",
+          None, _RIGHT, IN_DEGREES),
+    ] = math.radians(3.5)  # fmt: skip
+    r_0: Annotated[float, Q("m", "nominal crystal radius", _II, None, 2.0, IN_MM)] = 87.5 * MM
+    v_0: Annotated[float, Q("m/s", "nominal pull speed", _II, None, 1e-3, IN_MM_PER_MIN)] = 1.2 * MM_PER_MIN
+    C_1: Annotated[float, Q("J/K", "heat capacity of the heater", f"{_E}: 30 kg graphite", 500.0, 1e9, IN_KILO)] = 5.7e4
     C_2: Annotated[
-        float,
-        Quantity(
-            "J/K",
-            "heat capacity of susceptor and crucible",
-            f"{_ESTIMATE}: susceptor and quartz",
-            500.0,
-            1e9,
-            IN_KILO,
-        ),
+        float, Q("J/K", "heat capacity of susceptor and crucible", f"{_E}: susceptor and quartz", 500.0, 1e9, IN_KILO)
     ] = 1.0e5
-    C_b: Annotated[
-        float, Quantity("J/K", "heat capacity of the melt bulk", f"{_ESTIMATE}: 80 kg melt", 500.0, 1e9, IN_KILO)
-    ] = 8.0e4
-    kappa_12: Annotated[float, Quantity("W/K4", "radiative link heater to susceptor", _ESTIMATE, None, 1e-4)] = 2.8e-8
-    G_1a: Annotated[float, Quantity("W/K", "insulation loss of the heater", _ESTIMATE, None, 1e5)] = 30.0
-    T_a: Annotated[float, Quantity("K", "ambient (shell) temperature", _ESTIMATE, 200.0, 2e3, IN_CELSIUS)] = 350.0
-    G_2b: Annotated[float, Quantity("W/K", "conductance of the quartz wall", _ESTIMATE, None, 1e5)] = 200.0
-    eps: Annotated[
-        float, Quantity("1", "emissivity of the melt surface", f"{_ESTIMATE}: liquid silicon", None, 1.0, IN_PERCENT)
-    ] = 0.2
-    R_cr: Annotated[float, Quantity("m", "inner radius of the crucible", _ESTIMATE, None, 5.0, IN_MM)] = 0.28
-    T_e: Annotated[
-        float, Quantity("K", "effective temperature the melt surface sees", f"{_ESTIMATE}: heat shield", 0.0)
-    ] = 1300.0
+    C_b: Annotated[float, Q("J/K", "heat capacity of the melt bulk", f"{_E}: 80 kg melt", 500.0, 1e9, IN_KILO)] = 8.0e4
+    kappa_12: Annotated[float, Q("W/K4", "radiative link heater to susceptor", _E, None, 1e-4)] = 2.8e-8
+    G_1a: Annotated[float, Q("W/K", "insulation loss of the heater", _E, None, 1e5)] = 30.0
+    T_a: Annotated[float, Q("K", "ambient (shell) temperature", _E, 200.0, 2e3, IN_CELSIUS)] = 350.0
+    G_2b: Annotated[float, Q("W/K", "conductance of the quartz wall", _E, None, 1e5)] = 200.0
+    eps: Annotated[float, Q("1", "emissivity of the melt surface", f"{_E}: liquid silicon", None, 1.0, IN_PERCENT)] = (
+        0.2
+    )
+    R_cr: Annotated[float, Q("m", "inner radius of the crucible", _E, None, 5.0, IN_MM)] = 0.28
+    T_e: Annotated[float, Q("K", "effective temperature the melt surface sees", f"{_E}: heat shield", 0.0)] = 1300.0
 
 
 def describe(kind: type[Any] = Parameters) -> dict[str, Quantity]:
