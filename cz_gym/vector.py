@@ -104,10 +104,7 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
         self._seeds: list[int | None] = [None] * num_envs
 
     def reset(
-        self,
-        *,
-        seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
         """Draw episodes; slot i is seeded with seed + i, or with seed[i].
 

@@ -122,11 +122,7 @@ class RecurrentPolicy(BasePolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         """What :meth:`load` makes it with."""
-        return {
-            **super()._get_constructor_parameters(),
-            **self.options,
-            "lr_schedule": self._dummy_schedule,
-        }
+        return {**super()._get_constructor_parameters(), **self.options, "lr_schedule": self._dummy_schedule}
 
 
 def leaky_means(interval: float) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:

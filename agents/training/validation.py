@@ -51,12 +51,7 @@ class Validation(NamedTuple):
 def validate(policy: Any, config: Config, seeds: Sequence[int]) -> Validation:
     """Run one episode a seed."""
     measured = metrics(rollout(policy, config, seeds))
-    figures = (
-        costs(measured),
-        measured.rmse_mm,
-        measured.pull_step_rms_mm_per_min,
-        measured.failure_rate,
-    )
+    figures = (costs(measured), measured.rmse_mm, measured.pull_step_rms_mm_per_min, measured.failure_rate)
     return Validation(*(float(figure.mean()) for figure in figures))
 
 

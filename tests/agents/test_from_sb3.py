@@ -16,7 +16,7 @@ import torch
 from gymnasium.spaces import Box
 from gymnasium.wrappers import RecordEpisodeStatistics, RescaleAction, TransformAction
 from sb3_contrib import TQC, RecurrentPPO
-from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
+from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -25,6 +25,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecMoni
 from cz_gym import CzEnv, sb3
 from cz_gym.agents import AgentFileError, OnnxPolicy, from_sb3
 from cz_gym.agents.apg import APG
+from cz_gym.agents.export import to_onnx
 from cz_gym.config import make_config
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from tests.processes import ROOT
@@ -70,6 +71,12 @@ def test_every_policy_becomes_a_file_that_acts_as_it_does(kind: str, tmp_path: P
     for parameter in model.policy.parameters():
         parameter.data += 0.3
     assert from_sb3.disagreement(agent, model, None) > 1e-3, "the comparison would not tell another network"
+
+
+def test_a_policy_without_an_actor_is_refused() -> None:
+    model = DQN("MlpPolicy", "CartPole-v1", buffer_size=10)
+    with pytest.raises(AgentFileError, match="DQNPolicy has no actor that gives two continuous actions"):
+        to_onnx(model.policy, 4)
 
 
 @pytest.mark.parametrize("kind", ["ppo", "ppo_lstm"])
@@ -213,10 +220,7 @@ class Own(BaseFeaturesExtractor):
 
 @pytest.mark.parametrize(
     ("options", "said"),
-    [
-        ({"features_extractor_class": Own}, "operator 'Sin'"),
-        ({"activation_fn": torch.nn.GELU}, "operator 'Erf'"),
-    ],
+    [({"features_extractor_class": Own}, "operator 'Sin'"), ({"activation_fn": torch.nn.GELU}, "operator 'Erf'")],
 )
 def test_a_network_that_cannot_be_written_is_refused(options: dict[str, Any], said: str, tmp_path: Path) -> None:
     model = PPO("MlpPolicy", "Cz-v0", device="cpu", n_steps=8, batch_size=8, policy_kwargs=options)

@@ -11,16 +11,7 @@ from cz_gym import CzEnv, Parameters, make_puller
 from cz_gym.camera.image import picture
 from cz_gym.camera.rays import make_scene
 from cz_gym.camera.ring_detector import RingDetector, wall_edge
-from cz_gym.camera.view import (
-    COLUMNS,
-    IMAGE,
-    ROWS,
-    Camera,
-    camera_for,
-    check_camera,
-    make_view,
-    project,
-)
+from cz_gym.camera.view import COLUMNS, IMAGE, ROWS, Camera, camera_for, check_camera, make_view, project
 from cz_gym.config import make_config
 from cz_gym.episodes.record import stream_number
 from cz_gym.episodes.scenario import Scenario, Sensor

@@ -8,10 +8,7 @@ from cz_gym import Parameters, make_puller
 from cz_gym.physics.parameters import check_parameters
 
 
-@given(
-    st.sampled_from(Parameters._fields),
-    st.sampled_from([math.nan, math.inf, -math.inf, -1.0, "0.1", None]),
-)
+@given(st.sampled_from(Parameters._fields), st.sampled_from([math.nan, math.inf, -math.inf, -1.0, "0.1", None]))
 def test_what_is_not_a_number_is_refused_by_name(name: str, value: object) -> None:
     with pytest.raises(ValueError, match=rf"^parameter {name} = .*\[") as refusal:
         check_parameters(Parameters()._replace(**{name: value}))

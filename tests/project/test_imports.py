@@ -100,10 +100,7 @@ def test_nothing_is_imported_from_above(package: str) -> None:
 
 @pytest.mark.parametrize(
     ("module", "absent"),
-    [
-        ("cz_gym", {"cz_gym.physics.young_laplace"}),
-        ("cz_gym.play", {"torch", "pygame", "PIL", "onnxruntime"}),
-    ],
+    [("cz_gym", {"cz_gym.physics.young_laplace"}), ("cz_gym.play", {"torch", "pygame", "PIL", "onnxruntime"})],
 )
 def test_importing_loads_nothing_that_is_not_needed(module: str, absent: set[str]) -> None:
     code = f"import sys, {module}; assert not {absent} & set(sys.modules)"

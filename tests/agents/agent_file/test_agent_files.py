@@ -8,7 +8,6 @@ import numpy as np
 import onnx
 import pytest
 
-from cz_gym import Parameters
 from cz_gym.agents import AgentFileError, OnnxPolicy, shipped
 from cz_gym.agents.agent_file.contract import MAX_BYTES, write_agent
 from cz_gym.agents.export import to_onnx
@@ -35,11 +34,6 @@ def test_one_observation_and_a_batch_of_one_act_alike(agent: Path) -> None:
     np.testing.assert_array_equal(policy.predict(seen)[0][0], policy.predict(seen[0])[0])
     with pytest.raises(ValueError, match="expected 72 channels"):
         policy.predict(seen[:, :-1])
-
-
-def test_agent_for_another_plant_is_refused(agent: Path) -> None:
-    with pytest.raises(AgentFileError, match="trained on plant"):
-        OnnxPolicy.load(agent, make_config(observation="history", parameters=Parameters(k_l=60.0)))
 
 
 @pytest.mark.parametrize(

@@ -17,9 +17,6 @@ from cz_gym.config import make_config
 from cz_gym.cost import SCALES, WEIGHTS, saturated
 from cz_gym.differentiable import STATES, DifferentiableBatch
 from cz_gym.errors import CzError
-from cz_gym.evaluation.metrics import metrics
-from cz_gym.evaluation.protocol import VALIDATION_SEEDS
-from cz_gym.evaluation.rollout import rollout
 from cz_gym.sb3 import make_vec_env
 
 SETTINGS: dict[str, Any] = {"observation": "measured", "action": "rate"}
@@ -208,13 +205,3 @@ def test_apg_lowers_the_cost_in_a_few_updates() -> None:
     before = driven(model.policy, batch, 360).item()
     model.learn(24 * 90 * 30)
     assert driven(model.policy, batch, 360).item() < 0.5 * before
-
-
-@pytest.mark.slow
-def test_apg_holds_crystals_after_half_a_million_steps() -> None:
-    """From losing all crystals to holding most of them."""
-    model = algorithm(64, 180)
-    seeds = VALIDATION_SEEDS[:16]
-    assert metrics(rollout(model, CONFIG, seeds)).failure_rate.mean() > 0.8
-    model.learn(64 * 180 * 45)
-    assert metrics(rollout(model, CONFIG, seeds)).failure_rate.mean() < 0.3
