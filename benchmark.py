@@ -89,8 +89,8 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
     """Check the arguments, run the benchmark, write and print the results."""
     from tqdm import tqdm
 
+    from cz_gym.evaluation.files import check_targets, write
     from cz_gym.evaluation.report.markdown import terminal
-    from cz_gym.evaluation.report.output import check_targets, write
     from cz_gym.evaluation.runner import run
 
     rows = rows_of(arguments)

@@ -24,7 +24,7 @@ class Contender:
     observation: str
     """Observation mode it reads; "state" marks a bound, which no sensor could feed."""
     meaning: str
-    """Description of one line."""
+    """What it is, in one line for tables."""
     default: bool = True
     """Whether a benchmark that names no controllers runs it."""
     privileged: bool = False
@@ -54,7 +54,7 @@ class Contender:
 
     @property
     def knows(self) -> str:
-        """Its group in tables, by its knowledge of the plant."""
+        """Heading of its group in tables, by its knowledge of the plant."""
         if self.bound:
             return "bounds, told what no sensor shows"
         if not self.learned:

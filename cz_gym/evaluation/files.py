@@ -1,4 +1,4 @@
-"""A benchmark's results as JSON and CSV, written and read back."""
+"""A benchmark's results as files: JSON and CSV, written with the report, and read back."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.atomic_files import naming
+from cz_gym.atomic_files import check_writable, naming, write_files
 from cz_gym.errors import CzError
 
 from .metrics import metric_names
@@ -31,8 +31,54 @@ Episodes = dict[str, dict[str, npt.NDArray[np.float64]]]
 """By scenario and controller: metrics of shape (training seeds, crystals, metrics)."""
 
 
+def check_targets(folder: Path | None, lone: Path | None, partial: bool, overwrite: bool) -> None:
+    """Raise CzError if the results could not be written, or would replace files without ``overwrite``.
+
+    Only a full run into the folder of an earlier benchmark replaces its files unasked.
+    """
+    renews = folder is not None and not partial and (folder / RESULTS).is_file()
+    theirs = [folder / name for name in FILES] if folder and not renews else []
+    found = [path for path in (*theirs, lone) if path and path.exists()]
+    if lone and lone.is_dir():
+        raise CzError(f"--json {lone} is a folder")
+    if found and not overwrite:
+        raise CzError(f"{found[0]} exists: add --overwrite, or name another --out or --json")
+    for place in (folder, lone and lone.parent):
+        if place:
+            check_writable(place)
+
+
+def write(
+    folder: Path | None, lone: Path | None, results: Sequence[Result], command: str, quoted: Path | None = None
+) -> None:
+    """Write the files, ``benchmark.json`` last, and the table between the markers of the page ``quoted``, if it exists.
+
+    Needs matplotlib and plotly if there is a folder.
+    """
+    text = to_json(results, command).encode()
+    files: dict[Path, bytes] = {}
+    if folder:
+        from .report.figures import draw_figures
+        from .report.markdown import fill_in, markdown
+        from .report.page import page
+
+        figures = draw_figures(results)
+        files |= {folder / name: image for name, image in figures.items()}
+        files[folder / EPISODES] = to_csv(results).encode()
+        files[folder / "report.md"] = markdown(results, command, figures).encode()
+        files[folder / "report.html"] = page(results, command).encode()
+        if quoted and quoted.is_file():
+            with naming(quoted):
+                before = quoted.read_text("utf-8")
+            files[quoted] = fill_in(before, results).encode()
+        files[folder / RESULTS] = text
+    if lone:
+        files[lone] = text
+    write_files(files)
+
+
 def to_json(results: Sequence[Result], command: str) -> str:
-    """``benchmark.json``: results, paired differences, tails, verdicts and provenance."""
+    """Return the text of ``benchmark.json``: results, paired differences, tails, verdicts and provenance."""
 
     def each(table: Callable[[Result], Mapping[str, Any]]) -> dict[str, Any]:
         return {result.row.name: _plain(table(result)) for result in results}
@@ -123,7 +169,7 @@ def software(packages: Sequence[str]) -> dict[str, Any]:
 
 
 def to_csv(results: Sequence[Result]) -> str:
-    """``episodes.csv``: one line an episode."""
+    """Return the text of ``episodes.csv``, one line an episode."""
     rows = (
         (result.row.name, sample.name, training_seed, seed, *(f"{value:.5g}" for value in values))
         for result in results

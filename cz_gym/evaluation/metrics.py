@@ -31,7 +31,7 @@ class Metrics(NamedTuple):
     rmse_mm: Floats
     """Root mean square of r_c - r_ref [mm]."""
     rmse_observable_mm: Floats
-    """The same against r_ref minus the ring offset that no sensor shows [mm]."""
+    """Root mean square of r_c against r_ref minus the ring offset that no sensor shows [mm]."""
     max_error_mm: Floats
     """Largest |r_c - r_ref| [mm]."""
     within_half_mm: Floats

@@ -20,17 +20,17 @@ from .rollout import EpisodeBatch, Rollout, call_policy, check_policy, check_see
 
 @dataclass(frozen=True)
 class Counterfactual:
-    """Episodes as they went, and as they would have gone under another controller."""
+    """Episodes under one controller, and the same episodes under another one from some moment on."""
 
     at: float
     """Moment at which the other controller takes over [s]."""
     actual: Rollout
     instead: Rollout
-    """Equal to ``actual`` up to ``at``."""
+    """Rollout with the other controller; equal to ``actual`` up to ``at``."""
 
 
 class Playback:
-    """Policy that repeats logged actions, whatever it observes; after the last one it repeats that."""
+    """Policy that plays logged actions back without reading observations; it holds the last one at the end."""
 
     def __init__(self, actions: npt.ArrayLike) -> None:
         """``actions`` has shape (steps, 2), for every episode alike, or (steps, episodes, 2); CzError otherwise."""

@@ -32,7 +32,7 @@ class Sample:
     contender: Contender
     seeds: tuple[int, ...]
     values: Floats
-    """Shape (training seeds or 1, episodes, metrics), metrics in the order of :func:`metric_names`."""
+    """Metrics in the order of :func:`metric_names`, shape (training seeds or 1, episodes, metrics)."""
     microseconds: float
     """Time in the policy per step and episode [us]."""
     example: Signals | None = None
@@ -40,7 +40,7 @@ class Sample:
 
     @classmethod
     def of(cls, contender: Contender, run: Rollout) -> Sample:
-        """Measure a rollout of one policy."""
+        """Metrics and first signals of a rollout of one policy."""
         values = np.stack(metrics(run), axis=-1)[None]
         return cls(contender, run.seeds, values, run.microseconds_per_step, run.episode(0))
 

@@ -20,9 +20,9 @@ from cz_gym.config import make_config
 from cz_gym.contender import Contender
 from cz_gym.errors import CzError
 from cz_gym.evaluation import runner
+from cz_gym.evaluation.files import check_targets
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.protocol import TEST_SEEDS, find_row
-from cz_gym.evaluation.report.output import check_targets
 from cz_gym.observation import OBSERVATIONS
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE

@@ -24,11 +24,11 @@ from .tables import (
     Column,
     comparison,
     crystals,
+    headline,
     label,
     rows,
 )
 from .tables import markdown as table
-from .verdict import headline
 
 BEST = 2
 """Agents that :func:`brief` shows: those of the lowest RMSE."""

@@ -21,7 +21,6 @@ from . import tables
 from .canvas import styles_of
 from .markdown import measured_from
 from .page_pictures import crystal, errors, pareto
-from .verdict import headline
 
 _SLOT = re.compile(r"<!-- slot:(\w+) -->")
 
@@ -33,7 +32,7 @@ def page(results: Sequence[Result], command: str) -> str:
     parts = {
         "style": _asset("page.css"),
         "plotly": get_plotlyjs(),
-        "verdict": escape(headline(results)),
+        "verdict": escape(tables.headline(results)),
         "lede": f"{tables.count(len(results[0].samples), 'controller')}, {tables.count(len(results), 'scenario')}, "
         f"up to {tables.crystals(most)} each, the same for everyone: {config.horizon / HOUR:g} h at one action every "
         f"{config.control_interval:g} s, on {row.grown_on}.",

@@ -120,7 +120,7 @@ class Panel(NamedTuple):
     title: str
     unit: str
     scale: float
-    """The unit in SI."""
+    """Size of the unit in SI units."""
     lines: Mapping[str, Callable[[Signals, float], Floats]]
     """Functions of an episode's signals and the operator's bias [m], in SI: ``true``, and what the ``camera`` reports,
     of each controller; any other is what all controllers are asked for or meet."""

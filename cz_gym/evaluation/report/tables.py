@@ -1,4 +1,4 @@
-"""Columns of the tables of results, the estimates in them, and the format of numbers and names."""
+"""Texts that every form of the report has: the verdict, and the tables' columns, estimates, numbers and names."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from cz_gym.evaluation.statistics import Estimate
 from cz_gym.units import PERCENT
 
 NOTHING = "-"
+FEWEST = 20
+"""Least number of crystals for a verdict on a scenario with randomness."""
 
 
 class Column(NamedTuple):
@@ -19,7 +21,7 @@ class Column(NamedTuple):
     heading: str
     decimals: int
     unit: float = 1.0
-    """The table's unit in the metric's own."""
+    """Unit of the column, in units of the metric."""
     kind: str = "means"
     """Name of the estimates, an attribute of :class:`Result`."""
     interval: bool = True
@@ -101,10 +103,48 @@ def markdown(heads: Iterable[str], rows: Iterable[Iterable[str]], rule: str = "-
 
 
 def count(number: int, what: str) -> str:
-    """Return "2 scenarios", "1 scenario"."""
+    """Return a number with its noun: "2 scenarios", "1 scenario"."""
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def crystals(number: int) -> str:
-    """Return "500 crystals", "1 crystal"."""
+    """Return a number of crystals in words: "500 crystals", "1 crystal"."""
     return count(number, "crystal")
+
+
+def headline(results: Sequence[Result]) -> str:
+    """Return one line: whether the agents win, and where they do not.
+
+    Scenarios of a single crystal do not count, unless there are no others; nor does an agent that is a bound. A few
+    crystals of a random scenario give no verdict.
+    """
+    contenders = [sample.contender for sample in results[0].samples]
+    agents = [each.name for each in contenders if each.learned and not each.bound]
+    if not agents:
+        return "No learned agent took part in this run."
+    if results[0].rival is None:
+        return "No classical controller took part in this run to compare the agents with."
+    deciding = [result for result in results if len(result.seeds) > 1] or list(results)
+    if 1 < len(deciding[0].seeds) < FEWEST:
+        return f"No verdict: {len(deciding[0].seeds)} crystals, and a verdict needs at least {FEWEST}."
+    if always := [agent for agent in agents if all(result.wins(agent) for result in deciding)]:
+        first = f"{', '.join(always)} win{'s' if len(always) == 1 else ''} on every scenario."
+    else:
+        some = any(result.wins(agent) for result in deciding for agent in agents)
+        first = "No agent wins on every scenario." if some else "No agent wins."
+    return f"{first} {'; '.join(_among(result) for result in deciding)}."
+
+
+def _among(result: Result) -> str:
+    """Who is better than whom on one scenario, the best classical controller or each agent."""
+    agents, rival = list(result.verdicts), result.rival
+
+    def named(some: Sequence[str]) -> str:
+        return f"all {len(agents)} agents" if len(some) == len(agents) > 1 else ", ".join(some)
+
+    won, lost = list(filter(result.wins, agents)), list(filter(result.loses, agents))
+    rest = [agent for agent in agents if agent not in won + lost]
+    parts = [f"{named(won)} better than {rival}"] if won else []
+    parts += [f"{rival} better than {named(lost)}"] if lost else []
+    parts += [f"no clear difference between {rival} and {named(rest)}"] if rest else []
+    return f"{result.row.name}: {', '.join(parts)}"

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from cz_gym.evaluation.protocol import Row
-from cz_gym.evaluation.report import verdict
-from cz_gym.evaluation.report.verdict import headline
+from cz_gym.evaluation.report import tables
+from cz_gym.evaluation.report.tables import FEWEST, headline
 from cz_gym.evaluation.results import Result, Sample
 from cz_gym.evaluation.statistics import Estimate
 from tests.samples import contender
@@ -21,7 +21,7 @@ def made(**scenarios: Any) -> list[Result]:
     results = []
     for name, differences in scenarios.items():
         verdicts = dict(zip("abc", differences, strict=False))
-        seeds = (0,) if name.startswith("single") else tuple(range(verdict.FEWEST))
+        seeds = (0,) if name.startswith("single") else tuple(range(FEWEST))
         who = [contender("lqg"), *(contender(agent, training_seeds=(0,)) for agent in verdicts)]
         samples = tuple(Sample(each, seeds, np.zeros((1, 1, 1)), 0.0) for each in who)
         row = Row(name, "randomized", "")
@@ -51,7 +51,7 @@ def test_a_single_crystal_does_not_count_beside_others() -> None:
 
 def test_a_few_crystals_give_no_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
     few = made(one=[BETTER])
-    monkeypatch.setattr(verdict, "FEWEST", verdict.FEWEST + 1)
+    monkeypatch.setattr(tables, "FEWEST", FEWEST + 1)
     assert headline(few) == "No verdict: 20 crystals, and a verdict needs at least 21."
 
 
