@@ -31,76 +31,18 @@ CUT_OFFS = (1e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2)
 
 
 def report(captions: Mapping[str, str]) -> str:
-    """The whole report, with figures of these captions."""
+    """The whole report: template.md, filled in, with figures of these captions."""
 
     def figures(*marks: str) -> str:
         shown = {name: caption for name, caption in captions.items() if name.startswith(marks)}
         return "\n\n".join(f"![{caption}]({name})\n\n*{caption}*" for name, caption in shown.items())
 
-    ramp = ex.ramp_numbers(ex.ramp("I"))
-    return f"""# Part II, redone on our plant
-
-Every value that Bukhari, Hovd and Winkler print in Part II beside what our plant, or the paper's own functions, give.
-Written by `python -m studies.paper`; `docs/paper.md` says what each step means, in sections of the
-same numbers.
-
-- The design procedure returns the printed compensator.
-- The printed crossover ({CROSSOVER} rad/s) and phase margin ({PHASE_MARGIN_DEG:.0f} degrees) **do not follow from the
-  paper's own functions and Table 1**.
-- In the temperature ramp the true radius is off by up to {ramp["max_error_mm"]:.2f} mm while the compensated
-  measurement shows {ramp["max_compensated_error_mm"]:.2f} mm.
-
-## Published beside computed
-
-A dash means that the paper gives no number.
-
-{as_markdown(rows())}
-
-## 1. Open loop
-
-The pull speed falls by 10 % within 600 s. The paper shows its profile without numbers, so the shapes can be compared
-and not the values.
-
-{figures("figure_02", "figure_03")}
-
-## 4. PID
-
-The loop is continuous; K_p = {PID.K_p} 1/s, T_i = {PID.T_i:.0f} s, T_d = {PID.T_d:.0f} s, N = {PID.N:.0f}.
-
-{_margins()}
-
-{figures("figure_09")}
-
-Without the compensator the linear loop is unstable. What that means on the nonlinear plant, whose pull speed has
-limits, shows in the temperature ramp of the next section:
-
-{_without()}
-
-In Model II the instability costs the crystal; its RMSE is over the time it lived. In Model I, where a rising meniscus
-freezes faster, it ends in a limit cycle between the limits of the pull speed, which no puller should be asked for. The
-true radius is nearer to its reference all the same: the cycle holds the ring, whose mean is that of the crystal, and
-the compensated loop loses accuracy by the compensator's washout (section 6).
-
-## 5. Closed loop on the nonlinear plant
-
-The ramp: T_1,ref rises by 0.5 K/min for 10 min and holds. The paper gives no duration, nor the gains of the temperature
-loop, so its curves can be compared in shape only.
-
-{figures("figure_11", "figure_12", "figure_13", "figure_14")}
-
-## 6. The washout, which the paper does not show
-
-Largest errors in the ramp, with the compensator redesigned from our Model I for each high-pass cut-off:
-
-{_cut_offs()}
-
-## 7. Hurle against the exact meniscus
-
-At the operating point, Hurle's closed form and the axisymmetric Young-Laplace equation; the last line is of a ramp on a
-plant with that meniscus, Model I:
-
-{_menisci()}
-"""
+    return Path(__file__).with_name("template.md").read_text("utf-8").format(
+        CROSSOVER=CROSSOVER, PHASE_MARGIN_DEG=PHASE_MARGIN_DEG, PID=PID, ramp=ex.ramp_numbers(ex.ramp("I")),
+        comparison=as_markdown(rows()), open_loop=figures("figure_02", "figure_03"), bode=figures("figure_09"),
+        closed_loop=figures("figure_11", "figure_12", "figure_13", "figure_14"), margins=_margins(),
+        without=_without(), cut_offs=_cut_offs(), menisci=_menisci(),
+    )  # fmt: skip
 
 
 def _table(head: str, lines: Iterable[Iterable[str]]) -> str:
