@@ -53,6 +53,15 @@ def make_view(render_mode: str | None, size: Any, config: Config) -> View | None
     return View(render_mode, width, height, config)
 
 
+def record_of(env: Any) -> Record:
+    """The record of an environment with a render mode, since its last reset; ResetNeeded before the first."""
+    view = env.unwrapped._view
+    if view is None or view.record is None:
+        raise ResetNeeded("no record before the first reset, or without a render_mode")
+    record: Record = view.record
+    return record
+
+
 class View:
     """The record of an episode, drawn when asked or, for "human", at every reset and step."""
 
