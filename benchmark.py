@@ -6,6 +6,7 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -55,6 +56,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     add("--controller", action="append", default=[], metavar="FILE.py:NAME", help=own)
     own = "scenario of your own, in place of others"
     add("--scenario", action="append", default=[], metavar="FILE.py:NAME", help=own)
+    parser.add_puller("every row runs on it, with the controllers that are designed for it")
     add("--slow", action="store_true", help="slow controllers too, on 50 episodes; resumed from results/cache")
     add("--overwrite", action="store_true", help="replace files of earlier or other runs")
     add("--quiet", action="store_true", help="no progress bar, no table")
@@ -80,6 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.out is None and arguments.json is None:
         mine = [place.rpartition(":")[2] for place in (*arguments.controller, *arguments.scenario)]
         mine += [name or file.stem for name, file in arguments.agent]
+        mine += [Path(arguments.puller).stem] if arguments.puller else []
         arguments.out = OWN / "-".join(dict.fromkeys(mine)) if mine else FOLDER
     command = shlex.join(["benchmark.py", *(sys.argv[1:] if argv is None else argv)])
     return guarded("benchmark.py", lambda: benchmark(arguments, command), "benchmark")
@@ -101,7 +104,7 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
         import matplotlib  # noqa: F401
         import plotly  # noqa: F401
     with tqdm(unit="step", unit_scale=True, leave=False, disable=arguments.quiet) as bar:
-        results = run(contenders, rows, arguments.episodes, bar, CACHE, BOUNDS)
+        results = run(contenders, rows, arguments.episodes, bar, CACHE, None if arguments.puller else BOUNDS)
     quoted = README if not smaller and arguments.out and arguments.out.resolve() == FOLDER else None
     write(arguments.out, arguments.json, results, command, quoted)
     if not arguments.quiet:
@@ -118,12 +121,14 @@ def rows_of(arguments: argparse.Namespace) -> list[Row]:
     """Scenarios that the command line asks for, as rows of the protocol."""
     from cz_gym.evaluation import user_code
     from cz_gym.evaluation.protocol import ROWS, check_episodes, find_row
+    from cz_gym.puller import chosen_puller
 
     check_episodes(arguments.episodes)
     names = arguments.scenarios or [row.name for row in ROWS if row.default and not arguments.scenario]
     rows = [*map(find_row, names), *map(user_code.row, arguments.scenario)]
     user_code.check_apart([row.name for row in rows], "scenario")
-    return rows
+    puller = chosen_puller(arguments.puller)
+    return [replace(row, puller=puller) for row in rows]
 
 
 def contenders_of(arguments: argparse.Namespace, rows: Sequence[Row]) -> list[Contender]:
@@ -134,6 +139,7 @@ def contenders_of(arguments: argparse.Namespace, rows: Sequence[Row]) -> list[Co
     what was given and what is allowed.
     """
     from cz_gym.agents import OnnxPolicy, shipped_names, shipped_seeds
+    from cz_gym.baselines.for_puller import ON_PULLER
     from cz_gym.baselines.registry import CONTROLLERS
     from cz_gym.contender import agent
     from cz_gym.evaluation import user_code
@@ -148,8 +154,10 @@ def contenders_of(arguments: argparse.Namespace, rows: Sequence[Row]) -> list[Co
     def may_run(each: Contender) -> bool:
         return not each.slow or arguments.slow or is_cached(each, rows, arguments.episodes, CACHE)
 
-    wanted, agents = arguments.controllers, list(given) or shipped
-    if not wanted and own and not arguments.slow:
+    wanted, agents = arguments.controllers, list(given) or ([] if arguments.puller else shipped)
+    if not wanted and arguments.puller:
+        wanted = [*ON_PULLER, *agents]
+    elif not wanted and own and not arguments.slow:
         wanted = [each.name for each in CONTROLLERS if each.quoted]
     elif not wanted:
         wanted = [each.name for each in CONTROLLERS if (arguments.slow if each.slow else each.default)] + agents
@@ -197,7 +205,7 @@ def is_partial(arguments: argparse.Namespace, contenders: Sequence[Contender], r
 
     usual = {each.name for each in CONTROLLERS if each.default and not each.slow} | set(shipped_names())
     missing = usual - {each.name for each in contenders} or {row for row in ROWS if row.default} - set(rows)
-    own = arguments.agent or arguments.controller or arguments.scenario
+    own = arguments.agent or arguments.controller or arguments.scenario or arguments.puller
     return bool(arguments.episodes < EPISODES or missing or own)
 
 

@@ -47,6 +47,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         "scenario to train on: a name, all, FILE.py:NAME, or A=0.6,B=0.4 (default: the recipe's, or the resumed run's)"
     )
     add("--scenario", help=about)
+    parser.add_puller("train for it, at its control interval")
     about = (
         "run folder (default: runs/<algo>-seed<seed>); with --seeds the folder of their folders seed0, seed1 ... "
         "(default: runs/<algo>)"
@@ -58,7 +59,8 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     add("--checkpoint-seconds", type=_seconds, default=CHECKPOINT_SECONDS, metavar="S", help=about)
     arguments = parser.parse_args(argv)
     suffix = "" if arguments.seeds else f"-seed{arguments.seed or 0}"
-    arguments.out = arguments.out or Path("runs") / f"{arguments.algo or DEFAULT}{suffix}"
+    puller = f"-{Path(arguments.puller).stem}" if arguments.puller else ""
+    arguments.out = arguments.out or Path("runs") / f"{arguments.algo or DEFAULT}{puller}{suffix}"
     return arguments
 
 
@@ -94,7 +96,8 @@ def train(arguments: argparse.Namespace) -> int:
     seeds = arguments.seeds or [arguments.seed]
     jobs = [Job(folder, recipe, seed, *options) for folder, seed in zip(folders, seeds, strict=True)]
     what = f"{len(jobs)} seeds" if arguments.seeds else f"seed {arguments.seed}, {recipe.steps:,} steps"
-    print(f"{recipe.name}, {what} on {recipe.config.scenario.name}, into {arguments.out}")
+    machine = f", puller {recipe.config.puller.label}" if recipe.puller else ""
+    print(f"{recipe.name}, {what} on {recipe.config.scenario.name}{machine}, into {arguments.out}")
     if not arguments.seeds:
         with tqdm(total=recipe.steps, unit="step", unit_scale=True, dynamic_ncols=True, mininterval=1.0) as bar:
             summary = train_seed(jobs[0], bar)
@@ -150,6 +153,7 @@ def _fill_from_resumed_run(arguments: argparse.Namespace, folders: list[Path]) -
         "algo": (saved.get("algorithm"), DEFAULT),
         "seed": (saved.get("seed"), 0),
         "scenario": (settings.get("scenario"), ""),
+        "puller": (settings.get("puller"), ""),
     }
     for name, (value, default) in values.items():
         if getattr(arguments, name) is None:
@@ -163,10 +167,13 @@ def _recipe_from(arguments: argparse.Namespace, saved_steps: int | None) -> Reci
     """The recipe with scenario and steps of the command line or the resumed run."""
     from cz_gym.agents.training.recipes import RECIPES
     from cz_gym.config import check_config
+    from cz_gym.puller import chosen_puller
 
     recipe = RECIPES[arguments.algo]
     steps = arguments.steps or saved_steps or recipe.steps
-    recipe = replace(recipe, scenario=arguments.scenario or recipe.scenario, steps=steps)
+    scenario = arguments.scenario or recipe.scenario
+    recipe = replace(recipe, scenario=scenario, steps=steps, puller=arguments.puller or recipe.puller)
+    chosen_puller(recipe.puller or None)
     check_config(recipe.config)
     return recipe
 

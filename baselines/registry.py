@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
+from cz_gym.baselines import for_puller
 from cz_gym.baselines.bounds import lqg as lqg_bounds
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
 from cz_gym.baselines.lqg import designs
+from cz_gym.baselines.lqg.controller import LQG
 from cz_gym.baselines.lqg.designs import adaptive
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
 from cz_gym.baselines.pid.settings import tuned
@@ -15,12 +17,23 @@ from cz_gym.config import Config, check_config
 from cz_gym.contender import Contender
 from cz_gym.errors import CzError
 from cz_gym.names import unknown
+from cz_gym.puller import DEFAULT
 
 from .policy import OpenLoop, Policy
 
 
 def _tuned(name: str, meaning: str, quoted: bool = False) -> Contender:
-    return Contender(name, lambda config: tuned(name, config), "measured", meaning, quoted=quoted)
+    return Contender(name, lambda config: _pid(name, config), "measured", meaning, quoted=quoted)
+
+
+def _pid(name: str, config: Config) -> Policy:
+    own = config.puller != DEFAULT and name in for_puller.ON_PULLER
+    return for_puller.pid(name, config) if own else tuned(name, config)
+
+
+def _lqg_for(name: str, config: Config) -> LQG:
+    own = config.puller != DEFAULT and name in for_puller.ON_PULLER
+    return for_puller.lqg(name, config) if own else designs.lqg(name, config)
 
 
 IN_TABLE = 0.02
@@ -29,7 +42,7 @@ agents, so their radius errors can be compared. On ``hard`` the agents are more 
 
 
 def _lqg(name: str, meaning: str, default: bool = True) -> Contender:
-    return Contender(name, partial(designs.lqg, name), "measured", meaning, default)
+    return Contender(name, partial(_lqg_for, name), "measured", meaning, default)
 
 
 def _lqg_at(activity: float) -> Contender:
@@ -39,7 +52,7 @@ def _lqg_at(activity: float) -> Contender:
 
 
 def _adaptive(name: str) -> Contender:
-    make = partial(designs.lqg, name)
+    make = partial(_lqg_for, name)
     meaning = f"{name} with filters for weak to strong fluctuations, weighted by how well they predict"
     default = name == designs.family_name(IN_TABLE)
     return Contender(f"{name}-adaptive", lambda config: adaptive(make(config)), "measured", meaning, default)
@@ -55,7 +68,7 @@ _bound = partial(Contender, default=False, privileged=True)
 
 
 def _privileged(name: str) -> Contender:
-    make = partial(designs.lqg, name)
+    make = partial(_lqg_for, name)
     meaning = f"bound: {name} given the puller's parameters and how strong each crystal's fluctuations are"
     return _bound(f"{name}-privileged", lambda config: lqg_bounds.privileged(make(config)), "measured", meaning)
 
@@ -71,6 +84,14 @@ CONTROLLERS: tuple[Contender, ...] = (
         CompensatedPID().for_config,
         "measured",
         "the paper's compensator and PID as printed, Table 1",
+        quoted=True,
+    ),
+    Contender(
+        "paper-here",
+        for_puller.paper_here,
+        "measured",
+        "the paper's compensator and PID, designed by its procedure for this puller",
+        default=False,
         quoted=True,
     ),
     Contender(

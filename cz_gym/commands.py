@@ -30,6 +30,11 @@ class OneLineParser(argparse.ArgumentParser):
         """Exit with code 2."""
         self.exit(2, f"{self.prog}: {' '.join(message.split())}\n")
 
+    def add_puller(self, use: str = "run on it") -> None:
+        """Add the option ``--puller``."""
+        about = f"puller file, or the name of a shipped one: {use} (docs/extend/puller.md)"
+        self.add_argument("--puller", metavar="FILE.toml", help=about)
+
     def run(
         self,
         body: Callable[[argparse.Namespace], int | None],

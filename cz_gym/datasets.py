@@ -33,6 +33,7 @@ from cz_gym.errors import CzError
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from cz_gym.names import unknown
 from cz_gym.observation import DRIVE_CHANNELS, to_measured
+from cz_gym.puller import DEFAULT, Puller, chosen_puller
 from cz_gym.task import drives_of
 from cz_gym.vector import CzVectorEnv
 
@@ -126,6 +127,7 @@ def write(
     noise: float = NOISE,
     horizon: float = 10800.0,
     overwrite: bool = False,
+    puller: Puller = DEFAULT,
 ) -> Any:
     """Write the Minari dataset ``cz/<scenario>/<name>-v0`` and return it; a dot in the name becomes "_".
 
@@ -134,6 +136,7 @@ def write(
     """
     minari, _ = import_module("minari"), import_module("h5py")
     settings: dict[str, Any] = {"scenario": scenario, "observation": "history", "action": "direct", "horizon": horizon}
+    settings |= {"puller": puller} if puller != DEFAULT else {}
     config, place = make_config(**settings), f"cz/{scenario}/{name.replace('.', '_')}-v0"
     if not seeds or not set(seeds) <= set(TRAINING_SEEDS):
         raise CzError(f"seeds must be some of the training seeds, {TRAINING_SEEDS[0]} to {TRAINING_SEEDS[-1]}")
@@ -176,20 +179,22 @@ def main(argv: list[str] | None = None) -> int:
     add("--noise", type=float, default=NOISE, metavar="X", help="highest level of the excitation (%(default)s)")
     add("--out", type=Path, metavar="FOLDER", help="instead of $MINARI_DATASETS_PATH or ~/.minari/datasets")
     add("--overwrite", action="store_true", help="replace datasets that exist")
+    parser.add_puller("record on it, at its control interval")
     return parser.run(_write_all, argv, "data", "the datasets named above are complete")
 
 
 def _write_all(given: argparse.Namespace) -> None:
     if given.out is not None:
         os.environ["MINARI_DATASETS_PATH"] = str(given.out.resolve())
+    puller = chosen_puller(given.puller)
     chosen = [
-        (name, find_policy(name, make_config(scenario)), scenario)
+        (name, find_policy(name, make_config(scenario, puller=puller)), scenario)
         for scenario in given.scenarios.split(",")
         for name in given.policies.split(",")
     ]
     for each in chosen:
         began = time.perf_counter()
-        dataset = write(*each, TRAINING_SEEDS[: given.episodes], given.noise, overwrite=given.overwrite)
+        dataset = write(*each, TRAINING_SEEDS[: given.episodes], given.noise, overwrite=given.overwrite, puller=puller)
         said = f"{dataset.id}: {dataset.total_episodes} episodes, {dataset.total_steps:,} steps, "
         print(f"{said}{dataset.storage.get_size():.0f} MB, {time.perf_counter() - began:.1f} s", flush=True)
 

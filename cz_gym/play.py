@@ -22,6 +22,7 @@ from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.replay import Playback
 from cz_gym.evaluation.rollout import rollout
+from cz_gym.puller import chosen_puller
 from cz_gym.rendering.canvas import load
 from cz_gym.units import MINUTE
 
@@ -49,12 +50,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--seed", type=between(0, 2**31 - 1), default=1, metavar="N", help="which crystal (%(default)s)")
     add("--speed", type=between(5, 300), default=60, metavar="N", help="times faster than real time (%(default)s)")
     add("--minutes", type=between(1, 6000), default=180, metavar="M", help="length of the run (%(default)s)")
+    parser.add_puller("pull its crystals")
     return parser.run(_play, arguments, "render")
 
 
 def settings(arguments: argparse.Namespace) -> Config:
     """The environment's settings."""
-    return make_config(arguments.scenario, None, "measured", horizon=arguments.minutes * MINUTE, action="rate")
+    length, puller = arguments.minutes * MINUTE, chosen_puller(arguments.puller)
+    return make_config(arguments.scenario, None, "measured", horizon=length, action="rate", puller=puller)
 
 
 def keys() -> dict[tuple[int, ...], Action]:

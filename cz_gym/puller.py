@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import sys
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -237,6 +238,8 @@ class Puller:
     """Time between actions [s]."""
     missing: tuple[str, ...] = field(default=(), compare=False, repr=False)
     """Keys that its file does not have: they keep the default's value."""
+    file: Path | None = field(default=None, compare=False, repr=False)
+    """The file that it was read from; what is designed for it stands beside."""
 
     def __post_init__(self) -> None:
         if not (isinstance(self.name, str) and self.name.strip() and len(self.name) <= 80 and self.name.isprintable()):
@@ -299,7 +302,7 @@ def read_puller(path: str | Path) -> Puller:
     with naming(path):
         text = path.read_text("utf-8")
     try:
-        return _puller(tomllib.loads(text, parse_float=Decimal), path.stem)
+        return replace(_puller(tomllib.loads(text, parse_float=Decimal), path.stem), file=path)
     except (tomllib.TOMLDecodeError, CzError) as error:
         raise CzError(f"{path}: {' '.join(str(error).split())}") from None
 
@@ -321,6 +324,14 @@ def find_puller(given: str | Path | Puller | None) -> Puller:
     if Path(given).suffix != ".toml" and not Path(given).exists():
         raise CzError(unknown("puller", str(given), shipped, ", or a file NAME.toml"))
     return read_puller(given)
+
+
+def chosen_puller(given: str | None) -> Puller:
+    """The puller that a command line names; a line on stderr lists the keys that its file does not have."""
+    puller = find_puller(given)
+    if puller.missing:
+        print(f"puller {puller.label}: the default's values for {', '.join(puller.missing)}", file=sys.stderr)
+    return puller
 
 
 def to_toml(puller: Puller) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from cz_gym import puller as machine
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.baselines.analysis.frequency import LoopMargins, frequencies, margins_of, opened, response
 from cz_gym.baselines.analysis.linear_form import LinearForm, linear_form
@@ -30,10 +31,12 @@ PLACES = {"camera": "ring", "v_p": "pull speed", "Q_H": "heater"}
 """Places where the loop is opened, and their names."""
 
 
-def form_of(name: str) -> LinearForm:
+def form_of(name: str, puller: machine.Puller = machine.DEFAULT) -> LinearForm:
     """The linear form of a shipped controller, or of ``FILE.py:NAME``; ValueError says in one line why it has none."""
-    config = make_config("nominal", observation="measured", action="direct")
-    return linear_form(user_code.controller(name).make(config) if ":" in name else make_controller(name, config))
+    config = make_config("nominal", observation="measured", action="direct", puller=puller)
+    sensor = make_config("randomized", puller=puller).sole_scenario.sensor
+    policy = user_code.controller(name).make(config) if ":" in name else make_controller(name, config)
+    return linear_form(policy, sensor)
 
 
 def margins(form: LinearForm, puller: Puller, at: str) -> tuple[Any, LoopMargins]:
@@ -79,6 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("controller", help="name of a shipped controller, or FILE.py:NAME")
     parser.add_argument("--mix", type=float, default=0.5, help="1: Model I, 0: Model II (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("runs/bode.png"), help="picture (default: %(default)s)")
+    parser.add_puller("the loop with its plant")
     return parser.run(_main, arguments, "benchmark")
 
 
@@ -86,7 +90,8 @@ def _main(given: argparse.Namespace) -> None:
     if not 0.0 <= given.mix <= 1.0:
         raise CzError(f"--mix must lie in [0, 1], not {given.mix:g}")
     check_writable(given.out.parent)
-    form, puller = form_of(given.controller), make_puller(lam=given.mix)
+    own = machine.chosen_puller(given.puller)
+    form, puller = form_of(given.controller, own), make_puller(own.parameters, given.mix)
     heats = form.controller.C[1].any() or form.controller.D[1].any()
     found = {at: margins(form, puller, at) for at in PLACES if heats or at != "Q_H"}
     heads = ("opened at", "crossover [rad/s]", "gain up", "gain down", "phase [deg]", "delay [s]", "sensitivity")
@@ -97,7 +102,9 @@ def _main(given: argparse.Namespace) -> None:
     print(table(heads, rows))
     if not close(form.controller, puller, form.dt).stable:
         print("the closed loop is unstable: it has no margins")
-    zones = [(name, *stable_range(form.controller, form.dt, of, given.mix)) for name, of in HOT_ZONE.items()]
+    zones = [
+        (name, *stable_range(form.controller, form.dt, of, given.mix, own.parameters)) for name, of in HOT_ZONE.items()
+    ]
     print(table(("factor on", "stable from", "to"), [(name, f"{low:.2f}", f"{high:.2f}") for name, low, high in zones]))
     write_files({given.out: picture(given.controller, form, {at: values for at, (values, _) in found.items()})})
     print(f"wrote {given.out}")

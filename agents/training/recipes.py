@@ -30,14 +30,20 @@ class Recipe:
     scenario: str = "all"
     """Scenario or mixture of the training and validation crystals (:func:`cz_gym.evaluation.user_code.scenarios`)."""
     control_interval: float = 5.0
-    """Time between actions [s]."""
+    """Time between actions on the default puller [s]."""
+    puller: str = ""
+    """Puller file, or name of a shipped one, which has a control interval of its own; empty: the default puller."""
 
     @property
     def config(self) -> Config:
         """The environment that the recipe's agents act in."""
-        crystals = scenarios(self.scenario)
+        interval = None if self.puller else self.control_interval
         return make_config(
-            crystals, observation=self.observation, control_interval=self.control_interval, action=self.action
+            scenarios(self.scenario),
+            observation=self.observation,
+            control_interval=interval,
+            action=self.action,
+            puller=self.puller or None,
         )
 
 

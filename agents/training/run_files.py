@@ -34,7 +34,7 @@ def check_settings(folder: Path, recipe: Recipe, seed: int) -> list[dict[str, An
 
 def identity(recipe: Recipe, seed: int) -> dict[str, Any]:
     """The settings that a resumed run must share with the one that was begun; it may be longer."""
-    settings = {name: value for name, value in asdict(recipe).items() if name != "steps"}
+    settings = {name: value for name, value in asdict(recipe).items() if name != "steps" and value != ""}
     return {
         "algorithm": recipe.name,
         "seed": seed,

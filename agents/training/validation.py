@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.config import Config, make_config
+from cz_gym.config import Config
 from cz_gym.cost import COST_CAP
 from cz_gym.evaluation.metrics import Metrics, metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
@@ -57,7 +58,7 @@ def validate(policy: Any, config: Config, seeds: Sequence[int]) -> Validation:
 
 def references(make_controller: Callable[[str, Config], Any], recipe: Recipe) -> References:
     """RMSEs of the classical controllers on the crystals of a recipe; ``make_controller`` makes one by its name."""
-    config = make_config(recipe.config.scenario, None, "measured", recipe.control_interval, action="direct")
+    config = replace(recipe.config, observation="measured", action="direct")
     # Classical controllers are designed for one scenario.
     design = config if len(config.scenario.scenarios) == 1 else config.with_scenario("randomized")
     found = {}

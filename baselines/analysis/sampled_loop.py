@@ -34,6 +34,7 @@ _DISTURBED = ("v_p", "Q_H", "Q_d", "dT_i", "camera", "pyrometer")
 """Inputs of a loop."""
 HOT_ZONE = {name: name for name in ("C_1", "C_2", "C_b", "kappa_12", "G_1a", "G_2b")} | {"kappa_b": "eps"}
 """Constants of a puller that follow from estimates, and the parameter that each is proportional to."""
+_NOMINAL = Parameters()
 WIDEST = 4.0
 """Largest factor on a parameter for which a loop's stability is asked; the smallest is its inverse [-]."""
 _ANSWERS = ("v_p", "Q_H", "r_c", "r_br")
@@ -186,12 +187,13 @@ def close(controller: StateSpace, puller: Puller, dt: float, broken: str = "") -
     )
 
 
-def stable_range(controller: StateSpace, dt: float, parameter: str, lam: float) -> tuple[float, float]:
-    """The range of a factor on that parameter of the default puller, around 1, in which the closed loop is stable.
+def stable_range(
+    controller: StateSpace, dt: float, parameter: str, lam: float, nominal: Parameters = _NOMINAL
+) -> tuple[float, float]:
+    """The range of a factor on that parameter of a puller, around 1, in which the closed loop is stable.
 
     It ends at 1/WIDEST and WIDEST; both ends are NaN if the loop is unstable with the puller as it is.
     """
-    nominal = Parameters()
 
     def stable(factor: float) -> bool:
         puller = make_puller(nominal._replace(**{parameter: factor * getattr(nominal, parameter)}), lam)

@@ -100,5 +100,5 @@ def settings_of(controller: str, scenario: Scenario) -> FilteredPID | Industrial
 
 
 def tuned(controller: str, config: Config) -> FilteredPID | Industrial:
-    """The controller with its tuned settings for that environment."""
+    """The controller with its tuned settings for that environment, on the default puller."""
     return settings_of(controller, config.sole_scenario).for_config(config)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from cz_gym.baselines import for_puller
 from cz_gym.baselines.analysis.frequency import LoopMargins, frequencies, margins_of, opened, response
 from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign
@@ -21,9 +22,10 @@ from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.physics.linearisation import radius_model
 from cz_gym.physics.plant import Puller, make_puller
+from cz_gym.puller import DEFAULT
 from cz_gym.units import HOUR, MINUTE, MM
 
-from .search import Figures, Goal, Parameter
+from .search import Figures, Goal, Parameter, value_at
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,7 @@ def margins(policy: FilteredPID) -> list[tuple[LoopMargins, Puller]]:
 
 def calm(found: Figures, policy: FilteredPID) -> float:
     """Slack of the pull steps, weighted [-]."""
-    return STEP_WEIGHT * (STEP - found.pull_step)
+    return STEP_WEIGHT * (STEP * policy.v_0 / DEFAULT.parameters.v_0 - found.pull_step)
 
 
 def insensitive(found: Figures, policy: FilteredPID) -> float:
@@ -201,6 +203,33 @@ def _lqg_goal(name: str, scenario: Scenario) -> LQGGoal:
     serves_hard = name in ("lqg", "lqg-quiet") and scenario == RANDOMIZED
     survive = (first, "hard") if serves_hard else (first,)
     return LQGGoal(design_of(name, scenario), LQG_PARAMETERS, survive, *LQG_LIMITS[name, scenario.name])
+
+
+QUICK = {"pid.K_p", "pid.T_i", "pid.T_d", "T_f", "compensator.gain", "heater.K", "heater.K_pull", "heater.T_pull"}
+"""Parameters of a PID that are searched for a puller of the user's own, from its scaled settings."""
+FILTER_PARAMETERS = ("noise.heater_walk", "noise.thermal_walk", "noise.drift_rate_sd", "weights.pull_step")
+"""The same of an LQG: how much its filter doubts the hot zone, and its activity."""
+NEAR = 8.0
+"""How far, as a factor, a search for a puller goes from the scaled settings [-]."""
+
+
+def goal_on(name: str, config: Config) -> Goal:
+    """The goal of a controller's search for a puller of the user's own; CzError if there is none."""
+    if name == for_puller.FILTER:
+        design = for_puller.scaled_design(name, config)
+        near = tuple(_near(Parameter(path, 0.0, 0.0), design) for path in FILTER_PARAMETERS)
+        return LQGGoal(design, near, (), 0.3 * config.puller.scale, 0.02, False)
+    if name not in for_puller.PIDS:
+        raise CzError(unknown("controller to tune for a puller", name, [*for_puller.PIDS, for_puller.FILTER]))
+    start, given = for_puller.scaled_pid(name, config), PIDS[name]
+    near = tuple(_near(each, start) for each in given["parameters"] if each.path in QUICK)
+    return PIDGoal(start, survive=("hard",), **given | {"parameters": near})
+
+
+def _near(parameter: Parameter, start: Any) -> Parameter:
+    """The parameter with a range around where the search begins."""
+    value = value_at(start, parameter.path)
+    return parameter._replace(low=value / NEAR, high=value * NEAR) if parameter.log else parameter
 
 
 TUNABLE = (*PIDS, *SHIPPED)

@@ -12,8 +12,7 @@ import json
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -21,6 +20,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from cz_gym.atomic_files import check_writable, naming, write_files
+from cz_gym.baselines.for_puller import with_values
 from cz_gym.baselines.lqg.regulator import STEP_TIME
 from cz_gym.baselines.policy import Floats
 from cz_gym.config import Config
@@ -28,6 +28,7 @@ from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
+from cz_gym.puller import DEFAULT
 
 DIGITS = 4
 """Number of significant digits of a candidate's values."""
@@ -109,14 +110,6 @@ def value_at(settings: Any, path: str) -> float:
     return float(attrgetter(path)(settings))
 
 
-def with_value(settings: Any, path: str, value: float) -> Any:
-    """The settings with another value of a parameter; settings are dataclasses or NamedTuples."""
-    head, _, rest = path.partition(".")
-    new = with_value(getattr(settings, head), rest, value) if rest else value
-    change = settings._replace if hasattr(settings, "_replace") else partial(replace, settings)
-    return change(**{head: new})
-
-
 def file_name(controller: str, scenario: str) -> str:
     """Name of a search's file in results/tuning."""
     return f"{controller}.json" if scenario == "randomized" else f"{controller}-{scenario}.json"
@@ -173,10 +166,7 @@ class Search:
 
     def settings(self, values: Iterable[float]) -> Any:
         """The settings with these values of the parameters."""
-        settings = self.goal.start
-        for parameter, value in zip(self.goal.parameters, values, strict=True):
-            settings = with_value(settings, parameter.path, value)
-        return settings
+        return with_values(self.goal.start, dict(zip(self._paths, values, strict=True)))
 
     def explore(self) -> None:
         """Minimise the objective with COBYLA while every slack is positive."""
@@ -252,6 +242,8 @@ class Search:
                 found = json.loads(path.read_text("utf-8"))
             if found["parameters"] != self._paths:
                 raise CzError(f"its parameters are not those of {self.controller}")
+            if found.get("puller", DEFAULT.label) != self.config.puller.label:
+                raise CzError(f"it is of puller {found['puller']}: remove it to begin anew")
             trials = [Trial(tuple(values), score, facts) for values, score, facts in found["history"]]
             return found["budget"]["episodes"], trials
         except (AttributeError, KeyError, TypeError, ValueError) as error:
@@ -267,12 +259,14 @@ class Search:
     def _write(self, choice: Mapping[str, Any]) -> None:
         if self.path is None:
             return
-        about = {
+        about: dict[str, Any] = {
             "controller": self.controller,
             "scenario": self.config.scenario.name,
             "scenario_hash": self.config.scenario.hash,
             "budget": self.budget,
         }
+        if self.config.puller != DEFAULT:
+            about["puller"] = self.config.puller.label
         lines = ",\n  ".join(map(json.dumps, self.trials))
         head = json.dumps({**about, **choice, "parameters": self._paths}, indent=1).removesuffix("\n}")
         write_files({self.path: f'{head},\n "history": [\n  {lines}\n ]\n}}\n'.encode()})

@@ -1,0 +1,116 @@
+"""Controllers for another puller: the paper's procedure, proportions, what a search keeps, and the commands."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmark import main as benchmark
+from cz_gym import make_puller
+from cz_gym.agents import load
+from cz_gym.baselines import for_puller
+from cz_gym.baselines.analysis.linear_form import linear_form
+from cz_gym.baselines.analysis.sampled_loop import close
+from cz_gym.baselines.pid.compensated_pid import CompensatedPID
+from cz_gym.baselines.pid.settings import settings_of
+from cz_gym.baselines.registry import find_controller, make_controller
+from cz_gym.baselines.tuning import __main__ as tuning
+from cz_gym.baselines.tuning import for_puller as design
+from cz_gym.baselines.tuning.search import Figures
+from cz_gym.config import make_config
+from cz_gym.episodes.scenarios import RANDOMIZED
+from cz_gym.errors import CzError
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.puller import find_puller, write_puller
+from tests.observed import PLAIN
+
+WIDE = make_config(puller="silicon-300mm", **PLAIN)
+
+
+def test_on_the_default_puller_the_papers_procedure_gives_the_papers_numbers() -> None:
+    here, printed = for_puller.paper_here(make_config(**PLAIN)), CompensatedPID()
+    assert here.pid == printed.pid
+    assert here.compensator is not None
+    np.testing.assert_allclose(list(vars(here.compensator).values()), [-0.22517, 1.684e-3, 2e-4], rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", for_puller.PIDS)
+def test_on_the_default_puller_nothing_is_scaled(name: str) -> None:
+    assert for_puller.scaled_pid(name, make_config(**PLAIN)) == settings_of(name, RANDOMIZED)
+
+
+@pytest.mark.parametrize("puller", ["silicon-300mm", "germanium"])
+@pytest.mark.parametrize("name", ["paper-here", "paper-tuned", "pid-conventional", "lqg-at-0.02"])
+def test_loops_are_stable_on_the_pullers_own_linear_model(name: str, puller: str) -> None:
+    config = make_config("nominal", puller=puller, **PLAIN)
+    form = linear_form(make_controller(name, config), config.sole_scenario.sensor)
+    assert form.dt == config.control_interval
+    for lam in (0.5, 1.0):
+        assert close(form.controller, make_puller(config.parameters, lam), form.dt).stable
+
+
+@pytest.mark.parametrize("name", ["paper-here", "paper-tuned", "lqg-at-0.02"])
+def test_a_scaled_controller_loses_no_crystal(name: str) -> None:
+    short = replace(WIDE, horizon=3600.0)
+    found = metrics(rollout(make_controller(name, short), short, range(4)))
+    assert not found.failure_rate.any()
+    assert found.rmse_observable_mm.mean() < 0.6
+
+
+def test_what_was_found_is_used_for_that_puller_alone(tmp_path: Path) -> None:
+    place = tmp_path / "mine.toml"
+    write_puller(find_puller("silicon-300mm"), place)
+    puller, kept = find_puller(place), tmp_path / "mine" / "paper-tuned.json"
+    config, before = make_config(puller=puller, **PLAIN), for_puller.pid("paper-tuned", WIDE)
+    assert for_puller.pid("paper-tuned", config) == replace(before, puller=puller)
+    kept.parent.mkdir()
+    kept.write_text(json.dumps({"puller": puller.label, "chosen": {"values": {"T_f": 12.5, "pid.K_p": 0.02}}}))
+    found: Any = make_controller("paper-tuned", config)
+    assert (found.T_f, found.pid.K_p) == (12.5, 0.02)
+    kept.write_text(json.dumps({"puller": "other (0)", "chosen": {"values": {}}}))
+    with pytest.raises(CzError, match=r"found for puller other \(0\), not for silicon-300mm"):
+        make_controller("paper-tuned", config)
+    kept.write_text("{}")
+    with pytest.raises(CzError, match="or damaged"):
+        make_controller("paper-tuned", config)
+
+
+def test_one_command_designs_and_another_runs_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = tmp_path / "mine.toml"
+    write_puller(find_puller("silicon-300mm"), place)
+    figures = Figures(0.1, 0.01, 0.01, 1900.0, 0.0, 5400)
+    monkeypatch.setattr(design, "measure", lambda policy, config, seeds: figures)
+    monkeypatch.setattr(design, "in_processes", lambda function, tasks, look: enumerate(map(function, tasks)))
+    assert tuning.main(["--puller", str(place), "--trials", "10"]) == 0
+    for name in (for_puller.FILTER, *for_puller.PIDS):
+        kept = json.loads((tmp_path / "mine" / f"{name}.json").read_text())
+        assert len(kept["history"]) > 5
+        assert kept["puller"] == find_puller(place).label
+    assert "wrote" in capsys.readouterr().out
+    out = tmp_path / "out"
+    words = ["--puller", str(place), "--controllers", "paper-here,paper-tuned", "--scenarios", "reference-b"]
+    assert benchmark([*words, "--out", str(out), "--quiet"]) == 0
+    written = json.loads((out / "benchmark.json").read_text())
+    assert written["provenance"]["puller"].startswith("silicon-300mm (")
+    assert written["provenance"]["control_interval_s"] == 2.0
+    assert "puller silicon-300mm (" in (out / "report.md").read_text()
+    assert tuning.main(["--puller", str(place), "--controller", "lqg"]) == 2
+    assert tuning.main([]) == 2
+    assert "name a --controller, or a --puller" in capsys.readouterr().err
+
+
+def test_agents_and_controllers_for_another_puller_are_refused_by_its_name() -> None:
+    with pytest.raises(ValueError, match=r"trained for puller default, this environment's is silicon-300mm \("):
+        load("ppo", make_config(puller="silicon-300mm"))
+    other = find_controller("lqg").make(make_config(**PLAIN))
+    with pytest.raises(CzError, match=r"the environment has .* puller silicon-300mm \("):
+        rollout(other, WIDE, [1])
+    assert (
+        benchmark(["--puller", "silicon-300mm", "--controllers", "ppo", "--scenarios", "nominal", "--json", "x"]) == 2
+    )
