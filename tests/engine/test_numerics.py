@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Truth, integrated
 
 from cz_gym import CzEnv, CzVectorEnv, Parameters, make_puller
 from cz_gym.engine.lockstep import judged
@@ -13,6 +12,7 @@ from cz_gym.episodes.record import Factors
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.plant import Disturbance, Inputs, State, rk4
 from cz_gym.task import HEIGHT_MIN
+from tests.equations import Truth, integrated
 from tests.observed import PLAIN
 from tests.stress.__main__ import WIDE, campaign, cases
 from tests.stress.adversaries import KINDS, Adversaries

@@ -3,12 +3,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import View, drawn, hold
 
 from cz_gym import SCENARIOS, CzEnv, Scenario, decode
 from cz_gym.episodes.scenario import Faults, Sensor
 from cz_gym.episodes.schedule import bias_offset, pyrometer_drift
 from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED, OBSERVATIONS, lags
+from tests.equations import Fields, drawn, hold
 from tests.observed import PLAIN
 
 
@@ -16,7 +16,7 @@ def run(env: CzEnv, steps: int, pull: float = 0.0, seed: int = 1) -> tuple[np.nd
     """Observations, infos and the state saved at the start, under a gentle sine or open loop."""
     observation, info = env.reset(seed=seed)
     start = env.get_state().slot
-    rows, infos, p = [observation], [info], View(start.slot["puller"])
+    rows, infos, p = [observation], [info], Fields(start.slot["puller"])
     for k in range(steps):
         feedback = hold(info, p) if pull else 0.0
         action = np.array([pull * np.sin(k / 9.0) + feedback, pull * np.cos(k / 20.0)], np.float32)
@@ -53,7 +53,7 @@ def test_measured_holds_what_the_control_computer_has_and_nothing_else(scenario:
     np.testing.assert_allclose(seen.v_p, column(infos, "v_p") - nominal["v_0"], atol=1e-11)
     np.testing.assert_allclose(seen.Q_H, column(infos, "Q_H") - nominal["Q_H_0"], atol=1e-2)
     t = 5.0 * np.arange(401)
-    e = View(start.slot["episode"])
+    e = Fields(start.slot["episode"])
     drift = np.array([pyrometer_drift(now, e) for now in t])
     pyrometer = column(infos, "T_1") + drift + drawn(env).noise[:401, 1] - nominal["T_1_0"]
     np.testing.assert_allclose(seen.T_1, pyrometer, atol=1e-5)
@@ -145,7 +145,7 @@ def test_faulty_camera_shows_the_last_value() -> None:
     scenario = Scenario("mine", sensor=SCENARIOS["hard"].sensor, faults=SCENARIOS["sensor-fault"].faults)
     env = CzEnv(scenario, info="all", **PLAIN)
     rows, infos, start = run(env, 2160, 0.01, seed=2)
-    noise, e, windows = drawn(env).noise, View(start.slot["episode"]), start.slot["freezes"]
+    noise, e, windows = drawn(env).noise, Fields(start.slot["episode"]), start.slot["freezes"]
     shown, invalid, silent = np.nan, 0, 0
     for k, info in enumerate(infos):
         t, camera = 5.0 * k, noise[k, 0]

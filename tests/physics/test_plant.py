@@ -3,7 +3,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import HOUR, Truth, View, design_rates, drawn, hold, integrated
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
@@ -16,6 +15,8 @@ from cz_gym.episodes.series import draw_factors
 from cz_gym.jit.compile import kernel
 from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.plant import NO_DISTURBANCE, Disturbance, Inputs, growth, hidden_load, rates, rk4
+from cz_gym.units import HOUR
+from tests.equations import Fields, Truth, design_rates, drawn, hold, integrated
 
 MIXES = [0.0, 0.3, 1.0]
 SPREAD = st.floats(0.85, 1.15)
@@ -127,7 +128,7 @@ def test_an_hour_of_driven_motion_agrees_with_scipy(interval: float, scenario: s
     env = CzEnv(scenario, control_interval=interval, horizon=HOUR, info="all")
     env.reset(seed=5)
     saved, interface = env.get_state().slot, drawn(env).interface
-    p, e, x = View(saved.slot["puller"]), View(saved.slot["episode"]), np.array(saved.slot["x"].tolist())
+    p, e, x = Fields(saved.slot["puller"]), Fields(saved.slot["episode"]), np.array(saved.slot["x"].tolist())
     steps = round(HOUR / interval)
     worst, heights, feedback = 0.0, [], 0.0
     for k in range(steps):
