@@ -97,7 +97,7 @@ class Excited:
             begins = np.ones(n, np.bool_)
         last = state or Memory(None, np.zeros(n, np.int64), np.zeros((n, 2)), begins)
         step, before = np.where(begins, 0, last.step), np.where(begins[:, None], 0.0, last.added)
-        error = decode(seen, parameters.v_0).ring_error
+        error = decode(seen, parameters.v_0, self.heater_range).ring_error
         stopped = (last.stopped & ~begins) | (np.abs(error) > self.limit)
         chip = (step * self.interval / self.clock + 1e-9).astype(np.int64)
         size = self.pull, self.heater * make_puller(parameters).Q_H_0 / self.heater_range

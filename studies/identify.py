@@ -1,0 +1,165 @@
+"""Pullers that nobody knows, each identified from a log of three hours: ``python -m studies.identify``.
+
+Their diameters are uniform from 100 to 300 mm. The start file has the right geometry and pull speed, a hot zone scaled
+with the crystal's area and a size of its own, and handbook values of the melt. The truth's hot zone is off by a factor
+of lognormal distribution, as the prior says. Each log is made under a PID of the puller's own, with and without
+excitation. Three LQGs of one design then run on the same crystals: told the truth, the identified file, the start.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from cz_gym import CzEnv, Parameters, make_puller
+from cz_gym.atomic_files import check_writable, write_files
+from cz_gym.baselines.lqg.designs import TOLD, lqg
+from cz_gym.baselines.pid.filtered_pid import FilteredPID
+from cz_gym.baselines.registry import make_controller
+from cz_gym.commands import OneLineParser
+from cz_gym.config import make_config
+from cz_gym.episodes.scenario import Pullers
+from cz_gym.episodes.scenarios import RANDOMIZED
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from cz_gym.evaluation.report.tables import markdown
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.identify import Excited, Identified, identify, read_log, record_log
+from cz_gym.identify.estimate import PRIOR_SD, measure_excitation
+from cz_gym.puller import Drives, Puller, read_puller, write_puller
+from cz_gym.task import HEATER_RANGE
+from cz_gym.units import KILO, MM, PERCENT
+
+PULLERS, CRYSTALS, QUICK = 20, 20, 3
+"""Pullers, crystals of each, pullers of a quick run."""
+HOT_ZONE, MELT = ("C_1", "C_2", "C_b", "kappa_12", "G_1a", "G_2b", "eps"), ("sigma", "k_l")
+"""What the start file has wrong by PRIOR_SD, and by MELT_SD."""
+MELT_SD = 0.1
+"""Standard deviation of the logarithm of the melt's numbers in handbooks [-]."""
+SCENARIO = replace(
+    RANDOMIZED, name="randomized, one puller", pullers=Pullers(RANDOMIZED.pullers.mix, start_radius_sd=0.2 * MM)
+)
+"""The scenario ``randomized`` without its spread of pullers."""
+
+
+class Row(NamedTuple):
+    """What came of a puller."""
+
+    truth: Puller
+    found: Identified
+    passive: tuple[float, float]
+    """Excitation of pull speed and heater in the log without excitation, in multiples of what is needed."""
+    rmse_mm: tuple[float, ...]
+    """Root mean square radius error of the LQGs told the truth, the identified file and the start [mm]."""
+    lost: tuple[int, ...]
+    """Crystals that they lost."""
+
+    @property
+    def inside(self) -> list[bool]:
+        """Whether the interval holds the truth, of every informed parameter."""
+        told = [e for e in self.found.estimates if e.informed and e.name in Parameters._fields]
+        return [e.low <= getattr(self.truth.parameters, e.name) <= e.high for e in told]
+
+
+def draw(number: int) -> tuple[Puller, Puller]:
+    """The start file and the truth of a puller."""
+    random, default = np.random.default_rng([5, number]), Parameters()
+    r_0 = random.uniform(50.0, 150.0) * MM
+    area = (r_0 / default.r_0) ** 2
+    size = area * 2.0 ** random.uniform(-1.0, 1.0)
+    scaled = dict.fromkeys(("C_1", "C_2", "C_b"), size) | dict.fromkeys(("kappa_12", "G_1a", "G_2b"), area)
+    start = default._replace(
+        r_0=r_0,
+        v_0=default.v_0 * random.uniform(0.7, 1.3) * (default.r_0 / r_0) ** 0.5,
+        R_cr=3.2 * r_0,
+        **{name: factor * getattr(default, name) for name, factor in scaled.items()},
+    )
+    sds = dict.fromkeys(HOT_ZONE, PRIOR_SD) | dict.fromkeys(MELT, MELT_SD)
+    truth = {name: getattr(start, name) * np.exp(sd * random.standard_normal()) for name, sd in sds.items()}
+    named, drives = f"puller {number}", Drives(heater_range=area * HEATER_RANGE)
+    return Puller(named, start, drives), Puller(named, start._replace(**truth), drives)
+
+
+def write_logs(truth: Puller, seed: int, folder: Path) -> tuple[Path, Path]:
+    """CSV files of three hours under a PID of the puller's own, with and without excitation."""
+    env = CzEnv(SCENARIO, observation="measured", action="direct", puller=truth, info="all")
+    pid = make_controller("pid-conventional", env.config)
+    assert isinstance(pid, FilteredPID)
+    pid = replace(pid, heater=replace(pid.heater, K=pid.heater.K * truth.parameters.C_1 / Parameters().C_1))
+    paths = folder / "excited.csv", folder / "passive.csv"
+    for path, policy in zip(paths, (Excited(pid), pid), strict=True):
+        record_log(env, policy, path, seed)
+    return paths
+
+
+def study(number: int, crystals: int) -> Row:
+    """Draw a puller, log it, identify it, and run the LQGs on it."""
+    start, truth = draw(number)
+    with tempfile.TemporaryDirectory() as name:
+        excited, passive = write_logs(truth, number, Path(name))
+        found, without = identify(read_log(excited), start), measure_excitation(read_log(passive), start)
+        write_puller(found.puller, Path(name) / "my.toml")
+        identified = read_puller(Path(name) / "my.toml")
+    config = make_config(SCENARIO, observation="measured", action="direct", puller=truth)
+    policies = [
+        replace(lqg(TOLD, config), parameters=told.parameters, puller=told, any_environment=True)
+        for told in (truth, identified, start)
+    ]
+    runs = [rollout(policy, config, VALIDATION_SEEDS[:crystals]) for policy in policies]
+    rmse = tuple(float(np.sqrt(np.mean(np.square(metrics(run).rmse_mm)))) for run in runs)
+    return Row(truth, found, without, rmse, tuple(int(run.failed.sum()) for run in runs))
+
+
+def report(rows: Sequence[Row]) -> str:
+    """The table and what follows from it."""
+    heads = "diameter [mm]", "heater [kW]", "told", "inside", "LQG told truth [mm]", "identified", "start", "lost"
+    lines = [
+        (
+            f"{2.0 * row.truth.parameters.r_0 / MM:.0f}",
+            f"{make_puller(row.truth.parameters).Q_H_0 / KILO:.0f}",
+            str(len(row.inside)),
+            str(sum(row.inside)),
+            *(f"{error:.3f}" for error in row.rmse_mm),
+            ", ".join(map(str, row.lost)),
+        )
+        for row in rows
+    ]
+    ratios = [row.rmse_mm[1] / row.rmse_mm[0] for row in rows]
+    inside, lost = np.concatenate([row.inside for row in rows]), np.sum([row.lost for row in rows], axis=0)
+    return f"""{markdown(heads, lines)}
+
+error of the LQG of the identified file over that of the truth: median {np.median(ratios):.3f}, worst {max(ratios):.3f}
+crystals lost, told the truth, the identified file, the start: {", ".join(map(str, lost))}
+intervals that hold the truth: {np.mean(inside) / PERCENT:.0f} % of {len(inside)} informed parameters
+without excitation, logs that are said to tell the pull speed's path: {sum(row.passive[0] >= 1.0 for row in rows)}
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    parser = OneLineParser("python -m studies.identify", "Identify pullers that nobody knows.")
+    parser.add_argument("--quick", action="store_true", help=f"{QUICK} pullers, 4 crystals each")
+    parser.add_argument("--out", type=Path, default=Path("results/identify"), metavar="FOLDER", help="%(default)s")
+    return parser.run(_main, arguments, "benchmark")
+
+
+def _main(given: argparse.Namespace) -> None:
+    check_writable(given.out)
+    rows = []
+    for number in range(QUICK if given.quick else PULLERS):
+        rows.append(study(number, 4 if given.quick else CRYSTALS))
+        print(f"puller {number}: RMSE {', '.join(f'{error:.3f}' for error in rows[-1].rmse_mm)} mm", flush=True)
+    text = report(rows)
+    write_files({given.out / "pullers.txt": text.encode()})
+    print(text, end="")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
