@@ -135,6 +135,7 @@ def report(rows: Sequence[Row]) -> str:
     inside, lost = np.concatenate([row.inside for row in rows]), np.sum([row.lost for row in rows], axis=0)
     return f"""{markdown(heads, lines)}
 
+pullers: {len(rows)}
 error of the LQG of the identified file over that of the truth: median {np.median(ratios):.3f}, worst {max(ratios):.3f}
 crystals lost, told the truth, the identified file, the start: {", ".join(map(str, lost))}
 intervals that hold the truth: {np.mean(inside) / PERCENT:.0f} % of {len(inside)} informed parameters
@@ -152,13 +153,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(given: argparse.Namespace) -> None:
     check_writable(given.out)
-    rows = []
+    rows: list[Row] = []
     for number in range(QUICK if given.quick else PULLERS):
         rows.append(study(number, 4 if given.quick else CRYSTALS))
+        write_files({given.out / "pullers.txt": report(rows).encode()})
         print(f"puller {number}: RMSE {', '.join(f'{error:.3f}' for error in rows[-1].rmse_mm)} mm", flush=True)
-    text = report(rows)
-    write_files({given.out / "pullers.txt": text.encode()})
-    print(text, end="")
+    print(report(rows), end="")
 
 
 if __name__ == "__main__":

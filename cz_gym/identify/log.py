@@ -243,7 +243,7 @@ def check_puller(log: Log, machine: Puller) -> None:
         ("ring_radius_mm", log.ring - puller.ring_bias, 0.8 * puller.r_0, 1.25 * puller.r_0),
         ("pull_speed_mm_per_min", log.v_p, 0.4 * puller.v_0, 2.5 * puller.v_0),
         ("T_1_K", log.T_1, puller.T_m, puller.T_m + 800.0),
-        ("heater_power_kW", log.Q_H, KILO, KILO * KILO),
+        ("heater_power_kW", log.Q_H, 0.25 * puller.Q_H_0, 4.0 * puller.Q_H_0),
     ):
         units, own = COLUMNS[name]
         middle = float(np.nanmedian(values))

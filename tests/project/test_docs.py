@@ -29,7 +29,7 @@ from tests.processes import ROOT, python  # noqa: E402
 
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
-SLOW = {"docs/paper.md", "docs/extend/meniscus.md"}
+SLOW = {"docs/paper.md", "docs/extend/meniscus.md", "docs/your-puller.md"}
 SMALL = {
     "num_envs=10_000": "num_envs=100",
     "TEST_SEEDS[:50]": "TEST_SEEDS[:2]",

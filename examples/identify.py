@@ -1,0 +1,42 @@
+"""From a puller's log to a report and a controller: ``python -m examples.identify LOG.csv start.toml my.toml``.
+
+Without arguments a simulated puller makes the log. docs/your-puller.md explains each step.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from cz_gym import CzEnv, Parameters
+from cz_gym.atomic_files import write_files
+from cz_gym.baselines.registry import make_controller
+from cz_gym.config import make_config
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.identify import Excited, identify, read_log, record_log
+from cz_gym.identify.report import report
+from cz_gym.puller import Puller, find_puller, to_toml
+
+
+def make_log(path: str) -> str:
+    """Log a simulated puller whose heater is not what the default file says."""
+    other = Puller("other", Parameters(C_1=8e4, G_1a=24.0))
+    env = CzEnv("randomized", observation="measured", action="direct", info="all", puller=other)
+    record_log(env, Excited(make_controller("pid-conventional", env.config)), path, seed=1)
+    return path
+
+
+def main(log_file: str, start: str = "default", out: str = "runs/my.toml") -> float:
+    """Write the puller file and its report; return the radius error of an LQG designed for it [mm]."""
+    log = read_log(log_file)
+    found = identify(log, find_puller(start))
+    pages = report(found, log, log_file, Path(out).with_suffix(".md"))
+    write_files(pages | {Path(out): to_toml(found.puller).encode()})
+    config = make_config("randomized", observation="measured", action="direct", puller=out)
+    return float(metrics(rollout(make_controller("lqg", config), config, range(20))).rmse_mm.mean())
+
+
+if __name__ == "__main__":
+    words = sys.argv[1:] or [make_log("runs/log.csv")]
+    print(f"LQG for this puller: radius error {main(*words):.3f} mm")
