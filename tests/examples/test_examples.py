@@ -16,7 +16,7 @@ from examples import cleanrl_ppo, gradient, sb3_ppo
 @pytest.mark.usefixtures("few_crystals")
 def test_the_stable_baselines_example_writes_an_agent(tmp_path: Path) -> None:
     contract = sb3_ppo.main(steps=40_000, out=tmp_path / "some.onnx")
-    assert (contract.action, contract.algorithm, contract.training_steps) == ("smooth", "sb3-ppo", 65_536)
+    assert (contract.action, contract.algorithm, contract.training_steps) == ("smooth", "sb3-ppo", 262_144)
     assert agents.load(tmp_path / "some.onnx").contract == contract
 
 
