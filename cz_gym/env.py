@@ -20,7 +20,7 @@ from cz_gym.engine.layout import Out, check_info
 from cz_gym.episodes.mixture import AnyScenario, Mixture
 from cz_gym.episodes.scenarios import find_distribution
 from cz_gym.errors import CzError
-from cz_gym.names import unknown
+from cz_gym.names import known_keywords, unknown
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.rendering.canvas import Frame
@@ -175,7 +175,9 @@ class CzEnv(Form, gym.Env[Observation, Action]):
         action: str = "smooth",
         info: str = "lean",
         puller: str | Path | Puller | None = None,
+        **others: Any,
     ) -> None:
+        known_keywords(type(self).__init__, others)
         config = make_config(
             scenario, model, observation, control_interval, horizon, parameters, meniscus, camera, action, puller
         )

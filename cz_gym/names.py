@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import inspect
+from collections.abc import Callable, Iterable
 from difflib import get_close_matches
 from typing import Any
 
@@ -22,3 +23,10 @@ def unknown(kind: str, name: object, known: Iterable[str], also: str = "") -> st
     close = get_close_matches(name, names, 1, 0.65) if isinstance(name, str) else []
     meant = f": did you mean {close[0]!r}? Choose" if close else "; choose"
     return f"unknown {kind} {name!r:.80}{meant} from {', '.join(names) or 'none'}{also}"
+
+
+def known_keywords(function: Callable[..., Any], others: Iterable[str]) -> None:
+    """Raise CzError for the first of ``others``, keywords that the function does not have."""
+    for name in others:
+        has = [each.name for each in inspect.signature(function).parameters.values() if each.kind != each.VAR_KEYWORD]
+        raise CzError(unknown("keyword", name, has[1:]))

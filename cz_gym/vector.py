@@ -19,6 +19,7 @@ from cz_gym.engine.batch import Batch, new_key
 from cz_gym.engine.layout import Out, check_info
 from cz_gym.episodes.mixture import AnyScenario, Mixture
 from cz_gym.errors import CzError
+from cz_gym.names import known_keywords
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.processors import processors
@@ -66,7 +67,9 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
         action: str = "smooth",
         info: str = "lean",
         puller: str | Path | Puller | None = None,
+        **others: Any,
     ) -> None:
+        known_keywords(type(self).__init__, others)
         config = make_config(
             scenario, model, observation, control_interval, horizon, parameters, meniscus, camera, action, puller
         )

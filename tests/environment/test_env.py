@@ -50,6 +50,7 @@ def test_everything_advertised_is_there() -> None:
         ({"parameters": {"sigma": 1.0}}, r"cz_gym\.Parameters"),
         ({"parameters": Parameters(k_l=math.nan)}, "parameter k_l = nan"),
         ({"meniscus": "hurle"}, r"cz_gym\.MeniscusModel"),
+        ({"scenaro": "hard"}, "unknown keyword .scenaro.: did you mean .scenario.[?]"),
         ({"control_interval": True}, "not True"),
         ({"action": "rough"}, "unknown action 'rough'; choose from direct, smooth, rate"),
         ({"info": "everything"}, "info must be one of lean, all, not 'everything'"),
