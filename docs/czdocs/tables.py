@@ -19,6 +19,7 @@ from cz_gym.camera.view import Camera
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED, STATE, Channel
 from cz_gym.physics.parameters import describe
+from cz_gym.serve.machine import TAGS
 from cz_gym.signals import INFO_ROWS, PULL_SCALE
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
@@ -172,6 +173,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "single-scenarios": single_scenarios,
     "families": families,
     "camera": camera,
+    "tags": lambda: markdown(("tag", "type", "meaning"), ((code(t.name), t.kind.__name__, t.meaning) for t in TAGS)),
     **{part: partial(symbols, part) for part in nomenclature.ROWS},
 }
 """Every table, by the name a page asks for it with."""

@@ -2,9 +2,7 @@
 is absent."""
 
 import json
-import os
-import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,23 +11,10 @@ import pytest
 
 from cz_gym.evaluation.report.page import page
 from cz_gym.evaluation.results import Result
+from tests.browser.chromium import chromium, pytestmark, resize, until  # noqa: F401
 from tests.samples import result_of
 
-selenium = pytest.importorskip("selenium", reason="selenium is absent: pip install '.[browser]'")
-from selenium import webdriver  # noqa: E402
-from selenium.webdriver.chrome.service import Service  # noqa: E402
-from selenium.webdriver.support.ui import WebDriverWait  # noqa: E402
-
-CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
-pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason="chromium is absent: apt-get install chromium"),
-    pytest.mark.skipif(DRIVER is None, reason="chromedriver is absent: apt-get install chromium-driver"),
-]
 EVIL = "</script><img src=x onerror=document.title='evil'>\"'&amp;<b>%{x}<a href=\"javascript:alert(1)\">a</a>"
-FLAGS = (
-    "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run",
-    "--disable-component-update",
-)  # fmt: skip
 PICTURES = ("pareto", "errors", "crystal")
 
 
@@ -45,30 +30,10 @@ def browser(made: list[Result], tmp_path_factory: pytest.TempPathFactory) -> Ite
     """Chromium with the page open, its pictures drawn."""
     path = tmp_path_factory.mktemp("page") / "report.html"
     path.write_text(page(made, "benchmark.py"), "utf-8")
-    os.environ["SE_OFFLINE"] = "true"
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM or ""
-    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    driver = webdriver.Chrome(options=options, service=Service(DRIVER))
-    try:
-        resize(driver, 1280)
+    with chromium(tmp_path_factory.mktemp("profile")) as driver:
         driver.get(Path(path).as_uri())
         until(driver, lambda: driver.find_elements("css selector", "#crystal .legendtext"))
         yield driver
-    finally:
-        driver.quit()
-
-
-def resize(driver: Any, width: int) -> None:
-    size = {"width": width, "height": 768, "deviceScaleFactor": 1, "mobile": False}
-    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-
-
-def until(driver: Any, holds: Callable[[], Any]) -> Any:
-    """What ``holds`` returns once it is true."""
-    return WebDriverWait(driver, 60.0, 0.05).until(lambda _: holds())
 
 
 def test_the_page_opens_from_disk_without_an_error_and_fetches_nothing(browser: Any) -> None:
