@@ -1,0 +1,58 @@
+"""The controller over OPC UA: the same crystal as in Python, step for step."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("asyncua", reason="asyncua is absent: pip install '.[plant]'")
+
+from cz_gym.config import make_config
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.units import KILO, MM, MM_PER_MIN
+from examples import opcua_controller
+from tests.serve.conftest import PASSWORD, running
+
+
+def grown(log: Path) -> Any:
+    """Ring radius [mm], pull speed [mm/min] and heater power [kW] of a log, a row a step."""
+    rows = np.genfromtxt(log, delimiter=",", names=True)[1:]
+    return np.stack([rows[name] for name in ("ring_radius_mm", "pull_speed_mm_per_min", "heater_power_kW")], axis=-1)
+
+
+@pytest.mark.parametrize(
+    ("name", "scenario", "steps"),
+    [
+        ("paper", "randomized", 200),
+        ("paper-tuned", "puller", 200),
+        ("gradient", "randomized", 200),
+        pytest.param("paper", "randomized", 2160, marks=pytest.mark.slow),
+    ],
+)
+def test_the_loop_over_opc_ua_is_the_loop_in_python(name: str, scenario: str, steps: int, tmp_path: Path) -> None:
+    with running(tmp_path, "--speed", "0", "--scenario", scenario) as puller:
+        assert opcua_controller.main(["--url", puller.url, "--controller", name, "--steps", str(steps)]) == 0
+        found = grown(tmp_path / "log.csv")
+    acting = opcua_controller.controller(name, None)
+    config = make_config(scenario, None, "measured", action=acting.action, horizon=steps * 5.0)
+    s = rollout(acting, config, [1]).signals
+    twin = np.concatenate([s.r_br_measured / MM, s.v_p / MM_PER_MIN, s.Q_H / KILO], axis=-1)
+    assert len(found) >= steps - 1
+    np.testing.assert_allclose(found, twin[: len(found)], rtol=0, atol=2e-6)
+
+
+def test_it_logs_in_over_an_encrypted_channel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CZ_GYM_OPERATOR_PASSWORD", PASSWORD)
+    with running(tmp_path, "--operator", "olga", "--speed", "0", remote=True) as puller:
+        login = ["--operator", "olga", "--encrypt", str(tmp_path / "certificates" / "certificate.pem")]
+        own = ["--certificates", str(tmp_path / "client"), "--steps", "3"]
+        assert opcua_controller.main(["--url", puller.url, *login, *own]) == 0
+        assert puller.machine.answered == 2
+    assert sorted(os.listdir(tmp_path / "client")) == ["certificate.der", "certificate.pem", "key.pem"]
+
+
+def test_a_server_that_is_not_there_and_a_controller_that_is_not_are_said_in_one_line(refused: Any) -> None:
+    assert "127.0.0.1" in refused(opcua_controller.main, ["--url", "opc.tcp://127.0.0.1:9/"])
+    assert "did you mean 'paper'" in refused(opcua_controller.main, ["--controller", "papr"])
