@@ -28,7 +28,7 @@ from .env import CzEnv, EnvState
 from .observation import decode
 from .vector import CzVectorEnv
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 ENV_ID = "Cz-v0"
 
 __all__ = [
