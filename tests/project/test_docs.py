@@ -37,7 +37,7 @@ SMALL = {
     "VALIDATION_SEEDS[:10]": "VALIDATION_SEEDS[:2]",
     "VALIDATION_SEEDS[:100]": "VALIDATION_SEEDS[:2]",
     "range(3000)": "range(30)",
-    "learn(5_000_000)": "learn(8192)",
+    "learn(9_000_000)": "learn(8192)",
     "seeds=range(20)": "seeds=range(2)",
     "seeds=range(10)": "seeds=range(2)",
     "--scenarios randomized --out mine": "--scenarios reference-b --episodes 1 --quiet --out mine",
