@@ -21,7 +21,6 @@ import numpy as np
 from cz_gym import CzEnv, Parameters, make_puller
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.baselines.lqg.designs import TOLD, lqg
-from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.registry import make_controller
 from cz_gym.commands import OneLineParser
 from cz_gym.config import make_config
@@ -91,8 +90,6 @@ def write_logs(truth: Puller, seed: int, folder: Path) -> tuple[Path, Path]:
     """CSV files of three hours under a PID of the puller's own, with and without excitation."""
     env = CzEnv(SCENARIO, observation="measured", action="direct", puller=truth, info="all")
     pid = make_controller("pid-conventional", env.config)
-    assert isinstance(pid, FilteredPID)
-    pid = replace(pid, heater=replace(pid.heater, K=pid.heater.K * truth.parameters.C_1 / Parameters().C_1))
     paths = folder / "excited.csv", folder / "passive.csv"
     for path, policy in zip(paths, (Excited(pid), pid), strict=True):
         record_log(env, policy, path, seed)
