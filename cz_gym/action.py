@@ -54,7 +54,7 @@ def check_marked(action: MarkedAction, own: MadeFor) -> None:
 
 
 def mismatch(made_for: MadeFor | None, own: MadeFor) -> str:
-    """How an environment differs from the one that a controller or agent was made for; empty if it does not."""
+    """Differences between an environment and the one that a controller was made for; empty if there are none."""
     if made_for is None or made_for == own:
         return ""
     return (

@@ -86,7 +86,7 @@ def locked(folder: Path, patience: float = 0.0) -> Iterator[None]:
 
 
 def _missing(folder: Path) -> list[Path]:
-    """Those of a folder and its parents that do not exist, innermost first."""
+    """A folder and its parents as far as they do not exist, innermost first."""
     return [each for each in (folder, *folder.parents) if not each.exists()]
 
 

@@ -24,7 +24,7 @@ class Contender:
     observation: str
     """Observation mode it reads; "state" marks a bound, which no sensor could feed."""
     meaning: str
-    """What it is, in one line for tables."""
+    """Description in one line, for tables."""
     default: bool = True
     """Whether a benchmark that names no controllers runs it."""
     privileged: bool = False

@@ -165,7 +165,7 @@ class DifferentiableBatch:
 
     @property
     def grows(self) -> npt.NDArray[np.bool_]:
-        """Which crystals grew in the last step, shape (n,)."""
+        """Whether each crystal grew in the last step, shape (n,)."""
         return self._grows
 
     @property

@@ -17,7 +17,7 @@ def value(name: str, *shape: Any) -> Any:
 
 
 def graph_of(nodes: list[Any], weights: dict[str, Any], channels: int, **changes: Any) -> Any:
-    """A graph from an observation of so many channels to an action; other ``inputs`` and ``outputs`` may be given."""
+    """A graph from an observation of ``channels`` numbers to an action, unless ``inputs`` or ``outputs`` are given."""
     inputs = changes.get("inputs", [value("observation", "n", channels)])
     outputs = changes.get("outputs", [value("action", "n", 2)])
     tensors = [numpy_helper.from_array(np.asarray(array), name) for name, array in weights.items()]
@@ -31,7 +31,7 @@ def model_of(nodes: list[Any], weights: dict[str, Any], channels: int, **changes
 
 
 def facts(observation: str = "history", **changes: Any) -> dict[str, Any]:
-    """What :func:`cz_gym.agents.agent_file.contract.make_contract` asks for, of an agent trained on "randomized"."""
+    """Arguments of :func:`cz_gym.agents.agent_file.contract.make_contract` for an agent trained on "randomized"."""
     config = make_config(observation=observation)
     known = {
         **facts_of(config),

@@ -30,7 +30,7 @@ def pulls(policy: Any, rows: Iterable[Any]) -> np.ndarray:
 
 
 def observations(n: int = 3, steps: int = 20, **keywords: Any) -> Iterator[Any]:
-    """What n slots show, sample by sample."""
+    """Observations of n slots, sample by sample."""
     env = CzVectorEnv(n, **keywords)
     observation, _ = env.reset(seed=0)
     rng = np.random.default_rng(0)

@@ -28,9 +28,9 @@ def sample_of(who: Contender, runs: Sequence[Rollout]) -> Sample:
 def result_of(
     name: str, names: Sequence[str], last: str, training_seeds: tuple[int, ...] = (4,), fewer: int = 0
 ) -> tuple[Result, dict[str, Rollout]]:
-    """What controllers come to on three crystals (one of a scenario without randomness), and their rollouts.
+    """Results of controllers on three crystals (one of a scenario without randomness), and their rollouts.
 
-    The last is shown as an agent of that name, trained with the given seeds, and meets so many crystals less.
+    The last is shown as an agent of that name, trained with the given seeds, and meets ``fewer`` crystals less.
     """
     row, samples, runs = find_row(name), [], {}
     config, seeds = row.config(), row.seeds(3)

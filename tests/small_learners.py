@@ -18,7 +18,7 @@ TRAIN_SEED = fleet.train_seed
 
 
 def train_small_seed(job: Job, bar: Any = None) -> dict[str, float]:
-    """As :func:`fleet.train_seed`, with few validation episodes, in whatever process."""
+    """:func:`fleet.train_seed` with few validation episodes, in any process."""
     validation.PICKING, validation.JUDGING = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4]
     return TRAIN_SEED(job, bar)
 

@@ -38,7 +38,7 @@ class AgentFileError(CzError):
 
 @dataclass(frozen=True)
 class Contract:
-    """What an agent reads, how it acts, and how it was trained."""
+    """An agent's observation, the meaning of its actions, and its training."""
 
     observation: str
     """Name of the observation that it reads."""

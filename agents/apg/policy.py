@@ -121,7 +121,7 @@ class RecurrentPolicy(BasePolicy):
         raise NotImplementedError("a policy with a memory acts through predict")
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        """What :meth:`load` makes it with."""
+        """Arguments with which :meth:`load` makes the policy again."""
         return {**super()._get_constructor_parameters(), **self.options, "lr_schedule": self._dummy_schedule}
 
 

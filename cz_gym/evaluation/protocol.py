@@ -32,7 +32,7 @@ class Row:
     name: str
     scenario: str | Scenario
     meaning: str
-    """What disturbs its crystals, in one line for tables."""
+    """Disturbances of its crystals in one line, for tables."""
     model: str | None = None
     """ "I" or "II", or None for the scenario's own draw."""
     default: bool = True

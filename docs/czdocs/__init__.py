@@ -1,1 +1,1 @@
-"""What the site needs beyond Sphinx: formulas without scripts, tables from the code, an index of what there is."""
+"""Extensions of Sphinx for the site: formulas without scripts, tables from the code, an index of names."""

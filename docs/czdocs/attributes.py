@@ -1,4 +1,4 @@
-"""What the code says about its own fields: the text below each, its unit in the first brackets."""
+"""Docstrings of fields: the text below each, its unit in the first brackets."""
 
 from __future__ import annotations
 

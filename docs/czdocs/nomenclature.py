@@ -91,7 +91,7 @@ def seen() -> list[Row]:
 
 
 def parameters() -> list[Row]:
-    """What is typed in about a puller and its material."""
+    """Given numbers of a puller and its material."""
     values = Parameters()._asdict()
     return [_row(name, q.unit, q.meaning, f"{values[name]:.6g}", q.source) for name, q in describe().items()]
 

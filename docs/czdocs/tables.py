@@ -37,7 +37,7 @@ READABLE = {
     "rev/s": (1.0 / MINUTE, "rev/min"),
     "s": (1.0, "s"),
 }
-"""Where people read another unit than SI: its size in SI, its name."""
+"""Units that people read instead of SI: size in SI and name."""
 
 
 def markdown(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:

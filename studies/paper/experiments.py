@@ -42,7 +42,7 @@ PHASE_MARGIN_DEG = 74.0
 MODELS = {"I": 1.0, "II": 0.0}
 """Share of conduction of the paper's models [-]."""
 SOURCES = ("published", "own")
-"""Where linear models come from: the paper's functions, our plant."""
+"""Sources of linear models: the paper's functions, our plant."""
 PRINTED, BARE = CompensatedPID(pid=PID), CompensatedPID(pid=PID, compensator=None)
 """The printed controller, and its PID alone."""
 INTERVAL = 5.0

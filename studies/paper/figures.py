@@ -33,7 +33,7 @@ SHOWN = {
     "T_1": (1.0, "temperature [K]", "-", BLUE, "$T_1$"),
     "T_b": (1.0, "temperature [K]", "-", ORANGE, "$T_{bulk}$"),
 }
-"""Of each signal the unit in which people read it, the name of its axis, its line, colour and name in a legend."""
+"""For each signal: the unit in which people read it, name of its axis, line, colour, and name in a legend."""
 
 
 def values(run: Trace, name: str) -> Floats:

@@ -202,7 +202,7 @@ def test_a_model_of_several_scenarios_is_written_for_the_one_that_is_given(tmp_p
         ("mine.onnx", {"config": "hard"}, "needs a Config, not 'hard'"),
     ],
 )
-def test_a_name_is_no_model(path: str, given: dict[str, Any], said: str) -> None:
+def test_a_wrong_model_name_or_setting_is_refused(path: str, given: dict[str, Any], said: str) -> None:
     model = PPO("MlpPolicy", "Cz-v0", device="cpu", n_steps=8, batch_size=8)
     with pytest.raises(ValueError, match=said):
         from_sb3.save_agent(path, **{"model": model, "name": "mine", **given})
@@ -267,7 +267,7 @@ def test_converting_without_stable_baselines3_says_what_to_install() -> None:
         ("good.zip --algo ppo --out mine.onnx --name ''", "algorithm"),
     ],
 )
-def test_mistakes_are_one_line(
+def test_a_wrong_command_is_refused_in_one_line(
     arguments: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Any
 ) -> None:
     monkeypatch.chdir(tmp_path)

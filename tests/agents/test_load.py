@@ -47,7 +47,7 @@ def test_an_agent_that_does_not_exist_is_refused_in_one_line(name: str, message:
     assert "\n" not in str(caught.value)
 
 
-def test_a_name_is_no_file() -> None:
+def test_a_path_without_its_ending_is_refused_with_a_suggestion() -> None:
     file = agents.shipped_seeds("ppo")[0]
     with pytest.raises(agents.AgentFileError, match=f"did you mean {re.escape(str(file))}\\?"):
         agents.OnnxPolicy.load(file.with_suffix(""))

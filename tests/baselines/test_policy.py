@@ -1,4 +1,4 @@
-"""What every controller on "measured" observations has in common: batches, memories, shapes, control intervals."""
+"""Common behaviour of the controllers on "measured" observations: batches, memories, shapes, control intervals."""
 
 import math
 from dataclasses import replace

@@ -66,7 +66,7 @@ def test_a_lost_crystal_ends_its_episode(place: Path) -> None:
 
 @pytest.mark.parametrize("name", ["paper-tuned", "gradient", "ppo"])
 def test_without_excitation_a_policy_acts_as_in_the_benchmark(name: str) -> None:
-    """Whatever it reads and its actions mean: "measured" and "direct", "measured" and "rate", "history", "smooth"."""
+    """Observations and actions are "measured" and "direct", "measured" and "rate", "history" and "smooth"."""
     if name != "paper-tuned":
         pytest.importorskip("onnxruntime")
     policy, seeds = find_policy(name, CONFIG), TRAINING_SEEDS[:3]

@@ -18,7 +18,7 @@ from tests.processes import ROOT, python
 GOLDEN: dict[str, Any] = json.loads(FILE.read_text())
 
 
-def test_golden_trajectories() -> None:
+def test_trajectories_are_those_of_the_golden_file() -> None:
     found = trajectories()
     assert found.keys() == GOLDEN.keys()
     assert len(found) == 2 * len(SCENARIOS)

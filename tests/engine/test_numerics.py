@@ -21,8 +21,8 @@ from tests.stress.checks import Broken, Watch
 MM = 1e-3
 
 
-def test_a_short_campaign() -> None:
-    """One case in seven, so that every interval and nearly every scenario comes."""
+def test_crystals_under_attack_keep_every_law() -> None:
+    """One case in seven: every control interval and nearly every scenario occurs."""
     watches = campaign(cases()[::7], 60_000)
     failures = sum(watch.failures for watch in watches)
     assert sum(watch.episodes for watch in watches) > failures > 100
@@ -110,8 +110,8 @@ def test_steps_from_states_that_adversaries_reach_are_exact_enough() -> None:
 @pytest.mark.parametrize(("excess", "bound"), [(-5.0, 1e-4), (-8.0, 1e-4), (-13.0, 5e-4), (-20.0, np.inf)])
 @pytest.mark.parametrize("pull", [0.0, 2.0])
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
-def test_no_freezing_is_missed(excess: float, bound: float, pull: float) -> None:
-    """Over a melt too cold a meniscus freezes within seconds: the exact solution reaches 1.2 mm, and so does the step.
+def test_a_meniscus_that_freezes_within_a_step_ends_the_episode(excess: float, bound: float, pull: float) -> None:
+    """Over a cold melt a meniscus freezes within seconds: the exact solution reaches 1.2 mm, and so does the step.
 
     Adversaries reach 13 K below freezing on "hard". A step that a crystal just survives there, ending at 1.2 mm, is the
     least exact of all. Across the singularity the trial steps of both methods meet roots of negative numbers.

@@ -21,7 +21,7 @@ from cz_gym.task import ACTIONS
 from tests.observed import PLAIN
 
 STEPS = {"r_c": 1e-7, "h_c": 1e-7, "T_1": 1.0, "T_2": 1.0, "T_b": 1e-2, "v_p": 1e-9, "Q_H": 100.0, "a": 1e-3}
-"""How far each number is moved for differences."""
+"""Step of the finite differences, for each number."""
 
 
 def moved(batch: DifferentiableBatch, slots: Any, frames: Any, actions: Any, column: int, by: float) -> Any:

@@ -193,7 +193,7 @@ def test_a_refused_reset_changes_nothing(form: Any, options: Any, says: str) -> 
     ("name", "value"), [("r_c", np.nan), ("h_c", np.nan), ("T_b", np.nan), ("h_c", 0.0), ("h_c", -1e-3)]
 )
 def test_a_broken_state_terminates(name: str, value: float) -> None:
-    """What no crystal can be ends the episode as a failure, without an exception."""
+    """A state that no crystal can have ends the episode as a failure, without an exception."""
     env = CzEnv("nominal")
     env.reset(seed=0)
     state = copy.deepcopy(env.get_state())

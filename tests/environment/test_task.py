@@ -15,7 +15,7 @@ MM, MM_PER_MIN = 1e-3, 1e-3 / 60
 P = make_puller()
 
 
-def test_cost_is_the_designs() -> None:
+def test_cost_terms_are_those_of_the_design() -> None:
     cost = cost_terms(0.5 * MM, 0.36 * MM_PER_MIN, -0.06 * MM_PER_MIN, 1000.0)
     assert cost == pytest.approx((1.0, 0.5 * (0.12 / 0.36) ** 2, 0.05, 0.5))
     total = sum(cost)
@@ -41,7 +41,7 @@ def test_a_crystal_grows_within_its_limits_alone() -> None:
 
 
 @given(st.floats(0.0, 0.99), st.floats(0.0, 1e12))
-def test_a_failure_never_pays(discount: float, cost: float) -> None:
+def test_a_failing_step_earns_less_than_the_worst_life(discount: float, cost: float) -> None:
     """A failing step earns no more than the worst life without an end, discounted."""
     zero = cost_terms(0.0, 0.0, 0.0, 0.0)
     worst = reward(zero._replace(radius=cost), True)
@@ -49,7 +49,7 @@ def test_a_failure_never_pays(discount: float, cost: float) -> None:
 
 
 def fly(model: str, pull: float, horizon: float = 10800.0) -> tuple[list[float], bool, bool, dict[str, Any]]:
-    """Rewards under one pull action until the episode ends, and what its last step says."""
+    """Rewards under one pull action until the episode ends, and the results of its last step."""
     env, rewards = CzEnv("nominal", model=model, horizon=horizon, info="all", **PLAIN), []
     env.reset(seed=0)
     while True:

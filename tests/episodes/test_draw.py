@@ -118,7 +118,7 @@ MEMBERS = [(family, each) for family in FAMILIES for each in dataclasses.fields(
 @pytest.mark.parametrize("spread", [0.0, 0.5])
 @pytest.mark.parametrize(("family", "member"), MEMBERS, ids=lambda part: getattr(part, "name", part))
 def test_every_member_says_whether_it_is_random(family: str, member: Any, spread: float) -> None:
-    """What is called deterministic draws the same episode for every key; a member that says nothing fails."""
+    """A scenario called deterministic draws the same episode for every key; a member without that information fails."""
     says, whole = member.metadata["member"], isinstance(np.ravel(member.default)[0].item(), int)
     high = says.high if whole else min(0.5 * says.high, 100.0)
     low = high if not spread else 0 if whole else spread * high
@@ -243,7 +243,7 @@ def test_one_freeze_starts_uniformly() -> None:
     assert stats.kstest(starts, stats.uniform(0, SPAN - 100).cdf).pvalue > 1e-3
 
 
-def test_factors_reach_the_puller() -> None:
+def test_drawn_factors_scale_the_parameters_of_the_puller() -> None:
     q, factors = Parameters(), Factors(0.3, 1.02, 1.1, 0.9, 1.05, 0.95, 1.08)
     p, nominal = make_puller(randomised(q, factors), factors.lam), make_puller(q)
     assert p.a / nominal.a == pytest.approx(1.02)

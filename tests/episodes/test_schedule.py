@@ -66,7 +66,7 @@ def test_disturbance_hides_the_drift_and_melts_the_charge_away() -> None:
     assert disturbance(2 * THREE_HOURS, 0.0, e, p).melt == pytest.approx(0.9)
 
 
-def test_sensors_errors_in_time() -> None:
+def test_errors_of_the_sensors_follow_their_schedule() -> None:
     e = Episode(
         ring_offset=1e-4, bias_drift_start=1000.0, bias_drift_duration=1000.0, bias_drift_amount=-2e-4,
         ripple_amplitude=1e-4, ripple_omega=2 * np.pi / 6.0, ripple_phase=np.pi / 2, pyrometer_drift=2.0,

@@ -1,4 +1,4 @@
-"""What a benchmark makes of its samples: pairs on common episodes, the optimality gap, and an earlier run's bound."""
+"""Results of a benchmark's samples: pairs on common episodes, the optimality gap, and an earlier run's bound."""
 
 import csv
 import itertools

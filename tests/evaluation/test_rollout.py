@@ -148,7 +148,7 @@ def test_a_policy_that_does_not_fit_is_refused(policy: Any, config: Any, message
 @pytest.mark.parametrize(
     "make", [CzEnv.from_config, CzVectorEnv.from_config, partial(make_controller, "lqg"), partial(load, "ppo")]
 )
-def test_a_name_is_no_config(make: Any) -> None:
+def test_a_scenario_name_in_place_of_a_config_is_refused(make: Any) -> None:
     with pytest.raises(ValueError, match=r"needs a Config, not 'hard': cz_gym.config.make_config\('hard'\) makes one"):
         make("hard")
 

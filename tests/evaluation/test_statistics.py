@@ -89,7 +89,7 @@ def test_probability_of_improvement_counts_wins_and_half_the_ties() -> None:
 
 
 def test_cvar_is_the_mean_of_the_worst_twentieth(rng: np.random.Generator) -> None:
-    """Where it is no whole number of episodes, the last one counts in part; training seeds are pooled."""
+    """If the share is no whole number of episodes, the last one counts in part; training seeds are pooled."""
     values = rng.permutation(np.arange(1.0, 101.0))[None]
     assert cvar(values, Resamples.draw(100)).mean == pytest.approx((96 + 97 + 98 + 99 + 100) / 5)
     few = np.arange(1.0, 31.0)[None]
@@ -99,6 +99,6 @@ def test_cvar_is_the_mean_of_the_worst_twentieth(rng: np.random.Generator) -> No
     assert cvar(seeds, Resamples.draw(20)).mean == pytest.approx((19 + 18) / 2)
 
 
-def test_no_episodes_no_bootstrap() -> None:
+def test_a_bootstrap_of_no_episodes_is_refused() -> None:
     with pytest.raises(ValueError, match="at least one"):
         Resamples.draw(0)

@@ -1,4 +1,4 @@
-"""What users copy: each example learns, is judged, and leaves what it says."""
+"""The examples that users copy: each learns, is judged, and writes the files that it names."""
 
 import re
 import subprocess

@@ -1,4 +1,4 @@
-"""What an environment gives, as one hash; ``python -m tests.golden.digest`` prints it, and where cz_gym came from."""
+"""One hash of an environment's results; ``python -m tests.golden.digest`` prints it, and the file of cz_gym."""
 
 import hashlib
 

@@ -35,7 +35,7 @@ def package(tmp_path: Path) -> Path:
 
 
 def run(code: str, folder: Path, cache: Path) -> list[str]:
-    """What a fresh process prints, split at bars."""
+    """The output of a fresh process, split at bars."""
     environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
     environment["CZ_GYM_CACHE_DIR"] = str(cache)
     return python("-W", "error", "-c", code, cwd=folder, env=environment).strip().split("|")

@@ -1,4 +1,4 @@
-"""What this package takes from numba's private parts: a numba that changes them is found here, by name."""
+"""The private parts of numba that this package uses: a numba that changes them fails here, by name."""
 
 import hashlib
 from importlib import import_module

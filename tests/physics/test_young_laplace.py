@@ -116,7 +116,7 @@ def test_table_against_the_exact_solution(narrowest, slopes, ring, height):
 
 @pytest.mark.parametrize("degrees", [1.0, 3.5, 10.0])
 def test_ring_sensitivity_against_the_exact_solution(degrees):
-    """How fast the ring moves with the height at the operating point, on which G_m depends."""
+    """Derivative of the ring by the height at the operating point, on which G_m depends."""
     step, phi_b = 1e-4 * A, math.radians(degrees)
     p = make_puller(Parameters(phi_b=phi_b), meniscus=YOUNG_LAPLACE)
     low, high = solve(R_0, p.h_0 + np.array([-step, step]), phi_b).ring_offset
@@ -148,7 +148,7 @@ def test_environment_runs_on_the_exact_meniscus():
     env.close()
 
 
-def test_outside_the_table_is_nan():
+def test_values_outside_the_table_are_nan():
     p = SimpleNamespace(a=A, X_b=float(ring_point(PHI_B)))
     assert all(np.isnan(YOUNG_LAPLACE.slope(0.02, 5e-3, p)))
     assert np.isnan(YOUNG_LAPLACE.ring_offset(R_0, 5e-3, SimpleNamespace(a=A, X_b=float(ring_point(0.5)))))

@@ -94,7 +94,7 @@ def test_a_failed_run_counts_to_the_horizon() -> None:
         (["--seed", "-1"], "--seed: must be between 0 and"),
     ],
 )
-def test_bad_options_are_one_line(options: list[str], says: str, refused: Any) -> None:
+def test_a_wrong_option_is_refused_in_one_line(options: list[str], says: str, refused: Any) -> None:
     assert says in refused(play.main, options)
 
 

@@ -152,7 +152,7 @@ def test_every_episode_is_in_the_table_and_provenance_says_what_was_run(finished
         (["--controllers", "paper", "--json", "/"], "is a folder"),
     ],
 )
-def test_mistakes_get_one_line(arguments: list[str], message: str, refusal: Any) -> None:
+def test_a_wrong_command_is_refused_in_one_line(arguments: list[str], message: str, refusal: Any) -> None:
     assert message in refusal(arguments)
 
 
@@ -200,7 +200,7 @@ def test_a_file_may_be_named_and_stand_beside_the_shipped_agents(tmp_path: Path)
 def test_files_are_replaced_by_a_full_run_or_when_told_to(
     tmp_path: Path, finished: Path, monkeypatch: pytest.MonkeyPatch, refusal: Any
 ) -> None:
-    """Whatever names the results, and whatever else the files are."""
+    """For results named by every option, and for other files of the user."""
     monkeypatch.setattr(benchmark, "FOLDER", finished)
     results, page = finished / "benchmark.json", tmp_path / "report.html"
     page.write_text("precious")

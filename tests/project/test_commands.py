@@ -37,7 +37,7 @@ def name(part: Any) -> str | None:
 
 @pytest.mark.parametrize("abbreviated", [False, True])
 @pytest.mark.parametrize(("module", "beginning"), [row[:2] for row in COMMANDS], ids=name)
-def test_bad_options_get_one_line(module: Any, beginning: str, abbreviated: bool, refused: Any) -> None:
+def test_an_unknown_option_is_refused_in_one_line(module: Any, beginning: str, abbreviated: bool, refused: Any) -> None:
     required = ["--controller", "industrial"] if module is tuning else []
     line = refused(module.main, [*required, beginning if abbreviated else "--frobnicate"])
     assert "unrecognized arguments" in line

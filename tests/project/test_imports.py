@@ -80,7 +80,7 @@ def circle(pairs: Arrows) -> list[str]:
     return []
 
 
-def test_there_is_no_circle() -> None:
+def test_packages_do_not_import_in_a_circle() -> None:
     found = arrows()
     assert circle({("a", "b"), ("b", "a")}) != []
     assert circle(found) == []

@@ -1,4 +1,4 @@
-"""What is installed: one package, on four dependencies, by every way of installing it."""
+"""Installation: one package with four dependencies, by every way of installing it."""
 
 import os
 import shutil

@@ -113,7 +113,7 @@ def test_a_restored_state_is_shown_from_there_on() -> None:
     assert env.render() is not None
 
 
-def test_window_and_list_wrappers() -> None:
+def test_gymnasiums_wrappers_for_windows_and_lists_of_frames_work() -> None:
     env = gym.wrappers.HumanRendering(gym.make("Cz-v0", render_mode="rgb_array", **PLAIN))
     env.reset(seed=1)
     env.step(env.action_space.sample())

@@ -17,7 +17,7 @@ Array = npt.NDArray[Any]
 COLDEST, HOTTEST = 1000.0, 2600.0
 """Temperatures [K] that no hot zone with 10 kW more or less than nominal leaves."""
 OVERSHOOT = HEIGHT_MIN
-"""How far beyond a limit a crystal can be when it fails [m]: a longer jump in one substep is none."""
+"""Largest distance beyond a limit at which a crystal fails [m]: no substep jumps farther."""
 BALANCE = 2e-3
 """Heat that may be missing from a step's balance, as a share of the nominal heater power: the fluxes are taken as
 straight lines over the step."""

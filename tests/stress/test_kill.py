@@ -37,7 +37,7 @@ PHASES = {
     "checkpoint, as it moves": (f"{RUN}.validate:1>os:replace:2", 9664),
     "summary, as it moves": (f"{RUN}.finish:1>os:replace:2", 9664),
 }
-"""Where one run of PPO is killed, resumed, killed ..., and the step at which it stands then.
+"""Points at which one run of PPO is killed and resumed in turn, and the step at which it then stands.
 
 ``os:replace:2`` is the second call of ``os.replace`` since the process began; ``>`` begins to count at another call.
 Rollouts have 2,048 steps, and a validation follows every second one.

@@ -73,7 +73,7 @@ def test_finished_runs_are_kept_and_evaluated_anew(tmp_path: Path, monkeypatch: 
         (["--steps", "-5"], "--steps: must be between 1"),
     ],
 )
-def test_mistakes_give_one_line(arguments: list[str], message: str, refused: Any) -> None:
+def test_a_wrong_command_is_refused_in_one_line(arguments: list[str], message: str, refused: Any) -> None:
     assert message in refused(command.main, arguments)
 
 

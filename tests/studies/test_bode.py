@@ -41,7 +41,7 @@ def test_a_controllers_margins_are_the_design_tables(tmp_path: Path, capsys: pyt
 
 
 def test_phases_are_read_against_minus_180_degrees() -> None:
-    """Where the gain is one, the phase above -180 degrees is python-control's phase margin."""
+    """The phase above -180 degrees at a gain of one is python-control's phase margin."""
     form, puller = bode.form_of("paper"), make_puller(lam=1.0)
     values, found = bode.margins(form, puller, "v_p")
     phase = bode.phase_of(values)

@@ -152,7 +152,7 @@ def measured_from(result: Result) -> str:
 
 
 def _training_seeds(pooled: Sequence[Sample]) -> str:
-    """How far the training seeds of each agent lie apart: mean RMSE of the best, the middle and the worst one, and how
+    """Spread over the training seeds of each agent: mean RMSE of the best, the middle and the worst one, and how
     many crystals each lost."""
     lines = []
     for sample in pooled:

@@ -136,7 +136,7 @@ def headline(results: Sequence[Result]) -> str:
 
 
 def _among(result: Result) -> str:
-    """Who is better than whom on one scenario, the best classical controller or each agent."""
+    """Comparison of each agent with the best classical controller on one scenario."""
     agents, rival = list(result.verdicts), result.rival
 
     def named(some: Sequence[str]) -> str:

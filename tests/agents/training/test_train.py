@@ -159,6 +159,8 @@ def test_interrupting_before_learning_prints_one_line(
         (["--resume"], "nothing to resume"),
     ],
 )
-def test_mistakes_give_one_line(tmp_path: Path, arguments: list[str], message: str, refused: Any) -> None:
+def test_a_wrong_command_is_refused_in_one_line(
+    tmp_path: Path, arguments: list[str], message: str, refused: Any
+) -> None:
     assert message in refused(train.main, [*arguments, "--out", str(tmp_path / "run")])
     assert not (tmp_path / "run").exists()

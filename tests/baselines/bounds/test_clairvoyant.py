@@ -116,7 +116,7 @@ def test_the_clairvoyant_optimum_within_tight_limits_is_a_general_optimisers():
     scale, N = np.array([MM_PER_MIN, KILO]), len(future.target)
 
     def costs(W):
-        """Of candidates of shape (m, 2 N), which may be complex."""
+        """Cost of candidates of shape (m, 2 N), which may be complex."""
         u = nominal + W.reshape(-1, N, 2).swapaxes(0, 1) * scale
         x = [np.broadcast_to(np.stack(future.start, axis=-1), (len(W), 5))]
         for k in range(N):
