@@ -14,7 +14,7 @@ import numpy.typing as npt
 from cz_gym.action import MadeFor, mark
 from cz_gym.config import Config, positive
 from cz_gym.errors import CzError
-from cz_gym.observation import Measured, decode
+from cz_gym.observation import Measured, decode, readable
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.puller import DEFAULT, Puller
@@ -162,15 +162,6 @@ class OpenLoop:
         array, single = batched(observation)
         zero = np.zeros(len(array))
         return to_action(zero, zero, single), state
-
-
-def readable(seen: Measured, last: Measured) -> Measured:
-    """A sample with the ``last`` reading wherever a channel is not finite or the ring is not valid."""
-    finite = Measured(*map(np.isfinite, seen))
-    valid = (seen.valid > 0.5) & finite.ring_error
-    kept = Measured(*map(np.where, finite, seen, last))
-    ring_error = np.where(valid, seen.ring_error, last.ring_error + last.r_ref - kept.r_ref)
-    return kept._replace(ring_error=ring_error, valid=valid.astype(np.float64))
 
 
 def batched(observation: Any) -> tuple[Floats, bool]:

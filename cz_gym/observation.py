@@ -110,6 +110,15 @@ def decode(observation: npt.ArrayLike, v_0: float = PULL_SCALE, heater_range: fl
     )
 
 
+def readable(seen: Measured, last: Measured) -> Measured:
+    """A sample with the ``last`` reading wherever a channel is not finite or the ring is not valid."""
+    finite = Measured(*map(np.isfinite, seen))
+    valid = (seen.valid > 0.5) & finite.ring_error
+    kept = Measured(*map(np.where, finite, seen, last))
+    ring_error = np.where(valid, seen.ring_error, last.ring_error + last.r_ref - kept.r_ref)
+    return kept._replace(ring_error=ring_error, valid=valid.astype(np.float64))
+
+
 def to_measured(
     history: npt.ArrayLike, v_0: float = PULL_SCALE, heater_range: float = HEATER_SCALE
 ) -> npt.NDArray[np.float32]:

@@ -93,7 +93,7 @@ class PlantFilter(NamedTuple):
     def correct(self, state: FilterState, seen: Measured) -> FilterState:
         """The state after the pyrometer where it is finite, and the camera where its frame is valid."""
         n, noise = len(state.mean), self.noise
-        row = np.zeros(state.mean.shape)
+        row = np.zeros_like(state.mean)
         row[:, _PYROMETER] = 1.0
         known = np.isfinite(seen.T_1)
         innovation = np.where(known, seen.T_1 - state.mean[:, _PYROMETER], 0.0)
@@ -136,7 +136,7 @@ class PlantFilter(NamedTuple):
         p = self.puller
         r_c, h_c = p.r_0 + mean[:, _RADIUS], p.h_0 + mean[:, _HEIGHT]
         offset = self.meniscus.ring_offset(r_c, h_c + 1j * _STEP, p)
-        row = np.zeros(mean.shape)
+        row = np.zeros_like(mean)
         row[:, _RADIUS], row[:, _HEIGHT] = slope[..., _RADIUS], offset.imag / _STEP
         return mean[:, _RADIUS] + offset.real - p.ring_bias, row
 

@@ -107,7 +107,7 @@ def look_ahead(plan: Floats, seen: Measured, starts: npt.NDArray[np.bool_], dt: 
     """
     radius = seen.r_ref, seen.r_ref_1min, seen.r_ref_5min
     temperature = seen.T_1_ref, seen.T_1_ref_1min, seen.T_1_ref_5min
-    previewed = np.array([radius, temperature]).transpose(2, 0, 1)
+    previewed = np.stack([np.stack(radius), np.stack(temperature)]).transpose(2, 0, 1)
     moved = np.concatenate([plan[:, :, 1:], previewed[:, :, -1:]], axis=2)
     moved[:, :, 0] = previewed[:, :, 0]
     if starts.any():

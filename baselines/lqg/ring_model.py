@@ -112,7 +112,8 @@ def oscillator(omega: Floats, ring: RingModel, dt: float) -> Floats:
 def transition(A: Floats, row: Floats, omega: Floats, ring: RingModel, dt: float) -> Floats:
     """The model's A with the ripple frequency and the ring's slope of each slot, shape (n, states, states)."""
     n, states = row.shape
-    moved = np.broadcast_to(A, (n, states, states)).copy()
+    moved = np.zeros_like(row, shape=(n, states, states))
+    moved[:] = A
     if ring.has_ripple:
         moved[:, RIPPLE_STATES, RIPPLE_STATES] = oscillator(omega, ring, dt)
     if ring.first_past < states:
@@ -125,7 +126,7 @@ def delivered_row(row: Floats, ring: RingModel, dt: float) -> Floats:
     samples, oldest = ring.delay(dt)
     delivered = row.copy()
     if samples:
-        delivered = (1.0 - oldest) * row if samples == 1 else np.zeros(row.shape)
+        delivered = (1.0 - oldest) * row if samples == 1 else np.zeros_like(row)
         delivered[:, ring.first_past + samples - 1] = oldest
         if samples > 1:
             delivered[:, ring.first_past + samples - 2] = 1.0 - oldest
@@ -197,7 +198,7 @@ def search_step(
     bend = 2.0 * top - left - right
     shift = np.where(bend > 0.0, 0.5 * (right - left) / np.where(bend > 0.0, bend, 1.0), 0.0)
     spacing = omega[1] - omega[0]
-    refined = omega[inside] + spacing * np.clip(shift, -1.0, 1.0)
+    refined = np.take_along_axis(omega, inside, axis=0) + spacing * np.clip(shift, -1.0, 1.0)
     new = clear & (np.abs(refined - search.omega) > 1.5 * spacing)
     ripple = 2.0 * np.stack([Z.real[slot, peak], Z.imag[slot, peak]], axis=-1)
     spectrum = Z.view(np.float64).reshape(search.spectrum.shape)

@@ -40,7 +40,7 @@ class Memory(NamedTuple):
 
 def dead_zone(error: npt.ArrayLike) -> Floats:
     """E of the diameter error e [mm]: 2 e up to 1 mm, flat (the dead zone) at +-2 from there to 2 mm, +-3 beyond."""
-    e = np.asarray(error, np.float64)
+    e = np.multiply(error, 1.0)
     return np.where(np.abs(e) >= 2.0, 3.0 * np.sign(e), np.clip(2.0 * e, -2.0, 2.0))
 
 

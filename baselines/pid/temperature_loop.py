@@ -63,7 +63,7 @@ class TemperatureLoop:
     def at_rest(self, seen: Measured) -> Heat:
         """The memory before the first sample: the applied power continues."""
         zero = np.zeros_like(seen.T_1)
-        return Heat(seen.Q_H / self.K, np.array(seen.Q_H), zero, zero)
+        return Heat(seen.Q_H / self.K, np.copy(seen.Q_H), zero, zero)
 
     def step(self, seen: Measured, memory: Heat, dt: float, v_0: float, heater_range: float) -> tuple[Floats, Heat]:
         """Power above nominal [W], shape (n,), and the new memory; dt in s, v_0 in m/s, the heater's range in W."""

@@ -1,0 +1,114 @@
+"""An exported controller in the simulator: the recorded program, or its compiled form, as a policy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.action import MadeFor, mark
+from cz_gym.config import Config
+from cz_gym.observation import decode
+from cz_gym.physics.plant import make_puller
+from cz_gym.task import HEATER_RANGE
+from cz_gym.units import KILO, MM, MM_PER_MIN
+
+from .program import Floats, Program
+
+Run = Callable[[Mapping[str, Any], Any], tuple[dict[str, Floats], Any]]
+"""Outputs and next memory for inputs and memory, as :meth:`cz_gym.export.program.Program.run`."""
+
+
+class BlockState(NamedTuple):
+    """What a block's policy remembers."""
+
+    samples: npt.NDArray[np.int64]
+    """Number of samples since the episode began, shape (n,)."""
+    memory: Any
+    alarms: npt.NDArray[np.int64]
+    """Alarm bits of the last sample, shape (n,)."""
+
+
+@dataclass(frozen=True)
+class BlockPolicy:
+    """A controller in its shell, acting in the environment that it was exported for.
+
+    The environment's readings are deviations from each crystal's own nominal values; the block gets them added to its
+    nominal ones, so that every puller looks as if it had been calibrated.
+    """
+
+    observation: ClassVar[str] = "measured"
+    action: ClassVar[str] = "direct"
+
+    program: Program
+    config: Config
+    settings_changed: Mapping[str, float] = field(default_factory=dict)
+    """Settings that differ from the program's defaults."""
+    run: Run | None = None
+    """What runs the block instead of the program's interpreter."""
+    begin: Callable[[int], Any] | None = None
+    """Makes the memory of n blocks for ``run``."""
+
+    @property
+    def made_for(self) -> MadeFor:
+        """The environment that takes its actions."""
+        return self.config.made_for._replace(action=self.action)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Arguments of ``gym.make("Cz-v0", ...)``."""
+        return {"observation": "measured", "action": "direct", "control_interval": self.config.control_interval}
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[npt.NDArray[np.float32], Any]:
+        """Actions and the next state; arguments as of every policy."""
+        rows = np.atleast_2d(np.asarray(observation, np.float64))
+        n = len(rows)
+        begins = np.ones(n, np.bool_) if state is None else np.broadcast_to(np.asarray(episode_start or False), (n,))
+        if state is None or begins.any():
+            state = self._begun(state, begins)
+        inputs = self.inputs(rows, state.samples) | dict(self.settings_changed)
+        outputs, memory = (self.run or self.program.run)(inputs, state.memory)
+        alarms = outputs["alarms"].astype(np.int64)
+        action = self.action_of(outputs)
+        marked = mark(action[0] if np.ndim(observation) == 1 else action, self.made_for)
+        return marked, BlockState(state.samples + 1, memory, alarms)
+
+    def _begun(self, state: Any, begins: npt.NDArray[np.bool_]) -> BlockState:
+        n = len(begins)
+        fresh = self.begin(n) if self.begin is not None else np.tile(self.program.start, (n, 1))
+        if state is None:
+            return BlockState(np.zeros(n, np.int64), fresh, np.zeros(n, np.int64))
+        memory = np.where(begins[:, None] if np.ndim(fresh) == 2 else begins, fresh, state.memory)
+        return state._replace(samples=np.where(begins, 0, state.samples), memory=memory)
+
+    def inputs(self, rows: Any, samples: Any) -> dict[str, Any]:
+        """The block's inputs for observations of shape (n, channels) at those samples of their episodes."""
+        puller = make_puller(self.config.parameters, 0.5, self.config.meniscus)
+        seen = decode(rows, puller.v_0)
+        time = samples * self.config.control_interval
+        radii = {name: (getattr(seen, name) + puller.r_0) / MM for name in ("r_ref", "r_ref_1min", "r_ref_5min")}
+        recipe = {name: getattr(seen, name) + puller.T_1_0 for name in ("T_1_ref", "T_1_ref_1min", "T_1_ref_5min")}
+        return {
+            "time_s": time,
+            "ring_time_s": time,
+            "ring_radius_mm": (seen.ring_error + seen.r_ref + puller.r_0 + puller.ring_bias) / MM,
+            "valid": seen.valid,
+            **{f"{name}_mm": value for name, value in radii.items()},
+            **{f"{name}_K": value for name, value in recipe.items()},
+            "T_1_K": seen.T_1 + puller.T_1_0,
+            "pull_speed_mm_per_min": (seen.v_p + puller.v_0) / MM_PER_MIN,
+            "heater_power_kW": (seen.Q_H + puller.Q_H_0) / KILO,
+            "automatic": np.ones(len(rows)),
+        }
+
+    def action_of(self, outputs: Mapping[str, Any]) -> npt.NDArray[np.float32]:
+        """The environment's action for the setpoints, shape (n, 2)."""
+        puller = make_puller(self.config.parameters, 0.5, self.config.meniscus)
+        pull = outputs["pull_speed_setpoint_mm_per_min"] * MM_PER_MIN / puller.v_0 - 1.0
+        heat = (outputs["heater_power_setpoint_kW"] * KILO - puller.Q_H_0) / HEATER_RANGE
+        return np.clip(np.stack([pull, heat], axis=-1), -1.0, 1.0).astype(np.float32)

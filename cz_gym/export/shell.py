@@ -1,0 +1,267 @@
+"""What a plant needs around a controller: takeover, limits, hold, fallback, alarms.
+
+Every sample: readings that are not finite, invalid, too old or outside the range of the observations are replaced by
+the last good ones, and the controller is told that its ring reading is not valid. If that lasts, or the controller's
+output is not finite, the fallback PID takes over until the next reset or takeover; without a ring it holds the pull
+speed. After every takeover the setpoints start at the applied drives and move to the controller's within
+``takeover_s``. All of it is NumPy code on arrays of shape (n,), which :mod:`cz_gym.export.trace` records.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntFlag
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from cz_gym.config import Config
+from cz_gym.observation import CLIP, MEASURED, Measured, readable, scales
+from cz_gym.physics.plant import Puller, make_puller
+from cz_gym.task import HEATER_RANGE, RADIUS_LIMIT
+from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
+
+from .program import Port, Program, record
+
+NO_LIMIT = 1e30
+"""A slew rate that limits nothing."""
+
+
+class Controller(Protocol):
+    """What the shell is put around, :class:`cz_gym.baselines.policy.MeasuredController` for one."""
+
+    @property
+    def estimates_temperature(self) -> bool:
+        """Whether it is given a pyrometer reading that is not finite as such."""
+        ...
+
+    def at_rest(self, seen: Measured) -> Any:
+        """Its memory before the first sample."""
+        ...
+
+    def step(self, seen: Measured, memory: Any) -> tuple[Any, Any, Any]:
+        """Pull speed [m/s] and heater power [W] above nominal, and the new memory."""
+        ...
+
+
+class Alarm(IntFlag):
+    """The bits of ``alarms``."""
+
+    RING = 1
+    """The ring reading is invalid, too old, or outside its range; the last good one is held."""
+    PYROMETER = 2
+    """The same of the pyrometer."""
+    DRIVES = 4
+    """The same of an applied drive."""
+    REFERENCE = 8
+    """The same of a reference or its preview."""
+    LATE = 16
+    """The sample came more than a tenth of the control interval late."""
+    CLOCK = 32
+    """The time stood still, ran back, or was no number."""
+    PULL_LIMITED = 64
+    """The pull speed's range or slew rate cut its setpoint."""
+    HEATER_LIMITED = 128
+    """The heater's range or slew rate cut its setpoint."""
+    TAKEOVER = 256
+    """The setpoints still move from the drives found at a takeover to the controller's."""
+    FALLBACK = 512
+    """The PID controls instead of the controller, until reset or the next takeover."""
+    FAILED = 1024
+    """The controller's output was no number."""
+    MANUAL = 2048
+    """``automatic`` is not set: the setpoints follow the applied drives."""
+
+
+INPUTS = (
+    Port("time_s", "time of this call"),
+    Port("ring_time_s", "time of the ring reading"),
+    Port("ring_radius_mm", "radius of the bright ring, as the camera gives it"),
+    Port("valid", "whether the camera says that the reading is good", 1.0, True),
+    Port("r_ref_mm", "radius reference now"),
+    Port("r_ref_1min_mm", "radius reference in 1 minute"),
+    Port("r_ref_5min_mm", "radius reference in 5 minutes"),
+    Port("T_1_ref_K", "recipe of the heater temperature now"),
+    Port("T_1_ref_1min_K", "recipe in 1 minute"),
+    Port("T_1_ref_5min_K", "recipe in 5 minutes"),
+    Port("T_1_K", "pyrometer reading of the heater temperature"),
+    Port("pull_speed_mm_per_min", "applied pull speed"),
+    Port("heater_power_kW", "applied heater power"),
+    Port("automatic", "whether the controller acts; a rising edge is a takeover", 1.0, True),
+)
+"""The inputs of every block."""
+OUTPUTS = (
+    Port("pull_speed_setpoint_mm_per_min", "setpoint of the pull speed"),
+    Port("heater_power_setpoint_kW", "setpoint of the heater power"),
+    Port("alarms", "sum of the alarm bits"),
+)
+"""The outputs of every block."""
+
+
+class Memory(NamedTuple):
+    """The memory of the shell, of its controller and of its PID."""
+
+    last_time_s: Any
+    """Time of the last sample [s], infinite before the first."""
+    engaged: Any
+    """1 if the last sample was automatic."""
+    since: Any
+    """Time since the takeover [s]."""
+    bad: Any
+    """Time without a good set of readings [s]."""
+    fallback: Any
+    """1 if the PID controls."""
+    pull: Any
+    """Last setpoint of the pull speed [mm/min]."""
+    heater: Any
+    """Last setpoint of the heater power [kW]."""
+    readings: Measured
+    """Last good readings, deviations, SI."""
+    controller: Any
+    pid: Any
+
+
+def settings_of(puller: Puller, pull_slew: float = NO_LIMIT, heater_slew: float = NO_LIMIT) -> tuple[Port, ...]:
+    """The settings of a block for a puller, with their defaults; slew rates in mm/min per minute and kW per minute."""
+    v_0, Q_0 = puller.v_0 / MM_PER_MIN, puller.Q_H_0 / KILO
+    reach = min(HEATER_RANGE / KILO, Q_0)
+    return (
+        Port("nominal_radius_mm", "radius that the controller was designed at", puller.r_0 / MM),
+        Port("ring_bias_mm", "the operator's bias: ring radius minus crystal radius at nominal", puller.ring_bias / MM),
+        Port("nominal_pull_speed_mm_per_min", "this puller's pull speed at its operating point", v_0),
+        Port("nominal_heater_power_kW", "this puller's heater power there", Q_0),
+        Port("nominal_T_1_K", "this puller's pyrometer reading there", puller.T_1_0),
+        Port("pull_speed_min_mm_per_min", "lowest setpoint of the pull speed", 0.0),
+        Port("pull_speed_max_mm_per_min", "highest setpoint of the pull speed", 2.0 * v_0),
+        Port("heater_power_min_kW", "lowest setpoint of the heater power", Q_0 - reach),
+        Port("heater_power_max_kW", "highest setpoint of the heater power", Q_0 + reach),
+        Port("pull_slew_mm_per_min2", "largest change of the pull speed in a minute; 1e30: no limit", pull_slew),
+        Port("heater_slew_kW_per_min", "largest change of the heater power in a minute; 1e30: no limit", heater_slew),
+        Port("takeover_s", "time from a takeover to the controller's full authority", 60.0),
+        Port("fallback_after_s", "time without good readings after which the PID takes over", 240.0),
+        Port("oldest_reading_s", "age from which a ring reading counts as stale", 15.0),
+    )
+
+
+def readings_of(given: Any, nominal: Any, v_0: float) -> tuple[Measured, Measured]:
+    """Readings as deviations in SI units, and whether each lies within the range of the observations."""
+    radius, power = given["ring_radius_mm"] - nominal["ring_bias_mm"], nominal["nominal_heater_power_kW"]
+    seen = Measured(
+        ring_error=(radius - given["r_ref_mm"]) * MM,
+        valid=np.where(given["valid"] > 0.5, 1.0, 0.0),
+        r_ref=(given["r_ref_mm"] - nominal["nominal_radius_mm"]) * MM,
+        r_ref_1min=(given["r_ref_1min_mm"] - nominal["nominal_radius_mm"]) * MM,
+        r_ref_5min=(given["r_ref_5min_mm"] - nominal["nominal_radius_mm"]) * MM,
+        T_1_ref=given["T_1_ref_K"] - nominal["nominal_T_1_K"],
+        T_1_ref_1min=given["T_1_ref_1min_K"] - nominal["nominal_T_1_K"],
+        T_1_ref_5min=given["T_1_ref_5min_K"] - nominal["nominal_T_1_K"],
+        T_1=given["T_1_K"] - nominal["nominal_T_1_K"],
+        v_p=(given["pull_speed_mm_per_min"] - nominal["nominal_pull_speed_mm_per_min"]) * MM_PER_MIN,
+        Q_H=(given["heater_power_kW"] - power) * KILO,
+    )
+    limits = 1.001 * CLIP * scales(MEASURED, v_0)
+    return seen, Measured(*(np.abs(value) <= limit for value, limit in zip(seen, limits, strict=True)))
+
+
+def step(controller: Controller, pid: Controller, dt: float, v_0: float, settings: Any, given: Any, memory: Any) -> Any:
+    """Outputs, memory and whether a sample was due; arguments as of :func:`cz_gym.export.program.record`."""
+    started = np.isfinite(memory.last_time_s)
+    elapsed = np.where(started, given["time_s"] - memory.last_time_s, dt)
+    clock = np.isfinite(given["time_s"]) & ((elapsed > 0.0) | ~started)
+    due = np.isfinite(given["time_s"]) & ((elapsed >= 0.9 * dt) | (elapsed < 0.0))
+    late = elapsed > 1.1 * dt
+
+    seen, plausible = readings_of(given, settings, v_0)
+    age = given["time_s"] - given["ring_time_s"]
+    ring = plausible.ring_error & (seen.valid > 0.5) & (np.abs(age) <= settings["oldest_reading_s"])
+    first = Measured(*(np.where(good, value, 0.0) for good, value in zip(plausible, seen, strict=True)))
+    last = Measured(*(np.where(started, old, new) for old, new in zip(memory.readings, first, strict=True)))
+    trusted = Measured(*(np.where(good, value, np.inf) for good, value in zip(plausible, seen, strict=True)))
+    read = readable(trusted._replace(valid=np.where(ring, 1.0, 0.0)), last)
+    references = [getattr(plausible, name) for name in Measured._fields if "ref" in name]
+    reference = _all(references)
+    good = ring & reference & plausible.T_1 & plausible.v_p & plausible.Q_H
+    bad = np.where(good & ~late, 0.0, memory.bad + np.clip(np.abs(elapsed), 0.0, HOUR))
+
+    engaged = given["automatic"] > 0.5
+    runs = engaged & (memory.engaged > 0.5)
+    fallen = runs & (memory.fallback > 0.5)
+    fallback = runs & (fallen | (bad > settings["fallback_after_s"]))
+    since = np.where(runs & (fallen | ~fallback), memory.since + np.clip(elapsed, 0.0, HOUR), 0.0)
+    share = np.minimum(since / np.maximum(settings["takeover_s"], 1e-3), 1.0)
+
+    seen_by = read._replace(T_1=trusted.T_1) if controller.estimates_temperature else read
+    own = controller.step(seen_by, _where(runs, memory.controller, controller.at_rest(read)))
+    other = pid.step(read, _where(fallen, memory.pid, pid.at_rest(read)))
+    applied = (
+        np.where(plausible.v_p, given["pull_speed_mm_per_min"], memory.pull),
+        np.where(plausible.Q_H, given["heater_power_kW"], memory.heater),
+    )
+    before = tuple(np.where(runs, old, new) for old, new in zip((memory.pull, memory.heater), applied, strict=True))
+    nominal = settings["nominal_pull_speed_mm_per_min"], settings["nominal_heater_power_kW"]
+    wanted = [
+        deviation / unit + at
+        for deviation, unit, at in zip(
+            (np.where(fallback, other[0], own[0]), np.where(fallback, other[1], own[1])),
+            (MM_PER_MIN, KILO), nominal, strict=True,
+        )
+    ]  # fmt: skip
+    wanted[0] = np.where(fallback & ~ring, before[0], wanted[0])
+    sound = np.isfinite(wanted[0]) & np.isfinite(wanted[1])
+    slews = settings["pull_slew_mm_per_min2"], settings["heater_slew_kW_per_min"]
+    ranges = (
+        (settings["pull_speed_min_mm_per_min"], settings["pull_speed_max_mm_per_min"]),
+        (settings["heater_power_min_kW"], settings["heater_power_max_kW"]),
+    )
+    setpoints, limited = [], []
+    for value, old, drive, slew, span in zip(wanted, before, applied, slews, ranges, strict=True):
+        target = np.where(sound, value, old)
+        target = np.where(share < 1.0, old + share * (target - old), target)
+        most = slew * (dt / MINUTE)
+        limit = np.clip(np.where(engaged, np.clip(target, old - most, old + most), drive), *span)
+        limited.append(engaged & (np.abs(limit - target) > 1e-6))
+        setpoints.append(np.where(due, limit, np.clip(memory.pull if not setpoints else memory.heater, *span)))
+
+    bits = {
+        Alarm.RING: ~ring, Alarm.PYROMETER: ~plausible.T_1, Alarm.DRIVES: ~(plausible.v_p & plausible.Q_H),
+        Alarm.REFERENCE: ~reference, Alarm.LATE: late, Alarm.CLOCK: ~clock, Alarm.PULL_LIMITED: limited[0],
+        Alarm.HEATER_LIMITED: limited[1], Alarm.TAKEOVER: engaged & (share < 1.0), Alarm.FALLBACK: fallback,
+        Alarm.FAILED: engaged & ~sound, Alarm.MANUAL: ~engaged,
+    }  # fmt: skip
+    alarms: Any = 0.0
+    for bit, holds in bits.items():
+        alarms = alarms + np.where(holds, float(bit), 0.0)
+    outputs = dict(zip((port.name for port in OUTPUTS), (*setpoints, alarms), strict=True))
+    truth = (np.where(value, 1.0, 0.0) for value in (engaged, fallback | (engaged & ~sound)))
+    now = Memory(given["time_s"], next(truth), since, bad, next(truth), *setpoints, read, own[2], other[2])
+    return outputs, now, due
+
+
+def _all(conditions: Any) -> Any:
+    together = conditions[0]
+    for one in conditions[1:]:
+        together = together & one
+    return together
+
+
+def _where(condition: Any, one: Any, other: Any) -> Any:
+    """``one`` where the condition holds, else ``other``: nested tuples of arrays."""
+    if isinstance(other, tuple):
+        parts = [_where(condition, a, b) for a, b in zip(one, other, strict=True)]
+        return type(other)(*parts) if hasattr(other, "_fields") else tuple(parts)
+    return np.where(np.reshape(condition, (-1, *(1,) * (np.ndim(other) - 1))), one, other)
+
+
+def shelled(name: str, controller: Controller, pid: Controller, config: Config, notes: tuple[str, ...] = ()) -> Program:
+    """Record a controller in its shell, for the puller and the control interval of an environment."""
+    puller = make_puller(config.parameters, 0.5, config.meniscus)
+    zero = Measured(*(np.zeros(1) for _ in Measured._fields))
+    start = Memory(
+        np.full(1, math.inf), *(np.zeros(1) for _ in range(4)), np.full(1, puller.v_0 / MM_PER_MIN),
+        np.full(1, puller.Q_H_0 / KILO), zero, controller.at_rest(zero), pid.at_rest(zero),
+    )  # fmt: skip
+
+    def body(settings: Any, given: Any, memory: Any) -> Any:
+        return step(controller, pid, config.control_interval, puller.v_0, settings, given, memory)
+
+    return record(name, settings_of(puller), INPUTS, OUTPUTS, start, body, notes)

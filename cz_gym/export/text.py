@@ -1,0 +1,512 @@
+"""A recorded program as C99 or as IEC 61131-3 structured text.
+
+:class:`Writer` orders the statements and gives their results to a small pool of work arrays; a :class:`Dialect` says how
+a language writes them. An operation whose result is used once, element by element, becomes part of a longer expression.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import dataclass
+from textwrap import wrap
+from typing import Any
+
+import numpy as np
+
+from .program import Port, Program
+from .shell import Alarm
+from .trace import FUNCTIONS, Ids, Node
+
+LONGEST = 90
+"""Longest expression that becomes part of another one, in characters."""
+C_OPERATIONS = {
+    "add": "({0} + {1})", "subtract": "({0} - {1})", "multiply": "({0} * {1})", "divide": "({0} / {1})",
+    "negative": "(-{0})", "absolute": "fabs({0})", "sqrt": "sqrt@({0})", "exp": "exp@({0})", "log": "log@({0})",
+    "sin": "sin@({0})", "cos": "cos@({0})", "tanh": "tanh@({0})", "minimum": "fmin@({0}, {1})",
+    "maximum": "fmax@({0}, {1})", "less": "({0} < {1})", "less_equal": "({0} <= {1})", "equal": "({0} == {1})",
+    "and": "({0} && {1})", "or": "({0} || {1})", "not": "(!{0})", "select": "({0} ? {1} : {2})",
+    "finite": "(fabs({0}) <= 1e38)", "real": "({0} ? 1.0 : 0.0)",
+}  # fmt: skip
+ST_OPERATIONS = {
+    "add": "({0} + {1})", "subtract": "({0} - {1})", "multiply": "({0} * {1})", "divide": "({0} / {1})",
+    "negative": "(-{0})", "absolute": "ABS({0})", "sqrt": "SQRT({0})", "exp": "EXP({0})", "log": "LN({0})",
+    "sin": "SIN({0})", "cos": "COS({0})",
+    "tanh": "(1.0 - 2.0 / (EXP(2.0 * LIMIT(-20.0, {0}, 20.0)) + 1.0))", "minimum": "MIN({0}, {1})",
+    "maximum": "MAX({0}, {1})", "less": "({0} < {1})", "less_equal": "({0} <= {1})", "equal": "({0} = {1})",
+    "and": "({0} AND {1})", "or": "({0} OR {1})", "not": "(NOT {0})", "select": "SEL({0}, {2}, {1})",
+    "finite": "(ABS({0}) <= 1.0E38)", "real": "SEL({0}, 0.0, 1.0)",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """How a language writes expressions and loops."""
+
+    operations: dict[str, str]
+    true: str
+    false: str
+    assign: str
+    end: str
+    """End of a statement."""
+    loop: tuple[str, str]
+    """Begin of a loop over ``{0}`` from 0 to ``{1}``, which is not included, or ``{2}``, which is; and its end."""
+    if_: tuple[str, str]
+    remainder: str
+    index: str
+    """A whole number in a real one, as an index."""
+    memory: str
+    """Prefix of memory and settings."""
+    given: str
+    """Prefix of inputs."""
+    result: str
+    """Prefix of outputs."""
+    literal: str
+    """End of a literal."""
+    function: str
+    """End of a function's name."""
+    whole: str
+    """A real number as the type of the alarms."""
+
+    def number(self, value: float) -> str:
+        """A literal."""
+        text = repr(float(value))
+        mantissa, _, exponent = text.partition("e")
+        if "." not in mantissa:
+            mantissa += ".0"
+        text = mantissa + (f"E{int(exponent)}" if exponent else "")
+        return f"({text}{self.literal})" if value < 0 else text + self.literal
+
+
+def c_dialect(single: bool) -> Dialect:
+    """C99 in double or single precision."""
+    end = "f" if single else ""
+    return Dialect(
+        C_OPERATIONS, "1", "0", " = ", ";", ("for ({0} = 0; {0} < {1}; {0}++) {{", "}"), ("if ({0}) {{", "}"), "%",
+        "(int)({0})", "block->", "measured->", "setpoints->", end, end, "(unsigned)({0})",
+    )  # fmt: skip
+
+
+def st_dialect(single: bool) -> Dialect:
+    """Structured text in LREAL or REAL."""
+    real = "REAL" if single else "LREAL"
+    return Dialect(
+        ST_OPERATIONS, "TRUE", "FALSE", " := ", ";", ("FOR {0} := 0 TO {2} DO", "END_FOR;"),
+        ("IF {0} THEN", "END_IF;"), " MOD ", f"{real}_TO_DINT({{0}})", "", "", "", "", "", f"{real}_TO_UDINT({{0}})",
+    )  # fmt: skip
+
+
+@dataclass
+class Statement:
+    """Lines of text in which work arrays stand as ``<number>``."""
+
+    lines: list[str]
+    defines: int = -1
+
+
+class Writer:
+    """The statements of a program in a dialect, with the work arrays and the constants that they need."""
+
+    def __init__(self, program: Program, dialect: Dialect) -> None:
+        self.program, self.dialect, self.graph = program, dialect, program.graph
+        self.cells = {cell.name: cell for cell in program.memory}
+        self.settings = {port.name for port in program.settings}
+        self.tables: dict[bytes, tuple[str, Any]] = {}
+        self.statements: list[Statement] = []
+        self.sizes: dict[int, tuple[int, bool]] = {}
+        self.inlined: dict[int, str] = {}
+        self.copies: dict[bytes, int] = {}
+        self.uses: Counter[int] = Counter()
+        for node in program.nodes:
+            for ids in node.args:
+                self.uses.update(self._owners(ids))
+        once = [*(ids for _, ids in program.outputs), *(cell.after for cell in program.memory), program.due]
+        self.uses.update(owner for ids in once for owner in 2 * self._owners(ids))
+        for node in program.nodes:
+            self._node(node)
+        self._finish()
+        self.work, self.body = self._allocated()
+
+    def _owners(self, ids: Ids) -> list[int]:
+        return sorted(set((np.searchsorted(self.graph.starts, ids, side="right") - 1).tolist()))
+
+    def _add(self, lines: list[str], size: int = 0, logical: bool = False) -> int:
+        number = len(self.sizes)
+        if size:
+            self.sizes[number] = size, logical
+        self.statements.append(Statement(lines, number if size else -1))
+        return number
+
+    def _loop(self, variable: str, count: int, lines: list[str]) -> list[str]:
+        head, tail = self.dialect.loop
+        return [head.format(variable, count, count - 1), *(f"    {line}" for line in lines), tail]
+
+    def _assign(self, target: str, value: str) -> str:
+        return f"{target}{self.dialect.assign}{value}{self.dialect.end}"
+
+    def _node(self, node: Node) -> None:
+        if node.op == "input":
+            return
+        size, new = node.size, "<new>" + ("[{}]" if node.size > 1 else "")
+        if node.op in FUNCTIONS:
+            args = [self._element(ids, "i") for ids in node.args]
+            text = self.dialect.operations[node.op].replace("@", self.dialect.function).format(*args)
+            if self.uses[self._at(node)] == 1 and len(text) <= LONGEST and self._joins(node):
+                self.inlined[self._at(node)] = text
+                return
+            line = [self._assign(new.format("i"), _bare(text))]
+            lines = self._loop("i", size, line) if size > 1 else line
+        elif node.op == "matmul":
+            lines = self._product(node)
+        elif node.op == "argmax":
+            row, best = self._array(node.args[0]), self.dialect.index.format("<new>")
+            head, tail = self.dialect.if_
+            body = [head.format(row.format(best) + " < " + row.format("i")), "    " + self._assign("<new>", "i"), tail]
+            lines = [self._assign("<new>", self.dialect.number(0.0)), *self._loop("i", node.args[0].size, body)]
+        else:
+            row = self._array(node.args[0])
+            line = [self._assign(new.format("i"), row.format(self.dialect.index.format(self._element(node.args[1], "i"))))]
+            lines = self._loop("i", size, line) if size > 1 else line
+        self.copies[f"node {self._at(node)}".encode()] = self._add(lines, size, node.logical)
+
+    def _at(self, node: Node) -> int:
+        return self._owners(np.array([node.start]))[0]
+
+    def _joins(self, node: Node) -> bool:
+        """Whether the one use of a node is the same element of an operation on each element."""
+        whole = node.start + np.arange(node.size)
+        for later in self.program.nodes[self.program.nodes.index(node) + 1 :]:
+            for ids in later.args:
+                if ids.size and ids[0] <= node.start <= ids[-1]:
+                    return later.op in FUNCTIONS and np.array_equal(ids, whole)
+        return False
+
+    def _product(self, node: Node) -> list[str]:
+        m, k, n = node.data
+        a, b = self._array(node.args[0]), self._array(node.args[1])
+        row = "" if m == 1 else (f"{k} * i" if k > 1 else "i")
+        left = a.format(_plus(row, "l"))
+        right = b.format(_plus("l" if n == 1 else f"{n} * l", "" if n == 1 else "j"))
+        at = _plus("" if m == 1 else ("i" if n == 1 else f"{n} * i"), "" if n == 1 else "j")
+        target = f"<new>[{at}]" if m * n > 1 else "<new>"
+        lines = [
+            self._assign("sum", self.dialect.number(0.0)),
+            *self._loop("l", k, [self._assign("sum", f"sum + {left} * {right}")]),
+            self._assign(target, "sum"),
+        ]
+        lines = self._loop("j", n, lines) if n > 1 else lines
+        return self._loop("i", m, lines) if m > 1 else lines
+
+    def _array(self, ids: Ids) -> str:
+        """Text of an array's element ``{}``."""
+        known = self.graph.values(ids)
+        if known is not None:
+            return self._table(known) + "[{}]"
+        owners = self._owners(ids)
+        node = self.graph.nodes[owners[0]]
+        whole = len(owners) == 1 and np.array_equal(ids, node.start + np.arange(node.size))
+        if whole and node.size > 1 and owners[0] not in self.inlined:
+            return self._name(owners[0]) + "[{}]"
+        return f"<{self._copy(ids)}>" + ("[{}]" if ids.size > 1 else "")
+
+    def _element(self, ids: Ids, i: str) -> str:
+        """Text of element i of an argument."""
+        known = self.graph.values(ids)
+        if known is not None:
+            flat = known.ravel()
+            if (flat == flat[0]).all():
+                if known.dtype == np.bool_:
+                    return self.dialect.true if flat[0] else self.dialect.false
+                return self.dialect.number(flat[0])
+            return f"{self._table(known)}[{i}]"
+        owners = self._owners(ids)
+        pattern = _pattern(ids - self.graph.nodes[owners[0]].start, i, self.dialect) if len(owners) == 1 else None
+        if pattern is None:
+            return f"<{self._copy(ids)}>[{i}]"
+        if owners[0] in self.inlined:
+            return self.inlined[owners[0]]
+        node = self.graph.nodes[owners[0]]
+        return self._name(owners[0]) + (f"[{pattern}]" if node.size > 1 else "")
+
+    def _name(self, owner: int) -> str:
+        """Name of a node's array or number."""
+        node = self.graph.nodes[owner]
+        if node.op != "input":
+            return f"<{self.copies[f'node {owner}'.encode()]}>"
+        own = node.data in self.cells or node.data in self.settings
+        return (self.dialect.memory if own else self.dialect.given) + node.data
+
+    def _table(self, values: Any) -> str:
+        key = values.tobytes() + values.dtype.char.encode()
+        self.tables.setdefault(key, (f"c{len(self.tables)}", values.ravel()))
+        return self.tables[key][0]
+
+    def _copy(self, ids: Ids) -> int:
+        """Work array that holds these elements next to each other."""
+        key = ids.tobytes()
+        if key not in self.copies:
+            lines: list[str] = []
+            for first, last in _runs(ids, self._starts(ids)):
+                part = ids[first:last]
+                source = self._element(part, "i")
+                at = f"[{_plus('i' if last - first > 1 else '', str(first) if first else '')}]" if ids.size > 1 else ""
+                at = at.replace("[]", "[0]")
+                line = [self._assign(f"<new>{at}", source)]
+                lines += self._loop("i", last - first, line) if last - first > 1 else line
+            logical = self.graph.owner(int(ids[0])).logical
+            self.copies[key] = self._add(lines, ids.size, logical)
+        return self.copies[key]
+
+    def _starts(self, ids: Ids) -> Any:
+        return np.searchsorted(self.graph.starts, ids, side="right") - 1
+
+    def _finish(self) -> None:
+        """Copy results to the outputs, and to the memory where a sample was due."""
+        changes: list[str] = []
+        for cell in self.program.memory:
+            owners = self._owners(cell.after)
+            nodes = [self.graph.nodes[at] for at in owners]
+            if [node.data for node in nodes if node.op == "input"] == [cell.name] and np.array_equal(
+                cell.after, nodes[0].start + np.arange(cell.after.size)
+            ):
+                continue
+            name = self.dialect.memory + cell.name
+            if any(node.op == "input" and node.data in self.cells for node in nodes) and cell.after.size > 1:
+                source = f"<{self._copy(cell.after)}>[i]"
+            elif any(node.op == "input" and node.data in self.cells for node in nodes):
+                source = f"<{self._copy(cell.after)}>"
+            else:
+                source = self._element(cell.after, "i")
+            if cell.after.size > 1:
+                changes += self._loop("i", cell.after.size, [self._assign(f"{name}[i]", source)])
+            else:
+                changes.append(self._assign(name, source))
+        for port, ids in self.program.outputs:
+            value = self._element(ids, "0")
+            value = self.dialect.whole.format(value) if port.name == "alarms" else value
+            self._add([self._assign(self.dialect.result + port.name, value)])
+        head, tail = self.dialect.if_
+        self._add([head.format(self._element(self.program.due, "0")), *(f"    {line}" for line in changes), tail])
+
+    def _allocated(self) -> tuple[dict[str, tuple[int, bool]], list[str]]:
+        """Work arrays by name, and the lines with their names; an array is used again after its last use."""
+        token = re.compile(r"<(\d+|new)>")
+        last: dict[int, int] = {}
+        for at, statement in enumerate(self.statements):
+            for word in token.findall("\n".join(statement.lines)):
+                last[statement.defines if word == "new" else int(word)] = at
+        work: dict[str, tuple[int, bool]] = {}
+        free: dict[tuple[int, bool], list[str]] = {}
+        names: dict[int, str] = {}
+        lines: list[str] = []
+        for at, statement in enumerate(self.statements):
+            if statement.defines >= 0:
+                kind = self.sizes[statement.defines]
+                if not free.get(kind):
+                    free.setdefault(kind, []).append(f"{'b' if kind[1] else 'w'}{len(work)}")
+                    work[free[kind][-1]] = kind
+                names[statement.defines] = free[kind].pop()
+            mine = statement.defines
+
+            def named(match: re.Match[str], mine: int = mine) -> str:
+                return names[mine if match[1] == "new" else int(match[1])]
+
+            lines += [token.sub(named, line) for line in statement.lines]
+            for number in [number for number, use in last.items() if use == at]:
+                free[self.sizes[number]].append(names[number])
+        return work, lines
+
+
+def _bare(text: str) -> str:
+    """An expression without parentheses around all of it."""
+    depth = 0
+    for at, letter in enumerate(text):
+        depth += (letter == "(") - (letter == ")")
+        if depth == 0:
+            return text[1:-1] if at == len(text) - 1 and text[0] == "(" else text
+    return text
+
+
+def _plus(one: str, other: str) -> str:
+    return " + ".join(part for part in (one, other) if part)
+
+
+def _pattern(at: Ids, i: str, dialect: Dialect) -> str | None:
+    """Text of the i-th of these indices; None if there is no short one."""
+    first = int(at[0])
+    if (at == first).all():
+        return str(first)
+
+    def term(stride: int, text: str) -> str:
+        return "" if stride == 0 else text if stride == 1 else f"{stride} * {text}"
+
+    steps = np.diff(at)
+    if (steps == steps[0]).all():
+        if steps[0] < 0:
+            return f"{first} - {term(-int(steps[0]), i)}"
+        return _plus(term(int(steps[0]), i), str(first) if first else "")
+    for m in (m for m in range(2, at.size) if at.size % m == 0):
+        table = at.reshape(-1, m)
+        inner, outer = np.diff(table, axis=1), np.diff(table[:, 0])
+        if (inner == inner[0, 0]).all() and (outer == outer[0]).all() and inner[0, 0] >= 0 and outer[0] >= 0:
+            parts = term(int(outer[0]), f"({i} / {m})"), term(int(inner[0, 0]), f"({i}{dialect.remainder}{m})")
+            return _plus(_plus(*parts), str(first) if first else "")
+    return None
+
+
+def _runs(ids: Ids, owners: Any) -> list[tuple[int, int]]:
+    """First and last + 1 of the longest runs with equal steps within one node."""
+    runs, first = [], 0
+    for at in range(1, ids.size + 1):
+        together = at < ids.size and owners[at] == owners[first]
+        if together and (at - first < 2 or ids[at] - ids[at - 1] == ids[first + 1] - ids[first]):
+            continue
+        runs.append((first, at))
+        first = at
+    return runs
+
+
+def _comment(lines: list[str], left: str, right: str) -> str:
+    """Lines as one comment."""
+    return "\n".join([left, *(f"   {line}".rstrip() for line in lines), right])
+
+
+def _explained(port: Port, default: bool) -> str:
+    return f"{port.meaning}{f'; default {port.default:.10g}' if default else ''}"
+
+
+def about(program: Program) -> list[str]:
+    """The header of each file: what it is and where it comes from."""
+    said = [f"{program.name}: controller for Czochralski growth, generated by cz-gym; do not edit.", *program.notes]
+    said.append("Not tested on a real puller. Read README.md before use.")
+    return [line for each in said for line in wrap(each, 100)]
+
+
+def write_c(program: Program, single: bool = False) -> dict[str, str]:
+    """The header and the source, by file name."""
+    writer, name = Writer(program, c_dialect(single)), f"cz_{program.name}"
+    number, real = writer.dialect.number, f"cz_{program.name}_real"
+    guard = f"{name.upper()}_H"
+
+    def members(ports: tuple[Port, ...], default: bool) -> list[str]:
+        kinds = {True: "int", False: "double"}
+        return [f"    {kinds[port.logical]} {port.name}; /* {_explained(port, default)} */" for port in ports]
+
+    def field(kind: str, field_name: str, size: int) -> str:
+        return f"    {kind} {field_name}{f'[{size}]' if size > 1 else ''};"
+
+    bits = [
+        f"#define {name.upper()}_{bit.name} {bit.value}u /* {meaning} */" for bit, meaning in _meanings(Alarm).items()
+    ]
+    shown = [port for port, _ in program.outputs]
+    header = [
+        _comment(about(program), "/*", "*/"), f"#ifndef {guard}", f"#define {guard}", "",
+        f"typedef {'float' if single else 'double'} {real};", "", *bits, "", "typedef struct {",
+        *members(program.inputs, False), f"}} {name}_measured;", "", "typedef struct {",
+        *(f"    {'unsigned' if p.name == 'alarms' else real} {p.name}; /* {p.meaning} */" for p in shown),
+        f"}} {name}_setpoints;", "",
+        "/* Settings may be changed after init; the rest is the block's memory. */",
+        "typedef struct {", *members(program.settings, True),
+        *(field("double" if cell.wide else real, cell.name, cell.start.size) for cell in program.memory), f"}} {name};", "",
+        "/* Default settings, and reset. */", f"void {name}_init({name} *block);",
+        "/* Forget everything but the settings: the next automatic sample is a takeover. */",
+        f"void {name}_reset({name} *block);",
+        "/* One call; a new sample is taken when the control interval has passed since the last one. */",
+        f"void {name}_step({name} *block, const {name}_measured *measured, {name}_setpoints *setpoints);", "",
+        f"#endif /* {guard} */", "",
+    ]  # fmt: skip
+    tables = [
+        f"static const {real} {table}[{len(values)}] = {{\n" + "\n".join(_rows(map(number, values))) + "\n};"
+        for table, values in writer.tables.values()
+    ]
+    used = {word for line in writer.body for word in re.findall(r"\b(?:i|j|l|sum)\b", line)}
+    declared = [f"    int {', '.join(sorted(used - {'sum'}))};"] + [f"    {real} sum;"] * ("sum" in used)
+    source = [
+        _comment(about(program), "/*", "*/"), f'#include "{name}.h"', "#include <math.h>", "", *tables, "",
+        f"void {name}_init({name} *block)", "{",
+        *(f"    block->{port.name} = {number(port.default)};" for port in program.settings),
+        f"    {name}_reset(block);", "}", "", f"void {name}_reset({name} *block)", "{",
+        *_starts(program, writer, "    int i;"), "}", "",
+        f"void {name}_step({name} *block, const {name}_measured *measured, {name}_setpoints *setpoints)", "{",
+        *declared, *_declared(writer, real),
+        "", *(f"    {line}" for line in writer.body), "}", "",
+    ]  # fmt: skip
+    return {f"{name}.h": "\n".join(header), f"{name}.c": "\n".join(source)}
+
+
+def _declared(writer: Writer, real: str) -> list[str]:
+    """The work arrays of a C function."""
+    lines = []
+    for wanted, kind in ((True, "unsigned char"), (False, real)):
+        names = [name + (f"[{size}]" if size > 1 else "") for name, (size, logical) in writer.work.items() if logical == wanted]
+        lines += wrap(", ".join(names), 110, initial_indent=f"    {kind} ", subsequent_indent=f"    {' ' * len(kind)} ")
+        lines[-1] += ";"
+    return lines
+
+
+def write_st(program: Program, single: bool = False) -> dict[str, str]:
+    """The function block, by file name."""
+    writer, name = Writer(program, st_dialect(single)), f"cz_{program.name}"
+    number, real = writer.dialect.number, "REAL" if single else "LREAL"
+
+    def of(size: int, kind: str) -> str:
+        return f"ARRAY [0..{size - 1}] OF {kind}" if size > 1 else kind
+
+    def given(port: Port, default: bool) -> str:
+        value = ("TRUE" if port.default else "FALSE") if port.logical else number(port.default).strip("()")
+        kind = "BOOL" if port.logical else real
+        start = f" := {value}" if default or port.logical else ""
+        return f"    {port.name} : {kind}{start}; (* {port.meaning} *)"
+
+    bits = [f"{bit.value}: {meaning}" for bit, meaning in _meanings(Alarm).items()]
+    kinds = {port.name: "UDINT" if port.name == "alarms" else real for port, _ in program.outputs}
+    lines = [
+        _comment([*about(program), "", "The bits of alarms:", *bits], "(*", "*)"), f"FUNCTION_BLOCK {name}", "VAR_INPUT",
+        *(given(port, False) for port in program.inputs),
+        "    reset : BOOL := FALSE; (* forget everything but the settings *)",
+        *(given(port, True) for port in program.settings), "END_VAR", "VAR_OUTPUT",
+        *(f"    {port.name} : {kinds[port.name]}; (* {port.meaning} *)" for port, _ in program.outputs), "END_VAR", "VAR",
+        "    begun : BOOL := FALSE; (* whether the memory below holds anything *)",
+        *(f"    {cell.name} : {of(cell.start.size, real)};" for cell in program.memory), "END_VAR",
+        *(["VAR CONSTANT"] if writer.tables else []),
+        *(
+            f"    {table} : {of(len(values), real)} := [\n"
+            + "\n".join(_rows(number(value).strip("()") for value in values)) + "\n    ];"
+            for table, values in writer.tables.values()
+        ),
+        *(["END_VAR"] if writer.tables else []), "VAR_TEMP", "    i : DINT;", "    j : DINT;", "    l : DINT;",
+        f"    sum : {real};",
+        *(f"    {work} : {of(size, 'BOOL' if logical else real)};" for work, (size, logical) in writer.work.items()),
+        "END_VAR", "", "IF reset OR NOT begun THEN", *_starts(program, writer, ""), "    begun := TRUE;", "END_IF;",
+        *writer.body, "END_FUNCTION_BLOCK", "",
+    ]  # fmt: skip
+    return {f"{name}.st": "\n".join(lines)}
+
+
+def _starts(program: Program, writer: Writer, declared: str) -> list[str]:
+    """Statements that bring the memory to its state before the first sample."""
+    lines: list[str] = []
+    for cell in program.memory:
+        name = writer.dialect.memory + cell.name
+        for first, last in _runs(np.zeros(cell.start.size, np.int64), np.unique(cell.start, return_inverse=True)[1]):
+            value = writer.dialect.number(cell.start[first])
+            if last - first == 1:
+                at = "" if cell.start.size == 1 else f"[{first}]"
+                lines.append(writer._assign(f"{name}{at}", value))
+            else:
+                line = [writer._assign(f"{name}[{_plus('i', str(first) if first else '')}]", value)]
+                lines += writer._loop("i", last - first, line)
+    needed = any("[i" in line for line in lines)
+    return [declared] * bool(declared and needed) + [f"    {line}" for line in lines]
+
+
+def _rows(numbers: Any) -> list[str]:
+    return wrap(", ".join(numbers), 112, initial_indent="    ", subsequent_indent="    ", break_on_hyphens=False)
+
+
+def _meanings(kind: Any) -> dict[Any, str]:
+    """The members of an enumeration with the docstrings below them."""
+    import inspect
+
+    found = re.findall(r'^    (\w+) = \d+\n    """(.*?)"""', inspect.getsource(kind), re.MULTILINE | re.DOTALL)
+    return {kind[name]: " ".join(text.split()) for name, text in found}

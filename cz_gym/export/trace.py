@@ -1,0 +1,368 @@
+"""Record what NumPy code computes as a straight line of operations.
+
+A controller's own functions are called with :class:`Traced` arrays in place of numbers. Each arithmetic operation adds
+a :class:`Node` to a :class:`Graph`; slices, transposes and concatenations add none, because a traced array is an
+integer array of element numbers, on which NumPy does them. The batch axis has length 1. Shortcuts that a controller
+takes where no slot needs work are not taken: ``any()`` of a traced array is True and ``all()`` is False.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.errors import CzError
+
+Ids = npt.NDArray[np.int64]
+BAD = 3e38
+"""Stands for NaN and infinity in recorded programs; float32 holds it."""
+FINITE = 1e38
+"""Largest magnitude of a finite number in recorded programs."""
+LOGICAL = {"less", "less_equal", "equal", "and", "or", "not", "finite"}
+"""Operations whose results are logical."""
+FUNCTIONS: dict[str, Callable[..., Any]] = {
+    "add": np.add, "subtract": np.subtract, "multiply": np.multiply, "divide": np.divide, "negative": np.negative,
+    "absolute": np.absolute, "sqrt": np.sqrt, "exp": np.exp, "log": np.log, "sin": np.sin, "cos": np.cos,
+    "tanh": np.tanh, "minimum": np.minimum, "maximum": np.maximum, "less": np.less, "less_equal": np.less_equal,
+    "equal": np.equal, "and": np.logical_and, "or": np.logical_or, "not": np.logical_not, "select": np.where,
+    "finite": lambda x: np.abs(x) <= FINITE, "real": lambda x: x.astype(np.float64),
+}  # fmt: skip
+"""Operations on single numbers, which apply to each element."""
+_ALIASES = {
+    "bitwise_and": "and", "logical_and": "and", "bitwise_or": "or", "logical_or": "or", "invert": "not",
+    "logical_not": "not", "isfinite": "finite",
+}  # fmt: skip
+_TINY = 1e-20
+
+
+@dataclass(eq=False)
+class Node:
+    """One operation."""
+
+    op: str
+    """A key of :data:`FUNCTIONS`, or "input", "constant", "matmul", "argmax" or "pick"."""
+    args: tuple[Ids, ...]
+    """Element numbers of the arguments, each of ``size`` or one number."""
+    size: int
+    """Number of elements."""
+    start: int
+    """Number of its first element."""
+    logical: bool = False
+    data: Any = None
+    """Values of a constant, name of an input, (m, k, n) of a matrix product."""
+
+
+@dataclass
+class Graph:
+    """The recorded operations, in order."""
+
+    nodes: list[Node] = field(default_factory=list)
+    starts: list[int] = field(default_factory=list)
+    known: dict[bytes, Node] = field(default_factory=dict)
+    length: int = 0
+
+    def add(self, op: str, args: tuple[Ids, ...], size: int, data: Any = None) -> Node:
+        """A new node at the end."""
+        logical = op in LOGICAL or (op == "constant" and data.dtype == np.bool_)
+        logical = logical or (op == "select" and self.owner(args[1].flat[0]).logical)
+        node = Node(op, args, size, self.length, logical, data)
+        self.nodes.append(node)
+        self.starts.append(self.length)
+        self.length += size
+        return node
+
+    def owner(self, element: int) -> Node:
+        """The node of an element."""
+        return self.nodes[int(np.searchsorted(self.starts, element, side="right")) - 1]
+
+    def values(self, ids: Ids) -> Any:
+        """The elements' values if all are constants; None otherwise."""
+        owners = np.searchsorted(self.starts, ids.ravel(), side="right") - 1
+        if any(self.nodes[at].op != "constant" for at in set(owners.tolist())):
+            return None
+        flat = [self.nodes[at].data[i - self.starts[at]] for at, i in zip(owners, ids.ravel(), strict=True)]
+        return np.array(flat).reshape(ids.shape)
+
+    def input(self, name: str, shape: tuple[int, ...] = (1,)) -> Traced:
+        """A new input, or memory from the last sample."""
+        node = self.add("input", (), int(np.prod(shape)), name)
+        return Traced(self, node.start + np.arange(node.size).reshape(shape))
+
+    def constant(self, value: Any) -> Traced:
+        """A constant; equal ones are one node."""
+        array = np.asarray(value)
+        array = (
+            array
+            if array.dtype == np.bool_
+            else np.nan_to_num(array.astype(np.float64), nan=BAD, posinf=BAD, neginf=-BAD)
+        )
+        key = array.tobytes() + array.dtype.char.encode()
+        if key not in self.known:
+            self.known[key] = self.add("constant", (), array.size, array.ravel())
+        return Traced(self, self.known[key].start + np.arange(array.size).reshape(array.shape))
+
+    def lift(self, value: Any) -> Traced:
+        """The value itself if it is traced, else as a constant."""
+        return value if isinstance(value, Traced) else self.constant(value)
+
+    def apply(self, op: str, *values: Any) -> Traced:
+        """The result of an operation on each element, with NumPy's broadcasting."""
+        args = np.broadcast_arrays(*(self.lift(value).ids for value in values))
+        known = [self.values(ids) for ids in args]
+        if all(value is not None for value in known):
+            with np.errstate(all="ignore"):
+                return self.constant(FUNCTIONS[op](*known))
+        if (simple := self._simplified(op, args, known)) is not None:
+            return Traced(self, simple)
+        flat = tuple(np.ascontiguousarray(ids).ravel() for ids in args)
+        node = self.add(op, flat, flat[0].size)
+        return Traced(self, node.start + np.arange(node.size).reshape(args[0].shape))
+
+    def _simplified(self, op: str, args: Any, known: list[Any]) -> Any:
+        """Element numbers that the operation leaves as they are; None if it changes something."""
+        for value, other in ((1, 0), (0, 1)) if len(known) == 2 else ():
+            if known[value] is not None and not (op in ("subtract", "divide") and value == 0):
+                neutral = {"add": 0.0, "subtract": 0.0, "multiply": 1.0, "divide": 1.0, "minimum": BAD, "maximum": -BAD}
+                if np.all(known[value] == neutral.get(op)):
+                    return args[other]
+        if op == "divide" and known[1] is not None and args[0].size:
+            of = self.owner(args[0].flat[0])
+            whole = of.op == "multiply" and np.array_equal(args[0].ravel(), of.start + np.arange(of.size))
+            factor = self.values(of.args[1]) if whole else None
+            if factor is not None and np.all(factor == known[1].ravel()):
+                return of.args[0].reshape(args[0].shape)
+        return None
+
+
+class Traced(np.lib.mixins.NDArrayOperatorsMixin):
+    """An array whose elements are results of a graph's operations."""
+
+    def __init__(self, graph: Graph, ids: Any) -> None:
+        self.graph, self.ids = graph, np.asarray(ids, np.int64)
+
+    shape = property(lambda self: self.ids.shape)
+    ndim = property(lambda self: self.ids.ndim)
+    size = property(lambda self: self.ids.size)
+    dtype = property(lambda self: np.dtype(np.bool_ if self.logical else np.float64))
+    T = property(lambda self: Traced(self.graph, self.ids.T))
+
+    @property
+    def logical(self) -> bool:
+        """Whether its elements are logical."""
+        return bool(self.size) and self.graph.owner(self.ids.flat[0]).logical
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __getitem__(self, key: Any) -> Traced:
+        if isinstance(key, Traced) and key.logical:  # the slots where it holds, out of one slot
+            return self
+        if isinstance(key, tuple) and any(isinstance(part, Traced) for part in key):  # [slot, index]
+            return _take(self.graph, self[0], key[1])
+        return Traced(self.graph, self.ids[key])
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        first = key[0] if isinstance(key, tuple) else key
+        new = self.graph.lift(value)
+        if isinstance(first, Traced):
+            key = (slice(None), *key[1:]) if isinstance(key, tuple) else slice(None)
+            where = first.reshape(1, *(1,) * (self.ids[key].ndim - 1))
+            new = self.graph.apply("select", where, new, Traced(self.graph, self.ids[key]))
+        self.ids = self.ids.copy()
+        self.ids[key] = new.ids
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("reshape", "transpose", "swapaxes", "copy", "ravel", "squeeze"):
+            return lambda *given: Traced(self.graph, getattr(self.ids, name)(*given))
+        raise AttributeError(name)
+
+    def any(self, axis: Any = None) -> bool:
+        """True: every masked step is recorded."""
+        return True
+
+    def all(self, axis: Any = None) -> bool:
+        """False: no step is left out."""
+        return False
+
+    def astype(self, dtype: Any) -> Traced:
+        """The numbers 0 and 1 of logical elements."""
+        return self.graph.apply("real", self) if self.logical else self
+
+    def sum(self, axis: int) -> Traced:
+        """Sum along an axis."""
+        last = np.moveaxis(self.ids, axis, -1)
+        ones = np.ones((last.shape[-1], 1))
+        return self._matmul(Traced(self.graph, last.reshape(-1, last.shape[-1])), ones).reshape(last.shape[:-1])
+
+    def mean(self, axis: int) -> Traced:
+        """Mean along an axis."""
+        return self.sum(axis) / self.shape[axis]
+
+    def argmax(self, axis: int) -> Traced:
+        """Index of the first largest element of the one row."""
+        node = self.graph.add("argmax", (self.ids.ravel(),), 1)
+        return Traced(self.graph, [node.start])
+
+    def view(self, dtype: Any) -> Complex:
+        """Pairs of numbers as complex ones."""
+        return Complex(self[..., 0::2], self[..., 1::2])
+
+    def _matmul(self, a: Any, b: Any) -> Traced:
+        x, y = self.graph.lift(a).ids, self.graph.lift(b).ids
+        left, right = (x[None] if x.ndim == 1 else x), (y[:, None] if y.ndim == 1 else y)
+        batch = np.broadcast_shapes(left.shape[:-2], right.shape[:-2])
+        (m, k), n = left.shape[-2:], right.shape[-1]
+        if np.prod(batch, dtype=int) != 1 or right.shape[-2] != k:
+            raise CzError(f"cannot record a matrix product of shapes {x.shape} and {y.shape}")
+        node = self.graph.add("matmul", (left.ravel(), right.ravel()), m * n, (m, k, n))
+        shape = (*batch, *((m,) if x.ndim > 1 else ()), *((n,) if y.ndim > 1 else ()))
+        return Traced(self.graph, node.start + np.arange(m * n).reshape(shape))
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, out: Any = None, **kwargs: Any) -> Any:
+        name = ufunc.__name__
+        if method != "__call__" or kwargs:
+            raise CzError(f"cannot record np.{name}.{method} with {', '.join(kwargs)}")
+        if any(isinstance(value, (complex, Complex)) or np.iscomplexobj(value) for value in inputs):
+            return complex_ufunc(name, *inputs)
+        if name == "matmul":
+            result = self._matmul(*inputs)
+        elif name in ("greater", "greater_equal"):
+            result = self.graph.apply(name.replace("greater", "less"), *reversed(inputs))
+        elif name == "not_equal":
+            result = ~self.graph.apply("equal", *inputs)
+        elif name == "sign":
+            result = np.where(inputs[0] > 0.0, 1.0, np.where(inputs[0] < 0.0, -1.0, 0.0))
+        elif name == "square":
+            result = self.graph.apply("multiply", *inputs, *inputs)
+        elif _ALIASES.get(name, name) in FUNCTIONS:
+            result = self.graph.apply(_ALIASES.get(name, name), *inputs)
+        else:
+            raise CzError(f"cannot record np.{name}")
+        if out:
+            out[0].ids = result.ids
+            return out[0]
+        return result
+
+    def __array_function__(self, function: Any, types: Any, args: Any, kwargs: Any) -> Any:
+        if function in _RULES:
+            return _RULES[function](self.graph, *args, **kwargs)
+        if function in (np.zeros_like, np.ones_like, np.full_like):
+            shape = kwargs.pop("shape", None) or args[0].shape
+            return self.graph.constant(function(np.zeros(shape), *args[1:], **kwargs))
+        return Traced(
+            self.graph, function(*self._numbers(args), **dict(zip(kwargs, self._numbers(kwargs.values()), strict=True)))
+        )
+
+    def _numbers(self, values: Any) -> list[Any]:
+        """Arguments of a function that only moves elements, as arrays of element numbers."""
+        found: list[Any] = []
+        for value in values:
+            if isinstance(value, Traced):
+                found.append(value.ids)
+            elif isinstance(value, (list, tuple)) and any(isinstance(part, Traced) for part in value):
+                found.append([self.graph.lift(part).ids for part in value])
+            else:
+                found.append(value)
+        return found
+
+
+def _clip(graph: Graph, value: Any, low: Any, high: Any) -> Any:
+    return graph.apply("minimum", graph.apply("maximum", value, low), high)
+
+
+def _take(graph: Graph, array: Any, index: Any, axis: Any = None) -> Traced:
+    row, at = graph.lift(array).ids, graph.lift(index).ids
+    node = graph.add("pick", (row.ravel(), at.ravel()), at.size)
+    return Traced(graph, node.start + np.arange(node.size).reshape(at.shape))
+
+
+def _einsum(graph: Graph, rule: str, a: Any, b: Any) -> Any:
+    if rule != "ni,ni->n":
+        raise CzError(f"cannot record np.einsum({rule!r})")
+    product = graph.lift(a)[:, None, :] @ graph.lift(b)[:, :, None]
+    return product[:, 0, 0]
+
+
+_RULES: dict[Any, Callable[..., Any]] = {
+    np.ndim: lambda graph, array: array.ndim,
+    np.iscomplexobj: lambda graph, array: False,
+    np.where: lambda graph, *values: graph.apply("select", *values),
+    np.clip: _clip,
+    np.take_along_axis: _take,
+    np.einsum: _einsum,
+    np.diff: lambda graph, array, axis: array[..., 1:] - array[..., :-1],
+}
+
+
+class Complex(np.lib.mixins.NDArrayOperatorsMixin):
+    """Traced complex numbers ``re + j unit im``; with a tiny unit, that of complex steps, its square is zero."""
+
+    def __init__(self, re: Any, im: Any, unit: float = 1.0) -> None:
+        self.re, self.im, self.unit = re, im, unit
+
+    @property
+    def real(self) -> Any:
+        """Real part."""
+        return self.re
+
+    @property
+    def imag(self) -> Any:
+        """Imaginary part."""
+        return self.im * self.unit
+
+    def __len__(self) -> int:
+        return len(self.re)
+
+    def __getitem__(self, key: Any) -> Complex:
+        return Complex(self.re[key], self.im[key], self.unit)
+
+    def view(self, dtype: Any) -> Any:
+        """Complex numbers as pairs."""
+        return np.stack([self.re, self.imag], axis=-1).reshape(*self.re.shape[:-1], 2 * self.re.shape[-1])
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, out: Any = None, **kwargs: Any) -> Any:
+        return complex_ufunc(ufunc.__name__, *inputs)
+
+
+def complex_ufunc(name: str, *inputs: Any) -> Complex:
+    """The ufunc of complex numbers, traced in real ones."""
+    parts = [_parts(value) for value in inputs]
+    unit = min(part.unit for part in parts if part.im is not None)
+    a, b = parts[0], parts[-1]
+    if name in ("add", "subtract"):
+        plus: Any = getattr(np, name)
+        im = a.im if b.im is None else (plus(0.0, b.im) if a.im is None else plus(a.im, b.im))
+        return Complex(plus(a.re, b.re), im, unit)
+    if name == "multiply":
+        re = a.re * b.re
+        if a.im is not None and b.im is not None and unit == 1.0:
+            re = re - a.im * b.im
+        im = sum(x * y for x, y in ((a.re, b.im), (a.im, b.re)) if x is not None and y is not None)
+        return Complex(re, im, unit)
+    if name == "divide" and (b.im is None or unit < _TINY):
+        re = a.re / b.re
+        top = 0.0 if a.im is None else a.im
+        return Complex(re, (top if b.im is None else top - re * b.im) / b.re, unit)
+    if name == "negative":
+        return Complex(-a.re, -a.im, unit)
+    if name == "sqrt" and unit < _TINY:
+        root = np.sqrt(a.re)
+        return Complex(root, a.im / (2.0 * root), unit)
+    if name == "log" and unit < _TINY:
+        return Complex(np.log(a.re), a.im / a.re, unit)
+    raise CzError(f"cannot record np.{name} of complex numbers")
+
+
+def _parts(value: Any) -> Complex:
+    if isinstance(value, Complex):
+        return value
+    if not np.iscomplexobj(value):
+        return Complex(value, None)
+    array = np.asarray(value)
+    unit = float(np.max(np.abs(array.imag)))
+    unit = unit if 0.0 < unit < _TINY else 1.0
+    return Complex(array.real, array.imag / unit, unit)
