@@ -84,7 +84,7 @@ class BlockPolicy:
         if state is None:
             return BlockState(np.zeros(n, np.int64), fresh, np.zeros(n, np.int64))
         memory = np.where(begins[:, None] if np.ndim(fresh) == 2 else begins, fresh, state.memory)
-        return state._replace(samples=np.where(begins, 0, state.samples), memory=memory)
+        return BlockState(np.where(begins, 0, state.samples), memory, state.alarms)
 
     def inputs(self, rows: Any, samples: Any) -> dict[str, Any]:
         """The block's inputs for observations of shape (n, channels) at those samples of their episodes."""
@@ -111,4 +111,5 @@ class BlockPolicy:
         puller = make_puller(self.config.parameters, 0.5, self.config.meniscus)
         pull = outputs["pull_speed_setpoint_mm_per_min"] * MM_PER_MIN / puller.v_0 - 1.0
         heat = (outputs["heater_power_setpoint_kW"] * KILO - puller.Q_H_0) / HEATER_RANGE
-        return np.clip(np.stack([pull, heat], axis=-1), -1.0, 1.0).astype(np.float32)
+        action: npt.NDArray[np.float32] = np.clip(np.stack([pull, heat], axis=-1), -1.0, 1.0).astype(np.float32)
+        return action

@@ -57,6 +57,8 @@ class Program:
     memory: tuple[Cell, ...]
     due: Ids
     """Whether the memory changes at this call, one logical element."""
+    needs_double: bool = False
+    """Whether single precision loses too much."""
     notes: tuple[str, ...] = ()
     """Facts for the header of each written file: puller, hashes, scenario."""
 
@@ -114,7 +116,9 @@ class Program:
                 table[:, node.start : node.start + node.size] = node.data
         with np.errstate(all="ignore"):
             for node, fetches in self._plan:
-                args = [table[:, at] if isinstance(at, (slice, np.ndarray)) and not _is_value(at) else at for at in fetches]
+                args = [
+                    table[:, at] if isinstance(at, (slice, np.ndarray)) and not _is_value(at) else at for at in fetches
+                ]
                 table[:, node.start : node.start + node.size] = _compute(node, args)
         after = np.concatenate([table[:, cell.after] for cell in self.memory], axis=1)
         due = table[:, self.due] > 0.5
@@ -153,7 +157,9 @@ def flatten(value: Any, name: str = "") -> list[tuple[str, Any]]:
     if not isinstance(value, tuple):
         return [(name, value)]
     names = getattr(value, "_fields", range(len(value)))
-    return [leaf for part, each in zip(names, value, strict=True) for leaf in flatten(each, f"{name}_{part}".strip("_"))]
+    return [
+        leaf for part, each in zip(names, value, strict=True) for leaf in flatten(each, f"{name}_{part}".strip("_"))
+    ]
 
 
 def rebuild(like: Any, leaves: Any) -> Any:
@@ -161,7 +167,8 @@ def rebuild(like: Any, leaves: Any) -> Any:
     if not isinstance(like, tuple):
         return next(leaves)
     parts = [rebuild(each, leaves) for each in like]
-    return type(like)(*parts) if hasattr(like, "_fields") else tuple(parts)
+    kind: Any = type(like)
+    return kind(*parts) if hasattr(like, "_fields") else tuple(parts)
 
 
 def record(
@@ -171,6 +178,7 @@ def record(
     outputs: tuple[Port, ...],
     memory: Any,
     step: Callable[[Any, Any, Any], tuple[Any, Any, Any]],
+    needs_double: bool = False,
     notes: tuple[str, ...] = (),
 ) -> Program:
     """Record ``step(settings, inputs, memory) -> outputs, memory, due``; ``memory`` is that before the first sample.
@@ -181,7 +189,7 @@ def record(
     leaves = [(leaf, np.clip(np.asarray(value, np.float64), -BAD, BAD)) for leaf, value in flatten(memory)]
     cells = [graph.input(leaf, value.shape) if value.size else value for leaf, value in leaves]
     given = [{port.name: graph.input(port.name) for port in ports} for ports in (settings, inputs)]
-    results, after, due = step(*given, rebuild(memory, iter(cells)))
+    results, after, due = step(given[0], given[1], rebuild(memory, iter(cells)))
 
     def ids_of(value: Any) -> Ids:
         return np.ascontiguousarray(graph.lift(value).ids).ravel()
@@ -195,7 +203,7 @@ def record(
         if cell.after.size != cell.start.size:
             raise ValueError(f"{cell.name}: {cell.start.size} numbers became {cell.after.size}")
     shown = tuple((port, ids_of(results[port.name])) for port in outputs)
-    return Program(name, graph, settings, inputs, shown, tuple(held), ids_of(due), notes)
+    return Program(name, graph, settings, inputs, shown, tuple(held), ids_of(due), needs_double, notes)
 
 
 __all__ = ["Cell", "Port", "Program", "Traced", "flatten", "rebuild", "record"]

@@ -18,7 +18,7 @@ import numpy as np
 from cz_gym.config import Config
 from cz_gym.observation import CLIP, MEASURED, Measured, readable, scales
 from cz_gym.physics.plant import Puller, make_puller
-from cz_gym.task import HEATER_RANGE, RADIUS_LIMIT
+from cz_gym.task import HEATER_RANGE
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 from .program import Port, Program, record
@@ -213,7 +213,8 @@ def step(controller: Controller, pid: Controller, dt: float, v_0: float, setting
         (settings["pull_speed_min_mm_per_min"], settings["pull_speed_max_mm_per_min"]),
         (settings["heater_power_min_kW"], settings["heater_power_max_kW"]),
     )
-    setpoints, limited = [], []
+    setpoints: list[Any] = []
+    limited: list[Any] = []
     for value, old, drive, slew, span in zip(wanted, before, applied, slews, ranges, strict=True):
         target = np.where(sound, value, old)
         target = np.where(share < 1.0, old + share * (target - old), target)
@@ -232,8 +233,18 @@ def step(controller: Controller, pid: Controller, dt: float, v_0: float, setting
     for bit, holds in bits.items():
         alarms = alarms + np.where(holds, float(bit), 0.0)
     outputs = dict(zip((port.name for port in OUTPUTS), (*setpoints, alarms), strict=True))
-    truth = (np.where(value, 1.0, 0.0) for value in (engaged, fallback | (engaged & ~sound)))
-    now = Memory(given["time_s"], next(truth), since, bad, next(truth), *setpoints, read, own[2], other[2])
+    now = Memory(
+        last_time_s=given["time_s"],
+        engaged=np.where(engaged, 1.0, 0.0),
+        since=since,
+        bad=bad,
+        fallback=np.where(fallback | (engaged & ~sound), 1.0, 0.0),
+        pull=setpoints[0],
+        heater=setpoints[1],
+        readings=read,
+        controller=own[2],
+        pid=other[2],
+    )
     return outputs, now, due
 
 
@@ -256,12 +267,18 @@ def shelled(name: str, controller: Controller, pid: Controller, config: Config, 
     """Record a controller in its shell, for the puller and the control interval of an environment."""
     puller = make_puller(config.parameters, 0.5, config.meniscus)
     zero = Measured(*(np.zeros(1) for _ in Measured._fields))
+    nominal = puller.v_0 / MM_PER_MIN, puller.Q_H_0 / KILO
     start = Memory(
-        np.full(1, math.inf), *(np.zeros(1) for _ in range(4)), np.full(1, puller.v_0 / MM_PER_MIN),
-        np.full(1, puller.Q_H_0 / KILO), zero, controller.at_rest(zero), pid.at_rest(zero),
-    )  # fmt: skip
+        last_time_s=np.full(1, math.inf),
+        **{name: np.zeros(1) for name in ("engaged", "since", "bad", "fallback")},
+        pull=np.full(1, nominal[0]),
+        heater=np.full(1, nominal[1]),
+        readings=zero,
+        controller=controller.at_rest(zero),
+        pid=pid.at_rest(zero),
+    )
 
     def body(settings: Any, given: Any, memory: Any) -> Any:
         return step(controller, pid, config.control_interval, puller.v_0, settings, given, memory)
 
-    return record(name, settings_of(puller), INPUTS, OUTPUTS, start, body, notes)
+    return record(name, settings_of(puller), INPUTS, OUTPUTS, start, body, controller.estimates_temperature, notes)

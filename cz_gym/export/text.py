@@ -1,7 +1,7 @@
 """A recorded program as C99 or as IEC 61131-3 structured text.
 
-:class:`Writer` orders the statements and gives their results to a small pool of work arrays; a :class:`Dialect` says how
-a language writes them. An operation whose result is used once, element by element, becomes part of a longer expression.
+A :class:`Writer` orders the statements and gives their results to a small pool of work arrays, a :class:`Dialect` says
+how a language writes them. An operation whose result is used once, element by element, becomes part of an expression.
 """
 
 from __future__ import annotations
@@ -165,7 +165,9 @@ class Writer:
             lines = [self._assign("<new>", self.dialect.number(0.0)), *self._loop("i", node.args[0].size, body)]
         else:
             row = self._array(node.args[0])
-            line = [self._assign(new.format("i"), row.format(self.dialect.index.format(self._element(node.args[1], "i"))))]
+            line = [
+                self._assign(new.format("i"), row.format(self.dialect.index.format(self._element(node.args[1], "i"))))
+            ]
             lines = self._loop("i", size, line) if size > 1 else line
         self.copies[f"node {self._at(node)}".encode()] = self._add(lines, size, node.logical)
 
@@ -239,7 +241,8 @@ class Writer:
     def _table(self, values: Any) -> str:
         key = values.tobytes() + values.dtype.char.encode()
         self.tables.setdefault(key, (f"c{len(self.tables)}", values.ravel()))
-        return self.tables[key][0]
+        name: str = self.tables[key][0]
+        return name
 
     def _copy(self, ids: Ids) -> int:
         """Work array that holds these elements next to each other."""
@@ -396,7 +399,7 @@ def write_c(program: Program, single: bool = False) -> dict[str, str]:
         return f"    {kind} {field_name}{f'[{size}]' if size > 1 else ''};"
 
     bits = [
-        f"#define {name.upper()}_{bit.name} {bit.value}u /* {meaning} */" for bit, meaning in _meanings(Alarm).items()
+        f"#define {name.upper()}_{bit.name} {bit.value}u /* {meaning} */" for bit, meaning in meanings(Alarm).items()
     ]
     shown = [port for port, _ in program.outputs]
     header = [
@@ -407,8 +410,8 @@ def write_c(program: Program, single: bool = False) -> dict[str, str]:
         f"}} {name}_setpoints;", "",
         "/* Settings may be changed after init; the rest is the block's memory. */",
         "typedef struct {", *members(program.settings, True),
-        *(field("double" if cell.wide else real, cell.name, cell.start.size) for cell in program.memory), f"}} {name};", "",
-        "/* Default settings, and reset. */", f"void {name}_init({name} *block);",
+        *(field("double" if cell.wide else real, cell.name, cell.start.size) for cell in program.memory), f"}} {name};",
+        "", "/* Default settings, and reset. */", f"void {name}_init({name} *block);",
         "/* Forget everything but the settings: the next automatic sample is a takeover. */",
         f"void {name}_reset({name} *block);",
         "/* One call; a new sample is taken when the control interval has passed since the last one. */",
@@ -438,7 +441,11 @@ def _declared(writer: Writer, real: str) -> list[str]:
     """The work arrays of a C function."""
     lines = []
     for wanted, kind in ((True, "unsigned char"), (False, real)):
-        names = [name + (f"[{size}]" if size > 1 else "") for name, (size, logical) in writer.work.items() if logical == wanted]
+        names = [
+            name + (f"[{size}]" if size > 1 else "")
+            for name, (size, logical) in writer.work.items()
+            if logical == wanted
+        ]
         lines += wrap(", ".join(names), 110, initial_indent=f"    {kind} ", subsequent_indent=f"    {' ' * len(kind)} ")
         lines[-1] += ";"
     return lines
@@ -458,14 +465,16 @@ def write_st(program: Program, single: bool = False) -> dict[str, str]:
         start = f" := {value}" if default or port.logical else ""
         return f"    {port.name} : {kind}{start}; (* {port.meaning} *)"
 
-    bits = [f"{bit.value}: {meaning}" for bit, meaning in _meanings(Alarm).items()]
+    bits = [f"{bit.value}: {meaning}" for bit, meaning in meanings(Alarm).items()]
     kinds = {port.name: "UDINT" if port.name == "alarms" else real for port, _ in program.outputs}
     lines = [
-        _comment([*about(program), "", "The bits of alarms:", *bits], "(*", "*)"), f"FUNCTION_BLOCK {name}", "VAR_INPUT",
+        _comment([*about(program), "", "The bits of alarms:", *bits], "(*", "*)"),
+        f"FUNCTION_BLOCK {name}", "VAR_INPUT",
         *(given(port, False) for port in program.inputs),
         "    reset : BOOL := FALSE; (* forget everything but the settings *)",
         *(given(port, True) for port in program.settings), "END_VAR", "VAR_OUTPUT",
-        *(f"    {port.name} : {kinds[port.name]}; (* {port.meaning} *)" for port, _ in program.outputs), "END_VAR", "VAR",
+        *(f"    {port.name} : {kinds[port.name]}; (* {port.meaning} *)" for port, _ in program.outputs), "END_VAR",
+        "VAR",
         "    begun : BOOL := FALSE; (* whether the memory below holds anything *)",
         *(f"    {cell.name} : {of(cell.start.size, real)};" for cell in program.memory), "END_VAR",
         *(["VAR CONSTANT"] if writer.tables else []),
@@ -504,7 +513,7 @@ def _rows(numbers: Any) -> list[str]:
     return wrap(", ".join(numbers), 112, initial_indent="    ", subsequent_indent="    ", break_on_hyphens=False)
 
 
-def _meanings(kind: Any) -> dict[Any, str]:
+def meanings(kind: Any) -> dict[Any, str]:
     """The members of an enumeration with the docstrings below them."""
     import inspect
 

@@ -68,7 +68,7 @@ class Graph:
     def add(self, op: str, args: tuple[Ids, ...], size: int, data: Any = None) -> Node:
         """A new node at the end."""
         logical = op in LOGICAL or (op == "constant" and data.dtype == np.bool_)
-        logical = logical or (op == "select" and self.owner(args[1].flat[0]).logical)
+        logical = logical or (op == "select" and self.owner(int(args[1].flat[0])).logical)
         node = Node(op, args, size, self.length, logical, data)
         self.nodes.append(node)
         self.starts.append(self.length)
@@ -130,7 +130,7 @@ class Graph:
                 if np.all(known[value] == neutral.get(op)):
                     return args[other]
         if op == "divide" and known[1] is not None and args[0].size:
-            of = self.owner(args[0].flat[0])
+            of = self.owner(int(args[0].flat[0]))
             whole = of.op == "multiply" and np.array_equal(args[0].ravel(), of.start + np.arange(of.size))
             factor = self.values(of.args[1]) if whole else None
             if factor is not None and np.all(factor == known[1].ravel()):
@@ -153,7 +153,7 @@ class Traced(np.lib.mixins.NDArrayOperatorsMixin):
     @property
     def logical(self) -> bool:
         """Whether its elements are logical."""
-        return bool(self.size) and self.graph.owner(self.ids.flat[0]).logical
+        return bool(self.size) and self.graph.owner(int(self.ids.flat[0])).logical
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -195,12 +195,12 @@ class Traced(np.lib.mixins.NDArrayOperatorsMixin):
     def sum(self, axis: int) -> Traced:
         """Sum along an axis."""
         last = np.moveaxis(self.ids, axis, -1)
-        ones = np.ones((last.shape[-1], 1))
-        return self._matmul(Traced(self.graph, last.reshape(-1, last.shape[-1])), ones).reshape(last.shape[:-1])
+        product = self._matmul(Traced(self.graph, last.reshape(-1, last.shape[-1])), np.ones((last.shape[-1], 1)))
+        return Traced(self.graph, product.ids.reshape(last.shape[:-1]))
 
     def mean(self, axis: int) -> Traced:
         """Mean along an axis."""
-        return self.sum(axis) / self.shape[axis]
+        return self.graph.apply("divide", self.sum(axis), self.shape[axis])
 
     def argmax(self, axis: int) -> Traced:
         """Index of the first largest element of the one row."""
@@ -235,7 +235,8 @@ class Traced(np.lib.mixins.NDArrayOperatorsMixin):
         elif name == "not_equal":
             result = ~self.graph.apply("equal", *inputs)
         elif name == "sign":
-            result = np.where(inputs[0] > 0.0, 1.0, np.where(inputs[0] < 0.0, -1.0, 0.0))
+            below = self.graph.apply("select", inputs[0] < 0.0, -1.0, 0.0)
+            result = self.graph.apply("select", inputs[0] > 0.0, 1.0, below)
         elif name == "square":
             result = self.graph.apply("multiply", *inputs, *inputs)
         elif _ALIASES.get(name, name) in FUNCTIONS:

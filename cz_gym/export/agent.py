@@ -1,0 +1,198 @@
+"""A trained agent as a controller of the shell: its ONNX graph in NumPy, its observation, what its actions mean."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import FunctionType, SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cz_gym.engine.outputs import recall, remember
+from cz_gym.errors import CzError
+from cz_gym.observation import CLIP, HISTORY, INTEGRAL_SCALE, LAGGED, MEASURED, Measured, lags, scales
+from cz_gym.task import HEATER_RANGE, drives_of
+
+HEATER_SLACK = 60.0
+"""Difference between commanded and applied power [W] that is due to the resolution of the drive."""
+
+
+def _clip(x: Any, low: Any = None, high: Any = None) -> Any:
+    x = x if low is None else np.maximum(x, low)
+    return x if high is None else np.minimum(x, high)
+
+
+def _gemm(a: Any, b: Any, c: Any = 0.0, alpha: float = 1.0, beta: float = 1.0, transA: int = 0, transB: int = 0) -> Any:
+    product = (a.T if transA else a) @ (b.T if transB else b)
+    return (product if alpha == 1.0 else alpha * product) + (c if beta == 1.0 else beta * c)
+
+
+def _slice(x: Any, starts: Any, ends: Any, axes: Any = None, steps: Any = None) -> Any:
+    key = [slice(None)] * x.ndim
+    for at, axis in enumerate(range(len(starts)) if axes is None else axes):
+        key[int(axis)] = slice(int(starts[at]), int(ends[at]), 1 if steps is None else int(steps[at]))
+    return x[tuple(key)]
+
+
+def _split(x: Any, lengths: Any = None, axis: int = 0, parts: int = 1) -> Any:
+    width = x.shape[axis]
+    ends = np.cumsum([width // parts] * parts if lengths is None else lengths)
+    return [
+        np.moveaxis(np.moveaxis(x, axis, 0)[end - n : end], 0, axis)
+        for end, n in zip(ends, np.diff(ends, prepend=0), strict=True)
+    ]
+
+
+def _softplus(x: Any) -> Any:
+    return np.maximum(x, 0.0) + np.log(1.0 + np.exp(-np.absolute(x)))
+
+
+OPERATORS: dict[str, Callable[..., Any]] = {
+    "Add": np.add, "Sub": np.subtract, "Mul": np.multiply, "Div": np.divide, "Neg": np.negative, "Sqrt": np.sqrt,
+    "Tanh": np.tanh, "MatMul": np.matmul, "Gemm": _gemm, "Clip": _clip, "Slice": _slice, "Split": _split,
+    "Identity": lambda x: x, "Concat": lambda *x, axis: np.concatenate(x, axis=axis),
+    "Gather": lambda x, at, axis=0: np.moveaxis(np.moveaxis(x, axis, 0)[at], 0, axis),
+    "Relu": lambda x: np.maximum(x, 0.0), "Sigmoid": lambda x: 0.5 + 0.5 * np.tanh(0.5 * x), "Softplus": _softplus,
+    "LeakyRelu": lambda x, alpha=0.01: np.where(x > 0.0, x, alpha * x),
+    "Elu": lambda x, alpha=1.0: np.where(x > 0.0, x, alpha * (np.exp(np.minimum(x, 0.0)) - 1.0)),
+}  # fmt: skip
+"""The operators that an agent's graph may hold, :data:`cz_gym.agents.agent_file.graph.OPERATORS`, in NumPy."""
+
+
+class Network:
+    """An agent's checked ONNX graph as a function of NumPy arrays, in double precision."""
+
+    def __init__(self, content: bytes) -> None:
+        import onnx
+        from onnx import helper, numpy_helper
+
+        graph = onnx.load_from_string(content).graph
+        self.weights = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
+        self.weights = {k: v.astype(np.float64) if v.dtype == np.float32 else v for k, v in self.weights.items()}
+        self.outputs = [value.name for value in graph.output]
+        self.nodes = [
+            (
+                node.op_type,
+                list(node.input),
+                list(node.output),
+                {a.name: helper.get_attribute_value(a) for a in node.attribute},
+            )
+            for node in graph.node
+        ]
+
+    def __call__(self, **inputs: Any) -> list[Any]:
+        """The outputs for inputs of shape (n, width)."""
+        values: dict[str, Any] = {"": None} | self.weights | inputs
+        for operator, given, named, attributes in self.nodes:
+            extra = {"parts": len(named)} if operator == "Split" else {}
+            result = OPERATORS[operator](*(values[name] for name in given), **attributes, **extra)
+            values.update(zip(named, result if operator == "Split" else [result], strict=True))
+        return [values[name] for name in self.outputs]
+
+
+class Cells:
+    """A table of traced numbers that can be set one by one."""
+
+    def __init__(self, table: Any) -> None:
+        self.shape = table.shape
+        self.values = {at: table[at] for at in np.ndindex(table.shape)}
+
+    def __getitem__(self, at: Any) -> Any:
+        return self.values[at if isinstance(at, tuple) else (at,)]
+
+    def __setitem__(self, at: Any, value: Any) -> None:
+        self.values[at if isinstance(at, tuple) else (at,)] = value
+
+
+class Past(NamedTuple):
+    """The memory of the observation "history"; empty for "measured"."""
+
+    sums: Any
+    """Running sums of the remembered channels less the newest ones, the oldest first, shape (1, depth, channels)."""
+    integral: Any
+    """Integral of the scaled ring error, shape (1,)."""
+
+
+class AgentMemory(NamedTuple):
+    """The memory of an agent outside Python."""
+
+    past: Past
+    command: Any
+    """Last commanded inputs in shares of their ranges, shape (1, 2)."""
+    network: Any
+    """The network's own state, shape (1, k)."""
+
+
+class Agent:
+    """A trained agent as a controller of the shell, for a single crystal."""
+
+    estimates_temperature = False
+
+    def __init__(self, policy: Any, v_0: float) -> None:
+        contract = policy.contract
+        if contract.observation not in ("measured", "history"):
+            raise CzError(f"an agent that reads {contract.observation!r} cannot be exported: no plant has that")
+        self.network, self.remembers, self.v_0 = Network(policy.content), policy.remembers, v_0
+        self.dt = contract.control_interval
+        self.newest, self.before = lags(self.dt)[0], lags(self.dt)[1] + 1
+        self.depth = int(self.before.max()) + 1 if contract.observation == "history" else 0
+        self.drives = drives_of(contract.action, contract.control_interval)
+        self.heater_range = HEATER_RANGE
+
+    def at_rest(self, seen: Measured) -> AgentMemory:
+        """The network's state at zero, the applied drives as the last command, the first ring error as the past."""
+        ring = self._measured(seen)[:, :1]
+        ages = np.zeros((1, self.depth, len(LAGGED)))
+        ages[0, :, 0] = np.arange(self.depth)[::-1]
+        integral = -(ring[:, 0] if self.depth else np.zeros(0)) * self._integral_step
+        return AgentMemory(Past(-ring[:, :, None] * ages, integral), self._applied(seen), np.zeros((1, self.remembers)))
+
+    def step(self, seen: Measured, memory: AgentMemory) -> tuple[Any, Any, AgentMemory]:
+        """Pull speed and heater power above nominal, and the new memory."""
+        observation, past = self._measured(seen), memory.past
+        if self.depth:
+            observation, past = self._history(seen, observation, past)
+        action, *state = self.network(observation=observation, **({"state": memory.network} if self.remembers else {}))
+        applied = self._applied(seen)
+        slack = np.array([0.0, HEATER_SLACK / self.heater_range])
+        before = applied + np.clip(memory.command - applied, -slack, slack)
+        gains = np.array([self.drives.pull, self.drives.heater])
+        command = np.clip(self.drives.keep * before + gains * np.clip(action, -1.0, 1.0), -1.0, 1.0)
+        new = AgentMemory(past, command, state[0] if state else memory.network)
+        return command[:, 0] * self.v_0, command[:, 1] * self.heater_range, new
+
+    @property
+    def _integral_step(self) -> float:
+        step: float = self.dt * MEASURED[0].scale / INTEGRAL_SCALE
+        return step
+
+    def _applied(self, seen: Measured) -> Any:
+        return np.stack([seen.v_p / self.v_0, seen.Q_H / self.heater_range], axis=-1)
+
+    def _measured(self, seen: Measured) -> Any:
+        return np.clip(np.stack(seen, axis=-1) / scales(MEASURED, self.v_0), -CLIP, CLIP)
+
+    def _history(self, seen: Measured, measured: Any, past: Past) -> tuple[Any, Past]:
+        """The observation "history" and its memory, by the engine's own functions, which see one slot.
+
+        The engine's circular table is turned so that the newest sample stands at 0.
+        """
+        slot = SimpleNamespace(k=self.depth, integral=past.integral[0])
+        sums, out = Cells(past.sums[0]), Cells(np.concatenate([measured[0], np.zeros(len(HISTORY) - len(MEASURED))]))
+        share = 1.0 / (self.before - self.newest)
+        constants = SimpleNamespace(
+            newest=self.newest, before=self.before, share=share, measured=1.0 / scales(MEASURED, self.v_0)
+        )
+        _uncompiled(remember)(slot, sums, self.dt, out)
+        _uncompiled(recall)(slot, Measured(*(value[0] for value in seen)), sums, constants, out)
+        newest = np.stack([sums[0, channel] for channel in range(len(LAGGED))])
+        table = np.concatenate([past.sums[0, 1:] - newest, np.zeros((1, len(LAGGED)))])
+        return np.stack(list(out.values.values()))[None], Past(table[None], np.reshape(slot.integral, (1,)))
+
+
+def _uncompiled(function: Any) -> Any:
+    """An engine's function whose limits are recorded, where the compiled one branches."""
+    recorded = {"clip": lambda value, limit: np.clip(value, -limit, limit)}
+    return FunctionType(
+        function.__code__, function.__globals__ | recorded | {"scratch": lambda *shape: Cells(np.zeros(shape))}
+    )

@@ -1,0 +1,320 @@
+"""Exported blocks: the recorded program is the controller, the C is the program, the shell keeps its promises."""
+
+import shutil
+import subprocess
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from cz_gym import agents
+from cz_gym.baselines.registry import make_controller
+from cz_gym.config import Config, make_config
+from cz_gym.export.__main__ import export_program, main
+from cz_gym.export.compiled import CompiledBlock
+from cz_gym.export.policy import BlockPolicy
+from cz_gym.export.program import Program
+from cz_gym.export.shell import INPUTS, Alarm
+from cz_gym.export.text import write_c
+from cz_gym.observation import decode, readable
+from cz_gym.task import HEATER_RANGE, drives_of
+from cz_gym.vector import CzVectorEnv
+
+CONTROLLERS = ("paper", "paper-tuned", "industrial", "lqg", "gradient", "ppo")
+needs_compiler = pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed: no C can be compiled")
+PULL, HEATER, ALARMS = "pull_speed_setpoint_mm_per_min", "heater_power_setpoint_kW", "alarms"
+
+
+def config_of(scenario: str, **changed: Any) -> Config:
+    return make_config(scenario, observation="measured", action="direct", horizon=1800.0, **changed)
+
+
+@lru_cache(maxsize=None)
+def program(name: str, scenario: str = "puller") -> Program:
+    return export_program(name, config_of(scenario))
+
+
+def compiled(name: str, scenario: str, folder: Path, single: bool = False) -> CompiledBlock:
+    exported = program(name, scenario)
+    for file, text in write_c(exported, single).items():
+        (folder / file).write_text(text)
+    return CompiledBlock(exported, folder / f"cz_{exported.name}.c", single, "gcc")
+
+
+def nominal(changed: dict[str, float] | None = None) -> dict[str, float]:
+    """Inputs at the operating point."""
+    known = {port.name: port.default for port in program("paper").settings}
+    ring = known["nominal_radius_mm"] + known["ring_bias_mm"]
+    given = {port.name: port.default for port in INPUTS} | {"ring_radius_mm": ring}
+    given |= {name: known["nominal_radius_mm"] for name in given if name.startswith("r_ref")}
+    given |= {name: known["nominal_T_1_K"] for name in given if name.startswith("T_1")}
+    given |= {"pull_speed_mm_per_min": 1.2, "heater_power_kW": known["nominal_heater_power_kW"]}
+    return given | (changed or {})
+
+
+class Plant:
+    """A block, called at times of the test's own."""
+
+    def __init__(self, name: str = "paper-tuned", **changed: float) -> None:
+        self.program, self.changed = program(name), changed
+        self.memory = self.program.start[None]
+        self.time = 0.0
+
+    def __call__(self, time: float | None = None, **given: float) -> dict[str, float]:
+        self.time = self.time + 5.0 if time is None else time
+        clock = {"time_s": self.time, "ring_time_s": self.time}
+        outputs, self.memory = self.program.run(nominal(clock | given) | self.changed, self.memory)
+        return {name: float(value[0]) for name, value in outputs.items()}
+
+    def alarms(self, **given: Any) -> Alarm:
+        return Alarm(int(self(**given)["alarms"]))
+
+
+@pytest.mark.parametrize("scenario", ["sensor-fault", "puller"])
+@pytest.mark.parametrize("name", ["paper", "paper-tuned", "pid-conventional", "industrial", "lqg", "lqg-at-0.02"])
+def test_the_recorded_program_computes_what_the_controller_computes(name: str, scenario: str) -> None:
+    config, n = config_of(scenario), 3
+    controller: Any = make_controller(name, config)
+    block = BlockPolicy(program(name, scenario), config)
+    env = CzVectorEnv.from_config(config, n)
+    observation, _ = env.reset(seed=list(range(n)))
+    memory, state, last = np.tile(block.program.start, (n, 1)), None, None
+    for k in range(300):
+        seen = decode(np.asarray(observation, np.float64))
+        last = readable(seen, seen if last is None else last)
+        state = controller.at_rest(last) if state is None else state
+        pull, heat, state = controller.step(last._replace(T_1=seen.T_1), state)
+        inputs = block.inputs(np.asarray(observation, np.float64), np.full(n, k))
+        outputs, memory = block.program.run(inputs | {"takeover_s": 0.0}, memory)
+        if k:
+            setting = {port.name: port.default for port in block.program.settings}
+            v_0, Q_0 = setting["nominal_pull_speed_mm_per_min"], setting["nominal_heater_power_kW"]
+            assert outputs[PULL] / v_0 - 1.0 == pytest.approx(np.clip(pull / config.parameters.v_0, -1, 1), abs=1e-9)
+            own = np.clip(heat / HEATER_RANGE, -1.0, 1.0)
+            assert (outputs[HEATER] - Q_0) * 1e3 / HEATER_RANGE == pytest.approx(own, abs=1e-9)
+        observation, *_ = env.step(block.action_of(outputs))
+
+
+@pytest.mark.parametrize("name", agents.shipped_names())
+def test_a_recorded_agent_acts_as_onnxruntime_does(name: str) -> None:
+    """onnxruntime works in single precision, on observations that were rounded to it."""
+    policy, n = agents.load(name), 3
+    block = BlockPolicy(program(name, "sensor-fault"), config_of("sensor-fault"))
+    acts = {"action": policy.action, "horizon": 1800.0}
+    own, env = (
+        CzVectorEnv.from_config(make_config("sensor-fault", observation=observation, **acts), n)  # type: ignore[arg-type]
+        for observation in (policy.observation, "measured")
+    )
+    seen, measured = own.reset(seed=[1, 2, 3])[0], env.reset(seed=[1, 2, 3])[0]
+    memory, state, drives = np.tile(block.program.start, (n, 1)), None, drives_of(policy.action, 5.0)
+    for k in range(250):
+        action, state = policy.predict(seen, state)
+        inputs = block.inputs(np.asarray(measured, np.float64), np.full(n, k))
+        outputs, memory = block.program.run(inputs | {"takeover_s": 0.0}, memory)
+        if k:
+            applied, gains = measured[:, -2:].astype(np.float64), np.array([drives.pull, drives.heater])
+            wanted = np.clip(drives.keep * applied + gains * np.asarray(action), -1.0, 1.0)
+            assert (block.action_of(outputs) - wanted) / gains == pytest.approx(0.0, abs=1e-4)
+        seen, measured = own.step(np.asarray(action))[0], env.step(np.asarray(action))[0]
+
+
+@needs_compiler
+@pytest.mark.parametrize("scenario", ["randomized", "hard", "sensor-fault", "puller"])
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_the_c_acts_as_the_program_does(name: str, scenario: str, tmp_path: Path) -> None:
+    """On the crystals that the C grows; in single precision on the same readings."""
+    config, n = config_of(scenario), 2
+    double = compiled(name, scenario, tmp_path)
+    single = None if double.program.needs_double else compiled(name, scenario, tmp_path, single=True)
+    block = BlockPolicy(double.program, config)
+    env = CzVectorEnv.from_config(config, n)
+    observation, _ = env.reset(seed=list(range(n)))
+    memory, mine = np.tile(block.program.start, (n, 1)), double.begin(n)
+    short = single.begin(n) if single else None
+    for k in range(200):
+        inputs = block.inputs(np.asarray(observation, np.float64), np.full(n, k))
+        outputs, memory = block.program.run(inputs, memory)
+        found, mine = double.run(inputs, mine)
+        assert (found[ALARMS] == outputs[ALARMS]).all()
+        for output, scale in ((PULL, 1.2), (HEATER, 10.0)):
+            assert found[output] / scale == pytest.approx(outputs[output] / scale, abs=1e-9)
+        if single:
+            rough, short = single.run(inputs, short)
+            for output, scale in ((PULL, 1.2), (HEATER, 10.0)):
+                assert rough[output] / scale == pytest.approx(outputs[output] / scale, abs=1e-4)
+        observation, *_ = env.step(block.action_of(found))
+
+
+MAIN = """
+#include "cz_{name}.h"
+#include <stdio.h>
+int main(void)
+{{
+    cz_{name} block;
+    cz_{name}_measured m;
+    cz_{name}_setpoints s;
+    double x[{count}];
+    int i;
+    cz_{name}_init(&block);
+    for (;;) {{
+        for (i = 0; i < {count}; i++) if (scanf("%lf", &x[i]) != 1) return 0;
+        {assign}
+        cz_{name}_step(&block, &m, &s);
+        printf("%.17g %.17g %u\\n", (double)s.{pull}, (double)s.{heater}, s.alarms);
+    }}
+}}
+"""
+SANITIZED = "-std=c99 -pedantic -Wall -Wextra -Werror -g -fsanitize=address,undefined -fno-sanitize-recover=all"
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_the_c_is_clean_under_sanitizers_whatever_it_reads(name: str, tmp_path: Path) -> None:
+    block = program(name)
+    assign = " ".join(
+        f"m.{port.name} = {f'x[{at}] > 0.5' if port.logical else f'x[{at}]'};" for at, port in enumerate(INPUTS)
+    )
+    main_c = MAIN.format(name=block.name, count=len(INPUTS), assign=assign, pull=PULL, heater=HEATER)
+    for file, text in (write_c(block) | {"main.c": main_c}).items():
+        (tmp_path / file).write_text(text)
+    files = ["main.c", f"cz_{block.name}.c", "-o", "block", "-lm"]
+    subprocess.run(["gcc", *SANITIZED.split(), *files], cwd=tmp_path, check=True)
+    rng, rows, memory, expected = np.random.default_rng(1), [], block.start[None], []
+    odd = [np.nan, np.inf, -np.inf, 1e300, -1e300, 0.0, 1e-300]
+    for k in range(60):
+        given = nominal({"time_s": 5.0 * k, "ring_time_s": 5.0 * k})
+        given["ring_radius_mm"] += rng.normal(0.0, 0.1)
+        if k % 3 == 2:
+            given[str(rng.choice([port.name for port in INPUTS]))] = float(rng.choice(odd))
+        rows.append(" ".join(repr(given[port.name]) for port in INPUTS))
+        outputs, memory = block.run(given, memory)
+        expected.append([outputs[output][0] for output in (PULL, HEATER, ALARMS)])
+    done = subprocess.run(["./block"], input="\n".join(rows), cwd=tmp_path, capture_output=True, text=True, check=True)
+    found = np.array([line.split() for line in done.stdout.splitlines()], np.float64)
+    assert found == pytest.approx(np.array(expected), abs=1e-8)
+
+
+ODD = st.one_of(st.floats(), st.sampled_from([np.nan, np.inf, -np.inf]))
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    st.sampled_from(["paper", "lqg", "gradient"]),
+    st.lists(
+        st.dictionaries(st.sampled_from([port.name for port in INPUTS]), ODD, max_size=4), min_size=3, max_size=12
+    ),
+)
+def test_no_reading_brings_a_setpoint_outside_its_limits(name: str, samples: list[dict[str, float]]) -> None:
+    plant = Plant(name, pull_speed_min_mm_per_min=0.9, pull_speed_max_mm_per_min=1.4)
+    known = {port.name: port.default for port in plant.program.settings}
+    for given in samples:
+        outputs = plant(**{"time_s": plant.time + 5.0} | given)
+        assert 0.9 <= outputs[PULL] <= 1.4
+        assert known["heater_power_min_kW"] <= outputs[HEATER] <= known["heater_power_max_kW"]
+        assert outputs[ALARMS] >= 0
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_takeover_moves_no_drive_and_authority_grows(name: str) -> None:
+    plant = Plant(name)
+    off = {"pull_speed_mm_per_min": 1.31, "heater_power_kW": 58.7, "ring_radius_mm": 102.0}
+    for automatic in (0.0, 0.0, 1.0):
+        outputs = plant(automatic=automatic, **off)
+        assert (outputs[PULL], outputs[HEATER]) == (1.31, 58.7)
+        assert bool(int(outputs[ALARMS]) & Alarm.MANUAL) == (not automatic)
+    alarms = [plant.alarms(**off) for _ in range(13)]
+    assert all(Alarm.TAKEOVER in alarm for alarm in alarms[:11])
+    assert Alarm.TAKEOVER not in alarms[-1]
+
+
+def test_a_bad_ring_is_held_then_the_pid_takes_over_until_the_next_takeover() -> None:
+    plant = Plant("lqg")
+    for _ in range(20):
+        assert plant.alarms() & ~Alarm.TAKEOVER == 0
+    bad = [plant.alarms(valid=0.0) for _ in range(60)]
+    assert bad[0] == Alarm.RING
+    assert [Alarm.FALLBACK in alarm for alarm in bad].index(True) == 48  # the first after 240 s
+    assert Alarm.FALLBACK in plant.alarms()
+    assert Alarm.FALLBACK in plant.alarms(automatic=1.0)
+    plant(automatic=0.0)
+    assert Alarm.FALLBACK not in plant.alarms()
+
+
+@pytest.mark.parametrize(
+    ("given", "alarm"),
+    [
+        ({"ring_radius_mm": 130.0}, Alarm.RING),
+        ({"ring_radius_mm": np.nan}, Alarm.RING),
+        ({"T_1_K": 300.0}, Alarm.PYROMETER),
+        ({"heater_power_kW": np.inf}, Alarm.DRIVES),
+        ({"r_ref_5min_mm": 0.0}, Alarm.REFERENCE),
+    ],
+)
+def test_each_reading_has_its_alarm_and_is_held(given: dict[str, float], alarm: Alarm) -> None:
+    plant, twin = Plant(), Plant()
+    for _ in range(20):
+        plant(), twin()
+    assert plant.alarms(**given) == alarm
+    assert plant.alarms() == twin.alarms() == 0
+
+
+def test_the_clock_is_watched_and_no_sample_is_taken_twice() -> None:
+    plant = Plant()
+    for _ in range(20):
+        before = plant()
+    assert plant(time=102.0) == before  # too early: the same again
+    assert int(plant(time=102.0)[ALARMS]) == 0
+    assert int(plant(time=100.0)[ALARMS]) == Alarm.CLOCK
+    assert int(plant(time=np.nan)[ALARMS]) & Alarm.CLOCK
+    assert int(plant(time=105.0)[ALARMS]) == 0
+    assert int(plant(time=112.0)[ALARMS]) == Alarm.LATE
+    old = plant.alarms(ring_time_s=plant.time - 30.0)
+    assert old == Alarm.RING
+
+
+def test_ranges_and_slew_rates_hold() -> None:
+    plant = Plant("paper", pull_slew_mm_per_min2=0.3, heater_slew_kW_per_min=1.0, pull_speed_max_mm_per_min=1.5)
+    rng, before = np.random.default_rng(0), None
+    for _ in range(100):
+        outputs = plant(ring_radius_mm=101.6 + rng.normal(0.0, 1.0), T_1_ref_K=1810.0)
+        if before is not None:
+            assert abs(outputs[PULL] - before[PULL]) <= 0.3 / 12.0 + 1e-12
+            assert abs(outputs[HEATER] - before[HEATER]) <= 1.0 / 12.0 + 1e-12
+        assert outputs[PULL] <= 1.5
+        before = outputs
+    assert int(outputs[ALARMS]) & Alarm.HEATER_LIMITED
+
+
+@pytest.mark.parametrize(("name", "to", "files"), [("paper", "c", 3), ("ppo", "st", 2)])
+def test_the_command_writes_a_folder(name: str, to: str, files: int, tmp_path: Path) -> None:
+    assert main([name, "--to", to, "--out", str(tmp_path)]) == 0
+    assert len(list(tmp_path.iterdir())) == files
+    text = (tmp_path / "README.md").read_text()
+    for fact in (
+        "US 9,340,897",
+        "not tested on a real puller" if False else "tested on a real puller",
+        "ring_radius_mm",
+    ):
+        assert fact in text
+    assert config_of("puller").plant_hash in text
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["lqg", "--real", "float"], "needs --real double"),
+        (["nobody"], "unknown controller or agent 'nobody'"),
+        (["open-loop"], "cannot be exported"),
+        (["lqg-true"], "unknown"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused_in_one_line(
+    given: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*given, "--to", "c", "--out", str(tmp_path / "out")]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
