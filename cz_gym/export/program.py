@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from .trace import BAD, FUNCTIONS, Graph, Ids, Node, Traced
+from .trace import BAD, FINITE, FUNCTIONS, Graph, Ids, Node, Traced
 
 Floats = npt.NDArray[np.float64]
 
@@ -84,72 +84,102 @@ class Program:
                 reached.extend(self.graph.nodes[at].args)
         return tuple(node for at, node in enumerate(self.graph.nodes) if at in wanted and node.op != "constant")
 
-    @cached_property
-    def _plan(self) -> list[tuple[Node, list[Any]]]:
-        return [(node, [self._fetch(ids) for ids in node.args]) for node in self.nodes if node.op != "input"]
-
-    def _fetch(self, ids: Ids) -> Any:
-        """Constant values, or a function that reads the elements from the table of results, shape (n, size)."""
-        known = self.graph.values(ids)
-        if known is not None:
-            return known[None]
-        first, last = int(ids[0]), int(ids[-1])
-        if (ids == first).all():
-            return slice(first, first + 1)
-        return slice(first, last + 1) if np.array_equal(ids, np.arange(first, last + 1)) else ids
-
     def run(self, inputs: Mapping[str, Any], memory: Floats) -> tuple[dict[str, Floats], Floats]:
         """The outputs, each of shape (n,), and the next memory, for inputs of shape (n,) and a memory (n, width).
 
         ``inputs`` may also hold settings; those that are missing have their defaults.
         """
         n = len(memory)
-        table = np.zeros((n, self.graph.length))
-        cells = dict(zip([cell.name for cell in self.memory], np.split(memory, self._ends, axis=1), strict=True))
-        given = {port.name: port.default for port in (*self.settings, *self.inputs)} | dict(inputs)
-        for node in self.nodes:
-            if node.op == "input":
-                value = cells[node.data] if node.data in cells else np.reshape(given[node.data], (-1, 1))
-                table[:, node.start : node.start + node.size] = value
-        for node in self.graph.nodes:
-            if node.op == "constant":
-                table[:, node.start : node.start + node.size] = node.data
-        with np.errstate(all="ignore"):
-            for node, fetches in self._plan:
-                args = [
-                    table[:, at] if isinstance(at, (slice, np.ndarray)) and not _is_value(at) else at for at in fetches
-                ]
-                table[:, node.start : node.start + node.size] = _compute(node, args)
-        after = np.concatenate([table[:, cell.after] for cell in self.memory], axis=1)
-        due = table[:, self.due] > 0.5
-        outputs = {port.name: table[:, ids[0]].copy() for port, ids in self.outputs}
-        return outputs, np.where(due, after, memory)
+        if n not in self._machines:
+            self._machines[n] = Machine(self, n)
+        return self._machines[n].run(inputs, memory)
 
     @cached_property
-    def _ends(self) -> list[int]:
-        return [int(end) for end in np.cumsum([cell.start.size for cell in self.memory])[:-1]]
+    def _machines(self) -> dict[int, Machine]:
+        return {}
 
 
-def _is_value(at: Any) -> bool:
-    return isinstance(at, np.ndarray) and at.ndim == 2
+class Machine:
+    """NumPy calls that run a program for n blocks, on one table of results of shape (elements, n)."""
+
+    def __init__(self, program: Program, n: int) -> None:
+        self.program, self.n, graph = program, n, program.graph
+        self.table = np.zeros((graph.length, n))
+        for node in graph.nodes:
+            if node.op == "constant":
+                self.rows(node)[:] = node.data[:, None]
+        self.calls: list[Callable[[], Any]] = []
+        for node in program.nodes:
+            if node.op != "input":
+                self.calls.append(self._call(node, [self._read(ids) for ids in node.args]))
+        self.inputs = {node.data: self.rows(node) for node in program.nodes if node.op == "input"}
+        self.ports = [
+            (port.name, port.default) for port in (*program.settings, *program.inputs) if port.name in self.inputs
+        ]
+        sizes = np.cumsum([0, *(cell.start.size for cell in program.memory)])
+        self.cells = [
+            (cell.name, slice(first, last), cell.after)
+            for cell, first, last in zip(program.memory, sizes[:-1], sizes[1:], strict=True)
+        ]
+
+    def rows(self, node: Node) -> Any:
+        """The results of a node."""
+        return self.table[node.start : node.start + node.size]
+
+    def run(self, inputs: Mapping[str, Any], memory: Floats) -> tuple[dict[str, Floats], Floats]:
+        """As :meth:`Program.run`."""
+        for name, where, _ in self.cells:
+            if name in self.inputs:
+                self.inputs[name][:] = memory[:, where].T
+        for name, default in self.ports:
+            self.inputs[name][:] = inputs.get(name, default)
+        with np.errstate(all="ignore"):
+            for call in self.calls:
+                call()
+        after = np.concatenate([self.table[ids] for _, _, ids in self.cells]).T
+        due = self.table[self.program.due[0]] > 0.5
+        outputs = {port.name: self.table[ids[0]].copy() for port, ids in self.program.outputs}
+        return outputs, np.where(due[:, None], after, memory)
+
+    def _read(self, ids: Ids) -> Any:
+        """A view of the elements, or a buffer that a call of its own fills."""
+        first, last = int(ids[0]), int(ids[-1])
+        if (ids == first).all():
+            return self.table[first : first + 1]
+        if np.array_equal(ids, np.arange(first, last + 1)):
+            return self.table[first : last + 1]
+        buffer = np.zeros((len(ids), self.n))
+        self.calls.append(partial(np.take, self.table, ids, 0, buffer, "clip"))
+        return buffer
+
+    def _call(self, node: Node, args: list[Any]) -> Callable[[], Any]:
+        out = self.rows(node)
+        if node.op == "matmul":
+            m, k, n = node.data
+            a, b, c = (
+                np.moveaxis(x.reshape(*shape, -1), -1, 0)
+                for x, shape in zip((*args, out), ((m, k), (k, n), (m, n)), strict=True)
+            )
+            return partial(np.matmul, a, b, c)
+        if node.op == "select":
+            return partial(_select, *args, out)
+        if node.op == "argmax":
+            return lambda: out.__setitem__(0, args[0].argmax(axis=0))
+        if node.op == "pick":
+            return lambda: out.__setitem__(slice(None), np.take_along_axis(args[0], args[1].astype(np.int64), axis=0))
+        if node.op in ("finite", "real"):
+            return partial(np.copyto, out, args[0]) if node.op == "real" else partial(_finite, args[0], out)
+        function: Any = FUNCTIONS[node.op]
+        return partial(function, *args, out=out)
 
 
-def _compute(node: Node, args: list[Any]) -> Any:
-    """The results of a node, shape (n, size)."""
-    if node.op == "matmul":
-        m, k, n = node.data
-        a, b = (np.reshape(x, (-1, *shape)) for x, shape in zip(args, ((m, k), (k, n)), strict=True))
-        product = a @ b
-        return product.reshape(len(product), m * n)
-    if node.op == "argmax":
-        return args[0].argmax(axis=1)[:, None]
-    if node.op == "pick":
-        at = args[1].astype(np.int64)
-        return np.take_along_axis(np.broadcast_to(args[0], (len(at), args[0].shape[1])), at, axis=1)
-    if node.op in ("select", "and", "or", "not", "real"):
-        logical = 1 if node.op in ("select", "real") else len(args)
-        args = [value > 0.5 for value in args[:logical]] + args[logical:]
-    return FUNCTIONS[node.op](*args)
+def _select(condition: Any, one: Any, other: Any, out: Any) -> None:
+    np.copyto(out, other)
+    np.copyto(out, one, where=condition > 0.5)
+
+
+def _finite(value: Any, out: Any) -> None:
+    np.less_equal(np.abs(value), FINITE, out)
 
 
 def flatten(value: Any, name: str = "") -> list[tuple[str, Any]]:

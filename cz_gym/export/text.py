@@ -117,9 +117,11 @@ class Writer:
         self.inlined: dict[int, str] = {}
         self.copies: dict[bytes, int] = {}
         self.uses: Counter[int] = Counter()
+        self.users: dict[int, tuple[Node, Ids]] = {}
         for node in program.nodes:
             for ids in node.args:
                 self.uses.update(self._owners(ids))
+                self.users.update(dict.fromkeys(self._owners(ids), (node, ids)))
         once = [*(ids for _, ids in program.outputs), *(cell.after for cell in program.memory), program.due]
         self.uses.update(owner for ids in once for owner in 2 * self._owners(ids))
         for node in program.nodes:
@@ -172,16 +174,12 @@ class Writer:
         self.copies[f"node {self._at(node)}".encode()] = self._add(lines, size, node.logical)
 
     def _at(self, node: Node) -> int:
-        return self._owners(np.array([node.start]))[0]
+        return int(np.searchsorted(self.graph.starts, node.start, side="right")) - 1
 
     def _joins(self, node: Node) -> bool:
         """Whether the one use of a node is the same element of an operation on each element."""
-        whole = node.start + np.arange(node.size)
-        for later in self.program.nodes[self.program.nodes.index(node) + 1 :]:
-            for ids in later.args:
-                if ids.size and ids[0] <= node.start <= ids[-1]:
-                    return later.op in FUNCTIONS and np.array_equal(ids, whole)
-        return False
+        user, ids = self.users[self._at(node)]
+        return user.op in FUNCTIONS and np.array_equal(ids, node.start + np.arange(node.size))
 
     def _product(self, node: Node) -> list[str]:
         m, k, n = node.data
@@ -236,7 +234,7 @@ class Writer:
         if node.op != "input":
             return f"<{self.copies[f'node {owner}'.encode()]}>"
         own = node.data in self.cells or node.data in self.settings
-        return (self.dialect.memory if own else self.dialect.given) + node.data
+        return f"{self.dialect.memory if own else self.dialect.given}{node.data}"
 
     def _table(self, values: Any) -> str:
         key = values.tobytes() + values.dtype.char.encode()

@@ -81,11 +81,18 @@ class Graph:
 
     def values(self, ids: Ids) -> Any:
         """The elements' values if all are constants; None otherwise."""
-        owners = np.searchsorted(self.starts, ids.ravel(), side="right") - 1
-        if any(self.nodes[at].op != "constant" for at in set(owners.tolist())):
+        flat = ids.ravel()
+        if not flat.size:
+            return np.zeros(ids.shape)
+        owners = np.searchsorted(self.starts, flat, side="right") - 1
+        present = np.unique(owners)
+        if any(self.nodes[at].op != "constant" for at in present):
             return None
-        flat = [self.nodes[at].data[i - self.starts[at]] for at, i in zip(owners, ids.ravel(), strict=True)]
-        return np.array(flat).reshape(ids.shape)
+        parts = [self.nodes[at].data for at in present]
+        values = np.zeros(flat.size, parts[0].dtype)
+        for at, data in zip(present, parts, strict=True):
+            values[owners == at] = data[flat[owners == at] - self.starts[at]]
+        return values.reshape(ids.shape)
 
     def input(self, name: str, shape: tuple[int, ...] = (1,)) -> Traced:
         """A new input, or memory from the last sample."""
