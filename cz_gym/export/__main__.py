@@ -14,7 +14,8 @@ from cz_gym.commands import OneLineParser, shown
 from cz_gym.config import Config, make_config
 from cz_gym.errors import CzError
 from cz_gym.names import unknown
-from cz_gym.units import MM_PER_MIN
+from cz_gym.observation import CLIP
+from cz_gym.units import KILO, MM_PER_MIN
 
 from .agent import Agent
 from .program import Program
@@ -93,13 +94,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("controller", help="a classical controller, a shipped agent, or an agent file (.onnx)")
     add("--to", choices=sorted(WRITERS), required=True, help="c: C99; st: IEC 61131-3 structured text")
     add("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
+    parser.add_puller("its nominal values, its drives' limits, what is designed for it")
     add("--scenario", default="puller", metavar="NAME", help="scenario whose tuned settings it has (%(default)s)")
     add("--real", choices=("double", "float"), default="double", help="precision of the numbers (%(default)s)")
     return parser.run(_export, arguments, "benchmark")
 
 
 def _export(given: argparse.Namespace) -> None:
-    config = make_config(given.scenario, observation="measured", action="direct")
+    config = make_config(given.scenario, observation="measured", action="direct", puller=given.puller)
     program = export_program(given.controller, config)
     if given.real == "float" and program.needs_double:
         raise CzError(f"{given.controller}: its filter works on temperatures in kelvin and needs --real double")
@@ -121,7 +123,7 @@ def choose(name: str, config: Config) -> Chosen:
     """The controller of that name, with the facts for the header."""
     agents: Any = pkgutil.resolve_name(AGENTS)
     known = [entry.name for entry in pkgutil.resolve_name(f"{REGISTRY}:CONTROLLERS") if not entry.bound]
-    plant = f"Plant {config.plant_hash}; control interval {config.control_interval:g} s."
+    plant = f"Puller {config.puller.label}; plant {config.plant_hash}; control interval {config.control_interval:g} s."
     identifier = re.sub(r"\W+", "_", Path(name).stem.lower())
     if name in known:
         entry = pkgutil.resolve_name(f"{REGISTRY}:find_controller")(name)
@@ -134,6 +136,8 @@ def choose(name: str, config: Config) -> Chosen:
         raise CzError(unknown("controller or agent", name, [*known, *agents.shipped_names()]))
     policy = agents.load(name)
     contract = policy.contract
+    if contract.puller != config.puller.label:
+        raise CzError(f"{name} was trained for the puller {contract.puller}, not for {config.puller.label}")
     if contract.plant_hash != config.plant_hash:
         raise CzError(f"{name} was trained on plant {contract.plant_hash}, this puller is {config.plant_hash}")
     if contract.control_interval != config.control_interval:
@@ -143,7 +147,7 @@ def choose(name: str, config: Config) -> Chosen:
         f"({contract.scenario_hash}).",
         f"File {contract.sha256}; observation {contract.observation} {contract.observation_hash}. {plant}",
     )
-    return Chosen(identifier, Agent(policy, config.parameters.v_0), config, facts)
+    return Chosen(identifier, Agent(policy, config.ranges), config, facts)
 
 
 def readme(program: Program, config: Config, files: list[str]) -> str:
@@ -154,8 +158,8 @@ def readme(program: Program, config: Config, files: list[str]) -> str:
         about="  \n".join(program.notes),
         files="\n".join(f"| `{name}` | {kinds[Path(name).suffix]} |" for name in files),
         interval=config.control_interval,
-        pull=10.0 * config.parameters.v_0 / MM_PER_MIN,
-        heater=100.0,
+        pull=CLIP * config.parameters.v_0 / MM_PER_MIN,
+        heater=CLIP * config.heater_range / KILO,
         inputs="\n".join(f"| `{port.name}` | {port.meaning} |" for port in program.inputs),
         settings="\n".join(f"| `{port.name}` | {port.meaning}: {port.default:.10g} |" for port in program.settings),
         alarms="\n".join(f"| {bit.value} | `{bit.name}` | {text} |" for bit, text in meanings(Alarm).items()),

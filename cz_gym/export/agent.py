@@ -11,7 +11,7 @@ import numpy as np
 from cz_gym.engine.outputs import recall, remember
 from cz_gym.errors import CzError
 from cz_gym.observation import CLIP, HISTORY, INTEGRAL_SCALE, LAGGED, MEASURED, Measured, lags, scales
-from cz_gym.task import HEATER_RANGE, drives_of
+from cz_gym.task import drives_of
 
 HEATER_SLACK = 60.0
 """Difference between commanded and applied power [W] that is due to the resolution of the drive."""
@@ -128,16 +128,16 @@ class Agent:
 
     estimates_temperature = False
 
-    def __init__(self, policy: Any, v_0: float) -> None:
+    def __init__(self, policy: Any, ranges: tuple[float, float]) -> None:
         contract = policy.contract
         if contract.observation not in ("measured", "history"):
             raise CzError(f"an agent that reads {contract.observation!r} cannot be exported: no plant has that")
-        self.network, self.remembers, self.v_0 = Network(policy.content), policy.remembers, v_0
+        self.network, self.remembers, self.ranges = Network(policy.content), policy.remembers, ranges
+        self.v_0, self.heater_range = ranges
         self.dt = contract.control_interval
         self.newest, self.before = lags(self.dt)[0], lags(self.dt)[1] + 1
         self.depth = int(self.before.max()) + 1 if contract.observation == "history" else 0
-        self.drives = drives_of(contract.action, contract.control_interval)
-        self.heater_range = HEATER_RANGE
+        self.drives = drives_of(contract.action, contract.control_interval, self.heater_range)
 
     def at_rest(self, seen: Measured) -> AgentMemory:
         """The network's state at zero, the applied drives as the last command, the first ring error as the past."""
@@ -170,7 +170,7 @@ class Agent:
         return np.stack([seen.v_p / self.v_0, seen.Q_H / self.heater_range], axis=-1)
 
     def _measured(self, seen: Measured) -> Any:
-        return np.clip(np.stack(seen, axis=-1) / scales(MEASURED, self.v_0), -CLIP, CLIP)
+        return np.clip(np.stack(seen, axis=-1) / scales(MEASURED, *self.ranges), -CLIP, CLIP)
 
     def _history(self, seen: Measured, measured: Any, past: Past) -> tuple[Any, Past]:
         """The observation "history" and its memory, by the engine's own functions, which see one slot.
@@ -181,7 +181,7 @@ class Agent:
         sums, out = Cells(past.sums[0]), Cells(np.concatenate([measured[0], np.zeros(len(HISTORY) - len(MEASURED))]))
         share = 1.0 / (self.before - self.newest)
         constants = SimpleNamespace(
-            newest=self.newest, before=self.before, share=share, measured=1.0 / scales(MEASURED, self.v_0)
+            newest=self.newest, before=self.before, share=share, measured=1.0 / scales(MEASURED, *self.ranges)
         )
         _uncompiled(remember)(slot, sums, self.dt, out)
         _uncompiled(recall)(slot, Measured(*(value[0] for value in seen)), sums, constants, out)

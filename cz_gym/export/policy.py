@@ -13,7 +13,6 @@ from cz_gym.action import MadeFor, mark
 from cz_gym.config import Config
 from cz_gym.observation import decode
 from cz_gym.physics.plant import make_puller
-from cz_gym.task import HEATER_RANGE
 from cz_gym.units import KILO, MM, MM_PER_MIN
 
 from .program import Floats, Program
@@ -89,7 +88,7 @@ class BlockPolicy:
     def inputs(self, rows: Any, samples: Any) -> dict[str, Any]:
         """The block's inputs for observations of shape (n, channels) at those samples of their episodes."""
         puller = make_puller(self.config.parameters, 0.5, self.config.meniscus)
-        seen = decode(rows, puller.v_0)
+        seen = decode(rows, *self.config.ranges)
         time = samples * self.config.control_interval
         radii = {name: (getattr(seen, name) + puller.r_0) / MM for name in ("r_ref", "r_ref_1min", "r_ref_5min")}
         recipe = {name: getattr(seen, name) + puller.T_1_0 for name in ("T_1_ref", "T_1_ref_1min", "T_1_ref_5min")}
@@ -110,6 +109,6 @@ class BlockPolicy:
         """The environment's action for the setpoints, shape (n, 2)."""
         puller = make_puller(self.config.parameters, 0.5, self.config.meniscus)
         pull = outputs["pull_speed_setpoint_mm_per_min"] * MM_PER_MIN / puller.v_0 - 1.0
-        heat = (outputs["heater_power_setpoint_kW"] * KILO - puller.Q_H_0) / HEATER_RANGE
+        heat = (outputs["heater_power_setpoint_kW"] * KILO - puller.Q_H_0) / self.config.heater_range
         action: npt.NDArray[np.float32] = np.clip(np.stack([pull, heat], axis=-1), -1.0, 1.0).astype(np.float32)
         return action

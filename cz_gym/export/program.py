@@ -162,7 +162,7 @@ class Machine:
             )
             return partial(np.matmul, a, b, c)
         if node.op == "select":
-            return partial(_select, *args, out)
+            return partial(_select, args[0], args[1], args[2], out)
         if node.op == "argmax":
             return lambda: out.__setitem__(0, args[0].argmax(axis=0))
         if node.op == "pick":

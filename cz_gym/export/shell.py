@@ -17,8 +17,7 @@ import numpy as np
 
 from cz_gym.config import Config
 from cz_gym.observation import CLIP, MEASURED, Measured, readable, scales
-from cz_gym.physics.plant import Puller, make_puller
-from cz_gym.task import HEATER_RANGE
+from cz_gym.physics.plant import make_puller
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 from .program import Port, Program, record
@@ -121,29 +120,34 @@ class Memory(NamedTuple):
     pid: Any
 
 
-def settings_of(puller: Puller, pull_slew: float = NO_LIMIT, heater_slew: float = NO_LIMIT) -> tuple[Port, ...]:
-    """The settings of a block for a puller, with their defaults; slew rates in mm/min per minute and kW per minute."""
+def settings_of(config: Config) -> tuple[Port, ...]:
+    """The settings of a block for an environment's puller; its file's limits of the drives are the defaults."""
+    puller, drives = make_puller(config.parameters, 0.5, config.meniscus), config.puller.drives
     v_0, Q_0 = puller.v_0 / MM_PER_MIN, puller.Q_H_0 / KILO
-    reach = min(HEATER_RANGE / KILO, Q_0)
+    window = min(puller.v_0, math.inf if drives.pull_window is None else drives.pull_window) / MM_PER_MIN
+    fastest = min(v_0 + window, math.inf if drives.pull_max is None else drives.pull_max / MM_PER_MIN)
+    pull_slew = NO_LIMIT if drives.pull_slew is None else drives.pull_slew / (MM_PER_MIN / MINUTE)
+    heater_slew = NO_LIMIT if drives.heater_slew is None else drives.heater_slew / (KILO / MINUTE)
+    reach = config.heater_range / KILO
     return (
         Port("nominal_radius_mm", "radius that the controller was designed at", puller.r_0 / MM),
         Port("ring_bias_mm", "the operator's bias: ring radius minus crystal radius at nominal", puller.ring_bias / MM),
         Port("nominal_pull_speed_mm_per_min", "this puller's pull speed at its operating point", v_0),
         Port("nominal_heater_power_kW", "this puller's heater power there", Q_0),
         Port("nominal_T_1_K", "this puller's pyrometer reading there", puller.T_1_0),
-        Port("pull_speed_min_mm_per_min", "lowest setpoint of the pull speed", 0.0),
-        Port("pull_speed_max_mm_per_min", "highest setpoint of the pull speed", 2.0 * v_0),
-        Port("heater_power_min_kW", "lowest setpoint of the heater power", Q_0 - reach),
+        Port("pull_speed_min_mm_per_min", "lowest setpoint of the pull speed", v_0 - window),
+        Port("pull_speed_max_mm_per_min", "highest setpoint of the pull speed", fastest),
+        Port("heater_power_min_kW", "lowest setpoint of the heater power", max(Q_0 - reach, 0.0)),
         Port("heater_power_max_kW", "highest setpoint of the heater power", Q_0 + reach),
         Port("pull_slew_mm_per_min2", "largest change of the pull speed in a minute; 1e30: no limit", pull_slew),
         Port("heater_slew_kW_per_min", "largest change of the heater power in a minute; 1e30: no limit", heater_slew),
         Port("takeover_s", "time from a takeover to the controller's full authority", 60.0),
         Port("fallback_after_s", "time without good readings after which the PID takes over", 240.0),
-        Port("oldest_reading_s", "age from which a ring reading counts as stale", 15.0),
+        Port("oldest_reading_s", "age from which a ring reading counts as stale", 3.0 * config.control_interval),
     )
 
 
-def readings_of(given: Any, nominal: Any, v_0: float) -> tuple[Measured, Measured]:
+def readings_of(given: Any, nominal: Any, ranges: tuple[float, float]) -> tuple[Measured, Measured]:
     """Readings as deviations in SI units, and whether each lies within the range of the observations."""
     radius, power = given["ring_radius_mm"] - nominal["ring_bias_mm"], nominal["nominal_heater_power_kW"]
     seen = Measured(
@@ -159,11 +163,13 @@ def readings_of(given: Any, nominal: Any, v_0: float) -> tuple[Measured, Measure
         v_p=(given["pull_speed_mm_per_min"] - nominal["nominal_pull_speed_mm_per_min"]) * MM_PER_MIN,
         Q_H=(given["heater_power_kW"] - power) * KILO,
     )
-    limits = 1.001 * CLIP * scales(MEASURED, v_0)
+    limits = 1.001 * CLIP * scales(MEASURED, *ranges)
     return seen, Measured(*(np.abs(value) <= limit for value, limit in zip(seen, limits, strict=True)))
 
 
-def step(controller: Controller, pid: Controller, dt: float, v_0: float, settings: Any, given: Any, memory: Any) -> Any:
+def step(
+    controller: Controller, pid: Controller, dt: float, ranges: Any, settings: Any, given: Any, memory: Any
+) -> Any:
     """Outputs, memory and whether a sample was due; arguments as of :func:`cz_gym.export.program.record`."""
     started = np.isfinite(memory.last_time_s)
     elapsed = np.where(started, given["time_s"] - memory.last_time_s, dt)
@@ -171,7 +177,7 @@ def step(controller: Controller, pid: Controller, dt: float, v_0: float, setting
     due = np.isfinite(given["time_s"]) & ((elapsed >= 0.9 * dt) | (elapsed < 0.0))
     late = elapsed > 1.1 * dt
 
-    seen, plausible = readings_of(given, settings, v_0)
+    seen, plausible = readings_of(given, settings, ranges)
     age = given["time_s"] - given["ring_time_s"]
     ring = plausible.ring_error & (seen.valid > 0.5) & (np.abs(age) <= settings["oldest_reading_s"])
     first = Measured(*(np.where(good, value, 0.0) for good, value in zip(plausible, seen, strict=True)))
@@ -279,6 +285,6 @@ def shelled(name: str, controller: Controller, pid: Controller, config: Config, 
     )
 
     def body(settings: Any, given: Any, memory: Any) -> Any:
-        return step(controller, pid, config.control_interval, puller.v_0, settings, given, memory)
+        return step(controller, pid, config.control_interval, config.ranges, settings, given, memory)
 
-    return record(name, settings_of(puller), INPUTS, OUTPUTS, start, body, controller.estimates_temperature, notes)
+    return record(name, settings_of(config), INPUTS, OUTPUTS, start, body, controller.estimates_temperature, notes)

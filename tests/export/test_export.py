@@ -328,3 +328,12 @@ def test_what_cannot_be_exported_is_refused_in_one_line(
     assert main([*given, "--to", "c", "--out", str(tmp_path / "out")]) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_puller_file_gives_nominal_values_limits_and_its_name(tmp_path: Path) -> None:
+    assert main(["paper-tuned", "--to", "c", "--out", str(tmp_path), "--puller", "silicon-300mm"]) == 0
+    source, header = ((tmp_path / f"cz_paper_tuned.{end}").read_text() for end in "ch")
+    config = config_of("puller", puller="silicon-300mm")
+    assert config.puller.label in header
+    assert f"nominal_radius_mm = {config.parameters.r_0 * 1e3!r}" in source
+    assert "pull_slew_mm_per_min2 = 1.0E30" not in source
