@@ -104,8 +104,8 @@ class SAC(Reinforcement):
     """Soft actor-critic."""
 
     name: str = "sac"
-    steps: int = 6_000_000
-    num_envs: int = 64
+    steps: int = 12_000_000
+    num_envs: int = 256
     action_repeat: int = 4
     gamma: float = 0.97
     buffer_size: int = 1_000_000
