@@ -8,6 +8,7 @@ zero of G_m), gains to the plant's, the temperature loop's to the heater's capac
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -41,6 +42,13 @@ ON_PULLER = ("paper", "paper-here", *PIDS, *(name for name in LQGS if name != TO
 """Controllers of the default table on a puller."""
 JUMP = 1.0 * MM
 """Largest difference of reading and filter that counts on the default puller, where outliers are to be expected [m]."""
+
+
+PULL = 0.1
+"""Least weight of the pull speed of an LQG whose drive has a window or a slew rate, which its regulator does not know:
+with less it swings between them until the crystal is lost [-]."""
+SLACK = 0.6
+"""Difference between commanded and applied power that is due to the heater's resolution, in units of it [-]."""
 
 
 class Scale(NamedTuple):
@@ -151,9 +159,11 @@ def scaled_design(name: str, config: Config) -> LQGDesign:
         heater_walk=known.noise.heater_walk * config.heater_range / DEFAULT.heater_range,
         start_radius_sd=max(scenario.pullers.start_radius_sd, known.noise.start_radius_sd),
     )
-    return replace(
-        known, noise=noise, ring=ring_of(sensor), heater_slack=0.6 * max(scenario.actuators.heater_step, 1.0)
-    )
+    drives = scenario.actuators
+    limited = math.isfinite(drives.pull_window) or math.isfinite(drives.pull_slew)
+    weights = known.weights._replace(pull=max(known.weights.pull, PULL)) if limited else known.weights
+    slack = SLACK * drives.heater_step
+    return replace(known, noise=noise, weights=weights, ring=ring_of(sensor), heater_slack=slack)
 
 
 def _rms(sd: tuple[float, float]) -> float:

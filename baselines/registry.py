@@ -92,7 +92,6 @@ CONTROLLERS: tuple[Contender, ...] = (
         "measured",
         "the paper's compensator and PID, designed by its procedure for this puller",
         default=False,
-        quoted=True,
     ),
     Contender(
         "pid-uncompensated",

@@ -463,7 +463,8 @@ def on(puller: Puller, distribution: Distribution) -> Distribution:
 
     What the puller's file says of drives, sensors and melt stands in place of the scenario's. Of the rest, shares,
     temperatures and times stay as they are; lengths are in proportion to r_0, speeds to v_0, powers to the heater's
-    range. On the default puller nothing changes. CzError for a scenario on another puller.
+    range; changes of the reference to v_0 as well, so that the cone angle that they ask for stays. On the default
+    puller nothing changes. CzError for a scenario on another puller.
     """
     if isinstance(distribution, Mixture):
         members: Any = tuple(on(puller, each) for each in distribution.scenarios)
@@ -489,6 +490,7 @@ def on(puller: Puller, distribution: Distribution) -> Distribution:
         old, values = getattr(distribution, family.name), {}
         for each in fields(old):
             size = power if each.name.startswith("heater_") else sizes.get(each.metadata["member"].slip, 1.0)
+            size = speed if family.name == "reference" and each.name == "amount" else size
             stated, own = said.get(family.name, {}).get(each.name), getattr(old, each.name)
             scaled = own if size == 1.0 else tuple(size * end for end in own) if isinstance(own, tuple) else size * own
             values[each.name] = scaled if stated is None else stated

@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add(
         "--trials",
         type=trials,
-        help="candidates to try, those of an earlier run included (100; with --puller 40 or 16)",
+        help="candidates to try, those of an earlier run included (100; with --puller 40 or 12)",
     )
     add("--episodes", type=episodes, help="training episodes of a candidate (100; with --puller 20)")
     add("--out", type=Path, help="folder of histories and choices (results/tuning; with --puller beside its file)")

@@ -17,7 +17,7 @@ from cz_gym.puller import Puller
 from .goals import goal_on
 from .search import Search, Trial, measure
 
-TRIALS = {for_puller.FILTER: 16}
+TRIALS = {for_puller.FILTER: 12}
 """Candidates of a search; 40 of a PID's."""
 Task = tuple[str, Puller, int, int, Path]
 """Controller, puller, candidates, episodes and folder of a search."""

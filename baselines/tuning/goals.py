@@ -207,7 +207,13 @@ def _lqg_goal(name: str, scenario: Scenario) -> LQGGoal:
 
 QUICK = {"pid.K_p", "pid.T_i", "pid.T_d", "T_f", "compensator.gain", "heater.K", "heater.K_pull", "heater.T_pull"}
 """Parameters of a PID that are searched for a puller of the user's own, from its scaled settings."""
-FILTER_PARAMETERS = ("noise.heater_walk", "noise.thermal_walk", "noise.drift_rate_sd", "weights.pull_step")
+FILTER_PARAMETERS = (
+    "noise.heater_walk",
+    "noise.thermal_walk",
+    "weights.pull",
+    "weights.pull_step",
+    "weights.heater_step",
+)
 """The same of an LQG: how much its filter doubts the hot zone, and its activity."""
 NEAR = 8.0
 """How far, as a factor, a search for a puller goes from the scaled settings [-]."""

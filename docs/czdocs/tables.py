@@ -18,7 +18,8 @@ from cz_gym import SCENARIOS, Scenario
 from cz_gym.camera.view import Camera
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED, STATE, Channel
-from cz_gym.physics.parameters import describe
+from cz_gym.physics.parameters import Parameters, describe
+from cz_gym.puller import DEFAULT, KEYS, Drives, Melt, Puller, Sensors, value_of
 from cz_gym.serve.machine import TAGS
 from cz_gym.signals import INFO_ROWS, PULL_SCALE
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
@@ -153,6 +154,20 @@ def symbols(part: str) -> list[str]:
     return markdown(("symbol", "code", "value", "unit", "meaning", "equation", "source"), rows)
 
 
+def puller() -> list[str]:
+    """The keys of a puller file."""
+    known = {name: quantity.meaning for name, quantity in describe(Parameters).items()}
+    known |= {each.name: each.meaning for kind in (Drives, Sensors, Melt, Puller) for each in attributes(kind)}
+    rows = []
+    for key in KEYS:
+        value = value_of(DEFAULT, key)
+        default = "the scenario's" if value is None else f"{value / float(key.size):.10g}"
+        pair = "number or pair" if key.drawn else ""
+        name = code(f"[{key.table}]"), code(key.name)
+        rows.append((*name, default, f"{key.low:g} to {key.high:g}", pair, known[key.field]))
+    return markdown(("table", "key", "default", "range", "", "meaning"), rows)
+
+
 def camera() -> list[str]:
     """The camera's parameters."""
     default = Camera()
@@ -174,6 +189,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "families": families,
     "camera": camera,
     "tags": lambda: markdown(("tag", "type", "meaning"), ((code(t.name), t.kind.__name__, t.meaning) for t in TAGS)),
+    "puller": puller,
     **{part: partial(symbols, part) for part in nomenclature.ROWS},
 }
 """Every table, by the name a page asks for it with."""

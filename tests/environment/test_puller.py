@@ -171,9 +171,10 @@ def test_the_machine_is_the_files_and_the_crystal_the_scenarios() -> None:
     longer, faster = 150.0 / 87.5, 0.8 / 1.2
     assert scenario.sensor.camera_noise == WIDE.sensors.camera_noise
     assert (scenario.sensor.latency, scenario.interface.tau_fast) == (1.0, 40.0)
-    assert scenario.actuators.pull_window == pytest.approx(0.3 * MM_PER_MIN)
+    assert scenario.actuators.pull_window == pytest.approx(0.4 * MM_PER_MIN)
     assert scenario.sensor.bias_offset == pytest.approx((-0.3 * longer * MM, 0.3 * longer * MM))
     assert scenario.recipe == PULLER.recipe
+    assert scenario.reference.amount[1] == pytest.approx(faster * PULLER.reference.amount[1])
     assert scenario.pullers.melt_loss == PULLER.pullers.melt_loss
     bare: Any = replace(WIDE, drives=WIDE.drives._replace(pull_window=None, pull_slew=None, heater_slew=None))
     assert on(bare, PULLER).actuators.pull_window == pytest.approx(0.5 * faster * MM_PER_MIN)  # type: ignore[union-attr]
