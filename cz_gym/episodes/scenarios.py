@@ -133,6 +133,8 @@ SCENARIOS: dict[str, Scenario] = {
     )
 }
 """Every named scenario."""
+ALIASES = {"unknown-puller": PULLER.name}
+"""Other names of scenarios: the puller's true numbers, camera and drives are not what controllers were told."""
 ALL = make_mixture([(RANDOMIZED, 0.3), *((each, 0.175) for each in (HARD, SENSOR_FAULT, PULLER, HOT_ZONE))])
 """The mixture "all": every random scenario of the benchmark's default table."""
 
@@ -161,13 +163,13 @@ def find_scenario(scenario: AnyScenario) -> Scenario:
         return scenario
     if isinstance(scenario, Mixture | Mapping) or scenario == "all":
         raise CzError(f"this needs one scenario, not the mixture {find_distribution(scenario).name!r}")
-    if isinstance(scenario, str) and scenario in SCENARIOS:
-        return SCENARIOS[scenario]
+    if isinstance(scenario, str) and ALIASES.get(scenario, scenario) in SCENARIOS:
+        return SCENARIOS[ALIASES.get(scenario, scenario)]
     name, _, row = scenario.rpartition("-") if isinstance(scenario, str) else ("", "", "")
     if name in SCENARIOS and row in _ROWS:
         raise CzError(f"{scenario!r} is a row of the benchmark: the scenario is {name!r}, with {_ROWS[row]}")
     also = "" if isinstance(scenario, str) else ", or pass a cz_gym.Scenario, or a dict of scenarios and their shares"
-    raise CzError(unknown("scenario", scenario, [*SCENARIOS, "all"], also))
+    raise CzError(unknown("scenario", scenario, [*SCENARIOS, *ALIASES, "all"], also))
 
 
 def mix_of(model: str | float | None, distribution: Distribution) -> tuple[float, float]:

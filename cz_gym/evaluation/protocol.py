@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from cz_gym.config import Config, make_config
 from cz_gym.episodes.scenario import Scenario
-from cz_gym.episodes.scenarios import find_scenario
+from cz_gym.episodes.scenarios import ALIASES, find_scenario
 from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
@@ -122,7 +122,7 @@ ROWS: tuple[Row, ...] = (
 def find_row(name: str) -> Row:
     """Return the row of that name; CzError names those that exist."""
     for row in ROWS:
-        if row.name == name:
+        if row.name == ALIASES.get(name, name):
             return row
     raise CzError(unknown("scenario", name, [row.name for row in ROWS]))
 

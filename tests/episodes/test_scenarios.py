@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from cz_gym import SCENARIOS, Scenario
 from cz_gym.episodes.scenario import Drift, Faults, Interface, Pullers, Recipe
-from cz_gym.episodes.scenarios import mix_of
+from cz_gym.episodes.scenarios import find_scenario, mix_of
+from cz_gym.evaluation.protocol import find_row
 
 MM, MINUTE = 1e-3, 60.0
 FAMILIES = [field.name for field in dataclasses.fields(Scenario)[1:]]
@@ -142,3 +143,8 @@ def test_a_model_sets_the_share_of_conduction() -> None:
     assert mix_of(None, SCENARIOS["nominal"]) == (1.0, 1.0)
     assert (mix_of("I", randomized), mix_of("II", randomized)) == ((1.0, 1.0), (0.0, 0.0))
     assert mix_of(0.25, randomized) == (0.25, 0.25)
+
+
+def test_the_scenario_of_an_unknown_puller_has_two_names() -> None:
+    assert find_scenario("unknown-puller") == find_scenario("puller") == SCENARIOS["puller"]
+    assert find_row("unknown-puller") == find_row("puller")
