@@ -21,7 +21,8 @@ import numpy as np
 from cz_gym import CzEnv, Parameters, make_puller
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.baselines.lqg.designs import TOLD, lqg
-from cz_gym.baselines.registry import make_controller
+from cz_gym.baselines.pid.filtered_pid import FilteredPID
+from cz_gym.baselines.pid.settings import tuned
 from cz_gym.commands import OneLineParser
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Pullers
@@ -31,7 +32,7 @@ from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.identify import Excited, Identified, identify, read_log, record_log
-from cz_gym.identify.estimate import PRIOR_SD, WIDER, measure_excitation
+from cz_gym.identify.estimate import PRIOR_SD, measure_excitation
 from cz_gym.puller import Drives, Puller, read_puller, write_puller
 from cz_gym.task import HEATER_RANGE
 from cz_gym.units import KILO, MM, PERCENT
@@ -60,14 +61,11 @@ class Row(NamedTuple):
     lost: tuple[int, ...]
     """Crystals that they lost."""
 
-    def inside(self, share: float = 1.0) -> list[bool]:
-        """Whether the interval, or its inner ``share``, holds the truth, of every informed parameter."""
+    @property
+    def inside(self) -> list[bool]:
+        """Whether the interval holds the truth, of every informed parameter."""
         told = [e for e in self.found.estimates if e.informed and e.name in Parameters._fields]
-        truths = [getattr(self.truth.parameters, e.name) / e.value for e in told]
-        return [
-            (e.low / e.value) ** share <= truth <= (e.high / e.value) ** share
-            for e, truth in zip(told, truths, strict=True)
-        ]
+        return [e.low <= getattr(self.truth.parameters, e.name) <= e.high for e in told]
 
 
 def draw(number: int) -> tuple[Puller, Puller]:
@@ -92,7 +90,9 @@ def draw(number: int) -> tuple[Puller, Puller]:
 def write_logs(truth: Puller, seed: int, folder: Path) -> tuple[Path, Path]:
     """CSV files of three hours under a PID of the puller's own, with and without excitation."""
     env = CzEnv(SCENARIO, observation="measured", action="direct", puller=truth, info="all")
-    pid = make_controller("pid-conventional", env.config)
+    pid = tuned("pid-conventional", env.config)
+    assert isinstance(pid, FilteredPID)
+    pid = replace(pid, heater=replace(pid.heater, K=pid.heater.K * truth.parameters.C_1 / Parameters().C_1))
     paths = folder / "excited.csv", folder / "passive.csv"
     for path, policy in zip(paths, (Excited(pid), pid), strict=True):
         record_log(env, policy, path, seed)
@@ -124,23 +124,21 @@ def report(rows: Sequence[Row]) -> str:
         (
             f"{2.0 * row.truth.parameters.r_0 / MM:.0f}",
             f"{make_puller(row.truth.parameters).Q_H_0 / KILO:.0f}",
-            str(len(row.inside())),
-            str(sum(row.inside())),
+            str(len(row.inside)),
+            str(sum(row.inside)),
             *(f"{error:.3f}" for error in row.rmse_mm),
             ", ".join(map(str, row.lost)),
         )
         for row in rows
     ]
     ratios = [row.rmse_mm[1] / row.rmse_mm[0] for row in rows]
-    inside, curvature = (np.concatenate([row.inside(share) for row in rows]) for share in (1.0, 1.0 / WIDER))
-    lost = np.sum([row.lost for row in rows], axis=0)
+    inside, lost = np.concatenate([row.inside for row in rows]), np.sum([row.lost for row in rows], axis=0)
+    ratio = f"median {np.median(ratios):.3f}, worst {max(ratios):.3f}"
     return f"""{markdown(heads, lines)}
 
-pullers: {len(rows)}
-error of the LQG of the identified file over that of the truth: median {np.median(ratios):.3f}, worst {max(ratios):.3f}
+{len(rows)} pullers; error of the LQG of the identified file over that of the truth: {ratio}
 crystals lost, told the truth, the identified file, the start: {", ".join(map(str, lost))}
 intervals that hold the truth: {np.mean(inside) / PERCENT:.0f} % of {len(inside)} informed parameters
-by the curvature alone, without the factor {WIDER}: {np.mean(curvature) / PERCENT:.0f} %
 without excitation, logs that are said to tell the pull speed's path: {sum(row.passive[0] >= 1.0 for row in rows)}
 """
 

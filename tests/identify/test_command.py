@@ -7,6 +7,7 @@ import pytest
 from cz_gym.identify import Identified
 from cz_gym.identify import __main__ as command
 from cz_gym.puller import read_puller
+from examples import identify as example
 from studies import identify as study
 
 
@@ -23,6 +24,16 @@ def test_the_command_writes_the_puller_and_its_report(
     assert text.count("| told |") == sum(e.informed for e in (*found.estimates, *found.noise))
     assert "says nothing about it" in text
     assert "calliper" in text
+
+
+def test_the_example_goes_from_a_log_to_a_controller(
+    logs: tuple[Path, Path], found: Identified, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(example, "identify", lambda *_: found)
+    out = tmp_path / "my.toml"
+    assert 0.0 < example.main(str(logs[0]), out=str(out)) < 0.2
+    assert read_puller(out).hash == found.puller.hash
+    assert out.with_suffix(".md").is_file()
 
 
 @pytest.mark.parametrize(
