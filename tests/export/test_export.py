@@ -19,10 +19,11 @@ from cz_gym.export.compiled import CompiledBlock
 from cz_gym.export.policy import BlockPolicy
 from cz_gym.export.program import Program
 from cz_gym.export.shell import INPUTS, Alarm
-from cz_gym.export.text import write_c
+from cz_gym.export.text import write_c, write_st
 from cz_gym.observation import decode, readable
 from cz_gym.task import HEATER_RANGE, drives_of
 from cz_gym.vector import CzVectorEnv
+from tests.export.structured_text import FunctionBlock
 
 CONTROLLERS = ("paper", "paper-tuned", "industrial", "lqg", "gradient", "ppo")
 needs_compiler = pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed: no C can be compiled")
@@ -337,3 +338,34 @@ def test_a_puller_file_gives_nominal_values_limits_and_its_name(tmp_path: Path) 
     assert config.puller.label in header
     assert f"nominal_radius_mm = {config.parameters.r_0 * 1e3!r}" in source
     assert "pull_slew_mm_per_min2 = 1.0E30" not in source
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_the_structured_text_acts_as_the_program_does(name: str) -> None:
+    """Statement by statement, on noisy readings of which some are bad."""
+    exported, rng = program(name), np.random.default_rng(5)
+    (text,) = write_st(exported).values()
+    block, memory, pull = FunctionBlock(text), exported.start[None], 1.2
+    for k in range(60):
+        ring, pyrometer = 101.6 + rng.normal(0.0, 0.1), 1785.6 + rng.normal(0.0, 0.3)
+        inputs = nominal({"time_s": 5.0 * k, "ring_time_s": 5.0 * k, "ring_radius_mm": ring, "T_1_K": pyrometer})
+        inputs |= {"r_ref_5min_mm": 87.5 - 0.02 * k, "pull_speed_mm_per_min": pull}
+        inputs |= {"valid": 0.0, "T_1_K": np.nan} if k in (30, 31, 47) else {}
+        outputs, memory = exported.run(inputs, memory)
+        found = block(**inputs)
+        for output, scale in ((PULL, 1.2), (HEATER, 10.0)):
+            assert found[output] / scale == pytest.approx(float(outputs[output][0]) / scale, abs=1e-9)
+        assert found[ALARMS] == outputs[ALARMS][0]
+        pull = found[PULL]
+    assert block(reset=True, **nominal({"time_s": 1e3, "ring_time_s": 1e3, "pull_speed_mm_per_min": 1.1}))[PULL] == 1.1
+
+
+@pytest.mark.parametrize("name", ["paper-tuned", pytest.param("lqg", marks=pytest.mark.slow)])
+def test_the_structured_text_is_of_the_standard(name: str) -> None:
+    parse = pytest.importorskip("blark.parse", reason="blark, the parser of structured text, is not installed")
+    (text,) = write_st(program(name)).values()
+    parsed = parse.parse_source_code(text)
+    assert parsed.exception is None
+    (block,) = parsed.transform().items
+    assert str(block.name) == f"cz_{program(name).name}"
+    assert len(block.body.statements) > 100
