@@ -67,7 +67,11 @@ class BlockPolicy:
         """Actions and the next state; arguments as of every policy."""
         rows = np.atleast_2d(np.asarray(observation, np.float64))
         n = len(rows)
-        begins = np.ones(n, np.bool_) if state is None else np.broadcast_to(np.asarray(episode_start or False), (n,))
+        begins = (
+            np.ones(n, np.bool_)
+            if state is None
+            else np.broadcast_to(np.asarray(False if episode_start is None else episode_start), (n,))
+        )
         if state is None or begins.any():
             state = self._begun(state, begins)
         inputs = self.inputs(rows, state.samples) | dict(self.settings_changed)
