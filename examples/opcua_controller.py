@@ -120,7 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("--url", default="opc.tcp://127.0.0.1:4840/", help="server (%(default)s)")
     add("--controller", default="paper", metavar="NAME", help="controller, agent or agent file (%(default)s)")
-    add("--puller", metavar="FILE", help="the server's puller file (the default puller)")
+    parser.add_puller("the server's")
     add("--steps", type=int, default=10**9, metavar="N", help="most steps to answer")
     add("--operator", metavar="NAME", help="user; the password is in CZ_GYM_OPERATOR_PASSWORD")
     add("--encrypt", type=Path, metavar="FILE", help="encrypt; the server's certificate.pem")

@@ -31,7 +31,7 @@ def commands() -> OneLineParser:
         "Passwords are read from CZ_GYM_OPERATOR_PASSWORD and CZ_GYM_READER_PASSWORD. Ctrl-C ends.",
     )
     add = parser.add_argument
-    add("--puller", metavar="FILE", help="puller file, or the name of a shipped one (the default puller)")
+    parser.add_puller("the puller behind the server, at its control interval")
     add("--scenario", default="randomized", metavar="NAME", help="scenario (%(default)s)")
     add("--seed", type=between(0, 2**31 - 1), default=1, metavar="N", help="which crystal (%(default)s)")
     add("--speed", type=between(0, 10_000), default=1, metavar="N",

@@ -18,6 +18,7 @@ import numpy as np
 from cz_gym.config import Config
 from cz_gym.env import CzEnv
 from cz_gym.errors import CzError
+from cz_gym.identify.log import COLUMNS
 from cz_gym.observation import decode
 from cz_gym.rendering.canvas import Frame
 from cz_gym.rendering.view import record_of
@@ -29,12 +30,10 @@ FALLBACK = "paper-tuned"
 """The controller that takes over when setpoints are not renewed."""
 BLEND = 60.0
 """Time from the fallback's takeover to its full authority; its first setpoints are the held ones [s]."""
+SYNC = 0.5
+"""Time after which a log waits for the disk, which takes longer than a step [s]."""
 SIZE = (640, 480)
 """Width and height of the picture [px]."""
-COLUMNS = (
-    "time_s", "ring_radius_mm", "valid", "pull_speed_mm_per_min", "heater_power_kW", "T_1_K", "r_ref_mm", "T_1_ref_K",
-)  # fmt: skip
-"""Columns of the log."""
 
 
 class Alarm(IntFlag):
@@ -105,26 +104,25 @@ SETPOINTS = ("pull_speed_setpoint_mm_per_min", "heater_power_setpoint_kW")
 
 
 class Log:
-    """A CSV log that is whole up to its last row however the process ends; CzError if the file exists."""
+    """A CSV log that is whole however the process ends, and up to the last second if the power fails.
+
+    CzError if the file exists.
+    """
 
     def __init__(self, path: str | Path) -> None:
+        self._synced = 0.0
         try:
             self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
         except OSError as error:
             raise CzError(f"{path}: {os.strerror(error.errno or 0)}") from None
-        self._write(",".join(COLUMNS))
+        os.write(self._file, f"{','.join(COLUMNS)}\n".encode())
 
     def add(self, tags: dict[str, Any]) -> None:
-        """Add a row and wait until it is on the disk."""
-        self._write(",".join(f"{float(tags[name]):.10g}" for name in COLUMNS))
-
-    def _write(self, line: str) -> None:
-        os.write(self._file, f"{line}\n".encode())
-        os.fsync(self._file)
-
-    def close(self) -> None:
-        """Close the file."""
-        os.close(self._file)
+        """Write a row, whole, and wait for the disk unless that was done within the last second."""
+        os.write(self._file, f"{','.join(f'{float(tags[name]):.10g}' for name in COLUMNS)}\n".encode())
+        if time.monotonic() >= self._synced + SYNC:
+            os.fsync(self._file)
+            self._synced = time.monotonic()
 
 
 class Machine:

@@ -13,7 +13,8 @@ pytest.importorskip("pygame")
 
 from cz_gym.config import make_config
 from cz_gym.errors import CzError
-from cz_gym.serve.machine import COLUMNS, SETPOINTS, Alarm, Clock, Log, Machine
+from cz_gym.identify.log import COLUMNS
+from cz_gym.serve.machine import SETPOINTS, Alarm, Clock, Log, Machine
 
 PULL, HEATER = SETPOINTS
 
