@@ -1,79 +1,62 @@
-"""A controller of a puller over OPC UA: the paper's, any other of the table, or an agent that reads "measured".
+"""A controller of a puller over OPC UA: any that ``python -m cz_gym.export`` can write, in Python or as compiled C.
 
-It reads the tags of ``python -m cz_gym.serve``, computes, and writes both setpoints and the step that they answer.
+It reads the tags of ``python -m cz_gym.serve``, calls the exported block, which has inputs of the same names, and
+writes both setpoints and the step that they answer.
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import logging
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
 from asyncua import Client, ua
 from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 
-from cz_gym import agents
-from cz_gym.baselines.registry import make_controller
-from cz_gym.commands import OneLineParser
-from cz_gym.config import make_config
+from cz_gym.commands import OneLineParser, between
+from cz_gym.config import Config, make_config
 from cz_gym.errors import CzError
-from cz_gym.observation import CLIP, MEASURED, Measured, scales
-from cz_gym.serve.machine import TAGS
+from cz_gym.export.__main__ import export_program
+from cz_gym.export.compiled import CompiledBlock
+from cz_gym.export.text import write_c
+from cz_gym.serve.machine import SETPOINTS, TAGS
 from cz_gym.serve.opcua import KINDS, URI, certify, password
-from cz_gym.task import drives_of
-from cz_gym.units import KILO, MM, MM_PER_MIN
-
-WRITTEN = {tag.name: KINDS[tag.kind] for tag in TAGS if tag.writable}
 
 
-def observe(tags: dict[str, Any]) -> Any:
-    """The tags as a "measured" observation."""
-    r_0, T_0 = tags["nominal_radius_mm"], tags["nominal_T_1_K"]
-    seen = Measured(
-        ring_error=(tags["ring_radius_mm"] - tags["ring_bias_mm"] - tags["r_ref_mm"]) * MM,
-        valid=float(tags["valid"]),
-        **{name: (tags[f"{name}_mm"] - r_0) * MM for name in ("r_ref", "r_ref_1min", "r_ref_5min")},
-        **{name: tags[f"{name}_K"] - T_0 for name in ("T_1_ref", "T_1_ref_1min", "T_1_ref_5min", "T_1")},
-        v_p=(tags["pull_speed_mm_per_min"] - tags["nominal_pull_speed_mm_per_min"]) * MM_PER_MIN,
-        Q_H=(tags["heater_power_kW"] - tags["nominal_heater_power_kW"]) * KILO,
-    )
-    ranges = (
-        tags["nominal_pull_speed_mm_per_min"] * MM_PER_MIN,
-        (tags["heater_power_max_kW"] - tags["nominal_heater_power_kW"]) * KILO,
-    )
-    return np.clip(np.array(seen) / scales(MEASURED, *ranges), -CLIP, CLIP).astype(np.float32)
+class Block:
+    """A controller in its shell, which holds bad readings, limits its setpoints and takes over without a jump."""
+
+    def __init__(self, name: str, config: Config, compiled: bool = False) -> None:
+        program = export_program(name, config)
+        self.names = {port.name for port in (*program.settings, *program.inputs)}
+        self._run, self._memory = program.run, program.start[None]
+        if compiled:
+            with TemporaryDirectory() as folder:
+                for file, text in write_c(program).items():
+                    (Path(folder) / file).write_text(text)
+                block = CompiledBlock(program, Path(folder) / f"cz_{program.name}.c")
+            self._run, self._memory = block.run, block.begin(1)
+
+    def setpoints(self, tags: dict[str, Any]) -> list[float]:
+        """The setpoints for the tags of a step."""
+        given = tags | {"ring_time_s": tags["time_s"], "automatic": True}
+        inputs = {name: float(given[name]) for name in self.names & given.keys()}
+        outputs, self._memory = self._run(inputs, self._memory)
+        return [float(outputs[name][0]) for name in SETPOINTS]
 
 
-def setpoints(tags: dict[str, Any], action: Any, mode: str) -> tuple[float, ...]:
-    """Pull speed [mm/min] and heater power [kW] of an action in this mode."""
-    names = ("pull_speed", "mm_per_min"), ("heater_power", "kW")
-    applied, nominal, most = (
-        np.array([tags[pattern.format(*name)] for name in names]) for pattern in ("{}_{}", "nominal_{}_{}", "{}_max_{}")
-    )
-    drives, reach = drives_of(mode, tags["control_interval_s"]), most - nominal
-    gains, clipped = np.array([drives.pull, drives.heater]), np.clip(np.asarray(action, float), -1.0, 1.0)
-    moved = drives.keep * (applied - nominal) / reach + gains * clipped
-    return tuple((nominal + reach * np.clip(moved, -1.0, 1.0)).tolist())
-
-
-def controller(name: str, puller: str | None) -> Any:
-    """The controller of that name, or the agent of a name or file, for a puller."""
-    agent = Path(name).suffix == ".onnx" or name in agents.shipped_names()
-    found = agents.load(name) if agent else None
-    config = make_config(observation="measured", action=found.settings["action"] if found else "direct", puller=puller)
-    return agents.load(name, config) if found else make_controller(name, config)
-
-
-async def control(acting: Any, label: str, client: Client, steps: int) -> int:
+async def control(block: Block, label: str, client: Client, steps: int) -> int:
     """Control until the crystal ends, or for so many steps; returns how many were answered."""
     space = await client.get_namespace_index(f"{URI}:tags")
     nodes = {tag.name: client.get_node(ua.NodeId(tag.name, space)) for tag in TAGS}
-    memory, last, answered = None, -1, 0
+    written = {tag.name: KINDS[tag.kind] for tag in TAGS if tag.writable}
+    last, answered = -1, 0
     while answered < steps:
         tags = dict(zip(nodes, await client.read_values(nodes.values()), strict=True))
         if tags["puller"] != label:
@@ -84,44 +67,45 @@ async def control(acting: Any, label: str, client: Client, steps: int) -> int:
             await asyncio.sleep(0.001)
             continue
         last = tags["step"]
-        action, memory = acting.predict(observe(tags), memory)
-        values = (*setpoints(tags, action, acting.action), last)
-        variants = [ua.Variant(value, kind) for value, kind in zip(values, WRITTEN.values(), strict=True)]
+        values = zip((*block.setpoints(tags), last), written.values(), strict=True)
         with suppress(ua.UaStatusCodeError):  # refused: the server says why, and holds what it had
-            await client.write_values([nodes[name] for name in WRITTEN], variants)
+            await client.write_values([nodes[name] for name in written], [ua.Variant(*value) for value in values])
             answered += 1
     return answered
 
 
 async def run(arguments: argparse.Namespace) -> None:
-    """Connect, with encryption if there is a user, and control."""
-    acting, config = controller(arguments.controller, arguments.puller), make_config(puller=arguments.puller)
-    client = Client(arguments.url)
+    """Connect, with encryption if the server's certificate is given, and control."""
+    config = make_config(arguments.scenario, observation="measured", action="direct", puller=arguments.puller)
+    block, client = Block(arguments.controller, config, arguments.compiled), Client(arguments.url)
     if arguments.operator:
-        client.application_uri = URI
         client.set_user(arguments.operator)
         client.set_password(password("operator"))
     if arguments.encrypt:
         await certify(arguments.certificates)
         certificate, key = arguments.certificates / "certificate.pem", arguments.certificates / "key.pem"
+        client.application_uri = URI
         await client.set_security(
             SecurityPolicyBasic256Sha256, certificate, key, server_certificate=str(arguments.encrypt)
         )
     try:
         async with client:
-            print(f"{await control(acting, config.puller.label, client, arguments.steps)} steps answered")
+            print(f"{await control(block, config.puller.label, client, arguments.steps)} steps answered")
     except (OSError, ua.UaError) as error:
         raise CzError(f"{arguments.url}: {error or type(error).__name__}") from None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Control a puller; 0 when its crystal has ended, 2 for bad input, 130 when interrupted."""
+    logging.getLogger("asyncua").setLevel(logging.ERROR)
     parser = OneLineParser("python -m examples.opcua_controller", "Control a puller over OPC UA.")
     add = parser.add_argument
     add("--url", default="opc.tcp://127.0.0.1:4840/", help="server (%(default)s)")
     add("--controller", default="paper", metavar="NAME", help="controller, agent or agent file (%(default)s)")
+    add("--compiled", action="store_true", help="as C, compiled by this machine's compiler")
     parser.add_puller("the server's")
-    add("--steps", type=int, default=10**9, metavar="N", help="most steps to answer")
+    add("--scenario", default="puller", metavar="NAME", help="scenario whose tuned settings it has (%(default)s)")
+    add("--steps", type=between(1, 10**9), default=10**9, metavar="N", help="most steps to answer")
     add("--operator", metavar="NAME", help="user; the password is in CZ_GYM_OPERATOR_PASSWORD")
     add("--encrypt", type=Path, metavar="FILE", help="encrypt; the server's certificate.pem")
     add("--certificates", type=Path, default=Path("client"), metavar="DIR",

@@ -66,7 +66,7 @@ def running(folder: Path, *options: str, remote: bool = False) -> Iterator[Any]:
     puller = Running(folder, options, remote)
     thread = threading.Thread(target=puller.run)
     thread.start()
-    puller.ready.wait(180.0)
+    puller.ready.wait(600.0)
     try:
         if puller.error:
             raise puller.error
