@@ -65,7 +65,7 @@ def test_what_was_found_is_used_for_that_puller_alone(tmp_path: Path) -> None:
     place = tmp_path / "mine.toml"
     write_puller(find_puller("silicon-300mm"), place)
     puller, kept = find_puller(place), tmp_path / "mine" / "paper-tuned.json"
-    config, before = make_config(puller=puller, **PLAIN), for_puller.pid("paper-tuned", WIDE)
+    config, before = make_config(puller=puller, **PLAIN), for_puller.scaled_pid("paper-tuned", WIDE)
     assert for_puller.pid("paper-tuned", config) == replace(before, puller=puller)
     kept.parent.mkdir()
     kept.write_text(json.dumps({"puller": puller.label, "chosen": {"values": {"T_f": 12.5, "pid.K_p": 0.02}}}))
