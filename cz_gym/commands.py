@@ -13,7 +13,7 @@ from gymnasium.error import DependencyNotInstalled
 from cz_gym.errors import CzError
 
 OPTIONAL = (
-    "aiohttp", "asyncua", "casadi", "control", "envpool", "filelock", "h5py", "matplotlib", "minari", "onnx",
+    "aiohttp", "asyncua", "blark", "casadi", "control", "envpool", "filelock", "h5py", "matplotlib", "minari", "onnx",
     "onnxruntime", "pcgym", "plotly", "pygame", "safetensors", "sb3_contrib", "selenium", "stable_baselines3",
     "tensorboard", "torch", "tqdm",
 )  # fmt: skip

@@ -8,7 +8,7 @@ from cz_gym.agents.training.recipes import APG, PPO, SAC, Recipe
 from cz_gym.agents.training.run import Job
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
-SMALL = PPO(num_envs=4, hidden=(16, 16), steps=128, n_steps=16, batch_size=32, n_epochs=1)
+SMALL = PPO(num_envs=4, action_repeat=2, hidden=(16, 16), steps=128, n_steps=16, batch_size=32, n_epochs=1)
 SMALL_SAC = SAC(
     num_envs=4, hidden=(16, 16), steps=256, buffer_size=256, learning_starts=32, batch_size=16, gradient_steps=1
 )

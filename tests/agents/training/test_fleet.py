@@ -20,7 +20,16 @@ from cz_gym.evaluation import processes
 from tests.small_learners import REFERENCES, train_small_seed
 
 pytestmark = pytest.mark.usefixtures("few_crystals")
-SMALL_PPO = PPO(steps=4096, num_envs=64, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,), control_interval=30.0)
+SMALL_PPO = PPO(
+    steps=4096,
+    num_envs=64,
+    action_repeat=2,
+    n_steps=32,
+    batch_size=1024,
+    n_epochs=1,
+    hidden=(16,),
+    control_interval=30.0,
+)
 
 
 def in_turn(

@@ -24,7 +24,7 @@ from cz_gym.commands import interpreter
 ROOT = Path(__file__).parents[3]
 
 
-SMALL = PPO(num_envs=64, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,))
+SMALL = PPO(num_envs=64, action_repeat=2, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,))
 
 
 @pytest.fixture

@@ -21,6 +21,7 @@ from cz_gym.config import make_config
 from cz_gym.observation import MEASURED, PULL_SCALE, Measured
 from cz_gym.physics.linearisation import StateSpace, radius_model
 from cz_gym.physics.parameters import Parameters
+from cz_gym.task import HEATER_RANGE
 from cz_gym.units import MM, MM_PER_MIN
 from tests.observed import PLAIN, measured, pulls
 
@@ -122,11 +123,11 @@ def test_trim_rises_while_pull_is_fast_and_stops_at_its_limit(dt):
     memory = loop.at_rest(fast)
     for _ in range(round(600.0 / dt)):
         before = memory
-        _, memory = loop.step(fast, memory, dt, PULL_SCALE)
+        _, memory = loop.step(fast, memory, dt, PULL_SCALE, HEATER_RANGE)
     assert memory.trim - before.trim == pytest.approx(6.0 * 0.1 * dt / 1200.0, rel=1e-9)
     assert memory.trim == pytest.approx(6.0 * 0.1 * (600.0 - 20.0) / 1200.0, rel=0.03)
     for _ in range(round(20000.0 / dt)):
-        _, memory = loop.step(fast, memory, dt, PULL_SCALE)
+        _, memory = loop.step(fast, memory, dt, PULL_SCALE, HEATER_RANGE)
     assert memory.trim == loop.limit
 
 
