@@ -151,7 +151,8 @@ class CzEnv(Form, gym.Env[Observation, Action]):
     :class:`cz_gym.signals.Logged`; with observation "history" also the true ``state``, for critics),
     ``render_mode``, ``parameters`` (:class:`cz_gym.Parameters`), ``meniscus`` (:class:`cz_gym.MeniscusModel`),
     ``camera`` (:class:`cz_gym.camera.Camera`, with observation "camera" only), ``puller`` (a file, or the name of a
-    shipped one; see docs/puller.md: parameters and control interval are then its own). Bad values raise ValueError.
+    shipped one; see docs/extend/puller.md: parameters and control interval are then its own). Bad values raise
+    ValueError.
     ``render_mode`` is None, "rgb_array" or "human", ``render_size`` the picture's width and height [px]; rendering
     needs the extra ``render``, without which no mode is declared and asking for one raises
     :class:`gymnasium.error.DependencyNotInstalled`.

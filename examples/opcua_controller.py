@@ -60,7 +60,7 @@ async def control(block: Block, label: str, client: Client, steps: int) -> int:
     while answered < steps:
         tags = dict(zip(nodes, await client.read_values(nodes.values()), strict=True))
         if tags["puller"] != label:
-            raise CzError(f"the server's puller is {tags['puller'] or 'the default one'}: --puller must be its file")
+            raise CzError(f"the server's puller is {tags['puller']}: --puller must be its file")
         if tags["state"] != "growing":
             break
         if tags["step"] == last:

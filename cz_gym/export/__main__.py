@@ -147,12 +147,12 @@ def choose(name: str, config: Config) -> Chosen:
         f"({contract.scenario_hash}).",
         f"File {contract.sha256}; observation {contract.observation} {contract.observation_hash}. {plant}",
     )
-    return Chosen(identifier, Agent(policy, config.ranges), config, facts)
+    return Chosen(identifier, Agent(policy, config), config, facts)
 
 
 def readme(program: Program, config: Config, files: list[str]) -> str:
     """The README beside the files."""
-    kinds = {".h": "declarations", ".c": "the block", ".st": "the function block", ".onnx": "the graph"}
+    kinds = {".h": "declarations", ".c": "the block", ".st": "the function block"}
     return README.format(
         name=program.name,
         about="  \n".join(program.notes),

@@ -8,13 +8,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cz_gym.config import Config
 from cz_gym.engine.outputs import recall, remember
 from cz_gym.errors import CzError
 from cz_gym.observation import CLIP, HISTORY, INTEGRAL_SCALE, LAGGED, MEASURED, Measured, lags, scales
 from cz_gym.task import drives_of
 
-HEATER_SLACK = 60.0
-"""Difference between commanded and applied power [W] that is due to the resolution of the drive."""
+SLACK = 0.6
+"""Difference between commanded and applied power that is due to the heater's resolution, in units of it [-]."""
 
 
 def _clip(x: Any, low: Any = None, high: Any = None) -> Any:
@@ -128,12 +129,13 @@ class Agent:
 
     estimates_temperature = False
 
-    def __init__(self, policy: Any, ranges: tuple[float, float]) -> None:
-        contract = policy.contract
+    def __init__(self, policy: Any, config: Config) -> None:
+        contract, ranges = policy.contract, config.ranges
         if contract.observation not in ("measured", "history"):
             raise CzError(f"an agent that reads {contract.observation!r} cannot be exported: no plant has that")
         self.network, self.remembers, self.ranges = Network(policy.content), policy.remembers, ranges
         self.v_0, self.heater_range = ranges
+        self.slack = SLACK * max(each.actuators.heater_step for each in config.scenario.scenarios)
         self.dt = contract.control_interval
         self.newest, self.before = lags(self.dt)[0], lags(self.dt)[1] + 1
         self.depth = int(self.before.max()) + 1 if contract.observation == "history" else 0
@@ -154,7 +156,7 @@ class Agent:
             observation, past = self._history(seen, observation, past)
         action, *state = self.network(observation=observation, **({"state": memory.network} if self.remembers else {}))
         applied = self._applied(seen)
-        slack = np.array([0.0, HEATER_SLACK / self.heater_range])
+        slack = np.array([0.0, self.slack / self.heater_range])
         before = applied + np.clip(memory.command - applied, -slack, slack)
         gains = np.array([self.drives.pull, self.drives.heater])
         command = np.clip(self.drives.keep * before + gains * np.clip(action, -1.0, 1.0), -1.0, 1.0)

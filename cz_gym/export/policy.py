@@ -13,9 +13,10 @@ from cz_gym.action import MadeFor, mark
 from cz_gym.config import Config
 from cz_gym.observation import decode
 from cz_gym.physics.plant import make_puller
-from cz_gym.units import KILO, MM, MM_PER_MIN
+from cz_gym.units import KILO, MM_PER_MIN
 
 from .program import Floats, Program
+from .shell import in_plant_units
 
 Run = Callable[[Mapping[str, Any], Any], tuple[dict[str, Floats], Any]]
 """Outputs and next memory for inputs and memory, as :meth:`cz_gym.export.program.Program.run`."""
@@ -92,22 +93,9 @@ class BlockPolicy:
     def inputs(self, rows: Any, samples: Any) -> dict[str, Any]:
         """The block's inputs for observations of shape (n, channels) at those samples of their episodes."""
         puller = make_puller(self.config.parameters, 0.5, self.config.meniscus)
-        seen = decode(rows, *self.config.ranges)
         time = samples * self.config.control_interval
-        radii = {name: (getattr(seen, name) + puller.r_0) / MM for name in ("r_ref", "r_ref_1min", "r_ref_5min")}
-        recipe = {name: getattr(seen, name) + puller.T_1_0 for name in ("T_1_ref", "T_1_ref_1min", "T_1_ref_5min")}
-        return {
-            "time_s": time,
-            "ring_time_s": time,
-            "ring_radius_mm": (seen.ring_error + seen.r_ref + puller.r_0 + puller.ring_bias) / MM,
-            "valid": seen.valid,
-            **{f"{name}_mm": value for name, value in radii.items()},
-            **{f"{name}_K": value for name, value in recipe.items()},
-            "T_1_K": seen.T_1 + puller.T_1_0,
-            "pull_speed_mm_per_min": (seen.v_p + puller.v_0) / MM_PER_MIN,
-            "heater_power_kW": (seen.Q_H + puller.Q_H_0) / KILO,
-            "automatic": np.ones(len(rows)),
-        }
+        readings = in_plant_units(decode(rows, *self.config.ranges), puller)
+        return readings | {"time_s": time, "ring_time_s": time, "automatic": np.ones(len(rows))}
 
     def action_of(self, outputs: Mapping[str, Any]) -> npt.NDArray[np.float32]:
         """The environment's action for the setpoints, shape (n, 2)."""

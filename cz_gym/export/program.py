@@ -1,6 +1,6 @@
 """A recorded controller: its inputs, memory and outputs; and the NumPy interpreter that runs it.
 
-This is the one description from which C, structured text and ONNX are written.
+This is the one description from which C and structured text are written.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .trace import BAD, FINITE, FUNCTIONS, Graph, Ids, Node, Traced
+from .trace import BAD, FINITE, FUNCTIONS, Graph, Ids, Node
 
 Floats = npt.NDArray[np.float64]
 
@@ -234,6 +234,3 @@ def record(
             raise ValueError(f"{cell.name}: {cell.start.size} numbers became {cell.after.size}")
     shown = tuple((port, ids_of(results[port.name])) for port in outputs)
     return Program(name, graph, settings, inputs, shown, tuple(held), ids_of(due), needs_double, notes)
-
-
-__all__ = ["Cell", "Port", "Program", "Traced", "flatten", "rebuild", "record"]

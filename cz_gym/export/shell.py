@@ -167,6 +167,20 @@ def readings_of(given: Any, nominal: Any, ranges: tuple[float, float]) -> tuple[
     return seen, Measured(*(np.abs(value) <= limit for value, limit in zip(seen, limits, strict=True)))
 
 
+def in_plant_units(seen: Measured, puller: Any) -> dict[str, Any]:
+    """The readings of a sample as a plant has them, by the names of :data:`INPUTS`: the inverse of readings_of."""
+    radii = {f"{name}_mm": (getattr(seen, name) + puller.r_0) / MM for name in ("r_ref", "r_ref_1min", "r_ref_5min")}
+    recipe = ("T_1_ref", "T_1_ref_1min", "T_1_ref_5min", "T_1")
+    return {
+        "ring_radius_mm": (seen.ring_error + seen.r_ref + puller.r_0 + puller.ring_bias) / MM,
+        "valid": seen.valid,
+        **radii,
+        **{f"{name}_K": getattr(seen, name) + puller.T_1_0 for name in recipe},
+        "pull_speed_mm_per_min": (seen.v_p + puller.v_0) / MM_PER_MIN,
+        "heater_power_kW": (seen.Q_H + puller.Q_H_0) / KILO,
+    }
+
+
 def step(
     controller: Controller, pid: Controller, dt: float, ranges: Any, settings: Any, given: Any, memory: Any
 ) -> Any:

@@ -29,8 +29,8 @@ PRIOR_SD, NOISE_SD = 0.35, 1.0
 LAM, LAM_SD = 0.5, 0.3
 """Mean and standard deviation of lam [-], about those of a uniform distribution."""
 WIDER = 1.3
-"""Factor on the standard deviations of the curvature, which is steeper at the maximum than around it: without it, 8 of
-41 95 % intervals missed the truth of five simulated pullers (others than those of ``studies.identify``)."""
+"""Factor on the standard deviations of the curvature, which is steeper at the maximum than around it; ``python -m
+studies.identify`` counts the intervals that hold the truth."""
 INFORMED = 0.5
 """An informed parameter keeps less than this share of the prior's standard deviation [-]."""
 MOVE, ENOUGH, PAST = 0.005, 20 * 0.02**2, 6

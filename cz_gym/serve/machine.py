@@ -18,6 +18,7 @@ import numpy as np
 from cz_gym.config import Config
 from cz_gym.env import CzEnv
 from cz_gym.errors import CzError
+from cz_gym.export.shell import INPUTS, in_plant_units
 from cz_gym.identify.log import COLUMNS
 from cz_gym.observation import decode
 from cz_gym.rendering.canvas import Frame
@@ -63,22 +64,21 @@ class Tag(NamedTuple):
     writable: bool = False
 
 
+def _readings(*names: str) -> list[Tag]:
+    """Tags that are inputs of the exported blocks too, with the same names and meanings."""
+    meanings = {port.name: port.meaning for port in INPUTS}
+    return [Tag(name, float, meanings[name]) for name in names]
+
+
 TAGS = (
     Tag("time_s", float, "time since the crystal's start"),
     Tag("state", str, "growing, or how the crystal ended"),
     Tag("control", str, "who sets the drives: client, held, fallback or manual"),
     Tag("alarms", int, "sum of the alarm bits"),
-    Tag("ring_radius_mm", float, "radius of the bright ring as the camera gives it"),
+    *_readings("ring_radius_mm"),
     Tag("valid", bool, "whether the camera says that this reading is good"),
-    Tag("T_1_K", float, "pyrometer reading of the heater temperature"),
-    Tag("pull_speed_mm_per_min", float, "applied pull speed"),
-    Tag("heater_power_kW", float, "applied heater power"),
-    Tag("r_ref_mm", float, "radius reference now"),
-    Tag("r_ref_1min_mm", float, "radius reference in 1 minute"),
-    Tag("r_ref_5min_mm", float, "radius reference in 5 minutes"),
-    Tag("T_1_ref_K", float, "recipe of the heater temperature now"),
-    Tag("T_1_ref_1min_K", float, "recipe in 1 minute"),
-    Tag("T_1_ref_5min_K", float, "recipe in 5 minutes"),
+    *_readings("T_1_K", "pull_speed_mm_per_min", "heater_power_kW", "r_ref_mm", "r_ref_1min_mm", "r_ref_5min_mm"),
+    *_readings("T_1_ref_K", "T_1_ref_1min_K", "T_1_ref_5min_K"),
     Tag("pull_speed_setpoint_mm_per_min", float, "setpoint of the pull speed", True),
     Tag("heater_power_setpoint_kW", float, "setpoint of the heater power", True),
     Tag("watchdog", int, "number of the step that the setpoints answer; writing it makes them act", True),
@@ -94,7 +94,7 @@ TAGS = (
     Tag("control_interval_s", float, "length of a step"),
     Tag("watchdog_s", float, "time after which setpoints that are not renewed give way to the fallback"),
     Tag("scenario", str, "the scenario"),
-    Tag("puller", str, "name and hash of the puller file; empty for the default one"),
+    Tag("puller", str, "name and hash of the puller file, or default"),
     Tag("step", int, "number of the control interval that begins now; it changes after all other tags"),
 )
 """Every tag, in the order in which they are written."""
@@ -250,28 +250,22 @@ class Machine:
         return tags
 
     def _tags(self, control: str) -> dict[str, Any]:
-        p, ending = self.puller, self._record.ending
+        ending = self._record.ending
         seen = decode(self._observation.astype(float), *self._ranges)
         bits = {
             Alarm.CAMERA: seen.valid < 0.5, Alarm.HELD: control == "held", Alarm.FALLBACK: control == "fallback",
             Alarm.MANUAL: control == "manual", Alarm.LATE: self.late, Alarm.ENDED: ending is not None,
         }  # fmt: skip
-        radii = {f"{name}_mm": (getattr(seen, name) + p.r_0) / MM for name in ("r_ref", "r_ref_1min", "r_ref_5min")}
-        recipe = {f"{n}_K": getattr(seen, n) + p.T_1_0 for n in ("T_1_ref", "T_1_ref_1min", "T_1_ref_5min", "T_1")}
         values = (
             self._fixed
-            | radii
-            | recipe
+            | in_plant_units(seen, self.puller)
             | dict(zip(SETPOINTS, self._active, strict=True))
             | {
                 "time_s": self.k * self.interval,
                 "state": "growing" if ending is None else ending.value.lower(),
                 "control": control,
                 "alarms": sum(bit for bit, holds in bits.items() if holds),
-                "ring_radius_mm": (seen.ring_error + seen.r_ref + p.r_0 + p.ring_bias) / MM,
                 "valid": seen.valid > 0.5,
-                "pull_speed_mm_per_min": (seen.v_p + p.v_0) / MM_PER_MIN,
-                "heater_power_kW": (seen.Q_H + p.Q_H_0) / KILO,
                 "watchdog": max(self.answered, 0),
                 "step": self.k,
             }

@@ -1,11 +1,13 @@
 """Identification: exact derivatives, exact predictions without noise, and what a log can and cannot tell."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from cz_gym import CzEnv, Parameters
+from cz_gym.action import MadeFor
 from cz_gym.baselines.policy import OpenLoop
 from cz_gym.errors import CzError
 from cz_gym.identify import Excited, Identified, identify, read_log, record_log
@@ -110,6 +112,9 @@ def test_excitation_stops_for_good_beyond_a_radius_error() -> None:
         assert bool(np.abs(action).any()) is moves
     with pytest.raises(CzError, match="amplitudes"):
         Excited(OpenLoop(), pull=0.5)
+    agent = SimpleNamespace(control_interval=2.0, made_for=MadeFor("rate", 2.0, "1234", "mine (5678)"))
+    with pytest.raises(CzError, match="does not say its puller's numbers"):
+        Excited(agent)
 
 
 def test_whiteness_tells_white_from_coloured() -> None:
