@@ -394,7 +394,8 @@ def _number(key: Key, value: Any) -> Any:
         return _number(key, value[0])[0], _number(key, value[1])[0]
     if isinstance(value, bool) or not isinstance(value, int | Decimal) or not Decimal(value).is_finite():
         also = ", or a pair [low, high]" if pair else ""
-        raise CzError(f"{key.name} must be a number{also}, not {value!r:.40}")
+        said = str(value) if isinstance(value, Decimal) else repr(value)
+        raise CzError(f"{key.name} must be a number{also}, not {said:.40}")
     number = _read(Decimal(value), key)
     return (number, number) if pair else number
 

@@ -90,6 +90,7 @@ def test_the_default_file_is_the_puller_of_every_environment_without_one() -> No
     ("text", "said"),
     [
         ("[crystal]\nradius_mmm = 150", "did you mean 'radius_mm'"),
+        ("[crystal]\nradius_mm = nan", "radius_mm must be a number, not NaN"),
         ("[crystal]\nradius_m = 0.15", "did you mean 'radius_mm'"),
         ("[crystal]\nC_1_J_per_K = 5e4", "belongs in [hot_zone]"),
         ("[crystall]\nradius_mm = 150", "did you mean '[crystal]'"),
