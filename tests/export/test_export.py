@@ -1,5 +1,6 @@
 """Exported blocks: the recorded program is the controller, the C is the program, the shell keeps its promises."""
 
+import re
 import shutil
 import subprocess
 from functools import cache
@@ -362,9 +363,12 @@ def test_the_structured_text_acts_as_the_program_does(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["paper-tuned", pytest.param("lqg", marks=pytest.mark.slow)])
 def test_the_structured_text_is_of_the_standard(name: str) -> None:
+    """Long tables of constants are cut for the parser, which needs minutes for them."""
     parse = pytest.importorskip("blark.parse", reason="blark, the parser of structured text, is not installed")
     (text,) = write_st(program(name)).values()
-    parsed = parse.parse_source_code(text)
+    table = re.compile(r":= \[\n(.*?)\n    \];", re.DOTALL)
+    cut = table.sub(lambda found: f":= [{', '.join(found[1].split(', ')[:3])}];", text)
+    parsed = parse.parse_source_code(cut)
     assert parsed.exception is None
     (block,) = parsed.transform().items
     assert str(block.name) == f"cz_{program(name).name}"
