@@ -32,6 +32,7 @@ from cz_gym.physics.linearisation import RadiusModel, radius_model
 from cz_gym.physics.plant import Puller as PlantPuller
 from cz_gym.physics.plant import make_puller
 from cz_gym.puller import DEFAULT, Puller
+from cz_gym.task import HEATER_SLACK
 from cz_gym.units import MM
 
 PIDS = ("paper-tuned", "pid-conventional", "industrial")
@@ -42,13 +43,9 @@ ON_PULLER = ("paper", "paper-here", *PIDS, *(name for name in LQGS if name != TO
 """Controllers of the default table on a puller."""
 JUMP = 1.0 * MM
 """Largest difference of reading and filter that counts on the default puller, where outliers are to be expected [m]."""
-
-
-PULL = 0.1
+LEAST_PULL = 0.1
 """Least weight of the pull speed of an LQG whose drive has a window or a slew rate, which its regulator does not know:
 with less it swings between them until the crystal is lost [-]."""
-SLACK = 0.6
-"""Difference between commanded and applied power that is due to the heater's resolution, in units of it [-]."""
 
 
 class Scale(NamedTuple):
@@ -161,8 +158,8 @@ def scaled_design(name: str, config: Config) -> LQGDesign:
     )
     drives = scenario.actuators
     limited = math.isfinite(drives.pull_window) or math.isfinite(drives.pull_slew)
-    weights = known.weights._replace(pull=max(known.weights.pull, PULL)) if limited else known.weights
-    slack = SLACK * drives.heater_step
+    weights = known.weights._replace(pull=max(known.weights.pull, LEAST_PULL)) if limited else known.weights
+    slack = HEATER_SLACK * drives.heater_step
     return replace(known, noise=noise, weights=weights, ring=ring_of(sensor), heater_slack=slack)
 
 

@@ -21,6 +21,8 @@ HEIGHT_MAX_IN_A = 1.24
 """Highest meniscus before it detaches [capillary constants]."""
 HEATER_RANGE = 10.0 * KILO
 """Range of the default puller's heater drive [W]: Q_H = Q_H0 +- HEATER_RANGE."""
+HEATER_SLACK = 0.6
+"""Difference between commanded and applied power that is due to the heater's resolution, in units of it [-]."""
 SMOOTH_TIME = 50.0
 """Time constant with which ``action="smooth"`` moves both drives [s]."""
 SMOOTH_PULL, SMOOTH_HEATER = 1.0, 0.5

@@ -50,7 +50,7 @@ SCENARIO = replace(
 
 
 class Row(NamedTuple):
-    """What came of a puller."""
+    """The identification of a puller and its use."""
 
     truth: Puller
     found: Identified

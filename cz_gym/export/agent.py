@@ -12,10 +12,7 @@ from cz_gym.config import Config
 from cz_gym.engine.outputs import recall, remember
 from cz_gym.errors import CzError
 from cz_gym.observation import CLIP, HISTORY, INTEGRAL_SCALE, LAGGED, MEASURED, Measured, lags, scales
-from cz_gym.task import drives_of
-
-SLACK = 0.6
-"""Difference between commanded and applied power that is due to the heater's resolution, in units of it [-]."""
+from cz_gym.task import HEATER_SLACK, drives_of
 
 
 def _clip(x: Any, low: Any = None, high: Any = None) -> Any:
@@ -135,7 +132,7 @@ class Agent:
             raise CzError(f"an agent that reads {contract.observation!r} cannot be exported: no plant has that")
         self.network, self.remembers, self.ranges = Network(policy.content), policy.remembers, ranges
         self.v_0, self.heater_range = ranges
-        self.slack = SLACK * max(each.actuators.heater_step for each in config.scenario.scenarios)
+        self.slack = HEATER_SLACK * max(each.actuators.heater_step for each in config.scenario.scenarios)
         self.dt = contract.control_interval
         self.newest, self.before = lags(self.dt)[0], lags(self.dt)[1] + 1
         self.depth = int(self.before.max()) + 1 if contract.observation == "history" else 0

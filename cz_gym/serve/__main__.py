@@ -59,7 +59,7 @@ def settings(arguments: argparse.Namespace) -> Config:
 
 
 def door_of(arguments: argparse.Namespace) -> Any:
-    """Who may come in; CzError for a password that is too short, and for another address without an operator."""
+    """The accounts that may log in; CzError for too short a password, and for another address without an operator."""
     from .opcua import Account, Door, password
 
     given = (("operator", arguments.operator, True), ("reader", arguments.reader, False))

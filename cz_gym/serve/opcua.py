@@ -47,7 +47,7 @@ class Account(NamedTuple):
 
 
 class Door:
-    """Who may come in, and the list of what was refused.
+    """The accounts that may log in, and the list of what was refused.
 
     Without accounts everybody on this machine may read and write tags. With accounts only operators write; elsewhere
     than on this machine nobody reads without an account.
