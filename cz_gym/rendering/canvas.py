@@ -23,7 +23,6 @@ MISSING = 'rendering needs pygame: pip install ".[render]"'
 FINE = 2
 """Drawn pixels along each side of a pixel of the picture."""
 FONTS = Path(__file__).parent / "fonts"
-TIMES = "\N{MULTIPLICATION SIGN}"
 BASE = (640, 480)
 """Width and height of a picture whose pixels are nominal ones."""
 FAR = 20_000.0

@@ -29,4 +29,3 @@ MELT: Colour = (242, 138, 66)
 ON_MELT: Colour = (60, 20, 0)
 """Words on the bright melt."""
 CRYSTAL: Colour = (104, 112, 128)
-QUARTZ: Colour = (120, 128, 140)

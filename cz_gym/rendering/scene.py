@@ -1,4 +1,4 @@
-"""The whole picture of one episode, in any size: crystal, triple point, numbers and the chart of the radius error."""
+"""The whole picture of one episode, in any size: the crystal's edge, numbers and the chart of the radius error."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
-from . import chart, palette, puller_panel, triple_point
+from . import chart, palette, triple_point
 from .canvas import Box, Canvas, Frame
 from .palette import Colour
 from .record import Ending, Record
@@ -17,7 +17,6 @@ from .record import Ending, Record
 class Layout(NamedTuple):
     """The boxes of the panels."""
 
-    puller: Box
     triple_point: Box
     numbers: Box
     chart: Box
@@ -28,8 +27,7 @@ def layout(box: Box) -> Layout:
     top, below = 34.0, 0.24 * box.h
     main = box.h - top - below - 12.0
     return Layout(
-        puller=Box(6.0, top, 188.0, main),
-        triple_point=Box(200.0, top, box.w - 362.0, main),
+        triple_point=Box(6.0, top, box.w - 168.0, main),
         numbers=Box(box.w - 156.0, top, 150.0, main),
         chart=Box(6.0, top + main + 6.0, box.w - 12.0, below),
     )
@@ -45,28 +43,26 @@ class Scene:
     def draw(self, record: Record) -> Frame:
         """The picture of a record's newest sample, shape (height, width, 3)."""
         canvas, boxes = self.canvas, self.layout
-        canvas.begin(boxes.puller, boxes.numbers, boxes.chart)
-        _draw_header(canvas, boxes.triple_point.x, record)
-        puller_panel.draw(canvas, boxes.puller, record)
-        canvas.text(boxes.puller.x + 8, boxes.puller.y + 5, "crystal", palette.FAINT)
+        canvas.begin(boxes.numbers, boxes.chart)
+        _draw_header(canvas, record)
         triple_point.draw(canvas, boxes.triple_point, record)
         _draw_numbers(canvas, boxes.numbers, record)
         chart.draw(canvas, boxes.chart, record)
         if record.ending is not None:
-            draw_ending(canvas, boxes.triple_point, record.ending)
+            _draw_ending(canvas, boxes.triple_point, record.ending)
         return canvas.finish()
 
 
-def _draw_header(canvas: Canvas, middle: float, record: Record) -> None:
+def _draw_header(canvas: Canvas, record: Record) -> None:
     """Scenario, time, length grown, and whether the crystal grows."""
     hours, rest = divmod(round(float(record.t[-1])), round(HOUR))
     minutes, seconds = divmod(rest, round(MINUTE))
     canvas.text(10, 7, "Cz-v0", size=14, bold=True)
     canvas.text(64, 10, record.scenario, palette.FAINT, 11)
     time, grown = f"{hours}:{minutes:02d}:{seconds:02d}", f"{record.length[-1] / MM:.1f} mm"
-    for x, after, name, value in ((0, 30, "time", time), (112, 152, "grown", grown)):
-        canvas.text(middle + x, 10, name, palette.FAINT, 11)
-        canvas.text(middle + after, 7.5, value, size=13, bold=True)
+    for x, name, value in ((200, "time", time), (312, "grown", grown)):
+        canvas.text(x, 10, name, palette.FAINT, 11)
+        canvas.text(x + 42, 7.5, value, size=13, bold=True)
     status, colour = ("growing", palette.WELL) if record.ending is None else ("ended", palette.ALARM)
     if record.ending is None and record.last("valid") <= 0.0:
         status, colour = "camera: no reading", palette.CAMERA
@@ -108,7 +104,7 @@ def _draw_numbers(canvas: Canvas, box: Box, record: Record) -> None:
         y += 9
 
 
-def draw_ending(canvas: Canvas, box: Box, ending: Ending) -> None:
+def _draw_ending(canvas: Canvas, box: Box, ending: Ending) -> None:
     """A band across a panel that says how the episode ended."""
     band = Box(box.x, box.y + 6, box.w, 20)
     canvas.rectangle(palette.RIM if ending is Ending.HORIZON else palette.ALARM, band)

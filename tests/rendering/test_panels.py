@@ -61,7 +61,7 @@ def test_the_drawn_surface_is_the_logged_radius(picture: tuple[Frame, Record]) -
     scale = triple_point.scale_of(PANELS.triple_point, record)
     r_c, _, z = record.surface()
     blue = near(frame, palette.TRUE)
-    rows = range(round(scale.y(z[-1])) + 8, round(scale.y(z[0])) - 8)
+    rows = range(round(PANELS.triple_point.y) + 8, round(scale.y(z[0])) - 8)
     for row in rows:
         check_near(blue[row], scale.x(np.interp((scale.y_0 - (row + 0.5)) / scale.per_metre, z, r_c)), 12)
     assert len(rows) > 50
