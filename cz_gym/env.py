@@ -178,7 +178,7 @@ class CzEnv(Form, gym.Env[Observation, Action]):
         puller: str | Path | Puller | None = None,
         **others: Any,
     ) -> None:
-        known_keywords(type(self).__init__, others)
+        known_keywords(others, type(self).__init__)
         config = make_config(
             scenario, model, observation, control_interval, horizon, parameters, meniscus, camera, action, puller
         )

@@ -25,8 +25,10 @@ def unknown(kind: str, name: object, known: Iterable[str], also: str = "") -> st
     return f"unknown {kind} {name!r:.80}{meant} from {', '.join(names) or 'none'}{also}"
 
 
-def known_keywords(function: Callable[..., Any], others: Iterable[str]) -> None:
-    """Raise CzError for the first of ``others``, keywords that the function does not have."""
-    for name in others:
-        has = [each.name for each in inspect.signature(function).parameters.values() if each.kind != each.VAR_KEYWORD]
-        raise CzError(unknown("keyword", name, has[1:]))
+def known_keywords(given: Iterable[str], *functions: Callable[..., Any]) -> None:
+    """Raise CzError for the first keyword that none of the functions has."""
+    parameters = [each for function in functions for each in inspect.signature(function).parameters.values()]
+    known = [each.name for each in parameters if each.name != "self" and each.kind != each.VAR_KEYWORD]
+    for name in given:
+        if name not in known:
+            raise CzError(unknown("keyword", name, known))

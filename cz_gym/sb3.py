@@ -56,10 +56,6 @@ class CzVecEnv(VecEnv):
         if stagger is not None:
             self._cuts = np.random.default_rng(stagger).integers(1, env.config.steps, env.num_envs, endpoint=True)
 
-    def seed_slots(self, seeds: Sequence[int]) -> None:
-        """Set the seeds of the slots' episodes from the next reset on."""
-        self._seeds = list(seeds)
-
     def reset(self) -> Any:
         """Draw new episodes, with the seeds and options given before."""
         seeds = list(self._seeds)

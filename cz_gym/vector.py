@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,20 +13,16 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from cz_gym.camera.view import Camera
 from cz_gym.engine.batch import Batch, new_key
 from cz_gym.engine.layout import Out, check_info
 from cz_gym.episodes.mixture import AnyScenario, Mixture
 from cz_gym.errors import CzError
 from cz_gym.names import known_keywords
-from cz_gym.physics.meniscus import MeniscusModel
-from cz_gym.physics.parameters import Parameters
 from cz_gym.processors import processors
 
 from .action import MarkedAction, check_marked
 from .config import Config, make_config, positive_whole
 from .env import CzEnv, EnvState, Form, action_space, check_options, check_state, observation_space
-from .puller import Puller
 from .signals import INFO, LEAN
 
 _CLIPPED = INFO.index("action_clipped")
@@ -54,25 +49,14 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
         self,
         num_envs: int = 1,
         scenario: AnyScenario = "randomized",
-        model: str | float | None = None,
-        observation: str = "history",
-        control_interval: float | None = None,
-        horizon: float = 10800.0,
-        render_mode: str | None = None,
-        parameters: Parameters | None = None,
-        meniscus: MeniscusModel | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         threads: int | None = None,
-        camera: Camera | None = None,
-        action: str = "smooth",
         info: str = "lean",
-        puller: str | Path | Puller | None = None,
-        **others: Any,
+        render_mode: str | None = None,
+        **settings: Any,
     ) -> None:
-        known_keywords(type(self).__init__, others)
-        config = make_config(
-            scenario, model, observation, control_interval, horizon, parameters, meniscus, camera, action, puller
-        )
+        known_keywords(settings, make_config, type(self).__init__)
+        config = make_config(scenario, **settings)
         if render_mode is not None:
             raise CzError(f"a batch does not render: render_mode must be None, not {render_mode!r}")
         self._setup(config, num_envs, autoreset_mode, threads, info)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from cz_gym.contender import Contender
 from cz_gym.errors import CzError
@@ -20,28 +20,12 @@ BLOCK = 10
 """Episodes that a slow controller runs at once, and that are cached together."""
 
 
-class Piece(NamedTuple):
-    """Some episodes of one policy on one row."""
-
-    contender: Contender
-    """A controller, or an agent of one training seed."""
-    row: Row
-    seeds: tuple[int, ...]
-
-    @property
-    def steps(self) -> int:
-        """Environment steps of its episodes."""
-        return len(self.seeds) * self.row.config().steps
-
-
-def run_piece(piece: Piece, progress: Callable[[int], None] | None = None) -> Sample:
-    """Make the policy and roll it out."""
-    interface = piece.contender.observation, piece.contender.action
-    designed_for = piece.row.design_config(*interface)
-    policy = piece.contender.make(designed_for)
-    return Sample.of(
-        piece.contender, rollout(policy, piece.row.config(*interface), piece.seeds, progress, designed_for)
-    )
+def run_episodes(contender: Contender, row: Row, seeds: Sequence[int], progress: Callable[[int], None]) -> Sample:
+    """Roll out a controller, or an agent of one training seed, on some episodes of a row."""
+    interface = contender.observation, contender.action
+    designed_for = row.design_config(*interface)
+    policy = contender.make(designed_for)
+    return Sample.of(contender, rollout(policy, row.config(*interface), seeds, progress, designed_for))
 
 
 def check_agents(contenders: Sequence[Contender], rows: Sequence[Row]) -> None:
@@ -85,7 +69,7 @@ def run(
     """
     done: dict[tuple[str, str], list[Sample]] = {}
     stores: dict[tuple[str, str], SlowEpisodes] = {}
-    pieces: list[Piece] = []
+    pieces: list[tuple[Contender, Row, tuple[int, ...]]] = []
     for row, contender in ((row, contender) for row in rows for contender in contenders):
         key, seeds, at_once = (row.name, contender.name), tuple(episodes_of(contender, row, episodes)), AT_ONCE
         done[key] = []
@@ -95,11 +79,11 @@ def run(
             there = {seed for sample in done[key] for seed in sample.seeds}
             seeds = tuple(seed for seed in seeds if seed not in there)
         blocks = [seeds[first : first + at_once] for first in range(0, len(seeds), at_once)]
-        pieces += [Piece(copy, row, block) for copy in contender.copies() for block in blocks]
-    bar.reset(total=sum(piece.steps for piece in pieces))
-    for piece in pieces:
-        bar.set_description(f"{piece.row.name}, {piece.contender.name}")
-        key, sample = (piece.row.name, piece.contender.name), run_piece(piece, bar.update)
+        pieces += [(copy, row, block) for copy in contender.copies() for block in blocks]
+    bar.reset(total=sum(len(seeds) * row.config().steps for _, row, seeds in pieces))
+    for contender, row, seeds in pieces:
+        bar.set_description(f"{row.name}, {contender.name}")
+        key, sample = (row.name, contender.name), run_episodes(contender, row, seeds, bar.update)
         if key in stores:
             stores[key].write(sample)
         done[key].append(sample)

@@ -42,13 +42,12 @@ def check_vector_env(
     seed: int = 0,
     modes: Sequence[AutoresetMode] = tuple(AutoresetMode),
     random_start: bool = True,
-    rtol: float = 0.0,
 ) -> Checked:
     """Raise :class:`NotConforming` in one line unless the native form equals a vector of scalars; return the counts.
 
     ``make_vector(num_envs, mode)`` makes the native form, ``make_scalar()`` one slot of it. ``steps`` batched steps
     with sampled actions must end episodes in every mode (give a short horizon). ``random_start`` says whether first
-    observations of different episodes differ; ``rtol`` is the tolerance of floats [-], 0 for bit equality.
+    observations of different episodes differ.
     Checked in each mode: spaces, shapes and dtypes; seeds (one, a list, none); that autoreset draws a new
     episode; every observation, reward, end, info, final observation and final info against the scalars; that a
     reset mask resets its slots alone and is not kept; that nothing returned is written later, whoever holds it
@@ -60,8 +59,8 @@ def check_vector_env(
     for mode in modes:
         driver = Driver(make_vector, make_scalar, num_envs, steps, seed, AutoresetMode(mode))
         _check_spaces(driver)
-        _check_seeds(driver, random_start, rtol)
-        _check_equality(driver, random_start, rtol)
+        _check_seeds(driver, random_start)
+        _check_equality(driver, random_start)
         _check_kept(driver, every=True)
         _check_kept(driver, every=False)
         _check_writes(driver)
@@ -88,7 +87,7 @@ def _first(driver: Driver, seed: Any, env: Any = None) -> list[Any]:
         return deepcopy(list(iterate(env.observation_space, env.reset(seed=seed)[0])))
 
 
-def _check_seeds(driver: Driver, random_start: bool, rtol: float) -> None:
+def _check_seeds(driver: Driver, random_start: bool) -> None:
     seed, n = driver.seed, driver.num_envs
     expected = _first(driver, seed)
     with driver.vector() as env:
@@ -99,7 +98,7 @@ def _check_seeds(driver: Driver, random_start: bool, rtol: float) -> None:
     seeds = [seed + 7 * (n - i) for i in range(n)]
     for i, slot in enumerate(_first(driver, seeds)):
         with closing(driver.make_scalar()) as scalar:
-            differs = difference(flatten(slot), flatten(scalar.reset(seed=seeds[i])[0]), rtol)
+            differs = difference(flatten(slot), flatten(scalar.reset(seed=seeds[i])[0]))
         driver.require(not differs, f"seed list: slot {i} with seed {seeds[i]} differs from the scalar with that seed")
     if not random_start:
         return
@@ -115,7 +114,7 @@ def _check_seeds(driver: Driver, random_start: bool, rtol: float) -> None:
         driver.require(not alike, f"slots 0 and {i} have the same first observation")
 
 
-def _check_equality(driver: Driver, random_start: bool, rtol: float) -> None:
+def _check_equality(driver: Driver, random_start: bool) -> None:
     """Every result equals the scalars', and every episode of a slot has a first observation of its own."""
     begun: list[list[Any]] = [[] for _ in range(driver.num_envs)]
     with driver.vector() as env, driver.scalars() as oracle:
@@ -128,7 +127,7 @@ def _check_equality(driver: Driver, random_start: bool, rtol: float) -> None:
             driver.require(one.call == other.call, f"{one.call} where the scalars have {other.call}")
             names = _RESULT if len(one.result) == 5 else (_RESULT[0], _RESULT[-1])
             for name, ours, theirs in zip(names, one.result, other.result, strict=True):
-                found = difference(flatten(ours, name), flatten(theirs, name), rtol, masked=name == "info")
+                found = difference(flatten(ours, name), flatten(theirs, name), masked=name == "info")
                 driver.require(not found, f"{one.call}: {found} (native and scalar)")
     driver.require(
         driver.seen.episodes, f"no episode ended in {driver.steps} steps: give more steps or a shorter horizon"

@@ -36,7 +36,7 @@ def flatten(value: Any, name: str = "") -> list[NamedArray]:
     return [NamedArray(name, value if isinstance(value, np.ndarray) else np.asarray(value))]
 
 
-def difference(one: list[NamedArray], other: list[NamedArray], rtol: float = 0.0, masked: bool = False) -> str | None:
+def difference(one: list[NamedArray], other: list[NamedArray], masked: bool = False) -> str | None:
     """The first difference, in words; None if there is none.
 
     ``masked`` compares only where the masks are true, and allows other dtypes except for bool, as infos have them.
@@ -48,7 +48,7 @@ def difference(one: list[NamedArray], other: list[NamedArray], rtol: float = 0.0
     for (name, a, _), (_, b, mask) in zip(one, other, strict=True):
         if a.shape != b.shape or (a.dtype != b.dtype and (not masked or b.dtype == np.bool_)):
             return f"{name} is {a.dtype} {a.shape} and {b.dtype} {b.shape}"
-        unlike = ~_close(a, b, rtol)
+        unlike = ~_close(a, b)
         if masked and mask is not None and a.ndim > 0 and mask.shape == a.shape[:1]:
             unlike &= mask.reshape(-1, *[1] * (a.ndim - 1))
         if unlike.any():
@@ -58,12 +58,10 @@ def difference(one: list[NamedArray], other: list[NamedArray], rtol: float = 0.0
     return None
 
 
-def _close(a: Array, b: Array, rtol: float) -> Array:
+def _close(a: Array, b: Array) -> Array:
     alike: Array = np.asarray(a == b)
     if np.issubdtype(a.dtype, np.inexact) and np.issubdtype(b.dtype, np.inexact):
         alike = alike | (np.isnan(a) & np.isnan(b))
-        if rtol > 0.0:
-            alike = alike | np.isclose(a, b, rtol=rtol, atol=0.0)
     return alike
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from itertools import cycle
 from typing import IO, NamedTuple
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -23,27 +24,21 @@ MARKERS = {
     "X": "x", "p": "pentagon", "h": "hexagon", "<": "triangle-left", ">": "triangle-right",
 }  # fmt: skip
 """Matplotlib's markers with plotly's names for them."""
-DASHES = ("solid", "dash", "dot")
-"""Plotly's dashes; the next one is used where the colours begin again."""
 DPI = 160
 INK, GREY = "#222222", "#999999"
 
 
 class Style(NamedTuple):
-    """Colour, marker and dashes of a controller, the same in every figure of a run."""
+    """Colour and marker of a controller, the same in every figure of a run."""
 
     colour: str
     marker: str
-    dash: str
 
 
 def styles(names: Sequence[str]) -> dict[str, Style]:
-    """Return one style a controller, in turn; no two are alike in a run."""
-    markers = list(MARKERS)
-    return {
-        name: Style(COLOURS[i % len(COLOURS)], markers[i % len(markers)], DASHES[i // len(COLOURS) % len(DASHES)])
-        for i, name in enumerate(dict.fromkeys(names))
-    }
+    """Return one style a controller, in turn."""
+    turns = zip(cycle(COLOURS), cycle(MARKERS))
+    return {name: Style(*style) for name, style in zip(dict.fromkeys(names), turns, strict=False)}
 
 
 def styles_of(samples: Sequence[Sample]) -> dict[str, Style]:

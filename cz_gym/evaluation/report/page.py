@@ -20,7 +20,7 @@ from cz_gym.units import HOUR
 from . import tables
 from .canvas import styles_of
 from .markdown import measured_from
-from .page_pictures import crystal, errors, pareto
+from .page_pictures import crystal, pareto
 
 _SLOT = re.compile(r"<!-- slot:(\w+) -->")
 
@@ -38,7 +38,6 @@ def page(results: Sequence[Result], command: str) -> str:
         f"{config.control_interval:g} s, on {row.grown_on}.",
         "tables": "\n".join(_table(result, is_open=result is results[0]) for result in results),
         "pareto": _html(pareto(results, styles), "pareto"),
-        "errors": _html(errors(results, styles), "errors"),
         "crystal": _html(crystal(results, styles), "crystal"),
         "controllers": "\n".join(
             "<tr>"

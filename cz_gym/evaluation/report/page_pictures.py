@@ -1,4 +1,4 @@
-"""Plotly's pictures, one scenario shown at a time: error against pull activity, errors crystal by crystal, and signals.
+"""Plotly's pictures, one scenario shown at a time: error against pull activity, and signals.
 
 Signals are those of each scenario's first crystal under some controllers, in panels over one time axis.
 """
@@ -85,25 +85,6 @@ def pareto(results: Sequence[Result], styles: Mapping[str, Style]) -> go.Figure:
 def _bars(estimate: Estimate) -> dict[str, Any]:
     low, high = estimate.ends
     return {"symmetric": False, "array": [high - estimate.mean], "arrayminus": [estimate.mean - low]}
-
-
-def errors(results: Sequence[Result], styles: Mapping[str, Style]) -> go.Figure:
-    """Draw the distribution of RMSE over the crystals and training seeds: median, quartiles, 5 to 95 %."""
-    figure = go.Figure()
-    for number, result in enumerate(results):
-        for sample in reversed(result.samples):
-            low, first, median, third, high = (
-                [float(each)] for each in np.quantile(sample.metric(RMSE.metric), [0.05, 0.25, 0.5, 0.75, 0.95])
-            )
-            figure.add_box(
-                y=[plain(sample.name)], lowerfence=low, q1=first, median=median, q3=third, upperfence=high,
-                orientation="h", marker={"color": styles[sample.name].colour}, name=plain(sample.name), meta=number,
-            )  # fmt: skip
-    figure.update_xaxes(LOG, title=RMSE.heading)
-    figure.update_yaxes(automargin=True)
-    figure.update_layout(showlegend=False, height=140 + 24 * len(results[0].samples))
-    add_menu(figure, results)
-    return figure
 
 
 POINT = 45.0
@@ -194,7 +175,7 @@ def _draw(figure: go.Figure, scenario: int, result: Result, styles: Mapping[str,
                 line = {"color": style.colour if own else INK, "width": 0.8 if name == "camera" else 1.5}
                 figure.add_scatter(
                     row=number + 1, col=1, y=values, **time, **look, mode="lines",
-                    line={**line, "dash": style.dash if own else "dash"}, opacity=0.35 if name == "camera" else 1.0,
+                    line={**line, "dash": "solid" if own else "dash"}, opacity=0.35 if name == "camera" else 1.0,
                     legendgroup=sample.name if own else name, meta=scenario,
                 )  # fmt: skip
                 if len(values) and (not own or sample.name in whole):

@@ -18,7 +18,7 @@ from cz_gym.config import make_config
 from cz_gym.env import CzEnv
 from cz_gym.evaluation.report.canvas import styles_of
 from cz_gym.evaluation.report.page import page
-from cz_gym.evaluation.report.page_pictures import PANELS, crystal, errors, pareto, plain
+from cz_gym.evaluation.report.page_pictures import PANELS, crystal, pareto, plain
 from cz_gym.evaluation.report.tables import DRIVES, ERROR, comparison
 from cz_gym.evaluation.results import Result
 from cz_gym.observation import MEASURED, scales
@@ -72,14 +72,14 @@ class Made:
         self.runs = dict(zip(ROWS, runs, strict=True))
         self.text = page_of(self.results)
         self.parts = Parts(self.text)
-        self.figures = [draw(self.results, styles_of(self.results[0].samples)) for draw in (pareto, errors, crystal)]
+        self.figures = [draw(self.results, styles_of(self.results[0].samples)) for draw in (pareto, crystal)]
 
     def lines(self, row: str, title: str) -> dict[str, list[Any]]:
         """Lines of a panel of the crystal by what they are called, those of a controller by legend group."""
         number = [panel.title for panel in PANELS].index(title)
         axis = f"y{number + 1 if number else ''}"
         found: dict[str, list[Any]] = {}
-        shown = visible(self.figures[2], ROWS.index(row))
+        shown = visible(self.figures[1], ROWS.index(row))
         for trace in (each for each in shown if each.yaxis == axis):
             found.setdefault(trace.legendgroup, []).append(np.array(trace.y))
         return found
@@ -117,16 +117,13 @@ def test_the_tables_are_the_results(made: Made) -> None:
 
 def test_pictures_are_the_results_of_the_chosen_scenario(made: Made) -> None:
     for scenario, result in enumerate(made.results):
-        points, boxes = (visible(figure, scenario) for figure in made.figures[:2])
-        for point, box, sample in zip(points, boxes[::-1], result.samples, strict=True):
+        for point, sample in zip(visible(made.figures[0], scenario), result.samples, strict=True):
             error = result.means[sample.name]["rmse_mm"]
             low, high = error.ends
-            assert point.name == box.name == plain(sample.name)
+            assert point.name == plain(sample.name)
             assert point.y == (error.mean,)
             ends = point.y[0] - point.error_y.arrayminus[0], point.y[0] + point.error_y.array[0]
             assert ends == pytest.approx((low, high))
-            parts = [part[0] for part in (box.lowerfence, box.q1, box.median, box.q3, box.upperfence)]
-            np.testing.assert_allclose(parts, np.quantile(sample.metric("rmse_mm"), [0.05, 0.25, 0.5, 0.75, 0.95]))
 
 
 @pytest.mark.parametrize("row", ROWS)
@@ -173,8 +170,8 @@ def test_a_signal_that_is_no_number_ends_the_line(made: Made) -> None:
 
 
 def test_lost_crystals_do_not_set_the_scale(made: Made) -> None:
-    low, high = made.figures[2].layout.yaxis.range
-    for trace in (each for each in visible(made.figures[2], 0) if each.yaxis == "y" and each.opacity == 1.0):
+    low, high = made.figures[1].layout.yaxis.range
+    for trace in (each for each in visible(made.figures[1], 0) if each.yaxis == "y" and each.opacity == 1.0):
         inside = np.mean((low <= np.array(trace.y)) & (np.array(trace.y) <= high))
         assert (inside > 0.99) == (not trace.name.endswith(", lost"))
 
@@ -187,7 +184,7 @@ def test_plotly_sees_no_markup_in_a_name(text: str) -> None:
 def test_names_stay_text_and_nothing_is_fetched(made: Made) -> None:
     """No address in the page but plotly's own, no element that loads, and a policy that forbids it all the same."""
     tags = [tag for tag, _ in made.parts.elements]
-    assert tags.count("script") == 4, "plotly, and its call for each picture"
+    assert tags.count("script") == 3, "plotly, and its call for each picture"
     assert not {"img", "iframe", "object", "embed"} & {*tags}
     own = made.text.replace(made.parts.scripts[0], "")
     assert "<img" not in own
@@ -207,7 +204,7 @@ def test_names_stay_text_and_nothing_is_fetched(made: Made) -> None:
 
 def test_the_same_results_give_the_same_bytes_and_few_of_them(made: Made) -> None:
     assert page_of(made.results) == made.text
-    crystals = len(made.figures[2].to_json()) / len(ROWS)
+    crystals = len(made.figures[1].to_json()) / len(ROWS)
     assert crystals < 110_000, "eight scenarios fit into 6 MB beside plotly.js"
 
 
