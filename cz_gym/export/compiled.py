@@ -35,41 +35,30 @@ class CompiledBlock:
             raise CzError(f"{source}: {compiler} says {done.stderr.strip()[:300]}")
         self.library = ctypes.CDLL(str(library))
         self._init, self._step = getattr(self.library, f"{name}_init"), getattr(self.library, f"{name}_step")
-        real: Any = ctypes.c_float if single else ctypes.c_double
-        kinds = [(cell, ctypes.c_double if cell.wide else real) for cell in program.memory]
-        arrays = [(cell.name, kind * cell.start.size if cell.start.size > 1 else kind) for cell, kind in kinds]
-        self.block = _structure([*((port.name, ctypes.c_double) for port in program.settings), *arrays])
-        self.measured = _structure([(p.name, ctypes.c_int if p.logical else ctypes.c_double) for p in program.inputs])
-        self.setpoints = _structure(
-            [(port.name, ctypes.c_uint if port.name == "alarms" else real) for port, _ in program.outputs]
-        )
+        self._init.argtypes, self._step.argtypes = [ctypes.c_void_p], [ctypes.c_void_p] * 3
+        real = "f4" if single else "f8"
+        cells = [(cell.name, "f8" if cell.wide else real, cell.start.shape) for cell in program.memory]
+        self.block = np.dtype([*((port.name, "f8") for port in program.settings), *cells], align=True)
+        self.measured = np.dtype([(port.name, "i4" if port.logical else "f8") for port in program.inputs], align=True)
+        kinds = [(port.name, "u4" if port.name == "alarms" else real) for port, _ in program.outputs]
+        self.setpoints = np.dtype(kinds, align=True)
 
     def begin(self, n: int) -> Any:
-        """The memory of n blocks."""
-        blocks = np.empty(n, object)
+        """The memory of n blocks, a structured array of shape (n,)."""
+        blocks = np.zeros(n, self.block)
         for i in range(n):
-            blocks[i] = self.block()
-            self._init(ctypes.byref(blocks[i]))
+            self._init(blocks.ctypes.data + i * self.block.itemsize)
         return blocks
 
     def run(self, inputs: Mapping[str, Any], memory: Any) -> tuple[dict[str, Floats], Any]:
         """The outputs, each of shape (n,), and the blocks, which are changed."""
-        names = [port.name for port in self.program.inputs]
-        columns = [np.broadcast_to(inputs[name], (len(memory),)).tolist() for name in names]
-        changed = {name: value for name, value in inputs.items() if name not in names}
-        outputs = np.zeros((len(memory), len(self.program.outputs)))
-        for i, (block, row) in enumerate(zip(memory, zip(*columns, strict=True), strict=True)):
-            for name, value in changed.items():
-                setattr(block, name, value)
-            measured, setpoints = self.measured(*map(_whole, self.program.inputs, row)), self.setpoints()
-            self._step(ctypes.byref(block), ctypes.byref(measured), ctypes.byref(setpoints))
-            outputs[i] = [getattr(setpoints, port.name) for port, _ in self.program.outputs]
-        return {port.name: outputs[:, at] for at, (port, _) in enumerate(self.program.outputs)}, memory
-
-
-def _structure(fields: list[tuple[str, Any]]) -> Any:
-    return type("Fields", (ctypes.Structure,), {"_fields_": fields})
-
-
-def _whole(port: Any, value: float) -> Any:
-    return int(value > 0.5) if port.logical else value
+        measured, setpoints = np.zeros(len(memory), self.measured), np.zeros(len(memory), self.setpoints)
+        for port in self.program.inputs:
+            value = np.asarray(inputs[port.name])
+            measured[port.name] = value > 0.5 if port.logical else value
+        for name in inputs.keys() - set(self.measured.names or ()):
+            memory[name] = inputs[name]
+        places = [(array.ctypes.data, array.itemsize) for array in (memory, measured, setpoints)]
+        for i in range(len(memory)):
+            self._step(*(start + i * size for start, size in places))
+        return {name: setpoints[name].astype(np.float64) for name in self.setpoints.names or ()}, memory

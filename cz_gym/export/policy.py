@@ -28,8 +28,8 @@ class BlockState(NamedTuple):
     samples: npt.NDArray[np.int64]
     """Number of samples since the episode began, shape (n,)."""
     memory: Any
-    alarms: npt.NDArray[np.int64]
-    """Alarm bits of the last sample, shape (n,)."""
+    outputs: Mapping[str, Floats]
+    """Setpoints and alarm bits of the last sample, each of shape (n,)."""
 
 
 @dataclass(frozen=True)
@@ -77,18 +77,18 @@ class BlockPolicy:
             state = self._begun(state, begins)
         inputs = self.inputs(rows, state.samples) | dict(self.settings_changed)
         outputs, memory = (self.run or self.program.run)(inputs, state.memory)
-        alarms = outputs["alarms"].astype(np.int64)
         action = self.action_of(outputs)
         marked = mark(action[0] if np.ndim(observation) == 1 else action, self.made_for)
-        return marked, BlockState(state.samples + 1, memory, alarms)
+        return marked, BlockState(state.samples + 1, memory, outputs)
 
     def _begun(self, state: Any, begins: npt.NDArray[np.bool_]) -> BlockState:
         n = len(begins)
         fresh = self.begin(n) if self.begin is not None else np.tile(self.program.start, (n, 1))
         if state is None:
-            return BlockState(np.zeros(n, np.int64), fresh, np.zeros(n, np.int64))
-        memory = np.where(begins[:, None] if np.ndim(fresh) == 2 else begins, fresh, state.memory)
-        return BlockState(np.where(begins, 0, state.samples), memory, state.alarms)
+            return BlockState(np.zeros(n, np.int64), fresh, {})
+        memory = state.memory.copy()
+        memory[begins] = fresh[begins]
+        return BlockState(np.where(begins, 0, state.samples), memory, state.outputs)
 
     def inputs(self, rows: Any, samples: Any) -> dict[str, Any]:
         """The block's inputs for observations of shape (n, channels) at those samples of their episodes."""
@@ -97,10 +97,14 @@ class BlockPolicy:
         readings = in_plant_units(decode(rows, *self.config.ranges), puller)
         return readings | {"time_s": time, "ring_time_s": time, "automatic": np.ones(len(rows))}
 
-    def action_of(self, outputs: Mapping[str, Any]) -> npt.NDArray[np.float32]:
-        """The environment's action for the setpoints, shape (n, 2)."""
+    def shares_of(self, outputs: Mapping[str, Any]) -> npt.NDArray[np.float64]:
+        """The setpoints above nominal in shares of the drives' ranges, shape (n, 2)."""
         puller = make_puller(self.config.parameters, 0.5, self.config.meniscus)
         pull = outputs["pull_speed_setpoint_mm_per_min"] * MM_PER_MIN / puller.v_0 - 1.0
         heat = (outputs["heater_power_setpoint_kW"] * KILO - puller.Q_H_0) / self.config.heater_range
-        action: npt.NDArray[np.float32] = np.clip(np.stack([pull, heat], axis=-1), -1.0, 1.0).astype(np.float32)
+        return np.stack([pull, heat], axis=-1)
+
+    def action_of(self, outputs: Mapping[str, Any]) -> npt.NDArray[np.float32]:
+        """The environment's action for the setpoints, shape (n, 2)."""
+        action: npt.NDArray[np.float32] = np.clip(self.shares_of(outputs), -1.0, 1.0).astype(np.float32)
         return action
