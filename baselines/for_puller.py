@@ -29,9 +29,8 @@ from cz_gym.config import Config
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.errors import CzError
 from cz_gym.physics.linearisation import RadiusModel, radius_model
-from cz_gym.physics.plant import Puller as PlantPuller
-from cz_gym.physics.plant import make_puller
-from cz_gym.puller import DEFAULT, Puller
+from cz_gym.physics.plant import Puller, make_puller
+from cz_gym.puller import DEFAULT, PullerFile
 from cz_gym.task import HEATER_SLACK
 from cz_gym.units import MM
 
@@ -46,6 +45,8 @@ JUMP = 1.0 * MM
 LEAST_PULL = 0.1
 """Least weight of the pull speed of an LQG whose drive has a window or a slew rate, which its regulator does not know:
 with less it swings between them until the crystal is lost [-]."""
+ERROR_SHARE = 0.5
+"""Share of such a drive's window that the radius error alone may ask for [-]."""
 
 
 class Scale(NamedTuple):
@@ -85,7 +86,7 @@ def scale_of(config: Config) -> Scale:
     )
 
 
-def _trim(p: PlantPuller) -> float:
+def _trim(p: Puller) -> float:
     """Temperature of the melt that changes the growth rate by v_0 [K]."""
     return p.v_0 * p.rho_dH * p.h_0 / p.k_l
 
@@ -153,14 +154,15 @@ def scaled_design(name: str, config: Config) -> LQGDesign:
         slow_tau=melt.tau_slow,
         pyrometer_sd=_rms(sensor.pyrometer_noise) / _rms(RANDOMIZED.sensor.pyrometer_noise) * known.noise.pyrometer_sd,
         camera_sd=max(float(np.mean(sensor.camera_noise)), known.noise.camera_sd_range[0]),
-        heater_walk=known.noise.heater_walk * config.heater_range / DEFAULT.heater_range,
+        heater_walk=known.noise.heater_walk * config.heater_range / DEFAULT.power_range,
         start_radius_sd=max(scenario.pullers.start_radius_sd, known.noise.start_radius_sd),
     )
     drives = scenario.actuators
     limited = math.isfinite(drives.pull_window) or math.isfinite(drives.pull_slew)
     weights = known.weights._replace(pull=max(known.weights.pull, LEAST_PULL)) if limited else known.weights
+    error_pull = ERROR_SHARE * min(drives.pull_window, config.parameters.v_0) if limited else None
     slack = HEATER_SLACK * drives.heater_step
-    return replace(known, noise=noise, weights=weights, ring=ring_of(sensor), heater_slack=slack)
+    return replace(known, noise=noise, weights=weights, ring=ring_of(sensor), heater_slack=slack, error_pull=error_pull)
 
 
 def _rms(sd: tuple[float, float]) -> float:
@@ -169,7 +171,7 @@ def _rms(sd: tuple[float, float]) -> float:
     return float(np.sqrt((low * low + low * high + high * high) / 3.0)) or 1e-3
 
 
-def found_for(puller: Puller, name: str) -> Mapping[str, float]:
+def found_for(puller: PullerFile, name: str) -> Mapping[str, float]:
     """The values that a search has chosen for a puller, by their paths; empty if there are none.
 
     CzError if they were chosen for other numbers of the puller.
@@ -187,7 +189,7 @@ def found_for(puller: Puller, name: str) -> Mapping[str, float]:
     return values
 
 
-def tuned_folder(puller: Puller) -> Path:
+def tuned_folder(puller: PullerFile) -> Path:
     """The folder of what was found for a puller: beside its file, with its name."""
     return (puller.file or Path(f"{puller.name}.toml")).with_suffix("")
 

@@ -17,7 +17,7 @@ from cz_gym.errors import CzError
 from cz_gym.observation import Measured, decode, readable
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
-from cz_gym.puller import DEFAULT, Puller
+from cz_gym.puller import DEFAULT, PullerFile
 
 Floats = npt.NDArray[np.float64]
 
@@ -74,7 +74,7 @@ class MeasuredController(ABC):
     """Parameters of the nominal puller."""
     meniscus: MeniscusModel = field(default=HURLE, kw_only=True)
     """Meniscus of the nominal puller."""
-    puller: Puller = field(default=DEFAULT, kw_only=True)
+    puller: PullerFile = field(default=DEFAULT, kw_only=True)
     """The machine that it is for."""
     any_environment: bool = field(default=False, kw_only=True)
     """Whether every environment takes its actions (``made_for`` is None)."""
@@ -90,7 +90,7 @@ class MeasuredController(ABC):
     @property
     def heater_range(self) -> float:
         """What an action of 1 moves the heater by [W]."""
-        return self.puller.heater_range
+        return self.puller.power_range
 
     @cached_property
     def made_for(self) -> MadeFor | None:

@@ -19,7 +19,7 @@ class MadeFor(NamedTuple):
     plant: str
     """Hash of the plant (:attr:`cz_gym.config.Config.plant_hash`)."""
     puller: str = "default"
-    """Name and hash of the puller file (:attr:`cz_gym.puller.Puller.label`)."""
+    """Name and hash of the puller file (:attr:`cz_gym.puller.PullerFile.label`)."""
 
     def __str__(self) -> str:
         puller = "" if self.puller == "default" else f", puller {self.puller}"

@@ -14,8 +14,8 @@ from cz_gym.errors import CzError
 
 OPTIONAL = (
     "aiohttp", "asyncua", "blark", "casadi", "control", "envpool", "filelock", "h5py", "matplotlib", "minari", "onnx",
-    "onnxruntime", "pcgym", "plotly", "pygame", "safetensors", "sb3_contrib", "selenium", "stable_baselines3",
-    "tensorboard", "torch", "tqdm",
+    "onnxruntime", "pandas", "pcgym", "plotly", "pyarrow", "pygame", "safetensors", "sb3_contrib", "selenium",
+    "stable_baselines3", "tensorboard", "torch", "tqdm",
 )  # fmt: skip
 """Modules of the packages in the extras of ``pyproject.toml``."""
 

@@ -24,7 +24,7 @@ from cz_gym.physics.plant import EQUATIONS, make_puller
 
 from .action import MadeFor
 from .observation import CAMERA, OBSERVATIONS
-from .puller import DEFAULT, Puller, find_puller, on
+from .puller import DEFAULT, PullerFile, find_puller, on
 from .task import ACTIONS, check_height
 
 VERSION = 0
@@ -77,7 +77,7 @@ class Config:
     meniscus: MeniscusModel = HURLE
     camera: Camera = field(default_factory=Camera)
     """The camera of ``observation="camera"``; nothing else depends on it."""
-    puller: Puller = DEFAULT
+    puller: PullerFile = DEFAULT
     """The machine; scenario, parameters and control interval follow from it in :func:`make_config`."""
 
     @property
@@ -88,7 +88,7 @@ class Config:
     @property
     def heater_range(self) -> float:
         """What an action of 1 moves the heater power by [W]."""
-        return self.puller.heater_range
+        return self.puller.power_range
 
     @property
     def radius_limit(self) -> float:
@@ -169,7 +169,7 @@ def make_config(
     meniscus: MeniscusModel | None = None,
     camera: Camera | None = None,
     action: str = "smooth",
-    puller: str | Path | Puller | None = None,
+    puller: str | Path | PullerFile | None = None,
 ) -> Config:
     """Check the arguments of the environment; CzError names what was given and what is allowed."""
     machine = find_puller(puller)

@@ -33,7 +33,7 @@ from cz_gym.errors import CzError
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from cz_gym.names import unknown
 from cz_gym.observation import DRIVE_CHANNELS, to_measured
-from cz_gym.puller import DEFAULT, Puller, chosen_puller
+from cz_gym.puller import DEFAULT, PullerFile, chosen_puller
 from cz_gym.task import drives_of
 from cz_gym.vector import CzVectorEnv
 
@@ -127,7 +127,7 @@ def write(
     noise: float = NOISE,
     horizon: float = 10800.0,
     overwrite: bool = False,
-    puller: Puller = DEFAULT,
+    puller: PullerFile = DEFAULT,
 ) -> Any:
     """Write the Minari dataset ``cz/<scenario>/<name>-v0`` and return it; a dot in the name becomes "_".
 

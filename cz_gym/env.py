@@ -29,7 +29,7 @@ from cz_gym.rendering.view import FPS, declared_modes, make_view
 from .action import MarkedAction, check_marked
 from .config import Config, check_config, make_config
 from .observation import CAMERA, CLIP, OBSERVATIONS
-from .puller import Puller
+from .puller import PullerFile
 from .signals import INFO, LEAN
 
 Observation = npt.NDArray[Any]
@@ -175,7 +175,7 @@ class CzEnv(Form, gym.Env[Observation, Action]):
         camera: Camera | None = None,
         action: str = "smooth",
         info: str = "lean",
-        puller: str | Path | Puller | None = None,
+        puller: str | Path | PullerFile | None = None,
         **others: Any,
     ) -> None:
         known_keywords(others, type(self).__init__)

@@ -23,7 +23,7 @@ import numpy as np
 
 from cz_gym.atomic_files import naming, write_files
 from cz_gym.episodes.mixture import Distribution, Mixture
-from cz_gym.episodes.scenario import MAX_LATENCY, Interface, Range, Scenario, Sensor
+from cz_gym.episodes.scenario import MAX_LATENCY, Range, Scenario
 from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.physics.parameters import Parameters, check_parameters
@@ -37,63 +37,6 @@ FORMAT = 1
 """Version of the file format."""
 FOLDER = Path(__file__).parent / "pullers"
 """Folder of the files that ship."""
-
-
-class Drives(NamedTuple):
-    """Drives of pull speed and heater; None: as the scenario says, relative to v_0 and to the heater's range."""
-
-    heater_range: float = HEATER_RANGE
-    """Largest |Q_H - Q_H0|: what an action of 1 moves the heater by [W]"""
-    heater_max: float | None = None
-    """Largest power that the heater can have; narrows its range [W]"""
-    heater_slew: float | None = None
-    """Largest rate of change of the heater power [W/s]"""
-    heater_step: float | None = None
-    """Resolution of the heater power [W]"""
-    pull_max: float | None = None
-    """Largest pull speed; narrows its window [m/s]"""
-    pull_window: float | None = None
-    """Largest |v_p - v_0| [m/s]"""
-    pull_slew: float | None = None
-    """Largest rate of change of the pull speed [m/s2]"""
-
-
-class Sensors(NamedTuple):
-    """Camera and pyrometer; None: as the scenario says, lengths relative to r_0. A pair is a range, drawn from anew for
-    each crystal.
-    """
-
-    camera_noise: Range | None = None
-    """Standard deviation of the white noise on the ring [m]"""
-    pyrometer_noise: Range | None = None
-    """Standard deviation of the white noise on T_1 [K]"""
-    pyrometer_drift: Range | None = None
-    """Drift of the pyrometer over 3 h [K]"""
-    bias_offset: Range | None = None
-    """Constant offset of the ring from a wrong bias [m]"""
-    level_offset: Range | None = None
-    """Constant offset of the ring from the melt level [m]"""
-    ripple: Range | None = None
-    """Amplitude of the rotation-synchronous ripple [m]"""
-    rotation: Range | None = None
-    """Crystal rotation [rev/s]"""
-    latency: float | None = None
-    """Age of the newest camera frame [s]"""
-    outlier_probability: float | None = None
-    """Share of samples that carry an outlier [-]"""
-    outlier_sd: float | None = None
-    """Standard deviation of an outlier [m]"""
-
-
-class Melt(NamedTuple):
-    """Usual fluctuation of the interface's temperature; None: as the scenario says."""
-
-    sd: Range | None = None
-    """Standard deviation of the fast and of the slow fluctuation, each drawn on its own [K]"""
-    tau_fast: float | None = None
-    """Correlation time of the fast one [s]"""
-    tau_slow: float | None = None
-    """Correlation time of the slow one [s]"""
 
 
 class Unit(NamedTuple):
@@ -143,10 +86,10 @@ class Key(NamedTuple):
     """Smallest plausible value, in the key's unit."""
     high: float
     """Largest plausible value."""
-    part: str = "parameters"
-    """Member of :class:`Puller` that has the number."""
-    member: str = ""
-    """Its name there, by default the stem; empty part: the member of :class:`Puller` itself."""
+    field: str
+    """Its name in :class:`PullerFile`, or in Parameters."""
+    drawn: bool = False
+    """Whether each crystal draws its own number from a range."""
 
     @property
     def name(self) -> str:
@@ -154,88 +97,71 @@ class Key(NamedTuple):
         return f"{self.stem}_{self.unit}" if self.unit else self.stem
 
     @property
-    def field(self) -> str:
-        """Name of the number in its part."""
-        return self.member or self.stem
-
-    @property
     def size(self) -> Fraction:
         """Size of the unit in SI units."""
         return Fraction(UNITS[self.unit].size)
 
-    @property
-    def drawn(self) -> bool:
-        """Whether each crystal draws its own number from a range."""
-        return isinstance(getattr(_DRAWN.get(self.part), self.field, None), tuple)
 
-
-_DRAWN = {"sensors": Sensor(), "melt": Interface()}
-
-KEYS = (
-    Key("crystal", "radius", "mm", 2.0, 500.0, member="r_0"),
-    Key("crystal", "pull_speed", "mm_per_min", 0.005, 30.0, member="v_0"),
-    Key("crystal", "sigma", "N_per_m", 0.01, 5.0),
-    Key("crystal", "rho_l", "kg_per_m3", 100.0, 3e4),
-    Key("crystal", "rho_s", "kg_per_m3", 100.0, 3e4),
-    Key("crystal", "alpha_0", "deg", 0.0, 60.0),
-    Key("crystal", "k_l", "W_per_mK", 0.1, 1e3),
-    Key("crystal", "dH", "J_per_kg", 1e4, 1e8),
-    Key("crystal", "T_m", "K", 200.0, 5e3),
-    Key("hot_zone", "dT_0", "K", 0.01, 500.0),
-    Key("hot_zone", "C_1", "J_per_K", 500.0, 1e8),
-    Key("hot_zone", "C_2", "J_per_K", 500.0, 1e8),
-    Key("hot_zone", "C_b", "J_per_K", 500.0, 1e8),
-    Key("hot_zone", "kappa_12", "W_per_K4", 1e-12, 1e-5),
-    Key("hot_zone", "G_1a", "W_per_K", 0.01, 1e5),
-    Key("hot_zone", "T_a", "K", 200.0, 2e3),
-    Key("hot_zone", "G_2b", "W_per_K", 0.01, 1e5),
-    Key("hot_zone", "eps", "", 1e-3, 1.0),
-    Key("hot_zone", "R_cr", "mm", 5.0, 2e3),
-    Key("hot_zone", "T_e", "K", 0.0, 5e3),
-    Key("hot_zone", "g", "m_per_s2", 1e-3, 100.0),
-    Key("hot_zone", "sigma_SB", "W_per_m2K4", 1e-9, 1e-6),
-    Key("drives", "heater_range", "kW", 0.05, 500.0, "drives"),
-    Key("drives", "heater_max", "kW", 0.1, 5e3, "drives"),
-    Key("drives", "heater_slew", "kW_per_min", 0.01, 1e3, "drives"),
-    Key("drives", "heater_step", "W", 0.0, 1e4, "drives"),
-    Key("drives", "pull_max", "mm_per_min", 0.01, 60.0, "drives"),
-    Key("drives", "pull_window", "mm_per_min", 0.001, 60.0, "drives"),
-    Key("drives", "pull_slew", "mm_per_min2", 0.001, 600.0, "drives"),
-    Key("sensors", "interval", "s", 0.1, 60.0, "", "control_interval"),
-    Key("sensors", "phi_b", "deg", 0.01, 60.0),
-    Key("sensors", "camera_noise", "mm", 0.0, 2.0, "sensors"),
-    Key("sensors", "pyrometer_noise", "K", 0.0, 100.0, "sensors"),
-    Key("sensors", "pyrometer_drift", "K", -100.0, 100.0, "sensors"),
-    Key("sensors", "bias_offset", "mm", -5.0, 5.0, "sensors"),
-    Key("sensors", "level_offset", "mm", -5.0, 5.0, "sensors"),
-    Key("sensors", "ripple", "mm", 0.0, 5.0, "sensors"),
-    Key("sensors", "rotation", "rpm", 0.0, 100.0, "sensors"),
-    Key("sensors", "latency", "s", 0.0, MAX_LATENCY, "sensors"),
-    Key("sensors", "outlier_probability", "percent", 0.0, 100.0, "sensors"),
-    Key("sensors", "outlier_sd", "mm", 0.0, 5.0, "sensors"),
-    Key("melt", "fluctuation_sd", "K", 0.0, 100.0, "melt", "sd"),
-    Key("melt", "tau_fast", "s", 0.1, 1e5, "melt"),
-    Key("melt", "tau_slow", "s", 0.1, 1e6, "melt"),
-)
-"""Every key of the file, in order."""
-TABLES = tuple(dict.fromkeys(key.table for key in KEYS))
-"""Tables of the file."""
+def number(
+    table: str, unit: str, low: float, high: float, default: Any = None, drawn: bool = False, stem: str = ""
+) -> Any:
+    """A number of a puller, with its :class:`Key` in the file, whose stem is the field's name unless one is given."""
+    return field(default=default, metadata={"key": Key(table, stem, unit, low, high, "", drawn)})
 
 
 @dataclass(frozen=True)
-class Puller:
+class PullerFile:
     """A machine: its operating point and hot zone, its drives, its sensors, and how its melt usually fluctuates.
 
-    CzError for numbers that are not plausible, impossible geometry, and drives that exclude the operating point.
+    A number that is None is the scenario's, lengths relative to r_0, speeds to v_0, powers to the heater's range. A
+    pair is a range, drawn from anew for each crystal. CzError for numbers that are not plausible, impossible geometry,
+    and drives that exclude the operating point.
     """
 
     name: str = "default"
     parameters: Parameters = field(default_factory=Parameters)
-    drives: Drives = field(default_factory=Drives)
-    sensors: Sensors = field(default_factory=Sensors)
-    melt: Melt = field(default_factory=Melt)
-    control_interval: float = 5.0
-    """Time between actions [s]."""
+    heater_range: float = number("drives", "kW", 0.05, 500.0, HEATER_RANGE)
+    """Largest |Q_H - Q_H0|: what an action of 1 moves the heater by [W]"""
+    heater_max: float | None = number("drives", "kW", 0.1, 5e3)
+    """Largest power that the heater can have; narrows its range [W]"""
+    heater_slew: float | None = number("drives", "kW_per_min", 0.01, 1e3)
+    """Largest rate of change of the heater power [W/s]"""
+    heater_step: float | None = number("drives", "W", 0.0, 1e4)
+    """Resolution of the heater power [W]"""
+    pull_max: float | None = number("drives", "mm_per_min", 0.01, 60.0)
+    """Largest pull speed; narrows its window [m/s]"""
+    pull_window: float | None = number("drives", "mm_per_min", 0.001, 60.0)
+    """Largest |v_p - v_0| [m/s]"""
+    pull_slew: float | None = number("drives", "mm_per_min2", 0.001, 600.0)
+    """Largest rate of change of the pull speed [m/s2]"""
+    control_interval: float = number("sensors", "s", 0.1, 60.0, 5.0, stem="interval")
+    """Time between actions [s]"""
+    camera_noise: Range | None = number("sensors", "mm", 0.0, 2.0, drawn=True)
+    """Standard deviation of the white noise on the ring [m]"""
+    pyrometer_noise: Range | None = number("sensors", "K", 0.0, 100.0, drawn=True)
+    """Standard deviation of the white noise on T_1 [K]"""
+    pyrometer_drift: Range | None = number("sensors", "K", -100.0, 100.0, drawn=True)
+    """Drift of the pyrometer over 3 h [K]"""
+    bias_offset: Range | None = number("sensors", "mm", -5.0, 5.0, drawn=True)
+    """Constant offset of the ring from a wrong bias [m]"""
+    level_offset: Range | None = number("sensors", "mm", -5.0, 5.0, drawn=True)
+    """Constant offset of the ring from the melt level [m]"""
+    ripple: Range | None = number("sensors", "mm", 0.0, 5.0, drawn=True)
+    """Amplitude of the rotation-synchronous ripple [m]"""
+    rotation: Range | None = number("sensors", "rpm", 0.0, 100.0, drawn=True)
+    """Crystal rotation [rev/s]"""
+    latency: float | None = number("sensors", "s", 0.0, MAX_LATENCY)
+    """Age of the newest camera frame [s]"""
+    outlier_probability: float | None = number("sensors", "percent", 0.0, 100.0)
+    """Share of samples that carry an outlier [-]"""
+    outlier_sd: float | None = number("sensors", "mm", 0.0, 5.0)
+    """Standard deviation of an outlier [m]"""
+    fluctuation_sd: Range | None = number("melt", "K", 0.0, 100.0, drawn=True)
+    """Standard deviation of the fast and of the slow fluctuation of the melt, each drawn on its own [K]"""
+    tau_fast: float | None = number("melt", "s", 0.1, 1e5)
+    """Correlation time of the fast one [s]"""
+    tau_slow: float | None = number("melt", "s", 0.1, 1e6)
+    """Correlation time of the slow one [s]"""
     missing: tuple[str, ...] = field(default=(), compare=False, repr=False)
     """Keys that its file does not have: they keep the default's value."""
     file: Path | None = field(default=None, compare=False, repr=False)
@@ -249,7 +175,7 @@ class Puller:
         object.__setattr__(self, "parameters", check_parameters(self.parameters))
         plant = make_puller(self.parameters)
         check_height(plant)
-        highest, fastest = self.drives.heater_max, self.drives.pull_max
+        highest, fastest = self.heater_max, self.pull_max
         if highest is not None and highest <= plant.Q_H_0:
             raise CzError(
                 f"heater_max_kW = {highest / KILO:g} excludes the operating point, "
@@ -274,11 +200,16 @@ class Puller:
         return "default" if self.hash == DEFAULT.hash else f"{self.name} ({self.hash})"
 
     @cached_property
-    def heater_range(self) -> float:
-        """What an action of 1 moves the heater by [W]."""
-        highest = self.drives.heater_max
-        room = math.inf if highest is None else highest - make_puller(self.parameters).Q_H_0
-        return min(self.drives.heater_range, room)
+    def power_range(self) -> float:
+        """What an action of 1 moves the heater by: its range, or what is left to its largest power [W]."""
+        room = math.inf if self.heater_max is None else self.heater_max - make_puller(self.parameters).Q_H_0
+        return min(self.heater_range, room)
+
+    @property
+    def pull_room(self) -> float:
+        """Largest |v_p - v_0| that the file allows; infinite if it allows any [m/s]."""
+        room = math.inf if self.pull_max is None else self.pull_max - self.parameters.v_0
+        return min(room, math.inf if self.pull_window is None else self.pull_window)
 
     @property
     def scale(self) -> float:
@@ -291,12 +222,48 @@ class Puller:
         return RADIUS_LIMIT * self.scale
 
 
-def value_of(puller: Puller, key: Key) -> Any:
+_PARAMETERS = (
+    Key("crystal", "radius", "mm", 2.0, 500.0, "r_0"),
+    Key("crystal", "pull_speed", "mm_per_min", 0.005, 30.0, "v_0"),
+    Key("crystal", "sigma", "N_per_m", 0.01, 5.0, "sigma"),
+    Key("crystal", "rho_l", "kg_per_m3", 100.0, 3e4, "rho_l"),
+    Key("crystal", "rho_s", "kg_per_m3", 100.0, 3e4, "rho_s"),
+    Key("crystal", "alpha_0", "deg", 0.0, 60.0, "alpha_0"),
+    Key("crystal", "k_l", "W_per_mK", 0.1, 1e3, "k_l"),
+    Key("crystal", "dH", "J_per_kg", 1e4, 1e8, "dH"),
+    Key("crystal", "T_m", "K", 200.0, 5e3, "T_m"),
+    Key("hot_zone", "dT_0", "K", 0.01, 500.0, "dT_0"),
+    Key("hot_zone", "C_1", "J_per_K", 500.0, 1e8, "C_1"),
+    Key("hot_zone", "C_2", "J_per_K", 500.0, 1e8, "C_2"),
+    Key("hot_zone", "C_b", "J_per_K", 500.0, 1e8, "C_b"),
+    Key("hot_zone", "kappa_12", "W_per_K4", 1e-12, 1e-5, "kappa_12"),
+    Key("hot_zone", "G_1a", "W_per_K", 0.01, 1e5, "G_1a"),
+    Key("hot_zone", "T_a", "K", 200.0, 2e3, "T_a"),
+    Key("hot_zone", "G_2b", "W_per_K", 0.01, 1e5, "G_2b"),
+    Key("hot_zone", "eps", "", 1e-3, 1.0, "eps"),
+    Key("hot_zone", "R_cr", "mm", 5.0, 2e3, "R_cr"),
+    Key("hot_zone", "T_e", "K", 0.0, 5e3, "T_e"),
+    Key("hot_zone", "g", "m_per_s2", 1e-3, 100.0, "g"),
+    Key("hot_zone", "sigma_SB", "W_per_m2K4", 1e-9, 1e-6, "sigma_SB"),
+    Key("sensors", "phi_b", "deg", 0.01, 60.0, "phi_b"),
+)
+_OWN = [
+    (key := each.metadata["key"])._replace(stem=key.stem or each.name, field=each.name)
+    for each in fields(PullerFile) if each.metadata
+]  # fmt: skip
+_SENSORS = [key.table for key in _OWN].index("sensors") + 1
+KEYS = (*_PARAMETERS[:-1], *_OWN[:_SENSORS], _PARAMETERS[-1], *_OWN[_SENSORS:])
+"""Every key of the file, in order."""
+TABLES = tuple(dict.fromkeys(key.table for key in KEYS))
+"""Tables of the file."""
+
+
+def value_of(puller: PullerFile, key: Key) -> Any:
     """The number, or range, of a key [SI units]; None: the scenario's own."""
-    return getattr(getattr(puller, key.part) if key.part else puller, key.field)
+    return getattr(puller.parameters if key in _PARAMETERS else puller, key.field)
 
 
-def read_puller(path: str | Path) -> Puller:
+def read_puller(path: str | Path) -> PullerFile:
     """Read a puller file; CzError, one line that names the file, for anything that cannot be meant."""
     path = Path(path)
     with naming(path):
@@ -307,17 +274,17 @@ def read_puller(path: str | Path) -> Puller:
         raise CzError(f"{path}: {' '.join(str(error).split())}") from None
 
 
-def write_puller(puller: Puller, path: str | Path) -> None:
+def write_puller(puller: PullerFile, path: str | Path) -> None:
     """Write a puller as a file that :func:`read_puller` reads as the same puller, bit for bit."""
     write_files({Path(path): to_toml(puller).encode()})
 
 
-def find_puller(given: str | Path | Puller | None) -> Puller:
+def find_puller(given: str | Path | PullerFile | None) -> PullerFile:
     """The puller that is meant by a file, a shipped name, or itself; None is the default one."""
-    if given is None or isinstance(given, Puller):
+    if given is None or isinstance(given, PullerFile):
         return given or DEFAULT
     if not isinstance(given, str | Path):
-        raise CzError(f"puller must be a puller file, a shipped name or a cz_gym.puller.Puller, not {given!r:.80}")
+        raise CzError(f"puller must be a puller file, a shipped name or a cz_gym.puller.PullerFile, not {given!r:.80}")
     shipped = {file.stem: file for file in sorted(FOLDER.glob("*.toml"))}
     if str(given) in shipped and not Path(given).exists():
         return read_puller(shipped[str(given)])
@@ -326,7 +293,7 @@ def find_puller(given: str | Path | Puller | None) -> Puller:
     return read_puller(given)
 
 
-def chosen_puller(given: str | None) -> Puller:
+def chosen_puller(given: str | None) -> PullerFile:
     """The puller that a command line names; a line on stderr lists the keys that its file does not have."""
     puller = find_puller(given)
     if puller.missing:
@@ -334,7 +301,7 @@ def chosen_puller(given: str | None) -> Puller:
     return puller
 
 
-def to_toml(puller: Puller) -> str:
+def to_toml(puller: PullerFile) -> str:
     """The puller as the text of a file; numbers that are the scenario's own are left out."""
     lines = [f"format = {FORMAT}", f"name = {json.dumps(puller.name, ensure_ascii=False)}"]
     for table in TABLES:
@@ -348,14 +315,14 @@ def to_toml(puller: Puller) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _puller(found: Mapping[str, Any], stem: str) -> Puller:
+def _puller(found: Mapping[str, Any], stem: str) -> PullerFile:
     """The puller of a file's content; without a name it has the file's."""
     if found.get("format") != FORMAT:
         raise CzError(f"expected 'format = {FORMAT}' at the top, not {found.get('format', 'nothing')!r:.40}")
     if odd := set(found) - {"format", "name", *TABLES}:
         raise CzError(unknown("table", f"[{min(odd)}]", [f"[{table}]" for table in TABLES]))
-    numbers: dict[str, dict[str, Any]] = {"parameters": {}, "drives": {}, "sensors": {}, "melt": {}, "": {}}
-    missing = []
+    numbers: dict[str, Any] = {}
+    missing: list[str] = []
     for table in TABLES:
         given, known = found.get(table, {}), {key.name: key for key in KEYS if key.table == table}
         if not isinstance(given, Mapping):
@@ -363,18 +330,10 @@ def _puller(found: Mapping[str, Any], stem: str) -> Puller:
         for name, value in given.items():
             if name not in known:
                 raise CzError(_misplaced(table, name, known))
-            numbers[known[name].part][known[name].field] = _number(known[name], value)
+            numbers[known[name].field] = _number(known[name], value)
         missing += [name for name in known if name not in given]
-    name = found.get("name", stem)
-    return Puller(
-        name,
-        Parameters(**numbers["parameters"]),
-        Drives(**numbers["drives"]),
-        Sensors(**numbers["sensors"]),
-        Melt(**numbers["melt"]),
-        missing=tuple(missing),
-        **numbers[""],
-    )
+    parameters = Parameters(**{name: numbers.pop(name) for name in Parameters._fields if name in numbers})
+    return PullerFile(found.get("name", stem), parameters, **numbers, missing=tuple(missing))
 
 
 def _misplaced(table: str, name: str, known: Mapping[str, Key]) -> str:
@@ -421,7 +380,7 @@ def _shortest(value: float, key: Key) -> str:
 
 def _check(key: Key, value: Any) -> None:
     """Raise CzError, with a guess at the unit that was meant, unless a key's value is plausible."""
-    if value is None and key.part not in ("", "parameters") and key.field != "heater_range":
+    if value is None and key in _OWN and getattr(PullerFile, key.field) is None:
         return
     pair = key.drawn
     numbers = value if isinstance(value, tuple) else (value,)
@@ -431,18 +390,13 @@ def _check(key: Key, value: Any) -> None:
     for number in numbers:
         shown = number / UNITS[key.unit].size
         if not key.low - 1e-12 * abs(key.low) <= shown <= key.high + 1e-12 * abs(key.high):
-            raise CzError(f"{key.name} = {shown:g} must lie within {key.low:g} to {key.high:g}{_meant(key, shown)}")
+            guesses = [(shown * factor + offset, unit) for unit, factor, offset in UNITS[key.unit].slips if shown > 0.0]
+            meant = [f": did you mean {guess:.6g} ({shown:g} {unit})?" for guess, unit in guesses
+                     if key.low <= guess <= key.high]  # fmt: skip
+            raise CzError(f"{key.name} = {shown:g} must lie within {key.low:g} to {key.high:g}{''.join(meant[:1])}")
 
 
-def _meant(key: Key, shown: float) -> str:
-    for unit, factor, offset in UNITS[key.unit].slips:
-        guess = shown * factor + offset
-        if shown > 0.0 and key.low <= guess <= key.high:
-            return f": did you mean {guess:.6g} ({shown:g} {unit})?"
-    return ""
-
-
-DEFAULT = Puller()
+DEFAULT = PullerFile()
 """The puller that was invented for this project: that of every environment without another one."""
 
 
@@ -459,7 +413,7 @@ class ScenarioOn(Scenario):
         return hashlib.sha256(f"{super().hash} {self.puller}".encode()).hexdigest()[:16]
 
 
-def on(puller: Puller, distribution: Distribution) -> Distribution:
+def on(puller: PullerFile, distribution: Distribution) -> Distribution:
     """The scenario, or each one of a mixture, on a puller.
 
     What the puller's file says of drives, sensors and melt stands in place of the scenario's. Of the rest, shares,
@@ -477,22 +431,16 @@ def on(puller: Puller, distribution: Distribution) -> Distribution:
         raise CzError(f"scenario {distribution.name!r} is on another puller ({there}) than {puller.label}")
     speed = puller.parameters.v_0 / DEFAULT.parameters.v_0
     sizes = {IN_MM: puller.scale, IN_MM_PER_MIN: speed, IN_MM_PER_MIN2: speed}
-    power = puller.heater_range / DEFAULT.heater_range
-    drives, room = puller.drives, puller.drives.pull_max and puller.drives.pull_max - puller.parameters.v_0
-    window = min(room or math.inf, drives.pull_window or math.inf)
-    said = {
-        "actuators": {"pull_window": window if math.isfinite(window) else None, "pull_slew": drives.pull_slew,
-                      "heater_slew": drives.heater_slew, "heater_step": drives.heater_step},
-        "sensor": puller.sensors._asdict(),
-        "interface": puller.melt._asdict(),
-    }  # fmt: skip
+    power, room = puller.power_range / DEFAULT.power_range, puller.pull_room
+    said = {key.field: value_of(puller, key) for key in _OWN} | {"pull_window": room if math.isfinite(room) else None}
+    said["sd"] = said["fluctuation_sd"]
     families: dict[str, Any] = {}
     for family in fields(Scenario)[1:]:
         old, values = getattr(distribution, family.name), {}
         for each in fields(old):
             size = power if each.name.startswith("heater_") else sizes.get(each.metadata["member"].slip, 1.0)
             size = speed if family.name == "reference" and each.name == "amount" else size
-            stated, own = said.get(family.name, {}).get(each.name), getattr(old, each.name)
+            stated, own = said.get(each.name), getattr(old, each.name)
             scaled = own if size == 1.0 else tuple(size * end for end in own) if isinstance(own, tuple) else size * own
             values[each.name] = scaled if stated is None else stated
         families[family.name] = type(old)(**values)

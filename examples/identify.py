@@ -16,12 +16,12 @@ from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.identify import Excited, identify, read_log, record_log
 from cz_gym.identify.report import report
-from cz_gym.puller import Puller, find_puller, to_toml
+from cz_gym.puller import PullerFile, find_puller, to_toml
 
 
 def make_log(path: str) -> str:
     """Log a simulated puller whose heater is not what the default file says."""
-    other = Puller("other", Parameters(C_1=8e4, G_1a=24.0))
+    other = PullerFile("other", Parameters(C_1=8e4, G_1a=24.0))
     env = CzEnv("randomized", observation="measured", action="direct", info="all", puller=other)
     record_log(env, Excited(make_controller("pid-conventional", env.config)), path, seed=1)
     return path

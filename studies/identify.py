@@ -33,7 +33,7 @@ from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.identify import Excited, Identified, identify, read_log, record_log
 from cz_gym.identify.estimate import PRIOR_SD, measure_excitation
-from cz_gym.puller import Drives, Puller, read_puller, write_puller
+from cz_gym.puller import PullerFile, read_puller, write_puller
 from cz_gym.task import HEATER_RANGE
 from cz_gym.units import KILO, MM, PERCENT
 
@@ -52,7 +52,7 @@ SCENARIO = replace(
 class Row(NamedTuple):
     """The identification of a puller and its use."""
 
-    truth: Puller
+    truth: PullerFile
     found: Identified
     passive: tuple[float, float]
     """Excitation of pull speed and heater in the log without excitation, in multiples of what is needed."""
@@ -68,7 +68,7 @@ class Row(NamedTuple):
         return [e.low <= getattr(self.truth.parameters, e.name) <= e.high for e in told]
 
 
-def draw(number: int) -> tuple[Puller, Puller]:
+def draw(number: int) -> tuple[PullerFile, PullerFile]:
     """The start file and the truth of a puller."""
     random, default = np.random.default_rng([5, number]), Parameters()
     r_0 = random.uniform(50.0, 150.0) * MM
@@ -83,11 +83,11 @@ def draw(number: int) -> tuple[Puller, Puller]:
     )
     sds = dict.fromkeys(HOT_ZONE, PRIOR_SD) | dict.fromkeys(MELT, MELT_SD)
     truth = {name: getattr(start, name) * np.exp(sd * random.standard_normal()) for name, sd in sds.items()}
-    named, drives = f"puller {number}", Drives(heater_range=area * HEATER_RANGE)
-    return Puller(named, start, drives), Puller(named, start._replace(**truth), drives)
+    file = PullerFile(f"puller {number}", start, heater_range=area * HEATER_RANGE)
+    return file, replace(file, parameters=start._replace(**truth))
 
 
-def write_logs(truth: Puller, seed: int, folder: Path) -> tuple[Path, Path]:
+def write_logs(truth: PullerFile, seed: int, folder: Path) -> tuple[Path, Path]:
     """CSV files of three hours under a PID of the puller's own, with and without excitation."""
     env = CzEnv(SCENARIO, observation="measured", action="direct", puller=truth, info="all")
     pid = tuned("pid-conventional", env.config)

@@ -71,7 +71,7 @@ class Contract:
     sha256: str
     """Hash of the ONNX file."""
     puller: str = DEFAULT.label
-    """Name and hash of the puller file that it was trained for (:attr:`cz_gym.puller.Puller.label`)."""
+    """Name and hash of the puller file that it was trained for (:attr:`cz_gym.puller.PullerFile.label`)."""
 
 
 def observation_hash(name: str) -> str:

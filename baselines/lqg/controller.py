@@ -50,6 +50,10 @@ class LQGDesign:
     """Difference between commanded and applied power [W] that is due to the resolution of the drive."""
     ring: RingModel | None = None
     """Model of a camera with latency or a ring with ripple; None for neither."""
+    error_pull: float | None = None
+    """Largest move of the pull speed that the radius error alone asks for [m/s]; None: any. What is left of the drive's
+    window damps the meniscus height, without which narrow and slow drives swing between their limits until the crystal
+    is lost (nested saturation, Teel 1992)."""
 
     @property
     def hash(self) -> str:
@@ -141,8 +145,13 @@ class LQG(MeasuredController):
 
     def law(self, estimate: Floats, plan: Floats, previous: Floats) -> Floats:
         """The inputs for an estimate; arguments as of :func:`optimal_inputs`."""
-        limits = self.v_0, self.heater_range
-        return optimal_inputs(estimate, plan, previous, self.gains.regulator, self.design.noise.recipe_share, limits)
+        limits, law = (self.v_0, self.heater_range), self.gains.regulator
+        if self.design.error_pull is not None:
+            reach = abs(self.design.error_pull * law.feedback[0, len(STATES)] / law.feedback[0, 0])
+            meant = plan[:, 0, :1]
+            radius = meant + np.clip(estimate[:, :1] - meant, -reach, reach)
+            estimate = np.concatenate([radius, estimate[:, 1:]], axis=1)
+        return optimal_inputs(estimate, plan, previous, law, self.design.noise.recipe_share, limits)
 
 
 @lru_cache(maxsize=16)

@@ -12,19 +12,19 @@ from pathlib import Path
 from cz_gym.baselines import for_puller
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation.processes import in_processes
-from cz_gym.puller import Puller
+from cz_gym.puller import PullerFile
 
 from .goals import goal_on
 from .search import Search, Trial, measure
 
 TRIALS = {for_puller.FILTER: 12}
 """Candidates of a search; 40 of a PID's."""
-Task = tuple[str, Puller, int, int, Path]
+Task = tuple[str, PullerFile, int, int, Path]
 """Controller, puller, candidates, episodes and folder of a search."""
 
 
 def design(
-    puller: Puller, controller: str | None, trials: int | None, episodes: int | None, folder: Path | None
+    puller: PullerFile, controller: str | None, trials: int | None, episodes: int | None, folder: Path | None
 ) -> None:
     """Search for a puller, several controllers side by side, and print what was chosen."""
     from tqdm import tqdm
@@ -47,7 +47,7 @@ def design(
     print(f"wrote {place}: benchmark.py --puller {puller.file or puller.name} runs what was designed")
 
 
-def crystals_on(puller: Puller) -> Config:
+def crystals_on(puller: PullerFile) -> Config:
     """The crystals that controllers are designed on for a puller: half of them with other hot zones."""
     mixed = {"randomized": 0.5, "hot-zone": 0.5}
     return make_config(mixed, None, "measured", action="direct", puller=puller)

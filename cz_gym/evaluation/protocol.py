@@ -11,7 +11,7 @@ from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
-from cz_gym.puller import DEFAULT, Puller
+from cz_gym.puller import DEFAULT, PullerFile
 from cz_gym.units import MM, MM_PER_MIN
 
 TRAINING_SEEDS = range(1_000_000)
@@ -43,7 +43,7 @@ class Row:
     """Meniscus of the plant; controllers and agents are made for Hurle's, whatever it is."""
     file: str = ""
     """Source of a scenario of the user's own: FILE.py:NAME."""
-    puller: Puller = DEFAULT
+    puller: PullerFile = DEFAULT
 
     @property
     def control_interval(self) -> float:

@@ -17,7 +17,7 @@ import numpy as np
 
 from cz_gym.config import Config
 from cz_gym.observation import CLIP, MEASURED, Measured, readable, scales
-from cz_gym.physics.plant import make_puller
+from cz_gym.physics.plant import Puller, make_puller
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 from .program import Port, Program, record
@@ -120,9 +120,11 @@ class Memory(NamedTuple):
     pid: Any
 
 
-def settings_of(config: Config) -> tuple[Port, ...]:
-    """The settings of a block for an environment's puller; its file's limits of the drives are the defaults."""
-    puller, drives = make_puller(config.parameters, 0.5, config.meniscus), config.puller.drives
+def settings_of(config: Config, puller: Puller | None = None) -> tuple[Port, ...]:
+    """The settings of a block for an environment's puller, or for one that was drawn there; its file's limits of the
+    drives are the defaults.
+    """
+    puller, drives = puller or make_puller(config.parameters, 0.5, config.meniscus), config.puller
     v_0, Q_0 = puller.v_0 / MM_PER_MIN, puller.Q_H_0 / KILO
     window = min(puller.v_0, math.inf if drives.pull_window is None else drives.pull_window) / MM_PER_MIN
     fastest = min(v_0 + window, math.inf if drives.pull_max is None else drives.pull_max / MM_PER_MIN)

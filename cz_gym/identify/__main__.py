@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="NAME=SD",
         help="uncertainty of a start value: sd of its logarithm",
     )
-    return parser.run(_main, arguments, "benchmark")
+    return parser.run(_main, arguments, "plant")
 
 
 def _main(given: argparse.Namespace) -> None:

@@ -15,7 +15,7 @@ from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
-from cz_gym.puller import DEFAULT, Puller
+from cz_gym.puller import DEFAULT, PullerFile
 
 from .log import Floats, Log
 from .model import Model, Noise, Predicted, sensitivities
@@ -66,7 +66,7 @@ class Estimate(NamedTuple):
 class Identified:
     """The result of an identification."""
 
-    start: Puller
+    start: PullerFile
     estimates: tuple[Estimate, ...]
     """Of HEATER and PULL."""
     noise: tuple[Estimate, ...]
@@ -80,7 +80,7 @@ class Identified:
     """Whether the search has ended at a maximum."""
 
     @property
-    def puller(self) -> Puller:
+    def puller(self) -> PullerFile:
         """The start with the numbers that the log tells: parameters, and the noise of camera and pyrometer.
 
         ``lam`` is none of them: each crystal of a scenario draws its own.
@@ -95,7 +95,7 @@ class Identified:
         return replace(
             self.start,
             parameters=self.start.parameters._replace(**parameters),
-            sensors=self.start.sensors._replace(**sensors),
+            **sensors,
         )
 
     @property
@@ -106,7 +106,7 @@ class Identified:
 
 def identify(
     log: Log,
-    start: Puller = DEFAULT,
+    start: PullerFile = DEFAULT,
     prior_sd: Mapping[str, float] | None = None,
     meniscus: MeniscusModel = HURLE,
 ) -> Identified:
@@ -139,7 +139,7 @@ def identify(
     return Identified(start, told, noise, moved, errors, out, settled)
 
 
-def measure_excitation(log: Log, start: Puller = DEFAULT) -> tuple[float, float]:
+def measure_excitation(log: Log, start: PullerFile = DEFAULT) -> tuple[float, float]:
     """:func:`excitation` of pull speed and heater."""
     errors = np.stack([log.ring - np.nan_to_num(log.r_ref), log.T_1 - np.nan_to_num(log.T_1_ref)], axis=1)
     return excitation(log.v_p / start.parameters.v_0, errors), excitation(log.Q_H / np.median(log.Q_H), errors)

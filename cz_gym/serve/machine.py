@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import pkgutil
 import threading
 import time
 from collections import deque
@@ -15,22 +14,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cz_gym.atomic_files import naming
 from cz_gym.config import Config
 from cz_gym.env import CzEnv
-from cz_gym.errors import CzError
-from cz_gym.export.shell import INPUTS, in_plant_units
+from cz_gym.export.__main__ import FALLBACK, export_program
+from cz_gym.export.shell import INPUTS, OUTPUTS, in_plant_units, settings_of
 from cz_gym.identify.log import COLUMNS
 from cz_gym.observation import decode
 from cz_gym.rendering.canvas import Frame
 from cz_gym.rendering.view import record_of
-from cz_gym.units import HOUR, KILO, MM, MM_PER_MIN
+from cz_gym.units import HOUR, KILO, MM_PER_MIN
 
-CONTROLLERS = "cz_gym.baselines.registry:find_controller"
-"""Function that finds the fallback controller, looked up by name because this package imports no controller."""
-FALLBACK = "paper-tuned"
-"""The controller that takes over when setpoints are not renewed."""
-BLEND = 60.0
-"""Time from the fallback's takeover to its full authority; its first setpoints are the held ones [s]."""
 SYNC = 0.5
 """Time after which a log waits for the disk, which takes longer than a step [s]."""
 SIZE = (640, 480)
@@ -64,33 +58,19 @@ class Tag(NamedTuple):
     writable: bool = False
 
 
-def _readings(*names: str) -> list[Tag]:
-    """Tags that are inputs of the exported blocks too, with the same names and meanings."""
-    meanings = {port.name: port.meaning for port in INPUTS}
-    return [Tag(name, float, meanings[name]) for name in names]
-
-
+_BLOCK = {port.name: Tag(port.name, bool if port.logical else float, port.meaning) for port in (*INPUTS, *OUTPUTS)}
+SETPOINTS = tuple(port.name for port in OUTPUTS[:2])
 TAGS = (
     Tag("time_s", float, "time since the crystal's start"),
     Tag("state", str, "growing, or how the crystal ended"),
     Tag("control", str, "who sets the drives: client, held, fallback or manual"),
     Tag("alarms", int, "sum of the alarm bits"),
-    *_readings("ring_radius_mm"),
-    Tag("valid", bool, "whether the camera says that this reading is good"),
-    *_readings("T_1_K", "pull_speed_mm_per_min", "heater_power_kW", "r_ref_mm", "r_ref_1min_mm", "r_ref_5min_mm"),
-    *_readings("T_1_ref_K", "T_1_ref_1min_K", "T_1_ref_5min_K"),
-    Tag("pull_speed_setpoint_mm_per_min", float, "setpoint of the pull speed", True),
-    Tag("heater_power_setpoint_kW", float, "setpoint of the heater power", True),
+    *(_BLOCK[name] for name in ("ring_radius_mm", "valid", "T_1_K", "pull_speed_mm_per_min", "heater_power_kW")),
+    *(_BLOCK[name] for name in ("r_ref_mm", "r_ref_1min_mm", "r_ref_5min_mm")),
+    *(_BLOCK[name] for name in ("T_1_ref_K", "T_1_ref_1min_K", "T_1_ref_5min_K")),
+    *(_BLOCK[name]._replace(writable=True) for name in SETPOINTS),
     Tag("watchdog", int, "number of the step that the setpoints answer; writing it makes them act", True),
-    Tag("nominal_radius_mm", float, "crystal radius at this puller's operating point"),
-    Tag("ring_bias_mm", float, "the operator's bias: ring radius minus crystal radius there"),
-    Tag("nominal_pull_speed_mm_per_min", float, "pull speed there"),
-    Tag("nominal_heater_power_kW", float, "heater power there"),
-    Tag("nominal_T_1_K", float, "pyrometer reading there"),
-    Tag("pull_speed_min_mm_per_min", float, "lowest setpoint of the pull speed"),
-    Tag("pull_speed_max_mm_per_min", float, "highest setpoint of the pull speed"),
-    Tag("heater_power_min_kW", float, "lowest setpoint of the heater power"),
-    Tag("heater_power_max_kW", float, "highest setpoint of the heater power"),
+    *(Tag(port.name, float, port.meaning) for port in settings_of(Config())[:9]),
     Tag("control_interval_s", float, "length of a step"),
     Tag("watchdog_s", float, "time after which setpoints that are not renewed give way to the fallback"),
     Tag("scenario", str, "the scenario"),
@@ -100,7 +80,6 @@ TAGS = (
 """Every tag, in the order in which they are written."""
 TOLERANCE = 1e-9
 """Rounding of a setpoint that is forgiven at its limits [mm/min, kW]."""
-SETPOINTS = ("pull_speed_setpoint_mm_per_min", "heater_power_setpoint_kW")
 
 
 class Log:
@@ -111,10 +90,8 @@ class Log:
 
     def __init__(self, path: str | Path) -> None:
         self._synced = 0.0
-        try:
+        with naming(path):
             self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
-        except OSError as error:
-            raise CzError(f"{path}: {os.strerror(error.errno or 0)}") from None
         os.write(self._file, f"{','.join(COLUMNS)}\n".encode())
 
     def add(self, tags: dict[str, Any]) -> None:
@@ -134,32 +111,21 @@ class Machine:
     """
 
     def __init__(self, config: Config, seed: int, watchdog: float, log: Log | None = None) -> None:
-        self.env, self.interval, self.watchdog = (
-            CzEnv.from_config(config, "rgb_array", SIZE),
-            config.control_interval,
-            watchdog,
-        )
-        self._fallback = pkgutil.resolve_name(CONTROLLERS)(FALLBACK).make(config)
+        self.env = CzEnv.from_config(config, "rgb_array", SIZE)
+        self.interval, self.watchdog, self._ranges = config.control_interval, watchdog, config.ranges
         self._observation, _ = self.env.reset(seed=seed)
         self._record, self._log, self._lock = record_of(self.env), log, threading.RLock()
-        p = self.puller = self._record.puller
-        self.nominal = np.array([p.v_0 / MM_PER_MIN, p.Q_H_0 / KILO])
-        self._ranges = config.ranges
-        self._reach = np.array([self._ranges[0] / MM_PER_MIN, self._ranges[1] / KILO])
-        lows, highs = (self.nominal - self._reach).tolist(), (self.nominal + self._reach).tolist()
-        self.limits = dict(zip(SETPOINTS, zip(lows, highs, strict=True), strict=True))
-        self._fixed = {
-            "nominal_radius_mm": p.r_0 / MM, "ring_bias_mm": p.ring_bias / MM, "nominal_T_1_K": p.T_1_0,
-            "nominal_pull_speed_mm_per_min": self.nominal[0], "nominal_heater_power_kW": self.nominal[1],
-            "pull_speed_min_mm_per_min": lows[0], "pull_speed_max_mm_per_min": highs[0],
-            "heater_power_min_kW": lows[1], "heater_power_max_kW": highs[1],
-            "control_interval_s": self.interval, "watchdog_s": watchdog, "scenario": self._record.scenario,
-            "puller": config.puller.label,
-        }  # fmt: skip
-        self.k, self.answered, self.late, self.manual = 0, -1, False, False
-        self._pending = dict(zip(SETPOINTS, self.nominal.tolist(), strict=True))
+        self.puller = self._record.puller
+        self._fallback = export_program(FALLBACK, config)
+        self._memory = self._fallback.start[None]
+        self._fixed: dict[str, Any] = {port.name: port.default for port in settings_of(config, self.puller)}
+        self.limits = {name: [self._fixed[name.replace("setpoint", e)] for e in ("min", "max")] for name in SETPOINTS}
+        self.nominal = np.array([self.puller.v_0 / MM_PER_MIN, self.puller.Q_H_0 / KILO])
+        self._fixed |= {"control_interval_s": self.interval, "watchdog_s": watchdog, "puller": config.puller.label}
+        self._fixed["scenario"] = self._record.scenario
+        self.k, self.answered, self.late, self.manual, self._renewed = 0, -1, False, False, -math.inf
         self._active = self.nominal
-        self._renewed, self._fallen, self._memory, self._held = -math.inf, -1, None, self._active
+        self._pending = dict(zip(SETPOINTS, self.nominal.tolist(), strict=True))
         self.committed = threading.Condition(self._lock)
         self.hour: deque[dict[str, Any]] = deque(maxlen=int(HOUR / self.interval) + 1)
         """The tags of the last hour."""
@@ -226,21 +192,15 @@ class Machine:
         with self._lock:
             control = self.control
             if control == "fallback":
-                self._fall_back()
+                given = self.hour[-1] | {"ring_time_s": self.k * self.interval, "automatic": True}
+                outputs, self._memory = self._fallback.run(given, self._memory)
+                self._active = np.array([outputs[name][0] for name in SETPOINTS])
             else:
-                self._fallen = -1
-            self._observation, *_ = self.env.step((self._active - self.nominal) / self._reach)
+                self._memory = self._fallback.start[None]
+            move = (self._active - self.nominal) / (self._ranges[0] / MM_PER_MIN, self._ranges[1] / KILO)
+            self._observation, *_ = self.env.step(move)
             self.k += 1
             return self._publish(control)
-
-    def _fall_back(self) -> None:
-        """Set the active setpoints to the fallback's, which begin at the held ones."""
-        if self._fallen < 0:
-            self._fallen, self._memory, self._held = self.k, None, self._active
-        action, self._memory = self._fallback.predict(self._observation, self._memory)
-        own = self.nominal + self._reach * np.asarray(action)
-        share = min((self.k - self._fallen) * self.interval / BLEND, 1.0)
-        self._active = self._held + share * (own - self._held)
 
     def _publish(self, control: str = "held") -> dict[str, Any]:
         tags = self._tags(control)

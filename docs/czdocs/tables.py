@@ -19,7 +19,7 @@ from cz_gym.camera.view import Camera
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED, STATE, Channel
 from cz_gym.physics.parameters import Parameters, describe
-from cz_gym.puller import DEFAULT, KEYS, Drives, Melt, Puller, Sensors, value_of
+from cz_gym.puller import DEFAULT, KEYS, PullerFile, value_of
 from cz_gym.serve.machine import TAGS
 from cz_gym.signals import INFO_ROWS, PULL_SCALE
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
@@ -157,7 +157,7 @@ def symbols(part: str) -> list[str]:
 def puller() -> list[str]:
     """The keys of a puller file."""
     known = {name: quantity.meaning for name, quantity in describe(Parameters).items()}
-    known |= {each.name: each.meaning for kind in (Drives, Sensors, Melt, Puller) for each in attributes(kind)}
+    known |= {each.name: each.meaning for each in attributes(PullerFile)}
     rows = []
     for key in KEYS:
         value = value_of(DEFAULT, key)

@@ -19,8 +19,7 @@ from cz_gym.puller import (
     DEFAULT,
     FOLDER,
     KEYS,
-    Puller,
-    Sensors,
+    PullerFile,
     find_puller,
     on,
     read_puller,
@@ -42,27 +41,30 @@ def file(folder: Path, text: str) -> Path:
 
 
 @st.composite
-def pullers(draw: st.DrawFn) -> Puller:
-    parts: dict[str, dict[str, object]] = {"parameters": {}, "drives": {}, "sensors": {}, "melt": {}, "": {}}
+def pullers(draw: st.DrawFn) -> PullerFile:
+    parameters: dict[str, float] = {}
+    own: dict[str, Any] = {}
     for key in KEYS:
         if key.field in ("heater_max", "pull_max", "g", "sigma_SB", "alpha_0", "rho_l", "sigma", "phi_b", "T_m"):
             continue
         middle = value_of(DEFAULT, key)
         low, high = (max(key.low, -100.0) * float(key.size), min(key.high, 100.0) * float(key.size))
-        if key.part == "parameters":
+        if key.field in Parameters._fields:
             low, high = 0.9 * middle, 1.1 * middle
         value = draw(st.none() | st.floats(low, high, allow_subnormal=False))
         if value is not None:
             other = draw(st.floats(low, high, allow_subnormal=False))
-            parts[key.part][key.field] = tuple(sorted((value, other))) if key.drawn else value
-    kinds = {name: type(getattr(DEFAULT, name))(**found) for name, found in parts.items() if name}
-    return Puller(draw(st.sampled_from(["my puller", "Züchtung 3", '"q"\\'])), **kinds, **parts[""])  # type: ignore[arg-type]
+            part = parameters if key.field in Parameters._fields else own
+            part[key.field] = tuple(sorted((value, other))) if key.drawn else value
+    return PullerFile(draw(st.sampled_from(["my puller", "Züchtung 3", '"q"\\'])), Parameters(**parameters), **own)
 
 
 @settings(max_examples=60, deadline=None)
 @given(puller=pullers())
-@example(puller=Puller("ends", sensors=Sensors(camera_noise=(5e-324, 1e-305), pyrometer_drift=(-100.0, 100.0))))
-def test_what_is_written_is_read_again_bit_for_bit(puller: Puller, tmp_path_factory: pytest.TempPathFactory) -> None:
+@example(puller=PullerFile("ends", camera_noise=(5e-324, 1e-305), pyrometer_drift=(-100.0, 100.0)))
+def test_what_is_written_is_read_again_bit_for_bit(
+    puller: PullerFile, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     path = tmp_path_factory.mktemp("puller") / "mine.toml"
     write_puller(puller, path)
     again = read_puller(path)
@@ -74,7 +76,7 @@ def test_what_is_written_is_read_again_bit_for_bit(puller: Puller, tmp_path_fact
 def test_what_a_file_does_not_say_keeps_the_defaults_value_and_is_listed(tmp_path: Path) -> None:
     puller = read_puller(file(tmp_path, "[crystal]\nradius_mm = 100\n[sensors]\ncamera_noise_mm = [0, 0.05]\n"))
     assert puller.parameters == Parameters(r_0=100 * MM)
-    assert puller.sensors.camera_noise == (0.0, 0.05 * MM)
+    assert puller.camera_noise == (0.0, 0.05 * MM)
     assert puller.name == "mine"
     assert "C_1_J_per_K" in puller.missing
     assert not {"radius_mm", "camera_noise_mm"} & set(puller.missing)
@@ -131,7 +133,7 @@ def test_other_formats_and_unknown_pullers_are_refused(tmp_path: Path) -> None:
     with pytest.raises(CzError, match="No such file"):
         find_puller("none.toml")
     with pytest.raises(CzError, match="excludes the operating point"):
-        replace(DEFAULT, drives=DEFAULT.drives._replace(heater_max=20 * KILO))
+        replace(DEFAULT, heater_max=20 * KILO)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -170,14 +172,14 @@ def test_the_machine_is_the_files_and_the_crystal_the_scenarios() -> None:
     scenario = on(WIDE, PULLER)
     assert isinstance(scenario, Scenario)
     longer, faster = 150.0 / 87.5, 0.8 / 1.2
-    assert scenario.sensor.camera_noise == WIDE.sensors.camera_noise
+    assert scenario.sensor.camera_noise == WIDE.camera_noise
     assert (scenario.sensor.latency, scenario.interface.tau_fast) == (1.0, 40.0)
     assert scenario.actuators.pull_window == pytest.approx(0.4 * MM_PER_MIN)
     assert scenario.sensor.bias_offset == pytest.approx((-0.3 * longer * MM, 0.3 * longer * MM))
     assert scenario.recipe == PULLER.recipe
     assert scenario.reference.amount[1] == pytest.approx(faster * PULLER.reference.amount[1])
     assert scenario.pullers.melt_loss == PULLER.pullers.melt_loss
-    bare: Any = replace(WIDE, drives=WIDE.drives._replace(pull_window=None, pull_slew=None, heater_slew=None))
+    bare: Any = replace(WIDE, pull_window=None, pull_slew=None, heater_slew=None)
     assert on(bare, PULLER).actuators.pull_window == pytest.approx(0.5 * faster * MM_PER_MIN)  # type: ignore[union-attr]
     assert on(bare, PULLER).actuators.heater_slew == pytest.approx(1.5 * 2000.0 / 60.0)
     assert on(bare, HARD).hash != on(WIDE, HARD).hash != HARD.hash
@@ -196,14 +198,14 @@ def test_limits_actions_and_episodes_are_in_proportion_to_the_puller() -> None:
     power = env.step(np.array([1.0, 1.0], np.float32))[-1]["Q_H"]
     nominal = make_puller(WIDE.parameters).Q_H_0
     assert power - nominal == pytest.approx(3.0 * KILO * 2.0 / 60.0)  # its slew, on the nominal scenario too
-    ceiling = replace(WIDE, drives=WIDE.drives._replace(heater_max=nominal + 5 * KILO, pull_max=0.9 * MM_PER_MIN))
+    ceiling = replace(WIDE, heater_max=nominal + 5 * KILO, pull_max=0.9 * MM_PER_MIN)
     narrow = make_config("nominal", puller=ceiling)
     assert narrow.heater_range == pytest.approx(5 * KILO)
     assert narrow.scenario.scenarios[0].actuators.pull_window == pytest.approx(0.1 * MM_PER_MIN)
 
 
 def test_another_pullers_states_actions_and_parameters_are_refused() -> None:
-    env, other = CzEnv(puller=WIDE), CzEnv(puller=replace(WIDE, sensors=WIDE.sensors._replace(latency=2.0)))
+    env, other = CzEnv(puller=WIDE), CzEnv(puller=replace(WIDE, latency=2.0))
     env.reset(seed=1)
     other.reset(seed=1)
     with pytest.raises(CzError, match="saved under other settings"):
