@@ -13,6 +13,7 @@ import json
 import sys
 from collections.abc import Sequence
 from functools import cache
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -81,26 +82,30 @@ def earlier_bound(folder: Path, row: Row, samples: Sequence[Sample]) -> Sample |
     None unless the folder has the row's first test episodes, and at least one classical controller ran then and now,
     with the same figures: another plant, scenario or code makes other figures.
     """
-    columns = ("seed", *metric_names())
     try:
+        heads = (folder / EPISODES).read_text("utf-8").partition("\n")[0].split(",")
+        known = [name in heads for name in metric_names()]  # an earlier run may lack a newer metric
+        columns = ("seed", *compress(metric_names(), known))
         found = read_episodes(folder / EPISODES, lambda scenario: columns if scenario == row.name else ())[row.name]
         (episodes,) = found[BOUND]
-    except (ValueError, KeyError):
+    except (OSError, ValueError, KeyError):
         return None
     seeds = row.seeds(len(episodes))
     classical = [sample for sample in samples if sample.name in found and not sample.contender.learned]
-    agree = [_agree(sample, found[sample.name][0]) for sample in classical]
+    agree = [_agree(sample, found[sample.name][0], known) for sample in classical]
     if episodes[:, 0].tolist() != list(seeds) or not agree or not all(agree):
         return None
     contender = Contender(BOUND, lambda config: None, "state", "bound of an earlier run", privileged=True, slow=True)
-    return Sample(contender, tuple(seeds), episodes[None, :, 1:], float("nan"))
+    values = np.full((1, len(episodes), len(known)), np.nan)
+    values[..., known] = episodes[:, 1:]
+    return Sample(contender, tuple(seeds), values, float("nan"))
 
 
-def _agree(sample: Sample, earlier: Floats) -> bool:
-    """Whether a controller has the figures it had earlier, shape (episodes, 1 + metrics), on the same crystals."""
+def _agree(sample: Sample, earlier: Floats, known: Sequence[bool]) -> bool:
+    """Whether a controller has the figures it had earlier, shape (episodes, 1 + known), on the same crystals."""
     both = min(len(sample.seeds), len(earlier))
     same_seeds = earlier[:both, 0].tolist() == list(sample.seeds[:both])
-    return same_seeds and np.allclose(sample.values[0, :both], earlier[:both, 1:], rtol=PRINTED)
+    return same_seeds and np.allclose(sample.values[0, :both][:, known], earlier[:both, 1:], rtol=PRINTED)
 
 
 @cache

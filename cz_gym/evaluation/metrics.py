@@ -20,6 +20,9 @@ PULL_WINDOW = 30.0 * MINUTE
 PULL_TOLERANCE = 0.03
 """Largest deviation of that mean from the nominal pull speed, relative [-]."""
 
+ALMOST = 1.0 - 1e-6
+"""Share of a limit that counts as the limit itself [-]."""
+
 
 class Metrics(NamedTuple):
     """Metrics of each episode, shape (episodes,).
@@ -44,6 +47,8 @@ class Metrics(NamedTuple):
     """Share of the time after 30 min in which the 30 min mean of v_p is within 3 % of v_0 [-]."""
     heater_step_rms_kw: Floats
     """RMS of the change of Q_H from one step to the next [kW]."""
+    time_at_limits: Floats
+    """Share of time in which a drive is at its range or moves as fast as it can [-]."""
     growth_rate_rms_mm_per_min: Floats
     """RMS of v_g - v_0 [mm/min]."""
     ground_off_pct: Floats
@@ -80,6 +85,7 @@ def metrics(run: Rollout) -> Metrics:
         pull_step_rms_mm_per_min=_rms(pull_step, alive) / MM_PER_MIN,
         mean_pull_within_3pct=_mean_pull_share(s.v_p, alive, v_0, run.config.control_interval),
         heater_step_rms_kw=_rms(heater_step, alive) / KILO,
+        time_at_limits=np.mean(_at_limits(run, pull_step, heater_step), axis=0, where=alive),
         growth_rate_rms_mm_per_min=_rms(s.v_g - v_0, alive) / MM_PER_MIN,
         ground_off_pct=_ground_off(s.r_c, alive),
         cost=_cost(observable, s.v_p - v_0, pull_step, heater_step, alive),
@@ -98,6 +104,21 @@ def _cost(error: Floats, pull: Floats, pull_step: Floats, heater_step: Floats, a
     terms = cost_terms(error, *(np.where(alive, moved, 0.0) for moved in (pull, pull_step, heater_step)))
     mean: Floats = np.sum(terms, axis=0).mean(axis=0)
     return mean
+
+
+def _at_limits(run: Rollout, pull_step: Floats, heater_step: Floats) -> npt.NDArray[np.bool_]:
+    """Whether a drive is at a limit; those of a mixture are the widest of its scenarios'."""
+    config, s, start = run.config, run.signals, run.start
+    drives = [each.actuators for each in config.scenario.scenarios]
+    window = min(config.parameters.v_0, max(each.pull_window for each in drives))
+    fastest = config.control_interval * max(each.pull_slew for each in drives)
+    slew = config.control_interval * max(each.heater_slew for each in drives)
+    half = 0.5 * max(each.heater_step for each in drives)
+    pull = (np.abs(s.v_p - start.v_p) >= ALMOST * window) | (np.abs(pull_step) >= ALMOST * fastest)
+    heater = np.abs(s.Q_H - start.Q_H) >= ALMOST * config.heater_range - half
+    heater |= np.less_equal(s.Q_H, half)
+    found: npt.NDArray[np.bool_] = pull | heater | (np.abs(heater_step) >= ALMOST * slew - half)
+    return found
 
 
 def _last(alive: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:

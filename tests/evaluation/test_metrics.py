@@ -16,9 +16,9 @@ R, V, Q = 0.0875, 2e-5, 60e3
 MM_PER_MIN = 1e-3 / 60
 
 
-def made_up(steps: int, lived: int | None = None, **signals: Any) -> Rollout:
+def made_up(steps: int, lived: int | None = None, scenario: str = "nominal", **signals: Any) -> Rollout:
     """One episode of a perfect crystal but for the given signals; with ``lived``, it fails at that step."""
-    config = make_config("nominal", control_interval=DT, horizon=DT * steps, **PLAIN)
+    config = make_config(scenario, control_interval=DT, horizon=DT * steps, **PLAIN)
     calm = dict.fromkeys(Signals._fields, 0.0) | {"r_c": R, "r_ref": R, "v_p": V, "v_g": V, "Q_H": Q}
     columns = {name: np.full((steps, 1), value) for name, value in calm.items()}
     for name, value in signals.items():
@@ -36,7 +36,7 @@ def of(run: Rollout) -> Metrics:
 
 def test_metrics_of_a_perfect_crystal_are_perfect() -> None:
     perfect = of(made_up(720))
-    assert perfect == Metrics(0, 0, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0)
+    assert perfect == Metrics(0, 0, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0)
 
 
 def test_mean_square_error_is_against_the_reference_as_it_moves() -> None:
@@ -56,6 +56,19 @@ def test_observable_error_forgives_what_no_sensor_shows() -> None:
     lucky = of(made_up(100, ring_offset=0.3e-3))
     assert lucky.rmse_mm == 0
     assert lucky.rmse_observable_mm == pytest.approx(0.3)
+
+
+def test_time_at_the_limits_counts_steps_in_which_a_drive_is_at_its_range_or_slew() -> None:
+    config = make_config("puller", **PLAIN)
+    drives = config.sole_scenario.actuators
+    steps = np.zeros(20)
+    steps[3:6] = drives.pull_slew * DT  # three steps at the slew rate, then back slowly
+    steps[6:] = -3.0 / 14.0 * drives.pull_slew * DT
+    assert of(made_up(20, scenario="puller", v_p=V + np.cumsum(steps))).time_at_limits == pytest.approx(3 / 20)
+    move = np.where(np.arange(20) < 10, 0.0, drives.heater_step)  # slower than its slew rate
+    assert of(made_up(20, scenario="puller", Q_H=Q + move)).time_at_limits == 0.0
+    far = Q + np.linspace(0.0, config.heater_range, 200)
+    assert of(made_up(200, scenario="puller", Q_H=far)).time_at_limits == pytest.approx(1 / 200)
 
 
 @pytest.mark.parametrize("steps", [1, 4, 10])

@@ -57,6 +57,7 @@ DRIVES = (
     PULL_STEP,
     Column("mean_pull_within_3pct", "30 min mean pull within 3 % [%]", 1, PERCENT),
     HEATER_STEP,
+    Column("time_at_limits", "at the drives' limits [%]", 1, PERCENT),
     Column("growth_rate_rms_mm_per_min", "growth rate RMS [mm/min]", 3),
     Column("cost", "cost", 4),
     RETURN,
