@@ -31,7 +31,7 @@ PLACES = {"camera": "ring", "v_p": "pull speed", "Q_H": "heater"}
 """Places where the loop is opened, and their names."""
 
 
-def form_of(name: str, puller: machine.Puller = machine.DEFAULT) -> LinearForm:
+def form_of(name: str, puller: machine.PullerFile = machine.DEFAULT) -> LinearForm:
     """The linear form of a shipped controller, or of ``FILE.py:NAME``; ValueError says in one line why it has none."""
     config = make_config("nominal", observation="measured", action="direct", puller=puller)
     sensor = make_config("randomized", puller=puller).sole_scenario.sensor
