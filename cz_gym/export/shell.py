@@ -132,7 +132,7 @@ def settings_of(config: Config, puller: Puller | None = None) -> tuple[Port, ...
     heater_slew = NO_LIMIT if drives.heater_slew is None else drives.heater_slew / (KILO / MINUTE)
     reach = config.heater_range / KILO
     return (
-        Port("nominal_radius_mm", "radius that the controller was designed at", puller.r_0 / MM),
+        Port("nominal_radius_mm", "crystal radius at the operating point", puller.r_0 / MM),
         Port("ring_bias_mm", "the operator's bias: ring radius minus crystal radius at nominal", puller.ring_bias / MM),
         Port("nominal_pull_speed_mm_per_min", "this puller's pull speed at its operating point", v_0),
         Port("nominal_heater_power_kW", "this puller's heater power there", Q_0),
