@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import io
 import warnings
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import onnx
 import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
-from cz_gym.agents.agent_file.contract import AgentFileError
+from cz_gym.agents.agent_file.contract import PLANT, REWARD, AgentFileError, facts_of, make_contract
 from cz_gym.agents.agent_file.graph import INPUTS, OUTPUTS
-from cz_gym.agents.apg import RecurrentPolicy
+from cz_gym.agents.apg import APG, RecurrentPolicy
+from cz_gym.agents.policies.onnx import OnnxPolicy
+from cz_gym.config import Config
+from cz_gym.observation import OBSERVATIONS
+from cz_gym.sb3 import environment_steps
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecNormalize
@@ -122,3 +128,21 @@ def to_onnx(policy: BasePolicy, channels: int, normalisation: VecNormalize | Non
     onnx.checker.check_model(model)
     serialised: bytes = model.SerializeToString()
     return serialised
+
+
+def to_agent(
+    algorithm: BaseAlgorithm, name: str, seed: int, config: Config, normalisation: VecNormalize | None, path: str | Path
+) -> OnnxPolicy:
+    """The algorithm's policy as an agent called ``name``, not validated yet; ``path`` names it in errors."""
+    content = to_onnx(algorithm.policy, len(OBSERVATIONS[config.observation]), normalisation)
+    contract = make_contract(
+        content,
+        **facts_of(config),
+        algorithm=name,
+        learned_from=PLANT if isinstance(algorithm, APG) else REWARD,
+        training_seed=seed,
+        training_steps=environment_steps(algorithm),
+        validation_cost=0.0,
+        validation_rmse_mm=0.0,
+    )
+    return OnnxPolicy.of(contract, content, config, path)

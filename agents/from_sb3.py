@@ -17,17 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cz_gym.agents.agent_file.contract import (
-    PLANT,
-    REWARD,
-    AgentFileError,
-    Contract,
-    facts_of,
-    make_contract,
-    write_agent,
-)
+from cz_gym.agents.agent_file.contract import AgentFileError, Contract, agent_files
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.agents.training.validation import JUDGING, validate
+from cz_gym.atomic_files import write_files
 from cz_gym.commands import OneLineParser
 from cz_gym.config import Config, check_config, make_config
 from cz_gym.env import CzEnv, observation_space
@@ -86,9 +79,7 @@ def save_agent(
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.vec_env import VecNormalize
 
-    from cz_gym.agents.apg import APG
-    from cz_gym.agents.export import to_onnx
-    from cz_gym.sb3 import environment_steps
+    from cz_gym.agents.export import to_agent
 
     path = Path(path)
     if path.suffix != ".onnx":
@@ -102,26 +93,16 @@ def save_agent(
     _check_wrappers(model)
     _check_spaces(model, config)
     _check_normalisation(model, normalisation, config.observation)
-    content = to_onnx(model.policy, len(OBSERVATIONS[config.observation]), normalisation)
-    facts = {
-        **facts_of(config),
-        "algorithm": name,
-        "learned_from": PLANT if isinstance(model, APG) else REWARD,
-        "training_seed": int((model.seed if seed is None else seed) or 0),
-        "training_steps": environment_steps(model),
-        "validation_cost": 0.0,
-        "validation_rmse_mm": 0.0,
-    }
-    agent = OnnxPolicy.of(make_contract(content, **facts), content, config, path)
+    agent = to_agent(model, name, int((model.seed if seed is None else seed) or 0), config, normalisation, path)
     apart = disagreement(agent, model, normalisation, config)
     if not apart <= TOLERANCE:
         raise AgentFileError(f"{path}: the file would act otherwise than the model, by up to {apart:.2g}")
     if normalisation is None and not model.num_timesteps:
         said = f"this model does not know how it was trained: if on normalised observations, {GIVE_IT}"
         warnings.warn(said, stacklevel=2)
-    found = validate(agent, config, JUDGING)
-    facts |= {"validation_cost": found.cost, "validation_rmse_mm": found.rmse_mm}
-    return write_agent(path, content, **facts)
+    contract = validate(agent, config, JUDGING).put_into(agent.contract)
+    write_files(agent_files(path, agent.content, contract))
+    return contract
 
 
 def disagreement(
@@ -226,19 +207,18 @@ def main(argv: list[str] | None = None) -> int:
     description = "Write a model of stable-baselines3 or RL-Zoo as an agent file, which the benchmark runs."
     epilog = "A saved model is a pickle: reading one can run any code, so convert only what you trained."
     parser = OneLineParser("python -m cz_gym.agents.from_sb3", description, epilog)
-    parser.add_argument("model", type=Path, help="saved model (.zip)")
-    parser.add_argument("--algo", choices=sorted(ALGORITHMS), required=True, help="algorithm, by RL-Zoo's name")
-    parser.add_argument(
-        "--vecnormalize", type=Path, metavar="PKL", help="saved VecNormalize, if it was trained with one"
-    )
-    parser.add_argument("--name", help="what the agent is called (default: the agent file's name)")
+    add = parser.add_argument
+    add("model", type=Path, help="saved model (.zip)")
+    add("--algo", choices=sorted(ALGORITHMS), required=True, help="algorithm, by RL-Zoo's name")
+    add("--vecnormalize", type=Path, metavar="PKL", help="saved VecNormalize, if it was trained with one")
+    add("--name", help="what the agent is called (default: the agent file's name)")
     about = "what it was trained on: a scenario's name, all, FILE.py:NAME or A=0.6,B=0.4 (default: %(default)s)"
-    parser.add_argument("--scenario", default="randomized", help=about)
-    parser.add_argument("--observation", default="history", help="observation it reads (default: %(default)s)")
-    parser.add_argument("--action", default="smooth", help="direct, smooth or rate (default: %(default)s)")
-    parser.add_argument("--control-interval", type=float, default=5.0, help="in seconds (default: %(default)s)")
-    parser.add_argument("--seed", type=int, help="training seed (default: the model's)")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="agent file to write (.onnx)")
+    add("--scenario", default="randomized", help=about)
+    add("--observation", default="history", help="observation it reads (default: %(default)s)")
+    add("--action", default="smooth", help="direct, smooth or rate (default: %(default)s)")
+    add("--control-interval", type=float, default=5.0, help="in seconds (default: %(default)s)")
+    add("--seed", type=int, help="training seed (default: the model's)")
+    add("--out", type=Path, required=True, metavar="FILE", help="agent file to write (.onnx)")
     return parser.run(_convert, argv, "agents")
 
 
@@ -251,28 +231,26 @@ def _convert(given: argparse.Namespace) -> None:
         if error.name != "sb3_contrib":
             raise
         raise AgentFileError(f"{given.algo} is missing: pip install sb3-contrib") from None
-    model = _read(given.model, f"a model of {given.algo}", lambda: algorithm.load(given.model, device="cpu"))
+    model = _read(given.model, f"a model of {given.algo}", lambda path: algorithm.load(path, device="cpu"))
     crystals = scenarios(given.scenario)
     config = make_config(crystals, None, given.observation, given.control_interval, action=given.action)
     _check_spaces(model, config)
     normalisation = None
     if given.vecnormalize:
         env = DummyVecEnv([lambda: CzEnv(observation=given.observation)])
-        normalisation = _read(
-            given.vecnormalize, "a VecNormalize", lambda: VecNormalize.load(str(given.vecnormalize), env)
-        )
+        normalisation = _read(given.vecnormalize, "a VecNormalize", lambda path: VecNormalize.load(str(path), env))
     name = given.out.stem if given.name is None else given.name
     contract = save_agent(given.out, model, name, normalisation, config, given.seed)
     said = f"mean RMSE {contract.validation_rmse_mm:.3f} mm on {len(JUDGING)} validation episodes"
     print(f"wrote {given.out}: {contract.algorithm} after {contract.training_steps:,} steps, {said}")
 
 
-def _read(path: Path, what: str, load: Callable[[], Any]) -> Any:
+def _read(path: Path, what: str, load: Callable[[Path], Any]) -> Any:
     """The content of a file of stable-baselines3; AgentFileError whatever a broken file makes it raise."""
     if not path.is_file():
         raise AgentFileError(f"{path}: no such file")
     try:
-        return load()
+        return load(path)
     except Exception as error:
         raise AgentFileError(f"{path}: not {what} that stable-baselines3 can read ({error})") from None
 

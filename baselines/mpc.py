@@ -108,7 +108,7 @@ class EkfMpc(LQG):
     def hash(self) -> str:
         """Hash of its settings (16 hex digits)."""
         plant = self.control_interval, self.parameters, self.meniscus.name
-        chosen = self.design.hash, plant, self.hypotheses, self.actuators, self.horizon, self.blocks
+        chosen = self.design, plant, self.hypotheses, self.actuators, self.horizon, self.blocks
         return hashlib.sha256(repr(chosen).encode()).hexdigest()[:16]
 
     @property

@@ -16,7 +16,7 @@ import numpy as np
 
 from cz_gym import puller as machine
 from cz_gym.atomic_files import check_writable, write_files
-from cz_gym.baselines.analysis.frequency import LoopMargins, frequencies, margins_of, opened, response
+from cz_gym.baselines.analysis.frequency import frequencies, loop_margins, opened, response
 from cz_gym.baselines.analysis.linear_form import LinearForm, linear_form
 from cz_gym.baselines.analysis.sampled_loop import HOT_ZONE, close, stable_range
 from cz_gym.baselines.registry import make_controller
@@ -25,7 +25,8 @@ from cz_gym.config import make_config
 from cz_gym.errors import CzError
 from cz_gym.evaluation import user_code
 from cz_gym.evaluation.report.tables import markdown as table
-from cz_gym.physics.plant import Puller, make_puller
+from cz_gym.physics.linearisation import StateSpace
+from cz_gym.physics.plant import make_puller
 
 PLACES = {"camera": "ring", "v_p": "pull speed", "Q_H": "heater"}
 """Places where the loop is opened, and their names."""
@@ -39,30 +40,22 @@ def form_of(name: str, puller: machine.PullerFile = machine.DEFAULT) -> LinearFo
     return linear_form(policy, sensor)
 
 
-def margins(form: LinearForm, puller: Puller, at: str) -> tuple[Any, LoopMargins]:
-    """The loop opened there: its response at :func:`frequencies`, and its margins."""
-    controller = form.controller if at == "camera" else form.free
-    omega = frequencies(form.dt)
-    values = response(opened(controller, puller, form.dt, at), form.dt, omega)
-    return values, margins_of(values, omega, form.dt, close(form.controller, puller, form.dt).stable)
-
-
 def phase_of(values: Any) -> Any:
     """Continuous phase of a response [degrees]; it begins between -360 and 0, so that margins are read at -180."""
     phase = np.degrees(np.unwrap(np.angle(values)))
     return phase - 360.0 * (phase[0] // 360.0 + 1.0)
 
 
-def picture(name: str, form: LinearForm, responses: dict[str, Any]) -> bytes:
-    """Gain and phase of the loop, and its sensitivity, as PNG."""
+def picture(name: str, dt: float, loops: dict[str, StateSpace]) -> bytes:
+    """Gain and phase of the loops, by the place where they are opened, and their sensitivity, as PNG."""
     from cz_gym.evaluation.report.canvas import COLOURS, GREY, canvas, png
 
-    omega = frequencies(form.dt)
+    omega = frequencies(dt)
     figure = canvas(7.0, 6.5)
     gain, phase, sensitivity = figure.subplots(3, 1, sharex=True)
-    for (at, values), colour in zip(responses.items(), COLOURS, strict=False):
-        label = f"opened at the {PLACES[at]}"
-        gain.loglog(omega, np.abs(values), color=colour, lw=1.2, label=label)
+    for (at, loop), colour in zip(loops.items(), COLOURS, strict=False):
+        values = response(loop, dt, omega)
+        gain.loglog(omega, np.abs(values), color=colour, lw=1.2, label=f"opened at the {PLACES[at]}")
         phase.semilogx(omega, phase_of(values), color=colour, lw=1.2)
         sensitivity.loglog(omega, 1.0 / np.abs(1.0 + values), color=colour, lw=1.2)
     for panel, label in ((gain, "|L| [-]"), (phase, "phase of L [deg]"), (sensitivity, "|1 / (1 + L)| [-]")):
@@ -93,20 +86,22 @@ def _main(given: argparse.Namespace) -> None:
     own = machine.chosen_puller(given.puller)
     form, puller = form_of(given.controller, own), make_puller(own.parameters, given.mix)
     heats = form.controller.C[1].any() or form.controller.D[1].any()
-    found = {at: margins(form, puller, at) for at in PLACES if heats or at != "Q_H"}
+    stable = close(form.controller, puller, form.dt).stable
     heads = ("opened at", "crossover [rad/s]", "gain up", "gain down", "phase [deg]", "delay [s]", "sensitivity")
-    rows = [
-        (PLACES[at], f"{first:.2e}", *("none" if np.isnan(value) else f"{value:.3g}" for value in rest))
-        for at, (_, (first, *rest)) in found.items()
-    ]
+    rows, loops = [], {}
+    for at in PLACES if heats else ("camera", "v_p"):
+        controller = form.controller if at == "camera" else form.free
+        first, *rest = loop_margins(controller, puller, form.dt, at, stable)
+        rows.append((PLACES[at], f"{first:.2e}", *("none" if np.isnan(value) else f"{value:.3g}" for value in rest)))
+        loops[at] = opened(controller, puller, form.dt, at)
     print(table(heads, rows))
-    if not close(form.controller, puller, form.dt).stable:
+    if not stable:
         print("the closed loop is unstable: it has no margins")
     zones = [
         (name, *stable_range(form.controller, form.dt, of, given.mix, own.parameters)) for name, of in HOT_ZONE.items()
     ]
     print(table(("factor on", "stable from", "to"), [(name, f"{low:.2f}", f"{high:.2f}") for name, low, high in zones]))
-    write_files({given.out: picture(given.controller, form, {at: values for at, (values, _) in found.items()})})
+    write_files({given.out: picture(given.controller, form.dt, loops)})
     print(f"wrote {given.out}")
 
 

@@ -50,16 +50,15 @@ class Response(NamedTuple):
     rings: dict[str, Floats]
     """The three readings [m]."""
 
-    def depth(self, ring: Floats) -> float:
-        """Largest excursion of a ring in the wrong direction [m]."""
-        return float(np.nanmax(ring * np.sign(self.change)))
+    @property
+    def depths(self) -> dict[str, float]:
+        """Largest excursion of each ring in the wrong direction [um]."""
+        return {name: 1e3 * float(np.nanmax(ring * np.sign(self.change))) / MM for name, ring in self.rings.items()}
 
     def recovery(self, ring: Floats) -> float | None:
         """Time after which a ring is back and stays back [s]; None if it never is."""
-        wrong = np.flatnonzero(ring * np.sign(self.change) > 0.0)
-        if wrong.size == 0 or wrong[-1] + 1 >= len(self.t) or np.isnan(ring[wrong[-1] + 1]):
-            return None
-        return float(self.t[wrong[-1] + 1])
+        back = np.flatnonzero(ring * np.sign(self.change) > 0.0).max(initial=-1) + 1
+        return None if back in (0, len(self.t)) or np.isnan(ring[back]) else float(self.t[back])
 
 
 def read_rings(detector: RingDetector, r_c: Any, h_c: Any, images: Any = None) -> dict[str, Floats]:
@@ -103,10 +102,8 @@ def numbers(detector: RingDetector, responses: Sequence[Response]) -> dict[str, 
     return {
         "pixel_mm": detector.pixel / MM,
         "edge_slope_deg": math.degrees(edge.slope),
-        "edge_height_mm": edge.z / MM,
         "edge_outside_crystal_mm": (edge.r - PULLER.r_0) / MM,
         "closed_form_outside_crystal_mm": PULLER.ring_bias / MM,
-        "detector_bias_mm": detector.bias / MM,
         "largest_difference_px": {name: value / detector.pixel for name, value in worst.items()},
         "largest_difference_mm": {name: value / MM for name, value in worst.items()},
         "images_without_ring": int(np.isnan(grid["detected"]).sum()),
@@ -118,7 +115,7 @@ def numbers(detector: RingDetector, responses: Sequence[Response]) -> dict[str, 
             {
                 "model": one.model,
                 "change_of_pull": one.change,
-                "depth_um": {name: 1e3 * one.depth(ring) / MM for name, ring in one.rings.items()},
+                "depth_um": one.depths,
                 "recovery_s": {name: one.recovery(ring) for name, ring in one.rings.items()},
             }
             for one in responses
@@ -135,20 +132,17 @@ def view_figure(detector: RingDetector) -> bytes:
     for axis, h_c in zip(axes, (5.0 * MM, PULLER.h_0, 8.0 * MM), strict=True):
         image = picture(PULLER.r_0, h_c, PULLER, VIEW)
         ring, offset = detector.read(image), float(hurle_ring_offset(PULLER.r_0, h_c, PULLER))
-        axis.imshow(
-            image[:, :, 0], cmap="gray", vmin=0, vmax=255, extent=(0, COLUMNS, ROWS, 0), interpolation="nearest"
-        )
-        for r, angles, z, look in (
-            (ring.edges, ANGLES, detector.height, {"color": "#56B4E9", "label": "detected edge"}),
-            (PULLER.r_0 + offset, wide, 0.0, {"color": COLOURS[0], "ls": "--", "label": "closed-form ring"}),
+        axis.imshow(image[:, :, 0], cmap="gray", vmin=0, vmax=255, extent=(0, COLUMNS, ROWS, 0))
+        for r, angles, z, colour, label in (
+            (ring.edges, ANGLES, detector.height, COLOURS[2], "detected edge"),
+            (PULLER.r_0 + offset, wide, 0.0, COLOURS[0], "closed-form ring"),
         ):
             seen = project(r * np.cos(angles), r * np.sin(angles), z, VIEW)
-            axis.plot(seen.column, seen.row, lw=1.0, **look)
+            axis.plot(seen.column, seen.row, lw=1.0, color=colour, label=label)
         errors = (ring.radius - PULLER.r_0) / MM, (offset - PULLER.ring_bias) / MM
         said = "$h_c$ = {:.2f} mm: detected {:+.2f} mm,\nclosed form {:+.2f} mm".format(h_c / MM, *errors)
         axis.set_title(said, fontsize=8.5)
         axis.set(xlim=(0, COLUMNS), ylim=(ROWS, 0), xlabel="column")
-    axes[0].set_ylabel("row")
     axes[0].legend(fontsize=7, loc="upper center", framealpha=0.85)
     return png(figure)
 
@@ -159,15 +153,13 @@ def response_figure(responses: Sequence[Response]) -> bytes:
 
     figure = canvas(9.6, 6.0)
     for axis, one in zip(figure.subplots(2, 2, sharex=True).flat, responses, strict=True):
-        closed, traced, detected = (1e3 * ring / MM for ring in one.rings.values())
         axis.plot(one.t, 1e3 * one.r_c / MM, color=INK, label="true radius")
-        axis.plot(one.t, closed, color=COLOURS[0], label="closed-form ring")
-        axis.plot(one.t, traced, "--", color=COLOURS[2], label="exactly traced edge")
-        axis.plot(one.t, detected, ".", color=COLOURS[1], ms=4, label="image and detector")
-        depths = ", ".join(f"{1e3 * one.depth(ring) / MM:.1f} ({name})" for name, ring in one.rings.items())
+        for (name, ring), line, colour in zip(one.rings.items(), ("-", "--", "."), COLOURS, strict=False):
+            axis.plot(one.t, 1e3 * ring / MM, line, color=colour, label=name)
+        depths = ", ".join(f"{depth:.1f} ({name})" for name, depth in one.depths.items())
         title = f"Model {one.model}, pull speed {100 * one.change:+.0f} %\ndepth [µm]: {depths}"
         axis.set_title(title, fontsize=8.5)
-        least = min(float(np.nanmin(ring)) for ring in (closed, traced, detected))
+        least = 1e3 * min(float(np.nanmin(ring)) for ring in one.rings.values()) / MM
         axis.set(ylim=(1.25 * least, -2.5 * least), xlabel="time [s]", ylabel="change of radius [µm]")
     figure.axes[0].legend(fontsize=7.5, loc="lower right")
     return png(figure)

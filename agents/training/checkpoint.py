@@ -83,14 +83,11 @@ def load_checkpoint(path: Path) -> tuple[Progress, Tensors, dict[str, bytes]]:
     try:
         tensors: Tensors = load(content)
         header = json.loads(content[8:end])["__metadata__"]
+        progress = Progress(**json.loads(header["progress"])) if header["format"] == FORMAT else None
     except (SafetensorError, ValueError, KeyError, TypeError, AttributeError, RuntimeError, RecursionError):
         raise AgentFileError(f"{path}: not a checkpoint of this project, or damaged") from None
-    if header.get("format") != FORMAT:
+    if progress is None:
         raise AgentFileError(f"{path}: not a checkpoint of this release ({FORMAT})")
-    try:
-        progress = Progress(**json.loads(header["progress"]))
-    except (ValueError, KeyError, TypeError, RecursionError):
-        raise AgentFileError(f"{path}: does not say where the run stood") from None
     best = 0.0 if progress.best_cost is None else progress.best_cost
     whole = type(progress.steps) is int and 0 <= progress.steps < 2**63
     if not whole or not all(type(each) is float and 0.0 <= each < math.inf for each in (progress.seconds, best)):

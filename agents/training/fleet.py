@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -12,12 +11,10 @@ from tqdm import tqdm
 
 from cz_gym.atomic_files import locked
 from cz_gym.errors import CzError
+from cz_gym.evaluation.processes import in_processes
 
 from .run import Job, Run
 from .run_files import read_rows
-
-Perform = Callable[[Callable[[Job], Any], Sequence[Job], Callable[[], None]], Iterator[tuple[int, Any]]]
-"""A function that runs jobs: :func:`cz_gym.evaluation.processes.in_processes`."""
 
 
 def train_seed(job: Job, bar: Any = None) -> dict[str, float]:
@@ -28,7 +25,6 @@ def train_seed(job: Job, bar: Any = None) -> dict[str, float]:
     with locked(job.folder):
         if summary := job.summary:
             return summary
-        sys.argv = list(job.command)
         run = Run(job)
         run.learn(tqdm(disable=True) if bar is None else bar)
         return run.finish()
@@ -45,7 +41,7 @@ def _tried(train: Callable[[Job], dict[str, float]], job: Job) -> dict[str, floa
         return error
 
 
-def train_seeds(jobs: Sequence[Job], perform: Perform, bar: Any) -> Iterator[tuple[Job, dict[str, float]]]:
+def train_seeds(jobs: Sequence[Job], bar: Any) -> Iterator[tuple[Job, dict[str, float]]]:
     """Train the seeds that are not finished; yields each with its summary. ``bar`` is tqdm's and counts seeds.
 
     Once the others are done, CzError names the seeds that failed; any other exception of a seed is raised as it is.
@@ -56,25 +52,24 @@ def train_seeds(jobs: Sequence[Job], perform: Perform, bar: Any) -> Iterator[tup
         bar.set_postfix_str("  ".join(lines), refresh=False)
         bar.update(sum(shares) - bar.n)
 
-    missing = []
+    missing, failed = list[Job](), dict[int, Exception]()
     for job in jobs:
         if summary := job.summary:
             yield job, summary
         else:
             missing.append(job)
-    failed: list[tuple[int, Exception]] = []
-    for number, result in perform(partial(_tried, train_seed), missing, look):
+    for number, result in in_processes(partial(_tried, train_seed), missing, look):
         if isinstance(result, Exception):
-            failed.append((missing[number].seed, result))
+            failed[missing[number].seed] = result
         else:
             yield missing[number], result
     look()
-    for seed, error in failed:
+    for seed, error in failed.items():
         if not isinstance(error, CzError):
             error.add_note(f"seed {seed}")
             raise error
     if failed:
-        raise CzError("; ".join(f"seed {seed}: {error}" for seed, error in failed))
+        raise CzError("; ".join(f"seed {seed}: {error}" for seed, error in failed.items()))
 
 
 def _standing(job: Job) -> tuple[float, str]:
@@ -82,6 +77,5 @@ def _standing(job: Job) -> tuple[float, str]:
     rows = read_rows(job.folder / "progress.csv")
     if not rows:
         return 0.0, f"{job.seed}: 0%"
-    steps = float(rows[-1]["steps"])
-    share = min(steps / job.recipe.steps, 1.0)
+    share = min(float(rows[-1]["steps"]) / job.recipe.steps, 1.0)
     return share, f"{job.seed}: {share:.0%} {float(rows[-1]['validation_rmse_mm']):.3f} mm"

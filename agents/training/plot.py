@@ -1,31 +1,42 @@
-"""A picture of a run's progress, beside the classical controllers on the same validation crystals."""
+"""Learning curves: validation error against steps and time, beside the classical controllers on the same crystals."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cz_gym.evaluation.report.canvas import COLOURS, INK, canvas, png
+from cz_gym.evaluation.report.canvas import INK, canvas, png, styles
 
 from .validation import REFERENCES
 
+AXES = (("steps", 1e6, "environment steps [million]"), ("seconds", 60.0, "minutes, validation included"))
+"""Horizontal axes: column of a run's progress, unit, label."""
 
-def progress(rows: Sequence[dict[str, Any]], title: str) -> bytes:
-    """Validation RMSE [mm] against environment steps, the references as lines across, as PNG."""
-    figure = canvas(6.4, 3.8)
-    axis = figure.subplots()
-    steps = [1e-6 * float(row["steps"]) for row in rows]
-    errors = [float(row["validation_rmse_mm"]) for row in rows]
-    for name, colour in zip(REFERENCES, COLOURS[1:], strict=False):
-        rmse = float(rows[-1][f"{name}_rmse_mm"])
-        axis.axhline(rmse, color=colour, lw=1.2, label=f"{name} {rmse:.3f}")
-    axis.plot(steps, errors, color=COLOURS[0], marker="o", ms=3.5, label=f"{title} {errors[-1]:.3f}")
-    for step, error, row in zip(steps, errors, rows, strict=True):
-        if lost := float(row["failure_rate"]):
-            axis.annotate(f"{lost:.0%} lost", (step, error), (4, 2), textcoords="offset points", fontsize=7, color=INK)
-    axis.set_yscale("log")
-    axis.yaxis.set_major_formatter(lambda value, position: f"{value:g}")
-    axis.set_xlabel(f"environment steps [million]; {float(rows[-1]['seconds']) / 60.0:.1f} min so far")
-    axis.set_ylabel("validation RMSE of the radius [mm]")
-    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
+
+def curves(runs: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) -> bytes:
+    """Validation RMSE [mm] against steps and minutes, a line a run, as PNG; the references are dashed lines across.
+
+    ``runs`` are the rows of ``progress.csv`` of each run, by the name of their agents.
+    """
+    figure, style = canvas(9.4, 4.6), styles([*runs])
+    panels = figure.subplots(1, 2, sharey=True)
+    last = next(iter(runs.values()))[0][-1]
+    for axis, (column, unit, title) in zip(panels, AXES, strict=True):
+        for name, several in runs.items():
+            for place, rows in enumerate(several):
+                spent, error = ([float(row[each]) for row in rows] for each in (column, "validation_rmse_mm"))
+                look = {"color": style[name].colour, "marker": style[name].marker}
+                label = name if place == 0 and axis is panels[0] else None
+                axis.plot([each / unit for each in spent], error, ms=2.5, lw=1.0, label=label, **look)
+        for name in REFERENCES:
+            axis.axhline(rmse := float(last[f"{name}_rmse_mm"]), color=INK, lw=0.9, ls="--")
+            if axis is panels[0]:
+                axis.annotate(name, (0.99, rmse), (0, 2), axis.get_yaxis_transform(), textcoords="offset points",
+                              ha="right", fontsize=8, color=INK)  # fmt: skip
+        axis.set(xscale="log", yscale="log", xlabel=title)
+        for each in (axis.xaxis, axis.yaxis):
+            each.set_major_formatter(lambda value, _: f"{value:g}")
+    panels[0].set_ylabel("validation RMSE of the radius [mm]")
+    figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+    figure.suptitle("Radius error on validation crystals while learning: a line a training seed", fontsize=11)
     return png(figure)

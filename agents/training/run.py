@@ -6,37 +6,26 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import configure_logger
 
-from cz_gym.agents.agent_file.contract import (
-    PLANT,
-    REWARD,
-    Contract,
-    agent_files,
-    facts_of,
-    make_contract,
-    read_agent,
-    read_json,
-)
-from cz_gym.agents.export import to_onnx
+from cz_gym.agents.agent_file.contract import agent_files, read_json
+from cz_gym.agents.export import to_agent
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.atomic_files import write_files
-from cz_gym.observation import OBSERVATIONS
 from cz_gym.sb3 import environment_steps
 
 from . import validation
 from .algorithms import make_algorithm, repeat_of
 from .checkpoint import load_checkpoint, restore, to_bytes
-from .recipes import APG, Recipe
+from .recipes import Recipe
 from .run_files import check_settings, identity, provenance, read_rows, to_csv, to_json
-from .validation import COLUMNS, REFERENCES, References, Validation, validate
+from .validation import COLUMNS, REFERENCES, References, validate
 
 CHECKPOINT = "checkpoint.safetensors"
 VALIDATE_EVERY = 200_000
@@ -57,8 +46,6 @@ class Job(NamedTuple):
     """Longest time between checkpoints, apart from validations and updates in between [s]."""
     plot: bool = False
     """Whether to draw the progress into the folder."""
-    command: Sequence[str] = ()
-    """The command line, for the run's settings."""
 
     @property
     def sessions(self) -> list[dict[str, Any]]:
@@ -141,8 +128,8 @@ class Run:
     def finish(self) -> dict[str, float]:
         """Test the best agent on episodes that did not choose it; the contents of ``summary.json``."""
         path = self.folder / "agent.onnx"
-        figures = validate(OnnxPolicy.load(path, self.config), self.config, validation.JUDGING)
-        contract, content = read_agent(path)
+        agent = OnnxPolicy.load(path, self.config)
+        figures = validate(agent, self.config, validation.JUDGING)
         summary = {
             "validation_episodes": len(validation.JUDGING),
             "validation_cost": figures.cost,
@@ -150,41 +137,31 @@ class Run:
             **{f"{name}_rmse_mm": judged for name, (_, judged) in self.job.references.items()},
             "pull_step_rms_mm_per_min": figures.pull_step_rms_mm_per_min,
             "failure_rate": figures.failure_rate,
-            "training_steps": contract.training_steps,
+            "training_steps": agent.contract.training_steps,
             "steps": self.steps,
             "seconds": time.monotonic() - self.began,
         }
-        self._hold(agent_files(path, content, _with_figures(contract, figures)))
+        self._hold(agent_files(path, agent.content, figures.put_into(agent.contract)))
         self._hold({self.folder / "summary.json": to_json(summary)})
         self.save()
         return summary
 
     def validate(self, bar: Any) -> None:
         """Export the actor as it stands and run the file itself on validation episodes; keep it if it is the best."""
-        algorithm, channels = self.algorithm, len(OBSERVATIONS[self.config.observation])
-        content = to_onnx(algorithm.policy, channels, algorithm.get_vec_normalize_env())
-        contract = make_contract(
-            content,
-            **facts_of(self.config),
-            algorithm=self.recipe.name,
-            learned_from=PLANT if isinstance(self.recipe, APG) else REWARD,
-            training_seed=self.seed,
-            training_steps=self.steps,
-            validation_cost=0.0,
-            validation_rmse_mm=0.0,
-        )
-        figures = validate(OnnxPolicy.of(contract, content, self.config), self.config, validation.PICKING)
+        path, normalisation = self.folder / "agent.onnx", self.algorithm.get_vec_normalize_env()
+        agent = to_agent(self.algorithm, self.recipe.name, self.seed, self.config, normalisation, path)
+        figures = validate(agent, self.config, validation.PICKING)
         if self.best is None or figures.cost < self.best:
             self.best = figures.cost
-            self._hold(agent_files(self.folder / "agent.onnx", content, _with_figures(contract, figures)))
+            self._hold(agent_files(path, agent.content, figures.put_into(agent.contract)))
         picked = [picked for picked, _ in self.job.references.values()]
         row = self.steps, round(time.monotonic() - self.began, 1), *figures, *picked
         self.rows.append(dict(zip(COLUMNS, row, strict=True)))
         self._hold({self.folder / "progress.csv": to_csv(self.rows)})
         if self.job.plot:
-            from .plot import progress
+            from .plot import curves
 
-            self._hold({self.folder / "progress.png": progress(self.rows, f"{self.recipe.name}, seed {self.seed}")})
+            self._hold({self.folder / "progress.png": curves({self.recipe.name: [self.rows]})})
         self.save()
         for name, figure in figures._asdict().items():
             self.logger.record(f"validation/{name}", figure)
@@ -219,10 +196,6 @@ class _Watch(BaseCallback):
         if interrupted:
             raise KeyboardInterrupt
         return True
-
-
-def _with_figures(contract: Contract, figures: Validation) -> Contract:
-    return replace(contract, validation_cost=figures.cost, validation_rmse_mm=figures.rmse_mm)
 
 
 @contextmanager

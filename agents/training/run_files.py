@@ -20,6 +20,8 @@ from .recipes import Recipe
 from .validation import COLUMNS
 
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "stable-baselines3", "torch", "onnx", "onnxruntime")
+SETTINGS = {"algorithm": str, "seed": int, "settings": dict, "steps": int, "sessions": list}
+"""Fields of ``settings.json`` that a resumed run reads, and their types."""
 
 
 def check_settings(folder: Path, recipe: Recipe, seed: int) -> list[dict[str, Any]]:
@@ -48,33 +50,18 @@ def read_settings(path: Path) -> dict[str, Any]:
     """The contents of ``settings.json``; AgentFileError unless a run wrote it."""
     try:
         saved = read_json(path)
-    except AgentFileError:
-        saved = None
-    steps, sessions = (saved.get("steps"), saved.get("sessions")) if isinstance(saved, dict) else (None, None)
-    whole = type(steps) is int and 0 < steps < 2**63 and isinstance(sessions, list)
-    if not whole or not sessions or not all(isinstance(session, dict) for session in sessions):
-        raise AgentFileError(f"{path}: missing or damaged, so there is nothing to resume")
+        sound = all(type(saved[name]) is kind for name, kind in SETTINGS.items()) and 0 < saved["steps"] < 2**63
+        if not sound or not saved["sessions"] or not all(isinstance(session, dict) for session in saved["sessions"]):
+            raise KeyError
+    except (AgentFileError, KeyError, TypeError, IndexError):
+        raise AgentFileError(f"{path}: missing or damaged, so there is nothing to resume") from None
     return dict(saved)
 
 
 def provenance() -> dict[str, Any]:
     """The command, and the software it runs on: git commit, Python, packages."""
-    return {
-        "command": " ".join([Path(sys.executable).name, *_program(), *sys.argv[1:]]),
-        "git_commit": _git_commit(),
-        **software(PACKAGES),
-    }
-
-
-def _program() -> list[str]:
-    """The program as a command line names it: a module of this checkout, or a program's name."""
-    path = Path(sys.argv[0])
-    here = Path(__file__).resolve().parents[2]
-    if path.is_absolute() and path.is_relative_to(here):
-        path = path.relative_to(here)
-        module = ".".join(path.with_suffix("").parts).removesuffix(".__main__")
-        return ["-m", module] if len(path.parts) > 1 else [str(path)]
-    return [path.name if path.is_absolute() else str(path)]
+    command = " ".join([Path(sys.executable).name, Path(sys.argv[0]).name, *sys.argv[1:]])
+    return {"command": command, "git_commit": _git_commit(), **software(PACKAGES)}
 
 
 def _git_commit() -> str | None:

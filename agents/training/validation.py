@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.agents.agent_file.contract import Contract
 from cz_gym.config import Config
 from cz_gym.cost import COST_CAP
 from cz_gym.evaluation.metrics import Metrics, metrics
@@ -47,6 +48,10 @@ class Validation(NamedTuple):
     rmse_mm: float
     pull_step_rms_mm_per_min: float
     failure_rate: float
+
+    def put_into(self, contract: Contract) -> Contract:
+        """The contract of an agent with these figures."""
+        return replace(contract, validation_cost=self.cost, validation_rmse_mm=self.rmse_mm)
 
 
 def validate(policy: Any, config: Config, seeds: Sequence[int]) -> Validation:

@@ -53,48 +53,41 @@ def opened(controller: StateSpace, puller: Puller, dt: float, at: str) -> StateS
     return StateSpace(A, B, -C, -D)
 
 
-def crossover_of(values: npt.NDArray[np.complex128], omega: Floats) -> float:
-    """Highest frequency [rad/s] where the gain of an open loop's response falls through one; NaN if it never does."""
-    gain = np.log(np.abs(values))
-    falls = np.flatnonzero((gain[:-1] > 0.0) & (gain[1:] <= 0.0))
-    if not len(falls):
-        return float("nan")
-    k = falls[-1]
-    share = gain[k] / (gain[k] - gain[k + 1])
-    return float(omega[k] * (omega[k + 1] / omega[k]) ** share)
+def loop_margins(
+    controller: StateSpace,
+    puller: Puller,
+    dt: float,
+    at: str = "camera",
+    stable: bool | None = None,
+    points: int = 2000,
+) -> LoopMargins:
+    """Margins of the loop opened there; if the closed loop is not ``stable``, all but the crossover are NaN.
 
-
-def loop_margins(controller: StateSpace, puller: Puller, dt: float, at: str = "camera") -> LoopMargins:
-    """Margins of the loop opened there; if the closed loop is unstable, all but the crossover are NaN."""
-    omega = frequencies(dt)
-    values = response(opened(controller, puller, dt, at), dt, omega)
-    return margins_of(values, omega, dt, close(controller, puller, dt).stable)
-
-
-def margins_of(values: npt.NDArray[np.complex128], omega: Floats, dt: float, stable: bool) -> LoopMargins:
-    """Margins of an open loop's response up to the Nyquist frequency; ``stable`` is whether the closed loop is."""
+    ``stable`` may be given where it is known, or that of another controller counts; ``points`` is the grid's.
+    """
     import control
 
-    found = crossover_of(values, omega)
-    if not stable:
-        return LoopMargins(found, *[float("nan")] * 5)
+    omega = frequencies(dt, points)
+    values = response(opened(controller, puller, dt, at), dt, omega)
+    log_gain = np.log(np.abs(values))
+    falls = np.flatnonzero((log_gain[:-1] > 0.0) & (log_gain[1:] <= 0.0))[-1:]
+    share = log_gain[falls] / (log_gain[falls] - log_gain[falls + 1])
+    crossover = _pick(omega[falls] * (omega[falls + 1] / omega[falls]) ** share, np.max)
+    if not (close(controller, puller, dt).stable if stable is None else stable):
+        return LoopMargins(crossover, *[float("nan")] * 5)
     gain, phase, _, _, crossing, _ = control.stability_margins(control.frd(values, omega), returnall=True)
-    late = np.append(np.radians(np.mod(phase, 360.0)) / crossing, _late_at_nyquist(values[-1], dt))
+    # A delay also turns a real loop gain above one at the Nyquist frequency to the critical point's side.
+    nyquist = np.mod(np.angle(values[-1:]) + np.pi, 2.0 * np.pi) * dt / np.pi
+    late = np.append(np.radians(np.mod(phase, 360.0)) / crossing, nyquist[np.abs(values[-1:]) > 1.0])
     return LoopMargins(
-        found,
-        _least(gain[gain > 1.0], np.min),
-        _least(gain[gain < 1.0], np.max),
-        _least(np.abs(phase), np.min),
-        _least(late, np.min),
+        crossover,
+        _pick(gain[gain > 1.0], np.min),
+        _pick(gain[gain < 1.0], np.max),
+        _pick(np.abs(phase), np.min),
+        _pick(late, np.min),
         float(np.max(1.0 / np.abs(1.0 + values))),
     )
 
 
-def _late_at_nyquist(value: complex, dt: float) -> Floats:
-    """Delay [s] that turns a real loop gain above one at the Nyquist frequency to the critical point's side."""
-    turn = np.mod(np.angle(value) + np.pi, 2.0 * np.pi)
-    return np.array([turn * dt / np.pi] if np.abs(value) > 1.0 else [])
-
-
-def _least(values: Any, pick: Any) -> float:
-    return float(pick(values)) if len(values) else float("nan")
+def _pick(values: Any, which: Any) -> float:
+    return float(which(values)) if len(values) else float("nan")

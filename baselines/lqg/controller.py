@@ -8,10 +8,8 @@ limits and slew rates never wind anything up.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, ClassVar, NamedTuple
 
@@ -54,13 +52,6 @@ class LQGDesign:
     """Largest move of the pull speed that the radius error alone asks for [m/s]; None: any. What is left of the drive's
     window damps the meniscus height, without which narrow and slow drives swing between their limits until the crystal
     is lost (nested saturation, Teel 1992)."""
-
-    @property
-    def hash(self) -> str:
-        """SHA-256 of the design (16 hex digits)."""
-        given = asdict(self) | {"weights": self.weights._asdict()}
-        present = {name: value for name, value in given.items() if value is not None}
-        return hashlib.sha256(json.dumps(present, sort_keys=True).encode()).hexdigest()[:16]
 
 
 class Gains(NamedTuple):

@@ -21,8 +21,9 @@ from .ring_model import RingModel
 
 MEAN_RIPPLE = 0.4
 """Standard deviation of a ripple whose amplitude is uniform from zero to A, in units of A: 1/sqrt(6), rounded."""
-FACTORS = 0.2, 0.6, 1.0, 1.4, 1.8
-"""Standard deviations of the fluctuations that adaptive LQGs consider possible, in units of the design's own [-]."""
+FACTORS = 0.2, 0.6, 1.0
+"""Standard deviations of the fluctuations that adaptive LQGs consider possible, in units of the design's own [-]. Above
+it the loop is unstable on some hot zones, and its own oscillation then speaks for still stronger fluctuations."""
 _WEIGHTS = "pull", "pull_step", "heater_step"
 _NOISE = (
     *("fast_sd", "slow_sd", "drift_rate_sd", "drift_rate_tau"),

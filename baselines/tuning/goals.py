@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from cz_gym.baselines import for_puller
-from cz_gym.baselines.analysis.frequency import LoopMargins, frequencies, margins_of, opened, response
+from cz_gym.baselines.analysis.frequency import LoopMargins, loop_margins
 from cz_gym.baselines.analysis.linear_form import linear_form
-from cz_gym.baselines.lqg.controller import LQG, LQGDesign
+from cz_gym.baselines.lqg.controller import LQGDesign
 from cz_gym.baselines.lqg.designs import ACTIVITIES, SEARCHED, SHIPPED, TOLD, design_of, family_name
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.settings import settings_of
@@ -26,33 +24,6 @@ from cz_gym.puller import DEFAULT
 from cz_gym.units import HOUR, MINUTE, MM
 
 from .search import Figures, Goal, Parameter, value_at
-
-
-@dataclass(frozen=True)
-class PIDGoal(Goal):
-    """Least observable RMSE plus priced pull steps, failures and broken limits [mm]."""
-
-    failure_price: ClassVar[float] = 5.0
-    miss_price: ClassVar[float] = 2.0
-    """Price of a broken limit [mm]."""
-    step_price: ClassVar[float] = 0.2
-    """Price of the pull step RMS [mm per mm/min]."""
-
-    limits: tuple[Callable[[Figures, Any], float], ...] = ()
-    """Slacks by figures and controller."""
-
-    def policy(self, settings: Any, config: Config) -> Any:
-        """The controller, which is its own settings, for an environment."""
-        return settings.for_config(config)
-
-    def objective(self, found: Figures) -> float:
-        """The priced sum [mm]."""
-        return found.rmse_mm + self.step_price * found.pull_step + self.failure_price * found.failure_rate
-
-    def slack(self, found: Figures, policy: Any) -> tuple[float, ...]:
-        """The slack of each limit."""
-        return tuple(limit(found, policy) for limit in self.limits)
-
 
 # A gain above 2 kW/K would improve the radius, and pass the pyrometer's noise to the heater.
 HEATER = (
@@ -95,9 +66,8 @@ def margins(policy: FilteredPID) -> list[tuple[LoopMargins, Puller]]:
     They are those of a stable loop, whether it is stable or not.
     """
     free, dt = linear_form(policy).free, policy.control_interval
-    omega = frequencies(dt, 400)
     pullers = [make_puller(policy.parameters, lam, policy.meniscus) for lam in (1.0, 0.0)]
-    return [(margins_of(response(opened(free, p, dt, "camera"), dt, omega), omega, dt, True), p) for p in pullers]
+    return [(loop_margins(free, puller, dt, stable=True, points=400), puller) for puller in pullers]
 
 
 def calm(found: Figures, policy: FilteredPID) -> float:
@@ -125,47 +95,39 @@ PIDS: dict[str, dict[str, Any]] = {
     "pid-conventional": {"parameters": LOOP, "limits": (calm, below_half_the_zero, insensitive)},
     "industrial": {"parameters": (Parameter("T_f", 1.0, MINUTE), *HEATER)},
 }
-"""Parameters and limits of the PIDs, as arguments of :class:`PIDGoal`."""
+"""Parameters and limits of the PIDs, as arguments of :func:`pid_goal`."""
 
 
-def _pid_goal(name: str, scenario: Scenario) -> PIDGoal:
-    """The goal of a PID; its search begins with the settings for ``randomized``."""
-    start, given = settings_of(name, RANDOMIZED), PIDS[name]
-    if scenario == RANDOMIZED:
-        return PIDGoal(start, survive=("hard", "hot-zone"), **given)
-    more = ROBUST if beyond(scenario, RANDOMIZED) and isinstance(start, FilteredPID) else ()
-    return PIDGoal(start, survive=(), **given | {"parameters": (*given["parameters"], *more)})
+STEP_PRICE, FAILURE_PRICE, MISS_PRICE = 0.2, 5.0, 2.0
+"""Prices of the pull step RMS [mm per mm/min], of losing every crystal, and of a broken limit [mm]."""
 
 
-@dataclass(frozen=True)
-class LQGGoal(Goal):
-    """Most return, or least radius error, within limits of radius error and pull steps; of order ten."""
+def priced(found: Figures) -> float:
+    """What a PID's search minimises: observable RMSE plus priced pull steps and failures [mm]."""
+    return found.rmse_mm + STEP_PRICE * found.pull_step + FAILURE_PRICE * found.failure_rate
 
-    failure_price: ClassVar[float] = 100.0
-    miss_price: ClassVar[float] = 20.0
-    """Price of the relative excess over a limit."""
-    emphasis: ClassVar[float] = 10.0
-    """Weight of the return of a step, or of the relative radius error."""
 
-    rmse_mm: float
-    """Limit of the observable radius error [mm]."""
-    pull_step: float
-    """Limit of the pull step RMS [mm/min]."""
-    by_return: bool
-    """Whether the mean return is maximised, or the radius error minimised."""
+def pid_goal(start: Any, parameters: tuple[Parameter, ...], survive: tuple[str, ...], limits: Any = ()) -> Goal:
+    """Least priced sum within limits."""
+    return Goal(start, parameters, survive, priced, limits, FAILURE_PRICE, MISS_PRICE)
 
-    def policy(self, settings: LQGDesign, config: Config) -> LQG:
-        """The LQG of a design for an environment."""
-        return LQG(design=settings).for_config(config)
 
-    def objective(self, found: Figures) -> float:
-        """What is minimised within the limits, failures included."""
-        cost = -found.mean_return / found.steps if self.by_return else found.rmse_mm / self.rmse_mm
-        return self.emphasis * cost + self.failure_price * found.failure_rate
+def lqg_goal(
+    start: LQGDesign,
+    parameters: tuple[Parameter, ...],
+    survive: tuple[str, ...],
+    rmse_mm: float,
+    pull_step: float,
+    by_return: bool,
+) -> Goal:
+    """Most return, or least radius error, within an observable RMSE [mm] and a pull step RMS [mm/min]; of order ten."""
 
-    def slack(self, found: Figures, policy: Any) -> tuple[float, float]:
-        """Relative distances to the limits, negative beyond them."""
-        return 1.0 - found.rmse_mm / self.rmse_mm, 1.0 - found.pull_step / self.pull_step
+    def objective(found: Figures) -> float:
+        cost = -found.mean_return / found.steps if by_return else found.rmse_mm / rmse_mm
+        return 10.0 * cost + 100.0 * found.failure_rate
+
+    limits = (lambda found, _: 1.0 - found.rmse_mm / rmse_mm, lambda found, _: 1.0 - found.pull_step / pull_step)
+    return Goal(start, parameters, survive, objective, limits, failure_price=100.0, miss_price=20.0)
 
 
 LQG_PARAMETERS = tuple(Parameter(path, 1e-4, 1e4) for path in SEARCHED)
@@ -181,7 +143,7 @@ LQG_LIMITS: dict[tuple[str, str], tuple[float, float, bool]] = {
     **{(family_name(each), name): (0.3, each, False) for name in FAMILY_SCENARIOS for each in ACTIVITIES},
     (TOLD, "randomized"): (0.3, 0.02, False),
 }
-"""Last three arguments of :class:`LQGGoal`, by controller and scenario."""
+"""Last three arguments of :func:`lqg_goal`, by controller and scenario."""
 
 
 NOMINAL = (TOLD, "paper-filtered", "paper-tuned", "pid-conventional")
@@ -192,17 +154,6 @@ def crystals(name: str, scenario: Scenario) -> Distribution:
     """The crystals on which candidates are scored: for ``randomized`` half of them are of ``hot-zone``."""
     mixed = scenario == RANDOMIZED and name not in NOMINAL
     return make_mixture([(HOT_ZONE, 0.5), (RANDOMIZED, 0.5)]) if mixed else scenario
-
-
-def _lqg_goal(name: str, scenario: Scenario) -> LQGGoal:
-    """The goal of an LQG; its search begins with the design that ships for the scenario."""
-    if (name, scenario.name) not in LQG_LIMITS:
-        known = ", ".join(where for each, where in LQG_LIMITS if each == name)
-        raise CzError(f"{name} has no goal on {scenario.name!r}, but on {known}")
-    first = crystals(name, scenario).scenarios[0].name
-    serves_hard = name in ("lqg", "lqg-quiet") and scenario == RANDOMIZED
-    survive = (first, "hard") if serves_hard else (first,)
-    return LQGGoal(design_of(name, scenario), LQG_PARAMETERS, survive, *LQG_LIMITS[name, scenario.name])
 
 
 QUICK = {"pid.K_p", "pid.T_i", "pid.T_d", "T_f", "compensator.gain", "heater.K", "heater.K_pull", "heater.T_pull"}
@@ -224,12 +175,12 @@ def goal_on(name: str, config: Config) -> Goal:
     if name == for_puller.FILTER:
         design = for_puller.scaled_design(name, config)
         near = tuple(_near(Parameter(path, 0.0, 0.0), design) for path in FILTER_PARAMETERS)
-        return LQGGoal(design, near, (), 0.3 * config.puller.scale, 0.02, False)
+        return lqg_goal(design, near, (), 0.3 * config.puller.scale, 0.02, False)
     if name not in for_puller.PIDS:
         raise CzError(unknown("controller to tune for a puller", name, [*for_puller.PIDS, for_puller.FILTER]))
     start, given = for_puller.scaled_pid(name, config), PIDS[name]
     near = tuple(_near(each, start) for each in given["parameters"] if each.path in QUICK)
-    return PIDGoal(start, survive=("hard",), **given | {"parameters": near})
+    return pid_goal(start, survive=("hard",), **given | {"parameters": near})
 
 
 def _near(parameter: Parameter, start: Any) -> Parameter:
@@ -243,7 +194,20 @@ TUNABLE = (*PIDS, *SHIPPED)
 
 
 def goal_of(name: str, scenario: Scenario) -> Goal:
-    """The goal of a controller's search on a scenario; CzError if there is none."""
+    """The goal of a controller's search on a scenario; CzError if there is none.
+
+    A PID's search begins with the settings for ``randomized``, an LQG's with the design that ships for the scenario.
+    """
     if name not in TUNABLE:
         raise CzError(unknown("controller to tune", name, TUNABLE))
-    return _pid_goal(name, scenario) if name in PIDS else _lqg_goal(name, scenario)
+    if name in PIDS:
+        start, given = settings_of(name, RANDOMIZED), PIDS[name]
+        more = ROBUST if beyond(scenario, RANDOMIZED) and isinstance(start, FilteredPID) else ()
+        survive = ("hard", "hot-zone") if scenario == RANDOMIZED else ()
+        return pid_goal(start, survive=survive, **given | {"parameters": (*given["parameters"], *more)})
+    if (name, scenario.name) not in LQG_LIMITS:
+        known = ", ".join(where for each, where in LQG_LIMITS if each == name)
+        raise CzError(f"{name} has no goal on {scenario.name!r}, but on {known}")
+    serves_hard = name in ("lqg", "lqg-quiet") and scenario == RANDOMIZED
+    survive = (crystals(name, scenario).scenarios[0].name, *(("hard",) if serves_hard else ()))
+    return lqg_goal(design_of(name, scenario), LQG_PARAMETERS, survive, *LQG_LIMITS[name, scenario.name])

@@ -10,17 +10,17 @@ from __future__ import annotations
 
 import json
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from cz_gym.atomic_files import check_writable, naming, write_files
 from cz_gym.baselines.for_puller import with_values
+from cz_gym.baselines.lqg.controller import LQG, LQGDesign
 from cz_gym.baselines.lqg.regulator import STEP_TIME
 from cz_gym.baselines.policy import Floats
 from cz_gym.config import Config
@@ -116,7 +116,7 @@ def file_name(controller: str, scenario: str) -> str:
 
 
 @dataclass(frozen=True)
-class Goal(ABC):
+class Goal:
     """The aim of a controller's search on a scenario: the least objective within limits."""
 
     start: Any
@@ -124,27 +124,23 @@ class Goal(ABC):
     parameters: tuple[Parameter, ...]
     survive: tuple[str, ...]
     """Scenarios that only have to be survived."""
-
-    failure_price: ClassVar[float]
+    objective: Callable[[Figures], float]
+    """What is minimised within the limits, failures included."""
+    limits: tuple[Callable[[Figures, Any], float], ...]
+    """Distances to the limits by figures and controller, negative beyond them."""
+    failure_price: float
     """Cost of losing every crystal."""
-    miss_price: ClassVar[float]
-    """Price of a negative slack."""
+    miss_price: float
+    """Price of a negative distance."""
 
-    @abstractmethod
     def policy(self, settings: Any, config: Config) -> Any:
-        """The controller with these settings."""
-
-    @abstractmethod
-    def objective(self, found: Figures) -> float:
-        """What is minimised within the limits, failures included."""
-
-    @abstractmethod
-    def slack(self, found: Figures, policy: Any) -> tuple[float, ...]:
-        """Distances to the limits, negative beyond them."""
+        """The controller with these settings, which are an LQG's design or a controller, for an environment."""
+        return (LQG(design=settings) if isinstance(settings, LQGDesign) else settings).for_config(config)
 
     def cost(self, found: Figures, policy: Any) -> float:
         """The objective plus the price of missed limits: the score of the figures on the scenario itself."""
-        return self.objective(found) + self.miss_price * sum(max(0.0, -each) for each in self.slack(found, policy))
+        missed = sum(max(0.0, -limit(found, policy)) for limit in self.limits)
+        return self.objective(found) + self.miss_price * missed
 
 
 class Search:
@@ -158,6 +154,7 @@ class Search:
         self.budget, self.trials = {"trials": trials, "episodes": episodes}, list[Trial]()
         self.path: Path | None = None
         """File of the trials; None for none."""
+        self._paths = [parameter.path for parameter in goal.parameters]
 
     @property
     def first(self) -> tuple[float, ...]:
@@ -169,28 +166,28 @@ class Search:
         return with_values(self.goal.start, dict(zip(self._paths, values, strict=True)))
 
     def explore(self) -> None:
-        """Minimise the objective with COBYLA while every slack is positive."""
+        """Minimise the objective with COBYLA while every limit is kept."""
         from scipy.optimize import NonlinearConstraint, minimize
 
         goal = self.goal
 
-        def found(point: Floats) -> tuple[Figures, Any]:
+        def tried(point: Floats) -> tuple[tuple[float, ...], Figures]:
             values = tuple(p.value(x) for p, x in zip(goal.parameters, point, strict=True))
             known = {trial.values: trial for trial in self.trials}
-            figures = (known.get(values) or self.add(values)).facts["figures"]
-            return Figures(**figures), goal.policy(self.settings(values), self.config)
+            return values, Figures(**(known.get(values) or self.add(values)).facts["figures"])
 
-        def slack(point: Floats) -> tuple[float, ...]:
-            return goal.slack(*found(point))
+        def objective(point: Floats) -> float:
+            return goal.objective(tried(point)[1])
+
+        def distances(point: Floats) -> tuple[float, ...]:
+            values, figures = tried(point)
+            policy = goal.policy(self.settings(values), self.config)
+            return tuple(limit(figures, policy) for limit in goal.limits)
 
         start = np.array([p.coordinate(value) for p, value in zip(goal.parameters, self.first, strict=True)])
-        limits: Any = [NonlinearConstraint(slack, 0.0, np.inf)] if slack(start) else []
+        limits: Any = [NonlinearConstraint(distances, 0.0, np.inf)] if goal.limits else []
         options: Any = {"maxiter": self.budget["trials"], "rhobeg": FIRST_STEP, "tol": 1e-3}
-
-        def minimised(point: Floats) -> float:
-            return goal.objective(found(point)[0])
-
-        minimize(minimised, start, method="COBYLA", constraints=limits, options=options)
+        minimize(objective, start, method="COBYLA", constraints=limits, options=options)
 
     def add(self, values: tuple[float, ...]) -> Trial:
         """Score a candidate on training episodes; one that would be the best must also survive other scenarios."""
@@ -225,18 +222,20 @@ class Search:
         check_writable(path.parent)
         self.path = path
         if path.exists():
-            episodes, self.trials = self._read(path)
-            if episodes != self.budget["episodes"]:
-                raise CzError(f"{path} was begun with {episodes} episodes; ask for as many, or write another file")
+            self._read(path)
         self.explore()
         twice = 2 * self.budget["episodes"]
         found = [self._scored(trial.values, VALIDATION_SEEDS[:twice], twice) for trial in self.best(FINALISTS)]
         judged = sorted(found, key=lambda trial: trial.score)
-        self._write({"chosen": self._entry(judged[0]), "finalists": [self._entry(trial) for trial in judged]})
+        entries = [
+            {"score": trial.score, "values": dict(zip(self._paths, trial.values, strict=True)), **trial.facts}
+            for trial in judged
+        ]
+        self._write({"chosen": entries[0], "finalists": entries})
         return judged[0]
 
-    def _read(self, path: Path) -> tuple[int, list[Trial]]:
-        """Training episodes and trials of a file; CzError if it is none, or of another search."""
+    def _read(self, path: Path) -> None:
+        """Take up the trials of a file; CzError if it is none, or of another search."""
         try:
             with naming(path):
                 found = json.loads(path.read_text("utf-8"))
@@ -244,17 +243,12 @@ class Search:
                 raise CzError(f"its parameters are not those of {self.controller}")
             if found.get("puller", DEFAULT.label) != self.config.puller.label:
                 raise CzError(f"it is of puller {found['puller']}: remove it to begin anew")
-            trials = [Trial(tuple(values), score, facts) for values, score, facts in found["history"]]
-            return found["budget"]["episodes"], trials
+            self.trials = [Trial(tuple(values), score, facts) for values, score, facts in found["history"]]
+            episodes = found["budget"]["episodes"]
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise CzError(f"{path} is no history of this search: {error!r}") from None
-
-    def _entry(self, trial: Trial) -> dict[str, Any]:
-        return {"score": trial.score, "values": dict(zip(self._paths, trial.values, strict=True)), **trial.facts}
-
-    @property
-    def _paths(self) -> list[str]:
-        return [parameter.path for parameter in self.goal.parameters]
+        if episodes != self.budget["episodes"]:
+            raise CzError(f"{path} was begun with {episodes} episodes; ask for as many, or write another file")
 
     def _write(self, choice: Mapping[str, Any]) -> None:
         if self.path is None:

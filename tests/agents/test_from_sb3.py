@@ -2,9 +2,6 @@
 
 import os
 import shlex
-import subprocess
-import sys
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,7 +25,6 @@ from cz_gym.agents.apg import APG
 from cz_gym.agents.export import to_onnx
 from cz_gym.config import make_config
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
-from tests.processes import ROOT
 
 ON = {"n_steps": 16, "batch_size": 32, "n_epochs": 1}
 OFF = {"learning_starts": 8, "buffer_size": 64, "batch_size": 8}
@@ -236,19 +232,6 @@ def test_a_file_that_would_act_otherwise_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(AgentFileError, match=r"otherwise than the model, by up to 0\.01"):
         from_sb3.save_agent(tmp_path / "mine.onnx", model, "mine")
     assert not list(tmp_path.iterdir())
-
-
-def test_converting_without_stable_baselines3_says_what_to_install() -> None:
-    code = (
-        "import sys; sys.modules['stable_baselines3'] = sys.modules['torch'] = None\n"
-        "from cz_gym.agents import from_sb3\n"
-        "sys.exit(from_sb3.main(['a.zip', '--algo', 'ppo', '--out', 'b.onnx']))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
-    assert 'pip install ".[agents]"' in done.stderr
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    assert any(name.startswith("stable-baselines3") for name in extras["agents"])
 
 
 @pytest.mark.parametrize(

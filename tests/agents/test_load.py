@@ -77,8 +77,3 @@ def test_an_environment_refuses_an_agent_that_is_not_made_for_it(other: dict[str
     own.step(agent.predict(own.reset(seed=1)[0])[0])
     with pytest.raises(InvalidAction, match=r"made for action='smooth', control_interval=5, plant .*; the environment"):
         env.step(agent.predict(env.reset(seed=1)[0])[0])
-
-
-def test_an_agent_refuses_another_observation() -> None:
-    with pytest.raises(ValueError, match=r"expected 72 channels \(history\), got shape \(11,\): gym.make"):
-        agents.load("ppo").predict(np.zeros(11, np.float32))

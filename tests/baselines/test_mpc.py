@@ -186,10 +186,3 @@ def test_without_casadi_one_line_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "casadi", None)
     with pytest.raises(ImportError, match=r"^this needs the package casadi: pip install '\.\[mpc\]'$"):
         find_controller("ekf-mpc").make(make_config(**PLAIN))
-
-
-def test_the_hash_of_mpc_follows_its_settings():
-    config = make_config("randomized", **PLAIN)
-    assert ekf_mpc(config).hash == ekf_mpc(config).hash
-    others = (replace(ekf_mpc(config), horizon=400.0), EkfMpc(), ekf_mpc(make_config("puller", **PLAIN)))
-    assert len({ekf_mpc(config).hash, *(other.hash for other in others)}) == 4

@@ -152,13 +152,6 @@ def test_readings_that_are_not_finite_are_not_read(name, bad, value, start):
         np.testing.assert_allclose(found[-1], usual[-1], atol=5e-3 if name.startswith("lqg") else 1e-7)
 
 
-def test_mpc_does_not_read_what_is_not_finite():
-    pytest.importorskip("casadi", reason="needs the extra mpc")
-    rows = np.repeat(ROW[None], 4, axis=0)
-    rows[1, :, :] = math.nan
-    assert np.isfinite(actions_of(make_controller("ekf-mpc", make_config(**PLAIN)), rows)).all()
-
-
 @pytest.mark.parametrize("name", ["paper", "paper-tuned", "industrial", "lqg"])
 @pytest.mark.parametrize("garbage", [math.nan, 0.0, 9.0])
 def test_a_ring_that_is_not_valid_is_not_read(name, garbage):
@@ -175,20 +168,14 @@ def test_a_ring_that_is_not_valid_is_not_read(name, garbage):
     ("kind", "wrong"),
     [
         (SeriesPID, {"K_p": -0.01}),
-        (SeriesPID, {"K_p": 0.0}),
         (SeriesPID, {"T_i": 0.0}),
-        (SeriesPID, {"T_d": -1.0}),
         (SeriesPID, {"N": math.nan}),
         (Compensator, {"fast": -1e-3}),
-        (CompensatedPID, {"T_iT": 0.0}),
         (CompensatedPID, {"control_interval": 0.0}),
         (FilteredPID, {"T_f": -1.0}),
-        (FilteredPID, {"T_track": 0.0}),
         (TemperatureLoop, {"T_i": 0.0}),
-        (TemperatureLoop, {"K": -1.0}),
         (Industrial, {"T_f": 0.0}),
         (NoiseModel, {"slow_tau": 0.0}),
-        (NoiseModel, {"pyrometer_sd": 0.0}),
         (RingModel, {"latency": -5.0}),
     ],
 )

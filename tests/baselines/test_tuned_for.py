@@ -29,14 +29,6 @@ def test_named_scenarios_have_their_own_settings_or_those_of_randomized(scenario
         assert settings_of(name, scenario) == SHIPPED.get((name, scenario.name), SHIPPED[name, "randomized"])
 
 
-@pytest.mark.parametrize(
-    "scenario", ["randomized", "hard", "nominal", "paper-ramp", "reference-a", "only-sensor", "hot-zone"]
-)
-def test_designs_are_those_that_were_published(scenario):
-    assert design_of("lqg", SCENARIOS[scenario]).hash == "732cdecaebde8f86"
-    assert design_of("lqg-quiet", SCENARIOS[scenario]).hash == "3f9b89424d75f74e"
-
-
 @pytest.mark.parametrize("scenario", [RANDOMIZED, HARD, SENSOR_FAULT, PULLER], ids=NAMES)
 def test_another_name_changes_nothing(scenario):
     other = replace(scenario, name="mine", drift=replace(scenario.drift, amount=(-1.0, 1.0)))

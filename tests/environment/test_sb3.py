@@ -117,7 +117,7 @@ def test_stable_baselines3s_checker_on_every_scenario(observation: str) -> None:
 
 @pytest.mark.parametrize("form", ["vector_entry_point", "sync"])
 def test_gymnasiums_wrapper_counts_the_episodes_of_both_forms(form: str) -> None:
-    """Wrappers of single-file training loops; CleanRL's own is in ``tests/examples``."""
+    """Wrappers of single-file training loops, as CleanRL's."""
     envs: Any = gym.make_vec("Cz-v0", num_envs=4, vectorization_mode=form, control_interval=20.0, horizon=400.0)
     envs = gym.wrappers.vector.RecordEpisodeStatistics(envs)
     envs.reset(seed=1)

@@ -43,10 +43,10 @@ def test_a_controllers_margins_are_the_design_tables(tmp_path: Path, capsys: pyt
 def test_phases_are_read_against_minus_180_degrees() -> None:
     """The phase above -180 degrees at a gain of one is python-control's phase margin."""
     form, puller = bode.form_of("paper"), make_puller(lam=1.0)
-    values, found = bode.margins(form, puller, "v_p")
-    phase = bode.phase_of(values)
+    omega, found = bode.frequencies(form.dt), loop_margins(form.free, puller, form.dt, "v_p")
+    phase = bode.phase_of(bode.response(bode.opened(form.free, puller, form.dt, "v_p"), form.dt, omega))
     assert -360.0 <= phase[0] < 0.0
-    at = np.argmin(np.abs(np.log(bode.frequencies(form.dt) / found.crossover)))
+    at = np.argmin(np.abs(np.log(omega / found.crossover)))
     assert phase[at] + 180.0 == pytest.approx(found.phase_deg, abs=1.0)
 
 

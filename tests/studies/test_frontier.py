@@ -4,8 +4,7 @@ import json
 
 import pytest
 
-from cz_gym.baselines.lqg.designs import ACTIVITIES, family_name
-from cz_gym.baselines.registry import find_controller
+from cz_gym.baselines.lqg.designs import family_name
 from studies import frontier
 
 
@@ -33,12 +32,6 @@ def test_another_file_is_refused_in_a_line(content, tmp_path, refused):
     (tmp_path / "x.json").write_text(content)
     refused(frontier.main, [str(tmp_path / "x.json")])
     refused(frontier.main, [str(tmp_path / "none.json")])
-
-
-def test_an_lqg_as_active_as_ppo_stands_in_the_default_table():
-    """And no other of the family: they run when named."""
-    shown = {name: find_controller(name).default for name in map(family_name, ACTIVITIES)}
-    assert [name for name, default in shown.items() if default] == ["lqg-at-0.02"]
 
 
 def test_episodes_beside_a_benchmark_give_intervals_unless_they_are_of_another_run(tmp_path, capsys, refused):

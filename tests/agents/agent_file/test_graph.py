@@ -11,7 +11,7 @@ from onnx import TensorProto, helper, numpy_helper, parser
 
 from cz_gym.agents import AgentFileError, OnnxPolicy, shipped
 from cz_gym.agents.agent_file.contract import make_contract, read_agent
-from cz_gym.agents.agent_file.graph import MAX_ACTIVATIONS, MAX_NODES, OPERATORS, GraphError, checked
+from cz_gym.agents.agent_file.graph import MAX_ACTIVATIONS, MAX_NODES, OPERATORS, checked
 from cz_gym.config import make_config
 from cz_gym.observation import MEASURED
 from tests import contracts
@@ -269,14 +269,3 @@ def test_every_operator_is_a_standard_one_without_control_flow() -> None:
     for name in OPERATORS:
         schema = onnx.defs.get_schema(name, 17)
         assert not any("GRAPH" in str(attribute.type) for attribute in schema.attributes.values())
-
-
-def test_metadata_of_a_graph_are_dropped() -> None:
-    model = model_of()
-    model.metadata_props.add(key="note", value="x" * 1000)
-    model.graph.doc_string = "y" * 1000
-    clean, _ = checked(model.SerializeToString(), CHANNELS)
-    assert b"xxx" not in clean
-    assert b"yyy" not in clean
-    with pytest.raises(GraphError):
-        checked(b"garbage", CHANNELS)

@@ -16,7 +16,6 @@ from cz_gym.agents import AgentFileError
 from cz_gym.agents.training import fleet, run
 from cz_gym.agents.training.recipes import PPO, RECIPES, Recipe
 from cz_gym.atomic_files import locked
-from cz_gym.evaluation import processes
 from tests.small_learners import REFERENCES, train_small_seed
 
 pytestmark = pytest.mark.usefixtures("few_crystals")
@@ -50,7 +49,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         return train_small_seed(job, bar)
 
     monkeypatch.setattr(fleet, "train_seed", counted)
-    monkeypatch.setattr(processes, "in_processes", in_turn)
+    monkeypatch.setattr(fleet, "in_processes", in_turn)
     monkeypatch.setitem(RECIPES, "ppo", SMALL_PPO)
     return seeds
 
@@ -66,14 +65,13 @@ def sessions(folder: Path) -> list[int]:
 
 
 def jobs(folder: Path, seeds: range, recipe: Recipe = SMALL_PPO) -> list[run.Job]:
-    options = REFERENCES, 60.0, False, ["train.py", "--seeds"]
-    return [run.Job(folder / f"seed{seed}", recipe, seed, *options) for seed in seeds]
+    return [run.Job(folder / f"seed{seed}", recipe, seed, REFERENCES) for seed in seeds]
 
 
-def done(some: list[run.Job], perform: fleet.Perform) -> list[int]:
+def done(some: list[run.Job]) -> list[int]:
     """Seeds in the order they were finished; the bar has counted them all."""
     with tqdm(total=len(some), file=io.StringIO()) as bar:
-        seeds = [job.seed for job, _ in fleet.train_seeds(some, perform, bar)]
+        seeds = [job.seed for job, _ in fleet.train_seeds(some, bar)]
         assert bar.n == pytest.approx(len(some))
     return seeds
 
@@ -156,22 +154,10 @@ def test_a_folder_in_use_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert not trained
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--seeds", "3"], "must be FIRST-LAST"),
-        (["--seeds", "9-0"], "must be FIRST-LAST"),
-        (["--seeds", "0-99999999999"], "at most 1000 seeds"),
-        (["--seeds", "0-1", "--seed", "0"], "not allowed with"),
-    ],
-)
-def test_impossible_arguments_exit_with_2(arguments: list[str], message: str, refused: Any) -> None:
-    assert message in refused(train.main, arguments)
-
-
 @pytest.mark.slow
 def test_processes_train_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fleet, "train_seed", train_small_seed)
-    assert sorted(done(jobs(tmp_path / "there", range(3)), processes.in_processes)) == [0, 1, 2]
-    assert done(jobs(tmp_path / "here", range(3)), in_turn) == [0, 1, 2]
+    assert sorted(done(jobs(tmp_path / "there", range(3)))) == [0, 1, 2]
+    monkeypatch.setattr(fleet, "in_processes", in_turn)
+    assert done(jobs(tmp_path / "here", range(3))) == [0, 1, 2]
     assert agents(tmp_path / "there") == agents(tmp_path / "here")

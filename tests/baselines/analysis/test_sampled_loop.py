@@ -16,7 +16,6 @@ from cz_gym.baselines.analysis.sampled_loop import HOT_ZONE, NotLinearError, clo
 from cz_gym.baselines.lqg.designs import FAMILY, TOLD
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
-from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
 from cz_gym.baselines.registry import make_controller
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Scenario, Sensor
@@ -140,16 +139,6 @@ def test_noise_gains_are_those_of_the_simulated_plant():
     v_p = run.signals.v_p[200:] - make_puller().v_0
     for power, gains in ((v_p, kick), (np.diff(v_p, axis=0), np.diff(kick, prepend=0.0))):
         assert np.std(power) / (0.002 * MM) == pytest.approx(np.linalg.norm(gains), rel=0.03)
-
-
-def test_trim_of_the_recipe_stands_in_the_loop():
-    plain = linear_controller(FilteredPID(T_f=0.0))
-    trimmed = linear_controller(FilteredPID(T_f=0.0, heater=TemperatureLoop(K_pull=5.0)))
-    puller = make_puller()
-    crossovers = [loop_margins(each, puller, 5.0).crossover for each in (plain, trimmed)]
-    assert crossovers[0] == pytest.approx(crossovers[1], rel=0.02)
-    slow = [np.abs(response(opened(c, puller, 5.0, "v_p"), 5.0, np.array([1e-4]))) for c in (plain, trimmed)]
-    assert abs(slow[0] / slow[1] - 1.0) > 0.1
 
 
 def test_controllers_that_are_not_linear_are_named():

@@ -14,7 +14,6 @@ from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.physics.plant import hidden_load
 from cz_gym.units import HOUR
 from tests.observed import PLAIN, observations
 
@@ -61,11 +60,6 @@ def test_other_slots_than_the_known_ones_are_refused():
     privileged = lqg_bounds.PrivilegedLQG().for_episodes(make_config("randomized", **PLAIN), [1, 2])
     with pytest.raises(ValueError, match="2 pullers are known, got 3 slots"):
         privileged.predict(next(observations()))
-
-
-def test_the_drift_is_read_off_its_load():
-    drift = np.linspace(-7.5, 7.5, 7)
-    np.testing.assert_allclose(lqg_bounds._drift(hidden_load(drift, PULLER), PULLER), drift, atol=1e-6)
 
 
 def test_full_information_beats_the_filter_on_the_same_episodes():

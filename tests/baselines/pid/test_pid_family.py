@@ -140,8 +140,3 @@ def test_conventional_loop_keeps_the_papers_rule():
     assert policy.T_start > 0.0
     puller = make_puller()
     assert loop_margins(linear_form(policy).free, puller, 5.0).crossover < 0.5 * radius_model(puller).zero
-
-
-def test_the_rule_of_half_the_zero_measures_its_breach():
-    fast = FilteredPID(pid=SeriesPID(K_p=0.02, T_i=2000.0, T_d=300.0, N=6.0), compensator=None, T_f=10.0)
-    assert below_half_the_zero(None, fast) < -0.2

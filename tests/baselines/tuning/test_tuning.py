@@ -17,10 +17,10 @@ from cz_gym.baselines.tuning.goals import (
     LQG_LIMITS,
     LQG_PARAMETERS,
     PIDS,
-    LQGGoal,
-    PIDGoal,
     crystals,
     goal_of,
+    lqg_goal,
+    pid_goal,
 )
 from cz_gym.baselines.tuning.search import Figures, Parameter, Search, file_name, measure, value_at
 from cz_gym.config import make_config
@@ -47,7 +47,7 @@ def bowl(trials=40, episodes=4, parameters=PARAMETERS):
         error = np.log10(policy.T_f / 10.0) ** 2 + (policy.K_ff - 0.5) ** 2
         return FIGURES._replace(rmse_mm=float(error) if seeds[0] < 1_000_000 else 1.0 / policy.T_f, pull_step=0.0)
 
-    return Search("bowl", PIDGoal(FilteredPID(), parameters, ()), CONFIG, trials, episodes, figures), met
+    return Search("bowl", pid_goal(FilteredPID(), parameters, ()), CONFIG, trials, episodes, figures), met
 
 
 def test_validation_chooses_among_the_best_of_training(tmp_path):
@@ -140,7 +140,7 @@ def test_every_parameter_sets_what_it_names_and_a_search_begins_with_the_setting
 
 
 def test_the_cost_of_a_pid_is_its_priced_sum():
-    goal = PIDGoal(FilteredPID(), (), (), (lambda *_: -0.5, lambda *_: -0.25, lambda *_: 9.0))
+    goal = pid_goal(FilteredPID(), (), (), (lambda *_: -0.5, lambda *_: -0.25, lambda *_: 9.0))
     found = FIGURES._replace(failure_rate=0.1)
     assert goal.cost(found, None) == pytest.approx(0.06 + 0.2 * 0.01 + 5.0 * 0.1 + 2.0 * 0.75)
 
@@ -148,7 +148,7 @@ def test_the_cost_of_a_pid_is_its_priced_sum():
 # LQGs
 
 START = LQGDesign()
-GOAL = LQGGoal(START, LQG_PARAMETERS, ("hard", "puller"), 0.07, 0.02, True)
+GOAL = lqg_goal(START, LQG_PARAMETERS, ("hard", "puller"), 0.07, 0.02, True)
 
 
 def logarithms(design):

@@ -1,24 +1,27 @@
-"""Evaluation of trained agents on every random scenario, and the table and learning curves of a comparison."""
+"""Trained agents side by side, several training seeds each: ``python -m studies.algorithms RUNS``.
+
+``RUNS`` are folders of ``train.py``: of one run, or of ``--seeds``. Every agent is evaluated on every random scenario;
+``--out`` receives the table and the learning curves.
+"""
 
 from __future__ import annotations
 
+import argparse
+import sys
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from cz_gym.agents.policies.onnx import OnnxPolicy
-from cz_gym.agents.training import validation
-from cz_gym.agents.training.fleet import train_seed
-from cz_gym.agents.training.run import Job
-from cz_gym.agents.training.run_files import read_rows, to_csv
-from cz_gym.agents.training.validation import REFERENCES, references
-from cz_gym.baselines.registry import make_controller
-from cz_gym.config import Config
+from cz_gym.atomic_files import check_writable, write_files
+from cz_gym.commands import OneLineParser
+from cz_gym.config import make_config
 from cz_gym.episodes.scenarios import find_scenario
+from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.processes import in_processes
 from cz_gym.evaluation.protocol import ROWS
-from cz_gym.evaluation.report.canvas import INK, canvas, png, styles
 from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.rollout import Floats, rollout
 from cz_gym.evaluation.statistics import Estimate, Resamples, means
@@ -36,8 +39,6 @@ COLUMNS = (
     ("pull step [um/min]", MICRON, ".1f"),
 )
 """Heading, unit and format of each figure of :func:`evaluate`."""
-AXES = (("steps", 1e6, "environment steps [million]"), ("seconds", 60.0, "minutes on a core, validation included"))
-"""Horizontal axes of the learning curves: column of a run's progress, unit, label."""
 ABOUT = """RMSE of the radius on {crystals} validation crystals of each scenario that did not choose a run's agent; of
 each run the agent of least cost on the validation that selects. Lost: share of all these crystals. Cost and pull step:
 on `{scenario}`. In brackets: 95 % intervals, bootstrap over training seeds and crystals; with few training seeds they
@@ -47,27 +48,28 @@ are somewhat too narrow. Differences are taken on the same crystals and training
 class Result(NamedTuple):
     """Figures of one training run."""
 
+    name: str
+    """Name of the agent."""
+    seed: int
     figures: Floats
-    """Figures as :func:`evaluate` returns them, shape (crystals, figures)."""
+    """Figures of :data:`COLUMNS` on the validation crystals that chose no agent, shape (crystals, figures)."""
     progress: Sequence[Mapping[str, float]]
     """Rows of the run's ``progress.csv``."""
 
 
-def train_and_evaluate(job: Job) -> Result:
-    """Train a run to its end, from its checkpoint if there is one, and evaluate its best agent."""
-    if job.summary is None:
-        train_seed(job._replace(references=references(make_controller, job.recipe)))
-    config = job.recipe.config
-    rows = [{name: float(value) for name, value in row.items()} for row in read_rows(job.folder / "progress.csv")]
-    return Result(evaluate(OnnxPolicy.load(job.folder / "agent.onnx", config), config), rows)
+def evaluate(folder: Path) -> Result:
+    """Evaluate the agent of a finished run."""
+    from cz_gym.agents import load
+    from cz_gym.agents.training import validation
+    from cz_gym.agents.training.run_files import read_rows
 
-
-def evaluate(policy: Any, config: Config) -> Floats:
-    """Figures of :data:`COLUMNS` on the validation crystals that chose no agent, shape (crystals, figures)."""
-    found = [metrics(rollout(policy, config.with_scenario(name), validation.JUDGING)) for name in SCENARIOS]
+    agent = load(folder / "agent.onnx")
+    configs = [make_config(name, **agent.settings) for name in SCENARIOS]
+    found = [metrics(rollout(agent, config, validation.JUDGING)) for config in configs]
     lost = np.mean([each.failure_rate for each in found], axis=0)
     columns = *(each.rmse_mm for each in found), lost, found[0].cost, found[0].pull_step_rms_mm_per_min
-    return np.stack(columns, axis=-1)
+    rows = [{name: float(value) for name, value in row.items()} for row in read_rows(folder / "progress.csv")]
+    return Result(agent.contract.algorithm, agent.contract.training_seed, np.stack(columns, axis=-1), rows)
 
 
 Results = Mapping[str, Mapping[int, Result]]
@@ -85,23 +87,28 @@ class Line(NamedTuple):
 
 def report(results: Results) -> dict[str, bytes]:
     """``table.md``, ``curves.png`` and ``curves.csv``, by file name."""
+    from cz_gym.agents.training.plot import curves
+    from cz_gym.agents.training.run_files import to_csv
+
     lines = tabulate(results)
-    about = ABOUT.format(crystals=len(validation.JUDGING), scenario=SCENARIOS[0])
+    crystals = len(next(iter(lines[0].runs.values())).figures)
+    about = ABOUT.format(crystals=crystals, scenario=SCENARIOS[0])
     title = "# Algorithms side by side: the recipes of train.py on the same crystals"
     text = "\n".join([title, "", about, "", to_markdown(lines), ""])
+    progress = {name: [run.progress for run in runs.values()] for name, runs in results.items()}
     rows = [
         {"variant": name, "seed": seed, **row}
         for name, runs in results.items()
         for seed, run in runs.items()
         for row in run.progress
     ]
-    return {"table.md": text.encode(), "curves.png": curves(lines), "curves.csv": to_csv(rows)}
+    return {"table.md": text.encode(), "curves.png": curves(progress), "curves.csv": to_csv(rows)}
 
 
 def tabulate(results: Results) -> list[Line]:
     """A line for each recipe with results."""
     lines = []
-    for name, mine in ((name, runs) for name, runs in results.items() if runs):
+    for name, mine in results.items():
         others = results.get(BASE, {}) if name != BASE else {}
         values = np.array([run.figures for run in mine.values()])
         weights = Resamples.draw(values.shape[1])
@@ -129,32 +136,27 @@ def to_markdown(lines: list[Line]) -> str:
     return markdown(("", "seeds", *(head for head, *_ in COLUMNS), "million steps", "minutes"), rows)
 
 
-def curves(lines: list[Line]) -> bytes:
-    """Validation RMSE while learning against steps and minutes, a line a training seed, as PNG.
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    parser = OneLineParser("python -m studies.algorithms", (__doc__ or "").split("\n")[0])
+    parser.add_argument("runs", type=Path, nargs="+", help="folder of a finished run of train.py, or of several")
+    about = "folder of the results (default: %(default)s)"
+    parser.add_argument("--out", type=Path, default=Path("results/algorithms"), help=about)
+    return parser.run(_compare, arguments, "agents,benchmark")
 
-    Dashed: the classical controllers on the same crystals.
-    """
-    figure = canvas(9.4, 4.6)
-    panels = figure.subplots(1, 2, sharey=True)
-    style, last = styles([line.name for line in lines]), next(iter(lines[0].runs.values())).progress[-1]
-    for axis, (column, unit, title) in zip(panels, AXES, strict=True):
-        for line in lines:
-            for place, run in enumerate(line.runs.values()):
-                spent = [row[column] / unit for row in run.progress]
-                error = [row["validation_rmse_mm"] for row in run.progress]
-                look = {"color": style[line.name].colour, "marker": style[line.name].marker}
-                label = line.name if place == 0 and axis is panels[0] else None
-                axis.plot(spent, error, ms=2.5, lw=1.0, label=label, **look)
-        for name in REFERENCES:
-            rmse = last[f"{name}_rmse_mm"]
-            axis.axhline(rmse, color=INK, lw=0.9, ls="--")
-            if axis is panels[0]:
-                axis.annotate(name, (0.99, rmse), (0, 2), axis.get_yaxis_transform(), textcoords="offset points",
-                              ha="right", fontsize=8, color=INK)  # fmt: skip
-        axis.set(xscale="log", yscale="log", xlabel=title)
-        for each in (axis.xaxis, axis.yaxis):
-            each.set_major_formatter(lambda value, position: f"{value:g}")
-    panels[0].set_ylabel("validation RMSE of the radius [mm]")
-    figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=8)
-    figure.suptitle("Radius error on validation crystals while learning: a line a training seed", fontsize=11)
-    return png(figure)
+
+def _compare(given: argparse.Namespace) -> None:
+    check_writable(given.out)
+    folders = sorted(path.parent for runs in given.runs for path in runs.glob("**/summary.json"))
+    if not folders:
+        raise CzError(f"no finished run of train.py in {', '.join(map(str, given.runs))}")
+    found = dict(in_processes(evaluate, folders))
+    results: dict[str, dict[int, Result]] = {}
+    for each in (found[number] for number in range(len(folders))):
+        results.setdefault(each.name, {})[each.seed] = each
+    write_files({given.out / name: content for name, content in report(results).items()})
+    print(f"wrote {given.out / 'table.md'}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,1 +1,0 @@
-"""Learning algorithms, and changes of a recipe, side by side: ``python -m studies.algorithms``."""
