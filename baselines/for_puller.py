@@ -11,9 +11,9 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
+from functools import partial, reduce
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -49,41 +49,41 @@ ERROR_SHARE = 0.5
 """Share of such a drive's window that the radius error alone may ask for [-]."""
 
 
-class Scale(NamedTuple):
-    """A puller relative to the default one."""
-
-    time: float
-    """Its time scale."""
-    gain: float
-    """A PID's gain."""
-    compensator: float
-    """The compensator's gain."""
-    lead: float
-    """The ring's lead coefficient."""
-    heat: float
-    """The heater's capacity."""
-    trim: float
-    """The melt temperature that changes growth by v_0."""
+SCALED = {
+    "time": ("pid.T_i", "pid.T_d", "T_f", "T_start", "T_track", "heater.T_i", "heater.T_pull", "heater.T_mean"),
+    "rate": ("compensator.fast", "compensator.slow"),
+    "gain": ("pid.K_p", "gain"),
+    "compensator": ("compensator.gain",),
+    "lead": ("ring_lead",),
+    "heat": ("heater.K",),
+    "trim": ("heater.K_pull", "heater.limit"),
+}
+"""Numbers of a PID's settings, by what they are in proportion to: :func:`scale_of`."""
 
 
-def models(config: Config) -> tuple[RadiusModel, RadiusModel]:
-    """Model I of the default puller and of an environment's."""
-    return radius_model(make_puller()), radius_model(make_puller(config.parameters, 1.0, config.meniscus))
+def scale_of(config: Config) -> dict[str, float]:
+    """The environment's puller relative to the default one, on Model I of both [-].
 
-
-def scale_of(config: Config) -> Scale:
-    """The environment's puller relative to the default one."""
-    default, own = models(config)
-    time = default.zero / own.zero
+    Its time scale and the inverse; the gains of a PID and of a compensator; the ring's lead coefficient; the heater's
+    capacity; the melt temperature that changes growth by v_0.
+    """
+    default, own = radius_model(make_puller()), model_of(config)
+    time, trims = default.zero / own.zero, [_trim(make_puller(of)) for of in (config.parameters, DEFAULT.parameters)]
     gains = [design_compensator(model, CUT_OFF / slower).gain for model, slower in ((own, time), (default, 1.0))]
-    return Scale(
-        time,
-        gain=default.numerator / own.numerator / time**2,
-        compensator=gains[0] / gains[1],
-        lead=own.lead / default.lead,
-        heat=config.parameters.C_1 / DEFAULT.parameters.C_1,
-        trim=_trim(make_puller(config.parameters)) / _trim(make_puller()),
-    )
+    return {
+        "time": time,
+        "rate": 1.0 / time,
+        "gain": default.numerator / own.numerator / time**2,
+        "compensator": gains[0] / gains[1],
+        "lead": own.lead / default.lead,
+        "heat": config.parameters.C_1 / DEFAULT.parameters.C_1,
+        "trim": trims[0] / trims[1],
+    }
+
+
+def model_of(config: Config) -> RadiusModel:
+    """Model I of an environment's puller."""
+    return radius_model(make_puller(config.parameters, 1.0, config.meniscus))
 
 
 def _trim(p: Puller) -> float:
@@ -100,45 +100,28 @@ def paper_here(config: Config) -> FilteredPID:
     does not say is that of ``paper-tuned`` (measurement filter, anti-windup, heater): with tight drives the printed
     controller winds up.
     """
-    (_, own), pid = models(config), _slower(SeriesPID(), scale_of(config))
-    compensator = design_compensator(own, CUT_OFF / scale_of(config).time)
-    known = scaled_pid("paper-tuned", config)
-    assert isinstance(known, FilteredPID)
-    return replace(known, pid=pid, compensator=compensator, ring_lead=0.0, K_ff=0.0)
-
-
-def _slower(pid: SeriesPID, scale: Scale) -> SeriesPID:
-    """A PID for a puller of that scale."""
-    return replace(pid, K_p=scale.gain * pid.K_p, T_i=scale.time * pid.T_i, T_d=scale.time * pid.T_d)
+    printed = replace(settings_of("paper-tuned", RANDOMIZED), pid=SeriesPID(), ring_lead=0.0, K_ff=0.0)
+    compensator = design_compensator(model_of(config), CUT_OFF / scale_of(config)["time"])
+    made: FilteredPID = replace(_scaled(printed, config), compensator=compensator)
+    return made
 
 
 def scaled_pid(name: str, config: Config) -> FilteredPID | Industrial:
     """A PID's settings for the default puller, in proportion to this one."""
-    scale, known = scale_of(config), settings_of(name, RANDOMIZED)
-    times, loop = ("T_i", "T_pull", "T_mean"), known.heater
-    slower = {each: scale.time * getattr(loop, each) for each in times}
-    heater = replace(
-        loop, K=scale.heat * loop.K, K_pull=scale.trim * loop.K_pull, limit=scale.trim * loop.limit, **slower
-    )
-    if isinstance(known, Industrial):
-        return replace(known, gain=scale.gain * known.gain, heater=heater).for_config(config)
-    compensator = known.compensator
-    outliers = any(each.sensor.outlier_probability for each in config.scenario.scenarios)
-    return replace(
-        known,
-        pid=_slower(known.pid, scale),
-        compensator=compensator
-        and replace(
-            compensator,
-            gain=scale.compensator * compensator.gain,
-            fast=compensator.fast / scale.time,
-            slow=compensator.slow / scale.time,
-        ),
-        **{each: scale.time * getattr(known, each) for each in ("T_f", "T_start", "T_track")},
-        jump=config.puller.scale * JUMP if outliers else known.jump,
-        ring_lead=scale.lead * known.ring_lead,
-        heater=heater,
-    ).for_config(config)
+    scaled: FilteredPID | Industrial = _scaled(settings_of(name, RANDOMIZED), config)
+    return scaled
+
+
+def _scaled(known: Any, config: Config) -> Any:
+    values = {}
+    for name, factor in scale_of(config).items():
+        for path in SCALED[name]:
+            value = reduce(lambda part, each: getattr(part, each, None), path.split("."), known)
+            if value is not None and (path, type(known)) != ("T_f", Industrial):  # it filters noise alone
+                values[path] = factor * value
+    if any(each.sensor.outlier_probability for each in config.scenario.scenarios) and hasattr(known, "jump"):
+        values["jump"] = config.puller.scale * JUMP
+    return with_values(known, values).for_config(config)
 
 
 def scaled_design(name: str, config: Config) -> LQGDesign:
@@ -182,10 +165,11 @@ def found_for(puller: PullerFile, name: str) -> Mapping[str, float]:
     try:
         kept = json.loads(path.read_text("utf-8"))
         values: dict[str, float] = kept.get("chosen", {"values": {}})["values"]
-        if kept["puller"] != puller.label:
-            raise CzError(f"{path}: found for puller {kept['puller']}, not for {puller.label}: tune again")
-    except (KeyError, TypeError, ValueError) as error:
-        raise error if isinstance(error, CzError) else CzError(f"{path}: no choice of a search, or damaged") from None
+        made_for = kept["puller"]
+    except (KeyError, TypeError, ValueError):
+        raise CzError(f"{path}: no choice of a search, or damaged") from None
+    if made_for != puller.label:
+        raise CzError(f"{path}: found for puller {made_for}, not for {puller.label}: tune again")
     return values
 
 
@@ -195,18 +179,13 @@ def tuned_folder(puller: PullerFile) -> Path:
 
 
 def with_values(settings: Any, values: Mapping[str, float]) -> Any:
-    """The settings with other numbers, by their paths."""
+    """The settings, dataclasses or NamedTuples, with other numbers, by their paths."""
     for path, value in values.items():
-        settings = with_value(settings, path, value)
+        head, _, rest = path.partition(".")
+        new = with_values(getattr(settings, head), {rest: value}) if rest else value
+        change = settings._replace if hasattr(settings, "_replace") else partial(replace, settings)
+        settings = change(**{head: new})
     return settings
-
-
-def with_value(settings: Any, path: str, value: float) -> Any:
-    """The settings with another value at a path; settings are dataclasses or NamedTuples."""
-    head, _, rest = path.partition(".")
-    new = with_value(getattr(settings, head), rest, value) if rest else value
-    change = settings._replace if hasattr(settings, "_replace") else partial(replace, settings)
-    return change(**{head: new})
 
 
 def pid(name: str, config: Config) -> FilteredPID | Industrial:

@@ -34,7 +34,6 @@ class Block:
 
     def __init__(self, name: str, config: Config, compiled: bool = False) -> None:
         program = export_program(name, config)
-        self.names = {port.name for port in (*program.settings, *program.inputs)}
         self._run, self._memory = program.run, program.start[None]
         if compiled:
             with TemporaryDirectory() as folder:
@@ -44,10 +43,8 @@ class Block:
             self._run, self._memory = block.run, block.begin(1)
 
     def setpoints(self, tags: dict[str, Any]) -> list[float]:
-        """The setpoints for the tags of a step."""
-        given = tags | {"ring_time_s": tags["time_s"], "automatic": True}
-        inputs = {name: float(given[name]) for name in self.names & given.keys()}
-        outputs, self._memory = self._run(inputs, self._memory)
+        """The setpoints for the tags of a step, whose names are those of the block's inputs and settings."""
+        outputs, self._memory = self._run(tags | {"ring_time_s": tags["time_s"], "automatic": True}, self._memory)
         return [float(outputs[name][0]) for name in SETPOINTS]
 
 

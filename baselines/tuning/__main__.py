@@ -1,24 +1,62 @@
 """Tune controllers: ``python -m cz_gym.baselines.tuning --controller paper-tuned --scenario puller``.
 
-``--puller my.toml`` designs for a puller of the user's own (:mod:`.for_puller`).
+``--puller my.toml`` designs for a puller of the user's own: its PIDs and the filter of its LQGs are searched from their
+scaled settings (:mod:`cz_gym.baselines.for_puller`), side by side. Half of the crystals have hot zones that are not the
+file's, so that what is chosen is robust to them. Choices and histories are kept in a folder beside the file.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from cz_gym.baselines import for_puller
 from cz_gym.commands import OneLineParser, between
 from cz_gym.config import make_config
 from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.errors import CzError
-from cz_gym.puller import chosen_puller
+from cz_gym.evaluation.processes import in_processes
+from cz_gym.puller import PullerFile, chosen_puller
 
-from .for_puller import design
-from .goals import TUNABLE, crystals, goal_of
+from .goals import TUNABLE, crystals, crystals_on, goal_of, goal_on, search_for
 from .search import Search, file_name, measure
+
+PER_PARAMETER = 2, 5
+"""Candidates of a search for a puller, for each of its parameters: of an LQG, of a PID."""
+
+
+def design(
+    puller: PullerFile, controller: str | None, trials: int | None, episodes: int | None, folder: Path | None
+) -> None:
+    """Search for a puller, several controllers side by side, and print what was chosen."""
+    from tqdm import tqdm
+
+    names = [controller] if controller else [for_puller.FILTER, *for_puller.PIDS]
+    place, most = folder or for_puller.tuned_folder(puller), episodes or 20
+    config = crystals_on(puller)
+    tries = {
+        name: trials or PER_PARAMETER[name in for_puller.PIDS] * len(goal_on(name, config).parameters) for name in names
+    }
+    tasks = [(name, puller, tries[name], most, place) for name in names]
+    with tqdm(total=sum(task[2] for task in tasks), unit="candidate", dynamic_ncols=True) as bar:
+
+        def look() -> None:
+            bar.update(sum(tried(place / f"{name}.json") for name in names) - bar.n)
+
+        for number, chosen in in_processes(search_for, tasks, look):
+            look()
+            found = chosen.facts["figures"]
+            said = f"RMSE {found['rmse_mm']:.3f} mm, {100 * found['failure_rate']:.0f} % lost"
+            bar.write(f"{names[number]}: {said} on validation crystals, half of them with other hot zones")
+    print(f"wrote {place}: benchmark.py --puller {puller.file or puller.name} runs what was designed")
+
+
+def tried(path: Path) -> int:
+    """Number of candidates in a history."""
+    return len(json.loads(path.read_text("utf-8"))["history"]) if path.exists() else 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -33,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add(
         "--trials",
         type=trials,
-        help="candidates to try, those of an earlier run included (100; with --puller 40 or 12)",
+        help="candidates to try, those of an earlier run included (100; with --puller 10 to 40)",
     )
     add("--episodes", type=episodes, help="training episodes of a candidate (100; with --puller 20)")
     add("--out", type=Path, help="folder of histories and choices (results/tuning; with --puller beside its file)")

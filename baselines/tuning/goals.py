@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 from cz_gym.baselines import for_puller
@@ -12,7 +14,7 @@ from cz_gym.baselines.lqg.designs import ACTIVITIES, SEARCHED, SHIPPED, TOLD, de
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.settings import settings_of
 from cz_gym.baselines.tuned_for import beyond
-from cz_gym.config import Config
+from cz_gym.config import Config, make_config
 from cz_gym.episodes.mixture import Distribution, make_mixture
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import HOT_ZONE, RANDOMIZED
@@ -20,10 +22,10 @@ from cz_gym.errors import CzError
 from cz_gym.names import unknown
 from cz_gym.physics.linearisation import radius_model
 from cz_gym.physics.plant import Puller, make_puller
-from cz_gym.puller import DEFAULT
+from cz_gym.puller import DEFAULT, PullerFile
 from cz_gym.units import HOUR, MINUTE, MM
 
-from .search import Figures, Goal, Parameter, value_at
+from .search import Figures, Goal, Parameter, Search, Trial, measure, value_at
 
 # A gain above 2 kW/K would improve the radius, and pass the pyrometer's noise to the heater.
 HEATER = (
@@ -60,6 +62,7 @@ STEP, STEP_WEIGHT = 0.029, 10.0
 """Limit of the pull step RMS [mm/min], and the weight of its slack [1/(mm/min)]."""
 
 
+@lru_cache(maxsize=4)
 def margins(policy: FilteredPID) -> list[tuple[LoopMargins, Puller]]:
     """Margins of the sampled loop opened at the camera, without anti-windup, on Models I and II of the puller.
 
@@ -187,6 +190,19 @@ def _near(parameter: Parameter, start: Any) -> Parameter:
     """The parameter with a range around where the search begins."""
     value = value_at(start, parameter.path)
     return parameter._replace(low=value / NEAR, high=value * NEAR) if parameter.log else parameter
+
+
+def crystals_on(puller: PullerFile) -> Config:
+    """The crystals that controllers are designed on for a puller: half of them with other hot zones."""
+    mixed = {"randomized": 0.5, "hot-zone": 0.5}
+    return make_config(mixed, None, "measured", action="direct", puller=puller)
+
+
+def search_for(task: tuple[str, PullerFile, int, int, Path]) -> Trial:
+    """One search for a puller: controller, puller, candidates, episodes and folder."""
+    name, puller, trials, episodes, folder = task
+    config = crystals_on(puller)
+    return Search(name, goal_on(name, config), config, trials, episodes, measure, True).tune(folder / f"{name}.json")
 
 
 TUNABLE = (*PIDS, *SHIPPED)

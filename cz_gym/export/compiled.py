@@ -56,8 +56,8 @@ class CompiledBlock:
         for port in self.program.inputs:
             value = np.asarray(inputs[port.name])
             measured[port.name] = value > 0.5 if port.logical else value
-        for name in inputs.keys() - set(self.measured.names or ()):
-            memory[name] = inputs[name]
+        for port in self.program.settings:
+            memory[port.name] = inputs.get(port.name, memory[port.name])
         places = [(array.ctypes.data, array.itemsize) for array in (memory, measured, setpoints)]
         for i in range(len(memory)):
             self._step(*(start + i * size for start, size in places))

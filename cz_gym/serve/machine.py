@@ -58,17 +58,14 @@ class Tag(NamedTuple):
     writable: bool = False
 
 
-_BLOCK = {port.name: Tag(port.name, bool if port.logical else float, port.meaning) for port in (*INPUTS, *OUTPUTS)}
 SETPOINTS = tuple(port.name for port in OUTPUTS[:2])
 TAGS = (
     Tag("time_s", float, "time since the crystal's start"),
     Tag("state", str, "growing, or how the crystal ended"),
     Tag("control", str, "who sets the drives: client, held, fallback or manual"),
     Tag("alarms", int, "sum of the alarm bits"),
-    *(_BLOCK[name] for name in ("ring_radius_mm", "valid", "T_1_K", "pull_speed_mm_per_min", "heater_power_kW")),
-    *(_BLOCK[name] for name in ("r_ref_mm", "r_ref_1min_mm", "r_ref_5min_mm")),
-    *(_BLOCK[name] for name in ("T_1_ref_K", "T_1_ref_1min_K", "T_1_ref_5min_K")),
-    *(_BLOCK[name]._replace(writable=True) for name in SETPOINTS),
+    *(Tag(port.name, bool if port.logical else float, port.meaning) for port in INPUTS[2:-1]),
+    *(Tag(port.name, float, port.meaning, True) for port in OUTPUTS[:2]),
     Tag("watchdog", int, "number of the step that the setpoints answer; writing it makes them act", True),
     *(Tag(port.name, float, port.meaning) for port in settings_of(Config())[:9]),
     Tag("control_interval_s", float, "length of a step"),
@@ -77,7 +74,7 @@ TAGS = (
     Tag("puller", str, "name and hash of the puller file, or default"),
     Tag("step", int, "number of the control interval that begins now; it changes after all other tags"),
 )
-"""Every tag, in the order in which they are written."""
+"""Every tag, in the order of writing; readings, setpoints and settings are those of the exported blocks."""
 TOLERANCE = 1e-9
 """Rounding of a setpoint that is forgiven at its limits [mm/min, kW]."""
 

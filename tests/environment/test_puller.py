@@ -82,12 +82,6 @@ def test_what_a_file_does_not_say_keeps_the_defaults_value_and_is_listed(tmp_pat
     assert not {"radius_mm", "camera_noise_mm"} & set(puller.missing)
 
 
-def test_the_default_file_is_the_puller_of_every_environment_without_one() -> None:
-    default = find_puller("default")
-    assert default == DEFAULT == find_puller(None)
-    assert default.label == "default"
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -161,6 +155,8 @@ def test_one_many_and_differentiable_crystals_are_the_same_on_a_puller(name: str
 
 
 def test_the_default_file_changes_nothing() -> None:
+    assert find_puller("default") == DEFAULT == find_puller(None)
+    assert find_puller("default").label == "default"
     mixed: Any = {"hard": 0.5, "puller": 0.5}
     for scenario in (*SCENARIOS, ALL, mixed):
         plain, filed = make_config(scenario), make_config(scenario, puller="default")

@@ -8,12 +8,14 @@ import warnings
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 pytest.importorskip("asyncua", reason="asyncua is absent: pip install '.[plant]'")
 from asyncua import Client, ua
+from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 
 from cz_gym.serve.__main__ import commands, door_of, serving
 from cz_gym.serve.machine import TAGS
@@ -28,51 +30,40 @@ def free_port() -> int:
         return int(one.getsockname()[1])
 
 
-class Running:
-    """A running puller: its machine, its addresses, and where its files are."""
+@contextmanager
+def running(folder: Path, *options: str, remote: bool = False) -> Iterator[Any]:
+    """A puller with these options, its addresses and machine; ``remote`` makes it as strict as on another address."""
+    port, page = free_port(), free_port()
+    files = ("--certificates", str(folder / "certificates"), "--log", str(folder / "log.csv"))
+    arguments = commands().parse_args(["--port", str(port), "--page-port", str(page), *files, *options])
+    puller = SimpleNamespace(folder=folder, port=port, page=page, url=f"opc.tcp://127.0.0.1:{port}/", error=None)
+    ready, done = threading.Event(), threading.Event()
 
-    def __init__(self, folder: Path, options: tuple[str, ...], remote: bool) -> None:
-        self.folder, self.port, self.page = folder, free_port(), free_port()
-        ports = ("--port", str(self.port), "--page-port", str(self.page))
-        files = ("--certificates", str(folder / "certificates"), "--log", str(folder / "log.csv"))
-        self.arguments, self.remote, self.machine = commands().parse_args([*ports, *files, *options]), remote, None
-        self.ready, self.done, self.error = threading.Event(), threading.Event(), None
+    async def serve() -> None:
+        puller.door = door_of(arguments)
+        puller.door.remote = remote
+        async with serving(arguments, puller.door) as (puller.machine, _):
+            ready.set()
+            await asyncio.to_thread(done.wait)
 
-    @property
-    def url(self) -> str:
-        return f"opc.tcp://127.0.0.1:{self.port}/"
-
-    def run(self) -> None:
-        async def run() -> None:
-            door = door_of(self.arguments)
-            door.remote = self.remote
-            async with serving(self.arguments, door) as (self.machine, _):
-                self.door = door
-                self.ready.set()
-                await asyncio.to_thread(self.done.wait)
-
+    def run() -> None:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                asyncio.run(run())
+                asyncio.run(serve())
         except BaseException as error:
-            self.error = error
-        self.ready.set()
+            puller.error = error
+        ready.set()
 
-
-@contextmanager
-def running(folder: Path, *options: str, remote: bool = False) -> Iterator[Any]:
-    """A puller with these options; ``remote`` makes it as strict as on another address."""
-    puller = Running(folder, options, remote)
-    thread = threading.Thread(target=puller.run)
+    thread = threading.Thread(target=run)
     thread.start()
-    puller.ready.wait(600.0)
+    ready.wait(600.0)
     try:
         if puller.error:
             raise puller.error
         yield puller
     finally:
-        puller.done.set()
+        done.set()
         thread.join(30.0)
 
 
@@ -93,18 +84,26 @@ class Hand:
         return [code.name for code in await self.client.write_values(nodes, variants, raise_on_partial_error=False)]
 
 
-async def connected(url: str, act: Callable[[Hand], Awaitable[Any]], user: str = "") -> Any:
-    """What ``act`` returns for a connected client."""
-    client = Client(url, timeout=30)
+async def connected(
+    url: str, act: Callable[[Hand], Awaitable[Any]], user: str = "", password: str = PASSWORD, keys: Path | None = None
+) -> Any:
+    """What ``act`` returns for a connected client; with a folder of ``keys``, an encrypted one."""
+    client = Client(url, timeout=10 if keys else 30)
     if user:
         client.set_user(user)
-        client.set_password(PASSWORD)
+        client.set_password(password)
+    if keys:
+        client.application_uri = URI
+        certificate = keys / "certificate.pem"
+        await client.set_security(
+            SecurityPolicyBasic256Sha256, certificate, keys / "key.pem", server_certificate=str(certificate)
+        )
     async with client:
         return await act(Hand(client, await client.get_namespace_index(f"{URI}:tags")))
 
 
-def with_client(url: str, act: Callable[[Hand], Awaitable[Any]], user: str = "") -> Any:
-    return asyncio.run(connected(url, act, user))
+def with_client(url: str, act: Callable[[Hand], Awaitable[Any]], *account: Any) -> Any:
+    return asyncio.run(connected(url, act, *account))
 
 
 def answer(step: int, pull: float = 1.2, heater: float = 57.0) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """The machine behind the tags: whose setpoints act, what is refused, and a clock that nothing delays."""
 
 import math
-import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -129,28 +128,3 @@ def test_the_log_has_a_row_a_step_and_is_never_written_over(tmp_path: Path) -> N
     assert [float(each) for each in lines[-1].split(",")] == pytest.approx([float(rows[-1][name]) for name in COLUMNS])
     with pytest.raises(CzError, match=r"log\.csv: File exists"):
         Log(tmp_path / "log.csv")
-
-
-def test_threads_that_write_at_once_leave_whole_pairs() -> None:
-    """Setpoints of one client never act with those of another."""
-    one = machine(horizon=108000.0)
-    stop = threading.Event()
-
-    def client(number: int) -> None:
-        while not stop.is_set():
-            one.offer({PULL: 1.0 + 0.01 * number, HEATER: 56.0 + 0.1 * number, "watchdog": one.k})
-
-    threads = [threading.Thread(target=client, args=(number,)) for number in range(10)]
-    for thread in threads:
-        thread.start()
-    rows = []
-    while len(rows) < 300 and not one.over:
-        with one.committed:
-            one.committed.wait(0.02)  # on a busy machine the steps alone would leave the clients no time
-        rows.append(one.step())
-    stop.set()
-    for thread in threads:
-        thread.join()
-    pairs = {(round(row[PULL], 6), round(row[HEATER], 6)) for row in rows if row["control"] == "client"}
-    assert pairs <= {(round(1.0 + 0.01 * n, 6), round(56.0 + 0.1 * n, 6)) for n in range(10)}
-    assert pairs

@@ -24,8 +24,7 @@ from cz_gym.serve.machine import SETPOINTS
 from tests.processes import ROOT
 from tests.serve.conftest import NAN, PASSWORD, Hand, answer, connected, free_port, running, with_client
 
-from asyncua import Client, ua  # isort: skip
-from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256  # isort: skip
+from asyncua import ua  # isort: skip
 
 PULL, HEATER = SETPOINTS
 
@@ -171,20 +170,7 @@ def test_a_reader_reads_and_an_operator_writes(locked: Any) -> None:
 
 
 def encrypted(puller: Any, act: Any, user: str, password: str) -> Any:
-    async def run() -> Any:
-        folder = puller.folder / "certificates"
-        client = Client(puller.url, timeout=3)
-        client.application_uri = "urn:cz-gym:puller"
-        client.set_user(user)
-        client.set_password(password)
-        await client.set_security(
-            SecurityPolicyBasic256Sha256, folder / "certificate.pem", folder / "key.pem",
-            server_certificate=str(folder / "certificate.pem"),
-        )  # fmt: skip
-        async with client:
-            return await act(Hand(client, await client.get_namespace_index("urn:cz-gym:puller:tags")))
-
-    return asyncio.run(run())
+    return with_client(puller.url, act, user, password, puller.folder / "certificates")
 
 
 def test_the_page_elsewhere_is_encrypted_and_only_an_operator_sets_drives(locked: Any) -> None:
