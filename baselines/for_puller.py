@@ -100,7 +100,8 @@ def paper_here(config: Config) -> FilteredPID:
     does not say is that of ``paper-tuned`` (measurement filter, anti-windup, heater): with tight drives the printed
     controller winds up.
     """
-    printed = replace(settings_of("paper-tuned", RANDOMIZED), pid=SeriesPID(), ring_lead=0.0, K_ff=0.0)
+    known: Any = settings_of("paper-tuned", RANDOMIZED)
+    printed = replace(known, pid=SeriesPID(), ring_lead=0.0, K_ff=0.0)
     compensator = design_compensator(model_of(config), CUT_OFF / scale_of(config)["time"])
     made: FilteredPID = replace(_scaled(printed, config), compensator=compensator)
     return made
