@@ -123,15 +123,7 @@ class Config:
     @property
     def hash(self) -> str:
         """SHA-256 of everything a saved state depends on (16 hex digits)."""
-        mix = [float(share) + 0.0 for share in self.mix]
-        parts = [self.plant_hash, self.scenario.hash, mix, self.observation, self.control_interval, self.horizon]
-        if self.observation == CAMERA:
-            parts.append(list(self.camera))
-        if self.action != "direct":
-            parts.append(self.action)
-        if self.puller.hash != DEFAULT.hash:
-            parts.append(self.puller.hash)
-        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
+        return hashlib.sha256(json.dumps(self.identity).encode()).hexdigest()[:16]
 
     @property
     def identity(self) -> Identity:

@@ -65,14 +65,14 @@ def _history() -> tuple[Channel, ...]:
         c._replace(scale=RELATIVE[c.name].scale, meaning=RELATIVE[c.name].meaning) if c.name in RELATIVE else c
         for c in MEASURED
     ]
-    integral = Channel("integral", "m s", INTEGRAL_SCALE, "integral of ring_error since the start, held within +-10")
+    integral = Channel("m s", INTEGRAL_SCALE, "integral of ring_error since the start, held within +-10", "integral")
     later = ("the value now", *(f"that over the span up to {age:g} s" for age in LAGS))
     past = [
         Channel(
-            f"{name}_{age:g}s",
             signals(Measured)[name].unit,
             PAST_SCALES[name],
             f"{name}: mean over the span up to {age:g} s ago, minus {subtracted}",
+            f"{name}_{age:g}s",
         )
         for age, subtracted in zip(LAGS, later, strict=False)
         for name in LAGGED

@@ -30,8 +30,8 @@ TEMPERATURE_SCALE = 5.0
 """Scale of temperatures [K]."""
 
 
-class Signal(NamedTuple):
-    """Unit, scale and meaning of a signal."""
+class Channel(NamedTuple):
+    """One number of an observation or of ``info``."""
 
     unit: str
     """SI unit; "1" for none."""
@@ -39,15 +39,8 @@ class Signal(NamedTuple):
     """Observations hold the number divided by this [unit]."""
     meaning: str
     """Description for tables."""
-
-
-class Channel(NamedTuple):
-    """One number of an observation or of ``info``."""
-
-    name: str
-    unit: str
-    scale: float
-    meaning: str
+    name: str = ""
+    """The field that it annotates."""
 
 
 class Measured(NamedTuple):
@@ -57,18 +50,18 @@ class Measured(NamedTuple):
     """
 
     ring_error: Annotated[
-        Any, Signal("m", MM, "camera reading minus bias minus r_ref; the last valid reading while invalid")
+        Any, Channel("m", MM, "camera reading minus bias minus r_ref; the last valid reading while invalid")
     ]
-    valid: Annotated[Any, Signal("1", 1.0, "1 if the camera says this reading is good, else 0")]
-    r_ref: Annotated[Any, Signal("m", MM, "radius reference minus r_0, now")]
-    r_ref_1min: Annotated[Any, Signal("m", MM, "the same in 1 minute")]
-    r_ref_5min: Annotated[Any, Signal("m", MM, "the same in 5 minutes")]
-    T_1_ref: Annotated[Any, Signal("K", TEMPERATURE_SCALE, "recipe of the heater temperature minus nominal, now")]
-    T_1_ref_1min: Annotated[Any, Signal("K", TEMPERATURE_SCALE, "the same in 1 minute")]
-    T_1_ref_5min: Annotated[Any, Signal("K", TEMPERATURE_SCALE, "the same in 5 minutes")]
-    T_1: Annotated[Any, Signal("K", TEMPERATURE_SCALE, "pyrometer reading minus nominal")]
-    v_p: Annotated[Any, Signal("m/s", PULL_SCALE, "applied pull speed minus v_0; the scale is v_0")]
-    Q_H: Annotated[Any, Signal("W", HEATER_SCALE, "applied heater power minus nominal")]
+    valid: Annotated[Any, Channel("1", 1.0, "1 if the camera says this reading is good, else 0")]
+    r_ref: Annotated[Any, Channel("m", MM, "radius reference minus r_0, now")]
+    r_ref_1min: Annotated[Any, Channel("m", MM, "the same in 1 minute")]
+    r_ref_5min: Annotated[Any, Channel("m", MM, "the same in 5 minutes")]
+    T_1_ref: Annotated[Any, Channel("K", TEMPERATURE_SCALE, "recipe of the heater temperature minus nominal, now")]
+    T_1_ref_1min: Annotated[Any, Channel("K", TEMPERATURE_SCALE, "the same in 1 minute")]
+    T_1_ref_5min: Annotated[Any, Channel("K", TEMPERATURE_SCALE, "the same in 5 minutes")]
+    T_1: Annotated[Any, Channel("K", TEMPERATURE_SCALE, "pyrometer reading minus nominal")]
+    v_p: Annotated[Any, Channel("m/s", PULL_SCALE, "applied pull speed minus v_0; the scale is v_0")]
+    Q_H: Annotated[Any, Channel("W", HEATER_SCALE, "applied heater power minus nominal")]
 
 
 @jittable
@@ -92,10 +85,10 @@ def measure(slot: Any, t: Any) -> Any:
 
 
 @cache
-def signals(kind: Any) -> dict[str, Signal]:
-    """The rows of one of the classes above, by name."""
+def signals(kind: Any) -> dict[str, Channel]:
+    """The channels of :class:`Measured`, :class:`TrueState` or :class:`Logged` by name, in their order."""
     hints = get_type_hints(kind, include_extras=True)
-    return {name: hints[name].__metadata__[0] for name in kind._fields}
+    return {name: hints[name].__metadata__[0]._replace(name=name) for name in kind._fields}
 
 
 _SHARED = signals(Measured)
@@ -104,11 +97,11 @@ _SHARED = signals(Measured)
 class TrueState(NamedTuple):
     """The true state and the disturbances; deviations, SI units. For bounds and asymmetric critics only."""
 
-    r_c_error: Annotated[Any, Signal("m", MM, "true radius minus r_ref")]
-    h_c: Annotated[Any, Signal("m", MM, "true meniscus height minus its nominal")]
-    T_1: Annotated[Any, Signal("K", TEMPERATURE_SCALE, "true heater temperature minus nominal")]
-    T_2: Annotated[Any, Signal("K", TEMPERATURE_SCALE, "true susceptor temperature minus nominal")]
-    T_b: Annotated[Any, Signal("K", TEMPERATURE_SCALE, "true melt temperature minus nominal")]
+    r_c_error: Annotated[Any, Channel("m", MM, "true radius minus r_ref")]
+    h_c: Annotated[Any, Channel("m", MM, "true meniscus height minus its nominal")]
+    T_1: Annotated[Any, Channel("K", TEMPERATURE_SCALE, "true heater temperature minus nominal")]
+    T_2: Annotated[Any, Channel("K", TEMPERATURE_SCALE, "true susceptor temperature minus nominal")]
+    T_b: Annotated[Any, Channel("K", TEMPERATURE_SCALE, "true melt temperature minus nominal")]
     r_ref: Annotated[Any, _SHARED["r_ref"]]
     r_ref_1min: Annotated[Any, _SHARED["r_ref_1min"]]
     r_ref_5min: Annotated[Any, _SHARED["r_ref_5min"]]
@@ -117,10 +110,10 @@ class TrueState(NamedTuple):
     T_1_ref_5min: Annotated[Any, _SHARED["T_1_ref_5min"]]
     v_p: Annotated[Any, _SHARED["v_p"]]
     Q_H: Annotated[Any, _SHARED["Q_H"]]
-    dT_i: Annotated[Any, Signal("K", 1.0, "interface fluctuation now")]
-    Q_d: Annotated[Any, Signal("W", KILO, "heat load on the melt now")]
-    ring_offset: Annotated[Any, Signal("m", MM, "offset of the ring that no sensor shows")]
-    lam: Annotated[Any, Signal("1", 1.0, "share of conduction: 1 is Model I, 0 is Model II")]
+    dT_i: Annotated[Any, Channel("K", 1.0, "interface fluctuation now")]
+    Q_d: Annotated[Any, Channel("W", KILO, "heat load on the melt now")]
+    ring_offset: Annotated[Any, Channel("m", MM, "offset of the ring that no sensor shows")]
+    lam: Annotated[Any, Channel("1", 1.0, "share of conduction: 1 is Model I, 0 is Model II")]
 
 
 @jittable
@@ -151,24 +144,24 @@ def true_state(slot: Any, measured: Any, t: Any) -> Any:
 class Logged(NamedTuple):
     """The entries of a step's ``info``, in SI units."""
 
-    r_c: Annotated[Any, Signal("m", 1.0, "true crystal radius")]
-    r_br: Annotated[Any, Signal("m", 1.0, "true radius of the bright ring")]
-    r_ref: Annotated[Any, Signal("m", 1.0, "radius reference")]
-    h_c: Annotated[Any, Signal("m", 1.0, "true meniscus height")]
-    alpha_c: Annotated[Any, Signal("rad", 1.0, "cone angle of the crystal's wall")]
-    v_g: Annotated[Any, Signal("m/s", 1.0, "growth rate")]
-    v_p: Annotated[Any, Signal("m/s", 1.0, "applied pull speed")]
-    Q_H: Annotated[Any, Signal("W", 1.0, "applied heater power")]
-    T_1: Annotated[Any, Signal("K", 1.0, "true heater temperature")]
-    T_1_ref: Annotated[Any, Signal("K", 1.0, "recipe of the heater temperature")]
-    T_b: Annotated[Any, Signal("K", 1.0, "true melt temperature")]
-    r_br_measured: Annotated[Any, Signal("m", 1.0, "the camera's reading, with noise and offset")]
-    ring_offset: Annotated[Any, Signal("m", 1.0, "offset of the ring that no sensor shows")]
-    cost_radius: Annotated[Any, Signal("1", 1.0, "the cost's term of the radius error")]
-    cost_pull: Annotated[Any, Signal("1", 1.0, "the cost's term of the pull speed")]
-    cost_pull_step: Annotated[Any, Signal("1", 1.0, "the cost's term of the step of the pull speed")]
-    cost_heater_step: Annotated[Any, Signal("1", 1.0, "the cost's term of the step of the heater power")]
-    action_clipped: Annotated[Any, Signal("bool", 1.0, "whether the action lay outside its box")]
+    r_c: Annotated[Any, Channel("m", 1.0, "true crystal radius")]
+    r_br: Annotated[Any, Channel("m", 1.0, "true radius of the bright ring")]
+    r_ref: Annotated[Any, Channel("m", 1.0, "radius reference")]
+    h_c: Annotated[Any, Channel("m", 1.0, "true meniscus height")]
+    alpha_c: Annotated[Any, Channel("rad", 1.0, "cone angle of the crystal's wall")]
+    v_g: Annotated[Any, Channel("m/s", 1.0, "growth rate")]
+    v_p: Annotated[Any, Channel("m/s", 1.0, "applied pull speed")]
+    Q_H: Annotated[Any, Channel("W", 1.0, "applied heater power")]
+    T_1: Annotated[Any, Channel("K", 1.0, "true heater temperature")]
+    T_1_ref: Annotated[Any, Channel("K", 1.0, "recipe of the heater temperature")]
+    T_b: Annotated[Any, Channel("K", 1.0, "true melt temperature")]
+    r_br_measured: Annotated[Any, Channel("m", 1.0, "the camera's reading, with noise and offset")]
+    ring_offset: Annotated[Any, Channel("m", 1.0, "offset of the ring that no sensor shows")]
+    cost_radius: Annotated[Any, Channel("1", 1.0, "the cost's term of the radius error")]
+    cost_pull: Annotated[Any, Channel("1", 1.0, "the cost's term of the pull speed")]
+    cost_pull_step: Annotated[Any, Channel("1", 1.0, "the cost's term of the step of the pull speed")]
+    cost_heater_step: Annotated[Any, Channel("1", 1.0, "the cost's term of the step of the heater power")]
+    action_clipped: Annotated[Any, Channel("bool", 1.0, "whether the action lay outside its box")]
 
 
 @jittable
@@ -197,16 +190,11 @@ def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, at_interface:
     )
 
 
-def channels(kind: Any) -> tuple[Channel, ...]:
-    """The channels of :class:`Measured`, :class:`TrueState` or :class:`Logged`, in their order."""
-    return tuple(Channel(name, s.unit, s.scale, s.meaning) for name, s in signals(kind).items())
-
-
-MEASURED = channels(Measured)
+MEASURED = tuple(signals(Measured).values())
 """Channels of ``observation="measured"``."""
-STATE = channels(TrueState)
+STATE = tuple(signals(TrueState).values())
 """Channels of ``observation="state"``."""
-INFO_ROWS = channels(Logged)
+INFO_ROWS = tuple(signals(Logged).values())
 """Channels of ``info``."""
 INFO = Logged._fields
 """Names of the entries of ``info``."""

@@ -17,7 +17,7 @@ from cz_gym.episodes.noise import first_fluctuation, fluctuation, sample_noise
 from cz_gym.episodes.schedule import bias_offset
 from cz_gym.jit.cache import hashed
 from cz_gym.jit.compile import fetch, inlined, jittable, kernel
-from cz_gym.physics.meniscus import HURLE, MeniscusModel
+from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.plant import Disturbance, State, derive_puller, growth
 from cz_gym.signals import INFO, LEAN, logged, measure, true_state
 
@@ -253,7 +253,3 @@ def build_kernels(meniscus: MeniscusModel) -> Kernels:
         kernel(plant, keep, allocates=False),
         kernel(derive, keep),
     )
-
-
-KERNELS = build_kernels(HURLE)
-"""The loops on Hurle's meniscus."""

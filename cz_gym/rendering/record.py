@@ -11,7 +11,7 @@ import numpy.typing as npt
 from cz_gym.config import Config
 from cz_gym.physics.plant import Puller
 from cz_gym.signals import INFO
-from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT
+from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
 
 Floats = npt.NDArray[np.float64]
 _COLUMN = {name: column for column, name in enumerate((*INFO, "valid"))}
@@ -22,7 +22,7 @@ class Ending(Enum):
 
     FROZEN = "FROZEN: meniscus too low"
     DETACHED = "DETACHED: meniscus too high"
-    LOST = "RADIUS LOST: more than 8 mm off"
+    LOST = "RADIUS LOST: too far off"
     HORIZON = "END OF THE RUN"
 
 
@@ -46,7 +46,7 @@ class Record:
         row[:-1], row[-1] = info, valid
         self._count += 1
         if terminated:
-            self.ending = how_it_failed(self.last("h_c"), float(self.error[-1]), self.puller.a)
+            self.ending = self._failure()
         elif truncated:
             self.ending = Ending.HORIZON
 
@@ -96,15 +96,12 @@ class Record:
         z = self.last("h_c") + (length[-1] - length[remains])
         return self.column("r_c")[remains][::-1], self.column("r_ref")[remains][::-1], z[::-1]
 
-
-def how_it_failed(h_c: float, error: float, a: float) -> Ending:
-    """The limit that a failed sample broke, or came nearest to where its last substep was discarded.
-
-    Meniscus height, radius error and capillary constant in [m].
-    """
-    room = {
-        Ending.FROZEN: (h_c - HEIGHT_MIN) / HEIGHT_MIN,
-        Ending.DETACHED: (HEIGHT_MAX_IN_A * a - h_c) / a,
-        Ending.LOST: (RADIUS_LIMIT - abs(error)) / RADIUS_LIMIT,
-    }
-    return min(room, key=lambda ending: room[ending])
+    def _failure(self) -> Ending:
+        """The limit that the newest sample broke, or came nearest to where its last substep was discarded."""
+        h_c, a = self.last("h_c"), self.puller.a
+        room = {
+            Ending.FROZEN: (h_c - HEIGHT_MIN) / HEIGHT_MIN,
+            Ending.DETACHED: (HEIGHT_MAX_IN_A * a - h_c) / a,
+            Ending.LOST: 1.0 - abs(self.error[-1]) / self.config.radius_limit,
+        }
+        return min(room, key=lambda ending: float(room[ending]))

@@ -14,12 +14,12 @@ from cz_gym.jit.compile import kernel
 from tests.processes import ROOT, python
 
 DERIVE = """
-from cz_gym import Parameters
+from cz_gym import HURLE, Parameters
 from cz_gym.jit.cache import cache_folder
-from cz_gym.engine.kernels import KERNELS
-puller = KERNELS.derive(Parameters(), 1.0)
-stats = getattr(KERNELS.derive, "stats", None)
-print(cache_folder(), puller.h_0, sum(stats.cache_hits.values()), sep="|")
+from cz_gym.engine.kernels import build_kernels
+derive = build_kernels(HURLE).derive
+puller = derive(Parameters(), 1.0)
+print(cache_folder(), puller.h_0, sum(derive.stats.cache_hits.values()), sep="|")
 """
 
 
