@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
@@ -62,12 +62,9 @@ class Contender:
         plant = any(policy.contract.learned_from == PLANT for policy in self.trained)
         return "learned, plant known in training" if plant else "learned from the reward alone"
 
-    def copies(self) -> Iterator[Contender]:
-        """Yield the contender itself, or one contender of a single training seed for each of an agent's."""
-        if not self.trained:
-            yield self
-        for seed, policy in zip(self.training_seeds, self.trained, strict=bool(self.trained)):
-            yield replace(self, make=partial(given, policy), training_seeds=(seed,), trained=(policy,))
+    def policies(self, config: Config) -> tuple[Any, ...]:
+        """Its policy for an environment's settings; of an agent one a training seed."""
+        return self.trained or (self.make(config),)
 
     def facts(self) -> dict[str, Any]:
         """Its entry in ``benchmark.json``."""

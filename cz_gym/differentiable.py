@@ -133,19 +133,8 @@ class DifferentiableBatch:
         self._grows = active & ~out.terminated
         self._out, self._state = out, self._now()
         jacobian = self._jacobians.new()
-        self._tangents(
-            batch.memory,
-            before,
-            held,
-            batch.actions,
-            self._grows,
-            batch.clock,
-            batch.drives,
-            self._work,
-            jacobian,
-            0,
-            n,
-        )
+        step = (held, batch.actions, self._grows, batch.clock, batch.drives)
+        self._tangents(batch.memory, before, *step, self._work, jacobian, 0, n)
         info = out.info[:, :n]
         cost = np.where(self._grows, info[_COSTS], 0.0).T
         error = info[_RADIUS] - info[_REFERENCE]

@@ -19,12 +19,6 @@ def contender(name: str, meaning: str = "", training_seeds: tuple[int, ...] = ()
     return Contender(name, meaning=meaning, training_seeds=training_seeds, trained=trained, **facts)
 
 
-def sample_of(who: Contender, runs: Sequence[Rollout]) -> Sample:
-    """A contender's sample of rollouts, one a training seed, all on the same episodes."""
-    parts = [Sample.of(copy, run) for copy, run in zip(who.copies(), runs, strict=True)]
-    return Sample.joined(who, runs[0].seeds, parts)
-
-
 def result_of(
     name: str, names: Sequence[str], last: str, training_seeds: tuple[int, ...] = (4,), fewer: int = 0
 ) -> tuple[Result, dict[str, Rollout]]:
@@ -40,5 +34,5 @@ def result_of(
         runs[who] = run = rollout(find_controller(who).make(config), config, met)
         agent = contender(last, f"agent trained with {last}", training_seeds)
         shown = agent if learned else contender(who, f"what {who} is", quoted=who == "paper")
-        samples.append(sample_of(shown, [run] * (len(training_seeds) if learned else 1)))
+        samples.append(Sample.of(shown, [run] * (len(training_seeds) if learned else 1)))
     return summarise(row, samples), runs

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -39,24 +39,23 @@ class Sample:
     """Signals of the first episode up to its end, each of shape (steps,), of the first training seed."""
 
     @classmethod
-    def of(cls, contender: Contender, run: Rollout) -> Sample:
-        """Metrics and first signals of a rollout of one policy."""
-        values = np.stack(metrics(run), axis=-1)[None]
-        return cls(contender, run.seeds, values, run.microseconds_per_step, run.episode(0))
+    def of(cls, contender: Contender, runs: Iterable[Rollout]) -> Sample:
+        """Metrics of rollouts on the same episodes, one a training seed, and the signals of the first one."""
+        example, values, times = None, [], []
+        for run in runs:
+            example, seeds = example or run.episode(0), run.seeds
+            values.append(np.stack(metrics(run), axis=-1))
+            times.append(run.microseconds_per_step)
+        return cls(contender, seeds, np.stack(values), float(np.mean(times)), example)
 
     @classmethod
-    def joined(cls, contender: Contender, seeds: Sequence[int], parts: Sequence[Sample]) -> Sample:
-        """Join parts of one training seed each, in any order, which together hold the episodes of ``seeds``."""
-        rows = {
-            (part.contender.training_seeds, seed): values
-            for part in parts
-            for seed, values in zip(part.seeds, part.values[0], strict=True)
-        }
-        copies = [copy.training_seeds for copy in contender.copies()]
-        values = np.array([[rows[copy, seed] for seed in seeds] for copy in copies])
+    def joined(cls, seeds: Sequence[int], parts: Sequence[Sample]) -> Sample:
+        """Join a controller's samples, in any order, which together hold the episodes of ``seeds``."""
+        rows = {seed: values for part in parts for seed, values in zip(part.seeds, part.values[0], strict=True)}
         microseconds = np.average([part.microseconds for part in parts], weights=[len(part.seeds) for part in parts])
-        first = [p.example for p in parts if p.seeds[0] == seeds[0] and p.contender.training_seeds == copies[0]]
-        return cls(contender, tuple(seeds), values, float(microseconds), first[0])
+        (first,) = (part for part in parts if part.seeds[0] == seeds[0])
+        values = np.array([[rows[seed] for seed in seeds]])
+        return replace(first, seeds=tuple(seeds), values=values, microseconds=float(microseconds))
 
     @property
     def name(self) -> str:

@@ -1,8 +1,9 @@
-"""Running a benchmark: every contender on every row, piece by piece."""
+"""Running a benchmark: every contender on every row."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +15,30 @@ from .protocol import SLOW_EPISODES, Row
 from .results import Result, Sample, summarise
 from .rollout import check_policy, rollout
 
-AT_ONCE = 500
-"""Episodes that a policy runs at once."""
 BLOCK = 10
 """Episodes that a slow controller runs at once, and that are cached together."""
 
 
 def run_episodes(contender: Contender, row: Row, seeds: Sequence[int], progress: Callable[[int], None]) -> Sample:
-    """Roll out a controller, or an agent of one training seed, on some episodes of a row."""
+    """Roll a contender out on some episodes of a row."""
     interface = contender.observation, contender.action
-    designed_for = row.design_config(*interface)
-    policy = contender.make(designed_for)
-    return Sample.of(contender, rollout(policy, row.config(*interface), seeds, progress, designed_for))
+    config, designed_for = row.config(*interface), row.design_config(*interface)
+    policies = contender.policies(designed_for)
+    return Sample.of(contender, (rollout(policy, config, seeds, progress, designed_for) for policy in policies))
+
+
+def run_resumed(
+    contender: Contender, row: Row, seeds: Sequence[int], progress: Callable[[int], None], cache: Path
+) -> Sample:
+    """The same of a slow controller: cached episodes are read, the others run in blocks and cached."""
+    store = SlowEpisodes(contender, row, cache)
+    parts = store.read(seeds)
+    left = sorted({*seeds} - {seed for part in parts for seed in part.seeds})
+    progress(row.config().steps * (len(seeds) - len(left)))
+    for first in range(0, len(left), BLOCK):
+        parts.append(run_episodes(contender, row, left[first : first + BLOCK], progress))
+        store.write(parts[-1])
+    return Sample.joined(seeds, parts)
 
 
 def check_agents(contenders: Sequence[Contender], rows: Sequence[Row]) -> None:
@@ -67,30 +80,14 @@ def run(
     ``bar`` is tqdm's, over environment steps; ``cache`` is the folder of slow controllers' episodes, ``bounds`` that of
     an earlier benchmark whose bound serves a run without one.
     """
-    done: dict[tuple[str, str], list[Sample]] = {}
-    stores: dict[tuple[str, str], SlowEpisodes] = {}
-    pieces: list[tuple[Contender, Row, tuple[int, ...]]] = []
-    for row, contender in ((row, contender) for row in rows for contender in contenders):
-        key, seeds, at_once = (row.name, contender.name), tuple(episodes_of(contender, row, episodes)), AT_ONCE
-        done[key] = []
-        if contender.slow:
-            stores[key], at_once = SlowEpisodes(contender, row, cache), BLOCK
-            done[key] += stores[key].read(seeds)
-            there = {seed for sample in done[key] for seed in sample.seeds}
-            seeds = tuple(seed for seed in seeds if seed not in there)
-        blocks = [seeds[first : first + at_once] for first in range(0, len(seeds), at_once)]
-        pieces += [(copy, row, block) for copy in contender.copies() for block in blocks]
-    bar.reset(total=sum(len(seeds) * row.config().steps for _, row, seeds in pieces))
-    for contender, row, seeds in pieces:
-        bar.set_description(f"{row.name}, {contender.name}")
-        key, sample = (row.name, contender.name), run_episodes(contender, row, seeds, bar.update)
-        if key in stores:
-            stores[key].write(sample)
-        done[key].append(sample)
-    results = []
-    for row in rows:
-        samples = [
-            Sample.joined(each, episodes_of(each, row, episodes), done[row.name, each.name]) for each in contenders
-        ]
-        results.append(summarise(row, samples, earlier_bound(bounds, row, samples) if bounds else None))
-    return results
+    pairs = [(row, each, episodes_of(each, row, episodes)) for row in rows for each in contenders]
+    bar.reset(total=sum(row.config().steps * len(seeds) * max(len(each.trained), 1) for row, each, seeds in pairs))
+    samples: dict[str, list[Sample]] = {row.name: [] for row in rows}
+    for row, each, seeds in pairs:
+        bar.set_description(f"{row.name}, {each.name}")
+        rolled_out = partial(run_resumed, cache=cache) if each.slow else run_episodes
+        samples[row.name].append(rolled_out(each, row, seeds, bar.update))
+    return [
+        summarise(row, samples[row.name], earlier_bound(bounds, row, samples[row.name]) if bounds else None)
+        for row in rows
+    ]

@@ -62,6 +62,6 @@ def test_a_batch_of_images_is_a_vector_of_scalars(scenario: str) -> None:
 
 def test_the_command_prints_the_counts(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cz_gym.episodes.scenarios.SCENARIOS", {"nominal": SCENARIOS["nominal"]})
-    assert main(["--steps", "50"]) == 0
+    assert main([]) == 0
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith("4 cases conform: ")

@@ -164,14 +164,6 @@ def test_a_critic_may_see_the_state_beside_the_history() -> None:
     np.testing.assert_array_equal(history.step(ZERO)[4]["state"], state.step(ZERO)[0])
 
 
-def test_one_episode_of_another_scenario() -> None:
-    env = CzEnv("nominal", observation="state", info="all", action="direct")
-    given, _ = env.reset(seed=5, options={"scenario": "hard"})
-    hard, _ = CzEnv("hard", observation="state", info="all", action="direct").reset(seed=5)
-    np.testing.assert_array_equal(given, hard)
-    assert env.reset()[1]["r_c"] == make_puller().r_0
-
-
 def test_drives_obey_window_slew_and_steps() -> None:
     limits = Actuators(
         pull_window=0.5 * MM_PER_MIN, pull_slew=0.3 * MM_PER_MIN / 60, heater_slew=2000.0 / 60, heater_step=100.0

@@ -161,17 +161,6 @@ def test_families_share_no_random_number() -> None:
     assert factors[0] == factors[1]
 
 
-def test_sensor_fault_and_puller_disturb_the_same_crystal_as_randomized() -> None:
-    key = (13, 14)
-    whole, series = draw("randomized", key)
-    for name in ("sensor-fault", "puller"):
-        e, other = draw(name, key)
-        assert (e.recipe_amount, e.drift_amount, e.reference_amount) == (
-            whole.recipe_amount, whole.drift_amount, whole.reference_amount,
-        )  # fmt: skip
-        np.testing.assert_array_equal(other.interface, series.interface)
-
-
 def test_interface_fluctuation_is_two_stationary_processes() -> None:
     scenario = Scenario("mine", interface=Interface(sd=(1.0, 1.0)))
     runs = np.array([draw(scenario, key, grid=320)[1].interface for key in keys(3000)])
@@ -216,15 +205,6 @@ def test_half_the_references_move_and_the_start_is_normal() -> None:
     assert np.mean([e.reference_amount != 0 for e in episodes]) == pytest.approx(0.5, abs=0.045)
     starts = np.array([e.r_c_start for e in episodes]) / (0.2 * MM)
     assert stats.kstest(starts, "norm").pvalue > 1e-3
-
-
-def test_camera_and_pyrometer_noise_are_white_and_normal() -> None:
-    scenario = Scenario("mine", sensor=Sensor(camera_noise=(1e-5, 1e-5), pyrometer_noise=(0.2, 0.2)))
-    noise = draw(scenario, (3, 4), samples=20000)[1].noise / [1e-5, 0.2]
-    for column in noise.T:
-        assert stats.kstest(column, "norm").pvalue > 1e-3
-        assert abs(np.mean(column[1:] * column[:-1])) < 4 / math.sqrt(len(column))
-    assert abs(np.mean(noise[:, 0] * noise[:, 1])) < 4 / math.sqrt(len(noise))
 
 
 def test_outliers_are_rare_and_normal_and_dropouts_have_their_probability() -> None:

@@ -24,7 +24,6 @@ from cz_gym.evaluation.protocol import Row
 from cz_gym.evaluation.results import Sample
 from cz_gym.evaluation.rollout import rollout
 from tests.observed import PLAIN
-from tests.samples import sample_of
 
 CONFIG = make_config(horizon=300.0, **PLAIN)
 SEEDS = range(5)
@@ -84,7 +83,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 def test_episodes_are_run_once_and_are_those_of_one_rollout(tmp_path: Path, counted: list[int]) -> None:
     first, again = sample(tmp_path, seeds=range(2)), sample(tmp_path)
-    direct = sample_of(slow(Snail()), [rollout(OpenLoop(), CONFIG, SEEDS)])
+    direct = Sample.of(slow(Snail()), [rollout(OpenLoop(), CONFIG, SEEDS)])
     assert counted == [0, 1, 2, 3, 4]
     assert again.seeds == direct.seeds
     assert again.microseconds > 0.0

@@ -9,7 +9,6 @@ import time
 import pytest
 
 from cz_gym.evaluation.processes import in_processes
-from cz_gym.processors import processors
 from tests.processes import ROOT
 
 
@@ -64,12 +63,3 @@ def test_processes_end_with_a_killed_caller() -> None:
         assert caller.stdout.readline() == b"begun\n"
         caller.kill()
         assert caller.stdout.read() == b"", "a process outlived its caller"
-
-
-def test_processors_are_those_that_the_process_may_use(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert 1 <= processors() <= (os.cpu_count() or 1)
-    monkeypatch.delattr(os, "process_cpu_count", raising=False)
-    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {3, 5, 6}, raising=False)
-    assert processors() == 3
-    monkeypatch.setattr(os, "process_cpu_count", lambda: 2, raising=False)
-    assert processors() == 2

@@ -25,7 +25,7 @@ from cz_gym.evaluation.results import Result, Sample, summarise
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.evaluation.statistics import Resamples, optimality_gap
 from tests.observed import PLAIN
-from tests.samples import contender, sample_of
+from tests.samples import contender
 
 
 def made(name: str, errors: list[float], costs: list[float] | None = None, **facts: Any) -> Sample:
@@ -77,7 +77,7 @@ def test_different_numbers_of_episodes_meet_on_those_of_both() -> None:
 def paper() -> Sample:
     """The paper's controller on two crystals."""
     run = rollout(CompensatedPID(), find_row("randomized").config(), TEST_SEEDS[:2])
-    return sample_of(contender("paper"), [run])
+    return Sample.of(contender("paper"), [run])
 
 
 @pytest.fixture
@@ -128,7 +128,7 @@ def test_a_bound_is_used_only_beside_the_same_figures_of_the_same_controller(ear
     assert earlier_bound(earlier, row, [replace(paper, contender=contender("other"))]) is None
     assert earlier_bound(earlier, find_row("hard"), [paper]) is None
     other = make_config("randomized", parameters=make_config(**PLAIN).parameters._replace(k_l=62.1), **PLAIN)
-    moved = sample_of(paper.contender, [rollout(find_controller("paper").make(other), other, paper.seeds)])
+    moved = Sample.of(paper.contender, [rollout(find_controller("paper").make(other), other, paper.seeds)])
     assert earlier_bound(earlier, row, [moved]) is None
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import cz_gym
-from cz_gym import CzEnv, CzVectorEnv
+from cz_gym import CzEnv
 from cz_gym.agents import load
 from cz_gym.baselines import CompensatedPID, OpenLoop
 from cz_gym.baselines.registry import make_controller
@@ -136,7 +136,6 @@ WITHOUT_TUPLE = SimpleNamespace(predict=lambda observation, **rest: np.zeros((le
             r"made for action='direct'.* has action",
         ),
         (load("gradient"), SHORT, r"made for action='rate'.* has action='direct'"),
-        (OpenLoop(), "hard", r"needs a Config, not 'hard': cz_gym.config.make_config\('hard'\) makes one"),
         ("paper", SHORT, r"as make_controller\('paper', config\) makes one"),
     ],
 )
@@ -145,9 +144,10 @@ def test_a_policy_that_does_not_fit_is_refused(policy: Any, config: Any, message
         rollout(policy, config, [1])
 
 
-@pytest.mark.parametrize(
-    "make", [CzEnv.from_config, CzVectorEnv.from_config, partial(make_controller, "lqg"), partial(load, "ppo")]
-)
+WITH_SEED = partial(rollout, OpenLoop(), seeds=[1])
+
+
+@pytest.mark.parametrize("make", [CzEnv.from_config, partial(make_controller, "lqg"), partial(load, "ppo"), WITH_SEED])
 def test_a_scenario_name_in_place_of_a_config_is_refused(make: Any) -> None:
     with pytest.raises(ValueError, match=r"needs a Config, not 'hard': cz_gym.config.make_config\('hard'\) makes one"):
         make("hard")
@@ -195,16 +195,3 @@ def test_a_rollout_can_be_looked_at(tmp_path: Path) -> None:
         plot("paper")  # type: ignore[arg-type]
     with pytest.raises(IndexError, match="below 2"):
         plot(run, 2)
-
-
-def test_making_and_compiling_the_environment_is_no_time_of_the_policy(monkeypatch: pytest.MonkeyPatch) -> None:
-    module, now = import_module("cz_gym.evaluation.rollout"), [0.0]
-    make = CzVectorEnv.from_config
-
-    def slowly(*arguments: Any, **options: Any) -> CzVectorEnv:
-        now[0] += 10.0
-        return make(*arguments, **options)
-
-    monkeypatch.setattr(module.time, "perf_counter", lambda: now[0])
-    monkeypatch.setattr(module.CzVectorEnv, "from_config", slowly)
-    assert rollout(OpenLoop(), SHORT, [1]).seconds_in_policy == 0.0

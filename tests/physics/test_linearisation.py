@@ -6,7 +6,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from cz_gym import make_puller
-from cz_gym.physics.linearisation import INPUTS, linearise, radius_model
+from cz_gym.physics.linearisation import linearise, radius_model
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.plant import NO_DISTURBANCE, Inputs, State, rates
 from cz_gym.units import MM
@@ -39,16 +39,6 @@ def test_complex_step_against_finite_differences():
             sides.append(np.array(rates(State(*at[:5]), Inputs(*at[5:7]), d, p, HURLE.slope)))
         column = (sides[0] - sides[1]) / (2.0 * step)
         np.testing.assert_allclose(np.hstack([model.A, model.B])[:, j], column, rtol=2e-6, atol=1e-12)
-
-
-def test_transfer_functions_agree_with_the_state_space():
-    p = make_puller()
-    model, full = radius_model(p), linearise(p)
-    for s in (1e-4j, 3e-3j, 0.05j):
-        G_p = model.numerator / ((s - model.poles[0]) * (s - model.poles[1]))
-        G_m = model.lead * s + model.constant
-        exact = full.C @ np.linalg.solve(s * np.eye(5) - full.A, full.B[:, INPUTS.index("v_p")])
-        np.testing.assert_allclose([G_p, G_m * G_p], exact[:2], rtol=1e-9)
 
 
 def test_small_step_follows_the_linear_model_with_second_order_error():

@@ -20,12 +20,6 @@ def angles(r_c: np.ndarray, h_c: np.ndarray) -> np.ndarray:
     return np.arcsin(B / np.sqrt(1 + A**2)) - np.arctan(A)
 
 
-def test_slope_solves_hurles_equation(points: tuple[np.ndarray, np.ndarray]) -> None:
-    r_c, h_c = points
-    sine, cosine = hurle_slope(r_c, h_c, PULLER)
-    np.testing.assert_allclose(h_c / (2 * r_c) * cosine + sine, 1 - (h_c / PULLER.a) ** 2, atol=1e-14)
-
-
 def test_height_is_the_inverse_of_the_slope(points: tuple[np.ndarray, np.ndarray]) -> None:
     r_c, h_c = points
     np.testing.assert_allclose(hurle_height(r_c, angles(r_c, h_c), PULLER.a), h_c, rtol=1e-12)

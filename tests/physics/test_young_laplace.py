@@ -90,15 +90,6 @@ def test_table_against_collocation(r_c, h_c):
         assert math.atan(-found.sol(ring)[1]) == pytest.approx(PHI_B, rel=1e-6)
 
 
-def test_table_of_a_wide_crystal_is_planar():
-    h, p = np.linspace(0.2, 1.2, 6) * A, SimpleNamespace(a=A, X_b=ring_point(PHI_B))
-    sine, _ = YOUNG_LAPLACE.slope(1e4, h, p)
-    np.testing.assert_allclose(sine, 1.0 - (h / A) ** 2, atol=1e-6)
-    np.testing.assert_allclose(
-        YOUNG_LAPLACE.ring_offset(1e4, h, p), A * (ring_point(PHI_B) - profile(h / A, 1.0)), rtol=1e-6
-    )
-
-
 @pytest.mark.parametrize(
     ("narrowest", "slopes", "ring", "height"), [(0.05, (1.0, 12.0), 1e-7, 1e-9), (A / 0.3, (0.5, 15.0), 2e-6, 3e-9)]
 )

@@ -13,9 +13,9 @@ from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.rendering import chart, palette, triple_point
 from cz_gym.rendering.canvas import Canvas, Frame
 from cz_gym.rendering.record import Ending, Record
-from cz_gym.rendering.scene import layout, numbers
+from cz_gym.rendering.scene import layout
 from cz_gym.signals import INFO
-from cz_gym.units import KILO, MM, MM_PER_MIN
+from cz_gym.units import MM
 from tests.observed import PLAIN
 
 pygame = pytest.importorskip("pygame")
@@ -82,22 +82,6 @@ def test_the_chart_ends_at_the_true_error(picture: tuple[Frame, Record]) -> None
     x = round(plot.x + record.t[-1] / record.config.horizon * plot.w)
     y = plot.y + plot.h / 2 - record.error[-1] / chart.error_range(record.error) * plot.h / 2
     check_near(near(frame, palette.TRUE)[:, x : x + 3].any(axis=1), y, 8)
-
-
-def test_the_numbers_are_the_records_in_the_units_they_name(record: Record) -> None:
-    p, last = record.puller, record.last
-    rows = [row[:2] for group in numbers(record) for row in group]
-    assert rows == [
-        ("by the camera", f"{(last('r_br_measured') - p.ring_bias) / MM:.2f} mm"),
-        ("reference", f"{last('r_ref') / MM:.2f} mm"),
-        ("pull speed", f"{last('v_p') / MM_PER_MIN:.2f} mm/min"), ("nominal", "1.20"),
-        ("heater", f"{last('Q_H') / KILO:.2f} kW"), ("nominal", f"{p.Q_H_0 / KILO:.2f}"),
-        ("heater T_1", f"{last('T_1'):.2f} K"), ("recipe", f"{last('T_1_ref'):.2f}"),
-        ("melt T_b", f"{last('T_b'):.2f} K"), ("nominal", f"{p.T_b_0:.2f}"),
-    ]  # fmt: skip
-    record.column("valid")[-1] = 0.0
-    assert numbers(record)[0][0][1] == "no reading"
-    record.column("valid")[-1] = 1.0
 
 
 @pytest.mark.parametrize(("model", "tolerance"), [(HURLE, 1e-6), (YOUNG_LAPLACE, 0.3 * MM)], ids=["hurle", "exact"])

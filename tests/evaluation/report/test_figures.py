@@ -19,7 +19,7 @@ from cz_gym.evaluation.report.markdown import brief
 from cz_gym.evaluation.results import Sample, summarise
 from cz_gym.evaluation.rollout import rollout
 from tests.observed import PLAIN
-from tests.samples import contender, sample_of
+from tests.samples import contender
 
 AGENTS = {"gradient": 0.05, "ppo": 0.06, "sac": 0.2}
 """Shipped agents with their RMSE [mm], as on the test crystals."""
@@ -79,7 +79,7 @@ def test_figures_of_a_crystal_that_nothing_disturbs_and_of_a_name_that_seems_a_f
         row = find_row(name)
         run = rollout(OpenLoop(), make_config(name, horizon=600.0, **PLAIN), row.seeds(2))
         who = ["a $\\frac$ b", *(f"c{i}" for i in range(COLUMNS))]
-        results.append(summarise(row, [sample_of(contender(each, training_seeds=(1,)), [run]) for each in who]))
+        results.append(summarise(row, [Sample.of(contender(each, training_seeds=(1,)), [run]) for each in who]))
     figures = draw_figures(results)
     assert set(figures) == {"crystal.png", "pareto.png"}
     assert all(image.startswith(b"\x89PNG") for image in figures.values())

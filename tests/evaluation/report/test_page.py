@@ -14,15 +14,10 @@ from hypothesis import strategies as st
 from plotly import graph_objects as go
 
 import benchmark
-from cz_gym.config import make_config
-from cz_gym.env import CzEnv
 from cz_gym.evaluation.report.canvas import styles_of
 from cz_gym.evaluation.report.page import page
 from cz_gym.evaluation.report.page_pictures import PANELS, crystal, pareto, plain
 from cz_gym.evaluation.report.tables import DRIVES, ERROR, comparison
-from cz_gym.evaluation.results import Result
-from cz_gym.observation import MEASURED, scales
-from tests.observed import PLAIN
 from tests.samples import result_of
 
 EVIL = "</script><img src=x onerror=alert(1)>\"'&amp;<b>\u2028%{x}|"
@@ -145,18 +140,6 @@ def test_lines_are_means_of_the_rollouts_over_45_seconds(made: Made, row: str) -
         np.testing.assert_allclose(camera - ring, read, atol=1e-5)
 
 
-def test_the_camera_reading_is_what_the_controller_gets(made: Made) -> None:
-    """The environment's own observation, which is less the operator's bias and the reference, is the oracle."""
-    camera = made.lines("puller", "radius error")["open-loop"][0]
-    env, read = CzEnv("puller", **PLAIN), []
-    env.reset(seed=made.results[0].seeds[0])
-    scale = scales(MEASURED, make_config(**PLAIN).parameters.v_0)[0]
-    for _ in range(40 * STEP):
-        observation, *_ = env.step(np.zeros(2, np.float32))
-        read.append(1e3 * observation[0] * scale)
-    np.testing.assert_allclose(camera[:40], np.reshape(read, (-1, STEP)).mean(axis=1), atol=2e-3)
-
-
 def test_a_signal_that_is_no_number_ends_the_line(made: Made) -> None:
     result = made.results[1]
     first, *others = result.samples
@@ -206,12 +189,6 @@ def test_the_same_results_give_the_same_bytes_and_few_of_them(made: Made) -> Non
     assert page_of(made.results) == made.text
     crystals = len(made.figures[1].to_json()) / len(ROWS)
     assert crystals < 110_000, "eight scenarios fit into 6 MB beside plotly.js"
-
-
-def test_without_the_reference_there_is_no_comparison() -> None:
-    alone: Result = result_of("reference-b", ("open-loop",), "some")[0]
-    assert comparison(alone) == ()
-    assert len(Parts(page_of([alone])).rows[0]) == 1 + len(ERROR) + len(DRIVES)
 
 
 def test_json_alone_needs_no_plotly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
