@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from functools import partial
+from dataclasses import dataclass
 from typing import Any
 
 from cz_gym.config import Config
@@ -66,20 +65,6 @@ class Contender:
         """Its policy for an environment's settings; of an agent one a training seed."""
         return self.trained or (self.make(config),)
 
-    def facts(self) -> dict[str, Any]:
-        """Its entry in ``benchmark.json``."""
-        known = ("name", "observation", "meaning", "training_seeds", "privileged", "slow", "action", "own")
-        return {name: getattr(self, name) for name in known}
-
-    def contracts(self) -> list[dict[str, Any]]:
-        """The contracts of an agent's files."""
-        return [asdict(policy.contract) for policy in self.trained]
-
-
-def given(policy: Any, config: Config) -> Any:
-    """Return the policy itself; the settings are ignored."""
-    return policy
-
 
 def agent(name: str, policies: Sequence[Any], own: bool = False) -> Contender:
     """An agent from its policies with a ``contract``, one a training seed.
@@ -99,6 +84,6 @@ def agent(name: str, policies: Sequence[Any], own: bool = False) -> Contender:
     one = contracts[0]
     meaning = f"agent trained with {one.algorithm} on {one.scenario}{', given as a file' if own else ''}"
     return Contender(
-        name, partial(given, policies[0]), one.observation, meaning,
+        name, lambda config: policies[0], one.observation, meaning,
         action=one.action, own=own, training_seeds=seeds, trained=tuple(policies),
     )  # fmt: skip

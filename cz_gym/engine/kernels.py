@@ -160,8 +160,6 @@ class Kernels(NamedTuple):
     plant: Any
     """``plant(memory, actions, active, clock, drives, rings, start, stop)``: drives, plant and ring of all slots alone,
     to measure speed against."""
-    derive: Any
-    """``derive(parameters, lam)``: the puller at its operating point."""
 
 
 @lru_cache(maxsize=8)
@@ -242,14 +240,10 @@ def build_kernels(meniscus: MeniscusModel) -> Kernels:
                 p, x = memory.slots[i].puller, memory.slots[i].x
                 rings[i] = x.r_c + ring_offset(x.r_c, height_inside(x.h_c, p), p)
 
-    def derive(parameters: Any, lam: float) -> Any:
-        return derive_puller(parameters, lam, height, ring_offset)
-
     keep = hashed(*meniscus.functions)
     return Kernels(
         kernel(step, keep, allocates=False),
         kernel(draw, keep),
         kernel(show, keep, allocates=False),
         kernel(plant, keep, allocates=False),
-        kernel(derive, keep),
     )

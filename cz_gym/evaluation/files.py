@@ -8,6 +8,7 @@ import json
 import platform
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ from .statistics import RESAMPLES, SEED, Estimate
 
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime", "casadi")
 """Packages whose versions are recorded."""
+FACTS = ("name", "observation", "meaning", "training_seeds", "privileged", "slow", "action", "own")
+"""What is recorded of a contender."""
 RESULTS, EPISODES = "benchmark.json", "episodes.csv"
 FILES = (RESULTS, EPISODES, "report.md", "report.html", "crystal.png", "pareto.png")
 """Everything a folder of results may hold."""
@@ -136,8 +139,8 @@ def _provenance(results: Sequence[Result], command: str) -> dict[str, Any]:
         "control_interval_s": config.control_interval,
         "horizon_s": config.horizon,
         "scenarios": {result.row.name: _crystals(result) for result in results},
-        "controllers": {each.name: each.facts() for each in contenders},
-        "agents": [contract for each in contenders for contract in each.contracts()],
+        "controllers": {each.name: {name: getattr(each, name) for name in FACTS} for each in contenders},
+        "agents": [asdict(policy.contract) for each in contenders for policy in each.trained],
         "bootstrap": {"resamples": RESAMPLES, "seed": SEED, "paired_against": REFERENCE},
         "gap_measured_from": BOUND,
         "gap_from_cached_episodes": {

@@ -69,28 +69,27 @@ class View:
         self.mode, self.size, self.config = mode, (width, height), config
         self.record: Record | None = None
         self._scene: Scene | None = None
-        self._window: Window | None = None
+        self._window: Any = None
+        """Surface of the window; None while there is none."""
 
     def begin(self, info: npt.NDArray[np.float64], slot: Any, scenario: str) -> None:
         """Begin the record of an episode at its first sample, or at the one where a state was restored."""
         self.record = Record(self.config, slot, scenario)
-        self.record.add(info, float(slot["valid"]))
-        self._show()
+        self.add(info, float(slot["valid"]))
 
-    def add(self, info: npt.NDArray[np.float64], valid: float, terminated: bool, truncated: bool) -> None:
+    def add(
+        self, info: npt.NDArray[np.float64], valid: float, terminated: bool = False, truncated: bool = False
+    ) -> None:
         """Add a step to the record."""
         if self.record is not None:
             self.record.add(info, valid, terminated, truncated)
-            self._show()
-
-    def _show(self) -> None:
-        if self.mode == "human":
-            self.render()
+            if self.mode == "human":
+                self.render()
 
     def render(self) -> Frame | None:
         """The picture, shape (height, width, 3), or None once it is in the window.
 
-        Raises ResetNeeded before the first reset.
+        Raises ResetNeeded before the first reset, :class:`gymnasium.error.Error` where no window can be opened.
         """
         if self.record is None:
             raise ResetNeeded("cannot render before the first reset(): there is no crystal yet")
@@ -99,38 +98,26 @@ class View:
         picture = self._scene.draw(self.record)
         if self.mode == "rgb_array":
             return picture
+        pygame = load()
         if self._window is None:
-            self._window = Window(self.size, "Cz-v0: Czochralski growth")
-        self._window.show(picture)
+            self._open(pygame)
+        pygame.surfarray.blit_array(self._window, picture.swapaxes(0, 1))
+        pygame.event.pump()
+        self._clock.tick(FPS)
+        pygame.display.flip()
         return None
+
+    def _open(self, pygame: Any) -> None:
+        try:
+            pygame.display.init()
+            self._window = pygame.display.set_mode(self.size)
+        except pygame.error as error:
+            raise Error(f"cannot open a window: {error}; render_mode='rgb_array' needs none") from None
+        pygame.display.set_caption("Cz-v0: Czochralski growth")
+        self._clock = pygame.time.Clock()
 
     def close(self) -> None:
         """Close the window, if there is one; it opens again with the next picture."""
         if self._window is not None:
-            self._window.close()
+            load().display.quit()
             self._window = None
-
-
-class Window:
-    """A window for pictures of one size. Raises :class:`gymnasium.error.Error` where none can be opened."""
-
-    def __init__(self, size: tuple[int, int], caption: str) -> None:
-        self._pygame = load()
-        try:
-            self._pygame.display.init()
-            self.screen = self._pygame.display.set_mode(size)
-        except self._pygame.error as error:
-            raise Error(f"cannot open a window: {error}; render_mode='rgb_array' needs none") from None
-        self._pygame.display.set_caption(caption)
-        self._clock = self._pygame.time.Clock()
-
-    def show(self, picture: Frame) -> None:
-        """Show a picture, at most FPS a second."""
-        self._pygame.surfarray.blit_array(self.screen, picture.swapaxes(0, 1))
-        self._pygame.event.pump()
-        self._clock.tick(FPS)
-        self._pygame.display.flip()
-
-    def close(self) -> None:
-        """Close the window."""
-        self._pygame.display.quit()

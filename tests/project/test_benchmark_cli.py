@@ -189,7 +189,7 @@ def test_a_file_may_be_named_and_stand_beside_the_shipped_agents(tmp_path: Path)
     everything = "0.175 hard + 0.175 hot-zone + 0.175 puller + 0.3 randomized + 0.175 sensor-fault"
     trained_on = [each.meaning.partition(" on ")[2] for each in found[1:]]
     assert trained_on == ["randomized, given as a file", everything]
-    assert [len(each.contracts()) for each in found] == [0, 1, len(found[2].training_seeds)]
+    assert [len(each.trained) for each in found] == [0, 1, len(found[2].training_seeds)]
     alone = contenders("--controllers", "paper", "--agent", str(file))
     assert [each.name for each in alone] == ["paper", "ppo"]
     names = ("a", Path("b=c.onnx")), ("", Path("x/a=b.onnx"))

@@ -11,7 +11,7 @@ from gymnasium.error import DependencyNotInstalled
 import benchmark
 from cz_gym import datasets, play
 from cz_gym.baselines.tuning import __main__ as tuning
-from cz_gym.commands import OPTIONAL, OneLineParser, guarded
+from cz_gym.commands import OPTIONAL, guarded
 from cz_gym.errors import CzError
 from studies import speed
 from studies.paper import __main__ as paper
@@ -64,12 +64,6 @@ def test_an_interrupt_and_a_place_that_cannot_be_written_are_one_line_and_leave_
     assert captured.err.count("\n") == 1
     assert ("interrupted" if writable else "new is not a folder") in captured.err
     assert [path.name for path in tmp_path.iterdir()] == ([] if writable else ["new"])
-
-
-def test_a_message_of_several_lines_becomes_one(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        OneLineParser("it").parse_args(["two\nlines"])
-    assert capsys.readouterr().err == "it: unrecognized arguments: two lines\n"
 
 
 @pytest.mark.parametrize(

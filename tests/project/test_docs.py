@@ -161,15 +161,6 @@ def test_commands_of_the_pages_are_understood(understood: Any) -> None:
     assert len(listed) > 20
 
 
-@pytest.mark.parametrize(
-    "line",
-    ["make all", "python benchmark.py --episode 5", "pip install '.[none]'", "python -m studies.paper --no", "ls"],
-)
-def test_commands_that_do_not_exist_are_noticed(line: str, understood: Any) -> None:
-    with pytest.raises((AssertionError, SystemExit)):
-        understood(shlex.split(line))
-
-
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The built site: warnings are errors, as in ``make docs``."""
