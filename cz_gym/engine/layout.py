@@ -57,7 +57,7 @@ was drawn from and the index of its ``scenario`` in the mixture, the drives [m/s
 action was clipped: a sample can be written again from its slot. Then the 5 s grid point that ``dT_i`` belongs to with
 its two processes [standard deviations], and the episode's random streams, as far as they are drawn from."""
 PULLER_AT, EPISODE_AT, STATE_AT = np.cumsum([0, len(Puller._fields), len(Episode._fields)]).tolist()
-"""Where a slot's constants and its plant state begin, in numbers of eight bytes."""
+"""Offsets in a slot of the puller's constants, the episode's constants and the plant's state [numbers of 8 bytes]."""
 
 
 class Clock(NamedTuple):

@@ -11,11 +11,11 @@ from cz_gym.signals import MEASURED, Measured
 _M, _L = len(MEASURED), len(LAGGED)
 _REMEMBERED = tuple(Measured._fields.index(name) for name in LAGGED)
 _PAST_CHANGE = tuple(MEASURED[at].scale / PAST_SCALES[name] for at, name in zip(_REMEMBERED, LAGGED, strict=True))
-"""Scale of each remembered signal over that of its past differences."""
+"""Ratio of each remembered signal's scale to the scale of its past differences [-]."""
 _PLACE = tuple(Measured._fields.index(name) for name in RELATIVE)
 _TO = tuple(Measured._fields.index(relative.to) for relative in RELATIVE.values())
 _CHANGE = tuple(MEASURED[at].scale / relative.scale for at, relative in zip(_PLACE, RELATIVE.values(), strict=True))
-"""Signals relative to another one: their index, the index of the other, and the change of their scale."""
+"""Signals shown relative to another one: their index, the index of the other, and the ratio of the two scales."""
 _RING = _REMEMBERED[0]
 _RING_SCALE = MEASURED[_RING].scale
 

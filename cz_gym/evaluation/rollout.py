@@ -90,10 +90,10 @@ def rollout(
     if hasattr(policy, "for_episodes"):
         policy = policy.for_episodes(config, list(seeds))
     planning = time.perf_counter() - before
-    course = EpisodeBatch(config, seeds)  # its first one compiles: no time of the policy's
-    course.seconds = planning
-    course.run(policy, config.steps, progress)
-    return course.finish()
+    episodes = EpisodeBatch(config, seeds)  # its first one compiles: no time of the policy's
+    episodes.seconds = planning
+    episodes.run(policy, config.steps, progress)
+    return episodes.finish()
 
 
 def check_seeds(seeds: Sequence[int] | npt.NDArray[Any]) -> tuple[int, ...]:
@@ -121,11 +121,11 @@ def check_policy(policy: Any, config: Config, designed_for: Config | None = None
             raise CzError(f"{type(policy).__name__}.predict: {error}; it must be {PREDICT}") from None
     own = (designed_for or config).made_for
     acts, interval = getattr(policy, "action", None), getattr(policy, "control_interval", None)
-    said = own._replace(
+    declared = own._replace(
         action=acts if isinstance(acts, str) else own.action,
         control_interval=own.control_interval if interval is None else interval,
     )
-    if message := mismatch(getattr(policy, "made_for", said), own):
+    if message := mismatch(getattr(policy, "made_for", declared), own):
         raise CzError(f"{type(policy).__name__}: {message}")
 
 

@@ -64,10 +64,10 @@ def test_a_rollout_looks_through_the_camera_of_its_settings() -> None:
     """It was dropped, while the settings' hash said that it was there."""
     near = Camera(tilt=0.4)
     config = make_config("nominal", observation="camera", horizon=10.0, camera=near, action="direct")
-    course = EpisodeBatch(config, [3])
+    batch = EpisodeBatch(config, [3])
     image, _ = CzEnv.from_config(config, info="all").reset(seed=3)
-    np.testing.assert_array_equal(course.observation[0], image)
-    assert course.env.config is config
+    np.testing.assert_array_equal(batch.observation[0], image)
+    assert batch.env.config is config
 
 
 def check_against_scalar(policy: Any, config: Config, seeds: Sequence[int]) -> Rollout:

@@ -18,9 +18,9 @@ from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 from .canvas import GREY, INK, Style, canvas, chosen, png
 
 COLUMNS = 5
-"""Most controllers in the figure: with more, its words are too small where a page shows it 830 pixels wide."""
+"""Largest number of controllers in the figure: with more, its text is too small on a page 830 pixels wide."""
 ROOM = (0.01 * MM, 3.0 * MM)
-"""Least and largest radius error that the figure has room for, beyond the reference's own range [m]."""
+"""Smallest and largest margin of the radius axis around the reference [m]."""
 SMOOTH = 5.0 * MINUTE
 """Length of the running mean of the drives [s], drawn over their single steps."""
 
@@ -115,7 +115,7 @@ def lost(sample: Sample) -> bool:
 
 
 def _set_limits(axes: Any, columns: Sequence[Column], longest: Signals, dt: float) -> None:
-    """Scale by the crystals that were not lost: one that was leaves the picture, it does not set the scale."""
+    """Set the axes' limits by the crystals that were not lost; a lost one leaves the picture."""
     whole = [column.signals for column in columns if not column.lost] or [column.signals for column in columns]
     worst = max(float(np.abs(signals.r_c - signals.r_ref).max()) for signals in whole)
     width = 1.15 * float(np.clip(worst, *ROOM))

@@ -33,7 +33,7 @@ def draw_figures(results: Sequence[Result]) -> dict[str, bytes]:
 
 
 def floor_of(results: Sequence[Result]) -> float:
-    """Return the pull step RMS at which controllers are drawn that never move the pull speed [mm/min]."""
+    """Return the pull step RMS [mm/min] at which to draw controllers that never move the pull speed."""
     moving = [each[PULL_STEP.metric].mean for result in results for each in result.means.values()]
     return min((value for value in moving if value > 0.0), default=1.0) / 3.0
 

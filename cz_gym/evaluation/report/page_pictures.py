@@ -90,9 +90,9 @@ def _bars(estimate: Estimate) -> dict[str, Any]:
 POINT = 45.0
 """Time over which a point is the mean [s]."""
 MOST = 5
-"""Most controllers whose signals are on the page, so that it stays small."""
+"""Largest number of controllers whose signals are on the page, which keeps the page small."""
 OUTLIERS = 0.001
-"""Share of the values at either end that a panel's range need not hold."""
+"""Share of the values at either end that may lie outside a panel's range [-]."""
 
 
 class Panel(NamedTuple):
@@ -103,8 +103,8 @@ class Panel(NamedTuple):
     scale: float
     """Size of the unit in SI units."""
     lines: Mapping[str, Callable[[Signals, float], Floats]]
-    """Functions of an episode's signals and the operator's bias [m], in SI: ``true``, and what the ``camera`` reports,
-    of each controller; any other is what all controllers are asked for or meet."""
+    """Lines by name, each a function of an episode's signals and the operator's bias [m], in SI units. "true" and
+    "camera" (its reading) are drawn for each controller; other lines are the same for all and drawn once."""
     levels: tuple[float, ...] = ()
     """Values that are marked [unit]."""
 
@@ -133,7 +133,7 @@ PANELS = (
     Panel("growth angle", "deg", np.pi / 180.0, {"true": lambda s, bias: s.alpha_c}, (0.0,)),
 )  # fmt: skip
 OWN = ("true", "camera")
-"""Lines that each controller has of its own."""
+"""Lines that are drawn for each controller."""
 
 
 def crystal(results: Sequence[Result], styles: Mapping[str, Style]) -> go.Figure:
