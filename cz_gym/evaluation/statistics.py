@@ -58,7 +58,7 @@ class Resamples:
         return cls(_weights(episodes, count, np.random.default_rng(seed)))
 
     def training_seeds(self, number: int, of: int = 0) -> Floats:
-        """Draw weights of ``number`` training seeds, shape (resamples, number), independently for each controller ``of``."""
+        """Draw weights of ``number`` training seeds, shape (resamples, number), anew for each controller ``of``."""
         return _weights(number, len(self.episodes), np.random.default_rng([SEED, 1 + of]))
 
 
