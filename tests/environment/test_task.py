@@ -2,7 +2,6 @@ import math
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,15 +12,6 @@ from tests.observed import PLAIN
 
 MM, MM_PER_MIN = 1e-3, 1e-3 / 60
 P = make_puller()
-
-
-def test_cost_terms_are_those_of_the_design() -> None:
-    cost = cost_terms(0.5 * MM, 0.36 * MM_PER_MIN, -0.06 * MM_PER_MIN, 1000.0)
-    assert cost == pytest.approx((1.0, 0.5 * (0.12 / 0.36) ** 2, 0.05, 0.5))
-    total = sum(cost)
-    assert reward(cost, True) == pytest.approx(1 - 10 * total / (10 + total))
-    assert reward(cost, False) == pytest.approx(1 - 10 * total / (10 + total) - 1000)
-    assert reward(cost_terms(0.0, 0.0, 0.0, 0.0), True) == 1.0
 
 
 @given(st.floats(0, 8e-3), st.floats(1e-6, 1e-3), st.floats(-4e-5, 4e-5), st.floats(-2e4, 2e4))
