@@ -49,6 +49,7 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
         self,
         num_envs: int = 1,
         scenario: AnyScenario = "randomized",
+        *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         threads: int | None = None,
         info: str = "lean",
