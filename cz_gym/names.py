@@ -28,7 +28,7 @@ def unknown(kind: str, name: object, known: Iterable[str], also: str = "") -> st
 def known_keywords(given: Iterable[str], *functions: Callable[..., Any]) -> None:
     """Raise CzError for the first keyword that none of the functions has."""
     parameters = [each for function in functions for each in inspect.signature(function).parameters.values()]
-    known = [each.name for each in parameters if each.name != "self" and each.kind != each.VAR_KEYWORD]
+    known = dict.fromkeys(each.name for each in parameters if each.name != "self" and each.kind != each.VAR_KEYWORD)
     for name in given:
         if name not in known:
             raise CzError(unknown("keyword", name, known))
