@@ -13,7 +13,6 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from asyncua import Client, ua
@@ -22,33 +21,29 @@ from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 from cz_gym.commands import OneLineParser, between
 from cz_gym.config import Config, make_config
 from cz_gym.errors import CzError
-from cz_gym.export.__main__ import export_program
+from cz_gym.export.__main__ import make_block
 from cz_gym.export.compiled import CompiledBlock
-from cz_gym.export.text import write_c
+from cz_gym.export.policy import Runner
 from cz_gym.serve.machine import SETPOINTS, TAGS
 from cz_gym.serve.opcua import KINDS, URI, certify, password
 
 
-class Block:
+class Controller:
     """A controller in its shell, which holds bad readings, limits its setpoints and takes over without a jump."""
 
     def __init__(self, name: str, config: Config, compiled: bool = False) -> None:
-        program = export_program(name, config)
-        self._run, self._memory = program.run, program.start[None]
-        if compiled:
-            with TemporaryDirectory() as folder:
-                for file, text in write_c(program).items():
-                    (Path(folder) / file).write_text(text)
-                block = CompiledBlock(program, Path(folder) / f"cz_{program.name}.c")
-            self._run, self._memory = block.run, block.begin(1)
+        block = make_block(name, config)
+        self._runner: Runner = CompiledBlock(block) if compiled else block
+        self._memory = self._runner.start(1)
 
     def setpoints(self, tags: dict[str, Any]) -> list[float]:
         """The setpoints for the tags of a step, whose names are those of the block's inputs and settings."""
-        outputs, self._memory = self._run(tags | {"ring_time_s": tags["time_s"], "automatic": True}, self._memory)
+        given = tags | {"ring_time_s": tags["time_s"], "automatic": True}
+        outputs, self._memory = self._runner.run(given, self._memory)
         return [float(outputs[name][0]) for name in SETPOINTS]
 
 
-async def control(block: Block, label: str, client: Client, steps: int) -> int:
+async def control(controller: Controller, label: str, client: Client, steps: int) -> int:
     """Control until the crystal ends, or for so many steps; returns how many were answered."""
     space = await client.get_namespace_index(f"{URI}:tags")
     nodes = {tag.name: client.get_node(ua.NodeId(tag.name, space)) for tag in TAGS}
@@ -64,7 +59,7 @@ async def control(block: Block, label: str, client: Client, steps: int) -> int:
             await asyncio.sleep(0.001)
             continue
         last = tags["step"]
-        values = zip((*block.setpoints(tags), last), written.values(), strict=True)
+        values = zip((*controller.setpoints(tags), last), written.values(), strict=True)
         with suppress(ua.UaStatusCodeError):  # refused: the server says why, and holds what it had
             await client.write_values([nodes[name] for name in written], [ua.Variant(*value) for value in values])
             answered += 1
@@ -74,7 +69,8 @@ async def control(block: Block, label: str, client: Client, steps: int) -> int:
 async def run(arguments: argparse.Namespace) -> None:
     """Connect, with encryption if the server's certificate is given, and control."""
     config = make_config(arguments.scenario, observation="measured", action="direct", puller=arguments.puller)
-    block, client = Block(arguments.controller, config, arguments.compiled), Client(arguments.url)
+    controller = Controller(arguments.controller, config, arguments.compiled)
+    client = Client(arguments.url)
     if arguments.operator:
         client.set_user(arguments.operator)
         client.set_password(password("operator"))
@@ -87,7 +83,7 @@ async def run(arguments: argparse.Namespace) -> None:
         )
     try:
         async with client:
-            print(f"{await control(block, config.puller.label, client, arguments.steps)} steps answered")
+            print(f"{await control(controller, config.puller.label, client, arguments.steps)} steps answered")
     except (OSError, ua.UaError) as error:
         raise CzError(f"{arguments.url}: {error or type(error).__name__}") from None
 

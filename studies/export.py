@@ -12,7 +12,6 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,10 +23,10 @@ from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.rollout import Rollout, rollout
-from cz_gym.export.__main__ import export_program
+from cz_gym.export.__main__ import make_block
 from cz_gym.export.compiled import CompiledBlock
 from cz_gym.export.policy import BlockPolicy
-from cz_gym.export.text import write_c
+from cz_gym.export.shell import Block, in_shares
 
 CONTROLLERS = ("paper", "paper-tuned", "lqg-at-0.02", "gradient", "ppo")
 SCENARIOS = ("randomized", "hard", "sensor-fault", "puller")
@@ -61,12 +60,13 @@ class Row(NamedTuple):
 
 
 class Beside:
-    """A policy that acts, and blocks that get the same readings; keeps the largest differences of their actions."""
+    """A block in Python that acts, and compiled ones that get the same readings; keeps the largest differences."""
 
     made_for = None
 
-    def __init__(self, acting: BlockPolicy, others: Sequence[BlockPolicy]) -> None:
-        self.policies, self.differences = (acting, *others), np.zeros(len(others))
+    def __init__(self, block: Block, compiled: Sequence[CompiledBlock]) -> None:
+        self.config, self.differences = block.config, np.zeros(len(compiled))
+        self.policies = [BlockPolicy(block), *(BlockPolicy(block, runner) for runner in compiled)]
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
@@ -74,7 +74,7 @@ class Beside:
         """As of every policy; the state is that of each block."""
         states = state or [None] * len(self.policies)
         done = [block.predict(observation, of, episode_start) for block, of in zip(self.policies, states, strict=True)]
-        own, *rest = (block.shares_of(of.outputs) for block, (_, of) in zip(self.policies, done, strict=True))
+        own, *rest = (in_shares(of.outputs, self.config) for _, of in done)
         self.differences = np.maximum(self.differences, [np.abs(each - own).max() for each in rest])
         return done[0][0], [of for _, of in done]
 
@@ -89,19 +89,14 @@ def figures(run: Rollout) -> Figures:
 def study(controller: str, scenario: str, crystals: int) -> list[Row]:
     """Grow the crystals with Python, and with the C in each precision that the controller allows."""
     config, seeds = make_config(scenario, observation="measured", action="direct"), VALIDATION_SEEDS[:crystals]
-    program, blocks = export_program(controller, config), {}
-    with TemporaryDirectory() as folder:
-        for real in LARGEST if not program.needs_double else ("double",):
-            write_files(
-                {Path(folder) / name: text.encode() for name, text in write_c(program, real == "float").items()}
-            )
-            block = CompiledBlock(program, Path(folder) / f"cz_{program.name}.c", real == "float")
-            blocks[real] = BlockPolicy(program, config, run=block.run, begin=block.begin)
-    beside = Beside(BlockPolicy(program, config), list(blocks.values()))
+    block = make_block(controller, config)
+    reals = ["double"] if block.program.needs_double else list(LARGEST)
+    compiled = [CompiledBlock(block, real == "float") for real in reals]
+    beside = Beside(block, compiled)
     python = figures(rollout(beside, config, seeds))
     return [
-        Row(controller, scenario, real, float(difference), python, figures(rollout(block, config, seeds)))
-        for (real, block), difference in zip(blocks.items(), beside.differences, strict=True)
+        Row(controller, scenario, real, float(difference), python, figures(rollout(policy, config, seeds)))
+        for real, difference, policy in zip(reals, beside.differences, beside.policies[1:], strict=True)
     ]
 
 

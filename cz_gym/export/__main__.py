@@ -1,4 +1,4 @@
-"""Write a controller for a plant: ``python -m cz_gym.export CONTROLLER --to c|st --out DIR``."""
+"""Write a controller for a plant, or the plant for a simulator: ``python -m cz_gym.export``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pkgutil
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from cz_gym.atomic_files import write_files
 from cz_gym.commands import OneLineParser, shown
@@ -18,16 +18,15 @@ from cz_gym.observation import CLIP
 from cz_gym.units import KILO, MM_PER_MIN
 
 from .agent import Agent
-from .program import Program
-from .shell import Alarm, shelled
+from .onnx_graph import write_onnx
+from .shell import Alarm, Block
 from .text import meanings, write_c, write_st
 
 REGISTRY, AGENTS = "cz_gym.baselines.registry", "cz_gym.agents"
 """Modules that know controllers and agents, looked up by name because this package imports neither."""
 FALLBACK = "paper-tuned"
 """The PID that takes over."""
-WRITERS = {"c": write_c, "st": write_st}
-"""Writers by the name of their language."""
+FORMS = ("c", "fmu", "onnx", "st")
 README = """# {name}: a controller for Czochralski growth
 
 {about}
@@ -76,54 +75,58 @@ Write in the nominal values of your own puller, and limits that it can bear.
 """
 
 
-class Chosen(NamedTuple):
-    """A controller to be exported."""
-
-    name: str
-    controller: Any
-    config: Config
-    notes: tuple[str, ...]
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the files; 0 when done, 2 for bad input."""
     parser = OneLineParser(
-        "python -m cz_gym.export", "Write a controller, with what a plant needs around it, as C99 or structured text."
+        "python -m cz_gym.export",
+        "Write a controller, with what a plant needs around it, as C99, structured text or ONNX; or the puller as FMU.",
     )
     add = parser.add_argument
-    add("controller", help="a classical controller, a shipped agent, or an agent file (.onnx)")
-    add("--to", choices=sorted(WRITERS), required=True, help="c: C99; st: IEC 61131-3 structured text")
+    add("controller", nargs="?", help="a classical controller, a shipped agent, or an agent file (.onnx)")
+    add("--plant", action="store_true", help="the puller in place of a controller (--to fmu)")
+    add("--to", choices=FORMS, required=True, help="c: C99; st: IEC 61131-3 structured text; onnx: ONNX; fmu: FMI 2.0")
     add("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
     parser.add_puller("its nominal values, its drives' limits, what is designed for it")
-    add("--scenario", default="puller", metavar="NAME", help="scenario whose tuned settings it has (%(default)s)")
-    add("--real", choices=("double", "float"), default="double", help="precision of the numbers (%(default)s)")
-    return parser.run(_export, arguments, "benchmark")
+    add("--scenario", default="puller", metavar="NAME",
+        help="scenario whose tuned settings a controller has, and that a plant begins with (%(default)s)")  # fmt: skip
+    add("--real", choices=("double", "float"), default="double", help="precision of c and st (%(default)s)")
+    return parser.run(_export, arguments, "plant")
 
 
 def _export(given: argparse.Namespace) -> None:
+    if given.plant != (given.to == "fmu") or given.plant == bool(given.controller):
+        raise CzError("name a controller and --to c, st or onnx; or --plant --to fmu")
     config = make_config(given.scenario, observation="measured", action="direct", puller=given.puller)
-    program = export_program(given.controller, config)
-    if given.real == "float" and program.needs_double:
-        raise CzError(f"{given.controller}: its filter works on temperatures in kelvin and needs --real double")
-    texts = WRITERS[given.to](program, given.real == "float")
-    texts["README.md"] = readme(program, config, list(texts))
-    write_files({given.out / name: text.encode() for name, text in texts.items()})
+    if given.plant:
+        from .fmu import build_fmu
+
+        print(shown(build_fmu(given.out, given.scenario, config.puller if given.puller else None)))
+        return
+    block, single = make_block(given.controller, config), given.real == "float"
+    if single and (block.program.needs_double or given.to == "onnx"):
+        why = "ONNX is written" if given.to == "onnx" else "its filter works on temperatures in kelvin and needs"
+        raise CzError(f"{given.controller}: {why} --real double")
+    texts: dict[str, Any] = (
+        write_onnx(block.program)
+        if given.to == "onnx"
+        else {"c": write_c, "st": write_st}[given.to](block.program, single)
+    )
+    texts["README.md"] = readme(block, list(texts))
+    encoded = {name: text if isinstance(text, bytes) else text.encode() for name, text in texts.items()}
+    write_files({given.out / name: text for name, text in encoded.items()})
     for name in texts:
         print(shown(given.out / name))
 
 
-def export_program(name: str, config: Config) -> Program:
-    """The program of a controller or agent in its shell; its fallback is the re-tuned PID of the same settings."""
-    chosen = choose(name, config)
-    pid = pkgutil.resolve_name(f"{REGISTRY}:make_controller")(FALLBACK, config)
-    return shelled(chosen.name, chosen.controller, pid, chosen.config, chosen.notes)
+def make_block(name: str, config: Config) -> Block:
+    """A controller or agent in its shell; its fallback is the re-tuned PID of the same settings.
 
-
-def choose(name: str, config: Config) -> Chosen:
-    """The controller of that name, with the facts for the header."""
+    CzError if there is none of that name, if it cannot be exported, or if an agent is of another puller.
+    """
     agents: Any = pkgutil.resolve_name(AGENTS)
     known = [entry.name for entry in pkgutil.resolve_name(f"{REGISTRY}:CONTROLLERS") if not entry.bound]
     plant = f"Puller {config.puller.label}; plant {config.plant_hash}; control interval {config.control_interval:g} s."
+    pid = pkgutil.resolve_name(f"{REGISTRY}:make_controller")(FALLBACK, config)
     identifier = re.sub(r"\W+", "_", Path(name).stem.lower())
     if name in known:
         entry = pkgutil.resolve_name(f"{REGISTRY}:find_controller")(name)
@@ -131,7 +134,7 @@ def choose(name: str, config: Config) -> Chosen:
         controller = entry.make(config)
         if not (hasattr(controller, "at_rest") and hasattr(controller, "step")):
             raise CzError(f"{name} cannot be exported: it solves an optimisation problem, or has no feedback")
-        return Chosen(identifier, controller, config, (f"Controller {name}: {entry.meaning}.", tuned))
+        return Block(identifier, controller, pid, config, (f"Controller {name}: {entry.meaning}.", tuned))
     if name not in agents.shipped_names() and Path(name).suffix != ".onnx":
         raise CzError(unknown("controller or agent", name, [*known, *agents.shipped_names()]))
     policy = agents.load(name)
@@ -147,12 +150,17 @@ def choose(name: str, config: Config) -> Chosen:
         f"({contract.scenario_hash}).",
         f"File {contract.sha256}; observation {contract.observation} {contract.observation_hash}. {plant}",
     )
-    return Chosen(identifier, Agent(policy, config), config, facts)
+    return Block(identifier, Agent(policy, config), pid, config, facts)
 
 
-def readme(program: Program, config: Config, files: list[str]) -> str:
+def readme(block: Block, files: list[str]) -> str:
     """The README beside the files."""
-    kinds = {".h": "declarations", ".c": "the block", ".st": "the function block"}
+    kinds = {
+        ".h": "declarations", ".c": "the block", ".st": "the function block",
+        ".onnx": "the block as a graph in double precision, inputs of shape [1]; the output `next_memory` is the input "
+        "`memory` of the next call, which the first call leaves out",
+    }  # fmt: skip
+    program, config = block.program, block.config
     return README.format(
         name=program.name,
         about="  \n".join(program.notes),

@@ -88,27 +88,13 @@ class Network:
         return [values[name] for name in self.outputs]
 
 
-class Cells:
-    """A table of traced numbers that can be set one by one."""
-
-    def __init__(self, table: Any) -> None:
-        self.shape = table.shape
-        self.values = {at: table[at] for at in np.ndindex(table.shape)}
-
-    def __getitem__(self, at: Any) -> Any:
-        return self.values[at if isinstance(at, tuple) else (at,)]
-
-    def __setitem__(self, at: Any, value: Any) -> None:
-        self.values[at if isinstance(at, tuple) else (at,)] = value
-
-
 class Past(NamedTuple):
     """The memory of the observation "history"; empty for "measured"."""
 
     sums: Any
-    """Running sums of the remembered channels less the newest ones, the oldest first, shape (1, depth, channels)."""
+    """Running sums of the remembered channels less the newest ones, the newest first, shape (n, depth, channels)."""
     integral: Any
-    """Integral of the scaled ring error, shape (1,)."""
+    """Integral of the scaled ring error, shape (n,)."""
 
 
 class AgentMemory(NamedTuple):
@@ -116,13 +102,13 @@ class AgentMemory(NamedTuple):
 
     past: Past
     command: Any
-    """Last commanded inputs in shares of their ranges, shape (1, 2)."""
+    """Last commanded inputs in shares of their ranges, shape (n, 2)."""
     network: Any
-    """The network's own state, shape (1, k)."""
+    """The network's own state, shape (n, k)."""
 
 
 class Agent:
-    """A trained agent as a controller of the shell, for a single crystal."""
+    """A trained agent as a controller of the shell."""
 
     estimates_temperature = False
 
@@ -141,10 +127,11 @@ class Agent:
     def at_rest(self, seen: Measured) -> AgentMemory:
         """The network's state at zero, the applied drives as the last command, the first ring error as the past."""
         ring = self._measured(seen)[:, :1]
-        ages = np.zeros((1, self.depth, len(LAGGED)))
-        ages[0, :, 0] = np.arange(self.depth)[::-1]
-        integral = -(ring[:, 0] if self.depth else np.zeros(0)) * self._integral_step
-        return AgentMemory(Past(-ring[:, :, None] * ages, integral), self._applied(seen), np.zeros((1, self.remembers)))
+        ages = np.zeros((self.depth, len(LAGGED)))
+        ages[:, 0] = np.arange(self.depth)[::-1]
+        integral = -ring[:, 0] * self._integral_step if self.depth else np.zeros((len(ring), 0))
+        network = np.zeros((len(ring), self.remembers))
+        return AgentMemory(Past(-ring[:, :, None] * ages, integral), self._applied(seen), network)
 
     def step(self, seen: Measured, memory: AgentMemory) -> tuple[Any, Any, AgentMemory]:
         """Pull speed and heater power above nominal, and the new memory."""
@@ -172,26 +159,28 @@ class Agent:
         return np.clip(np.stack(seen, axis=-1) / scales(MEASURED, *self.ranges), -CLIP, CLIP)
 
     def _history(self, seen: Measured, measured: Any, past: Past) -> tuple[Any, Past]:
-        """The observation "history" and its memory, by the engine's own functions, which see one slot.
+        """The observation "history" and its memory, by the engine's own functions.
 
-        The engine's circular table is turned so that the newest sample stands at 0.
+        The engine's circular table is turned so that the newest sample stands at 0; the slots stand in the last axis.
         """
-        slot = SimpleNamespace(k=self.depth, integral=past.integral[0])
-        sums, out = Cells(past.sums[0]), Cells(np.concatenate([measured[0], np.zeros(len(HISTORY) - len(MEASURED))]))
+        slot = SimpleNamespace(k=self.depth, integral=past.integral)
+        sums, n = np.moveaxis(past.sums, 0, -1).copy(), len(measured)
+        out = np.concatenate([measured.T, np.zeros((len(HISTORY) - len(MEASURED), n))])
         share = 1.0 / (self.before - self.newest)
         constants = SimpleNamespace(
             newest=self.newest, before=self.before, share=share, measured=1.0 / scales(MEASURED, *self.ranges)
         )
-        _uncompiled(remember)(slot, sums, self.dt, out)
-        _uncompiled(recall)(slot, Measured(*(value[0] for value in seen)), sums, constants, out)
-        newest = np.stack([sums[0, channel] for channel in range(len(LAGGED))])
-        table = np.concatenate([past.sums[0, 1:] - newest, np.zeros((1, len(LAGGED)))])
-        return np.stack(list(out.values.values()))[None], Past(table[None], np.reshape(slot.integral, (1,)))
+        _uncompiled(remember, sums)(slot, sums, self.dt, out)
+        _uncompiled(recall, sums)(slot, seen, sums, constants, out)
+        table = np.concatenate([sums[1:] - sums[0], np.zeros((1, len(LAGGED), n))])
+        return out.T, Past(np.moveaxis(table, -1, 0), slot.integral)
 
 
-def _uncompiled(function: Any) -> Any:
-    """An engine's function whose limits are recorded, where the compiled one branches."""
-    recorded = {"clip": lambda value, limit: np.clip(value, -limit, limit)}
-    return FunctionType(
-        function.__code__, function.__globals__ | recorded | {"scratch": lambda *shape: Cells(np.zeros(shape))}
-    )
+def _uncompiled(function: Any, like: Any) -> Any:
+    """An engine's function for arrays with slots in the last axis, which records limits where it would branch."""
+    n = like.shape[-1]
+    own = {
+        "clip": lambda value, limit: np.clip(value, -limit, limit),
+        "scratch": lambda *shape: np.zeros_like(like, shape=(*shape, n)),
+    }
+    return FunctionType(function.__code__, function.__globals__ | own)

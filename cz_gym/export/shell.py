@@ -4,13 +4,17 @@ Every sample: readings that are not finite, invalid, too old or outside the rang
 the last good ones, and the controller is told that its ring reading is not valid. If that lasts, or the controller's
 output is not finite, the fallback PID takes over until the next reset or takeover; without a ring it holds the pull
 speed. After every takeover the setpoints start at the applied drives and move to the controller's within
-``takeover_s``. All of it is NumPy code on arrays of shape (n,), which :mod:`cz_gym.export.trace` records.
+``takeover_s``. All of it is NumPy code on arrays of shape (n,): :meth:`Block.run` runs it on n plants at once, and
+:attr:`Block.program` is its record, from which other languages are written.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import IntFlag
+from functools import cache, cached_property
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -20,7 +24,8 @@ from cz_gym.observation import CLIP, MEASURED, Measured, readable, scales
 from cz_gym.physics.plant import Puller, make_puller
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
-from .program import Port, Program, record
+from .program import Floats, Port, Program, record
+from .trace import FINITE
 
 NO_LIMIT = 1e30
 """A slew rate that limits nothing."""
@@ -120,11 +125,19 @@ class Memory(NamedTuple):
     pid: Any
 
 
+def nominal_puller(config: Config) -> Puller:
+    """The puller at its operating point that a block is made for."""
+    return _puller(config.parameters, config.meniscus)
+
+
+_puller = cache(lambda parameters, meniscus: make_puller(parameters, 0.5, meniscus))
+
+
 def settings_of(config: Config, puller: Puller | None = None) -> tuple[Port, ...]:
     """The settings of a block for an environment's puller, or for one that was drawn there; its file's limits of the
     drives are the defaults.
     """
-    puller, drives = puller or make_puller(config.parameters, 0.5, config.meniscus), config.puller
+    puller, drives = puller or nominal_puller(config), config.puller
     v_0, Q_0 = puller.v_0 / MM_PER_MIN, puller.Q_H_0 / KILO
     window = min(puller.v_0, math.inf if drives.pull_window is None else drives.pull_window) / MM_PER_MIN
     fastest = min(v_0 + window, math.inf if drives.pull_max is None else drives.pull_max / MM_PER_MIN)
@@ -149,20 +162,20 @@ def settings_of(config: Config, puller: Puller | None = None) -> tuple[Port, ...
     )
 
 
-def readings_of(given: Any, nominal: Any, ranges: tuple[float, float]) -> tuple[Measured, Measured]:
+def readings_of(given: Any, ranges: tuple[float, float]) -> tuple[Measured, Measured]:
     """Readings as deviations in SI units, and whether each lies within the range of the observations."""
-    radius, power = given["ring_radius_mm"] - nominal["ring_bias_mm"], nominal["nominal_heater_power_kW"]
+    radius, power = given["ring_radius_mm"] - given["ring_bias_mm"], given["nominal_heater_power_kW"]
     seen = Measured(
         ring_error=(radius - given["r_ref_mm"]) * MM,
         valid=np.where(given["valid"] > 0.5, 1.0, 0.0),
-        r_ref=(given["r_ref_mm"] - nominal["nominal_radius_mm"]) * MM,
-        r_ref_1min=(given["r_ref_1min_mm"] - nominal["nominal_radius_mm"]) * MM,
-        r_ref_5min=(given["r_ref_5min_mm"] - nominal["nominal_radius_mm"]) * MM,
-        T_1_ref=given["T_1_ref_K"] - nominal["nominal_T_1_K"],
-        T_1_ref_1min=given["T_1_ref_1min_K"] - nominal["nominal_T_1_K"],
-        T_1_ref_5min=given["T_1_ref_5min_K"] - nominal["nominal_T_1_K"],
-        T_1=given["T_1_K"] - nominal["nominal_T_1_K"],
-        v_p=(given["pull_speed_mm_per_min"] - nominal["nominal_pull_speed_mm_per_min"]) * MM_PER_MIN,
+        r_ref=(given["r_ref_mm"] - given["nominal_radius_mm"]) * MM,
+        r_ref_1min=(given["r_ref_1min_mm"] - given["nominal_radius_mm"]) * MM,
+        r_ref_5min=(given["r_ref_5min_mm"] - given["nominal_radius_mm"]) * MM,
+        T_1_ref=given["T_1_ref_K"] - given["nominal_T_1_K"],
+        T_1_ref_1min=given["T_1_ref_1min_K"] - given["nominal_T_1_K"],
+        T_1_ref_5min=given["T_1_ref_5min_K"] - given["nominal_T_1_K"],
+        T_1=given["T_1_K"] - given["nominal_T_1_K"],
+        v_p=(given["pull_speed_mm_per_min"] - given["nominal_pull_speed_mm_per_min"]) * MM_PER_MIN,
         Q_H=(given["heater_power_kW"] - power) * KILO,
     )
     limits = 1.001 * CLIP * scales(MEASURED, *ranges)
@@ -183,19 +196,27 @@ def in_plant_units(seen: Measured, puller: Any) -> dict[str, Any]:
     }
 
 
-def step(
-    controller: Controller, pid: Controller, dt: float, ranges: Any, settings: Any, given: Any, memory: Any
-) -> Any:
-    """Outputs, memory and whether a sample was due; arguments as of :func:`cz_gym.export.program.record`."""
-    started = np.isfinite(memory.last_time_s)
+def in_shares(setpoints: Mapping[str, Any], config: Config) -> Floats:
+    """Setpoints by their names in :data:`OUTPUTS` as shares of the drives' ranges above nominal, shape (..., 2)."""
+    puller, (pull, heater, _) = nominal_puller(config), OUTPUTS
+    shares = (
+        setpoints[pull.name] * MM_PER_MIN / puller.v_0 - 1.0,
+        (setpoints[heater.name] * KILO - puller.Q_H_0) / config.heater_range,
+    )
+    return np.stack(shares, axis=-1)
+
+
+def step(controller: Controller, pid: Controller, dt: float, ranges: Any, given: Any, memory: Any) -> Any:
+    """Outputs, memory and whether a sample was due, for settings and inputs by their names."""
+    started = _finite(memory.last_time_s)
     elapsed = np.where(started, given["time_s"] - memory.last_time_s, dt)
-    clock = np.isfinite(given["time_s"]) & ((elapsed > 0.0) | ~started)
-    due = np.isfinite(given["time_s"]) & ((elapsed >= 0.9 * dt) | (elapsed < 0.0))
+    clock = _finite(given["time_s"]) & ((elapsed > 0.0) | ~started)
+    due = _finite(given["time_s"]) & ((elapsed >= 0.9 * dt) | (elapsed < 0.0))
     late = elapsed > 1.1 * dt
 
-    seen, plausible = readings_of(given, settings, ranges)
+    seen, plausible = readings_of(given, ranges)
     age = given["time_s"] - given["ring_time_s"]
-    ring = plausible.ring_error & (seen.valid > 0.5) & (np.abs(age) <= settings["oldest_reading_s"])
+    ring = plausible.ring_error & (seen.valid > 0.5) & (np.abs(age) <= given["oldest_reading_s"])
     first = Measured(*(np.where(good, value, 0.0) for good, value in zip(plausible, seen, strict=True)))
     last = Measured(*(np.where(started, old, new) for old, new in zip(memory.readings, first, strict=True)))
     trusted = Measured(*(np.where(good, value, np.inf) for good, value in zip(plausible, seen, strict=True)))
@@ -208,19 +229,23 @@ def step(
     engaged = given["automatic"] > 0.5
     runs = engaged & (memory.engaged > 0.5)
     fallen = runs & (memory.fallback > 0.5)
-    fallback = runs & (fallen | (bad > settings["fallback_after_s"]))
+    fallback = runs & (fallen | (bad > given["fallback_after_s"]))
     since = np.where(runs & (fallen | ~fallback), memory.since + np.clip(elapsed, 0.0, HOUR), 0.0)
-    share = np.minimum(since / np.maximum(settings["takeover_s"], 1e-3), 1.0)
+    share = np.minimum(since / np.maximum(given["takeover_s"], 1e-3), 1.0)
 
     seen_by = read._replace(T_1=trusted.T_1) if controller.estimates_temperature else read
-    own = controller.step(seen_by, _where(runs, memory.controller, controller.at_rest(read)))
-    other = pid.step(read, _where(fallen, memory.pid, pid.at_rest(read)))
+    own = controller.step(
+        seen_by, memory.controller if runs.all() else select(runs, memory.controller, controller.at_rest(read))
+    )
+    other = own[0], own[1], memory.pid
+    if (fallback | ~(_finite(own[0]) & _finite(own[1]))).any():
+        other = pid.step(read, select(fallen, memory.pid, pid.at_rest(read)))
     applied = (
         np.where(plausible.v_p, given["pull_speed_mm_per_min"], memory.pull),
         np.where(plausible.Q_H, given["heater_power_kW"], memory.heater),
     )
     before = tuple(np.where(runs, old, new) for old, new in zip((memory.pull, memory.heater), applied, strict=True))
-    nominal = settings["nominal_pull_speed_mm_per_min"], settings["nominal_heater_power_kW"]
+    nominal = given["nominal_pull_speed_mm_per_min"], given["nominal_heater_power_kW"]
     wanted = [
         deviation / unit + at
         for deviation, unit, at in zip(
@@ -229,11 +254,11 @@ def step(
         )
     ]  # fmt: skip
     wanted[0] = np.where(fallback & ~ring, before[0], wanted[0])
-    sound = np.isfinite(wanted[0]) & np.isfinite(wanted[1])
-    slews = settings["pull_slew_mm_per_min2"], settings["heater_slew_kW_per_min"]
+    sound = _finite(wanted[0]) & _finite(wanted[1])
+    slews = given["pull_slew_mm_per_min2"], given["heater_slew_kW_per_min"]
     ranges = (
-        (settings["pull_speed_min_mm_per_min"], settings["pull_speed_max_mm_per_min"]),
-        (settings["heater_power_min_kW"], settings["heater_power_max_kW"]),
+        (given["pull_speed_min_mm_per_min"], given["pull_speed_max_mm_per_min"]),
+        (given["heater_power_min_kW"], given["heater_power_max_kW"]),
     )
     setpoints: list[Any] = []
     limited: list[Any] = []
@@ -277,30 +302,65 @@ def _all(conditions: Any) -> Any:
     return together
 
 
-def _where(condition: Any, one: Any, other: Any) -> Any:
-    """``one`` where the condition holds, else ``other``: nested tuples of arrays."""
+def _finite(value: Any) -> Any:
+    return np.abs(value) <= FINITE
+
+
+def select(condition: Any, one: Any, other: Any) -> Any:
+    """``one`` where the condition of shape (n,) holds, else ``other``: arrays, or nested tuples of them."""
     if isinstance(other, tuple):
-        parts = [_where(condition, a, b) for a, b in zip(one, other, strict=True)]
+        parts = [select(condition, a, b) for a, b in zip(one, other, strict=True)]
         return type(other)(*parts) if hasattr(other, "_fields") else tuple(parts)
     return np.where(np.reshape(condition, (-1, *(1,) * (np.ndim(other) - 1))), one, other)
 
 
-def shelled(name: str, controller: Controller, pid: Controller, config: Config, notes: tuple[str, ...] = ()) -> Program:
-    """Record a controller in its shell, for the puller and the control interval of an environment."""
-    puller = make_puller(config.parameters, 0.5, config.meniscus)
-    zero = Measured(*(np.zeros(1) for _ in Measured._fields))
-    nominal = puller.v_0 / MM_PER_MIN, puller.Q_H_0 / KILO
-    start = Memory(
-        last_time_s=np.full(1, math.inf),
-        **{name: np.zeros(1) for name in ("engaged", "since", "bad", "fallback")},
-        pull=np.full(1, nominal[0]),
-        heater=np.full(1, nominal[1]),
-        readings=zero,
-        controller=controller.at_rest(zero),
-        pid=pid.at_rest(zero),
-    )
+@dataclass(frozen=True)
+class Block:
+    """A controller in its shell, for the puller and the control interval of an environment."""
 
-    def body(settings: Any, given: Any, memory: Any) -> Any:
-        return step(controller, pid, config.control_interval, config.ranges, settings, given, memory)
+    name: str
+    controller: Controller
+    pid: Controller
+    """The fallback."""
+    config: Config
+    notes: tuple[str, ...] = ()
+    """Facts for the header of each written file: puller, hashes, scenario."""
 
-    return record(name, settings_of(config), INPUTS, OUTPUTS, start, body, controller.estimates_temperature, notes)
+    @cached_property
+    def ports(self) -> dict[str, Port]:
+        """Settings and inputs by name."""
+        return {port.name: port for port in (*settings_of(self.config), *INPUTS)}
+
+    def start(self, n: int) -> Memory:
+        """The memory of n blocks before their first sample."""
+        puller, zero = nominal_puller(self.config), Measured(*(np.zeros(n) for _ in Measured._fields))
+        return Memory(
+            last_time_s=np.full(n, math.inf),
+            **{name: np.zeros(n) for name in ("engaged", "since", "bad", "fallback")},
+            pull=np.full(n, puller.v_0 / MM_PER_MIN),
+            heater=np.full(n, puller.Q_H_0 / KILO),
+            readings=zero,
+            controller=self.controller.at_rest(zero),
+            pid=self.pid.at_rest(zero),
+        )
+
+    def run(self, inputs: Mapping[str, Any], memory: Memory) -> tuple[dict[str, Floats], Memory]:
+        """The outputs, each of shape (n,), and the next memory, for inputs and settings; missing ones have defaults."""
+        n = len(memory.pull)
+        given = {
+            name: np.broadcast_to(np.asarray(inputs.get(name, port.default), np.float64), (n,))
+            for name, port in self.ports.items()
+        }
+        with np.errstate(all="ignore"):
+            outputs, after, due = self._step(given, memory)
+        return outputs, after if due.all() else select(due, after, memory)
+
+    def _step(self, given: Any, memory: Any) -> Any:
+        return step(self.controller, self.pid, self.config.control_interval, self.config.ranges, given, memory)
+
+    @cached_property
+    def program(self) -> Program:
+        """What it computes, recorded."""
+        needs_double = self.controller.estimates_temperature
+        settings = settings_of(self.config)
+        return record(self.name, settings, INPUTS, OUTPUTS, self.start(1), self._step, needs_double, self.notes)

@@ -17,7 +17,7 @@ import numpy as np
 from cz_gym.atomic_files import naming
 from cz_gym.config import Config
 from cz_gym.env import CzEnv
-from cz_gym.export.__main__ import FALLBACK, export_program
+from cz_gym.export.__main__ import FALLBACK, make_block
 from cz_gym.export.shell import INPUTS, OUTPUTS, in_plant_units, settings_of
 from cz_gym.identify.log import COLUMNS
 from cz_gym.observation import decode
@@ -113,8 +113,8 @@ class Machine:
         self._observation, _ = self.env.reset(seed=seed)
         self._record, self._log, self._lock = record_of(self.env), log, threading.RLock()
         self.puller = self._record.puller
-        self._fallback = export_program(FALLBACK, config)
-        self._memory = self._fallback.start[None]
+        self._fallback = make_block(FALLBACK, config)
+        self._memory = self._fallback.start(1)
         self._fixed: dict[str, Any] = {port.name: port.default for port in settings_of(config, self.puller)}
         self.limits = {name: [self._fixed[name.replace("setpoint", e)] for e in ("min", "max")] for name in SETPOINTS}
         self.nominal = np.array([self.puller.v_0 / MM_PER_MIN, self.puller.Q_H_0 / KILO])
@@ -193,7 +193,7 @@ class Machine:
                 outputs, self._memory = self._fallback.run(given, self._memory)
                 self._active = np.array([outputs[name][0] for name in SETPOINTS])
             else:
-                self._memory = self._fallback.start[None]
+                self._memory = self._fallback.start(1)
             move = (self._active - self.nominal) / (self._ranges[0] / MM_PER_MIN, self._ranges[1] / KILO)
             self._observation, *_ = self.env.step(move)
             self.k += 1

@@ -12,7 +12,7 @@ pytest.importorskip("asyncua", reason="asyncua is absent: pip install '.[plant]'
 
 from cz_gym.config import make_config
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.export.__main__ import export_program
+from cz_gym.export.__main__ import make_block
 from cz_gym.export.policy import BlockPolicy
 from cz_gym.units import KILO, MM, MM_PER_MIN
 from examples import opcua_controller
@@ -45,7 +45,7 @@ def test_the_loop_over_opc_ua_is_the_loop_in_python(
         assert opcua_controller.main(["--url", puller.url, *chosen]) == 0
         found = grown(tmp_path / "log.csv")
     config = make_config(scenario, observation="measured", action="direct", horizon=steps * 5.0)
-    s = rollout(BlockPolicy(export_program(name, config), config), config, [1]).signals
+    s = rollout(BlockPolicy(make_block(name, config)), config, [1]).signals
     twin = np.concatenate([s.r_br_measured / MM, s.v_p / MM_PER_MIN, s.Q_H / KILO], axis=-1)
     assert len(found) >= steps - 1
     np.testing.assert_allclose(found, twin[: len(found)], rtol=0, atol=5e-6)
