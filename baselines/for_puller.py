@@ -20,7 +20,7 @@ import numpy as np
 from cz_gym.baselines.analysis.compensator_design import CUT_OFF, design_compensator
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign
 from cz_gym.baselines.lqg.designs import SHIPPED as LQGS
-from cz_gym.baselines.lqg.designs import TOLD, design_of, family_name, ring_of
+from cz_gym.baselines.lqg.designs import MEAN_RIPPLE, TOLD, design_of, family_name, ring_of
 from cz_gym.baselines.pid.compensated_pid import SeriesPID
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.industrial import Industrial
@@ -126,10 +126,15 @@ def _scaled(known: Any, config: Config) -> Any:
 
 
 def scaled_design(name: str, config: Config) -> LQGDesign:
-    """An LQG's design for the default puller, with this one's camera, sensor noise and melt fluctuation."""
+    """An LQG's design for the default puller, with this one's camera, sensor noise and melt fluctuation.
+
+    Its filter takes the camera to be no better than the file says, and a ripple that it has not found yet for noise:
+    an overconfident filter can explain the ring by a wrong meniscus height, and lose the crystal.
+    """
     known, scenario = design_of(name, RANDOMIZED), config.scenario.scenarios[0]
     melt, sensor = scenario.interface, scenario.sensor
     fluctuation = _rms(melt.sd) / _rms(RANDOMIZED.interface.sd)
+    least, most = known.noise.camera_sd_range
     noise = replace(
         known.noise,
         fast_sd=fluctuation * known.noise.fast_sd,
@@ -137,7 +142,8 @@ def scaled_design(name: str, config: Config) -> LQGDesign:
         fast_tau=melt.tau_fast,
         slow_tau=melt.tau_slow,
         pyrometer_sd=_rms(sensor.pyrometer_noise) / _rms(RANDOMIZED.sensor.pyrometer_noise) * known.noise.pyrometer_sd,
-        camera_sd=max(float(np.mean(sensor.camera_noise)), known.noise.camera_sd_range[0]),
+        camera_sd=max(float(np.hypot(np.mean(sensor.camera_noise), MEAN_RIPPLE * sensor.ripple[1])), least),
+        camera_sd_range=(max(sensor.camera_noise[0], least), most),
         heater_walk=known.noise.heater_walk * config.heater_range / DEFAULT.power_range,
         start_radius_sd=max(scenario.pullers.start_radius_sd, known.noise.start_radius_sd),
     )
