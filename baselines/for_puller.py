@@ -19,8 +19,8 @@ import numpy as np
 
 from cz_gym.baselines.analysis.compensator_design import CUT_OFF, design_compensator
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign
-from cz_gym.baselines.lqg.designs import SHIPPED as LQGS
 from cz_gym.baselines.lqg.designs import MEAN_RIPPLE, TOLD, design_of, family_name, ring_of
+from cz_gym.baselines.lqg.designs import SHIPPED as LQGS
 from cz_gym.baselines.pid.compensated_pid import SeriesPID
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.industrial import Industrial

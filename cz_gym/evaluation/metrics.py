@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -85,7 +86,7 @@ def metrics(run: Rollout) -> Metrics:
         pull_step_rms_mm_per_min=_rms(pull_step, alive) / MM_PER_MIN,
         mean_pull_within_3pct=_mean_pull_share(s.v_p, alive, v_0, run.config.control_interval),
         heater_step_rms_kw=_rms(heater_step, alive) / KILO,
-        time_at_limits=np.mean(_at_limits(run, pull_step, heater_step), axis=0, where=alive),
+        time_at_limits=np.mean(_at_limits(run), axis=0, where=alive),
         growth_rate_rms_mm_per_min=_rms(s.v_g - v_0, alive) / MM_PER_MIN,
         ground_off_pct=_ground_off(s.r_c, alive),
         cost=_cost(observable, s.v_p - v_0, pull_step, heater_step, alive),
@@ -106,18 +107,23 @@ def _cost(error: Floats, pull: Floats, pull_step: Floats, heater_step: Floats, a
     return mean
 
 
-def _at_limits(run: Rollout, pull_step: Floats, heater_step: Floats) -> npt.NDArray[np.bool_]:
-    """Whether a drive is at a limit; those of a mixture are the widest of its scenarios'."""
+def _at_limits(run: Rollout) -> npt.NDArray[np.bool_]:
+    """Whether a drive is at a limit; those of a mixture are the widest of its scenarios'.
+
+    The heater's rate is that over the shortest time in which it can make two steps of its resolution.
+    """
     config, s, start = run.config, run.signals, run.start
     drives = [each.actuators for each in config.scenario.scenarios]
     window = min(config.parameters.v_0, max(each.pull_window for each in drives))
     fastest = config.control_interval * max(each.pull_slew for each in drives)
-    slew = config.control_interval * max(each.heater_slew for each in drives)
-    half = 0.5 * max(each.heater_step for each in drives)
-    pull = (np.abs(s.v_p - start.v_p) >= ALMOST * window) | (np.abs(pull_step) >= ALMOST * fastest)
-    heater = np.abs(s.Q_H - start.Q_H) >= ALMOST * config.heater_range - half
-    heater |= np.less_equal(s.Q_H, half)
-    found: npt.NDArray[np.bool_] = pull | heater | (np.abs(heater_step) >= ALMOST * slew - half)
+    slew, step = config.control_interval * max(each.heater_slew for each in drives), drives[0].heater_step
+    steps = max(1, math.ceil(2.0 * step / slew - 1e-9))
+    moved = s.Q_H - np.vstack([np.repeat(start.Q_H, steps, axis=0), s.Q_H])[: len(s.Q_H)]
+    pull = (np.abs(s.v_p - start.v_p) >= ALMOST * window) | (
+        np.abs(np.diff(s.v_p, axis=0, prepend=start.v_p)) >= ALMOST * fastest
+    )
+    heater = (np.abs(s.Q_H - start.Q_H) >= ALMOST * config.heater_range - 0.5 * step) | np.less_equal(s.Q_H, 0.5 * step)
+    found: npt.NDArray[np.bool_] = pull | heater | (np.abs(moved) >= ALMOST * steps * slew - 0.5 * step)
     return found
 
 
