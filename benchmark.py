@@ -59,7 +59,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_puller("every row runs on it, with the controllers that are designed for it")
     add("--slow", action="store_true", help="slow controllers too, on 50 episodes; resumed from results/cache")
     add("--overwrite", action="store_true", help="replace files of earlier or other runs")
-    add("--quiet", action="store_true", help="no progress bar, no table")
+    add("--quiet", action="store_true", help="no progress bar, no table; a bar is shown on a terminal only")
     return parser.parse_args(argv)
 
 
@@ -103,7 +103,7 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
     if arguments.out is not None:  # a missing package is named before the work, not after it
         import matplotlib  # noqa: F401
         import plotly  # noqa: F401
-    with tqdm(unit="step", unit_scale=True, leave=False, disable=arguments.quiet) as bar:
+    with tqdm(unit="step", unit_scale=True, leave=False, disable=arguments.quiet or None) as bar:
         results = run(contenders, rows, arguments.episodes, bar, CACHE, None if arguments.puller else BOUNDS)
     quoted = README if not smaller and arguments.out and arguments.out.resolve() == FOLDER else None
     write(arguments.out, arguments.json, results, command, quoted)

@@ -86,11 +86,12 @@ def train(arguments: argparse.Namespace) -> int:
     machine = f", puller {recipe.config.puller.label}" if recipe.puller else ""
     print(f"{recipe.name}, {what} on {recipe.config.scenario.name}{machine}, into {arguments.out}")
     if not arguments.seeds:
-        with tqdm(total=recipe.steps, unit="step", unit_scale=True, dynamic_ncols=True, mininterval=1.0) as bar:
+        with tqdm(total=recipe.steps, unit="step", unit_scale=True, dynamic_ncols=True, disable=None) as bar:
             summary = train_seed(jobs[0], bar)
         print(f"{_summary_line(summary)}\nwrote {arguments.out / 'agent.onnx'}")
         return 0
-    with tqdm(total=len(jobs), bar_format="{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}") as bar:
+    form = "{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
+    with tqdm(total=len(jobs), bar_format=form, disable=None) as bar:
         for job, summary in train_seeds(jobs, bar):
             bar.write(f"seed {job.seed}: {_summary_line(summary)}")
     print(f"wrote agent.onnx into {len(jobs)} folders of {arguments.out}")

@@ -30,6 +30,8 @@ FIGURES = {
     "failure_rate": ("lost [%]", ".1f", PERCENT),
 }
 """Heading, format and unit of each metric of a card."""
+RETURN = "return"
+"""Metric that model hubs show as the mean reward."""
 Results = Mapping[str, Mapping[str, Mapping[str, Estimate]]]
 """Estimates of the benchmark by scenario, controller and metric."""
 
@@ -76,6 +78,19 @@ mode, which its schedule keeps small.
 """
 
 
+def hub_page(name: str, text: str, results: Results) -> str:
+    """A card as a model hub reads it: metadata in YAML, with the mean return of each scenario, then the text."""
+    metrics = [
+        f"  - task: {{type: reinforcement-learning, name: reinforcement-learning}}\n"
+        f"    dataset: {{name: Cz-v0 {scenario}, type: Cz-v0}}\n"
+        f"    metrics: [{{type: mean_reward, value: {of[name][RETURN].mean:.1f}, name: mean_reward}}]"
+        for scenario, of in results.items()
+    ]
+    head = ["library_name: cz-gym", "license: mit", "tags: [Cz-v0, reinforcement-learning, control]", "model-index:"]
+    head += [f"- name: {name}", "  results:", *metrics]
+    return "\n".join(["---", *head, "---", "", text.replace("## ", "# ", 1)])
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser("python -m studies.cards", __doc__)
@@ -84,19 +99,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ("--out", "results/cards/cards.md", "file to write"),
     ):
         parser.add_argument(option, type=Path, default=Path(default), help=f"{about} (default: %(default)s)")
+    parser.add_argument("--hub", type=Path, metavar="DIR", help="also write a folder an agent, ready for a model hub")
     return parser.run(_main, arguments, "benchmark")
 
 
 def _main(given: argparse.Namespace) -> None:
     check_writable(given.out.parent)
-    results = read_results(given.benchmark, [*FIGURES])
+    results = read_results(given.benchmark, [*FIGURES, RETURN])
     if not all(AGENTS.keys() <= by_name.keys() for by_name in results.values()):
         raise CzError(f"{given.benchmark}: no results of {', '.join(AGENTS)}")
-    cards = [
-        card(name, of, [read_agent(each)[0] for each in shipped_seeds(name)], results) for name, of in AGENTS.items()
-    ]
-    write_files({given.out: "\n".join([ABOUT, *cards]).encode()})
+    cards = {
+        name: card(name, of, [read_agent(each)[0] for each in shipped_seeds(name)], results)
+        for name, of in AGENTS.items()
+    }
+    write_files({given.out: "\n".join([ABOUT, *cards.values()]).encode()})
     print(f"wrote {given.out}")
+    for name, text in cards.items() if given.hub else ():
+        files = [path for file in shipped_seeds(name) for path in (file, file.with_suffix(".json"))]
+        content = {given.hub / name / path.name: path.read_bytes() for path in files}
+        write_files({**content, given.hub / name / "README.md": hub_page(name, text, results).encode()})
+        print(f"wrote {given.hub / name}")
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from multiprocessing import parent_process
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -166,7 +167,10 @@ class Run:
         for name, figure in figures._asdict().items():
             self.logger.record(f"validation/{name}", figure)
         beside = ", ".join(f"{name} {rmse:.3f}" for name, rmse in zip(REFERENCES, picked, strict=True))
-        bar.set_postfix_str(f"RMSE {figures.rmse_mm:.3f} mm, {figures.failure_rate:.0%} lost ({beside})")
+        figures_now = f"RMSE {figures.rmse_mm:.3f} mm, {figures.failure_rate:.0%} lost ({beside})"
+        bar.set_postfix_str(figures_now)
+        if not sys.stderr.isatty() and parent_process() is None:  # a log holds lines
+            print(f"{self.steps:,} steps: {figures_now}", flush=True)
 
     def _write_settings(self, sessions: list[dict[str, Any]]) -> None:
         """Write the run's settings; each time it is begun or resumed adds a session."""

@@ -20,6 +20,7 @@ from cz_gym.atomic_files import check_writable, naming, write_files
 from cz_gym.errors import CzError
 
 from .metrics import metric_names
+from .protocol import contract_hash
 from .results import BOUND, REFERENCE, Result
 from .statistics import RESAMPLES, SEED, Estimate
 
@@ -133,6 +134,7 @@ def _provenance(results: Sequence[Result], command: str) -> dict[str, Any]:
     return {
         "command": command,
         **software(PACKAGES),
+        "contract": contract_hash(result.row for result in results),
         "plant_hash": config.plant_hash,
         "puller": config.puller.label,
         "parameters": config.parameters._asdict(),

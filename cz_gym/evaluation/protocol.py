@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from cz_gym.config import Config, make_config
@@ -44,6 +46,8 @@ class Row:
     file: str = ""
     """Source of a scenario of the user's own: FILE.py:NAME."""
     puller: PullerFile = DEFAULT
+    first_seed: int = TEST_SEEDS.start
+    """Seed of its first crystal."""
 
     @property
     def control_interval(self) -> float:
@@ -68,8 +72,9 @@ class Row:
         return f"{name}: radius {r_0:g} mm, pull speed {v_0:g} mm/min, plant {config.plant_hash}"
 
     def seeds(self, episodes: int) -> range:
-        """Return the first test seeds; one seed where every draw is the same."""
-        return TEST_SEEDS[: 1 if find_scenario(self.scenario).deterministic else episodes]
+        """Return seeds of so many crystals, one where every draw is the same; by default the first test seeds."""
+        number = 1 if find_scenario(self.scenario).deterministic else episodes
+        return range(self.first_seed, self.first_seed + number)
 
 
 _RAMP = (
@@ -125,6 +130,12 @@ def find_row(name: str) -> Row:
         if row.name == ALIASES.get(name, name):
             return row
     raise CzError(unknown("scenario", name, [row.name for row in ROWS]))
+
+
+def contract_hash(rows: Iterable[Row]) -> str:
+    """Return the hash of what the random rows' figures rest on: plant, scenarios, control interval and horizon."""
+    parts = sorted(row.config().hash for row in rows if not find_scenario(row.scenario).deterministic)
+    return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:12]
 
 
 def check_episodes(episodes: int) -> int:

@@ -4,10 +4,12 @@ import json
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from cz_gym import agents
 from studies import cards
 
-FIGURES = {key: {"mean": 0.0, "ci95": [0.0, 0.5]} for key in cards.FIGURES}
+FIGURES = {key: {"mean": 0.0, "ci95": [0.0, 0.5]} for key in (*cards.FIGURES, cards.RETURN)}
 
 
 def test_every_shipped_agent_has_a_card_with_the_benchmark_s_figures(tmp_path: Path) -> None:
@@ -19,7 +21,12 @@ def test_every_shipped_agent_has_a_card_with_the_benchmark_s_figures(tmp_path: P
     }
     (tmp_path / "benchmark.json").write_text(json.dumps({"results": results}))
     command = ["--benchmark", str(tmp_path / "benchmark.json"), "--out", str(tmp_path / "cards.md")]
-    assert cards.main(command) == 0
+    assert cards.main([*command, "--hub", str(tmp_path / "hub")]) == 0
+    _, metadata, text = (tmp_path / "hub" / "ppo" / "README.md").read_text().split("---\n")
+    (entry,) = yaml.safe_load(metadata)["model-index"]
+    assert [result["dataset"]["name"] for result in entry["results"]] == ["Cz-v0 hard", "Cz-v0 puller"]
+    assert text.startswith("\n# `ppo`")
+    agents.OnnxPolicy.load(tmp_path / "hub" / "ppo" / "ppo-seed0.onnx")
     sections = (tmp_path / "cards.md").read_text().split("\n## ")[1:]
     assert [section.split("`")[1] for section in sections] == list(cards.AGENTS)
     for section in sections:

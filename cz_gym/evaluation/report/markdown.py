@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from cz_gym.evaluation.protocol import contract_hash
 from cz_gym.evaluation.results import BOUND, REFERENCE, SPEED, Result, Sample, common
 from cz_gym.puller import DEFAULT
 from cz_gym.units import HOUR, PERCENT
@@ -47,7 +48,10 @@ BEGIN, END = "<!-- benchmark:begin -->", "<!-- benchmark:end -->"
 
 
 def summary(results: Sequence[Result]) -> str:
-    """Return one table: RMSE and failures on each scenario; activity and return on the first; by what was known."""
+    """Return one table, and its contract below: RMSE and failures on each scenario, activity and return on the first.
+
+    Contenders are grouped by what they knew.
+    """
     alone = [column._replace(interval=False) for column in (PULL_STEP, HEATER_STEP, RETURN)]
     columns = (RMSE, FAILURES._replace(interval=False), *alone)
     found = [{name: row for name, *row in rows(result, columns)} for result in results]
@@ -59,7 +63,9 @@ def summary(results: Sequence[Result]) -> str:
         groups.setdefault(sample.contender.knows, []).append(line)
     heads = "controller", *(result.row.name for result in results), *(column.heading for column in alone)
     lines = [line for group, listed in groups.items() for line in ((f"*{group}*", *[""] * len(heads)), *listed)]
-    return table((*heads, FAILURES.heading), lines)
+    contract = contract_hash(result.row for result in results)
+    below = f"Contract `{contract}` (plant, random scenarios, interval, horizon)."
+    return f"{table((*heads, FAILURES.heading), lines)}\n\n{below}"
 
 
 def brief(results: Sequence[Result]) -> str:

@@ -1,0 +1,121 @@
+"""A leaderboard of submitted agents, each run again on fresh crystals: ``python -m studies.leaderboard FOLDER``.
+
+A submission is a folder FOLDER/NAME with the agent's files (``*.onnx``, each with its ``.json``), one a training seed,
+and the ``benchmark.json`` that ``benchmark.py --agent NAME=FILE ...`` wrote of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import secrets
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from cz_gym.agents import OnnxPolicy
+from cz_gym.atomic_files import check_writable, naming, write_files
+from cz_gym.baselines.registry import CONTROLLERS
+from cz_gym.commands import OneLineParser, between
+from cz_gym.contender import Contender, agent
+from cz_gym.episodes.scenarios import find_scenario
+from cz_gym.errors import CzError
+from cz_gym.evaluation.files import read_results, to_json
+from cz_gym.evaluation.protocol import ROWS, TEST_SEEDS, Row, contract_hash
+from cz_gym.evaluation.report.markdown import summary
+from cz_gym.evaluation.report.tables import markdown as table
+from cz_gym.evaluation.results import Result
+from cz_gym.evaluation.runner import check_agents, run
+
+FRESH = range(3_000_000, 2**31)
+"""Seeds that no training, validation or test uses."""
+BUDGETS = {"1 M": 1_000_000, "5 M": 5_000_000, "20 M": 20_000_000}
+"""Classes of agents by the environment steps of their longest training; the rest is open."""
+HEADS = ("place", "agent", "budget", "training seeds", "claimed RMSE [mm]", "here", "lost here [%]", "contract")
+Claims = Mapping[str, tuple[float, str]]
+"""RMSE [mm] on the first row, and the contract, that each submission claims."""
+
+
+def budget(contender: Contender) -> str:
+    """The smallest budget that the trainings of an agent keep."""
+    steps = max(policy.contract.training_steps for policy in contender.trained)
+    return next((name for name, most in BUDGETS.items() if steps <= 1.02 * most), "open")
+
+
+def submission(folder: Path) -> tuple[Contender, tuple[float, str]]:
+    """The agent of a folder, and its claim: RMSE on test crystals of the first row, and contract."""
+    files = sorted(folder.glob("*.onnx"))
+    if not files:
+        raise CzError(f"{folder}: no agent file (*.onnx)")
+    claimed = folder / "benchmark.json"
+    results = read_results(claimed, ["rmse_mm"])
+    if folder.name not in results.get(ROWS[0].name, {}):
+        raise CzError(f"{claimed}: no results of {folder.name!r} on {ROWS[0].name}")
+    with naming(claimed):
+        contract = json.loads(claimed.read_text("utf-8"))["provenance"].get("contract", "unknown")
+    contender = agent(folder.name, [OnnxPolicy.load(file) for file in files], own=True)
+    return contender, (results[ROWS[0].name][folder.name]["rmse_mm"].mean, contract)
+
+
+def page(results: Sequence[Result], claims: Claims, rows: Sequence[Row]) -> str:
+    """The leaderboard in Markdown: agents by their mean RMSE over the scenarios here; losses and claims beside it."""
+    here = {sample.name: sample.contender for sample in results[0].samples if sample.name in claims}
+
+    def mean(name: str, metric: str) -> float:
+        return sum(result.means[name][metric].mean for result in results) / len(results)
+
+    lines = []
+    for place, name in enumerate(sorted(here, key=lambda name: mean(name, "rmse_mm")), 1):
+        claim, contract = claims[name]
+        own = results[0].means[name]["rmse_mm"].text(".3f", 1.0)
+        same = "the same" if contract == contract_hash(rows) else f"other: `{contract}`"
+        seeds, lost = str(len(here[name].training_seeds)), f"{100.0 * mean(name, 'failure_rate'):.2f}"
+        lines.append((str(place), name, budget(here[name]), seeds, f"{claim:.3f}", own, lost, same))
+    seeds = f"{rows[0].first_seed} to {results[0].seeds[-1]}"
+    about = (
+        f"Submitted agents on {len(results[0].seeds)} fresh crystals of each scenario (seeds {seeds}), by mean RMSE. "
+        f'"Claimed" and "here" are the RMSE on {rows[0].name}, from the submission and from these crystals.'
+    )
+    beside = "Every scenario, beside classical controllers:"
+    return "\n\n".join(["# Leaderboard", about, table(HEADS, lines), beside, summary(results)]) + "\n"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    parser = OneLineParser("python -m studies.leaderboard", (__doc__ or "").split("\n")[0])
+    parser.add_argument("folder", type=Path, help="folder of the submissions, a folder each")
+    about = "fresh crystals a scenario (default: %(default)s)"
+    parser.add_argument("--episodes", type=between(2, len(TEST_SEEDS)), default=100, help=about)
+    about = "seed of the first crystal (default: a random one, which the page names)"
+    parser.add_argument("--first-seed", type=between(FRESH.start, FRESH.stop - len(TEST_SEEDS)), help=about)
+    about = "folder for leaderboard.md and leaderboard.json (default: %(default)s)"
+    parser.add_argument("--out", type=Path, default=Path("runs/leaderboard"), help=about)
+    return parser.run(_main, arguments, "benchmark")
+
+
+def _main(given: argparse.Namespace) -> None:
+    from tqdm import tqdm
+
+    check_writable(given.out)
+    with naming(given.folder):
+        submitted = [submission(each) for each in sorted(given.folder.iterdir()) if each.is_dir()]
+    if not submitted:
+        raise CzError(f"{given.folder}: no submissions: each is a folder with agent files and benchmark.json")
+    first = given.first_seed or FRESH[secrets.randbelow(len(FRESH) - len(TEST_SEEDS))]
+    random = [row for row in ROWS if row.default and not find_scenario(row.scenario).deterministic]
+    rows = [replace(row, first_seed=first) for row in random]
+    agents = [contender for contender, _ in submitted]
+    check_agents(agents, rows)
+    contenders = [*(each for each in CONTROLLERS if each.quoted), *agents]
+    with tqdm(unit="step", unit_scale=True, leave=False, disable=None) as bar:
+        results = run(contenders, rows, given.episodes, bar, given.out)
+    text = page(results, {contender.name: claim for contender, claim in submitted}, rows)
+    command = f"python -m studies.leaderboard {given.folder} --episodes {given.episodes} --first-seed {first}"
+    files = {"leaderboard.md": text, "leaderboard.json": to_json(results, command)}
+    write_files({given.out / name: content.encode() for name, content in files.items()})
+    print(text)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

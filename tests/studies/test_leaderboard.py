@@ -1,0 +1,59 @@
+"""The leaderboard runs submitted agents again, on crystals of its own."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cz_gym import agents
+from cz_gym.evaluation.protocol import ROWS, TRAINING_SEEDS, contract_hash
+from studies import leaderboard
+
+MEAN = {"mean": 0.0125, "ci95": None}
+
+
+@pytest.fixture
+def submissions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with one submission, the shipped PPO under another name, with a claim that is too good."""
+    monkeypatch.setattr(leaderboard, "ROWS", ROWS[:1])
+    monkeypatch.setattr(leaderboard, "CONTROLLERS", leaderboard.CONTROLLERS[:2])
+    folder = tmp_path / "submissions" / "mine"
+    folder.mkdir(parents=True)
+    for file in agents.MODELS.glob("ppo-seed0.*"):
+        shutil.copy(file, folder)
+    claim = {
+        "results": {"randomized": {"mine": {"rmse_mm": MEAN}}},
+        "provenance": {"contract": contract_hash(ROWS[:1])},
+    }
+    (folder / "benchmark.json").write_text(json.dumps(claim))
+    return folder.parent
+
+
+def test_a_claim_stands_beside_what_fresh_crystals_show(submissions: Path, tmp_path: Path) -> None:
+    command = [str(submissions), "--episodes", "2", "--first-seed", "3000007", "--out", str(tmp_path)]
+    assert leaderboard.main(command) == 0
+    page = (tmp_path / "leaderboard.md").read_text()
+    (line,) = (line for line in page.splitlines() if line.startswith("| 1 |"))
+    _, _, name, budget, seeds, claimed, here, _, contract, _ = (cell.strip() for cell in line.split("|"))
+    assert (name, budget, seeds, claimed, contract) == ("mine", "open", "1", "0.013", "the same")
+    assert 0.02 < float(here.split()[0]) < 0.3
+    assert "seeds 3000007 to 3000008" in page
+    assert "| paper |" in page
+    found = json.loads((tmp_path / "leaderboard.json").read_text())
+    assert found["provenance"]["scenarios"]["randomized"]["first_seed"] == 3_000_007
+
+
+def test_fresh_seeds_are_nobody_else_s() -> None:
+    taken = {seed for row in ROWS for seed in row.seeds(500)} | {TRAINING_SEEDS.stop}
+    assert max(taken) < leaderboard.FRESH.start
+
+
+def test_what_is_no_submission_is_named(submissions: Path, tmp_path: Path, refused: Any) -> None:
+    assert "no such" in refused(leaderboard.main, [str(tmp_path / "nowhere")]).lower()
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert "no submissions" in refused(leaderboard.main, [str(empty)])
+    (submissions / "mine" / "benchmark.json").write_text('{"results": {"randomized": {}}}')
+    assert "no results of 'mine'" in refused(leaderboard.main, [str(submissions), "--out", str(tmp_path)])
