@@ -11,23 +11,34 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
+from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_wrapper
 
 from cz_gym.errors import CzError
 from cz_gym.names import needs
+from cz_gym.observation import OBSERVATIONS
+from cz_gym.signals import STATE
 from cz_gym.vector import CzVectorEnv
 
 
-def make_vec_env(num_envs: int, stagger: int | None = None, action_repeat: int = 1, **settings: Any) -> VecEnv:
+def make_vec_env(
+    num_envs: int, stagger: int | None = None, action_repeat: int = 1, critic_state: bool = False, **settings: Any
+) -> VecEnv:
     """Many environments for stable-baselines3; ``settings`` are the keywords of ``gym.make("Cz-v0", ...)``.
 
-    ``stagger`` is :class:`CzVecEnv`'s. With ``action_repeat`` above 1 each action is held for as many steps while an
-    agent learns, whose effect is then easier to see (:class:`ActionRepeat`); a trained agent acts at every step.
+    ``stagger`` and ``critic_state`` are :class:`CzVecEnv`'s. With ``action_repeat`` above 1 each action is held for as
+    many steps while an agent learns, whose effect is then easier to see (:class:`ActionRepeat`); a trained agent acts
+    at every step.
     """
-    env = CzVecEnv(CzVectorEnv(num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings), stagger=stagger)
+    settings |= {"info": "all"} if critic_state else {}
+    batch = CzVectorEnv(num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings)
+    env = CzVecEnv(batch, stagger, critic_state)
     return env if action_repeat == 1 else ActionRepeat(env, action_repeat)
 
 
@@ -37,16 +48,23 @@ class CzVecEnv(VecEnv):
     Observations are float32, shape (num_envs, channels); ``infos`` are empty except for slots whose episode ended: they
     hold ``terminal_observation``, ``TimeLimit.truncated`` and ``episode``: return, length and time, as those of
     stable-baselines3's ``Monitor``. With ``stagger``, a seed, each slot's first episode is cut (truncated) at a random
-    step, so that slots are not all in the same minute.
+    step, so that slots are not all in the same minute. With ``critic_state`` the plant's true state
+    (:class:`cz_gym.signals.TrueState`) follows the channels of ``observation="history"``, for an
+    :class:`AsymmetricPolicy`; the batch needs ``info="all"``.
     """
 
-    def __init__(self, env: CzVectorEnv, stagger: int | None = None) -> None:
+    def __init__(self, env: CzVectorEnv, stagger: int | None = None, critic_state: bool = False) -> None:
         needs(CzVectorEnv, env, "without wrappers of gymnasium around it")
         if env.autoreset_mode != AutoresetMode.SAME_STEP:
             raise CzError("CzVecEnv needs autoreset_mode=AutoresetMode.SAME_STEP, as stable-baselines3 resets itself")
         self.env = env
         self.render_mode = env.render_mode
-        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        self.critic_state, space = critic_state, env.single_observation_space
+        if critic_state:
+            if env.config.observation != "history":
+                raise CzError(f"critic_state needs observation='history', not {env.config.observation!r}")
+            space = Box(-np.inf, np.inf, (len(OBSERVATIONS["history"]) + len(STATE),), np.float32)
+        super().__init__(env.num_envs, space, env.single_action_space)
         self._actions = np.zeros((env.num_envs, 2), np.float32)
         self._returns = np.zeros(env.num_envs)
         self._lengths = np.zeros(env.num_envs, np.int64)
@@ -60,7 +78,7 @@ class CzVecEnv(VecEnv):
         """Draw new episodes, with the seeds and options given before."""
         seeds = list(self._seeds)
         options = self._options[0] if self._options and self._options[0] else None
-        observation, _ = self.env.reset(seed=seeds, options=options)
+        observation = self._shown(*self.env.reset(seed=seeds, options=options))
         self._reset_seeds()
         self._reset_options()
         self._returns[:] = 0.0
@@ -76,22 +94,27 @@ class CzVecEnv(VecEnv):
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Advance every slot."""
         observation, reward, terminated, truncated, info = self.env.step(self._actions)
+        observation = self._shown(observation, info)
         self._returns += reward
         self._lengths += 1
         self._k += 1
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         done = terminated | truncated
         for i in np.flatnonzero(done).tolist():
-            infos[i] = self._final(i, info["final_obs"][i], bool(truncated[i]))
+            last = self._shown(info["final_obs"][i], {name: of[i] for name, of in info["final_info"].items()})
+            infos[i] = self._final(i, last, bool(truncated[i]))
         cut = (self._cuts == self._k) & ~done
         if cut.any():
             for i in np.flatnonzero(cut).tolist():
                 infos[i] = self._final(i, observation[i].copy(), True)
-            observation[cut] = self.env.reset(options={"reset_mask": cut})[0][cut]
+            observation[cut] = self._shown(*self.env.reset(options={"reset_mask": cut}))[cut]
             done = done | cut
         self._returns[done] = 0.0
         self._lengths[done] = 0
         return observation, reward.astype(np.float32), done, infos
+
+    def _shown(self, observation: np.ndarray, info: dict[str, Any]) -> np.ndarray:
+        return np.concatenate([observation, info["state"]], axis=-1) if self.critic_state else observation
 
     def _final(self, i: int, observation: np.ndarray, truncated: bool) -> dict[str, Any]:
         episode = {"r": float(self._returns[i]), "l": int(self._lengths[i]), "t": round(time.time() - self._began, 6)}
@@ -155,6 +178,39 @@ class ActionRepeat(VecEnvWrapper):
             infos = [one if one else other for one, other in zip(infos, others, strict=True)]
             done = done | over
         return observation, earned, done, infos
+
+
+class AsymmetricPolicy(ActorCriticPolicy):
+    """stable-baselines3's policy of two networks, whose critic also reads the plant's true state while it learns.
+
+    For a :class:`CzVecEnv` with ``critic_state``. The actor reads the observation alone, and acts from observations of
+    the environment as it is.
+    """
+
+    @property
+    def channels(self) -> int:
+        """Number of channels that the actor reads."""
+        return self.features_dim - len(STATE)
+
+    def _build_mlp_extractor(self) -> None:
+        arguments: Any = (self.net_arch, self.activation_fn, self.device)
+        self.mlp_extractor = _ActorAndCritic(self.channels, self.features_dim, *arguments)
+
+    def predict(self, observation: Any, *others: Any, **named: Any) -> Any:
+        """As stable-baselines3's; the true state may be missing from the observation."""
+        missing = self.features_dim - observation.shape[-1]
+        return super().predict(
+            np.pad(observation, ((0, 0),) * (observation.ndim - 1) + ((0, missing),)), *others, **named
+        )
+
+
+class _ActorAndCritic(MlpExtractor):
+    def __init__(self, channels: int, features: int, *arguments: Any) -> None:
+        super().__init__(features, *arguments)
+        self.channels, self.policy_net = channels, MlpExtractor(channels, *arguments).policy_net
+
+    def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
+        return super().forward_actor(features[:, : self.channels])
 
 
 def environment_steps(model: BaseAlgorithm) -> int:

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from cz_gym import CzVectorEnv
 from cz_gym.agents import apg
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
-from cz_gym.sb3 import ActionRepeat, CzVecEnv
+from cz_gym.sb3 import ActionRepeat, AsymmetricPolicy, CzVecEnv
 
 from .recipes import APG, PPO, SAC, Recipe, Reinforcement
 
@@ -25,12 +25,16 @@ def make_algorithm(recipe: Recipe, seed: int, done: int = 0) -> BaseAlgorithm:
     """The algorithm of a recipe for a training seed; a resumed one has taken ``done`` steps before."""
     torch.set_num_threads(1)  # small networks are quicker so
     torch.manual_seed(seed)
+    critic_state = isinstance(recipe, PPO) and recipe.critic_state
+    info = "all" if critic_state else "lean"
     env: VecEnv = CzVecEnv(
-        CzVectorEnv.from_config(recipe.config, recipe.num_envs, AutoresetMode.SAME_STEP),
-        stagger=seed + done if isinstance(recipe, Reinforcement) else None,
+        CzVectorEnv.from_config(recipe.config, recipe.num_envs, AutoresetMode.SAME_STEP, info=info),
+        seed + done if isinstance(recipe, Reinforcement) else None,
+        critic_state,
     )
     kind: Any
-    policy, options = "MlpPolicy", dict[str, Any]()
+    policy: Any = AsymmetricPolicy if critic_state else "MlpPolicy"
+    options = dict[str, Any]()
     match recipe:
         case APG():
             kind, policy, options = apg.APG, "RecurrentPolicy", {"betas": recipe.betas}

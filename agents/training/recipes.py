@@ -94,7 +94,10 @@ class PPO(Reinforcement):
     batch_size: int = 4096
     n_epochs: int = 5
     learning_rate: float = 1e-3
-    gae_lambda: float = 0.95
+    gae_lambda: float = 0.9
+    """Lower than stable-baselines3's 0.95: a critic that reads the true state is a good judge."""
+    critic_state: bool = True
+    """Whether the critic reads the plant's true state in training (:class:`cz_gym.sb3.AsymmetricPolicy`)."""
     log_std_init: float = -0.7
     """Logarithm of the initial standard deviation of the actions."""
 
