@@ -10,7 +10,7 @@ from cz_gym.config import Config
 from cz_gym.errors import CzError
 
 REWARD, PLANT = "reward", "plant"
-"""Sources that an agent learned from: the reward alone, or gradients through the plant's equations."""
+"""Sources that an agent learned from: the reward, or gradients through the plant's equations."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Contender:
         if not self.learned:
             return "classical"
         plant = any(policy.contract.learned_from == PLANT for policy in self.trained)
-        return "learned, plant known in training" if plant else "learned from the reward alone"
+        return "learned, plant known in training" if plant else "learned from the reward"
 
     def policies(self, config: Config) -> tuple[Any, ...]:
         """Its policy for an environment's settings; of an agent one a training seed."""

@@ -84,7 +84,7 @@ def earlier_bound(folder: Path, row: Row, samples: Sequence[Sample]) -> Sample |
     """
     try:
         heads = (folder / EPISODES).read_text("utf-8").partition("\n")[0].split(",")
-        known = [name in heads for name in metric_names()]  # an earlier run may lack a newer metric
+        known = [name in heads or name == "cost" for name in metric_names()]  # it may lack a newer metric
         columns = ("seed", *compress(metric_names(), known))
         found = read_episodes(folder / EPISODES, lambda scenario: columns if scenario == row.name else ())[row.name]
         (episodes,) = found[BOUND]

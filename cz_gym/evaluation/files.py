@@ -134,7 +134,7 @@ def _provenance(results: Sequence[Result], command: str) -> dict[str, Any]:
     return {
         "command": command,
         **software(PACKAGES),
-        "contract": contract_hash(result.row for result in results),
+        "contract": contract_hash([result.row for result in results]),
         "plant_hash": config.plant_hash,
         "puller": config.puller.label,
         "parameters": config.parameters._asdict(),

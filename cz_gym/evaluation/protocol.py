@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from cz_gym.config import Config, make_config
@@ -132,9 +132,10 @@ def find_row(name: str) -> Row:
     raise CzError(unknown("scenario", name, [row.name for row in ROWS]))
 
 
-def contract_hash(rows: Iterable[Row]) -> str:
-    """Return the hash of what the random rows' figures rest on: plant, scenarios, control interval and horizon."""
-    parts = sorted(row.config().hash for row in rows if not find_scenario(row.scenario).deterministic)
+def contract_hash(rows: Sequence[Row]) -> str:
+    """Return the hash of what figures rest on: plant, scenarios, control interval and horizon of the random rows."""
+    random = [row for row in rows if not find_scenario(row.scenario).deterministic]
+    parts = sorted(row.config().hash for row in random or rows)
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:12]
 
 

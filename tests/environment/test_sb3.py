@@ -1,18 +1,22 @@
 """Cz-v0 and its adapter under stable-baselines3's checker and wrappers, against a vector of scalar environments."""
 
 import warnings
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv
-from cz_gym.sb3 import CzVecEnv, make_vec_env
+from cz_gym.agents import OnnxPolicy
+from cz_gym.agents.from_sb3 import save_agent
+from cz_gym.sb3 import AsymmetricPolicy, CzVecEnv, make_vec_env
 
 N = 3
 SETTINGS: dict[str, Any] = {"scenario": "hard", "control_interval": 20.0, "horizon": 400.0}
@@ -130,3 +134,35 @@ def test_gymnasiums_wrapper_counts_the_episodes_of_both_forms(form: str) -> None
             earned[i], ends = 0.0, ends + 1
     envs.close()
     assert ends >= 16
+
+
+def test_a_critic_may_read_the_true_state_that_no_actor_reads(tmp_path: Path) -> None:
+    """The state behind the observation is the one of ``observation="state"``, at the end of an episode too."""
+    plain, told = adapter(), adapter(critic_state=True)
+    states = CzVectorEnv(N, observation="state", autoreset_mode="SameStep", **SETTINGS)
+    plain.seed(5)
+    told.seed(5)
+    channels = plain.observation_space.shape[0]
+    np.testing.assert_array_equal(told.reset(), np.hstack([plain.reset(), states.reset(seed=5)[0]]))
+    actions = np.zeros((N, 2), np.float32)
+    for _ in range(20):
+        one, other = told.step(actions), plain.step(actions)
+        state, *_, info = states.step(actions)
+        np.testing.assert_array_equal(one[0], np.hstack([other[0], state]))
+    assert other[2].all()
+    for i in range(N):
+        last = np.hstack([other[3][i]["terminal_observation"], info["final_obs"][i]])
+        np.testing.assert_array_equal(one[3][i]["terminal_observation"], last)
+    model = PPO(AsymmetricPolicy, told, n_steps=8, batch_size=24, seed=0, device="cpu").learn(24)
+    seen, other_state = one[0], one[0].copy()
+    other_state[:, channels:] = 7.0
+    action = model.predict(seen, deterministic=True)[0]
+    np.testing.assert_array_equal(action, model.predict(other_state, deterministic=True)[0])
+    np.testing.assert_array_equal(action, model.predict(seen[:, :channels], deterministic=True)[0])
+    values = [model.policy.predict_values(torch.tensor(each)) for each in (seen, other_state)]
+    assert (values[0] != values[1]).all()
+    save_agent(tmp_path / "agent.onnx", model, "asymmetric")
+    agent = OnnxPolicy.load(tmp_path / "agent.onnx")
+    np.testing.assert_allclose(agent.predict(seen[:, :channels])[0], action, atol=1e-5)
+    with pytest.raises(ValueError, match="needs observation='history'"):
+        adapter(observation="measured", critic_state=True)

@@ -63,7 +63,7 @@ def summary(results: Sequence[Result]) -> str:
         groups.setdefault(sample.contender.knows, []).append(line)
     heads = "controller", *(result.row.name for result in results), *(column.heading for column in alone)
     lines = [line for group, listed in groups.items() for line in ((f"*{group}*", *[""] * len(heads)), *listed)]
-    contract = contract_hash(result.row for result in results)
+    contract = contract_hash([result.row for result in results])
     below = f"Contract `{contract}` (plant, random scenarios, interval, horizon)."
     return f"{table((*heads, FAILURES.heading), lines)}\n\n{below}"
 
