@@ -41,7 +41,7 @@ def design(
         name: trials or PER_PARAMETER[name in for_puller.PIDS] * len(goal_on(name, config).parameters) for name in names
     }
     tasks = [(name, puller, tries[name], most, place) for name in names]
-    with tqdm(total=sum(task[2] for task in tasks), unit="candidate", dynamic_ncols=True) as bar:
+    with tqdm(total=sum(task[2] for task in tasks), unit="candidate", dynamic_ncols=True, disable=None) as bar:
 
         def look() -> None:
             bar.update(sum(tried(place / f"{name}.json") for name in names) - bar.n)
