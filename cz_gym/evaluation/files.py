@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import platform
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
@@ -182,12 +182,7 @@ def to_csv(results: Sequence[Result]) -> str:
         for training_seed, episodes in zip(sample.contender.training_seeds or ("",), sample.values, strict=True)
         for seed, values in zip(sample.seeds, episodes, strict=True)
     )
-    return csv_text(("scenario", "controller", "training_seed", "seed", *metric_names()), rows)
-
-
-def csv_text(heads: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
-    """Return a table as the text of a CSV file."""
-    text = io.StringIO()
+    text, heads = io.StringIO(), ("scenario", "controller", "training_seed", "seed", *metric_names())
     csv.writer(text, lineterminator="\n").writerows([heads, *rows])
     return text.getvalue()
 

@@ -19,9 +19,6 @@ from cz_gym.names import unknown
 
 from .protocol import Row
 
-PREFIX = "cz_gym_user_"
-"""Beginning of the names of modules that are made of the user's files."""
-
 
 def load(place: str, kind: str, fits: Callable[[Any, str], bool]) -> tuple[str, Any]:
     """Return the name and the object at ``FILE.py:NAME``; CzError says why there is none.
@@ -36,7 +33,7 @@ def load(place: str, kind: str, fits: Callable[[Any, str], bool]) -> tuple[str, 
         raise CzError(f"must be FILE.py:NAME, not {place!r:.80}")
     if not path.is_file():
         raise CzError(f"{path}: no such file")
-    module_name = f"{PREFIX}{path.stem}"
+    module_name = f"cz_gym_user_{path.stem}"
     spec: Any = importlib.util.spec_from_file_location(module_name, path)
     # Dataclasses look their module up.
     module = sys.modules[module_name] = importlib.util.module_from_spec(spec)
