@@ -35,15 +35,10 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecNormalize
 
 ALGORITHMS = {
-    "a2c": "stable_baselines3:A2C",
     "apg": "cz_gym.agents.apg:APG",
-    "ddpg": "stable_baselines3:DDPG",
-    "ppo": "stable_baselines3:PPO",
     "ppo_lstm": "sb3_contrib:RecurrentPPO",
-    "sac": "stable_baselines3:SAC",
-    "td3": "stable_baselines3:TD3",
-    "tqc": "sb3_contrib:TQC",
-    "trpo": "sb3_contrib:TRPO",
+    **{name: f"sb3_contrib:{name.upper()}" for name in ("tqc", "trpo")},
+    **{name: f"stable_baselines3:{name.upper()}" for name in ("a2c", "ddpg", "ppo", "sac", "td3")},
 }
 """Algorithms by RL-Zoo's names, and this package's own."""
 VALID = "valid"

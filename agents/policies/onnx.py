@@ -42,12 +42,9 @@ class OnnxPolicy:
         says why the file is refused. Nothing in the file is executed except its tensor operations.
         """
         path = Path(path)
-        if not path.suffix and not path.exists():
-            if (file := path.with_name(f"{path.name}.onnx")).exists():
-                raise AgentFileError(f"{path}: no agent file; did you mean {file}?")
-            raise AgentFileError(f"{path}: no agent file; cz_gym.agents.load({str(path)!r}) loads a shipped agent")
         if path.suffix != ".onnx":
-            raise AgentFileError(f"{path}: not an .onnx agent file")
+            said = f"{path}: not an .onnx agent file; cz_gym.agents.load({str(path)!r}) loads a shipped agent"
+            raise AgentFileError(said)
         return cls.of(*read_agent(path), config, path)
 
     @classmethod
@@ -55,29 +52,22 @@ class OnnxPolicy:
         cls, contract: Contract, onnx_bytes: bytes, config: Config | None = None, path: str | Path = "agent"
     ) -> OnnxPolicy:
         """An agent from its contract and ONNX file; ``path`` names it in errors."""
-        if contract.observation not in OBSERVATIONS:
-            raise AgentFileError(
-                f"{path}: reads observation {contract.observation!r}, which this release does not have"
-            )
+        for name, known in ((contract.observation, OBSERVATIONS), (contract.action, ACTIONS)):
+            if name not in known:
+                raise AgentFileError(f"{path}: made for {name!r}, which this release does not have")
         expected = len(OBSERVATIONS[contract.observation])
-        if contract.channels != expected:
+        if (contract.channels, contract.observation_hash) != (expected, observation_hash(contract.observation)):
             raise AgentFileError(
-                f"{path}: reads {contract.channels} channels, this release's {contract.observation!r} has {expected}"
+                f"{path}: reads {contract.channels} channels of {contract.observation!r}; this release's has "
+                f"{expected}, or others, or other scales"
             )
-        if contract.observation_hash != observation_hash(contract.observation):
-            raise AgentFileError(
-                f"{path}: reads observation {contract.observation!r} with other channels or scales than this release's"
-            )
-        if contract.action not in ACTIONS:
-            raise AgentFileError(f"{path}: gives actions {contract.action!r}, which this release does not have")
-        if config is not None and check_config(config).puller.label != contract.puller:
-            raise AgentFileError(
-                f"{path}: trained for puller {contract.puller}, this environment's is {config.puller.label}"
-            )
-        if config is not None and config.plant_hash != contract.plant_hash:
-            raise AgentFileError(
-                f"{path}: trained on plant {contract.plant_hash}, this environment's is {config.plant_hash}"
-            )
+        if config is not None:
+            for what, own, other in (
+                ("puller", contract.puller, check_config(config).puller.label),
+                ("plant", contract.plant_hash, config.plant_hash),
+            ):
+                if own != other:
+                    raise AgentFileError(f"{path}: trained for {what} {own}, this environment's is {other}")
         policy = cls(contract, *_session(path, onnx_bytes, expected), onnx_bytes)
         try:
             policy.predict(np.zeros((2, expected), np.float32))

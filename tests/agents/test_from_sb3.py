@@ -194,7 +194,6 @@ def test_a_model_of_several_scenarios_is_written_for_the_one_that_is_given(tmp_p
     [
         ("mine", {}, "ends in .onnx"),
         ("mine.onnx", {"model": "model.zip"}, "needs a BaseAlgorithm, not 'model.zip': stable_baselines3.PPO.load"),
-        ("mine.onnx", {"normalisation": "vec.pkl"}, "needs a VecNormalize, not 'vec.pkl'"),
         ("mine.onnx", {"config": "hard"}, "needs a Config, not 'hard'"),
     ],
 )
