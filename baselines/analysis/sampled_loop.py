@@ -19,7 +19,7 @@ from scipy.signal import cont2discrete
 from cz_gym.baselines.policy import Floats, State, map_arrays
 from cz_gym.errors import CzError
 from cz_gym.observation import MEASURED, PULL_SCALE, Measured, scales
-from cz_gym.physics.linearisation import INPUTS, OUTPUTS, STATES, StateSpace, linearise
+from cz_gym.physics.linearisation import OUTPUTS, STATES, StateSpace, linearise
 from cz_gym.physics.parameters import Parameters
 from cz_gym.physics.plant import Puller, make_puller
 from cz_gym.task import HEATER_RANGE
@@ -30,15 +30,15 @@ _SEEN = ("ring_error", "T_1", "v_p", "Q_H")
 """Channels through which the plant reaches the controller."""
 _AT_REST = np.array([float(channel.name == "valid") for channel in MEASURED])
 """Observation at rest: zeros and a valid camera."""
-_DISTURBED = ("v_p", "Q_H", "Q_d", "dT_i", "camera", "pyrometer")
+_DISTURBED = ("v_p", "Q_H", "camera")
 """Inputs of a loop."""
 HOT_ZONE = {name: name for name in ("C_1", "C_2", "C_b", "kappa_12", "G_1a", "G_2b")} | {"kappa_b": "eps"}
 """Constants of a puller that follow from estimates, and the parameter that each is proportional to."""
 _NOMINAL = Parameters()
 WIDEST = 4.0
 """Largest factor on a parameter for which a loop's stability is asked; the smallest is its inverse [-]."""
-_ANSWERS = ("v_p", "Q_H", "r_c", "r_br")
-"""Outputs of a loop: both commands and both radii."""
+_ANSWERS = ("v_p", "Q_H", "r_br")
+"""Outputs of a loop: both commands and the ring."""
 
 
 class NotLinearError(CzError):
@@ -58,17 +58,7 @@ class Loop(NamedTuple):
     @property
     def stable(self) -> bool:
         """Whether every pole lies inside the unit circle."""
-        return self._largest < 1.0
-
-    @property
-    def growth(self) -> float:
-        """Time in which the fastest growing mode grows by e [s]; infinite for a stable loop."""
-        return self.dt / math.log(self._largest) if self._largest > 1.0 else math.inf
-
-    @property
-    def _largest(self) -> float:
-        """The largest absolute value of a pole [-]."""
-        return float(np.abs(np.linalg.eigvals(self.A)).max())
+        return float(np.abs(np.linalg.eigvals(self.A)).max()) < 1.0
 
     def pick(self, output: str, inputs: tuple[str, ...]) -> StateSpace:
         """The system from some inputs to one output."""
@@ -143,46 +133,42 @@ def _answer(policy: Any, probes: Floats, rest: Any, free: Sequence[str]) -> Floa
 
 
 def sampled_plant(puller: Puller, dt: float) -> StateSpace:
-    """The plant with held inputs v_p, Q_H, Q_d, dT_i and outputs r_c, r_br, T_1; deviations in SI units."""
+    """The plant with held inputs v_p, Q_H and outputs r_br, T_1; deviations in SI units."""
     A, B, C, _ = linearise(puller)
-    pyrometer = np.zeros((1, len(STATES)))
-    pyrometer[0, STATES.index("T_1")] = 1.0
-    C = np.vstack([C[: OUTPUTS.index("r_br") + 1], pyrometer])
-    A_d, B_d, *_ = cont2discrete((A, B, C, np.zeros((len(C), len(INPUTS)))), dt, method="zoh")
-    return StateSpace(A_d, B_d, C, np.zeros((len(C), len(INPUTS))))
+    C = np.stack([C[OUTPUTS.index("r_br")], np.eye(len(STATES))[STATES.index("T_1")]])
+    A_d, B_d, *_ = cont2discrete((A, B[:, :2], C, np.zeros((2, 2))), dt, method="zoh")
+    return StateSpace(A_d, B_d, C, np.zeros((2, 2)))
 
 
 def close(controller: StateSpace, puller: Puller, dt: float, broken: str = "") -> Loop:
     """The loop of controller and plant.
 
-    Inputs: v_p (added to the command), Q_H (heat that the controller does not see), Q_d, dT_i, camera and pyrometer
-    noise; references held. Outputs: v_p and Q_H (the commands), r_c, r_br. ``broken="camera"`` opens the loop at the
-    camera: the controller reads only the input ``camera``. ``broken="v_p"`` opens it at the pull speed: plant and
-    controller see only the input ``v_p``. ``broken="Q_H"`` opens it between heater and hot zone: the plant gets only
-    the input ``Q_H``, the controller sees its command applied. The state is (plant, last applied v_p and Q_H,
-    controller).
+    Inputs: v_p (added to the command), Q_H (heat that the controller does not see), camera noise; references held.
+    Outputs: v_p and Q_H (the commands), r_br. ``broken="camera"`` opens the loop at the camera: the controller reads
+    only the input ``camera``. ``broken="v_p"`` opens it at the pull speed: plant and controller see only the input
+    ``v_p``. ``broken="Q_H"`` opens it between heater and hot zone: the plant gets only the input ``Q_H``, and the
+    controller sees its command applied. The state is (plant, last applied v_p and Q_H, controller).
     """
     plant, n, inputs = sampled_plant(puller, dt), len(STATES), len(_DISTURBED)
     at = [Measured._fields.index(name) for name in _SEEN]
-    column = {name: np.eye(inputs)[i] for i, name in enumerate(_DISTURBED)}
     seen = np.zeros((len(_SEEN), n + 2))
-    seen[0, :n], seen[1, :n] = plant.C[1] * (broken != "camera"), plant.C[2]
+    seen[0, :n], seen[1, :n] = plant.C[0] * (broken != "camera"), plant.C[1]
     seen[2, n], seen[3, n + 1] = 1.0, 1.0
-    noise = np.stack([column["camera"], column["pyrometer"], np.zeros(inputs), np.zeros(inputs)])
+    noise = np.zeros((len(_SEEN), inputs))
+    noise[0, _DISTURBED.index("camera")] = 1.0
     B, D = controller.B[:, at], controller.D[:, at]
     command, direct = np.hstack([D @ seen, controller.C]), D @ noise
     pulls, heats = float(broken != "v_p"), float(broken != "Q_H")
-    apply = np.vstack([plant.B[:, :2] @ np.diag([pulls, heats]), np.diag([pulls, 1.0])])
-    own = np.zeros((n + 2, n + 2))
-    own[:n, :n] = plant.A
-    disturbed = np.vstack([plant.B @ np.stack([column[name] for name in INPUTS]), column["v_p"], np.zeros(inputs)])
+    apply = np.vstack([plant.B @ np.diag([pulls, heats]), np.diag([pulls, 1.0])])
+    own, disturbed = np.zeros((n + 2, n + 2)), np.zeros((n + 2, inputs))
+    own[:n, :n], disturbed[:n, :2], disturbed[n, 0] = plant.A, plant.B, 1.0
     moved = np.hstack([own, np.zeros((n + 2, len(controller.A)))]) + apply @ command
-    radii = np.hstack([plant.C[:2], np.zeros((2, command.shape[1] - n))])
+    ring = np.hstack([plant.C[:1], np.zeros((1, command.shape[1] - n))])
     return Loop(
         np.vstack([moved, np.hstack([B @ seen, controller.A])]),
         np.vstack([disturbed + apply @ direct, B @ noise]),
-        np.vstack([command, radii]),
-        np.vstack([direct, np.zeros((2, inputs))]),
+        np.vstack([command, ring]),
+        np.vstack([direct, np.zeros((1, inputs))]),
         dt,
     )
 
