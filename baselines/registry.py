@@ -53,7 +53,7 @@ def _lqg_at(activity: float) -> Contender:
 
 def _adaptive(name: str) -> Contender:
     make = partial(_lqg_for, name)
-    meaning = f"{name} with filters for weak to strong fluctuations, weighted by how well they predict"
+    meaning = f"{name} with filters for weaker fluctuations too, weighted by how well they predict"
     default = name == designs.family_name(IN_TABLE)
     return Contender(f"{name}-adaptive", lambda config: adaptive(make(config)), "measured", meaning, default)
 
