@@ -26,7 +26,7 @@ REGISTRY, AGENTS = "cz_gym.baselines.registry", "cz_gym.agents"
 """Modules that know controllers and agents, looked up by name because this package imports neither."""
 FALLBACK = "paper-tuned"
 """The PID that takes over."""
-FORMS = ("c", "fmu", "onnx", "st")
+WRITERS = {"c": write_c, "st": write_st}
 README = """# {name}: a controller for Czochralski growth
 
 {about}
@@ -84,7 +84,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("controller", nargs="?", help="a classical controller, a shipped agent, or an agent file (.onnx)")
     add("--plant", action="store_true", help="the puller in place of a controller (--to fmu)")
-    add("--to", choices=FORMS, required=True, help="c: C99; st: IEC 61131-3 structured text; onnx: ONNX; fmu: FMI 2.0")
+    add(
+        "--to",
+        choices=("c", "fmu", "onnx", "st"),
+        required=True,
+        help="c: C99; st: IEC 61131-3 structured text; onnx: ONNX; fmu: FMI 2.0",
+    )
     add("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
     parser.add_puller("its nominal values, its drives' limits, what is designed for it")
     add("--scenario", default="puller", metavar="NAME",
@@ -106,16 +111,12 @@ def _export(given: argparse.Namespace) -> None:
     if single and (block.program.needs_double or given.to == "onnx"):
         why = "ONNX is written" if given.to == "onnx" else "its filter works on temperatures in kelvin and needs"
         raise CzError(f"{given.controller}: {why} --real double")
-    texts: dict[str, Any] = (
-        write_onnx(block.program)
-        if given.to == "onnx"
-        else {"c": write_c, "st": write_st}[given.to](block.program, single)
-    )
-    texts["README.md"] = readme(block, list(texts))
-    encoded = {name: text if isinstance(text, bytes) else text.encode() for name, text in texts.items()}
-    write_files({given.out / name: text for name, text in encoded.items()})
-    for name in texts:
-        print(shown(given.out / name))
+    files: dict[str, bytes] = write_onnx(block.program) if given.to == "onnx" else {}
+    if given.to in WRITERS:
+        files = {name: text.encode() for name, text in WRITERS[given.to](block.program, single).items()}
+    files["README.md"] = readme(block, list(files)).encode()
+    write_files({given.out / name: content for name, content in files.items()})
+    print(*(shown(given.out / name) for name in files), sep="\n")
 
 
 def make_block(name: str, config: Config) -> Block:
@@ -137,14 +138,14 @@ def make_block(name: str, config: Config) -> Block:
         return Block(identifier, controller, pid, config, (f"Controller {name}: {entry.meaning}.", tuned))
     if name not in agents.shipped_names() and Path(name).suffix != ".onnx":
         raise CzError(unknown("controller or agent", name, [*known, *agents.shipped_names()]))
-    policy = agents.load(name)
-    contract = policy.contract
-    if contract.puller != config.puller.label:
-        raise CzError(f"{name} was trained for the puller {contract.puller}, not for {config.puller.label}")
-    if contract.plant_hash != config.plant_hash:
-        raise CzError(f"{name} was trained on plant {contract.plant_hash}, this puller is {config.plant_hash}")
-    if contract.control_interval != config.control_interval:
-        raise CzError(f"{name} acts every {contract.control_interval:g} s, not every {config.control_interval:g} s")
+    contract = (policy := agents.load(name)).contract
+    for what, its, own in (
+        ("puller", contract.puller, config.puller.label),
+        ("plant", contract.plant_hash, config.plant_hash),
+        ("control interval [s]", contract.control_interval, config.control_interval),
+    ):
+        if its != own:
+            raise CzError(f"{name} was trained for the {what} {its}, not for {own}")
     facts = (
         f"Agent {name}: {contract.algorithm}, seed {contract.training_seed}, trained on {contract.scenario} "
         f"({contract.scenario_hash}).",

@@ -33,12 +33,7 @@ def _slice(x: Any, starts: Any, ends: Any, axes: Any = None, steps: Any = None) 
 
 
 def _split(x: Any, lengths: Any = None, axis: int = 0, parts: int = 1) -> Any:
-    width = x.shape[axis]
-    ends = np.cumsum([width // parts] * parts if lengths is None else lengths)
-    return [
-        np.moveaxis(np.moveaxis(x, axis, 0)[end - n : end], 0, axis)
-        for end, n in zip(ends, np.diff(ends, prepend=0), strict=True)
-    ]
+    return np.split(x, parts if lengths is None else np.cumsum(lengths)[:-1].tolist(), axis)
 
 
 def _softplus(x: Any) -> Any:
@@ -57,35 +52,25 @@ OPERATORS: dict[str, Callable[..., Any]] = {
 """The operators that an agent's graph may hold, :data:`cz_gym.agents.agent_file.graph.OPERATORS`, in NumPy."""
 
 
-class Network:
-    """An agent's checked ONNX graph as a function of NumPy arrays, in double precision."""
+def network_of(content: bytes) -> Callable[..., list[Any]]:
+    """An agent's checked ONNX graph as a function of NumPy arrays of shape (n, width), in double precision."""
+    import onnx
+    from onnx import helper, numpy_helper
 
-    def __init__(self, content: bytes) -> None:
-        import onnx
-        from onnx import helper, numpy_helper
+    graph = onnx.load_from_string(content).graph
+    tensors = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
+    weights = {name: each.astype(np.float64) if each.dtype == np.float32 else each for name, each in tensors.items()}
 
-        graph = onnx.load_from_string(content).graph
-        self.weights = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
-        self.weights = {k: v.astype(np.float64) if v.dtype == np.float32 else v for k, v in self.weights.items()}
-        self.outputs = [value.name for value in graph.output]
-        self.nodes = [
-            (
-                node.op_type,
-                list(node.input),
-                list(node.output),
-                {a.name: helper.get_attribute_value(a) for a in node.attribute},
-            )
-            for node in graph.node
-        ]
+    def network(**inputs: Any) -> list[Any]:
+        values: dict[str, Any] = {"": None} | weights | inputs
+        for node in graph.node:
+            extra = {a.name: helper.get_attribute_value(a) for a in node.attribute}
+            extra |= {"parts": len(node.output)} if node.op_type == "Split" else {}
+            result = OPERATORS[node.op_type](*(values[name] for name in node.input), **extra)
+            values.update(zip(node.output, result if node.op_type == "Split" else [result], strict=True))
+        return [values[value.name] for value in graph.output]
 
-    def __call__(self, **inputs: Any) -> list[Any]:
-        """The outputs for inputs of shape (n, width)."""
-        values: dict[str, Any] = {"": None} | self.weights | inputs
-        for operator, given, named, attributes in self.nodes:
-            extra = {"parts": len(named)} if operator == "Split" else {}
-            result = OPERATORS[operator](*(values[name] for name in given), **attributes, **extra)
-            values.update(zip(named, result if operator == "Split" else [result], strict=True))
-        return [values[name] for name in self.outputs]
+    return network
 
 
 class Past(NamedTuple):
@@ -116,7 +101,7 @@ class Agent:
         contract, ranges = policy.contract, config.ranges
         if contract.observation not in ("measured", "history"):
             raise CzError(f"an agent that reads {contract.observation!r} cannot be exported: no plant has that")
-        self.network, self.remembers, self.ranges = Network(policy.content), policy.remembers, ranges
+        self.network, self.remembers, self.ranges = network_of(policy.content), policy.remembers, ranges
         self.v_0, self.heater_range = ranges
         self.slack = HEATER_SLACK * max(each.actuators.heater_step for each in config.scenario.scenarios)
         self.dt = contract.control_interval

@@ -14,9 +14,9 @@ import numpy as np
 
 from cz_gym.errors import CzError
 
-from .program import Floats
 from .shell import INPUTS, Block
 from .text import write_c
+from .trace import Floats
 
 FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O2", "-ffp-contract=off", "-fPIC", "-shared")
 """Options of the compiler."""

@@ -16,9 +16,10 @@ from pythonfmu.builder import FmuBuilder
 
 from cz_gym.config import Config, make_config
 from cz_gym.env import CzEnv
-from cz_gym.observation import decode
+from cz_gym.observation import Measured, decode
 from cz_gym.puller import PullerFile, write_puller
 
+from .program import Port
 from .shell import INPUTS, OUTPUTS, in_plant_units, in_shares, nominal_puller
 
 SCRIPT = """import ctypes
@@ -32,7 +33,7 @@ class CzPuller(fmu.CzPuller):
     scenario, puller = {scenario!r}, {puller!r}
 """
 """The module in a unit, with the defaults of its parameters."""
-READINGS = tuple(port for port in INPUTS if port.name not in ("time_s", "ring_time_s", "automatic"))
+SHOWN = tuple(port for port in INPUTS if port.name not in ("time_s", "ring_time_s", "automatic"))
 """What the puller shows."""
 
 
@@ -44,28 +45,23 @@ class CzPuller(Fmi2Slave):  # type: ignore[misc]
     def __init__(self, **given: Any) -> None:
         super().__init__(**given)
         self.description = "Czochralski puller of cz-gym: one crystal, and what the puller's sensors show"
-        parameter = {"causality": Fmi2Causality.parameter, "variability": Fmi2Variability.fixed}
-        self.register_variable(Integer("seed", description="which crystal", **parameter))
-        self.register_variable(String("scenario", description="its disturbances", **parameter))
-        about = "puller file beside this module, name of a shipped one, or empty for the default"
-        self.register_variable(String("puller", description=about, **parameter))
+        beside = "puller file beside this module, name of a shipped one, or empty for the default"
+        for kind, name, about in ((Integer, "seed", "which crystal"), (String, "scenario", "its disturbances"),
+                                  (String, "puller", beside)):  # fmt: skip
+            self._add(kind, name, about, Fmi2Causality.parameter, Fmi2Variability.fixed)
         config = self._config()
         self.default_experiment = DefaultExperiment(0.0, config.horizon, config.control_interval)
-        puller = nominal_puller(config)
-        at_rest = in_plant_units(decode([0.0] * len(READINGS), *config.ranges), puller)
-        for port, name in zip(OUTPUTS, ("pull_speed_mm_per_min", "heater_power_kW"), strict=False):
-            setattr(self, port.name, float(at_rest[name]))
-            self.register_variable(Real(port.name, causality=Fmi2Causality.input, description=port.meaning))
-        for port in READINGS:
-            setattr(self, port.name, 0.0)
-            kind = Boolean if port.logical else Real
-            variability = Fmi2Variability.discrete if port.logical else None
-            self.register_variable(
-                kind(port.name, causality=Fmi2Causality.output, description=port.meaning, variability=variability)
-            )
+        self.__dict__.update(in_plant_units(Measured(*[0.0] * len(Measured._fields)), nominal_puller(config)))
+        for port, applied in zip(OUTPUTS, ("pull_speed_mm_per_min", "heater_power_kW"), strict=False):
+            setattr(self, port.name, getattr(self, applied))
+            self._add(Real, port.name, port.meaning, Fmi2Causality.input)
         self.growing = True
-        shown = {"causality": Fmi2Causality.output, "variability": Fmi2Variability.discrete}
-        self.register_variable(Boolean("growing", description="false once the crystal has ended", **shown))
+        for port in (*SHOWN, Port("growing", "false once the crystal has ended", 1.0, True)):
+            discrete = Fmi2Variability.discrete if port.logical else None
+            self._add(Boolean if port.logical else Real, port.name, port.meaning, Fmi2Causality.output, discrete)
+
+    def _add(self, kind: Any, name: str, about: str, causality: Any, variability: Any = None) -> None:
+        self.register_variable(kind(name, causality=causality, description=about, variability=variability))
 
     def _config(self) -> Config:
         beside = Path(self.resources or "") / self.puller
@@ -85,28 +81,27 @@ class CzPuller(Fmi2Slave):  # type: ignore[misc]
             self.log(f"a step must be a multiple of the control interval, {interval:g} s, not {step_size:g} s")
             return False
         action = in_shares(vars(self), self.env.config)
-        for _ in range(steps if self.growing else 0):
-            observation, _, terminated, truncated, _ = self.env.step(action.clip(-1.0, 1.0))
-            self.growing = not (terminated or truncated)
-            self._show(observation)
-            if not self.growing:
-                break
+        for _ in range(steps):
+            if self.growing:
+                observation, _, terminated, truncated, _ = self.env.step(action.clip(-1.0, 1.0))
+                self.growing = not (terminated or truncated)
+                self._show(observation)
         return True
 
     def _show(self, observation: Any) -> None:
         config = self.env.config
-        vars(self).update(in_plant_units(decode(observation.astype(float), *config.ranges), nominal_puller(config)))
+        self.__dict__.update(in_plant_units(decode(observation.astype(float), *config.ranges), nominal_puller(config)))
 
 
 def build_fmu(folder: Path, scenario: str, puller: PullerFile | None = None) -> Path:
     """Write ``CzPuller.fmu`` into the folder, with these defaults of its parameters; returns its path."""
     with TemporaryDirectory() as name:
-        script, files = Path(name) / "cz_puller.py", [Path(name) / "puller.toml"] if puller else []
-        for file in files:
+        script, file = Path(name) / "cz_puller.py", Path(name) / "puller.toml"
+        if puller is not None:
             write_puller(puller, file)
-        script.write_text(SCRIPT.format(scenario=scenario, puller="puller.toml" if puller else ""))
+        script.write_text(SCRIPT.format(scenario=scenario, puller=file.name if puller else ""))
         try:
-            path: Path = FmuBuilder.build_FMU(script, folder, files)
+            path: Path = FmuBuilder.build_FMU(script, folder, [file] if puller else [])
         finally:
             sys.modules.pop(script.stem, None)
             sys.path[:] = [place for place in sys.path if place != name]

@@ -64,7 +64,7 @@ class Writer:
         if known is not None:
             flat = known.ravel()
             return self.constant(flat[:1] if each and (flat == flat[0]).all() else flat)
-        owners = [self.graph.nodes[at] for at in np.unique(np.searchsorted(self.graph.starts, ids, side="right") - 1)]
+        owners = [self.graph.nodes[at] for at in np.unique(self.graph.owners(ids))]
         names = [self.constant(node.data) if node.op == "constant" else self._name(node) for node in owners]
         source = names[0] if len(names) == 1 else self.add("Concat", *names, axis=0)
         whole = np.concatenate([node.start + np.arange(node.size) for node in owners])  # in order, as the nodes are

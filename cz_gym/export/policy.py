@@ -12,8 +12,8 @@ import numpy.typing as npt
 from cz_gym.action import MadeFor, mark
 from cz_gym.observation import decode
 
-from .program import Floats
 from .shell import Block, in_plant_units, in_shares, nominal_puller, select
+from .trace import Floats
 
 
 class Runner(Protocol):

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from .trace import BAD, Graph, Ids, Node
-
-Floats = npt.NDArray[np.float64]
-
+from .trace import BAD, Floats, Graph, Ids, Node
 
 WIDE = ("last_time_s",)
 """Memory that needs double precision also where the controller computes in single precision."""
@@ -66,7 +62,7 @@ class Program:
         reached = [self.due, *(ids for _, ids in self.outputs), *(cell.after for cell in self.memory)]
         while reached:
             ids = reached.pop()
-            for at in set((np.searchsorted(self.graph.starts, ids, side="right") - 1).tolist()) - wanted:
+            for at in set(self.graph.owners(ids).tolist()) - wanted:
                 wanted.add(at)
                 reached.extend(self.graph.nodes[at].args)
         return tuple(node for at, node in enumerate(self.graph.nodes) if at in wanted and node.op != "constant")
@@ -77,35 +73,32 @@ def flatten(value: Any, name: str = "") -> list[tuple[str, Any]]:
     if not isinstance(value, tuple):
         return [(name, value)]
     names = getattr(value, "_fields", range(len(value)))
-    return [
-        leaf for part, each in zip(names, value, strict=True) for leaf in flatten(each, f"{name}_{part}".strip("_"))
-    ]
+    parts = zip(names, value, strict=True)
+    return [leaf for part, each in parts for leaf in flatten(each, f"{name}_{part}".strip("_"))]
 
 
-def rebuild(like: Any, leaves: Any) -> Any:
-    """Nested tuples like ``like`` with the arrays that an iterator gives, in order."""
+def rebuild(like: Any, leaves: Iterator[Any]) -> Any:
+    """Nested tuples like ``like`` with the arrays of an iterator, in order."""
     if not isinstance(like, tuple):
         return next(leaves)
-    parts = [rebuild(each, leaves) for each in like]
-    kind: Any = type(like)
-    return kind(*parts) if hasattr(like, "_fields") else tuple(parts)
+    parts = tuple(rebuild(each, leaves) for each in like)
+    return type(like)(*parts) if hasattr(like, "_fields") else parts
 
 
 def record(
-    name: str,
-    settings: tuple[Port, ...],
-    inputs: tuple[Port, ...],
-    outputs: tuple[Port, ...],
-    memory: Any,
     step: Callable[[Any, Any], tuple[Any, Any, Any]],
-    needs_double: bool = False,
-    notes: tuple[str, ...] = (),
+    memory: Any,
+    ports: Sequence[tuple[Port, ...]],
+    name: str,
+    needs_double: bool,
+    notes: tuple[str, ...],
 ) -> Program:
     """Record ``step(given, memory) -> outputs, memory, due``; ``memory`` is that before the first sample.
 
-    Settings and inputs are passed as a dictionary of traced numbers, outputs are returned as one.
-    """
-    graph = Graph()
+    ``ports`` are settings, inputs and outputs. The first two are passed as one dictionary of traced numbers, and
+    outputs are returned as one.
+    """  # fmt: skip
+    graph, (settings, inputs, outputs) = Graph(), ports
     leaves = [(leaf, np.clip(np.asarray(value, np.float64), -BAD, BAD)) for leaf, value in flatten(memory)]
     cells = [graph.input(leaf, value.shape) if value.size else value for leaf, value in leaves]
     given = {port.name: graph.input(port.name) for port in (*settings, *inputs)}
@@ -114,13 +107,10 @@ def record(
     def ids_of(value: Any) -> Ids:
         return np.ascontiguousarray(graph.lift(value).ids).ravel()
 
-    held = [
+    held = tuple(
         Cell(leaf, value.ravel(), ids_of(new), leaf in WIDE)
         for (leaf, value), (_, new) in zip(leaves, flatten(after), strict=True)
         if value.size
-    ]
-    for cell in held:
-        if cell.after.size != cell.start.size:
-            raise ValueError(f"{cell.name}: {cell.start.size} numbers became {cell.after.size}")
+    )
     shown = tuple((port, ids_of(results[port.name])) for port in outputs)
-    return Program(name, graph, settings, inputs, shown, tuple(held), ids_of(due), needs_double, notes)
+    return Program(name, graph, settings, inputs, shown, held, ids_of(due), needs_double, notes)

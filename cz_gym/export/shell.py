@@ -14,7 +14,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntFlag
-from functools import cache, cached_property
+from functools import cache, cached_property, reduce
+from operator import and_
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -24,8 +25,8 @@ from cz_gym.observation import CLIP, MEASURED, Measured, readable, scales
 from cz_gym.physics.plant import Puller, make_puller
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
-from .program import Floats, Port, Program, record
-from .trace import FINITE
+from .program import Port, Program, record
+from .trace import FINITE, Floats
 
 NO_LIMIT = 1e30
 """A slew rate that limits nothing."""
@@ -94,6 +95,16 @@ INPUTS = (
     Port("automatic", "whether the controller acts; a rising edge is a takeover", 1.0, True),
 )
 """The inputs of every block."""
+READINGS = {
+    **{name: (f"{name}_mm", "nominal_radius_mm", "r_0", MM) for name in ("r_ref", "r_ref_1min", "r_ref_5min")},
+    **{
+        name: (f"{name}_K", "nominal_T_1_K", "T_1_0", 1.0)
+        for name in ("T_1_ref", "T_1_ref_1min", "T_1_ref_5min", "T_1")
+    },
+    "v_p": ("pull_speed_mm_per_min", "nominal_pull_speed_mm_per_min", "v_0", MM_PER_MIN),
+    "Q_H": ("heater_power_kW", "nominal_heater_power_kW", "Q_H_0", KILO),
+}
+"""Readings but the ring: input, setting with its nominal value, that of a puller, and the input's unit."""
 OUTPUTS = (
     Port("pull_speed_setpoint_mm_per_min", "setpoint of the pull speed"),
     Port("heater_power_setpoint_kW", "setpoint of the heater power"),
@@ -164,35 +175,19 @@ def settings_of(config: Config, puller: Puller | None = None) -> tuple[Port, ...
 
 def readings_of(given: Any, ranges: tuple[float, float]) -> tuple[Measured, Measured]:
     """Readings as deviations in SI units, and whether each lies within the range of the observations."""
-    radius, power = given["ring_radius_mm"] - given["ring_bias_mm"], given["nominal_heater_power_kW"]
-    seen = Measured(
-        ring_error=(radius - given["r_ref_mm"]) * MM,
-        valid=np.where(given["valid"] > 0.5, 1.0, 0.0),
-        r_ref=(given["r_ref_mm"] - given["nominal_radius_mm"]) * MM,
-        r_ref_1min=(given["r_ref_1min_mm"] - given["nominal_radius_mm"]) * MM,
-        r_ref_5min=(given["r_ref_5min_mm"] - given["nominal_radius_mm"]) * MM,
-        T_1_ref=given["T_1_ref_K"] - given["nominal_T_1_K"],
-        T_1_ref_1min=given["T_1_ref_1min_K"] - given["nominal_T_1_K"],
-        T_1_ref_5min=given["T_1_ref_5min_K"] - given["nominal_T_1_K"],
-        T_1=given["T_1_K"] - given["nominal_T_1_K"],
-        v_p=(given["pull_speed_mm_per_min"] - given["nominal_pull_speed_mm_per_min"]) * MM_PER_MIN,
-        Q_H=(given["heater_power_kW"] - power) * KILO,
-    )
+    seen = {each: (given[port] - given[nominal]) * unit for each, (port, nominal, _, unit) in READINGS.items()}
+    ring = (given["ring_radius_mm"] - given["ring_bias_mm"] - given["r_ref_mm"]) * MM
+    read = Measured(ring_error=ring, valid=np.where(given["valid"] > 0.5, 1.0, 0.0), **seen)
     limits = 1.001 * CLIP * scales(MEASURED, *ranges)
-    return seen, Measured(*(np.abs(value) <= limit for value, limit in zip(seen, limits, strict=True)))
+    return read, Measured(*(np.abs(value) <= limit for value, limit in zip(read, limits, strict=True)))
 
 
 def in_plant_units(seen: Measured, puller: Any) -> dict[str, Any]:
     """The readings of a sample as a plant has them, by the names of :data:`INPUTS`: the inverse of readings_of."""
-    radii = {f"{name}_mm": (getattr(seen, name) + puller.r_0) / MM for name in ("r_ref", "r_ref_1min", "r_ref_5min")}
-    recipe = ("T_1_ref", "T_1_ref_1min", "T_1_ref_5min", "T_1")
-    return {
-        "ring_radius_mm": (seen.ring_error + seen.r_ref + puller.r_0 + puller.ring_bias) / MM,
-        "valid": seen.valid,
-        **radii,
-        **{f"{name}_K": getattr(seen, name) + puller.T_1_0 for name in recipe},
-        "pull_speed_mm_per_min": (seen.v_p + puller.v_0) / MM_PER_MIN,
-        "heater_power_kW": (seen.Q_H + puller.Q_H_0) / KILO,
+    ring = (seen.ring_error + seen.r_ref + puller.r_0 + puller.ring_bias) / MM
+    return {"ring_radius_mm": ring, "valid": seen.valid} | {
+        port: (getattr(seen, each) + getattr(puller, at_rest)) / unit
+        for each, (port, _, at_rest, unit) in READINGS.items()
     }
 
 
@@ -222,7 +217,7 @@ def step(controller: Controller, pid: Controller, dt: float, ranges: Any, given:
     trusted = Measured(*(np.where(good, value, np.inf) for good, value in zip(plausible, seen, strict=True)))
     read = readable(trusted._replace(valid=np.where(ring, 1.0, 0.0)), last)
     references = [getattr(plausible, name) for name in Measured._fields if "ref" in name]
-    reference = _all(references)
+    reference = reduce(and_, references)
     good = ring & reference & plausible.T_1 & plausible.v_p & plausible.Q_H
     bad = np.where(good & ~late, 0.0, memory.bad + np.clip(np.abs(elapsed), 0.0, HOUR))
 
@@ -295,13 +290,6 @@ def step(controller: Controller, pid: Controller, dt: float, ranges: Any, given:
     return outputs, now, due
 
 
-def _all(conditions: Any) -> Any:
-    together = conditions[0]
-    for one in conditions[1:]:
-        together = together & one
-    return together
-
-
 def _finite(value: Any) -> Any:
     return np.abs(value) <= FINITE
 
@@ -361,6 +349,5 @@ class Block:
     @cached_property
     def program(self) -> Program:
         """What it computes, recorded."""
-        needs_double = self.controller.estimates_temperature
-        settings = settings_of(self.config)
-        return record(self.name, settings, INPUTS, OUTPUTS, self.start(1), self._step, needs_double, self.notes)
+        ports = settings_of(self.config), INPUTS, OUTPUTS
+        return record(self._step, self.start(1), ports, self.name, self.controller.estimates_temperature, self.notes)

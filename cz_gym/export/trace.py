@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from cz_gym.errors import CzError
 
+Floats = npt.NDArray[np.float64]
 Ids = npt.NDArray[np.int64]
 BAD = 3e38
 """Stands for NaN and infinity in recorded programs; float32 holds it."""
@@ -75,16 +76,20 @@ class Graph:
         self.length += size
         return node
 
+    def owners(self, ids: Any) -> Any:
+        """The numbers of the elements' nodes."""
+        return np.searchsorted(self.starts, ids, side="right") - 1
+
     def owner(self, element: int) -> Node:
         """The node of an element."""
-        return self.nodes[int(np.searchsorted(self.starts, element, side="right")) - 1]
+        return self.nodes[int(self.owners(element))]
 
     def values(self, ids: Ids) -> Any:
         """The elements' values if all are constants; None otherwise."""
         flat = ids.ravel()
         if not flat.size:
             return np.zeros(ids.shape)
-        owners = np.searchsorted(self.starts, flat, side="right") - 1
+        owners = self.owners(flat)
         present = np.unique(owners)
         if any(self.nodes[at].op != "constant" for at in present):
             return None
@@ -102,11 +107,8 @@ class Graph:
     def constant(self, value: Any) -> Traced:
         """A constant; equal ones are one node."""
         array = np.asarray(value)
-        array = (
-            array
-            if array.dtype == np.bool_
-            else np.nan_to_num(array.astype(np.float64), nan=BAD, posinf=BAD, neginf=-BAD)
-        )
+        if array.dtype != np.bool_:
+            array = np.nan_to_num(array.astype(np.float64), nan=BAD, posinf=BAD, neginf=-BAD)
         key = array.tobytes() + array.dtype.char.encode()
         if key not in self.known:
             self.known[key] = self.add("constant", (), array.size, array.ravel())
@@ -123,26 +125,9 @@ class Graph:
         if all(value is not None for value in known):
             with np.errstate(all="ignore"):
                 return self.constant(FUNCTIONS[op](*known))
-        if (simple := self._simplified(op, args, known)) is not None:
-            return Traced(self, simple)
         flat = tuple(np.ascontiguousarray(ids).ravel() for ids in args)
         node = self.add(op, flat, flat[0].size)
         return Traced(self, node.start + np.arange(node.size).reshape(args[0].shape))
-
-    def _simplified(self, op: str, args: Any, known: list[Any]) -> Any:
-        """Element numbers that the operation leaves as they are; None if it changes something."""
-        for value, other in ((1, 0), (0, 1)) if len(known) == 2 else ():
-            if known[value] is not None and not (op in ("subtract", "divide") and value == 0):
-                neutral = {"add": 0.0, "subtract": 0.0, "multiply": 1.0, "divide": 1.0, "minimum": BAD, "maximum": -BAD}
-                if np.all(known[value] == neutral.get(op)):
-                    return args[other]
-        if op == "divide" and known[1] is not None and args[0].size:
-            of = self.owner(int(args[0].flat[0]))
-            whole = of.op == "multiply" and np.array_equal(args[0].ravel(), of.start + np.arange(of.size))
-            factor = self.values(of.args[1]) if whole else None
-            if factor is not None and np.all(factor == known[1].ravel()):
-                return of.args[0].reshape(args[0].shape)
-        return None
 
 
 class Traced(np.lib.mixins.NDArrayOperatorsMixin):
@@ -302,6 +287,7 @@ _RULES: dict[Any, Callable[..., Any]] = {
     np.clip: _clip,
     np.take_along_axis: _take,
     np.einsum: _einsum,
+    np.split: lambda graph, array, *given: [Traced(graph, ids) for ids in np.split(array.ids, *given)],
     np.diff: lambda graph, array, axis: array[..., 1:] - array[..., :-1],
 }
 
@@ -355,8 +341,6 @@ def complex_ufunc(name: str, *inputs: Any) -> Complex:
         re = a.re / b.re
         top = 0.0 if a.im is None else a.im
         return Complex(re, (top if b.im is None else top - re * b.im) / b.re, unit)
-    if name == "negative":
-        return Complex(-a.re, -a.im, unit)
     if name == "sqrt" and unit < _TINY:
         root = np.sqrt(a.re)
         return Complex(root, a.im / (2.0 * root), unit)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import re
 from collections.abc import Callable, Iterable
@@ -178,6 +179,22 @@ def camera() -> list[str]:
     return markdown(("code", "value", "unit", "meaning", "source"), rows)
 
 
+def exported() -> list[str]:
+    """What the study of exported C found: each controller's largest difference of an action, and rows that differ."""
+    found: dict[tuple[str, str], list[Any]] = {}
+    for row in json.loads((DOCS.parent / "results" / "export" / "export.json").read_text())["rows"]:
+        found.setdefault((code(row["controller"]), row["real"]), []).append(row)
+    rows = (
+        (
+            *names,
+            f"{max(row['difference'] for row in of):.1e}",
+            f"{sum(r['python'] != r['c'] for r in of)} of {len(of)}",
+        )
+        for names, of in found.items()
+    )
+    return markdown(("controller", "C", "largest difference of an action", "rows of the table that differ"), rows)
+
+
 TABLES: dict[str, Callable[[], list[str]]] = {
     "measured": lambda: channels(MEASURED),
     "history": remembered,
@@ -188,6 +205,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "single-scenarios": single_scenarios,
     "families": families,
     "camera": camera,
+    "exported": exported,
     "tags": lambda: markdown(("tag", "type", "meaning"), ((code(t.name), t.kind.__name__, t.meaning) for t in TAGS)),
     "puller": puller,
     **{part: partial(symbols, part) for part in nomenclature.ROWS},

@@ -24,6 +24,7 @@ from cz_gym.export.text import write_c, write_st
 from cz_gym.observation import decode, readable
 from cz_gym.task import HEATER_RANGE, drives_of
 from cz_gym.vector import CzVectorEnv
+from studies.export import LARGEST, report, study
 from tests.export.structured_text import FunctionBlock
 
 CONTROLLERS = ("paper", "paper-tuned", "industrial", "lqg", "gradient", "ppo")
@@ -156,6 +157,15 @@ def test_c_and_onnx_act_as_python_does(name: str, scenario: str) -> None:
             assert in_shares(found, block.config) == pytest.approx(in_shares(own, block.config), abs=tolerance)
         assert rest[0][ALARMS] == rest[1][ALARMS] == own[ALARMS]
         observation, *_ = env.step(done[0][0])
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_the_study_finds_no_difference() -> None:
+    rows = study("paper-tuned", "puller", 1)
+    assert [row.real for row in rows] == ["double", "float"]
+    assert all(row.difference <= LARGEST[row.real] and row.python == row.c for row in rows)
+    assert report(rows, 1).count(": none.") == 2
 
 
 MAIN = """

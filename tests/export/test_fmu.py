@@ -12,7 +12,7 @@ import fmpy
 
 from cz_gym import CzEnv
 from cz_gym.export.__main__ import main
-from cz_gym.export.fmu import READINGS
+from cz_gym.export.fmu import SHOWN
 from cz_gym.export.shell import OUTPUTS, in_plant_units, in_shares, nominal_puller
 from cz_gym.observation import decode
 
@@ -29,7 +29,7 @@ def test_fmpy_grows_the_crystal_of_the_environment(own: tuple[str, ...], tmp_pat
 
     def shown() -> dict[str, Any]:
         get = {True: unit.getBoolean, False: unit.getReal}
-        return {port.name: get[port.logical]([at[port.name]])[0] for port in READINGS}
+        return {port.name: get[port.logical]([at[port.name]])[0] for port in SHOWN}
 
     def expected(observation: Any) -> dict[str, Any]:
         return in_plant_units(decode(observation.astype(float), *config.ranges), puller)
