@@ -24,7 +24,7 @@ from cz_gym.puller import PullerFile, chosen_puller
 from .goals import TUNABLE, crystals, crystals_on, goal_of, goal_on, search_for
 from .search import Search, file_name, measure
 
-PER_PARAMETER = 2, 5
+PER_PARAMETER = 2, 6
 """Most candidates of a search for a puller, for each of its parameters: of an LQG, of a PID."""
 
 
@@ -71,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add(
         "--trials",
         type=trials,
-        help="candidates to try, those of an earlier run included (100; with --puller at most 10 to 40)",
+        help="candidates to try, those of an earlier run included (100; with --puller at most 10 to 48)",
     )
     add("--episodes", type=episodes, help="training episodes of a candidate (100; with --puller 20)")
     add("--out", type=Path, help="folder of histories and choices (results/tuning; with --puller beside its file)")

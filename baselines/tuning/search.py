@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,7 +29,6 @@ from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.puller import DEFAULT
-from cz_gym.units import HOUR
 
 DIGITS = 4
 """Number of significant digits of a candidate's values."""
@@ -39,8 +38,6 @@ LINEAR = 5.0
 """Length of a range that is not searched logarithmically, in the same units."""
 QUICK_STEP = 0.05
 """Step of COBYLA below which a quick search ends, in the same units."""
-QUICK_HORIZON = 2.0 * HOUR
-"""Length of the training episodes of a quick search [s]; its finalists meet whole ones."""
 FINALISTS = 3
 """Number of candidates that are scored on validation seeds, on twice as many episodes as training candidates."""
 SURVIVAL_SEEDS = TRAINING_SEEDS[100_000:]
@@ -163,8 +160,7 @@ class Search:
     ) -> None:
         """At most ``trials`` candidates, each on ``episodes`` training episodes; tests replace ``measure``.
 
-        A ``quick`` search ends at QUICK_STEP, on shorter episodes, and only its finalists have to survive other
-        scenarios.
+        A ``quick`` search ends at QUICK_STEP, and only its finalists have to survive other scenarios.
         """
         self.controller, self.goal, self.config, self.measure, self.quick = controller, goal, config, measure, quick
         self.budget, self.trials = {"trials": trials, "episodes": episodes}, list[Trial]()
@@ -210,27 +206,23 @@ class Search:
         """Score a candidate on training episodes; one that would be the best must also survive other scenarios."""
         episodes = self.budget["episodes"]
         best = min((trial.score for trial in self.trials), default=math.inf)
-        shorter = replace(self.config, horizon=min(self.config.horizon, QUICK_HORIZON))
-        config, survive = (shorter, 0) if self.quick else (self.config, episodes // 5)
-        trial = self._scored(values, config, TRAINING_SEEDS[:episodes], survive, best)
+        trial = self._scored(values, TRAINING_SEEDS[:episodes], 0 if self.quick else episodes // 5, best)
         self.trials.append(trial)
         self._write({})
         return trial
 
-    def _scored(
-        self, values: tuple[float, ...], config: Config, seeds: Sequence[int], survive: int, below: float = math.inf
-    ) -> Trial:
+    def _scored(self, values: tuple[float, ...], seeds: Sequence[int], survive: int, below: float = math.inf) -> Trial:
         """The candidate's trial on those seeds; survival counts if its score is ``below`` a limit."""
         settings = self.settings(values)
-        policy = self.goal.policy(settings, config)
-        found = self.measure(policy, config, seeds)
+        policy = self.goal.policy(settings, self.config)
+        found = self.measure(policy, self.config, seeds)
         score = self.goal.cost(found, policy)
         lost: dict[str, float] = {}
         if survive and score < below:
             for name in self.goal.survive:
-                there = config.with_scenario(name)
-                other = self.goal.policy(settings, there)
-                lost[name] = self.measure(other, there, SURVIVAL_SEEDS[:survive]).failure_rate
+                config = self.config.with_scenario(name)
+                other = self.goal.policy(settings, config)
+                lost[name] = self.measure(other, config, SURVIVAL_SEEDS[:survive]).failure_rate
         facts = {"figures": found._asdict(), "lost": lost}
         return Trial(values, score + self.goal.failure_price * sum(lost.values()), facts)
 
@@ -246,9 +238,7 @@ class Search:
             self._read(path)
         self.explore()
         twice = 2 * self.budget["episodes"]
-        found = [
-            self._scored(trial.values, self.config, VALIDATION_SEEDS[:twice], twice) for trial in self.best(FINALISTS)
-        ]
+        found = [self._scored(trial.values, VALIDATION_SEEDS[:twice], twice) for trial in self.best(FINALISTS)]
         judged = sorted(found, key=lambda trial: trial.score)
         entries = [
             {"score": trial.score, "values": dict(zip(self._paths, trial.values, strict=True)), **trial.facts}
