@@ -25,7 +25,7 @@ from cz_gym.export.__main__ import make_block
 from cz_gym.export.compiled import CompiledBlock
 from cz_gym.export.policy import Runner
 from cz_gym.serve.machine import SETPOINTS, TAGS
-from cz_gym.serve.opcua import KINDS, URI, certify, password
+from cz_gym.serve.opcua import URI, WRITABLE, certify, password
 
 
 class Controller:
@@ -47,7 +47,6 @@ async def control(controller: Controller, label: str, client: Client, steps: int
     """Control until the crystal ends, or for so many steps; returns how many were answered."""
     space = await client.get_namespace_index(f"{URI}:tags")
     nodes = {tag.name: client.get_node(ua.NodeId(tag.name, space)) for tag in TAGS}
-    written = {tag.name: KINDS[tag.kind] for tag in TAGS if tag.writable}
     last, answered = -1, 0
     while answered < steps:
         tags = dict(zip(nodes, await client.read_values(nodes.values()), strict=True))
@@ -59,9 +58,9 @@ async def control(controller: Controller, label: str, client: Client, steps: int
             await asyncio.sleep(0.001)
             continue
         last = tags["step"]
-        values = zip((*controller.setpoints(tags), last), written.values(), strict=True)
+        values = zip((*controller.setpoints(tags), last), WRITABLE.values(), strict=True)
         with suppress(ua.UaStatusCodeError):  # refused: the server says why, and holds what it had
-            await client.write_values([nodes[name] for name in written], [ua.Variant(*value) for value in values])
+            await client.write_values([nodes[name] for name in WRITABLE], [ua.Variant(*value) for value in values])
             answered += 1
     return answered
 

@@ -69,12 +69,6 @@ class Excited:
             raise CzError(f"the clock {self.clock!r} s must be at least the control interval of {self.interval:g} s")
 
     @property
-    def parameters(self) -> Parameters:
-        """Parameters of the policy's puller; the default's if it has none."""
-        given: Parameters = getattr(self.policy, "parameters", Parameters())
-        return given
-
-    @property
     def interval(self) -> float:
         """Control interval [s]."""
         return float(getattr(self.policy, "control_interval", 5.0))
@@ -95,7 +89,7 @@ class Excited:
         """Return the action and the next memory; arguments as of :class:`cz_gym.baselines.policy.Policy`."""
         shown = np.array(observation, np.float64)
         seen, single = np.atleast_2d(shown), shown.ndim == 1
-        n, parameters = len(seen), self.parameters
+        n, parameters = len(seen), getattr(self.policy, "parameters", Parameters())
         begins = np.zeros(n, np.bool_) if episode_start is None else np.asarray(episode_start, np.bool_)
         if state is None:
             begins = np.ones(n, np.bool_)

@@ -200,13 +200,7 @@ class Machine:
             return self._publish(control)
 
     def _publish(self, control: str = "held") -> dict[str, Any]:
-        tags = self._tags(control)
-        self.hour.append(tags)
-        if self._log is not None:
-            self._log.add(tags)
-        return tags
-
-    def _tags(self, control: str) -> dict[str, Any]:
+        """Log the tags, and return them."""
         ending = self._record.ending
         seen = decode(self._observation.astype(float), *self._ranges)
         bits = {
@@ -227,7 +221,11 @@ class Machine:
                 "step": self.k,
             }
         )
-        return {tag.name: tag.kind(values[tag.name]) for tag in TAGS}
+        tags = {tag.name: tag.kind(values[tag.name]) for tag in TAGS}
+        self.hour.append(tags)
+        if self._log is not None:
+            self._log.add(tags)
+        return tags
 
     def picture(self) -> Frame:
         """The picture of the crystal as it is now."""

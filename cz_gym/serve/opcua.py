@@ -29,6 +29,7 @@ URI = "urn:cz-gym:puller"
 KINDS = {
     float: ua.VariantType.Double, int: ua.VariantType.UInt32, bool: ua.VariantType.Boolean, str: ua.VariantType.String,
 }  # fmt: skip
+WRITABLE = {tag.name: KINDS[tag.kind] for tag in TAGS if tag.writable}
 MOST_CLIENTS = 100
 """Connections at once; further ones are closed."""
 SHORTEST = 8
@@ -131,10 +132,7 @@ class Writes(AttributeService):  # type: ignore[misc]
 
     def _check(self, write: Any, user: str) -> int:
         """The status of a write that is refused whatever its value's size, else 0."""
-        kind = next(
-            (KINDS[tag.kind] for tag in TAGS if tag.writable and tag.name == self.nodes.get(write.NodeId)), None
-        )
-        variant = write.Value.Value
+        kind, variant = WRITABLE.get(self.nodes.get(write.NodeId, "")), write.Value.Value
         if kind is None or write.AttributeId != ua.AttributeIds.Value or not user.startswith("operator "):
             return int(ua.StatusCodes.BadUserAccessDenied)
         bad = variant is None or variant.VariantType != kind or variant.is_array or write.IndexRange

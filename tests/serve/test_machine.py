@@ -2,7 +2,6 @@
 
 import math
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,8 +10,6 @@ import pytest
 pytest.importorskip("pygame")
 
 from cz_gym.config import make_config
-from cz_gym.errors import CzError
-from cz_gym.identify.log import COLUMNS
 from cz_gym.serve.machine import SETPOINTS, Alarm, Clock, Log, Machine
 
 PULL, HEATER = SETPOINTS
@@ -116,15 +113,3 @@ def test_an_error_in_the_clock_reaches_whoever_waits() -> None:
     clock.join(10.0)
     assert sent == [{}]
     assert isinstance(clock.error, ZeroDivisionError)
-
-
-def test_the_log_has_a_row_a_step_and_is_never_written_over(tmp_path: Path) -> None:
-    log = Log(tmp_path / "log.csv")
-    one = machine(log=log)
-    rows = [one.step() for _ in range(3)]
-    lines = (tmp_path / "log.csv").read_text().splitlines()
-    assert lines[0] == ",".join(COLUMNS)
-    assert len(lines) == 5
-    assert [float(each) for each in lines[-1].split(",")] == pytest.approx([float(rows[-1][name]) for name in COLUMNS])
-    with pytest.raises(CzError, match=r"log\.csv: File exists"):
-        Log(tmp_path / "log.csv")

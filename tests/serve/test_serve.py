@@ -227,6 +227,7 @@ def test_it_listens_on_the_loopback_unless_told_and_elsewhere_only_with_a_user(r
 def test_a_port_that_is_taken_and_half_a_certificate_are_said_in_one_line(
     puller: Any, refused: Any, tmp_path: Path, monkeypatch: Any
 ) -> None:
+    assert "log.csv: File exists" in refused(command.main, ["--log", str(puller.folder / "log.csv")])
     assert "address already in use" in refused(command.main, ["--port", str(puller.port), "--page-port", "0"]).lower()
     monkeypatch.setenv("CZ_GYM_OPERATOR_PASSWORD", PASSWORD)
     (tmp_path / "key.pem").touch()
