@@ -39,39 +39,31 @@ FOLDER = Path(__file__).parent / "pullers"
 """Folder of the files that ship."""
 
 
-class Unit(NamedTuple):
-    """A unit of keys."""
-
-    size: float
-    """Its size in SI units."""
-    slips: tuple[tuple[str, float, float], ...] = ()
-    """Units that users may have meant instead: name, factor and offset to this unit."""
-
-
-UNITS = {
-    "mm": Unit(MM, (("m", 1e3, 0.0), ("µm", 1e-3, 0.0))),
-    "mm_per_min": Unit(MM_PER_MIN, (("mm/h", 1.0 / MINUTE, 0.0), ("m/s", 1.0 / MM_PER_MIN, 0.0))),
-    "mm_per_min2": Unit(MM_PER_MIN / MINUTE, (("mm/s2", MINUTE * MINUTE, 0.0),)),
-    "deg": Unit(math.pi / 180.0, (("rad", 180.0 / math.pi, 0.0),)),
-    "K": Unit(1.0, (("°C", 1.0, 273.15),)),
-    "s": Unit(1.0, (("ms", 1e-3, 0.0), ("min", MINUTE, 0.0))),
-    "rpm": Unit(1.0 / MINUTE, (("rev/s", MINUTE, 0.0),)),
-    "percent": Unit(PERCENT),
-    "kW": Unit(KILO, (("W", 1e-3, 0.0), ("MW", 1e3, 0.0))),
-    "W": Unit(1.0, (("kW", KILO, 0.0),)),
-    "kW_per_min": Unit(KILO / MINUTE, (("W/s", MINUTE / KILO, 0.0),)),
-    "N_per_m": Unit(1.0, (("mN/m", 1e-3, 0.0),)),
-    "kg_per_m3": Unit(1.0, (("g/cm3", KILO, 0.0),)),
-    "J_per_kg": Unit(1.0, (("kJ/kg", KILO, 0.0),)),
-    "J_per_K": Unit(1.0, (("kJ/K", KILO, 0.0),)),
-    "W_per_K": Unit(1.0, (("kW/K", KILO, 0.0),)),
-    "W_per_mK": Unit(1.0, (("W/cm/K", 100.0, 0.0),)),
-    "W_per_K4": Unit(1.0),
-    "W_per_m2K4": Unit(1.0),
-    "m_per_s2": Unit(1.0),
-    "": Unit(1.0, (("%", PERCENT, 0.0),)),
+UNITS: dict[str, tuple[float, tuple[tuple[str, float, float], ...]]] = {
+    "mm": (MM, (("m", 1e3, 0.0), ("µm", 1e-3, 0.0))),
+    "mm_per_min": (MM_PER_MIN, (("mm/h", 1.0 / MINUTE, 0.0), ("m/s", 1.0 / MM_PER_MIN, 0.0))),
+    "mm_per_min2": (MM_PER_MIN / MINUTE, (("mm/s2", MINUTE * MINUTE, 0.0),)),
+    "deg": (math.pi / 180.0, (("rad", 180.0 / math.pi, 0.0),)),
+    "K": (1.0, (("°C", 1.0, 273.15),)),
+    "s": (1.0, (("ms", 1e-3, 0.0), ("min", MINUTE, 0.0))),
+    "rpm": (1.0 / MINUTE, (("rev/s", MINUTE, 0.0),)),
+    "percent": (PERCENT, ()),
+    "kW": (KILO, (("W", 1e-3, 0.0), ("MW", 1e3, 0.0))),
+    "W": (1.0, (("kW", KILO, 0.0),)),
+    "kW_per_min": (KILO / MINUTE, (("W/s", MINUTE / KILO, 0.0),)),
+    "N_per_m": (1.0, (("mN/m", 1e-3, 0.0),)),
+    "kg_per_m3": (1.0, (("g/cm3", KILO, 0.0),)),
+    "J_per_kg": (1.0, (("kJ/kg", KILO, 0.0),)),
+    "J_per_K": (1.0, (("kJ/K", KILO, 0.0),)),
+    "W_per_K": (1.0, (("kW/K", KILO, 0.0),)),
+    "W_per_mK": (1.0, (("W/cm/K", 100.0, 0.0),)),
+    "W_per_K4": (1.0, ()),
+    "W_per_m2K4": (1.0, ()),
+    "m_per_s2": (1.0, ()),
+    "": (1.0, (("%", PERCENT, 0.0),)),
 }
-"""Units of keys, by the keys' endings."""
+"""Units of keys, by the keys' endings: the size in SI units, and units that users may have meant instead, each with its
+name, its factor and its offset to this one."""
 
 
 class Key(NamedTuple):
@@ -99,7 +91,7 @@ class Key(NamedTuple):
     @property
     def size(self) -> Fraction:
         """Size of the unit in SI units."""
-        return Fraction(UNITS[self.unit].size)
+        return Fraction(UNITS[self.unit][0])
 
 
 def number(
@@ -387,10 +379,11 @@ def _check(key: Key, value: Any) -> None:
     sound = all(isinstance(each, int | float) and not isinstance(each, bool) for each in numbers)
     if not sound or len(numbers) != (2 if pair else 1) or not numbers[0] <= numbers[-1]:
         raise CzError(f"{key.name} must be {'a pair of numbers low <= high' if pair else 'a number'}, not {value!r}")
+    size, slips = UNITS[key.unit]
     for number in numbers:
-        shown = number / UNITS[key.unit].size
+        shown = number / size
         if not key.low - 1e-12 * abs(key.low) <= shown <= key.high + 1e-12 * abs(key.high):
-            guesses = [(shown * factor + offset, unit) for unit, factor, offset in UNITS[key.unit].slips if shown > 0.0]
+            guesses = [(shown * factor + offset, unit) for unit, factor, offset in slips if shown > 0.0]
             meant = [f": did you mean {guess:.6g} ({shown:g} {unit})?" for guess, unit in guesses
                      if key.low <= guess <= key.high]  # fmt: skip
             raise CzError(f"{key.name} = {shown:g} must lie within {key.low:g} to {key.high:g}{''.join(meant[:1])}")
