@@ -19,20 +19,14 @@ from .log import COLUMNS, check_puller, column_map, read_log
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser("python -m cz_gym.identify", "Identify a puller from its log.")
-    parser.add_argument("log", type=Path, help=f"CSV or Parquet file with the columns {', '.join(COLUMNS)}")
-    parser.add_argument("--puller", default="default", help="puller file to start from (default: %(default)s)")
-    parser.add_argument("--out", type=Path, required=True, help="puller file to write; its report stands beside it")
-    parser.add_argument(
-        "--column", action="append", default=[], metavar="NAME=COLUMN[:UNIT]", help="a column with another name or unit"
-    )
-    parser.add_argument("--columns", type=Path, metavar="FILE", help='TOML file with lines NAME = "COLUMN:UNIT"')
-    parser.add_argument(
-        "--prior",
-        action="append",
-        default=[],
-        metavar="NAME=SD",
-        help="uncertainty of a start value: sd of its logarithm",
-    )
+    add = parser.add_argument
+    add("log", type=Path, help=f"CSV or Parquet file with the columns {', '.join(COLUMNS)}")
+    add("--puller", default="default", help="puller file to start from (default: %(default)s)")
+    add("--out", type=Path, required=True, help="puller file to write; its report stands beside it")
+    named = "NAME=COLUMN[:UNIT]"
+    add("--column", action="append", default=[], metavar=named, help="a column with another name or unit")
+    add("--columns", type=Path, metavar="FILE", help='TOML file with lines NAME = "COLUMN:UNIT"')
+    add("--prior", action="append", default=[], metavar="NAME=SD", help="sd of the logarithm of a start value")
     return parser.run(_main, arguments, "plant")
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from cz_gym.commands import OneLineParser, between
-from cz_gym.config import Config, make_config
+from cz_gym.config import make_config
 from cz_gym.errors import CzError
 from cz_gym.units import HOUR
 
@@ -52,12 +52,6 @@ def commands() -> OneLineParser:
     return parser
 
 
-def settings(arguments: argparse.Namespace) -> Config:
-    """The environment's settings."""
-    horizon = arguments.hours * HOUR
-    return make_config(arguments.scenario, None, "measured", horizon=horizon, action="direct", puller=arguments.puller)
-
-
 def door_of(arguments: argparse.Namespace) -> Any:
     """The accounts that may log in; CzError for too short a password, and for another address without an operator."""
     from .opcua import Account, Door, password
@@ -87,7 +81,9 @@ async def serving(arguments: argparse.Namespace, door: Any) -> AsyncIterator[tup
     if door.remote:
         await certify(arguments.certificates)
     log = Log(arguments.log) if arguments.log else None
-    machine = Machine(settings(arguments), arguments.seed, arguments.watchdog, log)
+    horizon, puller = arguments.hours * HOUR, arguments.puller
+    config = make_config(arguments.scenario, None, "measured", horizon=horizon, action="direct", puller=puller)
+    machine = Machine(config, arguments.seed, arguments.watchdog, log)
     loop, queue = asyncio.get_running_loop(), asyncio.Queue[dict[str, Any]]()
     clock = Clock(
         machine, arguments.speed, arguments.wait, lambda tags: loop.call_soon_threadsafe(queue.put_nowait, tags)
