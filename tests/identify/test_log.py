@@ -10,7 +10,7 @@ import pandas
 import pytest
 
 from cz_gym.errors import CzError
-from cz_gym.identify.log import COLUMNS, check_puller, column_map, read_log
+from cz_gym.identify.log import check_puller, column_map, read_log
 from cz_gym.puller import DEFAULT
 
 Row = dict[str, str]
@@ -134,19 +134,3 @@ def test_wrong_units_and_other_pullers_are_noticed(
     wrong = log._replace(**{name: getattr(log, name) * by for name, by in factor.items()})
     with pytest.raises(CzError, match=said.replace("(", r"\(")):
         check_puller(wrong, DEFAULT)
-
-
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        ("ring_mm=DIA", "unknown column 'ring_mm': did you mean 'ring_radius_mm'"),
-        ("T_1_K=PYRO:F", "unknown unit of T_1_K 'F'; choose from K, degC"),
-        ("T_1_K", "T_1_K: say which column it is"),
-    ],
-)
-def test_a_wrong_mapping_is_one_line(given: str, said: str) -> None:
-    with pytest.raises(CzError, match=said):
-        column_map([given])
-    assert set(column_map([f"{name}=x" for name in COLUMNS]).values()) == {
-        ("x", next(iter(each))) for each in COLUMNS.values()
-    }
