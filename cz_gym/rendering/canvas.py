@@ -7,7 +7,7 @@ import importlib
 import importlib.util
 import io
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -146,6 +146,11 @@ class Canvas:
         points[:, 0], points[:, 1] = x, y
         fine: list[list[float]] = np.clip(points * (self.unit * FINE), -FAR, FAR).tolist()
         return fine
+
+
+def first_at_least(value: float, steps: Sequence[float]) -> float:
+    """The first of increasing steps that is at least a value, or the last."""
+    return next((step for step in steps if step >= value), steps[-1])
 
 
 @lru_cache(maxsize=8)

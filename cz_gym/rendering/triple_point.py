@@ -13,8 +13,7 @@ from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
 from cz_gym.units import MM
 
 from . import palette
-from .canvas import Box, Canvas
-from .chart import first_at_least
+from .canvas import Box, Canvas, first_at_least
 from .palette import Colour
 from .record import Ending, Floats, Record
 

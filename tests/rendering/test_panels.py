@@ -10,7 +10,7 @@ from scipy.integrate import trapezoid
 from cz_gym import HURLE, CzEnv, Parameters, make_puller
 from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
-from cz_gym.rendering import chart, palette, triple_point
+from cz_gym.rendering import palette, scene, triple_point
 from cz_gym.rendering.canvas import Canvas, Frame
 from cz_gym.rendering.record import Ending, Record
 from cz_gym.rendering.scene import layout
@@ -78,9 +78,9 @@ def test_the_rings_mark_is_at_the_rings_radius(pull: float, r_0: float) -> None:
 
 def test_the_chart_ends_at_the_true_error(picture: tuple[Frame, Record]) -> None:
     frame, record = picture
-    plot = PANELS.chart.inner(*chart.MARGINS)
+    plot = PANELS.chart.inner(*scene.MARGINS)
     x = round(plot.x + record.t[-1] / record.config.horizon * plot.w)
-    y = plot.y + plot.h / 2 - record.error[-1] / chart.error_range(record.error) * plot.h / 2
+    y = plot.y + plot.h / 2 - record.error[-1] / scene.error_range(record.error) * plot.h / 2
     check_near(near(frame, palette.TRUE)[:, x : x + 3].any(axis=1), y, 8)
 
 
