@@ -67,10 +67,13 @@ def _ekf_mpc(config: Config) -> Policy:
 _bound = partial(Contender, default=False, privileged=True)
 
 
+def _told(name: str, config: Config, fluctuations: bool = False) -> Policy:
+    return lqg_bounds.privileged(_lqg_for(name, config), fluctuations)
+
+
 def _privileged(name: str) -> Contender:
-    make = partial(_lqg_for, name)
     meaning = f"bound: {name} given the puller's parameters and how strong each crystal's fluctuations are"
-    return _bound(f"{name}-privileged", lambda config: lqg_bounds.privileged(make(config)), "measured", meaning)
+    return _bound(f"{name}-privileged", partial(_told, name, fluctuations=True), "measured", meaning)
 
 
 WITH_ADAPTIVE = tuple(map(designs.family_name, (0.013, IN_TABLE)))
@@ -109,9 +112,14 @@ CONTROLLERS: tuple[Contender, ...] = (
     *map(_adaptive, WITH_ADAPTIVE),
     _lqg(designs.TOLD, "lqg-at-0.02 as tuned on nominal hot zones alone: it loses crystals on other ones"),
     Contender("ekf-mpc", _ekf_mpc, "measured", "nonlinear MPC on a bank of lqg's filters", default=False, slow=True),
-    _bound("lqg-true", lqg_bounds.lqg_true, "measured", "bound: lqg given the puller's parameters"),
+    _bound("lqg-true", partial(_told, "lqg"), "measured", "bound: lqg given the puller's parameters"),
     *map(_privileged, WITH_PRIVILEGED),
-    _bound("lqg-at-0.02-told", lqg_bounds.told, "measured", f"bound: {designs.TOLD} given the puller's parameters"),
+    _bound(
+        "lqg-at-0.02-told",
+        partial(_told, designs.TOLD),
+        "measured",
+        f"bound: {designs.TOLD} given the puller's parameters",
+    ),
     _bound("full-information", lqg_bounds.full_information, "state", "bound: lqg's regulator, true state seen"),
     _bound(
         "clairvoyant",

@@ -58,7 +58,7 @@ def versions(name: str, config: Config) -> dict[str, Any]:
         return {"before": with_values(after, BEFORE[name]), "after": after}
     before = replace(after, design=with_values(after.design, BEFORE[name]))
     if after.hypotheses is None:
-        return {"before": before, "after": after, "told": replace(privileged(before), knows_fluctuations=False)}
+        return {"before": before, "after": after, "told": privileged(before, knows_fluctuations=False)}
     return {"before": adaptive(before) if name.endswith("-adaptive") else before, "after": after}
 
 

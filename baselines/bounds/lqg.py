@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any, ClassVar, NamedTuple, Self
@@ -19,7 +19,7 @@ from scipy.linalg import solve_discrete_are
 
 from cz_gym.action import mark
 from cz_gym.baselines.lqg.controller import LQG, Gains, LQGDesign, solve_each
-from cz_gym.baselines.lqg.designs import TOLD, lqg
+from cz_gym.baselines.lqg.designs import lqg
 from cz_gym.baselines.lqg.estimator import PlantFilter
 from cz_gym.baselines.lqg.model import DRIFT, DRIFT_RATE, FAST, PLANT, SLOW, STATES, NoiseModel, load_per_drift
 from cz_gym.baselines.lqg.multiple_model import MultipleModelFilter
@@ -123,15 +123,8 @@ class FullInformation(PrivilegedLQG):
     ) -> tuple[npt.NDArray[np.float32], Any]:
         """Return the action and the next memory; arguments as of :class:`cz_gym.baselines.policy.Policy`."""
         array, single = batched(observation)
-        seen: Any = SimpleNamespace(
-            **dict(
-                zip(
-                    (channel.name for channel in STATE),
-                    (array * scales(STATE, self.v_0, self.heater_range)).T,
-                    strict=True,
-                )
-            )
-        )
+        values = (array * scales(STATE, self.v_0, self.heater_range)).T
+        seen: Any = SimpleNamespace(**dict(zip((channel.name for channel in STATE), values, strict=True)))
         pull, power, memory = self.step(seen, fresh(state, self.at_rest(seen), episode_start))
         return mark(to_action(pull / self.v_0, power / self.heater_range, single), self.made_for), memory
 
@@ -163,26 +156,10 @@ def _drift(Q_d: Floats, p: Any) -> Floats:
     return drift
 
 
-def privileged(plain: LQG) -> PrivilegedLQG:
-    """Bound: that LQG with each puller's parameters and the strength of each crystal's fluctuations."""
-    return PrivilegedLQG(
-        plain.control_interval,
-        plain.design,
-        parameters=plain.parameters,
-        meniscus=plain.meniscus,
-        puller=plain.puller,
-        knows_fluctuations=True,
-    )
-
-
-def lqg_true(config: Config) -> PrivilegedLQG:
-    """Bound: ``lqg`` with each puller's parameters."""
-    return replace(privileged(lqg("lqg", config)), knows_fluctuations=False)
-
-
-def told(config: Config) -> PrivilegedLQG:
-    """Bound: the LQG that was tuned on a known hot zone, with each puller's parameters."""
-    return replace(privileged(lqg(TOLD, config)), knows_fluctuations=False)
+def privileged(plain: LQG, knows_fluctuations: bool = True) -> PrivilegedLQG:
+    """Bound: that LQG with each puller's parameters and, by default, the strength of each crystal's fluctuations."""
+    known = {each.name: getattr(plain, each.name) for each in fields(plain) if each.name != "hypotheses"}
+    return PrivilegedLQG(**known, knows_fluctuations=knows_fluctuations)
 
 
 def full_information(config: Config) -> FullInformation:
