@@ -161,11 +161,13 @@ def test_c_and_onnx_act_as_python_does(name: str, scenario: str) -> None:
 
 @needs_compiler
 @pytest.mark.slow
-def test_the_study_finds_no_difference() -> None:
+def test_the_study_of_exported_c_finds_what_the_page_says() -> None:
+    """A loop in single precision may end elsewhere."""
     rows = study("paper-tuned", "puller", 1)
     assert [row.real for row in rows] == ["double", "float"]
-    assert all(row.difference <= LARGEST[row.real] and row.python == row.c for row in rows)
-    assert report(rows, 1).count(": none.") == 2
+    assert all(row.difference <= LARGEST[row.real] for row in rows)
+    assert rows[0].python == rows[0].c
+    assert "above the limit: none." in report(rows, 1)
 
 
 MAIN = """
