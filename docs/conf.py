@@ -26,7 +26,7 @@ nitpick_ignore = [("py:func", "make_config")]
 nitpick_ignore_regex = [
     # Other projects' names; their inventories would have to be fetched.
     (r"py:.*", r"(numpy|np|npt|gymnasium|gym|collections|typing|pathlib|ndarray|optional|Callable|Any|Floats)\b.*"),
-    (r"py:.*", r"(VecNormalize|VecEnv|BaseAlgorithm|RecurrentPolicy|GymEnv|Schedule|Contract|Noise|PullerFile|Block)\b.*"),
+    (r"py:.*", r"(VecNormalize|VecEnv|BaseAlgorithm|GymEnv|Schedule|Contract|Noise|PullerFile|Block)\b.*"),
     (r"py:.*", r"(int|float|str|bool|dict|list|tuple|array|Array|Mask|Mapping|Sequence|Path)\b.*"),
 ]
 
