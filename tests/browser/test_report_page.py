@@ -76,6 +76,7 @@ def test_no_window_needs_sideways_scrolling_and_nothing_covers_anything(browser:
         assert box(f"#{picture} svg")["right"] <= width
         assert box(f"#{picture} .nsewdrag")["width"] > 100
         assert box(f"#{picture} .updatemenu-header")["bottom"] <= box(f"#{picture} .nsewdrag")["top"]
+    assert box("#crystal .updatemenu-header")["bottom"] <= box("#crystal .annotation")["top"]
     assert box("#crystal .legend")["bottom"] <= boxes[1]["bottom"]
     labels = browser.find_elements("css selector", "#pareto .xtick text")
     ends = sorted((label.rect["x"], label.rect["x"] + label.rect["width"]) for label in labels)

@@ -47,7 +47,7 @@ def add_menu(figure: go.Figure, results: Sequence[Result], layouts: Sequence[Map
         arguments += [dict(layouts[number])] if layouts else []
         buttons.append({"label": plain(result.row.name), "method": "update", "args": arguments})
     figure.for_each_trace(lambda trace: trace.update(visible=trace.meta == 0))
-    menu = {"buttons": buttons, "x": 0, "xanchor": "left", "y": 1, "yanchor": "bottom", "pad": {"b": 8}}
+    menu = {"buttons": buttons, "x": 0, "xanchor": "left", "y": 1, "yanchor": "bottom", "pad": {"b": 28}}
     figure.update_layout(updatemenus=[menu] if len(results) > 1 else [], **(layouts[0] if layouts else {}))
 
 
