@@ -27,7 +27,7 @@ FIGURES = {
     "rmse_mm": ("RMSE [mm]", ".4f", 1.0),
     "rmse_observable_mm": ("observable RMSE [mm]", ".4f", 1.0),
     "pull_step_rms_mm_per_min": ("pull step RMS [mm/min]", ".4f", 1.0),
-    "failure_rate": ("lost [%]", ".1f", PERCENT),
+    "failure_rate": ("lost [%]", ".2f", PERCENT),
 }
 """Heading, format and unit of each metric of a card."""
 RETURN = "return"

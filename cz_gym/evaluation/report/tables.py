@@ -40,7 +40,7 @@ class Column(NamedTuple):
 
 
 RMSE = Column("rmse_mm", "RMSE [mm]", 3)
-FAILURES = Column("failure_rate", "failures [%]", 1, PERCENT)
+FAILURES = Column("failure_rate", "failures [%]", 2, PERCENT)
 PULL_STEP = Column("pull_step_rms_mm_per_min", "pull step RMS [mm/min]", 4)
 RETURN = Column("return", "return", 0)
 HEATER_STEP = Column("heater_step_rms_kw", "heater step RMS [kW]", 3)
