@@ -13,9 +13,9 @@ from gymnasium.error import DependencyNotInstalled
 from cz_gym.errors import CzError
 
 OPTIONAL = (
-    "aiohttp", "asyncua", "blark", "casadi", "control", "envpool", "filelock", "fmpy", "h5py", "matplotlib", "minari",
-    "onnx", "onnxruntime", "pandas", "pcgym", "plotly", "pyarrow", "pygame", "pythonfmu", "safetensors", "sb3_contrib",
-    "selenium", "stable_baselines3", "tensorboard", "torch", "tqdm",
+    "aiohttp", "array_api_compat", "asyncua", "blark", "casadi", "control", "envpool", "filelock", "fmpy", "h5py",
+    "matplotlib", "minari", "onnx", "onnxruntime", "pandas", "pcgym", "plotly", "pyarrow", "pygame", "pythonfmu",
+    "safetensors", "sb3_contrib", "selenium", "stable_baselines3", "tensorboard", "torch", "tqdm",
 )  # fmt: skip
 """Modules of the packages in the extras of ``pyproject.toml``."""
 
