@@ -49,7 +49,8 @@ def known(ppo: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[s
     facts = {name: value for name, value in vars(contract).items() if name not in ("observation_hash", "sha256")}
     (folder / "agent.onnx").write_bytes(network)
     progress = ",".join(COLUMNS) + "\r\n" + ",".join(["1.5"] * len(COLUMNS)) + "\r\n"
-    settings = json.dumps({"steps": 100, "sessions": [{"from_step": 0}]})
+    run = {"algorithm": "ppo", "seed": 0, "settings": {}, "steps": 100, "sessions": [{"from_step": 0}]}
+    settings = json.dumps(run)
 
     def kept(seed: bytes, name: str, read: Callable[[Path], Any]) -> Target:
         return Target(seed, lambda content: ((folder / name).write_bytes(content), read(folder / name)))
