@@ -12,7 +12,7 @@ from cz_gym.config import make_config
 from cz_gym.physics.parameters import Parameters
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 
-SHIPPED = {"gradient": 3, "ppo": 5, "sac": 3}
+SHIPPED = {"gradient": 10, "ppo": 5, "sac": 3}
 """Training seeds of each name."""
 
 
