@@ -26,7 +26,7 @@ from cz_gym.jit.code_hash import hash_files
 from .files import EPISODES, read_episodes, software
 from .metrics import metric_names
 from .protocol import Row
-from .results import BOUND, Sample
+from .results import BOUND, GAPS, Sample
 from .rollout import Floats, Signals
 
 PRINTED = 1e-4
@@ -84,7 +84,8 @@ def earlier_bound(folder: Path, row: Row, samples: Sequence[Sample]) -> Sample |
     """
     try:
         heads = (folder / EPISODES).read_text("utf-8").partition("\n")[0].split(",")
-        known = [name in heads or name == "cost" for name in metric_names()]  # it may lack a newer metric
+        # An earlier run may lack a newer metric, but not what gaps are made of.
+        known = [name in heads or name in GAPS for name in metric_names()]
         columns = ("seed", *compress(metric_names(), known))
         found = read_episodes(folder / EPISODES, lambda scenario: columns if scenario == row.name else ())[row.name]
         (episodes,) = found[BOUND]

@@ -21,6 +21,8 @@ BOUND = "clairvoyant"
 """Controller that optimality gaps are measured from."""
 SPEED = "microseconds_per_step"
 """Name of the one metric that is not per episode: time in ``predict`` per step and episode, batched [us]."""
+GAPS = {"cost": 1, "rmse_mm": 2}
+"""Metrics of which optimality gaps are made, with their powers."""
 TAIL_METRICS = ("rmse_mm", "rmse_observable_mm", "max_error_mm")
 """Metrics whose worst 5 % are reported."""
 
@@ -170,7 +172,7 @@ def _improvement(resamples: Draw, ours: Sample, theirs: Sample) -> dict[str, Est
 
 def _gaps(resamples: Draw, ours: Sample, theirs: Sample, bound: Sample) -> dict[str, Estimate]:
     found = {}
-    for metric, power in (("cost", 1), ("rmse_mm", 2)):
+    for metric, power in GAPS.items():
         one, reference, best = (sample.metric(metric) ** power for sample in (ours, theirs, bound))
         if gap := optimality_gap(one, reference, best, resamples(len(ours.seeds))):
             found[metric] = gap

@@ -3,7 +3,8 @@
 import json
 import shutil
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -43,6 +44,15 @@ def test_a_claim_stands_beside_what_fresh_crystals_show(submissions: Path, tmp_p
     assert "| paper |" in page
     found = json.loads((tmp_path / "leaderboard.json").read_text())
     assert found["provenance"]["scenarios"]["randomized"]["first_seed"] == 3_000_007
+
+
+@pytest.mark.parametrize(
+    ("steps", "name"), [(1_048_576, "1 M"), (1_100_000, "5 M"), (5_242_880, "5 M"), (20_447_232, "20 M"), (6e7, "open")]
+)
+def test_an_agent_has_the_smallest_budget_that_its_longest_training_keeps(steps: int, name: str) -> None:
+    """The recipe ppo, asked for 1, 5 and 20 million steps, ends with its update: after 2,048 x 64 x 4 steps each."""
+    trained = [SimpleNamespace(contract=SimpleNamespace(training_steps=each)) for each in (9, steps)]
+    assert leaderboard.budget(cast("Any", SimpleNamespace(trained=trained))) == name
 
 
 def test_fresh_seeds_are_nobody_else_s() -> None:
