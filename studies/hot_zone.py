@@ -21,10 +21,12 @@ from cz_gym.baselines.mpc import WEIGHT_FACTOR
 from cz_gym.baselines.registry import find_controller, make_controller
 from cz_gym.commands import OneLineParser, between
 from cz_gym.config import Config, make_config
+from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import TEST_SEEDS
 from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.rollout import rollout
+from cz_gym.names import unknown
 
 LQGS = {
     "lqg": (0.1556, 0.06564, 0.5706, 0.3106, 0.369, 0.0007519, 2113.0, 0.3833, 0.002862, 0.08655, 0.2398),
@@ -84,7 +86,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(given: argparse.Namespace) -> None:
     rows = []
-    for name in given.controllers.split(","):
+    for name in (wanted := given.controllers.split(",")):
+        if name not in BEFORE:
+            raise CzError(unknown("controller", name, BEFORE))
+    for name in wanted:
         episodes = min(given.episodes, SLOW) if find_controller(name).slow else given.episodes
         rows.append(row(name, TEST_SEEDS[:episodes]))
     print(markdown(("RMSE [mm] / lost", *(", ".join(each) for each in product(SCENARIOS, VERSIONS))), rows))

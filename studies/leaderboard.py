@@ -7,7 +7,6 @@ and the ``benchmark.json`` that ``benchmark.py --agent NAME=FILE ...`` wrote of 
 from __future__ import annotations
 
 import argparse
-import json
 import secrets
 import sys
 from collections.abc import Mapping, Sequence
@@ -21,7 +20,7 @@ from cz_gym.commands import OneLineParser, between
 from cz_gym.contender import Contender, agent
 from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.errors import CzError
-from cz_gym.evaluation.files import read_results, to_json
+from cz_gym.evaluation.files import read_benchmark, to_json
 from cz_gym.evaluation.protocol import ROWS, TEST_SEEDS, Row, contract_hash
 from cz_gym.evaluation.report.markdown import summary
 from cz_gym.evaluation.report.tables import markdown as table
@@ -51,11 +50,9 @@ def submission(folder: Path) -> tuple[Contender, tuple[float, str]]:
     if not files:
         raise CzError(f"{folder}: no agent file (*.onnx)")
     claimed = folder / "benchmark.json"
-    results = read_results(claimed, ["rmse_mm"])
+    results, contract = read_benchmark(claimed, ["rmse_mm"])
     if folder.name not in results.get(ROWS[0].name, {}):
         raise CzError(f"{claimed}: no results of {folder.name!r} on {ROWS[0].name}")
-    with naming(claimed):
-        contract = json.loads(claimed.read_text("utf-8"))["provenance"].get("contract", "unknown")
     contender = agent(folder.name, [OnnxPolicy.load(file) for file in files], own=True)
     return contender, (results[ROWS[0].name][folder.name]["rmse_mm"].mean, contract)
 
@@ -71,7 +68,7 @@ def page(results: Sequence[Result], claims: Claims, rows: Sequence[Row]) -> str:
     for place, name in enumerate(sorted(here, key=lambda name: mean(name, "rmse_mm")), 1):
         claim, contract = claims[name]
         own = results[0].means[name]["rmse_mm"].text(".3f", 1.0)
-        same = "the same" if contract == contract_hash(rows) else f"other: `{contract}`"
+        same = "the same" if contract == contract_hash(rows) else f"other: `{contract or 'unknown'}`"
         seeds, lost = str(len(here[name].training_seeds)), f"{100.0 * mean(name, 'failure_rate'):.2f}"
         lines.append((str(place), name, budget(here[name]), seeds, f"{claim:.3f}", own, lost, same))
     seeds = f"{rows[0].first_seed} to {results[0].seeds[-1]}"

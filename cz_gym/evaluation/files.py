@@ -189,16 +189,23 @@ def to_csv(results: Sequence[Result]) -> str:
 
 def read_results(path: Path, metrics: Sequence[str]) -> dict[str, dict[str, dict[str, Estimate]]]:
     """Read the estimates of these metrics from a ``benchmark.json``, by scenario and controller; CzError for others."""
+    return read_benchmark(path, metrics)[0]
+
+
+def read_benchmark(path: Path, metrics: Sequence[str]) -> tuple[dict[str, dict[str, dict[str, Estimate]]], str]:
+    """The same, and the hash of its contract, empty in a file of an earlier release."""
+    with naming(path):
+        text = path.read_text("utf-8")
     try:
-        with naming(path):
-            results = json.loads(path.read_text("utf-8"))["results"]
-        return {
+        content = json.loads(text)
+        results = {
             scenario: {
                 name: {metric: _estimate(found[metric]) for metric in metrics} for name, found in by_name.items()
             }
-            for scenario, by_name in results.items()
+            for scenario, by_name in content["results"].items()
         }
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError):
+        return results, str(content.get("provenance", {}).get("contract", ""))
+    except (ValueError, KeyError, TypeError, AttributeError):
         raise CzError(f"{path} is no benchmark.json") from None
 
 

@@ -26,4 +26,5 @@ def test_the_command_prints_a_row_a_controller(monkeypatch: pytest.MonkeyPatch, 
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
     assert [[cell.strip("| ") == "-" for cell in row].count(True) for row in rows] == [2, 0]
     assert rows[0][1] == rows[0][2], "a PID has its settings of before"
-    assert "unknown controller 'lqgg'" in refused(hot_zone.main, ["--controllers", "lqgg"])
+    for name in ("lqgg", "paper"):  # no controller, and one without settings of before
+        assert f"unknown controller {name!r}" in refused(hot_zone.main, ["--controllers", name])

@@ -65,5 +65,8 @@ def test_what_is_no_submission_is_named(submissions: Path, tmp_path: Path, refus
     empty = tmp_path / "empty"
     empty.mkdir()
     assert "no submissions" in refused(leaderboard.main, [str(empty)])
+    for broken in ("", "[]", '{"results": {"randomized": {"mine": {"rmse_mm": {"mean": "x"}}}}}', '{"results": 1}'):
+        (submissions / "mine" / "benchmark.json").write_text(broken)
+        assert "is no benchmark.json" in refused(leaderboard.main, [str(submissions), "--out", str(tmp_path)])
     (submissions / "mine" / "benchmark.json").write_text('{"results": {"randomized": {}}}')
     assert "no results of 'mine'" in refused(leaderboard.main, [str(submissions), "--out", str(tmp_path)])
