@@ -19,7 +19,7 @@ from cz_gym.units import PERCENT
 
 AGENTS = {
     "gradient": "analytic policy gradients: the cost's gradient through policy and plant; the plant is known",
-    "ppo": "proximal policy optimisation from nothing, from the reward",
+    "ppo": "proximal policy optimisation from nothing, from the reward; its critic also reads the true state in training",
     "sac": "soft actor-critic from nothing, from the reward",
 }
 """Shipped agents, and how each learned."""
@@ -49,7 +49,7 @@ def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -
             f"## `{name}`",
             "",
             f"- How it learned: {how}.",
-            f"- Saw: crystals of {first.scenario}; {_steps(contracts)} a run.",
+            f"- Saw: crystals of {first.scenario}; kept after {_steps(contracts)}.",
             f"- Reads: `{first.observation}`; acts every {first.control_interval:g} s; its action is `{first.action}`.",
             f"- Training seeds: {len(contracts)}. `agents.load({name!r})` is the one of least validation cost.",
             "- Fails: " + (f"loses crystals of {', '.join(fails)}." if fails else "on none of these."),
@@ -61,7 +61,7 @@ def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -
 
 
 def _steps(contracts: Sequence[Contract]) -> str:
-    """Number of environment steps that a run learned from."""
+    """Number of environment steps after which its runs kept it."""
     taken = [contract.training_steps / 1e6 for contract in contracts]
     steps = [f"{least_or_most(taken):.0f}" for least_or_most in (min, max)]
     return f"{' to '.join(dict.fromkeys(steps))} million steps"
@@ -73,8 +73,7 @@ What each shipped agent saw, what it reaches and where it fails, on test crystal
 training seeds of a name are pooled; in brackets the 95 % interval over crystals and training seeds. The figures are of
 [the benchmark](../benchmark/report.md); `python -m studies.cards` wrote this page.
 
-No agent was trained or tested on a real puller: none may control one. The linear loop of `gradient` has an unstable
-mode, which its schedule keeps small.
+No agent was trained or tested on a real puller: none may control one.
 """
 
 
