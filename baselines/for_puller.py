@@ -7,12 +7,9 @@ zero of G_m), gains to the plant's, the temperature loop's to the heater's capac
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial, reduce
-from pathlib import Path
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -25,12 +22,12 @@ from cz_gym.baselines.pid.compensated_pid import SeriesPID
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.industrial import Industrial
 from cz_gym.baselines.pid.settings import settings_of
+from cz_gym.baselines.tuned_for import found_for, with_values
 from cz_gym.config import Config
 from cz_gym.episodes.scenarios import RANDOMIZED
-from cz_gym.errors import CzError
 from cz_gym.physics.linearisation import RadiusModel, radius_model
 from cz_gym.physics.plant import Puller, make_puller
-from cz_gym.puller import DEFAULT, PullerFile
+from cz_gym.puller import DEFAULT
 from cz_gym.task import HEATER_SLACK
 from cz_gym.units import MM
 
@@ -159,40 +156,6 @@ def _rms(sd: tuple[float, float]) -> float:
     """Root mean square of a standard deviation that is uniform in a range."""
     low, high = sd
     return float(np.sqrt((low * low + low * high + high * high) / 3.0)) or 1e-3
-
-
-def found_for(puller: PullerFile, name: str) -> Mapping[str, float]:
-    """The values that a search has chosen for a puller, by their paths; empty if there are none.
-
-    CzError if they were chosen for other numbers of the puller.
-    """
-    path = tuned_folder(puller) / f"{name}.json"
-    if puller.file is None or not path.is_file():
-        return {}
-    try:
-        kept = json.loads(path.read_text("utf-8"))
-        values: dict[str, float] = kept.get("chosen", {"values": {}})["values"]
-        made_for = kept["puller"]
-    except (KeyError, TypeError, ValueError):
-        raise CzError(f"{path}: no choice of a search, or damaged") from None
-    if made_for != puller.label:
-        raise CzError(f"{path}: found for puller {made_for}, not for {puller.label}: tune again")
-    return values
-
-
-def tuned_folder(puller: PullerFile) -> Path:
-    """The folder of what was found for a puller: beside its file, with its name."""
-    return (puller.file or Path(f"{puller.name}.toml")).with_suffix("")
-
-
-def with_values(settings: Any, values: Mapping[str, float]) -> Any:
-    """The settings, dataclasses or NamedTuples, with other numbers, by their paths."""
-    for path, value in values.items():
-        head, _, rest = path.partition(".")
-        new = with_values(getattr(settings, head), {rest: value}) if rest else value
-        change = settings._replace if hasattr(settings, "_replace") else partial(replace, settings)
-        settings = change(**{head: new})
-    return settings
 
 
 def pid(name: str, config: Config) -> FilteredPID | Industrial:

@@ -14,11 +14,11 @@ from itertools import product
 from typing import Any
 
 from cz_gym.baselines.bounds.lqg import privileged
-from cz_gym.baselines.for_puller import with_values
 from cz_gym.baselines.lqg.controller import LQG
-from cz_gym.baselines.lqg.designs import SEARCHED, SHIPPED, TOLD, adaptive
+from cz_gym.baselines.lqg.designs import TOLD, adaptive
 from cz_gym.baselines.mpc import WEIGHT_FACTOR
 from cz_gym.baselines.registry import find_controller, make_controller
+from cz_gym.baselines.tuned_for import shipped, with_values
 from cz_gym.commands import OneLineParser, between
 from cz_gym.config import Config, make_config
 from cz_gym.errors import CzError
@@ -34,10 +34,11 @@ LQGS = {
     "lqg-at-0.005": (0.06819, 2.177, 21.29, 0.268, 0.2347, 0.0004393, 1878.0, 0.2029, 0.001509, 0.04786, 0.186),
     "lqg-at-0.008": (0.01523, 0.456, 28.15, 0.2674, 0.2534, 0.0004875, 2724.0, 0.1891, 0.0009058, 0.04916, 0.1245),
     "lqg-at-0.013": (0.01691, 0.08806, 19.53, 0.2547, 0.2575, 0.0006169, 2070.0, 0.2052, 0.001683, 0.06757, 0.1713),
-    "lqg-at-0.02": SHIPPED[TOLD]["randomized"],
+    "lqg-at-0.02": tuple(shipped(TOLD)["randomized"].values()),
     "lqg-at-0.03": (0.004128, 0.006732, 2.685, 0.251, 0.2861, 0.0005686, 2077.0, 0.1983, 0.001488, 0.05271, 0.205),
 }
-"""Values of ``SEARCHED`` before, by LQG."""
+"""Values of the searched fields before, by LQG."""
+SEARCHED = tuple(shipped("lqg")["randomized"])
 BEFORE: dict[str, dict[str, float]] = {
     "paper-tuned": {},
     "pid-conventional": {},

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cz_gym.baselines import for_puller
+from cz_gym.baselines.tuned_for import file_name, tuned_folder
 from cz_gym.commands import OneLineParser, between
 from cz_gym.config import make_config
 from cz_gym.episodes.scenarios import find_scenario
@@ -22,7 +23,7 @@ from cz_gym.evaluation.processes import in_processes
 from cz_gym.puller import PullerFile, chosen_puller
 
 from .goals import TUNABLE, crystals, crystals_on, goal_of, goal_on, search_for
-from .search import Search, file_name, measure
+from .search import Search, measure
 
 PER_PARAMETER = 2, 6
 """Most candidates of a search for a puller, for each of its parameters: of an LQG, of a PID."""
@@ -35,7 +36,7 @@ def design(
     from tqdm import tqdm
 
     names = [controller] if controller else [for_puller.FILTER, *for_puller.PIDS]
-    place, most = folder or for_puller.tuned_folder(puller), episodes or 20
+    place, most = folder or tuned_folder(puller), episodes or 20
     config = crystals_on(puller)
     tries = {
         name: trials or PER_PARAMETER[name in for_puller.PIDS] * len(goal_on(name, config).parameters) for name in names
@@ -74,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="candidates to try, those of an earlier run included (100; with --puller at most 10 to 48)",
     )
     add("--episodes", type=episodes, help="training episodes of a candidate (100; with --puller 20)")
-    add("--out", type=Path, help="folder of histories and choices (results/tuning; with --puller beside its file)")
+    add("--out", type=Path, help="folder of histories and choices (runs/tuning; with --puller beside its file)")
     return parser.run(tune, arguments, "benchmark", "the same command continues from the candidates in its history")
 
 
@@ -89,7 +90,7 @@ def tune(given: argparse.Namespace) -> None:
     goal, scored_on = goal_of(given.controller, scenario), crystals(given.controller, scenario)
     config = make_config(scored_on, None, "measured", given.control_interval, action="direct")
     search = Search(given.controller, goal, config, given.trials or 100, given.episodes or 100, measure)
-    folder = given.out or Path("results/tuning")
+    folder = given.out or Path("runs/tuning")
     chosen = search.tune(folder / file_name(given.controller, given.scenario))
     print(f"{given.controller} on {given.scenario}: {chosen.score:.4f} {chosen.facts}")
     print(search.settings(chosen.values))

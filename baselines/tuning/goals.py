@@ -10,10 +10,10 @@ from cz_gym.baselines import for_puller
 from cz_gym.baselines.analysis.frequency import LoopMargins, loop_margins
 from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.lqg.controller import LQGDesign
-from cz_gym.baselines.lqg.designs import ACTIVITIES, SEARCHED, SHIPPED, TOLD, design_of, family_name
+from cz_gym.baselines.lqg.designs import ACTIVITIES, SHIPPED, TOLD, design_of, family_name
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.settings import settings_of
-from cz_gym.baselines.tuned_for import beyond
+from cz_gym.baselines.tuned_for import beyond, shipped
 from cz_gym.config import Config, make_config
 from cz_gym.episodes.mixture import Distribution, make_mixture
 from cz_gym.episodes.scenario import Scenario
@@ -133,7 +133,7 @@ def lqg_goal(
     return Goal(start, parameters, survive, objective, limits, failure_price=100.0, miss_price=20.0)
 
 
-LQG_PARAMETERS = tuple(Parameter(path, 1e-4, 1e4) for path in SEARCHED)
+LQG_PARAMETERS = tuple(Parameter(path, 1e-4, 1e4) for path in shipped("lqg")["randomized"])
 FAMILY_SCENARIOS = "randomized", "hard", "sensor-fault", "puller"
 """Scenarios on which the family has members of its own."""
 LQG_LIMITS: dict[tuple[str, str], tuple[float, float, bool]] = {

@@ -19,10 +19,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cz_gym.atomic_files import check_writable, naming, write_files
-from cz_gym.baselines.for_puller import with_values
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign
 from cz_gym.baselines.lqg.regulator import STEP_TIME
 from cz_gym.baselines.policy import Floats
+from cz_gym.baselines.tuned_for import with_values
 from cz_gym.config import Config
 from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
@@ -110,11 +110,6 @@ def measure(policy: Any, config: Config, seeds: Sequence[int]) -> Figures:
 def value_at(settings: Any, path: str) -> float:
     """The value of a parameter."""
     return float(attrgetter(path)(settings))
-
-
-def file_name(controller: str, scenario: str) -> str:
-    """Name of a search's file in results/tuning."""
-    return f"{controller}.json" if scenario == "randomized" else f"{controller}-{scenario}.json"
 
 
 @dataclass(frozen=True)

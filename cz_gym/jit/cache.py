@@ -32,7 +32,7 @@ from .code_hash import hash_files
 PACKAGE = Path(__file__).parents[1]
 CACHE_VARIABLE = "CZ_GYM_CACHE_DIR"
 """Environment variable naming the folder for compiled code; empty means: keep none."""
-NEVER_COMPILED = ("agents", "baselines", "evaluation", "export", "play.py", "serve", "testing")
+NEVER_COMPILED = ("agents", "baselines", "evaluation", "export", "play.py", "pullers", "serve", "testing")
 """Parts of the package of which nothing is compiled in; all others count, whatever they hold."""
 FunctionCache: Any = caching.FunctionCache
 dumps: Any = serialize.dumps

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import pytest
 
-from cz_gym.baselines.lqg.designs import SHIPPED as LQG_SHIPPED
-from cz_gym.baselines.lqg.designs import design_of, ring_of
+from cz_gym.baselines.lqg.designs import SHIPPED, design_of, ring_of
 from cz_gym.baselines.lqg.ring_model import RingModel
-from cz_gym.baselines.pid.settings import SHIPPED, settings_of
+from cz_gym.baselines.pid.settings import settings_of
 from cz_gym.baselines.registry import make_controller
-from cz_gym.baselines.tuned_for import TUNED
+from cz_gym.baselines.tuned_for import TUNED, shipped
+from cz_gym.baselines.tuning.search import value_at
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Sensor
 from cz_gym.episodes.scenarios import HARD, PULLER, RANDOMIZED, SCENARIOS, SENSOR_FAULT
@@ -21,12 +21,10 @@ NAMES = [scenario.name for scenario in TUNED]
 
 @pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)
 def test_named_scenarios_have_their_own_settings_or_those_of_randomized(scenario):
-    for name, shipped in LQG_SHIPPED.items():
-        own = scenario.name if scenario.name in shipped else "randomized"
-        weights = design_of(name, scenario).weights
-        assert (weights.pull, weights.pull_step, weights.heater_step) == shipped[own][:3]
-    for name in ("paper-tuned", "industrial"):
-        assert settings_of(name, scenario) == SHIPPED.get((name, scenario.name), SHIPPED[name, "randomized"])
+    for name in (*SHIPPED[:-1], "paper-tuned", "industrial"):
+        values = shipped(name).get(scenario.name, shipped(name)["randomized"])
+        made = design_of(name, scenario) if name in SHIPPED else settings_of(name, scenario)
+        assert {path: value_at(made, path) for path in values} == values
 
 
 @pytest.mark.parametrize("scenario", [RANDOMIZED, HARD, SENSOR_FAULT, PULLER], ids=NAMES)

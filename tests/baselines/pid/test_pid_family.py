@@ -14,7 +14,8 @@ from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.analysis.sampled_loop import linear_controller
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID, SeriesPID
 from cz_gym.baselines.pid.filtered_pid import FilteredPID, reference_derivatives
-from cz_gym.baselines.pid.settings import SHIPPED, tuned
+from cz_gym.baselines.pid.settings import settings_of, tuned
+from cz_gym.baselines.tuned_for import TUNED
 from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
 from cz_gym.baselines.tuning.goals import below_half_the_zero
 from cz_gym.config import make_config
@@ -132,8 +133,8 @@ def test_trim_rises_while_pull_is_fast_and_stops_at_its_limit(dt):
 
 
 def test_conventional_loop_keeps_the_papers_rule():
-    for (name, _), policy in SHIPPED.items():
-        assert name != "pid-conventional" or below_half_the_zero(None, policy) >= 0.0
+    for scenario in TUNED:
+        assert below_half_the_zero(None, settings_of("pid-conventional", scenario)) >= 0.0
     policy = tuned("pid-conventional", make_config("randomized", **PLAIN))
     assert policy.compensator is None
     assert math.isfinite(policy.T_track)

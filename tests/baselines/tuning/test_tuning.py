@@ -2,15 +2,15 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from cz_gym.baselines.lqg import designs
 from cz_gym.baselines.lqg.controller import LQGDesign
-from cz_gym.baselines.pid import settings as pid_settings
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
+from cz_gym.baselines.pid.settings import settings_of
+from cz_gym.baselines.tuned_for import TUNED, file_name, shipped
 from cz_gym.baselines.tuning import __main__ as command
 from cz_gym.baselines.tuning.goals import (
     FAMILY_SCENARIOS,
@@ -22,20 +22,20 @@ from cz_gym.baselines.tuning.goals import (
     lqg_goal,
     pid_goal,
 )
-from cz_gym.baselines.tuning.search import Figures, Parameter, Search, file_name, measure, value_at
+from cz_gym.baselines.tuning.search import Figures, Parameter, Search, measure, value_at
 from cz_gym.config import make_config
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from cz_gym.puller import FOLDER
 from tests.observed import PLAIN
 
-RESULTS = Path(__file__).parents[3] / "results" / "tuning"
 FIGURES = Figures(0.06, 0.01, 0.02, 1900.0, 0.0, 2160)
 CONFIG = make_config("randomized", **PLAIN)
 PARAMETERS = Parameter("T_f", 1.0, 100.0), Parameter("K_ff", -1.0, 1.0, log=False)
 
 
 def kept(controller, scenario):
-    return json.loads((RESULTS / file_name(controller, scenario)).read_text())
+    return json.loads((FOLDER / "default" / file_name(controller, scenario)).read_text())
 
 
 def bowl(trials=40, episodes=4, parameters=PARAMETERS):
@@ -135,7 +135,7 @@ def test_every_parameter_sets_what_it_names_and_a_search_begins_with_the_setting
     values = [0.5 * (each.low + each.high) for each in parameters]
     assert [value_at(search.settings(values), each.path) for each in parameters] == values
     highest = max((each.high for each in parameters if each.path == "jump"), default=None)
-    frozen = pid_settings.SHIPPED[name, "randomized"]
+    frozen = settings_of(name, RANDOMIZED)
     assert search.settings(search.first) == (frozen if highest is None else replace(frozen, jump=highest))
 
 
@@ -205,10 +205,11 @@ def test_a_search_uses_training_and_validation_seeds_only(tmp_path):
 
 # Shipped settings
 
-HEATER_STEP = designs.SEARCHED.index("weights.heater_step")
+HEATER_STEP = [*shipped("lqg")["randomized"]].index("weights.heater_step")
+TUNED_PIDS = [(name, scenario.name) for name in PIDS for scenario in TUNED if scenario.name in shipped(name)]
 
 
-@pytest.mark.parametrize(("controller", "scenario"), [*sorted(pid_settings.SHIPPED), *LQG_LIMITS])
+@pytest.mark.parametrize(("controller", "scenario"), [*TUNED_PIDS, *LQG_LIMITS])
 def test_shipped_settings_are_those_a_search_chose(controller, scenario):
     """Finalists of the searches that chose the LQGs were also tried with heavier weights on heater steps."""
     found, tuned_on, varied = kept(controller, scenario), find_scenario(scenario), []
@@ -218,7 +219,7 @@ def test_shipped_settings_are_those_a_search_chose(controller, scenario):
     assert list(values) == [parameter.path for parameter in search.goal.parameters]
     chosen = search.settings(values.values())
     if controller in PIDS:
-        assert chosen == pid_settings.SHIPPED[controller, scenario]
+        assert chosen == settings_of(controller, tuned_on)
     else:
         varied = [HEATER_STEP]
         assert chosen == designs.design_of(controller, tuned_on)
