@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 
 from cz_gym.baselines.analysis.compensator_design import CUT_OFF, design_compensator
+from cz_gym.baselines.lqg import designs
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign
-from cz_gym.baselines.lqg.designs import MEAN_RIPPLE, TOLD, design_of, family_name, ring_of
-from cz_gym.baselines.lqg.designs import SHIPPED as LQGS
 from cz_gym.baselines.pid.compensated_pid import SeriesPID
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.industrial import Industrial
@@ -33,9 +32,9 @@ from cz_gym.units import MM
 
 PIDS = ("paper-tuned", "pid-conventional", "industrial")
 """PIDs that are searched for a puller."""
-FILTER = family_name(0.02)
+FILTER = designs.family_name(0.02)
 """The LQG whose filter is searched; the others have the same filter, and their own weights."""
-ON_PULLER = ("paper", "paper-here", *PIDS, *(name for name in LQGS if name != TOLD))
+ON_PULLER = ("paper", "paper-here", *PIDS, *(name for name in designs.SHIPPED if name != designs.TOLD))
 """Controllers of the default table on a puller."""
 JUMP = 1.0 * MM
 """Largest difference of reading and filter that counts on the default puller, where outliers are to be expected [m]."""
@@ -128,7 +127,7 @@ def scaled_design(name: str, config: Config) -> LQGDesign:
     Its filter takes the camera to be no better than the file says, and a ripple that it has not found yet for noise:
     an overconfident filter can explain the ring by a wrong meniscus height, and lose the crystal.
     """
-    known, scenario = design_of(name, RANDOMIZED), config.scenario.scenarios[0]
+    known, scenario = designs.design_of(name, RANDOMIZED), config.scenario.scenarios[0]
     melt, sensor = scenario.interface, scenario.sensor
     fluctuation = _rms(melt.sd) / _rms(RANDOMIZED.interface.sd)
     least, most = known.noise.camera_sd_range
@@ -139,7 +138,7 @@ def scaled_design(name: str, config: Config) -> LQGDesign:
         fast_tau=melt.tau_fast,
         slow_tau=melt.tau_slow,
         pyrometer_sd=_rms(sensor.pyrometer_noise) / _rms(RANDOMIZED.sensor.pyrometer_noise) * known.noise.pyrometer_sd,
-        camera_sd=max(float(np.hypot(np.mean(sensor.camera_noise), MEAN_RIPPLE * sensor.ripple[1])), least),
+        camera_sd=max(float(np.hypot(np.mean(sensor.camera_noise), designs.MEAN_RIPPLE * sensor.ripple[1])), least),
         camera_sd_range=(max(sensor.camera_noise[0], least), most),
         heater_walk=known.noise.heater_walk * config.heater_range / DEFAULT.power_range,
         start_radius_sd=max(scenario.pullers.start_radius_sd, known.noise.start_radius_sd),
@@ -149,7 +148,9 @@ def scaled_design(name: str, config: Config) -> LQGDesign:
     weights = known.weights._replace(pull=max(known.weights.pull, LEAST_PULL)) if limited else known.weights
     error_pull = ERROR_SHARE * min(drives.pull_window, config.parameters.v_0) if limited else None
     slack = HEATER_SLACK * drives.heater_step
-    return replace(known, noise=noise, weights=weights, ring=ring_of(sensor), heater_slack=slack, error_pull=error_pull)
+    return replace(
+        known, noise=noise, weights=weights, ring=designs.ring_of(sensor), heater_slack=slack, error_pull=error_pull
+    )
 
 
 def _rms(sd: tuple[float, float]) -> float:
@@ -159,13 +160,22 @@ def _rms(sd: tuple[float, float]) -> float:
 
 
 def pid(name: str, config: Config) -> FilteredPID | Industrial:
-    """The PID of that name for a puller: what was found for it, or scaled."""
+    """The PID of that name for an environment: what was found for its puller, or scaled."""
+    if not _own(name, config):
+        return settings_of(name, config.sole_scenario).for_config(config)
     settings: FilteredPID | Industrial = with_values(scaled_pid(name, config), found_for(config.puller, name))
     return settings
 
 
 def lqg(name: str, config: Config) -> LQG:
-    """The LQG of that name for a puller: with the filter that was found for it, or a scaled one."""
+    """The LQG of that name for an environment: with the filter that was found for its puller, or a scaled one."""
+    if not _own(name, config):
+        return designs.lqg(name, config)
     found = found_for(config.puller, FILTER)
     filter_alone = {path: value for path, value in found.items() if name == FILTER or path.startswith("noise.")}
     return LQG(design=with_values(scaled_design(name, config), filter_alone)).for_config(config)
+
+
+def _own(name: str, config: Config) -> bool:
+    """Whether a controller has settings of its own on the puller of an environment."""
+    return config.puller != DEFAULT and name in ON_PULLER

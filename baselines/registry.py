@@ -9,31 +9,18 @@ from cz_gym.baselines import for_puller
 from cz_gym.baselines.bounds import lqg as lqg_bounds
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
 from cz_gym.baselines.lqg import designs
-from cz_gym.baselines.lqg.controller import LQG
 from cz_gym.baselines.lqg.designs import adaptive
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
-from cz_gym.baselines.pid.settings import tuned
 from cz_gym.config import Config, check_config
 from cz_gym.contender import Contender
 from cz_gym.errors import CzError
 from cz_gym.names import unknown
-from cz_gym.puller import DEFAULT
 
 from .policy import OpenLoop, Policy
 
 
 def _tuned(name: str, meaning: str, quoted: bool = False) -> Contender:
-    return Contender(name, lambda config: _pid(name, config), "measured", meaning, quoted=quoted)
-
-
-def _pid(name: str, config: Config) -> Policy:
-    own = config.puller != DEFAULT and name in for_puller.ON_PULLER
-    return for_puller.pid(name, config) if own else tuned(name, config)
-
-
-def _lqg_for(name: str, config: Config) -> LQG:
-    own = config.puller != DEFAULT and name in for_puller.ON_PULLER
-    return for_puller.lqg(name, config) if own else designs.lqg(name, config)
+    return Contender(name, partial(for_puller.pid, name), "measured", meaning, quoted=quoted)
 
 
 IN_TABLE = 0.02
@@ -42,7 +29,7 @@ agents, so their radius errors can be compared. On ``hard`` the agents are more 
 
 
 def _lqg(name: str, meaning: str, default: bool = True) -> Contender:
-    return Contender(name, partial(_lqg_for, name), "measured", meaning, default)
+    return Contender(name, partial(for_puller.lqg, name), "measured", meaning, default)
 
 
 def _lqg_at(activity: float) -> Contender:
@@ -52,7 +39,7 @@ def _lqg_at(activity: float) -> Contender:
 
 
 def _adaptive(name: str) -> Contender:
-    make = partial(_lqg_for, name)
+    make = partial(for_puller.lqg, name)
     meaning = f"{name} with filters for weaker fluctuations too, weighted by how well they predict"
     default = name == designs.family_name(IN_TABLE)
     return Contender(f"{name}-adaptive", lambda config: adaptive(make(config)), "measured", meaning, default)
@@ -68,7 +55,7 @@ _bound = partial(Contender, default=False, privileged=True)
 
 
 def _told(name: str, config: Config, fluctuations: bool = False) -> Policy:
-    return lqg_bounds.privileged(_lqg_for(name, config), fluctuations)
+    return lqg_bounds.privileged(for_puller.lqg(name, config), fluctuations)
 
 
 def _privileged(name: str) -> Contender:

@@ -22,7 +22,7 @@ from cz_gym import CzEnv, Parameters, make_puller
 from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.baselines.lqg.designs import TOLD, lqg
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
-from cz_gym.baselines.pid.settings import tuned
+from cz_gym.baselines.pid.settings import settings_of
 from cz_gym.commands import OneLineParser
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Pullers
@@ -90,7 +90,7 @@ def draw(number: int) -> tuple[PullerFile, PullerFile]:
 def write_logs(truth: PullerFile, seed: int, folder: Path) -> tuple[Path, Path]:
     """CSV files of three hours under a PID of the puller's own, with and without excitation."""
     env = CzEnv(SCENARIO, observation="measured", action="direct", puller=truth, info="all")
-    pid = tuned("pid-conventional", env.config)
+    pid = settings_of("pid-conventional", SCENARIO).for_config(env.config)
     assert isinstance(pid, FilteredPID)
     pid = replace(pid, heater=replace(pid.heater, K=pid.heater.K * truth.parameters.C_1 / Parameters().C_1))
     paths = folder / "excited.csv", folder / "passive.csv"

@@ -38,6 +38,12 @@ Claims = Mapping[str, tuple[float, str]]
 """RMSE [mm] on the first row, and the contract, that each submission claims."""
 
 
+def random_rows(first_seed: int) -> list[Row]:
+    """The benchmark's rows of several crystals, from this seed on."""
+    random = (row for row in ROWS if row.default and not find_scenario(row.scenario).deterministic)
+    return [replace(row, first_seed=first_seed) for row in random]
+
+
 def budget(contender: Contender) -> str:
     """The smallest budget that the trainings of an agent keep."""
     steps = max(policy.contract.training_steps for policy in contender.trained)
@@ -102,8 +108,7 @@ def _main(given: argparse.Namespace) -> None:
     if not submitted:
         raise CzError(f"{given.folder}: no submissions: each is a folder with agent files and benchmark.json")
     first = given.first_seed or FRESH[secrets.randbelow(len(FRESH) - len(TEST_SEEDS))]
-    random = [row for row in ROWS if row.default and not find_scenario(row.scenario).deterministic]
-    rows = [replace(row, first_seed=first) for row in random]
+    rows = random_rows(first)
     agents = [contender for contender, _ in submitted]
     check_agents(agents, rows)
     contenders = [*(each for each in CONTROLLERS if each.quoted), *agents]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from cz_gym.baselines.tuned_for import shipped, tuned_scenario, with_values
-from cz_gym.config import Config
 from cz_gym.episodes.scenario import Scenario
 
 from .filtered_pid import FilteredPID
@@ -24,8 +23,3 @@ def settings_of(controller: str, scenario: Scenario) -> FilteredPID | Industrial
     values = chosen[tuned_scenario(scenario, chosen, controller)]
     settings: FilteredPID | Industrial = with_values(START[controller], values)
     return settings
-
-
-def tuned(controller: str, config: Config) -> FilteredPID | Industrial:
-    """The controller with its tuned settings for that environment, on the default puller."""
-    return settings_of(controller, config.sole_scenario).for_config(config)

@@ -14,17 +14,17 @@ from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.analysis.sampled_loop import linear_controller
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID, SeriesPID
 from cz_gym.baselines.pid.filtered_pid import FilteredPID, reference_derivatives
-from cz_gym.baselines.pid.settings import settings_of, tuned
-from cz_gym.baselines.tuned_for import TUNED
+from cz_gym.baselines.pid.settings import settings_of
 from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
+from cz_gym.baselines.tuned_for import TUNED
 from cz_gym.baselines.tuning.goals import below_half_the_zero
-from cz_gym.config import make_config
+from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.observation import MEASURED, PULL_SCALE, Measured
 from cz_gym.physics.linearisation import StateSpace, radius_model
 from cz_gym.physics.parameters import Parameters
 from cz_gym.task import HEATER_RANGE
 from cz_gym.units import MM, MM_PER_MIN
-from tests.observed import PLAIN, measured, pulls
+from tests.observed import measured, pulls
 
 SCALES = {channel.name: channel.scale for channel in MEASURED}
 
@@ -135,7 +135,7 @@ def test_trim_rises_while_pull_is_fast_and_stops_at_its_limit(dt):
 def test_conventional_loop_keeps_the_papers_rule():
     for scenario in TUNED:
         assert below_half_the_zero(None, settings_of("pid-conventional", scenario)) >= 0.0
-    policy = tuned("pid-conventional", make_config("randomized", **PLAIN))
+    policy = settings_of("pid-conventional", RANDOMIZED)
     assert policy.compensator is None
     assert math.isfinite(policy.T_track)
     assert policy.T_start > 0.0
