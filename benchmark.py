@@ -7,6 +7,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -104,7 +105,8 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
         import matplotlib  # noqa: F401
         import plotly  # noqa: F401
     with tqdm(unit="step", unit_scale=True, leave=False, disable=arguments.quiet or None) as bar:
-        results = run(contenders, rows, arguments.episodes, bar, CACHE, None if arguments.puller else BOUNDS)
+        again, bounds = partial(taking_part, tuple(shlex.split(command)[1:])), None if arguments.puller else BOUNDS
+        results = run(contenders, rows, arguments.episodes, bar, CACHE, bounds, again)
     quoted = README if not smaller and arguments.out and arguments.out.resolve() == FOLDER else None
     write(arguments.out, arguments.json, results, command, quoted)
     if not arguments.quiet:
@@ -115,6 +117,14 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
         wrote = ", ".join(shown(path) for path in (arguments.out, arguments.json) if path)
         print(f"wrote {wrote}" + (f"; open {shown(arguments.out / 'report.html')}" if arguments.out else ""))
     return 0
+
+
+@cache
+def taking_part(argv: tuple[str, ...]) -> tuple[list[Contender], list[Row]]:
+    """Contenders and rows of a command line, for each process that runs some of them."""
+    arguments = parse(argv)
+    rows = rows_of(arguments)
+    return contenders_of(arguments, rows), rows
 
 
 def rows_of(arguments: argparse.Namespace) -> list[Row]:

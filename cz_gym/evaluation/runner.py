@@ -9,12 +9,18 @@ from typing import Any
 
 from cz_gym.contender import Contender
 from cz_gym.errors import CzError
+from cz_gym.processors import processors
 
 from .cache import SlowEpisodes, earlier_bound
+from .processes import in_processes
 from .protocol import SLOW_EPISODES, Row
 from .results import Result, Sample, summarise
 from .rollout import check_policy, rollout
 
+LONG = 5_000_000
+"""Number of steps from which on a run is shared between processes, which take seconds to start."""
+PROCESSES = 8
+"""Largest number of processes of a run, each of which needs some hundred MB."""
 BLOCK = 10
 """Episodes that a slow controller runs at once, and that are cached together."""
 
@@ -74,20 +80,46 @@ def run(
     bar: Any,
     cache: Path,
     bounds: Path | None = None,
+    again: Callable[[], tuple[Sequence[Contender], Sequence[Row]]] | None = None,
 ) -> list[Result]:
     """Roll every contender out on every row and summarise.
 
     ``bar`` is tqdm's, over environment steps; ``cache`` is the folder of slow controllers' episodes, ``bounds`` that of
-    an earlier benchmark whose bound serves a run without one.
+    an earlier benchmark whose bound serves a run without one. A long run is shared between processes if ``again`` makes
+    contenders and rows anew in each.
     """
-    pairs = [(row, each, episodes_of(each, row, episodes)) for row in rows for each in contenders]
-    bar.reset(total=sum(row.config().steps * len(seeds) * max(len(each.trained), 1) for row, each, seeds in pairs))
-    samples: dict[str, list[Sample]] = {row.name: [] for row in rows}
-    for row, each, seeds in pairs:
+    pairs = [(row, each) for row in rows for each in contenders]
+    seeds = [len(episodes_of(each, row, episodes)) for row, each in pairs]
+    steps = [row.config().steps * n * max(len(each.trained), 1) for n, (row, each) in zip(seeds, pairs, strict=True)]
+    bar.reset(total=sum(steps))
+    # The first pair compiles for all.
+    alone = 1 if again and sum(steps) > LONG else len(pairs)
+    measured = {}
+    for number, pair in enumerate(pairs[:alone]):
+        bar.set_description(f"{pair[0].name}, {pair[1].name}")
+        measured[number] = _rolled_out(pair, episodes, cache, bar.update)
+    apart = partial(_apart, again, episodes, cache)
+    for number, found in in_processes(apart, range(alone, len(pairs)), processes=min(processors(), PROCESSES)):
+        row, each = pairs[alone + number]
+        measured[alone + number] = Sample(each, *found)
         bar.set_description(f"{row.name}, {each.name}")
-        rolled_out = partial(run_resumed, cache=cache) if each.slow else run_episodes
-        samples[row.name].append(rolled_out(each, row, seeds, bar.update))
-    return [
-        summarise(row, samples[row.name], earlier_bound(bounds, row, samples[row.name]) if bounds else None)
-        for row in rows
-    ]
+        bar.update(steps[alone + number])
+    results = []
+    for number, row in enumerate(rows):
+        samples = [measured[number * len(contenders) + place] for place in range(len(contenders))]
+        results.append(summarise(row, samples, earlier_bound(bounds, row, samples) if bounds else None))
+    return results
+
+
+def _rolled_out(pair: tuple[Row, Contender], episodes: int, cache: Path, progress: Callable[[int], None]) -> Sample:
+    row, each = pair
+    rolled_out = partial(run_resumed, cache=cache) if each.slow else run_episodes
+    return rolled_out(each, row, episodes_of(each, row, episodes), progress)
+
+
+def _apart(again: Any, episodes: int, cache: Path, number: int) -> tuple[Any, ...]:
+    """In another process: the sample of a pair without its contender, which would not pass between processes."""
+    contenders, rows = again()
+    pair = rows[number // len(contenders)], contenders[number % len(contenders)]
+    sample = _rolled_out(pair, episodes, cache, lambda steps: None)
+    return sample.seeds, sample.values, sample.microseconds, sample.example

@@ -16,6 +16,9 @@ from tests.samples import result_of
 
 EVIL = "</script><img src=x onerror=document.title='evil'>\"'&amp;<b>%{x}<a href=\"javascript:alert(1)\">a</a>"
 PICTURES = ("pareto", "crystal")
+WATCH = """new MutationObserver(() => document.querySelector(".main-svg") && performance.mark("picture"))
+    .observe(document, { subtree: true, childList: true });"""
+"""Script that notes when there are pictures."""
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +34,11 @@ def browser(made: list[Result], tmp_path_factory: pytest.TempPathFactory) -> Ite
     path = tmp_path_factory.mktemp("page") / "report.html"
     path.write_text(page(made, "benchmark.py"), "utf-8")
     with chromium(tmp_path_factory.mktemp("profile")) as driver:
+        driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": WATCH})
         driver.get(Path(path).as_uri())
+        driver.execute_script("document.getElementById('pareto').scrollIntoView()")
+        until(driver, lambda: driver.find_elements("css selector", "#pareto .legendtext"))
+        driver.execute_script("document.getElementById('crystal').scrollIntoView()")
         until(driver, lambda: driver.find_elements("css selector", "#crystal .legendtext"))
         yield driver
 
@@ -47,6 +54,11 @@ def test_the_page_opens_from_disk_without_an_error_and_fetches_nothing(browser: 
     assert {address for address in addresses if not address.startswith(allowed)} == set()
     assert len([address for address in addresses if address.startswith("file:")]) == 1
     assert browser.execute_script("return performance.getEntriesByType('resource').length") == 0
+
+
+def test_text_is_painted_before_a_picture_is_drawn(browser: Any) -> None:
+    script = "return performance.getEntriesByName(arguments[0])[0].startTime"
+    assert browser.execute_script(script, "first-contentful-paint") < browser.execute_script(script, "picture")
 
 
 def test_the_first_line_is_the_verdict_and_names_are_text(browser: Any) -> None:

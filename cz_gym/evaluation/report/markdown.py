@@ -1,4 +1,4 @@
-"""The benchmark's report as text: in Markdown, whose first line is the verdict, and as a short table for a terminal."""
+"""The benchmark's report as text: in Markdown, which begins with the verdict, and as short tables for a terminal."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ from .tables import (
     ERROR,
     FAILURES,
     HEATER_STEP,
-    NOTHING,
     PULL_STEP,
-    RETURN,
     RMSE,
+    WHO,
     Column,
     comparison,
     crystals,
-    headline,
-    label,
+    deciding,
+    overview,
     rows,
+    verdict,
+    who,
 )
 from .tables import markdown as table
 
@@ -48,24 +49,11 @@ BEGIN, END = "<!-- benchmark:begin -->", "<!-- benchmark:end -->"
 
 
 def summary(results: Sequence[Result]) -> str:
-    """Return one table, and its contract below: RMSE and failures on each scenario, activity and return on the first.
-
-    Contenders are grouped by what they knew.
-    """
-    alone = [column._replace(interval=False) for column in (PULL_STEP, HEATER_STEP, RETURN)]
-    columns = (RMSE, FAILURES._replace(interval=False), *alone)
-    found = [{name: row for name, *row in rows(result, columns)} for result in results]
-    groups: dict[str, list[tuple[str, ...]]] = {}
-    for sample in results[0].samples:
-        name = label(sample, results[0])
-        errors, failures, *others = zip(*(each[name] for each in found), strict=True)
-        line = name, *errors, *(first for first, *_ in others), " / ".join(failures)
-        groups.setdefault(sample.contender.knows, []).append(line)
-    heads = "controller", *(result.row.name for result in results), *(column.heading for column in alone)
-    lines = [line for group, listed in groups.items() for line in ((f"*{group}*", *[""] * len(heads)), *listed)]
+    """Return :func:`overview` in Markdown, and its contract below."""
+    heads, groups = overview(results)
+    lines = [line for group, listed in groups.items() for line in ((f"*{group}*", *[""] * (len(heads) - 1)), *listed)]
     contract = contract_hash([result.row for result in results])
-    below = f"Contract `{contract}` (plant, random scenarios, interval, horizon)."
-    return f"{table((*heads, FAILURES.heading), lines)}\n\n{below}"
+    return f"{table(heads, lines)}\n\nContract `{contract}` (plant, random scenarios, interval, horizon)."
 
 
 def brief(results: Sequence[Result]) -> str:
@@ -73,7 +61,7 @@ def brief(results: Sequence[Result]) -> str:
 
     Everything is there if nobody is quoted, or nothing is random.
     """
-    results = [result for result in results if len(result.seeds) > 1] or list(results)
+    results = deciding(results)
     means = results[0].means
     samples = sorted(results[0].samples, key=lambda sample: means[sample.name][RMSE.metric].mean)
     best = [sample.name for sample in samples if sample.contender.learned and not sample.contender.bound][:BEST]
@@ -89,32 +77,27 @@ def fill_in(page: str, results: Sequence[Result]) -> str:
 
 
 def markdown(results: Sequence[Result], command: str, figures: Iterable[str]) -> str:
-    """Return ``report.md``; its first line is :func:`headline`."""
+    """Return ``report.md``; it begins with :func:`verdict`."""
     row = results[0].row
     config, most = row.config(), max(len(result.seeds) for result in results)
+    found = verdict(results)
     parts = [
-        headline(results),
+        found.sentence,
+        *([table(found.heads, found.rows)] if found.rows else []),
         "# Benchmark",
         f"Every controller meets the same crystals (test seeds), {config.horizon / HOUR:.3g} h each at "
         f"{config.control_interval:g} s control, on {row.grown_on}.",
         "The tables show means over crystals with 95 % bootstrap intervals; a scenario without randomness is one "
         "crystal and has no interval. After a failure the radius error counts 8 mm to the end; drives, growth rate and "
         "ground-off are those of the time before it. No failure in n crystals still allows a rate of up to 3/n, "
-        f"{3 / most / PERCENT:.2g} % at n = {most}. The first line compares radius errors alone: who moves the pull "
+        f"{3 / most / PERCENT:.2g} % at n = {most}. The verdict compares radius errors alone: who moves the pull "
         "speed more can have less. docs/controllers/bounds.md compares at equal pull steps, docs/benchmark.md has the "
         "protocol and every formula.",
         "RMSE of the true radius [mm] with 95 % interval and failures on each scenario, pull steps on the first.",
         summary(results),
         *(f"![{name.removesuffix('.png')}]({name})" for name in figures),
         "## Who took part",
-        table(
-            ("controller", "reads", "what it is", "training seeds"),
-            [
-                (each.name, each.observation, each.meaning, ", ".join(map(str, each.training_seeds)) or NOTHING)
-                for each in (sample.contender for sample in results[0].samples)
-            ],
-            rule="---",
-        ),
+        table(WHO, who(results[0].samples), rule="---"),
     ]
     for result in results:
         parts += _scenario(result)
@@ -174,20 +157,23 @@ def _training_seeds(pooled: Sequence[Sample]) -> str:
 
 
 def terminal(results: Sequence[Result]) -> str:
-    """Return the short table: RMSE with its interval, then means, and the paired difference of RMSE."""
-    return "\n\n".join([*map(_short, results), headline(results)])
+    """Return a short table a scenario, RMSE with its interval, then means, and the verdict."""
+    found = verdict(results, RMSE._replace(interval=False))
+    return "\n\n".join(
+        [*map(_short, results), found.sentence, *([_aligned(found.heads, found.rows)] if found.rows else [])]
+    )
 
 
 def _short(result: Result) -> str:
-    columns = (RMSE, *SHORT, LESS)
-    headings = ["controller", *(column.heading for column in columns)]
-    names, units = zip(*(heading.rstrip("]").partition(" [")[::2] for heading in headings), strict=True)
-    grid = [names, units, *rows(result, columns)]
-    widths = [max(map(len, column)) for column in zip(*grid, strict=True)]
-    row = result.row
+    columns, row = (RMSE, *SHORT, LESS), result.row
     grown_on = f", on {row.grown_on}" if row.file or row.puller != DEFAULT else ""
-    lines = [f"{row.name} ({crystals(len(result.seeds))}){grown_on}"]
-    for name, *cells in grid:
-        padded = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
-        lines.append("  ".join([f"  {name:<{widths[0]}}", *padded]).rstrip())
-    return "\n".join(lines)
+    heads = ["controller", *(column.heading for column in columns)]
+    return f"{row.name} ({crystals(len(result.seeds))}){grown_on}\n{_aligned(heads, rows(result, columns))}"
+
+
+def _aligned(heads: Sequence[str], lines: Iterable[tuple[str, ...]]) -> str:
+    """A table in columns of characters, its units in a line of their own."""
+    grid = [*zip(*(head.rstrip("]").partition(" [")[::2] for head in heads), strict=True), *lines]
+    widths = [max(map(len, column)) for column in zip(*grid, strict=True)]
+    padded = ((f"  {name:<{widths[0]}}", *map(str.rjust, cells, widths[1:])) for name, *cells in grid)
+    return "\n".join("  ".join(cells).rstrip() for cells in padded)

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from html import escape
 from importlib.resources import files
 
 from plotly.graph_objects import Figure
 from plotly.offline import get_plotlyjs
 
-from cz_gym.evaluation.results import Result, Sample
+from cz_gym.evaluation.results import Result
 from cz_gym.units import HOUR
 
 from . import tables
@@ -27,67 +28,68 @@ _SLOT = re.compile(r"<!-- slot:(\w+) -->")
 
 def page(results: Sequence[Result], command: str) -> str:
     """Return the page; the same results give the same text."""
-    row, styles = results[0].row, styles_of(results[0].samples)
-    config, most = row.config(), max(len(result.seeds) for result in results)
+    row, samples, found = results[0].row, results[0].samples, tables.verdict(results)
+    config, most, styles = row.config(), max(len(result.seeds) for result in results), styles_of(samples)
+    counted = tables.deciding(results)
+    best = replace(counted[0], samples=tuple(tables.best_of_each_kind(counted)))
+    heads, groups = tables.overview([best, *counted[1:]])
     parts = {
         "style": _asset("page.css"),
         "plotly": get_plotlyjs(),
-        "verdict": escape(tables.headline(results)),
-        "lede": f"{tables.count(len(results[0].samples), 'controller')}, {tables.count(len(results), 'scenario')}, "
+        "verdict": escape(found.sentence),
+        "best": _table(heads, [(f"{name} [{kind}]", *cells) for kind, rows in groups.items() for name, *cells in rows]),
+        "lede": f"{tables.count(len(samples), 'controller')}, {tables.count(len(results), 'scenario')}, "
         f"up to {tables.crystals(most)} each, the same for everyone: {config.horizon / HOUR:g} h at one action every "
         f"{config.control_interval:g} s, on {row.grown_on}.",
-        "tables": "\n".join(_table(result, is_open=result is results[0]) for result in results),
+        "scenarios": _table(found.heads, found.rows) if found.rows else "",
+        "tables": "\n".join(_metrics(result, is_open=result is results[0]) for result in results),
         "pareto": _html(pareto(results, styles), "pareto"),
         "crystal": _html(crystal(results, styles), "crystal"),
-        "controllers": "\n".join(
-            "<tr>"
-            + _each("td", (each.name, each.observation, each.meaning, ", ".join(map(str, each.training_seeds))))
-            + "</tr>"
-            for each in (sample.contender for sample in results[0].samples)
-        ),
+        "controllers": _table(tables.WHO, tables.who(samples), "words"),
         "command": escape(command),
     }
     return _SLOT.sub(lambda slot: parts[slot[1]], _asset("page.html"))
 
 
 def _html(figure: Figure, name: str) -> str:
+    """A picture as plotly's own HTML, with a script that waits until the page runs it."""
     margin = {"l": 60, "r": 10, "t": 90, "b": 40}
     figure.update_layout(template="plotly_white", margin=margin, hoverlabel_namelength=-1)
     config = {"displayModeBar": False, "responsive": True}
     text: str = figure.to_html(config, full_html=False, include_plotlyjs=False, div_id=name)
-    return text
+    return text.replace("<script>", '<script type="text/plain">')
 
 
-def _table(result: Result, is_open: bool) -> str:
+def _metrics(result: Result, is_open: bool) -> str:
     """Every metric of a scenario, the lowest RMSE first, to unfold."""
     columns = (*tables.ERROR, *tables.comparison(result), *tables.DRIVES)
-    heads = _each("th", ("controller", *(column.heading for column in columns)))
     ranked = sorted(result.samples, key=lambda sample: result.means[sample.name][tables.RMSE.metric].mean)
-    lines = "\n".join(
-        f"<tr>{_name(sample, result)}{''.join(_cell(result, sample.name, column) for column in columns)}</tr>"
-        for sample in ranked
+    heads, notes = (
+        ("controller", *(column.heading for column in columns)),
+        (" [bound]" * s.contender.bound for s in ranked),
     )
+    rows = [(f"{name}{note}", *c) for (name, *c), note in zip(tables.rows(result, columns, ranked), notes, strict=True)]
     about = escape(f"{result.row.meaning}. {measured_from(result).replace('`', '')}")
     return (
         f"<details{' open' if is_open else ''}><summary>{escape(result.row.name)} "
-        f'({tables.crystals(len(result.seeds))})</summary><p class="note">{about}</p>'
-        f'<div class="scroll"><table class="metrics">\n<thead><tr>{heads}</tr></thead>\n'
-        f"<tbody>\n{lines}\n</tbody></table></div></details>"
+        f'({tables.crystals(len(result.seeds))})</summary><p class="note">{about}</p>{_table(heads, rows)}</details>'
     )
 
 
-def _name(sample: Sample, result: Result) -> str:
-    bound = "<small>bound: knows what no sensor shows</small>" if sample.contender.bound else ""
-    return f"<th>{escape(tables.label(sample, result))}{bound}</th>"
+def _table(heads: Iterable[str], rows: Iterable[Iterable[str]], kind: str = "figures") -> str:
+    """A table that scrolls sideways in its own frame; what stands in brackets stands below, small."""
+    lines = "\n".join(
+        f"<tr>{_cell('th', name)}{''.join(_cell('td', cell) for cell in cells)}</tr>" for name, *cells in rows
+    )
+    return (
+        f'<div class="scroll"><table class="{kind}">\n<thead><tr>{"".join(_cell("th", head) for head in heads)}</tr>'
+        f"</thead>\n<tbody>\n{lines}\n</tbody></table></div>"
+    )
 
 
-def _cell(result: Result, name: str, column: tables.Column) -> str:
-    mean, _, interval = column.text(column.estimate(result, name)).partition(" ")
-    return f"<td>{mean}<small>{interval}</small></td>"
-
-
-def _each(tag: str, texts: Iterable[str]) -> str:
-    return "".join(f"<{tag}>{escape(text)}</{tag}>" for text in texts)
+def _cell(tag: str, text: str) -> str:
+    first, _, below = text.partition(" [")
+    return f"<{tag}>{escape(first)}{f'<small>[{escape(below)}</small>' if below else ''}</{tag}>"
 
 
 def _asset(name: str) -> str:

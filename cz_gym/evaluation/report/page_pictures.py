@@ -77,7 +77,9 @@ def pareto(results: Sequence[Result], styles: Mapping[str, Style]) -> go.Figure:
             )
     figure.update_xaxes(LOG, title=f"mean {PULL_STEP.heading}", nticks=4)
     figure.update_yaxes(LOG, title=f"mean {RMSE.heading}")
-    figure.update_layout(height=560, legend={"orientation": "h", "y": -0.2}, showlegend=True)
+    figure.update_layout(
+        height=560, legend={"orientation": "h", "y": 0, "yref": "container", "yanchor": "bottom"}, showlegend=True
+    )
     add_menu(figure, results)
     return figure
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from cz_gym.evaluation.results import REFERENCE, SPEED, Estimates, Result, Sample
@@ -88,11 +88,24 @@ def label(sample: Sample, result: Result) -> str:
     return sample.name + (f" (n = {met})" if met < len(result.seeds) else "")
 
 
-def rows(result: Result, columns: Sequence[Column]) -> list[tuple[str, ...]]:
-    """Return one row a contender: its label, then the columns' texts."""
+def rows(result: Result, columns: Sequence[Column], samples: Sequence[Sample] | None = None) -> list[tuple[str, ...]]:
+    """Return one row a contender, in the order of ``samples`` if given: its label, then the columns' texts."""
     return [
         (label(sample, result), *(column.text(column.estimate(result, sample.name)) for column in columns))
-        for sample in result.samples
+        for sample in samples or result.samples
+    ]
+
+
+WHO = "controller", "reads", "what it is", "training seeds"
+"""Heads of :func:`who`."""
+
+
+def who(samples: Sequence[Sample]) -> list[tuple[str, ...]]:
+    """Return one row a contender: what it is, reads and was trained with."""
+    contenders = [sample.contender for sample in samples]
+    return [
+        (each.name, each.observation, each.meaning, ", ".join(map(str, each.training_seeds)) or NOTHING)
+        for each in contenders
     ]
 
 
@@ -113,39 +126,97 @@ def crystals(number: int) -> str:
     return count(number, "crystal")
 
 
-def headline(results: Sequence[Result]) -> str:
-    """Return one line: whether the agents win, and where they do not.
+def overview(results: Sequence[Result]) -> tuple[tuple[str, ...], dict[str, list[tuple[str, ...]]]]:
+    """Return heads and rows of one table: RMSE and failures on each scenario, activity and return on the first.
 
-    Scenarios of a single crystal do not count, unless there are no others; nor does an agent that is a bound. A few
-    crystals of a random scenario give no verdict.
+    Rows are grouped by what the contenders knew.
     """
-    contenders = [sample.contender for sample in results[0].samples]
-    agents = [each.name for each in contenders if each.learned and not each.bound]
-    if not agents:
-        return "No learned agent took part in this run."
+    alone = [column._replace(interval=False) for column in (PULL_STEP, HEATER_STEP, RETURN)]
+    columns = (RMSE, FAILURES._replace(interval=False), *alone)
+    found = [{name: row for name, *row in rows(result, columns)} for result in results]
+    groups: dict[str, list[tuple[str, ...]]] = {}
+    for sample in results[0].samples:
+        name = label(sample, results[0])
+        errors, failures, *others = zip(*(each[name] for each in found), strict=True)
+        line = name, *errors, *(first for first, *_ in others), " / ".join(failures)
+        groups.setdefault(sample.contender.knows, []).append(line)
+    heads = "controller", *(result.row.name for result in results), *(column.heading for column in alone)
+    return (*heads, FAILURES.heading), groups
+
+
+def deciding(results: Sequence[Result]) -> list[Result]:
+    """Return the results on random scenarios, which alone count for a verdict; all if there are none."""
+    return [result for result in results if len(result.seeds) > 1] or list(results)
+
+
+def best_of_each_kind(results: Sequence[Result]) -> list[Sample]:
+    """Return who has the lowest mean RMSE of those that knew the same, and the user's own; bounds left out."""
+
+    def error(sample: Sample) -> float:
+        return sum(result.means[sample.name][RMSE.metric].mean for result in results)
+
+    able = [sample for sample in results[0].samples if not sample.contender.bound]
+    best = {sample.contender.knows: sample.name for sample in sorted(able, key=error, reverse=True)}
+    return [sample for sample in able if sample.name in best.values() or sample.contender.own]
+
+
+class Verdict(NamedTuple):
+    """Where classical controllers hold the radius best, and where learned agents do."""
+
+    sentence: str
+    heads: tuple[str, ...] = ()
+    rows: tuple[tuple[str, ...], ...] = ()
+    """One a scenario; empty if there is no verdict."""
+
+
+def verdict(results: Sequence[Result], column: Column = RMSE) -> Verdict:
+    """Compare the best classical controller of each scenario with the learned agents, bounds left out.
+
+    ``column`` has the form of the errors. A few crystals of a random scenario give no verdict.
+    """
+    results = deciding(results)
+    groups: dict[str, list[str]] = {}
+    for each in (sample.contender for sample in results[0].samples):
+        if each.learned and not each.bound:
+            groups.setdefault(each.knows, []).append(each.name)
+    if not groups:
+        return Verdict("No learned agent took part in this run.")
     if results[0].rival is None:
-        return "No classical controller took part in this run to compare the agents with."
-    deciding = [result for result in results if len(result.seeds) > 1] or list(results)
-    if 1 < len(deciding[0].seeds) < FEWEST:
-        return f"No verdict: {len(deciding[0].seeds)} crystals, and a verdict needs at least {FEWEST}."
-    if always := [agent for agent in agents if all(result.wins(agent) for result in deciding)]:
-        first = f"{', '.join(always)} win{'s' if len(always) == 1 else ''} on every scenario."
-    else:
-        some = any(result.wins(agent) for result in deciding for agent in agents)
-        first = "No agent wins on every scenario." if some else "No agent wins."
-    return f"{first} {'; '.join(_among(result) for result in deciding)}."
+        return Verdict("No classical controller took part in this run to compare the agents with.")
+    if 1 < (number := len(results[0].seeds)) < FEWEST:
+        return Verdict(f"No verdict: {number} crystals, and a verdict needs at least {FEWEST}.")
+    heads = ["scenario", "best classical [mm]"]
+    for group in groups:
+        heads += [f"best {group} [mm]", "difference [mm]"]
+    where: dict[str, list[str]] = {"a classical controller": [], "a learned agent": [], "": []}
+    rows = []
+    for result in results:
+        errors = {name: means[RMSE.metric] for name, means in result.means.items()}
+        won = [name for name in result.verdicts if result.wins(name)]
+        best = min(won, key=lambda name: errors[name].mean) if won else str(result.rival)
+        row = [f"{result.rival} {column.text(errors[str(result.rival)])}"]
+        for names in groups.values():
+            name = min(names, key=lambda name: errors[name].mean)
+            row += [f"{name} {column.text(errors[name])}", RMSE.text(result.verdicts[name])]
+        clear = won or all(map(result.loses, result.verdicts))
+        where["a learned agent" if won else "a classical controller" if clear else ""].append(result.row.name)
+        rows.append((result.row.name, *row, best if clear else "no difference shown"))
+    return Verdict(_sentence(where), (*heads, "lowest error"), tuple(rows))
 
 
-def _among(result: Result) -> str:
-    """Comparison of each agent with the best classical controller on one scenario."""
-    agents, rival = list(result.verdicts), result.rival
+def _sentence(where: Mapping[str, Sequence[str]]) -> str:
+    """Which kind holds the radius best on which scenarios, "" for neither."""
+    total = sum(map(len, where.values()))
 
-    def named(some: Sequence[str]) -> str:
-        return f"all {len(agents)} agents" if len(some) == len(agents) > 1 else ", ".join(some)
+    def listed(names: Sequence[str]) -> str:
+        return (
+            f"all {total} scenarios"
+            if len(names) == total > 1
+            else " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+        )
 
-    won, lost = list(filter(result.wins, agents)), list(filter(result.loses, agents))
-    rest = [agent for agent in agents if agent not in won + lost]
-    parts = [f"{named(won)} better than {rival}"] if won else []
-    parts += [f"{rival} better than {named(lost)}"] if lost else []
-    parts += [f"no clear difference between {rival} and {named(rest)}"] if rest else []
-    return f"{result.row.name}: {', '.join(parts)}"
+    held = [f"by {kind} on {listed(names)}" for kind, names in where.items() if kind and names]
+    same = listed(where[""]) if where[""] else ""
+    if not held:
+        return f"No difference is shown between classical controllers and learned agents on {same}."
+    return f"The radius is held best {', '.join(held)}" + (f"; on {same} no difference is shown." if same else ".")

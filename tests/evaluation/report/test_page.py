@@ -17,7 +17,7 @@ import benchmark
 from cz_gym.evaluation.report.canvas import styles_of
 from cz_gym.evaluation.report.page import page
 from cz_gym.evaluation.report.page_pictures import PANELS, crystal, pareto, plain
-from cz_gym.evaluation.report.tables import DRIVES, ERROR, comparison
+from cz_gym.evaluation.report.tables import DRIVES, ERROR, comparison, overview
 from tests.samples import result_of
 
 EVIL = "</script><img src=x onerror=alert(1)>\"'&amp;<b>\u2028%{x}|"
@@ -84,6 +84,11 @@ def page_of(results: Any) -> str:
     return page(results, f"benchmark.py --agent '{EVIL}'")
 
 
+def together(text: str) -> str:
+    """A cell's text as it is read back: what stands in brackets is an element of its own."""
+    return text.replace(" [", "[", 1)
+
+
 def visible(figure: go.Figure, scenario: int) -> list[Any]:
     """Traces that a figure shows when its menu is set to a scenario."""
     seen = figure.layout.updatemenus[0].buttons[scenario].args[0]["visible"]
@@ -98,16 +103,22 @@ def made() -> Made:
 def test_the_tables_are_the_results(made: Made) -> None:
     """Every metric has a column with a unit; the lowest RMSE stands first."""
     rows = iter(made.parts.rows)
+    heads, groups = overview(made.results[:1])
+    assert next(rows) == [heads[0], *map(together, heads[1:])]
+    for line in (next(rows), next(rows)):
+        kind = "learned from the reward" if line[0].startswith(EVIL) else "classical"
+        name, *cells = next(each for each in groups[kind] if line[0].startswith(each[0]))
+        assert line == [f"{name}[{kind}]", *map(together, cells)]
     for result in made.results:
         columns = (*ERROR, *comparison(result), *DRIVES)
         assert {column.metric for column in columns} == {*result.means["paper"]}
         without = [c.heading for c in columns if "[" not in c.heading and "probability" not in c.heading]
         assert without == ["cost", "return"]
-        assert next(rows) == ["controller", *(column.heading for column in columns)]
+        assert next(rows) == ["controller", *(together(column.heading) for column in columns)]
         for name in sorted(result.means, key=lambda name: result.means[name]["rmse_mm"].mean):
             head, *cells = next(rows)
             assert head.startswith(name)
-            assert cells == [column.text(column.estimate(result, name)).replace(" ", "", 1) for column in columns]
+            assert cells == [together(column.text(column.estimate(result, name))) for column in columns]
 
 
 def test_pictures_are_the_results_of_the_chosen_scenario(made: Made) -> None:
@@ -167,9 +178,9 @@ def test_plotly_sees_no_markup_in_a_name(text: str) -> None:
 def test_names_stay_text_and_nothing_is_fetched(made: Made) -> None:
     """No address in the page but plotly's own, no element that loads, and a policy that forbids it all the same."""
     tags = [tag for tag, _ in made.parts.elements]
-    assert tags.count("script") == 3, "plotly, and its call for each picture"
+    assert tags.count("script") == 4, "plotly, its call for each picture, and who runs them"
     assert not {"img", "iframe", "object", "embed"} & {*tags}
-    own = made.text.replace(made.parts.scripts[0], "")
+    own = made.text.replace(made.parts.scripts[2], "")
     assert "<img" not in own
     assert own[own.index("<body>") + len("<body>") :].lstrip().startswith('<p id="verdict">')
     assert EVIL in [row[0].partition(" (n =")[0] for row in made.parts.rows]

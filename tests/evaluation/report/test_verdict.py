@@ -1,4 +1,4 @@
-"""The report's first line: whether the agents win, and where they do not."""
+"""The verdict: one sentence on who holds the radius best where, and a table, a row a scenario."""
 
 from dataclasses import replace
 from typing import Any
@@ -8,7 +8,7 @@ import pytest
 
 from cz_gym.evaluation.protocol import Row
 from cz_gym.evaluation.report import tables
-from cz_gym.evaluation.report.tables import FEWEST, headline
+from cz_gym.evaluation.report.tables import FEWEST, best_of_each_kind, verdict
 from cz_gym.evaluation.results import Result, Sample
 from cz_gym.evaluation.statistics import Estimate
 from tests.samples import contender
@@ -17,49 +17,72 @@ BETTER, WORSE, EITHER = Estimate(-1.0, (-2.0, -0.5), 9), Estimate(1.0, (0.5, 2.0
 
 
 def made(**scenarios: Any) -> list[Result]:
-    """Results of agents a, b, ...; each scenario gives their differences, "single" stands for one crystal."""
+    """Results of agents a, b, ...; each scenario gives their differences, "single" stands for one crystal.
+
+    The rival has an RMSE of 5 mm; b knew the plant in training.
+    """
     results = []
     for name, differences in scenarios.items():
         verdicts = dict(zip("abc", differences, strict=False))
         seeds = (0,) if name.startswith("single") else tuple(range(FEWEST))
         who = [contender("lqg"), *(contender(agent, training_seeds=(0,)) for agent in verdicts)]
+        for each in who[2:3]:
+            each.trained[0].contract.learned_from = "plant"
         samples = tuple(Sample(each, seeds, np.zeros((1, 1, 1)), 0.0) for each in who)
-        row = Row(name, "randomized", "")
-        results.append(Result(row, samples, {}, {}, {}, {}, {}, "lqg", verdicts))
+        means = {"lqg": {"rmse_mm": Estimate(5.0, (4.0, 6.0), 9)}}
+        means |= {agent: {"rmse_mm": Estimate(5.0 + each.mean, None, 9)} for agent, each in verdicts.items()}
+        results.append(Result(Row(name, "randomized", ""), samples, means, {}, {}, {}, {}, "lqg", verdicts))
     return results
 
 
-def test_agents_and_scenarios_are_compared_in_one_line() -> None:
-    assert headline(made(one=[BETTER])) == "a wins on every scenario. one: a better than lqg."
-    assert headline(made(one=[WORSE], two=[EITHER])) == (
-        "No agent wins. one: lqg better than a; two: no clear difference between lqg and a."
+def test_the_sentence_says_which_kind_holds_the_radius_best_and_where() -> None:
+    def said(**scenarios: Any) -> str:
+        return verdict(made(**scenarios)).sentence
+
+    assert said(one=[BETTER]) == "The radius is held best by a learned agent on one."
+    assert (
+        said(one=[WORSE] * 3, two=[WORSE] * 3)
+        == "The radius is held best by a classical controller on all 2 scenarios."
     )
-    assert headline(made(one=[WORSE] * 3, two=[WORSE] * 3)) == (
-        "No agent wins. one: lqg better than all 3 agents; two: lqg better than all 3 agents."
+    assert said(one=[WORSE], two=[WORSE, BETTER], three=[WORSE], four=[EITHER]) == (
+        "The radius is held best by a classical controller on one and three, by a learned agent on two; "
+        "on four no difference is shown."
     )
-    assert headline(made(one=[BETTER, WORSE, EITHER], two=[BETTER, WORSE, BETTER])) == (
-        "a wins on every scenario. one: a better than lqg, lqg better than b, no clear difference between lqg and c; "
-        "two: a, c better than lqg, lqg better than b."
+    neither = "No difference is shown between classical controllers and learned agents on all 2 scenarios."
+    assert said(one=[EITHER, WORSE], two=[WORSE, EITHER]) == neither
+
+
+def test_the_table_has_a_row_a_scenario_with_the_best_of_each_kind() -> None:
+    results = made(one=[WORSE, BETTER, WORSE], two=[EITHER, WORSE, BETTER], three=[WORSE, EITHER, WORSE])
+    heads, rows = verdict(results)[1:]
+    assert heads[2::2] == (
+        "best learned from the reward [mm]",
+        "best learned, plant known in training [mm]",
+        "lowest error",
     )
-    assert headline(made(one=[WORSE, WORSE], two=[BETTER, WORSE])).startswith("No agent wins on every scenario.")
+    better, either, worse = "-1.000 [-2.000, -0.500]", "0.100 [-1.000, 1.000]", "1.000 [0.500, 2.000]"
+    rival = "lqg 5.000 [4.000, 6.000]"
+    assert rows == (
+        ("one", rival, "a 6.000", worse, "b 4.000", better, "b"),
+        ("two", rival, "c 4.000", better, "b 6.000", worse, "c"),
+        ("three", rival, "a 6.000", worse, "b 5.100", either, "no difference shown"),
+    )
+    assert [sample.name for sample in best_of_each_kind(results)] == ["lqg", "b", "c"]
 
 
 def test_a_single_crystal_does_not_count_beside_others() -> None:
-    assert "single" not in headline(made(one=[WORSE, WORSE], single=[BETTER, BETTER]))
-    assert headline(made(single=[Estimate(-1.0, None, 1)])).startswith("a wins")
+    assert [row[0] for row in verdict(made(one=[WORSE], single=[BETTER])).rows] == ["one"]
+    assert verdict(made(single=[Estimate(-1.0, None, 1)])).rows[0][-1] == "a"
 
 
-def test_a_few_crystals_give_no_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
-    few = made(one=[BETTER])
-    monkeypatch.setattr(tables, "FEWEST", FEWEST + 1)
-    assert headline(few) == "No verdict: 20 crystals, and a verdict needs at least 21."
-
-
-def test_the_headline_says_that_no_agent_or_rival_took_part() -> None:
+def test_there_is_no_verdict_on_a_few_crystals_or_of_one_kind_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     (nobody,) = made(one=[])
-    assert headline([nobody]) == "No learned agent took part in this run."
+    alone = "No learned agent took part in this run."
+    assert verdict([nobody]) == (alone, (), ())
     seer = replace(nobody.samples[0], contender=contender("a", training_seeds=(0,), privileged=True))
-    assert headline([replace(nobody, samples=(seer,))]) == "No learned agent took part in this run."
+    assert verdict([replace(nobody, samples=(seer,))]) == (alone, (), ())
     agent = replace(seer, contender=contender("b", training_seeds=(0,)))
-    alone = replace(nobody, samples=(agent,), rival=None)
-    assert headline([alone]).startswith("No classical controller took part")
+    only = replace(nobody, samples=(agent,), rival=None)
+    assert verdict([only]).sentence.startswith("No classical controller took part")
+    monkeypatch.setattr(tables, "FEWEST", FEWEST + 1)
+    assert verdict(made(one=[BETTER])) == ("No verdict: 20 crystals, and a verdict needs at least 21.", (), ())
