@@ -9,6 +9,8 @@ import sys
 from importlib import import_module
 from typing import Any
 
+from . import interrupts  # noqa: F401  (first of all)
+
 try:
     import gymnasium as gym
 except ModuleNotFoundError as error:

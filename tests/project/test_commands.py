@@ -1,6 +1,9 @@
 """Every command: one line for options that cannot be meant, one line for Ctrl-C, and nothing left behind."""
 
+import os
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -64,6 +67,19 @@ def test_an_interrupt_and_a_place_that_cannot_be_written_are_one_line_and_leave_
     assert captured.err.count("\n") == 1
     assert ("interrupted" if writable else "new is not a folder") in captured.err
     assert [path.name for path in tmp_path.iterdir()] == ([] if writable else ["new"])
+
+
+@pytest.mark.parametrize(
+    "command", ["-m cz_gym.play", "-m studies.paper", "benchmark.py", "train.py", "-c import\tcz_gym"]
+)
+def test_an_interrupt_while_a_command_is_imported_is_one_line(command: str, tmp_path: Path) -> None:
+    """Whoever imports the package from a program of theirs keeps the traceback."""
+    (tmp_path / "gymnasium.py").write_text("raise KeyboardInterrupt")
+    found = [str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(found)}
+    done = subprocess.run([sys.executable, *command.split(" ")], env=environment, capture_output=True, text=True)
+    assert ((done.returncode, done.stderr) == (130, "interrupted\n")) == ("-c" not in command)
+    assert "Traceback" in done.stderr or done.returncode == 130
 
 
 @pytest.mark.parametrize(
