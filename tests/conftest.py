@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch's threads wait by spinning: several workers would only wait
 os.environ["SDL_VIDEODRIVER"] = os.environ["SDL_AUDIODRIVER"] = "dummy"  # no test opens a window
 CACHE = Path(__file__).parents[1] / ".pytest_cache" / "cz-gym"
 os.environ.setdefault("CZ_GYM_CACHE_DIR", str(CACHE))

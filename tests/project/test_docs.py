@@ -32,6 +32,7 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"
 SLOW = {"docs/paper.md", "docs/extend/meniscus.md", "docs/your-puller.md"}
 SMALL = {
     "num_envs=10_000": "num_envs=100",
+    "make_vec_env(1024": "make_vec_env(32",
     "TEST_SEEDS[:50]": "TEST_SEEDS[:2]",
     "TRAINING_SEEDS[:20]": "TRAINING_SEEDS[:2]",
     "VALIDATION_SEEDS[:10]": "VALIDATION_SEEDS[:2]",
