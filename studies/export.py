@@ -12,6 +12,7 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,6 +48,18 @@ class Row(NamedTuple):
     python: Sequence[float]
     """Of the table: RMSE [mm], pull step RMS [mm/min], both rounded as there; crystals lost."""
     c: Sequence[float]
+    rounded: Sequence[float] | None = None
+    """Where the row differs: that of C in double precision whose setpoints alone are rounded to single precision."""
+
+
+def rounded(runner: Runner) -> Any:
+    """The runner with outputs that are rounded to single precision."""
+
+    def run(inputs: Mapping[str, Any], memory: Any) -> Any:
+        outputs, memory = runner.run(inputs, memory)
+        return {name: value.astype(np.float32).astype(np.float64) for name, value in outputs.items()}, memory
+
+    return SimpleNamespace(start=runner.start, run=run)
 
 
 class Beside:
@@ -70,8 +83,7 @@ class Beside:
 def study(controller: str, scenario: str, crystals: int) -> list[Row]:
     """Grow the crystals with Python, and with the C in each precision that the controller allows."""
     block = make_block(controller, make_config(scenario, observation="measured", action="direct"))
-    reals = ["double"] if block.program.needs_double else list(LARGEST)
-    compiled = [CompiledBlock(block, real == "float") for real in reals]
+    compiled = [CompiledBlock(block, real == "float") for real in LARGEST]
 
     def grown(runner: Runner) -> Sequence[float]:
         run = rollout(BlockPolicy(block, runner), block.config, VALIDATION_SEEDS[:crystals])
@@ -80,9 +92,13 @@ def study(controller: str, scenario: str, crystals: int) -> list[Row]:
         return round(rmse, 3), round(step, 4), int(run.failed.sum())
 
     beside = Beside(block, compiled)
-    python, own = grown(beside), map(grown, compiled)
-    rows = zip(reals, beside.differences.tolist(), own, strict=True)
-    return [Row(controller, scenario, real, difference, python, c) for real, difference, c in rows]
+    python, rows = grown(beside), list[Row]()
+    for real, runner, difference in zip(LARGEST, compiled, beside.differences.tolist(), strict=True):
+        c = grown(runner)
+        rows.append(
+            Row(controller, scenario, real, difference, python, c, None if c == python else grown(rounded(compiled[0])))
+        )
+    return rows
 
 
 def report(rows: Sequence[Row], crystals: int) -> str:
@@ -93,11 +109,12 @@ def report(rows: Sequence[Row], crystals: int) -> str:
     def which(chosen: Sequence[Row]) -> str:
         return ", ".join(f"{row.controller} on {row.scenario} in {row.real}" for row in chosen) or "none"
 
-    heads = ("controller", "scenario", "C", "action", "RMSE [mm]", "of C", "pull step [mm/min]", "of C", "lost", "of C")
+    heads = (each for name in ("RMSE [mm]", "pull step [mm/min]", "lost") for each in (name, "of C", "rounded"))
     lines = []
-    for *names, difference, python, c in rows:
-        pairs = (f"{value:{form}}" for form, *pair in zip((".3f", ".4f", ""), python, c, strict=True) for value in pair)
-        lines.append((*names, f"{difference:.1e}", *pairs))
+    for *names, difference, python, c, alone in rows:
+        triples = zip((".3f", ".4f", ""), python, c, alone or ("",) * 3, strict=True)
+        cells = (value if value == "" else f"{value:{form}}" for form, *triple in triples for value in triple)
+        lines.append((*names, f"{difference:.1e}", *cells))
     return f"""# Exported C beside Python
 
 {crystals} validation crystals of three hours a row. Largest difference of an action on the same readings, in shares of
@@ -106,8 +123,10 @@ the drives' ranges: {said}.
 Actions above the limit: {which([row for row in rows if row.difference > LARGEST[row.real]])}.
 
 Rows of the table that differ: {which([row for row in rows if row.python != row.c])}.
+Beside a row that differs stands, as "rounded", that of the C in double precision whose setpoints alone are rounded to
+single precision: so much the loop of crystal and controller makes of the seventh digit.
 
-{markdown(heads, lines)}
+{markdown(("controller", "scenario", "C", "action", *heads), lines)}
 """
 
 

@@ -108,9 +108,8 @@ def _export(given: argparse.Namespace) -> None:
         print(shown(build_fmu(given.out, given.scenario, config.puller if given.puller else None)))
         return
     block, single = make_block(given.controller, config), given.real == "float"
-    if single and (block.program.needs_double or given.to == "onnx"):
-        why = "ONNX is written" if given.to == "onnx" else "its filter works on temperatures in kelvin and needs"
-        raise CzError(f"{given.controller}: {why} --real double")
+    if single and given.to == "onnx":
+        raise CzError("an ONNX graph is in double precision: leave out --real float")
     files: dict[str, bytes] = write_onnx(block.program) if given.to == "onnx" else {}
     if given.to in WRITERS:
         files = {name: text.encode() for name, text in WRITERS[given.to](block.program, single).items()}
@@ -128,7 +127,7 @@ def make_block(name: str, config: Config) -> Block:
     known = [entry.name for entry in pkgutil.resolve_name(f"{REGISTRY}:CONTROLLERS") if not entry.bound]
     plant = f"Puller {config.puller.label}; plant {config.plant_hash}; control interval {config.control_interval:g} s."
     pid = pkgutil.resolve_name(f"{REGISTRY}:make_controller")(FALLBACK, config)
-    identifier = re.sub(r"\W+", "_", Path(name).stem.lower())
+    identifier = re.sub(r"\W+", "_", Path(name.removesuffix(".onnx")).name.lower())
     if name in known:
         entry = pkgutil.resolve_name(f"{REGISTRY}:find_controller")(name)
         tuned = f"Settings tuned for scenario {config.scenario.name} ({config.scenario.hash}). {plant}"

@@ -12,7 +12,9 @@ import numpy as np
 from .trace import BAD, Floats, Graph, Ids, Node
 
 WIDE = ("last_time_s",)
-"""Memory that needs double precision also where the controller computes in single precision."""
+"""Memory that needs double precision also where the controller computes in single precision, beside sums over time."""
+CARRY = ("add", "subtract", "negative", "minimum", "maximum", "select", "multiply", "divide")
+"""Operations through which a sum over time goes on, products and quotients with a constant."""
 
 
 class Port(NamedTuple):
@@ -50,8 +52,6 @@ class Program:
     memory: tuple[Cell, ...]
     due: Ids
     """Whether the memory changes at this call, one logical element."""
-    needs_double: bool = False
-    """Whether single precision loses too much."""
     notes: tuple[str, ...] = ()
     """Facts for the header of each written file: puller, hashes, scenario."""
 
@@ -90,7 +90,6 @@ def record(
     memory: Any,
     ports: Sequence[tuple[Port, ...]],
     name: str,
-    needs_double: bool,
     notes: tuple[str, ...],
 ) -> Program:
     """Record ``step(given, memory) -> outputs, memory, due``; ``memory`` is that before the first sample.
@@ -100,17 +99,43 @@ def record(
     """  # fmt: skip
     graph, (settings, inputs, outputs) = Graph(), ports
     leaves = [(leaf, np.clip(np.asarray(value, np.float64), -BAD, BAD)) for leaf, value in flatten(memory)]
-    cells = [graph.input(leaf, value.shape) if value.size else value for leaf, value in leaves]
+    cells: list[Any] = [graph.input(leaf, value.shape) if value.size else value for leaf, value in leaves]
     given = {port.name: graph.input(port.name) for port in (*settings, *inputs)}
     results, after, due = step(given, rebuild(memory, iter(cells)))
 
     def ids_of(value: Any) -> Ids:
         return np.ascontiguousarray(graph.lift(value).ids).ravel()
 
-    held = tuple(
-        Cell(leaf, value.ravel(), ids_of(new), leaf in WIDE)
-        for (leaf, value), (_, new) in zip(leaves, flatten(after), strict=True)
-        if value.size
-    )
+    sources, held = [_sources(graph, node) for node in graph.nodes], list[Cell]()
+    for (leaf, value), cell, (_, new) in zip(leaves, cells, flatten(after), strict=True):
+        if value.size:
+            if leaf.endswith("covariance"):  # else rounding makes it ever less symmetric
+                new = 0.5 * (new + new.swapaxes(-1, -2))
+            wide = leaf in WIDE or _widen(graph, sources, cell.ids, ids_of(new))
+            held.append(Cell(leaf, value.ravel(), ids_of(new), wide))
     shown = tuple((port, ids_of(results[port.name])) for port in outputs)
-    return Program(name, graph, settings, inputs, shown, held, ids_of(due), needs_double, notes)
+    return Program(name, graph, settings, inputs, shown, tuple(held), ids_of(due), notes)
+
+
+def _sources(graph: Graph, node: Node) -> set[int]:
+    """The nodes whose values this one adds, limits, selects, or scales by a constant."""
+    traced = [set(graph.owners(ids).tolist()) for ids in node.args if graph.values(ids) is None]
+    linear = node.op in CARRY and (len(traced) == 1 or node.op not in ("multiply", "divide"))
+    return set[int]().union(*traced) if linear else set()
+
+
+def _widen(graph: Graph, sources: list[set[int]], before: Ids, after: Ids) -> bool:
+    """Mark the operations that sum memory over time, as integrals and leaky means do; whether there are any.
+
+    Rounding errors add up in such a sum: code in single precision has it in double.
+    """
+    reached = set(graph.owners(before.ravel()).tolist())
+    for at, its in enumerate(sources):
+        reached |= {at} if its & reached else set()
+    loop = set(graph.owners(after).tolist()) & reached
+    for at in sorted(reached, reverse=True):
+        loop |= sources[at] & reached if at in loop else set()
+    sums = any(graph.nodes[at].op in ("add", "subtract") for at in loop)
+    for at in loop if sums else ():
+        graph.nodes[at].wide = True
+    return sums

@@ -350,4 +350,4 @@ class Block:
     def program(self) -> Program:
         """What it computes, recorded."""
         ports = settings_of(self.config), INPUTS, OUTPUTS
-        return record(self._step, self.start(1), ports, self.name, self.controller.estimates_temperature, self.notes)
+        return record(self._step, self.start(1), ports, self.name, self.notes)

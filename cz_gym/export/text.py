@@ -28,9 +28,9 @@ def about(program: Program) -> list[str]:
 
 def write_c(program: Program, single: bool = False) -> dict[str, str]:
     """The header and the source, by file name."""
-    writer, name = Writer(program, c_dialect(single)), f"cz_{program.name}"
-    number, real = writer.dialect.number, f"cz_{program.name}_real"
-    guard = f"{name.upper()}_H"
+    writer, name = Writer(program, c_dialect(single), c_dialect(False)), f"cz_{program.name}"
+    real, guard = f"{name}_real", f"{name.upper()}_H"
+    kinds = {"b": "unsigned char", "d": "double", "w": real}
 
     def members(ports: tuple[Port, ...], default: bool) -> list[str]:
         return [
@@ -63,20 +63,22 @@ def write_c(program: Program, single: bool = False) -> dict[str, str]:
         f"#endif /* {guard} */", "",
     ]  # fmt: skip
     tables = [
-        f"static const {real} {table}[{len(values)}] = {{\n" + "\n".join(_rows(map(number, values))) + "\n};"
-        for table, values in writer.tables.values()
+        f"static const {'double' if wide else real} {table}[{len(values)}] = {{\n"
+        + "\n".join(_rows(map(writer.dialects[wide].number, values)))
+        + "\n};"
+        for table, values, wide in writer.tables.values()
     ]
     used = {word for line in writer.body for word in re.findall(r"\b(?:i|j|l|sum)\b", line)}
     declared = [f"    int {', '.join(sorted(used - {'sum'}))};"] + [f"    {real} sum;"] * ("sum" in used)
     source = [
         _comment(about(program), "/*", "*/"), f'#include "{name}.h"', "#include <math.h>", "", *tables, "",
         f"void {name}_init({name} *block)", "{",
-        *(f"    block->{port.name} = {number(port.default)};" for port in program.settings),
+        *(f"    block->{port.name} = {float(port.default)!r};" for port in program.settings),
         f"    {name}_reset(block);", "}", "", f"void {name}_reset({name} *block)", "{",
         *_starts(program, writer, "    int i;"), "}", "",
         f"void {name}_step({name} *block, const {name}_measured *measured, {name}_setpoints *setpoints)", "{",
         *declared,
-        *(field("unsigned char" if logical else real, work, size) for work, (size, logical) in writer.work.items()),
+        *(field(kinds[kind], work, size) for work, (size, kind) in writer.work.items()),
         "", *(f"    {line}" for line in writer.body), "}", "",
     ]  # fmt: skip
     return {f"{name}.h": "\n".join(header), f"{name}.c": "\n".join(source)}
@@ -84,8 +86,8 @@ def write_c(program: Program, single: bool = False) -> dict[str, str]:
 
 def write_st(program: Program, single: bool = False) -> dict[str, str]:
     """The function block, by file name."""
-    writer, name = Writer(program, st_dialect(single)), f"cz_{program.name}"
-    number, real = writer.dialect.number, "REAL" if single else "LREAL"
+    writer, name = Writer(program, st_dialect(single), st_dialect(single)), f"cz_{program.name}"
+    number, real = writer.dialects[False].number, "REAL" if single else "LREAL"
 
     def of(size: int, kind: str) -> str:
         return f"ARRAY [0..{size - 1}] OF {kind}" if size > 1 else kind
@@ -112,11 +114,11 @@ def write_st(program: Program, single: bool = False) -> dict[str, str]:
         *(
             f"    {table} : {of(len(values), real)} := [\n"
             + "\n".join(_rows(number(value).strip("()") for value in values)) + "\n    ];"
-            for table, values in writer.tables.values()
+            for table, values, _ in writer.tables.values()
         ),
         *(["END_VAR"] if writer.tables else []), "VAR_TEMP", "    i : DINT;", "    j : DINT;", "    l : DINT;",
         f"    sum : {real};",
-        *(f"    {work} : {of(size, 'BOOL' if logical else real)};" for work, (size, logical) in writer.work.items()),
+        *(f"    {work} : {of(size, 'BOOL' if kind == 'b' else real)};" for work, (size, kind) in writer.work.items()),
         "END_VAR", "", "IF reset OR NOT begun THEN", *_starts(program, writer, ""), "    begun := TRUE;", "END_IF;",
         *writer.body, "END_FUNCTION_BLOCK", "",
     ]  # fmt: skip
@@ -127,6 +129,7 @@ def _starts(program: Program, writer: Writer, declared: str) -> list[str]:
     """Statements that bring the memory to its state before the first sample."""
     lines: list[str] = []
     for cell in program.memory:
+        writer.dialect = writer.dialects[cell.wide]
         name, size = writer.dialect.prefixes[0] + cell.name, cell.start.size
         for first, last in runs(np.zeros(size, np.int64), np.unique(cell.start, return_inverse=True)[1]):
             value = writer.dialect.number(cell.start[first])

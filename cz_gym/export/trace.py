@@ -55,6 +55,8 @@ class Node:
     logical: bool = False
     data: Any = None
     """Values of a constant, name of an input, (m, k, n) of a matrix product."""
+    wide: bool = False
+    """Whether it is in double precision also where the controller computes in single precision."""
 
 
 @dataclass
@@ -125,9 +127,31 @@ class Graph:
         if all(value is not None for value in known):
             with np.errstate(all="ignore"):
                 return self.constant(FUNCTIONS[op](*known))
+        if op in ("add", "subtract"):
+            (a, c), (b, d) = map(self._parted, args)
+            if np.any(c) or np.any(d):
+                rest: Traced = a if b is None else self.apply(op, 0.0 if a is None else a, b)
+                if not np.any(constant := FUNCTIONS[op](c, d)):
+                    return rest
+                op, args = "add", np.broadcast_arrays(rest.ids, self.constant(constant).ids)
         flat = tuple(np.ascontiguousarray(ids).ravel() for ids in args)
         node = self.add(op, flat, flat[0].size)
         return Traced(self, node.start + np.arange(node.size).reshape(args[0].shape))
+
+    def _parted(self, ids: Ids) -> tuple[Any, Any]:
+        """A value as a traced part, None if there is none, and the constant that is added to it.
+
+        Sums keep their constants last. So the equations of a plant are recorded in deviations from its operating point,
+        and single precision keeps differences of temperatures that are small beside the temperatures.
+        """
+        if (constant := self.values(ids)) is not None:
+            return None, constant
+        node = self.owner(int(ids.flat[0]))
+        if node.op == "add" and (self.owners(ids) == self.owners(node.start)).all():
+            left, right = (arg[ids - node.start] for arg in node.args)
+            if (constant := self.values(right)) is not None:
+                return Traced(self, left), constant
+        return Traced(self, ids), 0.0
 
 
 class Traced(np.lib.mixins.NDArrayOperatorsMixin):

@@ -85,15 +85,16 @@ def st_dialect(single: bool) -> Dialect:
 class Writer:
     """The statements of a program in a dialect, with the work arrays and the constants that they need."""
 
-    def __init__(self, program: Program, dialect: Dialect) -> None:
+    def __init__(self, program: Program, dialect: Dialect, wide: Dialect) -> None:
         self.program, self.dialect, self.graph = program, dialect, program.graph
+        self.dialects = dialect, wide
         self.cells = {cell.name for cell in program.memory}
         self.own = self.cells | {port.name for port in program.settings}
-        self.tables: dict[bytes, tuple[str, Floats]] = {}
-        """Name and numbers of each table of constants."""
+        self.tables: dict[tuple[bytes, str, bool], tuple[str, Floats, bool]] = {}
+        """Name and numbers of each table of constants, and whether they are in double precision."""
         self._statements: list[tuple[list[str], int]] = []
         """Lines in which work arrays stand as ``<number>``; the number of the array that they fill, or -1."""
-        self._sizes: dict[int, tuple[int, bool]] = {}
+        self._kinds: dict[int, tuple[int, str]] = {}
         self._inlined: dict[int, str] = {}
         self._names: dict[int, str] = {}
         self._copies: dict[bytes, int] = {}
@@ -127,13 +128,14 @@ class Writer:
         owners: list[int] = np.unique(self.graph.owners(ids)).tolist()
         return owners
 
-    def _add(self, lines: list[str], size: int, logical: bool) -> int:
-        self._sizes[len(self._sizes)] = size, logical
-        self._statements.append((lines, len(self._sizes) - 1))
-        return len(self._sizes) - 1
+    def _add(self, lines: list[str], size: int, node: Node) -> int:
+        """A new work array of the node's kind, which these lines fill; its number."""
+        self._kinds[len(self._kinds)] = size, "b" if node.logical else "d" if node.wide else "w"
+        self._statements.append((lines, len(self._kinds) - 1))
+        return len(self._kinds) - 1
 
     def _node(self, node: Node) -> None:
-        at = int(self.graph.owners(node.start))
+        at, self.dialect = int(self.graph.owners(node.start)), self.dialects[node.wide]
         if node.op == "input":
             self._names[at] = self.dialect.prefixes[node.data not in self.own] + node.data
             return
@@ -154,7 +156,7 @@ class Writer:
         else:
             picked = self._array(node.args[0]).format(self.dialect.index.format(self._element(node.args[1])))
             lines = self.each("<new>", node.size, picked)
-        self._names[at] = f"<{self._add(lines, node.size, node.logical)}>"
+        self._names[at] = f"<{self._add(lines, node.size, node)}>"
 
     def _joins(self, at: int, node: Node) -> bool:
         """Whether the one use of a node is the same element of an operation on each element."""
@@ -200,8 +202,10 @@ class Writer:
         return self._inlined[owner] if owner in self._inlined else self._array(ids).format("i")
 
     def _table(self, values: Floats) -> str:
-        key = values.tobytes() + values.dtype.char.encode()
-        return self.tables.setdefault(key, (f"c{len(self.tables)}", values.ravel()))[0]
+        wide = self.dialect is self.dialects[True]
+        return self.tables.setdefault(
+            (values.tobytes(), values.dtype.char, wide), (f"c{len(self.tables)}", values.ravel(), wide)
+        )[0]
 
     def _copy(self, ids: Ids) -> int:
         """Work array that holds these elements next to each other."""
@@ -215,7 +219,7 @@ class Writer:
                 else:
                     line = self.assign(f"<new>[{plus('i', str(first) if first else '')}]", value)
                     lines += self.loop("i", last - first, [line])
-            self._copies[key] = self._add(lines, ids.size, self.graph.owner(int(ids[0])).logical)
+            self._copies[key] = self._add(lines, ids.size, self.graph.owner(int(ids[0])))
         return self._copies[key]
 
     def _finish(self) -> None:
@@ -226,6 +230,7 @@ class Writer:
             old = [node for node in nodes if node.op == "input" and node.data in self.cells]
             if old and old[0].data == cell.name and np.array_equal(cell.after, old[0].start + np.arange(size)):
                 continue
+            self.dialect = self.dialects[cell.wide]
             held = f"<{self._copy(cell.after)}>" + "[i]" * (size > 1) if old else self._element(cell.after)
             changes += self.each(self.dialect.prefixes[0] + cell.name, size, held)
         for port, ids in self.program.outputs:
@@ -236,26 +241,29 @@ class Writer:
         due = head.format(self._element(self.program.due))
         self._statements.append(([due, *(f"    {line}" for line in changes), tail], -1))
 
-    def _allocated(self) -> tuple[dict[str, tuple[int, bool]], list[str]]:
-        """Work arrays by name, and the lines with their names; an array is used again after its last use."""
+    def _allocated(self) -> tuple[dict[str, tuple[int, str]], list[str]]:
+        """Work arrays by name, and the lines with their names; an array is used again after its last use.
+
+        A kind is "b" for logical numbers, "d" for double precision, "w" for the controller's own.
+        """
         token, last = re.compile(r"<(\d+)>"), dict[int, int]()
         texts = ["\n".join(lines).replace("<new>", f"<{new}>") for lines, new in self._statements]
         for at, text in enumerate(texts):
             last.update(dict.fromkeys(map(int, token.findall(text)), at))
-        work: dict[str, tuple[int, bool]] = {}
-        free: dict[tuple[int, bool], list[str]] = {}
+        work: dict[str, tuple[int, str]] = {}
+        free: dict[tuple[int, str], list[str]] = {}
         names: dict[int, str] = {}
         for at, ((_, new), text) in enumerate(zip(self._statements, texts, strict=True)):
             if new >= 0:
-                kind = self._sizes[new]
+                kind = self._kinds[new]
                 if not free.setdefault(kind, []):
-                    free[kind].append(f"{'b' if kind[1] else 'w'}{len(work)}")
+                    free[kind].append(f"{kind[1]}{len(work)}")
                     work[free[kind][-1]] = kind
                 names[new] = free[kind].pop()
             texts[at] = token.sub(lambda match: names[int(match[1])], text)
             for number in set(map(int, token.findall(text))):
                 if last[number] == at:
-                    free[self._sizes[number]].append(names[number])
+                    free[self._kinds[number]].append(names[number])
         return work, "\n".join(texts).split("\n")
 
 
