@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(given: argparse.Namespace) -> None:
     check_writable(given.out.parent)
-    results = read_results(given.benchmark, [*FIGURES, RETURN])
+    results, _ = read_results(given.benchmark, [*FIGURES, RETURN])
     if not all(AGENTS.keys() <= by_name.keys() for by_name in results.values()):
         raise CzError(f"{given.benchmark}: no results of {', '.join(AGENTS)}")
     cards = {

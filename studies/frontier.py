@@ -91,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _compare(given: argparse.Namespace) -> None:
-    results = read_results(given.benchmark, (given.metric, ACTIVITY, RETURN, FAILURES))
+    results, _ = read_results(given.benchmark, (given.metric, ACTIVITY, RETURN, FAILURES))
     beside = given.benchmark.with_name(EPISODES)
     episodes = read_episodes(beside, lambda _: (ACTIVITY, given.metric)) if beside.exists() else None
     text = table(results, given.metric, episodes)

@@ -20,7 +20,7 @@ from cz_gym.commands import OneLineParser, between
 from cz_gym.contender import Contender, agent
 from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.errors import CzError
-from cz_gym.evaluation.files import read_benchmark, to_json
+from cz_gym.evaluation.files import read_results, to_json
 from cz_gym.evaluation.protocol import ROWS, TEST_SEEDS, Row, contract_hash
 from cz_gym.evaluation.report.markdown import summary
 from cz_gym.evaluation.report.tables import markdown as table
@@ -56,7 +56,7 @@ def submission(folder: Path) -> tuple[Contender, tuple[float, str]]:
     if not files:
         raise CzError(f"{folder}: no agent file (*.onnx)")
     claimed = folder / "benchmark.json"
-    results, contract = read_benchmark(claimed, ["rmse_mm"])
+    results, contract = read_results(claimed, ["rmse_mm"])
     if folder.name not in results.get(ROWS[0].name, {}):
         raise CzError(f"{claimed}: no results of {folder.name!r} on {ROWS[0].name}")
     contender = agent(folder.name, [OnnxPolicy.load(file) for file in files], own=True)

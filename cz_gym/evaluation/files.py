@@ -187,13 +187,11 @@ def to_csv(results: Sequence[Result]) -> str:
     return text.getvalue()
 
 
-def read_results(path: Path, metrics: Sequence[str]) -> dict[str, dict[str, dict[str, Estimate]]]:
-    """Read the estimates of these metrics from a ``benchmark.json``, by scenario and controller; CzError for others."""
-    return read_benchmark(path, metrics)[0]
+def read_results(path: Path, metrics: Sequence[str]) -> tuple[dict[str, dict[str, dict[str, Estimate]]], str]:
+    """Read a ``benchmark.json``: the estimates of these metrics by scenario and controller, and the contract's hash.
 
-
-def read_benchmark(path: Path, metrics: Sequence[str]) -> tuple[dict[str, dict[str, dict[str, Estimate]]], str]:
-    """The same, and the hash of its contract, empty in a file of an earlier release."""
+    The hash is empty in a file of an earlier release. Raises CzError for other files.
+    """
     with naming(path):
         text = path.read_text("utf-8")
     try:

@@ -7,6 +7,7 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from multiprocessing import get_context
 from threading import Thread
 from typing import Any
@@ -35,7 +36,8 @@ def in_processes(
         max(min(processes or processors(), len(tasks)), 1), context, initializer=_end_with, initargs=(leash,)
     )
     try:
-        numbers = {pool.submit(function, task): number for number, task in enumerate(tasks)}
+        with _uninterrupted():
+            numbers = {pool.submit(function, task): number for number, task in enumerate(tasks)}
         while numbers:
             for each in wait(numbers, WAIT, FIRST_COMPLETED).done:
                 yield numbers.pop(each), each.result()
@@ -47,6 +49,17 @@ def in_processes(
     finally:
         held.close()
         pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Ctrl-C waits till the end, and never comes to processes that start here: their imports would show a traceback."""
+    mask: Any = getattr(signal, "pthread_sigmask", lambda *_: None)  # Windows has none
+    before = mask(getattr(signal, "SIG_BLOCK", 0), {signal.SIGINT})
+    try:
+        yield
+    finally:
+        mask(getattr(signal, "SIG_SETMASK", 0), before)
 
 
 def _end_with(leash: Any) -> None:

@@ -33,20 +33,6 @@ def run_episodes(contender: Contender, row: Row, seeds: Sequence[int], progress:
     return Sample.of(contender, (rollout(policy, config, seeds, progress, designed_for) for policy in policies))
 
 
-def run_resumed(
-    contender: Contender, row: Row, seeds: Sequence[int], progress: Callable[[int], None], cache: Path
-) -> Sample:
-    """The same of a slow controller: cached episodes are read, the others run in blocks and cached."""
-    store = SlowEpisodes(contender, row, cache)
-    parts = store.read(seeds)
-    left = sorted({*seeds} - {seed for part in parts for seed in part.seeds})
-    progress(row.config().steps * (len(seeds) - len(left)))
-    for first in range(0, len(left), BLOCK):
-        parts.append(run_episodes(contender, row, left[first : first + BLOCK], progress))
-        store.write(parts[-1])
-    return Sample.joined(seeds, parts)
-
-
 def check_agents(contenders: Sequence[Contender], rows: Sequence[Row]) -> None:
     """Raise CzError for an agent that was trained for another environment than a row has, its control interval say."""
     for each in contenders:
@@ -95,31 +81,39 @@ def run(
     # The first pair compiles for all.
     alone = 1 if again and sum(steps) > LONG else len(pairs)
     measured = {}
-    for number, pair in enumerate(pairs[:alone]):
-        bar.set_description(f"{pair[0].name}, {pair[1].name}")
-        measured[number] = _rolled_out(pair, episodes, cache, bar.update)
-    apart = partial(_apart, again, episodes, cache)
-    for number, found in in_processes(apart, range(alone, len(pairs)), processes=min(processors(), PROCESSES)):
-        row, each = pairs[alone + number]
-        measured[alone + number] = Sample(each, *found)
+    for number, (row, each) in enumerate(pairs[:alone]):
         bar.set_description(f"{row.name}, {each.name}")
-        bar.update(steps[alone + number])
+        measured[number] = _measure((row, each), episodes, cache, bar.update)
+    apart, left = partial(_apart, again, episodes, cache), range(alone, len(pairs))
+    for place, found in in_processes(apart, left, processes=min(processors(), PROCESSES)):
+        measured[left[place]] = Sample(pairs[left[place]][1], *found)
+        bar.update(steps[left[place]])
     results = []
-    for number, row in enumerate(rows):
-        samples = [measured[number * len(contenders) + place] for place in range(len(contenders))]
+    for row in rows:
+        samples = [measured[number] for number, pair in enumerate(pairs) if pair[0] is row]
         results.append(summarise(row, samples, earlier_bound(bounds, row, samples) if bounds else None))
     return results
 
 
-def _rolled_out(pair: tuple[Row, Contender], episodes: int, cache: Path, progress: Callable[[int], None]) -> Sample:
+def _measure(pair: tuple[Row, Contender], episodes: int, cache: Path, progress: Callable[[int], None]) -> Sample:
+    """The sample of a pair; of a slow controller cached episodes are read, the others run in blocks and cached."""
     row, each = pair
-    rolled_out = partial(run_resumed, cache=cache) if each.slow else run_episodes
-    return rolled_out(each, row, episodes_of(each, row, episodes), progress)
+    seeds = episodes_of(each, row, episodes)
+    if not each.slow:
+        return run_episodes(each, row, seeds, progress)
+    store = SlowEpisodes(each, row, cache)
+    parts = store.read(seeds)
+    left = sorted({*seeds} - {seed for part in parts for seed in part.seeds})
+    progress(row.config().steps * (len(seeds) - len(left)))
+    for first in range(0, len(left), BLOCK):
+        parts.append(run_episodes(each, row, left[first : first + BLOCK], progress))
+        store.write(parts[-1])
+    return Sample.joined(seeds, parts)
 
 
 def _apart(again: Any, episodes: int, cache: Path, number: int) -> tuple[Any, ...]:
     """In another process: the sample of a pair without its contender, which would not pass between processes."""
     contenders, rows = again()
     pair = rows[number // len(contenders)], contenders[number % len(contenders)]
-    sample = _rolled_out(pair, episodes, cache, lambda steps: None)
+    sample = _measure(pair, episodes, cache, lambda steps: None)
     return sample.seeds, sample.values, sample.microseconds, sample.example

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -13,6 +14,9 @@ from tests.processes import ROOT
 
 
 def number_and_process(task: int) -> tuple[int, int]:
+    """What came with the process's number, if no Ctrl-C can come to it, nor could while it began."""
+    if sys.platform != "win32":
+        assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
     return task, os.getpid()
 
 

@@ -101,6 +101,15 @@ def test_the_folder_holds_every_file_and_nothing_else(finished: Path) -> None:
         assert f"]({image.name})" in report
 
 
+@pytest.mark.slow
+def test_processes_side_by_side_find_the_same(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runner, "LONG", 0)
+    agents = [f"--agent={finished.parent / f'{seed}.onnx'}" for seed in (3, 8)]
+    assert benchmark.main([*SMALL, "--out", str(tmp_path / "apart"), "--quiet", *agents]) == 0
+    assert (tmp_path / "apart" / "episodes.csv").read_bytes() == (finished / "episodes.csv").read_bytes()
+    assert (tmp_path / "apart" / "crystal.png").read_bytes() == (finished / "crystal.png").read_bytes()
+
+
 def test_json_names_every_metric_of_everyone(data: dict[str, Any]) -> None:
     """The agent does nothing, as open-loop does."""
     assert list(data["results"]) == ["randomized", "reference-b"]

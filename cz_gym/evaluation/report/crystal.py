@@ -15,10 +15,8 @@ from cz_gym.evaluation.results import Result, Sample
 from cz_gym.evaluation.rollout import Floats, Signals
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
-from .canvas import GREY, INK, Style, canvas, chosen, png
+from .canvas import COLUMNS, GREY, INK, Style, canvas, chosen, png
 
-COLUMNS = 5
-"""Largest number of controllers in the figure: with more, its text is too small on a page 830 pixels wide."""
 ROOM = (0.01 * MM, 3.0 * MM)
 """Smallest and largest margin of the radius axis around the reference [m]."""
 SMOOTH = 5.0 * MINUTE

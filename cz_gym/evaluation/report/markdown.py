@@ -13,6 +13,7 @@ from cz_gym.evaluation.results import BOUND, REFERENCE, SPEED, Result, Sample, c
 from cz_gym.puller import DEFAULT
 from cz_gym.units import HOUR, PERCENT
 
+from .canvas import COLUMNS, chosen
 from .tables import (
     DRIVES,
     ERROR,
@@ -32,8 +33,6 @@ from .tables import (
 )
 from .tables import markdown as table
 
-BEST = 2
-"""Agents that :func:`brief` shows: those of the lowest RMSE."""
 SHORT = (
     Column("max_error_mm", "max [mm]", 2, interval=False),
     Column("within_half_mm", "in 0.5 mm [%]", 1, PERCENT, interval=False),
@@ -57,16 +56,9 @@ def summary(results: Sequence[Result]) -> str:
 
 
 def brief(results: Sequence[Result]) -> str:
-    """Return :func:`summary` of the random scenarios for the quoted controllers and the best agents.
-
-    Everything is there if nobody is quoted, or nothing is random.
-    """
-    results = deciding(results)
-    means = results[0].means
-    samples = sorted(results[0].samples, key=lambda sample: means[sample.name][RMSE.metric].mean)
-    best = [sample.name for sample in samples if sample.contender.learned and not sample.contender.bound][:BEST]
-    shown = [sample for sample in results[0].samples if sample.contender.quoted or sample.name in best]
-    return summary([replace(results[0], samples=tuple(shown or results[0].samples)), *results[1:]])
+    """Return :func:`summary` of the random scenarios, of the controllers that the figure of a crystal shows."""
+    first, *others = deciding(results)
+    return summary([replace(first, samples=tuple(chosen(first.samples, COLUMNS))), *others])
 
 
 def fill_in(page: str, results: Sequence[Result]) -> str:

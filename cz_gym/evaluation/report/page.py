@@ -64,15 +64,14 @@ def _metrics(result: Result, is_open: bool) -> str:
     """Every metric of a scenario, the lowest RMSE first, to unfold."""
     columns = (*tables.ERROR, *tables.comparison(result), *tables.DRIVES)
     ranked = sorted(result.samples, key=lambda sample: result.means[sample.name][tables.RMSE.metric].mean)
-    heads, notes = (
-        ("controller", *(column.heading for column in columns)),
-        (" [bound]" * s.contender.bound for s in ranked),
-    )
-    rows = [(f"{name}{note}", *c) for (name, *c), note in zip(tables.rows(result, columns, ranked), notes, strict=True)]
+    heads = "controller", *(column.heading for column in columns)
+    rows = tables.rows(replace(result, samples=tuple(ranked)), columns)
+    marks = (" [bound]" * sample.contender.bound for sample in ranked)
+    marked = [(f"{name}{mark}", *cells) for mark, (name, *cells) in zip(marks, rows, strict=True)]
     about = escape(f"{result.row.meaning}. {measured_from(result).replace('`', '')}")
     return (
         f"<details{' open' if is_open else ''}><summary>{escape(result.row.name)} "
-        f'({tables.crystals(len(result.seeds))})</summary><p class="note">{about}</p>{_table(heads, rows)}</details>'
+        f'({tables.crystals(len(result.seeds))})</summary><p class="note">{about}</p>{_table(heads, marked)}</details>'
     )
 
 

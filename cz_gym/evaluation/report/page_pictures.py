@@ -22,7 +22,7 @@ from cz_gym.evaluation.rollout import Floats, Signals
 from cz_gym.evaluation.statistics import Estimate
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
-from .canvas import GREY, INK, MARKERS, Style, chosen
+from .canvas import COLUMNS, GREY, INK, MARKERS, Style, chosen
 from .crystal import example, lost
 from .figures import floor_of
 from .tables import PULL_STEP, RMSE
@@ -91,8 +91,6 @@ def _bars(estimate: Estimate) -> dict[str, Any]:
 
 POINT = 45.0
 """Time over which a point is the mean [s]."""
-MOST = 5
-"""Largest number of controllers whose signals are on the page, which keeps the page small."""
 OUTLIERS = 0.001
 """Share of the values at either end that may lie outside a panel's range [-]."""
 
@@ -157,7 +155,7 @@ def crystal(results: Sequence[Result], styles: Mapping[str, Style]) -> go.Figure
 
 def _draw(figure: go.Figure, scenario: int, result: Result, styles: Mapping[str, Style]) -> dict[str, Any]:
     """Add the lines of a scenario and return the ranges of its panels: those of the crystals that were not lost."""
-    samples, interval = chosen(result.samples, MOST), result.row.control_interval
+    samples, interval = chosen(result.samples, COLUMNS), result.row.control_interval
     bias, step = ring_bias(result.row, result.seeds[0]), max(round(POINT / interval), 1)
     time = {"x0": 0.5 * step * interval / MINUTE, "dx": step * interval / MINUTE}
     longest = max(map(example, samples), key=lambda signals: len(signals.r_c))

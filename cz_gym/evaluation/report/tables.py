@@ -88,11 +88,11 @@ def label(sample: Sample, result: Result) -> str:
     return sample.name + (f" (n = {met})" if met < len(result.seeds) else "")
 
 
-def rows(result: Result, columns: Sequence[Column], samples: Sequence[Sample] | None = None) -> list[tuple[str, ...]]:
-    """Return one row a contender, in the order of ``samples`` if given: its label, then the columns' texts."""
+def rows(result: Result, columns: Sequence[Column]) -> list[tuple[str, ...]]:
+    """Return one row a contender: its label, then the columns' texts."""
     return [
         (label(sample, result), *(column.text(column.estimate(result, sample.name)) for column in columns))
-        for sample in samples or result.samples
+        for sample in result.samples
     ]
 
 

@@ -12,8 +12,7 @@ from cz_gym.baselines.registry import CONTROLLERS
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.protocol import find_row
-from cz_gym.evaluation.report.canvas import COLOURS, DPI, chosen, styles_of
-from cz_gym.evaluation.report.crystal import COLUMNS
+from cz_gym.evaluation.report.canvas import COLOURS, COLUMNS, DPI, chosen, styles_of
 from cz_gym.evaluation.report.figures import NAMED, draw_figures
 from cz_gym.evaluation.report.markdown import brief
 from cz_gym.evaluation.results import Sample, summarise
