@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from itertools import cycle
-from typing import IO, NamedTuple
+from typing import NamedTuple
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -86,11 +86,7 @@ def png(figure: Figure) -> bytes:
         axis.yaxis.label.set_fontsize(8.5)
     image = io.BytesIO()
     figure.savefig(image, dpi=DPI, format="png", metadata={"Software": None})
-    return small(image)
-
-
-def small(image: IO[bytes]) -> bytes:
-    """Return the image as a PNG of at most 256 colours, which is a third of the size; figures have few colours."""
+    # At most 256 colours make a third of the size; figures have few.
     palette = Image.open(image).convert("RGB").quantize(256, dither=Image.Dither.NONE)
     packed = io.BytesIO()
     palette.save(packed, format="png", optimize=True)

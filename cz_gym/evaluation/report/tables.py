@@ -209,14 +209,11 @@ def _sentence(where: Mapping[str, Sequence[str]]) -> str:
     total = sum(map(len, where.values()))
 
     def listed(names: Sequence[str]) -> str:
-        return (
-            f"all {total} scenarios"
-            if len(names) == total > 1
-            else " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
-        )
+        some = " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+        return f"all {total} scenarios" if len(names) == total > 1 else some
 
-    held = [f"by {kind} on {listed(names)}" for kind, names in where.items() if kind and names]
-    same = listed(where[""]) if where[""] else ""
+    places = {kind: listed(names) for kind, names in where.items() if names}
+    held = ", ".join(f"by {kind} on {place}" for kind, place in places.items() if kind)
     if not held:
-        return f"No difference is shown between classical controllers and learned agents on {same}."
-    return f"The radius is held best {', '.join(held)}" + (f"; on {same} no difference is shown." if same else ".")
+        return f"No difference is shown between classical controllers and learned agents on {places['']}."
+    return f"The radius is held best {held}" + (f"; on {places['']} no difference is shown." if "" in places else ".")
