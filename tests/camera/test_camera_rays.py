@@ -125,14 +125,6 @@ def test_rays_hit_the_first_surface_in_their_way(ray: Ray, what: int, at: tuple[
         np.testing.assert_allclose([hit.x, hit.y, hit.z], at, atol=1e-4 if what == MELT else 1e-12)
 
 
-def test_a_low_ray_from_the_melt_meets_the_rising_meniscus() -> None:
-    scene = scene_at()
-    hit = first_hit(Ray(scene.r_c + 0.02, 0.0, 1e-4, -1.0, 0.0, 0.2), FLAT, scene, VIEW)
-    assert hit.what == MELT
-    assert hit.z == pytest.approx(1e-4 + 0.2 * (scene.r_c + 0.02 - hit.x), abs=1e-10)
-    assert hit.z == pytest.approx(height_of_melt(hit.x, scene), abs=1e-9)
-
-
 @pytest.mark.parametrize(("tilt", "wall_height"), [(0.2, 0.12), (0.349, 0.12), (0.45, 0.08), (0.349, 0.2)])
 def test_the_rings_edge_halves_the_angle_between_camera_and_walls_end(tilt: float, wall_height: float) -> None:
     """The jump of brightness down the middle, by bisection on traced rays, against the half-angle's closed form."""

@@ -111,9 +111,7 @@ def test_excitation_is_a_smooth_action_of_white_noise() -> None:
         (["--policies", "papper"], "unknown policy 'papper': did you mean 'paper'?"),
         (["--policies", "lqg-true"], "unknown policy 'lqg-true'"),
         (["--scenarios", "randomised"], "unknown scenario 'randomised'"),
-        (["--scenarios", ""], "unknown scenario ''"),
         (["--noise", "-1"], "noise must be between 0 and 1, not -1"),
-        (["--noise", "nan"], "noise must be between 0 and 1, not nan"),
     ],
 )
 def test_bad_input_gets_one_line_and_leaves_nothing(options: list[str], said: str, refused: Any, place: Path) -> None:
@@ -153,5 +151,3 @@ def test_policies_that_do_not_fit_are_refused() -> None:
     pytest.importorskip("onnxruntime")
     with pytest.raises(ValueError, match=r"ppo is made for control_interval=5.0, this config has 2.0"):
         find_policy("ppo", replace(CONFIG, control_interval=2.0))
-    with pytest.raises(ValueError, match="needs a Config, not 'hard'"):
-        find_policy("paper", "hard")  # type: ignore[arg-type]

@@ -42,14 +42,14 @@ def test_memory_is_not_reused_while_a_reference_to_it_is_left(way: str) -> None:
     address = array.ctypes.data
     held = look(array)
     del array
-    gc.collect()
+    gc.collect(0)
     later = [pool.new() for _ in range(2 * SPARES)]
     for other in later:
         other[...] = -1.0
     assert address not in {other.ctypes.data for other in later}
     assert read(held) in (7.0, None)
     del held
-    gc.collect()
+    gc.collect(0)
     assert pool.new().ctypes.data == address, "let go, the memory is used again"
 
 

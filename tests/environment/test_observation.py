@@ -103,12 +103,6 @@ def test_history_is_differences_of_past_means_and_the_integral(interval: float) 
     np.testing.assert_allclose(rows[1:, 11], np.cumsum(steps), rtol=1e-4, atol=1e-5)
 
 
-def test_lags_at_the_default_interval_cover_the_past_without_gaps() -> None:
-    newest, oldest = lags(5.0)
-    assert oldest.tolist() == [round(age / 5) for age in LAGS]
-    assert newest.tolist() == [1, *(oldest[:-1] + 1).tolist()]
-
-
 def test_the_observation_state_is_that_of_the_plant() -> None:
     env = CzEnv("puller", observation="state", info="all", action="direct")
     rows, infos, start = run(env, 50, 0.05)

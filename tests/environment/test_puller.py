@@ -87,13 +87,10 @@ def test_what_a_file_does_not_say_keeps_the_defaults_value_and_is_listed(tmp_pat
     [
         ("[crystal]\nradius_mmm = 150", "did you mean 'radius_mm'"),
         ("[crystal]\nradius_mm = nan", "radius_mm must be a number, not NaN"),
-        ("[crystal]\nradius_m = 0.15", "did you mean 'radius_mm'"),
         ("[crystal]\nC_1_J_per_K = 5e4", "belongs in [hot_zone]"),
         ("[crystall]\nradius_mm = 150", "did you mean '[crystal]'"),
         ("[crystal]\nradius_mm = 0.15", "did you mean 150 (0.15 m)"),
-        ("[crystal]\nT_m_K = true", "must be a number"),
         ("[crystal]\nradius_mm = [1, 2]", "must be a number"),
-        ("[crystal]\nradius_mm = inf", "must be a number"),
         ("[crystal]\nradius_mm = 1e9999", "no plausible number"),
         ("[crystal]\nradius_mm = 300", "must be wider than the crystal"),
         ("[hot_zone]\nT_a_K = 25", "did you mean 298.15 (25 °C)"),
@@ -104,7 +101,6 @@ def test_what_a_file_does_not_say_keeps_the_defaults_value_and_is_listed(tmp_pat
         ("[sensors]\ncamera_noise_mm = [0.1, 0.05]", "low <= high"),
         ("[sensors]\ninterval_s = 2000", "did you mean 2 (2000 ms)"),
         ("name = 5", "must be up to 80 printable characters"),
-        ("crystal = 5", "must be a table"),
         ("[crystal", "mine.toml"),
     ],
 )

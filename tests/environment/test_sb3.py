@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv
 from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.from_sb3 import save_agent
-from cz_gym.sb3 import AsymmetricPolicy, CzVecEnv, make_vec_env
+from cz_gym.sb3 import AsymmetricPolicy, make_vec_env
 
 N = 3
 SETTINGS: dict[str, Any] = {"scenario": "hard", "control_interval": 20.0, "horizon": 400.0}
@@ -104,11 +104,6 @@ def test_the_adapter_has_the_attributes_and_methods_of_a_vec_env() -> None:
     assert env.env_is_wrapped(CzEnv) == [False] * N
     with pytest.raises(ValueError, match="no indices"):
         env.set_attr("render_mode", None, [0])
-
-
-def test_wrong_settings_are_refused() -> None:
-    with pytest.raises(ValueError, match="SAME_STEP"):
-        CzVecEnv(CzVectorEnv(2))
 
 
 @pytest.mark.parametrize("observation", ["measured", "history", "state"])

@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 
 from cz_gym import CzVectorEnv
-from cz_gym.agents import load
 from cz_gym.baselines import CompensatedPID
 from cz_gym.config import make_config
-from cz_gym.errors import CzError
 from cz_gym.evaluation.replay import Playback, replay
 from cz_gym.evaluation.rollout import Rollout, rollout
 from tests.observed import PLAIN
@@ -74,10 +72,3 @@ def test_bad_arguments_are_refused(arguments: dict[str, Any]) -> None:
     for log in ([], [1.0, 2.0], np.zeros((3, 3)), np.zeros((0, 2))):
         with pytest.raises(ValueError, match="logged actions must be of shape"):
             Playback(log)
-
-
-def test_policies_of_another_environment_are_refused() -> None:
-    agent, pid = load("gradient"), CompensatedPID()
-    for one, other in ((agent, pid), (pid, agent)):
-        with pytest.raises(CzError, match=r"made for action='rate', .* the environment has action='direct'"):
-            replay(one, other, make_config("randomized", horizon=600.0, **PLAIN), [1])

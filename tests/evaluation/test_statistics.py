@@ -97,8 +97,3 @@ def test_cvar_is_the_mean_of_the_worst_twentieth(rng: np.random.Generator) -> No
     assert cvar(few[:, :10], Resamples.draw(10)).mean == pytest.approx(10)
     seeds = np.stack([np.zeros(20), np.arange(20.0)])
     assert cvar(seeds, Resamples.draw(20)).mean == pytest.approx((19 + 18) / 2)
-
-
-def test_a_bootstrap_of_no_episodes_is_refused() -> None:
-    with pytest.raises(ValueError, match="at least one"):
-        Resamples.draw(0)

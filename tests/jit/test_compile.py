@@ -12,7 +12,7 @@ import pytest
 
 from cz_gym import HURLE
 from cz_gym.engine.kernels import build_kernels
-from cz_gym.jit.cache import CachedCode, Store, cache_folder, source_hash
+from cz_gym.jit.cache import CachedCode, Store, cache_folder
 from cz_gym.jit.compile import jittable, kernel
 from cz_gym.physics.meniscus import hurle_height
 from tests.processes import ROOT, python
@@ -145,18 +145,3 @@ def test_a_users_meniscus_is_never_run_from_a_cache() -> None:
 
     kept = [isinstance(build_kernels(one).step._cache, CachedCode) for one in (HURLE, HURLE._replace(height=height))]
     assert kept == [True, False]
-
-
-def test_hash_sees_names_and_contents(package: Path) -> None:
-    folder = package / "cz_gym"
-    first = source_hash(folder)
-    assert first == source_hash(ROOT / "cz_gym")
-    edit(folder / "cost.py", "FAILURE_COST = 1000.0", "FAILURE_COST = 1001.0")
-    second = source_hash(folder)
-    (folder / "cost.py").rename(folder / "costs.py")
-    third = source_hash(folder)
-    edit(folder / "rendering" / "canvas.py", "from __future__", "# changed\nfrom __future__")
-    fourth = source_hash(folder)
-    (folder / "evaluation" / "report" / "markdown.py").write_text("nothing of it is compiled")
-    assert len({first, second, third, fourth}) == 4
-    assert source_hash(folder) == fourth

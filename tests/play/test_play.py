@@ -85,19 +85,6 @@ def test_a_failed_run_counts_to_the_horizon() -> None:
     assert ", failed; by the paper's controller RMSE" in line
 
 
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        (["--scenario", "nonsense"], "unknown scenario 'nonsense'"),
-        (["--speed", "0"], "--speed: must be between 5 and 300, not 0"),
-        (["--minutes", "inf"], "--minutes: must be between 1 and 6000, not inf"),
-        (["--seed", "-1"], "--seed: must be between 0 and"),
-    ],
-)
-def test_a_wrong_option_is_refused_in_one_line(options: list[str], says: str, refused: Any) -> None:
-    assert says in refused(play.main, options)
-
-
 def test_playing_without_pygame_says_what_to_install(monkeypatch: pytest.MonkeyPatch, refused: Any) -> None:
     monkeypatch.setitem(sys.modules, "pygame", None)
     assert refused(play.main, []) == f"python -m cz_gym.play: {canvas.MISSING}\n"

@@ -150,8 +150,6 @@ def test_every_episode_is_in_the_table_and_provenance_says_what_was_run(finished
     ("arguments", "message"),
     [
         (["--episodes", "0"], "between 1 and 500, not 0"),
-        (["--episodes", "501"], "between 1 and 500, not 501"),
-        (["--episodes", "many"], "invalid int value: 'many'"),
         (["--controllers", "pid"], "unknown controller 'pid'; choose from open-loop, paper"),
         (["--controllers", "paper,,ppo"], "names with commas between"),
         (["--scenarios", "easy"], "unknown scenario 'easy'; choose from randomized, hard"),
@@ -351,13 +349,11 @@ def test_a_report_on_one_s_own_shows_it_and_prints_a_command_that_runs(
     ("option", "place", "message"),
     [
         ("--controller", "mine.py", "must be FILE.py:NAME"),
-        ("--controller", "nobody.py:Still", "no such file"),
         ("--controller", "mine.py:Stil", "controller 'Stil': did you mean 'Still'? Choose from Still, still, made\n"),
         ("--scenario", "mine.py:soon", "unknown scenario 'soon'; choose from later\n"),
         ("--scenarios", "soon", "randomized-exact\n"),
         ("--controller", "mine.py:number", "no controller"),
         ("--controller", "mine.py:later", "no controller"),
-        ("--scenario", "mine.py:Still", "no scenario"),
         ("--controller", "lqg.py:lqg", "two controllers are called 'lqg'"),
         ("--controller", "lqg.py:gradient", "two controllers are called 'gradient'"),
     ],

@@ -98,16 +98,12 @@ def test_nothing_is_imported_from_above(package: str) -> None:
     assert mine
 
 
-@pytest.mark.parametrize(
-    ("module", "absent"),
-    [("cz_gym", {"cz_gym.physics.young_laplace"}), ("cz_gym.play", {"torch", "pygame", "PIL", "onnxruntime"})],
-)
-def test_importing_loads_nothing_that_is_not_needed(module: str, absent: set[str]) -> None:
-    code = f"import sys, {module}; assert not {absent} & set(sys.modules)"
-    python("-W", "error", "-c", code)
-
-
-@pytest.mark.parametrize("name", ["baselines", "agents"])
-def test_no_module_has_a_second_name(name: str) -> None:
-    code = f"import cz_gym.{name}\ntry: import {name}.anything\nexcept ImportError as error: print(error)"
-    assert f"import cz_gym.{name}" in python("-c", code)
+def test_importing_loads_nothing_that_is_not_needed_and_no_module_has_a_second_name() -> None:
+    loads = "import sys, {}; assert not {} & set(sys.modules)"
+    code = [loads.format("cz_gym", {"cz_gym.physics.young_laplace"})]
+    code += [loads.format("cz_gym.play", {"torch", "pygame", "PIL", "onnxruntime"})]
+    for name in ("baselines", "agents"):
+        code += [f"import cz_gym.{name}", f"try: import {name}.anything", "except ImportError as error: print(error)"]
+    told = python("-W", "error", "-c", "\n".join(code))
+    assert "import cz_gym.baselines" in told
+    assert "import cz_gym.agents" in told

@@ -14,9 +14,7 @@ from cz_gym.rendering import palette, scene, triple_point
 from cz_gym.rendering.canvas import Canvas, Frame
 from cz_gym.rendering.record import Ending, Record
 from cz_gym.rendering.scene import layout
-from cz_gym.signals import INFO
 from cz_gym.units import MM
-from tests.observed import PLAIN
 
 pygame = pytest.importorskip("pygame")
 CANVAS = Canvas(640, 480)
@@ -103,20 +101,6 @@ def test_the_drawn_meniscus_leaves_the_triple_point_and_meets_the_ring(
 
 def test_length_grown_is_the_integral_of_the_growth_rate(record: Record) -> None:
     assert record.length[-1] == pytest.approx(trapezoid(record.column("v_g"), record.t), rel=2e-3)
-
-
-def test_crystal_that_melted_back_is_not_drawn() -> None:
-    env = CzEnv("nominal", render_mode="rgb_array", **PLAIN)
-    env.reset(seed=1)
-    record = env._view.record
-    info = record._samples[0, :-1].copy()
-    for radius, v_p in (0.0871, 1e-3), (0.0872, 1e-3), (0.0873, -1.5e-3), (0.0874, 1e-4):
-        info[[INFO.index("r_c"), INFO.index("v_p")]] = radius, v_p
-        record.add(info, 1.0)
-    r_c, _, z = record.surface()
-    assert np.all(np.diff(z) >= 0)
-    assert r_c == pytest.approx([0.0874, 0.0873, record.puller.r_0])
-    assert env.render() is not None
 
 
 @pytest.mark.parametrize(("pull", "ending"), [(1.0, Ending.DETACHED), (-1.0, Ending.FROZEN)])

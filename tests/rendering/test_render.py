@@ -79,15 +79,6 @@ def test_before_the_first_reset_there_is_no_crystal() -> None:
             env.render()
 
 
-def test_without_a_mode_render_warns_as_gymnasiums_environments_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[str] = []
-    monkeypatch.setattr(gym.logger, "warn", said.append)
-    env = CzEnv(**PLAIN)
-    env.reset(seed=1)
-    assert env.render() is None
-    assert ["rgb_array" in each for each in said] == [True]
-
-
 def test_a_frame_is_the_callers_own() -> None:
     env = CzEnv(render_mode="rgb_array", **PLAIN)
     env.reset(seed=1)
@@ -101,16 +92,6 @@ def test_a_frame_is_the_callers_own() -> None:
         env.step(np.ones(2, np.float32))
     assert not np.array_equal(env.render(), kept)
     assert np.array_equal(second, kept)
-
-
-def test_a_restored_state_is_shown_from_there_on() -> None:
-    env = CzEnv(render_mode="rgb_array", **PLAIN)
-    env.reset(seed=1)
-    for _ in range(30):
-        env.step(np.zeros(2, np.float32))
-    env.reset(options={"state": env.get_state()})
-    assert env._view.record.t.tolist() == [150.0]
-    assert env.render() is not None
 
 
 def test_gymnasiums_wrappers_for_windows_and_lists_of_frames_work() -> None:

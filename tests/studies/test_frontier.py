@@ -2,8 +2,6 @@
 
 import json
 
-import pytest
-
 from cz_gym.baselines.lqg.designs import family_name
 from studies import frontier
 
@@ -25,13 +23,6 @@ def test_a_benchmark_is_compared_at_equal_activity(tmp_path, capsys):
     assert "| lively | 0.0300 | 0.1000 | 1.414, more active than any LQG (0.0200) | -0 |" in told
     assert "Spearman's correlation of return and ratio, with its sign turned: 0.63 (4 rows)." in told
     assert "## nominal\n\na frontier needs two settings" in told
-
-
-@pytest.mark.parametrize("content", ["", "[]", "{}", '{"results": {"randomized": {"lqg": 1}}}'])
-def test_another_file_is_refused_in_a_line(content, tmp_path, refused):
-    (tmp_path / "x.json").write_text(content)
-    refused(frontier.main, [str(tmp_path / "x.json")])
-    refused(frontier.main, [str(tmp_path / "none.json")])
 
 
 def test_episodes_beside_a_benchmark_give_intervals_unless_they_are_of_another_run(tmp_path, capsys, refused):

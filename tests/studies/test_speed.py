@@ -1,6 +1,5 @@
 """The speed command's structure on a tiny run; its measurements are never tested."""
 
-import inspect
 import json
 import timeit
 from functools import partial
@@ -49,21 +48,3 @@ def test_every_row_of_ours_can_be_made_and_steps(monkeypatch: pytest.MonkeyPatch
     result = speed.measure(wanted, 1)
     assert result["skipped"] == {}
     assert len(result["rows"]) == len(wanted)
-
-
-def test_a_ratio_compares_the_fastest_rows_of_each_name() -> None:
-    speeds = {"ours, 1 thread": 100.0, "ours, 2 threads": 180.0, "peer, 1 thread": 60.0, "peer, 2 threads": 30.0}
-    assert speed.ratio(speeds, "ours", "peer") == 3.0
-    assert speed.ratio(speeds, "ours, 1 thread", "peer, 2") == 100.0 / 30.0
-    assert speed.ratio(speeds, "ours", "absent") is None
-
-
-def test_cases_without_resets_repeat_the_same_minutes() -> None:
-    for make in (speed.without_resets, speed.bare_plant):
-        case = make(64, 1)
-        memory = inspect.getclosurevars(case.step).nonlocals
-        for _ in range(3 * speed.UNFAILED):
-            case.step()
-            assert not memory["slots"]["over"].any()
-        assert memory["slots"].tobytes() == memory["first"].tobytes()
-        case.close()

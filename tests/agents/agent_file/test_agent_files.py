@@ -1,6 +1,7 @@
 """Agent files: what is broken, or made for something else, is refused in one line."""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,21 @@ def test_networks_that_give_no_action_are_refused(change: Any, message: str, age
     write_agent(agent, model.SerializeToString(), **facts())
     with pytest.raises(AgentFileError, match=message):
         OnnxPolicy.load(agent)
+
+
+def test_an_agent_loads_where_the_system_has_no_pipes_to_wait_for(agent: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows has no O_NONBLOCK, and a flag of its own without which a file would end at a Ctrl-Z."""
+    binary, opened, by_system = 1 << 28, [], os.open
+
+    def opening(path: Any, flags: int, *rest: Any, **named: Any) -> int:
+        opened.append((str(path), flags & binary))
+        return by_system(path, flags & ~binary, *rest, **named)
+
+    monkeypatch.delattr(os, "O_NONBLOCK")
+    monkeypatch.setattr(os, "O_BINARY", binary, raising=False)
+    monkeypatch.setattr(os, "open", opening)
+    OnnxPolicy.load(agent)
+    assert (str(agent), binary) in opened
 
 
 def test_an_oversized_file_is_refused(agent: Path) -> None:

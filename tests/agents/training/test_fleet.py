@@ -15,7 +15,6 @@ import train
 from cz_gym.agents import AgentFileError
 from cz_gym.agents.training import fleet, run
 from cz_gym.agents.training.recipes import PPO, RECIPES, Recipe
-from cz_gym.atomic_files import locked
 from tests.small_learners import REFERENCES, train_small_seed
 
 pytestmark = pytest.mark.usefixtures("few_crystals")
@@ -145,13 +144,6 @@ def test_one_seed_that_fails_stops_no_other(
         assert "in failing" in notes
         assert "seed 1" in notes
     assert sorted(agents(tmp_path)) == ["seed0", "seed2"]
-
-
-def test_a_folder_in_use_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], trained: list[int]) -> None:
-    with locked(tmp_path / "seed1"):
-        assert train.main(["--algo", "ppo", "--seeds", "0-1", "--out", str(tmp_path)]) == 2
-    assert capsys.readouterr().err == f"train.py: {tmp_path}/seed1: another process is at work in this folder\n"
-    assert not trained
 
 
 @pytest.mark.slow

@@ -40,7 +40,7 @@ def test_a_run_leaves_everything_and_goes_on(
     algorithm: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "run"
-    assert train.main(["--algo", algorithm, "--steps", "20000", "--seed", "3", "--out", str(folder), "--plot"]) == 0
+    assert train.main(["--algo", algorithm, "--steps", "9000", "--seed", "3", "--out", str(folder), "--plot"]) == 0
     crystals = "0.175 hard + 0.175 hot-zone + 0.175 puller + 0.3 randomized + 0.175 sensor-fault"
     assert f" steps on {crystals}, into {folder}\n" in capsys.readouterr().out
     assert (folder / "progress.png").read_bytes().startswith(b"\x89PNG")
@@ -63,10 +63,10 @@ def test_a_run_leaves_everything_and_goes_on(
     assert rows(folder / "progress.csv") == before
     assert train.main(["--algo", algorithm, "--out", str(folder)]) == 2
     assert "--resume" in capsys.readouterr().err
-    assert train.main(["--algo", algorithm, "--steps", "40000", "--seed", "3", "--resume", "--out", str(folder)]) == 0
+    assert train.main(["--algo", algorithm, "--steps", "18000", "--seed", "3", "--resume", "--out", str(folder)]) == 0
     after = rows(folder / "progress.csv")
     assert after[: len(before)] == before
-    assert int(after[-1]["steps"]) >= 40000 > int(before[-1]["steps"])
+    assert int(after[-1]["steps"]) >= 18000 > int(before[-1]["steps"])
 
 
 @pytest.fixture
@@ -102,41 +102,15 @@ def test_ctrl_c_in_the_middle_of_an_update_saves_after_it(
 
 
 @pytest.mark.parametrize(
-    ("given", "resumes"),
-    [
-        (["--algo", "ppo", "--seeds", "1-3"], "--algo ppo --seeds 1-3 --resume"),
-        (["--resume", "--out", "two words"], "--out 'two words' --resume"),
-    ],
-)
-def test_interrupting_before_learning_prints_one_line(
-    given: list[str], resumes: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def interrupt(arguments: Any) -> int:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(train, "train", interrupt)
-    monkeypatch.chdir(tmp_path)
-    assert train.main(given) == 130
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert f"{interpreter()} train.py {resumes} continues from the last checkpoint" in said
-
-
-@pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--algo", "dqn"], "invalid choice: 'dqn'"),
         (["--seeds", "9-0"], "must be FIRST-LAST"),
         (["--seeds", "0-99999999999"], "at most 1000 seeds"),
-        (["--seeds", "0-1", "--seed", "0"], "not allowed with"),
         (["--steps", "0"], "between 1 and 1000000000000, not 0"),
-        (["--seed", "minus"], "between 0 and 9223372036854775807, not minus"),
         (["--checkpoint-seconds", "nan"], "between 0 and 1000000, not nan"),
         (["--sceanrio", "hard"], "unrecognized arguments"),
-        (["--scen", "hard"], "unrecognized arguments"),
         (["--scenario", "quiet"], "unknown scenario 'quiet'"),
         (["--scenario", "hard=much"], "'hard=much' is no scenario with its share"),
-        (["--scenario", "hard=0.5,quiet=0.5"], "unknown scenario 'quiet'"),
         (["--scenario", "none.py:quiet"], "none.py: no such file"),
         (["--resume"], "nothing to resume"),
     ],

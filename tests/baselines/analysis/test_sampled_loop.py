@@ -105,6 +105,13 @@ def test_margins_at_the_heater_are_the_factors_on_its_power_that_the_loop_surviv
         assert not close(with_heat(form.controller, 1.02 * margins.gain_up), puller, 5.0).stable
 
 
+def test_the_linear_form_of_an_lqg_has_the_noise_of_the_camera_that_it_is_given():
+    lqg = make_controller("lqg", make_config("randomized", **PLAIN))
+    sensors = [Sensor(camera_noise=(sd, sd), pyrometer_noise=(0.2, 0.2)) for sd in (0.01 * MM, 0.1 * MM)]
+    quiet, loud = (np.abs(linear_form(lqg, sensor).controller.D[0, 0]) for sensor in sensors)
+    assert 0.0 < loud < 0.5 * quiet
+
+
 def test_a_range_of_hot_zones_ends_where_the_loop_turns_unstable():
     form = linear_form(make_controller(TOLD, make_config("randomized", **PLAIN)))
     low, high = stable_range(form.controller, 5.0, "C_2", 0.5)

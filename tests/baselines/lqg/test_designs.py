@@ -11,7 +11,11 @@ from tests.observed import PLAIN
 CRYSTALS = range(16)
 
 
-@pytest.mark.parametrize("name", ["lqg", *FAMILY, *(f"{name}-adaptive" for name in WITH_ADAPTIVE)])
+ADAPTIVE = [pytest.param(f"{name}-adaptive", marks=pytest.mark.slow) for name in WITH_ADAPTIVE]
+"""That each of their filters holds the slowest hot zones, ``test_adaptive.py`` tests on the linear loop."""
+
+
+@pytest.mark.parametrize("name", ["lqg", *FAMILY, *ADAPTIVE])
 def test_no_lqg_loses_a_crystal(name):
     config = make_config("hot-zone", **PLAIN)
     assert not rollout(make_controller(name, config), config, CRYSTALS).failed.any()

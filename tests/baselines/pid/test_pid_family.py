@@ -13,7 +13,7 @@ from cz_gym.baselines.analysis.frequency import loop_margins, response
 from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.analysis.sampled_loop import linear_controller
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID, SeriesPID
-from cz_gym.baselines.pid.filtered_pid import FilteredPID, reference_derivatives
+from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.settings import settings_of
 from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
 from cz_gym.baselines.tuned_for import TUNED
@@ -97,16 +97,6 @@ def test_an_outlier_moves_the_filter_by_no_more_than_it_believes():
     policy = FilteredPID(compensator=None, T_f=40.0, jump=0.1 * MM)
     _, state = policy.predict(measured(ring_error=5.0 * MM))
     assert state.memory.filtered[0] == pytest.approx((1.0 - math.exp(-5.0 / 40.0)) * 0.1 * MM)
-
-
-def test_reference_derivatives_from_its_preview():
-    c = -2e-9
-    shown = dict(
-        zip(("r_ref", "r_ref_1min", "r_ref_5min"), (0.5 * c * t**2 for t in (100.0, 160.0, 400.0)), strict=True)
-    )
-    slope, curvature = reference_derivatives(Measured(*np.zeros(len(MEASURED)))._replace(**shown))
-    assert slope == pytest.approx(c * 130.0)
-    assert curvature == pytest.approx(c)
 
 
 @pytest.mark.parametrize("sigma", [0.72, 0.8])

@@ -139,12 +139,6 @@ def test_every_parameter_sets_what_it_names_and_a_search_begins_with_the_setting
     assert search.settings(search.first) == (frozen if highest is None else replace(frozen, jump=highest))
 
 
-def test_the_cost_of_a_pid_is_its_priced_sum():
-    goal = pid_goal(FilteredPID(), (), (), (lambda *_: -0.5, lambda *_: -0.25, lambda *_: 9.0))
-    found = FIGURES._replace(failure_rate=0.1)
-    assert goal.cost(found, None) == pytest.approx(0.06 + 0.2 * 0.01 + 5.0 * 0.1 + 2.0 * 0.75)
-
-
 # LQGs
 
 START = LQGDesign()
@@ -181,12 +175,6 @@ def test_a_candidate_that_loses_crystals_is_never_best():
     lost = search.best(1)[0].facts["lost"]
     assert lost
     assert not sum(lost.values())
-
-
-def test_missing_a_limit_and_losing_a_crystal_cost_more_than_any_return():
-    inside, outside = Figures(0.069, 0.01, 0.0, 1800.0, 0.0, 2160), Figures(0.08, 0.01, 0.0, 2000.0, 0.0, 2160)
-    lost = inside._replace(mean_return=2000.0, failure_rate=0.01)
-    assert GOAL.cost(inside, None) < min(GOAL.cost(outside, None), GOAL.cost(lost, None))
 
 
 def test_a_search_uses_training_and_validation_seeds_only(tmp_path):
