@@ -7,6 +7,7 @@ import importlib.util
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,19 +25,23 @@ settings.register_profile("long", deadline=None, database=None, max_examples=20_
 settings.load_profile("repeatable")
 
 TRAINING = ("torch", "stable_baselines3", "sb3_contrib", "safetensors", "tensorboard")
+LARGE = ("torch", "stable_baselines3", "scipy.stats", "matplotlib.pyplot", "asyncua", "pandas", "control")
 ABSENT = tuple(name for name in TRAINING if importlib.util.find_spec(name) is None)
 if sys.platform == "win32":
     collect_ignore = ["stress"]  # signals, pipes and limits of memory as POSIX has them
 
 
 def pytest_sessionstart() -> None:
-    """Of parallel workers one compiles what most tests need, the camera's images too; the others then load it."""
+    """Of parallel workers one compiles what most tests need, kernels and large packages; the others then load it."""
     if "PYTEST_XDIST_WORKER" in os.environ and importlib.util.find_spec("filelock"):
         from cz_gym import CzEnv
         from cz_gym.atomic_files import locked
 
         CACHE.mkdir(parents=True, exist_ok=True)
-        with locked(CACHE, patience=600.0):
+        with locked(CACHE, patience=3600.0):
+            for package in LARGE:
+                with suppress(ImportError):
+                    importlib.import_module(package)
             env = CzEnv(observation="camera")
             env.reset(seed=0)
             env.step(np.zeros(2, np.float32))
