@@ -144,15 +144,6 @@ def test_info_is_the_plant_in_si() -> None:
     assert "state" not in info
 
 
-def test_a_critic_may_see_the_state_beside_the_history() -> None:
-    history, state = (
-        CzEnv(observation="history", info="all", action="direct"),
-        CzEnv(observation="state", info="all", action="direct"),
-    )
-    np.testing.assert_array_equal(history.reset(seed=4)[1]["state"], state.reset(seed=4)[0])
-    np.testing.assert_array_equal(history.step(ZERO)[4]["state"], state.step(ZERO)[0])
-
-
 def test_drives_obey_window_slew_and_steps() -> None:
     limits = Actuators(
         pull_window=0.5 * MM_PER_MIN, pull_slew=0.3 * MM_PER_MIN / 60, heater_slew=2000.0 / 60, heater_step=100.0

@@ -78,13 +78,6 @@ def test_the_score_of_the_same_controller_is_a_draw() -> None:
     assert by_hand.partition("by hand ")[2] == by_paper.partition("controller ")[2]
 
 
-def test_a_failed_run_counts_to_the_horizon() -> None:
-    config = make_config("nominal", None, "measured", horizon=5400.0, action="rate")
-    line = play.score(config, 1, [np.ones(2, np.float32)] * 400, True)
-    assert line.startswith("nominal, crystal 1, 90 min: by hand RMSE ")
-    assert ", failed; by the paper's controller RMSE" in line
-
-
 def test_playing_without_pygame_says_what_to_install(monkeypatch: pytest.MonkeyPatch, refused: Any) -> None:
     monkeypatch.setitem(sys.modules, "pygame", None)
     assert refused(play.main, []) == f"python -m cz_gym.play: {canvas.MISSING}\n"

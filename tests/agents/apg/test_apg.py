@@ -137,17 +137,6 @@ def test_predict_is_the_network_step_by_step_and_forgets_where_an_episode_begins
     assert single.shape == (2,)
 
 
-def test_leaky_means_follow_a_step_as_first_order_lags() -> None:
-    policy, memory, seen = some_policy(), some_policy().initial_memory(1), torch.zeros(1, 11)
-    seen[0, 0] = 1.0
-    for _ in range(100):
-        features, means = policy.remember(seen, memory)
-        memory = torch.cat([means, memory[:, means.shape[1] :]], dim=1)
-    times = np.geomspace(3.0, 3600.0, 8)
-    np.testing.assert_allclose(memory[0, :8], 1.0 - np.exp(-500.0 / times), rtol=1e-4)
-    np.testing.assert_allclose(features[0, :9].sum(), 1.0, rtol=1e-5)
-
-
 def parameters_of(model: APG) -> torch.Tensor:
     return torch.cat([each.flatten() for each in model.policy.parameters()])
 

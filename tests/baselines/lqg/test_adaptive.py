@@ -13,11 +13,8 @@ from cz_gym.baselines.lqg.controller import LQG, LQGDesign
 from cz_gym.baselines.lqg.designs import FACTORS, adaptive, lqg
 from cz_gym.baselines.lqg.multiple_model import Hypotheses, multiple_model_filter
 from cz_gym.baselines.policy import map_arrays
-from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Interface
-from cz_gym.evaluation.equal_activity import ratios
-from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.observation import decode
 from cz_gym.units import HOUR, MM
@@ -87,16 +84,3 @@ def test_every_filter_of_the_adaptive_lqg_holds_the_slowest_hot_zones():
         noise = replace(plain.design.noise, fast_sd=fast, slow_sd=slow)
         form = linear_form(replace(plain, design=replace(plain.design, noise=noise)))
         assert {close(form.controller, puller, form.dt).stable for puller in pullers} == {slow < strongest}
-
-
-@pytest.mark.slow
-def test_the_adaptive_lqg_has_less_radius_error_at_equal_activity():
-    config, family = (
-        make_config("randomized", horizon=2.0 * HOUR, **PLAIN),
-        ("lqg-at-0.013", "lqg-at-0.02", "lqg-at-0.03"),
-    )
-    points = {}
-    for name in (*family, "lqg-at-0.02-adaptive"):
-        found = metrics(rollout(find_controller(name).make(config), config, range(30)))
-        points[name] = float(found.pull_step_rms_mm_per_min.mean()), float(found.rmse_mm.mean())
-    assert ratios(points, family)["lqg-at-0.02-adaptive"] < 0.99
