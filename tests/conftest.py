@@ -11,11 +11,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+# Threads of torch and of NumPy's linear algebra wait for each other by spinning, all the longer beside other workers.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import numpy as np
 import pytest
 from hypothesis import settings
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch's threads wait by spinning: several workers would only wait
 os.environ["SDL_VIDEODRIVER"] = os.environ["SDL_AUDIODRIVER"] = "dummy"  # no test opens a window
 CACHE = Path(__file__).parents[1] / ".pytest_cache" / "cz-gym"
 os.environ.setdefault("CZ_GYM_CACHE_DIR", str(CACHE))

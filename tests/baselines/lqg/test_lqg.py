@@ -96,7 +96,7 @@ def test_the_first_move_is_that_of_the_whole_horizon(what):
         drift[:] = np.linspace(0.1, 0.0, ahead)
     else:
         z[[DRIFT, DRIFT + 1]] = 1.0, 1e-3
-    expected = brute_force_first_move(model, weights, dt, z, 200, reference, drift)
+    expected = brute_force_first_move(model, weights, dt, z, 140, reference, drift)
     found = -law.feedback @ z + reference @ law.reference + drift @ law.drift
     # A shifted reference counts as an equilibrium of its own, though the free radius drifts off it by 9e-6 a second.
     rtol = 0.02 if what == "reference" else 2e-3
