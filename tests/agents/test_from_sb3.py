@@ -125,7 +125,7 @@ def test_a_model_without_its_normalisation_is_refused(kind: str, tmp_path: Path)
         model.save(tmp_path / "model.zip")
         return type(model).load(tmp_path / "model.zip", env=env, device="cpu")
 
-    for env in (None, plain.get_env()):
+    for env in (None, plain.get_env()) if kind == "ppo" else (None,):
         with pytest.raises(AgentFileError, match=r"trained on normalised observations: .*--vecnormalize"):
             from_sb3.save_agent(tmp_path / "mine.onnx", again(normalised, env), "mine", config=config)
         from_sb3.save_agent(str(tmp_path / "mine.onnx"), again(plain, env), "mine", config=config)

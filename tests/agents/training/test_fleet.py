@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 import train
 from cz_gym.agents import AgentFileError
-from cz_gym.agents.training import fleet, run
+from cz_gym.agents.training import fleet, run, validation
 from cz_gym.agents.training.recipes import PPO, RECIPES, Recipe
 from tests.small_learners import REFERENCES, train_small_seed
 
@@ -49,6 +49,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     monkeypatch.setattr(fleet, "train_seed", counted)
     monkeypatch.setattr(fleet, "in_processes", in_turn)
+    monkeypatch.setattr(validation, "references", lambda *_: REFERENCES)
     monkeypatch.setitem(RECIPES, "ppo", SMALL_PPO)
     return seeds
 

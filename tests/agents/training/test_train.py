@@ -16,18 +16,27 @@ import torch
 
 import train
 from cz_gym.agents import OnnxPolicy
-from cz_gym.agents.training import run
+from cz_gym.agents.training import run, validation
 from cz_gym.agents.training.checkpoint import load_checkpoint
 from cz_gym.agents.training.recipes import PPO, RECIPES
 from cz_gym.commands import interpreter
 
 SMALL = PPO(num_envs=64, action_repeat=2, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,))
+REFERENCES, KNOWN = validation.references, dict[str, Any]()
+
+
+def references_once(make_controller: Any, recipe: Any) -> Any:
+    """Both recipes are validated on the same crystals."""
+    scenario = recipe.scenario
+    KNOWN[scenario] = KNOWN.get(scenario) or REFERENCES(make_controller, recipe)
+    return KNOWN[scenario]
 
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch, few_crystals: None) -> None:
+    monkeypatch.setattr(validation, "references", references_once)
     monkeypatch.setitem(RECIPES, "ppo", SMALL)
-    monkeypatch.setitem(RECIPES, "gradient", replace(RECIPES["gradient"], num_envs=16, window=12))
+    monkeypatch.setitem(RECIPES, "gradient", replace(RECIPES["gradient"], num_envs=64, window=12))
 
 
 def rows(path: Path) -> list[dict[str, str]]:
