@@ -49,14 +49,15 @@ async def control(controller: Controller, label: str, client: Client, steps: int
     nodes = {tag.name: client.get_node(ua.NodeId(tag.name, space)) for tag in TAGS}
     last, answered = -1, 0
     while answered < steps:
+        step, state = await client.read_values([nodes["step"], nodes["state"]])
+        if state != "growing":
+            break
+        if step == last:
+            await asyncio.sleep(0.002)
+            continue
         tags = dict(zip(nodes, await client.read_values(nodes.values()), strict=True))
         if tags["puller"] != label:
             raise CzError(f"the server's puller is {tags['puller']}: --puller must be its file")
-        if tags["state"] != "growing":
-            break
-        if tags["step"] == last:
-            await asyncio.sleep(0.001)
-            continue
         last = tags["step"]
         values = zip((*controller.setpoints(tags), last), WRITABLE.values(), strict=True)
         with suppress(ua.UaStatusCodeError):  # refused: the server says why, and holds what it had
