@@ -1,7 +1,7 @@
 """Radius errors over the LQG's at equal pull activity: ``python -m studies.frontier benchmark.json``.
 
-Returns stand beside them: Spearman's correlation of return and ratio, over the controllers that lose no crystal and are
-no bounds, says how well the reward ranks them.
+Returns stand beside them: Spearman's correlation of return and ratio, over the controllers that are no bounds, says how
+well the reward ranks them.
 
 The LQG's settings (:data:`cz_gym.baselines.lqg.designs.FAMILY`) are the reference family of
 :mod:`cz_gym.evaluation.equal_activity`. With ``episodes.csv`` beside the file, each ratio has a 95 % bootstrap interval
@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +30,11 @@ from cz_gym.evaluation.files import EPISODES, Episodes, read_episodes, read_resu
 from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.statistics import Estimate, Resamples
 
-ACTIVITY, RETURN, FAILURES = "pull_step_rms_mm_per_min", "return", "failure_rate"
+ACTIVITY, RETURN = "pull_step_rms_mm_per_min", "return"
 RESAMPLES = 2_000
 """Bootstrap resamples of a ratio."""
+APART = 1.05
+"""Two ratios further apart than this factor tell two controllers apart [-]."""
 Points = Mapping[str, Point]
 """Mean activity [mm/min] and radius error [mm] by controller."""
 BOUNDS = frozenset(entry.name for entry in CONTROLLERS if entry.bound)
@@ -40,12 +43,26 @@ Means = Mapping[str, Mapping[str, Estimate]]
 
 
 def ranking(means: Means, found: Mapping[str, float]) -> str:
-    """A sentence: how well the return ranks the controllers that lose no crystal as the ratios ``found`` do."""
-    names = [name for name in found if means[name][FAILURES].mean == 0.0 and name not in BOUNDS]
-    if len(names) < 3:
+    """Sentences: how well the return ranks the controllers as the ratios ``found`` do.
+
+    The reference family is left out of the first: its members' ratios are 1 by definition, whatever their returns.
+    """
+    names = [name for name in found if name not in BOUNDS]
+    others = [name for name in names if name not in FAMILY]
+    if len(others) < 3:
         return ""
-    agreement = -spearmanr([means[name][RETURN].mean for name in names], [found[name] for name in names]).statistic
-    return f"Spearman's correlation of return and ratio, with its sign turned: {agreement:.2f} ({len(names)} rows)."
+    ranked, with_family = (
+        -spearmanr([means[name][RETURN].mean for name in each], [found[name] for name in each]).statistic
+        for each in (others, names)
+    )
+    apart = [pair for pair in combinations(names, 2) if abs(np.log(found[pair[0]] / found[pair[1]])) > np.log(APART)]
+    alike = sum((found[a] > found[b]) == (means[a][RETURN].mean < means[b][RETURN].mean) for a, b in apart)
+    return (
+        f"Spearman's correlation of return and ratio, with its sign turned: {ranked:.2f} over the {len(others)} "
+        f"controllers outside the reference family, {with_family:.2f} with its members, whose ratios are 1 by "
+        f"definition. Of {len(apart)} pairs whose ratios are more than {APART - 1:.0%} apart, the return ranks "
+        f"{alike} as the ratio does."
+    )
 
 
 def table(results: Mapping[str, Means], metric: str, episodes: Episodes | None = None) -> str:
@@ -91,7 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _compare(given: argparse.Namespace) -> None:
-    results, _ = read_results(given.benchmark, (given.metric, ACTIVITY, RETURN, FAILURES))
+    results, _ = read_results(given.benchmark, (given.metric, ACTIVITY, RETURN))
     beside = given.benchmark.with_name(EPISODES)
     episodes = read_episodes(beside, lambda _: (ACTIVITY, given.metric)) if beside.exists() else None
     text = table(results, given.metric, episodes)
