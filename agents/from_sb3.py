@@ -171,11 +171,11 @@ def _check_wrappers(model: BaseAlgorithm) -> None:
 
 def _check_spaces(model: BaseAlgorithm, config: Config) -> None:
     """AgentFileError unless the model reads and acts as the environment of these settings wants."""
-    from cz_gym.sb3 import AsymmetricPolicy
+    from cz_gym.sb3 import Asymmetric
 
     wanted = (len(OBSERVATIONS.get(config.observation, ())),), (len(DRIVE_CHANNELS),)
     shapes = model.observation_space.shape, model.action_space.shape
-    if isinstance(model.policy, AsymmetricPolicy):
+    if isinstance(model.policy, Asymmetric):
         shapes = (model.policy.channels,), shapes[1]
     if shapes != wanted:
         raise AgentFileError(
@@ -190,14 +190,14 @@ def _check_normalisation(model: BaseAlgorithm, normalisation: VecNormalize | Non
     A saved model keeps its last observation: there the camera's flag is 0 or 1 unless it is normalised. A model that is
     loaded into an environment has lost that, but keeps the last original observation before a VecNormalize.
     """
-    from cz_gym.sb3 import AsymmetricPolicy
+    from cz_gym.sb3 import Asymmetric
 
     if normalisation is not None:
         return
     names = [channel.name for channel in OBSERVATIONS[observation]]
     seen, before = model._last_obs, model._last_original_obs
     space = observation_space(observation)
-    plain = before is None and (model.observation_space == space or isinstance(model.policy, AsymmetricPolicy))
+    plain = before is None and (model.observation_space == space or isinstance(model.policy, Asymmetric))
     if isinstance(seen, np.ndarray) and VALID in names:
         plain = bool(np.isin(seen[:, names.index(VALID)], (0.0, 1.0)).all())
     if not plain:

@@ -16,9 +16,10 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import MlpExtractor
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, MlpExtractor
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_wrapper
+from stable_baselines3.sac.policies import SACPolicy
 
 from cz_gym.errors import CzError
 from cz_gym.names import needs
@@ -50,7 +51,7 @@ class CzVecEnv(VecEnv):
     stable-baselines3's ``Monitor``. With ``stagger``, a seed, each slot's first episode is cut (truncated) at a random
     step, so that slots are not all in the same minute. With ``critic_state`` the plant's true state
     (:class:`cz_gym.signals.TrueState`) follows the channels of ``observation="history"``, for an
-    :class:`AsymmetricPolicy`; the batch needs ``info="all"``.
+    :class:`Asymmetric` policy; the batch needs ``info="all"``.
     """
 
     def __init__(self, env: CzVectorEnv, stagger: int | None = None, critic_state: bool = False) -> None:
@@ -180,28 +181,48 @@ class ActionRepeat(VecEnvWrapper):
         return observation, earned, done, infos
 
 
-class AsymmetricPolicy(ActorCriticPolicy):
-    """stable-baselines3's policy of two networks, whose critic also reads the plant's true state while it learns.
+class Asymmetric(BasePolicy):
+    """A policy whose critic also reads the plant's true state while it learns; its actor reads sensors alone.
 
-    For a :class:`CzVecEnv` with ``critic_state``. The actor reads the observation alone, and acts from observations of
-    the environment as it is.
+    For a :class:`CzVecEnv` with ``critic_state``. ``predict`` takes the observations of the environment as it is.
     """
 
     @property
     def channels(self) -> int:
         """Number of channels that the actor reads."""
-        return self.features_dim - len(STATE)
+        assert self.observation_space.shape is not None
+        return self.observation_space.shape[0] - len(STATE)
+
+    def predict(self, observation: Any, *others: Any, **named: Any) -> Any:
+        """As stable-baselines3's; the true state may be missing from the observation."""
+        missing = self.channels + len(STATE) - observation.shape[-1]
+        padding = ((0, 0),) * (observation.ndim - 1) + ((0, missing),)
+        return super().predict(np.pad(observation, padding), *others, **named)
+
+
+class AsymmetricPolicy(Asymmetric, ActorCriticPolicy):
+    """The policy of stable-baselines3's PPO and A2C with a critic that is told the true state."""
 
     def _build_mlp_extractor(self) -> None:
         arguments: Any = (self.net_arch, self.activation_fn, self.device)
         self.mlp_extractor = _ActorAndCritic(self.channels, self.features_dim, *arguments)
 
-    def predict(self, observation: Any, *others: Any, **named: Any) -> Any:
-        """As stable-baselines3's; the true state may be missing from the observation."""
-        missing = self.features_dim - observation.shape[-1]
-        return super().predict(
-            np.pad(observation, ((0, 0),) * (observation.ndim - 1) + ((0, missing),)), *others, **named
-        )
+
+class AsymmetricSACPolicy(Asymmetric, SACPolicy):
+    """The policy of stable-baselines3's SAC with critics that are told the true state."""
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
+        """The actor, on the channels of the observation alone."""
+        return super().make_actor(_Sensors(self.observation_space, self.channels))
+
+
+class _Sensors(FlattenExtractor):
+    def __init__(self, space: Any, channels: int) -> None:
+        super().__init__(space)
+        self._features_dim = channels
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        return super().forward(observations)[:, : self._features_dim]
 
 
 class _ActorAndCritic(MlpExtractor):

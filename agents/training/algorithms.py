@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from cz_gym import CzVectorEnv
 from cz_gym.agents import apg
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
-from cz_gym.sb3 import ActionRepeat, AsymmetricPolicy, CzVecEnv
+from cz_gym.sb3 import ActionRepeat, AsymmetricPolicy, AsymmetricSACPolicy, CzVecEnv
 
 from .recipes import APG, PPO, SAC, Recipe, Reinforcement
 
@@ -25,7 +25,7 @@ def make_algorithm(recipe: Recipe, seed: int, done: int = 0) -> BaseAlgorithm:
     """The algorithm of a recipe for a training seed; a resumed one has taken ``done`` steps before."""
     torch.set_num_threads(1)  # small networks are quicker so
     torch.manual_seed(seed)
-    critic_state = isinstance(recipe, PPO) and recipe.critic_state
+    critic_state = isinstance(recipe, Reinforcement)
     info = "all" if critic_state else "lean"
     env: VecEnv = CzVecEnv(
         CzVectorEnv.from_config(recipe.config, recipe.num_envs, AutoresetMode.SAME_STEP, info=info),
@@ -33,15 +33,15 @@ def make_algorithm(recipe: Recipe, seed: int, done: int = 0) -> BaseAlgorithm:
         critic_state,
     )
     kind: Any
-    policy: Any = AsymmetricPolicy if critic_state else "MlpPolicy"
+    policy: Any
     options = dict[str, Any]()
     match recipe:
         case APG():
             kind, policy, options = apg.APG, "RecurrentPolicy", {"betas": recipe.betas}
         case PPO():
-            kind, options = stable_baselines3.PPO, {"log_std_init": recipe.log_std_init}
+            kind, policy, options = stable_baselines3.PPO, AsymmetricPolicy, {"log_std_init": recipe.log_std_init}
         case SAC():
-            kind = stable_baselines3.SAC
+            kind, policy = stable_baselines3.SAC, AsymmetricSACPolicy
         case _:
             raise TypeError(f"no algorithm for a {type(recipe).__name__}")
     known = {name for each in kind.__mro__ for name in inspect.signature(each.__init__).parameters}

@@ -68,7 +68,8 @@ class APG(Recipe):
 class Reinforcement(Recipe):
     """Learns from reward, by trying; stable-baselines3's ``VecNormalize`` scales the reward. Observations are scaled by
     the environment: running means would remember the lost crystals of the first minutes, and make a reading that is
-    not valid, one in hundreds, an input of -10.
+    not valid, one in hundreds, an input of -10. Critics read the plant's true state (:class:`cz_gym.sb3.Asymmetric`);
+    actors never do.
     """
 
     hidden: tuple[int, ...] = (64, 64)
@@ -96,8 +97,6 @@ class PPO(Reinforcement):
     learning_rate: float = 1e-3
     gae_lambda: float = 0.9
     """Lower than stable-baselines3's 0.95: a critic that reads the true state is a good judge."""
-    critic_state: bool = True
-    """Whether the critic reads the plant's true state in training (:class:`cz_gym.sb3.AsymmetricPolicy`)."""
     log_std_init: float = -0.7
     """Logarithm of the initial standard deviation of the actions."""
 

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv
 from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.from_sb3 import save_agent
-from cz_gym.sb3 import AsymmetricPolicy, make_vec_env
+from cz_gym.sb3 import AsymmetricPolicy, AsymmetricSACPolicy, make_vec_env
 
 N = 3
 SETTINGS: dict[str, Any] = {"scenario": "hard", "control_interval": 20.0, "horizon": 400.0}
@@ -131,6 +131,11 @@ def test_gymnasiums_wrapper_counts_the_episodes_of_both_forms(form: str) -> None
     assert ends >= 16
 
 
+def judge(model: Any, seen: torch.Tensor, action: torch.Tensor) -> Any:
+    """What a model's critic says of observations, shape (n, 1)."""
+    return model.critic(seen, action)[0] if isinstance(model, SAC) else model.policy.predict_values(seen)
+
+
 def test_a_critic_may_read_the_true_state_that_no_actor_reads(tmp_path: Path) -> None:
     """The state behind the observation is the one of ``observation="state"``, at the end of an episode too."""
     plain, told = adapter(), adapter(critic_state=True)
@@ -148,16 +153,20 @@ def test_a_critic_may_read_the_true_state_that_no_actor_reads(tmp_path: Path) ->
     for i in range(N):
         last = np.hstack([other[3][i]["terminal_observation"], info["final_obs"][i]])
         np.testing.assert_array_equal(one[3][i]["terminal_observation"], last)
-    model = PPO(AsymmetricPolicy, told, n_steps=8, batch_size=24, seed=0, device="cpu").learn(24)
     seen, other_state = one[0], one[0].copy()
     other_state[:, channels:] = 7.0
-    action = model.predict(seen, deterministic=True)[0]
-    np.testing.assert_array_equal(action, model.predict(other_state, deterministic=True)[0])
-    np.testing.assert_array_equal(action, model.predict(seen[:, :channels], deterministic=True)[0])
-    values = [model.policy.predict_values(torch.tensor(each)) for each in (seen, other_state)]
-    assert (values[0] != values[1]).all()
-    save_agent(tmp_path / "agent.onnx", model, "asymmetric")
-    agent = OnnxPolicy.load(tmp_path / "agent.onnx")
-    np.testing.assert_allclose(agent.predict(seen[:, :channels])[0], action, atol=1e-5)
+    ppo = PPO(AsymmetricPolicy, told, n_steps=8, batch_size=24, seed=0, device="cpu")
+    sac = SAC(AsymmetricSACPolicy, told, learning_starts=10, batch_size=24, seed=0, device="cpu")
+    for model in (ppo, sac):
+        model.learn(24)
+        action = model.predict(seen, deterministic=True)[0]
+        np.testing.assert_array_equal(action, model.predict(other_state, deterministic=True)[0])
+        np.testing.assert_array_equal(action, model.predict(seen[:, :channels], deterministic=True)[0])
+        with torch.no_grad():
+            values = [judge(model, torch.tensor(each), torch.tensor(action)) for each in (seen, other_state)]
+        assert (values[0] != values[1]).all()
+        save_agent(tmp_path / "agent.onnx", model, "asymmetric")
+        agent = OnnxPolicy.load(tmp_path / "agent.onnx")
+        np.testing.assert_allclose(agent.predict(seen[:, :channels])[0], action, atol=1e-5)
     with pytest.raises(ValueError, match="needs observation='history'"):
         adapter(observation="measured", critic_state=True)
