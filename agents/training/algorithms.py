@@ -25,13 +25,11 @@ def make_algorithm(recipe: Recipe, seed: int, done: int = 0) -> BaseAlgorithm:
     """The algorithm of a recipe for a training seed; a resumed one has taken ``done`` steps before."""
     torch.set_num_threads(1)  # small networks are quicker so
     torch.manual_seed(seed)
-    critic_state = isinstance(recipe, Reinforcement)
-    info = "all" if critic_state else "lean"
-    env: VecEnv = CzVecEnv(
-        CzVectorEnv.from_config(recipe.config, recipe.num_envs, AutoresetMode.SAME_STEP, info=info),
-        seed + done if isinstance(recipe, Reinforcement) else None,
-        critic_state,
+    told = isinstance(recipe, Reinforcement)
+    batch = CzVectorEnv.from_config(
+        recipe.config, recipe.num_envs, AutoresetMode.SAME_STEP, info="all" if told else "lean"
     )
+    env: VecEnv = CzVecEnv(batch, seed + done if told else None, critic_state=told)
     kind: Any
     policy: Any
     options = dict[str, Any]()
@@ -39,9 +37,10 @@ def make_algorithm(recipe: Recipe, seed: int, done: int = 0) -> BaseAlgorithm:
         case APG():
             kind, policy, options = apg.APG, "RecurrentPolicy", {"betas": recipe.betas}
         case PPO():
-            kind, policy, options = stable_baselines3.PPO, AsymmetricPolicy, {"log_std_init": recipe.log_std_init}
+            kind, policy, critics = stable_baselines3.PPO, AsymmetricPolicy, "vf"
+            options = {"log_std_init": recipe.log_std_init}
         case SAC():
-            kind, policy = stable_baselines3.SAC, AsymmetricSACPolicy
+            kind, policy, critics = stable_baselines3.SAC, AsymmetricSACPolicy, "qf"
         case _:
             raise TypeError(f"no algorithm for a {type(recipe).__name__}")
     known = {name for each in kind.__mro__ for name in inspect.signature(each.__init__).parameters}
@@ -50,7 +49,7 @@ def make_algorithm(recipe: Recipe, seed: int, done: int = 0) -> BaseAlgorithm:
         env = ActionRepeat(env, recipe.action_repeat)
         env = VecNormalize(env, norm_obs=False, gamma=recipe.gamma)
         settings["learning_rate"] = partial(linear, recipe.learning_rate)
-        options["net_arch"] = list(recipe.hidden)
+        options["net_arch"] = {"pi": list(recipe.hidden), critics: list(recipe.critic)}
     if isinstance(recipe, SAC):  # a resumed one first fills a new replay buffer
         settings["learning_starts"] += done // recipe.action_repeat
     made: BaseAlgorithm = kind(policy, env, policy_kwargs=options, seed=seed, device="cpu", **settings)
