@@ -20,7 +20,7 @@ from cz_gym.units import PERCENT
 AGENTS = {
     "gradient": "analytic policy gradients: the cost's gradient through policy and plant; the plant is known",
     "ppo": "proximal policy optimisation from nothing, from the reward; its critic saw the true state in training",
-    "sac": "soft actor-critic from nothing, from the reward",
+    "sac": "soft actor-critic from nothing, from the reward; its critics saw the true state in training",
 }
 """Shipped agents, and how each learned."""
 FIGURES = {

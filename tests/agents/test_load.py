@@ -9,7 +9,7 @@ from cz_gym import agents
 from cz_gym.agents.agent_file.contract import read_agent
 from cz_gym.config import make_config
 
-SHIPPED = {"gradient": 10, "ppo": 5, "sac": 3}
+SHIPPED = {"gradient": 10, "ppo": 5, "sac": 5}
 """Training seeds of each name."""
 
 
