@@ -49,7 +49,7 @@ def make_algorithm(recipe: Recipe, seed: int, done: int = 0) -> BaseAlgorithm:
         env = ActionRepeat(env, recipe.action_repeat)
         env = VecNormalize(env, norm_obs=False, gamma=recipe.gamma)
         settings["learning_rate"] = partial(linear, recipe.learning_rate)
-        options["net_arch"] = {"pi": list(recipe.hidden), critics: list(recipe.critic)}
+        options["net_arch"] = {"pi": list(recipe.hidden), critics: list(recipe.critic_hidden)}
     if isinstance(recipe, SAC):  # a resumed one first fills a new replay buffer
         settings["learning_starts"] += done // recipe.action_repeat
     made: BaseAlgorithm = kind(policy, env, policy_kwargs=options, seed=seed, device="cpu", **settings)

@@ -74,7 +74,7 @@ class Reinforcement(Recipe):
 
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the actor's hidden layers."""
-    critic: tuple[int, ...] = (64, 64)
+    critic_hidden: tuple[int, ...] = (64, 64)
     """Widths of the critic's hidden layers."""
     action_repeat: int
     """Environment steps that an action is held for in training: the effect of one of 5 s is lost in the noise."""
@@ -108,7 +108,7 @@ class SAC(Reinforcement):
     """Soft actor-critic."""
 
     name: str = "sac"
-    critic: tuple[int, ...] = (128, 128)
+    critic_hidden: tuple[int, ...] = (128, 128)
     steps: int = 12_000_000
     num_envs: int = 256
     action_repeat: int = 4
