@@ -62,26 +62,21 @@ def rounded(runner: Runner) -> Any:
     return SimpleNamespace(start=runner.start, run=run)
 
 
-class Beside:
-    """Runs a block, and others on the same readings; keeps the largest differences of their actions."""
+def beside(block: Block, others: Sequence[Runner]) -> tuple[Any, Any]:
+    """A block that gives others the same readings; and the largest differences of their actions, which it keeps."""
+    runners, worst = (block, *others), np.zeros(len(others))
 
-    def __init__(self, block: Block, others: Sequence[Runner]) -> None:
-        self.runners, self.config, self.differences = (block, *others), block.config, np.zeros(len(others))
-
-    def start(self, n: int) -> Any:
-        """The memories of all."""
-        return tuple(runner.start(n) for runner in self.runners)
-
-    def run(self, inputs: Mapping[str, Any], memory: Any) -> Any:
-        """The block's outputs, and the next memories."""
-        done = [runner.run(inputs, its) for runner, its in zip(self.runners, memory, strict=True)]
-        own, *rest = (in_shares(outputs, self.config) for outputs, _ in done)
-        self.differences = np.maximum(self.differences, [np.abs(each - own).max() for each in rest])
+    def run(inputs: Mapping[str, Any], memory: Any) -> Any:
+        done = [runner.run(inputs, its) for runner, its in zip(runners, memory, strict=True)]
+        own, *rest = (in_shares(outputs, block.config) for outputs, _ in done)
+        np.maximum(worst, [np.abs(each - own).max() for each in rest], out=worst)
         return done[0][0], tuple(its for _, its in done)
+
+    return SimpleNamespace(start=lambda n: tuple(runner.start(n) for runner in runners), run=run), worst
 
 
 def study(controller: str, scenario: str, crystals: int) -> list[Row]:
-    """Grow the crystals with Python, and with the C in each precision that the controller allows."""
+    """Grow the crystals with Python, and with the C in each precision."""
     block = make_block(controller, make_config(scenario, observation="measured", action="direct"))
     compiled = [CompiledBlock(block, real == "float") for real in LARGEST]
 
@@ -91,13 +86,12 @@ def study(controller: str, scenario: str, crystals: int) -> list[Row]:
         rmse, step = float(np.mean(found.rmse_mm)), float(np.mean(found.pull_step_rms_mm_per_min))
         return round(rmse, 3), round(step, 4), int(run.failed.sum())
 
-    beside = Beside(block, compiled)
-    python, rows = grown(beside), list[Row]()
-    for real, runner, difference in zip(LARGEST, compiled, beside.differences.tolist(), strict=True):
+    watched, worst = beside(block, compiled)
+    python, rows = grown(watched), list[Row]()
+    for real, runner, difference in zip(LARGEST, compiled, worst.tolist(), strict=True):
         c = grown(runner)
-        rows.append(
-            Row(controller, scenario, real, difference, python, c, None if c == python else grown(rounded(compiled[0])))
-        )
+        alone = None if c == python else grown(rounded(compiled[0]))
+        rows.append(Row(controller, scenario, real, difference, python, c, alone))
     return rows
 
 

@@ -26,7 +26,7 @@ REGISTRY, AGENTS = "cz_gym.baselines.registry", "cz_gym.agents"
 """Modules that know controllers and agents, looked up by name because this package imports neither."""
 FALLBACK = "paper-tuned"
 """The PID that takes over."""
-WRITERS = {"c": write_c, "st": write_st}
+WRITERS: dict[str, Any] = {"c": write_c, "st": write_st, "onnx": write_onnx}
 README = """# {name}: a controller for Czochralski growth
 
 {about}
@@ -84,12 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("controller", nargs="?", help="a classical controller, a shipped agent, or an agent file (.onnx)")
     add("--plant", action="store_true", help="the puller in place of a controller (--to fmu)")
-    add(
-        "--to",
-        choices=("c", "fmu", "onnx", "st"),
-        required=True,
-        help="c: C99; st: IEC 61131-3 structured text; onnx: ONNX; fmu: FMI 2.0",
-    )
+    add("--to", choices=("c", "fmu", "onnx", "st"), required=True, help="C99, FMI, ONNX, IEC 61131-3 structured text")
     add("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
     parser.add_puller("its nominal values, its drives' limits, what is designed for it")
     add("--scenario", default="puller", metavar="NAME",
@@ -107,14 +102,10 @@ def _export(given: argparse.Namespace) -> None:
 
         print(shown(build_fmu(given.out, given.scenario, config.puller if given.puller else None)))
         return
-    block, single = make_block(given.controller, config), given.real == "float"
-    if single and given.to == "onnx":
-        raise CzError("an ONNX graph is in double precision: leave out --real float")
-    files: dict[str, bytes] = write_onnx(block.program) if given.to == "onnx" else {}
-    if given.to in WRITERS:
-        files = {name: text.encode() for name, text in WRITERS[given.to](block.program, single).items()}
-    files["README.md"] = readme(block, list(files)).encode()
-    write_files({given.out / name: content for name, content in files.items()})
+    block = make_block(given.controller, config)
+    files = WRITERS[given.to](block.program, given.real == "float")
+    files["README.md"] = readme(block, list(files))
+    write_files({given.out / name: text.encode() if isinstance(text, str) else text for name, text in files.items()})
     print(*(shown(given.out / name) for name in files), sep="\n")
 
 
@@ -138,13 +129,8 @@ def make_block(name: str, config: Config) -> Block:
     if name not in agents.shipped_names() and Path(name).suffix != ".onnx":
         raise CzError(unknown("controller or agent", name, [*known, *agents.shipped_names()]))
     contract = (policy := agents.load(name)).contract
-    for what, its, own in (
-        ("puller", contract.puller, config.puller.label),
-        ("plant", contract.plant_hash, config.plant_hash),
-        ("control interval [s]", contract.control_interval, config.control_interval),
-    ):
-        if its != own:
-            raise CzError(f"{name} was trained for the {what} {its}, not for {own}")
+    if (its := policy.made_for._replace(action=config.action)) != config.made_for:
+        raise CzError(f"{name} was made for {its}, not for {config.made_for}")
     facts = (
         f"Agent {name}: {contract.algorithm}, seed {contract.training_seed}, trained on {contract.scenario} "
         f"({contract.scenario_hash}).",

@@ -21,8 +21,7 @@ def _clip(x: Any, low: Any = None, high: Any = None) -> Any:
 
 
 def _gemm(a: Any, b: Any, c: Any = 0.0, alpha: float = 1.0, beta: float = 1.0, transA: int = 0, transB: int = 0) -> Any:
-    product = (a.T if transA else a) @ (b.T if transB else b)
-    return (product if alpha == 1.0 else alpha * product) + (c if beta == 1.0 else beta * c)
+    return alpha * ((a.T if transA else a) @ (b.T if transB else b)) + beta * c
 
 
 def _slice(x: Any, starts: Any, ends: Any, axes: Any = None, steps: Any = None) -> Any:
@@ -36,16 +35,13 @@ def _split(x: Any, lengths: Any = None, axis: int = 0, parts: int = 1) -> Any:
     return np.split(x, parts if lengths is None else np.cumsum(lengths)[:-1].tolist(), axis)
 
 
-def _softplus(x: Any) -> Any:
-    return np.maximum(x, 0.0) + np.log(1.0 + np.exp(-np.absolute(x)))
-
-
 OPERATORS: dict[str, Callable[..., Any]] = {
     "Add": np.add, "Sub": np.subtract, "Mul": np.multiply, "Div": np.divide, "Neg": np.negative, "Sqrt": np.sqrt,
     "Tanh": np.tanh, "MatMul": np.matmul, "Gemm": _gemm, "Clip": _clip, "Slice": _slice, "Split": _split,
     "Identity": lambda x: x, "Concat": lambda *x, axis: np.concatenate(x, axis=axis),
     "Gather": lambda x, at, axis=0: np.moveaxis(np.moveaxis(x, axis, 0)[at], 0, axis),
-    "Relu": lambda x: np.maximum(x, 0.0), "Sigmoid": lambda x: 0.5 + 0.5 * np.tanh(0.5 * x), "Softplus": _softplus,
+    "Relu": lambda x: np.maximum(x, 0.0), "Sigmoid": lambda x: 0.5 + 0.5 * np.tanh(0.5 * x),
+    "Softplus": lambda x: np.maximum(x, 0.0) + np.log(1.0 + np.exp(-np.absolute(x))),
     "LeakyRelu": lambda x, alpha=0.01: np.where(x > 0.0, x, alpha * x),
     "Elu": lambda x, alpha=1.0: np.where(x > 0.0, x, alpha * (np.exp(np.minimum(x, 0.0)) - 1.0)),
 }  # fmt: skip
@@ -73,19 +69,13 @@ def network_of(content: bytes) -> Callable[..., list[Any]]:
     return network
 
 
-class Past(NamedTuple):
-    """The memory of the observation "history"; empty for "measured"."""
+class AgentMemory(NamedTuple):
+    """The memory of an agent outside Python. Sums and integral are that of the observation "history"."""
 
     sums: Any
     """Running sums of the remembered channels less the newest ones, the newest first, shape (n, depth, channels)."""
     integral: Any
     """Integral of the scaled ring error, shape (n,)."""
-
-
-class AgentMemory(NamedTuple):
-    """The memory of an agent outside Python."""
-
-    past: Past
     command: Any
     """Last commanded inputs in shares of their ranges, shape (n, 2)."""
     network: Any
@@ -114,28 +104,24 @@ class Agent:
         ring = self._measured(seen)[:, :1]
         ages = np.zeros((self.depth, len(LAGGED)))
         ages[:, 0] = np.arange(self.depth)[::-1]
-        integral = -ring[:, 0] * self._integral_step if self.depth else np.zeros((len(ring), 0))
+        step = self.dt * MEASURED[0].scale / INTEGRAL_SCALE
+        integral = -ring[:, 0] * step if self.depth else np.zeros((len(ring), 0))
         network = np.zeros((len(ring), self.remembers))
-        return AgentMemory(Past(-ring[:, :, None] * ages, integral), self._applied(seen), network)
+        return AgentMemory(-ring[:, :, None] * ages, integral, self._applied(seen), network)
 
     def step(self, seen: Measured, memory: AgentMemory) -> tuple[Any, Any, AgentMemory]:
         """Pull speed and heater power above nominal, and the new memory."""
-        observation, past = self._measured(seen), memory.past
+        observation = self._measured(seen)
         if self.depth:
-            observation, past = self._history(seen, observation, past)
+            observation, memory = self._history(seen, observation, memory)
         action, *state = self.network(observation=observation, **({"state": memory.network} if self.remembers else {}))
         applied = self._applied(seen)
         slack = np.array([0.0, self.slack / self.heater_range])
         before = applied + np.clip(memory.command - applied, -slack, slack)
         gains = np.array([self.drives.pull, self.drives.heater])
         command = np.clip(self.drives.keep * before + gains * np.clip(action, -1.0, 1.0), -1.0, 1.0)
-        new = AgentMemory(past, command, state[0] if state else memory.network)
-        return command[:, 0] * self.v_0, command[:, 1] * self.heater_range, new
-
-    @property
-    def _integral_step(self) -> float:
-        step: float = self.dt * MEASURED[0].scale / INTEGRAL_SCALE
-        return step
+        memory = memory._replace(command=command, network=state[0] if state else memory.network)
+        return command[:, 0] * self.v_0, command[:, 1] * self.heater_range, memory
 
     def _applied(self, seen: Measured) -> Any:
         return np.stack([seen.v_p / self.v_0, seen.Q_H / self.heater_range], axis=-1)
@@ -143,7 +129,7 @@ class Agent:
     def _measured(self, seen: Measured) -> Any:
         return np.clip(np.stack(seen, axis=-1) / scales(MEASURED, *self.ranges), -CLIP, CLIP)
 
-    def _history(self, seen: Measured, measured: Any, past: Past) -> tuple[Any, Past]:
+    def _history(self, seen: Measured, measured: Any, past: AgentMemory) -> tuple[Any, AgentMemory]:
         """The observation "history" and its memory, by the engine's own functions.
 
         The engine's circular table is turned so that the newest sample stands at 0; the slots stand in the last axis.
@@ -158,7 +144,7 @@ class Agent:
         _uncompiled(remember, sums)(slot, sums, self.dt, out)
         _uncompiled(recall, sums)(slot, seen, sums, constants, out)
         table = np.concatenate([sums[1:] - sums[0], np.zeros((1, len(LAGGED), n))])
-        return out.T, Past(np.moveaxis(table, -1, 0), slot.integral)
+        return out.T, past._replace(sums=np.moveaxis(table, -1, 0), integral=slot.integral)
 
 
 def _uncompiled(function: Any, like: Any) -> Any:

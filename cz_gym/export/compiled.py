@@ -49,10 +49,9 @@ class CompiledBlock:
 
     def start(self, n: int) -> Any:
         """The memory of n blocks before their first sample, a structured array of shape (n,)."""
-        memory = np.zeros(n, self.memory)
-        for i in range(n):
-            self._init(memory.ctypes.data + i * memory.itemsize)
-        return memory
+        memory = np.zeros(1, self.memory)
+        self._init(memory.ctypes.data)
+        return memory.repeat(n)
 
     def run(self, inputs: Mapping[str, Any], memory: Any) -> tuple[dict[str, Floats], Any]:
         """The outputs, each of shape (n,), and the next memory; settings that are given stay."""

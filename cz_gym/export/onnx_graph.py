@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from cz_gym.errors import CzError
+
 from .program import Program
 from .trace import FINITE, FUNCTIONS, Ids, Node
 
@@ -68,8 +70,8 @@ class Writer:
         names = [self.constant(node.data) if node.op == "constant" else self._name(node) for node in owners]
         source = names[0] if len(names) == 1 else self.add("Concat", *names, axis=0)
         whole = np.concatenate([node.start + np.arange(node.size) for node in owners])  # in order, as the nodes are
-        same = np.array_equal(whole, ids)
-        return source if same else self.add("Gather", source, self.constant(np.searchsorted(whole, ids)), axis=0)
+        at = np.searchsorted(whole, ids)
+        return source if np.array_equal(whole, ids) else self.add("Gather", source, self.constant(at), axis=0)
 
     def _name(self, node: Node) -> str:
         name: str = node.data if node.op == "input" else f"n{node.start}"
@@ -96,9 +98,12 @@ class Writer:
             self.add("Gather", args[0], self.add("Cast", args[1], to=7), results=[result], axis=0)
 
 
-def write_onnx(program: Program) -> dict[str, bytes]:
-    """The graph, by file name."""
+def write_onnx(program: Program, single: bool = False) -> dict[str, bytes]:
+    """The graph, by file name; CzError for single precision."""
     from onnx import checker, helper, numpy_helper
+
+    if single:
+        raise CzError("an ONNX graph is in double precision: leave out --real float")
 
     def numbers(name: str, size: int = 1) -> Any:
         return helper.make_tensor_value_info(name, 11, [size])

@@ -21,11 +21,9 @@ class Runner(Protocol):
 
     def start(self, n: int) -> Any:
         """The memory of n blocks before their first sample."""
-        ...
 
     def run(self, inputs: Mapping[str, Any], memory: Any) -> tuple[dict[str, Floats], Any]:
         """The outputs, each of shape (n,), and the next memory."""
-        ...
 
 
 class BlockState(NamedTuple):

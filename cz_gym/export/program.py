@@ -58,31 +58,25 @@ class Program:
     @cached_property
     def nodes(self) -> tuple[Node, ...]:
         """The nodes that outputs or memory depend on, in order; without constants."""
-        wanted: set[int] = set()
-        reached = [self.due, *(ids for _, ids in self.outputs), *(cell.after for cell in self.memory)]
-        while reached:
-            ids = reached.pop()
-            for at in set(self.graph.owners(ids).tolist()) - wanted:
-                wanted.add(at)
-                reached.extend(self.graph.nodes[at].args)
-        return tuple(node for at, node in enumerate(self.graph.nodes) if at in wanted and node.op != "constant")
+        results = np.concatenate([self.due, *(ids for _, ids in self.outputs), *(cell.after for cell in self.memory)])
+        wanted = set(self.graph.owners(results).tolist())
+        for at in reversed(range(len(self.graph.nodes))):
+            if at in wanted:
+                wanted.update(*(self.graph.owners(ids).tolist() for ids in self.graph.nodes[at].args))
+        return tuple(self.graph.nodes[at] for at in sorted(wanted) if self.graph.nodes[at].op != "constant")
 
 
 def flatten(value: Any, name: str = "") -> list[tuple[str, Any]]:
-    """Names and arrays of nested tuples, in order; names are joined by underscores."""
+    """Names and arrays of nested NamedTuples, in order; names are joined by underscores."""
     if not isinstance(value, tuple):
         return [(name, value)]
-    names = getattr(value, "_fields", range(len(value)))
-    parts = zip(names, value, strict=True)
+    parts: Any = zip(value._fields, value, strict=True)  # type: ignore[attr-defined]
     return [leaf for part, each in parts for leaf in flatten(each, f"{name}_{part}".strip("_"))]
 
 
 def rebuild(like: Any, leaves: Iterator[Any]) -> Any:
-    """Nested tuples like ``like`` with the arrays of an iterator, in order."""
-    if not isinstance(like, tuple):
-        return next(leaves)
-    parts = tuple(rebuild(each, leaves) for each in like)
-    return type(like)(*parts) if hasattr(like, "_fields") else parts
+    """Nested NamedTuples like ``like`` with the arrays of an iterator, in order."""
+    return type(like)(*(rebuild(each, leaves) for each in like)) if isinstance(like, tuple) else next(leaves)
 
 
 def record(
@@ -104,7 +98,7 @@ def record(
     results, after, due = step(given, rebuild(memory, iter(cells)))
 
     def ids_of(value: Any) -> Ids:
-        return np.ascontiguousarray(graph.lift(value).ids).ravel()
+        return graph.lift(value).ids.ravel()
 
     sources, held = [_sources(graph, node) for node in graph.nodes], list[Cell]()
     for (leaf, value), cell, (_, new) in zip(leaves, cells, flatten(after), strict=True):

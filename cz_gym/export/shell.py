@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntFlag
 from functools import cache, cached_property, reduce
-from operator import and_
+from operator import add, and_
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -38,15 +38,12 @@ class Controller(Protocol):
     @property
     def estimates_temperature(self) -> bool:
         """Whether it is given a pyrometer reading that is not finite as such."""
-        ...
 
     def at_rest(self, seen: Measured) -> Any:
         """Its memory before the first sample."""
-        ...
 
     def step(self, seen: Measured, memory: Any) -> tuple[Any, Any, Any]:
         """Pull speed [m/s] and heater power [W] above nominal, and the new memory."""
-        ...
 
 
 class Alarm(IntFlag):
@@ -216,8 +213,7 @@ def step(controller: Controller, pid: Controller, dt: float, ranges: Any, given:
     last = Measured(*(np.where(started, old, new) for old, new in zip(memory.readings, first, strict=True)))
     trusted = Measured(*(np.where(good, value, np.inf) for good, value in zip(plausible, seen, strict=True)))
     read = readable(trusted._replace(valid=np.where(ring, 1.0, 0.0)), last)
-    references = [getattr(plausible, name) for name in Measured._fields if "ref" in name]
-    reference = reduce(and_, references)
+    reference = reduce(and_, (getattr(plausible, name) for name in Measured._fields if "ref" in name))
     good = ring & reference & plausible.T_1 & plausible.v_p & plausible.Q_H
     bad = np.where(good & ~late, 0.0, memory.bad + np.clip(np.abs(elapsed), 0.0, HOUR))
 
@@ -242,12 +238,9 @@ def step(controller: Controller, pid: Controller, dt: float, ranges: Any, given:
     before = tuple(np.where(runs, old, new) for old, new in zip((memory.pull, memory.heater), applied, strict=True))
     nominal = given["nominal_pull_speed_mm_per_min"], given["nominal_heater_power_kW"]
     wanted = [
-        deviation / unit + at
-        for deviation, unit, at in zip(
-            (np.where(fallback, other[0], own[0]), np.where(fallback, other[1], own[1])),
-            (MM_PER_MIN, KILO), nominal, strict=True,
-        )
-    ]  # fmt: skip
+        np.where(fallback, second, first) / unit + at
+        for first, second, unit, at in zip(own[:2], other[:2], (MM_PER_MIN, KILO), nominal, strict=True)
+    ]
     wanted[0] = np.where(fallback & ~ring, before[0], wanted[0])
     sound = _finite(wanted[0]) & _finite(wanted[1])
     slews = given["pull_slew_mm_per_min2"], given["heater_slew_kW_per_min"]
@@ -271,9 +264,7 @@ def step(controller: Controller, pid: Controller, dt: float, ranges: Any, given:
         Alarm.HEATER_LIMITED: limited[1], Alarm.TAKEOVER: engaged & (share < 1.0), Alarm.FALLBACK: fallback,
         Alarm.FAILED: engaged & ~sound, Alarm.MANUAL: ~engaged,
     }  # fmt: skip
-    alarms: Any = 0.0
-    for bit, holds in bits.items():
-        alarms = alarms + np.where(holds, float(bit), 0.0)
+    alarms = reduce(add, (np.where(holds, float(bit), 0.0) for bit, holds in bits.items()))
     outputs = dict(zip((port.name for port in OUTPUTS), (*setpoints, alarms), strict=True))
     now = Memory(
         last_time_s=given["time_s"],

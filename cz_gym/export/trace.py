@@ -33,10 +33,7 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "finite": lambda x: np.abs(x) <= FINITE, "real": lambda x: x.astype(np.float64),
 }  # fmt: skip
 """Operations on single numbers, which apply to each element."""
-_ALIASES = {
-    "bitwise_and": "and", "logical_and": "and", "bitwise_or": "or", "logical_or": "or", "invert": "not",
-    "logical_not": "not", "isfinite": "finite",
-}  # fmt: skip
+_ALIASES = {"bitwise_and": "and", "bitwise_or": "or", "invert": "not", "isfinite": "finite"}
 _TINY = 1e-20
 
 
@@ -65,18 +62,17 @@ class Graph:
 
     nodes: list[Node] = field(default_factory=list)
     starts: list[int] = field(default_factory=list)
-    known: dict[bytes, Node] = field(default_factory=dict)
     length: int = 0
 
-    def add(self, op: str, args: tuple[Ids, ...], size: int, data: Any = None) -> Node:
-        """A new node at the end."""
+    def add(self, op: str, args: tuple[Ids, ...], shape: tuple[int, ...], data: Any = None) -> Traced:
+        """The elements, in this shape, of a new node at the end."""
         logical = op in LOGICAL or (op == "constant" and data.dtype == np.bool_)
         logical = logical or (op == "select" and self.owner(int(args[1].flat[0])).logical)
-        node = Node(op, args, size, self.length, logical, data)
-        self.nodes.append(node)
+        flat, size = tuple(np.ascontiguousarray(ids).ravel() for ids in args), int(np.prod(shape))
+        self.nodes.append(Node(op, flat, size, self.length, logical, data))
         self.starts.append(self.length)
         self.length += size
-        return node
+        return Traced(self, self.starts[-1] + np.arange(size).reshape(shape))
 
     def owners(self, ids: Any) -> Any:
         """The numbers of the elements' nodes."""
@@ -88,33 +84,22 @@ class Graph:
 
     def values(self, ids: Ids) -> Any:
         """The elements' values if all are constants; None otherwise."""
-        flat = ids.ravel()
-        if not flat.size:
-            return np.zeros(ids.shape)
-        owners = self.owners(flat)
-        present = np.unique(owners)
-        if any(self.nodes[at].op != "constant" for at in present):
+        nodes = [self.nodes[at] for at in self.owners(ids.ravel())]
+        if any(node.op != "constant" for node in nodes):
             return None
-        parts = [self.nodes[at].data for at in present]
-        values = np.zeros(flat.size, parts[0].dtype)
-        for at, data in zip(present, parts, strict=True):
-            values[owners == at] = data[flat[owners == at] - self.starts[at]]
-        return values.reshape(ids.shape)
+        found = [node.data[element - node.start] for element, node in zip(ids.ravel(), nodes, strict=True)]
+        return np.array(found).reshape(ids.shape)
 
     def input(self, name: str, shape: tuple[int, ...] = (1,)) -> Traced:
         """A new input, or memory from the last sample."""
-        node = self.add("input", (), int(np.prod(shape)), name)
-        return Traced(self, node.start + np.arange(node.size).reshape(shape))
+        return self.add("input", (), shape, name)
 
     def constant(self, value: Any) -> Traced:
-        """A constant; equal ones are one node."""
+        """A constant."""
         array = np.asarray(value)
         if array.dtype != np.bool_:
             array = np.nan_to_num(array.astype(np.float64), nan=BAD, posinf=BAD, neginf=-BAD)
-        key = array.tobytes() + array.dtype.char.encode()
-        if key not in self.known:
-            self.known[key] = self.add("constant", (), array.size, array.ravel())
-        return Traced(self, self.known[key].start + np.arange(array.size).reshape(array.shape))
+        return self.add("constant", (), array.shape, array.ravel())
 
     def lift(self, value: Any) -> Traced:
         """The value itself if it is traced, else as a constant."""
@@ -134,9 +119,7 @@ class Graph:
                 if not np.any(constant := FUNCTIONS[op](c, d)):
                     return rest
                 op, args = "add", np.broadcast_arrays(rest.ids, self.constant(constant).ids)
-        flat = tuple(np.ascontiguousarray(ids).ravel() for ids in args)
-        node = self.add(op, flat, flat[0].size)
-        return Traced(self, node.start + np.arange(node.size).reshape(args[0].shape))
+        return self.add(op, tuple(args), args[0].shape)
 
     def _parted(self, ids: Ids) -> tuple[Any, Any]:
         """A value as a traced part, None if there is none, and the constant that is added to it.
@@ -220,8 +203,7 @@ class Traced(np.lib.mixins.NDArrayOperatorsMixin):
 
     def argmax(self, axis: int) -> Traced:
         """Index of the first largest element of the one row."""
-        node = self.graph.add("argmax", (self.ids.ravel(),), 1)
-        return Traced(self.graph, [node.start])
+        return self.graph.add("argmax", (self.ids,), (1,))
 
     def view(self, dtype: Any) -> Complex:
         """Pairs of numbers as complex ones."""
@@ -234,9 +216,8 @@ class Traced(np.lib.mixins.NDArrayOperatorsMixin):
         (m, k), n = left.shape[-2:], right.shape[-1]
         if np.prod(batch, dtype=int) != 1 or right.shape[-2] != k:
             raise CzError(f"cannot record a matrix product of shapes {x.shape} and {y.shape}")
-        node = self.graph.add("matmul", (left.ravel(), right.ravel()), m * n, (m, k, n))
         shape = (*batch, *((m,) if x.ndim > 1 else ()), *((n,) if y.ndim > 1 else ()))
-        return Traced(self.graph, node.start + np.arange(m * n).reshape(shape))
+        return self.graph.add("matmul", (left, right), shape, (m, k, n))
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, out: Any = None, **kwargs: Any) -> Any:
         name = ufunc.__name__
@@ -248,8 +229,6 @@ class Traced(np.lib.mixins.NDArrayOperatorsMixin):
             result = self._matmul(*inputs)
         elif name in ("greater", "greater_equal"):
             result = self.graph.apply(name.replace("greater", "less"), *reversed(inputs))
-        elif name == "not_equal":
-            result = ~self.graph.apply("equal", *inputs)
         elif name == "sign":
             below = self.graph.apply("select", inputs[0] < 0.0, -1.0, 0.0)
             result = self.graph.apply("select", inputs[0] > 0.0, 1.0, below)
@@ -270,21 +249,14 @@ class Traced(np.lib.mixins.NDArrayOperatorsMixin):
         if function in (np.zeros_like, np.ones_like, np.full_like):
             shape = kwargs.pop("shape", None) or args[0].shape
             return self.graph.constant(function(np.zeros(shape), *args[1:], **kwargs))
-        return Traced(
-            self.graph, function(*self._numbers(args), **dict(zip(kwargs, self._numbers(kwargs.values()), strict=True)))
-        )
+        moved = {name: self._numbers(value) for name, value in kwargs.items()}
+        return Traced(self.graph, function(*map(self._numbers, args), **moved))
 
-    def _numbers(self, values: Any) -> list[Any]:
-        """Arguments of a function that only moves elements, as arrays of element numbers."""
-        found: list[Any] = []
-        for value in values:
-            if isinstance(value, Traced):
-                found.append(value.ids)
-            elif isinstance(value, (list, tuple)) and any(isinstance(part, Traced) for part in value):
-                found.append([self.graph.lift(part).ids for part in value])
-            else:
-                found.append(value)
-        return found
+    def _numbers(self, value: Any) -> Any:
+        """An argument of a function that only moves elements, as element numbers."""
+        if isinstance(value, (list, tuple)) and any(isinstance(part, Traced) for part in value):
+            return [self.graph.lift(part).ids for part in value]
+        return value.ids if isinstance(value, Traced) else value
 
 
 def _clip(graph: Graph, value: Any, low: Any, high: Any) -> Any:
@@ -292,9 +264,8 @@ def _clip(graph: Graph, value: Any, low: Any, high: Any) -> Any:
 
 
 def _take(graph: Graph, array: Any, index: Any, axis: Any = None) -> Traced:
-    row, at = graph.lift(array).ids, graph.lift(index).ids
-    node = graph.add("pick", (row.ravel(), at.ravel()), at.size)
-    return Traced(graph, node.start + np.arange(node.size).reshape(at.shape))
+    at = graph.lift(index).ids
+    return graph.add("pick", (graph.lift(array).ids, at), at.shape)
 
 
 def _einsum(graph: Graph, rule: str, a: Any, b: Any) -> Any:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,7 +69,7 @@ class Dialect:
 def c_dialect(single: bool) -> Dialect:
     """C99 in double or single precision."""
     return Dialect(
-        C_OPERATIONS, ("0", "1"), "{} = {};", ("for ({0} = 0; {0} < {1}; {0}++) {{", "}"), ("if ({0}) {{", "}"),
+        C_OPERATIONS, ("0", "1"), "{} = {};", ("for (int {0} = 0; {0} < {1}; {0}++) {{", "}"), ("if ({0}) {{", "}"),
         "(int)({0})", "(unsigned)({0})", ("block->", "measured->", "setpoints->"), "f" if single else "",
     )  # fmt: skip
 
@@ -124,6 +125,17 @@ class Writer:
         """Statements that give each element of an array, or a number, its value, a text of ``i``."""
         return [self.assign(target, value)] if size == 1 else self.loop("i", size, [self.assign(f"{target}[i]", value)])
 
+    def fill(self, target: str, pieces: list[tuple[int, int]], value: Callable[[int, int], str]) -> list[str]:
+        """Statements that fill an array, or a number, piece by piece: from first to last + 1 with a text of ``i``."""
+        lines: list[str] = []
+        for first, last in pieces:
+            if last - first == 1:
+                lines.append(self.assign(f"{target}[{first}]" if pieces[-1][1] > 1 else target, value(first, last)))
+            else:
+                at = plus("i", str(first) if first else "")
+                lines += self.loop("i", last - first, [self.assign(f"{target}[{at}]", value(first, last))])
+        return lines
+
     def _owners(self, ids: Ids) -> list[int]:
         owners: list[int] = np.unique(self.graph.owners(ids)).tolist()
         return owners
@@ -142,10 +154,12 @@ class Writer:
         if node.op in FUNCTIONS:
             args = [self._element(ids) for ids in node.args]
             text = self.dialect.operations[node.op].replace("@", self.dialect.end).format(*args)
-            if self._uses[at] == 1 and len(text) <= LONGEST and self._joins(at, node):
-                self._inlined[at] = text
-                return
-            lines = self.each("<new>", node.size, _bare(text))
+            if self._uses[at] == 1 and len(text) <= LONGEST:
+                user, used = self._users[at]
+                if user.op in FUNCTIONS and np.array_equal(used, node.start + np.arange(node.size)):
+                    self._inlined[at] = text
+                    return
+            lines = self.each("<new>", node.size, text)
         elif node.op == "matmul":
             lines = self._product(node)
         elif node.op == "argmax":
@@ -157,11 +171,6 @@ class Writer:
             picked = self._array(node.args[0]).format(self.dialect.index.format(self._element(node.args[1])))
             lines = self.each("<new>", node.size, picked)
         self._names[at] = f"<{self._add(lines, node.size, node)}>"
-
-    def _joins(self, at: int, node: Node) -> bool:
-        """Whether the one use of a node is the same element of an operation on each element."""
-        user, ids = self._users[at]
-        return user.op in FUNCTIONS and np.array_equal(ids, node.start + np.arange(node.size))
 
     def _product(self, node: Node) -> list[str]:
         m, k, n = node.data
@@ -211,14 +220,8 @@ class Writer:
         """Work array that holds these elements next to each other."""
         key = ids.tobytes()
         if key not in self._copies:
-            lines: list[str] = []
-            for first, last in runs(ids, self.graph.owners(ids)):
-                value = self._element(ids[first:last])
-                if last - first == 1:
-                    lines.append(self.assign(f"<new>[{first}]" if ids.size > 1 else "<new>", value))
-                else:
-                    line = self.assign(f"<new>[{plus('i', str(first) if first else '')}]", value)
-                    lines += self.loop("i", last - first, [line])
+            pieces = runs(ids, self.graph.owners(ids))
+            lines = self.fill("<new>", pieces, lambda first, last: self._element(ids[first:last]))
             self._copies[key] = self._add(lines, ids.size, self.graph.owner(int(ids[0])))
         return self._copies[key]
 
@@ -265,16 +268,6 @@ class Writer:
                 if last[number] == at:
                     free[self._kinds[number]].append(names[number])
         return work, "\n".join(texts).split("\n")
-
-
-def _bare(text: str) -> str:
-    """An expression without parentheses around all of it."""
-    depth = 0
-    for at, letter in enumerate(text):
-        depth += (letter == "(") - (letter == ")")
-        if depth == 0:
-            return text[1:-1] if at == len(text) - 1 and text[0] == "(" else text
-    return text
 
 
 def plus(one: str, other: str) -> str:

@@ -144,16 +144,15 @@ def test_an_exported_agent_acts_as_onnxruntime_does(name: str) -> None:
 def test_c_and_onnx_act_as_python_does(name: str, scenario: str) -> None:
     """On one crystal, which Python grows; within 1e-9, in single precision within 1e-5."""
     block = block_of(name, scenario)
-    others: list[tuple[Any, float]] = [(CompiledBlock(block), 1e-9), (OnnxBlock(block), 1e-9)]
-    others += [(CompiledBlock(block, single=True), 1e-5)]
-    policies, states = [BlockPolicy(block), *(BlockPolicy(block, other) for other, _ in others)], [None] * 4
+    others: list[Any] = [None, CompiledBlock(block), OnnxBlock(block), CompiledBlock(block, single=True)]
+    policies, states = [BlockPolicy(block, other) for other in others], [None] * 4
     env = CzVectorEnv.from_config(block.config, 1)
     observation, _ = env.reset(seed=[1])
     for _ in range(100):
-        done = [policy.predict(observation, state) for policy, state in zip(policies, states, strict=False)]
+        done = [policy.predict(observation, state) for policy, state in zip(policies, states, strict=True)]
         states = [state for _, state in done]
         own, *rest = (state.outputs for state in states)  # type: ignore[attr-defined]
-        for found, (_, tolerance) in zip(rest, others, strict=True):
+        for found, tolerance in zip(rest, (1e-9, 1e-9, 1e-5), strict=True):
             assert in_shares(found, block.config) == pytest.approx(in_shares(own, block.config), abs=tolerance)
         assert rest[0][ALARMS] == rest[1][ALARMS] == own[ALARMS]
         observation, *_ = env.step(done[0][0])
@@ -310,10 +309,11 @@ def test_ranges_and_slew_rates_hold() -> None:
     assert int(outputs[ALARMS]) & Alarm.HEATER_LIMITED
 
 
-@pytest.mark.parametrize(("name", "to", "files"), [("paper", "c", 3), ("ppo", "st", 2), ("lqg", "onnx", 2)])
+@pytest.mark.parametrize(("name", "to", "files"), [("lqg-at-0.02", "c", 3), ("ppo", "st", 2), ("lqg", "onnx", 2)])
 def test_the_command_writes_a_folder(name: str, to: str, files: int, tmp_path: Path) -> None:
     assert main([name, "--to", to, "--out", str(tmp_path)]) == 0
     assert len(list(tmp_path.iterdir())) == files
+    assert (tmp_path / f"cz_{re.sub('[^a-z0-9]', '_', name)}.{to}").is_file()
     text = (tmp_path / "README.md").read_text()
     for fact in ("US 9,340,897", "tested on a real puller", "ring_radius_mm"):
         assert fact in text
