@@ -56,10 +56,11 @@ def shipped(controller: str, also: str = "") -> Mapping[str, Mapping[str, float]
 def found_for(puller: PullerFile, name: str) -> Mapping[str, float]:
     """The values that a search has chosen for a puller, by their paths; empty if there are none.
 
-    CzError if they were chosen for other numbers of the puller.
+    Those of the default puller are :func:`shipped`'s: a puller made of its file by other numbers has none. CzError if
+    they were chosen for other numbers of the puller.
     """
     path = tuned_folder(puller) / f"{name}.json"
-    if puller.file is None or not path.is_file():
+    if puller.file is None or path.parent == FOLDER / DEFAULT.name or not path.is_file():
         return {}
     try:
         kept = json.loads(path.read_text("utf-8"))

@@ -44,6 +44,12 @@ def test_on_the_default_puller_nothing_is_scaled(name: str) -> None:
     assert for_puller.scaled_pid(name, make_config(**PLAIN)) == settings_of(name, RANDOMIZED)
 
 
+def test_a_puller_made_of_the_defaults_file_by_other_numbers_is_scaled_to() -> None:
+    config = make_config(puller=replace(find_puller("default"), name="mine", heater_range=5e3), **PLAIN)
+    for name in for_puller.PIDS:
+        assert for_puller.pid(name, config) == for_puller.scaled_pid(name, config)
+
+
 @pytest.mark.parametrize("puller", ["silicon-300mm", "germanium"])
 @pytest.mark.parametrize("name", ["paper-here", "paper-tuned", "pid-conventional", "lqg-at-0.02"])
 def test_loops_are_stable_on_the_pullers_own_linear_model(name: str, puller: str) -> None:
