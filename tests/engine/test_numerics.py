@@ -96,6 +96,7 @@ def _error(x: State, u: Inputs, d: Disturbance, p: Any, dt: float) -> float:
     return float(np.abs(np.array(rk4(x, u, d, p, dt, HURLE.slope)) / exact - 1).max())
 
 
+@pytest.mark.slow
 def test_steps_from_states_that_adversaries_reach_are_exact_enough() -> None:
     states = _visited(75)
     assert len(states) >= 50

@@ -139,7 +139,11 @@ def test_an_exported_agent_acts_as_onnxruntime_does(name: str) -> None:
 
 @needs_compiler
 @pytest.mark.parametrize(
-    ("name", "scenario"), [*((name, "puller") for name in CONTROLLERS), ("lqg", "sensor-fault"), ("lqg", "randomized")]
+    ("name", "scenario"),
+    [
+        *((name, "puller") for name in CONTROLLERS),
+        *(pytest.param("lqg", scenario, marks=pytest.mark.slow) for scenario in ("sensor-fault", "randomized")),
+    ],
 )
 def test_c_and_onnx_act_as_python_does(name: str, scenario: str) -> None:
     """On one crystal, which Python grows; within 1e-9, in single precision within 1e-5."""
@@ -366,7 +370,9 @@ def test_the_structured_text_acts_as_python_does(name: str) -> None:
     assert block(reset=True, **nominal({"time_s": 1e3, "ring_time_s": 1e3, "pull_speed_mm_per_min": 1.1}))[PULL] == 1.1
 
 
-@pytest.mark.parametrize("name", ["paper-tuned", pytest.param("lqg", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["paper", *(pytest.param(name, marks=pytest.mark.slow) for name in ("paper-tuned", "lqg"))]
+)
 def test_the_structured_text_is_of_the_standard(name: str) -> None:
     """Long tables of constants are cut for the parser, which needs minutes for them."""
     parse = pytest.importorskip("blark.parse", reason="blark, the parser of structured text, is not installed")

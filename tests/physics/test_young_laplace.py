@@ -121,6 +121,7 @@ def test_hurle_is_within_its_known_error():
         assert float(YOUNG_LAPLACE.height(r_c, ALPHA_0, A)) == pytest.approx(hurle, rel=6e-3)
 
 
+@pytest.mark.slow
 def test_environment_runs_on_the_exact_meniscus():
     """Compiled and plain agree, and the operating point is a steady state."""
     env = gym.make("Cz-v0", scenario="nominal", model="I", meniscus=YOUNG_LAPLACE, info="all")

@@ -56,6 +56,7 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="forks")
 def test_a_writer_killed_at_any_line_leaves_every_file_whole_and_the_last_one_last(tmp_path: Path) -> None:
     lines, seen = python("-c", KILL_AT_EVERY_LINE, str(tmp_path)).split(maxsplit=1)

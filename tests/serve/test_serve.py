@@ -192,6 +192,7 @@ def test_the_page_elsewhere_is_encrypted_and_only_an_operator_sets_drives(locked
     assert posted(page, {}, "olga", context=context)[0] == 200
 
 
+@pytest.mark.slow
 def test_a_killed_server_leaves_a_whole_log(tmp_path: Path) -> None:
     log = tmp_path / "log.csv"
     options = ["--speed", "2000", "--port", str(free_port()), "--page-port", "0", "--log", str(log)]

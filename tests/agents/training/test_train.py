@@ -44,7 +44,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 @pytest.mark.usefixtures("quick")
-@pytest.mark.parametrize("algorithm", ["gradient", "ppo"])
+@pytest.mark.parametrize("algorithm", [pytest.param("gradient", marks=pytest.mark.slow), "ppo"])
 def test_a_run_leaves_everything_and_goes_on(
     algorithm: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
