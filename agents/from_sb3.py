@@ -200,6 +200,9 @@ def _check_normalisation(model: BaseAlgorithm, normalisation: VecNormalize | Non
     plain = before is None and (model.observation_space == space or isinstance(model.policy, Asymmetric))
     if isinstance(seen, np.ndarray) and VALID in names:
         plain = bool(np.isin(seen[:, names.index(VALID)], (0.0, 1.0)).all())
+    elif before is not None and hasattr(model, "replay_buffer"):
+        loaded = "a model with a replay buffer, loaded into an environment, does not tell whether it was trained on"
+        raise AgentFileError(f"{loaded} normalised observations: load it without env and give config, or {GIVE_IT}")
     if not plain:
         raise AgentFileError(f"the model was trained on normalised observations: {GIVE_IT}")
 

@@ -129,6 +129,9 @@ def test_a_model_without_its_normalisation_is_refused(kind: str, tmp_path: Path)
         with pytest.raises(AgentFileError, match=r"trained on normalised observations: .*--vecnormalize"):
             from_sb3.save_agent(tmp_path / "mine.onnx", again(normalised, env), "mine", config=config)
         from_sb3.save_agent(str(tmp_path / "mine.onnx"), again(plain, env), "mine", config=config)
+    if kind == "sac":
+        with pytest.raises(AgentFileError, match=r"does not tell .*: load it without env and give config"):
+            from_sb3.save_agent(tmp_path / "mine.onnx", again(plain, plain.get_env()), "mine")
     environment = normalised.get_vec_normalize_env()
     from_sb3.save_agent(tmp_path / "mine.onnx", again(normalised, None), "mine", environment, config)
 
