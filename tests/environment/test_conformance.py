@@ -60,6 +60,7 @@ def test_a_batch_of_images_is_a_vector_of_scalars(scenario: str) -> None:
     assert checked.held > 300
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_counts(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cz_gym.episodes.scenarios.SCENARIOS", {"nominal": SCENARIOS["nominal"]})
     assert main([]) == 0

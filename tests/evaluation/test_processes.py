@@ -33,6 +33,7 @@ def tell_and_wait(task: int) -> None:
     print("still there", flush=True)
 
 
+@pytest.mark.slow
 def test_processes_bring_results_and_end_alone() -> None:
     """A process that the caller has of its own goes on."""
     own = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(600.0,))

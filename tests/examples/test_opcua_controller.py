@@ -32,7 +32,7 @@ def grown(log: Path) -> Any:
     [
         ("paper", "randomized", (), 200),
         ("ppo", "puller", (), 100),
-        pytest.param("gradient", "puller", ("--compiled",), 200, marks=needs_compiler),
+        pytest.param("gradient", "puller", ("--compiled",), 200, marks=(needs_compiler, pytest.mark.slow)),
         pytest.param("paper", "randomized", (), 2160, marks=pytest.mark.slow),
     ],
 )

@@ -196,7 +196,7 @@ SANITIZED = "-std=c99 -pedantic -Wall -Wextra -Werror -g -fsanitize=address,unde
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.parametrize("name", [*CONTROLLERS[:3], pytest.param("lqg", marks=pytest.mark.slow), *CONTROLLERS[4:]])
 def test_the_c_is_clean_under_sanitizers_whatever_it_reads(name: str, tmp_path: Path) -> None:
     block = block_of(name)
     assign = " ".join(

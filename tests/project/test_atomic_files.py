@@ -100,6 +100,7 @@ def test_a_file_that_cannot_be_read_is_named_with_the_reason(tmp_path: Path) -> 
         raise KeyError("any other error passes")
 
 
+@pytest.mark.slow
 def test_a_folder_is_used_by_one_process(tmp_path: Path) -> None:
     code = "import sys, pathlib; from cz_gym.atomic_files import locked\nwith locked(pathlib.Path(sys.argv[1])): pass"
     with locked(tmp_path / "new"):
