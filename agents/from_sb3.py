@@ -200,6 +200,8 @@ def _check_normalisation(model: BaseAlgorithm, normalisation: VecNormalize | Non
     plain = before is None and (model.observation_space == space or isinstance(model.policy, Asymmetric))
     if isinstance(seen, np.ndarray) and VALID in names:
         plain = bool(np.isin(seen[:, names.index(VALID)], (0.0, 1.0)).all())
+    elif isinstance(seen, np.ndarray) and model.get_env() is not None:
+        plain = True  # it learned in this environment, whose VecNormalize would have been found
     elif before is not None and hasattr(model, "replay_buffer"):
         loaded = "a model with a replay buffer, loaded into an environment, does not tell whether it was trained on"
         raise AgentFileError(f"{loaded} normalised observations: load it without env and give config, or {GIVE_IT}")

@@ -132,6 +132,7 @@ def test_a_model_without_its_normalisation_is_refused(kind: str, tmp_path: Path)
     if kind == "sac":
         with pytest.raises(AgentFileError, match=r"does not tell .*: load it without env and give config"):
             from_sb3.save_agent(tmp_path / "mine.onnx", again(plain, plain.get_env()), "mine")
+        from_sb3.save_agent(tmp_path / "mine.onnx", trained(kind, observation="state"), "mine")  # it has no flag
     environment = normalised.get_vec_normalize_env()
     from_sb3.save_agent(tmp_path / "mine.onnx", again(normalised, None), "mine", environment, config)
 
