@@ -129,8 +129,12 @@ def make_block(name: str, config: Config) -> Block:
     if name not in agents.shipped_names() and Path(name).suffix != ".onnx":
         raise CzError(unknown("controller or agent", name, [*known, *agents.shipped_names()]))
     contract = (policy := agents.load(name)).contract
-    if (its := policy.made_for._replace(action=config.action)) != config.made_for:
-        raise CzError(f"{name} was made for {its}, not for {config.made_for}")
+    its, own = (
+        f"puller {each.puller}, plant {each.plant}, control interval {each.control_interval:g} s"
+        for each in (policy.made_for, config.made_for)
+    )
+    if its != own:
+        raise CzError(f"{name} was trained for {its}, not for {own}")
     facts = (
         f"Agent {name}: {contract.algorithm}, seed {contract.training_seed}, trained on {contract.scenario} "
         f"({contract.scenario_hash}).",
