@@ -322,7 +322,8 @@ def _puller(found: Mapping[str, Any], stem: str) -> PullerFile:
         for name, value in given.items():
             if name not in known:
                 raise CzError(_misplaced(table, name, known))
-            numbers[known[name].field] = _number(known[name], value)
+            key, read = known[name], _read(value, known[name])
+            numbers[key.field] = (read, read) if key.drawn and not isinstance(read, tuple) else read
         missing += [name for name in known if name not in given]
     parameters = Parameters(**{name: numbers.pop(name) for name in Parameters._fields if name in numbers})
     return PullerFile(found.get("name", stem), parameters, **numbers, missing=tuple(missing))
@@ -338,24 +339,15 @@ def _misplaced(table: str, name: str, known: Mapping[str, Key]) -> str:
     return unknown(f"key of [{table}]", name, known)
 
 
-def _number(key: Key, value: Any) -> Any:
-    """A value of the file in SI units: a number, or a pair where the number is drawn from a range."""
-    pair = key.drawn
-    if isinstance(value, list) and pair and len(value) == 2:
-        return _number(key, value[0])[0], _number(key, value[1])[0]
+def _read(value: Any, key: Key) -> Any:
+    """A decimal number of the key's unit, or each of a list, in SI units, rounded once; anything else as it is."""
+    if isinstance(value, list):
+        return tuple(_read(each, key) for each in value)
     if isinstance(value, bool) or not isinstance(value, int | Decimal) or not Decimal(value).is_finite():
-        also = ", or a pair [low, high]" if pair else ""
-        said = str(value) if isinstance(value, Decimal) else repr(value)
-        raise CzError(f"{key.name} must be a number{also}, not {said:.40}")
-    number = _read(Decimal(value), key)
-    return (number, number) if pair else number
-
-
-def _read(text: Decimal, key: Key) -> float:
-    """A decimal number of the key's unit in SI units, rounded once."""
-    if not -400 < text.adjusted() < 300:  # beyond, a float is infinite, or the fraction needs minutes
-        raise CzError(f"{key.name} = {text} is no plausible number")
-    return float(Fraction(text) * key.size)
+        return value
+    if not -400 < Decimal(value).adjusted() < 300:  # beyond, a float is infinite, or the fraction needs minutes
+        raise CzError(f"{key.name} = {value} is no plausible number")
+    return float(Fraction(value) * key.size)
 
 
 def _shortest(value: float, key: Key) -> str:
@@ -374,11 +366,11 @@ def _check(key: Key, value: Any) -> None:
     """Raise CzError, with a guess at the unit that was meant, unless a key's value is plausible."""
     if value is None and key in _OWN and getattr(PullerFile, key.field) is None:
         return
-    pair = key.drawn
-    numbers = value if isinstance(value, tuple) else (value,)
+    numbers = value if key.drawn and isinstance(value, tuple) else (value,)
     sound = all(isinstance(each, int | float) and not isinstance(each, bool) for each in numbers)
-    if not sound or len(numbers) != (2 if pair else 1) or not numbers[0] <= numbers[-1]:
-        raise CzError(f"{key.name} must be {'a pair of numbers low <= high' if pair else 'a number'}, not {value!r}")
+    if not sound or len(numbers) != 1 + key.drawn or not numbers[0] <= numbers[-1]:
+        pair = ", or a pair [low, high] with low <= high" if key.drawn else ""
+        raise CzError(f"{key.name} must be a number{pair}, not {value!s:.60}")
     size, slips = UNITS[key.unit]
     for number in numbers:
         shown = number / size
