@@ -18,7 +18,7 @@ from cz_gym.physics.parameters import Parameters
 from cz_gym.puller import DEFAULT, PullerFile
 
 from .log import Floats, Log
-from .model import Model, Noise, Predicted, sensitivities
+from .model import LAM, Model, Noise, Predicted, sensitivities
 
 HEATER = ("C_1", "C_2", "C_b", "kappa_12", "G_1a", "G_2b", "eps", "k_l")
 """Parameters of the path from the heater."""
@@ -26,8 +26,8 @@ PULL = ("sigma", "lam")
 """Parameters of the path from the pull speed to the ring; ``lam`` stands for the product lam dT_0."""
 PRIOR_SD, NOISE_SD = 0.35, 1.0
 """Standard deviation of the logarithm of a parameter, and of the strength of a noise [-]."""
-LAM, LAM_SD = 0.5, 0.3
-"""Mean and standard deviation of lam [-], about those of a uniform distribution."""
+LAM_SD = 0.3
+"""Standard deviation of lam [-]; with the mean LAM about that of a uniform distribution."""
 WIDER = 1.3
 """Factor on the standard deviations of the curvature, which is steeper at the maximum than around it; ``python -m
 studies.identify`` counts the intervals that hold the truth."""
@@ -121,7 +121,7 @@ def identify(
         sds[name] = value
     moved = measure_excitation(log, start)
     free = (*(HEATER if moved[1] >= 1.0 else ()), *(PULL if moved[0] >= 1.0 else ()))
-    model = Model((*free, *Noise._fields), start.parameters, Noise(), LAM, meniscus)
+    model = Model((*free, *Noise._fields), start.parameters, meniscus)
     sd = np.array([sds[name] for name in model.names])
     theta, spread, out, settled = _maximise(log, model, sd)
 

@@ -49,6 +49,8 @@ class Noise(NamedTuple):
     """Rate of the heat load on the melt, in shares of the heat that passes through it [1/s]."""
 
 
+LAM = 0.5
+"""Share of conduction where it is not free, and the mean of its prior [-]."""
 TAU_FAST, TAU_SLOW, TAU_RATE = 30.0, 780.0, 2400.0
 """Correlation times of the interface temperature's fluctuations and of the load's rate [s]."""
 START_SD = (0.5 * MM, 0.1 * MM, 1.0, 0.5, 0.3)
@@ -121,21 +123,18 @@ class Model(NamedTuple):
     names: tuple[str, ...]
     """The free ones, of Parameters, Noise and ``lam``."""
     start: Parameters
-    noise: Noise
-    lam: float
-    """Share of conduction if it is not free [-]."""
     meniscus: MeniscusModel = HURLE
 
     @property
     def mean(self) -> Any:
         """The free numbers of the start, shape (names,)."""
-        return np.array([self.lam if name == "lam" else 0.0 for name in self.names])
+        return np.array([LAM if name == "lam" else 0.0 for name in self.names])
 
     def value(self, name: str, at: float) -> float:
         """The parameter or noise where its free number is ``at``; of ``lam``, the product lam dT_0 [K]."""
         if name == "lam":
             return at * self.start.dT_0
-        return float(getattr(self.noise if name in Noise._fields else self.start, name) * np.exp(at))
+        return float(getattr(Noise() if name in Noise._fields else self.start, name) * np.exp(at))
 
     def puller(self, theta: Any) -> Any:
         """The puller of free numbers, real or complex, shape (names,)."""
@@ -144,12 +143,12 @@ class Model(NamedTuple):
         q = self.start._replace(**{name: getattr(self.start, name) * factor for name, factor in factors.items()})
         zero = 0.0 * theta[0]
         numbers = Parameters(*(number + zero for number in q))
-        return derive_puller(numbers, free.get("lam", self.lam) + zero, self.meniscus.height, self.meniscus.ring_offset)
+        return derive_puller(numbers, free.get("lam", LAM) + zero, self.meniscus.height, self.meniscus.ring_offset)
 
     def noises(self, theta: Any) -> Noise:
         """The noise of free numbers, as :meth:`puller`."""
-        free = {name: value for name, value in zip(self.names, theta, strict=True) if name in Noise._fields}
-        return self.noise._replace(**{name: getattr(self.noise, name) * np.exp(at) for name, at in free.items()})
+        free = dict(zip(self.names, theta, strict=True))
+        return Noise(*(usual * np.exp(free.get(name, 0.0)) for name, usual in Noise()._asdict().items()))
 
 
 def predict(log: Log, model: Model, theta: Any) -> Predicted:

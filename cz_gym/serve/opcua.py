@@ -47,8 +47,8 @@ class Account(NamedTuple):
     writes: bool
 
 
-class Door:
-    """The accounts that may log in, and the list of what was refused.
+class Door(UserManager):  # type: ignore[misc]
+    """The accounts that may log in to the server and its page, and the list of what was refused.
 
     Without accounts everybody on this machine may read and write tags. With accounts only operators write; elsewhere
     than on this machine nobody reads without an account.
@@ -71,6 +71,14 @@ class Door:
         self.refused(f"login as {name!r:.40}")
         return None
 
+    def get_user(
+        self, iserver: Any, username: Any = None, password: Any = None, certificate: Any = None
+    ) -> User | None:
+        """The user of an OPC UA session as asyncua asks for it, None if it is refused."""
+        account = self.login(username, password)
+        role = "operator" if account and account.writes else "reader"
+        return account and User(UserRole.User, f"{role} {account.name or 'guest'}")
+
     def refused(self, what: str) -> None:
         """Log a refusal."""
         now = datetime.now(UTC)
@@ -81,22 +89,6 @@ class Door:
             what += " (and more in this second)" * (self._count == LINES_PER_SECOND)
             self.events.append(f"{now:%H:%M:%S} refused: {what}")
             logger.warning("refused: %s", what)
-
-
-class Users(UserManager):  # type: ignore[misc]
-    """The accounts, as asyncua asks for them."""
-
-    def __init__(self, door: Door) -> None:
-        self.door = door
-
-    def get_user(
-        self, iserver: Any, username: Any = None, password: Any = None, certificate: Any = None
-    ) -> User | None:
-        """The user of a session, None if it is refused."""
-        account = self.door.login(username, password)
-        return account and User(
-            UserRole.User, ("operator " if account.writes else "reader ") + (account.name or "guest")
-        )
 
 
 class Writes(AttributeService):  # type: ignore[misc]
@@ -145,7 +137,7 @@ class Tags:
 
     def __init__(self, machine: Machine, door: Door, host: str, certificates: Path, port: int) -> None:
         self.machine, self.door, self.certificates = machine, door, certificates
-        self.server = Server(user_manager=Users(door))
+        self.server = Server(user_manager=door)
         self.endpoint = f"opc.tcp://{host}:{port}/"
         self.nodes: dict[str, ua.NodeId] = {}
 

@@ -11,10 +11,10 @@ from cz_gym.action import MadeFor
 from cz_gym.baselines.policy import OpenLoop
 from cz_gym.errors import CzError
 from cz_gym.identify import Excited, Identified, identify, read_log, record_log
-from cz_gym.identify.estimate import HEATER, LAM, PULL, measure_excitation, whiteness
+from cz_gym.identify.estimate import HEATER, PULL, measure_excitation, whiteness
 from cz_gym.identify.excitation import CHIPS, SEQUENCE
 from cz_gym.identify.log import Log
-from cz_gym.identify.model import Model, Noise, predict, sensitivities
+from cz_gym.identify.model import LAM, Model, Noise, predict, sensitivities
 from cz_gym.observation import decode
 from cz_gym.puller import DEFAULT
 from cz_gym.task import HEATER_RANGE
@@ -27,7 +27,7 @@ def test_without_noise_the_filter_of_the_true_puller_predicts_every_reading(
 ) -> None:
     env = CzEnv("nominal", 0.5, "measured", interval, 3600.0, parameters=TRUTH, action="direct", info="all")
     record_log(env, Excited(OpenLoop(), heater=0.01), tmp_path / "log.csv", seed=0)
-    log, model = read_log(tmp_path / "log.csv"), Model(("C_1",), TRUTH, Noise(), 0.5)
+    log, model = read_log(tmp_path / "log.csv"), Model(("C_1",), TRUTH)
     assert np.ptp(log.T_1) > 1.0
     assert np.abs(predict(log, model, np.zeros(1)).error[1:]).max() < off
     assert np.abs(predict(log, model, np.array([0.05])).error[:, 0]).max() > 0.02
@@ -35,7 +35,7 @@ def test_without_noise_the_filter_of_the_true_puller_predicts_every_reading(
 
 def test_derivatives_are_those_of_the_filter(logs: tuple[Path, Path]) -> None:
     log = Log(*(each[:400] if isinstance(each, np.ndarray) else each for each in read_log(logs[0])))
-    model = Model((*HEATER, *PULL, *Noise._fields), Parameters(), Noise(), LAM)
+    model = Model((*HEATER, *PULL, *Noise._fields), Parameters())
     theta, step = model.mean + 0.05, 1e-5
     out, *exact = sensitivities(log, model, theta)
     for j, name in enumerate(model.names):
