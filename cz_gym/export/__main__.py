@@ -20,59 +20,13 @@ from cz_gym.units import KILO, MM_PER_MIN
 from .agent import Agent
 from .onnx_graph import write_onnx
 from .shell import Alarm, Block
-from .text import meanings, write_c, write_st
+from .text import fill_template, meanings, write_c, write_st
 
 REGISTRY, AGENTS = "cz_gym.baselines.registry", "cz_gym.agents"
 """Modules that know controllers and agents, looked up by name because this package imports neither."""
 FALLBACK = "paper-tuned"
 """The PID that takes over."""
 WRITERS: dict[str, Any] = {"c": write_c, "st": write_st, "onnx": write_onnx}
-README = """# {name}: a controller for Czochralski growth
-
-{about}
-
-| file | what it is |
-|---|---|
-{files}
-
-The block is called with the readings and returns setpoints and alarms. It takes a sample when {interval:g} s have
-passed since the last one and answers with the same setpoints in between, so it may stand in a faster task. Everything
-is in the units of the names: mm, mm/min, kW, K, s.
-
-## Inputs
-
-| name | meaning |
-|---|---|
-{inputs}
-
-A reading counts if it is finite and within the range that the controller knows: the ring within 10 mm of its reference
-and radii within 10 mm of nominal, temperatures within 50 K of nominal, drives within {pull:g} mm/min and {heater:g} kW
-of nominal. The last good reading stands in for one that does not.
-
-## Settings and their defaults
-
-| name | meaning |
-|---|---|
-{settings}
-
-Write in the nominal values of your own puller, and limits that it can bear.
-
-## Alarms
-
-| bit | name | meaning |
-|---|---|---|
-{alarms}
-
-## Before it meets a puller
-
-- **No controller or agent of this project was tested on a real puller.** All figures come from a simulation whose
-  numbers are traced to the literature.
-- Radius control by pull speed and heater power is the subject of patents, US 9,340,897 among them: check them before
-  industrial use.
-- Compile without options that drop NaN and infinity (`-ffast-math`): the checks of the readings need them.
-- Limits, interlocks and an emergency stop that do not depend on this block belong to the plant.
-- First run it beside the present controller with `automatic` not set, and read its alarms.
-"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -151,17 +105,16 @@ def readme(block: Block, files: list[str]) -> str:
         "`memory` of the next call, which the first call leaves out",
     }  # fmt: skip
     program, config = block.program, block.config
-    return README.format(
-        name=program.name,
-        about="  \n".join(program.notes),
-        files="\n".join(f"| `{name}` | {kinds[Path(name).suffix]} |" for name in files),
-        interval=config.control_interval,
-        pull=CLIP * config.parameters.v_0 / MM_PER_MIN,
-        heater=CLIP * config.heater_range / KILO,
-        inputs="\n".join(f"| `{port.name}` | {port.meaning} |" for port in program.inputs),
-        settings="\n".join(f"| `{port.name}` | {port.meaning}: {port.default:.10g} |" for port in program.settings),
-        alarms="\n".join(f"| {bit.value} | `{bit.name}` | {text} |" for bit, text in meanings(Alarm).items()),
-    )
+    parts = {
+        "files": "\n".join(f"| `{name}` | {kinds[Path(name).suffix]} |" for name in files),
+        "interval": f"{config.control_interval:g}",
+        "pull": f"{CLIP * config.parameters.v_0 / MM_PER_MIN:g}",
+        "heater": f"{CLIP * config.heater_range / KILO:g}",
+        "inputs": "\n".join(f"| `{port.name}` | {port.meaning} |" for port in program.inputs),
+        "settings": "\n".join(f"| `{port.name}` | {port.meaning}: {port.default:.10g} |" for port in program.settings),
+        "alarms": "\n".join(f"| {bit.value} | `{bit.name}` | {text} |" for bit, text in meanings(Alarm).items()),
+    }
+    return fill_template("block.md", parts | {"name": program.name, "about": "  \n".join(program.notes)})
 
 
 if __name__ == "__main__":

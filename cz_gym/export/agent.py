@@ -15,11 +15,6 @@ from cz_gym.observation import CLIP, HISTORY, INTEGRAL_SCALE, LAGGED, MEASURED, 
 from cz_gym.task import HEATER_SLACK, drives_of
 
 
-def _clip(x: Any, low: Any = None, high: Any = None) -> Any:
-    x = x if low is None else np.maximum(x, low)
-    return x if high is None else np.minimum(x, high)
-
-
 def _gemm(a: Any, b: Any, c: Any = 0.0, alpha: float = 1.0, beta: float = 1.0, transA: int = 0, transB: int = 0) -> Any:
     return alpha * ((a.T if transA else a) @ (b.T if transB else b)) + beta * c
 
@@ -37,7 +32,8 @@ def _split(x: Any, lengths: Any = None, axis: int = 0, parts: int = 1) -> Any:
 
 OPERATORS: dict[str, Callable[..., Any]] = {
     "Add": np.add, "Sub": np.subtract, "Mul": np.multiply, "Div": np.divide, "Neg": np.negative, "Sqrt": np.sqrt,
-    "Tanh": np.tanh, "MatMul": np.matmul, "Gemm": _gemm, "Clip": _clip, "Slice": _slice, "Split": _split,
+    "Tanh": np.tanh, "MatMul": np.matmul, "Gemm": _gemm, "Slice": _slice, "Split": _split,
+    "Clip": lambda x, low=None, high=None: np.clip(x, low, high),
     "Identity": lambda x: x, "Concat": lambda *x, axis: np.concatenate(x, axis=axis),
     "Gather": lambda x, at, axis=0: np.moveaxis(np.moveaxis(x, axis, 0)[at], 0, axis),
     "Relu": lambda x: np.maximum(x, 0.0), "Sigmoid": lambda x: 0.5 + 0.5 * np.tanh(0.5 * x),

@@ -25,17 +25,17 @@ FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O2", "-ffp-co
 class CompiledBlock:
     """Runs n blocks of compiled C, as :class:`cz_gym.export.shell.Block` does; CzError if there is no compiler."""
 
-    def __init__(self, block: Block, single: bool = False, compiler: str = "cc") -> None:
+    def __init__(self, block: Block, single: bool = False) -> None:
         program, name = block.program, f"cz_{block.name}"
-        if shutil.which(compiler) is None:
-            raise CzError(f"no C compiler: {compiler!r} is not installed")
+        if shutil.which("cc") is None:
+            raise CzError("no C compiler: 'cc' is not installed")
         with TemporaryDirectory() as folder:
             for file, text in write_c(program, single).items():
                 (Path(folder) / file).write_text(text)
-            command = [compiler, *FLAGS, f"{name}.c", "-o", f"{name}.so", "-lm"]
+            command = ["cc", *FLAGS, f"{name}.c", "-o", f"{name}.so", "-lm"]
             done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
             if done.returncode:
-                raise CzError(f"{name}.c: {compiler} says {done.stderr.strip()[:300]}")
+                raise CzError(f"{name}.c: cc says {done.stderr.strip()[:300]}")
             library = ctypes.CDLL(f"{folder}/{name}.so")
         self._init, self._step = getattr(library, f"{name}_init"), getattr(library, f"{name}_step")
         self._init.argtypes, self._step.argtypes = [ctypes.c_void_p], [ctypes.c_void_p] * 3

@@ -260,7 +260,8 @@ class Traced(np.lib.mixins.NDArrayOperatorsMixin):
 
 
 def _clip(graph: Graph, value: Any, low: Any, high: Any) -> Any:
-    return graph.apply("minimum", graph.apply("maximum", value, low), high)
+    value = value if low is None else graph.apply("maximum", value, low)
+    return value if high is None else graph.apply("minimum", value, high)
 
 
 def _take(graph: Graph, array: Any, index: Any, axis: Any = None) -> Traced:

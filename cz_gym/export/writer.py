@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -18,79 +18,113 @@ from .trace import FUNCTIONS, Floats, Ids, Node
 
 LONGEST = 90
 """Longest expression that becomes part of another one, in characters."""
-_ARITHMETIC = {
-    "add": "({0} + {1})", "subtract": "({0} - {1})", "multiply": "({0} * {1})", "divide": "({0} / {1})",
-    "negative": "(-{0})", "less": "({0} < {1})", "less_equal": "({0} <= {1})",
-}  # fmt: skip
-C_OPERATIONS = _ARITHMETIC | {
-    "absolute": "fabs({0})", "sqrt": "sqrt@({0})", "exp": "exp@({0})", "log": "log@({0})", "sin": "sin@({0})",
-    "cos": "cos@({0})", "tanh": "tanh@({0})", "minimum": "fmin@({0}, {1})", "maximum": "fmax@({0}, {1})",
-    "equal": "({0} == {1})", "and": "({0} && {1})", "or": "({0} || {1})", "not": "(!{0})",
-    "select": "({0} ? {1} : {2})", "finite": "(fabs({0}) <= 1e38)", "real": "({0} ? 1.0 : 0.0)",
-}  # fmt: skip
-ST_OPERATIONS = _ARITHMETIC | {
-    "absolute": "ABS({0})", "sqrt": "SQRT({0})", "exp": "EXP({0})", "log": "LN({0})", "sin": "SIN({0})",
-    "cos": "COS({0})", "tanh": "(1.0 - 2.0 / (EXP(2.0 * LIMIT(-20.0, {0}, 20.0)) + 1.0))", "minimum": "MIN({0}, {1})",
-    "maximum": "MAX({0}, {1})", "equal": "({0} = {1})", "and": "({0} AND {1})", "or": "({0} OR {1})",
-    "not": "(NOT {0})", "select": "SEL({0}, {2}, {1})", "finite": "(ABS({0}) <= 1.0E38)", "real": "SEL({0}, 0.0, 1.0)",
-}  # fmt: skip
+SYNTAX = {
+    "add": ("({0} + {1})", "({0} + {1})"),
+    "subtract": ("({0} - {1})", "({0} - {1})"),
+    "multiply": ("({0} * {1})", "({0} * {1})"),
+    "divide": ("({0} / {1})", "({0} / {1})"),
+    "negative": ("(-{0})", "(-{0})"),
+    "absolute": ("fabs({0})", "ABS({0})"),
+    "sqrt": ("sqrt{f}({0})", "SQRT({0})"),
+    "exp": ("exp{f}({0})", "EXP({0})"),
+    "log": ("log{f}({0})", "LN({0})"),
+    "sin": ("sin{f}({0})", "SIN({0})"),
+    "cos": ("cos{f}({0})", "COS({0})"),
+    "tanh": ("tanh{f}({0})", "(1.0 - 2.0 / (EXP(2.0 * LIMIT(-20.0, {0}, 20.0)) + 1.0))"),
+    "minimum": ("fmin{f}({0}, {1})", "MIN({0}, {1})"),
+    "maximum": ("fmax{f}({0}, {1})", "MAX({0}, {1})"),
+    "less": ("({0} < {1})", "({0} < {1})"),
+    "less_equal": ("({0} <= {1})", "({0} <= {1})"),
+    "equal": ("({0} == {1})", "({0} = {1})"),
+    "and": ("({0} && {1})", "({0} AND {1})"),
+    "or": ("({0} || {1})", "({0} OR {1})"),
+    "not": ("(!{0})", "(NOT {0})"),
+    "select": ("({0} ? {1} : {2})", "SEL({0}, {2}, {1})"),
+    "finite": ("(fabs({0}) <= 1e38)", "(ABS({0}) <= 1.0E38)"),
+    "real": ("({0} ? 1.0 : 0.0)", "SEL({0}, 0.0, 1.0)"),
+    "number": ("{0}{f}", "{0}"),
+    "false": ("0", "FALSE"),
+    "true": ("1", "TRUE"),
+    "index": ("(int)({0})", "{real}_TO_DINT({0})"),
+    "bits": ("(unsigned)({0})", "{real}_TO_UDINT({0})"),
+    "memory": ("block->{0}", "{0}"),
+    "reading": ("measured->{0}", "{0}"),
+    "setpoint": ("setpoints->{0}", "{0}"),
+    "assign": ("{0} = {1};", "{0} := {1};"),
+    "loop": ("for (int {0} = 0; {0} < {1}; {0}++) {{", "FOR {0} := 0 TO {2} DO"),
+    "end loop": ("}}", "END_FOR;"),
+    "if": ("if ({0}) {{", "IF {0} THEN"),
+    "end if": ("}}", "END_IF;"),
+    "type of reading": ("double", "{real}"),
+    "type of switch": ("int", "BOOL"),
+    "type of alarms": ("unsigned", "UDINT"),
+    "type of b": ("unsigned char", "BOOL"),
+    "type of d": ("double", "{real}"),
+    "type of w": ("{block}_real", "{real}"),
+    "type of real": ("{real}", "{real}"),
+    "declare input": ("{type} {name}; /* {meaning} */", "{name} : {type} := {start}; (* {meaning} *)"),
+    "declare setting": (
+        "{type} {name}; /* {meaning}; default {default:.10g} */",
+        "{name} : {type} := {start}; (* {meaning} *)",
+    ),
+    "declare output": ("{type} {name}; /* {meaning} */", "{name} : {type}; (* {meaning} *)"),
+    "declare number": ("{type} {name};", "{name} : {type};"),
+    "declare array": ("{type} {name}[{size}];", "{name} : ARRAY [0..{last}] OF {type};"),
+    "declare table": (
+        "static const {type} {name}[{size}] = {{\n{rows}\n}};",
+        "    {name} : ARRAY [0..{last}] OF {type} := [\n{rows}\n    ];",
+    ),
+    "tables": ("{0}", "VAR CONSTANT\n{0}\nEND_VAR"),
+    "bit": ("#define {BLOCK}_{0} {1}u /* {2} */", "{1}: {2}"),
+}
+"""How C99 and structured text write operations, statements and declarations.
+
+A loop runs over ``{0}`` from 0 to ``{1}``, which is not included, or ``{2}``, which is.
+"""
 
 
-@dataclass(frozen=True)
 class Dialect:
-    """How a language writes expressions and loops."""
+    """One of both languages, in one precision, for the block of a name: a column of :data:`SYNTAX`."""
 
-    operations: dict[str, str]
-    logical: tuple[str, str]
-    """False and true."""
-    assign: str
-    loop: tuple[str, str]
-    """Begin of a loop over ``{0}`` from 0 to ``{1}``, which is not included, or ``{2}``, which is; and its end."""
-    if_: tuple[str, str]
-    index: str
-    """A whole number in a real one, as an index."""
-    whole: str
-    """A real number as the type of the alarms."""
-    prefixes: tuple[str, str, str] = ("", "", "")
-    """Of memory and settings, of inputs, of outputs."""
-    end: str = ""
-    """End of a literal, and of a function's name."""
+    def __init__(self, language: str, block: str, single: bool) -> None:
+        self._syntax = {what: texts[language == "st"] for what, texts in SYNTAX.items()}
+        real = {"c": ("double", "float"), "st": ("LREAL", "REAL")}[language][single]
+        self._names = {"block": block, "BLOCK": block.upper(), "real": real, "f": "f" if single else ""}
+
+    def __call__(self, what: str, *parts: Any, **named: Any) -> str:
+        """What SYNTAX calls so, with its parts."""
+        return self._syntax[what].format(*parts, **self._names, **named)
 
     def number(self, value: float) -> str:
         """A literal."""
-        text = repr(float(value))
-        mantissa, _, exponent = text.partition("e")
-        if "." not in mantissa:
-            mantissa += ".0"
-        text = mantissa + (f"E{int(exponent)}" if exponent else "")
-        return f"({text}{self.end})" if value < 0 else text + self.end
+        mantissa, e, exponent = repr(float(value)).partition("e")
+        return self("number", f"{mantissa}{'' if '.' in mantissa else '.0'}{e and f'E{int(exponent)}'}")
 
+    def around(self, lines: list[str], what: str, *parts: Any) -> list[str]:
+        """Lines within a loop or a condition."""
+        return [self(what, *parts), *(f"    {line}" for line in lines), self(f"end {what}")]
 
-def c_dialect(single: bool) -> Dialect:
-    """C99 in double or single precision."""
-    return Dialect(
-        C_OPERATIONS, ("0", "1"), "{} = {};", ("for (int {0} = 0; {0} < {1}; {0}++) {{", "}"), ("if ({0}) {{", "}"),
-        "(int)({0})", "(unsigned)({0})", ("block->", "measured->", "setpoints->"), "f" if single else "",
-    )  # fmt: skip
+    def declare(self, what: str, kind: str, name: str, size: int = 1, **more: Any) -> str:
+        """A declaration."""
+        type_ = self(f"type of {kind}")
+        return self(f"declare {what}", type=type_, name=name, size=size, last=size - 1, **more)
 
-
-def st_dialect(single: bool) -> Dialect:
-    """Structured text in LREAL or REAL."""
-    real = "REAL" if single else "LREAL"
-    return Dialect(
-        ST_OPERATIONS, ("FALSE", "TRUE"), "{} := {};", ("FOR {0} := 0 TO {2} DO", "END_FOR;"),
-        ("IF {0} THEN", "END_IF;"), f"{real}_TO_DINT({{0}})", f"{real}_TO_UDINT({{0}})",
-    )  # fmt: skip
+    def variable(self, kind: str, name: str, size: int) -> str:
+        """The declaration of a number, or of an array if there are several."""
+        return self.declare("array" if size > 1 else "number", kind, name, size)
 
 
 class Writer:
     """The statements of a program in a dialect, with the work arrays and the constants that they need."""
 
-    def __init__(self, program: Program, dialect: Dialect, wide: Dialect) -> None:
-        self.program, self.dialect, self.graph = program, dialect, program.graph
-        self.dialects = dialect, wide
+    def __init__(self, program: Program, language: str, single: bool) -> None:
+        """The language is "c" or "st"; C in single precision has sums over time in double precision."""
+        self.program, self.graph, block = program, program.graph, f"cz_{program.name}"
+        self.dialects = Dialect(language, block, single), Dialect(language, block, single and language == "st")
+        self.dialect = self.dialects[False]
         self.cells = {cell.name for cell in program.memory}
         self.own = self.cells | {port.name for port in program.settings}
+        self.switches = {port.name for port in program.inputs if port.logical}
         self.tables: dict[tuple[bytes, str, bool], tuple[str, Floats, bool]] = {}
         """Name and numbers of each table of constants, and whether they are in double precision."""
         self._statements: list[tuple[list[str], int]] = []
@@ -111,15 +145,16 @@ class Writer:
             self._node(node)
         self._finish()
         self.work, self.body = self._allocated()
+        if any(node.op == "matmul" for node in program.nodes):
+            self.work["sum"] = 1, "w"
 
     def loop(self, variable: str, count: int, lines: list[str]) -> list[str]:
         """Lines that run for a variable from 0 to count - 1."""
-        head, tail = self.dialect.loop
-        return [head.format(variable, count, count - 1), *(f"    {line}" for line in lines), tail]
+        return self.dialect.around(lines, "loop", variable, count, count - 1)
 
     def assign(self, target: str, value: str) -> str:
         """A statement that gives a target its value."""
-        return self.dialect.assign.format(target, value)
+        return self.dialect("assign", target, value)
 
     def each(self, target: str, size: int, value: str) -> list[str]:
         """Statements that give each element of an array, or a number, its value, a text of ``i``."""
@@ -149,11 +184,11 @@ class Writer:
     def _node(self, node: Node) -> None:
         at, self.dialect = int(self.graph.owners(node.start)), self.dialects[node.wide]
         if node.op == "input":
-            self._names[at] = self.dialect.prefixes[node.data not in self.own] + node.data
+            name = self.dialect("memory" if node.data in self.own else "reading", node.data)
+            self._names[at] = self.dialect("real", name) if node.data in self.switches else name
             return
         if node.op in FUNCTIONS:
-            args = [self._element(ids) for ids in node.args]
-            text = self.dialect.operations[node.op].replace("@", self.dialect.end).format(*args)
+            text = self.dialect(node.op, *map(self._element, node.args))
             if self._uses[at] == 1 and len(text) <= LONGEST:
                 user, used = self._users[at]
                 if user.op in FUNCTIONS and np.array_equal(used, node.start + np.arange(node.size)):
@@ -163,12 +198,12 @@ class Writer:
         elif node.op == "matmul":
             lines = self._product(node)
         elif node.op == "argmax":
-            row, best = self._array(node.args[0]), self.dialect.index.format("<new>")
-            head, tail = self.dialect.if_
-            body = [head.format(f"{row.format(best)} < {row.format('i')}"), f"    {self.assign('<new>', 'i')}", tail]
+            row, best = self._array(node.args[0]), self.dialect("index", "<new>")
+            larger = f"{row.format(best)} < {row.format('i')}"
+            body = self.dialect.around([self.assign("<new>", "i")], "if", larger)
             lines = [self.assign("<new>", self.dialect.number(0.0)), *self.loop("i", node.args[0].size, body)]
         else:
-            picked = self._array(node.args[0]).format(self.dialect.index.format(self._element(node.args[1])))
+            picked = self._array(node.args[0]).format(self.dialect("index", self._element(node.args[1])))
             lines = self.each("<new>", node.size, picked)
         self._names[at] = f"<{self._add(lines, node.size, node)}>"
 
@@ -206,7 +241,9 @@ class Writer:
         known = self.graph.values(ids)
         if known is not None and (known.ravel() == known.flat[0]).all():
             value = known.flat[0]
-            return self.dialect.logical[int(value)] if known.dtype == np.bool_ else self.dialect.number(value)
+            if known.dtype == np.bool_:
+                return self.dialect("true" if value else "false")
+            return f"({self.dialect.number(value)})" if value < 0 else self.dialect.number(value)
         owner = int(self.graph.owners(ids[0]))
         return self._inlined[owner] if owner in self._inlined else self._array(ids).format("i")
 
@@ -235,14 +272,13 @@ class Writer:
                 continue
             self.dialect = self.dialects[cell.wide]
             held = f"<{self._copy(cell.after)}>" + "[i]" * (size > 1) if old else self._element(cell.after)
-            changes += self.each(self.dialect.prefixes[0] + cell.name, size, held)
+            changes += self.each(self.dialect("memory", cell.name), size, held)
         for port, ids in self.program.outputs:
             value = self._element(ids)
-            value = self.dialect.whole.format(value) if port.name == "alarms" else value
-            self._statements.append(([self.assign(self.dialect.prefixes[2] + port.name, value)], -1))
-        head, tail = self.dialect.if_
-        due = head.format(self._element(self.program.due))
-        self._statements.append(([due, *(f"    {line}" for line in changes), tail], -1))
+            value = self.dialect("bits", value) if port.name == "alarms" else value
+            self._statements.append(([self.assign(self.dialect("setpoint", port.name), value)], -1))
+        due = self._element(self.program.due)
+        self._statements.append((self.dialect.around(changes, "if", due), -1))
 
     def _allocated(self) -> tuple[dict[str, tuple[int, str]], list[str]]:
         """Work arrays by name, and the lines with their names; an array is used again after its last use.

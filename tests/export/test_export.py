@@ -355,6 +355,7 @@ def test_the_structured_text_acts_as_python_does(name: str) -> None:
     """Statement by statement, on noisy readings of which some are bad."""
     exported, rng = block_of(name), np.random.default_rng(5)
     (text,) = write_st(exported.program).values()
+    assert not re.search(r"< (valid|automatic)\b", text), "a BOOL is no number"
     block, memory, pull = FunctionBlock(text), exported.start(1), 1.2
     for k in range(60):
         ring, pyrometer = 101.6 + rng.normal(0.0, 0.1), 1785.6 + rng.normal(0.0, 0.3)

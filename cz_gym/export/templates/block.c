@@ -1,0 +1,25 @@
+/*
+   $about
+*/
+#include "$name.h"
+#include <math.h>
+
+$tables
+
+void ${name}_init($name *block)
+{
+    $defaults
+    ${name}_reset(block);
+}
+
+void ${name}_reset($name *block)
+{
+    $start
+}
+
+void ${name}_step($name *block, const ${name}_measured *measured, ${name}_setpoints *setpoints)
+{
+    $work
+
+    $body
+}
