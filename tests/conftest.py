@@ -1,6 +1,6 @@
 """Settings and fixtures of all tests: one folder for compiled code, a refused command, small trainings.
 
-Where a package for training is not installed, the tests that need it are skipped, whole modules where they import it.
+Where an optional package is not installed, the tests that need it are skipped, whole modules where they import it.
 """
 
 import importlib.util
@@ -13,22 +13,24 @@ from typing import Any
 
 # Threads of torch and of NumPy's linear algebra wait for each other by spinning, all the longer beside other workers.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("CZ_GYM_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "cz-gym"))
 
 import numpy as np
 import pytest
 from hypothesis import settings
 
+from cz_gym.commands import OPTIONAL
+
 os.environ["SDL_VIDEODRIVER"] = os.environ["SDL_AUDIODRIVER"] = "dummy"  # no test opens a window
-CACHE = Path(__file__).parents[1] / ".pytest_cache" / "cz-gym"
-os.environ.setdefault("CZ_GYM_CACHE_DIR", str(CACHE))
+CACHE = Path(os.environ["CZ_GYM_CACHE_DIR"])
 
 settings.register_profile("repeatable", deadline=None, derandomize=True, database=None, max_examples=40)
 settings.register_profile("long", deadline=None, database=None, max_examples=20_000)
 settings.load_profile("repeatable")
 
-TRAINING = ("torch", "stable_baselines3", "sb3_contrib", "safetensors", "tensorboard")
 LARGE = ("torch", "stable_baselines3", "scipy.stats", "matplotlib.pyplot", "asyncua", "pandas", "control")
-ABSENT = tuple(name for name in TRAINING if importlib.util.find_spec(name) is None)
+DOCUMENTING = ("sphinx", "myst_parser", "sybil", "jupytext", "nbformat")
+ABSENT = tuple(name for name in (*OPTIONAL, *DOCUMENTING) if importlib.util.find_spec(name) is None)
 if sys.platform == "win32":
     collect_ignore = ["stress"]  # signals, pipes and limits of memory as POSIX has them
 
@@ -50,7 +52,7 @@ def pytest_sessionstart() -> None:
 
 
 def lacks(error: BaseException | None) -> bool:
-    """Whether an error comes from a package for training that is not installed."""
+    """Whether an error comes from an optional package that is not installed."""
     while error is not None:
         if isinstance(error, ModuleNotFoundError) and str(error.name).partition(".")[0] in ABSENT:
             return True
@@ -63,7 +65,7 @@ def pytest_make_collect_report(collector: pytest.Collector) -> Iterator[None]:
     report: Any = yield
     failed = report.failed and report.call.excinfo
     if failed and lacks(failed.value):
-        report.outcome, report.longrepr = "skipped", (str(collector.path), 0, "Skipped: no package for training")
+        report.outcome, report.longrepr = "skipped", (str(collector.path), 0, "Skipped: no optional package")
     return report
 
 
@@ -71,9 +73,9 @@ def pytest_make_collect_report(collector: pytest.Collector) -> Iterator[None]:
 def pytest_runtest_call() -> Iterator[None]:
     try:
         return (yield)
-    except ModuleNotFoundError as error:
+    except ImportError as error:
         if lacks(error):
-            pytest.skip(f"no {error.name}")
+            pytest.skip(str(error))
         raise
 
 

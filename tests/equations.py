@@ -1,5 +1,6 @@
 """The plant's equations written a second time, its random series as a whole, and a controller on its true state."""
 
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,12 +46,9 @@ def integrated(x: Any, u: Truth, p: Any, dt: float, **options: Any) -> Any:
     return solve_ivp(lambda _, y: design_rates(y, u, p), (0.0, dt), np.array(x), **settings)
 
 
-class Fields:
-    """The fields of a NumPy record as floats."""
-
-    def __init__(self, record: Any) -> None:
-        for name in record.dtype.names:
-            setattr(self, name, float(record[name]))
+def fields(record: Any) -> Any:
+    """The fields of a NumPy record as floats, by name."""
+    return SimpleNamespace(**dict(zip(record.dtype.names, record.item(), strict=True)))
 
 
 def drawn(env: Any) -> Any:
@@ -61,6 +59,6 @@ def drawn(env: Any) -> Any:
     return series
 
 
-def hold(info: dict[str, Any], p: Any) -> float:
-    """Pull action that holds any crystal, from its true state: poles near 0.01 rad/s."""
-    return float(1000 * (info["r_c"] - info["r_ref"]) - 700 * (info["h_c"] - p.h_0))
+def hold(info: dict[str, Any], h_0: Any) -> Any:
+    """Pull action that holds any crystal, from its true state and nominal height [m]: poles near 0.01 rad/s."""
+    return 1000 * (info["r_c"] - info["r_ref"]) - 700 * (info["h_c"] - h_0)

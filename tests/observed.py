@@ -20,13 +20,30 @@ def measured(**values: Any) -> np.ndarray:
     return np.stack(columns, axis=1) / scales(MEASURED, PULL_SCALE)
 
 
-def pulls(policy: Any, rows: Iterable[Any]) -> np.ndarray:
-    """Pull speeds above nominal [m/s] of one slot, for its observations sample by sample."""
+class Watched:
+    """A policy whose memory is kept, sample by sample."""
+
+    def __init__(self, policy: Any) -> None:
+        self.policy, self.states = policy, []
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):  # type: ignore
+        action, state = self.policy.predict(observation, state, episode_start)
+        self.states.append(state)
+        return action, state
+
+
+def actions_of(policy: Any, rows: Iterable[Any]) -> np.ndarray:
+    """Actions of one slot, for its observations sample by sample."""
     state, found = None, []
     for row in rows:
         action, state = policy.predict(row, state)
-        found.append(float(action[0, 0]) * PULL_SCALE)
+        found.append(action[0])
     return np.array(found)
+
+
+def pulls(policy: Any, rows: Iterable[Any]) -> np.ndarray:
+    """The same as pull speeds above nominal [m/s]."""
+    return actions_of(policy, rows)[:, 0].astype(float) * PULL_SCALE
 
 
 def observations(n: int = 3, steps: int = 20, **keywords: Any) -> Iterator[Any]:

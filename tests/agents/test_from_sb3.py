@@ -104,9 +104,8 @@ def test_the_command_reads_what_stable_baselines3_and_rl_zoo_save(
 
 
 def test_the_command_reads_analytic_policy_gradients_of_a_mixture(tmp_path: Path) -> None:
-    model = APG("RecurrentPolicy", sb3.make_vec_env(2, observation="measured", action="rate"), window=4, seed=3).learn(
-        16
-    )
+    env = sb3.make_vec_env(2, observation="measured", action="rate")
+    model = APG("RecurrentPolicy", env, window=4, seed=3).learn(16)
     model.save(tmp_path / "model.zip")
     command = f"{tmp_path / 'model.zip'} --algo apg --out {tmp_path / 'own.onnx'} --observation measured --action rate"
     assert from_sb3.main([*command.split(), "--scenario", "randomized=0.5,hard=0.5"]) == 0

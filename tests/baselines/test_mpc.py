@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+from cz_gym.baselines.bounds.trajectory import SCALES, Limits
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign, optimal_inputs
 from cz_gym.baselines.lqg.model import DRIFT, HEATER, PLANT, STATES
+from cz_gym.baselines.mpc import EkfMpc, best_corrections, expected_disturbances, held, newton, predict_under_law
 from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Actuators
@@ -16,20 +18,7 @@ from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.physics.plant import Disturbance, Inputs, State, hidden_load, rk4
 from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
-from tests.observed import PLAIN
-
-pytest.importorskip("casadi", reason="needs the extra mpc")
-
-from cz_gym.baselines.bounds.trajectory import SCALES, Limits
-from cz_gym.baselines.mpc import (
-    EkfMpc,
-    best_corrections,
-    ekf_mpc,
-    expected_disturbances,
-    held,
-    newton,
-    predict_under_law,
-)
+from tests.observed import PLAIN, Watched
 
 LINEAR = LQGDesign(nonlinear=False)
 SHARE = LINEAR.noise.recipe_share
@@ -44,18 +33,6 @@ def situation(n=4, reference=0.0, size=1.0):
     plan[:, 1] = np.cumsum(random.normal(size=(n, 61)) * 0.05, axis=1)
     previous = random.normal(size=(n, 2)) * [1e-6, 100.0]
     return size * estimate, plan * size, size * previous
-
-
-class Watched:
-    """A policy whose memory is kept, sample by sample."""
-
-    def __init__(self, policy):
-        self.policy, self.states = policy, []
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=True):
-        action, state = self.policy.predict(observation, state, episode_start)
-        self.states.append(state)
-        return action, state
 
 
 def parts(mpc, estimate, plan, previous):
@@ -158,7 +135,7 @@ def test_mpc_asks_for_nothing_beyond_the_limits_of_the_drives():
     )
     config = make_config(replace(RANDOMIZED, name="narrow", actuators=actuators), horizon=0.1 * HOUR, **PLAIN)
     with pytest.warns(UserWarning, match=r"lqg was not tuned for actuators\.pull_window"):
-        watched = Watched(ekf_mpc(config))
+        watched = Watched(find_controller("ekf-mpc").make(config))
     run = rollout(watched, config, range(1_000_000, 1_000_003))
     wanted = np.array([state.memory.command for state in watched.states])
     pull = run.signals.v_p - config.parameters.v_0

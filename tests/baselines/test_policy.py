@@ -23,17 +23,11 @@ from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.observation import MEASURED
-from tests.observed import PLAIN, measured, observations
+from tests.observed import PLAIN, actions_of, measured, observations
 
 CASES = [(entry.name, "randomized") for entry in CONTROLLERS if entry.observation == "measured" and not entry.slow]
 TUNED = ("pid-conventional", "paper-filtered", "paper-tuned", "industrial", "lqg")
 CASES += [("paper-tuned", "puller"), ("lqg", "puller"), ("ekf-mpc", "puller")]
-
-
-def make(name, scenario):
-    if name == "ekf-mpc":
-        pytest.importorskip("casadi", reason="needs the extra mpc")
-    return make_controller(name, make_config(scenario, **PLAIN))
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +37,7 @@ def seen():
 
 @pytest.mark.parametrize(("name", "scenario"), CASES)
 def test_slots_do_not_disturb_each_other_and_begin_anew(name, scenario, seen):
-    policy, together, alone = make(name, scenario), None, None
+    policy, together, alone = make_controller(name, make_config(scenario, **PLAIN)), None, None
     assert isinstance(policy, Policy)
     for rows in seen:
         before = together
@@ -60,13 +54,6 @@ def test_slots_do_not_disturb_each_other_and_begin_anew(name, scenario, seen):
     np.testing.assert_allclose(mixed[[0, 2]], new[[0, 2]], rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(mixed[1], going_on[1], rtol=1e-5, atol=1e-6)
     assert name == "open-loop" or np.abs(new - going_on).max() > 1e-6
-
-
-@pytest.mark.parametrize("name", ["open-loop", "paper", "paper-tuned", "industrial", "lqg"])
-def test_history_is_read_like_measured(name):
-    policy = make(name, "randomized")
-    for row, history in zip(observations(steps=2), observations(steps=2, observation="history"), strict=True):
-        np.testing.assert_allclose(policy.predict(row)[0], policy.predict(history)[0], rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", TUNED)
@@ -91,8 +78,6 @@ OTHER = {"parameters": Parameters(r_0=0.1), "control_interval": 2.0}
 
 @pytest.mark.parametrize("name", [entry.name for entry in CONTROLLERS if entry.name != "open-loop"])
 def test_actions_are_for_the_environment_of_the_controller_alone(name):
-    if name == "ekf-mpc":
-        pytest.importorskip("casadi", reason="needs the extra mpc")
     entry = find_controller(name)
     config = make_config("nominal", observation=entry.observation, action="direct", horizon=60.0, **OTHER)
     policy = entry.make(config)
@@ -126,14 +111,6 @@ def test_a_controller_can_be_made_for_another_environment_or_for_any(option):
 READERS = [entry.name for entry in CONTROLLERS if entry.observation != "state" and entry.name != "ekf-mpc"]
 BAD = st.lists(st.sets(st.integers(0, len(MEASURED) - 1), min_size=1), min_size=1, max_size=4)
 ROW = measured(ring_error=1e-5, r_ref=2e-4, r_ref_1min=2e-4, r_ref_5min=2e-4, T_1=0.1, v_p=1e-7, Q_H=50.0)
-
-
-def actions_of(policy, rows):
-    state, found = None, []
-    for row in rows:
-        action, state = policy.predict(row, state)
-        found.append(action[0])
-    return np.array(found)
 
 
 @pytest.mark.parametrize("name", READERS)

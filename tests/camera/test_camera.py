@@ -28,11 +28,6 @@ def detector() -> RingDetector:
     return RingDetector(VIEW, PULLER)
 
 
-def closed_form(r_c: float, h_c: float) -> float:
-    """The plant's ring less the operator's bias [m]."""
-    return r_c + float(hurle_ring_offset(r_c, h_c, PULLER)) - PULLER.ring_bias
-
-
 @pytest.mark.filterwarnings("error")
 def test_gymnasiums_and_sb3s_checkers_pass() -> None:
     env = gym.make("Cz-v0", observation="camera", horizon=600.0)
@@ -128,7 +123,8 @@ def test_the_ring_follows_geometry_and_closed_form_within_a_pixel(detector: Ring
         for dh in (-1.5e-3, 0.0, 1e-3, 2e-3):
             r_c, h_c = PULLER.r_0 + dr, PULLER.h_0 + dh
             radius = detector.read(picture(r_c, h_c, PULLER, VIEW)).radius
-            assert abs(radius - closed_form(r_c, h_c)) < 0.5 * detector.pixel
+            closed_form = r_c + hurle_ring_offset(r_c, h_c, PULLER) - PULLER.ring_bias
+            assert abs(radius - closed_form) < 0.5 * detector.pixel
             assert abs(radius - (wall_edge(make_scene(r_c, h_c, PULLER), VIEW).r - at_rest)) < 0.15 * detector.pixel
 
 

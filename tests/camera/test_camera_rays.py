@@ -3,25 +3,12 @@ import math
 import numba
 import numpy as np
 import pytest
+from scipy.optimize import bisect
 
 from cz_gym import make_puller
+from cz_gym.camera import rays
 from cz_gym.camera.image import radiance, sight
-from cz_gym.camera.rays import (  # fmt: skip
-    CRYSTAL,
-    FLAT,
-    MELT,
-    OPENING,
-    SHIELD,
-    WALL,
-    Hit,
-    Ray,
-    Scene,
-    first_hit,
-    make_scene,
-    mirror,
-    profile_at,
-    slope_at,
-)
+from cz_gym.camera.rays import FLAT, MELT, Hit, Ray, Scene, first_hit, make_scene, mirror, profile_at, slope_at
 from cz_gym.camera.ring_detector import wall_edge
 from cz_gym.camera.view import Camera, make_view, project
 from cz_gym.physics.meniscus import hurle_slope, profile
@@ -36,14 +23,13 @@ def scene_at(r_c: float = PULLER.r_0, h_c: float = PULLER.h_0) -> Scene:
 
 def height_of_melt(r: float, scene: Scene) -> float:
     """Height of the surface at a distance from the axis, by bisection on the plant's own profile."""
-    low, high = 1e-9, scene.h_c
     if r <= scene.r_c:
         return math.inf
-    for _ in range(60):
-        z = 0.5 * (low + high)
-        out = scene.r_c + float(profile(z, scene.M) - profile(scene.h_c, scene.M))
-        low, high = (z, high) if out > r else (low, z)
-    return low
+
+    def beyond(z: float) -> float:
+        return scene.r_c + float(profile(z, scene.M) - profile(scene.h_c, scene.M)) - r
+
+    return bisect(beyond, 1e-9, scene.h_c, xtol=1e-18) if beyond(1e-9) > 0.0 else 1e-9
 
 
 @pytest.mark.parametrize("h_c", [1.2e-3, 4e-3, 6.64e-3, 9e-3])
@@ -71,18 +57,14 @@ def test_rays_meet_the_melt_where_marching_says() -> None:
             continue
         met += 1
 
-        def above(t: float, ray: Ray = ray) -> bool:
+        def above(t: float, ray: Ray = ray) -> float:
             r = math.hypot(ray.x + t * ray.dx, ray.y + t * ray.dy)
-            return ray.z + t * ray.dz > height_of_melt(r, scene)
+            return ray.z + t * ray.dz - height_of_melt(r, scene)
 
         t = (0.02 - ray.z) / ray.dz
-        while above(t):
+        while above(t) > 0.0:
             t += 1e-4
-        low, high = t - 1e-4, t
-        for _ in range(40):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if above(middle) else (low, middle)
-        at = np.array([ray.x, ray.y, ray.z]) + low * np.array([ray.dx, ray.dy, ray.dz])
+        at = np.array([ray.x, ray.y, ray.z]) + bisect(above, t - 1e-4, t) * np.array([ray.dx, ray.dy, ray.dz])
         np.testing.assert_allclose([hit.x, hit.y, hit.z], at, atol=2e-9)
     assert met > 12
 
@@ -107,14 +89,14 @@ def test_rays_are_mirrored_by_the_law_of_reflection() -> None:
 @pytest.mark.parametrize(
     ("ray", "what", "at"),
     [
-        (Ray(0.2, 0.0, 0.5, -1.0, 0.0, -1.0), CRYSTAL, (PULLER.r_0, 0.0, 0.5 - (0.2 - PULLER.r_0))),
-        (Ray(0.2, 0.0, 0.05, 1.0, 0.0, -0.1), WALL, (0.28, 0.0, 0.042)),
-        (Ray(0.2, 0.0, 0.05, 1.0, 0.0, 0.1), WALL, (0.28, 0.0, 0.058)),
-        (Ray(0.2, 0.0, 0.10, 1.0, 0.0, 1.0), SHIELD, (0.22, 0.0, 0.12)),
-        (Ray(0.2, 0.0, 0.20, 0.0, 0.0, -1.0), SHIELD, (0.2, 0.0, 0.12)),
+        (Ray(0.2, 0.0, 0.5, -1.0, 0.0, -1.0), rays.CRYSTAL, (PULLER.r_0, 0.0, 0.5 - (0.2 - PULLER.r_0))),
+        (Ray(0.2, 0.0, 0.05, 1.0, 0.0, -0.1), rays.WALL, (0.28, 0.0, 0.042)),
+        (Ray(0.2, 0.0, 0.05, 1.0, 0.0, 0.1), rays.WALL, (0.28, 0.0, 0.058)),
+        (Ray(0.2, 0.0, 0.10, 1.0, 0.0, 1.0), rays.SHIELD, (0.22, 0.0, 0.12)),
+        (Ray(0.2, 0.0, 0.20, 0.0, 0.0, -1.0), rays.SHIELD, (0.2, 0.0, 0.12)),
         (Ray(0.17, 0.0, 0.10, 0.0, 0.0, -1.0), MELT, (0.17, 0.0, 0.0)),
-        (Ray(0.12, 0.0, 0.10, 0.0, 0.0, 1.0), OPENING, None),
-        (Ray(0.12, 0.0, 0.01, -1.0, 0.0, 0.5), CRYSTAL, (PULLER.r_0, 0.0, 0.01 + 0.5 * (0.12 - PULLER.r_0))),
+        (Ray(0.12, 0.0, 0.10, 0.0, 0.0, 1.0), rays.OPENING, None),
+        (Ray(0.12, 0.0, 0.01, -1.0, 0.0, 0.5), rays.CRYSTAL, (PULLER.r_0, 0.0, 0.01 + 0.5 * (0.12 - PULLER.r_0))),
     ],
 )
 def test_rays_hit_the_first_surface_in_their_way(ray: Ray, what: int, at: tuple[float, float, float] | None) -> None:
@@ -133,17 +115,13 @@ def test_the_rings_edge_halves_the_angle_between_camera_and_walls_end(tilt: floa
     edge = wall_edge(scene, view)
     row = float(project(edge.r, 0.0, edge.z, view).row)
 
-    def bright(row: float) -> bool:
-        return radiance(sight(row, 80.0, view), scene, view) > 0.5
+    def excess(row: float) -> float:
+        return radiance(sight(row, 80.0, view), scene, view) - 0.5
 
-    inside, outside = row - 0.5, row + 0.5
-    assert bright(inside)
-    assert not bright(outside)
-    for _ in range(50):
-        middle = 0.5 * (inside + outside)
-        inside, outside = (middle, outside) if bright(middle) else (inside, middle)
-    assert inside == pytest.approx(row, abs=1e-6)
-    hit = first_hit(sight(inside, 80.0, view), scene.q_c, scene, view)
+    assert excess(row - 0.5) > 0.0 > excess(row + 0.5)
+    jump = bisect(excess, row - 0.5, row + 0.5)
+    assert jump == pytest.approx(row, abs=1e-6)
+    hit = first_hit(sight(jump, 80.0, view), scene.q_c, scene, view)
     assert math.acos(slope_at(hit.q)[1]) == pytest.approx(edge.slope, abs=1e-7)
 
 

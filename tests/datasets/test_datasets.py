@@ -1,9 +1,9 @@
 """Datasets: stock Minari reads them, each episode can be made again, and what is wrong is said in one line."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import minari
 import numpy as np
 import pytest
 
@@ -15,8 +15,6 @@ from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.replay import Playback
 from cz_gym.evaluation.rollout import rollout
 
-minari = pytest.importorskip("minari")
-pytest.importorskip("h5py")
 CONFIG = make_config("randomized", action="direct", horizon=1200.0)
 
 
@@ -67,8 +65,6 @@ def test_a_lost_crystal_ends_its_episode(place: Path) -> None:
 @pytest.mark.parametrize("name", ["paper-tuned", "gradient", "ppo"])
 def test_without_excitation_a_policy_acts_as_in_the_benchmark(name: str) -> None:
     """Observations and actions are "measured" and "direct", "measured" and "rate", "history" and "smooth"."""
-    if name != "paper-tuned":
-        pytest.importorskip("onnxruntime")
     policy, seeds = find_policy(name, CONFIG), TRAINING_SEEDS[:3]
     own = make_config("randomized", horizon=CONFIG.horizon, **settings_of(policy))
     expected = rollout(policy, own, seeds).signals.r_c
@@ -78,8 +74,6 @@ def test_without_excitation_a_policy_acts_as_in_the_benchmark(name: str) -> None
 
 @pytest.mark.parametrize("name", ["paper-tuned", "gradient"])
 def test_excitation_neither_piles_up_nor_depends_on_the_batch(name: str) -> None:
-    if name != "paper-tuned":
-        pytest.importorskip("onnxruntime")
     policy = find_policy(name, CONFIG)
     quiet, several = (record(policy, CONFIG, TRAINING_SEEDS[:4], noise) for noise in (0.0, 0.2))
     (alone,) = record(policy, CONFIG, TRAINING_SEEDS[3:4], 0.2)
@@ -145,9 +139,3 @@ def test_a_dataset_is_replaced_only_when_asked_for_and_never_left_half(
     monkeypatch.setattr(datasets, "record", lambda *_: [])
     assert main([*command, "--overwrite"]) == 130  # after it
     assert minari.list_local_datasets() == {}
-
-
-def test_policies_that_do_not_fit_are_refused() -> None:
-    pytest.importorskip("onnxruntime")
-    with pytest.raises(ValueError, match=r"ppo is made for control_interval=5.0, this config has 2.0"):
-        find_policy("ppo", replace(CONFIG, control_interval=2.0))

@@ -2,13 +2,11 @@
 
 import hashlib
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-import benchmark
 from cz_gym import SCENARIOS, CzVectorEnv, Parameters
 from tests.golden.digest import digest
 from tests.golden.trajectories import FILE, SIGNALS, trajectories, trajectory
@@ -52,16 +50,3 @@ def test_thread_counts_do_not_change_bits() -> None:
         env.close()
         digests.add(found.hexdigest())
     assert len(digests) == 1
-
-
-@pytest.mark.slow
-def test_the_benchmark_writes_the_same_figures_twice(tmp_path: Path) -> None:
-    """Here and in a process of its own; all but the time in the policies, which is measured."""
-    here, there = tmp_path / "here", tmp_path / "there"
-    options = ["--episodes", "2", "--controllers", "open-loop,paper", "--scenarios", "randomized,nominal", "--quiet"]
-    assert benchmark.main([*options, "--out", str(here)]) == 0
-    python(str(ROOT / "benchmark.py"), *options, "--out", str(there), cwd=tmp_path)
-    assert (here / "episodes.csv").read_bytes() == (there / "episodes.csv").read_bytes()
-    ours, theirs = (json.loads((folder / "benchmark.json").read_text()) for folder in (here, there))
-    for part in ("paired", "cvar5", "verdicts"):
-        assert ours[part] == theirs[part] != {}

@@ -22,10 +22,6 @@ BY_NAME = {scenario.name: scenario for scenario in MEMBERS}
 SHORT: dict[str, Any] = {"horizon": 40.0, "observation": "history", "action": "smooth", "info": "all"}
 
 
-def actions(n: int, steps: int = 30) -> np.ndarray:
-    return np.random.default_rng(4).uniform(-1.1, 1.1, (steps, n, 2))
-
-
 def test_all_is_every_random_row_of_the_benchmark() -> None:
     shares = {each.name: share for each, share in zip(ALL.scenarios, ALL.shares, strict=True)}
     assert shares == {"hard": 0.175, "hot-zone": 0.175, "puller": 0.175, "randomized": 0.3, "sensor-fault": 0.175}
@@ -93,8 +89,8 @@ def test_an_episode_is_bit_for_bit_that_of_its_scenario_alone(model: str | None)
         name = info.pop("scenario")
         met.add(name)
         np.testing.assert_array_equal(observation, expected[name][0])
-        for action in actions(1, 8):
-            found, (seen, reward, *ends, told) = env.step(action[0]), alone[name].step(action[0])
+        for action in np.random.default_rng(4).uniform(-1.1, 1.1, (8, 2)):
+            found, (seen, reward, *ends, told) = env.step(action), alone[name].step(action)
             assert found[4].pop("scenario") == name
             np.testing.assert_array_equal(found[0], seen)
             np.testing.assert_array_equal(found[4].pop("state"), told.pop("state"))

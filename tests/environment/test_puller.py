@@ -8,6 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+import cz_gym
 from cz_gym import SCENARIOS, CzVectorEnv, Scenario, decode, make_puller
 from cz_gym.config import Config, make_config
 from cz_gym.differentiable import DifferentiableBatch
@@ -15,22 +16,11 @@ from cz_gym.env import CzEnv
 from cz_gym.episodes.scenarios import ALL, HARD, PULLER, RANDOMIZED
 from cz_gym.errors import CzError
 from cz_gym.physics.parameters import Parameters
-from cz_gym.puller import (
-    DEFAULT,
-    FOLDER,
-    KEYS,
-    PullerFile,
-    find_puller,
-    on,
-    read_puller,
-    to_toml,
-    value_of,
-    write_puller,
-)
+from cz_gym.puller import DEFAULT, KEYS, PullerFile, find_puller, on, read_puller, to_toml, value_of, write_puller
 from cz_gym.units import KILO, MM, MM_PER_MIN
 from tests.observed import PLAIN
 
-SHIPPED = sorted(path.stem for path in FOLDER.glob("*.toml"))
+SHIPPED = sorted(path.stem for path in cz_gym.puller.FOLDER.glob("*.toml"))
 WIDE = find_puller("silicon-300mm")
 
 

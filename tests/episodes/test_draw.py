@@ -95,14 +95,6 @@ def same(one: tuple[Episode, Series], other: tuple[Episode, Series]) -> bool:
     return one[0] == other[0] and equal
 
 
-@pytest.mark.parametrize("name", list(SCENARIOS))
-def test_a_draw_is_made_from_its_key_alone(name: str) -> None:
-    first, again, other = felt(name, (5, 6)), felt(name, (5, 6)), felt(name, (5, 7))
-    assert same(first, again)
-    factors = [draw_factors(SCENARIOS[name], SCENARIOS[name].pullers.mix, key) for key in ((5, 6), (5, 7))]
-    assert (same(first, other) and factors[0] == factors[1]) == SCENARIOS[name].deterministic
-
-
 BESIDE = dataclasses.replace(
     Scenario("deterministic"),
     recipe=Recipe(duration=(50.0, 50.0)),

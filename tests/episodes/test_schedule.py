@@ -2,17 +2,9 @@ import numpy as np
 import pytest
 
 from cz_gym import SCENARIOS, make_puller
+from cz_gym.episodes import schedule
 from cz_gym.episodes.record import Episode
-from cz_gym.episodes.schedule import (
-    bias_offset,
-    disturbance,
-    drift,
-    pyrometer_drift,
-    quintic,
-    recipe,
-    reference,
-    ripple,
-)
+from cz_gym.episodes.schedule import bias_offset, disturbance, drift, pyrometer_drift, recipe, reference, ripple
 from cz_gym.episodes.series import draw_episode, new_series
 from cz_gym.physics.plant import hidden_load
 
@@ -27,10 +19,10 @@ def episode(scenario: str) -> Episode:
 def test_quintic_has_no_rate_and_no_curvature_at_its_ends() -> None:
     s = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
     points = np.linspace(0, 1, 101)
-    np.testing.assert_allclose(quintic(points), s(points), atol=1e-15)
+    np.testing.assert_allclose(schedule.quintic(points), s(points), atol=1e-15)
     for ends in (s.deriv(1), s.deriv(2)):
         assert ends(np.array([0.0, 1.0])) == pytest.approx([0.0, 0.0], abs=1e-12)
-    assert (quintic(0.0), quintic(1.0)) == (0.0, 1.0)
+    assert (schedule.quintic(0.0), schedule.quintic(1.0)) == (0.0, 1.0)
 
 
 def test_paper_ramp_rises_half_a_kelvin_a_minute_for_ten_minutes() -> None:

@@ -159,13 +159,9 @@ def test_after_import_cz_gym_everything_is_there() -> None:
         _ = cz_gym.agent
 
 
-def other_plant() -> Config:
-    settings = {**load("gradient").settings, "horizon": 60.0}
-    return make_config("randomized", parameters=Parameters(k_l=66.0), **settings)
-
-
 def test_an_agent_of_another_plant_is_refused_unless_that_is_said() -> None:
-    agent, config = load("gradient"), other_plant()
+    agent = load("gradient")
+    config = make_config("randomized", parameters=Parameters(k_l=66.0), **{**agent.settings, "horizon": 60.0})
     with pytest.raises(CzError, match=f"made for .*; the environment has .*plant {config.plant_hash}: gym.make"):
         rollout(agent, config, [1])
     there = replace(config, parameters=Parameters())
@@ -186,7 +182,6 @@ def test_other_seeds_are_refused(seeds: Any) -> None:
 
 
 def test_a_rollout_can_be_looked_at(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
     run = rollout(OpenLoop(), SHORT, [1, 2])
     figure = plot(run, 1, tmp_path / "crystal.png")
     assert (tmp_path / "crystal.png").read_bytes().startswith(b"\x89PNG")

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("stable_baselines3")
-
 from cz_gym import agents
 from examples import gradient, sb3_ppo
 

@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("asyncua", reason="asyncua is absent: pip install '.[plant]'")
-
 from cz_gym.config import make_config
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.export.__main__ import make_block
@@ -19,12 +17,6 @@ from examples import opcua_controller
 from tests.serve.conftest import PASSWORD, running
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="cc is not installed: no C can be compiled")
-
-
-def grown(log: Path) -> Any:
-    """Ring radius [mm], pull speed [mm/min] and heater power [kW] of a log, a row a step."""
-    rows = np.genfromtxt(log, delimiter=",", names=True)[1:]
-    return np.stack([rows[name] for name in ("ring_radius_mm", "pull_speed_mm_per_min", "heater_power_kW")], axis=-1)
 
 
 @pytest.mark.parametrize(
@@ -43,7 +35,9 @@ def test_the_loop_over_opc_ua_is_the_loop_in_python(
     with running(tmp_path, "--speed", "0", "--scenario", scenario) as puller:
         chosen = ["--controller", name, "--scenario", scenario, "--steps", str(steps), *options]
         assert opcua_controller.main(["--url", puller.url, *chosen]) == 0
-        found = grown(tmp_path / "log.csv")
+        rows = np.genfromtxt(tmp_path / "log.csv", delimiter=",", names=True)[1:]
+    shown = "ring_radius_mm", "pull_speed_mm_per_min", "heater_power_kW"
+    found = np.stack([rows[name] for name in shown], axis=-1)
     config = make_config(scenario, observation="measured", action="direct", horizon=steps * 5.0)
     s = rollout(BlockPolicy(make_block(name, config)), config, [1]).signals
     twin = np.concatenate([s.r_br_measured / MM, s.v_p / MM_PER_MIN, s.Q_H / KILO], axis=-1)

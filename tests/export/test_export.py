@@ -333,11 +333,8 @@ def test_the_command_writes_a_folder(name: str, to: str, files: int, tmp_path: P
         (["lqg-true"], "unknown"),
     ],
 )
-def test_what_cannot_be_exported_is_refused_in_one_line(
-    given: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main([*given, "--to", "c", "--out", str(tmp_path / "out")]) == 2
-    assert said in capsys.readouterr().err
+def test_what_cannot_be_exported_is_refused_in_one_line(given: Any, said: str, tmp_path: Path, refused: Any) -> None:
+    assert said in refused(main, [*given, "--to", "c", "--out", str(tmp_path / "out")])
     assert not (tmp_path / "out").exists()
 
 

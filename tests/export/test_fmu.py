@@ -3,12 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-import pytest
-
-pytest.importorskip("pythonfmu", reason="pythonfmu is absent: pip install '.[plant]'")
-pytest.importorskip("fmpy", reason="FMPy is absent: pip install '.[plant]'")
-
 import fmpy
+import pytest
 
 from cz_gym import CzEnv
 from cz_gym.export.__main__ import main

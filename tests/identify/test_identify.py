@@ -86,11 +86,8 @@ def test_the_drives_follow_the_sequence_whatever_the_action_means(action: str) -
             return super().predict(observation, state, episode_start, deterministic)
 
     Rest.action, size = action, 0.003  # what a smooth drive can do in one step
-    env, state, excited = (
-        CzEnv("nominal", 0.5, "measured", action=action, info="all"),
-        None,
-        Excited(Rest(), size, size),
-    )
+    env = CzEnv("nominal", 0.5, "measured", action=action, info="all")
+    excited, state = Excited(Rest(), size, size), None
     observation, start = env.reset(seed=0)
     for k in range(60):
         chosen, state = excited.predict(observation, state)

@@ -44,12 +44,6 @@ def run(code: str, folder: Path, cache: Path) -> list[str]:
     return python("-W", "error", "-c", code, cwd=folder, env=environment).strip().split("|")
 
 
-def edit(file: Path, old: str, new: str) -> None:
-    text = file.read_text()
-    assert old in text
-    file.write_text(text.replace(old, new))
-
-
 @pytest.mark.slow
 def test_changed_physics_is_never_run_from_an_old_cache(package: Path, tmp_path: Path) -> None:
     """The edited function is compiled into a loop that stands in another, unchanged module."""
@@ -57,7 +51,8 @@ def test_changed_physics_is_never_run_from_an_old_cache(package: Path, tmp_path:
     folder, factor, hits = run(FACTOR, package, cache)
     assert (Path(folder).parent, hits) == (cache, "0")
     assert run(FACTOR, package, cache) == [folder, factor, "1"]
-    edit(package / "cz_gym" / "episodes" / "draw.py", "return 1.0 + spread *", "return 1.01 + spread *")
+    file = package / "cz_gym" / "episodes" / "draw.py"
+    file.write_text(file.read_text().replace("return 1.0 + spread *", "return 1.01 + spread *"))
     other, changed, hits = run(FACTOR, package, cache)
     assert float(changed) == pytest.approx(0.01 + float(factor))
     assert (other != folder, hits) == (True, "0")

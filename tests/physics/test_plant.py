@@ -14,7 +14,7 @@ from cz_gym.jit.compile import kernel
 from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.plant import NO_DISTURBANCE, Disturbance, Inputs, growth, hidden_load, rates, rk4
 from cz_gym.units import HOUR
-from tests.equations import Fields, Truth, design_rates, drawn, hold, integrated
+from tests.equations import Truth, design_rates, drawn, fields, hold, integrated
 
 MIXES = [0.0, 0.3, 1.0]
 SPREAD = st.floats(0.85, 1.15)
@@ -112,14 +112,14 @@ def test_an_hour_of_driven_motion_agrees_with_scipy(interval: float, scenario: s
     env = CzEnv(scenario, control_interval=interval, horizon=HOUR, info="all")
     env.reset(seed=5)
     saved, interface = env.get_state().slot, drawn(env).interface
-    p, e, x = Fields(saved.slot["puller"]), Fields(saved.slot["episode"]), np.array(saved.slot["x"].tolist())
+    p, e, x = fields(saved.slot["puller"]), fields(saved.slot["episode"]), np.array(saved.slot["x"].tolist())
     steps = round(HOUR / interval)
     worst, heights, feedback = 0.0, [], 0.0
     for k in range(steps):
         t = k * interval
         pull = 0.3 * np.sin(t / 70.0) + feedback
         _, _, terminated, _, info = env.step(np.array([pull, 0.3 * np.sin(t / 300.0)], np.float32))
-        feedback = hold(info, p)
+        feedback = hold(info, p.h_0)
         while t < (k + 1) * interval - 1e-6:
             j = int(t // 5.0)
             upto = min(5.0 * (j + 1), (k + 1) * interval)

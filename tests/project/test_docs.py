@@ -15,17 +15,15 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import myst_parser  # noqa: F401
 import pytest
+import sybil
+from markdown_it import MarkdownIt
+from sybil.parsers.markdown import CodeBlockParser
 
-pytest.importorskip("sphinx")
-pytest.importorskip("myst_parser")
-sybil = pytest.importorskip("sybil")
-from markdown_it import MarkdownIt  # noqa: E402
-from sybil.parsers.markdown import CodeBlockParser  # noqa: E402
-
-from cz_gym import CzEnv  # noqa: E402
-from cz_gym.physics.parameters import describe  # noqa: E402
-from tests.processes import ROOT, python  # noqa: E402
+from cz_gym import CzEnv
+from cz_gym.physics.parameters import describe
+from tests.processes import ROOT, python
 
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
@@ -217,13 +215,9 @@ def test_pages_read_well_on_github_and_their_tables_are_the_code_s(monkeypatch: 
         )
 
 
-@pytest.fixture
-def nomenclature(monkeypatch: pytest.MonkeyPatch) -> Any:
+def test_every_symbol_has_unit_meaning_and_a_numbered_equation(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(DOCS))
-    return importlib.import_module("czdocs.nomenclature")
-
-
-def test_every_symbol_has_unit_meaning_and_a_numbered_equation(nomenclature: Any) -> None:
+    nomenclature = importlib.import_module("czdocs.nomenclature")
     assert list(nomenclature.formulas()) == [str(number + 1) for number in range(len(nomenclature.formulas()))]
     for part in ("states", "inputs", "parameters", "derived"):
         for row in nomenclature.ROWS[part]():

@@ -4,14 +4,13 @@ import re
 import runpy
 from pathlib import Path
 
-import pytest
+import nbformat
 
-pytest.importorskip("jupytext")
 DOCS = Path(__file__).parents[2] / "docs"
 
 
 def test_the_example_pages_become_notebooks(tmp_path: Path) -> None:
-    nbformat, made = pytest.importorskip("nbformat"), runpy.run_path(str(DOCS / "notebooks.py"))
+    made = runpy.run_path(str(DOCS / "notebooks.py"))
     for page, file in zip(made["PAGES"], made["write"](tmp_path), strict=True):
         notebook = nbformat.read(file, as_version=4)
         nbformat.validate(notebook)

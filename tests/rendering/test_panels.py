@@ -16,7 +16,6 @@ from cz_gym.rendering.record import Ending, Record
 from cz_gym.rendering.scene import layout
 from cz_gym.units import MM
 
-pygame = pytest.importorskip("pygame")
 CANVAS = Canvas(640, 480)
 PANELS = layout(CANVAS.box)
 
@@ -47,11 +46,6 @@ def check_near(pixels: npt.NDArray[np.bool_], expected: float, reach: int) -> No
 @pytest.fixture(scope="module")
 def picture() -> tuple[Frame, Record]:
     return grown()
-
-
-@pytest.fixture(scope="module")
-def record(picture: tuple[Frame, Record]) -> Record:
-    return picture[1]
 
 
 def test_the_drawn_surface_is_the_logged_radius(picture: tuple[Frame, Record]) -> None:
@@ -99,7 +93,8 @@ def test_the_drawn_meniscus_leaves_the_triple_point_and_meets_the_ring(
             assert (r[1] - r[0]) / (z[0] - z[1]) == pytest.approx(sine / cosine, rel=2e-3)
 
 
-def test_length_grown_is_the_integral_of_the_growth_rate(record: Record) -> None:
+def test_length_grown_is_the_integral_of_the_growth_rate(picture: tuple[Frame, Record]) -> None:
+    record = picture[1]
     assert record.length[-1] == pytest.approx(trapezoid(record.column("v_g"), record.t), rel=2e-3)
 
 

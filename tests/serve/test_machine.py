@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("pygame")
-
 from cz_gym.config import make_config
 from cz_gym.serve.machine import SETPOINTS, Alarm, Clock, Log, Machine
 

@@ -48,12 +48,6 @@ def locked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     patch.undo()
 
 
-def steps(puller: Any, seconds: float) -> int:
-    before = puller.machine.k
-    time.sleep(seconds)
-    return int(puller.machine.k - before)
-
-
 def test_values_of_wrong_type_or_size_are_refused_and_logged(puller: Any) -> None:
     async def act(hand: Hand) -> None:
         low, high = puller.machine.limits[PULL]
@@ -120,7 +114,9 @@ def test_a_client_that_dies_in_the_middle_of_a_message_leaves_all_as_it_was(pull
     assert {"held", "fallback"} & {row["control"] for row in rows}
     assert max(row[PULL] for row in rows) < 1.9, "2.0 was never committed"
     assert with_client(puller.url, lambda hand: hand.read("control")) == "fallback"
-    assert steps(puller, 1.0) == pytest.approx(40, abs=8)
+    before = puller.machine.k
+    time.sleep(1.0)
+    assert puller.machine.k - before == pytest.approx(40, abs=8)
 
 
 def test_the_page_is_read_only_on_a_puller_without_accounts(puller: Any) -> None:

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tests.equations import hold
+
 KINDS = (
     "uniform", "bang-bang", "full pull", "no pull", "kept alive, hot", "kept alive, cold", "infinite", "chatter",
     "random walk", "kept alive, bang-bang heat",
 )  # fmt: skip
 """One kind a slot, in turn."""
-RADIUS_GAIN, HEIGHT_GAIN = 1000.0, 700.0
-"""Pull action per metre of true radius error and of meniscus height [1/m]: poles near 0.01 rad/s."""
 EXTREME = np.array([np.inf, -np.inf, 1e308, -1e308, 1e-320, -0.0, 1.0 + 1e-7, -1.0 - 1e-7])
 
 
@@ -32,8 +32,7 @@ class Adversaries:
         self._turn += 1
         self._bang *= np.where(random.random((n, 2)) < 0.02, -1.0, 1.0)
         self._walk = np.clip(self._walk + 0.1 * random.standard_normal((n, 2)), -1.5, 1.5)
-        alive = RADIUS_GAIN * (infos["r_c"] - infos["r_ref"]) - HEIGHT_GAIN * (infos["h_c"] - height)
-        alive = alive + 0.02 * random.standard_normal(n)
+        alive = hold(infos, height) + 0.02 * random.standard_normal(n)
         extreme = EXTREME[random.integers(len(EXTREME), size=(n, 2))]
         chatter = np.full((n, 2), 1.0 if self._turn % 2 else -1.0)
         one, none = np.ones(n), np.zeros(n)

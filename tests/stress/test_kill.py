@@ -10,20 +10,21 @@ import os
 import signal
 import threading
 from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from tqdm import tqdm
 
-pytest.importorskip("torch")
 import train
 from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.training import run, validation
 from cz_gym.agents.training.checkpoint import load_checkpoint
-from cz_gym.agents.training.recipes import PPO, RECIPES
+from cz_gym.agents.training.recipes import RECIPES
 from cz_gym.atomic_files import write_files
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from tests.small_learners import QUICK
 
 FRESH = multiprocessing.get_context("forkserver")
 FRESH.set_forkserver_preload(["tests.stress.test_kill"])
@@ -67,16 +68,7 @@ def training(arguments: list[str], point: str | None, log: Path) -> None:
     """train.py on less of everything, with a checkpoint at every step, up to a point."""
     tqdm.set_lock(threading.RLock())  # its own is a semaphore, which a killed process leaves behind
     validation.PICKING, validation.JUDGING, run.VALIDATE_EVERY = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4], 4096
-    RECIPES["ppo"] = PPO(
-        steps=8192,
-        num_envs=64,
-        action_repeat=1,
-        n_steps=32,
-        batch_size=512,
-        n_epochs=2,
-        hidden=(16,),
-        control_interval=30.0,
-    )
+    RECIPES["ppo"] = replace(QUICK, steps=8192, action_repeat=1, batch_size=512, n_epochs=2, control_interval=30.0)
     if point is not None:
         kill_at(point)
     with log.open("a") as file, redirect_stdout(file), redirect_stderr(file):

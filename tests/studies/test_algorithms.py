@@ -5,9 +5,6 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("stable_baselines3")
-pytest.importorskip("matplotlib")
-
 from cz_gym.agents.training import validation
 from cz_gym.agents.training.run import Job
 from cz_gym.evaluation.protocol import ROWS, TEST_SEEDS, VALIDATION_SEEDS

@@ -6,8 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("control")
-
 from cz_gym.baselines.analysis.frequency import loop_margins
 from cz_gym.observation import PULL_SCALE
 from cz_gym.physics.plant import make_puller

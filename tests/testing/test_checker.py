@@ -10,7 +10,7 @@ import pytest
 from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from cz_gym.testing.checker import NotConforming, check_vector_env, main
+from cz_gym.testing.checker import NotConforming, check_vector_env
 
 MODES = list(AutoresetMode)
 
@@ -42,37 +42,32 @@ class Conforming(SyncVectorEnv):
         super().__init__([Walk] * num_envs, autoreset_mode=mode, copy=True)
 
 
-def made(
-    change: Callable[[Any], Any] = lambda env: None, fewer: int = 0, always: AutoresetMode | None = None
+def odd(
+    made: Callable[[Any], Any] = lambda env: None,
+    reset: Callable[[Any, Any], dict[str, Any]] = lambda seed, options: {},
+    acts: Callable[[Any], Any] = lambda actions: actions,
+    step: Callable[..., Any] = lambda *result: result,
+    after: Callable[[Any], Any] = lambda actions: None,
+    fewer: int = 0,
+    always: AutoresetMode | None = None,
 ) -> type[Conforming]:
-    """A vector of fewer slots, of one mode whatever is asked for, or changed once it is made."""
+    """A vector that is changed once it is made, resets with other arguments, takes other actions, returns something
+    else from a step, or does something to the actions after it; of fewer slots, or always of one mode."""
 
-    class Made(Conforming):
+    class Broken(Conforming):
         def __init__(self, num_envs: int, mode: AutoresetMode) -> None:
             super().__init__(num_envs - fewer, always or mode)
-            change(self)
+            made(self)
 
-    return Made
-
-
-def resetting(change: Callable[[Any, Any], dict[str, Any]]) -> type[Conforming]:
-    """A vector whose resets get other arguments, as ``change(seed, options)`` gives them."""
-
-    class Resetting(Conforming):
         def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-            return super().reset(**{"seed": seed, "options": options, **change(seed, options)})
+            return super().reset(**{"seed": seed, "options": options, **reset(seed, options)})
 
-    return Resetting
-
-
-def stepping(change: Callable[..., Any]) -> type[Conforming]:
-    """A vector whose steps return something else, as ``change(observation, reward, ...)`` gives it."""
-
-    class Stepping(Conforming):
         def step(self, actions: Any) -> Any:
-            return change(*super().step(actions))
+            result = step(*super().step(acts(actions)))
+            after(actions)
+            return result
 
-    return Stepping
+    return Broken
 
 
 class Repeating(Conforming):
@@ -134,52 +129,40 @@ class KeepsActions(ReadBack):
         return actions[:, 0], actions[:, 0].copy()
 
 
-def acting(change: Callable[[Any], Any], after: Callable[[Any], Any] = lambda actions: None) -> type[Conforming]:
-    """A vector that takes other actions, as ``change(actions)`` gives them, or does something to them afterwards."""
-
-    class Acting(Conforming):
-        def step(self, actions: Any) -> Any:
-            result = super().step(change(actions))
-            after(actions)
-            return result
-
-    return Acting
-
-
-REWARD = stepping(lambda observation, reward, *rest: (observation, reward * [1.0, 1.0 + 1e-12, 1.0], *rest))
-TIMEOUT = stepping(lambda o, r, terminated, truncated, i: (o, r, terminated | truncated, np.zeros_like(truncated), i))
+REWARD = odd(step=lambda observation, reward, *rest: (observation, reward * [1.0, 1.0 + 1e-12, 1.0], *rest))
+TIMEOUT = odd(step=lambda o, r, failed, truncated, i: (o, r, failed | truncated, np.zeros_like(truncated), i))
 """The time limit is returned as a failure, as in pc-gym."""
 NEXT, SAME, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
 BROKEN: dict[str, tuple[type[Conforming], str, AutoresetMode]] = {
-    "space": (made(lambda env: setattr(env, "single_action_space", Box(-2, 2, (1,)))), "single_action_space is", NEXT),
-    "batched": (made(lambda env: setattr(env, "action_space", env.single_action_space)),
+    "space": (odd(lambda env: setattr(env, "single_action_space", Box(-2, 2, (1,)))), "single_action_space is", NEXT),
+    "batched": (odd(lambda env: setattr(env, "action_space", env.single_action_space)),
                 "action_space is .* the batch of 3 is", NEXT),
-    "mode": (made(always=NEXT), r"metadata\['autoreset_mode'\] is", SAME),
-    "fewer": (made(fewer=1), "num_envs is 2, asked for 3", NEXT),
-    "seedless": (resetting(lambda seed, options: {"seed": None}),
+    "mode": (odd(always=NEXT), r"metadata\['autoreset_mode'\] is", SAME),
+    "fewer": (odd(fewer=1), "num_envs is 2, asked for 3", NEXT),
+    "seedless": (odd(reset=lambda seed, options: {"seed": None}),
                  "seed 0 gives another first observation in a second environment", NEXT),
-    "stuck": (resetting(lambda seed, options: {"seed": None if "reset_mask" in (options or {}) else 5}),
+    "stuck": (odd(reset=lambda seed, options: {"seed": None if "reset_mask" in (options or {}) else 5}),
               "differs from the scalar with that seed", NEXT),
-    "alike": (resetting(lambda seed, options: {"seed": [seed] * 3 if isinstance(seed, int) else seed}),
+    "alike": (odd(reset=lambda seed, options: {"seed": [seed] * 3 if isinstance(seed, int) else seed}),
               "slots 0 and 1 have the same first observation", NEXT),
-    "first of a seed list": (resetting(lambda seed, options: {"seed": seed[0] if isinstance(seed, list) else seed}),
-                             "seed list: slot 1 with seed 14 differs", NEXT),
+    "first of a seed list": (odd(reset=lambda seed, options: {"seed": seed[0] if isinstance(seed, list) else seed}),
+                            "seed list: slot 1 with seed 14 differs", NEXT),
     "repeating": (Repeating, "the same first observations", NEXT),
-    "observations of 64 bits": (stepping(lambda shown, *rest: ({k: v.astype(float) for k, v in shown.items()}, *rest)),
+    "observations of 64 bits": (odd(step=lambda shown, *rest: ({k: v.astype(float) for k, v in shown.items()}, *rest)),
                                 r"observation\['t'\] is float64 .* and float32", NEXT),
-    "unmasked": (stepping(lambda *result: (*result[:4], {k: each for k, each in result[4].items() if k != "_far"})),
+    "unmasked": (odd(step=lambda *result: (*result[:4], {k: each for k, each in result[4].items() if k != "_far"})),
                  r"info\['_far'\] is in one only", NEXT),
     "reward": (REWARD, "reward of slot 1 is .* and", NEXT),
     "time limit": (TIMEOUT, "terminated of slot . is True and False", NEXT),
-    "final": (stepping(next_first), r"info\['final_obs'\]\[.\]\['t'\]", SAME),
-    "coupled": (acting(lambda actions: np.repeat(actions[:1], len(actions), axis=0)),
+    "final": (odd(step=next_first), r"info\['final_obs'\]\[.\]\['t'\]", SAME),
+    "coupled": (odd(acts=lambda actions: np.repeat(actions[:1], len(actions), axis=0)),
                 r"observation\['x'\] of slot 1", NEXT),
-    "reused": (made(lambda env: setattr(env, "copy", False)), "was written by a later call", NEXT),
+    "reused": (odd(lambda env: setattr(env, "copy", False)), "was written by a later call", NEXT),
     "recycled": (Recycled, r"\[1\] .kept as .* was written by a later call", NEXT),
     "reads results back": (ReadBack, "writing into earlier results or actions changed", NEXT),
     "keeps actions": (KeepsActions, "writing into earlier results or actions changed", NEXT),
-    "writes actions": (acting(lambda actions: actions, lambda actions: actions.fill(0.5)), "wrote into the", NEXT),
-    "resets all": (resetting(lambda seed, options: {"options": None}), "reset of ended slots", DISABLED),
+    "writes actions": (odd(after=lambda actions: actions.fill(0.5)), "wrote into the", NEXT),
+    "resets all": (odd(reset=lambda seed, options: {"options": None}), "reset of ended slots", DISABLED),
 }  # fmt: skip
 """Each with what is said of it, and the mode that shows it."""
 
@@ -194,9 +177,9 @@ def test_gymnasiums_own_vector_conforms(mode: AutoresetMode) -> None:
 
 @pytest.mark.parametrize("name", BROKEN)
 def test_each_break_is_named_in_one_line(name: str) -> None:
-    broken, says, mode = BROKEN[name]
+    make, says, mode = BROKEN[name]
     with pytest.raises(NotConforming, match=says) as found:
-        check_vector_env(broken, Walk, steps=40, modes=[mode])
+        check_vector_env(make, Walk, steps=40, modes=[mode])
     assert "\n" not in str(found.value)
     assert str(found.value).startswith(f"[{mode.value}] ")
 
@@ -229,7 +212,3 @@ def test_a_check_that_sees_no_end_is_no_check() -> None:
 def test_bad_arguments_are_refused(arguments: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="a check needs num_envs"):
         check_vector_env(Conforming, Walk, **arguments)
-
-
-def test_the_command_refuses_in_one_line(refused: Any) -> None:
-    refused(main, ["--stepps", "60"])

@@ -6,9 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-
-pytest.importorskip("stable_baselines3")
-
 from stable_baselines3.common.env_util import make_vec_env as scalar_environments
 
 from cz_gym.agents.apg import APG, RecurrentPolicy

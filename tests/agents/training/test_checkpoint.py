@@ -15,13 +15,20 @@ from cz_gym.agents.training.recipes import Recipe
 from tests.small_learners import SMALL, SMALL_APG, SMALL_SAC, learned, trained
 
 
+def resume(learner: Any, other: Any, path: Path) -> Any:
+    """Have another algorithm go on from a checkpoint of the first; what the checkpoint says of the run."""
+    path.write_bytes(to_bytes(learner, 12.0, 0.5))
+    progress, tensors, _ = load_checkpoint(path)
+    restore(other, tensors, path)
+    return progress
+
+
 def test_a_checkpoint_continues_and_refuses_what_does_not_fit(ppo: Any, tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.safetensors"
-    path.write_bytes(to_bytes(ppo, 12.0, 0.5))
-    progress, tensors, _ = load_checkpoint(path)
+    other = make_algorithm(SMALL, 1, 128)
+    progress = resume(ppo, other, path)
     assert (progress.steps, progress.seconds, progress.best_cost) == (128, 12.0, 0.5), "not environment steps"
-    other = make_algorithm(SMALL, 1, progress.steps)
-    restore(other, tensors, path)
+    _, tensors, _ = load_checkpoint(path)
     path.write_bytes(to_bytes(other, 12.0, 0.5))
     again = load_checkpoint(path)
     assert again[0] == progress
@@ -32,9 +39,8 @@ def test_a_checkpoint_continues_and_refuses_what_does_not_fit(ppo: Any, tmp_path
 
 
 def test_a_resumed_run_normalises_rewards_as_before(ppo: Any, tmp_path: Path) -> None:
-    path, other = tmp_path / "checkpoint.safetensors", make_algorithm(SMALL, 1)
-    path.write_bytes(to_bytes(ppo, 1.0, None))
-    restore(other, load_checkpoint(path)[1], path)
+    other = make_algorithm(SMALL, 1)
+    resume(ppo, other, tmp_path / "checkpoint.safetensors")
     before, after = ppo.get_vec_normalize_env().ret_rms, other.get_vec_normalize_env().ret_rms
     assert before.count > 60
     assert (before.mean, before.var, before.count) == (after.mean, after.var, after.count)
@@ -54,10 +60,8 @@ def test_weights_that_are_not_finite_are_not_saved() -> None:
 def test_an_algorithm_restored_before_its_first_update_learns_as_the_one_it_came_from(
     recipe: Recipe, tmp_path: Path
 ) -> None:
-    path, first, second = tmp_path / "checkpoint.safetensors", make_algorithm(recipe, 0), make_algorithm(recipe, 0)
-    path.write_bytes(to_bytes(first, 0.0, None))
-    restore(second, load_checkpoint(path)[1], path)
-    unsaved = make_algorithm(recipe, 0)
+    first, second, unsaved = (make_algorithm(recipe, 0) for _ in range(3))
+    resume(first, second, tmp_path / "checkpoint.safetensors")
     for algorithm in (first, second, unsaved):
         algorithm.set_random_seed(3)
         learned(algorithm, recipe)
@@ -67,22 +71,17 @@ def test_an_algorithm_restored_before_its_first_update_learns_as_the_one_it_came
 
 def test_a_resumed_sac_keeps_its_temperature(tmp_path: Path) -> None:
     """stable-baselines3 counts it as a variable, not among the parameters."""
-    path = tmp_path / "checkpoint.safetensors"
     learner, other = make_algorithm(SMALL_SAC, 0), make_algorithm(SMALL_SAC, 1)
     with torch.no_grad():
         learner.log_ent_coef.fill_(-1.25)
-    path.write_bytes(to_bytes(learner, 1.0, None))
-    restore(other, load_checkpoint(path)[1], path)
+    resume(learner, other, tmp_path / "checkpoint.safetensors")
     assert other.log_ent_coef.item() == -1.25
     assert other.log_ent_coef in other.ent_coef_optimizer.param_groups[0]["params"]
 
 
 def test_a_resumed_sac_fills_a_new_replay_buffer_before_it_learns(tmp_path: Path) -> None:
-    path, learner = tmp_path / "checkpoint.safetensors", trained(SMALL_SAC)
-    path.write_bytes(to_bytes(learner, 1.0, None))
-    progress, tensors, _ = load_checkpoint(path)
-    other = make_algorithm(SMALL_SAC, 0, progress.steps)
-    restore(other, tensors, path)
+    other = make_algorithm(SMALL_SAC, 0, 256)
+    assert resume(trained(SMALL_SAC), other, tmp_path / "checkpoint.safetensors").steps == 256
     learned(other, replace(SMALL_SAC, steps=256 + 4 * 32))
     assert (other.replay_buffer.size() * 4, other._n_updates) == (32, 0)
     learned(other, replace(SMALL_SAC, steps=256 + 4 * 36))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +15,11 @@ from tqdm import tqdm
 import train
 from cz_gym.agents import AgentFileError
 from cz_gym.agents.training import fleet, run, validation
-from cz_gym.agents.training.recipes import PPO, RECIPES, Recipe
-from tests.small_learners import REFERENCES, train_small_seed
+from cz_gym.agents.training.recipes import RECIPES
+from tests.small_learners import QUICK, REFERENCES, train_small_seed
 
 pytestmark = pytest.mark.usefixtures("few_crystals")
-SMALL_PPO = PPO(
-    steps=4096,
-    num_envs=64,
-    action_repeat=2,
-    n_steps=32,
-    batch_size=1024,
-    n_epochs=1,
-    hidden=(16,),
-    control_interval=30.0,
-)
+SMALL_PPO = replace(QUICK, steps=4096, control_interval=30.0)
 
 
 def in_turn(
@@ -62,18 +54,6 @@ def sessions(folder: Path) -> list[int]:
     """How often each seed's run was begun or resumed."""
     every = (json.loads(path.read_text()) for path in sorted(folder.glob("*/settings.json")))
     return [len(each["sessions"]) for each in every]
-
-
-def jobs(folder: Path, seeds: range, recipe: Recipe = SMALL_PPO) -> list[run.Job]:
-    return [run.Job(folder / f"seed{seed}", recipe, seed, REFERENCES) for seed in seeds]
-
-
-def done(some: list[run.Job]) -> list[int]:
-    """Seeds in the order they were finished; the bar has counted them all."""
-    with tqdm(total=len(some), file=io.StringIO()) as bar:
-        seeds = [job.seed for job, _ in fleet.train_seeds(some, bar)]
-        assert bar.n == pytest.approx(len(some))
-    return seeds
 
 
 def test_seeds_come_out_as_one_by_one_and_only_once(
@@ -149,8 +129,12 @@ def test_one_seed_that_fails_stops_no_other(
 
 @pytest.mark.slow
 def test_processes_train_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the bar counts them all."""
     monkeypatch.setattr(fleet, "train_seed", train_small_seed)
-    assert sorted(done(jobs(tmp_path / "there", range(3)))) == [0, 1, 2]
-    monkeypatch.setattr(fleet, "in_processes", in_turn)
-    assert done(jobs(tmp_path / "here", range(3))) == [0, 1, 2]
+    for place in (tmp_path / "there", tmp_path / "here"):
+        jobs = [run.Job(place / f"seed{seed}", SMALL_PPO, seed, REFERENCES) for seed in range(3)]
+        with tqdm(total=3, file=io.StringIO()) as bar:
+            assert {job.seed for job, _ in fleet.train_seeds(jobs, bar)} == {0, 1, 2}
+            assert bar.n == pytest.approx(3)
+        monkeypatch.setattr(fleet, "in_processes", in_turn)
     assert agents(tmp_path / "there") == agents(tmp_path / "here")

@@ -16,26 +16,16 @@ import torch
 
 import train
 from cz_gym.agents import OnnxPolicy
-from cz_gym.agents.training import run, validation
+from cz_gym.agents.training import run
 from cz_gym.agents.training.checkpoint import load_checkpoint
-from cz_gym.agents.training.recipes import PPO, RECIPES
+from cz_gym.agents.training.recipes import RECIPES
 from cz_gym.commands import interpreter
-
-SMALL = PPO(num_envs=64, action_repeat=2, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,))
-REFERENCES, KNOWN = validation.references, dict[str, Any]()
-
-
-def references_once(make_controller: Any, recipe: Any) -> Any:
-    """Both recipes are validated on the same crystals."""
-    scenario = recipe.scenario
-    KNOWN[scenario] = KNOWN.get(scenario) or REFERENCES(make_controller, recipe)
-    return KNOWN[scenario]
+from tests.small_learners import QUICK
 
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch, few_crystals: None) -> None:
-    monkeypatch.setattr(validation, "references", references_once)
-    monkeypatch.setitem(RECIPES, "ppo", SMALL)
+    monkeypatch.setitem(RECIPES, "ppo", QUICK)
     monkeypatch.setitem(RECIPES, "gradient", replace(RECIPES["gradient"], num_envs=64, window=12))
 
 
@@ -99,7 +89,7 @@ def test_ctrl_c_in_the_middle_of_an_update_saves_after_it(
             os.kill(os.getpid(), signal.SIGINT)
         return clip(*arguments)
 
-    monkeypatch.setitem(RECIPES, "ppo", replace(SMALL, n_epochs=2))
+    monkeypatch.setitem(RECIPES, "ppo", replace(QUICK, n_epochs=2))
     monkeypatch.setattr("torch.nn.utils.clip_grad_norm_", interrupted)
     folder = tmp_path / "run"
     assert train.main(["--steps", "12000", "--out", str(folder)]) == 130

@@ -5,8 +5,6 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("stable_baselines3")
-
 from cz_gym.agents.training.algorithms import make_algorithm
 from cz_gym.agents.training.recipes import RECIPES
 

@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from itertools import product
 
+import control
 import numpy as np
 import pytest
 
@@ -26,7 +27,6 @@ from cz_gym.physics.parameters import Parameters
 from cz_gym.units import MM
 from tests.observed import PLAIN
 
-control = pytest.importorskip("control")
 PAPER = CompensatedPID()
 OMEGA = np.geomspace(1e-4, 0.5, 60)
 

@@ -18,16 +18,7 @@ from cz_gym.episodes.scenario import Interface
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.observation import decode
 from cz_gym.units import HOUR, MM
-from tests.observed import PLAIN, measured
-
-
-class Watched(LQG):
-    """Keeps the last state of its bank."""
-
-    def step(self, seen, memory):
-        pull, heater, memory = super().step(seen, memory)
-        object.__setattr__(self, "last", memory.filter)
-        return pull, heater, memory
+from tests.observed import PLAIN, Watched, measured
 
 
 @pytest.mark.parametrize("scenario", ["sensor-fault", "puller"])
@@ -66,16 +57,14 @@ def test_the_adaptive_lqg_estimates_how_strong_the_fluctuations_are(strength, fa
     """
     config = make_config("randomized", horizon=HOUR, **PLAIN)
     config = config.with_scenario(replace(config.scenario, name="one", interface=Interface(sd=(strength, strength))))
-    controller = adaptive(lqg("lqg-at-0.02-nominal", config))
-    watched = Watched(design=controller.design, hypotheses=controller.hypotheses)
+    watched = Watched(adaptive(lqg("lqg-at-0.02-nominal", config)))
     rollout(watched, config, range(20))
-    expected = watched.last.probability @ np.repeat(FACTORS, len(FACTORS))
+    expected = watched.states[-1].memory.filter.probability @ np.repeat(FACTORS, len(FACTORS))
     assert (np.abs(expected - factor) < 0.4).mean() >= 0.9
 
 
 def test_every_filter_of_the_adaptive_lqg_holds_the_slowest_hot_zones():
     """Two of 500 validation crystals, on which a filter that expects stronger slow fluctuations would be unstable."""
-    pytest.importorskip("control")
     pullers = pullers_of(make_config("hot-zone", **PLAIN), (1_000_102, 1_000_275))
     plain = lqg("lqg-at-0.02", make_config("hot-zone", **PLAIN))
     hypotheses = adaptive(plain).hypotheses

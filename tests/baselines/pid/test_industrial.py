@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from cz_gym.baselines.pid.industrial import Industrial
-from cz_gym.observation import PULL_SCALE, Measured
-from cz_gym.units import MM_PER_MIN
-from tests.observed import measured
-
-RING, PULL = Measured._fields.index("ring_error"), Measured._fields.index("v_p")
+from cz_gym.observation import PULL_SCALE
+from cz_gym.units import MM, MM_PER_MIN
+from tests.observed import measured, pulls
 
 
 def literal(diameters):
@@ -30,9 +28,7 @@ def follow(policy, diameters):
     """Pull speeds [mm/min above nominal] when every command is applied."""
     state, pull, found = None, 0.0, []
     for diameter in diameters:
-        row = measured()
-        row[0, RING], row[0, PULL] = diameter / 2.0, pull
-        action, state = policy.predict(row, state)
+        action, state = policy.predict(measured(ring_error=diameter / 2.0 * MM, v_p=pull * PULL_SCALE), state)
         pull = float(action[0, 0])
         found.append(pull * PULL_SCALE / MM_PER_MIN)
     return np.array(found)
@@ -58,21 +54,15 @@ def test_other_intervals_follow_the_same_law(dt):
 
 
 def test_no_wind_up_on_a_stuck_drive():
-    policy, state = Industrial(), None
-    row = measured()
-    row[0, RING], row[0, PULL] = 0.4, 0.2
-    for _ in range(500):
-        action, state = policy.predict(row, state)
-    increment = float(action[0, 0]) * PULL_SCALE - 0.2 * PULL_SCALE
+    found = pulls(Industrial(), [measured(ring_error=0.4 * MM, v_p=0.2 * PULL_SCALE)] * 500)
+    increment = found[-1] - 0.2 * PULL_SCALE
     assert increment == pytest.approx(1.15 * 0.0004 * 1.6 * MM_PER_MIN, rel=1e-3)
 
 
 def test_a_held_diameter_and_a_moving_target():
     """The rates are those of the diameter itself; a falling target shows in the error alone."""
-    policy, state, r_ref = Industrial(T_f=1e-9), None, Measured._fields.index("r_ref")
+    policy, state = Industrial(T_f=1e-9), None
     for k in range(30):
-        row = measured()
-        row[0, r_ref], row[0, RING] = -0.01 * k, 0.01 * k
-        _, state = policy.predict(row, state)
+        _, state = policy.predict(measured(r_ref=-0.01 * k * MM, ring_error=0.01 * k * MM), state)
     assert abs(state.memory.rate[0]) < 1e-9
     np.testing.assert_allclose(state.memory.diameters, 0.0, atol=1e-9)

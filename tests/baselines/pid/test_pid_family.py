@@ -54,7 +54,6 @@ def test_filter_is_exact_and_linear(dt, rng):
 
 @pytest.mark.parametrize("dt", [2.0, 5.0, 10.0])
 def test_control_intervals_share_one_continuous_design(dt):
-    pytest.importorskip("control")
     pid = SeriesPID(K_p=0.004, T_i=1000.0, T_d=300.0, N=5.0)
     policy = FilteredPID(control_interval=dt, pid=pid, compensator=None, T_f=30.0, T_track=np.inf)
     A, B, C, D = linear_controller(policy)

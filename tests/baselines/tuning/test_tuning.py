@@ -12,16 +12,8 @@ from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.settings import settings_of
 from cz_gym.baselines.tuned_for import TUNED, file_name, shipped
 from cz_gym.baselines.tuning import __main__ as command
-from cz_gym.baselines.tuning.goals import (
-    FAMILY_SCENARIOS,
-    LQG_LIMITS,
-    LQG_PARAMETERS,
-    PIDS,
-    crystals,
-    goal_of,
-    lqg_goal,
-    pid_goal,
-)
+from cz_gym.baselines.tuning import goals
+from cz_gym.baselines.tuning.goals import LQG_PARAMETERS, PIDS, goal_of
 from cz_gym.baselines.tuning.search import Figures, Parameter, Search, measure, value_at
 from cz_gym.config import make_config
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
@@ -47,7 +39,7 @@ def bowl(trials=40, episodes=4, parameters=PARAMETERS):
         error = np.log10(policy.T_f / 10.0) ** 2 + (policy.K_ff - 0.5) ** 2
         return FIGURES._replace(rmse_mm=float(error) if seeds[0] < 1_000_000 else 1.0 / policy.T_f, pull_step=0.0)
 
-    return Search("bowl", pid_goal(FilteredPID(), parameters, ()), CONFIG, trials, episodes, figures), met
+    return Search("bowl", goals.pid_goal(FilteredPID(), parameters, ()), CONFIG, trials, episodes, figures), met
 
 
 def test_validation_chooses_among_the_best_of_training(tmp_path):
@@ -108,10 +100,8 @@ def test_steps_are_judged_by_time_not_by_sample():
 @pytest.mark.parametrize("dt", [2.0, 5.0])
 @pytest.mark.parametrize("name", ["paper-filtered", "lqg"])
 def test_a_search_keeps_the_control_interval_and_puller_of_its_environment(name, dt):
-    config, met = (
-        make_config("randomized", control_interval=dt, parameters=CONFIG.parameters._replace(r_0=0.1), **PLAIN),
-        [],
-    )
+    slim, met = CONFIG.parameters._replace(r_0=0.1), []
+    config = make_config("randomized", control_interval=dt, parameters=slim, **PLAIN)
 
     def figures(policy, config, seeds):
         met.append((policy.made_for, config.made_for))
@@ -142,7 +132,7 @@ def test_every_parameter_sets_what_it_names_and_a_search_begins_with_the_setting
 # LQGs
 
 START = LQGDesign()
-GOAL = lqg_goal(START, LQG_PARAMETERS, ("hard", "puller"), 0.07, 0.02, True)
+GOAL = goals.lqg_goal(START, LQG_PARAMETERS, ("hard", "puller"), 0.07, 0.02, True)
 
 
 def logarithms(design):
@@ -197,11 +187,11 @@ HEATER_STEP = [*shipped("lqg")["randomized"]].index("weights.heater_step")
 TUNED_PIDS = [(name, scenario.name) for name in PIDS for scenario in TUNED if scenario.name in shipped(name)]
 
 
-@pytest.mark.parametrize(("controller", "scenario"), [*TUNED_PIDS, *LQG_LIMITS])
+@pytest.mark.parametrize(("controller", "scenario"), [*TUNED_PIDS, *goals.LQG_LIMITS])
 def test_shipped_settings_are_those_a_search_chose(controller, scenario):
     """Finalists of the searches that chose the LQGs were also tried with heavier weights on heater steps."""
     found, tuned_on, varied = kept(controller, scenario), find_scenario(scenario), []
-    config = make_config(crystals(controller, tuned_on), **PLAIN)
+    config = make_config(goals.crystals(controller, tuned_on), **PLAIN)
     search = Search(controller, goal_of(controller, tuned_on), config, 1, 5)
     values = found["chosen"]["values"]
     assert list(values) == [parameter.path for parameter in search.goal.parameters]
@@ -217,7 +207,7 @@ def test_shipped_settings_are_those_a_search_chose(controller, scenario):
     assert found["scenario_hash"] == config.scenario.hash
 
 
-@pytest.mark.parametrize("scenario", FAMILY_SCENARIOS)
+@pytest.mark.parametrize("scenario", goals.FAMILY_SCENARIOS)
 def test_the_family_has_less_error_the_more_it_may_move(scenario):
     """But for the most active member on puller, where the drive limits the steps."""
     found = [kept(designs.family_name(each), scenario)["chosen"]["figures"] for each in designs.ACTIVITIES]
