@@ -2,15 +2,12 @@
 
 import os
 import shlex
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Box
 from gymnasium.wrappers import RecordEpisodeStatistics, RescaleAction, TransformAction
 from sb3_contrib import TQC, RecurrentPPO
 from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
@@ -28,7 +25,7 @@ from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
 ON = {"n_steps": 16, "batch_size": 32, "n_epochs": 1}
 OFF = {"learning_starts": 8, "buffer_size": 64, "batch_size": 8}
-KINDS: dict[str, tuple[Any, str, dict[str, Any]]] = {
+KINDS = {
     "a2c": (A2C, "MlpPolicy", {"policy_kwargs": {"activation_fn": torch.nn.ELU}}),
     "ddpg": (DDPG, "MlpPolicy", OFF),
     "ppo": (PPO, "MlpPolicy", ON),
@@ -41,22 +38,22 @@ KINDS: dict[str, tuple[Any, str, dict[str, Any]]] = {
 
 
 @pytest.fixture(autouse=True)
-def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+def _quick(monkeypatch):
     monkeypatch.setattr(from_sb3, "JUDGING", VALIDATION_SEEDS[:2])
     torch.set_num_threads(1)
 
 
-def trained(kind: str, normalised: bool = False, observation: str = "history") -> Any:
+def trained(kind, normalised=False, observation="history"):
     algorithm, policy, options = KINDS[kind]
     settings = {"observation": observation, "control_interval": 10.0}
-    env: Any = make_vec_env("Cz-v0", n_envs=2, env_kwargs=settings)
+    env = make_vec_env("Cz-v0", n_envs=2, env_kwargs=settings)
     if normalised:
         env = VecNormalize(env, clip_obs=3.0)
     return algorithm(policy, env, device="cpu", seed=5, **options).learn(64)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_policy_becomes_a_file_that_acts_as_it_does(kind: str, tmp_path: Path) -> None:
+def test_every_policy_becomes_a_file_that_acts_as_it_does(kind, tmp_path):
     model = trained(kind)
     contract = from_sb3.save_agent(tmp_path / "mine.onnx", model, "mine")
     assert (contract.algorithm, contract.observation, contract.training_seed) == ("mine", "history", 5)
@@ -69,14 +66,14 @@ def test_every_policy_becomes_a_file_that_acts_as_it_does(kind: str, tmp_path: P
     assert from_sb3.disagreement(agent, model, None) > 1e-3, "the comparison would not tell another network"
 
 
-def test_a_policy_without_an_actor_is_refused() -> None:
+def test_a_policy_without_an_actor_is_refused():
     model = DQN("MlpPolicy", "CartPole-v1", buffer_size=10)
     with pytest.raises(AgentFileError, match="DQNPolicy has no actor that gives two continuous actions"):
         to_onnx(model.policy, 4)
 
 
 @pytest.mark.parametrize("kind", ["ppo", "ppo_lstm"])
-def test_normalisation_goes_into_the_graph(kind: str, tmp_path: Path) -> None:
+def test_normalisation_goes_into_the_graph(kind, tmp_path):
     model = trained(kind, normalised=True, observation="measured")
     normalisation = model.get_vec_normalize_env()
     from_sb3.save_agent(tmp_path / "mine.onnx", model, "mine")
@@ -86,9 +83,7 @@ def test_normalisation_goes_into_the_graph(kind: str, tmp_path: Path) -> None:
     assert from_sb3.disagreement(agent, model, None) > 1e-3
 
 
-def test_the_command_reads_what_stable_baselines3_and_rl_zoo_save(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_reads_what_stable_baselines3_and_rl_zoo_save(tmp_path, capsys):
     model = trained("ppo", normalised=True)
     model.save(tmp_path / "best_model.zip")
     model.get_vec_normalize_env().save(str(tmp_path / "vecnormalize.pkl"))
@@ -103,7 +98,7 @@ def test_the_command_reads_what_stable_baselines3_and_rl_zoo_save(
     assert from_sb3.disagreement(agent, model, model.get_vec_normalize_env()) < 1e-4
 
 
-def test_the_command_reads_analytic_policy_gradients_of_a_mixture(tmp_path: Path) -> None:
+def test_the_command_reads_analytic_policy_gradients_of_a_mixture(tmp_path):
     env = sb3.make_vec_env(2, observation="measured", action="rate")
     model = APG("RecurrentPolicy", env, window=4, seed=3).learn(16)
     model.save(tmp_path / "model.zip")
@@ -115,12 +110,12 @@ def test_the_command_reads_analytic_policy_gradients_of_a_mixture(tmp_path: Path
 
 
 @pytest.mark.parametrize("kind", ["ppo", "sac"])
-def test_a_model_without_its_normalisation_is_refused(kind: str, tmp_path: Path) -> None:
+def test_a_model_without_its_normalisation_is_refused(kind, tmp_path):
     """A model that was saved and loaded has no environment that could tell, or a plain one that it was loaded into."""
     config = make_config(control_interval=10.0)
     normalised, plain = trained(kind, normalised=True), trained(kind)
 
-    def again(model: Any, env: Any) -> Any:
+    def again(model, env):
         model.save(tmp_path / "model.zip")
         return type(model).load(tmp_path / "model.zip", env=env, device="cpu")
 
@@ -136,7 +131,7 @@ def test_a_model_without_its_normalisation_is_refused(kind: str, tmp_path: Path)
     from_sb3.save_agent(tmp_path / "mine.onnx", again(normalised, None), "mine", environment, config)
 
 
-def test_a_model_that_does_not_know_its_training_is_written_with_a_warning(tmp_path: Path) -> None:
+def test_a_model_that_does_not_know_its_training_is_written_with_a_warning(tmp_path):
     model = trained("ppo")
     model.save(tmp_path / "model.zip")
     unknown = PPO("MlpPolicy", model.get_env(), device="cpu", **ON)
@@ -145,11 +140,11 @@ def test_a_model_that_does_not_know_its_training_is_written_with_a_warning(tmp_p
         from_sb3.save_agent(tmp_path / "mine.onnx", unknown, "mine")
 
 
-def in_environments(*wrapped: Callable[[], Any], outer: Callable[[Any], Any] = lambda env: env) -> PPO:
+def in_environments(*wrapped, outer=lambda env: env):
     return PPO("MlpPolicy", outer(DummyVecEnv([*wrapped])), device="cpu", n_steps=8, batch_size=8)
 
 
-def doubled(action: Any) -> Any:
+def doubled(action):
     return np.clip(2.0 * action, -1.0, 1.0)
 
 
@@ -170,14 +165,14 @@ def doubled(action: Any) -> Any:
         (lambda: in_environments(CzEnv, lambda: CzEnv(control_interval=2.0)), "environments differ"),
     ],
 )
-def test_a_model_whose_file_would_be_another_agent_is_refused(model: Any, said: str, tmp_path: Path) -> None:
+def test_a_model_whose_file_would_be_another_agent_is_refused(model, said, tmp_path):
     """The figures of a wrapped model would be those of an agent that acts without the wrapper."""
     with pytest.raises(AgentFileError, match=said):
         from_sb3.save_agent(tmp_path / "mine.onnx", model(), "mine")
     assert not list(tmp_path.iterdir())
 
 
-def test_a_model_of_several_scenarios_is_written_for_the_one_that_is_given(tmp_path: Path) -> None:
+def test_a_model_of_several_scenarios_is_written_for_the_one_that_is_given(tmp_path):
     model = in_environments(lambda: RecordEpisodeStatistics(CzEnv()), lambda: CzEnv(scenario="hard"), outer=VecMonitor)
     model.learn(16)
     contract = from_sb3.save_agent(tmp_path / "mine.onnx", model, "mine", config=make_config("hard"))
@@ -194,7 +189,7 @@ def test_a_model_of_several_scenarios_is_written_for_the_one_that_is_given(tmp_p
         ("mine.onnx", {"config": "hard"}, "needs a Config, not 'hard'"),
     ],
 )
-def test_a_wrong_model_name_or_setting_is_refused(path: str, given: dict[str, Any], said: str) -> None:
+def test_a_wrong_model_name_or_setting_is_refused(path, given, said):
     model = PPO("MlpPolicy", "Cz-v0", device="cpu", n_steps=8, batch_size=8)
     with pytest.raises(ValueError, match=said):
         from_sb3.save_agent(path, **{"model": model, "name": "mine", **given})
@@ -203,10 +198,10 @@ def test_a_wrong_model_name_or_setting_is_refused(path: str, given: dict[str, An
 class Own(BaseFeaturesExtractor):
     """A layer of somebody's own before the policy's, which no agent file may hold."""
 
-    def __init__(self, space: Box) -> None:
+    def __init__(self, space):
         super().__init__(space, space.shape[0])
 
-    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+    def forward(self, observations):
         return torch.sin(observations)
 
 
@@ -214,14 +209,14 @@ class Own(BaseFeaturesExtractor):
     ("options", "said"),
     [({"features_extractor_class": Own}, "operator 'Sin'"), ({"activation_fn": torch.nn.GELU}, "operator 'Erf'")],
 )
-def test_a_network_that_cannot_be_written_is_refused(options: dict[str, Any], said: str, tmp_path: Path) -> None:
+def test_a_network_that_cannot_be_written_is_refused(options, said, tmp_path):
     model = PPO("MlpPolicy", "Cz-v0", device="cpu", n_steps=8, batch_size=8, policy_kwargs=options)
     with pytest.raises(AgentFileError, match=said):
         from_sb3.save_agent(tmp_path / "mine.onnx", model, "mine")
     assert not list(tmp_path.iterdir())
 
 
-def test_a_file_that_would_act_otherwise_is_not_written(tmp_path: Path) -> None:
+def test_a_file_that_would_act_otherwise_is_not_written(tmp_path):
     model = trained("ppo")
     predict = model.predict
     model.predict = lambda *given, **options: (predict(*given, **options)[0] + np.float32(0.01), None)
@@ -242,9 +237,7 @@ def test_a_file_that_would_act_otherwise_is_not_written(tmp_path: Path) -> None:
         ("good.zip --algo ppo --out mine.onnx --seed -1", "training_seed"),
     ],
 )
-def test_a_wrong_command_is_refused_in_one_line(
-    arguments: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Any
-) -> None:
+def test_a_wrong_command_is_refused_in_one_line(arguments, said, tmp_path, monkeypatch, refused):
     monkeypatch.chdir(tmp_path)
     env = gym.make("Cz-v0")
     PPO("MlpPolicy", env, device="cpu", n_steps=8, batch_size=8).save("good.zip")

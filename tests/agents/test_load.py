@@ -1,7 +1,5 @@
 """Shipped agents by name."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -14,7 +12,7 @@ SHIPPED = {"gradient": 10, "ppo": 5, "sac": 5}
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_every_shipped_agent_is_called_by_how_it_was_made(name: str) -> None:
+def test_every_shipped_agent_is_called_by_how_it_was_made(name):
     contracts = [read_agent(path)[0] for path in agents.shipped_seeds(name)]
     assert [contract.training_seed for contract in contracts] == list(range(SHIPPED[name]))
     assert {contract.algorithm for contract in contracts} == {name}
@@ -24,7 +22,7 @@ def test_every_shipped_agent_is_called_by_how_it_was_made(name: str) -> None:
     assert policy.predict(np.zeros((3, policy.contract.channels), np.float32))[0].shape == (3, 2)
 
 
-def test_an_agent_is_loaded_by_its_file() -> None:
+def test_an_agent_is_loaded_by_its_file():
     path = agents.shipped_seeds("ppo")[1]
     assert agents.load(path) == agents.load(str(path)) == agents.OnnxPolicy.load(path)
 
@@ -37,19 +35,19 @@ def test_an_agent_is_loaded_by_its_file() -> None:
         ("nobody.onnx", "nobody.onnx: no such file"),
     ],
 )
-def test_an_agent_that_does_not_exist_is_refused_in_one_line(name: str, message: str) -> None:
+def test_an_agent_that_does_not_exist_is_refused_in_one_line(name, message):
     with pytest.raises(agents.AgentFileError, match=message) as caught:
         agents.load(name)
     assert "\n" not in str(caught.value)
 
 
-def test_a_path_without_its_ending_is_refused_with_a_suggestion() -> None:
+def test_a_path_without_its_ending_is_refused_with_a_suggestion():
     with pytest.raises(agents.AgentFileError, match=r"not an \.onnx agent file; cz_gym\.agents\.load\('ppo'\) loads"):
         agents.OnnxPolicy.load("ppo")
 
 
 @pytest.mark.parametrize("other", [{"action": "rate"}, {"control_interval": 2.0}, {"observation": "measured"}])
-def test_an_agent_refuses_a_config_that_it_is_not_made_for(other: dict[str, Any]) -> None:
+def test_an_agent_refuses_a_config_that_it_is_not_made_for(other):
     settings = agents.load("ppo").settings
     assert agents.load("ppo", make_config("hard", **settings)).settings == settings
     ((name, value),) = other.items()

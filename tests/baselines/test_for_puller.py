@@ -2,8 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +30,7 @@ from tests.observed import PLAIN
 WIDE = make_config(puller="silicon-300mm", **PLAIN)
 
 
-def test_on_the_default_puller_the_papers_procedure_gives_the_papers_numbers() -> None:
+def test_on_the_default_puller_the_papers_procedure_gives_the_papers_numbers():
     here, printed = for_puller.paper_here(make_config(**PLAIN)), CompensatedPID()
     assert here.pid == printed.pid
     assert here.compensator is not None
@@ -40,11 +38,11 @@ def test_on_the_default_puller_the_papers_procedure_gives_the_papers_numbers() -
 
 
 @pytest.mark.parametrize("name", for_puller.PIDS)
-def test_on_the_default_puller_nothing_is_scaled(name: str) -> None:
+def test_on_the_default_puller_nothing_is_scaled(name):
     assert for_puller.scaled_pid(name, make_config(**PLAIN)) == settings_of(name, RANDOMIZED)
 
 
-def test_a_puller_made_of_the_defaults_file_by_other_numbers_is_scaled_to() -> None:
+def test_a_puller_made_of_the_defaults_file_by_other_numbers_is_scaled_to():
     config = make_config(puller=replace(find_puller("default"), name="mine", heater_range=5e3), **PLAIN)
     for name in for_puller.PIDS:
         assert for_puller.pid(name, config) == for_puller.scaled_pid(name, config)
@@ -52,7 +50,7 @@ def test_a_puller_made_of_the_defaults_file_by_other_numbers_is_scaled_to() -> N
 
 @pytest.mark.parametrize("puller", ["silicon-300mm", "germanium"])
 @pytest.mark.parametrize("name", ["paper-here", "paper-tuned", "pid-conventional", "lqg-at-0.02"])
-def test_loops_are_stable_on_the_pullers_own_linear_model(name: str, puller: str) -> None:
+def test_loops_are_stable_on_the_pullers_own_linear_model(name, puller):
     config = make_config("nominal", puller=puller, **PLAIN)
     form = linear_form(make_controller(name, config), config.sole_scenario.sensor)
     assert form.dt == config.control_interval
@@ -70,14 +68,14 @@ def test_loops_are_stable_on_the_pullers_own_linear_model(name: str, puller: str
         pytest.param("lqg-at-0.03", [2_000_049], 2.1, marks=pytest.mark.slow),
     ],
 )
-def test_a_scaled_controller_loses_no_crystal(name: str, seeds: Any, hours: float) -> None:
+def test_a_scaled_controller_loses_no_crystal(name, seeds, hours):
     short = replace(WIDE, horizon=hours * HOUR)
     found = metrics(rollout(make_controller(name, short), short, seeds))
     assert not found.failure_rate.any()
     assert found.rmse_observable_mm.mean() < 0.6
 
 
-def test_what_was_found_is_used_for_that_puller_alone(tmp_path: Path) -> None:
+def test_what_was_found_is_used_for_that_puller_alone(tmp_path):
     place = tmp_path / "mine.toml"
     write_puller(find_puller("silicon-300mm"), place)
     puller, kept = find_puller(place), tmp_path / "mine" / "paper-tuned.json"
@@ -85,7 +83,7 @@ def test_what_was_found_is_used_for_that_puller_alone(tmp_path: Path) -> None:
     assert for_puller.pid("paper-tuned", config) == replace(before, puller=puller)
     kept.parent.mkdir()
     kept.write_text(json.dumps({"puller": puller.label, "chosen": {"values": {"T_f": 12.5, "pid.K_p": 0.02}}}))
-    found: Any = make_controller("paper-tuned", config)
+    found = make_controller("paper-tuned", config)
     assert (found.T_f, found.pid.K_p) == (12.5, 0.02)
     kept.write_text(json.dumps({"puller": "other (0)", "chosen": {"values": {}}}))
     with pytest.raises(CzError, match=r"found for puller other \(0\), not for silicon-300mm"):
@@ -95,9 +93,7 @@ def test_what_was_found_is_used_for_that_puller_alone(tmp_path: Path) -> None:
         make_controller("paper-tuned", config)
 
 
-def test_one_command_designs_and_another_runs_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_one_command_designs_and_another_runs_it(tmp_path, monkeypatch, capsys):
     place = tmp_path / "mine.toml"
     write_puller(find_puller("silicon-300mm"), place)
     figures = Figures(0.1, 0.01, 0.01, 1900.0, 0.0, 5400)
@@ -121,7 +117,7 @@ def test_one_command_designs_and_another_runs_it(
     assert "name a --controller, or a --puller" in capsys.readouterr().err
 
 
-def test_agents_and_controllers_for_another_puller_are_refused_by_its_name() -> None:
+def test_agents_and_controllers_for_another_puller_are_refused_by_its_name():
     with pytest.raises(ValueError, match=r"trained for puller default, this environment's is silicon-300mm \("):
         load("ppo", make_config(puller="silicon-300mm"))
     other = find_controller("lqg").make(make_config(**PLAIN))

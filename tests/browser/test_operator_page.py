@@ -1,8 +1,5 @@
 """The operator's page of a virtual puller in Chromium."""
 
-from collections.abc import Iterator
-from typing import Any
-
 import pytest
 
 from tests.browser.chromium import chromium, pytestmark, resize, until  # noqa: F401
@@ -10,7 +7,7 @@ from tests.serve.conftest import PASSWORD, running
 
 
 @pytest.fixture(scope="module")
-def puller(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+def puller(tmp_path_factory):
     patch = pytest.MonkeyPatch()
     patch.setenv("CZ_GYM_OPERATOR_PASSWORD", PASSWORD)
     with running(tmp_path_factory.mktemp("page"), "--operator", "olga", "--speed", "60", "--scenario", "puller") as one:
@@ -19,18 +16,18 @@ def puller(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def browser(puller: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+def browser(puller, tmp_path_factory):
     with chromium(tmp_path_factory.mktemp("profile")) as driver:
         driver.get(f"http://127.0.0.1:{puller.page}/")
         until(driver, lambda: len(driver.find_elements("css selector", "#charts .main-svg")) >= 4)
         yield driver
 
 
-def text(driver: Any, name: str) -> str:
+def text(driver, name):
     return str(driver.find_element("id", name).text)
 
 
-def test_it_shows_what_the_tags_say_and_goes_on(puller: Any, browser: Any) -> None:
+def test_it_shows_what_the_tags_say_and_goes_on(puller, browser):
     first = text(browser, "time")
     until(browser, lambda: text(browser, "time") > first)
     until(browser, lambda: "fallback" in text(browser, "alarms"))
@@ -51,7 +48,7 @@ def test_it_shows_what_the_tags_say_and_goes_on(puller: Any, browser: Any) -> No
     assert browser.execute_script("return document.getElementById('crystal').naturalWidth") == 640
 
 
-def test_a_guest_cannot_set_drives_and_an_operator_can(puller: Any, browser: Any) -> None:
+def test_a_guest_cannot_set_drives_and_an_operator_can(puller, browser):
     assert not browser.find_element("id", "hand").is_displayed()
     assert text(browser, "login") == "log in"
     browser.get(f"http://olga:{PASSWORD.replace(' ', '%20')}@127.0.0.1:{puller.page}/login")
@@ -69,7 +66,7 @@ def test_a_guest_cannot_set_drives_and_an_operator_can(puller: Any, browser: Any
 
 
 @pytest.mark.parametrize("width", [1280, 400])
-def test_no_window_needs_sideways_scrolling(browser: Any, width: int) -> None:
+def test_no_window_needs_sideways_scrolling(browser, width):
     resize(browser, width)
     until(browser, lambda: browser.execute_script("return window.innerWidth") == width)
     until(browser, lambda: browser.execute_script("return document.documentElement.scrollWidth <= window.innerWidth"))
@@ -77,5 +74,5 @@ def test_no_window_needs_sideways_scrolling(browser: Any, width: int) -> None:
     assert image["width"] / image["height"] == pytest.approx(640 / 480, rel=0.01)
 
 
-def test_nothing_complains(browser: Any) -> None:
+def test_nothing_complains(browser):
     assert [line for line in browser.get_log("browser") if line["level"] != "INFO"] == []

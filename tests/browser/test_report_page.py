@@ -2,15 +2,12 @@
 is absent."""
 
 import json
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from cz_gym.evaluation.report.page import page
-from cz_gym.evaluation.results import Result
 from tests.browser.chromium import chromium, pytestmark, resize, until  # noqa: F401
 from tests.samples import result_of
 
@@ -22,14 +19,14 @@ WATCH = """new MutationObserver(() => document.querySelector(".main-svg") && per
 
 
 @pytest.fixture(scope="module")
-def made() -> list[Result]:
+def made():
     """Two controllers and an agent with a name that is markup, on two scenarios."""
     names = ("open-loop", "paper", "industrial")
     return [result_of(name, names, EVIL)[0] for name in ("puller", "reference-b")]
 
 
 @pytest.fixture(scope="module")
-def browser(made: list[Result], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+def browser(made, tmp_path_factory):
     """Chromium with the page open, its pictures drawn."""
     path = tmp_path_factory.mktemp("page") / "report.html"
     path.write_text(page(made, "benchmark.py"), "utf-8")
@@ -43,7 +40,7 @@ def browser(made: list[Result], tmp_path_factory: pytest.TempPathFactory) -> Ite
         yield driver
 
 
-def test_the_page_opens_from_disk_without_an_error_and_fetches_nothing(browser: Any) -> None:
+def test_the_page_opens_from_disk_without_an_error_and_fetches_nothing(browser):
     assert browser.current_url.startswith("file://")
     sent = [json.loads(line["message"])["message"] for line in browser.get_log("performance")]
     addresses = {
@@ -56,12 +53,12 @@ def test_the_page_opens_from_disk_without_an_error_and_fetches_nothing(browser: 
     assert browser.execute_script("return performance.getEntriesByType('resource').length") == 0
 
 
-def test_text_is_painted_before_a_picture_is_drawn(browser: Any) -> None:
+def test_text_is_painted_before_a_picture_is_drawn(browser):
     script = "return performance.getEntriesByName(arguments[0])[0].startTime"
     assert browser.execute_script(script, "first-contentful-paint") < browser.execute_script(script, "picture")
 
 
-def test_the_first_line_is_the_verdict_and_names_are_text(browser: Any) -> None:
+def test_the_first_line_is_the_verdict_and_names_are_text(browser):
     assert browser.find_element("tag name", "body").text.startswith("No verdict: ")
     assert browser.title == "Cz-v0 benchmark"
     assert EVIL in [cell.text for cell in browser.find_elements("css selector", "details[open] tbody th")]
@@ -71,13 +68,13 @@ def test_the_first_line_is_the_verdict_and_names_are_text(browser: Any) -> None:
 
 
 @pytest.mark.parametrize("width", [1280, 400])
-def test_no_window_needs_sideways_scrolling_and_nothing_covers_anything(browser: Any, width: int) -> None:
+def test_no_window_needs_sideways_scrolling_and_nothing_covers_anything(browser, width):
     """Only a table may be wider than the window, inside its own frame."""
     resize(browser, width)
     until(browser, lambda: browser.execute_script("return window.innerWidth") == width)
     until(browser, lambda: browser.execute_script("return document.documentElement.scrollWidth <= window.innerWidth"))
 
-    def box(selector: str) -> dict[str, float]:
+    def box(selector):
         script = "return document.querySelector(arguments[0]).getBoundingClientRect().toJSON()"
         return dict(browser.execute_script(script, selector))
 
@@ -95,5 +92,5 @@ def test_no_window_needs_sideways_scrolling_and_nothing_covers_anything(browser:
     assert all(right <= left for (_, right), (left, _) in pairwise(ends)), "numbers at an axis collide"
 
 
-def test_the_browser_logged_no_error(browser: Any) -> None:
+def test_the_browser_logged_no_error(browser):
     assert [line for line in browser.get_log("browser") if line["level"] != "INFO"] == []

@@ -1,5 +1,4 @@
 import math
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -24,26 +23,26 @@ ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (60, 3, 2)).astype(np.floa
 
 
 @pytest.fixture(scope="module")
-def detector() -> RingDetector:
+def detector():
     return RingDetector(VIEW, PULLER)
 
 
 @pytest.mark.filterwarnings("error")
-def test_gymnasiums_and_sb3s_checkers_pass() -> None:
+def test_gymnasiums_and_sb3s_checkers_pass():
     env = gym.make("Cz-v0", observation="camera", horizon=600.0)
     check_with_gymnasium(env.unwrapped, skip_render_check=True)
     check_with_sb3(env, warn=True)
     assert env.observation_space == gym.spaces.Box(0, 255, (120, 160, 1), np.uint8)
 
 
-def test_steps_and_info_equal_those_of_measured() -> None:
+def test_steps_and_info_equal_those_of_measured():
     camera, measured = CzEnv("puller", observation="camera"), CzEnv("puller")
     assert repr(camera.reset(seed=3)[1]) == repr(measured.reset(seed=3)[1])
     for action in ACTIONS[:10, 0]:
         assert repr(camera.step(action)[1:]) == repr(measured.step(action)[1:])
 
 
-def test_the_image_shows_the_reading_not_the_truth(detector: RingDetector) -> None:
+def test_the_image_shows_the_reading_not_the_truth(detector):
     """The ring in the image is the reading, noise included: what "measured" says, and nothing better."""
     env, measured = (
         CzEnv("only-sensor", observation=name, horizon=200.0, info="all") for name in ("camera", "measured")
@@ -63,7 +62,7 @@ def test_the_image_shows_the_reading_not_the_truth(detector: RingDetector) -> No
     assert np.std(errors) < 0.5 * np.std(truths)
 
 
-def test_flagged_readings_are_black_and_unflagged_freezes_repeat_the_image() -> None:
+def test_flagged_readings_are_black_and_unflagged_freezes_repeat_the_image():
     env, measured = (CzEnv("sensor-fault", observation=name, horizon=600.0) for name in ("camera", "measured"))
     black = frozen = 0
     over, rest = True, np.zeros(2, np.float32)
@@ -85,7 +84,7 @@ def test_flagged_readings_are_black_and_unflagged_freezes_repeat_the_image() -> 
     assert frozen > 0
 
 
-def test_shot_noise_has_its_statistics_and_nominal_images_have_none() -> None:
+def test_shot_noise_has_its_statistics_and_nominal_images_have_none():
     still = CzEnv("nominal", observation="camera")
     first, _ = still.reset(seed=0)
     np.testing.assert_array_equal(first, picture(PULLER.r_0, PULLER.h_0, PULLER, VIEW))
@@ -98,7 +97,7 @@ def test_shot_noise_has_its_statistics_and_nominal_images_have_none() -> None:
     )
 
 
-def test_a_new_random_stream_of_an_episode_changes_no_image() -> None:
+def test_a_new_random_stream_of_an_episode_changes_no_image():
     """Frame k draws from NumPy's stream 8 + k whatever members Stream has; no member shares a frame's numbers."""
     faint = Scenario("faint-noise", sensor=Sensor(camera_noise=(1e-12, 1e-12)))
     env = CzEnv(faint, observation="camera")
@@ -117,7 +116,7 @@ def test_a_new_random_stream_of_an_episode_changes_no_image() -> None:
     assert not {stream_number(index) for index in range(8, 100)} & set(range(8, 8 + horizon))
 
 
-def test_the_ring_follows_geometry_and_closed_form_within_a_pixel(detector: RingDetector) -> None:
+def test_the_ring_follows_geometry_and_closed_form_within_a_pixel(detector):
     at_rest = wall_edge(make_scene(PULLER.r_0, PULLER.h_0, PULLER), VIEW).r - PULLER.r_0
     for dr in np.linspace(-8e-3, 8e-3, 5):
         for dh in (-1.5e-3, 0.0, 1e-3, 2e-3):
@@ -128,7 +127,7 @@ def test_the_ring_follows_geometry_and_closed_form_within_a_pixel(detector: Ring
             assert abs(radius - (wall_edge(make_scene(r_c, h_c, PULLER), VIEW).r - at_rest)) < 0.15 * detector.pixel
 
 
-def test_an_image_without_a_ring_reads_as_nan(detector: RingDetector) -> None:
+def test_an_image_without_a_ring_reads_as_nan(detector):
     flat = picture(PULLER.r_0, 3e-3, PULLER, VIEW)
     for image in (np.zeros(IMAGE, np.uint8), np.full(IMAGE, 200, np.uint8), flat):
         assert math.isnan(detector.read(image).radius)
@@ -148,22 +147,22 @@ def test_an_image_without_a_ring_reads_as_nan(detector: RingDetector) -> None:
         ({"wall_temperature": "hot"}, "wall_temperature"),
     ],
 )
-def test_impossible_cameras_are_refused_in_one_line(change: dict[str, Any], says: str) -> None:
+def test_impossible_cameras_are_refused_in_one_line(change, says):
     with pytest.raises(ValueError, match=says) as raised:
         check_camera(Camera()._replace(**change), Parameters())
     assert "\n" not in str(raised.value)
 
 
-def test_a_camera_needs_the_camera_observation_and_changes_the_hash() -> None:
+def test_a_camera_needs_the_camera_observation_and_changes_the_hash():
     with pytest.raises(ValueError, match="observation"):
         make_config(camera=Camera())
     with pytest.raises(ValueError, match=r"cz_gym\.camera\.Camera"):
-        make_config(observation="camera", camera=3)  # type: ignore[arg-type]
+        make_config(observation="camera", camera=3)
     looking = [make_config(observation="camera", camera=Camera(tilt=tilt)).hash for tilt in (0.3, 0.35)]
     assert looking[0] != looking[1]
 
 
-def test_images_and_detector_follow_another_puller() -> None:
+def test_images_and_detector_follow_another_puller():
     parameters = Parameters(r_0=0.06, R_cr=0.2)
     puller, view = make_puller(parameters), make_view(camera_for(parameters))
     assert abs(RingDetector(view, puller).read(picture(0.061, puller.h_0, puller, view)).radius - 0.061) < 1e-4
@@ -172,7 +171,7 @@ def test_images_and_detector_follow_another_puller() -> None:
 
 
 @pytest.mark.slow  # compiles step and image for another meniscus
-def test_images_and_detector_follow_the_exact_meniscus() -> None:
+def test_images_and_detector_follow_the_exact_meniscus():
     puller = make_puller(meniscus=YOUNG_LAPLACE)
     detector = RingDetector(VIEW, puller)
     env = CzEnv("nominal", observation="camera", action="direct", meniscus=YOUNG_LAPLACE, info="all")

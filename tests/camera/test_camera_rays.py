@@ -17,23 +17,23 @@ PULLER = make_puller()
 VIEW = make_view(Camera())
 
 
-def scene_at(r_c: float = PULLER.r_0, h_c: float = PULLER.h_0) -> Scene:
+def scene_at(r_c=PULLER.r_0, h_c=PULLER.h_0):
     return Scene(*map(float, make_scene(r_c, h_c, PULLER)))
 
 
-def height_of_melt(r: float, scene: Scene) -> float:
+def height_of_melt(r, scene):
     """Height of the surface at a distance from the axis, by bisection on the plant's own profile."""
     if r <= scene.r_c:
         return math.inf
 
-    def beyond(z: float) -> float:
+    def beyond(z):
         return scene.r_c + float(profile(z, scene.M) - profile(scene.h_c, scene.M)) - r
 
     return bisect(beyond, 1e-9, scene.h_c, xtol=1e-18) if beyond(1e-9) > 0.0 else 1e-9
 
 
 @pytest.mark.parametrize("h_c", [1.2e-3, 4e-3, 6.64e-3, 9e-3])
-def test_the_profile_is_the_plants(h_c: float) -> None:
+def test_the_profile_is_the_plants(h_c):
     scene = scene_at(h_c=h_c)
     for q in np.linspace(scene.q_c, 8.0, 30):
         r, z, dr, dz = profile_at(q, scene)
@@ -45,7 +45,7 @@ def test_the_profile_is_the_plants(h_c: float) -> None:
     assert slope_at(scene.q_c)[1] == pytest.approx(float(sin_theta), abs=1e-12)
 
 
-def test_rays_meet_the_melt_where_marching_says() -> None:
+def test_rays_meet_the_melt_where_marching_says():
     """Oracle: bisection between the last point above the surface and the first below, marched in steps of 0.1 mm."""
     rng = np.random.default_rng(1)
     scene = scene_at()
@@ -57,7 +57,7 @@ def test_rays_meet_the_melt_where_marching_says() -> None:
             continue
         met += 1
 
-        def above(t: float, ray: Ray = ray) -> float:
+        def above(t, ray=ray):
             r = math.hypot(ray.x + t * ray.dx, ray.y + t * ray.dy)
             return ray.z + t * ray.dz - height_of_melt(r, scene)
 
@@ -69,7 +69,7 @@ def test_rays_meet_the_melt_where_marching_says() -> None:
     assert met > 12
 
 
-def test_rays_are_mirrored_by_the_law_of_reflection() -> None:
+def test_rays_are_mirrored_by_the_law_of_reflection():
     rng = np.random.default_rng(2)
     scene = scene_at()
     for _ in range(50):
@@ -99,7 +99,7 @@ def test_rays_are_mirrored_by_the_law_of_reflection() -> None:
         (Ray(0.12, 0.0, 0.01, -1.0, 0.0, 0.5), rays.CRYSTAL, (PULLER.r_0, 0.0, 0.01 + 0.5 * (0.12 - PULLER.r_0))),
     ],
 )
-def test_rays_hit_the_first_surface_in_their_way(ray: Ray, what: int, at: tuple[float, float, float] | None) -> None:
+def test_rays_hit_the_first_surface_in_their_way(ray, what, at):
     scene = scene_at()
     hit = first_hit(ray, FLAT if ray.dz > 0 else scene.q_c, scene, VIEW)
     assert hit.what == what
@@ -108,14 +108,14 @@ def test_rays_hit_the_first_surface_in_their_way(ray: Ray, what: int, at: tuple[
 
 
 @pytest.mark.parametrize(("tilt", "wall_height"), [(0.2, 0.12), (0.349, 0.12), (0.45, 0.08), (0.349, 0.2)])
-def test_the_rings_edge_halves_the_angle_between_camera_and_walls_end(tilt: float, wall_height: float) -> None:
+def test_the_rings_edge_halves_the_angle_between_camera_and_walls_end(tilt, wall_height):
     """The jump of brightness down the middle, by bisection on traced rays, against the half-angle's closed form."""
     view = make_view(Camera(tilt=tilt, wall_height=wall_height))
     scene = scene_at()
     edge = wall_edge(scene, view)
     row = float(project(edge.r, 0.0, edge.z, view).row)
 
-    def excess(row: float) -> float:
+    def excess(row):
         return radiance(sight(row, 80.0, view), scene, view) - 0.5
 
     assert excess(row - 0.5) > 0.0 > excess(row + 0.5)
@@ -126,11 +126,11 @@ def test_the_rings_edge_halves_the_angle_between_camera_and_walls_end(tilt: floa
 
 
 @numba.njit(error_model="numpy")
-def _compiled(row: float, column: float, scene: Scene, view: object) -> float:
+def _compiled(row, column, scene, view):
     return radiance(sight(row, column, view), scene, view)
 
 
-def test_compiled_equals_uncompiled() -> None:
+def test_compiled_equals_uncompiled():
     rng = np.random.default_rng(3)
     for h_c in (1.2e-3, 4e-3, 6.64e-3, 9.3e-3):
         scene = scene_at(PULLER.r_0 + rng.uniform(-8e-3, 8e-3), h_c)

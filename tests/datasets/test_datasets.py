@@ -1,8 +1,5 @@
 """Datasets: stock Minari reads them, each episode can be made again, and what is wrong is said in one line."""
 
-from pathlib import Path
-from typing import Any
-
 import minari
 import numpy as np
 import pytest
@@ -19,12 +16,12 @@ CONFIG = make_config("randomized", action="direct", horizon=1200.0)
 
 
 @pytest.fixture
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def place(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "data"))
     return tmp_path / "data"
 
 
-def again(dataset: Any, episode: int) -> None:
+def again(dataset, episode):
     """Make an episode again, from its seed and its actions: everything is the same."""
     (facts,) = dataset.storage.get_episode_metadata([episode])
     kept, env = dataset[episode], dataset.recover_environment(info="all")
@@ -38,7 +35,7 @@ def again(dataset: Any, episode: int) -> None:
     env.close()
 
 
-def test_an_episode_can_be_made_again_from_its_seed_and_actions(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_episode_can_be_made_again_from_its_seed_and_actions(place, monkeypatch):
     monkeypatch.setattr(datasets, "AT_ONCE", 2)
     write("lqg-at-0.02", find_policy("lqg-at-0.02", CONFIG), "sensor-fault", TRAINING_SEEDS[7:10], horizon=600.0)
     dataset = minari.load_dataset("cz/sensor-fault/lqg-at-0_02-v0")
@@ -51,7 +48,7 @@ def test_an_episode_can_be_made_again_from_its_seed_and_actions(place: Path, mon
     assert minari.list_local_datasets()["cz/sensor-fault/lqg-at-0_02-v0"]["algorithm_name"] == "lqg-at-0.02"
 
 
-def test_a_lost_crystal_ends_its_episode(place: Path) -> None:
+def test_a_lost_crystal_ends_its_episode(place):
     """A policy that pulls at full speed loses each crystal."""
     dataset = write("fast", Playback([[1.0, 0.0]]), seeds=TRAINING_SEEDS[:2], horizon=3600.0)
     for episode, kept in enumerate(dataset.iterate_episodes()):
@@ -63,7 +60,7 @@ def test_a_lost_crystal_ends_its_episode(place: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["paper-tuned", "gradient", "ppo"])
-def test_without_excitation_a_policy_acts_as_in_the_benchmark(name: str) -> None:
+def test_without_excitation_a_policy_acts_as_in_the_benchmark(name):
     """Observations and actions are "measured" and "direct", "measured" and "rate", "history" and "smooth"."""
     policy, seeds = find_policy(name, CONFIG), TRAINING_SEEDS[:3]
     own = make_config("randomized", horizon=CONFIG.horizon, **settings_of(policy))
@@ -73,7 +70,7 @@ def test_without_excitation_a_policy_acts_as_in_the_benchmark(name: str) -> None
 
 
 @pytest.mark.parametrize("name", ["paper-tuned", "gradient"])
-def test_excitation_neither_piles_up_nor_depends_on_the_batch(name: str) -> None:
+def test_excitation_neither_piles_up_nor_depends_on_the_batch(name):
     policy = find_policy(name, CONFIG)
     quiet, several = (record(policy, CONFIG, TRAINING_SEEDS[:4], noise) for noise in (0.0, 0.2))
     (alone,) = record(policy, CONFIG, TRAINING_SEEDS[3:4], 0.2)
@@ -85,7 +82,7 @@ def test_excitation_neither_piles_up_nor_depends_on_the_batch(name: str) -> None
     assert late < 1.5 * early, "a sum of noise would grow by more"
 
 
-def test_excitation_is_a_smooth_action_of_white_noise() -> None:
+def test_excitation_is_a_smooth_action_of_white_noise():
     """Its lag-one correlation is the drives' lag, its spread that of a first-order process."""
     config = make_config("randomized", action="direct", horizon=500_000.0)
     level, noise = excitation(3, config, 0.5)
@@ -108,21 +105,19 @@ def test_excitation_is_a_smooth_action_of_white_noise() -> None:
         (["--noise", "-1"], "noise must be between 0 and 1, not -1"),
     ],
 )
-def test_bad_input_gets_one_line_and_leaves_nothing(options: list[str], said: str, refused: Any, place: Path) -> None:
+def test_bad_input_gets_one_line_and_leaves_nothing(options, said, refused, place):
     assert said in refused(main, ["--policies", "paper", *options, "--out", str(place)])
     assert not place.exists()
 
 
 @pytest.mark.parametrize("seeds", [[], [-1], [0, 1_000_000], VALIDATION_SEEDS[:1]])
-def test_only_training_seeds_are_recorded(seeds: list[int]) -> None:
+def test_only_training_seeds_are_recorded(seeds):
     with pytest.raises(ValueError, match="training seeds, 0 to 999999"):
         write("paper", CompensatedPID(), seeds=seeds)
     assert not set(VALIDATION_SEEDS) & set(TRAINING_SEEDS)
 
 
-def test_a_dataset_is_replaced_only_when_asked_for_and_never_left_half(
-    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_dataset_is_replaced_only_when_asked_for_and_never_left_half(place, monkeypatch, capsys):
     command = ["--policies", "paper", "--scenarios", "nominal", "--episodes", "1", "--out", str(place)]
     assert main(command) == 0
     assert "cz/nominal/paper-v0: 1 episodes, 2,160 steps" in capsys.readouterr().out
@@ -130,7 +125,7 @@ def test_a_dataset_is_replaced_only_when_asked_for_and_never_left_half(
     assert capsys.readouterr().err.count("cz/nominal/paper-v0 exists already") == 1
     assert main([*command, "--overwrite"]) == 0
 
-    def interrupted(*_: Any) -> Any:
+    def interrupted(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(datasets, "excitation", interrupted)

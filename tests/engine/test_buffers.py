@@ -2,8 +2,6 @@
 
 import gc
 import threading
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,11 +12,11 @@ from cz_gym.engine.buffers import SPARES, BufferPool
 SHAPE = 64, 64
 
 
-def torch_tensor(array: np.ndarray) -> Any:
+def torch_tensor(array):
     return pytest.importorskip("torch").from_numpy(array)
 
 
-WAYS: dict[str, tuple[Callable[[np.ndarray], Any], Callable[[Any], Any]]] = {
+WAYS = {
     "itself": (lambda array: array, lambda held: held[0, 0]),
     "view of a view": (lambda array: array.T[:1][0][::-1].view(np.int64)[:5], lambda held: held.view(np.float64)[-1]),
     "frombuffer": (lambda array: np.frombuffer(array, array.dtype), lambda held: held[0]),
@@ -34,7 +32,7 @@ WAYS: dict[str, tuple[Callable[[np.ndarray], Any], Callable[[Any], Any]]] = {
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_memory_is_not_reused_while_a_reference_to_it_is_left(way: str) -> None:
+def test_memory_is_not_reused_while_a_reference_to_it_is_left(way):
     look, read = WAYS[way]
     pool = BufferPool(SHAPE, np.float64)
     array = pool.new()
@@ -53,11 +51,11 @@ def test_memory_is_not_reused_while_a_reference_to_it_is_left(way: str) -> None:
     assert pool.new().ctypes.data == address, "let go, the memory is used again"
 
 
-def test_threads_that_hold_and_let_go_never_see_another_value() -> None:
+def test_threads_that_hold_and_let_go_never_see_another_value():
     pool, wrong = BufferPool((2048,), np.float64), []
 
-    def work(number: int) -> None:
-        held: list[np.ndarray] = []
+    def work(number):
+        held = []
         for turn in range(300):
             array = pool.new()
             array[...] = number * 1000 + turn
@@ -74,7 +72,7 @@ def test_threads_that_hold_and_let_go_never_see_another_value() -> None:
 
 
 @pytest.mark.parametrize("observation", ["measured", "state"])
-def test_a_batch_large_enough_to_be_lent_memory_writes_nothing_again(observation: str) -> None:
+def test_a_batch_large_enough_to_be_lent_memory_writes_nothing_again(observation):
     env = CzVectorEnv(
         600, "nominal", observation=observation, horizon=40.0, autoreset_mode="SameStep", threads=2, info="all"
     )

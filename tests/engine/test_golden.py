@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,10 +12,10 @@ from tests.golden.trajectories import FILE, SIGNALS, trajectories, trajectory
 from tests.observed import PLAIN
 from tests.processes import ROOT, python
 
-GOLDEN: dict[str, Any] = json.loads(FILE.read_text())
+GOLDEN = json.loads(FILE.read_text())
 
 
-def test_trajectories_are_those_of_the_golden_file() -> None:
+def test_trajectories_are_those_of_the_golden_file():
     found = trajectories()
     assert found.keys() == GOLDEN.keys()
     assert len(found) == 2 * len(SCENARIOS)
@@ -25,7 +24,7 @@ def test_trajectories_are_those_of_the_golden_file() -> None:
 
 
 @pytest.mark.parametrize("name", Parameters._fields)
-def test_goldens_notice_a_change_of_any_parameter(name: str) -> None:
+def test_goldens_notice_a_change_of_any_parameter(name):
     """By a millionth: of what the plant is made of, whatever the scenario."""
     changed = Parameters()._replace(**{name: getattr(Parameters(), name) * (1.0 + 1e-6)})
     rows = np.array(trajectory("randomized", "I", changed))
@@ -33,12 +32,12 @@ def test_goldens_notice_a_change_of_any_parameter(name: str) -> None:
     assert not np.allclose(rows, GOLDEN["randomized, I"], rtol=1e-9, atol=0.0)
 
 
-def test_the_same_bits_in_another_process() -> None:
+def test_the_same_bits_in_another_process():
     """And from an installed wheel: ``tests/project/test_packaging.py``."""
     assert python("-m", "tests.golden.digest").split() == [digest(), str(ROOT / "cz_gym" / "__init__.py")]
 
 
-def test_thread_counts_do_not_change_bits() -> None:
+def test_thread_counts_do_not_change_bits():
     digests = set()
     for threads in (1, 2, 3):
         env = CzVectorEnv(780, "puller", horizon=50.0, threads=threads, info="all", **PLAIN)

@@ -13,7 +13,7 @@ P = make_puller()
 
 
 @pytest.mark.parametrize("interval", [2.0, 5.0, 10.0])
-def test_a_held_action_is_approached_with_one_time_constant(interval: float) -> None:
+def test_a_held_action_is_approached_with_one_time_constant(interval):
     """v_p -> v_0 (1 + a) and Q_H -> Q_H0 + 5 kW a, whatever the control interval."""
     env = CzEnv("nominal", action="smooth", control_interval=interval, horizon=600.0, info="all")
     env.reset(seed=0)
@@ -28,7 +28,7 @@ def test_a_held_action_is_approached_with_one_time_constant(interval: float) -> 
 
 
 @pytest.mark.parametrize("interval", [2.0, 10.0])
-def test_rates_add_up_within_the_range_of_the_drives(interval: float) -> None:
+def test_rates_add_up_within_the_range_of_the_drives(interval):
     """An action of 1 moves the pull speed by v_0 and the heater by 5 kW every 50 s; left alone they stay."""
     env = CzEnv("nominal", action="rate", control_interval=interval, horizon=600.0, info="all")
     env.reset(seed=0)
@@ -47,7 +47,7 @@ def test_rates_add_up_within_the_range_of_the_drives(interval: float) -> None:
     assert not over
 
 
-def test_info_is_lean_unless_all_is_asked_for() -> None:
+def test_info_is_lean_unless_all_is_asked_for():
     for env, keys in (
         (CzEnv(), {"r_c", "r_ref"}),
         (CzEnv(info="all"), {*INFO, "state"}),
@@ -62,7 +62,7 @@ def test_info_is_lean_unless_all_is_asked_for() -> None:
         assert info["action_clipped"] is True
 
 
-def test_a_deep_copy_of_info_shares_nothing() -> None:
+def test_a_deep_copy_of_info_shares_nothing():
     for env in CzEnv(), CzEnv(observation="measured"), CzEnv(info="all"):
         _, info = env.reset(seed=0)
         info["of a wrapper"] = {"inside": [1.0]}

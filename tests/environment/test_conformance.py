@@ -1,7 +1,6 @@
 """Cz-v0 under Gymnasium's checker, and its batch under ours; under stable-baselines3's in ``test_sb3.py``."""
 
 import warnings
-from typing import Any
 
 import gymnasium as gym
 import pytest
@@ -11,11 +10,11 @@ from gymnasium.vector import AutoresetMode
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv
 from cz_gym.testing.checker import check_vector_env, main
 
-SHORT: dict[str, Any] = {"control_interval": 60.0, "horizon": 1200.0}
+SHORT = {"control_interval": 60.0, "horizon": 1200.0}
 
 
 @pytest.mark.parametrize("observation", ["measured", "history", "state"])
-def test_gymnasiums_checker_on_every_scenario(observation: str) -> None:
+def test_gymnasiums_checker_on_every_scenario(observation):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for scenario in SCENARIOS:
@@ -34,7 +33,7 @@ def test_gymnasiums_checker_on_every_scenario(observation: str) -> None:
     ],
     ids=["puller", "hard", "sensor-fault", "all", "lean"],
 )
-def test_the_native_batch_is_a_vector_of_scalars(settings: dict[str, Any], mode: AutoresetMode) -> None:
+def test_the_native_batch_is_a_vector_of_scalars(settings, mode):
     settings = {"info": "all", **SHORT, **settings}
     checked = check_vector_env(
         lambda n, mode: CzVectorEnv(n, autoreset_mode=mode, **settings),
@@ -47,8 +46,8 @@ def test_the_native_batch_is_a_vector_of_scalars(settings: dict[str, Any], mode:
 
 
 @pytest.mark.parametrize("scenario", ["sensor-fault", pytest.param("puller", marks=pytest.mark.slow)])
-def test_a_batch_of_images_is_a_vector_of_scalars(scenario: str) -> None:
-    settings: dict[str, Any] = {"scenario": scenario, "observation": "camera", **SHORT, "horizon": 180.0, "info": "all"}
+def test_a_batch_of_images_is_a_vector_of_scalars(scenario):
+    settings = {"scenario": scenario, "observation": "camera", **SHORT, "horizon": 180.0, "info": "all"}
     checked = check_vector_env(
         lambda n, mode: CzVectorEnv(n, autoreset_mode=mode, **settings),
         lambda: CzEnv(**settings),
@@ -61,7 +60,7 @@ def test_a_batch_of_images_is_a_vector_of_scalars(scenario: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_command_prints_the_counts(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_prints_the_counts(capsys, monkeypatch):
     monkeypatch.setattr("cz_gym.episodes.scenarios.SCENARIOS", {"nominal": SCENARIOS["nominal"]})
     assert main([]) == 0
     last = capsys.readouterr().out.splitlines()[-1]

@@ -1,7 +1,6 @@
 """Derivatives of a step: against differences of the environment's own steps, through failures, on the plant alone."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +23,7 @@ STEPS = {"r_c": 1e-7, "h_c": 1e-7, "T_1": 1.0, "T_2": 1.0, "T_b": 1e-2, "v_p": 1
 """Step of the finite differences, for each number."""
 
 
-def moved(batch: DifferentiableBatch, slots: Any, frames: Any, actions: Any, column: int, by: float) -> Any:
+def moved(batch, slots, frames, actions, column, by):
     """State and cost after a step from a state, or action, of which one number was moved."""
     memory, actions = batch._batch.memory, actions.copy()
     memory.slots[:], memory.frames[:] = slots, frames
@@ -55,7 +54,7 @@ LATE = replace(RANDOMIZED, sensor=replace(RANDOMIZED.sensor, latency=1.0))
         *((LATE, "smooth", 2.0, steps) for steps in (42, 43)),
     ],
 )
-def test_derivatives_are_those_of_the_steps(scenario: Any, action: str, interval: float, steps: int) -> None:
+def test_derivatives_are_those_of_the_steps(scenario, action, interval, steps):
     n, random = 24, np.random.default_rng(0)
     config = make_config(scenario, action=action, observation="measured", control_interval=interval)
     batch = DifferentiableBatch(config, n)
@@ -79,7 +78,7 @@ def test_derivatives_are_those_of_the_steps(scenario: Any, action: str, interval
         assert (np.abs(found - expected) <= 2e-5 * np.abs(expected).max(axis=0) + rounding).all(), (ROWS, name)
 
 
-def test_a_reading_that_is_held_or_late_depends_on_the_one_before() -> None:
+def test_a_reading_that_is_held_or_late_depends_on_the_one_before():
     ring, reading = STATES.index("ring"), STATES.index("reading")
     late = DifferentiableBatch(make_config("puller", **PLAIN), 8)
     late.reset(range(8))
@@ -98,7 +97,7 @@ def test_a_reading_that_is_held_or_late_depends_on_the_one_before() -> None:
     assert held.any()
 
 
-def test_window_and_slew_stop_derivatives() -> None:
+def test_window_and_slew_stop_derivatives():
     batch = DifferentiableBatch(make_config("puller", **PLAIN), 4)
     batch.reset(range(4))
     step = batch.step(np.full((4, 2), 0.9))
@@ -107,7 +106,7 @@ def test_window_and_slew_stop_derivatives() -> None:
     np.testing.assert_array_equal(step.jacobian[:, v, v], 1.0)
 
 
-def test_a_lost_crystal_stops_counting() -> None:
+def test_a_lost_crystal_stops_counting():
     batch = DifferentiableBatch(make_config("randomized", **PLAIN), 8)
     batch.reset(range(8))
     actions = np.zeros((8, 2))
@@ -127,7 +126,7 @@ def test_a_lost_crystal_stops_counting() -> None:
 
 
 @pytest.mark.parametrize("scenario", ["hard", "all"])
-def test_the_environment_s_own_crystals_and_observations(scenario: str) -> None:
+def test_the_environment_s_own_crystals_and_observations(scenario):
     """Also where the config observes something else."""
     batch, env = DifferentiableBatch(make_config(scenario), 4), CzVectorEnv(4, scenario, observation="measured")
     _, measured = batch.reset([5, 6, 7, 8])
@@ -140,7 +139,7 @@ def test_the_environment_s_own_crystals_and_observations(scenario: str) -> None:
     assert batch.measured_by_state.shape == (len(MEASURED), len(STATES))
 
 
-def test_the_chain_rule_over_rk4_is_exact() -> None:
+def test_the_chain_rule_over_rk4_is_exact():
     """Against the complex step through the whole of it, ten times in a row."""
     puller, d = make_puller(lam=0.5), Disturbance(50.0, 0.3, 0.95)
     x, u, work = State(*puller.state_0)._replace(r_c=0.051, h_c=0.0062), puller.inputs_0, np.zeros(SCRATCH)
@@ -161,12 +160,12 @@ def test_the_chain_rule_over_rk4_is_exact() -> None:
         (make_config(**PLAIN), 2.0, "num_envs must be"),
     ],
 )
-def test_a_config_without_derivatives_is_refused(config: Any, slots: Any, message: str) -> None:
+def test_a_config_without_derivatives_is_refused(config, slots, message):
     with pytest.raises(ValueError, match=message):
         DifferentiableBatch(config, slots)
 
 
-def test_resets_and_actions_that_are_none_are_refused() -> None:
+def test_resets_and_actions_that_are_none_are_refused():
     batch = DifferentiableBatch(make_config(**PLAIN), np.int64(2))
     with pytest.raises(ResetNeeded, match="every slot needs a crystal"):
         batch.step(np.zeros((2, 2)))
@@ -175,15 +174,15 @@ def test_resets_and_actions_that_are_none_are_refused() -> None:
         batch.step(np.zeros((2, 2)))
     for seeds, which in (([1.7], [0]), ([1, 2], [0, 0]), ([1], [-1]), ([1], [2])):
         with pytest.raises(ValueError, match=r"seeds must be whole|slots must be different"):
-            batch.reset(seeds, which)  # type: ignore[arg-type]
-    batch.reset([np.int64(1), 2])  # type: ignore[list-item]
+            batch.reset(seeds, which)
+    batch.reset([np.int64(1), 2])
     for actions in (np.full((2, 2), np.nan), np.zeros(2), np.zeros((3, 2))):
         with pytest.raises(InvalidAction, match=r"shape \(2, 2\)"):
             batch.step(actions)
     assert batch.step(np.zeros((2, 2))).grows.all()
 
 
-def test_crystals_at_their_end_stay() -> None:
+def test_crystals_at_their_end_stay():
     batch = DifferentiableBatch(make_config(horizon=50.0, **PLAIN), 2)
     batch.reset([1, 2])
     ends = [batch.step(np.zeros((2, 2))) for _ in range(12)]
@@ -193,7 +192,7 @@ def test_crystals_at_their_end_stay() -> None:
 
 
 @pytest.mark.slow  # compiles for another meniscus
-def test_the_exact_meniscus_has_derivatives_too() -> None:
+def test_the_exact_meniscus_has_derivatives_too():
     batch = DifferentiableBatch(make_config(meniscus=YOUNG_LAPLACE, **PLAIN), 4)
     batch.reset(range(4))
     slots, frames = batch._batch.memory.slots.copy(), batch._batch.memory.frames.copy()

@@ -1,6 +1,5 @@
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ MM_PER_MIN = 1e-3 / 60
 ZERO = np.zeros(2, np.float32)
 
 
-def test_everything_advertised_is_there() -> None:
+def test_everything_advertised_is_there():
     assert cz_gym.__all__ == sorted(cz_gym.__all__, key=lambda name: (not name.isupper(), name))
     for name in cz_gym.__all__:
         assert hasattr(cz_gym, name)
@@ -50,13 +49,13 @@ def test_everything_advertised_is_there() -> None:
     ],
 )
 @pytest.mark.parametrize("make", [CzEnv, cz_gym.CzVectorEnv])
-def test_bad_arguments_are_refused_in_one_line(make: Any, arguments: dict[str, Any], says: str) -> None:
+def test_bad_arguments_are_refused_in_one_line(make, arguments, says):
     with pytest.raises(ValueError, match=says) as refusal:
         make(**arguments)
     assert "\n" not in str(refusal.value)
 
 
-def test_a_drawn_puller_without_operating_point_is_drawn_again() -> None:
+def test_a_drawn_puller_without_operating_point_is_drawn_again():
     """In a crucible as hot as this, every third draw has none: a training died of it in the middle of a step."""
     scenario = SCENARIOS["randomized"]
     spread = replace(scenario.pullers, conductance=0.3, conductivity=0.3)
@@ -80,7 +79,7 @@ def test_a_drawn_puller_without_operating_point_is_drawn_again() -> None:
      np.full((2, 2), math.nan), [[0.0, 0.0], [0.0]]],
 )  # fmt: skip
 @pytest.mark.parametrize("make", [CzEnv, lambda: CzVectorEnv(2, **PLAIN)])
-def test_bad_actions_are_refused(make: Any, action: Any) -> None:
+def test_bad_actions_are_refused(make, action):
     env = make()
     with pytest.raises(ResetNeeded):
         env.step(np.zeros((2, 2)))
@@ -91,14 +90,14 @@ def test_bad_actions_are_refused(make: Any, action: Any) -> None:
 
 
 @pytest.mark.parametrize("number", [np.int64, np.float32, np.float64])
-def test_numpy_numbers_are_numbers(number: Any) -> None:
+def test_numpy_numbers_are_numbers(number):
     parameters = Parameters()._replace(T_m=number(1685), C_1=number(57000))
     given = make_config("nominal", number(1), "measured", number(5), number(100), parameters, action="direct")
     plain = make_config("nominal", 1.0, "measured", 5.0, 100.0, action="direct")
     assert (given.hash, given.steps, given.mix) == (plain.hash, 20, (1.0, 1.0))
 
 
-def test_equal_plants_have_equal_hashes() -> None:
+def test_equal_plants_have_equal_hashes():
     zero, minus_zero = (make_config(parameters=Parameters(T_e=T_e), **PLAIN) for T_e in (0.0, -0.0))
     assert zero.plant_hash == minus_zero.plant_hash == Config(parameters=Parameters(T_e=0)).plant_hash
     assert Config(parameters=Parameters(T_m=1685)).plant_hash == make_config(**PLAIN).plant_hash
@@ -107,7 +106,7 @@ def test_equal_plants_have_equal_hashes() -> None:
     assert make_config("nominal", -0.0, **PLAIN).hash == make_config("nominal", 0, **PLAIN).hash
 
 
-def test_out_of_range_actions_are_clipped_and_said_so() -> None:
+def test_out_of_range_actions_are_clipped_and_said_so():
     runs = []
     for action, clipped in (([3.0, -math.inf], True), ([1.0, -1.0], False)):
         env = CzEnv(info="all", **PLAIN)
@@ -118,7 +117,7 @@ def test_out_of_range_actions_are_clipped_and_said_so() -> None:
     assert runs[0] == runs[1]
 
 
-def test_actions_are_pull_speed_and_power() -> None:
+def test_actions_are_pull_speed_and_power():
     env, p = CzEnv("nominal", info="all", **PLAIN), make_puller()
     _, start = env.reset(seed=0)
     assert (start["v_p"], start["Q_H"]) == (p.v_0, p.Q_H_0)
@@ -128,7 +127,7 @@ def test_actions_are_pull_speed_and_power() -> None:
         assert info["Q_H"] - p.Q_H_0 == pytest.approx(10e3 * heat)
 
 
-def test_info_is_the_plant_in_si() -> None:
+def test_info_is_the_plant_in_si():
     env = CzEnv("only-interface", model=0.3, info="all", **PLAIN)
     env.reset(seed=2)
     p = make_puller(lam=0.3)
@@ -144,7 +143,7 @@ def test_info_is_the_plant_in_si() -> None:
     assert "state" not in info
 
 
-def test_drives_obey_window_slew_and_steps() -> None:
+def test_drives_obey_window_slew_and_steps():
     limits = Actuators(
         pull_window=0.5 * MM_PER_MIN, pull_slew=0.3 * MM_PER_MIN / 60, heater_slew=2000.0 / 60, heater_step=100.0
     )

@@ -1,7 +1,5 @@
 """Every form of the environment refuses the actions of what was made for another one (trap 12)."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from gymnasium.error import InvalidAction
@@ -18,7 +16,7 @@ OWN = make_config(horizon=600.0, **PLAIN)
 
 
 @pytest.fixture(params=["scalar", "vector", "differentiable"])
-def step(request: pytest.FixtureRequest) -> Any:
+def step(request):
     """The step of one form of the environment, with an action of its shape."""
     if request.param == "scalar":
         env = CzEnv.from_config(OWN)
@@ -38,7 +36,7 @@ def step(request: pytest.FixtureRequest) -> Any:
         ({"meniscus": YOUNG_LAPLACE}, "plant [0-9a-f]{16}"),
     ],
 )
-def test_step_refuses_what_was_made_for_another_environment(step: Any, other: dict[str, Any], named: str) -> None:
+def test_step_refuses_what_was_made_for_another_environment(step, other, named):
     take, action = step
     theirs = mark(action, make_config(horizon=600.0, **other).made_for)
     with pytest.raises(InvalidAction, match=f"was made for .*{named}.*; the environment has .*gym.make"):
@@ -50,7 +48,7 @@ def test_step_refuses_what_was_made_for_another_environment(step: Any, other: di
 
 
 @pytest.mark.parametrize("weights", [Weights(), Weights(2.0, 0.3, 0.7, 23.4)])
-def test_slopes_are_the_derivatives_of_the_terms(weights: Weights) -> None:
+def test_slopes_are_the_derivatives_of_the_terms(weights):
     at = np.array([1e-4, -9e-6, 3e-7, 150.0])
     for i in range(4):
         stepped = at.astype(complex)

@@ -3,7 +3,6 @@
 import math
 import pickle
 from dataclasses import replace
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -13,23 +12,22 @@ from cz_gym import SCENARIOS, CzEnv, CzVectorEnv
 from cz_gym.config import make_config
 from cz_gym.engine.batch import first_key
 from cz_gym.episodes.record import MIXTURE_STREAM
-from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import ALL, find_distribution
 
-MIX: dict[str | Scenario, float] = {"puller": 1.0, "randomized": 2.0, replace(SCENARIOS["hard"], name="mine"): 1.0}
+MIX = {"puller": 1.0, "randomized": 2.0, replace(SCENARIOS["hard"], name="mine"): 1.0}
 MEMBERS = find_distribution(MIX).scenarios
 BY_NAME = {scenario.name: scenario for scenario in MEMBERS}
-SHORT: dict[str, Any] = {"horizon": 40.0, "observation": "history", "action": "smooth", "info": "all"}
+SHORT = {"horizon": 40.0, "observation": "history", "action": "smooth", "info": "all"}
 
 
-def test_all_is_every_random_row_of_the_benchmark() -> None:
+def test_all_is_every_random_row_of_the_benchmark():
     shares = {each.name: share for each, share in zip(ALL.scenarios, ALL.shares, strict=True)}
     assert shares == {"hard": 0.175, "hot-zone": 0.175, "puller": 0.175, "randomized": 0.3, "sensor-fault": 0.175}
     assert find_distribution("all") is ALL
     assert find_distribution({name: 2.0 * share for name, share in shares.items()}) == ALL
 
 
-def test_shares_order_and_unit_of_equal_mixtures_do_not_matter() -> None:
+def test_shares_order_and_unit_of_equal_mixtures_do_not_matter():
     one, other = find_distribution({"hard": 1, "puller": 3}), find_distribution({"puller": 75.0, "hard": 25.0})
     assert (one, one.hash, one.name) == (other, other.hash, "0.25 hard + 0.75 puller")
     assert one.hash != find_distribution({"hard": 1, "puller": 2}).hash
@@ -60,13 +58,13 @@ def test_shares_order_and_unit_of_equal_mixtures_do_not_matter() -> None:
         (["hard"], "unknown scenario .* dict of scenarios and their shares"),
     ],
 )
-def test_bad_mixtures_are_refused_in_one_line(given: Any, message: str) -> None:
+def test_bad_mixtures_are_refused_in_one_line(given, message):
     with pytest.raises(ValueError, match=message) as refusal:
         CzEnv(given)
     assert "\n" not in str(refusal.value)
 
 
-def test_shares_of_two_thousand_episodes_on_a_stream_of_their_own() -> None:
+def test_shares_of_two_thousand_episodes_on_a_stream_of_their_own():
     _, infos = CzVectorEnv(2000, "all").reset(seed=5)
     names, upto = [each.name for each in ALL.scenarios], np.cumsum(ALL.shares)
     for i in range(2000):
@@ -78,7 +76,7 @@ def test_shares_of_two_thousand_episodes_on_a_stream_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("model", [None, "I"])
-def test_an_episode_is_bit_for_bit_that_of_its_scenario_alone(model: str | None) -> None:
+def test_an_episode_is_bit_for_bit_that_of_its_scenario_alone(model):
     """Every re-drawn episode, too: the environments alone are reset with the same seed as often as the mixture was."""
     env, alone = CzEnv(MIX, model, **SHORT), {name: CzEnv(one, model, **SHORT) for name, one in BY_NAME.items()}
     met = set()
@@ -98,7 +96,7 @@ def test_an_episode_is_bit_for_bit_that_of_its_scenario_alone(model: str | None)
     assert met == set(BY_NAME)
 
 
-def test_an_option_draws_one_episode_from_a_scenario_or_a_mixture() -> None:
+def test_an_option_draws_one_episode_from_a_scenario_or_a_mixture():
     env, batch = gym.make("Cz-v0", scenario=MIX), gym.make_vec("Cz-v0", 2, "vector_entry_point", scenario=MIX)
     assert env.reset(seed=1, options={"scenario": "sensor-fault"})[1]["scenario"] == "sensor-fault"
     assert batch.reset(seed=1, options={"scenario": "nominal"})[1]["scenario"].tolist() == ["nominal"] * 2

@@ -1,5 +1,4 @@
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from tests.equations import drawn, fields, hold
 from tests.observed import PLAIN
 
 
-def run(env: CzEnv, steps: int, pull: float = 0.0, seed: int = 1) -> tuple[np.ndarray, list[dict[str, Any]], Any]:
+def run(env, steps, pull=0.0, seed=1):
     """Observations, infos and the state saved at the start, under a gentle sine or open loop."""
     observation, info = env.reset(seed=seed)
     start = env.get_state().slot
@@ -26,11 +25,11 @@ def run(env: CzEnv, steps: int, pull: float = 0.0, seed: int = 1) -> tuple[np.nd
     return np.array(rows), infos, start
 
 
-def column(infos: list[dict[str, Any]], name: str) -> np.ndarray:
+def column(infos, name):
     return np.array([info[name] for info in infos])
 
 
-def test_every_channel_is_documented() -> None:
+def test_every_channel_is_documented():
     assert [len(channels) for channels in OBSERVATIONS.values()] == [11, 72, 17]
     for channels in OBSERVATIONS.values():
         assert len({channel.name for channel in channels}) == len(channels)
@@ -39,7 +38,7 @@ def test_every_channel_is_documented() -> None:
 
 
 @pytest.mark.parametrize("scenario", ["randomized", "puller", "sensor-fault"])
-def test_measured_holds_what_the_control_computer_has_and_nothing_else(scenario: str) -> None:
+def test_measured_holds_what_the_control_computer_has_and_nothing_else(scenario):
     """Each channel is rebuilt from readings and recipes alone; what no instrument shows does not enter."""
     env = CzEnv(scenario, info="all", **PLAIN)
     rows, infos, start = run(env, 400, 0.05)
@@ -61,7 +60,7 @@ def test_measured_holds_what_the_control_computer_has_and_nothing_else(scenario:
 
 
 @pytest.mark.parametrize(("interval", "ahead"), [(5.0, (12, 60)), (10.0, (6, 30))])
-def test_the_recipe_is_known_one_and_five_minutes_ahead(interval: float, ahead: tuple[int, int]) -> None:
+def test_the_recipe_is_known_one_and_five_minutes_ahead(interval, ahead):
     scenario = Scenario(
         "mine",
         recipe=replace(SCENARIOS["randomized"].recipe, start=(120.0, 120.0)),
@@ -76,8 +75,8 @@ def test_the_recipe_is_known_one_and_five_minutes_ahead(interval: float, ahead: 
 
 
 @pytest.mark.parametrize("interval", [2.0, 5.0, 10.0, 60.0])
-def test_history_is_differences_of_past_means_and_the_integral(interval: float) -> None:
-    arguments: dict[str, Any] = {"control_interval": interval, "info": "all"}
+def test_history_is_differences_of_past_means_and_the_integral(interval):
+    arguments = {"control_interval": interval, "info": "all"}
     steps = round(2000 / interval)
     rows, _, _ = run(CzEnv("randomized", observation="history", **arguments), steps, 0.05)
     plain, _, _ = run(CzEnv("randomized", observation="measured", **arguments), steps, 0.05)
@@ -103,7 +102,7 @@ def test_history_is_differences_of_past_means_and_the_integral(interval: float) 
     np.testing.assert_allclose(rows[1:, 11], np.cumsum(steps), rtol=1e-4, atol=1e-5)
 
 
-def test_the_observation_state_is_that_of_the_plant() -> None:
+def test_the_observation_state_is_that_of_the_plant():
     env = CzEnv("puller", observation="state", info="all", action="direct")
     rows, infos, start = run(env, 50, 0.05)
     p, slot = start.slot["puller"], env.get_state().slot.slot
@@ -120,7 +119,7 @@ def test_the_observation_state_is_that_of_the_plant() -> None:
 
 
 @pytest.mark.parametrize(("interval", "latency"), [(5.0, 5.0), (5.0, 12.0), (2.0, 5.0), (2.0, 60.0), (20.0, 5.0)])
-def test_a_late_frame_is_the_newest_old_enough(interval: float, latency: float) -> None:
+def test_a_late_frame_is_the_newest_old_enough(interval, latency):
     """Frames are taken at samples and on the 5 s grid; the true ring of every second is the oracle."""
     scenario = Scenario("mine", interface=SCENARIOS["hard"].interface, sensor=Sensor(latency=latency))
     every_second = CzEnv(replace(scenario, sensor=Sensor()), control_interval=1.0, info="all", **PLAIN)
@@ -134,7 +133,7 @@ def test_a_late_frame_is_the_newest_old_enough(interval: float, latency: float) 
     assert np.ptp(ring) > 1e-5
 
 
-def test_faulty_camera_shows_the_last_value() -> None:
+def test_faulty_camera_shows_the_last_value():
     """Flagged freezes and drop-outs are invalid; the unflagged freeze, outliers and the drifting bias are not."""
     sensor = replace(SCENARIOS["hard"].sensor, outlier_probability=0.01, outlier_sd=1e-3)
     scenario = Scenario("mine", sensor=sensor, faults=SCENARIOS["sensor-fault"].faults)
@@ -159,7 +158,7 @@ def test_faulty_camera_shows_the_last_value() -> None:
     assert np.nanmax(np.abs(noise[:, 0])) > 1e-3, "no outlier was drawn"
 
 
-def test_ring_ripple_is_sampled_at_the_frame() -> None:
+def test_ring_ripple_is_sampled_at_the_frame():
     scenario = Scenario("mine", sensor=Sensor(ripple=(1e-4, 1e-4), rotation=(11 / 60, 11 / 60)))
     env = CzEnv(scenario, info="all", **PLAIN)
     _, infos, start = run(env, 60)
@@ -168,14 +167,14 @@ def test_ring_ripple_is_sampled_at_the_frame() -> None:
     np.testing.assert_allclose(column(infos, "r_br_measured") - column(infos, "r_br"), expected, atol=1e-12)
 
 
-def test_observations_are_clipped_not_lost() -> None:
+def test_observations_are_clipped_not_lost():
     sensor = Sensor(bias_offset=(5e-3, 5e-3), outlier_probability=1.0, outlier_sd=5e-3)
     observations, infos, _ = run(CzEnv(Scenario("mine", sensor=sensor), info="all", **PLAIN), 50)
     assert column(infos, "r_br_measured").max() > 12e-3 + infos[0]["r_br"]
     assert observations[:, 0].max() == 10.0
 
 
-def test_decode_takes_any_batch_and_refuses_other_shapes(rng: np.random.Generator) -> None:
+def test_decode_takes_any_batch_and_refuses_other_shapes(rng):
     batch = rng.normal(size=(4, 3, 72))
     assert decode(batch).T_1.shape == (4, 3)
     np.testing.assert_allclose(decode(batch).T_1, 5.0 * batch[..., 5] + 2.0 * batch[..., 8])

@@ -1,6 +1,4 @@
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -24,16 +22,16 @@ SHIPPED = sorted(path.stem for path in cz_gym.puller.FOLDER.glob("*.toml"))
 WIDE = find_puller("silicon-300mm")
 
 
-def file(folder: Path, text: str) -> Path:
+def file(folder, text):
     path = folder / "mine.toml"
     path.write_text(f"format = 1\n{text}", "utf-8")
     return path
 
 
 @st.composite
-def pullers(draw: st.DrawFn) -> PullerFile:
-    parameters: dict[str, float] = {}
-    own: dict[str, Any] = {}
+def pullers(draw):
+    parameters = {}
+    own = {}
     for key in KEYS:
         if key.field in ("heater_max", "pull_max", "g", "sigma_SB", "alpha_0", "rho_l", "sigma", "phi_b", "T_m"):
             continue
@@ -52,9 +50,7 @@ def pullers(draw: st.DrawFn) -> PullerFile:
 @settings(max_examples=60, deadline=None)
 @given(puller=pullers())
 @example(puller=PullerFile("ends", camera_noise=(5e-324, 1e-305), pyrometer_drift=(-100.0, 100.0)))
-def test_what_is_written_is_read_again_bit_for_bit(
-    puller: PullerFile, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_what_is_written_is_read_again_bit_for_bit(puller, tmp_path_factory):
     path = tmp_path_factory.mktemp("puller") / "mine.toml"
     write_puller(puller, path)
     again = read_puller(path)
@@ -63,7 +59,7 @@ def test_what_is_written_is_read_again_bit_for_bit(
     assert to_toml(again) == to_toml(puller)
 
 
-def test_what_a_file_does_not_say_keeps_the_defaults_value_and_is_listed(tmp_path: Path) -> None:
+def test_what_a_file_does_not_say_keeps_the_defaults_value_and_is_listed(tmp_path):
     puller = read_puller(file(tmp_path, "[crystal]\nradius_mm = 100\n[sensors]\ncamera_noise_mm = [0, 0.05]\n"))
     assert puller.parameters == Parameters(r_0=100 * MM)
     assert puller.camera_noise == (0.0, 0.05 * MM)
@@ -94,7 +90,7 @@ def test_what_a_file_does_not_say_keeps_the_defaults_value_and_is_listed(tmp_pat
         ("[crystal", "mine.toml"),
     ],
 )
-def test_a_bad_file_is_refused_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+def test_a_bad_file_is_refused_in_one_line(tmp_path, text, said):
     path = file(tmp_path, text)
     with pytest.raises(CzError) as refused:
         read_puller(path)
@@ -103,7 +99,7 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path: Path, text: str, said: str)
     assert "\n" not in str(refused.value)
 
 
-def test_other_formats_and_unknown_pullers_are_refused(tmp_path: Path) -> None:
+def test_other_formats_and_unknown_pullers_are_refused(tmp_path):
     path = tmp_path / "old.toml"
     path.write_text("[crystal]\n")
     with pytest.raises(CzError, match="expected 'format = 1'"):
@@ -113,10 +109,10 @@ def test_other_formats_and_unknown_pullers_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_one_many_and_differentiable_crystals_are_the_same_on_a_puller(name: str) -> None:
+def test_one_many_and_differentiable_crystals_are_the_same_on_a_puller(name):
     given = {"puller": name, "scenario": "hard", "info": "all"}
-    env: CzEnv = gym.make("Cz-v0", **given, **PLAIN).unwrapped  # type: ignore
-    many = CzVectorEnv(2, **given, **PLAIN)  # type: ignore[arg-type]
+    env = gym.make("Cz-v0", **given, **PLAIN).unwrapped
+    many = CzVectorEnv(2, **given, **PLAIN)
     twin = DifferentiableBatch(many.config, 2)
     assert env.config == many.config
     assert env.config.control_interval == find_puller(name).control_interval
@@ -136,17 +132,17 @@ def test_one_many_and_differentiable_crystals_are_the_same_on_a_puller(name: str
     assert not terminated
 
 
-def test_the_default_file_changes_nothing() -> None:
+def test_the_default_file_changes_nothing():
     assert find_puller("default") == DEFAULT == find_puller(None)
     assert find_puller("default").label == "default"
-    mixed: Any = {"hard": 0.5, "puller": 0.5}
+    mixed = {"hard": 0.5, "puller": 0.5}
     for scenario in (*SCENARIOS, ALL, mixed):
         plain, filed = make_config(scenario), make_config(scenario, puller="default")
         assert filed == plain
         assert (filed.hash, filed.made_for, filed.identity) == (plain.hash, plain.made_for, plain.identity)
 
 
-def test_the_machine_is_the_files_and_the_crystal_the_scenarios() -> None:
+def test_the_machine_is_the_files_and_the_crystal_the_scenarios():
     scenario = on(WIDE, PULLER)
     assert isinstance(scenario, Scenario)
     longer, faster = 150.0 / 87.5, 0.8 / 1.2
@@ -157,17 +153,17 @@ def test_the_machine_is_the_files_and_the_crystal_the_scenarios() -> None:
     assert scenario.recipe == PULLER.recipe
     assert scenario.reference.amount[1] == pytest.approx(faster * PULLER.reference.amount[1])
     assert scenario.pullers.melt_loss == PULLER.pullers.melt_loss
-    bare: Any = replace(WIDE, pull_window=None, pull_slew=None, heater_slew=None)
-    assert on(bare, PULLER).actuators.pull_window == pytest.approx(0.5 * faster * MM_PER_MIN)  # type: ignore[union-attr]
+    bare = replace(WIDE, pull_window=None, pull_slew=None, heater_slew=None)
+    assert on(bare, PULLER).actuators.pull_window == pytest.approx(0.5 * faster * MM_PER_MIN)
     assert on(bare, PULLER).actuators.heater_slew == pytest.approx(1.5 * 2000.0 / 60.0)
     assert on(bare, HARD).hash != on(WIDE, HARD).hash != HARD.hash
     assert on(WIDE, scenario) == scenario
-    assert on(WIDE, ALL).shares == ALL.shares  # type: ignore[union-attr]
+    assert on(WIDE, ALL).shares == ALL.shares
     with pytest.raises(CzError, match="is on another puller"):
         on(bare, scenario)
 
 
-def test_limits_actions_and_episodes_are_in_proportion_to_the_puller() -> None:
+def test_limits_actions_and_episodes_are_in_proportion_to_the_puller():
     config = make_config("randomized", puller=WIDE, **PLAIN)
     assert config.control_interval == 2.0
     assert config.radius_limit == pytest.approx(8.0 * MM * 150.0 / 87.5)
@@ -182,7 +178,7 @@ def test_limits_actions_and_episodes_are_in_proportion_to_the_puller() -> None:
     assert narrow.scenario.scenarios[0].actuators.pull_window == pytest.approx(0.1 * MM_PER_MIN)
 
 
-def test_another_pullers_states_actions_and_parameters_are_refused() -> None:
+def test_another_pullers_states_actions_and_parameters_are_refused():
     env, other = CzEnv(puller=WIDE), CzEnv(puller=replace(WIDE, latency=2.0))
     env.reset(seed=1)
     other.reset(seed=1)
@@ -191,6 +187,6 @@ def test_another_pullers_states_actions_and_parameters_are_refused() -> None:
     with pytest.raises(CzError, match=r"parameters are those of the puller 'silicon-300mm'"):
         make_config(puller=WIDE, parameters=Parameters())
     with pytest.raises(CzError, match=r"puller must be a puller file"):
-        make_config(puller=Config())  # type: ignore[arg-type]
+        make_config(puller=Config())
     assert make_config().with_scenario("randomized").scenario == RANDOMIZED
     assert "silicon-300mm (" in str(env.config.made_for)

@@ -1,8 +1,6 @@
 """Cz-v0 and its adapter under stable-baselines3's checker and wrappers, against a vector of scalar environments."""
 
 import warnings
-from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -19,14 +17,14 @@ from cz_gym.agents.from_sb3 import save_agent
 from cz_gym.sb3 import AsymmetricPolicy, AsymmetricSACPolicy, make_vec_env
 
 N = 3
-SETTINGS: dict[str, Any] = {"scenario": "hard", "control_interval": 20.0, "horizon": 400.0}
+SETTINGS = {"scenario": "hard", "control_interval": 20.0, "horizon": 400.0}
 
 
-def adapter(n: int = N, stagger: int | None = None, **changes: Any) -> Any:
+def adapter(n=N, stagger=None, **changes):
     return make_vec_env(n, stagger, **{**SETTINGS, **changes})
 
 
-def test_the_adapter_equals_sb3s_own_vector_of_scalars() -> None:
+def test_the_adapter_equals_sb3s_own_vector_of_scalars():
     ours, theirs = adapter(), DummyVecEnv([lambda: CzEnv(**SETTINGS)] * N)
     rng = np.random.default_rng(0)
     for env in (ours, theirs):
@@ -50,7 +48,7 @@ def test_the_adapter_equals_sb3s_own_vector_of_scalars() -> None:
     assert min(failed, truncated) > 0, "both kinds of end must have happened"
 
 
-def test_evaluation_sees_the_environment_s_own_returns() -> None:
+def test_evaluation_sees_the_environment_s_own_returns():
     """Monitored returns and lengths, where a wrapper changes the reward that the algorithm learns from."""
     env = make_vec_env(2, scenario="nominal", **{name: SETTINGS[name] for name in ("control_interval", "horizon")})
     scaled = VecNormalize(env, norm_reward=True, training=False)
@@ -67,9 +65,9 @@ def test_evaluation_sees_the_environment_s_own_returns() -> None:
 
 
 @pytest.mark.parametrize("steps", [50, 6])
-def test_a_repeated_action_earns_the_sum_of_its_steps_and_ends_with_an_episode(steps: int) -> None:
+def test_a_repeated_action_earns_the_sum_of_its_steps_and_ends_with_an_episode(steps):
     """Beside the same steps one by one; episodes of 6 steps end in the middle of the second action."""
-    settings: dict[str, Any] = {**SETTINGS, "horizon": 20.0 * steps}
+    settings = {**SETTINGS, "horizon": 20.0 * steps}
     repeated, plain = make_vec_env(N, action_repeat=4, **settings), make_vec_env(N, **settings)
     for env in (repeated, plain):
         env.seed(5)
@@ -86,7 +84,7 @@ def test_a_repeated_action_earns_the_sum_of_its_steps_and_ends_with_an_episode(s
             np.testing.assert_array_equal(infos[0]["terminal_observation"], counted[-1][3][0]["terminal_observation"])
 
 
-def test_staggered_first_episodes_end_at_different_times() -> None:
+def test_staggered_first_episodes_end_at_different_times():
     env, ends = adapter(64, stagger=3, scenario="nominal"), []
     env.reset()
     for _ in range(20):
@@ -97,7 +95,7 @@ def test_staggered_first_episodes_end_at_different_times() -> None:
     assert sum(ends) >= 64
 
 
-def test_the_adapter_has_the_attributes_and_methods_of_a_vec_env() -> None:
+def test_the_adapter_has_the_attributes_and_methods_of_a_vec_env():
     env = adapter()
     assert [config.steps for config in env.get_attr("config")] == [20] * N
     assert len(env.get_attr("config", [0, 2])) == 2
@@ -107,7 +105,7 @@ def test_the_adapter_has_the_attributes_and_methods_of_a_vec_env() -> None:
 
 
 @pytest.mark.parametrize("observation", ["measured", "history", "state"])
-def test_stable_baselines3s_checker_on_every_scenario(observation: str) -> None:
+def test_stable_baselines3s_checker_on_every_scenario(observation):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for scenario in SCENARIOS:
@@ -115,9 +113,9 @@ def test_stable_baselines3s_checker_on_every_scenario(observation: str) -> None:
 
 
 @pytest.mark.parametrize("form", ["vector_entry_point", "sync"])
-def test_gymnasiums_wrapper_counts_the_episodes_of_both_forms(form: str) -> None:
+def test_gymnasiums_wrapper_counts_the_episodes_of_both_forms(form):
     """Wrappers of single-file training loops, as CleanRL's."""
-    envs: Any = gym.make_vec("Cz-v0", num_envs=4, vectorization_mode=form, control_interval=20.0, horizon=400.0)
+    envs = gym.make_vec("Cz-v0", num_envs=4, vectorization_mode=form, control_interval=20.0, horizon=400.0)
     envs = gym.wrappers.vector.RecordEpisodeStatistics(envs)
     envs.reset(seed=1)
     random, earned, ends = np.random.default_rng(0), np.zeros(4), 0
@@ -131,12 +129,12 @@ def test_gymnasiums_wrapper_counts_the_episodes_of_both_forms(form: str) -> None
     assert ends >= 16
 
 
-def judge(model: Any, seen: torch.Tensor, action: torch.Tensor) -> Any:
+def judge(model, seen, action):
     """What a model's critic says of observations, shape (n, 1)."""
     return model.critic(seen, action)[0] if isinstance(model, SAC) else model.policy.predict_values(seen)
 
 
-def test_a_critic_may_read_the_true_state_that_no_actor_reads(tmp_path: Path) -> None:
+def test_a_critic_may_read_the_true_state_that_no_actor_reads(tmp_path):
     """The state behind the observation is the one of ``observation="state"``, at the end of an episode too."""
     plain, told = adapter(), adapter(critic_state=True)
     states = CzVectorEnv(N, observation="state", autoreset_mode="SameStep", **SETTINGS)

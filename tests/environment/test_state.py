@@ -1,9 +1,7 @@
 import copy
 import dataclasses
 import pickle
-from collections.abc import Callable
 from itertools import product
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -15,9 +13,9 @@ from cz_gym import CzEnv, CzVectorEnv, Parameters
 ACTIONS = np.random.default_rng(0).uniform(-0.3, 0.3, (100, 2)).astype(np.float32)
 
 
-def run(env: CzEnv, steps: int, first: int = 0) -> list[Any]:
+def run(env, steps, first=0):
     """Everything an environment says, resetting when it must."""
-    said: list[Any] = []
+    said = []
     for k in range(first, first + steps):
         observation, gained, terminated, truncated, info = env.step(ACTIONS[k])
         said.append((observation.tobytes(), gained, terminated, truncated, sorted(info.items(), key=str)))
@@ -34,7 +32,7 @@ def run(env: CzEnv, steps: int, first: int = 0) -> list[Any]:
         ("sensor-fault", "camera"),
     ],
 )
-def test_a_saved_state_continues_bit_for_bit(scenario: str, observation: str) -> None:
+def test_a_saved_state_continues_bit_for_bit(scenario, observation):
     """A state is a value; a reset from it shows its last sample."""
     env, other = (CzEnv(scenario, observation=observation, horizon=200.0) for _ in range(2))
     env.reset(seed=9)
@@ -52,7 +50,7 @@ def test_a_saved_state_continues_bit_for_bit(scenario: str, observation: str) ->
         assert run(each, 60, 25) == expected
 
 
-def test_state_of_a_finished_episode_stays_finished() -> None:
+def test_state_of_a_finished_episode_stays_finished():
     env, other = CzEnv("nominal", horizon=5.0), CzEnv("nominal", horizon=5.0)
     env.reset(seed=0)
     env.step(ACTIONS[0])
@@ -61,7 +59,7 @@ def test_state_of_a_finished_episode_stays_finished() -> None:
         other.step(ACTIONS[0])
 
 
-def test_states_travel_between_scalar_and_vector() -> None:
+def test_states_travel_between_scalar_and_vector():
     scalars = [CzEnv("all", horizon=100.0, info="all") for _ in range(3)]
     for seed, env in enumerate(scalars):
         env.reset(seed=seed)
@@ -94,9 +92,7 @@ def test_states_travel_between_scalar_and_vector() -> None:
     ],
 )
 @pytest.mark.parametrize("form", [CzEnv, CzVectorEnv])
-def test_a_state_of_other_settings_is_refused_with_the_name_of_the_setting(
-    form: Any, arguments: dict[str, Any], says: str
-) -> None:
+def test_a_state_of_other_settings_is_refused_with_the_name_of_the_setting(form, arguments, says):
     env = form()
     env.reset(seed=0)
     with pytest.raises(ValueError, match=f"other settings than this environment's: {says}") as refusal:
@@ -104,11 +100,11 @@ def test_a_state_of_other_settings_is_refused_with_the_name_of_the_setting(
     assert "\n" not in str(refusal.value)
 
 
-def with_slot(**changes: Any) -> Callable[[Any], Any]:
+def with_slot(**changes):
     return lambda state: dataclasses.replace(state, slot=dataclasses.replace(state.slot, **changes))
 
 
-def at_sample(k: int) -> Callable[[Any], Any]:
+def at_sample(k):
     return lambda state: state.slot.slot.__setitem__("k", k) or state
 
 
@@ -133,7 +129,7 @@ def at_sample(k: int) -> Callable[[Any], Any]:
         (lambda state: {"x": 1}, "get_state"),
     ],
 )
-def test_a_damaged_state_is_refused_and_changes_nothing(damaged: Any, says: str) -> None:
+def test_a_damaged_state_is_refused_and_changes_nothing(damaged, says):
     env = CzEnv()
     env.reset(seed=0)
     before = pickle.dumps(env.get_state())
@@ -158,7 +154,7 @@ OTHER.reset(seed=0)
     ],
 )
 @pytest.mark.parametrize("form", [CzEnv, lambda: CzVectorEnv(2)])
-def test_a_refused_reset_changes_nothing(form: Any, options: Any, says: str) -> None:
+def test_a_refused_reset_changes_nothing(form, options, says):
     env = form()
     env.reset(seed=0)
     before = pickle.dumps(env.get_state())
@@ -170,7 +166,7 @@ def test_a_refused_reset_changes_nothing(form: Any, options: Any, says: str) -> 
 @pytest.mark.parametrize(
     ("name", "value"), [("r_c", np.nan), ("h_c", np.nan), ("T_b", np.nan), ("h_c", 0.0), ("h_c", -1e-3)]
 )
-def test_a_broken_state_terminates(name: str, value: float) -> None:
+def test_a_broken_state_terminates(name, value):
     """A state that no crystal can have ends the episode as a failure, without an exception."""
     env = CzEnv("nominal")
     env.reset(seed=0)
@@ -185,7 +181,7 @@ def test_a_broken_state_terminates(name: str, value: float) -> None:
 
 
 @pytest.mark.parametrize("steps", [0, 12, 55])
-def test_a_pickled_environment_goes_on_bit_for_bit(steps: int) -> None:
+def test_a_pickled_environment_goes_on_bit_for_bit(steps):
     """Never reset, in an episode, and after the first one; wrappers and all."""
     env = gym.make("Cz-v0", scenario="all", observation="history", action="smooth", horizon=200.0, info="all")
     if steps:
@@ -202,7 +198,7 @@ def test_a_pickled_environment_goes_on_bit_for_bit(steps: int) -> None:
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode)[:2])
-def test_a_pickled_batch_goes_on_bit_for_bit(mode: AutoresetMode) -> None:
+def test_a_pickled_batch_goes_on_bit_for_bit(mode):
     """With slots that are over and wait for their next episode."""
     batch = CzVectorEnv(3, "all", horizon=100.0, autoreset_mode=mode, info="all")
     for steps in (0, 20, 20):

@@ -2,7 +2,6 @@ import multiprocessing
 import pickle
 import sys
 import threading
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from gymnasium.error import ResetNeeded
 from cz_gym import CzVectorEnv
 
 
-def test_a_thread_that_is_late_is_not_waited_for() -> None:
+def test_a_thread_that_is_late_is_not_waited_for():
     env, alone = (CzVectorEnv(512, "nominal", threads=threads) for threads in (2, 1))
     env.reset(seed=0)
     alone.reset(seed=0)
@@ -28,7 +27,7 @@ def test_a_thread_that_is_late_is_not_waited_for() -> None:
     env.close()
 
 
-def test_a_large_batch_holds_the_same_slots_as_a_small_one(rng: np.random.Generator) -> None:
+def test_a_large_batch_holds_the_same_slots_as_a_small_one(rng):
     """Two slots with violent actions, one with small ones: episodes end by failure and by time."""
     large, small = CzVectorEnv(600, horizon=300.0), CzVectorEnv(3, horizon=300.0)
     first = large.reset(seed=100)[0][500:503]
@@ -40,7 +39,7 @@ def test_a_large_batch_holds_the_same_slots_as_a_small_one(rng: np.random.Genera
         np.testing.assert_array_equal(large.step(wide)[0][500:503], small.step(action)[0])
 
 
-def test_a_masked_reset_of_a_batch_with_padded_info_keeps_the_other_slots() -> None:
+def test_a_masked_reset_of_a_batch_with_padded_info_keeps_the_other_slots():
     env = CzVectorEnv(64, horizon=600.0)
     env.reset(seed=0)
     before = env.step(np.full((64, 2), 0.1))
@@ -53,7 +52,7 @@ def test_a_masked_reset_of_a_batch_with_padded_info_keeps_the_other_slots() -> N
     np.testing.assert_array_equal(env._out.info[0, :64][~mask], before[4]["r_c"][~mask])
 
 
-def test_no_step_while_an_episode_is_over() -> None:
+def test_no_step_while_an_episode_is_over():
     env = CzVectorEnv(3, autoreset_mode="Disabled", horizon=10.0)
     env.reset(seed=0)
     env.step(np.zeros((3, 2)))
@@ -67,7 +66,7 @@ def test_no_step_while_an_episode_is_over() -> None:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows cannot fork")
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_a_forked_child_steps_on_threads_of_its_own() -> None:
+def test_a_forked_child_steps_on_threads_of_its_own():
     env = CzVectorEnv(512, "nominal", threads=2)
     env.reset(seed=0)
     env.step(np.zeros((512, 2)))
@@ -89,7 +88,7 @@ def test_a_forked_child_steps_on_threads_of_its_own() -> None:
         (np.array([True]), ValueError),
     ],
 )
-def test_bad_masks_are_refused(mask: Any, error: type[Exception]) -> None:
+def test_bad_masks_are_refused(mask, error):
     env = CzVectorEnv(2, autoreset_mode="Disabled")
     env.reset(seed=0)
     with pytest.raises(error, match="reset_mask"):
@@ -100,13 +99,13 @@ def test_bad_masks_are_refused(mask: Any, error: type[Exception]) -> None:
     "arguments",
     [{"num_envs": 0}, {"num_envs": 2.5}, {"threads": 0}, {"autoreset_mode": "never"}, {"render_mode": "human"}],
 )
-def test_bad_arguments_are_refused(arguments: dict[str, Any]) -> None:
+def test_bad_arguments_are_refused(arguments):
     with pytest.raises(ValueError, match=r"must be|not a valid"):
         CzVectorEnv(**arguments)
     CzVectorEnv.__new__(CzVectorEnv).close_extras()  # Gymnasium up to 1.1 does so when one is forgotten
 
 
-def test_seeds_are_one_a_slot_and_remembered() -> None:
+def test_seeds_are_one_a_slot_and_remembered():
     env = CzVectorEnv(2)
     env.reset(seed=4)
     assert env.np_random_seed == (4, 5)

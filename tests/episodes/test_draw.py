@@ -1,7 +1,6 @@
 import dataclasses
 import math
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,14 +12,14 @@ from cz_gym import SCENARIOS, Parameters, Scenario, make_puller
 from cz_gym.episodes.draw import randomised
 from cz_gym.episodes.record import FREEZES, Episode, Factors
 from cz_gym.episodes.scenario import Draw, Faults, Interface, Recipe, Reference, Sensor
-from cz_gym.episodes.series import Series, draw_episode, draw_factors, new_series
+from cz_gym.episodes.series import draw_episode, draw_factors, new_series
 
 MM, MINUTE, SPAN = 1e-3, 60.0, 10800.0
 WORD = st.integers(0, 2**64 - 1)
 KEY = st.tuples(WORD, WORD)
 
 
-def draw(scenario: str | Scenario, key: tuple[int, int], grid: int = 50, samples: int = 50) -> tuple[Episode, Series]:
+def draw(scenario, key, grid=50, samples=50):
     found = SCENARIOS[scenario] if isinstance(scenario, str) else scenario
     series = new_series(grid, samples)
     for array in series:
@@ -28,11 +27,11 @@ def draw(scenario: str | Scenario, key: tuple[int, int], grid: int = 50, samples
     return draw_episode(found, key, series), series
 
 
-def keys(n: int) -> list[tuple[int, int]]:
+def keys(n):
     return [(i, 3 * i + 1) for i in range(n)]
 
 
-def within(value: float, low: float, high: float, unit: float = 1.0) -> bool:
+def within(value, low, high, unit=1.0):
     return low * unit - 1e-12 <= value <= high * unit + 1e-12
 
 
@@ -55,7 +54,7 @@ RANGES = {
 
 
 @given(KEY, st.sampled_from(sorted(RANGES)))
-def test_draws_lie_in_the_designs_ranges(key: tuple[int, int], scenario: str) -> None:
+def test_draws_lie_in_the_designs_ranges(key, scenario):
     e, _ = draw(scenario, key)
     for name, ends in RANGES[scenario].items():
         assert within(getattr(e, name), *ends), name
@@ -67,7 +66,7 @@ def test_draws_lie_in_the_designs_ranges(key: tuple[int, int], scenario: str) ->
 
 
 @given(KEY)
-def test_freezes_last_as_designed_and_are_disjoint(key: tuple[int, int]) -> None:
+def test_freezes_last_as_designed_and_are_disjoint(key):
     _, series = draw("sensor-fault", key)
     lengths = series.freezes[:, 1] - series.freezes[:, 0]
     flagged = lengths[: FREEZES - 1]
@@ -80,7 +79,7 @@ def test_freezes_last_as_designed_and_are_disjoint(key: tuple[int, int]) -> None
     assert all(before[1] <= after[0] for before, after in pairwise(windows))
 
 
-def felt(scenario: str | Scenario, key: tuple[int, int]) -> tuple[Episode, Series]:
+def felt(scenario, key):
     """A draw without the numbers that act on nothing."""
     e, series = draw(scenario, key)
     if not e.ripple_amplitude:
@@ -90,7 +89,7 @@ def felt(scenario: str | Scenario, key: tuple[int, int]) -> tuple[Episode, Serie
     return e, series
 
 
-def same(one: tuple[Episode, Series], other: tuple[Episode, Series]) -> bool:
+def same(one, other):
     equal = all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one[1], other[1], strict=True))
     return one[0] == other[0] and equal
 
@@ -109,7 +108,7 @@ MEMBERS = [(family, each) for family in FAMILIES for each in dataclasses.fields(
 
 @pytest.mark.parametrize("spread", [0.0, 0.5])
 @pytest.mark.parametrize(("family", "member"), MEMBERS, ids=lambda part: getattr(part, "name", part))
-def test_every_member_says_whether_it_is_random(family: str, member: Any, spread: float) -> None:
+def test_every_member_says_whether_it_is_random(family, member, spread):
     """A scenario called deterministic draws the same episode for every key; a member without that information fails."""
     says, whole = member.metadata["member"], isinstance(np.ravel(member.default)[0].item(), int)
     high = says.high if whole else min(0.5 * says.high, 100.0)
@@ -127,7 +126,7 @@ def test_every_member_says_whether_it_is_random(family: str, member: Any, spread
 
 
 @pytest.mark.parametrize("name", list(SCENARIOS))
-def test_a_longer_horizon_extends_a_draw_and_never_changes_it(name: str) -> None:
+def test_a_longer_horizon_extends_a_draw_and_never_changes_it(name):
     short, long = draw(name, (8, 9), 100, 90), draw(name, (8, 9), 400, 2000)
     assert short[0] == long[0]
     np.testing.assert_array_equal(short[1].interface, long[1].interface[:100])
@@ -135,7 +134,7 @@ def test_a_longer_horizon_extends_a_draw_and_never_changes_it(name: str) -> None
     np.testing.assert_array_equal(short[1].freezes, long[1].freezes)
 
 
-def test_families_share_no_random_number() -> None:
+def test_families_share_no_random_number():
     key = (11, 12)
     whole, series = draw("randomized", key)
     shared = {"recipe": "recipe_", "drift": "drift_", "reference": "reference_"}
@@ -153,7 +152,7 @@ def test_families_share_no_random_number() -> None:
     assert factors[0] == factors[1]
 
 
-def test_interface_fluctuation_is_two_stationary_processes() -> None:
+def test_interface_fluctuation_is_two_stationary_processes():
     scenario = Scenario("mine", interface=Interface(sd=(1.0, 1.0)))
     runs = np.array([draw(scenario, key, grid=320)[1].interface for key in keys(3000)])
     for start in (0, 150):
@@ -165,7 +164,7 @@ def test_interface_fluctuation_is_two_stationary_processes() -> None:
     assert stats.kstest(runs[:, 100] / math.sqrt(2), "norm").pvalue > 1e-3
 
 
-def test_draws_are_uniform() -> None:
+def test_draws_are_uniform():
     factors = np.array([draw_factors(SCENARIOS["randomized"], (0.0, 1.0), key) for key in keys(2000)])
     assert (factors[:, 7:] == 1.0).all()
     widths = np.array([0.5, 0.03, 0.1, 0.1, 0.1, 0.1, 0.1])
@@ -173,7 +172,7 @@ def test_draws_are_uniform() -> None:
     check_uniform(0.5 + 0.5 * (factors[:, :7] - middle) / widths)
 
 
-def test_hot_zone_draws_are_log_uniform_on_the_crystals_of_randomized() -> None:
+def test_hot_zone_draws_are_log_uniform_on_the_crystals_of_randomized():
     hot_zone, randomized = (
         np.array([draw_factors(SCENARIOS[name], (0.0, 1.0), key) for key in keys(2000)])
         for name in ("hot-zone", "randomized")
@@ -185,21 +184,21 @@ def test_hot_zone_draws_are_log_uniform_on_the_crystals_of_randomized() -> None:
     check_uniform((np.log(hot_zone[:, 3:]) - low) / (high - low))
 
 
-def check_uniform(columns: Any) -> None:
+def check_uniform(columns):
     """Each column is uniform in [0, 1], and independent of the others."""
     for column in columns.T:
         assert stats.kstest(column, stats.uniform().cdf).pvalue > 1e-3
     assert np.abs(np.corrcoef(columns.T) - np.eye(columns.shape[1])).max() < 0.1
 
 
-def test_half_the_references_move_and_the_start_is_normal() -> None:
+def test_half_the_references_move_and_the_start_is_normal():
     episodes = [draw("randomized", key)[0] for key in keys(2000)]
     assert np.mean([e.reference_amount != 0 for e in episodes]) == pytest.approx(0.5, abs=0.045)
     starts = np.array([e.r_c_start for e in episodes]) / (0.2 * MM)
     assert stats.kstest(starts, "norm").pvalue > 1e-3
 
 
-def test_outliers_are_rare_and_normal_and_dropouts_have_their_probability() -> None:
+def test_outliers_are_rare_and_normal_and_dropouts_have_their_probability():
     sensor, faults = Sensor(outlier_probability=0.02, outlier_sd=1e-3), Faults(dropout=(0.03, 0.03))
     camera = draw(Scenario("mine", sensor=sensor), (3, 4), samples=100_000)[1].noise[:, 0]
     hit = camera[camera != 0]
@@ -209,13 +208,13 @@ def test_outliers_are_rare_and_normal_and_dropouts_have_their_probability() -> N
     assert np.isnan(camera).mean() == pytest.approx(0.03, abs=4 * math.sqrt(0.03 / 50_000))
 
 
-def test_one_freeze_starts_uniformly() -> None:
+def test_one_freeze_starts_uniformly():
     scenario = Scenario("mine", faults=Faults(flagged=(1, 1), flagged_duration=(100.0, 100.0)))
     starts = [draw(scenario, key)[1].freezes[0, 0] for key in keys(1000)]
     assert stats.kstest(starts, stats.uniform(0, SPAN - 100).cdf).pvalue > 1e-3
 
 
-def test_drawn_factors_scale_the_parameters_of_the_puller() -> None:
+def test_drawn_factors_scale_the_parameters_of_the_puller():
     q, factors = Parameters(), Factors(0.3, 1.02, 1.1, 0.9, 1.05, 0.95, 1.08)
     p, nominal = make_puller(randomised(q, factors), factors.lam), make_puller(q)
     assert p.a / nominal.a == pytest.approx(1.02)

@@ -11,7 +11,7 @@ WORD = st.one_of(st.integers(0, 2**64 - 1), st.sampled_from([0, 1, 2**32 - 1, 2*
 
 
 @kernel
-def fill(key, number, words, uniforms, normals):  # type: ignore[no-untyped-def]
+def fill(key, number, words, uniforms, normals):
     s = np.zeros(WORDS, np.uint64)
     seed_stream(s, key, number)
     for i in range(words.size):
@@ -26,13 +26,13 @@ def fill(key, number, words, uniforms, normals):  # type: ignore[no-untyped-def]
     return s
 
 
-def numpys(key: tuple[int, int], number: int) -> np.random.PCG64:
+def numpys(key, number):
     return np.random.PCG64(np.random.SeedSequence(key, spawn_key=(number,)))
 
 
 @settings(max_examples=200)
 @given(st.tuples(WORD, WORD), st.sampled_from(list(Stream)))
-def test_streams_are_numpys_own_bit_for_bit(key: tuple[int, int], number: Stream) -> None:
+def test_streams_are_numpys_own_bit_for_bit(key, number):
     words, uniforms, normals = np.zeros(3, np.uint64), np.zeros(5), np.zeros(52)
     end = fill(np.array(key, np.uint64), int(number), words, uniforms, normals)
     random = np.random.Generator(numpys(key, number))
@@ -44,7 +44,7 @@ def test_streams_are_numpys_own_bit_for_bit(key: tuple[int, int], number: Stream
 
 
 @pytest.mark.parametrize("key", [(1, 2), (2**63, 5)])
-def test_normals_agree_through_every_branch_of_the_ziggurat(key: tuple[int, int]) -> None:
+def test_normals_agree_through_every_branch_of_the_ziggurat(key):
     """200,000 numbers visit the tail beyond the last layer some fifty times."""
     normals = np.zeros(200_000)
     fill(np.array(key, np.uint64), 4, np.zeros(0, np.uint64), np.zeros(0), normals)

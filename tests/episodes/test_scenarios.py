@@ -1,6 +1,5 @@
 import dataclasses
 import math
-from typing import Any
 
 import pytest
 from hypothesis import given
@@ -35,27 +34,27 @@ MEMBERS = [
 ]
 
 
-def changed(scenario: Scenario, family: str, member: str, value: Any) -> Scenario:
+def changed(scenario, family, member, value):
     """The scenario with one number replaced, which may raise."""
     part = dataclasses.replace(getattr(scenario, family), **{member: value})
     return dataclasses.replace(scenario, **{family: part})
 
 
-def test_contents_of_the_scenarios_are_frozen() -> None:
+def test_contents_of_the_scenarios_are_frozen():
     """A changed scenario is another benchmark: change a hash here only together with the committed results."""
     assert {scenario.name: scenario.hash for scenario in SCENARIOS.values()} == FROZEN
     assert list(SCENARIOS) == list(FROZEN)
     with pytest.raises(dataclasses.FrozenInstanceError):
-        SCENARIOS["nominal"].recipe = Recipe()  # type: ignore[misc]
+        SCENARIOS["nominal"].recipe = Recipe()
 
 
 @given(st.sampled_from(MEMBERS))
-def test_every_number_counts_in_the_hash(where: tuple[str, str]) -> None:
+def test_every_number_counts_in_the_hash(where):
     family, member = where
     base = SCENARIOS["sensor-fault"]
     old = getattr(getattr(base, family), member)
     if isinstance(old, tuple):
-        new: Any = (old[0], old[1] if old[1] == 3 else old[1] + (1 if isinstance(old[1], int) else 1e-7))
+        new = (old[0], old[1] if old[1] == 3 else old[1] + (1 if isinstance(old[1], int) else 1e-7))
     else:
         new = 1e-6 if math.isinf(old) else old * 0.5 if old else 0.00125
     if new == old or (family, member) in (("pullers", "mix"), ("faults", "flagged")):
@@ -69,7 +68,7 @@ def test_every_number_counts_in_the_hash(where: tuple[str, str]) -> None:
     st.sampled_from(MEMBERS),
     st.sampled_from([math.nan, -math.inf, "much", None, (0.0,), (1.0, 0.0), (0.0, math.nan), (-2.0, -1.0), [0.0, 1.0]]),
 )
-def test_nonsense_is_refused_in_one_line(where: tuple[str, str], value: object) -> None:
+def test_nonsense_is_refused_in_one_line(where, value):
     signed = {"rate", "amount", "pyrometer_drift", "bias_drift"}
     family, member = where
     if value == (-2.0, -1.0) and member in signed:
@@ -99,9 +98,7 @@ def test_nonsense_is_refused_in_one_line(where: tuple[str, str], value: object) 
         ("pullers", "capillary", 3.0, r"0.03 \(3 %\)"),
     ],
 )  # fmt: skip
-def test_a_number_outside_its_range_is_refused_with_a_guess_at_the_unit_that_was_meant(
-    family: str, member: str, value: object, meant: str
-) -> None:
+def test_a_number_outside_its_range_is_refused_with_a_guess_at_the_unit_that_was_meant(family, member, value, meant):
     with pytest.raises(ValueError, match=rf"scenario 'nominal': {family}.{member}.*{meant}"):
         changed(SCENARIOS["nominal"], family, member, value)
 
@@ -114,20 +111,18 @@ def test_a_number_outside_its_range_is_refused_with_a_guess_at_the_unit_that_was
         ({"faults": Faults(flagged=(3, 3), flagged_duration=(3601.0, 3601.0))}, "do not fit"),
     ],
 )
-def test_families_of_another_kind_no_name_and_freezes_that_do_not_fit_are_refused(
-    arguments: dict[str, Any], message: str
-) -> None:
+def test_families_of_another_kind_no_name_and_freezes_that_do_not_fit_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         Scenario(**{"name": "mine", **arguments})
 
 
-def test_equal_contents_have_equal_hashes() -> None:
+def test_equal_contents_have_equal_hashes():
     whole = Scenario("mine", Pullers(mix=(0, 1)), drift=Drift((-0.0, 2)), interface=Interface((1, 1)))
     same = Scenario("mine", Pullers(mix=(0.0, 1.0)), drift=Drift((0.0, 2.0)), interface=Interface((1.0, 1.0)))
     assert (whole == same, whole.hash) == (True, same.hash)
 
 
-def test_a_model_sets_the_share_of_conduction() -> None:
+def test_a_model_sets_the_share_of_conduction():
     randomized = SCENARIOS["randomized"]
     assert mix_of(None, randomized) == (0.0, 1.0)
     assert mix_of(None, SCENARIOS["nominal"]) == (1.0, 1.0)
@@ -135,6 +130,6 @@ def test_a_model_sets_the_share_of_conduction() -> None:
     assert mix_of(0.25, randomized) == (0.25, 0.25)
 
 
-def test_the_scenario_of_an_unknown_puller_has_two_names() -> None:
+def test_the_scenario_of_an_unknown_puller_has_two_names():
     assert find_scenario("unknown-puller") == find_scenario("puller") == SCENARIOS["puller"]
     assert find_row("unknown-puller") == find_row("puller")

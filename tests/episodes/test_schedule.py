@@ -12,11 +12,11 @@ MINUTE = 60.0
 THREE_HOURS = 10800.0
 
 
-def episode(scenario: str) -> Episode:
+def episode(scenario):
     return draw_episode(SCENARIOS[scenario], (1, 2), new_series(10, 10))
 
 
-def test_quintic_has_no_rate_and_no_curvature_at_its_ends() -> None:
+def test_quintic_has_no_rate_and_no_curvature_at_its_ends():
     s = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
     points = np.linspace(0, 1, 101)
     np.testing.assert_allclose(schedule.quintic(points), s(points), atol=1e-15)
@@ -25,7 +25,7 @@ def test_quintic_has_no_rate_and_no_curvature_at_its_ends() -> None:
     assert (schedule.quintic(0.0), schedule.quintic(1.0)) == (0.0, 1.0)
 
 
-def test_paper_ramp_rises_half_a_kelvin_a_minute_for_ten_minutes() -> None:
+def test_paper_ramp_rises_half_a_kelvin_a_minute_for_ten_minutes():
     e = episode("paper-ramp")
     minutes = np.array([0.0, 10.0, 11.0, 15.0, 20.0, 90.0])
     assert recipe(minutes * MINUTE, e) == pytest.approx([0.0, 0.0, 0.5, 2.5, 5.0, 5.0])
@@ -33,13 +33,13 @@ def test_paper_ramp_rises_half_a_kelvin_a_minute_for_ten_minutes() -> None:
 
 
 @pytest.mark.parametrize(("name", "fall"), [("reference-a", -2.5e-3), ("reference-b", -0.5e-3)])
-def test_references_fall_over_half_an_hour(name: str, fall: float) -> None:
+def test_references_fall_over_half_an_hour(name, fall):
     minutes = np.array([0.0, 10.0, 25.0, 40.0, 170.0])
     expected = np.array([0.0, 0.0, 0.5, 1.0, 1.0]) * fall
     assert reference(minutes * MINUTE, episode(name)) == pytest.approx(expected)
 
 
-def test_recipe_is_error_and_drift_together() -> None:
+def test_recipe_is_error_and_drift_together():
     e = Episode(
         recipe_start=600.0, recipe_duration=300.0, recipe_amount=2.0,
         drift_start=0.0, drift_duration=1000.0, drift_amount=-4.0, drift_rate=0.1 / 60,
@@ -48,7 +48,7 @@ def test_recipe_is_error_and_drift_together() -> None:
     assert drift(2000.0, e) == pytest.approx(-4.0 + 0.1 / 60 * 2000)
 
 
-def test_disturbance_hides_the_drift_and_melts_the_charge_away() -> None:
+def test_disturbance_hides_the_drift_and_melts_the_charge_away():
     p = make_puller()
     e = Episode(drift_duration=100.0, drift_amount=3.0, melt_loss=0.1)
     d = disturbance(THREE_HOURS / 2, 0.7, e, p)
@@ -58,7 +58,7 @@ def test_disturbance_hides_the_drift_and_melts_the_charge_away() -> None:
     assert disturbance(2 * THREE_HOURS, 0.0, e, p).melt == pytest.approx(0.9)
 
 
-def test_errors_of_the_sensors_follow_their_schedule() -> None:
+def test_errors_of_the_sensors_follow_their_schedule():
     e = Episode(
         ring_offset=1e-4, bias_drift_start=1000.0, bias_drift_duration=1000.0, bias_drift_amount=-2e-4,
         ripple_amplitude=1e-4, ripple_omega=2 * np.pi / 6.0, ripple_phase=np.pi / 2, pyrometer_drift=2.0,

@@ -36,11 +36,11 @@ class Snail(OpenLoop):
     setting: float = 0.0
 
     @property
-    def hash(self) -> str:
+    def hash(self):
         return repr(self)
 
 
-def slow(policy: Any) -> Contender:
+def slow(policy):
     return Contender("snail", lambda config: policy, "measured", "slow", slow=True)
 
 
@@ -50,27 +50,27 @@ class Fixed(Row):
     given: Any = CONFIG
     these: Any = SEEDS
 
-    def config(self, *arguments: Any) -> Any:
+    def config(self, *arguments):
         return self.given
 
     design_config = config
 
-    def seeds(self, episodes: int) -> Any:
+    def seeds(self, episodes):
         return self.these
 
 
-def sample(folder: Path, policy: Any = None, config: Any = CONFIG, seeds: Any = SEEDS) -> Sample:
+def sample(folder, policy=None, config=CONFIG, seeds=SEEDS):
     row = type("Some", (Fixed,), {"given": config, "these": seeds})("some", "randomized", "")
     (result,) = runner.run([slow(policy or Snail())], [row], 500, tqdm(disable=True), folder)
     return result.samples[0]
 
 
 @pytest.fixture
-def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def counted(monkeypatch):
     """Seeds of every episode that was really run; with a -1 before it, the next block is interrupted."""
-    ran: list[int] = []
+    ran = []
 
-    def counting(policy: Any, config: Any, seeds: Any, *more: Any) -> Any:
+    def counting(policy, config, seeds, *more):
         if ran[-1:] == [-1]:
             raise KeyboardInterrupt
         ran.extend(seeds)
@@ -81,7 +81,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return ran
 
 
-def test_episodes_are_run_once_and_are_those_of_one_rollout(tmp_path: Path, counted: list[int]) -> None:
+def test_episodes_are_run_once_and_are_those_of_one_rollout(tmp_path, counted):
     first, again = sample(tmp_path, seeds=range(2)), sample(tmp_path)
     direct = Sample.of(slow(Snail()), [rollout(OpenLoop(), CONFIG, SEEDS)])
     assert counted == [0, 1, 2, 3, 4]
@@ -93,7 +93,7 @@ def test_episodes_are_run_once_and_are_those_of_one_rollout(tmp_path: Path, coun
         np.testing.assert_array_equal(ours, theirs)
 
 
-def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, counted: list[int]) -> None:
+def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path, counted):
     sample(tmp_path, seeds=range(2))
     counted.append(-1)
     with pytest.raises(KeyboardInterrupt):
@@ -103,7 +103,7 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, counted: li
     assert counted == [2, 3, 4]
 
 
-def test_cached_episodes_serve_no_other_settings_plant_or_scenario(tmp_path: Path, counted: list[int]) -> None:
+def test_cached_episodes_serve_no_other_settings_plant_or_scenario(tmp_path, counted):
     others = (
         (Snail(), CONFIG),
         (Snail(setting=1.0), CONFIG),
@@ -116,7 +116,7 @@ def test_cached_episodes_serve_no_other_settings_plant_or_scenario(tmp_path: Pat
     assert counted == [0] * 5
 
 
-def test_a_damaged_file_and_a_first_episode_without_signals_are_run_again(tmp_path: Path, counted: list[int]) -> None:
+def test_a_damaged_file_and_a_first_episode_without_signals_are_run_again(tmp_path, counted):
     whole = sample(tmp_path, seeds=range(2))
     assert sample(tmp_path, seeds=range(1, 2)).example is not None
     for path in tmp_path.glob("*/1.npz"):
@@ -126,9 +126,7 @@ def test_a_damaged_file_and_a_first_episode_without_signals_are_run_again(tmp_pa
 
 
 @pytest.mark.parametrize("package", cache.COMPUTING)
-def test_another_version_of_a_package_that_computes_runs_cached_episodes_again(
-    package: str, tmp_path: Path, counted: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_version_of_a_package_that_computes_runs_cached_episodes_again(package, tmp_path, counted, monkeypatch):
     sample(tmp_path, seeds=range(1))
     versions = cache.software(cache.COMPUTING)["packages"]
     monkeypatch.setattr(cache, "software", lambda packages: {"packages": {**versions, package: "99"}})
@@ -143,7 +141,7 @@ def test_another_version_of_a_package_that_computes_runs_cached_episodes_again(
         *((name, False) for name in ("rendering/palette.py", "camera", "evaluation/report")),
     ],
 )
-def test_the_cache_key_holds_the_code_that_computes_and_not_the_code_that_draws(room: str, computes: bool) -> None:
+def test_the_cache_key_holds_the_code_that_computes_and_not_the_code_that_draws(room, computes):
     """Kernels, draws and random streams were once left out; an edited palette threw hours of episodes away."""
     place, sources = Path(cz_gym.__file__).parent / room, {*sources_behind(Snail.__module__)}
     files = {*(place.rglob("*.py") if place.is_dir() else [place])}
@@ -153,7 +151,7 @@ def test_the_cache_key_holds_the_code_that_computes_and_not_the_code_that_draws(
 
 
 @pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+def small(monkeypatch, tmp_path):
     """A registry of two quick controllers and a slow one that is a bound, two episodes for it, no agents."""
     snail = replace(slow(Snail()), name="clairvoyant", default=False, privileged=True)
     quick = tuple(registry.find_controller(name) for name in ("open-loop", "paper"))
@@ -164,7 +162,7 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return tmp_path / "out"
 
 
-def test_the_command_says_how_many_episodes_a_slow_controller_met(small: Path) -> None:
+def test_the_command_says_how_many_episodes_a_slow_controller_met(small):
     arguments = ["--episodes", "3", "--scenarios", "randomized", "--controllers", "open-loop,paper,clairvoyant"]
     assert benchmark.main([*arguments, "--slow", "--out", str(small), "--quiet"]) == 0
     data = json.loads((small / "benchmark.json").read_text())
@@ -178,12 +176,12 @@ def test_the_command_says_how_many_episodes_a_slow_controller_met(small: Path) -
     assert len(list((small.parent / "cache").glob("clairvoyant-randomized-*/*.npz"))) == 2
 
 
-def taking_part(arguments: list[str]) -> list[str]:
+def taking_part(arguments):
     given = benchmark.parse([*arguments, "--scenarios", "randomized,nominal"])
     return [each.name for each in benchmark.contenders_of(given, benchmark.rows_of(given))]
 
 
-def test_slow_controllers_run_only_when_asked_for(small: Path, refused: Any) -> None:
+def test_slow_controllers_run_only_when_asked_for(small, refused):
     line = refused(benchmark.main, ["--controllers", "paper,clairvoyant", "--out", str(small)])
     assert line == "benchmark.py: 'clairvoyant' is slow: add --slow to run it on the first 50 episodes\n"
     assert not small.exists()
@@ -192,7 +190,7 @@ def test_slow_controllers_run_only_when_asked_for(small: Path, refused: Any) -> 
         assert "clairvoyant" in taking_part([*wanted, "--slow"])
 
 
-def test_all_takes_those_that_are_cached_and_names_the_others(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_all_takes_those_that_are_cached_and_names_the_others(small, capsys):
     everyone = ["--controllers", "all", "--episodes", "2"]
     nominal = ["--scenarios", "nominal", "--json", str(small.parent / "all.json")]
     assert benchmark.main([*everyone, *nominal]) == 0

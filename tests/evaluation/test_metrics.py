@@ -1,7 +1,5 @@
 """Metrics against values worked out by hand, on made-up crystals."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -16,7 +14,7 @@ R, V, Q = 0.0875, 2e-5, 60e3
 MM_PER_MIN = 1e-3 / 60
 
 
-def made_up(steps: int, lived: int | None = None, scenario: str = "nominal", **signals: Any) -> Rollout:
+def made_up(steps, lived=None, scenario="nominal", **signals):
     """One episode of a perfect crystal but for the given signals; with ``lived``, it fails at that step."""
     config = make_config(scenario, control_interval=DT, horizon=DT * steps, **PLAIN)
     calm = dict.fromkeys(Signals._fields, 0.0) | {"r_c": R, "r_ref": R, "v_p": V, "v_g": V, "Q_H": Q}
@@ -29,17 +27,17 @@ def made_up(steps: int, lived: int | None = None, scenario: str = "nominal", **s
     return Rollout(config, (0,), Signals(**columns), np.zeros((steps, 1)), alive, failed, start, 0.0)
 
 
-def of(run: Rollout) -> Metrics:
+def of(run):
     """The metrics of the one episode."""
     return Metrics(*(value.item() for value in metrics(run)))
 
 
-def test_metrics_of_a_perfect_crystal_are_perfect() -> None:
+def test_metrics_of_a_perfect_crystal_are_perfect():
     perfect = of(made_up(720))
     assert perfect == Metrics(0, 0, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0)
 
 
-def test_mean_square_error_is_against_the_reference_as_it_moves() -> None:
+def test_mean_square_error_is_against_the_reference_as_it_moves():
     error = np.where(np.arange(100) < 25, 0.6e-3, 0.2e-3) * np.where(np.arange(100) % 2, 1, -1)
     moving = R - np.linspace(0, 2.5e-3, 100)
     found = of(made_up(100, r_c=moving + error, r_ref=moving))
@@ -48,7 +46,7 @@ def test_mean_square_error_is_against_the_reference_as_it_moves() -> None:
     assert found.within_half_mm == 0.75
 
 
-def test_observable_error_forgives_what_no_sensor_shows() -> None:
+def test_observable_error_forgives_what_no_sensor_shows():
     """The ring reads 0.3 mm too wide: a crystal held 0.3 mm too thin is all that a controller can do."""
     fooled = of(made_up(100, r_c=R - 0.3e-3, ring_offset=0.3e-3))
     assert fooled.rmse_mm == pytest.approx(0.3)
@@ -58,7 +56,7 @@ def test_observable_error_forgives_what_no_sensor_shows() -> None:
     assert lucky.rmse_observable_mm == pytest.approx(0.3)
 
 
-def test_time_at_the_limits_counts_steps_in_which_a_drive_is_at_its_range_or_slew() -> None:
+def test_time_at_the_limits_counts_steps_in_which_a_drive_is_at_its_range_or_slew():
     config = make_config("puller", **PLAIN)
     drives = config.sole_scenario.actuators
     steps = np.zeros(20)
@@ -72,7 +70,7 @@ def test_time_at_the_limits_counts_steps_in_which_a_drive_is_at_its_range_or_sle
 
 
 @pytest.mark.parametrize("steps", [1, 4, 10])
-def test_a_failure_counts_eight_millimetres_to_the_end(steps: int) -> None:
+def test_a_failure_counts_eight_millimetres_to_the_end(steps):
     """Ten steps: perfect ones, then the failing one and all after it at 8 mm."""
     found = of(made_up(10, lived=steps))
     assert found.rmse_mm == found.rmse_observable_mm == pytest.approx(8 * np.sqrt((11 - steps) / 10))
@@ -81,14 +79,14 @@ def test_a_failure_counts_eight_millimetres_to_the_end(steps: int) -> None:
     assert found.failure_rate == 1
 
 
-def test_an_early_failure_never_lowers_the_error() -> None:
+def test_an_early_failure_never_lowers_the_error():
     errors = [of(made_up(50, lived=lived, r_c=R + 7e-3)) for lived in range(1, 51)]
     rmse = [found.rmse_mm for found in errors]
     assert rmse == sorted(rmse, reverse=True)
     assert min(rmse) > of(made_up(50, r_c=R + 7e-3)).rmse_mm
 
 
-def test_signals_after_a_failure_do_not_count() -> None:
+def test_signals_after_a_failure_do_not_count():
     """The slot goes on with another crystal, or with NaN: no metric reads it."""
     steps, lived = 800, 300
     rng = np.random.default_rng(1)
@@ -99,7 +97,7 @@ def test_signals_after_a_failure_do_not_count() -> None:
     np.testing.assert_array_equal(of(made_up(steps, lived, **told)), of(made_up(steps, lived, **after)))
 
 
-def test_drives_are_those_of_the_time_lived_and_the_first_step_is_a_step() -> None:
+def test_drives_are_those_of_the_time_lived_and_the_first_step_is_a_step():
     found = of(made_up(100, lived=50, v_p=V + 0.1 * MM_PER_MIN, v_g=V - 0.2 * MM_PER_MIN))
     assert found.pull_rms_mm_per_min == pytest.approx(0.1)
     assert found.growth_rate_rms_mm_per_min == pytest.approx(0.2)
@@ -109,11 +107,11 @@ def test_drives_are_those_of_the_time_lived_and_the_first_step_is_a_step() -> No
 
 
 @pytest.mark.parametrize(("factor", "share"), [(1.0299, 1), (0.9701, 1), (1.0301, 0), (0.9699, 0)])
-def test_mean_pull_has_a_three_per_cent_band(factor: float, share: int) -> None:
+def test_mean_pull_has_a_three_per_cent_band(factor, share):
     assert of(made_up(720, v_p=factor * V)).mean_pull_within_3pct == share
 
 
-def test_mean_pull_counts_full_windows_up_to_a_failure() -> None:
+def test_mean_pull_counts_full_windows_up_to_a_failure():
     """v_0 for an hour, then 6.01 % more: a window of 360 steps leaves the band when 180 of them are faster."""
     pull, windows = V * np.where(np.arange(1440) < 720, 1.0, 1.0601), 1440 - 359
     assert of(made_up(1440, v_p=pull)).mean_pull_within_3pct == pytest.approx((720 + 179 - 359) / windows)
@@ -121,7 +119,7 @@ def test_mean_pull_counts_full_windows_up_to_a_failure() -> None:
     assert of(made_up(1440, lived=300)).mean_pull_within_3pct == 0
 
 
-def test_ground_off_a_taper() -> None:
+def test_ground_off_a_taper():
     """A straight taper from r_1 to r_2: mean r^2 is (r_1^2 + r_1 r_2 + r_2^2) / 3."""
     first, last = 0.0880, 0.0860
     steps = 20_001
@@ -130,7 +128,7 @@ def test_ground_off_a_taper() -> None:
     assert found.ground_off_pct == pytest.approx(expected, rel=1e-4)
 
 
-def test_return_is_the_sum_of_rewards_and_nothing_else_reads_them() -> None:
+def test_return_is_the_sum_of_rewards_and_nothing_else_reads_them():
     run = made_up(10, lived=4, r_c=R + 1e-4)
     run.reward[:] = np.arange(10.0)[:, None]
     rewarded = of(run)
@@ -138,7 +136,7 @@ def test_return_is_the_sum_of_rewards_and_nothing_else_reads_them() -> None:
     assert rewarded._replace(return_=0.0) == of(made_up(10, lived=4, r_c=R + 1e-4))
 
 
-def test_cost_is_that_of_the_reward_before_it_saturates() -> None:
+def test_cost_is_that_of_the_reward_before_it_saturates():
     """Each term where it is one weight, by the printed scales: 0.5 mm, 0.36 and 0.06 mm/min, 1 kW.
 
     After a failure the radius counts to the end; drives count while the crystal lived.
@@ -152,7 +150,7 @@ def test_cost_is_that_of_the_reward_before_it_saturates() -> None:
     assert found.cost == pytest.approx((7 * 16.0**2 + 4 * 0.5 * (0.12 / 0.36) ** 2 + 0.05 * 36.0) / 10)
 
 
-def test_cost_gives_the_reward_of_every_step() -> None:
+def test_cost_gives_the_reward_of_every_step():
     """One step an episode: what the environment paid is the saturated cost."""
     for seed in range(3):
         run = rollout(CompensatedPID(), make_config("randomized", horizon=DT, **PLAIN), [seed])
@@ -160,7 +158,7 @@ def test_cost_gives_the_reward_of_every_step() -> None:
         np.testing.assert_allclose(found.return_, 1.0 - 10.0 * found.cost / (10.0 + found.cost), rtol=1e-6)
 
 
-def test_metrics_of_a_batch_are_those_of_its_episodes() -> None:
+def test_metrics_of_a_batch_are_those_of_its_episodes():
     """A batch of three, one failing: the same values as one by one."""
     runs = [made_up(800, r_c=R + 1e-4), made_up(800, lived=500, v_p=1.01 * V), made_up(800, Q_H=Q + np.arange(800.0))]
     batch = Rollout(

@@ -1,5 +1,3 @@
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -7,24 +5,24 @@ from cz_gym import CzVectorEnv
 from cz_gym.baselines import CompensatedPID
 from cz_gym.config import make_config
 from cz_gym.evaluation.replay import Playback, replay
-from cz_gym.evaluation.rollout import Rollout, rollout
+from cz_gym.evaluation.rollout import rollout
 from tests.observed import PLAIN
 
 CONFIG = make_config("puller", horizon=600.0, **PLAIN)
 SEEDS = [3, 4, 5]
 
 
-def equal(one: Rollout, other: Rollout, first: int = 0, last: int | None = None) -> None:
+def equal(one, other, first=0, last=None):
     for a, b in zip(one.signals, other.signals, strict=True):
         np.testing.assert_array_equal(a[first:last], b[first:last])
     np.testing.assert_array_equal(one.reward[first:last], other.reward[first:last])
 
 
-def actions(steps: int = 120) -> np.ndarray:
+def actions(steps=120):
     return np.random.default_rng(0).uniform(-0.2, 0.2, (steps, len(SEEDS), 2)).astype(np.float32)
 
 
-def test_from_the_start_both_are_rollouts_on_the_same_melt() -> None:
+def test_from_the_start_both_are_rollouts_on_the_same_melt():
     found = replay(Playback(actions()), CompensatedPID(), CONFIG, np.array(SEEDS))  # an array, as rollout takes one
     equal(found.actual, rollout(Playback(actions()), CONFIG, SEEDS))
     equal(found.instead, rollout(CompensatedPID(), CONFIG, SEEDS))
@@ -32,7 +30,7 @@ def test_from_the_start_both_are_rollouts_on_the_same_melt() -> None:
 
 @pytest.mark.parametrize("at", [5.0, 300.0, 600.0])
 @pytest.mark.parametrize("watches", [False, True])
-def test_the_same_controller_instead_changes_nothing(at: float, watches: bool) -> None:
+def test_the_same_controller_instead_changes_nothing(at, watches):
     """A log played back has no memory but its place; a controller that watched itself goes on as it was."""
     found = replay(CompensatedPID(), CompensatedPID(), CONFIG, SEEDS, at, watches)
     equal(found.actual, rollout(CompensatedPID(), CONFIG, SEEDS))
@@ -41,7 +39,7 @@ def test_the_same_controller_instead_changes_nothing(at: float, watches: bool) -
         equal(found.actual, found.instead)
 
 
-def test_both_runs_are_equal_until_the_takeover_and_share_the_disturbances_after_it() -> None:
+def test_both_runs_are_equal_until_the_takeover_and_share_the_disturbances_after_it():
     found = replay(Playback(actions()), Playback(np.zeros((1, 2))), CONFIG, SEEDS, 300.0)
     equal(found.actual, found.instead, 0, 60)
     assert found.at == 300.0
@@ -56,7 +54,7 @@ def test_both_runs_are_equal_until_the_takeover_and_share_the_disturbances_after
     np.testing.assert_array_equal(found.instead.signals.r_c[-1], info["r_c"])
 
 
-def test_a_failed_episode_stays_failed() -> None:
+def test_a_failed_episode_stays_failed():
     found = replay(
         Playback([[1.0, 0.0]]), Playback([[0.0, 0.0]]), make_config("hard", horizon=1800.0, **PLAIN), SEEDS, 900.0
     )
@@ -66,7 +64,7 @@ def test_a_failed_episode_stays_failed() -> None:
 
 
 @pytest.mark.parametrize("arguments", [{"seeds": []}, {"at": -1.0}, {"at": 601.0}, {"at": float("nan")}])
-def test_bad_arguments_are_refused(arguments: dict[str, Any]) -> None:
+def test_bad_arguments_are_refused(arguments):
     with pytest.raises(ValueError, match=r"at least one whole number|must lie in the episode"):
         replay(Playback([[0, 0]]), Playback([[0, 0]]), **{"config": CONFIG, "seeds": SEEDS, **arguments})
     for log in ([], [1.0, 2.0], np.zeros((3, 3)), np.zeros((0, 2))):

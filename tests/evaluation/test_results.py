@@ -5,8 +5,6 @@ import itertools
 import json
 import re
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,14 +19,14 @@ from cz_gym.evaluation.files import to_csv
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.protocol import TEST_SEEDS, find_row
 from cz_gym.evaluation.report.markdown import markdown
-from cz_gym.evaluation.results import Result, Sample, summarise
+from cz_gym.evaluation.results import Sample, summarise
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.evaluation.statistics import Resamples, optimality_gap
 from tests.observed import PLAIN
 from tests.samples import contender
 
 
-def made(name: str, errors: list[float], costs: list[float] | None = None, **facts: Any) -> Sample:
+def made(name, errors, costs=None, **facts):
     """A sample with these RMSEs [mm] and costs."""
     values = np.zeros((1, len(errors), len(metric_names())))
     values[0, :, 0] = errors
@@ -36,11 +34,11 @@ def made(name: str, errors: list[float], costs: list[float] | None = None, **fac
     return Sample(contender(name, **facts), tuple(range(len(errors))), values, 1.0)
 
 
-def results_of(*samples: Sample) -> list[Result]:
+def results_of(*samples):
     return [summarise(find_row("randomized"), samples)]
 
 
-def test_the_gap_is_zero_at_the_bound_and_one_at_the_reference() -> None:
+def test_the_gap_is_zero_at_the_bound_and_one_at_the_reference():
     bound, reference = np.array([[0.0, 1.0]]), np.array([[4.0, 9.0]])
     resamples = Resamples.draw(2)
     assert optimality_gap(bound, reference, bound, resamples) == (0.0, (0.0, 0.0), 2)
@@ -52,7 +50,7 @@ def test_the_gap_is_zero_at_the_bound_and_one_at_the_reference() -> None:
     assert optimality_gap(bound, bound, bound, resamples) is None
 
 
-def test_different_numbers_of_episodes_meet_on_those_of_both() -> None:
+def test_different_numbers_of_episodes_meet_on_those_of_both():
     samples = [
         made("paper", [1.0, 2.0, 30.0], [8.0, 4.0, 99.0]),
         made("lqg", [0.5, 0.4, 9.0], [3.0, 1.0, 99.0]),
@@ -74,14 +72,14 @@ def test_different_numbers_of_episodes_meet_on_those_of_both() -> None:
 
 
 @pytest.fixture(scope="module")
-def paper() -> Sample:
+def paper():
     """The paper's controller on two crystals."""
     run = rollout(CompensatedPID(), find_row("randomized").config(), TEST_SEEDS[:2])
     return Sample.of(contender("paper"), [run])
 
 
 @pytest.fixture
-def earlier(tmp_path: Path, paper: Sample) -> Path:
+def earlier(tmp_path, paper):
     """A folder with the results of an earlier run with a bound, on two crystals."""
     samples = (paper, made("clairvoyant", [0.1, 0.2], [0.3, 0.5], privileged=True, slow=True))
     results = results_of(*(replace(sample, seeds=TEST_SEEDS[:2]) for sample in samples))
@@ -90,9 +88,7 @@ def earlier(tmp_path: Path, paper: Sample) -> Path:
     return folder
 
 
-def test_gaps_are_measured_from_an_earlier_bound(
-    earlier: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gaps_are_measured_from_an_earlier_bound(earlier, tmp_path, monkeypatch):
     monkeypatch.setattr(benchmark, "BOUNDS", earlier)
     arguments = ["--episodes", "3", "--scenarios", "randomized,hard", "--controllers", "open-loop,paper"]
     assert benchmark.main([*arguments, "--out", str(tmp_path / "new"), "--quiet"]) == 0
@@ -116,7 +112,7 @@ def test_gaps_are_measured_from_an_earlier_bound(
     )
 
 
-def test_a_bound_is_used_only_beside_the_same_figures_of_the_same_controller(earlier: Path, paper: Sample) -> None:
+def test_a_bound_is_used_only_beside_the_same_figures_of_the_same_controller(earlier, paper):
     """A plant, a scenario or code that moves the paper's figures moves the bound's too."""
     row = find_row("randomized")
     found = earlier_bound(earlier, row, [paper])
@@ -132,7 +128,7 @@ def test_a_bound_is_used_only_beside_the_same_figures_of_the_same_controller(ear
     assert earlier_bound(earlier, row, [moved]) is None
 
 
-def test_an_earlier_bound_needs_its_episodes_from_the_first_on(earlier: Path, paper: Sample) -> None:
+def test_an_earlier_bound_needs_its_episodes_from_the_first_on(earlier, paper):
     row, table = find_row("randomized"), earlier / "episodes.csv"
     whole = table.read_text()
     for broken in (whole.replace(",2000000,", ",2000001,"), whole.replace("cost", "price"), "", whole[:-9] + "nan\n"):
@@ -142,13 +138,13 @@ def test_an_earlier_bound_needs_its_episodes_from_the_first_on(earlier: Path, pa
     assert earlier_bound(earlier, row, [paper]) is None
 
 
-def test_the_committed_bounds_can_be_used(paper: Sample) -> None:
+def test_the_committed_bounds_can_be_used(paper):
     found = earlier_bound(benchmark.BOUNDS, find_row("randomized"), [paper])
     assert found is not None
     assert len(found.seeds) == 50
 
 
-def test_the_table_of_training_seeds_names_those_that_lost_crystals() -> None:
+def test_the_table_of_training_seeds_names_those_that_lost_crystals():
     sample = made("ppo", [0.1, 0.2, 0.3], training_seeds=(4, 7, 9))
     values = np.repeat(sample.values, 3, axis=0)
     values[1, :, metric_names().index("failure_rate")] = [0.0, 1.0, 1.0]
@@ -160,7 +156,7 @@ def test_the_table_of_training_seeds_names_those_that_lost_crystals() -> None:
     assert "| 7 | none | 3 |" in report
 
 
-def test_a_name_with_a_bar_breaks_no_table() -> None:
+def test_a_name_with_a_bar_breaks_no_table():
     """Agents may be called anything."""
     sample = made("a|b", [0.1, 0.2], training_seeds=(1, 2))
     two = replace(sample, values=np.repeat(sample.values, 2, axis=0))

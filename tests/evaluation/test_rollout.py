@@ -1,12 +1,9 @@
 """Rollouts against the scalar environment, step by step."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,11 +14,11 @@ from cz_gym.agents import load
 from cz_gym.baselines import CompensatedPID, OpenLoop
 from cz_gym.baselines.registry import make_controller
 from cz_gym.camera import Camera
-from cz_gym.config import Config, make_config
+from cz_gym.config import make_config
 from cz_gym.errors import CzError
 from cz_gym.evaluation import plot
 from cz_gym.evaluation.replay import Playback
-from cz_gym.evaluation.rollout import EpisodeBatch, Rollout, Signals, check_seeds, rollout
+from cz_gym.evaluation.rollout import EpisodeBatch, Signals, check_seeds, rollout
 from cz_gym.observation import MEASURED
 from cz_gym.physics.parameters import Parameters
 from tests.observed import PLAIN
@@ -33,23 +30,21 @@ CHANNELS = [channel.name for channel in MEASURED]
 class FullPull:
     """Pulls as fast as it can, which detaches every crystal; notes what it is told."""
 
-    def __init__(self) -> None:
-        self.told: list[tuple[np.ndarray, np.ndarray]] = []
+    def __init__(self):
+        self.told = []
 
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[np.ndarray, Any]:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
         self.told.append((np.array(observation), np.array(episode_start)))
         assert deterministic
         assert (state is None) == (len(self.told) == 1)
         return np.tile(np.float32([1.0, 0.2]), (len(observation), 1)), 0
 
 
-def one_by_one(policy: Any, config: Config, seed: int) -> tuple[dict[str, np.ndarray], float, bool]:
+def one_by_one(policy, config, seed):
     """Signals up to the end, return and failure of an episode in the scalar environment."""
     env = CzEnv.from_config(config, info="all")
     observation, _ = env.reset(seed=seed)
-    rows: list[dict[str, Any]] = []
+    rows = []
     state, total, over, terminated = None, 0.0, False, False
     while not over:
         action, state = policy.predict(observation[None], state, np.array([not rows]), True)
@@ -60,7 +55,7 @@ def one_by_one(policy: Any, config: Config, seed: int) -> tuple[dict[str, np.nda
     return {name: np.array([row[name] for row in rows]) for name in Signals._fields}, total, terminated
 
 
-def test_a_rollout_looks_through_the_camera_of_its_settings() -> None:
+def test_a_rollout_looks_through_the_camera_of_its_settings():
     """It was dropped, while the settings' hash said that it was there."""
     near = Camera(tilt=0.4)
     config = make_config("nominal", observation="camera", horizon=10.0, camera=near, action="direct")
@@ -70,7 +65,7 @@ def test_a_rollout_looks_through_the_camera_of_its_settings() -> None:
     assert batch.env.config is config
 
 
-def check_against_scalar(policy: Any, config: Config, seeds: Sequence[int]) -> Rollout:
+def check_against_scalar(policy, config, seeds):
     run = rollout(policy, config, seeds)
     for i, seed in enumerate(seeds):
         signals, total, failed = one_by_one(policy, run.config, seed)
@@ -85,17 +80,17 @@ def check_against_scalar(policy: Any, config: Config, seeds: Sequence[int]) -> R
     return run
 
 
-def test_every_signal_is_the_scalar_environments() -> None:
+def test_every_signal_is_the_scalar_environments():
     check_against_scalar(CompensatedPID(), make_config("sensor-fault", horizon=600.0, **PLAIN), [3, 2_000_000, 17])
 
 
-def test_failed_episodes_end_where_the_scalar_ones_do() -> None:
+def test_failed_episodes_end_where_the_scalar_ones_do():
     run = check_against_scalar(Playback([[1.0, 0.2]]), SHORT, range(5))
     assert run.failed.all()
     assert len(set(run.alive.sum(axis=0).tolist())) > 1
 
 
-def test_policy_begins_again_where_the_crystal_does() -> None:
+def test_policy_begins_again_where_the_crystal_does():
     """``episode_start`` comes with an episode's first observation: drives at nominal, whatever the policy asks."""
     policy = FullPull()
     run = rollout(policy, SHORT, range(4))
@@ -107,8 +102,8 @@ def test_policy_begins_again_where_the_crystal_does() -> None:
     assert sum(starts.sum() for _, starts in policy.told[1:]) >= 4
 
 
-def test_start_is_the_state_before_the_first_step_and_progress_counts_every_step_once() -> None:
-    counted: list[int] = []
+def test_start_is_the_state_before_the_first_step_and_progress_counts_every_step_once():
+    counted = []
     run = rollout(OpenLoop(), SHORT, [7, 8, 9], counted.append)
     assert sum(counted) == run.alive.size == 3 * SHORT.steps
     _, info = CzEnv.from_config(SHORT, info="all").reset(seed=7)
@@ -139,7 +134,7 @@ WITHOUT_TUPLE = SimpleNamespace(predict=lambda observation, **rest: np.zeros((le
         ("paper", SHORT, r"as make_controller\('paper', config\) makes one"),
     ],
 )
-def test_a_policy_that_does_not_fit_is_refused(policy: Any, config: Any, message: str) -> None:
+def test_a_policy_that_does_not_fit_is_refused(policy, config, message):
     with pytest.raises(ValueError, match=message):
         rollout(policy, config, [1])
 
@@ -148,18 +143,18 @@ WITH_SEED = partial(rollout, OpenLoop(), seeds=[1])
 
 
 @pytest.mark.parametrize("make", [CzEnv.from_config, partial(make_controller, "lqg"), partial(load, "ppo"), WITH_SEED])
-def test_a_scenario_name_in_place_of_a_config_is_refused(make: Any) -> None:
+def test_a_scenario_name_in_place_of_a_config_is_refused(make):
     with pytest.raises(ValueError, match=r"needs a Config, not 'hard': cz_gym.config.make_config\('hard'\) makes one"):
         make("hard")
 
 
-def test_after_import_cz_gym_everything_is_there() -> None:
+def test_after_import_cz_gym_everything_is_there():
     assert cz_gym.__getattr__("agents") is import_module("cz_gym.agents")
     with pytest.raises(AttributeError, match="no attribute 'agent'"):
         _ = cz_gym.agent
 
 
-def test_an_agent_of_another_plant_is_refused_unless_that_is_said() -> None:
+def test_an_agent_of_another_plant_is_refused_unless_that_is_said():
     agent = load("gradient")
     config = make_config("randomized", parameters=Parameters(k_l=66.0), **{**agent.settings, "horizon": 60.0})
     with pytest.raises(CzError, match=f"made for .*; the environment has .*plant {config.plant_hash}: gym.make"):
@@ -170,23 +165,23 @@ def test_an_agent_of_another_plant_is_refused_unless_that_is_said() -> None:
 
 
 @pytest.mark.parametrize("seeds", [[3, 4], (3, 4), range(3, 5), np.array([3, 4]), np.array([3, 4], np.uint8)])
-def test_seeds_may_be_any_sequence_of_whole_numbers(seeds: Any) -> None:
+def test_seeds_may_be_any_sequence_of_whole_numbers(seeds):
     assert check_seeds(seeds) == (3, 4)
     assert rollout(OpenLoop(), replace(SHORT, horizon=10.0), seeds).seeds == (3, 4)
 
 
 @pytest.mark.parametrize("seeds", [[], 3, 5.0, "12", [1.0], [[1]], [-1], {1}, np.array([True])])
-def test_other_seeds_are_refused(seeds: Any) -> None:
+def test_other_seeds_are_refused(seeds):
     with pytest.raises(CzError, match="seeds must be a sequence of at least one whole number from 0 on"):
         rollout(OpenLoop(), SHORT, seeds)
 
 
-def test_a_rollout_can_be_looked_at(tmp_path: Path) -> None:
+def test_a_rollout_can_be_looked_at(tmp_path):
     run = rollout(OpenLoop(), SHORT, [1, 2])
     figure = plot(run, 1, tmp_path / "crystal.png")
     assert (tmp_path / "crystal.png").read_bytes().startswith(b"\x89PNG")
     assert figure.axes[0].get_ylabel() == "crystal radius\n[mm]"
     with pytest.raises(ValueError, match=r"needs a Rollout, not 'paper': .*rollout\(policy, config, seeds\) makes one"):
-        plot("paper")  # type: ignore[arg-type]
+        plot("paper")
     with pytest.raises(IndexError, match="below 2"):
         plot(run, 2)

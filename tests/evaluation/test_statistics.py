@@ -6,12 +6,12 @@ import pytest
 from cz_gym.evaluation.statistics import Resamples, cvar, differences, means, probability_of_improvement
 
 
-def single(values: np.ndarray) -> np.ndarray:
+def single(values):
     """Episodes of a controller without training seeds, one metric."""
     return np.asarray(values, float)[None, :, None]
 
 
-def test_interval_of_a_mean_is_the_normal_one(rng: np.random.Generator) -> None:
+def test_interval_of_a_mean_is_the_normal_one(rng):
     values = rng.normal(2.0, 0.5, 500)
     (estimate,) = means(single(values), Resamples.draw(500))
     half = 1.96 * values.std() / np.sqrt(500)
@@ -20,7 +20,7 @@ def test_interval_of_a_mean_is_the_normal_one(rng: np.random.Generator) -> None:
     assert estimate.ci95 == pytest.approx((values.mean() - half, values.mean() + half), abs=0.06 * half)
 
 
-def test_intervals_cover_the_truth_as_often_as_they_say(rng: np.random.Generator) -> None:
+def test_intervals_cover_the_truth_as_often_as_they_say(rng):
     resamples = Resamples.draw(100, count=1000)
     draws = rng.exponential(1.0, (1, 100, 400))
     covered = [estimate.ci95[0] <= 1.0 <= estimate.ci95[1] for estimate in means(draws, resamples) if estimate.ci95]
@@ -28,7 +28,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say(rng: np.random.Generator
     assert np.mean(covered) == pytest.approx(0.94, abs=0.035)
 
 
-def test_every_metric_and_controller_shares_its_resamples(rng: np.random.Generator) -> None:
+def test_every_metric_and_controller_shares_its_resamples(rng):
     values = rng.normal(0.0, 1.0, 60)
     resamples = Resamples.draw(60)
     both = np.stack([values, 3.0 - 2.0 * values], axis=-1)[None]
@@ -40,14 +40,14 @@ def test_every_metric_and_controller_shares_its_resamples(rng: np.random.Generat
     assert shift.ci95 == pytest.approx((-0.1, -0.1))
 
 
-def test_paired_difference_is_as_sharp_as_the_differences(rng: np.random.Generator) -> None:
+def test_paired_difference_is_as_sharp_as_the_differences(rng):
     crystal, own = rng.normal(0.0, 5.0, 400), rng.normal(-0.2, 0.3, 400)
     (estimate,) = differences(single(crystal + own), single(crystal), Resamples.draw(400))
     half = 1.96 * own.std() / np.sqrt(400)
     assert estimate.ci95 == pytest.approx((own.mean() - half, own.mean() + half), abs=0.08 * half)
 
 
-def test_one_deterministic_episode_has_no_interval() -> None:
+def test_one_deterministic_episode_has_no_interval():
     resamples = Resamples.draw(1)
     assert means(single([0.7]), resamples)[0] == (0.7, None, 1)
     assert differences(single([0.7]), single([0.9]), resamples)[0] == (pytest.approx(-0.2), None, 1)
@@ -55,7 +55,7 @@ def test_one_deterministic_episode_has_no_interval() -> None:
     assert cvar(np.array([[0.7]]), resamples) == (pytest.approx(0.7), None, 1)
 
 
-def test_training_seeds_carry_their_own_uncertainty(rng: np.random.Generator) -> None:
+def test_training_seeds_carry_their_own_uncertainty(rng):
     """Two seeds at 0 and 1 on identical episodes: a resample's mean is 0, 1/2 or 1 with chances 1/4, 1/2, 1/4.
 
     Both sides of a difference are resampled on their own. Seeds that agree add nothing.
@@ -69,7 +69,7 @@ def test_training_seeds_carry_their_own_uncertainty(rng: np.random.Generator) ->
         assert five.ci95 == pytest.approx(one.ci95)
 
 
-def test_spread_over_seeds_and_episodes_adds_up(rng: np.random.Generator) -> None:
+def test_spread_over_seeds_and_episodes_adds_up(rng):
     """Seed effect plus episode effect: variances of the two resamplings add."""
     seeds, episodes = rng.normal(0.0, 1.0, 40), rng.normal(0.0, 3.0, 300)
     values = (seeds[:, None] + episodes[None])[:, :, None]
@@ -79,7 +79,7 @@ def test_spread_over_seeds_and_episodes_adds_up(rng: np.random.Generator) -> Non
     assert np.diff(estimate.ci95)[0] == pytest.approx(2 * half, rel=0.06)
 
 
-def test_probability_of_improvement_counts_wins_and_half_the_ties() -> None:
+def test_probability_of_improvement_counts_wins_and_half_the_ties():
     ours, theirs = np.array([[0.1, 0.2, 0.3, 0.4]]), np.array([[0.2, 0.2, 0.2, 0.5]])
     estimate = probability_of_improvement(ours, theirs, Resamples.draw(4))
     assert estimate.mean == (1 + 0.5 + 0 + 1) / 4
@@ -88,7 +88,7 @@ def test_probability_of_improvement_counts_wins_and_half_the_ties() -> None:
     assert probability_of_improvement(two_seeds, theirs, Resamples.draw(4)).mean == (estimate.mean + 0.5) / 2
 
 
-def test_cvar_is_the_mean_of_the_worst_twentieth(rng: np.random.Generator) -> None:
+def test_cvar_is_the_mean_of_the_worst_twentieth(rng):
     """If the share is no whole number of episodes, the last one counts in part; training seeds are pooled."""
     values = rng.permutation(np.arange(1.0, 101.0))[None]
     assert cvar(values, Resamples.draw(100)).mean == pytest.approx((96 + 97 + 98 + 99 + 100) / 5)

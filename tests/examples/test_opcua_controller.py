@@ -2,8 +2,6 @@
 
 import os
 import shutil
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -28,9 +26,7 @@ needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="cc is no
         pytest.param("paper", "randomized", (), 2160, marks=pytest.mark.slow),
     ],
 )
-def test_the_loop_over_opc_ua_is_the_loop_in_python(
-    name: str, scenario: str, options: tuple[str, ...], steps: int, tmp_path: Path
-) -> None:
+def test_the_loop_over_opc_ua_is_the_loop_in_python(name, scenario, options, steps, tmp_path):
     """To the float32 of observations and of the twin's actions."""
     with running(tmp_path, "--speed", "0", "--scenario", scenario) as puller:
         chosen = ["--controller", name, "--scenario", scenario, "--steps", str(steps), *options]
@@ -45,7 +41,7 @@ def test_the_loop_over_opc_ua_is_the_loop_in_python(
     np.testing.assert_allclose(found, twin[: len(found)], rtol=0, atol=5e-6)
 
 
-def test_it_logs_in_over_an_encrypted_channel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_logs_in_over_an_encrypted_channel(tmp_path, monkeypatch):
     monkeypatch.setenv("CZ_GYM_OPERATOR_PASSWORD", PASSWORD)
     with running(tmp_path, "--operator", "olga", "--speed", "0", remote=True) as puller:
         login = ["--operator", "olga", "--encrypt", str(tmp_path / "certificates" / "certificate.pem")]
@@ -55,6 +51,6 @@ def test_it_logs_in_over_an_encrypted_channel(tmp_path: Path, monkeypatch: pytes
     assert sorted(os.listdir(tmp_path / "client")) == ["certificate.der", "certificate.pem", "key.pem"]
 
 
-def test_a_server_that_is_not_there_and_a_controller_that_is_not_are_said_in_one_line(refused: Any) -> None:
+def test_a_server_that_is_not_there_and_a_controller_that_is_not_are_said_in_one_line(refused):
     assert "127.0.0.1" in refused(opcua_controller.main, ["--url", "opc.tcp://127.0.0.1:9/"])
     assert "did you mean 'paper'" in refused(opcua_controller.main, ["--controller", "papr"])

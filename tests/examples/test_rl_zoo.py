@@ -2,7 +2,6 @@
 
 import inspect
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -13,7 +12,7 @@ from stable_baselines3.common.env_util import make_vec_env
 import cz_gym  # noqa: F401  (registers Cz-v0)
 
 FOLDER = Path(__file__).parents[2] / "examples" / "rl_zoo"
-ALGORITHMS: dict[str, Any] = {"ppo": PPO, "ppo_lstm": RecurrentPPO, "sac": SAC, "tqc": TQC}
+ALGORITHMS = {"ppo": PPO, "ppo_lstm": RecurrentPPO, "sac": SAC, "tqc": TQC}
 TAKEN_BY_RL_ZOO = ("env_kwargs", "normalize", "n_envs", "n_timesteps")
 SMALL = {
     "ppo": {"n_steps": 8, "batch_size": 16, "n_epochs": 1},
@@ -23,11 +22,11 @@ SMALL = {
 }
 
 
-def read(name: str) -> dict[str, Any]:
+def read(name):
     """Hyperparameters as RL-Zoo reads them: schedules "lin_x", and dictionaries written as Python."""
     found = yaml.safe_load((FOLDER / f"{name}.yml").read_text())
     assert list(found) == ["Cz-v0"]
-    chosen: dict[str, Any] = found["Cz-v0"]
+    chosen = found["Cz-v0"]
     for key, value in chosen.items():
         if isinstance(value, str) and value.startswith("lin_"):
             chosen[key] = float(value.removeprefix("lin_"))
@@ -37,7 +36,7 @@ def read(name: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_rl_zoos_files_are_what_their_algorithms_take(name: str) -> None:
+def test_rl_zoos_files_are_what_their_algorithms_take(name):
     chosen = read(name)
     rest = {key: value for key, value in chosen.items() if key not in TAKEN_BY_RL_ZOO}
     assert set(rest) <= set(inspect.signature(ALGORITHMS[name]).parameters)
@@ -46,7 +45,7 @@ def test_rl_zoos_files_are_what_their_algorithms_take(name: str) -> None:
     ALGORITHMS[name](env=env, device="cpu", **{**rest, **SMALL[name]}).learn(24)
 
 
-def test_every_file_says_its_command() -> None:
+def test_every_file_says_its_command():
     assert {path.stem for path in FOLDER.glob("*.yml")} == set(ALGORITHMS)
     for path in FOLDER.glob("*.yml"):
         command = f"python -m rl_zoo3.train --algo {path.stem} --env Cz-v0 --gym-packages cz_gym"

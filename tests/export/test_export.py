@@ -4,8 +4,6 @@ import re
 import shutil
 import subprocess
 from functools import cache
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,12 +12,12 @@ from hypothesis import strategies as st
 
 from cz_gym import agents
 from cz_gym.baselines.registry import make_controller
-from cz_gym.config import Config, make_config
+from cz_gym.config import make_config
 from cz_gym.export.__main__ import main, make_block
 from cz_gym.export.compiled import CompiledBlock
 from cz_gym.export.onnx_graph import write_onnx
 from cz_gym.export.policy import BlockPolicy
-from cz_gym.export.shell import INPUTS, Alarm, Block, in_shares
+from cz_gym.export.shell import INPUTS, Alarm, in_shares
 from cz_gym.export.text import write_c, write_st
 from cz_gym.observation import decode, readable
 from cz_gym.task import HEATER_RANGE, drives_of
@@ -32,36 +30,36 @@ needs_compiler = pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is 
 PULL, HEATER, ALARMS = "pull_speed_setpoint_mm_per_min", "heater_power_setpoint_kW", "alarms"
 
 
-def config_of(scenario: str, **changed: Any) -> Config:
+def config_of(scenario, **changed):
     return make_config(scenario, observation="measured", action="direct", horizon=1800.0, **changed)
 
 
 @cache
-def block_of(name: str, scenario: str = "puller") -> Block:
+def block_of(name, scenario="puller"):
     return make_block(name, config_of(scenario))
 
 
 class OnnxBlock:
     """A block's ONNX graph in onnxruntime, for one plant."""
 
-    def __init__(self, block: Block) -> None:
+    def __init__(self, block):
         runtime = pytest.importorskip("onnxruntime")
         options = runtime.SessionOptions()
         options.log_severity_level = 3
         (content,) = write_onnx(block.program).values()
         self.session = runtime.InferenceSession(content, options)
 
-    def start(self, n: int) -> dict[str, Any]:
+    def start(self, n):
         return {}
 
-    def run(self, inputs: Any, memory: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    def run(self, inputs, memory):
         given = {name: np.ravel(value).astype(np.float64) for name, value in inputs.items()}
         names = [output.name for output in self.session.get_outputs()]
         found = dict(zip(names, self.session.run(names, given | memory), strict=True))
         return found, {"memory": found.pop("next_memory")}
 
 
-def nominal(changed: dict[str, float] | None = None) -> dict[str, float]:
+def nominal(changed=None):
     """Inputs at the operating point."""
     known = {name: port.default for name, port in block_of("paper").ports.items()}
     ring = known["nominal_radius_mm"] + known["ring_bias_mm"]
@@ -75,18 +73,18 @@ def nominal(changed: dict[str, float] | None = None) -> dict[str, float]:
 class Plant:
     """A block, called at times of the test's own."""
 
-    def __init__(self, name: str = "paper-tuned", **changed: float) -> None:
+    def __init__(self, name="paper-tuned", **changed):
         self.block, self.changed = block_of(name), changed
         self.memory = self.block.start(1)
         self.time = 0.0
 
-    def __call__(self, time: float | None = None, **given: float) -> dict[str, float]:
+    def __call__(self, time=None, **given):
         self.time = self.time + 5.0 if time is None else time
-        clock: dict[str, float] = {"time_s": self.time, "ring_time_s": self.time}
+        clock = {"time_s": self.time, "ring_time_s": self.time}
         outputs, self.memory = self.block.run(nominal(clock | given) | self.changed, self.memory)
         return {name: float(value[0]) for name, value in outputs.items()}
 
-    def alarms(self, **given: Any) -> Alarm:
+    def alarms(self, **given):
         return Alarm(int(self(**given)["alarms"]))
 
 
@@ -94,9 +92,9 @@ class Plant:
     ("name", "scenario"),
     [("paper", "puller"), ("industrial", "puller"), ("lqg", "puller"), ("lqg-at-0.02", "sensor-fault")],
 )
-def test_a_block_computes_what_the_controller_computes(name: str, scenario: str) -> None:
+def test_a_block_computes_what_the_controller_computes(name, scenario):
     config, n = config_of(scenario), 3
-    controller: Any = make_controller(name, config)
+    controller = make_controller(name, config)
     block = block_of(name, scenario)
     policy, memory, state, last = BlockPolicy(block), block.start(n), None, None
     env = CzVectorEnv.from_config(config, n)
@@ -115,13 +113,13 @@ def test_a_block_computes_what_the_controller_computes(name: str, scenario: str)
 
 
 @pytest.mark.parametrize("name", agents.shipped_names())
-def test_an_exported_agent_acts_as_onnxruntime_does(name: str) -> None:
+def test_an_exported_agent_acts_as_onnxruntime_does(name):
     """onnxruntime works in single precision, on observations that were rounded to it."""
     policy, n = agents.load(name), 3
     block = block_of(name, "sensor-fault")
     twin, acts = BlockPolicy(block), {"action": policy.action, "horizon": 1800.0}
     own, env = (
-        CzVectorEnv.from_config(make_config("sensor-fault", observation=observation, **acts), n)  # type: ignore[arg-type]
+        CzVectorEnv.from_config(make_config("sensor-fault", observation=observation, **acts), n)
         for observation in (policy.observation, "measured")
     )
     seen, measured = own.reset(seed=[1, 2, 3])[0], env.reset(seed=[1, 2, 3])[0]
@@ -145,17 +143,17 @@ def test_an_exported_agent_acts_as_onnxruntime_does(name: str) -> None:
         *(pytest.param("lqg", scenario, marks=pytest.mark.slow) for scenario in ("sensor-fault", "randomized")),
     ],
 )
-def test_c_and_onnx_act_as_python_does(name: str, scenario: str) -> None:
+def test_c_and_onnx_act_as_python_does(name, scenario):
     """On one crystal, which Python grows; within 1e-9, in single precision within 1e-5."""
     block = block_of(name, scenario)
-    others: list[Any] = [None, CompiledBlock(block), OnnxBlock(block), CompiledBlock(block, single=True)]
+    others = [None, CompiledBlock(block), OnnxBlock(block), CompiledBlock(block, single=True)]
     policies, states = [BlockPolicy(block, other) for other in others], [None] * 4
     env = CzVectorEnv.from_config(block.config, 1)
     observation, _ = env.reset(seed=[1])
     for _ in range(100):
         done = [policy.predict(observation, state) for policy, state in zip(policies, states, strict=True)]
         states = [state for _, state in done]
-        own, *rest = (state.outputs for state in states)  # type: ignore[attr-defined]
+        own, *rest = (state.outputs for state in states)
         for found, tolerance in zip(rest, (1e-9, 1e-9, 1e-5), strict=True):
             assert in_shares(found, block.config) == pytest.approx(in_shares(own, block.config), abs=tolerance)
         assert rest[0][ALARMS] == rest[1][ALARMS] == own[ALARMS]
@@ -164,7 +162,7 @@ def test_c_and_onnx_act_as_python_does(name: str, scenario: str) -> None:
 
 @needs_compiler
 @pytest.mark.slow
-def test_the_study_of_exported_c_finds_what_the_page_says() -> None:
+def test_the_study_of_exported_c_finds_what_the_page_says():
     """A loop in single precision may end elsewhere."""
     rows = study("paper-tuned", "puller", 1)
     assert [row.real for row in rows] == ["double", "float"]
@@ -197,7 +195,7 @@ SANITIZED = "-std=c99 -pedantic -Wall -Wextra -Werror -g -fsanitize=address,unde
 
 @needs_compiler
 @pytest.mark.parametrize("name", [*CONTROLLERS[:3], pytest.param("lqg", marks=pytest.mark.slow), *CONTROLLERS[4:]])
-def test_the_c_is_clean_under_sanitizers_whatever_it_reads(name: str, tmp_path: Path) -> None:
+def test_the_c_is_clean_under_sanitizers_whatever_it_reads(name, tmp_path):
     block = block_of(name)
     assign = " ".join(
         f"m.{port.name} = {f'x[{at}] > 0.5' if port.logical else f'x[{at}]'};" for at, port in enumerate(INPUTS)
@@ -232,7 +230,7 @@ ODD = st.one_of(st.floats(), st.sampled_from([np.nan, np.inf, -np.inf]))
         st.dictionaries(st.sampled_from([port.name for port in INPUTS]), ODD, max_size=4), min_size=3, max_size=12
     ),
 )
-def test_no_reading_brings_a_setpoint_outside_its_limits(name: str, samples: list[dict[str, float]]) -> None:
+def test_no_reading_brings_a_setpoint_outside_its_limits(name, samples):
     plant = Plant(name, pull_speed_min_mm_per_min=0.9, pull_speed_max_mm_per_min=1.4)
     known = {name: port.default for name, port in plant.block.ports.items()}
     for sample in samples:
@@ -243,7 +241,7 @@ def test_no_reading_brings_a_setpoint_outside_its_limits(name: str, samples: lis
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
-def test_a_takeover_moves_no_drive_and_authority_grows(name: str) -> None:
+def test_a_takeover_moves_no_drive_and_authority_grows(name):
     plant = Plant(name)
     off = {"pull_speed_mm_per_min": 1.31, "heater_power_kW": 58.7, "ring_radius_mm": 102.0}
     for automatic in (0.0, 0.0, 1.0):
@@ -255,7 +253,7 @@ def test_a_takeover_moves_no_drive_and_authority_grows(name: str) -> None:
     assert Alarm.TAKEOVER not in alarms[-1]
 
 
-def test_a_bad_ring_is_held_then_the_pid_takes_over_until_the_next_takeover() -> None:
+def test_a_bad_ring_is_held_then_the_pid_takes_over_until_the_next_takeover():
     plant = Plant("lqg")
     for _ in range(20):
         assert plant.alarms() & ~Alarm.TAKEOVER == 0
@@ -278,7 +276,7 @@ def test_a_bad_ring_is_held_then_the_pid_takes_over_until_the_next_takeover() ->
         ({"r_ref_5min_mm": 0.0}, Alarm.REFERENCE),
     ],
 )
-def test_each_reading_has_its_alarm_and_is_held(given: dict[str, float], alarm: Alarm) -> None:
+def test_each_reading_has_its_alarm_and_is_held(given, alarm):
     plant, twin = Plant(), Plant()
     for _ in range(20):
         plant(), twin()
@@ -286,7 +284,7 @@ def test_each_reading_has_its_alarm_and_is_held(given: dict[str, float], alarm: 
     assert plant.alarms() == twin.alarms() == 0
 
 
-def test_the_clock_is_watched_and_no_sample_is_taken_twice() -> None:
+def test_the_clock_is_watched_and_no_sample_is_taken_twice():
     plant = Plant()
     for _ in range(20):
         before = plant()
@@ -300,7 +298,7 @@ def test_the_clock_is_watched_and_no_sample_is_taken_twice() -> None:
     assert old == Alarm.RING
 
 
-def test_ranges_and_slew_rates_hold() -> None:
+def test_ranges_and_slew_rates_hold():
     plant = Plant("paper", pull_slew_mm_per_min2=0.3, heater_slew_kW_per_min=1.0, pull_speed_max_mm_per_min=1.5)
     rng, before = np.random.default_rng(0), None
     for _ in range(100):
@@ -314,7 +312,7 @@ def test_ranges_and_slew_rates_hold() -> None:
 
 
 @pytest.mark.parametrize(("name", "to", "files"), [("lqg-at-0.02", "c", 3), ("ppo", "st", 2), ("lqg", "onnx", 2)])
-def test_the_command_writes_a_folder(name: str, to: str, files: int, tmp_path: Path) -> None:
+def test_the_command_writes_a_folder(name, to, files, tmp_path):
     assert main([name, "--to", to, "--out", str(tmp_path)]) == 0
     assert len(list(tmp_path.iterdir())) == files
     assert (tmp_path / f"cz_{re.sub('[^a-z0-9]', '_', name)}.{to}").is_file()
@@ -333,12 +331,12 @@ def test_the_command_writes_a_folder(name: str, to: str, files: int, tmp_path: P
         (["lqg-true"], "unknown"),
     ],
 )
-def test_what_cannot_be_exported_is_refused_in_one_line(given: Any, said: str, tmp_path: Path, refused: Any) -> None:
+def test_what_cannot_be_exported_is_refused_in_one_line(given, said, tmp_path, refused):
     assert said in refused(main, [*given, "--to", "c", "--out", str(tmp_path / "out")])
     assert not (tmp_path / "out").exists()
 
 
-def test_a_puller_file_gives_nominal_values_limits_and_its_name(tmp_path: Path) -> None:
+def test_a_puller_file_gives_nominal_values_limits_and_its_name(tmp_path):
     assert main(["paper-tuned", "--to", "c", "--out", str(tmp_path), "--puller", "silicon-300mm"]) == 0
     source, header = ((tmp_path / f"cz_paper_tuned.{end}").read_text() for end in "ch")
     config = config_of("puller", puller="silicon-300mm")
@@ -348,7 +346,7 @@ def test_a_puller_file_gives_nominal_values_limits_and_its_name(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
-def test_the_structured_text_acts_as_python_does(name: str) -> None:
+def test_the_structured_text_acts_as_python_does(name):
     """Statement by statement, on noisy readings of which some are bad."""
     exported, rng = block_of(name), np.random.default_rng(5)
     (text,) = write_st(exported.program).values()
@@ -371,7 +369,7 @@ def test_the_structured_text_acts_as_python_does(name: str) -> None:
 @pytest.mark.parametrize(
     "name", ["paper", *(pytest.param(name, marks=pytest.mark.slow) for name in ("paper-tuned", "lqg"))]
 )
-def test_the_structured_text_is_of_the_standard(name: str) -> None:
+def test_the_structured_text_is_of_the_standard(name):
     """Long tables of constants are cut for the parser, which needs minutes for them."""
     parse = pytest.importorskip("blark.parse", reason="blark, the parser of structured text, is not installed")
     (text,) = write_st(block_of(name).program).values()

@@ -1,8 +1,5 @@
 """The puller as a co-simulation unit, run by FMPy: the same crystal as in the environment, bit for bit."""
 
-from pathlib import Path
-from typing import Any
-
 import fmpy
 import pytest
 
@@ -14,7 +11,7 @@ from cz_gym.observation import decode
 
 
 @pytest.mark.parametrize("own", [(), ("--puller", "silicon-300mm")])
-def test_fmpy_grows_the_crystal_of_the_environment(own: tuple[str, ...], tmp_path: Path) -> None:
+def test_fmpy_grows_the_crystal_of_the_environment(own, tmp_path):
     assert main(["--plant", "--to", "fmu", "--out", str(tmp_path), *own]) == 0
     env = CzEnv("hard", observation="measured", action="direct", puller=own[1] if own else None)
     config, puller, dt = env.config, nominal_puller(env.config), env.config.control_interval
@@ -23,11 +20,11 @@ def test_fmpy_grows_the_crystal_of_the_environment(own: tuple[str, ...], tmp_pat
     at = {variable.name: variable.valueReference for variable in model.modelVariables}
     unit = fmpy.instantiate_fmu(fmpy.extract(file, str(tmp_path / "unit")), model)
 
-    def shown() -> dict[str, Any]:
+    def shown():
         get = {True: unit.getBoolean, False: unit.getReal}
         return {port.name: get[port.logical]([at[port.name]])[0] for port in SHOWN}
 
-    def expected(observation: Any) -> dict[str, Any]:
+    def expected(observation):
         return in_plant_units(decode(observation.astype(float), *config.ranges), puller)
 
     unit.setupExperiment(startTime=0.0)

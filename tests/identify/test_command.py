@@ -1,19 +1,14 @@
 """The command: a puller file, a report and pictures; or one line and nothing. The study, on three pullers."""
 
-from pathlib import Path
-
 import pytest
 
-from cz_gym.identify import Identified
 from cz_gym.identify import __main__ as command
 from cz_gym.puller import read_puller
 from examples import identify as example
 from studies import identify as study
 
 
-def test_the_command_writes_the_puller_and_its_report(
-    logs: tuple[Path, Path], found: Identified, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_writes_the_puller_and_its_report(logs, found, tmp_path, monkeypatch):
     monkeypatch.setattr(command, "identify", lambda *_: found)
     out = tmp_path / "new" / "my.toml"
     assert command.main([str(logs[0]), "--out", str(out)]) == 0
@@ -26,9 +21,7 @@ def test_the_command_writes_the_puller_and_its_report(
     assert "calliper" in text
 
 
-def test_the_example_goes_from_a_log_to_a_controller(
-    logs: tuple[Path, Path], found: Identified, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_example_goes_from_a_log_to_a_controller(logs, found, tmp_path, monkeypatch):
     monkeypatch.setattr(example, "identify", lambda *_: found)
     out = tmp_path / "my.toml"
     assert 0.0 < example.main(str(logs[0]), out=str(out)) < 0.2
@@ -50,16 +43,14 @@ def test_the_example_goes_from_a_log_to_a_controller(
         (["--puller", "none.toml"], "none.toml: No such file"),
     ],
 )
-def test_what_is_wrong_is_one_line_and_nothing_is_written(
-    options: list[str], said: str, logs: tuple[Path, Path], tmp_path: Path, refused
-) -> None:
+def test_what_is_wrong_is_one_line_and_nothing_is_written(options, said, logs, tmp_path, refused):
     given = options if "--out" in options else [*options, "--out", str(tmp_path / "new" / "my.toml")]
     assert said in refused(command.main, [str(logs[0]), *given])
     assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.slow
-def test_the_study_identifies_pullers_that_nobody_knows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_study_identifies_pullers_that_nobody_knows(tmp_path, capsys):
     assert study.main(["--quick", "--out", str(tmp_path)]) == 0
     text = (tmp_path / "pullers.txt").read_text()
     assert text in capsys.readouterr().out

@@ -1,6 +1,5 @@
 """Identification: exact derivatives, exact predictions without noise, and what a log can and cannot tell."""
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +9,7 @@ from cz_gym import CzEnv, Parameters
 from cz_gym.action import MadeFor
 from cz_gym.baselines.policy import OpenLoop
 from cz_gym.errors import CzError
-from cz_gym.identify import Excited, Identified, identify, read_log, record_log
+from cz_gym.identify import Excited, identify, read_log, record_log
 from cz_gym.identify.estimate import HEATER, PULL, measure_excitation, whiteness
 from cz_gym.identify.excitation import CHIPS, SEQUENCE
 from cz_gym.identify.log import Log
@@ -22,9 +21,7 @@ from tests.identify.conftest import TRUTH
 
 
 @pytest.mark.parametrize(("interval", "off"), [(5.0, 1e-5), (10.0, 1e-4)])
-def test_without_noise_the_filter_of_the_true_puller_predicts_every_reading(
-    interval: float, off: float, tmp_path: Path
-) -> None:
+def test_without_noise_the_filter_of_the_true_puller_predicts_every_reading(interval, off, tmp_path):
     env = CzEnv("nominal", 0.5, "measured", interval, 3600.0, parameters=TRUTH, action="direct", info="all")
     record_log(env, Excited(OpenLoop(), heater=0.01), tmp_path / "log.csv", seed=0)
     log, model = read_log(tmp_path / "log.csv"), Model(("C_1",), TRUTH)
@@ -33,7 +30,7 @@ def test_without_noise_the_filter_of_the_true_puller_predicts_every_reading(
     assert np.abs(predict(log, model, np.array([0.05])).error[:, 0]).max() > 0.02
 
 
-def test_derivatives_are_those_of_the_filter(logs: tuple[Path, Path]) -> None:
+def test_derivatives_are_those_of_the_filter(logs):
     log = Log(*(each[:400] if isinstance(each, np.ndarray) else each for each in read_log(logs[0])))
     model = Model((*HEATER, *PULL, *Noise._fields), Parameters())
     theta, step = model.mean + 0.05, 1e-5
@@ -46,7 +43,7 @@ def test_derivatives_are_those_of_the_filter(logs: tuple[Path, Path]) -> None:
             assert np.abs((exact[part][j] - differences) / scale).max() < 2e-3, name
 
 
-def test_a_log_with_excitation_tells_the_hot_zone(found: Identified) -> None:
+def test_a_log_with_excitation_tells_the_hot_zone(found):
     told = {e.name: e for e in found.estimates if e.informed}
     assert found.settled
     assert {"C_1", "C_2", "kappa_12", "G_1a", "G_2b", "eps"} <= set(told)
@@ -59,14 +56,14 @@ def test_a_log_with_excitation_tells_the_hot_zone(found: Identified) -> None:
     assert min(found.whiteness) > 0.01
 
 
-def test_a_log_of_a_controller_alone_tells_nothing(logs: tuple[Path, Path]) -> None:
+def test_a_log_of_a_controller_alone_tells_nothing(logs):
     passive = identify(read_log(logs[1]))
     assert max(passive.excitation) < 0.5
     assert not any(e.informed or e.excited for e in passive.estimates)
     assert passive.puller.parameters == Parameters()
 
 
-def test_a_log_quicker_than_its_controller_is_no_more_excited(logs: tuple[Path, Path]) -> None:
+def test_a_log_quicker_than_its_controller_is_no_more_excited(logs):
     for path, enough in zip(logs, (True, False), strict=True):
         log = read_log(path)
         quick = log._replace(**{name: np.repeat(getattr(log, name), 5) for name in Log._fields[:8]}, interval=1.0)
@@ -75,7 +72,7 @@ def test_a_log_quicker_than_its_controller_is_no_more_excited(logs: tuple[Path, 
 
 
 @pytest.mark.parametrize("action", ["direct", "smooth", "rate"])
-def test_the_drives_follow_the_sequence_whatever_the_action_means(action: str) -> None:
+def test_the_drives_follow_the_sequence_whatever_the_action_means(action):
     class Rest(OpenLoop):
         """Nominal drives, which are the ones that it sees."""
 
@@ -97,7 +94,7 @@ def test_the_drives_follow_the_sequence_whatever_the_action_means(action: str) -
         assert info["Q_H"] - start["Q_H"] == pytest.approx(other * start["Q_H"], abs=2e-6 * HEATER_RANGE)
 
 
-def test_excitation_stops_for_good_beyond_a_radius_error() -> None:
+def test_excitation_stops_for_good_beyond_a_radius_error():
     excited = Excited(OpenLoop(), limit=1.5e-3)
     near, far = np.zeros((2, 1, 11), np.float32)
     near[:, 1] = far[:, 1] = 1.0
@@ -114,7 +111,7 @@ def test_excitation_stops_for_good_beyond_a_radius_error() -> None:
         Excited(agent)
 
 
-def test_whiteness_tells_white_from_coloured() -> None:
+def test_whiteness_tells_white_from_coloured():
     white = np.random.default_rng(1).standard_normal(2000)
     white[100:150] = np.nan
     assert whiteness(white) > 0.01

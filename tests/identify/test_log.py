@@ -1,9 +1,7 @@
 """The log reader: other names and units, gaps, repeats, jitter; one line for what is wrong."""
 
 import csv
-from collections.abc import Callable
 from datetime import datetime, timedelta
-from pathlib import Path
 
 import numpy as np
 import pandas
@@ -16,17 +14,17 @@ from cz_gym.puller import DEFAULT
 Row = dict[str, str]
 
 
-def read(path: Path) -> list[Row]:
+def read(path):
     return list(csv.DictReader(path.read_text().splitlines()))
 
 
-def write(path: Path, rows: list[Row], delimiter: str = ",") -> Path:
+def write(path, rows, delimiter=","):
     lines = [delimiter.join(rows[0]), *(delimiter.join(row.values()) for row in rows)]
     path.write_text("\n".join(lines) + "\n\n")
     return path
 
 
-def test_other_names_units_and_separators_are_the_same_log(logs: tuple[Path, Path], tmp_path: Path) -> None:
+def test_other_names_units_and_separators_are_the_same_log(logs, tmp_path):
     start = datetime.fromisoformat("2024-05-01T23:00:00+02:00")
     rows = [
         {
@@ -48,7 +46,7 @@ def test_other_names_units_and_separators_are_the_same_log(logs: tuple[Path, Pat
     assert (mine.interval, mine.notes) == (5.0, ())
 
 
-def test_a_parquet_file_is_the_same_log(logs: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_parquet_file_is_the_same_log(logs, tmp_path):
     table = pandas.read_csv(logs[0])
     table["valid"] = table["valid"] > 0.5
     table["time_s"] = pandas.Timestamp("2024-05-01T23:00:00+02:00") + pandas.to_timedelta(table["time_s"], unit="s")
@@ -63,7 +61,7 @@ def test_a_parquet_file_is_the_same_log(logs: tuple[Path, Path], tmp_path: Path)
         read_log(tmp_path / "log.parquet")
 
 
-def test_gaps_repeats_jitter_and_outliers_are_counted(logs: tuple[Path, Path], tmp_path: Path) -> None:
+def test_gaps_repeats_jitter_and_outliers_are_counted(logs, tmp_path):
     whole, rows = read_log(logs[0]), read(logs[0])
     for k, row in enumerate(rows):
         row["time_s"] = f"{float(row['time_s']) + 0.8 * np.sin(k):.3f}"
@@ -85,7 +83,7 @@ def test_gaps_repeats_jitter_and_outliers_are_counted(logs: tuple[Path, Path], t
     assert np.flatnonzero(log.gap).tolist() == [140]
 
 
-def changed(name: str, value: str, at: int = 400) -> Callable[[list[Row]], list[Row]]:
+def changed(name, value, at=400):
     return lambda rows: [row | {name: value} if k == at else row for k, row in enumerate(rows)]
 
 
@@ -106,9 +104,7 @@ def changed(name: str, value: str, at: int = 400) -> Callable[[list[Row]], list[
         (changed("time_s", "1e9", 2160), "nearly all of it are gaps"),
     ],
 )
-def test_what_is_wrong_is_one_line_with_its_row(
-    change: Callable[[list[Row]], list[Row]], said: str, logs: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_what_is_wrong_is_one_line_with_its_row(change, said, logs, tmp_path):
     with pytest.raises(CzError) as error:
         read_log(write(tmp_path / "bad.csv", change(read(logs[0]))))
     assert str(error.value).startswith(f"{tmp_path / 'bad.csv'}: ")
@@ -126,9 +122,7 @@ def test_what_is_wrong_is_one_line_with_its_row(
         ({"ring": 1.4}, "is it another puller's log?"),
     ],
 )
-def test_wrong_units_and_other_pullers_are_noticed(
-    factor: dict[str, float], said: str, logs: tuple[Path, Path]
-) -> None:
+def test_wrong_units_and_other_pullers_are_noticed(factor, said, logs):
     log = read_log(logs[0])
     check_puller(log, DEFAULT)
     wrong = log._replace(**{name: getattr(log, name) * by for name, by in factor.items()})

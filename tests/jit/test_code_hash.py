@@ -1,12 +1,10 @@
 """The plant's hash follows from its equations, not from their formatting, nor from a number bumped by hand (trap 5)."""
 
 import runpy
-from pathlib import Path
-from typing import Any
 
 import pytest
 
-from cz_gym import HURLE, MeniscusModel, config
+from cz_gym import HURLE, config
 from cz_gym.config import make_config
 from cz_gym.jit.code_hash import function_hash, hash_files
 from cz_gym.jit.compile import jittable
@@ -40,7 +38,7 @@ def outer(x, by=1.0):
         ("math.pi", "math.e", False),
     ],
 )
-def test_hash_of_a_function_follows_from_what_it_computes(tmp_path: Path, before: str, after: str, same: bool) -> None:
+def test_hash_of_a_function_follows_from_what_it_computes(tmp_path, before, after, same):
     hashes = []
     for name, text in (("one.py", SOURCE), ("two.py", SOURCE.replace(before, after))):
         (tmp_path / name).write_text(text)
@@ -48,8 +46,8 @@ def test_hash_of_a_function_follows_from_what_it_computes(tmp_path: Path, before
     assert (hashes[0] == hashes[1]) is same
 
 
-def test_a_changed_equation_is_another_plant(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fourth_power(T: Any) -> Any:
+def test_a_changed_equation_is_another_plant(monkeypatch):
+    def fourth_power(T):
         return T**4.01
 
     before = make_config().plant_hash
@@ -63,17 +61,17 @@ def test_a_changed_equation_is_another_plant(monkeypatch: pytest.MonkeyPatch) ->
     assert make_config().plant_hash == before
 
 
-def stretched(by: float) -> MeniscusModel:
+def stretched(by):
     """Hurle's meniscus, its height stretched."""
 
     @jittable
-    def height(r_c: Any, theta: Any, a: Any) -> Any:
+    def height(r_c, theta, a):
         return by * HURLE.height(r_c, theta, a)
 
     return HURLE._replace(name="stretched", height=height)
 
 
-def test_two_menisci_of_one_factory_are_two_plants() -> None:
+def test_two_menisci_of_one_factory_are_two_plants():
     hashes = {make_config(meniscus=stretched(by)).plant_hash for by in (1.0, 1.01, 1.02)}
     assert len({*hashes, make_config().plant_hash}) == 4
     assert make_config(meniscus=stretched(1.01)).plant_hash in hashes
@@ -82,7 +80,7 @@ def test_two_menisci_of_one_factory_are_two_plants() -> None:
     assert function_hash(*lambdas[0].functions) != function_hash(*lambdas[1].functions)
 
 
-def test_the_hash_of_files_counts_code_and_not_text(tmp_path: Path) -> None:
+def test_the_hash_of_files_counts_code_and_not_text(tmp_path):
     module, hashes = tmp_path / "thing.py", []
     for text in ('"""A."""\nx = 1\n"""B."""\n', '"""C."""\n# why\nx = (\n    1\n)\n', "x = 2\n"):
         module.write_text(text)

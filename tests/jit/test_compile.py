@@ -4,9 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -27,7 +25,7 @@ print(cache_folder(), a, sum(series._factors.stats.cache_hits.values()), sep="|"
 
 
 @pytest.fixture
-def package(tmp_path: Path) -> Path:
+def package(tmp_path):
     """A folder that holds a copy of the package."""
     shutil.copytree(
         ROOT / "cz_gym",
@@ -37,7 +35,7 @@ def package(tmp_path: Path) -> Path:
     return tmp_path / "copy"
 
 
-def run(code: str, folder: Path, cache: Path) -> list[str]:
+def run(code, folder, cache):
     """The output of a fresh process, split at bars."""
     environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
     environment["CZ_GYM_CACHE_DIR"] = str(cache)
@@ -45,7 +43,7 @@ def run(code: str, folder: Path, cache: Path) -> list[str]:
 
 
 @pytest.mark.slow
-def test_changed_physics_is_never_run_from_an_old_cache(package: Path, tmp_path: Path) -> None:
+def test_changed_physics_is_never_run_from_an_old_cache(package, tmp_path):
     """The edited function is compiled into a loop that stands in another, unchanged module."""
     cache = tmp_path / "cache"
     folder, factor, hits = run(FACTOR, package, cache)
@@ -59,7 +57,7 @@ def test_changed_physics_is_never_run_from_an_old_cache(package: Path, tmp_path:
 
 
 @pytest.mark.slow
-def test_damaged_code_is_compiled_again(tmp_path: Path) -> None:
+def test_damaged_code_is_compiled_again(tmp_path):
     cache = tmp_path / "cache"
     folder, factor, _ = run(FACTOR, ROOT, cache)
     (file,) = Path(folder).rglob("*factors*.code")
@@ -69,9 +67,7 @@ def test_damaged_code_is_compiled_again(tmp_path: Path) -> None:
     assert not list(Path(folder).rglob("*.new"))
 
 
-def test_code_for_other_types_is_not_used_and_a_full_disk_keeps_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_code_for_other_types_is_not_used_and_a_full_disk_keeps_nothing(tmp_path, monkeypatch):
     store = Store(tmp_path, "kernel")
     store.save("floats", 1)
     store.save("integers", 2)
@@ -80,7 +76,7 @@ def test_code_for_other_types_is_not_used_and_a_full_disk_keeps_nothing(
     store.save("integers", 3)
     assert store.load("integers") == 3
 
-    def full(*arguments: object) -> None:
+    def full(*arguments):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("cz_gym.atomic_files.os.replace", full)
@@ -90,7 +86,7 @@ def test_code_for_other_types_is_not_used_and_a_full_disk_keeps_nothing(
 
 
 @pytest.mark.slow
-def test_processes_that_compile_at_once_all_have_it_right(tmp_path: Path) -> None:
+def test_processes_that_compile_at_once_all_have_it_right(tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "CZ_GYM_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, "-c", FACTOR]
     several = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)]
@@ -101,20 +97,20 @@ def test_processes_that_compile_at_once_all_have_it_right(tmp_path: Path) -> Non
 
 
 @pytest.fixture
-def fresh(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
+def fresh(monkeypatch):
     """The choice of a cache folder, made anew and forgotten."""
     cache_folder.cache_clear()
     yield monkeypatch
     cache_folder.cache_clear()
 
 
-def test_no_vector_mathematics_that_rounds_otherwise(package: Path, tmp_path: Path, fresh: pytest.MonkeyPatch) -> None:
+def test_no_vector_mathematics_that_rounds_otherwise(package, tmp_path, fresh):
     fresh.delenv("NUMBA_DISABLE_INTEL_SVML", raising=False)
     code = "import cz_gym, numba\nprint(numba.config.DISABLE_INTEL_SVML, numba.config.USING_SVML)"
     assert run(code, package, tmp_path / "cache") == ["1 False"]
 
 
-def test_without_a_writable_folder_nothing_is_cached(fresh: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_without_a_writable_folder_nothing_is_cached(fresh, tmp_path):
     """No name, a home that is not there, a read-only file system."""
     (tmp_path / "file").write_text("in the way")
     for variable, value in (("CZ_GYM_CACHE_DIR", ""), ("XDG_CACHE_HOME", str(tmp_path / "file"))):
@@ -131,11 +127,11 @@ def test_without_a_writable_folder_nothing_is_cached(fresh: pytest.MonkeyPatch, 
     assert cache_folder() is None
 
 
-def test_a_users_meniscus_is_never_run_from_a_cache() -> None:
+def test_a_users_meniscus_is_never_run_from_a_cache():
     """No hash sees the user's own functions change."""
 
     @jittable
-    def height(r_c: Any, theta: Any, a: Any) -> Any:
+    def height(r_c, theta, a):
         return 1.1 * hurle_height(r_c, theta, a)
 
     kept = [isinstance(build_kernels(one).step._cache, CachedCode) for one in (HURLE, HURLE._replace(height=height))]

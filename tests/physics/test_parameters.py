@@ -9,7 +9,7 @@ from cz_gym.physics.parameters import check_parameters
 
 
 @given(st.sampled_from(Parameters._fields), st.sampled_from([math.nan, math.inf, -math.inf, -1.0, "0.1", None]))
-def test_what_is_not_a_number_is_refused_by_name(name: str, value: object) -> None:
+def test_what_is_not_a_number_is_refused_by_name(name, value):
     with pytest.raises(ValueError, match=rf"^parameter {name} = .*\[") as refusal:
         check_parameters(Parameters()._replace(**{name: value}))
     assert "\n" not in str(refusal.value)
@@ -33,13 +33,13 @@ def test_what_is_not_a_number_is_refused_by_name(name: str, value: object) -> No
         ({"C_1": 57.0}, r"did you mean 57000 "),
     ],
 )
-def test_what_no_puller_can_be_made_of_is_refused(given: dict[str, float], message: str) -> None:
+def test_what_no_puller_can_be_made_of_is_refused(given, message):
     with pytest.raises(ValueError, match=message):
         make_puller(Parameters(**given))
     assert check_parameters(Parameters(alpha_0=0.0, T_a=200.0, T_e=0.0))
 
 
 @pytest.mark.parametrize("lam", [-0.1, 1.5, math.nan])
-def test_the_mix_of_models_lies_between_them(lam: float) -> None:
+def test_the_mix_of_models_lies_between_them(lam):
     with pytest.raises(ValueError, match=r"\[0, 1\]"):
         make_puller(lam=lam)

@@ -1,5 +1,4 @@
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -7,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from cz_gym import SCENARIOS, CzEnv, Parameters, Puller, Scenario, State, make_puller
+from cz_gym import SCENARIOS, CzEnv, Parameters, State, make_puller
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.episodes.schedule import disturbance
 from cz_gym.jit.compile import kernel
@@ -22,7 +21,7 @@ MELTING = replace(SCENARIOS["puller"], name="puller without limits", actuators=A
 
 
 @pytest.fixture
-def states(rng: np.random.Generator) -> State:
+def states(rng):
     p = make_puller()
     n = 200
     return State(
@@ -31,7 +30,7 @@ def states(rng: np.random.Generator) -> State:
     )  # fmt: skip
 
 
-def drawn_inputs(rng: np.random.Generator, p: Puller, n: int) -> tuple[Inputs, Disturbance]:
+def drawn_inputs(rng, p, n):
     u = Inputs(rng.uniform(0, 4e-5, n), p.Q_H_0 + rng.uniform(-1e4, 1e4, n))
     return u, Disturbance(rng.normal(0, 1000, n), rng.normal(0, 1, n), rng.uniform(0.9, 1, n))
 
@@ -40,7 +39,7 @@ VARIED = ("sigma", "k_l", "kappa_12", "G_2b", "eps", "r_0", "v_0")
 
 
 @given(st.sampled_from(MIXES), st.lists(SPREAD, min_size=len(VARIED), max_size=len(VARIED)))
-def test_operating_point_is_a_steady_state(lam: float, factors: list[float]) -> None:
+def test_operating_point_is_a_steady_state(lam, factors):
     q = Parameters()
     changes = {name: getattr(q, name) * factor for name, factor in zip(VARIED, factors, strict=True)}
     p = make_puller(q._replace(**changes), lam)
@@ -53,7 +52,7 @@ def test_operating_point_is_a_steady_state(lam: float, factors: list[float]) -> 
 
 
 @pytest.mark.parametrize("lam", MIXES)
-def test_rates_are_the_equations_of_the_design(lam: float, states: State, rng: np.random.Generator) -> None:
+def test_rates_are_the_equations_of_the_design(lam, states, rng):
     p = make_puller(lam=lam)
     u, d = drawn_inputs(rng, p, 200)
     expected = design_rates(np.array(states), Truth(u.v_p, u.Q_H, d.Q_d, d.dT_i, d.melt), p)
@@ -61,9 +60,9 @@ def test_rates_are_the_equations_of_the_design(lam: float, states: State, rng: n
     np.testing.assert_allclose(actual, expected, rtol=1e-11, atol=1e-13)
 
 
-def test_compiled_equations_equal_the_plain_ones(states: State, rng: np.random.Generator) -> None:
+def test_compiled_equations_equal_the_plain_ones(states, rng):
     @kernel
-    def loop(rows: Any, u: Any, d: Any, p: Any, out: Any) -> None:
+    def loop(rows, u, d, p, out):
         for i in range(len(rows)):
             x = State(rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4])
             load = Disturbance(d[i, 0], d[i, 1], d[i, 2])
@@ -91,7 +90,7 @@ def test_compiled_equations_equal_the_plain_ones(states: State, rng: np.random.G
     np.testing.assert_allclose(out / scale, np.array(plain).T / scale, rtol=1e-12, atol=1e-13)
 
 
-def test_runge_kutta_is_of_fourth_order() -> None:
+def test_runge_kutta_is_of_fourth_order():
     p = make_puller(lam=0.7)
     x = np.array([p.r_0, 0.8 * p.h_0, p.T_1_0 + 5, p.T_2_0, p.T_b_0 + 2])
     u, d = Inputs(1.2 * p.v_0, p.Q_H_0 + 8000.0), Disturbance(500.0, 0.3, 0.95)
@@ -108,7 +107,7 @@ def test_runge_kutta_is_of_fourth_order() -> None:
 
 
 @pytest.mark.parametrize(("interval", "scenario"), [(5.0, "randomized"), (2.0, MELTING), (10.0, "hard")])
-def test_an_hour_of_driven_motion_agrees_with_scipy(interval: float, scenario: str | Scenario) -> None:
+def test_an_hour_of_driven_motion_agrees_with_scipy(interval, scenario):
     env = CzEnv(scenario, control_interval=interval, horizon=HOUR, info="all")
     env.reset(seed=5)
     saved, interface = env.get_state().slot, drawn(env).interface
@@ -137,7 +136,7 @@ def test_an_hour_of_driven_motion_agrees_with_scipy(interval: float, scenario: s
 
 
 @pytest.mark.parametrize("drift", [-20.0, -5.0, 0.0, 1e-3, 5.0, 20.0])
-def test_hidden_load_is_the_static_equivalent_of_a_drift(drift: float) -> None:
+def test_hidden_load_is_the_static_equivalent_of_a_drift(drift):
     p = make_puller()
     T_1 = p.T_1_0 + drift
     T_2 = brentq(lambda T: p.kappa_12 * (T_1**4 - T**4) - p.G_2b * (T - p.T_b_0), 1000, 3000, xtol=1e-12, rtol=1e-15)

@@ -30,7 +30,7 @@ class Solution(NamedTuple):
     ring_offset: Any
 
 
-def solve(r_c: Any, h_c: Any, phi_b: Any = PHI_B) -> Solution:
+def solve(r_c, h_c, phi_b=PHI_B):
     """Menisci of these radii and heights [m], by shooting from the linear tail z = c K_0(sqrt(2) r)."""
     r, h, ring_slope = np.broadcast_arrays(np.atleast_1d(r_c) / A, h_c / A, phi_b)
     k = math.sqrt(2.0)

@@ -2,8 +2,6 @@
 
 import itertools
 import sys
-from collections.abc import Iterator
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -19,7 +17,7 @@ from cz_gym.rendering import canvas
 
 
 @pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def quick(monkeypatch):
     """A clock that does not wait, and matplotlib's backend as it was."""
     backend = matplotlib.rcParams["backend"]
     monkeypatch.setattr(pygame.time, "Clock", lambda: type("Clock", (), {"tick": lambda *_: None}))
@@ -27,7 +25,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     matplotlib.rcParams["backend"] = backend
 
 
-def test_keys_move_the_drives_while_they_are_held() -> None:
+def test_keys_move_the_drives_while_they_are_held():
     keys, p = play.keys(), make_puller()
     assert len(keys) == 17  # of three by three by two, all but none; shift alone does nothing
     env = CzEnv("nominal", action="rate", info="all")
@@ -45,12 +43,12 @@ def test_keys_move_the_drives_while_they_are_held() -> None:
 
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("leaves", [True, False])
-def test_a_run_ends_with_the_score(leaves: bool, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+def test_a_run_ends_with_the_score(leaves, monkeypatch, capsys):
     """Up to the horizon of 5 min, or 21 steps: 20 without a key and one more that ends the game."""
     shown, counter = [], itertools.count()
     display = gymnasium_play.display_arr
 
-    def watch(screen: Any, picture: Any, **options: Any) -> None:
+    def watch(screen, picture, **options):
         shown.append(int(picture.max()))
         display(screen, picture, **options)
         if leaves and next(counter) == 20:
@@ -65,7 +63,7 @@ def test_a_run_ends_with_the_score(leaves: bool, monkeypatch: pytest.MonkeyPatch
     assert capsys.readouterr().out == play.score(config, 3, [np.zeros(2, np.float32)] * steps, False) + "\n"
 
 
-def test_the_score_of_the_same_controller_is_a_draw() -> None:
+def test_the_score_of_the_same_controller_is_a_draw():
     config = make_config("randomized", None, "measured", horizon=600.0, action="direct")
     paper = find_controller("paper").make(config)
     env, state, actions, over = CzEnv.from_config(config), None, [], False
@@ -78,12 +76,12 @@ def test_the_score_of_the_same_controller_is_a_draw() -> None:
     assert by_hand.partition("by hand ")[2] == by_paper.partition("controller ")[2]
 
 
-def test_playing_without_pygame_says_what_to_install(monkeypatch: pytest.MonkeyPatch, refused: Any) -> None:
+def test_playing_without_pygame_says_what_to_install(monkeypatch, refused):
     monkeypatch.setitem(sys.modules, "pygame", None)
     assert refused(play.main, []) == f"python -m cz_gym.play: {canvas.MISSING}\n"
 
 
-def test_playing_without_a_display_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch, refused: Any) -> None:
+def test_playing_without_a_display_is_refused_in_one_line(monkeypatch, refused):
     pygame.display.quit()
     monkeypatch.setenv("SDL_VIDEODRIVER", "offscreen")
     assert refused(play.main, []) == f"python -m cz_gym.play: {play.NO_DISPLAY}\n"

@@ -3,8 +3,6 @@
 import errno
 import os
 import sys
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -52,23 +50,21 @@ print(line, sorted(seen))
 """A writer killed before each line of the module in turn, in a process that forks before every kill."""
 
 
-def names(folder: Path) -> list[str]:
+def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="forks")
-def test_a_writer_killed_at_any_line_leaves_every_file_whole_and_the_last_one_last(tmp_path: Path) -> None:
+def test_a_writer_killed_at_any_line_leaves_every_file_whole_and_the_last_one_last(tmp_path):
     lines, seen = python("-c", KILL_AT_EVERY_LINE, str(tmp_path)).split(maxsplit=1)
     assert int(lines) > 30
     assert seen == "[0, 1, 2, 3]\n"
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
-def test_a_full_disk_leaves_what_was_there_and_names_the_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
-) -> None:
-    def full(*arguments: Any) -> None:
+def test_a_full_disk_leaves_what_was_there_and_names_the_file(tmp_path, monkeypatch, call):
+    def full(*arguments):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     write_files({tmp_path / "a": b"old"})
@@ -81,7 +77,7 @@ def test_a_full_disk_leaves_what_was_there_and_names_the_file(
 
 
 @pytest.mark.parametrize(("place", "reason"), [("folder", "is a folder"), ("file/b", "Not a directory|File exists")])
-def test_a_place_where_no_file_can_be_is_named(place: str, reason: str, tmp_path: Path) -> None:
+def test_a_place_where_no_file_can_be_is_named(place, reason, tmp_path):
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_text("")
     with pytest.raises(CzError, match=reason):
@@ -91,7 +87,7 @@ def test_a_place_where_no_file_can_be_is_named(place: str, reason: str, tmp_path
         check_writable(tmp_path / "file" / "new")
 
 
-def test_a_file_that_cannot_be_read_is_named_with_the_reason(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_read_is_named_with_the_reason(tmp_path):
     (tmp_path / "latin").write_bytes(b"\xe9")
     for name, reason in (("none", "No such file or directory"), ("latin", "not a text file in UTF-8")):
         with pytest.raises(CzError, match=f"^{tmp_path / name}: {reason}$"), naming(tmp_path / name):
@@ -101,7 +97,7 @@ def test_a_file_that_cannot_be_read_is_named_with_the_reason(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_a_folder_is_used_by_one_process(tmp_path: Path) -> None:
+def test_a_folder_is_used_by_one_process(tmp_path):
     code = "import sys, pathlib; from cz_gym.atomic_files import locked\nwith locked(pathlib.Path(sys.argv[1])): pass"
     with locked(tmp_path / "new"):
         with pytest.raises(CzError, match="another process is at work"), locked(tmp_path / "new"):

@@ -5,10 +5,8 @@ import json
 import re
 import shlex
 import sys
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +16,6 @@ from cz_gym.agents import shipped_names
 from cz_gym.agents.agent_file.contract import write_agent
 from cz_gym.baselines.registry import CONTROLLERS
 from cz_gym.config import make_config
-from cz_gym.contender import Contender
 from cz_gym.errors import CzError
 from cz_gym.evaluation import runner
 from cz_gym.evaluation.files import check_targets
@@ -36,7 +33,7 @@ SMALL = ["--episodes", "3", "--scenarios", "randomized,reference-b", "--controll
 ONE = ["--scenarios", "reference-b", "--controllers", "open-loop", "--quiet"]
 
 
-def constant_agent(path: Path, observation: str = "measured", **changes: Any) -> Path:
+def constant_agent(path, observation="measured", **changes):
     """An agent file that always answers with the nominal drives."""
     channels = len(OBSERVATIONS[observation])
     weights = {"weight": np.zeros((channels, 2), np.float32), "bias": np.zeros(2, np.float32)}
@@ -45,7 +42,7 @@ def constant_agent(path: Path, observation: str = "measured", **changes: Any) ->
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished(tmp_path_factory):
     """The folder of a small run: two controllers and an agent of two training seeds, both as good as nothing."""
     folder = tmp_path_factory.mktemp("benchmark")
     agents = [f"--agent={constant_agent(folder / f'{seed}.onnx', training_seed=seed)}" for seed in (3, 8)]
@@ -55,38 +52,38 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def data(finished: Path) -> dict[str, Any]:
-    loaded: dict[str, Any] = json.loads((finished / "benchmark.json").read_text())
+def data(finished):
+    loaded = json.loads((finished / "benchmark.json").read_text())
     return loaded
 
 
 @pytest.fixture
-def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*arguments: Any) -> None:
+def no_work(monkeypatch):
+    def refuse(*arguments):
         raise AssertionError("work was done")
 
     monkeypatch.setattr(runner, "rollout", refuse)
 
 
 @pytest.fixture
-def refusal(refused: Any) -> Callable[[list[str]], str]:
+def refusal(refused):
     """The one line with which a command line is refused."""
     return partial(refused, benchmark.main)
 
 
-def contenders(*arguments: str) -> list[Contender]:
+def contenders(*arguments):
     given = benchmark.parse(arguments)
     return benchmark.contenders_of(given, benchmark.rows_of(given))
 
 
-def test_default_contenders_are_those_of_the_registry_and_the_shipped_agents() -> None:
+def test_default_contenders_are_those_of_the_registry_and_the_shipped_agents():
     usual = [each.name for each in CONTROLLERS if each.default] + shipped_names()
     assert [each.name for each in contenders()] == usual
     (gradient,) = contenders("--controllers", "gradient")
     assert len(gradient.trained) == 10
 
 
-def test_the_folder_holds_every_file_and_nothing_else(finished: Path) -> None:
+def test_the_folder_holds_every_file_and_nothing_else(finished):
     assert sorted(path.name for path in finished.iterdir()) == FILES
     assert (finished.parent / "copy.json").read_bytes() == (finished / "benchmark.json").read_bytes()
     report = (finished / "report.md").read_text()
@@ -97,7 +94,7 @@ def test_the_folder_holds_every_file_and_nothing_else(finished: Path) -> None:
 
 
 @pytest.mark.slow
-def test_processes_side_by_side_find_the_same(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_side_by_side_find_the_same(finished, tmp_path, monkeypatch):
     """All but the time in the policies, which is measured."""
     monkeypatch.setattr(runner, "LONG", 0)
     agents = [f"--agent={finished.parent / f'{seed}.onnx'}" for seed in (3, 8)]
@@ -109,7 +106,7 @@ def test_processes_side_by_side_find_the_same(finished: Path, tmp_path: Path, mo
         assert ours[part] == theirs[part] != {}
 
 
-def test_json_names_every_metric_of_everyone(data: dict[str, Any]) -> None:
+def test_json_names_every_metric_of_everyone(data):
     """The agent does nothing, as open-loop does."""
     assert list(data["results"]) == ["randomized", "reference-b"]
     for name, scenario in data["results"].items():
@@ -126,7 +123,7 @@ def test_json_names_every_metric_of_everyone(data: dict[str, Any]) -> None:
     assert (verdict["wins"], verdict["rival"]) == (False, "paper")
 
 
-def test_every_episode_is_in_the_table_and_provenance_says_what_was_run(finished: Path, data: dict[str, Any]) -> None:
+def test_every_episode_is_in_the_table_and_provenance_says_what_was_run(finished, data):
     with (finished / "episodes.csv").open() as file:
         lines = list(csv.DictReader(file))
     assert {line["training_seed"] for line in lines if line["controller"] == "ppo"} == {"3", "8"}
@@ -158,14 +155,14 @@ def test_every_episode_is_in_the_table_and_provenance_says_what_was_run(finished
         (["--controllers", "paper", "--json", "/"], "is a folder"),
     ],
 )
-def test_a_wrong_command_is_refused_in_one_line(arguments: list[str], message: str, refusal: Any) -> None:
+def test_a_wrong_command_is_refused_in_one_line(arguments, message, refusal):
     line = refusal(arguments)
     assert line.startswith("benchmark.py: ")
     assert message in line
 
 
 @pytest.mark.usefixtures("no_work")
-def test_agent_files_that_cannot_be_used_get_one_line(tmp_path: Path, refusal: Any) -> None:
+def test_agent_files_that_cannot_be_used_get_one_line(tmp_path, refusal):
     broken = constant_agent(tmp_path / "broken.onnx")
     broken.write_bytes(b"not a model")
     assert "broken.onnx" in refusal(["--agent", str(broken)])
@@ -189,7 +186,7 @@ def test_agent_files_that_cannot_be_used_get_one_line(tmp_path: Path, refusal: A
     assert "clairvoyant, mine, gradient, ppo, sac, or all" in line
 
 
-def test_a_file_may_be_named_and_stand_beside_the_shipped_agents(tmp_path: Path) -> None:
+def test_a_file_may_be_named_and_stand_beside_the_shipped_agents(tmp_path):
     """Each agent's line says the scenarios that it was trained on."""
     file = constant_agent(tmp_path / "some.onnx", algorithm="ppo")
     found = contenders("--controllers", "paper,mine,gradient", "--agent", f"mine={file}")
@@ -205,9 +202,7 @@ def test_a_file_may_be_named_and_stand_beside_the_shipped_agents(tmp_path: Path)
 
 
 @pytest.mark.usefixtures("no_work")
-def test_files_are_replaced_by_a_full_run_or_when_told_to(
-    tmp_path: Path, finished: Path, monkeypatch: pytest.MonkeyPatch, refusal: Any
-) -> None:
+def test_files_are_replaced_by_a_full_run_or_when_told_to(tmp_path, finished, monkeypatch, refusal):
     """For results named by every option, and for other files of the user."""
     monkeypatch.setattr(benchmark, "FOLDER", finished)
     results, page = finished / "benchmark.json", tmp_path / "report.html"
@@ -224,7 +219,7 @@ def test_files_are_replaced_by_a_full_run_or_when_told_to(
     check_targets(finished, None, partial=False, overwrite=False)
 
 
-def test_a_full_run_is_quoted_in_the_readme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_run_is_quoted_in_the_readme(tmp_path, monkeypatch):
     """Full as measured by a smaller protocol; a partial run leaves the page alone."""
     page = tmp_path / "README.md"
     page.write_text("before\n<!-- benchmark:begin -->\nold\n<!-- benchmark:end -->\nafter\n")
@@ -247,7 +242,7 @@ def test_a_full_run_is_quoted_in_the_readme(tmp_path: Path, monkeypatch: pytest.
 
 @pytest.mark.usefixtures("no_work")
 @pytest.mark.parametrize("package", ["matplotlib", "plotly", "tqdm", "onnxruntime"])
-def test_a_missing_extra_is_named(package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refusal: Any) -> None:
+def test_a_missing_extra_is_named(package, tmp_path, monkeypatch, refusal):
     agent = constant_agent(tmp_path / "agent.onnx")
     monkeypatch.setitem(sys.modules, package, None)
     line = refusal([*SMALL, "--agent", str(agent), "--out", str(tmp_path / "out")])
@@ -256,7 +251,7 @@ def test_a_missing_extra_is_named(package: str, tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.slow
-def test_the_benchmark_needs_neither_torch_nor_stable_baselines3(tmp_path: Path) -> None:
+def test_the_benchmark_needs_neither_torch_nor_stable_baselines3(tmp_path):
     agent = constant_agent(tmp_path / "agent.onnx")
     arguments = [*ONE[:3], "paper", "--agent", str(agent), "--out", str(tmp_path / "out"), "--quiet"]
     loaded = "{'torch', 'stable_baselines3'} & {*sys.modules}"
@@ -267,7 +262,7 @@ def test_the_benchmark_needs_neither_torch_nor_stable_baselines3(tmp_path: Path)
     )
 
 
-def test_rows_have_the_settings_that_their_names_say() -> None:
+def test_rows_have_the_settings_that_their_names_say():
     assert find_row("hard").seeds(7) == range(2_000_000, 2_000_007)
     assert len(find_row("reference-b").seeds(500)) == 1
     assert find_row("paper-ramp-II").config().mix == (0.0, 0.0)
@@ -276,7 +271,7 @@ def test_rows_have_the_settings_that_their_names_say() -> None:
     assert (exact.config().meniscus, exact.design_config().meniscus) == (YOUNG_LAPLACE, HURLE)
 
 
-def test_an_agent_that_reads_the_true_state_is_a_bound_and_wins_nothing(tmp_path: Path) -> None:
+def test_an_agent_that_reads_the_true_state_is_a_bound_and_wins_nothing(tmp_path):
     agent = constant_agent(tmp_path / "seer.onnx", observation="state", algorithm="seer")
     command = ["--agent", str(agent), "--controllers", "paper,seer", "--scenarios", "reference-b"]
     assert benchmark.main([*command, "--json", str(tmp_path / "out.json"), "--quiet"]) == 0
@@ -304,9 +299,7 @@ later = replace(REFERENCE_B, name="later")
 """
 
 
-def test_one_s_own_controller_runs_beside_a_few_into_its_own_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], refusal: Any
-) -> None:
+def test_one_s_own_controller_runs_beside_a_few_into_its_own_folder(tmp_path, monkeypatch, capsys, refusal):
     monkeypatch.chdir(tmp_path)
     Path("mine.py").write_text(MINE)
     command = ["--scenarios", "reference-b", "--controller", "mine.py:Still"]
@@ -316,14 +309,12 @@ def test_one_s_own_controller_runs_beside_a_few_into_its_own_folder(
     assert list(results) == ["paper", "paper-tuned", "lqg-at-0.02", "Still"]
     assert "runs/Still/benchmark.json exists: add --overwrite" in refusal(command)
     monkeypatch.setattr(benchmark, "benchmark", lambda arguments, command: folders.append(arguments.out) or 0)
-    folders: list[Path] = []
+    folders = []
     benchmark.main([*ONE, "--agent", "some.onnx", "--scenario", "mine.py:later"])
     assert folders == [Path("runs/later-some")]
 
 
-def test_a_report_on_one_s_own_shows_it_and_prints_a_command_that_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_report_on_one_s_own_shows_it_and_prints_a_command_that_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("my files").mkdir()
     mine = Path("my files/mine.py")
@@ -359,9 +350,7 @@ def test_a_report_on_one_s_own_shows_it_and_prints_a_command_that_runs(
         ("--controller", "lqg.py:gradient", "two controllers are called 'gradient'"),
     ],
 )
-def test_files_of_one_s_own_that_do_not_fit_get_one_line(
-    option: str, place: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refusal: Any
-) -> None:
+def test_files_of_one_s_own_that_do_not_fit_get_one_line(option, place, message, tmp_path, monkeypatch, refusal):
     monkeypatch.chdir(tmp_path)
     Path("mine.py").write_text(MINE)
     Path("lqg.py").write_text(f"{MINE}\nlqg = gradient = still")
@@ -384,9 +373,7 @@ made = Mine()
     ("body", "place", "line"),
     [("return helper(), state", "Mine", 3), ("observation + [1, 2, 3, 4, 5]", "made", 7), ("pass\n1 / 0", "Mine", 8)],
 )
-def test_a_bug_in_one_s_own_file_shows_its_file_and_line(
-    body: str, place: str, line: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bug_in_one_s_own_file_shows_its_file_and_line(body, place, line, tmp_path, monkeypatch):
     """Whether it is in ``predict`` or stops the import."""
     monkeypatch.chdir(tmp_path)
     Path("mine.py").write_text(RAISES.format(body))

@@ -6,7 +6,6 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
-from typing import Any
 
 import pytest
 from gymnasium.error import DependencyNotInstalled
@@ -19,7 +18,7 @@ from cz_gym.errors import CzError
 from studies import speed
 from studies.paper import __main__ as paper
 
-COMMANDS: list[tuple[Any, str, str, list[str]]] = [
+COMMANDS = [
     (benchmark, "--episode", "benchmark", ["--out", "new/folder"]),
     (paper, "--ou", "report", ["--out", "new/folder"]),
     (tuning, "--trial", "measure", ["--controller", "industrial", "--out", "new/folder"]),
@@ -30,17 +29,17 @@ COMMANDS: list[tuple[Any, str, str, list[str]]] = [
 """Each with the beginning of an option, the function that does its work, and arguments that would write a file."""
 
 
-def interrupt(*arguments: Any, **named: Any) -> None:
+def interrupt(*arguments, **named):
     raise KeyboardInterrupt
 
 
-def name(part: Any) -> str | None:
+def name(part):
     return getattr(part, "__name__", None)
 
 
 @pytest.mark.parametrize("abbreviated", [False, True])
 @pytest.mark.parametrize(("module", "beginning"), [row[:2] for row in COMMANDS], ids=name)
-def test_an_unknown_option_is_refused_in_one_line(module: Any, beginning: str, abbreviated: bool, refused: Any) -> None:
+def test_an_unknown_option_is_refused_in_one_line(module, beginning, abbreviated, refused):
     required = ["--controller", "industrial"] if module is tuning else []
     line = refused(module.main, [*required, beginning if abbreviated else "--frobnicate"])
     assert "unrecognized arguments" in line
@@ -53,9 +52,9 @@ def test_an_unknown_option_is_refused_in_one_line(module: Any, beginning: str, a
     ids=name,
 )
 def test_an_interrupt_and_a_place_that_cannot_be_written_are_one_line_and_leave_nothing(
-    module: Any, work: str, arguments: list[str], writable: bool, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    module, work, arguments, writable, tmp_path,
+    monkeypatch, capsys,
+):  # fmt: skip
     """The place is refused before the work."""
     if not writable:
         (tmp_path / "new").write_text("not a folder")
@@ -72,7 +71,7 @@ def test_an_interrupt_and_a_place_that_cannot_be_written_are_one_line_and_leave_
 @pytest.mark.parametrize(
     "command", ["-m cz_gym.play", "-m studies.paper", "benchmark.py", "train.py", "-c import\tcz_gym"]
 )
-def test_an_interrupt_while_a_command_is_imported_is_one_line(command: str, tmp_path: Path) -> None:
+def test_an_interrupt_while_a_command_is_imported_is_one_line(command, tmp_path):
     """Whoever imports the package from a program of theirs keeps the traceback."""
     (tmp_path / "gymnasium.py").write_text("raise KeyboardInterrupt")
     found = [str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]
@@ -97,10 +96,8 @@ def test_an_interrupt_while_a_command_is_imported_is_one_line(command: str, tmp_
     ],
     ids=repr,
 )
-def test_only_what_is_meant_for_the_user_is_one_line_and_a_bug_keeps_its_traceback(
-    error: BaseException | None, code: int | None, said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def body() -> int:
+def test_only_what_is_meant_for_the_user_is_one_line_and_a_bug_keeps_its_traceback(error, code, said, capsys):
+    def body():
         if error is not None:
             raise error
         return 0
@@ -113,7 +110,7 @@ def test_only_what_is_meant_for_the_user_is_one_line_and_a_bug_keeps_its_traceba
     assert capsys.readouterr().err == said
 
 
-def test_every_package_of_the_extras_is_known_as_optional() -> None:
+def test_every_package_of_the_extras_is_known_as_optional():
     project = tomllib.loads(Path("pyproject.toml").read_text())["project"]
     building = {"ruff", "mypy", "build", "setuptools", "pytest", "pytest_xdist", "hypothesis", "sybil", "scipy_stubs"}
     documenting = {"sphinx", "myst_parser", "furo", "latex2mathml", "jupytext"}

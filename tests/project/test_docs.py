@@ -9,11 +9,8 @@ import inspect
 import re
 import shlex
 import tomllib
-from argparse import ArgumentParser, Namespace
-from collections.abc import Iterator
+from argparse import ArgumentParser
 from contextlib import suppress
-from pathlib import Path
-from typing import Any
 
 import myst_parser  # noqa: F401
 import pytest
@@ -47,24 +44,24 @@ HEADINGS = (
 )
 
 
-def small(text: str) -> str:
+def small(text):
     for large, little in SMALL.items():
         text = text.replace(large, little)
     return text
 
 
-def run_python(example: Any) -> None:
+def run_python(example):
     """Run a block where it stands, so that a traceback shows the page's own line."""
     example.namespace.setdefault("__name__", "page")
     text = "\n" * example.line + small(example.parsed)
     exec(compile(text, example.path, "exec", dont_inherit=True), example.namespace)
 
 
-def blocks(page: Path) -> list[Any]:
+def blocks(page):
     return list(sybil.Sybil(parsers=[CodeBlockParser("python", run_python)]).parse(page).examples())
 
 
-def commands(page: Path) -> Iterator[tuple[list[str], bool]]:
+def commands(page):
     """The words of each command of a page, and whether it is to be run."""
     programs = ("python", "pip", "make")
     for token in MarkdownIt().parse(page.read_text()):
@@ -79,7 +76,7 @@ def commands(page: Path) -> Iterator[tuple[list[str], bool]]:
                 yield words, False
 
 
-def _words(line: str) -> list[str]:
+def _words(line):
     """A line without prompt, comment and environment variables."""
     try:
         words = shlex.split(line.strip().removeprefix("$ "), comments=True)
@@ -90,7 +87,7 @@ def _words(line: str) -> list[str]:
     return [words[0].removeprefix(".venv/bin/"), *words[1:]] if words else []
 
 
-def program(words: list[str]) -> tuple[Any, list[str]] | None:
+def program(words):
     """This project's module that a python command names, its ``__main__`` where it is a package, and its options."""
     name, options = (words[2], words[3:]) if words[1] == "-m" else (words[1].removesuffix(".py"), words[2:])
     top = name.partition(".")[0]
@@ -106,17 +103,17 @@ class Parsed(BaseException):
 
 
 @pytest.fixture
-def understood(monkeypatch: pytest.MonkeyPatch) -> Any:
+def understood(monkeypatch):
     """A function that raises AssertionError or SystemExit for a command that does not exist or has other options."""
     understand = ArgumentParser.parse_args
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 
-    def parse_args(parser: ArgumentParser, args: Any = None, namespace: Any = None) -> Namespace:
+    def parse_args(parser, args=None, namespace=None):
         understand(parser, args, namespace)
         raise Parsed
 
-    def check(words: list[str]) -> None:
+    def check(words):
         line = " ".join(words)
         if words[0] == "make":
             assert {word for word in words[1:] if "=" not in word} <= targets, line
@@ -141,7 +138,7 @@ def understood(monkeypatch: pytest.MonkeyPatch) -> Any:
         if blocks(page) and (name := str(page.relative_to(ROOT)))
     ],
 )
-def test_blocks_of_a_page_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blocks_of_a_page_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     for example in blocks(page):
@@ -153,7 +150,7 @@ def test_blocks_of_a_page_run(page: Path, tmp_path: Path, monkeypatch: pytest.Mo
             assert found[0].main(found[1]) == 0, words
 
 
-def test_commands_of_the_pages_are_understood(understood: Any) -> None:
+def test_commands_of_the_pages_are_understood(understood):
     listed = [words for page in PAGES for words, _ in commands(page)]
     for words in listed:
         understood(words)
@@ -161,7 +158,7 @@ def test_commands_of_the_pages_are_understood(understood: Any) -> None:
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def site(tmp_path_factory):
     """The built site: warnings are errors, as in ``make docs``."""
     folder = tmp_path_factory.mktemp("site")
     makefile = (ROOT / "Makefile").read_text()
@@ -172,7 +169,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_the_site_loads_nothing_from_elsewhere_and_formulas_need_no_script(site: Path) -> None:
+def test_the_site_loads_nothing_from_elsewhere_and_formulas_need_no_script(site):
     elsewhere = {
         ".html": r"""<(?:link|script|img|source|object)\b[^>]*?(?:href|src|srcset|data)=["'](?:https?:)?//[^>]*>"""
         r"|MathJax|\$\$",
@@ -188,7 +185,7 @@ def test_the_site_loads_nothing_from_elsewhere_and_formulas_need_no_script(site:
     assert formulas > 100
 
 
-def test_the_environment_page_has_gymnasiums_headings_and_the_arguments_as_they_are() -> None:
+def test_the_environment_page_has_gymnasiums_headings_and_the_arguments_as_they_are():
     text = (DOCS / "environment.md").read_text()
     assert ", ".join(re.findall(r"^## (.*)$", text, re.MULTILINE)) == HEADINGS
     rows = re.findall(r"^\| `(\w+)` \| `([^`]*)` \|", text[text.index("## Arguments") :], re.MULTILINE)
@@ -196,7 +193,7 @@ def test_the_environment_page_has_gymnasiums_headings_and_the_arguments_as_they_
     assert list(rows) == [(each.name, repr(each.default).replace("'", '"')) for each in arguments]
 
 
-def test_pages_read_well_on_github_and_their_tables_are_the_code_s(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pages_read_well_on_github_and_their_tables_are_the_code_s(monkeypatch):
     """Only the pages of the code's own names, and the site's contents, have blocks that GitHub shows as they stand."""
     monkeypatch.syspath_prepend(str(DOCS))
     tables = importlib.import_module("czdocs.tables")
@@ -215,7 +212,7 @@ def test_pages_read_well_on_github_and_their_tables_are_the_code_s(monkeypatch: 
         )
 
 
-def test_every_symbol_has_unit_meaning_and_a_numbered_equation(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_symbol_has_unit_meaning_and_a_numbered_equation(monkeypatch):
     monkeypatch.syspath_prepend(str(DOCS))
     nomenclature = importlib.import_module("czdocs.nomenclature")
     assert list(nomenclature.formulas()) == [str(number + 1) for number in range(len(nomenclature.formulas()))]

@@ -5,7 +5,6 @@ A room is a package, or a module that stands beside packages (``cz_gym.env``, ``
 
 import ast
 import os
-from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -25,7 +24,7 @@ Arrows = set[tuple[str, str]]
 """Pairs of which the first imports from the second."""
 
 
-def modules() -> dict[str, Path]:
+def modules():
     """Every module by its one name."""
     found = {name: ROOT / f"{name}.py" for name in PROGRAMS}
     for top in ("cz_gym", "studies"):
@@ -35,7 +34,7 @@ def modules() -> dict[str, Path]:
     return dict(sorted(found.items()))
 
 
-def imports(name: str, file: Path) -> Iterator[str]:
+def imports(name, file):
     """Dotted names that a module imports: modules, or names in them."""
     package = name if file.name == "__init__.py" else name.rpartition(".")[0]
     for node in ast.walk(ast.parse(file.read_bytes())):
@@ -47,12 +46,12 @@ def imports(name: str, file: Path) -> Iterator[str]:
             yield from (f"{base}.{alias.name}" for alias in node.names)
 
 
-def within(name: str, package: str) -> bool:
+def within(name, package):
     """Whether a dotted name is a package or lies in it."""
     return name == package or name.startswith(f"{package}.")
 
 
-def arrows() -> Arrows:
+def arrows():
     """Arrows between modules."""
     known = modules()
     targets = ((name, each, each.rpartition(".")[0]) for name, file in known.items() for each in imports(name, file))
@@ -60,7 +59,7 @@ def arrows() -> Arrows:
     return {(name, target) for name, target in found if target in known and target != name}
 
 
-def room(name: str) -> str:
+def room(name):
     """The room of a module: its package, or itself where packages stand beside it."""
     package = name.rpartition(".")[0]
     folder = ROOT / name.replace(".", "/")
@@ -68,15 +67,15 @@ def room(name: str) -> str:
     return name if folder.is_dir() or several or not package else package
 
 
-def check_no_circle(pairs: Arrows) -> None:
+def check_no_circle(pairs):
     """Raise CycleError, which names the first circle."""
-    graph: dict[str, set[str]] = {}
+    graph = {}
     for one, other in pairs:
         graph.setdefault(one, set()).add(other)
     TopologicalSorter(graph).prepare()
 
 
-def test_packages_do_not_import_in_a_circle() -> None:
+def test_packages_do_not_import_in_a_circle():
     found = arrows()
     with pytest.raises(CycleError):
         check_no_circle({("a", "b"), ("b", "a")})
@@ -85,7 +84,7 @@ def test_packages_do_not_import_in_a_circle() -> None:
 
 
 @pytest.mark.parametrize("package", FORBIDDEN)
-def test_nothing_is_imported_from_above(package: str) -> None:
+def test_nothing_is_imported_from_above(package):
     inner = [each for each in FORBIDDEN if each != package and within(each, package)]
     mine = {name: file for name, file in modules().items() if within(name, package)}
     for name, file in mine.items():
@@ -95,7 +94,7 @@ def test_nothing_is_imported_from_above(package: str) -> None:
     assert mine
 
 
-def test_importing_loads_nothing_that_is_not_needed_and_no_module_has_a_second_name() -> None:
+def test_importing_loads_nothing_that_is_not_needed_and_no_module_has_a_second_name():
     loads = "import sys, {}; assert not {} & set(sys.modules)"
     code = [loads.format("cz_gym", {"cz_gym.physics.young_laplace"})]
     code += [loads.format("cz_gym.play", {"torch", "pygame", "PIL", "onnxruntime"})]

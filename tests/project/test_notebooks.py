@@ -9,7 +9,7 @@ import nbformat
 DOCS = Path(__file__).parents[2] / "docs"
 
 
-def test_the_example_pages_become_notebooks(tmp_path: Path) -> None:
+def test_the_example_pages_become_notebooks(tmp_path):
     made = runpy.run_path(str(DOCS / "notebooks.py"))
     for page, file in zip(made["PAGES"], made["write"](tmp_path), strict=True):
         notebook = nbformat.read(file, as_version=4)

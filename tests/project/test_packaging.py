@@ -44,7 +44,7 @@ assert CompensatedPID().predict(batch.step(np.zeros((2, 2)))[0])[0].shape == (2,
 """
 
 
-def printed(code: str, place: Path, cwd: Path) -> list[str]:
+def printed(code, place, cwd):
     """Lines that a fresh process prints, which finds packages in ``place``, as an installer left it, before others."""
     prelude = (
         "import site, sys\n"
@@ -57,7 +57,7 @@ def printed(code: str, place: Path, cwd: Path) -> list[str]:
     return python("-W", "error", "-c", prelude + code, cwd=cwd).split()
 
 
-def test_every_package_is_listed() -> None:
+def test_every_package_is_listed():
     folders = {"cz_gym": ROOT / "cz_gym", **{package: ROOT / "cz_gym" / name for name, package in LINKS.items()}}
     found = {
         ".".join((package, *file.parent.relative_to(folder).parts))
@@ -69,7 +69,7 @@ def test_every_package_is_listed() -> None:
     assert sorted(listed) == sorted(found)
 
 
-def test_versions_agree_and_core_dependencies_are_four() -> None:
+def test_versions_agree_and_core_dependencies_are_four():
     assert cz_gym.__version__ == PROJECT["version"]
     assert f"\nversion: {PROJECT['version']}\n" in (ROOT / "CITATION.cff").read_text()
     names = [requirement.partition(">")[0] for requirement in PROJECT["dependencies"]]
@@ -77,7 +77,7 @@ def test_versions_agree_and_core_dependencies_are_four() -> None:
 
 
 @pytest.mark.parametrize("file", ["constraints.txt", "constraints-lowest.txt"])
-def test_pins_lie_in_the_open_ranges(file: str) -> None:
+def test_pins_lie_in_the_open_ranges(file):
     """And ``make test-lowest`` tests the lowest versions of all it names; torch alone stands where its note says."""
     packaging = pytest.importorskip("packaging.requirements")
     version = pytest.importorskip("packaging.version").Version
@@ -99,14 +99,14 @@ def test_pins_lie_in_the_open_ranges(file: str) -> None:
         assert {requirement.name for requirement in requirements} == set(pins)
 
 
-def test_environment_and_baselines_need_neither_torch_nor_plots(tmp_path: Path) -> None:
+def test_environment_and_baselines_need_neither_torch_nor_plots(tmp_path):
     absent = ["torch", "stable_baselines3", "sb3_contrib", "matplotlib", "onnxruntime", "onnx", "tensorboard"]
     absent += ["control", "tqdm", "pygame", "casadi"]
     printed(f"import sys\nsys.modules.update(dict.fromkeys({absent}))\n{SMOKE}", ROOT, tmp_path)
 
 
 @pytest.mark.parametrize("command", ["train.py", "benchmark.py", "-m studies.bode", "-m cz_gym.datasets"])
-def test_outside_the_virtual_environment_one_line_says_so(command: str) -> None:
+def test_outside_the_virtual_environment_one_line_says_so(command):
     line = [sys.executable, "-S", *command.split()]
     done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, env={"PATH": os.environ["PATH"]})
     assert done.returncode != 0
@@ -115,11 +115,11 @@ def test_outside_the_virtual_environment_one_line_says_so(command: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def source(tmp_path_factory):
     """A checkout as it is where there are no links, as on Windows: the files named as links hold where these lead."""
     folder = tmp_path_factory.mktemp("source")
 
-    def left_out(place: str, names: list[str]) -> set[str]:
+    def left_out(place, names):
         return {name for name in names if name in UNPACKED or name[0] == "." or (Path(place) / name).is_symlink()}
 
     shutil.copytree(ROOT, folder, ignore=left_out, dirs_exist_ok=True)
@@ -129,7 +129,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def built(source: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def built(source, tmp_path_factory):
     """The source distribution and the wheel that is built from it."""
     folder = tmp_path_factory.mktemp("built")
     python("-m", "build", "--no-isolation", "--outdir", str(folder), str(source))
@@ -137,7 +137,7 @@ def built(source: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
 
 
 @pytest.mark.slow
-def test_the_wheel_holds_one_package_and_what_it_needs(built: tuple[Path, Path], tmp_path: Path) -> None:
+def test_the_wheel_holds_one_package_and_what_it_needs(built, tmp_path):
     sdist, wheel = built
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
@@ -161,7 +161,7 @@ def test_the_wheel_holds_one_package_and_what_it_needs(built: tuple[Path, Path],
 
 
 @pytest.mark.slow
-def test_an_editable_install_needs_no_links(source: Path, tmp_path: Path) -> None:
+def test_an_editable_install_needs_no_links(source, tmp_path):
     code = f"from setuptools.build_meta import build_editable\nbuild_editable({str(tmp_path)!r})"
     python("-c", code, cwd=source)
     with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as archive:

@@ -1,9 +1,6 @@
 """A picture shows the logged signals: pixels and drawn numbers against the record."""
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.integrate import trapezoid
 
@@ -11,8 +8,8 @@ from cz_gym import HURLE, CzEnv, Parameters, make_puller
 from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.rendering import palette, scene, triple_point
-from cz_gym.rendering.canvas import Canvas, Frame
-from cz_gym.rendering.record import Ending, Record
+from cz_gym.rendering.canvas import Canvas
+from cz_gym.rendering.record import Ending
 from cz_gym.rendering.scene import layout
 from cz_gym.units import MM
 
@@ -20,7 +17,7 @@ CANVAS = Canvas(640, 480)
 PANELS = layout(CANVAS.box)
 
 
-def grown(steps: int = 240, pull: float = 0.0, **arguments: Any) -> tuple[Frame, Record]:
+def grown(steps=240, pull=0.0, **arguments):
     """A crystal pulled with a slow swing of the pull speed, so that its surface is not straight."""
     env = CzEnv(render_mode="rgb_array", observation="measured", **arguments)
     env.reset(seed=4)
@@ -32,23 +29,23 @@ def grown(steps: int = 240, pull: float = 0.0, **arguments: Any) -> tuple[Frame,
     return frame, env._view.record
 
 
-def near(frame: Frame, colour: palette.Colour, within: float = 70.0) -> npt.NDArray[np.bool_]:
+def near(frame, colour, within=70.0):
     """Pixels close to a colour, shape (height, width)."""
     return np.linalg.norm(frame.astype(float) - colour, axis=-1) < within
 
 
-def check_near(pixels: npt.NDArray[np.bool_], expected: float, reach: int) -> None:
+def check_near(pixels, expected, reach):
     """The pixels of a line that are set within ``reach`` of the expected coordinate are centred on it, to one pixel."""
     first = round(expected) - reach
     assert np.flatnonzero(pixels[first : first + 2 * reach]).mean() + first + 0.5 == pytest.approx(expected, abs=1.0)
 
 
 @pytest.fixture(scope="module")
-def picture() -> tuple[Frame, Record]:
+def picture():
     return grown()
 
 
-def test_the_drawn_surface_is_the_logged_radius(picture: tuple[Frame, Record]) -> None:
+def test_the_drawn_surface_is_the_logged_radius(picture):
     frame, record = picture
     scale = triple_point.scale_of(PANELS.triple_point, record)
     r_c, _, z = record.surface()
@@ -61,14 +58,14 @@ def test_the_drawn_surface_is_the_logged_radius(picture: tuple[Frame, Record]) -
 
 
 @pytest.mark.parametrize(("pull", "r_0"), [(-0.3, 87.5e-3), (0.3, 87.5e-3), (0.0, 20e-3), (0.0, 150e-3)])
-def test_the_rings_mark_is_at_the_rings_radius(pull: float, r_0: float) -> None:
+def test_the_rings_mark_is_at_the_rings_radius(pull, r_0):
     frame, record = grown(60, pull=pull, parameters=Parameters(r_0=r_0))
     scale = triple_point.scale_of(PANELS.triple_point, record)
     # In the melt, where the mark's line goes down from the ring.
     check_near(near(frame, palette.CAMERA)[round(scale.y_0 + 34)], scale.x(record.last("r_br")), 8)
 
 
-def test_the_chart_ends_at_the_true_error(picture: tuple[Frame, Record]) -> None:
+def test_the_chart_ends_at_the_true_error(picture):
     frame, record = picture
     plot = PANELS.chart.inner(*scene.MARGINS)
     x = round(plot.x + record.t[-1] / record.config.horizon * plot.w)
@@ -77,9 +74,7 @@ def test_the_chart_ends_at_the_true_error(picture: tuple[Frame, Record]) -> None
 
 
 @pytest.mark.parametrize(("model", "tolerance"), [(HURLE, 1e-6), (YOUNG_LAPLACE, 0.3 * MM)], ids=["hurle", "exact"])
-def test_the_drawn_meniscus_leaves_the_triple_point_and_meets_the_ring(
-    model: Any, tolerance: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_drawn_meniscus_leaves_the_triple_point_and_meets_the_ring(model, tolerance, monkeypatch):
     """Hurle's curve leaves at Hurle's slope; through the exact model's slope it passes near the exact ring."""
     monkeypatch.setattr(triple_point, "POINTS", 20_001)
     p = make_puller(meniscus=model)
@@ -93,13 +88,13 @@ def test_the_drawn_meniscus_leaves_the_triple_point_and_meets_the_ring(
             assert (r[1] - r[0]) / (z[0] - z[1]) == pytest.approx(sine / cosine, rel=2e-3)
 
 
-def test_length_grown_is_the_integral_of_the_growth_rate(picture: tuple[Frame, Record]) -> None:
+def test_length_grown_is_the_integral_of_the_growth_rate(picture):
     record = picture[1]
     assert record.length[-1] == pytest.approx(trapezoid(record.column("v_g"), record.t), rel=2e-3)
 
 
 @pytest.mark.parametrize(("pull", "ending"), [(1.0, Ending.DETACHED), (-1.0, Ending.FROZEN)])
-def test_the_picture_of_a_failed_crystal_has_a_band_that_says_so(pull: float, ending: Ending) -> None:
+def test_the_picture_of_a_failed_crystal_has_a_band_that_says_so(pull, ending):
     # Model I finds a balance without any pull; Model II grows on, and freezes.
     frame, record = grown(900, pull=pull, scenario="nominal", model="II")
     assert record.ending is ending

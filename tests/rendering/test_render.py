@@ -5,7 +5,6 @@ import pickle
 import subprocess
 import sys
 import warnings
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -21,10 +20,10 @@ from tests.observed import PLAIN
 from tests.processes import ROOT, python
 
 
-def trajectory(render_mode: str | None, scenario: str, steps: int = 60) -> list[Any]:
+def trajectory(render_mode, scenario, steps=60):
     env = CzEnv(scenario=scenario, render_mode=render_mode, observation="history", action="direct")
     generator = np.random.default_rng(4)
-    found: list[Any] = [env.reset(seed=9)]
+    found = [env.reset(seed=9)]
     for _ in range(steps):
         found.append(env.step(generator.uniform(-1, 1, 2).astype(np.float32)))
         if render_mode == "rgb_array":
@@ -37,23 +36,23 @@ def trajectory(render_mode: str | None, scenario: str, steps: int = 60) -> list[
 
 
 @pytest.mark.parametrize("mode", [None, *MODES])
-def test_gymnasiums_checker_renders_every_mode_without_a_warning(mode: str | None) -> None:
+def test_gymnasiums_checker_renders_every_mode_without_a_warning(mode):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         env = gym.make("Cz-v0", horizon=600.0, render_mode=mode, render_size=(641, 483), **PLAIN)
         check_env(env.unwrapped)
     if mode == "rgb_array":
-        assert env.unwrapped.render().shape == (483, 641, 3)  # type: ignore[union-attr]
+        assert env.unwrapped.render().shape == (483, 641, 3)
 
 
 @pytest.mark.parametrize("scenario", ["randomized", "puller"])
 @pytest.mark.parametrize("mode", MODES)
-def test_rendering_changes_nothing(mode: str, scenario: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rendering_changes_nothing(mode, scenario, monkeypatch):
     monkeypatch.setattr(view, "FPS", 0)  # as fast as it can
     assert pickle.dumps(trajectory(mode, scenario)) == pickle.dumps(trajectory(None, scenario))
 
 
-def test_the_users_environment_stays_as_it_was() -> None:
+def test_the_users_environment_stays_as_it_was():
     code = (
         "import os, gymnasium as gym; before = dict(os.environ)\n"
         "import cz_gym\n"
@@ -67,18 +66,18 @@ def test_the_users_environment_stays_as_it_was() -> None:
 
 
 @pytest.mark.parametrize("size", [None, 640, "640x480", (640.0, 480.0), (640,), (359, 480), (640, 3841), (True, 480)])
-def test_other_sizes_are_refused_in_one_line(size: Any) -> None:
+def test_other_sizes_are_refused_in_one_line(size):
     with pytest.raises(ValueError, match=r"^render_size must be \(width, height\), .*not .*$"):
         check_size(size)
 
 
-def test_before_the_first_reset_there_is_no_crystal() -> None:
+def test_before_the_first_reset_there_is_no_crystal():
     for env in (gym.make("Cz-v0", render_mode="rgb_array", **PLAIN), CzEnv(render_mode="rgb_array", **PLAIN)):
         with pytest.raises(ResetNeeded):
             env.render()
 
 
-def test_a_frame_is_the_callers_own() -> None:
+def test_a_frame_is_the_callers_own():
     env = CzEnv(render_mode="rgb_array", **PLAIN)
     env.reset(seed=1)
     first = env.render()
@@ -93,7 +92,7 @@ def test_a_frame_is_the_callers_own() -> None:
     assert np.array_equal(second, kept)
 
 
-def test_gymnasiums_wrappers_for_windows_and_lists_of_frames_work() -> None:
+def test_gymnasiums_wrappers_for_windows_and_lists_of_frames_work():
     env = gym.wrappers.HumanRendering(gym.make("Cz-v0", render_mode="rgb_array", **PLAIN))
     env.reset(seed=1)
     env.step(env.action_space.sample())
@@ -104,10 +103,10 @@ def test_gymnasiums_wrappers_for_windows_and_lists_of_frames_work() -> None:
     listed = gym.make("Cz-v0", render_mode="rgb_array_list", **PLAIN)
     listed.reset(seed=1)
     listed.step(listed.action_space.sample())
-    assert len(listed.render()) == 2  # type: ignore[arg-type]
+    assert len(listed.render()) == 2
 
 
-def test_without_pygame_nothing_is_declared_and_asking_says_what_to_install() -> None:
+def test_without_pygame_nothing_is_declared_and_asking_says_what_to_install():
     code = (
         "import sys\nsys.modules['pygame'] = None\n"
         "import cz_gym\n"
@@ -119,7 +118,7 @@ def test_without_pygame_nothing_is_declared_and_asking_says_what_to_install() ->
     assert python("-W", "error", "-c", code) == f"DependencyNotInstalled {canvas.MISSING}\n"
 
 
-def test_a_window_that_cannot_open_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_window_that_cannot_open_is_one_clear_error(monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "nonsense")
     pygame.display.quit()
     env = CzEnv(render_mode="human", **PLAIN)

@@ -2,22 +2,21 @@
 
 import math
 import time
-from typing import Any
 
 import numpy as np
 import pytest
 
 from cz_gym.config import make_config
-from cz_gym.serve.machine import SETPOINTS, Alarm, Clock, Log, Machine
+from cz_gym.serve.machine import SETPOINTS, Alarm, Clock, Machine
 
 PULL, HEATER = SETPOINTS
 
 
-def machine(watchdog: float = 60.0, log: Log | None = None, **settings: Any) -> Machine:
+def machine(watchdog=60.0, log=None, **settings):
     return Machine(make_config("randomized", None, "measured", action="direct", **settings), 1, watchdog, log)
 
 
-def test_setpoints_act_once_the_step_they_answer_is_written_and_not_before() -> None:
+def test_setpoints_act_once_the_step_they_answer_is_written_and_not_before():
     one = machine()
     assert one.offer({PULL: 1.5}) == {}
     one.step()
@@ -29,7 +28,7 @@ def test_setpoints_act_once_the_step_they_answer_is_written_and_not_before() -> 
     assert (tags["control"], tags["alarms"], tags["step"], tags["watchdog"]) == ("client", 0, 3, 2)
 
 
-def test_a_refused_value_refuses_all_that_came_with_it() -> None:
+def test_a_refused_value_refuses_all_that_came_with_it():
     one = machine()
     low, high = one.limits[HEATER]
     for bad in (math.nan, math.inf, -math.inf, high + 1e-3, low - 1e-3):
@@ -40,7 +39,7 @@ def test_a_refused_value_refuses_all_that_came_with_it() -> None:
         assert list(one.offer({"watchdog": step})) == ["watchdog"], "answered, and not begun"
 
 
-def test_setpoints_that_are_not_renewed_are_held_and_then_the_fallback_takes_over_without_a_jump() -> None:
+def test_setpoints_that_are_not_renewed_are_held_and_then_the_fallback_takes_over_without_a_jump():
     one = machine(watchdog=30.0)
     one.offer({PULL: 1.5, HEATER: 57.5, "watchdog": 0})
     rows = [one.step() for _ in range(8)]
@@ -55,7 +54,7 @@ def test_setpoints_that_are_not_renewed_are_held_and_then_the_fallback_takes_ove
     assert one.step()["control"] == "client"
 
 
-def test_the_operator_takes_control_and_gives_it_back() -> None:
+def test_the_operator_takes_control_and_gives_it_back():
     one = machine(watchdog=10.0)
     assert list(one.by_hand({PULL: 9.0, HEATER: 57.0})) == [PULL]
     assert one.by_hand({PULL: 1.4, HEATER: 57.0}) == {}
@@ -67,7 +66,7 @@ def test_the_operator_takes_control_and_gives_it_back() -> None:
     assert [one.step()["control"] for _ in range(3)] == ["held", "fallback", "fallback"]
 
 
-def test_a_lost_crystal_raises_an_alarm() -> None:
+def test_a_lost_crystal_raises_an_alarm():
     one = machine()
     while not one.over:
         one.offer({PULL: 0.0, "watchdog": one.k})
@@ -76,11 +75,11 @@ def test_a_lost_crystal_raises_an_alarm() -> None:
     assert "frozen" in tags["state"] or "lost" in tags["state"]
 
 
-def test_a_clock_makes_up_for_what_it_missed_and_does_not_drift() -> None:
+def test_a_clock_makes_up_for_what_it_missed_and_does_not_drift():
     """A publisher that blocks for 0.3 s, more than twenty steps, costs none of them."""
     one, times = machine(), []
 
-    def published(tags: dict[str, Any]) -> None:
+    def published(tags):
         times.append(time.monotonic())
         if tags["step"] == 20:
             time.sleep(0.3)
@@ -102,10 +101,10 @@ def test_a_clock_makes_up_for_what_it_missed_and_does_not_drift() -> None:
     assert [row["step"] for row in one.hour] == list(range(one.k + 1))
 
 
-def test_an_error_in_the_clock_reaches_whoever_waits() -> None:
-    sent: list[dict[str, Any]] = []
+def test_an_error_in_the_clock_reaches_whoever_waits():
+    sent = []
     one = machine(horizon=10.0)
-    one.step = lambda: 1 / 0  # type: ignore[method-assign,assignment]
+    one.step = lambda: 1 / 0
     clock = Clock(one, 1e6, False, sent.append)
     clock.start()
     clock.join(10.0)

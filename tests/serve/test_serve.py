@@ -11,9 +11,6 @@ import sys
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +19,7 @@ from cz_gym.identify.log import read_log
 from cz_gym.serve import __main__ as command
 from cz_gym.serve.machine import SETPOINTS
 from tests.processes import ROOT
-from tests.serve.conftest import NAN, PASSWORD, Hand, answer, connected, free_port, running, with_client
+from tests.serve.conftest import NAN, PASSWORD, answer, connected, free_port, running, with_client
 
 from asyncua import ua  # isort: skip
 
@@ -30,14 +27,14 @@ PULL, HEATER = SETPOINTS
 
 
 @pytest.fixture(scope="module")
-def puller(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+def puller(tmp_path_factory):
     """A puller on the loopback, 200 times as fast as real, for everybody."""
     with running(tmp_path_factory.mktemp("open"), "--speed", "200", "--hours", "1000") as one:
         yield one
 
 
 @pytest.fixture(scope="module")
-def locked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+def locked(tmp_path_factory):
     """A puller with accounts, as strict as one that listens on another address."""
     patch = pytest.MonkeyPatch()
     for role in ("OPERATOR", "READER"):
@@ -48,8 +45,8 @@ def locked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     patch.undo()
 
 
-def test_values_of_wrong_type_or_size_are_refused_and_logged(puller: Any) -> None:
-    async def act(hand: Hand) -> None:
+def test_values_of_wrong_type_or_size_are_refused_and_logged(puller):
+    async def act(hand):
         low, high = puller.machine.limits[PULL]
         for bad in (NAN, float("inf"), low - 1.0, high + 1.0):
             assert await hand.write(**{PULL: bad}) == ["BadOutOfRange"]
@@ -70,8 +67,8 @@ def test_values_of_wrong_type_or_size_are_refused_and_logged(puller: Any) -> Non
     assert any(f"{HEATER} = nan" in line for line in puller.door.events)
 
 
-def test_ten_clients_at_once_of_which_one_floods_and_no_step_is_late(puller: Any) -> None:
-    async def reads(hand: Hand) -> int:
+def test_ten_clients_at_once_of_which_one_floods_and_no_step_is_late(puller):
+    async def reads(hand):
         seen = set()
         for _ in range(50):
             values = await hand.client.read_values([hand.nodes["time_s"], hand.nodes["step"]])
@@ -80,14 +77,14 @@ def test_ten_clients_at_once_of_which_one_floods_and_no_step_is_late(puller: Any
             await asyncio.sleep(0.01)
         return len(seen)
 
-    async def floods(hand: Hand) -> int:
+    async def floods(hand):
         refused = 0
         for _ in range(100):
             codes = await asyncio.gather(*(hand.write(**{PULL: 99.0}) for _ in range(10)))
             refused += codes.count(["BadOutOfRange"])
         return refused
 
-    async def all_of_them() -> list[int]:
+    async def all_of_them():
         acts = [reads] * 9 + [floods]
         return await asyncio.gather(*(connected(puller.url, act) for act in acts))
 
@@ -100,8 +97,8 @@ def test_ten_clients_at_once_of_which_one_floods_and_no_step_is_late(puller: Any
     assert len(puller.door.events) <= 100
 
 
-def test_a_client_that_dies_in_the_middle_of_a_message_leaves_all_as_it_was(puller: Any) -> None:
-    async def takes(hand: Hand) -> None:
+def test_a_client_that_dies_in_the_middle_of_a_message_leaves_all_as_it_was(puller):
+    async def takes(hand):
         assert await hand.write(**answer(await hand.read("step"), 1.25, 57.2)) == ["Good"] * 3
         await hand.write(**{PULL: 2.0})  # half of what it meant to say
 
@@ -119,7 +116,7 @@ def test_a_client_that_dies_in_the_middle_of_a_message_leaves_all_as_it_was(pull
     assert puller.machine.k - before == pytest.approx(40, abs=8)
 
 
-def test_the_page_is_read_only_on_a_puller_without_accounts(puller: Any) -> None:
+def test_the_page_is_read_only_on_a_puller_without_accounts(puller):
     data = json.load(urllib.request.urlopen(f"http://127.0.0.1:{puller.page}/data"))
     assert (data["user"], data["writes"], data["accounts"]) == ("", False, False)
     assert [row["step"] for row in data["hour"]] == list(range(data["hour"][0]["step"], data["now"]["step"] + 1))
@@ -128,9 +125,7 @@ def test_the_page_is_read_only_on_a_puller_without_accounts(puller: Any) -> None
     assert posted(f"http://127.0.0.1:{puller.page}", {})[0] == 403
 
 
-def posted(
-    page: str, body: Any, user: str = "", kind: str = "application/json", context: Any = None
-) -> tuple[int, str]:
+def posted(page, body, user="", kind="application/json", context=None):
     import base64
 
     headers = {"Content-Type": kind}
@@ -145,7 +140,7 @@ def posted(
             return error.code, error.read().decode()
 
 
-def test_elsewhere_nobody_reads_without_an_account_and_encryption(locked: Any) -> None:
+def test_elsewhere_nobody_reads_without_an_account_and_encryption(locked):
     for user, password in (("", ""), ("olga", "wrong horse"), ("nobody", PASSWORD)):
         with pytest.raises((ua.UaError, ConnectionError, TimeoutError)):
             encrypted(locked, lambda hand: hand.read("step"), user, password)
@@ -154,8 +149,8 @@ def test_elsewhere_nobody_reads_without_an_account_and_encryption(locked: Any) -
     assert any("login as 'olga'" in line for line in locked.door.events)
 
 
-def test_a_reader_reads_and_an_operator_writes(locked: Any) -> None:
-    async def act(hand: Hand) -> tuple[int, list[str]]:
+def test_a_reader_reads_and_an_operator_writes(locked):
+    async def act(hand):
         step = await hand.read("step")
         return step, await hand.write(**answer(step))
 
@@ -165,11 +160,11 @@ def test_a_reader_reads_and_an_operator_writes(locked: Any) -> None:
     assert (locked.folder / "certificates" / "key.pem").stat().st_mode & 0o077 == 0
 
 
-def encrypted(puller: Any, act: Any, user: str, password: str) -> Any:
+def encrypted(puller, act, user, password):
     return with_client(puller.url, act, user, password, puller.folder / "certificates")
 
 
-def test_the_page_elsewhere_is_encrypted_and_only_an_operator_sets_drives(locked: Any) -> None:
+def test_the_page_elsewhere_is_encrypted_and_only_an_operator_sets_drives(locked):
     import ssl
 
     context = ssl.create_default_context(cafile=str(locked.folder / "certificates" / "certificate.pem"))
@@ -189,7 +184,7 @@ def test_the_page_elsewhere_is_encrypted_and_only_an_operator_sets_drives(locked
 
 
 @pytest.mark.slow
-def test_a_killed_server_leaves_a_whole_log(tmp_path: Path) -> None:
+def test_a_killed_server_leaves_a_whole_log(tmp_path):
     log = tmp_path / "log.csv"
     options = ["--speed", "2000", "--port", str(free_port()), "--page-port", "0", "--log", str(log)]
     server = subprocess.Popen([sys.executable, "-m", "cz_gym.serve", *options], cwd=ROOT, stdout=subprocess.PIPE)
@@ -210,7 +205,7 @@ def test_a_killed_server_leaves_a_whole_log(tmp_path: Path) -> None:
     assert rows.notes == ()
 
 
-def test_it_listens_on_the_loopback_unless_told_and_elsewhere_only_with_a_user(refused: Any, monkeypatch: Any) -> None:
+def test_it_listens_on_the_loopback_unless_told_and_elsewhere_only_with_a_user(refused, monkeypatch):
     assert command.commands().parse_args([]).host == "127.0.0.1"
     for host in ("0.0.0.0", "::", "192.168.1.7", "puller.local"):
         assert "--operator and its password are needed" in refused(command.main, ["--host", host])
@@ -221,9 +216,7 @@ def test_it_listens_on_the_loopback_unless_told_and_elsewhere_only_with_a_user(r
     assert re.search("did you mean", refused(command.main, ["--scenario", "pulller"]))
 
 
-def test_a_port_that_is_taken_and_half_a_certificate_are_said_in_one_line(
-    puller: Any, refused: Any, tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_a_port_that_is_taken_and_half_a_certificate_are_said_in_one_line(puller, refused, tmp_path, monkeypatch):
     assert "log.csv: File exists" in refused(command.main, ["--log", str(puller.folder / "log.csv")])
     assert "address already in use" in refused(command.main, ["--port", str(puller.port), "--page-port", "0"]).lower()
     monkeypatch.setenv("CZ_GYM_OPERATOR_PASSWORD", PASSWORD)

@@ -6,7 +6,7 @@
 import json
 import os
 import resource
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,7 +43,7 @@ class Target(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def known(ppo: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Target]]:
+def known(ppo, tmp_path_factory):
     """Every kind of file that the project reads back; memory is bounded while they are read."""
     folder, contract, network = tmp_path_factory.mktemp("hostile"), *read_agent(shipped())
     facts = {name: value for name, value in vars(contract).items() if name not in ("observation_hash", "sha256")}
@@ -52,10 +52,10 @@ def known(ppo: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[s
     run = {"algorithm": "ppo", "seed": 0, "settings": {}, "steps": 100, "sessions": [{"from_step": 0}]}
     settings = json.dumps(run)
 
-    def kept(seed: bytes, name: str, read: Callable[[Path], Any]) -> Target:
+    def kept(seed, name, read):
         return Target(seed, lambda content: ((folder / name).write_bytes(content), read(folder / name)))
 
-    def restored(path: Path) -> None:
+    def restored(path):
         restore(ppo, load_checkpoint(path)[1], path)
 
     targets = {
@@ -75,7 +75,7 @@ def known(ppo: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[s
     resource.setrlimit(resource.RLIMIT_AS, limits)
 
 
-def refused(read: Callable[[bytes], Any], content: bytes) -> bool:
+def refused(read, content):
     """Whether a file is refused with one line; anything else that is raised passes."""
     try:
         read(content)
@@ -88,7 +88,7 @@ def refused(read: Callable[[bytes], Any], content: bytes) -> bool:
 
 
 @st.composite
-def odd_bytes(draw: Any, seed: bytes) -> bytes:
+def odd_bytes(draw, seed):
     """Parts removed, overwritten, repeated and cut; most often at the start, which says what the rest means."""
     content = bytearray(seed)
     for where, size, new, times in draw(EDITS):
@@ -101,7 +101,7 @@ def odd_bytes(draw: Any, seed: bytes) -> bytes:
 
 
 @st.composite
-def odd_json(draw: Any, seed: bytes) -> bytes:
+def odd_json(draw, seed):
     """Members removed, added and replaced, at the top or one level below."""
     data = json.loads(seed)
     for _ in range(draw(st.integers(1, 3))):
@@ -114,16 +114,16 @@ def odd_json(draw: Any, seed: bytes) -> bytes:
 
 
 @st.composite
-def odd_header(draw: Any, seed: bytes) -> bytes:
+def odd_header(draw, seed):
     """A checkpoint whose list of tensors says something else than it holds, or names another."""
     size = int.from_bytes(seed[:8], "little")
     text = seed[8 : 8 + size]
     text = draw(st.just(text.replace(b"weight", b"height", 1)) | odd_json(text))
-    said: int = draw(st.sampled_from((len(text), size, 2**62)))
+    said = draw(st.sampled_from((len(text), size, 2**62)))
     return said.to_bytes(8, "little") + text + seed[8 + size :]
 
 
-MUTANTS: dict[str, Any] = {
+MUTANTS = {
     "agent.onnx": odd_bytes, "agent.json": odd_json, "checkpoint": odd_header, "settings.json": odd_json,
     "progress.csv": odd_bytes,
 }  # fmt: skip
@@ -131,14 +131,14 @@ MUTANTS: dict[str, Any] = {
 
 @pytest.mark.parametrize("kind", MUTANTS)
 @given(data=st.data())
-def test_damaged_files_are_read_or_refused(known: dict[str, Target], kind: str, data: st.DataObject) -> None:
+def test_damaged_files_are_read_or_refused(known, kind, data):
     seed, read = known[kind]
     assert not refused(read, seed)
     for content in data.draw(st.tuples(MUTANTS[kind](seed), odd_bytes(seed), st.binary(max_size=300))):
         refused(read, content)
 
 
-def test_pipes_devices_and_folders_are_refused_at_once(tmp_path: Path) -> None:
+def test_pipes_devices_and_folders_are_refused_at_once(tmp_path):
     os.mkfifo(tmp_path / "pipe.onnx")
     for path in (tmp_path / "pipe.onnx", Path("/dev/zero"), tmp_path, Path("a\0b.onnx"), Path("")):
         with pytest.raises(AgentFileError, match=r"regular file|cannot be read|null|not an .onnx agent file"):

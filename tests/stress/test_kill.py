@@ -11,8 +11,6 @@ import signal
 import threading
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 from tqdm import tqdm
@@ -45,16 +43,16 @@ Rollouts have 2,048 steps, and a validation follows every second one.
 """
 
 
-def kill_at(point: str) -> None:
+def kill_at(point):
     """Have this process kill itself in place of a call."""
     here, _, later = point.partition(">")
     module, name, turn = here.split(":")
     *path, last = name.split(".")
-    owner: Any = functools.reduce(getattr, path, importlib.import_module(module))
+    owner = functools.reduce(getattr, path, importlib.import_module(module))
     function, calls = getattr(owner, last), itertools.count(1)
 
     @functools.wraps(function)
-    def counted(*given: Any, **named: Any) -> Any:
+    def counted(*given, **named):
         if next(calls) == int(turn):
             if not later:
                 os.kill(os.getpid(), signal.SIGKILL)
@@ -64,7 +62,7 @@ def kill_at(point: str) -> None:
     setattr(owner, last, counted)
 
 
-def training(arguments: list[str], point: str | None, log: Path) -> None:
+def training(arguments, point, log):
     """train.py on less of everything, with a checkpoint at every step, up to a point."""
     tqdm.set_lock(threading.RLock())  # its own is a semaphore, which a killed process leaves behind
     validation.PICKING, validation.JUDGING, run.VALIDATE_EVERY = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4], 4096
@@ -76,7 +74,7 @@ def training(arguments: list[str], point: str | None, log: Path) -> None:
     os._exit(code)
 
 
-def ended(arguments: list[str], point: str | None, log: Path) -> int | None:
+def ended(arguments, point, log):
     """Exit code of a training in a process of its own."""
     process = FRESH.Process(target=training, args=(arguments, point, log))
     process.start()
@@ -84,7 +82,7 @@ def ended(arguments: list[str], point: str | None, log: Path) -> int | None:
     return process.exitcode
 
 
-def is_torn(folder: Path) -> bool:
+def is_torn(folder):
     """Whether a file is older than the checkpoint; all are written anew, as a resumed run does first."""
     if not (folder / run.CHECKPOINT).exists():
         return False
@@ -94,14 +92,14 @@ def is_torn(folder: Path) -> bool:
     return torn
 
 
-def reached(out: Path) -> int:
+def reached(out):
     """The step at which a killed run stands; what it left is whole and agrees with itself."""
     if not (out / run.CHECKPOINT).exists():
         assert not (out / "settings.json").exists(), "settings without a checkpoint"
         return 0
     progress, *_ = load_checkpoint(out / run.CHECKPOINT)
     file, summary = out / "progress.csv", out / "summary.json"
-    rows: list[dict[str, Any]] = list(csv.DictReader(file.read_text().splitlines())) if file.exists() else []
+    rows = list(csv.DictReader(file.read_text().splitlines())) if file.exists() else []
     best = min((float(row["validation_cost"]) for row in rows), default=None)
     assert best == progress.best_cost
     if best is not None:
@@ -112,7 +110,7 @@ def reached(out: Path) -> int:
 
 
 @pytest.mark.slow
-def test_a_training_run_killed_in_every_phase_goes_on(tmp_path: Path) -> None:
+def test_a_training_run_killed_in_every_phase_goes_on(tmp_path):
     """One run, killed at each point in turn and resumed until nothing is left to do."""
     out, log, torn = tmp_path / "run", tmp_path / "log", []
     for phase, (point, step) in PHASES.items():

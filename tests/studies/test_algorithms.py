@@ -1,8 +1,5 @@
 """Comparisons of algorithms: agents are evaluated on crystals that did not choose them."""
 
-from pathlib import Path
-from typing import Any
-
 import pytest
 
 from cz_gym.agents.training import validation
@@ -12,14 +9,14 @@ from studies import algorithms, leaderboard
 from tests.small_learners import REFERENCES, SMALL, SMALL_APG, train_small_seed
 
 
-def test_evaluation_crystals_neither_select_nor_test() -> None:
+def test_evaluation_crystals_neither_select_nor_test():
     judged = set(validation.JUDGING)
     assert judged <= set(VALIDATION_SEEDS)
     assert not judged & (set(validation.PICKING) | set(TEST_SEEDS))
 
 
 @pytest.mark.usefixtures("few_crystals")
-def test_finished_runs_are_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Any) -> None:
+def test_finished_runs_are_compared(tmp_path, monkeypatch, refused):
     monkeypatch.setattr(leaderboard, "ROWS", ROWS[:2])
     assert "no finished run" in refused(algorithms.main, [str(tmp_path)])
     for recipe in (SMALL, SMALL_APG):

@@ -1,8 +1,5 @@
 """The Bode plot of any controller: the design table's margins, and one line where there is none."""
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -27,7 +24,7 @@ class Gain:
 """
 
 
-def test_a_controllers_margins_are_the_design_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_controllers_margins_are_the_design_tables(tmp_path, capsys):
     assert bode.main(["lqg", "--out", str(tmp_path / "lqg.png")]) == 0
     assert (tmp_path / "lqg.png").read_bytes().startswith(b"\x89PNG")
     form = bode.form_of("lqg")
@@ -35,7 +32,7 @@ def test_a_controllers_margins_are_the_design_tables(tmp_path: Path, capsys: pyt
     assert f"| ring | {expected.crossover:.2e} | {expected.gain_up:.3g} |" in capsys.readouterr().out
 
 
-def test_phases_are_read_against_minus_180_degrees() -> None:
+def test_phases_are_read_against_minus_180_degrees():
     """The phase above -180 degrees at a gain of one is python-control's phase margin."""
     form, puller = bode.form_of("paper"), make_puller(lam=1.0)
     omega, found = bode.frequencies(form.dt), loop_margins(form.free, puller, form.dt, "v_p")
@@ -45,7 +42,7 @@ def test_phases_are_read_against_minus_180_degrees() -> None:
     assert phase[at] + 180.0 == pytest.approx(found.phase_deg, abs=1.0)
 
 
-def test_a_gain_alone_in_a_file_of_one_s_own_needs_neither_memory_nor_interval(tmp_path: Path) -> None:
+def test_a_gain_alone_in_a_file_of_one_s_own_needs_neither_memory_nor_interval(tmp_path):
     (tmp_path / "my.py").write_text(GAIN)
     form = bode.form_of(f"{tmp_path / 'my.py'}:Gain")
     assert (form.dt, form.controller.A.shape) == (5.0, (0, 0))
@@ -63,9 +60,7 @@ def test_a_gain_alone_in_a_file_of_one_s_own_needs_neither_memory_nor_interval(t
         (["lqg", "--mix", "2"], "must lie in"),
     ],
 )
-def test_a_controller_without_a_bode_plot_is_refused_in_one_line(
-    given: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Any
-) -> None:
+def test_a_controller_without_a_bode_plot_is_refused_in_one_line(given, said, tmp_path, monkeypatch, refused):
     (tmp_path / "my.py").write_text(OWN)
     monkeypatch.chdir(tmp_path)
     assert said in refused(bode.main, given)

@@ -1,7 +1,6 @@
 """The camera's study, made small: what it says of the ring, and that its pictures can be drawn."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from studies import camera as study
 
 
 @pytest.mark.slow
-def test_the_study_measures_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_study_measures_and_draws(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "RADII", np.linspace(-8.0, 8.0, 3) * MM)
     monkeypatch.setattr(study, "HEIGHTS", np.zeros(1))
     monkeypatch.setattr(study, "HORIZON", 20.0)

@@ -1,8 +1,6 @@
 """Model cards: every shipped agent has one, with the benchmark's own figures."""
 
 import json
-from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -12,7 +10,7 @@ from studies import cards
 FIGURES = {key: {"mean": 0.0, "ci95": [0.0, 0.5]} for key in (*cards.FIGURES, cards.RETURN)}
 
 
-def test_every_shipped_agent_has_a_card_with_the_benchmark_s_figures(tmp_path: Path) -> None:
+def test_every_shipped_agent_has_a_card_with_the_benchmark_s_figures(tmp_path):
     assert {path.stem.rpartition("-seed")[0] for path in agents.MODELS.glob("*.onnx")} == set(cards.AGENTS)
     lost = {**FIGURES, "rmse_mm": {"mean": 1.25, "ci95": [1.0, 2.0]}, "failure_rate": {"mean": 0.25, "ci95": None}}
     results = {
@@ -36,7 +34,7 @@ def test_every_shipped_agent_has_a_card_with_the_benchmark_s_figures(tmp_path: P
         )
 
 
-def test_another_file_is_refused_in_one_line(tmp_path: Path, refused: Any) -> None:
+def test_another_file_is_refused_in_one_line(tmp_path, refused):
     (tmp_path / "some.json").write_text("[]")
     command = ["--benchmark", str(tmp_path / "some.json"), "--out", str(tmp_path / "cards.md")]
     assert "some.json is no benchmark.json" in refused(cards.main, command)

@@ -1,9 +1,6 @@
 """The price of robustness: each controller before, after and told."""
 
 from functools import partial
-from typing import Any
-
-import pytest
 
 from cz_gym.baselines.lqg.designs import TOLD
 from cz_gym.baselines.registry import make_controller
@@ -12,7 +9,7 @@ from studies import hot_zone
 from tests.observed import PLAIN
 
 
-def test_a_controller_before_has_the_settings_of_the_one_that_ships_for_nominal_hot_zones() -> None:
+def test_a_controller_before_has_the_settings_of_the_one_that_ships_for_nominal_hot_zones():
     config = make_config("hot-zone", **PLAIN)
     found, nominal = hot_zone.versions("lqg-at-0.02", config), make_controller(TOLD, config)
     assert found["before"] == nominal != found["after"]
@@ -20,7 +17,7 @@ def test_a_controller_before_has_the_settings_of_the_one_that_ships_for_nominal_
     assert "told" not in hot_zone.versions("lqg-at-0.02-adaptive", config)
 
 
-def test_the_command_prints_a_row_a_controller(monkeypatch: pytest.MonkeyPatch, capsys: Any, refused: Any) -> None:
+def test_the_command_prints_a_row_a_controller(monkeypatch, capsys, refused):
     monkeypatch.setattr(hot_zone, "make_config", partial(make_config, horizon=300.0))
     assert hot_zone.main(["--episodes", "2", "--controllers", "paper-tuned,lqg"]) == 0
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -16,7 +15,7 @@ MEAN = {"mean": 0.0125, "ci95": None}
 
 
 @pytest.fixture
-def submissions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def submissions(tmp_path, monkeypatch):
     """A folder with one submission, the shipped PPO under another name, with a claim that is too good."""
     monkeypatch.setattr(leaderboard, "ROWS", ROWS[:1])
     monkeypatch.setattr(leaderboard, "CONTROLLERS", leaderboard.CONTROLLERS[:2])
@@ -32,7 +31,7 @@ def submissions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder.parent
 
 
-def test_a_claim_stands_beside_what_fresh_crystals_show(submissions: Path, tmp_path: Path) -> None:
+def test_a_claim_stands_beside_what_fresh_crystals_show(submissions, tmp_path):
     command = [str(submissions), "--episodes", "2", "--first-seed", "3000007", "--out", str(tmp_path)]
     assert leaderboard.main(command) == 0
     page = (tmp_path / "leaderboard.md").read_text()
@@ -49,18 +48,18 @@ def test_a_claim_stands_beside_what_fresh_crystals_show(submissions: Path, tmp_p
 @pytest.mark.parametrize(
     ("steps", "name"), [(1_048_576, "1 M"), (1_100_000, "5 M"), (5_242_880, "5 M"), (20_447_232, "20 M"), (6e7, "open")]
 )
-def test_an_agent_has_the_smallest_budget_that_its_longest_training_keeps(steps: int, name: str) -> None:
+def test_an_agent_has_the_smallest_budget_that_its_longest_training_keeps(steps, name):
     """The recipe ppo, asked for 1, 5 and 20 million steps, ends with its update: after 2,048 x 64 x 4 steps each."""
     trained = [SimpleNamespace(contract=SimpleNamespace(training_steps=each)) for each in (9, steps)]
     assert leaderboard.budget(cast("Any", SimpleNamespace(trained=trained))) == name
 
 
-def test_fresh_seeds_are_nobody_else_s() -> None:
+def test_fresh_seeds_are_nobody_else_s():
     taken = {seed for row in ROWS for seed in row.seeds(500)} | {TRAINING_SEEDS.stop}
     assert max(taken) < leaderboard.FRESH.start
 
 
-def test_what_is_no_submission_is_named(submissions: Path, tmp_path: Path, refused: Any) -> None:
+def test_what_is_no_submission_is_named(submissions, tmp_path, refused):
     assert "no such" in refused(leaderboard.main, [str(tmp_path / "nowhere")]).lower()
     empty = tmp_path / "empty"
     empty.mkdir()

@@ -3,7 +3,6 @@
 import json
 import timeit
 from functools import partial
-from pathlib import Path
 
 import gymnasium as gym
 import pytest
@@ -19,13 +18,11 @@ SMALL = {
 
 
 @pytest.fixture(autouse=True)
-def one_call(monkeypatch: pytest.MonkeyPatch) -> None:
+def one_call(monkeypatch):
     monkeypatch.setattr(timeit.Timer, "autorange", lambda timer: (1, 0.0))
 
 
-def test_the_speed_command_writes_json_and_prints_a_table(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_speed_command_writes_json_and_prints_a_table(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(speed, "cases", lambda quick: {**SMALL, "peer": partial(__import__, "no_such_package")})
     file = tmp_path / "new" / "speed.json"
     assert speed.main(["--quick", "--json", str(file)]) == 0
@@ -40,7 +37,7 @@ def test_the_speed_command_writes_json_and_prints_a_table(
 
 
 @pytest.mark.slow
-def test_every_row_of_ours_can_be_made_and_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_row_of_ours_can_be_made_and_steps(monkeypatch):
     monkeypatch.setattr(speed, "SLOTS", 8)
     monkeypatch.setattr(speed, "SB3_SLOTS", 2)
     peers = ("EnvPool", "pc-gym")

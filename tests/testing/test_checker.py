@@ -1,7 +1,6 @@
 """The checker fires on each way to break a vector environment, and says which in one line."""
 
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -21,48 +20,48 @@ class Walk(gym.Env[Any, Any]):
     observation_space: Any = Dict({"x": Box(-np.inf, np.inf, (2,), np.float32), "t": Box(0, 9, (1,), np.float32)})
     action_space: Any = Box(-1, 1, (1,), np.float32)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.x, self.k = self.np_random.normal(size=2), 0
         return self._shown(), {"far": float(np.abs(self.x).max())}
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action):
         self.x, self.k = self.x + action[0] + self.np_random.normal(size=2), self.k + 1
         far = float(np.abs(self.x).max())
         return self._shown(), -far, far > 4.0, self.k >= 8, {"far": far, "hit": far > 2.0}
 
-    def _shown(self) -> Any:
+    def _shown(self):
         return {"x": self.x.astype(np.float32), "t": np.array([self.k], np.float32)}
 
 
 class Conforming(SyncVectorEnv):
     """Gymnasium's own vector of walks: what the toys below break."""
 
-    def __init__(self, num_envs: int, mode: AutoresetMode) -> None:
+    def __init__(self, num_envs, mode):
         super().__init__([Walk] * num_envs, autoreset_mode=mode, copy=True)
 
 
 def odd(
-    made: Callable[[Any], Any] = lambda env: None,
-    reset: Callable[[Any, Any], dict[str, Any]] = lambda seed, options: {},
-    acts: Callable[[Any], Any] = lambda actions: actions,
-    step: Callable[..., Any] = lambda *result: result,
-    after: Callable[[Any], Any] = lambda actions: None,
-    fewer: int = 0,
-    always: AutoresetMode | None = None,
-) -> type[Conforming]:
+    made=lambda env: None,
+    reset=lambda seed, options: {},
+    acts=lambda actions: actions,
+    step=lambda *result: result,
+    after=lambda actions: None,
+    fewer=0,
+    always=None,
+):
     """A vector that is changed once it is made, resets with other arguments, takes other actions, returns something
     else from a step, or does something to the actions after it; of fewer slots, or always of one mode."""
 
     class Broken(Conforming):
-        def __init__(self, num_envs: int, mode: AutoresetMode) -> None:
+        def __init__(self, num_envs, mode):
             super().__init__(num_envs - fewer, always or mode)
             made(self)
 
-        def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        def reset(self, *, seed=None, options=None):
             return super().reset(**{"seed": seed, "options": options, **reset(seed, options)})
 
-        def step(self, actions: Any) -> Any:
+        def step(self, actions):
             result = step(*super().step(acts(actions)))
             after(actions)
             return result
@@ -73,13 +72,13 @@ def odd(
 class Repeating(Conforming):
     """Autoreset replays each slot's first state, as in brax."""
 
-    def __init__(self, num_envs: int, mode: AutoresetMode) -> None:
+    def __init__(self, num_envs, mode):
         super().__init__(num_envs, mode)
         for env in self.envs:
-            env.reset = functools.partial(self._again, env)  # type: ignore[method-assign]
+            env.reset = functools.partial(self._again, env)
 
     @staticmethod
-    def _again(env: Any, seed: int | None = None, options: Any = None) -> Any:
+    def _again(env, seed=None, options=None):
         shown = Walk.reset(env, seed=seed, options=options)
         if seed is not None or not hasattr(env, "first"):
             env.first = env.x.copy()
@@ -88,7 +87,7 @@ class Repeating(Conforming):
         return env._shown(), {"far": float(np.abs(env.x).max())}
 
 
-def next_first(observation: Any, *rest: Any) -> Any:
+def next_first(observation, *rest):
     """The final observation is the next episode's first."""
     infos = rest[-1]
     for i in np.flatnonzero(infos.get("_final_obs", [])):
@@ -99,7 +98,7 @@ def next_first(observation: Any, *rest: Any) -> Any:
 class Recycled(Conforming):
     """Rewards alternate between two arrays."""
 
-    def step(self, actions: Any) -> Any:
+    def step(self, actions):
         if not hasattr(self, "arrays"):
             self.arrays = [np.zeros(self.num_envs), np.zeros(self.num_envs)]
         observation, reward, *rest = super().step(actions)
@@ -113,19 +112,19 @@ class ReadBack(Conforming):
 
     last: Any = None
 
-    def step(self, actions: Any) -> Any:
+    def step(self, actions):
         observation, reward, *rest = super().step(actions)
         if self.last is not None:
             reward = reward + (self.last[0] - self.last[1])
         self.last = self.remembered(reward, actions)
         return observation, reward, *rest
 
-    def remembered(self, reward: Any, actions: Any) -> Any:
+    def remembered(self, reward, actions):
         return reward, reward.copy()
 
 
 class KeepsActions(ReadBack):
-    def remembered(self, reward: Any, actions: Any) -> Any:
+    def remembered(self, reward, actions):
         return actions[:, 0], actions[:, 0].copy()
 
 
@@ -133,7 +132,7 @@ REWARD = odd(step=lambda observation, reward, *rest: (observation, reward * [1.0
 TIMEOUT = odd(step=lambda o, r, failed, truncated, i: (o, r, failed | truncated, np.zeros_like(truncated), i))
 """The time limit is returned as a failure, as in pc-gym."""
 NEXT, SAME, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
-BROKEN: dict[str, tuple[type[Conforming], str, AutoresetMode]] = {
+BROKEN = {
     "space": (odd(lambda env: setattr(env, "single_action_space", Box(-2, 2, (1,)))), "single_action_space is", NEXT),
     "batched": (odd(lambda env: setattr(env, "action_space", env.single_action_space)),
                 "action_space is .* the batch of 3 is", NEXT),
@@ -168,7 +167,7 @@ BROKEN: dict[str, tuple[type[Conforming], str, AutoresetMode]] = {
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_gymnasiums_own_vector_conforms(mode: AutoresetMode) -> None:
+def test_gymnasiums_own_vector_conforms(mode):
     checked = check_vector_env(Conforming, Walk, steps=40, modes=[mode])
     assert checked.steps == 4 * 40
     assert checked.episodes > checked.failures > 10
@@ -176,7 +175,7 @@ def test_gymnasiums_own_vector_conforms(mode: AutoresetMode) -> None:
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_each_break_is_named_in_one_line(name: str) -> None:
+def test_each_break_is_named_in_one_line(name):
     make, says, mode = BROKEN[name]
     with pytest.raises(NotConforming, match=says) as found:
         check_vector_env(make, Walk, steps=40, modes=[mode])
@@ -184,11 +183,11 @@ def test_each_break_is_named_in_one_line(name: str) -> None:
     assert str(found.value).startswith(f"[{mode.value}] ")
 
 
-def test_a_replayed_start_is_found_where_no_seed_shows_it() -> None:
+def test_a_replayed_start_is_found_where_no_seed_shows_it():
     class Replays(Repeating):
         """A reset of the user's draws; only autoreset replays."""
 
-        def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        def reset(self, *, seed=None, options=None):
             for env in self.envs:
                 if options is None:
                     env.__dict__.pop("first", None)
@@ -198,9 +197,9 @@ def test_a_replayed_start_is_found_where_no_seed_shows_it() -> None:
         check_vector_env(Replays, Walk, steps=40, modes=[AutoresetMode.NEXT_STEP])
 
 
-def test_a_check_that_sees_no_end_is_no_check() -> None:
+def test_a_check_that_sees_no_end_is_no_check():
     class Endless(Walk):
-        def step(self, action: Any) -> Any:
+        def step(self, action):
             observation, reward, _, _, info = super().step(action)
             return observation | {"t": np.zeros(1, np.float32)}, reward, False, False, info
 
@@ -209,6 +208,6 @@ def test_a_check_that_sees_no_end_is_no_check() -> None:
 
 
 @pytest.mark.parametrize("arguments", [{"num_envs": 1}, {"steps": 1}, {"modes": []}])
-def test_bad_arguments_are_refused(arguments: dict[str, Any]) -> None:
+def test_bad_arguments_are_refused(arguments):
     with pytest.raises(ValueError, match="a check needs num_envs"):
         check_vector_env(Conforming, Walk, **arguments)

@@ -2,8 +2,6 @@
 
 import json
 import os
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
@@ -23,13 +21,13 @@ CONFIG = make_config(observation="history")
 
 
 @pytest.fixture
-def agent(ppo: Any, tmp_path: Path) -> Path:
+def agent(ppo, tmp_path):
     path = tmp_path / "agent.onnx"
     write_agent(path, to_onnx(ppo.policy, 72), **facts())
     return path
 
 
-def test_one_observation_and_a_batch_of_one_act_alike(agent: Path) -> None:
+def test_one_observation_and_a_batch_of_one_act_alike(agent):
     policy = OnnxPolicy.load(agent)
     seen = np.random.default_rng(0).uniform(-3.0, 3.0, (1, len(HISTORY))).astype(np.float32)
     np.testing.assert_array_equal(policy.predict(seen)[0][0], policy.predict(seen[0])[0])
@@ -52,7 +50,7 @@ def test_one_observation_and_a_batch_of_one_act_alike(agent: Path) -> None:
         ({"validation_rmse_mm": float("inf")}, "must be finite"),
     ],
 )
-def test_broken_promises_are_refused(agent: Path, change: dict[str, Any], message: str) -> None:
+def test_broken_promises_are_refused(agent, change, message):
     contract = agent.with_suffix(".json")
     contract.write_text(json.dumps({**json.loads(contract.read_text()), **change}))
     with pytest.raises(AgentFileError, match=message) as caught:
@@ -60,12 +58,12 @@ def test_broken_promises_are_refused(agent: Path, change: dict[str, Any], messag
     assert "\n" not in str(caught.value)
 
 
-def last_bias(model: Any, value: Any) -> None:
+def last_bias(model, value):
     (weight,) = (each for each in model.graph.initializer if each.name == model.graph.node[-2].input[2])
     weight.CopyFrom(onnx.numpy_helper.from_array(value, weight.name))
 
 
-def infinity_less_infinity(model: Any) -> None:
+def infinity_less_infinity(model):
     last_bias(model, np.full(2, 3e38, np.float32))
     (beta,) = (each for each in model.graph.node[-2].attribute if each.name == "beta")
     beta.f = 2.0
@@ -81,7 +79,7 @@ def infinity_less_infinity(model: Any) -> None:
         (lambda model: last_bias(model, np.zeros(900, np.float32)), "cannot be run"),
     ],
 )
-def test_networks_that_give_no_action_are_refused(change: Any, message: str, agent: Path) -> None:
+def test_networks_that_give_no_action_are_refused(change, message, agent):
     model = onnx.load_from_string(agent.read_bytes())
     change(model)
     write_agent(agent, model.SerializeToString(), **facts())
@@ -89,11 +87,11 @@ def test_networks_that_give_no_action_are_refused(change: Any, message: str, age
         OnnxPolicy.load(agent)
 
 
-def test_an_agent_loads_where_the_system_has_no_pipes_to_wait_for(agent: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_agent_loads_where_the_system_has_no_pipes_to_wait_for(agent, monkeypatch):
     """Windows has no O_NONBLOCK, and a flag of its own without which a file would end at a Ctrl-Z."""
     binary, opened, by_system = 1 << 28, [], os.open
 
-    def opening(path: Any, flags: int, *rest: Any, **named: Any) -> int:
+    def opening(path, flags, *rest, **named):
         opened.append((str(path), flags & binary))
         return by_system(path, flags & ~binary, *rest, **named)
 
@@ -104,13 +102,13 @@ def test_an_agent_loads_where_the_system_has_no_pipes_to_wait_for(agent: Path, m
     assert (str(agent), binary) in opened
 
 
-def test_an_oversized_file_is_refused(agent: Path) -> None:
+def test_an_oversized_file_is_refused(agent):
     agent.write_bytes(b"0" * (MAX_BYTES + 1))
     with pytest.raises(AgentFileError, match="larger than"):
         OnnxPolicy.load(agent)
 
 
-def test_shipped_agent_beats_the_paper_s_controller_on_validation() -> None:
+def test_shipped_agent_beats_the_paper_s_controller_on_validation():
     seeds = range(1_000_000, 1_000_030)
     policy = OnnxPolicy.load(shipped(), CONFIG)
     agent, paper = (metrics(rollout(each, make_config(**each.settings), seeds)) for each in (policy, CompensatedPID()))

@@ -1,8 +1,6 @@
 """Agents' graphs: what may run, and that hostile ones are refused before anything large or foreign happens."""
 
 import sys
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import onnx
@@ -22,20 +20,20 @@ CHANNELS = len(MEASURED)
 WEIGHTS = {"weight": np.full((CHANNELS, 2), 0.01, np.float32), "bias": np.zeros(2, np.float32)}
 
 
-def model_of(nodes: list[Any] | None = None, weights: dict[str, Any] | None = None, **changes: Any) -> Any:
+def model_of(nodes=None, weights=None, **changes):
     return contracts.model_of(
         [LINEAR] if nodes is None else nodes, WEIGHTS if weights is None else weights, CHANNELS, **changes
     )
 
 
-def policy_of(model: Any) -> OnnxPolicy:
+def policy_of(model):
     config = make_config()
     content = model if isinstance(model, bytes) else model.SerializeToString()
     return OnnxPolicy.of(make_contract(content, **facts("measured", channels=CHANNELS)), content, config)
 
 
 @pytest.mark.parametrize("name", ["gradient", "ppo"])
-def test_the_shipped_agent_is_run_as_it_is_stored(name: str) -> None:
+def test_the_shipped_agent_is_run_as_it_is_stored(name):
     contract, content = read_agent(shipped(name))
     clean, state = checked(content, contract.channels)
     assert (state > 0) == (name == "gradient")
@@ -47,17 +45,17 @@ def test_the_shipped_agent_is_run_as_it_is_stored(name: str) -> None:
         np.testing.assert_array_equal(numpy_helper.to_array(one), numpy_helper.to_array(two))
 
 
-def nodes_of(text: str) -> list[Any]:
+def nodes_of(text):
     """Nodes in ONNX's text format."""
     return list(parser.parse_graph(f"graph (float[n] observation) => (float[n] action) {{ {text} }}").node)
 
 
-def written(text: str, **weights: Any) -> Any:
+def written(text, **weights):
     """A model of these nodes."""
     return model_of(nodes_of(text), {**WEIGHTS, **weights})
 
 
-def test_an_agent_with_a_memory_begins_each_episode_at_zero() -> None:
+def test_an_agent_with_a_memory_begins_each_episode_at_zero():
     """A counter: state + 1 each step, shown as the action."""
     nodes = nodes_of("next_state = Add(state, one) still = MatMul(observation, zero) action = Add(still, next_state)")
     weights = {"one": np.float32([[0.25, 0.5]]), "zero": np.zeros((CHANNELS, 2), np.float32)}
@@ -84,13 +82,13 @@ LOOP = """
 """
 
 
-def branch() -> Any:
+def branch():
     model = written("action = Identity(observation)")
     model.graph.node[0].attribute.append(helper.make_attribute("then_branch", graph_of([LINEAR], WEIGHTS, CHANNELS)))
     return model
 
 
-def external(location: str) -> Any:
+def external(location):
     model = model_of()
     tensor = model.graph.initializer[0]
     tensor.ClearField("raw_data")
@@ -101,25 +99,25 @@ def external(location: str) -> Any:
     return model
 
 
-def changed(change: Callable[[Any], Any]) -> Any:
+def changed(change):
     model = model_of()
     change(model)
     return model
 
 
-def deep(nodes: int, width: int) -> Any:
+def deep(nodes, width):
     chain = "".join(f"x{i + 1} = Mul(x{i}, one) " for i in range(nodes))
     first, last = np.ones((CHANNELS, width), np.float32), np.ones((width, 2), np.float32)
     text = f"x0 = MatMul(observation, first) {chain} action = MatMul(x{nodes}, last)"
     return written(text, first=first, last=last, one=np.ones(1, np.float32))
 
 
-def broadcast_bomb() -> Any:
+def broadcast_bomb():
     weights = {name: np.zeros((1000,) + (1,) * (i + 2), np.float32) for i, name in enumerate("abc")}
     return written("x = Add(observation, a) y = Add(x, b) z = Add(y, c) action = Gemm(z, weight, bias)", **weights)
 
 
-def honest_shape(model: Any, dims: list[int]) -> None:
+def honest_shape(model, dims):
     del model.graph.initializer[0].dims[:]
     model.graph.initializer[0].dims.extend(dims)
 
@@ -217,7 +215,7 @@ OPSET = b"\x42\x02\x10\x11"
 """A model's first bytes: standard operators, version 17."""
 
 
-def field(tag: bytes, content: bytes) -> bytes:
+def field(tag, content):
     """A part of a message, in the ONNX format's encoding."""
     length, size = b"", len(content)
     while size > 127:
@@ -226,7 +224,7 @@ def field(tag: bytes, content: bytes) -> bytes:
     return tag + length + bytes([size]) + content
 
 
-def nested() -> bytes:
+def nested():
     """Graphs in attributes in nodes in graphs, 1200 deep."""
     content = b""
     for tag in (b"\x3a", b"\x0a", b"\x2a", b"\x32") * 300:
@@ -235,7 +233,7 @@ def nested() -> bytes:
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_hostile_graphs_are_refused_with_the_reason(name: str) -> None:
+def test_hostile_graphs_are_refused_with_the_reason(name):
     make, reason = HOSTILE[name]
     with pytest.raises(AgentFileError) as caught:
         policy_of(make())
@@ -245,7 +243,7 @@ def test_hostile_graphs_are_refused_with_the_reason(name: str) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits and measures memory as Linux does")
-def test_hostile_graphs_stay_within_a_small_memory() -> None:
+def test_hostile_graphs_stay_within_a_small_memory():
     """All of them in one process that may not have a gigabyte beyond what importing takes."""
     code = (
         "import resource, sys\n"
@@ -265,7 +263,7 @@ def test_hostile_graphs_stay_within_a_small_memory() -> None:
     python("-c", code)
 
 
-def test_every_operator_is_a_standard_one_without_control_flow() -> None:
+def test_every_operator_is_a_standard_one_without_control_flow():
     for name in OPERATORS:
         schema = onnx.defs.get_schema(name, 17)
         assert not any("GRAPH" in str(attribute.type) for attribute in schema.attributes.values())

@@ -1,14 +1,11 @@
 """Analytic policy gradients: the gradient is that of differences, and the interface stable-baselines3's."""
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 from stable_baselines3.common.env_util import make_vec_env as scalar_environments
 
-from cz_gym.agents.apg import APG, RecurrentPolicy
+from cz_gym.agents.apg import APG
 from cz_gym.agents.apg.plant_step import StepCost, advance
 from cz_gym.config import make_config
 from cz_gym.cost import SCALES, WEIGHTS, saturated
@@ -16,16 +13,16 @@ from cz_gym.differentiable import STATES, DifferentiableBatch
 from cz_gym.errors import CzError
 from cz_gym.sb3 import make_vec_env
 
-SETTINGS: dict[str, Any] = {"observation": "measured", "action": "rate"}
+SETTINGS = {"observation": "measured", "action": "rate"}
 CONFIG = make_config(**SETTINGS)
 
 
-def algorithm(n: int = 8, window: int = 20, seed: int = 0, **options: Any) -> APG:
+def algorithm(n=8, window=20, seed=0, **options):
     torch.set_num_threads(1)
     return APG("RecurrentPolicy", make_vec_env(n, **SETTINGS), window=window, seed=seed, **options)
 
 
-def some_policy(interval: float = 5.0) -> RecurrentPolicy:
+def some_policy(interval=5.0):
     """A policy with random weights, which moves both drives a little."""
     torch.manual_seed(0)
     policy = algorithm().policy
@@ -37,7 +34,7 @@ def some_policy(interval: float = 5.0) -> RecurrentPolicy:
     return policy
 
 
-def driven(policy: RecurrentPolicy, batch: DifferentiableBatch, steps: int) -> torch.Tensor:
+def driven(policy, batch, steps):
     """Mean cost of crystals that the policy drives."""
     state, measured = map(torch.from_numpy, batch.reset(range(batch.num_envs)))
     memory, cost_of, costs = policy.initial_memory(batch.num_envs), StepCost(batch.config), []
@@ -50,7 +47,7 @@ def driven(policy: RecurrentPolicy, batch: DifferentiableBatch, steps: int) -> t
 
 
 @pytest.mark.parametrize(("scenario", "apart"), [("randomized", 0.01), ("sensor-fault", 0.01), ("puller", 0.05)])
-def test_the_gradient_is_that_of_differences(scenario: str, apart: float) -> None:
+def test_the_gradient_is_that_of_differences(scenario, apart):
     """Along a random direction of all weights, through 40 steps of plant, sensors, memory and policy.
 
     The heater of ``puller`` moves in whole steps, which differences see and the gradient does not.
@@ -59,7 +56,7 @@ def test_the_gradient_is_that_of_differences(scenario: str, apart: float) -> Non
     driven(policy, batch, 40).backward()
     parameters = list(policy.parameters())
     directions = [torch.randn_like(parameter) for parameter in parameters]
-    along = sum(float((one.grad * by).sum()) for one, by in zip(parameters, directions, strict=True))  # type: ignore[operator]
+    along = sum(float((one.grad * by).sum()) for one, by in zip(parameters, directions, strict=True))
     costs = []
     with torch.no_grad():
         for share in (2e-3, -4e-3):
@@ -69,7 +66,7 @@ def test_the_gradient_is_that_of_differences(scenario: str, apart: float) -> Non
     assert along == pytest.approx((costs[0] - costs[1]) / 4e-3, rel=apart)
 
 
-def stepped(scenario: str, action: str, actions: Any) -> tuple[Any, Any, Any, Any, StepCost]:
+def stepped(scenario, action, actions):
     """States before and after a step of four crystals, the actions, the batch's own record of it, and the cost."""
     config = make_config(scenario, observation="measured", action=action)
     batch, twin = (DifferentiableBatch(config, 4) for _ in range(2))
@@ -83,14 +80,14 @@ def stepped(scenario: str, action: str, actions: Any) -> tuple[Any, Any, Any, An
 
 
 @pytest.mark.parametrize("action", ["rate", "smooth", "direct"])
-def test_the_cost_is_the_environment_s(action: str) -> None:
+def test_the_cost_is_the_environment_s(action):
     before, (after, _, grows, target), actions, step, cost_of = stepped("sensor-fault", action, np.full((4, 2), 0.05))
     assert np.abs(step.offset).max() > 1e-6
     wanted = saturated(step.cost.sum(axis=1))
     np.testing.assert_allclose(cost_of(before, actions, after, grows, target), wanted, rtol=1e-5)
 
 
-def test_a_pull_step_that_a_limit_cuts_is_charged_as_asked() -> None:
+def test_a_pull_step_that_a_limit_cuts_is_charged_as_asked():
     """On ``puller`` the pull speed moves by 0.025 mm/min in 5 s: its cost and derivative go on beyond."""
     asked = np.array([[0.05, 0.0], [0.5, 0.0], [-0.5, 0.0], [1.0, 0.0]])
     before, (after, _, grows, target), actions, step, cost_of = stepped("puller", "rate", asked)
@@ -105,7 +102,7 @@ def test_a_pull_step_that_a_limit_cuts_is_charged_as_asked() -> None:
     np.testing.assert_array_equal(np.sign(actions.grad[:, 0].numpy()), np.sign(asked[:, 0]))
 
 
-def test_a_lost_crystal_costs_nothing_and_has_no_gradient() -> None:
+def test_a_lost_crystal_costs_nothing_and_has_no_gradient():
     batch = DifferentiableBatch(CONFIG, 2)
     state, _ = map(torch.from_numpy, batch.reset(range(2)))
     batch._batch.memory.slots["x"]["r_c"][1] += 9e-3
@@ -119,7 +116,7 @@ def test_a_lost_crystal_costs_nothing_and_has_no_gradient() -> None:
     assert not action.grad[1].any()
 
 
-def test_predict_is_the_network_step_by_step_and_forgets_where_an_episode_begins() -> None:
+def test_predict_is_the_network_step_by_step_and_forgets_where_an_episode_begins():
     policy = some_policy()
     random, state, memory = np.random.default_rng(0), None, policy.initial_memory(3)
     for step in range(12):
@@ -134,11 +131,11 @@ def test_predict_is_the_network_step_by_step_and_forgets_where_an_episode_begins
     assert single.shape == (2,)
 
 
-def parameters_of(model: APG) -> torch.Tensor:
+def parameters_of(model):
     return torch.cat([each.flatten() for each in model.policy.parameters()])
 
 
-def test_a_saved_model_acts_and_goes_on_as_it_did(tmp_path: Path) -> None:
+def test_a_saved_model_acts_and_goes_on_as_it_did(tmp_path):
     model = algorithm().learn(320)
     model.save(tmp_path / "model.zip")
     again = APG.load(tmp_path / "model.zip", env=make_vec_env(8, **SETTINGS))
@@ -151,10 +148,10 @@ def test_a_saved_model_acts_and_goes_on_as_it_did(tmp_path: Path) -> None:
     assert torch.equal(parameters_of(again), parameters_of(model))
 
 
-def test_callbacks_see_every_step_and_end_the_training() -> None:
-    seen: list[int] = []
+def test_callbacks_see_every_step_and_end_the_training():
+    seen = []
 
-    def callback(known: Any, _: Any) -> bool:
+    def callback(known, _):
         seen.append(known["self"].num_timesteps)
         return len(seen) < 5
 
@@ -162,7 +159,7 @@ def test_callbacks_see_every_step_and_end_the_training() -> None:
     assert seen[:5] == [8, 16, 24, 32, 40]
 
 
-def test_two_seeds_learn_from_other_crystals_and_one_seed_repeats() -> None:
+def test_two_seeds_learn_from_other_crystals_and_one_seed_repeats():
     first, again, other = (parameters_of(algorithm(seed=seed).learn(160)) for seed in (0, 0, 1))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
@@ -175,17 +172,17 @@ def test_two_seeds_learn_from_other_crystals_and_one_seed_repeats() -> None:
         (lambda: make_vec_env(2, observation="history"), "reads observation=\"measured\".*not 'history'"),
     ],
 )
-def test_another_environment_is_refused(env: Any, said: str) -> None:
+def test_another_environment_is_refused(env, said):
     with pytest.raises(CzError, match=said):
         APG("RecurrentPolicy", env())
 
 
-def test_scalar_environments_learn_too() -> None:
+def test_scalar_environments_learn_too():
     env = scalar_environments("Cz-v0", n_envs=2, env_kwargs=SETTINGS)
     assert APG("RecurrentPolicy", env, window=10).learn(40).num_timesteps == 40
 
 
-def test_apg_lowers_the_cost_in_a_few_updates() -> None:
+def test_apg_lowers_the_cost_in_a_few_updates():
     """On the same crystals before and after: from losing them to following the reference for half an hour."""
     model, batch = algorithm(24, 90), DifferentiableBatch(CONFIG, 24)
     before = driven(model.policy, batch, 360).item()

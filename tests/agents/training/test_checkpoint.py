@@ -2,8 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -11,11 +9,10 @@ import torch
 from cz_gym.agents import AgentFileError
 from cz_gym.agents.training.algorithms import make_algorithm
 from cz_gym.agents.training.checkpoint import load_checkpoint, restore, to_bytes
-from cz_gym.agents.training.recipes import Recipe
 from tests.small_learners import SMALL, SMALL_APG, SMALL_SAC, learned, trained
 
 
-def resume(learner: Any, other: Any, path: Path) -> Any:
+def resume(learner, other, path):
     """Have another algorithm go on from a checkpoint of the first; what the checkpoint says of the run."""
     path.write_bytes(to_bytes(learner, 12.0, 0.5))
     progress, tensors, _ = load_checkpoint(path)
@@ -23,7 +20,7 @@ def resume(learner: Any, other: Any, path: Path) -> Any:
     return progress
 
 
-def test_a_checkpoint_continues_and_refuses_what_does_not_fit(ppo: Any, tmp_path: Path) -> None:
+def test_a_checkpoint_continues_and_refuses_what_does_not_fit(ppo, tmp_path):
     path = tmp_path / "checkpoint.safetensors"
     other = make_algorithm(SMALL, 1, 128)
     progress = resume(ppo, other, path)
@@ -38,7 +35,7 @@ def test_a_checkpoint_continues_and_refuses_what_does_not_fit(ppo: Any, tmp_path
         restore(make_algorithm(replace(SMALL, hidden=(8, 8)), 0), tensors, path)
 
 
-def test_a_resumed_run_normalises_rewards_as_before(ppo: Any, tmp_path: Path) -> None:
+def test_a_resumed_run_normalises_rewards_as_before(ppo, tmp_path):
     other = make_algorithm(SMALL, 1)
     resume(ppo, other, tmp_path / "checkpoint.safetensors")
     before, after = ppo.get_vec_normalize_env().ret_rms, other.get_vec_normalize_env().ret_rms
@@ -48,7 +45,7 @@ def test_a_resumed_run_normalises_rewards_as_before(ppo: Any, tmp_path: Path) ->
     assert after.count > before.count
 
 
-def test_weights_that_are_not_finite_are_not_saved() -> None:
+def test_weights_that_are_not_finite_are_not_saved():
     learner = make_algorithm(SMALL, 0)
     with torch.no_grad():
         next(learner.policy.parameters()).fill_(math.nan)
@@ -57,9 +54,7 @@ def test_weights_that_are_not_finite_are_not_saved() -> None:
 
 
 @pytest.mark.parametrize("recipe", [SMALL, SMALL_APG], ids=lambda recipe: recipe.name)
-def test_an_algorithm_restored_before_its_first_update_learns_as_the_one_it_came_from(
-    recipe: Recipe, tmp_path: Path
-) -> None:
+def test_an_algorithm_restored_before_its_first_update_learns_as_the_one_it_came_from(recipe, tmp_path):
     first, second, unsaved = (make_algorithm(recipe, 0) for _ in range(3))
     resume(first, second, tmp_path / "checkpoint.safetensors")
     for algorithm in (first, second, unsaved):
@@ -69,7 +64,7 @@ def test_an_algorithm_restored_before_its_first_update_learns_as_the_one_it_came
     assert all(torch.equal(each, parameters[0]) for each in parameters)
 
 
-def test_a_resumed_sac_keeps_its_temperature(tmp_path: Path) -> None:
+def test_a_resumed_sac_keeps_its_temperature(tmp_path):
     """stable-baselines3 counts it as a variable, not among the parameters."""
     learner, other = make_algorithm(SMALL_SAC, 0), make_algorithm(SMALL_SAC, 1)
     with torch.no_grad():
@@ -79,7 +74,7 @@ def test_a_resumed_sac_keeps_its_temperature(tmp_path: Path) -> None:
     assert other.log_ent_coef in other.ent_coef_optimizer.param_groups[0]["params"]
 
 
-def test_a_resumed_sac_fills_a_new_replay_buffer_before_it_learns(tmp_path: Path) -> None:
+def test_a_resumed_sac_fills_a_new_replay_buffer_before_it_learns(tmp_path):
     other = make_algorithm(SMALL_SAC, 0, 256)
     assert resume(trained(SMALL_SAC), other, tmp_path / "checkpoint.safetensors").steps == 256
     learned(other, replace(SMALL_SAC, steps=256 + 4 * 32))
@@ -101,7 +96,7 @@ def test_a_resumed_sac_fills_a_new_replay_buffer_before_it_learns(tmp_path: Path
         ("elsewhere/weight", lambda tensor: torch.zeros(2), "does not fit"),
     ],
 )
-def test_tensors_that_do_not_belong_are_refused(ppo: Any, name: str, change: Any, message: str, tmp_path: Path) -> None:
+def test_tensors_that_do_not_belong_are_refused(ppo, name, change, message, tmp_path):
     path = tmp_path / "checkpoint.safetensors"
     other = make_algorithm(SMALL, 1)
     path.write_bytes(to_bytes(ppo, 1.0, None))

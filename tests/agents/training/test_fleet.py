@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 from tqdm import tqdm
@@ -22,20 +19,18 @@ pytestmark = pytest.mark.usefixtures("few_crystals")
 SMALL_PPO = replace(QUICK, steps=4096, control_interval=30.0)
 
 
-def in_turn(
-    function: Callable[[Any], Any], tasks: Sequence[Any], look: Callable[[], None]
-) -> Iterator[tuple[int, Any]]:
+def in_turn(function, tasks, look):
     for number, task in enumerate(tasks):
         yield number, function(task)
         look()
 
 
 @pytest.fixture
-def trained(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def trained(monkeypatch):
     """Small runs in this process; the seeds that were trained, in turn."""
-    seeds: list[int] = []
+    seeds = []
 
-    def counted(job: run.Job, bar: Any = None) -> Any:
+    def counted(job, bar=None):
         seeds.append(job.seed)
         return train_small_seed(job, bar)
 
@@ -46,19 +41,17 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return seeds
 
 
-def agents(folder: Path) -> dict[str, bytes]:
+def agents(folder):
     return {path.parent.name: path.read_bytes() for path in sorted(folder.glob("*/agent.onnx"))}
 
 
-def sessions(folder: Path) -> list[int]:
+def sessions(folder):
     """How often each seed's run was begun or resumed."""
     every = (json.loads(path.read_text()) for path in sorted(folder.glob("*/settings.json")))
     return [len(each["sessions"]) for each in every]
 
 
-def test_seeds_come_out_as_one_by_one_and_only_once(
-    trained: list[int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_seeds_come_out_as_one_by_one_and_only_once(trained, tmp_path, capsys):
     several, one = tmp_path / "several", tmp_path / "one"
     assert train.main(["--algo", "ppo", "--seeds", "3-4", "--out", str(several)]) == 0
     assert "seed 4: best agent on 2 validation episodes" in capsys.readouterr().out
@@ -75,12 +68,10 @@ def test_seeds_come_out_as_one_by_one_and_only_once(
     assert "begun with another settings" in capsys.readouterr().err
 
 
-def test_an_unfinished_seed_goes_on_and_longer_runs_do_too(
-    trained: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unfinished_seed_goes_on_and_longer_runs_do_too(trained, tmp_path, monkeypatch):
     finish = run.Run.finish
 
-    def killed(self: run.Run) -> Any:
+    def killed(self):
         if self.seed == 1:
             raise AgentFileError("killed")
         return finish(self)
@@ -100,15 +91,15 @@ def test_an_unfinished_seed_goes_on_and_longer_runs_do_too(
 
 @pytest.mark.parametrize("error", [AgentFileError("the training went wrong"), ValueError("could not be broadcast")])
 def test_one_seed_that_fails_stops_no_other(
-    error: Exception,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    trained: list[int],
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    error,
+    tmp_path,
+    monkeypatch,
+    trained,
+    capsys,
+):
     """An error that the project raises on purpose is one line; any other one is raised with its traceback."""
 
-    def failing(job: run.Job) -> Any:
+    def failing(job):
         if job.seed == 1:
             raise error
         return train_small_seed(job)
@@ -128,7 +119,7 @@ def test_one_seed_that_fails_stops_no_other(
 
 
 @pytest.mark.slow
-def test_processes_train_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_train_the_same(tmp_path, monkeypatch):
     """And the bar counts them all."""
     monkeypatch.setattr(fleet, "train_seed", train_small_seed)
     for place in (tmp_path / "there", tmp_path / "here"):

@@ -6,10 +6,7 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -24,20 +21,18 @@ from tests.small_learners import QUICK
 
 
 @pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch, few_crystals: None) -> None:
+def quick(monkeypatch, few_crystals):
     monkeypatch.setitem(RECIPES, "ppo", QUICK)
     monkeypatch.setitem(RECIPES, "gradient", replace(RECIPES["gradient"], num_envs=64, window=12))
 
 
-def rows(path: Path) -> list[dict[str, str]]:
+def rows(path):
     return list(csv.DictReader(path.read_text().splitlines()))
 
 
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("algorithm", [pytest.param("gradient", marks=pytest.mark.slow), "ppo"])
-def test_a_run_leaves_everything_and_goes_on(
-    algorithm: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_leaves_everything_and_goes_on(algorithm, tmp_path, capsys):
     folder = tmp_path / "run"
     assert train.main(["--algo", algorithm, "--steps", "9000", "--seed", "3", "--out", str(folder), "--plot"]) == 0
     crystals = "0.175 hard + 0.175 hot-zone + 0.175 puller + 0.3 randomized + 0.175 sensor-fault"
@@ -69,7 +64,7 @@ def test_a_run_leaves_everything_and_goes_on(
 
 
 @pytest.fixture
-def ctrl_c() -> Iterator[None]:
+def ctrl_c():
     """Ctrl-C as in a terminal, also where pytest itself runs in the background."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
@@ -78,13 +73,11 @@ def ctrl_c() -> Iterator[None]:
 
 @pytest.mark.usefixtures("quick", "ctrl_c")
 @pytest.mark.skipif(sys.platform == "win32", reason="signals as POSIX has them")
-def test_ctrl_c_in_the_middle_of_an_update_saves_after_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ctrl_c_in_the_middle_of_an_update_saves_after_it(tmp_path, monkeypatch, capsys):
     """An update is four optimiser steps: two batches in each of two epochs, of which the second is interrupted."""
     clip, calls = torch.nn.utils.clip_grad_norm_, itertools.count(1)
 
-    def interrupted(*arguments: Any) -> Any:
+    def interrupted(*arguments):
         if next(calls) == 6:
             os.kill(os.getpid(), signal.SIGINT)
         return clip(*arguments)
@@ -114,8 +107,6 @@ def test_ctrl_c_in_the_middle_of_an_update_saves_after_it(
         (["--resume"], "nothing to resume"),
     ],
 )
-def test_a_wrong_command_is_refused_in_one_line(
-    tmp_path: Path, arguments: list[str], message: str, refused: Any
-) -> None:
+def test_a_wrong_command_is_refused_in_one_line(tmp_path, arguments, message, refused):
     assert message in refused(train.main, [*arguments, "--out", str(tmp_path / "run")])
     assert not (tmp_path / "run").exists()

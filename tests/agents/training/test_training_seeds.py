@@ -1,7 +1,6 @@
 """Training seeds learn on crystals of their own, and a resumed run on new ones."""
 
 from dataclasses import asdict, replace
-from typing import Any
 
 import pytest
 
@@ -10,11 +9,11 @@ from cz_gym.agents.training.recipes import RECIPES
 
 
 @pytest.mark.parametrize("name", ["ppo", "sac"])
-def test_no_two_training_seeds_meet_the_same_crystals(name: str) -> None:
-    recipe: Any = replace(RECIPES[name], num_envs=8, hidden=(4,), batch_size=64)  # type: ignore[call-arg]
-    met: list[set[int]] = []
+def test_no_two_training_seeds_meet_the_same_crystals(name):
+    recipe = replace(RECIPES[name], num_envs=8, hidden=(4,), batch_size=64)
+    met = []
     for seed, done in ((0, 0), (1, 0), (2, 0), (1, 327_680)):
-        env: Any = make_algorithm(recipe, seed, done).env
+        env = make_algorithm(recipe, seed, done).env
         met.append({int(each) for each in env.unwrapped._seeds})
         env.close()
     assert [len(each) for each in met] == [8] * 4
@@ -22,8 +21,8 @@ def test_no_two_training_seeds_meet_the_same_crystals(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", RECIPES)
-def test_the_numbers_of_a_recipe_reach_its_algorithm(name: str) -> None:
-    recipe: Any = replace(RECIPES[name], num_envs=64)
+def test_the_numbers_of_a_recipe_reach_its_algorithm(name):
+    recipe = replace(RECIPES[name], num_envs=64)
     algorithm = make_algorithm(recipe, 0)
     given = 0
     for field, wanted in asdict(recipe).items():

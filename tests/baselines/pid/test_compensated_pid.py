@@ -13,7 +13,7 @@ from tests.observed import PLAIN, measured, pulls
 MM, V_0 = 1e-3, 1.2e-3 / 60
 
 
-def test_settings_are_table_one() -> None:
+def test_settings_are_table_one():
     assert dataclasses.astuple(SeriesPID()) == (0.01, 5000.0, 650.0, 100.0)
     c = Compensator()
     assert c.gain == -0.22517
@@ -22,7 +22,7 @@ def test_settings_are_table_one() -> None:
 
 
 @pytest.mark.parametrize("dt", [2.0, 5.0, 10.0])
-def test_pid_is_the_papers_discretised_by_tustin(dt: float, rng: np.random.Generator) -> None:
+def test_pid_is_the_papers_discretised_by_tustin(dt, rng):
     p = SeriesPID()
     numerator = p.K_p * np.polymul([p.T_i, 1.0], [p.T_d, 1.0])
     denominator = np.polymul([p.T_i, 0.0], [p.T_d / p.N, 1.0])
@@ -34,7 +34,7 @@ def test_pid_is_the_papers_discretised_by_tustin(dt: float, rng: np.random.Gener
 
 
 @pytest.mark.parametrize("dt", [2.0, 5.0, 10.0])
-def test_compensator_is_the_papers_driven_by_the_applied_pull(dt: float, rng: np.random.Generator) -> None:
+def test_compensator_is_the_papers_driven_by_the_applied_pull(dt, rng):
     """Exact response to the held pull speed; the speed seen at t_k was applied until t_k."""
     applied = np.cumsum(rng.normal(0, 1e-6, 200))
     t = dt * np.arange(201)
@@ -48,7 +48,7 @@ def test_compensator_is_the_papers_driven_by_the_applied_pull(dt: float, rng: np
     np.testing.assert_allclose(y, exact, rtol=1e-9, atol=1e-12)
 
 
-def test_heater_is_a_pi_loop_by_forward_euler(rng: np.random.Generator) -> None:
+def test_heater_is_a_pi_loop_by_forward_euler(rng):
     controller, state = CompensatedPID(), None
     errors = np.concatenate([rng.normal(0, 2, 50), np.full(40, 12.0), rng.normal(0, 2, 50)])
     integral, saturated = 0.0, 0
@@ -64,7 +64,7 @@ def test_heater_is_a_pi_loop_by_forward_euler(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize(("model", "dt", "peak_mm"), [("I", 5, 1.48), ("II", 5, 1.54), ("I", 2, 1.48), ("I", 10, 1.48)])
-def test_papers_ramp_peaks_where_the_printed_controller_puts_it(model: str, dt: float, peak_mm: float) -> None:
+def test_papers_ramp_peaks_where_the_printed_controller_puts_it(model, dt, peak_mm):
     run = rollout(CompensatedPID(dt), make_config("paper-ramp", model, control_interval=dt, **PLAIN), [0])
     true, ring = ((signal - run.signals.r_ref)[:, 0] for signal in (run.signals.r_c, run.signals.r_br))
     assert not run.failed.any()

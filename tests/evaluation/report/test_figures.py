@@ -1,7 +1,6 @@
 """Figures: who is shown when there are many, colours, and a crystal that nothing disturbs."""
 
 import io
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,20 +23,20 @@ AGENTS = {"gradient": 0.05, "ppo": 0.06, "sac": 0.2}
 """Shipped agents with their RMSE [mm], as on the test crystals."""
 
 
-def sample(name: str, rmse: float, **facts: Any) -> Sample:
+def sample(name, rmse, **facts):
     values = np.full((1, 1, len(metric_names())), rmse)
     return Sample(contender(name, **facts), (7,), values, 0.0)
 
 
-def agent(name: str, rmse: float) -> Sample:
+def agent(name, rmse):
     return sample(name, rmse, training_seeds=(0,))
 
 
-def names(samples: list[Sample]) -> list[str]:
+def names(samples):
     return [one.name for one in samples]
 
 
-def everyone() -> list[Sample]:
+def everyone():
     """The default table: classical controllers of the registry, and the shipped agents."""
     default = [each for each in CONTROLLERS if each.default]
     return [Sample(each, (7,), np.full((1, 1, len(metric_names())), 0.1), 0.0) for each in default] + [
@@ -45,7 +44,7 @@ def everyone() -> list[Sample]:
     ]
 
 
-def test_many_controllers_are_chosen_by_a_rule() -> None:
+def test_many_controllers_are_chosen_by_a_rule():
     many = [sample("bound", 0.1, observation="state"), sample("paper", 9.0)]
     many += [*(sample(f"c{i}", 1.0 + i) for i in range(6)), agent("ppo", 99.0)]
     shown = chosen(many, 4)
@@ -54,7 +53,7 @@ def test_many_controllers_are_chosen_by_a_rule() -> None:
     assert chosen(many, 99) == many
 
 
-def test_figure_and_short_table_show_who_is_quoted_the_best_agents_and_one_s_own() -> None:
+def test_figure_and_short_table_show_who_is_quoted_the_best_agents_and_one_s_own():
     usual = ["paper", "paper-tuned", "lqg-at-0.02", "gradient", "ppo"]
     assert names(chosen(everyone(), COLUMNS)) == usual
     mine = [*everyone(), sample("mine", 50.0, own=True)]
@@ -65,14 +64,14 @@ def test_figure_and_short_table_show_who_is_quoted_the_best_agents_and_one_s_own
     assert [name for name in shown if "*" in name] == ["*classical*", "*learned from the reward*"]
 
 
-def test_no_two_controllers_look_alike() -> None:
+def test_no_two_controllers_look_alike():
     assert len(COLOURS) >= NAMED
     known = styles_of(everyone())
     assert len({one.colour for one in known.values()}) == len(known) == len(everyone())
 
 
 @pytest.mark.filterwarnings("error")
-def test_figures_of_a_crystal_that_nothing_disturbs_and_of_a_name_that_seems_a_formula() -> None:
+def test_figures_of_a_crystal_that_nothing_disturbs_and_of_a_name_that_seems_a_formula():
     results = []
     for name in ("nominal", "randomized"):
         row = find_row(name)

@@ -4,14 +4,11 @@ import re
 import sys
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from plotly import graph_objects as go
 
 import benchmark
 from cz_gym.evaluation.report.canvas import styles_of
@@ -29,16 +26,16 @@ STEP = 9
 class Parts(HTMLParser):
     """The elements of a page, the texts of its scripts, and the cells of its tables."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
-        self.scripts: list[str] = []
-        self.rows: list[list[str]] = []
+        self.elements = []
+        self.scripts = []
+        self.rows = []
         self._within = ""
         self.feed(text)
         self.close()
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         self.elements.append((tag, dict(attrs)))
         if tag == "script":
             self.scripts.append("")
@@ -48,10 +45,10 @@ class Parts(HTMLParser):
             self.rows[-1].append("")
         self._within = tag if tag in ("script", "td", "th") else self._within
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         self._within = "" if tag == self._within else self._within
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         if self._within == "script":
             self.scripts[-1] += data
         elif self._within:
@@ -62,45 +59,45 @@ class Made:
     """A small benchmark, its rollouts and its page. The last controller is called an evil agent of two seeds, and met
     one crystal less."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.results, runs = zip(*(result_of(name, NAMES, EVIL, (4, 7), fewer=1) for name in ROWS), strict=True)
         self.runs = dict(zip(ROWS, runs, strict=True))
         self.text = page_of(self.results)
         self.parts = Parts(self.text)
         self.figures = [draw(self.results, styles_of(self.results[0].samples)) for draw in (pareto, crystal)]
 
-    def lines(self, row: str, title: str) -> dict[str, list[Any]]:
+    def lines(self, row, title):
         """Lines of a panel of the crystal by what they are called, those of a controller by legend group."""
         number = [panel.title for panel in PANELS].index(title)
         axis = f"y{number + 1 if number else ''}"
-        found: dict[str, list[Any]] = {}
+        found = {}
         shown = visible(self.figures[1], ROWS.index(row))
         for trace in (each for each in shown if each.yaxis == axis):
             found.setdefault(trace.legendgroup, []).append(np.array(trace.y))
         return found
 
 
-def page_of(results: Any) -> str:
+def page_of(results):
     return page(results, f"benchmark.py --agent '{EVIL}'")
 
 
-def together(text: str) -> str:
+def together(text):
     """A cell's text as it is read back: what stands in brackets is an element of its own."""
     return text.replace(" [", "[", 1)
 
 
-def visible(figure: go.Figure, scenario: int) -> list[Any]:
+def visible(figure, scenario):
     """Traces that a figure shows when its menu is set to a scenario."""
     seen = figure.layout.updatemenus[0].buttons[scenario].args[0]["visible"]
     return [trace for trace, shown in zip(figure.data, seen, strict=True) if shown]
 
 
 @pytest.fixture(scope="module")
-def made() -> Made:
+def made():
     return Made()
 
 
-def test_the_tables_are_the_results(made: Made) -> None:
+def test_the_tables_are_the_results(made):
     """Every metric has a column with a unit; the lowest RMSE stands first."""
     rows = iter(made.parts.rows)
     heads, groups = overview(made.results[:1])
@@ -121,7 +118,7 @@ def test_the_tables_are_the_results(made: Made) -> None:
             assert cells == [together(column.text(column.estimate(result, name))) for column in columns]
 
 
-def test_pictures_are_the_results_of_the_chosen_scenario(made: Made) -> None:
+def test_pictures_are_the_results_of_the_chosen_scenario(made):
     for scenario, result in enumerate(made.results):
         for point, sample in zip(visible(made.figures[0], scenario), result.samples, strict=True):
             error = result.means[sample.name]["rmse_mm"]
@@ -133,7 +130,7 @@ def test_pictures_are_the_results_of_the_chosen_scenario(made: Made) -> None:
 
 
 @pytest.mark.parametrize("row", ROWS)
-def test_lines_are_means_of_the_rollouts_over_45_seconds(made: Made, row: str) -> None:
+def test_lines_are_means_of_the_rollouts_over_45_seconds(made, row):
     for who, run in made.runs[row].items():
         signals = run.episode(0)
         wanted = {
@@ -151,7 +148,7 @@ def test_lines_are_means_of_the_rollouts_over_45_seconds(made: Made, row: str) -
         np.testing.assert_allclose(camera - ring, read, atol=1e-5)
 
 
-def test_a_signal_that_is_no_number_ends_the_line(made: Made) -> None:
+def test_a_signal_that_is_no_number_ends_the_line(made):
     result = made.results[1]
     first, *others = result.samples
     assert first.example
@@ -163,7 +160,7 @@ def test_a_signal_that_is_no_number_ends_the_line(made: Made) -> None:
     assert lengths == {100 // STEP, 2160 // STEP}, "the camera goes on"
 
 
-def test_lost_crystals_do_not_set_the_scale(made: Made) -> None:
+def test_lost_crystals_do_not_set_the_scale(made):
     low, high = made.figures[1].layout.yaxis.range
     for trace in (each for each in visible(made.figures[1], 0) if each.yaxis == "y" and each.opacity == 1.0):
         inside = np.mean((low <= np.array(trace.y)) & (np.array(trace.y) <= high))
@@ -171,11 +168,11 @@ def test_lost_crystals_do_not_set_the_scale(made: Made) -> None:
 
 
 @given(st.text())
-def test_plotly_sees_no_markup_in_a_name(text: str) -> None:
+def test_plotly_sees_no_markup_in_a_name(text):
     assert not re.search(r"[<>\x00-\x1f\x7f-\x9f]|&(?!amp;|lt;|gt;)", plain(text))
 
 
-def test_names_stay_text_and_nothing_is_fetched(made: Made) -> None:
+def test_names_stay_text_and_nothing_is_fetched(made):
     """No address in the page but plotly's own, no element that loads, and a policy that forbids it all the same."""
     tags = [tag for tag, _ in made.parts.elements]
     assert tags.count("script") == 4, "plotly, its call for each picture, and who runs them"
@@ -196,13 +193,13 @@ def test_names_stay_text_and_nothing_is_fetched(made: Made) -> None:
     assert "connect-src" not in policy
 
 
-def test_the_same_results_give_the_same_bytes_and_few_of_them(made: Made) -> None:
+def test_the_same_results_give_the_same_bytes_and_few_of_them(made):
     assert page_of(made.results) == made.text
     crystals = len(made.figures[1].to_json()) / len(ROWS)
     assert crystals < 110_000, "eight scenarios fit into 6 MB beside plotly.js"
 
 
-def test_json_alone_needs_no_plotly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_json_alone_needs_no_plotly(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "plotly", None)
     arguments = ["--scenarios", "reference-b", "--controllers", "open-loop", "--quiet"]
     assert benchmark.main([*arguments, "--json", str(tmp_path / "lone.json")]) == 0

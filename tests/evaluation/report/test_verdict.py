@@ -1,10 +1,8 @@
 """The verdict: one sentence on who holds the radius best where, and a table, a row a scenario."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import pytest
 
 from cz_gym.evaluation.protocol import Row
 from cz_gym.evaluation.report import tables
@@ -16,7 +14,7 @@ from tests.samples import contender
 BETTER, WORSE, EITHER = Estimate(-1.0, (-2.0, -0.5), 9), Estimate(1.0, (0.5, 2.0), 9), Estimate(0.1, (-1.0, 1.0), 9)
 
 
-def made(**scenarios: Any) -> list[Result]:
+def made(**scenarios):
     """Results of agents a, b, ...; each scenario gives their differences, "single" stands for one crystal.
 
     The rival has an RMSE of 5 mm; b knew the plant in training.
@@ -35,8 +33,8 @@ def made(**scenarios: Any) -> list[Result]:
     return results
 
 
-def test_the_sentence_says_which_kind_holds_the_radius_best_and_where() -> None:
-    def said(**scenarios: Any) -> str:
+def test_the_sentence_says_which_kind_holds_the_radius_best_and_where():
+    def said(**scenarios):
         return verdict(made(**scenarios)).sentence
 
     assert said(one=[BETTER]) == "The radius is held best by a learned agent on one."
@@ -52,7 +50,7 @@ def test_the_sentence_says_which_kind_holds_the_radius_best_and_where() -> None:
     assert said(one=[EITHER, WORSE], two=[WORSE, EITHER]) == neither
 
 
-def test_the_table_has_a_row_a_scenario_with_the_best_of_each_kind() -> None:
+def test_the_table_has_a_row_a_scenario_with_the_best_of_each_kind():
     results = made(one=[WORSE, BETTER, WORSE], two=[EITHER, WORSE, BETTER], three=[WORSE, EITHER, WORSE])
     heads, rows = verdict(results)[1:]
     assert heads[2::2] == (
@@ -70,12 +68,12 @@ def test_the_table_has_a_row_a_scenario_with_the_best_of_each_kind() -> None:
     assert [sample.name for sample in best_of_each_kind(results)] == ["lqg", "b", "c"]
 
 
-def test_a_single_crystal_does_not_count_beside_others() -> None:
+def test_a_single_crystal_does_not_count_beside_others():
     assert [row[0] for row in verdict(made(one=[WORSE], single=[BETTER])).rows] == ["one"]
     assert verdict(made(single=[Estimate(-1.0, None, 1)])).rows[0][-1] == "a"
 
 
-def test_there_is_no_verdict_on_a_few_crystals_or_of_one_kind_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_there_is_no_verdict_on_a_few_crystals_or_of_one_kind_alone(monkeypatch):
     (nobody,) = made(one=[])
     alone = "No learned agent took part in this run."
     assert verdict([nobody]) == (alone, (), ())
