@@ -73,7 +73,7 @@ def pytest_make_collect_report(collector: pytest.Collector) -> Iterator[None]:
 def pytest_runtest_call() -> Iterator[None]:
     try:
         return (yield)
-    except ImportError as error:
+    except Exception as error:
         if lacks(error):
             pytest.skip(str(error))
         raise

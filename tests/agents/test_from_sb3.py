@@ -21,8 +21,8 @@ from cz_gym.agents import AgentFileError, OnnxPolicy, from_sb3
 from cz_gym.agents.apg import APG
 from cz_gym.agents.export import to_onnx
 from cz_gym.config import make_config
-from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
+pytestmark = pytest.mark.usefixtures("few_crystals")
 ON = {"n_steps": 16, "batch_size": 32, "n_epochs": 1}
 OFF = {"learning_starts": 8, "buffer_size": 64, "batch_size": 8}
 KINDS = {
@@ -35,12 +35,6 @@ KINDS = {
     "td3": (TD3, "MlpPolicy", {**OFF, "policy_kwargs": {"activation_fn": torch.nn.SiLU}}),
     "tqc": (TQC, "MlpPolicy", OFF),
 }
-
-
-@pytest.fixture(autouse=True)
-def _quick(monkeypatch):
-    monkeypatch.setattr(from_sb3, "JUDGING", VALIDATION_SEEDS[:2])
-    torch.set_num_threads(1)
 
 
 def trained(kind, normalised=False, observation="history"):

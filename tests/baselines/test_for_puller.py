@@ -123,6 +123,5 @@ def test_agents_and_controllers_for_another_puller_are_refused_by_its_name():
     other = find_controller("lqg").make(make_config(**PLAIN))
     with pytest.raises(CzError, match=r"the environment has .* puller silicon-300mm \("):
         rollout(other, WIDE, [1])
-    assert (
-        benchmark(["--puller", "silicon-300mm", "--controllers", "ppo", "--scenarios", "nominal", "--json", "x"]) == 2
-    )
+    command = ["--puller", "silicon-300mm", "--controllers", "ppo", "--scenarios", "nominal", "--json", "x"]
+    assert benchmark(command) == 2

@@ -89,9 +89,8 @@ def test_excitation_is_a_smooth_action_of_white_noise():
     keep = np.exp(-5.0 / 50.0)
     assert 0.0 < level < 0.5
     assert level == excitation(3, config, 0.5)[0] != excitation(4, config, 0.5)[0]
-    np.testing.assert_allclose(
-        np.std(noise, axis=0), level * (1 - keep) / np.sqrt(1 - keep**2) * np.array([1, 0.5]), rtol=0.05
-    )
+    spread = level * (1 - keep) / np.sqrt(1 - keep**2) * np.array([1, 0.5])
+    np.testing.assert_allclose(np.std(noise, axis=0), spread, rtol=0.05)
     assert np.corrcoef(noise[1:, 0], noise[:-1, 0])[0, 1] == pytest.approx(keep, abs=0.01)
     assert not excitation(3, config, 0.0)[1].any()
 

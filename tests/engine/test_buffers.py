@@ -12,10 +12,6 @@ from cz_gym.engine.buffers import SPARES, BufferPool
 SHAPE = 64, 64
 
 
-def torch_tensor(array):
-    return pytest.importorskip("torch").from_numpy(array)
-
-
 WAYS = {
     "itself": (lambda array: array, lambda held: held[0, 0]),
     "view of a view": (lambda array: array.T[:1][0][::-1].view(np.int64)[:5], lambda held: held.view(np.float64)[-1]),
@@ -27,7 +23,7 @@ WAYS = {
         array.ctypes._ctypes.c_double)), lambda held: held[0]),
     "dlpack": (lambda array: np.from_dlpack(array), lambda held: held[0, 0]),
     "capsule": (lambda array: array.__dlpack__(), lambda held: None),
-    "torch": (torch_tensor, lambda held: float(held[0, 0])),
+    "torch": (lambda array: pytest.importorskip("torch").from_numpy(array), lambda held: float(held[0, 0])),
 }  # fmt: skip
 
 

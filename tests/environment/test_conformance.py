@@ -13,6 +13,13 @@ from cz_gym.testing.checker import check_vector_env, main
 SHORT = {"control_interval": 60.0, "horizon": 1200.0}
 
 
+def conforming(settings, **options):
+    """What a check of these settings counts; it raises where batch and scalars differ."""
+    return check_vector_env(
+        lambda n, mode: CzVectorEnv(n, autoreset_mode=mode, **settings), lambda: CzEnv(**settings), **options
+    )
+
+
 @pytest.mark.parametrize("observation", ["measured", "history", "state"])
 def test_gymnasiums_checker_on_every_scenario(observation):
     with warnings.catch_warnings():
@@ -35,12 +42,7 @@ def test_gymnasiums_checker_on_every_scenario(observation):
 )
 def test_the_native_batch_is_a_vector_of_scalars(settings, mode):
     settings = {"info": "all", **SHORT, **settings}
-    checked = check_vector_env(
-        lambda n, mode: CzVectorEnv(n, autoreset_mode=mode, **settings),
-        lambda: CzEnv(**settings),
-        steps=60,
-        modes=[mode],
-    )
+    checked = conforming(settings, steps=60, modes=[mode])
     assert checked.episodes > checked.failures > 8
     assert checked.held > (2000 if settings["info"] == "all" else 700)
 
@@ -48,13 +50,7 @@ def test_the_native_batch_is_a_vector_of_scalars(settings, mode):
 @pytest.mark.parametrize("scenario", ["sensor-fault", pytest.param("puller", marks=pytest.mark.slow)])
 def test_a_batch_of_images_is_a_vector_of_scalars(scenario):
     settings = {"scenario": scenario, "observation": "camera", **SHORT, "horizon": 180.0, "info": "all"}
-    checked = check_vector_env(
-        lambda n, mode: CzVectorEnv(n, autoreset_mode=mode, **settings),
-        lambda: CzEnv(**settings),
-        num_envs=2,
-        steps=5,
-        random_start=scenario != "sensor-fault",
-    )
+    checked = conforming(settings, num_envs=2, steps=5, random_start=scenario != "sensor-fault")
     assert checked.episodes > 6
     assert checked.held > 300
 

@@ -104,6 +104,10 @@ def with_slot(**changes):
     return lambda state: dataclasses.replace(state, slot=dataclasses.replace(state.slot, **changes))
 
 
+def with_random(random):
+    return lambda state: dataclasses.replace(state, random=random)
+
+
 def at_sample(k):
     return lambda state: state.slot.slot.__setitem__("k", k) or state
 
@@ -117,13 +121,10 @@ def at_sample(k):
         (with_slot(history=[1, 2]), "its history does not fit"),
         (with_slot(history=np.zeros((0, 4), np.float32)), "its history does not fit"),
         (with_slot(frames=np.zeros((1, 2))), "its frames does not fit"),
-        *(
-            (
-                lambda state, random=random: dataclasses.replace(state, random=random),
-                "random stream is not one of PCG64",
-            )
-            for random in ({}, None, {"bit_generator": "MT19937"}, {"bit_generator": "PCG64", "state": 3})
-        ),
+        (with_random({}), "random stream is not one of PCG64"),
+        (with_random(None), "random stream is not one of PCG64"),
+        (with_random({"bit_generator": "MT19937"}), "random stream is not one of PCG64"),
+        (with_random({"bit_generator": "PCG64", "state": 3}), "random stream is not one of PCG64"),
         (at_sample(-1), "damaged: sample -1 of 2160"),
         (at_sample(2161), "damaged: sample 2161 of 2160"),
         (lambda state: {"x": 1}, "get_state"),

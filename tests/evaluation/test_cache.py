@@ -44,6 +44,7 @@ def slow(policy):
     return Contender("snail", lambda config: policy, "measured", "slow", slow=True)
 
 
+@dataclass(frozen=True)
 class Fixed(Row):
     """A row of given settings and seeds."""
 
@@ -60,7 +61,7 @@ class Fixed(Row):
 
 
 def sample(folder, policy=None, config=CONFIG, seeds=SEEDS):
-    row = type("Some", (Fixed,), {"given": config, "these": seeds})("some", "randomized", "")
+    row = Fixed("some", "randomized", "", given=config, these=seeds)
     (result,) = runner.run([slow(policy or Snail())], [row], 500, tqdm(disable=True), folder)
     return result.samples[0]
 

@@ -142,12 +142,11 @@ def test_cost_is_that_of_the_reward_before_it_saturates():
     After a failure the radius counts to the end; drives count while the crystal lived.
     """
     assert of(made_up(100, r_c=R + 1e-3)).cost == pytest.approx(4.0)
-    assert of(made_up(100, v_p=V + 0.36 * MM_PER_MIN)).cost == pytest.approx(
-        0.5 * (0.12 / 0.36) ** 2 + 0.05 * 36.0 / 100
-    )
+    pull = 0.5 * (0.12 / 0.36) ** 2
+    assert of(made_up(100, v_p=V + 0.36 * MM_PER_MIN)).cost == pytest.approx(pull + 0.05 * 36.0 / 100)
     assert of(made_up(100, Q_H=Q + 1e3 * (np.arange(100) % 2))).cost == pytest.approx(0.5 * 99 / 100)
     found = of(made_up(10, lived=4, v_p=V + 0.36 * MM_PER_MIN))
-    assert found.cost == pytest.approx((7 * 16.0**2 + 4 * 0.5 * (0.12 / 0.36) ** 2 + 0.05 * 36.0) / 10)
+    assert found.cost == pytest.approx((7 * 16.0**2 + 4 * pull + 0.05 * 36.0) / 10)
 
 
 def test_cost_gives_the_reward_of_every_step():

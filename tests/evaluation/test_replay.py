@@ -55,9 +55,8 @@ def test_both_runs_are_equal_until_the_takeover_and_share_the_disturbances_after
 
 
 def test_a_failed_episode_stays_failed():
-    found = replay(
-        Playback([[1.0, 0.0]]), Playback([[0.0, 0.0]]), make_config("hard", horizon=1800.0, **PLAIN), SEEDS, 900.0
-    )
+    config = make_config("hard", horizon=1800.0, **PLAIN)
+    found = replay(Playback([[1.0, 0.0]]), Playback([[0.0, 0.0]]), config, SEEDS, 900.0)
     assert found.actual.failed.all()
     np.testing.assert_array_equal(found.instead.failed, found.actual.failed)
     np.testing.assert_array_equal(found.instead.alive, found.actual.alive)

@@ -106,10 +106,8 @@ def test_gaps_are_measured_from_an_earlier_bound(earlier, tmp_path, monkeypatch)
     assert data["provenance"]["gap_from_cached_episodes"] == {"randomized": 2}
     report = (tmp_path / "new" / "report.md").read_text()
     assert "`clairvoyant` of an earlier run (results/bounds), on the first 2 crystals" in report
-    assert (
-        "`python benchmark.py --slow --controllers paper,clairvoyant --scenarios hard --out runs/bound` runs it"
-        in report
-    )
+    command = "python benchmark.py --slow --controllers paper,clairvoyant --scenarios hard --out runs/bound"
+    assert f"`{command}` runs it" in report
 
 
 def test_a_bound_is_used_only_beside_the_same_figures_of_the_same_controller(earlier, paper):

@@ -19,12 +19,11 @@ from cz_gym.errors import CzError
 from cz_gym.evaluation import plot
 from cz_gym.evaluation.replay import Playback
 from cz_gym.evaluation.rollout import EpisodeBatch, Signals, check_seeds, rollout
-from cz_gym.observation import MEASURED
+from cz_gym.observation import Measured
 from cz_gym.physics.parameters import Parameters
 from tests.observed import PLAIN
 
 SHORT = make_config("randomized", horizon=600.0, **PLAIN)
-CHANNELS = [channel.name for channel in MEASURED]
 
 
 class FullPull:
@@ -94,7 +93,7 @@ def test_policy_begins_again_where_the_crystal_does():
     """``episode_start`` comes with an episode's first observation: drives at nominal, whatever the policy asks."""
     policy = FullPull()
     run = rollout(policy, SHORT, range(4))
-    pull = CHANNELS.index("v_p")
+    pull = Measured._fields.index("v_p")
     assert run.failed.all()
     for observation, starts in policy.told:
         np.testing.assert_array_equal(starts, observation[:, pull] == 0.0)

@@ -3,11 +3,8 @@
 import itertools
 import sys
 
-import matplotlib
 import numpy as np
-import pygame
 import pytest
-from gymnasium.utils import play as gymnasium_play
 
 from cz_gym import CzEnv, play
 from cz_gym.baselines.registry import find_controller
@@ -15,14 +12,17 @@ from cz_gym.config import make_config
 from cz_gym.physics.plant import make_puller
 from cz_gym.rendering import canvas
 
+pygame = pytest.importorskip("pygame")
+gymnasium_play = pytest.importorskip("gymnasium.utils.play")
+
 
 @pytest.fixture
 def quick(monkeypatch):
     """A clock that does not wait, and matplotlib's backend as it was."""
-    backend = matplotlib.rcParams["backend"]
+    backend = pytest.importorskip("matplotlib").rcParams["backend"]
     monkeypatch.setattr(pygame.time, "Clock", lambda: type("Clock", (), {"tick": lambda *_: None}))
     yield
-    matplotlib.rcParams["backend"] = backend
+    sys.modules["matplotlib"].rcParams["backend"] = backend
 
 
 def test_keys_move_the_drives_while_they_are_held():

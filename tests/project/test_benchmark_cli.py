@@ -172,9 +172,8 @@ def test_agent_files_that_cannot_be_used_get_one_line(tmp_path, refusal):
         assert "ppo is shipped and runs by its name: --controllers ppo" in refusal(["--agent", given])
     fast = str(constant_agent(tmp_path / "fast.onnx"))
     slow = constant_agent(tmp_path / "slow.onnx", control_interval=10.0)
-    assert "agent 'ppo' on randomized: OnnxPolicy: this controller or agent was made for" in refusal(
-        ["--agent", str(slow)]
-    )
+    line = refusal(["--agent", str(slow)])
+    assert "agent 'ppo' on randomized: OnnxPolicy: this controller or agent was made for" in line
     assert "control_interval=5, plant" in refusal(["--agent", fast, "--scenarios", "randomized-2s"])
     twice = str(constant_agent(tmp_path / "twice.onnx"))
     assert "appears twice" in refusal(["--agent", twice, "--agent", twice])
@@ -257,9 +256,8 @@ def test_the_benchmark_needs_neither_torch_nor_stable_baselines3(tmp_path):
     loaded = "{'torch', 'stable_baselines3'} & {*sys.modules}"
     code = f"import sys, benchmark; sys.exit(benchmark.main({arguments!r}) or len({loaded}))"
     python("-W", "error", "-c", code)
-    assert (
-        (tmp_path / "out" / "report.md").read_text().startswith("The radius is held best by a classical controller on ")
-    )
+    report = (tmp_path / "out" / "report.md").read_text()
+    assert report.startswith("The radius is held best by a classical controller on ")
 
 
 def test_rows_have_the_settings_that_their_names_say():

@@ -197,19 +197,16 @@ def test_pages_read_well_on_github_and_their_tables_are_the_code_s(monkeypatch):
     """Only the pages of the code's own names, and the site's contents, have blocks that GitHub shows as they stand."""
     monkeypatch.syspath_prepend(str(DOCS))
     tables = importlib.import_module("czdocs.tables")
-    assert set(tables.TABLES) == set(
-        re.findall(r"<!-- table:(?!end)([\w-]+) -->", "".join(p.read_text() for p in PAGES))
-    )
+    text = "".join(page.read_text() for page in PAGES)
+    assert set(tables.TABLES) == set(re.findall(r"<!-- table:(?!end)([\w-]+) -->", text))
     for page in PAGES:
         text = page.read_text()
-        assert re.findall(r"^ *(?:\$ )?python (?:-m|\w+\.py) ?.*", text, re.MULTILINE) == [], (
-            f"{page}: .venv/bin/python"
-        )
+        bare = re.findall(r"^ *(?:\$ )?python (?:-m|\w+\.py) ?.*", text, re.MULTILINE)
+        assert bare == [], f"{page}: .venv/bin/python"
         assert tables.filled(text) == text, f"{page}: make tables"
         blocks = set(re.findall(r"^```\{([\w-]+)\}", text, re.MULTILINE))
-        assert blocks <= (
-            {"eval-rst"} if page.parent.name == "api" else {"toctree"} if page == tables.CONTENTS else set()
-        )
+        allowed = {"eval-rst"} if page.parent.name == "api" else {"toctree"} if page == tables.CONTENTS else set()
+        assert blocks <= allowed
 
 
 def test_every_symbol_has_unit_meaning_and_a_numbered_equation(monkeypatch):

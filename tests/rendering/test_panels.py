@@ -13,6 +13,7 @@ from cz_gym.rendering.record import Ending
 from cz_gym.rendering.scene import layout
 from cz_gym.units import MM
 
+pygame = pytest.importorskip("pygame")
 CANVAS = Canvas(640, 480)
 PANELS = layout(CANVAS.box)
 

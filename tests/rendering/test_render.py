@@ -8,7 +8,6 @@ import warnings
 
 import gymnasium as gym
 import numpy as np
-import pygame
 import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
@@ -18,6 +17,8 @@ from cz_gym.rendering import canvas, view
 from cz_gym.rendering.view import MODES, check_size
 from tests.observed import PLAIN
 from tests.processes import ROOT, python
+
+pygame = pytest.importorskip("pygame")
 
 
 def trajectory(render_mode, scenario, steps=60):

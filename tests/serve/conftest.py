@@ -1,7 +1,6 @@
 """A virtual puller in a thread of its own, as the command starts it."""
 
 import asyncio
-import math
 import socket
 import threading
 import warnings
@@ -109,6 +108,3 @@ def with_client(url: str, act: Callable[[Hand], Awaitable[Any]], *account: Any) 
 def answer(step: int, pull: float = 1.2, heater: float = 57.0) -> dict[str, Any]:
     """Setpoints that answer a step."""
     return {"pull_speed_setpoint_mm_per_min": pull, "heater_power_setpoint_kW": heater, "watchdog": step}
-
-
-NAN = math.nan

@@ -19,7 +19,7 @@ from cz_gym.identify.log import read_log
 from cz_gym.serve import __main__ as command
 from cz_gym.serve.machine import SETPOINTS
 from tests.processes import ROOT
-from tests.serve.conftest import NAN, PASSWORD, answer, connected, free_port, running, with_client
+from tests.serve.conftest import PASSWORD, answer, connected, free_port, running, with_client
 
 from asyncua import ua  # isort: skip
 
@@ -48,7 +48,7 @@ def locked(tmp_path_factory):
 def test_values_of_wrong_type_or_size_are_refused_and_logged(puller):
     async def act(hand):
         low, high = puller.machine.limits[PULL]
-        for bad in (NAN, float("inf"), low - 1.0, high + 1.0):
+        for bad in (np.nan, np.inf, low - 1.0, high + 1.0):
             assert await hand.write(**{PULL: bad}) == ["BadOutOfRange"]
         for wrong in (
             ua.Variant(1, ua.VariantType.Int32), ua.Variant("1.2"), ua.Variant([1.2, 1.3], ua.VariantType.Double),
@@ -58,7 +58,7 @@ def test_values_of_wrong_type_or_size_are_refused_and_logged(puller):
         for name, value in (("ring_radius_mm", 100.0), ("step", 7), ("state", "growing")):
             assert await hand.write(**{name: value}) == ["BadUserAccessDenied"]
         assert await hand.write(**answer(await hand.read("step") + 1000)) == ["BadInvalidState"] * 2 + ["BadOutOfRange"]
-        assert await hand.write(**answer(await hand.read("step"), heater=NAN)) == [
+        assert await hand.write(**answer(await hand.read("step"), heater=np.nan)) == [
             "BadInvalidState", "BadOutOfRange", "BadInvalidState",
         ]  # fmt: skip
         assert low <= await hand.read(PULL) <= high, "nothing that was refused is kept"

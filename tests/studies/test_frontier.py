@@ -13,12 +13,8 @@ def entry(activity, rmse):
 
 def test_a_benchmark_is_compared_at_equal_activity(tmp_path, capsys):
     scenario = {name: entry(a, 0.01 * a**-0.5) for name, a in ((family_name(0.005), 0.005), ("lqg-quiet", 0.02))}
-    scenario |= {
-        "ppo": entry(0.01, 0.2),
-        "industrial": entry(0.001, 0.4),
-        "lively": entry(0.03, 0.1),
-        "wild": entry(0.01, 0.5),
-    }
+    others = {"ppo": (0.01, 0.2), "industrial": (0.001, 0.4), "lively": (0.03, 0.1), "wild": (0.01, 0.5)}
+    scenario |= {name: entry(*pair) for name, pair in others.items()}
     file = tmp_path / "benchmark.json"
     file.write_text(json.dumps({"results": {"randomized": scenario, "nominal": {"ppo": entry(0.01, 0.2)}}}))
     assert frontier.main([str(file)]) == 0

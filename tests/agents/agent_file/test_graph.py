@@ -20,10 +20,8 @@ CHANNELS = len(MEASURED)
 WEIGHTS = {"weight": np.full((CHANNELS, 2), 0.01, np.float32), "bias": np.zeros(2, np.float32)}
 
 
-def model_of(nodes=None, weights=None, **changes):
-    return contracts.model_of(
-        [LINEAR] if nodes is None else nodes, WEIGHTS if weights is None else weights, CHANNELS, **changes
-    )
+def model_of(nodes=(LINEAR,), weights=WEIGHTS, **changes):
+    return contracts.model_of([*nodes], weights, CHANNELS, **changes)
 
 
 def policy_of(model):

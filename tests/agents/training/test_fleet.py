@@ -1,7 +1,5 @@
 """``train.py --seeds``: seeds side by side come out as one by one, and nothing is lost or done twice."""
 
-from __future__ import annotations
-
 import io
 import json
 from dataclasses import replace

@@ -59,9 +59,7 @@ def played(u, inputs_0):
 def test_the_known_future_is_the_one_the_environment_brings(interval):
     config = make_config(HARD, observation="state", control_interval=interval, horizon=0.5 * HOUR, action="direct")
     future = future_of(config, SEEDS)
-    env = CzVectorEnv(
-        3, HARD, observation="state", control_interval=interval, horizon=0.5 * HOUR, info="all", action="direct"
-    )
+    env = CzVectorEnv.from_config(config, 3, info="all")
     env.reset(seed=list(SEEDS))
     actions = np.random.default_rng(0).uniform(-0.05, 0.05, (200, 3, 2)).astype(np.float32).astype(np.float64)
     x = future.start

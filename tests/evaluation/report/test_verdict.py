@@ -38,10 +38,8 @@ def test_the_sentence_says_which_kind_holds_the_radius_best_and_where():
         return verdict(made(**scenarios)).sentence
 
     assert said(one=[BETTER]) == "The radius is held best by a learned agent on one."
-    assert (
-        said(one=[WORSE] * 3, two=[WORSE] * 3)
-        == "The radius is held best by a classical controller on all 2 scenarios."
-    )
+    classical = "The radius is held best by a classical controller on all 2 scenarios."
+    assert said(one=[WORSE] * 3, two=[WORSE] * 3) == classical
     assert said(one=[WORSE], two=[WORSE, BETTER], three=[WORSE], four=[EITHER]) == (
         "The radius is held best by a classical controller on one and three, by a learned agent on two; "
         "on four no difference is shown."
