@@ -1,5 +1,6 @@
 """Observations for tests of controllers: of given values, and of a batch that is driven at random."""
 
+from collections import deque
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -21,12 +22,12 @@ def measured(**values: Any) -> np.ndarray:
 
 
 class Watched:
-    """A policy whose memory is kept, sample by sample."""
+    """A policy whose memory is kept, sample by sample: of all samples, or of that many."""
 
-    def __init__(self, policy: Any) -> None:
-        self.policy, self.states = policy, []
+    def __init__(self, policy: Any, last: int | None = None) -> None:
+        self.policy, self.states = policy, deque(maxlen=last)
 
-    def predict(self, observation, state=None, episode_start=None, deterministic=True):  # type: ignore
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
         action, state = self.policy.predict(observation, state, episode_start)
         self.states.append(state)
         return action, state

@@ -57,7 +57,7 @@ def test_the_adaptive_lqg_estimates_how_strong_the_fluctuations_are(strength, fa
     """
     config = make_config("randomized", horizon=HOUR, **PLAIN)
     config = config.with_scenario(replace(config.scenario, name="one", interface=Interface(sd=(strength, strength))))
-    watched = Watched(adaptive(lqg("lqg-at-0.02-nominal", config)))
+    watched = Watched(adaptive(lqg("lqg-at-0.02-nominal", config)), 1)
     rollout(watched, config, range(20))
     expected = watched.states[-1].memory.filter.probability @ np.repeat(FACTORS, len(FACTORS))
     assert (np.abs(expected - factor) < 0.4).mean() >= 0.9
