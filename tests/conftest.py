@@ -6,10 +6,8 @@ Where an optional package is not installed, the tests that need it are skipped, 
 import importlib.util
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 # Threads of torch and of NumPy's linear algebra wait for each other by spinning, all the longer beside other workers.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -35,7 +33,7 @@ if sys.platform == "win32":
     collect_ignore = ["stress"]  # signals, pipes and limits of memory as POSIX has them
 
 
-def pytest_sessionstart() -> None:
+def pytest_sessionstart():
     """Of parallel workers one compiles what most tests need, kernels and large packages; the others then load it."""
     if "PYTEST_XDIST_WORKER" in os.environ and importlib.util.find_spec("filelock"):
         from cz_gym import CzEnv
@@ -51,7 +49,7 @@ def pytest_sessionstart() -> None:
             env.step(np.zeros(2, np.float32))
 
 
-def lacks(error: BaseException | None) -> bool:
+def lacks(error):
     """Whether an error comes from an optional package that is not installed."""
     while error is not None:
         if isinstance(error, ModuleNotFoundError) and str(error.name).partition(".")[0] in ABSENT:
@@ -61,8 +59,8 @@ def lacks(error: BaseException | None) -> bool:
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_make_collect_report(collector: pytest.Collector) -> Iterator[None]:
-    report: Any = yield
+def pytest_make_collect_report(collector):
+    report = yield
     failed = report.failed and report.call.excinfo
     if failed and lacks(failed.value):
         report.outcome, report.longrepr = "skipped", (str(collector.path), 0, "Skipped: no optional package")
@@ -70,7 +68,7 @@ def pytest_make_collect_report(collector: pytest.Collector) -> Iterator[None]:
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_call() -> Iterator[None]:
+def pytest_runtest_call():
     try:
         return (yield)
     except Exception as error:
@@ -80,12 +78,12 @@ def pytest_runtest_call() -> Iterator[None]:
 
 
 @pytest.fixture
-def refused(capsys: pytest.CaptureFixture[str]) -> Callable[[Callable[[list[str]], int], Sequence[str]], str]:
+def refused(capsys):
     """A function that runs a command which must refuse its arguments; the one line that it says."""
 
-    def run(main: Callable[[list[str]], int], arguments: Sequence[str]) -> str:
+    def run(main, arguments):
         try:
-            code: Any = main([*arguments])
+            code = main([*arguments])
         except SystemExit as left:
             code = left.code
         said = capsys.readouterr()
@@ -96,7 +94,7 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[[Callable[[list[str]
 
 
 @pytest.fixture
-def few_crystals(monkeypatch: pytest.MonkeyPatch) -> None:
+def few_crystals(monkeypatch):
     """Training runs of this process pick and judge on two crystals each."""
     from cz_gym.agents.training import validation
     from cz_gym.evaluation.protocol import VALIDATION_SEEDS
@@ -107,7 +105,7 @@ def few_crystals(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="session")
-def ppo() -> Any:
+def ppo():
     """An algorithm that has learned a little, for tests that leave it as it is."""
     from tests.small_learners import SMALL, trained
 
@@ -115,5 +113,5 @@ def ppo() -> Any:
 
 
 @pytest.fixture
-def rng() -> np.random.Generator:
+def rng():
     return np.random.default_rng(20)

@@ -2,10 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -26,7 +23,7 @@ FLAGS = (
 
 
 @contextmanager
-def chromium(profile: Path) -> Iterator[Any]:
+def chromium(profile):
     """A browser 1280 px wide."""
     os.environ["SE_OFFLINE"] = "true"
     options = webdriver.ChromeOptions()
@@ -42,11 +39,11 @@ def chromium(profile: Path) -> Iterator[Any]:
         driver.quit()
 
 
-def resize(driver: Any, width: int) -> None:
+def resize(driver, width):
     size = {"width": width, "height": 768, "deviceScaleFactor": 1, "mobile": False}
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
 
 
-def until(driver: Any, holds: Callable[[], Any]) -> Any:
+def until(driver, holds):
     """What ``holds`` returns once it is true."""
     return WebDriverWait(driver, 60.0, 0.05).until(lambda _: holds())

@@ -4,11 +4,8 @@ import asyncio
 import socket
 import threading
 import warnings
-from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
@@ -23,14 +20,14 @@ from cz_gym.serve.opcua import KINDS, URI
 PASSWORD = "correct horse"
 
 
-def free_port() -> int:
+def free_port():
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
         return int(one.getsockname()[1])
 
 
 @contextmanager
-def running(folder: Path, *options: str, remote: bool = False) -> Iterator[Any]:
+def running(folder, *options, remote=False):
     """A puller with these options, its addresses and machine; ``remote`` makes it as strict as on another address."""
     port, page = free_port(), free_port()
     files = ("--certificates", str(folder / "certificates"), "--log", str(folder / "log.csv"))
@@ -38,14 +35,14 @@ def running(folder: Path, *options: str, remote: bool = False) -> Iterator[Any]:
     puller = SimpleNamespace(folder=folder, port=port, page=page, url=f"opc.tcp://127.0.0.1:{port}/", error=None)
     ready, done = threading.Event(), threading.Event()
 
-    async def serve() -> None:
+    async def serve():
         puller.door = door_of(arguments)
         puller.door.remote = remote
         async with serving(arguments, puller.door) as (puller.machine, _):
             ready.set()
             await asyncio.to_thread(done.wait)
 
-    def run() -> None:
+    def run():
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -69,13 +66,13 @@ def running(folder: Path, *options: str, remote: bool = False) -> Iterator[Any]:
 class Hand:
     """A client that reads and writes tags by name."""
 
-    def __init__(self, client: Client, space: int) -> None:
+    def __init__(self, client, space):
         self.client, self.nodes = client, {tag.name: client.get_node(ua.NodeId(tag.name, space)) for tag in TAGS}
 
-    async def read(self, name: str) -> Any:
+    async def read(self, name):
         return await self.nodes[name].read_value()
 
-    async def write(self, **values: Any) -> list[str]:
+    async def write(self, **values):
         """The names of the status codes."""
         kinds = {tag.name: KINDS[tag.kind] for tag in TAGS}
         variants = [v if isinstance(v, ua.Variant) else ua.Variant(v, kinds[name]) for name, v in values.items()]
@@ -83,9 +80,7 @@ class Hand:
         return [code.name for code in await self.client.write_values(nodes, variants, raise_on_partial_error=False)]
 
 
-async def connected(
-    url: str, act: Callable[[Hand], Awaitable[Any]], user: str = "", password: str = PASSWORD, keys: Path | None = None
-) -> Any:
+async def connected(url, act, user="", password=PASSWORD, keys=None):
     """What ``act`` returns for a connected client; with a folder of ``keys``, an encrypted one."""
     client = Client(url, timeout=10 if keys else 30)
     if user:
@@ -101,10 +96,10 @@ async def connected(
         return await act(Hand(client, await client.get_namespace_index(f"{URI}:tags")))
 
 
-def with_client(url: str, act: Callable[[Hand], Awaitable[Any]], *account: Any) -> Any:
+def with_client(url, act, *account):
     return asyncio.run(connected(url, act, *account))
 
 
-def answer(step: int, pull: float = 1.2, heater: float = 57.0) -> dict[str, Any]:
+def answer(step, pull=1.2, heater=57.0):
     """Setpoints that answer a step."""
     return {"pull_speed_setpoint_mm_per_min": pull, "heater_power_setpoint_kW": heater, "watchdog": step}

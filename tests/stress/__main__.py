@@ -7,10 +7,9 @@ the command and names the case, the step and the slot.
 """
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import replace
 
-from cz_gym.config import Config, make_config
+from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Interface
 from cz_gym.episodes.scenarios import HARD, PULLER, SCENARIOS
 from cz_gym.units import MM
@@ -21,7 +20,7 @@ from .checks import Broken, Watch
 
 INTERVALS = (0.5, 1.0, 2.0, 5.0, 7.5, 10.0, 20.0, 30.0, 60.0)
 """Control intervals [s]."""
-MODELS: tuple[str | None, ...] = (None, "I", "II")
+MODELS = (None, "I", "II")
 OBSERVATIONS = ("measured", "history", "state")
 WIDE = replace(
     HARD,
@@ -39,7 +38,7 @@ CALLS = 460
 """Steps in a row that a large campaign takes in each case; the rest goes into more slots."""
 
 
-def cases() -> list[Config]:
+def cases():
     """Each scenario and "wide" at each interval; models and observations take turns, so that all meet."""
     return [
         make_config(scenario, MODELS[(at + turn) % 3], OBSERVATIONS[(at + 2 * turn) % 3], interval, action="direct")
@@ -48,7 +47,7 @@ def cases() -> list[Config]:
     ]
 
 
-def run_case(config: Config, steps: int, seed: int) -> Watch:
+def run_case(config, steps, seed):
     """About ``steps`` slot steps of one case, at least one, all checked; raises :class:`Broken`."""
     n = len(KINDS) * max(1, round(steps / CALLS / len(KINDS)))
     # The horizon is cut so that every case meets ends by time as well.
@@ -67,7 +66,7 @@ def run_case(config: Config, steps: int, seed: int) -> Watch:
     return watch
 
 
-def campaign(configs: Sequence[Config], steps: int, seed: int = 0) -> list[Watch]:
+def campaign(configs, steps, seed=0):
     """Share ``steps`` among the cases; raises :class:`Broken` with the name of the case in front."""
     watches = []
     for number, config in enumerate(configs):

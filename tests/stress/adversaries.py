@@ -1,10 +1,7 @@
 """Actions that look for trouble: extremes, bang-bang, long saturation, infinities; feedback that saves a crystal while
 its heater saturates."""
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
 from tests.equations import hold
 
@@ -19,14 +16,14 @@ EXTREME = np.array([np.inf, -np.inf, 1e308, -1e308, 1e-320, -0.0, 1.0 + 1e-7, -1
 class Adversaries:
     """Actions for ``num_envs`` slots, slot i by kind i modulo the number of kinds."""
 
-    def __init__(self, num_envs: int, seed: int) -> None:
+    def __init__(self, num_envs, seed):
         self._kind = np.arange(num_envs) % len(KINDS)
         self._random = np.random.default_rng([20, seed])
         self._bang = np.ones((num_envs, 2))
         self._walk = np.zeros((num_envs, 2))
         self._turn = 0
 
-    def actions(self, infos: dict[str, Any], height: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def actions(self, infos, height):
         """The next actions, shape (num_envs, 2), from the last infos and the nominal heights [m], shape (num_envs,)."""
         random, n = self._random, len(self._kind)
         self._turn += 1
@@ -40,5 +37,5 @@ class Adversaries:
         full, no, hot, cold, bang_heat = (np.stack(pair, axis=-1) for pair in pairs)
         uniform = random.uniform(-1.0, 1.0, (n, 2))
         by_kind = [uniform, self._bang, full, no, hot, cold, extreme, chatter, self._walk, bang_heat]
-        chosen: npt.NDArray[np.float64] = np.stack(by_kind)[self._kind, np.arange(n)]
+        chosen = np.stack(by_kind)[self._kind, np.arange(n)]
         return chosen

@@ -11,7 +11,6 @@ from cz_gym.observation import CLIP
 from cz_gym.physics.plant import fourth_power
 from cz_gym.signals import INFO
 from cz_gym.task import HEATER_RANGE, HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT
-from cz_gym.vector import CzVectorEnv
 
 Array = npt.NDArray[Any]
 COLDEST, HOTTEST = 1000.0, 2600.0
@@ -31,7 +30,7 @@ class Broken(AssertionError):
 class Watch:
     """Checks everything an environment returns, and its heat balance; autoreset NEXT_STEP."""
 
-    def __init__(self, env: CzVectorEnv) -> None:
+    def __init__(self, env):
         self._env, self._slots = env, env._batch.memory.slots
         self._dt, self._steps = env.config.control_interval, env.config.steps
         self._over = np.zeros(env.num_envs, np.bool_)
@@ -39,17 +38,15 @@ class Watch:
         self.episodes = self.failures = 0
         self.missing_heat = 0.0
 
-    def begin(self, observation: Array, infos: dict[str, Any]) -> None:
+    def begin(self, observation, infos):
         """Check what the reset returned."""
         self._check_numbers(observation, np.zeros(self._env.num_envs), infos)
 
-    def before(self) -> None:
+    def before(self):
         """Remember the slots; call it before each step."""
         self._old = self._slots.copy()
 
-    def after(
-        self, actions: Array, observation: Array, reward: Array, terminated: Array, truncated: Array, infos: Any
-    ) -> None:
+    def after(self, actions, observation, reward, terminated, truncated, infos):
         """Check what a step returned; raises :class:`Broken`."""
         self._call += 1
         ran, over = ~self._over, terminated | truncated
@@ -61,11 +58,11 @@ class Watch:
         self.episodes, self.failures = self.episodes + int(over.sum()), self.failures + int(terminated.sum())
         self._over = over
 
-    def _need(self, fact: Any, what: str) -> None:
+    def _need(self, fact, what):
         if not np.all(fact):
             raise Broken(f"step {self._call}, slot {int(np.argmin(fact))}: {what}")
 
-    def _check_numbers(self, observation: Array, reward: Array, infos: dict[str, Any]) -> None:
+    def _check_numbers(self, observation, reward, infos):
         finite = np.isfinite(observation).all(axis=1) & (np.abs(observation) <= CLIP).all(axis=1)
         self._need(finite, f"the observation is not finite and within +-{CLIP}")
         self._need(np.isfinite(reward), "the reward is not finite")
@@ -74,7 +71,7 @@ class Watch:
         if "state" in infos:
             self._need(np.isfinite(infos["state"]).all(axis=1), "info 'state' is not finite")
 
-    def _check_ends(self, ran: Array, terminated: Array, truncated: Array, infos: dict[str, Any]) -> None:
+    def _check_ends(self, ran, terminated, truncated, infos):
         """Failures terminate, at the limits and nowhere else; time truncates; radii and heights are a crystal's."""
         k, a = self._slots["k"], self._slots["puller"]["a"]
         error, h_c = np.abs(infos["r_c"] - infos["r_ref"]), infos["h_c"]
@@ -90,14 +87,14 @@ class Watch:
             T = self._slots["x"][name]
             self._need((T > COLDEST) & (T < HOTTEST), f"{name} outside {COLDEST:g} to {HOTTEST:g} K")
 
-    def _check_rewards(self, ran: Array, reward: Array, terminated: Array, infos: dict[str, Any]) -> None:
+    def _check_rewards(self, ran, reward, terminated, infos):
         """The reward is one minus the saturated cost of ``info``, and 1,000 less for a failing step."""
         cost = sum(infos[f"cost_{name}"] for name in Cost._fields)
         expected = np.where(ran, 1.0 - 10.0 * cost / (10.0 + cost) - 1000.0 * terminated, 0.0)
         self._need(np.abs(reward - expected) < _EPS, "the reward does not follow from the cost")
         self._need(cost >= 0.0, "a negative cost")
 
-    def _check_drives(self, ran: Array, actions: Array, infos: dict[str, Any]) -> None:
+    def _check_drives(self, ran, actions, infos):
         p, e, old = self._slots["puller"], self._slots["episode"], self._old
         pull, power = infos["v_p"] - p["v_0"], infos["Q_H"] - p["Q_H_0"]
         widest = np.minimum(p["v_0"], e["pull_window"]) * (1.0 + _EPS)
@@ -109,7 +106,7 @@ class Watch:
         said = infos["action_clipped"] == (np.abs(actions) > 1.0).any(axis=1)
         self._need(~ran | said, "info 'action_clipped' is wrong")
 
-    def _check_heat(self, living: Array, infos: dict[str, Any]) -> None:
+    def _check_heat(self, living, infos):
         """Heat stored over the step is what flowed in less what flowed out."""
         p, old, new = self._slots["puller"], self._old["x"], self._slots["x"]
         middle = (self._slots["k"] - 0.5) * self._dt
@@ -126,8 +123,8 @@ class Watch:
         self.missing_heat = max(self.missing_heat, float(missing.max()))
 
 
-def _losses(p: Array, x: Array) -> Array:
+def _losses(p, x):
     """Heat that insulation and melt surface lose [W]."""
     surface = p["kappa_b"] * (fourth_power(x["T_b"]) - fourth_power(p["T_e"]))
-    loss: Array = p["G_1a"] * (x["T_1"] - p["T_a"]) + surface
+    loss = p["G_1a"] * (x["T_1"] - p["T_a"]) + surface
     return loss
