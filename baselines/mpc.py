@@ -125,7 +125,7 @@ class EkfMpc(LQG):
     def law(self, estimate: Floats, plan: Floats, previous: Floats) -> Floats:
         """The best inputs [m/s, W], deviations, shape (n, 2); the LQG's own in slots where the prediction fails.
 
-        Arguments are those of :func:`cz_gym.baselines.lqg.controller.optimal_inputs`.
+        Arguments are those of :meth:`cz_gym.baselines.lqg.controller.LQG.law`.
         """
         gains, shape, scale = self.gains, self.shape, SCALES[PLANT:]
         share = self.design.noise.recipe_share
@@ -223,10 +223,10 @@ def newton(
     (n,), and the disturbance states ``d``, shape (n, 5), are those at the horizon's end.
     """
     n, N, _, n_c = prediction.outputs_c.shape
-    cost = quadratic_cost(weights, dt)
-    pull = cost.Q[PLANT, PLANT]
+    Q, _, R = quadratic_cost(weights, dt)
+    pull = Q[PLANT, PLANT]
     squares = np.array([SCALES[0], *SCALES[PLANT:], *SCALES[PLANT:]]) ** 2
-    stage = np.tile(squares * np.array([cost.Q[0, 0], pull, 0.0, cost.R[0, 0] - pull, cost.R[1, 1]]), (N, 1))
+    stage = np.tile(squares * np.array([Q[0, 0], pull, 0.0, R[0, 0] - pull, R[1, 1]]), (N, 1))
     stage[-1, 0] = 0.0
     weighted = (stage[..., None] * prediction.outputs_c).reshape(n, -1, n_c)
     H = weighted.swapaxes(1, 2) @ prediction.outputs_c.reshape(n, -1, n_c)

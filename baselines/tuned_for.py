@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -83,25 +83,26 @@ def with_values(settings: Any, values: Mapping[str, float]) -> Any:
     return settings
 
 
-def tuned_scenario(scenario: Scenario, among: Collection[str], controller: str) -> str:
-    """Name of the tuned scenario whose settings a controller should have on another one.
+def tuned(start: Any, controller: str, scenario: Scenario, also: str = "") -> Any:
+    """The settings ``start`` with the values chosen for a controller; ``also`` as of :func:`shipped`.
 
-    It is the first of those in ``among`` that goes as far in every field of KIND, and of SIZE if there is such a one.
-    If none does, a warning names the fields.
+    They are those of the first tuned scenario that goes as far as ``scenario`` in every field of KIND, and of SIZE if
+    there is such a one. If none does, a warning names the fields.
     """
-    tuned = [each for each in TUNED if each.name in among]
-    fit = [each for each in tuned if not beyond(scenario, each)]
+    chosen = shipped(controller, also)
+    known = [each for each in TUNED if each.name in chosen]
+    fit = [each for each in known if not beyond(scenario, each)]
     if not fit:
-        nearest = min(reversed(tuned), key=lambda each: len(beyond(scenario, each)))
+        nearest = min(reversed(known), key=lambda each: len(beyond(scenario, each)))
         fields = ", ".join(beyond(scenario, nearest))
         warnings.warn(
             f"{controller} was not tuned for {fields} of scenario {scenario.name!r}: it has the settings "
             f"for {nearest.name!r}",
             stacklevel=2,
         )
-        return nearest.name
+        fit = [nearest]
     large_enough = [each for each in fit if not beyond(scenario, each, SIZE)]
-    return (large_enough or fit)[0].name
+    return with_values(start, chosen[(large_enough or fit)[0].name])
 
 
 def beyond(scenario: Scenario, tuned: Scenario, fields: Mapping[str, tuple[str, ...]] = KIND) -> list[str]:

@@ -15,22 +15,13 @@ from cz_gym.baselines.policy import Floats, stack
 from cz_gym.config import Config
 from cz_gym.engine.batch import Key, first_key
 from cz_gym.episodes.draw import randomised
-from cz_gym.episodes.record import GRID, Episode
+from cz_gym.episodes.record import GRID
 from cz_gym.episodes.schedule import bias_offset, disturbance, reference
 from cz_gym.episodes.series import draw_episode, draw_factors, new_series
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.plant import Disturbance, Inputs, Puller, State, make_puller, rk4
 
 _EPS = 1e-9
-
-
-class Substeps(NamedTuple):
-    """Integration steps of the control intervals, split at the 5 s grid as in the environment."""
-
-    point: npt.NDArray[np.int64]
-    """Grid point whose disturbance holds, shape (steps, substeps)."""
-    length: Floats
-    """Length [s], 0 where an interval has fewer, shape (steps, substeps)."""
 
 
 class Future(NamedTuple):
@@ -74,25 +65,28 @@ def fluctuations_of(config: Config, seeds: Sequence[int]) -> tuple[tuple[float, 
 def future_of(config: Config, seeds: Sequence[int]) -> Future:
     """The future of the first episode of each seed."""
     puller = stack(pullers_of(config, seeds))
-    substeps = substeps_of(config.control_interval, config.steps)
-    points = int(substeps.point.max()) + 1
-    drawn = [_drawn(config, key, points) for key in _keys(seeds)]
-    e = stack([episode for episode, _ in drawn])
-    dT_i = np.stack([interface for _, interface in drawn], axis=1)
+    point, length = substeps_of(config.control_interval, config.steps)
+    points = int(point.max()) + 1
+    series = [new_series(points, 0) for _ in seeds]
+    drawn = [draw_episode(config.sole_scenario, *of) for of in zip(_keys(seeds), series, strict=True)]
+    e, dT_i = stack(drawn), np.stack([each.interface for each in series], axis=1)
     on_grid = disturbance(np.arange(points)[:, None] * GRID, dT_i, e, puller)
     end = np.arange(1, config.steps + 1)[:, None] * config.control_interval
     return Future(
         puller,
         puller.state_0._replace(r_c=puller.r_0 + e.r_c_start),
         puller.r_0 + reference(end, e) - bias_offset(end, e),
-        tuple(Disturbance(*(np.asarray(value)[column] for value in on_grid)) for column in substeps.point.T),
-        substeps.length.T[:, :, None],
+        tuple(Disturbance(*(np.asarray(value)[column] for value in on_grid)) for column in point.T),
+        length.T[:, :, None],
         config.meniscus,
     )
 
 
-def substeps_of(interval: float, steps: int) -> Substeps:
-    """The substeps of ``steps`` control intervals [s]."""
+def substeps_of(interval: float, steps: int) -> tuple[npt.NDArray[np.int64], Floats]:
+    """Integration steps of ``steps`` control intervals [s], split at the 5 s grid as in the environment.
+
+    The grid point whose disturbance holds, and the length [s], 0 where an interval has fewer; shape (steps, substeps).
+    """
     most = int(np.ceil(interval / GRID - _EPS)) + 1
     point, length = np.zeros((steps, most), np.int64), np.zeros((steps, most))
     for k in range(steps):
@@ -103,15 +97,9 @@ def substeps_of(interval: float, steps: int) -> Substeps:
             length[k, at] = upto - t
             t, at = upto, at + 1
     used = length.any(axis=0)
-    return Substeps(point[:, used], length[:, used])
+    return point[:, used], length[:, used]
 
 
 def _keys(seeds: Sequence[int]) -> list[Key]:
     """The key of each seed's first episode; seeds may be an array."""
     return [first_key(int(seed)) for seed in seeds]
-
-
-def _drawn(config: Config, key: Key, points: int) -> tuple[Episode, Floats]:
-    """The episode of that key and its interface fluctuation on the grid."""
-    series = new_series(points, 0)
-    return draw_episode(config.sole_scenario, key, series), series.interface

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from types import SimpleNamespace
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -47,7 +47,7 @@ class PrivilegedLQG(LQG):
     gains_by_slot: Gains | None = None
     knows_fluctuations: bool = False
 
-    @property
+    @cached_property
     def gains(self) -> Gains:
         """Gains of the slots' own pullers."""
         return super().gains if self.gains_by_slot is None else self.gains_by_slot

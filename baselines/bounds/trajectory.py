@@ -60,19 +60,13 @@ class Stages(NamedTuple):
     """Slope of the cost by the stage's input, shape (N, n, inputs)."""
 
 
-class Law(NamedTuple):
-    """w_k = feedback_k z_k + forward_k."""
+def sweep_back(stages: Stages) -> tuple[Floats, Floats]:
+    """The law that is optimal for every starting state: w_k = feedback_k z_k + forward_k.
 
-    feedback: Floats
-    """Shape (N, n, inputs, states)."""
-    forward: Floats
-    """Shape (N, n, inputs)."""
-
-
-def sweep_back(stages: Stages) -> Law:
-    """The law that is optimal for every starting state."""
+    feedback has shape (N, n, inputs, states), forward (N, n, inputs).
+    """
     N, n, states, inputs = stages.B.shape
-    law = Law(np.empty((N, n, inputs, states)), np.empty((N, n, inputs)))
+    feedback, forward = np.empty((N, n, inputs, states)), np.empty((N, n, inputs))
     P, p = np.zeros((n, states, states)), np.zeros((n, states))
     diagonal, own = np.arange(states), np.arange(inputs)
     for k in range(N - 1, -1, -1):
@@ -85,20 +79,20 @@ def sweep_back(stages: Stages) -> Law:
         G = np.swapaxes(B, 1, 2) @ PA
         g = stages.r[k] + _times(np.swapaxes(B, 1, 2), p)
         both = -np.linalg.solve(H, np.concatenate([G, g[:, :, None]], axis=2))
-        K, forward = both[:, :, :-1], both[:, :, -1]
-        law.feedback[k], law.forward[k] = K, forward
+        K, w = both[:, :, :-1], both[:, :, -1]
+        feedback[k], forward[k] = K, w
         P = np.swapaxes(A, 1, 2) @ PA + np.swapaxes(G, 1, 2) @ K
         P = 0.5 * (P + np.swapaxes(P, 1, 2))
-        p = _times(np.swapaxes(A, 1, 2), p) + _times(np.swapaxes(G, 1, 2), forward)
-    return law
+        p = _times(np.swapaxes(A, 1, 2), p) + _times(np.swapaxes(G, 1, 2), w)
+    return feedback, forward
 
 
-def sweep_forward(stages: Stages, law: Law, start: Floats) -> tuple[Floats, Floats]:
-    """States after each stage, shape (N, n, states), and inputs, shape (N, n, inputs), from a start (n, states)."""
-    z = start
-    after, inputs = np.empty(stages.c.shape), np.empty(law.forward.shape)
+def sweep_forward(stages: Stages, feedback: Floats, forward: Floats) -> tuple[Floats, Floats]:
+    """States after each stage, shape (N, n, states), and inputs, shape (N, n, inputs), of that law from z = 0."""
+    after, inputs = np.empty(stages.c.shape), np.empty(forward.shape)
+    z = np.zeros(stages.c.shape[1:])
     for k in range(len(after)):
-        inputs[k] = _times(law.feedback[k], z) + law.forward[k]
+        inputs[k] = _times(feedback[k], z) + forward[k]
         z = after[k] = _times(stages.A[k], z) + _times(stages.B[k], inputs[k]) + stages.c[k]
     return after, inputs
 
@@ -157,8 +151,8 @@ def optimise(future: Future, limits: Limits) -> Trajectory:
             break
         barrier = max(BARRIER_END, barrier * BARRIER_CUT) if step else barrier
         stages = _stages(future, x, u, nominal, slack, force, barrier)
-        law = sweep_back(stages)
-        after, moves = sweep_forward(stages, law, np.zeros((n, STATES + INPUTS)))
+        feedback, forward = sweep_back(stages)
+        after, moves = sweep_forward(stages, feedback, forward)
         dz = after * SCALES
         ds = _slopes(after[:, :, STATES:], moves)
         df = barrier / slack - force - force / slack * ds
@@ -168,7 +162,7 @@ def optimise(future: Future, limits: Limits) -> Trajectory:
         slack = _slacks(u, nominal, limits)
         force = force + _step_fraction(force, df)[:, None] * df
         moved = np.abs(after).max(axis=(0, 2))
-    return Trajectory(x, u, law.feedback * (SCALES[STATES:, None] / SCALES), moved)
+    return Trajectory(x, u, feedback * (SCALES[STATES:, None] / SCALES), moved)
 
 
 def linearised(future: Future, x: Floats, u: Floats) -> tuple[Floats, Floats]:

@@ -10,17 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from cz_gym.baselines.policy import Floats, MeasuredController, stack
 from cz_gym.cost import WEIGHTS, Weights
 from cz_gym.observation import Measured
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
-from cz_gym.physics.parameters import Parameters
 from cz_gym.physics.plant import Puller, make_puller
 from cz_gym.units import KILO
 
@@ -106,16 +104,15 @@ class LQG(MeasuredController):
     hypotheses: Hypotheses | None = None
     """Fluctuations that a bank of filters considers possible; None for a single filter."""
 
-    @property
+    @cached_property
     def gains(self) -> Gains:
         """Gains of the design point."""
-        return _at_design_point(self.design, self.control_interval, self.parameters, self.meniscus)
+        puller = make_puller(self.parameters, self.design.lam, self.meniscus)
+        return solve(self.design, self.control_interval, puller, self.meniscus)
 
     def estimator(self, n: int) -> PlantFilter | MultipleModelFilter:
         """The filter, or the bank of filters, for n slots."""
-        if self.hypotheses is None:
-            return self.gains.filter
-        return _bank(self.design, self.control_interval, self.parameters, self.meniscus, self.hypotheses, n)
+        return self.gains.filter if self.hypotheses is None else _bank(self, self.hypotheses, n)
 
     def at_rest(self, seen: Measured) -> Memory:
         """The filter at its initial covariance."""
@@ -130,53 +127,32 @@ class LQG(MeasuredController):
         drift_moved = self.design.noise.recipe_share * (memory.plan[:, 1, 1] - memory.plan[:, 1, 0])
         state = self.estimator(len(applied)).step(memory.filter, applied, drift_moved, seen, starts)
         plan = look_ahead(memory.plan, seen, starts, self.control_interval)
-        previous = previous_inputs(applied, memory.command, starts, self.design.heater_slack)
+        # Moves start from the applied inputs, the heater's corrected by the resolution of its drive.
+        slack = np.array([0.0, self.design.heater_slack])
+        previous = applied + np.where(starts[:, None], 0.0, np.clip(memory.command - applied, -slack, slack))
         inputs = self.law(state.mean, plan, previous)
         return inputs[:, 0], inputs[:, 1], Memory(state, plan, inputs, np.ones(len(inputs)))
 
     def law(self, estimate: Floats, plan: Floats, previous: Floats) -> Floats:
-        """The inputs for an estimate; arguments as of :func:`optimal_inputs`."""
-        limits, law = (self.v_0, self.heater_range), self.gains.regulator
+        """The regulator's inputs [m/s, W], deviations within the drives' range, shape (n, 2).
+
+        ``estimate`` has shape (n, states), ``plan`` (n, 2, samples + 1), ``previous`` (n, 2). The drift is expected to
+        follow the noise model's ``recipe_share`` of the recipe's movement.
+        """
+        law, recipe_share = self.gains.regulator, self.design.noise.recipe_share
+        error = estimate[:, : len(STATES)].copy()
+        error[:, 0] -= plan[:, 0, 0]
         if self.design.error_pull is not None:
             reach = abs(self.design.error_pull * law.feedback[0, len(STATES)] / law.feedback[0, 0])
-            meant = plan[:, 0, :1]
-            radius = meant + np.clip(estimate[:, :1] - meant, -reach, reach)
-            estimate = np.concatenate([radius, estimate[:, 1:]], axis=1)
-        return optimal_inputs(estimate, plan, previous, law, self.design.noise.recipe_share, limits)
-
-
-@lru_cache(maxsize=16)
-def _at_design_point(design: LQGDesign, dt: float, parameters: Parameters, meniscus: MeniscusModel) -> Gains:
-    return solve(design, dt, make_puller(parameters, design.lam, meniscus), meniscus)
+            error[:, 0] = np.clip(error[:, 0], -reach, reach)
+        ahead = np.diff(plan, axis=-1)
+        moves = -(law.feedback @ np.concatenate([error, previous], axis=-1)[..., None])[..., 0]
+        moves += (ahead[:, :1] @ law.reference)[:, 0] + recipe_share * (ahead[:, 1:] @ law.drift)[:, 0]
+        limit = np.array([self.v_0, self.heater_range])
+        inputs: Floats = np.clip(previous + moves, -limit, limit)
+        return inputs
 
 
 @lru_cache(maxsize=2)
-def _bank(
-    design: LQGDesign, dt: float, parameters: Parameters, meniscus: MeniscusModel, hypotheses: Hypotheses, n: int
-) -> MultipleModelFilter:
-    return multiple_model_filter(_at_design_point(design, dt, parameters, meniscus).filter, hypotheses, n)
-
-
-def previous_inputs(applied: Floats, command: Floats, starts: npt.NDArray[np.bool_], heater_slack: float) -> Floats:
-    """The inputs that moves start from: the applied ones, the heater's corrected by the resolution of its drive."""
-    slack = np.array([0.0, heater_slack])
-    previous: Floats = applied + np.where(starts[:, None], 0.0, np.clip(command - applied, -slack, slack))
-    return previous
-
-
-def optimal_inputs(
-    estimate: Floats, plan: Floats, previous: Floats, law: Regulator, recipe_share: float, limits: tuple[float, float]
-) -> Floats:
-    """The regulator's inputs [m/s, W], deviations within the drives' range, shape (n, 2).
-
-    ``estimate`` has shape (n, states), ``plan`` (n, 2, samples + 1), ``previous`` (n, 2). The drift is expected to
-    follow ``recipe_share`` of the recipe's movement. ``limits`` are the ranges of both drives [m/s, W].
-    """
-    error = estimate[:, : len(STATES)].copy()
-    error[:, 0] -= plan[:, 0, 0]
-    ahead = np.diff(plan, axis=-1)
-    moves = -(law.feedback @ np.concatenate([error, previous], axis=-1)[..., None])[..., 0]
-    moves += (ahead[:, :1] @ law.reference)[:, 0] + recipe_share * (ahead[:, 1:] @ law.drift)[:, 0]
-    limit = np.array(limits)
-    inputs: Floats = np.clip(previous + moves, -limit, limit)
-    return inputs
+def _bank(controller: LQG, hypotheses: Hypotheses, n: int) -> MultipleModelFilter:
+    return multiple_model_filter(controller.gains.filter, hypotheses, n)

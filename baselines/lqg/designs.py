@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from cz_gym.baselines.tuned_for import shipped, tuned_scenario, with_values
+from cz_gym.baselines.tuned_for import tuned
 from cz_gym.config import Config
 from cz_gym.episodes.scenario import Scenario, Sensor
 
@@ -43,9 +43,8 @@ def ring_of(sensor: Sensor) -> RingModel | None:
 
 def design_of(controller: str, scenario: Scenario) -> LQGDesign:
     """The tuned design of an LQG for that scenario, with the model of its camera."""
-    chosen = shipped(controller, family_name(0.02) if controller == TOLD else "")
-    values = chosen[tuned_scenario(scenario, chosen, controller)]
-    design: LQGDesign = with_values(LQGDesign(ring=ring_of(scenario.sensor)), values)
+    start, also = LQGDesign(ring=ring_of(scenario.sensor)), family_name(0.02) if controller == TOLD else ""
+    design: LQGDesign = tuned(start, controller, scenario, also)
     return design
 
 

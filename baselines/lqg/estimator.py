@@ -20,7 +20,6 @@ from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT
 from cz_gym.units import KILO, MINUTE
 
 from . import kalman, ring_model
-from .kalman import Gaussian, Measurement
 from .model import DRIFT, FAST, HEATER, PLANT, SLOW, STATES, NoiseModel, PlantModel
 from .ring_model import RIPPLE, RIPPLE_STATES, RingModel, RippleSearch
 
@@ -92,28 +91,28 @@ class PlantFilter(NamedTuple):
 
     def correct(self, state: FilterState, seen: Measured) -> FilterState:
         """The state after the pyrometer where it is finite, and the camera where its frame is valid."""
-        n, noise = len(state.mean), self.noise
+        noise, gate = self.noise, self.gate
         row = np.zeros_like(state.mean)
         row[:, _PYROMETER] = 1.0
         known = np.isfinite(seen.T_1)
         innovation = np.where(known, seen.T_1 - state.mean[:, _PYROMETER], 0.0)
-        pyrometer = Measurement(innovation, row, np.where(known, noise.pyrometer_sd**2, np.inf))
-        estimate = kalman.correct(Gaussian(state.mean, state.covariance), pyrometer, self.gate)
-        ring, row = self.expected_frame(estimate.mean)
-        valid = seen.valid > 0.5
-        camera = Measurement(seen.ring_error + seen.r_ref - ring, row, np.where(valid, state.camera_variance, np.inf))
+        variance = np.where(known, noise.pyrometer_sd**2, np.inf)
+        mean, covariance = kalman.correct(state.mean, state.covariance, row, innovation, variance, gate)
+        ring, row = self.expected_frame(mean)
+        innovation, valid = seen.ring_error + seen.r_ref - ring, seen.valid > 0.5
+        expected = kalman.expected_variance(covariance, row)
         keep = 1.0 - self.dt / (noise.camera_memory + self.dt)
-        predicted = kalman.innovation_variance(estimate, camera._replace(variance=np.zeros(n)))
         least, most = noise.camera_sd_range
         camera_variance = kalman.matched_variance(
-            state.camera_variance, camera.innovation, predicted, valid, keep, (least**2, most**2), self.gate
+            state.camera_variance, innovation, expected, valid, keep, (least**2, most**2), gate
         )
-        corrected = kalman.correct(estimate, camera, self.gate)
-        new = FilterState(self._clipped(corrected.mean), corrected.covariance, camera_variance, state.ripple)
+        variance = np.where(valid, state.camera_variance, np.inf)
+        corrected, covariance = kalman.correct(mean, covariance, row, innovation, variance, gate)
+        new = FilterState(self._clipped(corrected), covariance, camera_variance, state.ripple)
         if self.ring is None or not state.ripple.spectrum.shape[1]:
             return new
-        limit = self.gate * np.sqrt(predicted + state.camera_variance)
-        residual = np.clip(camera.innovation, -limit, limit) + estimate.mean[:, RIPPLE]
+        limit = gate * np.sqrt(expected + state.camera_variance)
+        residual = np.clip(innovation, -limit, limit) + mean[:, RIPPLE]
         return self._search_ripple(new, residual, valid, self.ring)
 
     def expected_frame(self, mean: Floats) -> tuple[Floats, Floats]:

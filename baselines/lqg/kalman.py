@@ -7,32 +7,10 @@ the Riccati equation.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 import numpy.typing as npt
 
 from cz_gym.baselines.policy import Floats
-
-
-class Gaussian(NamedTuple):
-    """An estimate and its uncertainty, by slot."""
-
-    mean: Floats
-    """Shape (n, states)."""
-    covariance: Floats
-    """Shape (n, states, states)."""
-
-
-class Measurement(NamedTuple):
-    """One scalar measurement, by slot."""
-
-    innovation: Floats
-    """Measured less expected value, shape (n,)."""
-    row: Floats
-    """Derivative of the expected value by the state, shape (n, states)."""
-    variance: Floats
-    """Variance of the noise, shape (n,); infinite where nothing was measured."""
 
 
 def predicted_covariance(P: Floats, A: Floats, Q: Floats) -> Floats:
@@ -41,26 +19,28 @@ def predicted_covariance(P: Floats, A: Floats, Q: Floats) -> Floats:
     return predicted
 
 
-def correct(estimate: Gaussian, measurement: Measurement, gate: float) -> Gaussian:
-    """The estimate after one measurement, with the gain K = P h / (h' P h + R).
+def correct(
+    mean: Floats, P: Floats, row: Floats, innovation: Floats, variance: Floats, gate: float
+) -> tuple[Floats, Floats]:
+    """The mean and the covariance after one measurement, with the gain K = P h / (h' P h + R).
 
+    ``innovation`` is the measured less the expected value, shape (n,), ``row`` (h) the derivative of the expected value
+    by the state, shape (n, states), ``variance`` (R) that of the noise, infinite where nothing was measured.
     Innovations are clipped to +-``gate`` standard deviations (Huber's limit): an outlier does little harm, and a real
     change is still followed.
     """
-    P = estimate.covariance
-    Ph = (P @ measurement.row[..., None])[..., 0]
-    S = innovation_variance(estimate, measurement)
+    Ph = (P @ row[..., None])[..., 0]
+    S = expected_variance(P, row) + variance
     limit = gate * np.sqrt(S)
     with np.errstate(invalid="ignore"):
-        used = np.where(np.isfinite(S), np.clip(measurement.innovation, -limit, limit), 0.0) / S
+        used = np.where(np.isfinite(S), np.clip(innovation, -limit, limit), 0.0) / S
     K = Ph / S[:, None]
-    return Gaussian(estimate.mean + Ph * used[:, None], P - K[:, :, None] * Ph[:, None, :])
+    return mean + Ph * used[:, None], P - K[:, :, None] * Ph[:, None, :]
 
 
-def innovation_variance(estimate: Gaussian, measurement: Measurement) -> Floats:
-    """h' P h + R, shape (n,)."""
-    Ph = (estimate.covariance @ measurement.row[..., None])[..., 0]
-    variance: Floats = np.einsum("ni,ni->n", Ph, measurement.row) + measurement.variance
+def expected_variance(P: Floats, row: Floats) -> Floats:
+    """Variance h' P h of the expected value of a measurement, shape (n,)."""
+    variance: Floats = np.einsum("ni,ni->n", (P @ row[..., None])[..., 0], row)
     return variance
 
 

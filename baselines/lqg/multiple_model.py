@@ -83,13 +83,11 @@ class MultipleModelFilter(NamedTuple):
         m = self.hypotheses.count
         rows = self.rows.predict(_by_row(state.filters), np.repeat(applied, m, axis=0), np.repeat(drift_moved, m))
         predicted = MultipleModelState(_by_slot(rows, m), state.evidence)
-        return self.correct(select(starts, state, predicted) if starts.any() else predicted, seen)
-
-    def correct(self, state: MultipleModelState, seen: Measured) -> MultipleModelState:
-        """The state after the measurements, which weight the filters and then correct each of them."""
-        m, rows = self.hypotheses.count, _by_row(state.filters)
-        repeated = Measured(*(np.repeat(channel, m) for channel in seen))
-        evidence = state.evidence + self._log_likelihood(rows, repeated).reshape(state.evidence.shape)
+        if starts.any():
+            predicted = select(starts, state, predicted)
+        # The measurements weight the filters, and then correct each of them.
+        rows, repeated = _by_row(predicted.filters), Measured(*(np.repeat(channel, m) for channel in seen))
+        evidence = predicted.evidence + self._log_likelihood(rows, repeated).reshape(predicted.evidence.shape)
         corrected = _by_slot(self.rows.correct(rows, repeated), m)
         return MultipleModelState(corrected, evidence - evidence.max(axis=1, keepdims=True))
 

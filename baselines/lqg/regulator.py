@@ -42,26 +42,18 @@ class Regulator(NamedTuple):
     """Shape (7, 5)."""
 
 
-class QuadraticCost(NamedTuple):
-    """sum z' Q z + 2 z' N du + du' R du with z = (plant's five states, previous inputs)."""
+def quadratic_cost(weights: Weights, dt: float) -> tuple[Floats, Floats, Floats]:
+    """Q, N and R of the cost sum z' Q z + 2 z' N du + du' R du for a control interval of dt [s].
 
-    Q: Floats
-    """Shape (7, 7)."""
-    N: Floats
-    """Shape (7, 2)."""
-    R: Floats
-    """Shape (2, 2)."""
-
-
-def quadratic_cost(weights: Weights, dt: float) -> QuadraticCost:
-    """The matrices of the cost for a control interval of dt [s]."""
+    z has the plant's five states and the previous inputs.
+    """
     Q, N = np.zeros((PLANT + 2, PLANT + 2)), np.zeros((PLANT + 2, 2))
     per_square = coefficients(weights)
     per_step = (STEP_TIME / dt) ** 2
     Q[0, 0] = per_square.radius
     Q[PLANT, PLANT] = N[PLANT, 0] = per_square.pull
     R = np.diag([per_square.pull + per_step * per_square.pull_step, per_step * per_square.heater_step])
-    return QuadraticCost(Q, N, R)
+    return Q, N, R
 
 
 def regulator(model: PlantModel, weights: Weights, dt: float) -> Regulator:

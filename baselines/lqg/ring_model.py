@@ -146,16 +146,6 @@ class RippleSearch(NamedTuple):
     """Number of samples so far, shape (n,)."""
 
 
-class Found(NamedTuple):
-    """The search after a sample."""
-
-    search: RippleSearch
-    new: npt.NDArray[np.bool_]
-    """Whether a ripple was found by this sample, for the first time or at another frequency, shape (n,)."""
-    ripple: Floats
-    """Two states of the ripple at the spectrum's peak [m], shape (n, 2)."""
-
-
 @lru_cache(maxsize=16)
 def frequencies(ring: RingModel, dt: float) -> Floats:
     """Frequencies of the search [rad/s], aliased by sampling every dt [s]."""
@@ -177,8 +167,11 @@ def search_at_rest(n: int, ring: RingModel | None, dt: float) -> RippleSearch:
 
 def search_step(
     search: RippleSearch, residual: Floats, valid: npt.NDArray[np.bool_], ring: RingModel, dt: float
-) -> Found:
+) -> tuple[RippleSearch, npt.NDArray[np.bool_], Floats]:
     """The search after one more ``residual`` [m] of the ring, shape (n,), which counts where ``valid``.
+
+    Also whether this sample shows a ripple for the first time, or at another frequency, shape (n,); and the two states
+    of the ripple at the spectrum's peak [m], shape (n, 2).
 
     Running sums Z <- (1 - 1/m) e^(i omega dt) Z + residual/m with m samples of memory, fewer at the start. A parabola
     through the log power of the peak and its neighbours refines the frequency. The ends of the spectrum, where slow
@@ -202,4 +195,4 @@ def search_step(
     new = clear & (np.abs(refined - search.omega) > 1.5 * spacing)
     ripple = 2.0 * np.stack([Z.real[slot, peak], Z.imag[slot, peak]], axis=-1)
     spectrum = Z.view(np.float64).reshape(search.spectrum.shape)
-    return Found(RippleSearch(spectrum, np.where(clear, refined, search.omega), samples), new, ripple)
+    return RippleSearch(spectrum, np.where(clear, refined, search.omega), samples), new, ripple

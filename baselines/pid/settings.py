@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cz_gym.baselines.tuned_for import shipped, tuned_scenario, with_values
+from cz_gym.baselines.tuned_for import tuned
 from cz_gym.episodes.scenario import Scenario
 
 from .filtered_pid import FilteredPID
@@ -19,7 +19,5 @@ START: dict[str, FilteredPID | Industrial] = {
 
 def settings_of(controller: str, scenario: Scenario) -> FilteredPID | Industrial:
     """The controller with its tuned settings for that scenario."""
-    chosen = shipped(controller)
-    values = chosen[tuned_scenario(scenario, chosen, controller)]
-    settings: FilteredPID | Industrial = with_values(START[controller], values)
+    settings: FilteredPID | Industrial = tuned(START[controller], controller, scenario)
     return settings

@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import minimize
 
 from cz_gym.baselines.bounds.trajectory import SCALES, Limits
-from cz_gym.baselines.lqg.controller import LQG, LQGDesign, optimal_inputs
+from cz_gym.baselines.lqg.controller import LQG, LQGDesign
 from cz_gym.baselines.lqg.model import DRIFT, HEATER, PLANT, STATES
 from cz_gym.baselines.mpc import EkfMpc, best_corrections, expected_disturbances, held, newton, predict_under_law
 from cz_gym.baselines.registry import find_controller
@@ -51,8 +51,7 @@ def test_mpc_on_a_linear_plant_without_limits_is_the_lqr(dt, blocks):
     lqg, mpc = LQG(dt, LINEAR), EkfMpc(dt, LINEAR, blocks=blocks)
     estimate, plan, previous = situation()
     plan = np.pad(plan, ((0, 0), (0, 0), (0, 90)), "edge")[:, :, : round(300.0 / dt) + 1]
-    law = optimal_inputs(estimate, plan, previous, lqg.gains.regulator, SHARE, (lqg.v_0, lqg.heater_range))
-    assert mpc.law(estimate, plan, previous) == pytest.approx(law, rel=1e-8)
+    assert mpc.law(estimate, plan, previous) == pytest.approx(lqg.law(estimate, plan, previous), rel=1e-8)
 
 
 def test_casadi_predicts_what_the_plant_does():
@@ -152,7 +151,7 @@ def test_estimates_beyond_the_equations_fall_back_on_the_law():
     estimate, plan, previous = situation()
     estimate[0, 1] = 20.0 * MM
     inputs = mpc.law(estimate, plan, previous)
-    law = optimal_inputs(estimate, plan, previous, mpc.gains.regulator, SHARE, (mpc.v_0, mpc.heater_range))
+    law = LQG.law(mpc, estimate, plan, previous)
     assert np.isfinite(inputs).all()
     assert inputs[0] == pytest.approx(law[0])
     alone = mpc.law(estimate[:1], plan[:1], previous[:1])

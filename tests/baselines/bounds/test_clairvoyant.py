@@ -78,20 +78,20 @@ def test_the_environment_replays_what_was_planned(optimum):
     run = replay(config, policy)
     power = run.signals.Q_H
     assert not run.failed.any()
-    assert run.signals.r_c == pytest.approx(policy.plan.best.x[1:, :, 0], abs=1e-6 * MM)
-    assert power == pytest.approx(policy.plan.best.u[:, :, 1], abs=0.01)
-    assert policy.plan.best.converged.all()
+    assert run.signals.r_c == pytest.approx(policy.best.x[1:, :, 0], abs=1e-6 * MM)
+    assert power == pytest.approx(policy.best.u[:, :, 1], abs=0.01)
+    assert policy.best.converged.all()
 
 
 def test_no_nearby_inputs_are_cheaper_and_the_slope_is_zero(optimum):
     config, policy = optimum
-    best = policy.plan.best
+    best = policy.best
     random = np.random.default_rng(5)
     smooth = np.cumsum(random.normal(size=best.u.shape), axis=0) / np.sqrt(len(best.u))
     rough = random.normal(size=best.u.shape)
     for shape in (smooth, rough):
         change = shape * np.array([0.002 * MM_PER_MIN, 0.002 * KILO])
-        moved = (played(best.u + sign * change, policy.plan.inputs_0) for sign in (-1.0, 0.0, 1.0))
+        moved = (played(best.u + sign * change, policy.inputs_0) for sign in (-1.0, 0.0, 1.0))
         costs = [metrics(replay(config, each)).cost * config.steps for each in moved]
         rise = costs[0] + costs[2] - 2.0 * costs[1]
         assert (rise > 0.0).all()
@@ -141,7 +141,7 @@ def test_slow_narrow_and_stepping_drives_are_respected_and_followed():
         heater_step=0.1 * KILO,
     )
     config, policy = planned(replace(HARD, name="narrow", actuators=actuators))
-    u, u_0 = policy.plan.best.u, policy.plan.inputs_0
+    u, u_0 = policy.best.u, policy.inputs_0
     pull, power = u[:, :, 0] - u_0[:, 0], u[:, :, 1] - u_0[:, 1]
     limits = limits_of(actuators, (u_0[0, 0], config.heater_range), config.control_interval)
     assert np.abs(pull).max() < limits.span[0] * MM_PER_MIN
@@ -149,12 +149,10 @@ def test_slow_narrow_and_stepping_drives_are_respected_and_followed():
     assert np.abs(np.diff(power, axis=0)).max() < limits.move[1] * KILO
     run = replay(config, policy)
     assert not run.failed.any()
-    assert run.signals.r_c == pytest.approx(policy.plan.best.x[1:, :, 0], abs=0.05 * MM)
+    assert run.signals.r_c == pytest.approx(policy.best.x[1:, :, 0], abs=0.05 * MM)
 
 
-def test_the_clairvoyant_refuses_to_act_without_a_plan_or_on_other_slots():
-    with pytest.raises(RuntimeError, match="for_episodes"):
-        Clairvoyant().predict(np.zeros((1, 17)))
+def test_the_clairvoyant_refuses_to_act_on_other_slots():
     _, policy = planned(horizon=60.0)
     with pytest.raises(ValueError, match="a plan for 3 episodes, not 2"):
         policy.predict(np.zeros((2, 17)))

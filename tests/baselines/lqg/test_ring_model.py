@@ -61,9 +61,8 @@ def heard(tone_hz, amplitude, noise, samples, dt=5.0, slots=40, ring=PULLER_RING
     phase, search = rng.uniform(0.0, 2.0 * np.pi, slots), ring_model.search_at_rest(slots, ring, dt)
     for k in range(samples):
         rest = amplitude * np.sin(2.0 * np.pi * tone_hz * k * dt + phase) + noise * rng.normal(size=slots)
-        found = search_step(search, rest, np.ones(slots, bool), ring, dt)
-        search = found.search
-    return found, amplitude * np.sin(2.0 * np.pi * tone_hz * k * dt + phase)
+        search, _, ripple = search_step(search, rest, np.ones(slots, bool), ring, dt)
+    return search, ripple, amplitude * np.sin(2.0 * np.pi * tone_hz * k * dt + phase)
 
 
 @pytest.mark.parametrize("dt", [2.0, 5.0, 10.0])
@@ -71,10 +70,10 @@ def heard(tone_hz, amplitude, noise, samples, dt=5.0, slots=40, ring=PULLER_RING
 def test_a_tone_is_found_where_its_alias_is(rotation, dt):
     tone = rotation / MINUTE
     alias = abs(tone - round(tone * dt) / dt)
-    found, now = heard(tone, 0.1 * MM, 0.05 * MM, round(1200.0 / dt), dt)
+    search, ripple, now = heard(tone, 0.1 * MM, 0.05 * MM, round(1200.0 / dt), dt)
     half_a_bin = 0.125 / PULLER_RING.memory
-    np.testing.assert_allclose(found.search.omega / (2.0 * np.pi), alias, atol=half_a_bin)
-    assert np.sqrt(np.mean((found.ripple[:, 0] - now) ** 2)) < PULLER_RING.ripple_sd
+    np.testing.assert_allclose(search.omega / (2.0 * np.pi), alias, atol=half_a_bin)
+    assert np.sqrt(np.mean((ripple[:, 0] - now) ** 2)) < PULLER_RING.ripple_sd
 
 
 def test_frequencies_as_slow_as_the_radius_are_not_searched():
