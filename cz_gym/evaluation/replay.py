@@ -1,6 +1,6 @@
 """Counterfactuals: the same episodes with another controller from some moment on.
 
-The environment's state is saved and continued bit for bit, so that the controller is all that differs.
+Equal seeds and actions give equal episodes bit for bit, so that the controller is all that differs.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy.typing as npt
 from cz_gym.config import Config
 from cz_gym.errors import CzError
 
-from .rollout import EpisodeBatch, Rollout, call_policy, check_policy, check_seeds
+from .rollout import Rollout, call_policy, check_policy, check_seeds, informed, rollout
 
 
 @dataclass(frozen=True)
@@ -69,29 +69,31 @@ def replay(
     seeds = check_seeds(seeds)
     if not 0.0 <= at <= config.horizon:
         raise CzError(f"at must lie in the episode, 0 to {config.horizon:g} s, not {at!r}")
-    policy, instead = (
-        one.for_episodes(config, list(seeds)) if hasattr(one, "for_episodes") else one for one in (policy, instead)
-    )
+    policy, instead = (informed(one, config, seeds) for one in (policy, instead))
     takeover = round(at / config.control_interval)
-    actual, watcher = EpisodeBatch(config, seeds), _Watched(policy, instead if watches else None)
-    actual.run(watcher, takeover)
-    other = actual.fork()
-    other.memory = watcher.memory
-    other.begins = np.zeros_like(actual.begins) if watches and takeover > 0 else np.ones_like(actual.begins)
-    actual.run(policy, config.steps)
-    other.run(instead, config.steps)
-    return Counterfactual(takeover * config.control_interval, actual.finish(), other.finish())
+    actual = rollout(_Handover(policy, instead, config.steps, False), config, seeds)
+    other = rollout(_Handover(policy, instead, takeover, watches), config, seeds)
+    return Counterfactual(takeover * config.control_interval, actual, other)
 
 
-class _Watched:
-    """A policy that acts while another one gets the same observations."""
+@dataclass(frozen=True)
+class _Handover:
+    """One policy until a step, then another one, which may have watched before; memory: step, and that of each."""
 
-    def __init__(self, policy: Any, watcher: Any) -> None:
-        self.policy, self.watcher, self.memory = policy, watcher, None
+    first: Any
+    second: Any
+    step: int
+    watches: bool
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[Any, Any]:
-        if self.watcher is not None:
-            _, self.memory = call_policy(self.watcher, observation.copy(), self.memory, episode_start)
-        return call_policy(self.policy, observation, state, episode_start)
+        k, first, second = state or (0, None, None)
+        if k >= self.step:
+            begins = episode_start if self.watches or k > self.step else np.ones(len(observation), np.bool_)
+            action, second = call_policy(self.second, observation, second, begins)
+            return action, (k + 1, first, second)
+        if self.watches:
+            _, second = call_policy(self.second, observation.copy(), second, episode_start)
+        action, first = call_policy(self.first, observation, first, episode_start)
+        return action, (k + 1, first, second)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from inspect import signature
 from typing import Any, NamedTuple
@@ -86,14 +87,37 @@ def rollout(
     """
     check_policy(policy, config, designed_for)
     seeds = check_seeds(seeds)
+    n, shape = len(seeds), (config.steps, len(seeds))
     before = time.perf_counter()
-    if hasattr(policy, "for_episodes"):
-        policy = policy.for_episodes(config, list(seeds))
-    planning = time.perf_counter() - before
-    episodes = EpisodeBatch(config, seeds)  # its first one compiles: no time of the policy's
-    episodes.seconds = planning
-    episodes.run(policy, config.steps, progress)
-    return episodes.finish()
+    policy = informed(policy, config, seeds)
+    seconds = time.perf_counter() - before
+    signals, memory = Signals(*(np.zeros(shape) for _ in Signals._fields)), None
+    reward, alive, failed = np.zeros(shape), np.zeros(shape, np.bool_), np.zeros(n, np.bool_)
+    running, begins, over = np.ones(n, np.bool_), np.ones(n, np.bool_), np.zeros(n, np.bool_)
+    with closing(CzVectorEnv.from_config(config, n, info="all")) as env:
+        observation, info = env.reset(seed=list(seeds))
+        start = Signals(*(np.array(info[name])[None] for name in Signals._fields))
+        for k in range(config.steps):
+            before = time.perf_counter()
+            action, memory = call_policy(policy, observation, memory, begins)
+            seconds += time.perf_counter() - before
+            # An action may be marked with what it was made for; check_policy has said what fits.
+            observation, gained, terminated, truncated, info = env.step(np.asarray(action))
+            for log, name in zip(signals, Signals._fields, strict=True):
+                log[k] = info[name]
+            reward[k], alive[k] = np.where(running, gained, 0.0), running
+            failed |= running & terminated
+            # A slot that is over is drawn anew by the next step: only then does its policy begin again.
+            begins, over = over, terminated | truncated
+            running &= ~over
+            if progress is not None:
+                progress(n)
+    return Rollout(config, seeds, signals, reward, alive, failed, start, seconds)
+
+
+def informed(policy: Any, config: Config, seeds: Sequence[int]) -> Any:
+    """Return the policy; of a bound, the one that knows these episodes."""
+    return policy.for_episodes(config, list(seeds)) if hasattr(policy, "for_episodes") else policy
 
 
 def check_seeds(seeds: Sequence[int] | npt.NDArray[Any]) -> tuple[int, ...]:
@@ -140,60 +164,3 @@ def call_policy(policy: Any, observation: Any, state: Any, begins: Any) -> tuple
             f"not {np.shape(found[0])}"
         )
     return found
-
-
-class EpisodeBatch:
-    """Episodes in progress, one a seed: run by a policy up to a step, copied, continued by another."""
-
-    def __init__(self, config: Config, seeds: Sequence[int]) -> None:
-        n = len(seeds)
-        self.config, self.seeds, self.k, self.seconds = config, tuple(seeds), 0, 0.0
-        self.env = CzVectorEnv.from_config(config, n, info="all")
-        self.signals = Signals(*(np.zeros((config.steps, n)) for _ in Signals._fields))
-        self.reward, self.alive = np.zeros((config.steps, n)), np.zeros((config.steps, n), np.bool_)
-        self.failed, self.running = np.zeros(n, np.bool_), np.ones(n, np.bool_)
-        self.begins, self.over = np.ones(n, np.bool_), np.zeros(n, np.bool_)
-        self.memory: Any = None
-        """The policy's memory."""
-        self.observation, info = self.env.reset(seed=list(seeds))
-        self.start = Signals(*(np.array(info[name])[None] for name in Signals._fields))
-
-    def run(self, policy: Any, upto: int, progress: Callable[[int], None] | None = None) -> None:
-        """Let the policy act until ``upto`` steps are done."""
-        while self.k < upto:
-            before = time.perf_counter()
-            action, self.memory = call_policy(policy, self.observation, self.memory, self.begins)
-            self.seconds += time.perf_counter() - before
-            self._step(action)
-            if progress is not None:
-                progress(len(self.seeds))
-
-    def _step(self, action: Any) -> None:
-        # An action may be marked with what it was made for; check_policy has said what fits.
-        self.observation, gained, terminated, truncated, info = self.env.step(np.asarray(action))
-        # A slot that is over is drawn anew by the next step: only then does its policy begin again.
-        self.begins, self.over = self.over, terminated | truncated
-        for log, name in zip(self.signals, Signals._fields, strict=True):
-            log[self.k] = info[name]
-        self.reward[self.k] = np.where(self.running, gained, 0.0)
-        self.alive[self.k] = self.running
-        self.failed |= self.running & terminated
-        self.running &= ~self.over
-        self.k += 1
-
-    def fork(self) -> EpisodeBatch:
-        """A copy of the episodes at this step, with their logs, for another policy to continue."""
-        other = EpisodeBatch(self.config, self.seeds)
-        other.env.set_state(self.env.get_state())
-        other.k, other.observation = self.k, self.observation.copy()
-        other.signals = Signals(*(log.copy() for log in self.signals))
-        other.reward, other.alive, other.failed = self.reward.copy(), self.alive.copy(), self.failed.copy()
-        other.running, other.over = self.running.copy(), self.over.copy()
-        return other
-
-    def finish(self) -> Rollout:
-        """The finished rollout; closes the environment."""
-        self.env.close()
-        return Rollout(
-            self.config, self.seeds, self.signals, self.reward, self.alive, self.failed, self.start, self.seconds
-        )
