@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 try:
-    from cz_gym.commands import OneLineParser, guarded, shown
+    from cz_gym.commands import OneLineParser, between, guarded, shown
     from cz_gym.errors import CzError
     from cz_gym.names import unknown
 except ModuleNotFoundError as error:
@@ -43,7 +43,8 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
         epilog="docs/benchmark.md has the protocol, the formula of every metric and how to add a controller.",
     )
     add = parser.add_argument
-    add("--episodes", type=int, default=EPISODES, metavar="N", help="first N test episodes (%(default)s)")
+    about = "first N test episodes (%(default)s)"
+    add("--episodes", type=between(1, EPISODES), default=EPISODES, metavar="N", help=about)
     add("--controllers", type=_names, metavar="A,B", help='controllers and agents by name, or "all"')
     add("--scenarios", type=_names, metavar="A,B", help="scenarios by name")
     add("--out", type=Path, metavar="DIR", help="folder for the results (results/benchmark; of your own: runs/NAME)")
@@ -91,8 +92,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def benchmark(arguments: argparse.Namespace, command: str) -> int:
     """Check the arguments, run the benchmark, write and print the results."""
-    from tqdm import tqdm
-
     from cz_gym.evaluation.files import check_targets, write
     from cz_gym.evaluation.report.markdown import terminal
     from cz_gym.evaluation.runner import run
@@ -104,9 +103,8 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
     if arguments.out is not None:  # a missing package is named before the work, not after it
         import matplotlib  # noqa: F401
         import plotly  # noqa: F401
-    with tqdm(unit="step", unit_scale=True, leave=False, disable=arguments.quiet or None) as bar:
-        again, bounds = partial(taking_part, tuple(shlex.split(command)[1:])), None if arguments.puller else BOUNDS
-        results = run(contenders, rows, arguments.episodes, bar, CACHE, bounds, again)
+    again, bounds = partial(taking_part, tuple(shlex.split(command)[1:])), None if arguments.puller else BOUNDS
+    results = run(contenders, rows, arguments.episodes, CACHE, bounds, again, arguments.quiet)
     quoted = README if not smaller and arguments.out and arguments.out.resolve() == FOLDER else None
     write(arguments.out, arguments.json, results, command, quoted)
     if not arguments.quiet:
@@ -130,10 +128,9 @@ def taking_part(argv: tuple[str, ...]) -> tuple[list[Contender], list[Row]]:
 def rows_of(arguments: argparse.Namespace) -> list[Row]:
     """Scenarios that the command line asks for, as rows of the protocol."""
     from cz_gym.evaluation import user_code
-    from cz_gym.evaluation.protocol import ROWS, check_episodes, find_row
+    from cz_gym.evaluation.protocol import ROWS, find_row
     from cz_gym.puller import chosen_puller
 
-    check_episodes(arguments.episodes)
     names = arguments.scenarios or [row.name for row in ROWS if row.default and not arguments.scenario]
     rows = [*map(find_row, names), *map(user_code.row, arguments.scenario)]
     user_code.check_apart([row.name for row in rows], "scenario")

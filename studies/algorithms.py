@@ -65,8 +65,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _compare(given: argparse.Namespace) -> None:
-    from tqdm import tqdm
-
     from cz_gym.agents import OnnxPolicy
     from cz_gym.agents.training.run_files import read_rows
     from cz_gym.agents.training.validation import JUDGING
@@ -84,8 +82,7 @@ def _compare(given: argparse.Namespace) -> None:
             folder / "progress.csv"
         )
     agents = [agent(name, trained) for name, trained in policies.items()]
-    with tqdm(unit="step", unit_scale=True, leave=False, disable=None) as bar:
-        results = run(agents, random_rows(JUDGING[0]), len(JUDGING), bar, given.out)
+    results = run(agents, random_rows(JUDGING[0]), len(JUDGING), given.out)
     write_files({given.out / name: content for name, content in report(results, runs).items()})
     print(f"wrote {given.out / 'table.md'}")
 

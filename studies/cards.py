@@ -13,9 +13,9 @@ from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.commands import OneLineParser
 from cz_gym.errors import CzError
 from cz_gym.evaluation.files import read_results
+from cz_gym.evaluation.report.tables import FAILURES, PULL_STEP, RMSE, Column
 from cz_gym.evaluation.report.tables import markdown as table
 from cz_gym.evaluation.statistics import Estimate
-from cz_gym.units import PERCENT
 
 AGENTS = {
     "gradient": "analytic policy gradients: the cost's gradient through policy and plant; the plant is known",
@@ -23,13 +23,13 @@ AGENTS = {
     "sac": "soft actor-critic from nothing, from the reward; its critics saw the true state in training",
 }
 """Shipped agents, and how each learned."""
-FIGURES = {
-    "rmse_mm": ("RMSE [mm]", ".4f", 1.0),
-    "rmse_observable_mm": ("observable RMSE [mm]", ".4f", 1.0),
-    "pull_step_rms_mm_per_min": ("pull step RMS [mm/min]", ".4f", 1.0),
-    "failure_rate": ("lost [%]", ".2f", PERCENT),
-}
-"""Heading, format and unit of each metric of a card."""
+FIGURES = (
+    RMSE._replace(decimals=4),
+    Column("rmse_observable_mm", "observable RMSE [mm]", 4),
+    PULL_STEP,
+    FAILURES._replace(heading="lost [%]"),
+)
+"""Columns of a card."""
 RETURN = "return"
 """Metric that model hubs show as the mean reward."""
 Results = Mapping[str, Mapping[str, Mapping[str, Estimate]]]
@@ -40,8 +40,7 @@ def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -
     """An agent's section."""
     first = contracts[0]
     rows = [
-        [scenario, *(of[name][metric].text(form, unit) for metric, (_, form, unit) in FIGURES.items())]
-        for scenario, of in results.items()
+        [scenario, *(column.text(of[name][column.metric]) for column in FIGURES)] for scenario, of in results.items()
     ]
     fails = [f"`{scenario}`" for scenario, of in results.items() if of[name]["failure_rate"].mean > 0.0]
     return "\n".join(
@@ -54,7 +53,7 @@ def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -
             f"- Training seeds: {len(contracts)}. `agents.load({name!r})` is the one of least validation cost.",
             "- Fails: " + (f"loses crystals of {', '.join(fails)}." if fails else "on none of these."),
             "",
-            table(["scenario", *(head for head, *_ in FIGURES.values())], rows),
+            table(["scenario", *(column.heading for column in FIGURES)], rows),
             "",
         ]
     )
@@ -104,7 +103,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(given: argparse.Namespace) -> None:
     check_writable(given.out.parent)
-    results, _ = read_results(given.benchmark, [*FIGURES, RETURN])
+    results, _ = read_results(given.benchmark, [*(column.metric for column in FIGURES), RETURN])
     if not all(AGENTS.keys() <= by_name.keys() for by_name in results.values()):
         raise CzError(f"{given.benchmark}: no results of {', '.join(AGENTS)}")
     cards = {

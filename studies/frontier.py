@@ -110,7 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _compare(given: argparse.Namespace) -> None:
     results, _ = read_results(given.benchmark, (given.metric, ACTIVITY, RETURN))
     beside = given.benchmark.with_name(EPISODES)
-    episodes = read_episodes(beside, lambda _: (ACTIVITY, given.metric)) if beside.exists() else None
+    episodes = read_episodes(beside, (ACTIVITY, given.metric)) if beside.exists() else None
     text = table(results, given.metric, episodes)
     print(text)
     if given.out is not None:

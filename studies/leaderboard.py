@@ -23,6 +23,7 @@ from cz_gym.errors import CzError
 from cz_gym.evaluation.files import read_results, to_json
 from cz_gym.evaluation.protocol import ROWS, TEST_SEEDS, Row, contract_hash
 from cz_gym.evaluation.report.markdown import summary
+from cz_gym.evaluation.report.tables import RMSE
 from cz_gym.evaluation.report.tables import markdown as table
 from cz_gym.evaluation.results import Result
 from cz_gym.evaluation.runner import check_agents, run
@@ -73,7 +74,7 @@ def page(results: Sequence[Result], claims: Claims, rows: Sequence[Row]) -> str:
     lines = []
     for place, name in enumerate(sorted(here, key=lambda name: mean(name, "rmse_mm")), 1):
         claim, contract = claims[name]
-        own = results[0].means[name]["rmse_mm"].text(".3f", 1.0)
+        own = RMSE.text(results[0].means[name][RMSE.metric])
         same = "the same" if contract == contract_hash(rows) else f"other: `{contract or 'unknown'}`"
         seeds, lost = str(len(here[name].training_seeds)), f"{100.0 * mean(name, 'failure_rate'):.2f}"
         lines.append((str(place), name, budget(here[name]), seeds, f"{claim:.3f}", own, lost, same))
@@ -100,8 +101,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(given: argparse.Namespace) -> None:
-    from tqdm import tqdm
-
     check_writable(given.out)
     with naming(given.folder):
         submitted = [submission(each) for each in sorted(given.folder.iterdir()) if each.is_dir()]
@@ -112,8 +111,7 @@ def _main(given: argparse.Namespace) -> None:
     agents = [contender for contender, _ in submitted]
     check_agents(agents, rows)
     contenders = [*(each for each in CONTROLLERS if each.quoted), *agents]
-    with tqdm(unit="step", unit_scale=True, leave=False, disable=None) as bar:
-        results = run(contenders, rows, given.episodes, bar, given.out)
+    results = run(contenders, rows, given.episodes, given.out)
     text = page(results, {contender.name: claim for contender, claim in submitted}, rows)
     command = f"python -m studies.leaderboard {given.folder} --episodes {given.episodes} --first-seed {first}"
     files = {"leaderboard.md": text, "leaderboard.json": to_json(results, command)}

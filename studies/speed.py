@@ -72,7 +72,7 @@ def cases(quick: bool) -> dict[str, Callable[[], Any]]:
     }
     for name, make in (
         ("Cz-v0 batch, measured", our_batch),
-        ("Cz-v0 batch without resets", without_resets),
+        ("Cz-v0 batch without resets", partial(our_batch, resets=False)),
         ("bare compiled plant and ring", bare_plant),
         ("EnvPool Pendulum-v1", _envpool),
     ):
@@ -117,19 +117,17 @@ def batched(env: Any, num_envs: int) -> Stepper:
     return Stepper(num_envs, lambda: env.step(action), env.close)
 
 
-def our_batch(num_envs: int, threads: int = 1) -> Stepper:
-    """The native batch; its slots are at random steps of their episodes, so that resets are spread out."""
+def our_batch(num_envs: int, threads: int, resets: bool = True) -> Stepper:
+    """The native batch, its slots at random steps of their episodes, so that resets are spread out.
+
+    Without ``resets`` it repeats the same first minutes, to be compared with the bare loop.
+    """
     env = CzVectorEnv(num_envs, observation="measured", threads=threads)
     env.reset(seed=0)
+    if not resets:
+        return repeated(env._batch, batched(env, num_envs))
     env._batch.memory.slots["k"] = np.random.default_rng(0).integers(0, env.config.steps, num_envs)
     return batched(env, num_envs)
-
-
-def without_resets(num_envs: int, threads: int) -> Stepper:
-    """The native batch, which repeats the same first minutes without resets, to compare with the bare loop."""
-    env = CzVectorEnv(num_envs, observation="measured", threads=threads)
-    env.reset(seed=0)
-    return repeated(env._batch, batched(env, num_envs))
 
 
 def bare_plant(num_envs: int, threads: int) -> Stepper:

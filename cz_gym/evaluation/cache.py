@@ -13,7 +13,6 @@ import json
 import sys
 from collections.abc import Sequence
 from functools import cache
-from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -50,20 +49,18 @@ class SlowEpisodes:
 
     def read(self, seeds: Sequence[int]) -> list[Sample]:
         """Samples of the cached episodes, one an episode; the first is left out if its signals were not kept."""
-        found = (self._read(seed, seed == seeds[0]) for seed in seeds)
-        return [sample for sample in found if sample]
+        found = map(self._read, seeds)
+        return [sample for sample in found if sample and (sample.example or sample.seeds[0] != seeds[0])]
 
-    def _read(self, seed: int, example: bool) -> Sample | None:
-        """An episode with its signals if it is an ``example``; None if it is not there, or damaged."""
+    def _read(self, seed: int) -> Sample | None:
+        """An episode with the signals that were kept; None if it is not there, or damaged."""
         try:
             with np.load(io.BytesIO((self.place / f"{seed}.npz").read_bytes())) as data:
-                values, microseconds, signals = data["values"], float(data["microseconds"]), data["signals"]
+                example = Signals(*data["signals"]) if len(data["signals"]) else None
+                values, microseconds = data["values"][None, None], float(data["microseconds"])
+                return Sample(self.contender, (seed,), values, microseconds, example)
         except Exception:  # zipfile, zlib and NumPy each raise their own for a file cut short
             return None
-        if example and not len(signals):
-            return None
-        shown = Signals(*signals) if example else None
-        return Sample(self.contender, (seed,), values[None, None], microseconds, shown)
 
     def write(self, sample: Sample) -> None:
         """Keep the episodes of a sample, and the signals of its first."""
@@ -83,30 +80,27 @@ def earlier_bound(folder: Path, row: Row, samples: Sequence[Sample]) -> Sample |
     with the same figures: another plant, scenario or code makes other figures.
     """
     try:
-        heads = (folder / EPISODES).read_text("utf-8").partition("\n")[0].split(",")
-        # An earlier run may lack a newer metric, but not what gaps are made of.
-        known = [name in heads or name in GAPS for name in metric_names()]
-        columns = ("seed", *compress(metric_names(), known))
-        found = read_episodes(folder / EPISODES, lambda scenario: columns if scenario == row.name else ())[row.name]
+        found = read_episodes(folder / EPISODES, ("seed", *GAPS))[row.name]
         (episodes,) = found[BOUND]
-    except (OSError, ValueError, KeyError):
+    except (ValueError, KeyError):
         return None
     seeds = row.seeds(len(episodes))
     classical = [sample for sample in samples if sample.name in found and not sample.contender.learned]
-    agree = [_agree(sample, found[sample.name][0], known) for sample in classical]
+    agree = [_agree(sample, found[sample.name][0]) for sample in classical]
     if episodes[:, 0].tolist() != list(seeds) or not agree or not all(agree):
         return None
     contender = Contender(BOUND, lambda config: None, "state", "bound of an earlier run", privileged=True, slow=True)
-    values = np.full((1, len(episodes), len(known)), np.nan)
-    values[..., known] = episodes[:, 1:]
+    values = np.full((1, len(episodes), len(metric_names())), np.nan)
+    values[..., [metric_names().index(name) for name in GAPS]] = episodes[:, 1:]
     return Sample(contender, tuple(seeds), values, float("nan"))
 
 
-def _agree(sample: Sample, earlier: Floats, known: Sequence[bool]) -> bool:
-    """Whether a controller has the figures it had earlier, shape (episodes, 1 + known), on the same crystals."""
+def _agree(sample: Sample, earlier: Floats) -> bool:
+    """Whether a controller has the figures it had earlier: seeds and GAPS, shape (episodes, 1 + metrics)."""
     both = min(len(sample.seeds), len(earlier))
     same_seeds = earlier[:both, 0].tolist() == list(sample.seeds[:both])
-    return same_seeds and np.allclose(sample.values[0, :both][:, known], earlier[:both, 1:], rtol=PRINTED)
+    now = np.stack([sample.metric(name)[0, :both] for name in GAPS], axis=1)
+    return same_seeds and np.allclose(now, earlier[:both, 1:], rtol=PRINTED)
 
 
 @cache

@@ -19,7 +19,7 @@ from scipy.interpolate import PchipInterpolator
 
 from cz_gym.errors import CzError
 
-from .statistics import LEVEL, Floats, Resamples
+from .statistics import LEVEL, Floats, Resamples, resampled_means
 
 Point = tuple[float, float]
 """Pull activity [mm/min] and radius error [mm]."""
@@ -85,10 +85,7 @@ def intervals(episodes: Mapping[str, Floats], family: Sequence[str], resamples: 
     ``episodes`` has activity [mm/min] and radius error [mm] by controller, shape (training seeds, crystals, 2). Every
     resample has a frontier of its own. A controller quieter than every member in some resample is left out.
     """
-    means = {}
-    for of, (name, values) in enumerate(episodes.items()):
-        seeds = resamples.training_seeds(len(values), of)
-        means[name] = np.einsum("rs,rsm->rm", seeds, np.stack([resamples.episodes @ copy for copy in values], axis=1))
+    means = {name: resampled_means(values, resamples, of) for of, (name, values) in enumerate(episodes.items())}
     found = [
         ratios({name: (float(each[draw, 0]), float(each[draw, 1])) for name, each in means.items()}, family)
         for draw in range(len(resamples.episodes))

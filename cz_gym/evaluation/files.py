@@ -212,8 +212,8 @@ def _estimate(found: Mapping[str, Any]) -> Estimate:
     return Estimate(float(found["mean"]), interval and (float(interval[0]), float(interval[1])), found.get("n", 0))
 
 
-def read_episodes(path: Path, columns: Callable[[str], Sequence[str]]) -> Episodes:
-    """Read the wanted columns of each scenario of an ``episodes.csv``, crystals in the file's order.
+def read_episodes(path: Path, columns: Sequence[str]) -> Episodes:
+    """Read some columns of an ``episodes.csv``, crystals in the file's order.
 
     Raises CzError if the file is none of a benchmark's, holds what is no finite number, or a controller's training
     seeds did not meet the same number of crystals.
@@ -224,8 +224,7 @@ def read_episodes(path: Path, columns: Callable[[str], Sequence[str]]) -> Episod
     try:
         for line in csv.DictReader(io.StringIO(text)):
             by_seed = found.setdefault(line["scenario"], {}).setdefault(line["controller"], {})
-            figures = [float(line[name]) for name in columns(line["scenario"])]
-            by_seed.setdefault(line["training_seed"], []).append(figures)
+            by_seed.setdefault(line["training_seed"], []).append([float(line[name]) for name in columns])
         arrays = {
             scenario: {name: np.array([*by_seed.values()]) for name, by_seed in by_name.items()}
             for scenario, by_name in found.items()

@@ -72,11 +72,12 @@ def metrics(run: Rollout) -> Metrics:
     """Compute the metrics of a rollout."""
     s, alive = run.signals, run.alive
     v_0, limit = run.config.parameters.v_0, run.config.radius_limit
-    lost = ~alive | (run.failed & _last(alive))
+    lost = np.arange(len(alive))[:, None] >= alive.sum(axis=0) - run.failed  # from a failing step on
     error = np.where(lost, limit, s.r_c - s.r_ref)
     observable = np.where(lost, limit, s.r_c - s.r_ref + s.ring_offset)
     pull_step = np.diff(s.v_p, axis=0, prepend=run.start.v_p)
     heater_step = np.diff(s.Q_H, axis=0, prepend=run.start.Q_H)
+    drives = (np.where(alive, moved, 0.0) for moved in (s.v_p - v_0, pull_step, heater_step))
     return Metrics(
         rmse_mm=_rms(error) / MM,
         rmse_observable_mm=_rms(observable) / MM,
@@ -89,22 +90,15 @@ def metrics(run: Rollout) -> Metrics:
         time_at_limits=np.mean(_at_limits(run), axis=0, where=alive),
         growth_rate_rms_mm_per_min=_rms(s.v_g - v_0, alive) / MM_PER_MIN,
         ground_off_pct=_ground_off(s.r_c, alive),
-        cost=_cost(observable, s.v_p - v_0, pull_step, heater_step, alive),
+        cost=np.sum(cost_terms(observable, *drives), axis=0).mean(axis=0),
         failure_rate=run.failed.astype(np.float64),
         return_=run.reward.sum(axis=0),
     )
 
 
-def _rms(values: Floats, where: npt.NDArray[np.bool_] | None = None) -> Floats:
-    squares = np.square(values)
-    mean: Floats = np.mean(squares, axis=0) if where is None else np.mean(squares, axis=0, where=where)
+def _rms(values: Floats, where: npt.NDArray[np.bool_] | bool = True) -> Floats:
+    mean: Floats = np.mean(np.square(values), axis=0, where=where)
     return np.sqrt(mean)
-
-
-def _cost(error: Floats, pull: Floats, pull_step: Floats, heater_step: Floats, alive: npt.NDArray[np.bool_]) -> Floats:
-    terms = cost_terms(error, *(np.where(alive, moved, 0.0) for moved in (pull, pull_step, heater_step)))
-    mean: Floats = np.sum(terms, axis=0).mean(axis=0)
-    return mean
 
 
 def _at_limits(run: Rollout) -> npt.NDArray[np.bool_]:
@@ -125,12 +119,6 @@ def _at_limits(run: Rollout) -> npt.NDArray[np.bool_]:
     heater = (np.abs(s.Q_H - start.Q_H) >= ALMOST * config.heater_range - 0.5 * step) | np.less_equal(s.Q_H, 0.5 * step)
     found: npt.NDArray[np.bool_] = pull | heater | (np.abs(moved) >= ALMOST * steps * slew - 0.5 * step)
     return found
-
-
-def _last(alive: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """The last step taken in each episode."""
-    following = np.vstack([alive[1:], np.zeros((1, alive.shape[1]), np.bool_)])
-    return alive & ~following
 
 
 def _mean_pull_share(v_p: Floats, alive: npt.NDArray[np.bool_], v_0: float, dt: float) -> Floats:

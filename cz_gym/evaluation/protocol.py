@@ -137,10 +137,3 @@ def contract_hash(rows: Sequence[Row]) -> str:
     random = [row for row in rows if not find_scenario(row.scenario).deterministic]
     parts = sorted(row.config().hash for row in random or rows)
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:12]
-
-
-def check_episodes(episodes: int) -> int:
-    """Return the number of test episodes; CzError if the protocol has fewer."""
-    if not 1 <= episodes <= len(TEST_SEEDS):
-        raise CzError(f"episodes must be between 1 and {len(TEST_SEEDS)}, not {episodes}")
-    return episodes

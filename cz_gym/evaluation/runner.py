@@ -63,31 +63,32 @@ def run(
     contenders: Sequence[Contender],
     rows: Sequence[Row],
     episodes: int,
-    bar: Any,
     cache: Path,
     bounds: Path | None = None,
     again: Callable[[], tuple[Sequence[Contender], Sequence[Row]]] | None = None,
+    quiet: bool = False,
 ) -> list[Result]:
-    """Roll every contender out on every row and summarise.
+    """Roll every contender out on every row, with a progress bar unless ``quiet``, and summarise.
 
-    ``bar`` is tqdm's, over environment steps; ``cache`` is the folder of slow controllers' episodes, ``bounds`` that of
-    an earlier benchmark whose bound serves a run without one. A long run is shared between processes if ``again`` makes
-    contenders and rows anew in each.
+    ``cache`` is the folder of slow controllers' episodes, ``bounds`` that of an earlier benchmark whose bound serves a
+    run without one. A long run is shared between processes if ``again`` makes contenders and rows anew in each.
     """
+    from tqdm import tqdm
+
     pairs = [(row, each) for row in rows for each in contenders]
     seeds = [len(episodes_of(each, row, episodes)) for row, each in pairs]
     steps = [row.config().steps * n * max(len(each.trained), 1) for n, (row, each) in zip(seeds, pairs, strict=True)]
-    bar.reset(total=sum(steps))
     # The first pair compiles for all.
     alone = 1 if again and sum(steps) > LONG else len(pairs)
     measured = {}
-    for number, (row, each) in enumerate(pairs[:alone]):
-        bar.set_description(f"{row.name}, {each.name}")
-        measured[number] = _measure((row, each), episodes, cache, bar.update)
-    apart, left = partial(_apart, again, episodes, cache), range(alone, len(pairs))
-    for place, found in in_processes(apart, left, processes=min(processors(), PROCESSES)):
-        measured[left[place]] = Sample(pairs[left[place]][1], *found)
-        bar.update(steps[left[place]])
+    with tqdm(total=sum(steps), unit="step", unit_scale=True, leave=False, disable=quiet or None) as bar:
+        for number, (row, each) in enumerate(pairs[:alone]):
+            bar.set_description(f"{row.name}, {each.name}")
+            measured[number] = _measure((row, each), episodes, cache, bar.update)
+        apart, left = partial(_apart, again, episodes, cache), range(alone, len(pairs))
+        for place, found in in_processes(apart, left, processes=min(processors(), PROCESSES)):
+            measured[left[place]] = Sample(pairs[left[place]][1], *found)
+            bar.update(steps[left[place]])
     results = []
     for row in rows:
         samples = [measured[number] for number, pair in enumerate(pairs) if pair[0] is row]

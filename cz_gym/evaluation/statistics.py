@@ -53,9 +53,9 @@ class Resamples:
     episodes: Floats
 
     @classmethod
-    def draw(cls, episodes: int, count: int = RESAMPLES, seed: int = SEED) -> Resamples:
+    def draw(cls, episodes: int, count: int = RESAMPLES) -> Resamples:
         """Draw multinomial counts over ``episodes``, ``count`` times. Raises CzError without episodes."""
-        return cls(_weights(episodes, count, np.random.default_rng(seed)))
+        return cls(_weights(episodes, count, np.random.default_rng(SEED)))
 
     def training_seeds(self, number: int, of: int = 0) -> Floats:
         """Draw weights of ``number`` training seeds, shape (resamples, number), anew for each controller ``of``."""
@@ -70,13 +70,13 @@ def _weights(items: int, count: int, random: np.random.Generator) -> Floats:
 
 def means(values: Floats, resamples: Resamples) -> tuple[Estimate, ...]:
     """Estimate the mean of each metric over seeds and episodes."""
-    return _estimates(values.mean(axis=(0, 1)), _resampled_means(values, resamples), values.shape[:2])
+    return _estimates(values.mean(axis=(0, 1)), resampled_means(values, resamples), values.shape[:2])
 
 
 def differences(values: Floats, reference: Floats, resamples: Resamples) -> tuple[Estimate, ...]:
     """Estimate the difference of each metric's mean from the reference's on the same crystals."""
     point = values.mean(axis=(0, 1)) - reference.mean(axis=(0, 1))
-    spread = _resampled_means(values, resamples) - _resampled_means(reference, resamples, of=1)
+    spread = resampled_means(values, resamples) - resampled_means(reference, resamples, of=1)
     shape = max(len(values), len(reference)), values.shape[1]
     return _estimates(point, spread, shape)
 
@@ -91,21 +91,21 @@ def probability_of_improvement(values: Floats, reference: Floats, resamples: Res
     return means(wins, resamples)[0]
 
 
-def cvar(values: Floats, resamples: Resamples, tail: float = TAIL) -> Estimate:
-    """Estimate the mean of the worst (largest) ``tail`` of one metric, shape (training seeds, episodes).
+def cvar(values: Floats, resamples: Resamples) -> Estimate:
+    """Estimate the mean of the worst (largest) TAIL of one metric, shape (training seeds, episodes).
 
     Rockafellar and Uryasev's conditional value at risk: where the tail is no whole number of episodes, the last one
-    counts in part; with fewer than 1/tail episodes it is the maximum.
+    counts in part; with fewer than 1/TAIL episodes it is the maximum.
     """
     flat = values.ravel()
     order = np.argsort(-flat, kind="stable")
-    point = _tail_mean(flat[order], np.full((1, flat.size), 1.0 / flat.size), tail)
+    point = _tail_mean(flat[order], np.full((1, flat.size), 1.0 / flat.size))
     seeds = resamples.training_seeds(len(values))
     spread = np.empty(len(resamples.episodes))
     for first in range(0, len(spread), _BLOCK):
         part = slice(first, first + _BLOCK)
         weights = (seeds[part, :, None] * resamples.episodes[part, None, :]).reshape(-1, flat.size)
-        spread[part] = _tail_mean(flat[order], weights[:, order], tail)
+        spread[part] = _tail_mean(flat[order], weights[:, order])
     return _estimates(point, spread[:, None], values.shape)[0]
 
 
@@ -114,26 +114,25 @@ def optimality_gap(costs: Floats, reference: Floats, bound: Floats, resamples: R
 
     All three have shape (training seeds, episodes). 0 is the bound, 1 the reference; None where the two are equal.
     """
-    point, spread = [], []
-    for of, values in enumerate((costs, reference, bound)):
-        point.append(values.mean())
-        spread.append(_resampled_means(values[:, :, None], resamples, of)[:, 0])
-    if point[1] <= point[2]:
+    three = costs, reference, bound
+    ours, theirs, least = (values.mean() for values in three)
+    if theirs <= least:
         return None
-    ratio = np.array([(point[0] - point[2]) / (point[1] - point[2])])
+    spread = [resampled_means(values[:, :, None], resamples, of)[:, 0] for of, values in enumerate(three)]
+    ratio = np.array([(ours - least) / (theirs - least)])
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = (spread[0] - spread[2]) / (spread[1] - spread[2])
     return _estimates(ratio, ratios[np.isfinite(ratios), None], costs.shape)[0]
 
 
-def _tail_mean(descending: Floats, weights: Floats, tail: float) -> Floats:
-    """Mean of the first ``tail`` of the weight, one a row of ``weights``."""
-    taken = np.diff(np.minimum(np.cumsum(weights, axis=1), tail), axis=1, prepend=0.0)
-    return taken @ descending / tail
+def _tail_mean(descending: Floats, weights: Floats) -> Floats:
+    """Mean of the first TAIL of the weight, one a row of ``weights``."""
+    taken = np.diff(np.minimum(np.cumsum(weights, axis=1), TAIL), axis=1, prepend=0.0)
+    return taken @ descending / TAIL
 
 
-def _resampled_means(values: Floats, resamples: Resamples, of: int = 0) -> Floats:
-    """Means of every resample, shape (resamples, metrics)."""
+def resampled_means(values: Floats, resamples: Resamples, of: int = 0) -> Floats:
+    """Return the means of every resample, shape (resamples, metrics); ``of`` numbers the controller."""
     seeds = resamples.training_seeds(len(values), of)
     total = np.zeros((len(seeds), values.shape[2]))
     for weight, copy in zip(seeds.T, values, strict=True):

@@ -48,7 +48,7 @@ def difference(one: list[NamedArray], other: list[NamedArray], masked: bool = Fa
     for (name, a, _), (_, b, mask) in zip(one, other, strict=True):
         if a.shape != b.shape or (a.dtype != b.dtype and (not masked or b.dtype == np.bool_)):
             return f"{name} is {a.dtype} {a.shape} and {b.dtype} {b.shape}"
-        unlike = ~_close(a, b)
+        unlike = np.asarray((a != b) & ((a == a) | (b == b)))  # NaN is like NaN
         if masked and mask is not None and a.ndim > 0 and mask.shape == a.shape[:1]:
             unlike &= mask.reshape(-1, *[1] * (a.ndim - 1))
         if unlike.any():
@@ -56,13 +56,6 @@ def difference(one: list[NamedArray], other: list[NamedArray], masked: bool = Fa
             slot = f" of slot {at[0]}" if at else ""
             return f"{name}{slot} is {a[at]} and {b[at]}"
     return None
-
-
-def _close(a: Array, b: Array) -> Array:
-    alike: Array = np.asarray(a == b)
-    if np.issubdtype(a.dtype, np.inexact) and np.issubdtype(b.dtype, np.inexact):
-        alike = alike | (np.isnan(a) & np.isnan(b))
-    return alike
 
 
 def overwrite(value: Any) -> None:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tqdm import tqdm
 
 import benchmark
 import cz_gym
@@ -62,7 +61,7 @@ class Fixed(Row):
 
 def sample(folder, policy=None, config=CONFIG, seeds=SEEDS):
     row = Fixed("some", "randomized", "", given=config, these=seeds)
-    (result,) = runner.run([slow(policy or Snail())], [row], 500, tqdm(disable=True), folder)
+    (result,) = runner.run([slow(policy or Snail())], [row], 500, folder)
     return result.samples[0]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from textwrap import fill
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ from cz_gym.evaluation.results import Result, Sample
 from cz_gym.evaluation.rollout import Floats, Signals
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
-from .canvas import COLUMNS, GREY, INK, Style, canvas, chosen, png
+from .canvas import COLUMNS, GREY, INK, canvas, chosen, png, styles_of
 
 ROOM = (0.01 * MM, 3.0 * MM)
 """Smallest and largest margin of the radius axis around the reference [m]."""
@@ -76,9 +76,9 @@ def draw(columns: Sequence[Column], dt: float, title: str) -> Figure:
     return figure
 
 
-def crystal(result: Result, style: Mapping[str, Style]) -> bytes:
+def crystal(result: Result) -> bytes:
     """Draw the first crystal of a scenario under the controllers of :func:`.chosen`."""
-    samples = chosen(result.samples, COLUMNS)
+    samples, style = chosen(result.samples, COLUMNS), styles_of(result.samples)
     columns = []
     for sample in samples:
         rmse = f"RMSE {sample.metric('rmse_mm')[0, 0]:.3g} mm"

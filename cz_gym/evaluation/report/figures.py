@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib import rc_context
@@ -11,7 +11,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from cz_gym.evaluation.results import Result
 from cz_gym.evaluation.statistics import Estimate
 
-from .canvas import GREY, INK, Style, canvas, chosen, png, styles_of
+from .canvas import GREY, INK, canvas, chosen, png, styles_of
 from .crystal import crystal
 from .tables import PULL_STEP, RMSE
 
@@ -23,12 +23,11 @@ NAMED = 8
 
 def draw_figures(results: Sequence[Result]) -> dict[str, bytes]:
     """Draw every figure, by file name; without a random scenario there is only the crystal."""
-    style = styles_of(results[0].samples)
     random = [result for result in results if len(result.seeds) > 1]
     with rc_context({"text.parse_math": False}):  # a name with dollar signs is no formula
-        figures = {"crystal.png": crystal(results[0], style)}
+        figures = {"crystal.png": crystal(results[0])}
         if random:
-            figures["pareto.png"] = pareto(random, style)
+            figures["pareto.png"] = pareto(random)
     return figures
 
 
@@ -38,13 +37,14 @@ def floor_of(results: Sequence[Result]) -> float:
     return min((value for value in moving if value > 0.0), default=1.0) / 3.0
 
 
-def pareto(results: Sequence[Result], style: Mapping[str, Style]) -> bytes:
+def pareto(results: Sequence[Result]) -> bytes:
     """Draw mean RMSE against mean pull step RMS with 95 % intervals, both logarithmic; lower left is better.
 
     The controllers of :func:`.chosen` have a colour each, the others are grey dots. Errors of more than :data:`FAR`
     times the least one are left out.
     """
-    names, floor = [sample.name for sample in chosen(results[0].samples, NAMED)], floor_of(results)
+    samples = results[0].samples
+    names, floor, style = [sample.name for sample in chosen(samples, NAMED)], floor_of(results), styles_of(samples)
     columns = min(len(results), 2)
     rows = -(-len(results) // columns)
     figure = canvas(4.5 * columns, 2.9 * rows + 1.2)

@@ -19,7 +19,6 @@ from cz_gym.evaluation.results import Result
 from cz_gym.units import HOUR
 
 from . import tables
-from .canvas import styles_of
 from .markdown import measured_from
 from .page_pictures import crystal, pareto
 
@@ -29,7 +28,7 @@ _SLOT = re.compile(r"<!-- slot:(\w+) -->")
 def page(results: Sequence[Result], command: str) -> str:
     """Return the page; the same results give the same text."""
     row, samples, found = results[0].row, results[0].samples, tables.verdict(results)
-    config, most, styles = row.config(), max(len(result.seeds) for result in results), styles_of(samples)
+    config, most = row.config(), max(len(result.seeds) for result in results)
     counted = tables.deciding(results)
     best = replace(counted[0], samples=tuple(tables.best_of_each_kind(counted)))
     heads, groups = tables.overview([best, *counted[1:]])
@@ -43,8 +42,8 @@ def page(results: Sequence[Result], command: str) -> str:
         f"{config.control_interval:g} s, on {row.grown_on}.",
         "scenarios": _table(found.heads, found.rows) if found.rows else "",
         "tables": "\n".join(_metrics(result, is_open=result is results[0]) for result in results),
-        "pareto": _html(pareto(results, styles), "pareto"),
-        "crystal": _html(crystal(results, styles), "crystal"),
+        "pareto": _html(pareto(results), "pareto"),
+        "crystal": _html(crystal(results), "crystal"),
         "controllers": _table(tables.WHO, tables.who(samples), "words"),
         "command": escape(command),
     }

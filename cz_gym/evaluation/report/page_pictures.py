@@ -17,12 +17,12 @@ from plotly.subplots import make_subplots
 from cz_gym.env import CzEnv
 from cz_gym.evaluation.metrics import TOLERANCE
 from cz_gym.evaluation.protocol import Row
-from cz_gym.evaluation.results import Result, Sample
+from cz_gym.evaluation.results import Result
 from cz_gym.evaluation.rollout import Floats, Signals
 from cz_gym.evaluation.statistics import Estimate
 from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
 
-from .canvas import COLUMNS, GREY, INK, MARKERS, Style, chosen
+from .canvas import COLUMNS, GREY, INK, MARKERS, Style, chosen, styles_of
 from .crystal import example, lost
 from .figures import floor_of
 from .tables import PULL_STEP, RMSE
@@ -51,12 +51,12 @@ def add_menu(figure: go.Figure, results: Sequence[Result], layouts: Sequence[Map
     figure.update_layout(updatemenus=[menu] if len(results) > 1 else [], **(layouts[0] if layouts else {}))
 
 
-def pareto(results: Sequence[Result], styles: Mapping[str, Style]) -> go.Figure:
+def pareto(results: Sequence[Result]) -> go.Figure:
     """Draw mean RMSE against mean pull step RMS with 95 % intervals, both logarithmic.
 
     A controller that never moves the pull speed stands left of all others.
     """
-    figure = go.Figure()
+    figure, styles = go.Figure(), styles_of(results[0].samples)
     for number, result in enumerate(results):
         floor = floor_of([result])
         for name, means in result.means.items():
@@ -136,10 +136,11 @@ OWN = ("true", "camera")
 """Lines that are drawn for each controller."""
 
 
-def crystal(results: Sequence[Result], styles: Mapping[str, Style]) -> go.Figure:
+def crystal(results: Sequence[Result]) -> go.Figure:
     """Draw the first crystal of each scenario, one scenario at a time, under the controllers of :func:`chosen`."""
     titles = [f"{panel.title} [{panel.unit}]" for panel in PANELS]
     figure = make_subplots(len(PANELS), 1, shared_xaxes=True, vertical_spacing=0.02, subplot_titles=titles)
+    styles = styles_of(results[0].samples)
     layouts = [_draw(figure, number, result, styles) for number, result in enumerate(results)]
     for row, panel in enumerate(PANELS, 1):
         for level in panel.levels:
@@ -167,10 +168,10 @@ def _draw(figure: go.Figure, scenario: int, result: Result, styles: Mapping[str,
             for sample in samples if name in OWN else samples[:1]:
                 own = name in OWN
                 values = _points(function(example(sample) if own else longest, bias) / panel.scale, step)
+                look = {"name": plain(sample.name) if own else name, "showlegend": False}
                 if own and not number and name == "true":
-                    look = {"name": _name(sample), "showlegend": True}
-                else:
-                    look = {"name": plain(sample.name) if own else name, "showlegend": False}
+                    rmse = f"{sample.metric('rmse_mm')[0, 0]:.3f} mm{', lost' if lost(sample) else ''}"
+                    look = {"name": f"{look['name']}: {rmse}", "showlegend": True}
                 style = styles[sample.name]
                 line = {"color": style.colour if own else INK, "width": 0.8 if name == "camera" else 1.5}
                 figure.add_scatter(
@@ -191,11 +192,6 @@ def _points(values: Floats, step: int) -> npt.NDArray[np.float32]:
     blocks = values[: steps // step * step].reshape(-1, step)
     points: npt.NDArray[np.float32] = blocks.mean(axis=1).astype(np.float32)
     return points
-
-
-def _name(sample: Sample) -> str:
-    """The contender's name with its RMSE on that crystal."""
-    return f"{plain(sample.name)}: {sample.metric('rmse_mm')[0, 0]:.3f} mm{', lost' if lost(sample) else ''}"
 
 
 def ring_bias(row: Row, seed: int) -> float:

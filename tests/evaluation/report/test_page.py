@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import benchmark
-from cz_gym.evaluation.report.canvas import styles_of
 from cz_gym.evaluation.report.page import page
 from cz_gym.evaluation.report.page_pictures import PANELS, crystal, pareto, plain
 from cz_gym.evaluation.report.tables import DRIVES, ERROR, comparison, overview
@@ -64,7 +63,7 @@ class Made:
         self.runs = dict(zip(ROWS, runs, strict=True))
         self.text = page_of(self.results)
         self.parts = Parts(self.text)
-        self.figures = [draw(self.results, styles_of(self.results[0].samples)) for draw in (pareto, crystal)]
+        self.figures = [draw(self.results) for draw in (pareto, crystal)]
 
     def lines(self, row, title):
         """Lines of a panel of the crystal by what they are called, those of a controller by legend group."""
@@ -155,7 +154,7 @@ def test_a_signal_that_is_no_number_ends_the_line(made):
     r_br = first.example.r_br.copy()
     r_br[100:] = np.nan
     broken = replace(first, example=first.example._replace(r_br=r_br))
-    drawn = crystal([replace(result, samples=(broken, *others))], styles_of(result.samples))
+    drawn = crystal([replace(result, samples=(broken, *others))])
     lengths = {len(t.y) for t in drawn.data if t.legendgroup == "open-loop" and t.yaxis == "y2"}
     assert lengths == {100 // STEP, 2160 // STEP}, "the camera goes on"
 
