@@ -42,6 +42,17 @@ batch = gym.make_vec("Cz-v0", num_envs=2, vectorization_mode="vector_entry_point
 batch.reset(seed=1)
 assert CompensatedPID().predict(batch.step(np.zeros((2, 2)))[0])[0].shape == (2, 2)
 """
+ABSENT = """
+import sys
+class Blind:
+    def __init__(self, finder):
+        self.finder = finder
+    def __getattr__(self, name):
+        return getattr(self.finder, name)
+    def find_spec(self, name, path=None, target=None):
+        return None if name.partition(".")[0] in {absent} else self.finder.find_spec(name, path, target)
+sys.meta_path[:] = map(Blind, sys.meta_path)
+"""
 
 
 def printed(code, place, cwd):
@@ -100,9 +111,9 @@ def test_pins_lie_in_the_open_ranges(file):
 
 
 def test_environment_and_baselines_need_neither_torch_nor_plots(tmp_path):
-    absent = ["torch", "stable_baselines3", "sb3_contrib", "matplotlib", "onnxruntime", "onnx", "tensorboard"]
-    absent += ["control", "tqdm", "pygame", "casadi"]
-    printed(f"import sys\nsys.modules.update(dict.fromkeys({absent}))\n{SMOKE}", ROOT, tmp_path)
+    absent = {"torch", "stable_baselines3", "sb3_contrib", "matplotlib", "onnxruntime", "onnx", "tensorboard"}
+    absent |= {"control", "tqdm", "pygame", "casadi"}
+    printed(ABSENT.replace("{absent}", repr(absent)) + SMOKE, ROOT, tmp_path)
 
 
 @pytest.mark.parametrize("command", ["train.py", "benchmark.py", "-m studies.bode", "-m cz_gym.datasets"])
