@@ -366,12 +366,14 @@ def _check(key: Key, value: Any) -> None:
     """Raise CzError, with a guess at the unit that was meant, unless a key's value is plausible."""
     if value is None and key in _OWN and getattr(PullerFile, key.field) is None:
         return
+    size, slips = UNITS[key.unit]
     numbers = value if key.drawn and isinstance(value, tuple) else (value,)
     sound = all(isinstance(each, int | float) and not isinstance(each, bool) for each in numbers)
     if not sound or len(numbers) != 1 + key.drawn or not numbers[0] <= numbers[-1]:
         pair = ", or a pair [low, high] with low <= high" if key.drawn else ""
-        raise CzError(f"{key.name} must be a number{pair}, not {value!s:.60}")
-    size, slips = UNITS[key.unit]
+        given = value if isinstance(value, tuple) else (value,)
+        texts = ", ".join(f"{each / size:g}" if isinstance(each, float) else str(each) for each in given)
+        raise CzError(f"{key.name} must be a number{pair}, not {f'[{texts}]' if given is value else texts:.60}")
     for number in numbers:
         shown = number / size
         if not key.low - 1e-12 * abs(key.low) <= shown <= key.high + 1e-12 * abs(key.high):
