@@ -85,9 +85,11 @@ class Reinforcement(Recipe):
 
 @dataclass(frozen=True, kw_only=True)
 class PPO(Reinforcement):
-    """Proximal policy optimisation."""
+    """Proximal policy optimisation; the actor reads an estimate of the plant's state
+    (:class:`cz_gym.sb3.StateEstimator`)."""
 
     name: str = "ppo"
+    hidden: tuple[int, ...] = (32, 32)
     steps: int = 60_000_000
     num_envs: int = 2048
     """Many crystals at a time: what an action changes is small beside what the disturbances do."""

@@ -19,12 +19,12 @@ from cz_gym.agents.agent_file.contract import agent_files, read_json
 from cz_gym.agents.export import to_agent
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.atomic_files import write_files
-from cz_gym.sb3 import environment_steps
+from cz_gym.sb3 import LearnState, environment_steps
 
 from . import validation
 from .algorithms import make_algorithm, repeat_of
 from .checkpoint import load_checkpoint, restore, to_bytes
-from .recipes import Recipe
+from .recipes import PPO, Recipe
 from .run_files import check_settings, identity, provenance, read_rows, to_csv, to_json
 from .validation import COLUMNS, REFERENCES, References, validate
 
@@ -110,7 +110,9 @@ class Run:
         with deferred_interrupt() as interrupted:
             if self.steps < self.recipe.steps:
                 left = -(-(self.recipe.steps - self.steps) // repeat_of(self.recipe))
-                self.algorithm.learn(left, _Watch(self, bar, interrupted), reset_num_timesteps=False)
+                watch: list[BaseCallback] = [_Watch(self, bar, interrupted)]
+                fits = [LearnState()] if isinstance(self.recipe, PPO) else []
+                self.algorithm.learn(left, [*fits, *watch], reset_num_timesteps=False)
             if not self.rows or int(self.rows[-1]["steps"]) < self.steps:
                 self.validate(bar)
             if interrupted():
