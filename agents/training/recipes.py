@@ -90,7 +90,7 @@ class PPO(Reinforcement):
 
     name: str = "ppo"
     hidden: tuple[int, ...] = (32, 32)
-    steps: int = 60_000_000
+    steps: int = 48_000_000
     num_envs: int = 2048
     """Many crystals at a time: what an action changes is small beside what the disturbances do."""
     action_repeat: int = 4
