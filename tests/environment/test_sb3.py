@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv
 from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.from_sb3 import save_agent
-from cz_gym.sb3 import AsymmetricPolicy, AsymmetricSACPolicy, make_vec_env
+from cz_gym.sb3 import AsymmetricPolicy, AsymmetricSACPolicy, LearnState, make_vec_env
 
 N = 3
 SETTINGS = {"scenario": "hard", "control_interval": 20.0, "horizon": 400.0}
@@ -168,3 +168,21 @@ def test_a_critic_may_read_the_true_state_that_no_actor_reads(tmp_path):
         np.testing.assert_allclose(agent.predict(seen[:, :channels])[0], action, atol=1e-5)
     with pytest.raises(ValueError, match="needs observation='history'"):
         adapter(observation="measured", critic_state=True)
+
+
+def test_an_estimate_is_fitted_to_the_state_and_not_to_the_reward():
+    told = adapter(critic_state=True)
+    model = PPO(AsymmetricPolicy, told, 3e-3, n_steps=8, batch_size=24, seed=0, device="cpu")
+    estimator = model.policy.pi_features_extractor
+    before = [each.detach().clone() for each in estimator.parameters()]
+    model.learn(48)
+    assert all(map(torch.equal, before, estimator.parameters()))
+    seen = torch.tensor(model.rollout_buffer.observations).reshape(-1, *told.observation_space.shape)
+    start = estimator.loss(seen).item()
+    model.learn(960, LearnState())
+    assert estimator.loss(seen).item() < 0.75 * start
+    with torch.no_grad():  # an estimator that is right, in the units of its features
+        state = seen[:, estimator.gains.numel() :][:, [0, 1, 2, 3, 4, 13, 14, 15, 16]] * estimator.state_gains
+        estimator.estimate.forward = lambda _: state
+        assert estimator.loss(seen).item() == 0.0
+        torch.testing.assert_close(estimator(seen)[:, 12:], state)
