@@ -171,7 +171,7 @@ def _check_wrappers(model: BaseAlgorithm) -> None:
 
 def _check_spaces(model: BaseAlgorithm, config: Config) -> None:
     """AgentFileError unless the model reads and acts as the environment of these settings wants."""
-    from cz_gym.sb3 import Asymmetric
+    from cz_gym.asymmetric import Asymmetric
 
     wanted = (len(OBSERVATIONS.get(config.observation, ())),), (len(DRIVE_CHANNELS),)
     shapes = model.observation_space.shape, model.action_space.shape
@@ -190,7 +190,7 @@ def _check_normalisation(model: BaseAlgorithm, normalisation: VecNormalize | Non
     A saved model keeps its last observation: there the camera's flag is 0 or 1 unless it is normalised. A model that is
     loaded into an environment has lost that, but keeps the last original observation before a VecNormalize.
     """
-    from cz_gym.sb3 import Asymmetric
+    from cz_gym.asymmetric import Asymmetric
 
     if normalisation is not None:
         return

@@ -15,8 +15,9 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from cz_gym import CzVectorEnv
 from cz_gym.agents import apg
+from cz_gym.asymmetric import AsymmetricPolicy, AsymmetricSACPolicy
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
-from cz_gym.sb3 import ActionRepeat, AsymmetricPolicy, AsymmetricSACPolicy, CzVecEnv
+from cz_gym.sb3 import ActionRepeat, CzVecEnv
 
 from .recipes import APG, PPO, SAC, Recipe, Reinforcement
 

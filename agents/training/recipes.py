@@ -68,8 +68,8 @@ class APG(Recipe):
 class Reinforcement(Recipe):
     """Learns from reward, by trying; stable-baselines3's ``VecNormalize`` scales the reward. Observations are scaled by
     the environment: running means would remember the lost crystals of the first minutes, and make a reading that is
-    not valid, one in hundreds, an input of -10. Critics read the plant's true state (:class:`cz_gym.sb3.Asymmetric`);
-    actors never do.
+    not valid, one in hundreds, an input of -10. Critics read the plant's true state (:mod:`cz_gym.asymmetric`); actors
+    never do.
     """
 
     hidden: tuple[int, ...] = (64, 64)
@@ -86,7 +86,7 @@ class Reinforcement(Recipe):
 @dataclass(frozen=True, kw_only=True)
 class PPO(Reinforcement):
     """Proximal policy optimisation; the actor reads an estimate of the plant's state
-    (:class:`cz_gym.sb3.StateEstimator`)."""
+    (:class:`cz_gym.asymmetric.StateEstimator`)."""
 
     name: str = "ppo"
     hidden: tuple[int, ...] = (32, 32)
