@@ -15,10 +15,11 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
-from cz_gym.agents.agent_file.contract import PLANT, REWARD, AgentFileError, facts_of, make_contract
+from cz_gym.agents.agent_file.contract import PLANT, REWARD, STATE, AgentFileError, facts_of, make_contract
 from cz_gym.agents.agent_file.graph import INPUTS, OUTPUTS
 from cz_gym.agents.apg import APG, RecurrentPolicy
 from cz_gym.agents.policies.onnx import OnnxPolicy
+from cz_gym.asymmetric import Asymmetric
 from cz_gym.config import Config
 from cz_gym.observation import OBSERVATIONS
 from cz_gym.sb3 import environment_steps
@@ -134,12 +135,13 @@ def to_agent(
     algorithm: BaseAlgorithm, name: str, seed: int, config: Config, normalisation: VecNormalize | None, path: str | Path
 ) -> OnnxPolicy:
     """The algorithm's policy as an agent called ``name``, not validated yet; ``path`` names it in errors."""
-    content = to_onnx(algorithm.policy, len(OBSERVATIONS[config.observation]), normalisation)
+    policy = algorithm.policy
+    content = to_onnx(policy, len(OBSERVATIONS[config.observation]), normalisation)
     contract = make_contract(
         content,
         **facts_of(config),
         algorithm=name,
-        learned_from=PLANT if isinstance(algorithm, APG) else REWARD,
+        learned_from=PLANT if isinstance(algorithm, APG) else STATE if isinstance(policy, Asymmetric) else REWARD,
         training_seed=seed,
         training_steps=environment_steps(algorithm),
         validation_cost=0.0,

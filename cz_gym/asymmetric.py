@@ -1,7 +1,8 @@
 """Policies of stable-baselines3 that are told the plant's true state while they learn; what they act on is sensors.
 
 For a :class:`cz_gym.sb3.CzVecEnv` with ``critic_state``. Critics read the state. The actor of :class:`AsymmetricPolicy`
-(PPO, A2C) reads an estimate of it, which the callback :class:`LearnState` fits by regression. ``predict`` takes the
+(PPO, A2C) reads an estimate of it, which the callback :class:`LearnState` fits by regression:
+``PPO(AsymmetricPolicy, make_vec_env(1024, critic_state=True)).learn(steps, LearnState())``. ``predict`` takes the
 observations of the environment as it is. Needs stable-baselines3.
 """
 
@@ -19,6 +20,8 @@ from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 from torch.nn.functional import huber_loss
 
+from cz_gym.errors import CzError
+from cz_gym.names import needs
 from cz_gym.observation import HISTORY
 from cz_gym.signals import MEASURED, STATE, Channel, Measured
 
@@ -28,7 +31,7 @@ GAINS = {
     "ring_error": 8.0, "integral": 4.0, "v_p": 8.0, "Q_H": 8.0, "r_c_error": 8.0, "h_c": 8.0, "T_b": 8.0, "dT_i": 2.0,
     "ring_offset": 8.0, "lam": 4.0,
 }  # fmt: skip
-"""Factors that bring what varies little on a crystal that is held to the order of 1; the other channels are there."""
+"""Factors that bring channels that vary little while a crystal is held to the order of 1; the others need none."""
 UNKNOWN = [i for i, each in enumerate(STATE) if each.name not in Measured._fields or each.name == "T_1"]
 """Places in the true state of what no sensor shows without error."""
 
@@ -36,11 +39,13 @@ UNKNOWN = [i for i, each in enumerate(STATE) if each.name not in Measured._field
 class Asymmetric(BasePolicy):
     """A policy whose critic reads the plant's true state behind the channels of "history"."""
 
-    @property
-    def channels(self) -> int:
-        """Number of channels that the actor reads."""
-        assert self.observation_space.shape is not None
-        return self.observation_space.shape[0] - len(STATE)
+    channels = len(HISTORY)
+    """Number of channels that the actor reads."""
+
+    def __init__(self, observation_space: Any, *others: Any, **named: Any) -> None:
+        if observation_space.shape != (len(HISTORY) + len(STATE),):
+            raise CzError("this policy is told the true state: make_vec_env(..., critic_state=True)")
+        super().__init__(observation_space, *others, **named)
 
     def predict(self, observation: Any, *others: Any, **named: Any) -> Any:
         """As stable-baselines3's; the true state may be missing from the observation."""
@@ -52,7 +57,7 @@ class Asymmetric(BasePolicy):
 class AsymmetricPolicy(Asymmetric, ActorCriticPolicy):
     """The policy of stable-baselines3's PPO and A2C whose critic is told the true state, and whose actor estimates it.
 
-    ``learn`` needs the callback :class:`LearnState`, which teaches the actor's :class:`StateEstimator`.
+    Give ``learn`` the callback :class:`LearnState`: without it the actor's :class:`StateEstimator` stays random.
     """
 
     def _build_mlp_extractor(self) -> None:
@@ -71,16 +76,16 @@ class AsymmetricSACPolicy(Asymmetric, SACPolicy):
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         """The actor, on the channels of the observation alone."""
-        return super().make_actor(_Sensors(self.observation_space, self.channels))
+        return super().make_actor(_Sensors(self.observation_space))
 
 
 class _Sensors(FlattenExtractor):
-    def __init__(self, space: Any, channels: int) -> None:
+    def __init__(self, space: Any) -> None:
         super().__init__(space)
-        self._features_dim = channels
+        self._features_dim = len(HISTORY)
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        return super().forward(observations)[:, : self._features_dim]
+        return super().forward(observations)[:, : len(HISTORY)]
 
 
 def _gains(channels: Sequence[Channel]) -> torch.Tensor:
@@ -115,7 +120,10 @@ class StateEstimator(BaseFeaturesExtractor):
 
 
 class StateSight(BaseFeaturesExtractor):
-    """Features of a critic: "history", the true state, and its products: a linear plant's value is quadratic in it."""
+    """Features of a critic: "history", the true state, and its products.
+
+    With a linear plant and a quadratic cost the value is quadratic in the state.
+    """
 
     gains: torch.Tensor
     pairs: torch.Tensor
@@ -136,13 +144,14 @@ class StateSight(BaseFeaturesExtractor):
 class LearnState(BaseCallback):
     """Fits the :class:`StateEstimator` of an :class:`AsymmetricPolicy` while it learns.
 
-    After each update, it goes once through the last rollout in batches of 512, at the algorithm's learning rate.
+    After each update, it goes once through the last rollout in batches of 512, at the algorithm's learning rate. Not
+    before the update: it must meet the actor that acted.
     """
 
     seen: torch.Tensor | None = None
 
     def _init_callback(self) -> None:
-        policy: Any = self.model.policy
+        policy = needs(AsymmetricPolicy, self.model.policy, "LearnState fits the estimate of that policy alone")
         self.estimator: StateEstimator = policy.pi_features_extractor
         self.optimizer = torch.optim.Adam(self.estimator.estimate.parameters())
 
@@ -151,7 +160,7 @@ class LearnState(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         model: Any = self.model
-        self.seen = torch.tensor(model.rollout_buffer.observations).flatten(0, 1)
+        self.seen = torch.as_tensor(model.rollout_buffer.observations, device=model.device).flatten(0, 1)
 
     def _on_rollout_start(self) -> None:
         if self.seen is None:

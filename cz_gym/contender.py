@@ -9,8 +9,15 @@ from typing import Any
 from cz_gym.config import Config
 from cz_gym.errors import CzError
 
-REWARD, PLANT = "reward", "plant"
-"""Sources that an agent learned from: the reward, or gradients through the plant's equations."""
+REWARD, STATE, PLANT = "reward", "state", "plant"
+"""Sources that an agent learned from: the reward alone; the reward, and the true state, told in training; gradients
+through the plant's equations."""
+GROUPS = {
+    REWARD: "learned from the reward",
+    STATE: "learned from the reward, state told in training",
+    PLANT: "learned, plant known in training",
+}
+"""Headings of the groups of agents, by source."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +65,7 @@ class Contender:
             return "bounds, told what no sensor shows"
         if not self.learned:
             return "classical"
-        plant = any(policy.contract.learned_from == PLANT for policy in self.trained)
-        return "learned, plant known in training" if plant else "learned from the reward"
+        return GROUPS.get(self.trained[0].contract.learned_from, GROUPS[REWARD])
 
     def policies(self, config: Config) -> tuple[Any, ...]:
         """Its policy for an environment's settings; of an agent one a training seed."""

@@ -46,7 +46,7 @@ class CzVecEnv(VecEnv):
     hold ``terminal_observation``, ``TimeLimit.truncated`` and ``episode``: return, length and time, as those of
     stable-baselines3's ``Monitor``. With ``stagger``, a seed, each slot's first episode is cut (truncated) at a random
     step, so that slots are not all in the same minute. With ``critic_state`` the plant's true state
-    (:class:`cz_gym.signals.TrueState`) follows the channels of ``observation="history"``, for an
+    (:class:`cz_gym.signals.TrueState`) follows the channels of ``observation="history"``, for a
     policy of :mod:`cz_gym.asymmetric`; the batch needs ``info="all"``.
     """
 

@@ -95,7 +95,7 @@ _SHARED = signals(Measured)
 
 
 class TrueState(NamedTuple):
-    """The true state and the disturbances; deviations, SI units. For bounds and asymmetric critics only."""
+    """The true state and the disturbances; deviations, SI units. For bounds and for training; no agent acts on it."""
 
     r_c_error: Annotated[Any, Channel("m", MM, "true radius minus r_ref")]
     h_c: Annotated[Any, Channel("m", MM, "true meniscus height minus its nominal")]

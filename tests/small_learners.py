@@ -6,6 +6,7 @@ from cz_gym.agents.training import fleet, validation
 from cz_gym.agents.training.algorithms import make_algorithm, repeat_of
 from cz_gym.agents.training.recipes import APG, PPO, SAC, Recipe
 from cz_gym.agents.training.run import Job
+from cz_gym.asymmetric import LearnState
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
 SMALL = PPO(num_envs=4, action_repeat=2, hidden=(16, 16), steps=128, n_steps=16, batch_size=32, n_epochs=1)
@@ -28,7 +29,8 @@ def train_small_seed(job: Job, bar: Any = None) -> dict[str, float]:
 def learned(algorithm: Any, recipe: Recipe) -> Any:
     """The algorithm after what is left of the recipe's steps, as a run lets it learn."""
     left = recipe.steps // repeat_of(recipe) - algorithm.num_timesteps
-    return algorithm.learn(left, reset_num_timesteps=False)
+    fits = [LearnState()] if isinstance(recipe, PPO) else None
+    return algorithm.learn(left, fits, reset_num_timesteps=False)
 
 
 def trained(recipe: Recipe, seed: int = 0) -> Any:

@@ -16,6 +16,7 @@ from cz_gym.atomic_files import write_files
 from cz_gym.config import Config
 from cz_gym.contender import PLANT as PLANT
 from cz_gym.contender import REWARD as REWARD
+from cz_gym.contender import STATE as STATE
 from cz_gym.errors import CzError
 from cz_gym.observation import CLIP, OBSERVATIONS
 from cz_gym.puller import DEFAULT
@@ -59,7 +60,7 @@ class Contract:
     algorithm: str
     """Name of the recipe that trained it."""
     learned_from: str
-    """:data:`REWARD` alone, or gradients through the :data:`PLANT`'s equations, which were known in training."""
+    """:data:`REWARD` alone; that and the true :data:`STATE`, told in training; or the :data:`PLANT`'s equations."""
     training_seed: int
     """Seed of the training run."""
     training_steps: int

@@ -118,7 +118,7 @@ def restore(algorithm: BaseAlgorithm, tensors: Tensors, path: Path) -> None:
 
 
 def _tensors(algorithm: BaseAlgorithm) -> Tensors:
-    """Every tensor that training changes, by name."""
+    """Every tensor of the algorithm that training changes, by name."""
     states, lone = algorithm._get_torch_save_params()
     tensors: Tensors = {f"{name}/": attrgetter(name)(algorithm) for name in lone}
     for name in states:

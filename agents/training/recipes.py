@@ -69,7 +69,7 @@ class Reinforcement(Recipe):
     """Learns from reward, by trying; stable-baselines3's ``VecNormalize`` scales the reward. Observations are scaled by
     the environment: running means would remember the lost crystals of the first minutes, and make a reading that is
     not valid, one in hundreds, an input of -10. Critics read the plant's true state (:mod:`cz_gym.asymmetric`); actors
-    never do.
+    never do, but PPO's estimate is fitted to it.
     """
 
     hidden: tuple[int, ...] = (64, 64)

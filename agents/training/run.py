@@ -111,9 +111,8 @@ class Run:
         with deferred_interrupt() as interrupted:
             if self.steps < self.recipe.steps:
                 left = -(-(self.recipe.steps - self.steps) // repeat_of(self.recipe))
-                watch: list[BaseCallback] = [_Watch(self, bar, interrupted)]
-                fits = [LearnState()] if isinstance(self.recipe, PPO) else []
-                self.algorithm.learn(left, [*fits, *watch], reset_num_timesteps=False)
+                fits: list[BaseCallback] = [LearnState()] if isinstance(self.recipe, PPO) else []
+                self.algorithm.learn(left, [*fits, _Watch(self, bar, interrupted)], reset_num_timesteps=False)
             if not self.rows or int(self.rows[-1]["steps"]) < self.steps:
                 self.validate(bar)
             if interrupted():

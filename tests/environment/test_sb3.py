@@ -164,11 +164,16 @@ def test_a_critic_may_read_the_true_state_that_no_actor_reads(tmp_path):
         with torch.no_grad():
             values = [judge(model, torch.tensor(each), torch.tensor(action)) for each in (seen, other_state)]
         assert (values[0] != values[1]).all()
-        save_agent(tmp_path / "agent.onnx", model, "asymmetric")
+        assert save_agent(tmp_path / "agent.onnx", model, "asymmetric").learned_from == "state"
         agent = OnnxPolicy.load(tmp_path / "agent.onnx")
         np.testing.assert_allclose(agent.predict(seen[:, :channels])[0], action, atol=1e-5)
     with pytest.raises(ValueError, match="needs observation='history'"):
         adapter(observation="measured", critic_state=True)
+    with pytest.raises(ValueError, match="this needs a AsymmetricPolicy"):
+        sac.learn(24, LearnState())
+    for algorithm, policy in ((PPO, AsymmetricPolicy), (SAC, AsymmetricSACPolicy)):
+        with pytest.raises(ValueError, match="told the true state"):
+            algorithm(policy, plain)
 
 
 def test_an_estimate_is_fitted_to_the_state_and_not_to_the_reward():
