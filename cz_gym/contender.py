@@ -17,7 +17,7 @@ GROUPS = {
     STATE: "learned from the reward, state told in training",
     PLANT: "learned, plant known in training",
 }
-"""Headings of the groups of agents, by source."""
+"""Headings of the groups of agents, by source: who is told more comes later."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,8 @@ class Contender:
             return "bounds, told what no sensor shows"
         if not self.learned:
             return "classical"
-        return GROUPS.get(self.trained[0].contract.learned_from, GROUPS[REWARD])
+        sources = {policy.contract.learned_from for policy in self.trained}
+        return next((group for source, group in reversed(GROUPS.items()) if source in sources), GROUPS[REWARD])
 
     def policies(self, config: Config) -> tuple[Any, ...]:
         """Its policy for an environment's settings; of an agent one a training seed."""

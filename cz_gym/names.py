@@ -13,7 +13,8 @@ from cz_gym.errors import CzError
 def needs(kind: type, value: Any, how: str) -> Any:
     """Return the value; raise CzError with a hint on how to make one unless it is of this type."""
     if not isinstance(value, kind):
-        raise CzError(f"this needs a {kind.__name__}, not {value!r:.80}: {how}")
+        name, given = kind.__name__, " ".join(repr(value).split())
+        raise CzError(f"this needs {'an' if name[0] in 'AEIO' else 'a'} {name}, not {given:.80}: {how}")
     return value
 
 

@@ -1,6 +1,7 @@
 """The verdict: one sentence on who holds the radius best where, and a table, a row a scenario."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -82,3 +83,15 @@ def test_there_is_no_verdict_on_a_few_crystals_or_of_one_kind_alone(monkeypatch)
     assert verdict([only]).sentence.startswith("No classical controller took part")
     monkeypatch.setattr(tables, "FEWEST", FEWEST + 1)
     assert verdict(made(one=[BETTER])) == ("No verdict: 20 crystals, and a verdict needs at least 21.", (), ())
+
+
+def test_an_agent_stands_with_those_that_were_told_as_much_as_the_most_told_of_its_training_seeds():
+    made_from = ["reward", "state", "plant"]
+    told = [SimpleNamespace(contract=SimpleNamespace(learned_from=source)) for source in made_from]
+    agent = contender("a", training_seeds=(0,))
+    groups = [replace(agent, trained=tuple(told[:n])).knows for n in (1, 2, 3)]
+    assert groups == [
+        "learned from the reward",
+        "learned from the reward, state told in training",
+        "learned, plant known in training",
+    ]
