@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 try:
-    from cz_gym.commands import OneLineParser, between, guarded, shown
     from cz_gym.errors import CzError
-    from cz_gym.names import unknown
+    from cz_gym.support.command_line import OneLineParser, between, guarded, shown
+    from cz_gym.support.names import unknown
 except ModuleNotFoundError as error:
     sys.exit(f"benchmark.py: {error}")
 
 if TYPE_CHECKING:
-    from cz_gym.contender import Contender
+    from cz_gym.evaluation.contender import Contender
     from cz_gym.evaluation.protocol import Row
 
 FOLDER = Path(__file__).resolve().parent / "results" / "benchmark"
@@ -129,7 +129,7 @@ def rows_of(arguments: argparse.Namespace) -> list[Row]:
     """Scenarios that the command line asks for, as rows of the protocol."""
     from cz_gym.evaluation import user_code
     from cz_gym.evaluation.protocol import ROWS, find_row
-    from cz_gym.puller import chosen_puller
+    from cz_gym.machine.puller import chosen_puller
 
     names = arguments.scenarios or [row.name for row in ROWS if row.default and not arguments.scenario]
     rows = [*map(find_row, names), *map(user_code.row, arguments.scenario)]
@@ -148,8 +148,8 @@ def contenders_of(arguments: argparse.Namespace, rows: Sequence[Row]) -> list[Co
     from cz_gym.agents import OnnxPolicy, shipped_names, shipped_seeds
     from cz_gym.baselines.for_puller import ON_PULLER
     from cz_gym.baselines.registry import CONTROLLERS
-    from cz_gym.contender import agent
     from cz_gym.evaluation import user_code
+    from cz_gym.evaluation.contender import agent
     from cz_gym.evaluation.protocol import SLOW_EPISODES
     from cz_gym.evaluation.runner import check_agents, is_cached
 
@@ -186,7 +186,7 @@ def contenders_of(arguments: argparse.Namespace, rows: Sequence[Row]) -> list[Co
 def given_agents(arguments: argparse.Namespace) -> dict[str, Contender]:
     """Agents of files by name: the files of one name are its training seeds."""
     from cz_gym.agents import OnnxPolicy, shipped_names
-    from cz_gym.contender import agent
+    from cz_gym.evaluation.contender import agent
 
     policies: dict[str, list[OnnxPolicy]] = {}
     for name, file in arguments.agent:

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 try:
-    from cz_gym.commands import OneLineParser, between, guarded, interpreter
     from cz_gym.errors import CzError
+    from cz_gym.support.command_line import OneLineParser, between, guarded, interpreter
 except ModuleNotFoundError as error:
     sys.exit(f"train.py: {error}")
 
@@ -70,8 +70,8 @@ def train(arguments: argparse.Namespace) -> int:
     from cz_gym.agents.training.fleet import train_seed, train_seeds
     from cz_gym.agents.training.run import Job
     from cz_gym.agents.training.validation import references
-    from cz_gym.atomic_files import check_writable, locked
     from cz_gym.baselines.registry import make_controller
+    from cz_gym.support.atomic_files import check_writable, locked
 
     folders = [arguments.out.resolve() / f"seed{seed}" for seed in arguments.seeds or ()] or [arguments.out]
     recipe, seed = _recipe_and_seed(arguments, folders)
@@ -116,7 +116,7 @@ def _recipe_and_seed(arguments: argparse.Namespace, folders: list[Path]) -> tupl
     from cz_gym.agents.training.recipes import DEFAULT, RECIPES
     from cz_gym.agents.training.run_files import read_settings
     from cz_gym.config import check_config
-    from cz_gym.puller import chosen_puller
+    from cz_gym.machine.puller import chosen_puller
 
     begun = [folder for folder in folders if (folder / "settings.json").exists()]
     if begun and not arguments.resume:

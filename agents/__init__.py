@@ -14,7 +14,7 @@ from pathlib import Path
 from cz_gym.agents.agent_file.contract import AgentFileError, Contract, read_agent
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.config import Config
-from cz_gym.names import unknown
+from cz_gym.support.names import unknown
 
 __all__ = ["AgentFileError", "Contract", "OnnxPolicy", "load", "shipped", "shipped_names", "shipped_seeds"]
 

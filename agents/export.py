@@ -18,8 +18,8 @@ from torch import nn
 from cz_gym.agents.agent_file.contract import PLANT, REWARD, STATE, AgentFileError, facts_of, make_contract
 from cz_gym.agents.agent_file.graph import INPUTS, OUTPUTS
 from cz_gym.agents.apg import APG, RecurrentPolicy
+from cz_gym.agents.asymmetric import Asymmetric
 from cz_gym.agents.policies.onnx import OnnxPolicy
-from cz_gym.asymmetric import Asymmetric
 from cz_gym.config import Config
 from cz_gym.observation import OBSERVATIONS
 from cz_gym.sb3 import environment_steps

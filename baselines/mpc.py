@@ -9,7 +9,7 @@ blocks. One Gauss-Newton step (Diehl's real-time iteration) finds the best corre
 CasADi solves a quadratic programme. The cost beyond the horizon is the law's own cost-to-go, so on a linear plant
 without limits the best corrections are zero and the moves are the LQG's: only limits and curvature bring a gain.
 
-The functions of :mod:`cz_gym.physics.plant` take CasADi's symbols, so no equation is written twice and the derivatives
+The functions of :mod:`cz_gym.body.plant` take CasADi's symbols, so no equation is written twice and the derivatives
 are CasADi's. The prediction's numbers are deviations from the operating point in the units of
 :data:`cz_gym.baselines.bounds.trajectory.SCALES`.
 """
@@ -33,12 +33,12 @@ from cz_gym.baselines.lqg.model import DRIFT, FAST, HEATER, PLANT, SLOW, STATES
 from cz_gym.baselines.lqg.multiple_model import Hypotheses
 from cz_gym.baselines.lqg.regulator import Regulator, quadratic_cost
 from cz_gym.baselines.policy import Floats
+from cz_gym.body.cost import Weights
+from cz_gym.body.plant import Disturbance, Inputs, Puller, State, hidden_load, rk4
 from cz_gym.config import Config
-from cz_gym.cost import Weights
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.physics.meniscus import MeniscusModel
-from cz_gym.physics.plant import Disturbance, Inputs, Puller, State, hidden_load, rk4
-from cz_gym.units import MINUTE
+from cz_gym.support.units import MINUTE
 
 WEIGHT_FACTOR = 0.8
 """Factor on the weights of ``lqg`` on pull and moves: the better estimate allows it at the same pull activity."""

@@ -14,10 +14,10 @@ import numpy.typing as npt
 from cz_gym.action import MadeFor, mark
 from cz_gym.config import Config, positive
 from cz_gym.errors import CzError
+from cz_gym.machine.puller import DEFAULT, PullerFile
 from cz_gym.observation import Measured, decode, readable
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
-from cz_gym.puller import DEFAULT, PullerFile
 
 Floats = npt.NDArray[np.float64]
 

@@ -12,9 +12,9 @@ from cz_gym.baselines.lqg import designs
 from cz_gym.baselines.lqg.designs import adaptive
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
 from cz_gym.config import Config, check_config
-from cz_gym.contender import Contender
 from cz_gym.errors import CzError
-from cz_gym.names import unknown
+from cz_gym.evaluation.contender import Contender
+from cz_gym.support.names import unknown
 
 from .policy import OpenLoop, Policy
 

@@ -1,7 +1,7 @@
 """Settings that a search has chosen: for a puller those beside its file, for a scenario those of one that contains it.
 
-Those of the default puller are in ``cz_gym/pullers/default``, a file a controller and scenario, with the history of its
-search (``python -m cz_gym.baselines.tuning``). Each was searched on training seeds and chosen on validation seeds.
+Those of the default puller are in ``cz_gym/machine/pullers/default``, a file a controller and scenario, with the history
+of its search (``python -m cz_gym.baselines.tuning``). Each was searched on training seeds and chosen on validation seeds.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import HARD, PULLER, RANDOMIZED, SENSOR_FAULT
 from cz_gym.errors import CzError
-from cz_gym.puller import DEFAULT, FOLDER, PullerFile
+from cz_gym.machine.puller import DEFAULT, FOLDER, PullerFile
 
 TUNED = (RANDOMIZED, HARD, SENSOR_FAULT, PULLER)
 """Scenarios that controllers are tuned on, the least demanding first."""

@@ -9,7 +9,7 @@ import sys
 from importlib import import_module
 from typing import Any
 
-from . import interrupts  # noqa: F401  (first of all)
+from .support import interrupts  # noqa: F401  (first of all)
 
 try:
     import gymnasium as gym
@@ -19,11 +19,11 @@ except ModuleNotFoundError as error:
         sys.exit(said)
     raise ModuleNotFoundError(said, name=error.name) from None
 
+from cz_gym.body.plant import Puller, State, make_puller
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import SCENARIOS
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
-from cz_gym.physics.plant import Puller, State, make_puller
 
 from .config import Config
 from .env import CzEnv, EnvState

@@ -13,13 +13,13 @@ class MadeFor(NamedTuple):
     """The environment that a controller or an agent was made for."""
 
     action: str
-    """Mode of its actions: "direct", "smooth" or "rate" (:func:`cz_gym.task.drives_of`)."""
+    """Mode of its actions: "direct", "smooth" or "rate" (:func:`cz_gym.body.task.drives_of`)."""
     control_interval: float
     """Time between its actions [s]."""
     plant: str
     """Hash of the plant (:attr:`cz_gym.config.Config.plant_hash`)."""
     puller: str = "default"
-    """Name and hash of the puller file (:attr:`cz_gym.puller.PullerFile.label`)."""
+    """Name and hash of the puller file (:attr:`cz_gym.machine.puller.PullerFile.label`)."""
 
     def __str__(self) -> str:
         puller = "" if self.puller == "default" else f", puller {self.puller}"

@@ -11,21 +11,21 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import NamedTuple
 
+from cz_gym.body.plant import EQUATIONS, make_puller
+from cz_gym.body.task import ACTIONS, check_height
 from cz_gym.camera.view import Camera, camera_for, check_camera
 from cz_gym.episodes.mixture import AnyScenario, Distribution
 from cz_gym.episodes.scenario import Range, Scenario
 from cz_gym.episodes.scenarios import RANDOMIZED, find_distribution, find_scenario, mix_of
 from cz_gym.errors import CzError
 from cz_gym.jit.code_hash import function_hash
-from cz_gym.names import needs, unknown
+from cz_gym.machine.puller import DEFAULT, PullerFile, find_puller, on
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters, check_parameters
-from cz_gym.physics.plant import EQUATIONS, make_puller
+from cz_gym.support.names import needs, unknown
 
 from .action import MadeFor
 from .observation import CAMERA, OBSERVATIONS
-from .puller import DEFAULT, PullerFile, find_puller, on
-from .task import ACTIONS, check_height
 
 VERSION = 0
 """Version of the environment's contract; a change of it, or of physics, makes a Cz-v1."""
@@ -68,7 +68,7 @@ class Config:
     model: str | float | None = None
     observation: str = "history"
     action: str = "smooth"
-    """Action mode: "direct", "smooth" or "rate" (:func:`cz_gym.task.drives_of`)."""
+    """Action mode: "direct", "smooth" or "rate" (:func:`cz_gym.body.task.drives_of`)."""
     control_interval: float = 5.0
     """Time between actions [s]."""
     horizon: float = 10800.0

@@ -26,15 +26,15 @@ import numpy.typing as npt
 from scipy.signal import lfilter
 
 import cz_gym
-from cz_gym.atomic_files import check_writable
-from cz_gym.commands import OneLineParser, between
+from cz_gym.body.task import drives_of
 from cz_gym.config import Config, check_config, make_config
 from cz_gym.errors import CzError
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
-from cz_gym.names import unknown
+from cz_gym.machine.puller import DEFAULT, PullerFile, chosen_puller
 from cz_gym.observation import DRIVE_CHANNELS, to_measured
-from cz_gym.puller import DEFAULT, PullerFile, chosen_puller
-from cz_gym.task import drives_of
+from cz_gym.support.atomic_files import check_writable
+from cz_gym.support.command_line import OneLineParser, between
+from cz_gym.support.names import unknown
 from cz_gym.vector import CzVectorEnv
 
 CONTROLLERS, AGENTS = "cz_gym.baselines.registry:CONTROLLERS", "cz_gym.agents:load"

@@ -15,15 +15,15 @@ import numpy.typing as npt
 from gymnasium.error import InvalidAction, ResetNeeded
 
 from cz_gym.action import MarkedAction, check_marked
+from cz_gym.body.cost import Cost
+from cz_gym.body.signals import INFO, MEASURED, scales
 from cz_gym.config import Config, check_config, positive_whole
-from cz_gym.cost import Cost
 from cz_gym.engine.batch import Batch, first_key
 from cz_gym.engine.buffers import BufferPool
 from cz_gym.engine.layout import Out
 from cz_gym.engine.tangents import ACTIONS, ROWS, SCRATCH, SMOOTH, build_tangents
 from cz_gym.episodes.record import GRID
 from cz_gym.errors import CzError
-from cz_gym.signals import INFO, MEASURED, scales
 
 Floats = npt.NDArray[np.float64]
 _COSTS = [INFO.index(f"cost_{name}") for name in Cost._fields]
@@ -38,7 +38,7 @@ class Step(NamedTuple):
     measured: npt.NDArray[np.float32]
     """The "measured" observation, shape (n, 11)."""
     cost: Floats
-    """The four terms of the cost (:class:`cz_gym.cost.Cost`), shape (n, 4)."""
+    """The four terms of the cost (:class:`cz_gym.body.cost.Cost`), shape (n, 4)."""
     error: Floats
     """The true radius error r_c - r_ref [m], shape (n,)."""
     offset: Floats

@@ -14,23 +14,23 @@ import numpy.typing as npt
 from gymnasium.error import InvalidAction, ResetNeeded
 from gymnasium.spaces import Box
 
+from cz_gym.body.signals import INFO, LEAN
 from cz_gym.camera.view import IMAGE, Camera
 from cz_gym.engine.batch import Batch, SlotState, new_key
 from cz_gym.engine.layout import Out, check_info
 from cz_gym.episodes.mixture import AnyScenario, Mixture
 from cz_gym.episodes.scenarios import find_distribution
 from cz_gym.errors import CzError
-from cz_gym.names import known_keywords, unknown
+from cz_gym.machine.puller import PullerFile
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.rendering.canvas import Frame
 from cz_gym.rendering.view import FPS, declared_modes, make_view
+from cz_gym.support.names import known_keywords, unknown
 
 from .action import MarkedAction, check_marked
 from .config import Config, check_config, make_config
 from .observation import CAMERA, CLIP, OBSERVATIONS
-from .puller import PullerFile
-from .signals import INFO, LEAN
 
 Observation = npt.NDArray[Any]
 Action = npt.NDArray[np.float32]
@@ -148,7 +148,7 @@ class CzEnv(Form, gym.Env[Observation, Action]):
     several, ``info["scenario"]`` names the episode's own), ``model`` ("I", "II", a mix in [0, 1], or None for the
     scenario's draw), ``observation``, ``action`` ("direct", "smooth" or "rate"), ``control_interval`` [s],
     ``horizon`` [s], ``info`` ("lean": true radius and its reference; "all": every signal, see
-    :class:`cz_gym.signals.Logged`; with observation "history" also the true ``state``, for critics),
+    :class:`cz_gym.body.signals.Logged`; with observation "history" also the true ``state``, for critics),
     ``render_mode``, ``parameters`` (:class:`cz_gym.Parameters`), ``meniscus`` (:class:`cz_gym.MeniscusModel`),
     ``camera`` (:class:`cz_gym.camera.Camera`, with observation "camera" only), ``puller`` (a file, or the name of a
     shipped one; see docs/extend/puller.md: parameters and control interval are then its own). Bad values raise

@@ -1,6 +1,6 @@
 """Observations: scaled and clipped signals, and their decoding.
 
-An observed value is ``quantity / scale`` clipped to +-10, float32; :mod:`cz_gym.signals` has quantities and scales.
+An observed value is ``quantity / scale`` clipped to +-10, float32; :mod:`cz_gym.body.signals` has quantities and scales.
 "history" adds the past as differences of the means of neighbouring time spans. These differ by micrometres, readings by
 millimetres, so the differences have scales of their own.
 """
@@ -12,18 +12,17 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.body.signals import HEATER_SCALE as HEATER_SCALE
+from cz_gym.body.signals import MEASURED as MEASURED
+from cz_gym.body.signals import PREVIEWS as PREVIEWS
+from cz_gym.body.signals import PULL_SCALE as PULL_SCALE
+from cz_gym.body.signals import STATE as STATE
+from cz_gym.body.signals import Channel as Channel
+from cz_gym.body.signals import Measured as Measured
+from cz_gym.body.signals import scales as scales
+from cz_gym.body.signals import signals
 from cz_gym.errors import CzError
-
-from .signals import HEATER_SCALE as HEATER_SCALE
-from .signals import MEASURED as MEASURED
-from .signals import PREVIEWS as PREVIEWS
-from .signals import PULL_SCALE as PULL_SCALE
-from .signals import STATE as STATE
-from .signals import Channel as Channel
-from .signals import Measured as Measured
-from .signals import scales as scales
-from .signals import signals
-from .units import KILO, MM
+from cz_gym.support.units import KILO, MM
 
 CLIP = 10.0
 """Largest observed value after scaling [-]."""

@@ -15,16 +15,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.commands import OneLineParser, between
 from cz_gym.config import Config, make_config
 from cz_gym.env import CzEnv
 from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.replay import Playback
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.puller import chosen_puller
+from cz_gym.machine.puller import chosen_puller
 from cz_gym.rendering.canvas import load
-from cz_gym.units import MINUTE
+from cz_gym.support.command_line import OneLineParser, between
+from cz_gym.support.units import MINUTE
 
 Action = npt.NDArray[np.float32]
 CONTROLLERS = "cz_gym.baselines.registry:find_controller"

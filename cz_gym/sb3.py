@@ -17,10 +17,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_wrapper
 
+from cz_gym.body.signals import STATE
 from cz_gym.errors import CzError
-from cz_gym.names import needs
 from cz_gym.observation import HISTORY
-from cz_gym.signals import STATE
+from cz_gym.support.names import needs
 from cz_gym.vector import CzVectorEnv
 
 
@@ -46,8 +46,8 @@ class CzVecEnv(VecEnv):
     hold ``terminal_observation``, ``TimeLimit.truncated`` and ``episode``: return, length and time, as those of
     stable-baselines3's ``Monitor``. With ``stagger``, a seed, each slot's first episode is cut (truncated) at a random
     step, so that slots are not all in the same minute. With ``critic_state`` the plant's true state
-    (:class:`cz_gym.signals.TrueState`) follows the channels of ``observation="history"``, for a
-    policy of :mod:`cz_gym.asymmetric`; the batch needs ``info="all"``.
+    (:class:`cz_gym.body.signals.TrueState`) follows the channels of ``observation="history"``, for a
+    policy of :mod:`cz_gym.agents.asymmetric`; the batch needs ``info="all"``.
     """
 
     def __init__(self, env: CzVectorEnv, stagger: int | None = None, critic_state: bool = False) -> None:

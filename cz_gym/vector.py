@@ -13,17 +13,17 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from cz_gym.body.signals import INFO, LEAN
 from cz_gym.engine.batch import Batch, new_key
 from cz_gym.engine.layout import Out, check_info
 from cz_gym.episodes.mixture import AnyScenario, Mixture
 from cz_gym.errors import CzError
-from cz_gym.names import known_keywords
-from cz_gym.processors import processors
+from cz_gym.support.names import known_keywords
+from cz_gym.support.processors import processors
 
 from .action import MarkedAction, check_marked
 from .config import Config, make_config, positive_whole
 from .env import CzEnv, EnvState, Form, action_space, check_options, check_state, observation_space
-from .signals import INFO, LEAN
 
 _CLIPPED = INFO.index("action_clipped")
 _LEAN_ROWS = tuple(map(INFO.index, LEAN))

@@ -1,6 +1,6 @@
-"""A controller of a puller over OPC UA: any that ``python -m cz_gym.export`` can write, in Python or as compiled C.
+"""A controller of a puller over OPC UA: any that ``python -m cz_gym.machine.export`` can write, in Python or as compiled C.
 
-It reads the tags of ``python -m cz_gym.serve``, calls the exported block, which has inputs of the same names, and
+It reads the tags of ``python -m cz_gym.machine.serve``, calls the exported block, which has inputs of the same names, and
 writes both setpoints and the step that they answer.
 """
 
@@ -18,14 +18,14 @@ from typing import Any
 from asyncua import Client, ua
 from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 
-from cz_gym.commands import OneLineParser, between
 from cz_gym.config import Config, make_config
 from cz_gym.errors import CzError
-from cz_gym.export.__main__ import make_block
-from cz_gym.export.compiled import CompiledBlock
-from cz_gym.export.policy import Runner
-from cz_gym.serve.machine import SETPOINTS, TAGS
-from cz_gym.serve.opcua import URI, WRITABLE, certify, password
+from cz_gym.machine.export.__main__ import make_block
+from cz_gym.machine.export.compiled import CompiledBlock
+from cz_gym.machine.export.policy import Runner
+from cz_gym.machine.serve.machine import SETPOINTS, TAGS
+from cz_gym.machine.serve.opcua import URI, WRITABLE, certify, password
+from cz_gym.support.command_line import OneLineParser, between
 
 
 class Controller:

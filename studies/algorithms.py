@@ -11,15 +11,15 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from cz_gym.atomic_files import check_writable, write_files
-from cz_gym.commands import OneLineParser
-from cz_gym.contender import agent
 from cz_gym.errors import CzError
+from cz_gym.evaluation.contender import agent
 from cz_gym.evaluation.report.markdown import summary
 from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.results import Result
 from cz_gym.evaluation.runner import run
-from cz_gym.units import MINUTE
+from cz_gym.support.atomic_files import check_writable, write_files
+from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.units import MINUTE
 
 from .leaderboard import random_rows
 

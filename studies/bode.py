@@ -14,19 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from cz_gym import puller as machine
-from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.baselines.analysis.frequency import frequencies, loop_margins, opened, response
 from cz_gym.baselines.analysis.linear_form import LinearForm, linear_form
 from cz_gym.baselines.analysis.sampled_loop import HOT_ZONE, close, stable_range
 from cz_gym.baselines.registry import make_controller
-from cz_gym.commands import OneLineParser
+from cz_gym.body.plant import make_puller
 from cz_gym.config import make_config
 from cz_gym.errors import CzError
 from cz_gym.evaluation import user_code
 from cz_gym.evaluation.report.tables import markdown as table
+from cz_gym.machine import puller as machine
 from cz_gym.physics.linearisation import StateSpace
-from cz_gym.physics.plant import make_puller
+from cz_gym.support.atomic_files import check_writable, write_files
+from cz_gym.support.command_line import OneLineParser
 
 PLACES = {"camera": "ring", "v_p": "pull speed", "Q_H": "heater"}
 """Places where the loop is opened, and their names."""

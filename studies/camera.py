@@ -16,17 +16,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.atomic_files import check_writable, write_files
+from cz_gym.body.plant import make_puller
 from cz_gym.camera.image import picture
 from cz_gym.camera.rays import make_scene
 from cz_gym.camera.ring_detector import ANGLES, RingDetector, wall_edge
 from cz_gym.camera.view import COLUMNS, ROWS, Camera, make_view, project
-from cz_gym.commands import OneLineParser
 from cz_gym.env import CzEnv
 from cz_gym.physics.linearisation import Floats
 from cz_gym.physics.meniscus import hurle_ring_offset
-from cz_gym.physics.plant import make_puller
-from cz_gym.units import MM
+from cz_gym.support.atomic_files import check_writable, write_files
+from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.units import MM
 
 RADII, HEIGHTS = np.linspace(-8.0, 8.0, 17) * MM, np.linspace(-2.0, 2.0, 9) * MM
 """Radii less r_0 and heights less h_0 at which the readings are compared [m]."""

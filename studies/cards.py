@@ -9,13 +9,13 @@ from pathlib import Path
 
 from cz_gym.agents import shipped_seeds
 from cz_gym.agents.agent_file.contract import Contract, read_agent
-from cz_gym.atomic_files import check_writable, write_files
-from cz_gym.commands import OneLineParser
 from cz_gym.errors import CzError
 from cz_gym.evaluation.files import read_results
 from cz_gym.evaluation.report.tables import FAILURES, PULL_STEP, RMSE, Column
 from cz_gym.evaluation.report.tables import markdown as table
 from cz_gym.evaluation.statistics import Estimate
+from cz_gym.support.atomic_files import check_writable, write_files
+from cz_gym.support.command_line import OneLineParser
 
 AGENTS = {
     "gradient": "analytic policy gradients: the cost's gradient through policy and plant; the plant is known",

@@ -20,15 +20,15 @@ from typing import Any
 import numpy as np
 from scipy.stats import spearmanr
 
-from cz_gym.atomic_files import write_files
 from cz_gym.baselines.lqg.designs import FAMILY
 from cz_gym.baselines.registry import CONTROLLERS
-from cz_gym.commands import OneLineParser
 from cz_gym.errors import CzError
 from cz_gym.evaluation.equal_activity import Point, frontier, intervals, ratios
 from cz_gym.evaluation.files import EPISODES, Episodes, read_episodes, read_results
 from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.statistics import Estimate, Resamples
+from cz_gym.support.atomic_files import write_files
+from cz_gym.support.command_line import OneLineParser
 
 ACTIVITY, RETURN = "pull_step_rms_mm_per_min", "return"
 RESAMPLES = 2_000

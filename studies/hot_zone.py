@@ -19,14 +19,14 @@ from cz_gym.baselines.lqg.designs import TOLD, adaptive
 from cz_gym.baselines.mpc import WEIGHT_FACTOR
 from cz_gym.baselines.registry import find_controller, make_controller
 from cz_gym.baselines.tuned_for import shipped, with_values
-from cz_gym.commands import OneLineParser, between
 from cz_gym.config import Config, make_config
 from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import TEST_SEEDS
 from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.names import unknown
+from cz_gym.support.command_line import OneLineParser, between
+from cz_gym.support.names import unknown
 
 LQGS = {
     "lqg": (0.1556, 0.06564, 0.5706, 0.3106, 0.369, 0.0007519, 2113.0, 0.3833, 0.002862, 0.08655, 0.2398),

@@ -19,11 +19,10 @@ from typing import NamedTuple
 import numpy as np
 
 from cz_gym import CzEnv, Parameters, make_puller
-from cz_gym.atomic_files import check_writable, write_files
 from cz_gym.baselines.lqg.designs import TOLD, lqg
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.settings import settings_of
-from cz_gym.commands import OneLineParser
+from cz_gym.body.task import HEATER_RANGE
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Pullers
 from cz_gym.episodes.scenarios import RANDOMIZED
@@ -31,11 +30,12 @@ from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.identify import Excited, Identified, identify, read_log, record_log
-from cz_gym.identify.estimate import PRIOR_SD, measure_excitation
-from cz_gym.puller import PullerFile, read_puller, write_puller
-from cz_gym.task import HEATER_RANGE
-from cz_gym.units import KILO, MM, PERCENT
+from cz_gym.machine.identify import Excited, Identified, identify, read_log, record_log
+from cz_gym.machine.identify.estimate import PRIOR_SD, measure_excitation
+from cz_gym.machine.puller import PullerFile, read_puller, write_puller
+from cz_gym.support.atomic_files import check_writable, write_files
+from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.units import KILO, MM, PERCENT
 
 PULLERS, CRYSTALS, QUICK = 20, 20, 3
 """Pullers, crystals of each, pullers of a quick run."""

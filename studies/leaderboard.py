@@ -14,12 +14,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from cz_gym.agents import OnnxPolicy
-from cz_gym.atomic_files import check_writable, naming, write_files
 from cz_gym.baselines.registry import CONTROLLERS
-from cz_gym.commands import OneLineParser, between
-from cz_gym.contender import Contender, agent
 from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.errors import CzError
+from cz_gym.evaluation.contender import Contender, agent
 from cz_gym.evaluation.files import read_results, to_json
 from cz_gym.evaluation.protocol import ROWS, TEST_SEEDS, Row, contract_hash
 from cz_gym.evaluation.report.markdown import summary
@@ -27,6 +25,8 @@ from cz_gym.evaluation.report.tables import RMSE
 from cz_gym.evaluation.report.tables import markdown as table
 from cz_gym.evaluation.results import Result
 from cz_gym.evaluation.runner import check_agents, run
+from cz_gym.support.atomic_files import check_writable, naming, write_files
+from cz_gym.support.command_line import OneLineParser, between
 
 FRESH = range(3_000_000, 2**31)
 """Seeds that no training, validation or test uses."""

@@ -20,13 +20,13 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from cz_gym.atomic_files import check_writable, write_files
-from cz_gym.commands import OneLineParser
 from cz_gym.config import make_config
 from cz_gym.differentiable import DifferentiableBatch
 from cz_gym.engine.batch import Batch
 from cz_gym.env import CzEnv
-from cz_gym.processors import processors
+from cz_gym.support.atomic_files import check_writable, write_files
+from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.processors import processors
 from cz_gym.vector import CzVectorEnv
 
 QUICK, FULL = 3, 15

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from cz_gym.commands import OPTIONAL
+from cz_gym.support.command_line import OPTIONAL
 
 os.environ["SDL_VIDEODRIVER"] = os.environ["SDL_AUDIODRIVER"] = "dummy"  # no test opens a window
 CACHE = Path(os.environ["CZ_GYM_CACHE_DIR"])
@@ -37,7 +37,7 @@ def pytest_sessionstart():
     """Of parallel workers one compiles what most tests need, kernels and large packages; the others then load it."""
     if "PYTEST_XDIST_WORKER" in os.environ and importlib.util.find_spec("filelock"):
         from cz_gym import CzEnv
-        from cz_gym.atomic_files import locked
+        from cz_gym.support.atomic_files import locked
 
         CACHE.mkdir(parents=True, exist_ok=True)
         with locked(CACHE, patience=3600.0):

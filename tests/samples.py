@@ -5,7 +5,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from cz_gym.baselines.registry import find_controller
-from cz_gym.contender import Contender
+from cz_gym.evaluation.contender import Contender
 from cz_gym.evaluation.protocol import find_row
 from cz_gym.evaluation.results import Result, Sample, summarise
 from cz_gym.evaluation.rollout import Rollout, rollout

@@ -2,11 +2,11 @@
 
 from typing import Any
 
+from cz_gym.agents.asymmetric import LearnState
 from cz_gym.agents.training import fleet, validation
 from cz_gym.agents.training.algorithms import make_algorithm, repeat_of
 from cz_gym.agents.training.recipes import APG, PPO, SAC, Recipe
 from cz_gym.agents.training.run import Job
-from cz_gym.asymmetric import LearnState
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
 SMALL = PPO(num_envs=4, action_repeat=2, hidden=(16, 16), steps=128, n_steps=16, batch_size=32, n_epochs=1)

@@ -12,14 +12,14 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from cz_gym.atomic_files import write_files
 from cz_gym.config import Config
-from cz_gym.contender import PLANT as PLANT
-from cz_gym.contender import REWARD as REWARD
-from cz_gym.contender import STATE as STATE
 from cz_gym.errors import CzError
+from cz_gym.evaluation.contender import PLANT as PLANT
+from cz_gym.evaluation.contender import REWARD as REWARD
+from cz_gym.evaluation.contender import STATE as STATE
+from cz_gym.machine.puller import DEFAULT
 from cz_gym.observation import CLIP, OBSERVATIONS
-from cz_gym.puller import DEFAULT
+from cz_gym.support.atomic_files import write_files
 
 FORMAT = "cz-gym-agent"
 FORMAT_VERSION = 5
@@ -48,7 +48,7 @@ class Contract:
     observation_hash: str
     """Hash of that observation's channels: their names, units and scales, in order."""
     action: str
-    """Meaning of its actions: "direct", "smooth" or "rate" (:func:`cz_gym.task.drives_of`)."""
+    """Meaning of its actions: "direct", "smooth" or "rate" (:func:`cz_gym.body.task.drives_of`)."""
     control_interval: float
     """Time between its actions [s]."""
     plant_hash: str
@@ -72,7 +72,7 @@ class Contract:
     sha256: str
     """Hash of the ONNX file."""
     puller: str = DEFAULT.label
-    """Name and hash of the puller file that it was trained for (:attr:`cz_gym.puller.PullerFile.label`)."""
+    """Name and hash of the puller file that it was trained for (:attr:`cz_gym.machine.puller.PullerFile.label`)."""
 
 
 def observation_hash(name: str) -> str:

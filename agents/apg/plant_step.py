@@ -6,10 +6,10 @@ from typing import Any
 
 import torch
 
+from cz_gym.body.cost import cost_terms, saturated
+from cz_gym.body.task import drives_of
 from cz_gym.config import Config
-from cz_gym.cost import cost_terms, saturated
 from cz_gym.differentiable import STATES, DifferentiableBatch
-from cz_gym.task import drives_of
 
 R_C, V_P, Q_H = (STATES.index(name) for name in ("r_c", "v_p", "Q_H"))
 

@@ -13,7 +13,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from cz_gym.signals import MEASURED
+from cz_gym.body.signals import MEASURED
 
 TIMES = tuple(float(time) for time in np.geomspace(3.0, 3600.0, 8))
 """Time constants of the leaky means [s]."""

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from cz_gym import CzVectorEnv
 from cz_gym.agents import apg
-from cz_gym.asymmetric import AsymmetricPolicy, AsymmetricSACPolicy
+from cz_gym.agents.asymmetric import AsymmetricPolicy, AsymmetricSACPolicy
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from cz_gym.sb3 import ActionRepeat, CzVecEnv
 

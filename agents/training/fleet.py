@@ -9,9 +9,9 @@ from typing import Any
 
 from tqdm import tqdm
 
-from cz_gym.atomic_files import locked
 from cz_gym.errors import CzError
 from cz_gym.evaluation.processes import in_processes
+from cz_gym.support.atomic_files import locked
 
 from .run import Job, Run
 from .run_files import read_rows

@@ -26,7 +26,7 @@ class Recipe:
     """Initial learning rate, decayed linearly."""
     observation: str = "history"
     action: str = "smooth"
-    """Meaning of the network's two outputs (:func:`cz_gym.task.drives_of`)."""
+    """Meaning of the network's two outputs (:func:`cz_gym.body.task.drives_of`)."""
     scenario: str = "all"
     """Scenario or mixture of the training and validation crystals (:func:`cz_gym.evaluation.user_code.scenarios`)."""
     control_interval: float = 5.0
@@ -68,8 +68,8 @@ class APG(Recipe):
 class Reinforcement(Recipe):
     """Learns from reward, by trying; stable-baselines3's ``VecNormalize`` scales the reward. Observations are scaled by
     the environment: running means would remember the lost crystals of the first minutes, and make a reading that is
-    not valid, one in hundreds, an input of -10. Critics read the plant's true state (:mod:`cz_gym.asymmetric`); actors
-    never do, but PPO's estimate is fitted to it.
+    not valid, one in hundreds, an input of -10. Critics read the plant's true state
+    (:mod:`cz_gym.agents.asymmetric`); actors never do, but PPO's estimate is fitted to it.
     """
 
     hidden: tuple[int, ...] = (64, 64)
@@ -86,7 +86,7 @@ class Reinforcement(Recipe):
 @dataclass(frozen=True, kw_only=True)
 class PPO(Reinforcement):
     """Proximal policy optimisation; the actor reads an estimate of the plant's state
-    (:class:`cz_gym.asymmetric.StateEstimator`)."""
+    (:class:`cz_gym.agents.asymmetric.StateEstimator`)."""
 
     name: str = "ppo"
     hidden: tuple[int, ...] = (32, 32)

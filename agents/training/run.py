@@ -16,11 +16,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import configure_logger
 
 from cz_gym.agents.agent_file.contract import agent_files, read_json
+from cz_gym.agents.asymmetric import LearnState
 from cz_gym.agents.export import to_agent
 from cz_gym.agents.policies.onnx import OnnxPolicy
-from cz_gym.asymmetric import LearnState
-from cz_gym.atomic_files import write_files
 from cz_gym.sb3 import environment_steps
+from cz_gym.support.atomic_files import write_files
 
 from . import validation
 from .algorithms import make_algorithm, repeat_of

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.agents.agent_file.contract import Contract
+from cz_gym.body.cost import COST_CAP
 from cz_gym.config import Config
-from cz_gym.cost import COST_CAP
 from cz_gym.evaluation.metrics import Metrics, metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout

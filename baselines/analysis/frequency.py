@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.body.plant import Puller
 from cz_gym.physics.linearisation import Floats, StateSpace
-from cz_gym.physics.plant import Puller
 
 from .sampled_loop import close
 

@@ -24,9 +24,9 @@ from cz_gym.baselines.lqg.estimator import PlantFilter
 from cz_gym.baselines.lqg.model import DRIFT, DRIFT_RATE, FAST, PLANT, SLOW, STATES, NoiseModel, load_per_drift
 from cz_gym.baselines.lqg.multiple_model import MultipleModelFilter
 from cz_gym.baselines.policy import Floats, batched, fresh, to_action
+from cz_gym.body.plant import hidden_load
 from cz_gym.config import Config
 from cz_gym.observation import STATE, scales
-from cz_gym.physics.plant import hidden_load
 
 from .future import fluctuations_of, pullers_of
 

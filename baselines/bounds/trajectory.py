@@ -16,11 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.baselines.policy import Floats
-from cz_gym.cost import beyond_band, coefficients
+from cz_gym.body.cost import beyond_band, coefficients
+from cz_gym.body.plant import Inputs, State
+from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
 from cz_gym.episodes.scenario import Actuators
-from cz_gym.physics.plant import Inputs, State
-from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
-from cz_gym.units import KILO, MM, MM_PER_MIN
+from cz_gym.support.units import KILO, MM, MM_PER_MIN
 
 from .future import Future
 

@@ -13,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.baselines.policy import Floats, select
+from cz_gym.body.plant import Disturbance, Inputs, State, hidden_load, rk4
+from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT
 from cz_gym.observation import Measured
 from cz_gym.physics.meniscus import MeniscusModel
-from cz_gym.physics.plant import Disturbance, Inputs, State, hidden_load, rk4
-from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT
-from cz_gym.units import KILO, MINUTE
+from cz_gym.support.units import KILO, MINUTE
 
 from . import kalman, ring_model
 from .model import DRIFT, FAST, HEATER, PLANT, SLOW, STATES, NoiseModel, PlantModel

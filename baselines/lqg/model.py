@@ -16,10 +16,10 @@ from scipy.linalg import expm
 from scipy.signal import cont2discrete
 
 from cz_gym.baselines.policy import Floats, check_numbers
+from cz_gym.body.plant import Puller, hidden_load
 from cz_gym.physics.linearisation import INPUTS, OUTPUTS, linearise
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
-from cz_gym.physics.plant import Puller, hidden_load
-from cz_gym.units import MINUTE, MM
+from cz_gym.support.units import MINUTE, MM
 
 STATES = ("r_c", "h_c", "T_1", "T_2", "T_b", "fast", "slow", "drift", "drift_rate", "heater")
 """States of the augmented plant."""

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy.linalg import solve_discrete_are
 
 from cz_gym.baselines.policy import Floats
-from cz_gym.cost import Weights, coefficients
+from cz_gym.body.cost import Weights, coefficients
 from cz_gym.observation import PREVIEWS, Measured
 
 from .model import DRIFT, PLANT, STATES, PlantModel

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.baselines.policy import Floats, check_numbers
-from cz_gym.units import MINUTE, MM
+from cz_gym.support.units import MINUTE, MM
 
 from .model import STATES, PlantModel
 

@@ -17,7 +17,7 @@ from scipy.signal import cont2discrete
 
 from cz_gym.baselines.policy import Floats, MeasuredController, check_numbers
 from cz_gym.observation import Measured
-from cz_gym.units import KILO
+from cz_gym.support.units import KILO
 
 
 class PIDState(NamedTuple):

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from cz_gym.baselines.policy import Floats, MeasuredController, check_numbers
 from cz_gym.observation import Measured
-from cz_gym.units import MINUTE, MM, MM_PER_MIN
+from cz_gym.support.units import MINUTE, MM, MM_PER_MIN
 
 from .temperature_loop import Heat, TemperatureLoop
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from cz_gym.baselines.policy import Floats, check_numbers
 from cz_gym.observation import Measured
-from cz_gym.units import KILO
+from cz_gym.support.units import KILO
 
 
 class Heat(NamedTuple):

@@ -15,12 +15,12 @@ from pathlib import Path
 
 from cz_gym.baselines import for_puller
 from cz_gym.baselines.tuned_for import file_name, tuned_folder
-from cz_gym.commands import OneLineParser, between
 from cz_gym.config import make_config
 from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.errors import CzError
 from cz_gym.evaluation.processes import in_processes
-from cz_gym.puller import PullerFile, chosen_puller
+from cz_gym.machine.puller import PullerFile, chosen_puller
+from cz_gym.support.command_line import OneLineParser, between
 
 from .goals import TUNABLE, crystals, crystals_on, goal_of, goal_on, search_for
 from .search import Search, measure

@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.atomic_files import check_writable, naming, write_files
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign
 from cz_gym.baselines.lqg.regulator import STEP_TIME
 from cz_gym.baselines.policy import Floats
@@ -28,7 +27,8 @@ from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.puller import DEFAULT
+from cz_gym.machine.puller import DEFAULT
+from cz_gym.support.atomic_files import check_writable, naming, write_files
 
 DIGITS = 4
 """Number of significant digits of a candidate's values."""

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.body.plant import Puller
 from cz_gym.episodes.record import FIRST_FRAME
 from cz_gym.episodes.rng import WORDS, normal, seed_stream
 from cz_gym.jit.cache import hashed
 from cz_gym.jit.compile import jittable, kernel
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
-from cz_gym.physics.plant import Puller
 
 from .rays import CRYSTAL, FLAT, MELT, SHIELD, WALL, Ray, first_hit, make_scene, mirror
 from .view import COLUMNS, IMAGE, ROWS, View

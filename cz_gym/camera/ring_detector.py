@@ -18,9 +18,9 @@ from scipy.integrate import trapezoid
 from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
+from cz_gym.body.plant import Puller
 from cz_gym.errors import CzError
-from cz_gym.physics.plant import Puller
-from cz_gym.units import MM
+from cz_gym.support.units import MM
 
 from .image import picture
 from .rays import Scene, make_scene, profile_at

@@ -11,7 +11,7 @@ from typing import Annotated, Any, NamedTuple
 
 from cz_gym.errors import CzError
 from cz_gym.physics.parameters import Parameters, Q, check_numbers
-from cz_gym.units import MM
+from cz_gym.support.units import MM
 
 ROWS, COLUMNS = 120, 160
 IMAGE = (ROWS, COLUMNS, 1)

@@ -18,6 +18,9 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.utils import seeding
 
+from cz_gym.body.plant import NO_OPERATING_POINT
+from cz_gym.body.signals import INFO, MEASURED, STATE, scales
+from cz_gym.body.task import drives_of
 from cz_gym.camera.image import build_look
 from cz_gym.camera.view import IMAGE, make_view
 from cz_gym.config import Config, Identity
@@ -26,12 +29,9 @@ from cz_gym.episodes.record import GRID, Lots, lots_of
 from cz_gym.episodes.scenario import MAX_LATENCY
 from cz_gym.errors import CzError
 from cz_gym.jit.compile import entry
+from cz_gym.machine.puller import on
 from cz_gym.observation import HISTORY, LAGGED, lags
 from cz_gym.physics.parameters import Parameters
-from cz_gym.physics.plant import NO_OPERATING_POINT
-from cz_gym.puller import on
-from cz_gym.signals import INFO, MEASURED, STATE, scales
-from cz_gym.task import drives_of
 
 from .buffers import BufferPool
 from .kernels import build_kernels

@@ -1,6 +1,6 @@
 """The compiled loops: draws, drives, plant, sensors, observation and reward, for one slot or ten thousand.
 
-The equations are the functions of :mod:`cz_gym.physics.plant`, :mod:`cz_gym.episodes.schedule` and :mod:`cz_gym.task`,
+The equations are the functions of :mod:`cz_gym.body.plant`, :mod:`cz_gym.body.schedule` and :mod:`cz_gym.body.task`,
 compiled in; this module calls them in order for each slot.
 """
 
@@ -11,15 +11,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.cost import Cost, cost_terms, reward
+from cz_gym.body.cost import Cost, cost_terms, reward
+from cz_gym.body.plant import Disturbance, State, derive_puller, growth
+from cz_gym.body.schedule import bias_offset
+from cz_gym.body.signals import INFO, LEAN, logged, measure, true_state
 from cz_gym.episodes.draw import draw_episode, draw_factors, draw_scenario, randomised, seed_streams
 from cz_gym.episodes.noise import first_fluctuation, fluctuation, sample_noise
-from cz_gym.episodes.schedule import bias_offset
 from cz_gym.jit.cache import hashed
 from cz_gym.jit.compile import fetch, inlined, jittable, kernel
 from cz_gym.physics.meniscus import MeniscusModel
-from cz_gym.physics.plant import Disturbance, State, derive_puller, growth
-from cz_gym.signals import INFO, LEAN, logged, measure, true_state
 
 from .layout import EPISODE_AT, PULLER_AT, SLOT
 from .lockstep import LANES, advance, height_inside

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cz_gym.body.plant import Puller, State
 from cz_gym.episodes.record import FREEZES, Episode, Stream
 from cz_gym.episodes.rng import WORDS
 from cz_gym.errors import CzError
-from cz_gym.physics.plant import Puller, State
 
 
 def _record(fields: tuple[str, ...]) -> np.dtype[Any]:
@@ -103,7 +103,8 @@ class Out(NamedTuple):
     truncated: Any
     """Bool, shape (n,)."""
     info: Any
-    """Rows of :class:`cz_gym.signals.Logged`, float64, shape (rows, n or a little more: see :func:`info_width`)."""
+    """Rows of :class:`cz_gym.body.signals.Logged`, float64, shape (rows, n or a little more:
+    see :func:`info_width`)."""
 
 
 class ObservationScales(NamedTuple):

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from cz_gym.body.plant import Disturbance, Inputs, Puller, State, growth, hidden_load, rk4
+from cz_gym.body.schedule import drift, melt_left, reference
+from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT, within_limits
 from cz_gym.episodes.noise import fluctuation, next_fluctuation
 from cz_gym.episodes.record import GRID
-from cz_gym.episodes.schedule import drift, melt_left, reference
 from cz_gym.jit.compile import column, inlined, jittable, scratch, set_column
-from cz_gym.physics.plant import Disturbance, Inputs, Puller, State, growth, hidden_load, rk4
-from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT, within_limits
-from cz_gym.units import MM
+from cz_gym.support.units import MM
 
 from .layout import PULLER_AT, STATE_AT
 from .sensors import photograph

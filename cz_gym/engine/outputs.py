@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from cz_gym.body.signals import MEASURED, Measured
 from cz_gym.jit.compile import jittable, scratch
 from cz_gym.observation import CLIP, INTEGRAL_SCALE, LAGGED, PAST_SCALES, RELATIVE
-from cz_gym.signals import MEASURED, Measured
 
 _M, _L = len(MEASURED), len(LAGGED)
 _REMEMBERED = tuple(Measured._fields.index(name) for name in LAGGED)

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from cz_gym.body.schedule import bias_offset, pyrometer_drift, ripple
 from cz_gym.episodes.record import FREEZES
-from cz_gym.episodes.schedule import bias_offset, pyrometer_drift, ripple
 from cz_gym.jit.compile import jittable
 
 _EPS = 1e-9

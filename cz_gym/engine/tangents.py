@@ -10,13 +10,13 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
-from cz_gym.cost import Cost, cost_slopes
+from cz_gym.body.cost import Cost, cost_slopes
+from cz_gym.body.plant import Disturbance, Inputs, State, along, rates, rk4
+from cz_gym.body.schedule import bias_offset, melt_left, reference
 from cz_gym.episodes.record import GRID
-from cz_gym.episodes.schedule import bias_offset, melt_left, reference
 from cz_gym.jit.cache import hashed
 from cz_gym.jit.compile import force_inlined, jittable, kernel
 from cz_gym.physics.meniscus import MeniscusModel
-from cz_gym.physics.plant import Disturbance, Inputs, State, along, rates, rk4
 
 from .kernels import next_power, next_speed
 from .lockstep import height_inside
@@ -97,7 +97,7 @@ def _stage(work: Any, weight: Any, ahead: Any, x: Any, u: Any, d: Any, p: Any, s
 
 @jittable
 def rk4_by(work: Any, x: Any, u: Any, d: Any, p: Any, dt: Any, slope: Any) -> None:
-    """Derivatives of :func:`cz_gym.physics.plant.rk4` by state and inputs, into ``work[3]``, shape (5, 7)."""
+    """Derivatives of :func:`cz_gym.body.plant.rk4` by state and inputs, into ``work[3]``, shape (5, 7)."""
     for i in range(_X):
         for j in range(_X + _INPUTS):
             work[1, i, j], work[3, i, j] = 0.0, 1.0 if i == j else 0.0

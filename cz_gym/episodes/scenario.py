@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cz_gym.errors import CzError
-from cz_gym.plausible import (
+from cz_gym.support.plausible import (
     IN_K_PER_MIN,
     IN_MM,
     IN_MM_PER_MIN,
@@ -27,7 +27,7 @@ from cz_gym.plausible import (
     Slip,
     check_plausible,
 )
-from cz_gym.units import HOUR, MM
+from cz_gym.support.units import HOUR, MM
 
 Range = tuple[float, float]
 NONE: Range = (0.0, 0.0)

@@ -7,8 +7,8 @@ from dataclasses import replace
 from numbers import Real
 
 from cz_gym.errors import CzError
-from cz_gym.names import unknown
-from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
+from cz_gym.support.names import unknown
+from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 from .mixture import AnyScenario, Distribution, Mixture, make_mixture
 from .scenario import Actuators, Drift, Faults, Interface, Pullers, Recipe, Reference, Scenario, Sensor

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cz_gym.atomic_files import write_files
-from cz_gym.names import needs
-from cz_gym.units import MM
+from cz_gym.support.atomic_files import write_files
+from cz_gym.support.names import needs
+from cz_gym.support.units import MM
 
 from .rollout import Rollout
 

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.atomic_files import check_writable, naming, write_files
 from cz_gym.errors import CzError
+from cz_gym.support.atomic_files import check_writable, naming, write_files
 
 from .metrics import metric_names
 from .protocol import contract_hash

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.cost import cost_terms
-from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
+from cz_gym.body.cost import cost_terms
+from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from .rollout import Rollout
 

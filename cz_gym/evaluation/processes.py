@@ -13,7 +13,7 @@ from threading import Thread
 from typing import Any
 
 from cz_gym.errors import CzError
-from cz_gym.processors import processors
+from cz_gym.support.processors import processors
 
 WAIT = 1.0
 """Longest time between two calls of :data:`Look` [s]."""

@@ -10,11 +10,11 @@ from cz_gym.config import Config, make_config
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import ALIASES, find_scenario
 from cz_gym.errors import CzError
-from cz_gym.names import unknown
+from cz_gym.machine.puller import DEFAULT, PullerFile
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
-from cz_gym.puller import DEFAULT, PullerFile
-from cz_gym.units import MM, MM_PER_MIN
+from cz_gym.support.names import unknown
+from cz_gym.support.units import MM, MM_PER_MIN
 
 TRAINING_SEEDS = range(1_000_000)
 """Seeds of the episodes that controllers are tuned and agents are trained on."""

@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 
-from cz_gym.contender import Contender
+from cz_gym.evaluation.contender import Contender
 
 from .metrics import metric_names, metrics
 from .protocol import Row

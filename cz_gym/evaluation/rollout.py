@@ -15,7 +15,7 @@ import numpy.typing as npt
 from cz_gym.action import mismatch
 from cz_gym.config import Config, check_config
 from cz_gym.errors import CzError
-from cz_gym.units import MICRO
+from cz_gym.support.units import MICRO
 from cz_gym.vector import CzVectorEnv
 
 Floats = npt.NDArray[np.float64]

@@ -7,9 +7,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cz_gym.contender import Contender
 from cz_gym.errors import CzError
-from cz_gym.processors import processors
+from cz_gym.evaluation.contender import Contender
+from cz_gym.support.processors import processors
 
 from .cache import SlowEpisodes, earlier_bound
 from .processes import in_processes

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from cz_gym.config import Config
-from cz_gym.contender import Contender
 from cz_gym.episodes.mixture import Distribution
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import SCENARIOS, find_distribution
 from cz_gym.errors import CzError
-from cz_gym.names import unknown
+from cz_gym.evaluation.contender import Contender
+from cz_gym.support.names import unknown
 
 from .protocol import Row
 

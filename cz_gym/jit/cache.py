@@ -24,15 +24,17 @@ import numba
 import numpy as np
 from numba.core import caching, serialize
 
-from cz_gym.atomic_files import write_files
 from cz_gym.errors import CzError
+from cz_gym.support.atomic_files import write_files
 
 from .code_hash import hash_files
 
 PACKAGE = Path(__file__).parents[1]
 CACHE_VARIABLE = "CZ_GYM_CACHE_DIR"
 """Environment variable naming the folder for compiled code; empty means: keep none."""
-NEVER_COMPILED = ("agents", "baselines", "evaluation", "export", "play.py", "pullers", "serve", "testing")
+NEVER_COMPILED = (
+    "agents", "baselines", "evaluation", "machine/export", "machine/pullers", "machine/serve", "play.py", "testing",
+)  # fmt: skip
 """Parts of the package of which nothing is compiled in; all others count, whatever they hold."""
 FunctionCache: Any = caching.FunctionCache
 dumps: Any = serialize.dumps
@@ -42,7 +44,8 @@ def compiled_sources(folder: Path | None = None) -> list[Path]:
     """Every file of the package that compiled code may have taken a function or a constant from, sorted."""
     folder = folder or PACKAGE
     files = (file for kind in ("*.py", "*.json") for file in folder.rglob(kind))
-    return sorted(file for file in files if file.relative_to(folder).parts[0] not in NEVER_COMPILED)
+    apart = [folder / part for part in NEVER_COMPILED]
+    return sorted(file for file in files if not any(file.is_relative_to(part) for part in apart))
 
 
 def source_hash(folder: Path | None = None) -> str:

@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.body.plant import NO_DISTURBANCE, Disturbance, Inputs, Puller, State, growth, rates
+
 from .meniscus import HURLE, MeniscusModel
-from .plant import NO_DISTURBANCE, Disturbance, Inputs, Puller, State, growth, rates
 
 Floats = npt.NDArray[np.float64]
 STATES = State._fields

@@ -7,7 +7,7 @@ from numbers import Real
 from typing import Annotated, Any, NamedTuple, get_type_hints
 
 from cz_gym.errors import CzError
-from cz_gym.plausible import (
+from cz_gym.support.plausible import (
     IN_CELSIUS,
     IN_DEGREES,
     IN_KILO,
@@ -18,7 +18,7 @@ from cz_gym.plausible import (
     Slip,
     check_plausible,
 )
-from cz_gym.units import MM, MM_PER_MIN
+from cz_gym.support.units import MM, MM_PER_MIN
 
 
 class Quantity(NamedTuple):
@@ -45,7 +45,7 @@ class Parameters(NamedTuple):
     """The parameters of a puller and its material; SI units, kelvin, radians.
 
     Nominal temperatures, power, meniscus height and heat fluxes are *derived* from these by
-    :func:`cz_gym.physics.plant.make_puller`. Another puller or material is another instance:
+    :func:`cz_gym.body.plant.make_puller`. Another puller or material is another instance:
     ``Parameters(r_0=0.1)`` or ``Parameters()._replace(sigma=0.83)``.
     """
 

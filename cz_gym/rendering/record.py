@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.body.plant import Puller
+from cz_gym.body.signals import INFO
+from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
 from cz_gym.config import Config
-from cz_gym.physics.plant import Puller
-from cz_gym.signals import INFO
-from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
 
 Floats = npt.NDArray[np.float64]
 _COLUMN = {name: column for column, name in enumerate((*INFO, "valid"))}
@@ -41,7 +41,7 @@ class Record:
         return self._count
 
     def add(self, info: Floats, valid: float, terminated: bool = False, truncated: bool = False) -> None:
-        """Add a sample: the row of info (:data:`cz_gym.signals.INFO`), and 1 if the camera's reading is valid."""
+        """Add a sample: the row of info (:data:`cz_gym.body.signals.INFO`), and 1 if the camera's reading is valid."""
         row = self._samples[self._count]
         row[:-1], row[-1] = info, valid
         self._count += 1

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
+from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 from . import palette, triple_point
 from .canvas import Box, Canvas, Frame, first_at_least

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cz_gym.body.plant import Puller
+from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
 from cz_gym.physics.meniscus import MeniscusModel, profile, profile_scale
-from cz_gym.physics.plant import Puller
-from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
-from cz_gym.units import MM
+from cz_gym.support.units import MM
 
 from . import palette
 from .canvas import Box, Canvas, first_at_least

@@ -11,7 +11,7 @@ from gymnasium.error import DependencyNotInstalled, Error, ResetNeeded
 
 from cz_gym.config import Config
 from cz_gym.errors import CzError
-from cz_gym.names import unknown
+from cz_gym.support.names import unknown
 
 from .canvas import MISSING, Frame, available, load
 from .record import Record

@@ -20,10 +20,10 @@ from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space, iterate
 
-from cz_gym.commands import OneLineParser
 from cz_gym.episodes import scenarios
 from cz_gym.errors import CzError
 from cz_gym.observation import CAMERA, OBSERVATIONS
+from cz_gym.support.command_line import OneLineParser
 
 from .driver import Checked, Driver, MakeScalar, MakeVector, NotConforming
 from .nested_arrays import KEEPERS, difference, flatten, keep, overwrite

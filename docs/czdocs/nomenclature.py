@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cz_gym import Parameters, Puller, State
+from cz_gym.body.plant import Disturbance, Inputs
+from cz_gym.body.signals import INFO_ROWS
 from cz_gym.physics.parameters import describe
-from cz_gym.physics.plant import Disturbance, Inputs
-from cz_gym.signals import INFO_ROWS
 
 from .attributes import attributes
 

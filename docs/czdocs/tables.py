@@ -16,14 +16,14 @@ from pathlib import Path
 from typing import Any
 
 from cz_gym import SCENARIOS, Scenario
+from cz_gym.body.signals import INFO_ROWS, PULL_SCALE
 from cz_gym.camera.view import Camera
 from cz_gym.episodes.scenarios import RANDOMIZED
+from cz_gym.machine.puller import DEFAULT, KEYS, PullerFile, value_of
+from cz_gym.machine.serve.machine import TAGS
 from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED, STATE, Channel
 from cz_gym.physics.parameters import Parameters, describe
-from cz_gym.puller import DEFAULT, KEYS, PullerFile, value_of
-from cz_gym.serve.machine import TAGS
-from cz_gym.signals import INFO_ROWS, PULL_SCALE
-from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
+from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from . import nomenclature
 from .attributes import attributes

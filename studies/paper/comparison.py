@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from cz_gym.evaluation.report.tables import markdown as table
 from cz_gym.physics.linearisation import RadiusModel
-from cz_gym.units import HOUR, MM
+from cz_gym.support.units import HOUR, MM
 
 from . import experiments as ex
 from .experiments import COMPENSATOR, CROSSOVER, ODE, PHASE_MARGIN_DEG, PUBLISHED, ZERO

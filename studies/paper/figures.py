@@ -13,7 +13,7 @@ from cz_gym import make_puller
 from cz_gym.baselines.analysis.compensator_design import open_loop
 from cz_gym.evaluation.report.canvas import GREY, canvas
 from cz_gym.physics.linearisation import Floats
-from cz_gym.units import MINUTE, MM, MM_PER_MIN
+from cz_gym.support.units import MINUTE, MM, MM_PER_MIN
 
 from . import experiments as ex
 from .experiments import PID, Trace

@@ -23,8 +23,8 @@ from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.puller import find_puller, write_puller
-from cz_gym.units import HOUR
+from cz_gym.machine.puller import find_puller, write_puller
+from cz_gym.support.units import HOUR
 from tests.observed import PLAIN
 
 WIDE = make_config(puller="silicon-300mm", **PLAIN)

@@ -12,12 +12,12 @@ from cz_gym.baselines.lqg.controller import LQG, LQGDesign
 from cz_gym.baselines.lqg.model import DRIFT, HEATER, PLANT, STATES
 from cz_gym.baselines.mpc import EkfMpc, best_corrections, expected_disturbances, held, newton, predict_under_law
 from cz_gym.baselines.registry import find_controller
+from cz_gym.body.plant import Disturbance, Inputs, State, hidden_load, rk4
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.physics.plant import Disturbance, Inputs, State, hidden_load, rk4
-from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
+from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 from tests.observed import PLAIN, Watched
 
 LINEAR = LQGDesign(nonlinear=False)

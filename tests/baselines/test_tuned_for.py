@@ -13,7 +13,7 @@ from cz_gym.baselines.tuning.search import value_at
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Sensor
 from cz_gym.episodes.scenarios import HARD, PULLER, RANDOMIZED, SCENARIOS, SENSOR_FAULT
-from cz_gym.units import MINUTE, MM
+from cz_gym.support.units import MINUTE, MM
 from tests.observed import PLAIN
 
 NAMES = [scenario.name for scenario in TUNED]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cz_gym import CzEnv, make_puller
-from cz_gym.signals import INFO
+from cz_gym.body.signals import INFO
 
 P = make_puller()
 

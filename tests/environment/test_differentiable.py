@@ -7,6 +7,8 @@ import pytest
 from gymnasium.error import InvalidAction, ResetNeeded
 
 from cz_gym import CzVectorEnv
+from cz_gym.body.plant import Disturbance, Inputs, State, make_puller, rk4
+from cz_gym.body.task import ACTIONS
 from cz_gym.config import make_config
 from cz_gym.differentiable import STATES, DifferentiableBatch
 from cz_gym.engine.tangents import ROWS, SCRATCH, rk4_by
@@ -14,9 +16,7 @@ from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.observation import MEASURED
 from cz_gym.physics.linearisation import jacobian
 from cz_gym.physics.meniscus import hurle_slope
-from cz_gym.physics.plant import Disturbance, Inputs, State, make_puller, rk4
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
-from cz_gym.task import ACTIONS
 from tests.observed import PLAIN
 
 STEPS = {"r_c": 1e-7, "h_c": 1e-7, "T_1": 1.0, "T_2": 1.0, "T_b": 1e-2, "v_p": 1e-9, "Q_H": 100.0, "a": 1e-3}

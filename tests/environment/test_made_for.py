@@ -6,8 +6,8 @@ from gymnasium.error import InvalidAction
 
 from cz_gym import CzEnv, CzVectorEnv, Parameters
 from cz_gym.action import mark
+from cz_gym.body.cost import PULL_BAND, Weights, coefficients, cost_slopes, cost_terms
 from cz_gym.config import make_config
-from cz_gym.cost import PULL_BAND, Weights, coefficients, cost_slopes, cost_terms
 from cz_gym.differentiable import DifferentiableBatch
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from tests.observed import PLAIN

@@ -13,8 +13,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv
 from cz_gym.agents import OnnxPolicy
+from cz_gym.agents.asymmetric import AsymmetricPolicy, AsymmetricSACPolicy, LearnState
 from cz_gym.agents.from_sb3 import save_agent
-from cz_gym.asymmetric import AsymmetricPolicy, AsymmetricSACPolicy, LearnState
 from cz_gym.sb3 import make_vec_env
 
 N = 3

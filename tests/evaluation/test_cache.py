@@ -15,9 +15,9 @@ import cz_gym.agents
 from cz_gym.baselines import OpenLoop, registry
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
 from cz_gym.config import make_config
-from cz_gym.contender import Contender
 from cz_gym.evaluation import cache, runner
 from cz_gym.evaluation.cache import code_behind, sources_behind
+from cz_gym.evaluation.contender import Contender
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.protocol import Row
 from cz_gym.evaluation.results import Sample

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import benchmark
-from cz_gym.atomic_files import write_files
 from cz_gym.baselines import CompensatedPID
 from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config
@@ -22,6 +21,7 @@ from cz_gym.evaluation.report.markdown import markdown
 from cz_gym.evaluation.results import Sample, summarise
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.evaluation.statistics import Resamples, optimality_gap
+from cz_gym.support.atomic_files import write_files
 from tests.observed import PLAIN
 from tests.samples import contender
 

@@ -8,11 +8,11 @@ import pytest
 
 from cz_gym.config import make_config
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.export.__main__ import make_block
-from cz_gym.export.policy import BlockPolicy
-from cz_gym.units import KILO, MM, MM_PER_MIN
+from cz_gym.machine.export.__main__ import make_block
+from cz_gym.machine.export.policy import BlockPolicy
+from cz_gym.support.units import KILO, MM, MM_PER_MIN
 from examples import opcua_controller
-from tests.serve.conftest import PASSWORD, running
+from tests.machine.serve.conftest import PASSWORD, running
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="cc is not installed: no C can be compiled")
 

@@ -79,7 +79,7 @@ def test_code_for_other_types_is_not_used_and_a_full_disk_keeps_nothing(tmp_path
     def full(*arguments):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("cz_gym.atomic_files.os.replace", full)
+    monkeypatch.setattr("cz_gym.support.atomic_files.os.replace", full)
     store.save("floats", 1)
     assert store.load("floats") is None
     assert list(tmp_path.iterdir()) == [store.path("integers")]

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from cz_gym import make_puller
+from cz_gym.body.plant import NO_DISTURBANCE, Inputs, State, rates
 from cz_gym.physics.linearisation import linearise, radius_model
 from cz_gym.physics.meniscus import HURLE
-from cz_gym.physics.plant import NO_DISTURBANCE, Inputs, State, rates
-from cz_gym.units import MM
+from cz_gym.support.units import MM
 
 
 @pytest.mark.parametrize(("lam", "second_pole"), [(1.0, -1.684e-3), (0.0, 0.0)])

@@ -12,10 +12,10 @@ from scipy.optimize import newton
 from scipy.special import k0e, k1e
 
 from cz_gym import Parameters, make_puller
+from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
 from cz_gym.physics.linearisation import radius_model
 from cz_gym.physics.meniscus import HURLE, profile, ring_point
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
-from cz_gym.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
 
 PULLER = make_puller()
 A, R_0, ALPHA_0, PHI_B = PULLER.a, PULLER.r_0, math.radians(11.0), math.radians(3.5)

@@ -11,7 +11,7 @@ from cz_gym.rendering import palette, scene, triple_point
 from cz_gym.rendering.canvas import Canvas
 from cz_gym.rendering.record import Ending
 from cz_gym.rendering.scene import layout
-from cz_gym.units import MM
+from cz_gym.support.units import MM
 
 pygame = pytest.importorskip("pygame")
 CANVAS = Canvas(640, 480)

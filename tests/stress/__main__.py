@@ -12,7 +12,7 @@ from dataclasses import replace
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Interface
 from cz_gym.episodes.scenarios import HARD, PULLER, SCENARIOS
-from cz_gym.units import MM
+from cz_gym.support.units import MM
 from cz_gym.vector import CzVectorEnv
 
 from .adversaries import KINDS, Adversaries

@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.cost import Cost
-from cz_gym.episodes.schedule import melt_left
+from cz_gym.body.cost import Cost
+from cz_gym.body.plant import fourth_power
+from cz_gym.body.schedule import melt_left
+from cz_gym.body.signals import INFO
+from cz_gym.body.task import HEATER_RANGE, HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT
 from cz_gym.observation import CLIP
-from cz_gym.physics.plant import fourth_power
-from cz_gym.signals import INFO
-from cz_gym.task import HEATER_RANGE, HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT
 
 Array = npt.NDArray[Any]
 COLDEST, HOTTEST = 1000.0, 2600.0

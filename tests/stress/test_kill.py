@@ -20,8 +20,8 @@ from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.training import run, validation
 from cz_gym.agents.training.checkpoint import load_checkpoint
 from cz_gym.agents.training.recipes import RECIPES
-from cz_gym.atomic_files import write_files
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from cz_gym.support.atomic_files import write_files
 from tests.small_learners import QUICK
 
 FRESH = multiprocessing.get_context("forkserver")

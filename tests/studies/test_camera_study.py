@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from cz_gym.units import MM
+from cz_gym.support.units import MM
 from studies import camera as study
 
 

@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 
 from cz_gym.evaluation.results import Result, Sample
 from cz_gym.evaluation.rollout import Floats, Signals
-from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
+from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from .canvas import COLUMNS, GREY, INK, canvas, chosen, png, styles_of
 

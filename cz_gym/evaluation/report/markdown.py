@@ -10,8 +10,8 @@ import numpy as np
 
 from cz_gym.evaluation.protocol import contract_hash
 from cz_gym.evaluation.results import BOUND, REFERENCE, SPEED, Result, Sample, common
-from cz_gym.puller import DEFAULT
-from cz_gym.units import HOUR, PERCENT
+from cz_gym.machine.puller import DEFAULT
+from cz_gym.support.units import HOUR, PERCENT
 
 from .canvas import COLUMNS, chosen
 from .tables import (

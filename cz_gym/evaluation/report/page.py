@@ -16,7 +16,7 @@ from plotly.graph_objects import Figure
 from plotly.offline import get_plotlyjs
 
 from cz_gym.evaluation.results import Result
-from cz_gym.units import HOUR
+from cz_gym.support.units import HOUR
 
 from . import tables
 from .markdown import measured_from

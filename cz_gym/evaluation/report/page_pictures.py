@@ -20,7 +20,7 @@ from cz_gym.evaluation.protocol import Row
 from cz_gym.evaluation.results import Result
 from cz_gym.evaluation.rollout import Floats, Signals
 from cz_gym.evaluation.statistics import Estimate
-from cz_gym.units import KILO, MINUTE, MM, MM_PER_MIN
+from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from .canvas import COLUMNS, GREY, INK, MARKERS, Style, chosen, styles_of
 from .crystal import example, lost

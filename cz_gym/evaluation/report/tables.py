@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from cz_gym.evaluation.results import REFERENCE, SPEED, Estimates, Result, Sample
 from cz_gym.evaluation.statistics import Estimate
-from cz_gym.units import PERCENT
+from cz_gym.support.units import PERCENT
 
 NOTHING = "-"
 FEWEST = 20

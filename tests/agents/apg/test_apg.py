@@ -7,8 +7,8 @@ from stable_baselines3.common.env_util import make_vec_env as scalar_environment
 
 from cz_gym.agents.apg import APG
 from cz_gym.agents.apg.plant_step import StepCost, advance
+from cz_gym.body.cost import SCALES, WEIGHTS, saturated
 from cz_gym.config import make_config
-from cz_gym.cost import SCALES, WEIGHTS, saturated
 from cz_gym.differentiable import STATES, DifferentiableBatch
 from cz_gym.errors import CzError
 from cz_gym.sb3 import make_vec_env

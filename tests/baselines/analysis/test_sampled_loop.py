@@ -24,7 +24,7 @@ from cz_gym.evaluation.rollout import rollout
 from cz_gym.observation import MEASURED, Measured
 from cz_gym.physics.linearisation import StateSpace, radius_model
 from cz_gym.physics.parameters import Parameters
-from cz_gym.units import MM
+from cz_gym.support.units import MM
 from tests.observed import PLAIN
 
 PAPER = CompensatedPID()

@@ -11,16 +11,16 @@ from cz_gym.baselines.bounds import trajectory
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
 from cz_gym.baselines.bounds.future import future_of
 from cz_gym.baselines.bounds.trajectory import Limits, limits_of, optimise
+from cz_gym.body.cost import cost_terms
+from cz_gym.body.plant import Inputs, State
 from cz_gym.config import make_config
-from cz_gym.cost import cost_terms
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.episodes.scenarios import HARD, RANDOMIZED
 from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.replay import Playback
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.physics.plant import Inputs, State
-from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
+from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 from cz_gym.vector import CzVectorEnv
 
 SEEDS = (1_000_000, 1_000_001, 1_000_002)

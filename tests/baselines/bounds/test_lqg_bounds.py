@@ -14,7 +14,7 @@ from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.units import HOUR
+from cz_gym.support.units import HOUR
 from tests.observed import PLAIN, observations
 
 PULLER = make_puller(lam=0.5)

@@ -17,7 +17,7 @@ from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Interface
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.observation import decode
-from cz_gym.units import HOUR, MM
+from cz_gym.support.units import HOUR, MM
 from tests.observed import PLAIN, Watched, measured
 
 

@@ -13,8 +13,8 @@ from cz_gym import make_puller
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign, solve
 from cz_gym.baselines.lqg.model import PLANT, STATES, NoiseModel
 from cz_gym.baselines.lqg.ring_model import RingModel
-from cz_gym.cost import cost_terms
-from cz_gym.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
+from cz_gym.body.cost import cost_terms
+from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 from tests.observed import measured
 
 PULLER = make_puller(lam=0.5)

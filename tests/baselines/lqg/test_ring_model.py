@@ -17,7 +17,7 @@ from cz_gym.episodes.scenarios import PULLER as PULLER_SCENARIO
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.units import MINUTE, MM
+from cz_gym.support.units import MINUTE, MM
 from tests.observed import PLAIN
 
 PULLER = make_puller(lam=0.5)

@@ -7,7 +7,7 @@ import pytest
 
 from cz_gym.baselines.pid.industrial import Industrial
 from cz_gym.observation import PULL_SCALE
-from cz_gym.units import MM, MM_PER_MIN
+from cz_gym.support.units import MM, MM_PER_MIN
 from tests.observed import measured, pulls
 
 

@@ -18,7 +18,7 @@ from cz_gym.baselines.tuning.search import Figures, Parameter, Search, measure, 
 from cz_gym.config import make_config
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
-from cz_gym.puller import FOLDER
+from cz_gym.machine.puller import FOLDER
 from tests.observed import PLAIN
 
 FIGURES = Figures(0.06, 0.01, 0.02, 1900.0, 0.0, 2160)

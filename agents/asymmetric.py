@@ -1,0 +1,174 @@
+"""Policies of stable-baselines3 that are told the plant's true state while they learn; what they act on is sensors.
+
+For a :class:`cz_gym.sb3.CzVecEnv` with ``critic_state``. Critics read the state. The actor of :class:`AsymmetricPolicy`
+(PPO, A2C) reads an estimate of it, which the callback :class:`LearnState` fits by regression:
+``PPO(AsymmetricPolicy, make_vec_env(1024, critic_state=True)).learn(steps, LearnState())``. ``predict`` takes the
+observations of the environment as it is. Needs stable-baselines3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, MlpExtractor, create_mlp
+from stable_baselines3.sac.policies import SACPolicy
+from torch import nn
+from torch.nn.functional import huber_loss
+
+from cz_gym.body.signals import MEASURED, STATE, Channel, Measured
+from cz_gym.errors import CzError
+from cz_gym.observation import HISTORY
+from cz_gym.support.names import needs
+
+PRESENT = len(MEASURED) + 1
+"""Number of channels of "history" that show the present; the last one is the integral of the ring error."""
+GAINS = {
+    "ring_error": 8.0, "integral": 4.0, "v_p": 8.0, "Q_H": 8.0, "r_c_error": 8.0, "h_c": 8.0, "T_b": 8.0, "dT_i": 2.0,
+    "ring_offset": 8.0, "lam": 4.0,
+}  # fmt: skip
+"""Factors that bring channels that vary little while a crystal is held to the order of 1; the others need none."""
+UNKNOWN = [i for i, each in enumerate(STATE) if each.name not in Measured._fields or each.name == "T_1"]
+"""Places in the true state of what no sensor shows without error."""
+
+
+class Asymmetric(BasePolicy):
+    """A policy whose critic reads the plant's true state behind the channels of "history"."""
+
+    channels = len(HISTORY)
+    """Number of channels that the actor reads."""
+
+    def __init__(self, observation_space: Any, *others: Any, **named: Any) -> None:
+        if observation_space.shape != (len(HISTORY) + len(STATE),):
+            raise CzError("this policy is told the true state: make_vec_env(..., critic_state=True)")
+        super().__init__(observation_space, *others, **named)
+
+    def predict(self, observation: Any, *others: Any, **named: Any) -> Any:
+        """As stable-baselines3's; the true state may be missing from the observation."""
+        missing = self.channels + len(STATE) - observation.shape[-1]
+        padding = ((0, 0),) * (observation.ndim - 1) + ((0, missing),)
+        return super().predict(np.pad(observation, padding), *others, **named)
+
+
+class AsymmetricPolicy(Asymmetric, ActorCriticPolicy):
+    """The policy of stable-baselines3's PPO and A2C whose critic is told the true state, and whose actor estimates it.
+
+    Give ``learn`` the callback :class:`LearnState`: without it the actor's :class:`StateEstimator` stays random.
+    """
+
+    def _build_mlp_extractor(self) -> None:
+        self.share_features_extractor = False
+        self.pi_features_extractor = self.features_extractor = StateEstimator(self.observation_space)
+        self.vf_features_extractor = StateSight(self.observation_space)
+        self.mlp_extractor, critic = (
+            MlpExtractor(each.features_dim, self.net_arch, self.activation_fn, self.device)
+            for each in (self.pi_features_extractor, self.vf_features_extractor)
+        )
+        self.mlp_extractor.value_net = critic.value_net
+
+
+class AsymmetricSACPolicy(Asymmetric, SACPolicy):
+    """The policy of stable-baselines3's SAC with critics that are told the true state; its actor has no estimate."""
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
+        """The actor, on the channels of the observation alone."""
+        return super().make_actor(_Sensors(self.observation_space))
+
+
+class _Sensors(FlattenExtractor):
+    def __init__(self, space: Any) -> None:
+        super().__init__(space)
+        self._features_dim = len(HISTORY)
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        return super().forward(observations)[:, : len(HISTORY)]
+
+
+def _gains(channels: Sequence[Channel]) -> torch.Tensor:
+    return torch.tensor([GAINS.get(each.name, 1.0) for each in channels])
+
+
+class StateEstimator(BaseFeaturesExtractor):
+    """Features of an actor: what the sensors show now, and the unknown part of the state as estimated from the past.
+
+    The estimate is a network's, two layers of 128 units on the channels of "history". :class:`LearnState` fits it: the
+    reward does not change it.
+    """
+
+    gains: torch.Tensor
+    state_gains: torch.Tensor
+
+    def __init__(self, space: Any) -> None:
+        super().__init__(space, PRESENT + len(UNKNOWN))
+        self.register_buffer("gains", _gains(HISTORY), persistent=False)
+        self.register_buffer("state_gains", _gains(STATE)[UNKNOWN], persistent=False)
+        self.estimate = nn.Sequential(*create_mlp(len(HISTORY), len(UNKNOWN), [128, 128]))
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """Shape (n, at least the channels of "history") to (n, features)."""
+        seen = observations[:, : len(HISTORY)] * self.gains
+        return torch.cat([seen[:, :PRESENT], self.estimate(seen).detach()], dim=1)
+
+    def loss(self, observations: torch.Tensor) -> torch.Tensor:
+        """Huber's loss of the estimate; the true state follows the channels of "history"."""
+        seen, state = observations[:, : len(HISTORY)], observations[:, len(HISTORY) :]
+        return huber_loss(self.estimate(seen * self.gains), state[:, UNKNOWN] * self.state_gains)
+
+
+class StateSight(BaseFeaturesExtractor):
+    """Features of a critic: "history", the true state, and its products.
+
+    With a linear plant and a quadratic cost the value is quadratic in the state.
+    """
+
+    gains: torch.Tensor
+    pairs: torch.Tensor
+
+    def __init__(self, space: Any) -> None:
+        pairs = torch.triu_indices(len(STATE), len(STATE))
+        super().__init__(space, len(HISTORY) + len(STATE) + pairs.shape[1])
+        self.register_buffer("gains", _gains([*HISTORY, *STATE]), persistent=False)
+        self.register_buffer("pairs", pairs, persistent=False)
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """Shape (n, channels of "history" and of the state) to (n, features)."""
+        seen = observations * self.gains
+        state = seen[:, len(HISTORY) :].clamp(-4.0, 4.0)
+        return torch.cat([seen, 0.5 * state[:, self.pairs[0]] * state[:, self.pairs[1]]], dim=1)
+
+
+class LearnState(BaseCallback):
+    """Fits the :class:`StateEstimator` of an :class:`AsymmetricPolicy` while it learns.
+
+    After each update, it goes once through the last rollout in batches of 512, at the algorithm's learning rate. Not
+    before the update: it must meet the actor that acted.
+    """
+
+    seen: torch.Tensor | None = None
+
+    def _init_callback(self) -> None:
+        policy = needs(AsymmetricPolicy, self.model.policy, "LearnState fits the estimate of that policy alone")
+        self.estimator: StateEstimator = policy.pi_features_extractor
+        self.optimizer = torch.optim.Adam(self.estimator.estimate.parameters())
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        model: Any = self.model
+        self.seen = torch.as_tensor(model.rollout_buffer.observations, device=model.device).flatten(0, 1)
+
+    def _on_rollout_start(self) -> None:
+        if self.seen is None:
+            return
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.model.lr_schedule(self.model._current_progress_remaining)
+        for batch in torch.split(self.seen[torch.randperm(len(self.seen))], 512):
+            loss: Any = self.estimator.loss(batch)
+            self.optimizer.zero_grad()
+            loss.backward()
+            self.optimizer.step()

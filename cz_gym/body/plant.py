@@ -1,0 +1,265 @@
+"""The plant: states, inputs, disturbances, the derived operating point and the rates of change.
+
+Everything here is a pure function of labelled tuples in SI units, kelvin and radians. ``p`` is a
+:class:`Puller`, or a NumPy record with the same field names (what the compiled loop holds per slot); fields
+may be floats, arrays or complex numbers. The thermal chain drives growth one way: the interface's heat draw
+Q_i stays at its nominal value, whatever the crystal does.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cz_gym.errors import CzError
+from cz_gym.jit.compile import force_inlined, jittable
+from cz_gym.physics.meniscus import HURLE, MeniscusModel, ring_point
+from cz_gym.physics.parameters import Parameters, check_parameters
+
+
+class State(NamedTuple):
+    """Plant state x."""
+
+    r_c: Any
+    """Crystal radius [m]."""
+    h_c: Any
+    """Meniscus height [m]."""
+    T_1: Any
+    """Heater (pyrometer) temperature [K]."""
+    T_2: Any
+    """Susceptor and crucible temperature [K]."""
+    T_b: Any
+    """Melt bulk temperature [K]."""
+
+
+class Inputs(NamedTuple):
+    """Inputs u, held over a step."""
+
+    v_p: Any
+    """Pull speed relative to the melt surface [m/s]."""
+    Q_H: Any
+    """Heater power [W]."""
+
+
+class Disturbance(NamedTuple):
+    """Disturbance d, held over a substep."""
+
+    Q_d: Any
+    """Heat load on the melt [W], positive heats."""
+    dT_i: Any
+    """Fluctuation of the temperature that drives the interface flux [K]."""
+    melt: Any
+    """Share of the initial melt heat capacity left [-]."""
+
+
+class Growth(NamedTuple):
+    """Growth at the interface."""
+
+    v_g: Any
+    """Growth rate [m/s]."""
+    tan_alpha: Any
+    """Tangent of the cone angle alpha_c = theta - alpha_0 [-]."""
+
+
+class Puller(NamedTuple):
+    """The constants of one puller: the parameters in the rates, and those that follow from its operating point."""
+
+    lam: float
+    """Share of conduction in the interface flux [-]: 1 is Model I, 0 is Model II."""
+    a: float
+    """Capillary constant, a^2 = 2 sigma / (rho_l g) [m]."""
+    sin_alpha_0: float
+    """Sine of the contact angle [-]."""
+    cos_alpha_0: float
+    """Cosine of the contact angle [-]."""
+    X_b: float
+    """X(z_b) / M of the bright ring's slope [-]."""
+    k_l: float
+    """Thermal conductivity of the melt [W/m/K]."""
+    rho_dH: float
+    """Latent heat per volume of crystal, rho_s dH [J/m3]."""
+    T_m: float
+    """Melting temperature [K]."""
+    C_1: float
+    """Heat capacity of the heater [J/K]."""
+    C_2: float
+    """Heat capacity of susceptor and crucible [J/K]."""
+    C_b: float
+    """Heat capacity of the melt bulk [J/K]."""
+    kappa_12: float
+    """Radiative link heater to susceptor [W/K4]."""
+    G_1a: float
+    """Insulation loss of the heater [W/K]."""
+    T_a: float
+    """Ambient temperature [K]."""
+    G_2b: float
+    """Conductance of the quartz wall [W/K]."""
+    kappa_b: float
+    """Radiation of the melt surface, eps sigma_SB pi (R_cr^2 - r_0^2) [W/K4]."""
+    T_e: float
+    """Temperature the melt surface sees [K]."""
+    r_0: float
+    """Nominal radius [m]."""
+    v_0: float
+    """Nominal pull speed [m/s]."""
+    h_0: float
+    """Nominal meniscus height, where alpha_c = 0 [m]."""
+    Phi_s: float
+    """Heat flux into the crystal [W/m2]."""
+    Q_i: float
+    """Heat the interface draws from the melt, pi r_0^2 Phi_l0 [W]."""
+    T_1_0: float
+    """Nominal heater temperature [K]."""
+    T_2_0: float
+    """Nominal susceptor temperature [K]."""
+    T_b_0: float
+    """Nominal melt temperature, T_m + dT_0 [K]."""
+    Q_H_0: float
+    """Nominal heater power [W]."""
+    ring_bias: float
+    """The operator's bias: bright ring minus radius at the operating point [m]."""
+
+    @property
+    def state_0(self) -> State:
+        """The operating point's state."""
+        return State(self.r_0, self.h_0, self.T_1_0, self.T_2_0, self.T_b_0)
+
+    @property
+    def inputs_0(self) -> Inputs:
+        """The operating point's inputs."""
+        return Inputs(self.v_0, self.Q_H_0)
+
+
+NO_DISTURBANCE = Disturbance(0.0, 0.0, 1.0)
+NO_OPERATING_POINT = "these parameters have no finite operating point; check temperatures and conductances"
+
+
+class _RingPuller(NamedTuple):
+    """The fields the bright ring needs before the rest of the puller is known."""
+
+    a: Any
+    sin_alpha_0: Any
+    cos_alpha_0: Any
+    X_b: Any
+
+
+@jittable
+def derive_puller(q: Any, lam: Any, height: Any, ring_offset: Any) -> Any:
+    """Solve the operating point in order: h_0, Phi_l0, Phi_s, Q_i, T_2, T_1, Q_H0, ring bias."""
+    a = np.sqrt(2.0 * q.sigma / (q.rho_l * q.g))
+    h_0 = height(q.r_0, q.alpha_0, a)
+    Phi_l_0 = q.k_l * q.dT_0 / h_0
+    rho_dH = q.rho_s * q.dH
+    Phi_s = Phi_l_0 + rho_dH * q.v_0
+    Q_i = math.pi * q.r_0 * q.r_0 * Phi_l_0
+    kappa_b = q.eps * q.sigma_SB * math.pi * (q.R_cr * q.R_cr - q.r_0 * q.r_0)
+    T_b_0 = q.T_m + q.dT_0
+    through = kappa_b * (T_b_0**4 - q.T_e**4) + Q_i
+    T_2_0 = T_b_0 + through / q.G_2b
+    T_1_0 = np.sqrt(np.sqrt(T_2_0**4 + through / q.kappa_12))
+    Q_H_0 = through + q.G_1a * (T_1_0 - q.T_a)
+    ring = _RingPuller(a=a, sin_alpha_0=np.sin(q.alpha_0), cos_alpha_0=np.cos(q.alpha_0), X_b=ring_point(q.phi_b))
+    bias = ring_offset(q.r_0, h_0, ring)
+    return Puller(
+        lam=lam, a=a, sin_alpha_0=ring.sin_alpha_0, cos_alpha_0=ring.cos_alpha_0, X_b=ring.X_b,
+        k_l=q.k_l, rho_dH=rho_dH, T_m=q.T_m, C_1=q.C_1, C_2=q.C_2, C_b=q.C_b,
+        kappa_12=q.kappa_12, G_1a=q.G_1a, T_a=q.T_a, G_2b=q.G_2b, kappa_b=kappa_b, T_e=q.T_e,
+        r_0=q.r_0, v_0=q.v_0, h_0=h_0, Phi_s=Phi_s, Q_i=Q_i,
+        T_1_0=T_1_0, T_2_0=T_2_0, T_b_0=T_b_0, Q_H_0=Q_H_0, ring_bias=bias,
+    )  # fmt: skip
+
+
+def make_puller(parameters: Parameters | None = None, lam: float = 1.0, meniscus: MeniscusModel = HURLE) -> Puller:
+    """The puller of these parameters at its own steady state.
+
+    ``lam`` is the share of conduction [-], 1 for Model I and 0 for Model II. Raises CzError for parameters
+    that are no plausible numbers or have no finite operating point.
+    """
+    if not 0.0 <= lam <= 1.0:
+        raise CzError(f"lam (share of conduction) must lie in [0, 1], not {lam!r}")
+    q = check_parameters(parameters or Parameters())
+    with np.errstate(all="ignore"):
+        puller = derive_puller(q, float(lam), meniscus.height, meniscus.ring_offset)
+    puller = Puller(*map(float, puller))
+    if np.isfinite(puller.a) and not np.all(np.isfinite([puller.h_0, puller.ring_bias])):
+        covers = f" ({meniscus.covers}; a = {puller.a:.4g} m)" if meniscus.covers else ""
+        raise CzError(
+            f"r_0 = {puller.r_0:g} m, alpha_0 or phi_b lies outside the range of the meniscus {meniscus.name!r}{covers}"
+            f": its height is {puller.h_0:.4g} m, its bright ring {puller.ring_bias:.4g} m outside the crystal"
+        )
+    if not np.all(np.isfinite(puller)):
+        raise CzError(NO_OPERATING_POINT)
+    return puller
+
+
+@force_inlined
+def growth(x: Any, d: Any, p: Any, slope: Any) -> Any:
+    """Growth rate from the interface's heat balance, and the cone angle from the meniscus slope."""
+    Phi_l = p.k_l * (x.T_b + d.dT_i - p.T_m) * (p.lam / x.h_c + (1.0 - p.lam) / p.h_0)
+    v_g = (p.Phi_s - Phi_l) / p.rho_dH
+    sin_theta, cos_theta = slope(x.r_c, x.h_c, p)
+    sin_alpha = sin_theta * p.cos_alpha_0 - cos_theta * p.sin_alpha_0
+    cos_alpha = cos_theta * p.cos_alpha_0 + sin_theta * p.sin_alpha_0
+    return Growth(v_g, sin_alpha / cos_alpha)
+
+
+@jittable
+def fourth_power(T: Any) -> Any:
+    """T^4, as two squarings."""
+    square = T * T
+    return square * square
+
+
+@force_inlined
+def rates(x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
+    """Time derivatives of the state [m/s, m/s, K/s, K/s, K/s]; design equations of section 2."""
+    at_interface = growth(x, d, p, slope)
+    radiated = p.kappa_12 * (fourth_power(x.T_1) - fourth_power(x.T_2))
+    into_melt = p.G_2b * (x.T_2 - x.T_b)
+    surface_loss = p.kappa_b * (fourth_power(x.T_b) - fourth_power(p.T_e))
+    return State(
+        at_interface.v_g * at_interface.tan_alpha,
+        u.v_p - at_interface.v_g,
+        (u.Q_H - radiated - p.G_1a * (x.T_1 - p.T_a)) / p.C_1,
+        (radiated - into_melt) / p.C_2,
+        (into_melt - surface_loss - p.Q_i + d.Q_d) / (p.C_b * d.melt),
+    )
+
+
+@jittable
+def along(x: Any, s: Any, k: Any) -> Any:
+    """The state x + s k."""
+    return State(x.r_c + s * k.r_c, x.h_c + s * k.h_c, x.T_1 + s * k.T_1, x.T_2 + s * k.T_2, x.T_b + s * k.T_b)
+
+
+@force_inlined
+def rk4(x: Any, u: Any, d: Any, p: Any, dt: Any, slope: Any) -> Any:
+    """One classical Runge-Kutta step of dt [s], inputs and disturbance held."""
+    k_1 = rates(x, u, d, p, slope)
+    k_2 = rates(along(x, 0.5 * dt, k_1), u, d, p, slope)
+    k_3 = rates(along(x, 0.5 * dt, k_2), u, d, p, slope)
+    k_4 = rates(along(x, dt, k_3), u, d, p, slope)
+    return along(along(along(along(x, dt / 6.0, k_1), dt / 3.0, k_2), dt / 3.0, k_3), dt / 6.0, k_4)
+
+
+@jittable
+def hidden_load(p_drift: Any, p: Any) -> Any:
+    """Heat load Q_d [W] that a recipe shifted by p_drift [K] would exactly cancel (static equivalence).
+
+    Solves kappa_12 ((T_1,0 + p_drift)^4 - T_2^4) = G_2b (T_2 - T_b0) for T_2 by Newton from T_2,0: four steps
+    reach rounding error for |p_drift| up to 100 K. Then Q_d = -G_2b (T_2 - T_2,0).
+    """
+    T_1 = p.T_1_0 + p_drift
+    hot = p.kappa_12 * fourth_power(T_1) + p.G_2b * p.T_b_0
+    T_2 = p.T_2_0 + 0.0 * p_drift
+    for _ in range(4):
+        cube = T_2 * T_2 * T_2
+        excess = p.kappa_12 * cube * T_2 + p.G_2b * T_2 - hot
+        T_2 = T_2 - excess / (4.0 * p.kappa_12 * cube + p.G_2b)
+    return -p.G_2b * (T_2 - p.T_2_0)
+
+
+EQUATIONS = (derive_puller, rates, rk4, hidden_load)
+"""The functions that define the plant, for :attr:`cz_gym.config.Config.plant_hash`."""

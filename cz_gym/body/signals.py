@@ -1,0 +1,212 @@
+"""The table of signals: every number that an observation or ``info`` holds, and the function that computes it.
+
+A signal is a field of :class:`Measured` (readings and recipe), :class:`TrueState` (the plant) or :class:`Logged`
+(``info``); its annotation gives unit, scale and meaning. The function below each class
+computes its fields by name, in SI units. Channels, decoding, ``info`` and the pages' tables all follow from here.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Annotated, Any, NamedTuple, get_type_hints
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.body.schedule import bias_offset, recipe, reference
+from cz_gym.jit.compile import jittable
+from cz_gym.physics.parameters import Parameters
+from cz_gym.support.units import KILO, MINUTE, MM
+
+PREVIEWS = (0.0, 1.0 * MINUTE, 5.0 * MINUTE)
+"""Times ahead for which reference and recipe are observed [s]."""
+_IN_1_MIN, _IN_5_MIN = PREVIEWS[1:]
+PULL_SCALE = Parameters().v_0
+"""Scale of pull speeds for the default puller, its v_0 [m/s]; another puller's are scaled with its own v_0."""
+HEATER_SCALE = 10.0 * KILO
+"""Scale of heater powers for the default puller, its heater's range [W]; another puller's are scaled with its own."""
+TEMPERATURE_SCALE = 5.0
+"""Scale of temperatures [K]."""
+
+
+class Channel(NamedTuple):
+    """One number of an observation or of ``info``."""
+
+    unit: str
+    """SI unit; "1" for none."""
+    scale: float
+    """Observations hold the number divided by this [unit]."""
+    meaning: str
+    """Description for tables."""
+    name: str = ""
+    """The field that it annotates."""
+
+
+class Measured(NamedTuple):
+    """What a puller's control computer knows, in SI units; arrays of the batch's shape where decoded.
+
+    Temperatures, power and pull speed are deviations from the puller's own nominal; radii from r_0.
+    """
+
+    ring_error: Annotated[
+        Any, Channel("m", MM, "camera reading minus bias minus r_ref; the last valid reading while invalid")
+    ]
+    valid: Annotated[Any, Channel("1", 1.0, "1 if the camera says this reading is good, else 0")]
+    r_ref: Annotated[Any, Channel("m", MM, "radius reference minus r_0, now")]
+    r_ref_1min: Annotated[Any, Channel("m", MM, "the same in 1 minute")]
+    r_ref_5min: Annotated[Any, Channel("m", MM, "the same in 5 minutes")]
+    T_1_ref: Annotated[Any, Channel("K", TEMPERATURE_SCALE, "recipe of the heater temperature minus nominal, now")]
+    T_1_ref_1min: Annotated[Any, Channel("K", TEMPERATURE_SCALE, "the same in 1 minute")]
+    T_1_ref_5min: Annotated[Any, Channel("K", TEMPERATURE_SCALE, "the same in 5 minutes")]
+    T_1: Annotated[Any, Channel("K", TEMPERATURE_SCALE, "pyrometer reading minus nominal")]
+    v_p: Annotated[Any, Channel("m/s", PULL_SCALE, "applied pull speed minus v_0; the scale is v_0")]
+    Q_H: Annotated[Any, Channel("W", HEATER_SCALE, "applied heater power minus nominal")]
+
+
+@jittable
+def measure(slot: Any, t: Any) -> Any:
+    """:class:`Measured` of a slot at its sample's time t [s]."""
+    p, e = slot.puller, slot.episode
+    r_ref = reference(t, e)
+    return Measured(
+        ring_error=slot.ring - p.r_0 - r_ref,
+        valid=slot.valid,
+        r_ref=r_ref,
+        r_ref_1min=reference(t + _IN_1_MIN, e),
+        r_ref_5min=reference(t + _IN_5_MIN, e),
+        T_1_ref=recipe(t, e),
+        T_1_ref_1min=recipe(t + _IN_1_MIN, e),
+        T_1_ref_5min=recipe(t + _IN_5_MIN, e),
+        T_1=slot.T_1 - p.T_1_0,
+        v_p=slot.v_p - p.v_0,
+        Q_H=slot.Q_H - p.Q_H_0,
+    )
+
+
+@cache
+def signals(kind: Any) -> dict[str, Channel]:
+    """The channels of :class:`Measured`, :class:`TrueState` or :class:`Logged` by name, in their order."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {name: hints[name].__metadata__[0]._replace(name=name) for name in kind._fields}
+
+
+_SHARED = signals(Measured)
+
+
+class TrueState(NamedTuple):
+    """The true state and the disturbances; deviations, SI units. For bounds and for training; no agent acts on it."""
+
+    r_c_error: Annotated[Any, Channel("m", MM, "true radius minus r_ref")]
+    h_c: Annotated[Any, Channel("m", MM, "true meniscus height minus its nominal")]
+    T_1: Annotated[Any, Channel("K", TEMPERATURE_SCALE, "true heater temperature minus nominal")]
+    T_2: Annotated[Any, Channel("K", TEMPERATURE_SCALE, "true susceptor temperature minus nominal")]
+    T_b: Annotated[Any, Channel("K", TEMPERATURE_SCALE, "true melt temperature minus nominal")]
+    r_ref: Annotated[Any, _SHARED["r_ref"]]
+    r_ref_1min: Annotated[Any, _SHARED["r_ref_1min"]]
+    r_ref_5min: Annotated[Any, _SHARED["r_ref_5min"]]
+    T_1_ref: Annotated[Any, _SHARED["T_1_ref"]]
+    T_1_ref_1min: Annotated[Any, _SHARED["T_1_ref_1min"]]
+    T_1_ref_5min: Annotated[Any, _SHARED["T_1_ref_5min"]]
+    v_p: Annotated[Any, _SHARED["v_p"]]
+    Q_H: Annotated[Any, _SHARED["Q_H"]]
+    dT_i: Annotated[Any, Channel("K", 1.0, "interface fluctuation now")]
+    Q_d: Annotated[Any, Channel("W", KILO, "heat load on the melt now")]
+    ring_offset: Annotated[Any, Channel("m", MM, "offset of the ring that no sensor shows")]
+    lam: Annotated[Any, Channel("1", 1.0, "share of conduction: 1 is Model I, 0 is Model II")]
+
+
+@jittable
+def true_state(slot: Any, measured: Any, t: Any) -> Any:
+    """:class:`TrueState` of a slot at its sample's time t [s]."""
+    p, x = slot.puller, slot.x
+    return TrueState(
+        r_c_error=x.r_c - p.r_0 - measured.r_ref,
+        h_c=x.h_c - p.h_0,
+        T_1=x.T_1 - p.T_1_0,
+        T_2=x.T_2 - p.T_2_0,
+        T_b=x.T_b - p.T_b_0,
+        r_ref=measured.r_ref,
+        r_ref_1min=measured.r_ref_1min,
+        r_ref_5min=measured.r_ref_5min,
+        T_1_ref=measured.T_1_ref,
+        T_1_ref_1min=measured.T_1_ref_1min,
+        T_1_ref_5min=measured.T_1_ref_5min,
+        v_p=measured.v_p,
+        Q_H=measured.Q_H,
+        dT_i=slot.dT_i,
+        Q_d=slot.Q_d,
+        ring_offset=bias_offset(t, slot.episode),
+        lam=p.lam,
+    )
+
+
+class Logged(NamedTuple):
+    """The entries of a step's ``info``, in SI units."""
+
+    r_c: Annotated[Any, Channel("m", 1.0, "true crystal radius")]
+    r_br: Annotated[Any, Channel("m", 1.0, "true radius of the bright ring")]
+    r_ref: Annotated[Any, Channel("m", 1.0, "radius reference")]
+    h_c: Annotated[Any, Channel("m", 1.0, "true meniscus height")]
+    alpha_c: Annotated[Any, Channel("rad", 1.0, "cone angle of the crystal's wall")]
+    v_g: Annotated[Any, Channel("m/s", 1.0, "growth rate")]
+    v_p: Annotated[Any, Channel("m/s", 1.0, "applied pull speed")]
+    Q_H: Annotated[Any, Channel("W", 1.0, "applied heater power")]
+    T_1: Annotated[Any, Channel("K", 1.0, "true heater temperature")]
+    T_1_ref: Annotated[Any, Channel("K", 1.0, "recipe of the heater temperature")]
+    T_b: Annotated[Any, Channel("K", 1.0, "true melt temperature")]
+    r_br_measured: Annotated[Any, Channel("m", 1.0, "the camera's reading, with noise and offset")]
+    ring_offset: Annotated[Any, Channel("m", 1.0, "offset of the ring that no sensor shows")]
+    cost_radius: Annotated[Any, Channel("1", 1.0, "the cost's term of the radius error")]
+    cost_pull: Annotated[Any, Channel("1", 1.0, "the cost's term of the pull speed")]
+    cost_pull_step: Annotated[Any, Channel("1", 1.0, "the cost's term of the step of the pull speed")]
+    cost_heater_step: Annotated[Any, Channel("1", 1.0, "the cost's term of the step of the heater power")]
+    action_clipped: Annotated[Any, Channel("bool", 1.0, "whether the action lay outside its box")]
+
+
+@jittable
+def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, at_interface: Any) -> Any:
+    """:class:`Logged` of a slot at its sample's time t [s]; ``ring`` [m] is the true bright ring."""
+    p, x = slot.puller, slot.x
+    return Logged(
+        r_c=x.r_c,
+        r_br=ring,
+        r_ref=p.r_0 + measured.r_ref,
+        h_c=x.h_c,
+        alpha_c=np.arctan(at_interface.tan_alpha),
+        v_g=at_interface.v_g,
+        v_p=slot.v_p,
+        Q_H=slot.Q_H,
+        T_1=x.T_1,
+        T_1_ref=p.T_1_0 + measured.T_1_ref,
+        T_b=x.T_b,
+        r_br_measured=slot.ring + p.ring_bias,
+        ring_offset=bias_offset(t, slot.episode),
+        cost_radius=cost.radius,
+        cost_pull=cost.pull,
+        cost_pull_step=cost.pull_step,
+        cost_heater_step=cost.heater_step,
+        action_clipped=slot.clipped,
+    )
+
+
+MEASURED = tuple(signals(Measured).values())
+"""Channels of ``observation="measured"``."""
+STATE = tuple(signals(TrueState).values())
+"""Channels of ``observation="state"``."""
+INFO_ROWS = tuple(signals(Logged).values())
+"""Channels of ``info``."""
+INFO = Logged._fields
+"""Names of the entries of ``info``."""
+LEAN = ("r_c", "r_ref")
+"""Entries of ``info="lean"``; libraries copy info key by key, which costs more than the step."""
+
+
+def scales(listed: tuple[Channel, ...], v_0: float, heater_range: float = HEATER_SCALE) -> npt.NDArray[np.float64]:
+    """Scales of the channels for a puller of nominal pull speed v_0 [m/s] and heater range [W], shape (channels,)."""
+    own = {"m/s": (v_0, PULL_SCALE), "W": (heater_range, HEATER_SCALE)}
+
+    def scale(channel: Channel) -> float:
+        size, default = own.get(channel.unit, (1.0, 1.0))
+        return size * (channel.scale / default)
+
+    return np.array([scale(channel) for channel in listed])

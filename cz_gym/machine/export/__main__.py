@@ -1,0 +1,121 @@
+"""Write a controller for a plant, or the plant for a simulator: ``python -m cz_gym.machine.export``."""
+
+from __future__ import annotations
+
+import argparse
+import pkgutil
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from cz_gym.config import Config, make_config
+from cz_gym.errors import CzError
+from cz_gym.observation import CLIP
+from cz_gym.support.atomic_files import write_files
+from cz_gym.support.command_line import OneLineParser, shown
+from cz_gym.support.names import unknown
+from cz_gym.support.units import KILO, MM_PER_MIN
+
+from .agent import Agent
+from .onnx_graph import write_onnx
+from .shell import Alarm, Block
+from .text import fill_template, meanings, write_c, write_st
+
+REGISTRY, AGENTS = "cz_gym.baselines.registry", "cz_gym.agents"
+"""Modules that know controllers and agents, looked up by name because this package imports neither."""
+FALLBACK = "paper-tuned"
+"""The PID that takes over."""
+WRITERS: dict[str, Any] = {"c": write_c, "st": write_st, "onnx": write_onnx}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write the files; 0 when done, 2 for bad input."""
+    parser = OneLineParser(
+        "python -m cz_gym.machine.export",
+        "Write a controller, with what a plant needs around it, as C99, structured text or ONNX; or the puller as FMU.",
+    )
+    add = parser.add_argument
+    add("controller", nargs="?", help="a classical controller, a shipped agent, or an agent file (.onnx)")
+    add("--plant", action="store_true", help="the puller in place of a controller (--to fmu)")
+    add("--to", choices=("c", "fmu", "onnx", "st"), required=True, help="C99, FMI, ONNX, IEC 61131-3 structured text")
+    add("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
+    parser.add_puller("its nominal values, its drives' limits, what is designed for it")
+    add("--scenario", default="puller", metavar="NAME",
+        help="scenario whose tuned settings a controller has, and that a plant begins with (%(default)s)")  # fmt: skip
+    add("--real", choices=("double", "float"), default="double", help="precision of c and st (%(default)s)")
+    return parser.run(_export, arguments, "plant")
+
+
+def _export(given: argparse.Namespace) -> None:
+    if given.plant != (given.to == "fmu") or given.plant == bool(given.controller):
+        raise CzError("name a controller and --to c, st or onnx; or --plant --to fmu")
+    config = make_config(given.scenario, observation="measured", action="direct", puller=given.puller)
+    if given.plant:
+        from .fmu import build_fmu
+
+        print(shown(build_fmu(given.out, given.scenario, config.puller if given.puller else None)))
+        return
+    block = make_block(given.controller, config)
+    files = WRITERS[given.to](block.program, given.real == "float")
+    files["README.md"] = readme(block, list(files))
+    write_files({given.out / name: text.encode() if isinstance(text, str) else text for name, text in files.items()})
+    print(*(shown(given.out / name) for name in files), sep="\n")
+
+
+def make_block(name: str, config: Config) -> Block:
+    """A controller or agent in its shell; its fallback is the re-tuned PID of the same settings.
+
+    CzError if there is none of that name, if it cannot be exported, or if an agent is of another puller.
+    """
+    agents: Any = pkgutil.resolve_name(AGENTS)
+    known = [entry.name for entry in pkgutil.resolve_name(f"{REGISTRY}:CONTROLLERS") if not entry.bound]
+    plant = f"Puller {config.puller.label}; plant {config.plant_hash}; control interval {config.control_interval:g} s."
+    pid = pkgutil.resolve_name(f"{REGISTRY}:make_controller")(FALLBACK, config)
+    identifier = re.sub(r"\W+", "_", Path(name.removesuffix(".onnx")).name.lower())
+    if name in known:
+        entry = pkgutil.resolve_name(f"{REGISTRY}:find_controller")(name)
+        tuned = f"Settings tuned for scenario {config.scenario.name} ({config.scenario.hash}). {plant}"
+        controller = entry.make(config)
+        if not (hasattr(controller, "at_rest") and hasattr(controller, "step")):
+            raise CzError(f"{name} cannot be exported: it solves an optimisation problem, or has no feedback")
+        return Block(identifier, controller, pid, config, (f"Controller {name}: {entry.meaning}.", tuned))
+    if name not in agents.shipped_names() and Path(name).suffix != ".onnx":
+        raise CzError(unknown("controller or agent", name, [*known, *agents.shipped_names()]))
+    contract = (policy := agents.load(name)).contract
+    its, own = (
+        f"puller {each.puller}, plant {each.plant}, control interval {each.control_interval:g} s"
+        for each in (policy.made_for, config.made_for)
+    )
+    if its != own:
+        raise CzError(f"{name} was trained for {its}, not for {own}")
+    facts = (
+        f"Agent {name}: {contract.algorithm}, seed {contract.training_seed}, trained on {contract.scenario} "
+        f"({contract.scenario_hash}).",
+        f"File {contract.sha256}; observation {contract.observation} {contract.observation_hash}. {plant}",
+    )
+    return Block(identifier, Agent(policy, config), pid, config, facts)
+
+
+def readme(block: Block, files: list[str]) -> str:
+    """The README beside the files."""
+    kinds = {
+        ".h": "declarations", ".c": "the block", ".st": "the function block",
+        ".onnx": "the block as a graph in double precision, inputs of shape [1]; the output `next_memory` is the input "
+        "`memory` of the next call, which the first call leaves out",
+    }  # fmt: skip
+    program, config = block.program, block.config
+    parts = {
+        "files": "\n".join(f"| `{name}` | {kinds[Path(name).suffix]} |" for name in files),
+        "interval": f"{config.control_interval:g}",
+        "pull": f"{CLIP * config.parameters.v_0 / MM_PER_MIN:g}",
+        "heater": f"{CLIP * config.heater_range / KILO:g}",
+        "inputs": "\n".join(f"| `{port.name}` | {port.meaning} |" for port in program.inputs),
+        "settings": "\n".join(f"| `{port.name}` | {port.meaning}: {port.default:.10g} |" for port in program.settings),
+        "alarms": "\n".join(f"| {bit.value} | `{bit.name}` | {text} |" for bit, text in meanings(Alarm).items()),
+    }
+    return fill_template("block.md", parts | {"name": program.name, "about": "  \n".join(program.notes)})
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

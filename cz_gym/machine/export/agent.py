@@ -1,0 +1,153 @@
+"""A trained agent as a controller of the shell: its ONNX graph in NumPy, its observation, what its actions mean."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import FunctionType, SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cz_gym.body.task import HEATER_SLACK, drives_of
+from cz_gym.config import Config
+from cz_gym.engine.outputs import recall, remember
+from cz_gym.errors import CzError
+from cz_gym.observation import CLIP, HISTORY, INTEGRAL_SCALE, LAGGED, MEASURED, Measured, lags, scales
+
+
+def _gemm(a: Any, b: Any, c: Any = 0.0, alpha: float = 1.0, beta: float = 1.0, transA: int = 0, transB: int = 0) -> Any:
+    return alpha * ((a.T if transA else a) @ (b.T if transB else b)) + beta * c
+
+
+def _slice(x: Any, starts: Any, ends: Any, axes: Any = None, steps: Any = None) -> Any:
+    key = [slice(None)] * x.ndim
+    for at, axis in enumerate(range(len(starts)) if axes is None else axes):
+        key[int(axis)] = slice(int(starts[at]), int(ends[at]), 1 if steps is None else int(steps[at]))
+    return x[tuple(key)]
+
+
+def _split(x: Any, lengths: Any = None, axis: int = 0, parts: int = 1) -> Any:
+    return np.split(x, parts if lengths is None else np.cumsum(lengths)[:-1].tolist(), axis)
+
+
+OPERATORS: dict[str, Callable[..., Any]] = {
+    "Add": np.add, "Sub": np.subtract, "Mul": np.multiply, "Div": np.divide, "Neg": np.negative, "Sqrt": np.sqrt,
+    "Tanh": np.tanh, "MatMul": np.matmul, "Gemm": _gemm, "Slice": _slice, "Split": _split,
+    "Clip": lambda x, low=None, high=None: np.clip(x, low, high),
+    "Identity": lambda x: x, "Concat": lambda *x, axis: np.concatenate(x, axis=axis),
+    "Gather": lambda x, at, axis=0: np.moveaxis(np.moveaxis(x, axis, 0)[at], 0, axis),
+    "Relu": lambda x: np.maximum(x, 0.0), "Sigmoid": lambda x: 0.5 + 0.5 * np.tanh(0.5 * x),
+    "Softplus": lambda x: np.maximum(x, 0.0) + np.log(1.0 + np.exp(-np.absolute(x))),
+    "LeakyRelu": lambda x, alpha=0.01: np.where(x > 0.0, x, alpha * x),
+    "Elu": lambda x, alpha=1.0: np.where(x > 0.0, x, alpha * (np.exp(np.minimum(x, 0.0)) - 1.0)),
+}  # fmt: skip
+"""The operators that an agent's graph may hold, :data:`cz_gym.agents.agent_file.graph.OPERATORS`, in NumPy."""
+
+
+def network_of(content: bytes) -> Callable[..., list[Any]]:
+    """An agent's checked ONNX graph as a function of NumPy arrays of shape (n, width), in double precision."""
+    import onnx
+    from onnx import helper, numpy_helper
+
+    graph = onnx.load_from_string(content).graph
+    tensors = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
+    weights = {name: each.astype(np.float64) if each.dtype == np.float32 else each for name, each in tensors.items()}
+
+    def network(**inputs: Any) -> list[Any]:
+        values: dict[str, Any] = {"": None} | weights | inputs
+        for node in graph.node:
+            extra = {a.name: helper.get_attribute_value(a) for a in node.attribute}
+            extra |= {"parts": len(node.output)} if node.op_type == "Split" else {}
+            result = OPERATORS[node.op_type](*(values[name] for name in node.input), **extra)
+            values.update(zip(node.output, result if node.op_type == "Split" else [result], strict=True))
+        return [values[value.name] for value in graph.output]
+
+    return network
+
+
+class AgentMemory(NamedTuple):
+    """The memory of an agent outside Python. Sums and integral are that of the observation "history"."""
+
+    sums: Any
+    """Running sums of the remembered channels less the newest ones, the newest first, shape (n, depth, channels)."""
+    integral: Any
+    """Integral of the scaled ring error, shape (n,)."""
+    command: Any
+    """Last commanded inputs in shares of their ranges, shape (n, 2)."""
+    network: Any
+    """The network's own state, shape (n, k)."""
+
+
+class Agent:
+    """A trained agent as a controller of the shell."""
+
+    estimates_temperature = False
+
+    def __init__(self, policy: Any, config: Config) -> None:
+        contract, ranges = policy.contract, config.ranges
+        if contract.observation not in ("measured", "history"):
+            raise CzError(f"an agent that reads {contract.observation!r} cannot be exported: no plant has that")
+        self.network, self.remembers, self.ranges = network_of(policy.content), policy.remembers, ranges
+        self.v_0, self.heater_range = ranges
+        self.slack = HEATER_SLACK * max(each.actuators.heater_step for each in config.scenario.scenarios)
+        self.dt = contract.control_interval
+        self.newest, self.before = lags(self.dt)[0], lags(self.dt)[1] + 1
+        self.depth = int(self.before.max()) + 1 if contract.observation == "history" else 0
+        self.drives = drives_of(contract.action, contract.control_interval, self.heater_range)
+
+    def at_rest(self, seen: Measured) -> AgentMemory:
+        """The network's state at zero, the applied drives as the last command, the first ring error as the past."""
+        ring = self._measured(seen)[:, :1]
+        ages = np.zeros((self.depth, len(LAGGED)))
+        ages[:, 0] = np.arange(self.depth)[::-1]
+        step = self.dt * MEASURED[0].scale / INTEGRAL_SCALE
+        integral = -ring[:, 0] * step if self.depth else np.zeros((len(ring), 0))
+        network = np.zeros((len(ring), self.remembers))
+        return AgentMemory(-ring[:, :, None] * ages, integral, self._applied(seen), network)
+
+    def step(self, seen: Measured, memory: AgentMemory) -> tuple[Any, Any, AgentMemory]:
+        """Pull speed and heater power above nominal, and the new memory."""
+        observation = self._measured(seen)
+        if self.depth:
+            observation, memory = self._history(seen, observation, memory)
+        action, *state = self.network(observation=observation, **({"state": memory.network} if self.remembers else {}))
+        applied = self._applied(seen)
+        slack = np.array([0.0, self.slack / self.heater_range])
+        before = applied + np.clip(memory.command - applied, -slack, slack)
+        gains = np.array([self.drives.pull, self.drives.heater])
+        command = np.clip(self.drives.keep * before + gains * np.clip(action, -1.0, 1.0), -1.0, 1.0)
+        memory = memory._replace(command=command, network=state[0] if state else memory.network)
+        return command[:, 0] * self.v_0, command[:, 1] * self.heater_range, memory
+
+    def _applied(self, seen: Measured) -> Any:
+        return np.stack([seen.v_p / self.v_0, seen.Q_H / self.heater_range], axis=-1)
+
+    def _measured(self, seen: Measured) -> Any:
+        return np.clip(np.stack(seen, axis=-1) / scales(MEASURED, *self.ranges), -CLIP, CLIP)
+
+    def _history(self, seen: Measured, measured: Any, past: AgentMemory) -> tuple[Any, AgentMemory]:
+        """The observation "history" and its memory, by the engine's own functions.
+
+        The engine's circular table is turned so that the newest sample stands at 0; the slots stand in the last axis.
+        """
+        slot = SimpleNamespace(k=self.depth, integral=past.integral)
+        sums, n = np.moveaxis(past.sums, 0, -1).copy(), len(measured)
+        out = np.concatenate([measured.T, np.zeros((len(HISTORY) - len(MEASURED), n))])
+        share = 1.0 / (self.before - self.newest)
+        constants = SimpleNamespace(
+            newest=self.newest, before=self.before, share=share, measured=1.0 / scales(MEASURED, *self.ranges)
+        )
+        _uncompiled(remember, sums)(slot, sums, self.dt, out)
+        _uncompiled(recall, sums)(slot, seen, sums, constants, out)
+        table = np.concatenate([sums[1:] - sums[0], np.zeros((1, len(LAGGED), n))])
+        return out.T, past._replace(sums=np.moveaxis(table, -1, 0), integral=slot.integral)
+
+
+def _uncompiled(function: Any, like: Any) -> Any:
+    """An engine's function for arrays with slots in the last axis, which records limits where it would branch."""
+    n = like.shape[-1]
+    own = {
+        "clip": lambda value, limit: np.clip(value, -limit, limit),
+        "scratch": lambda *shape: np.zeros_like(like, shape=(*shape, n)),
+    }
+    return FunctionType(function.__code__, function.__globals__ | own)

@@ -1,0 +1,10 @@
+"""Identification of a puller from its log: excitation, log reader, estimation, report.
+
+``python -m cz_gym.machine.identify LOG.csv --puller start.toml --out my.toml`` does it in one command.
+"""
+
+from .estimate import Identified, identify
+from .excitation import Excited
+from .log import Log, read_log, record_log
+
+__all__ = ["Excited", "Identified", "Log", "identify", "read_log", "record_log"]

@@ -1,0 +1,210 @@
+"""The filter whose prediction errors are made small: an extended Kalman filter on the plant, and its derivatives.
+
+Eleven states: the plant's five, a fast and a slow fluctuation of the interface temperature [K], a heat load on the melt
+[W] with its rate [W/s], and the constant offsets of pyrometer [K] and ring [m]. The mean moves by the plant's
+equations, the covariance by the plant linearised at its operating point. The loop takes complex numbers: a complex step
+through it gives the derivatives of every prediction error, and of its variance, by a parameter.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import expm
+
+from cz_gym.body.plant import Disturbance, Inputs, State, derive_puller, rates, rk4
+from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
+from cz_gym.jit.cache import hashed
+from cz_gym.jit.compile import kernel
+from cz_gym.physics.meniscus import HURLE, MeniscusModel
+from cz_gym.physics.parameters import Parameters
+from cz_gym.support.units import MM
+
+from .log import Floats, Log
+
+Numbers = npt.NDArray[np.complex128]
+STATES = (*State._fields, "fast", "slow", "load", "load_rate", "pyrometer_offset", "ring_offset")
+FAST, SLOW, LOAD, RATE, PYROMETER, RING = range(5, len(STATES))
+LONGEST_STEP = 5.0
+"""Longest step of the integration [s]."""
+_STEP, _SHARE = 1e-30, 1e-6
+
+
+class Noise(NamedTuple):
+    """Strength of the disturbances and of the sensors' noise."""
+
+    camera_sd: Any = 0.025 * MM
+    """[m]"""
+    pyrometer_sd: Any = 0.1
+    """[K]"""
+    fast_sd: Any = 0.25
+    """Fluctuation of the interface temperature with a correlation time of 30 s [K]."""
+    slow_sd: Any = 0.25
+    """The one of 780 s [K]."""
+    load_rate: Any = 1e-5
+    """Rate of the heat load on the melt, in shares of the heat that passes through it [1/s]."""
+
+
+LAM = 0.5
+"""Share of conduction where it is not free, and the mean of its prior [-]."""
+TAU_FAST, TAU_SLOW, TAU_RATE = 30.0, 780.0, 2400.0
+"""Correlation times of the interface temperature's fluctuations and of the load's rate [s]."""
+START_SD = (0.5 * MM, 0.1 * MM, 1.0, 0.5, 0.3)
+"""Standard deviation of the plant's state at the log's first row; pyrometer and ring have offsets of their own."""
+OFFSET_SD = 5.0, 1.0 * MM
+"""Standard deviation of the pyrometer's offset [K] and the ring's [m]."""
+DRIFT_SD = 5.0
+"""Standard deviation of the hot zone's drift at the first row: heater and susceptor are warmer, and a load on the melt
+takes the heat away [K]."""
+
+
+FLOOR = 0.01, 3e-3 * MM
+"""Least noise of pyrometer [K] and ring [m]: no sensor is better."""
+
+
+class Predicted(NamedTuple):
+    """Prediction errors of pyrometer [K] and ring [m], shape (rows, 2); 0 with variance 1 where nothing was read."""
+
+    error: Any
+    variance: Any
+    state: Any
+    """Estimated states after each row, shape (rows, 11)."""
+
+
+@lru_cache(maxsize=4)
+def build_filter(meniscus: MeniscusModel) -> Any:
+    """Compile the filter's loop for a meniscus model."""
+    slope, ring_offset = meniscus.slope, meniscus.ring_offset
+
+    def run(
+        p: Any, A: Any, Q: Any, z: Any, start: Any, R: Any, read: Any, drives: Any, gap: Any, dt: Any, parts: Any,
+        lowest: Any, highest: Any, error: Any, variance: Any, states: Any,
+    ) -> None:  # fmt: skip
+        P, A_t = start, np.ascontiguousarray(A.T)
+        for k in range(read.shape[0]):
+            if k > 0:
+                x, u = State(z[0], z[1], z[2], z[3], z[4]), Inputs(drives[k, 0] + 0.0 * z[0], drives[k, 1] + 0.0 * z[0])
+                d = Disturbance(z[7], z[5] + z[6], 1.0 + 0.0 * z[0])
+                for _ in range(parts):
+                    x = rk4(x, u, d, p, dt / parts, slope)
+                z = A @ z
+                z[0], z[1], z[2], z[3], z[4] = x.r_c, x.h_c, x.T_1, x.T_2, x.T_b
+                P = start if gap[k] else A @ P @ A_t + Q
+            for sensor in range(2):
+                error[k, sensor], variance[k, sensor] = 0.0, 1.0
+                if np.isnan(read[k, sensor]):
+                    continue
+                H = np.zeros_like(z)
+                if sensor == 0:
+                    H[2], H[9], expected = 1.0, 1.0, z[2] + z[9]
+                else:
+                    near, far = _SHARE * z[0], _SHARE * z[1]
+                    H[0] = 1.0 + (ring_offset(z[0] + near, z[1], p) - ring_offset(z[0] - near, z[1], p)) / (2.0 * near)
+                    H[1] = (ring_offset(z[0], z[1] + far, p) - ring_offset(z[0], z[1] - far, p)) / (2.0 * far)
+                    H[10], expected = 1.0, z[0] + ring_offset(z[0], z[1], p) + z[10]
+                PH = P @ H
+                error[k, sensor], variance[k, sensor] = read[k, sensor] - expected, (H * PH).sum() + R[sensor]
+                z = z + PH * (error[k, sensor] / variance[k, sensor])
+                P = P - np.outer(PH, PH / variance[k, sensor])
+            if not lowest < z[1].real < highest:
+                z[1] = min(max(z[1].real, lowest), highest)
+            states[k] = z
+
+    return kernel(run, keep=hashed(*meniscus.functions))
+
+
+class Model(NamedTuple):
+    """The map from free numbers to a puller and its noise: logarithms of factors, and ``lam`` itself."""
+
+    names: tuple[str, ...]
+    """The free ones, of Parameters, Noise and ``lam``."""
+    start: Parameters
+    meniscus: MeniscusModel = HURLE
+
+    @property
+    def mean(self) -> Any:
+        """The free numbers of the start, shape (names,)."""
+        return np.array([LAM if name == "lam" else 0.0 for name in self.names])
+
+    def value(self, name: str, at: float) -> float:
+        """The parameter or noise where its free number is ``at``; of ``lam``, the product lam dT_0 [K]."""
+        if name == "lam":
+            return at * self.start.dT_0
+        return float(getattr(Noise() if name in Noise._fields else self.start, name) * np.exp(at))
+
+    def puller(self, theta: Any) -> Any:
+        """The puller of free numbers, real or complex, shape (names,)."""
+        free = dict(zip(self.names, theta, strict=True))
+        factors = {name: np.exp(value) for name, value in free.items() if name in Parameters._fields}
+        q = self.start._replace(**{name: getattr(self.start, name) * factor for name, factor in factors.items()})
+        zero = 0.0 * theta[0]
+        numbers = Parameters(*(number + zero for number in q))
+        return derive_puller(numbers, free.get("lam", LAM) + zero, self.meniscus.height, self.meniscus.ring_offset)
+
+    def noises(self, theta: Any) -> Noise:
+        """The noise of free numbers, as :meth:`puller`."""
+        free = dict(zip(self.names, theta, strict=True))
+        return Noise(*(usual * np.exp(free.get(name, 0.0)) for name, usual in Noise()._asdict().items()))
+
+
+def predict(log: Log, model: Model, theta: Any) -> Predicted:
+    """Run the filter of the free numbers ``theta``, shape (names,), real or complex, over a log."""
+    p, noise, meniscus = model.puller(np.asarray(theta, np.complex128)), model.noises(theta), model.meniscus
+    through = p.Q_H_0 - p.G_1a * (p.T_1_0 - p.T_a)
+    A, Q = _sampled(p, noise, through, log.interval, meniscus)
+    z, P = np.zeros(len(STATES), np.complex128), np.zeros((len(STATES),) * 2, np.complex128)
+    z[:5] = p.state_0
+    known = np.isfinite(log.r_ref).all()
+    z[0] = log.r_ref[0] if known else p.r_0
+    z[RING] = np.nanmedian(log.ring - (log.r_ref if known else p.r_0.real)) - p.ring_bias
+    start_sd = {FAST: noise.fast_sd, SLOW: noise.slow_sd, RATE: noise.load_rate * through}
+    for state, sd in (*enumerate(START_SD), *start_sd.items(), (PYROMETER, OFFSET_SD[0]), (RING, OFFSET_SD[1])):
+        P[state, state] = sd**2
+    warmer = p.T_1_0**3 / (p.T_2_0**3 + p.G_2b / (4.0 * p.kappa_12))
+    drift = DRIFT_SD * np.array([0.0, 0.0, 1.0, warmer, 0.0, 0.0, 0.0, -p.G_2b * warmer, 0.0, 0.0, 0.0])
+    P = P + np.outer(drift, drift)
+    rows, parts = len(log.time), math.ceil(log.interval / LONGEST_STEP - 1e-9)
+    out = Predicted(*(np.zeros((rows, width), np.complex128) for width in (2, 2, len(STATES))))
+    R = np.array([noise.pyrometer_sd**2, noise.camera_sd**2], np.complex128) + np.square(FLOOR)
+    read, drives = np.stack([log.T_1, log.ring], axis=1), np.stack([log.v_p, log.Q_H], axis=1)
+    limits = HEIGHT_MIN, HEIGHT_MAX_IN_A * float(p.a.real)
+    build_filter(meniscus)(p, A, Q, z, P, R, read, drives, log.gap, log.interval, parts, *limits, *out)
+    return out
+
+
+def _sampled(p: Any, noise: Noise, through: Any, dt: float, meniscus: MeniscusModel) -> tuple[Numbers, Numbers]:
+    """Transition over dt [s] at the operating point, and the covariance of the disturbances in it (Van Loan 1978)."""
+    n = len(STATES)
+    F, Q = np.zeros((n, n), np.complex128), np.zeros((n, n), np.complex128)
+    point = np.array([*p.state_0, 0.0, 0.0], np.complex128)
+    size = np.array([*p.state_0, p.Q_H_0, 1.0])
+
+    def motion(at: Any) -> Numbers:
+        d = Disturbance(at[5], at[6], 1.0)
+        return np.array(rates(State(*at[:5]), p.inputs_0, d, p, meniscus.slope))
+
+    for j, shift in enumerate(_SHARE * size * np.eye(7)):
+        column = (motion(point + shift) - motion(point - shift)) / (2.0 * shift[j])
+        for state in ((j,), (LOAD,), (FAST, SLOW))[max(j - 4, 0)]:
+            F[:5, state] = column
+    F[LOAD, RATE] = 1.0
+    A = expm(F * dt)
+    for state, sd, tau in (
+        (FAST, noise.fast_sd, TAU_FAST),
+        (SLOW, noise.slow_sd, TAU_SLOW),
+        (RATE, noise.load_rate * through, TAU_RATE),
+    ):
+        A[state, state] = np.exp(-dt / tau)
+        Q[state, state] = sd**2 * (1.0 - A[state, state] ** 2)
+    return A, Q
+
+
+def sensitivities(log: Log, model: Model, theta: Floats) -> tuple[Predicted, Floats, Floats]:
+    """The filter's output at ``theta``, and the derivatives of errors and variances, shape (names, rows, 2)."""
+    runs = [predict(log, model, theta + 1j * _STEP * unit) for unit in np.eye(len(theta))]
+    errors, variances = (np.stack([run[part].imag for run in runs]) / _STEP for part in (0, 1))
+    return Predicted(*(np.ascontiguousarray(part.real) for part in runs[0])), errors, variances

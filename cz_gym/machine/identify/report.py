@@ -1,0 +1,147 @@
+"""Report of an identification: Markdown with two pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from cz_gym.body.plant import make_puller
+from cz_gym.evaluation.report.canvas import COLOURS, GREY, INK, canvas, png
+from cz_gym.evaluation.report.tables import markdown
+from cz_gym.physics.parameters import describe
+from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN, PERCENT
+
+from .estimate import WHITE, Estimate, Identified
+from .log import Log
+
+CALLIPER = 0.05 * MM
+"""Error of a calliper's reading of the radius [m]."""
+OTHERS = {
+    "lam": ("lam dT_0", "K"),
+    "camera_sd": ("camera noise", "m"),
+    "pyrometer_sd": ("pyrometer noise", "K"),
+    "fast_sd": ("melt, fast fluctuation", "K"),
+    "slow_sd": ("melt, slow fluctuation", "K"),
+    "load_rate": ("hot zone, rate of drift", "1/s"),
+}
+"""Names and units of the numbers that are no parameters."""
+HEADS = "number", "unit", "start", "log", "95 % interval", "uncertainty left [%]", "verdict"
+
+
+def report(found: Identified, log: Log, source: str, path: Path) -> dict[Path, bytes]:
+    """The files of a report, its text at ``path``: what the log ``source`` tells of a puller, and what it does not."""
+    readings, numbers = (path.with_name(f"{path.stem}-{name}.png") for name in ("readings", "numbers"))
+    told, moves = sum(e.informed for e in found.estimates), zip(("pull speed", "heater"), found.excitation, strict=True)
+    white = zip(("pyrometer", "ring"), found.whiteness, strict=True)
+    text = f"""# What {source} tells of the puller {found.start.name}
+
+The log tells {told} of {len(found.estimates)} numbers of the puller; the others keep the start's values.
+{"" if found.settled else "**The search has not settled: do not use these numbers.**"}
+{markdown(HEADS, map(_row, (*found.estimates, *found.noise)), "---")}
+
+"Uncertainty left" compares the estimate's standard deviation with the start's; below 50 % the log tells the number.
+A log gives lam and dT_0 only as their product, and no phi_b.
+
+![start and estimates]({numbers.name})
+
+## Excitation
+
+{chr(10).join(f"- {name}: {_moved(share)}" for name, share in moves)}
+
+## Predicted and measured
+
+![readings and their prediction errors]({readings.name})
+
+{chr(10).join(f"- {name}: {_whiteness(p)}" for name, p in white)}
+
+## What one calliper reading would add
+
+{_calliper(found, log)}
+
+## The log
+
+{len(log.time)} rows of {log.interval:g} s; {"; ".join(log.notes) or "nothing was left out"}.
+"""
+    return {path: text.encode(), readings: _readings(found, log), numbers: _numbers(found)}
+
+
+def _row(e: Estimate) -> tuple[str, ...]:
+    name, unit = OTHERS.get(e.name) or (e.name, describe()[e.name].unit)
+    if not e.excited:
+        return name, unit, f"{e.prior:.4g}", "-", "-", "-", "not estimated: its drive was not excited"
+    verdict = "told" if e.informed else "this log says nothing about it"
+    interval = f"{e.low:.4g} to {e.high:.4g}"
+    return name, unit, f"{e.prior:.4g}", f"{e.value:.4g}", interval, f"{e.left / PERCENT:.0f}", verdict
+
+
+def _moved(share: float) -> str:
+    if share >= 1.0:
+        return f"moves of its own, {share:.3g} times what is needed"
+    return (
+        f"{share:.2g} of the moves that are needed. The readings explain the others, as a controller's moves, and such a "
+        "log misleads: the numbers of this drive were not estimated. `cz_gym.machine.identify.Excited` makes the moves."
+    )
+
+
+def _whiteness(probability: float) -> str:
+    if probability >= WHITE:
+        return f"the prediction errors are white (p = {probability:.2g}), so the model explains the readings"
+    return (
+        f"the prediction errors are **not white** (p = {probability:.1g}): something moves the readings that the model "
+        "does not have, and the intervals are too narrow"
+    )
+
+
+def _calliper(found: Identified, log: Log) -> str:
+    """What the ring's offset would say of phi_b if the crystal's radius were known."""
+    parameters, step = found.puller.parameters, 1e-4
+    ring = make_puller(parameters).ring_bias
+    slope = (make_puller(parameters._replace(phi_b=parameters.phi_b + step)).ring_bias - ring) / step
+    meant = np.where(np.isfinite(log.r_ref), log.r_ref, parameters.r_0)
+    middle = float(np.nanmedian(log.ring - meant))
+    return (
+        f"The ring is {middle / MM:.2f} mm outside the reference, in the middle of the log; with phi_b = "
+        f"{np.degrees(parameters.phi_b):.2f} deg it is {ring / MM:.2f} mm outside the crystal. The log cannot say how "
+        f"much of the difference is an error of the radius. A calliper reading of the crystal, to {CALLIPER / MM:g} mm "
+        f"of its radius, gives phi_b to {np.degrees(CALLIPER / abs(slope)):.2g} deg, and with it the true radius."
+    )
+
+
+def _readings(found: Identified, log: Log) -> bytes:
+    """Drives, readings with their predictions, and prediction errors, as PNG."""
+    figure, hours = canvas(8.0, 8.0), log.time / HOUR
+    drives, ring, pyrometer, errors = figure.subplots(4, 1, sharex=True)
+    drives.plot(hours, log.v_p / MM_PER_MIN, color=COLOURS[1], lw=0.8, label="pull speed [mm/min]")
+    power = drives.twinx()
+    power.plot(hours, log.Q_H / KILO, color=COLOURS[0], lw=0.8, label="heater power [kW]")
+    for axis, values, error, size, label in (
+        (ring, log.ring, found.predicted.error[:, 1], MM, "ring radius [mm]"),
+        (pyrometer, log.T_1, found.predicted.error[:, 0], 1.0, "T_1 [K]"),
+    ):
+        axis.plot(hours, values / size, ".", color=GREY, ms=2, label="measured")
+        axis.plot(hours, (values - error) / size, color=COLOURS[1], lw=0.8, label="predicted")
+        axis.set_ylabel(label)
+    for sensor, name in enumerate(("pyrometer", "ring")):
+        errors.plot(hours, found.errors[:, sensor], ".", color=COLOURS[sensor], ms=2, label=name)
+    drives.set_ylabel("pull speed [mm/min]", color=COLOURS[1])
+    power.set_ylabel("heater power [kW]", color=COLOURS[0])
+    errors.set(xlabel="time [h]", ylabel="error / its sd [-]", ylim=(-5.0, 5.0))
+    for axis in (ring, errors):
+        axis.legend(fontsize=7.5, frameon=False, ncols=2)
+    return png(figure)
+
+
+def _numbers(found: Identified) -> bytes:
+    """Start and estimates with their 95 % intervals, relative to the start, as PNG."""
+    figure = canvas(7.0, 4.5)
+    axis = figure.subplots()
+    for y, e in enumerate(found.estimates):
+        colour = COLOURS[1] if e.informed else GREY
+        axis.plot([max(e.low, 0.0) / e.prior, e.high / e.prior], [y, y], color=colour, lw=2)
+        axis.plot(e.value / e.prior, y, "o", color=colour)
+    axis.axvline(1.0, color=INK, lw=0.8)
+    axis.set_yticks(range(len(found.estimates)), [OTHERS.get(e.name, (e.name,))[0] for e in found.estimates])
+    axis.invert_yaxis()
+    axis.set_xlabel("estimate / start [-]; grey: this log says nothing about it")
+    return png(figure)

@@ -1,0 +1,278 @@
+"""The puller behind the tags: one crystal, its setpoints, and what happens when nobody renews them."""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from enum import IntFlag
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cz_gym.config import Config
+from cz_gym.env import CzEnv
+from cz_gym.machine.export.__main__ import FALLBACK, make_block
+from cz_gym.machine.export.shell import INPUTS, OUTPUTS, in_plant_units, settings_of
+from cz_gym.machine.identify.log import COLUMNS
+from cz_gym.observation import decode
+from cz_gym.rendering.canvas import Frame
+from cz_gym.rendering.view import record_of
+from cz_gym.support.atomic_files import naming
+from cz_gym.support.units import HOUR, KILO, MM_PER_MIN
+
+SYNC = 0.5
+"""Time after which a log waits for the disk, which takes longer than a step [s]."""
+SIZE = (640, 480)
+"""Width and height of the picture [px]."""
+
+
+class Alarm(IntFlag):
+    """The bits of ``alarms``."""
+
+    CAMERA = 1
+    """The ring reading is not valid; the last valid one is shown."""
+    HELD = 2
+    """The setpoints were not renewed for this control interval."""
+    FALLBACK = 4
+    """The fallback controls, because the setpoints were not renewed within the watchdog time."""
+    MANUAL = 8
+    """The operator's setpoints hold; clients are refused."""
+    LATE = 16
+    """The server ran more than one control interval behind its clock, and catches up."""
+    ENDED = 32
+    """The crystal was lost, or the run is over."""
+
+
+class Tag(NamedTuple):
+    """A value that clients see."""
+
+    name: str
+    """The quantity, ending in its unit."""
+    kind: type
+    meaning: str
+    writable: bool = False
+
+
+SETPOINTS = tuple(port.name for port in OUTPUTS[:2])
+TAGS = (
+    Tag("time_s", float, "time since the crystal's start"),
+    Tag("state", str, "growing, or how the crystal ended"),
+    Tag("control", str, "who sets the drives: client, held, fallback or manual"),
+    Tag("alarms", int, "sum of the alarm bits"),
+    *(Tag(port.name, bool if port.logical else float, port.meaning) for port in INPUTS[2:-1]),
+    *(Tag(port.name, float, port.meaning, True) for port in OUTPUTS[:2]),
+    Tag("watchdog", int, "number of the step that the setpoints answer; writing it makes them act", True),
+    *(Tag(port.name, float, port.meaning) for port in settings_of(Config())[:9]),
+    Tag("control_interval_s", float, "length of a step"),
+    Tag("watchdog_s", float, "time after which setpoints that are not renewed give way to the fallback"),
+    Tag("scenario", str, "the scenario"),
+    Tag("puller", str, "name and hash of the puller file, or default"),
+    Tag("step", int, "number of the control interval that begins now; it changes after all other tags"),
+)
+"""Every tag, in the order of writing; readings, setpoints and settings are those of the exported blocks."""
+TOLERANCE = 1e-9
+"""Rounding of a setpoint that is forgiven at its limits [mm/min, kW]."""
+
+
+class Log:
+    """A CSV log that is whole however the process ends, and up to the last second if the power fails.
+
+    CzError if the file exists.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self._synced = 0.0
+        with naming(path):
+            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
+        os.write(self._file, f"{','.join(COLUMNS)}\n".encode())
+
+    def add(self, tags: dict[str, Any]) -> None:
+        """Write a row, whole, and wait for the disk unless that was done within the last second."""
+        os.write(self._file, f"{','.join(f'{float(tags[name]):.10g}' for name in COLUMNS)}\n".encode())
+        if time.monotonic() >= self._synced + SYNC:
+            os.fsync(self._file)
+            self._synced = time.monotonic()
+
+
+class Machine:
+    """A puller with one crystal, which :meth:`step` advances by one control interval.
+
+    Setpoints act from the step that begins now. Those of a client are held when it does not renew them, and after
+    ``watchdog`` seconds the fallback controls; those of the operator need no renewal. All methods may be called from
+    any thread.
+    """
+
+    def __init__(self, config: Config, seed: int, watchdog: float, log: Log | None = None) -> None:
+        self.env = CzEnv.from_config(config, "rgb_array", SIZE)
+        self.interval, self.watchdog, self._ranges = config.control_interval, watchdog, config.ranges
+        self._observation, _ = self.env.reset(seed=seed)
+        self._record, self._log, self._lock = record_of(self.env), log, threading.RLock()
+        self.puller = self._record.puller
+        self._fallback = make_block(FALLBACK, config)
+        self._memory = self._fallback.start(1)
+        self._fixed: dict[str, Any] = {port.name: port.default for port in settings_of(config, self.puller)}
+        self.limits = {name: [self._fixed[name.replace("setpoint", e)] for e in ("min", "max")] for name in SETPOINTS}
+        self.nominal = np.array([self.puller.v_0 / MM_PER_MIN, self.puller.Q_H_0 / KILO])
+        self._fixed |= {"control_interval_s": self.interval, "watchdog_s": watchdog, "puller": config.puller.label}
+        self._fixed["scenario"] = self._record.scenario
+        self.k, self.answered, self.late, self.manual, self._renewed = 0, -1, False, False, -math.inf
+        self._active = self.nominal
+        self._pending = dict(zip(SETPOINTS, self.nominal.tolist(), strict=True))
+        self.committed = threading.Condition(self._lock)
+        self.hour: deque[dict[str, Any]] = deque(maxlen=int(HOUR / self.interval) + 1)
+        """The tags of the last hour."""
+        self._publish()
+
+    def offer(self, writes: dict[str, Any]) -> dict[str, str]:
+        """Take a client's values, all or none; returns the reasons of those that are refused.
+
+        Setpoints are stored. They act once the client writes the number of the step that they answer to ``watchdog``.
+        """
+        with self._lock:
+            reasons = {name: reason for name, value in writes.items() if (reason := self._refusal(name, value))}
+            if not reasons:
+                self._pending |= {name: value for name, value in writes.items() if name in SETPOINTS}
+                if "watchdog" in writes:
+                    self.answered = writes["watchdog"]
+                    self._act()
+                    self.committed.notify_all()
+            return reasons
+
+    def by_hand(self, setpoints: dict[str, float]) -> dict[str, str]:
+        """Give the operator control with these setpoints, or, with none, give it back to the clients.
+
+        Returns the reasons of those that are refused.
+        """
+        with self._lock:
+            before, self.manual = self.manual, False
+            reasons = self.offer(setpoints)
+            self.manual = before if reasons else bool(setpoints)
+            if not reasons:
+                self._act()
+                self._renewed -= not setpoints  # held until a client comes
+            return reasons
+
+    def _refusal(self, name: str, value: Any) -> str:
+        if self.manual:
+            return "the operator has control"
+        if name in SETPOINTS:
+            low, high = self.limits[name]
+            inside = low - TOLERANCE <= value <= high + TOLERANCE  # false for NaN
+            return "" if inside else f"outside {low:.6g} to {high:.6g}"
+        return "" if self.answered < value <= self.k else f"step {self.k} is the newest, {self.answered} was answered"
+
+    def _act(self) -> None:
+        """Let the stored setpoints act."""
+        self._active, self._renewed = np.array([self._pending[name] for name in SETPOINTS]), self.k
+
+    @property
+    def control(self) -> str:
+        """Who sets the drives in the step that begins now."""
+        if self.manual:
+            return "manual"
+        if self._renewed == self.k:
+            return "client"
+        return "held" if (self.k - self._renewed) * self.interval < self.watchdog else "fallback"
+
+    @property
+    def over(self) -> bool:
+        """Whether the crystal has ended."""
+        return self._record.ending is not None
+
+    def step(self) -> dict[str, Any]:
+        """Advance by one control interval with the newest setpoints; returns the tags."""
+        with self._lock:
+            control = self.control
+            if control == "fallback":
+                given = self.hour[-1] | {"ring_time_s": self.k * self.interval, "automatic": True}
+                outputs, self._memory = self._fallback.run(given, self._memory)
+                self._active = np.array([outputs[name][0] for name in SETPOINTS])
+            else:
+                self._memory = self._fallback.start(1)
+            move = (self._active - self.nominal) / (self._ranges[0] / MM_PER_MIN, self._ranges[1] / KILO)
+            self._observation, *_ = self.env.step(move)
+            self.k += 1
+            return self._publish(control)
+
+    def _publish(self, control: str = "held") -> dict[str, Any]:
+        """Log the tags, and return them."""
+        ending = self._record.ending
+        seen = decode(self._observation.astype(float), *self._ranges)
+        bits = {
+            Alarm.CAMERA: seen.valid < 0.5, Alarm.HELD: control == "held", Alarm.FALLBACK: control == "fallback",
+            Alarm.MANUAL: control == "manual", Alarm.LATE: self.late, Alarm.ENDED: ending is not None,
+        }  # fmt: skip
+        values = (
+            self._fixed
+            | in_plant_units(seen, self.puller)
+            | dict(zip(SETPOINTS, self._active, strict=True))
+            | {
+                "time_s": self.k * self.interval,
+                "state": "growing" if ending is None else ending.value.lower(),
+                "control": control,
+                "alarms": sum(bit for bit, holds in bits.items() if holds),
+                "valid": seen.valid > 0.5,
+                "watchdog": max(self.answered, 0),
+                "step": self.k,
+            }
+        )
+        tags = {tag.name: tag.kind(values[tag.name]) for tag in TAGS}
+        self.hour.append(tags)
+        if self._log is not None:
+            self._log.add(tags)
+        return tags
+
+    def picture(self) -> Frame:
+        """The picture of the crystal as it is now."""
+        with self._lock:
+            frame = self.env.render()
+        assert frame is not None  # it has the mode "rgb_array"
+        return frame
+
+
+class Clock(threading.Thread):
+    """Steps a machine in real time times ``speed``, in a thread of its own that no client can delay.
+
+    Step k ends at the start plus k intervals, whatever happened before: the clock does not drift, and steps that were
+    missed follow at once. With ``waits``, time begins with a client's first setpoints. At a speed of 0, every step
+    waits for its setpoints.
+    """
+
+    def __init__(
+        self, machine: Machine, speed: float, waits: bool, published: Callable[[dict[str, Any]], object]
+    ) -> None:
+        super().__init__(name="plant", daemon=True)
+        self.machine, self.speed, self.waits, self.published = machine, speed, waits or not speed, published
+        self.stopped = threading.Event()
+        self.error: BaseException | None = None
+
+    def run(self) -> None:
+        """Step until the crystal ends or the clock is stopped."""
+        try:
+            if self.waits:
+                self._answered(0)
+            start, first = time.monotonic(), self.machine.k
+            while not (self.stopped.is_set() or self.machine.over):
+                if self.speed:
+                    period = self.machine.interval / self.speed
+                    due = start + (self.machine.k - first + 1) * period
+                    self.stopped.wait(max(due - time.monotonic(), 0.0))
+                    self.machine.late = time.monotonic() > due + period
+                else:
+                    self._answered(self.machine.k)
+                if not self.stopped.is_set():
+                    self.published(self.machine.step())
+        except BaseException as error:
+            self.error = error
+            self.published({})
+
+    def _answered(self, step: int) -> None:
+        """Wait until a client has answered the step."""
+        with self.machine.committed:
+            while not (self.stopped.is_set() or self.machine.answered >= step):
+                self.machine.committed.wait(0.2)

@@ -1,0 +1,147 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+
+from cz_gym import SCENARIOS, CzEnv, Parameters, State, make_puller
+from cz_gym.body.plant import NO_DISTURBANCE, Disturbance, Inputs, growth, hidden_load, rates, rk4
+from cz_gym.body.schedule import disturbance
+from cz_gym.episodes.scenario import Actuators
+from cz_gym.jit.compile import kernel
+from cz_gym.physics.meniscus import hurle_slope
+from cz_gym.support.units import HOUR
+from tests.equations import Truth, design_rates, drawn, fields, hold, integrated
+
+MIXES = [0.0, 0.3, 1.0]
+SPREAD = st.floats(0.85, 1.15)
+MELTING = replace(SCENARIOS["puller"], name="puller without limits", actuators=Actuators())
+
+
+@pytest.fixture
+def states(rng):
+    p = make_puller()
+    n = 200
+    return State(
+        rng.uniform(0.08, 0.095, n), rng.uniform(0.002, 1.24 * p.a, n), p.T_1_0 + rng.normal(0, 20, n),
+        p.T_2_0 + rng.normal(0, 10, n), p.T_b_0 + rng.normal(0, 3, n),
+    )  # fmt: skip
+
+
+def drawn_inputs(rng, p, n):
+    u = Inputs(rng.uniform(0, 4e-5, n), p.Q_H_0 + rng.uniform(-1e4, 1e4, n))
+    return u, Disturbance(rng.normal(0, 1000, n), rng.normal(0, 1, n), rng.uniform(0.9, 1, n))
+
+
+VARIED = ("sigma", "k_l", "kappa_12", "G_2b", "eps", "r_0", "v_0")
+
+
+@given(st.sampled_from(MIXES), st.lists(SPREAD, min_size=len(VARIED), max_size=len(VARIED)))
+def test_operating_point_is_a_steady_state(lam, factors):
+    q = Parameters()
+    changes = {name: getattr(q, name) * factor for name, factor in zip(VARIED, factors, strict=True)}
+    p = make_puller(q._replace(**changes), lam)
+    rate = rates(p.state_0, p.inputs_0, NO_DISTURBANCE, p, hurle_slope)
+    assert abs(rate.r_c) < 1e-12 * p.v_0
+    assert abs(rate.h_c) < 1e-12 * p.v_0
+    heats = np.array([rate.T_1 * p.C_1, rate.T_2 * p.C_2, rate.T_b * p.C_b])
+    assert np.abs(heats).max() < 1e-9 * p.Q_H_0
+    assert p.T_b_0 == Parameters().T_m + Parameters().dT_0
+
+
+@pytest.mark.parametrize("lam", MIXES)
+def test_rates_are_the_equations_of_the_design(lam, states, rng):
+    p = make_puller(lam=lam)
+    u, d = drawn_inputs(rng, p, 200)
+    expected = design_rates(np.array(states), Truth(u.v_p, u.Q_H, d.Q_d, d.dT_i, d.melt), p)
+    actual = np.array(rates(states, u, d, p, hurle_slope))
+    np.testing.assert_allclose(actual, expected, rtol=1e-11, atol=1e-13)
+
+
+def test_compiled_equations_equal_the_plain_ones(states, rng):
+    @kernel
+    def loop(rows, u, d, p, out):
+        for i in range(len(rows)):
+            x = State(rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4])
+            load = Disturbance(d[i, 0], d[i, 1], d[i, 2])
+            inputs = Inputs(u[i, 0], u[i, 1])
+            rate = rates(x, inputs, load, p, hurle_slope)
+            new = rk4(x, inputs, load, p, 5.0, hurle_slope)
+            grown = growth(x, load, p, hurle_slope)
+            for j in range(5):
+                out[i, j] = rate[j]
+                out[i, 5 + j] = new[j]
+            out[i, 10] = grown.v_g
+            out[i, 11] = hidden_load(d[i, 1] * 20.0, p)
+
+    p = make_puller(lam=0.4)
+    u, d = drawn_inputs(rng, p, 200)
+    out = np.zeros((200, 12))
+    loop(np.array(states).T, np.array(u).T, np.array(d).T, p, out)
+    plain = [
+        *rates(states, u, d, p, hurle_slope),
+        *rk4(states, u, d, p, 5.0, hurle_slope),
+        growth(states, d, p, hurle_slope).v_g,
+        hidden_load(d.dT_i * 20.0, p),
+    ]
+    scale = np.abs(out).max(axis=0)
+    np.testing.assert_allclose(out / scale, np.array(plain).T / scale, rtol=1e-12, atol=1e-13)
+
+
+def test_runge_kutta_is_of_fourth_order():
+    p = make_puller(lam=0.7)
+    x = np.array([p.r_0, 0.8 * p.h_0, p.T_1_0 + 5, p.T_2_0, p.T_b_0 + 2])
+    u, d = Inputs(1.2 * p.v_0, p.Q_H_0 + 8000.0), Disturbance(500.0, 0.3, 0.95)
+    exact = integrated(x, Truth(*u, *d), p, 240.0).y[:, -1]
+    steps = np.array([10.0, 15.0, 20.0, 30.0, 40.0])
+    errors = []
+    for dt in steps:
+        new = State(*x)
+        for _ in range(round(240.0 / dt)):
+            new = rk4(new, u, d, p, dt, hurle_slope)
+        errors.append(np.abs((np.array(new) - exact) / exact)[:2].max())
+    order = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert order == pytest.approx(4.0, abs=0.15)
+
+
+@pytest.mark.parametrize(("interval", "scenario"), [(5.0, "randomized"), (2.0, MELTING), (10.0, "hard")])
+def test_an_hour_of_driven_motion_agrees_with_scipy(interval, scenario):
+    env = CzEnv(scenario, control_interval=interval, horizon=HOUR, info="all")
+    env.reset(seed=5)
+    saved, interface = env.get_state().slot, drawn(env).interface
+    p, e, x = fields(saved.slot["puller"]), fields(saved.slot["episode"]), np.array(saved.slot["x"].tolist())
+    steps = round(HOUR / interval)
+    worst, heights, feedback = 0.0, [], 0.0
+    for k in range(steps):
+        t = k * interval
+        pull = 0.3 * np.sin(t / 70.0) + feedback
+        _, _, terminated, _, info = env.step(np.array([pull, 0.3 * np.sin(t / 300.0)], np.float32))
+        feedback = hold(info, p.h_0)
+        while t < (k + 1) * interval - 1e-6:
+            j = int(t // 5.0)
+            upto = min(5.0 * (j + 1), (k + 1) * interval)
+            d = disturbance(5.0 * j, interface[j], e, p)
+            x = integrated(x, Truth(info["v_p"], info["Q_H"], *d), p, upto - t).y[:, -1]
+            t = upto
+        ours = [info["r_c"], info["h_c"], info["T_1"], x[3], info["T_b"]]
+        worst = max(worst, np.abs(np.array(ours) / x - 1).max())
+        heights.append(info["h_c"])
+        assert not terminated
+    assert max(heights) - min(heights) > 5e-4, "the hour must move the meniscus"
+    assert worst < 1e-8
+    end = np.array(env.get_state().slot.slot["x"].tolist())
+    np.testing.assert_allclose(end, x, rtol=1e-8)
+
+
+@pytest.mark.parametrize("drift", [-20.0, -5.0, 0.0, 1e-3, 5.0, 20.0])
+def test_hidden_load_is_the_static_equivalent_of_a_drift(drift):
+    p = make_puller()
+    T_1 = p.T_1_0 + drift
+    T_2 = brentq(lambda T: p.kappa_12 * (T_1**4 - T**4) - p.G_2b * (T - p.T_b_0), 1000, 3000, xtol=1e-12, rtol=1e-15)
+    load = hidden_load(drift, p)
+    assert load == pytest.approx(-p.G_2b * (T_2 - p.T_2_0), rel=1e-8, abs=1e-6)
+    assert drift * load <= 0
+    held = rates(State(p.r_0, p.h_0, T_1, T_2, p.T_b_0), p.inputs_0, Disturbance(load, 0.0, 1.0), p, hurle_slope)
+    assert [held.T_2 * p.C_2, held.T_b * p.C_b] == pytest.approx([0.0, 0.0], abs=1e-5)

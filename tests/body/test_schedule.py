@@ -1,0 +1,68 @@
+import numpy as np
+import pytest
+
+from cz_gym import SCENARIOS, make_puller
+from cz_gym.body.plant import hidden_load
+from cz_gym.body.schedule import bias_offset, disturbance, drift, pyrometer_drift, recipe, reference, ripple
+from cz_gym.episodes import schedule
+from cz_gym.episodes.record import Episode
+from cz_gym.episodes.series import draw_episode, new_series
+
+MINUTE = 60.0
+THREE_HOURS = 10800.0
+
+
+def episode(scenario):
+    return draw_episode(SCENARIOS[scenario], (1, 2), new_series(10, 10))
+
+
+def test_quintic_has_no_rate_and_no_curvature_at_its_ends():
+    s = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
+    points = np.linspace(0, 1, 101)
+    np.testing.assert_allclose(schedule.quintic(points), s(points), atol=1e-15)
+    for ends in (s.deriv(1), s.deriv(2)):
+        assert ends(np.array([0.0, 1.0])) == pytest.approx([0.0, 0.0], abs=1e-12)
+    assert (schedule.quintic(0.0), schedule.quintic(1.0)) == (0.0, 1.0)
+
+
+def test_paper_ramp_rises_half_a_kelvin_a_minute_for_ten_minutes():
+    e = episode("paper-ramp")
+    minutes = np.array([0.0, 10.0, 11.0, 15.0, 20.0, 90.0])
+    assert recipe(minutes * MINUTE, e) == pytest.approx([0.0, 0.0, 0.5, 2.5, 5.0, 5.0])
+    assert drift(60 * MINUTE, e) == 0.0
+
+
+@pytest.mark.parametrize(("name", "fall"), [("reference-a", -2.5e-3), ("reference-b", -0.5e-3)])
+def test_references_fall_over_half_an_hour(name, fall):
+    minutes = np.array([0.0, 10.0, 25.0, 40.0, 170.0])
+    expected = np.array([0.0, 0.0, 0.5, 1.0, 1.0]) * fall
+    assert reference(minutes * MINUTE, episode(name)) == pytest.approx(expected)
+
+
+def test_recipe_is_error_and_drift_together():
+    e = Episode(
+        recipe_start=600.0, recipe_duration=300.0, recipe_amount=2.0,
+        drift_start=0.0, drift_duration=1000.0, drift_amount=-4.0, drift_rate=0.1 / 60,
+    )  # fmt: skip
+    assert recipe(750.0, e) == pytest.approx(1.0 - 3.0 + 1.25)
+    assert drift(2000.0, e) == pytest.approx(-4.0 + 0.1 / 60 * 2000)
+
+
+def test_disturbance_hides_the_drift_and_melts_the_charge_away():
+    p = make_puller()
+    e = Episode(drift_duration=100.0, drift_amount=3.0, melt_loss=0.1)
+    d = disturbance(THREE_HOURS / 2, 0.7, e, p)
+    assert d.Q_d == pytest.approx(hidden_load(3.0, p))
+    assert d.dT_i == 0.7
+    assert d.melt == pytest.approx(0.95)
+    assert disturbance(2 * THREE_HOURS, 0.0, e, p).melt == pytest.approx(0.9)
+
+
+def test_errors_of_the_sensors_follow_their_schedule():
+    e = Episode(
+        ring_offset=1e-4, bias_drift_start=1000.0, bias_drift_duration=1000.0, bias_drift_amount=-2e-4,
+        ripple_amplitude=1e-4, ripple_omega=2 * np.pi / 6.0, ripple_phase=np.pi / 2, pyrometer_drift=2.0,
+    )  # fmt: skip
+    assert bias_offset(np.array([0.0, 1500.0, 9000.0]), e) == pytest.approx([1e-4, 0.0, -1e-4])
+    assert ripple(np.array([0.0, 3.0, 6.0]), e) == pytest.approx([1e-4, -1e-4, 1e-4])
+    assert pyrometer_drift(np.array([0.0, THREE_HOURS / 2, THREE_HOURS]), e) == pytest.approx([0.0, 1.0, 2.0])

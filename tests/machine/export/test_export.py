@@ -1,0 +1,382 @@
+"""Exported blocks: a block is the controller, other languages do what Python does, the shell keeps its promises."""
+
+import re
+import shutil
+import subprocess
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from cz_gym import agents
+from cz_gym.baselines.registry import make_controller
+from cz_gym.body.task import HEATER_RANGE, drives_of
+from cz_gym.config import make_config
+from cz_gym.machine.export.__main__ import main, make_block
+from cz_gym.machine.export.compiled import CompiledBlock
+from cz_gym.machine.export.onnx_graph import write_onnx
+from cz_gym.machine.export.policy import BlockPolicy
+from cz_gym.machine.export.shell import INPUTS, Alarm, in_shares
+from cz_gym.machine.export.text import write_c, write_st
+from cz_gym.observation import decode, readable
+from cz_gym.vector import CzVectorEnv
+from studies.export import LARGEST, report, study
+from tests.machine.export.structured_text import FunctionBlock
+
+CONTROLLERS = ("paper", "paper-tuned", "industrial", "lqg", "gradient", "ppo")
+needs_compiler = pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed: no C can be compiled")
+PULL, HEATER, ALARMS = "pull_speed_setpoint_mm_per_min", "heater_power_setpoint_kW", "alarms"
+
+
+def config_of(scenario, **changed):
+    return make_config(scenario, observation="measured", action="direct", horizon=1800.0, **changed)
+
+
+@cache
+def block_of(name, scenario="puller"):
+    return make_block(name, config_of(scenario))
+
+
+class OnnxBlock:
+    """A block's ONNX graph in onnxruntime, for one plant."""
+
+    def __init__(self, block):
+        runtime = pytest.importorskip("onnxruntime")
+        options = runtime.SessionOptions()
+        options.log_severity_level = 3
+        (content,) = write_onnx(block.program).values()
+        self.session = runtime.InferenceSession(content, options)
+
+    def start(self, n):
+        return {}
+
+    def run(self, inputs, memory):
+        given = {name: np.ravel(value).astype(np.float64) for name, value in inputs.items()}
+        names = [output.name for output in self.session.get_outputs()]
+        found = dict(zip(names, self.session.run(names, given | memory), strict=True))
+        return found, {"memory": found.pop("next_memory")}
+
+
+def nominal(changed=None):
+    """Inputs at the operating point."""
+    known = {name: port.default for name, port in block_of("paper").ports.items()}
+    ring = known["nominal_radius_mm"] + known["ring_bias_mm"]
+    given = {port.name: port.default for port in INPUTS} | {"ring_radius_mm": ring}
+    given |= {name: known["nominal_radius_mm"] for name in given if name.startswith("r_ref")}
+    given |= {name: known["nominal_T_1_K"] for name in given if name.startswith("T_1")}
+    given |= {"pull_speed_mm_per_min": 1.2, "heater_power_kW": known["nominal_heater_power_kW"]}
+    return given | (changed or {})
+
+
+class Plant:
+    """A block, called at times of the test's own."""
+
+    def __init__(self, name="paper-tuned", **changed):
+        self.block, self.changed = block_of(name), changed
+        self.memory = self.block.start(1)
+        self.time = 0.0
+
+    def __call__(self, time=None, **given):
+        self.time = self.time + 5.0 if time is None else time
+        clock = {"time_s": self.time, "ring_time_s": self.time}
+        outputs, self.memory = self.block.run(nominal(clock | given) | self.changed, self.memory)
+        return {name: float(value[0]) for name, value in outputs.items()}
+
+    def alarms(self, **given):
+        return Alarm(int(self(**given)["alarms"]))
+
+
+@pytest.mark.parametrize(
+    ("name", "scenario"),
+    [("paper", "puller"), ("industrial", "puller"), ("lqg", "puller"), ("lqg-at-0.02", "sensor-fault")],
+)
+def test_a_block_computes_what_the_controller_computes(name, scenario):
+    config, n = config_of(scenario), 3
+    controller = make_controller(name, config)
+    block = block_of(name, scenario)
+    policy, memory, state, last = BlockPolicy(block), block.start(n), None, None
+    env = CzVectorEnv.from_config(config, n)
+    observation, _ = env.reset(seed=list(range(n)))
+    for k in range(150):
+        seen = decode(np.asarray(observation, np.float64))
+        last = readable(seen, seen if last is None else last)
+        state = controller.at_rest(last) if state is None else state
+        pull, heat, state = controller.step(last._replace(T_1=seen.T_1), state)
+        inputs = policy.inputs(np.asarray(observation, np.float64), np.full(n, k))
+        outputs, memory = block.run(inputs | {"takeover_s": 0.0}, memory)
+        if k:
+            own = np.stack([pull / config.parameters.v_0, heat / HEATER_RANGE], axis=-1)
+            assert in_shares(outputs, config) == pytest.approx(np.clip(own, -1.0, 1.0), abs=1e-9)
+        observation, *_ = env.step(policy.action_of(outputs))
+
+
+@pytest.mark.parametrize("name", agents.shipped_names())
+def test_an_exported_agent_acts_as_onnxruntime_does(name):
+    """onnxruntime works in single precision, on observations that were rounded to it."""
+    policy, n = agents.load(name), 3
+    block = block_of(name, "sensor-fault")
+    twin, acts = BlockPolicy(block), {"action": policy.action, "horizon": 1800.0}
+    own, env = (
+        CzVectorEnv.from_config(make_config("sensor-fault", observation=observation, **acts), n)
+        for observation in (policy.observation, "measured")
+    )
+    seen, measured = own.reset(seed=[1, 2, 3])[0], env.reset(seed=[1, 2, 3])[0]
+    memory, state, drives = block.start(n), None, drives_of(policy.action, 5.0)
+    for k in range(120):
+        action, state = policy.predict(seen, state)
+        inputs = twin.inputs(np.asarray(measured, np.float64), np.full(n, k))
+        outputs, memory = block.run(inputs | {"takeover_s": 0.0}, memory)
+        if k:
+            applied, gains = measured[:, -2:].astype(np.float64), np.array([drives.pull, drives.heater])
+            wanted = np.clip(drives.keep * applied + gains * np.asarray(action), -1.0, 1.0)
+            assert (twin.action_of(outputs) - wanted) / gains == pytest.approx(0.0, abs=1e-4)
+        seen, measured = own.step(np.asarray(action))[0], env.step(np.asarray(action))[0]
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("name", "scenario"),
+    [
+        *((name, "puller") for name in CONTROLLERS),
+        *(pytest.param("lqg", scenario, marks=pytest.mark.slow) for scenario in ("sensor-fault", "randomized")),
+    ],
+)
+def test_c_and_onnx_act_as_python_does(name, scenario):
+    """On one crystal, which Python grows; within 1e-9, in single precision within 1e-5."""
+    block = block_of(name, scenario)
+    others = [None, CompiledBlock(block), OnnxBlock(block), CompiledBlock(block, single=True)]
+    policies, states = [BlockPolicy(block, other) for other in others], [None] * 4
+    env = CzVectorEnv.from_config(block.config, 1)
+    observation, _ = env.reset(seed=[1])
+    for _ in range(100):
+        done = [policy.predict(observation, state) for policy, state in zip(policies, states, strict=True)]
+        states = [state for _, state in done]
+        own, *rest = (state.outputs for state in states)
+        for found, tolerance in zip(rest, (1e-9, 1e-9, 1e-5), strict=True):
+            assert in_shares(found, block.config) == pytest.approx(in_shares(own, block.config), abs=tolerance)
+        assert rest[0][ALARMS] == rest[1][ALARMS] == own[ALARMS]
+        observation, *_ = env.step(done[0][0])
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_the_study_of_exported_c_finds_what_the_page_says():
+    """A loop in single precision may end elsewhere."""
+    rows = study("paper-tuned", "puller", 1)
+    assert [row.real for row in rows] == ["double", "float"]
+    assert all(row.difference <= LARGEST[row.real] for row in rows)
+    assert rows[0].python == rows[0].c
+    assert "above the limit: none." in report(rows, 1)
+
+
+MAIN = """
+#include "cz_{name}.h"
+#include <stdio.h>
+int main(void)
+{{
+    cz_{name} block;
+    cz_{name}_measured m;
+    cz_{name}_setpoints s;
+    double x[{count}];
+    int i;
+    cz_{name}_init(&block);
+    for (;;) {{
+        for (i = 0; i < {count}; i++) if (scanf("%lf", &x[i]) != 1) return 0;
+        {assign}
+        cz_{name}_step(&block, &m, &s);
+        printf("%.17g %.17g %u\\n", (double)s.{pull}, (double)s.{heater}, s.alarms);
+    }}
+}}
+"""
+SANITIZED = "-std=c99 -pedantic -Wall -Wextra -Werror -g -fsanitize=address,undefined -fno-sanitize-recover=all"
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", [*CONTROLLERS[:3], pytest.param("lqg", marks=pytest.mark.slow), *CONTROLLERS[4:]])
+def test_the_c_is_clean_under_sanitizers_whatever_it_reads(name, tmp_path):
+    block = block_of(name)
+    assign = " ".join(
+        f"m.{port.name} = {f'x[{at}] > 0.5' if port.logical else f'x[{at}]'};" for at, port in enumerate(INPUTS)
+    )
+    main_c = MAIN.format(name=block.name, count=len(INPUTS), assign=assign, pull=PULL, heater=HEATER)
+    for file, text in (write_c(block.program) | {"main.c": main_c}).items():
+        (tmp_path / file).write_text(text)
+    files = ["main.c", f"cz_{block.name}.c", "-o", "block", "-lm"]
+    subprocess.run(["gcc", *SANITIZED.split(), *files], cwd=tmp_path, check=True)
+    rng, rows, memory, expected = np.random.default_rng(1), [], block.start(1), []
+    odd = [np.nan, np.inf, -np.inf, 1e300, -1e300, 0.0, 1e-300]
+    for k in range(60):
+        given = nominal({"time_s": 5.0 * k, "ring_time_s": 5.0 * k})
+        given["ring_radius_mm"] += rng.normal(0.0, 0.1)
+        if k % 3 == 2:
+            given[str(rng.choice([port.name for port in INPUTS]))] = float(rng.choice(odd))
+        rows.append(" ".join(repr(given[port.name]) for port in INPUTS))
+        outputs, memory = block.run(given, memory)
+        expected.append([outputs[output][0] for output in (PULL, HEATER, ALARMS)])
+    done = subprocess.run(["./block"], input="\n".join(rows), cwd=tmp_path, capture_output=True, text=True, check=True)
+    found = np.array([line.split() for line in done.stdout.splitlines()], np.float64)
+    assert found == pytest.approx(np.array(expected), abs=1e-8)
+
+
+ODD = st.one_of(st.floats(), st.sampled_from([np.nan, np.inf, -np.inf]))
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    st.sampled_from(["paper", "lqg", "gradient"]),
+    st.lists(
+        st.dictionaries(st.sampled_from([port.name for port in INPUTS]), ODD, max_size=4), min_size=3, max_size=12
+    ),
+)
+def test_no_reading_brings_a_setpoint_outside_its_limits(name, samples):
+    plant = Plant(name, pull_speed_min_mm_per_min=0.9, pull_speed_max_mm_per_min=1.4)
+    known = {name: port.default for name, port in plant.block.ports.items()}
+    for sample in samples:
+        outputs = plant(**{"time": plant.time + 5.0} | sample)
+        assert 0.9 <= outputs[PULL] <= 1.4
+        assert known["heater_power_min_kW"] <= outputs[HEATER] <= known["heater_power_max_kW"]
+        assert outputs[ALARMS] >= 0
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_takeover_moves_no_drive_and_authority_grows(name):
+    plant = Plant(name)
+    off = {"pull_speed_mm_per_min": 1.31, "heater_power_kW": 58.7, "ring_radius_mm": 102.0}
+    for automatic in (0.0, 0.0, 1.0):
+        outputs = plant(automatic=automatic, **off)
+        assert (outputs[PULL], outputs[HEATER]) == (1.31, 58.7)
+        assert bool(int(outputs[ALARMS]) & Alarm.MANUAL) == (not automatic)
+    alarms = [plant.alarms(**off) for _ in range(13)]
+    assert all(Alarm.TAKEOVER in alarm for alarm in alarms[:11])
+    assert Alarm.TAKEOVER not in alarms[-1]
+
+
+def test_a_bad_ring_is_held_then_the_pid_takes_over_until_the_next_takeover():
+    plant = Plant("lqg")
+    for _ in range(20):
+        assert plant.alarms() & ~Alarm.TAKEOVER == 0
+    bad = [plant.alarms(valid=0.0) for _ in range(60)]
+    assert bad[0] == Alarm.RING
+    assert [Alarm.FALLBACK in alarm for alarm in bad].index(True) == 48  # the first after 240 s
+    assert Alarm.FALLBACK in plant.alarms()
+    assert Alarm.FALLBACK in plant.alarms(automatic=1.0)
+    plant(automatic=0.0)
+    assert Alarm.FALLBACK not in plant.alarms()
+
+
+@pytest.mark.parametrize(
+    ("given", "alarm"),
+    [
+        ({"ring_radius_mm": 130.0}, Alarm.RING),
+        ({"ring_radius_mm": np.nan}, Alarm.RING),
+        ({"T_1_K": 300.0}, Alarm.PYROMETER),
+        ({"heater_power_kW": np.inf}, Alarm.DRIVES),
+        ({"r_ref_5min_mm": 0.0}, Alarm.REFERENCE),
+    ],
+)
+def test_each_reading_has_its_alarm_and_is_held(given, alarm):
+    plant, twin = Plant(), Plant()
+    for _ in range(20):
+        plant(), twin()
+    assert plant.alarms(**given) == alarm
+    assert plant.alarms() == twin.alarms() == 0
+
+
+def test_the_clock_is_watched_and_no_sample_is_taken_twice():
+    plant = Plant()
+    for _ in range(20):
+        before = plant()
+    assert plant(time=102.0) == before  # too early: the same again
+    assert int(plant(time=102.0)[ALARMS]) == 0
+    assert int(plant(time=100.0)[ALARMS]) == Alarm.CLOCK
+    assert int(plant(time=np.nan)[ALARMS]) & Alarm.CLOCK
+    assert int(plant(time=105.0)[ALARMS]) == 0
+    assert int(plant(time=112.0)[ALARMS]) == Alarm.LATE
+    old = plant.alarms(ring_time_s=plant.time - 30.0)
+    assert old == Alarm.RING
+
+
+def test_ranges_and_slew_rates_hold():
+    plant = Plant("paper", pull_slew_mm_per_min2=0.3, heater_slew_kW_per_min=1.0, pull_speed_max_mm_per_min=1.5)
+    rng, before = np.random.default_rng(0), None
+    for _ in range(100):
+        outputs = plant(ring_radius_mm=101.6 + rng.normal(0.0, 1.0), T_1_ref_K=1810.0)
+        if before is not None:
+            assert abs(outputs[PULL] - before[PULL]) <= 0.3 / 12.0 + 1e-12
+            assert abs(outputs[HEATER] - before[HEATER]) <= 1.0 / 12.0 + 1e-12
+        assert outputs[PULL] <= 1.5
+        before = outputs
+    assert int(outputs[ALARMS]) & Alarm.HEATER_LIMITED
+
+
+@pytest.mark.parametrize(("name", "to", "files"), [("lqg-at-0.02", "c", 3), ("ppo", "st", 2), ("lqg", "onnx", 2)])
+def test_the_command_writes_a_folder(name, to, files, tmp_path):
+    assert main([name, "--to", to, "--out", str(tmp_path)]) == 0
+    assert len(list(tmp_path.iterdir())) == files
+    assert (tmp_path / f"cz_{re.sub('[^a-z0-9]', '_', name)}.{to}").is_file()
+    text = (tmp_path / "README.md").read_text()
+    for fact in ("US 9,340,897", "tested on a real puller", "ring_radius_mm"):
+        assert fact in text
+    assert config_of("puller").plant_hash in text
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["--plant"], "--plant --to fmu"),
+        (["nobody"], "unknown controller or agent 'nobody'"),
+        (["open-loop"], "cannot be exported"),
+        (["lqg-true"], "unknown"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused_in_one_line(given, said, tmp_path, refused):
+    assert said in refused(main, [*given, "--to", "c", "--out", str(tmp_path / "out")])
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_puller_file_gives_nominal_values_limits_and_its_name(tmp_path):
+    assert main(["paper-tuned", "--to", "c", "--out", str(tmp_path), "--puller", "silicon-300mm"]) == 0
+    source, header = ((tmp_path / f"cz_paper_tuned.{end}").read_text() for end in "ch")
+    config = config_of("puller", puller="silicon-300mm")
+    assert config.puller.label in header
+    assert f"nominal_radius_mm = {config.parameters.r_0 * 1e3!r}" in source
+    assert "pull_slew_mm_per_min2 = 1.0E30" not in source
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_the_structured_text_acts_as_python_does(name):
+    """Statement by statement, on noisy readings of which some are bad."""
+    exported, rng = block_of(name), np.random.default_rng(5)
+    (text,) = write_st(exported.program).values()
+    assert not re.search(r"< (valid|automatic)\b", text), "a BOOL is no number"
+    block, memory, pull = FunctionBlock(text), exported.start(1), 1.2
+    for k in range(60):
+        ring, pyrometer = 101.6 + rng.normal(0.0, 0.1), 1785.6 + rng.normal(0.0, 0.3)
+        inputs = nominal({"time_s": 5.0 * k, "ring_time_s": 5.0 * k, "ring_radius_mm": ring, "T_1_K": pyrometer})
+        inputs |= {"r_ref_5min_mm": 87.5 - 0.02 * k, "pull_speed_mm_per_min": pull}
+        inputs |= {"valid": 0.0, "T_1_K": np.nan} if k in (30, 31, 47) else {}
+        outputs, memory = exported.run(inputs, memory)
+        found = block(**inputs)
+        for output, scale in ((PULL, 1.2), (HEATER, 10.0)):
+            assert found[output] / scale == pytest.approx(float(outputs[output][0]) / scale, abs=1e-9)
+        assert found[ALARMS] == outputs[ALARMS][0]
+        pull = found[PULL]
+    assert block(reset=True, **nominal({"time_s": 1e3, "ring_time_s": 1e3, "pull_speed_mm_per_min": 1.1}))[PULL] == 1.1
+
+
+@pytest.mark.parametrize(
+    "name", ["paper", *(pytest.param(name, marks=pytest.mark.slow) for name in ("paper-tuned", "lqg"))]
+)
+def test_the_structured_text_is_of_the_standard(name):
+    """Long tables of constants are cut for the parser, which needs minutes for them."""
+    parse = pytest.importorskip("blark.parse", reason="blark, the parser of structured text, is not installed")
+    (text,) = write_st(block_of(name).program).values()
+    table = re.compile(r":= \[\n(.*?)\n    \];", re.DOTALL)
+    cut = table.sub(lambda found: f":= [{', '.join(found[1].split(', ')[:3])}];", text)
+    parsed = parse.parse_source_code(cut)
+    assert parsed.exception is None
+    (block,) = parsed.transform().items
+    assert str(block.name) == f"cz_{block_of(name).name}"
+    assert len(block.body.statements) > 100

@@ -1,0 +1,57 @@
+"""The command: a puller file, a report and pictures; or one line and nothing. The study, on three pullers."""
+
+import pytest
+
+from cz_gym.machine.identify import __main__ as command
+from cz_gym.machine.puller import read_puller
+from examples import identify as example
+from studies import identify as study
+
+
+def test_the_command_writes_the_puller_and_its_report(logs, found, tmp_path, monkeypatch):
+    monkeypatch.setattr(command, "identify", lambda *_: found)
+    out = tmp_path / "new" / "my.toml"
+    assert command.main([str(logs[0]), "--out", str(out)]) == 0
+    files = {file.name for file in out.parent.iterdir()}
+    assert files == {"my-numbers.png", "my-readings.png", "my.md", "my.toml"}
+    assert read_puller(out).hash == found.puller.hash
+    text = out.with_suffix(".md").read_text()
+    assert text.count("| told |") == sum(e.informed for e in (*found.estimates, *found.noise))
+    assert "says nothing about it" in text
+    assert "calliper" in text
+
+
+def test_the_example_goes_from_a_log_to_a_controller(logs, found, tmp_path, monkeypatch):
+    monkeypatch.setattr(example, "identify", lambda *_: found)
+    out = tmp_path / "my.toml"
+    assert 0.0 < example.main(str(logs[0]), out=str(out)) < 0.2
+    assert read_puller(out).hash == found.puller.hash
+    assert out.with_suffix(".md").is_file()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--out", "my.txt"], "--out must be a file NAME.toml"),
+        (["--prior", "C_1"], "--prior C_1: write it as NAME=SD"),
+        (["--prior", "C1=0.1"], "did you mean 'C_1'"),
+        (["--column", "T_1_K=PYRO"], "unknown column 'PYRO'"),
+        (["--column", "ring_mm=DIA"], "unknown column 'ring_mm': did you mean 'ring_radius_mm'"),
+        (["--column", "T_1_K=PYRO:F"], "unknown unit of T_1_K 'F'; choose from K, degC"),
+        (["--column", "T_1_K"], "T_1_K: say which column it is"),
+        (["--column", "ring_radius_mm=ring_radius_mm:cm"], "is it another puller's log?"),
+        (["--puller", "none.toml"], "none.toml: No such file"),
+    ],
+)
+def test_what_is_wrong_is_one_line_and_nothing_is_written(options, said, logs, tmp_path, refused):
+    given = options if "--out" in options else [*options, "--out", str(tmp_path / "new" / "my.toml")]
+    assert said in refused(command.main, [str(logs[0]), *given])
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.slow
+def test_the_study_identifies_pullers_that_nobody_knows(tmp_path, capsys):
+    assert study.main(["--quick", "--out", str(tmp_path)]) == 0
+    text = (tmp_path / "pullers.txt").read_text()
+    assert text in capsys.readouterr().out
+    assert "tell the pull speed's path: 0\n" in text

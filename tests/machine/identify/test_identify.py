@@ -1,0 +1,118 @@
+"""Identification: exact derivatives, exact predictions without noise, and what a log can and cannot tell."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from cz_gym import CzEnv, Parameters
+from cz_gym.action import MadeFor
+from cz_gym.baselines.policy import OpenLoop
+from cz_gym.body.task import HEATER_RANGE
+from cz_gym.errors import CzError
+from cz_gym.machine.identify import Excited, identify, read_log, record_log
+from cz_gym.machine.identify.estimate import HEATER, PULL, measure_excitation, whiteness
+from cz_gym.machine.identify.excitation import CHIPS, SEQUENCE
+from cz_gym.machine.identify.log import Log
+from cz_gym.machine.identify.model import LAM, Model, Noise, predict, sensitivities
+from cz_gym.machine.puller import DEFAULT
+from cz_gym.observation import decode
+from tests.machine.identify.conftest import TRUTH
+
+
+@pytest.mark.parametrize(("interval", "off"), [(5.0, 1e-5), (10.0, 1e-4)])
+def test_without_noise_the_filter_of_the_true_puller_predicts_every_reading(interval, off, tmp_path):
+    env = CzEnv("nominal", 0.5, "measured", interval, 3600.0, parameters=TRUTH, action="direct", info="all")
+    record_log(env, Excited(OpenLoop(), heater=0.01), tmp_path / "log.csv", seed=0)
+    log, model = read_log(tmp_path / "log.csv"), Model(("C_1",), TRUTH)
+    assert np.ptp(log.T_1) > 1.0
+    assert np.abs(predict(log, model, np.zeros(1)).error[1:]).max() < off
+    assert np.abs(predict(log, model, np.array([0.05])).error[:, 0]).max() > 0.02
+
+
+def test_derivatives_are_those_of_the_filter(logs):
+    log = Log(*(each[:400] if isinstance(each, np.ndarray) else each for each in read_log(logs[0])))
+    model = Model((*HEATER, *PULL, *Noise._fields), Parameters())
+    theta, step = model.mean + 0.05, 1e-5
+    out, *exact = sensitivities(log, model, theta)
+    for j, name in enumerate(model.names):
+        up, down = (predict(log, model, theta + sign * step * np.eye(len(theta))[j]) for sign in (1.0, -1.0))
+        for part in (0, 1):
+            differences = (up[part] - down[part]).real / (2.0 * step)
+            scale = np.abs(differences).max(axis=0) + 1e-4 * np.sqrt(out.variance).max(axis=0)
+            assert np.abs((exact[part][j] - differences) / scale).max() < 2e-3, name
+
+
+def test_a_log_with_excitation_tells_the_hot_zone(found):
+    told = {e.name: e for e in found.estimates if e.informed}
+    assert found.settled
+    assert {"C_1", "C_2", "kappa_12", "G_1a", "G_2b", "eps"} <= set(told)
+    assert np.mean([e.low < getattr(TRUTH, e.name, LAM * TRUTH.dT_0) < e.high for e in told.values()]) >= 0.85
+    learned = found.puller.parameters
+    np.testing.assert_allclose([learned.C_1, learned.C_2], [TRUTH.C_1, TRUTH.C_2], rtol=0.05)
+    changed = {name for name in Parameters._fields if getattr(learned, name) != getattr(Parameters(), name)}
+    assert changed == set(told) - {"lam"}, "what the log does not tell keeps its value"
+    assert min(found.excitation) > 5.0
+    assert min(found.whiteness) > 0.01
+
+
+def test_a_log_of_a_controller_alone_tells_nothing(logs):
+    passive = identify(read_log(logs[1]))
+    assert max(passive.excitation) < 0.5
+    assert not any(e.informed or e.excited for e in passive.estimates)
+    assert passive.puller.parameters == Parameters()
+
+
+def test_a_log_quicker_than_its_controller_is_no_more_excited(logs):
+    for path, enough in zip(logs, (True, False), strict=True):
+        log = read_log(path)
+        quick = log._replace(**{name: np.repeat(getattr(log, name), 5) for name in Log._fields[:8]}, interval=1.0)
+        assert (min(measure_excitation(quick, DEFAULT)) > 1.0) is enough
+        assert (max(measure_excitation(quick, DEFAULT)) > 1.0) is enough
+
+
+@pytest.mark.parametrize("action", ["direct", "smooth", "rate"])
+def test_the_drives_follow_the_sequence_whatever_the_action_means(action):
+    class Rest(OpenLoop):
+        """Nominal drives, which are the ones that it sees."""
+
+        def predict(self, observation, state=None, episode_start=None, deterministic=True):
+            seen = decode(observation)
+            assert abs(seen.v_p) < 1e-10
+            assert abs(seen.Q_H) < 1e-2
+            return super().predict(observation, state, episode_start, deterministic)
+
+    Rest.action, size = action, 0.003  # what a smooth drive can do in one step
+    env = CzEnv("nominal", 0.5, "measured", action=action, info="all")
+    excited, state = Excited(Rest(), size, size), None
+    observation, start = env.reset(seed=0)
+    for k in range(60):
+        chosen, state = excited.predict(observation, state)
+        observation, _, _, _, info = env.step(chosen)
+        assert info["v_p"] / start["v_p"] - 1.0 == pytest.approx(size * SEQUENCE[k // 12], abs=1e-6)
+        other = size * SEQUENCE[k // 12 + CHIPS // 2]
+        assert info["Q_H"] - start["Q_H"] == pytest.approx(other * start["Q_H"], abs=2e-6 * HEATER_RANGE)
+
+
+def test_excitation_stops_for_good_beyond_a_radius_error():
+    excited = Excited(OpenLoop(), limit=1.5e-3)
+    near, far = np.zeros((2, 1, 11), np.float32)
+    near[:, 1] = far[:, 1] = 1.0
+    far[:, 0] = 1.6
+    action, state = excited.predict(near)
+    assert np.abs(action).min() > 0.02
+    for seen, begins, moves in ((far, False, False), (near, False, False), (near, True, True)):
+        action, state = excited.predict(seen, state, np.array([begins]))
+        assert bool(np.abs(action).any()) is moves
+    with pytest.raises(CzError, match="amplitudes"):
+        Excited(OpenLoop(), pull=0.5)
+    agent = SimpleNamespace(control_interval=2.0, made_for=MadeFor("rate", 2.0, "1234", "mine (5678)"))
+    with pytest.raises(CzError, match="does not say its puller's numbers"):
+        Excited(agent)
+
+
+def test_whiteness_tells_white_from_coloured():
+    white = np.random.default_rng(1).standard_normal(2000)
+    white[100:150] = np.nan
+    assert whiteness(white) > 0.01
+    assert whiteness(white[1:] + 0.3 * white[:-1]) < 1e-6

@@ -1,0 +1,112 @@
+"""The machine behind the tags: whose setpoints act, what is refused, and a clock that nothing delays."""
+
+import math
+import time
+
+import numpy as np
+import pytest
+
+from cz_gym.config import make_config
+from cz_gym.machine.serve.machine import SETPOINTS, Alarm, Clock, Machine
+
+PULL, HEATER = SETPOINTS
+
+
+def machine(watchdog=60.0, log=None, **settings):
+    return Machine(make_config("randomized", None, "measured", action="direct", **settings), 1, watchdog, log)
+
+
+def test_setpoints_act_once_the_step_they_answer_is_written_and_not_before():
+    one = machine()
+    assert one.offer({PULL: 1.5}) == {}
+    one.step()
+    assert one.step()["pull_speed_mm_per_min"] == pytest.approx(1.2, abs=0.1), "the fallback's"
+    assert one.offer({PULL: 1.5, HEATER: 58.0, "watchdog": 2}) == {}
+    tags = one.step()
+    assert tags["pull_speed_mm_per_min"] == pytest.approx(1.5)
+    assert tags["heater_power_kW"] == pytest.approx(58.0)
+    assert (tags["control"], tags["alarms"], tags["step"], tags["watchdog"]) == ("client", 0, 3, 2)
+
+
+def test_a_refused_value_refuses_all_that_came_with_it():
+    one = machine()
+    low, high = one.limits[HEATER]
+    for bad in (math.nan, math.inf, -math.inf, high + 1e-3, low - 1e-3):
+        assert list(one.offer({PULL: 1.5, HEATER: bad, "watchdog": 0})) == [HEATER]
+    assert one.answered == -1
+    assert one.offer({PULL: one.limits[PULL][1], HEATER: low, "watchdog": 0}) == {}
+    for step in (0, 1):
+        assert list(one.offer({"watchdog": step})) == ["watchdog"], "answered, and not begun"
+
+
+def test_setpoints_that_are_not_renewed_are_held_and_then_the_fallback_takes_over_without_a_jump():
+    one = machine(watchdog=30.0)
+    one.offer({PULL: 1.5, HEATER: 57.5, "watchdog": 0})
+    rows = [one.step() for _ in range(8)]
+    assert [row["control"] for row in rows] == ["client", *["held"] * 5, *["fallback"] * 2]
+    assert [row["alarms"] for row in rows] == [0, *[Alarm.HELD] * 5, *[Alarm.FALLBACK] * 2]
+    assert [row["pull_speed_mm_per_min"] for row in rows[:7]] == pytest.approx([1.5] * 7), "its first is the held one"
+    rows += [one.step() for _ in range(1000)]
+    assert np.abs(np.diff([row["pull_speed_mm_per_min"] for row in rows[6:20]])).max() < 0.12
+    assert all(row["state"] == "growing" for row in rows)
+    assert abs(rows[-1]["ring_radius_mm"] - rows[-1]["ring_bias_mm"] - rows[-1]["r_ref_mm"]) < 0.5
+    one.offer({PULL: 1.3, HEATER: 57.0, "watchdog": 1008})
+    assert one.step()["control"] == "client"
+
+
+def test_the_operator_takes_control_and_gives_it_back():
+    one = machine(watchdog=10.0)
+    assert list(one.by_hand({PULL: 9.0, HEATER: 57.0})) == [PULL]
+    assert one.by_hand({PULL: 1.4, HEATER: 57.0}) == {}
+    assert one.offer({"watchdog": 0}) == {"watchdog": "the operator has control"}
+    rows = [one.step() for _ in range(10)]
+    assert {(row["control"], row["alarms"]) for row in rows} == {("manual", Alarm.MANUAL)}
+    assert [row["pull_speed_mm_per_min"] for row in rows] == pytest.approx([1.4] * 10)
+    assert one.by_hand({}) == {}
+    assert [one.step()["control"] for _ in range(3)] == ["held", "fallback", "fallback"]
+
+
+def test_a_lost_crystal_raises_an_alarm():
+    one = machine()
+    while not one.over:
+        one.offer({PULL: 0.0, "watchdog": one.k})
+        tags = one.step()
+    assert tags["alarms"] & Alarm.ENDED
+    assert "frozen" in tags["state"] or "lost" in tags["state"]
+
+
+def test_a_clock_makes_up_for_what_it_missed_and_does_not_drift():
+    """A publisher that blocks for 0.3 s, more than twenty steps, costs none of them."""
+    one, times = machine(), []
+
+    def published(tags):
+        times.append(time.monotonic())
+        if tags["step"] == 20:
+            time.sleep(0.3)
+
+    clock = Clock(one, 400.0, True, published)
+    clock.start()
+    time.sleep(0.1)
+    assert one.k == 0, "it waits for the first setpoints"
+    one.offer({"watchdog": 0})
+    begin = time.monotonic()
+    while one.k < 120:
+        time.sleep(0.001)
+    clock.stopped.set()
+    clock.join()
+    lag = np.array(times) - begin - np.arange(1, len(times) + 1) * 5.0 / 400.0
+    assert lag.min() > -0.02
+    assert lag[60:].min() < 0.05, "it has caught up"
+    assert any(row["alarms"] & Alarm.LATE for row in one.hour)
+    assert [row["step"] for row in one.hour] == list(range(one.k + 1))
+
+
+def test_an_error_in_the_clock_reaches_whoever_waits():
+    sent = []
+    one = machine(horizon=10.0)
+    one.step = lambda: 1 / 0
+    clock = Clock(one, 1e6, False, sent.append)
+    clock.start()
+    clock.join(10.0)
+    assert sent == [{}]
+    assert isinstance(clock.error, ZeroDivisionError)

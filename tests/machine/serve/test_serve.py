@@ -1,0 +1,227 @@
+"""The OPC UA server and the page: who may do what, and what clients cannot break."""
+
+import asyncio
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+
+from cz_gym.machine.identify.log import read_log
+from cz_gym.machine.serve import __main__ as command
+from cz_gym.machine.serve.machine import SETPOINTS
+from tests.machine.serve.conftest import PASSWORD, answer, connected, free_port, running, with_client
+from tests.processes import ROOT
+
+from asyncua import ua  # isort: skip
+
+PULL, HEATER = SETPOINTS
+
+
+@pytest.fixture(scope="module")
+def puller(tmp_path_factory):
+    """A puller on the loopback, 200 times as fast as real, for everybody."""
+    with running(tmp_path_factory.mktemp("open"), "--speed", "200", "--hours", "1000") as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def locked(tmp_path_factory):
+    """A puller with accounts, as strict as one that listens on another address."""
+    patch = pytest.MonkeyPatch()
+    for role in ("OPERATOR", "READER"):
+        patch.setenv(f"CZ_GYM_{role}_PASSWORD", PASSWORD)
+    users = ("--operator", "olga", "--reader", "rita")
+    with running(tmp_path_factory.mktemp("locked"), *users, "--speed", "20", remote=True) as one:
+        yield one
+    patch.undo()
+
+
+def test_values_of_wrong_type_or_size_are_refused_and_logged(puller):
+    async def act(hand):
+        low, high = puller.machine.limits[PULL]
+        for bad in (np.nan, np.inf, low - 1.0, high + 1.0):
+            assert await hand.write(**{PULL: bad}) == ["BadOutOfRange"]
+        for wrong in (
+            ua.Variant(1, ua.VariantType.Int32), ua.Variant("1.2"), ua.Variant([1.2, 1.3], ua.VariantType.Double),
+            ua.Variant(1.2, ua.VariantType.Float), ua.Variant(None), ua.Variant(True),
+        ):  # fmt: skip
+            assert await hand.write(**{PULL: wrong}) == ["BadTypeMismatch"], wrong
+        for name, value in (("ring_radius_mm", 100.0), ("step", 7), ("state", "growing")):
+            assert await hand.write(**{name: value}) == ["BadUserAccessDenied"]
+        assert await hand.write(**answer(await hand.read("step") + 1000)) == ["BadInvalidState"] * 2 + ["BadOutOfRange"]
+        assert await hand.write(**answer(await hand.read("step"), heater=np.nan)) == [
+            "BadInvalidState", "BadOutOfRange", "BadInvalidState",
+        ]  # fmt: skip
+        assert low <= await hand.read(PULL) <= high, "nothing that was refused is kept"
+
+    with_client(puller.url, act)
+    assert any(f"{HEATER} = nan" in line for line in puller.door.events)
+
+
+def test_ten_clients_at_once_of_which_one_floods_and_no_step_is_late(puller):
+    async def reads(hand):
+        seen = set()
+        for _ in range(50):
+            values = await hand.client.read_values([hand.nodes["time_s"], hand.nodes["step"]])
+            assert values[0] == pytest.approx(5.0 * values[1])
+            seen.add(values[1])
+            await asyncio.sleep(0.01)
+        return len(seen)
+
+    async def floods(hand):
+        refused = 0
+        for _ in range(100):
+            codes = await asyncio.gather(*(hand.write(**{PULL: 99.0}) for _ in range(10)))
+            refused += codes.count(["BadOutOfRange"])
+        return refused
+
+    async def all_of_them():
+        acts = [reads] * 9 + [floods]
+        return await asyncio.gather(*(connected(puller.url, act) for act in acts))
+
+    begin, first = time.monotonic(), puller.machine.k
+    found = asyncio.run(all_of_them())
+    expected = (time.monotonic() - begin) * 40.0
+    assert puller.machine.k - first == pytest.approx(expected, abs=40)
+    assert min(found[:9]) > 5
+    assert found[9] == 1000
+    assert len(puller.door.events) <= 100
+
+
+def test_a_client_that_dies_in_the_middle_of_a_message_leaves_all_as_it_was(puller):
+    async def takes(hand):
+        assert await hand.write(**answer(await hand.read("step"), 1.25, 57.2)) == ["Good"] * 3
+        await hand.write(**{PULL: 2.0})  # half of what it meant to say
+
+    with_client(puller.url, takes)
+    for message in (b"HELF\x40\x00\x00\x00half", b"MSGF" + b"\xff" * 4, os.urandom(4096), b""):
+        with socket.create_connection(("127.0.0.1", puller.port)) as one:
+            one.sendall(message)
+    time.sleep(1.0)
+    rows = list(puller.machine.hour)[-60:]
+    assert {"held", "fallback"} & {row["control"] for row in rows}
+    assert max(row[PULL] for row in rows) < 1.9, "2.0 was never committed"
+    assert with_client(puller.url, lambda hand: hand.read("control")) == "fallback"
+    before = puller.machine.k
+    time.sleep(1.0)
+    assert puller.machine.k - before == pytest.approx(40, abs=8)
+
+
+def test_the_page_is_read_only_on_a_puller_without_accounts(puller):
+    data = json.load(urllib.request.urlopen(f"http://127.0.0.1:{puller.page}/data"))
+    assert (data["user"], data["writes"], data["accounts"]) == ("", False, False)
+    assert [row["step"] for row in data["hour"]] == list(range(data["hour"][0]["step"], data["now"]["step"] + 1))
+    picture = urllib.request.urlopen(f"http://127.0.0.1:{puller.page}/crystal.png").read()
+    assert picture.startswith(b"\x89PNG")
+    assert posted(f"http://127.0.0.1:{puller.page}", {})[0] == 403
+
+
+def posted(page, body, user="", kind="application/json", context=None):
+    import base64
+
+    headers = {"Content-Type": kind}
+    if user:
+        headers["Authorization"] = "Basic " + base64.b64encode(f"{user}:{PASSWORD}".encode()).decode()
+    request = urllib.request.Request(f"{page}/setpoints", json.dumps(body).encode(), headers)
+    try:
+        with urllib.request.urlopen(request, context=context) as reply:
+            return reply.status, reply.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode()
+
+
+def test_elsewhere_nobody_reads_without_an_account_and_encryption(locked):
+    for user, password in (("", ""), ("olga", "wrong horse"), ("nobody", PASSWORD)):
+        with pytest.raises((ua.UaError, ConnectionError, TimeoutError)):
+            encrypted(locked, lambda hand: hand.read("step"), user, password)
+    with pytest.raises((ua.UaError, ConnectionError, TimeoutError)):
+        with_client(locked.url, lambda hand: hand.read("step"), "olga")
+    assert any("login as 'olga'" in line for line in locked.door.events)
+
+
+def test_a_reader_reads_and_an_operator_writes(locked):
+    async def act(hand):
+        step = await hand.read("step")
+        return step, await hand.write(**answer(step))
+
+    assert encrypted(locked, act, "rita", PASSWORD)[1] == ["BadUserAccessDenied"] * 3
+    assert encrypted(locked, act, "olga", PASSWORD)[1] == ["Good"] * 3
+    assert any(line.endswith(f"reader rita: {PULL} = 1.2: BadUserAccessDenied") for line in locked.door.events)
+    assert (locked.folder / "certificates" / "key.pem").stat().st_mode & 0o077 == 0
+
+
+def encrypted(puller, act, user, password):
+    return with_client(puller.url, act, user, password, puller.folder / "certificates")
+
+
+def test_the_page_elsewhere_is_encrypted_and_only_an_operator_sets_drives(locked):
+    import ssl
+
+    context = ssl.create_default_context(cafile=str(locked.folder / "certificates" / "certificate.pem"))
+    context.check_hostname = False
+    page, wanted = f"https://127.0.0.1:{locked.page}", {PULL: 1.3, HEATER: 57.0}
+    with pytest.raises(urllib.error.HTTPError, match="401"):
+        urllib.request.urlopen(f"{page}/data", context=context)
+    assert posted(page, wanted, context=context)[0] == 401
+    assert posted(page, wanted, "rita", context=context)[0] == 403
+    assert posted(page, wanted, "olga", "text/plain", context)[0] == 403, "what another site's form could send"
+    for bad in ({PULL: 1.3}, {PULL: "1.3", HEATER: 57.0}, [1.3], None):
+        assert posted(page, bad, "olga", context=context)[0] == 400
+    assert posted(page, {PULL: 99.0, HEATER: 57.0}, "olga", context=context) == (400, f"{PULL}: outside 0 to 2.4")
+    assert posted(page, wanted, "olga", context=context) == (200, "")
+    assert locked.machine.control == "manual"
+    assert posted(page, {}, "olga", context=context)[0] == 200
+
+
+@pytest.mark.slow
+def test_a_killed_server_leaves_a_whole_log(tmp_path):
+    log = tmp_path / "log.csv"
+    options = ["--speed", "2000", "--port", str(free_port()), "--page-port", "0", "--log", str(log)]
+    server = subprocess.Popen(
+        [sys.executable, "-m", "cz_gym.machine.serve", *options], cwd=ROOT, stdout=subprocess.PIPE
+    )
+    try:
+        assert server.stdout is not None
+        server.stdout.readline()
+        until = time.monotonic() + 60.0
+        while (before := log.read_bytes().count(b"\n")) < 500 and time.monotonic() < until:
+            time.sleep(0.05)
+    finally:
+        server.send_signal(signal.SIGKILL)
+        server.wait()
+        server.stdout.close()
+    assert log.read_bytes().endswith(b"\n")
+    rows = read_log(log)
+    assert len(rows.time) >= before - 1 >= 499
+    assert np.array_equal(rows.time, 5.0 * np.arange(len(rows.time)))
+    assert rows.notes == ()
+
+
+def test_it_listens_on_the_loopback_unless_told_and_elsewhere_only_with_a_user(refused, monkeypatch):
+    assert command.commands().parse_args([]).host == "127.0.0.1"
+    for host in ("0.0.0.0", "::", "192.168.1.7", "puller.local"):
+        assert "--operator and its password are needed" in refused(command.main, ["--host", host])
+    monkeypatch.delenv("CZ_GYM_OPERATOR_PASSWORD", raising=False)
+    assert "CZ_GYM_OPERATOR_PASSWORD" in refused(command.main, ["--host", "0.0.0.0", "--operator", "olga"])
+    monkeypatch.setenv("CZ_GYM_OPERATOR_PASSWORD", "short")
+    assert "at least 8 characters" in refused(command.main, ["--operator", "olga"])
+    assert re.search("did you mean", refused(command.main, ["--scenario", "pulller"]))
+
+
+def test_a_port_that_is_taken_and_half_a_certificate_are_said_in_one_line(puller, refused, tmp_path, monkeypatch):
+    assert "log.csv: File exists" in refused(command.main, ["--log", str(puller.folder / "log.csv")])
+    assert "address already in use" in refused(command.main, ["--port", str(puller.port), "--page-port", "0"]).lower()
+    monkeypatch.setenv("CZ_GYM_OPERATOR_PASSWORD", PASSWORD)
+    (tmp_path / "key.pem").touch()
+    options = ["--host", "0.0.0.0", "--operator", "olga", "--certificates", str(tmp_path)]
+    assert "both certificate.pem and key.pem" in refused(command.main, options)

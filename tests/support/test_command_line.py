@@ -1,0 +1,119 @@
+"""Every command: one line for options that cannot be meant, one line for Ctrl-C, and nothing left behind."""
+
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from gymnasium.error import DependencyNotInstalled
+
+import benchmark
+from cz_gym import datasets, play
+from cz_gym.baselines.tuning import __main__ as tuning
+from cz_gym.errors import CzError
+from cz_gym.support.command_line import OPTIONAL, guarded
+from studies import speed
+from studies.paper import __main__ as paper
+
+COMMANDS = [
+    (benchmark, "--episode", "benchmark", ["--out", "new/folder"]),
+    (paper, "--ou", "report", ["--out", "new/folder"]),
+    (tuning, "--trial", "measure", ["--controller", "industrial", "--out", "new/folder"]),
+    (speed, "--qui", "measure", ["--quick"]),
+    (play, "--minute", "settings", []),
+    (datasets, "--episode", "record", ["--policies", "paper", "--out", "new/folder"]),
+]
+"""Each with the beginning of an option, the function that does its work, and arguments that would write a file."""
+
+
+def interrupt(*arguments, **named):
+    raise KeyboardInterrupt
+
+
+def name(part):
+    return getattr(part, "__name__", None)
+
+
+@pytest.mark.parametrize("abbreviated", [False, True])
+@pytest.mark.parametrize(("module", "beginning"), [row[:2] for row in COMMANDS], ids=name)
+def test_an_unknown_option_is_refused_in_one_line(module, beginning, abbreviated, refused):
+    required = ["--controller", "industrial"] if module is tuning else []
+    line = refused(module.main, [*required, beginning if abbreviated else "--frobnicate"])
+    assert "unrecognized arguments" in line
+
+
+@pytest.mark.parametrize(
+    ("module", "work", "arguments", "writable"),
+    [(*row[::2], row[3], True) for row in COMMANDS]
+    + [(*row[::2], row[3], False) for row in COMMANDS[1:] if "new/" in str(row[3])],
+    ids=name,
+)
+def test_an_interrupt_and_a_place_that_cannot_be_written_are_one_line_and_leave_nothing(
+    module, work, arguments, writable, tmp_path,
+    monkeypatch, capsys,
+):  # fmt: skip
+    """The place is refused before the work."""
+    if not writable:
+        (tmp_path / "new").write_text("not a folder")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(module, work, interrupt)
+    assert module.main(arguments) == (130 if writable else 2)
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert ("interrupted" if writable else "new is not a folder") in captured.err
+    assert [path.name for path in tmp_path.iterdir()] == ([] if writable else ["new"])
+
+
+@pytest.mark.parametrize(
+    "command", ["-m cz_gym.play", "-m studies.paper", "benchmark.py", "train.py", "-c import\tcz_gym"]
+)
+def test_an_interrupt_while_a_command_is_imported_is_one_line(command, tmp_path):
+    """Whoever imports the package from a program of theirs keeps the traceback."""
+    (tmp_path / "gymnasium.py").write_text("raise KeyboardInterrupt")
+    found = [str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(found)}
+    done = subprocess.run([sys.executable, *command.split(" ")], env=environment, capture_output=True, text=True)
+    assert ((done.returncode, done.stderr) == (130, "interrupted\n")) == ("-c" not in command)
+    assert "Traceback" in done.stderr or done.returncode == 130
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (None, 0, ""),
+        (ModuleNotFoundError("none", name="torch.nn"), 2, 'prog: torch is missing: pip install ".[agents]"\n'),
+        (CzError("first line\nsecond line"), 2, "prog: first line second line\n"),
+        (DependencyNotInstalled("no pygame"), 2, "prog: no pygame\n"),
+        (KeyboardInterrupt(), 130, "prog: interrupted; runs are complete\n"),
+        (ModuleNotFoundError("none", name="their_own"), None, ""),
+        (ImportError("cannot import name 'one'", name="torch"), None, ""),
+        (ValueError("operands could not be broadcast together"), None, ""),
+        (FileNotFoundError(2, "No such file", "there.csv"), None, ""),
+    ],
+    ids=repr,
+)
+def test_only_what_is_meant_for_the_user_is_one_line_and_a_bug_keeps_its_traceback(error, code, said, capsys):
+    def body():
+        if error is not None:
+            raise error
+        return 0
+
+    if code is None and error is not None:
+        with pytest.raises(type(error)):
+            guarded("prog", body, "agents")
+    else:
+        assert guarded("prog", body, "agents", "runs are complete") == code
+    assert capsys.readouterr().err == said
+
+
+def test_every_package_of_the_extras_is_known_as_optional():
+    project = tomllib.loads(Path("pyproject.toml").read_text())["project"]
+    building = {"ruff", "mypy", "build", "setuptools", "pytest", "pytest_xdist", "hypothesis", "sybil", "scipy_stubs"}
+    documenting = {"sphinx", "myst_parser", "furo", "latex2mathml", "jupytext"}
+    optional = project["optional-dependencies"]
+    needed = {re.split(r"[^\w-]", line)[0].replace("-", "_") for extra in optional.values() for line in extra}
+    assert needed - building - documenting - {"cz_gym", "pygame_ce"} == {*OPTIONAL} - {"h5py"}
