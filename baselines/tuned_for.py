@@ -1,7 +1,8 @@
 """Settings that a search has chosen: for a puller those beside its file, for a scenario those of one that contains it.
 
-Those of the default puller are in ``cz_gym/machine/pullers/default``, a file a controller and scenario, with the history
-of its search (``python -m cz_gym.baselines.tuning``). Each was searched on training seeds and chosen on validation seeds.
+Those of the default puller are in ``cz_gym/machine/pullers/default``, a file a controller and scenario, with the
+history of its search (``python -m cz_gym.baselines.tuning``). Each was searched on training seeds and chosen on
+validation seeds.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Observations: scaled and clipped signals, and their decoding.
 
-An observed value is ``quantity / scale`` clipped to +-10, float32; :mod:`cz_gym.body.signals` has quantities and scales.
-"history" adds the past as differences of the means of neighbouring time spans. These differ by micrometres, readings by
-millimetres, so the differences have scales of their own.
+An observed value is ``quantity / scale`` clipped to +-10, float32; :mod:`cz_gym.body.signals` has quantities and
+scales. "history" adds the past as differences of the means of neighbouring time spans. These differ by micrometres,
+readings by millimetres, so the differences have scales of their own.
 """
 
 from __future__ import annotations

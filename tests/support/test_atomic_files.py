@@ -98,7 +98,8 @@ def test_a_file_that_cannot_be_read_is_named_with_the_reason(tmp_path):
 
 @pytest.mark.slow
 def test_a_folder_is_used_by_one_process(tmp_path):
-    code = "import sys, pathlib; from cz_gym.support.atomic_files import locked\nwith locked(pathlib.Path(sys.argv[1])): pass"
+    code = "from cz_gym.support.atomic_files import locked\nwith locked(Path(sys.argv[1])): pass"
+    code = f"import sys; from pathlib import Path; {code}"
     with locked(tmp_path / "new"):
         with pytest.raises(CzError, match="another process is at work"), locked(tmp_path / "new"):
             pass
