@@ -4,20 +4,21 @@ A step is one control interval or several. The unit begins and ends as :class:`c
 has ended, its outputs stay.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from xml.etree.ElementTree import Element, SubElement
 
 from pythonfmu import Boolean, DefaultExperiment, Fmi2Causality, Fmi2Slave, Fmi2Variability, Integer, Real, String
 from pythonfmu.builder import FmuBuilder
 
 from cz_gym.config import Config, make_config
 from cz_gym.env import CzEnv
+from cz_gym.errors import CzError
 from cz_gym.machine.puller import PullerFile, write_puller
 from cz_gym.observation import Measured, decode
+from cz_gym.support.units import KILO, MM, MM_PER_MIN
 
 from .program import Port
 from .shell import INPUTS, OUTPUTS, in_plant_units, in_shares, nominal_puller
@@ -34,13 +35,23 @@ class CzPuller(fmu.CzPuller):
 """
 """The module in a unit, with the defaults of its parameters."""
 SHOWN = tuple(port for port in INPUTS if port.name not in ("time_s", "ring_time_s", "automatic"))
-"""What the puller shows."""
+"""Readings of the puller's sensors, references and applied drives."""
+TRUTH = Port("crystal_radius_mm", "true radius of the crystal; no sensor shows it, so no controller may read it")
+SETPOINTS = dict(zip((port.name for port in OUTPUTS), ("pull_speed_mm_per_min", "heater_power_kW"), strict=False))
+"""Inputs of the unit, and the applied drives that they begin at."""
+UNITS: dict[str, tuple[str, dict[str, Any]]] = {
+    "_mm": ("mm", {"m": 1, "factor": MM}),
+    "_mm_per_min": ("mm/min", {"m": 1, "s": -1, "factor": MM_PER_MIN}),
+    "_K": ("K", {"K": 1}),
+    "_kW": ("kW", {"kg": 1, "m": 2, "s": -3, "factor": KILO}),
+}
+"""Units by the endings of variables: the name, and exponents and factor of the SI unit."""
 
 
 class CzPuller(Fmi2Slave):  # type: ignore[misc]
     """A puller with one crystal."""
 
-    seed, scenario, puller = 1, "puller", ""
+    seed, scenario, puller, growing = 1, "puller", "", True
 
     def __init__(self, **given: Any) -> None:
         super().__init__(**given)
@@ -51,12 +62,11 @@ class CzPuller(Fmi2Slave):  # type: ignore[misc]
             self._add(kind, name, about, Fmi2Causality.parameter, Fmi2Variability.fixed)
         config = self._config()
         self.default_experiment = DefaultExperiment(0.0, config.horizon, config.control_interval)
-        self.__dict__.update(in_plant_units(Measured(*[0.0] * len(Measured._fields)), nominal_puller(config)))
-        for port, applied in zip(OUTPUTS, ("pull_speed_mm_per_min", "heater_power_kW"), strict=False):
-            setattr(self, port.name, getattr(self, applied))
+        self._begin(config)
+        for port in OUTPUTS[:2]:
             self._add(Real, port.name, port.meaning, Fmi2Causality.input)
-        self.growing = True
-        for port in (*SHOWN, Port("growing", "false once the crystal has ended", 1.0, True)):
+        self._started = {name: getattr(self, name) for name in SETPOINTS}
+        for port in (*SHOWN, TRUTH, Port("growing", "false once the crystal has ended", 1.0, True)):
             discrete = Fmi2Variability.discrete if port.logical else None
             self._add(Boolean if port.logical else Real, port.name, port.meaning, Fmi2Causality.output, discrete)
 
@@ -68,29 +78,55 @@ class CzPuller(Fmi2Slave):  # type: ignore[misc]
         puller = beside if self.puller and beside.is_file() else self.puller or None
         return make_config(self.scenario, observation="measured", action="direct", puller=puller)
 
+    def _begin(self, config: Config) -> None:
+        """Set all variables to the operating point of the puller."""
+        puller = nominal_puller(config)
+        rest = in_plant_units(Measured(*[0.0] * len(Measured._fields)), puller)
+        self.__dict__.update(rest, growing=True, **{TRUTH.name: puller.r_0 / MM})
+        self.__dict__.update({name: rest[applied] for name, applied in SETPOINTS.items()})
+
+    def to_xml(self, model_options: dict[str, str] | None = None) -> Element:
+        """Return the model description with what pythonfmu leaves out: units, and the unknowns of the initial state."""
+        root: Element = super().to_xml(model_options or {})
+        units = Element("UnitDefinitions")
+        for name, base in UNITS.values():
+            SubElement(SubElement(units, "Unit", name=name), "BaseUnit", {each: str(n) for each, n in base.items()})
+        root.insert(1, units)
+        for variable in root.iter("ScalarVariable"):
+            for real in variable.iter("Real"):
+                real.set(
+                    "unit", next(unit for end, (unit, _) in UNITS.items() if variable.attrib["name"].endswith(end))
+                )
+        for outputs in root.findall("ModelStructure/Outputs"):
+            SubElement(root[-1], "InitialUnknowns").extend(outputs)
+        return root
+
     def exit_initialization_mode(self) -> None:
-        """Begin the crystal of the parameters."""
-        self.env = CzEnv.from_config(self._config())
-        self._show(self.env.reset(seed=self.seed)[0])
+        """Begin the crystal of the parameters; setpoints that nobody has set begin at its puller's operating point."""
+        config, given = self._config(), {name: getattr(self, name) for name in SETPOINTS}
+        self._begin(config)
+        self.__dict__.update({name: value for name, value in given.items() if value != self._started[name]})
+        self.env = CzEnv.from_config(config)
+        self._show(*self.env.reset(seed=self.seed))
 
     def do_step(self, current_time: float, step_size: float) -> bool:
-        """Grow for a whole number of control intervals with the setpoints; False for another step size."""
+        """Grow for a whole number of control intervals with the setpoints; CzError for another step size."""
         interval = self.env.config.control_interval
         steps = round(step_size / interval)
         if steps < 1 or abs(steps * interval - step_size) > 1e-6 * interval:
-            self.log(f"a step must be a multiple of the control interval, {interval:g} s, not {step_size:g} s")
-            return False
+            raise CzError(f"a step must be a multiple of the control interval, {interval:g} s, not {step_size:g} s")
         action = in_shares(vars(self), self.env.config)
         for _ in range(steps):
             if self.growing:
-                observation, _, terminated, truncated, _ = self.env.step(action.clip(-1.0, 1.0))
+                observation, _, terminated, truncated, info = self.env.step(action.clip(-1.0, 1.0))
                 self.growing = not (terminated or truncated)
-                self._show(observation)
+                self._show(observation, info)
         return True
 
-    def _show(self, observation: Any) -> None:
+    def _show(self, observation: Any, info: dict[str, Any]) -> None:
         config = self.env.config
-        self.__dict__.update(in_plant_units(decode(observation.astype(float), *config.ranges), nominal_puller(config)))
+        seen = decode(observation.astype(float), *config.ranges)
+        self.__dict__.update(in_plant_units(seen, nominal_puller(config)), **{TRUTH.name: info["r_c"] / MM})
 
 
 def build_fmu(folder: Path, scenario: str, puller: PullerFile | None = None) -> Path:
