@@ -4,11 +4,10 @@ All policies are recorded in one form: "history" observations, "direct" actions,
 true state. Datasets of different policies can therefore be joined, and seed and actions reproduce an episode.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import pkgutil
+import re
 import shutil
 import sys
 import time
@@ -30,7 +29,7 @@ from cz_gym.body.task import drives_of
 from cz_gym.config import Config, check_config, make_config
 from cz_gym.errors import CzError
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
-from cz_gym.machine.puller import DEFAULT, PullerFile, chosen_puller
+from cz_gym.machine.puller import DEFAULT, PullerFile, chosen_puller, to_toml
 from cz_gym.observation import DRIVE_CHANNELS, to_measured
 from cz_gym.support.atomic_files import check_writable
 from cz_gym.support.command_line import OneLineParser, between
@@ -119,6 +118,27 @@ def record(policy: Any, config: Config, seeds: Sequence[int], noise: float) -> l
     ]
 
 
+def place_of(name: str, scenario: str, puller: PullerFile) -> str:
+    """The identifier ``cz/<scenario>/<policy>-v0`` of a dataset, with the puller before the scenario if it has a file.
+
+    An agent file has its own name, or its folder's if it is the "agent.onnx" of a training run. "_" stands for what
+    Minari does not take.
+    """
+    path = Path(name).absolute()
+    if path.suffix == ".onnx":
+        name = path.parent.name if path.stem == "agent" else path.stem
+    parts = ["cz", *([puller.name] if puller != DEFAULT else []), scenario, f"{name}-v0"]
+    return "/".join(re.sub(r"[^-\w]+", "_", part, flags=re.ASCII) for part in parts)
+
+
+def datasets_root() -> Path:
+    """Minari's folder of datasets; CzError where the user has no home."""
+    try:
+        return Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
+    except RuntimeError:
+        raise CzError("there is no home folder: name another one with --out, or in MINARI_DATASETS_PATH") from None
+
+
 def write(
     name: str,
     policy: Any,
@@ -129,21 +149,21 @@ def write(
     overwrite: bool = False,
     puller: PullerFile = DEFAULT,
 ) -> Any:
-    """Write the Minari dataset ``cz/<scenario>/<name>-v0`` and return it; a dot in the name becomes "_".
+    """Write a Minari dataset, whose name is :func:`place_of`, and return it.
 
-    Raises CzError for seeds that are not training seeds, and for a dataset that exists unless ``overwrite`` is set.
+    Its environment comes back with :meth:`recover_environment`, the puller too, whose numbers stand in the dataset. Raises
+    CzError for seeds that are not training seeds, and for a dataset that exists unless ``overwrite`` is set.
     Nothing is left of a dataset whose writing fails or is interrupted.
     """
     minari, _ = import_module("minari"), import_module("h5py")
     settings: dict[str, Any] = {"scenario": scenario, "observation": "history", "action": "direct", "horizon": horizon}
-    settings |= {"puller": puller} if puller != DEFAULT else {}
-    config, place = make_config(**settings), f"cz/{scenario}/{name.replace('.', '_')}-v0"
+    settings |= {"puller": to_toml(puller)} if puller != DEFAULT else {}  # a spec is JSON
+    config, place = make_config(**settings), place_of(name, scenario, puller)
     if not seeds or not set(seeds) <= set(TRAINING_SEEDS):
         raise CzError(f"seeds must be some of the training seeds, {TRAINING_SEEDS[0]} to {TRAINING_SEEDS[-1]}")
     if not 0.0 <= noise <= 1.0:
         raise CzError(f"noise must be between 0 and 1, not {noise:g}")
-    folder = Path(os.environ.get("MINARI_DATASETS_PATH", "~/.minari/datasets")).expanduser() / place
-    check_writable(folder)
+    check_writable(folder := datasets_root() / place)
     if folder.exists() and not overwrite:
         raise CzError(f"{place} exists already: overwrite it, or give another folder ({folder})")
 

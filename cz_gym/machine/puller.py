@@ -256,13 +256,17 @@ def value_of(puller: PullerFile, key: Key) -> Any:
 
 def read_puller(path: str | Path) -> PullerFile:
     """Read a puller file; CzError, one line that names the file, for anything that cannot be meant."""
-    path = Path(path)
-    with naming(path):
+    with naming(path := Path(path)):
         text = path.read_text("utf-8")
+    return replace(from_toml(text, path), file=path)
+
+
+def from_toml(text: str, source: str | Path = "puller") -> PullerFile:
+    """The puller of a file's text; CzError, one line that begins with the text's source, for what cannot be meant."""
     try:
-        return replace(_puller(tomllib.loads(text, parse_float=Decimal), path.stem), file=path)
+        return _puller(tomllib.loads(text, parse_float=Decimal), Path(source).stem)
     except (tomllib.TOMLDecodeError, CzError) as error:
-        raise CzError(f"{path}: {' '.join(str(error).split())}") from None
+        raise CzError(f"{source}: {' '.join(str(error).split())}") from None
 
 
 def write_puller(puller: PullerFile, path: str | Path) -> None:
@@ -271,13 +275,15 @@ def write_puller(puller: PullerFile, path: str | Path) -> None:
 
 
 def find_puller(given: str | Path | PullerFile | None) -> PullerFile:
-    """The puller that is meant by a file, a shipped name, or itself; None is the default one."""
+    """The puller that is meant by a file, a file's text, a shipped name, or itself; None is the default one."""
     if given is None or isinstance(given, PullerFile):
         return given or DEFAULT
     if not isinstance(given, str | Path):
         raise CzError(
             f"puller must be a puller file, a shipped name or a cz_gym.machine.puller.PullerFile, not {given!r:.80}"
         )
+    if isinstance(given, str) and "\n" in given:
+        return from_toml(given)
     shipped = {file.stem: file for file in sorted(FOLDER.glob("*.toml"))}
     if str(given) in shipped and not Path(given).exists():
         return read_puller(shipped[str(given)])

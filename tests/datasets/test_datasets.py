@@ -7,10 +7,11 @@ import pytest
 from cz_gym import datasets
 from cz_gym.baselines import CompensatedPID
 from cz_gym.config import make_config
-from cz_gym.datasets import excitation, find_policy, main, record, settings_of, write
+from cz_gym.datasets import excitation, find_policy, main, place_of, record, settings_of, write
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.replay import Playback
 from cz_gym.evaluation.rollout import rollout
+from cz_gym.machine.puller import DEFAULT, find_puller
 
 CONFIG = make_config("randomized", action="direct", horizon=1200.0)
 
@@ -46,6 +47,34 @@ def test_an_episode_can_be_made_again_from_its_seed_and_actions(place, monkeypat
     for episode in range(3):
         again(dataset, episode)
     assert minari.list_local_datasets()["cz/sensor-fault/lqg-at-0_02-v0"]["algorithm_name"] == "lqg-at-0.02"
+
+
+def test_a_set_of_another_puller_gives_that_puller_back(place):
+    """Minari #131, Gymnasium #439: the settings in a set are JSON, which holds no PullerFile and no Path."""
+    puller = find_puller("germanium")
+    write("paper", CompensatedPID(), "puller", TRAINING_SEEDS[:1], horizon=300.0, puller=puller)
+    dataset = minari.load_dataset("cz/germanium/puller/paper-v0")
+    assert dataset.recover_environment().unwrapped.config.puller == puller
+    again(dataset, 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("lqg-at-0.02", "cz/hard/lqg-at-0_02-v0"),
+        ("runs/mine/agent.onnx", "cz/hard/mine-v0"),
+        ("runs/mine/größte ppo.onnx", "cz/hard/gr_te_ppo-v0"),
+    ],
+)
+def test_names_are_what_minari_takes(name, expected):
+    assert place_of(name, "hard", DEFAULT) == expected
+
+
+def test_without_a_home_a_folder_is_asked_for(monkeypatch, refused):
+    for name in ("HOME", "MINARI_DATASETS_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)
+    assert "name another one with --out" in refused(main, ["--policies", "paper", "--episodes", "1"])
 
 
 def test_a_lost_crystal_ends_its_episode(place):
