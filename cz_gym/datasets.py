@@ -152,7 +152,8 @@ def write(
     """Write a Minari dataset, whose name is :func:`place_of`, and return it.
 
     The numbers of the puller stand in it, so ``recover_environment`` gives the same puller back. Raises CzError for
-    seeds that are not training seeds, and for a dataset that exists unless ``overwrite`` is set. Nothing is left of a dataset whose writing fails or is interrupted.
+    seeds that are not training seeds, and for a dataset that exists unless ``overwrite`` is set. Nothing is
+    left of a dataset whose writing fails or is interrupted.
     """
     minari, _ = import_module("minari"), import_module("h5py")
     settings: dict[str, Any] = {"scenario": scenario, "observation": "history", "action": "direct", "horizon": horizon}

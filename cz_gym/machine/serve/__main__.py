@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import logging
+import math
 import sys
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
@@ -49,6 +50,8 @@ def commands() -> OneLineParser:
     add("--certificates", type=Path, default=Path("certificates"), metavar="DIR",
         help="folder of certificate.pem and key.pem, made there if absent (%(default)s)")  # fmt: skip
     add("--log", type=Path, metavar="FILE", help="CSV log to write, a row each step")
+    add("--log-size", type=between(1, 10_000), metavar="MB", help="size at which the log goes on in a file FILE-2")
+    add("--state", type=Path, metavar="FILE", help="file of the newest state; if it exists, its crystal goes on")
     return parser
 
 
@@ -74,16 +77,18 @@ def _is_loopback(host: str) -> bool:
 @asynccontextmanager
 async def serving(arguments: argparse.Namespace, door: Any) -> AsyncIterator[tuple[Any, asyncio.Task[None]]]:
     """Run a crystal, its server and page; yields the machine, and a task that ends only if the plant's thread fails."""
-    from .machine import Clock, Log, Machine
+    from .files import Log, StateFile
+    from .machine import Clock, Machine
     from .opcua import Tags, certify, pump
     from .page import Page
 
     if door.remote:
         await certify(arguments.certificates)
-    log = Log(arguments.log) if arguments.log else None
+    log = Log(arguments.log, 1e6 * (arguments.log_size or math.inf)) if arguments.log else None
+    state = StateFile(arguments.state) if arguments.state else None
     horizon, puller = arguments.hours * HOUR, arguments.puller
     config = make_config(arguments.scenario, None, "measured", horizon=horizon, action="direct", puller=puller)
-    machine = Machine(config, arguments.seed, arguments.watchdog, log)
+    machine = Machine(config, arguments.seed, arguments.watchdog, log, state)
     loop, queue = asyncio.get_running_loop(), asyncio.Queue[dict[str, Any]]()
     clock = Clock(
         machine, arguments.speed, arguments.wait, lambda tags: loop.call_soon_threadsafe(queue.put_nowait, tags)

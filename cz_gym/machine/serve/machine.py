@@ -1,32 +1,27 @@
 """The puller behind the tags: one crystal, its setpoints, and what happens when nobody renews them."""
 
-from __future__ import annotations
-
 import math
-import os
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
 from enum import IntFlag
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from cz_gym.config import Config
 from cz_gym.env import CzEnv
-from cz_gym.machine.export.__main__ import FALLBACK, make_block
+from cz_gym.errors import CzError
+from cz_gym.machine.controllers import FALLBACK, make_block
 from cz_gym.machine.export.shell import INPUTS, OUTPUTS, in_plant_units, settings_of
-from cz_gym.machine.identify.log import COLUMNS
-from cz_gym.observation import decode
+from cz_gym.observation import CLIP, Measured, decode
 from cz_gym.rendering.canvas import Frame
 from cz_gym.rendering.view import record_of
-from cz_gym.support.atomic_files import naming
 from cz_gym.support.units import HOUR, KILO, MM_PER_MIN
 
-SYNC = 0.5
-"""Time after which a log waits for the disk, which takes longer than a step [s]."""
+from .files import Log, StateFile
+
 SIZE = (640, 480)
 """Width and height of the picture [px]."""
 
@@ -75,28 +70,12 @@ TAGS = (
     Tag("step", int, "number of the control interval that begins now; it changes after all other tags"),
 )
 """Every tag, in the order of writing; readings, setpoints and settings are those of the exported blocks."""
-TOLERANCE = 1e-9
-"""Rounding of a setpoint that is forgiven at its limits [mm/min, kW]."""
-
-
-class Log:
-    """A CSV log that is whole however the process ends, and up to the last second if the power fails.
-
-    CzError if the file exists.
-    """
-
-    def __init__(self, path: str | Path) -> None:
-        self._synced = 0.0
-        with naming(path):
-            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
-        os.write(self._file, f"{','.join(COLUMNS)}\n".encode())
-
-    def add(self, tags: dict[str, Any]) -> None:
-        """Write a row, whole, and wait for the disk unless that was done within the last second."""
-        os.write(self._file, f"{','.join(f'{float(tags[name]):.10g}' for name in COLUMNS)}\n".encode())
-        if time.monotonic() >= self._synced + SYNC:
-            os.fsync(self._file)
-            self._synced = time.monotonic()
+TOLERANCE = 1e-6
+"""Rounding in single precision that is forgiven at a setpoint's limits, relative [-]."""
+APPLIED = ("pull_speed_mm_per_min", "heater_power_kW")
+"""Applied values of the drives, in the order of the setpoints."""
+SAVED = ("k", "answered", "manual", "_renewed", "_active", "_pending", "_memory")
+"""Attributes of a machine that its state holds beside the environment's."""
 
 
 class Machine:
@@ -104,14 +83,18 @@ class Machine:
 
     Setpoints act from the step that begins now. Those of a client are held when it does not renew them, and after
     ``watchdog`` seconds the fallback controls; those of the operator need no renewal. All methods may be called from
-    any thread.
+    any thread. With a state file that exists, the crystal goes on that was saved there; CzError if it has ended, or
+    grew under other settings.
     """
 
-    def __init__(self, config: Config, seed: int, watchdog: float, log: Log | None = None) -> None:
+    def __init__(
+        self, config: Config, seed: int, watchdog: float, log: Log | None = None, state: StateFile | None = None
+    ) -> None:
         self.env = CzEnv.from_config(config, "rgb_array", SIZE)
         self.interval, self.watchdog, self._ranges = config.control_interval, watchdog, config.ranges
-        self._observation, _ = self.env.reset(seed=seed)
-        self._record, self._log, self._lock = record_of(self.env), log, threading.RLock()
+        saved = state.load() if state else None
+        self._observation, _ = self.env.reset(seed=seed, options=saved and {"state": saved["env"]})
+        self._record, self._log, self._state, self._lock = record_of(self.env), log, state, threading.RLock()
         self.puller = self._record.puller
         self._fallback = make_block(FALLBACK, config)
         self._memory = self._fallback.start(1)
@@ -126,7 +109,31 @@ class Machine:
         self.committed = threading.Condition(self._lock)
         self.hour: deque[dict[str, Any]] = deque(maxlen=int(HOUR / self.interval) + 1)
         """The tags of the last hour."""
-        self._publish()
+        if saved:
+            self._resume(saved)
+        else:
+            self._publish()
+        if log:
+            log.begin(self.k * self.interval if saved else None)
+
+    @property
+    def spans(self) -> dict[str, tuple[float, float]]:
+        """Ranges of readings and drives by their tags: readings outside of theirs count as implausible."""
+        at_rest = Measured(*[0.0] * len(Measured._fields))
+        low, high = (
+            in_plant_units(decode(np.full(len(at_rest), end), *self._ranges), self.puller) for end in (-CLIP, CLIP)
+        )
+        limits = {name: tuple(span) for name, span in self.limits.items()}
+        spans = {name: (low[name], high[name]) for name in low if name != "valid"}
+        return spans | limits | dict(zip(APPLIED, limits.values(), strict=True))
+
+    def _resume(self, saved: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        if saved["tags"]["alarms"] & Alarm.ENDED:
+            raise CzError(f"the crystal of this state has ended ({saved['tags']['state']}): name another file")
+        for name in SAVED:
+            setattr(self, name, saved[name])
+        self.hour.append(saved["tags"])
 
     def offer(self, writes: dict[str, Any]) -> dict[str, str]:
         """Take a client's values, all or none; returns the reasons of those that are refused.
@@ -136,7 +143,7 @@ class Machine:
         with self._lock:
             reasons = {name: reason for name, value in writes.items() if (reason := self._refusal(name, value))}
             if not reasons:
-                self._pending |= {name: value for name, value in writes.items() if name in SETPOINTS}
+                self._pending |= {n: float(np.clip(v, *self.limits[n])) for n, v in writes.items() if n in SETPOINTS}
                 if "watchdog" in writes:
                     self.answered = writes["watchdog"]
                     self._act()
@@ -162,8 +169,8 @@ class Machine:
             return "the operator has control"
         if name in SETPOINTS:
             low, high = self.limits[name]
-            inside = low - TOLERANCE <= value <= high + TOLERANCE  # false for NaN
-            return "" if inside else f"outside {low:.6g} to {high:.6g}"
+            room = TOLERANCE * high
+            return "" if low - room <= value <= high + room else f"outside {low:.6g} to {high:.6g}"
         return "" if self.answered < value <= self.k else f"step {self.k} is the newest, {self.answered} was answered"
 
     def _act(self) -> None:
@@ -187,9 +194,9 @@ class Machine:
     def step(self) -> dict[str, Any]:
         """Advance by one control interval with the newest setpoints; returns the tags."""
         with self._lock:
-            control = self.control
+            control, before = self.control, self.hour[-1]
             if control == "fallback":
-                given = self.hour[-1] | {"ring_time_s": self.k * self.interval, "automatic": True}
+                given = before | {"ring_time_s": self.k * self.interval, "automatic": True}
                 outputs, self._memory = self._fallback.run(given, self._memory)
                 self._active = np.array([outputs[name][0] for name in SETPOINTS])
             else:
@@ -197,10 +204,17 @@ class Machine:
             move = (self._active - self.nominal) / (self._ranges[0] / MM_PER_MIN, self._ranges[1] / KILO)
             self._observation, *_ = self.env.step(move)
             self.k += 1
-            return self._publish(control)
+            tags = self._publish(control)
+            if self._log is not None:
+                self._log.add(*([before] if self.k == 1 else []), tags)
+            if self._state is not None:
+                self._state.save(
+                    {name: getattr(self, name) for name in SAVED} | {"env": self.env.get_state(), "tags": tags}
+                )
+            return tags
 
     def _publish(self, control: str = "held") -> dict[str, Any]:
-        """Log the tags, and return them."""
+        """Add the tags to the last hour's, and return them."""
         ending = self._record.ending
         seen = decode(self._observation.astype(float), *self._ranges)
         bits = {
@@ -221,10 +235,10 @@ class Machine:
                 "step": self.k,
             }
         )
+        for applied, limits in zip(APPLIED, self.limits.values(), strict=True):
+            values[applied] = np.clip(values[applied], *limits)  # actions are in single precision
         tags = {tag.name: tag.kind(values[tag.name]) for tag in TAGS}
         self.hour.append(tags)
-        if self._log is not None:
-            self._log.add(tags)
         return tags
 
     def picture(self) -> Frame:

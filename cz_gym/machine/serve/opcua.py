@@ -22,14 +22,28 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from cz_gym.errors import CzError
 
-from .machine import TAGS, Clock, Machine
+from .machine import TAGS, Clock, Machine, Tag
 
 URI = "urn:cz-gym:puller"
 """Namespace of the tags, and the application's name."""
 KINDS = {
     float: ua.VariantType.Double, int: ua.VariantType.UInt32, bool: ua.VariantType.Boolean, str: ua.VariantType.String,
 }  # fmt: skip
-WRITABLE = {tag.name: KINDS[tag.kind] for tag in TAGS if tag.writable}
+WHOLE = {getattr(ua.VariantType, f"{sign}Int{bits}") for sign in ("", "U") for bits in (16, 32, 64)}
+WHOLE |= {ua.VariantType.SByte, ua.VariantType.Byte}
+TAKEN = {int: WHOLE, float: WHOLE | {ua.VariantType.Float, ua.VariantType.Double}}
+"""Types that clients may write to a tag, by the kind of its value."""
+KIND_OF = {tag.name: tag.kind for tag in TAGS}
+WRITABLE = {tag.name: tag.kind for tag in TAGS if tag.writable}
+UNITS = {
+    "_mm": ("mm", "MMT"),
+    "_mm_per_min": ("mm/min", "H81"),
+    "_K": ("K", "KEL"),
+    "_kW": ("kW", "KWT"),
+    "_s": ("s", "SEC"),
+}
+"""Units by the endings of tags: name, and common code of UNECE Recommendation 20."""
+CODES = "http://www.opcfoundation.org/UA/units/un/cefact"
 MOST_CLIENTS = 100
 """Connections at once; further ones are closed."""
 SHORTEST = 8
@@ -101,7 +115,7 @@ class Writes(AttributeService):  # type: ignore[misc]
     async def write(self, params: Any, user: Any = User(role=UserRole.Admin)) -> list[ua.StatusCode]:  # noqa: B008
         """Return a status for each value; the server's own writes pass."""
         if user.role == UserRole.Admin:
-            return await self._write(params, user)
+            return await super().write(params, user)  # type: ignore[no-any-return]
         codes = [self._check(each, user.name) for each in params.NodesToWrite]
         wanted = {self.nodes[each.NodeId]: each.Value.Value.Value for each in params.NodesToWrite if not any(codes)}
         reasons = self.machine.offer(wanted)
@@ -116,18 +130,16 @@ class Writes(AttributeService):  # type: ignore[misc]
                 )
         if any(codes):
             return [ua.StatusCode(code or ua.StatusCodes.BadInvalidState) for code in codes]
-        return await self._write(params, User(UserRole.Admin))
-
-    async def _write(self, params: Any, user: Any) -> list[ua.StatusCode]:
-        codes: list[ua.StatusCode] = await super().write(params, user)
-        return codes
+        for each in params.NodesToWrite:
+            each.Value = data_value(self.nodes[each.NodeId], each.Value.Value.Value)
+        return await super().write(params, User(UserRole.Admin))  # type: ignore[no-any-return]
 
     def _check(self, write: Any, user: str) -> int:
         """The status of a write that is refused whatever its value's size, else 0."""
         kind, variant = WRITABLE.get(self.nodes.get(write.NodeId, "")), write.Value.Value
         if kind is None or write.AttributeId != ua.AttributeIds.Value or not user.startswith("operator "):
             return int(ua.StatusCodes.BadUserAccessDenied)
-        bad = variant is None or variant.VariantType != kind or variant.is_array or write.IndexRange
+        bad = variant is None or variant.VariantType not in TAKEN[kind] or variant.is_array or write.IndexRange
         bad = bad or not isinstance(variant.Value, float | int) or not write.Value.StatusCode.is_good()
         return int(ua.StatusCodes.BadTypeMismatch) if bad else 0
 
@@ -138,7 +150,7 @@ class Tags:
     def __init__(self, machine: Machine, door: Door, host: str, certificates: Path, port: int) -> None:
         self.machine, self.door, self.certificates = machine, door, certificates
         self.server = Server(user_manager=door)
-        self.endpoint = f"opc.tcp://{host}:{port}/"
+        self.endpoint = f"opc.tcp://{in_address(host)}:{port}/"
         self.nodes: dict[str, ua.NodeId] = {}
 
     async def __aenter__(self) -> Tags:
@@ -162,7 +174,7 @@ class Tags:
         for tag in TAGS:
             node_id = self.nodes[tag.name] = ua.NodeId(tag.name, space)
             node = await puller.add_variable(node_id, f"{space}:{tag.name}", values[tag.name], KINDS[tag.kind])
-            await node.write_attribute(ua.AttributeIds.Description, ua.DataValue(ua.LocalizedText(tag.meaning)))
+            await self._describe(node, tag, space)
             if tag.writable:
                 await node.set_writable()
         names = {node_id: name for name, node_id in self.nodes.items()}
@@ -174,6 +186,21 @@ class Tags:
         print(f"OPC UA: {self.endpoint}", flush=True)
         return self
 
+    async def _describe(self, node: Any, tag: Tag, space: int) -> None:
+        """Write what a tag means, its unit and its range."""
+        await node.write_attribute(ua.AttributeIds.Description, ua.DataValue(ua.LocalizedText(tag.meaning)))
+        properties: dict[str, Any] = {}
+        for unit, code in (each for end, each in UNITS.items() if tag.name.endswith(end)):
+            text = ua.LocalizedText(unit)
+            properties["EngineeringUnits"] = ua.EUInformation(CODES, int.from_bytes(code.encode(), "big"), text, text)
+        if span := self.machine.spans.get(tag.name):
+            properties["EURange"] = ua.Range(*span)
+        for name, value in properties.items():
+            await node.add_property(ua.NodeId(f"{tag.name}.{name}", space), ua.QualifiedName(name, 0), value)
+        if properties:
+            await node.delete_reference(ua.ObjectIds.BaseDataVariableType, ua.ObjectIds.HasTypeDefinition)
+            await node.add_reference(ua.ObjectIds.BaseAnalogType, ua.ObjectIds.HasTypeDefinition, bidirectional=False)
+
     async def __aexit__(self, *_: object) -> None:
         await self.server.stop()
 
@@ -181,10 +208,19 @@ class Tags:
         """Show values; ``step`` comes last, so that whoever sees a new step sees all that belongs to it."""
         now = datetime.now(UTC)
         for tag in TAGS:
-            value = ua.DataValue(
-                ua.Variant(values[tag.name], KINDS[tag.kind]), SourceTimestamp=now, ServerTimestamp=now
-            )
+            value = data_value(tag.name, values[tag.name], now)
             await self.server.write_attribute_value(self.nodes[tag.name], value)
+
+
+def data_value(name: str, value: Any, now: datetime | None = None) -> ua.DataValue:
+    """The value of a tag in the type that the tag has."""
+    kind = KIND_OF[name]
+    return ua.DataValue(ua.Variant(kind(value), KINDS[kind]), SourceTimestamp=now, ServerTimestamp=now)
+
+
+def in_address(host: str) -> str:
+    """The host as an address has it: IPv6 in brackets."""
+    return f"[{host}]" if ":" in host else host
 
 
 async def certify(folder: Path) -> None:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import ssl
 from collections.abc import Awaitable, Callable
 from io import BytesIO
+from ipaddress import ip_address
 from pathlib import Path
+from socket import gethostname
+from urllib.parse import urlsplit
 
 from aiohttp import BasicAuth, web
 from plotly.offline import get_plotlyjs
@@ -15,7 +19,7 @@ from cz_gym.errors import CzError
 from cz_gym.rendering.canvas import load
 
 from .machine import SETPOINTS, Alarm, Machine
-from .opcua import Account, Door
+from .opcua import Account, Door, in_address
 
 HTML = Path(__file__).parent / "page.html"
 ASK = {"WWW-Authenticate": 'Basic realm="virtual puller", charset="UTF-8"'}
@@ -49,8 +53,8 @@ class Page:
             try:
                 await web.TCPSite(self._runner, host, port, ssl_context=context).start()
             except OSError as error:
-                raise CzError(f"page on {host}:{port}: {error.strerror or error}") from None
-            print(f"page: http{'s' if context else ''}://{host}:{port}/", flush=True)
+                raise CzError(f"page on {in_address(host)}:{port}: {error.strerror or error}") from None
+            print(f"page: http{'s' if context else ''}://{in_address(host)}:{port}/", flush=True)
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -59,6 +63,10 @@ class Page:
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Let in whoever may; guests may read on this machine, operators may write."""
+        if not self._is_served(request.host):
+            return web.Response(
+                status=421, text="this page is served to its address, localhost and its host's name only"
+            )
         account = self._account(request)
         writes = request.method == "POST"
         # JSON cannot be posted by another site's page without this server's consent.
@@ -70,6 +78,16 @@ class Page:
         response = await handler(request)
         response.headers.update(HEADERS)
         return response
+
+    def _is_served(self, given: str) -> bool:
+        """Whether a Host header names this server: an address, or a name that another site cannot point here."""
+        host = ""
+        try:
+            host = urlsplit(f"//{given}").hostname or ""
+            ip_address(host)
+        except ValueError:
+            return host in {"localhost", self.place[0].lower(), gethostname().lower()}
+        return True
 
     def _account(self, request: web.Request) -> Account | None:
         try:
@@ -90,7 +108,11 @@ class Page:
 
     async def _data(self, request: web.Request) -> web.Response:
         """The newest tags, and the last hour after the step that the page has."""
-        after, rows = int(request.query.get("after", "-1")), list(self.machine.hour)
+        rows = list(self.machine.hour)
+        try:
+            after = int(request.query.get("after", "-1"))
+        except ValueError:
+            raise web.HTTPBadRequest(text="after must be the number of a step") from None
         account, now = self._account(request) or Account("", "", False), rows[-1]
         return web.json_response({
             "now": now,
@@ -117,7 +139,10 @@ class Page:
 
     async def _write(self, request: web.Request) -> web.Response:
         """Setpoints of the operator; none gives control back to the clients."""
-        given = await request.json()
+        try:
+            given = json.loads(await request.read())
+        except (ValueError, RecursionError):
+            given = None
         good = isinstance(given, dict) and set(given) in (set(), set(SETPOINTS))
         if not good or not all(type(value) in (int, float) for value in given.values()):
             return web.Response(status=400, text="two numbers, or none")

@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 
 from cz_gym.config import make_config
+from cz_gym.errors import CzError
+from cz_gym.machine.puller import PullerFile
+from cz_gym.machine.serve.files import Log, StateFile
 from cz_gym.machine.serve.machine import SETPOINTS, Alarm, Clock, Machine
 
 PULL, HEATER = SETPOINTS
 
 
-def machine(watchdog=60.0, log=None, **settings):
-    return Machine(make_config("randomized", None, "measured", action="direct", **settings), 1, watchdog, log)
+def machine(watchdog=60.0, log=None, state=None, **settings):
+    return Machine(make_config("randomized", None, "measured", action="direct", **settings), 1, watchdog, log, state)
 
 
 def test_setpoints_act_once_the_step_they_answer_is_written_and_not_before():
@@ -37,6 +40,57 @@ def test_a_refused_value_refuses_all_that_came_with_it():
     assert one.offer({PULL: one.limits[PULL][1], HEATER: low, "watchdog": 0}) == {}
     for step in (0, 1):
         assert list(one.offer({"watchdog": step})) == ["watchdog"], "answered, and not begun"
+
+
+def test_applied_drives_are_shown_within_their_limits():
+    """An action is in single precision: 1.3 mm/min was applied as 1.300000012."""
+    one = machine(puller=PullerFile(pull_window=0.1 / 6e4, heater_range=1234.5))
+    for end in (0, 1):
+        setpoints = {name: float(np.float32(limits[end])) for name, limits in one.limits.items()}
+        assert one.offer(setpoints | {"watchdog": one.k}) == {}, "rounding of a Float is forgiven"
+        row = one.step()
+        for applied, (low, high) in zip(("pull_speed_mm_per_min", "heater_power_kW"), one.limits.values(), strict=True):
+            assert low <= row[applied] <= high
+            assert row[applied] == pytest.approx((low, high)[end], rel=1e-7)
+
+
+def drive(one, steps):
+    """Half of the steps have setpoints of a client; the others are held, or the fallback's."""
+    for _ in range(steps):
+        if one.k % 40 < 20:
+            one.offer({PULL: 1.2 + 0.001 * (one.k % 7), "watchdog": one.k})
+        one.step()
+    return list(one.hour)
+
+
+def test_a_crystal_goes_on_from_its_state_as_if_nothing_had_happened(tmp_path):
+    """The process ends after a row was logged and before its state was saved; the log is one of many parts."""
+    whole = drive(machine(watchdog=30.0, horizon=1500.0), 300)
+    log, file = tmp_path / "log.csv", StateFile(tmp_path / "state")
+    first = machine(30.0, Log(log, 4096), file, horizon=1500.0)
+    drive(first, 170)
+    first._state = None
+    drive(first, 1)
+    second = machine(30.0, Log(log, 4096), file, horizon=1500.0)
+    assert second.k == 170
+    assert drive(second, 130) == whole[170:]
+    parts = [log, *sorted(tmp_path.glob("log-?.csv"))]
+    times = [np.genfromtxt(part, delimiter=",", names=True)["time_s"] for part in parts]
+    assert np.concatenate(times).tolist() == [row["time_s"] for row in whole]
+    assert len(parts) == 5
+    assert max(part.stat().st_size for part in parts) < 4096 + 100
+    with pytest.raises(CzError, match="has ended \\(end of the run\\): name another file"):
+        machine(30.0, None, file, horizon=1500.0)
+
+
+def test_a_state_of_other_settings_or_a_damaged_one_is_refused_in_one_line(tmp_path):
+    file = StateFile(tmp_path / "state")
+    drive(machine(state=file, horizon=1500.0), 2)
+    with pytest.raises(CzError, match=r"horizon 1500\.0, not 3000\.0"):
+        machine(state=file, horizon=3000.0)
+    file.path.write_bytes(file.path.read_bytes()[:-100])
+    with pytest.raises(CzError, match="state: no state of a virtual puller"):
+        machine(state=file, horizon=1500.0)
 
 
 def test_setpoints_that_are_not_renewed_are_held_and_then_the_fallback_takes_over_without_a_jump():

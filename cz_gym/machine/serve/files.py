@@ -1,0 +1,98 @@
+"""What a virtual puller leaves on the disk, whole however its process ends: the log, and the state it goes on from."""
+
+import math
+import os
+import pickle
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from cz_gym.errors import CzError
+from cz_gym.machine.identify.log import COLUMNS
+from cz_gym.support.atomic_files import check_writable, naming, write_files
+
+SYNC = 0.5
+"""Time after which a log waits for the disk, which takes longer than a step [s]."""
+
+
+class Log:
+    """A CSV log, up to the last second if the power fails.
+
+    The file is made with the first row. Once it has ``largest`` bytes, rows go on in a file of the next number:
+    ``log.csv``, ``log-2.csv``.
+    """
+
+    def __init__(self, path: str | Path, largest: float = math.inf) -> None:
+        self.path, self.largest = Path(path), largest
+        self._part, self._size, self._synced, self._file = 1, 0, 0.0, -1
+
+    def begin(self, resumed_at: float | None) -> None:
+        """Check that rows can be written; a crystal that was resumed at a time [s] loses the rows of later times.
+
+        CzError if the log of another crystal exists.
+        """
+        check_writable(self.path.absolute().parent)
+        if resumed_at is None:
+            for path in filter(Path.exists, map(self._name, (1, 2))):
+                raise CzError(f"{path}: File exists")
+            return
+        while self._name(self._part + 1).exists():
+            self._part += 1
+        if (path := self._name(self._part)).exists():
+            with naming(path):
+                head, *rows = path.read_text("utf-8").splitlines(keepends=True)
+            before = [row for row in rows if float(row.split(",")[0]) <= resumed_at]
+            write_files({path: "".join([head, *before]).encode()})
+            self._open(os.O_APPEND)
+
+    def add(self, *rows: Mapping[str, Any]) -> None:
+        """Write rows, each whole, and wait for the disk unless that was done within the last second."""
+        if self._file < 0:
+            self._open(os.O_APPEND | os.O_CREAT | os.O_EXCL)
+            self._write(",".join(COLUMNS))
+        for row in rows:
+            self._write(",".join(f"{float(row[name]):.10g}" for name in COLUMNS))
+        full = self._size >= self.largest
+        if full or time.monotonic() >= self._synced + SYNC:
+            os.fsync(self._file)
+            self._synced = time.monotonic()
+        if full:
+            os.close(self._file)
+            self._file, self._part = -1, self._part + 1
+
+    def _name(self, part: int) -> Path:
+        return self.path if part == 1 else self.path.with_stem(f"{self.path.stem}-{part}")
+
+    def _open(self, flags: int) -> None:
+        with naming(path := self._name(self._part)):
+            self._file = os.open(path, os.O_WRONLY | flags, 0o644)
+            self._size = os.fstat(self._file).st_size
+
+    def _write(self, line: str) -> None:
+        self._size += os.write(self._file, f"{line}\n".encode())
+
+
+class StateFile:
+    """The file of the newest state, from which a server that was killed goes on."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+
+    def load(self) -> Any:
+        """The state, or None if there is no file yet; CzError for a file of something else."""
+        check_writable(self.path.absolute().parent)
+        if not self.path.exists():
+            return None
+        with naming(self.path):
+            content = self.path.read_bytes()
+        try:
+            return pickle.loads(content)
+        except Exception:  # a damaged pickle can raise anything
+            raise CzError(f"{self.path}: no state of a virtual puller, or one of another version") from None
+
+    def save(self, state: Any) -> None:
+        """Replace the file at once, without waiting for the disk."""
+        new = self.path.with_name(f".{self.path.name}.new")
+        new.write_bytes(pickle.dumps(state))
+        os.replace(new, self.path)
