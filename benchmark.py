@@ -59,6 +59,8 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     own = "scenario of your own, in place of others"
     add("--scenario", action="append", default=[], metavar="FILE.py:NAME", help=own)
     parser.add_puller("every row runs on it, with the controllers that are designed for it")
+    about = "largest deviation of the diameter that is no scrap, in the report for --puller [mm] (1)"
+    add("--tolerance", type=float, metavar="MM", help=about)
     add("--slow", action="store_true", help="slow controllers too, on 50 episodes; resumed from results/cache")
     add("--overwrite", action="store_true", help="replace files of earlier or other runs")
     add("--quiet", action="store_true", help="no progress bar, no table; a bar is shown on a terminal only")
@@ -130,12 +132,16 @@ def rows_of(arguments: argparse.Namespace) -> list[Row]:
     from cz_gym.evaluation import user_code
     from cz_gym.evaluation.protocol import ROWS, find_row
     from cz_gym.machine.puller import chosen_puller
+    from cz_gym.support.units import MM
 
+    if arguments.tolerance is not None and not (arguments.puller and 0.0 < arguments.tolerance <= 50.0):
+        raise CzError(f"--tolerance {arguments.tolerance:g} must be up to 50 mm, beside --puller FILE.toml")
     names = arguments.scenarios or [row.name for row in ROWS if row.default and not arguments.scenario]
     rows = [*map(find_row, names), *map(user_code.row, arguments.scenario)]
     user_code.check_apart([row.name for row in rows], "scenario")
     puller = chosen_puller(arguments.puller)
-    return [replace(row, puller=puller) for row in rows]
+    tolerance = 0.5 * MM * (arguments.tolerance or 1.0) if arguments.puller else None
+    return [replace(row, puller=puller, tolerance=tolerance) for row in rows]
 
 
 def contenders_of(arguments: argparse.Namespace, rows: Sequence[Row]) -> list[Contender]:

@@ -71,10 +71,7 @@ def metric_names() -> tuple[str, ...]:
 def metrics(run: Rollout) -> Metrics:
     """Compute the metrics of a rollout."""
     s, alive = run.signals, run.alive
-    v_0, limit = run.config.parameters.v_0, run.config.radius_limit
-    lost = np.arange(len(alive))[:, None] >= alive.sum(axis=0) - run.failed  # from a failing step on
-    error = np.where(lost, limit, s.r_c - s.r_ref)
-    observable = np.where(lost, limit, s.r_c - s.r_ref + s.ring_offset)
+    v_0, error, observable = run.config.parameters.v_0, radius_error(run), radius_error(run, s.ring_offset)
     pull_step = np.diff(s.v_p, axis=0, prepend=run.start.v_p)
     heater_step = np.diff(s.Q_H, axis=0, prepend=run.start.Q_H)
     drives = (np.where(alive, moved, 0.0) for moved in (s.v_p - v_0, pull_step, heater_step))
@@ -94,6 +91,19 @@ def metrics(run: Rollout) -> Metrics:
         failure_rate=run.failed.astype(np.float64),
         return_=run.reward.sum(axis=0),
     )
+
+
+def radius_error(run: Rollout, offset: Floats | float = 0.0) -> Floats:
+    """The radius error plus an offset [m], shape (steps, episodes); from a failing step on the largest allowed one."""
+    lost = np.arange(len(run.alive))[:, None] >= run.alive.sum(axis=0) - run.failed
+    error: Floats = np.where(lost, run.config.radius_limit, run.signals.r_c - run.signals.r_ref + offset)
+    return error
+
+
+def outside(run: Rollout, tolerance: float) -> Floats:
+    """Share of time with a radius error of more than the tolerance [m], shape (episodes,)."""
+    share: Floats = np.mean(np.abs(radius_error(run)) > tolerance, axis=0)
+    return share
 
 
 def _rms(values: Floats, where: npt.NDArray[np.bool_] | bool = True) -> Floats:

@@ -46,6 +46,8 @@ class Row:
     file: str = ""
     """Source of a scenario of the user's own: FILE.py:NAME."""
     puller: PullerFile = DEFAULT
+    tolerance: float | None = None
+    """Largest radius error that is no scrap [m]: with it, the report is one for a grower."""
     first_seed: int = TEST_SEEDS.start
     """Seed of its first crystal."""
 

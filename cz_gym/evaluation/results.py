@@ -10,7 +10,7 @@ import numpy as np
 
 from cz_gym.evaluation.contender import Contender
 
-from .metrics import metric_names, metrics
+from .metrics import metric_names, metrics, outside
 from .protocol import Row
 from .rollout import Floats, Rollout, Signals
 from .statistics import Estimate, Resamples, cvar, differences, means, optimality_gap, probability_of_improvement
@@ -39,16 +39,21 @@ class Sample:
     """Time in the policy per step and episode [us]."""
     example: Signals | None = None
     """Signals of the first episode up to its end, each of shape (steps,), of the first training seed."""
+    outside: Floats | None = None
+    """Share of time outside the row's tolerance band [-], shape (training seeds or 1, episodes), if it has one."""
 
     @classmethod
-    def of(cls, contender: Contender, runs: Iterable[Rollout]) -> Sample:
+    def of(cls, contender: Contender, runs: Iterable[Rollout], tolerance: float | None = None) -> Sample:
         """Metrics of rollouts on the same episodes, one a training seed, and the signals of the first one."""
-        example, values, times = None, [], []
+        example, values, times, shares = None, [], [], []
         for run in runs:
             example, seeds = example or run.episode(0), run.seeds
             values.append(np.stack(metrics(run), axis=-1))
             times.append(run.microseconds_per_step)
-        return cls(contender, seeds, np.stack(values), float(np.mean(times)), example)
+            shares += [outside(run, tolerance)] if tolerance else []
+        return cls(
+            contender, seeds, np.stack(values), float(np.mean(times)), example, np.array(shares) if shares else None
+        )
 
     @classmethod
     def joined(cls, seeds: Sequence[int], parts: Sequence[Sample]) -> Sample:
@@ -57,7 +62,7 @@ class Sample:
         microseconds = np.average([part.microseconds for part in parts], weights=[len(part.seeds) for part in parts])
         (first,) = (part for part in parts if part.seeds[0] == seeds[0])
         values = np.array([[rows[seed] for seed in seeds]])
-        return replace(first, seeds=tuple(seeds), values=values, microseconds=float(microseconds))
+        return replace(first, seeds=tuple(seeds), values=values, microseconds=float(microseconds), outside=None)
 
     @property
     def name(self) -> str:
@@ -70,7 +75,8 @@ class Sample:
 
     def first(self, episodes: int) -> Sample:
         """The same sample on its first episodes."""
-        return replace(self, seeds=self.seeds[:episodes], values=self.values[:, :episodes])
+        share = None if self.outside is None else self.outside[:, :episodes]
+        return replace(self, seeds=self.seeds[:episodes], values=self.values[:, :episodes], outside=share)
 
 
 Estimates = Mapping[str, Mapping[str, Estimate]]

@@ -30,7 +30,8 @@ def run_episodes(contender: Contender, row: Row, seeds: Sequence[int], progress:
     interface = contender.observation, contender.action
     config, designed_for = row.config(*interface), row.design_config(*interface)
     policies = contender.policies(designed_for)
-    return Sample.of(contender, (rollout(policy, config, seeds, progress, designed_for) for policy in policies))
+    runs = (rollout(policy, config, seeds, progress, designed_for) for policy in policies)
+    return Sample.of(contender, runs, row.tolerance)
 
 
 def check_agents(contenders: Sequence[Contender], rows: Sequence[Row]) -> None:
@@ -117,4 +118,4 @@ def _apart(again: Any, episodes: int, cache: Path, number: int) -> tuple[Any, ..
     contenders, rows = again()
     pair = rows[number // len(contenders)], contenders[number % len(contenders)]
     sample = _measure(pair, episodes, cache, lambda steps: None)
-    return sample.seeds, sample.values, sample.microseconds, sample.example
+    return sample.seeds, sample.values, sample.microseconds, sample.example, sample.outside

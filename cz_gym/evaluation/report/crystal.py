@@ -55,12 +55,18 @@ class Column(NamedTuple):
     lost: bool
 
 
-def draw(columns: Sequence[Column], dt: float, title: str) -> Figure:
-    """Draw a crystal under some controllers: radius, ring, pull, heater, melt against time, at steps of ``dt`` [s]."""
+def draw(columns: Sequence[Column], dt: float, title: str, tolerance: float = 0.0) -> Figure:
+    """Draw a crystal under some controllers: radius, ring, pull, heater, melt against time, at steps of ``dt`` [s].
+
+    The band of the reference plus and minus the tolerance [m] is grey.
+    """
     figure = canvas(max(1.62 * len(columns) + 1.0, 5.0), 7.6)
     axes = figure.subplots(len(_PANELS), len(columns), sharex=True, sharey="row", squeeze=False)
     longest = max((column.signals for column in columns), key=lambda signals: len(signals.r_c))
     for place, column in enumerate(columns):
+        if tolerance:
+            ends = (longest.r_ref - tolerance) / MM, (longest.r_ref + tolerance) / MM
+            axes[0, place].fill_between(_minutes(len(longest.r_ref), dt), *ends, color=GREY, alpha=0.3, lw=0)
         _draw(axes[:, place], column, dt, longest.r_ref)
     for row, panel in enumerate(_PANELS):
         axes[row, 0].set_ylabel(panel.label.replace(" [", "\n["))
@@ -85,8 +91,9 @@ def crystal(result: Result) -> bytes:
         columns.append(
             Column(f"{fill(sample.name, 18)}\n{rmse}", example(sample), style[sample.name].colour, lost(sample))
         )
-    title = f"One crystal of {result.row.name} (test seed {samples[0].seeds[0]:,})"
-    return png(draw(columns, result.row.control_interval, title))
+    title, tolerance = f"One crystal of {result.row.name} (test seed {samples[0].seeds[0]:,})", result.row.tolerance
+    title += f"; grey: diameter within ±{2.0 * tolerance / MM:g} mm" if tolerance else ""
+    return png(draw(columns, result.row.control_interval, title, tolerance or 0.0))
 
 
 def _draw(axes: Any, column: Column, dt: float, reference: Floats) -> None:

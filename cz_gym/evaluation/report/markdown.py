@@ -1,7 +1,5 @@
 """The benchmark's report as text: in Markdown, which begins with the verdict, and as short tables for a terminal."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -11,8 +9,9 @@ import numpy as np
 from cz_gym.evaluation.protocol import contract_hash
 from cz_gym.evaluation.results import BOUND, REFERENCE, SPEED, Result, Sample, common
 from cz_gym.machine.puller import DEFAULT
-from cz_gym.support.units import HOUR, PERCENT
+from cz_gym.support.units import HOUR, MM, PERCENT
 
+from . import puller
 from .canvas import COLUMNS, chosen
 from .tables import (
     DRIVES,
@@ -72,19 +71,17 @@ def markdown(results: Sequence[Result], command: str, figures: Iterable[str]) ->
     """Return ``report.md``; it begins with :func:`verdict`."""
     row = results[0].row
     config, most = row.config(), max(len(result.seeds) for result in results)
-    found = verdict(results)
     parts = [
-        found.sentence,
-        *([table(found.heads, found.rows)] if found.rows else []),
+        *(_verdict(results) if row.tolerance is None else _for_a_grower(results)),
         "# Benchmark",
         f"Every controller meets the same crystals (test seeds), {config.horizon / HOUR:.3g} h each at "
         f"{config.control_interval:g} s control, on {row.grown_on}.",
         "The tables show means over crystals with 95 % bootstrap intervals; a scenario without randomness is one "
-        "crystal and has no interval. After a failure the radius error counts 8 mm to the end; drives, growth rate and "
-        "ground-off are those of the time before it. No failure in n crystals still allows a rate of up to 3/n, "
-        f"{3 / most / PERCENT:.2g} % at n = {most}. The verdict compares radius errors alone: who moves the pull "
-        "speed more can have less. docs/controllers/bounds.md compares at equal pull steps, docs/benchmark.md has the "
-        "protocol and every formula.",
+        f"crystal and has no interval. After a failure the radius error counts {config.radius_limit / MM:.3g} mm to "
+        "the end; drives, growth rate and ground-off are those of the time before it. No failure in n crystals still "
+        f"allows a rate of up to 3/n, {3 / most / PERCENT:.2g} % at n = {most}. The verdict compares radius errors "
+        "alone: who moves the pull speed more can have less. docs/controllers/bounds.md compares at equal pull steps, "
+        "docs/benchmark.md has the protocol and every formula.",
         "RMSE of the true radius [mm] with 95 % interval and failures on each scenario, pull steps on the first.",
         summary(results),
         *(f"![{name.removesuffix('.png')}]({name})" for name in figures),
@@ -95,6 +92,21 @@ def markdown(results: Sequence[Result], command: str, figures: Iterable[str]) ->
         parts += _scenario(result)
     parts += ["## How it was made", f"`{command}`; versions, hashes and seeds stand in benchmark.json."]
     return "\n\n".join(parts) + "\n"
+
+
+def _verdict(results: Sequence[Result]) -> list[str]:
+    found = verdict(results)
+    return [found.sentence, *([table(found.heads, found.rows)] if found.rows else [])]
+
+
+def _for_a_grower(results: Sequence[Result]) -> list[str]:
+    """The recommendation, what each controller gives on each scenario, and how much its loop bears."""
+    parts = [puller.recommendation(results), f"# {puller.title(results[0].row)}"]
+    for result in results:
+        parts += [f"**{result.row.name}**: {result.row.meaning}.", table(*puller.outcome(result))]
+    margins = table(puller.MARGINS, puller.margins(results[0].samples, results[0]))
+    agents = any(sample.contender.learned for sample in results[0].samples)
+    return [*parts, puller.EXPLAINED, margins, puller.MARGINS_EXPLAINED, *(_verdict(results) if agents else [])]
 
 
 def _scenario(result: Result) -> list[str]:
@@ -149,18 +161,21 @@ def _training_seeds(pooled: Sequence[Sample]) -> str:
 
 
 def terminal(results: Sequence[Result]) -> str:
-    """Return a short table a scenario, RMSE with its interval, then means, and the verdict."""
+    """Return a short table a scenario, RMSE with its interval, then means, and the verdict or the recommendation."""
     found = verdict(results, RMSE._replace(interval=False))
-    return "\n\n".join(
-        [*map(_short, results), found.sentence, *([_aligned(found.heads, found.rows)] if found.rows else [])]
-    )
+    parts = [*map(_short, results), *([found.sentence] if found.rows or results[0].row.tolerance is None else [])]
+    parts += [_aligned(found.heads, found.rows)] if found.rows else []
+    return "\n\n".join(parts + ([puller.recommendation(results)] if results[0].row.tolerance else []))
 
 
 def _short(result: Result) -> str:
     columns, row = (RMSE, *SHORT, LESS), result.row
     grown_on = f", on {row.grown_on}" if row.file or row.puller != DEFAULT else ""
-    heads = ["controller", *(column.heading for column in columns)]
-    return f"{row.name} ({crystals(len(result.seeds))}){grown_on}\n{_aligned(heads, rows(result, columns))}"
+    heads: Sequence[str] = ["controller", *(column.heading for column in columns)]
+    lines = rows(result, columns)
+    if row.tolerance is not None:
+        heads, lines = puller.outcome(result, interval=False)
+    return f"{row.name} ({crystals(len(result.seeds))}){grown_on}\n{_aligned(heads, lines)}"
 
 
 def _aligned(heads: Sequence[str], lines: Iterable[tuple[str, ...]]) -> str:

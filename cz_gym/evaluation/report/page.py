@@ -4,8 +4,6 @@ Everything is inside the file, plotly.js included, and its content policy forbid
 Names come from agent files and are untrusted: they are escaped for HTML and for plotly.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -16,12 +14,21 @@ from plotly.graph_objects import Figure
 from plotly.offline import get_plotlyjs
 
 from cz_gym.evaluation.results import Result
-from cz_gym.support.units import HOUR
+from cz_gym.support.units import HOUR, MM
 
-from . import tables
+from . import puller, tables
 from .markdown import measured_from
 from .page_pictures import crystal, pareto
 
+BEST_NOTE = (
+    "The best of each kind by mean RMSE [mm] over these scenarios, and your own. "
+    "Drives and return are those on the first."
+)
+ANSWER_NOTE = (
+    "RMSE of the true radius; the difference is learned less classical, and is shown if its 95&nbsp;% interval, on "
+    "the same crystals, leaves out zero. Who moves the pull speed more can have less error: "
+    "docs/controllers/bounds.md compares at equal pull steps."
+)
 _SLOT = re.compile(r"<!-- slot:(\w+) -->")
 
 
@@ -37,6 +44,10 @@ def page(results: Sequence[Result], command: str) -> str:
         "plotly": get_plotlyjs(),
         "verdict": escape(found.sentence),
         "best": _table(heads, [(f"{name} [{kind}]", *cells) for kind, rows in groups.items() for name, *cells in rows]),
+        "best_note": BEST_NOTE,
+        "question": "Who holds the radius best",
+        "answer_note": ANSWER_NOTE,
+        "limit": f"{config.radius_limit / MM:.3g}",
         "lede": f"{tables.count(len(samples), 'controller')}, {tables.count(len(results), 'scenario')}, "
         f"up to {tables.crystals(most)} each, the same for everyone: {config.horizon / HOUR:g} h at one action every "
         f"{config.control_interval:g} s, on {row.grown_on}.",
@@ -47,7 +58,22 @@ def page(results: Sequence[Result], command: str) -> str:
         "controllers": _table(tables.WHO, tables.who(samples), "words"),
         "command": escape(command),
     }
+    if row.tolerance is not None:
+        parts |= _for_a_grower(results)
     return _SLOT.sub(lambda slot: parts[slot[1]], _asset("page.html"))
+
+
+def _for_a_grower(results: Sequence[Result]) -> dict[str, str]:
+    """The parts of the page that differ on a puller."""
+    tables_of = (f"<h3>{escape(result.row.name)}</h3>{_table(*puller.outcome(result))}" for result in results)
+    return {
+        "verdict": escape(puller.recommendation(results)),
+        "best": f"<h2>{escape(puller.title(results[0].row))}</h2>{''.join(tables_of)}",
+        "best_note": escape(puller.EXPLAINED),
+        "question": "What the loops bear",
+        "scenarios": _table(puller.MARGINS, puller.margins(results[0].samples, results[0])),
+        "answer_note": escape(puller.MARGINS_EXPLAINED),
+    }
 
 
 def _html(figure: Figure, name: str) -> str:
