@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from cz_gym.evaluation.results import Result, Sample
@@ -58,7 +59,7 @@ class Column(NamedTuple):
 def draw(columns: Sequence[Column], dt: float, title: str, tolerance: float = 0.0) -> Figure:
     """Draw a crystal under some controllers: radius, ring, pull, heater, melt against time, at steps of ``dt`` [s].
 
-    The band of the reference plus and minus the tolerance [m] is grey.
+    The reference plus and minus the tolerance [m] is a grey band.
     """
     figure = canvas(max(1.62 * len(columns) + 1.0, 5.0), 7.6)
     axes = figure.subplots(len(_PANELS), len(columns), sharex=True, sharey="row", squeeze=False)
@@ -73,11 +74,13 @@ def draw(columns: Sequence[Column], dt: float, title: str, tolerance: float = 0.
     figure.align_ylabels(axes[:, 0])
     _set_limits(axes, columns, longest, dt)
     figure.suptitle(title, fontsize=10.5)
-    handles = [
+    handles: list[Any] = [
         Line2D([], [], color=INK, lw=1.2, ls="--", label="reference"),
         Line2D([], [], color=GREY, lw=1.2, label="ring as the camera reports it"),
         Line2D([], [], ls="none", label="in colour: true value; of a drive, its 5 min mean over single steps"),
     ]
+    if tolerance:
+        handles.insert(1, Patch(color=GREY, alpha=0.3, lw=0, label=f"diameter within ±{2.0 * tolerance / MM:g} mm"))
     figure.legend(handles=handles, loc="outside lower center", fontsize=8.5, frameon=False)
     return figure
 
@@ -91,9 +94,8 @@ def crystal(result: Result) -> bytes:
         columns.append(
             Column(f"{fill(sample.name, 18)}\n{rmse}", example(sample), style[sample.name].colour, lost(sample))
         )
-    title, tolerance = f"One crystal of {result.row.name} (test seed {samples[0].seeds[0]:,})", result.row.tolerance
-    title += f"; grey: diameter within ±{2.0 * tolerance / MM:g} mm" if tolerance else ""
-    return png(draw(columns, result.row.control_interval, title, tolerance or 0.0))
+    title = f"One crystal of {result.row.name} (test seed {samples[0].seeds[0]:,})"
+    return png(draw(columns, result.row.control_interval, title, result.row.tolerance or 0.0))
 
 
 def _draw(axes: Any, column: Column, dt: float, reference: Floats) -> None:

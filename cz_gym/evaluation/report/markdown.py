@@ -118,7 +118,7 @@ def _scenario(result: Result) -> list[str]:
         _metrics(result, DRIVES),
     ]
     if columns := comparison(result):
-        parts += [_metrics(result, columns), measured_from(result)]
+        parts += [_metrics(result, columns), *filter(None, [measured_from(result)])]
     pooled = [sample for sample in result.samples if len(sample.contender.training_seeds) > 1]
     if pooled:
         parts.append(_training_seeds(pooled))
@@ -130,8 +130,10 @@ def _metrics(result: Result, columns: Sequence[Column]) -> str:
 
 
 def measured_from(result: Result) -> str:
-    """Return a sentence on where the optimality gap comes from, or how to get it."""
+    """Return a sentence on where the optimality gap comes from, or how to get it; none on a grower's puller."""
     row, bound = result.row, result.earlier_bound
+    if row.tolerance is not None:
+        return ""
     if bound is not None:
         count = crystals(len(common(bound, *result.samples)[0].seeds))
         return f"Optimality gaps are measured from `{BOUND}` of an earlier run (results/bounds), on the first {count}."

@@ -103,7 +103,7 @@ def recommendation(results: Sequence[Result]) -> str:
     )
     up, down, phase, delay = _margins(best, counted[0])
     loop = (
-        f" Its loop bears a gain of {down} to {up}, {phase} degrees and a delay of {delay} s."
+        f" Its loop bears {down} to {up} times its gain, {phase} degrees and a delay of {delay} s."
         if delay != NOTHING
         else ""
     )
