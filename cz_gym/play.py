@@ -1,7 +1,5 @@
 """Pull a crystal by hand in Gymnasium's own player: ``python -m cz_gym.play [--scenario NAME] [--seed N] ...``."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import pkgutil

@@ -1,7 +1,5 @@
 """The camera above the melt: its view, ray-traced images, and the detector of the bright ring in them."""
 
-from __future__ import annotations
-
 from .ring_detector import RingDetector
 from .view import Camera
 

@@ -4,8 +4,6 @@ A ray is traced through each corner of the pixels. A pixel whose corners agree h
 ring and other edges, it has the mean of SUB x SUB rays, so that an edge can move by fractions of a pixel.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Any
 

@@ -8,8 +8,6 @@ profile's radius is a function of q with a single zero below the triple point; N
 Directions need not have unit length. Coordinates are those of :mod:`cz_gym.camera.view`, in [m].
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -7,8 +7,6 @@ falls. SciPy's robust least squares fits a circle about the axis, so that a few 
 the reading at the puller's steady state minus r_0, is subtracted, as in the plant.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

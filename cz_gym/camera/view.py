@@ -4,8 +4,6 @@ x points from the crystal's axis towards the camera, y to its right, z up; z = 0
 docs/camera.md describes how the image is made.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Any, NamedTuple
 

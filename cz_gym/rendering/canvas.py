@@ -1,7 +1,5 @@
 """A canvas of shapes and text: pygame draws at twice the picture's resolution, so that its mean has smooth edges."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import importlib.util
@@ -65,7 +63,7 @@ class Box(NamedTuple):
         """The lower edge."""
         return self.y + self.h
 
-    def inner(self, left: float, top: float, right: float, bottom: float) -> Box:
+    def inner(self, left: float, top: float, right: float, bottom: float) -> "Box":
         """The box without margins of these widths [nominal px]."""
         return Box(self.x + left, self.y + top, self.w - left - right, self.h - top - bottom)
 

@@ -1,7 +1,5 @@
 """Colours of the pictures: Okabe and Ito's where a colour has a meaning, safe for colour-blind readers."""
 
-from __future__ import annotations
-
 Colour = tuple[int, int, int]
 
 BACK: Colour = (13, 17, 23)

@@ -1,7 +1,5 @@
 """The samples of one episode so far, from which its pictures are drawn."""
 
-from __future__ import annotations
-
 from enum import Enum
 from typing import Any
 

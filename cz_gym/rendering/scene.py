@@ -1,7 +1,5 @@
 """The whole picture of one episode, in any size: the crystal's edge, numbers and the chart of the radius error."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

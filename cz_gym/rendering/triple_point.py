@@ -1,7 +1,5 @@
 """The triple point to scale: crystal edge with the grown surface above it, meniscus, melt, bright ring."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """The view of an environment with a ``render_mode``: the episode's record, its picture and, for "human", a window."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -38,7 +36,7 @@ def check_size(size: Any) -> tuple[int, int]:
     raise CzError(f"render_size must be (width, height), whole numbers of {SMALLEST} to {LARGEST} pixels, not {size!r}")
 
 
-def make_view(render_mode: str | None, size: Any, config: Config) -> View | None:
+def make_view(render_mode: str | None, size: Any, config: Config) -> "View | None":
     """The view of a render mode, None without one.
 
     Raises CzError for a mode or size that is not allowed, DependencyNotInstalled where pygame is missing.

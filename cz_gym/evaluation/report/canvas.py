@@ -1,7 +1,5 @@
 """Parts of every figure: the style of each controller, a canvas without a display, PNG bytes."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from itertools import cycle

@@ -1,7 +1,5 @@
 """The figure of one disturbed crystal under one or more controllers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from textwrap import fill
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """The figures of ``report.md``, as PNG bytes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

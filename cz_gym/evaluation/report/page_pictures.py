@@ -3,8 +3,6 @@
 Signals are those of each scenario's first crystal under some controllers, in panels over one time axis.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Texts that every form of the report has: the verdict, and the tables' columns, estimates, numbers and names."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 

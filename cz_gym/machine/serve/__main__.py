@@ -1,7 +1,5 @@
 """``python -m cz_gym.machine.serve``: a virtual puller on OPC UA, with an operator's page."""
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import logging

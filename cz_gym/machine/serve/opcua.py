@@ -1,7 +1,5 @@
 """The OPC UA server: the machine's tags, who may write them, and what is refused."""
 
-from __future__ import annotations
-
 import asyncio
 import hmac
 import logging
@@ -153,7 +151,7 @@ class Tags:
         self.endpoint = f"opc.tcp://{in_address(host)}:{port}/"
         self.nodes: dict[str, ua.NodeId] = {}
 
-    async def __aenter__(self) -> Tags:
+    async def __aenter__(self) -> "Tags":
         server, aspace = self.server, self.server.iserver
         await server.init()
         server.set_endpoint(self.endpoint)

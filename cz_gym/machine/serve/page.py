@@ -1,7 +1,5 @@
 """The operator's page: readings, strip charts of the last hour and the crystal, in a browser."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import ssl
@@ -42,7 +40,7 @@ class Page:
         self._picture: tuple[int, bytes] = -1, b""
         self._script = get_plotlyjs().encode()
 
-    async def __aenter__(self) -> Page:
+    async def __aenter__(self) -> "Page":
         host, port = self.place
         if port:
             context = None
