@@ -8,7 +8,7 @@ import pytest
 
 from cz_gym.config import make_config
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.machine.controllers import make_block
+from cz_gym.machine.export.controllers import make_block
 from cz_gym.machine.export.policy import BlockPolicy
 from cz_gym.support.units import KILO, MM, MM_PER_MIN
 from examples import opcua_controller

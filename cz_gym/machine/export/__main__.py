@@ -7,12 +7,12 @@ from typing import Any
 
 from cz_gym.config import make_config
 from cz_gym.errors import CzError
-from cz_gym.machine.controllers import make_block
 from cz_gym.observation import CLIP
 from cz_gym.support.atomic_files import write_files
 from cz_gym.support.command_line import OneLineParser, shown
 from cz_gym.support.units import KILO, MM_PER_MIN
 
+from .controllers import make_block
 from .onnx_graph import write_onnx
 from .shell import Alarm, Block
 from .text import fill_template, meanings, write_c, write_st

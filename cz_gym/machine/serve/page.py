@@ -62,9 +62,7 @@ class Page:
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Let in whoever may; guests may read on this machine, operators may write."""
         if not self._is_served(request.host):
-            return web.Response(
-                status=421, text="this page is served to its address, localhost and its host's name only"
-            )
+            return web.Response(status=421, text="this is neither the address nor the name of this machine")
         account = self._account(request)
         writes = request.method == "POST"
         # JSON cannot be posted by another site's page without this server's consent.

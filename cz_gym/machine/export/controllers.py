@@ -9,8 +9,8 @@ from cz_gym.config import Config
 from cz_gym.errors import CzError
 from cz_gym.support.names import unknown
 
-from .export.agent import Agent
-from .export.shell import Block
+from .agent import Agent
+from .shell import Block
 
 REGISTRY, AGENTS = "cz_gym.baselines.registry", "cz_gym.agents"
 """Modules that know controllers and agents, looked up by name because this package imports neither."""
