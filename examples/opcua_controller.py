@@ -20,8 +20,8 @@ from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 
 from cz_gym.config import Config, make_config
 from cz_gym.errors import CzError
-from cz_gym.machine.export.controllers import make_block
 from cz_gym.machine.export.compiled import CompiledBlock
+from cz_gym.machine.export.controllers import make_block
 from cz_gym.machine.export.policy import Runner
 from cz_gym.machine.serve.machine import SETPOINTS, TAGS
 from cz_gym.machine.serve.opcua import URI, WRITABLE, certify, password

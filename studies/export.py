@@ -22,8 +22,8 @@ from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.machine.export.controllers import make_block
 from cz_gym.machine.export.compiled import CompiledBlock
+from cz_gym.machine.export.controllers import make_block
 from cz_gym.machine.export.policy import BlockPolicy, Runner
 from cz_gym.machine.export.shell import Block, in_shares
 from cz_gym.support.atomic_files import check_writable, write_files

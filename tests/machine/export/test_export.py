@@ -14,9 +14,9 @@ from cz_gym import agents
 from cz_gym.baselines.registry import make_controller
 from cz_gym.body.task import HEATER_RANGE, drives_of
 from cz_gym.config import make_config
-from cz_gym.machine.export.controllers import make_block
 from cz_gym.machine.export.__main__ import main
 from cz_gym.machine.export.compiled import CompiledBlock
+from cz_gym.machine.export.controllers import make_block
 from cz_gym.machine.export.onnx_graph import write_onnx
 from cz_gym.machine.export.policy import BlockPolicy
 from cz_gym.machine.export.shell import INPUTS, Alarm, in_shares
