@@ -134,7 +134,7 @@ SCENARIOS: dict[str, Scenario] = {
 }
 """Every named scenario."""
 ALIASES = {"unknown-puller": PULLER.name}
-"""Other names of scenarios: the puller's true numbers, camera and drives are not what controllers were told."""
+"""Aliases of scenario names. In unknown-puller, hot zone, camera and drives are not what controllers were told."""
 ALL = make_mixture([(RANDOMIZED, 0.3), *((each, 0.175) for each in (HARD, SENSOR_FAULT, PULLER, HOT_ZONE))])
 """The mixture "all": every random scenario of the benchmark's default table."""
 

@@ -102,16 +102,14 @@ BESIDE = dataclasses.replace(
     faults=Faults(flagged_duration=(50.0, 50.0), unflagged_duration=(50.0, 50.0)),
 )
 """Every episode is the same, but a member that is random takes effect."""
-FAMILIES = [family.name for family in dataclasses.fields(Scenario)[1:]]
-MEMBERS = [(family, each) for family in FAMILIES for each in dataclasses.fields(getattr(BESIDE, family))]
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.5])
-@pytest.mark.parametrize(("family", "member"), MEMBERS, ids=lambda part: getattr(part, "name", part))
+@pytest.mark.parametrize(("family", "member"), [each[:2] for each in BESIDE.members])
 def test_every_member_says_whether_it_is_random(family, member, spread):
     """A scenario called deterministic draws the same episode for every key; a member without that information fails."""
     says, whole = member.metadata["member"], isinstance(np.ravel(member.default)[0].item(), int)
-    high = says.high if whole else min(0.5 * says.high, 100.0)
+    high = says.quantity.high if whole else min(0.5 * says.quantity.high * says.quantity.size, 100.0)
     low = high if not spread else 0 if whole else spread * high
     value = (low, high) if isinstance(member.default, tuple) else low if says.draw is Draw.CHANCE else high
     part = dataclasses.replace(getattr(BESIDE, family), **{member.name: value})
@@ -164,19 +162,14 @@ def test_interface_fluctuation_is_two_stationary_processes():
     assert stats.kstest(runs[:, 100] / math.sqrt(2), "norm").pvalue > 1e-3
 
 
-def test_draws_are_uniform():
-    factors = np.array([draw_factors(SCENARIOS["randomized"], (0.0, 1.0), key) for key in keys(2000)])
-    assert (factors[:, 7:] == 1.0).all()
-    widths = np.array([0.5, 0.03, 0.1, 0.1, 0.1, 0.1, 0.1])
-    middle = np.array([0.5, 1, 1, 1, 1, 1, 1])
-    check_uniform(0.5 + 0.5 * (factors[:, :7] - middle) / widths)
-
-
-def test_hot_zone_draws_are_log_uniform_on_the_crystals_of_randomized():
+def test_factors_are_uniform_and_those_of_hot_zones_log_uniform_on_the_same_crystals():
     hot_zone, randomized = (
         np.array([draw_factors(SCENARIOS[name], (0.0, 1.0), key) for key in keys(2000)])
         for name in ("hot-zone", "randomized")
     )
+    assert (randomized[:, 7:] == 1.0).all()
+    widths, middle = np.array([0.5, 0.03, *[0.1] * 5]), np.array([0.5, *[1.0] * 6])
+    check_uniform(0.5 + 0.5 * (randomized[:, :7] - middle) / widths)
     np.testing.assert_array_equal(hot_zone[:, :3], randomized[:, :3])
     assert draw("hot-zone", (5, 6))[0] == draw("randomized", (5, 6))[0]
     low = np.log([0.75] * 4 + [0.5, 0.5, 0.7])
@@ -208,14 +201,11 @@ def check_uniform(columns):
     assert np.abs(np.corrcoef(columns.T) - np.eye(columns.shape[1])).max() < 0.1
 
 
-def test_half_the_references_move_and_the_start_is_normal():
+def test_what_happens_by_chance_has_its_probability_and_its_distribution():
     episodes = [draw("randomized", key)[0] for key in keys(2000)]
     assert np.mean([e.reference_amount != 0 for e in episodes]) == pytest.approx(0.5, abs=0.045)
     starts = np.array([e.r_c_start for e in episodes]) / (0.2 * MM)
     assert stats.kstest(starts, "norm").pvalue > 1e-3
-
-
-def test_outliers_are_rare_and_normal_and_dropouts_have_their_probability():
     sensor, faults = Sensor(outlier_probability=0.02, outlier_sd=1e-3), Faults(dropout=(0.03, 0.03))
     camera = draw(Scenario("mine", sensor=sensor), (3, 4), samples=100_000)[1].noise[:, 0]
     hit = camera[camera != 0]
@@ -223,9 +213,6 @@ def test_outliers_are_rare_and_normal_and_dropouts_have_their_probability():
     assert stats.kstest(hit / 1e-3, "norm").pvalue > 1e-3
     camera = draw(Scenario("mine", faults=faults), (3, 4), samples=50_000)[1].noise[:, 0]
     assert np.isnan(camera).mean() == pytest.approx(0.03, abs=4 * math.sqrt(0.03 / 50_000))
-
-
-def test_one_freeze_starts_uniformly():
     scenario = Scenario("mine", faults=Faults(flagged=(1, 1), flagged_duration=(100.0, 100.0)))
     starts = [draw(scenario, key)[1].freezes[0, 0] for key in keys(1000)]
     assert stats.kstest(starts, stats.uniform(0, SPAN - 100).cdf).pvalue > 1e-3
