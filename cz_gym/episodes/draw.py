@@ -5,8 +5,6 @@ Scalars come first on each stream, and the noise of each step after them (:mod:`
 horizon extends a draw and never changes it.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

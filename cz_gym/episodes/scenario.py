@@ -5,15 +5,13 @@ left at its default is absent. Two scenarios with equal contents have equal :att
 number is its :class:`cz_gym.physics.quantities.Quantity`'s; what belongs to the machine is in its table.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json
 import math
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -217,7 +215,7 @@ class Scenario:
             raise CzError(f"scenario {self.name!r}: freezes of {longest} s do not fit into {DRAW_SPAN} s")
 
     @property
-    def scenarios(self) -> tuple[Scenario, ...]:
+    def scenarios(self) -> tuple[Self, ...]:
         """The scenario itself: a mixture has several (:class:`cz_gym.episodes.mixture.Mixture`)."""
         return (self,)
 

@@ -1,7 +1,5 @@
 """The named scenarios, frozen: the distributions every controller and agent meets."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from numbers import Real
@@ -109,29 +107,17 @@ HOT_ZONE = replace(
 )
 
 _ONE_FAMILY = (
-    Scenario("only-recipe", recipe=RANDOMIZED.recipe),
-    Scenario("only-drift", drift=RANDOMIZED.drift),
-    Scenario("only-interface", interface=RANDOMIZED.interface),
-    Scenario("only-sensor", sensor=RANDOMIZED.sensor),
-    Scenario("only-reference", reference=RANDOMIZED.reference),
+    *(Scenario(f"only-{family}", **{family: getattr(RANDOMIZED, family)})
+      for family in ("recipe", "drift", "interface", "sensor", "reference")),
     Scenario("only-parameters", pullers=RANDOMIZED.pullers),
-)
+)  # fmt: skip
 
 SCENARIOS: dict[str, Scenario] = {
     scenario.name: scenario
     for scenario in (
-        NOMINAL,
-        PAPER_RAMP,
-        REFERENCE_A,
-        REFERENCE_B,
-        RANDOMIZED,
-        HARD,
-        SENSOR_FAULT,
-        PULLER,
-        HOT_ZONE,
-        *_ONE_FAMILY,
+        NOMINAL, PAPER_RAMP, REFERENCE_A, REFERENCE_B, RANDOMIZED, HARD, SENSOR_FAULT, PULLER, HOT_ZONE, *_ONE_FAMILY,
     )
-}
+}  # fmt: skip
 """Every named scenario."""
 ALIASES = {"unknown-puller": PULLER.name}
 """Aliases of scenario names. In unknown-puller, hot zone, camera and drives are not what controllers were told."""

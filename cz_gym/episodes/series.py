@@ -5,8 +5,6 @@ from the episode's own streams (:mod:`cz_gym.episodes.noise`): the environment d
 whole series.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -54,17 +54,6 @@ def _stated(puller: PullerFile, *symbols: str) -> str:
     return text
 
 
-def unstated(puller: PullerFile) -> tuple[str, str]:
-    """Keys that the file does not have: with the default's values, and those whose numbers the scenario decides."""
-    missing = [quantity for quantity in MACHINE.values() if quantity.key in puller.missing]
-    values = {each.key: value_of(DEFAULT, each) for each in missing}
-    sizes = {each.key: each.size for each in missing}
-    return (
-        ", ".join(f"{key} = {value / sizes[key]:.10g}" for key, value in values.items() if value is not None),
-        ", ".join(key for key, value in values.items() if value is None),
-    )
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser("python -m cz_gym.machine.describe", "Print what a puller file implies.")
@@ -74,8 +63,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(given: argparse.Namespace) -> None:
     puller = find_puller(given.puller)
-    default, scenario = unstated(puller)
-    lines = implied(puller) | {"as the default": default, "as the scenario": scenario}
+    absent = {each: value_of(DEFAULT, each) for each in MACHINE.values() if each.key in puller.missing}
+    lines = implied(puller) | {
+        "as the default": ", ".join(f"{k.key} = {v / k.size:.10g}" for k, v in absent.items() if v is not None),
+        "as the scenario": ", ".join(k.key for k, v in absent.items() if v is None),
+    }
     print(f"puller {puller.label}")
     for heading, text in lines.items():
         print(f"{heading:<15} {text or 'nothing'}")

@@ -4,8 +4,6 @@ Keys are those of :data:`cz_gym.physics.quantities.MACHINE`, from which reader, 
 follow.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

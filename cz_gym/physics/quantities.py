@@ -11,26 +11,13 @@ from cz_gym.errors import CzError
 from cz_gym.support.units import CELSIUS, HOUR, KILO, MINUTE, MM, MM_PER_MIN, PERCENT
 
 SIZES: dict[str, dict[str, float]] = {
-    "m": {"mm": MM, "cm": 1e-2, "µm": 1e-6},
-    "m/s": {"mm/min": MM_PER_MIN, "mm/h": MM / HOUR, "mm/s": MM},
-    "m/s2": {"mm/min2": MM_PER_MIN / MINUTE, "mm/s2": MM},
-    "rad": {"deg": math.pi / 180.0},
-    "K": {"°C": 1.0},
-    "K/s": {"K/min": 1.0 / MINUTE, "K/h": 1.0 / HOUR},
-    "s": {"ms": 1e-3, "min": MINUTE},
-    "rev/s": {"rpm": 1.0 / MINUTE},
-    "W": {"kW": KILO, "MW": 1e6},
-    "W/s": {"kW/min": KILO / MINUTE},
-    "N/m": {"mN/m": 1e-3},
-    "kg/m3": {"g/cm3": KILO},
-    "J/kg": {"kJ/kg": KILO},
-    "J/K": {"kJ/K": KILO},
-    "W/K": {"kW/K": KILO},
-    "W/m/K": {"W/cm/K": 100.0},
-    "W/K4": {},
-    "W/m2/K4": {},
-    "1": {"%": PERCENT},
-}
+    "m": {"mm": MM, "cm": 1e-2, "µm": 1e-6}, "m/s": {"mm/min": MM_PER_MIN, "mm/h": MM / HOUR, "mm/s": MM},
+    "m/s2": {"mm/min2": MM_PER_MIN / MINUTE, "mm/s2": MM}, "rad": {"deg": math.pi / 180.0}, "1": {"%": PERCENT},
+    "K": {"°C": 1.0}, "K/s": {"K/min": 1.0 / MINUTE, "K/h": 1.0 / HOUR}, "s": {"ms": 1e-3, "min": MINUTE},
+    "rev/s": {"rpm": 1.0 / MINUTE}, "W": {"kW": KILO, "MW": 1e6}, "W/s": {"kW/min": KILO / MINUTE},
+    "N/m": {"mN/m": 1e-3}, "kg/m3": {"g/cm3": KILO}, "J/kg": {"kJ/kg": KILO}, "J/K": {"kJ/K": KILO},
+    "W/K": {"kW/K": KILO}, "W/m/K": {"W/cm/K": 100.0}, "W/K4": {}, "W/m2/K4": {},
+}  # fmt: skip
 """Each SI unit, with the units that users may state or mean instead, and their sizes in it."""
 _SI = {name: si for si, sizes in SIZES.items() for name in (si, *sizes)}
 _ZEROS = {"°C": CELSIUS}
