@@ -11,7 +11,7 @@ from cz_gym.evaluation.results import BOUND, REFERENCE, SPEED, Result, Sample, c
 from cz_gym.machine.puller import DEFAULT
 from cz_gym.support.units import HOUR, MM, PERCENT
 
-from . import puller
+from . import grower
 from .canvas import COLUMNS, chosen
 from .tables import (
     DRIVES,
@@ -101,12 +101,12 @@ def _verdict(results: Sequence[Result]) -> list[str]:
 
 def _for_a_grower(results: Sequence[Result]) -> list[str]:
     """The recommendation, what each controller gives on each scenario, and how much its loop bears."""
-    parts = [puller.recommendation(results), f"# {puller.title(results[0].row)}"]
+    parts = [grower.recommendation(results), f"# {grower.title(results[0].row)}"]
     for result in results:
-        parts += [f"**{result.row.name}**: {result.row.meaning}.", table(*puller.outcome(result))]
-    margins = table(puller.MARGINS, puller.margins(results[0].samples, results[0]))
+        parts += [f"**{result.row.name}**: {result.row.meaning}.", table(*grower.outcome(result))]
+    margins = table(grower.MARGINS, grower.margins(results[0].samples, results[0]))
     agents = any(sample.contender.learned for sample in results[0].samples)
-    return [*parts, puller.EXPLAINED, margins, puller.MARGINS_EXPLAINED, *(_verdict(results) if agents else [])]
+    return [*parts, grower.EXPLAINED, margins, grower.MARGINS_EXPLAINED, *(_verdict(results) if agents else [])]
 
 
 def _scenario(result: Result) -> list[str]:
@@ -167,7 +167,7 @@ def terminal(results: Sequence[Result]) -> str:
     found = verdict(results, RMSE._replace(interval=False))
     parts = [*map(_short, results), *([found.sentence] if found.rows or results[0].row.tolerance is None else [])]
     parts += [_aligned(found.heads, found.rows)] if found.rows else []
-    return "\n\n".join(parts + ([puller.recommendation(results)] if results[0].row.tolerance else []))
+    return "\n\n".join(parts + ([grower.recommendation(results)] if results[0].row.tolerance else []))
 
 
 def _short(result: Result) -> str:
@@ -176,7 +176,7 @@ def _short(result: Result) -> str:
     heads: Sequence[str] = ["controller", *(column.heading for column in columns)]
     lines = rows(result, columns)
     if row.tolerance is not None:
-        heads, lines = puller.outcome(result, interval=False)
+        heads, lines = grower.outcome(result, interval=False)
     return f"{row.name} ({crystals(len(result.seeds))}){grown_on}\n{_aligned(heads, lines)}"
 
 

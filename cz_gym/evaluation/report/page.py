@@ -16,7 +16,7 @@ from plotly.offline import get_plotlyjs
 from cz_gym.evaluation.results import Result
 from cz_gym.support.units import HOUR, MM
 
-from . import puller, tables
+from . import grower, tables
 from .markdown import measured_from
 from .page_pictures import crystal, pareto
 
@@ -65,14 +65,14 @@ def page(results: Sequence[Result], command: str) -> str:
 
 def _for_a_grower(results: Sequence[Result]) -> dict[str, str]:
     """The parts of the page that differ on a puller."""
-    tables_of = (f"<h3>{escape(result.row.name)}</h3>{_table(*puller.outcome(result))}" for result in results)
+    tables_of = (f"<h3>{escape(result.row.name)}</h3>{_table(*grower.outcome(result))}" for result in results)
     return {
-        "verdict": escape(puller.recommendation(results)),
-        "best": f"<h2>{escape(puller.title(results[0].row))}</h2>{''.join(tables_of)}",
-        "best_note": escape(puller.EXPLAINED),
+        "verdict": escape(grower.recommendation(results)),
+        "best": f"<h2>{escape(grower.title(results[0].row))}</h2>{''.join(tables_of)}",
+        "best_note": escape(grower.EXPLAINED),
         "question": "What the loops bear",
-        "scenarios": _table(puller.MARGINS, puller.margins(results[0].samples, results[0])),
-        "answer_note": escape(puller.MARGINS_EXPLAINED),
+        "scenarios": _table(grower.MARGINS, grower.margins(results[0].samples, results[0])),
+        "answer_note": escape(grower.MARGINS_EXPLAINED),
     }
 
 

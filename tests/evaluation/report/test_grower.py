@@ -11,7 +11,7 @@ from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.registry import find_controller
 from cz_gym.body.plant import make_puller
 from cz_gym.evaluation.protocol import find_row
-from cz_gym.evaluation.report import puller
+from cz_gym.evaluation.report import grower
 from cz_gym.evaluation.report.markdown import markdown, terminal
 from cz_gym.evaluation.report.page import page
 from cz_gym.evaluation.results import Sample, summarise
@@ -41,8 +41,8 @@ def test_scrap_is_the_share_of_time_outside_the_band_and_all_of_it_after_a_loss(
         inside = [(error[:end, crystal] <= ROW.tolerance).sum() for crystal, end in enumerate(whole)]
         shares[name] = 1.0 - np.mean(inside) / len(error)
     for sample in result.samples:
-        assert puller.scrap(sample).mean == pytest.approx(shares[sample.name])
-    heads, rows = puller.outcome(result)
+        assert grower.scrap(sample).mean == pytest.approx(shares[sample.name])
+    heads, rows = grower.outcome(result)
     assert heads[1:4] == ("scrap: diameter outside ±0.8 mm [% of time]", "crystals lost [%]", "diameter RMSE [mm]")
     assert [row[0] for row in rows] == sorted(shares, key=shares.get)
     rmse = result.means["paper-tuned"]["rmse_mm"].mean
@@ -52,12 +52,12 @@ def test_scrap_is_the_share_of_time_outside_the_band_and_all_of_it_after_a_loss(
 def test_the_first_line_recommends_the_controller_that_loses_least_and_scraps_least(result, monkeypatch):
     texts = markdown([result], "", ()), page([result], ""), terminal([result])
     assert texts[0].startswith("No recommendation: 4 crystals, and it takes a controller and at least 20.")
-    monkeypatch.setattr(puller, "FEWEST", 4)
-    line = puller.recommendation([result])
-    best = puller.outcome(result)[1][0][0]
+    monkeypatch.setattr(grower, "FEWEST", 4)
+    line = grower.recommendation([result])
+    best = grower.outcome(result)[1][0][0]
     assert line.startswith(f"Recommended for silicon-300mm: {best}, which loses none of 4 crystals on randomized. The ")
     alone = summarise(ROW, [sample for sample in result.samples if sample.name == "open-loop"])
-    assert puller.recommendation([alone]).startswith("No controller is fit for silicon-300mm: open-loop loses the ")
+    assert grower.recommendation([alone]).startswith("No controller is fit for silicon-300mm: open-loop loses the ")
     texts = markdown([result], "", ()), page([result], ""), terminal([result])
     assert texts[0].startswith(line)
     assert f'<body>\n<p id="verdict">{line}' in texts[1]
@@ -71,7 +71,7 @@ def test_the_first_line_recommends_the_controller_that_loses_least_and_scraps_le
 
 
 def test_margins_are_those_of_the_worse_model_and_a_dash_where_there_is_no_loop(result):
-    rows = {name: cells for name, *cells in puller.margins(result.samples, result)}
+    rows = {name: cells for name, *cells in grower.margins(result.samples, result)}
     assert rows["open-loop"] == ["-"] * 4
     config = ROW.config()
     form = linear_form(find_controller("paper-tuned").make(config), config.sole_scenario.sensor)
