@@ -29,10 +29,10 @@ KINDS = {
 }  # fmt: skip
 WHOLE = {getattr(ua.VariantType, f"{sign}Int{bits}") for sign in ("", "U") for bits in (16, 32, 64)}
 WHOLE |= {ua.VariantType.SByte, ua.VariantType.Byte}
-TAKEN = {int: WHOLE, float: WHOLE | {ua.VariantType.Float, ua.VariantType.Double}}
-"""Types that clients may write to a tag, by the kind of its value."""
+TAKEN = {ua.VariantType.UInt32: WHOLE, ua.VariantType.Double: WHOLE | {ua.VariantType.Float, ua.VariantType.Double}}
+"""Types that clients may write to a tag, by the tag's own."""
 KIND_OF = {tag.name: tag.kind for tag in TAGS}
-WRITABLE = {tag.name: tag.kind for tag in TAGS if tag.writable}
+WRITABLE = {tag.name: KINDS[tag.kind] for tag in TAGS if tag.writable}
 UNITS = {
     "_mm": ("mm", "MMT"),
     "_mm_per_min": ("mm/min", "H81"),
