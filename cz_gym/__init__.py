@@ -9,8 +9,6 @@ import sys
 from importlib import import_module
 from typing import Any
 
-from .support import interrupts  # noqa: F401  (first of all)
-
 try:
     import gymnasium as gym
 except ModuleNotFoundError as error:

@@ -19,7 +19,6 @@ from scipy.linalg import solve_discrete_are
 
 from cz_gym.action import mark
 from cz_gym.baselines.lqg.controller import LQG, Gains, LQGDesign, solve_each
-from cz_gym.baselines.lqg.designs import lqg
 from cz_gym.baselines.lqg.estimator import PlantFilter
 from cz_gym.baselines.lqg.model import DRIFT, DRIFT_RATE, FAST, PLANT, SLOW, STATES, NoiseModel, load_per_drift
 from cz_gym.baselines.lqg.multiple_model import MultipleModelFilter
@@ -162,8 +161,7 @@ def privileged(plain: LQG, knows_fluctuations: bool = True) -> PrivilegedLQG:
     return PrivilegedLQG(**known, knows_fluctuations=knows_fluctuations)
 
 
-def full_information(config: Config) -> FullInformation:
-    """Bound: the regulator of ``lqg`` on the true state and the present disturbances."""
-    design = lqg("lqg", config).design
+def full_information(design: LQGDesign, config: Config) -> FullInformation:
+    """Bound: an LQG's regulator on the true state and the present disturbances."""
     exact = replace(design, noise=replace(design.noise, recipe_share=0.0), heater_slack=0.0)
     return FullInformation(design=exact).for_config(config)
