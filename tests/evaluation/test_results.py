@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import benchmark
+from cz_gym.commands import benchmark
 from cz_gym.baselines import CompensatedPID
 from cz_gym.baselines.registry import find_controller
 from cz_gym.config import make_config

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import benchmark
+from cz_gym.commands import benchmark
 from cz_gym.agents import shipped_names
 from cz_gym.agents.agent_file.contract import write_agent
 from cz_gym.baselines.registry import CONTROLLERS
@@ -157,7 +157,7 @@ def test_every_episode_is_in_the_table_and_provenance_says_what_was_run(finished
 )
 def test_a_wrong_command_is_refused_in_one_line(arguments, message, refusal):
     line = refusal(arguments)
-    assert line.startswith("benchmark.py: ")
+    assert line.startswith("cz-gym benchmark: ")
     assert message in line
 
 

@@ -15,7 +15,7 @@ from dataclasses import replace
 import pytest
 from tqdm import tqdm
 
-import train
+from cz_gym.commands import train
 from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.training import run, validation
 from cz_gym.agents.training.checkpoint import load_checkpoint

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from gymnasium.error import DependencyNotInstalled
 
-import benchmark
+from cz_gym.commands import benchmark
 from cz_gym import datasets, play
 from cz_gym.baselines.tuning import __main__ as tuning
 from cz_gym.errors import CzError
