@@ -13,7 +13,7 @@ COMMANDS = {
     "benchmark": ("cz_gym.commands.benchmark", "compare controllers and agents on the same crystals"),
     "tune": ("cz_gym.commands.tune", "search settings of controllers, or design them for a puller"),
     "identify": ("cz_gym.machine.identify.__main__", "estimate a puller's numbers from its log"),
-    "puller": ("cz_gym.machine.command", "write and check puller files"),
+    "puller": ("cz_gym.machine.describe", "write and check puller files"),
     "export": ("cz_gym.machine.export.__main__", "write a controller or agent as code for a PLC"),
     "serve": ("cz_gym.machine.serve.__main__", "run a virtual puller on OPC UA"),
     "play": ("cz_gym.play", "pull a crystal by hand"),

@@ -1,7 +1,5 @@
 """The interface that controllers and agents share: stable-baselines3's ``predict``, for a batch of crystals at once."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace

@@ -8,8 +8,6 @@ The LQG's settings (:data:`cz_gym.baselines.tuning.lqg.FAMILY`) are the referenc
 over crystals and training seeds.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The state space of a shipped controller near rest, without what keeps its code from being linear there."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, NamedTuple
 

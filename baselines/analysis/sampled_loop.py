@@ -5,8 +5,6 @@ observation channel; its memory must be a NamedTuple of arrays. So the margins a
 that of the environment: measure at t_k, act at once; the v_p and Q_H observed at t_k were applied before.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from itertools import pairwise

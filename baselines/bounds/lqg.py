@@ -4,8 +4,6 @@ They know what no controller can know, and stand in tables as bounds, never as c
 ``for_episodes``, which a rollout calls, gives them this knowledge of the episodes that it is about to run.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace

@@ -6,8 +6,6 @@ the estimate (:mod:`cz_gym.baselines.lqg.regulator`). The filter's inputs are th
 limits and slew rates never wind anything up.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache

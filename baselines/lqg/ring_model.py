@@ -5,8 +5,6 @@ oscillator of two states with a slowly wandering phase (a narrow-band process), 
 sampling. This frequency is unknown; it is found as the peak in the spectrum of the ring's residual.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache

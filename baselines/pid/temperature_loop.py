@@ -5,8 +5,6 @@ for the recipe, so the temperature set-point rises until the mean pull speed is 
 [W], speeds [m/s], all as deviations from the puller's nominal.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -140,5 +140,12 @@ class Tuned(ABC):
     @property
     def contender(self) -> Contender:
         """The controller as a row of the benchmark."""
-        kind = {"default": self.default, "quoted": self.quoted, "on_puller": self.on_puller}
-        return Contender(self.name, self.make, "measured", self.meaning, **kind)
+        return Contender(
+            self.name,
+            self.make,
+            "measured",
+            self.meaning,
+            default=self.default,
+            on_puller=self.on_puller,
+            quoted=self.quoted,
+        )

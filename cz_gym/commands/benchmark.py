@@ -143,7 +143,9 @@ def contenders_of(arguments: argparse.Namespace, rows: Sequence[Row]) -> list[Co
     elif not wanted and own and not arguments.slow:
         wanted = [each.name for each in registry.CONTROLLERS if each.quoted]
     elif not wanted:
-        wanted = [each.name for each in registry.CONTROLLERS if (arguments.slow if each.slow else each.default)] + agents
+        wanted = [
+            each.name for each in registry.CONTROLLERS if (arguments.slow if each.slow else each.default)
+        ] + agents
     elif wanted == ["all"]:
         wanted = [each.name for each in registry.CONTROLLERS if may_run(each)] + agents
     for name in wanted:

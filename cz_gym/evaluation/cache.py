@@ -5,8 +5,6 @@ on: the controller's settings, the environment's (plant, scenario, interval, hor
 packages that compute.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -9,8 +9,6 @@ monotone cubic (Fritsch and Carlson's PCHIP) of the logarithm of the activity::
     curve.at(0.015)                                                # radius error of the family there [mm]
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 

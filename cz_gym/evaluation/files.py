@@ -1,7 +1,5 @@
 """A benchmark's results as files: JSON and CSV, written with the report, and read back."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """The benchmark's metrics on the true radius, one value an episode, from logged signals; ``return`` alone is reward."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

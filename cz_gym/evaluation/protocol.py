@@ -1,7 +1,5 @@
 """The benchmark's protocol: its scenarios, their episodes and settings."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

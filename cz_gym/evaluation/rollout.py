@@ -1,7 +1,5 @@
 """Rollouts: a policy on seeded episodes, all in one batch, every signal logged."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -73,7 +71,7 @@ def rollout(
     policy: Any,
     config: Config,
     seeds: Sequence[int] | npt.NDArray[Any],
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[int], Any] | None = None,
     designed_for: Config | None = None,
 ) -> Rollout:
     """Run ``policy.predict`` on one episode a seed, all in one batch.

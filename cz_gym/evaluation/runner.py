@@ -23,7 +23,7 @@ BLOCK = 10
 """Episodes that a slow controller runs at once, and that are cached together."""
 
 
-def run_episodes(contender: Contender, row: Row, seeds: Sequence[int], progress: Callable[[int], object]) -> Sample:
+def run_episodes(contender: Contender, row: Row, seeds: Sequence[int], progress: Callable[[int], Any]) -> Sample:
     """Roll a contender out on some episodes of a row."""
     interface = contender.observation, contender.action
     config, designed_for = row.config(*interface), row.design_config(*interface)
@@ -112,7 +112,7 @@ def run(
     return results
 
 
-def measure(task: Task, progress: Callable[[int], object]) -> Sample:
+def measure(task: Task, progress: Callable[[int], Any]) -> Sample:
     """The sample of a task; a slow controller's cached episodes are read, the others run in blocks and cached."""
     each, row, seeds = task.contender, task.row, task.seeds
     if not each.slow:

@@ -1,7 +1,5 @@
 """Conversions between SI and the units people read: ``0.5 * MM`` enters SI, ``r_c / MM`` leaves it."""
 
-from __future__ import annotations
-
 MM = 1e-3
 """One millimetre [m]."""
 KILO = 1e3

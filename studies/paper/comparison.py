@@ -1,7 +1,5 @@
 """Every published value beside ours, with the difference and, where they differ, why."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

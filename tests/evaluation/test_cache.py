@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cz_gym.commands import benchmark
 import cz_gym
 import cz_gym.agents
 from cz_gym.baselines import OpenLoop, registry
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
+from cz_gym.commands import benchmark
 from cz_gym.config import make_config
 from cz_gym.evaluation import cache, runner
 from cz_gym.evaluation.cache import code_behind, sources_behind

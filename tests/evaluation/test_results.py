@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cz_gym.commands import benchmark
 from cz_gym.baselines import CompensatedPID
 from cz_gym.baselines.registry import find_controller
+from cz_gym.commands import benchmark
 from cz_gym.config import make_config
 from cz_gym.evaluation.cache import earlier_bound
 from cz_gym.evaluation.files import to_csv

@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 from tqdm import tqdm
 
-from cz_gym.commands import train
 from cz_gym.agents import AgentFileError
 from cz_gym.agents.training import fleet, run, validation
 from cz_gym.agents.training.recipes import RECIPES
+from cz_gym.commands import train
 from tests.small_learners import QUICK, REFERENCES, train_small_seed
 
 pytestmark = pytest.mark.usefixtures("few_crystals")

@@ -11,11 +11,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from cz_gym.commands import train
 from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.training import run
 from cz_gym.agents.training.checkpoint import load_checkpoint
 from cz_gym.agents.training.recipes import RECIPES
+from cz_gym.commands import train
 from cz_gym.support.command_line import interpreter
 from tests.small_learners import QUICK
 
