@@ -143,7 +143,7 @@ class EkfMpc(LQG):
 
 
 def ekf_mpc(design: LQGDesign, config: Config) -> EkfMpc:
-    """``ekf-mpc`` as it ships: ``lqg``'s design with smaller weights on moves, and the limits of the scenario's drives."""
+    """``ekf-mpc`` as it ships: that design with smaller weights on moves, and the limits of the scenario's drives."""
     radius, *others = design.weights
     weights = Weights(radius, *(WEIGHT_FACTOR * weight for weight in others))
     return EkfMpc(design=replace(design, weights=weights), actuators=config.sole_scenario.actuators).for_config(config)

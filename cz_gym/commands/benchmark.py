@@ -85,7 +85,7 @@ def main(argv: Sequence[str]) -> int:
         mine += [name or file.stem for name, file in arguments.agent]
         mine += [Path(arguments.puller).stem] if arguments.puller else []
         arguments.out = OWN / "-".join(dict.fromkeys(mine)) if mine else FOLDER
-    command = shlex.join(["-m", "cz_gym", "benchmark", *argv])
+    command = shlex.join(["cz-gym", "benchmark", *argv])
     return guarded("cz-gym benchmark", lambda: benchmark(arguments, command), "benchmark")
 
 

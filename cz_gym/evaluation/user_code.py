@@ -5,9 +5,8 @@ import inspect
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from cz_gym.config import Config
 from cz_gym.episodes.mixture import Distribution
@@ -71,14 +70,16 @@ class Maker:
     """The controllers of ``FILE.py:NAME``; another process reads the file again."""
 
     place: str
+    source: Any
+    """The object there."""
+
+    @classmethod
+    def of(cls, place: str) -> Self:
+        """The maker of a place; CzError if nothing there can be one."""
+        return cls(str(Path(place).absolute()), load(place, "controller", _controls)[1])
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (str(Path(self.place).absolute()),)
-
-    @cached_property
-    def source(self) -> Any:
-        """The object there."""
-        return load(self.place, "controller", _controls)[1]
+        return type(self).of, (self.place,)
 
     def __call__(self, config: Config) -> Any:
         """The controller for an environment; a class or function gets what it names of its settings."""
@@ -96,7 +97,7 @@ def controller(place: str) -> Contender:
     names. Its attributes ``observation`` and ``action`` say what it reads and what its actions mean; "measured" and
     "direct" without.
     """
-    source = (maker := Maker(place)).source
+    source = (maker := Maker.of(place)).source
     if not (hasattr(source, "predict") or (callable(source) and not inspect.isclass(source))):
         raise CzError(f"{place}: no controller: it has no method predict(observation, state, ...)")
     reads, acts = str(getattr(source, "observation", "measured")), str(getattr(source, "action", "direct"))
