@@ -141,7 +141,7 @@ class LQG(MeasuredController):
         error = estimate[:, : len(STATES)].copy()
         error[:, 0] -= plan[:, 0, 0]
         if self.design.error_pull is not None:
-            reach = abs(self.design.error_pull * law.feedback[0, len(STATES)] / law.feedback[0, 0])
+            reach = abs(self.design.error_pull * law.feedback[..., 0, len(STATES)] / law.feedback[..., 0, 0])
             error[:, 0] = np.clip(error[:, 0], -reach, reach)
         ahead = np.diff(plan, axis=-1)
         moves = -(law.feedback @ np.concatenate([error, previous], axis=-1)[..., None])[..., 0]

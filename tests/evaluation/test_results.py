@@ -5,6 +5,7 @@ import itertools
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -137,7 +138,7 @@ def test_an_earlier_bound_needs_its_episodes_from_the_first_on(earlier, paper):
 
 
 def test_the_committed_bounds_can_be_used(paper):
-    found = earlier_bound(benchmark.BOUNDS, find_row("randomized"), [paper])
+    found = earlier_bound(Path("results/bounds"), find_row("randomized"), [paper])
     assert found is not None
     assert len(found.seeds) == 50
 
