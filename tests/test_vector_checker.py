@@ -1,6 +1,5 @@
-"""The checker fires on each way to break a vector environment, and says which in one line."""
+"""The checker of vector environments fires on each way to break one, and says which in one line."""
 
-import functools
 from typing import Any
 
 import gymnasium as gym
@@ -10,6 +9,8 @@ from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from tests.vector_checker import NotConforming, check_vector_env
+
+NEXT, SAME, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
 
 
 class Walk(gym.Env[Any, Any]):
@@ -32,57 +33,41 @@ class Walk(gym.Env[Any, Any]):
         return {"x": self.x.astype(np.float32), "t": np.array([self.k], np.float32)}
 
 
-class Conforming(SyncVectorEnv):
-    """Gymnasium's own vector of walks: what the toys below break."""
-
-    def __init__(self, num_envs, mode):
-        super().__init__([Walk] * num_envs, autoreset_mode=mode, copy=True)
-
-
-def odd(
-    made=lambda env: None,
+def vector(
+    num_envs=3,
+    mode=NEXT,
+    made=None,
     reset=lambda seed, options: {},
-    acts=lambda actions: actions,
     step=lambda *result: result,
-    after=lambda actions: None,
-    fewer=0,
-    always=None,
+    after=lambda given: None,
 ):
-    """A vector that is changed once it is made, resets with other arguments, takes other actions, returns something
-    else from a step, or does something to the actions after it; of fewer slots, or always of one mode."""
+    """Gymnasium's vector of walks, changed once it is made, that resets with other arguments, returns something else
+    from a step, or does something to the actions after it."""
 
-    class Broken(Conforming):
-        def __init__(self, num_envs, mode):
-            super().__init__(num_envs - fewer, always or mode)
-            made(self)
-
+    class Broken(SyncVectorEnv):
         def reset(self, *, seed=None, options=None):
             return super().reset(**{"seed": seed, "options": options, **reset(seed, options)})
 
         def step(self, actions):
-            result = step(*super().step(acts(actions)))
+            result = step(*super().step(actions))
             after(actions)
             return result
 
-    return Broken
+    env = Broken([Walk] * num_envs, autoreset_mode=mode, copy=True)
+    vars(env).update(made or {})
+    return env
 
 
-class Repeating(Conforming):
-    """Autoreset replays each slot's first state, as in brax."""
+def reads_back():
+    """A step whose rewards carry over what is in the array that was handed out."""
+    handed = [np.zeros(3)] * 2
 
-    def __init__(self, num_envs, mode):
-        super().__init__(num_envs, mode)
-        for env in self.envs:
-            env.reset = functools.partial(self._again, env)
+    def step(observation, reward, *rest):
+        reward = reward + (handed[0] - handed[1])
+        handed[:] = reward, reward.copy()
+        return observation, reward, *rest
 
-    @staticmethod
-    def _again(env, seed=None, options=None):
-        shown = Walk.reset(env, seed=seed, options=options)
-        if seed is not None or not hasattr(env, "first"):
-            env.first = env.x.copy()
-            return shown
-        env.x = env.first.copy()
-        return env._shown(), {"far": float(np.abs(env.x).max())}
+    return step
 
 
 def next_first(observation, *rest):
@@ -93,112 +78,45 @@ def next_first(observation, *rest):
     return observation, *rest
 
 
-class Recycled(Conforming):
-    """Rewards alternate between two arrays."""
-
-    def step(self, actions):
-        if not hasattr(self, "arrays"):
-            self.arrays = [np.zeros(self.num_envs), np.zeros(self.num_envs)]
-        observation, reward, *rest = super().step(actions)
-        self.arrays.reverse()
-        self.arrays[0][:] = reward
-        return observation, self.arrays[0], *rest
-
-
-class ReadBack(Conforming):
-    """Rewards carry over what is in the array that was handed out, or handed in."""
-
-    last: Any = None
-
-    def step(self, actions):
-        observation, reward, *rest = super().step(actions)
-        if self.last is not None:
-            reward = reward + (self.last[0] - self.last[1])
-        self.last = self.remembered(reward, actions)
-        return observation, reward, *rest
-
-    def remembered(self, reward, actions):
-        return reward, reward.copy()
-
-
-class KeepsActions(ReadBack):
-    def remembered(self, reward, actions):
-        return actions[:, 0], actions[:, 0].copy()
-
-
-REWARD = odd(step=lambda observation, reward, *rest: (observation, reward * [1.0, 1.0 + 1e-12, 1.0], *rest))
-TIMEOUT = odd(step=lambda o, r, failed, truncated, i: (o, r, failed | truncated, np.zeros_like(truncated), i))
-"""The time limit is returned as a failure, as in pc-gym."""
-NEXT, SAME, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
-BROKEN = {
-    "space": (odd(lambda env: setattr(env, "single_action_space", Box(-2, 2, (1,)))), "single_action_space is", NEXT),
-    "batched": (odd(lambda env: setattr(env, "action_space", env.single_action_space)),
-                "action_space is .* the batch of 3 is", NEXT),
-    "mode": (odd(always=NEXT), r"metadata\['autoreset_mode'\] is", SAME),
-    "fewer": (odd(fewer=1), "num_envs is 2, asked for 3", NEXT),
-    "seedless": (odd(reset=lambda seed, options: {"seed": None}),
-                 "seed 0 gives another first observation in a second environment", NEXT),
-    "stuck": (odd(reset=lambda seed, options: {"seed": None if "reset_mask" in (options or {}) else 5}),
-              "differs from the scalar with that seed", NEXT),
-    "alike": (odd(reset=lambda seed, options: {"seed": [seed] * 3 if isinstance(seed, int) else seed}),
-              "slots 0 and 1 have the same first observation", NEXT),
-    "first of a seed list": (odd(reset=lambda seed, options: {"seed": seed[0] if isinstance(seed, list) else seed}),
-                            "seed list: slot 1 with seed 14 differs", NEXT),
-    "repeating": (Repeating, "the same first observations", NEXT),
-    "observations of 64 bits": (odd(step=lambda shown, *rest: ({k: v.astype(float) for k, v in shown.items()}, *rest)),
-                                r"observation\['t'\] is float64 .* and float32", NEXT),
-    "unmasked": (odd(step=lambda *result: (*result[:4], {k: each for k, each in result[4].items() if k != "_far"})),
-                 r"info\['_far'\] is in one only", NEXT),
-    "reward": (REWARD, "reward of slot 1 is .* and", NEXT),
-    "time limit": (TIMEOUT, "terminated of slot . is True and False", NEXT),
-    "final": (odd(step=next_first), r"info\['final_obs'\]\[.\]\['t'\]", SAME),
-    "coupled": (odd(acts=lambda actions: np.repeat(actions[:1], len(actions), axis=0)),
-                r"observation\['x'\] of slot 1", NEXT),
-    "reused": (odd(lambda env: setattr(env, "copy", False)), "was written by a later call", NEXT),
-    "recycled": (Recycled, r"\[1\] .kept as .* was written by a later call", NEXT),
-    "reads results back": (ReadBack, "writing into earlier results or actions changed", NEXT),
-    "keeps actions": (KeepsActions, "writing into earlier results or actions changed", NEXT),
-    "writes actions": (odd(after=lambda actions: actions.fill(0.5)), "wrote into the", NEXT),
-    "resets all": (odd(reset=lambda seed, options: {"options": None}), "reset of ended slots", DISABLED),
+BROKEN: dict[str, tuple[dict[str, Any], AutoresetMode]] = {
+    "single_action_space is": ({"made": {"single_action_space": Box(-2, 2, (1,))}}, NEXT),
+    "seed 0 gives another first observation in a second environment": ({"reset": lambda *_: {"seed": None}}, NEXT),
+    "slots 0 and 1 have the same first observation": (
+        {"reset": lambda seed, _: {"seed": [seed] * 3 if isinstance(seed, int) else seed}}, NEXT),
+    "seed list: slot 1 with seed 14 differs": (
+        {"reset": lambda seed, _: {"seed": seed[0] if isinstance(seed, list) else seed}}, NEXT),
+    r"observation\['t'\] is float64 .* and float32": (
+        {"step": lambda shown, *rest: ({k: v.astype(float) for k, v in shown.items()}, *rest)}, NEXT),
+    r"info\['_far'\] is in one only": (
+        {"step": lambda *result: (*result[:4], {k: v for k, v in result[4].items() if k != "_far"})}, NEXT),
+    "reward of slot 1 is .* and": ({"step": lambda o, r, *rest: (o, r * [1.0, 1.0 + 1e-12, 1.0], *rest)}, NEXT),
+    "terminated of slot . is True and False": (
+        {"step": lambda o, r, failed, late, info: (o, r, failed | late, np.zeros_like(late), info)}, NEXT),
+    r"info\['final_obs'\]\[.\]\['t'\]": ({"step": next_first}, SAME),
+    "was written by a later call": ({"made": {"copy": False}}, NEXT),
+    "writing into earlier results or actions changed": ({"step": reads_back}, NEXT),
+    "wrote into the": ({"after": lambda actions: actions.fill(0.5)}, NEXT),
+    "reset of ended slots": ({"reset": lambda *_: {"options": None}}, DISABLED),
 }  # fmt: skip
-"""Each with what is said of it, and the mode that shows it."""
+"""Changes of the vector by what is said of them, and the mode that shows them."""
 
 
 @pytest.mark.parametrize("mode", AutoresetMode)
 def test_gymnasiums_own_vector_conforms(mode):
-    checked = check_vector_env(Conforming, Walk, steps=40, mode=mode)
+    checked = check_vector_env(vector, Walk, steps=40, mode=mode)
     assert checked.episodes > checked.failures > 2
     assert checked.held > 40 * 4
 
 
-@pytest.mark.parametrize("name", BROKEN)
-def test_each_break_is_named_in_one_line(name):
-    make, says, mode = BROKEN[name]
-    with pytest.raises(NotConforming, match=says) as found:
-        check_vector_env(make, Walk, steps=40, mode=mode)
-    assert "\n" not in str(found.value)
-    assert str(found.value).startswith(f"[{mode.value}] ")
+@pytest.mark.parametrize("says", BROKEN)
+def test_each_break_is_named_in_one_line(says):
+    changes, mode = BROKEN[says]
 
+    def broken(n, mode):
+        own = {name: change() if change is reads_back else change for name, change in changes.items()}
+        return vector(n, mode, **own)
 
-def test_a_replayed_start_is_found_where_no_seed_shows_it():
-    class Replays(Repeating):
-        """A reset of the user's draws; only autoreset replays."""
-
-        def reset(self, *, seed=None, options=None):
-            for env in self.envs:
-                if options is None:
-                    env.__dict__.pop("first", None)
-            return super().reset(seed=seed, options=options)
-
-    with pytest.raises(NotConforming, match=r"step \d+: slot . begins again with a first observation it had before"):
-        check_vector_env(Replays, Walk, steps=40, mode=NEXT)
-
-
-def test_a_check_that_sees_no_end_is_no_check():
-    class Endless(Walk):
-        def step(self, action):
-            observation, reward, _, _, info = super().step(action)
-            return observation | {"t": np.zeros(1, np.float32)}, reward, False, False, info
-
-    with pytest.raises(NotConforming, match="no episode ended in 5 steps"):
-        check_vector_env(lambda n, mode: SyncVectorEnv([Endless] * n, autoreset_mode=mode), Endless, mode=NEXT, steps=5)
+    with pytest.raises(NotConforming, match=says) as caught:
+        check_vector_env(broken, Walk, steps=40, mode=mode)
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith(f"[{mode.value}] ")

@@ -110,10 +110,10 @@ def _parts(memory: Any, name: str = "") -> dict[str, Floats]:
     """The arrays of a memory's first slot, by their names in the nested tuple."""
     if not isinstance(memory, tuple):
         return {name: np.asarray(memory, np.float64)[:1]}
-    found: dict[str, Floats] = {}
+    parts: dict[str, Floats] = {}
     for field, part in zip(memory._fields, memory, strict=True):  # type: ignore[attr-defined]
-        found |= _parts(part, f"{name}.{field}" if name else field)
-    return found
+        parts |= _parts(part, f"{name}.{field}" if name else field)
+    return parts
 
 
 def _answer(policy: Any, probes: Floats, rest: Any, free: Sequence[str]) -> Floats:

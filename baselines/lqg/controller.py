@@ -96,7 +96,7 @@ def solve_each(
 class LQG(MeasuredController):
     """The LQG of the nominal puller; with ``hypotheses``, one that estimates the strength of the fluctuations."""
 
-    estimates_temperature: ClassVar[bool] = True
+    accepts_missing_temperature: ClassVar[bool] = True
 
     design: LQGDesign = LQGDesign()
     hypotheses: Hypotheses | None = None

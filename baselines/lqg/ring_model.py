@@ -21,7 +21,7 @@ from .model import STATES, PlantModel
 RIPPLE = len(STATES)
 """Index of the first of the ripple's two states."""
 RIPPLE_STATES = slice(RIPPLE, RIPPLE + 2)
-"""Both."""
+"""Indices of the two ripple states."""
 
 
 @dataclass(frozen=True)

@@ -53,13 +53,13 @@ Measure = Callable[[Any, Config, Sequence[int]], Figures]
 
 def measure(policy: Any, config: Config, seeds: Sequence[int]) -> Figures:
     """Run a controller on those episodes; figures have six digits, as in the history."""
-    found, per_step = metrics(rollout(policy, config, seeds)), STEP_TIME / config.control_interval
+    means, per_step = metrics(rollout(policy, config, seeds)), STEP_TIME / config.control_interval
     values = (
-        found.rmse_observable_mm.mean(),
-        per_step * found.pull_step_rms_mm_per_min.mean(),
-        per_step * found.heater_step_rms_kw.mean(),
-        found.return_.mean(),
-        found.failure_rate.mean(),
+        means.rmse_observable_mm.mean(),
+        per_step * means.pull_step_rms_mm_per_min.mean(),
+        per_step * means.heater_step_rms_kw.mean(),
+        means.return_.mean(),
+        means.failure_rate.mean(),
     )
     return Figures._make([*(float(f"{value:.6g}") for value in values), config.steps])
 
@@ -134,15 +134,15 @@ class Search:
         """The candidate's trial on those seeds; survival counts if its score is ``below`` a limit."""
         settings = self.settings(values)
         policy = self.goal.policy(settings, self.config)
-        found = self.measure(policy, self.config, seeds)
-        score = self.goal.cost(found, policy)
+        figures = self.measure(policy, self.config, seeds)
+        score = self.goal.cost(figures, policy)
         lost: dict[str, float] = {}
         if survive and score < below:
             for name in self.goal.survive:
                 config = self.config.with_scenario(name)
                 other = self.goal.policy(settings, config)
                 lost[name] = self.measure(other, config, SURVIVAL_SEEDS[:survive]).failure_rate
-        facts = {"figures": found._asdict(), "lost": lost}
+        facts = {"figures": figures._asdict(), "lost": lost}
         return Trial(values, score + self.goal.failure_price * sum(lost.values()), facts)
 
     def best(self, count: int) -> list[Trial]:
@@ -157,8 +157,8 @@ class Search:
             self._read(path)
         self.explore()
         twice = 2 * self.budget["episodes"]
-        found = [self._scored(trial.values, VALIDATION_SEEDS[:twice], twice) for trial in self.best(FINALISTS)]
-        judged = sorted(found, key=lambda trial: trial.score)
+        finalists = [self._scored(trial.values, VALIDATION_SEEDS[:twice], twice) for trial in self.best(FINALISTS)]
+        judged = sorted(finalists, key=lambda trial: trial.score)
         entries = [
             {"score": trial.score, "values": dict(zip(self._paths, trial.values, strict=True)), **trial.facts}
             for trial in judged
@@ -170,13 +170,13 @@ class Search:
         """Take up the trials of a file; CzError if it is none, or of another search."""
         try:
             with naming(path):
-                found = json.loads(path.read_text("utf-8"))
-            if found["parameters"] != self._paths:
+                file = json.loads(path.read_text("utf-8"))
+            if file["parameters"] != self._paths:
                 raise CzError(f"its parameters are not those of {self.controller}")
-            if found.get("puller", DEFAULT.label) != self.config.puller.label:
-                raise CzError(f"it is of puller {found['puller']}: remove it to begin anew")
-            self.trials = [Trial(tuple(values), score, facts) for values, score, facts in found["history"]]
-            episodes = found["budget"]["episodes"]
+            if file.get("puller", DEFAULT.label) != self.config.puller.label:
+                raise CzError(f"it is of puller {file['puller']}: remove it to begin anew")
+            self.trials = [Trial(tuple(values), score, facts) for values, score, facts in file["history"]]
+            episodes = file["budget"]["episodes"]
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise CzError(f"{path} is no history of this search: {error!r}") from None
         if episodes != self.budget["episodes"]:
