@@ -10,6 +10,8 @@ HOUR = 3600.0
 """One hour [s]."""
 MM_PER_MIN = MM / MINUTE
 """One millimetre per minute [m/s]."""
+CELSIUS = 273.15
+"""Zero degrees Celsius [K]."""
 PERCENT = 1e-2
 """One per cent [-]."""
 MICRO = 1e-6

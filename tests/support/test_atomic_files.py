@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from cz_gym.support import atomic_files
 from cz_gym.errors import CzError
+from cz_gym.support import atomic_files
 from cz_gym.support.atomic_files import LOCK, check_writable, locked, naming, write_files
 from tests.processes import python
 
