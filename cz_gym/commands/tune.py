@@ -10,7 +10,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from cz_gym.baselines.tuning.lqg import FILTER, LQGS
+from cz_gym.baselines.tuning.lqg import LQGS
 from cz_gym.baselines.tuning.pid import PIDS
 from cz_gym.baselines.tuning.record import Tuned
 from cz_gym.baselines.tuning.search import Search, Trial, measure
@@ -64,7 +64,7 @@ def for_puller(given: argparse.Namespace, puller: PullerFile) -> None:
     """Search for a puller, several controllers side by side, and print what was chosen."""
     from tqdm import tqdm
 
-    searched = {name: TUNABLE[name] for name in sorted(TUNABLE, key=FILTER.__ne__) if TUNABLE[name].searched_on_puller}
+    searched = {each.name: each for each in (*LQGS, *PIDS) if each.searched_on_puller}
     if given.controller not in (None, *searched):
         raise CzError(unknown("controller to tune for a puller", given.controller, searched))
     config, folder = crystals_on(puller), given.out or folder_of(puller)
