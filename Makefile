@@ -57,9 +57,9 @@ test-wheel: $(TEST_READY) ## the tests on what the wheel installs, outside this 
 	$(BIN)/python -m build --no-isolation --outdir "$$folder" . >/dev/null && \
 	tar -xzf "$$folder"/*.tar.gz -C "$$folder/tests" --strip-components=1 && \
 	$(BIN)/python -m pip install --quiet --no-deps --target "$$folder/installed" "$$folder"/*.whl && \
-	rm -r "$$folder/tests/cz_gym" "$$folder/tests/agents" "$$folder/tests/baselines" && \
-	ln -s ../installed/cz_gym "$$folder/tests" && \
-	cd "$$folder/tests" && "$(CURDIR)/$(BIN)/python" -m pytest -q $(TESTS) $(IN_PARALLEL)
+	cd "$$folder/tests" && rm -r cz_gym cz_gym_command.py agents baselines && \
+	ln -s ../installed/cz_gym ../installed/cz_gym_command.py . && \
+	"$(CURDIR)/$(BIN)/python" -m pytest -q $(TESTS) $(IN_PARALLEL)
 
 ADVISORIES := https://pypi.org/pypi/numpy/$(shell sed -n 's/^numpy==//p' constraints.txt)/json
 audit: ## known weaknesses of the pinned packages; asks PyPI's advisories

@@ -1,7 +1,5 @@
 """Classical controllers, all through the method ``predict`` on "measured" observations."""
 
-from __future__ import annotations
-
 if __name__ != "cz_gym.baselines":
     raise ImportError("import cz_gym.baselines: the folder baselines is that package, under no other name")
 

@@ -27,8 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.baselines.bounds.trajectory import SCALES, Limits, limits_of
-from cz_gym.baselines.lqg.controller import LQG, Gains
-from cz_gym.baselines.lqg.designs import lqg
+from cz_gym.baselines.lqg.controller import LQG, Gains, LQGDesign
 from cz_gym.baselines.lqg.model import DRIFT, FAST, HEATER, PLANT, SLOW, STATES
 from cz_gym.baselines.lqg.multiple_model import Hypotheses
 from cz_gym.baselines.lqg.regulator import Regulator, quadratic_cost
@@ -143,9 +142,8 @@ class EkfMpc(LQG):
         return np.clip(moved, -scale * self.limits.span, scale * self.limits.span)
 
 
-def ekf_mpc(config: Config) -> EkfMpc:
-    """``ekf-mpc`` as it ships: ``lqg`` with smaller weights on moves, and the limits of the scenario's drives."""
-    design = lqg("lqg", config).design
+def ekf_mpc(design: LQGDesign, config: Config) -> EkfMpc:
+    """``ekf-mpc`` as it ships: that design with smaller weights on moves, and the limits of the scenario's drives."""
     radius, *others = design.weights
     weights = Weights(radius, *(WEIGHT_FACTOR * weight for weight in others))
     return EkfMpc(design=replace(design, weights=weights), actuators=config.sole_scenario.actuators).for_config(config)

@@ -1,7 +1,5 @@
 """The interface that controllers and agents share: stable-baselines3's ``predict``, for a batch of crystals at once."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -65,8 +63,8 @@ class MeasuredController(ABC):
     """Observation that it reads."""
     action: ClassVar[str] = "direct"
     """Meaning of its actions."""
-    estimates_temperature: ClassVar[bool] = False
-    """Whether a pyrometer reading that is not finite reaches it as such, instead of the last one."""
+    accepts_missing_temperature: ClassVar[bool] = False
+    """Whether missing pyrometer readings arrive as NaN, and not as the last reading."""
 
     control_interval: float = 5.0
     """Time between actions [s]."""
@@ -143,7 +141,7 @@ class MeasuredController(ABC):
             state = fresh(state, State(first, self.at_rest(first)), episode_start)
         good = np.isfinite(array).all() and (seen.valid > 0.5).all()
         read = seen if good else readable(seen, state.readings)
-        given = read._replace(T_1=seen.T_1) if self.estimates_temperature else read
+        given = read._replace(T_1=seen.T_1) if self.accepts_missing_temperature else read
         pull, power, memory = self.step(given, state.memory)
         action = to_action(pull / self.v_0, power / self.heater_range, single)
         return mark(action, self.made_for), State(read, memory)

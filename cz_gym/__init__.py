@@ -3,13 +3,9 @@
 Importing this package registers ``Cz-v0``; ``gym.make("cz_gym:Cz-v0")`` imports it by itself.
 """
 
-from __future__ import annotations
-
 import sys
 from importlib import import_module
 from typing import Any
-
-from .support import interrupts  # noqa: F401  (first of all)
 
 try:
     import gymnasium as gym

@@ -1,4 +1,4 @@
-"""Pull a crystal by hand in Gymnasium's own player: ``python -m cz_gym.play [--scenario NAME] [--seed N] ...``."""
+"""Pull a crystal by hand in Gymnasium's own player: ``cz-gym play [--scenario NAME] [--seed N] ...``."""
 
 import argparse
 import os
@@ -39,7 +39,7 @@ STEP = 0.1
 def main(arguments: Sequence[str] | None = None) -> int:
     """Play one crystal; 0 when done, 2 for bad input or without a window, 130 when interrupted."""
     parser = OneLineParser(
-        "python -m cz_gym.play",
+        "cz-gym play",
         "Pull a crystal by hand in a window; the score compares you with the paper's controller on the same crystal.",
         "Keys: up and down change the pull speed, right and left the heater, ten times as fast with shift; Esc ends.",
     )

@@ -4,8 +4,6 @@
 scenario that did not choose them; ``--out`` receives the table and the learning curves.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Mapping, Sequence

@@ -4,8 +4,6 @@
 whose ``state`` must be a NamedTuple of arrays.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

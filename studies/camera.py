@@ -4,8 +4,6 @@ The readings are of the same crystals: the plant's closed-form ring, the ring's 
 what the detector reads from an image.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -1,7 +1,5 @@
 """Model cards of the shipped agents, with the benchmark's figures: training, results and failures."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Mapping, Sequence

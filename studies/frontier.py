@@ -3,12 +3,10 @@
 Returns stand beside them: Spearman's correlation of return and ratio, over the controllers that are no bounds, says how
 well the reward ranks them.
 
-The LQG's settings (:data:`cz_gym.baselines.lqg.designs.FAMILY`) are the reference family of
+The LQG's settings (:data:`cz_gym.baselines.tuning.lqg.FAMILY`) are the reference family of
 :mod:`cz_gym.evaluation.equal_activity`. With ``episodes.csv`` beside the file, each ratio has a 95 % bootstrap interval
 over crystals and training seeds.
 """
-
-from __future__ import annotations
 
 import argparse
 import sys
@@ -20,8 +18,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import spearmanr
 
-from cz_gym.baselines.lqg.designs import FAMILY
 from cz_gym.baselines.registry import CONTROLLERS
+from cz_gym.baselines.tuning.lqg import FAMILY
 from cz_gym.errors import CzError
 from cz_gym.evaluation.equal_activity import Point, frontier, intervals, ratios
 from cz_gym.evaluation.files import EPISODES, Episodes, read_episodes, read_results

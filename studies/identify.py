@@ -19,9 +19,10 @@ from typing import NamedTuple
 import numpy as np
 
 from cz_gym import CzEnv, Parameters, make_puller
-from cz_gym.baselines.lqg.designs import TOLD, lqg
+from cz_gym.baselines.lqg.controller import LQG
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
-from cz_gym.baselines.pid.settings import settings_of
+from cz_gym.baselines.tuning.lqg import FILTER, LQGS
+from cz_gym.baselines.tuning.pid import PIDS
 from cz_gym.body.task import HEATER_RANGE
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Pullers
@@ -90,7 +91,8 @@ def draw(number: int) -> tuple[PullerFile, PullerFile]:
 def write_logs(truth: PullerFile, seed: int, folder: Path) -> tuple[Path, Path]:
     """CSV files of three hours under a PID of the puller's own, with and without excitation."""
     env = CzEnv(SCENARIO, observation="measured", action="direct", puller=truth, info="all")
-    pid = settings_of("pid-conventional", SCENARIO).for_config(env.config)
+    (tuned,) = (each for each in PIDS if each.name == "pid-conventional")
+    pid = tuned.settings(SCENARIO).for_config(env.config)
     assert isinstance(pid, FilteredPID)
     pid = replace(pid, heater=replace(pid.heater, K=pid.heater.K * truth.parameters.C_1 / Parameters().C_1))
     paths = folder / "excited.csv", folder / "passive.csv"
@@ -108,8 +110,10 @@ def study(number: int, crystals: int) -> Row:
         write_puller(found.puller, Path(name) / "my.toml")
         identified = read_puller(Path(name) / "my.toml")
     config = make_config(SCENARIO, observation="measured", action="direct", puller=truth)
+    (tuned,) = (each for each in LQGS if each.name == FILTER)
+    design = tuned.design(config.sole_scenario)
     policies = [
-        replace(lqg(TOLD, config), parameters=told.parameters, puller=told, any_environment=True)
+        replace(LQG(design=design).for_config(config), parameters=told.parameters, puller=told, any_environment=True)
         for told in (truth, identified, start)
     ]
     runs = [rollout(policy, config, VALIDATION_SEEDS[:crystals]) for policy in policies]

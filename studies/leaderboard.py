@@ -4,8 +4,6 @@ A submission is a folder FOLDER/NAME with the agent's files (``*.onnx``, each wi
 and the ``benchmark.json`` that ``benchmark.py --agent NAME=FILE ...`` wrote of them.
 """
 
-from __future__ import annotations
-
 import argparse
 import secrets
 import sys

@@ -4,8 +4,6 @@ Every case is measured in turn, the round is repeated, and medians are reported,
 while slows all cases alike. Steps per second count every slot's step, resets included unless a name says otherwise.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import statistics

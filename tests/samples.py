@@ -4,11 +4,26 @@ from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
+from cz_gym.baselines.lqg.controller import LQG, LQGDesign
 from cz_gym.baselines.registry import find_controller
+from cz_gym.baselines.tuning.values import with_values
 from cz_gym.evaluation.contender import Contender
 from cz_gym.evaluation.protocol import find_row
 from cz_gym.evaluation.results import Result, Sample, summarise
 from cz_gym.evaluation.rollout import Rollout, rollout
+
+NOMINAL_LQG = LQG(
+    design=with_values(
+        LQGDesign(),
+        {
+            "weights.pull": 0.008875, "weights.pull_step": 0.025, "weights.heater_step": 2.578,
+            "noise.fast_sd": 0.2618, "noise.slow_sd": 0.2928, "noise.drift_rate_sd": 0.000594,
+            "noise.drift_rate_tau": 2651.0, "noise.heater_walk": 0.2195, "noise.thermal_walk": 0.001497,
+            "noise.pyrometer_sd": 0.04472, "noise.recipe_share": 0.1782,
+        },
+    )
+)  # fmt: skip
+"""An LQG tuned on nominal hot zones alone: it is precise there, and unstable on some others."""
 
 
 def contender(name: str, meaning: str = "", training_seeds: tuple[int, ...] = (), **facts: Any) -> Contender:

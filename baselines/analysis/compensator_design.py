@@ -1,7 +1,5 @@
 """Part II's design of the compensator from a linear model of the plant, and the margins of its continuous loop."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Margins of sampled loops, computed by python-control from their frequency response."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

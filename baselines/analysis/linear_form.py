@@ -1,7 +1,5 @@
 """The state space of a shipped controller near rest, without what keeps its code from being linear there."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -67,10 +65,10 @@ def _lqg(policy: LQG, sensor: Sensor) -> LinearForm:
     still = memory._replace(
         filter=settled._replace(mean=0.0 * settled.mean), plan=0.0 * memory.plan, command=0.0 * memory.command
     )
-    found = linear_controller(
+    controller = linear_controller(
         linear,
         (policy.v_0, policy.heater_range),
         state._replace(readings=readings, memory=still),
         ("memory.filter.mean", "memory.command"),
     )
-    return LinearForm(found, found, policy.control_interval)
+    return LinearForm(controller, controller, policy.control_interval)

@@ -5,8 +5,6 @@ observation channel; its memory must be a NamedTuple of arrays. So the margins a
 that of the environment: measure at t_k, act at once; the v_p and Q_H observed at t_k were applied before.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from itertools import pairwise
@@ -112,10 +110,10 @@ def _parts(memory: Any, name: str = "") -> dict[str, Floats]:
     """The arrays of a memory's first slot, by their names in the nested tuple."""
     if not isinstance(memory, tuple):
         return {name: np.asarray(memory, np.float64)[:1]}
-    found: dict[str, Floats] = {}
+    parts: dict[str, Floats] = {}
     for field, part in zip(memory._fields, memory, strict=True):  # type: ignore[attr-defined]
-        found |= _parts(part, f"{name}.{field}" if name else field)
-    return found
+        parts |= _parts(part, f"{name}.{field}" if name else field)
+    return parts
 
 
 def _answer(policy: Any, probes: Floats, rest: Any, free: Sequence[str]) -> Floats:

@@ -3,8 +3,6 @@
 It comes from the environment's own draws and schedules, and is for bounds only; no controller may read it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

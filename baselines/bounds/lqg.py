@@ -4,8 +4,6 @@ They know what no controller can know, and stand in tables as bounds, never as c
 ``for_episodes``, which a rollout calls, gives them this knowledge of the episodes that it is about to run.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -19,7 +17,6 @@ from scipy.linalg import solve_discrete_are
 
 from cz_gym.action import mark
 from cz_gym.baselines.lqg.controller import LQG, Gains, LQGDesign, solve_each
-from cz_gym.baselines.lqg.designs import lqg
 from cz_gym.baselines.lqg.estimator import PlantFilter
 from cz_gym.baselines.lqg.model import DRIFT, DRIFT_RATE, FAST, PLANT, SLOW, STATES, NoiseModel, load_per_drift
 from cz_gym.baselines.lqg.multiple_model import MultipleModelFilter
@@ -162,8 +159,7 @@ def privileged(plain: LQG, knows_fluctuations: bool = True) -> PrivilegedLQG:
     return PrivilegedLQG(**known, knows_fluctuations=knows_fluctuations)
 
 
-def full_information(config: Config) -> FullInformation:
-    """Bound: the regulator of ``lqg`` on the true state and the present disturbances."""
-    design = lqg("lqg", config).design
+def full_information(design: LQGDesign, config: Config) -> FullInformation:
+    """Bound: an LQG's regulator on the true state and the present disturbances."""
     exact = replace(design, noise=replace(design.noise, recipe_share=0.0), heater_slack=0.0)
     return FullInformation(design=exact).for_config(config)

@@ -7,8 +7,6 @@ drives' limits (Wright 1997). The cost is quadratic, so leaving out the dynamics
 little speed and no accuracy.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ the estimate (:mod:`cz_gym.baselines.lqg.regulator`). The filter's inputs are th
 limits and slew rates never wind anything up.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -98,7 +96,7 @@ def solve_each(
 class LQG(MeasuredController):
     """The LQG of the nominal puller; with ``hypotheses``, one that estimates the strength of the fluctuations."""
 
-    estimates_temperature: ClassVar[bool] = True
+    accepts_missing_temperature: ClassVar[bool] = True
 
     design: LQGDesign = LQGDesign()
     hypotheses: Hypotheses | None = None
@@ -143,7 +141,7 @@ class LQG(MeasuredController):
         error = estimate[:, : len(STATES)].copy()
         error[:, 0] -= plan[:, 0, 0]
         if self.design.error_pull is not None:
-            reach = abs(self.design.error_pull * law.feedback[0, len(STATES)] / law.feedback[0, 0])
+            reach = abs(self.design.error_pull * law.feedback[..., 0, len(STATES)] / law.feedback[..., 0, 0])
             error[:, 0] = np.clip(error[:, 0], -reach, reach)
         ahead = np.diff(plan, axis=-1)
         moves = -(law.feedback @ np.concatenate([error, previous], axis=-1)[..., None])[..., 0]

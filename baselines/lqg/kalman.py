@@ -5,8 +5,6 @@ meniscus, and the camera's noise is unknown. On a linear plant with constant noi
 the Riccati equation.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

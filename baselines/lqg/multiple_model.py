@@ -6,8 +6,6 @@ deviations. Bayes' rule on the ring's innovations gives its probability (Magill 
 the filters.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple

@@ -5,8 +5,6 @@ reward's, before it saturates. The disturbance states, which drive the plant and
 Sylvester equation: in the Riccati equation an integrating disturbance would be unstabilisable.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

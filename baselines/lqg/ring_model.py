@@ -5,8 +5,6 @@ oscillator of two states with a slowly wandering phase (a narrow-band process), 
 sampling. This frequency is unknown; it is found as the peak in the spectrum of the ring's residual.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -23,7 +21,7 @@ from .model import STATES, PlantModel
 RIPPLE = len(STATES)
 """Index of the first of the ripple's two states."""
 RIPPLE_STATES = slice(RIPPLE, RIPPLE + 2)
-"""Both."""
+"""Indices of the two ripple states."""
 
 
 @dataclass(frozen=True)

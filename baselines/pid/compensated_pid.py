@@ -5,8 +5,6 @@ discretised by Tustin's rule, the compensator by zero-order hold, the temperatur
 starts at zero. Radii [m], speeds [m/s], temperatures [K], power [W].
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple

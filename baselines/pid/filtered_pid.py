@@ -4,8 +4,6 @@ The structure and the discretisation are those of :mod:`cz_gym.baselines.pid.com
 ``compensator=None`` it is a conventional PID. Radii [m], speeds [m/s], temperatures [K], power [W].
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from functools import cached_property

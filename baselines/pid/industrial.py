@@ -5,8 +5,6 @@ Tommy840602/czochralski-virtual-plc, docs/control_analysis.md). It speaks of dia
 mm/min, and acts every 5 s; at other control intervals each increment is scaled by the interval.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import NamedTuple

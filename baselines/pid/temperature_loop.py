@@ -5,8 +5,6 @@ for the recipe, so the temperature set-point rises until the mean pull speed is 
 [W], speeds [m/s], all as deviations from the puller's nominal.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -68,8 +66,8 @@ class TemperatureLoop:
     def step(self, seen: Measured, memory: Heat, dt: float, v_0: float, heater_range: float) -> tuple[Floats, Heat]:
         """Power above nominal [W], shape (n,), and the new memory; dt in s, v_0 in m/s, the heater's range in W."""
         mean = memory.mean_pull - math.expm1(-dt / self.T_mean) * (seen.v_p / v_0 - memory.mean_pull)
-        kept = memory.trim if self.K_pull > 0.0 else 0.0
-        trim = np.clip(kept + self.K_pull * dt / self.T_pull * mean, -self.limit, self.limit)
+        before = memory.trim if self.K_pull > 0.0 else 0.0
+        trim = np.clip(before + self.K_pull * dt / self.T_pull * mean, -self.limit, self.limit)
         error = self.share * seen.T_1_ref + self.K_pull * mean + trim - seen.T_1
         missed = (seen.Q_H - memory.command) / self.K
         integral = memory.integral + min(dt / self.T_track, 1.0) * missed

@@ -1,1 +1,1 @@
-"""Searches of controller settings: ``python -m cz_gym.baselines.tuning --controller paper-tuned --scenario puller``."""
+"""Tuned controllers: a record each, the values that searches have chosen, and the search."""

@@ -6,22 +6,16 @@ and written into the same file. Test seeds are never used. COBYLA is determinist
 candidates of a search that was stopped again, measures none of them again, and continues.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.baselines.lqg.controller import LQG, LQGDesign
 from cz_gym.baselines.lqg.regulator import STEP_TIME
 from cz_gym.baselines.policy import Floats
-from cz_gym.baselines.tuned_for import with_values
 from cz_gym.config import Config
 from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
@@ -30,54 +24,17 @@ from cz_gym.evaluation.rollout import rollout
 from cz_gym.machine.puller import DEFAULT
 from cz_gym.support.atomic_files import check_writable, naming, write_files
 
-DIGITS = 4
-"""Number of significant digits of a candidate's values."""
+from .record import Figures, Goal, value_at
+from .values import with_values
+
 FIRST_STEP = 0.5
 """COBYLA's first step, in natural logarithms of the parameters."""
-LINEAR = 5.0
-"""Length of a range that is not searched logarithmically, in the same units."""
 QUICK_STEP = 0.05
 """Step of COBYLA below which a quick search ends, in the same units."""
 FINALISTS = 3
 """Number of candidates that are scored on validation seeds, on twice as many episodes as training candidates."""
 SURVIVAL_SEEDS = TRAINING_SEEDS[100_000:]
 """Training seeds of the episodes that only have to be survived: a fifth of the episodes of a candidate."""
-
-
-class Parameter(NamedTuple):
-    """One number of a controller's settings and the range of its search."""
-
-    path: str
-    """Fields of the settings, joined by dots."""
-    low: float
-    high: float
-    log: bool = True
-    """Whether the range is searched logarithmically."""
-
-    def coordinate(self, value: float) -> float:
-        """The place of a value in the space of the search."""
-        inside = min(max(value, self.low), self.high)
-        return math.log(inside) if self.log else LINEAR * (inside - self.low) / (self.high - self.low)
-
-    def value(self, coordinate: float) -> float:
-        """The value at a place, within the range, with the digits of a candidate."""
-        free = math.exp(coordinate) if self.log else self.low + (self.high - self.low) * coordinate / LINEAR
-        return float(f"{min(max(free, self.low), self.high):.{DIGITS}g}")
-
-
-class Figures(NamedTuple):
-    """Mean figures over episodes."""
-
-    rmse_mm: float
-    """Observable radius error [mm]."""
-    pull_step: float
-    """Pull step RMS [mm/min]; at other control intervals than 5 s, that of steps of the same slope over 5 s."""
-    heater_step: float
-    """Heater step RMS [kW], likewise."""
-    mean_return: float
-    failure_rate: float
-    steps: int
-    """Number of steps of an episode."""
 
 
 class Trial(NamedTuple):
@@ -96,48 +53,15 @@ Measure = Callable[[Any, Config, Sequence[int]], Figures]
 
 def measure(policy: Any, config: Config, seeds: Sequence[int]) -> Figures:
     """Run a controller on those episodes; figures have six digits, as in the history."""
-    found, per_step = metrics(rollout(policy, config, seeds)), STEP_TIME / config.control_interval
+    means, per_step = metrics(rollout(policy, config, seeds)), STEP_TIME / config.control_interval
     values = (
-        found.rmse_observable_mm.mean(),
-        per_step * found.pull_step_rms_mm_per_min.mean(),
-        per_step * found.heater_step_rms_kw.mean(),
-        found.return_.mean(),
-        found.failure_rate.mean(),
+        means.rmse_observable_mm.mean(),
+        per_step * means.pull_step_rms_mm_per_min.mean(),
+        per_step * means.heater_step_rms_kw.mean(),
+        means.return_.mean(),
+        means.failure_rate.mean(),
     )
     return Figures._make([*(float(f"{value:.6g}") for value in values), config.steps])
-
-
-def value_at(settings: Any, path: str) -> float:
-    """The value of a parameter."""
-    return float(attrgetter(path)(settings))
-
-
-@dataclass(frozen=True)
-class Goal:
-    """The aim of a controller's search on a scenario: the least objective within limits."""
-
-    start: Any
-    """Settings with which the search begins; what is no parameter stays as it is here."""
-    parameters: tuple[Parameter, ...]
-    survive: tuple[str, ...]
-    """Scenarios that only have to be survived."""
-    objective: Callable[[Figures], float]
-    """What is minimised within the limits, failures included."""
-    limits: tuple[Callable[[Figures, Any], float], ...]
-    """Distances to the limits by figures and controller, negative beyond them."""
-    failure_price: float
-    """Cost of losing every crystal."""
-    miss_price: float
-    """Price of a negative distance."""
-
-    def policy(self, settings: Any, config: Config) -> Any:
-        """The controller with these settings, which are an LQG's design or a controller, for an environment."""
-        return (LQG(design=settings) if isinstance(settings, LQGDesign) else settings).for_config(config)
-
-    def cost(self, found: Figures, policy: Any) -> float:
-        """The objective plus the price of missed limits: the score of the figures on the scenario itself."""
-        missed = sum(max(0.0, -limit(found, policy)) for limit in self.limits)
-        return self.objective(found) + self.miss_price * missed
 
 
 class Search:
@@ -210,15 +134,15 @@ class Search:
         """The candidate's trial on those seeds; survival counts if its score is ``below`` a limit."""
         settings = self.settings(values)
         policy = self.goal.policy(settings, self.config)
-        found = self.measure(policy, self.config, seeds)
-        score = self.goal.cost(found, policy)
+        figures = self.measure(policy, self.config, seeds)
+        score = self.goal.cost(figures, policy)
         lost: dict[str, float] = {}
         if survive and score < below:
             for name in self.goal.survive:
                 config = self.config.with_scenario(name)
                 other = self.goal.policy(settings, config)
                 lost[name] = self.measure(other, config, SURVIVAL_SEEDS[:survive]).failure_rate
-        facts = {"figures": found._asdict(), "lost": lost}
+        facts = {"figures": figures._asdict(), "lost": lost}
         return Trial(values, score + self.goal.failure_price * sum(lost.values()), facts)
 
     def best(self, count: int) -> list[Trial]:
@@ -233,8 +157,8 @@ class Search:
             self._read(path)
         self.explore()
         twice = 2 * self.budget["episodes"]
-        found = [self._scored(trial.values, VALIDATION_SEEDS[:twice], twice) for trial in self.best(FINALISTS)]
-        judged = sorted(found, key=lambda trial: trial.score)
+        finalists = [self._scored(trial.values, VALIDATION_SEEDS[:twice], twice) for trial in self.best(FINALISTS)]
+        judged = sorted(finalists, key=lambda trial: trial.score)
         entries = [
             {"score": trial.score, "values": dict(zip(self._paths, trial.values, strict=True)), **trial.facts}
             for trial in judged
@@ -246,13 +170,13 @@ class Search:
         """Take up the trials of a file; CzError if it is none, or of another search."""
         try:
             with naming(path):
-                found = json.loads(path.read_text("utf-8"))
-            if found["parameters"] != self._paths:
+                file = json.loads(path.read_text("utf-8"))
+            if file["parameters"] != self._paths:
                 raise CzError(f"its parameters are not those of {self.controller}")
-            if found.get("puller", DEFAULT.label) != self.config.puller.label:
-                raise CzError(f"it is of puller {found['puller']}: remove it to begin anew")
-            self.trials = [Trial(tuple(values), score, facts) for values, score, facts in found["history"]]
-            episodes = found["budget"]["episodes"]
+            if file.get("puller", DEFAULT.label) != self.config.puller.label:
+                raise CzError(f"it is of puller {file['puller']}: remove it to begin anew")
+            self.trials = [Trial(tuple(values), score, facts) for values, score, facts in file["history"]]
+            episodes = file["budget"]["episodes"]
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise CzError(f"{path} is no history of this search: {error!r}") from None
         if episodes != self.budget["episodes"]:

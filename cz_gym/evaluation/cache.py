@@ -5,8 +5,6 @@ on: the controller's settings, the environment's (plant, scenario, interval, hor
 packages that compute.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json
@@ -49,8 +47,9 @@ class SlowEpisodes:
 
     def read(self, seeds: Sequence[int]) -> list[Sample]:
         """Samples of the cached episodes, one an episode; the first is left out if its signals were not kept."""
-        found = map(self._read, seeds)
-        return [sample for sample in found if sample and (sample.example or sample.seeds[0] != seeds[0])]
+        return [
+            sample for sample in map(self._read, seeds) if sample and (sample.example or sample.seeds[0] != seeds[0])
+        ]
 
     def _read(self, seed: int) -> Sample | None:
         """An episode with the signals that were kept; None if it is not there, or damaged."""
@@ -80,13 +79,13 @@ def earlier_bound(folder: Path, row: Row, samples: Sequence[Sample]) -> Sample |
     with the same figures: another plant, scenario or code makes other figures.
     """
     try:
-        found = read_episodes(folder / EPISODES, ("seed", *GAPS))[row.name]
-        (episodes,) = found[BOUND]
+        earlier = read_episodes(folder / EPISODES, ("seed", *GAPS))[row.name]
+        (episodes,) = earlier[BOUND]
     except (ValueError, KeyError):
         return None
     seeds = row.seeds(len(episodes))
-    classical = [sample for sample in samples if sample.name in found and not sample.contender.learned]
-    agree = [_agree(sample, found[sample.name][0]) for sample in classical]
+    classical = [sample for sample in samples if sample.name in earlier and not sample.contender.learned]
+    agree = [_agree(sample, earlier[sample.name][0]) for sample in classical]
     if episodes[:, 0].tolist() != list(seeds) or not agree or not all(agree):
         return None
     contender = Contender(BOUND, lambda config: None, "state", "bound of an earlier run", privileged=True, slow=True)

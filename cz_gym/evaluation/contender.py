@@ -1,9 +1,8 @@
 """Contenders: controllers and agents by name, and functions that build them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from cz_gym.config import Config
@@ -17,7 +16,7 @@ GROUPS = {
     STATE: "learned from the reward, state told in training",
     PLANT: "learned, plant known in training",
 }
-"""Headings of the groups of agents, by source: who is told more comes later."""
+"""Table headings of agents by source, the least information first."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +25,7 @@ class Contender:
 
     name: str
     make: Callable[[Config], Any]
-    """Builds the policy for an environment's settings; of an agent it returns the one of the first training seed."""
+    """Builds the policy for an environment's settings, of an agent that of the first training seed; it must pickle."""
     observation: str
     """Observation mode it reads; "state" marks a bound, which no sensor could feed."""
     meaning: str
@@ -37,6 +36,8 @@ class Contender:
     """Whether it knows the puller, the state or the future, which no controller can; that makes it a bound."""
     slow: bool = False
     """Whether it meets only the first few episodes, which are cached, and runs only when slow ones are asked for."""
+    on_puller: bool = False
+    """Whether a benchmark on a puller of the user's own that names no controllers runs it."""
     quoted: bool = False
     """Whether it stands in short tables and small figures, and beside a controller of the user's own."""
     action: str = "direct"
@@ -91,6 +92,10 @@ def agent(name: str, policies: Sequence[Any], own: bool = False) -> Contender:
     one = contracts[0]
     meaning = f"agent trained with {one.algorithm} on {one.scenario}{', given as a file' if own else ''}"
     return Contender(
-        name, lambda config: policies[0], one.observation, meaning,
+        name, partial(_given, policies[0]), one.observation, meaning,
         action=one.action, own=own, training_seeds=seeds, trained=tuple(policies),
     )  # fmt: skip
+
+
+def _given(policy: Any, config: Config) -> Any:
+    return policy

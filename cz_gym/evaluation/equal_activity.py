@@ -9,8 +9,6 @@ monotone cubic (Fritsch and Carlson's PCHIP) of the logarithm of the activity::
     curve.at(0.015)                                                # radius error of the family there [mm]
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -52,18 +50,18 @@ def frontier(points: Sequence[Point]) -> Frontier:
 
     Raises CzError for numbers that are not positive, and if fewer than two points are left.
     """
-    kept: list[Point] = []
+    best: list[Point] = []
     for activity, rmse in sorted(points):
         if not (0.0 < activity < np.inf and 0.0 < rmse < np.inf):
             raise CzError(f"activity and radius error must be positive numbers, not {activity} and {rmse}")
-        if not kept or rmse < kept[-1][1]:
+        if not best or rmse < best[-1][1]:
             # Two activities whose logarithms are equal are one point of the curve: the better one.
-            if kept and not np.log(activity) > np.log(kept[-1][0]):
-                kept.pop()
-            kept.append((activity, rmse))
-    if len(kept) < 2:
-        raise CzError(f"a frontier needs two settings of which neither beats the other, found {len(kept)}")
-    activities, errors = np.array(kept).T
+            if best and not np.log(activity) > np.log(best[-1][0]):
+                best.pop()
+            best.append((activity, rmse))
+    if len(best) < 2:
+        raise CzError(f"a frontier needs two settings of which neither beats the other, found {len(best)}")
+    activities, errors = np.array(best).T
     return Frontier(activities, errors)
 
 
@@ -86,11 +84,11 @@ def intervals(episodes: Mapping[str, Floats], family: Sequence[str], resamples: 
     resample has a frontier of its own. A controller quieter than every member in some resample is left out.
     """
     means = {name: resampled_means(values, resamples, of) for of, (name, values) in enumerate(episodes.items())}
-    found = [
+    by_draw = [
         ratios({name: (float(each[draw, 0]), float(each[draw, 1])) for name, each in means.items()}, family)
         for draw in range(len(resamples.episodes))
     ]
-    in_all = [name for name in means if all(name in each for each in found)]
+    in_all = [name for name in means if all(name in each for each in by_draw)]
     tail = (1.0 - LEVEL) / 2.0
-    limits = {name: np.quantile([each[name] for each in found], [tail, 1.0 - tail]) for name in in_all}
+    limits = {name: np.quantile([each[name] for each in by_draw], [tail, 1.0 - tail]) for name in in_all}
     return {name: (float(low), float(high)) for name, (low, high) in limits.items()}

@@ -1,7 +1,5 @@
 """A benchmark's results as files: JSON and CSV, written with the report, and read back."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json
@@ -42,11 +40,11 @@ def check_targets(folder: Path | None, lone: Path | None, partial: bool, overwri
     """
     renews = folder is not None and not partial and (folder / RESULTS).is_file()
     theirs = [folder / name for name in FILES] if folder and not renews else []
-    found = [path for path in (*theirs, lone) if path and path.exists()]
+    present = [path for path in (*theirs, lone) if path and path.exists()]
     if lone and lone.is_dir():
         raise CzError(f"--json {lone} is a folder")
-    if found and not overwrite:
-        raise CzError(f"{found[0]} exists: add --overwrite, or name another --out or --json")
+    if present and not overwrite:
+        raise CzError(f"{present[0]} exists: add --overwrite, or name another --out or --json")
     for place in (folder, lone and lone.parent):
         if place:
             check_writable(place)
@@ -114,19 +112,19 @@ def _plain(value: Any) -> Any:
 
 def _gaps(results: Sequence[Result], metric: str) -> dict[str, Any]:
     """The gaps in one metric, of the scenarios that have any."""
-    found = {
+    by_row = {
         result.row.name: {name: _plain(gaps[metric]) for name, gaps in result.gaps.items() if metric in gaps}
         for result in results
     }
-    return {row: gaps for row, gaps in found.items() if gaps}
+    return {row: gaps for row, gaps in by_row.items() if gaps}
 
 
 def _paired(result: Result) -> dict[str, Any]:
     """The differences, with the probability of improvement beside that of RMSE."""
-    found: dict[str, Any] = _plain(result.paired)
+    differences: dict[str, Any] = _plain(result.paired)
     for name, each in result.improvement.items():
-        found[name]["rmse_mm"]["probability_of_improvement"] = _plain(each["rmse_mm"])
-    return found
+        differences[name]["rmse_mm"]["probability_of_improvement"] = _plain(each["rmse_mm"])
+    return differences
 
 
 def _provenance(results: Sequence[Result], command: str) -> dict[str, Any]:
@@ -166,11 +164,11 @@ def _crystals(result: Result) -> dict[str, Any]:
 
 def software(packages: Sequence[str]) -> dict[str, Any]:
     """Return the versions of Python and of the packages, None for one that is not installed."""
-    found: dict[str, str | None] = dict.fromkeys(packages)
+    versions: dict[str, str | None] = dict.fromkeys(packages)
     for name in packages:
         with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return {"python": platform.python_version(), "packages": found}
+            versions[name] = version(name)
+    return {"python": platform.python_version(), "packages": versions}
 
 
 def to_csv(results: Sequence[Result]) -> str:
@@ -218,16 +216,16 @@ def read_episodes(path: Path, columns: Sequence[str]) -> Episodes:
     Raises CzError if the file is none of a benchmark's, holds what is no finite number, or a controller's training
     seeds did not meet the same number of crystals.
     """
-    found: dict[str, dict[str, dict[str, list[list[float]]]]] = {}
+    lines: dict[str, dict[str, dict[str, list[list[float]]]]] = {}
     with naming(path):
         text = path.read_text("utf-8")
     try:
         for line in csv.DictReader(io.StringIO(text)):
-            by_seed = found.setdefault(line["scenario"], {}).setdefault(line["controller"], {})
+            by_seed = lines.setdefault(line["scenario"], {}).setdefault(line["controller"], {})
             by_seed.setdefault(line["training_seed"], []).append([float(line[name]) for name in columns])
         arrays = {
             scenario: {name: np.array([*by_seed.values()]) for name, by_seed in by_name.items()}
-            for scenario, by_name in found.items()
+            for scenario, by_name in lines.items()
         }
         if not all(np.isfinite(values).all() for by_name in arrays.values() for values in by_name.values()):
             raise ValueError

@@ -1,7 +1,5 @@
 """The benchmark's metrics on the true radius, one value an episode, from logged signals; ``return`` alone is reward."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -127,8 +125,8 @@ def _at_limits(run: Rollout) -> npt.NDArray[np.bool_]:
         np.abs(np.diff(s.v_p, axis=0, prepend=start.v_p)) >= ALMOST * fastest
     )
     heater = (np.abs(s.Q_H - start.Q_H) >= ALMOST * config.heater_range - 0.5 * step) | np.less_equal(s.Q_H, 0.5 * step)
-    found: npt.NDArray[np.bool_] = pull | heater | (np.abs(moved) >= ALMOST * steps * slew - 0.5 * step)
-    return found
+    at_limit: npt.NDArray[np.bool_] = pull | heater | (np.abs(moved) >= ALMOST * steps * slew - 0.5 * step)
+    return at_limit
 
 
 def _mean_pull_share(v_p: Floats, alive: npt.NDArray[np.bool_], v_0: float, dt: float) -> Floats:

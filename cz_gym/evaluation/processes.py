@@ -1,11 +1,9 @@
-"""One function on many tasks, in several processes of this machine; results in the order they are done."""
-
-from __future__ import annotations
+"""One function on many tasks, through any executor; by default in several processes of this machine."""
 
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import get_context
@@ -21,28 +19,36 @@ Look = Callable[[], None]
 """A function that is called about once a second while tasks run."""
 
 
+def through(
+    executor: Executor, function: Callable[[Any], Any], tasks: Sequence[Any], look: Look | None = None
+) -> Iterator[tuple[int, Any]]:
+    """Run ``function`` on every task by an executor; yields the number of a task and its result, as they come.
+
+    Function, tasks and results must pickle. The exception of a task is raised here.
+    """
+    with _uninterrupted():
+        numbers = {executor.submit(function, task): number for number, task in enumerate(tasks)}
+    while numbers:
+        for each in wait(numbers, WAIT, FIRST_COMPLETED).done:
+            yield numbers.pop(each), each.result()
+        if look:
+            look()
+
+
 def in_processes(
     function: Callable[[Any], Any], tasks: Sequence[Any], look: Look | None = None, processes: int | None = None
 ) -> Iterator[tuple[int, Any]]:
-    """Run ``function`` on every task in a pool of processes (None: one a processor).
+    """Run ``function`` on every task in a pool of processes (None: one a processor), as :func:`through` does.
 
-    Yields the number of a task and its result, as they come. What a task raises is raised here, with its traceback.
     When the caller stops early, or is killed, the pool's processes end; no other process does.
     """
     # Forking would copy the threads of torch and of the native batch in unknown states.
     context = get_context("spawn")
     leash, held = context.Pipe(duplex=False)
-    pool = ProcessPoolExecutor(
-        max(min(processes or processors(), len(tasks)), 1), context, initializer=_end_with, initargs=(leash,)
-    )
+    workers = max(min(processes or processors(), len(tasks)), 1)
+    pool = ProcessPoolExecutor(workers, context, initializer=_end_with, initargs=(leash,))
     try:
-        with _uninterrupted():
-            numbers = {pool.submit(function, task): number for number, task in enumerate(tasks)}
-        while numbers:
-            for each in wait(numbers, WAIT, FIRST_COMPLETED).done:
-                yield numbers.pop(each), each.result()
-            if look:
-                look()
+        yield from through(pool, function, tasks, look)
         pool.shutdown()
     except BrokenProcessPool:
         raise CzError("a process was killed: is there enough memory?") from None

@@ -1,7 +1,5 @@
 """The benchmark's protocol: its scenarios, their episodes and settings."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -74,7 +72,7 @@ class Row:
         return f"{name}: radius {r_0:g} mm, pull speed {v_0:g} mm/min, plant {config.plant_hash}"
 
     def seeds(self, episodes: int) -> range:
-        """Return seeds of so many crystals, one where every draw is the same; by default the first test seeds."""
+        """Return the seeds of the first ``episodes`` crystals, of one if the scenario is deterministic."""
         number = 1 if find_scenario(self.scenario).deterministic else episodes
         return range(self.first_seed, self.first_seed + number)
 

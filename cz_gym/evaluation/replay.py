@@ -3,8 +3,6 @@
 Equal seeds and actions give equal episodes bit for bit, so that the controller is all that differs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -162,13 +162,13 @@ def common(*samples: Sample) -> tuple[Sample, ...]:
 
 
 def _means(sample: Sample, resamples: Draw) -> dict[str, Estimate]:
-    found = dict(zip(metric_names(), means(sample.values, resamples(len(sample.seeds))), strict=True))
-    return {**found, SPEED: Estimate(sample.microseconds, None, len(sample.seeds))}
+    estimates = dict(zip(metric_names(), means(sample.values, resamples(len(sample.seeds))), strict=True))
+    return {**estimates, SPEED: Estimate(sample.microseconds, None, len(sample.seeds))}
 
 
 def _paired(resamples: Draw, ours: Sample, theirs: Sample) -> dict[str, Estimate]:
-    found = differences(ours.values, theirs.values, resamples(len(ours.seeds)))
-    return dict(zip(metric_names(), found, strict=True))
+    estimates = differences(ours.values, theirs.values, resamples(len(ours.seeds)))
+    return dict(zip(metric_names(), estimates, strict=True))
 
 
 def _improvement(resamples: Draw, ours: Sample, theirs: Sample) -> dict[str, Estimate]:
@@ -177,12 +177,12 @@ def _improvement(resamples: Draw, ours: Sample, theirs: Sample) -> dict[str, Est
 
 
 def _gaps(resamples: Draw, ours: Sample, theirs: Sample, bound: Sample) -> dict[str, Estimate]:
-    found = {}
+    gaps = {}
     for metric, power in GAPS.items():
         one, reference, best = (sample.metric(metric) ** power for sample in (ours, theirs, bound))
         if gap := optimality_gap(one, reference, best, resamples(len(ours.seeds))):
-            found[metric] = gap
-    return found
+            gaps[metric] = gap
+    return gaps
 
 
 def _verdicts(samples: Sequence[Sample], resamples: Draw) -> tuple[str | None, dict[str, Estimate]]:
@@ -193,8 +193,8 @@ def _verdicts(samples: Sequence[Sample], resamples: Draw) -> tuple[str | None, d
         return None, {}
     best = min(common(*rivals), key=lambda sample: float(sample.metric("rmse_mm").mean())).name
     (rival,) = (sample for sample in rivals if sample.name == best)
-    found = {}
+    verdicts = {}
     for agent in (sample for sample in able if sample.contender.learned):
         ours, theirs = (one.metric("rmse_mm")[:, :, None] for one in common(agent, rival))
-        found[agent.name] = differences(ours, theirs, resamples(ours.shape[1]))[0]
-    return best, found
+        verdicts[agent.name] = differences(ours, theirs, resamples(ours.shape[1]))[0]
+    return best, verdicts

@@ -1,7 +1,5 @@
 """Rollouts: a policy on seeded episodes, all in one batch, every signal logged."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -73,7 +71,7 @@ def rollout(
     policy: Any,
     config: Config,
     seeds: Sequence[int] | npt.NDArray[Any],
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[int], Any] | None = None,
     designed_for: Config | None = None,
 ) -> Rollout:
     """Run ``policy.predict`` on one episode a seed, all in one batch.
@@ -155,12 +153,12 @@ def check_policy(policy: Any, config: Config, designed_for: Config | None = None
 
 def call_policy(policy: Any, observation: Any, state: Any, begins: Any) -> tuple[Any, Any]:
     """Return actions, shape (n, 2), and the policy's memory; CzError if ``predict`` returns anything else."""
-    found = policy.predict(observation, state=state, episode_start=begins, deterministic=True)
-    if not (isinstance(found, tuple) and len(found) == 2):
-        raise CzError(f"predict must return a tuple (action, state), not {type(found).__name__}")
-    if np.shape(found[0]) != (len(observation), 2):
+    answer = policy.predict(observation, state=state, episode_start=begins, deterministic=True)
+    if not (isinstance(answer, tuple) and len(answer) == 2):
+        raise CzError(f"predict must return a tuple (action, state), not {type(answer).__name__}")
+    if np.shape(answer[0]) != (len(observation), 2):
         raise CzError(
             f"predict must return actions of shape {(len(observation), 2)} for {len(observation)} observations, "
-            f"not {np.shape(found[0])}"
+            f"not {np.shape(answer[0])}"
         )
-    return found
+    return answer

@@ -1,9 +1,7 @@
 """Running a benchmark: every contender on every row."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +23,7 @@ BLOCK = 10
 """Episodes that a slow controller runs at once, and that are cached together."""
 
 
-def run_episodes(contender: Contender, row: Row, seeds: Sequence[int], progress: Callable[[int], None]) -> Sample:
+def run_episodes(contender: Contender, row: Row, seeds: Sequence[int], progress: Callable[[int], Any]) -> Sample:
     """Roll a contender out on some episodes of a row."""
     interface = contender.observation, contender.action
     config, designed_for = row.config(*interface), row.design_config(*interface)
@@ -60,50 +58,67 @@ def is_cached(contender: Contender, rows: Sequence[Row], episodes: int, cache: P
         return False
 
 
+@dataclass(frozen=True)
+class Task:
+    """A contender on a row, as a value that any process can run."""
+
+    contender: Contender
+    row: Row
+    episodes: int
+    cache: Path
+    """Folder of slow controllers' episodes."""
+
+    @property
+    def seeds(self) -> range:
+        """Seeds of its episodes."""
+        return episodes_of(self.contender, self.row, self.episodes)
+
+    @property
+    def steps(self) -> int:
+        """Number of steps, all training seeds together."""
+        return self.row.config().steps * len(self.seeds) * max(len(self.contender.trained), 1)
+
+
 def run(
     contenders: Sequence[Contender],
     rows: Sequence[Row],
     episodes: int,
     cache: Path,
     bounds: Path | None = None,
-    again: Callable[[], tuple[Sequence[Contender], Sequence[Row]]] | None = None,
     quiet: bool = False,
 ) -> list[Result]:
     """Roll every contender out on every row, with a progress bar unless ``quiet``, and summarise.
 
     ``cache`` is the folder of slow controllers' episodes, ``bounds`` that of an earlier benchmark whose bound serves a
-    run without one. A long run is shared between processes if ``again`` makes contenders and rows anew in each.
+    run without one. A long run is shared between processes.
     """
     from tqdm import tqdm
 
-    pairs = [(row, each) for row in rows for each in contenders]
-    seeds = [len(episodes_of(each, row, episodes)) for row, each in pairs]
-    steps = [row.config().steps * n * max(len(each.trained), 1) for n, (row, each) in zip(seeds, pairs, strict=True)]
-    # The first pair compiles for all.
-    alone = 1 if again and sum(steps) > LONG else len(pairs)
-    measured = {}
-    with tqdm(total=sum(steps), unit="step", unit_scale=True, leave=False, disable=quiet or None) as bar:
-        for number, (row, each) in enumerate(pairs[:alone]):
-            bar.set_description(f"{row.name}, {each.name}")
-            measured[number] = _measure((row, each), episodes, cache, bar.update)
-        apart, left = partial(_apart, again, episodes, cache), range(alone, len(pairs))
-        for place, found in in_processes(apart, left, processes=min(processors(), PROCESSES)):
-            measured[left[place]] = Sample(pairs[left[place]][1], *found)
-            bar.update(steps[left[place]])
+    tasks = [Task(each, row, episodes, cache) for row in rows for each in contenders]
+    total = sum(task.steps for task in tasks)
+    # The first task compiles for all.
+    alone = 1 if total > LONG else len(tasks)
+    samples: dict[int, Sample] = {}
+    with tqdm(total=total, unit="step", unit_scale=True, leave=False, disable=quiet or None) as bar:
+        for number, task in enumerate(tasks[:alone]):
+            bar.set_description(f"{task.row.name}, {task.contender.name}")
+            samples[number] = measure(task, bar.update)
+        for place, facts in in_processes(_facts, tasks[alone:], processes=min(processors(), PROCESSES)):
+            samples[alone + place] = Sample(tasks[alone + place].contender, *facts)
+            bar.update(tasks[alone + place].steps)
     results = []
     for row in rows:
-        samples = [measured[number] for number, pair in enumerate(pairs) if pair[0] is row]
-        results.append(summarise(row, samples, earlier_bound(bounds, row, samples) if bounds else None))
+        own = [samples[number] for number, task in enumerate(tasks) if task.row is row]
+        results.append(summarise(row, own, earlier_bound(bounds, row, own) if bounds else None))
     return results
 
 
-def _measure(pair: tuple[Row, Contender], episodes: int, cache: Path, progress: Callable[[int], None]) -> Sample:
-    """The sample of a pair; of a slow controller cached episodes are read, the others run in blocks and cached."""
-    row, each = pair
-    seeds = episodes_of(each, row, episodes)
+def measure(task: Task, progress: Callable[[int], Any]) -> Sample:
+    """The sample of a task; a slow controller's cached episodes are read, the others run in blocks and cached."""
+    each, row, seeds = task.contender, task.row, task.seeds
     if not each.slow:
         return run_episodes(each, row, seeds, progress)
-    store = SlowEpisodes(each, row, cache)
+    store = SlowEpisodes(each, row, task.cache)
     parts = store.read(seeds)
     left = sorted({*seeds} - {seed for part in parts for seed in part.seeds})
     progress(row.config().steps * (len(seeds) - len(left)))
@@ -113,9 +128,7 @@ def _measure(pair: tuple[Row, Contender], episodes: int, cache: Path, progress: 
     return Sample.joined(seeds, parts)
 
 
-def _apart(again: Any, episodes: int, cache: Path, number: int) -> tuple[Any, ...]:
-    """In another process: the sample of a pair without its contender, which would not pass between processes."""
-    contenders, rows = again()
-    pair = rows[number // len(contenders)], contenders[number % len(contenders)]
-    sample = _measure(pair, episodes, cache, lambda steps: None)
+def _facts(task: Task) -> tuple[Any, ...]:
+    """In another process: the sample of a task without its contender, which the caller has."""
+    sample = measure(task, lambda steps: None)
     return sample.seeds, sample.values, sample.microseconds, sample.example, sample.outside

@@ -1,13 +1,12 @@
 """Controllers and scenarios from the user's own Python files, by ``FILE.py:NAME``."""
 
-from __future__ import annotations
-
 import importlib.util
 import inspect
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from cz_gym.config import Config
 from cz_gym.episodes.mixture import Distribution
@@ -66,6 +65,31 @@ def scenarios(text: str) -> Distribution:
     return find_distribution(shares)
 
 
+@dataclass(frozen=True)
+class Maker:
+    """The controllers of ``FILE.py:NAME``; another process reads the file again."""
+
+    place: str
+    source: Any
+    """The object there."""
+
+    @classmethod
+    def of(cls, place: str) -> Self:
+        """The maker of a place; CzError if nothing there can be one."""
+        return cls(str(Path(place).absolute()), load(place, "controller", _controls)[1])
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self).of, (self.place,)
+
+    def __call__(self, config: Config) -> Any:
+        """The controller for an environment; a class or function gets what it names of its settings."""
+        if hasattr(self.source, "predict") and not inspect.isclass(self.source):
+            return self.source
+        given = {"config": config, "control_interval": config.control_interval}
+        known = inspect.signature(self.source).parameters
+        return self.source(**{name: value for name, value in given.items() if name in known})
+
+
 def controller(place: str) -> Contender:
     """Return the contender at ``FILE.py:NAME``: an object with ``predict``, or a class or function that makes one.
 
@@ -73,10 +97,11 @@ def controller(place: str) -> Contender:
     names. Its attributes ``observation`` and ``action`` say what it reads and what its actions mean; "measured" and
     "direct" without.
     """
-    name, found = load(place, "controller", _controls)
-    made = _maker(place, found)
-    reads, acts = str(getattr(found, "observation", "measured")), str(getattr(found, "action", "direct"))
-    return Contender(name, made, reads, f"of {place}", action=acts, own=True)
+    source = (maker := Maker.of(place)).source
+    if not (hasattr(source, "predict") or (callable(source) and not inspect.isclass(source))):
+        raise CzError(f"{place}: no controller: it has no method predict(observation, state, ...)")
+    reads, acts = str(getattr(source, "observation", "measured")), str(getattr(source, "action", "direct"))
+    return Contender(place.rpartition(":")[2], maker, reads, f"of {place}", action=acts, own=True)
 
 
 def _controls(value: Any, module: str) -> bool:
@@ -86,26 +111,12 @@ def _controls(value: Any, module: str) -> bool:
     return acts or (own and inspect.isfunction(value))
 
 
-def _maker(place: str, found: Any) -> Callable[[Config], Any]:
-    if not inspect.isclass(found) and hasattr(found, "predict"):
-        return lambda config: found
-    if not callable(found) or (inspect.isclass(found) and not hasattr(found, "predict")):
-        raise CzError(f"{place}: no controller: it has no method predict(observation, state, ...)")
-    known = inspect.signature(found).parameters
-
-    def make(config: Config) -> Any:
-        given = {"config": config, "control_interval": config.control_interval}
-        return found(**{name: value for name, value in given.items() if name in known})
-
-    return make
-
-
 def row(place: str) -> Row:
     """Return a row of the scenario at ``FILE.py:NAME``, a :class:`cz_gym.Scenario`, on the default puller."""
-    _, found = load(place, "scenario", lambda value, _: isinstance(value, Scenario) and value.name not in SCENARIOS)
-    if not isinstance(found, Scenario):
-        raise CzError(f"{place}: no scenario: a {type(found).__name__}, not a cz_gym.Scenario")
-    return Row(found.name, found, f"of {place}", default=False, file=place)
+    _, scenario = load(place, "scenario", lambda value, _: isinstance(value, Scenario) and value.name not in SCENARIOS)
+    if not isinstance(scenario, Scenario):
+        raise CzError(f"{place}: no scenario: a {type(scenario).__name__}, not a cz_gym.Scenario")
+    return Row(scenario.name, scenario, f"of {place}", default=False, file=place)
 
 
 def check_apart(names: Sequence[str], kind: str) -> None:

@@ -1,4 +1,4 @@
-"""What a puller file implies: ``python -m cz_gym.machine.describe FILE.toml``."""
+"""What a puller file implies: ``cz-gym puller FILE.toml``."""
 
 import argparse
 import math
@@ -56,7 +56,7 @@ def _stated(puller: PullerFile, *symbols: str) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser("python -m cz_gym.machine.describe", "Print what a puller file implies.")
+    parser = OneLineParser("cz-gym puller", "Print what a puller file implies.")
     parser.add_argument("puller", metavar="FILE.toml", help="puller file, or the name of a shipped one")
     return parser.run(_main, arguments, "plant", "nothing printed")
 

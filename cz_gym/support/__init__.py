@@ -1,1 +1,1 @@
-"""What only serves the others: files, names, command lines, interrupts, processors, plausible numbers, units."""
+"""What only serves the others: files, names, command lines, processors, plausible numbers, units."""

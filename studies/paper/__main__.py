@@ -3,8 +3,6 @@
 The report has the comparison, the figures, and what the paper does not show; docs/paper.md explains.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

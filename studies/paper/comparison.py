@@ -1,7 +1,5 @@
 """Every published value beside ours, with the difference and, where they differ, why."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 
@@ -89,47 +87,47 @@ def _compensator_rows() -> list[Row]:
 
 
 def _margin_rows() -> list[Row]:
-    found = []
+    rows = []
     for source, what, why in (
         ("published", "published functions", "does not follow from the paper's own numbers"),
         ("own", "our plant", "as from published functions"),
     ):
         for model in ex.MODELS:
             margin, name = ex.loop_margins(source, model), f"Model {model}, {what}"
-            found.append(Row(f"crossover, {name}", "rad/s", CROSSOVER, margin.crossover, why))
-            found.append(Row(f"phase margin, {name}", "deg", PHASE_MARGIN_DEG, margin.phase_margin_deg, why))
+            rows.append(Row(f"crossover, {name}", "rad/s", CROSSOVER, margin.crossover, why))
+            rows.append(Row(f"phase margin, {name}", "deg", PHASE_MARGIN_DEG, margin.phase_margin_deg, why))
     for model in ex.MODELS:
         worst = float(ex.loop_margins("own", model, compensated=False).poles.real.max())
         name = f"rightmost closed-loop pole without compensator, Model {model}"
-        found.append(Row(name, "1/s", None, worst, "positive: the linear loop is unstable"))
-    return found
+        rows.append(Row(name, "1/s", None, worst, "positive: the linear loop is unstable"))
+    return rows
 
 
 def _response_rows() -> list[Row]:
-    found = []
+    rows = []
     for m in ex.MODELS:
         for change, over in (("-10 % over 600 s", 600.0), ("sudden -10 %", ex.SUDDEN)):
             depth, recovery = ex.inverse_response(ex.pull_change(m, over=over))
-            found.append(Row(f"inverse response, {change}, depth, Model {m}", "mm", None, depth / MM))
-            found.append(Row(f"inverse response, {change}, recovery, Model {m}", "s", None, recovery))
-        found += [
+            rows.append(Row(f"inverse response, {change}, depth, Model {m}", "mm", None, depth / MM))
+            rows.append(Row(f"inverse response, {change}, recovery, Model {m}", "s", None, recovery))
+        rows += [
             Row(f"cases, max of A - 5 B over max of A, {name}, Model {m}", "-", None, value, "plotted, not given")
             for name, value in ex.case_difference(m).items()
         ]
         n = ex.ramp_numbers(ex.ramp(m))
-        found += [
+        rows += [
             Row(f"ramp, largest true error, Model {m}", "mm", None, n["max_error_mm"], 'the text says "small"'),
             Row(f"ramp, true RMSE, Model {m}", "mm", None, n["rmse_mm"]),
             Row(f"ramp, largest error of r_tilde, Model {m}", "mm", None, n["max_compensated_error_mm"]),
             Row(f"ramp, lowest pull speed, Model {m}", "mm/min", None, n["v_p_min_mm_per_min"]),
         ]
-    return found
+    return rows
 
 
-def as_markdown(found: list[Row]) -> str:
+def as_markdown(rows: list[Row]) -> str:
     """The comparison as a Markdown table, numbers with five significant digits."""
     lines = []
-    for row in found:
+    for row in rows:
         published = "-" if row.published is None else f"{row.published:.5g}"
         lines.append((row.quantity, row.unit, published, f"{row.ours:.5g}", row.difference, row.why))
     return table(("quantity", "unit", "published", "ours", "difference", "why"), lines, "---")

@@ -5,8 +5,6 @@ II: Mitigation by control", Journal of Crystal Growth. Its controller's own numb
 with.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any, NamedTuple
 

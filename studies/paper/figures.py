@@ -1,7 +1,5 @@
 """The paper's figures of data, drawn from our runs in the paper's layout."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any

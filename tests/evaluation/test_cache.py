@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-import benchmark
 import cz_gym
 import cz_gym.agents
 from cz_gym.baselines import OpenLoop, registry
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
+from cz_gym.commands import benchmark
 from cz_gym.config import make_config
 from cz_gym.evaluation import cache, runner
 from cz_gym.evaluation.cache import code_behind, sources_behind
@@ -183,7 +183,7 @@ def taking_part(arguments):
 
 def test_slow_controllers_run_only_when_asked_for(small, refused):
     line = refused(benchmark.main, ["--controllers", "paper,clairvoyant", "--out", str(small)])
-    assert line == "benchmark.py: 'clairvoyant' is slow: add --slow to run it on the first 50 episodes\n"
+    assert line == "cz-gym benchmark: 'clairvoyant' is slow: add --slow to run it on the first 50 episodes\n"
     assert not small.exists()
     for wanted in ([], ["--controllers", "all"]):
         assert "clairvoyant" not in taking_part(wanted)

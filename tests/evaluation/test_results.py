@@ -5,13 +5,14 @@ import itertools
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-import benchmark
 from cz_gym.baselines import CompensatedPID
 from cz_gym.baselines.registry import find_controller
+from cz_gym.commands import benchmark
 from cz_gym.config import make_config
 from cz_gym.evaluation.cache import earlier_bound
 from cz_gym.evaluation.files import to_csv
@@ -137,7 +138,7 @@ def test_an_earlier_bound_needs_its_episodes_from_the_first_on(earlier, paper):
 
 
 def test_the_committed_bounds_can_be_used(paper):
-    found = earlier_bound(benchmark.BOUNDS, find_row("randomized"), [paper])
+    found = earlier_bound(Path("results/bounds"), find_row("randomized"), [paper])
     assert found is not None
     assert len(found.seeds) == 50
 

@@ -78,15 +78,15 @@ def test_the_score_of_the_same_controller_is_a_draw():
 
 def test_playing_without_pygame_says_what_to_install(monkeypatch, refused):
     monkeypatch.setitem(sys.modules, "pygame", None)
-    assert refused(play.main, []) == f"python -m cz_gym.play: {canvas.MISSING}\n"
+    assert refused(play.main, []) == f"cz-gym play: {canvas.MISSING}\n"
 
 
 def test_playing_without_a_display_is_refused_in_one_line(monkeypatch, refused):
     pygame.display.quit()
     monkeypatch.setenv("SDL_VIDEODRIVER", "offscreen")
-    assert refused(play.main, []) == f"python -m cz_gym.play: {play.NO_DISPLAY}\n"
+    assert refused(play.main, []) == f"cz-gym play: {play.NO_DISPLAY}\n"
     pygame.display.quit()
     if sys.platform.startswith("linux"):  # where displays have names
         for name in play.DISPLAYS:
             monkeypatch.delenv(name, raising=False)
-        assert refused(play.main, []) == f"python -m cz_gym.play: {play.NO_DISPLAY}\n"
+        assert refused(play.main, []) == f"cz-gym play: {play.NO_DISPLAY}\n"

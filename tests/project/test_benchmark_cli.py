@@ -1,26 +1,30 @@
-"""``benchmark.py``: what it writes, what it refuses to overwrite, and one line for every mistake."""
+"""``cz-gym benchmark``: what it writes, what it refuses to overwrite, and one line for every mistake."""
 
 import csv
 import json
+import pickle
 import re
 import shlex
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import benchmark
 from cz_gym.agents import shipped_names
 from cz_gym.agents.agent_file.contract import write_agent
 from cz_gym.baselines.registry import CONTROLLERS
+from cz_gym.commands import benchmark
 from cz_gym.config import make_config
 from cz_gym.errors import CzError
 from cz_gym.evaluation import runner
 from cz_gym.evaluation.files import check_targets
 from cz_gym.evaluation.metrics import metric_names
-from cz_gym.evaluation.protocol import TEST_SEEDS, find_row
+from cz_gym.evaluation.processes import through
+from cz_gym.evaluation.protocol import ROWS, TEST_SEEDS, find_row
 from cz_gym.observation import OBSERVATIONS
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
@@ -157,7 +161,7 @@ def test_every_episode_is_in_the_table_and_provenance_says_what_was_run(finished
 )
 def test_a_wrong_command_is_refused_in_one_line(arguments, message, refusal):
     line = refusal(arguments)
-    assert line.startswith("benchmark.py: ")
+    assert line.startswith("cz-gym benchmark: ")
     assert message in line
 
 
@@ -254,7 +258,9 @@ def test_the_benchmark_needs_neither_torch_nor_stable_baselines3(tmp_path):
     agent = constant_agent(tmp_path / "agent.onnx")
     arguments = [*ONE[:3], "paper", "--agent", str(agent), "--out", str(tmp_path / "out"), "--quiet"]
     loaded = "{'torch', 'stable_baselines3'} & {*sys.modules}"
-    code = f"import sys, benchmark; sys.exit(benchmark.main({arguments!r}) or len({loaded}))"
+    code = (
+        f"import sys; from cz_gym_command import main; sys.exit(main({['benchmark', *arguments]!r}) or len({loaded}))"
+    )
     python("-W", "error", "-c", code)
     report = (tmp_path / "out" / "report.md").read_text()
     assert report.startswith("The radius is held best by a classical controller on ")
@@ -312,6 +318,28 @@ def test_one_s_own_controller_runs_beside_a_few_into_its_own_folder(tmp_path, mo
     assert folders == [Path("runs/later-some")]
 
 
+@pytest.mark.parametrize("method", ["spawn", pytest.param("fork", marks=pytest.mark.skipif("sys.platform == 'win32'"))])
+def test_everything_of_a_benchmark_passes_to_other_processes_as_a_value(method, tmp_path, monkeypatch):
+    """Controllers, agents, and code of one's own, which another process reads from its file again."""
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text(MINE)
+    own = [part for name in ("Still", "still", "made") for part in ("--controller", f"mine.py:{name}")]
+    arguments = benchmark.parse([*own, "--scenario", "mine.py:later", "--controllers", "paper-tuned,lqg,ppo"])
+    (row,) = benchmark.rows_of(arguments)
+    tasks = [runner.Task(each, row, 1, tmp_path) for each in benchmark.contenders_of(arguments, [row])]
+    monkeypatch.chdir("/")
+    with ProcessPoolExecutor(1, get_context(method)) as pool:
+        found = dict(through(pool, values, tasks))
+    for number, task in enumerate(tasks):
+        sample = runner.measure(task, lambda steps: None)
+        np.testing.assert_array_equal(found[number], sample.values)
+    assert pickle.loads(pickle.dumps([*CONTROLLERS, *ROWS]))[-len(ROWS) :] == [*ROWS]
+
+
+def values(task):
+    return runner.measure(task, lambda steps: None).values
+
+
 def test_a_report_on_one_s_own_shows_it_and_prints_a_command_that_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("my files").mkdir()
@@ -325,8 +353,7 @@ def test_a_report_on_one_s_own_shows_it_and_prints_a_command_that_runs(tmp_path,
     assert len({each["rmse_mm"]["mean"] for name, each in results.items() if name != "paper"}) == 1
     told = re.search("`python (.*)` runs it", Path("out/report.md").read_text())
     assert told
-    command = shlex.split(told[1])[1:]
-    arguments = benchmark.parse(command)
+    arguments = benchmark.parse(shlex.split(told[1])[1:])
     assert [row.name for row in benchmark.rows_of(arguments)] == ["later"]
     check_targets(arguments.out, arguments.json, True, arguments.overwrite)
     page, puller = Path("out/report.html").read_text(), make_config(**PLAIN).plant_hash

@@ -18,6 +18,7 @@ import sybil
 from markdown_it import MarkdownIt
 from sybil.parsers.markdown import CodeBlockParser
 
+import cz_gym_command
 from cz_gym import CzEnv
 from cz_gym.physics.parameters import describe
 from tests.processes import ROOT, python
@@ -63,7 +64,7 @@ def blocks(page):
 
 def commands(page):
     """The words of each command of a page, and whether it is to be run."""
-    programs = ("python", "pip", "make")
+    programs = ("python", "cz-gym", "pip", "make")
     for token in MarkdownIt().parse(page.read_text()):
         shell = token.type == "fence" and token.info.split()[:1] in (["bash"], ["sh"], ["console"])
         if shell or token.type == "code_block":
@@ -89,9 +90,13 @@ def _words(line):
 
 def program(words):
     """This project's module that a python command names, its ``__main__`` where it is a package, and its options."""
+    if words[0] == "cz-gym" or words[1] in ("benchmark.py", "train.py"):
+        return cz_gym_command, [words[1].removesuffix(".py"), *words[2:]]
     name, options = (words[2], words[3:]) if words[1] == "-m" else (words[1].removesuffix(".py"), words[2:])
+    if name == "cz_gym":
+        return cz_gym_command, options
     top = name.partition(".")[0]
-    if top not in ("cz_gym", "studies", "benchmark", "train"):
+    if top not in ("cz_gym", "studies"):
         assert importlib.util.find_spec(top) if words[1] == "-m" else (ROOT / words[1]).is_file(), words
         return None
     module = importlib.import_module(name)
@@ -119,10 +124,10 @@ def understood(monkeypatch):
             assert {word for word in words[1:] if "=" not in word} <= targets, line
         elif words[0] == "pip":
             assert set(re.findall(r"[\w-]+", " ".join(re.findall(r"\[(.*?)\]", line)))) <= set(extras), line
-        elif words[0] == "python":
+        elif words[0] in ("python", "cz-gym"):
             found = program(words)
             with suppress(Parsed):
-                _ = found and found[1] and found[0].main(found[1])
+                _ = found and found[1][found[0] is cz_gym_command :] and found[0].main(found[1])
         else:
             assert words[0] in ("cd", "git", "mkdir", "tensorboard", "pre-commit"), f"{line}: not a known command"
 

@@ -153,7 +153,8 @@ def test_the_wheel_holds_one_package_and_what_it_needs(built, tmp_path):
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
         archive.extractall(tmp_path / "installed")
-    assert {name.partition("/")[0] for name in names if ".dist-info/" not in name} == {"cz_gym"}
+    tops = {name.partition("/")[0] for name in names if ".dist-info/" not in name}
+    assert tops == {"cz_gym", "cz_gym_command.py"}
     parts = {part for name in names for part in Path(name).parts}
     assert not parts & {"tests", "studies", "examples", "docs", "results"}
     shipped = [f"cz_gym/agents/models/{file.name}" for file in (ROOT / "cz_gym" / "agents" / "models").glob("*-*.*")]

@@ -15,11 +15,11 @@ from dataclasses import replace
 import pytest
 from tqdm import tqdm
 
-import train
 from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.training import run, validation
 from cz_gym.agents.training.checkpoint import load_checkpoint
 from cz_gym.agents.training.recipes import RECIPES
+from cz_gym.commands import train
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.support.atomic_files import write_files
 from tests.small_learners import QUICK

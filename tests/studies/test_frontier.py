@@ -2,7 +2,6 @@
 
 import json
 
-from cz_gym.baselines.lqg.designs import family_name
 from studies import frontier
 
 
@@ -12,7 +11,7 @@ def entry(activity, rmse):
 
 
 def test_a_benchmark_is_compared_at_equal_activity(tmp_path, capsys):
-    scenario = {name: entry(a, 0.01 * a**-0.5) for name, a in ((family_name(0.005), 0.005), ("lqg-quiet", 0.02))}
+    scenario = {name: entry(a, 0.01 * a**-0.5) for name, a in (("lqg-at-0.005", 0.005), ("lqg-quiet", 0.02))}
     others = {"ppo": (0.01, 0.2), "industrial": (0.001, 0.4), "lively": (0.03, 0.1), "wild": (0.01, 0.5)}
     scenario |= {name: entry(*pair) for name, pair in others.items()}
     file = tmp_path / "benchmark.json"

@@ -1,5 +1,6 @@
 """Every command: one line for options that cannot be meant, one line for Ctrl-C, and nothing left behind."""
 
+import importlib
 import os
 import re
 import subprocess
@@ -10,18 +11,19 @@ from pathlib import Path
 import pytest
 from gymnasium.error import DependencyNotInstalled
 
-import benchmark
+import cz_gym_command
 from cz_gym import datasets, play
-from cz_gym.baselines.tuning import __main__ as tuning
+from cz_gym.commands import benchmark, tune
 from cz_gym.errors import CzError
 from cz_gym.support.command_line import OPTIONAL, guarded
 from studies import speed
 from studies.paper import __main__ as paper
+from tests.processes import python
 
 COMMANDS = [
     (benchmark, "--episode", "benchmark", ["--out", "new/folder"]),
     (paper, "--ou", "report", ["--out", "new/folder"]),
-    (tuning, "--trial", "measure", ["--controller", "industrial", "--out", "new/folder"]),
+    (tune, "--trial", "measure", ["--controller", "industrial", "--out", "new/folder"]),
     (speed, "--qui", "measure", ["--quick"]),
     (play, "--minute", "settings", []),
     (datasets, "--episode", "record", ["--policies", "paper", "--out", "new/folder"]),
@@ -40,7 +42,7 @@ def name(part):
 @pytest.mark.parametrize("abbreviated", [False, True])
 @pytest.mark.parametrize(("module", "beginning"), [row[:2] for row in COMMANDS], ids=name)
 def test_an_unknown_option_is_refused_in_one_line(module, beginning, abbreviated, refused):
-    required = ["--controller", "industrial"] if module is tuning else []
+    required = ["--controller", "industrial"] if module is tune else []
     line = refused(module.main, [*required, beginning if abbreviated else "--frobnicate"])
     assert "unrecognized arguments" in line
 
@@ -69,7 +71,14 @@ def test_an_interrupt_and_a_place_that_cannot_be_written_are_one_line_and_leave_
 
 
 @pytest.mark.parametrize(
-    "command", ["-m cz_gym.play", "-m studies.paper", "benchmark.py", "train.py", "-c import\tcz_gym"]
+    "command",
+    [
+        "-m studies.paper",
+        "benchmark.py",
+        "train.py",
+        "-c import\tsys,cz_gym_command;sys.exit(cz_gym_command.main(['play']))",
+        "-c import\tcz_gym",
+    ],
 )
 def test_an_interrupt_while_a_command_is_imported_is_one_line(command, tmp_path):
     """Whoever imports the package from a program of theirs keeps the traceback."""
@@ -77,8 +86,29 @@ def test_an_interrupt_while_a_command_is_imported_is_one_line(command, tmp_path)
     found = [str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(found)}
     done = subprocess.run([sys.executable, *command.split(" ")], env=environment, capture_output=True, text=True)
-    assert ((done.returncode, done.stderr) == (130, "interrupted\n")) == ("-c" not in command)
-    assert "Traceback" in done.stderr or done.returncode == 130
+    theirs = command == "-c import\tcz_gym"
+    assert ((done.returncode, done.stderr) == (130, "interrupted\n")) != theirs
+    assert ("Traceback" in done.stderr) == theirs
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["--help"], 0, "usage: cz-gym COMMAND"),
+        ([], 0, "usage: cz-gym COMMAND"),
+        (["trian"], 2, "cz-gym: unknown command 'trian': did you mean 'train'? Choose from train, benchmark, tune"),
+        (["tune"], 2, "cz-gym tune: name a --controller, or a --puller to design for"),
+    ],
+)
+def test_a_word_after_cz_gym_is_a_command(words, code, said, capfd):
+    assert cz_gym_command.main(words) == code
+    assert "".join(capfd.readouterr()).startswith(said)
+
+
+def test_help_comes_before_the_package_is_imported():
+    loads = "import sys, cz_gym_command; cz_gym_command.main([]); assert not {'cz_gym', 'numpy'} & {*sys.modules}"
+    for word in python("-c", loads).split("\n  ")[1:]:
+        importlib.import_module(cz_gym_command.COMMANDS[word.split()[0]][0])
 
 
 @pytest.mark.parametrize(

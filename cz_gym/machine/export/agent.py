@@ -81,7 +81,7 @@ class AgentMemory(NamedTuple):
 class Agent:
     """A trained agent as a controller of the shell."""
 
-    estimates_temperature = False
+    accepts_missing_temperature = False
 
     def __init__(self, policy: Any, config: Config) -> None:
         contract, ranges = policy.contract, config.ranges

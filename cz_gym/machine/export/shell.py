@@ -36,7 +36,7 @@ class Controller(Protocol):
     """What the shell is put around, :class:`cz_gym.baselines.policy.MeasuredController` for one."""
 
     @property
-    def estimates_temperature(self) -> bool:
+    def accepts_missing_temperature(self) -> bool:
         """Whether it is given a pyrometer reading that is not finite as such."""
 
     def at_rest(self, seen: Measured) -> Any:
@@ -224,7 +224,7 @@ def step(controller: Controller, pid: Controller, dt: float, ranges: Any, given:
     since = np.where(runs & (fallen | ~fallback), memory.since + np.clip(elapsed, 0.0, HOUR), 0.0)
     share = np.minimum(since / np.maximum(given["takeover_s"], 1e-3), 1.0)
 
-    seen_by = read._replace(T_1=trusted.T_1) if controller.estimates_temperature else read
+    seen_by = read._replace(T_1=trusted.T_1) if controller.accepts_missing_temperature else read
     own = controller.step(
         seen_by, memory.controller if runs.all() else select(runs, memory.controller, controller.at_rest(read))
     )

@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 from tqdm import tqdm
 
-import train
 from cz_gym.agents import AgentFileError
 from cz_gym.agents.training import fleet, run, validation
 from cz_gym.agents.training.recipes import RECIPES
+from cz_gym.commands import train
 from tests.small_learners import QUICK, REFERENCES, train_small_seed
 
 pytestmark = pytest.mark.usefixtures("few_crystals")
@@ -106,7 +106,7 @@ def test_one_seed_that_fails_stops_no_other(
     command = ["--algo", "ppo", "--seeds", "0-2", "--out", str(tmp_path)]
     if isinstance(error, AgentFileError):
         assert train.main(command) == 2
-        assert capsys.readouterr().err.splitlines()[-1] == "train.py: seed 1: the training went wrong"
+        assert capsys.readouterr().err.splitlines()[-1] == "cz-gym train: seed 1: the training went wrong"
     else:
         with pytest.raises(ValueError, match="could not be broadcast") as caught:
             train.main(command)

@@ -11,11 +11,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-import train
 from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.training import run
 from cz_gym.agents.training.checkpoint import load_checkpoint
 from cz_gym.agents.training.recipes import RECIPES
+from cz_gym.commands import train
 from cz_gym.support.command_line import interpreter
 from tests.small_learners import QUICK
 
@@ -86,7 +86,7 @@ def test_ctrl_c_in_the_middle_of_an_update_saves_after_it(tmp_path, monkeypatch,
     monkeypatch.setattr("torch.nn.utils.clip_grad_norm_", interrupted)
     folder = tmp_path / "run"
     assert train.main(["--steps", "12000", "--out", str(folder)]) == 130
-    assert f"{interpreter()} train.py --steps 12000 --out {folder} --resume continues" in capsys.readouterr().err
+    assert f"{interpreter()} -m cz_gym train --steps 12000 --out {folder} --resume continues" in capsys.readouterr().err
     progress, tensors, _ = load_checkpoint(folder / run.CHECKPOINT)
     assert 2 * 4096 < progress.steps < 3 * 4096
     assert float(tensors["policy.optimizer/0/step"]) == 8.0

@@ -14,10 +14,10 @@ from cz_gym.baselines.analysis.compensator_design import controller_transfer
 from cz_gym.baselines.analysis.frequency import loop_margins, opened, response
 from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.analysis.sampled_loop import HOT_ZONE, NotLinearError, close, linear_controller, stable_range
-from cz_gym.baselines.lqg.designs import FAMILY, TOLD
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.registry import make_controller
+from cz_gym.baselines.tuning.lqg import FAMILY
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Scenario, Sensor
 from cz_gym.evaluation.rollout import rollout
@@ -26,6 +26,7 @@ from cz_gym.physics.linearisation import StateSpace, radius_model
 from cz_gym.physics.parameters import Parameters
 from cz_gym.support.units import MM
 from tests.observed import PLAIN
+from tests.samples import NOMINAL_LQG
 
 PAPER = CompensatedPID()
 OMEGA = np.geomspace(1e-4, 0.5, 60)
@@ -94,7 +95,7 @@ def with_heat(controller, factor):
     return StateSpace(A, B * shown, power * C, power * D * shown)
 
 
-@pytest.mark.parametrize("name", ["lqg", TOLD, "paper-tuned"])
+@pytest.mark.parametrize("name", ["lqg", "lqg-at-0.02", "paper-tuned"])
 def test_margins_at_the_heater_are_the_factors_on_its_power_that_the_loop_survives(name):
     form, puller = linear_form(make_controller(name, make_config("randomized", **PLAIN))), make_puller(lam=0.5)
     margins = loop_margins(form.controller, puller, 5.0, "Q_H")
@@ -113,7 +114,7 @@ def test_the_linear_form_of_an_lqg_has_the_noise_of_the_camera_that_it_is_given(
 
 
 def test_a_range_of_hot_zones_ends_where_the_loop_turns_unstable():
-    form = linear_form(make_controller(TOLD, make_config("randomized", **PLAIN)))
+    form = linear_form(NOMINAL_LQG)
     low, high = stable_range(form.controller, 5.0, "C_2", 0.5)
     for factor, stable in ((0.99 * low, False), (1.01 * low, True), (0.99 * high, True), (1.01 * high, False)):
         puller = make_puller(Parameters(C_2=factor * Parameters().C_2), 0.5)

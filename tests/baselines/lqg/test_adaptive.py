@@ -10,21 +10,23 @@ from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.analysis.sampled_loop import close
 from cz_gym.baselines.bounds.future import pullers_of
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign
-from cz_gym.baselines.lqg.designs import FACTORS, adaptive, lqg
 from cz_gym.baselines.lqg.multiple_model import Hypotheses, multiple_model_filter
 from cz_gym.baselines.policy import map_arrays
+from cz_gym.baselines.registry import make_controller
+from cz_gym.baselines.tuning.lqg import FACTORS, adaptive
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Interface
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.observation import decode
 from cz_gym.support.units import HOUR, MM
 from tests.observed import PLAIN, Watched, measured
+from tests.samples import NOMINAL_LQG
 
 
 @pytest.mark.parametrize("scenario", ["sensor-fault", "puller"])
 def test_the_adaptive_lqg_with_one_hypothesis_is_the_lqg(scenario):
     config = make_config(scenario, horizon=1800.0, **PLAIN)
-    plain = lqg("lqg-at-0.02", config)
+    plain = make_controller("lqg-at-0.02", config)
     noise = plain.design.noise
     one = replace(plain, hypotheses=Hypotheses((noise.fast_sd,), (noise.slow_sd,)))
     ours, theirs = (rollout(each, config, range(4)) for each in (one, plain))
@@ -57,7 +59,7 @@ def test_the_adaptive_lqg_estimates_how_strong_the_fluctuations_are(strength, fa
     """
     config = make_config("randomized", horizon=HOUR, **PLAIN)
     config = config.with_scenario(replace(config.scenario, name="one", interface=Interface(sd=(strength, strength))))
-    watched = Watched(adaptive(lqg("lqg-at-0.02-nominal", config)), 1)
+    watched = Watched(adaptive(NOMINAL_LQG.for_config(config)), 1)
     rollout(watched, config, range(20))
     expected = watched.states[-1].memory.filter.probability @ np.repeat(FACTORS, len(FACTORS))
     assert (np.abs(expected - factor) < 0.4).mean() >= 0.9
@@ -66,7 +68,7 @@ def test_the_adaptive_lqg_estimates_how_strong_the_fluctuations_are(strength, fa
 def test_every_filter_of_the_adaptive_lqg_holds_the_slowest_hot_zones():
     """Two of 500 validation crystals, on which a filter that expects stronger slow fluctuations would be unstable."""
     pullers = pullers_of(make_config("hot-zone", **PLAIN), (1_000_102, 1_000_275))
-    plain = lqg("lqg-at-0.02", make_config("hot-zone", **PLAIN))
+    plain = make_controller("lqg-at-0.02", make_config("hot-zone", **PLAIN))
     hypotheses = adaptive(plain).hypotheses
     strongest = 1.4 * plain.design.noise.slow_sd
     for fast, slow in product(hypotheses.fast_sd, (*hypotheses.slow_sd, strongest)):

@@ -8,9 +8,9 @@ import pytest
 from cz_gym import make_puller
 from cz_gym.baselines.lqg import ring_model
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign
-from cz_gym.baselines.lqg.designs import design_of, ring_of
 from cz_gym.baselines.lqg.model import STATES, NoiseModel, plant_model
 from cz_gym.baselines.lqg.ring_model import RingModel, frequencies, search_step
+from cz_gym.baselines.tuning.lqg import BEST_RETURN, ring_of
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Interface, Scenario, Sensor
 from cz_gym.episodes.scenarios import PULLER as PULLER_SCENARIO
@@ -85,7 +85,9 @@ def with_and_without_search(sensor):
     """Metrics on crystals with that camera: with the search for a ripple, and with the latency alone."""
     scenario = Scenario("camera", interface=Interface(sd=(0.2, 0.2)), sensor=sensor)
     config = make_config(scenario, horizon=3600.0, **PLAIN)
-    policies = (LQG(design=replace(design_of("lqg", RANDOMIZED), ring=ring)) for ring in (PULLER_RING, RingModel(5.0)))
+    policies = (
+        LQG(design=replace(BEST_RETURN.design(RANDOMIZED), ring=ring)) for ring in (PULLER_RING, RingModel(5.0))
+    )
     return [metrics(rollout(policy, config, range(12))) for policy in policies]
 
 

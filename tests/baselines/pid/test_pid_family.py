@@ -14,10 +14,9 @@ from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.analysis.sampled_loop import linear_controller
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID, SeriesPID
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
-from cz_gym.baselines.pid.settings import settings_of
 from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
-from cz_gym.baselines.tuned_for import TUNED
-from cz_gym.baselines.tuning.goals import below_half_the_zero
+from cz_gym.baselines.tuning.pid import PIDS, below_half_the_zero
+from cz_gym.baselines.tuning.values import TUNED
 from cz_gym.body.task import HEATER_RANGE
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.observation import MEASURED, PULL_SCALE, Measured
@@ -122,9 +121,10 @@ def test_trim_rises_while_pull_is_fast_and_stops_at_its_limit(dt):
 
 
 def test_conventional_loop_keeps_the_papers_rule():
+    (conventional,) = (each for each in PIDS if each.name == "pid-conventional")
     for scenario in TUNED:
-        assert below_half_the_zero(None, settings_of("pid-conventional", scenario)) >= 0.0
-    policy = settings_of("pid-conventional", RANDOMIZED)
+        assert below_half_the_zero(None, conventional.settings(scenario)) >= 0.0
+    policy = conventional.settings(RANDOMIZED)
     assert policy.compensator is None
     assert math.isfinite(policy.T_track)
     assert policy.T_start > 0.0

@@ -6,15 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cz_gym.baselines.lqg import designs
 from cz_gym.baselines.lqg.controller import LQGDesign
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
-from cz_gym.baselines.pid.settings import settings_of
-from cz_gym.baselines.tuned_for import TUNED, file_name, shipped
-from cz_gym.baselines.tuning import __main__ as command
-from cz_gym.baselines.tuning import goals
-from cz_gym.baselines.tuning.goals import LQG_PARAMETERS, PIDS, goal_of
-from cz_gym.baselines.tuning.search import Figures, Parameter, Search, measure, value_at
+from cz_gym.baselines.tuning.lqg import ACTIVITIES, BEST_RETURN, FAMILY, LQGS, PARAMETERS, lqg_goal
+from cz_gym.baselines.tuning.pid import PIDS, pid_goal
+from cz_gym.baselines.tuning.record import Figures, Parameter, value_at
+from cz_gym.baselines.tuning.search import Search, measure
+from cz_gym.baselines.tuning.values import TUNED, by_scenario, file_name
+from cz_gym.commands import tune
 from cz_gym.config import make_config
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
@@ -23,14 +22,18 @@ from tests.observed import PLAIN
 
 FIGURES = Figures(0.06, 0.01, 0.02, 1900.0, 0.0, 2160)
 CONFIG = make_config("randomized", **PLAIN)
-PARAMETERS = Parameter("T_f", 1.0, 100.0), Parameter("K_ff", -1.0, 1.0, log=False)
+TWO = Parameter("T_f", 1.0, 100.0), Parameter("K_ff", -1.0, 1.0, log=False)
+
+
+def name(part):
+    return getattr(part, "name", None)
 
 
 def kept(controller, scenario):
     return json.loads((FOLDER / "default" / file_name(controller, scenario)).read_text())
 
 
-def bowl(trials=40, episodes=4, parameters=PARAMETERS):
+def bowl(trials=40, episodes=4, parameters=TWO):
     """Least error on training episodes at T_f = 10 and K_ff = 0.5, on validation episodes the longer T_f the better."""
     met = []
 
@@ -39,7 +42,7 @@ def bowl(trials=40, episodes=4, parameters=PARAMETERS):
         error = np.log10(policy.T_f / 10.0) ** 2 + (policy.K_ff - 0.5) ** 2
         return FIGURES._replace(rmse_mm=float(error) if seeds[0] < 1_000_000 else 1.0 / policy.T_f, pull_step=0.0)
 
-    return Search("bowl", goals.pid_goal(FilteredPID(), parameters, ()), CONFIG, trials, episodes, figures), met
+    return Search("bowl", pid_goal(FilteredPID(), parameters), CONFIG, trials, episodes, figures), met
 
 
 def test_validation_chooses_among_the_best_of_training(tmp_path):
@@ -72,7 +75,7 @@ def test_every_trial_is_kept_at_once_and_a_search_continues_where_it_stopped(tmp
 def test_another_file_is_refused(tmp_path):
     path = tmp_path / "bowl.json"
     bowl()[0].tune(path)
-    for other, message in ((bowl(episodes=5), "was begun with 4 episodes"), (bowl(parameters=PARAMETERS[:1]), "param")):
+    for other, message in ((bowl(episodes=5), "was begun with 4 episodes"), (bowl(parameters=TWO[:1]), "param")):
         with pytest.raises(ValueError, match=message):
             other[0].tune(path)
     for content in ("{}", "[]", "", '{"budget": {"episodes": 4}, "history": [1]}'):
@@ -98,8 +101,8 @@ def test_steps_are_judged_by_time_not_by_sample():
 
 
 @pytest.mark.parametrize("dt", [2.0, 5.0])
-@pytest.mark.parametrize("name", ["paper-filtered", "lqg"])
-def test_a_search_keeps_the_control_interval_and_puller_of_its_environment(name, dt):
+@pytest.mark.parametrize("tuned", [PIDS[0], BEST_RETURN], ids=name)
+def test_a_search_keeps_the_control_interval_and_puller_of_its_environment(tuned, dt):
     slim, met = CONFIG.parameters._replace(r_0=0.1), []
     config = make_config("randomized", control_interval=dt, parameters=slim, **PLAIN)
 
@@ -107,7 +110,7 @@ def test_a_search_keeps_the_control_interval_and_puller_of_its_environment(name,
         met.append((policy.made_for, config.made_for))
         return FIGURES
 
-    search = Search(name, goal_of(name, RANDOMIZED), config, 1, 10, figures)
+    search = Search(tuned.name, tuned.goal(RANDOMIZED), config, 1, 10, figures)
     search.add(search.first)
     assert len(met) == 1 + len(search.goal.survive)
     assert set(met) == {(config.made_for, config.made_for)}
@@ -117,26 +120,26 @@ def test_a_search_keeps_the_control_interval_and_puller_of_its_environment(name,
 
 
 @pytest.mark.parametrize("scenario", ["randomized", "sensor-fault", "puller"])
-@pytest.mark.parametrize("name", PIDS)
-def test_every_parameter_sets_what_it_names_and_a_search_begins_with_the_settings_of_randomized(name, scenario):
+@pytest.mark.parametrize("tuned", PIDS, ids=name)
+def test_every_parameter_sets_what_it_names_and_a_search_begins_with_the_settings_of_randomized(tuned, scenario):
     """But for an infinite jump, which is clipped to the range of its parameter."""
-    search = Search(name, goal_of(name, find_scenario(scenario)), make_config(scenario, **PLAIN), 1, 5)
+    search = Search(tuned.name, tuned.goal(find_scenario(scenario)), make_config(scenario, **PLAIN), 1, 5)
     parameters = search.goal.parameters
     values = [0.5 * (each.low + each.high) for each in parameters]
     assert [value_at(search.settings(values), each.path) for each in parameters] == values
     highest = max((each.high for each in parameters if each.path == "jump"), default=None)
-    frozen = settings_of(name, RANDOMIZED)
+    frozen = tuned.settings(RANDOMIZED)
     assert search.settings(search.first) == (frozen if highest is None else replace(frozen, jump=highest))
 
 
 # LQGs
 
 START = LQGDesign()
-GOAL = goals.lqg_goal(START, LQG_PARAMETERS, ("hard", "puller"), 0.07, 0.02, True)
+GOAL = lqg_goal(START, PARAMETERS, ("hard", "puller"), 0.07, 0.02, True)
 
 
 def logarithms(design):
-    return np.log([value_at(design, parameter.path) for parameter in LQG_PARAMETERS])
+    return np.log([value_at(design, parameter.path) for parameter in PARAMETERS])
 
 
 def made_up(policy, config=CONFIG, seeds=()):
@@ -175,7 +178,7 @@ def test_a_search_uses_training_and_validation_seeds_only(tmp_path):
         return made_up(policy)
 
     config = make_config("puller", **PLAIN)
-    goal = replace(goal_of("lqg", config.scenario), start=START)
+    goal = replace(BEST_RETURN.goal(config.scenario), start=START)
     Search("lqg", goal, config, 15, 10, watched).tune(tmp_path / "lqg.json")
     survived = {*range(100_000, 100_020)}
     assert met == {"puller": {*range(10), *survived, *VALIDATION_SEEDS[:20]}}
@@ -183,38 +186,39 @@ def test_a_search_uses_training_and_validation_seeds_only(tmp_path):
 
 # Shipped settings
 
-HEATER_STEP = [*shipped("lqg")["randomized"]].index("weights.heater_step")
-TUNED_PIDS = [(name, scenario.name) for name in PIDS for scenario in TUNED if scenario.name in shipped(name)]
+HEATER_STEP = [*by_scenario("lqg")["randomized"]].index("weights.heater_step")
+SEARCHES = [(each, scenario) for each in PIDS for scenario in TUNED if scenario.name in by_scenario(each.name)]
+SEARCHES += [(each, find_scenario(scenario)) for each in LQGS for scenario in each.limits]
 
 
-@pytest.mark.parametrize(("controller", "scenario"), [*TUNED_PIDS, *goals.LQG_LIMITS])
-def test_shipped_settings_are_those_a_search_chose(controller, scenario):
+@pytest.mark.parametrize(("tuned", "scenario"), SEARCHES, ids=name)
+def test_shipped_settings_are_those_a_search_chose(tuned, scenario):
     """Finalists of the searches that chose the LQGs were also tried with heavier weights on heater steps."""
-    found, tuned_on, varied = kept(controller, scenario), find_scenario(scenario), []
-    config = make_config(goals.crystals(controller, tuned_on), **PLAIN)
-    search = Search(controller, goal_of(controller, tuned_on), config, 1, 5)
+    found, varied = kept(tuned.name, scenario.name), []
+    config = make_config(tuned.crystals(scenario), **PLAIN)
+    search = Search(tuned.name, tuned.goal(scenario), config, 1, 5)
     values = found["chosen"]["values"]
     assert list(values) == [parameter.path for parameter in search.goal.parameters]
     chosen = search.settings(values.values())
-    if controller in PIDS:
-        assert chosen == settings_of(controller, tuned_on)
+    if tuned in PIDS:
+        assert chosen == tuned.settings(scenario)
     else:
         varied = [HEATER_STEP]
-        assert chosen == designs.design_of(controller, tuned_on)
+        assert chosen == tuned.design(scenario)
         assert not found["chosen"]["figures"]["failure_rate"]
     history = [np.delete(tried, varied).tolist() for tried, *_ in found["history"]]
     assert np.delete([*values.values()], varied).tolist() in history
     assert found["scenario_hash"] == config.scenario.hash
 
 
-@pytest.mark.parametrize("scenario", goals.FAMILY_SCENARIOS)
+@pytest.mark.parametrize("scenario", LQGS[-1].limits)
 def test_the_family_has_less_error_the_more_it_may_move(scenario):
     """But for the most active member on puller, where the drive limits the steps."""
-    found = [kept(designs.family_name(each), scenario)["chosen"]["figures"] for each in designs.ACTIVITIES]
+    found = [kept(each, scenario)["chosen"]["figures"] for each in FAMILY[1:]]
     errors = [one["rmse_mm"] for one in found]
     assert errors[:-1] == sorted(errors[:-1], reverse=True)
     assert errors[-1] < errors[-2] or scenario == "puller"
-    for activity, one in zip(designs.ACTIVITIES, found, strict=True):
+    for activity, one in zip(ACTIVITIES, found, strict=True):
         assert one["pull_step"] < 1.05 * activity
 
 
@@ -229,9 +233,9 @@ def test_the_family_has_less_error_the_more_it_may_move(scenario):
     ],
 )
 def test_the_command_writes_what_the_search_chose(name, kind, trials, scenario, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(command, "measure", lambda policy, config, seeds: FIGURES)
+    monkeypatch.setattr(tune, "measure", lambda policy, config, seeds: FIGURES)
     arguments = ["--controller", name, "--trials", f"{trials}", "--control-interval", "2", "--out", str(tmp_path)]
-    assert command.main(arguments) == 0
+    assert tune.main(arguments) == 0
     written = json.loads((tmp_path / f"{name}.json").read_text())
     assert len(written["history"]) == trials
     assert written["scenario"] == scenario
@@ -247,5 +251,5 @@ def test_the_command_writes_what_the_search_chose(name, kind, trials, scenario, 
     ],
 )
 def test_the_command_refuses_in_one_line(given, said, tmp_path, refused):
-    assert said in refused(command.main, [*given, "--out", str(tmp_path)])
+    assert said in refused(tune.main, [*given, "--out", str(tmp_path)])
     assert not list(tmp_path.iterdir())

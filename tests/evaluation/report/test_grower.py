@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import benchmark
 from cz_gym.baselines.analysis.frequency import loop_margins
 from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.registry import find_controller
 from cz_gym.body.plant import make_puller
+from cz_gym.commands import benchmark
 from cz_gym.evaluation.protocol import find_row
 from cz_gym.evaluation.report import grower
 from cz_gym.evaluation.report.markdown import markdown, terminal

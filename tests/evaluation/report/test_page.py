@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import benchmark
+from cz_gym.commands import benchmark
 from cz_gym.evaluation.report.page import page
 from cz_gym.evaluation.report.page_pictures import PANELS, crystal, pareto, plain
 from cz_gym.evaluation.report.tables import DRIVES, ERROR, comparison, overview

@@ -6,18 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmark import main as benchmark
 from cz_gym import make_puller
 from cz_gym.agents import load
-from cz_gym.baselines import for_puller
 from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.analysis.sampled_loop import close
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
-from cz_gym.baselines.pid.settings import settings_of
 from cz_gym.baselines.registry import find_controller, make_controller
-from cz_gym.baselines.tuning import __main__ as tuning
-from cz_gym.baselines.tuning import goals
-from cz_gym.baselines.tuning.search import Figures
+from cz_gym.baselines.tuning.pid import PAPER_TUNED, PIDS, paper_here
+from cz_gym.baselines.tuning.record import Figures
+from cz_gym.baselines.tuning.scaling import scaled
+from cz_gym.commands import tune
+from cz_gym.commands.benchmark import main as benchmark
 from cz_gym.config import make_config
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.errors import CzError
@@ -31,21 +30,26 @@ WIDE = make_config(puller="silicon-300mm", **PLAIN)
 
 
 def test_on_the_default_puller_the_papers_procedure_gives_the_papers_numbers():
-    here, printed = for_puller.paper_here(make_config(**PLAIN)), CompensatedPID()
+    here, printed = paper_here(make_config(**PLAIN)), CompensatedPID()
     assert here.pid == printed.pid
     assert here.compensator is not None
     np.testing.assert_allclose(list(vars(here.compensator).values()), [-0.22517, 1.684e-3, 2e-4], rtol=1e-3)
 
 
-@pytest.mark.parametrize("name", for_puller.PIDS)
-def test_on_the_default_puller_nothing_is_scaled(name):
-    assert for_puller.scaled_pid(name, make_config(**PLAIN)) == settings_of(name, RANDOMIZED)
+def on_puller(tuned, config):
+    """The settings that the record scales to a puller, before any search for it."""
+    return scaled(tuned.settings(RANDOMIZED), config)
+
+
+@pytest.mark.parametrize("tuned", PIDS, ids=[each.name for each in PIDS])
+def test_on_the_default_puller_nothing_is_scaled(tuned):
+    assert on_puller(tuned, make_config(**PLAIN)) == tuned.settings(RANDOMIZED)
 
 
 def test_a_puller_made_of_the_defaults_file_by_other_numbers_is_scaled_to():
     config = make_config(puller=replace(find_puller("default"), name="mine", heater_range=5e3), **PLAIN)
-    for name in for_puller.PIDS:
-        assert for_puller.pid(name, config) == for_puller.scaled_pid(name, config)
+    for tuned in (each for each in PIDS if each.on_puller):
+        assert tuned.make(config) == on_puller(tuned, config)
 
 
 @pytest.mark.parametrize("puller", ["silicon-300mm", "germanium"])
@@ -79,8 +83,8 @@ def test_what_was_found_is_used_for_that_puller_alone(tmp_path):
     place = tmp_path / "mine.toml"
     write_puller(find_puller("silicon-300mm"), place)
     puller, kept = find_puller(place), tmp_path / "mine" / "paper-tuned.json"
-    config, before = make_config(puller=puller, **PLAIN), for_puller.scaled_pid("paper-tuned", WIDE)
-    assert for_puller.pid("paper-tuned", config) == replace(before, puller=puller)
+    config = make_config(puller=puller, **PLAIN)
+    assert PAPER_TUNED.make(config) == replace(on_puller(PAPER_TUNED, WIDE), puller=puller)
     kept.parent.mkdir()
     kept.write_text(json.dumps({"puller": puller.label, "chosen": {"values": {"T_f": 12.5, "pid.K_p": 0.02}}}))
     found = make_controller("paper-tuned", config)
@@ -97,10 +101,10 @@ def test_one_command_designs_and_another_runs_it(tmp_path, monkeypatch, capsys):
     place = tmp_path / "mine.toml"
     write_puller(find_puller("silicon-300mm"), place)
     figures = Figures(0.1, 0.01, 0.01, 1900.0, 0.0, 5400)
-    monkeypatch.setattr(goals, "measure", lambda policy, config, seeds: figures)
-    monkeypatch.setattr(tuning, "in_processes", lambda function, tasks, look: enumerate(map(function, tasks)))
-    assert tuning.main(["--puller", str(place), "--trials", "10"]) == 0
-    for name in (for_puller.FILTER, *for_puller.PIDS):
+    monkeypatch.setattr(tune, "measure", lambda policy, config, seeds: figures)
+    monkeypatch.setattr(tune, "in_processes", lambda function, tasks, look: enumerate(map(function, tasks)))
+    assert tune.main(["--puller", str(place), "--trials", "10"]) == 0
+    for name in ("lqg-at-0.02", "paper-tuned", "pid-conventional", "industrial"):
         kept = json.loads((tmp_path / "mine" / f"{name}.json").read_text())
         assert len(kept["history"]) > 3
         assert kept["puller"] == find_puller(place).label
@@ -112,8 +116,8 @@ def test_one_command_designs_and_another_runs_it(tmp_path, monkeypatch, capsys):
     assert written["provenance"]["puller"].startswith("silicon-300mm (")
     assert written["provenance"]["control_interval_s"] == 2.0
     assert "puller silicon-300mm (" in (out / "report.md").read_text()
-    assert tuning.main(["--puller", str(place), "--controller", "lqg"]) == 2
-    assert tuning.main([]) == 2
+    assert tune.main(["--puller", str(place), "--controller", "lqg"]) == 2
+    assert tune.main([]) == 2
     assert "name a --controller, or a --puller" in capsys.readouterr().err
 
 

@@ -1,0 +1,52 @@
+"""The command ``cz-gym``: one word for each thing to do, whose module is imported when it is asked for.
+
+It stands beside the package, whose import takes a second: help comes at once, and Ctrl-C during the import is one line.
+"""
+
+import sys
+from collections.abc import Sequence
+from difflib import get_close_matches
+from importlib import import_module
+
+COMMANDS = {
+    "train": ("cz_gym.commands.train", "train an agent by a recipe"),
+    "benchmark": ("cz_gym.commands.benchmark", "compare controllers and agents on the same crystals"),
+    "tune": ("cz_gym.commands.tune", "search settings of controllers, or design them for a puller"),
+    "identify": ("cz_gym.machine.identify.__main__", "estimate a puller's numbers from its log"),
+    "puller": ("cz_gym.machine.describe", "write and check puller files"),
+    "export": ("cz_gym.machine.export.__main__", "write a controller or agent as code for a PLC"),
+    "serve": ("cz_gym.machine.serve.__main__", "run a virtual puller on OPC UA"),
+    "play": ("cz_gym.play", "pull a crystal by hand"),
+    "data": ("cz_gym.datasets", "record datasets for offline learning"),
+}
+"""For each word its module, whose ``main`` takes the arguments after it, and what it does."""
+HELP = "\n".join([
+    "usage: cz-gym COMMAND ...; cz-gym COMMAND --help has its options",
+    "",
+    *(f"  {name:10} {about}" for name, (_, about) in COMMANDS.items()),
+])  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; returns its exit code, 2 for a word that is none, 130 when its import is interrupted."""
+    word, *others = [*(sys.argv[1:] if arguments is None else arguments), "--help"]
+    if word in ("-h", "--help"):
+        print(HELP)
+        return 0
+    if word not in COMMANDS:
+        close = get_close_matches(word, COMMANDS, 1)
+        meant = f": did you mean {close[0]!r}? Choose" if close else "; choose"
+        print(f"cz-gym: unknown command {word!r:.80}{meant} from {', '.join(COMMANDS)}", file=sys.stderr)
+        return 2
+    try:
+        module = import_module(COMMANDS[word][0])
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("cz_gym"):
+            raise
+        print(f"cz-gym: {error}", file=sys.stderr)
+        return 2
+    code: int = module.main(others[:-1])
+    return code

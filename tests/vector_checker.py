@@ -1,0 +1,271 @@
+"""Comparison of a native vector environment with Gymnasium's vector of its scalar form, in every autoreset mode.
+
+Further checks show that returned arrays are never written or read again. ``tests/test_vector_checker.py`` breaks
+Gymnasium's own vector in each of these ways.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, nullcontext
+from copy import deepcopy
+from ctypes import c_char
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium.utils.env_checker import data_equivalence
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector.utils import batch_space, iterate
+
+RESULT = ("observation", "reward", "terminated", "truncated", "info")
+
+
+class NotConforming(AssertionError):
+    """A vector environment differs from a vector of its scalar form; the message is one line."""
+
+
+class Event(NamedTuple):
+    """A call, its result, and the slots whose observation is an episode's first, bool of shape (num_envs,)."""
+
+    call: str
+    result: tuple[Any, ...]
+    first: Any
+
+
+@dataclass
+class Driver:
+    """Runs environments in one autoreset mode, and counts the native form's episodes, failures and kept arrays."""
+
+    make_vector: Callable[[int, AutoresetMode], Any]
+    make_scalar: Callable[[], Any]
+    num_envs: int
+    steps: int
+    seed: int
+    mode: AutoresetMode
+    episodes: int = 0
+    failures: int = 0
+    held: int = 0
+
+    def vector(self) -> Any:
+        """A new native form, as a context."""
+        return closing(self.make_vector(self.num_envs, self.mode))
+
+    def require(self, fact: Any, message: str) -> None:
+        """Raise :class:`NotConforming` unless the fact is true."""
+        if not fact:
+            raise NotConforming(f"[{self.mode.value}] {message}")
+
+    def run(self, env: Any, counts: bool = False, overwrites: bool = False) -> Iterator[Event]:
+        """Reset and step with sampled actions; where the mode is ``DISABLED``, reset the slots that ended.
+
+        ``overwrites`` overwrites each action after its step.
+        """
+        env.action_space.seed(self.seed)
+        over, none = np.zeros(self.num_envs, np.bool_), np.zeros(self.num_envs, np.bool_)
+        yield Event("reset", env.reset(seed=self.seed), ~none)
+        for k in range(self.steps):
+            action = env.action_space.sample()
+            given = [(array.value, array.value.copy()) for array in flatten(action)]
+            result = env.step(action)
+            self.require(all(np.array_equal(a, b) for a, b in given), f"step {k} wrote into the actions it was given")
+            if overwrites:
+                overwrite(action)
+            ended = np.array(result[2] | result[3], np.bool_)
+            self.episodes += counts * int(ended.sum())
+            self.failures += counts * int(np.sum(result[2]))
+            begun = {AutoresetMode.NEXT_STEP: over, AutoresetMode.SAME_STEP: ended}.get(self.mode, none)
+            over = ended.copy()
+            yield Event(f"step {k}", result, begun.copy())
+            if self.mode == AutoresetMode.DISABLED and over.any():
+                mask = over.copy()
+                again = env.reset(options={"reset_mask": mask})
+                mask[:] = True
+                yield Event(f"reset of ended slots after step {k}", again, over)
+
+
+def check_vector_env(
+    make_vector: Callable[[int, AutoresetMode], Any],
+    make_scalar: Callable[[], Any],
+    *,
+    mode: AutoresetMode,
+    num_envs: int = 3,
+    steps: int = 200,
+    seed: int = 0,
+    random_start: bool = True,
+) -> Driver:
+    """Raise :class:`NotConforming` in one line unless the native form equals a vector of scalars; return the counts.
+
+    ``steps`` batched steps with sampled actions must end episodes (give a short horizon). ``random_start`` says whether
+    first observations of different episodes differ.
+    """
+    driver = Driver(make_vector, make_scalar, num_envs, steps, seed, mode)
+    _check_spaces(driver)
+    _check_seeds(driver, random_start)
+    _check_equality(driver, random_start)
+    _check_kept(driver, every=True)
+    _check_kept(driver, every=False)
+    _check_writes(driver)
+    return driver
+
+
+def _check_spaces(driver: Driver) -> None:
+    with driver.vector() as env, closing(driver.make_scalar()) as scalar:
+        n = driver.num_envs
+        driver.require(env.num_envs == n, f"num_envs is {env.num_envs}, asked for {n}")
+        declared = env.metadata.get("autoreset_mode")
+        driver.require(declared == driver.mode, f"metadata['autoreset_mode'] is {declared!r}")
+        for name in ("action_space", "observation_space"):
+            alone, single, batched = getattr(scalar, name), getattr(env, f"single_{name}"), getattr(env, name)
+            driver.require(single == alone, f"single_{name} is {single}, the scalar's is {alone}")
+            expected = batch_space(single, n)
+            driver.require(batched == expected, f"{name} is {batched}, the batch of {n} is {expected}")
+
+
+def _first(driver: Driver, seed: Any, env: Any = None) -> list[Any]:
+    """Copies of the first observation of every slot; of a new environment unless one is given."""
+    with driver.vector() if env is None else nullcontext(env) as env:
+        return deepcopy(list(iterate(env.observation_space, env.reset(seed=seed)[0])))
+
+
+def _check_seeds(driver: Driver, random_start: bool) -> None:
+    seed, n = driver.seed, driver.num_envs
+    expected = _first(driver, seed)
+    with driver.vector() as env:
+        for what in ("a second environment", "a second reset"):
+            again = data_equivalence(_first(driver, seed, env), expected, exact=True)
+            driver.require(again, f"seed {seed} gives another first observation in {what}")
+        unseeded = _first(driver, None, env)
+    seeds = [seed + 7 * (n - i) for i in range(n)]
+    for i, slot in enumerate(_first(driver, seeds)):
+        with closing(driver.make_scalar()) as scalar:
+            differs = difference(flatten(slot), flatten(scalar.reset(seed=seeds[i])[0]))
+        driver.require(not differs, f"seed list: slot {i} with seed {seeds[i]} differs from the scalar with that seed")
+    pairs = [
+        (_first(driver, seed + 1000), expected, f"seeds {seed} and {seed + 1000} give the same first observations"),
+        (unseeded, expected, "a reset without seed repeats the last one: both give the same first observations"),
+        (_first(driver, None), expected, f"no seed and seed {seed} give the same first observations"),
+        *((expected[i], expected[0], f"slots 0 and {i} have the same first observation") for i in range(1, n)),
+    ]
+    for one, other, message in pairs if random_start else ():
+        driver.require(not data_equivalence(one, other, exact=True), message)
+
+
+def _check_equality(driver: Driver, random_start: bool) -> None:
+    """Every result equals the scalars', and every episode of a slot has a first observation of its own."""
+    begun: list[list[Any]] = [[] for _ in range(driver.num_envs)]
+    scalars = closing(SyncVectorEnv([driver.make_scalar] * driver.num_envs, autoreset_mode=driver.mode))
+    with driver.vector() as env, scalars as oracle:
+        for one, other in zip(driver.run(env, counts=True), driver.run(oracle), strict=True):
+            slots = list(iterate(env.observation_space, one.result[0]))
+            for i in np.flatnonzero(one.first).tolist() if random_start else ():
+                again = any(data_equivalence(slots[i], old, exact=True) for old in begun[i])
+                driver.require(not again, f"{one.call}: slot {i} begins again with a first observation it had before")
+                begun[i].append(deepcopy(slots[i]))
+            driver.require(one.call == other.call, f"{one.call} where the scalars have {other.call}")
+            names = RESULT if len(one.result) == 5 else (RESULT[0], RESULT[-1])
+            for name, ours, theirs in zip(names, one.result, other.result, strict=True):
+                found = difference(flatten(ours, name), flatten(theirs, name), masked=name == "info")
+                driver.require(not found, f"{one.call}: {found} (native and scalar)")
+    driver.require(driver.episodes, f"no episode ended in {driver.steps} steps: give more, or a shorter horizon")
+
+
+def _check_kept(driver: Driver, every: bool) -> None:
+    """Keep every array, or one of each call alone, each in another way; all must be unchanged at the end.
+
+    One alone, because an environment that recycles arrays nobody holds would find the others free.
+    """
+    kept: list[tuple[str, str, Callable[[], bool]]] = []
+    with driver.vector() as env:
+        for number, event in enumerate(driver.run(env)):
+            arrays = flatten(event.result)
+            one = number // len(KEEPERS) % len(arrays)
+            some = enumerate(arrays, len(kept)) if every else [(number, arrays[one])]
+            kept += [(event.call, *keep(array, way)) for way, array in some]
+            del arrays, event, some
+        for call, name, unchanged in kept:
+            driver.require(unchanged(), f"{call}: {name} was written by a later call")
+    driver.held += len(kept)
+
+
+def _check_writes(driver: Driver) -> None:
+    """Overwrite the results and actions of one of two equal environments; both must go on alike."""
+    with driver.vector() as plain, driver.vector() as overwritten:
+        for one, other in zip(driver.run(plain), driver.run(overwritten, overwrites=True), strict=True):
+            found = difference(flatten(other.result, "result"), flatten(one.result, "result"), masked=True)
+            driver.require(not found, f"{one.call}: writing into earlier results or actions changed {found}")
+            overwrite(other.result)
+
+
+class NamedArray(NamedTuple):
+    """One array of a nested result; ``mask`` says which slots of an info have a value, None: all."""
+
+    name: str
+    value: Any
+    mask: Any = None
+
+
+def flatten(value: Any, name: str = "") -> list[NamedArray]:
+    """The arrays of nested mappings, sequences and object arrays, in order; those of an info with its mask."""
+    if isinstance(value, dict):
+        found = []
+        for key in sorted(value, key=str):
+            by_slot = isinstance(value[key], dict) or np.asarray(value[key]).dtype != object
+            mask = value.get(f"_{key}") if isinstance(key, str) and by_slot else None
+            for array in flatten(value[key], f"{name}[{key!r}]" if name else str(key)):
+                found.append(array if array.mask is not None or mask is None else array._replace(mask=mask))
+        return found
+    if isinstance(value, tuple | list) or (isinstance(value, np.ndarray) and value.dtype == object and value.ndim > 0):
+        return [array for i, part in enumerate(value) if part is not None for array in flatten(part, f"{name}[{i}]")]
+    return [NamedArray(name, value if isinstance(value, np.ndarray) else np.asarray(value))]
+
+
+def difference(one: Sequence[NamedArray], other: Sequence[NamedArray], masked: bool = False) -> str | None:
+    """The first difference, in words; None if there is none.
+
+    ``masked`` compares only where the masks are true, and allows other dtypes except for bool, as infos have them.
+    """
+    names = [[array.name for array in arrays] for arrays in (one, other)]
+    if names[0] != names[1]:
+        odd = sorted(set(names[0]) ^ set(names[1]))
+        return f"{', '.join(odd[:3]) or 'the order of parts'} is in one only"
+    for (name, a, _), (_, b, mask) in zip(one, other, strict=True):
+        if a.shape != b.shape or (a.dtype != b.dtype and (not masked or b.dtype == np.bool_)):
+            return f"{name} is {a.dtype} {a.shape} and {b.dtype} {b.shape}"
+        unlike = np.asarray((a != b) & ((a == a) | (b == b)))  # NaN is like NaN
+        if masked and mask is not None and a.ndim > 0 and mask.shape == a.shape[:1]:
+            unlike &= mask.reshape(-1, *[1] * (a.ndim - 1))
+        if unlike.any():
+            at = tuple(int(i) for i in np.argwhere(unlike)[0])
+            return f"{name}{f' of slot {at[0]}' if at else ''} is {a[at]} and {b[at]}"
+    return None
+
+
+def overwrite(value: Any) -> None:
+    """Overwrite every writeable array of a nested value with ones."""
+    for array in flatten(value):
+        if array.value.flags.writeable and array.value.dtype != object:
+            array.value[...] = 1
+
+
+KEEPERS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], bytes]]] = {
+    "itself": (lambda array: array, np.ndarray.tobytes),
+    "a view": (lambda array: array[...].view(), np.ndarray.tobytes),
+    "a slice": (lambda array: array[::1].T, lambda kept: kept.T.tobytes()),
+    "a memoryview": (memoryview, bytes),
+    # Only the exported buffer keeps the array alive.
+    "a ctypes buffer": (lambda array: (c_char * array.nbytes).from_buffer(memoryview(array).cast("B")), bytes),
+    "an iterator": (lambda array: array.flat, lambda kept: kept.base.tobytes()),
+}
+"""Ways to keep an array: a function that makes the keeper from the array, and one that reads the bytes from it."""
+
+
+def keep(array: NamedArray, number: int) -> tuple[str, Callable[[], bool]]:
+    """Keep an array in way ``number`` modulo their count, or as itself where that way is impossible.
+
+    Returns its name with the way, and a function that says whether it shows the same bytes still.
+    """
+    value = array.value
+    simple = value.ndim > 0 and value.size > 0 and value.flags.c_contiguous and value.flags.writeable
+    way = list(KEEPERS)[number % len(KEEPERS) if simple else 0]
+    make, read = KEEPERS[way]
+    kept, content = make(value), value.tobytes()  # nothing else may hold the array
+    return f"{array.name} (kept as {way})", lambda: read(kept) == content
