@@ -23,7 +23,7 @@ from cz_gym.baselines.pid.industrial import Industrial
 from cz_gym.baselines.pid.settings import settings_of
 from cz_gym.baselines.tuned_for import found_for, with_values
 from cz_gym.body.plant import Puller, make_puller
-from cz_gym.body.task import HEATER_SLACK
+from cz_gym.action import HEATER_SLACK
 from cz_gym.config import Config
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.machine.puller import DEFAULT

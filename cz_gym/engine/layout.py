@@ -1,63 +1,123 @@
 """The arrays of the compiled loops: the memory of a slot, the constants of a step and its results."""
 
-from __future__ import annotations
-
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.body.plant import Puller, State
 from cz_gym.episodes.record import FREEZES, Episode, Stream
 from cz_gym.episodes.rng import WORDS
 from cz_gym.errors import CzError
+from cz_gym.jit.compile import static
+from cz_gym.physics.meniscus import MeniscusModel
+from cz_gym.process import Inputs, Process
 
 
-def _record(fields: tuple[str, ...]) -> np.dtype[Any]:
-    return np.dtype([(name, np.float64) for name in fields])
+def _record(kind: Any) -> np.dtype[Any]:
+    return np.dtype([(name, np.float64) for name in kind._fields])
 
 
-SLOT = np.dtype(
-    [
-        ("puller", _record(Puller._fields)),
-        ("episode", _record(Episode._fields)),
-        ("x", _record(State._fields)),
-        ("freezes", np.float64, (FREEZES, 2)),
-        ("v_p", np.float64),
-        ("Q_H", np.float64),
-        ("Q_H_slewed", np.float64),
-        ("dT_i", np.float64),
-        ("Q_d", np.float64),
-        ("ring", np.float64),
-        ("h_seen", np.float64),
-        ("T_1", np.float64),
-        ("valid", np.float64),
-        ("integral", np.float64),
-        ("drift", np.float64),
-        ("k", np.int64),
-        ("frames", np.int64),
-        ("over", np.int64),
-        ("k_seen", np.int64),
-        ("key", np.uint64, (2,)),
-        ("scenario", np.int64),
-        ("v_p_before", np.float64),
-        ("Q_H_before", np.float64),
-        ("clipped", np.float64),
-        ("point", np.int64),
-        ("fast", np.float64),
-        ("slow", np.float64),
-        ("streams", np.uint64, (len(Stream), WORDS)),
-    ],
-    align=True,
-)
-"""One slot: constants of puller and episode, plant state, drives [m/s, W], the disturbance of the last substep,
-the last readings (``ring`` [m] without the operator's bias, with the meniscus height ``h_seen`` [m] and the sample
-``k_seen`` it was taken at, ``T_1`` [K], ``valid``), the integral of the scaled ring error, the drift [K] that ``Q_d``
-belongs to, the sample number ``k``, the number of camera frames taken, whether the episode is over, the ``key`` it
-was drawn from and the index of its ``scenario`` in the mixture, the drives [m/s, W] of the step before and whether the
-action was clipped: a sample can be written again from its slot. Then the 5 s grid point that ``dT_i`` belongs to with
-its two processes [standard deviations], and the episode's random streams, as far as they are drawn from."""
-PULLER_AT, EPISODE_AT, STATE_AT = np.cumsum([0, len(Puller._fields), len(Episode._fields)]).tolist()
-"""Offsets in a slot of the puller's constants, the episode's constants and the plant's state [numbers of 8 bytes]."""
+@cache
+def slot_type(process: Process) -> np.dtype[Any]:
+    """One slot of a process: constants of puller and episode, plant state, drives [m/s, W], the disturbance of the
+    last substep, the last readings (``ring`` [m] without the operator's bias, with the meniscus height ``h_seen`` [m]
+    and the sample ``k_seen`` it was taken at, ``T_1`` [K], ``valid``), the integral of the scaled ring error, the drift
+    [K] that ``Q_d`` belongs to, the sample number ``k``, the number of camera frames taken, whether the episode is
+    over, the ``key`` it was drawn from and the index of its ``scenario`` in the mixture, the drives [m/s, W] of the step
+    before and whether the action was clipped: a sample can be written again from its slot. Then the 5 s grid point that
+    ``dT_i`` belongs to with its two processes [standard deviations], the episode's random streams, as far as they are
+    drawn from, and what the process adds: the fields of ``Extra`` and its table."""
+    number, whole, table = np.float64, np.int64, process.table
+    return np.dtype(
+        [
+            ("puller", _record(process.Constants)),
+            ("episode", _record(Episode)),
+            ("x", _record(process.State)),
+            ("freezes", number, (FREEZES, 2)),
+            *((name, number) for name in ("v_p", "Q_H", "Q_H_slewed", "dT_i", "Q_d", "ring", "h_seen", "T_1", "valid")),
+            *((name, number) for name in ("integral", "drift")),
+            *((name, whole) for name in ("k", "frames", "over", "k_seen")),
+            ("key", np.uint64, (2,)),
+            ("scenario", whole),
+            *((name, number) for name in ("v_p_before", "Q_H_before", "clipped")),
+            ("point", whole),
+            ("fast", number),
+            ("slow", number),
+            ("streams", np.uint64, (len(Stream), WORDS)),
+            *((name, number) for name in process.Extra._fields),
+            *([("table", number, table)] if table[0] else []),
+        ],
+        align=True,
+    )
+
+
+@static
+class Model(NamedTuple):
+    """What is compiled into the loops: a process on a meniscus, and where its numbers stand."""
+
+    process: Process
+    meniscus: MeniscusModel
+
+    @property
+    def puller_at(self) -> int:
+        """Offset in a slot of the puller's constants [numbers of 8 bytes]."""
+        return 0
+
+    @property
+    def episode_at(self) -> int:
+        """Offset in a slot of the episode's constants [numbers of 8 bytes]."""
+        return len(self.process.Constants._fields)
+
+    @property
+    def slot_numbers(self) -> int:
+        """Length of a slot without its table [numbers of 8 bytes]."""
+        rows, columns = self.process.table
+        return self.stride - rows * columns
+
+    @property
+    def stride(self) -> int:
+        """Length of a slot [numbers of 8 bytes]."""
+        return slot_type(self.process).itemsize // 8
+
+    @property
+    def states(self) -> int:
+        """Number of states."""
+        return len(self.process.State._fields)
+
+    @property
+    def x_at(self) -> int:
+        """Row of the state in a lane, after the constants; inputs and disturbance follow."""
+        return len(self.process.Constants._fields)
+
+    @property
+    def u_at(self) -> int:
+        """Row of the inputs in a lane."""
+        return self.x_at + self.states
+
+    @property
+    def d_at(self) -> int:
+        """Row of the disturbance in a lane."""
+        return self.u_at + len(Inputs._fields)
+
+    @property
+    def dt_at(self) -> int:
+        """Row of the substep's length [s] in a lane; the time that is reached [s], and whether more follows, are next."""
+        return self.d_at + len(self.process.Disturbance._fields)
+
+    @property
+    def lane_rows(self) -> int:
+        """Rows of the lanes."""
+        return self.dt_at + 3
+
+    @property
+    def info_rows(self) -> int:
+        """Rows of ``info``."""
+        return len(self.process.info)
+
+    @property
+    def lean_rows(self) -> tuple[int, ...]:
+        """Rows of ``info="lean"``, and that of the clipped action."""
+        return tuple(map(self.process.info.index, (*self.process.Lean._fields, "action_clipped")))
 
 
 class Clock(NamedTuple):
@@ -77,7 +137,7 @@ class Memory(NamedTuple):
     """The memory of the slots, one row per slot."""
 
     slots: Any
-    """Records of :data:`SLOT`, shape (n,)."""
+    """Records of :func:`slot_type`, shape (n,)."""
     numbers: Any
     """The same memory as plain float64, shape (n, numbers a record)."""
     history: Any
@@ -103,7 +163,7 @@ class Out(NamedTuple):
     truncated: Any
     """Bool, shape (n,)."""
     info: Any
-    """Rows of :class:`cz_gym.body.signals.Logged`, float64, shape (rows, n or a little more:
+    """Rows of the process' ``Logged``, float64, shape (rows, n or a little more:
     see :func:`info_width`)."""
 
 
@@ -121,7 +181,7 @@ class ObservationScales(NamedTuple):
     share: Any
     """One over the number of samples in each span, shape (lags,)."""
     everything: bool
-    """Whether all of ``info`` is written; otherwise only ``LEAN`` and ``action_clipped``."""
+    """Whether all of ``info`` is written; otherwise only the rows of ``Lean`` and ``action_clipped``."""
 
 
 INFO_CHOICES = ("lean", "all")

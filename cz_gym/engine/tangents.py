@@ -12,7 +12,7 @@ from typing import Any
 
 from cz_gym.body.cost import Cost, cost_slopes
 from cz_gym.body.plant import Disturbance, Inputs, State, along, rates, rk4
-from cz_gym.body.schedule import bias_offset, melt_left, reference
+from cz_gym.episodes.schedule import bias_offset, melt_left, reference
 from cz_gym.episodes.record import GRID
 from cz_gym.jit.cache import hashed
 from cz_gym.jit.compile import force_inlined, jittable, kernel

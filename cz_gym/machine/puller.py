@@ -22,7 +22,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cz_gym.body.plant import make_puller
-from cz_gym.body.task import HEATER_RANGE, RADIUS_LIMIT, check_height
+from cz_gym.action import HEATER_RANGE
+from cz_gym.body.task import RADIUS_LIMIT, check_height
 from cz_gym.episodes.mixture import Distribution, Mixture
 from cz_gym.episodes.scenario import MAX_LATENCY, Range, Scenario
 from cz_gym.errors import CzError

@@ -8,7 +8,7 @@ from gymnasium.error import InvalidAction, ResetNeeded
 
 from cz_gym import CzVectorEnv
 from cz_gym.body.plant import Disturbance, Inputs, State, make_puller, rk4
-from cz_gym.body.task import ACTIONS
+from cz_gym.action import ACTIONS
 from cz_gym.config import make_config
 from cz_gym.differentiable import STATES, DifferentiableBatch
 from cz_gym.engine.tangents import ROWS, SCRATCH, rk4_by

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.body.task import HEATER_SLACK, drives_of
+from cz_gym.action import HEATER_SLACK, drives_of
 from cz_gym.config import Config
 from cz_gym.engine.outputs import recall, remember
 from cz_gym.errors import CzError

@@ -11,7 +11,7 @@ from cz_gym.baselines.lqg.model import DRIFT, FAST, HEATER, PLANT, SLOW, STATES,
 from cz_gym.baselines.lqg.regulator import look_ahead, quadratic_cost, regulator, samples_ahead
 from cz_gym.body.cost import Weights
 from cz_gym.body.plant import Disturbance, Inputs, State, hidden_load, rates
-from cz_gym.body.schedule import quintic
+from cz_gym.episodes.schedule import quintic
 from cz_gym.observation import Measured
 from cz_gym.physics.meniscus import HURLE
 
