@@ -101,8 +101,9 @@ class NoExtra(NamedTuple):
 
 
 @jittable
-def carry_nothing(slot: Any, interval: Any) -> None:
-    """Nothing to carry on: a process without numbers besides the state."""
+def carry_nothing(extra: Any, u: Any, p: Any, interval: Any) -> Any:
+    """Nothing is carried on: a process without numbers besides the state."""
+    return extra
 
 
 @static
@@ -159,8 +160,8 @@ class Process(NamedTuple):
     lean: Function
     """``lean(slot, measured)``: ``Lean``."""
     charged: Function
-    """``charged(x, u, before, slot, t)``: ``Cost`` of the numbers that the terms charge, ``before`` the inputs of the
-    step before; linear in the inputs."""
+    """``charged(x, u, before, extra, slot, t)``: ``Cost`` of the numbers that the terms charge, ``before`` the inputs
+    of the step before."""
     cost_terms: Function
     """``cost_terms(*charged)``: ``Cost``."""
     cost_slopes: Function
@@ -172,7 +173,7 @@ class Process(NamedTuple):
     Extra: type[Any] = NoExtra
     """Numbers of a slot that outlive a step."""
     carry: Function = carry_nothing
-    """``carry(slot, interval)``: moves ``Extra`` on, after the drives have moved."""
+    """``carry(extra, u, p, interval)``: ``Extra`` after the drives have moved to u."""
     table: tuple[int, int] = (0, 0)
     """Rows and columns of ``slot.table``, which ``begin`` fills; none by default."""
 

@@ -118,7 +118,7 @@ def lean(slot: Any, measured: Any) -> Any:
 
 
 @jittable
-def charged(x: Any, u: Any, before: Any, slot: Any, t: Any) -> Any:
+def charged(x: Any, u: Any, before: Any, extra: Any, slot: Any, t: Any) -> Any:
     """True radius error less what no sensor shows [m], pull speed above nominal [m/s], steps of both drives."""
     p, e = slot.puller, slot.episode
     error = x.r_c - p.r_0 - reference(t, e) + bias_offset(t, e)

@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from cz_gym.jit.compile import jittable
+from cz_gym.jit.compile import jittable, labelled, set_labelled
+from cz_gym.process import Inputs
 
 from .arithmetic import clip
 
@@ -27,15 +28,26 @@ def next_power(Q_H: Any, heat: Any, drives: Any, nominal: Any, e: Any, interval:
 
 
 @jittable
+def next_inputs(x: Any, u: Any, action: Any, drives: Any, slot: Any, interval: Any, process: Any) -> Any:
+    """The inputs after an action, before the heater is rounded to whole steps, from those before and the state."""
+    e, nominal = slot.episode, process.nominal(x, slot)
+    return Inputs(
+        next_speed(u.v_p, action.v_p, drives, nominal.v_p, e, interval),
+        next_power(u.Q_H, action.Q_H, drives, nominal.Q_H, e, interval),
+    )
+
+
+@jittable
 def drive(slot: Any, pull: Any, heat: Any, drives: Any, interval: Any, process: Any) -> None:
-    """Move the drives by an action, the heater in whole steps."""
-    e, nominal = slot.episode, process.nominal(slot.x, slot)
+    """Move the drives by an action, the heater in whole steps, and with them what the process carries on."""
+    e, x = slot.episode, labelled(process.State, slot.x)
     slot.v_p_before, slot.Q_H_before = slot.v_p, slot.Q_H
     slot.clipped = 1.0 if (np.abs(pull) > 1.0 or np.abs(heat) > 1.0) else 0.0
-    slot.v_p = next_speed(slot.v_p, pull, drives, nominal.v_p, e, interval)
-    slot.Q_H_slewed = next_power(slot.Q_H_slewed, heat, drives, nominal.Q_H, e, interval)
-    slot.Q_H = slot.Q_H_slewed
+    u = next_inputs(x, Inputs(slot.v_p, slot.Q_H_slewed), Inputs(pull, heat), drives, slot, interval, process)
+    slot.v_p, slot.Q_H_slewed, slot.Q_H = u.v_p, u.Q_H, u.Q_H
     if e.heater_step > 0.0:
-        whole = nominal.Q_H + e.heater_step * np.rint((slot.Q_H_slewed - nominal.Q_H) / e.heater_step)
+        nominal = process.nominal(x, slot).Q_H
+        whole = nominal + e.heater_step * np.rint((slot.Q_H_slewed - nominal) / e.heater_step)
         slot.Q_H = np.maximum(whole, 0.0)
-    process.carry(slot, interval)
+    extra = process.carry(labelled(process.Extra, slot), labelled(Inputs, slot), slot.puller, interval)
+    set_labelled(process.Extra, extra, slot)

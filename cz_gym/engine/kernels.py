@@ -61,8 +61,8 @@ def _sample(memory: Any, i: Any, fresh: Any, clock: Any, scales: Any, out: Any, 
         recall(slot, measured, memory.history[i], scales, row, process)
     if out.state.shape[1] > 0:
         write_channels(process.true_state(slot, measured, t), scales.state, out.state[i])
-    before = Inputs(slot.v_p_before, slot.Q_H_before)
-    cost = process.cost_terms(*process.charged(x, labelled(Inputs, slot), before, slot, t))
+    u, before = labelled(Inputs, slot), Inputs(slot.v_p_before, slot.Q_H_before)
+    cost = process.cost_terms(*process.charged(x, u, before, labelled(process.Extra, slot), slot, t))
     if slot.k == 0:
         cost = along(cost, -1.0, cost)
     if scales.everything:

@@ -168,7 +168,7 @@ def compiled_as(function: Any) -> Any:
 
         def compiled(*arguments: Any) -> Any:
             lines, scope = writer(*arguments)
-            exec("\n    ".join([f"def compiled({names}):", *lines]), scope)
+            exec("\n    ".join([f"def compiled({names}):", *(lines or ["return None"])]), scope)
             return scope["compiled"]
 
         exec(f"def wrapper({names}): return compiled({names})", scope := {"compiled": compiled})
