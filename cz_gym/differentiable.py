@@ -83,7 +83,7 @@ class DifferentiableBatch:
         self._names, info = smooth(config.process), config.process.info
         self._state = np.zeros((num_envs, len(self._names)))
         self._costs = [info.index(f"cost_{name}") for name in config.process.Cost._fields]
-        self._errors = [info.index(name) for name in (*config.process.Lean._fields, "ring_offset")]
+        self._errors = [info.index(name) for name in (*config.process.Lean._fields[:2], "ring_offset")]
         self._grows, self._begun = np.ones(num_envs, np.bool_), np.zeros(num_envs, np.bool_)
         self._work = np.zeros(work_shape(config.process))
         self._jacobians = BufferPool((self.num_envs, len(rows(config.process)), len(self._names) + ACTIONS), np.float64)

@@ -196,6 +196,7 @@ class CzEnv(Form, gym.Env[Observation, Action]):
         self._everything, self._settings = check_info(info), (config, render_mode, render_size, info)
         self.config, self._made_for = config, config.made_for
         self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_modes": declared_modes(config.process)}
         self.action_space = action_space()
         self.observation_space = observation_space(config)
         self._batch = Batch(self.config, 1, everything=self._everything or render_mode is not None)

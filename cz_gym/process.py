@@ -18,7 +18,7 @@ Another process is one more value, in a room of its own:
   in the slot; ``begin`` sets them, ``carry`` moves them on at every step.
 * Constants of an episode: drawn in ``begin`` into ``Extra``, or new fields of ``Episode`` and of the scenario's families.
 * Stages: numbers of the parameters, which ``derive`` hands on as constants.
-* An end with success: ``accept`` returns :data:`DONE`.
+* An end with success: ``accept`` returns :data:`DONE`, which ``slot.over`` then is; a row ``succeeded`` of ``info`` says so.
 * Channels of its own: ``Measured``, ``TrueState``, ``Logged``, ``past`` and ``relative``.
 """
 
@@ -121,9 +121,10 @@ class Process(NamedTuple):
     TrueState: type[Any]
     """Channels of "state"."""
     Logged: type[Any]
-    """Rows of ``info``; with those of ``Lean``, ``v_p``, ``Q_H``, ``cost_`` and each name of ``Cost``, ``action_clipped``."""
+    """Rows of ``info``; among them those of ``Lean``, ``v_p``, ``Q_H``, ``ring_offset``, ``cost_`` and each name of ``Cost``,
+    ``action_clipped``."""
     Lean: type[Any]
-    """Rows of ``info="lean"``: the controlled quantity and its reference."""
+    """Rows of ``info="lean"``: the controlled quantity and its reference first."""
     Cost: type[Any]
     """Terms of a step's cost; each depends on one number."""
     past: tuple[Past, ...]

@@ -156,8 +156,8 @@ def build_kernels(process: Process, meniscus: MeniscusModel) -> Kernels:
                 out.reward[i] = model.process.reward(cost, outcome != LOST)
                 out.terminated[i] = outcome != GROWS
                 out.truncated[i] = outcome == GROWS and ends
-                slot.over = 1 if (outcome != GROWS or ends) else 0
-                ended += slot.over
+                slot.over = LOST if outcome == GROWS and ends else outcome
+                ended += 1 if slot.over != GROWS else 0
         return ended
 
     def draw(

@@ -90,7 +90,7 @@ def rollout(
             for log, name in zip(signals, kind._fields, strict=True):
                 log[k] = info[name]
             reward[k], alive[k] = np.where(running, gained, 0.0), running
-            failed |= running & terminated
+            failed |= running & terminated & (np.asarray(info.get("succeeded", 0.0)) == 0.0)
             # A slot that is over is drawn anew by the next step: only then does its policy begin again.
             begins, over = over, terminated | truncated
             running &= ~over

@@ -11,6 +11,8 @@ import numpy.typing as npt
 from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
 from cz_gym.config import Config
 
+DRAWN = frozenset({"r_c", "r_ref", "r_br", "r_br_measured", "h_c", "v_p", "Q_H", "T_1", "T_1_ref", "T_b"})
+"""Rows of ``info`` that a picture shows; a process without them has none."""
 Floats = npt.NDArray[np.float64]
 
 
