@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from cz_gym.action import HEATER_SLACK
 from cz_gym.baselines.analysis.compensator_design import CUT_OFF, design_compensator
 from cz_gym.baselines.lqg import designs
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign
@@ -23,7 +24,6 @@ from cz_gym.baselines.pid.industrial import Industrial
 from cz_gym.baselines.pid.settings import settings_of
 from cz_gym.baselines.tuned_for import found_for, with_values
 from cz_gym.body.plant import Puller, make_puller
-from cz_gym.action import HEATER_SLACK
 from cz_gym.config import Config
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.machine.puller import DEFAULT

@@ -52,11 +52,11 @@ def action_space() -> Any:
     return Box(-1.0, 1.0, (2,), np.float32)
 
 
-def observation_space(config: Config) -> Any:
+def observation_space(observation: str, process: Process = BODY) -> Any:
     """The observation's channels, scaled and clipped to +-10, or the camera's grey values."""
-    if config.observation == CAMERA:
+    if observation == CAMERA:
         return Box(0, 255, IMAGE, np.uint8)
-    return Box(-CLIP, CLIP, (len(observations(config.process)[config.observation]),), np.float32)
+    return Box(-CLIP, CLIP, (len(observations(process)[observation]),), np.float32)
 
 
 def check_options(options: dict[str, Any] | None, allowed: tuple[str, ...] = _OPTIONS) -> dict[str, Any]:
@@ -181,7 +181,16 @@ class CzEnv(Form, gym.Env[Observation, Action]):
     ) -> None:
         known_keywords(others, type(self).__init__)
         config = make_config(
-            scenario, model, observation, control_interval, horizon, parameters, meniscus, camera, action, puller,
+            scenario,
+            model,
+            observation,
+            control_interval,
+            horizon,
+            parameters,
+            meniscus,
+            camera,
+            action,
+            puller,
             process,
         )
         self._setup(config, render_mode, render_size, info)
@@ -198,7 +207,7 @@ class CzEnv(Form, gym.Env[Observation, Action]):
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_modes": declared_modes(config.process)}
         self.action_space = action_space()
-        self.observation_space = observation_space(config)
+        self.observation_space = observation_space(config.observation, config.process)
         self._batch = Batch(self.config, 1, everything=self._everything or render_mode is not None)
         self._slots = self._batch.memory.slots
         self._out = self._batch.new_out()

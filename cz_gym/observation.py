@@ -51,9 +51,7 @@ def decode(observation: npt.ArrayLike, v_0: float = PULL_SCALE, heater_range: fl
     values = Measured(*np.moveaxis(array[..., : len(MEASURED)] * scales(present, v_0, heater_range), -1, 0))
     if array.shape[-1] == len(MEASURED):
         return values
-    return values._replace(
-        **{each.name: getattr(values, each.name) + getattr(values, each.to) for each in RELATIVE}
-    )
+    return values._replace(**{each.name: getattr(values, each.name) + getattr(values, each.to) for each in RELATIVE})
 
 
 def readable(seen: Measured, last: Measured) -> Measured:

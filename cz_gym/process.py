@@ -4,21 +4,23 @@ Its types say which numbers there are, its functions what becomes of them. Slots
 and channels of observations follow from the types; ``Cz-v0`` is :data:`cz_gym.body.process.BODY`.
 
 Every process stands in a puller: two drives move it (:class:`Inputs`), a camera and a pyrometer see it (:class:`Seen`),
-a scenario disturbs it (:class:`cz_gym.episodes.record.Episode`). All functions are pure, marked
-:func:`cz_gym.jit.compile.jittable`, and take SI units. ``p`` are the puller's constants, ``e`` is the episode, ``m`` the
-meniscus model, ``t`` the time [s]. ``slot`` is the record :func:`cz_gym.engine.layout.slot_type`, with ``slot.puller``,
-``slot.episode``, ``slot.x``, the drives and the last readings.
+a scenario disturbs it (:class:`cz_gym.episodes.record.Episode`). All functions take SI units and are pure, but for
+``begin``, and marked :func:`cz_gym.jit.compile.jittable`. ``p`` are the puller's constants, ``e`` is the episode, ``m``
+the meniscus model, ``t`` the time [s]. ``slot`` is a record of :func:`cz_gym.engine.layout.slot_type`, with
+``slot.puller``, ``slot.episode``, ``slot.x``, the drives and the last readings.
 
 Another process is one more value, in a room of its own:
 
-* References that run with length: ``reference`` and ``nominal`` take the state, and the tangents follow them.
-* A recipe of each reset: :attr:`Process.table` is the shape of ``slot.table``, which ``begin`` fills, with random numbers
-  from ``slot.streams`` where it needs some.
-* Numbers of its own that outlive a step, as a running mean of the pull speed: the fields of :attr:`Process.Extra` stand
-  in the slot; ``begin`` sets them, ``carry`` moves them on at every step.
-* Constants of an episode: drawn in ``begin`` into ``Extra``, or new fields of ``Episode`` and of the scenario's families.
+* References that run with length: ``nominal``, ``accept``, ``charged`` and ``measure`` see the state, and the
+  derivatives of a step follow them.
+* A recipe of each reset: :attr:`Process.table` is the shape of ``slot.table``, which ``begin`` fills, with random
+  numbers from ``slot.streams`` where it needs some.
+* Numbers that outlive a step, as a running mean of the pull speed: the fields of :attr:`Process.Extra` stand in the
+  slot; ``begin`` sets them, ``carry`` moves them on at every step, ``charged`` may charge them.
+* Constants of an episode: fields of ``Extra`` that ``begin`` draws, or new ones of ``Episode`` and of the scenario.
 * Stages: numbers of the parameters, which ``derive`` hands on as constants.
-* An end with success: ``accept`` returns :data:`DONE`, which ``slot.over`` then is; a row ``succeeded`` of ``info`` says so.
+* An end with success: ``accept`` returns :data:`DONE`, which ``slot.over`` then is; a row ``succeeded`` of ``info``
+  tells it to rollouts.
 * Channels of its own: ``Measured``, ``TrueState``, ``Logged``, ``past`` and ``relative``.
 """
 
@@ -110,22 +112,22 @@ def carry_nothing(extra: Any, u: Any, p: Any, interval: Any) -> Any:
 class Process(NamedTuple):
     """A process: types, tables and functions; see the module for how a further one is written."""
 
-    Constants: type[Any]
+    Constants: Any
     """The puller's constants p, the puller's equations solved."""
-    State: type[Any]
+    State: Any
     """State x."""
-    Disturbance: type[Any]
+    Disturbance: Any
     """Disturbance d, held over a substep."""
-    Measured: type[Any]
+    Measured: Any
     """Channels of "measured", annotated with :class:`Channel`; ``v_p`` and ``Q_H`` are deviations from nominal."""
-    TrueState: type[Any]
+    TrueState: Any
     """Channels of "state"."""
-    Logged: type[Any]
-    """Rows of ``info``; among them those of ``Lean``, ``v_p``, ``Q_H``, ``ring_offset``, ``cost_`` and each name of ``Cost``,
-    ``action_clipped``."""
-    Lean: type[Any]
+    Logged: Any
+    """Rows of ``info``; among them those of ``Lean``, ``v_p``, ``Q_H``, ``ring_offset``, ``action_clipped``, and
+    ``cost_`` with each name of ``Cost``."""
+    Lean: Any
     """Rows of ``info="lean"``: the controlled quantity and its reference first."""
-    Cost: type[Any]
+    Cost: Any
     """Terms of a step's cost; each depends on one number."""
     past: tuple[Past, ...]
     """The signals whose past "history" shows; the first is the one that is integrated."""
@@ -137,7 +139,7 @@ class Process(NamedTuple):
     """``derive(parameters, factors, m)``: ``Constants`` at these factors of the hot zone
     (:class:`cz_gym.episodes.record.Factors`)."""
     begin: Function
-    """``begin(slot, m)``: the first ``State``."""
+    """``begin(slot, m)``: the first ``State``; sets ``Extra`` and the table in the slot."""
     nominal: Function
     """``nominal(x, slot)``: the ``Inputs`` from which actions and observed drives are counted."""
     hidden_load: Function
@@ -171,7 +173,7 @@ class Process(NamedTuple):
     """``reward(cost, grows)``: the reward of a step [-], whose cost is ``Cost``; false if the crystal is lost in it."""
     equations: tuple[Any, ...]
     """The functions that define the plant, for :attr:`cz_gym.config.Config.plant_hash`."""
-    Extra: type[Any] = NoExtra
+    Extra: Any = NoExtra
     """Numbers of a slot that outlive a step."""
     carry: Function = carry_nothing
     """``carry(extra, u, p, interval)``: ``Extra`` after the drives have moved to u."""
@@ -226,7 +228,9 @@ class Process(NamedTuple):
     @property
     def relative_change(self) -> tuple[float, ...]:
         """Ratio of each relative signal's scale to the scale of the difference [-]."""
-        return tuple(self.measured[at].scale / each.scale for at, each in zip(self.relative_at, self.relative, strict=True))
+        return tuple(
+            self.measured[at].scale / each.scale for at, each in zip(self.relative_at, self.relative, strict=True)
+        )
 
     @property
     def integrated_scale(self) -> float:

@@ -74,7 +74,7 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.single_action_space = action_space()
-        self.single_observation_space = observation_space(config)
+        self.single_observation_space = observation_space(config.observation, config.process)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         rows, lean = config.process.info, config.process.Lean._fields

@@ -19,10 +19,10 @@ from typing import NamedTuple
 import numpy as np
 
 from cz_gym import CzEnv, Parameters, make_puller
+from cz_gym.action import HEATER_RANGE
 from cz_gym.baselines.lqg.designs import TOLD, lqg
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.settings import settings_of
-from cz_gym.action import HEATER_RANGE
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Pullers
 from cz_gym.episodes.scenarios import RANDOMIZED

@@ -18,7 +18,8 @@ from cz_gym.errors import CzError
 from cz_gym.jit.compile import force_inlined, jittable
 from cz_gym.physics.meniscus import HURLE, MeniscusModel, ring_point
 from cz_gym.physics.parameters import Parameters, check_parameters
-from cz_gym.process import NO_OPERATING_POINT, Inputs
+from cz_gym.process import NO_OPERATING_POINT
+from cz_gym.process import Inputs as Inputs
 
 
 class State(NamedTuple):

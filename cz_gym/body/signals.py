@@ -11,7 +11,8 @@ import numpy as np
 
 from cz_gym.episodes.schedule import bias_offset, recipe, reference
 from cz_gym.jit.compile import jittable
-from cz_gym.process import HEATER_SCALE, PULL_SCALE, Channel, Past, Relative, signals
+from cz_gym.process import HEATER_SCALE, PULL_SCALE, Past, Relative, signals
+from cz_gym.process import Channel as Channel
 from cz_gym.support.units import KILO, MINUTE, MM
 
 PREVIEWS = (0.0, 1.0 * MINUTE, 5.0 * MINUTE)

@@ -19,14 +19,17 @@ def _record(kind: Any) -> np.dtype[Any]:
 
 @cache
 def slot_type(process: Process) -> np.dtype[Any]:
-    """One slot of a process: constants of puller and episode, plant state, drives [m/s, W], the disturbance of the
-    last substep, the last readings (``ring`` [m] without the operator's bias, with the meniscus height ``h_seen`` [m]
-    and the sample ``k_seen`` it was taken at, ``T_1`` [K], ``valid``), the integral of the scaled ring error, the drift
-    [K] that ``Q_d`` belongs to, the sample number ``k``, the number of camera frames taken, whether the episode is
-    over, the ``key`` it was drawn from and the index of its ``scenario`` in the mixture, the drives [m/s, W] of the step
-    before and whether the action was clipped: a sample can be written again from its slot. Then the 5 s grid point that
-    ``dT_i`` belongs to with its two processes [standard deviations], the episode's random streams, as far as they are
-    drawn from, and what the process adds: the fields of ``Extra`` and its table."""
+    """One slot of a process.
+
+    Constants of puller and episode, plant state, drives [m/s, W], the disturbance of the last substep, last readings
+    (``ring`` [m] without the operator's bias, with the meniscus height ``h_seen`` [m] and the sample ``k_seen`` it was
+    taken at, ``T_1`` [K], ``valid``), the integral of the scaled ring error, the drift [K] that ``Q_d`` belongs to, the
+    sample number ``k``, the number of camera frames taken, whether the episode is over, the ``key`` it was drawn from
+    and the index of its ``scenario`` in the mixture, the drives [m/s, W] of the step before and whether the action was
+    clipped: a sample can be written again from its slot. Then the 5 s grid point that ``dT_i`` belongs to with its two
+    processes [standard deviations], the episode's random streams, as far as they are drawn from, and what the process
+    adds: the fields of ``Extra`` and its table.
+    """
     number, whole, table = np.float64, np.int64, process.table
     return np.dtype(
         [
@@ -101,7 +104,7 @@ class Model(NamedTuple):
 
     @property
     def dt_at(self) -> int:
-        """Row of the substep's length [s] in a lane; the time that is reached [s], and whether more follows, are next."""
+        """Row of the substep [s] in a lane; then the time that is reached [s], and whether the slot goes on."""
         return self.d_at + len(self.process.Disturbance._fields)
 
     @property

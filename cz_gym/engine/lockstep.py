@@ -65,7 +65,8 @@ def _integrate(lanes: Any, ends: Any, count: Any, model: Any) -> None:
     for lane in range(count):
         x, u = column(process.State, lanes, model.x_at, lane), column(Inputs, lanes, model.u_at, lane)
         d, p = column(process.Disturbance, lanes, model.d_at, lane), column(process.Constants, lanes, 0, lane)
-        set_column(process.State, rk4(process.rates, x, u, d, p, lanes[model.dt_at, lane], model.meniscus), ends, 0, lane)
+        new = rk4(process.rates, x, u, d, p, lanes[model.dt_at, lane], model.meniscus)
+        set_column(process.State, new, ends, 0, lane)
 
 
 @jittable

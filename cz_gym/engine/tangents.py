@@ -122,7 +122,8 @@ def _derivatives(kind: Any, function: Any, at: Any, rest: Any, by: Any) -> Any:
             parts[place] = f"X{place}({', '.join(named)})"
             results.append(f"function({', '.join([*parts, *others])})")
     lines = [f"k{to} = {result}" for to, result in enumerate(results)]
-    lines += [f"by[{i}, {to}] = k{to}.{name}.imag / {_H!r}" for to in range(len(results)) for i, name in enumerate(values)]
+    for to in range(len(results)):
+        lines += [f"by[{i}, {to}] = k{to}.{name}.imag / {_H!r}" for i, name in enumerate(values)]
     real = ", ".join(f"k{len(results) - 1}.{name}.real" for name in values)
     return [*lines, f"return kind({real})"], scope
 

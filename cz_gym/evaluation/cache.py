@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cz_gym.body.signals import Logged
 from cz_gym.evaluation.contender import Contender
 from cz_gym.jit.cache import PACKAGE, compiled_sources
 from cz_gym.jit.code_hash import hash_files
@@ -27,7 +28,6 @@ from .metrics import metric_names
 from .protocol import Row
 from .results import BOUND, GAPS, Sample
 from .rollout import Floats
-from cz_gym.body.signals import Logged
 
 PRINTED = 1e-4
 """Relative precision of the figures in ``episodes.csv``, five digits [-]."""

@@ -8,12 +8,12 @@ from functools import cache
 
 import numpy as np
 
+from cz_gym.body.signals import Logged
 from cz_gym.evaluation.contender import Contender
 
 from .metrics import metric_names, metrics
 from .protocol import Row
 from .rollout import Floats, Rollout
-from cz_gym.body.signals import Logged
 from .statistics import Estimate, Resamples, cvar, differences, means, optimality_gap, probability_of_improvement
 
 REFERENCE = "paper"

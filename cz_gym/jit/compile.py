@@ -111,7 +111,7 @@ def _compiled_fetch(array: Any, at: Any) -> Any:
     return compiled
 
 
-class Static(types.Opaque):  # type: ignore[misc]
+class Static(types.Opaque):
     """Type of one :func:`static` value: its attributes are constants and functions of the compiled code."""
 
     def __init__(self, value: Any) -> None:
@@ -120,6 +120,7 @@ class Static(types.Opaque):  # type: ignore[misc]
 
     @property
     def key(self) -> Any:
+        """What tells two of these types apart."""
         return self.value
 
 
@@ -133,24 +134,25 @@ def static(kind: Any) -> Any:
     return kind
 
 
-register_model(Static)(models.OpaqueModel)
+register_model(Static)(models.OpaqueModel)  # type: ignore[no-untyped-call]
 
 
-@lower_constant(Static)
+@lower_constant(Static)  # type: ignore[no-untyped-call]
 def _no_bits(context: Any, builder: Any, kind: Any, value: Any) -> Any:
     return context.get_dummy_value()
 
 
 @infer_getattr
-class _StaticAttribute(AttributeTemplate):  # type: ignore[misc]
+class _StaticAttribute(AttributeTemplate):
     key = Static
 
-    def generic_resolve(self, kind: Any, name: str) -> Any:
+    def generic_resolve(self, kind: Any, name: str) -> Any:  # type: ignore[override]
         value = getattr(kind.value, name)
-        return types.literal(value) if type(value) is int else self.context.resolve_value_type(value)
+        literal: Any = types.literal
+        return literal(value) if type(value) is int else self.context.resolve_value_type(value)
 
 
-@lower_getattr_generic(Static)
+@lower_getattr_generic(Static)  # type: ignore[no-untyped-call]
 def _static_attribute(context: Any, builder: Any, kind: Any, value: Any, name: str) -> Any:
     type_of = context.typing_context.resolve_getattr(kind, name)
     return context.get_constant_generic(builder, type_of, getattr(kind.value, name))
@@ -159,8 +161,7 @@ def _static_attribute(context: Any, builder: Any, kind: Any, value: Any, name: s
 def compiled_as(function: Any) -> Any:
     """Decorate a writer of the text that a function of labelled tuples compiles to: numba unrolls no loop over fields.
 
-    The writer takes the arguments' numba types and returns the body's lines; they may name the classes ``X``, ``K``,
-    and the functions, that it returns as a dictionary beside them.
+    The writer takes the arguments' numba types and returns the lines of the body, and a dictionary of the names in them.
     """
 
     def register(writer: Any) -> Any:

@@ -15,17 +15,17 @@ from gymnasium.vector import AutoresetMode
 from scipy.integrate import solve_ivp
 from stable_baselines3.common.env_checker import check_env as check_with_sb3
 
-from cz_gym import HURLE, CzEnv, CzVectorEnv
+from cz_gym import CzEnv, CzVectorEnv
 from cz_gym.body.cost import Cost, cost_slopes, cost_terms, reward
 from cz_gym.config import make_config
 from cz_gym.differentiable import DifferentiableBatch
+from cz_gym.episodes.schedule import bias_offset, recipe, reference
 from cz_gym.evaluation.contender import Contender
 from cz_gym.evaluation.protocol import Row
 from cz_gym.evaluation.report.tables import DRIVES, ERROR, rows
 from cz_gym.evaluation.results import summarise
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.evaluation.runner import run_episodes
-from cz_gym.episodes.schedule import bias_offset, recipe, reference
 from cz_gym.jit.compile import force_inlined, jittable
 from cz_gym.process import DONE, GROWS, LOST, PULL_SCALE, Channel, Inputs, Past, Process, Relative, Seen
 from cz_gym.testing.checker import check_vector_env
@@ -135,11 +135,11 @@ def charged(x, u, before, extra, slot, t):
 
 
 TANK = Process(
-    Tank, Level, Load, Read, Truth, Log, Lean, Cost, (Past("level", MM),), (Relative("T", "T_ref", 2.0, "above recipe"),),
+    Tank, Level, Load, Read, Truth, Log, Lean, Cost, (Past("level", MM),), (Relative("T", "T_ref", 2.0, "-"),),
     check=lambda parameters, meniscus: parameters, derive=derive, begin=begin, nominal=nominal,
     hidden_load=jittable(lambda p_drift, p: -p.G * p_drift), disturb=jittable(lambda Q_d, dT_i, t, e: Load(Q_d)),
     rates=rates, accept=accept, see=jittable(lambda x, p, m: Seen(x.h, x.h, 0.0 * x.h, x.T)), measure=measure,
-    true_state=jittable(lambda slot, seen, t: Truth(slot.x.h - slot.puller.h_0 - seen.h_ref, slot.x.T - slot.puller.T_0)),
+    true_state=jittable(lambda slot, seen, t: Truth(slot.x.h - slot.puller.h_0, slot.x.T - slot.puller.T_0)),
     logged=logged, lean=jittable(lambda slot, seen: Lean(slot.x.h, slot.puller.h_0 + seen.h_ref)), charged=charged,
     cost_terms=cost_terms, cost_slopes=cost_slopes, reward=reward, equations=(derive, rates), Extra=Extra,
     carry=jittable(lambda extra, u, p, interval: Extra(extra.fed + u.v_p * interval)), table=(3, 2),

@@ -7,11 +7,11 @@ import pytest
 from gymnasium.error import InvalidAction, ResetNeeded
 
 from cz_gym import CzVectorEnv
-from cz_gym.body.plant import Disturbance, Inputs, State, make_puller, rk4
 from cz_gym.action import ACTIONS
+from cz_gym.body.plant import Disturbance, Inputs, State, make_puller, rk4
+from cz_gym.body.process import BODY
 from cz_gym.config import make_config
 from cz_gym.differentiable import STATES, DifferentiableBatch
-from cz_gym.body.process import BODY
 from cz_gym.engine.tangents import Places, rk4_by, rows, work_shape
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.observation import MEASURED

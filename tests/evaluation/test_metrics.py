@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
+from cz_gym.body.signals import Logged
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import Metrics, metrics
 from cz_gym.evaluation.rollout import Rollout, rollout
-from cz_gym.body.signals import Logged
 from tests.observed import PLAIN
 
 DT = 5.0

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from cz_gym.body.signals import Logged
 from cz_gym.evaluation.results import Result, Sample
 from cz_gym.evaluation.rollout import Floats
-from cz_gym.body.signals import Logged
 from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from .canvas import COLUMNS, GREY, INK, canvas, chosen, png, styles_of

@@ -8,6 +8,7 @@ import pytest
 from scipy.signal import lfilter
 
 from cz_gym import make_puller
+from cz_gym.action import HEATER_RANGE
 from cz_gym.baselines.analysis.compensator_design import controller_transfer
 from cz_gym.baselines.analysis.frequency import loop_margins, response
 from cz_gym.baselines.analysis.linear_form import linear_form
@@ -18,7 +19,6 @@ from cz_gym.baselines.pid.settings import settings_of
 from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
 from cz_gym.baselines.tuned_for import TUNED
 from cz_gym.baselines.tuning.goals import below_half_the_zero
-from cz_gym.action import HEATER_RANGE
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.observation import MEASURED, PULL_SCALE, Measured
 from cz_gym.physics.linearisation import StateSpace, radius_model
