@@ -130,11 +130,14 @@ def static(kind: Any) -> Any:
     Attributes, properties too, may be functions marked as equations, named tuples' classes, numbers and their tuples,
     and other static values. Each value compiles code of its own.
     """
-    typeof_impl.register(kind)(lambda value, context: Static(value))
+    register: Any = typeof_impl.register
+    register(kind)(lambda value, context: Static(value))
     return kind
 
 
-register_model(Static)(models.OpaqueModel)  # type: ignore[no-untyped-call]
+_register: Any = register_model
+_lower_attribute: Any = lower_getattr_generic
+_register(Static)(models.OpaqueModel)
 
 
 @lower_constant(Static)  # type: ignore[no-untyped-call]
@@ -152,7 +155,7 @@ class _StaticAttribute(AttributeTemplate):
         return literal(value) if type(value) is int else self.context.resolve_value_type(value)
 
 
-@lower_getattr_generic(Static)  # type: ignore[no-untyped-call]
+@_lower_attribute(Static)
 def _static_attribute(context: Any, builder: Any, kind: Any, value: Any, name: str) -> Any:
     type_of = context.typing_context.resolve_getattr(kind, name)
     return context.get_constant_generic(builder, type_of, getattr(kind.value, name))
@@ -161,7 +164,7 @@ def _static_attribute(context: Any, builder: Any, kind: Any, value: Any, name: s
 def compiled_as(function: Any) -> Any:
     """Decorate a writer of the text that a function of labelled tuples compiles to: numba unrolls no loop over fields.
 
-    The writer takes the arguments' numba types and returns the lines of the body, and a dictionary of the names in them.
+    The writer takes the arguments' numba types; it returns the body's lines, and a dictionary of the names in them.
     """
 
     def register(writer: Any) -> Any:
