@@ -23,11 +23,11 @@ from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.industrial import Industrial
 from cz_gym.baselines.pid.settings import settings_of
 from cz_gym.baselines.tuned_for import found_for, with_values
+from cz_gym.body.linearisation import RadiusModel, radius_model
 from cz_gym.body.plant import Puller, make_puller
 from cz_gym.config import Config
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.machine.puller import DEFAULT
-from cz_gym.physics.linearisation import RadiusModel, radius_model
 from cz_gym.support.units import MM
 
 PIDS = ("paper-tuned", "pid-conventional", "industrial")

@@ -14,6 +14,7 @@ from cz_gym.baselines.lqg.designs import ACTIVITIES, SHIPPED, TOLD, design_of, f
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.settings import settings_of
 from cz_gym.baselines.tuned_for import beyond, shipped
+from cz_gym.body.linearisation import radius_model
 from cz_gym.body.plant import Puller, make_puller
 from cz_gym.config import Config, make_config
 from cz_gym.episodes.mixture import Distribution, make_mixture
@@ -21,7 +22,6 @@ from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import HOT_ZONE, RANDOMIZED
 from cz_gym.errors import CzError
 from cz_gym.machine.puller import DEFAULT, PullerFile
-from cz_gym.physics.linearisation import radius_model
 from cz_gym.support.names import unknown
 from cz_gym.support.units import HOUR, MINUTE, MM
 

@@ -7,14 +7,20 @@ import numpy as np
 from cz_gym.body.plant import Puller
 from cz_gym.errors import CzError
 from cz_gym.jit.compile import jittable
+from cz_gym.physics.parameters import Parameters
 from cz_gym.support.units import MM
 
 RADIUS_LIMIT = 8.0 * MM
-"""Largest |r_c - r_ref| of the default puller [m]; another one's is in proportion to its r_0."""
+"""Largest |r_c - r_ref| of the default puller [m]."""
 HEIGHT_MIN = 1.2 * MM
 """Lowest meniscus before it freezes [m]."""
 HEIGHT_MAX_IN_A = 1.24
 """Highest meniscus before it detaches [capillary constants]."""
+
+
+def radius_limit(r_0: Any) -> Any:
+    """Largest |r_c - r_ref| of a puller of nominal radius r_0 [m]: :data:`RADIUS_LIMIT`, in proportion to r_0."""
+    return RADIUS_LIMIT * (r_0 / Parameters().r_0)
 
 
 @jittable

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+from cz_gym.body.linearisation import RadiusModel
 from cz_gym.evaluation.report.tables import markdown as table
-from cz_gym.physics.linearisation import RadiusModel
 from cz_gym.support.units import HOUR, MM
 
 from . import experiments as ex

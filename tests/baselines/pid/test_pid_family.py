@@ -19,9 +19,10 @@ from cz_gym.baselines.pid.settings import settings_of
 from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
 from cz_gym.baselines.tuned_for import TUNED
 from cz_gym.baselines.tuning.goals import below_half_the_zero
+from cz_gym.body.linearisation import radius_model
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.observation import MEASURED, PULL_SCALE, Measured
-from cz_gym.physics.linearisation import StateSpace, radius_model
+from cz_gym.physics.linearisation import StateSpace
 from cz_gym.physics.parameters import Parameters
 from cz_gym.support.units import MM, MM_PER_MIN
 from tests.observed import measured, pulls
