@@ -75,6 +75,11 @@ class DifferentiableBatch:
                 f"the camera's latency of {latency:g} s is longer than the control interval; a puller file's latency_s "
                 "stands in place of the scenario's"
             )
+        machines = [(each.actuators, each.sensor) for each in config.scenario.scenarios]
+        if any(max(a.heater_lag + a.heater_dead_time + s.pyrometer_filter) > 0.0 for a, s in machines):
+            raise CzError(
+                "a slow heater or a pyrometer's filter has no derivatives: lag, dead time and filter must be 0"
+            )
         self.config = config = replace(config, observation="measured")
         self._made_for = config.made_for
         self._batch = Batch(config, self.num_envs, threads)

@@ -27,7 +27,7 @@ from cz_gym.episodes.record import GRID, ScenarioTable, scenario_table
 from cz_gym.errors import CzError
 from cz_gym.jit.compile import entry
 from cz_gym.machine.adapt import adapt_scenario
-from cz_gym.physics.quantities import MAX_LATENCY
+from cz_gym.physics.quantities import MAX_DEAD_TIME, MAX_LATENCY
 from cz_gym.process import NO_OPERATING_POINT, scales
 
 from .buffers import BufferPool
@@ -39,7 +39,7 @@ SLOTS_PER_THREAD, SLOTS_AT_ONCE = 256, 128
 """Least slots per thread in a step, and slots that a thread takes at once."""
 DRAWS_PER_THREAD, DRAWS_AT_ONCE = 16, 16
 """Least draws per thread in a reset, and draws that a thread takes at once."""
-_SAVED = ("slot", "history", "frames")
+_SAVED = ("slot", "history", "frames", "powers")
 Key = tuple[int, int]
 """The 128 random bits from which an episode is drawn, as two 64-bit words."""
 
@@ -63,6 +63,7 @@ class SlotState:
     slot: npt.NDArray[Any]
     history: npt.NDArray[np.float64]
     frames: npt.NDArray[np.float64]
+    powers: npt.NDArray[np.float64]
     scenario: str
     """Name of the scenario that the episode was drawn from."""
 
@@ -99,6 +100,7 @@ class Batch:
             slots.view(np.float64).reshape(num_envs, -1),
             np.zeros((num_envs, depth, process.lagged)),
             np.zeros((num_envs, frames, 3)),
+            np.zeros((num_envs, math.ceil(MAX_DEAD_TIME / interval) + 2)),
         )
         self.memory.slots["over"] = 1
         self._lots = scenario_table(config.scenario, config.model)
@@ -232,8 +234,8 @@ class Batch:
     def save(self, i: int) -> SlotState:
         """A copy of the state of slot i."""
         # array[i] of a structured array is a view that np.copy does not copy; array[i, ...] is an array.
-        slot, history, frames = (rows[i, ...].copy() for rows in self._saved())
-        return SlotState(self.identity, slot, history, frames, self.scenarios[i])
+        arrays = (rows[i, ...].copy() for rows in self._saved())
+        return SlotState(self.identity, *arrays, self.scenarios[i])
 
     def check(self, state: SlotState) -> None:
         """Raise ValueError if this is no saved state, or one saved under other settings."""
@@ -262,7 +264,7 @@ class Batch:
 
     def _saved(self) -> tuple[npt.NDArray[Any], ...]:
         memory = self.memory
-        return memory.slots, memory.history, memory.frames
+        return memory.slots, memory.history, memory.frames, memory.powers
 
     def close(self) -> None:
         """Stop the threads."""

@@ -9,6 +9,8 @@ from cz_gym.process import Inputs
 
 from .arithmetic import clip
 
+_EPS = 1e-9
+
 
 @jittable
 def next_speed(v_p: Any, pull: Any, drives: Any, nominal: Any, e: Any, interval: Any) -> Any:
@@ -51,3 +53,29 @@ def drive(slot: Any, pull: Any, heat: Any, drives: Any, interval: Any, process: 
         slot.Q_H = np.maximum(whole, 0.0)
     extra = process.carry(labelled(process.Extra, slot), labelled(Inputs, slot), slot.puller, interval)
     set_labelled(process.Extra, extra, slot)
+
+
+@jittable
+def is_slow(e: Any) -> Any:
+    """Whether the power that heats is not simply the one that was set."""
+    return e.heater_lag > 0.0 or e.heater_dead_time > 0.0
+
+
+@jittable
+def mean_power(slot: Any, powers: Any, start: Any, stop: Any, interval: Any) -> Any:
+    """Mean power [W] that heats from ``start`` to ``stop`` [s]: the one set, after the dead time and through the lag.
+
+    ``powers`` [W] are those set at the last control intervals, circular; the power set is constant between, so that
+    both are exact, and the mean gives the plant the energy. The lag's output stays in the slot.
+    """
+    lag, dead_time = slot.episode.heater_lag, slot.episode.heater_dead_time
+    t, energy = start, 0.0
+    while t < stop - _EPS:
+        step = int(np.floor((t - dead_time) / interval + _EPS))
+        end = min((step + 1) * interval + dead_time, stop)
+        power, done = powers[step % powers.size], -np.expm1(-(end - t) / lag) if lag > 0.0 else 1.0
+        behind = slot.Q_heats - power
+        energy += power * (end - t) + behind * lag * done
+        slot.Q_heats = power + behind * (1.0 - done)
+        t = end
+    return energy / (stop - start)

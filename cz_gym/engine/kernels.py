@@ -39,7 +39,7 @@ def _begin(slot: Any, model: Any) -> None:
     slot.v_p_before, slot.Q_H_before, slot.clipped = nominal.v_p, nominal.Q_H, 0.0
     slot.fast, slot.slow = first_fluctuation(e, slot.streams)
     slot.dT_i, slot.Q_d, slot.drift = fluctuation(e, slot.fast, slot.slow), 0.0, np.nan
-    slot.integral = 0.0
+    slot.integral, slot.Q_heats = 0.0, nominal.Q_H
     slot.k = slot.frames = slot.over = slot.point = 0
 
 
@@ -185,6 +185,7 @@ def build_kernels(process: Process, meniscus: MeniscusModel) -> Kernels:
             for number in range(len(episode)):
                 numbers[model.episode_at + number] = episode[number]
             _begin(slot, model)
+            memory.powers[i] = slot.Q_H
             _sample_alone(memory, i, True, clock, scales, out, model)
         return impossible
 

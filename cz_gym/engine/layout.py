@@ -27,8 +27,9 @@ def slot_type(process: Process) -> np.dtype[Any]:
     sample number ``k``, the number of camera frames taken, whether the episode is over, the ``key`` it was drawn from
     and the index of its ``scenario`` in the mixture, the drives [m/s, W] of the step before and whether the action was
     clipped: a sample can be written again from its slot. Then the 5 s grid point that ``dT_i`` belongs to with its two
-    processes [standard deviations], the episode's random streams, as far as they are drawn from, and what the process
-    adds: the fields of ``Extra`` and its table.
+    processes [standard deviations], the episode's random streams, as far as they are drawn from, the power that heats
+    [W] where the heater is slow, the pyrometer's filter with the true temperature at the last sample [K], and what the
+    process adds: the fields of ``Extra`` and its table.
     """
     number, whole, table = np.float64, np.int64, process.table
     return np.dtype(
@@ -47,6 +48,7 @@ def slot_type(process: Process) -> np.dtype[Any]:
             ("fast", number),
             ("slow", number),
             ("streams", np.uint64, (len(Stream), WORDS)),
+            *((name, number) for name in ("Q_heats", "T_filtered", "T_1_before")),
             *((name, number) for name in process.Extra._fields),
             *([("table", number, table)] if table[0] else []),
         ],
@@ -98,6 +100,11 @@ class Model(NamedTuple):
         return self.x_at + self.states
 
     @property
+    def power_at(self) -> int:
+        """Row of the power that heats in a lane."""
+        return self.u_at + Inputs._fields.index("Q_H")
+
+    @property
     def d_at(self) -> int:
         """Row of the disturbance in a lane."""
         return self.u_at + len(Inputs._fields)
@@ -147,6 +154,8 @@ class Memory(NamedTuple):
     """Running sums of the remembered channels, circular in time, shape (n, depth, channels); depth 0: none."""
     frames: Any
     """Time [s], ring [m] and meniscus height [m] of camera frames, circular, shape (n, depth, 3)."""
+    powers: Any
+    """Heater power set in each control interval [W], circular, shape (n, depth)."""
 
 
 class Out(NamedTuple):

@@ -44,6 +44,22 @@ def _freezes(slot: Any, t: Any) -> Any:
 
 
 @jittable
+def _filtered(slot: Any, T_1: Any, t: Any) -> Any:
+    """The true temperature [K] through the pyrometer's filter: exact for one that moves straight between samples."""
+    tau = slot.episode.pyrometer_filter
+    if tau <= 0.0:
+        return T_1
+    if slot.k == 0:
+        slot.T_filtered = T_1
+    else:
+        interval = t / slot.k
+        lead = (T_1 - slot.T_1_before) * (tau / interval)
+        slot.T_filtered = T_1 - lead + (slot.T_filtered - slot.T_1_before + lead) * np.exp(-interval / tau)
+    slot.T_1_before = T_1
+    return slot.T_filtered
+
+
+@jittable
 def sense(slot: Any, camera: Any, pyrometer: Any, frames: Any, t: Any, seen: Any) -> None:
     """Read pyrometer and camera at t; ``seen`` is what sensors without latency see (:class:`cz_gym.process.Seen`).
 
@@ -51,7 +67,7 @@ def sense(slot: Any, camera: Any, pyrometer: Any, frames: Any, t: Any, seen: Any
     shows the last reading again.
     """
     e = slot.episode
-    slot.T_1 = seen.T_1 + pyrometer_drift(t, e) + pyrometer
+    slot.T_1 = _filtered(slot, seen.T_1, t) + pyrometer_drift(t, e) + pyrometer
     lost = np.isnan(camera)
     frozen, flagged = _freezes(slot, t)
     slot.valid = 0.0 if lost or flagged else 1.0
