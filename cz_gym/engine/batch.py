@@ -234,8 +234,8 @@ class Batch:
     def save(self, i: int) -> SlotState:
         """A copy of the state of slot i."""
         # array[i] of a structured array is a view that np.copy does not copy; array[i, ...] is an array.
-        arrays = (rows[i, ...].copy() for rows in self._saved())
-        return SlotState(self.identity, *arrays, self.scenarios[i])
+        slot, history, frames, powers = (rows[i, ...].copy() for rows in self._saved())
+        return SlotState(self.identity, slot, history, frames, powers, self.scenarios[i])
 
     def check(self, state: SlotState) -> None:
         """Raise ValueError if this is no saved state, or one saved under other settings."""
