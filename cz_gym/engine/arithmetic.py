@@ -24,6 +24,19 @@ def _along(x: Any, s: Any, k: Any) -> Any:
     return [f"return X({fields})"], {"X": x.instance_class}
 
 
+def plus_product(start: Any, s: Any, k: Any, rows: Any, j: Any) -> Any:
+    """``start`` plus the sum of s k times column j of ``rows``, one row for each field of k, in their order."""
+    for row, value in enumerate(k):
+        start = start + (s * value) * rows[row, j]
+    return start
+
+
+@compiled_as(plus_product)
+def _plus_product(start: Any, s: Any, k: Any, rows: Any, j: Any) -> Any:
+    terms = (f"(s * k.{name}) * rows[{row}, j]" for row, name in enumerate(k.instance_class._fields))
+    return [f"return {' + '.join(['start', *terms])}"], {}
+
+
 @force_inlined
 def rk4(rates: Any, x: Any, u: Any, d: Any, p: Any, dt: Any, m: Any) -> Any:
     """One classical Runge-Kutta step of dt [s], inputs and disturbance held."""

@@ -14,7 +14,7 @@ from cz_gym.jit.compile import column, compiled_as, jittable, kernel, labelled, 
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.process import Inputs, Process, Seen
 
-from .arithmetic import along, rk4
+from .arithmetic import along, plus_product, rk4
 from .drives import next_inputs
 
 ACTIONS = 2
@@ -72,6 +72,11 @@ class Places(NamedTuple):
     def smooth(self) -> int:
         """Number of differentiable states, place of the first action and of the first term of the cost."""
         return self.ring + 2
+
+    @property
+    def columns(self) -> int:
+        """Columns of a Jacobian: the differentiable state and the actions."""
+        return self.smooth + ACTIONS
 
     @property
     def costs(self) -> int:
@@ -138,12 +143,9 @@ def _stage(work: Any, weight: Any, ahead: Any, x: Any, u: Any, d: Any, p: Any, p
     A, last, K, total = work[0], work[1], work[2], work[3]
     k = derivatives(places.process.State, places.process.rates, (x, u), (d, p, m), A)
     for i in range(places.states):
+        by_state = column(places.process.State, A.T, 0, i)
         for j in range(places.extra):
-            K[i, j] = A[i, j]
-        for between in range(places.states):
-            share = ahead * A[i, between]
-            for j in range(places.extra):
-                K[i, j] += share * last[between, j]
+            K[i, j] = plus_product(A[i, j], ahead, by_state, last, j)
     for i in range(places.states):
         for j in range(places.extra):
             last[i, j] = K[i, j]
@@ -208,7 +210,7 @@ def _carried_by(J: Any, slot: Any, extra: Any, interval: Any, places: Any) -> No
     if places.extras > 0:
         by, process = scratch(places.extras, places.carried_by), places.process
         derivatives(process.Extra, process.carry, (extra, labelled(Inputs, slot)), (slot.puller, interval), by)
-        for j in range(places.smooth + ACTIONS):
+        for j in range(places.columns):
             for row in range(places.extras):
                 total = by[row, j - places.extra] if places.extra <= j < places.ring else 0.0
                 for drive in range(2):
@@ -225,16 +227,17 @@ def _cost_by(J: Any, slot: Any, t: Any, places: Any) -> None:
         labelled(process.Extra, slot),
     )  # fmt: skip
     slopes = process.cost_slopes(*derivatives(process.Cost, process.charged, at, (slot, t), by))
-    for j in range(places.smooth + ACTIONS):
-        for term in range(places.costs):
-            total = 0.0
-            for i in range(n + 2):
-                total += by[term, i] * J[i, j]
-            for drive in range(2):
-                total += by[term, n + 2 + drive] * (1.0 if j == n + drive else 0.0)
-            for i in range(places.extras):
-                total += by[term, n + 4 + i] * J[places.extra + i, j]
-            J[places.smooth + term, j] = slopes[term] * total
+    for term in range(places.costs):
+        row = J[places.smooth + term]
+        for i in range(places.charged_by - 2):
+            weight = by[term, i if i < places.extra else i + 2]  # between stand the inputs before
+            if weight != 0.0:
+                for j in range(places.columns):
+                    row[j] += weight * J[i, j]
+        for drive in range(2):
+            row[n + drive] += by[term, places.extra + drive]
+        for j in range(places.columns):
+            row[j] *= slopes[term]
 
 
 @lru_cache(maxsize=8)
@@ -288,21 +291,23 @@ def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, Any]
                     work[1, 0, j] = 0.0
                     for row in range(places.states):
                         work[1, 0, j] += seen_by[0, row] * work[4, row, j]
-                for j in range(places.smooth + ACTIONS):
+                for j in range(places.columns):
                     J[reading, j] = _through_drives(work[1, 0], J, j, places)
             rk4_by(work, begun, u, d, p, left, places, m)
             if inside:
                 _after(work)
             derivatives(Seen, process.see, (labelled(process.State, slot.x),), (p, m), seen_by)
-            for j in range(places.smooth + ACTIONS):
+            for j in range(places.columns):
                 for row in range(places.states):
                     J[row, j] = _through_drives(work[3, row], J, j, places)
-                for row in range(places.states):
-                    J[ring, j] += seen_by[0, row] * J[row, j]
+            for row in range(places.states):
+                if seen_by[0, row] != 0.0:
+                    for j in range(places.columns):
+                        J[ring, j] += seen_by[0, row] * J[row, j]
             _cost_by(J, slot, slot.k * dt, places)
             # The camera's frame is of now, of the grid point inside the step, or of the sample before.
             fresh, between = slot.k_seen == slot.k, inside and at <= slot.k * dt - e.latency + _EPS
-            for j in range(places.smooth + ACTIONS):
+            for j in range(places.columns):
                 if fresh and not late:
                     J[reading, j] = J[ring, j]
                 elif not (fresh and between):
