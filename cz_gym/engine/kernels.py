@@ -18,7 +18,7 @@ from cz_gym.process import GROWS, LOST, Inputs, Process
 
 from .arithmetic import along
 from .drives import drive
-from .layout import Model
+from .layout import model_of
 from .lockstep import LANES, advance
 from .outputs import recall, remember, write_channels, write_info
 from .sensors import sense
@@ -130,7 +130,7 @@ class Kernels(NamedTuple):
 @lru_cache(maxsize=8)
 def build_kernels(process: Process, meniscus: MeniscusModel) -> Kernels:
     """Compile the loops for a process on a meniscus; those of this package's own are cached on disk."""
-    model = Model(process, meniscus)
+    model = model_of(process, meniscus)
 
     def step(
         memory: Any, actions: Any, active: Any, clock: Any, drives: Any, scales: Any, out: Any, start: int, stop: int
@@ -178,12 +178,12 @@ def build_kernels(process: Process, meniscus: MeniscusModel) -> Kernels:
                 puller = model.process.derive(parameters, factors, model.meniscus)
                 tries, sound = tries + 1, True
                 for number in range(len(puller)):
-                    numbers[model.puller_at + number] = puller[number]
+                    numbers[number] = puller[number]
                     sound = sound and np.isfinite(puller[number])
             impossible = impossible if sound else i
             episode = draw_episode(record, slot.streams, slot.freezes)
             for number in range(len(episode)):
-                numbers[model.episode_at + number] = episode[number]
+                numbers[model.constants + number] = episode[number]
             _begin(slot, model)
             memory.powers[i] = slot.Q_H
             _sample_alone(memory, i, True, clock, scales, out, model)

@@ -58,76 +58,66 @@ def slot_type(process: Process) -> np.dtype[Any]:
 
 @static
 class Model(NamedTuple):
-    """What is compiled into the loops: a process on a meniscus, and where its numbers stand."""
+    """What is compiled into the loops: a process on a meniscus, and where its numbers stand (:func:`model_of`)."""
 
     process: Process
     meniscus: MeniscusModel
+    stride: int
+    """Length of a slot [numbers of 8 bytes]."""
+    slot_numbers: int
+    """Length of a slot without its table [numbers of 8 bytes]."""
+    info_rows: int
+    """Rows of ``info``."""
+    lean_rows: tuple[int, ...]
+    """Rows of ``info="lean"``, and that of the clipped action."""
+    constants: int
+    """Number of the puller's constants: place of the episode in a slot, row of the state in a lane."""
+    states: int
+    """Number of states: place of the pull speed in the differentiable state."""
+    u_at: int
+    """Row of the inputs in a lane."""
+    power_at: int
+    """Row of the power that heats in a lane."""
+    d_at: int
+    """Row of the disturbance in a lane."""
+    dt_at: int
+    """Row of the substep [s] in a lane; then the time that is reached [s], and whether the slot goes on."""
+    lane_rows: int
+    extra: int
+    """Place in the differentiable state of what the process carries on; number of states and inputs."""
+    extras: int
+    """Number of what the process carries on."""
+    ring: int
+    """Place of the ring in the differentiable state; the reading follows."""
+    smooth: int
+    """Length of the differentiable state: column of the first action, row of the cost's first term."""
+    columns: int
+    """Columns of a Jacobian: differentiable state and actions."""
+    costs: int
+    """Number of terms of the cost."""
+    driven_by: int
+    """Number of what the next inputs depend on: state, inputs, actions."""
+    carried_by: int
+    """Number of what the carried numbers depend on: themselves and the inputs."""
+    charged_by: int
+    """Number of what the cost depends on: state, inputs and those before, what is carried on."""
 
-    @property
-    def puller_at(self) -> int:
-        """Offset in a slot of the puller's constants [numbers of 8 bytes]."""
-        return 0
 
-    @property
-    def episode_at(self) -> int:
-        """Offset in a slot of the episode's constants [numbers of 8 bytes]."""
-        return len(self.process.Constants._fields)
-
-    @property
-    def slot_numbers(self) -> int:
-        """Length of a slot without its table [numbers of 8 bytes]."""
-        rows, columns = self.process.table
-        return self.stride - rows * columns
-
-    @property
-    def stride(self) -> int:
-        """Length of a slot [numbers of 8 bytes]."""
-        return slot_type(self.process).itemsize // 8
-
-    @property
-    def states(self) -> int:
-        """Number of states."""
-        return len(self.process.State._fields)
-
-    @property
-    def x_at(self) -> int:
-        """Row of the state in a lane, after the constants; inputs and disturbance follow."""
-        return len(self.process.Constants._fields)
-
-    @property
-    def u_at(self) -> int:
-        """Row of the inputs in a lane."""
-        return self.x_at + self.states
-
-    @property
-    def power_at(self) -> int:
-        """Row of the power that heats in a lane."""
-        return self.u_at + Inputs._fields.index("Q_H")
-
-    @property
-    def d_at(self) -> int:
-        """Row of the disturbance in a lane."""
-        return self.u_at + len(Inputs._fields)
-
-    @property
-    def dt_at(self) -> int:
-        """Row of the substep [s] in a lane; then the time that is reached [s], and whether the slot goes on."""
-        return self.d_at + len(self.process.Disturbance._fields)
-
-    @property
-    def lane_rows(self) -> int:
-        """Rows of the lanes."""
-        return self.dt_at + 3
-
-    @property
-    def info_rows(self) -> int:
-        """Rows of ``info``."""
-        return len(self.process.info)
-
-    @property
-    def lean_rows(self) -> tuple[int, ...]:
-        """Rows of ``info="lean"``, and that of the clipped action."""
-        return tuple(map(self.process.info.index, (*self.process.Lean._fields, "action_clipped")))
+@cache
+def model_of(process: Process, meniscus: MeniscusModel) -> Model:
+    """The model of a process on a meniscus."""
+    u, stride = len(Inputs._fields), slot_type(process).itemsize // 8
+    constants, states, loads, extras, costs = (
+        len(kind._fields)
+        for kind in (process.Constants, process.State, process.Disturbance, process.Extra, process.Cost)
+    )
+    u_at, ring = constants + states, states + u + extras
+    dt_at, lean = u_at + u + loads, (*process.Lean._fields, "action_clipped")
+    return Model(
+        process, meniscus, stride, stride - process.table[0] * process.table[1], len(process.info),
+        tuple(map(process.info.index, lean)), constants, states, u_at, u_at + 1, u_at + u, dt_at, dt_at + 3,
+        states + u, extras, ring, ring + 2, ring + 2 + u, costs, states + 2 * u, extras + u, states + 2 * u + extras,
+    )  # fmt: skip
 
 
 class Clock(NamedTuple):

@@ -39,9 +39,9 @@ def _disturb(slot: Any, j: Any, process: Any) -> Any:
 @jittable
 def _begin(slot: Any, numbers: Any, powers: Any, lanes: Any, lane: Any, interval: Any, model: Any) -> None:
     """Copy a slot into its lane at the start of a control interval."""
-    for constant in range(model.x_at):
-        lanes[constant, lane] = numbers[model.puller_at + constant]
-    set_column(model.process.State, slot.x, lanes, model.x_at, lane)
+    for constant in range(model.constants):
+        lanes[constant, lane] = numbers[constant]
+    set_column(model.process.State, slot.x, lanes, model.constants, lane)
     set_column(Inputs, slot, lanes, model.u_at, lane)
     lanes[model.dt_at + 1, lane] = slot.k * interval
     if is_slow(slot.episode):
@@ -68,7 +68,7 @@ def _integrate(lanes: Any, ends: Any, count: Any, model: Any) -> None:
     """
     process = model.process
     for lane in range(count):
-        x, u = column(process.State, lanes, model.x_at, lane), column(Inputs, lanes, model.u_at, lane)
+        x, u = column(process.State, lanes, model.constants, lane), column(Inputs, lanes, model.u_at, lane)
         d, p = column(process.Disturbance, lanes, model.d_at, lane), column(process.Constants, lanes, 0, lane)
         new = rk4(process.rates, x, u, d, p, lanes[model.dt_at, lane], model.meniscus)
         set_column(process.State, new, ends, 0, lane)
@@ -79,10 +79,10 @@ def _judge(slot: Any, frames: Any, lanes: Any, ends: Any, lane: Any, clock: Any,
     """Accept or reject a substep; return whether the slot needs another one."""
     process, m = model.process, model.meniscus
     dt, upto = lanes[model.dt_at, lane], lanes[model.dt_at + 1, lane]
-    x, u = column(process.State, lanes, model.x_at, lane), column(Inputs, lanes, model.u_at, lane)
+    x, u = column(process.State, lanes, model.constants, lane), column(Inputs, lanes, model.u_at, lane)
     d, new = column(process.Disturbance, lanes, model.d_at, lane), column(process.State, ends, 0, lane)
     new, slot.over = process.accept(slot, x, new, u, d, upto, dt, clock.radius_limit, m)
-    set_column(process.State, new, lanes, model.x_at, lane)
+    set_column(process.State, new, lanes, model.constants, lane)
     more = upto < (slot.k + 1) * clock.interval - _EPS
     if more and slot.episode.latency > 0.0:
         seen = process.see(new, slot.puller, m)
@@ -116,6 +116,6 @@ def advance(memory: Any, active: Any, first: Any, count: Any, clock: Any, model:
                     going -= 1
     for lane in range(count):
         if active[first + lane]:
-            x = column(model.process.State, lanes, model.x_at, lane)
+            x = column(model.process.State, lanes, model.constants, lane)
             set_labelled(model.process.State, x, memory.slots[first + lane].x)
             memory.slots[first + lane].k += 1

@@ -6,16 +6,17 @@ subtraction, so h can be arbitrarily small (Squire and Trapp, SIAM Review 1998).
 """
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 from cz_gym.episodes.record import GRID
 from cz_gym.jit.cache import hashed
-from cz_gym.jit.compile import column, compiled_as, jittable, kernel, labelled, scratch, set_column, static
+from cz_gym.jit.compile import column, compiled_as, jittable, kernel, labelled, scratch, set_column
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.process import Inputs, Process, Seen
 
 from .arithmetic import along, plus_product, rk4
 from .drives import next_inputs
+from .layout import model_of
 
 ACTIONS = 2
 _H = 2.0**-100
@@ -40,63 +41,6 @@ def work_shape(process: Process) -> tuple[int, int, int]:
     """Shape of the loop's work array."""
     states = len(process.State._fields)
     return 6, states, states + _INPUTS
-
-
-@static
-class Places(NamedTuple):
-    """Where the numbers of a process stand in a Jacobian."""
-
-    process: Process
-
-    @property
-    def states(self) -> int:
-        """Number of the plant's states, and place of the pull speed; the heater power follows."""
-        return len(self.process.State._fields)
-
-    @property
-    def extra(self) -> int:
-        """Place of what the process carries on."""
-        return self.states + _INPUTS
-
-    @property
-    def extras(self) -> int:
-        """Number of what the process carries on."""
-        return len(self.process.Extra._fields)
-
-    @property
-    def ring(self) -> int:
-        """Place of the ring; the reading follows."""
-        return self.extra + self.extras
-
-    @property
-    def smooth(self) -> int:
-        """Number of differentiable states, place of the first action and of the first term of the cost."""
-        return self.ring + 2
-
-    @property
-    def columns(self) -> int:
-        """Columns of a Jacobian: the differentiable state and the actions."""
-        return self.smooth + ACTIONS
-
-    @property
-    def costs(self) -> int:
-        """Number of terms of the cost."""
-        return len(self.process.Cost._fields)
-
-    @property
-    def driven_by(self) -> int:
-        """Number of what the next inputs depend on: state, inputs, actions."""
-        return self.extra + ACTIONS
-
-    @property
-    def carried_by(self) -> int:
-        """Number of what the carried numbers depend on: themselves and the inputs."""
-        return self.extras + _INPUTS
-
-    @property
-    def charged_by(self) -> int:
-        """Number of what the terms of the cost depend on: state, inputs and those before, what is carried on."""
-        return self.states + 2 * _INPUTS + self.extras
 
 
 def derivatives(kind: Any, function: Any, at: Any, rest: Any, by: Any) -> Any:
@@ -134,35 +78,35 @@ def _derivatives(kind: Any, function: Any, at: Any, rest: Any, by: Any) -> Any:
 
 
 @jittable
-def _stage(work: Any, weight: Any, ahead: Any, x: Any, u: Any, d: Any, p: Any, places: Any, m: Any) -> Any:
+def _stage(work: Any, weight: Any, ahead: Any, x: Any, u: Any, d: Any, p: Any, model: Any) -> Any:
     """One stage of RK4: its rates, and their derivatives.
 
     ``work`` holds the derivatives of the rates, of this stage's and the last one's as functions of where the step began
     (K), and of the step so far. This stage is at ``ahead`` [s] times the last one's rates; it counts ``weight`` [s].
     """
     A, last, K, total = work[0], work[1], work[2], work[3]
-    k = derivatives(places.process.State, places.process.rates, (x, u), (d, p, m), A)
-    for i in range(places.states):
-        by_state = column(places.process.State, A.T, 0, i)
-        for j in range(places.extra):
+    k = derivatives(model.process.State, model.process.rates, (x, u), (d, p, model.meniscus), A)
+    for i in range(model.states):
+        by_state = column(model.process.State, A.T, 0, i)
+        for j in range(model.extra):
             K[i, j] = plus_product(A[i, j], ahead, by_state, last, j)
-    for i in range(places.states):
-        for j in range(places.extra):
+    for i in range(model.states):
+        for j in range(model.extra):
             last[i, j] = K[i, j]
             total[i, j] += weight * K[i, j]
     return k
 
 
 @jittable
-def rk4_by(work: Any, x: Any, u: Any, d: Any, p: Any, dt: Any, places: Any, m: Any) -> None:
+def rk4_by(work: Any, x: Any, u: Any, d: Any, p: Any, dt: Any, model: Any) -> None:
     """Derivatives of :func:`cz_gym.engine.arithmetic.rk4` by state and inputs, into ``work[3]``."""
-    for i in range(places.states):
-        for j in range(places.extra):
+    for i in range(model.states):
+        for j in range(model.extra):
             work[1, i, j], work[3, i, j] = 0.0, 1.0 if i == j else 0.0
-    k_1 = _stage(work, dt / 6.0, 0.0, x, u, d, p, places, m)
-    k_2 = _stage(work, dt / 3.0, 0.5 * dt, along(x, 0.5 * dt, k_1), u, d, p, places, m)
-    k_3 = _stage(work, dt / 3.0, 0.5 * dt, along(x, 0.5 * dt, k_2), u, d, p, places, m)
-    _stage(work, dt / 6.0, dt, along(x, dt, k_3), u, d, p, places, m)
+    k_1 = _stage(work, dt / 6.0, 0.0, x, u, d, p, model)
+    k_2 = _stage(work, dt / 3.0, 0.5 * dt, along(x, 0.5 * dt, k_1), u, d, p, model)
+    k_3 = _stage(work, dt / 3.0, 0.5 * dt, along(x, 0.5 * dt, k_2), u, d, p, model)
+    _stage(work, dt / 6.0, dt, along(x, dt, k_3), u, d, p, model)
 
 
 @jittable
@@ -186,57 +130,57 @@ def _after(work: Any) -> None:
 
 
 @jittable
-def _through_drives(by: Any, J: Any, j: Any, places: Any) -> Any:
+def _through_drives(by: Any, J: Any, j: Any, model: Any) -> Any:
     """Derivative by number j of what depends so on plant state and applied inputs at the begin of the step."""
-    direct = by[j] if j < places.states else 0.0
-    return direct + by[places.states] * J[places.states, j] + by[places.states + 1] * J[places.states + 1, j]
+    direct = by[j] if j < model.states else 0.0
+    return direct + by[model.states] * J[model.states, j] + by[model.states + 1] * J[model.states + 1, j]
 
 
 @jittable
-def _drives_by(J: Any, slot: Any, x: Any, u: Any, action: Any, drives: Any, interval: Any, places: Any) -> None:
+def _drives_by(J: Any, slot: Any, x: Any, u: Any, action: Any, drives: Any, interval: Any, model: Any) -> None:
     """Derivatives of the next inputs; whole steps of the heater are taken for a power that moves freely."""
-    by, process = scratch(2, places.driven_by), places.process
+    by, process = scratch(2, model.driven_by), model.process
     derivatives(Inputs, next_inputs, (x, u, action), (drives, slot, interval, process), by)
     for drive in range(2):
-        for j in range(places.extra):
-            J[places.states + drive, j] = by[drive, j]
+        for j in range(model.extra):
+            J[model.states + drive, j] = by[drive, j]
         for action_of in range(ACTIONS):
-            J[places.states + drive, places.smooth + action_of] = by[drive, places.extra + action_of]
+            J[model.states + drive, model.smooth + action_of] = by[drive, model.extra + action_of]
 
 
 @jittable
-def _carried_by(J: Any, slot: Any, extra: Any, interval: Any, places: Any) -> None:
+def _carried_by(J: Any, slot: Any, extra: Any, interval: Any, model: Any) -> None:
     """Derivatives of what the process carries on, from those of the inputs."""
-    if places.extras > 0:
-        by, process = scratch(places.extras, places.carried_by), places.process
+    if model.extras > 0:
+        by, process = scratch(model.extras, model.carried_by), model.process
         derivatives(process.Extra, process.carry, (extra, labelled(Inputs, slot)), (slot.puller, interval), by)
-        for j in range(places.columns):
-            for row in range(places.extras):
-                total = by[row, j - places.extra] if places.extra <= j < places.ring else 0.0
+        for j in range(model.columns):
+            for row in range(model.extras):
+                total = by[row, j - model.extra] if model.extra <= j < model.ring else 0.0
                 for drive in range(2):
-                    total += by[row, places.extras + drive] * J[places.states + drive, j]
-                J[places.extra + row, j] = total
+                    total += by[row, model.extras + drive] * J[model.states + drive, j]
+                J[model.extra + row, j] = total
 
 
 @jittable
-def _cost_by(J: Any, slot: Any, t: Any, places: Any) -> None:
+def _cost_by(J: Any, slot: Any, t: Any, model: Any) -> None:
     """Derivatives of the cost's terms, from those of the next state."""
-    process, n, by = places.process, places.states, scratch(places.costs, places.charged_by)
+    process, n, by = model.process, model.states, scratch(model.costs, model.charged_by)
     at = (
         labelled(process.State, slot.x), labelled(Inputs, slot), Inputs(slot.v_p_before, slot.Q_H_before),
         labelled(process.Extra, slot),
     )  # fmt: skip
     slopes = process.cost_slopes(*derivatives(process.Cost, process.charged, at, (slot, t), by))
-    for term in range(places.costs):
-        row = J[places.smooth + term]
-        for i in range(places.charged_by - 2):
-            weight = by[term, i if i < places.extra else i + 2]  # between stand the inputs before
+    for term in range(model.costs):
+        row = J[model.smooth + term]
+        for i in range(model.charged_by - 2):
+            weight = by[term, i if i < model.extra else i + 2]  # between stand the inputs before
             if weight != 0.0:
-                for j in range(places.columns):
+                for j in range(model.columns):
                     row[j] += weight * J[i, j]
         for drive in range(2):
-            row[n + drive] += by[term, places.extra + drive]
-        for j in range(places.columns):
+            row[n + drive] += by[term, model.extra + drive]
+        for j in range(model.columns):
             row[j] *= slopes[term]
 
 
@@ -250,22 +194,22 @@ def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, Any]
     ``held``, shape (n, 2), is Q_d [W] and dT_i [K] before the step, which may be 5 s long: those of its first substep
     if a point of the grid lies inside.
     """
-    places, m = Places(process), meniscus
+    model, m = model_of(process, meniscus), meniscus
 
     def gather(memory: Any, state: Any, start: int, stop: int) -> None:
         for i in range(start, stop):
             slot, numbers = memory.slots[i], state.T
             set_column(process.State, slot.x, numbers, 0, i)
-            state[i, places.states], state[i, places.states + 1] = slot.v_p, slot.Q_H_slewed
-            set_column(process.Extra, slot, numbers, places.extra, i)
-            state[i, places.ring] = process.see(labelled(process.State, slot.x), slot.puller, m).ring
-            state[i, places.ring + 1] = slot.ring
+            state[i, model.states], state[i, model.states + 1] = slot.v_p, slot.Q_H_slewed
+            set_column(process.Extra, slot, numbers, model.extra, i)
+            state[i, model.ring] = process.see(labelled(process.State, slot.x), slot.puller, m).ring
+            state[i, model.ring + 1] = slot.ring
 
     def tangents(
         memory: Any, state: Any, held: Any, actions: Any, grows: Any, clock: Any, drives: Any, work: Any,
         jacobian: Any, start: int, stop: int,
     ) -> None:  # fmt: skip
-        ring, reading, seen_by = places.ring, places.ring + 1, scratch(4, places.states)
+        ring, reading, seen_by = model.ring, model.ring + 1, scratch(4, model.states)
         for i in range(start, stop):
             J = jacobian[i]
             J[:, :] = 0.0
@@ -273,9 +217,9 @@ def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, Any]
                 continue
             slot, dt = memory.slots[i], clock.interval
             p, e = slot.puller, slot.episode
-            begun, before = column(process.State, state.T, 0, i), column(Inputs, state.T, places.states, i)
-            _drives_by(J, slot, begun, before, Inputs(actions[i, 0], actions[i, 1]), drives, dt, places)
-            _carried_by(J, slot, column(process.Extra, state.T, places.extra, i), dt, places)
+            begun, before = column(process.State, state.T, 0, i), column(Inputs, state.T, model.states, i)
+            _drives_by(J, slot, begun, before, Inputs(actions[i, 0], actions[i, 1]), drives, dt, model)
+            _carried_by(J, slot, column(process.Extra, state.T, model.extra, i), dt, model)
             u, d = labelled(Inputs, slot), process.disturb(slot.Q_d, slot.dT_i, slot.point * GRID, e)
             point = int((slot.k - 1) * dt / GRID + _EPS)
             at, late = (point + 1) * GRID, e.latency > 0.0
@@ -283,31 +227,31 @@ def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, Any]
             if inside:
                 first = process.disturb(held[i, 0], held[i, 1], point * GRID, e)
                 left = slot.k * dt - at
-                rk4_by(work, begun, u, first, p, dt - left, places, m)
+                rk4_by(work, begun, u, first, p, dt - left, model)
                 begun = rk4(process.rates, begun, u, first, p, dt - left, m)
                 _copy(work, 3, 4)
                 derivatives(Seen, process.see, (begun,), (p, m), seen_by)
-                for j in range(places.extra):
+                for j in range(model.extra):
                     work[1, 0, j] = 0.0
-                    for row in range(places.states):
+                    for row in range(model.states):
                         work[1, 0, j] += seen_by[0, row] * work[4, row, j]
-                for j in range(places.columns):
-                    J[reading, j] = _through_drives(work[1, 0], J, j, places)
-            rk4_by(work, begun, u, d, p, left, places, m)
+                for j in range(model.columns):
+                    J[reading, j] = _through_drives(work[1, 0], J, j, model)
+            rk4_by(work, begun, u, d, p, left, model)
             if inside:
                 _after(work)
             derivatives(Seen, process.see, (labelled(process.State, slot.x),), (p, m), seen_by)
-            for j in range(places.columns):
-                for row in range(places.states):
-                    J[row, j] = _through_drives(work[3, row], J, j, places)
-            for row in range(places.states):
+            for j in range(model.columns):
+                for row in range(model.states):
+                    J[row, j] = _through_drives(work[3, row], J, j, model)
+            for row in range(model.states):
                 if seen_by[0, row] != 0.0:
-                    for j in range(places.columns):
+                    for j in range(model.columns):
                         J[ring, j] += seen_by[0, row] * J[row, j]
-            _cost_by(J, slot, slot.k * dt, places)
+            _cost_by(J, slot, slot.k * dt, model)
             # The camera's frame is of now, of the grid point inside the step, or of the sample before.
             fresh, between = slot.k_seen == slot.k, inside and at <= slot.k * dt - e.latency + _EPS
-            for j in range(places.columns):
+            for j in range(model.columns):
                 if fresh and not late:
                     J[reading, j] = J[ring, j]
                 elif not (fresh and between):

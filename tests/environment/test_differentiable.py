@@ -12,7 +12,8 @@ from cz_gym.body.plant import Disturbance, Inputs, State, make_puller, rk4
 from cz_gym.body.process import BODY
 from cz_gym.config import make_config
 from cz_gym.differentiable import STATES, DifferentiableBatch
-from cz_gym.engine.tangents import Places, rk4_by, rows, work_shape
+from cz_gym.engine.layout import model_of
+from cz_gym.engine.tangents import rk4_by, rows, work_shape
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.observation import MEASURED
 from cz_gym.physics.linearisation import jacobian
@@ -145,7 +146,7 @@ def test_the_chain_rule_over_rk4_is_exact():
     puller, d = make_puller(lam=0.5), Disturbance(50.0, 0.3, 0.95)
     x, u, work = State(*puller.state_0)._replace(r_c=0.051, h_c=0.0062), puller.inputs_0, np.zeros(work_shape(BODY))
     for _ in range(10):
-        rk4_by(work, x, u, d, puller, 5.0, Places(BODY), HURLE)
+        rk4_by(work, x, u, d, puller, 5.0, model_of(BODY, HURLE))
         whole = jacobian(lambda *at: rk4(State(*at[:5]), Inputs(*at[5:]), d, puller, 5.0, hurle_slope), (*x, *u))
         np.testing.assert_allclose(work[3], whole, rtol=1e-10, atol=1e-16)
         x = rk4(x, u, d, puller, 5.0, hurle_slope)
