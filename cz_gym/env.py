@@ -18,7 +18,6 @@ from cz_gym.body.process import BODY
 from cz_gym.camera.view import IMAGE, Camera
 from cz_gym.engine.batch import Batch, SlotState, new_key
 from cz_gym.engine.layout import Out, check_info
-from cz_gym.engine.outputs import observations
 from cz_gym.episodes.mixture import AnyScenario, Mixture
 from cz_gym.episodes.scenarios import find_distribution
 from cz_gym.errors import CzError
@@ -32,7 +31,7 @@ from cz_gym.support.names import known_keywords, unknown
 
 from .action import MarkedAction, check_marked
 from .config import Config, check_config, make_config
-from .observation import CAMERA, CLIP
+from .observation import CAMERA, CLIP, observations
 
 Observation = npt.NDArray[Any]
 Action = npt.NDArray[np.float32]

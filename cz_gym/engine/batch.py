@@ -27,13 +27,13 @@ from cz_gym.episodes.record import GRID, ScenarioTable, scenario_table
 from cz_gym.errors import CzError
 from cz_gym.jit.compile import entry
 from cz_gym.machine.adapt import adapt_scenario
+from cz_gym.observation import lags, observations
 from cz_gym.physics.quantities import MAX_DEAD_TIME, MAX_LATENCY
 from cz_gym.process import NO_OPERATING_POINT, scales
 
 from .buffers import BufferPool
 from .kernels import build_kernels
 from .layout import Clock, Memory, ObservationScales, Out, info_width, slot_type
-from .outputs import lags, observations
 
 SLOTS_PER_THREAD, SLOTS_AT_ONCE = 256, 128
 """Least slots per thread in a step, and slots that a thread takes at once."""

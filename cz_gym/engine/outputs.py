@@ -1,61 +1,11 @@
 """Output of a slot's signals: scaled channels, the memory of "history", the rows of ``info``."""
 
-from functools import cache
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
 from cz_gym.jit.compile import jittable, scratch
-from cz_gym.process import Channel, Process
+from cz_gym.observation import CLIP, INTEGRAL_SCALE
 
 from .arithmetic import clip
-
-CLIP = 10.0
-"""Largest observed value after scaling [-]."""
-INTEGRAL_SCALE = 1.0
-"""Scale of the error's integral, one metre second: 1 mm held for 1000 s [m s]."""
-LAGS = (5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0, 240.0, 360.0, 480.0, 720.0, 960.0, 1200.0)
-"""Ages [s] at which the time spans of "history" end; each span starts at the age before."""
-
-
-@cache
-def observations(process: Process) -> dict[str, tuple[Channel, ...]]:
-    """Channels of every observation but the camera's."""
-    return {"measured": process.measured, "history": _history(process), "state": process.state}
-
-
-def _history(process: Process) -> tuple[Channel, ...]:
-    """The measured channels, relative ones as such, the integral of the error, and differences of past means."""
-    relative = {each.name: each for each in process.relative}
-    present = [
-        c._replace(scale=relative[c.name].scale, meaning=relative[c.name].meaning) if c.name in relative else c
-        for c in process.measured
-    ]
-    error, units = process.past[0].name, {channel.name: channel.unit for channel in process.measured}
-    meaning = f"integral of {error} since the start, held within +-10"
-    later = ("the value now", *(f"that over the span up to {age:g} s" for age in LAGS))
-    past = [
-        Channel(
-            units[name],
-            scale,
-            f"{name}: mean over the span up to {age:g} s ago, minus {subtracted}",
-            f"{name}_{age:g}s",
-        )
-        for age, subtracted in zip(LAGS, later, strict=False)
-        for name, scale in process.past
-    ]
-    return (*present, Channel("m s", INTEGRAL_SCALE, meaning, "integral"), *past)
-
-
-def lags(control_interval: float) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Ages, in samples, of the newest and the oldest sample of each span, at that control interval [s].
-
-    Each span holds at least one sample.
-    """
-    oldest = np.maximum(np.rint(np.array(LAGS) / control_interval).astype(np.int64), 1)
-    before = np.concatenate([[0], oldest[:-1]])
-    return np.minimum(before + 1, oldest), oldest
 
 
 @jittable
