@@ -24,7 +24,7 @@ from cz_gym.physics.parameters import Parameters, check_parameters
 from cz_gym.physics.quantities import MACHINE, Quantity
 from cz_gym.support.atomic_files import naming, write_files
 from cz_gym.support.names import unknown
-from cz_gym.support.units import CELSIUS, KILO, MM, MM_PER_MIN
+from cz_gym.support.units import CELSIUS, KILO, MM
 
 from .toml_numbers import FORMAT, read_numbers, write_numbers
 
@@ -85,13 +85,14 @@ class PullerFile:
         object.__setattr__(self, "parameters", check_parameters(self.parameters))
         plant = make_puller(self.parameters)
         check_height(plant)
-        for given, unit, needed, what in (
-            ("heater_max", KILO, plant.Q_H_0, "excludes the operating point, which needs"),
-            ("pull_max", MM_PER_MIN, plant.v_0, "excludes the operating point, whose pull speed is"),
+        for symbol, needed, which in (
+            ("heater_max", plant.Q_H_0, "which needs"),
+            ("pull_max", plant.v_0, "whose pull speed is"),
         ):
-            if (limit := getattr(self, given)) is not None and limit <= needed:
-                key, shown = MACHINE[given].key, MACHINE[given].shown
-                raise CzError(f"{key} = {limit / unit:g} {what} {needed / unit:.4g} {shown}")
+            limit, most = getattr(self, symbol), MACHINE[symbol]
+            if limit is not None and limit <= needed:
+                point = f"the operating point, {which} {needed / most.size:.4g} {most.shown}"
+                raise CzError(f"{most.key} = {limit / most.size:g} excludes {point}")
         if plant.T_1_0 > HOTTEST:
             raise CzError(
                 f"the heater would have to be at {plant.T_1_0:.0f} K, and none stands more than {HOTTEST:.0f} K: "

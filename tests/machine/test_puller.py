@@ -19,6 +19,7 @@ from cz_gym.machine.puller import (
     FOLDER,
     PullerFile,
     chosen_puller,
+    doubts,
     find_puller,
     read_puller,
     to_toml,
@@ -164,6 +165,7 @@ def test_one_many_and_differentiable_crystals_are_the_same_on_a_puller(name):
     many = CzVectorEnv(2, **given, **PLAIN)
     twin = DifferentiableBatch(many.config, 2)
     assert env.config == many.config
+    assert not doubts(find_puller(name))
     assert env.config.control_interval == find_puller(name).control_interval
     first, _ = env.reset(seed=3)
     rows, _ = many.reset(seed=3)
