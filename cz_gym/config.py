@@ -11,8 +11,7 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import NamedTuple
 
-from cz_gym.body.plant import EQUATIONS, make_puller
-from cz_gym.body.task import ACTIONS, check_height
+from cz_gym.body.process import BODY
 from cz_gym.camera.view import Camera, camera_for, check_camera
 from cz_gym.episodes.mixture import AnyScenario, Distribution
 from cz_gym.episodes.scenario import Range, Scenario
@@ -22,10 +21,11 @@ from cz_gym.jit.code_hash import function_hash
 from cz_gym.machine.adapt import adapt_scenario
 from cz_gym.machine.puller import DEFAULT, PullerFile, find_puller
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
-from cz_gym.physics.parameters import Parameters, check_parameters
+from cz_gym.physics.parameters import Parameters
+from cz_gym.process import Process
 from cz_gym.support.names import needs, unknown
 
-from .action import MadeFor
+from .action import ACTIONS, MadeFor
 from .observation import CAMERA, OBSERVATIONS
 
 VERSION = 0
@@ -69,7 +69,7 @@ class Config:
     model: str | float | None = None
     observation: str = "history"
     action: str = "smooth"
-    """Action mode: "direct", "smooth" or "rate" (:func:`cz_gym.body.task.drives_of`)."""
+    """Action mode: "direct", "smooth" or "rate" (:func:`cz_gym.action.drives_of`)."""
     control_interval: float = 5.0
     """Time between actions [s]."""
     horizon: float = 10800.0
@@ -80,6 +80,8 @@ class Config:
     """The camera of ``observation="camera"``; nothing else depends on it."""
     puller: PullerFile = DEFAULT
     """The machine; scenario, parameters and control interval follow from it in :func:`make_config`."""
+    process: Process = field(default=BODY, repr=False)
+    """What is simulated."""
 
     @property
     def ranges(self) -> tuple[float, float]:
@@ -114,7 +116,7 @@ class Config:
     @property
     def plant_hash(self) -> str:
         """SHA-256 of the plant: code of its equations and its meniscus, and its parameters (16 hex digits)."""
-        return _plant_hash(self.parameters, self.meniscus)
+        return _plant_hash(self.process, self.parameters, self.meniscus)
 
     @property
     def made_for(self) -> MadeFor:
@@ -163,6 +165,7 @@ def make_config(
     camera: Camera | None = None,
     action: str = "smooth",
     puller: str | Path | PullerFile | None = None,
+    process: Process = BODY,
 ) -> Config:
     """Check the arguments of the environment; CzError names what was given and what is allowed."""
     machine = find_puller(puller)
@@ -183,25 +186,25 @@ def make_config(
         raise CzError(f"horizon {horizon} s must be a whole number of control intervals of {interval:g} s")
     if meniscus is not None and not isinstance(meniscus, MeniscusModel):
         raise CzError(f"meniscus must be a cz_gym.MeniscusModel, not {meniscus!r}")
-    checked = check_parameters(machine.parameters if parameters is None else parameters)
-    check_height(make_puller(checked, meniscus=meniscus or HURLE))
+    checked = process.check(machine.parameters if parameters is None else parameters, meniscus or HURLE)
     checked_camera = check_camera(camera_for(checked) if camera is None else camera, checked)
     return Config(
         *(drawn_from, model, observation, action, interval, length, checked, meniscus or HURLE, checked_camera),
         puller=machine,
+        process=process,
     )
 
 
 @lru_cache(maxsize=64)
-def _plant_hash(parameters: Parameters, meniscus: MeniscusModel) -> str:
+def _plant_hash(process: Process, parameters: Parameters, meniscus: MeniscusModel) -> str:
     numbers = {name: float(value) + 0.0 for name, value in parameters._asdict().items()}
-    text = json.dumps([VERSION, _equations_hash(meniscus), numbers], sort_keys=True)
+    text = json.dumps([VERSION, _equations_hash(process, meniscus), numbers], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 @lru_cache(maxsize=64)
-def _equations_hash(meniscus: MeniscusModel) -> str:
-    return function_hash(*EQUATIONS, *meniscus.functions)
+def _equations_hash(process: Process, meniscus: MeniscusModel) -> str:
+    return function_hash(*process.equations, *meniscus.functions)
 
 
 def positive_whole(name: str, value: int) -> int:

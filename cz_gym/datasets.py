@@ -25,7 +25,7 @@ import numpy.typing as npt
 from scipy.signal import lfilter
 
 import cz_gym
-from cz_gym.body.task import drives_of
+from cz_gym.action import drives_of
 from cz_gym.config import Config, check_config, make_config
 from cz_gym.errors import CzError
 from cz_gym.evaluation.protocol import TRAINING_SEEDS

@@ -15,19 +15,17 @@ import numpy.typing as npt
 from gymnasium.error import InvalidAction, ResetNeeded
 
 from cz_gym.action import MarkedAction, check_marked
-from cz_gym.body.cost import Cost
-from cz_gym.body.signals import INFO, MEASURED, scales
+from cz_gym.body.process import BODY
 from cz_gym.config import Config, check_config, positive_whole
 from cz_gym.engine.batch import Batch, first_key
 from cz_gym.engine.buffers import BufferPool
 from cz_gym.engine.layout import Out
-from cz_gym.engine.tangents import ACTIONS, ROWS, SCRATCH, SMOOTH, build_tangents
+from cz_gym.engine.tangents import ACTIONS, build_tangents, rows, smooth, work_shape
 from cz_gym.episodes.record import GRID
 from cz_gym.errors import CzError
+from cz_gym.process import scales
 
 Floats = npt.NDArray[np.float64]
-_COSTS = [INFO.index(f"cost_{name}") for name in Cost._fields]
-_RADIUS, _REFERENCE, _OFFSET = (INFO.index(name) for name in ("r_c", "r_ref", "ring_offset"))
 
 
 class Step(NamedTuple):
@@ -51,7 +49,7 @@ class Step(NamedTuple):
     state before and the two actions."""
 
 
-STATES = SMOOTH
+STATES = smooth(BODY)
 """The differentiable state: radius, meniscus height [m], T_1, T_2, T_b [K], v_p [m/s], Q_H [W], the bright ring [m] and
 the camera's reading of it [m]. All else that a step depends on (disturbances, noise, time) depends on no action."""
 
@@ -77,15 +75,23 @@ class DifferentiableBatch:
                 f"the camera's latency of {latency:g} s is longer than the control interval; a puller file's latency_s "
                 "stands in place of the scenario's"
             )
+        machines = [(each.actuators, each.sensor) for each in config.scenario.scenarios]
+        if any(max(a.heater_lag + a.heater_dead_time + s.pyrometer_filter) > 0.0 for a, s in machines):
+            raise CzError(
+                "a slow heater or a pyrometer's filter has no derivatives: lag, dead time and filter must be 0"
+            )
         self.config = config = replace(config, observation="measured")
         self._made_for = config.made_for
         self._batch = Batch(config, self.num_envs, threads)
-        self._gather, self._tangents = build_tangents(config.meniscus)
+        self._gather, self._tangents = build_tangents(config.process, config.meniscus)
         self._out = self._batch.new_out()
-        self._state = np.zeros((num_envs, len(STATES)))
+        self._names, info = smooth(config.process), config.process.info
+        self._state = np.zeros((num_envs, len(self._names)))
+        self._costs = [info.index(f"cost_{name}") for name in config.process.Cost._fields]
+        self._errors = [info.index(name) for name in (*config.process.Lean._fields[:2], "ring_offset")]
         self._grows, self._begun = np.ones(num_envs, np.bool_), np.zeros(num_envs, np.bool_)
-        self._work = np.zeros(SCRATCH)
-        self._jacobians = BufferPool((self.num_envs, len(ROWS), len(STATES) + ACTIONS), np.float64)
+        self._work = np.zeros(work_shape(config.process))
+        self._jacobians = BufferPool((self.num_envs, len(rows(config.process)), len(self._names) + ACTIONS), np.float64)
         self.measured_by_state = _measured_by_state(config)
         """Derivatives of the "measured" observation with respect to the state, shape (11, 9)."""
 
@@ -136,9 +142,9 @@ class DifferentiableBatch:
         step = (held, batch.actions, self._grows, batch.clock, batch.drives)
         self._tangents(batch.memory, before, *step, self._work, jacobian, 0, n)
         info = out.info[:, :n]
-        cost = np.where(self._grows, info[_COSTS], 0.0).T
-        error = info[_RADIUS] - info[_REFERENCE]
-        return Step(self._state, out.observation, cost, error, info[_OFFSET], self._grows, jacobian)
+        cost = np.where(self._grows, info[self._costs], 0.0).T
+        value, reference, offset = info[self._errors]
+        return Step(self._state, out.observation, cost, value - reference, offset, self._grows, jacobian)
 
     def _copied(self) -> Out:
         """A copy of the last step's results in new arrays."""
@@ -148,7 +154,7 @@ class DifferentiableBatch:
         return out
 
     def _now(self) -> Floats:
-        state = np.empty((self.num_envs, len(STATES)))
+        state = np.empty((self.num_envs, len(self._names)))
         self._gather(self._batch.memory, state, 0, self.num_envs)
         return state
 
@@ -169,10 +175,10 @@ class DifferentiableBatch:
 
 def _measured_by_state(config: Config) -> Floats:
     """Derivatives of "measured" with respect to the differentiable state, shape (11, 9)."""
-    by_state = np.zeros((len(MEASURED), len(STATES)))
-    scale = dict(zip((channel.name for channel in MEASURED), scales(MEASURED, *config.ranges), strict=True))
-    for row, channel in enumerate(MEASURED):
-        of = {"ring_error": "reading", "T_1": "T_1", "v_p": "v_p", "Q_H": "Q_H"}.get(channel.name)
-        if of is not None:
-            by_state[row, STATES.index(of)] = 1.0 / scale[channel.name]
+    channels, names = config.process.measured, smooth(config.process)
+    by_state, shown = np.zeros((len(channels), len(names))), scales(channels, *config.ranges)
+    for row, channel in enumerate(channels):
+        name = "reading" if channel.name == config.process.past[0].name else channel.name
+        if name in names:
+            by_state[row, names.index(name)] = 1.0 / shown[row]
     return by_state

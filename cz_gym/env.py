@@ -14,7 +14,7 @@ import numpy.typing as npt
 from gymnasium.error import InvalidAction, ResetNeeded
 from gymnasium.spaces import Box
 
-from cz_gym.body.signals import INFO, LEAN
+from cz_gym.body.process import BODY
 from cz_gym.camera.view import IMAGE, Camera
 from cz_gym.engine.batch import Batch, SlotState, new_key
 from cz_gym.engine.layout import Out, check_info
@@ -24,19 +24,18 @@ from cz_gym.errors import CzError
 from cz_gym.machine.puller import PullerFile
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import Parameters
+from cz_gym.process import Process
 from cz_gym.rendering.canvas import Frame
 from cz_gym.rendering.view import FPS, declared_modes, make_view
 from cz_gym.support.names import known_keywords, unknown
 
 from .action import MarkedAction, check_marked
 from .config import Config, check_config, make_config
-from .observation import CAMERA, CLIP, OBSERVATIONS
+from .observation import CAMERA, CLIP, observations
 
 Observation = npt.NDArray[Any]
 Action = npt.NDArray[np.float32]
 _OPTIONS = ("scenario", "state")
-_LEAN_ROWS = tuple((name, INFO.index(name)) for name in LEAN)
-_CLIPPED = INFO.index("action_clipped")
 
 
 @dataclass(frozen=True)
@@ -52,11 +51,11 @@ def action_space() -> Any:
     return Box(-1.0, 1.0, (2,), np.float32)
 
 
-def observation_space(observation: str) -> Any:
+def observation_space(observation: str, process: Process = BODY) -> Any:
     """The observation's channels, scaled and clipped to +-10, or the camera's grey values."""
     if observation == CAMERA:
         return Box(0, 255, IMAGE, np.uint8)
-    return Box(-CLIP, CLIP, (len(OBSERVATIONS[observation]),), np.float32)
+    return Box(-CLIP, CLIP, (len(observations(process)[observation]),), np.float32)
 
 
 def check_options(options: dict[str, Any] | None, allowed: tuple[str, ...] = _OPTIONS) -> dict[str, Any]:
@@ -151,8 +150,8 @@ class CzEnv(Form, gym.Env[Observation, Action]):
     :class:`cz_gym.body.signals.Logged`; with observation "history" also the true ``state``, for critics),
     ``render_mode``, ``parameters`` (:class:`cz_gym.Parameters`), ``meniscus`` (:class:`cz_gym.MeniscusModel`),
     ``camera`` (:class:`cz_gym.camera.Camera`, with observation "camera" only), ``puller`` (a file, or the name of a
-    shipped one; see docs/extend/puller.md: parameters and control interval are then its own). Bad values raise
-    ValueError.
+    shipped one; see docs/extend/puller.md: parameters and control interval are then its own), ``process`` (what is
+    simulated, :class:`cz_gym.process.Process`). Bad values raise ValueError.
     ``render_mode`` is None, "rgb_array" or "human", ``render_size`` the picture's width and height [px]; rendering
     needs the extra ``render``, without which no mode is declared and asking for one raises
     :class:`gymnasium.error.DependencyNotInstalled`.
@@ -176,11 +175,22 @@ class CzEnv(Form, gym.Env[Observation, Action]):
         action: str = "smooth",
         info: str = "lean",
         puller: str | Path | PullerFile | None = None,
+        process: Process = BODY,
         **others: Any,
     ) -> None:
         known_keywords(others, type(self).__init__)
         config = make_config(
-            scenario, model, observation, control_interval, horizon, parameters, meniscus, camera, action, puller
+            scenario,
+            model,
+            observation,
+            control_interval,
+            horizon,
+            parameters,
+            meniscus,
+            camera,
+            action,
+            puller,
+            process,
         )
         self._setup(config, render_mode, render_size, info)
 
@@ -194,8 +204,9 @@ class CzEnv(Form, gym.Env[Observation, Action]):
         self._everything, self._settings = check_info(info), (config, render_mode, render_size, info)
         self.config, self._made_for = config, config.made_for
         self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_modes": declared_modes(config.process)}
         self.action_space = action_space()
-        self.observation_space = observation_space(config.observation)
+        self.observation_space = observation_space(config.observation, config.process)
         self._batch = Batch(self.config, 1, everything=self._everything or render_mode is not None)
         self._slots = self._batch.memory.slots
         self._out = self._batch.new_out()
@@ -204,6 +215,9 @@ class CzEnv(Form, gym.Env[Observation, Action]):
         self._signals, self._valid = self._out.info[:, 0], self._slots["valid"]
         self._step = self._batch.bound_step(self._action, self._out)
         self._over, self._begun, self._named = True, False, isinstance(config.scenario, Mixture)
+        names = config.process.info
+        self._names, self._clipped = names, names.index("action_clipped")
+        self._lean = tuple((name, names.index(name)) for name in config.process.Lean._fields)
         self._view = make_view(render_mode, render_size, self.config)
 
     def reset(
@@ -285,13 +299,13 @@ class CzEnv(Form, gym.Env[Observation, Action]):
 
     def _info(self) -> dict[str, Any]:
         if self._everything:
-            info = Info(zip(INFO, self._signals.tolist(), strict=True))
+            info = Info(zip(self._names, self._signals.tolist(), strict=True))
             info["action_clipped"] = info["action_clipped"] > 0.0
         else:
             info = Info()
-            for name, row in _LEAN_ROWS:
+            for name, row in self._lean:
                 info[name] = self._signals.item(row)
-            if self._signals.item(_CLIPPED) > 0.0:
+            if self._signals.item(self._clipped) > 0.0:
                 info["action_clipped"] = True
         if self._named:
             info["scenario"] = self._batch.scenarios[0]

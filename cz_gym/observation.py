@@ -1,88 +1,80 @@
-"""Observations: scaled and clipped signals, and their decoding.
+"""Observations of ``Cz-v0``: scaled and clipped signals, and their decoding.
 
 An observed value is ``quantity / scale`` clipped to +-10, float32; :mod:`cz_gym.body.signals` has quantities and
 scales. "history" adds the past as differences of the means of neighbouring time spans. These differ by micrometres,
 readings by millimetres, so the differences have scales of their own.
 """
 
-from __future__ import annotations
-
-from typing import NamedTuple
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.body.signals import HEATER_SCALE as HEATER_SCALE
-from cz_gym.body.signals import MEASURED as MEASURED
+from cz_gym.body.process import BODY
 from cz_gym.body.signals import PREVIEWS as PREVIEWS
-from cz_gym.body.signals import PULL_SCALE as PULL_SCALE
-from cz_gym.body.signals import STATE as STATE
-from cz_gym.body.signals import Channel as Channel
+from cz_gym.body.signals import RELATIVE
 from cz_gym.body.signals import Measured as Measured
-from cz_gym.body.signals import scales as scales
-from cz_gym.body.signals import signals
 from cz_gym.errors import CzError
-from cz_gym.support.units import KILO, MM
+from cz_gym.process import HEATER_SCALE as HEATER_SCALE
+from cz_gym.process import PULL_SCALE as PULL_SCALE
+from cz_gym.process import Channel as Channel
+from cz_gym.process import Process
+from cz_gym.process import scales as scales
 
 CLIP = 10.0
 """Largest observed value after scaling [-]."""
 INTEGRAL_SCALE = 1.0
 """Scale of the error's integral, one metre second: 1 mm held for 1000 s [m s]."""
-DRIVE_CHANNELS = tuple(Measured._fields.index(name) for name in ("v_p", "Q_H"))
-"""Where "measured" and "history" hold the applied drives, in units of the action."""
-PAST_SCALES = {"ring_error": 0.2 * MM, "v_p": 0.2 * PULL_SCALE, "T_1": 0.5, "Q_H": 0.5 * KILO}
-"""Scales of the differences of past means in "history", of each signal whose past it shows [unit of the signal]."""
-LAGGED = tuple(PAST_SCALES)
-"""Signals whose past "history" shows."""
 LAGS = (5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0, 240.0, 360.0, 480.0, 720.0, 960.0, 1200.0)
 """Ages [s] at which the time spans of "history" end; each span starts at the age before."""
 
 
-class Relative(NamedTuple):
-    """How "history" shows a signal relative to another one."""
-
-    to: str
-    """Name of the other signal."""
-    scale: float
-    """Scale of the difference [unit of the signal]."""
-    meaning: str
-    """Description for tables."""
+@cache
+def observations(process: Process) -> dict[str, tuple[Channel, ...]]:
+    """Channels of every observation but the camera's."""
+    return {"measured": process.measured, "history": _history(process), "state": process.state}
 
 
-RELATIVE = {
-    "r_ref_1min": Relative("r_ref", 0.1 * MM, "change of the radius reference within 1 minute"),
-    "r_ref_5min": Relative("r_ref", 0.5 * MM, "change of the radius reference within 5 minutes"),
-    "T_1_ref_1min": Relative("T_1_ref", 0.2, "change of the recipe within 1 minute"),
-    "T_1_ref_5min": Relative("T_1_ref", 1.0, "change of the recipe within 5 minutes"),
-    "T_1": Relative("T_1_ref", 2.0, "pyrometer reading minus recipe"),
-}
-"""The signals that "history" shows relative to another one."""
-
-
-def _history() -> tuple[Channel, ...]:
+def _history(process: Process) -> tuple[Channel, ...]:
+    """The measured channels, relative ones as such, the integral of the error, and differences of past means."""
+    relative = {each.name: each for each in process.relative}
     present = [
-        c._replace(scale=RELATIVE[c.name].scale, meaning=RELATIVE[c.name].meaning) if c.name in RELATIVE else c
-        for c in MEASURED
+        c._replace(scale=relative[c.name].scale, meaning=relative[c.name].meaning) if c.name in relative else c
+        for c in process.measured
     ]
-    integral = Channel("m s", INTEGRAL_SCALE, "integral of ring_error since the start, held within +-10", "integral")
+    error, units = process.past[0].name, {channel.name: channel.unit for channel in process.measured}
+    meaning = f"integral of {error} since the start, held within +-10"
     later = ("the value now", *(f"that over the span up to {age:g} s" for age in LAGS))
     past = [
         Channel(
-            signals(Measured)[name].unit,
-            PAST_SCALES[name],
+            units[name],
+            scale,
             f"{name}: mean over the span up to {age:g} s ago, minus {subtracted}",
             f"{name}_{age:g}s",
         )
         for age, subtracted in zip(LAGS, later, strict=False)
-        for name in LAGGED
+        for name, scale in process.past
     ]
-    return (*present, integral, *past)
+    return (*present, Channel("m s", INTEGRAL_SCALE, meaning, "integral"), *past)
 
 
-HISTORY = _history()
-"""Channels of ``observation="history"``."""
-OBSERVATIONS: dict[str, tuple[Channel, ...]] = {"measured": MEASURED, "history": HISTORY, "state": STATE}
+def lags(control_interval: float) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Ages, in samples, of the newest and the oldest sample of each span, at that control interval [s].
+
+    Each span holds at least one sample.
+    """
+    oldest = np.maximum(np.rint(np.array(LAGS) / control_interval).astype(np.int64), 1)
+    before = np.concatenate([[0], oldest[:-1]])
+    return np.minimum(before + 1, oldest), oldest
+
+
+DRIVE_CHANNELS = tuple(Measured._fields.index(name) for name in ("v_p", "Q_H"))
+"""Where "measured" and "history" hold the applied drives, in units of the action."""
+LAGGED = tuple(each.name for each in BODY.past)
+"""Signals whose past "history" shows."""
+OBSERVATIONS = observations(BODY)
 """Channels of every observation but the camera's."""
+MEASURED, HISTORY, STATE = (OBSERVATIONS[name] for name in ("measured", "history", "state"))
 CAMERA = "camera"
 """The observation that is an image instead of channels (:mod:`cz_gym.camera`)."""
 
@@ -104,9 +96,7 @@ def decode(observation: npt.ArrayLike, v_0: float = PULL_SCALE, heater_range: fl
     values = Measured(*np.moveaxis(array[..., : len(MEASURED)] * scales(present, v_0, heater_range), -1, 0))
     if array.shape[-1] == len(MEASURED):
         return values
-    return values._replace(
-        **{name: getattr(values, name) + getattr(values, relative.to) for name, relative in RELATIVE.items()}
-    )
+    return values._replace(**{each.name: getattr(values, each.name) + getattr(values, each.to) for each in RELATIVE})
 
 
 def readable(seen: Measured, last: Measured) -> Measured:
@@ -124,13 +114,3 @@ def to_measured(
     """Convert "history" observations, shape (..., channels), to "measured" ones, exact to the rounding of float32."""
     measured = np.stack(decode(history, v_0, heater_range), axis=-1) / scales(MEASURED, v_0, heater_range)
     return np.clip(measured, -CLIP, CLIP).astype(np.float32)
-
-
-def lags(control_interval: float) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Ages, in samples, of the newest and the oldest sample of each span, at that control interval [s].
-
-    Each span holds at least one sample.
-    """
-    oldest = np.maximum(np.rint(np.array(LAGS) / control_interval).astype(np.int64), 1)
-    before = np.concatenate([[0], oldest[:-1]])
-    return np.minimum(before + 1, oldest), oldest

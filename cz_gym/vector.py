@@ -13,7 +13,6 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from cz_gym.body.signals import INFO, LEAN
 from cz_gym.engine.batch import Batch, new_key
 from cz_gym.engine.layout import Out, check_info
 from cz_gym.episodes.mixture import AnyScenario, Mixture
@@ -25,10 +24,6 @@ from .action import MarkedAction, check_marked
 from .config import Config, make_config, positive_whole
 from .env import CzEnv, EnvState, Form, action_space, check_options, check_state, observation_space
 
-_CLIPPED = INFO.index("action_clipped")
-_LEAN_ROWS = tuple(map(INFO.index, LEAN))
-_KEYS = {everything: (n, tuple(f"_{name}" for name in n)) for everything, n in ((False, LEAN), (True, INFO))}
-"""Names of the entries of ``info`` and of their masks, for ``info="lean"`` (False) and ``"all"`` (True)."""
 Array = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
 
@@ -79,9 +74,13 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.single_action_space = action_space()
-        self.single_observation_space = observation_space(config.observation)
+        self.single_observation_space = observation_space(config.observation, config.process)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
+        rows, lean = config.process.info, config.process.Lean._fields
+        self._clipped, self._names = rows.index("action_clipped"), rows if self._everything else lean
+        self._rows = tuple(map(rows.index, self._names))
+        self._masks = tuple(f"_{name}" for name in self._names)
         self._batch = Batch(self.config, num_envs, threads, self._everything)
         self._out = self._batch.new_out()
         self._everybody: Mask = np.ones(num_envs, np.bool_)
@@ -270,11 +269,10 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
         whole = mask is None or bool(mask.all())
         mask = self._everybody.copy() if mask is None else mask
         rows: Any = out.info[:, : self.num_envs]
-        clipped = (rows[_CLIPPED] > 0.0) & mask
-        names, masks = _KEYS[self._everything]
-        shown = rows if self._everything else [rows[row] for row in _LEAN_ROWS]
-        infos: dict[str, Any] = dict.fromkeys(masks, mask)
-        infos.update(zip(names, shown if whole else np.where(mask, shown, 0.0), strict=True))
+        clipped = (rows[self._clipped] > 0.0) & mask
+        shown = [rows[row] for row in self._rows]
+        infos: dict[str, Any] = dict.fromkeys(self._masks, mask)
+        infos.update(zip(self._names, shown if whole else np.where(mask, shown, 0.0), strict=True))
         if self._everything or clipped.any():
             infos["action_clipped"], infos["_action_clipped"] = clipped, mask if self._everything else clipped.copy()
         if self._named:

@@ -19,11 +19,11 @@ from typing import NamedTuple
 import numpy as np
 
 from cz_gym import CzEnv, Parameters, make_puller
+from cz_gym.action import HEATER_RANGE
 from cz_gym.baselines.lqg.controller import LQG
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.tuning.lqg import FILTER, LQGS
 from cz_gym.baselines.tuning.pid import PIDS
-from cz_gym.body.task import HEATER_RANGE
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Pullers
 from cz_gym.episodes.scenarios import RANDOMIZED

@@ -48,7 +48,7 @@ class Contract:
     observation_hash: str
     """Hash of that observation's channels: their names, units and scales, in order."""
     action: str
-    """Meaning of its actions: "direct", "smooth" or "rate" (:func:`cz_gym.body.task.drives_of`)."""
+    """Meaning of its actions: "direct", "smooth" or "rate" (:func:`cz_gym.action.drives_of`)."""
     control_interval: float
     """Time between its actions [s]."""
     plant_hash: str

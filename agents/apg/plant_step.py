@@ -6,8 +6,8 @@ from typing import Any
 
 import torch
 
+from cz_gym.action import drives_of
 from cz_gym.body.cost import cost_terms, saturated
-from cz_gym.body.task import drives_of
 from cz_gym.config import Config
 from cz_gym.differentiable import STATES, DifferentiableBatch
 

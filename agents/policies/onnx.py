@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.action import MadeFor, mark
+from cz_gym.action import ACTIONS, MadeFor, mark
 from cz_gym.agents.agent_file.contract import AgentFileError, Contract, observation_hash, read_agent
 from cz_gym.agents.agent_file.graph import GraphError, checked
-from cz_gym.body.task import ACTIONS
 from cz_gym.config import Config, check_config
 from cz_gym.errors import CzError
 from cz_gym.observation import OBSERVATIONS

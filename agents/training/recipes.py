@@ -26,7 +26,7 @@ class Recipe:
     """Initial learning rate, decayed linearly."""
     observation: str = "history"
     action: str = "smooth"
-    """Meaning of the network's two outputs (:func:`cz_gym.body.task.drives_of`)."""
+    """Meaning of the network's two outputs (:func:`cz_gym.action.drives_of`)."""
     scenario: str = "all"
     """Scenario or mixture of the training and validation crystals (:func:`cz_gym.evaluation.user_code.scenarios`)."""
     control_interval: float = 5.0

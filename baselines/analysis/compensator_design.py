@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.baselines.pid.compensated_pid import Compensator, SeriesPID
+from cz_gym.body.linearisation import RadiusModel
 from cz_gym.errors import CzError
-from cz_gym.physics.linearisation import RadiusModel
 
 CUT_OFF = Compensator().slow
 """The paper's high-pass cut-off [rad/s]."""

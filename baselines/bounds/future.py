@@ -10,12 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.baselines.policy import Floats, stack
-from cz_gym.body.plant import Disturbance, Inputs, Puller, State, make_puller, rk4
-from cz_gym.body.schedule import bias_offset, disturbance, reference
+from cz_gym.body.plant import Disturbance, Inputs, Puller, State, disturbance, make_puller, rk4
 from cz_gym.config import Config
 from cz_gym.engine.batch import Key, first_key
 from cz_gym.episodes.draw import randomised
 from cz_gym.episodes.record import GRID
+from cz_gym.episodes.schedule import bias_offset, reference
 from cz_gym.episodes.series import draw_episode, draw_factors, new_series
 from cz_gym.physics.meniscus import MeniscusModel
 

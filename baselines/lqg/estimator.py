@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from cz_gym.baselines.policy import Floats, select
 from cz_gym.body.plant import Disturbance, Inputs, State, hidden_load, rk4
-from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT
+from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN, radius_limit
 from cz_gym.observation import Measured
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.support.units import KILO, MINUTE
@@ -24,8 +24,8 @@ from .model import DRIFT, FAST, HEATER, PLANT, SLOW, STATES, NoiseModel, PlantMo
 from .ring_model import RIPPLE, RIPPLE_STATES, RingModel, RippleSearch
 
 _RADIUS, _HEIGHT, _PYROMETER = (STATES.index(name) for name in ("r_c", "h_c", "T_1"))
-_LARGEST = np.array([RADIUS_LIMIT, 1.0, 50.0, 50.0, 50.0, 5.0, 5.0, 30.0, 1.0 / MINUTE, 5.0 * KILO])
-"""Limits of the estimates, SI units; beyond them the equations are meaningless. The height has its own limits."""
+_LARGEST = np.array([np.inf, 1.0, 50.0, 50.0, 50.0, 5.0, 5.0, 30.0, 1.0 / MINUTE, 5.0 * KILO])
+"""Limits of the estimates, SI units; beyond them the equations are meaningless. Radius and height have the puller's."""
 _INSIDE = 0.9
 """Limit of the estimated height, as a share of the way to freezing or detachment [-]."""
 _STEP = 1e-30
@@ -181,6 +181,7 @@ class PlantFilter(NamedTuple):
         clipped[:, : len(STATES)] = np.clip(mean[:, : len(STATES)], -_LARGEST, _LARGEST)
         lowest, highest = _INSIDE * (HEIGHT_MIN - p.h_0), _INSIDE * (HEIGHT_MAX_IN_A * p.a - p.h_0)
         clipped[:, _HEIGHT] = np.clip(mean[:, _HEIGHT], lowest, highest)
+        clipped[:, _RADIUS] = np.clip(mean[:, _RADIUS], -radius_limit(p.r_0), radius_limit(p.r_0))
         return clipped
 
 

@@ -16,8 +16,8 @@ from scipy.linalg import expm
 from scipy.signal import cont2discrete
 
 from cz_gym.baselines.policy import Floats, check_numbers
+from cz_gym.body.linearisation import INPUTS, OUTPUTS, linearise
 from cz_gym.body.plant import Puller, hidden_load
-from cz_gym.physics.linearisation import INPUTS, OUTPUTS, linearise
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.support.units import MINUTE, MM
 

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from cz_gym.baselines.policy import Floats, MeasuredController, check_numbers
+from cz_gym.body.linearisation import radius_model
 from cz_gym.body.plant import make_puller
 from cz_gym.observation import PREVIEWS, Measured
-from cz_gym.physics.linearisation import radius_model
 
 from .compensated_pid import Compensator, PIDState, SeriesPID, compensated_error
 from .temperature_loop import Heat, TemperatureLoop

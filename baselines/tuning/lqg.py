@@ -7,10 +7,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from cz_gym.action import HEATER_SLACK
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign
 from cz_gym.baselines.lqg.multiple_model import Hypotheses
 from cz_gym.baselines.lqg.ring_model import RingModel
-from cz_gym.body.task import HEATER_SLACK
 from cz_gym.config import Config
 from cz_gym.episodes.scenario import Scenario, Sensor
 from cz_gym.episodes.scenarios import RANDOMIZED

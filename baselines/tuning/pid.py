@@ -11,12 +11,12 @@ from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.pid.compensated_pid import SeriesPID
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.industrial import Industrial
+from cz_gym.body.linearisation import radius_model
 from cz_gym.body.plant import Puller, make_puller
 from cz_gym.config import Config
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.machine.puller import DEFAULT
-from cz_gym.physics.linearisation import radius_model
 from cz_gym.support.units import HOUR, MINUTE, MM
 
 from .record import Figures, Goal, Limit, Parameter, Tuned

@@ -9,10 +9,10 @@ from typing import Any
 
 from cz_gym.baselines.analysis.compensator_design import CUT_OFF, design_compensator
 from cz_gym.baselines.pid.industrial import Industrial
+from cz_gym.body.linearisation import RadiusModel, radius_model
 from cz_gym.body.plant import Puller, make_puller
 from cz_gym.config import Config
 from cz_gym.machine.puller import DEFAULT
-from cz_gym.physics.linearisation import RadiusModel, radius_model
 from cz_gym.support.units import MM
 
 from .values import with_values

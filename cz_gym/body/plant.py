@@ -13,10 +13,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cz_gym.episodes.schedule import drift, melt_left
 from cz_gym.errors import CzError
 from cz_gym.jit.compile import force_inlined, jittable
 from cz_gym.physics.meniscus import HURLE, MeniscusModel, ring_point
 from cz_gym.physics.parameters import Parameters, check_parameters
+from cz_gym.process import NO_OPERATING_POINT
+from cz_gym.process import Inputs as Inputs
 
 
 class State(NamedTuple):
@@ -32,15 +35,6 @@ class State(NamedTuple):
     """Susceptor and crucible temperature [K]."""
     T_b: Any
     """Melt bulk temperature [K]."""
-
-
-class Inputs(NamedTuple):
-    """Inputs u, held over a step."""
-
-    v_p: Any
-    """Pull speed relative to the melt surface [m/s]."""
-    Q_H: Any
-    """Heater power [W]."""
 
 
 class Disturbance(NamedTuple):
@@ -133,7 +127,6 @@ class Puller(NamedTuple):
 
 
 NO_DISTURBANCE = Disturbance(0.0, 0.0, 1.0)
-NO_OPERATING_POINT = "these parameters have no finite operating point; check temperatures and conductances"
 
 
 class _RingPuller(NamedTuple):
@@ -259,6 +252,11 @@ def hidden_load(p_drift: Any, p: Any) -> Any:
         excess = p.kappa_12 * cube * T_2 + p.G_2b * T_2 - hot
         T_2 = T_2 - excess / (4.0 * p.kappa_12 * cube + p.G_2b)
     return -p.G_2b * (T_2 - p.T_2_0)
+
+
+def disturbance(t: Any, dT_i: Any, e: Any, p: Any) -> Disturbance:
+    """Disturbance at a point t [s] of the 5 s grid, with the interface fluctuation [K] drawn there."""
+    return Disturbance(hidden_load(drift(t, e), p), dT_i, melt_left(t, e))
 
 
 EQUATIONS = (derive_puller, rates, rk4, hidden_load)

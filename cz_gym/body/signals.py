@@ -5,41 +5,21 @@ A signal is a field of :class:`Measured` (readings and recipe), :class:`TrueStat
 computes its fields by name, in SI units. Channels, decoding, ``info`` and the pages' tables all follow from here.
 """
 
-from __future__ import annotations
-
-from functools import cache
-from typing import Annotated, Any, NamedTuple, get_type_hints
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from cz_gym.body.schedule import bias_offset, recipe, reference
+from cz_gym.episodes.schedule import bias_offset, recipe, reference
 from cz_gym.jit.compile import jittable
-from cz_gym.physics.parameters import Parameters
+from cz_gym.process import HEATER_SCALE, PULL_SCALE, Past, Relative, signals
+from cz_gym.process import Channel as Channel
 from cz_gym.support.units import KILO, MINUTE, MM
 
 PREVIEWS = (0.0, 1.0 * MINUTE, 5.0 * MINUTE)
 """Times ahead for which reference and recipe are observed [s]."""
 _IN_1_MIN, _IN_5_MIN = PREVIEWS[1:]
-PULL_SCALE = Parameters().v_0
-"""Scale of pull speeds for the default puller, its v_0 [m/s]; another puller's are scaled with its own v_0."""
-HEATER_SCALE = 10.0 * KILO
-"""Scale of heater powers for the default puller, its heater's range [W]; another puller's are scaled with its own."""
 TEMPERATURE_SCALE = 5.0
 """Scale of temperatures [K]."""
-
-
-class Channel(NamedTuple):
-    """One number of an observation or of ``info``."""
-
-    unit: str
-    """SI unit; "1" for none."""
-    scale: float
-    """Observations hold the number divided by this [unit]."""
-    meaning: str
-    """Description for tables."""
-    name: str = ""
-    """The field that it annotates."""
 
 
 class Measured(NamedTuple):
@@ -81,13 +61,6 @@ def measure(slot: Any, t: Any) -> Any:
         v_p=slot.v_p - p.v_0,
         Q_H=slot.Q_H - p.Q_H_0,
     )
-
-
-@cache
-def signals(kind: Any) -> dict[str, Channel]:
-    """The channels of :class:`Measured`, :class:`TrueState` or :class:`Logged` by name, in their order."""
-    hints = get_type_hints(kind, include_extras=True)
-    return {name: hints[name].__metadata__[0]._replace(name=name) for name in kind._fields}
 
 
 _SHARED = signals(Measured)
@@ -189,24 +162,31 @@ def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, at_interface:
     )
 
 
+class Lean(NamedTuple):
+    """The entries of ``info="lean"``; libraries copy info key by key, which costs more than the step."""
+
+    r_c: Any
+    r_ref: Any
+
+
+PAST = (
+    Past("ring_error", 0.2 * MM),
+    Past("v_p", 0.2 * PULL_SCALE),
+    Past("T_1", 0.5),
+    Past("Q_H", 0.5 * KILO),
+)
+"""Signals whose past "history" shows."""
+RELATIVE = (
+    Relative("r_ref_1min", "r_ref", 0.1 * MM, "change of the radius reference within 1 minute"),
+    Relative("r_ref_5min", "r_ref", 0.5 * MM, "change of the radius reference within 5 minutes"),
+    Relative("T_1_ref_1min", "T_1_ref", 0.2, "change of the recipe within 1 minute"),
+    Relative("T_1_ref_5min", "T_1_ref", 1.0, "change of the recipe within 5 minutes"),
+    Relative("T_1", "T_1_ref", 2.0, "pyrometer reading minus recipe"),
+)
+"""The signals that "history" shows relative to another one."""
 MEASURED = tuple(signals(Measured).values())
 """Channels of ``observation="measured"``."""
 STATE = tuple(signals(TrueState).values())
 """Channels of ``observation="state"``."""
 INFO_ROWS = tuple(signals(Logged).values())
 """Channels of ``info``."""
-INFO = Logged._fields
-"""Names of the entries of ``info``."""
-LEAN = ("r_c", "r_ref")
-"""Entries of ``info="lean"``; libraries copy info key by key, which costs more than the step."""
-
-
-def scales(listed: tuple[Channel, ...], v_0: float, heater_range: float = HEATER_SCALE) -> npt.NDArray[np.float64]:
-    """Scales of the channels for a puller of nominal pull speed v_0 [m/s] and heater range [W], shape (channels,)."""
-    own = {"m/s": (v_0, PULL_SCALE), "W": (heater_range, HEATER_SCALE)}
-
-    def scale(channel: Channel) -> float:
-        size, default = own.get(channel.unit, (1.0, 1.0))
-        return size * (channel.scale / default)
-
-    return np.array([scale(channel) for channel in listed])

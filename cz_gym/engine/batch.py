@@ -18,9 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.utils import seeding
 
-from cz_gym.body.plant import NO_OPERATING_POINT
-from cz_gym.body.signals import INFO, MEASURED, STATE, scales
-from cz_gym.body.task import drives_of
+from cz_gym.action import drives_of
 from cz_gym.camera.image import build_look
 from cz_gym.camera.view import IMAGE, make_view
 from cz_gym.config import Config, Identity
@@ -29,19 +27,19 @@ from cz_gym.episodes.record import GRID, ScenarioTable, scenario_table
 from cz_gym.errors import CzError
 from cz_gym.jit.compile import entry
 from cz_gym.machine.adapt import adapt_scenario
-from cz_gym.observation import HISTORY, LAGGED, lags
-from cz_gym.physics.parameters import Parameters
-from cz_gym.physics.quantities import MAX_LATENCY
+from cz_gym.observation import lags, observations
+from cz_gym.physics.quantities import MAX_DEAD_TIME, MAX_LATENCY
+from cz_gym.process import NO_OPERATING_POINT, scales
 
 from .buffers import BufferPool
 from .kernels import build_kernels
-from .layout import SLOT, Clock, Memory, ObservationScales, Out, info_width
+from .layout import Clock, Memory, ObservationScales, Out, info_width, slot_type
 
 SLOTS_PER_THREAD, SLOTS_AT_ONCE = 256, 128
 """Least slots per thread in a step, and slots that a thread takes at once."""
 DRAWS_PER_THREAD, DRAWS_AT_ONCE = 16, 16
 """Least draws per thread in a reset, and draws that a thread takes at once."""
-_SAVED = ("slot", "history", "frames")
+_SAVED = ("slot", "history", "frames", "powers")
 Key = tuple[int, int]
 """The 128 random bits from which an episode is drawn, as two 64-bit words."""
 
@@ -65,6 +63,7 @@ class SlotState:
     slot: npt.NDArray[Any]
     history: npt.NDArray[np.float64]
     frames: npt.NDArray[np.float64]
+    powers: npt.NDArray[np.float64]
     scenario: str
     """Name of the scenario that the episode was drawn from."""
 
@@ -79,38 +78,40 @@ class Batch:
         self.config = config
         self.identity = config.identity
         self.num_envs = num_envs
-        self.kernels = build_kernels(config.meniscus)
+        process = config.process
+        self.kernels = build_kernels(process, config.meniscus)
         points = math.ceil(config.horizon / GRID) + 1
         self.clock = Clock(config.control_interval, config.steps, points, config.radius_limit)
-        self.drives = drives_of(config.action, config.control_interval, config.heater_range)
-        self.channels = len(HISTORY) if config.observation == "history" else len(MEASURED)
+        self.drives = drives_of(config.action, config.control_interval, *config.ranges[::-1])
+        self.channels = len(observations(process)["history" if config.observation == "history" else "measured"])
         shows_state = config.observation == "state" or (everything and config.observation == "history")
-        self.state_channels = len(STATE) if shows_state else 0
+        self.state_channels = len(process.state) if shows_state else 0
         self._camera = config.observation == "camera"
         newest, oldest = lags(config.control_interval)
-        measured, state = (1.0 / scales(channels, *config.ranges) for channels in (MEASURED, STATE))
+        measured, state = (1.0 / scales(channels, *config.ranges) for channels in (process.measured, process.state))
         share = 1.0 / (oldest - newest + 1)
         self.scales = ObservationScales(measured, state, newest, oldest + 1, share, everything)
         depth = int(oldest[-1]) + 2 if config.observation == "history" else 0
         interval = config.control_interval
         frames = math.ceil(MAX_LATENCY / interval) + math.ceil((MAX_LATENCY + interval) / GRID) + 2
-        slots = np.zeros(num_envs, SLOT)
+        slots = np.zeros(num_envs, slot_type(process))
         self.memory = Memory(
             slots,
             slots.view(np.float64).reshape(num_envs, -1),
-            np.zeros((num_envs, depth, len(LAGGED))),
+            np.zeros((num_envs, depth, process.lagged)),
             np.zeros((num_envs, frames, 3)),
+            np.zeros((num_envs, math.ceil(MAX_DEAD_TIME / interval) + 2)),
         )
         self.memory.slots["over"] = 1
         self._lots = scenario_table(config.scenario, config.model)
         self.scenarios, self._drawn = np.full(num_envs, "", object), slots["scenario"]
-        self._parameters = Parameters(*map(float, config.parameters))
+        self._parameters = type(config.parameters)(*map(float, config.parameters))
         self.actions = np.zeros((num_envs, 2))
         self._all = np.ones(num_envs, np.bool_)
         self._observations = BufferPool((num_envs, self.channels), np.float32)
         self._states = BufferPool((num_envs, self.state_channels), np.float32)
         self._images = BufferPool((num_envs, *IMAGE) if self._camera else (num_envs, 0, 0, 0), np.uint8)
-        self._infos = BufferPool((len(INFO), info_width(num_envs)), np.float64)
+        self._infos = BufferPool((len(process.info), info_width(num_envs)), np.float64)
         out, which, keys = self.new_out(), np.zeros(1, np.int64), np.zeros((1, 2), np.uint64)
         stepped = (self.memory, self.actions, self._all, self.clock, self.drives, self.scales, out, 0, 1)
         drawn = self._drawing(which, keys, self._lots, out)
@@ -233,8 +234,8 @@ class Batch:
     def save(self, i: int) -> SlotState:
         """A copy of the state of slot i."""
         # array[i] of a structured array is a view that np.copy does not copy; array[i, ...] is an array.
-        slot, history, frames = (rows[i, ...].copy() for rows in self._saved())
-        return SlotState(self.identity, slot, history, frames, self.scenarios[i])
+        slot, history, frames, powers = (rows[i, ...].copy() for rows in self._saved())
+        return SlotState(self.identity, slot, history, frames, powers, self.scenarios[i])
 
     def check(self, state: SlotState) -> None:
         """Raise ValueError if this is no saved state, or one saved under other settings."""
@@ -263,7 +264,7 @@ class Batch:
 
     def _saved(self) -> tuple[npt.NDArray[Any], ...]:
         memory = self.memory
-        return memory.slots, memory.history, memory.frames
+        return memory.slots, memory.history, memory.frames, memory.powers
 
     def close(self) -> None:
         """Stop the threads."""

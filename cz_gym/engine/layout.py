@@ -1,63 +1,123 @@
 """The arrays of the compiled loops: the memory of a slot, the constants of a step and its results."""
 
-from __future__ import annotations
-
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.body.plant import Puller, State
 from cz_gym.episodes.record import FREEZES, Episode, Stream
 from cz_gym.episodes.rng import WORDS
 from cz_gym.errors import CzError
+from cz_gym.jit.compile import static
+from cz_gym.physics.meniscus import MeniscusModel
+from cz_gym.process import Inputs, Process
 
 
-def _record(fields: tuple[str, ...]) -> np.dtype[Any]:
-    return np.dtype([(name, np.float64) for name in fields])
+def _record(kind: Any) -> np.dtype[Any]:
+    return np.dtype([(name, np.float64) for name in kind._fields])
 
 
-SLOT = np.dtype(
-    [
-        ("puller", _record(Puller._fields)),
-        ("episode", _record(Episode._fields)),
-        ("x", _record(State._fields)),
-        ("freezes", np.float64, (FREEZES, 2)),
-        ("v_p", np.float64),
-        ("Q_H", np.float64),
-        ("Q_H_slewed", np.float64),
-        ("dT_i", np.float64),
-        ("Q_d", np.float64),
-        ("ring", np.float64),
-        ("h_seen", np.float64),
-        ("T_1", np.float64),
-        ("valid", np.float64),
-        ("integral", np.float64),
-        ("drift", np.float64),
-        ("k", np.int64),
-        ("frames", np.int64),
-        ("over", np.int64),
-        ("k_seen", np.int64),
-        ("key", np.uint64, (2,)),
-        ("scenario", np.int64),
-        ("v_p_before", np.float64),
-        ("Q_H_before", np.float64),
-        ("clipped", np.float64),
-        ("point", np.int64),
-        ("fast", np.float64),
-        ("slow", np.float64),
-        ("streams", np.uint64, (len(Stream), WORDS)),
-    ],
-    align=True,
-)
-"""One slot: constants of puller and episode, plant state, drives [m/s, W], the disturbance of the last substep,
-the last readings (``ring`` [m] without the operator's bias, with the meniscus height ``h_seen`` [m] and the sample
-``k_seen`` it was taken at, ``T_1`` [K], ``valid``), the integral of the scaled ring error, the drift [K] that ``Q_d``
-belongs to, the sample number ``k``, the number of camera frames taken, whether the episode is over, the ``key`` it
-was drawn from and the index of its ``scenario`` in the mixture, the drives [m/s, W] of the step before and whether the
-action was clipped: a sample can be written again from its slot. Then the 5 s grid point that ``dT_i`` belongs to with
-its two processes [standard deviations], and the episode's random streams, as far as they are drawn from."""
-PULLER_AT, EPISODE_AT, STATE_AT = np.cumsum([0, len(Puller._fields), len(Episode._fields)]).tolist()
-"""Offsets in a slot of the puller's constants, the episode's constants and the plant's state [numbers of 8 bytes]."""
+@cache
+def slot_type(process: Process) -> np.dtype[Any]:
+    """One slot of a process.
+
+    Constants of puller and episode, plant state, drives [m/s, W], the disturbance of the last substep, last readings
+    (``ring`` [m] without the operator's bias, with the meniscus height ``h_seen`` [m] and the sample ``k_seen`` it was
+    taken at, ``T_1`` [K], ``valid``), the integral of the scaled ring error, the drift [K] that ``Q_d`` belongs to, the
+    sample number ``k``, the number of camera frames taken, whether the episode is over, the ``key`` it was drawn from
+    and the index of its ``scenario`` in the mixture, the drives [m/s, W] of the step before and whether the action was
+    clipped: a sample can be written again from its slot. Then the 5 s grid point that ``dT_i`` belongs to with its two
+    processes [standard deviations], the episode's random streams, as far as they are drawn from, the power that heats
+    [W] where the heater is slow, the pyrometer's filter with the true temperature at the last sample [K], and what the
+    process adds: the fields of ``Extra`` and its table.
+    """
+    number, whole, table = np.float64, np.int64, process.table
+    return np.dtype(
+        [
+            ("puller", _record(process.Constants)),
+            ("episode", _record(Episode)),
+            ("x", _record(process.State)),
+            ("freezes", number, (FREEZES, 2)),
+            *((name, number) for name in ("v_p", "Q_H", "Q_H_slewed", "dT_i", "Q_d", "ring", "h_seen", "T_1", "valid")),
+            *((name, number) for name in ("integral", "drift")),
+            *((name, whole) for name in ("k", "frames", "over", "k_seen")),
+            ("key", np.uint64, (2,)),
+            ("scenario", whole),
+            *((name, number) for name in ("v_p_before", "Q_H_before", "clipped")),
+            ("point", whole),
+            ("fast", number),
+            ("slow", number),
+            ("streams", np.uint64, (len(Stream), WORDS)),
+            *((name, number) for name in ("Q_heats", "T_filtered", "T_1_before")),
+            *((name, number) for name in process.Extra._fields),
+            *([("table", number, table)] if table[0] else []),
+        ],
+        align=True,
+    )
+
+
+@static
+class Model(NamedTuple):
+    """What is compiled into the loops: a process on a meniscus, and where its numbers stand (:func:`model_of`)."""
+
+    process: Process
+    meniscus: MeniscusModel
+    stride: int
+    """Length of a slot [numbers of 8 bytes]."""
+    slot_numbers: int
+    """Length of a slot without its table [numbers of 8 bytes]."""
+    info_rows: int
+    """Rows of ``info``."""
+    lean_rows: tuple[int, ...]
+    """Rows of ``info="lean"``, and that of the clipped action."""
+    constants: int
+    """Number of the puller's constants: place of the episode in a slot, row of the state in a lane."""
+    states: int
+    """Number of states: place of the pull speed in the differentiable state."""
+    u_at: int
+    """Row of the inputs in a lane."""
+    power_at: int
+    """Row of the power that heats in a lane."""
+    d_at: int
+    """Row of the disturbance in a lane."""
+    dt_at: int
+    """Row of the substep [s] in a lane; then the time that is reached [s], and whether the slot goes on."""
+    lane_rows: int
+    extra: int
+    """Place in the differentiable state of what the process carries on; number of states and inputs."""
+    extras: int
+    """Number of what the process carries on."""
+    ring: int
+    """Place of the ring in the differentiable state; the reading follows."""
+    smooth: int
+    """Length of the differentiable state: column of the first action, row of the cost's first term."""
+    columns: int
+    """Columns of a Jacobian: differentiable state and actions."""
+    costs: int
+    """Number of terms of the cost."""
+    driven_by: int
+    """Number of what the next inputs depend on: state, inputs, actions."""
+    carried_by: int
+    """Number of what the carried numbers depend on: themselves and the inputs."""
+    charged_by: int
+    """Number of what the cost depends on: state, inputs and those before, what is carried on."""
+
+
+@cache
+def model_of(process: Process, meniscus: MeniscusModel) -> Model:
+    """The model of a process on a meniscus."""
+    u, stride = len(Inputs._fields), slot_type(process).itemsize // 8
+    constants, states, loads, extras, costs = (
+        len(kind._fields)
+        for kind in (process.Constants, process.State, process.Disturbance, process.Extra, process.Cost)
+    )
+    u_at, ring = constants + states, states + u + extras
+    dt_at, lean = u_at + u + loads, (*process.Lean._fields, "action_clipped")
+    return Model(
+        process, meniscus, stride, stride - process.table[0] * process.table[1], len(process.info),
+        tuple(map(process.info.index, lean)), constants, states, u_at, u_at + 1, u_at + u, dt_at, dt_at + 3,
+        states + u, extras, ring, ring + 2, ring + 2 + u, costs, states + 2 * u, extras + u, states + 2 * u + extras,
+    )  # fmt: skip
 
 
 class Clock(NamedTuple):
@@ -77,13 +137,15 @@ class Memory(NamedTuple):
     """The memory of the slots, one row per slot."""
 
     slots: Any
-    """Records of :data:`SLOT`, shape (n,)."""
+    """Records of :func:`slot_type`, shape (n,)."""
     numbers: Any
     """The same memory as plain float64, shape (n, numbers a record)."""
     history: Any
     """Running sums of the remembered channels, circular in time, shape (n, depth, channels); depth 0: none."""
     frames: Any
     """Time [s], ring [m] and meniscus height [m] of camera frames, circular, shape (n, depth, 3)."""
+    powers: Any
+    """Heater power set in each control interval [W], circular, shape (n, depth)."""
 
 
 class Out(NamedTuple):
@@ -103,7 +165,7 @@ class Out(NamedTuple):
     truncated: Any
     """Bool, shape (n,)."""
     info: Any
-    """Rows of :class:`cz_gym.body.signals.Logged`, float64, shape (rows, n or a little more:
+    """Rows of the process' ``Logged``, float64, shape (rows, n or a little more:
     see :func:`info_width`)."""
 
 
@@ -121,7 +183,7 @@ class ObservationScales(NamedTuple):
     share: Any
     """One over the number of samples in each span, shape (lags,)."""
     everything: bool
-    """Whether all of ``info`` is written; otherwise only ``LEAN`` and ``action_clipped``."""
+    """Whether all of ``info`` is written; otherwise only the rows of ``Lean`` and ``action_clipped``."""
 
 
 INFO_CHOICES = ("lean", "all")

@@ -1,13 +1,11 @@
 """Camera and pyrometer of a slot: frames, latency, noise, drop-outs and freezes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 
-from cz_gym.body.schedule import bias_offset, pyrometer_drift, ripple
 from cz_gym.episodes.record import FREEZES
+from cz_gym.episodes.schedule import bias_offset, pyrometer_drift, ripple
 from cz_gym.jit.compile import jittable
 
 _EPS = 1e-9
@@ -46,19 +44,34 @@ def _freezes(slot: Any, t: Any) -> Any:
 
 
 @jittable
-def sense(slot: Any, camera: Any, pyrometer: Any, frames: Any, t: Any, ring: Any, h_c: Any) -> None:
-    """Read pyrometer and camera at t; ``ring`` [m] is what a camera without latency sees, less the operator's bias,
-    on a meniscus of height ``h_c`` [m].
+def _filtered(slot: Any, T_1: Any, t: Any) -> Any:
+    """The true temperature [K] through the pyrometer's filter: exact for one that moves straight between samples."""
+    tau = slot.episode.pyrometer_filter
+    if tau <= 0.0:
+        return T_1
+    if slot.k == 0:
+        slot.T_filtered = T_1
+    else:
+        interval = t / slot.k
+        lead = (T_1 - slot.T_1_before) * (tau / interval)
+        slot.T_filtered = T_1 - lead + (slot.T_filtered - slot.T_1_before + lead) * np.exp(-interval / tau)
+    slot.T_1_before = T_1
+    return slot.T_filtered
+
+
+@jittable
+def sense(slot: Any, camera: Any, pyrometer: Any, frames: Any, t: Any, seen: Any) -> None:
+    """Read pyrometer and camera at t; ``seen`` is what sensors without latency see (:class:`cz_gym.process.Seen`).
 
     ``camera`` [m] (NaN: the sample drops out) and ``pyrometer`` [K] are the sample's noise. A frozen or dropped sample
     shows the last reading again.
     """
     e = slot.episode
-    slot.T_1 = slot.x.T_1 + pyrometer_drift(t, e) + pyrometer
+    slot.T_1 = _filtered(slot, seen.T_1, t) + pyrometer_drift(t, e) + pyrometer
     lost = np.isnan(camera)
     frozen, flagged = _freezes(slot, t)
     slot.valid = 0.0 if lost or flagged else 1.0
-    taken = t
+    taken, ring, h_c = t, seen.reading, seen.h_c
     if e.latency > 0.0:
         photograph(slot, frames, t, ring, h_c)
         at = _delivered(slot, frames, t)

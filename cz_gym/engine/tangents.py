@@ -1,134 +1,192 @@
 """Derivatives of a step, by complex steps through its own functions and the chain rule.
 
-The differentiable state of a slot is :data:`SMOOTH`; :func:`build_tangents` compiles the loop that writes the
+The differentiable state of a slot is :func:`smooth`; :func:`build_tangents` compiles the loop that writes the
 derivatives of the next state and of the cost by this state and by the action. f'(x) = Im f(x + i h) / h, without
 subtraction, so h can be arbitrarily small (Squire and Trapp, SIAM Review 1998).
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Any
 
-from cz_gym.body.cost import Cost, cost_slopes
-from cz_gym.body.plant import Disturbance, Inputs, State, along, rates, rk4
-from cz_gym.body.schedule import bias_offset, melt_left, reference
 from cz_gym.episodes.record import GRID
 from cz_gym.jit.cache import hashed
-from cz_gym.jit.compile import force_inlined, jittable, kernel
+from cz_gym.jit.compile import column, compiled_as, jittable, kernel, labelled, scratch, set_column
 from cz_gym.physics.meniscus import MeniscusModel
+from cz_gym.process import Inputs, Process, Seen
 
-from .kernels import next_power, next_speed
-from .lockstep import height_inside
+from .arithmetic import along, plus_product, rk4
+from .drives import next_inputs
+from .layout import model_of
 
-SMOOTH = ("r_c", "h_c", "T_1", "T_2", "T_b", "v_p", "Q_H", "ring", "reading")
-"""The plant's state [m, K]; pull speed [m/s] and heater power [W], the latter before it is rounded to whole steps; the
-bright ring [m] and the camera's reading of it, without the operator's bias [m]."""
 ACTIONS = 2
-ROWS = (*SMOOTH, *Cost._fields)
-"""Rows of the Jacobian: the next state and the terms of the step's cost."""
-SCRATCH = (6, len(State._fields), len(State._fields) + len(Inputs._fields))
-"""Shape of the loop's work array."""
 _H = 2.0**-100
 """The imaginary step: a power of two, by which a compiler divides as quickly as it multiplies."""
 _EPS = 1e-9
-_X, _INPUTS = len(State._fields), len(Inputs._fields)
-_V, _Q, _RING, _READING = (SMOOTH.index(name) for name in ("v_p", "Q_H", "ring", "reading"))
-_COST = _ACT = len(SMOOTH)
+_INPUTS = len(Inputs._fields)
 
 
-@force_inlined
-def _step(value: Any) -> Any:
-    """The value plus an imaginary step."""
-    return complex(value, _H)
+def smooth(process: Process) -> tuple[str, ...]:
+    """Names of the differentiable state: the plant's; pull speed [m/s] and heater power [W], the latter before it is
+    rounded to whole steps; what the process carries on; the bright ring [m], and the camera's reading of it without the
+    operator's bias [m]."""
+    return (*process.State._fields, *Inputs._fields, *process.Extra._fields, "ring", "reading")
 
 
-@force_inlined
-def _column(A: Any, j: Any, k: Any) -> None:
-    """Derivatives of the rates along one of their arguments."""
-    A[0, j], A[1, j], A[2, j], A[3, j], A[4, j] = (
-        k.r_c.imag / _H, k.h_c.imag / _H, k.T_1.imag / _H, k.T_2.imag / _H, k.T_b.imag / _H,
-    )  # fmt: skip
+def rows(process: Process) -> tuple[str, ...]:
+    """Rows of the Jacobian: the next state and the terms of the step's cost."""
+    return (*smooth(process), *process.Cost._fields)
 
 
-@force_inlined
-def _rates_by(A: Any, x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
-    """Return the rates and write their derivatives into ``A``.
+def work_shape(process: Process) -> tuple[int, int, int]:
+    """Shape of the loop's work array."""
+    states = len(process.State._fields)
+    return 6, states, states + _INPUTS
 
-    Only the number that is stepped is complex, and all rates are computed before any is written: this lets the compiler
-    share their common terms.
+
+def derivatives(kind: Any, function: Any, at: Any, rest: Any, by: Any) -> Any:
+    """Return ``function(*at, *rest)``, a ``kind``, and write its derivatives by each field of the tuples ``at``.
+
+    ``by`` has shape (fields of the result, fields of all tuples). Only the number that is stepped is complex, and all
+    results are computed before any is written: this lets the compiler share their common terms.
     """
-    by_r = rates(State(_step(x.r_c), x.h_c, x.T_1, x.T_2, x.T_b), u, d, p, slope)
-    by_h = rates(State(x.r_c, _step(x.h_c), x.T_1, x.T_2, x.T_b), u, d, p, slope)
-    by_1 = rates(State(x.r_c, x.h_c, _step(x.T_1), x.T_2, x.T_b), u, d, p, slope)
-    by_2 = rates(State(x.r_c, x.h_c, x.T_1, _step(x.T_2), x.T_b), u, d, p, slope)
-    by_b = rates(State(x.r_c, x.h_c, x.T_1, x.T_2, _step(x.T_b)), u, d, p, slope)
-    by_v = rates(x, Inputs(_step(u.v_p), u.Q_H), d, p, slope)
-    k = rates(x, Inputs(u.v_p, _step(u.Q_H)), d, p, slope)
-    _column(A, 0, by_r)
-    _column(A, 1, by_h)
-    _column(A, 2, by_1)
-    _column(A, 3, by_2)
-    _column(A, 4, by_b)
-    _column(A, 5, by_v)
-    _column(A, 6, k)
-    return State(k.r_c.real, k.h_c.real, k.T_1.real, k.T_2.real, k.T_b.real)
+    to = 0
+    for place, x in enumerate(at):
+        for name in x._fields:
+            stepped = x._replace(**{name: complex(getattr(x, name), _H)})
+            result = function(*at[:place], stepped, *at[place + 1 :], *rest)
+            by[:, to] = [value.imag / _H for value in result]
+            to += 1
+    return kind(*(value.real for value in result))
 
 
-@force_inlined
-def _stage(work: Any, weight: Any, ahead: Any, x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
+@compiled_as(derivatives)
+def _derivatives(kind: Any, function: Any, at: Any, rest: Any, by: Any) -> Any:
+    others = [f"rest[{place}]" for place in range(len(rest))]
+    values, results, scope = kind.instance_class._fields, [], {}
+    for place, x in enumerate(at):
+        scope[f"X{place}"] = x.instance_class
+        for stepped in x.fields:
+            named = (f"complex(at[{place}].{n}, {_H!r})" if n == stepped else f"at[{place}].{n}" for n in x.fields)
+            parts = [f"at[{p}]" for p in range(len(at))]
+            parts[place] = f"X{place}({', '.join(named)})"
+            results.append(f"function({', '.join([*parts, *others])})")
+    lines = [f"k{to} = {result}" for to, result in enumerate(results)]
+    for to in range(len(results)):
+        lines += [f"by[{i}, {to}] = k{to}.{name}.imag / {_H!r}" for i, name in enumerate(values)]
+    real = ", ".join(f"k{len(results) - 1}.{name}.real" for name in values)
+    return [*lines, f"return kind({real})"], scope
+
+
+@jittable
+def _stage(work: Any, weight: Any, ahead: Any, x: Any, u: Any, d: Any, p: Any, model: Any) -> Any:
     """One stage of RK4: its rates, and their derivatives.
 
     ``work`` holds the derivatives of the rates, of this stage's and the last one's as functions of where the step began
     (K), and of the step so far. This stage is at ``ahead`` [s] times the last one's rates; it counts ``weight`` [s].
     """
     A, last, K, total = work[0], work[1], work[2], work[3]
-    k = _rates_by(A, x, u, d, p, slope)
-    for i in range(_X):
-        a, b, c, e, f = ahead * A[i, 0], ahead * A[i, 1], ahead * A[i, 2], ahead * A[i, 3], ahead * A[i, 4]
-        for j in range(_X + _INPUTS):
-            K[i, j] = A[i, j] + a * last[0, j] + b * last[1, j] + c * last[2, j] + e * last[3, j] + f * last[4, j]
-    for i in range(_X):
-        for j in range(_X + _INPUTS):
+    k = derivatives(model.process.State, model.process.rates, (x, u), (d, p, model.meniscus), A)
+    for i in range(model.states):
+        by_state = column(model.process.State, A.T, 0, i)
+        for j in range(model.extra):
+            K[i, j] = plus_product(A[i, j], ahead, by_state, last, j)
+    for i in range(model.states):
+        for j in range(model.extra):
             last[i, j] = K[i, j]
             total[i, j] += weight * K[i, j]
     return k
 
 
 @jittable
-def rk4_by(work: Any, x: Any, u: Any, d: Any, p: Any, dt: Any, slope: Any) -> None:
-    """Derivatives of :func:`cz_gym.body.plant.rk4` by state and inputs, into ``work[3]``, shape (5, 7)."""
-    for i in range(_X):
-        for j in range(_X + _INPUTS):
+def rk4_by(work: Any, x: Any, u: Any, d: Any, p: Any, dt: Any, model: Any) -> None:
+    """Derivatives of :func:`cz_gym.engine.arithmetic.rk4` by state and inputs, into ``work[3]``."""
+    for i in range(model.states):
+        for j in range(model.extra):
             work[1, i, j], work[3, i, j] = 0.0, 1.0 if i == j else 0.0
-    k_1 = _stage(work, dt / 6.0, 0.0, x, u, d, p, slope)
-    k_2 = _stage(work, dt / 3.0, 0.5 * dt, along(x, 0.5 * dt, k_1), u, d, p, slope)
-    k_3 = _stage(work, dt / 3.0, 0.5 * dt, along(x, 0.5 * dt, k_2), u, d, p, slope)
-    _stage(work, dt / 6.0, dt, along(x, dt, k_3), u, d, p, slope)
+    k_1 = _stage(work, dt / 6.0, 0.0, x, u, d, p, model)
+    k_2 = _stage(work, dt / 3.0, 0.5 * dt, along(x, 0.5 * dt, k_1), u, d, p, model)
+    k_3 = _stage(work, dt / 3.0, 0.5 * dt, along(x, 0.5 * dt, k_2), u, d, p, model)
+    _stage(work, dt / 6.0, dt, along(x, dt, k_3), u, d, p, model)
 
 
 @jittable
 def _copy(work: Any, of: Any, to: Any) -> None:
     """Copy one of the work array's matrices."""
-    for i in range(_X):
-        for j in range(_X + _INPUTS):
+    for i in range(work.shape[1]):
+        for j in range(work.shape[2]):
             work[to, i, j] = work[of, i, j]
 
 
 @jittable
 def _after(work: Any) -> None:
     """Derivatives of two substeps, one after the other: those of the first in ``work[4]``, of both in ``work[3]``."""
-    for i in range(_X):
-        for j in range(_X + _INPUTS):
-            work[5, i, j] = 0.0 if j < _X else work[3, i, j]
-            for between in range(_X):
+    states = work.shape[1]
+    for i in range(states):
+        for j in range(work.shape[2]):
+            work[5, i, j] = 0.0 if j < states else work[3, i, j]
+            for between in range(states):
                 work[5, i, j] += work[3, i, between] * work[4, between, j]
     _copy(work, 5, 3)
 
 
+@jittable
+def _through_drives(by: Any, J: Any, j: Any, model: Any) -> Any:
+    """Derivative by number j of what depends so on plant state and applied inputs at the begin of the step."""
+    direct = by[j] if j < model.states else 0.0
+    return direct + by[model.states] * J[model.states, j] + by[model.states + 1] * J[model.states + 1, j]
+
+
+@jittable
+def _drives_by(J: Any, slot: Any, x: Any, u: Any, action: Any, drives: Any, interval: Any, model: Any) -> None:
+    """Derivatives of the next inputs; whole steps of the heater are taken for a power that moves freely."""
+    by, process = scratch(2, model.driven_by), model.process
+    derivatives(Inputs, next_inputs, (x, u, action), (drives, slot, interval, process), by)
+    for drive in range(2):
+        for j in range(model.extra):
+            J[model.states + drive, j] = by[drive, j]
+        for action_of in range(ACTIONS):
+            J[model.states + drive, model.smooth + action_of] = by[drive, model.extra + action_of]
+
+
+@jittable
+def _carried_by(J: Any, slot: Any, extra: Any, interval: Any, model: Any) -> None:
+    """Derivatives of what the process carries on, from those of the inputs."""
+    if model.extras > 0:
+        by, process = scratch(model.extras, model.carried_by), model.process
+        derivatives(process.Extra, process.carry, (extra, labelled(Inputs, slot)), (slot.puller, interval), by)
+        for j in range(model.columns):
+            for row in range(model.extras):
+                total = by[row, j - model.extra] if model.extra <= j < model.ring else 0.0
+                for drive in range(2):
+                    total += by[row, model.extras + drive] * J[model.states + drive, j]
+                J[model.extra + row, j] = total
+
+
+@jittable
+def _cost_by(J: Any, slot: Any, t: Any, model: Any) -> None:
+    """Derivatives of the cost's terms, from those of the next state."""
+    process, n, by = model.process, model.states, scratch(model.costs, model.charged_by)
+    at = (
+        labelled(process.State, slot.x), labelled(Inputs, slot), Inputs(slot.v_p_before, slot.Q_H_before),
+        labelled(process.Extra, slot),
+    )  # fmt: skip
+    slopes = process.cost_slopes(*derivatives(process.Cost, process.charged, at, (slot, t), by))
+    for term in range(model.costs):
+        row = J[model.smooth + term]
+        for i in range(model.charged_by - 2):
+            weight = by[term, i if i < model.extra else i + 2]  # between stand the inputs before
+            if weight != 0.0:
+                for j in range(model.columns):
+                    row[j] += weight * J[i, j]
+        for drive in range(2):
+            row[n + drive] += by[term, model.extra + drive]
+        for j in range(model.columns):
+            row[j] *= slopes[term]
+
+
 @lru_cache(maxsize=8)
-def build_tangents(meniscus: MeniscusModel) -> tuple[Any, Any]:
-    """Compile the loops for a meniscus model.
+def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, Any]:
+    """Compile the loops for a process on a meniscus model.
 
     ``gather(memory, state, start, stop)`` writes the differentiable states. ``tangents(memory, state, held,
     actions, grows, clock, drives, work, jacobian, start, stop)`` writes the derivatives of the step that led from
@@ -136,83 +194,72 @@ def build_tangents(meniscus: MeniscusModel) -> tuple[Any, Any]:
     ``held``, shape (n, 2), is Q_d [W] and dT_i [K] before the step, which may be 5 s long: those of its first substep
     if a point of the grid lies inside.
     """
-    slope, ring_offset = meniscus.slope, meniscus.ring_offset
+    model, m = model_of(process, meniscus), meniscus
 
     def gather(memory: Any, state: Any, start: int, stop: int) -> None:
         for i in range(start, stop):
-            slot, p, x, row = memory.slots[i], memory.slots[i].puller, memory.slots[i].x, state[i]
-            row[0], row[1], row[2], row[3], row[4] = x.r_c, x.h_c, x.T_1, x.T_2, x.T_b
-            row[_V], row[_Q] = slot.v_p, slot.Q_H_slewed
-            row[_RING] = x.r_c + ring_offset(x.r_c, height_inside(x.h_c, p), p)
-            row[_READING] = slot.ring
+            slot, numbers = memory.slots[i], state.T
+            set_column(process.State, slot.x, numbers, 0, i)
+            state[i, model.states], state[i, model.states + 1] = slot.v_p, slot.Q_H_slewed
+            set_column(process.Extra, slot, numbers, model.extra, i)
+            state[i, model.ring] = process.see(labelled(process.State, slot.x), slot.puller, m).ring
+            state[i, model.ring + 1] = slot.ring
 
     def tangents(
         memory: Any, state: Any, held: Any, actions: Any, grows: Any, clock: Any, drives: Any, work: Any,
         jacobian: Any, start: int, stop: int,
     ) -> None:  # fmt: skip
+        ring, reading, seen_by = model.ring, model.ring + 1, scratch(4, model.states)
         for i in range(start, stop):
             J = jacobian[i]
             J[:, :] = 0.0
             if not grows[i]:
                 continue
-            slot, now = memory.slots[i], state[i]
-            p, e, x = slot.puller, slot.episode, slot.x
-            d = Disturbance(slot.Q_d, slot.dT_i, melt_left(slot.point * GRID, e))
-            v, Q, pull, heat, dt = now[_V], now[_Q], actions[i, 0], actions[i, 1], clock.interval
-            J[_V, _V] = next_speed(_step(v), pull, drives, p, e, dt).imag / _H
-            J[_V, _ACT] = next_speed(v, _step(pull), drives, p, e, dt).imag / _H
-            # Whole steps of the heater are taken for a power that moves freely.
-            J[_Q, _Q] = next_power(_step(Q), heat, drives, p, e, dt).imag / _H
-            J[_Q, _ACT + 1] = next_power(Q, _step(heat), drives, p, e, dt).imag / _H
-            begun, u = State(now[0], now[1], now[2], now[3], now[4]), Inputs(slot.v_p, slot.Q_H)
+            slot, dt = memory.slots[i], clock.interval
+            p, e = slot.puller, slot.episode
+            begun, before = column(process.State, state.T, 0, i), column(Inputs, state.T, model.states, i)
+            _drives_by(J, slot, begun, before, Inputs(actions[i, 0], actions[i, 1]), drives, dt, model)
+            _carried_by(J, slot, column(process.Extra, state.T, model.extra, i), dt, model)
+            u, d = labelled(Inputs, slot), process.disturb(slot.Q_d, slot.dT_i, slot.point * GRID, e)
             point = int((slot.k - 1) * dt / GRID + _EPS)
             at, late = (point + 1) * GRID, e.latency > 0.0
-            inside, left, seen_r, seen_h = at < slot.k * dt - _EPS, dt, 0.0, 0.0
+            inside, left = at < slot.k * dt - _EPS, dt
             if inside:
-                first = Disturbance(held[i, 0], held[i, 1], melt_left(point * GRID, e))
+                first = process.disturb(held[i, 0], held[i, 1], point * GRID, e)
                 left = slot.k * dt - at
-                rk4_by(work, begun, u, first, p, dt - left, slope)
-                begun = rk4(begun, u, first, p, dt - left, slope)
+                rk4_by(work, begun, u, first, p, dt - left, model)
+                begun = rk4(process.rates, begun, u, first, p, dt - left, m)
                 _copy(work, 3, 4)
-                h_c = height_inside(begun.h_c, p)
-                seen_r = 1.0 + ring_offset(_step(begun.r_c), h_c, p).imag / _H
-                seen_h = ring_offset(begun.r_c, _step(h_c), p).imag / _H
-            rk4_by(work, begun, u, d, p, left, slope)
+                derivatives(Seen, process.see, (begun,), (p, m), seen_by)
+                for j in range(model.extra):
+                    work[1, 0, j] = 0.0
+                    for row in range(model.states):
+                        work[1, 0, j] += seen_by[0, row] * work[4, row, j]
+                for j in range(model.columns):
+                    J[reading, j] = _through_drives(work[1, 0], J, j, model)
+            rk4_by(work, begun, u, d, p, left, model)
             if inside:
                 _after(work)
-            h_c = height_inside(x.h_c, p)
-            ring_by_r = 1.0 + ring_offset(_step(x.r_c), h_c, p).imag / _H
-            ring_by_h = ring_offset(x.r_c, _step(h_c), p).imag / _H
-            error = x.r_c - p.r_0 - reference(slot.k * dt, e) + bias_offset(slot.k * dt, e)
-            slopes = cost_slopes(error, slot.v_p - p.v_0, slot.v_p - slot.v_p_before, slot.Q_H - slot.Q_H_before)
-            for j in range(_ACT + ACTIONS):
-                drive = _V if j in (_V, _ACT) else _Q
-                if j < _X:
-                    share, column = 1.0, j
-                elif j in (_RING, _READING):
-                    continue
-                else:
-                    share, column = J[drive, j], drive
-                for row in range(_X):
-                    J[row, j] = share * work[3, row, column]
-                J[_RING, j] = ring_by_r * J[0, j] + ring_by_h * J[1, j]
-                if inside:
-                    J[_READING, j] = share * (seen_r * work[4, 0, column] + seen_h * work[4, 1, column])
-                J[_COST, j] = slopes.radius * J[0, j]
-                J[_COST + 1, j] = slopes.pull * J[_V, j]
-                J[_COST + 2, j] = slopes.pull_step * (J[_V, j] - (1.0 if j == _V else 0.0))
-                J[_COST + 3, j] = slopes.heater_step * (J[_Q, j] - (1.0 if j == _Q else 0.0))
+            derivatives(Seen, process.see, (labelled(process.State, slot.x),), (p, m), seen_by)
+            for j in range(model.columns):
+                for row in range(model.states):
+                    J[row, j] = _through_drives(work[3, row], J, j, model)
+            for row in range(model.states):
+                if seen_by[0, row] != 0.0:
+                    for j in range(model.columns):
+                        J[ring, j] += seen_by[0, row] * J[row, j]
+            _cost_by(J, slot, slot.k * dt, model)
             # The camera's frame is of now, of the grid point inside the step, or of the sample before.
             fresh, between = slot.k_seen == slot.k, inside and at <= slot.k * dt - e.latency + _EPS
-            for j in range(_ACT + ACTIONS):
+            for j in range(model.columns):
                 if fresh and not late:
-                    J[_READING, j] = J[_RING, j]
+                    J[reading, j] = J[ring, j]
                 elif not (fresh and between):
-                    J[_READING, j] = 0.0
+                    J[reading, j] = 0.0
             if fresh and late and not between:
-                J[_READING, _RING] = 1.0
+                J[reading, ring] = 1.0
             if not fresh:
-                J[_READING, _READING] = 1.0
+                J[reading, reading] = 1.0
 
-    keep = hashed(*meniscus.functions)
+    keep = hashed(*process.functions, *meniscus.functions)
     return kernel(gather, keep, allocates=False), kernel(tangents, keep, allocates=False)

@@ -1,6 +1,6 @@
 """An episode's draw: a value made at reset from one 128-bit key, and the series that follow from it.
 
-Ramps are kept as parameters and evaluated where needed (:mod:`cz_gym.body.schedule`). The noise of each step comes
+Ramps are kept as parameters and evaluated where needed (:mod:`cz_gym.episodes.schedule`). The noise of each step comes
 from the episode's own streams (:mod:`cz_gym.episodes.noise`): the environment draws it step by step, this module as
 whole series.
 """

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cz_gym.body.signals import Logged
 from cz_gym.evaluation.contender import Contender
 from cz_gym.jit.cache import PACKAGE, compiled_sources
 from cz_gym.jit.code_hash import hash_files
@@ -24,7 +25,7 @@ from .files import EPISODES, read_episodes, software
 from .metrics import metric_names
 from .protocol import Row
 from .results import BOUND, GAPS, Sample
-from .rollout import Floats, Signals
+from .rollout import Floats
 
 PRINTED = 1e-4
 """Relative precision of the figures in ``episodes.csv``, five digits [-]."""
@@ -55,7 +56,7 @@ class SlowEpisodes:
         """An episode with the signals that were kept; None if it is not there, or damaged."""
         try:
             with np.load(io.BytesIO((self.place / f"{seed}.npz").read_bytes())) as data:
-                example = Signals(*data["signals"]) if len(data["signals"]) else None
+                example = Logged(*data["signals"]) if len(data["signals"]) else None
                 values, microseconds = data["values"][None, None], float(data["microseconds"])
                 return Sample(self.contender, (seed,), values, microseconds, example)
         except Exception:  # zipfile, zlib and NumPy each raise their own for a file cut short

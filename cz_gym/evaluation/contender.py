@@ -41,7 +41,7 @@ class Contender:
     quoted: bool = False
     """Whether it stands in short tables and small figures, and beside a controller of the user's own."""
     action: str = "direct"
-    """Mode of its actions (:func:`cz_gym.body.task.drives_of`)."""
+    """Mode of its actions (:func:`cz_gym.action.drives_of`)."""
     own: bool = False
     """Whether it comes from the user's own file: figures show it first."""
     training_seeds: tuple[int, ...] = ()

@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.body.cost import cost_terms
 from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from .rollout import Rollout
@@ -49,7 +48,7 @@ class Metrics(NamedTuple):
     time_at_limits: Floats
     """Share of time in which a drive is at its range or moves as fast as it can [-]."""
     growth_rate_rms_mm_per_min: Floats
-    """RMS of v_g - v_0 [mm/min]."""
+    """RMS of v_g - v_0 [mm/min]; NaN for a process that logs no growth rate."""
     ground_off_pct: Floats
     """Silicon ground off to a cylinder, 100 (mean r_c^2 / min r_c^2 - 1) [%]."""
     cost: Floats
@@ -69,23 +68,27 @@ def metric_names() -> tuple[str, ...]:
 def metrics(run: Rollout) -> Metrics:
     """Compute the metrics of a rollout."""
     s, alive = run.signals, run.alive
-    v_0, error, observable = run.config.parameters.v_0, radius_error(run), radius_error(run, s.ring_offset)
+    process, v_0 = run.config.process, run.config.ranges[0]
+    value, lost = getattr(s, process.Lean._fields[0]), _lost(run)
+    counts = True if (alive | lost).all() else alive | lost  # not after an end with success
+    grows = getattr(s, "v_g", np.full(alive.shape, np.nan))
+    error, observable = radius_error(run), radius_error(run, s.ring_offset)
     pull_step = np.diff(s.v_p, axis=0, prepend=run.start.v_p)
     heater_step = np.diff(s.Q_H, axis=0, prepend=run.start.Q_H)
     drives = (np.where(alive, moved, 0.0) for moved in (s.v_p - v_0, pull_step, heater_step))
     return Metrics(
-        rmse_mm=_rms(error) / MM,
-        rmse_observable_mm=_rms(observable) / MM,
-        max_error_mm=np.abs(error).max(axis=0) / MM,
-        within_half_mm=np.mean(np.abs(error) <= TOLERANCE, axis=0),
+        rmse_mm=_rms(error, counts) / MM,
+        rmse_observable_mm=_rms(observable, counts) / MM,
+        max_error_mm=np.abs(error).max(axis=0, where=counts, initial=0.0) / MM,
+        within_half_mm=np.mean(np.abs(error) <= TOLERANCE, axis=0, where=counts),
         pull_rms_mm_per_min=_rms(s.v_p - v_0, alive) / MM_PER_MIN,
         pull_step_rms_mm_per_min=_rms(pull_step, alive) / MM_PER_MIN,
         mean_pull_within_3pct=_mean_pull_share(s.v_p, alive, v_0, run.config.control_interval),
         heater_step_rms_kw=_rms(heater_step, alive) / KILO,
         time_at_limits=np.mean(_at_limits(run), axis=0, where=alive),
-        growth_rate_rms_mm_per_min=_rms(s.v_g - v_0, alive) / MM_PER_MIN,
-        ground_off_pct=_ground_off(s.r_c, alive),
-        cost=np.sum(cost_terms(observable, *drives), axis=0).mean(axis=0),
+        growth_rate_rms_mm_per_min=_rms(grows - v_0, alive) / MM_PER_MIN,
+        ground_off_pct=_ground_off(value, alive),
+        cost=np.sum(process.cost_terms(observable, *drives), axis=0).mean(axis=0, where=counts),
         failure_rate=run.failed.astype(np.float64),
         return_=run.reward.sum(axis=0),
     )
@@ -93,9 +96,15 @@ def metrics(run: Rollout) -> Metrics:
 
 def radius_error(run: Rollout, offset: Floats | float = 0.0) -> Floats:
     """The radius error plus an offset [m], shape (steps, episodes); from a failing step on the largest allowed one."""
-    lost = np.arange(len(run.alive))[:, None] >= run.alive.sum(axis=0) - run.failed
-    error: Floats = np.where(lost, run.config.radius_limit, run.signals.r_c - run.signals.r_ref + offset)
+    value, reference = (getattr(run.signals, name) for name in run.config.process.Lean._fields[:2])
+    error: Floats = np.where(_lost(run), run.config.radius_limit, value - reference + offset)
     return error
+
+
+def _lost(run: Rollout) -> npt.NDArray[np.bool_]:
+    """Whether a crystal is lost, from its failing step on, shape (steps, episodes)."""
+    lost: npt.NDArray[np.bool_] = run.failed & (np.arange(len(run.alive))[:, None] >= run.alive.sum(axis=0) - 1)
+    return lost
 
 
 def outside(run: Rollout, tolerance: float) -> Floats:
@@ -116,7 +125,7 @@ def _at_limits(run: Rollout) -> npt.NDArray[np.bool_]:
     """
     config, s, start = run.config, run.signals, run.start
     drives = [each.actuators for each in config.scenario.scenarios]
-    window = min(config.parameters.v_0, max(each.pull_window for each in drives))
+    window = min(config.ranges[0], max(each.pull_window for each in drives))
     fastest = config.control_interval * max(each.pull_slew for each in drives)
     slew, step = config.control_interval * max(each.heater_slew for each in drives), drives[0].heater_step
     steps = max(1, math.ceil(2.0 * step / slew - 1e-9))

@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from cz_gym.body.process import BODY
 from cz_gym.config import Config, make_config
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import ALIASES, find_scenario
@@ -11,6 +12,7 @@ from cz_gym.errors import CzError
 from cz_gym.machine.puller import DEFAULT, PullerFile
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
+from cz_gym.process import Process
 from cz_gym.support.names import unknown
 from cz_gym.support.units import MM, MM_PER_MIN
 
@@ -48,6 +50,8 @@ class Row:
     """Largest radius error that is no scrap [m]: with it, the report is one for a grower."""
     first_seed: int = TEST_SEEDS.start
     """Seed of its first crystal."""
+    process: Process = BODY
+    """What is simulated."""
 
     @property
     def control_interval(self) -> float:
@@ -61,7 +65,9 @@ class Row:
     def design_config(self, observation: str = "measured", action: str = "direct") -> Config:
         """Return the settings that a controller is designed for: the same on Hurle's meniscus."""
         interval, puller = self.control_interval, self.puller
-        return make_config(self.scenario, self.model, observation, interval, action=action, puller=puller)
+        return make_config(
+            self.scenario, self.model, observation, interval, action=action, puller=puller, process=self.process
+        )
 
     @property
     def grown_on(self) -> str:

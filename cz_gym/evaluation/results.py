@@ -8,11 +8,12 @@ from functools import cache
 
 import numpy as np
 
+from cz_gym.body.signals import Logged
 from cz_gym.evaluation.contender import Contender
 
 from .metrics import metric_names, metrics, outside
 from .protocol import Row
-from .rollout import Floats, Rollout, Signals
+from .rollout import Floats, Rollout
 from .statistics import Estimate, Resamples, cvar, differences, means, optimality_gap, probability_of_improvement
 
 REFERENCE = "paper"
@@ -37,7 +38,7 @@ class Sample:
     """Metrics in the order of :func:`metric_names`, shape (training seeds or 1, episodes, metrics)."""
     microseconds: float
     """Time in the policy per step and episode [us]."""
-    example: Signals | None = None
+    example: Logged | None = None
     """Signals of the first episode up to its end, each of shape (steps,), of the first training seed."""
     outside: Floats | None = None
     """Share of time outside the row's tolerance band [-], shape (training seeds or 1, episodes), if it has one."""

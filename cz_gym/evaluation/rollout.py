@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from inspect import signature
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,38 +20,21 @@ Floats = npt.NDArray[np.float64]
 PREDICT = "predict(observation, state=None, episode_start=None, deterministic=True) -> (action, state)"
 
 
-class Signals(NamedTuple):
-    """Logged signals in SI units, shape (steps, episodes); row k is the end of step k + 1."""
-
-    r_c: Floats
-    r_ref: Floats
-    r_br: Floats
-    r_br_measured: Floats
-    ring_offset: Floats
-    h_c: Floats
-    alpha_c: Floats
-    v_g: Floats
-    v_p: Floats
-    Q_H: Floats
-    T_1: Floats
-    T_1_ref: Floats
-    T_b: Floats
-
-
 @dataclass(frozen=True)
 class Rollout:
     """The episodes of a policy on some seeds, with every signal logged."""
 
     config: Config
     seeds: tuple[int, ...]
-    signals: Signals
+    signals: Any
+    """The process' ``Logged`` in SI units, each of shape (steps, episodes); row k is the end of step k + 1."""
     reward: Floats
     """Reward, 0 after the end, shape (steps, episodes)."""
     alive: npt.NDArray[np.bool_]
     """Whether the step was taken: true up to and including a failing one, shape (steps, episodes)."""
     failed: npt.NDArray[np.bool_]
     """Whether the episode ended in a failure, shape (episodes,)."""
-    start: Signals
+    start: Any
     """Signals at t = 0, each of shape (1, episodes)."""
     seconds_in_policy: float
     """Time spent in ``predict``, and in ``for_episodes`` of a bound, all episodes together [s]."""
@@ -61,10 +44,10 @@ class Rollout:
         """Time in ``predict`` per step of one episode, batched [us]."""
         return self.seconds_in_policy / MICRO / self.alive.size
 
-    def episode(self, i: int) -> Signals:
+    def episode(self, i: int) -> Any:
         """Signals of episode ``i`` up to its end, each of shape (steps,); a copy."""
         taken = self.alive[:, i]
-        return Signals(*(signal[taken, i] for signal in self.signals))
+        return type(self.signals)(*(signal[taken, i] for signal in self.signals))
 
 
 def rollout(
@@ -89,22 +72,23 @@ def rollout(
     before = time.perf_counter()
     policy = informed(policy, config, seeds)
     seconds = time.perf_counter() - before
-    signals, memory = Signals(*(np.zeros(shape) for _ in Signals._fields)), None
+    kind, memory = config.process.Logged, None
+    signals = kind(*(np.zeros(shape) for _ in kind._fields))
     reward, alive, failed = np.zeros(shape), np.zeros(shape, np.bool_), np.zeros(n, np.bool_)
     running, begins, over = np.ones(n, np.bool_), np.ones(n, np.bool_), np.zeros(n, np.bool_)
     with closing(CzVectorEnv.from_config(config, n, info="all")) as env:
         observation, info = env.reset(seed=list(seeds))
-        start = Signals(*(np.array(info[name])[None] for name in Signals._fields))
+        start = kind(*(np.array(info[name])[None] for name in kind._fields))
         for k in range(config.steps):
             before = time.perf_counter()
             action, memory = call_policy(policy, observation, memory, begins)
             seconds += time.perf_counter() - before
             # An action may be marked with what it was made for; check_policy has said what fits.
             observation, gained, terminated, truncated, info = env.step(np.asarray(action))
-            for log, name in zip(signals, Signals._fields, strict=True):
+            for log, name in zip(signals, kind._fields, strict=True):
                 log[k] = info[name]
             reward[k], alive[k] = np.where(running, gained, 0.0), running
-            failed |= running & terminated
+            failed |= running & terminated & (np.asarray(info.get("succeeded", 0.0)) == 0.0)
             # A slot that is over is drawn anew by the next step: only then does its policy begin again.
             begins, over = over, terminated | truncated
             running &= ~over

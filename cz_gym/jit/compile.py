@@ -10,12 +10,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
+from inspect import signature
 from typing import Any, TypeVar, cast
 
 import numba
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.extending import intrinsic, overload, register_jitable
+from numba.core.datamodel import models
+from numba.core.imputils import lower_constant
+from numba.core.typing.templates import AttributeTemplate
+from numba.extending import (
+    infer_getattr,
+    intrinsic,
+    lower_getattr_generic,
+    overload,
+    register_jitable,
+    register_model,
+    typeof_impl,
+)
 
 from .cache import CachedCode, cache_folder
 
@@ -99,9 +111,86 @@ def _compiled_fetch(array: Any, at: Any) -> Any:
     return compiled
 
 
+class Static(types.Opaque):
+    """Type of one :func:`static` value: its attributes are constants and functions of the compiled code."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+        super().__init__(f"Static({type(value).__name__})")
+
+    @property
+    def key(self) -> Any:
+        """What tells two of these types apart."""
+        return self.value
+
+
+def static(kind: Any) -> Any:
+    """Mark a hashable class whose values are compiled in: in a kernel, ``value.rates(...)`` is a direct call.
+
+    Attributes, properties too, may be functions marked as equations, named tuples' classes, numbers and their tuples,
+    and other static values. Each value compiles code of its own.
+    """
+    register: Any = typeof_impl.register
+    register(kind)(lambda value, context: Static(value))
+    return kind
+
+
+_register: Any = register_model
+_lower_attribute: Any = lower_getattr_generic
+_register(Static)(models.OpaqueModel)
+
+
+@lower_constant(Static)  # type: ignore[no-untyped-call]
+def _no_bits(context: Any, builder: Any, kind: Any, value: Any) -> Any:
+    return context.get_dummy_value()
+
+
+@infer_getattr
+class _StaticAttribute(AttributeTemplate):
+    key = Static
+
+    def generic_resolve(self, kind: Any, name: str) -> Any:  # type: ignore[override]
+        value = getattr(kind.value, name)
+        literal: Any = types.literal
+        return literal(value) if type(value) is int else self.context.resolve_value_type(value)
+
+
+@_lower_attribute(Static)
+def _static_attribute(context: Any, builder: Any, kind: Any, value: Any, name: str) -> Any:
+    type_of = context.typing_context.resolve_getattr(kind, name)
+    return context.get_constant_generic(builder, type_of, getattr(kind.value, name))
+
+
+def compiled_as(function: Any) -> Any:
+    """Decorate a writer of the text that a function of labelled tuples compiles to: numba unrolls no loop over fields.
+
+    The writer takes the arguments' numba types; it returns the body's lines, and a dictionary of the names in them.
+    """
+
+    def register(writer: Any) -> Any:
+        names = ", ".join(signature(function).parameters)
+
+        def compiled(*arguments: Any) -> Any:
+            lines, scope = writer(*arguments)
+            exec("\n    ".join([f"def compiled({names}):", *(lines or ["return None"])]), scope)
+            return scope["compiled"]
+
+        exec(f"def wrapper({names}): return compiled({names})", scope := {"compiled": compiled})
+        overload(function, strict=False, jit_options={"error_model": "numpy", "forceinline": True})(scope["wrapper"])
+        return writer
+
+    return register
+
+
 def column(kind: Any, array: Any, at: Any, lane: Any) -> Any:
     """Read a named tuple of this kind from a column of an array, from row ``at`` on."""
     return kind(*(array[at + row, lane] for row in range(len(kind._fields))))
+
+
+@compiled_as(column)
+def _column(kind: Any, *_: Any) -> Any:
+    fields = kind.instance_class._fields
+    return [f"return kind({', '.join(f'{name}=array[at + {row}, lane]' for row, name in enumerate(fields))})"], {}
 
 
 def set_column(kind: Any, values: Any, array: Any, at: Any, lane: Any) -> None:
@@ -110,25 +199,30 @@ def set_column(kind: Any, values: Any, array: Any, at: Any, lane: Any) -> None:
         array[at + row, lane] = getattr(values, name)
 
 
-@overload(column, strict=False)
-def _compiled_column(kind: Any, array: Any, at: Any, lane: Any) -> Any:
-    fields = kind.instance_class._fields
-    values = (f"{name}=array[at + {row}, lane]" for row, name in enumerate(fields))
-    return _written(f"def compiled(kind, array, at, lane): return kind({', '.join(values)})")
+@compiled_as(set_column)
+def _set_column(kind: Any, *_: Any) -> Any:
+    return [f"array[at + {row}, lane] = values.{name}" for row, name in enumerate(kind.instance_class._fields)], {}
 
 
-@overload(set_column, strict=False)
-def _compiled_set_column(kind: Any, values: Any, array: Any, at: Any, lane: Any) -> Any:
-    fields = kind.instance_class._fields
-    lines = (f"    array[at + {row}, lane] = values.{name}" for row, name in enumerate(fields))
-    return _written("\n".join(["def compiled(kind, values, array, at, lane):", *lines]))
+def labelled(kind: Any, record: Any) -> Any:
+    """Read a named tuple of this kind from a record that has its fields."""
+    return kind(*(getattr(record, name) for name in kind._fields))
 
 
-def _written(source: str) -> Any:
-    """The function ``compiled`` that the source text defines; numba would not unroll a loop over fields."""
-    names: dict[str, Any] = {}
-    exec(source, names)
-    return names["compiled"]
+@compiled_as(labelled)
+def _labelled(kind: Any, record: Any) -> Any:
+    return [f"return kind({', '.join(f'record.{name}' for name in kind.instance_class._fields)})"], {}
+
+
+def set_labelled(kind: Any, values: Any, record: Any) -> None:
+    """Write a named tuple of this kind to a record that has its fields."""
+    for name in kind._fields:
+        setattr(record, name, getattr(values, name))
+
+
+@compiled_as(set_labelled)
+def _set_labelled(kind: Any, *_: Any) -> Any:
+    return [f"record.{name} = values.{name}" for name in kind.instance_class._fields], {}
 
 
 @intrinsic(prefer_literal=True)

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from cz_gym.body.linearisation import STATES, linearise, radius_model
 from cz_gym.body.plant import make_puller
 from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
-from cz_gym.physics.linearisation import STATES, linearise, radius_model
 from cz_gym.physics.quantities import MACHINE
 from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.units import CELSIUS, HOUR, KILO, MINUTE, MM, MM_PER_MIN

@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from cz_gym.action import HEATER_RANGE
 from cz_gym.body.plant import make_puller
-from cz_gym.body.task import HEATER_RANGE, RADIUS_LIMIT, check_height
+from cz_gym.body.task import RADIUS_LIMIT, check_height
 from cz_gym.episodes.scenario import Range
 from cz_gym.errors import CzError
 from cz_gym.physics.parameters import Parameters, check_parameters

@@ -13,11 +13,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.jit.compile import jittable
+from cz_gym.jit.compile import jittable, static
 
 SQRT_2, SQRT_HALF = math.sqrt(2.0), math.sqrt(0.5)
 
 
+@static
 class MeniscusModel(NamedTuple):
     """A model of the meniscus for the plant: its name and its functions.
 

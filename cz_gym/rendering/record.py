@@ -6,13 +6,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.body.plant import Puller
-from cz_gym.body.signals import INFO
 from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
 from cz_gym.config import Config
 
+DRAWN = frozenset({"r_c", "r_ref", "r_br", "r_br_measured", "h_c", "v_p", "Q_H", "T_1", "T_1_ref", "T_b"})
+"""Rows of ``info`` that a picture shows; a process without them has none."""
 Floats = npt.NDArray[np.float64]
-_COLUMN = {name: column for column, name in enumerate((*INFO, "valid"))}
 
 
 class Ending(Enum):
@@ -29,17 +28,18 @@ class Record:
 
     def __init__(self, config: Config, slot: Any, scenario: str) -> None:
         self.config, self.scenario = config, scenario
-        self.puller = Puller(*slot["puller"].tolist())
+        self.puller = config.process.Constants(*slot["puller"].tolist())
         self.ending: Ending | None = None
         """How the episode ended; None while it goes on."""
         self._first = int(slot["k"])
-        self._samples, self._count = np.zeros((config.steps + 1, len(_COLUMN))), 0
+        self._column = {name: column for column, name in enumerate((*config.process.info, "valid"))}
+        self._samples, self._count = np.zeros((config.steps + 1, len(self._column))), 0
 
     def __len__(self) -> int:
         return self._count
 
     def add(self, info: Floats, valid: float, terminated: bool = False, truncated: bool = False) -> None:
-        """Add a sample: the row of info (:data:`cz_gym.body.signals.INFO`), and 1 if the camera's reading is valid."""
+        """Add a sample: the row of info, and 1 if the camera's reading is valid."""
         row = self._samples[self._count]
         row[:-1], row[-1] = info, valid
         self._count += 1
@@ -50,11 +50,11 @@ class Record:
 
     def column(self, name: str) -> Floats:
         """All values of a signal of ``info``, or of "valid", shape (samples,)."""
-        return self._samples[: self._count, _COLUMN[name]]
+        return self._samples[: self._count, self._column[name]]
 
     def last(self, name: str) -> float:
         """The newest value of a :meth:`column`."""
-        return float(self._samples[self._count - 1, _COLUMN[name]])
+        return float(self._samples[self._count - 1, self._column[name]])
 
     @property
     def t(self) -> Floats:

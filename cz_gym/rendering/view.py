@@ -7,12 +7,14 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.error import DependencyNotInstalled, Error, ResetNeeded
 
+from cz_gym.body.process import BODY
 from cz_gym.config import Config
 from cz_gym.errors import CzError
+from cz_gym.process import Process
 from cz_gym.support.names import unknown
 
 from .canvas import MISSING, Frame, available, load
-from .record import Record
+from .record import DRAWN, Record
 from .scene import Scene
 
 MODES = ("human", "rgb_array")
@@ -22,9 +24,9 @@ SMALLEST, LARGEST = 360, 3840
 """Fewest and most pixels along a side."""
 
 
-def declared_modes() -> list[str]:
-    """The render modes that can be drawn here: none without pygame."""
-    return list(MODES) if available() else []
+def declared_modes(process: Process = BODY) -> list[str]:
+    """The render modes that can be drawn here: none without pygame, or for a process without a crystal's signals."""
+    return list(MODES) if available() and set(process.info) >= DRAWN else []
 
 
 def check_size(size: Any) -> tuple[int, int]:
@@ -48,6 +50,8 @@ def make_view(render_mode: str | None, size: Any, config: Config) -> "View | Non
         raise CzError(unknown("render_mode", render_mode, ["None", *MODES]))
     if not available():
         raise DependencyNotInstalled(MISSING)
+    if not declared_modes(config.process):
+        raise CzError("a picture shows a crystal on its melt: this process has none, so render_mode must be None")
     return View(render_mode, width, height, config)
 
 

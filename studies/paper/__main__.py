@@ -13,8 +13,8 @@ from pathlib import Path
 from cz_gym import HURLE, make_puller
 from cz_gym.baselines.analysis.compensator_design import design_compensator, margins
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
+from cz_gym.body.linearisation import radius_model
 from cz_gym.evaluation.report.tables import markdown as table
-from cz_gym.physics.linearisation import radius_model
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.support.atomic_files import check_writable, write_files
 from cz_gym.support.command_line import OneLineParser

@@ -3,8 +3,8 @@
 import math
 from typing import Any, NamedTuple
 
+from cz_gym.body.linearisation import RadiusModel
 from cz_gym.evaluation.report.tables import markdown as table
-from cz_gym.physics.linearisation import RadiusModel
 from cz_gym.support.units import HOUR, MM
 
 from . import experiments as ex

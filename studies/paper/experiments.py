@@ -13,11 +13,13 @@ import numpy as np
 from cz_gym import HURLE, MeniscusModel, Scenario, make_puller
 from cz_gym.baselines.analysis.compensator_design import Margins, design_compensator, margins
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID, Compensator, SeriesPID
-from cz_gym.body.schedule import quintic
+from cz_gym.body.linearisation import RadiusModel, radius_model
+from cz_gym.body.signals import Logged
 from cz_gym.config import make_config
+from cz_gym.episodes.schedule import quintic
 from cz_gym.evaluation.replay import Playback
-from cz_gym.evaluation.rollout import Signals, rollout
-from cz_gym.physics.linearisation import Floats, RadiusModel, radius_model
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.physics.linearisation import Floats
 from cz_gym.support.units import HOUR, MINUTE, MM, MM_PER_MIN
 
 MODEL_I = RadiusModel(numerator=-0.0047626, poles=(8.78e-6, -1.684e-3), lead=-47.1864, constant=1.0041)
@@ -76,7 +78,7 @@ class Trace(NamedTuple):
 
     t: Floats
     """Time [s]."""
-    signals: Signals
+    signals: Logged
     """Logged signals, SI units, radians."""
     r_tilde: Floats
     """Ring minus bias plus compensator [m]; without a compensator, ring minus bias."""
@@ -102,7 +104,7 @@ def trace(
     config = make_config(scenario, model, "measured", interval, horizon, meniscus=meniscus, action="direct")
     run = rollout(policy.for_config(config) if hasattr(policy, "for_config") else policy, config, [0])
     lived = int(run.alive.sum())
-    logged = Signals(
+    logged = Logged(
         *(np.concatenate([start[0], log[:lived, 0]]) for start, log in zip(run.start, run.signals, strict=True))
     )
     puller = make_puller(lam=MODELS[model], meniscus=meniscus)

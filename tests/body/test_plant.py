@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from cz_gym import SCENARIOS, CzEnv, Parameters, State, make_puller
-from cz_gym.body.plant import NO_DISTURBANCE, Disturbance, Inputs, growth, hidden_load, rates, rk4
-from cz_gym.body.schedule import disturbance
+from cz_gym.body.plant import NO_DISTURBANCE, Disturbance, Inputs, disturbance, growth, hidden_load, rates, rk4
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.jit.compile import kernel
 from cz_gym.physics.meniscus import hurle_slope

@@ -5,8 +5,8 @@ import pytest
 
 from cz_gym import CzEnv, CzVectorEnv, Parameters, make_puller
 from cz_gym.body.plant import Disturbance, Inputs, State, rk4
+from cz_gym.body.process import accept_substep
 from cz_gym.body.task import HEIGHT_MIN
-from cz_gym.engine.lockstep import judged
 from cz_gym.episodes.draw import randomised
 from cz_gym.episodes.record import Factors
 from cz_gym.physics.meniscus import HURLE
@@ -119,7 +119,7 @@ def test_a_meniscus_that_freezes_within_a_step_ends_the_episode(excess, bound, p
     d, u = Disturbance(0.0, 0.0, 1.0), Inputs(pull * p.v_0, p.Q_H_0)
     for height in np.arange(1.2, 2.6, 0.02):
         x = State(p.r_0, height * MM, p.T_1_0 - 60.0, p.T_2_0 - 40.0, p.T_m + excess)
-        new, grows = judged(x, rk4(x, u, d, p, 5.0, HURLE.slope), u, d, p, 5.0, p.r_0, HURLE.slope)
+        new, grows = accept_substep(x, rk4(x, u, d, p, 5.0, HURLE.slope), u, d, p, 5.0, p.r_0, HURLE.slope)
         solved = integrated(x, Truth(*u), p, 5.0, rtol=1e-12, atol=1e-6, events=_frozen)
         close = abs(solved.y[1, -1] - HEIGHT_MIN) < 5e-3 * MM and solved.t[-1] > 4.9
         assert grows == (solved.status == 0) or close

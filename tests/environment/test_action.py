@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cz_gym import CzEnv, make_puller
-from cz_gym.body.signals import INFO
+from cz_gym.body.signals import Logged
 
 P = make_puller()
 
@@ -50,8 +50,8 @@ def test_rates_add_up_within_the_range_of_the_drives(interval):
 def test_info_is_lean_unless_all_is_asked_for():
     for env, keys in (
         (CzEnv(), {"r_c", "r_ref"}),
-        (CzEnv(info="all"), {*INFO, "state"}),
-        (CzEnv(info="all", observation="measured"), set(INFO)),
+        (CzEnv(info="all"), {*Logged._fields, "state"}),
+        (CzEnv(info="all", observation="measured"), set(Logged._fields)),
     ):
         _, info = env.reset(seed=0)
         assert set(info) == keys

@@ -7,15 +7,17 @@ import pytest
 from gymnasium.error import InvalidAction, ResetNeeded
 
 from cz_gym import CzVectorEnv
+from cz_gym.action import ACTIONS
 from cz_gym.body.plant import Disturbance, Inputs, State, make_puller, rk4
-from cz_gym.body.task import ACTIONS
+from cz_gym.body.process import BODY
 from cz_gym.config import make_config
 from cz_gym.differentiable import STATES, DifferentiableBatch
-from cz_gym.engine.tangents import ROWS, SCRATCH, rk4_by
+from cz_gym.engine.layout import model_of
+from cz_gym.engine.tangents import rk4_by, rows, work_shape
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.observation import MEASURED
 from cz_gym.physics.linearisation import jacobian
-from cz_gym.physics.meniscus import hurle_slope
+from cz_gym.physics.meniscus import HURLE, hurle_slope
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from tests.observed import PLAIN
 
@@ -75,7 +77,7 @@ def test_derivatives_are_those_of_the_steps(scenario, action, interval, steps):
         found, expected = step.jacobian[:, :, column], (ahead - behind) / (2.0 * by)
         rounding = 2e-15 * np.abs(ahead) / by
         rounding[:, len(STATES) :] = 2e-14 / by  # costs are of small errors, differences of radii
-        assert (np.abs(found - expected) <= 2e-5 * np.abs(expected).max(axis=0) + rounding).all(), (ROWS, name)
+        assert (np.abs(found - expected) <= 2e-5 * np.abs(expected).max(axis=0) + rounding).all(), (rows(BODY), name)
 
 
 def test_a_reading_that_is_held_or_late_depends_on_the_one_before():
@@ -142,9 +144,9 @@ def test_the_environment_s_own_crystals_and_observations(scenario):
 def test_the_chain_rule_over_rk4_is_exact():
     """Against the complex step through the whole of it, ten times in a row."""
     puller, d = make_puller(lam=0.5), Disturbance(50.0, 0.3, 0.95)
-    x, u, work = State(*puller.state_0)._replace(r_c=0.051, h_c=0.0062), puller.inputs_0, np.zeros(SCRATCH)
+    x, u, work = State(*puller.state_0)._replace(r_c=0.051, h_c=0.0062), puller.inputs_0, np.zeros(work_shape(BODY))
     for _ in range(10):
-        rk4_by(work, x, u, d, puller, 5.0, hurle_slope)
+        rk4_by(work, x, u, d, puller, 5.0, model_of(BODY, HURLE))
         whole = jacobian(lambda *at: rk4(State(*at[:5]), Inputs(*at[5:]), d, puller, 5.0, hurle_slope), (*x, *u))
         np.testing.assert_allclose(work[3], whole, rtol=1e-10, atol=1e-16)
         x = rk4(x, u, d, puller, 5.0, hurle_slope)

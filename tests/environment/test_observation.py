@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from cz_gym import SCENARIOS, CzEnv, Scenario, decode
-from cz_gym.body.schedule import bias_offset, pyrometer_drift
 from cz_gym.episodes.scenario import Sensor
+from cz_gym.episodes.schedule import bias_offset, pyrometer_drift
 from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED, OBSERVATIONS, lags
 from tests.equations import drawn, fields, hold
 from tests.observed import PLAIN

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
+from cz_gym.body.signals import Logged
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import Metrics, metrics
-from cz_gym.evaluation.rollout import Rollout, Signals, rollout
+from cz_gym.evaluation.rollout import Rollout, rollout
 from tests.observed import PLAIN
 
 DT = 5.0
@@ -17,14 +18,14 @@ MM_PER_MIN = 1e-3 / 60
 def made_up(steps, lived=None, scenario="nominal", **signals):
     """One episode of a perfect crystal but for the given signals; with ``lived``, it fails at that step."""
     config = make_config(scenario, control_interval=DT, horizon=DT * steps, **PLAIN)
-    calm = dict.fromkeys(Signals._fields, 0.0) | {"r_c": R, "r_ref": R, "v_p": V, "v_g": V, "Q_H": Q}
+    calm = dict.fromkeys(Logged._fields, 0.0) | {"r_c": R, "r_ref": R, "v_p": V, "v_g": V, "Q_H": Q}
     columns = {name: np.full((steps, 1), value) for name, value in calm.items()}
     for name, value in signals.items():
         columns[name] = np.broadcast_to(np.asarray(value, float), steps).reshape(steps, 1).copy()
     alive = np.arange(steps)[:, None] < (steps if lived is None else lived)
-    start = Signals(**{name: np.full((1, 1), value) for name, value in calm.items()})
+    start = Logged(**{name: np.full((1, 1), value) for name, value in calm.items()})
     failed = np.array([lived is not None])
-    return Rollout(config, (0,), Signals(**columns), np.zeros((steps, 1)), alive, failed, start, 0.0)
+    return Rollout(config, (0,), Logged(**columns), np.zeros((steps, 1)), alive, failed, start, 0.0)
 
 
 def of(run):
@@ -163,11 +164,11 @@ def test_metrics_of_a_batch_are_those_of_its_episodes():
     batch = Rollout(
         runs[0].config,
         (0, 1, 2),
-        Signals(*(np.hstack(columns) for columns in zip(*(run.signals for run in runs), strict=True))),
+        Logged(*(np.hstack(columns) for columns in zip(*(run.signals for run in runs), strict=True))),
         np.hstack([run.reward for run in runs]),
         np.hstack([run.alive for run in runs]),
         np.concatenate([run.failed for run in runs]),
-        Signals(*(np.hstack(columns) for columns in zip(*(run.start for run in runs), strict=True))),
+        Logged(*(np.hstack(columns) for columns in zip(*(run.start for run in runs), strict=True))),
         0.0,
     )
     singles = np.array([of(run) for run in runs])

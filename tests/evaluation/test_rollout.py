@@ -13,12 +13,13 @@ from cz_gym import CzEnv
 from cz_gym.agents import load
 from cz_gym.baselines import CompensatedPID, OpenLoop
 from cz_gym.baselines.registry import make_controller
+from cz_gym.body.signals import Logged
 from cz_gym.camera import Camera
 from cz_gym.config import make_config
 from cz_gym.errors import CzError
 from cz_gym.evaluation import plot
 from cz_gym.evaluation.replay import Playback
-from cz_gym.evaluation.rollout import Signals, check_seeds, rollout
+from cz_gym.evaluation.rollout import check_seeds, rollout
 from cz_gym.observation import Measured
 from cz_gym.physics.parameters import Parameters
 from tests.observed import PLAIN
@@ -51,7 +52,7 @@ def one_by_one(policy, config, seed):
         total += reward
         rows.append(info)
         over = terminated or truncated
-    return {name: np.array([row[name] for row in rows]) for name in Signals._fields}, total, terminated
+    return {name: np.array([row[name] for row in rows]) for name in Logged._fields}, total, terminated
 
 
 def test_a_rollout_looks_through_the_camera_of_its_settings():
@@ -74,7 +75,7 @@ def check_against_scalar(policy, config, seeds):
         assert run.failed[i] == failed
         assert run.reward[:, i].sum() == pytest.approx(total)
         assert not run.reward[lived:, i].any()
-        for name, logged in zip(Signals._fields, run.signals, strict=True):
+        for name, logged in zip(Logged._fields, run.signals, strict=True):
             np.testing.assert_array_equal(logged[:lived, i], signals[name], err_msg=name)
     return run
 
@@ -106,7 +107,7 @@ def test_start_is_the_state_before_the_first_step_and_progress_counts_every_step
     run = rollout(OpenLoop(), SHORT, [7, 8, 9], counted.append)
     assert sum(counted) == run.alive.size == 3 * SHORT.steps
     _, info = CzEnv.from_config(SHORT, info="all").reset(seed=7)
-    for name, value in zip(Signals._fields, run.start, strict=True):
+    for name, value in zip(Logged._fields, run.start, strict=True):
         assert value[0, 0] == info[name]
 
 

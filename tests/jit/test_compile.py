@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from cz_gym import HURLE
+from cz_gym.body.process import BODY
 from cz_gym.engine.kernels import build_kernels
 from cz_gym.jit.cache import CachedCode, Store, cache_folder
 from cz_gym.jit.compile import jittable, kernel
@@ -134,5 +135,7 @@ def test_a_users_meniscus_is_never_run_from_a_cache():
     def height(r_c, theta, a):
         return 1.1 * hurle_height(r_c, theta, a)
 
-    kept = [isinstance(build_kernels(one).step._cache, CachedCode) for one in (HURLE, HURLE._replace(height=height))]
+    kept = [
+        isinstance(build_kernels(BODY, one).step._cache, CachedCode) for one in (HURLE, HURLE._replace(height=height))
+    ]
     assert kept == [True, False]

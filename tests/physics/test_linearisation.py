@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from cz_gym import make_puller
+from cz_gym.body.linearisation import linearise, radius_model
 from cz_gym.body.plant import NO_DISTURBANCE, Inputs, State, rates
-from cz_gym.physics.linearisation import linearise, radius_model
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.support.units import MM
 

@@ -5,11 +5,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.action import HEATER_RANGE
 from cz_gym.body.cost import Cost
 from cz_gym.body.plant import fourth_power
-from cz_gym.body.schedule import melt_left
-from cz_gym.body.signals import INFO
-from cz_gym.body.task import HEATER_RANGE, HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT
+from cz_gym.body.signals import Logged
+from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT
+from cz_gym.episodes.schedule import melt_left
 from cz_gym.observation import CLIP
 
 Array = npt.NDArray[Any]
@@ -66,7 +67,7 @@ class Watch:
         finite = np.isfinite(observation).all(axis=1) & (np.abs(observation) <= CLIP).all(axis=1)
         self._need(finite, f"the observation is not finite and within +-{CLIP}")
         self._need(np.isfinite(reward), "the reward is not finite")
-        for name in INFO:
+        for name in Logged._fields:
             self._need(np.isfinite(infos[name]), f"info {name!r} is not finite")
         if "state" in infos:
             self._need(np.isfinite(infos["state"]).all(axis=1), "info 'state' is not finite")

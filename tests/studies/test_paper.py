@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from cz_gym import make_puller
 from cz_gym.baselines import CompensatedPID
 from cz_gym.baselines.pid.compensated_pid import SeriesPID
-from cz_gym.physics.linearisation import radius_model
+from cz_gym.body.linearisation import radius_model
 from studies.paper import __main__ as paper
 from studies.paper import comparison
 from studies.paper.experiments import BARE, errors, inverse_response, pull_change, ramp, ramp_numbers, trace

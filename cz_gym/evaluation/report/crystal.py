@@ -10,8 +10,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
+from cz_gym.body.signals import Logged
 from cz_gym.evaluation.results import Result, Sample
-from cz_gym.evaluation.rollout import Floats, Signals
+from cz_gym.evaluation.rollout import Floats
 from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from .canvas import COLUMNS, GREY, INK, canvas, chosen, png, styles_of
@@ -22,7 +23,7 @@ SMOOTH = 5.0 * MINUTE
 """Length of the running mean of the drives [s], drawn over their single steps."""
 
 
-def example(sample: Sample) -> Signals:
+def example(sample: Sample) -> Logged:
     """Return the signals of a sample's first crystal, which every sample of a run has."""
     if sample.example is None:
         raise ValueError(f"the sample of {sample.name} has no signals")
@@ -31,7 +32,7 @@ def example(sample: Sample) -> Signals:
 
 class _Panel(NamedTuple):
     label: str
-    value: Callable[[Signals], Floats]
+    value: Callable[[Logged], Floats]
     noisy: bool = False
     """Whether to draw single steps pale, with their running mean on top."""
 
@@ -49,7 +50,7 @@ class Column(NamedTuple):
     """A crystal under one controller."""
 
     title: str
-    signals: Signals
+    signals: Logged
     colour: str
     lost: bool
 
@@ -119,7 +120,7 @@ def lost(sample: Sample) -> bool:
     return bool(sample.metric("failure_rate")[0, 0])
 
 
-def _set_limits(axes: Any, columns: Sequence[Column], longest: Signals, dt: float) -> None:
+def _set_limits(axes: Any, columns: Sequence[Column], longest: Logged, dt: float) -> None:
     """Set the axes' limits by the crystals that were not lost; a lost one leaves the picture."""
     whole = [column.signals for column in columns if not column.lost] or [column.signals for column in columns]
     worst = max(float(np.abs(signals.r_c - signals.r_ref).max()) for signals in whole)

@@ -12,11 +12,12 @@ import numpy.typing as npt
 from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 
+from cz_gym.body.signals import Logged
 from cz_gym.env import CzEnv
 from cz_gym.evaluation.metrics import TOLERANCE
 from cz_gym.evaluation.protocol import Row
 from cz_gym.evaluation.results import Result
-from cz_gym.evaluation.rollout import Floats, Signals
+from cz_gym.evaluation.rollout import Floats
 from cz_gym.evaluation.statistics import Estimate
 from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
 
@@ -100,7 +101,7 @@ class Panel(NamedTuple):
     unit: str
     scale: float
     """Size of the unit in SI units."""
-    lines: Mapping[str, Callable[[Signals, float], Floats]]
+    lines: Mapping[str, Callable[[Logged, float], Floats]]
     """Lines by name, each a function of an episode's signals and the operator's bias [m], in SI units. "true" and
     "camera" (its reading) are drawn for each controller; other lines are the same for all and drawn once."""
     levels: tuple[float, ...] = ()

@@ -34,7 +34,8 @@ class Column(NamedTuple):
         """Return the mean in the column's unit, with its interval if it has one that is shown."""
         if estimate and not self.interval:
             estimate = estimate._replace(ci95=None)
-        return estimate.text(f"z.{self.decimals}f", self.unit) if estimate else NOTHING
+        known = estimate and estimate.mean == estimate.mean  # NaN: the metric does not apply
+        return estimate.text(f"z.{self.decimals}f", self.unit) if estimate and known else NOTHING
 
 
 RMSE = Column("rmse_mm", "RMSE [mm]", 3)

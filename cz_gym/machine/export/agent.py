@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.body.task import HEATER_SLACK, drives_of
+from cz_gym.action import HEATER_SLACK, drives_of
+from cz_gym.body.process import BODY
 from cz_gym.config import Config
 from cz_gym.engine.outputs import recall, remember
 from cz_gym.errors import CzError
@@ -137,8 +138,8 @@ class Agent:
         constants = SimpleNamespace(
             newest=self.newest, before=self.before, share=share, measured=1.0 / scales(MEASURED, *self.ranges)
         )
-        _uncompiled(remember, sums)(slot, sums, self.dt, out)
-        _uncompiled(recall, sums)(slot, seen, sums, constants, out)
+        _uncompiled(remember, sums)(slot, sums, self.dt, out, BODY)
+        _uncompiled(recall, sums)(slot, seen, sums, constants, out, BODY)
         table = np.concatenate([sums[1:] - sums[0], np.zeros((1, len(LAGGED), n))])
         return out.T, past._replace(sums=np.moveaxis(table, -1, 0), integral=slot.integral)
 

@@ -13,9 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import max_len_seq
 
-from cz_gym.action import mark
+from cz_gym.action import HEATER_RANGE, drives_of, mark
 from cz_gym.body.plant import make_puller
-from cz_gym.body.task import HEATER_RANGE, drives_of
 from cz_gym.errors import CzError
 from cz_gym.observation import DRIVE_CHANNELS, decode
 from cz_gym.physics.parameters import Parameters

@@ -18,11 +18,12 @@ from cz_gym.baselines.pid.compensated_pid import CompensatedPID
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.registry import make_controller
 from cz_gym.baselines.tuning.lqg import FAMILY
+from cz_gym.body.linearisation import radius_model
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Scenario, Sensor
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.observation import MEASURED, Measured
-from cz_gym.physics.linearisation import StateSpace, radius_model
+from cz_gym.physics.linearisation import StateSpace
 from cz_gym.physics.parameters import Parameters
 from cz_gym.support.units import MM
 from tests.observed import PLAIN

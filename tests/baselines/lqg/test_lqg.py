@@ -7,11 +7,13 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from cz_gym import make_puller
+from cz_gym.baselines.lqg.controller import LQGDesign, solve
 from cz_gym.baselines.lqg.model import DRIFT, FAST, HEATER, PLANT, SLOW, STATES, NoiseModel, plant_model
 from cz_gym.baselines.lqg.regulator import look_ahead, quadratic_cost, regulator, samples_ahead
 from cz_gym.body.cost import Weights
 from cz_gym.body.plant import Disturbance, Inputs, State, hidden_load, rates
-from cz_gym.body.schedule import quintic
+from cz_gym.episodes.schedule import quintic
+from cz_gym.machine.puller import find_puller
 from cz_gym.observation import Measured
 from cz_gym.physics.meniscus import HURLE
 
@@ -127,3 +129,11 @@ def test_the_plan_is_the_recipe_five_minutes_ahead(dt):
             future = recipe((k + np.arange(samples + 1)) * dt)
             np.testing.assert_allclose(plan[0, 0], future, atol=1e-15)
             np.testing.assert_allclose(plan[0, 1], 2.0 * future, atol=1e-15)
+
+
+def test_the_radius_estimate_is_limited_as_the_puller_s_radius_is():
+    file = find_puller("silicon-300mm")
+    plant_filter = solve(LQGDesign(), 5.0, make_puller(file.parameters))[0]
+    mean = np.zeros((2, len(STATES)))
+    mean[:, 0] = 1.0, -0.012
+    assert plant_filter._clipped(mean)[:, 0] == pytest.approx([file.radius_limit, -0.012], rel=1e-12)

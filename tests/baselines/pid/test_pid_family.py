@@ -8,6 +8,7 @@ import pytest
 from scipy.signal import lfilter
 
 from cz_gym import make_puller
+from cz_gym.action import HEATER_RANGE
 from cz_gym.baselines.analysis.compensator_design import controller_transfer
 from cz_gym.baselines.analysis.frequency import loop_margins, response
 from cz_gym.baselines.analysis.linear_form import linear_form
@@ -17,10 +18,10 @@ from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
 from cz_gym.baselines.tuning.pid import PIDS, below_half_the_zero
 from cz_gym.baselines.tuning.values import TUNED
-from cz_gym.body.task import HEATER_RANGE
+from cz_gym.body.linearisation import radius_model
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.observation import MEASURED, PULL_SCALE, Measured
-from cz_gym.physics.linearisation import StateSpace, radius_model
+from cz_gym.physics.linearisation import StateSpace
 from cz_gym.physics.parameters import Parameters
 from cz_gym.support.units import MM, MM_PER_MIN
 from tests.observed import measured, pulls

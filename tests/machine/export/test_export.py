@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cz_gym import agents
+from cz_gym.action import HEATER_RANGE, drives_of
 from cz_gym.baselines.registry import make_controller
-from cz_gym.body.task import HEATER_RANGE, drives_of
 from cz_gym.config import make_config
 from cz_gym.machine.export.__main__ import main
 from cz_gym.machine.export.compiled import CompiledBlock

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from cz_gym import CzEnv, Parameters
-from cz_gym.action import MadeFor
+from cz_gym.action import HEATER_RANGE, MadeFor
 from cz_gym.baselines.policy import OpenLoop
-from cz_gym.body.task import HEATER_RANGE
 from cz_gym.errors import CzError
 from cz_gym.machine.identify import Excited, identify, read_log, record_log
 from cz_gym.machine.identify.estimate import HEATER, PULL, measure_excitation, whiteness

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from cz_gym import SCENARIOS, make_puller
-from cz_gym.body import schedule
-from cz_gym.body.plant import hidden_load
-from cz_gym.body.schedule import bias_offset, disturbance, drift, pyrometer_drift, recipe, reference, ripple
+from cz_gym.body.plant import disturbance, hidden_load
+from cz_gym.episodes import schedule
 from cz_gym.episodes.record import Episode
+from cz_gym.episodes.schedule import bias_offset, drift, pyrometer_drift, recipe, reference, ripple
 from cz_gym.episodes.series import draw_episode, new_series
 
 MINUTE = 60.0

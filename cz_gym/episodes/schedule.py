@@ -1,17 +1,15 @@
 """The signals of an episode that depend on time alone: reference, recipe, hidden drift and melt loss at t [s].
 
-``e`` is an :class:`cz_gym.episodes.record.Episode` or a record with its fields, ``p`` a puller.
+``e`` is an :class:`cz_gym.episodes.record.Episode` or a record with its fields.
 """
-
-from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
 
-from cz_gym.body.plant import Disturbance, hidden_load
-from cz_gym.episodes.scenario import DRAW_SPAN
 from cz_gym.jit.compile import jittable
+
+from .scenario import DRAW_SPAN
 
 
 @jittable
@@ -48,12 +46,6 @@ def reference(t: Any, e: Any) -> Any:
 def melt_left(t: Any, e: Any) -> Any:
     """Share of the melt's heat capacity left [-]."""
     return 1.0 - e.melt_loss * progress(t, 0.0, DRAW_SPAN)
-
-
-@jittable
-def disturbance(t: Any, dT_i: Any, e: Any, p: Any) -> Any:
-    """Disturbance at a point t [s] of the 5 s grid, with the interface fluctuation [K] drawn there."""
-    return Disturbance(hidden_load(drift(t, e), p), dT_i, melt_left(t, e))
 
 
 @jittable

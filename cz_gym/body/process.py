@@ -1,0 +1,157 @@
+"""The process of ``Cz-v0``: plant, signals, task and cost of a crystal's body as one value for the engine."""
+
+from typing import Any
+
+import numpy as np
+
+from cz_gym.episodes.draw import randomised
+from cz_gym.episodes.schedule import bias_offset, melt_left, reference
+from cz_gym.jit.compile import force_inlined, jittable, labelled
+from cz_gym.physics.meniscus import MeniscusModel
+from cz_gym.physics.parameters import Parameters, check_parameters
+from cz_gym.process import GROWS, LOST, Inputs, Process, Seen
+from cz_gym.support.units import MM
+
+from . import cost, plant, signals
+from .plant import Disturbance, Puller, State, growth
+from .task import HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT, check_height, within_limits
+
+_LOW = 5.0 * MM
+"""Above this height no melt can freeze the meniscus within half a substep [m]."""
+_JUMP = HEIGHT_MIN
+
+
+def check(parameters: Parameters, meniscus: MeniscusModel) -> Parameters:
+    """Return the parameters; raise CzError unless a crystal can grow with them."""
+    checked = check_parameters(parameters)
+    check_height(plant.make_puller(checked, meniscus=meniscus))
+    return checked
+
+
+@jittable
+def derive(parameters: Any, factors: Any, m: Any) -> Any:
+    """The drawn puller at its own operating point."""
+    return plant.derive_puller(randomised(parameters, factors), factors.lam, m.height, m.ring_offset)
+
+
+@jittable
+def begin(slot: Any, m: Any) -> Any:
+    """The operating point's state, the radius off by what was drawn."""
+    p = slot.puller
+    return State(p.r_0 + slot.episode.r_c_start, p.h_0, p.T_1_0, p.T_2_0, p.T_b_0)
+
+
+@jittable
+def nominal(x: Any, slot: Any) -> Any:
+    """The operating point's inputs."""
+    return Inputs(slot.puller.v_0, slot.puller.Q_H_0)
+
+
+@jittable
+def disturb(Q_d: Any, dT_i: Any, t: Any, e: Any) -> Any:
+    """The disturbance with what is left of the melt at t [s]."""
+    return Disturbance(Q_d, dT_i, melt_left(t, e))
+
+
+@force_inlined
+def rates(x: Any, u: Any, d: Any, p: Any, m: Any) -> Any:
+    """The plant's rates with this meniscus."""
+    return plant.rates(x, u, d, p, m.slope)
+
+
+@jittable
+def height_inside(h_c: Any, p: Any) -> Any:
+    """The meniscus height limited to its range, so that a failed state can still be measured."""
+    top = HEIGHT_MAX_IN_A * p.a
+    if h_c.real < HEIGHT_MIN:
+        return HEIGHT_MIN
+    return top if h_c.real > top else h_c
+
+
+@jittable
+def accept(slot: Any, x: Any, new: Any, u: Any, d: Any, t: Any, dt: Any, limit: Any, m: Any) -> Any:
+    """The state after a substep and whether the crystal still grows, at this moment's reference."""
+    p = slot.puller
+    new, grows = accept_substep(x, new, u, d, p, dt, p.r_0 + reference(t, slot.episode), m.slope, limit)
+    return new, GROWS if grows else LOST
+
+
+@jittable
+def accept_substep(
+    x: Any, new: Any, u: Any, d: Any, p: Any, dt: Any, r_ref: Any, slope: Any, radius_limit: Any = RADIUS_LIMIT
+) -> Any:
+    """The state after a substep and whether the crystal still grows; after an impossible jump the state before it.
+
+    Over a melt far too cold a low meniscus freezes within seconds, and a step across that singularity can end anywhere,
+    inside the limits too. There the height falls faster and faster, so half the step at the first rate tells.
+    """
+    inside = within_limits(new.r_c, new.h_c, r_ref, p.a, radius_limit)
+    grows = inside
+    if inside and x.h_c < _LOW:
+        grows = x.h_c + 0.5 * dt * (u.v_p - growth(x, d, p, slope).v_g) >= HEIGHT_MIN
+    if not grows and (inside or not (np.abs(new.r_c - x.r_c) < _JUMP and np.abs(new.h_c - x.h_c) < _JUMP)):
+        new = labelled(State, x)
+    return new, grows
+
+
+@jittable
+def see(x: Any, p: Any, m: Any) -> Any:
+    """The bright ring around the crystal, with and without the operator's bias, and the heater."""
+    h_c = height_inside(x.h_c, p)
+    ring = x.r_c + m.ring_offset(x.r_c, h_c, p)
+    return Seen(ring, ring - p.ring_bias, h_c, x.T_1)
+
+
+@jittable
+def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, m: Any) -> Any:
+    """The rows of ``info``, growth taken at a height within the limits."""
+    p, x = slot.puller, slot.x
+    at = State(x.r_c, height_inside(x.h_c, p), x.T_1, x.T_2, x.T_b)
+    at_interface = growth(at, Disturbance(slot.Q_d, slot.dT_i, 1.0), p, m.slope)
+    return signals.logged(slot, measured, cost, t, ring, at_interface)
+
+
+@jittable
+def lean(slot: Any, measured: Any) -> Any:
+    """True radius and its reference."""
+    return signals.Lean(slot.x.r_c, slot.puller.r_0 + measured.r_ref)
+
+
+@jittable
+def charged(x: Any, u: Any, before: Any, extra: Any, slot: Any, t: Any) -> Any:
+    """True radius error less what no sensor shows [m], pull speed above nominal [m/s], steps of both drives."""
+    p, e = slot.puller, slot.episode
+    error = x.r_c - p.r_0 - reference(t, e) + bias_offset(t, e)
+    return cost.Cost(error, u.v_p - p.v_0, u.v_p - before.v_p, u.Q_H - before.Q_H)
+
+
+BODY = Process(
+    Constants=Puller,
+    State=State,
+    Disturbance=Disturbance,
+    Measured=signals.Measured,
+    TrueState=signals.TrueState,
+    Logged=signals.Logged,
+    Lean=signals.Lean,
+    Cost=cost.Cost,
+    past=signals.PAST,
+    relative=signals.RELATIVE,
+    check=check,
+    derive=derive,
+    begin=begin,
+    nominal=nominal,
+    hidden_load=plant.hidden_load,
+    disturb=disturb,
+    rates=rates,
+    accept=accept,
+    see=see,
+    measure=signals.measure,
+    true_state=signals.true_state,
+    logged=logged,
+    lean=lean,
+    charged=charged,
+    cost_terms=cost.cost_terms,
+    cost_slopes=cost.cost_slopes,
+    reward=cost.reward,
+    equations=plant.EQUATIONS,
+)

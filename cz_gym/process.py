@@ -1,0 +1,256 @@
+"""What an environment simulates: one value of :class:`Process`, which the engine compiles in.
+
+Its types say which numbers there are, its functions what becomes of them. Slots, lanes, complex steps, rows of ``info``
+and channels of observations follow from the types; ``Cz-v0`` is :data:`cz_gym.body.process.BODY`.
+
+Every process stands in a puller: two drives move it (:class:`Inputs`), a camera and a pyrometer see it (:class:`Seen`),
+a scenario disturbs it (:class:`cz_gym.episodes.record.Episode`). All functions take SI units and are pure, but for
+``begin``, and marked :func:`cz_gym.jit.compile.jittable`. ``p`` are the puller's constants, ``e`` is the episode, ``m``
+the meniscus model, ``t`` the time [s]. ``slot`` is a record of :func:`cz_gym.engine.layout.slot_type`, with
+``slot.puller``, ``slot.episode``, ``slot.x``, the drives and the last readings.
+
+Another process is one more value, in a room of its own:
+
+* References that run with length: ``nominal``, ``accept``, ``charged`` and ``measure`` see the state, and the
+  derivatives of a step follow them.
+* A recipe of each reset: :attr:`Process.table` is the shape of ``slot.table``, which ``begin`` fills, with random
+  numbers from ``slot.streams`` where it needs some.
+* Numbers that outlive a step, as a running mean of the pull speed: the fields of :attr:`Process.Extra` stand in the
+  slot; ``begin`` sets them, ``carry`` moves them on at every step, ``charged`` may charge them.
+* Constants of an episode: fields of ``Extra`` that ``begin`` draws, or new ones of ``Episode`` and of the scenario.
+* Stages: numbers of the parameters, which ``derive`` hands on as constants.
+* An end with success: ``accept`` returns :data:`DONE`, which ``slot.over`` then is; a row ``succeeded`` of ``info``
+  tells it to rollouts.
+* Channels of its own: ``Measured``, ``TrueState``, ``Logged``, ``past`` and ``relative``.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from types import FunctionType
+from typing import Any, NamedTuple, get_type_hints
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.jit.compile import jittable, static
+from cz_gym.support.units import KILO, MM_PER_MIN
+
+GROWS, LOST, DONE = 0, 1, 2
+"""What ``accept`` says of a substep: it goes on, it ends in failure, it ends with success."""
+PULL_SCALE, HEATER_SCALE = 1.2 * MM_PER_MIN, 10.0 * KILO
+"""Ranges of the default puller's drives [m/s, W], in which channels of these units are scaled."""
+NO_OPERATING_POINT = "these parameters have no finite operating point; check temperatures and conductances"
+Function = Callable[..., Any]
+
+
+class Channel(NamedTuple):
+    """One number of an observation or of ``info``."""
+
+    unit: str
+    """SI unit; "1" for none."""
+    scale: float
+    """Observations hold the number divided by this [unit]."""
+    meaning: str
+    """Description for tables."""
+    name: str = ""
+    """The field that it annotates."""
+
+
+class Past(NamedTuple):
+    """A signal whose past "history" shows, as differences of the means of neighbouring time spans."""
+
+    name: str
+    scale: float
+    """Scale of these differences [unit of the signal]."""
+
+
+class Relative(NamedTuple):
+    """How "history" shows a signal relative to another one."""
+
+    name: str
+    to: str
+    """Name of the other signal."""
+    scale: float
+    """Scale of the difference [unit of the signal]."""
+    meaning: str
+    """Description for tables."""
+
+
+class Inputs(NamedTuple):
+    """Inputs u, held over a step: the drives of a puller."""
+
+    v_p: Any
+    """Pull speed relative to the melt surface [m/s]."""
+    Q_H: Any
+    """Heater power [W]."""
+
+
+class Seen(NamedTuple):
+    """What perfect sensors see."""
+
+    ring: Any
+    """Radius of the bright ring [m]."""
+    reading: Any
+    """The same less the operator's bias [m]."""
+    h_c: Any
+    """Height of the meniscus within its limits [m]."""
+    T_1: Any
+    """Temperature at the pyrometer [K]."""
+
+
+class NoExtra(NamedTuple):
+    """No numbers besides the state."""
+
+
+@jittable
+def carry_nothing(extra: Any, u: Any, p: Any, interval: Any) -> Any:
+    """Nothing is carried on: a process without numbers besides the state."""
+    return extra
+
+
+@static
+class Process(NamedTuple):
+    """A process: types, tables and functions; see the module for how a further one is written."""
+
+    Constants: Any
+    """The puller's constants p, the puller's equations solved."""
+    State: Any
+    """State x."""
+    Disturbance: Any
+    """Disturbance d, held over a substep."""
+    Measured: Any
+    """Channels of "measured", annotated with :class:`Channel`; ``v_p`` and ``Q_H`` are deviations from nominal."""
+    TrueState: Any
+    """Channels of "state"."""
+    Logged: Any
+    """Rows of ``info``; among them those of ``Lean``, ``v_p``, ``Q_H``, ``ring_offset``, ``action_clipped``, and
+    ``cost_`` with each name of ``Cost``."""
+    Lean: Any
+    """Rows of ``info="lean"``: the controlled quantity and its reference first."""
+    Cost: Any
+    """Terms of a step's cost; each depends on one number."""
+    past: tuple[Past, ...]
+    """The signals whose past "history" shows; the first is the one that is integrated."""
+    relative: tuple[Relative, ...]
+    """The signals that "history" shows relative to others."""
+    check: Function
+    """``check(parameters, meniscus)``: the parameters, checked; CzError if nothing can grow with them."""
+    derive: Function
+    """``derive(parameters, factors, m)``: ``Constants`` at these factors of the hot zone
+    (:class:`cz_gym.episodes.record.Factors`)."""
+    begin: Function
+    """``begin(slot, m)``: the first ``State``; sets ``Extra`` and the table in the slot."""
+    nominal: Function
+    """``nominal(x, slot)``: the ``Inputs`` from which actions and observed drives are counted."""
+    hidden_load: Function
+    """``hidden_load(p_drift, p)``: heat load [W] that a recipe shifted by p_drift [K] would cancel."""
+    disturb: Function
+    """``disturb(Q_d, dT_i, t, e)``: ``Disturbance`` at a point of the 5 s grid, with the hidden load [W] and the
+    interface's fluctuation [K] there."""
+    rates: Function
+    """``rates(x, u, d, p, m)``: time derivatives of the state; mark it ``force_inlined``."""
+    accept: Function
+    """``accept(slot, x, new, u, d, t, dt, limit, m)``: the state after the substep of dt [s] that ended at t, and
+    :data:`GROWS`, :data:`LOST` or :data:`DONE`; ``limit`` is the largest radius error [m]."""
+    see: Function
+    """``see(x, p, m)``: :class:`Seen`; complex for a complex state."""
+    measure: Function
+    """``measure(slot, t)``: ``Measured``."""
+    true_state: Function
+    """``true_state(slot, measured, t)``: ``TrueState``."""
+    logged: Function
+    """``logged(slot, measured, cost, t, ring, m)``: ``Logged``."""
+    lean: Function
+    """``lean(slot, measured)``: ``Lean``."""
+    charged: Function
+    """``charged(x, u, before, extra, slot, t)``: ``Cost`` of the numbers that the terms charge, ``before`` the inputs
+    of the step before."""
+    cost_terms: Function
+    """``cost_terms(*charged)``: ``Cost``."""
+    cost_slopes: Function
+    """``cost_slopes(*charged)``: the derivative of each term by its own number."""
+    reward: Function
+    """``reward(cost, grows)``: the reward of a step [-], whose cost is ``Cost``; false if the crystal is lost in it."""
+    equations: tuple[Any, ...]
+    """The functions that define the plant, for :attr:`cz_gym.config.Config.plant_hash`."""
+    Extra: Any = NoExtra
+    """Numbers of a slot that outlive a step."""
+    carry: Function = carry_nothing
+    """``carry(extra, u, p, interval)``: ``Extra`` after the drives have moved to u."""
+    table: tuple[int, int] = (0, 0)
+    """Rows and columns of ``slot.table``, which ``begin`` fills; none by default."""
+
+    @property
+    def functions(self) -> tuple[Any, ...]:
+        """The functions among the fields."""
+        return tuple(field for field in self if isinstance(field, FunctionType))
+
+    @property
+    def info(self) -> tuple[str, ...]:
+        """Names of the rows of ``info``."""
+        return tuple(self.Logged._fields)
+
+    @property
+    def measured(self) -> tuple[Channel, ...]:
+        """Channels of ``observation="measured"``."""
+        return tuple(signals(self.Measured).values())
+
+    @property
+    def state(self) -> tuple[Channel, ...]:
+        """Channels of ``observation="state"``."""
+        return tuple(signals(self.TrueState).values())
+
+    @property
+    def remembered(self) -> tuple[int, ...]:
+        """Places in "measured" of the signals in ``past``."""
+        return tuple(self.Measured._fields.index(each.name) for each in self.past)
+
+    @property
+    def lagged(self) -> int:
+        """Number of signals whose past "history" shows."""
+        return len(self.past)
+
+    @property
+    def past_change(self) -> tuple[float, ...]:
+        """Ratio of each remembered signal's scale to the scale of its past differences [-]."""
+        return tuple(self.measured[at].scale / each.scale for at, each in zip(self.remembered, self.past, strict=True))
+
+    @property
+    def relative_at(self) -> tuple[int, ...]:
+        """Places in "measured" of the signals in ``relative``."""
+        return tuple(self.Measured._fields.index(each.name) for each in self.relative)
+
+    @property
+    def relative_to(self) -> tuple[int, ...]:
+        """Places in "measured" of the signals that they are relative to."""
+        return tuple(self.Measured._fields.index(each.to) for each in self.relative)
+
+    @property
+    def relative_change(self) -> tuple[float, ...]:
+        """Ratio of each relative signal's scale to the scale of the difference [-]."""
+        return tuple(
+            self.measured[at].scale / each.scale for at, each in zip(self.relative_at, self.relative, strict=True)
+        )
+
+    @property
+    def integrated_scale(self) -> float:
+        """Scale of the signal that "history" integrates [its unit]."""
+        return self.measured[self.remembered[0]].scale
+
+
+@cache
+def signals(kind: Any) -> dict[str, Channel]:
+    """The channels of an annotated type by name, in their order."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {name: hints[name].__metadata__[0]._replace(name=name) for name in kind._fields}
+
+
+def scales(listed: tuple[Channel, ...], v_0: float, heater_range: float = HEATER_SCALE) -> npt.NDArray[np.float64]:
+    """Scales of the channels for a puller of nominal pull speed v_0 [m/s] and heater range [W], shape (channels,)."""
+    own = {"m/s": (v_0, PULL_SCALE), "W": (heater_range, HEATER_SCALE)}
+
+    def scale(channel: Channel) -> float:
+        size, default = own.get(channel.unit, (1.0, 1.0))
+        return size * (channel.scale / default)
+
+    return np.array([scale(channel) for channel in listed])

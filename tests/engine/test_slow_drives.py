@@ -1,0 +1,95 @@
+"""The heater's dead time and lag and the pyrometer's filter against analytic solutions."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from cz_gym import SCENARIOS, CzEnv, CzVectorEnv
+from cz_gym.config import make_config
+from cz_gym.differentiable import DifferentiableBatch
+from cz_gym.engine.drives import mean_power
+
+NOMINAL, KW = SCENARIOS["nominal"], 1000.0
+
+
+def slow(lag=0.0, dead_time=0.0, tau=0.0):
+    return replace(
+        NOMINAL,
+        name="slow",
+        actuators=replace(NOMINAL.actuators, heater_lag=(lag, lag), heater_dead_time=(dead_time, dead_time)),
+        sensor=replace(NOMINAL.sensor, pyrometer_filter=(tau, tau)),
+    )
+
+
+class Slot:
+    """A slot's numbers that the heater needs."""
+
+    def __init__(self, lag, dead_time, power):
+        self.episode, self.Q_heats = self, power
+        self.heater_lag, self.heater_dead_time = lag, dead_time
+
+
+@pytest.mark.parametrize("lag", [0.0, 3.0, 40.0])
+@pytest.mark.parametrize("dead_time", [0.0, 7.3, 20.0])
+def test_the_plant_gets_the_energy_of_the_analytic_step_response(lag, dead_time):
+    """After a step of 1 kW at t = 10 s, in substeps that no control interval or dead time fits."""
+    interval, powers, ends = 10.0, np.full(8, 2.0 * KW), np.cumsum([0.0, *([5.0, 2.0, 3.0] * 6)])
+    slot, begin = Slot(lag, dead_time, 2.0 * KW), 10.0 + dead_time
+
+    def energy(t):
+        after = np.maximum(t - begin, 0.0)
+        lagging = lag * -np.expm1(-after / lag) if lag > 0.0 else 0.0
+        return 2.0 * KW * t + 1.0 * KW * (after - lagging)
+
+    for start, stop in pairwise(ends):
+        powers[int(start / interval + 1e-9) % 8] = 3.0 * KW if start >= 10.0 else 2.0 * KW
+        mean = mean_power(slot, powers, start, stop, interval)
+        assert mean * (stop - start) == pytest.approx(energy(stop) - energy(start), rel=1e-12)
+
+
+def test_the_heater_s_temperature_answers_the_delayed_power():
+    """As that of a heater at once does, a dead time of two intervals later; with a lag it stays behind, and arrives."""
+    runs = {}
+    for name, scenario in (("at once", slow()), ("late", slow(dead_time=10.0)), ("lagging", slow(lag=60.0))):
+        env = CzEnv(scenario, observation="measured", action="direct", info="all")
+        env.reset(seed=0)
+        runs[name] = np.array([env.step(np.array([0.0, 0.3 * (k > 0)], np.float32))[4]["T_1"] for k in range(60)])
+        assert env._batch.memory.slots["Q_H"][0] == pytest.approx(env._batch.memory.slots["puller"]["Q_H_0"][0] + 3e3)
+    np.testing.assert_allclose(runs["late"][2:], runs["at once"][:-2], rtol=0.0, atol=2e-6)
+    assert (runs["lagging"][1:] < runs["at once"][1:]).all()
+
+
+def test_the_pyrometer_reads_the_filtered_temperature():
+    """The solution of tau y' = T_1 - y for the temperature that moves straight between samples."""
+    tau, interval = 30.0, 5.0
+    env = CzEnv(slow(tau=tau), observation="measured", action="direct", info="all")
+    env.reset(seed=0)
+    slots = env._batch.memory.slots
+    last = filtered = float(slots["x"]["T_1"][0])
+    for _ in range(80):
+        T_1 = env.step(np.array([0.0, 0.5], np.float32))[4]["T_1"]
+        times = (np.arange(20_000) + 0.5) * interval / 20_000
+        fed = (last + (T_1 - last) * times / interval) * np.exp((times - interval) / tau)
+        filtered, last = filtered * np.exp(-interval / tau) + fed.mean() * interval / tau, T_1
+        assert slots["T_1"][0] == pytest.approx(filtered, abs=1e-6)
+
+
+def test_the_batch_and_saved_states_know_the_slow_drives():
+    scenario = replace(slow(20.0, 12.0, 15.0), name="slow")
+    settings = {"scenario": scenario, "observation": "measured", "info": "all"}
+    batch, envs = CzVectorEnv(3, **settings), [CzEnv(**settings) for _ in range(3)]
+    first = batch.reset(seed=1)[0], np.stack([env.reset(seed=1 + i)[0] for i, env in enumerate(envs)])
+    np.testing.assert_array_equal(*first)
+    for k, action in enumerate(np.random.default_rng(0).uniform(-1, 1, (40, 3, 2)).astype(np.float32)):
+        if k == 20:
+            envs[0].set_state(batch.get_state()[0])
+        seen = np.stack([env.step(own)[0] for env, own in zip(envs, action, strict=True)])
+        np.testing.assert_array_equal(batch.step(action)[0], seen)
+
+
+def test_derivatives_of_slow_drives_are_refused():
+    for scenario in (slow(lag=5.0), slow(dead_time=5.0), slow(tau=5.0)):
+        with pytest.raises(ValueError, match="slow heater or a pyrometer's filter has no derivatives"):
+            DifferentiableBatch(make_config(scenario), 1)
