@@ -33,7 +33,8 @@ PACKAGE = Path(__file__).parents[1]
 CACHE_VARIABLE = "CZ_GYM_CACHE_DIR"
 """Environment variable naming the folder for compiled code; empty means: keep none."""
 NEVER_COMPILED = (
-    "agents", "baselines", "evaluation", "machine/export", "machine/pullers", "machine/serve", "play.py", "testing",
+    "agents", "baselines", "datasets.py", "evaluation", "machine/export", "machine/pullers", "machine/serve", "play.py",
+    "rendering", "sb3.py", "support/command_line.py", "support/interrupts.py", "testing",
 )  # fmt: skip
 """Parts of the package of which nothing is compiled in; all others count, whatever they hold."""
 FunctionCache: Any = caching.FunctionCache
@@ -49,8 +50,8 @@ def compiled_sources(folder: Path | None = None) -> list[Path]:
 
 
 def source_hash(folder: Path | None = None) -> str:
-    """SHA-256 of the names and contents of :func:`compiled_sources` (32 hex digits)."""
-    return hash_files(compiled_sources(folder))
+    """Hash of the names and the code of :func:`compiled_sources` (32 hex digits)."""
+    return hash_files(compiled_sources(folder), code_only=True)
 
 
 @cache

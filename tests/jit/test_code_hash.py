@@ -5,10 +5,10 @@ import runpy
 import pytest
 
 from cz_gym import HURLE, config
+from cz_gym.body import plant
 from cz_gym.config import make_config
 from cz_gym.jit.code_hash import function_hash, hash_files
 from cz_gym.jit.compile import jittable
-from cz_gym.physics import plant
 
 SOURCE = '''
 import math
