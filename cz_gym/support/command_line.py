@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -69,6 +70,7 @@ def guarded(prog: str, body: Callable[[], int], extra: str, left: str = "nothing
     exception is a bug, the user's or ours, and keeps its traceback. ``extra`` names the extras of what the command
     imports, ``left`` says what an interrupt leaves behind.
     """
+    os.environ["MPLBACKEND"] = "agg"  # commands draw files; a notebook's backend may be missing here
     try:
         return body()
     except (CzError, DependencyNotInstalled) as error:
