@@ -16,7 +16,7 @@ from cz_gym.errors import CzError
 OPTIONAL = (
     "aiohttp", "array_api_compat", "asyncua", "blark", "casadi", "control", "envpool", "filelock", "fmpy", "h5py",
     "matplotlib", "minari", "onnx", "onnxruntime", "pandas", "pcgym", "plotly", "pyarrow", "pygame", "pythonfmu",
-    "safetensors", "sb3_contrib", "selenium", "stable_baselines3", "tensorboard", "torch", "tqdm",
+    "sb3_contrib", "selenium", "stable_baselines3", "tensorboard", "torch", "tqdm",
 )  # fmt: skip
 """Modules of the packages in the extras of ``pyproject.toml``."""
 
