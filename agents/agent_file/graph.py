@@ -5,8 +5,6 @@ bound is known before anything is computed: no operator loops, branches, reads o
 its inputs say, and a puller's action depends on that puller's row alone.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A training run in its folder: settings and provenance, checkpoints, the best agent so far, progress."""
 
-from __future__ import annotations
-
 import signal
 import sys
 import threading

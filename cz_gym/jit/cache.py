@@ -6,8 +6,6 @@ Here a file is named by the types that it was compiled for, repeats them inside,
 be loaded is compiled again. A file is trusted as those of ``__pycache__`` are.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import pickle

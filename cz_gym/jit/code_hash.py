@@ -1,7 +1,5 @@
 """Hashes of functions and of files that ignore formatting and comments."""
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import inspect

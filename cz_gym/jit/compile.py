@@ -6,8 +6,6 @@ the outermost function, so a changed equation in another module would run the ol
 named by a hash of every source of the package that can be compiled in.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, TypeVar, cast

@@ -4,8 +4,6 @@ One file is replaced by one rename, which no kill or full disk can leave half do
 after the other: who needs to know that all of them are there writes the one that says so last.
 """
 
-from __future__ import annotations
-
 import os
 import tempfile
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """Command lines of the project: errors that are meant for the user, and interrupts, print one line."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

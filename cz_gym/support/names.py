@@ -1,7 +1,5 @@
 """Messages for a name that does not exist, and for a name given where an object is needed."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Iterable
 from difflib import get_close_matches

@@ -1,7 +1,5 @@
 """The number of processors that a process may use."""
 
-from __future__ import annotations
-
 import os
 from typing import Any
 
